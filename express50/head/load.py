@@ -1,0 +1,39 @@
+"""Load a head model by name or path."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from express50.errors import HeadModelError
+from express50.head.model import HeadModel
+
+_KINDS = '"procedural", a FLAME .pkl, an ICT-FaceKit checkout or an ICT .npz'
+
+
+def load_head(spec: str | Path) -> HeadModel:
+    """Load a head model.
+
+    Args:
+        spec: "procedural" for the built-in head, else a path: `*.pkl` is the user's FLAME model
+            (its landmark embedding and masks are looked for beside it), a folder is a checkout of
+            ICT-FaceKit, `*.npz` holds ICT-FaceKit's arrays.
+
+    Raises:
+        HeadModelError: unknown name, missing file or damaged content.
+    """
+    if str(spec) == "procedural":
+        from express50.head.procedural import build_procedural_head
+
+        return build_procedural_head()
+    path = Path(spec).expanduser()
+    if not path.exists():
+        raise HeadModelError(f"head model {str(spec)!r}: no such file or folder; expected {_KINDS}")
+    if path.is_dir() or path.suffix == ".npz":
+        from express50.head.ict import load_ict
+
+        return load_ict(path)
+    if path.suffix == ".pkl":
+        from express50.head.flame import load_flame
+
+        return load_flame(path)
+    raise HeadModelError(f"head model {str(spec)!r}: cannot tell its kind; expected {_KINDS}")

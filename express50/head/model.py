@@ -1,0 +1,298 @@
+"""The head model all parts share: a linear shape space posed by linear blend skinning.
+
+The layout is FLAME's (Li et al. 2017, "Learning a model of facial shape and expression from 4D
+scans"): five joints (root, neck, jaw, left eye, right eye), joints regressed from the shaped
+vertices, pose correctives linear in the entries of R - I of every joint but the root.
+Head space: metres, y up, the face looks along +z, the subject's left is +x.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields, replace
+
+import torch
+
+from express50.errors import HeadModelError
+from express50.torch_transforms import axis_angle_to_matrix
+
+JOINTS = ("root", "neck", "jaw", "left_eye", "right_eye")
+PARENTS = (-1, 0, 1, 1, 1)
+REGIONS = (
+    "face", "neck", "scalp", "forehead", "nose", "lips", "left_ear", "right_ear",
+    "left_eye_region", "right_eye_region", "left_eyeball", "right_eyeball", "left_iris",
+    "right_iris", "teeth", "upper_teeth", "lower_teeth", "tongue", "mouth_interior", "boundary",
+)  # fmt: skip
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class HeadModel:
+    """Arrays of a head model. V vertices, F faces, S shape and X expression directions, J joints.
+
+    All float tensors share one dtype and device; `to` moves them. Shapes are checked on
+    construction (HeadModelError), values by `check_head`, which the loaders call.
+
+    Attributes:
+        name: Where the model came from ("procedural", "flame2023", ...).
+        template: (V, 3) metres.
+        shape_dirs: (V, 3, S) metres a unit coefficient.
+        expression_dirs: (V, 3, X) metres a unit coefficient.
+        pose_dirs: (9 * (J - 1), V * 3) metres a unit of R - I, row-major.
+        joint_regressor: (J, V) rows sum to 1.
+        parents: parent of each joint, -1 for the root.
+        skinning: (V, J) rows sum to 1.
+        faces: (F, 3) int64.
+        uv: (T, 2) in [0, 1], v up.
+        uv_faces: (F, 3) int64 into uv.
+        landmark_faces: (68,) int64, iBUG-68 order (subject's right to left).
+        landmark_bary: (68, 3).
+        contour: for landmarks 0..16 the vertices that may form the visible jaw line, or None.
+        shape_names: S names.
+        expression_names: X names.
+        regions: region name -> (V,) bool.
+        unit_expressions: True where coefficients are activations in 0..1 (procedural, ICT),
+            False where they are standard deviations (FLAME).
+    """
+
+    name: str
+    template: torch.Tensor
+    shape_dirs: torch.Tensor
+    expression_dirs: torch.Tensor
+    pose_dirs: torch.Tensor
+    joint_regressor: torch.Tensor
+    skinning: torch.Tensor
+    faces: torch.Tensor
+    uv: torch.Tensor
+    uv_faces: torch.Tensor
+    landmark_faces: torch.Tensor
+    landmark_bary: torch.Tensor
+    shape_names: tuple[str, ...]
+    expression_names: tuple[str, ...]
+    parents: tuple[int, ...] = PARENTS
+    contour: tuple[torch.Tensor, ...] | None = None
+    regions: dict[str, torch.Tensor] = field(default_factory=dict)
+    unit_expressions: bool = True
+
+    def __post_init__(self) -> None:
+        vertices, joints = self.template.shape[0], len(self.parents)
+        shapes, expressions = len(self.shape_names), len(self.expression_names)
+        expected = {
+            "template": (vertices, 3),
+            "shape_dirs": (vertices, 3, shapes),
+            "expression_dirs": (vertices, 3, expressions),
+            "pose_dirs": (9 * (joints - 1), vertices * 3),
+            "joint_regressor": (joints, vertices),
+            "skinning": (vertices, joints),
+            "faces": (self.faces.shape[0], 3),
+            "uv": (self.uv.shape[0], 2),
+            "uv_faces": (self.faces.shape[0], 3),
+            "landmark_faces": (68,),
+            "landmark_bary": (68, 3),
+        }
+        for key, shape in expected.items():
+            got = tuple(getattr(self, key).shape)
+            if got != shape:
+                raise HeadModelError(
+                    f"head model {self.name!r}: {key} has shape {got}, expected {shape}"
+                )
+        for region, mask in self.regions.items():
+            if tuple(mask.shape) != (vertices,):
+                raise HeadModelError(
+                    f"head model {self.name!r}: region {region!r} has shape {tuple(mask.shape)}, "
+                    f"expected ({vertices},)"
+                )
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """Dtype of the float tensors."""
+        return self.template.dtype
+
+    @property
+    def device(self) -> torch.device:
+        """Device of all tensors."""
+        return self.template.device
+
+    def to(
+        self, device: torch.device | str | None = None, dtype: torch.dtype | None = None
+    ) -> HeadModel:
+        """Return the model on a device and with a float dtype (integers and masks keep theirs)."""
+        changes: dict[str, object] = {}
+        for item in fields(self):
+            value = getattr(self, item.name)
+            if isinstance(value, torch.Tensor):
+                changes[item.name] = value.to(device, dtype if value.is_floating_point() else None)
+        if self.contour is not None:
+            changes["contour"] = tuple(line.to(device) for line in self.contour)
+        changes["regions"] = {name: mask.to(device) for name, mask in self.regions.items()}
+        return replace(self, **changes)  # type: ignore[arg-type]
+
+
+def check_head(model: HeadModel) -> HeadModel:
+    """Return the model if its values are usable, else raise HeadModelError.
+
+    Checks finite arrays, index ranges, skinning and regressor rows summing to one and parents that
+    come before their children.
+    """
+    where = f"head model {model.name!r}"
+    for item in fields(model):
+        value = getattr(model, item.name)
+        if isinstance(value, torch.Tensor) and value.is_floating_point():
+            if not bool(torch.isfinite(value).all()):
+                raise HeadModelError(f"{where}: {item.name} holds NaN or infinite values")
+    vertices = model.template.shape[0]
+    ranges = {
+        "faces": (model.faces, vertices),
+        "uv_faces": (model.uv_faces, model.uv.shape[0]),
+        "landmark_faces": (model.landmark_faces, model.faces.shape[0]),
+    }
+    for key, (index, count) in ranges.items():
+        if index.numel() and (int(index.min()) < 0 or int(index.max()) >= count):
+            raise HeadModelError(
+                f"{where}: {key} holds indices {int(index.min())}..{int(index.max())}, "
+                f"expected 0..{count - 1}"
+            )
+    for key, rows in {"skinning": model.skinning, "joint_regressor": model.joint_regressor}.items():
+        error = float((rows.sum(1) - 1).abs().max())
+        if error > 1e-2:
+            raise HeadModelError(f"{where}: rows of {key} sum to 1 only within {error:.3g}")
+    if any(parent >= joint for joint, parent in enumerate(model.parents)) or model.parents[0] != -1:
+        raise HeadModelError(
+            f"{where}: parents {model.parents}, expected -1 first and then earlier joints only"
+        )
+    return model
+
+
+def pose(
+    model: HeadModel,
+    shape: torch.Tensor,
+    expression: torch.Tensor,
+    neck: torch.Tensor | None = None,
+    jaw: torch.Tensor | None = None,
+    eyes: torch.Tensor | None = None,
+    root: torch.Tensor | None = None,
+    translation: torch.Tensor | None = None,
+    offsets: torch.Tensor | None = None,
+) -> torch.Tensor:
+    """Pose the head. Missing arguments count as zero; fewer coefficients than directions are padded.
+
+    Args:
+        model: The head model.
+        shape: (B, <= S).
+        expression: (B, <= X).
+        neck: (B, 3) axis-angle, radians.
+        jaw: (B, 3) axis-angle; opening is +x.
+        eyes: (B, 6) axis-angle of the left, then the right eye.
+        root: (B, 3) axis-angle about the root joint (not about the origin, as in FLAME).
+        translation: (B, 3) metres, added last.
+        offsets: (B, V, 3) or (1, V, 3) metres, added to the rest shape; they move the joints too.
+
+    Returns:
+        (B, V, 3) vertices, metres.
+
+    Raises:
+        ValueError: where a shape does not fit.
+    """
+    rest = rest_vertices(model, shape, expression, offsets)
+    joints = torch.einsum("jv,bvc->bjc", model.joint_regressor, rest)
+    angles = joint_angles(rest, root, neck, jaw, eyes)
+    rotations = axis_angle_to_matrix(angles)
+    posed = skin(rest, joints, rotations, model.skinning, model.pose_dirs, model.parents)
+    return posed if translation is None else posed + translation[:, None]
+
+
+def rest_vertices(
+    model: HeadModel,
+    shape: torch.Tensor,
+    expression: torch.Tensor,
+    offsets: torch.Tensor | None = None,
+) -> torch.Tensor:
+    """Shaped, unposed vertices (B, V, 3): template + shape + expression directions + offsets."""
+    for name, value, count in (
+        ("shape", shape, model.shape_dirs.shape[2]),
+        ("expression", expression, model.expression_dirs.shape[2]),
+    ):
+        if value.ndim != 2 or value.shape[1] > count:
+            raise ValueError(f"{name} has shape {tuple(value.shape)}, expected (B, at most {count})")
+    rest = (
+        model.template
+        + torch.einsum("vcs,bs->bvc", model.shape_dirs[..., : shape.shape[1]], shape)
+        + torch.einsum("vcx,bx->bvc", model.expression_dirs[..., : expression.shape[1]], expression)
+    )
+    return rest if offsets is None else rest + offsets
+
+
+def joint_angles(
+    like: torch.Tensor,
+    root: torch.Tensor | None,
+    neck: torch.Tensor | None,
+    jaw: torch.Tensor | None,
+    eyes: torch.Tensor | None,
+) -> torch.Tensor:
+    """Axis-angles (B, 5, 3) in joint order from the optional parts; B, dtype from `like`."""
+    batch = like.shape[0]
+    blocks = []
+    for name, part, width in (("root", root, 3), ("neck", neck, 3), ("jaw", jaw, 3), ("eyes", eyes, 6)):
+        if part is None:
+            part = like.new_zeros(batch, width)
+        if part.ndim != 2 or part.shape[1] != width or part.shape[0] not in (1, batch):
+            raise ValueError(f"{name} has shape {tuple(part.shape)}, expected ({batch}, {width})")
+        blocks.append(part.expand(batch, width).reshape(batch, -1, 3))
+    return torch.cat(blocks, dim=1)
+
+
+def skin(
+    rest: torch.Tensor,
+    joints: torch.Tensor,
+    rotations: torch.Tensor,
+    skinning: torch.Tensor,
+    pose_dirs: torch.Tensor,
+    parents: tuple[int, ...],
+) -> torch.Tensor:
+    """Linear blend skinning with pose correctives (SMPL, Loper et al. 2015, equations 2 to 4).
+
+    Works on any subset of vertices, so that a landmark fit poses only what it needs.
+
+    Args:
+        rest: (B, N, 3) shaped vertices.
+        joints: (B, J, 3) rest joints.
+        rotations: (B, J, 3, 3), each relative to its parent.
+        skinning: (N, J).
+        pose_dirs: (9 * (J - 1), N * 3).
+        parents: parent of each joint, -1 first.
+
+    Returns:
+        (B, N, 3).
+    """
+    identity = torch.eye(3, dtype=rest.dtype, device=rest.device)
+    feature = (rotations[:, 1:] - identity).reshape(rest.shape[0], -1)
+    corrected = rest + (feature @ pose_dirs).reshape(rest.shape)
+    world_rotations, world_joints = [rotations[:, 0]], [joints[:, 0]]
+    for joint, parent in enumerate(parents[1:], start=1):
+        bone = (joints[:, joint] - joints[:, parent])[..., None]
+        world_joints.append(world_joints[parent] + (world_rotations[parent] @ bone)[..., 0])
+        world_rotations.append(world_rotations[parent] @ rotations[:, joint])
+    turn = torch.stack(world_rotations, dim=1)
+    # x -> turn (x - joint) + world joint, written as turn x + shift so that blending is one matmul.
+    shift = torch.stack(world_joints, dim=1) - (turn @ joints[..., None])[..., 0]
+    blended_turn = torch.einsum("nj,bjrc->bnrc", skinning, turn)
+    blended_shift = torch.einsum("nj,bjc->bnc", skinning, shift)
+    return (blended_turn @ corrected[..., None])[..., 0] + blended_shift
+
+
+def landmarks(model: HeadModel, vertices: torch.Tensor) -> torch.Tensor:
+    """The 68 landmarks (B, 68, 3) on posed vertices (B, V, 3), iBUG-68 order."""
+    corners = vertices[:, model.faces[model.landmark_faces]]
+    return (corners * model.landmark_bary[None, :, :, None]).sum(2)
+
+
+def vertex_normals(vertices: torch.Tensor, faces: torch.Tensor) -> torch.Tensor:
+    """Unit normals (B, V, 3) of vertices (B, V, 3), area weighted; zero where no face has area."""
+    a, b, c = (vertices[:, faces[:, corner]] for corner in range(3))
+    face_normals = torch.linalg.cross(b - a, c - a)
+    normals = torch.zeros_like(vertices)
+    for corner in range(3):
+        normals = normals.index_add(1, faces[:, corner], face_normals)
+    # The largest entry first: squares of tiny normals (float32 faces of a few microns) underflow.
+    scale = normals.abs().amax(-1, keepdim=True)
+    safe = torch.where(scale > 0, normals / scale.clamp_min(torch.finfo(scale.dtype).tiny), 0.0)
+    length = torch.where(scale > 0, safe.square().sum(-1, keepdim=True), 1.0).sqrt()
+    return safe / length
