@@ -1,0 +1,41 @@
+"""Checks of array arguments, with expected and got in one line."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+
+def check_shape(
+    name: str, array: np.ndarray, expected: Sequence[int | None], where: str = ""
+) -> None:
+    """Raise unless ``array`` has the expected shape (``None`` stands for any length).
+
+    Raises:
+        ValueError: the shape differs; the message names the argument, got and expected.
+    """
+    shape = tuple(array.shape)
+    fits = len(shape) == len(expected) and all(
+        want is None or want == got for got, want in zip(shape, expected, strict=True)
+    )
+    if not fits:
+        wanted = "(" + ", ".join("any" if n is None else str(n) for n in expected) + ")"
+        prefix = f"{where}: " if where else ""
+        raise ValueError(f"{prefix}{name} has shape {shape}, expected {wanted}")
+
+
+def check_finite(name: str, array: np.ndarray, where: str = "") -> None:
+    """Raise if ``array`` holds NaN or Inf.
+
+    Raises:
+        ValueError: how many values are not finite, and the index of the first.
+    """
+    bad = ~np.isfinite(array)
+    if bad.any():
+        first = tuple(int(i) for i in np.argwhere(bad)[0])
+        prefix = f"{where}: " if where else ""
+        raise ValueError(
+            f"{prefix}{name} has {int(bad.sum())} values that are not finite, the first at {first};"
+            " expected finite numbers"
+        )

@@ -1,0 +1,211 @@
+"""Image files through OpenImageIO, depth maps, colour curves, resizing and contact sheets.
+
+OpenImageIO reads and writes 8 and 16 bits, half and single float, with one interface; JPEG bytes
+in memory go through OpenCV. Images are RGB, (H, W, 3); files hold sRGB unless a name says linear.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+import OpenImageIO as oiio
+
+from express50.errors import FormatError
+
+PIXEL_LIMIT = 200_000_000  # refuses decompression bombs; six times a 4K frame of 33 megapixels
+DEPTH_UNIT_M = 5e-5  # one step of a 16-bit depth map; 3.28 m at most, 0.025 mm rounding
+
+
+def read_image(path: Path) -> np.ndarray:
+    """Read an image as (H, W) or (H, W, C) RGB in the file's own type.
+
+    Returns:
+        uint8, uint16 or float32 (half is widened) array.
+
+    Raises:
+        FormatError: the file is missing, not an image, truncated or over the pixel limit.
+    """
+    source = oiio.ImageInput.open(str(path))
+    if source is None:
+        raise FormatError(f"{path}: cannot be read as an image ({oiio.geterror().strip()})")
+    try:
+        spec = source.spec()
+        if spec.width * spec.height > PIXEL_LIMIT:
+            raise FormatError(f"{path}: {spec.width}x{spec.height} pixels, over {PIXEL_LIMIT}")
+        kind = {"uint8": "uint8", "uint16": "uint16"}.get(str(spec.format), "float")
+        pixels = source.read_image(format=kind)
+        if pixels is None:
+            raise FormatError(f"{path}: truncated or damaged ({source.geterror().strip()})")
+    finally:
+        source.close()
+    array = np.asarray(pixels).reshape(spec.height, spec.width, spec.nchannels)
+    return array[..., 0] if spec.nchannels == 1 else array[..., :4]
+
+
+def write_image(path: Path, image: np.ndarray, quality: int = 95, half: bool = False) -> None:
+    """Write (H, W) or (H, W, C) uint8, uint16 or float32; the ending chooses the format.
+
+    Args:
+        path: target; .png .jpg .tif .exr.
+        image: the pixels, RGB.
+        quality: JPEG quality, 1 to 100 (4:4:4 from 95 upwards).
+        half: store floats as half (EXR, TIFF).
+
+    Raises:
+        FormatError: the file cannot be written.
+    """
+    image = np.ascontiguousarray(image)
+    if image.dtype == np.float64:
+        image = image.astype(np.float32)
+    channels = 1 if image.ndim == 2 else image.shape[2]
+    kind = "half" if half else {"uint8": "uint8", "uint16": "uint16"}.get(str(image.dtype), "float")
+    spec = oiio.ImageSpec(image.shape[1], image.shape[0], channels, kind)
+    spec.attribute("Compression", _compression(Path(path).suffix.lower(), quality))
+    if quality >= 95:
+        spec.attribute("jpeg:subsampling", "4:4:4")
+    spec.attribute("png:compressionLevel", 3)
+    target = oiio.ImageOutput.create(str(path))
+    if target is None or not target.open(str(path), spec):
+        raise FormatError(f"{path}: cannot be written ({oiio.geterror().strip()})")
+    written = target.write_image(image.reshape(image.shape[0], image.shape[1], channels))
+    if not target.close() or not written:
+        raise FormatError(f"{path}: writing failed ({target.geterror().strip()})")
+
+
+def _compression(suffix: str, quality: int) -> str:
+    return {".jpg": f"jpeg:{quality}", ".jpeg": f"jpeg:{quality}", ".exr": "zip"}.get(suffix, "zip")
+
+
+def encode_jpeg(image: np.ndarray, quality: int = 95) -> bytes:
+    """JPEG bytes of an RGB (H, W, 3) or grey (H, W) uint8 image; 4:4:4 from quality 95 upwards."""
+    flags = [cv2.IMWRITE_JPEG_QUALITY, quality]
+    if quality >= 95:
+        flags += [cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]
+    return cv2.imencode(".jpg", _swap(image), flags)[1].tobytes()
+
+
+def encode_png(image: np.ndarray) -> bytes:
+    """PNG bytes of a grey or RGB uint8 or uint16 image."""
+    return cv2.imencode(".png", _swap(image), [cv2.IMWRITE_PNG_COMPRESSION, 3])[1].tobytes()
+
+
+def decode_image(data: bytes, name: str = "image") -> np.ndarray:
+    """Decode JPEG or PNG bytes to RGB (H, W, 3) or grey (H, W), keeping 8 or 16 bits.
+
+    Raises:
+        FormatError: the bytes are no image.
+    """
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data else None
+    if image is None:
+        raise FormatError(f"{name}: {len(data)} bytes are not a JPEG or PNG image")
+    return _swap(image)
+
+
+def _swap(image: np.ndarray) -> np.ndarray:
+    """RGB to BGR or back; a copy that OpenCV accepts."""
+    return np.ascontiguousarray(image[..., ::-1]) if image.ndim == 3 else image
+
+
+def depth_to_uint16(depth: np.ndarray, valid: np.ndarray) -> np.ndarray:
+    """16-bit steps (H, W) of a depth map (H, W), metres; 0 where not valid.
+
+    Raises:
+        ValueError: a valid depth is not finite, not positive or over 3.27 m.
+    """
+    inside = depth[valid]
+    limit = DEPTH_UNIT_M * 65535
+    if inside.size and not (
+        np.isfinite(inside).all() and inside.min() > 0 and inside.max() < limit
+    ):
+        raise ValueError(f"valid depth must lie in (0, {limit:.3f}) m; is the rig in metres?")
+    steps = np.where(valid, np.maximum(np.rint(depth / DEPTH_UNIT_M), 1), 0)
+    return np.nan_to_num(steps).astype(np.uint16)
+
+
+def depth_from_uint16(steps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Depth (H, W) float32 metres (0 where unknown) and its validity (H, W) of 16-bit steps."""
+    return (steps * np.float32(DEPTH_UNIT_M)).astype(np.float32), steps > 0
+
+
+def write_depth_png(path: Path, depth: np.ndarray, valid: np.ndarray) -> None:
+    """Write a depth map (H, W), metres, as 16-bit PNG in steps of 0.05 mm; 0 means unknown."""
+    write_image(path, depth_to_uint16(depth, valid))
+
+
+def read_depth_png(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Read depth (H, W) float32 metres and validity (H, W) bool.
+
+    Raises:
+        FormatError: the file is not a 16-bit grey image.
+    """
+    steps = read_image(path)
+    if steps.dtype != np.uint16 or steps.ndim != 2:
+        raise FormatError(f"{path}: {steps.dtype} {steps.shape}, expected a 16-bit grey depth map")
+    return depth_from_uint16(steps)
+
+
+def srgb_to_linear(image_srgb: np.ndarray) -> np.ndarray:
+    """Linear light of sRGB values in [0, 1]; IEC 61966-2-1."""
+    x = np.asarray(image_srgb)
+    return np.where(x <= 0.04045, x / 12.92, ((np.maximum(x, 0.04045) + 0.055) / 1.055) ** 2.4)
+
+
+def linear_to_srgb(image_linear: np.ndarray) -> np.ndarray:
+    """sRGB values of linear light in [0, 1]; IEC 61966-2-1."""
+    x = np.asarray(image_linear)
+    return np.where(
+        x <= 0.0031308, x * 12.92, 1.055 * np.maximum(x, 0.0031308) ** (1 / 2.4) - 0.055
+    )
+
+
+def resize_area(image: np.ndarray, width: int, height: int) -> np.ndarray:
+    """Resize (H, W[, C]); averages areas when shrinking, interpolates when growing."""
+    shrinking = width <= image.shape[1] and height <= image.shape[0]
+    mode = cv2.INTER_AREA if shrinking else cv2.INTER_LINEAR
+    return cv2.resize(image, (width, height), interpolation=mode)
+
+
+def fit_into(image: np.ndarray, height: int, width: int) -> np.ndarray:
+    """The image (h, w[, 3]) uint8 scaled to fit and centred on a dark (height, width, 3) tile."""
+    if image.ndim == 2:
+        image = np.repeat(image[..., None], 3, axis=2)
+    scale = min(width / image.shape[1], height / image.shape[0])
+    w, h = max(1, round(image.shape[1] * scale)), max(1, round(image.shape[0] * scale))
+    tile = np.full((height, width, 3), 24, np.uint8)
+    y, x = (height - h) // 2, (width - w) // 2
+    tile[y : y + h, x : x + w] = resize_area(image[..., :3], w, h)
+    return tile
+
+
+def contact_sheet(
+    rows: Sequence[Sequence[np.ndarray]],
+    labels: Sequence[str] | None = None,
+    tile: tuple[int, int] = (160, 160),
+) -> np.ndarray:
+    """One picture (H, W, 3) uint8 of rows of images, each row with an optional label."""
+    columns = max((len(row) for row in rows), default=1)
+    blank = np.full((*tile, 3), 24, np.uint8)
+    lines = []
+    for number, row in enumerate(rows):
+        tiles = [fit_into(image, *tile) for image in row]
+        line = np.concatenate(tiles + [blank] * (columns - len(tiles)), axis=1)
+        if labels is not None:
+            cv2.putText(
+                line,
+                labels[number],
+                (5, 15),
+                cv2.FONT_HERSHEY_SIMPLEX,
+                0.42,
+                (0, 0, 0),
+                3,
+                cv2.LINE_AA,
+            )
+            cv2.putText(
+                line, labels[number], (5, 15), cv2.FONT_HERSHEY_SIMPLEX, 0.42, (255, 255, 255), 1,
+                cv2.LINE_AA,
+            )  # fmt: skip
+        lines.append(line)
+    return np.concatenate(lines, axis=0) if lines else blank
