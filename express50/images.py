@@ -154,7 +154,7 @@ def srgb_to_linear(image_srgb: np.ndarray) -> np.ndarray:
 
 
 def linear_to_srgb(image_linear: np.ndarray) -> np.ndarray:
-    """sRGB values of linear light in [0, 1]; IEC 61966-2-1."""
+    """Encode linear light as sRGB values in [0, 1]; IEC 61966-2-1."""
     x = np.asarray(image_linear)
     return np.where(
         x <= 0.0031308, x * 12.92, 1.055 * np.maximum(x, 0.0031308) ** (1 / 2.4) - 0.055

@@ -152,7 +152,7 @@ def look_at(eye: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:
 def rigid_fit(
     source: np.ndarray, target: np.ndarray, weights: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Rotation (3, 3) and translation (3,) that best take ``source`` (N, 3) to ``target`` (N, 3)."""
+    """R (3, 3) and t (3,) that best take ``source`` (N, 3) to ``target`` (N, 3), least squares."""
     _, R, t = _procrustes(source, target, weights, with_scale=False)
     return R, t
 

@@ -1,0 +1,57 @@
+# One target per stage; `make demo` runs them all on a small synthetic capture.
+PYTHON ?= python3
+BIN := .venv/bin
+READY := .venv/.ready
+DATASET ?= build/dataset
+CAPTURES ?=
+PRESET ?= standard
+WORKERS ?= 2
+SET ?=
+STAGE_FLAGS = --preset $(PRESET) --workers $(WORKERS) $(foreach kv,$(SET),--set $(kv))
+
+.PHONY: help setup demo test check bench tradeoff report clean \
+        ingest calibrate align matte track depth pack train
+
+help: ## list the targets
+	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 14
+
+setup: $(READY) ## make .venv with everything that is needed
+$(READY): pyproject.toml constraints.txt setup.py scripts/system_libs.sh express50/native/gaussians.cpp
+	sh scripts/system_libs.sh $(PYTHON)
+	$(PYTHON) -m venv .venv
+	$(BIN)/python -m pip install --quiet --upgrade pip -c constraints.txt
+	$(BIN)/python -m pip install --quiet torch -c constraints.txt
+	$(BIN)/python -m pip install --quiet -e '.[dev]' -c constraints.txt
+	touch $@
+
+demo: $(READY) ## the whole chain on a synthetic capture (or CAPTURES="dir ..."): build/demo/report/index.html
+	$(BIN)/python -m benchmarks.demo build/demo $(if $(CAPTURES),--captures $(CAPTURES)) --workers $(WORKERS)
+
+test: check ## lint, types and every test
+	$(BIN)/python -m pytest
+
+check: $(READY) ## lint and types
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+bench: $(READY) ## every benchmark, each ends in one JSON object
+	$(BIN)/python -m benchmarks.all
+
+tradeoff: $(READY) ## sweep the speed-accuracy knobs into docs/TRADEOFFS.md
+	$(BIN)/python -m benchmarks.tradeoff
+
+ingest: $(READY) ## index CAPTURES="dir ..." into DATASET
+	$(BIN)/express50 ingest $(DATASET) $(CAPTURES) $(STAGE_FLAGS)
+
+calibrate align matte track depth pack: $(READY) ## one stage over DATASET
+	$(BIN)/express50 $@ $(DATASET) $(STAGE_FLAGS)
+
+train: $(READY) ## train GRMM on DATASET's shards
+	$(BIN)/grmm train $(DATASET)/pack/shards $(DATASET)/grmm
+
+report: $(READY) ## gather DATASET's QC into one HTML page
+	$(BIN)/express50 report $(DATASET)
+
+clean: ## remove what was built, keep .venv
+	rm -rf build .mypy_cache .ruff_cache .pytest_cache

@@ -1,0 +1,152 @@
+"""Cameras against OpenCV and against themselves."""
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from express50 import adapters, cameras, transforms
+from express50.cameras import Camera
+from express50.errors import CalibrationError
+
+POSE = transforms.look_at(np.array([0.1, 0.2, 1.0]), np.zeros(3), np.array([0.0, 1.0, 0.0]))
+OPENCV = Camera("a", 64, 48, "OPENCV", (80, 82, 31, 25, 0.1, -0.05, 0.001, 0.002), POSE)
+POINTS = np.random.default_rng(0).normal(size=(20, 3)) * 0.1
+
+
+def test_project_agrees_with_opencv():
+    R, t = POSE[:3, :3], POSE[:3, 3]
+    theirs = cv2.projectPoints(
+        POINTS, cv2.Rodrigues(R)[0], t, adapters.K_to_opencv(OPENCV.K), OPENCV.dist
+    )[0][:, 0]
+    ours, depth = cameras.project(OPENCV, POINTS)
+    np.testing.assert_allclose(ours, adapters.opencv_pixels_to_corner(theirs), atol=1e-9)
+    assert (depth > 0).all()
+
+
+@pytest.mark.parametrize(
+    ("model", "params"),
+    [
+        ("SIMPLE_PINHOLE", (80, 31, 25)),
+        ("PINHOLE", (80, 82, 31, 25)),
+        ("SIMPLE_RADIAL", (80, 31, 25, 0.1)),
+        ("RADIAL", (80, 31, 25, 0.1, -0.02)),
+        ("OPENCV", OPENCV.params),
+        ("FULL_OPENCV", (80, 82, 31, 25, 0.1, -0.05, 0.001, 0.002, 0.01, 0.0, 0.0, 0.0)),
+    ],
+)
+def test_unproject_inverts_project_for_every_model(model, params):
+    camera = Camera("a", 64, 48, model, params, POSE)
+    pixels, depth = cameras.project(camera, POINTS)
+    np.testing.assert_allclose(cameras.unproject(camera, pixels, depth), POINTS, atol=1e-9)
+
+
+def test_a_point_behind_the_camera_has_no_pixel():
+    behind = OPENCV.center + OPENCV.world_from_cam[:3, :3] @ np.array([[0.0, 0.0, -1.0]]).T.ravel()
+    pixels, depth = cameras.project(OPENCV, behind[None])
+    assert np.isnan(pixels).all()
+    assert depth[0] == pytest.approx(-1.0)
+
+
+def test_convention_first_pixel_centre_is_half():
+    camera = cameras.pinhole_camera(
+        "p", np.array([[10.0, 0, 2], [0, 10, 2], [0, 0, 1]]), 4, 4, np.eye(4)
+    )
+    origin, directions = cameras.rays(camera)
+    np.testing.assert_allclose(directions[0, 0], [(0.5 - 2) / 10, (0.5 - 2) / 10, 1.0])
+    np.testing.assert_allclose(origin, 0.0)
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    x0=st.floats(-20, 20), y0=st.floats(-20, 20), scale=st.floats(0.2, 4.0), seed=st.integers(0, 99)
+)
+def test_crop_and_scale_commute_with_projection(x0, y0, scale, seed):
+    points = np.random.default_rng(seed).normal(size=(5, 3)) * 0.1
+    pixels, _ = cameras.project(OPENCV, points)
+    moved = cameras.scale_camera(cameras.crop_camera(OPENCV, x0, y0, 40, 40), scale, scale)
+    np.testing.assert_allclose(
+        cameras.project(moved, points)[0], (pixels - (x0, y0)) * scale, atol=1e-8
+    )
+
+
+def test_scaling_a_one_focal_model_keeps_it_right():
+    camera = Camera("a", 64, 48, "SIMPLE_RADIAL", (80, 31, 25, 0.1), POSE)
+    moved = cameras.resized(camera, 32, 24)
+    assert (moved.width, moved.height) == (32, 24)
+    np.testing.assert_allclose(
+        cameras.project(moved, POINTS)[0], cameras.project(camera, POINTS)[0] / 2, atol=1e-9
+    )
+
+
+def test_triangulate_recovers_points_and_says_nan_for_one_view():
+    other_pose = transforms.look_at(
+        np.array([0.8, 0.2, 0.6]), np.zeros(3), np.array([0.0, 1.0, 0.0])
+    )
+    other = Camera("b", 64, 48, "PINHOLE", (80, 80, 31, 25), other_pose)
+    pixels = np.stack([cameras.project(c, POINTS)[0] for c in (OPENCV, other)])
+    np.testing.assert_allclose(cameras.triangulate([OPENCV, other], pixels), POINTS, atol=1e-8)
+    pixels[1, 3] = np.nan
+    got = cameras.triangulate([OPENCV, other], pixels)
+    assert np.isnan(got[3]).all()
+    assert np.isfinite(np.delete(got, 3, axis=0)).all()
+
+
+def test_moving_the_world_moves_nothing_in_the_image():
+    T = transforms.make_transform(
+        transforms.axis_angle_to_matrix(np.array([0.3, -1, 0.2])), [1, 2, 3]
+    )
+    moved = cameras.transform_camera(OPENCV, T)
+    points = POINTS @ T[:3, :3].T + T[:3, 3]
+    np.testing.assert_allclose(
+        cameras.project(moved, points)[0], cameras.project(OPENCV, POINTS)[0]
+    )
+
+
+def test_undistort_image_moves_features_to_the_pinhole_projection():
+    camera = Camera("a", 200, 160, "OPENCV", (180, 182, 101, 79, -0.3, 0.1, 0.0, 0.0), POSE)
+    point = np.array([[0.2, -0.15, 0.0]])
+    image = np.zeros((160, 200), np.float32)
+    y, x = np.mgrid[:160, :200] + 0.5
+    spot = cameras.project(camera, point)[0][0]
+    image[:] = np.exp(-((x - spot[0]) ** 2 + (y - spot[1]) ** 2) / 8)
+    flat = adapters.undistort_image(image, camera)
+    centroid = np.array([(flat * x).sum(), (flat * y).sum()]) / flat.sum()
+    np.testing.assert_allclose(
+        centroid, cameras.project(cameras.pinhole(camera), point)[0][0], atol=0.15
+    )
+
+
+def test_calibration_file_round_trip(tmp_path):
+    path = tmp_path / "calibration.json"
+    cameras.write_cameras(path, {"a": OPENCV})
+    back = cameras.read_cameras(path)["a"]
+    assert back.params == OPENCV.params
+    np.testing.assert_array_equal(back.cam_from_world, OPENCV.cam_from_world)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"params": [1, 2, 3]}, "params has shape"),
+        ({"world_to_camera": [[1, 0], [0, 1]]}, r"shape \(2, 2\), expected \(4, 4\)"),
+        ({"world_to_camera": (2 * np.eye(4)).tolist()}, "has no rotation"),
+        ({"world_to_camera": np.full((4, 4), np.nan).tolist()}, "NaN or Inf"),
+        ({"model": "FISHY"}, "is unknown"),
+        ({"params": [-1, 82, 31, 25, 0, 0, 0, 0]}, "focal length -1"),
+        ({"width": 0}, "positive whole numbers"),
+    ],
+)
+def test_a_bad_camera_is_named(tmp_path, change, message):
+    import json
+
+    path = tmp_path / "calibration.json"
+    cameras.write_cameras(path, {"cam07": OPENCV})
+    table = json.loads(path.read_text())
+    table["cam07"] |= change
+    path.write_text(json.dumps(table))
+    with pytest.raises(CalibrationError, match=message) as caught:
+        cameras.read_cameras(path)
+    assert "cam07" in str(caught.value)
+    assert "\n" not in str(caught.value)

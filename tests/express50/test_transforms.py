@@ -1,0 +1,98 @@
+"""Rotations and fits, NumPy against torch and against scipy."""
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from express50 import torch_transforms, transforms
+
+ANGLES = [0.0, 1e-12, 1e-5, 9.9e-4, 1.1e-3, 0.5, np.pi - 1e-9, np.pi, np.pi + 0.1, 2 * np.pi, 11.0]
+AXES = [np.array(a) / np.linalg.norm(a) for a in ([1.0, 0, 0], [0, -1.0, 0], [1.0, 2, -3])]
+
+
+@pytest.mark.parametrize("angle", ANGLES)
+def test_axis_angle_agrees_with_scipy_at_every_angle(angle):
+    for axis in AXES:
+        R = transforms.axis_angle_to_matrix(axis * angle)
+        np.testing.assert_allclose(R, Rotation.from_rotvec(axis * angle).as_matrix(), atol=1e-12)
+        np.testing.assert_allclose(
+            transforms.axis_angle_to_matrix(transforms.matrix_to_axis_angle(R)), R, atol=1e-12
+        )
+        twin = torch_transforms.axis_angle_to_matrix(torch.tensor(axis * angle))
+        np.testing.assert_allclose(twin.numpy(), R, atol=1e-12)
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.lists(st.floats(-10, 10), min_size=3, max_size=3))
+def test_rotations_are_orthonormal_and_round_trip(vector):
+    R = transforms.axis_angle_to_matrix(np.array(vector))
+    np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(R) == pytest.approx(1.0)
+    q = transforms.matrix_to_quat(R)
+    np.testing.assert_allclose(transforms.quat_to_matrix(q), R, atol=1e-12)
+    np.testing.assert_allclose(
+        torch_transforms.matrix_to_quat(torch.tensor(R)).numpy(), q, atol=1e-12
+    )
+
+
+def test_torch_gradients_are_finite_at_zero_and_pi():
+    for value in ([0.0, 0, 0], [np.pi, 0, 0], [1e-5, 0, 0], [0.3, -0.2, 0.1]):
+        a = torch.tensor([value], dtype=torch.float64, requires_grad=True)
+        assert torch.autograd.gradcheck(torch_transforms.axis_angle_to_matrix, a)
+        assert torch.autograd.gradcheck(torch_transforms.axis_angle_to_quat, a)
+
+
+@pytest.mark.parametrize("t", [0.0, 0.3, 1.0])
+def test_slerp_of_equal_and_nearly_opposite_rotations(t):
+    q = transforms.matrix_to_quat(transforms.axis_angle_to_matrix(np.array([0.2, 0.1, -0.4])))
+    np.testing.assert_allclose(transforms.slerp(q, q, t), q, atol=1e-12)
+    half_turn = transforms.matrix_to_quat(
+        transforms.axis_angle_to_matrix(np.array([np.pi - 1e-7, 0, 0]))
+    )
+    for end in (-q, half_turn):
+        got = transforms.slerp(q, end, t)
+        assert np.isfinite(got).all()
+        assert np.linalg.norm(got) == pytest.approx(1.0)
+        twin = torch_transforms.slerp(torch.tensor(q), torch.tensor(end), t).numpy()
+        np.testing.assert_allclose(np.abs(twin @ got), 1.0, atol=1e-9)
+
+
+def test_slerp_halves_the_angle():
+    ends = transforms.matrix_to_quat(
+        transforms.axis_angle_to_matrix(np.array([[0.0, 0, 0], [0.0, 1.2, 0]]))
+    )
+    middle = transforms.quat_to_matrix(transforms.slerp(ends[0], ends[1], 0.5))
+    np.testing.assert_allclose(
+        middle, transforms.axis_angle_to_matrix(np.array([0.0, 0.6, 0])), atol=1e-12
+    )
+
+
+def test_fits_recover_a_similarity_and_never_reflect():
+    rng = np.random.default_rng(1)
+    points = rng.normal(size=(10, 3))
+    R = transforms.axis_angle_to_matrix(np.array([1.0, 2.0, 0.5]))
+    scale, got, t = transforms.similarity_fit(points, 2.5 * points @ R.T + [1, 2, 3])
+    assert scale == pytest.approx(2.5)
+    np.testing.assert_allclose(got, R, atol=1e-12)
+    np.testing.assert_allclose(t, [1, 2, 3], atol=1e-12)
+    mirrored, _ = transforms.rigid_fit(points, points * [-1, 1, 1])
+    assert np.linalg.det(mirrored) == pytest.approx(1.0)
+
+
+def test_fits_refuse_what_has_no_answer():
+    with pytest.raises(ValueError, match="3 weighted points"):
+        transforms.rigid_fit(np.zeros((2, 3)), np.zeros((2, 3)))
+    with pytest.raises(ValueError, match="not all the same"):
+        transforms.rigid_fit(np.ones((5, 3)), np.zeros((5, 3)))
+    with pytest.raises(ValueError, match="zero length"):
+        transforms.quat_to_matrix(np.zeros(4))
+
+
+def test_look_at_puts_the_target_ahead_with_up_upwards():
+    T = transforms.look_at(np.array([0.0, 1, 2]), np.array([0.0, 1, 0]), np.array([0.0, 1, 0]))
+    np.testing.assert_allclose(T @ [0, 1, 0, 1], [0, 0, 2, 1], atol=1e-12)
+    assert (T @ [0, 2, 0, 1])[1] < 0  # up in the world is -y in an OpenCV camera
+    np.testing.assert_allclose(transforms.invert_transform(T) @ T, np.eye(4), atol=1e-12)
