@@ -1,0 +1,177 @@
+"""Differentiable rasterisation of 3D Gaussians: one interface, three backends.
+
+``reference`` is plain torch (the oracle), ``cpu`` the native C++ kernel (deterministic for any
+number of threads), ``gsplat`` CUDA. All follow ``grmm.rasterize.projection`` and gsplat's guards,
+so that a scene looks the same on each of them.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from express50 import native
+from grmm.rasterize.reference import rasterize_reference
+
+__all__ = ["BACKENDS", "RenderOutput", "rasterize", "resolve_backend"]
+
+BACKENDS = ("auto", "reference", "cpu", "gsplat")
+
+
+@dataclass(frozen=True)
+class RenderOutput:
+    """What ``rasterize`` returns.
+
+    Attributes:
+        colors: (H, W, C) blended colours (any channels), background included.
+        depth: (H, W) RaDe expected depth, camera z in metres; 0 where alpha is 0.
+        alpha: (H, W) in [0, 1).
+    """
+
+    colors: Tensor
+    depth: Tensor
+    alpha: Tensor
+
+
+def rasterize(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    colors: Tensor,
+    K: Tensor,
+    cam_from_world: Tensor,
+    width: int,
+    height: int,
+    *,
+    background: Tensor | None = None,
+    near: float = 0.01,
+    eps2d: float = 0.3,
+    antialiased: bool = False,
+    backend: str = "auto",
+) -> RenderOutput:
+    """Render Gaussians into one pinhole image; differentiable in every tensor argument.
+
+    Args:
+        means: (N, 3) metres, world. N may be 0.
+        quats: (N, 4) wxyz, any length; a quaternion of zero length stands for no rotation.
+        scales: (N, 3) standard deviations, metres, along the rotated axes; 0 is allowed.
+        opacities: (N,) in [0, 1]; under 1/255 a Gaussian is invisible.
+        colors: (N, C) any C >= 0 channels.
+        K: (3, 3) pixels, corner origin, no skew; the principal point may lie anywhere.
+        cam_from_world: (4, 4) rigid. Points are taken to the camera in float64, so a float64
+            camera keeps float32 Gaussians precise far from the origin.
+        width: image width, pixels.
+        height: image height, pixels.
+        background: (C,) colour behind the Gaussians; black without. Depth never gets one.
+        near: metres; Gaussians whose mean is not beyond it are dropped.
+        eps2d: px^2, added to the diagonal of every 2D covariance (> 0).
+        antialiased: scale opacity by sqrt(det before / det after dilation) (Mip-Splatting, 2024).
+        backend: ``auto`` takes gsplat for CUDA tensors, else the native kernel if it was built,
+            else the reference.
+
+    Raises:
+        ValueError: wrong shape, dtype or device, NaN or Inf, unknown backend.
+        RuntimeError: the backend asked for is not there; the message says how to mend it.
+    """
+    tensors = {
+        "means": means, "quats": quats, "scales": scales, "opacities": opacities,
+        "colors": colors, "K": K, "cam_from_world": cam_from_world,
+    }  # fmt: skip
+    if background is not None:
+        tensors["background"] = background
+    _check(tensors, width, height, near, eps2d)
+    run = _backend(resolve_backend(backend, means.device))
+    image, depth, alpha = run(
+        means, quats, scales, opacities, colors, K, cam_from_world,
+        width, height, background, near, eps2d, antialiased,
+    )  # fmt: skip
+    return RenderOutput(image, depth, alpha)
+
+
+def resolve_backend(backend: str = "auto", device: torch.device | str = "cpu") -> str:
+    """Name of the backend that ``auto`` stands for on ``device``; other names pass unchanged.
+
+    Raises:
+        ValueError: the name is unknown.
+    """
+    if backend not in BACKENDS:
+        raise ValueError(f"backend is {backend!r}, expected one of {', '.join(BACKENDS)}")
+    if backend != "auto":
+        return backend
+    if torch.device(device).type == "cuda":
+        return "gsplat"
+    if native.available():
+        return "cpu"
+    warnings.warn(
+        f"rendering with the slow torch reference: {native.why_missing()}", stacklevel=3
+    )
+    return "reference"
+
+
+def _backend(name: str) -> Callable[..., tuple[Tensor, Tensor, Tensor]]:
+    """The function of a backend, imported only when it is used."""
+    if name == "cpu":
+        from grmm.rasterize.cpu import rasterize_cpu
+
+        return rasterize_cpu
+    if name == "gsplat":
+        from grmm.rasterize.gsplat_backend import rasterize_gsplat
+
+        return rasterize_gsplat
+    return rasterize_reference
+
+
+def _check(tensors: dict[str, Tensor], width: int, height: int, near: float, eps2d: float) -> None:
+    """Shapes, dtypes, devices and finiteness of all arguments; ValueError names the first bad one."""
+    n, channels = tensors["means"].shape[0], tensors["colors"].shape[-1]
+    shapes = {
+        "means": (n, 3), "quats": (n, 4), "scales": (n, 3), "opacities": (n,),
+        "colors": (n, channels), "K": (3, 3), "cam_from_world": (4, 4), "background": (channels,),
+    }  # fmt: skip
+    dtype, device = tensors["means"].dtype, tensors["means"].device
+    for name, tensor in tensors.items():
+        if tuple(tensor.shape) != shapes[name]:
+            raise ValueError(f"{name} has shape {tuple(tensor.shape)}, expected {shapes[name]}")
+        camera = name in ("K", "cam_from_world")
+        if tensor.dtype not in (torch.float32, torch.float64) or (
+            tensor.dtype != dtype and not camera
+        ):
+            raise ValueError(
+                f"{name} is {tensor.dtype}, expected float32 or float64 and the same as means"
+            )
+        if tensor.device != device:
+            raise ValueError(f"{name} is on {tensor.device}, expected {device} as means")
+        _check_finite(name, tensor)
+    if width < 1 or height < 1:
+        raise ValueError(f"image size is {width} x {height}, expected at least 1 x 1")
+    if not near > 0 or not eps2d > 0:
+        raise ValueError(f"near is {near} and eps2d {eps2d}, expected both above 0")
+    _check_intrinsics(tensors["K"].detach())
+
+
+def _check_finite(name: str, tensor: Tensor) -> None:
+    """ValueError if ``tensor`` holds NaN or Inf."""
+    # A finite sum proves that all are finite, in one pass; only a doubtful one is looked at again.
+    if bool(torch.isfinite(tensor.detach().sum())):
+        return
+    bad = ~torch.isfinite(tensor.detach())
+    if bool(bad.any()):
+        first = tuple(bad.nonzero()[0].tolist())
+        raise ValueError(
+            f"{name} has {int(bad.sum())} values that are not finite, the first at {first};"
+            " expected finite numbers"
+        )
+
+
+def _check_intrinsics(K: Tensor) -> None:
+    """ValueError unless K is a pinhole matrix with positive focal lengths and no skew."""
+    (fx, skew, _), (below, fy, _), bottom = K.tolist()
+    if fx <= 0 or fy <= 0 or skew != 0 or below != 0 or bottom != [0.0, 0.0, 1.0]:
+        raise ValueError(
+            f"K is {K.tolist()}, expected [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with fx, fy > 0"
+        )

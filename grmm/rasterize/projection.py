@@ -1,0 +1,177 @@
+"""Projection of 3D Gaussians into one image: the readable torch form that every backend follows.
+
+Everything here is computed in float64 and only the results are rounded to the dtype of ``means``:
+needle-shaped and huge Gaussians cancel badly in float32, and N small matrices cost little.
+Sources: EWA splatting (Zwicker et al. 2001) as in 3DGS (Kerbl et al. 2023), with the guards of
+gsplat (Ye et al. 2025: dilation, field-of-view clamp of the Jacobian, near plane, 1/255 cut-off);
+the depth plane is RaDe-GS's (Zhang et al. 2024), written as a regression slope (see below).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from express50.torch_transforms import quat_to_matrix
+
+ALPHA_MIN = 1.0 / 255.0  # fainter contributions are skipped
+ALPHA_MAX = 0.99  # keeps 1 - alpha away from zero
+TRANSMITTANCE_MIN = 1e-4  # a pixel stops before it gets darker than this
+COMPENSATION_MIN = 0.005  # floor of the antialiasing factor: its square root has no slope at 0
+FOV_MARGIN = 0.15  # the Jacobian is clamped this part of the image size beyond the border
+
+
+@dataclass(frozen=True)
+class Projection:
+    """Gaussians in one image; rows of Gaussians that are not ``visible`` are finite but arbitrary.
+
+    Attributes:
+        means2d: (N, 2) pixels, corner origin.
+        conics: (N, 3) entries xx, xy, yy of the inverse of the dilated 2D covariance, 1/px^2.
+        depths: (N,) camera z of the means, metres.
+        planes: (N, 3) ray length l at the mean (m) and its slope (s_u, s_v) in m/px, so that the
+            Gaussian lies at ray length ``l + s . (pixel - mean2d)``.
+        opacities: (N,) after the antialiasing compensation, if any.
+        extents: (N, 2) half width and height of the box in which alpha reaches 1/255, pixels.
+        visible: (N,) bool, in front of the near plane and touching the image.
+    """
+
+    means2d: Tensor
+    conics: Tensor
+    depths: Tensor
+    planes: Tensor
+    opacities: Tensor
+    extents: Tensor
+    visible: Tensor
+
+
+def project(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    K: Tensor,
+    cam_from_world: Tensor,
+    width: int,
+    height: int,
+    near: float = 0.01,
+    eps2d: float = 0.3,
+    antialiased: bool = False,
+) -> Projection:
+    """Project Gaussians: means (N, 3), quats (N, 4) wxyz, scales (N, 3) m, opacities (N,).
+
+    ``K`` is (3, 3) pixels and ``cam_from_world`` (4, 4). Differentiable in all six tensors.
+    """
+    dtype = means.dtype
+    means, quats, scales, opacities, K, cam_from_world = (
+        x.double() for x in (means, quats, scales, opacities, K, cam_from_world)
+    )
+    R, t = cam_from_world[:3, :3], cam_from_world[:3, 3]
+    points = means @ R.T + t
+    front = points[:, 2] > near
+    # Culled points get a harmless place, so that no division by zero enters the gradients.
+    points = torch.where(front[:, None], points, points.new_tensor([0.0, 0.0, 1.0]))
+    rows = _jacobian(points, K, width, height) @ (R @ quat_to_matrix(quats) * scales[:, None, :])
+    covariance = rows @ rows.transpose(1, 2)  # over (u, v, ray length)
+    conics, compensation = _conics(rows, covariance, eps2d)
+    # Regression of the ray length on the pixel: s = Cov(t, uv) Cov(uv)^-1. It equals the plane of
+    # RaDe-GS without inverting a 3x3 matrix; the dilated conic keeps it bounded for flat ones.
+    tu, tv = covariance[:, 2, 0], covariance[:, 2, 1]
+    slope_u = conics[:, 0] * tu + conics[:, 1] * tv
+    slope_v = conics[:, 1] * tu + conics[:, 2] * tv
+    planes = torch.stack([points.norm(dim=1), slope_u, slope_v], 1)
+    focal = torch.stack([K[0, 0], K[1, 1]])
+    means2d = focal * points[:, :2] / points[:, 2:] + K[:2, 2]
+    if antialiased:
+        opacities = opacities * compensation
+    extents, visible = _extents(means2d, covariance, opacities, eps2d, width, height)
+    return Projection(
+        means2d=means2d.to(dtype),
+        conics=conics.to(dtype),
+        depths=points[:, 2].to(dtype),
+        planes=planes.to(dtype),
+        opacities=opacities.to(dtype),
+        extents=extents,
+        visible=visible & front,
+    )
+
+
+def _jacobian(points: Tensor, K: Tensor, width: int, height: int) -> Tensor:
+    """Derivatives (N, 3, 3) of (u, v, ray length) by camera coordinates (N, 3).
+
+    x/z and y/z of the pixel rows are clamped a little outside the image: beyond it the linear
+    model of a wide Gaussian would explode.
+    """
+    fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
+    z = points[:, 2]
+    tan_x = _clamp(
+        points[:, 0] / z,
+        -(cx + FOV_MARGIN * width) / fx,
+        (width - cx + FOV_MARGIN * width) / fx,
+    )
+    tan_y = _clamp(
+        points[:, 1] / z,
+        -(cy + FOV_MARGIN * height) / fy,
+        (height - cy + FOV_MARGIN * height) / fy,
+    )
+    zero = torch.zeros_like(z)
+    row_u = torch.stack([fx / z, zero, -fx * tan_x / z], 1)
+    row_v = torch.stack([zero, fy / z, -fy * tan_y / z], 1)
+    row_t = points / points.norm(dim=1, keepdim=True)
+    return torch.stack([row_u, row_v, row_t], 1)
+
+
+def _clamp(value: Tensor, low: Tensor, high: Tensor) -> Tensor:
+    """``torch.clamp`` whose gradient reaches the bounds (they depend on K) where they are used."""
+    return torch.where(value < low, low, torch.where(value > high, high, value))
+
+
+def _conics(rows: Tensor, covariance: Tensor, eps2d: float) -> tuple[Tensor, Tensor]:
+    """Conics (N, 3) and antialiasing factors (N,) from ``rows`` (N, 3, 3), their square roots.
+
+    The determinant is the squared area of the two pixel rows (Cauchy-Binet) plus the dilation's
+    terms: a sum of squares, so it stays positive where ``xx * yy - xy**2`` would cancel.
+    """
+    xx, xy, yy = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
+    det_sharp = torch.linalg.cross(rows[:, 0], rows[:, 1]).square().sum(1)
+    det = det_sharp + eps2d * (xx + yy) + eps2d * eps2d
+    conics = torch.stack([(yy + eps2d) / det, -xy / det, (xx + eps2d) / det], 1)
+    ratio = (det_sharp / det).clamp(min=COMPENSATION_MIN**2)
+    return conics, ratio.sqrt()
+
+
+@torch.no_grad()
+def _extents(
+    means2d: Tensor, covariance: Tensor, opacities: Tensor, eps2d: float, width: int, height: int
+) -> tuple[Tensor, Tensor]:
+    """Half sizes (N, 2) of the alpha >= 1/255 box, and whether it holds a pixel centre (N,)."""
+    level = 2.0 * torch.log((opacities / ALPHA_MIN).clamp(min=1.0))
+    variance = torch.stack([covariance[:, 0, 0], covariance[:, 1, 1]], 1) + eps2d
+    extents = (level[:, None] * variance).sqrt()
+    size = means2d.new_tensor([width, height])
+    inside = ((means2d + extents >= 0) & (means2d - extents <= size)).all(1)
+    return extents, inside & (opacities >= ALPHA_MIN)
+
+
+def ray_lengths(K: Tensor, width: int, height: int) -> Tensor:
+    """Length (H, W) of the ray through each pixel centre at camera z = 1; float64 inside."""
+    K64 = K.double()
+    u = torch.arange(width, device=K.device, dtype=torch.float64) + 0.5
+    v = torch.arange(height, device=K.device, dtype=torch.float64) + 0.5
+    x = (u - K64[0, 2]) / K64[0, 0]
+    y = (v - K64[1, 2]) / K64[1, 1]
+    return (1.0 + x[None, :].square() + y[:, None].square()).sqrt()
+
+
+def expected_depth(weighted_ray_length: Tensor, alpha: Tensor, K: Tensor) -> Tensor:
+    """Expected camera z (H, W), metres, from sum of weight * ray length (H, W) and alpha (H, W).
+
+    Zero where nothing was hit. Source: RaDe-GS, section 3 (z = t / |K^-1 (u, v, 1)|).
+    """
+    height, width = alpha.shape
+    hit = alpha > 0
+    safe = torch.where(hit, alpha, torch.ones_like(alpha))
+    lengths = ray_lengths(K, width, height).to(alpha.dtype)
+    return torch.where(hit, weighted_ray_length / (safe * lengths), torch.zeros_like(alpha))
