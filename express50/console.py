@@ -1,0 +1,97 @@
+"""The frame of every command line: one line for an error, exit codes 0, 1 and 2, clean stops."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+import os
+import signal
+import sys
+from collections.abc import Callable, Iterator
+
+from express50.errors import ConfigError, Express50Error
+
+OK, FAILED, USAGE, INTERRUPTED = 0, 1, 2, 130
+
+
+def run_handler(program: str, handler: Callable[[argparse.Namespace], int], args: object) -> int:
+    """Call a command's handler and turn its ending into an exit code.
+
+    An Express50Error becomes one line on standard error; any other error is a defect and keeps its
+    traceback.
+    """
+    try:
+        with _stop_on_sigterm():
+            code = handler(args)
+        sys.stdout.flush()
+        return code
+    except ConfigError as error:
+        return _fail(program, error, USAGE)
+    except Express50Error as error:
+        return _fail(program, error, FAILED)
+    except BrokenPipeError:
+        # The reader of a pipe left; what follows at exit must not complain either.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return OK
+    except KeyboardInterrupt:
+        sys.stderr.write(f"{program}: stopped; what is finished is kept, run the same to go on\n")
+        return INTERRUPTED
+
+
+def _fail(program: str, error: Express50Error, code: int) -> int:
+    notes = getattr(error, "__notes__", [])
+    line = " ".join(" ".join([str(error), *notes]).split())
+    sys.stderr.write(f"{program}: {type(error).__name__}: {line}\n")
+    return code
+
+
+@contextlib.contextmanager
+def _stop_on_sigterm() -> Iterator[None]:
+    """Let SIGTERM, as batch systems send it, stop a command like Ctrl-C does."""
+
+    def stop(number: int, frame: object) -> None:
+        raise KeyboardInterrupt
+
+    try:
+        former = signal.signal(signal.SIGTERM, stop)
+    except ValueError:  # not the main thread
+        yield
+        return
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, former)
+
+
+def say(*lines: str) -> None:
+    """Write lines to standard output."""
+    for line in lines:
+        sys.stdout.write(line + "\n")
+
+
+def say_json(value: object) -> None:
+    """Write JSON to standard output."""
+    say(json.dumps(value, indent=1, sort_keys=True, ensure_ascii=False))
+
+
+@contextlib.contextmanager
+def stdout_to_stderr() -> Iterator[None]:
+    """Send whatever is written to standard output, also by native code, to standard error."""
+    sys.stdout.flush()
+    with contextlib.redirect_stdout(sys.stderr):
+        saved = os.dup(1)
+        try:
+            os.dup2(2, 1)
+            yield
+        finally:
+            os.dup2(saved, 1)
+            os.close(saved)
+
+
+def format_table(header: list[str], rows: list[list[str]]) -> Iterator[str]:
+    """Lines of a table with aligned columns."""
+    widths = [max(len(row[i]) for row in [header, *rows]) for i in range(len(header))]
+    for row in [header, *rows]:
+        cells = (cell.ljust(width) for cell, width in zip(row, widths, strict=True))
+        yield "  ".join(cells).rstrip()

@@ -1,0 +1,272 @@
+"""Pixels of a dataset: full-resolution frames, plates, proxies, and the cameras to go with them."""
+
+from __future__ import annotations
+
+import json
+from collections import OrderedDict
+from functools import lru_cache
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from express50.adapters import undistort_image
+from express50.cameras import Camera, pinhole, read_cameras
+from express50.errors import CaptureError, FormatError, StageError
+from express50.images import decode_image, linear_to_srgb, read_image
+from express50.index import Index, read_index
+from express50.layout import Dataset
+from express50.video import VideoReader
+
+OPEN_READERS = 8  # open videos a process keeps; each holds a decoder's picture buffers
+
+
+def to_srgb8(image: np.ndarray) -> np.ndarray:
+    """Image (H, W[, C]) as (H, W, 3) uint8 sRGB; floats are linear light, 16 bits are sRGB.
+
+    Raises:
+        ValueError: the image holds NaN or infinity.
+    """
+    if image.ndim == 2:
+        image = np.repeat(image[..., None], 3, axis=2)
+    if image.shape[2] == 2:  # grey and alpha
+        image = np.repeat(image[..., :1], 3, axis=2)
+    image = image[..., :3]
+    if image.dtype == np.uint16:
+        image = np.rint(image / 257.0)
+    elif image.dtype != np.uint8:
+        if not np.isfinite(image).all():
+            raise ValueError("image holds NaN or infinity")
+        image = np.rint(linear_to_srgb(np.clip(image, 0.0, 1.0)) * 255.0)
+    return np.ascontiguousarray(image.astype(np.uint8))
+
+
+def dhash(image: np.ndarray) -> str:
+    """64-bit difference hash of an (H, W, 3) uint8 image, 16 hexadecimal digits.
+
+    The image is averaged to 8 rows of 9 grey cells; each bit says whether a cell is darker than
+    its right neighbour. Source: N. Krawetz, "Kind of like that", 2013.
+    """
+    grey = cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2GRAY)
+    cells = cv2.resize(grey, (9, 8), interpolation=cv2.INTER_AREA).astype(np.int16)
+    bits = (cells[:, :-1] < cells[:, 1:]).reshape(-1)
+    return np.packbits(bits).tobytes().hex()
+
+
+class FrameReader:
+    """Full-resolution frames of one camera; reading forward is quick."""
+
+    def __init__(self, index: Index, camera_id: str) -> None:
+        if camera_id not in index.cameras:
+            raise CaptureError(
+                f"{index.subject}: no camera {camera_id!r}; "
+                f"expected one of {', '.join(index.cameras)}"
+            )
+        self.camera_id = camera_id
+        self.source = index.cameras[camera_id]
+        self.path = index.capture / self.source.source
+        self._video = VideoReader(self.path, self.source.pts) if self._is_video else None
+
+    @property
+    def _is_video(self) -> bool:
+        return self.source.kind == "video"
+
+    def read(self, frame: int) -> np.ndarray:
+        """Image (H, W, 3) uint8 sRGB of a decode index, as recorded (not undistorted).
+
+        Raises:
+            CaptureError: no such frame, or the footage is not what was ingested.
+        """
+        if not 0 <= frame < self.source.frames:
+            raise CaptureError(
+                f"{self.path}: frame {frame} does not exist, expected 0 to {self.source.frames - 1}"
+            )
+        if self._video is None:
+            return self._checked(read_srgb8(self.path / self.source.names[frame]), frame)
+        image = self._video.read(frame)
+        if dhash(image) != self.source.dhash[frame]:
+            # A decoder may conceal a missing reference after a seek; from the start it cannot.
+            self._video.restart()
+            image = self._video.read(frame)
+        return self._checked(image, frame)
+
+    def _checked(self, image: np.ndarray, frame: int) -> np.ndarray:
+        found, expected = dhash(image), self.source.dhash[frame]
+        if found != expected:
+            raise CaptureError(
+                f"{self.path}: frame {frame} has hash {found}, the index says {expected}; the "
+                "footage changed since it was ingested, run 'express50 ingest' again"
+            )
+        return image
+
+    def close(self) -> None:
+        """Close the video, if there is one."""
+        if self._video is not None:
+            self._video.close()
+
+
+def read_srgb8(path: Path) -> np.ndarray:
+    """Read an image file as (H, W, 3) uint8 sRGB.
+
+    Raises:
+        CaptureError: the file is missing, damaged or holds NaN or infinity.
+    """
+    try:
+        return to_srgb8(read_image(path))
+    except FormatError as error:
+        raise CaptureError(str(error)) from error
+    except ValueError as error:
+        raise CaptureError(f"{path}: {error}; export it again") from error
+
+
+_readers: OrderedDict[tuple, FrameReader] = OrderedDict()
+
+
+def _reader(index: Index, camera_id: str) -> FrameReader:
+    """Reader of a camera, kept open while it is among the last few used."""
+    key = (index.capture, index.subject, camera_id)
+    reader = _readers.pop(key, None)
+    if reader is not None and reader.source != index.cameras.get(camera_id):
+        reader.close()
+        reader = None
+    _readers[key] = reader or FrameReader(index, camera_id)
+    while len(_readers) > OPEN_READERS:
+        _readers.popitem(last=False)[1].close()
+    return _readers[key]
+
+
+def read_frame(
+    dataset: Dataset, subject: str, camera_id: str, frame: int, undistort: bool = True
+) -> np.ndarray:
+    """Full-resolution frame (H, W, 3) uint8 sRGB by decode index.
+
+    Args:
+        dataset: the dataset.
+        subject: subject id.
+        camera_id: camera id.
+        frame: 0-based decode index.
+        undistort: as the pinhole camera of ``read_cameras_of`` sees it; needs calibrate.
+
+    Raises:
+        CaptureError: no such camera or frame, or the footage changed.
+        StageError: ingest, or calibrate when undistorting, did not run.
+    """
+    image = _reader(read_index(dataset, subject), camera_id).read(frame)
+    return _undistorted(dataset, subject, camera_id, image) if undistort else image
+
+
+def read_plate(
+    dataset: Dataset, subject: str, camera_id: str, undistort: bool = True
+) -> np.ndarray | None:
+    """Clean background plate (H, W, 3) uint8 sRGB, or None where the capture has none."""
+    index = read_index(dataset, subject)
+    if camera_id not in index.plates:
+        return None
+    image = read_srgb8(index.capture / index.plates[camera_id])
+    return _undistorted(dataset, subject, camera_id, image) if undistort else image
+
+
+def _undistorted(dataset: Dataset, subject: str, camera_id: str, image: np.ndarray) -> np.ndarray:
+    cameras = read_cameras_of(dataset, subject, undistorted=False)
+    if camera_id not in cameras:
+        raise StageError(
+            f"{subject}: camera {camera_id!r} is not calibrated; expected one of "
+            f"{', '.join(cameras)}"
+        )
+    return undistort_image(image, cameras[camera_id])
+
+
+def read_cameras_of(dataset: Dataset, subject: str, undistorted: bool = True) -> dict[str, Camera]:
+    """Calibrated cameras of a subject, sorted by id.
+
+    Args:
+        dataset: the dataset.
+        subject: subject id.
+        undistorted: give pinhole cameras, which undistorted frames belong to.
+
+    Raises:
+        StageError: the subject is not calibrated.
+    """
+    path = dataset.item_dir("calibrate", subject) / "cameras.json"
+    try:
+        stat = path.stat()
+    except FileNotFoundError as error:
+        raise StageError(
+            f"{path}: subject {subject!r} is not calibrated; "
+            f"run 'express50 calibrate {dataset.root}'"
+        ) from error
+    cameras = _cameras_cached(path, (stat.st_mtime_ns, stat.st_size, stat.st_ino))
+    return {name: pinhole(c) if undistorted else c for name, c in cameras.items()}
+
+
+@lru_cache(maxsize=64)
+def _cameras_cached(path: Path, version: tuple[int, ...]) -> dict[str, Camera]:
+    cameras = read_cameras(path)
+    return {name: cameras[name] for name in sorted(cameras)}
+
+
+def read_peaks(dataset: Dataset, subject: str) -> dict[str, int]:
+    """Peak frame (decode index) of each expression.
+
+    Raises:
+        StageError: the subject is not aligned.
+        FormatError: the file is not a table of peaks.
+        CaptureError: a peak's hash is not that of the indexed frame, so it names another frame.
+    """
+    path = dataset.item_dir("align", subject) / "peaks.json"
+    if not path.is_file():
+        raise StageError(
+            f"{path}: subject {subject!r} is not aligned; run 'express50 align {dataset.root}'"
+        )
+    try:
+        rows = json.loads(path.read_text(encoding="utf-8"))
+        peaks = {name: int(row["frame"]) for name, row in rows.items()}
+        named = [(n, row["camera"], row["dhash"]) for n, row in rows.items()]
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise FormatError(f"{path}: not a table of peaks ({type(error).__name__}: {error})") from (
+            error
+        )
+    index = read_index(dataset, subject)
+    for name, camera_id, expected in named:
+        _check_peak(index, path, name, peaks[name], camera_id, expected)
+    return peaks
+
+
+def _check_peak(
+    index: Index, path: Path, name: str, frame: int, camera_id: str, expected: str
+) -> None:
+    source = index.cameras.get(camera_id)
+    found = source.dhash[frame] if source and 0 <= frame < source.frames else "none"
+    if found != expected:
+        raise CaptureError(
+            f"{path}: {name}: frame {frame} of {camera_id} has hash {found}, the label says "
+            f"{expected}; the footage is not the one that was labelled, run 'express50 align' again"
+        )
+
+
+def read_proxy(dataset: Dataset, subject: str, camera_id: str, frame: int) -> np.ndarray:
+    """Small JPEG copy (h, w, 3) uint8 sRGB of a frame; a random read costs milliseconds.
+
+    Raises:
+        StageError: the subject is not ingested.
+        CaptureError: no such camera or frame.
+    """
+    folder = dataset.item_dir("ingest", subject) / "proxies"
+    index = read_index(dataset, subject)
+    if camera_id not in index.cameras or not 0 <= frame < index.cameras[camera_id].frames:
+        raise CaptureError(f"{folder}: no frame {frame} of camera {camera_id!r}")
+    return decode_proxy(folder, camera_id, frame)
+
+
+def decode_proxy(folder: Path, camera_id: str, frame: int) -> np.ndarray:
+    """Proxy (h, w, 3) uint8 sRGB out of a folder of indexed tars."""
+    tar, table = folder / f"{camera_id}.tar", folder / f"{camera_id}.json"
+    offset, size = _proxy_table(table, table.stat().st_mtime_ns)[frame]
+    with tar.open("rb") as file:
+        file.seek(offset)
+        return decode_image(file.read(size), f"{tar}: frame {frame}")
+
+
+@lru_cache(maxsize=256)
+def _proxy_table(path: Path, version: int) -> list[tuple[int, int]]:
+    return [tuple(pair) for pair in json.loads(path.read_text(encoding="utf-8"))]

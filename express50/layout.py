@@ -1,0 +1,91 @@
+"""Where everything lies in a dataset folder; the only file that knows the folder names."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+from express50.errors import FormatError
+
+
+@dataclass(frozen=True)
+class Dataset:
+    """A dataset folder: one folder a stage, one folder an item, plus ledger, labels and report."""
+
+    root: Path
+
+    def __post_init__(self) -> None:
+        """Accept a string path."""
+        object.__setattr__(self, "root", Path(self.root))
+
+    def stage_dir(self, stage: str) -> Path:
+        """Folder that holds the items of a stage."""
+        return self.root / stage
+
+    def item_dir(self, stage: str, item: str) -> Path:
+        """Published folder of one item; ``item`` may be nested (``S001/cam03``)."""
+        return self.root / stage / item
+
+    def subjects(self) -> list[str]:
+        """Ingested subjects, sorted."""
+        return sorted(path.parent.name for path in self.stage_dir("ingest").glob("*/index.json"))
+
+    @property
+    def captures_file(self) -> Path:
+        """JSON table subject -> folder of its raw capture."""
+        return self.root / "captures.json"
+
+    def captures(self) -> dict[str, Path]:
+        """Registered raw captures by subject, sorted; empty before the first ingest.
+
+        Raises:
+            FormatError: the table is not a JSON object of strings.
+        """
+        if not self.captures_file.is_file():
+            return {}
+        try:
+            table = json.loads(self.captures_file.read_text(encoding="utf-8"))
+        except ValueError as error:
+            raise FormatError(
+                f"{self.captures_file}: not JSON ({error}); delete it and run 'express50 ingest' "
+                "with every capture again"
+            ) from error
+        if not isinstance(table, dict) or not all(isinstance(v, str) for v in table.values()):
+            raise FormatError(
+                f"{self.captures_file}: expected an object subject -> path, got "
+                f"{type(table).__name__}; delete it and run 'express50 ingest' again"
+            )
+        return {subject: Path(table[subject]) for subject in sorted(table)}
+
+    def labels_file(self, subject: str) -> Path:
+        """Append-only label events of one subject."""
+        return self.root / "labels" / f"{subject}.jsonl"
+
+    @property
+    def ledger(self) -> Path:
+        """SQLite receipts of every stage."""
+        return self.root / "ledger.sqlite"
+
+    def config_file(self, stage: str) -> Path:
+        """Resolved configuration that a stage last ran with."""
+        return self.root / "config" / f"{stage}.toml"
+
+    @property
+    def report_dir(self) -> Path:
+        """Report pages."""
+        return self.root / "report"
+
+    @property
+    def staging_dir(self) -> Path:
+        """Unfinished outputs; nothing below it is ever read."""
+        return self.root / ".staging"
+
+    @property
+    def stale_dir(self) -> Path:
+        """Outputs set aside because a newer run of their item failed or no longer lists it."""
+        return self.root / ".stale"
+
+    def log_file(self, stage: str, item: str) -> Path:
+        """Traceback of an unexpected failure of one item."""
+        return self.root / "logs" / stage / f"{item.replace('/', '+')}.txt"

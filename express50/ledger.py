@@ -1,0 +1,120 @@
+"""The ledger: SQLite receipts that say what was made from what, and digests of files already read.
+
+Only the driver opens it; workers return receipts.
+"""
+
+from __future__ import annotations
+
+import json
+import sqlite3
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from express50.digests import file_sha256
+from express50.errors import FormatError
+
+SCHEMA = """
+CREATE TABLE IF NOT EXISTS receipts (
+    stage TEXT NOT NULL, item TEXT NOT NULL, fingerprint TEXT NOT NULL, status TEXT NOT NULL,
+    reason TEXT NOT NULL, metrics TEXT NOT NULL, seconds REAL NOT NULL,
+    peak_memory INTEGER NOT NULL, attempts INTEGER NOT NULL, time REAL NOT NULL, PRIMARY KEY (stage, item)
+);
+CREATE TABLE IF NOT EXISTS digests (
+    path TEXT PRIMARY KEY, size INTEGER NOT NULL, mtime_ns INTEGER NOT NULL,
+    inode INTEGER NOT NULL, sha256 TEXT NOT NULL
+);
+"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Receipt:
+    """What became of one item.
+
+    Attributes:
+        stage: stage name.
+        item: item id.
+        fingerprint: digest of stage version, config and inputs.
+        status: ``done`` or ``failed``.
+        reason: one line for a failure, else empty.
+        metrics: what the stage returned.
+        seconds: wall time of the last attempt.
+        peak_memory: largest resident memory while it ran, bytes.
+        attempts: how often it was tried in that run.
+        time: when it ended, seconds since 1970.
+    """
+
+    stage: str
+    item: str
+    fingerprint: str
+    status: str
+    reason: str = ""
+    metrics: dict = field(default_factory=dict)
+    seconds: float = 0.0
+    peak_memory: int = 0
+    attempts: int = 1
+    time: float = field(default_factory=time.time)
+
+
+class Ledger:
+    """Receipts by stage and item, and a cache of file digests."""
+
+    def __init__(self, path: Path) -> None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            self._database = sqlite3.connect(path, timeout=60, isolation_level=None)
+            self._database.execute("PRAGMA journal_mode=WAL")
+            self._database.execute("PRAGMA synchronous=FULL")
+            self._database.executescript(SCHEMA)
+        except sqlite3.DatabaseError as error:
+            raise FormatError(
+                f"{path}: not a ledger ({error}); delete it and run the stages again, the same "
+                "outputs will be made"
+            ) from error
+
+    def __enter__(self) -> Ledger:
+        return self
+
+    def __exit__(self, *unused: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the database."""
+        self._database.close()
+
+    def write(self, receipt: Receipt) -> None:
+        """Store a receipt in the place of the item's former one."""
+        row = dict(vars(receipt)) | {"metrics": json.dumps(receipt.metrics, sort_keys=True)}
+        marks = ", ".join(f":{name}" for name in row)
+        self._database.execute(
+            f"INSERT OR REPLACE INTO receipts ({', '.join(row)}) VALUES ({marks})", row
+        )
+
+    def read(self, stage: str) -> dict[str, Receipt]:
+        """Receipts of a stage by item, sorted."""
+        names = list(Receipt.__dataclass_fields__)
+        rows = self._database.execute(
+            f"SELECT {', '.join(names)} FROM receipts WHERE stage = ? ORDER BY item", (stage,)
+        )
+        values = [dict(zip(names, row, strict=True)) for row in rows]
+        return {v["item"]: Receipt(**v | {"metrics": json.loads(v["metrics"])}) for v in values}
+
+    def remove(self, stage: str, item: str) -> None:
+        """Forget an item."""
+        self._database.execute("DELETE FROM receipts WHERE stage = ? AND item = ?", (stage, item))
+
+    def sha256(self, path: Path) -> str:
+        """SHA-256 of a file; read again only when its size or modification time changed."""
+        stat = path.stat()
+        key = (str(path), stat.st_size, stat.st_mtime_ns, stat.st_ino)
+        row = self._database.execute(
+            "SELECT sha256 FROM digests WHERE path = ? AND size = ? AND mtime_ns = ? AND inode = ?",
+            key,
+        ).fetchone()
+        if row is not None:
+            return row[0]
+        digest = file_sha256(path)
+        self._database.execute(
+            "INSERT OR REPLACE INTO digests VALUES (?, ?, ?, ?, ?)", (*key, digest)
+        )
+        return digest

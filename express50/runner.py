@@ -1,0 +1,250 @@
+"""Runs a stage over its items: skips what is current, isolates what is bad, accounts for all."""
+
+from __future__ import annotations
+
+import fcntl
+import fnmatch
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass
+from typing import Any
+
+from express50.config import config_toml, nearest
+from express50.errors import ConfigError, Express50Error, StageError
+from express50.layout import Dataset
+from express50.ledger import Ledger, Receipt
+from express50.pool import Pool
+from express50.progress import Progress
+from express50.publish import clean_leftovers, discard_stale, set_aside, write_bytes
+from express50.stage import Stage
+from express50.work import Task, fingerprint
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of one item: ``done``, ``skipped`` (was current) or ``failed``."""
+
+    item: str
+    status: str
+    reason: str = ""
+    seconds: float = 0.0
+    dropped: tuple[dict, ...] = ()
+
+
+@dataclass(frozen=True)
+class Summary:
+    """What became of every item of a stage."""
+
+    stage: str
+    outcomes: tuple[Outcome, ...]
+    seconds: float
+
+    def count(self, status: str) -> int:
+        """Number of items with a status."""
+        return sum(outcome.status == status for outcome in self.outcomes)
+
+    @property
+    def ok(self) -> bool:
+        """Whether no item failed."""
+        return self.count("failed") == 0
+
+    def to_json(self) -> dict[str, Any]:
+        """JSON form, also the machine-readable output of a stage command."""
+        return {
+            "stage": self.stage,
+            "read": len(self.outcomes),
+            "done": self.count("done"),
+            "skipped": self.count("skipped"),
+            "failed": self.count("failed"),
+            "seconds": round(self.seconds, 3),
+            "items": [
+                dict(vars(o)) | {"dropped": list(o.dropped), "seconds": round(o.seconds, 3)}
+                for o in self.outcomes
+            ],
+        }
+
+    def lines(self) -> Iterator[str]:
+        """Lines for people: the account, then every item or part that is not there, and why."""
+        counts = " + ".join(f"{self.count(s)} {s}" for s in ("done", "skipped", "failed"))
+        yield f"{self.stage}: read {len(self.outcomes)} = {counts} in {self.seconds:.1f} s"
+        for outcome in self.outcomes:
+            if outcome.status == "failed":
+                yield f"  failed {outcome.item}: {outcome.reason}"
+            for part in outcome.dropped:
+                yield f"  dropped {part['what']} of {outcome.item}: {part['why']}"
+
+
+def select_items(stage: Stage, dataset: Dataset, pattern: str) -> list[str]:
+    """Items of a stage whose id matches a shell pattern.
+
+    Raises:
+        ConfigError: none does.
+    """
+    known = stage.items(dataset)
+    chosen = [item for item in known if fnmatch.fnmatchcase(item, pattern)]
+    if not chosen:
+        some = ", ".join(known[:8]) + (", ..." if len(known) > 8 else "")
+        raise ConfigError(
+            f"--items {pattern!r}: no item of {stage.name} matches{nearest(pattern, known)}; "
+            f"items: {some or 'none'}"
+        )
+    return chosen
+
+
+def run_stage(
+    stage: Stage,
+    dataset: Dataset,
+    config: Any,
+    items: Sequence[str] | None = None,
+    workers: int = 2,
+    scheduler: str | None = None,
+    progress: bool = True,
+    pool: Pool | None = None,
+) -> Summary:
+    """Bring a stage's outputs up to date.
+
+    Args:
+        stage: the stage.
+        dataset: the dataset.
+        config: instance of ``stage.config``.
+        items: ids to run; all by default, and then outputs of items that are no more are set aside.
+        workers: local processes; 0 or 1 runs in this one.
+        scheduler: address of a dask scheduler to use in place of local processes.
+        progress: show progress on standard error.
+        pool: workers shared with other stages, in place of the two arguments above.
+
+    Returns:
+        The account of all items. A bad item is in it; it does not raise.
+
+    Raises:
+        StageError: the stage has no items, or another run holds it.
+    """
+    started = time.perf_counter()
+    dataset = Dataset(dataset.root.resolve())
+    chosen = list(stage.items(dataset) if items is None else items)
+    if not chosen:
+        raise StageError(
+            f"{dataset.root}: {stage.name} has nothing to do; run the stages before it first"
+        )
+    shared = nullcontext(pool) if pool else Pool(workers, scheduler)
+    with shared as workers_pool, stage_lock(dataset, stage.name), Ledger(dataset.ledger) as ledger:
+        clean_leftovers(dataset, stage.name)
+        save_config(dataset, stage, config)
+        if items is None:
+            retire_items(dataset, ledger, stage.name, chosen)
+        outcomes = _run_items(stage, dataset, config, chosen, ledger, workers_pool, progress)
+    missing = set(chosen) - set(outcomes)
+    if missing:  # read = done + skipped + failed
+        raise StageError(f"{stage.name}: no account of {', '.join(sorted(missing))}; run it again")
+    seconds = time.perf_counter() - started
+    return Summary(stage.name, tuple(outcomes[item] for item in chosen), seconds)
+
+
+def _run_items(
+    stage: Stage,
+    dataset: Dataset,
+    config: Any,
+    chosen: list[str],
+    ledger: Ledger,
+    pool: Pool,
+    progress: bool,
+) -> dict[str, Outcome]:
+    """Sort items into current, unreadable and to do; run the last; settle each as it ends."""
+    outcomes: dict[str, Outcome] = {}
+    receipts = ledger.read(stage.name)
+    tasks, unreadable = [], []
+    for item in chosen:
+        try:
+            digest = fingerprint(stage, dataset, item, config, ledger)
+        except Express50Error as error:
+            reason = f"{type(error).__name__}: {error}"
+            unreadable.append(_refusal(stage, item, reason))
+            continue
+        if is_current(dataset, receipts.get(item), digest):
+            outcomes[item] = _outcome(receipts[item], status="skipped")
+        else:
+            tasks.append(Task(stage, dataset, item, config, digest, pool.threads))
+    for task in tasks:
+        # A receipt must not outlive the output it speaks of, should this run be killed half-way.
+        ledger.remove(stage.name, task.item)
+    with Progress(stage.name, len(tasks) + len(unreadable), progress) as display:
+
+        def settle(receipt: Receipt) -> None:
+            record(dataset, ledger, receipt)
+            outcomes[receipt.item] = _outcome(receipt)
+            display.settle(receipt)
+
+        for receipt in unreadable:
+            settle(receipt)
+        pool.run(tasks, settle, display.tick)
+    return outcomes
+
+
+def is_current(dataset: Dataset, receipt: Receipt | None, digest: str) -> bool:
+    """Whether an item was made from exactly these inputs and its output is there."""
+    return (
+        receipt is not None
+        and receipt.status == "done"
+        and receipt.fingerprint == digest
+        and (dataset.item_dir(receipt.stage, receipt.item) / "metrics.json").is_file()
+    )
+
+
+def record(dataset: Dataset, ledger: Ledger, receipt: Receipt) -> None:
+    """Store a receipt; a failed item's former output is set aside, so that nothing reads it."""
+    if receipt.status == "failed":
+        set_aside(dataset, receipt.stage, receipt.item)
+    else:
+        discard_stale(dataset, receipt.stage, receipt.item)
+        dataset.log_file(receipt.stage, receipt.item).unlink(missing_ok=True)
+    ledger.write(receipt)
+
+
+def retire_items(dataset: Dataset, ledger: Ledger, stage: str, chosen: list[str]) -> None:
+    """Set aside outputs of items that the stage no longer has."""
+    for item in set(ledger.read(stage)) - set(chosen):
+        set_aside(dataset, stage, item)
+        ledger.remove(stage, item)
+
+
+def save_config(dataset: Dataset, stage: Stage, config: Any) -> None:
+    """Save the resolved config of a stage beside its outputs."""
+    path, text = dataset.config_file(stage.name), config_toml(stage.name, config)
+    if not path.is_file() or path.read_text(encoding="utf-8") != text:
+        write_bytes(path, text.encode())
+
+
+@contextmanager
+def stage_lock(dataset: Dataset, stage: str) -> Iterator[None]:
+    """Hold a stage of a dataset; the system lets go when the process ends, however it ends.
+
+    Raises:
+        StageError: another process holds it.
+    """
+    path = dataset.staging_dir / f".{stage}.lock"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("w") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise StageError(
+                f"{dataset.root}: another '{stage}' runs on this dataset; wait until it ends"
+            ) from error
+        yield
+
+
+def _refusal(stage: Stage, item: str, reason: str) -> Receipt:
+    return Receipt(
+        stage=stage.name, item=item, fingerprint="", status="failed", reason=reason, attempts=0
+    )
+
+
+def _outcome(receipt: Receipt, status: str = "") -> Outcome:
+    return Outcome(
+        item=receipt.item,
+        status=status or receipt.status,
+        reason=receipt.reason,
+        seconds=receipt.seconds,
+        dropped=tuple(receipt.metrics.get("dropped", ())),
+    )

@@ -1,0 +1,254 @@
+"""Commands of the stages (one each, ``run`` for all) and of the dataset (status, info, config)."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterable
+from contextlib import nullcontext
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+from express50.config import PRESETS, config_toml, resolve_config
+from express50.console import FAILED, OK, format_table, say, say_json, stdout_to_stderr
+from express50.errors import ConfigError, StageError
+from express50.layout import Dataset
+from express50.stage import Stage
+from express50.threads import cap_threads
+
+HELP = {
+    "ingest": "index raw captures: frames, hashes, proxies",
+    "calibrate": "take or solve the cameras",
+    "align": "find and take the labelled peak frame of each expression",
+    "matte": "separate the head from the background",
+    "track": "fit the head model to the peak frames",
+    "depth": "estimate surface and depth maps",
+    "pack": "write shards, splits and dataset card",
+}
+
+
+def stages() -> dict[str, str]:
+    """Module of every stage, in order."""
+    return import_module("pipelines.order").STAGES
+
+
+def load_stage(name: str) -> Stage:
+    """Import one stage."""
+    return import_module(stages()[name]).STAGE
+
+
+def add_stage_commands(subparsers: Any) -> None:
+    """Add one command a stage, and ``run``."""
+    for name in stages():
+        parser = _stage_parser(subparsers, name, HELP.get(name, ""))
+        parser.set_defaults(handler=run_one, stage=name)
+    parser = _stage_parser(subparsers, "run", "run all stages in order")
+    parser.add_argument("--first", metavar="STAGE", choices=list(stages()), help="start here")
+    parser.add_argument("--last", metavar="STAGE", choices=list(stages()), help="end here")
+    parser.set_defaults(handler=run_all)
+
+
+def _stage_parser(subparsers: Any, name: str, words: str) -> argparse.ArgumentParser:
+    parser = subparsers.add_parser(
+        name, help=words, description=words, epilog=f"options of a stage: express50 config {name}"
+    )
+    parser.add_argument("dataset", type=Path, metavar="DATASET", help="folder of the dataset")
+    if name in ("ingest", "run"):
+        parser.add_argument(
+            "captures", nargs="*", type=Path, metavar="CAPTURE", help="folders of raw captures"
+        )
+    add_config_options(parser)
+    parser.add_argument(
+        "--workers", type=int, default=2, metavar="N", help="local processes; 0 runs in this one"
+    )
+    parser.add_argument("--scheduler", metavar="ADDRESS", help="dask scheduler, tcp://host:port")
+    parser.add_argument(
+        "--threads", type=int, default=1, metavar="N", help="threads an item may use (default 1)"
+    )
+    if name != "run":
+        parser.add_argument("--items", metavar="GLOB", help="only items that match, such as 'S00*'")
+    parser.add_argument("--json", action="store_true", help="print the account as JSON")
+    return parser
+
+
+def add_config_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options that make up a configuration."""
+    parser.add_argument("--preset", default="standard", metavar="P", help=", ".join(PRESETS))
+    parser.add_argument("--config", type=Path, metavar="FILE", help="TOML, one table a stage")
+    parser.add_argument(
+        "--set", action="append", default=[], metavar="STAGE.KEY=VALUE", help="set one value"
+    )
+
+
+def config_of(stage: Stage, args: argparse.Namespace) -> Any:
+    """Configuration of a stage by the command's options; other stages' values are left alone."""
+    return resolve_config(stage, args.preset, args.config, args.set, stages())
+
+
+def run_one(args: argparse.Namespace) -> int:
+    """Run one stage."""
+    for text in args.set:
+        if not text.startswith(args.stage + "."):
+            raise ConfigError(
+                f"--set {text!r}: this command runs {args.stage} only; "
+                f"expected {args.stage}.key=value"
+            )
+    return _run(args, [args.stage], args.items)
+
+
+def run_all(args: argparse.Namespace) -> int:
+    """Run all stages in order; one that fails for some items goes on with the others."""
+    names = list(stages())
+    first = names.index(args.first) if args.first else 0
+    last = names.index(args.last) if args.last else len(names) - 1
+    if first > last:
+        raise ConfigError(f"--first {args.first} comes after --last {args.last}; swap them")
+    return _run(args, names[first : last + 1], None)
+
+
+def _run(args: argparse.Namespace, names: list[str], pattern: str | None) -> int:
+    from express50.pool import Pool
+
+    if args.workers < 0 or args.threads < 1:
+        raise ConfigError(
+            f"--workers {args.workers} --threads {args.threads}: expected at least 0 and 1"
+        )
+    cap_threads(args.threads)
+    dataset = Dataset(args.dataset)
+    summaries = []
+    with (
+        stdout_to_stderr() if args.json else nullcontext(),
+        Pool(args.workers, args.scheduler, args.threads) as pool,
+    ):
+        # Every configuration is checked before the first stage spends hours.
+        loaded = [load_stage(name) for name in names]
+        configs = [config_of(stage, args) for stage in loaded]
+        for stage, config in zip(loaded, configs, strict=True):
+            chosen = _choose(stage, dataset, args, pattern)
+            summaries.append(_run_stage(stage, dataset, config, chosen, pool))
+            if not args.json:
+                say(*summaries[-1].lines())
+    if args.json:
+        accounts = [summary.to_json() for summary in summaries]
+        say_json(accounts if args.command == "run" else accounts[0])
+    return OK if all(summary.ok for summary in summaries) else FAILED
+
+
+def _run_stage(stage: Stage, dataset: Dataset, config: Any, chosen: Any, pool: Any) -> Any:
+    from express50.runner import run_stage
+
+    return run_stage(stage, dataset, config, chosen, pool=pool)
+
+
+def _choose(
+    stage: Stage, dataset: Dataset, args: argparse.Namespace, pattern: str | None
+) -> list[str] | None:
+    """Items to run; None for all."""
+    from express50.runner import select_items
+
+    if stage.name == "ingest" and args.captures:
+        register = import_module(stages()["ingest"]).register
+        subjects = register(dataset, args.captures)
+        return subjects if args.command == "ingest" else None
+    if not dataset.root.is_dir():
+        raise StageError(
+            f"{dataset.root}: no such dataset; run 'express50 ingest {dataset.root} CAPTURE'"
+        )
+    return select_items(stage, dataset, pattern) if pattern else None
+
+
+def add_dataset_commands(subparsers: Any) -> None:
+    """Add status, info and config."""
+    parser = subparsers.add_parser("status", help="what is done, failed and missing")
+    parser.add_argument("dataset", type=Path, metavar="DATASET")
+    parser.add_argument("--json", action="store_true", help="print receipts as JSON")
+    parser.set_defaults(handler=show_status)
+    parser = subparsers.add_parser("info", help="subjects, cameras, frames and expressions")
+    parser.add_argument("dataset", type=Path, metavar="DATASET")
+    parser.add_argument("--json", action="store_true", help="print as JSON")
+    parser.set_defaults(handler=show_info)
+    parser = subparsers.add_parser("config", help="print the configuration of stages as TOML")
+    parser.add_argument("stage", nargs="*", metavar="STAGE", help="all by default")
+    add_config_options(parser)
+    parser.set_defaults(handler=show_config)
+
+
+def _existing(path: Path) -> Dataset:
+    dataset = Dataset(path)
+    if not dataset.ledger.is_file():
+        raise StageError(
+            f"{path}: not a dataset (no ledger.sqlite); run 'express50 ingest {path} CAPTURE'"
+        )
+    return dataset
+
+
+def show_status(args: argparse.Namespace) -> int:
+    """Print receipts by stage; exit code 1 when an item's last run failed."""
+    from express50.ledger import Ledger
+
+    dataset = _existing(args.dataset)
+    with Ledger(dataset.ledger) as ledger:
+        receipts = {name: ledger.read(name) for name in stages()}
+    if args.json:
+        say_json({k: [vars(r) for r in v.values()] for k, v in receipts.items()})
+    else:
+        header = ["stage", "done", "failed", "seconds", "peak MB"]
+        say(*format_table(header, _status_rows(receipts)))
+        for rows in receipts.values():
+            for receipt in rows.values():
+                if receipt.status == "failed":
+                    say(f"failed {receipt.stage} {receipt.item}: {receipt.reason}")
+    failed = any(r.status == "failed" for rows in receipts.values() for r in rows.values())
+    return FAILED if failed else OK
+
+
+def _status_rows(receipts: dict[str, dict[str, Any]]) -> list[list[str]]:
+    rows = []
+    for name, table in receipts.items():
+        done = sum(r.status == "done" for r in table.values())
+        seconds = sum(r.seconds for r in table.values())
+        peak = max((r.peak_memory for r in table.values()), default=0) / 1e6
+        rows.append([name, str(done), str(len(table) - done), f"{seconds:.1f}", f"{peak:.0f}"])
+    return rows
+
+
+def show_info(args: argparse.Namespace) -> int:
+    """Print what was ingested."""
+    from express50.index import read_index
+
+    dataset = _existing(args.dataset)
+    indices = [read_index(dataset, subject) for subject in dataset.subjects()]
+    header = ["subject", "cameras", "size", "frames", "expressions", "plates", "calibration"]
+    rows = [[str(value) for value in _info(index).values()] for index in indices]
+    if args.json:
+        say_json([_info(index) for index in indices])
+    else:
+        say(*format_table(header, rows))
+    return OK
+
+
+def _info(index: Any) -> dict[str, Any]:
+    sizes = sorted({f"{c.width}x{c.height}" for c in index.cameras.values()})
+    return {
+        "subject": index.subject,
+        "cameras": len(index.cameras),
+        "size": ",".join(sizes),
+        "frames": index.frames,
+        "expressions": len(index.cues),
+        "plates": len(index.plates),
+        "calibration": "given" if index.calibration else "board" if index.board else "none",
+    }
+
+
+def show_config(args: argparse.Namespace) -> int:
+    """Print resolved configurations; the output can be given to --config."""
+    say("\n".join(_config_tables(args.stage or stages(), args)).rstrip())
+    return OK
+
+
+def _config_tables(names: Iterable[str], args: argparse.Namespace) -> Iterable[str]:
+    for name in names:
+        if name not in stages():
+            raise ConfigError(f"unknown stage {name!r}; expected one of {', '.join(stages())}")
+        stage = load_stage(name)
+        yield config_toml(name, config_of(stage, args))

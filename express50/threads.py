@@ -1,0 +1,35 @@
+"""Thread caps: processes times pools times threads must not exceed the cores, or all crawl.
+
+The cap is the same inline and in workers: sums over a different number of threads round
+differently, and the same data must give the same bytes.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+
+VARIABLES = (
+    "OMP_NUM_THREADS",
+    "OPENBLAS_NUM_THREADS",
+    "MKL_NUM_THREADS",
+    "VECLIB_MAXIMUM_THREADS",
+    "NUMEXPR_NUM_THREADS",
+    "NUMBA_NUM_THREADS",
+    "OPENCV_FOR_THREADS_NUM",
+)
+
+
+def thread_environment(threads: int) -> dict[str, str]:
+    """Environment variables that cap every known pool; they work before a library is imported."""
+    return dict.fromkeys(VARIABLES, str(threads))
+
+
+def cap_threads(threads: int) -> None:
+    """Cap pools in this process: by environment, and directly where a library is loaded already."""
+    os.environ.update(thread_environment(threads))
+    # sys.modules is asked, because importing torch only to cap it would cost seconds.
+    if "torch" in sys.modules:
+        sys.modules["torch"].set_num_threads(threads)
+    if "cv2" in sys.modules:
+        sys.modules["cv2"].setNumThreads(threads)

@@ -1,0 +1,115 @@
+"""One item of one stage, in whatever process: run it, publish its folder, return its receipt."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import resource
+import sys
+import time
+import traceback
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from express50.digests import path_digest, value_digest
+from express50.errors import Express50Error, StageError
+from express50.layout import Dataset
+from express50.ledger import Ledger, Receipt
+from express50.publish import dump_json, publishing, write_bytes
+from express50.stage import Stage
+from express50.threads import cap_threads
+
+
+@dataclass(frozen=True)
+class Task:
+    """An item to run, with everything a worker needs."""
+
+    stage: Stage
+    dataset: Dataset
+    item: str
+    config: Any
+    fingerprint: str
+    threads: int = 1
+
+
+def fingerprint(stage: Stage, dataset: Dataset, item: str, config: Any, ledger: Ledger) -> str:
+    """Digest of stage version, resolved config and inputs of an item.
+
+    Raises:
+        Express50Error: an input is missing or cannot be read.
+    """
+    digests = {}
+    for name, value in stage.inputs(dataset, item, config).items():
+        if isinstance(value, Path):
+            value = path_digest(value, ledger.sha256)
+        digests[name] = value
+    return value_digest([stage.name, stage.version, vars(config), digests])
+
+
+def run_task(task: Task) -> Receipt:
+    """Run one item and publish its outputs; whatever goes wrong becomes a receipt.
+
+    Only a receipt travels back to the driver, never data.
+    """
+    cap_threads(task.threads)
+    reset_peak_memory()
+    started = time.perf_counter()
+    reason, metrics = "", {}
+    try:
+        metrics = _run_and_publish(task)
+    except Express50Error as error:
+        reason = f"{type(error).__name__}: {error}"
+    except Exception as error:  # noqa: BLE001
+        # A defect that one item triggers must not stop the others; the traceback goes to a file.
+        reason = _record_defect(task, error)
+    return Receipt(
+        stage=task.stage.name,
+        item=task.item,
+        fingerprint=task.fingerprint,
+        status="failed" if reason else "done",
+        reason=" ".join(reason.split()),
+        metrics=metrics,
+        seconds=time.perf_counter() - started,
+        peak_memory=peak_memory(),
+    )
+
+
+def _run_and_publish(task: Task) -> dict:
+    with publishing(task.dataset, task.stage.name, task.item) as out:
+        # Data belong on standard output, and a library's chatter is none.
+        with contextlib.redirect_stdout(sys.stderr):
+            metrics = task.stage.run(task.dataset, task.item, task.config, out)
+        (out / "metrics.json").write_bytes(_metrics_bytes(metrics))
+    return json.loads(_metrics_bytes(metrics))
+
+
+def _metrics_bytes(metrics: dict) -> bytes:
+    try:
+        return dump_json(metrics)
+    except (TypeError, ValueError) as error:
+        raise StageError(
+            f"metrics cannot be written ({error}); expected finite numbers, texts, lists and tables"
+        ) from error
+
+
+def _record_defect(task: Task, error: Exception) -> str:
+    log = task.dataset.log_file(task.stage.name, task.item)
+    write_bytes(log, "".join(traceback.format_exception(error)).encode())
+    return f"{type(error).__name__}: {error} (unexpected; traceback in {log})"
+
+
+def reset_peak_memory() -> None:
+    """Start a new peak for this process where the system can (Linux, see proc(5))."""
+    with contextlib.suppress(OSError):
+        Path("/proc/self/clear_refs").write_text("5")
+
+
+def peak_memory() -> int:
+    """Largest resident memory of this process since the last reset, bytes."""
+    with contextlib.suppress(OSError):
+        for line in Path("/proc/self/status").read_text().splitlines():
+            if line.startswith("VmHWM:"):
+                return int(line.split()[1]) * 1024
+    unit = 1 if sys.platform == "darwin" else 1024
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit

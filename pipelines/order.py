@@ -1,0 +1,11 @@
+"""The order of the stages and the modules that hold them; imports none of them."""
+
+STAGES = {
+    "ingest": "pipelines.ingest",
+    "calibrate": "pipelines.calibrate",
+    "align": "annotations.align",
+    "matte": "pipelines.matte",
+    "track": "pipelines.track",
+    "depth": "pipelines.depth",
+    "pack": "pipelines.pack",
+}
