@@ -1,0 +1,1 @@
+"""Peak-expression labels: the store, suggestions, and the align stage that joins them."""
