@@ -172,7 +172,7 @@ def pose(
     translation: torch.Tensor | None = None,
     offsets: torch.Tensor | None = None,
 ) -> torch.Tensor:
-    """Pose the head. Missing arguments count as zero; fewer coefficients than directions are padded.
+    """Pose the head. Missing arguments are zero; too few coefficients are padded with zeros.
 
     Args:
         model: The head model.
@@ -211,7 +211,9 @@ def rest_vertices(
         ("expression", expression, model.expression_dirs.shape[2]),
     ):
         if value.ndim != 2 or value.shape[1] > count:
-            raise ValueError(f"{name} has shape {tuple(value.shape)}, expected (B, at most {count})")
+            raise ValueError(
+                f"{name} has shape {tuple(value.shape)}, expected (B, at most {count})"
+            )
     rest = (
         model.template
         + torch.einsum("vcs,bs->bvc", model.shape_dirs[..., : shape.shape[1]], shape)
@@ -230,7 +232,12 @@ def joint_angles(
     """Axis-angles (B, 5, 3) in joint order from the optional parts; B, dtype from `like`."""
     batch = like.shape[0]
     blocks = []
-    for name, part, width in (("root", root, 3), ("neck", neck, 3), ("jaw", jaw, 3), ("eyes", eyes, 6)):
+    for name, part, width in (
+        ("root", root, 3),
+        ("neck", neck, 3),
+        ("jaw", jaw, 3),
+        ("eyes", eyes, 6),
+    ):
         if part is None:
             part = like.new_zeros(batch, width)
         if part.ndim != 2 or part.shape[1] != width or part.shape[0] not in (1, batch):

@@ -1,0 +1,303 @@
+"""Import of ICT-FaceKit's light face model (USC Institute for Creative Technologies, MIT licence).
+
+Reads a checkout of the public repository (`FaceXModel/*.obj`) or the same arrays in one `.npz`.
+The model has blend shapes but no skeleton: joints and skinning are synthesised here, the jaw's from
+the model's own `jawOpen` shape. Vertex ranges and landmark indices are those of its README.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from express50.errors import HeadModelError
+from express50.head.ict_regions import ict_regions
+from express50.head.model import PARENTS, HeadModel, check_head
+
+VERTEX_COUNT = 26719
+METRES_PER_UNIT = 0.01
+LANDMARKS = (
+    1225, 1888, 1052, 367, 1719, 1722, 2199, 1447, 966, 3661, 4390, 3927, 3924, 2608, 3272, 4088,
+    3443, 268, 493, 1914, 2044, 1401, 3615, 4240, 4114, 2734, 2509, 978, 4527, 4942, 4857, 1140,
+    2075, 1147, 4269, 3360, 1507, 1542, 1537, 1528, 1518, 1511, 3742, 3751, 3756, 3721, 3725, 3732,
+    5708, 5695, 2081, 0, 4275, 6200, 6213, 6346, 6461, 5518, 5957, 5841, 5702, 5711, 5533, 6216,
+    6207, 6470, 5517, 5966,
+)  # fmt: skip
+# Shells that only a game engine's transparent shaders can show: as opaque faces they hide the eyes.
+_HIDDEN_MATERIALS = ("M_EyeBlend", "M_EyeOcclusion", "M_LacrimalFluid")
+_NPZ_KEYS = (
+    "v_template", "shapedirs", "exprdirs", "expression_names", "faces", "uv", "uv_faces",
+    "face_material", "materials",
+)  # fmt: skip
+
+
+@dataclass(frozen=True, kw_only=True)
+class IctArrays:
+    """ICT-FaceKit as stored: centimetres, UDIM texture tiles, triangles with material names."""
+
+    template: np.ndarray
+    shape_dirs: np.ndarray
+    expression_dirs: np.ndarray
+    expression_names: tuple[str, ...]
+    faces: np.ndarray
+    uv: np.ndarray
+    uv_faces: np.ndarray
+    face_material: np.ndarray
+
+
+def load_ict(path: str | Path) -> HeadModel:
+    """Load ICT-FaceKit from a checkout (or its FaceXModel folder) or from an .npz of its arrays.
+
+    Raises:
+        HeadModelError: missing files, another topology, damaged numbers.
+    """
+    path = Path(path)
+    arrays = read_ict_npz(path) if path.suffix == ".npz" else read_ict_checkout(path)
+    return build_ict_head(arrays, where=str(path))
+
+
+def read_ict_npz(path: Path) -> IctArrays:
+    """Read the arrays from one .npz (no pickled objects are accepted)."""
+    try:
+        with np.load(path, allow_pickle=False) as data:
+            missing = [key for key in _NPZ_KEYS if key not in data.files]
+            if missing:
+                raise HeadModelError(f"{path}: ICT .npz lacks {', '.join(missing)}")
+            names = [str(name) for name in data["materials"]]
+            return IctArrays(
+                template=data["v_template"].astype(np.float64),
+                shape_dirs=data["shapedirs"].astype(np.float32),
+                expression_dirs=data["exprdirs"].astype(np.float32),
+                expression_names=tuple(str(name) for name in data["expression_names"]),
+                faces=data["faces"].astype(np.int64),
+                uv=data["uv"].astype(np.float64),
+                uv_faces=data["uv_faces"].astype(np.int64),
+                face_material=np.array(names)[data["face_material"]],
+            )
+    except (OSError, ValueError, IndexError) as error:
+        raise HeadModelError(f"{path}: not a readable ICT .npz: {error}") from error
+
+
+def read_ict_checkout(path: Path) -> IctArrays:
+    """Read `generic_neutral_mesh.obj`, `identityNNN.obj` and the expression OBJ files."""
+    folder = path / "FaceXModel" if (path / "FaceXModel").is_dir() else path
+    neutral = folder / "generic_neutral_mesh.obj"
+    if not neutral.is_file():
+        raise HeadModelError(
+            f"{path}: no FaceXModel/generic_neutral_mesh.obj; expected a checkout of ICT-FaceKit"
+        )
+    template, uv, faces, uv_faces, material = read_obj(neutral)
+    others = sorted(file for file in folder.glob("*.obj") if file != neutral)
+    identities = [file for file in others if file.stem.startswith("identity")]
+    expressions = [file for file in others if not file.stem.startswith("identity")]
+    if not identities or not expressions:
+        raise HeadModelError(
+            f"{folder}: {len(identities)} identity and {len(expressions)} expression OBJ files; "
+            "expected identity000.obj ... and browDown_L.obj ..."
+        )
+    return IctArrays(
+        template=template,
+        shape_dirs=_offsets(identities, template),
+        expression_dirs=_offsets(expressions, template),
+        expression_names=tuple(file.stem for file in expressions),
+        faces=faces,
+        uv=uv,
+        uv_faces=uv_faces,
+        face_material=material,
+    )
+
+
+def read_obj(
+    path: Path,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Vertices (V,3), texture coordinates (T,2), triangles (F,3), their uv (F,3) and material (F,).
+
+    Polygons are cut into fans. Faces without texture coordinates get coordinate 0.
+    """
+    vertices: list[list[str]] = []
+    uv: list[list[str]] = []
+    corners: list[tuple[str, str, str]] = []
+    material, materials = "", []
+    try:
+        with path.open(encoding="utf-8") as lines:
+            for line in lines:
+                words = line.split()
+                if not words:
+                    continue
+                if words[0] == "v":
+                    vertices.append(words[1:4])
+                elif words[0] == "vt":
+                    uv.append(words[1:3])
+                elif words[0] == "usemtl":
+                    material = words[1]
+                elif words[0] == "f":
+                    for second, third in zip(words[2:-1], words[3:], strict=True):
+                        corners.append((words[1], second, third))
+                        materials.append(material)
+        index = np.array(
+            [[corner.split("/")[:2] + ["1"] for corner in face] for face in corners], dtype=object
+        )
+        faces = index[:, :, 0].astype(np.int64) - 1
+        uv_faces = np.where(index[:, :, 1] == "", "1", index[:, :, 1]).astype(np.int64) - 1
+        points = np.array(vertices, dtype=np.float64).reshape(-1, 3)
+        coordinates = np.array(uv or [["0", "0"]], dtype=np.float64)
+    except (OSError, ValueError, IndexError) as error:
+        raise HeadModelError(f"{path}: not a readable OBJ file: {error}") from error
+    return points, coordinates, faces, uv_faces, np.array(materials)
+
+
+def build_ict_head(arrays: IctArrays, where: str = "ICT") -> HeadModel:
+    """Turn the arrays into a HeadModel in metres with joints, skinning, landmarks and regions."""
+    if arrays.template.shape != (VERTEX_COUNT, 3):
+        raise HeadModelError(
+            f"{where}: template has shape {arrays.template.shape}, expected ({VERTEX_COUNT}, 3), "
+            "the topology of ICT-FaceKit's light model"
+        )
+    if "jawOpen" not in arrays.expression_names:
+        raise HeadModelError(f"{where}: no jawOpen expression; the jaw joint is derived from it")
+    template = arrays.template * METRES_PER_UNIT
+    regions = ict_regions(template, arrays.faces, arrays.uv_faces)
+    jaw_open = arrays.expression_names.index("jawOpen")
+    opened = arrays.expression_dirs[:, :, jaw_open].astype(np.float64) * METRES_PER_UNIT
+    joints, skinning = _rig(template, opened, regions)
+    shown = ~np.isin(arrays.face_material, _HIDDEN_MATERIALS)
+    landmark_faces, landmark_bary = _at_vertices(arrays.faces[shown], np.array(LANDMARKS))
+
+    def tensor(array: np.ndarray) -> torch.Tensor:
+        return torch.from_numpy(np.ascontiguousarray(array, dtype=np.float32))
+
+    return check_head(
+        HeadModel(
+            name="ict",
+            template=tensor(template),
+            shape_dirs=tensor(arrays.shape_dirs * METRES_PER_UNIT),
+            expression_dirs=tensor(arrays.expression_dirs * METRES_PER_UNIT),
+            pose_dirs=torch.zeros(9 * (len(PARENTS) - 1), VERTEX_COUNT * 3),
+            joint_regressor=tensor(_regressor(template, joints, regions)),
+            skinning=tensor(skinning),
+            faces=torch.from_numpy(arrays.faces[shown]),
+            uv=tensor(_pack_udim(arrays.uv, arrays.uv_faces)),
+            uv_faces=torch.from_numpy(arrays.uv_faces[shown]),
+            landmark_faces=torch.from_numpy(landmark_faces),
+            landmark_bary=tensor(landmark_bary),
+            shape_names=tuple(f"identity{i:03d}" for i in range(arrays.shape_dirs.shape[2])),
+            expression_names=arrays.expression_names,
+            regions={name: torch.from_numpy(mask) for name, mask in regions.items()},
+        )
+    )
+
+
+def _offsets(files: list[Path], template: np.ndarray) -> np.ndarray:
+    """Vertex offsets (V, 3, files) of OBJ files from the template."""
+    columns = []
+    for file in files:
+        lines = file.read_text(encoding="utf-8").splitlines()
+        try:
+            rows = np.array([line.split()[1:4] for line in lines if line.startswith("v ")], float)
+        except ValueError as error:
+            raise HeadModelError(f"{file}: not a readable OBJ file: {error}") from error
+        if rows.shape != template.shape:
+            raise HeadModelError(
+                f"{file}: {rows.shape[0]} vertices, expected {template.shape[0]} as in the neutral"
+            )
+        columns.append((rows - template).astype(np.float32))
+    return np.stack(columns, axis=2)
+
+
+def _rig(
+    template: np.ndarray, opened: np.ndarray, regions: dict[str, np.ndarray]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Joints (5, 3) and skinning (V, 5) for the template; `opened` is the jawOpen offset."""
+    height = template[:, 1]
+    chin = template[LANDMARKS[8]]
+    floor = height.min()
+    jaw_joint, jaw_weight = _jaw_rig(template, opened, regions["lower_teeth"])
+    neck_ring = np.abs(height - chin[1]) < 0.02
+    neck_ring &= regions["neck"] | regions["scalp"]
+    centre = template[neck_ring].mean(0) if neck_ring.any() else np.array([0.0, chin[1], 0.0])
+    neck_joint = np.array([0.0, chin[1], centre[2]])
+    root_joint = np.array([0.0, 0.5 * (floor + chin[1]), centre[2]])
+    # The neck's weight falls along a plane that rises to the nape, as a skull sits on a spine.
+    level = (height - 0.25 * (template[:, 2] - centre[2]) - floor) / (chin[1] - floor)
+    head = _smoothstep((level - 0.25) / 0.85)
+    head = np.where(regions["face"] | regions["mouth_interior"] | regions["teeth"], 1.0, head)
+    skinning = np.zeros((template.shape[0], 5))
+    skinning[:, 2] = jaw_weight * head
+    for column, side in ((3, "left_eyeball"), (4, "right_eyeball")):
+        skinning[regions[side]] = 0.0
+        skinning[regions[side], column] = 1.0
+    rest = head - skinning[:, 2:].sum(1)
+    skinning[:, 1] = np.clip(rest, 0.0, None)
+    skinning[:, 0] = 1.0 - skinning[:, 1:].sum(1)
+    eyes = [template[regions[side]].mean(0) for side in ("left_eyeball", "right_eyeball")]
+    return np.stack([root_joint, neck_joint, jaw_joint, *eyes]), skinning
+
+
+def _jaw_rig(
+    template: np.ndarray, opened: np.ndarray, lower_teeth: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Jaw hinge (3,) and weights (V,) that repeat what the jawOpen shape does.
+
+    The lower teeth are rigid: their motion in the y-z plane is a turn by some angle about a point
+    that stays in place, found by least squares of d = (R - I)(p - c). A vertex's weight is its own
+    motion over the motion of a rigid jaw at that place.
+    """
+    points, motion = template[lower_teeth][:, 1:], opened[lower_teeth][:, 1:]
+    centred = points - points.mean(0)
+    turn = np.linalg.lstsq(centred, motion - motion.mean(0), rcond=None)[0].T
+    angle = 0.5 * (turn[1, 0] - turn[0, 1])
+    if abs(angle) < 1e-4:
+        raise HeadModelError("ICT: jawOpen does not turn the lower teeth; cannot derive the jaw")
+    rotation = np.array([[np.cos(angle) - 1, -np.sin(angle)], [np.sin(angle), np.cos(angle) - 1]])
+    hinge = points.mean(0) - np.linalg.solve(rotation, motion.mean(0))
+    rigid = np.linalg.norm((template[:, 1:] - hinge) @ rotation.T, axis=1)
+    weight = np.linalg.norm(opened[:, 1:], axis=1) / np.maximum(rigid, 1e-3)
+    below = _smoothstep((hinge[0] + 0.03 - template[:, 1]) / 0.03)
+    return np.array([0.0, hinge[0], hinge[1]]), np.clip(weight, 0.0, 1.0) * below
+
+
+def _regressor(
+    template: np.ndarray, joints: np.ndarray, regions: dict[str, np.ndarray]
+) -> np.ndarray:
+    """Joint regressor (5, V): smallest-norm weights over nearby vertices that hit each joint."""
+    rows = np.zeros((5, template.shape[0]))
+    skin = ~(regions["teeth"] | regions["mouth_interior"] | regions["tongue"])
+    for row, joint in enumerate(joints):
+        side = {3: "left_eyeball", 4: "right_eyeball"}.get(row)
+        near = np.linalg.norm(template - joint, axis=1)
+        chosen = regions[side] if side else skin & (near <= np.sort(near[skin])[400])
+        system = np.vstack([template[chosen].T, np.ones(chosen.sum())])
+        uniform = np.full(chosen.sum(), 1.0 / chosen.sum())
+        target = np.append(joint, 1.0) - system @ uniform
+        rows[row, chosen] = uniform + np.linalg.lstsq(system, target, rcond=None)[0]
+    return rows
+
+
+def _pack_udim(uv: np.ndarray, uv_faces: np.ndarray) -> np.ndarray:
+    """Fold UDIM tiles into [0, 1]: tile 0 (the face) takes 3/4 of the side, others 1/4 each."""
+    packed = np.clip(uv, 0.0, None)
+    tile = np.minimum(np.floor(packed[:, 0]).astype(int), 7)
+    packed = packed - np.stack([tile, np.zeros_like(tile)], axis=1)
+    cells = [(0.75, 0.0), (0.75, 0.25), (0.75, 0.5), (0.75, 0.75)]
+    cells += [(0.0, 0.75), (0.25, 0.75), (0.5, 0.75)]
+    corner = np.array([(0.0, 0.0), *cells])[tile]
+    return np.clip(corner + packed * np.where(tile == 0, 0.75, 0.25)[:, None], 0.0, 1.0)
+
+
+def _at_vertices(faces: np.ndarray, vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Face ids (N,) and barycentrics (N, 3) that name mesh vertices (N,)."""
+    ids, bary = [], []
+    for vertex in vertices:
+        face, corner = (int(where[0]) for where in np.nonzero(faces == vertex))
+        ids.append(face)
+        bary.append(np.eye(3)[corner])
+    return np.array(ids, dtype=np.int64), np.array(bary)
+
+
+def _smoothstep(x: np.ndarray) -> np.ndarray:
+    """0 below 0, 1 above 1, smooth between."""
+    x = np.clip(x, 0.0, 1.0)
+    return x * x * (3.0 - 2.0 * x)

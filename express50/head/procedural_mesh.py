@@ -1,0 +1,133 @@
+"""Half-head mesh builder: vertices with tags, faces in UV charts; mirrored into the whole head.
+
+Parts are built on the subject's left (x >= 0, millimetres). A face's winding follows its chart:
+faces are turned so that their UV area is positive, and charts are laid out as seen from outside.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+Array = np.ndarray
+
+
+@dataclass
+class HalfMesh:
+    """Growing left half. tags name vertex indices, uv holds one (u, v) a vertex and chart."""
+
+    points: list[Array] = field(default_factory=list)
+    count: int = 0
+    tags: dict[str, Array] = field(default_factory=dict)
+    faces: dict[str, list[Array]] = field(default_factory=dict)
+    uv: dict[str, dict[int, tuple[float, float]]] = field(default_factory=dict)
+    labels: dict[int, tuple[float, float]] = field(default_factory=dict)  # see procedural_rays
+
+    def add(self, points: Array, tag: str = "") -> Array:
+        """Add vertices (N,3), return their indices; `tag` names them (appending to the tag)."""
+        index = np.arange(self.count, self.count + len(points))
+        self.points.append(np.asarray(points, float))
+        self.count += len(points)
+        if tag:
+            self.tags[tag] = np.concatenate([self.tags.get(tag, index[:0]), index])
+        return index
+
+    def set_uv(self, chart: str, index: Array, uv: Array) -> None:
+        """Set the chart's coordinates (N,2) of vertices `index`."""
+        store = self.uv.setdefault(chart, {})
+        for i, (u, v) in zip(index, uv, strict=True):
+            store[int(i)] = (float(u), float(v))
+
+    def label(self, index: Array, label: Array) -> None:
+        """Set azimuth (radians) and latitude (deg) (N,2) of skin vertices."""
+        for i, (azimuth, latitude) in zip(index, label, strict=True):
+            self.labels[int(i)] = (float(azimuth), float(latitude))
+
+    def add_faces(self, chart: str, faces: Array) -> None:
+        """Add triangles (N,3) to a chart; `set_uv` must cover their vertices before assembly."""
+        self.faces.setdefault(chart, []).append(np.asarray(faces, np.int64).reshape(-1, 3))
+
+    def strip(self, chart: str, inner: Array, outer: Array, closed: bool) -> None:
+        """Quads between two rows of equal length, split along the shorter diagonal."""
+        a, b = np.asarray(inner), np.asarray(outer)
+        if closed:
+            a, b = np.append(a, a[0]), np.append(b, b[0])
+        p = self.array()
+        first = np.linalg.norm(p[a[:-1]] - p[b[1:]], axis=1)
+        second = np.linalg.norm(p[a[1:]] - p[b[:-1]], axis=1)
+        quads = np.stack([a[:-1], a[1:], b[1:], b[:-1]], 1)
+        split = np.where(
+            (first <= second)[:, None, None],
+            quads[:, [[0, 1, 2], [0, 2, 3]]],
+            quads[:, [[0, 1, 3], [1, 2, 3]]],
+        )
+        faces = split.reshape(-1, 3)
+        degenerate = (
+            (faces[:, 0] == faces[:, 1])
+            | (faces[:, 1] == faces[:, 2])
+            | (faces[:, 0] == faces[:, 2])
+        )
+        self.add_faces(chart, faces[~degenerate])
+
+    def fan(self, chart: str, center: int, ring: Array, closed: bool) -> None:
+        """Triangles from one vertex to a row."""
+        a = np.append(ring, ring[0]) if closed else np.asarray(ring)
+        self.add_faces(chart, np.stack([np.full(len(a) - 1, center), a[:-1], a[1:]], 1))
+
+    def array(self) -> Array:
+        """All vertices (N,3)."""
+        return np.concatenate(self.points)
+
+
+@dataclass(frozen=True)
+class WholeMesh:
+    """Both halves: vertices (V,3) mm, faces (F,3), chart and UV of face corners, mirror map."""
+
+    vertices: Array
+    faces: Array
+    face_chart: Array  # (F,) names; right-hand charts of paired parts end in "_right"
+    corner_uv: Array  # (F,3,2) in the chart's own coordinates
+    mirror: Array  # (V,)
+    left_tags: dict[str, Array]
+
+    def tag(self, name: str, side: str = "both") -> Array:
+        """Indices of a tag: side "left" (x >= 0), "right" (mirrored, same order) or "both"."""
+        left = self.left_tags[name]
+        if side == "left":
+            return left
+        right = self.mirror[left]
+        return right if side == "right" else np.unique(np.concatenate([left, right]))
+
+
+def mirrored(half: HalfMesh, paired: tuple[str, ...]) -> WholeMesh:
+    """Mirror the half and weld it at x = 0. `paired` charts get a second island on the right."""
+    points = half.array()
+    on_plane = np.abs(points[:, 0]) < 1e-9
+    right = np.where(on_plane, np.arange(len(points)), 0)
+    right[~on_plane] = len(points) + np.arange((~on_plane).sum())
+    other = points[~on_plane] * [-1, 1, 1]
+    vertices = np.concatenate([points, other])
+    mirror = np.empty(len(vertices), int)
+    mirror[: len(points)] = right
+    mirror[right] = np.arange(len(points))
+    faces, charts, corners = [], [], []
+    for chart, blocks in half.faces.items():
+        block = np.concatenate(blocks)
+        uv = np.array([[half.uv[chart][int(i)] for i in face] for face in block])
+        e1, e2 = uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]
+        turned = e1[:, 0] * e2[:, 1] - e1[:, 1] * e2[:, 0] < 0
+        block[turned] = block[turned][:, ::-1]
+        uv[turned] = uv[turned][:, ::-1]
+        faces += [block, right[block][:, ::-1]]
+        corners += [uv, uv[:, ::-1] * [-1, 1]]
+        charts += [chart] * len(block)
+        charts += [chart + ("_right" if chart in paired else "")] * len(block)
+    return WholeMesh(
+        vertices=vertices,
+        faces=np.concatenate(faces),
+        face_chart=np.array(charts),
+        corner_uv=np.concatenate(corners),
+        mirror=mirror,
+        left_tags=dict(half.tags),
+    )
