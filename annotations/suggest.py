@@ -31,7 +31,7 @@ _CONTROL_GROUPS = {
     "eye": ("eye",),
     "nose": ("nose", "brow"),
     "nostril": ("nose",),
-    "cheek": ("mouth", "eye"),
+    "cheek": ("mouth",),
 }
 CROP = 48  # side of the aligned face, pixels
 _LANDMARK_FLOOR = 0.004  # of the face's size: what a still face moves by in the detector's eyes

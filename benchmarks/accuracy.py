@@ -1,0 +1,186 @@
+"""Errors of a dataset against the twin's ground truth. Opened after the stages have run, only here.
+
+A rig solved from a board lies in a world of its own: it is laid on the true one by one rigid motion
+a subject, fitted to the cameras; what is left of calibration error stays in every figure.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from express50.cameras import Camera, transform_camera
+from express50.errors import Express50Error
+from express50.frames import read_cameras_of, read_peaks
+from express50.images import contact_sheet, read_depth_png, read_image, write_image
+from express50.layout import Dataset
+from express50.twin.truth import Truth, align_worlds
+
+VIEWS_A_PEAK = 2  # views measured of every peak; they walk around the rig from peak to peak
+ERROR_RANGE_MM = 8.0  # white in the error pictures
+NEUTRAL = "neutral"
+
+
+def measure_dataset(dataset: Dataset, truth_root: Path, out: Path | None = None) -> dict:
+    """Every figure that the published stages allow, and error pictures below ``out``."""
+    truth = Truth(truth_root)
+    measures = {
+        "align": measure_align,
+        "matte": measure_matte,
+        "track": measure_track,
+        "depth": measure_depth,
+    }
+    figures: dict[str, float | int | None] = {}
+    for stage, measure in measures.items():
+        if dataset.stage_dir(stage).is_dir():
+            figures |= {f"{stage}.{k}": v for k, v in measure(dataset, truth, out).items()}
+    if out is not None:
+        out.mkdir(parents=True, exist_ok=True)
+        (out / "accuracy.json").write_text(json.dumps(figures, indent=1) + "\n")
+    return figures
+
+
+def measure_align(dataset: Dataset, truth: Truth, out: Path | None = None) -> dict:
+    """Frames between each label and the true peak; the neutral expression has none."""
+    errors = [
+        abs(frame - truth.peaks(subject)[expression])
+        for subject in dataset.subjects()
+        for expression, frame in read_peaks(dataset, subject).items()
+        if expression != NEUTRAL
+    ]
+    return {
+        "peak_error_frames_median": float(np.median(errors)),
+        "peak_error_frames_mean": round(float(np.mean(errors)), 3),
+        "within_1_frame": round(float(np.mean(np.array(errors) <= 1)), 3),
+        "labels": len(errors),
+    }
+
+
+def true_world_cameras(dataset: Dataset, truth: Truth, subject: str) -> dict[str, Camera]:
+    """The estimated pinhole cameras, moved into the true world."""
+    estimated = read_cameras_of(dataset, subject)
+    motion = align_worlds(estimated, truth.cameras(subject))
+    return {c: transform_camera(camera, motion) for c, camera in estimated.items()}
+
+
+def sampled_views(dataset: Dataset, truth: Truth) -> Iterator[tuple[str, str, int, Camera]]:
+    """(subject, expression, frame, camera in the true world), a few of every peak."""
+    turn = 0
+    for subject in dataset.subjects():
+        cameras = list(true_world_cameras(dataset, truth, subject).values())
+        for expression, frame in read_peaks(dataset, subject).items():
+            for _ in range(min(VIEWS_A_PEAK, len(cameras))):
+                yield subject, expression, frame, cameras[turn % len(cameras)]
+                turn += 3 if len(cameras) % 3 else 1
+
+
+def measure_matte(dataset: Dataset, truth: Truth, out: Path | None = None) -> dict:
+    """Mean absolute alpha error over whole images, and over the truth's uncertain rim alone."""
+    whole, rim, rows, names = [], [], [], []
+    for subject, expression, frame, camera in sampled_views(dataset, truth):
+        path = dataset.item_dir("matte", f"{subject}/{camera.id}") / f"{expression}.png"
+        if not path.is_file():
+            continue
+        alpha = read_image(path).astype(np.float64) / 255.0
+        true = truth.render_alpha(subject, frame, camera)
+        error = np.abs(alpha - true)
+        soft = (true > 0.02) & (true < 0.98)
+        whole.append(error.mean())
+        if soft.any():
+            rim.append(error[soft].mean())
+        rows.append([_grey(alpha), _grey(true), _grey(error)])
+        names.append(f"{subject} {expression} {camera.id}: alpha, truth, error")
+    _sheet(out, "matte_error", rows, names)
+    return {
+        "mae": float(np.mean(whole)),
+        "mae_rim": float(np.mean(rim)) if rim else None,
+        "views": len(whole),
+    }
+
+
+def measure_track(dataset: Dataset, truth: Truth, out: Path | None = None) -> dict:
+    """Root mean square distance between tracked and true vertices of the same topology."""
+    squares, medians = [], []
+    for subject in dataset.subjects():
+        path = dataset.item_dir("track", subject) / "track.npz"
+        if not path.is_file():
+            continue
+        motion = align_worlds(read_cameras_of(dataset, subject), truth.cameras(subject))
+        with np.load(path, allow_pickle=False) as track:
+            for vertices, frame in zip(track["vertices"], track["frames"], strict=True):
+                moved = vertices @ motion[:3, :3].T + motion[:3, 3]
+                true = truth.vertices(subject, int(frame))
+                if true.shape != moved.shape:
+                    raise Express50Error(
+                        f"{subject}: tracked {moved.shape[0]} vertices, the truth has"
+                        f" {true.shape[0]}; vertex errors need the twin's own head model"
+                    )
+                distance = np.linalg.norm(moved - true, axis=1)
+                squares.append(float((distance**2).mean()))
+                medians.append(float(np.median(distance)))
+    return {
+        "vertex_rmse_mm": 1e3 * float(np.sqrt(np.mean(squares))),
+        "vertex_median_mm": 1e3 * float(np.median(medians)),
+        "meshes": len(squares),
+    }
+
+
+def measure_depth(dataset: Dataset, truth: Truth, out: Path | None = None) -> dict:
+    """Absolute depth errors over pixels where both know the surface, and how many are covered."""
+    errors, covered, rows, names = [], [], [], []
+    for subject, expression, frame, camera in sampled_views(dataset, truth):
+        path = dataset.item_dir("depth", f"{subject}/{expression}") / f"{camera.id}.png"
+        if not path.is_file():
+            continue
+        depth, valid = read_depth_png(path)
+        true, true_valid = truth.render_depth(subject, frame, camera)
+        both = valid & true_valid
+        errors.append(1e3 * np.abs(depth - true)[both])
+        covered.append(both.sum() / max(1, true_valid.sum()))
+        rows.append(
+            [_depth_grey(depth, valid), _depth_grey(true, true_valid), _heat(depth - true, both)]
+        )
+        names.append(
+            f"{subject} {expression} {camera.id}: depth, truth, error to {ERROR_RANGE_MM:g} mm"
+        )
+    _sheet(out, "depth_error", rows, names)
+    every = np.concatenate(errors)
+    return {
+        "abs_error_mm_median": float(np.median(every)),
+        "abs_error_mm_p95": float(np.percentile(every, 95)),
+        "coverage": float(np.mean(covered)),
+        "views": len(errors),
+    }
+
+
+def _grey(image: np.ndarray) -> np.ndarray:
+    return np.rint(255 * np.clip(image, 0, 1)).astype(np.uint8)
+
+
+def _depth_grey(depth: np.ndarray, valid: np.ndarray) -> np.ndarray:
+    """Depth as grey, near is bright."""
+    if not valid.any():
+        return np.zeros(depth.shape, np.uint8)
+    low, high = np.percentile(depth[valid], [1, 99])
+    return _grey(np.where(valid, 1.0 - 0.8 * (depth - low) / max(1e-6, high - low), 0.0))
+
+
+def _heat(error_m: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """Signed error as colour: red in front of the truth, blue behind it."""
+    e = np.where(known, error_m * 1e3 / ERROR_RANGE_MM, 0.0)
+    colour = np.stack(
+        [1 - np.clip(e, 0, 1), 1 - np.abs(np.clip(e, -1, 1)), 1 + np.clip(e, -1, 0)], -1
+    )
+    return _grey(np.where(known[..., None], colour, 0.1))
+
+
+def _sheet(out: Path | None, name: str, rows: list, names: list[str]) -> None:
+    if out is None or not rows:
+        return
+    out.mkdir(parents=True, exist_ok=True)
+    step = max(1, len(rows) // 6)
+    sheet = contact_sheet(rows[::step][:6], names[::step][:6], tile=(240, 240))
+    write_image(out / f"{name}.jpg", sheet, quality=88)

@@ -1,0 +1,151 @@
+"""Sweep the presets of every measured stage: error against seconds, into docs/TRADEOFFS.md.
+
+``python -m benchmarks.tradeoff`` works on the demo's twin dataset (``make demo`` first). Each stage
+is run with each preset over the same upstream outputs, and measured against the truth.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import json
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+from benchmarks import accuracy
+from benchmarks.demo import STAGES
+from express50.layout import Dataset
+from express50.twin.truth import Truth
+
+PRESETS = ("draft", "standard", "reference")
+MEASURES = {
+    "align": (accuracy.measure_align, "peak_error_frames_mean"),
+    "matte": (accuracy.measure_matte, "mae"),
+    "track": (accuracy.measure_track, "vertex_rmse_mm"),
+    "depth": (accuracy.measure_depth, "abs_error_mm_median"),
+}
+
+
+def main() -> None:
+    """Run the sweep."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--base", type=Path, default=Path("build/demo"))
+    parser.add_argument("--out", type=Path, default=Path("build/tradeoff"))
+    parser.add_argument("--doc", type=Path, default=Path("docs/TRADEOFFS.md"))
+    parser.add_argument("--stages", nargs="+", default=list(MEASURES), choices=list(MEASURES))
+    args = parser.parse_args()
+    base = Dataset(args.base / "data" / "demo")
+    truth = Truth(args.base / "twin" / "truth")
+    if not base.captures_file.is_file():
+        sys.exit(f"{base.root}: no demo dataset; run 'make demo' first")
+    rows = [sweep_one(base, truth, stage, p, args.out) for stage in args.stages for p in PRESETS]
+    write_csv(rows, args.out / "tradeoff.csv")
+    plot(rows, args.doc.with_name("tradeoffs.png"))
+    args.doc.write_text(as_markdown(rows))
+    print(json.dumps({"rows": rows}))
+
+
+def sweep_one(base: Dataset, truth: Truth, stage: str, preset: str, out: Path) -> dict:
+    """Run one stage with one preset beside the base dataset; seconds an item and its error."""
+    dataset = Dataset(out / f"{stage}-{preset}")
+    dataset.root.mkdir(parents=True, exist_ok=True)
+    for name in ("captures.json", *STAGES[: STAGES.index(stage)]):
+        link = dataset.root / name
+        if not link.exists():
+            link.symlink_to((base.root / name).resolve())
+    command = [sys.executable, "-m", "express50.cli", stage, str(dataset.root), "--preset", preset]
+    start = time.perf_counter()
+    done = subprocess.run(
+        [*command, "--workers", "0", "--json"], stdout=subprocess.PIPE, check=False
+    )
+    seconds = time.perf_counter() - start
+    if done.returncode == 2:
+        sys.exit(f"tradeoff: {stage} {preset} did not start; see the line above")
+    measure, key = MEASURES[stage]
+    figures = measure(dataset, truth)
+    items = len(list(dataset.stage_dir(stage).rglob("metrics.json")))
+    return {
+        "stage": stage,
+        "preset": preset,
+        "seconds_per_item": round(seconds / max(1, items), 3),
+        "measure": key,
+        "error": round(float(figures[key]), 4),
+        "items": items,
+    }
+
+
+def pareto(rows: list[dict]) -> set[tuple[str, str]]:
+    """(stage, preset) that no other preset of the stage beats in both seconds and error."""
+    return {
+        (a["stage"], a["preset"])
+        for a in rows
+        if not any(
+            b["stage"] == a["stage"]
+            and b is not a
+            and b["seconds_per_item"] <= a["seconds_per_item"]
+            and b["error"] <= a["error"]
+            and (b["seconds_per_item"], b["error"]) != (a["seconds_per_item"], a["error"])
+            for b in rows
+        )
+    }
+
+
+def write_csv(rows: list[dict], path: Path) -> None:
+    """The rows as a table for machines."""
+    with path.open("w", newline="") as file:
+        writer = csv.DictWriter(file, list(rows[0]))
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+def plot(rows: list[dict], path: Path) -> None:
+    """Error against seconds, one panel a stage."""
+    import matplotlib as mpl
+
+    mpl.use("Agg")
+    from matplotlib import pyplot
+
+    stages = list(dict.fromkeys(r["stage"] for r in rows))
+    figure, panels = pyplot.subplots(
+        1, len(stages), figsize=(3.2 * len(stages), 2.8), squeeze=False
+    )
+    for axes, stage in zip(panels[0], stages, strict=True):
+        own = [r for r in rows if r["stage"] == stage]
+        axes.plot(
+            [r["seconds_per_item"] for r in own], [r["error"] for r in own], "o-", color="#2457a6"
+        )
+        for r in own:
+            axes.annotate(r["preset"], (r["seconds_per_item"], r["error"]), fontsize=8)
+        axes.set_title(f"{stage}: {own[0]['measure'].replace('_', ' ')}", fontsize=9)
+        axes.set_xlabel("seconds an item", fontsize=8)
+        axes.spines[["top", "right"]].set_visible(False)
+    figure.tight_layout()
+    figure.savefig(path, dpi=110)
+
+
+def as_markdown(rows: list[dict]) -> str:
+    """The document."""
+    front = pareto(rows)
+    lines = [
+        "# Speed against accuracy",
+        "",
+        "Made by `make tradeoff` on the demo's synthetic captures (4 subjects, 8 cameras, 320 px),"
+        " one process, against ground truth. Seconds include starting the command. A star marks"
+        " what no other preset of the stage beats in both.",
+        "",
+        "| stage | preset | seconds an item | error | measure | |",
+        "|---|---|---|---|---|---|",
+    ]
+    for r in rows:
+        star = "*" if (r["stage"], r["preset"]) in front else ""
+        lines.append(
+            f"| {r['stage']} | {r['preset']} | {r['seconds_per_item']:g} | {r['error']:g} |"
+            f" {r['measure']} | {star} |"
+        )
+    return "\n".join([*lines, "", "![error against seconds](tradeoffs.png)", ""])
+
+
+if __name__ == "__main__":
+    main()

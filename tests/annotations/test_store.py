@@ -1,0 +1,113 @@
+"""The label store: nothing is lost, people stand above suggestions, undo is a record."""
+
+import json
+import multiprocessing
+import time
+
+import pytest
+
+from annotations.store import (
+    AUTOMATIC,
+    Label,
+    append_label,
+    current_labels,
+    human_digest,
+    make_mark,
+    read_labels,
+)
+from express50.errors import AnnotationError
+from express50.index import CameraSource, Cue, Index
+from express50.layout import Dataset
+
+
+def _index(tmp_path):
+    source = CameraSource(
+        kind="frames", source="cameras/a/frames", width=8, height=8, frames=10,
+        pts=tuple(range(0, 100, 10)), dhash=tuple(f"{i:016x}" for i in range(10)), sha256="0",
+    )  # fmt: skip
+    return Index(
+        subject="S1", capture=tmp_path, fps=24.0, cameras={"a": source}, plates={}, board=None,
+        calibration=None, cues=(Cue("smile", 2, 6),),
+    )  # fmt: skip
+
+
+def _mark(frame, annotator, when):
+    return Label(
+        subject="S1", expression="smile", action="mark", annotator=annotator, time=when, frame=frame
+    )
+
+
+def test_a_mark_carries_the_frames_identity(tmp_path):
+    mark = make_mark(_index(tmp_path), "smile", 4, "a", "ann")
+    assert (mark.pts, mark.dhash) == (40, f"{4:016x}")
+    dataset = Dataset(tmp_path)
+    append_label(dataset, mark)
+    assert read_labels(dataset, "S1") == [mark]
+
+
+@pytest.mark.parametrize(
+    ("expression", "frame", "camera", "message"),
+    [("frown", 4, "a", "frown"), ("smile", 7, "a", "2 to 6"), ("smile", 4, "z", "no camera 'z'")],
+)
+def test_a_mark_that_points_nowhere_is_refused(tmp_path, expression, frame, camera, message):
+    with pytest.raises(AnnotationError, match=message):
+        make_mark(_index(tmp_path), expression, frame, camera, "ann")
+
+
+def test_a_person_stands_above_a_later_suggestion():
+    labels = [_mark(3, "ann", 1.0), _mark(5, AUTOMATIC, 2.0)]
+    assert current_labels(labels)["smile"].frame == 3
+    assert current_labels(reversed(labels))["smile"].frame == 3
+
+
+def test_the_later_of_two_people_stands_and_undo_brings_the_former_back():
+    labels = [_mark(3, "ann", 1.0), _mark(5, "bob", 2.0), _mark(6, "bob", 3.0)]
+    assert current_labels(labels)["smile"].frame == 6
+    undo = Label(subject="S1", expression="smile", action="undo", annotator="bob", time=4.0)
+    assert current_labels([*labels, undo])["smile"].frame == 5
+    assert current_labels([*labels, undo, undo])["smile"].frame == 3
+    assert current_labels([*labels, undo, undo, undo])["smile"].frame == 3
+
+
+def test_automatic_labels_do_not_change_the_human_digest(tmp_path):
+    dataset = Dataset(tmp_path)
+    before = human_digest(dataset, "S1")
+    append_label(dataset, _mark(3, AUTOMATIC, time.time()))
+    assert human_digest(dataset, "S1") == before
+    append_label(dataset, _mark(3, "ann", time.time()))
+    assert human_digest(dataset, "S1") != before
+
+
+def test_a_torn_line_loses_nothing_else(tmp_path):
+    dataset = Dataset(tmp_path)
+    append_label(dataset, _mark(3, "ann", 1.0))
+    with dataset.labels_file("S1").open("a") as file:
+        file.write('{"subject": "S1", "expre')
+    append_label(dataset, _mark(4, "ann", 2.0))
+    assert [label.frame for label in read_labels(dataset, "S1")] == [3, 4]
+
+
+def test_a_line_that_is_no_event_is_named(tmp_path):
+    dataset = Dataset(tmp_path)
+    append_label(dataset, _mark(3, "ann", 1.0))
+    with dataset.labels_file("S1").open("a") as file:
+        file.write(json.dumps({"subject": "S1"}) + "\n")
+    with pytest.raises(AnnotationError, match="line 2"):
+        read_labels(dataset, "S1")
+
+
+def _append_many(root, annotator):
+    for number in range(50):
+        append_label(Dataset(root), _mark(number, annotator, float(number)))
+
+
+def test_annotators_at_once_lose_nothing(tmp_path):
+    context = multiprocessing.get_context("fork")
+    workers = [context.Process(target=_append_many, args=(tmp_path, f"a{i}")) for i in range(3)]
+    for worker in workers:
+        worker.start()
+    for worker in workers:
+        worker.join()
+    labels = read_labels(Dataset(tmp_path), "S1")
+    for i in range(3):
+        assert [x.frame for x in labels if x.annotator == f"a{i}"] == list(range(50))
