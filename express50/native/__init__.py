@@ -1,17 +1,69 @@
 """The native library: C++ behind a plain C ABI, loaded through ctypes. This file is light.
 
-``setup.py`` compiles one source into one shared object for each instruction set of ``build.VARIANTS``;
+``setup.py`` compiles one source into one shared object for each instruction set of ``build.py``;
 at run time the best one that this processor understands is opened.
 """
 
 from __future__ import annotations
 
+import ctypes
+from functools import cache
+
+from express50.native.build import HERE, VARIANTS, library_file, source_digest
+
+MEND = "build it with `python -m express50.native.build` (needs g++) or reinstall the package"
+
+
+class NativeLibraryError(RuntimeError):
+    """The native library is missing, stale or does not load."""
+
 
 def available() -> bool:
     """Whether the native library can be loaded on this machine."""
-    return False
+    return not why_missing()
 
 
+@cache
 def why_missing() -> str:
     """One line on why the library cannot be loaded and how to mend it; empty when it can."""
-    return "the native library was not built; run `python -m express50.native.build`"
+    try:
+        load()
+    except NativeLibraryError as error:
+        return str(error)
+    return ""
+
+
+@cache
+def load(variant: str | None = None) -> ctypes.CDLL:
+    """The shared library of ``variant``, or the best that was built and this processor can run.
+
+    Raises:
+        NativeLibraryError: it was not built, is older than its source or does not load.
+    """
+    if variant is not None:
+        return _open(variant)
+    # The baseline variant runs anywhere and tells what the processor can do.
+    level = _open("baseline").native_level()
+    for name in reversed(list(VARIANTS)[: level + 1]):
+        if library_file(name).exists():
+            return _open(name)
+    raise NativeLibraryError(f"no native library in {HERE}; {MEND}")
+
+
+def _open(variant: str) -> ctypes.CDLL:
+    """Open one variant and compare its digest with the sources, where they are installed too."""
+    path = library_file(variant)
+    if not path.exists():
+        raise NativeLibraryError(f"the native library {path.name} was not built; {MEND}")
+    try:
+        library = ctypes.CDLL(str(path))
+    except OSError as error:
+        raise NativeLibraryError(f"the native library does not load: {error}; {MEND}") from error
+    library.native_digest.restype = ctypes.c_char_p
+    try:
+        expected = source_digest()
+    except FileNotFoundError:  # installed without its sources: nothing to compare with
+        return library
+    if library.native_digest().decode() != expected:
+        raise NativeLibraryError(f"the native library {path.name} is older than its source; {MEND}")
+    return library

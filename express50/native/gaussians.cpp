@@ -1,0 +1,306 @@
+// Differentiable rasterisation of 3D Gaussians on the CPU, behind a plain C ABI.
+//
+// forward:  gaussians_project -> gaussians_bin -> gaussians_forward
+// backward: gaussians_backward
+// The caller owns all memory (grmm/rasterize/cpu.py). Every sum is taken in an order that does not
+// depend on the number of threads: tiles write records of their own, which are then added for each
+// Gaussian by ascending tile, so images and gradients are the same bits on any number of threads.
+#include <cstdint>
+#include <type_traits>
+#include <vector>
+
+#include "blend.h"
+
+namespace {
+
+constexpr int64_t kChunk = 256;  // Gaussians whose camera gradients are added up together
+
+int tile_columns(const Camera& cam) { return (cam.width + kTile - 1) / kTile; }
+int tile_rows(const Camera& cam) { return (cam.height + kTile - 1) / kTile; }
+
+TileFrame tile_frame(const Camera& cam, int64_t tile) {
+    TileFrame f;
+    f.left = int(tile % tile_columns(cam)) * kTile;
+    f.top = int(tile / tile_columns(cam)) * kTile;
+    f.width = std::min(kTile, cam.width - f.left);
+    f.height = std::min(kTile, cam.height - f.top);
+    return f;
+}
+
+// Pixels [first, last) of one axis whose centres lie within `extent` of `mean`, with a margin for
+// the rounding of the mean to Real.
+void pixel_range(double mean, double extent, int size, int32_t& first, int32_t& last) {
+    const double reach = extent + 0.01 + 1e-6 * std::abs(mean);
+    first = int32_t(std::clamp(std::ceil(mean - reach - 0.5), 0.0, double(size)));
+    last = int32_t(std::clamp(std::floor(mean + reach - 0.5) + 1, 0.0, double(size)));
+}
+
+template <class Real>
+int64_t project(const Camera& cam, int64_t n, const Real* means, const Real* quats,
+                const Real* scales, const Real* opacities, Splat<Real>* splats, Real* depths,
+                Box* boxes) {
+    int64_t entries = 0;
+#pragma omp parallel for num_threads(cam.threads) schedule(static) reduction(+ : entries)
+    for (int64_t i = 0; i < n; ++i) {
+        Projected g;
+        boxes[i] = Box{0, 0, 0, 0};
+        depths[i] = 0;
+        project_one(cam, means + 3 * i, quats + 4 * i, scales + 3 * i, opacities[i], g);
+        if (!g.front || g.opacity < kAlphaMin) continue;
+        const double level = std::log(g.opacity / kAlphaMin), e = cam.eps2d;
+        Box box;
+        pixel_range(g.mean2d[0], std::sqrt(2 * level * (g.xx + e)), cam.width, box.x0, box.x1);
+        pixel_range(g.mean2d[1], std::sqrt(2 * level * (g.yy + e)), cam.height, box.y0, box.y1);
+        if (box.empty()) continue;
+        boxes[i] = box;
+        depths[i] = Real(g.p[2]);
+        const double root = std::sqrt(0.5 * g.A);
+        // 1 / (yy + e) is what remains of C after the first column of the Cholesky factor.
+        splats[i] = Splat<Real>{Real(g.mean2d[0]), Real(g.mean2d[1]), Real(root),
+                                Real(0.5 * g.B / root), Real(std::sqrt(0.5 / (g.yy + e))),
+                                Real(g.opacity), Real(level + 1e-3), Real(g.length),
+                                Real(g.slope[0]), Real(g.slope[1])};
+        entries += box.tiles();
+    }
+    return entries;
+}
+
+// Calls f(std::integral_constant<int, CV>) with the layout that fits the number of channels:
+// -1 planar, 1..6 channel vectors known to the compiler, 0 any number.
+template <class Real, class F> void with_layout(int channels, F&& f) {
+    if (channels <= kPlanarMax) return f(std::integral_constant<int, -1>{});
+    switch (channel_vectors<Real>(channels)) {
+        case 1: return f(std::integral_constant<int, 1>{});
+        case 2: return f(std::integral_constant<int, 2>{});
+        case 3: return f(std::integral_constant<int, 3>{});
+        case 4: return f(std::integral_constant<int, 4>{});
+        case 5: return f(std::integral_constant<int, 5>{});
+        case 6: return f(std::integral_constant<int, 6>{});
+        default: return f(std::integral_constant<int, 0>{});
+    }
+}
+
+// Visits the channels of every pixel of a tile as visit(index in w.pixels, index in the image).
+template <class Real, class Visit>
+void for_each_value(const Workspace<Real>& w, const Camera& cam, const TileFrame& tile,
+                    Visit&& visit) {
+    for (int y = 0; y < tile.height; ++y)
+        for (int x = 0; x < tile.width; ++x) {
+            const int64_t pixel = int64_t(tile.top + y) * cam.width + tile.left + x;
+            const size_t at = size_t(y) * kTile + x;
+            for (int c = 0; c < w.channels; ++c)
+                visit(w.planar() ? size_t(c) * kPixels + at : at * w.stride + c,
+                      pixel * w.channels + c, at, c);
+        }
+}
+
+template <class Real>
+int64_t forward(const Camera& cam, int channels, const Splat<Real>* splats, const Box* boxes,
+                const Real* colors, const Real* background, const int64_t* starts, int32_t* ids,
+                int32_t* used, Real* image, Real* weighted, Real* alpha) {
+    const int64_t tiles = int64_t(tile_columns(cam)) * tile_rows(cam);
+    int64_t records = 0;
+#pragma omp parallel num_threads(cam.threads) reduction(+ : records)
+    {
+        Workspace<Real> w(channels);
+#pragma omp for schedule(dynamic)
+        for (int64_t i = 0; i < tiles; ++i) {
+            const TileFrame tile = tile_frame(cam, i);
+            with_layout<Real>(channels, [&](auto layout) {
+                used[i] = blend_tile<Real, decltype(layout)::value>(
+                    w, tile, splats, boxes, colors, ids + starts[i], starts[i + 1] - starts[i]);
+            });
+            records += used[i];
+            for (int y = 0; y < tile.height; ++y) {
+                const int64_t row = int64_t(tile.top + y) * cam.width + tile.left;
+                std::copy_n(w.alpha + y * kTile, tile.width, alpha + row);
+                std::copy_n(w.weighted + y * kTile, tile.width, weighted + row);
+            }
+            for_each_value(w, cam, tile, [&](size_t from, int64_t to, size_t at, int c) {
+                image[to] = w.pixels[from] +
+                            (background ? (Real(1) - w.alpha[at]) * background[c] : Real(0));
+            });
+        }
+    }
+    return records;
+}
+
+// Gradients of the pixels of one tile, in the layout of the workspace. The alpha image and the
+// background share a slot: both see the sum of the weights.
+template <class Real>
+void load_gradients(Workspace<Real>& w, const Camera& cam, const TileFrame& tile,
+                    const Real* background, const Real* d_image, const Real* d_weighted,
+                    const Real* d_alpha) {
+    std::fill(w.pixels.begin(), w.pixels.end(), Real(0));
+    std::fill(w.alpha, w.alpha + kPixels, Real(0));
+    std::fill(w.weighted, w.weighted + kPixels, Real(0));
+    for (int y = 0; y < tile.height; ++y) {
+        const int64_t row = int64_t(tile.top + y) * cam.width + tile.left;
+        if (d_alpha) std::copy_n(d_alpha + row, tile.width, w.alpha + y * kTile);
+        if (d_weighted) std::copy_n(d_weighted + row, tile.width, w.weighted + y * kTile);
+    }
+    if (!d_image) return;
+    for_each_value(w, cam, tile, [&](size_t to, int64_t from, size_t at, int c) {
+        w.pixels[to] = d_image[from];
+        if (background) w.alpha[at] -= d_image[from] * background[c];
+    });
+}
+
+// For each Gaussian the numbers of its records, by ascending tile.
+struct RecordIndex {
+    std::vector<int64_t> first;  // n + 1
+    std::vector<int32_t> records;
+
+    RecordIndex(int64_t n, int64_t tiles, const int64_t* starts, const int32_t* ids,
+                const int32_t* used)
+        : first(n + 1, 0) {
+        for (int64_t t = 0; t < tiles; ++t)
+            for (int32_t k = 0; k < used[t]; ++k) ++first[ids[starts[t] + k] + 1];
+        for (int64_t i = 0; i < n; ++i) first[i + 1] += first[i];
+        records.resize(first[n]);
+        std::vector<int64_t> cursor(first.begin(), first.end() - 1);
+        int32_t record = 0;
+        for (int64_t t = 0; t < tiles; ++t)
+            for (int32_t k = 0; k < used[t]; ++k) records[cursor[ids[starts[t] + k]]++] = record++;
+    }
+};
+
+// Gradient by the projected Gaussian from its summed moments.
+template <class Real>
+SplatGradient splat_gradient(const Projected& g, const double* m) {
+    SplatGradient d;
+    d.mean2d[0] = -(g.A * m[1] + g.B * m[2]) - g.slope[0] * m[6];
+    d.mean2d[1] = -(g.B * m[1] + g.C * m[2]) - g.slope[1] * m[6];
+    d.conic[0] = 0.5 * m[3], d.conic[1] = m[4], d.conic[2] = 0.5 * m[5];
+    d.opacity = -m[0] / g.opacity;
+    d.length = m[6], d.slope[0] = m[7], d.slope[1] = m[8];
+    return d;
+}
+
+template <class Real> struct Scene {
+    int64_t n;
+    int channels;
+    const Real *means, *quats, *scales, *opacities;
+};
+
+template <class Real> struct SceneGradient {
+    Real *means, *quats, *scales, *opacities, *colors;
+};
+
+// Adds up the records of one Gaussian and takes them through the projection.
+template <class Real>
+void finish_gaussian(const Camera& cam, const Scene<Real>& scene, int64_t i,
+                     const RecordIndex& index, const Real* color_records,
+                     const Moments<Real>* moments, const SceneGradient<Real>& out,
+                     CameraGradient& d_cam) {
+    const int channels = scene.channels;
+    Real* color = out.colors + i * channels;
+    std::fill(color, color + channels, Real(0));
+    double m[9] = {}, mean[3] = {}, quat[4] = {}, scale[3] = {}, opacity = 0;
+    for (int64_t k = index.first[i]; k < index.first[i + 1]; ++k) {
+        const Real* record = color_records + int64_t(index.records[k]) * channels;
+        for (int c = 0; c < channels; ++c) color[c] += record[c];
+        const Real* values = &moments[index.records[k]].s;
+        for (int j = 0; j < 9; ++j) m[j] += values[j];
+    }
+    if (index.first[i] < index.first[i + 1]) {
+        Projected g;
+        project_one(cam, scene.means + 3 * i, scene.quats + 4 * i, scene.scales + 3 * i,
+                    scene.opacities[i], g);
+        project_gradient(cam, scene.means + 3 * i, scene.scales + 3 * i, scene.opacities[i], g,
+                         splat_gradient<Real>(g, m), mean, quat, scale, &opacity, d_cam);
+    }
+    std::copy_n(mean, 3, out.means + 3 * i);
+    std::copy_n(quat, 4, out.quats + 4 * i);
+    std::copy_n(scale, 3, out.scales + 3 * i);
+    out.opacities[i] = Real(opacity);
+}
+
+template <class Real>
+void backward(const Camera& cam, const Scene<Real>& scene, const Splat<Real>* splats,
+              const Box* boxes, const Real* colors, const Real* background, const int64_t* starts,
+              const int32_t* ids, const int32_t* used, const Real* d_image,
+              const Real* d_weighted, const Real* d_alpha, Real* color_records,
+              Moments<Real>* moments, const SceneGradient<Real>& out, CameraGradient* d_cam) {
+    const int64_t tiles = int64_t(tile_columns(cam)) * tile_rows(cam), n = scene.n;
+    std::vector<int64_t> first_record(tiles + 1, 0);
+    for (int64_t i = 0; i < tiles; ++i) first_record[i + 1] = first_record[i] + used[i];
+#pragma omp parallel num_threads(cam.threads)
+    {
+        Workspace<Real> w(scene.channels);
+#pragma omp for schedule(dynamic)
+        for (int64_t i = 0; i < tiles; ++i) {
+            if (!used[i]) continue;
+            const TileFrame tile = tile_frame(cam, i);
+            load_gradients(w, cam, tile, background, d_image, d_weighted, d_alpha);
+            with_layout<Real>(scene.channels, [&](auto layout) {
+                blend_tile_gradient<Real, decltype(layout)::value>(
+                    w, tile, splats, boxes, colors, ids + starts[i], used[i],
+                    color_records + first_record[i] * scene.channels, moments + first_record[i]);
+            });
+        }
+    }
+    const RecordIndex index(n, tiles, starts, ids, used);
+    const int64_t chunks = (n + kChunk - 1) / kChunk;
+    std::vector<CameraGradient> partial(chunks, CameraGradient{});
+#pragma omp parallel for num_threads(cam.threads) schedule(dynamic)
+    for (int64_t chunk = 0; chunk < chunks; ++chunk)
+        for (int64_t i = chunk * kChunk; i < std::min(n, (chunk + 1) * kChunk); ++i)
+            finish_gaussian(cam, scene, i, index, color_records, moments, out, partial[chunk]);
+    double* total = &d_cam->fx;
+    for (const CameraGradient& part : partial)
+        for (int k = 0; k < 16; ++k) total[k] += (&part.fx)[k];
+}
+
+}  // namespace
+
+#define EXPRESS50_EXPORT extern "C" __attribute__((visibility("default")))
+
+#define EXPRESS50_GAUSSIANS(Real, suffix)                                                         \
+    EXPRESS50_EXPORT int64_t gaussians_project_##suffix(                                          \
+        const Camera* cam, int64_t n, const Real* means, const Real* quats, const Real* scales,   \
+        const Real* opacities, Splat<Real>* splats, Real* depths, Box* boxes) {                   \
+        return project<Real>(*cam, n, means, quats, scales, opacities, splats, depths, boxes);    \
+    }                                                                                             \
+    EXPRESS50_EXPORT void gaussians_bin_##suffix(const Camera* cam, int64_t n,                    \
+                                                 const Real* depths, const Box* boxes,            \
+                                                 int64_t* starts, int32_t* ids) {                 \
+        bin_into_tiles<Real>(n, depths, boxes, tile_columns(*cam), tile_rows(*cam), starts, ids); \
+    }                                                                                             \
+    EXPRESS50_EXPORT int64_t gaussians_forward_##suffix(                                          \
+        const Camera* cam, int64_t channels, const Splat<Real>* splats, const Box* boxes,             \
+        const Real* colors, const Real* background, const int64_t* starts, int32_t* ids,          \
+        int32_t* used, Real* image, Real* weighted, Real* alpha) {                                \
+        return forward<Real>(*cam, int(channels), splats, boxes, colors, background, starts, ids,      \
+                             used, image, weighted, alpha);                                       \
+    }                                                                                             \
+    EXPRESS50_EXPORT void gaussians_backward_##suffix(                                            \
+        const Camera* cam, int64_t n, int64_t channels, const Real* means, const Real* quats,        \
+        const Real* scales, const Real* opacities, const Splat<Real>* splats, const Box* boxes,   \
+        const Real* colors, const Real* background, const int64_t* starts, const int32_t* ids,    \
+        const int32_t* used, const Real* d_image, const Real* d_weighted, const Real* d_alpha,    \
+        Real* color_records, Moments<Real>* moments, Real* d_means, Real* d_quats,                \
+        Real* d_scales, Real* d_opacities, Real* d_colors, CameraGradient* d_cam) {               \
+        backward<Real>(*cam, {n, int(channels), means, quats, scales, opacities}, splats, boxes,       \
+                       colors, background, starts, ids, used, d_image, d_weighted, d_alpha,       \
+                       color_records, moments,                                                    \
+                       {d_means, d_quats, d_scales, d_opacities, d_colors}, d_cam);               \
+    }
+
+EXPRESS50_GAUSSIANS(float, f32)
+EXPRESS50_GAUSSIANS(double, f64)
+
+// Which source this library was compiled from, so that a stale one is noticed.
+EXPRESS50_EXPORT const char* native_digest() { return EXPRESS50_DIGEST; }
+
+// Instruction sets of this processor that a variant exists for: 2 AVX-512, 1 AVX2 with FMA, 0 none.
+EXPRESS50_EXPORT int native_level() {
+#if defined(__x86_64__)
+    __builtin_cpu_init();
+    if (__builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512dq") &&
+        __builtin_cpu_supports("avx512bw") && __builtin_cpu_supports("avx512vl"))
+        return 2;
+    if (__builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma")) return 1;
+#endif
+    return 0;
+}
