@@ -1,0 +1,206 @@
+"""The ChArUco board: what `board.toml` says of it, and where its corners are in the footage.
+
+Corner positions leave this file in the project's pixels (origin at the corner of the first
+pixel); OpenCV reports them from that pixel's centre.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from express50.adapters import opencv_pixels_to_corner
+from express50.errors import CalibrationError
+from express50.frames import read_srgb8
+
+REQUIRED = ("squares_x", "squares_y", "square_length_m", "marker_length_m", "dictionary")
+
+
+@dataclass(frozen=True)
+class Board:
+    """A flat ChArUco board; `legacy_pattern` is the layout OpenCV printed before version 4.6."""
+
+    squares_x: int
+    squares_y: int
+    square_length_m: float
+    marker_length_m: float
+    dictionary: str
+    legacy_pattern: bool = False
+
+
+@dataclass(frozen=True)
+class Observations:
+    """Board corners seen in images, one row each.
+
+    `camera` and `frame` (N,) index into `cameras` and `frames`, `corner` (N,) is the corner's id
+    on the board and `pixels` (N, 2) its position.
+    """
+
+    cameras: tuple[str, ...]
+    frames: tuple[str, ...]
+    camera: np.ndarray
+    frame: np.ndarray
+    corner: np.ndarray
+    pixels: np.ndarray
+
+    def select(self, keep: np.ndarray) -> Observations:
+        """Return the rows where `keep` (N,) is true, with the same camera and frame numbers."""
+        return Observations(
+            self.cameras,
+            self.frames,
+            self.camera[keep],
+            self.frame[keep],
+            self.corner[keep],
+            self.pixels[keep],
+        )
+
+
+def board_from_table(table: Mapping[str, object], where: str) -> Board:
+    """Build the board that a parsed `board.toml` describes; `where` names the file in errors."""
+    missing = [key for key in REQUIRED if key not in table]
+    if missing:
+        raise CalibrationError(
+            f"{where}: {', '.join(missing)} is missing; board.toml needs {', '.join(REQUIRED)}"
+        )
+    try:
+        board = Board(
+            squares_x=int(table["squares_x"]),  # type: ignore[call-overload]
+            squares_y=int(table["squares_y"]),  # type: ignore[call-overload]
+            square_length_m=float(table["square_length_m"]),  # type: ignore[arg-type]
+            marker_length_m=float(table["marker_length_m"]),  # type: ignore[arg-type]
+            dictionary=str(table["dictionary"]),
+            legacy_pattern=bool(table.get("legacy_pattern", False)),
+        )
+    except (TypeError, ValueError) as error:
+        raise CalibrationError(
+            f"{where}: a value has the wrong kind ({error}); counts are integers, lengths metres"
+        ) from error
+    _check_board(board, where)
+    return board
+
+
+def _check_board(board: Board, where: str) -> None:
+    if min(board.squares_x, board.squares_y) < 3:
+        raise CalibrationError(
+            f"{where}: squares are {board.squares_x} x {board.squares_y}, expected at least 3 x 3"
+        )
+    lengths = (board.marker_length_m, board.square_length_m)
+    if not all(math.isfinite(length) for length in lengths) or not 0 < lengths[0] < lengths[1]:
+        raise CalibrationError(
+            f"{where}: marker_length_m {lengths[0]} and square_length_m {lengths[1]}: expected "
+            "0 < marker < square; measure the print and write both in metres"
+        )
+    if not isinstance(getattr(cv2.aruco, board.dictionary, None), int):
+        raise CalibrationError(
+            f"{where}: dictionary is {board.dictionary!r}; expected a name of OpenCV's, such as "
+            "DICT_4X4_50"
+        )
+    codes = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, board.dictionary)).bytesList
+    needed = board.squares_x * board.squares_y // 2
+    if len(codes) < needed:
+        raise CalibrationError(
+            f"{where}: a {board.squares_x} x {board.squares_y} board needs {needed} markers, but "
+            f"{board.dictionary} has {len(codes)}; name the dictionary it was printed with"
+        )
+
+
+def opencv_board(board: Board) -> cv2.aruco.CharucoBoard:
+    """Return OpenCV's object for this board (it draws, detects and lists corners)."""
+    dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, board.dictionary))
+    size = (board.squares_x, board.squares_y)
+    made = cv2.aruco.CharucoBoard(size, board.square_length_m, board.marker_length_m, dictionary)
+    made.setLegacyPattern(board.legacy_pattern)
+    return made
+
+
+def board_points(board: Board) -> np.ndarray:
+    """Inner corners (N, 3) in the board's own space: metres, x right, y down, z into the board.
+
+    Corner `i` of OpenCV's detector is row `i`: row by row from the print's top left.
+    """
+    across, down = board.squares_x - 1, board.squares_y - 1
+    ids = np.arange(across * down)
+    columns, rows = ids % across + 1, ids // across + 1
+    return np.column_stack([columns, rows, np.zeros_like(ids)]) * board.square_length_m
+
+
+def detect_corners(
+    image: np.ndarray, detector: cv2.aruco.CharucoDetector
+) -> tuple[np.ndarray, np.ndarray]:
+    """Find board corners in an image (H, W, 3) uint8: ids (N,), pixels (N, 2)."""
+    corners, ids, _, _ = detector.detectBoard(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))
+    if ids is None or len(ids) == 0:
+        return np.zeros(0, int), np.zeros((0, 2))
+    pixels = opencv_pixels_to_corner(np.asarray(corners, float).reshape(-1, 2))
+    return np.asarray(ids, int).reshape(-1), pixels
+
+
+def make_detector(board: Board) -> cv2.aruco.CharucoDetector:
+    """Return a detector for the board with sub-pixel marker corners."""
+    parameters = cv2.aruco.DetectorParameters()
+    # Markers only have to be found; the chessboard corners between them carry the measurement,
+    # so a marker's own corners are refined just enough to predict where those are.
+    parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
+    return cv2.aruco.CharucoDetector(opencv_board(board), cv2.aruco.CharucoParameters(), parameters)
+
+
+def gather(
+    found: Iterable[tuple[str, str, np.ndarray, np.ndarray]], cameras: Iterable[str]
+) -> Observations:
+    """Stack (camera, frame, ids (N,), pixels (N, 2)) detections into one table."""
+    names = tuple(sorted(cameras))
+    rows = list(found)
+    frames = tuple(sorted({frame for _, frame, _, _ in rows}))
+    camera_of, frame_of = ({n: i for i, n in enumerate(group)} for group in (names, frames))
+    camera = [np.full(len(ids), camera_of[name]) for name, _, ids, _ in rows]
+    frame = [np.full(len(ids), frame_of[name]) for _, name, ids, _ in rows]
+    empty = [np.zeros(0, int)]
+    return Observations(
+        names,
+        frames,
+        np.concatenate(camera + empty),
+        np.concatenate(frame + empty),
+        np.concatenate([ids for _, _, ids, _ in rows] + empty),
+        np.concatenate([pixels for _, _, _, pixels in rows] + [np.zeros((0, 2))]),
+    )
+
+
+def read_observations(
+    board: Board,
+    files: Mapping[str, Iterable[Path]],
+    sizes: Mapping[str, tuple[int, int]],
+    limit: int,
+) -> Observations:
+    """Detect the board in each camera's `files`; files of one name were taken at one time.
+
+    `limit` images at most are read a camera, evenly spaced over all names (0 = all). An image
+    whose (width, height) is not `sizes[camera]` is an error: its pixels are not the footage's.
+    """
+    by_name = {camera: {path.stem: path for path in paths} for camera, paths in files.items()}
+    names = sorted(set().union(*by_name.values()))
+    names = [names[i] for i in even(len(names), limit or len(names))]
+    detector = make_detector(board)
+    found = []
+    for camera, paths in sorted(by_name.items()):
+        for name in (n for n in names if n in paths):
+            image = read_srgb8(paths[name])
+            if (image.shape[1], image.shape[0]) != tuple(sizes[camera]):
+                raise CalibrationError(
+                    f"{paths[name]}: image is {image.shape[1]}x{image.shape[0]}, the footage "
+                    f"of {camera} is {sizes[camera][0]}x{sizes[camera][1]}; record the board "
+                    "with the settings of the capture"
+                )
+            found.append((camera, name, *detect_corners(image, detector)))
+    return gather(found, by_name)
+
+
+def even(count: int, limit: int) -> list[int]:
+    """At most `limit` indices below `count`, evenly spaced."""
+    if count <= limit:
+        return list(range(count))
+    return [int(i) for i in np.linspace(0, count - 1, limit).round()]

@@ -1,0 +1,179 @@
+"""Joint bundle adjustment in pycolmap: all cameras, all board poses, one rigid board.
+
+COLMAP's world is put into the board: its points are the board's corners, held constant, so the
+scale is the print's and the board stays flat and rigid. COLMAP's rig is the camera rig, and each
+board frame is one pose of the rig. So a corner seen at another time or by another camera is the
+same known point, and there are no 3D points to estimate.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pycolmap
+
+from express50.cameras import Camera, project
+from pipelines.calibrate.board import Observations
+
+
+@dataclass(frozen=True)
+class Rig:
+    """Cameras in the rig's space (their `cam_from_world`), and rig_from_board (4, 4) a frame."""
+
+    cameras: dict[str, Camera]
+    boards: dict[int, np.ndarray]
+
+
+def residuals(rig: Rig, observations: Observations, points: np.ndarray) -> np.ndarray:
+    """Pixel errors (N, 2) of observations; `points` (P, 3) are the board's corners.
+
+    Infinite where the rig has no such camera or frame, or the corner lies behind the camera.
+    """
+    errors = np.full((len(observations.corner), 2), np.inf)
+    for index, name in enumerate(observations.cameras):
+        for frame in rig.boards if name in rig.cameras else ():
+            rows = np.flatnonzero((observations.camera == index) & (observations.frame == frame))
+            if len(rows) == 0:
+                continue
+            pose = rig.cameras[name].cam_from_world @ rig.boards[frame]
+            placed = replace(rig.cameras[name], cam_from_world=pose)
+            pixels, _ = project(placed, points[observations.corner[rows]])
+            errors[rows] = pixels - observations.pixels[rows]
+    return np.where(np.isfinite(errors), errors, np.inf)
+
+
+def adjust(
+    rig: Rig,
+    observations: Observations,
+    points: np.ndarray,
+    loss_scale_px: float,
+    iterations: int,
+    refine_distortion: bool = True,
+) -> Rig:
+    """Refine all intrinsics, camera poses and board poses over the observations.
+
+    Args:
+        rig: where to start; every observed camera and frame must be in it.
+        observations: board corners.
+        points: (P, 3) corners on the board, metres.
+        loss_scale_px: residual at which the Cauchy loss begins to flatten.
+        iterations: of Levenberg-Marquardt at most.
+        refine_distortion: also refine distortion and principal points.
+    """
+    reconstruction, names, frames = _build(rig, observations, points)
+    options = pycolmap.BundleAdjustmentOptions()
+    options.print_summary = False
+    options.refine_points3D = False
+    options.refine_principal_point = refine_distortion
+    options.refine_extra_params = refine_distortion
+    options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
+    options.ceres.loss_function_scale = loss_scale_px
+    # There are no free points to eliminate, so COLMAP's choice by image count (an iterative
+    # solver beyond a thousand) loses to the default, factorising the normal equations.
+    options.ceres.auto_select_solver_type = False
+    options.ceres.solver_options.max_num_iterations = iterations
+    options.ceres.solver_options.function_tolerance = 1e-9
+    options.ceres.solver_options.num_threads = 1  # sums in one order: the same bytes every run
+    config = pycolmap.BundleAdjustmentConfig()
+    for image_id in reconstruction.reg_image_ids():
+        config.add_image(image_id)
+    pycolmap.create_default_bundle_adjuster(options, config, reconstruction).solve()
+    return _read(reconstruction, rig, names, frames)
+
+
+def _build(
+    rig: Rig, observations: Observations, points: np.ndarray
+) -> tuple[pycolmap.Reconstruction, list[str], list[int]]:
+    """Write the rig as a COLMAP reconstruction; camera i and frame i get the id i + 1."""
+    reconstruction = pycolmap.Reconstruction()
+    names = [n for i, n in enumerate(observations.cameras) if (observations.camera == i).any()]
+    frames = sorted({int(f) for f in observations.frame})
+    for i, name in enumerate(names):
+        camera = rig.cameras[name]
+        reconstruction.add_camera(
+            pycolmap.Camera(
+                camera_id=i + 1,
+                model=camera.model,
+                width=camera.width,
+                height=camera.height,
+                params=list(camera.params),
+            )
+        )
+    reconstruction.add_rig(_colmap_rig(rig, reconstruction, names))
+    for corner, point in enumerate(points):
+        reconstruction.add_point3D_with_id(corner + 1, pycolmap.Point3D(xyz=point))
+    root = rig.cameras[names[0]].cam_from_world
+    image_id = 0
+    for i, frame in enumerate(frames):
+        made = pycolmap.Frame(frame_id=i + 1, rig_id=1)
+        made.rig_from_world = _rigid(root @ rig.boards[frame])
+        images, rows_of = [], []
+        for j, name in enumerate(names):
+            index = observations.cameras.index(name)
+            rows = np.flatnonzero((observations.camera == index) & (observations.frame == frame))
+            if len(rows) == 0:
+                continue
+            image_id += 1
+            image = pycolmap.Image(
+                name=f"{name}/{frame}",
+                keypoints=observations.pixels[rows],
+                camera_id=j + 1,
+                image_id=image_id,
+            )
+            image.frame_id = i + 1
+            made.add_data_id(image.data_id)
+            images.append(image)
+            rows_of.append(rows)
+        reconstruction.add_frame(made)
+        for image, rows in zip(images, rows_of, strict=True):
+            reconstruction.add_image(image)
+            for k, corner in enumerate(observations.corner[rows]):
+                element = pycolmap.TrackElement(image.image_id, k)
+                reconstruction.add_observation(int(corner) + 1, element)
+        reconstruction.register_frame(i + 1)
+    return reconstruction, names, frames
+
+
+def _colmap_rig(
+    rig: Rig, reconstruction: pycolmap.Reconstruction, names: list[str]
+) -> pycolmap.Rig:
+    """COLMAP's rig of these cameras; its own space is that of the first one."""
+    made = pycolmap.Rig(rig_id=1)
+    made.add_ref_sensor(reconstruction.camera(1).sensor_id)
+    rig_from_root = rig.cameras[names[0]].world_from_cam
+    for i, name in enumerate(names[1:]):
+        pose = rig.cameras[name].cam_from_world @ rig_from_root
+        made.add_sensor(reconstruction.camera(i + 2).sensor_id, _rigid(pose))
+    return made
+
+
+def _rigid(T: np.ndarray) -> pycolmap.Rigid3d:
+    return pycolmap.Rigid3d(np.ascontiguousarray(T[:3]))
+
+
+def _read(
+    reconstruction: pycolmap.Reconstruction, rig: Rig, names: list[str], frames: list[int]
+) -> Rig:
+    """Read a reconstruction back, leaving the first camera where the rig had it."""
+    solved = reconstruction.rig(1)
+    root = rig.cameras[names[0]].cam_from_world
+    cameras = {}
+    for i, name in enumerate(names):
+        made = reconstruction.camera(i + 1)
+        pose = root
+        if i:
+            pose = _matrix(solved.sensor_from_rig(made.sensor_id)) @ root
+        cameras[name] = replace(
+            rig.cameras[name], params=tuple(float(p) for p in made.params), cam_from_world=pose
+        )
+    root_inverse = np.linalg.inv(root)
+    boards = {
+        frame: root_inverse @ _matrix(reconstruction.frame(i + 1).rig_from_world)
+        for i, frame in enumerate(frames)
+    }
+    return Rig(cameras, boards)
+
+
+def _matrix(pose: pycolmap.Rigid3d) -> np.ndarray:
+    return np.vstack([pose.matrix(), [0.0, 0.0, 0.0, 1.0]])

@@ -1,0 +1,38 @@
+"""Settings of the calibrate stage and its presets."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, kw_only=True)
+class CalibrateConfig:
+    """Every field trades time, or strictness, for accuracy; none depends on a rig."""
+
+    camera_model: str = "auto"
+    """COLMAP model; auto: `camera_model` of capture.toml, else the simplest that fits."""
+    board_frames: int = 80
+    """Board images read a camera, evenly spaced; 0 reads all."""
+    single_frames: int = 30
+    """Images used to start one camera's intrinsics (the joint adjustment uses all)."""
+    rounds: int = 3
+    """Joint adjustments, each followed by rejection of corners."""
+    iterations: int = 60
+    """Levenberg-Marquardt iterations a joint adjustment."""
+    reject_sigma: float = 4.0
+    """Corners further off than this many robust standard deviations are rejected."""
+    min_corners: int = 8
+    """Corners a board image needs to count."""
+    min_frames: int = 4
+    """Board images a camera needs; fewer and it is dropped."""
+    weak_corners: int = 200
+    """A camera with fewer accepted corners is reported as weakly tied in."""
+    weak_frames: int = 8
+    """A camera that shares fewer board images with others is reported as weakly tied in."""
+
+
+PRESETS: dict[str, dict[str, object]] = {
+    "draft": {"board_frames": 24, "single_frames": 15, "rounds": 1, "iterations": 30},
+    "standard": {},
+    "reference": {"board_frames": 0, "single_frames": 60, "rounds": 5, "iterations": 200},
+}
