@@ -104,7 +104,7 @@ def _stage_view(dataset: Dataset, report: StageReport) -> dict:
     return {
         "name": report.name,
         "purpose": _PURPOSES.get(report.name, ""),
-        "items": len(report.items),
+        "item_count": len(report.items),
         "failed": [(r.item, r.reason) for r in receipts.values() if r.status == "failed"],
         "dropped": report.dropped,
         "seconds": number(round(sum(r.seconds for r in receipts.values()), 1)),
