@@ -9,8 +9,7 @@ from __future__ import annotations
 import ctypes
 from functools import cache
 
-from express50.native.build import HERE, VARIANTS, library_file, source_digest
-
+# `build` is imported where it is used, so that `python -m express50.native.build` runs it only once.
 MEND = "build it with `python -m express50.native.build` (needs g++) or reinstall the package"
 
 
@@ -40,6 +39,8 @@ def load(variant: str | None = None) -> ctypes.CDLL:
     Raises:
         NativeLibraryError: it was not built, is older than its source or does not load.
     """
+    from express50.native.build import VARIANTS, library_file
+
     if variant is not None:
         return _open(variant)
     # The baseline variant runs anywhere and tells what the processor can do.
@@ -47,11 +48,13 @@ def load(variant: str | None = None) -> ctypes.CDLL:
     for name in reversed(list(VARIANTS)[: level + 1]):
         if library_file(name).exists():
             return _open(name)
-    raise NativeLibraryError(f"no native library in {HERE}; {MEND}")
+    raise NativeLibraryError(f"no variant of the native library was built; {MEND}")
 
 
 def _open(variant: str) -> ctypes.CDLL:
     """Open one variant and compare its digest with the sources, where they are installed too."""
+    from express50.native.build import library_file, source_digest
+
     path = library_file(variant)
     if not path.exists():
         raise NativeLibraryError(f"the native library {path.name} was not built; {MEND}")

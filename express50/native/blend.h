@@ -16,6 +16,7 @@
 
 constexpr int kPixels = kTile * kTile;
 constexpr int kPlanarMax = 8;
+constexpr int kAhead = 6;  // Gaussians of a tile are fetched into the cache this far in advance
 
 // What blending reads of one Gaussian. sigma = (l11 dx + l21 dy)^2 + (l22 dy)^2: the Cholesky factor
 // of half the conic. A sum of squares neither cancels nor turns negative for needles.
@@ -39,6 +40,17 @@ template <class Real> struct Span {
     }
 };
 
+// Centres, in pixels of the image, of the row y of a tile and of a vector that starts at column x.
+template <class Real> inline Real pixel_y(const TileFrame& tile, int y) {
+    return Real(tile.top + y) + Real(0.5);
+}
+
+template <class Real> inline VecOf<Real> pixel_x(const TileFrame& tile, int x) {
+    VecOf<Real> lane;
+    for (int i = 0; i < Lanes<Real>::N; ++i) lane[i] = Real(i) + Real(0.5);
+    return lane + Real(tile.left + x);
+}
+
 // One pixel vector of one Gaussian that received light.
 template <class Real> struct Hit {
     VecOf<Real> dx, alpha, before;  // before: transmittance in front of the Gaussian; alpha 0 = miss
@@ -54,20 +66,18 @@ inline int walk(const Splat<Real>& s, const Box& box, const TileFrame& tile, Rea
                 Visit&& visit) {
     using V = VecOf<Real>;
     constexpr int N = Lanes<Real>::N;
-    V lane;
-    for (int i = 0; i < N; ++i) lane[i] = Real(i) + Real(0.5);
     const Span<Real> span(box, tile);
     const V cutoff = broadcast(s.cutoff), zero = V{};
     const V capped = broadcast(Real(kAlphaMax)), floor = broadcast(Real(-80));
     int finished = 0;
     for (int y = span.y0; y < span.y1; ++y) {
-        const Real dy = Real(tile.top + y) + Real(0.5) - s.y;
+        const Real dy = pixel_y<Real>(tile, y) - s.y;
         const Real across = s.l22 * dy, base = across * across, shear = s.l21 * dy;
         if (base > s.cutoff) continue;
         for (int j = span.j0; j < span.j1; ++j) {
             Real* place = transmittance + y * kTile + j * N;
             const V before = load(place);
-            const V dx = (lane + Real(tile.left + j * N)) - s.x;
+            const V dx = pixel_x<Real>(tile, j * N) - s.x;
             const V along = s.l11 * dx + shear;
             const V sigma = along * along + base;
             MaskOf<Real> hit = (sigma <= cutoff) & (before > zero);
@@ -108,9 +118,10 @@ template <class Real> struct Workspace {
     std::vector<Real> color, color_gradient;
     alignas(64) Real transmittance[kPixels], alpha[kPixels], weighted[kPixels], suffix[kPixels];
 
-    struct Record {
-        Hit<Real> hit;
+    struct Record {  // what the way back needs of a hit
+        VecOf<Real> alpha, before;
         VecOf<Real> value;  // <colour, gradient of the pixel>, depth and alpha included
+        int position;
     };
     std::vector<Record> hits;
     std::vector<size_t> hit_start;
@@ -160,6 +171,15 @@ inline VecOf<Real> gather_colors(Workspace<Real>& w, const Hit<Real>& hit, VecOf
     return load(dots);
 }
 
+template <class Real>
+inline void prefetch(const Splat<Real>* splats, const Box* boxes, const Real* colors, int channels,
+                     int32_t id) {
+    __builtin_prefetch(&splats[id]);
+    __builtin_prefetch(&boxes[id]);
+    for (int c = 0; c < channels; c += 64 / int(sizeof(Real)))
+        __builtin_prefetch(colors + int64_t(id) * channels + c);
+}
+
 // Blends one tile. `ids` holds its Gaussians, nearest first; those that contributed are moved to
 // the front and their number is returned.
 template <class Real, int CV>
@@ -172,6 +192,7 @@ int blend_tile(Workspace<Real>& w, const TileFrame& tile, const Splat<Real>* spl
     std::fill(w.weighted, w.weighted + kPixels, Real(0));
     for (int64_t i = 0; i < count && open > 0; ++i) {
         const int32_t id = ids[i];
+        prefetch(splats, boxes, colors, w.channels, ids[std::min(i + kAhead, count - 1)]);
         const Splat<Real>& s = splats[id];
         const Real* color = colors + int64_t(id) * w.channels;
         bool contributed = false;
@@ -211,10 +232,13 @@ void blend_tile_gradient(Workspace<Real>& w, const TileFrame& tile, const Splat<
                          Real* color_records, Moments<Real>* moments) {
     using V = VecOf<Real>;
     start_tile(tile, w.transmittance);
-    w.hits.clear();
+    size_t hits = 0;
     w.hit_start.assign(1, 0);
     V planar_gradient[kPlanarMax];
     for (int i = 0; i < used; ++i) {
+        constexpr size_t most = kPixels / Lanes<Real>::N;  // hits of one Gaussian in a tile
+        if (w.hits.size() < hits + most) w.hits.resize(2 * (hits + most));
+        prefetch(splats, boxes, colors, w.channels, ids[std::min(i + kAhead, used - 1)]);
         const Splat<Real>& s = splats[ids[i]];
         const Real* color = colors + int64_t(ids[i]) * w.channels;
         std::copy(color, color + w.channels, w.color.begin());
@@ -237,9 +261,11 @@ void blend_tile_gradient(Workspace<Real>& w, const TileFrame& tile, const Splat<
                     planar_gradient[c] += weight * g;
                 }
             }
-            w.hits.push_back({hit, value});
+            auto& record = w.hits[hits++];
+            record.alpha = hit.alpha, record.before = hit.before;
+            record.value = value, record.position = hit.position;
         });
-        w.hit_start.push_back(w.hits.size());
+        w.hit_start.push_back(hits);
         moments[i].w = sum<Real>(depth);
         moments[i].wx = sum<Real>(depth_x), moments[i].wy = sum<Real>(depth_y);
         Real* record = color_records + int64_t(i) * w.channels;
@@ -250,15 +276,17 @@ void blend_tile_gradient(Workspace<Real>& w, const TileFrame& tile, const Splat<
     for (int i = used - 1; i >= 0; --i) {
         V s = V{}, sx = V{}, sy = V{}, sxx = V{}, sxy = V{}, syy = V{};
         for (size_t h = w.hit_start[i]; h < w.hit_start[i + 1]; ++h) {
-            const Hit<Real>& hit = w.hits[h].hit;
-            const V value = w.hits[h].value, behind = load(w.suffix + hit.position);
-            const V by_alpha = hit.before * value - behind / (Real(1) - hit.alpha);
-            store(w.suffix + hit.position, behind + hit.alpha * hit.before * value);
+            const auto& hit = w.hits[h];
+            const V behind = load(w.suffix + hit.position), flow = hit.before * hit.value;
+            const V by_alpha = flow - behind / (Real(1) - hit.alpha);
+            store(w.suffix + hit.position, behind + hit.alpha * flow);
             // No gradient flows through an alpha that was capped.
             const V by_sigma = hit.alpha < Real(kAlphaMax) ? -hit.alpha * by_alpha : V{};
-            const V by_dx = by_sigma * hit.dx, by_dy = by_sigma * hit.dy;
+            const V dx = pixel_x<Real>(tile, hit.position % kTile) - splats[ids[i]].x;
+            const Real dy = pixel_y<Real>(tile, hit.position / kTile) - splats[ids[i]].y;
+            const V by_dx = by_sigma * dx, by_dy = by_sigma * dy;
             s += by_sigma, sx += by_dx, sy += by_dy;
-            sxx += by_dx * hit.dx, sxy += by_dx * hit.dy, syy += by_dy * hit.dy;
+            sxx += by_dx * dx, sxy += by_dx * dy, syy += by_dy * dy;
         }
         Moments<Real>& m = moments[i];
         m.s = sum<Real>(s), m.sx = sum<Real>(sx), m.sy = sum<Real>(sy);

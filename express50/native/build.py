@@ -12,6 +12,7 @@ import platform
 import shutil
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 HERE = Path(__file__).resolve().parent
@@ -88,12 +89,18 @@ def compile_variant(variant: str, target: Path) -> None:
     raise BuildError(f"{command[0]} failed on {SOURCE.name} ({variant}): {run.stderr.strip()}")
 
 
+def _build_in_place(variant: str) -> str:
+    """Compile one variant next to this file; returns its name."""
+    compile_variant(variant, library_file(variant))
+    return variant
+
+
 def main() -> int:
     """Build every variant next to this file; 1 if that failed."""
     try:
-        for variant in variants():
-            compile_variant(variant, library_file(variant))
-            sys.stdout.write(f"built {library_file(variant)}\n")
+        with ThreadPoolExecutor(max_workers=2) as pool:
+            for variant in pool.map(_build_in_place, variants()):
+                sys.stdout.write(f"built {library_file(variant)}\n")
     except BuildError as error:
         sys.stderr.write(f"{error}\n")
         return 1

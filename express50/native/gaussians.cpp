@@ -69,6 +69,7 @@ int64_t project(const Camera& cam, int64_t n, const Real* means, const Real* qua
 // -1 planar, 1..6 channel vectors known to the compiler, 0 any number.
 template <class Real, class F> void with_layout(int channels, F&& f) {
     if (channels <= kPlanarMax) return f(std::integral_constant<int, -1>{});
+    if (sizeof(Real) == 8) return f(std::integral_constant<int, 0>{});  // for tests: compile less
     switch (channel_vectors<Real>(channels)) {
         case 1: return f(std::integral_constant<int, 1>{});
         case 2: return f(std::integral_constant<int, 2>{});
@@ -80,17 +81,42 @@ template <class Real, class F> void with_layout(int channels, F&& f) {
     }
 }
 
-// Visits the channels of every pixel of a tile as visit(index in w.pixels, index in the image).
-template <class Real, class Visit>
-void for_each_value(const Workspace<Real>& w, const Camera& cam, const TileFrame& tile,
-                    Visit&& visit) {
+// Takes the colours of the pixels of a tile to the image.
+template <class Real>
+void store_colors(const Workspace<Real>& w, const Camera& cam, const TileFrame& tile,
+                  const Real* background, Real* image) {
+    const std::vector<Real> black(w.channels, Real(0));
+    const Real* behind = background ? background : black.data();
     for (int y = 0; y < tile.height; ++y)
         for (int x = 0; x < tile.width; ++x) {
-            const int64_t pixel = int64_t(tile.top + y) * cam.width + tile.left + x;
-            const size_t at = size_t(y) * kTile + x;
-            for (int c = 0; c < w.channels; ++c)
-                visit(w.planar() ? size_t(c) * kPixels + at : at * w.stride + c,
-                      pixel * w.channels + c, at, c);
+            const int at = y * kTile + x, channels = w.channels;
+            const Real through = Real(1) - w.alpha[at];
+            Real* to = image + (int64_t(tile.top + y) * cam.width + tile.left + x) * channels;
+            const Real* from = w.pixels.data() + (w.planar() ? at : at * w.stride);
+            if (w.planar())
+                for (int c = 0; c < channels; ++c) to[c] = from[c * kPixels] + through * behind[c];
+            else
+                for (int c = 0; c < channels; ++c) to[c] = from[c] + through * behind[c];
+        }
+}
+
+// Takes the gradient of the colours of the pixels of a tile to the workspace. The background is
+// seen through 1 - alpha, so its part joins the gradient of alpha.
+template <class Real>
+void load_color_gradients(Workspace<Real>& w, const Camera& cam, const TileFrame& tile,
+                          const Real* background, const Real* d_image) {
+    for (int y = 0; y < tile.height; ++y)
+        for (int x = 0; x < tile.width; ++x) {
+            const int at = y * kTile + x, channels = w.channels;
+            const Real* from =
+                d_image + (int64_t(tile.top + y) * cam.width + tile.left + x) * channels;
+            Real* to = w.pixels.data() + (w.planar() ? at : at * w.stride);
+            if (w.planar())
+                for (int c = 0; c < channels; ++c) to[c * kPixels] = from[c];
+            else
+                std::copy_n(from, channels, to);
+            if (background)
+                for (int c = 0; c < channels; ++c) w.alpha[at] -= from[c] * background[c];
         }
 }
 
@@ -116,17 +142,13 @@ int64_t forward(const Camera& cam, int channels, const Splat<Real>* splats, cons
                 std::copy_n(w.alpha + y * kTile, tile.width, alpha + row);
                 std::copy_n(w.weighted + y * kTile, tile.width, weighted + row);
             }
-            for_each_value(w, cam, tile, [&](size_t from, int64_t to, size_t at, int c) {
-                image[to] = w.pixels[from] +
-                            (background ? (Real(1) - w.alpha[at]) * background[c] : Real(0));
-            });
+            store_colors(w, cam, tile, background, image);
         }
     }
     return records;
 }
 
-// Gradients of the pixels of one tile, in the layout of the workspace. The alpha image and the
-// background share a slot: both see the sum of the weights.
+// Gradients of the pixels of one tile, in the layout of the workspace.
 template <class Real>
 void load_gradients(Workspace<Real>& w, const Camera& cam, const TileFrame& tile,
                     const Real* background, const Real* d_image, const Real* d_weighted,
@@ -139,11 +161,7 @@ void load_gradients(Workspace<Real>& w, const Camera& cam, const TileFrame& tile
         if (d_alpha) std::copy_n(d_alpha + row, tile.width, w.alpha + y * kTile);
         if (d_weighted) std::copy_n(d_weighted + row, tile.width, w.weighted + y * kTile);
     }
-    if (!d_image) return;
-    for_each_value(w, cam, tile, [&](size_t to, int64_t from, size_t at, int c) {
-        w.pixels[to] = d_image[from];
-        if (background) w.alpha[at] -= d_image[from] * background[c];
-    });
+    if (d_image) load_color_gradients(w, cam, tile, background, d_image);
 }
 
 // For each Gaussian the numbers of its records, by ascending tile.
