@@ -1,0 +1,291 @@
+"""Read a user's pickles without executing anything.
+
+FLAME's files are Python 2 pickles that name chumpy and scipy classes; landmark embeddings hold
+torch tensors. None of those libraries is imported: every class comes from a short allow list, and
+those of chumpy, scipy and torch are replaced by records that only keep their state. A pickle that
+names anything else is refused before anything is called.
+"""
+
+from __future__ import annotations
+
+import codecs
+import io
+import pickle
+from collections import OrderedDict
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+
+from express50.errors import HeadModelError
+
+PICKLE_LIMIT_BYTES = 2 << 30
+
+
+class Record:
+    """Stands for an object of a class that is not imported; keeps what the pickle says of it."""
+
+    def __init__(self, *arguments: object) -> None:
+        self.arguments = arguments
+        self.state: dict[str, Any] = {}
+
+    def __setstate__(self, state: object) -> None:
+        """Keep the state; slots come as a pair (dict, dict)."""
+        for part in state if isinstance(state, tuple) else (state,):
+            if isinstance(part, dict):
+                self.state.update(part)
+
+
+class ChumpyArray(Record):
+    """A chumpy.Ch: the array is in state["x"]."""
+
+
+class SparseMatrix(Record):
+    """A scipy.sparse csc or csr matrix."""
+
+
+class CscMatrix(SparseMatrix):
+    """Column-compressed."""
+
+
+class CsrMatrix(SparseMatrix):
+    """Row-compressed."""
+
+
+class StorageType(Record):
+    """Names a torch storage type; never instantiated by what it names."""
+
+
+def _new_record(kind: object = Record, *_: object) -> Record:
+    """What copy_reg._reconstructor does, for records alone."""
+    if isinstance(kind, type) and issubclass(kind, Record):
+        return kind()
+    raise pickle.UnpicklingError("copy_reg._reconstructor of a class that is not allowed")
+
+
+def _encode(text: object, encoding: object = "latin1") -> bytes:
+    """What _codecs.encode does for the byte strings of protocol 2."""
+    if not isinstance(text, str) or encoding not in ("latin1", "latin-1"):
+        raise pickle.UnpicklingError("_codecs.encode of something other than latin-1 text")
+    return codecs.latin_1_encode(text)[0]
+
+
+def _reconstruct_array(kind: object, shape: object, code: object) -> np.ndarray:
+    """What numpy's _reconstruct does, for plain arrays alone."""
+    if kind is not np.ndarray:
+        raise pickle.UnpicklingError("numpy array subclass")
+    return np.ndarray((0,), np.dtype("b"))
+
+
+def _dtype(code: object, *flags: object) -> np.dtype:
+    """numpy.dtype from a type code string."""
+    if not isinstance(code, (str, bytes)):
+        raise pickle.UnpicklingError("numpy.dtype from something other than a code")
+    return np.dtype(code.decode("ascii") if isinstance(code, bytes) else code)
+
+
+def _scalar(dtype: np.dtype, data: object) -> np.generic:
+    """numpy scalar from its bytes."""
+    raw = data.encode("latin1") if isinstance(data, str) else data
+    if not isinstance(raw, bytes) or dtype.hasobject:
+        raise pickle.UnpicklingError("numpy scalar without bytes")
+    return np.frombuffer(raw, dtype=dtype, count=1)[0]
+
+
+def _tensor(
+    storage: object, offset: int, size: tuple[int, ...], stride: tuple[int, ...], *_: object
+) -> np.ndarray:
+    """What torch._utils._rebuild_tensor_v2 does, on a NumPy storage, bounds checked."""
+    if not isinstance(storage, np.ndarray) or storage.ndim != 1 or offset < 0:
+        raise pickle.UnpicklingError("tensor without a storage")
+    if min((*size, *stride, 0)) < 0:
+        raise pickle.UnpicklingError("tensor with negative size or stride")
+    last = offset + sum((n - 1) * step for n, step in zip(size, stride, strict=True))
+    if 0 not in size and last >= storage.size:
+        raise pickle.UnpicklingError("tensor reaches beyond its storage")
+    steps = [step * storage.itemsize for step in stride]
+    return np.lib.stride_tricks.as_strided(storage[offset:], size, steps).copy()
+
+
+def _storage_from_bytes(data: object) -> np.ndarray:
+    """What torch.storage._load_from_bytes does: a nested file, read by `_read_torch_storage`."""
+    if not isinstance(data, bytes):
+        raise pickle.UnpicklingError("torch storage without bytes")
+    return _read_torch_storage(data)
+
+
+_NUMPY = ("numpy.core.multiarray", "numpy._core.multiarray")
+_ALLOWED = MappingProxyType(
+    {
+        **{(module, "_reconstruct"): _reconstruct_array for module in _NUMPY},
+        **{(module, "scalar"): _scalar for module in _NUMPY},
+        ("numpy", "ndarray"): np.ndarray,
+        ("numpy", "dtype"): _dtype,
+        ("_codecs", "encode"): _encode,
+        ("copy_reg", "_reconstructor"): _new_record,
+        ("copyreg", "_reconstructor"): _new_record,
+        ("__builtin__", "object"): Record,
+        ("builtins", "object"): Record,
+        ("collections", "OrderedDict"): OrderedDict,
+        ("torch._utils", "_rebuild_tensor_v2"): _tensor,
+        ("torch.storage", "_load_from_bytes"): _storage_from_bytes,
+    }
+)
+_STORAGE_DTYPES = MappingProxyType(
+    {
+        "FloatStorage": np.float32, "DoubleStorage": np.float64, "HalfStorage": np.float16,
+        "LongStorage": np.int64, "IntStorage": np.int32, "ShortStorage": np.int16,
+        "ByteStorage": np.uint8, "CharStorage": np.int8, "BoolStorage": np.bool_,
+    }
+)  # fmt: skip
+
+
+class SafeUnpickler(pickle.Unpickler):
+    """Unpickler that resolves names from the allow list only."""
+
+    def find_class(self, module: str, name: str) -> Any:  # noqa: ANN401 (pickle's own signature)
+        """Return the stand-in for a name, or refuse."""
+        if (module, name) in _ALLOWED:
+            return _ALLOWED[(module, name)]
+        if module.split(".")[0] == "chumpy":
+            return ChumpyArray
+        if module.startswith("scipy.sparse") and name in ("csc_matrix", "csc_array"):
+            return CscMatrix
+        if module.startswith("scipy.sparse") and name in ("csr_matrix", "csr_array"):
+            return CsrMatrix
+        if module == "torch" and name in _STORAGE_DTYPES:
+            return type(name, (StorageType,), {})
+        raise pickle.UnpicklingError(f"it names {module}.{name}, which is not on the allow list")
+
+    def persistent_load(self, pid: object) -> np.ndarray:
+        """Storages of torch's old format: ("storage", type, key, location, count, view)."""
+        storages = getattr(self, "storages", None)
+        if storages is None or not isinstance(pid, tuple) or len(pid) < 5 or pid[0] != "storage":
+            raise pickle.UnpicklingError("a persistent id outside a torch storage")
+        dtype = _STORAGE_DTYPES[pid[1].__name__]
+        return storages.setdefault(str(pid[2]), np.zeros(int(pid[4]), dtype))
+
+
+def _read_torch_storage(data: bytes) -> np.ndarray:
+    """Read a storage pickled into an array file: torch's old format, magic number first.
+
+    Layout: pickles of magic, protocol, system information, the storage, its keys; then for each key
+    an int64 count and the raw little-endian numbers.
+    """
+    stream = io.BytesIO(data)
+    for _ in range(3):
+        SafeUnpickler(stream).load()
+    reader = SafeUnpickler(stream)
+    reader.storages = {}  # type: ignore[attr-defined]
+    storage = reader.load()
+    keys = SafeUnpickler(stream).load()
+    if not isinstance(keys, list) or not isinstance(storage, np.ndarray) or len(keys) != 1:
+        raise pickle.UnpicklingError("a torch storage with an unknown layout")
+    count = int(np.frombuffer(stream.read(8), "<i8", count=1)[0])
+    raw = stream.read(storage.nbytes)
+    if count != storage.size or len(raw) != storage.nbytes:
+        raise pickle.UnpicklingError("a torch storage that is cut short")
+    return np.frombuffer(raw, storage.dtype).copy()
+
+
+def read_pickle(path: Path) -> Any:  # noqa: ANN401 (whatever the file holds)
+    """Read a pickle, nothing executed.
+
+    Raises:
+        HeadModelError: unreadable, damaged, or naming something that is not on the allow list.
+    """
+    try:
+        size = path.stat().st_size
+        if size > PICKLE_LIMIT_BYTES:
+            raise HeadModelError(f"{path}: {size} bytes, expected at most {PICKLE_LIMIT_BYTES}")
+        with path.open("rb") as file:
+            return _load(file)
+    except OSError as error:
+        raise HeadModelError(f"{path}: cannot be read: {error}") from error
+    except _DAMAGE as error:
+        raise HeadModelError(f"{path}: refused or damaged pickle: {_one_line(error)}") from error
+
+
+def read_object_array(path: Path) -> Any:  # noqa: ANN401 (whatever the file holds)
+    """Read an `.npy` file, also one that holds a pickled object, nothing executed.
+
+    Raises:
+        HeadModelError: as `read_pickle`.
+    """
+    try:
+        with path.open("rb") as file:
+            version = np.lib.format.read_magic(file)
+            reader = {
+                (1, 0): np.lib.format.read_array_header_1_0,
+                (2, 0): np.lib.format.read_array_header_2_0,
+            }.get(version)
+            if reader is None:
+                raise HeadModelError(f"{path}: .npy version {version}, expected (1, 0) or (2, 0)")
+            shape, _, dtype = reader(file)
+            if not dtype.hasobject:
+                file.seek(0)
+                return np.load(file, allow_pickle=False)
+            content = _load(file)
+    except OSError as error:
+        raise HeadModelError(f"{path}: cannot be read: {error}") from error
+    except _DAMAGE as error:
+        raise HeadModelError(f"{path}: refused or damaged array: {_one_line(error)}") from error
+    return content.item() if isinstance(content, np.ndarray) and shape == () else content
+
+
+# What a damaged pickle makes the standard unpickler and the stand-ins above raise.
+_DAMAGE = (
+    pickle.UnpicklingError, EOFError, ValueError, TypeError, KeyError, IndexError, AttributeError,
+    UnicodeError, OverflowError, MemoryError, ImportError,
+)  # fmt: skip
+
+
+def _load(file: io.BufferedReader) -> Any:  # noqa: ANN401 (whatever the file holds)
+    return SafeUnpickler(file, encoding="latin1").load()
+
+
+def _one_line(error: BaseException) -> str:
+    return " ".join(str(error).split()) or type(error).__name__
+
+
+def to_array(value: object, name: str, where: str) -> np.ndarray:
+    """A dense numeric array of what a pickle held: array, chumpy, sparse matrix or list."""
+    if isinstance(value, ChumpyArray):
+        value = next((value.state[key] for key in ("x", "a", "v") if key in value.state), None)
+        return to_array(value, name, where)
+    if isinstance(value, SparseMatrix):
+        return _densify(value, name, where)
+    try:
+        array = np.asarray(value)
+    except ValueError as error:
+        raise HeadModelError(f"{where}: {name} is not an array: {_one_line(error)}") from error
+    if array.dtype.kind not in "fiub":
+        raise HeadModelError(f"{where}: {name} holds {array.dtype}, expected numbers")
+    return array
+
+
+def _densify(matrix: SparseMatrix, name: str, where: str) -> np.ndarray:
+    """Dense (rows, columns) of a compressed sparse matrix, bounds checked."""
+    state = matrix.state
+    shape = state.get("_shape", state.get("shape"))
+    if not isinstance(shape, tuple) or any(
+        key not in state for key in ("data", "indices", "indptr")
+    ):
+        raise HeadModelError(f"{where}: {name} is a sparse matrix without its parts")
+    data, indices, pointers = (np.asarray(state[key]) for key in ("data", "indices", "indptr"))
+    rows, columns = (int(n) for n in shape)
+    major = columns if isinstance(matrix, CscMatrix) else rows
+    minor = rows if isinstance(matrix, CscMatrix) else columns
+    if rows * columns > 1 << 28 or pointers.shape != (major + 1,) or (np.diff(pointers) < 0).any():
+        raise HeadModelError(f"{where}: {name} is a damaged sparse matrix of shape {shape}")
+    owner = np.repeat(np.arange(major), np.diff(pointers))
+    if (
+        owner.size != data.size
+        or indices.shape != data.shape
+        or (data.size and not 0 <= indices.min() <= indices.max() < minor)
+    ):
+        raise HeadModelError(f"{where}: {name} is a damaged sparse matrix of shape {shape}")
+    dense = np.zeros((major, minor))
+    np.add.at(dense, (owner, indices), data)
+    return dense.T if isinstance(matrix, CscMatrix) else dense

@@ -1,0 +1,114 @@
+"""The landmark network: a small convolutional encoder-decoder with one heat map a point.
+
+Points come from the expectation over softmax heat maps (integral regression, Sun et al. 2018), so
+they are continuous and have gradients everywhere; each has a learned scale of a two-dimensional
+Laplace distribution, from which the confidence follows.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import nn
+from torch.nn import functional
+
+CROP = 128
+POINTS = 68
+# Points may lie a little outside the crop: the grid of the heat maps is stretched about its middle.
+STRETCH = 1.15
+WEIGHTS = Path(__file__).with_name("weights.npz")
+
+
+class Residual(nn.Module):
+    """Two 3x3 convolutions with a skip."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.first, self.second = _conv(width, width, 3), _conv(width, width, 3)
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        """Map (B, C, H, W) to the same shape."""
+        return functional.relu(x + self.second(functional.relu(self.first(x))))
+
+
+class LandmarkNet(nn.Module):
+    """Crops (B, 3, 128, 128) in [0, 1] to points (B, 68, 2) pixels, log scales (B, 68), logit (B,).
+
+    The log scale is the natural logarithm of the Laplace scale in crop pixels; the logit says
+    whether a face looks towards the camera.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.stem1, self.stem2 = _conv(3, 16, 5, 2), _conv(16, 24, 3, 2)
+        self.block32 = Residual(24)
+        self.down16, self.block16 = _conv(24, 64, 3, 2), Residual(64)
+        self.down8, self.block8 = _conv(64, 96, 3, 2), Residual(96)
+        self.down4, self.block4 = _conv(96, 128, 3, 2), Residual(128)
+        self.side4, self.side8, self.side16 = _conv(128, 96, 1), _conv(96, 64, 1), _conv(64, 24, 1)
+        self.mix16, self.mix32 = _conv(64, 64, 3), _conv(24, 48, 3)
+        self.heat = nn.Conv2d(48, POINTS, 1)
+        self.scale = nn.Linear(128, POINTS)
+        self.spread = nn.Parameter(torch.zeros(POINTS))
+        self.face = nn.Linear(128, 1)
+
+    def forward(self, crops: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Run the network; exposure and contrast are normalised per crop."""
+        mean = crops.mean((1, 2, 3), keepdim=True)
+        deviation = crops.std((1, 2, 3), keepdim=True) + 0.02
+        x = functional.relu(self.stem1((crops - mean) / deviation))
+        x32 = self.block32(functional.relu(self.stem2(x)))
+        x16 = self.block16(functional.relu(self.down16(x32)))
+        x8 = self.block8(functional.relu(self.down8(x16)))
+        x4 = self.block4(functional.relu(self.down4(x8)))
+        pooled = x4.mean((2, 3))
+        y = self.side8(functional.relu(x8 + _twice(self.side4(x4))))
+        y = functional.relu(self.mix16(functional.relu(x16 + _twice(y))))
+        y = functional.relu(self.mix32(functional.relu(x32 + _twice(self.side16(y)))))
+        points, variance = _expectation(self.heat(y))
+        log_scale = self.scale(pooled) + self.spread * variance.clamp_min(1e-2).log()
+        return points, log_scale.clamp(-2.0, 4.0), self.face(pooled)[:, 0]
+
+
+def _conv(inputs: int, outputs: int, size: int, stride: int = 1) -> nn.Sequential:
+    return nn.Sequential(
+        nn.Conv2d(inputs, outputs, size, stride, size // 2, bias=False), nn.BatchNorm2d(outputs)
+    )
+
+
+def _twice(x: torch.Tensor) -> torch.Tensor:
+    return functional.interpolate(x, scale_factor=2.0, mode="bilinear", align_corners=False)
+
+
+def _expectation(heat: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Mean position (B, P, 2) in crop pixels and variance (B, P) of softmax heat maps."""
+    batch, points, height, width = heat.shape
+    share = functional.softmax(heat.reshape(batch, points, -1), -1).reshape(heat.shape)
+    axis = (torch.arange(width, dtype=heat.dtype, device=heat.device) + 0.5) / width
+    axis = ((axis - 0.5) * STRETCH + 0.5) * CROP
+    along_x, along_y = share.sum(2), share.sum(3)
+    mean = torch.stack([(along_x * axis).sum(-1), (along_y * axis).sum(-1)], -1)
+    square = (along_x * axis**2).sum(-1) + (along_y * axis**2).sum(-1)
+    return mean, (square - mean.square().sum(-1)).clamp_min(0.0)
+
+
+def save_network(net: LandmarkNet, path: Path) -> None:
+    """Write the weights as float16 (counters of batch normalisation are left out)."""
+    state = {
+        key: value.detach().cpu().numpy().astype(np.float16)
+        for key, value in net.state_dict().items()
+        if not key.endswith("num_batches_tracked")
+    }
+    with path.open("wb") as file:
+        np.savez_compressed(file, **state)
+
+
+def load_network(path: Path = WEIGHTS) -> LandmarkNet:
+    """Read weights written by `save_network`; the network is in evaluation mode."""
+    net = LandmarkNet()
+    with np.load(path, allow_pickle=False) as data:
+        state = {key: torch.from_numpy(data[key].astype(np.float32)) for key in data.files}
+    net.load_state_dict(state, strict=False)
+    return net.eval().to(memory_format=torch.channels_last)
