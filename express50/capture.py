@@ -123,7 +123,7 @@ def read_meta(root: Path) -> dict:
         raise CaptureError(f"{path}: fps is {fps!r}, expected a number such as 24")
     if not (math.isfinite(fps) and 0 < fps <= 10_000):
         raise CaptureError(f"{path}: fps is {fps!r}, expected more than 0 and at most 10000")
-    return plain(meta)
+    return {key: plain(value) for key, value in meta.items()}
 
 
 def plain(value: object) -> object:

@@ -9,12 +9,10 @@ import argparse
 import sys
 from collections.abc import Sequence
 from importlib import import_module
-from pathlib import Path
 
 from express50 import __version__
-from express50.console import FAILED, OK, USAGE, run_handler
+from express50.console import USAGE, run_handler
 from express50.stage_cli import add_dataset_commands, add_stage_commands
-from express50.threads import cap_threads
 
 # Commands of other areas: the module has add_commands(subparsers) for the command named here.
 AREAS = {
@@ -53,16 +51,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Entry point; returns the exit code."""
     arguments = list(sys.argv[1:] if argv is None else argv)
     command = next((a for a in arguments if not a.startswith("-")), None)
-    # Before NumPy comes in: its BLAS reads the cap when it is loaded.
-    cap_threads(1)
     try:
         args = build_parser(command).parse_args(arguments)
     except SystemExit as stop:  # argparse has said what is wrong
         return stop.code if isinstance(stop.code, int) else USAGE
     return run_handler("express50", args.handler, args)
 
-
-__all__ = ["AREAS", "FAILED", "OK", "build_parser", "main"]
 
 if __name__ == "__main__":
     sys.exit(main())

@@ -159,9 +159,8 @@ def _coerce(name: str, value: object, kind: Any) -> object:
             raise ConfigError(f"{name}: got NaN, expected a number")
         return float(value)
     # bool is an int in Python, but true is no count
-    if isinstance(kind, type) and isinstance(value, kind):
-        if kind is bool or not isinstance(value, bool):
-            return value
+    if isinstance(kind, type) and type(value) is kind:
+        return value
     raise ConfigError(
         f"{name}: got {value!r} ({type(value).__name__}), expected {_type_name(kind)}"
     )

@@ -15,7 +15,9 @@ from express50.errors import ConfigError, Express50Error
 OK, FAILED, USAGE, INTERRUPTED = 0, 1, 2, 130
 
 
-def run_handler(program: str, handler: Callable[[argparse.Namespace], int], args: object) -> int:
+def run_handler(
+    program: str, handler: Callable[[argparse.Namespace], int], args: argparse.Namespace
+) -> int:
     """Call a command's handler and turn its ending into an exit code.
 
     An Express50Error becomes one line on standard error; any other error is a defect and keeps its

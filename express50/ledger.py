@@ -18,7 +18,8 @@ SCHEMA = """
 CREATE TABLE IF NOT EXISTS receipts (
     stage TEXT NOT NULL, item TEXT NOT NULL, fingerprint TEXT NOT NULL, status TEXT NOT NULL,
     reason TEXT NOT NULL, metrics TEXT NOT NULL, seconds REAL NOT NULL,
-    peak_memory INTEGER NOT NULL, attempts INTEGER NOT NULL, time REAL NOT NULL, PRIMARY KEY (stage, item)
+    peak_memory INTEGER NOT NULL, attempts INTEGER NOT NULL, time REAL NOT NULL,
+    PRIMARY KEY (stage, item)
 );
 CREATE TABLE IF NOT EXISTS digests (
     path TEXT PRIMARY KEY, size INTEGER NOT NULL, mtime_ns INTEGER NOT NULL,

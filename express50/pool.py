@@ -15,6 +15,7 @@ from express50.work import Task, run_task
 
 ATTEMPTS = 2  # an item that killed its worker this often is set aside
 POLL_SECONDS = 0.5
+CONNECT_SECONDS = 20.0
 
 
 class Pool:
@@ -70,7 +71,8 @@ class Pool:
         from distributed.scheduler import KilledWorker
 
         client = self._connect()
-        waiting, running, killed = deque(tasks), {}, []
+        waiting, killed = deque(tasks), []
+        running: dict[Any, Task] = {}
         while waiting or running:
             while waiting and len(running) < self._window():
                 task = waiting.popleft()
@@ -105,7 +107,7 @@ class Pool:
 
         if self.scheduler is not None:
             try:
-                self._client = Client(self.scheduler, timeout="20s", set_as_default=False)
+                self._client = Client(self.scheduler, timeout=CONNECT_SECONDS, set_as_default=False)
             except (OSError, TimeoutError, ValueError) as error:
                 raise StageError(
                     f"scheduler {self.scheduler}: cannot connect ({error}); expected an address "

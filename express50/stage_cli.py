@@ -108,11 +108,13 @@ def run_all(args: argparse.Namespace) -> int:
 
 def _run(args: argparse.Namespace, names: list[str], pattern: str | None) -> int:
     from express50.pool import Pool
+    from express50.runner import run_stage
 
     if args.workers < 0 or args.threads < 1:
         raise ConfigError(
             f"--workers {args.workers} --threads {args.threads}: expected at least 0 and 1"
         )
+    # Before NumPy comes in with a stage: its BLAS reads the cap when it is loaded.
     cap_threads(args.threads)
     dataset = Dataset(args.dataset)
     summaries = []
@@ -125,19 +127,13 @@ def _run(args: argparse.Namespace, names: list[str], pattern: str | None) -> int
         configs = [config_of(stage, args) for stage in loaded]
         for stage, config in zip(loaded, configs, strict=True):
             chosen = _choose(stage, dataset, args, pattern)
-            summaries.append(_run_stage(stage, dataset, config, chosen, pool))
+            summaries.append(run_stage(stage, dataset, config, chosen, pool=pool))
             if not args.json:
                 say(*summaries[-1].lines())
     if args.json:
         accounts = [summary.to_json() for summary in summaries]
         say_json(accounts if args.command == "run" else accounts[0])
     return OK if all(summary.ok for summary in summaries) else FAILED
-
-
-def _run_stage(stage: Stage, dataset: Dataset, config: Any, chosen: Any, pool: Any) -> Any:
-    from express50.runner import run_stage
-
-    return run_stage(stage, dataset, config, chosen, pool=pool)
 
 
 def _choose(
@@ -149,8 +145,9 @@ def _choose(
     if stage.name == "ingest" and args.captures:
         register = import_module(stages()["ingest"]).register
         subjects = register(dataset, args.captures)
-        return subjects if args.command == "ingest" else None
-    if not dataset.root.is_dir():
+        if args.command == "ingest" and not pattern:
+            return subjects
+    elif not dataset.root.is_dir():
         raise StageError(
             f"{dataset.root}: no such dataset; run 'express50 ingest {dataset.root} CAPTURE'"
         )

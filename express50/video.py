@@ -30,7 +30,8 @@ def check_whole(path: Path) -> None:
     """
     size = path.stat().st_size
     with path.open("rb") as file:
-        offset, kinds = 0, []
+        offset = 0
+        kinds: list[bytes] = []
         while offset + 8 <= size:
             file.seek(offset)
             header = file.read(16)

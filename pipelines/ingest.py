@@ -204,7 +204,8 @@ def scan_camera(
     Raises:
         CaptureError: the footage is truncated, damaged or changes its size.
     """
-    pts, hashes = [], []
+    pts: list[int] = []
+    hashes: list[str] = []
     size: tuple[int, ...] | None = None
     with ProxyWriter(folder / f"{camera.id}.tar") as proxies:
         for stamp, image in iterate_camera(camera):

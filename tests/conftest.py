@@ -1,0 +1,52 @@
+"""Fixtures that all tests share."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+import pytest
+
+from express50.config import resolve_config
+from express50.layout import Dataset
+from tests.synth import make_capture
+
+REPOSITORY = Path(__file__).resolve().parent.parent
+
+
+def shared_folder(name: str) -> Path:
+    """Folder of material beside the repository; skips the test where it is not there."""
+    root = Path(os.environ.get("EXPRESS50_SHARED", REPOSITORY.parent / "shared"))
+    if not (root / name).exists():
+        pytest.skip(f"{name} is not beside the repository (set EXPRESS50_SHARED)")
+    return root / name
+
+
+@pytest.fixture
+def shared():
+    """Look up material beside the repository by name."""
+    return shared_folder
+
+
+@pytest.fixture(scope="session")
+def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Raw capture S001: 3 cameras, 6 frames of 64 px as PNG; do not change it."""
+    path = tmp_path_factory.mktemp("captures") / "S001"
+    make_capture(path)
+    return path
+
+
+@pytest.fixture
+def ingested(tmp_path: Path, capture: Path) -> Dataset:
+    """A dataset with S001 ingested."""
+    from express50.runner import run_stage
+    from pipelines import ingest
+
+    dataset = Dataset(tmp_path / "dataset")
+    ingest.register(dataset, [capture])
+    config = resolve_config(ingest.STAGE, "draft")
+    assert run_stage(ingest.STAGE, dataset, config, workers=0, progress=False).ok
+    return dataset

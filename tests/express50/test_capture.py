@@ -1,0 +1,147 @@
+"""Raw captures: what is read, and what each kind of damage is answered with."""
+
+import json
+
+import pytest
+
+from express50.capture import check_calibrated_sizes, read_capture, read_cues, read_meta
+from express50.errors import CalibrationError, CaptureError
+from express50.index import Cue
+from tests.synth import make_capture
+
+
+@pytest.fixture
+def raw(tmp_path):
+    make_capture(tmp_path / "S001")
+    return tmp_path / "S001"
+
+
+def test_whole_capture_is_read(raw):
+    capture = read_capture(raw)
+    assert (capture.subject, capture.fps) == ("S001", 24.0)
+    assert list(capture.cameras) == ["cam00", "cam01", "cam02"]
+    assert capture.cameras["cam00"].names[:2] == ("000000.png", "000001.png")
+    assert capture.cues == (Cue("neutral", 0, 2), Cue("smile", 3, 5))
+    assert capture.dropped == {}
+    assert capture.board is None
+    assert set(capture.plates) == set(capture.cameras) == set(capture.calibration)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("subject = 3\nfps = 24", "subject is 3, expected letters"),
+        ('subject = "../x"\nfps = 24', "subject is '../x'"),
+        ('subject = "a"', "fps is None, expected a number"),
+        ('subject = "a"\nfps = true', "fps is True"),
+        ('subject = "a"\nfps = 0', "fps is 0, expected more than 0"),
+        ('subject = "a"\nfps = nan', "fps is nan"),
+        ("subject = ", "not TOML"),
+    ],
+)
+def test_bad_capture_toml_says_what_is_wrong(raw, text, message):
+    (raw / "capture.toml").write_text(text)
+    with pytest.raises(CaptureError, match=message):
+        read_meta(raw)
+
+
+def test_missing_parts_are_named(tmp_path, raw):
+    with pytest.raises(CaptureError, match="no such folder"):
+        read_capture(tmp_path / "absent")
+    (raw / "cameras").rename(raw / "kameras")
+    with pytest.raises(CaptureError, match="expected cameras/<id>/video.mp4"):
+        read_capture(raw)
+    (raw / "capture.toml").unlink()
+    with pytest.raises(CaptureError, match="has no capture.toml"):
+        read_capture(raw)
+
+
+def test_dates_in_meta_become_text(raw):
+    with (raw / "capture.toml").open("a") as file:
+        file.write("recorded = 2024-05-01\n[rig]\nlenses = [35, 50]\n")
+    meta = read_meta(raw)
+    assert json.loads(json.dumps(meta)) == meta
+    assert (meta["recorded"], meta["rig"]["lenses"]) == ("2024-05-01", [35, 50])
+
+
+def test_gap_in_frames_drops_the_camera_and_names_the_frame(raw):
+    (raw / "cameras/cam01/frames/000003.png").unlink()
+    capture = read_capture(raw)
+    assert list(capture.cameras) == ["cam00", "cam02"]
+    assert "frame 3 is missing: found 000004.png" in capture.dropped["cam01"]
+
+
+def test_camera_without_or_with_two_kinds_of_footage_is_dropped(raw):
+    (raw / "cameras/cam00/video.mp4").touch()
+    (raw / "cameras/cam01/frames").rename(raw / "cameras/cam01/photos")
+    dropped = read_capture(raw).dropped
+    assert "holds video.mp4, frames/, expected one of them" in dropped["cam00"]
+    assert "holds no footage" in dropped["cam01"]
+
+
+def test_cameras_on_one_side_of_the_calibration_only_are_dropped(raw):
+    path = raw / "calibration.json"
+    table = json.loads(path.read_text())
+    table["cam77"] = table.pop("cam00")
+    path.write_text(json.dumps(table))
+    capture = read_capture(raw)
+    assert list(capture.cameras) == ["cam01", "cam02"]
+    assert "not in calibration.json" in capture.dropped["cam00"]
+    assert "cam77 is not there" in capture.dropped["cam77"]
+
+
+def test_malformed_calibration_is_an_error(raw):
+    path = raw / "calibration.json"
+    table = json.loads(path.read_text())
+    table["cam01"]["world_to_camera"] = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]
+    path.write_text(json.dumps(table))
+    with pytest.raises(CalibrationError, match=r"cam01.*shape \(3, 4\), expected \(4, 4\)"):
+        read_capture(raw)
+
+
+def test_calibration_for_another_size_is_an_error(raw):
+    capture = read_capture(raw)
+    check_calibrated_sizes(capture, {"cam00": (64, 64)})
+    with pytest.raises(CalibrationError, match="calibrated for 64x64, its footage is 64x48"):
+        check_calibrated_sizes(capture, {"cam00": (64, 48)})
+
+
+def test_board_is_listed_by_camera(raw):
+    for name in ("cam00", "cam02", "stranger"):
+        (raw / "board" / name).mkdir(parents=True)
+        (raw / "board" / name / "000.png").touch()
+    with pytest.raises(CaptureError, match=r"no board\.toml"):
+        read_capture(raw)
+    (raw / "board/board.toml").write_text("squares_x = 5\n")
+    board = read_capture(raw).board
+    assert board["config"] == {"squares_x": 5}
+    assert board["cameras"] == {"cam00": ["board/cam00/000.png"], "cam02": ["board/cam02/000.png"]}
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("expression,start_frame,end_frame\n", "no column expression_id"),
+        ("", "no column expression_id, start_frame, end_frame"),
+        ("expression_id,start_frame,end_frame\nsmile,0,x\n", ":2: frames are '0' and 'x'"),
+        ("expression_id,start_frame,end_frame\nsmile,0\n", ":2: frames are '0' and None"),
+        ("expression_id,start_frame,end_frame\nsmile,5,4\n", ":2: smile runs from 5 to 4"),
+        ("expression_id,start_frame,end_frame\nsmile,-1,4\n", "0 <= start <= end"),
+        ("expression_id,start_frame,end_frame\na.b,0,4\n", "expression_id is 'a.b'"),
+        ("expression_id,start_frame,end_frame\na,0,4\na,5,6\n", "a appears twice"),
+    ],
+)
+def test_bad_cues_name_the_line(tmp_path, text, message):
+    path = tmp_path / "cues.csv"
+    path.write_text(text)
+    with pytest.raises(CaptureError, match=message):
+        read_cues(path)
+
+
+def test_cues_may_come_from_a_spreadsheet(tmp_path):
+    path = tmp_path / "cues.csv"
+    path.write_bytes(
+        b"\xef\xbb\xbfexpression_id, start_frame, end_frame, note\r\nsmile, 0, 4, ok\r\n"
+    )
+    assert read_cues(path) == (Cue("smile", 0, 4),)
+    assert read_cues(tmp_path / "absent.csv") == ()

@@ -1,0 +1,91 @@
+"""The ledger: receipts come back as written; digests follow the content."""
+
+import os
+
+import pytest
+
+from express50.digests import file_sha256, path_digest, stat_digest
+from express50.errors import FormatError, StageError
+from express50.ledger import Ledger, Receipt
+
+
+@pytest.fixture
+def ledger(tmp_path):
+    with Ledger(tmp_path / "ledger.sqlite") as opened:
+        yield opened
+
+
+def receipt(item="S001", **values):
+    return Receipt(
+        **{"stage": "track", "item": item, "fingerprint": "f", "status": "done"} | values
+    )
+
+
+def test_receipts_come_back_as_written(ledger):
+    written = receipt(metrics={"a": [1, 2.5], "b": "ü"}, seconds=1.5, peak_memory=7, attempts=2)
+    ledger.write(written)
+    ledger.write(receipt("S000", status="failed", reason="dark"))
+    ledger.write(Receipt(stage="depth", item="S001", fingerprint="g", status="done"))
+    assert list(ledger.read("track")) == ["S000", "S001"]
+    assert ledger.read("track")["S001"] == written
+
+
+def test_newer_receipt_takes_the_place_of_the_older(ledger):
+    ledger.write(receipt(fingerprint="1"))
+    ledger.write(receipt(fingerprint="2"))
+    assert [r.fingerprint for r in ledger.read("track").values()] == ["2"]
+    ledger.remove("track", "S001")
+    assert ledger.read("track") == {}
+
+
+def test_two_processes_may_write(tmp_path):
+    with Ledger(tmp_path / "l.sqlite") as one, Ledger(tmp_path / "l.sqlite") as two:
+        one.write(receipt("a"))
+        two.write(receipt("b"))
+        assert set(one.read("track")) == {"a", "b"}
+
+
+def test_digest_is_cached_until_size_time_or_inode_changes(ledger, tmp_path, monkeypatch):
+    path = tmp_path / "x"
+    path.write_bytes(b"one")
+    first = ledger.sha256(path)
+    assert first == file_sha256(path)
+    monkeypatch.setattr("express50.ledger.file_sha256", lambda path: pytest.fail("read again"))
+    assert ledger.sha256(path) == first
+    monkeypatch.undo()
+    path.write_bytes(b"two")
+    os.utime(path, ns=(1, 1))
+    assert ledger.sha256(path) == file_sha256(path) != first
+
+
+def test_file_that_is_no_ledger_is_an_error(tmp_path):
+    path = tmp_path / "ledger.sqlite"
+    path.write_bytes(b"x" * 5000)
+    with pytest.raises(FormatError, match="not a ledger"):
+        Ledger(path)
+
+
+def test_folder_digest_sees_names_and_contents_but_not_hidden_files(tmp_path):
+    (tmp_path / "a").mkdir()
+    (tmp_path / "a/x").write_text("1")
+    first = path_digest(tmp_path)
+    (tmp_path / ".hidden").write_text("2")
+    assert path_digest(tmp_path) == first
+    (tmp_path / "a/x").rename(tmp_path / "a/y")
+    renamed = path_digest(tmp_path)
+    (tmp_path / "a/y").write_text("2")
+    assert len({first, renamed, path_digest(tmp_path)}) == 3
+
+
+def test_stat_digest_follows_size_and_time(tmp_path):
+    (tmp_path / "x").write_text("1")
+    os.utime(tmp_path / "x", ns=(5, 5))
+    first = stat_digest(tmp_path)
+    assert stat_digest(tmp_path) == first
+    os.utime(tmp_path / "x", ns=(5, 6))
+    assert stat_digest(tmp_path) != first
+
+
+def test_missing_input_names_the_remedy(tmp_path):
+    with pytest.raises(StageError, match="run the stage that writes it first"):
+        path_digest(tmp_path / "absent")

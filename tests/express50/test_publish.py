@@ -1,0 +1,89 @@
+"""Publishing: whole or absent, errors leave the former output, leftovers go."""
+
+import os
+
+import pytest
+
+from express50.layout import Dataset
+from express50.publish import (
+    clean_leftovers,
+    dump_json,
+    publishing,
+    set_aside,
+    write_bytes,
+    write_json,
+)
+
+
+@pytest.fixture
+def dataset(tmp_path):
+    return Dataset(tmp_path / "data")
+
+
+def publish(dataset, text, item="S001/cam00"):
+    with publishing(dataset, "matte", item) as out:
+        (out / "a.txt").write_text(text)
+
+
+def staged(dataset):
+    return list(dataset.staging_dir.iterdir())
+
+
+def test_folder_appears_only_at_the_end_and_replaces_the_former(dataset):
+    target = dataset.item_dir("matte", "S001/cam00")
+    with publishing(dataset, "matte", "S001/cam00") as out:
+        (out / "old.txt").write_text("1")
+        assert not target.exists()
+    publish(dataset, "2")
+    assert {p.name: p.read_text() for p in target.iterdir()} == {"a.txt": "2"}
+    assert staged(dataset) == []
+
+
+def test_error_in_the_body_leaves_the_former_folder(dataset):
+    publish(dataset, "1")
+    with pytest.raises(RuntimeError), publishing(dataset, "matte", "S001/cam00") as out:
+        (out / "a.txt").write_text("half")
+        raise RuntimeError
+    assert (dataset.item_dir("matte", "S001/cam00") / "a.txt").read_text() == "1"
+    assert staged(dataset) == []
+
+
+def test_everything_is_synced_before_the_rename(dataset, monkeypatch):
+    calls = []
+    real_sync, real_rename = os.fsync, os.rename
+    monkeypatch.setattr(os, "fsync", lambda fd: (calls.append("sync"), real_sync(fd)))
+    monkeypatch.setattr(os, "rename", lambda *a, **k: (calls.append("rename"), real_rename(*a)))
+    publish(dataset, "1")
+    # the file and its folder before the rename, the parent after it
+    assert calls == ["sync", "sync", "rename", "sync"]
+
+
+def test_leftovers_of_killed_runs_are_removed_for_that_stage_only(dataset):
+    for name in ("matte-S001+cam00-123", "track-S001-456"):
+        (dataset.staging_dir / name).mkdir(parents=True)
+    assert clean_leftovers(dataset, "matte") == 1
+    assert [p.name for p in staged(dataset)] == ["track-S001-456"]
+
+
+def test_set_aside_hides_an_item_from_later_stages(dataset):
+    publish(dataset, "1")
+    assert set_aside(dataset, "matte", "S001/cam00")
+    assert not dataset.item_dir("matte", "S001/cam00").exists()
+    assert (dataset.stale_dir / "matte/S001/cam00/a.txt").read_text() == "1"
+    assert not set_aside(dataset, "matte", "S001/cam00")
+
+
+def test_write_bytes_replaces_in_one_step_and_leaves_nothing_beside(tmp_path):
+    path = tmp_path / "deep" / "x.json"
+    write_json(path, {"b": 1, "a": [1.5]})
+    write_bytes(path, b"new")
+    assert path.read_bytes() == b"new"
+    assert [p.name for p in path.parent.iterdir()] == ["x.json"]
+
+
+def test_json_is_sorted_and_refuses_what_is_not_finite():
+    assert (
+        dump_json({"b": (1, 2), "a": "ä"}) == '{\n "a": "ä",\n "b": [\n  1,\n  2\n ]\n}\n'.encode()
+    )
+    with pytest.raises(ValueError, match="not JSON compliant"):
+        dump_json({"a": float("inf")})

@@ -1,0 +1,178 @@
+"""The runner: skips, isolates, accounts, and sets aside what is stale or deadly."""
+
+import dataclasses
+import json
+
+import pytest
+
+from express50.errors import ConfigError, StageError
+from express50.ledger import Ledger
+from express50.runner import run_stage, select_items
+from tests.faults import toy
+from tests.faults.toy import make_dataset, run_toy, tree
+
+
+def statuses(summary):
+    return {outcome.item: outcome.status for outcome in summary.outcomes}
+
+
+def receipts(dataset):
+    with Ledger(dataset.ledger) as ledger:
+        return ledger.read("toy")
+
+
+def test_one_bad_item_never_stops_the_others(tmp_path):
+    names = ["bad1", "bug1", "drop1", "nan1", "noinput1", "ok1", "S001/cam03"]
+    dataset = make_dataset(tmp_path / "data", names)
+    summary = run_toy(dataset)
+    failed = {"bad1", "bug1", "nan1", "noinput1"}
+    assert {k for k, v in statuses(summary).items() if v == "failed"} == failed
+    assert {k for k, v in statuses(summary).items() if v == "done"} == set(names) - failed
+    assert not summary.ok
+    assert {k: r.status for k, r in receipts(dataset).items()} == statuses(summary)
+    lines = "\n".join(summary.lines())
+    assert "read 7 = 3 done + 0 skipped + 4 failed" in lines
+    assert "failed bad1: StageError: bad1: text is 'bad1', expected 'mended'" in lines
+    assert "dropped cam03 of drop1: dark" in lines
+    assert all(not (dataset.item_dir("toy", name)).exists() for name in failed)
+
+
+def test_unexpected_error_leaves_its_traceback_in_a_log_that_success_removes(tmp_path):
+    dataset = make_dataset(tmp_path / "data", ["bug1", "ok1"])
+    (outcome,) = [o for o in run_toy(dataset).outcomes if o.status == "failed"]
+    log = dataset.log_file("toy", "bug1")
+    assert outcome.reason.startswith("KeyError: 'absent'")
+    assert str(log) in outcome.reason
+    assert "misbehave" in log.read_text()
+
+
+def test_second_run_skips_and_a_changed_input_or_config_redoes(tmp_path):
+    dataset = make_dataset(tmp_path / "data", ["a", "b"])
+    assert set(statuses(run_toy(dataset)).values()) == {"done"}
+    assert set(statuses(run_toy(dataset)).values()) == {"skipped"}
+    (dataset.root / "in" / "a.txt").write_text("other")
+    assert statuses(run_toy(dataset)) == {"a": "done", "b": "skipped"}
+    assert set(statuses(run_toy(dataset, word="b")).values()) == {"done"}
+    newer = dataclasses.replace(toy.STAGE, version=2)
+    summary = run_stage(newer, dataset, toy.ToyConfig(word="b"), workers=0, progress=False)
+    assert set(statuses(summary).values()) == {"done"}
+
+
+def test_touched_input_with_the_same_content_is_skipped(tmp_path):
+    dataset = make_dataset(tmp_path / "data", ["a"])
+    run_toy(dataset)
+    (dataset.root / "in" / "a.txt").write_text("a")
+    assert statuses(run_toy(dataset)) == {"a": "skipped"}
+
+
+def test_lost_output_is_made_again(tmp_path):
+    dataset = make_dataset(tmp_path / "data", ["a"])
+    run_toy(dataset)
+    before = tree(dataset.stage_dir("toy"))
+    (dataset.item_dir("toy", "a") / "metrics.json").unlink()
+    assert statuses(run_toy(dataset)) == {"a": "done"}
+    assert tree(dataset.stage_dir("toy")) == before
+
+
+def test_stale_output_of_a_failed_item_is_set_aside_and_success_clears_it(tmp_path):
+    dataset = make_dataset(tmp_path / "data", ["bad1"])
+    source = dataset.root / "in" / "bad1.txt"
+    source.write_text("mended")
+    assert run_toy(dataset).ok
+    source.write_text("broken")
+    assert not run_toy(dataset).ok
+    assert not dataset.item_dir("toy", "bad1").exists()
+    assert (dataset.stale_dir / "toy" / "bad1" / "metrics.json").is_file()
+    source.write_text("mended")
+    assert run_toy(dataset).ok
+    assert not (dataset.stale_dir / "toy" / "bad1").exists()
+
+
+def test_outputs_of_vanished_items_are_set_aside_only_by_a_full_run(tmp_path):
+    dataset = make_dataset(tmp_path / "data", ["a", "b"])
+    run_toy(dataset)
+    (dataset.root / "in" / "b.txt").unlink()
+    run_stage(toy.STAGE, dataset, toy.ToyConfig(), items=["a"], workers=0, progress=False)
+    assert dataset.item_dir("toy", "b").exists()
+    run_toy(dataset)
+    assert not dataset.item_dir("toy", "b").exists()
+    assert list(receipts(dataset)) == ["a"]
+
+
+def test_workers_give_the_same_bytes_as_inline(tmp_path):
+    names = [f"item{n}" for n in range(5)] + ["bad1", "bug1"]
+    inline, spread = (make_dataset(tmp_path / n, names) for n in ("inline", "spread"))
+    first, second = run_toy(inline, workers=0), run_toy(spread, workers=2)
+    assert statuses(first) == statuses(second)
+    assert tree(inline.stage_dir("toy")) == tree(spread.stage_dir("toy"))
+
+
+def test_item_that_kills_its_worker_is_set_aside_after_two_attempts(tmp_path):
+    names = ["poison1", "once1", *[f"item{n}" for n in range(6)]]
+    dataset = make_dataset(tmp_path / "data", names)
+    summary = run_toy(dataset, workers=2)
+    assert {k for k, v in statuses(summary).items() if v == "failed"} == {"poison1"}
+    table = receipts(dataset)
+    assert (table["poison1"].attempts, table["once1"].attempts) == (2, 2)
+    assert "died 2 times" in table["poison1"].reason
+
+
+def test_receipt_counts_time_and_memory(tmp_path):
+    dataset = make_dataset(tmp_path / "data", ["a"])
+    run_toy(dataset, seconds=0.05)
+    receipt = receipts(dataset)["a"]
+    assert receipt.seconds >= 0.15
+    assert 1e6 < receipt.peak_memory < 1e11
+    assert receipt.metrics == {"length": 1, "dropped": []}
+    assert json.loads((dataset.item_dir("toy", "a") / "metrics.json").read_text()) == (
+        receipt.metrics
+    )
+
+
+def test_resolved_config_is_saved_and_can_be_given_back(tmp_path):
+    from express50.config import resolve_config
+
+    dataset = make_dataset(tmp_path / "data", ["a"])
+    run_toy(dataset, word="x", files=4)
+    again = resolve_config(toy.STAGE, "draft", dataset.config_file("toy"))
+    assert again == toy.ToyConfig(word="x", files=4)
+
+
+def test_stage_without_items_and_unmatched_pattern_are_errors(tmp_path):
+    dataset = make_dataset(tmp_path / "data", [])
+    with pytest.raises(StageError, match="nothing to do"):
+        run_toy(dataset)
+    dataset = make_dataset(tmp_path / "other", ["S001", "S002"])
+    assert select_items(toy.STAGE, dataset, "*2") == ["S002"]
+    with pytest.raises(ConfigError, match="no item of toy matches, did you mean 'S001'"):
+        select_items(toy.STAGE, dataset, "S01")
+
+
+def test_unreachable_scheduler_is_one_error(tmp_path, monkeypatch):
+    from express50 import pool
+
+    dataset = make_dataset(tmp_path / "data", ["a", "b"])
+    monkeypatch.setattr(pool, "CONNECT_SECONDS", 0.5)
+    with pytest.raises(StageError, match="scheduler tcp://127.0.0.1:9: cannot connect"):
+        run_stage(
+            toy.STAGE, dataset, toy.ToyConfig(), scheduler="tcp://127.0.0.1:9", progress=False
+        )
+
+
+def test_given_scheduler_is_used_and_left_running(tmp_path):
+    from distributed import Client, LocalCluster
+
+    dataset = make_dataset(tmp_path / "data", ["a", "b", "c"])
+    with LocalCluster(
+        n_workers=1, threads_per_worker=1, processes=True, dashboard_address=None
+    ) as cluster:
+        summary = run_stage(
+            toy.STAGE,
+            dataset,
+            toy.ToyConfig(),
+            scheduler=cluster.scheduler_address,
+            progress=False,
+        )
+        with Client(cluster) as client:
+            assert len(client.nthreads()) == 1
+    assert summary.count("done") == 3

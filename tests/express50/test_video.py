@@ -1,0 +1,127 @@
+"""Frame-exact video: counts by decoding, seeks by time stamp, truncation is an error."""
+
+import av
+import numpy as np
+import pytest
+
+from express50.errors import CaptureError
+from express50.frames import dhash
+from express50.video import VideoReader, check_whole, iterate_video
+from tests.synth import noise_video_images, write_video
+
+FRAMES = 61
+
+
+@pytest.fixture(
+    scope="module",
+    params=[
+        {"gop": 12, "b_frames": 2},
+        {"gop": 60, "b_frames": 8},
+        {"gop": 16, "b_frames": 4, "options": {"x264-params": "open-gop=1:bframes=4:b-pyramid=2"}},
+        {"gop": 1, "b_frames": 0},
+    ],
+    ids=["closed", "long", "open", "intra"],
+)
+def video(request, tmp_path_factory):
+    path = tmp_path_factory.mktemp("video") / "video.mp4"
+    write_video(path, noise_video_images(FRAMES), **request.param)
+    return path
+
+
+def test_random_reads_give_the_sequential_frames(video):
+    sequential = list(iterate_video(video))
+    assert len(sequential) == FRAMES
+    pts = tuple(stamp for stamp, _ in sequential)
+    assert list(pts) == sorted(set(pts))
+    reader = VideoReader(video, pts)
+    order = np.random.default_rng(1).integers(0, FRAMES, 40)
+    for frame in [0, FRAMES - 1, 1, *order]:
+        assert np.array_equal(reader.read(int(frame)), sequential[frame][1]), frame
+    reader.close()
+
+
+def test_forward_reads_do_not_seek(video, monkeypatch):
+    pts = tuple(stamp for stamp, _ in iterate_video(video))
+    reader = VideoReader(video, pts)
+    monkeypatch.setattr(reader, "_seek", lambda frame: pytest.fail("seek"))
+    for frame in (0, 1, 2, 10, 20):
+        reader.read(frame)
+
+
+def test_frame_outside_is_refused(video):
+    pts = tuple(stamp for stamp, _ in iterate_video(video))
+    with pytest.raises(CaptureError, match="frame 61 does not exist, expected 0 to 60"):
+        VideoReader(video, pts).read(FRAMES)
+
+
+def test_foreign_time_stamps_are_refused(video):
+    pts = tuple(stamp + 1 for stamp, _ in iterate_video(video))
+    with pytest.raises(CaptureError, match="no frame with time stamp"):
+        VideoReader(video, pts).read(5)
+
+
+def test_frame_count_is_decoded_not_believed(tmp_path):
+    """An edit list hides the first frames: the container still counts them, decoding does not."""
+    images = noise_video_images(24)
+    whole, cut = tmp_path / "whole.mp4", tmp_path / "cut.mp4"
+    write_video(whole, images, gop=24, b_frames=0)
+    with av.open(str(whole)) as source, av.open(str(cut), "w") as target:
+        stream = source.streams.video[0]
+        copy = target.add_stream_from_template(stream)
+        start = [p.pts for p in source.demux(stream) if p.pts is not None][8]
+        source.seek(0, stream=stream)
+        for packet in source.demux(stream):
+            if packet.pts is None:
+                continue
+            packet.pts -= start
+            packet.dts -= start
+            packet.stream = copy
+            target.mux(packet)
+    decoded = [image for _, image in iterate_video(cut)]
+    with av.open(str(cut)) as container:
+        claimed = container.streams.video[0].frames
+    assert (len(decoded), claimed) == (16, 24)
+    assert dhash(decoded[0]) == dhash([image for _, image in iterate_video(whole)][8])
+
+
+@pytest.mark.parametrize("faststart", [False, True])
+@pytest.mark.parametrize("kept", [0.05, 0.4, 0.8, 0.999])
+def test_truncated_file_is_a_capture_error(tmp_path, faststart, kept):
+    path = tmp_path / "video.mp4"
+    options = {"movflags": "faststart"} if faststart else {}
+    write_video(path, noise_video_images(30), container_options=options)
+    data = path.read_bytes()
+    path.write_bytes(data[: int(kept * len(data))])
+    with pytest.raises(CaptureError, match="copy"):
+        list(iterate_video(path))
+
+
+def test_fragmented_file_cut_in_a_fragment_is_a_capture_error(tmp_path):
+    path = tmp_path / "video.mp4"
+    flags = {"movflags": "frag_keyframe+empty_moov"}
+    write_video(path, noise_video_images(48), gop=8, container_options=flags)
+    check_whole(path)
+    data = path.read_bytes()
+    path.write_bytes(data[: len(data) // 2])
+    with pytest.raises(CaptureError, match="truncated"):
+        list(iterate_video(path))
+
+
+@pytest.mark.parametrize("data", [b"", b"no video at all", b"\0" * 4096])
+def test_junk_is_a_capture_error(tmp_path, data):
+    path = tmp_path / "video.mp4"
+    path.write_bytes(data)
+    with pytest.raises(CaptureError, match="cannot be opened"):
+        list(iterate_video(path))
+
+
+def test_sound_only_is_a_capture_error(tmp_path):
+    path = tmp_path / "video.mp4"
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("aac", rate=44100)
+        frame = av.AudioFrame.from_ndarray(np.zeros((2, 1024), np.float32), "fltp", "stereo")
+        frame.sample_rate = 44100
+        for packet in [*stream.encode(frame), *stream.encode()]:
+            container.mux(packet)
+    with pytest.raises(CaptureError, match="no video stream"):
+        list(iterate_video(path))

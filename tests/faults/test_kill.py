@@ -1,0 +1,117 @@
+"""SIGKILL at any moment: every output is absent or whole, and a rerun gives the same bytes."""
+
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from express50.config import resolve_config
+from express50.layout import Dataset
+from express50.runner import run_stage
+from pipelines import ingest
+from tests.faults import toy
+from tests.synth import make_capture
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+NAMES = [f"item{number}" for number in range(6)] + ["S001/cam00", "S001/cam01"]
+
+
+def start(arguments: list[str]) -> subprocess.Popen:
+    environment = os.environ | {"PYTHONPATH": str(REPOSITORY), "OMP_NUM_THREADS": "1"}
+    return subprocess.Popen(
+        [sys.executable, "-m", *arguments],
+        cwd=REPOSITORY,
+        env=environment,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        start_new_session=True,
+    )
+
+
+def kill_until_done(arguments: list[str], check, delays: list[float]) -> int:
+    """Start, kill after each delay, check what is there; then let one run end. Returns kills."""
+    kills = 0
+    for delay in delays:
+        process = start(arguments)
+        try:
+            process.wait(delay)
+        except subprocess.TimeoutExpired:
+            process.send_signal(signal.SIGKILL)
+            process.wait()
+            kills += 1
+        check()
+    assert start(arguments).wait(timeout=60) == 0
+    return kills
+
+
+def published(root: Path, names: list[str]) -> dict[str, dict[str, bytes]]:
+    return {name: toy.tree(root / name) for name in names if (root / name).is_dir()}
+
+
+@pytest.mark.parametrize(("workers", "rounds", "longest"), [(0, 12, 0.9), (2, 3, 3.5)])
+def test_killed_driver_leaves_whole_items_and_a_rerun_completes(tmp_path, workers, rounds, longest):
+    calm = toy.make_dataset(tmp_path / "calm", NAMES)
+    assert toy.run_toy(calm, seconds=0.02).ok
+    expected = published(calm.stage_dir("toy"), NAMES)
+    assert len(expected) == len(NAMES)
+    hurt = toy.make_dataset(tmp_path / "hurt", NAMES)
+
+    def check():
+        for name, files in published(hurt.stage_dir("toy"), NAMES).items():
+            assert files == expected[name], name
+
+    rng = random.Random(workers)
+    delays = [rng.uniform(0.1, longest) for _ in range(rounds)]
+    kills = kill_until_done(["tests.faults.toy", str(hurt.root), str(workers)], check, delays)
+    assert kills > 0
+    assert toy.tree(hurt.stage_dir("toy")) == toy.tree(calm.stage_dir("toy"))
+    assert [p for p in hurt.staging_dir.iterdir() if not p.name.endswith(".lock")] == []
+
+
+def test_killed_ingest_reruns_to_the_same_bytes(tmp_path):
+    make_capture(tmp_path / "S001", cameras=4, frames=24, size=96, video=True)
+    calm, hurt = Dataset(tmp_path / "calm"), Dataset(tmp_path / "hurt")
+    for dataset in (calm, hurt):
+        ingest.register(dataset, [tmp_path / "S001"])
+    config = resolve_config(ingest.STAGE)
+    assert run_stage(ingest.STAGE, calm, config, workers=0, progress=False).ok
+    expected = toy.tree(calm.stage_dir("ingest"))
+
+    def check():
+        assert toy.tree(hurt.stage_dir("ingest")) in ({}, expected)
+
+    rng = random.Random(3)
+    delays = [rng.uniform(0.2, 1.2) for _ in range(6)]
+    command = ["express50.cli", "ingest", str(hurt.root)]
+    assert kill_until_done(command, check, delays) > 0
+    assert toy.tree(hurt.stage_dir("ingest")) == expected
+
+
+def test_interrupt_stops_soon_and_is_resumable(tmp_path):
+    dataset = toy.make_dataset(tmp_path / "data", [f"item{n}" for n in range(30)])
+    process = start(["tests.faults.toy", str(dataset.root), "2"])
+    give_up = time.monotonic() + 30
+    while not list(dataset.root.glob("toy/*")) and time.monotonic() < give_up:
+        time.sleep(0.05)
+    os.killpg(process.pid, signal.SIGINT)  # as a terminal does: driver and workers
+    process.wait(timeout=15)
+    finished = list(dataset.root.glob("toy/*"))
+    assert process.returncode != 0
+    assert 0 < len(finished) < 30
+    summary = toy.run_toy(dataset, seconds=0.02)
+    assert summary.count("done") + summary.count("skipped") == 30
+    assert summary.count("skipped") >= len(finished) - 2
+
+
+def test_second_run_on_the_same_stage_is_refused(tmp_path):
+    from express50.errors import StageError
+    from express50.runner import stage_lock
+
+    dataset = toy.make_dataset(tmp_path / "data", ["item0"])
+    with stage_lock(dataset, "toy"), pytest.raises(StageError, match="another 'toy' runs"):
+        toy.run_toy(dataset)

@@ -1,0 +1,106 @@
+"""A toy stage whose items misbehave by name, and a driver to be killed.
+
+Run as ``python -m tests.faults.toy ROOT WORKERS``.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import signal
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+from express50.config import resolve_config
+from express50.errors import StageError
+from express50.layout import Dataset
+from express50.runner import run_stage
+from express50.stage import Stage
+
+
+@dataclass(frozen=True, kw_only=True)
+class ToyConfig:
+    """Configuration."""
+
+    files: int = 3
+    """Files an item writes."""
+    seconds: float = 0.0
+    """Pause after each file."""
+    word: str = "a"
+    """Goes into the files."""
+
+
+def items(dataset: Dataset) -> list[str]:
+    return sorted(path.stem.replace("+", "/") for path in (dataset.root / "in").glob("*.txt"))
+
+
+def inputs(dataset: Dataset, item: str, config: ToyConfig) -> dict[str, Path | str]:
+    if item.startswith("noinput"):
+        raise StageError(f"{item}: no input")
+    return {"text": dataset.root / "in" / f"{item.replace('/', '+')}.txt", "kind": "toy"}
+
+
+def run(dataset: Dataset, item: str, config: ToyConfig, out: Path) -> dict:
+    text = (dataset.root / "in" / f"{item.replace('/', '+')}.txt").read_text()
+    (out / "deep").mkdir()
+    for number in range(config.files):
+        block = hashlib.sha256(f"{config.word}{item}{text}{number}".encode()).digest()
+        (out / "deep" / f"{number}.bin").write_bytes(block * 2000)
+        time.sleep(config.seconds)
+    print("chatter of a library")
+    return misbehave(dataset, item, text)
+
+
+def misbehave(dataset: Dataset, item: str, text: str) -> dict:
+    if item.startswith("bad") and text != "mended":
+        raise StageError(f"{item}: text is {text!r}, expected 'mended'")
+    if item.startswith("bug"):
+        return {}["absent"]
+    if item.startswith("nan"):
+        return {"value": float("nan")}
+    if item.startswith("poison"):
+        os.kill(os.getpid(), signal.SIGKILL)
+    if item.startswith("once"):
+        mark = dataset.root / f"{item}.mark"
+        if not mark.exists():
+            mark.touch()
+            os.kill(os.getpid(), signal.SIGKILL)
+    dropped = [{"what": "cam03", "why": "dark"}] if item.startswith("drop") else []
+    return {"length": len(text), "dropped": dropped}
+
+
+STAGE = Stage(
+    name="toy",
+    version=1,
+    config=ToyConfig,
+    presets={"draft": {"files": 2}, "standard": {}, "reference": {"files": 5}},
+    items=items,
+    inputs=inputs,
+    run=run,
+)
+
+
+def make_dataset(root: Path, names: list[str]) -> Dataset:
+    (root / "in").mkdir(parents=True)
+    for name in names:
+        (root / "in" / f"{name.replace('/', '+')}.txt").write_text(name)
+    return Dataset(root)
+
+
+def run_toy(dataset: Dataset, workers: int = 0, **values: object):
+    assignments = [f"toy.{key}={value!r}" for key, value in values.items()]
+    config = resolve_config(STAGE, "standard", None, assignments)
+    return run_stage(STAGE, dataset, config, workers=workers, progress=False)
+
+
+def tree(root: Path) -> dict[str, bytes]:
+    """Content of every file below a folder by relative path."""
+    files = (path for path in root.rglob("*") if path.is_file())
+    return {path.relative_to(root).as_posix(): path.read_bytes() for path in files}
+
+
+if __name__ == "__main__":
+    summary = run_toy(Dataset(Path(sys.argv[1])), int(sys.argv[2]), seconds=0.02)
+    sys.exit(0 if summary.ok else 1)

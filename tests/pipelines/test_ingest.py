@@ -1,0 +1,215 @@
+"""Ingest: the index is true to the footage; bad cameras are dropped, bad captures fail alone."""
+
+import json
+
+import numpy as np
+import pytest
+
+from express50.config import resolve_config
+from express50.errors import CaptureError, ConfigError, StageError
+from express50.frames import decode_proxy, dhash
+from express50.images import read_image
+from express50.index import CameraSource, Cue, read_index
+from express50.layout import Dataset
+from express50.runner import run_stage
+from pipelines import ingest
+from tests.synth import make_capture, noise_video_images, write_video
+
+
+def run(dataset, **values):
+    assignments = [f"ingest.{k}={v}" for k, v in values.items()]
+    config = resolve_config(ingest.STAGE, "standard", None, assignments)
+    return run_stage(ingest.STAGE, dataset, config, workers=0, progress=False)
+
+
+def metrics(dataset, subject="S001"):
+    return json.loads((dataset.item_dir("ingest", subject) / "metrics.json").read_text())
+
+
+@pytest.fixture
+def dataset(tmp_path):
+    make_capture(tmp_path / "S001", cameras=3, frames=8, video=True)
+    dataset = Dataset(tmp_path / "data")
+    ingest.register(dataset, [tmp_path / "S001"])
+    return dataset
+
+
+def camera_folder(dataset, name):
+    return dataset.captures()["S001"] / "cameras" / name
+
+
+def test_account_of_a_good_capture(dataset):
+    assert run(dataset).ok
+    assert metrics(dataset) == {
+        "cameras": 3,
+        "frames": 24,
+        "expressions": 2,
+        "frame_count": 8,
+        "frame_count_differs": {},
+        "plates": 3,
+        "dropped": [],
+    }
+    index = read_index(dataset, "S001")
+    pts = index.cameras["cam00"].pts
+    assert len(set(np.diff(pts))) == 1  # constant rate
+    sheet = read_image(dataset.item_dir("ingest", "S001") / "qc" / "cameras.jpg")
+    assert sheet.shape == (3 * 160, 6 * 160, 3)
+    assert sheet.std() > 20
+
+
+def test_proxy_size_follows_the_config_and_never_enlarges(dataset):
+    run(dataset, proxy_long_side=32)
+    folder = dataset.item_dir("ingest", "S001") / "proxies"
+    assert decode_proxy(folder, "cam00", 7).shape == (32, 32, 3)
+    run(dataset, proxy_long_side=640)
+    assert decode_proxy(folder, "cam00", 7).shape == (64, 64, 3)
+
+
+def test_proxy_keeps_the_identity_of_its_frame(dataset):
+    run(dataset)
+    index = read_index(dataset, "S001")
+    proxy = decode_proxy(dataset.item_dir("ingest", "S001") / "proxies", "cam01", 4)
+    bits = int(dhash(proxy), 16) ^ int(index.cameras["cam01"].dhash[4], 16)
+    assert bits.bit_count() <= 8
+
+
+def test_truncated_camera_is_dropped_with_its_reason(dataset):
+    video = camera_folder(dataset, "cam01") / "video.mp4"
+    video.write_bytes(video.read_bytes()[:-200])
+    summary = run(dataset)
+    assert summary.ok
+    (dropped,) = metrics(dataset)["dropped"]
+    assert dropped["what"] == "camera cam01"
+    assert "truncated" in dropped["why"]
+    assert list(read_index(dataset, "S001").cameras) == ["cam00", "cam02"]
+    names = {p.name for p in (dataset.item_dir("ingest", "S001") / "proxies").iterdir()}
+    assert names == {"cam00.tar", "cam00.json", "cam02.tar", "cam02.json"}
+    assert summary.outcomes[0].dropped == (dropped,)
+
+
+def test_missing_camera_is_dropped(dataset):
+    (camera_folder(dataset, "cam02") / "video.mp4").unlink()
+    camera_folder(dataset, "cam02").rmdir()
+    assert run(dataset).ok
+    assert [d["what"] for d in metrics(dataset)["dropped"]] == ["camera cam02"]
+
+
+def test_capture_without_a_usable_camera_fails(dataset):
+    for name in ("cam00", "cam01", "cam02"):
+        (camera_folder(dataset, name) / "video.mp4").write_bytes(b"junk")
+    summary = run(dataset)
+    assert summary.count("failed") == 1
+    assert "no usable camera: cam00: " in summary.outcomes[0].reason
+    assert not dataset.item_dir("ingest", "S001").exists()
+
+
+def test_wrong_calibration_stops_that_item_and_not_the_other(dataset, tmp_path):
+    make_capture(tmp_path / "S002", subject="S002", cameras=2, frames=4)
+    ingest.register(dataset, [tmp_path / "S002"])
+    path = dataset.captures()["S001"] / "calibration.json"
+    table = json.loads(path.read_text())
+    table["cam00"]["params"] = table["cam00"]["params"][:5]
+    path.write_text(json.dumps(table))
+    summary = run(dataset)
+    assert {o.item: o.status for o in summary.outcomes} == {"S001": "failed", "S002": "done"}
+    assert "CalibrationError" in summary.outcomes[0].reason
+    assert "cam00: params has shape (5,), expected (8,)" in summary.outcomes[0].reason
+
+
+def test_calibration_for_another_size_stops_the_item(dataset):
+    path = dataset.captures()["S001"] / "calibration.json"
+    table = json.loads(path.read_text())
+    table["cam00"]["width"] = 128
+    path.write_text(json.dumps(table))
+    assert "calibrated for 128x64, its footage is 64x64" in run(dataset).outcomes[0].reason
+
+
+def test_different_frame_counts_are_reported_and_short_cameras_dropped(dataset):
+    write_video(camera_folder(dataset, "cam00") / "video.mp4", noise_video_images(10))
+    write_video(camera_folder(dataset, "cam01") / "video.mp4", noise_video_images(5))
+    make = camera_folder(dataset, "cam03")
+    make.mkdir()
+    write_video(make / "video.mp4", noise_video_images(8))
+    (dataset.captures()["S001"] / "calibration.json").unlink()
+    assert run(dataset).ok
+    found = metrics(dataset)
+    assert found["frame_count"] == 8
+    assert found["frame_count_differs"] == {"cam00": 10}
+    (dropped,) = found["dropped"]
+    assert dropped["what"] == "camera cam01"
+    assert "has 5 frames, the cues need 8" in dropped["why"]
+
+
+def test_cues_outside_the_footage_are_dropped_and_reported(dataset):
+    cues = dataset.captures()["S001"] / "cues.csv"
+    cues.write_text("expression_id,start_frame,end_frame\nneutral,0,7\nsmile,6,8\nanger,90,95\n")
+    assert run(dataset).ok
+    assert read_index(dataset, "S001").cues == (Cue("neutral", 0, 7),)
+    dropped = metrics(dataset)["dropped"]
+    assert [d["what"] for d in dropped] == ["expression anger", "expression smile"]
+    assert "from frame 6 to 8, the footage has frames 0 to 7" in dropped[1]["why"]
+
+
+def test_frames_of_different_size_drop_the_camera(dataset):
+    from tests.synth import write_frames
+
+    folder = camera_folder(dataset, "cam01")
+    (folder / "video.mp4").unlink()
+    images = [np.zeros((64, 64, 3), np.uint8)] * 7 + [np.zeros((32, 64, 3), np.uint8)]
+    write_frames(folder / "frames", images)
+    assert run(dataset).ok
+    assert "frame 7 is 64x32, the first is 64x64" in metrics(dataset)["dropped"][0]["why"]
+
+
+def test_capture_that_changed_is_ingested_again(dataset):
+    assert run(dataset).count("done") == 1
+    assert run(dataset).count("skipped") == 1
+    cues = dataset.captures()["S001"] / "cues.csv"
+    cues.write_text("expression_id,start_frame,end_frame\nneutral,0,7\n")
+    assert run(dataset).count("done") == 1
+    assert len(read_index(dataset, "S001").cues) == 1
+
+
+def test_register_checks_before_it_writes(dataset, tmp_path):
+    make_capture(tmp_path / "other", subject="S001", cameras=1)
+    with pytest.raises(CaptureError, match="subject S001 is also that of"):
+        ingest.register(dataset, [dataset.captures()["S001"], tmp_path / "other"])
+    with pytest.raises(CaptureError, match="no such folder"):
+        ingest.register(dataset, [tmp_path / "absent"])
+    assert ingest.register(dataset, [tmp_path / "other"]) == ["S001"]  # moved
+    assert dataset.captures()["S001"] == (tmp_path / "other").resolve()
+
+
+def test_capture_that_went_away_or_changed_its_subject_fails_alone(dataset, tmp_path):
+    (tmp_path / "S001" / "capture.toml").write_text('subject = "S009"\nfps = 24\n')
+    assert "registered as 'S001'" in run(dataset).outcomes[0].reason
+    (tmp_path / "S001").rename(tmp_path / "elsewhere")
+    assert "no such folder; run 'express50 ingest" in run(dataset).outcomes[0].reason
+    with pytest.raises(StageError, match="no capture of 'S009'"):
+        ingest.inputs(dataset, "S009", ingest.IngestConfig())
+
+
+def test_config_ranges():
+    for text in ("proxy_long_side=5", "proxy_quality=0", "proxy_quality=101"):
+        with pytest.raises(ConfigError, match="expected"):
+            resolve_config(ingest.STAGE, "standard", None, [f"ingest.{text}"])
+
+
+def test_usual_count_prefers_the_common_then_the_larger():
+    def camera(frames):
+        return CameraSource(
+            kind="video", source="", width=1, height=1, frames=frames, pts=(), dhash=(), sha256=""
+        )
+
+    def usual(*counts):
+        return ingest.usual_count({str(i): camera(n) for i, n in enumerate(counts)})
+
+    assert (usual(), usual(5), usual(5, 9, 5), usual(4, 6)) == (0, 5, 5, 6)
+
+
+def test_real_size_captures(shared, tmp_path):
+    dataset = Dataset(tmp_path / "data")
+    ingest.register(dataset, [shared("captures/H900")])
+    assert run(dataset).ok
+    assert metrics(dataset, "H900")["frames"] == 8 * 48
+    assert metrics(dataset, "H900")["dropped"] == []

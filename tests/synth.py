@@ -1,0 +1,131 @@
+"""Tiny captures for tests: a textured ball with a moving mark, ray-traced in a known rig."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import av
+import numpy as np
+
+from express50.cameras import Camera, rays, write_cameras
+from express50.images import write_image
+from express50.transforms import look_at
+
+RADIUS_M = 0.1
+EXPRESSIONS = ("neutral", "smile")
+
+
+def make_rig(cameras: int = 3, size: int = 64) -> dict[str, Camera]:
+    """Cameras on an arc, 0.6 m from the origin, looking at it."""
+    rig = {}
+    for number in range(cameras):
+        angle = (number - (cameras - 1) / 2) * 0.5
+        eye = 0.6 * np.array([np.sin(angle), 0.1, np.cos(angle)])
+        pose = look_at(eye, np.zeros(3), np.array([0.0, 1.0, 0.0]))
+        name = f"cam{number:02d}"
+        params = (1.6 * size, 1.6 * size, size / 2, size / 2, 0.0, 0.0, 0.0, 0.0)
+        rig[name] = Camera(name, size, size, "OPENCV", params, pose)
+    return rig
+
+
+def render_ball(camera: Camera, frame: int | None) -> np.ndarray:
+    """(H, W, 3) uint8 of the ball at a frame, or of the bare background for None."""
+    origin, directions = rays(camera)
+    height, width = directions.shape[:2]
+    column, row = np.meshgrid(np.arange(width), np.arange(height))
+    image = np.stack([60 + 40 * (row // 8 % 2), 70 + 30 * (column // 8 % 2), 90 + row % 16], -1)
+    if frame is None:
+        return image.astype(np.uint8)
+    direction = directions / np.linalg.norm(directions, axis=-1, keepdims=True)
+    b = direction @ origin
+    root = b**2 - (origin @ origin - RADIUS_M**2)
+    hit = root > 0
+    point = origin + (-b - np.sqrt(np.maximum(root, 0)))[..., None] * direction
+    normal = point / RADIUS_M
+    shade = 0.4 + 0.6 * np.clip(normal @ np.array([0.3, 0.5, 0.8]), 0, 1)
+    mark_angle = 0.35 * frame
+    mark = np.array([np.sin(mark_angle), 0.3 * np.cos(mark_angle), 0.8])
+    marked = normal @ (mark / np.linalg.norm(mark)) > 0.85
+    colour = np.where(marked[..., None], [240, 60, 40], [210, 170, 140])
+    return np.where(hit[..., None], colour * shade[..., None], image).astype(np.uint8)
+
+
+def make_capture(
+    path: Path,
+    *,
+    subject: str = "S001",
+    cameras: int = 3,
+    frames: int = 6,
+    size: int = 64,
+    video: bool = False,
+    plates: bool = True,
+    calibration: bool = True,
+    expressions: tuple[str, ...] = EXPRESSIONS,
+) -> dict[str, Camera]:
+    """Write a raw capture; expressions share the frames evenly. Returns the true cameras."""
+    rig = make_rig(cameras, size)
+    path.mkdir(parents=True)
+    (path / "capture.toml").write_text(f'subject = "{subject}"\nfps = 24\n')
+    if calibration:
+        write_cameras(path / "calibration.json", rig)
+    write_cues(path, expressions, frames)
+    for name, camera in rig.items():
+        images = [render_ball(camera, frame) for frame in range(frames)]
+        folder = path / "cameras" / name
+        if video:
+            folder.mkdir(parents=True)
+            write_video(folder / "video.mp4", images)
+        else:
+            write_frames(folder / "frames", images)
+        if plates:
+            (path / "plates").mkdir(exist_ok=True)
+            write_image(path / "plates" / f"{name}.png", render_ball(camera, None))
+    return rig
+
+
+def write_cues(path: Path, expressions: tuple[str, ...], frames: int) -> None:
+    """Cues of equal length, one after another."""
+    each = frames // max(1, len(expressions))
+    rows = [f"{e},{i * each},{(i + 1) * each - 1}" for i, e in enumerate(expressions)]
+    text = "\n".join(["expression_id,start_frame,end_frame", *rows])
+    (path / "cues.csv").write_text(text + "\n")
+
+
+def write_frames(folder: Path, images: list[np.ndarray]) -> None:
+    """Numbered PNG files."""
+    folder.mkdir(parents=True)
+    for number, image in enumerate(images):
+        write_image(folder / f"{number:06d}.png", image)
+
+
+def write_video(
+    path: Path,
+    images: list[np.ndarray],
+    codec: str = "libx264",
+    gop: int = 12,
+    b_frames: int = 2,
+    options: dict[str, str] | None = None,
+    container_options: dict[str, str] | None = None,
+) -> None:
+    """H.264 with B-frames, as cameras write it."""
+    with av.open(str(path), "w", options=container_options or {}) as container:
+        stream = container.add_stream(codec, rate=24)
+        stream.height, stream.width = images[0].shape[:2]
+        stream.pix_fmt = "yuv420p"
+        stream.codec_context.gop_size = gop
+        stream.codec_context.max_b_frames = b_frames
+        stream.codec_context.thread_count = 1
+        stream.options = {"crf": "12"} | (options or {})
+        for image in images:
+            for packet in stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")):
+                container.mux(packet)
+        for packet in stream.encode():
+            container.mux(packet)
+
+
+def noise_video_images(count: int, size: int = 64) -> list[np.ndarray]:
+    """Blocky images that differ a lot from frame to frame, so that hashes tell them apart."""
+    rng = np.random.default_rng(0)
+    blocks = rng.integers(0, 256, (count, 9, 9, 3), dtype=np.uint8)
+    scale = -(-size // 9)
+    return [np.kron(b, np.ones((scale, scale, 1), np.uint8))[:size, :size] for b in blocks]
