@@ -1,0 +1,116 @@
+"""The CUDA backend: our projection in torch, gsplat's kernels for sorting and blending.
+
+Projecting here rather than in gsplat gives gradients to K and the pose, which gsplat's projection
+lacks, and the three channels from which RaDe depth is built. gsplat is imported on first use only:
+on a machine with nvcc but no GPU its import starts a long build.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from grmm.rasterize.projection import Projection, expected_depth, project
+
+TILE = 16
+CHUNK = 32  # channels of one pass; more would not fit the shared memory of the backward kernel
+WIDTHS = (1, 2, 3, 4, 5, 8, 9, 16, 17, 32)  # channel counts that every gsplat release compiles
+
+
+def rasterize_gsplat(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    colors: Tensor,
+    K: Tensor,
+    cam_from_world: Tensor,
+    width: int,
+    height: int,
+    background: Tensor | None,
+    near: float,
+    eps2d: float,
+    antialiased: bool,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Colours (H, W, C), depth (H, W) and alpha (H, W); arguments as ``grmm.rasterize``.
+
+    Raises:
+        ValueError: the tensors are not float32 on a CUDA device.
+        RuntimeError: there is no CUDA device, or gsplat is not installed.
+    """
+    gsplat = _require_gsplat(means)
+    splats = project(
+        means, quats, scales, opacities, K, cam_from_world, width, height, near, eps2d, antialiased
+    )
+    offsets, ids = _tiles(gsplat, splats, width, height)
+    passes = []
+    for values in _padded_chunks(torch.cat([plane_channels(splats, K), colors], 1)):
+        image, alpha = gsplat.rasterize_to_pixels(
+            splats.means2d[None], splats.conics[None].contiguous(), values[None].contiguous(),
+            splats.opacities[None], width, height, TILE, offsets, ids,
+        )  # fmt: skip
+        passes.append(image[0])
+    values, alpha = torch.cat(passes, -1), alpha[0, ..., 0]
+    image = values[..., 3 : 3 + colors.shape[1]]
+    if background is not None:
+        image = image + (1.0 - alpha)[..., None] * background
+    return image, expected_depth(combine_planes(values[..., :3], K), alpha, K), alpha
+
+
+def plane_channels(splats: Projection, K: Tensor) -> Tensor:
+    """Channels (N, 3) that are affine in the pixel: ray length = a + b (u - cx) + c (v - cy).
+
+    Blended like colours and combined by ``combine_planes`` they give the sum of weight * ray
+    length; counting from the principal point keeps float32 exact enough.
+    """
+    length, slope_u, slope_v = splats.planes.unbind(1)
+    offset = splats.means2d - K[:2, 2].to(splats.means2d.dtype)
+    a = length - slope_u * offset[:, 0] - slope_v * offset[:, 1]
+    return torch.stack([a, slope_u, slope_v], 1)
+
+
+def combine_planes(blended: Tensor, K: Tensor) -> Tensor:
+    """Sum of weight * ray length (H, W) from blended plane channels (H, W, 3)."""
+    height, width = blended.shape[:2]
+    center = K[:2, 2].to(blended.dtype)
+    u = torch.arange(width, device=blended.device, dtype=blended.dtype) + 0.5 - center[0]
+    v = torch.arange(height, device=blended.device, dtype=blended.dtype) + 0.5 - center[1]
+    a, b, c = blended.unbind(-1)
+    return a + b * u[None, :] + c * v[:, None]
+
+
+def _require_gsplat(means: Tensor) -> Any:
+    """The gsplat module; errors with the remedy where it cannot work on ``means``."""
+    if not torch.cuda.is_available():
+        raise RuntimeError("backend 'gsplat' needs a CUDA device; use backend='cpu' here")
+    try:
+        import gsplat
+    except ImportError as error:
+        raise RuntimeError("backend 'gsplat' needs gsplat >= 1.5: pip install gsplat") from error
+    if means.device.type != "cuda" or means.dtype != torch.float32:
+        raise ValueError(
+            f"backend 'gsplat' got {means.dtype} on {means.device}, expected float32 on cuda"
+        )
+    return gsplat
+
+
+@torch.no_grad()
+def _tiles(gsplat: Any, splats: Projection, width: int, height: int) -> tuple[Tensor, Tensor]:
+    """gsplat's tile offsets (1, rows, columns) and sorted Gaussian indices."""
+    columns, rows = -(-width // TILE), -(-height // TILE)
+    # One pixel more than the exact box; invisible Gaussians have radius 0 and are left out.
+    radii = (splats.extents.clamp(max=1e9).ceil() + 1).int() * splats.visible[:, None]
+    _, keys, ids = gsplat.isect_tiles(
+        splats.means2d[None], radii[None].contiguous(), splats.depths[None], TILE, columns, rows
+    )
+    return gsplat.isect_offset_encode(keys, 1, columns, rows), ids
+
+
+def _padded_chunks(values: Tensor) -> list[Tensor]:
+    """Channels (N, C) in parts of at most ``CHUNK``; zeros pad the last to a legal width."""
+    chunks = list(values.split(CHUNK, dim=1))
+    missing = min(w for w in WIDTHS if w >= chunks[-1].shape[1]) - chunks[-1].shape[1]
+    chunks[-1] = torch.nn.functional.pad(chunks[-1], (0, missing))
+    return chunks
