@@ -62,6 +62,7 @@ class Ledger:
 
     def __init__(self, path: Path) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
+        self._fresh: dict[str, tuple] = {}  # digests not yet stored
         try:
             self._database = sqlite3.connect(path, timeout=60, isolation_level=None)
             self._database.execute("PRAGMA journal_mode=WAL")
@@ -115,7 +116,14 @@ class Ledger:
         if row is not None:
             return row[0]
         digest = file_sha256(path)
-        self._database.execute(
-            "INSERT OR REPLACE INTO digests VALUES (?, ?, ?, ?, ?)", (*key, digest)
-        )
+        self._fresh[str(path)] = (*key, digest)
         return digest
+
+    def keep_digests(self) -> None:
+        """Store new digests in one transaction; one each would cost a disk sync a file."""
+        self._database.execute("BEGIN IMMEDIATE")
+        self._database.executemany(
+            "INSERT OR REPLACE INTO digests VALUES (?, ?, ?, ?, ?)", self._fresh.values()
+        )
+        self._database.execute("COMMIT")
+        self._fresh.clear()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections import deque
 from collections.abc import Callable, Iterable
+from concurrent.futures import CancelledError
 from dataclasses import replace
 from typing import Any
 
@@ -83,14 +84,17 @@ class Pool:
                     finished = wait(list(running), POLL_SECONDS, "FIRST_COMPLETED").done
             except TimeoutError:
                 finished = set()
+            except CancelledError as error:
+                raise StageError("lost the dask scheduler; start it, run the same again") from error
             for future in finished:
                 task = running.pop(future)
-                try:
-                    settle(replace(future.result(), attempts=attempt))
-                except KilledWorker:
+                error = future.exception()
+                if isinstance(error, KilledWorker):
                     killed.append(task)
-                except OSError as error:
-                    raise StageError(f"lost the scheduler ({error}); run the same again") from error
+                elif error is not None:  # the task did not even start
+                    settle(_failed(task, f"worker: {type(error).__name__}: {error}", attempt))
+                else:
+                    settle(replace(future.result(), attempts=attempt))
             tick()
         return killed
 
@@ -170,12 +174,19 @@ def _key(task: Task, attempt: int) -> str:
 
 
 def _killed(task: Task) -> Receipt:
+    reason = (
+        f"its worker process died {ATTEMPTS} times (out of memory or a crash in native code); run "
+        "this item with --workers 0 to see, or give it more memory"
+    )
+    return _failed(task, reason, ATTEMPTS)
+
+
+def _failed(task: Task, reason: str, attempts: int) -> Receipt:
     return Receipt(
         stage=task.stage.name,
         item=task.item,
         fingerprint=task.fingerprint,
         status="failed",
-        reason=f"its worker process died {ATTEMPTS} times (out of memory or a crash in native "
-        "code); run this item with --workers 0 to see, or give it more memory",
-        attempts=ATTEMPTS,
+        reason=" ".join(reason.split()),
+        attempts=attempts,
     )

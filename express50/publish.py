@@ -83,7 +83,15 @@ def set_aside(dataset: Dataset, stage: str, item: str) -> bool:
     stale.parent.mkdir(parents=True, exist_ok=True)
     target.rename(stale)
     sync_directory(target.parent)
+    _remove_empty(target.parent, dataset.stage_dir(stage))
     return True
+
+
+def _remove_empty(folder: Path, top: Path) -> None:
+    """Remove empty folders of nested items, so that no stage takes one for an item."""
+    while folder != top and not any(folder.iterdir()):
+        folder.rmdir()
+        folder = folder.parent
 
 
 def discard_stale(dataset: Dataset, stage: str, item: str) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import fcntl
 import fnmatch
+import functools
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext
@@ -11,6 +12,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from express50.config import config_toml, nearest
+from express50.digests import path_digest
 from express50.errors import ConfigError, Express50Error, StageError
 from express50.layout import Dataset
 from express50.ledger import Ledger, Receipt
@@ -154,9 +156,11 @@ def _run_items(
     outcomes: dict[str, Outcome] = {}
     receipts = ledger.read(stage.name)
     tasks, unreadable = [], []
+    # Items share inputs; what a stage reads does not change while it runs.
+    digest_of = functools.cache(lambda path: path_digest(path, ledger.sha256))
     for item in chosen:
         try:
-            digest = fingerprint(stage, dataset, item, config, ledger)
+            digest = fingerprint(stage, dataset, item, config, digest_of)
         except Express50Error as error:
             reason = f"{type(error).__name__}: {error}"
             unreadable.append(_refusal(stage, item, reason))
@@ -165,6 +169,7 @@ def _run_items(
             outcomes[item] = _outcome(receipts[item], status="skipped")
         else:
             tasks.append(Task(stage, dataset, item, config, digest, pool.threads))
+    ledger.keep_digests()
     for task in tasks:
         # A receipt must not outlive the output it speaks of, should this run be killed half-way.
         ledger.remove(stage.name, task.item)

@@ -156,7 +156,7 @@ def _choose(
 
 def add_dataset_commands(subparsers: Any) -> None:
     """Add status, info and config."""
-    parser = subparsers.add_parser("status", help="what is done, failed and missing")
+    parser = subparsers.add_parser("status", help="what is done, what failed, time and memory")
     parser.add_argument("dataset", type=Path, metavar="DATASET")
     parser.add_argument("--json", action="store_true", help="print receipts as JSON")
     parser.set_defaults(handler=show_status)

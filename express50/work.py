@@ -8,14 +8,15 @@ import resource
 import sys
 import time
 import traceback
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from express50.digests import path_digest, value_digest
+from express50.digests import value_digest
 from express50.errors import Express50Error, StageError
 from express50.layout import Dataset
-from express50.ledger import Ledger, Receipt
+from express50.ledger import Receipt
 from express50.publish import dump_json, publishing, write_bytes
 from express50.stage import Stage
 from express50.threads import cap_threads
@@ -33,17 +34,24 @@ class Task:
     threads: int = 1
 
 
-def fingerprint(stage: Stage, dataset: Dataset, item: str, config: Any, ledger: Ledger) -> str:
+def fingerprint(
+    stage: Stage, dataset: Dataset, item: str, config: Any, digest: Callable[[Path], str]
+) -> str:
     """Digest of stage version, resolved config and inputs of an item.
+
+    Args:
+        stage: the stage.
+        dataset: the dataset.
+        item: item id.
+        config: resolved config.
+        digest: content digest of a file or folder.
 
     Raises:
         Express50Error: an input is missing or cannot be read.
     """
     digests = {}
     for name, value in stage.inputs(dataset, item, config).items():
-        if isinstance(value, Path):
-            value = path_digest(value, ledger.sha256)
-        digests[name] = value
+        digests[name] = digest(value) if isinstance(value, Path) else value
     return value_digest([stage.name, stage.version, vars(config), digests])
 
 
@@ -95,8 +103,12 @@ def _metrics_bytes(metrics: dict) -> bytes:
 
 def _record_defect(task: Task, error: Exception) -> str:
     log = task.dataset.log_file(task.stage.name, task.item)
-    write_bytes(log, "".join(traceback.format_exception(error)).encode())
-    return f"{type(error).__name__}: {error} (unexpected; traceback in {log})"
+    words = f"{type(error).__name__}: {error}"
+    try:
+        write_bytes(log, "".join(traceback.format_exception(error)).encode())
+    except OSError as trouble:  # a full disk is a usual reason for the error itself
+        return f"{words} (unexpected; its traceback could not be written to {log}: {trouble})"
+    return f"{words} (unexpected; traceback in {log})"
 
 
 def reset_peak_memory() -> None:

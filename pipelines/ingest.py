@@ -191,9 +191,16 @@ def metrics(index: Index, usual: int, dropped: dict[str, str], outside: dict[str
         "expressions": len(index.cues),
         "frame_count": usual,
         "frame_count_differs": {k: n for k, n in counts.items() if n != usual},
+        "time_gaps": {k: n for k, c in index.cameras.items() if (n := time_gaps(c.pts))},
         "plates": len(index.plates),
         "dropped": [{"what": what, "why": why} for what, why in lost],
     }
+
+
+def time_gaps(pts: tuple[int, ...]) -> int:
+    """Steps between frames longer than 1.5 usual ones: each tells of a frame the recorder lost."""
+    steps = np.diff(np.array(pts, dtype=np.int64))
+    return int((steps > 1.5 * np.median(steps)).sum()) if steps.size else 0
 
 
 def scan_camera(

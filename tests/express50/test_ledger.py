@@ -50,6 +50,7 @@ def test_digest_is_cached_until_size_time_or_inode_changes(ledger, tmp_path, mon
     path.write_bytes(b"one")
     first = ledger.sha256(path)
     assert first == file_sha256(path)
+    ledger.keep_digests()
     monkeypatch.setattr("express50.ledger.file_sha256", lambda path: pytest.fail("read again"))
     assert ledger.sha256(path) == first
     monkeypatch.undo()

@@ -68,7 +68,7 @@ def test_leftovers_of_killed_runs_are_removed_for_that_stage_only(dataset):
 def test_set_aside_hides_an_item_from_later_stages(dataset):
     publish(dataset, "1")
     assert set_aside(dataset, "matte", "S001/cam00")
-    assert not dataset.item_dir("matte", "S001/cam00").exists()
+    assert not dataset.item_dir("matte", "S001").exists()  # no empty folder stays
     assert (dataset.stale_dir / "matte/S001/cam00/a.txt").read_text() == "1"
     assert not set_aside(dataset, "matte", "S001/cam00")
 

@@ -1,12 +1,19 @@
 """The runner: skips, isolates, accounts, and sets aside what is stale or deadly."""
 
+import contextlib
 import dataclasses
 import json
+import os
+import subprocess
+import sys
+import threading
+from pathlib import Path
 
 import pytest
 
 from express50.errors import ConfigError, StageError
 from express50.ledger import Ledger
+from express50.progress import format_rate
 from express50.runner import run_stage, select_items
 from tests.faults import toy
 from tests.faults.toy import make_dataset, run_toy, tree
@@ -176,3 +183,54 @@ def test_given_scheduler_is_used_and_left_running(tmp_path):
         with Client(cluster) as client:
             assert len(client.nthreads()) == 1
     assert summary.count("done") == 3
+
+
+def test_lost_scheduler_is_one_error_and_what_is_done_is_kept(tmp_path):
+    from distributed import LocalCluster
+
+    dataset = make_dataset(tmp_path / "data", [f"item{n}" for n in range(40)])
+    cluster = LocalCluster(n_workers=1, processes=True, dashboard_address=None, silence_logs=50)
+    timer = threading.Timer(1.0, cluster.close)
+    timer.start()
+    with pytest.raises(StageError, match="lost the dask scheduler"):
+        run_stage(
+            toy.STAGE,
+            dataset,
+            toy.ToyConfig(seconds=0.1),
+            scheduler=cluster.scheduler_address,
+            progress=False,
+        )
+    timer.join()
+    assert run_toy(dataset, seconds=0.001).ok
+
+
+def test_bar_on_a_terminal_shows_count_rate_and_time_left(tmp_path):
+    """The driver's standard error is a pseudo-terminal; plain lines go everywhere else."""
+    dataset = make_dataset(tmp_path / "data", ["a", "b", "bad1"])
+    code = (
+        "import sys; from pathlib import Path; from tests.faults import toy;"
+        "from express50.runner import run_stage;"
+        "run_stage(toy.STAGE, toy.Dataset(Path(sys.argv[1])), toy.ToyConfig(seconds=.1), workers=0)"
+    )
+    driver, terminal = os.openpty()
+    repository = Path(__file__).resolve().parents[2]
+    environment = os.environ | {"TERM": "xterm", "COLUMNS": "120"}
+    command = [sys.executable, "-c", code, str(dataset.root)]
+    with subprocess.Popen(command, cwd=repository, env=environment, stderr=terminal) as process:
+        os.close(terminal)
+        shown = b""
+        with contextlib.suppress(OSError):  # Linux ends a terminal's output with EIO
+            while block := os.read(driver, 4096):
+                shown += block
+    assert process.returncode == 0
+    text = shown.decode()
+    assert "3/3" in text
+    assert "/s" in text or "/min" in text
+    assert "left" in text
+    assert "failed" in text
+
+
+def test_rate_words():
+    assert format_rate(0, 5.0) == "-"
+    assert format_rate(10, 5.0) == "2.0/s"
+    assert format_rate(1, 120.0) == "0.5/min"

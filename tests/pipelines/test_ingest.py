@@ -46,6 +46,7 @@ def test_account_of_a_good_capture(dataset):
         "expressions": 2,
         "frame_count": 8,
         "frame_count_differs": {},
+        "time_gaps": {},
         "plates": 3,
         "dropped": [],
     }
@@ -205,6 +206,12 @@ def test_usual_count_prefers_the_common_then_the_larger():
         return ingest.usual_count({str(i): camera(n) for i, n in enumerate(counts)})
 
     assert (usual(), usual(5), usual(5, 9, 5), usual(4, 6)) == (0, 5, 5, 6)
+
+
+def test_lost_frames_show_as_time_gaps():
+    assert ingest.time_gaps((0, 10, 20, 30)) == 0
+    assert ingest.time_gaps((0, 10, 30, 40, 70, 80)) == 2
+    assert ingest.time_gaps((5,)) == ingest.time_gaps(()) == 0
 
 
 def test_real_size_captures(shared, tmp_path):
