@@ -88,11 +88,11 @@ class Pool:
                 raise StageError("lost the dask scheduler; start it, run the same again") from error
             for future in finished:
                 task = running.pop(future)
-                error = future.exception()
-                if isinstance(error, KilledWorker):
+                failure = future.exception()
+                if isinstance(failure, KilledWorker):
                     killed.append(task)
-                elif error is not None:  # the task did not even start
-                    settle(_failed(task, f"worker: {type(error).__name__}: {error}", attempt))
+                elif failure is not None:  # the task did not even start
+                    settle(_failed(task, f"worker: {type(failure).__name__}: {failure}", attempt))
                 else:
                     settle(replace(future.result(), attempts=attempt))
             tick()
