@@ -1,7 +1,7 @@
 """The native library: C++ behind a plain C ABI, loaded through ctypes. This file is light.
 
-``setup.py`` compiles one source into one shared object for each instruction set of ``build.py``;
-at run time the best one that this processor understands is opened.
+``setup.py`` compiles one source into a shared object for each instruction set of ``build.py``; at
+run time the best one that this processor understands is opened.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 import ctypes
 from functools import cache
 
-# `build` is imported where it is used, so that `python -m express50.native.build` runs it only once.
+# `build` is imported where it is used: `python -m express50.native.build` must not find it loaded.
 MEND = "build it with `python -m express50.native.build` (needs g++) or reinstall the package"
 
 

@@ -88,36 +88,19 @@ class _Rasterize(torch.autograd.Function):
         ctx.set_materialize_grads(False)
         # The kernel reads raw memory: a strided view would be read as other numbers.
         geometry = [x.contiguous() for x in (means, quats, scales, opacities)]
-        colors = colors.contiguous()
-        background = None if background is None else background.contiguous()
         camera = _camera(K, cam_from_world, *options)
-        width, height = camera.width, camera.height
-        n, dtype = means.shape[0], means.dtype
-        splats = torch.empty(n, _SPLAT, dtype=dtype)
-        depths = torch.empty(n, dtype=dtype)
-        boxes = torch.empty(n, 4, dtype=torch.int32)
-        entries = _call("project", dtype, camera, n, *geometry, splats, depths, boxes)
-        if entries >= 2**31:
-            raise ValueError(
-                f"the Gaussians cover {entries} tiles in all, expected under 2^31;"
-                " scales is too large for this image"
-            )
-        tiles = -(-width // _TILE) * -(-height // _TILE)
-        starts = torch.empty(tiles + 1, dtype=torch.int64)
-        ids = torch.empty(entries, dtype=torch.int32)
-        _call("bin", dtype, camera, n, depths, boxes, starts, ids)
-        image = torch.empty(height, width, colors.shape[1], dtype=dtype)
-        weighted = torch.empty(height, width, dtype=dtype)
-        alpha = torch.empty(height, width, dtype=dtype)
-        used = torch.empty(tiles, dtype=torch.int32)
+        splats, boxes, starts, ids = _bin(camera, geometry)
+        used = torch.empty(starts.numel() - 1, dtype=torch.int32)
+        blended = (splats, boxes, colors.contiguous(), _contiguous(background), starts, ids, used)
+        size, channels = (camera.height, camera.width), colors.shape[1]
+        image = torch.empty(*size, channels, dtype=means.dtype)
+        weighted = torch.empty(size, dtype=means.dtype)
+        alpha = torch.empty(size, dtype=means.dtype)
         ctx.records = _call(
-            "forward", dtype, camera, colors.shape[1], splats, boxes, colors, background,
-            starts, ids, used, image, weighted, alpha,
-        )  # fmt: skip
-        ctx.camera = camera
-        ctx.save_for_backward(
-            *geometry, splats, boxes, colors, background, starts, ids, used, alpha, K, cam_from_world
+            "forward", means.dtype, camera, channels, *blended, image, weighted, alpha
         )
+        ctx.camera = camera
+        ctx.save_for_backward(*geometry, *blended, alpha, K, cam_from_world)
         return image, weighted, alpha
 
     @staticmethod
@@ -125,15 +108,15 @@ class _Rasterize(torch.autograd.Function):
         ctx: Any, d_image: Tensor | None, d_weighted: Tensor | None, d_alpha: Tensor | None
     ) -> tuple[Tensor | None, ...]:
         saved = ctx.saved_tensors
-        geometry, (splats, boxes, colors, background, starts, ids, used) = saved[:4], saved[4:11]
-        alpha, K, cam_from_world = saved[11:]
+        geometry, blended, (alpha, K, cam_from_world) = saved[:4], saved[4:11], saved[11:]
+        colors, background = blended[2:4]
         n, channels = colors.shape
         grads = [torch.empty_like(x) for x in (*geometry, colors)]
         d_camera = torch.zeros(16, dtype=torch.float64)
         records = _workspace(ctx.records * (channels + _MOMENTS), colors.dtype)
         _call(
-            "backward", colors.dtype, ctx.camera, n, channels, *geometry, splats, boxes, colors,
-            background, starts, ids, used, *map(_contiguous, (d_image, d_weighted, d_alpha)),
+            "backward", colors.dtype, ctx.camera, n, channels, *geometry, *blended,
+            *map(_contiguous, (d_image, d_weighted, d_alpha)),
             records[_MOMENTS * ctx.records :], records, *grads, d_camera,
         )  # fmt: skip
         d_K = torch.zeros(3, 3, dtype=torch.float64)
@@ -145,6 +128,25 @@ class _Rasterize(torch.autograd.Function):
         if background is not None and d_image is not None:
             d_background = torch.einsum("hwc,hw->c", d_image, 1.0 - alpha)
         return *grads, d_K.to(K.dtype), d_pose.to(cam_from_world.dtype), d_background, None
+
+
+def _bin(camera: _Camera, geometry: list[Tensor]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Project, then sort into tiles: splats (N, 10), boxes (N, 4), tile starts and Gaussian ids."""
+    n, dtype = geometry[0].shape[0], geometry[0].dtype
+    splats = torch.empty(n, _SPLAT, dtype=dtype)
+    depths = torch.empty(n, dtype=dtype)
+    boxes = torch.empty(n, 4, dtype=torch.int32)
+    entries = _call("project", dtype, camera, n, *geometry, splats, depths, boxes)
+    if entries >= 2**31:
+        raise ValueError(
+            f"the Gaussians cover {entries} tiles in all, expected under 2^31; scales is too large"
+            " for this image"
+        )
+    tiles = -(-camera.width // _TILE) * -(-camera.height // _TILE)
+    starts = torch.empty(tiles + 1, dtype=torch.int64)
+    ids = torch.empty(entries, dtype=torch.int32)
+    _call("bin", dtype, camera, n, depths, boxes, starts, ids)
+    return splats, boxes, starts, ids
 
 
 def _camera(

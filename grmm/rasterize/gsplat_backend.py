@@ -98,7 +98,7 @@ def _require_gsplat(means: Tensor) -> Any:
 
 @torch.no_grad()
 def _tiles(gsplat: Any, splats: Projection, width: int, height: int) -> tuple[Tensor, Tensor]:
-    """gsplat's tile offsets (1, rows, columns) and sorted Gaussian indices."""
+    """Tile offsets of gsplat (1, rows, columns) and sorted Gaussian indices."""
     columns, rows = -(-width // TILE), -(-height // TILE)
     # One pixel more than the exact box; invisible Gaussians have radius 0 and are left out.
     radii = (splats.extents.clamp(max=1e9).ceil() + 1).int() * splats.visible[:, None]

@@ -44,13 +44,13 @@ def rasterize_reference(
     order = visible[torch.sort(splats.depths[visible].detach(), stable=True).indices]
     rows = []
     for top in range(0, height, TILE):
-        rows.append([
-            _blend(splats, colors, order, left, top, min(TILE, width - left), min(TILE, height - top))
+        h = min(TILE, height - top)
+        tiles = [
+            _blend(splats, colors, order, left, top, min(TILE, width - left), h)
             for left in range(0, width, TILE)
-        ])  # fmt: skip
-    image, weighted, alpha = (
-        torch.cat([torch.cat([tile[i] for tile in row], 1) for row in rows], 0) for i in range(3)
-    )
+        ]
+        rows.append([torch.cat(parts, 1) for parts in zip(*tiles, strict=True)])
+    image, weighted, alpha = (torch.cat(parts, 0) for parts in zip(*rows, strict=True))
     if background is not None:
         image = image + (1.0 - alpha)[..., None] * background
     return image, expected_depth(weighted, alpha, K), alpha
