@@ -52,14 +52,14 @@ SKULL = (
     _capsule((47, -58, 14), (58, -8, 6), 9, 9, 14),  # ramus
     _ellipsoid((0, -50, 30), (46, 38, 45), 16),
     _ellipsoid((0, -80, 80), (19, 13, 15), 12),  # chin
+    _ellipsoid((0, -78, 42), (36, 22, 38), 14),  # floor of the mouth
     _ellipsoid((34, -22, 60), (22, 28, 24), 16),  # cheek fat
 )
 NECK = (
     _capsule((0, -70, -16), (0, -230, -34), 53, 55, 16),
-    _capsule((58, -30, -20), (16, -215, 24), 9, 8, 14),  # sternocleidomastoid
-    _capsule((20, -20, -70), (105, -215, -45), 16, 26, 30),  # trapezius
-    _capsule((12, -205, 20), (120, -212, -5), 8, 8, 20),  # clavicle
-    _ellipsoid((0, -134, 33), (9, 14, 8), 12),  # thyroid cartilage
+    _capsule((55, -36, -22), (16, -215, 18), 7, 8, 18),  # sternocleidomastoid
+    _capsule((14, -60, -60), (76, -196, -42), 14, 30, 30),  # trapezius
+    _ellipsoid((0, -131, 30), (9, 13, 8), 14),  # thyroid cartilage
 )
 BROW_AND_ORBIT = (
     _capsule((10, 37, 86), (32, 43, 80), 8, 7.5, 10),
@@ -119,7 +119,7 @@ def _smooth_min(a: Array, b: Array, k: float) -> Array:
 def skin_field(points: Array, masses: tuple[Mass, ...] = MASSES) -> Array:
     """Signed distance-like value in mm at points (N,3) in mm: negative inside the skin."""
     p = np.asarray(points, float) * 1.0
-    p[:, 0] = np.abs(p[:, 0])
+    p[:, 0] = np.sqrt(p[:, 0] ** 2 + 1.0)  # folds without a crease on the mid plane
     value = _distance(masses[0], p)
     for mass in masses[1:]:
         d = _distance(mass, p)
@@ -137,6 +137,15 @@ def cast(origins: Array, directions: Array, far: float = 170.0, steps: int = 56)
     for _ in range(steps):
         value = skin_field(origins + t[:, None] * d)
         t = np.maximum(t - 0.8 * value, 0.0)
+    return origins + t[:, None] * d
+
+
+def cast_out(origins: Array, directions: Array, steps: int = 30) -> Array:
+    """First exit (N,3) from the skin on rays that start inside it."""
+    d = directions / np.linalg.norm(directions, axis=-1, keepdims=True)
+    t = np.zeros(len(origins))
+    for _ in range(steps):
+        t = t - 0.8 * skin_field(origins + t[:, None] * d)
     return origins + t[:, None] * d
 
 

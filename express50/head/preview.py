@@ -1,0 +1,165 @@
+"""Shaded pictures of a head model, by ray casting: base colours by region, key and fill light."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+import open3d as o3d
+import torch
+
+from express50.errors import HeadModelError
+from express50.head.model import HeadModel, pose, vertex_normals
+
+Array = np.ndarray
+
+_SKIN = (0.80, 0.60, 0.50)
+# Region -> linear base colour; later entries paint over earlier ones.
+_COLORS = {
+    "scalp": (0.76, 0.57, 0.48), "lips": (0.66, 0.34, 0.32), "mouth_interior": (0.40, 0.13, 0.13),
+    "gums": (0.62, 0.30, 0.30), "tongue": (0.66, 0.29, 0.29), "teeth": (0.85, 0.82, 0.74),
+    "left_eyeball": (0.88, 0.87, 0.85), "right_eyeball": (0.88, 0.87, 0.85),
+    "left_iris": (0.17, 0.26, 0.30), "right_iris": (0.17, 0.26, 0.30),
+    "left_pupil": (0.01, 0.01, 0.01), "right_pupil": (0.01, 0.01, 0.01),
+}  # fmt: skip
+_BACKGROUND = (0.11, 0.12, 0.14)
+
+# Name -> (expression controls, jaw opening rad), for the contact sheet.
+POSES: dict[str, tuple[dict[str, float], float]] = {
+    "neutral": ({}, 0.0),
+    "smile": ({"mouthSmile": 1.0, "cheekSquint": 0.4}, 0.0),
+    "smile open": ({"mouthSmile": 1.0, "mouthUpperUp": 0.4, "mouthLowerDown": 0.3}, 0.08),
+    "mouth open": ({}, 0.36),
+    "eyes shut": ({"eyeBlink": 1.0}, 0.0),
+    "pucker": ({"mouthPucker": 1.0}, 0.0),
+    "anger": ({"browDown": 1.0, "noseSneer": 0.5, "eyeSquint": 0.4, "mouthPress": 0.6}, 0.0),
+    "surprise": ({"browInnerUp": 1.0, "browOuterUp": 1.0, "eyeWide": 0.9}, 0.26),
+    "frown": ({"mouthFrown": 1.0, "browInnerUp": 0.7}, 0.0),
+    "shout": ({"mouthStretch": 0.5, "mouthUpperUp": 0.6, "mouthLowerDown": 0.7, "browDown": 0.5},
+              0.36),
+}  # fmt: skip
+
+
+def expression_vector(model: HeadModel, controls: Mapping[str, float]) -> torch.Tensor:
+    """Coefficients (1,X) of named controls; a name without _L/_R sets both sides.
+
+    Raises:
+        HeadModelError: a name that the model does not have.
+    """
+    index = {name: i for i, name in enumerate(model.expression_names)}
+    vector = torch.zeros(1, len(index), dtype=model.dtype)
+    for name, value in controls.items():
+        found = [n for n in (name, f"{name}_L", f"{name}_R") if n in index]
+        if not found:
+            raise HeadModelError(f"head model {model.name!r}: no expression {name!r}")
+        for n in found:
+            vector[0, index[n]] = value
+    return vector
+
+
+def vertex_colors(model: HeadModel) -> Array:
+    """Base colours (V,3), linear, by region."""
+    colors = np.tile(np.array(_SKIN), (len(model.template), 1))
+    for region, color in _COLORS.items():
+        if region in model.regions:
+            colors[model.regions[region].cpu().numpy()] = color
+    return colors
+
+
+def render_preview(
+    model: HeadModel,
+    vertices: Array | torch.Tensor,
+    *,
+    yaw: float = 0.0,
+    pitch: float = 0.0,
+    size: int = 384,
+    supersample: int = 2,
+    colors: Array | None = None,
+    span: float = 0.34,
+    center: tuple[float, float, float] = (0.0, -0.012, 0.0),
+) -> Array:
+    """Picture (size,size,3) uint8 sRGB of posed vertices.
+
+    Args:
+        model: The head whose faces and regions are used.
+        vertices: (V,3) metres.
+        yaw: Degrees the camera goes round to the subject's left.
+        pitch: Degrees the camera goes up.
+        size: Side of the picture, pixels.
+        supersample: Rays a pixel and axis.
+        colors: (V,3) linear base colours; by region if None.
+        span: Metres across the picture at the head's centre.
+        center: Point looked at, metres.
+    """
+    points = np.asarray(vertices, np.float32)
+    faces = model.faces.cpu().numpy()
+    scene = o3d.t.geometry.RaycastingScene(nthreads=1)
+    scene.add_triangles(points, faces.astype(np.uint32))
+    origin, directions, right, up, back = _camera(yaw, pitch, size * supersample, span, center)
+    rays = np.concatenate([np.broadcast_to(origin, directions.shape), directions], -1)
+    hits = scene.cast_rays(o3d.core.Tensor(rays.astype(np.float32)))
+    distance = hits["t_hit"].numpy()
+    seen = np.isfinite(distance)
+    triangle = hits["primitive_ids"].numpy()[seen]
+    u, v = hits["primitive_uvs"].numpy()[seen].T
+    weights = np.stack([1 - u - v, u, v], 1)[:, :, None]
+    normals = vertex_normals(torch.from_numpy(points)[None], model.faces.cpu())[0].numpy()
+    corner = faces[triangle]
+    n = (normals[corner] * weights).sum(1)
+    n /= np.linalg.norm(n, axis=1, keepdims=True) + 1e-9
+    base = ((vertex_colors(model) if colors is None else colors)[corner] * weights).sum(1)
+    place = origin + distance[seen, None] * directions[seen]
+    shade = _shade(scene, place, n, (right, up, back), -directions[seen])
+    image = np.tile(np.array(_BACKGROUND), (*distance.shape, 1))
+    image[seen] = base * shade[:, :1] + shade[:, 1:]
+    image = image.reshape(size, supersample, size, supersample, 3).mean((1, 3))
+    return (np.clip(image, 0, 1) ** (1 / 2.2) * 255 + 0.5).astype(np.uint8)
+
+
+def _camera(yaw: float, pitch: float, side: int, span: float, center: tuple) -> tuple:
+    a, b = np.radians(yaw), np.radians(pitch)
+    back = np.array([np.sin(a) * np.cos(b), np.sin(b), np.cos(a) * np.cos(b)])
+    right = np.array([np.cos(a), 0.0, -np.sin(a)])
+    up = np.cross(back, right)
+    away = 1.2
+    origin = np.array(center) + away * back
+    step = (np.arange(side) + 0.5) / side * span - span / 2
+    x, y = np.meshgrid(step, -step)
+    directions = x[..., None] * right + y[..., None] * up - away * back
+    directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
+    return origin, directions, right, up, back
+
+
+def _shade(scene: o3d.t.geometry.RaycastingScene, place: Array, n: Array, axes: tuple,
+           view: Array) -> Array:
+    """Diffuse factor and specular addition (N,2): shadowed key light, fill, sky; a dull gloss."""
+    right, up, back = axes
+    total = 0.20 + 0.12 * (n @ up)
+    gloss = np.zeros(len(n))
+    for light, power in ((-0.55 * right + 0.65 * up + 0.75 * back, 0.78),
+                         (0.8 * right + 0.15 * up + 0.5 * back, 0.24)):
+        light = light / np.linalg.norm(light)
+        rays = np.concatenate([place + 8e-4 * n, np.broadcast_to(light, n.shape)], 1)
+        dark = scene.test_occlusions(o3d.core.Tensor(rays.astype(np.float32))).numpy()
+        half = light + view
+        half /= np.linalg.norm(half, axis=1, keepdims=True)
+        lit = power * np.where(dark, 0.0, 1.0)
+        total = total + lit * np.clip(n @ light, 0, 1)
+        gloss += 0.07 * lit * np.clip((n * half).sum(1), 0, 1) ** 28
+    return np.stack([total, gloss], 1)
+
+
+def contact_sheet(
+    model: HeadModel, yaws: tuple[float, ...] = (0.0, 40.0, 90.0), size: int = 256
+) -> Array:
+    """One row a pose of POSES, one column a yaw: picture (rows*size, columns*size, 3) uint8."""
+    rows = []
+    for controls, opening in POSES.values():
+        vertices = pose(
+            model,
+            torch.zeros(1, len(model.shape_names)),
+            expression_vector(model, controls),
+            jaw=torch.tensor([[opening, 0.0, 0.0]]),
+        )[0]
+        rows.append([render_preview(model, vertices, yaw=yaw, size=size) for yaw in yaws])
+    return np.concatenate([np.concatenate(row, 1) for row in rows], 0)
