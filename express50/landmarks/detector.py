@@ -145,8 +145,8 @@ def _run(
     crops = torch.from_numpy(np.stack([_sample(pyramid, window) for window in windows]))
     crops = crops.permute(0, 3, 1, 2).contiguous(memory_format=torch.channels_last)
     with torch.inference_mode():
-        found, log_scale, logit = net(crops.float() / 255.0)
-    found, sigma = found.double().numpy(), log_scale.double().exp().numpy()
+        output = net(crops.float() / 255.0)
+    found, sigma = output.points.double().numpy(), output.log_scale.double().exp().numpy()
     points = np.empty_like(found)
     for index, window in enumerate(windows):
         points[index] = found[index] @ window[:, :2].T + window[:, 2]
@@ -154,7 +154,7 @@ def _run(
         sigma[index] *= np.sqrt(abs(determinant))
         if determinant < 0:
             points[index], sigma[index] = points[index][MIRROR], sigma[index][MIRROR]
-    return points, sigma, torch.sigmoid(logit).double().numpy()
+    return points, sigma, torch.sigmoid(output.logit).double().numpy()
 
 
 def _mean_view(

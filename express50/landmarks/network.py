@@ -8,6 +8,7 @@ Laplace distribution, from which the confidence follows.
 from __future__ import annotations
 
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -19,6 +20,22 @@ POINTS = 68
 # Points may lie a little outside the crop: the grid of the heat maps is stretched about its middle.
 STRETCH = 1.15
 WEIGHTS = Path(__file__).with_name("weights.npz")
+
+
+class Output(NamedTuple):
+    """What the network says of B crops.
+
+    Attributes:
+        points: (B, 68, 2) crop pixels.
+        log_scale: (B, 68) natural logarithm of the Laplace scale in crop pixels.
+        logit: (B,) whether a face looks towards the camera.
+        heat: (B, 68, 32, 32) heat maps before the softmax.
+    """
+
+    points: torch.Tensor
+    log_scale: torch.Tensor
+    logit: torch.Tensor
+    heat: torch.Tensor
 
 
 class Residual(nn.Module):
@@ -34,11 +51,7 @@ class Residual(nn.Module):
 
 
 class LandmarkNet(nn.Module):
-    """Crops (B, 3, 128, 128) in [0, 1] to points (B, 68, 2) pixels, log scales (B, 68), logit (B,).
-
-    The log scale is the natural logarithm of the Laplace scale in crop pixels; the logit says
-    whether a face looks towards the camera.
-    """
+    """Maps crops (B, 3, 128, 128) in [0, 1] to landmarks; see `Output`."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -54,7 +67,7 @@ class LandmarkNet(nn.Module):
         self.spread = nn.Parameter(torch.zeros(POINTS))
         self.face = nn.Linear(128, 1)
 
-    def forward(self, crops: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    def forward(self, crops: torch.Tensor) -> Output:
         """Run the network; exposure and contrast are normalised per crop."""
         mean = crops.mean((1, 2, 3), keepdim=True)
         deviation = crops.std((1, 2, 3), keepdim=True) + 0.02
@@ -67,9 +80,10 @@ class LandmarkNet(nn.Module):
         y = self.side8(functional.relu(x8 + _twice(self.side4(x4))))
         y = functional.relu(self.mix16(functional.relu(x16 + _twice(y))))
         y = functional.relu(self.mix32(functional.relu(x32 + _twice(self.side16(y)))))
-        points, variance = _expectation(self.heat(y))
+        heat = self.heat(y)
+        points, variance = _expectation(heat)
         log_scale = self.scale(pooled) + self.spread * variance.clamp_min(1e-2).log()
-        return points, log_scale.clamp(-2.0, 4.0), self.face(pooled)[:, 0]
+        return Output(points, log_scale.clamp(-2.0, 4.0), self.face(pooled)[:, 0], heat)
 
 
 def _conv(inputs: int, outputs: int, size: int, stride: int = 1) -> nn.Sequential:
@@ -86,12 +100,35 @@ def _expectation(heat: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """Mean position (B, P, 2) in crop pixels and variance (B, P) of softmax heat maps."""
     batch, points, height, width = heat.shape
     share = functional.softmax(heat.reshape(batch, points, -1), -1).reshape(heat.shape)
-    axis = (torch.arange(width, dtype=heat.dtype, device=heat.device) + 0.5) / width
-    axis = ((axis - 0.5) * STRETCH + 0.5) * CROP
+    axis = torch.arange(width, dtype=heat.dtype, device=heat.device)
+    axis = (((axis + 0.5) / width - 0.5) * STRETCH + 0.5) * CROP
     along_x, along_y = share.sum(2), share.sum(3)
     mean = torch.stack([(along_x * axis).sum(-1), (along_y * axis).sum(-1)], -1)
     square = (along_x * axis**2).sum(-1) + (along_y * axis**2).sum(-1)
     return mean, (square - mean.square().sum(-1)).clamp_min(0.0)
+
+
+def heat_loss(heat: torch.Tensor, points: torch.Tensor) -> torch.Tensor:
+    """Cross entropy (B, P) of heat maps against points (B, P, 2) spread over their four cells.
+
+    Its gradient is strong from the first step, where that of the expectation is still faint.
+    """
+    size = heat.shape[-1]
+    cells = ((points / CROP - 0.5) / STRETCH + 0.5) * size - 0.5
+    cells = cells.clamp(0.0, size - 1.001)
+    low = cells.floor()
+    share = cells - low
+    column, row = low.long().unbind(-1)
+    log_share = functional.log_softmax(heat.flatten(2), -1)
+    loss = torch.zeros_like(share[..., 0])
+    for dx in (0, 1):
+        for dy in (0, 1):
+            weight = (share[..., 0] if dx else 1 - share[..., 0]) * (
+                share[..., 1] if dy else 1 - share[..., 1]
+            )
+            index = (row + dy) * size + column + dx
+            loss = loss - weight * log_share.gather(2, index[..., None])[..., 0]
+    return loss
 
 
 def save_network(net: LandmarkNet, path: Path) -> None:

@@ -17,7 +17,13 @@ from torch.nn import functional
 
 from express50.head.load import load_head
 from express50.landmarks.augment import Crop, make_backgrounds, random_crop
-from express50.landmarks.network import WEIGHTS, LandmarkNet, load_network, save_network
+from express50.landmarks.network import (
+    WEIGHTS,
+    LandmarkNet,
+    heat_loss,
+    load_network,
+    save_network,
+)
 from express50.landmarks.training_set import ViewSet, make_views, read_views
 
 FILE_VIEWS = 500
@@ -95,13 +101,14 @@ def crop_batch(crops: list[Crop]) -> tuple[torch.Tensor, torch.Tensor, torch.Ten
 def crop_loss(net: LandmarkNet, crops: list[Crop]) -> torch.Tensor:
     """Distance and Laplace likelihood of the points, cross entropy of the score."""
     images, points, score, weight = crop_batch(crops)
-    found, log_scale, logit = net(images)
+    output = net(images)
     # The square root's slope at zero distance is bounded by the added 0.01 px^2.
-    distance = ((found - points).square().sum(-1) + 0.01).sqrt()
-    likelihood = 2 * log_scale + distance * torch.exp(-log_scale)
+    distance = ((output.points - points).square().sum(-1) + 0.01).sqrt()
+    likelihood = 2 * output.log_scale + distance * torch.exp(-output.log_scale)
+    heat = heat_loss(output.heat, points)
     share = weight / weight.sum().clamp_min(1.0)
-    point_loss = ((0.2 * distance + likelihood).mean(1) * share).sum()
-    return point_loss + functional.binary_cross_entropy_with_logits(logit, score)
+    point_loss = ((0.2 * distance + likelihood + heat).mean(1) * share).sum()
+    return point_loss + functional.binary_cross_entropy_with_logits(output.logit, score)
 
 
 @torch.no_grad()
@@ -115,11 +122,11 @@ def validate(net: LandmarkNet, views: ViewSet, seed: int) -> str:
         picks = range(start, min(start + BATCH, len(views.facing)))
         crops = [random_crop(views, i, backgrounds, rng) for i in picks]
         images, points, score, weight = crop_batch(crops)
-        found, _, logit = net(images)
-        error = (found - points).norm(dim=-1).mean(1)
+        output = net(images)
+        error = (output.points - points).norm(dim=-1).mean(1)
         errors.append(error[weight >= 1.0])
         clear = (score <= 0) | (score >= 1)
-        right.append(((logit > 0) == (score > 0.5))[clear].float())
+        right.append(((output.logit > 0) == (score > 0.5))[clear].float())
     error = torch.cat(errors)
     return (
         f"error median {error.median():.2f} mean {error.mean():.2f} crop px, "

@@ -1,0 +1,57 @@
+"""Settings of the track stage and its presets."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from express50.errors import ConfigError
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrackConfig:
+    """Every field trades time for accuracy or states how far to trust something."""
+
+    head: str = "procedural"
+    """Head model: procedural, the path of a FLAME pickle, or of ICT-FaceKit."""
+    cameras: int = 0
+    """Cameras used in the fit, those that see the face best; 0 uses all."""
+    refinements: int = 3
+    """Detector crops after the coarse pass."""
+    iterations: int = 14
+    """Levenberg-Marquardt steps of the landmark fit."""
+    silhouette_rounds: int = 3
+    """Rounds of outline matching to the mattes (each finds the outline anew); 0 for none."""
+    silhouette_iterations: int = 4
+    """Levenberg-Marquardt steps a round."""
+    min_score: float = 0.35
+    """Views whose face score is lower are left out."""
+    min_landmarks: int = 20
+    """Landmarks an expression needs after outlier rejection."""
+    landmark_floor_px: float = 1.0
+    """Least error assumed of a landmark, for a face 128 px tall; scales with the face."""
+    contour_weight: float = 0.25
+    """Weight of the jaw line's landmarks (0..16), which slide along the jaw."""
+    shape_prior: float = 1.0
+    """Weight of the prior on shape coefficients (standard deviations)."""
+    expression_prior: float = 0.45
+    """Standard deviation of expression coefficients; in the neutral frame a fifth of it."""
+    neutral: str = "neutral"
+    """Expression id that is the resting face; none need exist."""
+
+    def __post_init__(self) -> None:
+        """Refuse values that cannot work."""
+        if self.iterations < 1 or self.refinements < 1:
+            raise ConfigError("track: iterations and refinements must be at least 1")
+        if min(self.landmark_floor_px, self.shape_prior, self.expression_prior) <= 0:
+            raise ConfigError(
+                "track: landmark_floor_px, shape_prior and expression_prior must be above 0"
+            )
+        if min(self.cameras, self.silhouette_rounds, self.silhouette_iterations) < 0:
+            raise ConfigError("track: cameras and silhouette settings must not be negative")
+
+
+PRESETS: dict[str, dict[str, object]] = {
+    "draft": {"cameras": 6, "refinements": 2, "iterations": 8, "silhouette_rounds": 0},
+    "standard": {},
+    "reference": {"refinements": 5, "iterations": 30, "silhouette_rounds": 6},
+}

@@ -1,0 +1,185 @@
+"""Outlines: where the head ends in the mattes, for skull, ears and jaw that carry no landmark.
+
+The signed distance to the matte's edge is sampled under the vertices that form the outline of the
+current mesh, so no point-to-point matching is needed and the residual is smooth.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import open3d as o3d
+
+from express50.cameras import Camera, resized
+
+# Head outlines count as about this many independent points a view.
+EFFECTIVE_POINTS = 24
+POINTS_A_VIEW = 60
+OUTLINE_SIDE = 192
+OUTLINE_SIGMA_M = 0.003
+REGIONS = ("face", "forehead", "scalp", "left_ear", "right_ear", "nose", "lips")
+# Hair stands between the skull and the matte's edge: a skull inside is no contradiction.
+INSIDE_WEIGHT = 0.35
+
+
+@dataclass(frozen=True)
+class SignedDistance:
+    """Signed distance to a matte's edge, pixels, positive outside, and the camera it belongs to.
+
+    Attributes:
+        values: (H, W) float32 at pixel centres.
+        camera: pinhole camera of full size.
+        step: full-size pixels a cell.
+    """
+
+    values: np.ndarray
+    camera: Camera
+    step: float
+
+
+@dataclass(frozen=True)
+class Outline:
+    """Outline vertices of one view.
+
+    Attributes:
+        distance: the view's signed distance.
+        index: (n,) positions of the vertices among the fit's points.
+        sigma: standard deviation in full-size pixels, the number of points allowed for.
+    """
+
+    distance: SignedDistance
+    index: np.ndarray
+    sigma: float
+
+    @classmethod
+    def of(cls, distance: SignedDistance, first: int, count: int, positions: np.ndarray) -> Outline:
+        """Outline of `count` points that start at `first`, now at positions (count, 3).
+
+        One pixel, and three millimetres of unmodelled skin and hair, are assumed in every point;
+        neighbours err alike, so many points do not outvote the landmarks.
+        """
+        camera = distance.camera
+        depth = (positions @ camera.cam_from_world[2, :3] + camera.cam_from_world[2, 3]).mean()
+        sigma = np.hypot(distance.step, OUTLINE_SIGMA_M * camera.K[0, 0] / max(depth, 1e-6))
+        crowd = max(1.0, count / EFFECTIVE_POINTS) ** 0.5
+        return cls(distance, np.arange(first, first + count), float(sigma * crowd))
+
+    def residuals(
+        self, positions: np.ndarray, project: Callable
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Block (index (n,), residual (n, 1), slope (n, 1, 3)) of all points' positions (P, 3)."""
+        pixels, slope = project(self.distance.camera, positions[self.index])
+        value, gradient = sample(self.distance, pixels)
+        weight = np.where(value > 0, 1.0, INSIDE_WEIGHT) / self.sigma
+        return (
+            self.index,
+            (value * weight)[:, None],
+            (gradient[:, None, :] @ slope) * weight[:, None, None],
+        )
+
+
+def signed_distance(alpha: np.ndarray, camera: Camera, side: int = 640) -> SignedDistance | None:
+    """Signed distance of a matte (H, W) uint8; None where it is empty or full.
+
+    Large mattes are averaged down to about `side` pixels first.
+    """
+    step = max(1.0, max(alpha.shape) / side)
+    if step > 1.0:
+        size = (max(1, round(alpha.shape[1] / step)), max(1, round(alpha.shape[0] / step)))
+        alpha = cv2.resize(alpha, size, interpolation=cv2.INTER_AREA)
+    inside = (alpha >= 128).astype(np.uint8)
+    if inside.all() or not inside.any():
+        return None
+    # Distances are to the nearest pixel of the other side, half a pixel beyond the edge.
+    out = cv2.distanceTransform(1 - inside, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    back = cv2.distanceTransform(inside, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    values = np.where(inside > 0, 0.5 - back, out - 0.5).astype(np.float32)
+    # Full pixels know no part cover; a light blur gives the edge its slope back.
+    return SignedDistance(cv2.GaussianBlur(values, (0, 0), 0.8) * step, camera, step)
+
+
+def sample(distance: SignedDistance, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Bilinear value (n,) and gradient (n, 2) at full-size pixels (n, 2), clamped to the image."""
+    values = distance.values
+    height, width = values.shape
+    where = pixels / distance.step - 0.5
+    x = np.clip(where[:, 0], 0.0, width - 1.001)
+    y = np.clip(where[:, 1], 0.0, height - 1.001)
+    column, row = x.astype(int), y.astype(int)
+    fx, fy = x - column, y - row
+    a, b = values[row, column], values[row, column + 1]
+    c, d = values[row + 1, column], values[row + 1, column + 1]
+    value = (a * (1 - fx) + b * fx) * (1 - fy) + (c * (1 - fx) + d * fx) * fy
+    gradient = np.stack(
+        [(b - a) * (1 - fy) + (d - c) * fy, (c - a) * (1 - fx) + (d - b) * fx], axis=1
+    )
+    return value, gradient / distance.step
+
+
+def outline_vertices(
+    vertices: np.ndarray, faces: np.ndarray, camera: Camera, allowed: np.ndarray
+) -> np.ndarray:
+    """Vertices (n,) that form the outer outline of a mesh in a view, at most POINTS_A_VIEW.
+
+    A vertex counts if it lies between faces turned to and from the camera and projects to within a
+    pixel and a half of the edge of the mesh's own mask, so that inner folds do not.
+
+    Args:
+        vertices: (V, 3) world.
+        faces: (F, 3).
+        camera: pinhole.
+        allowed: (V,) bool.
+    """
+    window = _window(vertices, camera)
+    if window is None:
+        return np.zeros(0, dtype=np.int64)
+    edge = _mask_distance(vertices, faces, window)
+    corners = vertices[faces]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    front = ((camera.center - corners[:, 0]) * normals).sum(1) > 0
+    turned_to, turned_from = np.zeros(len(vertices), bool), np.zeros(len(vertices), bool)
+    turned_to[faces[front].ravel()] = True
+    turned_from[faces[~front].ravel()] = True
+    chosen = np.flatnonzero(turned_to & turned_from & allowed)
+    local = vertices[chosen] @ window.cam_from_world[:3, :3].T + window.cam_from_world[:3, 3]
+    pixels = local[:, :2] / local[:, 2:] * window.K[[0, 1], [0, 1]] + window.K[:2, 2]
+    column, row = np.floor(pixels).astype(int).T
+    inside = (column >= 0) & (row >= 0) & (column < window.width) & (row < window.height)
+    column, row = np.clip(column, 0, window.width - 1), np.clip(row, 0, window.height - 1)
+    chosen = chosen[inside & (edge[row, column] <= 1.5)]
+    if len(chosen) > POINTS_A_VIEW:
+        chosen = chosen[np.linspace(0, len(chosen) - 1, POINTS_A_VIEW).astype(int)]
+    return chosen
+
+
+def _window(vertices: np.ndarray, camera: Camera) -> Camera | None:
+    """A small camera that sees the part of the image where the mesh is."""
+    local = vertices @ camera.cam_from_world[:3, :3].T + camera.cam_from_world[:3, 3]
+    if (local[:, 2] <= 1e-3).any():
+        return None
+    side = max(camera.width, camera.height)
+    return resized(
+        camera,
+        max(1, round(camera.width * OUTLINE_SIDE * 2 / side)),
+        max(1, round(camera.height * OUTLINE_SIDE * 2 / side)),
+    )
+
+
+def _mask_distance(vertices: np.ndarray, faces: np.ndarray, camera: Camera) -> np.ndarray:
+    """Distance (H, W) of each pixel inside the mesh's mask to the mask's edge; 0 outside."""
+    scene = o3d.t.geometry.RaycastingScene(nthreads=1)
+    scene.add_triangles(
+        o3d.core.Tensor(np.ascontiguousarray(vertices, dtype=np.float32)),
+        o3d.core.Tensor(np.ascontiguousarray(faces, dtype=np.uint32)),
+    )
+    rays = o3d.t.geometry.RaycastingScene.create_rays_pinhole(
+        intrinsic_matrix=o3d.core.Tensor(camera.K),
+        extrinsic_matrix=o3d.core.Tensor(camera.cam_from_world),
+        width_px=camera.width,
+        height_px=camera.height,
+    )
+    mask = scene.test_occlusions(rays).numpy().astype(np.uint8)
+    return cv2.distanceTransform(mask, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)

@@ -1,0 +1,121 @@
+"""Pictures that show whether a track is right: the mesh drawn into the frames it was fitted to."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import open3d as o3d
+import torch
+
+from express50.cameras import Camera
+from express50.frames import read_cameras_of, read_frame
+from express50.head.model import HeadModel, landmarks
+from express50.images import write_image
+from express50.layout import Dataset
+from pipelines.track.fit import Target
+from pipelines.track.observe import project_pinhole
+
+TILE = 384
+SEEN_COLOR, FITTED_COLOR = (255, 210, 0), (0, 255, 120)
+
+
+def draw_overlays(
+    dataset: Dataset,
+    subject: str,
+    folder: Path,
+    model: HeadModel,
+    targets: list[Target],
+    vertices: np.ndarray,
+) -> None:
+    """Write overlay_<expression>.jpg: frame above, mesh and landmarks below, in four views.
+
+    Yellow: detected; green: fitted. Vertices (E, V, 3) world.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    cameras = read_cameras_of(dataset, subject)
+    for target, mesh in zip(targets, vertices, strict=True):
+        columns = []
+        for camera_id in _spread(target, cameras):
+            frame = read_frame(dataset, subject, camera_id, target.observation.frame)
+            columns.append(_column(frame, cameras[camera_id], camera_id, model, target, mesh))
+        path = folder / f"overlay_{target.observation.expression}.jpg"
+        write_image(path, np.concatenate(columns, axis=1), quality=88)
+
+
+def _spread(target: Target, cameras: dict[str, Camera]) -> list[str]:
+    """Up to four cameras: the surest view, then those furthest from all chosen so far."""
+    views = sorted(target.observation.views, key=lambda v: float(np.median(v.sigma)) / v.score)
+    chosen = [views[0].camera_id]
+    pool = [view.camera_id for view in views[1:]]
+    while pool and len(chosen) < 4:
+        axes = np.stack([cameras[name].cam_from_world[2, :3] for name in chosen])
+        far = [float((axes @ cameras[name].cam_from_world[2, :3]).max()) for name in pool]
+        chosen.append(pool.pop(int(np.argmin(far))))
+    return sorted(chosen)
+
+
+def _column(
+    frame: np.ndarray,
+    camera: Camera,
+    camera_id: str,
+    model: HeadModel,
+    target: Target,
+    mesh: np.ndarray,
+) -> np.ndarray:
+    """Frame and overlay (2 TILE, TILE, 3) of the part of one view where the head is."""
+    pixels, _ = project_pinhole(camera, mesh)
+    low, high = pixels.min(0), pixels.max(0)
+    side = 1.08 * float((high - low).max())
+    corner = 0.5 * (low + high) - 0.5 * side
+    scale = TILE / side
+    matrix = np.array([[scale, 0, -scale * corner[0]], [0, scale, -scale * corner[1]]])
+    # OpenCV's pixel centres lie on whole numbers, ours on halves.
+    shifted = matrix + np.array([[0, 0, 0.5 * scale - 0.5]])
+    flags = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
+    crop = cv2.warpAffine(frame, shifted, (TILE, TILE), flags=flags)
+    shaded = _wireframe(crop, camera, matrix, model, mesh)
+    marks = landmarks(model, torch.from_numpy(mesh)[None])[0].numpy()
+    _dots(shaded, project_pinhole(camera, marks)[0] @ matrix[:, :2].T + matrix[:, 2], FITTED_COLOR)
+    for view in target.observation.views:
+        if view.camera_id == camera_id:
+            _dots(shaded, view.points @ matrix[:, :2].T + matrix[:, 2], SEEN_COLOR)
+    cv2.putText(shaded, camera_id, (6, 16), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (255, 255, 255), 1)
+    return np.concatenate([crop, shaded])
+
+
+def _wireframe(
+    crop: np.ndarray, camera: Camera, matrix: np.ndarray, model: HeadModel, mesh: np.ndarray
+) -> np.ndarray:
+    """Blend visible triangle edges and the mesh's outline into a crop."""
+    K = np.diag([matrix[0, 0], matrix[1, 1], 1.0]) @ camera.K
+    K[:2, 2] += matrix[:, 2]
+    scene = o3d.t.geometry.RaycastingScene(nthreads=1)
+    faces = model.faces.numpy()
+    scene.add_triangles(
+        o3d.core.Tensor(mesh.astype(np.float32)), o3d.core.Tensor(faces.astype(np.uint32))
+    )
+    rays = o3d.t.geometry.RaycastingScene.create_rays_pinhole(
+        intrinsic_matrix=o3d.core.Tensor(K),
+        extrinsic_matrix=o3d.core.Tensor(camera.cam_from_world),
+        width_px=TILE,
+        height_px=TILE,
+    )
+    cast = scene.cast_rays(rays)
+    hit = np.isfinite(cast["t_hit"].numpy())
+    bary = cast["primitive_uvs"].numpy()
+    smallest = np.minimum(bary.min(2), 1 - bary.sum(2))
+    edge = hit & (smallest < 0.08)
+    rim = hit ^ cv2.erode(hit.astype(np.uint8), np.ones((3, 3), np.uint8)).astype(bool)
+    image = crop.astype(np.float32)
+    image[edge] = 0.7 * image[edge] + 0.3 * np.array([90, 200, 255], np.float32)
+    image[rim] = np.array([255, 60, 60], np.float32)
+    return np.ascontiguousarray(image.astype(np.uint8))
+
+
+def _dots(image: np.ndarray, points: np.ndarray, color: tuple[int, int, int]) -> None:
+    """Draw small dots at tile pixels (N, 2), corner origin, in place."""
+    for x, y in points:
+        if 0 <= x < TILE and 0 <= y < TILE:
+            cv2.circle(image, (int(x), int(y)), 1, color, -1, cv2.LINE_AA)

@@ -1,0 +1,296 @@
+"""The track stage: detect, triangulate, align, fit; writes track.npz and overlays."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from express50.cameras import Camera
+from express50.errors import CaptureError, StageError
+from express50.frames import read_cameras_of, read_frame, read_peaks
+from express50.head.load import load_head
+from express50.head.model import HeadModel, landmarks, pose
+from express50.images import read_image
+from express50.index import index_path
+from express50.landmarks.detector import detect
+from express50.landmarks.network import WEIGHTS, LandmarkNet, load_network
+from express50.layout import Dataset
+from express50.stage import Stage
+from pipelines.track.config import PRESETS, TrackConfig
+from pipelines.track.fit import State, Target, fit, landmark_sigma, start_state
+from pipelines.track.observe import Observation, View, agree, project_pinhole
+from pipelines.track.outline import REGIONS, Outline, outline_vertices, signed_distance
+from pipelines.track.overlay import draw_overlays
+from pipelines.track.sparse_head import POSE_SIZE, Basis, make_basis
+from pipelines.track.start import initial_pose
+
+SCHEMA = "express50.track/1"
+
+
+def items(dataset: Dataset) -> list[str]:
+    """Subjects: the shape is shared by all expressions of one."""
+    return dataset.subjects()
+
+
+def inputs(dataset: Dataset, item: str, config: TrackConfig) -> dict[str, Path | str]:
+    """Index, cameras, peaks, mattes, the detector's weights and the head model's file."""
+    found: dict[str, Path | str] = {
+        "index": index_path(dataset, item),
+        "cameras": dataset.item_dir("calibrate", item) / "cameras.json",
+        "peaks": dataset.item_dir("align", item) / "peaks.json",
+        "weights": WEIGHTS,
+    }
+    mattes = dataset.item_dir("matte", item)
+    if config.silhouette_rounds and mattes.is_dir():
+        found["mattes"] = mattes
+    if config.head != "procedural":
+        found["head"] = Path(config.head).expanduser()
+    return found
+
+
+def run(dataset: Dataset, item: str, config: TrackConfig, out: Path) -> dict:
+    """Track one subject; see the module docstring of `fit` for the method."""
+    torch.set_num_threads(1)
+    cameras = read_cameras_of(dataset, item)
+    dropped: list[dict[str, str]] = []
+    basis = _basis(config.head)
+    observations = _observe(dataset, item, cameras, config, dropped)
+    targets, poses = _targets(basis, observations, config, dropped)
+    if not targets:
+        reasons = "; ".join(f"{row['what']}: {row['why']}" for row in dropped[:3])
+        raise StageError(f"{item}: no expression could be tracked ({reasons})")
+    state, _ = fit(basis, targets, start_state(basis, poses), config, config.iterations)
+    state, targets = _refine(dataset, item, basis, targets, state, config)
+    vertices = _all_vertices(basis.model, state)
+    _write_track(out / "track.npz", config.head, basis, targets, state, vertices)
+    draw_overlays(dataset, item, out / "qc", basis.model, targets, vertices)
+    return _metrics(basis.model, targets, vertices, dropped)
+
+
+@lru_cache(maxsize=2)
+def _basis(head: str) -> Basis:
+    return make_basis(load_head(head))
+
+
+@lru_cache(maxsize=1)
+def _network() -> LandmarkNet:
+    return load_network()
+
+
+def _observe(
+    dataset: Dataset,
+    subject: str,
+    cameras: dict[str, Camera],
+    config: TrackConfig,
+    dropped: list[dict[str, str]],
+) -> list[Observation]:
+    """Detect landmarks at every peak in every camera and reject what does not agree."""
+    peaks = read_peaks(dataset, subject)
+    # The neutral frame shows which cameras see the face; the others need not look again.
+    order = sorted(peaks, key=lambda name: (name != config.neutral, list(peaks).index(name)))
+    chosen = list(cameras)
+    found = {}
+    for expression in order:
+        views = _views(dataset, subject, {n: cameras[n] for n in chosen}, peaks[expression], config)
+        if config.cameras and len(chosen) > config.cameras and len(views) >= config.cameras:
+            views = sorted(views, key=lambda view: float(np.median(view.sigma)) / view.score)
+            views = views[: config.cameras]
+            chosen = sorted(view.camera_id for view in views)
+        if not views:
+            dropped.append({"what": expression, "why": "no camera sees a face"})
+            continue
+        observation, refused = agree(expression, peaks[expression], views)
+        for camera_id in refused:
+            why = "its landmarks disagree with the other cameras"
+            dropped.append({"what": f"{expression}/{camera_id}", "why": why})
+        if observation.inliers.sum(1).max() < config.min_landmarks:
+            count = int(observation.inliers.sum(1).max())
+            dropped.append({"what": expression, "why": f"{count} landmarks agree between cameras"})
+            continue
+        found[expression] = observation
+    return [found[name] for name in peaks if name in found]
+
+
+def _views(
+    dataset: Dataset, subject: str, cameras: dict[str, Camera], frame: int, config: TrackConfig
+) -> list[View]:
+    """Views with a face in them; a camera whose footage lacks the frame is skipped."""
+    views = []
+    for camera_id, camera in cameras.items():
+        try:
+            image = read_frame(dataset, subject, camera_id, frame)
+        except CaptureError:
+            continue
+        seen = detect(_network(), image, config.refinements)
+        if seen.score >= config.min_score:
+            views.append(View(camera_id, camera, seen.points, seen.sigma, seen.score))
+    return views
+
+
+def _targets(
+    basis: Basis,
+    observations: list[Observation],
+    config: TrackConfig,
+    dropped: list[dict[str, str]],
+) -> tuple[list[Target], list[tuple[np.ndarray, np.ndarray]]]:
+    """Fit targets with their initial rotation and translation."""
+    template = landmarks(basis.model, basis.model.template[None])[0].numpy()
+    targets, poses = [], []
+    for observation in observations:
+        try:
+            poses.append(initial_pose(observation, template))
+        except StageError as error:
+            if "rig seems" in str(error):
+                raise
+            dropped.append({"what": observation.expression, "why": str(error)})
+            continue
+        sigma = landmark_sigma(observation, config)
+        neutral = observation.expression == config.neutral
+        targets.append(Target(observation, sigma, neutral))
+    return targets, poses
+
+
+def _refine(
+    dataset: Dataset,
+    subject: str,
+    basis: Basis,
+    targets: list[Target],
+    state: State,
+    config: TrackConfig,
+) -> tuple[State, list[Target]]:
+    """Alternate between finding the outline on the current mesh and fitting to the mattes."""
+    distances = [_distances(dataset, subject, target) for target in targets]
+    if not config.silhouette_rounds or not any(distances):
+        return state, targets
+    for _ in range(config.silhouette_rounds):
+        vertices = _all_vertices(basis.model, state)
+        targets = [
+            _with_outlines(basis.model, target, seen, mesh)
+            for target, seen, mesh in zip(targets, distances, vertices, strict=True)
+        ]
+        state, _ = fit(basis, targets, state, config, config.silhouette_iterations)
+    return state, targets
+
+
+def _distances(dataset: Dataset, subject: str, target: Target) -> list:
+    """Signed distances of the mattes of one expression, cameras without one left out.
+
+    All cameras count, those behind the head too: they see the skull.
+    """
+    found = []
+    for camera_id, camera in read_cameras_of(dataset, subject).items():
+        folder = dataset.item_dir("matte", f"{subject}/{camera_id}")
+        path = folder / f"{target.observation.expression}.png"
+        if not path.is_file():
+            continue
+        alpha = read_image(path)
+        distance = signed_distance(alpha if alpha.ndim == 2 else alpha[..., 0], camera)
+        if distance is not None:
+            found.append(distance)
+    return found
+
+
+def _with_outlines(model: HeadModel, target: Target, distances: list, mesh: np.ndarray) -> Target:
+    """The target with the outlines of the current mesh (V, 3)."""
+    allowed = torch.stack([model.regions[name] for name in REGIONS]).any(0).numpy()
+    faces = model.faces.numpy()
+    outlines, ids, offset = [], [], 68
+    for distance in distances:
+        chosen = outline_vertices(mesh, faces, distance.camera, allowed)
+        if len(chosen) < 8:
+            continue
+        outlines.append(Outline.of(distance, offset, len(chosen), mesh[chosen]))
+        ids.append(chosen)
+        offset += len(chosen)
+    vertices = np.concatenate(ids) if ids else np.zeros(0, dtype=np.int64)
+    return Target(target.observation, target.sigma, target.neutral, tuple(outlines), vertices)
+
+
+def _all_vertices(model: HeadModel, state: State) -> np.ndarray:
+    """World vertices (E, V, 3) of every expression."""
+    own = torch.from_numpy(np.stack([item.own for item in state.poses]))
+    count = model.expression_dirs.shape[2]
+    shape = torch.from_numpy(state.shape)[None].expand(len(own), -1)
+    angles = own[:, count : count + POSE_SIZE - 6]
+    with torch.inference_mode():
+        head = pose(
+            model, shape, own[:, :count], neck=angles[:, :3], jaw=angles[:, 3:6], eyes=angles[:, 6:]
+        ).numpy()
+    rotation = np.stack([item.rotation for item in state.poses])
+    return np.einsum("eij,evj->evi", rotation, head) + own[:, None, -3:].numpy()
+
+
+def _write_track(
+    path: Path,
+    head: str,
+    basis: Basis,
+    targets: list[Target],
+    state: State,
+    vertices: np.ndarray,
+) -> None:
+    """Write track.npz; no pickled objects."""
+    own = np.stack([item.own for item in state.poses])
+    count = basis.expression_size
+    arrays = {
+        "schema": np.array(SCHEMA),
+        "head": np.array(head),
+        "expressions": np.array([target.observation.expression for target in targets]),
+        "frames": np.array([target.observation.frame for target in targets], dtype=np.int64),
+        "shape": state.shape,
+        "expression": own[:, :count],
+        "neck": own[:, count : count + 3],
+        "jaw": own[:, count + 3 : count + 6],
+        "eyes": own[:, count + 6 : count + 12],
+        "R": np.stack([item.rotation for item in state.poses]),
+        "t": own[:, -3:],
+        "vertices": vertices.astype(np.float32),
+    }
+    for name, array in arrays.items():
+        if array.dtype.kind == "f" and not np.isfinite(array).all():
+            raise StageError(f"{name} holds NaN or infinite values; the fit diverged")
+    np.savez(path, **arrays)
+
+
+def _metrics(
+    model: HeadModel, targets: list[Target], vertices: np.ndarray, dropped: list[dict[str, str]]
+) -> dict:
+    """Reprojection of inlier landmarks, RMS pixels by expression and camera."""
+    marks = landmarks(model, torch.from_numpy(vertices)).numpy()
+    table: dict[str, dict[str, float]] = {}
+    used, total = 0, 0
+    for target, points in zip(targets, marks, strict=True):
+        row = {}
+        for view, inliers in zip(target.observation.views, target.observation.inliers, strict=True):
+            pixels, _ = project_pinhole(view.camera, points)
+            squared = ((pixels - view.points) ** 2).sum(1)
+            chosen = inliers.copy()
+            chosen[:17] = False
+            if chosen.any():
+                row[view.camera_id] = round(float(np.sqrt(squared[chosen].mean())), 4)
+            used, total = used + int(inliers.sum()), total + inliers.size
+        table[target.observation.expression] = row
+    values = [value for row in table.values() for value in row.values()]
+    return {
+        "expressions": len(targets),
+        "landmark_rms_px": table,
+        "landmark_rms_px_mean": round(float(np.mean(values)), 4) if values else None,
+        "landmarks_used": used,
+        "landmarks_seen": total,
+        "outline_views": int(sum(len(target.outlines) for target in targets)),
+        "head": model.name,
+        "dropped": dropped,
+    }
+
+
+STAGE = Stage(
+    name="track",
+    version=1,
+    config=TrackConfig,
+    presets=PRESETS,
+    items=items,
+    inputs=inputs,
+    run=run,
+)

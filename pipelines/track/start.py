@@ -1,0 +1,68 @@
+"""Where the head is, from geometry alone, before any optimisation."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from express50.errors import StageError
+from express50.transforms import rigid_fit, similarity_fit
+from pipelines.track.observe import Observation
+
+# Jaw-line points slide; brows to mouth are what a rigid alignment may trust.
+INNER = np.arange(17, 68)
+MIN_TRIANGULATED = 12
+SCALE_LIMITS = (0.5, 2.0)
+
+
+def initial_pose(observation: Observation, template: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Rotation (3, 3) and translation (3,) with world = R @ head + t.
+
+    Uses triangulated landmarks where enough exist (and checks that their size is a head's), else
+    perspective-n-point in the surest view.
+
+    Args:
+        observation: Views of one expression.
+        template: (68, 3) landmarks of the head model, metres.
+
+    Raises:
+        StageError: the rig's unit is not the metre, or too few landmarks.
+    """
+    seen = INNER[np.isfinite(observation.points[INNER]).all(1)]
+    if len(seen) < MIN_TRIANGULATED:
+        return _from_one_view(observation, template)
+    scale = similarity_fit(template[seen], observation.points[seen])[0]
+    if not SCALE_LIMITS[0] < scale < SCALE_LIMITS[1]:
+        raise StageError(
+            f"{observation.expression}: the rig seems {_factor(scale)} off: the head measures "
+            f"{scale:.3g} times a human head in the calibration's units; expected metres, divide "
+            f"the camera translations by {scale:.3g} and calibrate again"
+        )
+    return rigid_fit(template[seen], observation.points[seen])
+
+
+def _factor(scale: float) -> str:
+    """How far off a scale is, in words: 100x, 0.001x."""
+    power = round(float(np.log10(scale)))
+    return f"{10.0**power:g}x" if power else f"{scale:.2g}x"
+
+
+def _from_one_view(observation: Observation, template: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Pose from the view with the smallest expected error."""
+    view = min(observation.views, key=lambda view: float(np.median(view.sigma)) / view.score)
+    best = np.argsort(view.sigma[INNER])[:36]
+    points, pixels = template[INNER[best]], view.points[INNER[best]]
+    # EPnP needs no start; refined by Levenberg-Marquardt. OpenCV's K is given corner-origin pixels
+    # together with a corner-origin principal point, so no shift is due.
+    arguments = (np.ascontiguousarray(points), np.ascontiguousarray(pixels), view.camera.K, None)
+    found, turn, shift = cv2.solvePnP(*arguments, flags=cv2.SOLVEPNP_EPNP)
+    if not found:
+        raise StageError(
+            f"{observation.expression}: no pose explains the landmarks of {view.camera_id}; "
+            "look at its overlay, the face may be hidden"
+        )
+    turn, shift = cv2.solvePnPRefineLM(*arguments, turn, shift)
+    cam_from_head = np.eye(4)
+    cam_from_head[:3, :3], cam_from_head[:3, 3] = cv2.Rodrigues(turn)[0], shift[:, 0]
+    world = np.linalg.inv(view.camera.cam_from_world) @ cam_from_head
+    return world[:3, :3], world[:3, 3]
