@@ -205,8 +205,6 @@ def _read_board(root: Path, cameras: dict[str, RawCamera]) -> dict | None:
         return None
     path = folder / "board.toml"
     if not path.is_file():
-        path = root / "board.toml"
-    if not path.is_file():
         raise CaptureError(
             f"{folder}: has no board.toml; describe the ChArUco board in it, see docs/FORMAT.md"
         )

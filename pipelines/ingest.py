@@ -32,6 +32,7 @@ from express50.layout import Dataset
 from express50.publish import dump_json, write_json
 from express50.stage import Stage
 from express50.video import iterate_video
+from express50.withdraw import withdrawn
 
 QC_CAMERAS, QC_COLUMNS = 24, 6
 
@@ -57,13 +58,18 @@ def register(dataset: Dataset, captures: list[Path]) -> list[str]:
     """Add raw captures to the dataset's table; returns their subjects in the given order.
 
     Raises:
-        CaptureError: a folder is no capture, or two captures claim one subject.
+        CaptureError: a folder is no capture, two captures claim one subject, or the subject was
+            withdrawn.
     """
     table = {subject: str(path) for subject, path in dataset.captures().items()}
     added: dict[str, str] = {}
     for path in captures:
         root = Path(path).resolve()
         subject = read_meta(root)["subject"]
+        if text_digest(subject) in withdrawn(dataset):
+            raise CaptureError(
+                f"{root}: subject {subject} was withdrawn from {dataset.root}; delete the capture"
+            )
         if added.get(subject, str(root)) != str(root):
             raise CaptureError(
                 f"{root / 'capture.toml'}: subject {subject} is also that of {added[subject]}; "

@@ -1,0 +1,57 @@
+"""``express50 subject``: withdraw a person from a dataset."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from express50.console import FAILED, OK, say, say_json
+from express50.layout import Dataset
+from express50.withdraw import plan, withdraw
+
+
+def add_commands(subparsers: Any) -> None:
+    """Add the ``subject`` command."""
+    parser = subparsers.add_parser("subject", help="withdraw a person from a dataset")
+    actions = parser.add_subparsers(dest="action", metavar="ACTION", required=True)
+    action = actions.add_parser(
+        "withdraw",
+        help="remove all that the dataset holds of a subject",
+        description="Removes a subject's index, derived files, labels, receipts and the packed "
+        "shards, then searches all that is left for the subject's id. Lists only, without --yes.",
+        epilog="example: express50 subject withdraw DATASET S001 --yes",
+    )
+    action.add_argument("dataset", type=Path, metavar="DATASET")
+    action.add_argument("subject", metavar="SUBJECT")
+    action.add_argument("--yes", action="store_true", help="remove")
+    action.add_argument("--json", action="store_true", help="print as JSON")
+    action.set_defaults(handler=run_withdraw)
+
+
+def run_withdraw(args: argparse.Namespace) -> int:
+    """Withdraw; exit code 1 when a file that names the subject is left."""
+    dataset = Dataset(args.dataset)
+    if not args.yes:
+        paths = [str(path) for path in plan(dataset, args.subject)]
+        if args.json:
+            say_json({"subject": args.subject, "would_remove": paths})
+        else:
+            say(*(f"would remove {path}" for path in paths), "add --yes to remove")
+        return OK
+    done = withdraw(dataset, args.subject)
+    account = {
+        "subject": done.subject,
+        "removed": [str(path) for path in done.removed],
+        "remaining": [str(path) for path in done.remaining],
+        "raw_capture": str(done.capture) if done.capture else None,
+    }
+    if args.json:
+        say_json(account)
+    else:
+        say(*(f"removed {path}" for path in done.removed))
+        say(*(f"STILL NAMES {done.subject}: {path}" for path in done.remaining))
+        if done.capture:
+            say(f"the raw capture {done.capture} is outside the dataset: delete it yourself")
+        say("run 'express50 pack' and 'express50 report' again; retrain models that saw the person")
+    return FAILED if done.remaining else OK
