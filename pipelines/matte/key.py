@@ -1,0 +1,188 @@
+"""From a frame and its plate to alpha: what differs from the plate, and by how much.
+
+The key: a pixel's difference from the plate, in noise deviations, over the difference that the
+subject's own colour nearby would make. So alpha needs no fixed ramp: a strand of fair hair over
+a fair plate is as opaque as a dark one. The solid inside is found by shape and is always 1.
+Measured against guided filtering and colour projection, see benchmarks/matte.py.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from pipelines.matte.config import MatteConfig
+from pipelines.matte.plate import PlateModel
+
+# A part of the subject smaller than this share of its largest part is clutter.
+LEAST_PART = 0.02
+# A plate-coloured hole inside the subject is at most this share of the image.
+LARGEST_HOLE = 0.05
+_LUMA = np.array([0.299, 0.587, 0.114], dtype=np.float32)
+
+
+@dataclass(frozen=True)
+class Support:
+    """Where a frame shows the subject: `core` (H, W) surely, `near` (H, W) perhaps."""
+
+    core: np.ndarray
+    near: np.ndarray
+
+
+def alpha_of(
+    frame: np.ndarray, model: PlateModel, valid: np.ndarray, config: MatteConfig
+) -> np.ndarray:
+    """Opacity (H, W) float32 in [0, 1] of the subject in a frame (H, W, 3) uint8.
+
+    `model` is the plate in this frame's exposure; pixels outside `valid` (H, W) get 0.
+    """
+    alpha = np.zeros(valid.shape, np.float32)
+    length = max(valid.shape)
+    image = frame.astype(np.float32)
+    difference = plate_difference(image, model, config.shadow, length)
+    difference[~valid] = 0.0
+    region = subject_region(difference, config.high)
+    if not region.any():
+        return alpha
+    # All else happens around the subject only.
+    window = _window(region, 4 * _pixels(config.core, length))
+    part = PlateModel(model.plate[window], model.sigma[window], model.whiten)
+    support = find_support(difference[window], region[window], length, config)
+    own = subject_difference(image[window], difference[window], support.core, part, length)
+    soft = (difference[window] - config.low) / np.maximum(config.full * own - config.low, 1.0)
+    alpha[window] = np.where(support.core, 1.0, np.where(support.near, np.clip(soft, 0, 1), 0.0))
+    alpha[~valid] = 0.0
+    return alpha
+
+
+def _pixels(share: float, length: int) -> int:
+    return max(1, round(share * length))
+
+
+def _disc(radius: int) -> np.ndarray:
+    return cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
+
+
+def _window(region: np.ndarray, margin: int) -> tuple[slice, slice]:
+    rows, columns = np.flatnonzero(region.any(axis=1)), np.flatnonzero(region.any(axis=0))
+    return (
+        slice(max(0, int(rows[0]) - margin), int(rows[-1]) + 1 + margin),
+        slice(max(0, int(columns[0]) - margin), int(columns[-1]) + 1 + margin),
+    )
+
+
+def _length(error: np.ndarray, model: PlateModel) -> np.ndarray:
+    """Root mean square (H, W) of whitened errors (H, W, 3), 1 on average for mere noise."""
+    white = cv2.transform(error / model.sigma, model.whiten)
+    return np.sqrt(np.einsum("...i,...i->...", white, white) / 3.0)
+
+
+def plate_difference(
+    image: np.ndarray, model: PlateModel, shadow: float, length: int
+) -> np.ndarray:
+    """Difference (H, W) of an image (H, W, 3) from the plate, in noise deviations.
+
+    Where a whole neighbourhood is the plate darkened (no more than by `shadow`), the difference
+    is taken from the darkened plate. A dark strand darkens too, but not a whole neighbourhood.
+    """
+    difference = _length(image - model.plate, model)
+    if shadow <= 0:
+        return difference
+    # Darkening linear light by s darkens sRGB values by about s^(1/2.2).
+    dark = np.clip(
+        (image @ _LUMA) / np.maximum(model.plate @ _LUMA, 1.0), (1 - shadow) ** (1 / 2.2), 1.0
+    )
+    shaded = _length(image - model.plate * dark[..., None], model)
+    fits = (shaded < 3.0).astype(np.uint8)
+    # Opened by a disc wider than strands and soft edges: what is left is broad.
+    broad = cv2.morphologyEx(fits, cv2.MORPH_OPEN, _disc(_pixels(0.01, length))) > 0
+    return np.where(broad, np.minimum(difference, shaded), difference)
+
+
+def subject_region(difference: np.ndarray, high: float) -> np.ndarray:
+    """Pixels (H, W) of large connected parts that differ, each holding a sure pixel."""
+    smooth = np.sqrt(cv2.blur(difference**2, (3, 3)))
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(
+        (smooth > 2.2).astype(np.uint8), connectivity=8
+    )
+    sure = np.zeros(count, bool)
+    sure[np.unique(labels[smooth > high])] = True
+    sure[0] = False
+    if not sure.any():
+        return np.zeros(difference.shape, bool)
+    area = stats[:, cv2.CC_STAT_AREA]
+    # A few lone pixels are no subject, however bright.
+    least = max(LEAST_PART * area[sure].max(), 2e-4 * difference.size)
+    return (sure & (area >= least))[labels]
+
+
+def find_support(
+    difference: np.ndarray, region: np.ndarray, length: int, config: MatteConfig
+) -> Support:
+    """Split the region into the solid inside and the rest, where alpha is to be measured."""
+    differs = ((difference > 2 * config.low) & region).astype(np.uint8)
+    radius, edge = _pixels(config.core, length), _pixels(config.fill, length)
+    # The image's border cuts the subject off; it goes on behind it.
+    pad = 4 * radius + edge + 2
+    differs = cv2.copyMakeBorder(differs, pad, pad, pad, pad, cv2.BORDER_REPLICATE)
+    solid = cv2.morphologyEx(differs, cv2.MORPH_CLOSE, _disc(1))
+    thick = cv2.morphologyEx(solid, cv2.MORPH_OPEN, _disc(_pixels(0.006, length)))
+    hull = _filled(cv2.morphologyEx(thick, cv2.MORPH_CLOSE, _disc(2 * edge)), difference.size)
+    inside = cv2.erode(hull, _disc(3 * edge))
+    core = cv2.morphologyEx(solid | inside, cv2.MORPH_OPEN, _disc(radius))
+    # The outermost pixels of the solid are mixed with plate by lens and sampling.
+    core = cv2.erode(core, _disc(2 if length >= 256 else 1))[pad:-pad, pad:-pad] > 0
+    near = cv2.dilate(region.astype(np.uint8), _disc(1)) > 0
+    return Support(core, near & ~core)
+
+
+def _filled(mask: np.ndarray, pixels: int) -> np.ndarray:
+    """The mask (H, W) uint8 with enclosed holes filled up to LARGEST_HOLE of `pixels`."""
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(1 - mask, connectivity=4)
+    fill = stats[:, cv2.CC_STAT_AREA] < LARGEST_HOLE * pixels
+    touching = np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]])
+    fill[np.unique(touching)] = False
+    fill[0] = False  # the mask itself
+    return ((mask > 0) | fill[labels]).astype(np.uint8)
+
+
+def subject_difference(
+    image: np.ndarray,
+    difference: np.ndarray,
+    core: np.ndarray,
+    model: PlateModel,
+    length: int,
+) -> np.ndarray:
+    """Difference (H, W) from the plate that the subject's colour nearby would make at each pixel.
+
+    The colour is that of the core's rim, averaged over the nearest reach that holds any. With no
+    core (only strands in view) the strongest differences stand in for it.
+    """
+    if not core.any():
+        return np.full(core.shape, np.percentile(difference[difference > 0], 98), np.float32)
+    depth = _disc(2 * _pixels(0.012, length))
+    rim = core & (cv2.erode(core.astype(np.uint8), depth, borderValue=1) == 0)
+    weight = rim.astype(np.float32)
+    total = np.zeros_like(image)
+    weights = np.full(core.shape, 1e-12, np.float32)
+    colours = image * weight[..., None]
+    for octave in range(4):
+        reach = 0.012 * length * 2**octave
+        share = np.float32(1e-2**octave)
+        total += share * _blur(colours, reach)
+        weights += share * _blur(weight, reach)
+    return _length(total / weights[..., None] - model.plate, model)
+
+
+def _blur(image: np.ndarray, sigma: float) -> np.ndarray:
+    """Gaussian blur, at reduced size where that is wide (a blur this wide has no detail)."""
+    factor = max(1, int(sigma / 3))
+    if factor == 1:
+        return cv2.GaussianBlur(image, (0, 0), sigma)
+    height, width = image.shape[:2]
+    size = (max(1, width // factor), max(1, height // factor))
+    small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+    small = cv2.GaussianBlur(small, (0, 0), sigma / factor)
+    return cv2.resize(small, (width, height), interpolation=cv2.INTER_LINEAR)
