@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import sys
 from collections import deque
 from collections.abc import Callable, Iterable
 from concurrent.futures import CancelledError
@@ -117,6 +118,8 @@ class Pool:
                     f"scheduler {self.scheduler}: cannot connect ({error}); expected an address "
                     "such as tcp://host:8786 of a running dask scheduler"
                 ) from error
+            if not self._client.nthreads():
+                sys.stderr.write(f"scheduler {self.scheduler} has no workers yet; waiting\n")
             return self._client
         with dask.config.set(local_settings(self.threads)):
             self._cluster = LocalCluster(

@@ -53,8 +53,16 @@ def published(root: Path, names: list[str]) -> dict[str, dict[str, bytes]]:
     return {name: toy.tree(root / name) for name in names if (root / name).is_dir()}
 
 
-@pytest.mark.parametrize(("workers", "rounds", "longest"), [(0, 12, 0.9), (2, 3, 3.5)])
-def test_killed_driver_leaves_whole_items_and_a_rerun_completes(tmp_path, workers, rounds, longest):
+# Moments spread over import, start of the workers, and the work itself, on slow and fast machines.
+@pytest.mark.parametrize(
+    ("workers", "delays"),
+    [
+        (0, [random.Random(n).uniform(0.1, 0.9) for n in range(12)]),
+        (2, [1.3, 1.8, 2.4]),
+    ],
+    ids=["inline", "workers"],
+)
+def test_killed_driver_leaves_whole_items_and_a_rerun_completes(tmp_path, workers, delays):
     calm = toy.make_dataset(tmp_path / "calm", NAMES)
     assert toy.run_toy(calm, seconds=0.02).ok
     expected = published(calm.stage_dir("toy"), NAMES)
@@ -65,8 +73,6 @@ def test_killed_driver_leaves_whole_items_and_a_rerun_completes(tmp_path, worker
         for name, files in published(hurt.stage_dir("toy"), NAMES).items():
             assert files == expected[name], name
 
-    rng = random.Random(workers)
-    delays = [rng.uniform(0.1, longest) for _ in range(rounds)]
     kills = kill_until_done(["tests.faults.toy", str(hurt.root), str(workers)], check, delays)
     assert kills > 0
     assert toy.tree(hurt.stage_dir("toy")) == toy.tree(calm.stage_dir("toy"))
