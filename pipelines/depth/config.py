@@ -1,0 +1,59 @@
+"""Configuration of the depth stage and its presets."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, kw_only=True)
+class DepthConfig:
+    """How finely the surface is modelled, and how much the photographs may bend it."""
+
+    voxel_mm: float = 2.8
+    """Voxel of the last level, millimetres, 0.3 to 20."""
+    levels: int = 3
+    """Coarse-to-fine levels; each is 1.47 times coarser than the next; 1 to 6."""
+    image_side: int = 1024
+    """Longest side, pixels, of the images that silhouettes and photo-consistency use."""
+    photo: bool = True
+    """Move the surface by photo-consistency; False leaves the smoothed visual hull."""
+    use_track: bool = True
+    """Start from the tracked mesh where it agrees with the mattes."""
+    track_agreement: float = 0.85
+    """Share of the tracked mesh's pixels that must lie in the mattes for it to be used."""
+    inward_mm: float = 30.0
+    """How far below the hull the first level searches, millimetres."""
+    patch_samples: int = 5
+    """Samples along a patch's side, odd."""
+    noise: float = 0.8
+    """Texture under this standard deviation (8-bit steps, after blurring) counts as none."""
+    stiffness_voxels: float = 2.2
+    """Length, in voxels, under which displacements are smoothed as by a thin plate."""
+    rim_weight: float = 0.5
+    """Weight of the silhouettes against a perfect photographic match."""
+    fair_voxels: float = 1.4
+    """Gaussian smoothing of the distances before each level, in voxels."""
+    min_views: int = 2
+    """Fewest usable cameras; at least 2."""
+    qc_views: int = 4
+    """Cameras in the quality picture."""
+
+    def __post_init__(self) -> None:
+        """Check ranges."""
+        if not 0.3 <= self.voxel_mm <= 20:
+            raise ValueError(f"voxel_mm is {self.voxel_mm}, expected 0.3 to 20")
+        if not 1 <= self.levels <= 6:
+            raise ValueError(f"levels is {self.levels}, expected 1 to 6")
+        if self.patch_samples < 3 or self.patch_samples % 2 == 0:
+            raise ValueError(f"patch_samples is {self.patch_samples}, expected an odd number >= 3")
+        if self.min_views < 2:
+            raise ValueError(f"min_views is {self.min_views}, expected at least 2")
+        if self.noise <= 0 or self.stiffness_voxels <= 0 or self.image_side < 16:
+            raise ValueError("noise, stiffness_voxels must be positive and image_side at least 16")
+
+
+PRESETS: dict[str, dict[str, object]] = {
+    "draft": {"voxel_mm": 4.0, "levels": 2, "image_side": 512},
+    "standard": {},
+    "reference": {"voxel_mm": 1.6, "levels": 4, "patch_samples": 7, "image_side": 2048},
+}

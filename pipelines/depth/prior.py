@@ -1,0 +1,131 @@
+"""The tracked mesh as a signed distance: closed, checked with the mattes, merged with the hull."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import open3d as o3d
+
+from express50.cameras import rays
+from pipelines.depth.grid import Grid, View, sample_image
+from pipelines.depth.sweep import mesh_scene
+
+REACH = 0.020  # metres from the tracked mesh within which it is believed; beyond is hair or cloth
+BORDER = 0.015  # metres from the mesh's open border over which belief fades in
+
+
+@dataclass(frozen=True)
+class Prior:
+    """A tracked mesh made solid.
+
+    Attributes:
+        scene: the mesh and the caps over its holes.
+        border: scene of the caps over large holes (the neck), or None.
+    """
+
+    scene: o3d.t.geometry.RaycastingScene
+    border: o3d.t.geometry.RaycastingScene | None
+
+    def merge(self, grid: Grid) -> Grid:
+        """The grid with the tracked solid's distances blended in near the tracked surface."""
+        band = grid.values < 2 * grid.voxel
+        points = grid.points(np.argwhere(band))
+        distance = self.distance(points)
+        belief = self.belief(points, np.abs(distance))
+        values = grid.values.copy()
+        values[band] += belief * (np.maximum(distance, values[band]) - values[band])
+        return Grid(grid.origin, grid.voxel, values)
+
+    def distance(self, points: np.ndarray) -> np.ndarray:
+        """Signed distance (N,) float32, metres, negative inside the closed mesh."""
+        query = o3d.core.Tensor(np.ascontiguousarray(points, np.float32))
+        gap = self.scene.compute_distance(query, nthreads=1).numpy()
+        return np.where(self._enclosed(points), -gap, gap)
+
+    def belief(self, points: np.ndarray, gap: np.ndarray) -> np.ndarray:
+        """How far (N,) in [0, 1] the tracked surface counts at points (N, 3)."""
+        near = np.clip(2.0 - gap / REACH, 0, 1)
+        if self.border is None:
+            return near
+        query = o3d.core.Tensor(np.ascontiguousarray(points, np.float32))
+        edge = self.border.compute_distance(query, nthreads=1).numpy()
+        return near * np.clip(edge / BORDER - 1.0, 0, 1)
+
+    def _enclosed(self, points: np.ndarray) -> np.ndarray:
+        """Whether no straight way out exists (N,) in any of 26 directions.
+
+        Parity and winding tests fail on a head model, whose eyeballs, teeth and mouth cavity are
+        open sheets inside the skin; all of these count as inside here.
+        """
+        inside = np.ones(len(points), bool)
+        for direction in _directions():
+            left = np.flatnonzero(inside)
+            row = np.concatenate([points[left], np.broadcast_to(direction, (len(left), 3))], axis=1)
+            ray = o3d.core.Tensor(np.ascontiguousarray(row, np.float32))
+            inside[left] = self.scene.test_occlusions(ray, nthreads=1).numpy()
+        return inside
+
+
+def _directions() -> np.ndarray:
+    """26 unit vectors (26, 3) to the neighbours of a cell, the six axes first."""
+    cell = np.stack(np.meshgrid(*[[-1, 0, 1]] * 3, indexing="ij"), -1).reshape(-1, 3)
+    cell = cell[np.abs(cell).sum(1) > 0]
+    cell = cell[np.argsort(np.abs(cell).sum(1), kind="stable")]
+    return cell / np.linalg.norm(cell, axis=1, keepdims=True)
+
+
+def make_prior(vertices: np.ndarray, faces: np.ndarray) -> Prior:
+    """A prior of the tracked mesh (V, 3), (F, 3); holes are closed by fans to their middles."""
+    vertices = np.asarray(vertices, np.float64)
+    points, caps = [vertices], []
+    borders = []
+    for loop in boundary_loops(faces):
+        ring = vertices[loop]
+        middle = len(vertices) + len(points) - 1
+        points.append(ring.mean(0, keepdims=True))
+        fan = np.stack([loop, np.roll(loop, -1), np.full(len(loop), middle)], axis=1)
+        caps.append(fan)
+        if np.ptp(ring, axis=0).max() > 0.08:  # a neck, not an eye or a nostril
+            borders.append(fan)
+    all_points = np.concatenate(points)
+    scene = mesh_scene(all_points, np.concatenate([faces, *caps]))
+    return Prior(scene, mesh_scene(all_points, np.concatenate(borders)) if borders else None)
+
+
+def boundary_loops(faces: np.ndarray) -> list[np.ndarray]:
+    """Closed chains of vertex indices along edges that only one triangle (of (F, 3)) has."""
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    _, first, count = np.unique(
+        np.sort(edges, axis=1), axis=0, return_index=True, return_counts=True
+    )
+    following = dict(map(tuple, edges[first[count == 1]].tolist()))
+    loops = []
+    while following:
+        start, vertex = following.popitem()
+        loop = [start]
+        while vertex != start and vertex in following:
+            loop.append(vertex)
+            vertex = following.pop(vertex)
+        if vertex == start and len(loop) > 2:
+            loops.append(np.array(loop))
+    return loops
+
+
+def matte_agreement(views: Sequence[View], vertices: np.ndarray, faces: np.ndarray) -> float:
+    """Share of the pixels that a mesh (V, 3), (F, 3) covers which lie in the mattes.
+
+    The median over views of the mean matte there; a view that the mesh does not reach counts 0.
+    """
+    scene = mesh_scene(vertices, faces)
+    shares = []
+    for view in views:
+        origin, directions = rays(view.camera, stride=4)
+        way = directions.reshape(-1, 3)
+        row = np.concatenate([np.broadcast_to(origin, way.shape), way], axis=1)
+        hit = scene.test_occlusions(o3d.core.Tensor(row.astype(np.float32)), nthreads=1).numpy()
+        y, x = np.nonzero(hit.reshape(directions.shape[:2]))
+        inside = sample_image(view.alpha, np.stack([4 * x, 4 * y], 1) + 0.5) if len(x) else [0.0]
+        shares.append(float(np.mean(inside)))
+    return float(np.median(shares))

@@ -1,0 +1,86 @@
+"""What every camera sees of the surface: depth, confidence, normals, and files of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import open3d as o3d
+
+from express50.cameras import Camera, rays
+from pipelines.depth.grid import INSIDE
+from pipelines.depth.reconstruct import Surface
+
+STEEP = 0.25  # cosine between surface and ray below which confidence fades to 0
+
+
+@dataclass(frozen=True)
+class DepthView:
+    """Depth (H, W) metres (0 where not valid), valid (H, W), confidence (H, W), normals (H, W, 3).
+
+    Normals are in camera axes, 0 where not valid; ``covered`` is the share of the matte that the
+    surface fills, ``spill`` the surface's share outside the matte.
+    """
+
+    depth: np.ndarray
+    valid: np.ndarray
+    confidence: np.ndarray
+    normals: np.ndarray
+    covered: float
+    spill: float
+
+
+def cast_view(
+    surface: Surface, scene: o3d.t.geometry.RaycastingScene, camera: Camera, alpha: np.ndarray
+) -> DepthView:
+    """Raycast one camera; depth is valid where the surface is hit inside the matte (H, W)."""
+    origin, directions = rays(camera)
+    row = np.concatenate([np.broadcast_to(origin, directions.shape), directions], axis=-1)
+    hits = scene.cast_rays(o3d.core.Tensor(row.astype(np.float32)), nthreads=1)
+    depth = hits["t_hit"].numpy()
+    hit = np.isfinite(depth) & (depth > 0)
+    inside = alpha > INSIDE
+    valid = hit & inside
+    faces = surface.faces[hits["primitive_ids"].numpy()[valid]]
+    u, v = hits["primitive_uvs"].numpy()[valid].T
+    corners = np.stack([1 - u - v, u, v], axis=1)  # (n, 3) barycentric
+    normals = (surface.normals[faces] * corners[..., None]).sum(1)
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
+    way = directions[valid]
+    cosine = -(normals * way).sum(1) / np.linalg.norm(way, axis=1)
+    confidence = np.zeros(depth.shape, np.float32)
+    confidence[valid] = (surface.confidence[faces] * corners).sum(1) * np.clip(cosine / STEEP, 0, 1)
+    picture = np.zeros((*depth.shape, 3), np.float32)
+    picture[valid] = normals @ camera.cam_from_world[:3, :3].T
+    return DepthView(
+        depth=np.where(valid, depth, 0).astype(np.float32),
+        valid=valid,
+        confidence=np.clip(confidence, 0, 1),
+        normals=picture,
+        covered=float(valid.sum() / max(int(inside.sum()), 1)),
+        spill=float((hit & ~inside).sum() / max(int(hit.sum()), 1)),
+    )
+
+
+def write_ply(path: Path, surface: Surface) -> None:
+    """Binary PLY of the mesh: position, normal, colour, confidence; unused vertices left out."""
+    used = np.unique(surface.faces)
+    renumber = np.zeros(len(surface.vertices), np.int32)
+    renumber[used] = np.arange(len(used))
+    fields = [(name, "<f4") for name in ("x", "y", "z", "nx", "ny", "nz")]
+    fields += [(name, "u1") for name in ("red", "green", "blue")] + [("confidence", "<f4")]
+    table = np.zeros(len(used), dtype=fields)
+    for k, name in enumerate(("x", "y", "z")):
+        table[name] = surface.vertices[used, k]
+        table[f"n{name}"] = surface.normals[used, k]
+    for k, name in enumerate(("red", "green", "blue")):
+        table[name] = surface.colors[used, k]
+    table["confidence"] = surface.confidence[used]
+    faces = np.zeros(len(surface.faces), dtype=[("count", "u1"), ("index", "<i4", 3)])
+    faces["count"], faces["index"] = 3, renumber[surface.faces]
+    kinds = {"<f4": "float", "u1": "uchar"}
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(table)}"]
+    header += [f"property {kinds[kind]} {name}" for name, kind in fields]
+    header += [f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header"]
+    path.write_bytes("\n".join(header).encode() + b"\n" + table.tobytes() + faces.tobytes())
