@@ -34,7 +34,8 @@ from express50.expressions import Expression, load_script
 from express50.frames import read_proxy
 from express50.images import contact_sheet, write_image
 from express50.index import Cue, Index, read_index
-from express50.landmarks.detector import Detector, load_detector
+from express50.landmarks.detector import detect
+from express50.landmarks.network import LandmarkNet, load_network
 from express50.layout import Dataset
 from express50.stage import Stage
 
@@ -74,10 +75,10 @@ def run_item(dataset: Dataset, item: str, config: AlignConfig, out: Path) -> dic
     if not index.cues:
         raise StageError(f"{item}: cues.csv names no expression; add the script's timing")
     script = {e.id: e for e in load_script()}
-    detector = load_detector()
+    net = load_network()
     rest_cue = next((c for c in index.cues if c.expression_id == NEUTRAL), None)
-    watchers = choose_cameras(dataset, index, detector, rest_cue or index.cues[0], config)
-    rests = observe(dataset, index, detector, watchers, _rest_frames(index, rest_cue), None)
+    watchers = choose_cameras(dataset, index, net, rest_cue or index.cues[0], config)
+    rests = observe(dataset, index, net, watchers, _rest_frames(index, rest_cue), None)
     suggestions: dict[str, Suggestion] = {}
     dropped = []
     for cue in index.cues:
@@ -86,7 +87,7 @@ def run_item(dataset: Dataset, item: str, config: AlignConfig, out: Path) -> dic
             dropped.append({"what": cue.expression_id, "why": "its cue lies beyond the footage"})
             continue
         suggestions[cue.expression_id] = suggest_in_window(
-            dataset, index, detector, watchers, rests, frames, script.get(cue.expression_id), cue
+            dataset, index, net, watchers, rests, frames, script.get(cue.expression_id), cue
         )
     labels = accept(dataset, index, suggestions, watchers[0])
     peaks = {e: _peak_row(label) for e, label in labels.items() if label.action == "mark"}
@@ -116,7 +117,7 @@ def _rest_frames(index: Index, cue: Cue | None) -> np.ndarray:
 
 
 def choose_cameras(
-    dataset: Dataset, index: Index, detector: Detector, cue: Cue, config: AlignConfig
+    dataset: Dataset, index: Index, net: LandmarkNet, cue: Cue, config: AlignConfig
 ) -> list[str]:
     """The cameras that see the face best in the middle of a cue, best first.
 
@@ -125,7 +126,7 @@ def choose_cameras(
     """
     middle = min((cue.start_frame + cue.end_frame) // 2, index.frames - 1)
     scores = {
-        camera: detector.detect(read_proxy(dataset, index.subject, camera, middle)).score
+        camera: detect(net, read_proxy(dataset, index.subject, camera, middle)).score
         for camera in index.cameras
     }
     seeing = [
@@ -144,7 +145,7 @@ def choose_cameras(
 def observe(
     dataset: Dataset,
     index: Index,
-    detector: Detector,
+    net: LandmarkNet,
     cameras: list[str],
     frames: np.ndarray,
     rests: list[ClipObservation] | None,
@@ -153,7 +154,7 @@ def observe(
     out = []
     for number, camera in enumerate(cameras):
         images = [read_proxy(dataset, index.subject, camera, int(f)) for f in frames]
-        found = [detector.detect(image) for image in images]
+        found = [detect(net, image) for image in images]
         points = np.stack([d.points for d in found])
         neutral = np.median(points if rests is None else rests[number].points, axis=0)
         crops = np.stack(
@@ -166,7 +167,7 @@ def observe(
 def suggest_in_window(
     dataset: Dataset,
     index: Index,
-    detector: Detector,
+    net: LandmarkNet,
     cameras: list[str],
     rests: list[ClipObservation],
     frames: np.ndarray,
@@ -174,7 +175,7 @@ def suggest_in_window(
     cue: Cue,
 ) -> Suggestion:
     """The suggestion for one cue window, sampled at ``frames``."""
-    clips = observe(dataset, index, detector, cameras, frames, rests)
+    clips = observe(dataset, index, net, cameras, frames, rests)
     curve = activity(clips, rests, expression)
     found = suggest_peak(curve, 0, at_rest=cue.expression_id == NEUTRAL)
     return Suggestion(int(frames[found.frame]), found.confidence, found.activity)

@@ -1,0 +1,125 @@
+"""The whole chain on a tiny recording: it runs, it is right, and kills do not change its bytes."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from benchmarks.accuracy import measure_dataset
+from express50.cli import main
+from express50.images import decode_image
+from express50.layout import Dataset
+from express50.shards import ShardReader
+
+pytestmark = pytest.mark.slow
+
+STAGES = ("ingest", "calibrate", "align", "matte", "track", "depth", "pack")
+SETTINGS = {"pack": ["--set", "pack.size=96", "--set", 'pack.test_subjects=["S002"]']}
+RECORDING = [
+    "--subjects=2", "--cameras=6", "--width=192", "--height=192", "--frames-per-expression=4",
+    "--expressions=neutral,smile,jaw_open", "--seed=3", "--workers=2",
+]  # fmt: skip
+
+
+def _captures(twin: Path) -> list[str]:
+    return [str(p) for p in sorted((twin / "captures").iterdir())]
+
+
+def _stage(name: str, dataset: Path, twin: Path) -> list[str]:
+    captures = _captures(twin) if name == "ingest" else []
+    return [name, str(dataset), *captures, "--preset", "draft", *SETTINGS.get(name, [])]
+
+
+@pytest.fixture(scope="module")
+def twin(tmp_path_factory):
+    """Two people, six cameras, three expressions."""
+    root = tmp_path_factory.mktemp("twin")
+    assert main(["twin", "record", str(root), *RECORDING]) == 0
+    return root
+
+
+@pytest.fixture(scope="module")
+def dataset(twin, tmp_path_factory):
+    """Every stage has run over the recording."""
+    root = tmp_path_factory.mktemp("chain") / "dataset"
+    for name in STAGES:
+        assert main([*_stage(name, root, twin), "--workers", "0"]) == 0, name
+    return Dataset(root)
+
+
+def stage_bytes(root: Path) -> dict[str, bytes]:
+    """Every published file; the ledger and labels carry times of day and are left out."""
+    return {
+        str(p.relative_to(root)): p.read_bytes()
+        for stage in STAGES
+        for p in sorted((root / stage).rglob("*"))
+        if p.is_file()
+    }
+
+
+def test_footage_alone_gives_figures_close_to_the_truth(dataset, twin, tmp_path):
+    figures = measure_dataset(dataset, twin / "truth", tmp_path / "accuracy")
+    assert figures["align.peak_error_frames_median"] <= 1
+    assert figures["matte.mae"] < 0.02
+    assert figures["track.vertex_rmse_mm"] < 9
+    assert figures["depth.abs_error_mm_median"] < 6
+    assert figures["depth.coverage"] > 0.8
+    assert (tmp_path / "accuracy" / "depth_error.jpg").exists()
+
+
+def test_shards_hold_every_view_and_split_by_subject(dataset):
+    reader = ShardReader(dataset.item_dir("pack", "shards"))
+    assert len(reader) == 2 * 3 * 6
+    sample = reader.sample(0)
+    assert sample["rgb"].shape == (96, 96, 3)
+    splits = json.loads((dataset.item_dir("pack", "shards") / "splits.json").read_text())
+    assert splits["test"] == ["S002"]
+
+
+def test_a_second_run_skips_everything(dataset, twin, capsys):
+    for name in STAGES:
+        assert main([*_stage(name, dataset.root, twin), "--workers", "0", "--json"]) == 0
+        account = json.loads(capsys.readouterr().out)
+        assert account["skipped"] == account["read"], name
+
+
+def test_kills_at_random_moments_change_no_byte(dataset, twin, tmp_path):
+    """Each stage is killed twice with SIGKILL, workers and all, then run to its end."""
+    root = tmp_path / "killed"
+    moments = random.Random(5)
+    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[1])}
+    for name in STAGES:
+        command = [sys.executable, "-m", "express50.cli", *_stage(name, root, twin), "--workers=2"]
+        for _ in range(2):
+            process = subprocess.Popen(
+                command, env=environment, start_new_session=True, stdout=subprocess.DEVNULL,
+                stderr=subprocess.DEVNULL,
+            )  # fmt: skip
+            time.sleep(moments.uniform(1.0, 7.0))
+            os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
+        done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+        assert done.returncode == 0, f"{name}: {done.stderr[-2000:]}"
+    assert stage_bytes(root) == stage_bytes(dataset.root)
+
+
+def test_report_and_training_follow(dataset, tmp_path):
+    from grmm.cli import main as grmm
+
+    shards = str(dataset.item_dir("pack", "shards"))
+    out = dataset.root / "grmm" / "train"
+    assert grmm(["train", shards, str(out), "--preset", "demo", "--iterations", "3"]) == 0
+    assert json.loads((out / "metrics.json").read_text())["iterations"] == 3
+    assert main(["report", str(dataset.root), "--out", str(tmp_path)]) == 0
+    page = (tmp_path / "index.html").read_text()
+    assert "training" in page
+    assert page.count("data:image/jpeg;base64,") > 10
+    assert decode_image((dataset.item_dir("align", "S001") / "qc" / "peaks.jpg").read_bytes()).size
