@@ -242,13 +242,15 @@ def _jaw_rig(
     """Jaw hinge (3,) and weights (V,) that repeat what the jawOpen shape does.
 
     The lower teeth are rigid: their motion in the y-z plane is a turn by some angle about a point
-    that stays in place, found by least squares of d = (R - I)(p - c). A vertex's weight is its own
+    that stays in place: d = (R - I)(p - c). A vertex's weight is its own
     motion over the motion of a rigid jaw at that place.
     """
     points, motion = template[lower_teeth][:, 1:], opened[lower_teeth][:, 1:]
     centred = points - points.mean(0)
-    turn = np.linalg.lstsq(centred, motion - motion.mean(0), rcond=None)[0].T
-    angle = 0.5 * (turn[1, 0] - turn[0, 1])
+    moved = centred + motion - motion.mean(0)
+    overlap = centred.T @ moved
+    # The rotation that best turns one planar point set into another (Procrustes in two dimensions).
+    angle = np.arctan2(overlap[0, 1] - overlap[1, 0], overlap[0, 0] + overlap[1, 1])
     if abs(angle) < 1e-4:
         raise HeadModelError("ICT: jawOpen does not turn the lower teeth; cannot derive the jaw")
     rotation = np.array([[np.cos(angle) - 1, -np.sin(angle)], [np.sin(angle), np.cos(angle) - 1]])

@@ -26,9 +26,16 @@ PICKLE_LIMIT_BYTES = 2 << 30
 class Record:
     """Stands for an object of a class that is not imported; keeps what the pickle says of it."""
 
-    def __init__(self, *arguments: object) -> None:
-        self.arguments = arguments
-        self.state: dict[str, Any] = {}
+    state: dict[str, Any]
+
+    def __new__(cls, *_: object) -> Record:
+        """Start with an empty state: pickles may build objects without calling __init__."""
+        made = super().__new__(cls)
+        made.state = {}
+        return made
+
+    def __init__(self, *_: object) -> None:
+        """Ignore constructor arguments: the state says all."""
 
     def __setstate__(self, state: object) -> None:
         """Keep the state; slots come as a pair (dict, dict)."""
@@ -127,6 +134,8 @@ _ALLOWED = MappingProxyType(
         ("copyreg", "_reconstructor"): _new_record,
         ("__builtin__", "object"): Record,
         ("builtins", "object"): Record,
+        ("__builtin__", "set"): set,
+        ("builtins", "set"): set,
         ("collections", "OrderedDict"): OrderedDict,
         ("torch._utils", "_rebuild_tensor_v2"): _tensor,
         ("torch.storage", "_load_from_bytes"): _storage_from_bytes,
