@@ -35,7 +35,7 @@ class View:
 
 @dataclass(frozen=True)
 class Grid:
-    """Signed distances (X, Y, Z) float32, metres, negative inside; voxel i is at origin + i voxel."""
+    """Signed distances (X, Y, Z) float32, metres, negative inside, at origin + voxel * i."""
 
     origin: np.ndarray
     voxel: float

@@ -1,0 +1,273 @@
+"""Packed samples: USTAR tar shards in WebDataset's conventions, read at random by an index.
+
+A folder of shards holds ``<split>-000000.tar`` ..., ``index.json`` (where every member lies, with
+its CRC-32), ``manifest.json`` (SHA-256 of every file). Members of a sample are adjacent; their key
+has no dot, so that ``tar``, ``webdataset`` and Hugging Face ``datasets`` read the shards as they
+are. The writer is in :mod:`express50.shards_write`.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import struct
+import zlib
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from express50.errors import FormatError
+from express50.images import PIXEL_LIMIT, decode_image
+
+SCHEMA = "express50.shards/1"
+SHARD_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*-[0-9]{6}\.tar")
+KEY = re.compile(r"[A-Za-z0-9_-]{1,80}")
+RGB = ("rgb.jpg", "rgb.png")
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One sample's place: its ids, its shard, and (offset, size, crc32) of each member."""
+
+    key: str
+    subject: str
+    expression: str
+    camera: str
+    split: str
+    shard: str
+    members: dict[str, tuple[int, int, int]]
+
+
+class ShardReader:
+    """Random access to the samples of a folder of shards; safe to fork and to pickle.
+
+    State: one open file a shard, opened when first used.
+    """
+
+    def __init__(self, root: Path, entries: tuple[Entry, ...] | None = None) -> None:
+        """Read the index of ``root``, or take the given part of it.
+
+        Raises:
+            FormatError: the index is missing, malformed, or does not fit the shards.
+        """
+        self.root = Path(root)
+        self.entries = read_entries(self.root) if entries is None else entries
+        self._files: dict[str, int] = {}
+        self._owner = os.getpid()
+
+    def __len__(self) -> int:
+        """Number of samples."""
+        return len(self.entries)
+
+    def __getstate__(self) -> dict:
+        """Open files stay in the process that opened them."""
+        return self.__dict__ | {"_files": {}}
+
+    @property
+    def keys(self) -> list[str]:
+        """Keys of all samples, in order."""
+        return [entry.key for entry in self.entries]
+
+    def groups(self) -> dict[tuple[str, str], list[int]]:
+        """Sample numbers of every (subject, expression)."""
+        table: dict[tuple[str, str], list[int]] = {}
+        for number, entry in enumerate(self.entries):
+            table.setdefault((entry.subject, entry.expression), []).append(number)
+        return table
+
+    def select(
+        self,
+        subjects: Collection[str] | None = None,
+        expressions: Collection[str] | None = None,
+        cameras: Collection[str] | None = None,
+        split: str | None = None,
+    ) -> ShardReader:
+        """A reader of the samples that match all the given ids; none given means all.
+
+        Raises:
+            FormatError: an id or a split is unknown (the known ones are named).
+        """
+        wanted = {"subject": subjects, "expression": expressions, "camera": cameras}
+        wanted["split"] = None if split is None else [split]
+        chosen = self.entries
+        for name, values in wanted.items():
+            if values is None:
+                continue
+            known = {getattr(entry, name) for entry in self.entries}
+            unknown = sorted(set(values) - known)
+            if unknown:
+                raise FormatError(
+                    f"{self.root}: no {name} {', '.join(unknown)}; expected one of"
+                    f" {', '.join(sorted(known))}"
+                )
+            chosen = tuple(entry for entry in chosen if getattr(entry, name) in values)
+        return ShardReader(self.root, chosen)
+
+    def member(self, number: int, name: str) -> bytes:
+        """Bytes of one member of a sample, checked by CRC-32.
+
+        Raises:
+            FormatError: there is no such member, or its bytes are damaged.
+        """
+        entry = self.entries[number]
+        where = f"{self.root / entry.shard}: {entry.key}"
+        if name not in entry.members:
+            raise FormatError(f"{where}: has no {name}; it has {', '.join(entry.members)}")
+        offset, size, crc = entry.members[name]
+        data = os.pread(self._file(entry.shard), size, offset)
+        if len(data) != size or zlib.crc32(data) != crc:
+            raise FormatError(
+                f"{where}.{name}: damaged, CRC-32 {zlib.crc32(data):08x}, expected {crc:08x};"
+                " copy the shard again or rerun 'express50 pack'"
+            )
+        return data
+
+    def meta(self, number: int) -> dict:
+        """The sample's meta.json."""
+        entry = self.entries[number]
+        try:
+            meta = json.loads(self.member(number, "meta.json"))
+        except ValueError as error:
+            raise FormatError(f"{self.root / entry.shard}: {entry.key}: meta: {error}") from None
+        return meta
+
+    def sample(self, number: int) -> dict:
+        """Decode one sample.
+
+        Returns:
+            key; rgb (H, W, 3) uint8 sRGB; alpha (H, W) float32 in [0, 1]; depth (H, W) float32
+            metres, 0 where not valid; valid (H, W) bool; meta dict.
+
+        Raises:
+            FormatError: a member is damaged or does not have the size that the meta says.
+        """
+        entry, meta = self.entries[number], self.meta(number)
+        rgb_name = next((name for name in RGB if name in entry.members), RGB[0])
+        rgb = self._image(number, rgb_name, meta, np.uint8, 3)
+        alpha = self._image(number, "alpha.png", meta, np.uint8, 2)
+        steps = self._image(number, "depth.png", meta, np.uint16, 2)
+        return {
+            "key": entry.key,
+            "rgb": rgb,
+            "alpha": alpha.astype(np.float32) / 255,
+            "depth": steps.astype(np.float32) * np.float32(meta["depth_scale_m"]),
+            "valid": steps > 0,
+            "meta": meta,
+        }
+
+    def iterate(self, seed: int | None = None, epoch: int = 0, start: int = 0) -> Iterator[dict]:
+        """Samples of one pass from position ``start``; shuffled by (seed, epoch) unless None."""
+        for number in self.order(seed, epoch)[start:]:
+            yield self.sample(int(number))
+
+    def order(self, seed: int | None, epoch: int = 0) -> np.ndarray:
+        """Sample numbers (N,) of one pass: a pure function of (seed, epoch), for exact resume."""
+        if seed is None:
+            return np.arange(len(self))
+        return np.random.default_rng([seed, epoch]).permutation(len(self))
+
+    def close(self) -> None:
+        """Close the open shards."""
+        files, self._files = self._files, {}
+        for file in files.values():
+            os.close(file)
+
+    def _file(self, shard: str) -> int:
+        if self._owner != os.getpid():  # a fork shares descriptors; leave the parent's alone
+            self._files, self._owner = {}, os.getpid()
+        if shard not in self._files:
+            self._files[shard] = os.open(self.root / shard, os.O_RDONLY)
+        return self._files[shard]
+
+    def _image(self, number: int, name: str, meta: dict, kind: type, dimensions: int) -> np.ndarray:
+        entry = self.entries[number]
+        where = f"{self.root / entry.shard}: {entry.key}.{name}"
+        data = self.member(number, name)
+        width, height = image_size(data, where)
+        if width * height > PIXEL_LIMIT:
+            raise FormatError(f"{where}: {width}x{height} pixels, over the limit {PIXEL_LIMIT}")
+        if (width, height) != (meta.get("width"), meta.get("height")):
+            raise FormatError(
+                f"{where}: {width}x{height} pixels, expected the meta's"
+                f" {meta.get('width')}x{meta.get('height')}; rerun 'express50 pack'"
+            )
+        image = decode_image(data, where)
+        if image.dtype != kind or image.ndim != dimensions:
+            raise FormatError(f"{where}: {image.dtype} {image.shape}, expected {np.dtype(kind)}")
+        return image
+
+
+def image_size(data: bytes, where: str) -> tuple[int, int]:
+    """Width and height in a PNG's or JPEG's header, before any pixel is decoded.
+
+    Raises:
+        FormatError: the bytes are neither.
+
+    Source: PNG 1.2, 11.2.2 (IHDR); ITU-T T.81, B.2.2 (frame header).
+    """
+    if data[:8] == b"\x89PNG\r\n\x1a\n" and len(data) >= 24:
+        return struct.unpack(">II", data[16:24])
+    position = 2 if data[:2] == b"\xff\xd8" else len(data)
+    while position + 9 < len(data) and data[position] == 0xFF:
+        marker, length = data[position + 1], int.from_bytes(data[position + 2 : position + 4])
+        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
+            height, width = struct.unpack(">HH", data[position + 5 : position + 9])
+            return width, height
+        position += 2 + length
+    raise FormatError(f"{where}: {len(data)} bytes are no PNG or JPEG image")
+
+
+def read_entries(root: Path) -> tuple[Entry, ...]:
+    """Check and read ``index.json``.
+
+    Raises:
+        FormatError: it is missing or malformed, a shard's name would leave the folder, or a
+            member lies outside its shard.
+    """
+    path = root / "index.json"
+    try:
+        table = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise FormatError(f"{path}: no such index; name the folder that 'pack' wrote") from None
+    except ValueError as error:
+        raise FormatError(f"{path}: not JSON ({error}); rerun 'express50 pack'") from None
+    if not isinstance(table, dict) or table.get("schema") != SCHEMA:
+        got = table.get("schema") if isinstance(table, dict) else type(table).__name__
+        raise FormatError(f"{path}: schema {got!r}, expected {SCHEMA!r}")
+    entries: list[Entry] = []
+    try:
+        for shard in table["shards"]:
+            entries += _shard_entries(root, shard)
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise FormatError(
+            f"{path}: malformed ({type(error).__name__}: {error}); rerun 'express50 pack'"
+        ) from None
+    if len({entry.key for entry in entries}) != len(entries):
+        raise FormatError(f"{path}: a key appears twice; rerun 'express50 pack'")
+    return tuple(entries)
+
+
+def _shard_entries(root: Path, shard: dict) -> Iterator[Entry]:
+    name = str(shard["file"])
+    if not SHARD_NAME.fullmatch(name):
+        raise FormatError(f"{root}: shard name {name!r}, expected one like train-000000.tar")
+    path = root / name
+    size = path.stat().st_size if path.is_file() else -1
+    if size != shard["bytes"]:
+        got = "is missing" if size < 0 else f"has {size} bytes"
+        raise FormatError(f"{path}: {got}, expected {shard['bytes']}; copy the shard again")
+    for row in shard["samples"]:
+        members = {str(k): (int(a), int(b), int(c)) for k, (a, b, c) in row["members"].items()}
+        if any(a < 0 or b < 0 or a + b > size for a, b, _ in members.values()):
+            raise FormatError(
+                f"{path}: {row['key']} lies outside the shard; rerun 'express50 pack'"
+            )
+        if not KEY.fullmatch(row["key"]):
+            raise FormatError(f"{path}: key {row['key']!r}, expected letters, digits, _ and -")
+        yield Entry(
+            row["key"], row["subject"], row["expression"], row["camera"], shard["split"], name,
+            members,
+        )  # fmt: skip
