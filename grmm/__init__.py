@@ -1,0 +1,1 @@
+"""GRMM: a Gaussian residual morphable head model, trained on packed shards."""

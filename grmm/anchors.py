@@ -1,0 +1,155 @@
+"""Where Gaussians sit: the head's UV map rasterised once into (face, barycentrics) per texel.
+
+Texels that no triangle covers have no surface, so they get no Gaussian (the paper counts all
+N_g^2 of them; the survey's point 19 and ASH's non_empty_idx are the precedent for dropping them).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from express50.errors import HeadModelError
+from express50.head.model import HeadModel
+
+NEEDLE_AREA = 1e-14  # of a UV or 3D triangle; below it no direction on it is trustworthy
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Anchors:
+    """N covered texels of an n_g x n_g map, in row-major order; row 0 is the top (v = 1).
+
+    Attributes:
+        n_g: side of the map.
+        texels: (N,) flat index row * n_g + column.
+        faces: (N,) face under the texel's centre.
+        barycentrics: (N, 3) of the centre, non-negative, rows sum to 1.
+        overlaps: texels claimed by more than one face (the lowest face index got them).
+    """
+
+    n_g: int
+    texels: Tensor
+    faces: Tensor
+    barycentrics: Tensor
+    overlaps: int
+
+    def budget(self) -> str:
+        """One line that says how many Gaussians the scene gets, and how many it does not need."""
+        total = self.n_g * self.n_g
+        count = len(self.texels)
+        return (
+            f"{count} Gaussians of {total} texels ({100 * count / total:.0f} % covered, "
+            f"{self.overlaps} overlapping)"
+        )
+
+
+def make_anchors(head: HeadModel, n_g: int) -> Anchors:
+    """Rasterise the UV map of a head at the centres of n_g x n_g texels.
+
+    Raises:
+        HeadModelError: no triangle covers any texel's centre.
+    """
+    corners = head.uv.double()[head.uv_faces].cpu()  # (F, 3, 2)
+    grid = torch.stack([corners[..., 0] * n_g, (1 - corners[..., 1]) * n_g], -1)
+    face, column, row = _candidate_texels(grid, n_g)
+    centre = torch.stack([column, row], -1).double() + 0.5
+    weights = _barycentrics(grid[face], centre)
+    inside = (weights >= 0).all(1)
+    face, weights = face[inside], weights[inside]
+    texel = (row * n_g + column)[inside]
+    # A stable sort keeps faces in ascending order within a texel: the lowest index wins.
+    order = torch.argsort(texel, stable=True)
+    texel, face, weights = texel[order], face[order], weights[order]
+    first = torch.ones_like(texel, dtype=torch.bool)
+    first[1:] = texel[1:] != texel[:-1]
+    if not bool(first.any()):
+        raise HeadModelError(
+            f"head model {head.name!r}: no triangle of its UV map covers a texel's centre at "
+            f"n_g = {n_g}; expected UV coordinates in [0, 1]. Raise model.n_g or check the UV map"
+        )
+    # Texels on a shared edge belong to both neighbours; only strictly inner ones are overlaps.
+    strict = (weights > 1e-9).all(1)
+    claims = torch.bincount(texel[strict], minlength=n_g * n_g)
+    return Anchors(
+        n_g=n_g,
+        texels=texel[first],
+        faces=face[first],
+        barycentrics=weights[first].float(),
+        overlaps=int((claims > 1).sum()),
+    )
+
+
+def _candidate_texels(grid: Tensor, n_g: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Face, column and row of every texel whose centre lies in a triangle's bounding box."""
+    low = torch.ceil(grid.amin(1) - 0.5).clamp(0, n_g).long()  # (F, 2) as (column, row)
+    high = torch.floor(grid.amax(1) - 0.5).clamp(-1, n_g - 1).long()
+    size = (high - low + 1).clamp_min(0)
+    count = size[:, 0] * size[:, 1]
+    face = torch.repeat_interleave(torch.arange(len(grid)), count)
+    offset = torch.arange(len(face)) - (count.cumsum(0) - count)[face]
+    width = size[face, 0]
+    return face, low[face, 0] + offset % width, low[face, 1] + offset // width
+
+
+def _barycentrics(corners: Tensor, points: Tensor) -> Tensor:
+    """Barycentrics (M, 3) of points (M, 2) in triangles (M, 3, 2); -1 where a triangle has no area."""
+    a, b, c = corners.unbind(1)
+    ab, ac, ap = b - a, c - a, points - a
+    area = ab[:, 0] * ac[:, 1] - ab[:, 1] * ac[:, 0]
+    flat = area.abs() < NEEDLE_AREA
+    safe = torch.where(flat, torch.ones_like(area), area)
+    v = (ap[:, 0] * ac[:, 1] - ap[:, 1] * ac[:, 0]) / safe
+    w = (ab[:, 0] * ap[:, 1] - ab[:, 1] * ap[:, 0]) / safe
+    weights = torch.stack([1 - v - w, v, w], 1)
+    return torch.where(flat[:, None], torch.full_like(weights, -1.0), weights)
+
+
+def uv_gradients(head: HeadModel) -> Tensor:
+    """(F, 2, 2) matrices G with [dP/du dP/dv] = [P1 - P0, P2 - P0] @ G; zero where UV area is none."""
+    corners = head.uv.double()[head.uv_faces]
+    edges = torch.stack([corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]], -1)
+    determinant = torch.linalg.det(edges)
+    flat = determinant.abs() < NEEDLE_AREA
+    eye = torch.eye(2, dtype=edges.dtype, device=edges.device)
+    inverse = torch.linalg.inv(torch.where(flat[:, None, None], eye, edges))
+    return torch.where(flat[:, None, None], 0.0, inverse).to(head.dtype)
+
+
+def tangent_frames(vertices: Tensor, faces: Tensor, gradients: Tensor) -> tuple[Tensor, Tensor]:
+    """Right-handed frames of triangles and how far a unit of UV reaches along them.
+
+    Args:
+        vertices: (V, 3) metres.
+        faces: (F, 3).
+        gradients: (F, 2, 2) from `uv_gradients`.
+
+    Returns:
+        (F, 3, 3) rotations, columns = tangent (along dP/du), bitangent, normal; (F, 2) metres a
+        unit of UV along tangent and bitangent. A triangle without area gets the identity and 0.
+
+    Source: the tangent basis of TexAvatars and GaussianAvatars; the bitangent's reach is the
+    area a unit of UV area covers over the tangent's, so that sheared charts keep their area.
+    """
+    a, b, c = (vertices[faces[:, corner]] for corner in range(3))
+    edges = torch.stack([b - a, c - a], -1)  # (F, 3, 2)
+    along = edges @ gradients
+    tangent, cross = along[..., 0], torch.linalg.cross(edges[..., 0], edges[..., 1])
+    reach_u, area = (
+        tangent.norm(dim=1),
+        torch.linalg.cross(along[..., 0], along[..., 1]).norm(dim=1),
+    )
+    good = (reach_u > 1e-9) & (cross.norm(dim=1) > NEEDLE_AREA)
+    normal = torch.nn.functional.normalize(cross, dim=1, eps=1e-30)
+    tangent = torch.nn.functional.normalize(tangent, dim=1, eps=1e-30)
+    frame = torch.stack([tangent, torch.linalg.cross(normal, tangent), normal], -1)
+    eye = torch.eye(3, dtype=vertices.dtype, device=vertices.device)
+    frame = torch.where(good[:, None, None], frame, eye)
+    reach = torch.stack([reach_u, area / reach_u.clamp_min(1e-9)], 1)
+    return frame, torch.where(good[:, None], reach, 0.0)
+
+
+def interpolate(values: Tensor, faces: Tensor, anchors_faces: Tensor, weights: Tensor) -> Tensor:
+    """Barycentric interpolation (N, C) of vertex values (V, C) at anchors."""
+    return (values[faces[anchors_faces]] * weights[..., None]).sum(1)

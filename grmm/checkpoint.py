@@ -1,0 +1,183 @@
+"""Checkpoints: one file that holds the model, its configuration and the whole state of the loop.
+
+Written whole or not at all, read with ``weights_only``: nothing in a checkpoint is executed.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from pickle import UnpicklingError
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from express50.errors import FormatError
+from express50.head.load import load_head
+from express50.head.model import HeadModel
+from express50.publish import write_bytes
+from grmm.config import Config, as_tables, from_tables
+from grmm.data import HeadViews, Tracked, pose_state
+from grmm.model import GRMM, HeadState, View
+
+FORMAT = "grmm.checkpoint/1"
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Gallery:
+    """Tracked frames and cameras of the training set, so that a checkpoint renders on its own.
+
+    Attributes:
+        frames: (subject, expression) -> parameters.
+        cameras: camera id -> its view of the first frame it took.
+    """
+
+    frames: dict[tuple[str, str], Tracked]
+    cameras: dict[str, View]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Loaded:
+    """A checkpoint ready to use; ``loop`` and ``optimizer`` serve `train` alone."""
+
+    config: Config
+    head_spec: str
+    head: HeadModel
+    model: GRMM
+    gallery: Gallery
+    optimizer: dict[str, Any]
+    loop: dict[str, Any]
+
+    def state(self, subject: str, expression: str) -> HeadState:
+        """Tracked head of a training frame.
+
+        Raises:
+            FormatError: the training set had no such frame.
+        """
+        if (subject, expression) not in self.gallery.frames:
+            known = ", ".join(f"{s}/{e}" for s, e in list(self.gallery.frames)[:8])
+            raise FormatError(
+                f"the checkpoint knows no frame {subject}/{expression}; expected one such as {known}"
+            )
+        return pose_state(self.head, self.gallery.frames[subject, expression])
+
+
+def collect_gallery(views: HeadViews, indices: Sequence[int]) -> Gallery:
+    """Parameters of every frame, and one view of every camera, among the samples ``indices``."""
+    frames: dict[tuple[str, str], Tracked] = {}
+    cameras: dict[str, View] = {}
+    for index in indices:
+        key = views.keys[index]
+        if (key.subject, key.expression) in frames and key.camera in cameras:
+            continue
+        sample = views.sample(index)
+        frames.setdefault((key.subject, key.expression), sample.tracked)
+        height, width = sample.alpha.shape
+        cameras.setdefault(key.camera, views.view_of(sample, width, height))
+    return Gallery(frames=frames, cameras=cameras)
+
+
+def save_checkpoint(
+    path: Path,
+    *,
+    model: GRMM,
+    config: Config,
+    head_spec: str,
+    gallery: Gallery,
+    optimizer: dict[str, Any] | None = None,
+    loop: dict[str, Any] | None = None,
+) -> None:
+    """Write a checkpoint in one step; a former one stays until the new one is whole."""
+    content = {
+        "format": FORMAT,
+        "config": as_tables(config),
+        "head": head_spec,
+        "subjects": list(model.subjects),
+        "expressions": list(model.expressions),
+        "model": model.state_dict(),
+        "frames": [
+            {"subject": s, "expression_id": e, "parameters": _tensors(asdict(tracked))}
+            for (s, e), tracked in gallery.frames.items()
+        ],
+        "cameras": {
+            name: {
+                "K": view.K.cpu(),
+                "cam_from_head": view.cam_from_head.cpu(),
+                "width": view.width,
+                "height": view.height,
+            }
+            for name, view in gallery.cameras.items()
+        },
+        "optimizer": optimizer or {},
+        "loop": loop or {},
+    }
+    buffer = io.BytesIO()
+    torch.save(content, buffer)
+    write_bytes(path, buffer.getvalue())
+
+
+def load_checkpoint(path: Path, device: torch.device | str = "cpu") -> Loaded:
+    """Read a checkpoint and build its model.
+
+    Raises:
+        FormatError: no such file, or not a checkpoint of this format.
+    """
+    content = _read(path)
+    config = from_tables(content["config"])
+    head = load_head(content["head"]).to(device)
+    model = GRMM(config.model, head, content["subjects"], content["expressions"]).to(device)
+    try:
+        model.load_state_dict(content["model"])
+    except RuntimeError as error:
+        raise FormatError(
+            f"{path}: the weights do not fit head model {content['head']!r} as it is here now; "
+            "use the version that the model was trained with"
+        ) from error
+    return Loaded(
+        config=config,
+        head_spec=content["head"],
+        head=head,
+        model=model,
+        gallery=Gallery(
+            frames={
+                (frame["subject"], frame["expression_id"]): Tracked(**_arrays(frame["parameters"]))
+                for frame in content["frames"]
+            },
+            cameras={
+                name: View(
+                    K=camera["K"].to(device),
+                    cam_from_head=camera["cam_from_head"].to(device),
+                    width=camera["width"],
+                    height=camera["height"],
+                )
+                for name, camera in content["cameras"].items()
+            },
+        ),
+        optimizer=content["optimizer"],
+        loop=content["loop"],
+    )
+
+
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        content = torch.load(path, map_location="cpu", weights_only=True)
+    except FileNotFoundError as error:
+        raise FormatError(f"{path}: no such checkpoint; 'grmm train' writes one") from error
+    except (UnpicklingError, RuntimeError, EOFError) as error:
+        raise FormatError(f"{path}: not a checkpoint that 'grmm train' wrote") from error
+    found = content.get("format") if isinstance(content, dict) else None
+    if found != FORMAT:
+        raise FormatError(f"{path}: format is {found!r}, expected {FORMAT!r}")
+    return content
+
+
+def _tensors(arrays: dict[str, np.ndarray]) -> dict[str, Tensor]:
+    return {name: torch.from_numpy(np.ascontiguousarray(a)) for name, a in arrays.items()}
+
+
+def _arrays(tensors: dict[str, Tensor]) -> dict[str, np.ndarray]:
+    return {name: tensor.numpy() for name, tensor in tensors.items()}

@@ -1,0 +1,344 @@
+"""Training data: packed samples -> tensors in canonical head space.
+
+Geometry is not stored with the samples: the tracked mesh v_rec is posed from head-model
+parameters once per (subject, expression) and kept. The order of samples is a pure function of
+(seed, epoch, position), so that a resumed run goes on exactly where it stopped.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import OrderedDict
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from express50.errors import FormatError, TrainError
+from express50.head.model import HeadModel, pose
+from grmm.model import HeadState, View
+
+WINDOW_STEP = 32  # pixels; windows have sides of whole steps
+
+
+@dataclass(frozen=True, kw_only=True)
+class Key:
+    """Ids of one sample."""
+
+    subject: str
+    expression: str
+    camera: str
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Tracked:
+    """Head-model parameters of one frame; world = R @ head + t.
+
+    Attributes:
+        shape: (S,).
+        expression: (X,).
+        neck: (3,) axis-angle, radians.
+        jaw: (3,) axis-angle, radians.
+        eyes: (6,) axis-angles, left then right, radians.
+        R: (3, 3).
+        t: (3,) metres.
+    """
+
+    shape: np.ndarray
+    expression: np.ndarray
+    neck: np.ndarray
+    jaw: np.ndarray
+    eyes: np.ndarray
+    R: np.ndarray
+    t: np.ndarray
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Sample:
+    """One decoded view as the shards hold it.
+
+    Attributes:
+        image: (H, W, 3) uint8 sRGB.
+        alpha: (H, W) uint8.
+        depth: (H, W) float32 camera z, metres; 0 where unknown. None: no depth.
+        K: (3, 3) pixels, corner origin.
+        cam_from_world: (4, 4).
+        tracked: head-model parameters.
+    """
+
+    image: np.ndarray
+    alpha: np.ndarray
+    depth: np.ndarray | None
+    K: np.ndarray
+    cam_from_world: np.ndarray
+    tracked: Tracked
+
+
+class Source(Protocol):
+    """Where samples come from: the shard reader, or a list in tests."""
+
+    keys: Sequence[Key]
+    head: str
+
+    def read(self, index: int) -> Sample:
+        """Decode one sample."""
+        ...
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Item:
+    """One training view.
+
+    Attributes:
+        key: ids.
+        state: tracked head.
+        view: camera in head space.
+        target: (3, H, W) footage composited on the background.
+        mask: (H, W) bool, footage alpha over 0.5.
+        depth: (H, W) metres.
+        depth_valid: (H, W) bool.
+    """
+
+    key: Key
+    state: HeadState
+    view: View
+    target: Tensor
+    mask: Tensor
+    depth: Tensor
+    depth_valid: Tensor
+
+
+class HeadViews:
+    """Samples of a source as items, with a bounded cache of decoded samples."""
+
+    def __init__(
+        self,
+        source: Source,
+        head: HeadModel,
+        *,
+        background: float = 0.0,
+        cache_mb: int = 512,
+        device: torch.device | str = "cpu",
+    ) -> None:
+        """Wrap a source whose parameters belong to ``head``."""
+        self.source, self.head, self.device = source, head.to(device), torch.device(device)
+        self.background = background
+        self._capacity = cache_mb * 2**20
+        self._cache: OrderedDict[int, Sample] = OrderedDict()
+        self._cached_bytes = 0
+        self._states: dict[tuple[str, str], HeadState] = {}
+
+    def __len__(self) -> int:
+        """Number of samples."""
+        return len(self.source.keys)
+
+    @property
+    def keys(self) -> Sequence[Key]:
+        """Ids of all samples."""
+        return self.source.keys
+
+    def item(self, index: int, margin_px: int = -1) -> Item:
+        """One sample as tensors on the device.
+
+        With ``margin_px`` >= 0 only the window around head and matte, that much larger on each
+        side: outside it, footage and rendering are both the background.
+        """
+        key, sample = self.keys[index], self.sample(index)
+        state = self.state(index)
+        height, width = sample.alpha.shape
+        view = self.view_of(sample, width, height)
+        rows, columns = slice(0, height), slice(0, width)
+        if margin_px >= 0:
+            rows, columns = head_window(state.vertices, view, sample.alpha, margin_px)
+            view = crop_view(view, rows, columns)
+        image, alpha = sample.image[rows, columns], sample.alpha[rows, columns]
+        depth = np.zeros(alpha.shape, np.float32) if sample.depth is None else sample.depth
+        known = self._tensor(depth if sample.depth is None else depth[rows, columns])
+        weight = (self._tensor(alpha) / 255)[..., None]
+        target = self._tensor(image) / 255 * weight + self.background * (1 - weight)
+        return Item(
+            key=key,
+            state=state,
+            view=view,
+            target=target.permute(2, 0, 1).contiguous(),
+            mask=weight[..., 0] > 0.5,
+            depth=known,
+            depth_valid=known > 0,
+        )
+
+    def sample(self, index: int) -> Sample:
+        """The decoded sample, from memory if it is there."""
+        if index in self._cache:
+            self._cache.move_to_end(index)
+            return self._cache[index]
+        sample = self.source.read(index)
+        self._check(sample, self.keys[index])
+        self._cache[index] = sample
+        self._cached_bytes += _bytes(sample)
+        while self._cached_bytes > self._capacity and len(self._cache) > 1:
+            _, old = self._cache.popitem(last=False)
+            self._cached_bytes -= _bytes(old)
+        return sample
+
+    def state(self, index: int) -> HeadState:
+        """Tracked head of a sample, posed once per (subject, expression)."""
+        key = self.keys[index]
+        if (key.subject, key.expression) not in self._states:
+            tracked = self.sample(index).tracked
+            self._states[key.subject, key.expression] = pose_state(self.head, tracked)
+        return self._states[key.subject, key.expression]
+
+    def view_of(self, sample: Sample, width: int, height: int) -> View:
+        """Camera of a sample in head space, float64: subjects may stand far from the origin."""
+        head_to_world = np.eye(4)
+        head_to_world[:3, :3], head_to_world[:3, 3] = sample.tracked.R, sample.tracked.t
+        camera = sample.cam_from_world @ head_to_world
+        return View(
+            K=torch.as_tensor(sample.K, dtype=torch.float64, device=self.device),
+            cam_from_head=torch.as_tensor(camera, dtype=torch.float64, device=self.device),
+            width=width,
+            height=height,
+        )
+
+    def _tensor(self, array: np.ndarray) -> Tensor:
+        return torch.from_numpy(np.ascontiguousarray(array)).to(self.device, self.head.dtype)
+
+    def _check(self, sample: Sample, key: Key) -> None:
+        where = f"{key.subject}/{key.expression}/{key.camera}"
+        size = sample.image.shape[:2]
+        for name, array in (("alpha", sample.alpha), ("depth", sample.depth)):
+            if array is not None and array.shape != size:
+                raise FormatError(
+                    f"{where}: {name} is {array.shape}, expected the image's size {size}; "
+                    "pack the dataset again"
+                )
+        counts = {
+            "shape": self.head.shape_dirs.shape[2],
+            "expression": len(self.head.expression_names),
+        }
+        for name, count in counts.items():
+            got = len(getattr(sample.tracked, name))
+            if got > count:
+                raise FormatError(
+                    f"{where}: {got} {name} coefficients, head model {self.head.name!r} has {count}; "
+                    "name the head model that the dataset was tracked with"
+                )
+
+
+def pose_state(head: HeadModel, tracked: Tracked) -> HeadState:
+    """Rebuild the tracked mesh in head space from parameters."""
+
+    def row(values: np.ndarray) -> Tensor:
+        return torch.as_tensor(values, dtype=head.dtype, device=head.device)[None]
+
+    shape, expression = row(tracked.shape), row(tracked.expression)
+    neck, jaw = row(tracked.neck), row(tracked.jaw)
+    with torch.no_grad():
+        vertices = pose(head, shape, expression, neck, jaw, row(tracked.eyes))[0]
+    missing = len(head.expression_names) - expression.shape[1]
+    return HeadState(
+        vertices=vertices,
+        shape=shape[0],
+        expression=torch.nn.functional.pad(expression[0], (0, missing)),
+        neck=neck[0],
+        jaw=jaw[0],
+    )
+
+
+def head_window(
+    vertices: Tensor, view: View, alpha: np.ndarray, margin_px: int
+) -> tuple[slice, slice]:
+    """Rows and columns that hold the projected mesh (V, 3) and the matte (H, W), with a margin.
+
+    Sizes are rounded up to WINDOW_STEP where the image allows, so that few sizes occur: every new
+    size costs convolutions their set-up.
+    """
+    camera, K = view.cam_from_head.to(vertices.dtype), view.K.to(vertices.dtype)
+    points = vertices @ camera[:3, :3].T + camera[:3, 3]
+    front = points[points[:, 2] > 1e-3]
+    pixels = (front[:, :2] / front[:, 2:]) @ K[:2, :2].T + K[:2, 2]  # (M, 2) as (x, y)
+    spans = []
+    for axis, size in ((1, view.height), (0, view.width)):
+        matte = np.flatnonzero((alpha > 0).any(axis=axis))
+        ends = [*matte[[0, -1]].tolist()] if len(matte) else []
+        if len(pixels):
+            ends += [float(pixels[:, axis].min()), float(pixels[:, axis].max())]
+        low, high = (min(ends), max(ends)) if ends else (0, size)
+        spans.append(_span(low - margin_px, high + 1 + margin_px, size))
+    return spans[0], spans[1]
+
+
+def _span(low: float, high: float, size: int) -> slice:
+    """Whole steps around [low, high) that lie within [0, size); the whole axis if none is left."""
+    low, high = max(0.0, low), min(float(size), high)
+    if high <= low:
+        return slice(0, size)
+    length = min(size, math.ceil((high - low) / WINDOW_STEP) * WINDOW_STEP)
+    start = min(max(0, round((low + high - length) / 2)), size - length)
+    return slice(start, start + length)
+
+
+def crop_view(view: View, rows: slice, columns: slice) -> View:
+    """The same camera, seeing only some rows and columns."""
+    K = view.K.clone()
+    K[0, 2] -= columns.start
+    K[1, 2] -= rows.start
+    return View(
+        K=K,
+        cam_from_head=view.cam_from_head,
+        width=columns.stop - columns.start,
+        height=rows.stop - rows.start,
+    )
+
+
+def _bytes(sample: Sample) -> int:
+    depth = 0 if sample.depth is None else sample.depth.nbytes
+    return sample.image.nbytes + sample.alpha.nbytes + depth
+
+
+class Shuffle:
+    """Endless shuffled order over ``indices``; its state is (epoch, position)."""
+
+    def __init__(self, indices: Sequence[int], seed: int, rank: int = 0, world: int = 1) -> None:
+        """Rank ``rank`` of ``world`` processes takes every world-th entry of the common order."""
+        if not indices:
+            raise TrainError("no samples to train on; check the split and the held-out cameras")
+        self.indices, self.seed, self.rank, self.world = list(indices), seed, rank, world
+        self.epoch, self.position = 0, 0
+        self._order = self._permutation()
+
+    def _permutation(self) -> np.ndarray:
+        return np.random.default_rng([self.seed, self.epoch]).permutation(self.indices)
+
+    def next(self) -> int:
+        """Index of this rank's next sample."""
+        taken = None
+        for rank in range(self.world):
+            if self.position == len(self._order):
+                self.epoch, self.position = self.epoch + 1, 0
+                self._order = self._permutation()
+            if rank == self.rank:
+                taken = int(self._order[self.position])
+            self.position += 1
+        assert taken is not None
+        return taken
+
+    def state(self) -> dict[str, int]:
+        """What `restore` needs."""
+        return {"epoch": self.epoch, "position": self.position}
+
+    def restore(self, state: dict[str, int]) -> None:
+        """Go on after the sample that was taken last when ``state`` was saved."""
+        self.epoch, self.position = state["epoch"], state["position"]
+        self._order = self._permutation()
+
+
+def spread(indices: Sequence[int], count: int) -> list[int]:
+    """At most ``count`` of the indices, evenly chosen (first and last included)."""
+    if len(indices) <= count:
+        return list(indices)
+    steps = np.linspace(0, len(indices) - 1, count).round().astype(int)
+    return [indices[i] for i in steps]

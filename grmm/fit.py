@@ -1,0 +1,332 @@
+"""Fit an unseen identity by inverse rendering, in the paper's two stages.
+
+Stage 1 inverts the codes with all networks fixed, starting from the mean code. Stage 2 fixes the
+codes and fine-tunes the decoders, held near the pretrained model by the locality loss. What the
+paper leaves silent (iterations, rates, cameras of the locality loss) follows the survey's point 22.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from express50.errors import TrainError
+from express50.publish import write_json
+from grmm import losses
+from grmm.checkpoint import Gallery, Loaded, collect_gallery, save_checkpoint
+from grmm.config import FitConfig, LossConfig
+from grmm.data import HeadViews, Item, Shuffle, Tracked, pose_state
+from grmm.evaluate import Render, evaluate, mean
+from grmm.metrics import UNAVAILABLE
+from grmm.model import GRMM, HeadState, Rendering, View
+from grmm.render import comparison_sheet, interpolate_tracked
+from grmm.train import log
+from grmm.warm_start import LOGIT_LIMIT, project_texture
+
+
+@dataclass(kw_only=True)
+class Fit:
+    """What a fit works on: a copy of the model to tune, the frozen one, and the codes sought."""
+
+    loaded: Loaded
+    model: GRMM
+    frozen: GRMM
+    views: HeadViews
+    given: list[int]
+    z_id: Tensor
+    z_exp: dict[str, Tensor]
+    weights: LossConfig
+    settings: FitConfig
+
+
+def fit(
+    loaded: Loaded, views: HeadViews, given: Sequence[int], held_out: Sequence[int], out: Path
+) -> dict[str, object]:
+    """Fit one subject from the views ``given``; report on them and on ``held_out``.
+
+    Every expression among the views gets its own z_exp; z_id is common. Writes OUT/checkpoint.pt
+    (the tuned model, whose only subject is the fitted one), OUT/metrics.json and OUT/*.jpg.
+
+    Raises:
+        TrainError: no views, or views of several subjects.
+    """
+    state = start(loaded, views, list(given))
+    settings = loaded.config.fit
+    torch.manual_seed(settings.seed)
+    render = fitted_render(state)
+    held_out = [i for i in held_out if views.keys[i].expression in state.z_exp]
+    stages = {"mean_code": _scores(state, held_out, render)}
+    began = time.perf_counter()
+    first = invert_codes(state, deadline(settings, began, settings.stage1_share))
+    stages["stage1"] = _scores(state, held_out, render)
+    if settings.texture_warm_start and settings.stage2_iterations:
+        start_texture(state)
+    second = tune_decoders(state, deadline(settings, began, 1.0))
+    stages["stage2"] = _scores(state, held_out, render)
+    metrics: dict[str, object] = {
+        "subject": views.keys[state.given[0]].subject,
+        "expressions": sorted(state.z_exp),
+        "cameras": sorted({views.keys[i].camera for i in state.given}),
+        "held_out_cameras": sorted({views.keys[i].camera for i in held_out}),
+        "psnr_db": stages["stage2"]["psnr_held_out_db"] or stages["stage2"]["psnr_given_db"],
+        "psnr_is_of": "held-out views" if held_out else "given views: all were given",
+        "stages": stages,
+        "stage1_iterations": first,
+        "stage2_iterations": second,
+        "seconds": round(time.perf_counter() - began, 2),
+    }
+    metrics |= UNAVAILABLE
+    save_fit(state, out)
+    comparison_sheet(out / "given.jpg", views, state.given[:6], render)
+    if held_out:
+        comparison_sheet(out / "held_out.jpg", views, list(held_out)[:6], render)
+    write_json(out / "metrics.json", metrics)
+    return metrics
+
+
+def start(loaded: Loaded, views: HeadViews, given: list[int]) -> Fit:
+    """Mean codes and a frozen copy of the model; codes of known expressions start from theirs."""
+    subjects = sorted({views.keys[i].subject for i in given})
+    if len(subjects) != 1:
+        raise TrainError(
+            f"got views of {len(subjects)} subjects ({', '.join(subjects) or 'none'}), "
+            "expected one; check --subject, --expression and --cameras"
+        )
+    model = loaded.model
+    z_id = model.z_id.detach().mean(0)
+    z_exp = {}
+    for expression in sorted({views.keys[i].expression for i in given}):
+        if expression in model.expressions:
+            z_exp[expression] = model.z_exp.detach()[model.expressions.index(expression)].clone()
+        else:
+            z_exp[expression] = model.z_exp.detach().mean(0)
+    frozen = copy.deepcopy(model).requires_grad_(False)
+    return Fit(
+        loaded=loaded,
+        model=copy.deepcopy(model),
+        frozen=frozen,
+        views=views,
+        given=given,
+        z_id=z_id,
+        z_exp=z_exp,
+        weights=loaded.config.loss,
+        settings=loaded.config.fit,
+    )
+
+
+def fitted_render(state: Fit) -> Render:
+    """How an item of the fitted subject is rendered."""
+
+    def render(item: Item) -> Rendering:
+        code = state.z_exp[item.key.expression]
+        return state.model.render(state.z_id, code, item.state, item.view, state.views.background)
+
+    return render
+
+
+def deadline(settings: FitConfig, began: float, share: float) -> Callable[[], bool]:
+    """A question whether this share of the time budget is used up."""
+    limit = began + share * settings.seconds if settings.seconds else math.inf
+    return lambda: time.perf_counter() >= limit
+
+
+def invert_codes(state: Fit, late: Callable[[], bool]) -> int:
+    """Stage 1: optimise z_id and z_exp; returns the iterations done."""
+    settings = state.settings
+    state.model.requires_grad_(False)
+    codes = [state.z_id, *state.z_exp.values()]
+    for code in codes:
+        code.requires_grad_(True)
+    optimizer = torch.optim.Adam(codes, lr=settings.stage1_lr)
+    for number, item in _items(state, settings.stage1_iterations, late):
+        share = number / settings.stage1_iterations
+        optimizer.param_groups[0]["lr"] = settings.stage1_lr * settings.stage1_final_lr**share
+        optimizer.zero_grad()
+        z_exp = state.z_exp[item.key.expression]
+        rendering = state.model.render(
+            state.z_id, z_exp, item.state, item.view, state.views.background
+        )
+        loss = _both(rendering, item.target, state.weights)
+        _finite(loss + settings.codes * losses.codes(state.z_id, z_exp), number, 1).backward()
+        optimizer.step()
+        done = number + 1
+    for code in codes:
+        code.requires_grad_(False)
+    return done if settings.stage1_iterations else 0
+
+
+def tune_decoders(state: Fit, late: Callable[[], bool]) -> int:
+    """Stage 2: fine-tune the decoders with the locality loss; returns the iterations done."""
+    settings = state.settings
+    optimizer = _decoder_optimizer(state)
+    rng = np.random.default_rng(settings.seed)
+    done = 0
+    for number, item in _items(state, settings.stage2_iterations, late):
+        optimizer.zero_grad()
+        z_exp = state.z_exp[item.key.expression]
+        rendering = state.model.render(
+            state.z_id, z_exp, item.state, item.view, state.views.background
+        )
+        loss = _both(rendering, item.target, state.weights)
+        if settings.locality and number % settings.locality_every == 0:
+            weight = settings.locality * settings.locality_every
+            loss = loss + weight * locality_loss(state, item, rng)
+        _finite(loss, number, 2).backward()
+        optimizer.step()
+        done = number + 1
+    state.model.requires_grad_(False)
+    return done
+
+
+def _items(state: Fit, iterations: int, late: Callable[[], bool]) -> Iterator[tuple[int, Item]]:
+    """Given views in shuffled order, until iterations or time are used up (at least one view)."""
+    shuffle = Shuffle(state.given, state.settings.seed)
+    for number in range(iterations):
+        if number > 0 and late():
+            return
+        margin = state.loaded.config.data.crop_margin_px
+        yield number, state.views.item(shuffle.next(), margin)
+
+
+def _decoder_optimizer(state: Fit) -> torch.optim.Optimizer:
+    """Adam over D_GRMM (and the refinement if asked): codes stay fixed."""
+    model, settings = state.model, state.settings
+    modules = [model.transform, model.opacity, model.colour]
+    texels = {id(p): p for ladder in modules for p in ladder.texel_parameters()}
+    if model.mesh is not None:
+        modules.append(model.mesh)
+    if settings.tune_refinement and model.refinement is not None:
+        modules.append(model.refinement)
+    rest = [p for module in modules for p in module.parameters() if id(p) not in texels]
+    for parameter in (*rest, *texels.values()):
+        parameter.requires_grad_(True)
+    lr = settings.stage2_lr
+    return torch.optim.Adam(
+        [
+            {"params": rest, "lr": lr},
+            {"params": list(texels.values()), "lr": lr * settings.stage2_texel_lr_scale},
+        ],
+        fused=True,
+    )
+
+
+def start_texture(state: Fit) -> None:
+    """Put the colours that the given views show into the bias, where they show any (FitConfig)."""
+    model = state.model
+    shown = []
+    for expression, z_exp in state.z_exp.items():
+        own = [i for i in state.given if state.views.keys[i].expression == expression]
+        shown.append(project_texture(model, state.views, own, state.z_id, z_exp))
+    weight = sum(w for _, w in shown)
+    colours = sum(w[:, None] * c for c, w in shown) / weight.clamp_min(1e-8)[:, None]
+    item = state.views.item(state.given[0])
+    with torch.no_grad():
+        now = model.appearance(state.z_id, item.state, item.view)[:, :3]
+        wanted = torch.logit(colours.clamp(LOGIT_LIMIT, 1 - LOGIT_LIMIT))
+        change = wanted - torch.logit(now.clamp(LOGIT_LIMIT, 1 - LOGIT_LIMIT))
+        # Texels seen at a slant are blurred: trust grows with the squared cosine.
+        trust = (weight / 0.25).clamp(0, 1)[:, None]
+        model.colour.bias.flatten(1)[:3, model.texels] += (trust * change).T
+
+
+def locality_loss(state: Fit, item: Item, rng: np.random.Generator) -> Tensor:
+    """L_rec between the tuned and the frozen model between a training identity and the subject.
+
+    Codes and coefficients are blended at a fixed t (weight of the subject), jaw and neck by SLERP
+    (paper, supplement); the mesh is posed again from the blend; the camera is a random one of the
+    training set; refined and rasterised images both count, as in L_rec's other uses.
+    """
+    frames = sorted(state.loaded.gallery.frames)
+    subject, expression = frames[int(rng.integers(len(frames)))]
+    cameras = state.loaded.gallery.cameras
+    view = cameras[sorted(cameras)[int(rng.integers(len(cameras)))]]
+    t = state.settings.locality_t
+    mine = state.views.sample(_index_of(state, item)).tracked
+    head_state, z_id, z_exp = blend(
+        state, (subject, expression), mine, state.z_exp[item.key.expression], t
+    )
+    tuned = state.model.render(z_id, z_exp, head_state, view, state.views.background)
+    with torch.no_grad():
+        before = state.frozen.render(z_id, z_exp, head_state, view, state.views.background)
+    loss = losses.reconstruction(tuned.rgb, before.rgb, state.weights)
+    if state.model.refinement is not None:
+        loss = loss + losses.reconstruction(tuned.image, before.image, state.weights)
+    return loss
+
+
+def blend(
+    state: Fit, frame: tuple[str, str], mine: Tracked, z_exp: Tensor, t: float
+) -> tuple[HeadState, Tensor, Tensor]:
+    """Parameters and codes between a training frame (t = 0) and the fitted subject (t = 1)."""
+    model, gallery = state.frozen, state.loaded.gallery
+    tracked = interpolate_tracked(gallery.frames[frame], mine, t)
+    subject, expression = model.subjects.index(frame[0]), model.expressions.index(frame[1])
+    return (
+        pose_state(state.views.head, tracked),
+        torch.lerp(model.z_id[subject], state.z_id, t),
+        torch.lerp(model.z_exp[expression], z_exp, t),
+    )
+
+
+def _index_of(state: Fit, item: Item) -> int:
+    return next(i for i in state.given if state.views.keys[i] == item.key)
+
+
+def _both(rendering: Rendering, target: Tensor, weights: LossConfig) -> Tensor:
+    """L_rec of the rasterised and, if there is one, the refined image."""
+    loss = losses.reconstruction(rendering.rgb, target, weights)
+    if rendering.image is not rendering.rgb:
+        loss = loss + losses.reconstruction(rendering.image, target, weights)
+    return loss
+
+
+def _finite(loss: Tensor, iteration: int, stage: int) -> Tensor:
+    if not bool(torch.isfinite(loss)):
+        raise TrainError(
+            f"fit, stage {stage}, iteration {iteration}: the objective is {float(loss.detach())}; "
+            f"expected a finite number. Lower fit.stage{stage}_lr or check the tracked parameters"
+        )
+    return loss
+
+
+def _scores(state: Fit, held_out: Sequence[int], render: Render) -> dict[str, float | None]:
+    given = evaluate(state.views, state.given[:12], render)
+    other = evaluate(state.views, list(held_out)[:12], render)
+    scores = {
+        "psnr_given_db": mean(given, "psnr_db"),
+        "psnr_held_out_db": mean(other, "psnr_db"),
+        "psnr_held_out_head_db": mean(other, "psnr_head_db"),
+        "ssim_held_out": mean(other, "ssim"),
+    }
+    log("fit: " + "  ".join(f"{k} {v}" for k, v in scores.items() if v is not None))
+    return scores
+
+
+def save_fit(state: Fit, out: Path) -> None:
+    """A checkpoint of the tuned model, in which the fitted subject is the only one."""
+    subject = state.views.keys[state.given[0]].subject
+    model = GRMM(state.model.config, state.views.head, [subject], list(state.z_exp))
+    content = state.model.state_dict()
+    content["z_id"] = state.z_id[None]
+    content["z_exp"] = torch.stack(list(state.z_exp.values()))
+    model.load_state_dict(content)
+    own = collect_gallery(state.views, state.given)
+    # Training cameras stay for rendering; the subject's own come first.
+    cameras: dict[str, View] = own.cameras | {
+        f"training_{name}": view for name, view in state.loaded.gallery.cameras.items()
+    }
+    save_checkpoint(
+        out / "checkpoint.pt",
+        model=model,
+        config=replace(state.loaded.config),
+        head_spec=state.loaded.head_spec,
+        gallery=Gallery(frames=own.frames, cameras=cameras),
+    )

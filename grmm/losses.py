@@ -1,0 +1,154 @@
+"""The terms of the objective (paper: Training and Losses), each in the unit its name states.
+
+All return 0-d tensors, are finite for equal and for constant images, and are 0 where there is
+nothing to compare.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import lru_cache
+
+import torch
+from torch import Tensor, nn
+
+from grmm.config import LossConfig
+from grmm.model import Rendering
+
+SSIM_WINDOW, SSIM_SIGMA = 11, 1.5
+SSIM_C1, SSIM_C2 = 0.01**2, 0.03**2
+
+Perceptual = Callable[[Tensor, Tensor], Tensor]
+
+
+def ssim(a: Tensor, b: Tensor) -> Tensor:
+    """Mean structural similarity of two images (C, H, W) with values in [0, 1].
+
+    Gaussian window 11 x 11, sigma 1.5, only where it lies inside the image; it shrinks to the
+    largest odd size that fits smaller images. Half precision is computed in float32.
+
+    Source: Wang et al. 2004; the window is separable, applied as two banded matrices.
+    """
+    return ssim_map(a, b).mean()
+
+
+def ssim_map(a: Tensor, b: Tensor) -> Tensor:
+    """SSIM per window (C, H - 10, W - 10); see `ssim`."""
+    _same_shape(a, b)
+    dtype = a.dtype if a.dtype in (torch.float32, torch.float64) else torch.float32
+    a, b = a.to(dtype), b.to(dtype)
+    rows, columns = (_band(n, dtype, a.device) for n in a.shape[1:])
+    stack = torch.stack([a, b, a * a, b * b, a * b])  # (5, C, H, W)
+    mean_a, mean_b, aa, bb, ab = rows @ (stack @ columns.T)
+    covariance = ab - mean_a * mean_b
+    variances = (aa - mean_a * mean_a) + (bb - mean_b * mean_b)
+    luminance = (2 * mean_a * mean_b + SSIM_C1) / (mean_a * mean_a + mean_b * mean_b + SSIM_C1)
+    return luminance * (2 * covariance + SSIM_C2) / (variances + SSIM_C2)
+
+
+@lru_cache(maxsize=32)
+def _band(size: int, dtype: torch.dtype, device: torch.device) -> Tensor:
+    """(size - window + 1, size) matrix that slides the 1D Gaussian window."""
+    window = min(SSIM_WINDOW, size - 1 + size % 2)
+    offset = torch.arange(window, dtype=torch.float64) - window // 2
+    weights = torch.exp(-0.5 * (offset / SSIM_SIGMA) ** 2)
+    weights = weights / weights.sum()
+    band = torch.zeros(size - window + 1, size, dtype=torch.float64)
+    for row in range(len(band)):
+        band[row, row : row + window] = weights
+    return band.to(dtype=dtype, device=device)
+
+
+def reconstruction(
+    image: Tensor, target: Tensor, config: LossConfig, perceptual: Perceptual | None = None
+) -> Tensor:
+    """L_rec: weighted L1, 1 - SSIM and, with weights at hand, perceptual distance of (3, H, W)."""
+    _same_shape(image, target)
+    loss = config.l1 * (image - target).abs().mean()
+    if config.ssim > 0:
+        loss = loss + config.ssim * (1 - ssim(image, target))
+    if perceptual is not None and config.perceptual > 0:
+        loss = loss + config.perceptual * perceptual(image, target)
+    return loss
+
+
+def depth_dm2(
+    depth: Tensor, alpha: Tensor, target: Tensor, valid: Tensor, erode_px: int = 2
+) -> Tensor:
+    """Mean squared depth error in decimetres squared over pixels where both depths mean something.
+
+    Args:
+        depth: (H, W) rendered camera z, metres.
+        alpha: (H, W) rendered; pixels over 0.5 count.
+        target: (H, W) camera z, metres.
+        valid: (H, W) bool, where the target is known.
+        erode_px: pixels next to the border of the mask that are left out.
+
+    In metres the term would vanish (5 mm -> 2.5e-5), in millimetres it would rule; survey point 11.
+    """
+    mask = valid & (alpha.detach() > 0.5)
+    if erode_px > 0:
+        outside = nn.functional.pad((~mask)[None, None].float(), [erode_px] * 4)
+        mask = mask & (nn.functional.max_pool2d(outside, 2 * erode_px + 1, 1)[0, 0] == 0)
+    if not bool(mask.any()):
+        return depth.sum() * 0.0
+    return (10.0 * (depth - target)[mask]).square().mean()
+
+
+def scale_mm(scales_mm: Tensor, low: float = 0.1, high: float = 10.0) -> Tensor:
+    """Keep scales (N, 3), millimetres, within [low, high]: 1 / s below, (s - high)^2 above.
+
+    Millimetres as in RGCA, whose constants these are: in metres 1 / s of a 1 mm Gaussian is 1000
+    (survey point 2). The reciprocal stops at 1e-7, as the paper has it.
+    """
+    small = scales_mm < low
+    below = 1.0 / torch.where(small, scales_mm.clamp_min(1e-7), torch.ones_like(scales_mm))
+    above = (scales_mm - high).clamp_min(0).square()
+    return torch.where(small, below, above).mean()
+
+
+def mesh_edges(faces: Tensor) -> Tensor:
+    """(E, 2) directed edges, each once, both directions, of faces (F, 3)."""
+    pairs = torch.cat([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    return torch.unique(torch.cat([pairs, pairs.flip(1)]), dim=0)
+
+
+def laplacian_mm2(displacement: Tensor, edges: Tensor) -> Tensor:
+    """Mean squared uniform Laplacian of vertex displacements (V, 3), metres in, mm^2 out.
+
+    The displacement, not the mesh, is kept smooth, so that the head's own curvature costs nothing
+    (GaussianAvatars; survey point 12). A vertex without edges costs nothing.
+    """
+    field = 1e3 * displacement
+    source, target = edges.unbind(1)
+    degree = torch.bincount(source, minlength=len(field))[:, None]
+    around = torch.zeros_like(field).index_add(0, source, field[target]) / degree.clamp_min(1)
+    return torch.where(degree > 0, around - field, 0.0).square().sum(1).mean()
+
+
+def codes(z_id: Tensor, z_exp: Tensor) -> Tensor:
+    """Sum of squares of both codes (DeepSDF's form; survey point 13)."""
+    return z_id.square().sum() + z_exp.square().sum()
+
+
+def regularisers(
+    rendering: Rendering,
+    z_id: Tensor,
+    z_exp: Tensor,
+    edges: Tensor,
+    bounds_mm: tuple[float, float],
+    config: LossConfig,
+) -> dict[str, Tensor]:
+    """Weighted terms of L_reg by name."""
+    return {
+        "scale": config.scale * scale_mm(rendering.gaussians.scales_mm, *bounds_mm),
+        "laplacian": config.laplacian * laplacian_mm2(rendering.gaussians.displacement, edges),
+        "codes": config.codes * codes(z_id, z_exp),
+    }
+
+
+def _same_shape(a: Tensor, b: Tensor) -> None:
+    if a.shape != b.shape or a.ndim != 3:
+        raise ValueError(
+            f"images have shapes {tuple(a.shape)} and {tuple(b.shape)}, expected both (C, H, W)"
+        )

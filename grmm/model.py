@@ -1,0 +1,327 @@
+"""GRMM: codes and tracked parameters -> Gaussians on the head's UV map -> an image.
+
+The steps are separate, so that a caller pays only for what changes: `geometry` once per
+identity, expression and pose; `appearance` per view; `draw` rasterises and refines.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from express50.head.model import HeadModel
+from express50.torch_transforms import matrix_to_quat
+from grmm.anchors import interpolate, make_anchors, tangent_frames, uv_gradients
+from grmm.config import ModelConfig
+from grmm.decoders import Ladder
+from grmm.mesh_decoder import MeshDecoder
+from grmm.rasterize import rasterize
+from grmm.refine import Refinement, normalise_depth
+
+CODE_STD = 0.01  # of codes before training; silent in the paper, DeepSDF's habit (survey point 13)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class HeadState:
+    """What tracking knows of one frame, in head space: (R, t) belong to the camera (`View`).
+
+    Attributes:
+        vertices: (V, 3) tracked mesh v_rec, metres, eye pose included.
+        shape: (S,) identity coefficients alpha_id.
+        expression: (X,) expression coefficients alpha_exp.
+        neck: (3,) axis-angle.
+        jaw: (3,) axis-angle.
+    """
+
+    vertices: Tensor
+    shape: Tensor
+    expression: Tensor
+    neck: Tensor
+    jaw: Tensor
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class View:
+    """A pinhole camera in canonical head space: pi' = K E [R t] (paper, equation 2).
+
+    Attributes:
+        K: (3, 3) pixels, corner origin.
+        cam_from_head: (4, 4) rigid, metres, OpenCV axes.
+        width: pixels.
+        height: pixels.
+    """
+
+    K: Tensor
+    cam_from_head: Tensor
+    width: int
+    height: int
+
+    def direction(self) -> Tensor:
+        """(3,) unit vector from the head's origin to the camera (survey point 7)."""
+        centre = -self.cam_from_head[:3, :3].T @ self.cam_from_head[:3, 3]
+        return nn.functional.normalize(centre, dim=0)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Gaussians:
+    """N Gaussians in head space, without colour.
+
+    Attributes:
+        means: (N, 3) metres.
+        quats: (N, 4) wxyz.
+        scales_mm: (N, 3) unclamped standard deviations, which the regulariser sees.
+        opacities: (N,) in (0, 1).
+        displacement: (V, 3) metres, what the mesh decoder added.
+    """
+
+    means: Tensor
+    quats: Tensor
+    scales_mm: Tensor
+    opacities: Tensor
+    displacement: Tensor
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Rendering:
+    """One rendered view.
+
+    Attributes:
+        image: (3, H, W) refined colours I; the same tensor as ``rgb`` without refinement.
+        rgb: (3, H, W) rasterised colours I_rgb.
+        depth: (H, W) camera z, metres; 0 where alpha is 0.
+        alpha: (H, W).
+        gaussians: what was drawn.
+    """
+
+    image: Tensor
+    rgb: Tensor
+    depth: Tensor
+    alpha: Tensor
+    gaussians: Gaussians
+
+
+class GRMM(nn.Module):
+    """The morphable model: decoders, refinement, and tables of codes of the training set."""
+
+    def __init__(
+        self,
+        config: ModelConfig,
+        head: HeadModel,
+        subjects: Sequence[str],
+        expressions: Sequence[str],
+    ) -> None:
+        """Build for a head model and the named subjects and expressions; rows of the code tables."""
+        super().__init__()
+        self.config = config
+        self.subjects, self.expressions = tuple(subjects), tuple(expressions)
+        self.anchors = make_anchors(head, config.n_g)
+        self._add_anchor_buffers(head)
+        self.z_id = nn.Parameter(CODE_STD * torch.randn(len(subjects), config.z_id))
+        self.z_exp = nn.Parameter(CODE_STD * torch.randn(len(expressions), config.z_exp))
+        self.mesh = None
+        if config.mesh_decoder:
+            self.mesh = MeshDecoder(
+                z_id=config.z_id,
+                z_exp=config.z_exp,
+                coefficients=len(head.expression_names),
+                teeth=head.regions["teeth"],
+                shared_widths=config.shared_widths,
+                film_width=config.film_width,
+                head_width=config.mesh_width,
+                displacement_scale=config.displacement_scale,
+            )
+        both = config.z_id + config.z_exp
+        self.transform = self._ladder(both, 10)
+        self.opacity = self._ladder(both if config.opacity_from_expression else config.z_id, 1)
+        self.colour = self._ladder(config.z_id, 3 + config.features, config.view_channels)
+        with torch.no_grad():
+            self.opacity.bias.fill_(_logit(config.opacity_init))
+        self.refinement = None
+        if config.refine_widths:
+            self.refinement = Refinement(
+                inputs=3 + config.features + 1 + config.refine_alpha,
+                widths=config.refine_widths,
+                unshuffle=config.refine_unshuffle,
+            )
+
+    def _ladder(self, code: int, outputs: int, view_channels: int = 0) -> Ladder:
+        return Ladder(
+            code=code,
+            outputs=outputs,
+            n_g=self.config.n_g,
+            seed_channels=self.config.seed_channels,
+            widths=self.config.ladder,
+            modes=self.config.identity_modes,
+            view_channels=view_channels,
+        )
+
+    def _add_anchor_buffers(self, head: HeadModel) -> None:
+        """Constants of the head model: rebuilt from it, so they are not in the state dict."""
+        gradients = uv_gradients(head)
+        _, reach = tangent_frames(head.template, head.faces, gradients)
+        spacing_mm = 1e3 * reach[self.anchors.faces] / self.config.n_g
+        constants = {
+            "faces": head.faces,
+            "gradients": gradients,
+            "texels": self.anchors.texels,
+            "anchor_faces": self.anchors.faces,
+            "barycentrics": self.anchors.barycentrics.to(head.dtype),
+            "scale_bias": initial_scales(spacing_mm, self.config),
+            "head_centre": head.template.mean(0),
+        }
+        for name, value in constants.items():
+            self.register_buffer(name, value, persistent=False)
+
+    def codes(self, subject: int, expression: int) -> tuple[Tensor, Tensor]:
+        """Rows of the code tables: (z_id,) and (z_exp,)."""
+        return self.z_id[subject], self.z_exp[expression]
+
+    def forward(
+        self, subject: int, expression: int, state: HeadState, view: View, background: float = 0.0
+    ) -> Rendering:
+        """Render a training subject and expression (indices into the code tables)."""
+        z_id, z_exp = self.codes(subject, expression)
+        return self.render(z_id, z_exp, state, view, background)
+
+    def render(
+        self, z_id: Tensor, z_exp: Tensor, state: HeadState, view: View, background: float = 0.0
+    ) -> Rendering:
+        """Render any codes: (z_id,), (z_exp,)."""
+        gaussians = self.geometry(z_id, z_exp, state)
+        return self.draw(gaussians, self.appearance(z_id, state, view), view, background)
+
+    def geometry(self, z_id: Tensor, z_exp: Tensor, state: HeadState) -> Gaussians:
+        """Decode everything that does not depend on the view."""
+        z_id, z_exp = self._inputs(z_id, z_exp, state)
+        displacement = torch.zeros_like(state.vertices)
+        if self.mesh is not None:
+            displacement = sum(self.mesh(z_id, z_exp, state.neck, state.jaw, state.expression))
+        vertices = state.vertices + displacement
+        offsets = self._sample(self.transform(torch.cat([z_id, z_exp])))
+        code = torch.cat([z_id, z_exp]) if self.config.opacity_from_expression else z_id
+        means, quats = self._place(vertices, offsets)
+        return Gaussians(
+            means=means,
+            quats=quats,
+            scales_mm=nn.functional.softplus(offsets[:, 7:] + self.scale_bias),
+            opacities=torch.sigmoid(self._sample(self.opacity(code))[:, 0]),
+            displacement=displacement,
+        )
+
+    def appearance(self, z_id: Tensor, state: HeadState, view: View) -> Tensor:
+        """Colours in [0, 1] and features (N, 3 + features) as one view sees them."""
+        z_id, _ = self._inputs(z_id, self.z_exp[0], state)
+        maps = self._sample(self.colour(z_id, view.direction().to(z_id.dtype)))
+        return torch.cat([torch.sigmoid(maps[:, :3]), maps[:, 3:]], 1)
+
+    def draw(
+        self,
+        gaussians: Gaussians,
+        colours: Tensor,
+        view: View,
+        background: float = 0.0,
+        refine: bool = True,
+    ) -> Rendering:
+        """Rasterise and refine; features are rasterised only if the refinement will read them."""
+        refinement = self.refinement if refine else None
+        if refinement is None:
+            colours = colours[:, :3]
+        behind = colours.new_zeros(colours.shape[1])
+        behind[:3] = background
+        low, high = self.config.scale_bounds_mm
+        out = rasterize(
+            gaussians.means,
+            gaussians.quats,
+            1e-3 * gaussians.scales_mm.clamp(low, high),
+            gaussians.opacities,
+            colours,
+            view.K,
+            view.cam_from_head,
+            view.width,
+            view.height,
+            background=behind,
+            backend=self.config.backend,
+        )
+        maps = out.colors.permute(2, 0, 1)
+        rgb = image = maps[:3]
+        if refinement is not None:
+            image = refinement(self._refinement_input(maps, out.depth, out.alpha, view))
+        return Rendering(
+            image=image, rgb=rgb, depth=out.depth, alpha=out.alpha, gaussians=gaussians
+        )
+
+    def _refinement_input(self, maps: Tensor, depth: Tensor, alpha: Tensor, view: View) -> Tensor:
+        camera = view.cam_from_head.to(self.head_centre.dtype)
+        centre = camera[2, :3] @ self.head_centre + camera[2, 3]
+        scaled = normalise_depth(depth, alpha, self.config.depth_normalisation, centre)
+        extra = [scaled[None], alpha[None]] if self.config.refine_alpha else [scaled[None]]
+        return torch.cat([maps, *extra])
+
+    def _inputs(self, z_id: Tensor, z_exp: Tensor, state: HeadState) -> tuple[Tensor, Tensor]:
+        """The codes, or (ablation "no residuals") the tracked parameters in their place."""
+        if self.config.residual_codes:
+            return z_id, z_exp
+        return _to_length(state.shape, len(z_id)), _to_length(state.expression, len(z_exp))
+
+    def _sample(self, maps: Tensor) -> Tensor:
+        """(C, n_g, n_g) -> (N, C) at the covered texels."""
+        return maps.flatten(1).index_select(1, self.texels).T
+
+    def _place(self, vertices: Tensor, offsets: Tensor) -> tuple[Tensor, Tensor]:
+        """Means (N, 3) and quaternions (N, 4) from the mesh and decoded offsets (N, 10).
+
+        q = normalise(dq + identity), so that zeros mean no rotation (survey point 1).
+        """
+        base = interpolate(vertices, self.faces, self.anchor_faces, self.barycentrics)
+        shift = self.config.displacement_scale * offsets[:, :3]
+        unit = offsets.new_tensor([1.0, 0.0, 0.0, 0.0])
+        quats = nn.functional.normalize(offsets[:, 3:7] + unit, dim=1, eps=1e-8)
+        if self.config.frame == "head":
+            return base + shift, quats
+        # Frames steer, they are not learned through: their gradient is ill-conditioned on slivers.
+        with torch.no_grad():
+            used = self.anchor_faces
+            frames, _ = tangent_frames(vertices, self.faces[used], self.gradients[used])
+            turn = matrix_to_quat(frames)
+        return base + (frames * shift[:, None, :]).sum(2), quat_multiply(turn, quats)
+
+
+def initial_scales(spacing_mm: Tensor, config: ModelConfig) -> Tensor:
+    """Inputs of softplus (N, 3) that give scales from texel spacings (N, 2) in millimetres.
+
+    ``tangent``: along tangent, bitangent and, thinner, the normal; ``head``: the same on all axes.
+    """
+    low, high = config.scale_bounds_mm
+    along = (config.scale_init * spacing_mm).clamp(1.05 * low, 0.95 * high)
+    if config.frame == "tangent":
+        thickness = config.thickness_init * along.amin(1, keepdim=True)
+        scales = torch.cat([along, thickness.clamp_min(1.05 * low)], 1)
+    else:
+        scales = along.prod(1, keepdim=True).sqrt().expand(-1, 3)
+    return scales + torch.log(-torch.expm1(-scales))  # the inverse of softplus
+
+
+def quat_multiply(a: Tensor, b: Tensor) -> Tensor:
+    """Hamilton product (..., 4) of quaternions, wxyz: first b, then a."""
+    aw, ax, ay, az = a.unbind(-1)
+    bw, bx, by, bz = b.unbind(-1)
+    return torch.stack(
+        [
+            aw * bw - ax * bx - ay * by - az * bz,
+            aw * bx + ax * bw + ay * bz - az * by,
+            aw * by - ax * bz + ay * bw + az * bx,
+            aw * bz + ax * by - ay * bx + az * bw,
+        ],
+        -1,
+    )
+
+
+def _to_length(values: Tensor, length: int) -> Tensor:
+    return nn.functional.pad(values[:length], (0, max(0, length - len(values))))
+
+
+def _logit(probability: float) -> float:
+    return float(torch.logit(torch.tensor(probability, dtype=torch.float64)))

@@ -1,0 +1,135 @@
+"""A sensible head before the first step: texel colours averaged from footage.
+
+The paper trains from scratch for 250,000 iterations; on a small budget the first thousands would
+go into finding colours that projection gives at once (survey point 17).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from grmm.anchors import tangent_frames
+from grmm.data import HeadViews, Item, spread
+from grmm.model import GRMM, Gaussians
+
+FACING = 0.25  # cosine of normal and view below which a texel is seen too obliquely
+OCCLUSION_M = 0.012  # a texel this far behind the rendered surface is hidden; hair is this thick
+LOGIT_LIMIT = 0.01  # colours are kept this far from 0 and 1 before the logit
+
+
+@torch.no_grad()
+def warm_start(model: GRMM, views: HeadViews, indices: Sequence[int], images: int) -> None:
+    """Write the mean texture into the colour decoder's bias, and subjects into modes and codes.
+
+    With ``identity_modes`` the subjects' deviations from the mean texture are decomposed; each
+    component becomes one mode, its coefficient the entry of the subject's code.
+    """
+    textures, known = [], []
+    for subject in model.subjects:
+        own = [i for i in indices if views.keys[i].subject == subject]
+        colours, weight = project_texture(model, views, spread(own, images))
+        textures.append(colours)
+        known.append(weight > 0)
+    stack, seen = torch.stack(textures), torch.stack(known)[..., None]  # (S, N, 3), (S, N, 1)
+    mean = (stack * seen).sum(0) / seen.sum(0).clamp_min(1)
+    mean = fill_texels(mean, seen.any(0)[:, 0], model.anchors.texels, model.config.n_g)
+    stack = torch.where(seen, stack, mean)
+    logits = torch.logit(stack.clamp(LOGIT_LIMIT, 1 - LOGIT_LIMIT))
+    bias = model.colour.bias.flatten(1)
+    bias[:3, model.texels] = logits.mean(0).T
+    if model.colour.modes is not None and len(model.subjects) > 1:
+        _write_modes(model, model.colour.modes, logits)
+
+
+def _write_modes(model: GRMM, all_modes: Tensor, logits: Tensor) -> None:
+    """Principal components of the subjects' textures (S, N, 3) into modes and codes."""
+    deviations = (logits - logits.mean(0)).flatten(1)
+    u, s, v = torch.linalg.svd(deviations.double(), full_matrices=False)
+    count = min(len(s) - 1, len(all_modes))
+    # Codes of unit spread: every decoder then tells the subjects apart from its first step.
+    scale = u[:, :count].std(0).clamp_min(1e-8) / model.config.code_spread
+    model.z_id[:, :count] = (u[:, :count] / scale).to(model.z_id.dtype)
+    basis = (v[:count] * (s[:count] * scale)[:, None]).to(model.z_id.dtype)
+    modes = all_modes.flatten(2)
+    for k in range(count):
+        modes[k][:3, model.texels] = basis[k].view(-1, 3).T
+
+
+@torch.no_grad()
+def project_texture(
+    model: GRMM,
+    views: HeadViews,
+    indices: Sequence[int],
+    z_id: Tensor | None = None,
+    z_exp: Tensor | None = None,
+) -> tuple[Tensor, Tensor]:
+    """Mean footage colour of each texel over the views that see it.
+
+    Returns:
+        colours (N, 3) in [0, 1]; weight (N,), 0 where no view sees the texel.
+    """
+    count = len(model.texels)
+    total = model.z_id.new_zeros(count, 3)
+    weight = model.z_id.new_zeros(count)
+    zero_id, zero_exp = torch.zeros_like(model.z_id[0]), torch.zeros_like(model.z_exp[0])
+    z_id = zero_id if z_id is None else z_id
+    z_exp = zero_exp if z_exp is None else z_exp
+    states: dict[int, Gaussians] = {}
+    for index in indices:
+        item = views.item(index)
+        if id(item.state) not in states:
+            states[id(item.state)] = model.geometry(z_id, z_exp, item.state)
+        colours, seen = _seen_colours(model, states[id(item.state)], item)
+        total += seen[:, None] * colours
+        weight += seen
+    return total / weight.clamp_min(1e-8)[:, None], weight
+
+
+def _seen_colours(model: GRMM, gaussians: Gaussians, item: Item) -> tuple[Tensor, Tensor]:
+    """Colours (N, 3) under the projected means, and weights (N,): squared cosine, 0 if hidden."""
+    view = item.view
+    camera = view.cam_from_head.to(gaussians.means.dtype)
+    points = gaussians.means @ camera[:3, :3].T + camera[:3, 3]
+    z = points[:, 2].clamp_min(1e-6)
+    K = view.K.to(z.dtype)
+    x = K[0, 0] * points[:, 0] / z + K[0, 2]
+    y = K[1, 1] * points[:, 1] / z + K[1, 2]
+    blank = gaussians.means.new_zeros(len(points), 3)
+    drawn = model.draw(gaussians, blank, view, refine=False)
+    maps = torch.cat([item.target, drawn.depth[None], (drawn.alpha > 0.5)[None], item.mask[None]])
+    # grid_sample's -1 and 1 are the image's borders (align_corners off): the corner convention.
+    grid = torch.stack([2 * x / view.width - 1, 2 * y / view.height - 1], -1)
+    sampled = torch.nn.functional.grid_sample(maps[None], grid[None, None], align_corners=False)
+    sampled = sampled[0, :, 0].T  # (N, 6)
+    vertices = item.state.vertices
+    frames, _ = tangent_frames(
+        vertices, model.faces[model.anchor_faces], model.gradients[model.anchor_faces]
+    )
+    facing = -((frames[..., 2] @ camera[:3, :3].T) * points).sum(1) / points.norm(dim=1)
+    hit = (points[:, 2] > 0) & (points[:, 2] < sampled[:, 3] + OCCLUSION_M)
+    seen = hit & (sampled[:, 4:] > 0.99).all(1) & (facing > FACING)
+    return sampled[:, :3], seen * facing.square()
+
+
+def fill_texels(values: Tensor, known: Tensor, texels: Tensor, n_g: int) -> Tensor:
+    """Fill unknown texels (N, C) from near known ones on the UV map; grey if none is known.
+
+    Pull and push: averages over ever larger cells, each unknown texel takes the finest known.
+    """
+    grid = values.new_zeros(values.shape[1] + 1, n_g * n_g)
+    grid[:-1, texels] = (values * known[:, None]).T
+    grid[-1, texels] = known.to(values.dtype)
+    filled, found = values.clone(), known.clone()
+    level = grid.view(1, -1, n_g, n_g)
+    while not bool(found.all()) and level.shape[-1] > 1:
+        level = torch.nn.functional.avg_pool2d(level, 2, ceil_mode=True)
+        fine = torch.nn.functional.interpolate(level, size=(n_g, n_g), mode="nearest")
+        flat = fine[0].flatten(1)[:, texels]
+        take = ~found & (flat[-1] > 0)
+        filled[take] = (flat[:-1, take] / flat[-1, take]).T
+        found |= take
+    filled[~found] = 0.5
+    return filled

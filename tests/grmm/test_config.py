@@ -1,0 +1,56 @@
+import pytest
+
+from express50.errors import ConfigError
+from grmm.config import PRESETS, as_tables, from_tables, preset, resolve
+
+
+def test_paper_preset_has_the_papers_numbers():
+    config = preset("paper")
+    model, loss = config.model, config.loss
+    assert (model.n_g, model.z_id, model.z_exp, model.features) == (512, 512, 256, 32)
+    assert model.shared_widths[-1] + model.z_exp == 512
+    assert (loss.l1, loss.ssim, loss.perceptual, loss.depth) == (0.8, 0.2, 0.04, 0.5)
+    assert (loss.scale, loss.laplacian, loss.codes) == (0.1, 0.01, 0.001)
+    assert (config.train.iterations, config.train.lr) == (250_000, 1e-4)
+    assert (config.fit.locality, config.fit.locality_t) == (0.1, 0.3)
+    assert model.scale_bounds_mm == (0.1, 10.0)
+    assert (model.frame, model.identity_modes, model.refine_unshuffle) == ("head", 0, 1)
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_presets_survive_a_checkpoint(name):
+    config = preset(name)
+    assert from_tables(as_tables(config)) == config
+
+
+def test_assignments_stand_over_toml_over_preset(tmp_path):
+    file = tmp_path / "run.toml"
+    file.write_text("[train]\nlr = 0.5\niterations = 7\n")
+    config = resolve("demo", file, ["train.lr=0.25", "model.refine_widths=[8]"])
+    assert (config.train.lr, config.train.iterations) == (0.25, 7)
+    assert config.model.refine_widths == (8,)
+    assert config.train.final_lr == preset("demo").train.final_lr
+
+
+@pytest.mark.parametrize(
+    ("assignment", "message"),
+    [
+        ("model.ng=3", "did you mean 'n_g'"),
+        ("modle.n_g=3", "did you mean 'model'"),
+        ("model.n_g=100", "expected a multiple of 16"),
+        ("train.iterations=0", "expected >= 1"),
+        ("model.frame=tangant", "expected one of head, tangent"),
+        ("train.lr=fast", "expected float"),
+        ("model.identity_modes=99", "at most z_id"),
+    ],
+)
+def test_bad_values_are_named(assignment, message):
+    with pytest.raises(ConfigError, match=message):
+        resolve("demo", None, [assignment])
+
+
+def test_unknown_preset_and_missing_file_are_named(tmp_path):
+    with pytest.raises(ConfigError, match="expected one of paper, small, demo"):
+        resolve("dmeo")
+    with pytest.raises(ConfigError, match="no such file"):
+        resolve("demo", tmp_path / "absent.toml")

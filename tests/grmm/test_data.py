@@ -1,0 +1,148 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from express50.errors import FormatError, TrainError
+from grmm.data import HeadViews, Shuffle, crop_view, head_window, pose_state, spread
+from grmm.model import GRMM
+from tests.grmm.synthetic import STRETCH, EllipsoidSource, ellipsoid_head, tiny_config
+
+
+@pytest.fixture(scope="module")
+def source():
+    return EllipsoidSource(size=64)
+
+
+@pytest.fixture
+def views(source):
+    return HeadViews(source, ellipsoid_head())
+
+
+def test_footage_is_composited_on_the_background(source):
+    views = HeadViews(source, ellipsoid_head(), background=0.25)
+    item = views.item(0)
+    assert torch.equal(item.target[:, ~item.mask], torch.full_like(item.target[:, ~item.mask], 0.25))
+    sample = source.read(0)
+    inside = torch.from_numpy(sample.image).permute(2, 0, 1)[:, item.mask] / 255
+    torch.testing.assert_close(item.target[:, item.mask], inside)
+    assert torch.equal(item.depth_valid, item.mask)
+
+
+def test_geometry_is_posed_once_per_frame(views):
+    assert views.state(0) is views.state(1)  # another camera
+    taller = views.state(3).vertices[:, 1].max() - views.state(0).vertices[:, 1].max()
+    assert float(taller) == pytest.approx(STRETCH, rel=1e-5)
+
+
+def test_cache_is_bounded_and_answers_from_memory(source):
+    views = HeadViews(source, ellipsoid_head(), cache_mb=0)
+    assert views.sample(0) is views.sample(0)
+    first = views.sample(0)
+    views.sample(1)
+    assert views.sample(0) is not first
+    roomy = HeadViews(source, ellipsoid_head())
+    first = roomy.sample(0)
+    roomy.sample(1)
+    assert roomy.sample(0) is first
+
+
+def test_window_shows_the_same_picture():
+    """The saving: render and compare a window only. The same numbers come out inside it."""
+    views = HeadViews(EllipsoidSource(size=160), ellipsoid_head())
+    config = tiny_config(model={"refine_widths": ()})
+    model = GRMM(config.model, views.head, ("S000",), ("e0",))
+    whole, part = views.item(0), views.item(0, margin_px=6)
+    assert part.view.width < whole.view.width
+    rows, columns = head_window(whole.state.vertices, whole.view, views.sample(0).alpha, 6)
+    with torch.no_grad():
+        a = model(0, 0, whole.state, whole.view).rgb
+        b = model(0, 0, part.state, part.view).rgb
+    torch.testing.assert_close(a[:, rows, columns], b, atol=1e-5, rtol=0)
+    assert torch.equal(whole.target[:, rows, columns], part.target)
+    outside = torch.ones(160, 160, dtype=torch.bool)
+    outside[rows, columns] = False
+    assert float(whole.target[:, outside].max()) == 0 and float(a[:, outside].max()) < 1 / 255
+
+
+def test_window_of_a_head_outside_the_image_is_the_image(views):
+    item = views.item(0)
+    away = replace(item.view, K=item.view.K + torch.tensor([[0, 0, 900.0], [0, 0, 900], [0, 0, 0]]))
+    rows, columns = head_window(item.state.vertices, away, np.zeros((64, 64), np.uint8), 8)
+    assert (rows, columns) == (slice(0, 64), slice(0, 64))
+
+
+def test_crop_moves_the_principal_point(views):
+    view = crop_view(views.item(0).view, slice(3, 20), slice(5, 40))
+    whole = views.item(0).view
+    assert (view.width, view.height) == (35, 17)
+    assert float(whole.K[0, 2] - view.K[0, 2]) == 5 and float(whole.K[1, 2] - view.K[1, 2]) == 3
+
+
+def test_sizes_that_differ_are_named(source):
+    class Broken(EllipsoidSource):
+        def read(self, index):
+            return replace(super().read(index), alpha=np.zeros((3, 3), np.uint8))
+
+    with pytest.raises(FormatError, match=r"S000/e0/cam00: alpha is \(3, 3\)"):
+        HeadViews(Broken(size=32), ellipsoid_head()).item(0)
+
+
+def test_parameters_of_another_head_model_are_named(source):
+    class Other(EllipsoidSource):
+        def read(self, index):
+            sample = super().read(index)
+            return replace(sample, tracked=replace(sample.tracked, expression=np.zeros(9)))
+
+    with pytest.raises(FormatError, match="9 expression coefficients, head model 'ellipsoid' has 4"):
+        HeadViews(Other(size=32), ellipsoid_head()).item(0)
+
+
+def test_fewer_coefficients_are_padded(source):
+    tracked = replace(source.read(0).tracked, expression=np.ones(1), shape=np.zeros(1))
+    state = pose_state(ellipsoid_head(), tracked)
+    assert state.expression.tolist() == [1, 0, 0, 0]
+
+
+def test_missing_depth_is_no_depth(source):
+    class Flat(EllipsoidSource):
+        def read(self, index):
+            return replace(super().read(index), depth=None)
+
+    item = HeadViews(Flat(size=32), ellipsoid_head()).item(0, margin_px=4)
+    assert not item.depth_valid.any()
+    assert item.depth.shape == item.mask.shape
+
+
+def test_shuffle_visits_everything_each_epoch_and_depends_on_the_seed():
+    shuffle = Shuffle([3, 5, 7, 9], seed=1)
+    epochs = [sorted(shuffle.next() for _ in range(4)) for _ in range(3)]
+    assert epochs == [[3, 5, 7, 9]] * 3
+    orders = {tuple(Shuffle(range(9), seed).next() for _ in range(1)) for seed in range(20)}
+    assert len(orders) > 3
+
+
+def test_shuffle_resumes_exactly():
+    straight, first, second = (Shuffle(range(5), seed=2) for _ in range(3))
+    expected = [straight.next() for _ in range(13)]
+    got = [first.next() for _ in range(7)]
+    second.restore(first.state())
+    assert got + [second.next() for _ in range(6)] == expected
+
+
+def test_ranks_share_one_order_without_overlap():
+    alone = Shuffle(range(7), seed=3)
+    ranks = [Shuffle(range(7), seed=3, rank=r, world=3) for r in range(3)]
+    together = [rank.next() for _ in range(6) for rank in ranks]
+    assert together == [alone.next() for _ in range(18)]
+
+
+def test_nothing_to_train_on_is_an_error():
+    with pytest.raises(TrainError, match="no samples"):
+        Shuffle([], seed=0)
+
+
+def test_spread_takes_both_ends():
+    assert spread(range(10), 4) == [0, 3, 6, 9]
+    assert spread([1, 2], 4) == [1, 2]
