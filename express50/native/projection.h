@@ -98,8 +98,10 @@ inline void project_one(const Camera& cam, const Real* mean, const Real* quat, c
     g.det_sharp = dot3(g.cross, g.cross);
     g.det = g.det_sharp + e * (g.xx + g.yy) + e * e;
     g.A = (g.yy + e) / g.det, g.B = -g.xy / g.det, g.C = (g.xx + e) / g.det;
-    g.slope[0] = g.A * g.tu + g.B * g.tv;
-    g.slope[1] = g.B * g.tu + g.C * g.tv;
+    double t_v[3], u_t[3];
+    cross3(t, v, t_v), cross3(u, t, u_t);
+    g.slope[0] = (e * g.tu + dot3(g.cross, t_v)) / g.det;
+    g.slope[1] = (e * g.tv + dot3(g.cross, u_t)) / g.det;
     g.ratio = g.det_sharp / g.det;
     const double compensation = std::sqrt(std::max(g.ratio, kCompensationMin * kCompensationMin));
     g.opacity = double(opacity) * (cam.antialiased ? compensation : 1.0);
@@ -128,35 +130,33 @@ inline void project_gradient(const Camera& cam, const Real* mean, const Real* sc
                              const Projected& g, SplatGradient d, double* d_mean, double* d_quat,
                              double* d_scale, double* d_opacity, CameraGradient& d_cam) {
     const double *u = g.rows, *v = g.rows + 3, *t = g.rows + 6, e = cam.eps2d;
-    // slope = conic (tu, tv)
-    const double dA = d.conic[0] + d.slope[0] * g.tu;
-    const double dB = d.conic[1] + d.slope[0] * g.tv + d.slope[1] * g.tu;
-    const double dC = d.conic[2] + d.slope[1] * g.tv;
-    const double d_tu = g.A * d.slope[0] + g.B * d.slope[1];
-    const double d_tv = g.B * d.slope[0] + g.C * d.slope[1];
-    // d(conic) = -conic d(covariance) conic
-    const double a0 = g.A * dA + 0.5 * g.B * dB, a1 = 0.5 * g.A * dB + g.B * dC;
-    const double b0 = g.B * dA + 0.5 * g.C * dB, b1 = 0.5 * g.B * dB + g.C * dC;
-    double d_xx = -(a0 * g.A + a1 * g.B), d_yy = -(b0 * g.B + b1 * g.C);
-    double d_xy = -2 * (a0 * g.B + a1 * g.C);
-    *d_opacity = d.opacity;
+    const double n_u = d.slope[0] / g.det, n_v = d.slope[1] / g.det;  // by the numerators
+    double d_det = -(d.conic[0] * g.A + d.conic[1] * g.B + d.conic[2] * g.C) / g.det -
+                   n_u * g.slope[0] - n_v * g.slope[1];
     double d_sharp = 0;
+    *d_opacity = d.opacity;
     if (cam.antialiased) {
         const double root = std::sqrt(std::max(g.ratio, kCompensationMin * kCompensationMin));
         *d_opacity = d.opacity * root;
         if (g.ratio > kCompensationMin * kCompensationMin) {
             const double d_ratio = d.opacity * double(opacity) * 0.5 / root;
-            d_sharp = d_ratio * (1 - g.ratio) / g.det;
-            d_xx -= d_ratio * g.ratio / g.det * e;
-            d_yy -= d_ratio * g.ratio / g.det * e;
+            d_sharp = d_ratio / g.det;
+            d_det -= d_ratio * g.ratio / g.det;
         }
     }
-    double d_rows[9], v_cross[3], cross_u[3];  // det_sharp = |cross|^2
-    cross3(v, g.cross, v_cross), cross3(g.cross, u, cross_u);
+    d_sharp += d_det;
+    const double d_xx = d.conic[2] / g.det + e * d_det, d_yy = d.conic[0] / g.det + e * d_det;
+    const double d_xy = -d.conic[1] / g.det, d_tu = e * n_u, d_tv = e * n_v;
+    double t_v[3], u_t[3], v_c[3], c_t[3], t_c[3], c_u[3], d_c[3], v_dc[3], dc_u[3];
+    cross3(t, v, t_v), cross3(u, t, u_t), cross3(v, g.cross, v_c), cross3(g.cross, t, c_t);
+    cross3(t, g.cross, t_c), cross3(g.cross, u, c_u);
+    for (int k = 0; k < 3; ++k) d_c[k] = 2 * d_sharp * g.cross[k] + n_u * t_v[k] + n_v * u_t[k];
+    cross3(v, d_c, v_dc), cross3(d_c, u, dc_u);
+    double d_rows[9];
     for (int k = 0; k < 3; ++k) {
-        d_rows[k] = 2 * d_xx * u[k] + d_xy * v[k] + d_tu * t[k] + 2 * d_sharp * v_cross[k];
-        d_rows[3 + k] = d_xy * u[k] + 2 * d_yy * v[k] + d_tv * t[k] + 2 * d_sharp * cross_u[k];
-        d_rows[6 + k] = d_tu * u[k] + d_tv * v[k];
+        d_rows[k] = 2 * d_xx * u[k] + d_xy * v[k] + d_tu * t[k] + n_v * t_c[k] + v_dc[k];
+        d_rows[3 + k] = d_xy * u[k] + 2 * d_yy * v[k] + d_tv * t[k] + n_u * c_t[k] + dc_u[k];
+        d_rows[6 + k] = d_tu * u[k] + d_tv * v[k] + n_u * v_c[k] + n_v * c_u[k];
     }
     double d_J[9], d_W[9], d_Rq[9];
     for (int k = 0; k < 3; ++k) d_scale[k] = 0;

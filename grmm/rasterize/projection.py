@@ -4,7 +4,7 @@ Everything here is computed in float64 and only the results are rounded to the d
 needle-shaped and huge Gaussians cancel badly in float32, and N small matrices cost little.
 Sources: EWA splatting (Zwicker et al. 2001) as in 3DGS (Kerbl et al. 2023), with the guards of
 gsplat (Ye et al. 2025: dilation, field-of-view clamp of the Jacobian, near plane, 1/255 cut-off);
-the depth plane is RaDe-GS's (Zhang et al. 2024), written as a regression slope (see below).
+the depth plane is RaDe-GS's (Zhang et al. 2024), written as a regression.
 """
 
 from __future__ import annotations
@@ -74,19 +74,14 @@ def project(
     # Culled points get a harmless place, so that no division by zero enters the gradients.
     points = torch.where(front[:, None], points, points.new_tensor([0.0, 0.0, 1.0]))
     rows = _jacobian(points, K, width, height) @ (R @ quat_to_matrix(quats) * scales[:, None, :])
-    covariance = rows @ rows.transpose(1, 2)  # over (u, v, ray length)
-    conics, compensation = _conics(rows, covariance, eps2d)
-    # Regression of the ray length on the pixel: s = Cov(t, uv) Cov(uv)^-1. It equals the plane of
-    # RaDe-GS without inverting a 3x3 matrix; the dilated conic keeps it bounded for flat ones.
-    tu, tv = covariance[:, 2, 0], covariance[:, 2, 1]
-    slope_u = conics[:, 0] * tu + conics[:, 1] * tv
-    slope_v = conics[:, 1] * tu + conics[:, 2] * tv
-    planes = torch.stack([points.norm(dim=1), slope_u, slope_v], 1)
+    variances = rows.square().sum(2)  # of u, v and the ray length
+    conics, slopes, compensation = _regression(rows, variances, eps2d)
+    planes = torch.cat([points.norm(dim=1, keepdim=True), slopes], 1)
     focal = torch.stack([K[0, 0], K[1, 1]])
     means2d = focal * points[:, :2] / points[:, 2:] + K[:2, 2]
     if antialiased:
         opacities = opacities * compensation
-    extents, visible = _extents(means2d, covariance, opacities, eps2d, width, height)
+    extents, visible = _extents(means2d, variances[:, :2] + eps2d, opacities, width, height)
     return Projection(
         means2d=means2d.to(dtype),
         conics=conics.to(dtype),
@@ -128,28 +123,37 @@ def _clamp(value: Tensor, low: Tensor, high: Tensor) -> Tensor:
     return torch.where(value < low, low, torch.where(value > high, high, value))
 
 
-def _conics(rows: Tensor, covariance: Tensor, eps2d: float) -> tuple[Tensor, Tensor]:
-    """Conics (N, 3) and antialiasing factors (N,) from ``rows`` (N, 3, 3), their square roots.
+def _regression(rows: Tensor, variances: Tensor, eps2d: float) -> tuple[Tensor, Tensor, Tensor]:
+    """Conics (N, 3), slopes (N, 2) of the ray length and antialiasing factors (N,).
 
-    The determinant is the squared area of the two pixel rows (Cauchy-Binet) plus the dilation's
-    terms: a sum of squares, so it stays positive where ``xx * yy - xy**2`` would cancel.
+    ``rows`` (N, 3, 3), a square root of the covariance over (u, v, ray length), and its diagonal
+    ``variances`` (N, 3). The slope is that of the regression of the ray length t on the pixel,
+    Cov(uv)^-1 Cov(uv, t). It equals the plane of RaDe-GS without inverting a 3x3 matrix, and the
+    dilated Cov(uv) keeps it bounded for flat Gaussians.
+
+    Determinants are written as products of the rows' cross products (Cauchy-Binet): for a needle,
+    ``xx * yy - xy**2`` is the difference of two numbers that agree in all their digits.
     """
-    xx, xy, yy = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
-    det_sharp = torch.linalg.cross(rows[:, 0], rows[:, 1]).square().sum(1)
+    u, v, t = rows.unbind(1)
+    xx, yy = variances[:, 0], variances[:, 1]
+    xy, tu, tv = (u * v).sum(1), (t * u).sum(1), (t * v).sum(1)
+    normal = torch.linalg.cross(u, v)
+    det_sharp = normal.square().sum(1)
     det = det_sharp + eps2d * (xx + yy) + eps2d * eps2d
     conics = torch.stack([(yy + eps2d) / det, -xy / det, (xx + eps2d) / det], 1)
-    ratio = (det_sharp / det).clamp(min=COMPENSATION_MIN**2)
-    return conics, ratio.sqrt()
+    slope_u = (eps2d * tu + (normal * torch.linalg.cross(t, v)).sum(1)) / det
+    slope_v = (eps2d * tv + (normal * torch.linalg.cross(u, t)).sum(1)) / det
+    compensation = (det_sharp / det).clamp(min=COMPENSATION_MIN**2).sqrt()
+    return conics, torch.stack([slope_u, slope_v], 1), compensation
 
 
 @torch.no_grad()
 def _extents(
-    means2d: Tensor, covariance: Tensor, opacities: Tensor, eps2d: float, width: int, height: int
+    means2d: Tensor, variances: Tensor, opacities: Tensor, width: int, height: int
 ) -> tuple[Tensor, Tensor]:
     """Half sizes (N, 2) of the alpha >= 1/255 box, and whether it holds a pixel centre (N,)."""
     level = 2.0 * torch.log((opacities / ALPHA_MIN).clamp(min=1.0))
-    variance = torch.stack([covariance[:, 0, 0], covariance[:, 1, 1]], 1) + eps2d
-    extents = (level[:, None] * variance).sqrt()
+    extents = (level[:, None] * variances).sqrt()
     size = means2d.new_tensor([width, height])
     inside = ((means2d + extents >= 0) & (means2d - extents <= size)).all(1)
     return extents, inside & (opacities >= ALPHA_MIN)
