@@ -1,0 +1,255 @@
+"""A subject's geometry: the head model, hair and shoulders, posed for one frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+
+import numpy as np
+import scipy.sparse
+import torch
+
+from express50.head.model import HeadModel, landmarks, pose
+from express50.transforms import rigid_fit
+from express50.twin.hair import HairMesh, grow_hair
+from express50.twin.noise import random_stream, smoothstep
+from express50.twin.performance import Performance
+from express50.twin.subjects import Subject
+from express50.twin.surface import StarMap, face_to_vertex, smooth_over_mesh, vertex_normals
+
+
+class Material(IntEnum):
+    """What a triangle is made of."""
+
+    SKIN = 0
+    EYE = 1
+    TEETH = 2
+    MOUTH = 3
+    TONGUE = 4
+    HAIR = 5
+    CLOTH = 6
+    HIDDEN = 7
+
+
+@dataclass(frozen=True, kw_only=True)
+class Extras:
+    """What is not the head model, in rest head space.
+
+    Attributes:
+        hair: strands, rigid with the skull; may be empty.
+        cloth_vertices, cloth_faces: shoulders, rigid with the root.
+        skull: (K,) head vertices that hair follows; skull_rest (K, 3) where they rest.
+    """
+
+    hair: HairMesh
+    cloth_vertices: np.ndarray
+    cloth_faces: np.ndarray
+    skull: np.ndarray
+    skull_rest: np.ndarray
+
+
+@dataclass(frozen=True, kw_only=True)
+class Body:
+    """One subject's static geometry.
+
+    Attributes:
+        model: the head model.
+        subject: identity.
+        faces: (F, 3) of the head, then hair, then shoulders, as one mesh.
+        material: (F,) uint8.
+        template: (V, 3) float32 rest positions of the mean head, where textures live.
+        scalp: (V,) float32 hairiness, soft at the hairline.
+        centre: (3,) centre of the head, template space.
+        extras: hair and shoulders.
+        incidence: sums face normals of head and shoulders at their vertices.
+    """
+
+    model: HeadModel
+    subject: Subject
+    faces: np.ndarray
+    material: np.ndarray
+    template: np.ndarray
+    scalp: np.ndarray
+    centre: np.ndarray
+    extras: Extras
+    incidence: scipy.sparse.csr_matrix
+
+
+def build_body(model: HeadModel, subject: Subject, seed: int, with_hair: bool) -> Body:
+    """Everything of a subject that no frame changes."""
+    template = model.template.double().numpy()
+    faces = model.faces.numpy().astype(np.int32)
+    centre = head_centre(model)
+    scalp = smooth_over_mesh(model.regions["scalp"].numpy().astype(np.float32), faces, 2)
+    scalp = np.where(model.regions["scalp"].numpy(), np.clip(2.0 * scalp - 1.0, 0.0, 1.0), 0.0)
+    # Hair ends at the nape, wherever a model's scalp mask ends.
+    chin = landmarks(model, model.template[None])[0, 8, 1].item()
+    scalp = scalp * smoothstep(template[:, 1], chin - 0.005, chin + 0.025)
+    rest = neutral_vertices(model, subject)
+    skin_faces = faces[model_materials(model)[faces].min(1) == Material.SKIN]
+    star = StarMap(rest, skin_faces, centre)
+    rng = random_stream(seed, subject.number, 7)
+    hair = _no_hair()
+    if with_hair:
+        hair = grow_hair(rng, rest, faces, scalp, star, subject.look)
+    skull = np.flatnonzero(scalp > 0.8)[::7]
+    cloth_vertices, cloth_faces = _shoulders(rest, model.regions["boundary"].numpy())
+    extras = Extras(
+        hair=hair, cloth_vertices=cloth_vertices, cloth_faces=cloth_faces,
+        skull=skull, skull_rest=rest[skull],
+    )  # fmt: skip
+    return assemble(model, subject, extras, scalp.astype(np.float32), centre)
+
+
+def assemble(
+    model: HeadModel, subject: Subject, extras: Extras, scalp: np.ndarray, centre: np.ndarray
+) -> Body:
+    """Join head, hair and shoulders into one mesh."""
+    faces = model.faces.numpy().astype(np.int32)
+    heads, hairs = len(model.template), len(extras.hair.vertices)
+    labels = model_materials(model)
+    head_material = labels[faces].max(1)
+    # A triangle between skin and the inside of the mouth is lip.
+    mixed = (labels[faces] == Material.SKIN).any(1) & (head_material == Material.MOUTH)
+    head_material[mixed] = Material.SKIN
+    shown = head_material != Material.HIDDEN
+    joined = np.concatenate(
+        [faces[shown], extras.hair.faces + heads, extras.cloth_faces + heads + hairs]
+    ).astype(np.int32)
+    material = np.concatenate(
+        [
+            head_material[shown],
+            np.full(len(extras.hair.faces), Material.HAIR, np.uint8),
+            np.full(len(extras.cloth_faces), Material.CLOTH, np.uint8),
+        ]
+    ).astype(np.uint8)
+    solid = np.concatenate([faces, extras.cloth_faces + heads])
+    incidence = face_to_vertex(solid, heads + len(extras.cloth_vertices))
+    return Body(
+        model=model, subject=subject, faces=joined, material=material,
+        template=model.template.numpy(), scalp=scalp, centre=centre, extras=extras,
+        incidence=incidence,
+    )  # fmt: skip
+
+
+def model_materials(model: HeadModel) -> np.ndarray:
+    """Material (V,) uint8 of each head vertex, from the model's regions."""
+    labels = np.full(len(model.template), Material.SKIN, np.uint8)
+    named = np.zeros(len(labels), dtype=bool)
+    for mask in model.regions.values():
+        named |= mask.numpy()
+    # In no region: ICT-FaceKit's opaque lash cards and the sockets behind its eyes.
+    labels[~named] = Material.HIDDEN
+    for region, material in (
+        ("mouth_interior", Material.MOUTH),
+        ("tongue", Material.TONGUE),
+        ("teeth", Material.TEETH),
+        ("left_eyeball", Material.EYE),
+        ("right_eyeball", Material.EYE),
+    ):
+        labels[model.regions[region].numpy()] = material
+    return labels
+
+
+def head_centre(model: HeadModel) -> np.ndarray:
+    """A point (3,) inside the skull from which face, scalp and ears are all seen."""
+    template = model.template.double().numpy()
+    head = template[(model.regions["face"] | model.regions["scalp"]).numpy()]
+    joints = model.joint_regressor.double().numpy() @ template
+    middle = 0.5 * (head.min(0) + head.max(0))
+    return np.array([0.0, joints[3:5, 1].mean() - 0.01, middle[2] - 0.01])
+
+
+def neutral_vertices(model: HeadModel, subject: Subject) -> np.ndarray:
+    """Rest vertices (V, 3) of a subject without expression, float64 metres."""
+    dirs = model.shape_dirs.double().numpy()
+    return model.template.double().numpy() + dirs @ subject.shape + subject.offsets
+
+
+def head_vertices(model: HeadModel, subject: Subject, play: Performance, frame: int) -> np.ndarray:
+    """Vertices (V, 3) of the posed head model in the world, metres."""
+
+    def row(array: np.ndarray) -> torch.Tensor:
+        return torch.from_numpy(np.asarray(array, dtype=np.float32))[None]
+
+    with torch.no_grad():
+        posed = pose(
+            model,
+            row(subject.shape),
+            row(play.expression[frame]),
+            neck=row(play.neck[frame]),
+            jaw=row(play.jaw[frame]),
+            eyes=row(play.eyes[frame]),
+            offsets=row(subject.offsets),
+        )
+    return posed[0].double().numpy() @ play.R[frame].T + play.t[frame]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Posed:
+    """All geometry of one frame in the world: (N, 3) vertices and normals, hair's turn (3, 3)."""
+
+    vertices: np.ndarray
+    normals: np.ndarray
+    tangents: np.ndarray
+    head_from_world: np.ndarray
+
+
+def pose_body(body: Body, play: Performance, frame: int, with_normals: bool = True) -> Posed:
+    """Pose head, hair and shoulders for a frame."""
+    extras, hair = body.extras, body.extras.hair
+    head = head_vertices(body.model, body.subject, play, frame)
+    turn, shift = rigid_fit(extras.skull_rest, head[extras.skull])
+    cloth = extras.cloth_vertices @ play.R[frame].T + play.t[frame]
+    vertices = np.concatenate([head, hair.vertices @ turn.T + shift, cloth]).astype(np.float32)
+    normals = np.zeros_like(vertices)
+    tangents = (hair.tangents @ turn.T).astype(np.float32)
+    if with_normals:
+        solid = np.concatenate([head, cloth]).astype(np.float32)
+        solid_faces = np.concatenate([body.model.faces.numpy(), extras.cloth_faces + len(head)])
+        solid_normals = vertex_normals(solid, solid_faces, body.incidence)
+        normals[: len(head)] = solid_normals[: len(head)]
+        normals[len(head) : len(head) + len(hair.vertices)] = hair.normals @ turn.T
+        normals[len(head) + len(hair.vertices) :] = solid_normals[len(head) :]
+    return Posed(
+        vertices=vertices, normals=normals, tangents=tangents, head_from_world=play.R[frame].T
+    )
+
+
+def _no_hair() -> HairMesh:
+    empty = np.zeros((0, 3), np.float32)
+    return HairMesh(
+        vertices=empty, faces=np.zeros((0, 3), np.int32), tangents=empty, normals=empty,
+        colours=empty,
+    )  # fmt: skip
+
+
+def _shoulders(rest: np.ndarray, boundary: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """A shirt (N, 3) with faces (M, 3) that flares from a collar around the neck's open end."""
+    loop = rest[boundary]
+    low, high = loop.min(0), loop.max(0)
+    centre, half = 0.5 * (low + high), 0.5 * (high - low)
+    around = np.linspace(0, 2 * np.pi, 65)[:-1]
+    rings = []
+    for s in np.linspace(0.0, 1.0, 24):
+        flare = np.sin(0.5 * np.pi * min(1.0, 1.35 * s)) ** 0.8
+        width = (half[0] + 0.004) * (1 - flare) + max(0.2, half[0] + 0.05) * flare
+        depth = (half[2] + 0.004) * (1 - flare) + max(0.105, half[2] + 0.02) * flare
+        drop = 0.012 - 0.10 * flare**2.2 - 0.24 * s**3
+        squareness = 2.0 + 0.8 * flare
+        c, z = np.cos(around), np.sin(around)
+        scale = (np.abs(c) ** squareness + np.abs(z) ** squareness) ** (-1.0 / squareness)
+        ring = np.stack(
+            [
+                centre[0] + width * scale * c,
+                np.full_like(c, centre[1] + drop) + 0.006 * np.abs(c) * (1 - s),
+                centre[2] - 0.02 * flare + depth * scale * z,
+            ],
+            axis=1,
+        )
+        rings.append(ring)
+    index = np.arange(len(rings) * len(around)).reshape(len(rings), -1)
+    a, b = index[:-1], index[1:]
+    c, d = np.roll(a, -1, axis=1), np.roll(b, -1, axis=1)
+    faces = np.concatenate([np.stack([a, c, b], -1), np.stack([c, d, b], -1)]).reshape(-1, 3)
+    return np.concatenate(rings).astype(np.float32), faces.astype(np.int32)

@@ -1,0 +1,89 @@
+"""What a recording consists of: one frozen dataclass, checked once."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+
+from express50.errors import ConfigError
+
+
+@dataclass(frozen=True, kw_only=True)
+class TwinConfig:
+    """Settings of ``express50 twin record``; the same settings give the same bytes."""
+
+    head: str = "procedural"
+    "Head model spec of ``load_head``; it must name its expression directions."
+    subjects: int = 4
+    "Number of subjects."
+    first_subject: int = 1
+    "Number of the first subject's id; S001 for 1. Subjects do not depend on how many there are."
+    cameras: int = 8
+    "Number of cameras on the rig, over about 300 degrees."
+    width: int = 320
+    "Image width, pixels."
+    height: int = 320
+    "Image height, pixels."
+    expressions: tuple[str, ...] | None = None
+    "Ids from the script, in order; None is all 60."
+    frames_per_expression: int = 8
+    "Frames of each cue window, at least 4."
+    fps: float = 24.0
+    "Frames a second written to the capture."
+    seed: int = 0
+    "Seed of everything random."
+    footage: str = "video"
+    "``video`` (H.264, 4:4:4), ``png`` or ``jpg`` frames."
+    crf: int = 10
+    "H.264 constant rate factor; lower is closer to lossless."
+    board_frames: int = 24
+    "Synchronised ChArUco poses; 0 leaves the board out."
+    give_calibration: bool = False
+    "Write calibration.json into the capture, so that nothing has to be solved."
+    plates: bool = True
+    "Write clean background plates."
+    hair: bool = True
+    "Give subjects hair strands."
+    noise: float = 1.0
+    "Sensor noise relative to a good studio camera; 0 is none."
+
+    def __post_init__(self) -> None:
+        limits = {
+            "subjects": (1, 10_000),
+            "first_subject": (0, 99_999),
+            "cameras": (1, 200),
+            "width": (32, 16_384),
+            "height": (32, 16_384),
+            "frames_per_expression": (4, 10_000),
+            "fps": (1, 1000),
+            "crf": (0, 51),
+            "board_frames": (0, 1000),
+            "noise": (0, 100),
+        }
+        for name, (low, high) in limits.items():
+            value = getattr(self, name)
+            if not low <= value <= high:
+                raise ConfigError(f"twin.{name} is {value}, expected {low} to {high}")
+        if self.footage not in ("video", "png", "jpg"):
+            raise ConfigError(f"twin.footage is {self.footage!r}, expected video, png or jpg")
+        if self.footage == "video" and (self.width % 2 or self.height % 2):
+            raise ConfigError(
+                f"twin: video frames are {self.width}x{self.height}, H.264 wants even sizes;"
+                " change the size or record frames"
+            )
+
+    def subject_ids(self) -> list[str]:
+        """Ids of the subjects, such as S001."""
+        return [f"S{self.first_subject + n:03d}" for n in range(self.subjects)]
+
+
+def subject_number(subject: str) -> int:
+    """Number of a subject id such as S001; it seeds everything about the subject.
+
+    Raises:
+        ConfigError: the id is not of that form.
+    """
+    match = re.fullmatch(r"S(\d+)", subject)
+    if match is None:
+        raise ConfigError(f"subject {subject!r} is not a twin's id, expected S001 and so on")
+    return int(match.group(1))

@@ -1,0 +1,239 @@
+"""Rendering by ray casting: colour, alpha and depth of a frame in any camera.
+
+One ray a pixel finds where there is detail; only there further rays are cast: many where the
+silhouette or hair makes alpha fractional, a few inside. Images are made in bands of rows, so that
+memory does not grow with the image.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import scipy.spatial
+
+from express50.cameras import Camera, crop_camera, project, rays
+from express50.twin.body import Material
+from express50.twin.surface import MISS, Caster
+
+BAND_PIXELS = 1 << 18
+HALO = 4  # rows and columns beyond a band that the search for detail looks at
+_DEPTH_STEP = 0.004  # metres between neighbours that count as an edge inside the silhouette
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sampling:
+    """Rays a pixel: at silhouettes and loose hair, and at detail inside the silhouette."""
+
+    edge: int = 8
+    inside: int = 2
+
+
+@dataclass(frozen=True, kw_only=True)
+class Band:
+    """Rays of some rows of a camera, halo included, in the world.
+
+    Attributes:
+        top, bottom: rows of the image, halo left out.
+        pad: rows of halo above and below.
+        origin: (3,) float32.
+        centre: (h, w, 3) directions through pixel centres, camera z 1.
+        right, down: (h, w, 3) change of direction from pixel to pixel.
+    """
+
+    top: int
+    bottom: int
+    pad: tuple[int, int]
+    origin: np.ndarray
+    centre: np.ndarray
+    right: np.ndarray
+    down: np.ndarray
+
+
+def bands(camera: Camera) -> Iterator[Band]:
+    """The image in bands of at most ``BAND_PIXELS`` pixels, top to bottom."""
+    rows = max(1, BAND_PIXELS // camera.width)
+    for top in range(0, camera.height, rows):
+        bottom = min(top + rows, camera.height)
+        start, end = max(0, top - HALO), min(camera.height, bottom + HALO)
+        part = crop_camera(camera, -1, start - 1, camera.width + 2, end - start + 2)
+        origin, grid = rays(part)
+        # Central differences; one more pixel on every side was cast for them.
+        right = 0.5 * (grid[1:-1, 2:] - grid[1:-1, :-2])
+        down = 0.5 * (grid[2:, 1:-1] - grid[:-2, 1:-1])
+        yield Band(
+            top=top, bottom=bottom, pad=(top - start, end - bottom),
+            origin=origin.astype(np.float32),
+            centre=grid[1:-1, 1:-1].astype(np.float32),
+            right=right.astype(np.float32), down=down.astype(np.float32),
+        )  # fmt: skip
+
+
+def render_bands(
+    caster: Caster,
+    material: np.ndarray,
+    window: tuple[int, int, int, int],
+    band: Band,
+    sampling: Sampling,
+    shade: Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray] | None,
+) -> tuple[np.ndarray, np.ndarray, tuple[int, int, int, int]] | None:
+    """Premultiplied colour and alpha of one band, where the subject may be.
+
+    Args:
+        caster: compiled geometry.
+        material: (F,) of each triangle.
+        window: columns and rows x0, y0, x1, y1 of the image outside of which nothing is hit.
+        band: rays.
+        sampling: how many rays.
+        shade: colours (N, 3) for directions (N, 3), faces (N,), barycentrics (N, 2); None for
+            alpha alone.
+
+    Returns:
+        colour (h, w, 3) and alpha (h, w) float32 of the part x0, y0, x1, y1 of the image; None
+        where the band does not meet the window.
+    """
+    x0, x1 = window[0], window[2]
+    y0, y1 = max(band.top, window[1]), min(band.bottom, window[3])
+    if x0 >= x1 or y0 >= y1:
+        return None
+    first = band.top - band.pad[0]
+    a, b = max(y0 - HALO, first) - first, min(y1 + HALO, band.bottom + band.pad[1]) - first
+    c, d = max(x0 - HALO, 0), min(x1 + HALO, band.centre.shape[1])
+    centre, right, down = (part[a:b, c:d] for part in (band.centre, band.right, band.down))
+    height, width = centre.shape[:2]
+    distance, face, bary = caster.cast(band.origin, centre.reshape(-1, 3))
+    edge, inside = _detail(distance.reshape(height, width), face.reshape(height, width), material)
+    keep = np.zeros((height, width), dtype=bool)
+    keep[y0 - first - a : y1 - first - a, x0 - c : x1 - c] = True
+    colour = np.zeros((height * width, 3), np.float32)
+    alpha = np.zeros(height * width, np.float32)
+    plain = np.flatnonzero(keep.ravel() & ~(edge | inside).ravel() & (face != MISS))
+    alpha[plain] = 1.0
+    if shade is not None and plain.size:
+        colour[plain] = shade(centre.reshape(-1, 3)[plain], face[plain], bary[plain])
+    flat = [part.reshape(-1, 3) for part in (centre, right, down)]
+    for chosen, count in ((edge, sampling.edge), (inside & ~edge, sampling.inside)):
+        index = np.flatnonzero((chosen & keep).ravel())
+        for part in np.array_split(index, max(1, len(index) * count >> 18)):
+            if part.size:
+                colour[part], alpha[part] = _supersample(
+                    caster, band.origin, flat, part, count, shade
+                )
+    rows = slice(y0 - first - a, y1 - first - a)
+    columns = slice(x0 - c, x1 - c)
+    return (
+        colour.reshape(height, width, 3)[rows, columns],
+        alpha.reshape(height, width)[rows, columns],
+        (x0, y0, x1, y1),
+    )
+
+
+def _detail(
+    distance: np.ndarray, face: np.ndarray, material: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Masks (h, w) of pixels whose alpha may be fractional, and of other pixels with detail."""
+    hit = face != MISS
+    kind = np.where(hit, material[np.where(hit, face, 0)], 255).astype(np.uint8)
+    box = np.ones((3, 3), np.uint8)
+    covered = hit.astype(np.uint8)
+    # Strands thinner than a pixel hide between rays: look further around hair.
+    wide = np.ones((5, 5), np.uint8)
+    hair = cv2.dilate((kind == Material.HAIR).astype(np.uint8), wide)
+    some, every = cv2.dilate(covered, box), cv2.erode(covered, box)
+    edge = (some != every) | ((hair > 0) & (cv2.erode(covered, wide) == 0))
+    z = np.where(hit, distance, 0.0).astype(np.float32)
+    steps = cv2.dilate(z, box) - cv2.erode(z, box) > _DEPTH_STEP
+    mixed = cv2.dilate(kind, box) != cv2.erode(kind, box)
+    inside = (steps | mixed | (kind == Material.HAIR)) & (some > 0)
+    return edge, inside
+
+
+def _supersample(
+    caster: Caster,
+    origin: np.ndarray,
+    flat: list[np.ndarray],
+    index: np.ndarray,
+    count: int,
+    shade: Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray] | None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Premultiplied colour (N, 3) and alpha (N,) of pixels from ``count`` rays each."""
+    u, v = ray_pattern(count)
+    centre, right, down = (part[index] for part in flat)
+    directions = (
+        centre[:, None] + u.reshape(1, -1, 1) * right[:, None] + v.reshape(1, -1, 1) * down[:, None]
+    ).reshape(-1, 3)
+    _, face, bary = caster.cast(origin, directions)
+    hit = np.flatnonzero(face != MISS)
+    seen = np.zeros(len(directions), np.float32)
+    seen[hit] = 1.0
+    colours = np.zeros((len(directions), 3), np.float32)
+    if shade is not None and hit.size:
+        colours[hit] = shade(directions[hit], face[hit], bary[hit])
+    return colours.reshape(-1, count, 3).mean(1), seen.reshape(-1, count).mean(1)
+
+
+def ray_pattern(count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Places (count,) in a pixel, -0.5 to 0.5: even in x, in y and over the pixel.
+
+    Rank-1 lattice: every row and every column of a count x count grid holds one ray.
+    """
+    k = np.arange(count)
+    stride = max(1, round(count * 0.618034))
+    while np.gcd(stride, count) != 1:
+        stride += 1
+    u = (k + 0.5) / count - 0.5
+    v = ((k * stride) % count + 0.5) / count - 0.5
+    return u.astype(np.float32), v.astype(np.float32)
+
+
+def hull_of(vertices: np.ndarray) -> np.ndarray:
+    """Corners (K, 3) of the convex hull of vertices (N, 3), which are not all in one plane."""
+    return vertices[scipy.spatial.ConvexHull(vertices).vertices]
+
+
+def window_of(camera: Camera, vertices: np.ndarray) -> tuple[int, int, int, int]:
+    """Columns and rows x0, y0, x1, y1 that hold all of some vertices (N, 3), with a margin.
+
+    The corners of the convex hull (:func:`hull_of`) are enough.
+    """
+    pixels, depth = project(camera, vertices)
+    if not (depth > 0.05).all():
+        return 0, 0, camera.width, camera.height
+    # The lens bends the hull's straight edges by less than this.
+    margin = 3 + 0.005 * max(camera.width, camera.height)
+    x0, y0 = np.floor(pixels.min(0) - margin).astype(int)
+    x1, y1 = np.ceil(pixels.max(0) + margin).astype(int)
+    size = (camera.width, camera.height)
+    x0, x1 = np.clip((x0, x1), 0, size[0])
+    y0, y1 = np.clip((y0, y1), 0, size[1])
+    return int(x0), int(y0), int(x1), int(y1)
+
+
+def render_alpha(
+    caster: Caster, material: np.ndarray, vertices: np.ndarray, camera: Camera, count: int = 32
+) -> np.ndarray:
+    """Alpha (H, W) float32 in [0, 1] of geometry in a camera."""
+    alpha = np.zeros((camera.height, camera.width), np.float32)
+    window = window_of(camera, hull_of(vertices))
+    for band in bands(camera):
+        done = render_bands(caster, material, window, band, Sampling(edge=count, inside=1), None)
+        if done is not None:
+            x0, y0, x1, y1 = done[2]
+            alpha[y0:y1, x0:x1] = done[1]
+    return alpha
+
+
+def render_depth(caster: Caster, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """Camera z (H, W) float32 metres through pixel centres, 0 where nothing is hit; and valid."""
+    depth = np.zeros((camera.height, camera.width), np.float32)
+    for band in bands(camera):
+        rows = slice(band.pad[0], band.pad[0] + band.bottom - band.top)
+        part = band.centre[rows]
+        # Directions have camera z 1, so the distance along them is camera z.
+        distance, _, _ = caster.cast(band.origin, part.reshape(-1, 3))
+        depth[band.top : band.bottom] = np.where(np.isfinite(distance), distance, 0.0).reshape(
+            part.shape[:2]
+        )
+    return depth, depth > 0

@@ -1,0 +1,278 @@
+"""Light and materials: what colour a ray sees where it meets the subject.
+
+Everything is linear light in float32. Lights are soft boxes far away; how much of each, and of the
+ambient light, reaches a vertex is found by casting rays once a frame and shared by all cameras.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from express50.head.model import HeadModel
+from express50.twin.body import Body, Material, Posed
+from express50.twin.noise import make_lattice, noise, random_stream, smoothstep
+from express50.twin.skin import SkinTexture, sample_skin
+from express50.twin.surface import Caster, smooth_over_mesh, unit
+
+# How far light bleeds round the terminator in skin, per channel: red most (d'Eon et al. 2007).
+_BLEED = np.array([0.32, 0.12, 0.06], np.float32)
+_AMBIENT_RAYS, _SOFT_RAYS, _SMOOTHING = 6, 2, 4
+
+
+@dataclass(frozen=True, kw_only=True)
+class Lighting:
+    """Soft boxes: unit directions towards them (L, 3), colours (L, 3), angular size, ambient."""
+
+    directions: np.ndarray
+    colours: np.ndarray
+    size: float
+    sky: np.ndarray
+    ground: np.ndarray
+
+
+def make_lighting(number: int, seed: int) -> Lighting:
+    """The studio's lights on the day a subject was recorded; each day differs a little."""
+    rng = random_stream(seed, number, 9)
+    towards = np.array(
+        [[0.75, 0.65, 0.9], [-0.85, 0.35, 0.75], [-0.55, 0.55, -0.9], [0.8, 0.3, -0.7]]
+    ) + rng.normal(0.0, 0.1, (4, 3))
+    power = np.array([0.95, 0.55, 0.6, 0.45]) * rng.uniform(0.8, 1.2, 4)
+    if rng.uniform() < 0.5:
+        towards[:, 0] *= -1.0
+    tint = 1.0 + rng.normal(0.0, 0.035, (4, 1)) * np.array([1.0, 0.0, -1.0])
+    return Lighting(
+        directions=unit(towards).astype(np.float32),
+        colours=(power[:, None] * tint).astype(np.float32),
+        size=float(rng.uniform(0.10, 0.22)),
+        sky=np.full(3, 0.36, np.float32) * rng.uniform(0.85, 1.15),
+        ground=np.array([0.20, 0.18, 0.17], np.float32) * rng.uniform(0.8, 1.2),
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Eyes:
+    """Both eyeballs on the mean head: centres (2, 3), optical axes (2, 3), iris half-angle."""
+
+    centres: np.ndarray
+    axes: np.ndarray
+    iris: float
+
+
+def find_eyes(model: HeadModel) -> Eyes:
+    """Where the eyeballs of a head model are and how wide their irises."""
+    template = model.template.double().numpy()
+    centres, axes, angles = [], [], []
+    for side in ("left", "right"):
+        ball = template[model.regions[f"{side}_eyeball"].numpy()]
+        iris = template[model.regions[f"{side}_iris"].numpy()]
+        # The back of the ball is round; the front may bulge with the cornea or be cut open.
+        centre = 0.5 * (ball.min(0) + ball.max(0))
+        centre[2] = ball[:, 2].max() - 0.5 * np.ptp(ball[:, :2], axis=0).mean()
+        axis = unit(iris.mean(0) - centre)
+        angles.append(np.percentile(np.arccos(np.clip(unit(iris - centre) @ axis, -1, 1)), 95))
+        centres.append(centre)
+        axes.append(axis)
+    iris_angle = float(np.clip(np.mean(angles), 0.40, 0.56))
+    return Eyes(
+        centres=np.array(centres, np.float32), axes=np.array(axes, np.float32), iris=iris_angle
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scene:
+    """One frame ready for rays: compiled geometry and per-vertex attributes.
+
+    ``attributes`` (N, 7 + L) are normal, place or colour, ambient, light by light.
+    """
+
+    caster: Caster
+    body: Body
+    texture: SkinTexture
+    eyes: Eyes
+    lighting: Lighting
+    attributes: np.ndarray
+    hair_tangents: np.ndarray
+    vertices: np.ndarray
+    iris_lattice: np.ndarray
+
+
+def build_scene(
+    body: Body, texture: SkinTexture, eyes: Eyes, lighting: Lighting, posed: Posed, seed: int
+) -> Scene:
+    """Compile one frame: Embree scene, then light at every vertex."""
+    caster = Caster(posed.vertices, body.faces)
+    heads = len(body.template)
+    hairs = len(body.extras.hair.vertices)
+    attributes = np.ones((len(posed.vertices), 7 + len(lighting.colours)), np.float32)
+    attributes[:, :3] = posed.normals
+    attributes[:heads, 3:6] = body.template
+    attributes[heads : heads + hairs, 3:6] = body.extras.hair.colours
+    attributes[heads + hairs :, 3:6] = body.subject.look.cloth
+    solid = np.r_[0:heads, heads + hairs : len(attributes)]
+    attributes[solid, 6:] = _light_at(caster, posed.vertices[solid], posed.normals[solid], lighting)
+    smooth = smooth_over_mesh(attributes[:heads, 6:], body.model.faces.numpy(), _SMOOTHING)
+    attributes[:heads, 6:] = smooth
+    return Scene(
+        caster=caster, body=body, texture=texture, eyes=eyes, lighting=lighting,
+        attributes=attributes, hair_tangents=posed.tangents, vertices=posed.vertices,
+        iris_lattice=make_lattice(random_stream(seed, body.subject.number, 10)),
+    )  # fmt: skip
+
+
+def _light_at(
+    caster: Caster, points: np.ndarray, normals: np.ndarray, lighting: Lighting
+) -> np.ndarray:
+    """Share (N, 1 + L) of the ambient light and of each soft box that reaches points."""
+    count, starts = len(points), points + 6e-4 * normals
+    out = np.empty((count, 1 + len(lighting.directions)), np.float32)
+    helper = np.where(np.abs(normals[:, 1:2]) < 0.9, [[0.0, 1.0, 0.0]], [[1.0, 0.0, 0.0]])
+    across = unit(np.cross(helper, normals))
+    other = np.cross(normals, across)
+    # Every vertex turns the pattern by its own angle; smoothing then averages neighbours' rays.
+    spin = np.random.default_rng(0).uniform(0, 2 * np.pi, (count, 1))
+    free = np.zeros(count, np.float32)
+    for k in range(_AMBIENT_RAYS):
+        # Cosine-weighted spiral over the hemisphere.
+        radius, angle = np.sqrt((k + 0.5) / _AMBIENT_RAYS), 2.399963 * k + spin
+        ray = radius * (np.cos(angle) * across + np.sin(angle) * other)
+        free += ~caster.blocked(starts, ray + np.sqrt(1.0 - radius**2) * normals, 0.10)
+    out[:, 0] = free / _AMBIENT_RAYS
+    for light, direction in enumerate(lighting.directions):
+        side = unit(np.cross(direction, [0.0, 1.0, 0.1]))
+        lift = np.cross(side, direction)
+        lit = np.flatnonzero(normals @ direction > -0.3)
+        seen = np.zeros(len(lit), np.float32)
+        for k in range(_SOFT_RAYS):
+            angle = 2 * np.pi / _SOFT_RAYS * k + spin[lit]
+            ray = unit(direction + lighting.size * (np.cos(angle) * side + np.sin(angle) * lift))
+            seen += ~caster.blocked(starts[lit], ray, 2.0)
+        out[:, 1 + light] = 0.0
+        out[lit, 1 + light] = seen / _SOFT_RAYS
+    return out
+
+
+def shade(scene: Scene, directions: np.ndarray, face: np.ndarray, bary: np.ndarray) -> np.ndarray:
+    """Linear colour (N, 3) of hits.
+
+    Args:
+        scene: the frame.
+        directions: (N, 3) ray directions, any length.
+        face: (N,) index of the triangle hit; none may be a miss.
+        bary: (N, 2) weights of its second and third vertex.
+    """
+    body = scene.body
+    corners = body.faces[face]
+    w1, w2 = bary[:, :1], bary[:, 1:]
+    attributes = scene.attributes
+    mixed = np.take(attributes, corners[:, 0], axis=0) * (1 - w1 - w2)
+    mixed += np.take(attributes, corners[:, 1], axis=0) * w1
+    mixed += np.take(attributes, corners[:, 2], axis=0) * w2
+    view = -unit(directions)
+    normal = unit(mixed[:, :3])
+    facing = (normal * view).sum(1, keepdims=True)
+    normal = np.where(facing < 0, normal - 2 * facing * view, normal)
+    material = body.material[face]
+    out = np.empty((len(face), 3), np.float32)
+    for kind in np.unique(material):
+        chosen = np.flatnonzero(material == kind)
+        n, v, m = normal[chosen], view[chosen], mixed[chosen]
+        if kind == Material.HAIR:
+            first = corners[chosen, 0] - len(body.template)
+            out[chosen] = _hair(scene.lighting, n, v, m, scene.hair_tangents[first])
+            continue
+        albedo, gloss, power = _surface(scene, kind, m[:, 3:6])
+        out[chosen] = _lit(scene.lighting, n, v, m[:, 6:], albedo, gloss, power, kind)
+    return out
+
+
+def _surface(
+    scene: Scene, kind: int, place: np.ndarray
+) -> tuple[np.ndarray, np.ndarray | float, float]:
+    """Albedo (N, 3), strength and sharpness of the highlight at places (N, 3) on the mean head."""
+    if kind == Material.SKIN:
+        texel = sample_skin(scene.texture, place)
+        return texel[:, :3], 0.045 * texel[:, 3:], 22.0
+    if kind == Material.EYE:
+        return _eye_albedo(scene, place), 0.9, 400.0
+    if kind == Material.CLOTH:
+        return place, 0.01, 5.0
+    colour, gloss, power = {
+        Material.TEETH: ((0.68, 0.62, 0.52), 0.25, 90.0),
+        Material.MOUTH: ((0.30, 0.10, 0.09), 0.10, 40.0),
+        Material.TONGUE: ((0.42, 0.17, 0.16), 0.12, 30.0),
+    }[Material(kind)]
+    grain = 1.0 + 0.10 * noise(place / 0.0025, scene.iris_lattice)
+    return grain[:, None] * np.array(colour, np.float32), gloss, power
+
+
+def _eye_albedo(scene: Scene, place: np.ndarray) -> np.ndarray:
+    """Iris, pupil and sclera (N, 3) by the angle from the optical axis."""
+    eyes = scene.eyes
+    side = (place[:, 0] < 0).astype(np.int32)  # the left eye is at +x
+    out = unit(place - eyes.centres[side])
+    axis = eyes.axes[side]
+    angle = np.arccos(np.clip((out * axis).sum(1), -1.0, 1.0)) / eyes.iris
+    around = np.arctan2(out[:, 1] - axis[:, 1], out[:, 0] - axis[:, 0])
+    streaks = noise(np.stack([around * 9.0, angle * 1.5, side * 7.0], 1), scene.iris_lattice)
+    colour = scene.body.subject.look.eyes.astype(np.float32)
+    ring = 1.0 - 0.65 * smoothstep(angle, 0.78, 1.0)
+    inner = 1.0 + 0.5 * smoothstep(angle, 0.75, 0.45)
+    iris = colour * ((0.9 + 0.5 * streaks) * ring * inner)[:, None]
+    iris = iris * smoothstep(angle, 0.36, 0.42)[:, None] + 0.004
+    veins = smoothstep(noise(place / 0.0018, scene.iris_lattice), 0.35, 0.8)
+    far = smoothstep(angle, 1.1, 2.4)
+    white = np.array([0.60, 0.56, 0.53]) * (1 - 0.12 * far)[:, None]
+    white = white - (veins * far)[:, None] * np.array([0.05, 0.16, 0.15])
+    mix = smoothstep(angle, 0.95, 1.08)[:, None]
+    return (iris * (1 - mix) + white * mix).astype(np.float32)
+
+
+def _lit(
+    lighting: Lighting,
+    n: np.ndarray,
+    v: np.ndarray,
+    reach: np.ndarray,
+    albedo: np.ndarray,
+    gloss: np.ndarray | float,
+    power: float,
+    kind: int,
+) -> np.ndarray:
+    """Diffuse with soft terminator, Blinn-Phong highlight with Fresnel's rise, ambient."""
+    bleed = _BLEED if kind == Material.SKIN else np.zeros(3, np.float32)
+    up = 0.5 + 0.5 * n[:, 1:2]
+    diffuse = (lighting.ground * (1 - up) + lighting.sky * up) * reach[:, :1]
+    highlight = np.zeros_like(diffuse)
+    rim = (1.0 - np.clip((n * v).sum(1, keepdims=True), 0.0, 1.0)) ** 4
+    for k, towards in enumerate(lighting.directions):
+        cosine = (n @ towards)[:, None]
+        seen = reach[:, 1 + k : 2 + k]
+        soft = np.maximum(cosine + bleed, 0.0)
+        # Light that bled into shadow has crossed flesh, so shadows' edges are red as well.
+        share = seen * (1.0 + 1.5 * bleed * (1.0 - seen))
+        diffuse += (lighting.colours[k] / (1 + bleed)) * soft * share
+        half = unit(v + towards)
+        lobe = np.clip((n * half).sum(1, keepdims=True), 0.0, 1.0) ** power
+        highlight += lighting.colours[k] * (lobe * seen * (cosine > 0) * (power + 2.0) / 8.0)
+    if kind == Material.EYE:
+        highlight *= 0.08
+    return albedo * diffuse + highlight * gloss * (0.55 + 2.0 * rim)
+
+
+def _hair(
+    lighting: Lighting, n: np.ndarray, v: np.ndarray, mixed: np.ndarray, tangent: np.ndarray
+) -> np.ndarray:
+    """Two highlights along the strand and a diffuse term (Kajiya and Kay 1989; Marschner 2003)."""
+    albedo = mixed[:, 3:6]
+    up = 0.5 + 0.5 * n[:, 1:2]
+    out = albedo * (lighting.ground * (1 - up) + lighting.sky * up)
+    for k, towards in enumerate(lighting.directions):
+        along = (tangent @ towards)[:, None]
+        shown = np.clip(0.35 + 0.75 * (n @ towards)[:, None], 0.0, 1.0)
+        half = unit(v + towards)
+        across = np.sqrt(np.clip(1.0 - (tangent * half).sum(1, keepdims=True) ** 2, 0.0, 1.0))
+        diffuse = np.sqrt(np.clip(1.0 - along * along, 0.0, 1.0))
+        gleam = 0.045 * across**60 + 0.35 * albedo * across**14
+        out = out + lighting.colours[k] * shown * (0.75 * albedo * diffuse + gleam)
+    return out

@@ -1,0 +1,226 @@
+"""Skin painted by procedure, as a texture over directions from the head's centre.
+
+The texture knows nothing of the head model's UV map: a place on the mean head is looked up by its
+azimuth and elevation, so any head model can be painted. What folds behind (nostrils, the back of
+the ear) shares the colour of what is in front of it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from express50.head.model import HeadModel, landmarks
+from express50.twin.body import Body, Material, model_materials
+from express50.twin.noise import fractal, make_lattice, noise, random_stream, smoothstep
+from express50.twin.surface import (
+    MISS,
+    Caster,
+    smooth_over_mesh,
+    spherical_to_unit,
+    unit_to_spherical,
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SkinTexture:
+    """Colour and gloss by direction: (H, W, 4) float32, linear light and a factor."""
+
+    pixels: np.ndarray
+    centre: np.ndarray
+
+
+def texture_width(image_short_side: int) -> int:
+    """Texels around the head so that one is about as wide as a pixel of the images."""
+    wanted = 2 * np.pi * 0.1 / 0.43 * image_short_side * 1.2
+    return int(np.clip(2 ** np.ceil(np.log2(wanted)), 256, 4096))
+
+
+def sample_skin(texture: SkinTexture, points: np.ndarray) -> np.ndarray:
+    """Bilinear samples (N, 4) at places (N, 3) on the mean head."""
+    height, width = texture.pixels.shape[:2]
+    az, el = unit_to_spherical(points - texture.centre.astype(np.float32))
+    x = (az * np.float32(0.5 / np.pi) + np.float32(0.5)) * width - np.float32(0.5)
+    y = (el * np.float32(1.0 / np.pi) + np.float32(0.5)) * height - np.float32(0.5)
+    y = np.clip(y, 0, np.float32(height - 1.01))
+    left, top = np.floor(x), np.floor(y)
+    fx, fy = (x - left)[:, None], (y - top)[:, None]
+    x0, y0 = left.astype(np.int32), top.astype(np.int32)
+    xa, xb = x0 % width, (x0 + 1) % width
+    flat = texture.pixels.reshape(-1, 4)
+    row = y0 * width
+    low = flat[row + xa] * (1 - fx) + flat[row + xb] * fx
+    row = row + width
+    high = flat[row + xa] * (1 - fx) + flat[row + xb] * fx
+    return low * (1 - fy) + high * fy
+
+
+def paint_skin(body: Body, seed: int, width: int) -> SkinTexture:
+    """Paint the texture of one subject, ``width`` texels around."""
+    height = width // 2
+    rows = max(1, 262_144 // width)
+    bands = [
+        _paint_band(body, seed, width, height, y, min(y + rows, height))
+        for y in range(0, height, rows)
+    ]
+    pixels = np.concatenate(bands).reshape(height, width, 4)
+    return SkinTexture(pixels=pixels, centre=body.centre)
+
+
+def _paint_band(body: Body, seed: int, width: int, height: int, y0: int, y1: int) -> np.ndarray:
+    """Texels (N, 4) of rows y0 to y1."""
+    model, look = body.model, body.subject.look
+    points, masks = _surface_at(body, width, height, y0, y1)
+    rng = random_stream(seed, body.subject.number, 8)
+    lattices = [make_lattice(rng) for _ in range(6)]
+    face = masks["face"]
+    albedo = np.broadcast_to(look.skin.astype(np.float32), points.shape).copy()
+    tone = fractal(points, lattices[0], 0.030, 4, 0.55)
+    albedo *= 1.0 + 0.085 * tone[:, None] * np.array([0.6, 1.0, 1.1], np.float32)
+    flush = look.flush * _flush(model, points) * (0.7 + 0.5 * noise(points / 0.012, lattices[1]))
+    albedo *= 1.0 + flush[:, None] * np.array([0.02, -0.25, -0.22], np.float32)
+    pores = fractal(points, lattices[2], 0.0022, 2, 0.7)
+    albedo *= 1.0 + 0.05 * pores[:, None]
+    spots = smoothstep(fractal(points, lattices[3], 0.0045, 2), 0.42, 0.72)
+    where = face * smoothstep(noise(points / 0.02, lattices[4]), -0.4, 0.3)
+    albedo *= 1.0 - look.freckles * (spots * where)[:, None] * np.array([0.32, 0.45, 0.55])
+    albedo = _moles(rng, albedo, points, model, look.moles)
+    gloss = look.gloss * (1.0 + 0.25 * pores) * (0.8 + 0.5 * _oily(model, points))
+    lips = smoothstep(masks["lips"] + 0.10 * noise(points / 0.004, lattices[5]), 0.35, 0.65)
+    lip_colour = (
+        look.lips
+        * (1.0 + 0.12 * fractal(points * (1.0, 0.25, 1.0), lattices[1], 0.0025, 2))[:, None]
+    )
+    albedo += lips[:, None] * (lip_colour - albedo)
+    gloss += lips * 1.3
+    hairs = _hairiness(body, points, masks, lattices)
+    albedo += hairs[:, None] * (look.hair * 0.8 + 0.01 - albedo)
+    return np.concatenate([albedo, gloss[:, None] * (1 - 0.8 * hairs[:, None])], axis=1).astype(
+        np.float32
+    )
+
+
+def _surface_at(
+    body: Body, width: int, height: int, y0: int, y1: int
+) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Places (N, 3) on the mean head under the texels of some rows, and masks there."""
+    model = body.model
+    az = (np.arange(width) + 0.5) / width * 2 * np.pi - np.pi
+    el = (np.arange(y0, y1) + 0.5) / height * np.pi - 0.5 * np.pi
+    out = spherical_to_unit(*np.meshgrid(az, el)).reshape(-1, 3)
+    faces = model.faces.numpy()
+    faces = faces[model_materials(model)[faces].min(1) == Material.SKIN]
+    distance, face, bary = Caster(body.template, faces).cast(body.centre + out, -out)
+    # Beyond the centre it has come in through the open neck and struck the skull from inside.
+    hit = (face != MISS) & (distance < 1.0)
+    corners = faces[np.where(hit, face, 0)]
+    weights = np.stack([1 - bary.sum(1), bary[:, 0], bary[:, 1]], axis=1)
+
+    def at(values: np.ndarray) -> np.ndarray:
+        return np.where(hit, (values[corners] * weights).sum(1), 0.0).astype(np.float32)
+
+    points = body.centre + out * np.where(hit, 1.0 - distance, 0.1)[:, None]
+    masks = {
+        name: at(smooth_over_mesh(model.regions[name].numpy().astype(np.float32), faces, 1))
+        for name in ("lips", "face")
+    }
+    masks["scalp"] = at(body.scalp)
+    return points.astype(np.float32), masks
+
+
+def _mean_landmarks(model: HeadModel) -> np.ndarray:
+    return landmarks(model, model.template[None])[0].double().numpy()
+
+
+def _flush(model: HeadModel, points: np.ndarray) -> np.ndarray:
+    """Redness (N,): cheeks, tip of the nose, ears, chin."""
+    marks = _mean_landmarks(model)
+    left = 0.35 * marks[46] + 0.35 * marks[14] + 0.3 * marks[54]
+    right = 0.35 * marks[41] + 0.35 * marks[2] + 0.3 * marks[48]
+    total = np.zeros(len(points), np.float32)
+    for centre, radius, weight in (
+        (left, 0.026, 1.0), (right, 0.026, 1.0), (marks[30], 0.014, 0.9), (marks[8], 0.018, 0.4),
+    ):  # fmt: skip
+        total += weight * np.exp(-((points - centre) ** 2).sum(1) / (2 * radius**2))
+    ears = (model.regions["left_ear"] | model.regions["right_ear"]).numpy()
+    for side in (1.0, -1.0):
+        ear = model.template.numpy()[ears & (model.template[:, 0].numpy() * side > 0)].mean(0)
+        total += 0.8 * np.exp(-((points - ear) ** 2).sum(1) / (2 * 0.02**2))
+    return total
+
+
+def _oily(model: HeadModel, points: np.ndarray) -> np.ndarray:
+    """Shine (N,): forehead, nose."""
+    marks = _mean_landmarks(model)
+    brow = 0.5 * (marks[21] + marks[22]) + np.array([0.0, 0.03, 0.0])
+    nose = 0.5 * (marks[28] + marks[30])
+    forehead = np.exp(-((points - brow) ** 2).sum(1) / (2 * 0.03**2))
+    return forehead + np.exp(-((points - nose) ** 2).sum(1) / (2 * 0.014**2))
+
+
+def _moles(
+    rng: np.random.Generator, albedo: np.ndarray, points: np.ndarray, model: HeadModel, count: int
+) -> np.ndarray:
+    """Darken a few round spots on face and neck."""
+    places = model.template.numpy()[(model.regions["face"] | model.regions["neck"]).numpy()]
+    for place in places[rng.integers(0, len(places), count)]:
+        radius = rng.uniform(0.0007, 0.0018)
+        inside = smoothstep(np.linalg.norm(points - place, axis=1), 1.25 * radius, 0.75 * radius)
+        albedo = albedo * (1.0 - inside[:, None] * np.array([0.55, 0.65, 0.7]))
+    return albedo
+
+
+def _hairiness(
+    body: Body, points: np.ndarray, masks: dict[str, np.ndarray], lattices: list[np.ndarray]
+) -> np.ndarray:
+    """Coverage (N,) by short hair that has no geometry: brows, stubble, the roots on the scalp."""
+    look, marks = body.subject.look, _mean_landmarks(body.model)
+    cover = np.zeros(len(points), np.float32)
+    for ids in (range(17, 22), range(22, 27)):
+        along, off = _along_polyline(points, marks[list(ids)])
+        if ids[0] == 17:
+            along = 1.0 - along  # from the inner end outwards, on both sides
+        thick = 0.0046 * (1.0 - 0.55 * along) * smoothstep(along, -0.06, 0.12) + 0.0006
+        fibres = noise(np.stack([along * 60 + off * 900, off * 500, along * 10], 1), lattices[3])
+        body_of_brow = smoothstep(np.abs(off) / thick + 0.28 * fibres, 1.25, 0.55)
+        ends = smoothstep(along, -0.10, 0.02) * smoothstep(along, 1.10, 0.92)
+        cover = np.maximum(cover, look.brow_density * body_of_brow * ends)
+    if look.stubble > 0:
+        cover = np.maximum(cover, look.stubble * _beard(marks, points, masks, lattices))
+    if look.hair_length_m > 0 and len(body.extras.hair.vertices):
+        cover = np.maximum(cover, 0.85 * masks["scalp"])
+    return np.clip(cover, 0.0, 1.0)
+
+
+def _beard(
+    marks: np.ndarray, points: np.ndarray, masks: dict[str, np.ndarray], lattices: list[np.ndarray]
+) -> np.ndarray:
+    """Where a beard grows (N,), as dots of stubble."""
+    mouth, chin = marks[[48, 54]].mean(0), marks[8]
+    nose = marks[33]
+    below = smoothstep(points[:, 1], nose[1] - 0.001, nose[1] - 0.012)
+    jaw = smoothstep(points[:, 1], chin[1] - 0.035, chin[1] - 0.005)
+    cheek = np.abs(points[:, 0] - mouth[0]) / 0.06
+    line = smoothstep(points[:, 1] - (mouth[1] + 0.05 * (cheek - 0.75)), 0.02, -0.004)
+    front = smoothstep(points[:, 2], mouth[2] - 0.10, mouth[2] - 0.06)
+    upper = np.exp(-(((points - (marks[33] + marks[51]) / 2) / (0.022, 0.009, 0.03)) ** 2).sum(1))
+    dots = smoothstep(noise(points / 0.0011, lattices[2]), -0.1, 0.5)
+    area = below * jaw * front * np.maximum(line, 1.3 * upper) * (1 - masks["lips"])
+    return np.clip(area, 0, 1) * (0.30 + 0.35 * dots)
+
+
+def _along_polyline(points: np.ndarray, line: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Place along a polyline (N,), 0 to 1 and beyond the ends, and signed height off it, metres.
+
+    Works in the front view, where brows run sideways.
+    """
+    order = line[np.argsort(line[:, 0])]
+    place = np.interp(points[:, 0], order[:, 0], np.arange(len(order)) / (len(order) - 1))
+    span = order[-1, 0] - order[0, 0]
+    beyond = np.minimum(points[:, 0] - order[0, 0], 0) + np.maximum(points[:, 0] - order[-1, 0], 0)
+    height = np.interp(points[:, 0], order[:, 0], order[:, 1])
+    depth = np.interp(points[:, 0], order[:, 0], order[:, 2])
+    off = points[:, 1] - height
+    away = np.abs(points[:, 2] - depth) > 0.03
+    return (place + beyond / span).astype(np.float32), np.where(away, 1.0, off).astype(np.float32)

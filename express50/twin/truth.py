@@ -1,0 +1,205 @@
+"""Ground truth of the twin, kept apart from the capture: opened by benchmarks, tests and reports.
+
+Only parameters are stored; meshes, depth and alpha are made from them when they are asked for.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from express50.cameras import Camera, read_cameras, write_cameras
+from express50.errors import CaptureError
+from express50.head.load import load_head
+from express50.head.model import HeadModel
+from express50.head.model import landmarks as head_landmarks
+from express50.transforms import make_transform
+from express50.twin import render
+from express50.twin.body import Body, Extras, assemble, head_vertices, pose_body
+from express50.twin.hair import HairMesh
+from express50.twin.performance import Performance
+from express50.twin.subjects import Look, Subject
+from express50.twin.surface import Caster
+
+_PLAY = ("strength", "expression", "jaw", "neck", "eyes", "R", "t")
+
+
+def write_truth(
+    folder: Path, head: str, body: Body, play: Performance, cameras: Mapping[str, Camera]
+) -> None:
+    """Write a subject's truth: cameras.json, peaks.json, subject.json, frames.npz, body.npz."""
+    folder.mkdir(parents=True, exist_ok=True)
+    write_cameras(folder / "cameras.json", cameras)
+    subject = body.subject
+    look = {
+        k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in asdict(subject.look).items()
+    }
+    about = {"id": subject.id, "number": subject.number, "head": head, "look": look,
+             "cues": play.cues}  # fmt: skip
+    (folder / "subject.json").write_text(json.dumps(about, indent=1) + "\n")
+    (folder / "peaks.json").write_text(json.dumps(play.peaks, indent=1) + "\n")
+    np.savez_compressed(folder / "frames.npz", **{name: getattr(play, name) for name in _PLAY})
+    extras = body.extras
+    np.savez_compressed(
+        folder / "body.npz",
+        shape=subject.shape, offsets=subject.offsets, scalp=body.scalp, centre=body.centre,
+        hair_vertices=extras.hair.vertices, hair_faces=extras.hair.faces,
+        cloth_vertices=extras.cloth_vertices, cloth_faces=extras.cloth_faces,
+        skull=extras.skull, skull_rest=extras.skull_rest,
+    )  # fmt: skip
+
+
+class Truth:
+    """Reads what :func:`write_truth` wrote; everything is in the true world, metres."""
+
+    def __init__(self, root: Path) -> None:
+        """Open ``OUT/truth`` of a recording.
+
+        Raises:
+            CaptureError: the folder holds no truth.
+        """
+        self.root = Path(root)
+        if not self.subjects():
+            raise CaptureError(
+                f"{root}: holds no truth; expected the truth folder that 'express50 twin record'"
+                " writes beside captures"
+            )
+        self._subject = lru_cache(maxsize=4)(self._read_subject)
+        self._scene = lru_cache(maxsize=4)(self._compile)
+
+    def subjects(self) -> list[str]:
+        """Ids of the recorded subjects."""
+        return sorted(path.parent.name for path in self.root.glob("*/subject.json"))
+
+    def cameras(self, subject: str) -> dict[str, Camera]:
+        """The rig's true cameras, distorted, by id."""
+        return read_cameras(self.root / subject / "cameras.json")
+
+    def peaks(self, subject: str) -> dict[str, int]:
+        """Frame of each expression's peak."""
+        return dict(self._subject(subject)[1].peaks)
+
+    def head_model(self, subject: str) -> HeadModel:
+        """The head model that the subject was made with."""
+        return self._subject(subject)[0].model
+
+    def parameters(self, subject: str, frame: int) -> dict[str, np.ndarray]:
+        """Parameters of a frame: shape, offsets, expression, jaw, neck, eyes, R, t, strength."""
+        body, play = self._subject(subject)
+        self._check_frame(subject, play, frame)
+        values = {name: getattr(play, name)[frame] for name in _PLAY}
+        return {"shape": body.subject.shape, "offsets": body.subject.offsets} | values
+
+    def vertices(self, subject: str, frame: int) -> np.ndarray:
+        """Head-model vertices (V, 3) in the world."""
+        body, play = self._subject(subject)
+        self._check_frame(subject, play, frame)
+        return head_vertices(body.model, body.subject, play, frame)
+
+    def landmarks(self, subject: str, frame: int) -> np.ndarray:
+        """The 68 landmarks (68, 3) in the world."""
+        vertices = torch.from_numpy(self.vertices(subject, frame))[None]
+        model = self.head_model(subject).to(dtype=torch.float64)
+        return head_landmarks(model, vertices)[0].numpy()
+
+    def mesh(self, subject: str, frame: int) -> tuple[np.ndarray, np.ndarray]:
+        """All geometry, hair and shoulders included: vertices (N, 3) and faces (F, 3)."""
+        _, vertices = self._scene(subject, frame)
+        return vertices, self._subject(subject)[0].faces
+
+    def render_depth(
+        self, subject: str, frame: int, camera: Camera
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Depth (H, W) float32, camera z in metres, 0 where empty, and validity (H, W) bool."""
+        caster, _ = self._scene(subject, frame)
+        return render.render_depth(caster, camera)
+
+    def render_alpha(self, subject: str, frame: int, camera: Camera) -> np.ndarray:
+        """Alpha (H, W) float32 in [0, 1] of the subject, from 32 rays a pixel at silhouettes."""
+        caster, vertices = self._scene(subject, frame)
+        return render.render_alpha(caster, self._subject(subject)[0].material, vertices, camera)
+
+    def _compile(self, subject: str, frame: int) -> tuple[Caster, np.ndarray]:
+        body, play = self._subject(subject)
+        self._check_frame(subject, play, frame)
+        vertices = pose_body(body, play, frame, with_normals=False).vertices
+        return Caster(vertices, body.faces), vertices
+
+    def _check_frame(self, subject: str, play: Performance, frame: int) -> None:
+        if not 0 <= frame < play.frames:
+            raise ValueError(
+                f"{subject}: frame {frame} not in truth, expected 0..{play.frames - 1}"
+            )
+
+    def _read_subject(self, subject: str) -> tuple[Body, Performance]:
+        folder = self.root / subject
+        if not (folder / "subject.json").is_file():
+            raise CaptureError(
+                f"{self.root}: no truth of subject {subject!r}; it has {', '.join(self.subjects())}"
+            )
+        about = json.loads((folder / "subject.json").read_text())
+        peaks = json.loads((folder / "peaks.json").read_text())
+        with np.load(folder / "frames.npz", allow_pickle=False) as data:
+            arrays = {name: data[name] for name in _PLAY}
+        play = Performance(
+            cues=tuple((str(e), int(a), int(b)) for e, a, b in about["cues"]), peaks=peaks, **arrays
+        )
+        with np.load(folder / "body.npz", allow_pickle=False) as data:
+            body = _read_body(about, {name: data[name] for name in data.files})
+        return body, play
+
+
+def _read_body(about: dict, data: dict[str, np.ndarray]) -> Body:
+    """The body from its stored geometry; what only colours need is left empty."""
+    look = Look(**{k: np.array(v) if isinstance(v, list) else v for k, v in about["look"].items()})
+    subject = Subject(
+        id=about["id"], number=about["number"], shape=data["shape"], offsets=data["offsets"],
+        look=look,
+    )  # fmt: skip
+    blank = np.zeros_like(data["hair_vertices"])
+    hair = HairMesh(
+        vertices=data["hair_vertices"], faces=data["hair_faces"], tangents=blank, normals=blank,
+        colours=blank,
+    )  # fmt: skip
+    extras = Extras(
+        hair=hair, cloth_vertices=data["cloth_vertices"], cloth_faces=data["cloth_faces"],
+        skull=data["skull"], skull_rest=data["skull_rest"],
+    )  # fmt: skip
+    return assemble(load_head(about["head"]), subject, extras, data["scalp"], data["centre"])
+
+
+def align_worlds(
+    estimated: Mapping[str, Camera], true: Mapping[str, Camera], lever_m: float = 1.0
+) -> np.ndarray:
+    """``world_true_from_estimated`` (4, 4), rigid, from cameras that both rigs have.
+
+    Centres and viewing frames count together: each camera gives its centre and the ends of its
+    axes at ``lever_m``, so that even two cameras, or cameras in one line, fix the rotation.
+
+    Raises:
+        ValueError: no camera is in both.
+    """
+    shared = sorted(set(estimated) & set(true))
+    if not shared:
+        raise ValueError(
+            f"rigs share no camera: estimated {sorted(estimated)}, true {sorted(true)}"
+        )
+    source = np.concatenate([_frame_points(estimated[name], lever_m) for name in shared])
+    target = np.concatenate([_frame_points(true[name], lever_m) for name in shared])
+    mean_s, mean_t = source.mean(0), target.mean(0)
+    U, _, Vt = np.linalg.svd((target - mean_t).T @ (source - mean_s))
+    R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+    return make_transform(R, mean_t - R @ mean_s)
+
+
+def _frame_points(camera: Camera, lever: float) -> np.ndarray:
+    pose = camera.world_from_cam
+    ends = pose[:3, 3] + lever * pose[:3, :3].T
+    # Both ends of every axis, so that the points' mean is the centre.
+    return np.concatenate([pose[None, :3, 3], ends, 2 * pose[:3, 3] - ends])
