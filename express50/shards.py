@@ -4,6 +4,12 @@ A folder of shards holds ``<split>-000000.tar`` ..., ``index.json`` (where every
 its CRC-32), ``manifest.json`` (SHA-256 of every file). Members of a sample are adjacent; their key
 has no dot, so that ``tar``, ``webdataset`` and Hugging Face ``datasets`` read the shards as they
 are. The writer is in :mod:`express50.shards_write`.
+
+``meta.json`` of a sample: ids ``subject expression camera``, ``frame``, ``fps``; ``K``,
+``cam_from_world``, ``width``, ``height`` of the picture as packed; ``depth_scale_m``; ``head`` and
+``track`` {shape expression neck jaw eyes R t}, the head model and its parameters, with world =
+R @ head + t in the cameras' world; ``label`` (who chose the frame), ``crop``, ``source_size``,
+``consent``, ``licence``, ``session``.
 """
 
 from __future__ import annotations

@@ -97,7 +97,7 @@ def hull_distance(views: Sequence[View], points: np.ndarray) -> np.ndarray:
 
     Each view bounds the distance by its silhouette's, scaled from pixels to metres at the point's
     depth; the hull is the intersection, hence the maximum (Laurentini 1994). Points that fewer
-    than two views see are outside.
+    than two views, or a third of them, see are outside: too little would bound them.
     """
     distance = np.full(len(points), -UNSEEN, np.float32)
     seen = np.zeros(len(points), np.int8)
@@ -115,7 +115,7 @@ def hull_distance(views: Sequence[View], points: np.ndarray) -> np.ndarray:
         metres = -sample_image(view.silhouette_px, pixels[inside]) * depth[inside] / focal
         distance[inside] = np.maximum(distance[inside], metres)
         seen += inside
-    return np.where(seen >= 2, distance, UNSEEN).astype(np.float32)
+    return np.where(seen >= max(2, len(views) / 3), distance, UNSEEN).astype(np.float32)
 
 
 def head_box(views: Sequence[View], cells: int = 40) -> tuple[np.ndarray, np.ndarray]:

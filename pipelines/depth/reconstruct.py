@@ -211,7 +211,7 @@ def _finish(views: Sequence[View], grid: Grid, config: DepthConfig) -> Surface:
     offsets = np.array([-1.0, 0.0, 1.0]) * grid.voxel
     agreement = _scores(views, vertices, normals, faces, offsets, grid.voxel, config)[:, 1]
     on_hull = np.abs(hull_distance(views, vertices)) < 0.5 * grid.voxel
-    confidence = np.clip(agreement, 0, 1)
+    confidence = _averaged(np.clip(agreement, 0, 1), faces)
     used = np.zeros(len(vertices), bool)
     used[faces] = True
     numbers = {
@@ -226,6 +226,14 @@ def _finish(views: Sequence[View], grid: Grid, config: DepthConfig) -> Surface:
     confidence = np.maximum(confidence, np.where(on_hull, 0.5, 0.1)).astype(np.float32)
     colors = _colors(views, vertices, normals, faces, grid.voxel)
     return Surface(vertices, normals, faces, confidence, colors, grid, numbers)
+
+
+def _averaged(values: np.ndarray, faces: np.ndarray, rounds: int = 6) -> np.ndarray:
+    """Vertex values (V,) averaged over their neighbours: a patch speaks for what lies around it."""
+    laplacian = graph_laplacian(faces, len(values))
+    for _ in range(rounds):
+        values = values - 0.5 * (laplacian @ values)
+    return values
 
 
 def _colors(

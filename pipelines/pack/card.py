@@ -1,0 +1,117 @@
+"""Splits by subject and the dataset card."""
+
+from __future__ import annotations
+
+import hashlib
+from collections import Counter
+from collections.abc import Mapping, Sequence
+
+from express50.errors import StageError
+
+
+def split_subjects(
+    subjects: Sequence[str], test_subjects: Sequence[str], fraction: float, seed: int
+) -> dict[str, list[str]]:
+    """Subjects of ``train`` and ``test``; nobody is in both.
+
+    Without named test subjects each subject's seeded hash decides, so that a subject stays in its
+    split when others join; at least one of two or more is chosen unless the fraction is 0.
+
+    Raises:
+        StageError: a named subject is not there, or none is left to train on.
+    """
+    unknown = sorted(set(test_subjects) - set(subjects))
+    if unknown:
+        raise StageError(
+            f"pack.test_subjects names {', '.join(unknown)}; expected some of"
+            f" {', '.join(sorted(subjects))}"
+        )
+    test = set(test_subjects)
+    if not test and fraction > 0 and len(subjects) > 1:
+        draw = {name: _draw(seed, name) for name in subjects}
+        test = {name for name in subjects if draw[name] < fraction}
+        test = test or {min(subjects, key=lambda name: draw[name])}
+    train = sorted(set(subjects) - test)
+    if not train:
+        raise StageError(
+            f"all {len(test)} subjects are in the test split; lower pack.test_fraction or name"
+            " fewer pack.test_subjects"
+        )
+    return {"train": train, "test": sorted(test)}
+
+
+def _draw(seed: int, subject: str) -> float:
+    """Uniform number in [0, 1) of a subject."""
+    digest = hashlib.sha256(f"{seed}:{subject}".encode()).digest()
+    return int.from_bytes(digest[:8]) / 2**64
+
+
+def write_card(
+    splits: Mapping[str, Sequence[str]],
+    metas: Sequence[Mapping],
+    dropped: Sequence[Mapping],
+    statistics: Mapping[str, object],
+) -> str:
+    """Markdown datasheet of the packed samples.
+
+    Args:
+        splits: subjects by split.
+        metas: meta.json of every sample.
+        dropped: what was left out, with reasons.
+        statistics: further named numbers.
+    """
+    subjects = sorted({meta["subject"] for meta in metas})
+    expressions = sorted({meta["expression"] for meta in metas})
+    cameras = sorted({meta["camera"] for meta in metas})
+    counts = Counter((meta["subject"], meta["expression"]) for meta in metas)
+    lines = [
+        "# Dataset card",
+        "",
+        f"{len(metas)} samples of {len(subjects)} subjects x {len(expressions)} expressions x"
+        f" {len(cameras)} cameras: colour, matte, depth, camera and head-model parameters of one"
+        " peak frame an expression.",
+        "",
+        "| | |",
+        "|---|---|",
+        *(f"| {name} | {value} |" for name, value in statistics.items()),
+        *(
+            f"| {split} subjects | {', '.join(names) or 'none'} |"
+            for split, names in splits.items()
+        ),
+        f"| licence | {_values(metas, 'licence')} |",
+        f"| consent | {_values(metas, 'consent')} |",
+        f"| head model | {_values(metas, 'head')} |",
+        f"| labels by | {_annotators(metas)} |",
+        "",
+        "## Cameras packed, by subject and expression",
+        "",
+        "| expression | " + " | ".join(subjects) + " |",
+        "|---" * (len(subjects) + 1) + "|",
+    ]
+    for expression in expressions:
+        row = [str(counts[subject, expression]) for subject in subjects]
+        lines.append(f"| {expression} | " + " | ".join(row) + " |")
+    lines += ["", f"## Left out: {len(dropped)}", ""]
+    reasons = Counter(row["why"] for row in dropped)
+    lines += [f"- {count} x {why}" for why, count in sorted(reasons.items())] or ["Nothing."]
+    lines += [
+        "",
+        "## Reading",
+        "",
+        "Pixels have a corner origin; `K` and `cam_from_world` (OpenCV axes, metres) are in each"
+        " `meta.json`, and the head stands in the same world: world = R @ head + t. Depth is camera"
+        " z in steps of `depth_scale_m`, 0 where unknown. The people shown may withdraw: see"
+        " `express50 subject withdraw`.",
+        "",
+    ]
+    return "\n".join(lines)
+
+
+def _values(metas: Sequence[Mapping], key: str) -> str:
+    found = sorted({str(meta[key]) if meta[key] is not None else "not stated" for meta in metas})
+    return ", ".join(found[:5]) + (f" and {len(found) - 5} more" if len(found) > 5 else "")
+
+
+def _annotators(metas: Sequence[Mapping]) -> str:
+    found = Counter(str(meta["label"].get("annotator", "unknown")) for meta in metas)
+    return ", ".join(f"{name} ({count} samples)" for name, count in sorted(found.items()))
