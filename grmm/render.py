@@ -194,7 +194,8 @@ def write_video(path: Path, frames: Iterable[np.ndarray], rate: int = VIDEO_RATE
         stream.options = {"crf": "16", "preset": "veryfast"}
         for frame in frames:
             even = frame[: frame.shape[0] // 2 * 2, : frame.shape[1] // 2 * 2]
-            stream.height, stream.width = even.shape[:2]
+            if count == 0:
+                stream.height, stream.width = even.shape[:2]
             picture = av.VideoFrame.from_ndarray(np.ascontiguousarray(even), format="rgb24")
             container.mux(stream.encode(picture))
             count += 1

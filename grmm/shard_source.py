@@ -1,0 +1,82 @@
+"""Packed shards as a source of training samples."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from express50.errors import FormatError
+from express50.shards import ShardReader
+from grmm.data import Key, Sample, Tracked
+
+SIZES = {"neck": (3,), "jaw": (3,), "eyes": (6,), "R": (3, 3), "t": (3,)}
+
+
+class ShardSource:
+    """Samples of one split (``*``: of all) of a folder of shards."""
+
+    def __init__(self, root: Path, split: str = "train") -> None:
+        """Open the shards; all samples must be tracked with one head model.
+
+        Raises:
+            FormatError: no shards, unknown split, no samples.
+        """
+        reader = ShardReader(root)
+        self.reader = reader if split == "*" else reader.select(split=split)
+        if not len(self.reader):
+            raise FormatError(f"{root}: no samples; rerun 'express50 pack'")
+        self.keys: Sequence[Key] = [
+            Key(subject=entry.subject, expression=entry.expression, camera=entry.camera)
+            for entry in self.reader.entries
+        ]
+        self.head = str(self.reader.meta(0)["head"])
+
+    def read(self, index: int) -> Sample:
+        """Decode one sample.
+
+        Raises:
+            FormatError: it is damaged, or was tracked with another head model than the first.
+        """
+        sample = self.reader.sample(index)
+        meta, where = sample["meta"], f"{self.reader.root}: {sample['key']}"
+        if meta.get("head") != self.head:
+            raise FormatError(
+                f"{where}: tracked with head model {meta.get('head')!r}, the first sample with "
+                f"{self.head!r}; train on one of them: pack them into different folders"
+            )
+        return Sample(
+            image=sample["rgb"],
+            alpha=np.rint(sample["alpha"] * 255).astype(np.uint8),
+            depth=sample["depth"] if sample["valid"].any() else None,
+            K=_matrix(meta, "K", (3, 3), where),
+            cam_from_world=_matrix(meta, "cam_from_world", (4, 4), where),
+            tracked=_tracked(meta.get("track"), where),
+        )
+
+
+def _tracked(track: Any, where: str) -> Tracked:
+    if not isinstance(track, dict):
+        raise FormatError(f"{where}: meta has no track; rerun 'express50 track' and 'pack'")
+    return Tracked(
+        shape=_matrix(track, "shape", None, where),
+        expression=_matrix(track, "expression", None, where),
+        **{name: _matrix(track, name, size, where) for name, size in SIZES.items()},
+    )
+
+
+def _matrix(table: dict, name: str, size: tuple[int, ...] | None, where: str) -> np.ndarray:
+    """A finite float64 array of the table; ``size`` None: any vector."""
+    try:
+        array = np.array(table[name], dtype=np.float64)
+    except KeyError:
+        raise FormatError(f"{where}: meta has no {name}; rerun 'express50 pack'") from None
+    except (TypeError, ValueError):
+        raise FormatError(f"{where}: {name} is no array of numbers") from None
+    if (array.ndim != 1) if size is None else (array.shape != size):
+        raise FormatError(f"{where}: {name} has shape {array.shape}, expected {size or '(any,)'}")
+    if not np.isfinite(array).all():
+        raise FormatError(f"{where}: {name} holds NaN or Inf; rerun 'express50 track'")
+    return array
