@@ -16,7 +16,7 @@ help: ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 14
 
 setup: $(READY) ## make .venv with everything that is needed
-$(READY): pyproject.toml constraints.txt setup.py scripts/system_libs.sh express50/native/gaussians.cpp
+$(READY): pyproject.toml constraints.txt setup.py scripts/system_libs.sh $(wildcard express50/native/*.cpp express50/native/*.h)
 	sh scripts/system_libs.sh $(PYTHON)
 	$(PYTHON) -m venv .venv
 	$(BIN)/python -m pip install --quiet --upgrade pip -c constraints.txt
