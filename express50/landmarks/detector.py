@@ -19,6 +19,8 @@ from express50.landmarks.network import CROP, LandmarkNet
 
 # A point whose error scale is this share of the face box has half the confidence.
 HALF_CONFIDENCE_SHARE = 0.025
+# Points of a place that is no face are vague: at this share the score is halved.
+VAGUE_SHARE = 0.06
 FOUND_SCORE = 0.5
 
 
@@ -30,7 +32,8 @@ class Detection:
         points: (68, 2) pixels, corner origin, iBUG-68 order.
         sigma: (68,) expected error in pixels (the scale of a Laplace distribution).
         confidence: (68,) in 0..1, the score included.
-        score: probability that a face looks towards the camera; low for backs of heads.
+        score: in 0..1, how surely a face looks towards the camera: the network's probability,
+            lowered where the points are vague. Low for backs of heads and where there is no head.
     """
 
     points: np.ndarray
@@ -74,9 +77,7 @@ def _coarse(net: LandmarkNet, pyramid: list[np.ndarray]) -> tuple[np.ndarray, np
     best: tuple[np.ndarray, np.ndarray, float] | None = None
     for group in groups:
         points, sigma, score = _run(net, pyramid, group)
-        # Sharp points tell the right window from one that sees a face by accident.
-        quality = score / (1.0 + sigma.mean(1) / (0.02 * side))
-        top = int(np.argmax(quality))
+        top = int(np.argmax(score))
         if best is None or score[top] > best[2]:
             best = points[top], sigma[top], float(score[top])
         if best[2] >= FOUND_SCORE:
@@ -154,7 +155,9 @@ def _run(
         sigma[index] *= np.sqrt(abs(determinant))
         if determinant < 0:
             points[index], sigma[index] = points[index][MIRROR], sigma[index][MIRROR]
-    return points, sigma, torch.sigmoid(output.logit).double().numpy()
+    sides = np.array([max(face_box(place)[1], 1e-6) for place in points])
+    vague = np.median(sigma, axis=1) / (VAGUE_SHARE * sides)
+    return points, sigma, torch.sigmoid(output.logit).double().numpy() / (1.0 + vague**2)
 
 
 def _mean_view(

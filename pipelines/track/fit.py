@@ -20,6 +20,7 @@ from pipelines.track.priors import prior
 from pipelines.track.sparse_head import POSE_SIZE, Basis, Points
 
 HUBER = 1.5
+REJECT_SIGMA, REJECT_SHARE = 4.0, 0.12
 
 
 @dataclass(frozen=True)
@@ -100,6 +101,25 @@ def landmark_sigma(observation: Observation, config: TrackConfig) -> np.ndarray:
         sigma[index] = np.hypot(view.sigma, floor)
     sigma[:, :17] /= config.contour_weight
     return np.where(observation.inliers, sigma, np.inf)
+
+
+def consistent_sigma(target: Target, marks: np.ndarray) -> np.ndarray:
+    """The target's standard deviations with what the fit contradicts made infinite.
+
+    A landmark is contradicted at REJECT standard deviations; a view half of whose landmarks are is
+    left out as a whole, unless no other is left. `marks` (68, 3) are the fitted landmarks.
+    """
+    sigma = target.sigma.copy()
+    for index, view in enumerate(target.observation.views):
+        pixels, _ = project_pinhole(view.camera, marks)
+        used = np.isfinite(sigma[index])
+        limit = REJECT_SHARE * float(np.ptp(view.points, axis=0).max())
+        allowed = np.minimum(REJECT_SIGMA * sigma[index], limit)
+        far = used & (np.linalg.norm(pixels - view.points, axis=1) > allowed)
+        sigma[index, far] = np.inf
+        if far.sum() > 0.5 * used.sum():
+            sigma[index] = np.inf
+    return sigma if np.isfinite(sigma).any() else target.sigma
 
 
 def _parameters(state_shape: np.ndarray, pose: Pose) -> np.ndarray:

@@ -11,6 +11,8 @@ from express50.cameras import Camera, triangulate
 
 PAIR_LIMIT = 120
 INLIER_SIGMA = 3.5
+# However vague a landmark, one that is further off than this many shares of the face disagrees.
+SIGMA_SHARE_LIMIT = 0.04
 
 
 @dataclass(frozen=True)
@@ -87,6 +89,15 @@ def robust_triangulate(views: list[View]) -> tuple[np.ndarray, np.ndarray]:
     return points, inliers
 
 
+def facing(view: View, rotation: np.ndarray, translation: np.ndarray) -> float:
+    """Cosine between the face's forward direction and the direction to a camera.
+
+    The head is at world = rotation @ head + translation; it looks along +z.
+    """
+    towards = view.camera.center - translation
+    return float(rotation[:, 2] @ towards / max(float(np.linalg.norm(towards)), 1e-9))
+
+
 def _pair_points(views: list[View]) -> np.ndarray:
     """Midpoints (pairs, 68, 3) of closest approach of the rays of pairs of views."""
     origins, directions = zip(*(_landmark_rays(view) for view in views), strict=True)
@@ -122,7 +133,8 @@ def _squared_errors(views: list[View], candidates: np.ndarray) -> np.ndarray:
     errors = np.empty((len(candidates), len(views), 68))
     for index, view in enumerate(views):
         pixels, depth = project_pinhole(view.camera, candidates)
-        squared = ((pixels - view.points) ** 2).sum(-1) / view.sigma**2
+        limit = SIGMA_SHARE_LIMIT * float(np.ptp(view.points, axis=0).max())
+        squared = ((pixels - view.points) ** 2).sum(-1) / np.minimum(view.sigma, limit) ** 2
         errors[:, index] = np.where(depth > 0, squared, np.inf)
     return errors
 

@@ -14,15 +14,19 @@ import numpy as np
 import open3d as o3d
 
 from express50.cameras import Camera, resized
+from express50.head.model import HeadModel
 
 # Head outlines count as about this many independent points a view.
 EFFECTIVE_POINTS = 24
 POINTS_A_VIEW = 60
 OUTLINE_SIDE = 192
 OUTLINE_SIGMA_M = 0.003
-REGIONS = ("face", "forehead", "scalp", "left_ear", "right_ear", "nose", "lips")
-# Hair stands between the skull and the matte's edge: a skull inside is no contradiction.
-INSIDE_WEIGHT = 0.35
+# How much it counts where the mesh lies inside the matte. Beyond the edge always counts in full;
+# inside, hair may stand between skull and edge, and shoulders and clothes beside the neck.
+INSIDE_WEIGHTS = {
+    "neck": 0.05, "scalp": 0.35, "face": 1.0, "forehead": 0.35, "nose": 1.0, "lips": 1.0,
+    "left_ear": 0.7, "right_ear": 0.7,
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -48,15 +52,19 @@ class Outline:
         distance: the view's signed distance.
         index: (n,) positions of the vertices among the fit's points.
         sigma: standard deviation in full-size pixels, the number of points allowed for.
+        inside: (n,) weights where a vertex lies inside the matte.
     """
 
     distance: SignedDistance
     index: np.ndarray
     sigma: float
+    inside: np.ndarray
 
     @classmethod
-    def of(cls, distance: SignedDistance, first: int, count: int, positions: np.ndarray) -> Outline:
-        """Outline of `count` points that start at `first`, now at positions (count, 3).
+    def of(
+        cls, distance: SignedDistance, first: int, positions: np.ndarray, inside: np.ndarray
+    ) -> Outline:
+        """Outline of points that start at `first`, now at positions (n, 3).
 
         One pixel, and three millimetres of unmodelled skin and hair, are assumed in every point;
         neighbours err alike, so many points do not outvote the landmarks.
@@ -64,8 +72,9 @@ class Outline:
         camera = distance.camera
         depth = (positions @ camera.cam_from_world[2, :3] + camera.cam_from_world[2, 3]).mean()
         sigma = np.hypot(distance.step, OUTLINE_SIGMA_M * camera.K[0, 0] / max(depth, 1e-6))
+        count = len(positions)
         crowd = max(1.0, count / EFFECTIVE_POINTS) ** 0.5
-        return cls(distance, np.arange(first, first + count), float(sigma * crowd))
+        return cls(distance, np.arange(first, first + count), float(sigma * crowd), inside)
 
     def residuals(
         self, positions: np.ndarray, project: Callable
@@ -73,7 +82,7 @@ class Outline:
         """Block (index (n,), residual (n, 1), slope (n, 1, 3)) of all points' positions (P, 3)."""
         pixels, slope = project(self.distance.camera, positions[self.index])
         value, gradient = sample(self.distance, pixels)
-        weight = np.where(value > 0, 1.0, INSIDE_WEIGHT) / self.sigma
+        weight = np.where(value > 0, 1.0, self.inside) / self.sigma
         return (
             self.index,
             (value * weight)[:, None],
@@ -153,6 +162,15 @@ def outline_vertices(
     if len(chosen) > POINTS_A_VIEW:
         chosen = chosen[np.linspace(0, len(chosen) - 1, POINTS_A_VIEW).astype(int)]
     return chosen
+
+
+def inside_weights(model: HeadModel) -> np.ndarray:
+    """Weights (V,) of vertices inside the matte; 0 for vertices that form no outline."""
+    weights = np.zeros(model.template.shape[0])
+    for region, weight in INSIDE_WEIGHTS.items():
+        weights[model.regions[region].numpy()] = weight
+    weights[model.regions["boundary"].numpy()] = 0.0
+    return weights
 
 
 def _window(vertices: np.ndarray, camera: Camera) -> Camera | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 
@@ -20,14 +21,22 @@ from express50.landmarks.network import WEIGHTS, LandmarkNet, load_network
 from express50.layout import Dataset
 from express50.stage import Stage
 from pipelines.track.config import PRESETS, TrackConfig
-from pipelines.track.fit import State, Target, fit, landmark_sigma, start_state
-from pipelines.track.observe import Observation, View, agree, project_pinhole
-from pipelines.track.outline import REGIONS, Outline, outline_vertices, signed_distance
+from pipelines.track.fit import (
+    State,
+    Target,
+    consistent_sigma,
+    fit,
+    landmark_sigma,
+    start_state,
+)
+from pipelines.track.observe import Observation, View, agree, facing, project_pinhole
+from pipelines.track.outline import Outline, inside_weights, outline_vertices, signed_distance
 from pipelines.track.overlay import draw_overlays
 from pipelines.track.sparse_head import POSE_SIZE, Basis, make_basis
 from pipelines.track.start import initial_pose
 
 SCHEMA = "express50.track/1"
+MIN_FACING = 0.05
 
 
 def items(dataset: Dataset) -> list[str]:
@@ -63,6 +72,10 @@ def run(dataset: Dataset, item: str, config: TrackConfig, out: Path) -> dict:
         reasons = "; ".join(f"{row['what']}: {row['why']}" for row in dropped[:3])
         raise StageError(f"{item}: no expression could be tracked ({reasons})")
     state, _ = fit(basis, targets, start_state(basis, poses), config, config.iterations)
+    targets = [
+        replace(target, sigma=consistent_sigma(target, marks))
+        for target, marks in zip(targets, _marks(basis.model, state), strict=True)
+    ]
     state, targets = _refine(dataset, item, basis, targets, state, config)
     vertices = _all_vertices(basis.model, state)
     _write_track(out / "track.npz", config.head, basis, targets, state, vertices)
@@ -141,13 +154,17 @@ def _targets(
     targets, poses = [], []
     for observation in observations:
         try:
-            poses.append(initial_pose(observation, template))
+            pose_found = initial_pose(observation, template)
         except StageError as error:
             if "rig seems" in str(error):
                 raise
             dropped.append({"what": observation.expression, "why": str(error)})
             continue
+        poses.append(pose_found)
         sigma = landmark_sigma(observation, config)
+        # From behind, the detector can only guess; the pose tells which views those are.
+        behind = [facing(view, *pose_found) < MIN_FACING for view in observation.views]
+        sigma[np.array(behind)] = np.inf
         neutral = observation.expression == config.neutral
         targets.append(Target(observation, sigma, neutral))
     return targets, poses
@@ -195,18 +212,23 @@ def _distances(dataset: Dataset, subject: str, target: Target) -> list:
 
 def _with_outlines(model: HeadModel, target: Target, distances: list, mesh: np.ndarray) -> Target:
     """The target with the outlines of the current mesh (V, 3)."""
-    allowed = torch.stack([model.regions[name] for name in REGIONS]).any(0).numpy()
+    weights = inside_weights(model)
     faces = model.faces.numpy()
     outlines, ids, offset = [], [], 68
     for distance in distances:
-        chosen = outline_vertices(mesh, faces, distance.camera, allowed)
+        chosen = outline_vertices(mesh, faces, distance.camera, weights > 0)
         if len(chosen) < 8:
             continue
-        outlines.append(Outline.of(distance, offset, len(chosen), mesh[chosen]))
+        outlines.append(Outline.of(distance, offset, mesh[chosen], weights[chosen]))
         ids.append(chosen)
         offset += len(chosen)
     vertices = np.concatenate(ids) if ids else np.zeros(0, dtype=np.int64)
     return Target(target.observation, target.sigma, target.neutral, tuple(outlines), vertices)
+
+
+def _marks(model: HeadModel, state: State) -> np.ndarray:
+    """Fitted landmarks (E, 68, 3) in the world."""
+    return landmarks(model, torch.from_numpy(_all_vertices(model, state))).numpy()
 
 
 def _all_vertices(model: HeadModel, state: State) -> np.ndarray:
