@@ -12,7 +12,7 @@ import numpy as np
 
 from express50.twin.noise import fractal, make_lattice, noise, random_stream, smoothstep
 from express50.twin.rig import TARGET
-from express50.twin.surface import spherical_to_unit, unit_to_spherical
+from express50.twin.surface import spherical_to_unit, unit, unit_to_spherical
 
 RADIUS_M = 2.6
 _WIDTH = 2048
@@ -26,7 +26,7 @@ def background(seed: int, origin: np.ndarray, directions: np.ndarray) -> np.ndar
         origin: (3,) the camera's centre, inside the room.
         directions: (N, 3), any length.
     """
-    d = directions / np.sqrt((directions * directions).sum(1, keepdims=True))
+    d = unit(directions)
     start = np.asarray(origin - TARGET, d.dtype)
     b = d @ start
     reach = -b + np.sqrt(np.maximum(b * b - start @ start + RADIUS_M**2, 0.0))

@@ -57,13 +57,13 @@ def board_poses(spec: BoardSpec, count: int, seed: int) -> list[np.ndarray]:
     poses = []
     for k in range(count):
         place = ((k + 0.5) * 0.61803399) % 1.0
-        azimuth = math.radians(SPAN_DEG) * (place - 0.5) * 0.94
+        azimuth = math.radians(SPAN_DEG) * (place - 0.5)
         tilt, roll = rng.uniform(-0.45, 0.35), rng.uniform(-0.5, 0.5)
         # Board axes as its viewer sees them: x right, y down, z away from the viewer.
         facing = _about_y(-azimuth) @ np.diag([1.0, -1.0, -1.0])
         R = facing @ axis_angle_to_matrix(np.array([tilt, 0.0, 0.0]))
         R = R @ axis_angle_to_matrix(np.array([0.0, 0.0, roll]))
-        shift = rng.uniform(-1.0, 1.0, 3) * (0.055, 0.055, 0.06)
+        shift = rng.uniform(-1.0, 1.0, 3) * (0.075, 0.075, 0.08)
         poses.append(make_transform(R, TARGET + R @ shift - R @ middle))
     return poses
 

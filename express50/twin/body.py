@@ -75,8 +75,8 @@ class Body:
     incidence: scipy.sparse.csr_matrix
 
 
-def build_body(model: HeadModel, subject: Subject, seed: int, with_hair: bool) -> Body:
-    """Everything of a subject that no frame changes."""
+def build_body(model: HeadModel, subject: Subject, seed: int, hair_detail: float = 1.0) -> Body:
+    """Everything of a subject that no frame changes; a hair detail of 0 makes it bald."""
     template = model.template.double().numpy()
     faces = model.faces.numpy().astype(np.int32)
     centre = head_centre(model)
@@ -90,8 +90,8 @@ def build_body(model: HeadModel, subject: Subject, seed: int, with_hair: bool) -
     star = StarMap(rest, skin_faces, centre)
     rng = random_stream(seed, subject.number, 7)
     hair = _no_hair()
-    if with_hair:
-        hair = grow_hair(rng, rest, faces, scalp, star, subject.look)
+    if hair_detail > 0:
+        hair = grow_hair(rng, rest, faces, scalp, star, subject.look, hair_detail)
     skull = np.flatnonzero(scalp > 0.8)[::7]
     cloth_vertices, cloth_faces = _shoulders(rest, model.regions["boundary"].numpy())
     extras = Extras(

@@ -64,6 +64,7 @@ def grow_hair(
     scalp: np.ndarray,
     star: StarMap,
     look: Look,
+    detail: float = 1.0,
 ) -> HairMesh:
     """Grow a subject's hair.
 
@@ -74,11 +75,12 @@ def grow_hair(
         scalp: (V,) density of roots, 0 to 1.
         star: outer surface of the head.
         look: colour, style and length.
+        detail: more and thinner strands where above 1, fewer and thicker ones below.
     """
     style = _STYLES[look.hair_style]
-    roots = _roots(rng, vertices, faces, scalp, style.strands)
+    roots = _roots(rng, vertices, faces, scalp, round(style.strands * detail))
     points = _march(rng, roots, star, style, look.hair_length_m)
-    return _ribbons(rng, points, star.centre, style.width, look.hair)
+    return _ribbons(rng, points, star.centre, style.width / detail, look.hair)
 
 
 def _roots(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import multiprocessing
+import os
 import shutil
 import sys
 import time
@@ -15,7 +16,6 @@ from pathlib import Path
 from express50.errors import CaptureError
 from express50.expressions import select
 from express50.threads import cap_threads
-from express50.twin.board import BoardSpec
 from express50.twin.config import TwinConfig
 
 _counter = None  # shared count of pictures, set in every worker
@@ -129,33 +129,31 @@ def _film(config: TwinConfig, task: Task, staging: Path) -> None:
     torch.set_num_threads(1)
     subject, cameras = task
     if subject:
-        film_subject(config, subject, cameras, staging / "captures" / subject, _tick)
+        folders = staging / "captures" / subject, staging / "truth" / subject
+        film_subject(config, subject, cameras, *folders, _tick)
     else:
         film_board(config, cameras, staging / "board", _tick)
 
 
 def _publish(config: TwinConfig, subject: str, staging: Path, out: Path) -> None:
     """Add what is not footage, then move a subject's truth and capture into place."""
-    from express50.twin.rig import make_rig
-    from express50.twin.studio import cast_subject
-    from express50.twin.truth import write_truth
+    from express50.twin.board import BoardSpec
 
     capture, truth = staging / "captures" / subject, staging / "truth" / subject
-    body, play = cast_subject(config, subject)
-    rig = make_rig(config.cameras, config.width, config.height, config.seed)
-    write_truth(truth, config.head, body, play, rig)
-    look = body.subject.look
+    about = json.loads((truth / "subject.json").read_text())
+    age, gender = about["look"]["age"], about["look"]["gender"]
     (capture / "capture.toml").write_text(
         f'subject = "{subject}"\nfps = {config.fps:g}\nsession = "twin-seed-{config.seed}"\n'
         'units = "metre"\ncolor_space = "sRGB"\ncamera_model = "digital twin"\n'
         f'consent = "synthetic-{subject}"\nlicence = "CC0-1.0"\nsynthetic = true\n'
-        f'age = {look.age}\ngender = "{look.gender}"\n'
+        f'age = {age}\ngender = "{gender}"\n'
         f'rig = "{config.cameras} cameras over about 300 degrees, ray cast"\n'
     )
-    rows = [f"{name},{first},{last}\n" for name, first, last in play.cues]
+    rows = [f"{name},{first},{last}\n" for name, first, last in about["cues"]]
     (capture / "cues.csv").write_text("expression_id,start_frame,end_frame\n" + "".join(rows))
     if config.board_frames:
-        shutil.copytree(staging / "board", capture / "board")
+        # One rig, one board sequence: hard links spare the disk copies for every subject.
+        shutil.copytree(staging / "board", capture / "board", copy_function=os.link)
         (capture / "board" / "board.toml").write_text(BoardSpec().toml())
     if config.give_calibration:
         shutil.copyfile(truth / "cameras.json", capture / "calibration.json")

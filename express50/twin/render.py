@@ -18,6 +18,8 @@ from express50.cameras import Camera, crop_camera, project, rays
 from express50.twin.body import Material
 from express50.twin.surface import MISS, Caster
 
+# Colours (N, 3) for directions (N, 3), faces (N,) and barycentrics (N, 2).
+Shade = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 BAND_PIXELS = 1 << 18
 HALO = 4  # rows and columns beyond a band that the search for detail looks at
 _DEPTH_STEP = 0.004  # metres between neighbours that count as an edge inside the silhouette
@@ -25,10 +27,14 @@ _DEPTH_STEP = 0.004  # metres between neighbours that count as an edge inside th
 
 @dataclass(frozen=True, kw_only=True)
 class Sampling:
-    """Rays a pixel: at silhouettes and loose hair, and at detail inside the silhouette."""
+    """Rays a pixel: at silhouettes and loose hair, and at detail inside the silhouette.
 
-    edge: int = 8
+    Sparing rays, silhouette pixels where the first third agree get no more.
+    """
+
+    edge: int = 9
     inside: int = 2
+    sparing: bool = True
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,7 +83,7 @@ def render_bands(
     window: tuple[int, int, int, int],
     band: Band,
     sampling: Sampling,
-    shade: Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray] | None,
+    shade: Shade | None,
 ) -> tuple[np.ndarray, np.ndarray, tuple[int, int, int, int]] | None:
     """Premultiplied colour and alpha of one band, where the subject may be.
 
@@ -109,18 +115,18 @@ def render_bands(
     keep[y0 - first - a : y1 - first - a, x0 - c : x1 - c] = True
     colour = np.zeros((height * width, 3), np.float32)
     alpha = np.zeros(height * width, np.float32)
-    plain = np.flatnonzero(keep.ravel() & ~(edge | inside).ravel() & (face != MISS))
-    alpha[plain] = 1.0
-    if shade is not None and plain.size:
-        colour[plain] = shade(centre.reshape(-1, 3)[plain], face[plain], bary[plain])
     flat = [part.reshape(-1, 3) for part in (centre, right, down)]
+    # The centre's ray is one of the samples of every pixel.
+    seen = np.flatnonzero(keep.ravel() & (face != MISS))
+    alpha[seen] = 1.0
+    if shade is not None and seen.size:
+        colour[seen] = shade(flat[0][seen], face[seen], bary[seen])
     for chosen, count in ((edge, sampling.edge), (inside & ~edge, sampling.inside)):
         index = np.flatnonzero((chosen & keep).ravel())
         for part in np.array_split(index, max(1, len(index) * count >> 18)):
-            if part.size:
-                colour[part], alpha[part] = _supersample(
-                    caster, band.origin, flat, part, count, shade
-                )
+            if part.size and count > 1:
+                rays_at = Pixels(index=part, flat=flat, origin=band.origin)
+                _refine(caster, rays_at, count, sampling.sparing, shade, colour, alpha)
     rows = slice(y0 - first - a, y1 - first - a)
     columns = slice(x0 - c, x1 - c)
     return (
@@ -150,41 +156,81 @@ def _detail(
     return edge, inside
 
 
-def _supersample(
+@dataclass(frozen=True)
+class Pixels:
+    """Some pixels of a band: ``index`` (N,) into ``flat``, the band's (h * w, 3) ray arrays."""
+
+    index: np.ndarray
+    flat: list[np.ndarray]
+    origin: np.ndarray
+
+
+def _refine(
     caster: Caster,
-    origin: np.ndarray,
-    flat: list[np.ndarray],
-    index: np.ndarray,
+    pixels: Pixels,
     count: int,
-    shade: Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray] | None,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Premultiplied colour (N, 3) and alpha (N,) of pixels from ``count`` rays each."""
+    sparing: bool,
+    shade: Shade | None,
+    colour: np.ndarray,
+    alpha: np.ndarray,
+) -> None:
+    """Replace the one sample in ``colour`` and ``alpha`` of some pixels by ``count`` of them.
+
+    Sparing with rays, a third comes first; pixels where those all hit, or all miss, end there.
+    """
     u, v = ray_pattern(count)
-    centre, right, down = (part[index] for part in flat)
-    directions = (
-        centre[:, None] + u.reshape(1, -1, 1) * right[:, None] + v.reshape(1, -1, 1) * down[:, None]
-    ).reshape(-1, 3)
-    _, face, bary = caster.cast(origin, directions)
+    others = np.delete(np.arange(count), count // 2)
+    index = pixels.index
+    first = others[:: len(others) // 2] if sparing and len(others) > 4 else others
+    sums = _cast_more(caster, pixels, (u[first], v[first]), shade)
+    colour[index] += sums[0]
+    alpha[index] += sums[1]
+    weight = np.full(len(index), 1.0 + len(first), np.float32)
+    if len(first) < len(others):
+        mixed = np.flatnonzero((alpha[index] > 0) & (alpha[index] < weight))
+        rest = np.setdiff1d(others, first)
+        part = Pixels(index=index[mixed], flat=pixels.flat, origin=pixels.origin)
+        sums = _cast_more(caster, part, (u[rest], v[rest]), shade)
+        colour[part.index] += sums[0]
+        alpha[part.index] += sums[1]
+        weight[mixed] += len(rest)
+    colour[index] /= weight[:, None]
+    alpha[index] /= weight
+
+
+def _cast_more(
+    caster: Caster, pixels: Pixels, places: tuple[np.ndarray, np.ndarray], shade: Shade | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Sums over places in the pixel: colour (N, 3) and hits (N,)."""
+    centre, right, down = (part[pixels.index] for part in pixels.flat)
+    u, v = (place[:, None, None] for place in places)
+    directions = (centre + u * right + v * down).reshape(-1, 3)
+    _, face, bary = caster.cast(pixels.origin, directions)
     hit = np.flatnonzero(face != MISS)
     seen = np.zeros(len(directions), np.float32)
     seen[hit] = 1.0
+    count = len(places[0])
+    if shade is None:
+        return np.zeros((len(centre), 3), np.float32), seen.reshape(count, -1).sum(0)
     colours = np.zeros((len(directions), 3), np.float32)
-    if shade is not None and hit.size:
+    if hit.size:
         colours[hit] = shade(directions[hit], face[hit], bary[hit])
-    return colours.reshape(-1, count, 3).mean(1), seen.reshape(-1, count).mean(1)
+    return colours.reshape(count, -1, 3).sum(0), seen.reshape(count, -1).sum(0)
 
 
 def ray_pattern(count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Places (count,) in a pixel, -0.5 to 0.5: even in x, in y and over the pixel.
+    """Places (count,) in a pixel, from -0.5 up, even in x, in y and over the pixel.
 
-    Rank-1 lattice: every row and every column of a count x count grid holds one ray.
+    Rank-1 lattice: every row and every column of a count x count grid holds one ray. Number
+    ``count // 2`` is the centre.
     """
+    half = count // 2
     k = np.arange(count)
     stride = max(1, round(count * 0.618034))
     while np.gcd(stride, count) != 1:
         stride += 1
-    u = (k + 0.5) / count - 0.5
-    v = ((k * stride) % count + 0.5) / count - 0.5
+    u = (k - half) / count
+    v = (((k - half) * stride + half) % count - half) / count
     return u.astype(np.float32), v.astype(np.float32)
 
 
@@ -212,13 +258,14 @@ def window_of(camera: Camera, vertices: np.ndarray) -> tuple[int, int, int, int]
 
 
 def render_alpha(
-    caster: Caster, material: np.ndarray, vertices: np.ndarray, camera: Camera, count: int = 32
+    caster: Caster, material: np.ndarray, vertices: np.ndarray, camera: Camera, count: int = 33
 ) -> np.ndarray:
     """Alpha (H, W) float32 in [0, 1] of geometry in a camera."""
     alpha = np.zeros((camera.height, camera.width), np.float32)
     window = window_of(camera, hull_of(vertices))
+    sampling = Sampling(edge=count, inside=1, sparing=False)
     for band in bands(camera):
-        done = render_bands(caster, material, window, band, Sampling(edge=count, inside=1), None)
+        done = render_bands(caster, material, window, band, sampling, None)
         if done is not None:
             x0, y0, x1, y1 = done[2]
             alpha[y0:y1, x0:x1] = done[1]

@@ -11,10 +11,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from express50.head.model import HeadModel
-from express50.twin.body import Body, Material, Posed
+from express50.twin.body import Body, Material, Posed, model_materials
 from express50.twin.noise import make_lattice, noise, random_stream, smoothstep
 from express50.twin.skin import SkinTexture, sample_skin
-from express50.twin.surface import Caster, smooth_over_mesh, unit
+from express50.twin.surface import Caster, dot, smooth_over_mesh, unit
 
 # How far light bleeds round the terminator in skin, per channel: red most (d'Eon et al. 2007).
 _BLEED = np.array([0.32, 0.12, 0.06], np.float32)
@@ -84,7 +84,8 @@ def find_eyes(model: HeadModel) -> Eyes:
 class Scene:
     """One frame ready for rays: compiled geometry and per-vertex attributes.
 
-    ``attributes`` (N, 7 + L) are normal, place or colour, ambient, light by light.
+    ``attributes`` (N, 9 + L) are normal, place or colour, diffuse light that arrives (RGB), and
+    how much of each soft box is seen.
     """
 
     caster: Caster
@@ -105,15 +106,18 @@ def build_scene(
     caster = Caster(posed.vertices, body.faces)
     heads = len(body.template)
     hairs = len(body.extras.hair.vertices)
-    attributes = np.ones((len(posed.vertices), 7 + len(lighting.colours)), np.float32)
+    attributes = np.ones((len(posed.vertices), 9 + len(lighting.colours)), np.float32)
     attributes[:, :3] = posed.normals
     attributes[:heads, 3:6] = body.template
     attributes[heads : heads + hairs, 3:6] = body.extras.hair.colours
     attributes[heads + hairs :, 3:6] = body.subject.look.cloth
     solid = np.r_[0:heads, heads + hairs : len(attributes)]
-    attributes[solid, 6:] = _light_at(caster, posed.vertices[solid], posed.normals[solid], lighting)
-    smooth = smooth_over_mesh(attributes[:heads, 6:], body.model.faces.numpy(), _SMOOTHING)
-    attributes[:heads, 6:] = smooth
+    reach = _light_at(caster, posed.vertices[solid], posed.normals[solid], lighting)
+    reach[:heads] = smooth_over_mesh(reach[:heads], body.model.faces.numpy(), _SMOOTHING)
+    skin = np.zeros((len(solid), 1), np.float32)
+    skin[:heads, 0] = model_materials(body.model) == Material.SKIN
+    attributes[solid, 6:9] = _diffuse(lighting, posed.normals[solid], reach, skin)
+    attributes[solid, 9:] = reach[:, 1:]
     return Scene(
         caster=caster, body=body, texture=texture, eyes=eyes, lighting=lighting,
         attributes=attributes, hair_tangents=posed.tangents, vertices=posed.vertices,
@@ -153,6 +157,22 @@ def _light_at(
     return out
 
 
+def _diffuse(
+    lighting: Lighting, normals: np.ndarray, reach: np.ndarray, skin: np.ndarray
+) -> np.ndarray:
+    """Diffuse light (N, 3) at vertices; over skin (N, 1) it bleeds round the terminator."""
+    up = 0.5 + 0.5 * normals[:, 1:2]
+    total = (lighting.ground * (1 - up) + lighting.sky * up) * reach[:, :1]
+    bleed = _BLEED * skin
+    for k, towards in enumerate(lighting.directions):
+        soft = np.maximum((normals @ towards)[:, None] + bleed, 0.0)
+        seen = reach[:, 1 + k : 2 + k]
+        # Light that bled into shadow has crossed flesh, so shadows' edges are red as well.
+        share = seen * (1.0 + 1.5 * bleed * (1.0 - seen))
+        total += (lighting.colours[k] / (1 + bleed)) * soft * share
+    return total
+
+
 def shade(scene: Scene, directions: np.ndarray, face: np.ndarray, bary: np.ndarray) -> np.ndarray:
     """Linear colour (N, 3) of hits.
 
@@ -171,7 +191,7 @@ def shade(scene: Scene, directions: np.ndarray, face: np.ndarray, bary: np.ndarr
     mixed += np.take(attributes, corners[:, 2], axis=0) * w2
     view = -unit(directions)
     normal = unit(mixed[:, :3])
-    facing = (normal * view).sum(1, keepdims=True)
+    facing = dot(normal, view)
     normal = np.where(facing < 0, normal - 2 * facing * view, normal)
     material = body.material[face]
     out = np.empty((len(face), 3), np.float32)
@@ -180,10 +200,10 @@ def shade(scene: Scene, directions: np.ndarray, face: np.ndarray, bary: np.ndarr
         n, v, m = normal[chosen], view[chosen], mixed[chosen]
         if kind == Material.HAIR:
             first = corners[chosen, 0] - len(body.template)
-            out[chosen] = _hair(scene.lighting, n, v, m, scene.hair_tangents[first])
+            out[chosen] = _hair(scene.lighting, n, v, m[:, 3:6], scene.hair_tangents[first])
             continue
         albedo, gloss, power = _surface(scene, kind, m[:, 3:6])
-        out[chosen] = _lit(scene.lighting, n, v, m[:, 6:], albedo, gloss, power, kind)
+        out[chosen] = _lit(scene.lighting, n, v, m[:, 6:], albedo, gloss, power)
     return out
 
 
@@ -195,7 +215,7 @@ def _surface(
         texel = sample_skin(scene.texture, place)
         return texel[:, :3], 0.045 * texel[:, 3:], 22.0
     if kind == Material.EYE:
-        return _eye_albedo(scene, place), 0.9, 400.0
+        return _eye_albedo(scene, place), 0.07, 400.0
     if kind == Material.CLOTH:
         return place, 0.01, 5.0
     colour, gloss, power = {
@@ -233,46 +253,30 @@ def _lit(
     lighting: Lighting,
     n: np.ndarray,
     v: np.ndarray,
-    reach: np.ndarray,
+    light: np.ndarray,
     albedo: np.ndarray,
     gloss: np.ndarray | float,
     power: float,
-    kind: int,
 ) -> np.ndarray:
-    """Diffuse with soft terminator, Blinn-Phong highlight with Fresnel's rise, ambient."""
-    bleed = _BLEED if kind == Material.SKIN else np.zeros(3, np.float32)
-    up = 0.5 + 0.5 * n[:, 1:2]
-    diffuse = (lighting.ground * (1 - up) + lighting.sky * up) * reach[:, :1]
-    highlight = np.zeros_like(diffuse)
-    rim = (1.0 - np.clip((n * v).sum(1, keepdims=True), 0.0, 1.0)) ** 4
-    for k, towards in enumerate(lighting.directions):
-        cosine = (n @ towards)[:, None]
-        seen = reach[:, 1 + k : 2 + k]
-        soft = np.maximum(cosine + bleed, 0.0)
-        # Light that bled into shadow has crossed flesh, so shadows' edges are red as well.
-        share = seen * (1.0 + 1.5 * bleed * (1.0 - seen))
-        diffuse += (lighting.colours[k] / (1 + bleed)) * soft * share
-        half = unit(v + towards)
-        lobe = np.clip((n * half).sum(1, keepdims=True), 0.0, 1.0) ** power
-        highlight += lighting.colours[k] * (lobe * seen * (cosine > 0) * (power + 2.0) / 8.0)
-    if kind == Material.EYE:
-        highlight *= 0.08
-    return albedo * diffuse + highlight * gloss * (0.55 + 2.0 * rim)
+    """Diffuse light, found at the vertices, and Phong's highlight with Fresnel's rise."""
+    cosine = dot(n, v)
+    mirrored = 2.0 * cosine * n - v
+    lobes = np.clip(mirrored @ lighting.directions.T, 0.0, 1.0) ** np.float32(0.25 * power)
+    highlight = (lobes * light[:, 3:]) @ lighting.colours
+    rim = 0.55 + 2.0 * (1.0 - np.clip(cosine, 0.0, 1.0)) ** 4
+    return albedo * light[:, :3] + highlight * (gloss * np.float32((power + 2.0) / 8.0) * rim)
 
 
 def _hair(
-    lighting: Lighting, n: np.ndarray, v: np.ndarray, mixed: np.ndarray, tangent: np.ndarray
+    lighting: Lighting, n: np.ndarray, v: np.ndarray, albedo: np.ndarray, tangent: np.ndarray
 ) -> np.ndarray:
-    """Two highlights along the strand and a diffuse term (Kajiya and Kay 1989; Marschner 2003)."""
-    albedo = mixed[:, 3:6]
+    """A pale and a coloured highlight along the strand, and a diffuse term (Kajiya, Kay 1989)."""
+    along, seen_along = tangent @ lighting.directions.T, dot(tangent, v)
+    across = np.sqrt(np.clip(1.0 - along * along, 0.0, 1.0))
+    shown = np.clip(0.35 + 0.75 * (n @ lighting.directions.T), 0.0, 1.0)
+    seen_across = np.sqrt(np.clip(1.0 - seen_along * seen_along, 0.0, 1.0))
+    gleam = np.clip(across * seen_across - along * seen_along, 0.0, 1.0)
     up = 0.5 + 0.5 * n[:, 1:2]
-    out = albedo * (lighting.ground * (1 - up) + lighting.sky * up)
-    for k, towards in enumerate(lighting.directions):
-        along = (tangent @ towards)[:, None]
-        shown = np.clip(0.35 + 0.75 * (n @ towards)[:, None], 0.0, 1.0)
-        half = unit(v + towards)
-        across = np.sqrt(np.clip(1.0 - (tangent * half).sum(1, keepdims=True) ** 2, 0.0, 1.0))
-        diffuse = np.sqrt(np.clip(1.0 - along * along, 0.0, 1.0))
-        gleam = 0.045 * across**60 + 0.35 * albedo * across**14
-        out = out + lighting.colours[k] * shown * (0.75 * albedo * diffuse + gleam)
-    return out
+    ambient = lighting.ground * (1 - up) + lighting.sky * up
+    soft = (0.75 * shown * across + 0.35 * shown * gleam**6) @ lighting.colours
+    return albedo * (ambient + soft) + (0.045 * shown * gleam**24) @ lighting.colours

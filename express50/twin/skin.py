@@ -88,10 +88,8 @@ def _paint_band(body: Body, seed: int, width: int, height: int, y0: int, y1: int
     albedo = _moles(rng, albedo, points, model, look.moles)
     gloss = look.gloss * (1.0 + 0.25 * pores) * (0.8 + 0.5 * _oily(model, points))
     lips = smoothstep(masks["lips"] + 0.10 * noise(points / 0.004, lattices[5]), 0.35, 0.65)
-    lip_colour = (
-        look.lips
-        * (1.0 + 0.12 * fractal(points * (1.0, 0.25, 1.0), lattices[1], 0.0025, 2))[:, None]
-    )
+    creases = fractal(points * (1.0, 0.25, 1.0), lattices[1], 0.0025, 2)
+    lip_colour = look.lips * (1.0 + 0.12 * creases)[:, None]
     albedo += lips[:, None] * (lip_colour - albedo)
     gloss += lips * 1.3
     hairs = _hairiness(body, points, masks, lattices)

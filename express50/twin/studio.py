@@ -27,6 +27,7 @@ from express50.twin.sensor import Sensor, expose, make_sensor
 from express50.twin.shade import Scene, build_scene, find_eyes, make_lighting, shade
 from express50.twin.skin import paint_skin, texture_width
 from express50.twin.subjects import make_subject
+from express50.twin.truth import write_truth
 
 # Rays and plates of so many pixels are kept between frames (about 50 bytes each); beyond, every
 # band is made anew for every frame.
@@ -43,7 +44,9 @@ def cast_subject(config: TwinConfig, subject_id: str) -> tuple[Body, Performance
     """A subject's body and what it does in every frame."""
     model, number = _head(config.head), subject_number(subject_id)
     subject = make_subject(model, subject_id, number, config.seed)
-    body = build_body(model, subject, config.seed, config.hair)
+    # Strands follow the pixels: thin enough to be finer than one, not finer than can be seen.
+    detail = float(np.clip(min(config.width, config.height) / 512, 0.6, 3.0))
+    body = build_body(model, subject, config.seed, detail if config.hair else 0.0)
     script = select(config.expressions)
     play = perform(model, script, config.frames_per_expression, config.fps, number, config.seed)
     return body, play
@@ -79,6 +82,7 @@ def film_subject(
     subject_id: str,
     camera_indices: list[int],
     capture: Path,
+    truth: Path,
     tick: Callable[[], None],
 ) -> None:
     """Record all frames of one subject in some cameras, and their plates.
@@ -88,6 +92,7 @@ def film_subject(
         subject_id: who.
         camera_indices: which cameras of the rig; others may be filmed by other processes.
         capture: the capture's folder.
+        truth: the folder of its truth; whoever films camera 0 writes it.
         tick: called after every picture.
     """
     body, play = cast_subject(config, subject_id)
@@ -108,6 +113,8 @@ def film_subject(
                 chance = random_stream(seed, number, 11, view.index, frame)
                 film.write(expose(view.sensor, picture, chance, config.noise))
                 tick()
+    if 0 in camera_indices:
+        write_truth(truth, config.head, body, play, {camera.id: camera for camera in rig})
     if config.plates:
         for view in views:
             chance = random_stream(seed, number, 12, view.index)

@@ -66,8 +66,12 @@ def vertex_normals(
 
 def unit(vectors: np.ndarray) -> np.ndarray:
     """Vectors (..., 3) at length 1; zero stays zero."""
-    length = np.sqrt((vectors * vectors).sum(-1, keepdims=True))
-    return vectors / np.maximum(length, 1e-20)
+    return vectors / np.maximum(np.sqrt(dot(vectors, vectors)), 1e-20)
+
+
+def dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Products (..., 1) of vectors (..., 3); several times quicker than a sum over the axis."""
+    return np.einsum("...i,...i->...", a, b)[..., None]
 
 
 def smooth_over_mesh(values: np.ndarray, faces: np.ndarray, rounds: int) -> np.ndarray:
