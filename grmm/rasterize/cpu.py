@@ -1,7 +1,8 @@
 """The native CPU backend: ``torch.autograd.Function`` over the C ABI of express50/native.
 
 Deterministic: images and gradients are the same bits for any number of threads, which is taken
-from ``torch.get_num_threads()``.
+from ``torch.get_num_threads()``. A third of the time of a large image with many channels goes into
+fresh memory pages for it: THP_MEM_ALLOC_ENABLE=1 in the environment makes torch use huge pages.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from express50 import native
 from grmm.rasterize.projection import expected_depth
@@ -104,6 +106,7 @@ class _Rasterize(torch.autograd.Function):
         return image, weighted, alpha
 
     @staticmethod
+    @once_differentiable
     def backward(
         ctx: Any, d_image: Tensor | None, d_weighted: Tensor | None, d_alpha: Tensor | None
     ) -> tuple[Tensor | None, ...]:

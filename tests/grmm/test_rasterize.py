@@ -280,6 +280,14 @@ def test_unused_outputs_cost_no_gradient():
     assert only_depth[1].abs().sum() == 0
 
 
+def test_second_derivatives_are_refused_rather_than_wrong():
+    leaves = {k: v.requires_grad_() for k, v in random_scene(5, 3).tensors.items()}
+    out = rasterize(**leaves, width=61, height=47, backend="cpu")
+    (grad,) = torch.autograd.grad(out.colors.square().sum(), leaves["means"], create_graph=True)
+    with pytest.raises(RuntimeError, match="once_differentiable"):
+        grad.sum().backward()
+
+
 @pytest.mark.parametrize("name", [*GRADIENTS])
 @pytest.mark.parametrize("value", [math.nan, math.inf, 1e31])
 def test_values_that_are_not_finite_are_refused_by_name(name, value):
