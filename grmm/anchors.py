@@ -94,7 +94,7 @@ def _candidate_texels(grid: Tensor, n_g: int) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _barycentrics(corners: Tensor, points: Tensor) -> Tensor:
-    """Barycentrics (M, 3) of points (M, 2) in triangles (M, 3, 2); -1 where a triangle has no area."""
+    """Barycentrics (M, 3) of points (M, 2) in triangles (M, 3, 2); -1 where one has no area."""
     a, b, c = corners.unbind(1)
     ab, ac, ap = b - a, c - a, points - a
     area = ab[:, 0] * ac[:, 1] - ab[:, 1] * ac[:, 0]
@@ -107,7 +107,7 @@ def _barycentrics(corners: Tensor, points: Tensor) -> Tensor:
 
 
 def uv_gradients(head: HeadModel) -> Tensor:
-    """(F, 2, 2) matrices G with [dP/du dP/dv] = [P1 - P0, P2 - P0] @ G; zero where UV area is none."""
+    """(F, 2, 2) matrices G with [dP/du dP/dv] = [P1 - P0, P2 - P0] @ G; zero without UV area."""
     corners = head.uv.double()[head.uv_faces]
     edges = torch.stack([corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]], -1)
     determinant = torch.linalg.det(edges)

@@ -61,7 +61,8 @@ class Loaded:
         if (subject, expression) not in self.gallery.frames:
             known = ", ".join(f"{s}/{e}" for s, e in list(self.gallery.frames)[:8])
             raise FormatError(
-                f"the checkpoint knows no frame {subject}/{expression}; expected one such as {known}"
+                f"the checkpoint knows no frame {subject}/{expression}; "
+                f"expected one such as {known}"
             )
         return pose_state(self.head, self.gallery.frames[subject, expression])
 

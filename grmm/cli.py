@@ -1,4 +1,4 @@
-"""``grmm``: train, fit, render, evaluate, export. Handlers parse, call the library once and print."""
+"""``grmm``: train, fit, render, evaluate, export. Handlers parse, call the library, print."""
 
 from __future__ import annotations
 

@@ -80,7 +80,7 @@ class ModelConfig:
     refine_unshuffle: int = 1
     """Pixel-unshuffle factor before the refinement. G9: 2 makes it four times cheaper."""
     refine_alpha: bool = True
-    """Give the rendered alpha to the refinement too. G9 recommends it; P lists RGB, features, depth."""
+    """Give the rendered alpha to the refinement too. G9; P lists RGB, features and depth."""
     depth_normalisation: str = "minmax"
     """``minmax`` over the pixels with alpha > 0.5 (P, G10) or ``fixed`` (head centre +- 0.2 m)."""
     backend: str = "auto"
@@ -90,8 +90,8 @@ class ModelConfig:
         side = self.n_g / 2 ** (len(self.ladder) + 1)
         if side < 2 or side != int(side):
             raise ConfigError(
-                f"model.n_g is {self.n_g}, expected a multiple of {2 ** (len(self.ladder) + 1)}, at "
-                f"least twice it: a ladder of {len(self.ladder)} widths doubles the seed that often"
+                f"model.n_g is {self.n_g}, expected a multiple of {2 ** (len(self.ladder) + 1)}, "
+                f"at least twice it: a ladder of {len(self.ladder)} widths doubles that often"
             )
         _one_of("model.frame", self.frame, FRAMES)
         _one_of("model.depth_normalisation", self.depth_normalisation, DEPTH_NORMALISATIONS)
@@ -99,7 +99,8 @@ class ModelConfig:
         _in_range("model.scale_min_mm", self.scale_min_mm, 1e-6, self.scale_max_mm)
         if self.identity_modes > self.z_id:
             raise ConfigError(
-                f"model.identity_modes is {self.identity_modes}, expected at most z_id = {self.z_id}"
+                f"model.identity_modes is {self.identity_modes}, "
+                f"expected at most z_id = {self.z_id}"
             )
 
     @property
@@ -117,7 +118,7 @@ class LossConfig:
     ssim: float = 0.2
     perceptual: float = 0.04
     vgg16: str = ""
-    """Path of torchvision's vgg16 state dict; empty: the perceptual term is off, and train says so."""
+    """Path of torchvision's vgg16 state dict; empty: the term is off, and train says so."""
     perceptual_crop_px: int = 0
     """Side of a random crop for the perceptual term, 0 = whole image; for CPUs."""
     perceptual_every: int = 1
@@ -145,7 +146,7 @@ class DataConfig:
     holdout_cameras: tuple[str, ...] = ()
     """Camera ids that training never sees; metrics.json reports on them."""
     background: float = 0.0
-    """Grey value that footage and renderings are composited on, sRGB in [0, 1]. Silent in P. G15."""
+    """Grey that footage and renderings are composited on, sRGB in [0, 1]. Silent in P. G15."""
     crop_margin_px: int = 16
     """Train on the window around head and matte, this much larger; -1 = the whole image. Outside
     both, footage and rendering are background. Evaluation always takes the whole image."""
@@ -171,10 +172,10 @@ class TrainConfig:
     texel_lr_scale: float = 1.0
     """Factor for the rate of per-texel parameters (untied biases, modes) of the last layers."""
     final_lr: float = 1.0
-    """Rate at the end over the rate at the start, reached along a cosine. P states no decay. G16."""
+    """Last rate over the first, reached along a half cosine. P states no decay. G16."""
     betas: tuple[float, float] = (0.9, 0.999)
     accumulate: int = 1
-    """Iterations whose gradients are averaged before a step (4 stands for the paper's four GPUs)."""
+    """Views whose gradients are averaged in a step (4 stands for the paper's four GPUs)."""
     clip_norm: float = 0.0
     """Clip the gradient's norm, 0 = never. Silent in P."""
     warm_start: bool = True
@@ -199,7 +200,7 @@ class TrainConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class FitConfig:
-    """Two-stage fit of an unseen identity (P, Fitting via Inverse Rendering); G22 for what is silent."""
+    """Two-stage fit of an unseen identity (P, Fitting via Inverse Rendering); silences: G22."""
 
     stage1_iterations: int = 500
     stage2_iterations: int = 350

@@ -223,7 +223,8 @@ class HeadViews:
             got = len(getattr(sample.tracked, name))
             if got > count:
                 raise FormatError(
-                    f"{where}: {got} {name} coefficients, head model {self.head.name!r} has {count}; "
+                    f"{where}: {got} {name} coefficients, "
+                    f"head model {self.head.name!r} has {count}; "
                     "name the head model that the dataset was tracked with"
                 )
 

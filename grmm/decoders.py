@@ -24,7 +24,7 @@ class Doubling(nn.Module):
         """Map (inputs, side, side) to (outputs, 2 side, 2 side)."""
         super().__init__()
         convolution = nn.ConvTranspose2d(inputs, outputs, 4, 2, 1, bias=False)
-        # Glorot with the slope's gain; each output of a stride 2 kernel sees 2 x 2 of its 4 x 4 taps.
+        # Glorot with the slope's gain; at stride 2 an output sees 2 x 2 of the 4 x 4 taps.
         gain = math.sqrt(2 / (1 + SLOPE**2))
         bound = gain * math.sqrt(3 / (4 * 0.5 * (inputs + outputs)))
         nn.init.uniform_(convolution.weight, -bound, bound)

@@ -27,8 +27,8 @@ from grmm.data import HeadViews, Item, Shuffle, Tracked, pose_state
 from grmm.evaluate import Render, evaluate, mean
 from grmm.metrics import UNAVAILABLE
 from grmm.model import GRMM, HeadState, Rendering, View
+from grmm.progress import log
 from grmm.render import comparison_sheet, interpolate_tracked
-from grmm.train import log
 from grmm.warm_start import LOGIT_LIMIT, project_texture
 
 

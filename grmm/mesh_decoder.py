@@ -30,7 +30,7 @@ class MeshDecoder(nn.Module):
         head_width: int,
         displacement_scale: float,
     ) -> None:
-        """Build for a mesh whose teeth are marked in ``teeth`` (V,) bool; displacements in metres."""
+        """Build for a mesh whose teeth are marked in ``teeth`` (V,) bool; metres come out."""
         super().__init__()
         widths = [z_id + 6, *shared_widths]
         self.shared = nn.Sequential(

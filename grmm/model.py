@@ -113,7 +113,7 @@ class GRMM(nn.Module):
         subjects: Sequence[str],
         expressions: Sequence[str],
     ) -> None:
-        """Build for a head model and the named subjects and expressions; rows of the code tables."""
+        """Build for a head model; subjects and expressions name the rows of the code tables."""
         super().__init__()
         self.config = config
         self.subjects, self.expressions = tuple(subjects), tuple(expressions)

@@ -169,7 +169,7 @@ def slerp_axis_angle(a: np.ndarray, b: np.ndarray, t: float) -> np.ndarray:
 def interpolation(
     loaded: Loaded, start: tuple[str, str], end: tuple[str, str], frames: int = 48
 ) -> Iterable[np.ndarray]:
-    """Yield frames that go from one (subject, expression) to another, codes and parameters alike."""
+    """Yield frames from one (subject, expression) to another: codes and parameters are blended."""
     model, gallery = loaded.model, loaded.gallery.frames
     codes = [
         model.codes(model.subjects.index(subject), model.expressions.index(expression))
@@ -184,7 +184,7 @@ def interpolation(
 
 
 def write_video(path: Path, frames: Iterable[np.ndarray], rate: int = VIDEO_RATE) -> int:
-    """Write (H, W, 3) uint8 frames as H.264 (an odd last row or column is cut); returns the count."""
+    """Write (H, W, 3) uint8 frames as H.264, odd last row or column cut; returns the count."""
     count = 0
     path.parent.mkdir(parents=True, exist_ok=True)
     aside = path.with_name(f".{path.name}.part.mp4")

@@ -9,12 +9,8 @@ from __future__ import annotations
 
 import math
 import os
-import signal
-import sys
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import torch
@@ -33,6 +29,7 @@ from grmm.evaluate import evaluate, mean, training_render
 from grmm.metrics import UNAVAILABLE
 from grmm.model import GRMM, Rendering
 from grmm.perceptual import load_vgg, random_crop
+from grmm.progress import Interrupt, append_log, deferred_interrupt, log, start_log
 from grmm.render import comparison_sheet
 from grmm.warm_start import warm_start
 
@@ -91,6 +88,8 @@ def train(
         restore(run, checkpoint, config, device)
     elif config.train.warm_start:
         warm_start(run.model, views, run.training, config.train.warm_start_images)
+    if rank == 0:
+        start_log(out / "log.jsonl", run.iteration)
     parallel = DistributedDataParallel(run.model) if world > 1 else run.model
     if rank == 0:
         log(f"{run.model.anchors.budget()}; {len(run.training)} views to train on")
@@ -109,6 +108,7 @@ def train(
             last = finished(run, config) or interrupt.requested
             if rank == 0 and (run.iteration % config.train.log_every == 0 or last):
                 log(progress_line(run, config))
+                append_log(out / "log.jsonl", run.iteration, run.seconds, run.terms)
             if rank == 0 and (run.iteration % config.train.save_every == 0 or last):
                 save(run, checkpoint, config, source.head)
             if interrupt.requested:
@@ -351,43 +351,3 @@ def progress_line(run: Run, config: Config) -> str:
     left = run.seconds * (1 - used) / used if used > 0 else 0.0
     terms = " ".join(f"{name} {value:.4f}" for name, value in run.terms.items())
     return f"iteration {run.iteration}  {rate:.2f}/s  {left:.0f} s left  {terms}"
-
-
-def log(line: str) -> None:
-    """Progress goes to standard error: standard output is for results."""
-    sys.stderr.write(line + "\n")
-    sys.stderr.flush()
-
-
-@dataclass
-class Interrupt:
-    """Set by Ctrl-C or SIGTERM."""
-
-    requested: bool = False
-
-
-@contextmanager
-def deferred_interrupt() -> Iterator[Interrupt]:
-    """Let the current iteration end before Ctrl-C or SIGTERM takes effect."""
-    interrupt = Interrupt()
-
-    def request(number: int, frame: object) -> None:
-        interrupt.requested = True
-
-    try:
-        former = {s: signal.signal(s, request) for s in (signal.SIGINT, signal.SIGTERM)}
-    except ValueError:  # not the main thread: nobody interrupts it
-        yield interrupt
-        return
-    try:
-        yield interrupt
-    finally:
-        for number, handler in former.items():
-            signal.signal(number, handler)
-
-
-def with_budget(config: Config, seconds: float | None) -> Config:
-    """The configuration with a time budget in seconds, if one is given."""
-    if seconds is None:
-        return config
-    return replace(config, train=replace(config.train, seconds=seconds))

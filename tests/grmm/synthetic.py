@@ -54,7 +54,7 @@ def ellipsoid_head(rows: int = 10, columns: int = 16) -> HeadModel:
 
 
 class EllipsoidSource:
-    """Subjects x expressions x cameras on a ring; subjects differ in colour, expressions in height."""
+    """Subjects (by colour) x expressions (by height) x cameras on a ring."""
 
     head = "ellipsoid"
 

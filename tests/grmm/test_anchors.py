@@ -24,7 +24,7 @@ def test_barycentrics_give_back_the_texel_centres(head):
 
 
 def test_only_covered_texels_get_a_gaussian(head):
-    squeezed = dict(uv=head.uv * torch.tensor([0.5, 1.0]))
+    squeezed = {"uv": head.uv * torch.tensor([0.5, 1.0])}
     anchors = make_anchors(type(head)(**{**vars(head), **squeezed}), 32)
     assert len(anchors.texels) == 32 * 16
     assert (anchors.texels % 32 < 16).all()

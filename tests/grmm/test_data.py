@@ -23,7 +23,9 @@ def views(source):
 def test_footage_is_composited_on_the_background(source):
     views = HeadViews(source, ellipsoid_head(), background=0.25)
     item = views.item(0)
-    assert torch.equal(item.target[:, ~item.mask], torch.full_like(item.target[:, ~item.mask], 0.25))
+    assert torch.equal(
+        item.target[:, ~item.mask], torch.full_like(item.target[:, ~item.mask], 0.25)
+    )
     sample = source.read(0)
     inside = torch.from_numpy(sample.image).permute(2, 0, 1)[:, item.mask] / 255
     torch.testing.assert_close(item.target[:, item.mask], inside)
@@ -95,7 +97,7 @@ def test_parameters_of_another_head_model_are_named(source):
             sample = super().read(index)
             return replace(sample, tracked=replace(sample.tracked, expression=np.zeros(9)))
 
-    with pytest.raises(FormatError, match="9 expression coefficients, head model 'ellipsoid' has 4"):
+    with pytest.raises(FormatError, match="9 expression coefficients, head model .* has 4"):
         HeadViews(Other(size=32), ellipsoid_head()).item(0)
 
 

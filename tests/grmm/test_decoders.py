@@ -7,8 +7,8 @@ from grmm.refine import Refinement, normalise_depth
 
 
 def ladder(**changes):
-    settings = dict(code=6, outputs=5, n_g=32, seed_channels=8, widths=(8, 8)) | changes
-    return Ladder(**settings)
+    settings = {"code": 6, "outputs": 5, "n_g": 32, "seed_channels": 8, "widths": (8, 8)}
+    return Ladder(**(settings | changes))
 
 
 def mesh_decoder(teeth=None):

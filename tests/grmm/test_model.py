@@ -43,8 +43,10 @@ def test_at_the_start_all_codes_give_the_tracked_mesh(views):
     expected = (corners * model.barycentrics[..., None]).sum(1)
     torch.testing.assert_close(a.means, expected)
     assert torch.allclose(a.opacities, torch.tensor(0.8))
-    assert torch.equal(model(0, 0, item.state, item.view).image, model.draw(
-        a, model.appearance(model.z_id[0], item.state, item.view), item.view).rgb)
+    assert torch.equal(
+        model(0, 0, item.state, item.view).image,
+        model.draw(a, model.appearance(model.z_id[0], item.state, item.view), item.view).rgb,
+    )
 
 
 def test_head_frame_starts_unrotated_and_isotropic(views):

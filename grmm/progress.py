@@ -1,0 +1,65 @@
+"""What a run says while it goes on, and how it stops."""
+
+from __future__ import annotations
+
+import json
+import signal
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from express50.publish import write_bytes
+
+
+def append_log(path: Path, iteration: int, seconds: float, terms: dict[str, float]) -> None:
+    """Add where a run is to OUT/log.jsonl, one JSON object a line."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    entry = {"iteration": iteration, "seconds": round(seconds, 3)}
+    numbers = {"loss": sum(terms.values())} | terms
+    entry |= {name: round(value, 8) for name, value in numbers.items()}
+    with path.open("a", encoding="utf-8") as file:
+        file.write(json.dumps(entry) + "\n")
+
+
+def start_log(path: Path, iteration: int) -> None:
+    """Keep the lines of the log up to an iteration: a resumed run repeats what came later."""
+    if not path.exists():
+        return
+    lines = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines() if line]
+    kept = [json.dumps(line) + "\n" for line in lines if line["iteration"] <= iteration]
+    write_bytes(path, "".join(kept).encode())
+
+
+def log(line: str) -> None:
+    """Progress goes to standard error: standard output is for results."""
+    sys.stderr.write(line + "\n")
+    sys.stderr.flush()
+
+
+@dataclass
+class Interrupt:
+    """Set by Ctrl-C or SIGTERM."""
+
+    requested: bool = False
+
+
+@contextmanager
+def deferred_interrupt() -> Iterator[Interrupt]:
+    """Let the current iteration end before Ctrl-C or SIGTERM takes effect."""
+    interrupt = Interrupt()
+
+    def request(number: int, frame: object) -> None:
+        interrupt.requested = True
+
+    try:
+        former = {s: signal.signal(s, request) for s in (signal.SIGINT, signal.SIGTERM)}
+    except ValueError:  # not the main thread: nobody interrupts it
+        yield interrupt
+        return
+    try:
+        yield interrupt
+    finally:
+        for number, handler in former.items():
+            signal.signal(number, handler)

@@ -1,0 +1,176 @@
+import io
+import json
+
+import numpy as np
+import pytest
+
+from express50.images import encode_jpeg, encode_png
+from express50.shards_write import PackedSample, ShardWriter
+from grmm import checkpoint as checkpoint_module
+from grmm.cli import build_parser, main, train_config
+from grmm.ply import read_ply
+from grmm.shard_source import ShardSource
+from tests.grmm.synthetic import EllipsoidSource, ellipsoid_head
+
+TINY = [
+    "--set=model.n_g=32", "--set=model.ladder=[8, 8]", "--set=model.refine_widths=[8]",
+    "--set=model.seed_channels=8", "--set=train.iterations=3", "--set=train.evaluate_images=2",
+    "--set=fit.stage1_iterations=2", "--set=fit.stage2_iterations=2", "--preset=demo",
+]  # fmt: skip
+
+
+def packed(source, index):
+    """One sample as the pack stage encodes it."""
+    key, sample = source.keys[index], source.read(index)
+    track = {k: np.asarray(v).tolist() for k, v in vars(sample.tracked).items()}
+    meta = {
+        "subject": key.subject, "expression": key.expression, "camera": key.camera,
+        "K": sample.K.tolist(), "cam_from_world": sample.cam_from_world.tolist(),
+        "width": source.size, "height": source.size, "depth_scale_m": 5e-5,
+        "head": "ellipsoid", "track": track,
+    }  # fmt: skip
+    depth = np.rint(sample.depth / 5e-5).astype(np.uint16)
+    members = {
+        "rgb.jpg": encode_jpeg(sample.image, 98),
+        "alpha.png": encode_png(sample.alpha),
+        "depth.png": encode_png(depth),
+        "meta.json": json.dumps(meta).encode(),
+    }
+    return PackedSample(key.subject, key.expression, key.camera, members)
+
+
+@pytest.fixture(scope="module")
+def shards(tmp_path_factory):
+    """Three subjects, the last of them in the test split."""
+    root = tmp_path_factory.mktemp("shards")
+    source = EllipsoidSource(subjects=3, size=32)
+    writer = ShardWriter(root, 1 << 24)
+    groups = {}
+    for index, key in enumerate(source.keys):
+        groups.setdefault((key.subject, key.expression), []).append(packed(source, index))
+    for split in ("train", "test"):
+        for (subject, _), samples in groups.items():
+            if (subject == "S002") == (split == "test"):
+                writer.add_group(split, samples)
+    writer.close()
+    return root
+
+
+@pytest.fixture(autouse=True)
+def toy_head(monkeypatch):
+    from express50.head import load
+
+    monkeypatch.setattr(checkpoint_module, "load_head", lambda spec: ellipsoid_head())
+    monkeypatch.setattr(load, "load_head", lambda spec: ellipsoid_head())
+
+
+@pytest.fixture(scope="module")
+def checkpoint(shards, tmp_path_factory):
+    out = tmp_path_factory.mktemp("run")
+    with pytest.MonkeyPatch.context() as patch:
+        from express50.head import load
+
+        patch.setattr(load, "load_head", lambda spec: ellipsoid_head())
+        patch.setattr(checkpoint_module, "load_head", lambda spec: ellipsoid_head())
+        assert main(["train", str(shards), str(out), *TINY, "--holdout-cameras=cam01"]) == 0
+    return out / "checkpoint.pt"
+
+
+def test_source_gives_back_what_was_packed(shards):
+    source, truth = ShardSource(shards, "*"), EllipsoidSource(subjects=3, size=32)
+    index = next(i for i, k in enumerate(source.keys) if k == truth.keys[7])
+    got, expected = source.read(index), truth.read(7)
+    assert np.abs(got.image.astype(int) - expected.image).mean() < 8  # JPEG
+    np.testing.assert_array_equal(got.alpha, expected.alpha)
+    np.testing.assert_allclose(got.depth, expected.depth, atol=2.6e-5)
+    np.testing.assert_array_equal(got.K, expected.K)
+    for name, value in vars(expected.tracked).items():
+        np.testing.assert_array_equal(getattr(got.tracked, name), value)
+
+
+def test_train_sees_the_training_split_only(checkpoint):
+    metrics = json.loads((checkpoint.parent / "metrics.json").read_text())
+    assert metrics["subjects"] == ["S000", "S001"]
+    assert metrics["heldout_cameras"] == ["cam01"] and metrics["iterations"] == 3
+    lines = (checkpoint.parent / "log.jsonl").read_text().splitlines()
+    assert json.loads(lines[-1])["iteration"] == 3
+
+
+def test_fit_render_evaluate_export(checkpoint, shards, tmp_path, capsys):
+    fit = ["fit", str(checkpoint), str(shards), str(tmp_path / "fit"), "--subject=S002"]
+    assert main([*fit, "--expression=e0", "--cameras=cam00,cam01", "--seconds=30"]) == 0
+    assert "held-out views" in capsys.readouterr().out
+    metrics = json.loads((tmp_path / "fit" / "metrics.json").read_text())
+    assert metrics["held_out_cameras"] == ["cam02"] and metrics["psnr_db"] > 5
+
+    assert main(["render", str(checkpoint), str(tmp_path), "--turntable", "--frames=2"]) == 0
+    assert (tmp_path / "turntable.mp4").stat().st_size > 0
+    assert (tmp_path / "grid.jpg").stat().st_size > 0
+
+    evaluate = ["evaluate", str(checkpoint), str(shards), str(tmp_path / "e"), "--json"]
+    capsys.readouterr()
+    assert main([*evaluate, "--cameras=cam01"]) == 0
+    assert json.loads(capsys.readouterr().out)["images"] == 4
+
+    assert main(["export", str(checkpoint), str(tmp_path / "head.ply"), "--expression=e1"]) == 0
+    cloud = read_ply(tmp_path / "head.ply")
+    assert cloud.means.shape == (1024, 3)
+    assert main(["export", str(checkpoint), str(tmp_path / "head.npz")]) == 0
+    arrays = np.load(tmp_path / "head.npz")
+    assert arrays["colors"].min() >= 0 and arrays["colors"].max() <= 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "message"),
+    [
+        (["train", "{shards}", "{out}", "--preset=dmeo"], 2, "expected one of paper, small, demo"),
+        (["train", "{out}", "{out}"], 1, "no such index"),
+        (["train", "{shards}", "{out}", *TINY, "--holdout-cameras=x"], 2, "names x"),
+        (["fit", "{checkpoint}", "{shards}", "{out}", "--subject=S9"], 2, "no sample has subject"),
+        (["fit", "{checkpoint}", "{shards}", "{out}", "--subject=S002", "--set=train.lr=1"], 2,
+         "only fit"),
+        (["render", "{out}/absent.pt", "{out}"], 1, "no such checkpoint"),
+        (["render", "{checkpoint}", "{out}", "--subject=S9"], 1, "knows no frame S9"),
+        (["export", "{checkpoint}", "{out}/head.obj"], 2, "expected .ply or .npz"),
+    ],
+)  # fmt: skip
+def test_errors_are_one_line_and_set_the_exit_code(
+    arguments, code, message, checkpoint, shards, tmp_path, capsys
+):
+    names = {"shards": shards, "out": tmp_path, "checkpoint": checkpoint}
+    assert main([a.format(**names) if "{" in a else a for a in arguments]) == code
+    error = capsys.readouterr().err.strip().splitlines()[-1]
+    assert message in error and error.startswith("grmm: ")
+
+
+def test_flags_stand_above_assignments():
+    parser = build_parser()
+    args = parser.parse_args(
+        ["train", "a", "b", "--preset=demo", "--set=train.seconds=5", "--seconds=7", "--overfit"]
+    )
+    config = train_config(args)
+    assert config.train.seconds == 7 and config.train.overfit == 1
+
+
+def test_help_needs_no_torch():
+    import subprocess
+    import sys
+
+    code = "import sys, grmm.cli as c; c.build_parser(); sys.exit('torch' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_mixed_head_models_are_refused(tmp_path):
+    source = EllipsoidSource(size=16)
+    samples = [packed(source, 0), packed(source, 1)]
+    meta = json.loads(samples[1].members["meta.json"]) | {"head": "other"}
+    members = dict(samples[1].members) | {"meta.json": json.dumps(meta).encode()}
+    samples[1] = PackedSample("S000", "e0", "cam01", members)
+    writer = ShardWriter(tmp_path, 1 << 24)
+    writer.add_group("train", samples)
+    writer.close()
+    from express50.errors import FormatError
+
+    with pytest.raises(FormatError, match="'other', the first sample with 'ellipsoid'"):
+        ShardSource(tmp_path).read(1)
+    assert io.BytesIO(samples[0].members["alpha.png"]).read(4) == b"\x89PNG"

@@ -1,0 +1,169 @@
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from express50.errors import FormatError, TrainError
+from grmm import checkpoint as checkpoint_module
+from grmm.checkpoint import load_checkpoint
+from grmm.data import HeadViews
+from grmm.fit import blend, fit, invert_codes, locality_loss, start, tune_decoders
+from grmm.render import (
+    expression_grid,
+    interpolate_tracked,
+    interpolation,
+    transfer,
+    turntable,
+    write_video,
+)
+from grmm.train import train
+from tests.grmm.synthetic import EllipsoidSource, ellipsoid_head, tiny_config
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """A checkpoint trained on S000 and S001."""
+    out = tmp_path_factory.mktemp("run")
+    train(EllipsoidSource(size=32), ellipsoid_head(), out, tiny_config(train={"iterations": 8}))
+    return out / "checkpoint.pt"
+
+
+@pytest.fixture(autouse=True)
+def toy_head(monkeypatch):
+    monkeypatch.setattr(checkpoint_module, "load_head", lambda spec: ellipsoid_head())
+
+
+@pytest.fixture
+def loaded(trained):
+    return load_checkpoint(trained)
+
+
+@pytest.fixture
+def views():
+    """Three subjects; S002 is the unseen one."""
+    return HeadViews(EllipsoidSource(subjects=3, size=32), ellipsoid_head())
+
+
+def unseen(views, camera="cam00"):
+    return [i for i, k in enumerate(views.keys) if (k.subject, k.camera) == ("S002", camera)]
+
+
+def test_stage_one_changes_codes_only(loaded, views):
+    state = start(loaded, views, unseen(views))
+    before = {k: v.clone() for k, v in state.model.state_dict().items()}
+    z_id = state.z_id.clone()
+    assert torch.equal(z_id, loaded.model.z_id.mean(0))
+    assert invert_codes(state, lambda: False) == 3
+    assert all(torch.equal(v, before[k]) for k, v in state.model.state_dict().items())
+    assert not torch.equal(state.z_id, z_id)
+    assert set(state.z_exp) == {"e0", "e1"}
+
+
+def test_stage_two_changes_decoders_only(loaded, views):
+    state = start(loaded, views, unseen(views))
+    before = {k: v.clone() for k, v in state.model.state_dict().items()}
+    z_id = state.z_id.clone()
+    assert tune_decoders(state, lambda: False) == 3
+    changed = {k for k, v in state.model.state_dict().items() if not torch.equal(v, before[k])}
+    assert {name.split(".")[0] for name in changed} == {"mesh", "transform", "opacity", "colour"}
+    assert torch.equal(state.z_id, z_id)
+    frozen = state.frozen.state_dict()
+    assert all(torch.equal(frozen[k], before[k]) for k in frozen)
+
+
+def test_locality_loss_is_zero_until_the_model_is_tuned(loaded, views):
+    state = start(loaded, views, unseen(views))
+    item = views.item(state.given[0])
+    assert float(locality_loss(state, item, np.random.default_rng(0)).detach()) < 1e-6
+    with torch.no_grad():
+        state.model.colour.bias += 1
+    assert float(locality_loss(state, item, np.random.default_rng(0)).detach()) > 1e-3
+
+
+def test_blend_weighs_the_subject_by_t(loaded, views):
+    state = start(loaded, views, unseen(views))
+    mine = views.sample(state.given[0]).tracked
+    _, z_id, z_exp = blend(state, ("S001", "e1"), mine, state.z_exp["e0"], 0.3)
+    expected = 0.7 * loaded.model.z_id[1] + 0.3 * state.z_id
+    torch.testing.assert_close(z_id, expected)
+    torch.testing.assert_close(z_exp, 0.7 * loaded.model.z_exp[1] + 0.3 * state.z_exp["e0"])
+
+
+def test_fit_improves_on_the_mean_code_and_reports_both_views(loaded, views, tmp_path):
+    settings = replace(
+        loaded.config.fit, stage1_iterations=10, stage2_iterations=25, stage1_lr=5e-2
+    )
+    loaded = replace(loaded, config=replace(loaded.config, fit=settings))
+    given = unseen(views, "cam00") + unseen(views, "cam01")
+    metrics = fit(loaded, views, given, unseen(views, "cam02"), tmp_path)
+    stages = metrics["stages"]
+    assert stages["stage2"]["psnr_given_db"] > stages["mean_code"]["psnr_given_db"] + 1
+    assert metrics["psnr_db"] == stages["stage2"]["psnr_held_out_db"]
+    assert metrics["held_out_cameras"] == ["cam02"]
+    assert json.loads((tmp_path / "metrics.json").read_text())["subject"] == "S002"
+    assert (tmp_path / "given.jpg").exists() and (tmp_path / "held_out.jpg").exists()
+    again = load_checkpoint(tmp_path / "checkpoint.pt")
+    assert again.model.subjects == ("S002",)
+    item = views.item(given[0])
+    with torch.no_grad():
+        picture = again.model(0, 0, item.state, item.view).image
+    squared = (picture.clamp(0, 1) - item.target).square().mean()
+    assert float(-10 * torch.log10(squared)) == pytest.approx(
+        stages["stage2"]["psnr_given_db"], abs=2.0
+    )
+
+
+def test_fit_stops_at_its_time_budget(loaded, views, tmp_path):
+    settings = replace(
+        loaded.config.fit, stage1_iterations=10_000, stage2_iterations=10_000, seconds=0.4
+    )
+    loaded = replace(loaded, config=replace(loaded.config, fit=settings))
+    metrics = fit(loaded, views, unseen(views)[:1], [], tmp_path)
+    assert 1 <= metrics["stage1_iterations"] < 10_000
+    assert 1 <= metrics["stage2_iterations"] < 10_000
+    assert metrics["psnr_is_of"].startswith("given views")
+
+
+def test_views_of_two_subjects_are_refused(loaded, views, tmp_path):
+    with pytest.raises(TrainError, match="2 subjects"):
+        fit(loaded, views, [0, len(views) - 1], [], tmp_path)
+
+
+def test_interpolated_parameters_meet_both_ends(views):
+    a, b = views.sample(0).tracked, views.sample(3).tracked
+    b = replace(b, jaw=np.array([0.4, 0, 0]), shape=np.array([1.0, 2, 3]))
+    for t, end in ((0.0, a), (1.0, b)):
+        got = interpolate_tracked(a, b, t)
+        for name in ("shape", "expression", "neck", "jaw", "eyes"):
+            np.testing.assert_allclose(getattr(got, name), getattr(end, name), atol=1e-7)
+    assert interpolate_tracked(a, b, 0.3).jaw[0] == pytest.approx(0.12)
+
+
+def test_transfer_keeps_the_identity_and_takes_the_expression(views):
+    a, b = views.sample(0).tracked, views.sample(3).tracked
+    a = replace(a, shape=np.array([1.0, 2, 3]))
+    got = transfer(a, b)
+    assert got.shape is a.shape and got.expression is b.expression
+
+
+def test_turntable_grid_and_interpolation(loaded, tmp_path):
+    frames = list(turntable(loaded, "S000", "e0", frames=3))
+    assert len(frames) == 3 and frames[0].shape == (32, 32, 3)
+    assert not np.array_equal(frames[0], frames[1])
+    rows = expression_grid(loaded, ["S000", "S001"], ["e0", "e1"])
+    assert len(rows) == 2 and len(rows[0]) == 2
+    blend_frames = list(interpolation(loaded, ("S000", "e0"), ("S001", "e1"), frames=3))
+    np.testing.assert_array_equal(blend_frames[0], rows[0][0])
+    np.testing.assert_array_equal(blend_frames[2], rows[1][1])
+    assert write_video(tmp_path / "t.mp4", frames) == 3
+    import av
+
+    with av.open(str(tmp_path / "t.mp4")) as container:
+        assert sum(1 for _ in container.decode(video=0)) == 3
+
+
+def test_unknown_frames_are_named(loaded):
+    with pytest.raises(FormatError, match="knows no frame S009/e0; expected one such as S000/e0"):
+        loaded.state("S009", "e0")

@@ -1,0 +1,251 @@
+import json
+import os
+import signal
+
+import pytest
+import torch
+
+from express50.errors import ConfigError, FormatError, TrainError
+from grmm import checkpoint as checkpoint_module
+from grmm.checkpoint import load_checkpoint
+from grmm.data import HeadViews
+from grmm.evaluate import evaluate, summarise, training_render, write_evaluation
+from grmm.perceptual import LAYERS, VGGDistance, load_vgg, random_crop
+from grmm.train import budget_used, prepare, set_rates, train
+from grmm.warm_start import fill_texels, project_texture, warm_start
+from tests.grmm.synthetic import EllipsoidSource, ellipsoid_head, tiny_config
+
+
+@pytest.fixture(autouse=True)
+def toy_head(monkeypatch):
+    monkeypatch.setattr(checkpoint_module, "load_head", lambda spec: ellipsoid_head())
+
+
+@pytest.fixture(scope="module")
+def source():
+    return EllipsoidSource(size=32)
+
+
+def state_of(path):
+    return torch.load(path / "checkpoint.pt", weights_only=True)
+
+
+def assert_equal(a, b, where=""):
+    """Equal bit for bit, through nested dictionaries and lists."""
+    assert type(a) is type(b), where
+    if isinstance(a, dict):
+        assert a.keys() == b.keys(), where
+        for key in a:
+            assert_equal(a[key], b[key], f"{where}.{key}")
+    elif isinstance(a, list):
+        for i, (x, y) in enumerate(zip(a, b, strict=True)):
+            assert_equal(x, y, f"{where}[{i}]")
+    elif isinstance(a, torch.Tensor):
+        assert torch.equal(a, b), where
+    else:
+        assert a == b, where
+
+
+def test_resumed_run_equals_straight_run_bit_for_bit(tmp_path, source):
+    head = ellipsoid_head()
+    straight, broken = tmp_path / "straight", tmp_path / "broken"
+    config = tiny_config(train={"iterations": 6, "final_lr": 1.0})
+    first = tiny_config(train={"iterations": 3, "final_lr": 1.0})
+    train(source, head, straight, config)
+    train(source, head, broken, first)
+    torch.manual_seed(99)  # the state of the process must not matter
+    train(source, head, broken, config, resume=True)
+    a, b = state_of(straight), state_of(broken)
+    for content in (a, b):
+        content["loop"].pop("seconds")
+    assert_equal(a, b)
+    assert a["loop"]["iteration"] == 6
+
+
+def test_resuming_with_other_settings_is_refused(tmp_path, source):
+    train(source, ellipsoid_head(), tmp_path, tiny_config(train={"iterations": 1}))
+    other = tiny_config(train={"lr": 0.5, "iterations": 2})
+    with pytest.raises(ConfigError, match=r"train.lr 0.002 -> 0.5"):
+        train(source, ellipsoid_head(), tmp_path, other, resume=True)
+    with pytest.raises(FormatError, match="no such checkpoint"):
+        train(source, ellipsoid_head(), tmp_path / "x", other, resume=True)
+
+
+def test_overfitting_one_view_lowers_the_error(tmp_path, source):
+    start = tiny_config(train={"iterations": 1, "overfit": 1})
+    longer = tiny_config(train={"iterations": 40, "overfit": 1, "lr": 5e-3})
+    before = train(source, ellipsoid_head(), tmp_path / "a", start)["psnr_train_db"]
+    after = train(source, ellipsoid_head(), tmp_path / "b", longer)["psnr_train_db"]
+    assert after > before + 3
+
+
+def test_held_out_cameras_are_never_trained_on(tmp_path, source):
+    config = tiny_config(data={"holdout_cameras": ("cam01",)})
+    metrics = train(source, ellipsoid_head(), tmp_path, config)
+    assert metrics["training_views"] == 8 and metrics["heldout_images"] == 2
+    assert "cam01" not in state_of(tmp_path)["cameras"]
+    written = json.loads((tmp_path / "metrics.json").read_text())
+    assert written["psnr_heldout_view_db"] > 10 and written["lpips"].startswith("n/a")
+    assert {p.name for p in (tmp_path / "preview").iterdir()} == {"training.jpg", "heldout.jpg"}
+
+
+def test_unknown_and_exhaustive_holdouts_are_refused(tmp_path, source):
+    with pytest.raises(ConfigError, match="names cam09; the shards have cam00"):
+        train(source, ellipsoid_head(), tmp_path, tiny_config(data={"holdout_cameras": ("cam09",)}))
+    everything = tiny_config(data={"holdout_cameras": ("cam00", "cam01", "cam02")})
+    with pytest.raises(TrainError, match="no views to train on"):
+        train(source, ellipsoid_head(), tmp_path, everything)
+
+
+def test_time_budget_ends_the_run(tmp_path, source):
+    config = tiny_config(train={"iterations": 10_000, "seconds": 0.5})
+    metrics = train(source, ellipsoid_head(), tmp_path, config)
+    assert 1 <= metrics["iterations"] < 10_000
+    assert metrics["seconds"] < 20
+
+
+def test_interrupt_leaves_a_checkpoint_to_resume(tmp_path, source, monkeypatch):
+    from grmm import train as module
+
+    real = module.step
+
+    def interrupted(run, *rest):
+        if run.iteration == 2:
+            os.kill(os.getpid(), signal.SIGINT)
+        real(run, *rest)
+
+    monkeypatch.setattr(module, "step", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        train(source, ellipsoid_head(), tmp_path, tiny_config(train={"iterations": 5}))
+    assert state_of(tmp_path)["loop"]["iteration"] == 3
+    monkeypatch.undo()
+    monkeypatch.setattr(checkpoint_module, "load_head", lambda spec: ellipsoid_head())
+    config = tiny_config(train={"iterations": 5})
+    assert train(source, ellipsoid_head(), tmp_path, config, resume=True)["iterations"] == 5
+
+
+def test_rates_fall_along_a_cosine(source):
+    config = tiny_config(train={"iterations": 10, "lr": 1.0, "final_lr": 0.1, "code_lr_scale": 3.0})
+    run = prepare(HeadViews(source, ellipsoid_head()), config)
+    rates = []
+    for run.iteration in (0, 5, 10):
+        set_rates(run, config)
+        rates.append(run.optimizer.param_groups[0]["lr"])
+        assert run.optimizer.param_groups[1]["lr"] == pytest.approx(3 * rates[-1])
+    assert rates == pytest.approx([1.0, 0.55, 0.1])
+    assert budget_used(run, config) == 1
+
+
+def test_warm_start_shows_the_subjects_before_the_first_step(source):
+    views = HeadViews(source, ellipsoid_head())
+    config = tiny_config()
+    run = prepare(views, config)
+    cold = summarise(evaluate(views, run.training, training_render(run.model, views)))
+    warm_start(run.model, views, run.training, 6)
+    warm = summarise(evaluate(views, run.training, training_render(run.model, views)))
+    assert warm["psnr_head_db"] > cold["psnr_head_db"] + 3
+    colours = [run.model.appearance(z, views.state(0), views.item(0).view) for z in run.model.z_id]
+    assert colours[0][:, 0].mean() > colours[1][:, 0].mean() + 0.1  # S000 is red, S001 blue
+    spread = run.model.z_id[:, 0].detach()
+    assert float(spread.std()) == pytest.approx(config.model.code_spread, rel=1e-4)
+
+
+def test_projected_texture_is_the_footage_where_seen_only():
+    views = HeadViews(EllipsoidSource(size=64, cameras=6, subjects=1), ellipsoid_head(24, 32))
+    config = tiny_config()
+    run = prepare(views, config)
+    indices = [i for i, key in enumerate(views.keys) if key.expression == "e0"]
+    colours, weight = project_texture(run.model, views, indices)
+    with torch.no_grad():
+        points = run.model.geometry(*run.model.codes(0, 0), views.state(0)).means
+    unit = points / torch.tensor([0.08, 0.11, 0.09])
+    pattern = 0.6 + 0.25 * torch.sin(4 * unit[:, 0]) + 0.15 * torch.sign(unit[:, 1])
+    expected = torch.tensor([0.9, 0.5, 0.4]) * pattern[:, None]
+    smooth = (weight > 0) & (unit[:, 1].abs() > 0.15)
+    assert float((colours - expected)[smooth].abs().mean()) < 0.03
+    front = [i for i in indices if views.keys[i].camera == "cam00"]
+    _, from_one = project_texture(run.model, views, front)
+    assert 0.1 < float((from_one > 0).float().mean()) < 0.5
+
+
+def test_unknown_texels_take_the_nearest_colour():
+    values = torch.tensor([[1.0], [0.0], [0.0], [3.0]])
+    known = torch.tensor([True, False, False, True])
+    texels = torch.tensor([0, 1, 62, 63])
+    assert fill_texels(values, known, texels, 8)[:, 0].tolist() == [1, 1, 3, 3]
+    nothing = fill_texels(values, torch.zeros(4, dtype=torch.bool), texels, 8)
+    assert nothing[:, 0].tolist() == [0.5] * 4
+
+
+def test_objective_that_is_not_finite_stops_with_the_sample_named(source, tmp_path):
+    class Poisoned(EllipsoidSource):
+        def read(self, index):
+            sample = super().read(index)
+            sample.depth[16, 16] = float("inf")
+            return sample
+
+    with pytest.raises(TrainError, match=r"iteration 0: the objective is not finite at Key"):
+        train(Poisoned(size=32), ellipsoid_head(), tmp_path, tiny_config())
+
+
+def test_checkpoint_is_read_with_weights_only_and_damage_is_named(tmp_path):
+    path = tmp_path / "checkpoint.pt"
+    path.write_bytes(b"not a checkpoint")
+    with pytest.raises(FormatError, match="not a checkpoint"):
+        load_checkpoint(path)
+    torch.save({"format": "other/9"}, path)
+    with pytest.raises(FormatError, match="format is 'other/9'"):
+        load_checkpoint(path)
+
+
+def test_evaluation_is_written_as_table_and_means(tmp_path, source):
+    views = HeadViews(source, ellipsoid_head())
+    run = prepare(views, tiny_config())
+    rows = evaluate(views, [0, 4], training_render(run.model, views))
+    summary = write_evaluation(tmp_path, rows)
+    lines = (tmp_path / "evaluation.csv").read_text().splitlines()
+    assert len(lines) == 3 and lines[0].startswith("subject,expression,camera,psnr_db")
+    assert summary["psnr_db"] == pytest.approx(
+        (rows[0]["psnr_db"] + rows[1]["psnr_db"]) / 2, abs=1e-3
+    )
+    assert set(summary["by_camera"]) == {"cam00", "cam01"}
+
+
+def vgg_weights():
+    generator = torch.Generator().manual_seed(0)
+    weights, channels, index = {}, 3, 0
+    for entry in LAYERS:
+        if entry == "M":
+            index += 1
+            continue
+        weights[f"features.{index}.weight"] = 0.05 * torch.randn(
+            entry, channels, 3, 3, generator=generator
+        )
+        weights[f"features.{index}.bias"] = torch.zeros(entry)
+        channels, index = entry, index + 2
+    return weights
+
+
+def test_perceptual_distance_is_zero_for_equal_images_and_learns(tmp_path):
+    path = tmp_path / "vgg16.pth"
+    torch.save(vgg_weights() | {"classifier.0.weight": torch.zeros(1)}, path)
+    distance = load_vgg(path)
+    image = torch.rand(3, 32, 32, requires_grad=True)
+    assert float(distance(image, image.detach()).detach()) == 0
+    distance(image, torch.rand(3, 32, 32)).backward()
+    assert image.grad.abs().sum() > 0
+    assert not any(p.requires_grad for p in distance.parameters())
+
+
+def test_wrong_perceptual_weights_are_named(tmp_path):
+    with pytest.raises(TrainError, match="lack features.0.weight"):
+        VGGDistance({})
+    with pytest.raises(TrainError, match="no such file"):
+        load_vgg(tmp_path / "absent.pth")
+
+
+def test_random_crop_is_the_same_for_both_images():
+    image = torch.rand(3, 20, 20)
+    a, b = random_crop((image, image.clone()), 8, torch.Generator().manual_seed(0))
+    assert a.shape == (3, 8, 8) and torch.equal(a, b)
+    assert random_crop((image, image), 0, torch.Generator())[0] is image
