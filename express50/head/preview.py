@@ -13,13 +13,13 @@ from express50.head.model import HeadModel, pose, vertex_normals
 
 Array = np.ndarray
 
-_SKIN = (0.80, 0.60, 0.50)
+_SKIN = (0.58, 0.37, 0.28)
 # Region -> linear base colour; later entries paint over earlier ones.
 _COLORS = {
-    "scalp": (0.76, 0.57, 0.48), "lips": (0.66, 0.34, 0.32), "mouth_interior": (0.40, 0.13, 0.13),
-    "gums": (0.62, 0.30, 0.30), "tongue": (0.66, 0.29, 0.29), "teeth": (0.85, 0.82, 0.74),
-    "left_eyeball": (0.88, 0.87, 0.85), "right_eyeball": (0.88, 0.87, 0.85),
-    "left_iris": (0.17, 0.26, 0.30), "right_iris": (0.17, 0.26, 0.30),
+    "scalp": (0.54, 0.35, 0.27), "lips": (0.47, 0.20, 0.18), "mouth_interior": (0.16, 0.04, 0.04),
+    "gums": (0.42, 0.16, 0.15), "tongue": (0.45, 0.15, 0.15), "teeth": (0.75, 0.71, 0.60),
+    "left_eyeball": (0.78, 0.77, 0.75), "right_eyeball": (0.78, 0.77, 0.75),
+    "left_iris": (0.10, 0.16, 0.19), "right_iris": (0.10, 0.16, 0.19),
     "left_pupil": (0.01, 0.01, 0.01), "right_pupil": (0.01, 0.01, 0.01),
 }  # fmt: skip
 _BACKGROUND = (0.11, 0.12, 0.14)
@@ -130,14 +130,17 @@ def _camera(yaw: float, pitch: float, side: int, span: float, center: tuple) -> 
     return origin, directions, right, up, back
 
 
-def _shade(scene: o3d.t.geometry.RaycastingScene, place: Array, n: Array, axes: tuple,
-           view: Array) -> Array:
+def _shade(
+    scene: o3d.t.geometry.RaycastingScene, place: Array, n: Array, axes: tuple, view: Array
+) -> Array:
     """Diffuse factor and specular addition (N,2): shadowed key light, fill, sky; a dull gloss."""
     right, up, back = axes
-    total = 0.20 + 0.12 * (n @ up)
+    total = 0.14 + 0.10 * (n @ up)
     gloss = np.zeros(len(n))
-    for light, power in ((-0.55 * right + 0.65 * up + 0.75 * back, 0.78),
-                         (0.8 * right + 0.15 * up + 0.5 * back, 0.24)):
+    for light, power in (
+        (-0.55 * right + 0.65 * up + 0.75 * back, 0.88),
+        (0.8 * right + 0.15 * up + 0.5 * back, 0.24),
+    ):
         light = light / np.linalg.norm(light)
         rays = np.concatenate([place + 8e-4 * n, np.broadcast_to(light, n.shape)], 1)
         dark = scene.test_occlusions(o3d.core.Tensor(rays.astype(np.float32))).numpy()

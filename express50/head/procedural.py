@@ -7,9 +7,12 @@ taken from another model; the placement of features follows anthropometry (Farka
 from __future__ import annotations
 
 from functools import cache
+from typing import Any
 
 import numpy as np
+import torch
 
+from express50.head.model import HeadModel, check_head
 from express50.head.procedural_expressions import expression_directions
 from express50.head.procedural_eyes import add_eyeball
 from express50.head.procedural_landmarks import contour_candidates, embed_landmarks
@@ -17,7 +20,12 @@ from express50.head.procedural_mesh import HalfMesh, WholeMesh, mirrored
 from express50.head.procedural_regions import region_masks
 from express50.head.procedural_shapes import shape_directions
 from express50.head.procedural_skin import add_skin, set_skin_uv
-from express50.head.procedural_skinning import joint_positions, joint_regressor, skinning_weights
+from express50.head.procedural_skinning import (
+    joint_positions,
+    joint_regressor,
+    pose_correctives,
+    skinning_weights,
+)
 from express50.head.procedural_teeth import add_teeth, add_tongue
 from express50.head.procedural_uv import pack_uv
 
@@ -39,7 +47,7 @@ def procedural_mesh() -> WholeMesh:
     return mirrored(half, PAIRED_CHARTS)
 
 
-def procedural_arrays() -> dict[str, object]:
+def procedural_arrays() -> dict[str, Any]:
     """All arrays of the built-in head (NumPy, float64, metres), keyed as HeadModel's fields."""
     mesh = procedural_mesh()
     regions = region_masks(mesh)
@@ -49,14 +57,13 @@ def procedural_arrays() -> dict[str, object]:
     weights = skinning_weights(mesh, regions)
     shape_names, shapes = shape_directions(mesh, regions)
     expression_names, expressions = expression_directions(mesh, regions, weights)
-    count = len(mesh.vertices)
     return {
         "template": mesh.vertices / 1000,
         "shape_dirs": shapes / 1000,
         "shape_names": shape_names,
         "expression_dirs": expressions / 1000,
         "expression_names": expression_names,
-        "pose_dirs": np.zeros((36, count * 3)),
+        "pose_dirs": pose_correctives(mesh, regions) / 1000,
         "joint_regressor": joint_regressor(mesh, joints),
         "skinning": weights,
         "faces": mesh.faces,
@@ -70,19 +77,15 @@ def procedural_arrays() -> dict[str, object]:
 
 
 @cache
-def build_procedural_head():  # noqa: ANN201 - HeadModel is imported lazily, torch is heavy
+def build_procedural_head() -> HeadModel:
     """The built-in head as a HeadModel (float32, CPU). Cached: callers share it, do not modify."""
-    import torch
-
-    from express50.head.model import HeadModel
-
     arrays = procedural_arrays()
 
     def tensor(value: Array) -> torch.Tensor:
         kind = torch.float32 if value.dtype.kind == "f" else None
         return torch.as_tensor(np.ascontiguousarray(value), dtype=kind)
 
-    return HeadModel(
+    model = HeadModel(
         name="procedural",
         contour=tuple(tensor(line) for line in arrays.pop("contour")),
         regions={name: tensor(mask) for name, mask in arrays.pop("regions").items()},
@@ -90,3 +93,4 @@ def build_procedural_head():  # noqa: ANN201 - HeadModel is imported lazily, tor
         expression_names=tuple(arrays.pop("expression_names")),
         **{name: tensor(value) for name, value in arrays.items()},
     )
+    return check_head(model)

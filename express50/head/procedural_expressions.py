@@ -21,8 +21,14 @@ Triple = tuple[float, float, float]
 _CORNER: Triple = (25.5, -49.5, 87)
 
 
-def _p(at: Triple, radius: Triple, move: Triple = (0, 0, 0), stretch: Triple = (0, 0, 0),
-       scope: str = "skin", sides: str = "left") -> Pull:
+def _p(
+    at: Triple,
+    radius: Triple,
+    move: Triple = (0, 0, 0),
+    stretch: Triple = (0, 0, 0),
+    scope: str = "skin",
+    sides: str = "left",
+) -> Pull:
     return Pull(at=at, radius=radius, move=move, stretch=stretch, scope=scope, sides=sides)
 
 
@@ -58,7 +64,7 @@ PAIRED: dict[str, tuple[Pull, ...]] = {
         _p((38, -22, 74), (19, 15, 22), (2.0, 5.0, 3.5)),
         _p((12, -43, 102), (10, 9, 16), (2.0, 1.2, -1.2), scope="upper"),
         _p((12, -55, 100), (11, 9, 16), (2.2, 1.6, -1.2), scope="lower"),
-        _p((28, -33, 88), (7, 10, 14), (0.5, 0.0, -1.8)),
+        _p((27, -31, 90), (8, 11, 14), (0.5, 0.5, -1.0)),
     ),
     "mouthFrown": (
         _p(_CORNER, (14, 12, 22), (1.5, -7.5, -1.0)),
@@ -128,9 +134,7 @@ _MIDDLE: dict[str, tuple[Pull, ...]] = {
         _p((0, -54, 101), (18, 6, 18), (0, 2.4, 1.2), scope="lower", sides="middle"),
     ),
     "chinWrinkle": (_p((0, -80, 96), (16, 11, 16), (0, 3.0, 1.4), sides="middle"),),
-    "browSqueeze": (
-        _p((13, 38, 90), (10, 12, 16), (-3.4, -0.8, 1.0), sides="both"),
-    ),
+    "browSqueeze": (_p((13, 38, 90), (10, 12, 16), (-3.4, -0.8, 1.0), sides="both"),),
     "throatSwallow": (_p((0, -132, 36), (13, 16, 22), (0, 8.0, 1.0), sides="middle"),),
 }
 
@@ -191,8 +195,10 @@ def _jaw_directions(mesh: WholeMesh, jaw: Array) -> dict[str, Array]:
     z = np.sin(angle) * offset[:, 1] + np.cos(angle) * offset[:, 2]
     back = np.stack([offset[:, 0], y, z], 1) - offset
     near = window(mesh.vertices, np.array([0.0, -52.0, 95.0]), np.array([36.0, 15.0, 30.0]))
-    soft = 1.0 - np.isin(np.arange(len(jaw)), np.concatenate(
-        [mesh.tag(t) for t in ("lower_teeth", "lower_gums", "tongue")]))
+    soft = 1.0 - np.isin(
+        np.arange(len(jaw)),
+        np.concatenate([mesh.tag(t) for t in ("lower_teeth", "lower_gums", "tongue")]),
+    )
     lips = near.copy()
     for k in range(4):
         lips[mesh.tag(f"lip{k}")] = np.maximum(lips[mesh.tag(f"lip{k}")], 1.0 - 0.06 * k)

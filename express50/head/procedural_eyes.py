@@ -19,11 +19,11 @@ IRIS_RADIUS, PUPIL_RADIUS = 5.9, 1.9
 
 
 def lid_margin() -> Array:
-    """Front view (x, y) of the lid margin (40,2) mm: upper lid from the nose out, lower lid back."""
+    """Front view (x, y) of the lid margin (40,2) mm: upper lid outwards, lower lid back."""
     s = 0.5 - 0.5 * np.cos(np.linspace(0, np.pi, LID_SEGMENTS + 1))
     line = INNER_CANTHUS + s[:, None] * (OUTER_CANTHUS - INNER_CANTHUS)
     upper, lower = line.copy(), line.copy()
-    upper[:, 1] += 5.6 * np.abs(np.sin(np.pi * s**0.88)) ** 0.8
+    upper[:, 1] += 5.1 * np.abs(np.sin(np.pi * s**0.88)) ** 0.8
     lower[:, 1] -= 5.0 * np.abs(np.sin(np.pi * s**1.12)) ** 0.85
     return np.concatenate([upper, lower[-2:0:-1]])
 
@@ -71,8 +71,24 @@ def add_eyeball(half: HalfMesh, columns: int = 28) -> None:
     """A sphere with its pole forward: rings at the pupil's and iris's rims, two UV charts."""
     iris = np.degrees(np.arcsin(IRIS_RADIUS / EYE_RADIUS))
     pupil = np.degrees(np.arcsin(PUPIL_RADIUS / EYE_RADIUS))
-    polar = np.radians([pupil, 0.5 * (pupil + iris), iris, iris + 3, 42, 54, 66, 78, 90,
-                        110, 130, 150, 167])
+    polar = np.radians(
+        [
+            pupil,
+            pupil + 2,
+            0.5 * (pupil + iris),
+            iris,
+            iris + 2,
+            42,
+            54,
+            66,
+            78,
+            90,
+            110,
+            130,
+            150,
+            167,
+        ]
+    )
     turn = 2 * np.pi * np.arange(columns) / columns
     circle = np.stack([np.cos(turn), np.sin(turn)], 1)
     front = int(half.add(EYE_CENTER + [[0, 0, EYE_RADIUS]], "eyeball")[0])
@@ -80,16 +96,17 @@ def add_eyeball(half: HalfMesh, columns: int = 28) -> None:
     for k, a in enumerate(polar):
         ring = np.concatenate([np.sin(a) * circle, np.full((columns, 1), np.cos(a))], 1)
         rings.append(half.add(EYE_CENTER + EYE_RADIUS * ring, "eyeball"))
-        if k <= 8:
+        if k <= 9:
             half.set_uv("eye_front", rings[-1], circle * a / np.pi)
-        if k >= 8:
+        if k >= 9:
             half.set_uv("eye_back", rings[-1], circle * [-1, 1] * (np.pi - a) / np.pi)
     back = int(half.add(EYE_CENTER - [[0, 0, EYE_RADIUS]], "eyeball")[0])
-    half.set_uv("eye_front", [front], [[0, 0]])
-    half.set_uv("eye_back", [back], [[0, 0]])
+    pole = np.zeros((1, 2))
+    half.set_uv("eye_front", np.array([front]), pole)
+    half.set_uv("eye_back", np.array([back]), pole)
     half.fan("eye_front", front, rings[0], closed=True)
     half.fan("eye_back", back, rings[-1], closed=True)
     for k in range(len(rings) - 1):
-        half.strip("eye_front" if k < 8 else "eye_back", rings[k], rings[k + 1], closed=True)
+        half.strip("eye_front" if k < 9 else "eye_back", rings[k], rings[k + 1], closed=True)
     half.tags["pupil"] = np.concatenate([[front], rings[0]])
-    half.tags["iris"] = np.concatenate([[front], rings[0], rings[1], rings[2]])
+    half.tags["iris"] = np.concatenate([[front], *rings[:4]])

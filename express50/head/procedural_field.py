@@ -13,14 +13,14 @@ import numpy as np
 
 Array = np.ndarray
 
-EYE_CENTER = np.array([31.5, 20.0, 68.5])
+EYE_CENTER = np.array([31.5, 20.0, 70.0])
 EYE_RADIUS = 12.0
 LID_RADIUS = 13.3
 
 
 @dataclass(frozen=True)
 class Mass:
-    """One mass: kind "ellipsoid" (a centre, b radii) or "capsule" (a, b ends, radii at the ends)."""
+    """One mass: kind "ellipsoid" (a centre, b radii) or "capsule" (a, b ends)."""
 
     kind: str
     a: tuple[float, float, float]
@@ -32,58 +32,68 @@ class Mass:
     carve: bool = False
 
 
-def _ellipsoid(c: tuple, r: tuple, blend: float, *, tilt: float = 0.0, yaw: float = 0.0,
-               carve: bool = False) -> Mass:
+def _ellipsoid(
+    c: tuple, r: tuple, blend: float, *, tilt: float = 0.0, yaw: float = 0.0, carve: bool = False
+) -> Mass:
     return Mass("ellipsoid", c, r, blend, tilt=tilt, yaw=yaw, carve=carve)
 
 
-def _capsule(a: tuple, b: tuple, ra: float, rb: float, blend: float, *,
-             carve: bool = False) -> Mass:
+def _capsule(
+    a: tuple, b: tuple, ra: float, rb: float, blend: float, *, carve: bool = False
+) -> Mass:
     return Mass("capsule", a, b, blend, radii=(ra, rb), carve=carve)
 
 
 SKULL = (
     _ellipsoid((0, 54, -20), (75, 79, 74), 1),
-    _ellipsoid((0, 50, 22), (64, 80, 71), 28),
-    _ellipsoid((0, 5, 38), (62, 62, 46), 25),
-    _ellipsoid((0, -35, 44), (45, 42, 48), 22),  # maxilla and muscles around the mouth
-    _capsule((46, 1, 60), (65, 3, 12), 11, 6, 14),  # cheekbone and zygomatic arch
-    _capsule((16, -80, 75), (46, -60, 14), 12, 10, 12),  # body of the mandible
-    _capsule((47, -58, 14), (58, -8, 6), 9, 9, 14),  # ramus
-    _ellipsoid((0, -50, 30), (46, 38, 45), 16),
-    _ellipsoid((0, -80, 80), (19, 13, 15), 12),  # chin
-    _ellipsoid((0, -78, 42), (36, 22, 38), 14),  # floor of the mouth
-    _ellipsoid((34, -22, 60), (22, 28, 24), 16),  # cheek fat
+    _ellipsoid((0, 52, 24), (66, 78, 70), 28),
+    _ellipsoid((0, 5, 38), (62, 60, 46), 25),
+    _ellipsoid((0, -35, 46), (44, 42, 48), 22),  # maxilla and muscles around the mouth
+    _capsule((44, 2, 62), (66, 4, 12), 11, 6, 14),  # cheekbone and zygomatic arch
+    _capsule((10, -83, 78), (43, -60, 12), 10, 8.5, 18),  # body of the mandible
+    _capsule((44, -58, 12), (57, -8, 6), 9, 9, 14),  # ramus
+    _ellipsoid((0, -50, 32), (47, 39, 46), 16),
+    _ellipsoid((0, -80, 82), (15, 13, 14), 12),  # chin
+    _ellipsoid((0, -79, 38), (37, 23, 38), 14),  # floor of the mouth
+    _ellipsoid((34, -24, 60), (21, 26, 24), 16),  # cheek fat
+    _ellipsoid((28, -4, 76), (12, 9, 9), 14),  # front of the cheek, under the eye
 )
 NECK = (
-    _capsule((0, -70, -16), (0, -230, -34), 53, 55, 16),
-    _capsule((55, -36, -22), (16, -215, 18), 7, 8, 18),  # sternocleidomastoid
-    _capsule((14, -60, -60), (76, -196, -42), 14, 30, 30),  # trapezius
-    _ellipsoid((0, -131, 30), (9, 13, 8), 14),  # thyroid cartilage
+    _capsule((0, -70, -16), (0, -230, -34), 50, 52, 18),
+    _ellipsoid((0, -18, -46), (46, 44, 33), 22),  # nuchal muscles
+    _ellipsoid((56, -18, -22), (10, 18, 12), 12),  # mastoid
+    _capsule((54, -36, -22), (15, -215, 16), 7, 8, 16),  # sternocleidomastoid
+    _capsule((14, -60, -58), (82, -206, -42), 12, 27, 34),  # trapezius
+    _ellipsoid((0, -102, 24), (24, 15, 16), 16),  # hyoid
+    _ellipsoid((0, -131, 28), (8, 13, 8), 14),  # thyroid cartilage
 )
 BROW_AND_ORBIT = (
-    _capsule((10, 37, 86), (32, 43, 80), 8, 7.5, 10),
-    _capsule((32, 43, 80), (52, 36, 60), 7.5, 6, 10),
-    _ellipsoid((0, 37, 84), (14, 11, 11), 10),  # glabella
-    _ellipsoid((32, 18, 91), (17, 12.5, 17), 9, carve=True, yaw=18),
-    _ellipsoid((16, 24, 90), (7, 11, 12), 8, carve=True),
-    _ellipsoid(tuple(EYE_CENTER), (LID_RADIUS,) * 3, 3.5),
+    _capsule((10, 37, 86), (30, 42, 78), 7, 6.5, 12),
+    _capsule((30, 42, 78), (53, 35, 60), 6.5, 5.5, 12),
+    _ellipsoid((0, 37, 84), (14, 11, 10.5), 12),  # glabella
+    _ellipsoid((32, 15.0, 90), (16.5, 10.5, 14), 11, carve=True, yaw=18),
+    _ellipsoid((33, 32.5, 71), (18, 6.0, 11.5), 6, yaw=22),  # fullness between lid and brow
+    _ellipsoid((16.5, 22, 93.5), (5, 8, 8.5), 11, carve=True),
+    _ellipsoid(tuple(EYE_CENTER), (LID_RADIUS,) * 3, 3.0),
+    _capsule((20, 25.0, 85.0), (31, 28.8, 83.5), 1.4, 1.8, 2.5, carve=True),  # fold of the lid
+    _capsule((31, 28.8, 83.5), (45, 24.5, 77), 1.8, 1.4, 2.5, carve=True),
 )
 NOSE = (
-    _capsule((0, 26, 82), (0, -6, 98), 8, 9.5, 10),
-    _ellipsoid((0, -8, 88), (15, 22, 16), 9),
-    _ellipsoid((0, -14, 106), (10.5, 9.5, 10.5), 8),
-    _ellipsoid((12.5, -18.5, 97), (7, 7.5, 10), 5, yaw=-15),
-    _capsule((0, -26, 96), (0, -20, 109), 4.5, 5, 5),
+    _capsule((0, 26, 83), (0, -6, 99), 6.5, 8.5, 11),
+    _ellipsoid((0, -8, 88), (14, 22, 16), 9),
+    _ellipsoid((0, -14, 106.5), (9.5, 9, 10), 8),
+    _ellipsoid((12.5, -19, 97.5), (6.5, 7, 10), 4, yaw=-15),
+    _capsule((0, -26, 97), (0, -20, 109), 4.0, 5, 5),
 )
 LIPS = (
-    _ellipsoid((0, -48, 80), (27, 22, 19), 10),  # dental arch behind the lips
-    _capsule((4, -43.5, 96), (15, -45.5, 93.5), 5.2, 4.2, 4),
-    _capsule((15, -45.5, 93.5), (27, -49, 84), 4.2, 2.5, 4),
-    _capsule((0, -54.5, 95), (13, -54, 93), 5.6, 5.0, 4),
-    _capsule((13, -54, 93), (27, -50, 84), 5.0, 2.5, 4),
-    _capsule((0, -31, 104.5), (0, -41, 106.5), 3.5, 4, 3, carve=True),  # philtrum
-    _capsule((0, -65, 102), (14, -66, 97), 6, 5, 7, carve=True),  # labiomental fold
+    _ellipsoid((0, -48, 80), (28, 22, 19), 10),  # dental arch behind the lips
+    _capsule((3.5, -43.2, 98), (15, -45.0, 95), 5.4, 4.6, 4),
+    _capsule((15, -45.0, 95), (27, -49, 84.5), 4.6, 2.0, 4),
+    _capsule((0, -55, 97.0), (11, -54.6, 95.5), 6.0, 5.6, 5),
+    _capsule((11, -54.6, 95.5), (26, -50, 84.5), 5.6, 2.0, 5),
+    _capsule((0, -31, 105.5), (0, -40, 108), 3.5, 4, 3, carve=True),  # philtrum
+    _capsule((0, -66, 103), (14, -67, 98), 6, 5, 8, carve=True),  # labiomental fold
+    _ellipsoid((32, -50, 91), (5, 6, 7), 7, carve=True),  # hollow beside the mouth's corner
 )
 MASSES = SKULL + NECK + BROW_AND_ORBIT + NOSE + LIPS
 
@@ -95,48 +105,91 @@ def _rotation(tilt: float, yaw: float) -> Array:
     return ry @ rx
 
 
-def _distance(mass: Mass, p: Array) -> Array:
-    if mass.kind == "ellipsoid":
-        q = (p - np.asarray(mass.a, float)) @ _rotation(mass.tilt, mass.yaw)
-        r = np.asarray(mass.b, float)
-        q = q / r
-        k0 = np.sqrt((q * q).sum(-1)) + 1e-12
-        k1 = np.sqrt(((q / r) ** 2).sum(-1)) + 1e-12
-        return k0 * (k0 - 1.0) / k1
-    a, b = np.asarray(mass.a, float), np.asarray(mass.b, float)
-    ab = b - a
-    t = np.clip((p - a) @ ab / (ab @ ab), 0.0, 1.0)
-    radius = mass.radii[0] + (mass.radii[1] - mass.radii[0]) * t
-    return np.linalg.norm(p - a - t[:, None] * ab, axis=-1) - radius
+@dataclass(frozen=True)
+class _Stack:
+    """Masses as arrays, so that one matrix product serves all of them."""
+
+    unit: Array  # (3,3E) head space to the ellipsoids' unit spheres
+    shift: Array  # (3E,)
+    inverse_radii: Array  # (E,3)
+    start: Array  # (C,3) capsules: first end, axis, radii
+    axis: Array
+    radii: Array
+    order: tuple[tuple[bool, int, float, bool], ...]  # is ellipsoid, index, blend, carve
+
+
+def _stack(masses: tuple[Mass, ...]) -> _Stack:
+    round_ones = [m for m in masses if m.kind == "ellipsoid"]
+    long_ones = [m for m in masses if m.kind == "capsule"]
+    units = [_rotation(m.tilt, m.yaw) / np.array(m.b, float) for m in round_ones]
+    order, counts = [], {"ellipsoid": 0, "capsule": 0}
+    for m in masses:
+        order.append((m.kind == "ellipsoid", counts[m.kind], m.blend, m.carve))
+        counts[m.kind] += 1
+    return _Stack(
+        unit=np.concatenate(units, 1),
+        shift=np.concatenate([np.array(m.a) @ u for m, u in zip(round_ones, units, strict=True)]),
+        inverse_radii=np.array([1 / np.array(m.b, float) for m in round_ones]),
+        start=np.array([m.a for m in long_ones], float),
+        axis=np.array([np.subtract(m.b, m.a) for m in long_ones], float),
+        radii=np.array([m.radii for m in long_ones], float),
+        order=tuple(order),
+    )
+
+
+_SKIN = _stack(MASSES)
+
+
+def _ellipsoid_distances(stack: _Stack, p: Array) -> Array:
+    """Distances (N,E), first order near the surfaces."""
+    q = (p @ stack.unit - stack.shift).reshape(len(p), -1, 3)
+    k0 = np.sqrt(np.einsum("nec,nec->ne", q, q)) + 1e-12
+    q *= stack.inverse_radii
+    k1 = np.sqrt(np.einsum("nec,nec->ne", q, q)) + 1e-12
+    return k0 * (k0 - 1.0) / k1
+
+
+def _capsule_distances(stack: _Stack, p: Array) -> Array:
+    """Distances (N,C) to capsules whose radius runs linearly between the ends."""
+    length2 = np.einsum("cd,cd->c", stack.axis, stack.axis)
+    along = p @ stack.axis.T - np.einsum("cd,cd->c", stack.start, stack.axis)
+    offset2 = (p * p).sum(1)[:, None] - 2 * p @ stack.start.T
+    offset2 = offset2 + np.einsum("cd,cd->c", stack.start, stack.start)
+    t = np.clip(along / length2, 0.0, 1.0)
+    distance2 = offset2 - 2 * t * along + t * t * length2
+    radius = stack.radii[:, 0] + (stack.radii[:, 1] - stack.radii[:, 0]) * t
+    return np.sqrt(np.maximum(distance2, 0.0)) - radius
 
 
 def _smooth_min(a: Array, b: Array, k: float) -> Array:
     """Polynomial smooth minimum (quadratic), exact outside |a - b| < k."""
-    h = np.maximum(k - np.abs(a - b), 0.0) / k
-    return np.minimum(a, b) - 0.25 * k * h * h
+    h = np.maximum(k - np.abs(a - b), 0.0)
+    return np.minimum(a, b) - (0.25 / k) * h * h
 
 
-def skin_field(points: Array, masses: tuple[Mass, ...] = MASSES) -> Array:
+def skin_field(points: Array) -> Array:
     """Signed distance-like value in mm at points (N,3) in mm: negative inside the skin."""
-    p = np.asarray(points, float) * 1.0
+    p = np.array(points, float)
     p[:, 0] = np.sqrt(p[:, 0] ** 2 + 1.0)  # folds without a crease on the mid plane
-    value = _distance(masses[0], p)
-    for mass in masses[1:]:
-        d = _distance(mass, p)
-        if mass.carve:
-            value = -_smooth_min(-value, d, mass.blend)
-        else:
-            value = _smooth_min(value, d, mass.blend)
+    ellipsoids = np.ascontiguousarray(_ellipsoid_distances(_SKIN, p).T)
+    capsules = np.ascontiguousarray(_capsule_distances(_SKIN, p).T)
+    value = ellipsoids[0]
+    for is_ellipsoid, index, blend, carve in _SKIN.order[1:]:
+        d = ellipsoids[index] if is_ellipsoid else capsules[index]
+        value = -_smooth_min(-value, d, blend) if carve else _smooth_min(value, d, blend)
     return value
 
 
-def cast(origins: Array, directions: Array, far: float = 170.0, steps: int = 56) -> Array:
+def cast(origins: Array, directions: Array, far: float = 170.0, steps: int = 70) -> Array:
     """Outermost hit (N,3) of the skin on rays from inside, marching inwards from `far` mm."""
     d = directions / np.linalg.norm(directions, axis=-1, keepdims=True)
-    t = np.full(len(origins), far)
+    t, active = np.full(len(origins), far), np.arange(len(origins))
     for _ in range(steps):
-        value = skin_field(origins + t[:, None] * d)
-        t = np.maximum(t - 0.8 * value, 0.0)
+        value = skin_field(origins[active] + t[active, None] * d[active])
+        t[active] = np.maximum(t[active] - 0.85 * value, 0.0)
+        active = active[np.abs(value) > 5e-3]
+        if not len(active):
+            break
     return origins + t[:, None] * d
 
 

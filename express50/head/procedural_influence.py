@@ -52,14 +52,17 @@ def scope_weights(mesh: WholeMesh, regions: dict[str, Array], jaw: Array) -> dic
     balls = regions["left_eyeball"] | regions["right_eyeball"]
     skin = (~hard & ~balls).astype(float)
     return {
-        "all": np.ones(len(skin)), "skin": skin, "upper": skin * (1 - jaw), "lower": skin * jaw,
+        "all": np.ones(len(skin)),
+        "skin": skin,
+        "upper": skin * (1 - jaw),
+        "lower": skin * jaw,
     }
 
 
 def settle_eyes(mesh: WholeMesh, motion: Array, ball_motion: str) -> Array:
     """Make lids follow the eyeball. ball_motion: "rigid" (the field at its centre) or "none"."""
     result = motion.copy()
-    for side, sign in (("left", 1.0), ("right", -1.0)):
+    for side in ("left", "right"):
         ball = mesh.tag("eyeball", side)
         rigid = np.zeros(3)
         if ball_motion == "rigid":

@@ -29,19 +29,19 @@ def embed_landmarks(mesh: WholeMesh) -> tuple[Array, Array]:
     points[22:27], points[17:22] = brow, (brow * flip)[::-1]
     points[27:31] = bridge
     points[33:36], points[31:33] = nostrils, (nostrils * flip)[:0:-1]
-    lid, mouth, slit = "lid0", "lip3", "lip0"
-    for first, side, order in ((42, "left", (0, 7, 13, 20, 27, 33)),
-                               (36, "right", (20, 13, 7, 0, 33, 27))):
-        points[first : first + 6] = mesh.vertices[mesh.tag(lid, side)[list(order)]]
-    for start, tag, order in ((48, mouth, (16, 7, 2, 0, 25, 30, 32)), (60, slit, (16, 6, 0, 26, 32))):
-        left = mesh.vertices[mesh.tag(tag, "left")[list(order)]]
-        right = left * flip
-        if start == 48:
-            ring = [right[0], right[1], right[2], left[3], left[2], left[1], left[0],
-                    left[4], left[5], left[6], right[5], right[4]]
-        else:
-            ring = [right[0], right[1], left[2], left[1], left[0], left[3], left[4], right[3]]
-        points[start : start + len(ring)] = ring
+    for first, side, order in (
+        (42, "left", (0, 7, 13, 20, 27, 33)),
+        (36, "right", (20, 13, 7, 0, 33, 27)),
+    ):
+        points[first : first + 6] = mesh.vertices[mesh.tag("lid0", side)[list(order)]]
+    for first, tag, loop in (
+        (48, "lip3", (-16, -7, -2, 0, 2, 7, 16, 25, 30, 32, -30, -25)),
+        (60, "lip0", (-16, -6, 0, 6, 16, 26, 32, -26)),
+    ):
+        # Positions along the loop from the upper to the lower middle; negative on the right.
+        row = mesh.vertices[mesh.tag(tag, "left")]
+        sign = np.where(np.array(loop) < 0, -1.0, 1.0)[:, None]
+        points[first : first + len(loop)] = row[np.abs(loop)] * np.where([1, 0, 0], sign, 1.0)
     return _embed(mesh, points)
 
 
@@ -71,7 +71,7 @@ def _closest(corners: Array, p: Array) -> tuple[Array, Array]:
 
 
 def contour_candidates(mesh: WholeMesh) -> tuple[Array, ...]:
-    """For landmarks 0..16 the skin vertices, front to back, that may lie on the visible jaw line."""
+    """For landmarks 0..16 the skin vertices that may lie on the visible jaw line."""
     azimuth, latitude = labels(project(_JAW, 6))
     grid = mesh.tag("grid")
     result = []

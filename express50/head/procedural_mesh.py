@@ -57,8 +57,8 @@ class HalfMesh:
         first = np.linalg.norm(p[a[:-1]] - p[b[1:]], axis=1)
         second = np.linalg.norm(p[a[1:]] - p[b[:-1]], axis=1)
         quads = np.stack([a[:-1], a[1:], b[1:], b[:-1]], 1)
-        split = np.where(
-            (first <= second)[:, None, None],
+        split = np.where(  # the margin keeps ties from hanging on rounding
+            (first <= second + 1e-6)[:, None, None],
             quads[:, [[0, 1, 2], [0, 2, 3]]],
             quads[:, [[0, 1, 3], [1, 2, 3]]],
         )

@@ -19,7 +19,7 @@ _OUTER_CENTER_Y, _OUTER_X, _OUTER_UP, _OUTER_DOWN = -49.0, 41.0, 16.0, 20.0
 def slit_y(x: Array) -> Array:
     """Height of the closed lips' line at x (mm): a low bow that dips towards the corners."""
     t = np.clip(x / CORNER_X, 0, 1)
-    return -48.8 + 0.7 * np.exp(-((x / 7.0) ** 2)) * -1.0 - 1.6 * t**3 + 0.9 * t * (1 - t)
+    return -48.8 - 0.7 * np.exp(-((x / 7.0) ** 2)) - 0.5 * t**3 + 0.9 * t * (1 - t)
 
 
 def _rows() -> tuple[Array, Array, Array, Array]:
@@ -28,9 +28,9 @@ def _rows() -> tuple[Array, Array, Array, Array]:
     x = CORNER_X * np.sin(0.5 * np.pi * s)
     t = x / CORNER_X
     slit = np.stack([x, slit_y(x)], 1)
-    up = 6.9 * (1 - t**1.6) ** 0.9 + 1.1 * np.exp(-(((x - 5.5) / 3.2) ** 2)) + 0.2
-    down = 9.0 * (1 - t**2.2) ** 0.8
-    wide = x * (1 + 0.06 * t**4)
+    up = 7.6 * (1 - t**1.7) ** 0.9 + 1.2 * np.exp(-(((x - 5.5) / 3.2) ** 2)) + 0.2
+    down = 10.0 * (1 - t**2.2) ** 0.8
+    wide = x * (1 + 0.03 * t**4)
     upper = np.stack([wide, slit[:, 1] + up], 1)
     lower = np.stack([wide, slit[:, 1] - down], 1)
     upper[-1, 1] = lower[-1, 1] = slit[-1, 1]
@@ -49,7 +49,7 @@ def add_lip_rings(half: HalfMesh) -> tuple[Array, Array]:
     sign = np.concatenate([np.ones(LIP_SEGMENTS), [0.0], -np.ones(LIP_SEGMENTS)])
     thick = 1 - (x / CORNER_X) ** 4
     contact = from_front(slit)
-    contact[:, 2] -= 1.0 + 1.2 * thick
+    contact[:, 2] -= 0.3 + 2.2 * thick
     contact[:, 1] += 0.05 * sign
     rows = [contact]
     for f in (0.3, 0.65, 1.0):
@@ -95,7 +95,7 @@ def _add_cavity(half: HalfMesh, slit: Array, contact: Array, sign: Array, thick:
         half.tags[f"cavity{k}"] = rows[-1]
         half.set_uv("mouth", rows[-1], radii[min(k + 1, 7)] * np.stack([out, up], 1))
         half.strip("mouth", rows[-2], rows[-1], closed=False)
-    throat = half.add(np.array([[0.0, -51.0, 37.0]]), "cavity")
+    throat = half.tags["throat"] = half.add(np.array([[0.0, -51.0, 37.0]]), "cavity")
     half.set_uv("mouth", throat, np.array([[0.0, 0.0]]))
     half.fan("mouth", int(throat[0]), rows[-1], closed=False)
 

@@ -49,8 +49,9 @@ def region_masks(mesh: WholeMesh) -> dict[str, Array]:
     plain = skin & ~ears & ~regions["lips"]
     azimuth = np.degrees(np.arctan2(x, z))
     neck_top = np.interp(z, [-90, -60, -20, 12, 60, 90], [-42, -38, -32, -70, -101, -106])
-    hairline = np.interp(azimuth, [0, 25, 45, 60, 72, 84, 92, 100, 180],
-                         [84, 88, 82, 66, 44, 20, 6, -30, -42])
+    hairline = np.interp(
+        azimuth, [0, 25, 45, 60, 72, 84, 92, 100, 180], [84, 88, 82, 66, 44, 20, 6, -30, -42]
+    )
     eye_region = regions["left_eye_region"] | regions["right_eye_region"]
     regions["neck"] = plain & (y < neck_top)
     regions["scalp"] = plain & ~regions["neck"] & (y > hairline)

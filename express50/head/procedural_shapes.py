@@ -11,6 +11,7 @@ from express50.head.procedural_influence import (
     scope_weights,
     settle_eyes,
 )
+from express50.head.procedural_lids import lid_motion
 from express50.head.procedural_mesh import WholeMesh
 
 Array = np.ndarray
@@ -19,18 +20,34 @@ Triple = tuple[float, float, float]
 _WIDE: Triple = (1e5, 1e5, 1e5)
 
 
-def _all(at: Triple, radius: Triple, move: Triple = (0, 0, 0),
-         stretch: Triple = (0, 0, 0), sides: str = "middle") -> Pull:
+def _all(
+    at: Triple,
+    radius: Triple,
+    move: Triple = (0, 0, 0),
+    stretch: Triple = (0, 0, 0),
+    sides: str = "middle",
+) -> Pull:
     return Pull(at=at, radius=radius, move=move, stretch=stretch, sides=sides, scope="all")
 
 
-def _pair(at: Triple, radius: Triple, move: Triple = (0, 0, 0), stretch: Triple = (0, 0, 0),
-          scope: str = "skin", sides: str = "both") -> Pull:
+def _pair(
+    at: Triple,
+    radius: Triple,
+    move: Triple = (0, 0, 0),
+    stretch: Triple = (0, 0, 0),
+    scope: str = "skin",
+    sides: str = "both",
+) -> Pull:
     return Pull(at=at, radius=radius, move=move, stretch=stretch, sides=sides, scope=scope)
 
 
-def _mid(at: Triple, radius: Triple, move: Triple = (0, 0, 0), stretch: Triple = (0, 0, 0),
-         scope: str = "skin") -> Pull:
+def _mid(
+    at: Triple,
+    radius: Triple,
+    move: Triple = (0, 0, 0),
+    stretch: Triple = (0, 0, 0),
+    scope: str = "skin",
+) -> Pull:
     return Pull(at=at, radius=radius, move=move, stretch=stretch, sides="middle", scope=scope)
 
 
@@ -49,8 +66,10 @@ _HEAD: dict[str, tuple[Pull, ...]] = {
     "temple": (_pair((66, 40, 45), (16, 24, 26), move=(-3, 0, 0)),),
     "brow_ridge": (_pair((24, 39, 88), (22, 9, 16), move=(0, 0, 3.2)),),
     "brow_height": (_pair((30, 41, 82), (26, 11, 20), move=(0, 3, 0)),),
-    "brow_slant": (_pair((48, 37, 72), (14, 10, 18), move=(0, 3, 0)),
-                   _pair((12, 37, 90), (12, 10, 16), move=(0, -2, 0))),
+    "brow_slant": (
+        _pair((48, 37, 72), (14, 10, 18), move=(0, 3, 0)),
+        _pair((12, 37, 90), (12, 10, 16), move=(0, -2, 0)),
+    ),
     "glabella": (_mid((0, 37, 95), (12, 11, 14), move=(0, 0, 2.6)),),
     "face_width": (_all((0, -20, 40), (110, 75, 80), stretch=(0.055, 0, 0)),),
     "face_length": (_all((0, 10, 50), (110, 130, 110), stretch=(0, 0.05, 0)),),
@@ -64,7 +83,7 @@ _EYES: dict[str, tuple[Pull, ...]] = {
     "eye_height": (_pair((31.5, 20, 72), (22, 20, 30), move=(0, 2.5, 0), scope="all"),),
     "eye_depth": (_pair((31.5, 20, 74), (20, 17, 26), move=(0, 0, -2.5), scope="all"),),
     "eye_bags": (_pair((33, 6, 80), (12, 6, 12), move=(0, 0, 2)),),
-    "orbit_height": (_pair((31.5, 20, 80), (24, 18, 24), stretch=(0, 0.12, 0)),),
+    "orbit_height": (_pair((31.5, 20, 80), (24, 18, 24), stretch=(0, 0.2, 0)),),
     "orbit_hollow": (_pair((30, 31, 84), (15, 7, 14), move=(0, 0, -2.6)),),
     "canthus_inner": (_pair((14, 18, 82), (6, 7, 14), move=(-1.6, -0.6, 0)),),
 }
@@ -79,31 +98,37 @@ _NOSE: dict[str, tuple[Pull, ...]] = {
     "nose_hump": (_mid((0, 4, 104), (9, 8, 12), move=(0, 0, 2.6)),),
     "nasion_depth": (_mid((0, 25, 90), (11, 9, 14), move=(0, 0, -2.6)),),
     "nose_wing_height": (_pair((16, -19, 96), (9, 9, 12), move=(0, 2.2, 0)),),
-    "nostril_size": (_pair((8, -23, 104), (8, 7, 9), stretch=(0.22, 0, 0.15)),),
+    "nostril_size": (_pair((8, -23, 104), (8, 7, 9), stretch=(0.35, 0, 0.25)),),
     "columella": (_mid((0, -26, 104), (7, 6, 12), move=(0, -2.2, 0)),),
 }
 _MOUTH: dict[str, tuple[Pull, ...]] = {
     "mouth_width": (_mid((0, -49, 94), (36, 17, 30), stretch=(0.12, 0, 0)),),
     "mouth_height": (_mid((0, -49, 96), (36, 18, 34), move=(0, 3, 0)),),
     "mouth_forward": (_all((0, -49, 98), (34, 22, 34), move=(0, 0, 3.4)),),
-    "lip_fullness": (_mid((0, -42.5, 104), (22, 6.5, 16), move=(0, 1.2, 1.6), scope="upper"),
-                     _mid((0, -56, 102), (22, 7, 16), move=(0, -1.4, 1.6), scope="lower")),
+    "lip_fullness": (
+        _mid((0, -42.5, 104), (22, 6.5, 16), move=(0, 1.2, 1.6), scope="upper"),
+        _mid((0, -56, 102), (22, 7, 16), move=(0, -1.4, 1.6), scope="lower"),
+    ),
     "upper_lip_fullness": (_mid((0, -43, 104), (20, 6, 14), move=(0, 1.2, 1.8), scope="upper"),),
     "lower_lip_fullness": (_mid((0, -56, 102), (20, 7, 14), move=(0, -1.4, 1.8), scope="lower"),),
     "cupids_bow": (_pair((6, -41, 104), (5.5, 5, 10), move=(0, 1.3, 0.4), scope="upper"),),
     "philtrum_length": (_mid((0, -24, 104), (26, 11, 28), move=(0, 2.6, 0)),),
     "philtrum_depth": (_mid((0, -34, 103), (4.5, 7, 12), move=(0, 0, -1.5)),),
     "mouth_corner_height": (_pair((25, -49.5, 88), (11, 9, 18), move=(0, 2.2, 0)),),
-    "overbite": (_mid((0, -43, 100), (28, 10, 24), move=(0, 0, 2.2), scope="upper"),
-                 _mid((0, -56, 98), (28, 10, 24), move=(0, 0, -1.6), scope="lower")),
+    "overbite": (
+        _mid((0, -43, 100), (28, 10, 24), move=(0, 0, 2.2), scope="upper"),
+        _mid((0, -56, 98), (28, 10, 24), move=(0, 0, -1.6), scope="lower"),
+    ),
     "labiomental_fold": (_mid((0, -67, 96), (18, 7, 14), move=(0, 0, -2.6)),),
 }
 _JAW: dict[str, tuple[Pull, ...]] = {
     "jaw_width": (_pair((52, -58, 22), (24, 30, 36), move=(4.5, 0, 0)),),
     "jaw_angle_height": (_pair((50, -60, 16), (24, 20, 26), move=(0, -4.5, 0)),),
     "jaw_length": (_all((0, -75, 80), (55, 34, 55), move=(0, 0, 5)),),
-    "jaw_line_definition": (_pair((40, -86, 40), (24, 11, 34), move=(1.0, -2.6, 0)),
-                            _pair((36, -103, 42), (24, 10, 30), move=(0, 2.0, 0))),
+    "jaw_line_definition": (
+        _pair((40, -86, 40), (24, 11, 34), move=(1.0, -2.6, 0)),
+        _pair((36, -103, 42), (24, 10, 30), move=(0, 2.0, 0)),
+    ),
     "chin_forward": (_mid((0, -83, 94), (24, 16, 24), move=(0, 0, 4)),),
     "chin_width": (_mid((0, -83, 86), (30, 18, 24), stretch=(0.2, 0, 0)),),
     "chin_height": (_mid((0, -90, 86), (28, 15, 28), move=(0, -4, 0)),),
@@ -130,10 +155,14 @@ _EARS_AND_NECK: dict[str, tuple[Pull, ...]] = {
 _ASYMMETRIC: dict[str, tuple[Pull, ...]] = {
     "nose_deviation": (_mid((0, -8, 106), (20, 24, 26), move=(2.4, 0, 0)),),
     "jaw_asymmetry": (_all((0, -80, 60), (60, 40, 60), move=(3.4, 0, 0)),),
-    "mouth_asymmetry": (_pair((25, -49, 90), (17, 12, 20), move=(0, 2, 0), sides="left"),
-                        _pair((25, -49, 90), (17, 12, 20), move=(0, -1.4, 0), sides="right")),
-    "brow_asymmetry": (_pair((31, 40, 82), (22, 10, 18), move=(0, 2.4, 0), sides="left"),
-                       _pair((31, 40, 82), (22, 10, 18), move=(0, -1.8, 0), sides="right")),
+    "mouth_asymmetry": (
+        _pair((25, -49, 90), (17, 12, 20), move=(0, 2, 0), sides="left"),
+        _pair((25, -49, 90), (17, 12, 20), move=(0, -1.4, 0), sides="right"),
+    ),
+    "brow_asymmetry": (
+        _pair((31, 40, 82), (22, 10, 18), move=(0, 2.4, 0), sides="left"),
+        _pair((31, 40, 82), (22, 10, 18), move=(0, -1.8, 0), sides="right"),
+    ),
     "cheek_asymmetry": (_pair((48, -22, 62), (22, 24, 26), move=(2.8, 0, 1.6), sides="left"),),
     "ear_asymmetry": (_pair((76, 5, -18), (20, 42, 28), move=(2, 3, 0), sides="left"),),
     "skull_asymmetry": (_pair((55, 50, -60), (45, 50, 45), move=(3, 0, -3), sides="left"),),
@@ -149,17 +178,15 @@ def _eye_scaling(mesh: WholeMesh, kind: str) -> Array:
         for k in range(8):
             ring = mesh.tag(f"lid{k}", side)
             offset = mesh.vertices[ring] - center
-            share = (1 - k / 7) ** 1.5
+            share = 1 - (k / 7) ** 2
             if kind == "eye_size":
-                motion[ring] = 0.06 * share * offset
-            elif kind == "eye_opening":
-                motion[ring] = _turn(offset, share * np.sign(offset[:, 1] + 0.6) * 0.06)
+                motion[ring] = 0.08 * share * offset
             else:  # eye_slant: the outer corner up, the inner down
                 motion[ring] = _turn(offset, share * offset[:, 0] * np.sign(center[0]) * 0.0075)
         for tag in ("lid_edge", "lid_hidden"):
             motion[mesh.tag(tag, side)] = motion[mesh.tag("lid0", side)]
         if kind == "eye_size":
-            motion[ball] = 0.06 * (mesh.vertices[ball] - center)
+            motion[ball] = 0.08 * (mesh.vertices[ball] - center)
     return motion
 
 
@@ -182,7 +209,9 @@ def shape_directions(mesh: WholeMesh, regions: dict[str, Array]) -> tuple[tuple[
         motion = displacement(mesh, pulls, scopes)
         names.append(name)
         columns.append(motion if name == "head_size" else settle_eyes(mesh, motion, "rigid"))
-    for name in ("eye_size", "eye_opening", "eye_slant"):
+    for name in ("eye_size", "eye_slant"):
         names.append(name)
         columns.append(_eye_scaling(mesh, name))
+    names.append("eye_opening")
+    columns.append(lid_motion(mesh, "left", -0.12, -0.06) + lid_motion(mesh, "right", -0.12, -0.06))
     return tuple(names), np.stack(columns, -1)

@@ -62,8 +62,11 @@ def add_skin(half: HalfMesh) -> None:
 def _add_midline(half: HalfMesh, lip_top: float, lip_bottom: float) -> Array:
     """Mid-plane vertices from lip to crown to nape to collar and lip to collar, and the collar."""
     groups = []
-    for azimuth, low, high in ((0.0, lip_top, 90.0), (np.pi, BOTTOM_LATITUDE, 90.0),
-                               (0.0, BOTTOM_LATITUDE, lip_bottom)):
+    for azimuth, low, high in (
+        (0.0, lip_top, 90.0),
+        (np.pi, BOTTOM_LATITUDE, 90.0),
+        (0.0, BOTTOM_LATITUDE, lip_bottom),
+    ):
         latitude = np.linspace(low, high, 400)
         points = cast(*rays(np.full(400, azimuth), latitude))
         step = np.linalg.norm(np.diff(points, axis=0), axis=1)
@@ -79,8 +82,8 @@ def _add_midline(half: HalfMesh, lip_top: float, lip_bottom: float) -> Array:
         tag = {90.0: "midline_front", lip_bottom: "midline_low"}[high]
         groups.append(half.add(points, "midline_back" if azimuth else tag))
         half.label(groups[-1], np.stack([np.full(len(pick), azimuth), pick], 1))
-    azimuth = np.linspace(0, np.pi, 26)[1:-1]
-    collar = np.stack([azimuth, np.full(len(azimuth), BOTTOM_LATITUDE)], 1)
+    around = np.linspace(0, np.pi, 26)[1:-1]
+    collar = np.stack([around, np.full(len(around), BOTTOM_LATITUDE)], 1)
     groups.append(half.add(cast(*rays(*collar.T)), "collar"))
     half.label(groups[-1], collar)
     half.tags["collar"] = np.concatenate([groups[-1], groups[1][:1], groups[2][:1]])
@@ -94,8 +97,9 @@ def _add_fill(half: HalfMesh, fixed: Array, holes: list[Array]) -> Array:
     table = cast(*rays(a.ravel(), b.ravel())).reshape(61, 69, 3)
     rng = np.random.default_rng(50)
     label = rng.random((24000, 2))
-    label = np.stack([np.pi * label[:, 0],
-                      np.degrees(np.arcsin(2 * label[:, 1] - 1))], 1)  # even on the sphere
+    label = np.stack(
+        [np.pi * label[:, 0], np.degrees(np.arcsin(2 * label[:, 1] - 1))], 1
+    )  # even on the sphere
     more = rng.random((16000, 2)) * [1.2, 90.0] + [0.0, -60.0]
     label = np.concatenate([label, more])
     label = label[label[:, 1] > BOTTOM_LATITUDE + 1]
@@ -172,16 +176,27 @@ def _relax(half: HalfMesh, faces: Array, free: Array, fixed: Array) -> None:
     points[free] = project(points[free], 3)
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     half.points = [points]
-    half.label(free, np.stack([np.arctan2(direction[free, 0], direction[free, 2]),
-                               np.degrees(np.arcsin(direction[free, 1]))], 1))
+    half.label(
+        free,
+        np.stack(
+            [
+                np.arctan2(direction[free, 0], direction[free, 2]),
+                np.degrees(np.arcsin(direction[free, 1])),
+            ],
+            1,
+        ),
+    )
 
 
 def set_skin_uv(half: HalfMesh) -> None:
     """Skin chart: pseudo-cylindrical, cut along the back, pole at the crown, roomier in front."""
     index = np.array(sorted(half.labels))
     azimuth, latitude = np.array([half.labels[int(i)] for i in index]).T
-    width = np.interp(latitude, [-85, -80, -60, -42, -15, 15, 40, 60, 75, 84, 90],
-                      [0.8, 0.78, 0.74, 0.92, 1.0, 1.0, 0.84, 0.56, 0.3, 0.14, 0.0])
-    u = (azimuth / np.pi + 0.12 * np.sin(azimuth)) * width
-    v = np.interp(latitude, [-85, -80, -52, -45, 45, 90], [-0.09, 0.0, 0.16, 0.24, 0.78, 1.0])
+    width = np.interp(
+        latitude,
+        [-85, -80, -60, -42, -15, 15, 40, 60, 75, 84, 90],
+        [0.8, 0.78, 0.74, 0.92, 1.0, 1.0, 0.84, 0.56, 0.3, 0.14, 0.0],
+    )
+    u = (azimuth / np.pi + 0.19 * np.sin(azimuth)) * width
+    v = np.interp(latitude, [-85, -80, -52, -45, 45, 90], [-0.06, 0.0, 0.11, 0.17, 0.80, 1.0])
     half.set_uv("skin", index, np.stack([u, v], 1))

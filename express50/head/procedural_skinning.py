@@ -55,37 +55,40 @@ def jaw_weight(mesh: WholeMesh) -> Array:
     """Share (V,) of the jaw joint: lower lip, chin, jaw line, lower teeth, tongue."""
     p = mesh.vertices
     angle = np.degrees(np.arctan2(p[:, 1] + 8, np.maximum(p[:, 2] - 10, 1.0)))
-    weight = smoothstep(angle, -20.0, -38.0)
-    weight *= smoothstep(p[:, 2], -14.0, 42.0) * smoothstep(p[:, 1], -138.0, -92.0)
-    weight[mesh.tag("ear")] = 0.0
-    fixed = np.zeros(len(p), bool)
+    around = smoothstep(angle, -18.5, -31.5)
+    around *= smoothstep(p[:, 2], -14.0, 42.0) * smoothstep(p[:, 1], -138.0, -92.0)
+    around[mesh.tag("ear")] = 0.0
+    weight, fixed = around.copy(), np.zeros(len(p), bool)
     skin = mesh.faces[mesh.face_chart == "skin"]
-    side = np.concatenate([np.zeros(16), [0.5], np.ones(16)])
-    ramp = smoothstep(np.arange(33.0), 11.5, 20.5)
-    for k, f in enumerate((0.0, 0.15, 0.3, 0.45, 0.62, 0.82)):
+    for k, f in enumerate((0.0, 0.1, 0.22, 0.38, 0.58, 0.8)):
         for which in ("left", "right"):
             ring = mesh.tag(f"lip{k}", which)
-            weight[ring] = (1 - f) * (side if k == 0 else ramp) + f * weight[ring]
+            weight[ring] = (1 - f) * _CLOSURE + f * around[ring]
             fixed[ring] = k <= 2
-    for tag, value in (("ear_foot", 0.0), ("lid5", 0.0)):
-        weight[mesh.tag(tag)], fixed[mesh.tag(tag)] = value, True
-    for _ in range(12):
+    for tag in ("ear_foot", "lid5"):
+        weight[mesh.tag(tag)], fixed[mesh.tag(tag)] = 0.0, True
+    for _ in range(10):
         weight = np.where(fixed, weight, 0.5 * (weight + vertex_average(mesh, weight, skin)))
     return _inner_jaw_weight(mesh, weight)
 
 
+# Along a lip loop from the middle of the upper lip to that of the lower: corners share evenly.
+_CLOSURE = smoothstep(np.arange(33.0), 7.0, 25.0)
+
+
 def _inner_jaw_weight(mesh: WholeMesh, weight: Array) -> Array:
-    ramp = smoothstep(np.arange(33.0), 8.0, 24.0)
     for k in range(7):
         deep = smoothstep(np.array(float(k)), 3.0, 8.0)
         for which in ("left", "right"):
-            row = mesh.tag(f"cavity{k}", which)
-            side = np.concatenate([np.zeros(16), [0.5], np.ones(16)])
-            blend = min(1.0, k / 2)
-            weight[row] = ((1 - blend) * side + blend * ramp) * (1 - 0.6 * deep)
-    for tag, value in (("upper_teeth", 0.0), ("upper_gums", 0.0), ("lower_teeth", 1.0),
-                       ("lower_gums", 1.0)):
+            weight[mesh.tag(f"cavity{k}", which)] = _CLOSURE * (1 - 0.6 * deep)
+    for tag, value in (
+        ("upper_teeth", 0.0),
+        ("upper_gums", 0.0),
+        ("lower_teeth", 1.0),
+        ("lower_gums", 1.0),
+    ):
         weight[mesh.tag(tag)] = value
+    weight[mesh.tag("throat")] = 0.2
     tongue = mesh.tag("tongue")
     weight[tongue] = 0.55 + 0.45 * smoothstep(mesh.vertices[tongue, 2], 42.0, 62.0)
     return weight
@@ -108,3 +111,27 @@ def skinning_weights(mesh: WholeMesh, regions: dict[str, Array]) -> Array:
         weights[ball] = 0.0
         weights[ball, joint] = 1.0
     return weights
+
+
+def pose_correctives(mesh: WholeMesh, regions: dict[str, Array]) -> Array:
+    """Correctives (36,V*3) in mm a unit of R - I, for the jaw's opening alone.
+
+    Opening by a sets R[2,1] of the jaw to sin a. The lips then close in from the corners and the
+    upper lip gives way a little, which skinning cannot do.
+    """
+    hard = regions["teeth"] | regions["gums"] | regions["tongue"]
+    p, sign = mesh.vertices, np.sign(mesh.vertices[:, 0])
+
+    def near(at: tuple[float, float, float], radius: tuple[float, float, float]) -> Array:
+        folded = np.stack([np.abs(p[:, 0]), p[:, 1], p[:, 2]], 1)
+        return np.where(hard, 0.0, np.exp(-(((folded - at) / np.array(radius)) ** 2).sum(1)))
+
+    corner, upper = near((26, -49, 86), (15, 13, 24)), near((0, -42, 101), (22, 12, 20))
+    cheek = near((42, -42, 62), (18, 24, 26))
+    motion = np.zeros_like(p)
+    motion[:, 0] = -sign * (12.0 * corner + 6.0 * cheek)
+    motion[:, 1] = 5.0 * upper * (1 - jaw_weight(mesh))
+    motion[:, 2] = 4.0 * corner
+    result = np.zeros((36, p.size))
+    result[9 * (JAW - 1) + 7] = motion.ravel()
+    return result

@@ -23,13 +23,18 @@ def _arch(upper: bool) -> tuple[Array, Array, Array]:
             along.append(edges[k] + f * widths[k])
             phase.append(f % 1.0)
     x = np.linspace(0, 30, 400)
-    front = 90.5 if upper else 88.0
-    reach = 25.0 if upper else 23.0
+    front = 91.0 if upper else 86.8
+    reach = 25.0 if upper else 23.5
     z = front - 31.0 * (x / reach) ** 2.3
     length = np.concatenate([[0], np.cumsum(np.hypot(np.diff(x), np.diff(z)))])
     xs, zs = np.interp(along, length, x), np.interp(along, length, z)
-    tangent = np.stack([np.interp(np.array(along) + 1, length, x) - xs,
-                        np.interp(np.array(along) + 1, length, z) - zs], 1)
+    tangent = np.stack(
+        [
+            np.interp(np.array(along) + 1, length, x) - xs,
+            np.interp(np.array(along) + 1, length, z) - zs,
+        ],
+        1,
+    )
     tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
     normal = np.stack([-tangent[:, 1], tangent[:, 0]], 1)
     normal[0] = (0.0, 1.0)
@@ -43,7 +48,7 @@ def add_teeth(half: HalfMesh, upper: bool) -> None:
     groove[0] = 1.0
     bulge = np.where(phase == 0.5, 0.35, 0.0)
     t = np.linspace(0, 1, len(phase))
-    y0, sign = (-40.0, 1.0) if upper else (-61.5, -1.0)  # gum line; sign points to the roots
+    y0, sign = (-42.0, 1.0) if upper else (-61.5, -1.0)  # gum line; sign points to the roots
     crown = 10.3 - 2.5 * t if upper else 10.0 - 2.0 * t
     thick = 3.4 + 5.0 * t**1.5
     rows = []
@@ -74,7 +79,7 @@ def add_teeth(half: HalfMesh, upper: bool) -> None:
 
 
 def add_tongue(half: HalfMesh) -> None:
-    """Tongue, half: cross sections from the root forward to the tip, a closed tube over its floor."""
+    """Tongue, half: cross sections from the root forward to the tip."""
     sections = 13
     s = np.linspace(0, 1, sections)
     z = 42 + 42 * s

@@ -33,7 +33,9 @@ def pack_uv(mesh: WholeMesh) -> tuple[Array, Array]:
         low, high = uv.min((0, 1)), uv.max((0, 1))
         size = np.array([right - left, top - bottom])
         corner_uv[of_chart] = [left, bottom] + (uv - low) / (high - low) * size
-    flat = corner_uv.reshape(-1, 2)
-    key = np.concatenate([np.round(flat, 9), mesh.faces.reshape(-1, 1)], 1)
-    _, first, inverse = np.unique(key, axis=0, return_index=True, return_inverse=True)
-    return flat[first], inverse.reshape(-1, 3).astype(np.int64)
+    # A vertex has one position a chart, two where the chart is cut on the mid plane.
+    chart_id = np.unique(mesh.face_chart, return_inverse=True)[1]
+    side = (mesh.corner_uv[..., 0] > 0).astype(np.int64)
+    key = (mesh.faces * len(RECTANGLES) + chart_id[:, None]) * 2 + side
+    _, first, inverse = np.unique(key, return_index=True, return_inverse=True)
+    return corner_uv.reshape(-1, 2)[first], inverse.reshape(-1, 3).astype(np.int64)

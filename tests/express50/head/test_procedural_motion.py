@@ -1,0 +1,150 @@
+"""The built-in head in motion: directions, blink, jaw, lips."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from express50.expressions import load_script
+from express50.head.model import landmarks, pose
+from express50.head.preview import expression_vector, render_preview
+from express50.head.procedural import build_procedural_head, procedural_mesh
+
+
+@pytest.fixture(scope="module")
+def head():
+    return build_procedural_head()
+
+
+def posed(head, controls=None, jaw=0.0, shape=None):
+    coefficients = torch.zeros(1, len(head.shape_names))
+    for name, value in (shape or {}).items():
+        coefficients[0, head.shape_names.index(name)] = value
+    expression = expression_vector(head, controls or {})
+    return pose(head, coefficients, expression, jaw=torch.tensor([[jaw, 0.0, 0.0]]))[0]
+
+
+def edge_strain(head, directions):
+    faces = head.faces.numpy()
+    edges = np.unique(np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]]]), 1), axis=0)
+    ends = head.template.double().numpy()[edges]
+    length = np.maximum(np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1), 1e-3)
+    motion = directions.double().numpy()
+    change = np.linalg.norm(motion[edges[:, 0]] - motion[edges[:, 1]], axis=1)
+    return (change / length[:, None]).max(0)
+
+
+@pytest.mark.parametrize("kind, least, most", [("shape", 5e-4, 1.0), ("expression", 5e-4, 2.6)])
+def test_directions_are_finite_visible_and_smooth(head, kind, least, most):
+    directions = getattr(head, f"{kind}_dirs")
+    assert bool(torch.isfinite(directions).all())
+    assert float(directions.norm(dim=1).amax(0).min()) > least
+    assert edge_strain(head, directions).max() < most
+
+
+def test_one_sided_directions_mirror_each_other(head):
+    mirror = torch.from_numpy(procedural_mesh().mirror)
+    flip = torch.tensor([-1.0, 1.0, 1.0])
+    pairs = [n[:-2] for n in head.expression_names if n.endswith("_L")]
+    assert len(pairs) >= 15
+    for name in pairs:
+        left = head.expression_dirs[..., head.expression_names.index(f"{name}_L")]
+        right = head.expression_dirs[..., head.expression_names.index(f"{name}_R")]
+        torch.testing.assert_close(left[mirror] * flip, right, atol=1e-6, rtol=0)
+
+
+def test_knows_every_control_of_the_script(head):
+    used = {name for expression in load_script() for name in expression.controls}
+    assert used <= set(head.expression_names)
+
+
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_blink_shuts_the_eye_over_the_eyeball(head, side):
+    mesh = procedural_mesh()
+    shut = posed(head, {"eyeBlink": 1.0}).numpy()
+    margin = shut[mesh.tag("lid0", side)]
+    gap = np.linalg.norm(margin[1:20] - margin[:20:-1], axis=1)
+    assert gap.max() < 1e-3
+    center = (head.joint_regressor @ head.template)[3 if side == "left" else 4].numpy()
+    for loop in range(6):
+        lid = shut[mesh.tag(f"lid{loop}", side)]
+        assert np.linalg.norm(lid - center, axis=1).min() > 0.0121
+
+
+def test_no_eyeball_shows_through_shut_lids(head):
+    """Seen from seven sides, no pixel of a blink has the eyeball's colour."""
+    colors = np.zeros((len(head.template), 3))
+    for side in ("left", "right"):
+        colors[head.regions[f"{side}_eyeball"].numpy()] = (0.0, 50.0, 0.0)
+    view = {"size": 160, "supersample": 1, "span": 0.05, "center": (0.0315, 0.02, 0.075)}
+    for yaw, pitch in ((0, 0), (25, 0), (50, 0), (-25, 0), (0, 20), (0, -20), (40, -15)):
+        shut = render_preview(head, posed(head, {"eyeBlink": 1.0}), yaw=yaw, pitch=pitch,
+                              colors=colors, **view)  # fmt: skip
+        green = (shut[..., 1] > 200) & (shut[..., 0] < 120)
+        assert green.mean() < 5e-4, (yaw, pitch)
+    awake = render_preview(head, posed(head), colors=colors, **view)
+    assert ((awake[..., 1] > 200) & (awake[..., 0] < 120)).mean() > 0.03
+
+
+@pytest.mark.parametrize("name, value", [("eye_size", 2.0), ("eye_distance", -2.0),
+                                         ("eye_depth", 2.0), ("cheekbone", 2.0)])  # fmt: skip
+def test_lids_stay_outside_the_eyeball_whatever_the_shape(head, name, value):
+    mesh = procedural_mesh()
+    vertices = posed(head, shape={name: value})
+    center = (head.joint_regressor @ vertices)[3].numpy()
+    vertices = vertices.numpy()
+    ball = vertices[head.regions["left_eyeball"].numpy()]
+    radius = np.linalg.norm(ball - center, axis=1).max()
+    for loop in range(4):
+        lid = vertices[mesh.tag(f"lid{loop}", "left")]
+        assert np.linalg.norm(lid - center, axis=1).min() > radius
+
+
+def test_jaw_moves_the_lower_teeth_alone(head):
+    rest, opened = posed(head).numpy(), posed(head, jaw=0.36).numpy()
+    moved = np.linalg.norm(opened - rest, axis=1)
+    upper, lower = (head.regions[f"{row}_teeth"].numpy() for row in ("upper", "lower"))
+    assert moved[upper].max() < 1e-6
+    assert moved[lower].min() > 0.008
+    joint = (head.joint_regressor @ head.template).numpy()[2]
+    np.testing.assert_allclose(
+        np.linalg.norm(opened[lower] - joint, axis=1),
+        np.linalg.norm(rest[lower] - joint, axis=1),
+        atol=1e-4,
+    )
+    assert moved[head.regions["tongue"].numpy()].min() > 0.002
+
+
+def test_lips_meet_at_rest_and_part_with_the_jaw(head):
+    for jaw, low, high in ((0.0, 0.0, 1e-3), (0.36, 0.018, 0.05)):
+        points = landmarks(head, posed(head, jaw=jaw)[None])[0].numpy()
+        assert low <= points[62, 1] - points[66, 1] <= high
+
+
+def test_smile_lifts_and_widens_the_mouth(head):
+    rest = landmarks(head, posed(head)[None])[0].numpy()
+    smile = landmarks(head, posed(head, {"mouthSmile": 1.0})[None])[0].numpy()
+    assert smile[54, 1] - rest[54, 1] > 0.005 and smile[48, 1] - rest[48, 1] > 0.005
+    assert smile[54, 0] - smile[48, 0] > 1.15 * (rest[54, 0] - rest[48, 0])
+    pucker = landmarks(head, posed(head, {"mouthPucker": 1.0})[None])[0].numpy()
+    assert pucker[54, 0] - pucker[48, 0] < 0.8 * (rest[54, 0] - rest[48, 0])
+    assert pucker[51, 2] - rest[51, 2] > 0.004
+
+
+def test_expressions_leave_teeth_and_eyes_alone(head):
+    fixed = head.regions["teeth"] | head.regions["left_eyeball"] | head.regions["right_eyeball"]
+    jaw = {"jawForward", "jawLeft", "jawRight"}
+    for index, name in enumerate(head.expression_names):
+        if name not in jaw:
+            assert float(head.expression_dirs[fixed][..., index].abs().max()) == 0.0, name
+
+
+def test_open_mouth_shows_teeth_tongue_and_cavity(head):
+    labels = np.zeros((len(head.template), 3))
+    for channel, region in enumerate(("teeth", "tongue", "mouth_interior")):
+        labels[head.regions[region].numpy(), channel] = 50.0
+    image = render_preview(head, posed(head, jaw=0.36), size=160, supersample=1, colors=labels,
+                           span=0.09, center=(0.0, -0.06, 0.08))  # fmt: skip
+    for channel in range(3):
+        assert (image[..., channel] > 200).mean() > 0.01
