@@ -16,7 +16,7 @@ class DepthConfig:
     image_side: int = 1024
     """Longest side, pixels, of the images that silhouettes and photo-consistency use."""
     photo: bool = True
-    """Move the surface by photo-consistency; False leaves the smoothed visual hull."""
+    """Move the surface by photo-consistency; False leaves the smoothed hull at its silhouettes."""
     use_track: bool = True
     """Start from the tracked mesh where it agrees with the mattes."""
     track_agreement: float = 0.85

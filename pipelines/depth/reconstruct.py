@@ -83,8 +83,7 @@ def reconstruct(views: Sequence[View], config: DepthConfig, prior: Prior | None 
         grid = _within_hull(grid, hull)
         if prior is None or level:
             grid = fair(grid, config.fair_voxels * voxel)
-        if config.photo:
-            grid = _move(views, grid, hull, config, extent, first=level == 0 and prior is None)
+        grid = _move(views, grid, hull, config, extent, first=level == 0 and prior is None)
     return _finish(views, grid, config)
 
 
@@ -136,7 +135,10 @@ def _move(
     if not len(faces):
         return grid
     offsets = _offsets(config, voxel, first)
-    scores = _scores(views, vertices, normals, faces, offsets, voxel, config)
+    if config.photo:
+        scores = _scores(views, vertices, normals, faces, offsets, voxel, config)
+    else:
+        scores = np.zeros((len(vertices), len(offsets)), np.float32)
     pinned, weight = _pins(views, grid, vertices, extent, config.rim_weight)
     displacement, _ = smooth_displacement(
         scores,

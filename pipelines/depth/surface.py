@@ -21,7 +21,7 @@ def extract_mesh(grid: Grid) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """
     if not (grid.values.min() < 0 < grid.values.max()):
         return np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3), np.int64)
-    index, faces, _, _ = marching_cubes(grid.values, 0.0, gradient_direction="ascent")
+    index, faces, _, _ = marching_cubes(grid.values, 0.0, gradient_direction="descent")
     return grid.points(index), _gradient(grid, index), faces.astype(np.int64)
 
 

@@ -14,7 +14,7 @@ from pipelines.depth.grid import INSIDE, View, head_box, hull_distance, silhouet
 
 EMPTY = 0.002  # share of the image below which a matte holds no head
 FULL = 0.98  # share above which a matte cuts nothing out
-CONTRADICTION = 3.0  # growth of the hull without a view that marks its matte as wrong
+CONTRADICTION = 1.8  # growth of the hull without a view that marks its matte as wrong
 VOTERS = 5  # fewest views of which one can be outvoted
 
 

@@ -161,8 +161,8 @@ def _pack_group(
     """Samples of all cameras of one expression; those that cannot be packed go to ``dropped``."""
     group = []
     for camera_id in sorted(subject.cameras):
-        sample_key(subject.name, expression, camera_id)
         try:
+            sample_key(subject.name, expression, camera_id)
             sample = _pack_sample(dataset, subject, expression, camera_id, config)
         except (CaptureError, FormatError, StageError) as error:
             sample = str(error)

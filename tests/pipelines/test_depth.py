@@ -1,0 +1,195 @@
+"""The depth stage on an analytic head: accuracy, baselines, robustness, files."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from express50.cameras import rays
+from express50.errors import StageError
+from pipelines.depth.config import DepthConfig
+from pipelines.depth.grid import Grid, head_box, hull_distance, silhouette_distance
+from pipelines.depth.prior import boundary_loops, make_prior, matte_agreement
+from pipelines.depth.raycast import cast_view, write_ply
+from pipelines.depth.reconstruct import reconstruct
+from pipelines.depth.surface import advance, extract_mesh
+from pipelines.depth.sweep import mesh_scene
+from pipelines.depth.views import make_view, without_contradiction
+from tests.pipelines.bump_head import mesh, render, ring
+
+QUICK = DepthConfig(voxel_mm=4.0, levels=2)
+
+
+@pytest.fixture(scope="module")
+def shots():
+    """Eight cameras over 300 degrees: (camera, rgb, alpha, true depth)."""
+    return [(camera, *render(camera)) for camera in ring(8, 160)]
+
+
+@pytest.fixture(scope="module")
+def views(shots):
+    return [make_view(camera, rgb, alpha, 1024) for camera, rgb, alpha, _ in shots]
+
+
+@pytest.fixture(scope="module")
+def surface(views):
+    return reconstruct(views, QUICK)
+
+
+def errors_mm(surface, shots, views=None) -> np.ndarray:
+    """Absolute errors, millimetres; with views only of what lies over 2 mm inside their hull."""
+    scene = mesh_scene(surface.vertices, surface.faces)
+    found = []
+    for camera, _, alpha, true in shots:
+        view = cast_view(surface, scene, camera, alpha)
+        both = view.valid & (true > 0)
+        assert both.sum() > 0.95 * ((true > 0) & (alpha > 0.5)).sum()
+        if views is not None:
+            origin, directions = rays(camera)
+            both[both] = (
+                hull_distance(views, (origin + directions * true[..., None])[both]) < -0.002
+            )
+        found.append(1e3 * np.abs(view.depth - true)[both])
+    return np.concatenate(found)
+
+
+def test_depth_is_right_to_under_a_millimetre(surface, shots):
+    error = errors_mm(surface, shots)
+    assert np.median(error) < 0.8
+    assert np.percentile(error, 95) < 3.0
+
+
+def test_photographs_pay_where_silhouettes_say_nothing(surface, views, shots):
+    hull = reconstruct(views, replace(QUICK, photo=False))
+    carved, filled = (np.mean(errors_mm(s, shots, views)) for s in (surface, hull))
+    assert carved < 0.6 * filled
+
+
+def test_eye_sockets_which_no_silhouette_shows_are_carved(surface, views):
+    deep = np.array([[side, 0.025, 0.081] for side in (-0.03, 0.03)])
+    vertices, _ = mesh()
+    at = vertices[[np.linalg.norm(vertices - p, axis=1).argmin() for p in deep]]
+    assert (hull_distance(views, at) < -0.002).all()
+    assert np.abs(surface.grid.sample(at)).max() < 0.002
+
+
+def test_a_tracked_mesh_4_mm_off_does_no_harm(views, shots, surface):
+    vertices, faces = mesh()
+    wave = 0.004 * np.sin(vertices[:, [1, 2, 0]] * 50)
+    keep = (vertices[faces][:, :, 1] > -0.06).all(1)  # open below, like a head model's neck
+    moved = reconstruct(views, QUICK, make_prior(vertices + wave, faces[keep]))
+    assert np.median(errors_mm(moved, shots)) < np.median(errors_mm(surface, shots)) + 0.2
+
+
+def test_a_track_elsewhere_is_noticed(views):
+    vertices, faces = mesh()
+    assert matte_agreement(views, vertices, faces) > 0.97
+    assert matte_agreement(views, vertices + [0.06, 0, 0], faces) < 0.85
+
+
+def test_prior_counts_inner_sheets_and_capped_holes_as_inside():
+    vertices, faces = mesh()
+    open_below = faces[(vertices[faces][:, :, 1] > -0.06).all(1)]
+    assert len(boundary_loops(open_below)) == 1
+    prior = make_prior(vertices, open_below)
+    points = np.array([[0, 0, 0.0], [0, 0.05, 0], [0, 0.2, 0], [0, -0.09, 0.0], [0.1, 0, 0]])
+    assert (prior.distance(points) < 0).tolist() == [True, True, False, False, False]
+    gap = np.zeros(2)
+    believed = prior.belief(np.array([[0, 0.1, 0.0], [0, -0.06, 0.0]]), gap)
+    assert believed.tolist() == [1.0, 0.0]
+
+
+def test_fewer_cameras_still_give_a_head(shots):
+    few = [make_view(c, rgb, alpha, 1024) for c, rgb, alpha, _ in shots[2:6]]
+    assert np.median(errors_mm(reconstruct(few, QUICK), shots[2:6])) < 3.0
+
+
+def test_a_matte_that_contradicts_the_others_is_left_out(shots, views):
+    camera, rgb, alpha, _ = shots[3]
+    half = alpha.copy()
+    half[:, :85] = 0
+    kept, why = without_contradiction([*views[:3], make_view(camera, rgb, half, 1024), *views[4:]])
+    assert list(why) == [camera.id] and len(kept) == 7
+    assert without_contradiction(views)[1] == {}
+
+
+def test_unusable_mattes_say_why(shots):
+    camera, rgb, alpha, _ = shots[0]
+    assert "empty" in make_view(camera, rgb, np.zeros_like(alpha), 1024)
+    assert "cuts nothing out" in make_view(camera, rgb, np.ones_like(alpha), 1024)
+    assert "camera's" in make_view(camera, rgb, alpha[:-1], 1024)
+
+
+def test_large_images_are_reduced_with_their_camera(shots):
+    camera, rgb, alpha, _ = shots[0]
+    view = make_view(camera, rgb, alpha, 80)
+    assert view.alpha.shape == (80, 80)
+    np.testing.assert_allclose(view.camera.K[:2], camera.K[:2] / 2)
+
+
+def test_silhouette_distance_has_subpixel_position():
+    x = np.arange(64) + 0.5
+    alpha = np.clip(20.3 - np.hypot(x[None] - 32, x[:, None] - 32) + 0.5, 0, 1)
+    signed = silhouette_distance(alpha.astype(np.float32))
+    true = 20.3 - np.hypot(x[None] - 32, x[:, None] - 32)
+    near = np.abs(true) < 5
+    assert np.abs(signed - true)[near].max() < 0.25
+
+
+def test_box_holds_the_head_and_little_more(views):
+    low, high = head_box(views)
+    vertices, _ = mesh()
+    assert (low < vertices.min(0)).all() and (high > vertices.max(0)).all()
+    assert ((high - low) < 1.5 * np.ptp(vertices, axis=0)).all()
+
+
+def test_advance_moves_a_sphere_by_the_displacement():
+    axis = np.linspace(-0.15, 0.15, 61)
+    cube = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1)
+    values = (np.linalg.norm(cube, axis=-1) - 0.1).astype(np.float32)
+    grid = Grid(np.full(3, -0.15), 0.005, values)
+    vertices, normals, _ = extract_mesh(grid)
+    np.testing.assert_allclose((normals * vertices).sum(1), 0.1, atol=1e-3)
+    moved = extract_mesh(advance(grid, vertices, np.full(len(vertices), -0.012)))[0]
+    np.testing.assert_allclose(np.linalg.norm(moved, axis=1), 0.088, atol=3e-4)
+
+
+def test_two_runs_give_the_same_surface(surface, views):
+    again = reconstruct(views, QUICK)
+    assert again.vertices.tobytes() == surface.vertices.tobytes()
+    assert again.colors.tobytes() == surface.colors.tobytes()
+
+
+def test_confidence_tells_good_depth_from_bad(surface, shots):
+    scene = mesh_scene(surface.vertices, surface.faces)
+    sure, unsure = [], []
+    for camera, _, alpha, true in shots:
+        view = cast_view(surface, scene, camera, alpha)
+        error = np.abs(view.depth - true)
+        both = view.valid & (true > 0)
+        cut = np.median(view.confidence[both])
+        sure.append(error[both & (view.confidence > cut)])
+        unsure.append(error[both & (view.confidence <= cut)])
+    assert np.concatenate(sure).mean() < np.concatenate(unsure).mean()
+
+
+def test_ply_is_read_by_another_library(surface, tmp_path):
+    import trimesh
+
+    write_ply(tmp_path / "surface.ply", surface)
+    read = trimesh.load(tmp_path / "surface.ply", process=False)
+    assert len(read.faces) == len(surface.faces)
+    assert read.is_watertight and read.volume > 0
+    assert read.visual.vertex_colors[:, 0].mean() > read.visual.vertex_colors[:, 2].mean()
+
+
+def test_cameras_in_millimetres_are_refused(shots):
+    views = []
+    for camera, rgb, alpha, _ in shots[:3]:
+        pose = camera.cam_from_world.copy()
+        pose[:3, 3] *= 1000
+        views.append(make_view(replace(camera, cam_from_world=pose), rgb, alpha, 1024))
+    with pytest.raises(StageError, match="metres"):
+        reconstruct(views, QUICK)
