@@ -17,6 +17,7 @@ import numpy as np
 from express50.adapters import opencv_pixels_to_corner
 from express50.errors import CalibrationError
 from express50.frames import read_srgb8
+from pipelines.calibrate.saddle import refine_corners, square_sides
 
 REQUIRED = ("squares_x", "squares_y", "square_length_m", "marker_length_m", "dictionary")
 
@@ -130,14 +131,17 @@ def board_points(board: Board) -> np.ndarray:
 
 
 def detect_corners(
-    image: np.ndarray, detector: cv2.aruco.CharucoDetector
+    image: np.ndarray, detector: cv2.aruco.CharucoDetector, board: Board
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Find board corners in an image (H, W, 3) uint8: ids (N,), pixels (N, 2)."""
-    corners, ids, _, _ = detector.detectBoard(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))
+    """Find the board's corners in an image (H, W, 3) uint8: ids (N,), pixels (N, 2)."""
+    grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+    corners, ids, _, _ = detector.detectBoard(grey)
     if ids is None or len(ids) == 0:
         return np.zeros(0, int), np.zeros((0, 2))
-    pixels = opencv_pixels_to_corner(np.asarray(corners, float).reshape(-1, 2))
-    return np.asarray(ids, int).reshape(-1), pixels
+    ids, corners = np.asarray(ids, int).reshape(-1), np.asarray(corners, float).reshape(-1, 2)
+    sides = square_sides(board_points(board)[ids, :2], corners, board.square_length_m)
+    refined, found = refine_corners(grey, corners, sides)
+    return ids[found], opencv_pixels_to_corner(refined[found])
 
 
 def make_detector(board: Board) -> cv2.aruco.CharucoDetector:
@@ -195,7 +199,7 @@ def read_observations(
                     f"of {camera} is {sizes[camera][0]}x{sizes[camera][1]}; record the board "
                     "with the settings of the capture"
                 )
-            found.append((camera, name, *detect_corners(image, detector)))
+            found.append((camera, name, *detect_corners(image, detector, board)))
     return gather(found, by_name)
 
 

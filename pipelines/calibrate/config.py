@@ -4,13 +4,18 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from express50.errors import ConfigError
+
+AUTO = "auto"
+MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
+
 
 @dataclass(frozen=True, kw_only=True)
 class CalibrateConfig:
     """Every field trades time, or strictness, for accuracy; none depends on a rig."""
 
-    camera_model: str = "auto"
-    """COLMAP model; auto: `camera_model` of capture.toml, else the simplest that fits."""
+    camera_model: str = AUTO
+    """COLMAP model to solve for; auto: the simplest that fits, camera by camera."""
     board_frames: int = 80
     """Board images read a camera, evenly spaced; 0 reads all."""
     single_frames: int = 30
@@ -29,6 +34,14 @@ class CalibrateConfig:
     """A camera with fewer accepted corners is reported as weakly tied in."""
     weak_frames: int = 8
     """A camera that shares fewer board images with others is reported as weakly tied in."""
+
+    def __post_init__(self) -> None:
+        """Refuse models that a board cannot be solved for."""
+        if self.camera_model not in (AUTO, *MODELS):
+            raise ConfigError(
+                f"calibrate.camera_model is {self.camera_model!r}; expected {AUTO} or "
+                f"{', '.join(MODELS)}"
+            )
 
 
 PRESETS: dict[str, dict[str, object]] = {

@@ -114,15 +114,17 @@ def _predictor(
 
 
 def _average_near(best: np.ndarray, candidates: list[np.ndarray]) -> np.ndarray:
-    """Average the candidates whose rotation is near the best one's, nearer ones counting more."""
-    angles = np.linalg.norm(
-        matrix_to_axis_angle(np.stack([best[:3, :3].T @ c[:3, :3] for c in candidates])), axis=1
-    )
-    distances = np.linalg.norm(np.stack([c[:3, 3] - best[:3, 3] for c in candidates]), axis=1)
-    scale = max(float(np.linalg.norm(best[:3, 3])), 0.1)
-    spread = angles / np.radians(2.0) + distances / (0.05 * scale)
-    weights = 1.0 / (1.0 + spread**2) ** 2
-    return mean_transform(candidates, weights)
+    """Average the candidates near the best one, nearer ones counting more."""
+    return mean_transform(candidates, 1.0 / (1.0 + _distances(best, candidates) ** 2) ** 2)
+
+
+def _distances(pose: np.ndarray, others: list[np.ndarray]) -> np.ndarray:
+    """How far (N,) other poses are from one, in units of 2 degrees and 5 % of its distance."""
+    stack = np.stack(others)
+    angles = np.linalg.norm(matrix_to_axis_angle(pose[:3, :3].T @ stack[:, :3, :3]), axis=1)
+    shifts = np.linalg.norm(stack[:, :3, 3] - pose[:3, 3], axis=1)
+    scale = max(float(np.linalg.norm(pose[:3, 3])), 1e-3)
+    return angles / np.radians(2.0) + shifts / (0.05 * scale)
 
 
 def pair_edges(
@@ -176,7 +178,7 @@ def _relax(
     root: str,
     sweeps: int,
 ) -> dict[str, np.ndarray]:
-    """Move each pose to the weighted mean of what its neighbours say, again and again."""
+    """Move each pose to the mean of what its neighbours say; those far off hardly count."""
     for _ in range(sweeps):
         for name in sorted(poses):
             if name == root:
@@ -190,7 +192,8 @@ def _relax(
                 else:
                     continue
                 weights.append(weight)
-            poses[name] = mean_transform(told, np.array(weights))
+            doubt = _distances(poses[name], told)
+            poses[name] = mean_transform(told, np.array(weights) / (1.0 + doubt**2) ** 2)
     return poses
 
 

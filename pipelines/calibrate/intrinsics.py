@@ -11,10 +11,12 @@ import cv2
 import numpy as np
 
 from express50.cameras import Camera
+from express50.transforms import make_transform
 
-MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
 # A view whose corners span less than this share of the image's diagonal says little of the lens.
 SMALLEST_SPAN = 0.03
+# The mirrored pose of a flat target is ruled out when its error is this factor above the other's.
+CLEARLY_WORSE = 2.5
 
 
 @dataclass(frozen=True)
@@ -129,19 +131,25 @@ def with_ideal(camera: Camera, view: View) -> View:
 def board_poses(view: View) -> list[np.ndarray]:
     """Poses cam_from_board (4, 4) that explain a view (with `ideal` set), best first.
 
-    A small flat target has two of them that reproject almost alike (IPPE, Collins and Bartoli
-    2014); which one is true only the other cameras can tell.
+    A small flat target has two of them that may reproject almost alike (IPPE, Collins and Bartoli
+    2014); which one is true only the other cameras can tell. The second is left out where it
+    fits clearly worse.
     """
     # Object points are centred because IPPE asks for it; the shift is put back into the pose.
     middle = view.points.mean(0)
-    count, rotations, translations, errors = cv2.solvePnPGeneric(
-        view.points - middle, view.ideal, np.eye(3), None, flags=cv2.SOLVEPNP_IPPE
+    centred, eye = view.points - middle, np.eye(3)
+    count, rotations, translations, _ = cv2.solvePnPGeneric(
+        centred, view.ideal, eye, None, flags=cv2.SOLVEPNP_IPPE
     )
-    poses = []
-    for i in np.argsort(np.ravel(errors)) if count else []:
-        pose = np.eye(4)
-        pose[:3, :3] = cv2.Rodrigues(rotations[i])[0]
-        pose[:3, 3] = translations[i].ravel() - pose[:3, :3] @ middle
-        if np.isfinite(pose).all() and (view.points @ pose[2, :3] + pose[2, 3]).min() > 0:
-            poses.append(pose)
-    return poses
+    found = []
+    for rotation, translation in zip(rotations, translations, strict=True):
+        refined = cv2.solvePnPRefineLM(centred, view.ideal, eye, None, rotation, translation)
+        pose = make_transform(cv2.Rodrigues(refined[0])[0], refined[1].ravel())
+        pose[:3, 3] -= pose[:3, :3] @ middle
+        placed = view.points @ pose[:3, :3].T + pose[:3, 3]
+        if np.isfinite(placed).all() and placed[:, 2].min() > 0:
+            error = placed[:, :2] / placed[:, 2:] - view.ideal
+            found.append((float(np.sqrt(np.mean(error**2))), pose))
+    found.sort(key=lambda item: item[0])
+    limit = CLEARLY_WORSE * max(found[0][0], 1e-6) if found else 0.0
+    return [pose for error, pose in found if error <= limit]

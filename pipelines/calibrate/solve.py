@@ -15,7 +15,7 @@ from express50.errors import CalibrationError
 from pipelines.calibrate import graph
 from pipelines.calibrate.board import Observations, even
 from pipelines.calibrate.bundle import Rig, adjust, residuals
-from pipelines.calibrate.config import CalibrateConfig
+from pipelines.calibrate.config import AUTO, CalibrateConfig
 from pipelines.calibrate.intrinsics import (
     View,
     as_model,
@@ -28,7 +28,6 @@ from pipelines.calibrate.intrinsics import (
 )
 from pipelines.calibrate.world import canonical_from_rig, move_cameras
 
-AUTO = "auto"
 # From few to many parameters: a focal length and one radial term, two terms, two focal lengths
 # and tangential terms.
 LADDER = ("SIMPLE_RADIAL", "RADIAL", "OPENCV")
@@ -55,7 +54,6 @@ def solve_rig(
     observations: Observations,
     points: np.ndarray,
     sizes: Mapping[str, tuple[int, int]],
-    model: str,
     config: CalibrateConfig,
 ) -> Solution:
     """Calibrate every camera that the observations of one board tie together.
@@ -64,19 +62,18 @@ def solve_rig(
         observations: corners of a rigid board, moved about in front of the rig.
         points: (P, 3) the board's corners, metres.
         sizes: (width, height) of each camera, pixels.
-        model: COLMAP's name of the camera model, or "auto" for the simplest that fits a camera.
-        config: thresholds and rounds.
+        config: camera model, thresholds and rounds.
 
     Raises:
         CalibrationError: no camera can be calibrated; the message lists the reasons.
     """
     dropped: dict[str, str] = {}
     views = _views(observations, points, sizes, config, dropped)
-    start_model = "RADIAL" if model == AUTO else model
+    start_model = "RADIAL" if config.camera_model == AUTO else config.camera_model
     lone, views = _single_cameras(views, sizes, start_model, config, dropped)
     rig = _first_rig(lone, views, dropped)
     _require(rig.cameras, dropped)
-    rig, kept, errors = _refine(rig, observations, points, model, config, dropped)
+    rig, kept, errors = _refine(rig, observations, points, config, dropped)
     middles = [pose[:3, :3] @ points.mean(0) + pose[:3, 3] for pose in rig.boards.values()]
     world_from_rig = canonical_from_rig(rig.cameras, np.median(middles, axis=0))
     return Solution(
@@ -193,7 +190,6 @@ def _refine(
     rig: Rig,
     observations: Observations,
     points: np.ndarray,
-    model: str,
     config: CalibrateConfig,
     dropped: dict[str, str],
 ) -> tuple[Rig, Observations, np.ndarray]:
@@ -212,7 +208,7 @@ def _refine(
             [i for i, name in enumerate(observations.cameras) if name in rig.cameras],
         )
         kept = observations.select(keep)
-        if model == AUTO and number == min(1, config.rounds - 1):
+        if config.camera_model == AUTO and number == min(1, config.rounds - 1):
             rig = _simplest_models(rig, kept, points, loss_scale, config.iterations)
         rig = adjust(rig, kept, points, loss_scale, config.iterations)
         errors = residuals(rig, observations, points)

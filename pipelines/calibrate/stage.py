@@ -13,9 +13,8 @@ from express50.layout import Dataset
 from express50.stage import Stage
 from pipelines.calibrate.board import board_from_table, board_points, read_observations
 from pipelines.calibrate.config import PRESETS, CalibrateConfig
-from pipelines.calibrate.intrinsics import MODELS
 from pipelines.calibrate.pictures import draw_residuals, draw_rig
-from pipelines.calibrate.solve import AUTO, Solution, solve_rig
+from pipelines.calibrate.solve import Solution, solve_rig
 from pipelines.calibrate.world import check_meeting
 
 
@@ -99,27 +98,13 @@ def _run_board(index: Index, config: CalibrateConfig, out: Path) -> dict:
         name: [index.capture / file for file in table["cameras"].get(name, [])] for name in sizes
     }
     observations = read_observations(board, files, sizes, config.board_frames)
-    model = _model(config, index)
-    solution = solve_rig(observations, board_points(board), sizes, model, config)
+    solution = solve_rig(observations, board_points(board), sizes, config)
     write_cameras(out / "cameras.json", solution.cameras)
     (out / "qc").mkdir()
     boards = np.array([pose[:3, 3] for pose in solution.boards.values()]).reshape(-1, 3)
     draw_rig(out / "qc" / "rig.jpg", solution.cameras, boards)
     draw_residuals(out / "qc" / "residuals.jpg", solution)
     return _metrics(solution)
-
-
-def _model(config: CalibrateConfig, index: Index) -> str:
-    """The camera model to solve for: the config's, else the capture's, else the simplest fit."""
-    model = config.camera_model
-    if model == AUTO:
-        model = str(index.meta.get("camera_model", AUTO))
-    if model != AUTO and model not in MODELS:
-        raise CalibrationError(
-            f"{index.capture}: camera_model is {model!r}; a board is solved with "
-            f"{', '.join(MODELS)} or {AUTO}"
-        )
-    return model
 
 
 def _metrics(solution: Solution) -> dict:

@@ -1,0 +1,257 @@
+"""Calibration recovers known rigs, and names what it cannot use."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from express50.cameras import read_cameras, write_cameras
+from express50.errors import CalibrationError
+from express50.transforms import axis_angle_to_matrix, make_transform
+from pipelines.calibrate.board import (
+    Observations,
+    board_from_table,
+    detect_corners,
+    gather,
+    make_detector,
+    opencv_board,
+)
+from pipelines.calibrate.bundle import residuals
+from pipelines.calibrate.config import CalibrateConfig
+from pipelines.calibrate.solve import Rig, solve_rig
+from pipelines.calibrate.stage import check_given
+from pipelines.calibrate.world import canonical_from_rig, meeting_point, move_cameras
+from tests.pipelines.board_rigs import (
+    BOARD,
+    POINTS,
+    board_motion,
+    make_rig,
+    observe,
+    render_board,
+    rig_errors,
+    sizes_of,
+)
+
+CONFIG = CalibrateConfig()
+
+
+def solve(rig, observations: Observations, model: str = "auto", **changes):
+    """Solve with the default config, changed."""
+    config = replace(CONFIG, camera_model=model, **changes)
+    return solve_rig(observations, POINTS, sizes_of(rig), config)
+
+
+def changed(observations: Observations, camera: str, pixels) -> Observations:
+    """The observations with one camera's pixels (N, 2) mapped by a function."""
+    mine = observations.camera == observations.cameras.index(camera)
+    out = observations.pixels.copy()
+    out[mine] = pixels(out[mine])
+    return replace(observations, pixels=out)
+
+
+@pytest.mark.parametrize(("count", "noise"), [(4, 0.1), (6, 0.3)])
+def test_a_noisy_rig_is_recovered(count: int, noise: float) -> None:
+    rig = make_rig(count, distance=0.85)
+    solution = solve(rig, observe(rig, board_motion(40, 1), noise))
+    rotation, position, focal = rig_errors(solution.cameras, rig)
+    assert rotation < 0.1 and position < 2e-3 and focal < 0.3
+    assert not solution.dropped and not solution.weak
+    rms = np.sqrt(np.mean(np.sum(solution.errors**2, axis=1)))
+    assert 1.25 * noise < rms < 1.45 * noise  # sqrt(2) noise, a little less for fitting
+
+
+def test_exact_corners_give_the_exact_rig() -> None:
+    rig = make_rig(4)
+    solution = solve(rig, observe(rig, board_motion(20, 2), 0.0), "OPENCV")
+    rotation, position, focal = rig_errors(solution.cameras, rig)
+    assert rotation < 1e-3 and position < 1e-5 and focal < 1e-3
+
+
+def test_scale_is_the_boards() -> None:
+    rig = make_rig(3)
+    observations = observe(rig, board_motion(20, 3), 0.05)
+    once = solve(rig, observations).cameras
+    twice = solve_rig(observations, 2 * POINTS, sizes_of(rig), CONFIG).cameras
+    for a, b in (("cam00", "cam01"), ("cam01", "cam02")):
+        ratio = np.linalg.norm(twice[a].center - twice[b].center) / np.linalg.norm(
+            once[a].center - once[b].center
+        )
+        assert ratio == pytest.approx(2.0, rel=1e-5)
+
+
+def test_bad_corners_do_not_move_the_rig() -> None:
+    rig = make_rig(4)
+    observations = observe(rig, board_motion(25, 4), 0.1)
+    rng = np.random.default_rng(0)
+    bad = rng.random(len(observations.corner)) < 0.02
+    pixels = observations.pixels + bad[:, None] * rng.normal(size=(len(bad), 2)) * 15
+    solution = solve(rig, replace(observations, pixels=pixels))
+    rotation, position, focal = rig_errors(solution.cameras, rig)
+    assert rotation < 0.1 and position < 2e-3 and focal < 0.3
+    assert np.linalg.norm(solution.errors, axis=1).max() < 2.0
+
+
+def test_mirrored_images_are_named() -> None:
+    rig = make_rig(4)
+    observations = observe(rig, board_motion(20, 5), 0.1)
+    mirrored = changed(observations, "cam02", lambda p: p * [-1, 1] + [640, 0])
+    solution = solve(rig, mirrored)
+    assert "mirrored" in solution.dropped["cam02"]
+    assert sorted(solution.cameras) == ["cam00", "cam01", "cam03"]
+    assert rig_errors(solution.cameras, rig)[0] < 0.1
+
+
+def test_random_corners_are_named() -> None:
+    rig = make_rig(4)
+    observations = observe(rig, board_motion(20, 6), 0.1)
+    rng = np.random.default_rng(1)
+    garbage = changed(observations, "cam01", lambda p: rng.uniform(0, (640, 480), p.shape))
+    solution = solve(rig, garbage)
+    assert "cam01" in solution.dropped and len(solution.cameras) == 3
+    assert rig_errors(solution.cameras, rig)[0] < 0.1
+
+
+def test_a_camera_out_of_step_is_named() -> None:
+    rig = make_rig(5)
+    observations = observe(rig, board_motion(20, 7), 0.1)
+    frame = observations.frame.copy()
+    late = observations.camera == 1
+    frame[late] = (frame[late] + 3) % 20
+    solution = solve(rig, replace(observations, frame=frame))
+    assert "out of step" in solution.dropped["cam01"]
+    assert rig_errors(solution.cameras, rig)[0] < 0.1
+
+
+def test_a_camera_that_sees_no_board_is_dropped_and_the_rest_goes_on() -> None:
+    rig = make_rig(4)
+    observations = observe(rig, board_motion(20, 8), 0.1)
+    solution = solve(rig, observations.select(observations.camera != 3))
+    assert "seen well" in solution.dropped["cam03"] and len(solution.cameras) == 3
+
+
+def test_a_camera_with_few_corners_is_reported_as_weak() -> None:
+    rig = make_rig(4)
+    observations = observe(rig, board_motion(30, 9), 0.1)
+    rare = (observations.camera != 2) | (observations.frame % 6 == 0)
+    solution = solve(rig, observations.select(rare))
+    assert "cam02" in solution.weak and "cam02" in solution.cameras
+
+
+def test_no_board_anywhere_is_one_clear_error() -> None:
+    rig = make_rig(2)
+    with pytest.raises(CalibrationError, match="no camera can be calibrated.*cam01: the board"):
+        solve(rig, gather([], rig))
+
+
+def test_the_simplest_lens_that_fits_is_chosen() -> None:
+    plain = {n: replace(c, params=(*c.params[:4], 0, 0, 0, 0)) for n, c in make_rig(3).items()}
+    plain = {
+        n: replace(c, params=(c.params[0], *c.params[:1], *c.params[2:])) for n, c in plain.items()
+    }
+    skewed = {n: replace(c, params=(*c.params[:6], 3e-3, -3e-3)) for n, c in make_rig(3).items()}
+    boards = board_motion(20, 10)
+    for rig, model in ((plain, "SIMPLE_RADIAL"), (skewed, "OPENCV")):
+        cameras = solve(rig, observe(rig, boards, 0.1)).cameras
+        assert {camera.model for camera in cameras.values()} == {model}
+
+
+def test_residuals_of_the_truth_are_the_noise() -> None:
+    rig, boards = make_rig(2), board_motion(6, 11)
+    observations = observe(rig, boards, 0.0)
+    errors = residuals(Rig(rig, dict(enumerate(boards))), observations, POINTS)
+    assert np.abs(errors).max() < 1e-9
+
+
+def test_corners_of_an_image_are_found_to_a_fraction_of_a_pixel() -> None:
+    rig = make_rig(1, focal=500.0)
+    camera = rig["cam00"]
+    board = board_motion(1, 12, shift=0.0)[0]
+    ids, pixels = detect_corners(render_board(camera, board), make_detector(BOARD), BOARD)
+    true = observe(rig, [board], 0.0)
+    row = {int(c): p for c, p in zip(true.corner, true.pixels, strict=True)}
+    errors = np.array([p - row[int(i)] for i, p in zip(ids, pixels, strict=True) if int(i) in row])
+    assert len(errors) >= 50
+    # A forgotten half pixel would show as a mean of 0.5.
+    assert np.abs(errors.mean(axis=0)).max() < 0.02
+    assert np.sqrt(np.mean(np.sum(errors**2, axis=1))) < 0.08
+
+
+def test_board_points_are_opencvs() -> None:
+    theirs = np.asarray(opencv_board(BOARD).getChessboardCorners())
+    assert np.allclose(POINTS, theirs)
+
+
+def test_the_world_is_canonical_whatever_the_start() -> None:
+    rig = make_rig(5)
+    moved = move_cameras(
+        rig, make_transform(axis_angle_to_matrix(np.array([1.0, 2.0, -0.5])), np.array([3, -2, 9]))
+    )
+    one, two = (move_cameras(c, canonical_from_rig(c, np.zeros(3))) for c in (rig, moved))
+    for name in rig:
+        assert np.allclose(one[name].cam_from_world, two[name].cam_from_world, atol=1e-9)
+    assert np.allclose(meeting_point(one), 0, atol=1e-9)
+    middle = np.mean([camera.center for camera in one.values()], axis=0)
+    assert middle[2] > 0.5 and abs(middle[0]) < 0.2
+    assert np.mean([camera.cam_from_world[1, 1] for camera in one.values()]) < -0.9  # y is up
+
+
+def test_given_cameras_must_match_the_footage() -> None:
+    rig = make_rig(3)
+    check_given(rig, sizes_of(rig), "calibration.json")
+    with pytest.raises(CalibrationError, match="cam01 is 640x480, its footage is 1280x960"):
+        check_given(rig, sizes_of(rig) | {"cam01": (1280, 960)}, "calibration.json")
+
+
+def test_inverted_given_cameras_are_refused() -> None:
+    rig = make_rig(5)
+    inverted = {
+        n: replace(c, cam_from_world=np.linalg.inv(c.cam_from_world)) for n, c in rig.items()
+    }
+    turned = {
+        n: replace(c, cam_from_world=np.diag([1, -1, -1, 1.0]) @ c.cam_from_world)
+        for n, c in rig.items()
+    }
+    for wrong in (inverted, turned):
+        with pytest.raises(CalibrationError, match="lies behind"):
+            check_given(wrong, sizes_of(wrong), "calibration.json")
+
+
+def test_a_malformed_calibration_file_is_refused(tmp_path) -> None:
+    rig = make_rig(2)
+    path = tmp_path / "calibration.json"
+    write_cameras(path, rig)
+    text = path.read_text()
+    path.write_text(text.replace("OPENCV", "OPENKV", 1))
+    with pytest.raises(CalibrationError, match="OPENKV"):
+        read_cameras(path)
+    path.write_text(text.replace("1.0\n   ]", "1.0,\n    2.0\n   ]", 1))
+    with pytest.raises(CalibrationError, match="world_to_camera"):
+        read_cameras(path)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"squares_x": 2}, "at least 3 x 3"),
+        ({"marker_length_m": 0.06}, "marker < square"),
+        ({"square_length_m": float("nan")}, "marker < square"),
+        ({"dictionary": "DICT_9X9"}, "DICT_9X9"),
+        ({"dictionary": "DICT_4X4_50", "squares_x": 20}, "needs 80 markers"),
+        ({"squares_y": "many"}, "wrong kind"),
+    ],
+)
+def test_a_wrong_board_is_refused(change: dict, message: str) -> None:
+    table = {
+        "squares_x": 11,
+        "squares_y": 8,
+        "square_length_m": 0.05,
+        "marker_length_m": 0.037,
+        "dictionary": "DICT_5X5_250",
+    }
+    with pytest.raises(CalibrationError, match=message):
+        board_from_table(table | change, "board.toml")
+    del table["dictionary"]
+    with pytest.raises(CalibrationError, match="dictionary is missing"):
+        board_from_table(table, "board.toml")
