@@ -242,7 +242,7 @@ def joint_angles(
             part = like.new_zeros(batch, width)
         if part.ndim != 2 or part.shape[1] != width or part.shape[0] not in (1, batch):
             raise ValueError(f"{name} has shape {tuple(part.shape)}, expected ({batch}, {width})")
-        blocks.append(part.expand(batch, width).reshape(batch, -1, 3))
+        blocks.append(part.expand(batch, width).reshape(batch, width // 3, 3))
     return torch.cat(blocks, dim=1)
 
 
@@ -270,7 +270,7 @@ def skin(
         (B, N, 3).
     """
     identity = torch.eye(3, dtype=rest.dtype, device=rest.device)
-    feature = (rotations[:, 1:] - identity).reshape(rest.shape[0], -1)
+    feature = (rotations[:, 1:] - identity).flatten(1)
     corrected = rest + (feature @ pose_dirs).reshape(rest.shape)
     world_rotations, world_joints = [rotations[:, 0]], [joints[:, 0]]
     for joint, parent in enumerate(parents[1:], start=1):

@@ -22,6 +22,7 @@ HALF_CONFIDENCE_SHARE = 0.025
 # Points of a place that is no face are vague: at this share the score is halved.
 VAGUE_SHARE = 0.06
 FOUND_SCORE = 0.5
+KEEP_SHARE = 0.8
 
 
 @dataclass(frozen=True)
@@ -61,7 +62,11 @@ def detect(net: LandmarkNet, image: np.ndarray, refinements: int = 3) -> Detecti
         window = _window_about(points)
         last = step == refinements - 1
         views = [window, _mirrored(window)] if last else [window]
-        points, sigma, score = _mean_view(*_run(net, pyramid, views))
+        refined = _mean_view(*_run(net, pyramid, views))
+        if refined[2] < KEEP_SHARE * score:
+            # The crop went astray, as it may on a profile: the wider view knew better.
+            break
+        points, sigma, score = refined
     relative = sigma / (HALF_CONFIDENCE_SHARE * max(face_box(points)[1], 1e-6))
     return Detection(points, sigma, score / (1.0 + relative**2), score)
 

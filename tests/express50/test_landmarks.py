@@ -1,0 +1,196 @@
+"""The landmark network, its crops and the detector on renders of heads it never saw."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from express50.landmarks.augment import (
+    MIRROR,
+    face_box,
+    make_backgrounds,
+    random_crop,
+)
+from express50.landmarks.detector import _mirrored, _pyramid, _sample, _window, detect
+from express50.landmarks.network import (
+    CROP,
+    WEIGHTS,
+    LandmarkNet,
+    heat_loss,
+    load_network,
+    save_network,
+)
+from express50.landmarks.training_set import ViewSet
+
+
+@pytest.fixture(scope="module")
+def network() -> LandmarkNet:
+    torch.set_num_threads(1)
+    return load_network()
+
+
+def test_mirror_table_is_its_own_inverse_and_swaps_sides() -> None:
+    np.testing.assert_array_equal(MIRROR[MIRROR], np.arange(68))
+    assert [MIRROR[k] for k in (0, 8, 17, 36, 48, 31, 60)] == [16, 8, 26, 45, 54, 35, 64]
+
+
+def test_weights_are_small_and_complete(network: LandmarkNet) -> None:
+    assert WEIGHTS.stat().st_size < 4_000_000
+    with np.load(WEIGHTS, allow_pickle=False) as data:
+        assert all(np.isfinite(data[name]).all() for name in data.files)
+        names = {name for name in network.state_dict() if "num_batches" not in name}
+        assert names == set(data.files)
+
+
+def test_saved_weights_come_back_as_half_precision(tmp_path: Path) -> None:
+    torch.manual_seed(0)
+    net = LandmarkNet()
+    save_network(net, tmp_path / "net.npz")
+    back = load_network(tmp_path / "net.npz")
+    for name, value in net.state_dict().items():
+        if "num_batches" not in name:
+            torch.testing.assert_close(back.state_dict()[name], value.half().float())
+
+
+def test_expected_points_follow_a_peak_anywhere_in_the_crop() -> None:
+    """A heat map that is one sharp Gaussian has its expectation at the Gaussian's centre."""
+    from express50.landmarks.network import STRETCH, _expectation
+
+    grid = (torch.arange(32) + 0.5) / 32
+    grid = ((grid - 0.5) * STRETCH + 0.5) * CROP
+    target = torch.tensor([[40.3, 90.7]])
+    squared = (grid[None, :] - target[0, 0]) ** 2 + (grid[:, None] - target[0, 1]) ** 2
+    points, variance = _expectation(-squared[None, None] / (2 * 5.0**2))
+    torch.testing.assert_close(points[0], target, atol=0.02, rtol=0)
+    assert float(variance) == pytest.approx(50.0, rel=0.05)
+
+
+def test_heat_loss_is_least_at_the_true_point() -> None:
+    heat = torch.zeros(1, 1, 32, 32, dtype=torch.float64, requires_grad=True)
+    point = torch.tensor([[[50.0, 77.0]]], dtype=torch.float64)
+    for _ in range(60):
+        (gradient,) = torch.autograd.grad(heat_loss(heat, point).sum(), heat)
+        heat = (heat - 40.0 * gradient).detach().requires_grad_()
+    from express50.landmarks.network import _expectation
+
+    torch.testing.assert_close(_expectation(heat)[0][0], point[0], atol=0.3, rtol=0)
+
+
+@pytest.mark.parametrize("step", [0.5, 1.0, 4.0])
+def test_windows_sample_the_pixels_they_name(step: float) -> None:
+    """A linear ramp is reproduced exactly by any window: no half pixel is lost on the way."""
+    size = 1024
+    ramp = np.linspace(0, 255, size, dtype=np.float32)
+    image = np.repeat(np.repeat(ramp[None, :, None], size, 0), 3, 2).astype(np.uint8)
+    window = _window(np.array([500.25, 512.0]), step * CROP, 0.0)
+    crop = _sample(_pyramid(image), window)[64, :, 0].astype(float)
+    x = (np.arange(CROP) + 0.5) * window[0, 0] + window[0, 2]
+    np.testing.assert_allclose(crop, (x - 0.5) / (size - 1) * 255, atol=1.3)
+    mirrored = _sample(_pyramid(image), _mirrored(window))[64, ::-1, 0].astype(float)
+    np.testing.assert_allclose(mirrored, crop, atol=1.0)
+
+
+def test_crops_move_points_with_the_picture() -> None:
+    """A dot painted at every landmark is found where the crop says the landmark is."""
+    rng = np.random.default_rng(0)
+    points = rng.uniform(60, 150, (68, 2)).astype(np.float32)
+    rgba = np.zeros((208, 208, 4), np.uint8)
+    rgba[..., 3] = 255
+    x, y = points[30].astype(int)
+    rgba[y - 3 : y + 4, x - 3 : x + 4, :3] = 255
+    points[30] = [x + 0.5, y + 0.5]
+    views = ViewSet(rgba[None], points[None], np.ones(1, np.float32))
+    backgrounds = make_backgrounds(2, rng) // 16
+    errors = []
+    for _ in range(40):
+        crop = random_crop(views, 0, backgrounds, rng)
+        image = crop.image.astype(float).mean(2)
+        bright = image > 0.5 * (image.max() + np.median(image))
+        if crop.weight == 0 or bright.sum() < 6 or bright.sum() > 2500:
+            continue
+        centre = np.argwhere(bright).mean(0)[::-1] + 0.5
+        # The middle of the nose is its own mirror partner, so its index never changes.
+        errors.append(np.linalg.norm(centre - crop.points[30]))
+    assert len(errors) > 10
+    assert np.median(errors) < 1.5
+
+
+def test_detector_refuses_what_is_no_picture(network: LandmarkNet) -> None:
+    for image in (np.zeros((8, 8), np.uint8), np.zeros((8, 8, 3)), np.zeros((0, 8, 3), np.uint8)):
+        with pytest.raises(ValueError, match="expected uint8"):
+            detect(network, image)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (3, 500), (500, 3), (64, 64)])
+@pytest.mark.parametrize("value", [0, 255])
+def test_pictures_without_a_head_score_low(
+    network: LandmarkNet, size: tuple[int, int], value: int
+) -> None:
+    found = detect(network, np.full((*size, 3), value, np.uint8))
+    assert np.isfinite(found.points).all()
+    assert found.score < 0.3
+
+
+@pytest.fixture(scope="module")
+def unseen_views() -> ViewSet:
+    """Renders of procedural heads with a seed that training never uses."""
+    from express50.head.load import load_head
+    from express50.landmarks.synthetic import HeadScene, random_head
+
+    model = load_head("procedural")
+    rng = np.random.default_rng(987_654)
+    views = [HeadScene(model, random_head(model, rng)).render(rng, 208, False) for _ in range(10)]
+    return ViewSet(
+        np.stack([view.rgba for view in views]),
+        np.stack([view.points for view in views]),
+        np.array([view.facing for view in views]),
+    )
+
+
+def on_canvas(rgba: np.ndarray, seed: int, at: tuple[int, int], size: int = 400) -> np.ndarray:
+    """A view over noise, somewhere in a larger frame."""
+    rng = np.random.default_rng(seed)
+    frame = np.kron(rng.integers(0, 255, (20, 20, 3)), np.ones((size // 20, size // 20, 1)))
+    alpha = rgba[..., 3:] / 255.0
+    x, y = at
+    patch = frame[y : y + 208, x : x + 208]
+    frame[y : y + 208, x : x + 208] = patch * (1 - alpha) + rgba[..., :3] * alpha
+    return frame.astype(np.uint8)
+
+
+def test_finds_heads_it_never_saw_anywhere_in_a_frame(
+    network: LandmarkNet, unseen_views: ViewSet
+) -> None:
+    errors = []
+    for index in np.flatnonzero(unseen_views.facing > 0.6):
+        at = (13 * (index % 10), 190 - 17 * (index % 10))
+        found = detect(network, on_canvas(unseen_views.rgba[index], index, at))
+        truth = unseen_views.points[index] + at
+        _, side = face_box(truth)
+        errors.append(np.linalg.norm(found.points - truth, axis=1)[17:].mean() / side)
+    # Shares of the face box: 0.03 is two pixels of a face 70 pixels tall.
+    assert np.median(errors) < 0.03
+
+
+def test_points_follow_the_frame(network: LandmarkNet, unseen_views: ViewSet) -> None:
+    """Shifting the frame shifts the points; doubling its size doubles them."""
+    index = int(np.argmax(unseen_views.facing))
+    frame = on_canvas(unseen_views.rgba[index], 3, (100, 90))
+    found = detect(network, frame)
+    moved = detect(network, np.roll(frame, (6, 9), axis=(0, 1)))
+    assert np.median(np.linalg.norm(moved.points - found.points - [9, 6], axis=1)) < 1.0
+    large = detect(network, np.kron(frame, np.ones((2, 2, 1), np.uint8)))
+    assert np.median(np.linalg.norm(large.points / 2 - found.points, axis=1)) < 1.0
+
+
+def test_a_real_photograph(network: LandmarkNet) -> None:
+    """The detector was trained on renders alone; on a portrait it must land on the face."""
+    data = pytest.importorskip("skimage.data")
+    found = detect(network, data.astronaut())
+    low, high = found.points.min(0), found.points.max(0)
+    # The face of that picture spans about x 175..270, y 70..195.
+    assert 150 < low[0] < high[0] < 300
+    assert 50 < low[1] < high[1] < 220

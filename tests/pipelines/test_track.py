@@ -1,0 +1,384 @@
+"""Tracking, from its derivatives to the stage, on a small made-up head with exact landmarks."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from express50.cameras import Camera, project
+from express50.config import build_config
+from express50.errors import ConfigError, StageError
+from express50.head.model import landmarks, pose
+from express50.landmarks.detector import Detection
+from express50.transforms import axis_angle_to_matrix, look_at
+from pipelines.track.config import TrackConfig
+from pipelines.track.fit import (
+    State,
+    Target,
+    consistent_sigma,
+    fit,
+    landmark_sigma,
+    project_with_slope,
+    start_state,
+)
+from pipelines.track.observe import View, agree, robust_triangulate
+from pipelines.track.outline import Outline, outline_vertices, sample, signed_distance
+from pipelines.track.priors import prior
+from pipelines.track.sparse_head import Basis, Points, make_basis
+from pipelines.track.start import initial_pose
+from tests.express50.head.tiny_head import tiny_head
+
+CONFIG = TrackConfig()
+
+
+def make_camera(angle: float, size: int = 400, name: str = "") -> Camera:
+    eye = 1.2 * np.array([np.sin(angle), 0.1, np.cos(angle)])
+    pose_ = look_at(eye, np.zeros(3), np.array([0.0, 1.0, 0.0]))
+    params = (1.8 * size, 1.8 * size, size / 2, size / 2)
+    return Camera(name or f"cam{angle:+.2f}", size, size, "PINHOLE", params, pose_)
+
+
+RIG = [make_camera(angle) for angle in (-0.7, 0.0, 0.6)]
+
+
+@dataclasses.dataclass(frozen=True)
+class Scene:
+    """Truth of one expression of the tiny head."""
+
+    basis: Basis
+    shape: np.ndarray
+    own: np.ndarray
+    rotation: np.ndarray
+    vertices: np.ndarray
+    marks: np.ndarray
+
+
+def make_scene(seed: int = 0, expression: float = 0.6) -> Scene:
+    model = tiny_head(vertices=90, seed=1)
+    basis = make_basis(model)
+    shape = np.random.default_rng(99).normal(size=5) * 0.7
+    rng = np.random.default_rng(seed)
+    own = np.zeros(4 + 18)
+    own[:4] = rng.uniform(0, expression, 4)
+    own[7] = 0.1
+    own[-3:] = rng.normal(size=3) * 0.03
+    rotation = axis_angle_to_matrix(rng.normal(size=3) * 0.2)
+    points = Points(basis, np.arange(90))
+    everything = points.evaluate(np.concatenate([shape, own]), rotation)
+    return Scene(basis, shape, own, rotation, everything[68:], everything[:68])
+
+
+def make_views(marks: np.ndarray, noise: float = 0.0, cameras: list[Camera] = RIG) -> list[View]:
+    rng = np.random.default_rng(7)
+    return [
+        View(c.id, c, project(c, marks)[0] + noise * rng.normal(size=(68, 2)), np.ones(68), 0.9)
+        for c in cameras
+    ]
+
+
+def test_sparse_points_equal_the_whole_model() -> None:
+    scene = make_scene()
+    model = scene.basis.model
+    own = torch.from_numpy(scene.own)[None]
+    whole = pose(
+        model, torch.from_numpy(scene.shape)[None], own[:, :4],
+        neck=own[:, 4:7], jaw=own[:, 7:10], eyes=own[:, 10:16],
+    )  # fmt: skip
+    world = whole[0].numpy() @ scene.rotation.T + scene.own[-3:]
+    np.testing.assert_allclose(scene.vertices, world, atol=1e-12)
+    np.testing.assert_allclose(
+        scene.marks, landmarks(model, torch.from_numpy(world)[None])[0].numpy(), atol=1e-12
+    )
+
+
+def test_jacobian_matches_finite_differences() -> None:
+    scene = make_scene()
+    points = Points(scene.basis, np.array([3, 50]))
+    x = np.concatenate([scene.shape, scene.own])
+    _, jacobian = points.linearise(x, scene.rotation)
+    for column in range(len(x)):
+        step = np.zeros_like(x)
+        step[column] = 1e-6
+        ahead = points.evaluate(x + step, scene.rotation)
+        slope = (ahead - points.evaluate(x - step, scene.rotation)) / 2e-6
+        np.testing.assert_allclose(jacobian[:, :, column], slope, atol=1e-7)
+
+
+def test_projection_slope_matches_finite_differences() -> None:
+    points = np.random.default_rng(0).normal(size=(5, 3)) * 0.1
+    pixels, slope = project_with_slope(RIG[0], points)
+    np.testing.assert_allclose(pixels, project(RIG[0], points)[0], atol=1e-9)
+    for axis in range(3):
+        step = np.eye(3)[axis] * 1e-6
+        ahead, back = (project(RIG[0], points + s * step)[0] for s in (1, -1))
+        np.testing.assert_allclose(slope[:, :, axis], (ahead - back) / 2e-6, rtol=1e-5, atol=1e-4)
+
+
+@settings(deadline=None, max_examples=20)
+@given(seed=st.integers(0, 1000), unit=st.booleans(), neutral=st.booleans())
+def test_prior_slope_matches_finite_differences(seed: int, unit: bool, neutral: bool) -> None:
+    model = dataclasses.replace(tiny_head(vertices=20), unit_expressions=unit)
+    own = np.random.default_rng(seed).normal(size=22)
+    cost = lambda x: 0.5 * float((prior(model, x, neutral, CONFIG)[0] ** 2).sum())  # noqa: E731
+    residual, slope = prior(model, own, neutral, CONFIG)
+    gradient = slope.T @ residual
+    for column in range(22):
+        step = np.eye(22)[column] * 1e-6
+        numeric = (cost(own + step) - cost(own - step)) / 2e-6
+        assert gradient[column] == pytest.approx(numeric, rel=1e-4, abs=1e-3)
+    np.testing.assert_array_equal(gradient[-6:], 0.0)
+
+
+def test_triangulation_survives_wild_outliers() -> None:
+    scene = make_scene()
+    cameras = [make_camera(angle) for angle in np.linspace(-1, 1, 7)]
+    views = make_views(scene.marks, 0.3, cameras)
+    rng = np.random.default_rng(1)
+    wrong = rng.random((7, 68)) < 0.25
+    for view, bad in zip(views, wrong, strict=True):
+        view.points[bad] += rng.normal(size=(bad.sum(), 2)) * 120
+    points, inliers = robust_triangulate(views)
+    enough = (~wrong).sum(0) >= 3
+    error = np.linalg.norm(points - scene.marks, axis=1)[enough]
+    assert np.median(error) < 0.5e-3
+    assert (inliers & wrong).sum() < 0.05 * wrong.sum() + 3
+
+
+def test_a_view_that_shows_something_else_is_left_out() -> None:
+    scene = make_scene()
+    views = make_views(scene.marks, 0.3, [make_camera(angle) for angle in (-0.8, -0.3, 0.2, 0.7)])
+    views[2].points[:] = np.random.default_rng(0).uniform(0, 400, (68, 2))
+    observation, refused = agree("smile", 3, views)
+    assert refused == [views[2].camera_id]
+    assert len(observation.views) == 3
+
+
+@pytest.mark.parametrize("scale", [0.01, 100.0, 1000.0])
+def test_a_rig_in_another_unit_is_named(scale: float) -> None:
+    scene = make_scene()
+    cameras = []
+    for camera in RIG:
+        moved = camera.cam_from_world.copy()
+        moved[:3, 3] *= scale
+        cameras.append(dataclasses.replace(camera, cam_from_world=moved))
+    observation, _ = agree("smile", 0, make_views(scene.marks * scale, 0.0, cameras))
+    template = landmarks(scene.basis.model, scene.basis.model.template[None])[0].numpy()
+    with pytest.raises(StageError, match=f"the rig seems {scale:g}x off"):
+        initial_pose(observation, template)
+
+
+def targets_of(scene: Scene, views: list[View]) -> tuple[list[Target], list]:
+    observation, _ = agree("smile", 0, views)
+    model = scene.basis.model
+    start = initial_pose(observation, landmarks(model, model.template[None])[0].numpy())
+    return [Target(observation, landmark_sigma(observation, CONFIG), False)], [start]
+
+
+def test_exact_landmarks_give_the_mesh_back() -> None:
+    """Weak priors, exact data: the fitted mesh is the true one, vertices without landmarks too."""
+    scene = make_scene()
+    config = dataclasses.replace(CONFIG, shape_prior=1e-3, landmark_floor_px=0.01)
+    observation, _ = agree("smile", 0, make_views(scene.marks))
+    views = tuple(dataclasses.replace(view, sigma=np.full(68, 0.02)) for view in observation.views)
+    observation = dataclasses.replace(observation, views=views)
+    template = landmarks(scene.basis.model, scene.basis.model.template[None])[0].numpy()
+    targets = [Target(observation, landmark_sigma(observation, config), False)]
+    start = start_state(scene.basis, [initial_pose(observation, template)])
+    state, _ = fit(scene.basis, targets, start, config, 60)
+    got = fitted_vertices(scene.basis, state)
+    assert np.sqrt(((got - scene.vertices) ** 2).sum(1).mean()) < 2e-4
+
+
+def fitted_vertices(basis: Basis, state: State) -> np.ndarray:
+    points = Points(basis, np.arange(len(basis.model.template)))
+    pose_ = state.poses[0]
+    return points.evaluate(np.concatenate([state.shape, pose_.own]), pose_.rotation)[68:]
+
+
+def test_fit_never_raises_its_own_cost_and_shares_one_shape() -> None:
+    scenes = [make_scene(0), make_scene(1)]
+    pairs = [targets_of(scene, make_views(scene.marks, 1.0)) for scene in scenes]
+    targets = [pair[0][0] for pair in pairs]
+    state = start_state(scenes[0].basis, [pair[1][0] for pair in pairs])
+    costs = [fit(scenes[0].basis, targets, state, CONFIG, n)[1] for n in (0, 1, 2, 4, 8, 16)]
+    assert all(later <= earlier + 1e-9 for earlier, later in zip(costs, costs[1:], strict=False))
+    assert costs[-1] < 0.5 * costs[0]
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_few_cameras_stay_stable(count: int) -> None:
+    """One camera cannot see depth: the prior keeps coefficients sane and the mesh near."""
+    scene = make_scene()
+    targets, poses = targets_of(scene, make_views(scene.marks, 0.5, RIG[1 : 1 + count] or RIG[:1]))
+    state, _ = fit(scene.basis, targets, start_state(scene.basis, poses), CONFIG, 20)
+    assert np.abs(state.shape).max() < 4.0
+    assert -0.2 < state.poses[0].own[:4].min() <= state.poses[0].own[:4].max() < 1.4
+    pixels = project(RIG[1], fitted_vertices(scene.basis, state))[0]
+    truth = project(RIG[1], scene.vertices)[0]
+    assert np.median(np.linalg.norm(pixels - truth, axis=1)) < 6.0
+
+
+def test_fitted_rotations_stay_rotations() -> None:
+    scene = make_scene()
+    targets, poses = targets_of(scene, make_views(scene.marks, 2.0))
+    state, _ = fit(scene.basis, targets, start_state(scene.basis, poses), CONFIG, 15)
+    R = state.poses[0].rotation
+    np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-9)
+    assert np.linalg.det(R) > 0
+
+
+def test_views_that_the_fit_contradicts_lose_their_say() -> None:
+    scene = make_scene()
+    targets, _ = targets_of(scene, make_views(scene.marks, 0.3))
+    shifted = targets[0].observation.views[1]
+    shifted.points[:] += 90.0
+    sigma = consistent_sigma(targets[0], scene.marks)
+    assert np.isinf(sigma[1]).all()
+    assert np.isfinite(sigma[0]).mean() > 0.9
+
+
+def disc_alpha(size: int = 300, radius: float = 80.0) -> np.ndarray:
+    grid = np.arange(size) + 0.5 - size / 2
+    return np.where(np.hypot(grid[:, None], grid) < radius, 255, 0).astype(np.uint8)
+
+
+def test_signed_distance_of_a_disc() -> None:
+    distance = signed_distance(disc_alpha(), make_camera(0.0, 300))
+    assert distance is not None
+    angle = np.linspace(0, 6, 40)
+    for radius in (60.0, 80.0, 110.0):
+        pixels = 150 + radius * np.stack([np.cos(angle), np.sin(angle)], 1)
+        value, gradient = sample(distance, pixels)
+        np.testing.assert_allclose(value, radius - 80.0, atol=0.8)
+        np.testing.assert_allclose((gradient * (pixels - 150)).sum(1), radius, rtol=0.2)
+
+
+@pytest.mark.parametrize("fill", [0, 255])
+def test_a_matte_without_an_edge_says_nothing(fill: int) -> None:
+    assert signed_distance(np.full((40, 40), fill, np.uint8), make_camera(0.0, 40)) is None
+
+
+def test_outline_of_a_sphere_is_its_rim() -> None:
+    import trimesh
+
+    sphere = trimesh.creation.icosphere(subdivisions=4, radius=0.1)
+    vertices, faces = np.asarray(sphere.vertices), np.asarray(sphere.faces)
+    camera = make_camera(0.4)
+    allowed = vertices[:, 1] > -0.05
+    chosen = outline_vertices(vertices, faces, camera, allowed)
+    assert len(chosen) >= 20
+    assert allowed[chosen].all()
+    towards = camera.center / np.linalg.norm(camera.center)
+    # Rim of a sphere seen from distance d: cosine to the camera is r / d.
+    cosine = vertices[chosen] @ towards / 0.1
+    np.testing.assert_allclose(cosine, 0.1 / np.linalg.norm(camera.center), atol=0.06)
+
+
+def test_outline_residual_slope_matches_finite_differences() -> None:
+    camera = make_camera(0.3, 300)
+    distance = signed_distance(disc_alpha(), camera)
+    positions = np.random.default_rng(0).normal(size=(12, 3)) * 0.1
+    outline = Outline.of(distance, 0, positions, np.full(12, 0.5))
+    _, residual, slope = outline.residuals(positions, project_with_slope)
+    for axis in range(3):
+        step = np.eye(3)[axis] * 1e-6
+        ahead = outline.residuals(positions + step, project_with_slope)[1]
+        numeric = (ahead - residual) / 1e-6
+        close = np.isclose(slope[:, :, axis], numeric, rtol=0.02, atol=1.0)
+        assert close.mean() > 0.9
+
+
+def test_presets_are_valid_and_bad_values_are_refused() -> None:
+    from pipelines.track import STAGE
+
+    for values in STAGE.presets.values():
+        build_config(STAGE, values)
+    with pytest.raises(ConfigError, match="iterations"):
+        TrackConfig(iterations=0)
+
+
+@pytest.fixture
+def tracked_dataset(tmp_path: Path, ingested, monkeypatch: pytest.MonkeyPatch):
+    """A calibrated, labelled dataset whose detector is told the landmarks of a tiny head."""
+    import json
+
+    from express50.frames import read_cameras_of
+    from express50.index import read_index
+    from express50.runner import run_stage
+    from pipelines import calibrate
+    from pipelines.track import stage
+
+    run_stage(calibrate.STAGE, ingested, build_config(calibrate.STAGE, {}), progress=False)
+    index = read_index(ingested, "S001")
+    camera_id = sorted(index.cameras)[0]
+    source = index.cameras[camera_id]
+    peaks = {
+        name: {"frame": frame, "camera": camera_id, "pts": 0, "dhash": source.dhash[frame]}
+        for name, frame in (("neutral", 1), ("smile", 4))
+    }
+    folder = ingested.item_dir("align", "S001")
+    folder.mkdir(parents=True)
+    (folder / "peaks.json").write_text(json.dumps(peaks))
+    scene = make_scene()
+    answers = []
+
+    def told(network: object, image: np.ndarray, refinements: int) -> Detection:
+        camera = list(read_cameras_of(ingested, "S001").values())[len(answers) % 3]
+        answers.append(camera.id)
+        points = project(camera, scene.marks)[0]
+        return Detection(points, np.ones(68), np.full(68, 0.9), 0.95)
+
+    monkeypatch.setattr(stage, "detect", told)
+    monkeypatch.setattr(stage, "_network", lambda: None)
+    monkeypatch.setattr(stage, "_basis", lambda head: scene.basis)
+    return ingested, scene
+
+
+def test_stage_writes_the_contracted_file(tracked_dataset, tmp_path: Path) -> None:
+    from pipelines.track import STAGE
+
+    dataset, scene = tracked_dataset
+    outputs = []
+    for attempt in range(2):
+        out = tmp_path / f"out{attempt}"
+        out.mkdir()
+        metrics = STAGE.run(dataset, "S001", TrackConfig(silhouette_rounds=0), out)
+        outputs.append({file.name: file.read_bytes() for file in sorted(out.rglob("*.*"))})
+    assert outputs[0] == outputs[1]
+    assert set(outputs[0]) == {"track.npz", "overlay_neutral.jpg", "overlay_smile.jpg"}
+    assert set(metrics["landmark_rms_px"]) == {"neutral", "smile"}
+    with np.load(tmp_path / "out0" / "track.npz", allow_pickle=False) as track:
+        shapes = {name: track[name].shape for name in track.files}
+        assert str(track["schema"]) == "express50.track/1"
+        assert track["vertices"].dtype == np.float32
+        model = scene.basis.model
+        posed = pose(
+            model, torch.from_numpy(track["shape"])[None].expand(2, -1),
+            torch.from_numpy(track["expression"]), neck=torch.from_numpy(track["neck"]),
+            jaw=torch.from_numpy(track["jaw"]), eyes=torch.from_numpy(track["eyes"]),
+        ).numpy()  # fmt: skip
+        world = np.einsum("eij,evj->evi", track["R"], posed) + track["t"][:, None]
+        np.testing.assert_allclose(track["vertices"], world, atol=1e-6)
+    assert shapes == {
+        "schema": (), "head": (), "expressions": (2,), "frames": (2,), "shape": (5,),
+        "expression": (2, 4), "neck": (2, 3), "jaw": (2, 3), "eyes": (2, 6), "R": (2, 3, 3),
+        "t": (2, 3), "vertices": (2, 90, 3),
+    }  # fmt: skip
+
+
+def test_no_face_anywhere_is_a_clear_error(
+    tracked_dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from pipelines.track import STAGE, stage
+
+    dataset, _ = tracked_dataset
+    nothing = Detection(np.zeros((68, 2)), np.ones(68), np.zeros(68), 0.0)
+    monkeypatch.setattr(stage, "detect", lambda *_: nothing)
+    with pytest.raises(StageError, match="S001: no expression could be tracked"):
+        STAGE.run(dataset, "S001", TrackConfig(), tmp_path)
