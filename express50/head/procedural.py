@@ -21,6 +21,7 @@ from express50.head.procedural_regions import region_masks
 from express50.head.procedural_shapes import shape_directions
 from express50.head.procedural_skin import add_skin, set_skin_uv
 from express50.head.procedural_skinning import (
+    JAW,
     joint_positions,
     joint_regressor,
     pose_correctives,
@@ -55,7 +56,7 @@ def procedural_arrays() -> dict[str, Any]:
     uv, uv_faces = pack_uv(mesh)
     landmark_faces, landmark_bary = embed_landmarks(mesh)
     weights = skinning_weights(mesh, regions)
-    shape_names, shapes = shape_directions(mesh, regions)
+    shape_names, shapes = shape_directions(mesh, regions, weights[:, JAW])
     expression_names, expressions = expression_directions(mesh, regions, weights)
     return {
         "template": mesh.vertices / 1000,

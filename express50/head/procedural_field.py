@@ -92,8 +92,8 @@ LIPS = (
     _capsule((0, -55, 97.0), (11, -54.6, 95.5), 6.0, 5.6, 5),
     _capsule((11, -54.6, 95.5), (26, -50, 84.5), 5.6, 2.0, 5),
     _capsule((0, -31, 105.5), (0, -40, 108), 3.5, 4, 3, carve=True),  # philtrum
-    _capsule((0, -66, 103), (14, -67, 98), 6, 5, 8, carve=True),  # labiomental fold
-    _ellipsoid((32, -50, 91), (5, 6, 7), 7, carve=True),  # hollow beside the mouth's corner
+    _capsule((0, -66.5, 103.5), (20, -67, 96), 6, 4.5, 10, carve=True),  # labiomental fold
+    _ellipsoid((32, -50, 92), (5, 6, 7), 9, carve=True),  # hollow beside the mouth's corner
 )
 MASSES = SKULL + NECK + BROW_AND_ORBIT + NOSE + LIPS
 

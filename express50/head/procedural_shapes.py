@@ -167,6 +167,10 @@ _ASYMMETRIC: dict[str, tuple[Pull, ...]] = {
     "ear_asymmetry": (_pair((76, 5, -18), (20, 42, 28), move=(2, 3, 0), sides="left"),),
     "skull_asymmetry": (_pair((55, 50, -60), (45, 50, 45), move=(3, 0, -3), sides="left"),),
 }
+# The pulls are written as strong as one of them alone may be; drawn together from a normal
+# distribution they must give people, not caricatures.
+_UNIT = 0.5
+
 PULLS = _HEAD | _EYES | _NOSE | _MOUTH | _JAW | _EARS_AND_NECK | _ASYMMETRIC
 
 
@@ -196,22 +200,17 @@ def _turn(offset: Array, angle: Array) -> Array:
     return angle[:, None] * up
 
 
-def shape_directions(mesh: WholeMesh, regions: dict[str, Array]) -> tuple[tuple[str, ...], Array]:
-    """Names (S) and directions (V,3,S) in mm a unit."""
-    jaw = np.where(mesh.vertices[:, 1] < -49, 1.0, 0.0)
-    for k in range(4):
-        for which in ("left", "right"):
-            jaw[mesh.tag(f"lip{k}", which)[17:]] = 1.0
-            jaw[mesh.tag(f"lip{k}", which)[:16]] = 0.0
+def shape_directions(
+    mesh: WholeMesh, regions: dict[str, Array], jaw: Array
+) -> tuple[tuple[str, ...], Array]:
+    """Names (S) and directions (V,3,S) in mm a unit. `jaw` (V,) tells lower from upper lip."""
     scopes = scope_weights(mesh, regions, jaw)
-    names, columns = [], []
+    result = {}
     for name, pulls in PULLS.items():
         motion = displacement(mesh, pulls, scopes)
-        names.append(name)
-        columns.append(motion if name == "head_size" else settle_eyes(mesh, motion, "rigid"))
+        result[name] = motion if name == "head_size" else settle_eyes(mesh, motion, "rigid")
     for name in ("eye_size", "eye_slant"):
-        names.append(name)
-        columns.append(_eye_scaling(mesh, name))
-    names.append("eye_opening")
-    columns.append(lid_motion(mesh, "left", -0.12, -0.06) + lid_motion(mesh, "right", -0.12, -0.06))
-    return tuple(names), np.stack(columns, -1)
+        result[name] = _eye_scaling(mesh, name)
+    wider = [lid_motion(mesh, side, -0.12, -0.06) for side in ("left", "right")]
+    result["eye_opening"] = wider[0] + wider[1]
+    return tuple(result), _UNIT * np.stack(list(result.values()), -1)

@@ -87,8 +87,8 @@ def test_no_eyeball_shows_through_shut_lids(head):
     assert ((awake[..., 1] > 200) & (awake[..., 0] < 120)).mean() > 0.03
 
 
-@pytest.mark.parametrize("name, value", [("eye_size", 2.0), ("eye_distance", -2.0),
-                                         ("eye_depth", 2.0), ("cheekbone", 2.0)])  # fmt: skip
+@pytest.mark.parametrize("name, value", [("eye_size", 3.0), ("eye_distance", -3.0),
+                                         ("eye_depth", 3.0), ("cheekbone", 3.0)])  # fmt: skip
 def test_lids_stay_outside_the_eyeball_whatever_the_shape(head, name, value):
     mesh = procedural_mesh()
     vertices = posed(head, shape={name: value})
