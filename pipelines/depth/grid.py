@@ -65,7 +65,9 @@ def silhouette_distance(alpha: np.ndarray, upsample: int = 3) -> np.ndarray:
     outside = cv2.distanceTransform(1 - mask, cv2.DIST_L2, cv2.DIST_MASK_5)
     # Distances are to pixel centres across the contour: half a pixel too long on either side.
     signed = np.where(mask > 0, inside - 0.5, 0.5 - outside) / upsample
-    return cv2.resize(signed.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA)
+    limit = float(width + height)  # a matte without a contour is infinitely far from one
+    signed = np.clip(signed, -limit, limit).astype(np.float32)
+    return cv2.resize(signed, (width, height), interpolation=cv2.INTER_AREA)
 
 
 def sample_image(image: np.ndarray, pixels: np.ndarray) -> np.ndarray:

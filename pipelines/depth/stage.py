@@ -60,14 +60,14 @@ def run(dataset: Dataset, item: str, config: DepthConfig, out: Path) -> dict:
     cv2.setNumThreads(1)  # the runner counts one core an item
     subject, expression = item.split("/")
     frame = read_peaks(dataset, subject)[expression]
-    views, pictures, dropped = _read_views(dataset, subject, expression, frame, config)
+    views, pictures, dropped = read_views(dataset, subject, expression, frame, config)
     if len(views) < config.min_views:
         why = "; ".join(f"{row['what']}: {row['why']}" for row in dropped)
         raise StageError(
             f"{item}: {len(views)} usable cameras, expected at least {config.min_views} with a"
             f" matte of the head ({why or 'no others are calibrated'}); run 'express50 matte'"
         )
-    prior, track = _read_prior(dataset, subject, expression, views, config)
+    prior, track = read_prior(dataset, subject, expression, views, config)
     surface = reconstruct(views, config, prior)
     extent = float(np.ptp(surface.vertices[np.unique(surface.faces)], axis=0).max())
     if not UNITS[0] < extent < UNITS[1] * 3:
@@ -96,7 +96,7 @@ def _track_path(dataset: Dataset, subject: str) -> Path:
 Pictures = list[tuple[Camera, np.ndarray, np.ndarray]]
 
 
-def _read_views(
+def read_views(
     dataset: Dataset, subject: str, expression: str, frame: int, config: DepthConfig
 ) -> tuple[list[View], Pictures, list[dict]]:
     """Usable views, their full-size (camera, frame, alpha), and the cameras dropped."""
@@ -134,7 +134,7 @@ def _read_pair(
     return read_frame(dataset, subject, camera_id, frame), matte.astype(np.float32) / 255
 
 
-def _read_prior(
+def read_prior(
     dataset: Dataset, subject: str, expression: str, views: list[View], config: DepthConfig
 ) -> tuple[Prior | None, dict]:
     """The tracked mesh as a prior, or None, and what was made of it for the metrics."""

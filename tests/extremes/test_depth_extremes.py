@@ -1,0 +1,175 @@
+"""Depth at the edges: constant and empty maps, one camera, other units, far worlds, odd images."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from express50.cameras import transform_camera
+from express50.errors import StageError
+from express50.images import depth_from_uint16, depth_to_uint16
+from express50.shards_cli import sample_picture
+from express50.transforms import make_transform
+from pipelines.depth.config import DepthConfig
+from pipelines.depth.grid import Grid, head_box, silhouette_distance
+from pipelines.depth.reconstruct import reconstruct
+from pipelines.depth.surface import (
+    extract_mesh,
+    fair,
+    graph_laplacian,
+    rim_targets,
+    smooth_displacement,
+)
+from pipelines.depth.sweep import grey_images, sweep_scores
+from pipelines.depth.views import make_view
+from pipelines.pack.crop import Crop, cut_depth, cut_image
+from tests.pipelines.bump_head import render, ring
+
+COARSE = DepthConfig(voxel_mm=6.0, levels=1)
+
+
+def views_of(cameras, change=lambda rgb: rgb):
+    made = []
+    for camera in cameras:
+        rgb, alpha, _ = render(camera)
+        made.append(make_view(camera, change(rgb), alpha, 1024))
+    return made
+
+
+@pytest.fixture(scope="module")
+def views():
+    return views_of(ring(5, 80))
+
+
+def finite(surface) -> bool:
+    arrays = (surface.vertices, surface.normals, surface.confidence, surface.grid.values)
+    return all(np.isfinite(array).all() for array in arrays)
+
+
+def test_one_camera_and_parallel_cameras_are_refused(views):
+    with pytest.raises(StageError, match="one line"):
+        head_box(views[:1])
+    with pytest.raises(StageError, match="one line"):
+        head_box([views[0], views[0]])
+
+
+@pytest.mark.parametrize("value", [0, 128, 255])
+def test_textureless_images_leave_the_hull(views, value):
+    flat = [replace(view, rgb=np.full_like(view.rgb, value)) for view in views]
+    surface = reconstruct(flat, COARSE)
+    assert finite(surface)
+    assert surface.numbers["photo_agreement_median"] == 0
+    assert surface.confidence.max() <= 0.5 + 1e-6
+
+
+def test_pure_noise_neither_breaks_nor_counts_as_agreement(views):
+    rng = np.random.default_rng(0)
+    noisy = [replace(v, rgb=rng.integers(0, 255, v.rgb.shape, np.uint8)) for v in views]
+    surface = reconstruct(noisy, COARSE)
+    assert finite(surface) and surface.numbers["photo_agreement_median"] < 0.3
+
+
+@pytest.mark.parametrize("far", [1.0, 1000.0])
+def test_a_head_far_from_the_origin_is_the_same_head(views, far):
+    move = make_transform(np.eye(3), np.array([far, -far / 2, far / 3]))
+    moved = [replace(view, camera=transform_camera(view.camera, move)) for view in views]
+    near, there = reconstruct(views, COARSE), reconstruct(moved, COARSE)
+    size = [np.ptp(s.vertices[np.unique(s.faces)], axis=0) for s in (near, there)]
+    np.testing.assert_allclose(size[0], size[1], atol=0.004)
+    assert finite(there)
+
+
+def test_a_giant_or_a_doll_is_refused_or_has_no_surface(views):
+    for factor in (1000.0, 1e-3):
+        scaled = []
+        for view in views:
+            pose = view.camera.cam_from_world.copy()
+            pose[:3, 3] *= factor
+            scaled.append(replace(view, camera=replace(view.camera, cam_from_world=pose)))
+        with pytest.raises(StageError):
+            reconstruct(scaled, COARSE)
+
+
+def test_silhouettes_that_share_nothing_are_refused(views):
+    gone = [make_view(v.camera, v.rgb, np.roll(v.alpha, 40 * (k % 2), axis=0), 1024)
+            for k, v in enumerate(views)]  # fmt: skip
+    usable = [view for view in gone if not isinstance(view, str)]
+    try:
+        surface = reconstruct(usable, COARSE)
+    except StageError as error:
+        assert "matte" in str(error)
+    else:
+        assert finite(surface)
+
+
+@pytest.mark.parametrize("alpha", [np.zeros((9, 7)), np.ones((9, 7)), np.eye(1)])
+def test_silhouette_distance_of_constant_and_tiny_mattes_is_finite(alpha):
+    assert np.isfinite(silhouette_distance(alpha.astype(np.float32))).all()
+
+
+@pytest.mark.parametrize("value", [-1.0, 0.0, 1.0])
+def test_constant_grids_have_no_surface(value):
+    grid = Grid(np.zeros(3), 0.01, np.full((5, 6, 7), value, np.float32))
+    vertices, _, faces = extract_mesh(grid)
+    assert len(vertices) == len(faces) == 0
+    assert np.isfinite(fair(grid, 0.01).values).all()
+
+
+def test_no_silhouettes_give_no_targets():
+    grid = Grid(np.zeros(3), 0.01, np.ones((5, 5, 5), np.float32))
+    assert rim_targets([], grid, 0.1).shape == (0, 3)
+
+
+def test_scores_that_say_nothing_do_not_move_the_surface():
+    faces = np.array([[0, 1, 2], [1, 2, 3]])
+    zero = np.zeros(4)
+    for level in (0.0, 1.0, -1.0):
+        moved, trust = smooth_displacement(
+            np.full((4, 9), level), np.linspace(-4e-3, 4e-3, 9), graph_laplacian(faces, 4),
+            zero, zero, 25.0, (1e3, 1e4),
+        )  # fmt: skip
+        assert np.allclose(moved, 0) and np.allclose(trust, 0)
+
+
+def test_a_vertex_that_nobody_sees_scores_nothing(views):
+    vertices = np.array([[0, 0, 0.09], [0, 0, 50.0], [0, 0, -50.0]])
+    normals = np.array([[0, 0, 1.0], [0, 0, 0.0], [0, 0, 1.0]])
+    weights = np.zeros((len(views), 3), np.float32)
+    weights[:2, :] = 1
+    scores = sweep_scores(
+        views, grey_images(views, 0.0), vertices, normals, weights, np.array([-0.01, 0, 0.01]),
+        0.002, 1.0,
+    )  # fmt: skip
+    assert np.isfinite(scores).all() and np.abs(scores).max() <= 1 + 1e-5
+    assert (sweep_scores(views, grey_images(views, 0.0), vertices, normals, weights * 0,
+                         np.zeros(1), 0.002, 1.0) == 0).all()  # fmt: skip
+
+
+def test_depth_units_reject_millimetres_nan_and_negatives():
+    valid = np.ones((2, 2), bool)
+    for bad in (1100.0, np.nan, np.inf, -1.0, 0.0):
+        with pytest.raises(ValueError, match="metres"):
+            depth_to_uint16(np.full((2, 2), bad), valid)
+    empty = depth_to_uint16(np.full((2, 2), np.nan), ~valid)
+    assert (empty == 0).all() and not depth_from_uint16(empty)[1].any()
+
+
+@pytest.mark.parametrize("crop", [Crop(0, 0, 1), Crop(-50, -50, 20), Crop(-5, -5, 30)])
+@pytest.mark.parametrize("valid", [True, False])
+def test_depth_crops_outside_the_image_are_unknown_not_zero_metres(crop, valid):
+    depth, known = cut_depth(np.full((8, 8), 1.1), np.full((8, 8), valid), crop, 16)
+    assert np.isfinite(depth).all() and known.sum() == (depth > 0).sum()
+    assert known.any() == (valid and crop.x0 > -8)
+    if known.any():
+        np.testing.assert_allclose(depth[known], 1.1)
+    assert cut_image(np.zeros((8, 8, 3), np.uint8), crop, 16).shape == (16, 16, 3)
+
+
+@pytest.mark.parametrize("depth", [0.0, 1.1])
+def test_pictures_of_empty_and_constant_depth(depth):
+    flat = np.full((16, 16), depth, np.float32)
+    sample = {"rgb": np.zeros((16, 16, 3), np.uint8), "alpha": flat * 0, "depth": flat,
+              "valid": flat > 0}  # fmt: skip
+    assert sample_picture(sample).shape == (16, 48, 3)

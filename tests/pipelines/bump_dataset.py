@@ -1,0 +1,111 @@
+"""The bump head as an ingested, calibrated, aligned, matted and tracked dataset."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from express50.cameras import Camera, write_cameras
+from express50.head.load import load_head
+from express50.images import write_image
+from express50.index import read_index
+from express50.layout import Dataset
+from express50.runner import run_stage
+from express50.stage import Stage
+from pipelines.ingest import STAGE as INGEST
+from pipelines.ingest import register
+from tests.pipelines.bump_head import render, ring
+
+EXPRESSIONS = ("neutral", "smile")
+
+
+def make_dataset(
+    root: Path, subjects: tuple[str, ...] = ("S001",), cameras: int = 6, size: int = 96
+) -> Dataset:
+    """Write captures, ingest them, and put down what the stages up to track would write."""
+    dataset = Dataset(root / "data")
+    rig = ring(cameras, size)
+    shots = {camera.id: render(camera) for camera in rig}
+    for subject in subjects:
+        capture = root / "raw" / subject
+        _write_capture(capture, subject, rig, shots)
+        register(dataset, [capture])
+    run_stage(INGEST, dataset, INGEST.config(), workers=0, progress=False)
+    for subject in subjects:
+        write_given(dataset, subject, rig, shots)
+    return dataset
+
+
+def _write_capture(capture: Path, subject: str, rig: list[Camera], shots: dict) -> None:
+    capture.mkdir(parents=True)
+    (capture / "capture.toml").write_text(
+        f'subject = "{subject}"\nfps = 24\nconsent = "C-{subject}"\nlicence = "CC0-1.0"\n'
+    )
+    rows = [f"{name},{k},{k}" for k, name in enumerate(EXPRESSIONS)]
+    (capture / "cues.csv").write_text("expression_id,start_frame,end_frame\n" + "\n".join(rows))
+    write_cameras(capture / "calibration.json", {camera.id: camera for camera in rig})
+    for name, (rgb, _, _) in shots.items():
+        folder = capture / "cameras" / name / "frames"
+        folder.mkdir(parents=True)
+        for k in range(len(EXPRESSIONS)):
+            write_image(folder / f"{k:06d}.png", rgb)
+
+
+def write_given(dataset: Dataset, subject: str, rig: list[Camera], shots: dict) -> None:
+    """Outputs of calibrate, align, matte and track."""
+    for stage in ("calibrate", "align", "track"):
+        dataset.item_dir(stage, subject).mkdir(parents=True)
+    cameras = {camera.id: replace(camera) for camera in rig}
+    write_cameras(dataset.item_dir("calibrate", subject) / "cameras.json", cameras)
+    source = read_index(dataset, subject).cameras[rig[0].id]
+    peaks = {
+        name: {"frame": k, "camera": rig[0].id, "pts": k, "dhash": source.dhash[k],
+               "confidence": 1.0, "annotator": "tester"}
+        for k, name in enumerate(EXPRESSIONS)
+    }  # fmt: skip
+    (dataset.item_dir("align", subject) / "peaks.json").write_text(json.dumps(peaks))
+    for name, (_, alpha, _) in shots.items():
+        folder = dataset.item_dir("matte", f"{subject}/{name}")
+        folder.mkdir(parents=True)
+        for expression in EXPRESSIONS:
+            write_image(folder / f"{expression}.png", np.rint(alpha * 255).astype(np.uint8))
+    write_track(dataset, subject)
+
+
+def write_track(dataset: Dataset, subject: str) -> None:
+    """A track of the built-in head, which is near enough to an ellipsoid to frame it."""
+    head = load_head("procedural")
+    template = head.template.numpy()
+    low, high = template.min(0), template.max(0)
+    count = len(EXPRESSIONS)
+    t = -(low + high) / 2
+    scale = np.array([0.15, 0.21, 0.18]) / (high - low)
+    arrays = {
+        "schema": "express50.track/1",
+        "head": "procedural",
+        "expressions": np.array(EXPRESSIONS),
+        "frames": np.arange(count),
+        "shape": np.zeros(4),
+        "expression": np.zeros((count, 3)),
+        "neck": np.zeros((count, 3)),
+        "jaw": np.zeros((count, 3)),
+        "eyes": np.zeros((count, 6)),
+        "R": np.stack([np.eye(3)] * count),
+        "t": np.stack([t] * count),
+        "vertices": np.stack([((template + t) * scale).astype(np.float32)] * count),
+    }
+    np.savez(dataset.item_dir("track", subject) / "track.npz", **arrays)
+
+
+def published(dataset: Dataset, stage: Stage, config: object) -> dict:
+    """Run a stage in this process; returns the metrics of its items."""
+    run_stage(stage, dataset, config, workers=0, progress=False)
+    found = {}
+    for item in stage.items(dataset):
+        path = dataset.item_dir(stage.name, item) / "metrics.json"
+        if path.is_file():
+            found[item] = json.loads(path.read_text())
+    return found

@@ -1,0 +1,236 @@
+"""Packing: crops keep geometry, depth never blends surfaces, splits and shards are right."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from express50.cameras import pinhole_camera, project, unproject
+from express50.errors import StageError
+from express50.images import read_depth_png, write_image
+from express50.layout import Dataset
+from express50.shards import ShardReader
+from express50.shards_write import verify
+from express50.transforms import look_at
+from pipelines.depth import STAGE as DEPTH
+from pipelines.depth.config import DepthConfig
+from pipelines.pack import STAGE as PACK
+from pipelines.pack.card import split_subjects
+from pipelines.pack.config import PackConfig
+from pipelines.pack.crop import Crop, crop_pinhole, cut_depth, cut_image, head_crop
+from tests.pipelines.bump_dataset import make_dataset, published
+
+SMALL = PackConfig(size=64, test_subjects=("S002",))
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory) -> Dataset:
+    """Two subjects with depth."""
+    made = make_dataset(tmp_path_factory.mktemp("pack"), ("S001", "S002"))
+    published(made, DEPTH, DepthConfig(voxel_mm=6, levels=1))
+    return made
+
+
+@pytest.fixture(scope="module")
+def packed(dataset):
+    """(folder, metrics) of the packed dataset."""
+    metrics = published(dataset, PACK, SMALL)["shards"]
+    return dataset.item_dir("pack", "shards"), metrics
+
+
+coordinates = st.floats(-0.15, 0.15)
+
+
+@settings(deadline=None, max_examples=50)
+@given(
+    point=st.tuples(coordinates, coordinates, coordinates),
+    corner=st.tuples(st.integers(-200, 300), st.integers(-200, 300)),
+    side=st.integers(1, 500),
+    size=st.sampled_from([16, 100, 256, 512]),
+)
+def test_projection_commutes_with_crop_and_resize(point, corner, side, size):
+    K = np.array([[900.0, 0, 311.7], [0, 880.0, 250.2], [0, 0, 1]])
+    pose = look_at(np.array([0.2, 0.1, 1.1]), np.zeros(3), np.array([0.0, 1, 0]))
+    camera = pinhole_camera("c", K, 640, 480, pose)
+    crop = Crop(*corner, side)
+    pixels, depth = project(camera, np.array([point]))
+    moved, same = project(crop_pinhole(camera, crop, size), np.array([point]))
+    np.testing.assert_allclose(moved, (pixels - corner) * size / side, atol=1e-6)
+    assert depth == same
+
+
+def test_cut_image_and_its_camera_agree_on_where_a_dot_is():
+    image = np.zeros((120, 160), np.uint8)
+    image[60:64, 90:94] = 255  # centre at corner-origin pixel (92, 62)
+    for crop, size in ((Crop(50, 30, 64), 32), (Crop(60, 40, 40), 100), (Crop(70, -10, 100), 50)):
+        small = cut_image(image, crop, size).astype(float)
+        y, x = np.mgrid[:size, :size] + 0.5
+        found = np.array([(small * x).sum(), (small * y).sum()]) / small.sum()
+        expected = (np.array([92.0, 62.0]) - (crop.x0, crop.y0)) * size / crop.side
+        np.testing.assert_allclose(found, expected, atol=0.05)
+
+
+@settings(deadline=None, max_examples=30)
+@given(
+    corner=st.tuples(st.integers(-20, 60), st.integers(-20, 60)),
+    side=st.integers(8, 90),
+    size=st.sampled_from([16, 37, 64]),
+)
+def test_depth_of_a_slanted_plane_stays_on_the_plane(corner, side, size):
+    K = np.array([[300.0, 0, 40], [0, 300.0, 40], [0, 0, 1]])
+    camera = pinhole_camera("c", K, 80, 80, np.eye(4))
+    normal = np.array([0.3, -0.4, 1.0])
+
+    def plane(K, count):
+        v, u = np.mgrid[:count, :count] + 0.5
+        ray = np.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], np.ones_like(u)], -1)
+        return 1.0 / (ray @ normal)
+
+    crop = Crop(*corner, side)
+    depth, valid = cut_depth(plane(K, 80), np.ones((80, 80), bool), crop, size)
+    place = (np.arange(size) + 0.5) * side / size
+    inside = [(place + c > 0.5) & (place + c < 79.5) for c in (corner[1], corner[0])]
+    inner = (place > 0.5) & (place < side - 0.5)  # a window's border has no neighbour to lean on
+    inside = (inside[0] & inner)[:, None] & (inside[1] & inner)[None]
+    assert valid[inside].all()
+    expected = plane(crop_pinhole(camera, crop, size).K, size)
+    np.testing.assert_allclose(depth[inside], expected[inside], rtol=1e-9)
+
+
+@settings(deadline=None, max_examples=30)
+@given(size=st.integers(8, 90), seed=st.integers(0, 99))
+def test_depth_never_blends_two_surfaces_or_the_unknown(size, seed):
+    rng = np.random.default_rng(seed)
+    near = rng.uniform(size=(40, 40)) > 0.5
+    depth = np.where(near, 0.9, 1.3)
+    valid = rng.uniform(size=(40, 40)) > 0.2
+    cut, known = cut_depth(depth, valid, Crop(-3, 2, 44), size)
+    assert set(np.unique(np.round(cut[known], 9))) <= {0.9, 1.3}
+    assert (cut[~known] == 0).all()
+
+
+def test_crop_follows_head_and_hair_but_not_shoulders():
+    K = np.array([[500.0, 0, 160], [0, 500.0, 160], [0, 0, 1]])
+    pose = look_at(np.array([0, 0, 1.0]), np.zeros(3), np.array([0.0, 1, 0]))
+    camera = pinhole_camera("c", K, 320, 320, pose)
+    vertices = np.random.default_rng(0).uniform(-0.1, 0.1, (500, 3)) * [1, 1, 0.1]
+    alpha = np.zeros((320, 320), np.uint8)
+    alpha[100:320, 20:300] = 255  # shoulders
+    alpha[80:120, 120:200] = 255  # hair
+    crop = head_crop(camera, vertices, alpha, margin=0.0, hair=0.3)
+    assert crop.x0 > 60 and crop.y0 <= 85 and 100 < crop.side < 180
+    assert head_crop(camera, vertices, alpha * 0, 0.1, 0.3) == "its matte is empty"
+    assert "outside" in head_crop(camera, vertices + [5, 0, 0], alpha, 0.1, 0.3)
+    assert "behind" in head_crop(camera, vertices + [0, 0, 3], alpha, 0.1, 0.3)
+
+
+def test_split_is_disjoint_seeded_and_stable():
+    names = [f"S{k:03d}" for k in range(40)]
+    split = split_subjects(names, (), 0.2, 1)
+    assert sorted(split["train"] + split["test"]) == names
+    assert 2 <= len(split["test"]) <= 16
+    grown = split_subjects([*names, "S999"], (), 0.2, 1)
+    assert set(split["test"]) <= set(grown["test"])
+    assert split_subjects(names, (), 0.2, 2) != split
+    assert split_subjects(["A", "B"], (), 0.01, 0)["test"] != []
+    assert split_subjects(["A"], (), 0.5, 0) == {"train": ["A"], "test": []}
+    assert split_subjects(["A", "B"], ("B",), 0.5, 0) == {"train": ["A"], "test": ["B"]}
+    with pytest.raises(StageError, match="names C; expected some of A, B"):
+        split_subjects(["A", "B"], ("C",), 0.1, 0)
+    with pytest.raises(StageError, match="all 1 subjects"):
+        split_subjects(["A"], ("A",), 0.1, 0)
+
+
+def test_every_view_is_packed_and_the_account_balances(packed):
+    root, metrics = packed
+    assert metrics["read"] == metrics["kept"] == 2 * 2 * 6 and metrics["dropped"] == []
+    assert verify(root) == []
+    reader = ShardReader(root)
+    assert {e.subject for e in reader.select(split="test").entries} == {"S002"}
+    assert json.loads((root / "splits.json").read_text())["test"] == ["S002"]
+    card = (root / "card.md").read_text()
+    assert "CC0-1.0" in card and "C-S001" in card and "| smile | 6 | 6 |" in card
+
+
+def test_samples_of_two_cameras_agree_on_the_surface(packed):
+    """Depth, K and pose of a packed sample put points where other packed samples see them."""
+    reader = ShardReader(packed[0]).select(subjects=["S001"], expressions=["smile"])
+    first, second = reader.sample(2), reader.sample(3)
+
+    def camera(sample):
+        m = sample["meta"]
+        return pinhole_camera("c", np.array(m["K"]), m["width"], m["height"],
+                              np.array(m["cam_from_world"]))  # fmt: skip
+
+    y, x = np.nonzero(first["valid"])
+    points = unproject(camera(first), np.stack([x, y], 1) + 0.5, first["depth"][y, x])
+    pixels, depth = project(camera(second), points)
+    column, row = np.floor(pixels).astype(int).T
+    ok = (column >= 0) & (row >= 0) & (column < 64) & (row < 64)
+    seen = second["depth"][row[ok], column[ok]]
+    gap = (depth[ok] - seen)[seen > 0]
+    assert (gap < -0.01).mean() < 0.02  # nothing stands in front of what the other camera sees
+    assert (np.abs(gap) < 0.004).mean() > 0.3  # the rest is hidden from it
+    assert first["alpha"][first["valid"]].mean() > 0.9
+    assert first["meta"]["track"]["R"] == np.eye(3).tolist()
+    assert first["meta"]["label"]["annotator"] == "tester" and first["meta"]["fps"] == 24
+
+
+def test_packing_twice_gives_the_same_bytes(dataset, packed, tmp_path):
+    PACK.run(dataset, "shards", SMALL, tmp_path)
+    for path in sorted(p for p in tmp_path.rglob("*") if p.is_file()):
+        assert path.read_bytes() == (packed[0] / path.relative_to(tmp_path)).read_bytes(), path
+
+
+def test_what_is_missing_is_dropped_with_its_reason(dataset, tmp_path):
+    depth = dataset.item_dir("depth", "S001/smile") / "cam01.png"
+    matte = dataset.item_dir("matte", "S001/cam02") / "neutral.png"
+    kept = {path: path.read_bytes() for path in (depth, matte)}
+    depth.unlink()
+    write_image(matte, np.zeros((96, 96), np.uint8))
+    try:
+        metrics = PACK.run(dataset, "shards", SMALL, tmp_path)
+    finally:
+        for path, data in kept.items():
+            path.write_bytes(data)
+    assert metrics["read"] == metrics["kept"] + len(metrics["dropped"]) == 24
+    assert {row["what"]: row["why"] for row in metrics["dropped"]} == {
+        "S001/neutral/cam02": "its matte is empty",
+        "S001/smile/cam01": "it has no depth",
+    }
+    assert "1 x it has no depth" in (tmp_path / "card.md").read_text()
+
+
+def test_unsure_depth_can_be_left_out(dataset, packed, tmp_path):
+    PACK.run(dataset, "shards", PackConfig(size=64, min_confidence=0.6), tmp_path)
+    strict = ShardReader(tmp_path).select(subjects=["S001"])
+    loose = ShardReader(packed[0]).select(subjects=["S001"])
+    assert strict.sample(0)["valid"].sum() < loose.sample(0)["valid"].sum()
+
+
+def test_lossless_profile_keeps_pixels(dataset, tmp_path):
+    PACK.run(dataset, "shards", PackConfig(size=64, profile="lossless"), tmp_path)
+    reader = ShardReader(tmp_path)
+    assert "rgb.png" in reader.entries[0].members
+    assert reader.sample(0)["rgb"].shape == (64, 64, 3)
+
+
+def test_depth_stage_drops_a_bad_camera_and_reports_it(tmp_path):
+    dataset = make_dataset(tmp_path)
+    empty = dataset.item_dir("matte", "S001/cam01") / "smile.png"
+    write_image(empty, np.zeros((96, 96), np.uint8))
+    (dataset.item_dir("matte", "S001/cam04") / "smile.png").unlink()
+    metrics = published(dataset, DEPTH, DepthConfig(voxel_mm=6, levels=1))
+    row = metrics["S001/smile"]
+    assert {d["what"] for d in row["dropped"]} == {"cam01", "cam04"} and row["views"] == 4
+    assert "empty" in row["dropped"][0]["why"]
+    assert metrics["S001/neutral"]["views"] == 6
+    folder = dataset.item_dir("depth", "S001/smile")
+    depth, valid = read_depth_png(folder / "cam00.png")
+    assert 1.0 < depth[valid].mean() < 1.2 and valid.sum() > 500
+    assert not (folder / "cam01.png").exists() and (folder / "qc" / "surface.jpg").exists()
+    assert row["voxel_share"] < 1 and row["coverage"] > 0.9
