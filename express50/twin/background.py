@@ -10,31 +10,41 @@ from functools import cache
 import cv2
 import numpy as np
 
+from express50.cameras import Camera
 from express50.twin.noise import fractal, make_lattice, noise, random_stream, smoothstep
 from express50.twin.rig import TARGET
 from express50.twin.surface import spherical_to_unit, unit, unit_to_spherical
 
 RADIUS_M = 2.6
-_WIDTH = 2048
+_HIGHEST = 0.95  # elevation up to which the wall is painted, radians; cameras see less
 
 
-def background(seed: int, origin: np.ndarray, directions: np.ndarray) -> np.ndarray:
+def room_width(camera: Camera) -> int:
+    """Texels around the room that suit a camera; out of focus; 2048 or 4096."""
+    wanted = 2 * np.pi * camera.K[0, 0] * 0.35
+    return int(np.clip(2 ** np.round(np.log2(wanted)), 2048, 4096))
+
+
+def background(
+    seed: int, origin: np.ndarray, directions: np.ndarray, width: int = 2048
+) -> np.ndarray:
     """Linear colours (N, 3) of rays that miss the subject.
 
     Args:
         seed: the studio's seed.
         origin: (3,) the camera's centre, inside the room.
         directions: (N, 3), any length.
+        width: texels around the room.
     """
     d = unit(directions)
     start = np.asarray(origin - TARGET, d.dtype)
     b = d @ start
     reach = -b + np.sqrt(np.maximum(b * b - start @ start + RADIUS_M**2, 0.0))
     az, el = unit_to_spherical(start + reach[:, None] * d)
-    room = _room(seed)
-    height, width = room.shape[:2]
+    room = _room(seed, width)
+    height = room.shape[0]
     x = (az / (2 * np.pi) + 0.5) * width - 0.5
-    y = np.clip((el / np.pi + 0.5) * height - 0.5, 0, height - 1.01)
+    y = np.clip((el / (2 * _HIGHEST) + 0.5) * height - 0.5, 0, height - 1.01)
     left, top = np.floor(x), np.floor(y)
     fx, fy = (x - left)[:, None], (y - top)[:, None]
     x0, y0 = left.astype(np.int32), top.astype(np.int32)
@@ -45,23 +55,24 @@ def background(seed: int, origin: np.ndarray, directions: np.ndarray) -> np.ndar
 
 
 @cache
-def _room(seed: int) -> np.ndarray:
+def _room(seed: int, width: int) -> np.ndarray:
     """The room's wall (H, W, 3) float32, by azimuth and elevation from its middle."""
     rng = random_stream(seed, 201)
-    height = _WIDTH // 2
-    az = ((np.arange(_WIDTH) + 0.5) / _WIDTH * 2 * np.pi - np.pi).astype(np.float32)
-    el = ((np.arange(height) + 0.5) / height * np.pi - 0.5 * np.pi).astype(np.float32)
+    height = 2 * round(width * _HIGHEST / (2 * np.pi))
+    az = ((np.arange(width) + 0.5) / width * 2 * np.pi - np.pi).astype(np.float32)
+    el = (((np.arange(height) + 0.5) / height * 2 - 1) * _HIGHEST).astype(np.float32)
     base = np.array([0.17, 0.185, 0.20]) * rng.uniform(0.85, 1.2) * rng.uniform(0.93, 1.07, 3)
     shade = (1 + 0.35 * np.clip(el, -0.8, 0.8))[:, None] * _panels(az, el, make_lattice(rng))
     shade *= _felt(rng, az, el)
     wall = shade[..., None] * base.astype(np.float32)
     for _ in range(14):
         _pole(rng, wall, az, el)
-    for _ in range(6):
+    for _ in range(4):
         _cable(rng, wall, az, el)
     for _ in range(10):
         _lamp(rng, wall, az, el)
-    return wall
+    # The wall is far behind the plane of focus.
+    return cv2.GaussianBlur(wall, None, 0.0016 * width / (2 * np.pi) + 0.7)
 
 
 def _felt(rng: np.random.Generator, az: np.ndarray, el: np.ndarray) -> np.ndarray:
@@ -102,7 +113,7 @@ def _cable(rng: np.random.Generator, wall: np.ndarray, az: np.ndarray, el: np.nd
     base, waves = rng.uniform(-0.6, 0.7), rng.integers(2, 6)
     line = base + 0.12 * np.abs(np.sin(0.5 * waves * az + rng.uniform(0, 6)))
     rows = np.flatnonzero((el > base - 0.01) & (el < base + 0.13))
-    inside = smoothstep(np.abs(el[rows, None] - line), 0.005, 0.0035)[..., None]
+    inside = smoothstep(np.abs(el[rows, None] - line), 0.006, 0.003)[..., None]
     wall[rows] += inside * (np.array([0.03, 0.03, 0.033]) - wall[rows])
 
 

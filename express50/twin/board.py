@@ -10,7 +10,7 @@ import numpy as np
 
 from express50.cameras import Camera, project
 from express50.transforms import axis_angle_to_matrix, make_transform
-from express50.twin.background import background
+from express50.twin.background import background, room_width
 from express50.twin.noise import random_stream
 from express50.twin.render import bands, ray_pattern
 from express50.twin.rig import SPAN_DEG, TARGET
@@ -98,7 +98,8 @@ def render_board(
     for band in bands(camera):
         rows = slice(band.pad[0], band.pad[0] + band.bottom - band.top)
         centre, right, down = (part[rows] for part in (band.centre, band.right, band.down))
-        view = background(seed, band.origin, centre.reshape(-1, 3)).reshape(centre.shape)
+        view = background(seed, band.origin, centre.reshape(-1, 3), room_width(camera))
+        view = view.reshape(centre.shape)
         if band.bottom > low and band.top < high:
             paper = np.zeros(centre.shape[:2], np.float32)
             cover = np.zeros_like(paper)

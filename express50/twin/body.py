@@ -15,7 +15,7 @@ from express50.twin.hair import HairMesh, grow_hair
 from express50.twin.noise import random_stream, smoothstep
 from express50.twin.performance import Performance
 from express50.twin.subjects import Subject
-from express50.twin.surface import StarMap, face_to_vertex, smooth_over_mesh, vertex_normals
+from express50.twin.surface import Caster, StarMap, face_to_vertex, smooth_over_mesh, vertex_normals
 
 
 class Material(IntEnum):
@@ -87,13 +87,18 @@ def build_body(model: HeadModel, subject: Subject, seed: int, hair_detail: float
     scalp = scalp * smoothstep(template[:, 1], chin - 0.005, chin + 0.025)
     rest = neutral_vertices(model, subject)
     skin_faces = faces[model_materials(model)[faces].min(1) == Material.SKIN]
-    star = StarMap(rest, skin_faces, centre)
+    cloth_vertices, cloth_faces = _shoulders(rest, skin_faces, model.regions["boundary"].numpy())
+    # Hair lies on skin and shirt alike.
+    star = StarMap(
+        np.concatenate([rest, cloth_vertices]),
+        np.concatenate([skin_faces, cloth_faces + len(rest)]),
+        centre,
+    )
     rng = random_stream(seed, subject.number, 7)
     hair = _no_hair()
     if hair_detail > 0:
         hair = grow_hair(rng, rest, faces, scalp, star, subject.look, hair_detail)
     skull = np.flatnonzero(scalp > 0.8)[::7]
-    cloth_vertices, cloth_faces = _shoulders(rest, model.regions["boundary"].numpy())
     extras = Extras(
         hair=hair, cloth_vertices=cloth_vertices, cloth_faces=cloth_faces,
         skull=skull, skull_rest=rest[skull],
@@ -224,32 +229,40 @@ def _no_hair() -> HairMesh:
     )  # fmt: skip
 
 
-def _shoulders(rest: np.ndarray, boundary: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _shoulders(
+    rest: np.ndarray, skin_faces: np.ndarray, boundary: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """A shirt (N, 3) with faces (M, 3) that flares from a collar around the neck's open end."""
     loop = rest[boundary]
     low, high = loop.min(0), loop.max(0)
     centre, half = 0.5 * (low + high), 0.5 * (high - low)
-    around = np.linspace(0, 2 * np.pi, 65)[:-1]
-    rings = []
-    for s in np.linspace(0.0, 1.0, 24):
-        flare = np.sin(0.5 * np.pi * min(1.0, 1.35 * s)) ** 0.8
-        width = (half[0] + 0.004) * (1 - flare) + max(0.2, half[0] + 0.05) * flare
-        depth = (half[2] + 0.004) * (1 - flare) + max(0.105, half[2] + 0.02) * flare
-        drop = 0.012 - 0.10 * flare**2.2 - 0.24 * s**3
-        squareness = 2.0 + 0.8 * flare
-        c, z = np.cos(around), np.sin(around)
-        scale = (np.abs(c) ** squareness + np.abs(z) ** squareness) ** (-1.0 / squareness)
-        ring = np.stack(
-            [
-                centre[0] + width * scale * c,
-                np.full_like(c, centre[1] + drop) + 0.006 * np.abs(c) * (1 - s),
-                centre[2] - 0.02 * flare + depth * scale * z,
-            ],
-            axis=1,
-        )
-        rings.append(ring)
-    index = np.arange(len(rings) * len(around)).reshape(len(rings), -1)
+    around, s = np.meshgrid(np.linspace(0, 2 * np.pi, 65)[:-1], np.linspace(0.0, 1.0, 24))
+    c, z = np.cos(around), np.sin(around)
+    flare = np.sin(0.5 * np.pi * np.minimum(1.0, 1.35 * s)) ** 0.8
+    width = half[0] * (1 - flare) + max(0.2, half[0] + 0.05) * flare
+    depth = half[2] * (1 - flare) + max(0.105, half[2] + 0.02) * flare
+    # From an ellipse at the collar to a rounder box at the shoulders.
+    power = 2.0 + 0.8 * flare
+    scale = (np.abs(c) ** power + np.abs(z) ** power) ** (-1.0 / power)
+    # The collar is highest at the nape and lowest in front.
+    drop = 0.014 - 0.012 * z * (1 - s) - 0.10 * flare**2.2 - 0.24 * s**3
+    shirt = np.stack([width * scale * c, drop, -0.02 * flare + depth * scale * z], axis=-1)
+    shirt = _outside(shirt.reshape(-1, 3) + centre, centre, rest, skin_faces)
+    index = np.arange(shirt.shape[0]).reshape(around.shape)
     a, b = index[:-1], index[1:]
     c, d = np.roll(a, -1, axis=1), np.roll(b, -1, axis=1)
     faces = np.concatenate([np.stack([a, c, b], -1), np.stack([c, d, b], -1)]).reshape(-1, 3)
-    return np.concatenate(rings).astype(np.float32), faces.astype(np.int32)
+    return shirt.astype(np.float32), faces.astype(np.int32)
+
+
+def _outside(
+    points: np.ndarray, centre: np.ndarray, vertices: np.ndarray, faces: np.ndarray
+) -> np.ndarray:
+    """Points (N, 3) pushed level away from the neck's axis until they clear the skin."""
+    level = (points - centre) * (1.0, 0.0, 1.0)
+    radius = np.linalg.norm(level, axis=1, keepdims=True)
+    out = level / np.maximum(radius, 1e-6)
+    start = points - level + 0.5 * out
+    distance, _, _ = Caster(vertices, faces).cast(start, -out)
+    skin = np.where(np.isfinite(distance) & (distance < 0.5), 0.5 - distance, 0.0)[:, None]
+    return points + out * np.maximum(skin + 0.0035 - radius, 0.0)

@@ -14,6 +14,8 @@ from express50.twin.noise import smoothstep
 from express50.twin.subjects import Look
 from express50.twin.surface import StarMap, unit
 
+_CLEARANCE = 2.2e-3  # metres
+
 
 @dataclass(frozen=True, kw_only=True)
 class HairStyle:
@@ -116,11 +118,15 @@ def _march(
         out = unit(at - star.centre)
         flow = _flow(at, out, star, style) + drift
         at = at + step[:, None] * unit(flow)
-        at = _lay(at, star, layer * (1.0 - np.exp(-2.2 * k / style.steps * 3.0)))
+        # Never nearer than the clearance, or chords of the ribbons dip into the skin.
+        rise = layer * (1.0 - np.exp(-6.6 * k / style.steps))
+        at = _lay(at, star, np.maximum(rise, min(_CLEARANCE, 0.4 * style.lift)))
         turn = phase + wobble + 2.4 * k
         side = np.cross(out, unit(flow))
         curl = style.curl * (k / style.steps) ** 0.5
-        points.append(at + curl * (np.cos(turn)[:, None] * side + np.sin(turn)[:, None] * out))
+        points.append(
+            at + curl * (np.cos(turn)[:, None] * side + np.abs(np.sin(turn))[:, None] * out)
+        )
     return np.stack(points, axis=1)
 
 
@@ -149,7 +155,9 @@ def _lay(at: np.ndarray, star: StarMap, height: np.ndarray) -> np.ndarray:
     out = relative / np.maximum(distance, 1e-9)[:, None]
     wanted = star.radius(out) + height
     hanging = out[:, 1] < -0.25
-    placed = np.where(hanging, np.maximum(distance, wanted), wanted)
+    # Where the shoulders begin, the surface is suddenly far out: yield to it in small steps.
+    pushed = np.minimum(np.maximum(distance, wanted), distance + 0.004)
+    placed = np.where(hanging, pushed, wanted)
     return star.centre + out * placed[:, None]
 
 

@@ -113,12 +113,12 @@ def _envelope(rng: np.random.Generator, count: int, fps: float) -> tuple[int, np
     """Peak index and strength (count,), 1 at the peak and less everywhere else."""
     low, high = max(1, round(0.3 * count)), max(2, round(0.72 * count))
     peak = int(rng.integers(low, min(high, count - 2) + 1))
-    longest = 0.7 * fps
-    onset = np.clip(rng.uniform(0.2, 0.36) * count, 1.3, longest)
-    offset = np.clip(rng.uniform(0.24, 0.42) * count, 1.3, longest)
-    hold = rng.uniform(0.1, 0.9) * min(0.12 * count, 0.5 * fps)
+    # Both ends of the window are near rest, and nobody takes much longer than half a second.
+    onset = min(rng.uniform(0.2, 0.36) * count, peak + 0.9, 0.7 * fps)
+    offset = min(rng.uniform(0.24, 0.42) * count, count - peak - 0.1, 0.7 * fps)
+    hold = rng.uniform(0.1, 0.9) * min(0.06 * count, 0.5 * fps)
     d = np.arange(count) - peak
-    away = np.maximum(np.abs(d) - hold, 0.0) / np.where(d < 0, onset, offset)
+    away = np.maximum(np.abs(d) - hold, 0.0) / np.where(d < 0, max(onset, 1.3), max(offset, 1.3))
     sag = 1.0 - 0.06 * np.minimum(np.abs(d) / max(1.0, 0.15 * count), 1.0)
     return peak, sag * (1.0 - smoothstep(away, 0.0, 1.0))
 

@@ -215,7 +215,7 @@ def _surface(
         texel = sample_skin(scene.texture, place)
         return texel[:, :3], 0.045 * texel[:, 3:], 22.0
     if kind == Material.EYE:
-        return _eye_albedo(scene, place), 0.07, 400.0
+        return _eye_albedo(scene, place), 0.16, 240.0
     if kind == Material.CLOTH:
         return place, 0.01, 5.0
     colour, gloss, power = {

@@ -82,9 +82,9 @@ def _paint_band(body: Body, seed: int, width: int, height: int, y0: int, y1: int
     albedo *= 1.0 + flush[:, None] * np.array([0.02, -0.25, -0.22], np.float32)
     pores = fractal(points, lattices[2], 0.0022, 2, 0.7)
     albedo *= 1.0 + 0.05 * pores[:, None]
-    spots = smoothstep(fractal(points, lattices[3], 0.0045, 2), 0.42, 0.72)
+    spots = smoothstep(fractal(points, lattices[3], 0.0032, 2, 0.35), 0.48, 0.85)
     where = face * smoothstep(noise(points / 0.02, lattices[4]), -0.4, 0.3)
-    albedo *= 1.0 - look.freckles * (spots * where)[:, None] * np.array([0.32, 0.45, 0.55])
+    albedo *= 1.0 - look.freckles * (spots * where)[:, None] * np.array([0.22, 0.34, 0.40])
     albedo = _moles(rng, albedo, points, model, look.moles)
     gloss = look.gloss * (1.0 + 0.25 * pores) * (0.8 + 0.5 * _oily(model, points))
     lips = smoothstep(masks["lips"] + 0.10 * noise(points / 0.004, lattices[5]), 0.35, 0.65)

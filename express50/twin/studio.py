@@ -14,7 +14,7 @@ from express50.expressions import select
 from express50.head.load import load_head
 from express50.head.model import HeadModel
 from express50.images import encode_png
-from express50.twin.background import background
+from express50.twin.background import background, room_width
 from express50.twin.board import BoardSpec, board_poses, render_board
 from express50.twin.body import Body, build_body, pose_body
 from express50.twin.config import TwinConfig, subject_number
@@ -59,6 +59,7 @@ class View:
         self.camera, self.index = camera, index
         self.sensor: Sensor = make_sensor(index, seed)
         self._seed = seed
+        self._room = room_width(camera)
         self._kept = list(self._make()) if keep else None
 
     def _make(self):  # noqa: ANN202
@@ -66,7 +67,7 @@ class View:
             rows = slice(band.pad[0], band.pad[0] + band.bottom - band.top)
             shape = band.centre[rows].shape
             rays = band.centre[rows].reshape(-1, 3)
-            yield band, background(self._seed, band.origin, rays).reshape(shape)
+            yield band, background(self._seed, band.origin, rays, self._room).reshape(shape)
 
     def bands(self):  # noqa: ANN201
         """Pairs of rays and the empty studio's linear picture there."""

@@ -130,7 +130,7 @@ def _make_look(rng: np.random.Generator, number: int) -> Look:
     dark = smoothstep(np.array(tone), 0.35, 0.7)
     hair_place = rng.uniform(0.0, 0.75) * (1.0 - float(dark))
     hair = _blend(_HAIR_COLOURS[:5], hair_place)
-    if age > 50:
+    if age > 56:
         hair = 0.4 * hair + 0.6 * _HAIR_COLOURS[5]
     style = HAIR_STYLES[(number + int(rng.integers(0, 2)) * 3) % len(HAIR_STYLES)]
     length = {"short": 0.035, "side": 0.06, "curly": 0.05, "bob": 0.2, "buzz": 0.008, "swept": 0.09}
@@ -141,7 +141,7 @@ def _make_look(rng: np.random.Generator, number: int) -> Look:
         freckles=float(rng.uniform(0.0, 1.0) ** 3 * (1.0 - float(dark))),
         moles=int(rng.integers(2, 9)),
         stubble=float(rng.uniform(0.2, 0.9)) if gender == "male" else 0.0,
-        brow_density=float(rng.uniform(0.65, 1.0)),
+        brow_density=float(rng.uniform(0.5, 0.88)),
         lips=skin * rng.uniform([0.80, 0.50, 0.52], [0.95, 0.62, 0.70]),
         gloss=float(rng.uniform(0.6, 1.2)),
         eyes=eyes,
