@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
 import time
 from pathlib import Path
 
@@ -33,13 +34,15 @@ from pipelines.depth.sweep import mesh_scene
 def main() -> int:
     """Run and print."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--dataset", type=Path, required=True, help="staged up to matte or track")
-    parser.add_argument("--truth", type=Path, required=True, help="truth folder of the recording")
+    parser.add_argument("--dataset", type=Path, default=Path("build/demo/data/demo"))
+    parser.add_argument("--truth", type=Path, default=Path("build/demo/twin/truth"))
     parser.add_argument("--preset", default="standard")
     parser.add_argument("--set", dest="assignments", action="append", default=[])
     parser.add_argument("--items", type=int, default=0, help="only this many; 0: all")
     args = parser.parse_args()
     cv2.setNumThreads(1)
+    if not Dataset(args.dataset).stage_dir("matte").is_dir():
+        sys.exit(f"{args.dataset}: no mattes; run 'make demo' or name --dataset and --truth")
     dataset, truth = Dataset(args.dataset), Truth(args.truth)
     config = resolve_config(STAGE, args.preset, None, args.assignments)
     rows: dict[str, list[dict]] = {"depth": [], "visual_hull": [], "tracked_mesh": []}
