@@ -17,7 +17,7 @@ _SKIN = (0.58, 0.37, 0.28)
 # Region -> linear base colour; later entries paint over earlier ones.
 _COLORS = {
     "scalp": (0.54, 0.35, 0.27), "lips": (0.47, 0.20, 0.18), "mouth_interior": (0.16, 0.04, 0.04),
-    "gums": (0.42, 0.16, 0.15), "tongue": (0.45, 0.15, 0.15), "teeth": (0.75, 0.71, 0.60),
+    "gums": (0.42, 0.16, 0.15), "tongue": (0.45, 0.15, 0.15), "teeth": (0.85, 0.80, 0.68),
     "left_eyeball": (0.78, 0.77, 0.75), "right_eyeball": (0.78, 0.77, 0.75),
     "left_iris": (0.10, 0.16, 0.19), "right_iris": (0.10, 0.16, 0.19),
     "left_pupil": (0.01, 0.01, 0.01), "right_pupil": (0.01, 0.01, 0.01),
@@ -135,7 +135,7 @@ def _shade(
 ) -> Array:
     """Diffuse factor and specular addition (N,2): shadowed key light, fill, sky; a dull gloss."""
     right, up, back = axes
-    total = 0.14 + 0.10 * (n @ up)
+    total = 0.18 + 0.10 * (n @ up)
     gloss = np.zeros(len(n))
     for light, power in (
         (-0.55 * right + 0.65 * up + 0.75 * back, 0.88),
@@ -157,7 +157,10 @@ def contact_sheet(
 ) -> Array:
     """One row a pose of POSES, one column a yaw: picture (rows*size, columns*size, 3) uint8."""
     rows = []
+    known = set(model.expression_names) | {name[:-2] for name in model.expression_names}
     for controls, opening in POSES.values():
+        if not known.issuperset(controls):
+            continue
         vertices = pose(
             model,
             torch.zeros(1, len(model.shape_names)),
