@@ -13,12 +13,14 @@ class MatteConfig:
 
     scale: float = 1.0
     """Key at this share of the resolution; below 1 the matte is enlarged afterwards."""
-    low: float = 1.5
+    low: float = 1.2
     """Difference from the plate up to which a pixel counts as plate."""
     high: float = 6.0
     """Difference that proves foreground; weaker pixels must touch such ones."""
-    full: float = 0.9
+    full: float = 0.92
     """A difference of this share of the local foreground's own counts as alpha 1."""
+    firm: float = 0.5
+    """A difference of this share of the local foreground's own may belong to the solid inside."""
     core: float = 0.018
     """Radius of the disc that must fit inside a part of the subject for it to be solid."""
     fill: float = 0.012

@@ -49,9 +49,14 @@ def alpha_of(
     # All else happens around the subject only.
     window = _window(region, 4 * _pixels(config.core, length))
     part = PlateModel(model.plate[window], model.sigma[window], model.whiten)
-    support = find_support(difference[window], region[window], length, config)
-    own = subject_difference(image[window], difference[window], support.core, part, length)
-    soft = (difference[window] - config.low) / np.maximum(config.full * own - config.low, 1.0)
+    image, difference, region = image[window], difference[window], region[window]
+    support = find_support(difference > 2 * config.low, region, length, config)
+    own = subject_difference(image, difference, support.core, part, length)
+    # Knowing the subject's colour, thin hair that only differs no longer counts as solid.
+    firm = difference > np.maximum(config.firm * own, 2 * config.low)
+    support = find_support(firm, region, length, config)
+    own = subject_difference(image, difference, support.core, part, length)
+    soft = (difference - config.low) / np.maximum(config.full * own - config.low, 1.0)
     alpha[window] = np.where(support.core, 1.0, np.where(support.near, np.clip(soft, 0, 1), 0.0))
     alpha[~valid] = 0.0
     return alpha
@@ -118,19 +123,20 @@ def subject_region(difference: np.ndarray, high: float) -> np.ndarray:
     return (sure & (area >= least))[labels]
 
 
-def find_support(
-    difference: np.ndarray, region: np.ndarray, length: int, config: MatteConfig
-) -> Support:
-    """Split the region into the solid inside and the rest, where alpha is to be measured."""
-    differs = ((difference > 2 * config.low) & region).astype(np.uint8)
+def find_support(firm: np.ndarray, region: np.ndarray, length: int, config: MatteConfig) -> Support:
+    """Split the region (H, W) into the solid inside and the rest, where alpha is to be measured.
+
+    `firm` (H, W) marks pixels that look opaque one by one; where they leave no gap that a strand
+    could make, and deep inside the outline, the subject is solid.
+    """
+    solid = (firm & region).astype(np.uint8)
     radius, edge = _pixels(config.core, length), _pixels(config.fill, length)
     # The image's border cuts the subject off; it goes on behind it.
     pad = 4 * radius + edge + 2
-    differs = cv2.copyMakeBorder(differs, pad, pad, pad, pad, cv2.BORDER_REPLICATE)
-    solid = cv2.morphologyEx(differs, cv2.MORPH_CLOSE, _disc(1))
+    solid = cv2.copyMakeBorder(solid, pad, pad, pad, pad, cv2.BORDER_REPLICATE)
     thick = cv2.morphologyEx(solid, cv2.MORPH_OPEN, _disc(_pixels(0.006, length)))
-    hull = _filled(cv2.morphologyEx(thick, cv2.MORPH_CLOSE, _disc(2 * edge)), difference.size)
-    inside = cv2.erode(hull, _disc(3 * edge))
+    hull = _filled(cv2.morphologyEx(thick, cv2.MORPH_CLOSE, _disc(2 * edge)), firm.size)
+    inside = cv2.erode(hull, _disc(2 * edge))
     core = cv2.morphologyEx(solid | inside, cv2.MORPH_OPEN, _disc(radius))
     # The outermost pixels of the solid are mixed with plate by lens and sampling.
     core = cv2.erode(core, _disc(2 if length >= 256 else 1))[pad:-pad, pad:-pad] > 0
@@ -157,13 +163,16 @@ def subject_difference(
 ) -> np.ndarray:
     """Difference (H, W) from the plate that the subject's colour nearby would make at each pixel.
 
-    The colour is that of the core's rim, averaged over the nearest reach that holds any. With no
-    core (only strands in view) the strongest differences stand in for it.
+    The colour is that of the core's rim, a little inside (outside it is mixed with plate),
+    averaged over the nearest reach that holds any. With no core (only strands in view) the
+    strongest differences stand in for it.
     """
     if not core.any():
         return np.full(core.shape, np.percentile(difference[difference > 0], 98), np.float32)
     depth = _disc(2 * _pixels(0.012, length))
-    rim = core & (cv2.erode(core.astype(np.uint8), depth, borderValue=1) == 0)
+    inner = cv2.erode(core.astype(np.uint8), _disc(2), borderValue=1)
+    inner = inner if inner.any() else core.astype(np.uint8)
+    rim = (inner > 0) & (cv2.erode(inner, depth, borderValue=1) == 0)
     weight = rim.astype(np.float32)
     total = np.zeros_like(image)
     weights = np.full(core.shape, 1e-12, np.float32)

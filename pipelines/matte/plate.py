@@ -124,11 +124,15 @@ def _noise_table(error: np.ndarray, level: np.ndarray, floor: float) -> np.ndarr
 
 
 def _robust_deviation(size: np.ndarray) -> float:
-    """Deviation from absolute errors: a median, trimmed of subject pixels that slipped in."""
+    """Deviation from absolute errors, trimmed of subject pixels that slipped in.
+
+    The median finds the scale; the mean square inside three of it does not step as the median of
+    whole numbers does. A normal variable cut at three deviations keeps 0.9866 of its own.
+    """
     deviation = 1.4826 * float(np.median(size))
     for _ in range(3):
-        inside = size[size < 4 * max(deviation, 0.5)]
-        deviation = 1.4826 * float(np.median(inside))
+        inside = size[size < 3 * max(deviation, 0.7)]
+        deviation = float(np.sqrt(np.mean(inside**2))) / 0.9866
     return deviation
 
 

@@ -79,7 +79,9 @@ def run(dataset: Dataset, item: str, config: MatteConfig, out: Path) -> dict:
         )
     ]
     keyer = Keyer(plate, [read(frame) for frame in measured], valid, config)
-    coverage, border, rows = {}, {}, []
+    coverage: dict[str, float] = {}
+    border: dict[str, float] = {}
+    rows: list[tuple[str, list[np.ndarray]]] = []
     for expression, frame in peaks.items():
         image = read(frame)
         alpha = keyer.alpha(image)

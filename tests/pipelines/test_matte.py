@@ -1,0 +1,188 @@
+"""Mattes against alpha known by construction, and against the plain keys they must beat."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from express50.config import resolve_config
+from express50.errors import ConfigError, StageError
+from express50.frames import dhash, read_frame
+from express50.images import read_image
+from express50.index import read_index
+from pipelines.matte import STAGE
+from pipelines.matte.config import MatteConfig
+from pipelines.matte.key import plate_difference
+from pipelines.matte.plate import exposed, exposure_gain, fit_plate, plate_from_footage
+from pipelines.matte.stage import Keyer
+from tests.pipelines.matte_scenes import Scene, clutter, make_scene
+
+CONFIG = MatteConfig()
+
+
+def key(scene: Scene, **changes) -> np.ndarray:
+    """Alpha (H, W) of a scene."""
+    valid = np.ones(scene.alpha.shape, bool)
+    keyer = Keyer(scene.plate, [scene.frame], valid, replace(CONFIG, **changes))
+    return keyer.alpha(scene.frame)
+
+
+def mae(alpha: np.ndarray, scene: Scene) -> float:
+    """Mean absolute error of alpha over the image."""
+    return float(np.abs(alpha - scene.alpha).mean())
+
+
+@pytest.mark.parametrize("look", ["dark", "fair", "black"])
+def test_alpha_is_close_and_beats_plain_keys(look: str) -> None:
+    scene = make_scene(3, look)
+    difference = np.abs(scene.frame.astype(float) - scene.plate).max(axis=-1)
+    ramp = np.clip((difference - 8) / 40, 0, 1)
+    ours = mae(key(scene), scene)
+    assert ours < 0.012
+    assert ours < 0.6 * mae(difference > 24, scene)
+    assert ours < 0.8 * mae(ramp, scene)
+
+
+def test_strands_are_found_and_gaps_between_them_kept() -> None:
+    scene = make_scene(4, "dark")
+    alpha = key(scene)
+    upper = np.s_[: int(0.45 * 256)]
+    soft = (scene.alpha[upper] > 0.1) & (scene.alpha[upper] < 0.9)
+    assert np.abs(alpha[upper] - scene.alpha[upper])[soft].mean() < 0.12
+    assert np.corrcoef(alpha[upper][soft], scene.alpha[upper][soft])[0, 1] > 0.8
+
+
+def test_noise_that_doubles_does_not_reach_the_background() -> None:
+    scene = make_scene(5, "fair", noise=5.0)
+    alpha = key(scene)
+    assert alpha[scene.alpha == 0].mean() < 0.01
+    assert mae(alpha, scene) < 0.03
+
+
+def test_exposure_change_between_plate_and_frame_is_undone() -> None:
+    scene = make_scene(6, "dark", gain=0.9)
+    gain = exposure_gain(scene.frame, scene.plate)
+    # 0.9 in sRGB values is about 0.9^2.2 in light.
+    assert gain == pytest.approx(0.9**2.2, abs=0.03)
+    assert mae(key(scene), scene) < 0.012
+
+
+def test_a_shadow_is_not_the_subject() -> None:
+    scene = make_scene(7, "dark", shadow=0.2)
+    dark = np.s_[int(0.65 * 256) : int(0.75 * 256), int(0.78 * 256) : int(0.88 * 256)]
+    assert key(scene)[dark].mean() < 0.02
+    assert mae(key(scene), scene) < mae(key(scene, shadow=0.0), scene)
+
+
+def test_a_plate_coloured_spot_inside_the_subject_is_filled() -> None:
+    scene = make_scene(8, "dark")
+    frame = scene.frame.copy()
+    spot = np.s_[150:158, 124:132]
+    frame[spot] = scene.plate[spot]
+    assert key(replace(scene, frame=frame))[spot].min() == 1.0
+
+
+def test_the_difference_of_mere_noise_is_one() -> None:
+    rng = np.random.default_rng(9)
+    true = clutter(rng, 200)
+    plate, frame = (
+        np.clip(np.rint(true + rng.normal(size=true.shape) * 3), 0, 255).astype(np.uint8)
+        for _ in range(2)
+    )
+    model = fit_plate(plate, [frame], np.ones(plate.shape[:2], bool), 1.0)
+    assert np.median(model.sigma) == pytest.approx(3 * np.sqrt(2), rel=0.1)
+    difference = plate_difference(frame.astype(np.float32), model, 0.0, 200)
+    assert np.sqrt(np.mean(difference**2)) == pytest.approx(1.0, abs=0.1)
+
+
+def test_no_gain_leaves_the_plate_as_it_is() -> None:
+    plate = np.arange(256, dtype=np.uint8).repeat(3).reshape(16, 16, 3)
+    assert np.array_equal(exposed(plate, np.ones(3)), plate)
+    assert np.abs(exposed(plate, np.full(3, 1.05)) - plate).max() < 8
+
+
+def test_half_scale_is_coarser_but_near() -> None:
+    scene = make_scene(10, "dark")
+    assert mae(key(scene), scene) < mae(key(scene, scale=0.5), scene) < 0.03
+
+
+def test_pixels_without_footage_are_transparent() -> None:
+    scene = make_scene(11, "dark")
+    valid = np.ones(scene.alpha.shape, bool)
+    valid[:, :20] = valid[-30:] = False
+    frame = np.where(valid[..., None], scene.frame, 0).astype(np.uint8)
+    plate = np.where(valid[..., None], scene.plate, 0).astype(np.uint8)
+    alpha = Keyer(plate, [frame], valid, CONFIG).alpha(frame)
+    assert (alpha[~valid] == 0).all() and alpha[120, 128] == 1
+
+
+def test_a_moving_subject_gives_a_plate_and_a_still_one_does_not() -> None:
+    rng = np.random.default_rng(12)
+    plate = clutter(rng, 96).astype(np.uint8)
+
+    def frame(x: int) -> np.ndarray:
+        image = plate.copy()
+        image[30:96, x : x + 24] = (90, 60, 50)
+        return image
+
+    moving = plate_from_footage([frame(int(x)) for x in np.linspace(0, 72, 15)])
+    assert moving is not None and np.abs(moving.astype(int) - plate).mean() < 1
+    assert plate_from_footage([frame(40 + i % 2) for i in range(15)]) is None
+
+
+def test_wrong_settings_are_refused() -> None:
+    for change in ({"low": 7.0}, {"scale": 0.0}, {"full": 2.0}, {"shadow": 1.0}):
+        with pytest.raises(ConfigError, match="matte"):
+            MatteConfig(**change)
+
+
+@pytest.fixture
+def aligned(ingested):
+    """S001 with given cameras and its peaks labelled."""
+    from express50.runner import run_stage
+    from pipelines import calibrate
+
+    config = resolve_config(calibrate.STAGE, "draft")
+    assert run_stage(calibrate.STAGE, ingested, config, workers=0, progress=False).ok
+    index = read_index(ingested, "S001")
+    camera = sorted(index.cameras)[0]
+    peaks = {
+        cue.expression_id: {
+            "frame": cue.start_frame,
+            "camera": camera,
+            "pts": 0,
+            "dhash": dhash(read_frame(ingested, "S001", camera, cue.start_frame, undistort=False)),
+            "confidence": 1.0,
+            "annotator": "test",
+        }
+        for cue in index.cues
+    }
+    folder = ingested.item_dir("align", "S001")
+    folder.mkdir(parents=True)
+    (folder / "peaks.json").write_text(json.dumps(peaks))
+    return ingested
+
+
+def test_the_stage_writes_one_matte_a_peak_twice_alike(aligned, tmp_path) -> None:
+    item = STAGE.items(aligned)[0]
+    outs = [tmp_path / "a", tmp_path / "b"]
+    for out in outs:
+        out.mkdir()
+        metrics = STAGE.run(aligned, item, CONFIG, out)
+    names = sorted(path.name for path in outs[0].glob("*.png"))
+    assert names == ["neutral.png", "smile.png"] and metrics["plate"] == "given"
+    for path in sorted(outs[0].rglob("*.*")):
+        assert path.read_bytes() == (outs[1] / path.relative_to(outs[0])).read_bytes()
+    alpha = read_image(outs[0] / "neutral.png")
+    assert alpha.shape == (64, 64) and alpha.dtype == np.uint8
+    assert metrics["coverage"]["neutral"] == pytest.approx(alpha.mean() / 255, abs=2e-3)
+    assert 0.05 < metrics["coverage"]["neutral"] < 0.6
+
+
+def test_no_plate_and_a_still_subject_is_one_clear_error(aligned, tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr("pipelines.matte.stage.read_plate", lambda *args: None)
+    with pytest.raises(StageError, match="photograph the empty set as plates/"):
+        STAGE.run(aligned, STAGE.items(aligned)[0], CONFIG, tmp_path)
