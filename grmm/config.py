@@ -57,7 +57,8 @@ class ModelConfig:
     identity_modes: int = 0
     """Linear per-texel modes driven by the first entries of z_id, 0 = none (P). Not in P: the
     convolutions share weights over texels, so details of an identity need many iterations;
-    identity-specific bias maps (Cao 2022, Authentic Volumetric Avatars) are the precedent."""
+    identity-specific bias maps (Cao 2022, Authentic Volumetric Avatars) are the precedent. They
+    reach geometry, opacity and RGB, not the features."""
     code_spread: float = 1.0
     """Spread the warm start gives to the identity codes along the modes; used with modes only."""
     frame: str = "head"
@@ -256,7 +257,7 @@ PRESETS: dict[str, dict[str, dict[str, Any]]] = {
             "mesh_width": 128,
             "film_width": 128,
             "refine_unshuffle": 2,
-            "identity_modes": 16,
+            "identity_modes": 12,
             "frame": "tangent",
         },
         "train": {"iterations": 20_000, "lr": 5e-4, "code_lr_scale": 10.0, "final_lr": 0.1},

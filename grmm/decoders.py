@@ -40,8 +40,9 @@ class Ladder(nn.Module):
     """Code -> (outputs, n_g, n_g), zero at the start but for what is written into ``bias``.
 
     The last layer is a transposed convolution without weight norm (which cannot be zero) whose
-    weights start at zero. ``modes`` (identity_modes, outputs, n_g, n_g) adds a linear, per-texel
-    dependence on the first entries of the code; see ModelConfig.identity_modes.
+    weights start at zero. ``modes`` (modes, mode_outputs, n_g, n_g) adds a linear, per-texel
+    dependence of the first outputs on the first entries of the code; see
+    ModelConfig.identity_modes.
     """
 
     def __init__(
@@ -53,6 +54,7 @@ class Ladder(nn.Module):
         seed_channels: int,
         widths: Sequence[int],
         modes: int = 0,
+        mode_outputs: int | None = None,
         view_channels: int = 0,
     ) -> None:
         """Build; with ``view_channels`` the seed also carries a lifted view direction (RGCA)."""
@@ -69,7 +71,10 @@ class Ladder(nn.Module):
         self.last = nn.ConvTranspose2d(channels[-1], outputs, 4, 2, 1, bias=False)
         nn.init.zeros_(self.last.weight)
         self.bias = nn.Parameter(torch.zeros(outputs, n_g, n_g))
-        self.modes = nn.Parameter(torch.zeros(modes, outputs, n_g, n_g)) if modes else None
+        self.modes = None
+        if modes:
+            shape = (modes, outputs if mode_outputs is None else mode_outputs, n_g, n_g)
+            self.modes = nn.Parameter(torch.zeros(shape))
 
     def forward(self, code: Tensor, direction: Tensor | None = None) -> Tensor:
         """(code,), and (3,) unit view direction if built for one -> (outputs, n_g, n_g)."""
@@ -85,7 +90,8 @@ class Ladder(nn.Module):
             x = doubling(x)
         out = self.last(x)[0] + self.bias
         if self.modes is not None:
-            out = out + torch.tensordot(code[: len(self.modes)], self.modes, 1)
+            change = torch.tensordot(code[: len(self.modes)], self.modes, 1)
+            out = torch.cat([out[: len(change)] + change, out[len(change) :]])
         return out
 
     def texel_parameters(self) -> list[nn.Parameter]:

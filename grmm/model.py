@@ -21,6 +21,7 @@ from grmm.mesh_decoder import MeshDecoder
 from grmm.rasterize import rasterize
 from grmm.refine import Refinement, normalise_depth
 
+FEATURE_STD = 0.3  # of features before training; silent in the paper
 CODE_STD = 0.01  # of codes before training; silent in the paper, DeepSDF's habit (survey point 13)
 
 
@@ -136,9 +137,11 @@ class GRMM(nn.Module):
         both = config.z_id + config.z_exp
         self.transform = self._ladder(both, 10)
         self.opacity = self._ladder(both if config.opacity_from_expression else config.z_id, 1)
-        self.colour = self._ladder(config.z_id, 3 + config.features, config.view_channels)
+        self.colour = self._ladder(config.z_id, 3 + config.features, config.view_channels, 3)
         with torch.no_grad():
             self.opacity.bias.fill_(_logit(config.opacity_init))
+            # Features tell texels apart to the refinement: from all zeros it learns slowly.
+            self.colour.bias[3:].normal_(0, FEATURE_STD)
         self.refinement = None
         if config.refine_widths:
             self.refinement = Refinement(
@@ -147,7 +150,9 @@ class GRMM(nn.Module):
                 unshuffle=config.refine_unshuffle,
             )
 
-    def _ladder(self, code: int, outputs: int, view_channels: int = 0) -> Ladder:
+    def _ladder(
+        self, code: int, outputs: int, view_channels: int = 0, mode_outputs: int | None = None
+    ) -> Ladder:
         return Ladder(
             code=code,
             outputs=outputs,
@@ -155,6 +160,7 @@ class GRMM(nn.Module):
             seed_channels=self.config.seed_channels,
             widths=self.config.ladder,
             modes=self.config.identity_modes,
+            mode_outputs=mode_outputs,
             view_channels=view_channels,
         )
 

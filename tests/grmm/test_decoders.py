@@ -65,6 +65,13 @@ def test_modes_are_linear_in_the_code():
     torch.testing.assert_close(net(code), expected)
 
 
+def test_modes_may_reach_the_first_outputs_only():
+    net = ladder(modes=2, mode_outputs=3)
+    torch.nn.init.ones_(net.modes)
+    out = net(torch.ones(6))
+    assert torch.equal(out[:3], net.bias[:3] + 2) and torch.equal(out[3:], net.bias[3:])
+
+
 def test_activations_keep_their_size_through_the_ladder():
     torch.manual_seed(0)
     net = ladder(n_g=128, widths=(32, 32, 32), seed_channels=32)
