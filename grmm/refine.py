@@ -34,8 +34,12 @@ class Refinement(nn.Module):
             _block(a + b, a) for a, b in reversed(list(zip(widths, widths[1:], strict=False)))
         )
         self.head = nn.Conv2d(widths[0], 3 * unshuffle**2, 3, padding=1)
+        for layer in self.modules():
+            if isinstance(layer, nn.Conv2d):
+                # Without norms torch's default would shrink activations thousandfold on the way.
+                nn.init.kaiming_normal_(layer.weight, a=SLOPE)
+                nn.init.zeros_(layer.bias)
         nn.init.zeros_(self.head.weight)
-        nn.init.zeros_(self.head.bias)
 
     def forward(self, maps: Tensor) -> Tensor:
         """(inputs, H, W) -> refined colours (3, H, W)."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ from express50.errors import FormatError
 from express50.shards import ShardReader
 from grmm.data import Key, Sample, Tracked
 
+INSET_PX = 2  # of the footage's border: undistortion has nothing to put there
 SIZES = {"neck": (3,), "jaw": (3,), "eyes": (6,), "R": (3, 3), "t": (3,)}
 
 
@@ -47,14 +49,44 @@ class ShardSource:
                 f"{where}: tracked with head model {meta.get('head')!r}, the first sample with "
                 f"{self.head!r}; train on one of them: pack them into different folders"
             )
+        rows, columns = seen_window(meta, where)
+        K = _matrix(meta, "K", (3, 3), where)
+        K[:2, 2] -= columns.start, rows.start
         return Sample(
-            image=sample["rgb"],
-            alpha=np.rint(sample["alpha"] * 255).astype(np.uint8),
-            depth=sample["depth"] if sample["valid"].any() else None,
-            K=_matrix(meta, "K", (3, 3), where),
+            image=sample["rgb"][rows, columns],
+            alpha=np.rint(sample["alpha"] * 255).astype(np.uint8)[rows, columns],
+            depth=sample["depth"][rows, columns] if sample["valid"].any() else None,
+            K=K,
             cam_from_world=_matrix(meta, "cam_from_world", (4, 4), where),
             tracked=_tracked(meta.get("track"), where),
         )
+
+
+def seen_window(meta: dict, where: str) -> tuple[slice, slice]:
+    """Rows and columns of a packed sample that its camera saw.
+
+    Packing squares reach beyond the footage where a head stands at the border of the image. What
+    lies there is black in the sample, yet not background: a model taught so would learn to cut off
+    necks. A sample without ``crop`` was not cut out: all of it was seen.
+
+    Raises:
+        FormatError: the crop does not touch the footage.
+    """
+    size = (int(meta["height"]), int(meta["width"]))
+    crop = meta.get("crop")
+    if not crop:
+        return slice(0, size[0]), slice(0, size[1])
+    spans = []
+    for start, source, length in zip(
+        (crop["y0"], crop["x0"]), reversed(meta["source_size"]), size, strict=True
+    ):
+        scale = length / crop["side"]
+        inner = (INSET_PX - start) * scale, (source - INSET_PX - start) * scale
+        low, high = max(0, math.ceil(inner[0])), min(length, math.floor(inner[1]))
+        if high <= low:
+            raise FormatError(f"{where}: its crop lies outside the footage; rerun 'express50 pack'")
+        spans.append(slice(low, high))
+    return spans[0], spans[1]
 
 
 def _tracked(track: Any, where: str) -> Tracked:

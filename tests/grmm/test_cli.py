@@ -4,12 +4,13 @@ import json
 import numpy as np
 import pytest
 
+from express50.errors import FormatError
 from express50.images import encode_jpeg, encode_png
 from express50.shards_write import PackedSample, ShardWriter
 from grmm import checkpoint as checkpoint_module
 from grmm.cli import build_parser, main, train_config
 from grmm.ply import read_ply
-from grmm.shard_source import ShardSource
+from grmm.shard_source import ShardSource, seen_window
 from tests.grmm.synthetic import EllipsoidSource, ellipsoid_head
 
 TINY = [
@@ -86,6 +87,19 @@ def test_source_gives_back_what_was_packed(shards):
     np.testing.assert_array_equal(got.K, expected.K)
     for name, value in vars(expected.tracked).items():
         np.testing.assert_array_equal(getattr(got.tracked, name), value)
+
+
+def test_what_the_camera_did_not_see_is_left_out():
+    meta = {"width": 100, "height": 100, "source_size": [320, 300]}
+    whole = seen_window(meta, "x")
+    assert whole == (slice(0, 100), slice(0, 100))
+    below = meta | {"crop": {"x0": -20, "y0": 250, "side": 100}}
+    rows, columns = seen_window(below, "x")
+    assert (rows, columns) == (slice(0, 48), slice(22, 100))
+    inside = meta | {"crop": {"x0": 50, "y0": 60, "side": 200}}
+    assert seen_window(inside, "x") == whole
+    with pytest.raises(FormatError, match="outside the footage"):
+        seen_window(meta | {"crop": {"x0": 400, "y0": 0, "side": 50}}, "x")
 
 
 def test_train_sees_the_training_split_only(checkpoint):
@@ -169,8 +183,6 @@ def test_mixed_head_models_are_refused(tmp_path):
     writer = ShardWriter(tmp_path, 1 << 24)
     writer.add_group("train", samples)
     writer.close()
-    from express50.errors import FormatError
-
     with pytest.raises(FormatError, match="'other', the first sample with 'ellipsoid'"):
         ShardSource(tmp_path).read(1)
     assert io.BytesIO(samples[0].members["alpha.png"]).read(4) == b"\x89PNG"

@@ -125,6 +125,15 @@ def test_refinement_starts_as_the_identity_at_any_size(size, unshuffle):
     assert torch.equal(net(maps), maps[:3])
 
 
+def test_activations_keep_their_size_through_the_refinement():
+    torch.manual_seed(0)
+    net = Refinement(inputs=6, widths=(24, 32, 48), unshuffle=1)
+    torch.nn.init.normal_(net.head.weight, std=1 / (24 * 9) ** 0.5)
+    maps = torch.rand(6, 32, 32)
+    residual = (net(maps) - maps[:3]).detach()
+    assert 0.1 < float(residual.std()) < 10
+
+
 def test_every_parameter_of_the_refinement_learns():
     net = Refinement(inputs=5, widths=(8, 12), unshuffle=2)
     torch.nn.init.normal_(net.head.weight)
