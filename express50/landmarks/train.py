@@ -71,7 +71,7 @@ def train(views: ViewSet, steps: int, seed: int, start: Path | None, out: Path) 
     for step in range(steps):
         # Warm up over 100 steps, then a cosine down to one hundredth.
         rate = min(1.0, (step + 1) / 100) * (0.505 + 0.495 * math.cos(math.pi * step / steps))
-        optimiser.param_groups[0]["lr"] = 2.5e-3 * rate
+        optimiser.param_groups[0]["lr"] = (1.5e-3 if start else 2.5e-3) * rate
         picks = rng.integers(len(views.facing), size=BATCH)
         loss = crop_loss(net, [random_crop(views, i, backgrounds, rng) for i in picks])
         optimiser.zero_grad(set_to_none=True)

@@ -169,13 +169,21 @@ def _cost(
     basis: Basis, targets: list[Target], points: list[Points], state: State, config: TrackConfig
 ) -> float:
     """Total cost of a state."""
-    total = 0.5 * config.shape_prior * float(state.shape @ state.shape)
+    total = 0.5 * _shape_weight(config, len(targets)) * float(state.shape @ state.shape)
     for target, model, pose in zip(targets, points, state.poses, strict=True):
         positions = model.evaluate(_parameters(state.shape, pose), pose.rotation)
         total += sum(_huber_cost(block[1]) for block in _residuals(target, positions))
         residual, _ = prior(basis.model, pose.own, target.neutral, config)
         total += 0.5 * float(residual @ residual)
     return total if np.isfinite(total) else np.inf
+
+
+def _shape_weight(config: TrackConfig, expressions: int) -> float:
+    """Weight of the shape prior: what a detector gets wrong on a face it gets wrong in every frame.
+
+    More expressions of the same face are therefore no independent evidence of its shape.
+    """
+    return config.shape_prior * expressions
 
 
 def _normal_equations(
@@ -211,8 +219,9 @@ def _step(
     config: TrackConfig,
 ) -> State:
     """One damped Gauss-Newton step, expressions eliminated."""
-    reduced = config.shape_prior * np.eye(shapes)
-    right = -config.shape_prior * state.shape
+    weight = _shape_weight(config, len(system))
+    reduced = weight * np.eye(shapes)
+    right = -weight * state.shape
     eliminated = []
     for hessian, gradient in system:
         shared, cross = hessian[:shapes, :shapes], hessian[:shapes, shapes:]

@@ -21,11 +21,11 @@ EFFECTIVE_POINTS = 24
 POINTS_A_VIEW = 60
 OUTLINE_SIDE = 192
 OUTLINE_SIGMA_M = 0.003
-# How much it counts where the mesh lies inside the matte. Beyond the edge always counts in full;
-# inside, hair may stand between skull and edge, and shoulders and clothes beside the neck.
-INSIDE_WEIGHTS = {
-    "neck": 0.05, "scalp": 0.35, "face": 1.0, "forehead": 0.35, "nose": 1.0, "lips": 1.0,
-    "left_ear": 0.7, "right_ear": 0.7,
+# How far inside the matte the mesh may lie before the gap is taken for hair, cloth or shoulders and
+# stops to pull (metres). Beyond the matte's edge a vertex always counts in full.
+GAP_M = {
+    "neck": 0.003, "scalp": 0.005, "face": 0.02, "forehead": 0.005, "nose": 0.02, "lips": 0.02,
+    "left_ear": 0.005, "right_ear": 0.005,
 }  # fmt: skip
 
 
@@ -52,17 +52,17 @@ class Outline:
         distance: the view's signed distance.
         index: (n,) positions of the vertices among the fit's points.
         sigma: standard deviation in full-size pixels, the number of points allowed for.
-        inside: (n,) weights where a vertex lies inside the matte.
+        gap: (n,) pixels inside the matte at which the pull fades.
     """
 
     distance: SignedDistance
     index: np.ndarray
     sigma: float
-    inside: np.ndarray
+    gap: np.ndarray
 
     @classmethod
     def of(
-        cls, distance: SignedDistance, first: int, positions: np.ndarray, inside: np.ndarray
+        cls, distance: SignedDistance, first: int, positions: np.ndarray, gap_m: np.ndarray
     ) -> Outline:
         """Outline of points that start at `first`, now at positions (n, 3).
 
@@ -71,23 +71,26 @@ class Outline:
         """
         camera = distance.camera
         depth = (positions @ camera.cam_from_world[2, :3] + camera.cam_from_world[2, 3]).mean()
-        sigma = np.hypot(distance.step, OUTLINE_SIGMA_M * camera.K[0, 0] / max(depth, 1e-6))
+        pixels_a_metre = camera.K[0, 0] / max(float(depth), 1e-6)
+        sigma = np.hypot(distance.step, OUTLINE_SIGMA_M * pixels_a_metre)
         count = len(positions)
         crowd = max(1.0, count / EFFECTIVE_POINTS) ** 0.5
-        return cls(distance, np.arange(first, first + count), float(sigma * crowd), inside)
+        index = np.arange(first, first + count)
+        return cls(distance, index, float(sigma * crowd), gap_m * pixels_a_metre)
 
     def residuals(
         self, positions: np.ndarray, project: Callable
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Block (index (n,), residual (n, 1), slope (n, 1, 3)) of all points' positions (P, 3)."""
+        """Block (index (n,), residual (n, 1), slope (n, 1, 3)) of all points' positions (P, 3).
+
+        Inside the matte the squared residual is Geman and McClure's, v^2 / (1 + v^2 / gap^2).
+        """
         pixels, slope = project(self.distance.camera, positions[self.index])
         value, gradient = sample(self.distance, pixels)
-        weight = np.where(value > 0, 1.0, self.inside) / self.sigma
-        return (
-            self.index,
-            (value * weight)[:, None],
-            (gradient[:, None, :] @ slope) * weight[:, None, None],
-        )
+        fade = 1.0 + np.where(value < 0, value / self.gap, 0.0) ** 2
+        residual = value / np.sqrt(fade) / self.sigma
+        along = (fade**-1.5 / self.sigma)[:, None, None]
+        return self.index, residual[:, None], (gradient[:, None, :] @ slope) * along
 
 
 def signed_distance(alpha: np.ndarray, camera: Camera, side: int = 640) -> SignedDistance | None:
@@ -164,13 +167,13 @@ def outline_vertices(
     return chosen
 
 
-def inside_weights(model: HeadModel) -> np.ndarray:
-    """Weights (V,) of vertices inside the matte; 0 for vertices that form no outline."""
-    weights = np.zeros(model.template.shape[0])
-    for region, weight in INSIDE_WEIGHTS.items():
-        weights[model.regions[region].numpy()] = weight
-    weights[model.regions["boundary"].numpy()] = 0.0
-    return weights
+def outline_gaps(model: HeadModel) -> np.ndarray:
+    """Gaps (V,) metres at which the pull of a vertex fades; 0 for vertices that form no outline."""
+    gaps = np.zeros(model.template.shape[0])
+    for region, gap in GAP_M.items():
+        gaps[model.regions[region].numpy()] = gap
+    gaps[model.regions["boundary"].numpy()] = 0.0
+    return gaps
 
 
 def _window(vertices: np.ndarray, camera: Camera) -> Camera | None:

@@ -30,7 +30,7 @@ from pipelines.track.fit import (
     start_state,
 )
 from pipelines.track.observe import Observation, View, agree, facing, project_pinhole
-from pipelines.track.outline import Outline, inside_weights, outline_vertices, signed_distance
+from pipelines.track.outline import Outline, outline_gaps, outline_vertices, signed_distance
 from pipelines.track.overlay import draw_overlays
 from pipelines.track.sparse_head import POSE_SIZE, Basis, make_basis
 from pipelines.track.start import initial_pose
@@ -212,14 +212,14 @@ def _distances(dataset: Dataset, subject: str, target: Target) -> list:
 
 def _with_outlines(model: HeadModel, target: Target, distances: list, mesh: np.ndarray) -> Target:
     """The target with the outlines of the current mesh (V, 3)."""
-    weights = inside_weights(model)
+    gaps = outline_gaps(model)
     faces = model.faces.numpy()
     outlines, ids, offset = [], [], 68
     for distance in distances:
-        chosen = outline_vertices(mesh, faces, distance.camera, weights > 0)
+        chosen = outline_vertices(mesh, faces, distance.camera, gaps > 0)
         if len(chosen) < 8:
             continue
-        outlines.append(Outline.of(distance, offset, mesh[chosen], weights[chosen]))
+        outlines.append(Outline.of(distance, offset, mesh[chosen], gaps[chosen]))
         ids.append(chosen)
         offset += len(chosen)
     vertices = np.concatenate(ids) if ids else np.zeros(0, dtype=np.int64)
