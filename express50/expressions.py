@@ -28,9 +28,9 @@ class Expression:
         description: what to do, with FACS action units.
         categories: from ``CATEGORIES``.
         controls: activation of named expression directions; 1 is full, negative is its opposite.
-        jaw: axis-angle of the jaw, radians; opening is +x.
-        neck: axis-angle of the neck, radians.
-        gaze: yaw to the subject's left and pitch upwards, radians.
+        jaw: (3,) axis-angle of the jaw, radians; opening is +x.
+        neck: (3,) axis-angle of the neck, radians.
+        gaze: (2,) yaw to the subject's left and pitch upwards, radians.
     """
 
     id: str
@@ -38,9 +38,9 @@ class Expression:
     description: str
     categories: tuple[str, ...]
     controls: dict[str, float] = field(default_factory=dict)
-    jaw: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    neck: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    gaze: tuple[float, float] = (0.0, 0.0)
+    jaw: tuple[float, ...] = (0.0, 0.0, 0.0)
+    neck: tuple[float, ...] = (0.0, 0.0, 0.0)
+    gaze: tuple[float, ...] = (0.0, 0.0)
 
 
 @cache

@@ -244,8 +244,10 @@ def _shoulders(
     # From an ellipse at the collar to a rounder box at the shoulders.
     power = 2.0 + 0.8 * flare
     scale = (np.abs(c) ** power + np.abs(z) ** power) ** (-1.0 / power)
-    # The collar is highest at the nape and lowest in front.
-    drop = 0.014 - 0.012 * z * (1 - s) - 0.10 * flare**2.2 - 0.24 * s**3
+    # The collar follows the neck's open edge, or one could look into the neck.
+    bearing = np.arctan2(loop[:, 2] - centre[2], loop[:, 0] - centre[0])
+    edge = np.interp(around, bearing % (2 * np.pi), loop[:, 1] - centre[1], period=2 * np.pi)
+    drop = 0.012 + edge * (1 - flare) - 0.10 * flare**2.2 - 0.24 * s**3
     shirt = np.stack([width * scale * c, drop, -0.02 * flare + depth * scale * z], axis=-1)
     shirt = _outside(shirt.reshape(-1, 3) + centre, centre, rest, skin_faces)
     index = np.arange(shirt.shape[0]).reshape(around.shape)

@@ -12,13 +12,14 @@ from collections.abc import Callable
 from concurrent.futures import Future, ProcessPoolExecutor, wait
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 from express50.errors import CaptureError
 from express50.expressions import select
 from express50.threads import cap_threads
 from express50.twin.config import TwinConfig
 
-_counter = None  # shared count of pictures, set in every worker
+_counter: Any = None  # shared count of pictures, set in every worker
 
 
 def record(

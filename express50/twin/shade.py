@@ -219,7 +219,7 @@ def _surface(
     if kind == Material.CLOTH:
         return place, 0.01, 5.0
     colour, gloss, power = {
-        Material.TEETH: ((0.68, 0.62, 0.52), 0.25, 90.0),
+        Material.TEETH: ((0.66, 0.57, 0.44), 0.2, 90.0),
         Material.MOUTH: ((0.30, 0.10, 0.09), 0.10, 40.0),
         Material.TONGUE: ((0.42, 0.17, 0.16), 0.12, 30.0),
     }[Material(kind)]

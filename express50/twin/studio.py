@@ -40,6 +40,9 @@ def _head(spec: str) -> HeadModel:
     return load_head(spec)
 
 
+Film = VideoFootage | ImageFootage
+
+
 def cast_subject(config: TwinConfig, subject_id: str) -> tuple[Body, Performance]:
     """A subject's body and what it does in every frame."""
     model, number = _head(config.head), subject_number(subject_id)
@@ -104,7 +107,9 @@ def film_subject(
     texture = paint_skin(body, seed, texture_width(min(config.width, config.height)))
     eyes, lighting = find_eyes(body.model), make_lighting(number, seed)
     with ExitStack() as stack:
-        films = [stack.enter_context(_open(config, capture, view.camera)) for view in views]
+        films: list[Film] = [
+            stack.enter_context(_open(config, capture, view.camera)) for view in views
+        ]
         for frame in range(play.frames):
             posed = pose_body(body, play, frame)
             scene = build_scene(body, texture, eyes, lighting, posed, seed)
@@ -171,7 +176,7 @@ def write_png(path: Path, image: np.ndarray) -> None:
     path.write_bytes(encode_png(image))
 
 
-def _open(config: TwinConfig, capture: Path, camera: Camera) -> VideoFootage | ImageFootage:
+def _open(config: TwinConfig, capture: Path, camera: Camera) -> Film:
     folder = capture / "cameras" / camera.id
     if config.footage == "video":
         return VideoFootage(folder, camera.width, camera.height, config.fps, config.crf)

@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from dataclasses import asdict
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -157,7 +158,8 @@ class Truth:
 
 def _read_body(about: dict, data: dict[str, np.ndarray]) -> Body:
     """The body from its stored geometry; what only colours need is left empty."""
-    look = Look(**{k: np.array(v) if isinstance(v, list) else v for k, v in about["look"].items()})
+    fields: dict[str, Any] = about["look"]
+    look = Look(**{k: np.array(v) if isinstance(v, list) else v for k, v in fields.items()})
     subject = Subject(
         id=about["id"], number=about["number"], shape=data["shape"], offsets=data["offsets"],
         look=look,
