@@ -24,21 +24,12 @@ import psutil
 from express50.layout import Dataset
 
 STAGES = ("ingest", "calibrate", "align", "matte", "track", "depth", "pack")
-# Eight expressions that between them open the jaw, move brows, lids, lips and cheeks, and are
+# Six expressions that between them open the jaw, move brows, lids, lips and cheeks, and are
 # one-sided; the fourth subject is never trained on.
-EXPRESSIONS = (
-    "neutral",
-    "smile",
-    "jaw_open",
-    "pucker",
-    "brow_raise",
-    "anger",
-    "shout",
-    "wink_left",
-)
-TWIN = {"subjects": 4, "cameras": 8, "width": 320, "height": 320, "frames-per-expression": 7}
-TRAIN_SECONDS = 230
-FIT_SECONDS = 50
+EXPRESSIONS = ("neutral", "smile", "jaw_open", "pucker", "brow_raise", "wink_left")
+TWIN = {"subjects": 4, "cameras": 8, "width": 320, "height": 320, "frames-per-expression": 6}
+TRAIN_SECONDS = 220
+FIT_SECONDS = 45
 
 
 @dataclass
