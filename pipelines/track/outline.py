@@ -20,13 +20,12 @@ from express50.head.model import HeadModel
 EFFECTIVE_POINTS = 24
 POINTS_A_VIEW = 60
 OUTLINE_SIDE = 192
-OUTLINE_SIGMA_M = 0.003
-# How far inside the matte the mesh may lie before the gap is taken for hair, cloth or shoulders and
-# stops to pull (metres). Beyond the matte's edge a vertex always counts in full.
-GAP_M = {
-    "neck": 0.003, "scalp": 0.005, "face": 0.02, "forehead": 0.005, "nose": 0.02, "lips": 0.02,
-    "left_ear": 0.005, "right_ear": 0.005,
-}  # fmt: skip
+EDGE_SIGMA_M = 0.0015
+# Where hair, cloth or shoulders may stand before the skin: standard deviation of their thickness,
+# and the gap (metres) at which what lies inside the matte stops to pull.
+COVER_SIGMA_M, COVER_GAP_M, BARE_GAP_M = 0.008, 0.006, 0.02
+COVERED = ("neck", "scalp", "forehead", "left_ear", "right_ear")
+BARE = ("face", "nose", "lips")
 
 
 @dataclass(frozen=True)
@@ -51,32 +50,39 @@ class Outline:
     Attributes:
         distance: the view's signed distance.
         index: (n,) positions of the vertices among the fit's points.
-        sigma: standard deviation in full-size pixels, the number of points allowed for.
+        sigma: (n, 2) standard deviations in full-size pixels, inside and outside the matte.
         gap: (n,) pixels inside the matte at which the pull fades.
     """
 
     distance: SignedDistance
     index: np.ndarray
-    sigma: float
+    sigma: np.ndarray
     gap: np.ndarray
 
     @classmethod
     def of(
-        cls, distance: SignedDistance, first: int, positions: np.ndarray, gap_m: np.ndarray
+        cls,
+        distance: SignedDistance,
+        first: int,
+        positions: np.ndarray,
+        covered: np.ndarray,
+        pictures: int,
     ) -> Outline:
         """Outline of points that start at `first`, now at positions (n, 3).
 
-        One pixel, and three millimetres of unmodelled skin and hair, are assumed in every point;
-        neighbours err alike, so many points do not outvote the landmarks.
+        `covered` (n,) says where hair or cloth may hide the skin. Their thickness is much the same
+        in all `pictures` of a subject, so that more pictures are no more evidence of it; likewise
+        neighbours on an outline err alike.
         """
-        camera = distance.camera
+        camera, count = distance.camera, len(positions)
         depth = (positions @ camera.cam_from_world[2, :3] + camera.cam_from_world[2, 3]).mean()
-        pixels_a_metre = camera.K[0, 0] / max(float(depth), 1e-6)
-        sigma = np.hypot(distance.step, OUTLINE_SIGMA_M * pixels_a_metre)
-        count = len(positions)
+        scale = camera.K[0, 0] / max(float(depth), 1e-6)
         crowd = max(1.0, count / EFFECTIVE_POINTS) ** 0.5
-        index = np.arange(first, first + count)
-        return cls(distance, index, float(sigma * crowd), gap_m * pixels_a_metre)
+        edge = np.hypot(0.5 * distance.step, EDGE_SIGMA_M * scale)
+        cover = np.hypot(edge, COVER_SIGMA_M * scale) * max(1, pictures) ** 0.5
+        sigma = np.stack([np.where(covered, cover, edge), np.full(count, edge)], axis=1) * crowd
+        gap = np.where(covered, COVER_GAP_M, BARE_GAP_M) * scale
+        return cls(distance, np.arange(first, first + count), sigma, gap)
 
     def residuals(
         self, positions: np.ndarray, project: Callable
@@ -88,8 +94,9 @@ class Outline:
         pixels, slope = project(self.distance.camera, positions[self.index])
         value, gradient = sample(self.distance, pixels)
         fade = 1.0 + np.where(value < 0, value / self.gap, 0.0) ** 2
-        residual = value / np.sqrt(fade) / self.sigma
-        along = (fade**-1.5 / self.sigma)[:, None, None]
+        sigma = np.where(value < 0, self.sigma[:, 0], self.sigma[:, 1])
+        residual = value / np.sqrt(fade) / sigma
+        along = (fade**-1.5 / sigma)[:, None, None]
         return self.index, residual[:, None], (gradient[:, None, :] @ slope) * along
 
 
@@ -167,13 +174,14 @@ def outline_vertices(
     return chosen
 
 
-def outline_gaps(model: HeadModel) -> np.ndarray:
-    """Gaps (V,) metres at which the pull of a vertex fades; 0 for vertices that form no outline."""
-    gaps = np.zeros(model.template.shape[0])
-    for region, gap in GAP_M.items():
-        gaps[model.regions[region].numpy()] = gap
-    gaps[model.regions["boundary"].numpy()] = 0.0
-    return gaps
+def outline_regions(model: HeadModel) -> tuple[np.ndarray, np.ndarray]:
+    """Masks (V,) of the vertices that may form an outline, and of those that may be covered."""
+
+    def union(names: tuple[str, ...]) -> np.ndarray:
+        return np.any([model.regions[name].numpy() for name in names], axis=0)
+
+    allowed = union(BARE + COVERED) & ~model.regions["boundary"].numpy()
+    return allowed, union(COVERED)
 
 
 def _window(vertices: np.ndarray, camera: Camera) -> Camera | None:

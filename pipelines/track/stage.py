@@ -30,7 +30,7 @@ from pipelines.track.fit import (
     start_state,
 )
 from pipelines.track.observe import Observation, View, agree, facing, project_pinhole
-from pipelines.track.outline import Outline, outline_gaps, outline_vertices, signed_distance
+from pipelines.track.outline import Outline, outline_regions, outline_vertices, signed_distance
 from pipelines.track.overlay import draw_overlays
 from pipelines.track.sparse_head import POSE_SIZE, Basis, make_basis
 from pipelines.track.start import initial_pose
@@ -182,10 +182,11 @@ def _refine(
     distances = [_distances(dataset, subject, target) for target in targets]
     if not config.silhouette_rounds or not any(distances):
         return state, targets
+    pictures = sum(len(seen) for seen in distances)
     for _ in range(config.silhouette_rounds):
         vertices = _all_vertices(basis.model, state)
         targets = [
-            _with_outlines(basis.model, target, seen, mesh)
+            _with_outlines(basis.model, target, seen, mesh, pictures)
             for target, seen, mesh in zip(targets, distances, vertices, strict=True)
         ]
         state, _ = fit(basis, targets, state, config, config.silhouette_iterations)
@@ -210,16 +211,18 @@ def _distances(dataset: Dataset, subject: str, target: Target) -> list:
     return found
 
 
-def _with_outlines(model: HeadModel, target: Target, distances: list, mesh: np.ndarray) -> Target:
+def _with_outlines(
+    model: HeadModel, target: Target, distances: list, mesh: np.ndarray, pictures: int
+) -> Target:
     """The target with the outlines of the current mesh (V, 3)."""
-    gaps = outline_gaps(model)
+    allowed, covered = outline_regions(model)
     faces = model.faces.numpy()
     outlines, ids, offset = [], [], 68
     for distance in distances:
-        chosen = outline_vertices(mesh, faces, distance.camera, gaps > 0)
+        chosen = outline_vertices(mesh, faces, distance.camera, allowed)
         if len(chosen) < 8:
             continue
-        outlines.append(Outline.of(distance, offset, mesh[chosen], gaps[chosen]))
+        outlines.append(Outline.of(distance, offset, mesh[chosen], covered[chosen], pictures))
         ids.append(chosen)
         offset += len(chosen)
     vertices = np.concatenate(ids) if ids else np.zeros(0, dtype=np.int64)
