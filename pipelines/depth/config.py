@@ -29,7 +29,7 @@ class DepthConfig:
     """Texture under this standard deviation (8-bit steps, after blurring) counts as none."""
     stiffness_voxels: float = 2.2
     """Length, in voxels, under which displacements are smoothed as by a thin plate."""
-    rim_weight: float = 0.5
+    rim_weight: float = 1.0
     """Weight of the silhouettes against a perfect photographic match."""
     fair_voxels: float = 1.4
     """Gaussian smoothing of the distances before each level, in voxels."""

@@ -45,7 +45,7 @@ class Surface:
     Attributes:
         vertices (V, 3), normals (V, 3): world, metres, outward.
         faces: (F, 3).
-        confidence: (V,) in [0, 1]; agreement of the views, half where only silhouettes speak.
+        confidence: (V,) in [0, 1]; agreement of the views, 0.3 where only silhouettes speak.
         colors: (V, 3) uint8 sRGB.
         grid: signed distances the mesh was taken from.
         numbers: voxels and agreement for the metrics.
@@ -174,10 +174,12 @@ def _scores(
     weights = view_weights(views, vertices, normals, mesh_scene(vertices, faces), voxel)
     # the samples of a patch lie no closer than the pixels: finer ones would repeat them
     spacing = max(spacing, float(pixel))
-    return sweep_scores(
+    scores = sweep_scores(
         views, greys, vertices, normals, weights, offsets, spacing, config.noise,
         config.patch_samples,
     )  # fmt: skip
+    # neighbours see the same: chance matches of one patch, frequent in hair, average out
+    return _averaged(scores, faces, rounds=1)
 
 
 def _pixel_size(view: View, point: np.ndarray) -> float:
@@ -213,7 +215,7 @@ def _finish(views: Sequence[View], grid: Grid, config: DepthConfig) -> Surface:
     offsets = np.array([-1.0, 0.0, 1.0]) * grid.voxel
     agreement = _scores(views, vertices, normals, faces, offsets, grid.voxel, config)[:, 1]
     on_hull = np.abs(hull_distance(views, vertices)) < 0.5 * grid.voxel
-    confidence = _averaged(np.clip(agreement, 0, 1), faces)
+    confidence = _averaged(np.clip(agreement, 0, 1), faces, rounds=6)
     used = np.zeros(len(vertices), bool)
     used[faces] = True
     numbers = {
@@ -225,13 +227,13 @@ def _finish(views: Sequence[View], grid: Grid, config: DepthConfig) -> Surface:
         "photo_supported": float((confidence[used] > 0.3).mean()),
         "silhouette_supported": float(on_hull[used].mean()),
     }
-    confidence = np.maximum(confidence, np.where(on_hull, 0.5, 0.1)).astype(np.float32)
+    confidence = np.maximum(confidence, np.where(on_hull, 0.3, 0.1)).astype(np.float32)
     colors = _colors(views, vertices, normals, faces, grid.voxel)
     return Surface(vertices, normals, faces, confidence, colors, grid, numbers)
 
 
-def _averaged(values: np.ndarray, faces: np.ndarray, rounds: int = 6) -> np.ndarray:
-    """Vertex values (V,) averaged over their neighbours: a patch speaks for what lies around it."""
+def _averaged(values: np.ndarray, faces: np.ndarray, rounds: int) -> np.ndarray:
+    """Vertex values (V,) or (V, D) averaged over their neighbours, again and again."""
     laplacian = graph_laplacian(faces, len(values))
     for _ in range(rounds):
         values = values - 0.5 * (laplacian @ values)
