@@ -1,0 +1,232 @@
+"""Calibration against the twin's true rig: ``python -m benchmarks.calibrate --help``.
+
+The stage's solution stands beside a baseline from the same corners: OpenCV's calibration of every
+camera alone, then relative poses averaged and chained, without a joint adjustment. Rigs are laid
+on the true one by a rigid motion. ``head_px`` is what matters further on: how far, in pixels,
+points in the head's place project from where the true camera has them. The last line is one JSON
+object. Without a demo dataset a small capture is recorded first (some minutes).
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from express50.cameras import Camera, project, transform_camera, triangulate
+from express50.config import resolve_config
+from express50.index import Index, read_index
+from express50.layout import Dataset
+from express50.runner import run_stage
+from express50.transforms import invert_transform, matrix_to_axis_angle, rigid_fit
+from express50.twin.config import TwinConfig
+from express50.twin.record import print_progress, record
+from express50.twin.truth import Truth, align_worlds
+from pipelines import ingest
+from pipelines.calibrate import STAGE
+from pipelines.calibrate.board import (
+    Observations,
+    board_from_table,
+    board_points,
+    read_observations,
+)
+from pipelines.calibrate.bundle import Rig, residuals
+from pipelines.calibrate.graph import join, mean_transform, rig_from_board
+from pipelines.calibrate.intrinsics import (
+    View,
+    board_poses,
+    camera_params,
+    fit_intrinsics,
+    with_ideal,
+)
+from pipelines.calibrate.solve import solve_rig
+from pipelines.calibrate.world import meeting_point
+
+HEAD_RADIUS_M = 0.13
+
+
+def main() -> int:
+    """Run and print."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    add_data_arguments(parser)
+    parser.add_argument("--preset", default="standard")
+    parser.add_argument("--set", dest="assignments", action="append", default=[])
+    args = parser.parse_args()
+    cv2.setNumThreads(1)
+    dataset, truth = dataset_and_truth(args)
+    config = resolve_config(STAGE, args.preset, None, args.assignments)
+    subject = dataset.subjects()[0]
+    index, true = read_index(dataset, subject), truth.cameras(subject)
+    if index.board is None:
+        sys.exit(f"{index.capture}: no board was recorded; name another --dataset")
+    board = board_from_table(index.board["config"], str(index.capture))
+    points = board_points(board)
+    sizes = {name: (source.width, source.height) for name, source in index.cameras.items()}
+    start = time.process_time()
+    observations = read_observations(board, board_files(index), sizes, config.board_frames)
+    detected = time.process_time()
+    solution = solve_rig(observations, points, sizes, config)
+    solved = time.process_time()
+    rms = float(np.sqrt(np.mean(np.sum(solution.errors**2, axis=1))))
+    started = time.process_time()
+    rig = chained(observations, points, sizes)
+    chain_seconds = time.process_time() - started
+    errors = np.linalg.norm(residuals(rig, observations, points), axis=1)
+    baseline = figures(rig.cameras, true) | {
+        "reprojection_px": float(np.sqrt(np.mean(errors[np.isfinite(errors)] ** 2))),
+        "seconds": detected - start + chain_seconds,
+    }
+    row: dict[str, object] = {
+        **figures(solution.cameras, true),
+        "reprojection_px": rms,
+        "seconds": solved - start,
+        "seconds_detection": detected - start,
+        "corners": len(solution.errors),
+        "dropped": len(solution.dropped),
+        "baseline": {"opencv_chain": rounded(baseline)},
+    }
+    print(json.dumps({"benchmark": "calibrate", "preset": args.preset, **rounded(row)}))
+    return 0
+
+
+def add_data_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options that name a twin dataset and its truth."""
+    parser.add_argument("--dataset", type=Path, default=Path("build/demo/data/demo"))
+    parser.add_argument("--truth", type=Path, default=Path("build/demo/twin/truth"))
+    parser.add_argument("--small", type=Path, default=Path("build/bench-twin"))
+
+
+def dataset_and_truth(args: argparse.Namespace) -> tuple[Dataset, Truth]:
+    """The named dataset, or a small one recorded for the purpose."""
+    dataset = Dataset(args.dataset)
+    if dataset.captures_file.is_file():
+        return dataset, Truth(args.truth)
+    print(f"{dataset.root}: not there; recording a small twin in {args.small}", file=sys.stderr)
+    config = TwinConfig(
+        subjects=2,
+        cameras=6,
+        width=384,
+        height=384,
+        expressions=("neutral", "jaw_open"),
+        frames_per_expression=4,
+    )
+    record(config, args.small, report=print_progress())
+    dataset = Dataset(args.small / "data")
+    ingest.register(dataset, sorted((args.small / "captures").iterdir()))
+    ingested = run_stage(
+        ingest.STAGE, dataset, resolve_config(ingest.STAGE, "draft"), workers=0, progress=False
+    )
+    if not ingested.ok:
+        sys.exit(f"{dataset.root}: ingest failed; run 'express50 ingest' on {args.small}")
+    return dataset, Truth(args.small / "truth")
+
+
+def board_files(index: Index) -> dict[str, list[Path]]:
+    """Board images of every camera."""
+    table = index.board or {"cameras": {}}
+    return {
+        name: [index.capture / file for file in table["cameras"].get(name, [])]
+        for name in index.cameras
+    }
+
+
+def figures(estimated: Mapping[str, Camera], true: Mapping[str, Camera]) -> dict[str, float]:
+    """Errors of a rig after a rigid motion onto the true one."""
+    motion = align_worlds(estimated, true)
+    moved = {name: transform_camera(camera, motion) for name, camera in estimated.items()}
+    turns = [
+        np.degrees(
+            np.linalg.norm(
+                matrix_to_axis_angle(
+                    camera.cam_from_world[:3, :3] @ true[name].cam_from_world[:3, :3].T
+                )
+            )
+        )
+        for name, camera in moved.items()
+    ]
+    focals = [100 * abs(c.K[0, 0] / true[n].K[0, 0] - 1) for n, c in moved.items()]
+    shifts = [1e3 * np.linalg.norm(c.center - true[n].center) for n, c in moved.items()]
+    return {
+        "rotation_error_deg": float(np.mean(turns)),
+        "rotation_error_deg_max": float(np.max(turns)),
+        "position_error_mm": float(np.mean(shifts)),
+        "focal_error_percent": float(np.mean(focals)),
+        "head_px": head_error(estimated, true),
+        "cameras": len(moved),
+    }
+
+
+def head_error(estimated: Mapping[str, Camera], true: Mapping[str, Camera]) -> float:
+    """Rms distance, pixels, of points in the head's place between both rigs' pictures.
+
+    The worlds are laid on each other by those points, triangulated by either rig: a camera's
+    rotation and principal point trade places without harm there, and would tilt a fit to the
+    cameras themselves.
+    """
+    middle = meeting_point(true)
+    points = np.random.default_rng(0).normal(size=(200, 3))
+    points *= HEAD_RADIUS_M / np.linalg.norm(points, axis=1, keepdims=True)
+    points += np.zeros(3) if middle is None else middle
+    names = sorted(estimated)
+    seen = np.stack([project(true[name], points)[0] for name in names])
+    found = triangulate([estimated[name] for name in names], seen)
+    R, t = rigid_fit(points, found)
+    offs = [
+        project(estimated[n], points @ R.T + t)[0] - p for n, p in zip(names, seen, strict=True)
+    ]
+    return float(np.sqrt(np.mean(np.sum(np.stack(offs) ** 2, axis=-1))))
+
+
+def chained(
+    observations: Observations, points: np.ndarray, sizes: Mapping[str, tuple[int, int]]
+) -> Rig:
+    """OpenCV a camera, the mean relative pose a pair, and the best tree of pairs: no adjustment."""
+    lone: dict[str, Camera] = {}
+    views: dict[str, dict[int, View]] = {}
+    for i, name in enumerate(observations.cameras):
+        mine = observations.camera == i
+        frames = {int(f): mine & (observations.frame == f) for f in observations.frame[mine]}
+        found = [
+            View(f, points[observations.corner[rows]], observations.pixels[rows])
+            for f, rows in sorted(frames.items())
+            if rows.sum() >= 8
+        ]
+        fitted = fit_intrinsics(found, sizes[name], "OPENCV", 4)
+        if fitted is None:
+            continue
+        params = camera_params(*fitted[:2], "OPENCV")
+        lone[name] = Camera(name, *sizes[name], "OPENCV", params, np.eye(4))
+        views[name] = {found[k].frame: with_ideal(lone[name], found[k]) for k in fitted[2]}
+    poses = {
+        name: {f: best[:1] for f, view in mine.items() if (best := board_poses(view))}
+        for name, mine in views.items()
+    }
+    edges = {}
+    for a in sorted(lone):
+        for b in sorted(lone):
+            shared = sorted(set(poses[a]) & set(poses[b])) if a < b else []
+            if shared:
+                told = [poses[b][f][0] @ invert_transform(poses[a][f][0]) for f in shared]
+                weights = np.array([float(len(views[b][f].points)) for f in shared])
+                edges[a, b] = (mean_transform(told, weights), float(weights.sum()))
+    placed = join(sorted(lone), edges, sweeps=0)
+    shown = sorted({f for name in placed for f in poses[name]})
+    boards = {f: rig_from_board(f, placed, lone, views, poses) for f in shown}
+    cameras = {name: replace(lone[name], cam_from_world=pose) for name, pose in placed.items()}
+    return Rig(cameras, {f: pose for f, pose in boards.items() if pose is not None})
+
+
+def rounded(row: Mapping[str, object]) -> dict[str, object]:
+    """The row with floats to five significant digits."""
+    return {k: float(f"{v:.5g}") if isinstance(v, float) else v for k, v in row.items()}
+
+
+if __name__ == "__main__":
+    sys.exit(main())
