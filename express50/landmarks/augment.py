@@ -41,7 +41,7 @@ def random_crop(views: ViewSet, index: int, backgrounds: np.ndarray, rng: Rng) -
     rgba, points = views.rgba[index], views.points[index].astype(np.float64)
     centre, side = face_box(points)
     empty = rng.random() < 0.08
-    if rng.random() < 0.72:
+    if rng.random() < 0.8:
         side *= np.exp(rng.uniform(-0.18, 0.25))
         centre = centre + rng.normal(size=2) * 0.05 * side
     else:
