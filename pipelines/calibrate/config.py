@@ -47,5 +47,11 @@ class CalibrateConfig:
 PRESETS: dict[str, dict[str, object]] = {
     "draft": {"board_frames": 24, "single_frames": 15, "rounds": 1, "iterations": 30},
     "standard": {},
-    "reference": {"board_frames": 0, "single_frames": 60, "rounds": 5, "iterations": 200},
+    "reference": {
+        "board_frames": 0,
+        "single_frames": 60,
+        "rounds": 5,
+        "iterations": 200,
+        "reject_sigma": 6.0,
+    },
 }

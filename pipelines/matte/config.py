@@ -27,6 +27,8 @@ class MatteConfig:
     """Plate-coloured spots inside the solid subject are filled where this far from its edge."""
     shadow: float = 0.25
     """Broad darkening of the plate up to this share is taken for a shadow; 0 turns it off."""
+    smooth: bool = False
+    """Smooth alpha along the picture's colours in the uncertain band (doubles the time)."""
     noise_frames: int = 4
     """Frames that the camera's noise is measured on."""
     noise_floor: float = 1.0
@@ -51,5 +53,5 @@ class MatteConfig:
 PRESETS: dict[str, dict[str, object]] = {
     "draft": {"scale": 0.5, "noise_frames": 1, "plate_frames": 15},
     "standard": {},
-    "reference": {"noise_frames": 12, "plate_frames": 61},
+    "reference": {"smooth": True, "noise_frames": 12, "plate_frames": 61},
 }

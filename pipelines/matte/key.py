@@ -15,6 +15,7 @@ import numpy as np
 
 from pipelines.matte.config import MatteConfig
 from pipelines.matte.plate import PlateModel
+from pipelines.matte.smooth import smooth_alpha
 
 # A part of the subject smaller than this share of its largest part is clutter.
 LEAST_PART = 0.02
@@ -57,7 +58,9 @@ def alpha_of(
     support = find_support(firm, region, length, config)
     own = subject_difference(image, difference, support.core, part, length)
     soft = (difference - config.low) / np.maximum(config.full * own - config.low, 1.0)
-    alpha[window] = np.where(support.core, 1.0, np.where(support.near, np.clip(soft, 0, 1), 0.0))
+    soft = np.where(support.near, np.clip(soft, 0, 1), 0.0).astype(np.float32)
+    soft[support.core] = 1.0
+    alpha[window] = smooth_alpha(image, soft, support.near) if config.smooth else soft
     alpha[~valid] = 0.0
     return alpha
 

@@ -17,6 +17,7 @@ from pipelines.matte import STAGE
 from pipelines.matte.config import MatteConfig
 from pipelines.matte.key import plate_difference
 from pipelines.matte.plate import exposed, exposure_gain, fit_plate, plate_from_footage
+from pipelines.matte.smooth import matting_laplacian
 from pipelines.matte.stage import Keyer
 from tests.pipelines.matte_scenes import Scene, clutter, make_scene
 
@@ -102,6 +103,22 @@ def test_no_gain_leaves_the_plate_as_it_is() -> None:
     plate = np.arange(256, dtype=np.uint8).repeat(3).reshape(16, 16, 3)
     assert np.array_equal(exposed(plate, np.ones(3)), plate)
     assert np.abs(exposed(plate, np.full(3, 1.05)) - plate).max() < 8
+
+
+def test_smoothing_helps_thin_hair_and_keeps_what_is_sure() -> None:
+    scene = make_scene(13, "dark", noise=4.0)
+    plain, smooth = key(scene), key(scene, smooth=True)
+    assert np.mean((smooth - scene.alpha) ** 2) < np.mean((plain - scene.alpha) ** 2)
+    assert (smooth[180:, 115:140] == plain[180:, 115:140]).all()
+
+
+def test_the_matting_laplacian_ignores_affine_functions_of_colour() -> None:
+    image = np.random.default_rng(14).random((12, 15, 3))
+    laplacian = matting_laplacian(image, np.ones((12, 15), bool))
+    affine = image @ [0.3, -0.5, 0.2] + 0.4
+    assert np.abs(laplacian @ np.full(180, 0.7)).max() < 1e-12
+    assert affine.ravel() @ laplacian @ affine.ravel() < 1e-2
+    assert abs(laplacian - laplacian.T).max() < 1e-12
 
 
 def test_half_scale_is_coarser_but_near() -> None:
