@@ -107,9 +107,9 @@ def film_subject(
     texture = paint_skin(body, seed, texture_width(min(config.width, config.height)))
     eyes, lighting = find_eyes(body.model), make_lighting(number, seed)
     with ExitStack() as stack:
-        films: list[Film] = [
-            stack.enter_context(_open(config, capture, view.camera)) for view in views
-        ]
+        films = [_open(config, capture, view.camera) for view in views]
+        for film in films:
+            stack.enter_context(film)
         for frame in range(play.frames):
             posed = pose_body(body, play, frame)
             scene = build_scene(body, texture, eyes, lighting, posed, seed)

@@ -159,7 +159,9 @@ class Truth:
 def _read_body(about: dict, data: dict[str, np.ndarray]) -> Body:
     """The body from its stored geometry; what only colours need is left empty."""
     fields: dict[str, Any] = about["look"]
-    look = Look(**{k: np.array(v) if isinstance(v, list) else v for k, v in fields.items()})
+    for name, value in fields.items():
+        fields[name] = np.array(value) if isinstance(value, list) else value
+    look = Look(**fields)
     subject = Subject(
         id=about["id"], number=about["number"], shape=data["shape"], offsets=data["offsets"],
         look=look,
