@@ -218,7 +218,7 @@ def _depth_picture(view: DepthView) -> np.ndarray:
 
 STAGE = Stage(
     name="depth",
-    version=1,
+    version=2,
     config=DepthConfig,
     presets=PRESETS,
     items=items,

@@ -47,9 +47,8 @@ def head_crop(
     high = np.maximum(high, np.minimum(high + reach, matte[1]))
     if (high <= 0).any() or (low >= (camera.width, camera.height)).any():
         return "the tracked head lies outside the image"
+    low, high = np.maximum(low, 0), np.minimum(high, (camera.width, camera.height))
     side = int(np.ceil((high - low).max() * (1 + 2 * margin)))
-    if side > 8 * max(camera.width, camera.height):
-        return f"the tracked head spans {side} pixels"
     corner = np.floor((low + high) / 2 - side / 2).astype(int)
     return Crop(int(corner[0]), int(corner[1]), side)
 

@@ -286,7 +286,7 @@ def _write_picture(out: Path, reader: ShardReader) -> float:
 
 STAGE = Stage(
     name="pack",
-    version=1,
+    version=2,
     config=PackConfig,
     presets=PRESETS,
     items=items,
