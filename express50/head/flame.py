@@ -161,7 +161,7 @@ def read_embedding(
 
 
 def read_masks(path: Path, template: np.ndarray) -> dict[str, torch.Tensor]:
-    """Region masks from FLAME_masks.pkl; irises are the front of the eyeballs, absent parts empty."""
+    """Region masks of FLAME_masks.pkl; irises are the eyeballs' fronts, absent parts are empty."""
     content = read_pickle(path)
     if not isinstance(content, dict):
         raise HeadModelError(f"{path}: holds a {type(content).__name__}, expected a dict of ids")

@@ -135,9 +135,9 @@ def check_head(model: HeadModel) -> HeadModel:
     where = f"head model {model.name!r}"
     for item in fields(model):
         value = getattr(model, item.name)
-        if isinstance(value, torch.Tensor) and value.is_floating_point():
-            if not bool(torch.isfinite(value).all()):
-                raise HeadModelError(f"{where}: {item.name} holds NaN or infinite values")
+        # whole-number tensors are always finite
+        if isinstance(value, torch.Tensor) and not bool(torch.isfinite(value).all()):
+            raise HeadModelError(f"{where}: {item.name} holds NaN or infinite values")
     vertices = model.template.shape[0]
     ranges = {
         "faces": (model.faces, vertices),

@@ -93,7 +93,7 @@ def _dtype(code: object, *flags: object) -> np.dtype:
 
 
 def _scalar(dtype: np.dtype, data: object) -> np.generic:
-    """numpy scalar from its bytes."""
+    """Rebuild a NumPy scalar from its bytes."""
     raw = data.encode("latin1") if isinstance(data, str) else data
     if not isinstance(raw, bytes) or dtype.hasobject:
         raise pickle.UnpicklingError("numpy scalar without bytes")

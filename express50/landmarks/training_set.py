@@ -34,7 +34,7 @@ def make_views(folder: Path, model: HeadModel, number: int, count: int, seed: in
     if path.exists():
         return path
     rng = np.random.default_rng([seed, number, *model.name.encode()])
-    views = []
+    views: list = []
     while len(views) < count:
         scene = HeadScene(model, random_head(model, rng))
         # The last of each head's views comes from anywhere, backs of heads included.

@@ -18,11 +18,11 @@ class TwinConfig:
     "Number of subjects."
     first_subject: int = 1
     "Number of the first subject's id; S001 for 1. Subjects do not depend on how many there are."
-    cameras: int = 8
+    cameras: int = 24
     "Number of cameras on the rig, over about 300 degrees."
-    width: int = 320
+    width: int = 960
     "Image width, pixels."
-    height: int = 320
+    height: int = 540
     "Image height, pixels."
     expressions: tuple[str, ...] | None = None
     "Ids from the script, in order; None is all 60."
