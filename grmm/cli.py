@@ -262,7 +262,13 @@ def _views(loaded: Loaded, shards: Path) -> HeadViews:
 
     data = loaded.config.data
     source = ShardSource(shards, split="*")
-    return HeadViews(source, loaded.head, background=data.background, cache_mb=data.cache_mb)
+    return HeadViews(
+        source,
+        loaded.head,
+        background=data.background,
+        torso=data.torso,
+        cache_mb=data.cache_mb,
+    )
 
 
 def _select(views: HeadViews, subject: str, expressions: str, cameras: str) -> list[int]:

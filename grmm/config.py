@@ -148,6 +148,9 @@ class DataConfig:
     """Camera ids that training never sees; metrics.json reports on them."""
     background: float = 0.0
     """Grey that footage and renderings are composited on, sRGB in [0, 1]. Silent in P. G15."""
+    torso: str = "ignore"
+    """Pixels of shoulders and clothes: ``ignore`` them in losses and metrics (the paper's data
+    were masked to the head; see grmm.torso) or ``keep`` them as if the head model held them."""
     crop_margin_px: int = 16
     """Train on the window around head and matte, this much larger; -1 = the whole image. Outside
     both, footage and rendering are background. Evaluation always takes the whole image."""
@@ -155,6 +158,7 @@ class DataConfig:
     """Decoded samples kept in memory, megabytes."""
 
     def __post_init__(self) -> None:
+        _one_of("data.torso", self.torso, ("ignore", "keep"))
         _in_range("data.background", self.background, 0.0, 1.0)
 
 
@@ -172,6 +176,9 @@ class TrainConfig:
     """Factor for the codes' rate. P: one rate for all; G13 explains why 10 is useful."""
     texel_lr_scale: float = 1.0
     """Factor for the rate of per-texel parameters (untied biases, modes) of the last layers."""
+    refine_lr_scale: float = 1.0
+    """Factor for the refinement's rate. P: 1, at 1e-4. At the demo's 2e-3 the first steps of a
+    zero-initialised head throw the image about, and the network then learns to keep still."""
     final_lr: float = 1.0
     """Last rate over the first, reached along a half cosine. P states no decay. G16."""
     betas: tuple[float, float] = (0.9, 0.999)
@@ -286,6 +293,7 @@ PRESETS: dict[str, dict[str, dict[str, Any]]] = {
             "lr": 2e-3,
             "code_lr_scale": 2.0,
             "texel_lr_scale": 5.0,
+            "refine_lr_scale": 0.25,
             "final_lr": 0.05,
         },
         "fit": {

@@ -20,6 +20,7 @@ from torch import Tensor
 from express50.errors import FormatError, TrainError
 from express50.head.model import HeadModel, pose
 from grmm.model import HeadState, View
+from grmm.torso import torso_mask
 
 WINDOW_STEP = 32  # pixels; windows have sides of whole steps
 
@@ -97,7 +98,8 @@ class Item:
         state: tracked head.
         view: camera in head space.
         target: (3, H, W) footage composited on the background.
-        mask: (H, W) bool, footage alpha over 0.5.
+        mask: (H, W) bool, footage alpha over 0.5, and counts.
+        counts: (H, W) bool, False where footage shows what the head model does not hold: torso.
         depth: (H, W) metres.
         depth_valid: (H, W) bool.
     """
@@ -107,8 +109,13 @@ class Item:
     view: View
     target: Tensor
     mask: Tensor
+    counts: Tensor
     depth: Tensor
     depth_valid: Tensor
+
+    def comparable(self, image: Tensor) -> Tensor:
+        """``image`` (3, H, W) with the footage itself where pixels do not count."""
+        return torch.where(self.counts, image, self.target)
 
 
 class HeadViews:
@@ -120,12 +127,14 @@ class HeadViews:
         head: HeadModel,
         *,
         background: float = 0.0,
+        torso: str = "ignore",
         cache_mb: int = 512,
         device: torch.device | str = "cpu",
     ) -> None:
-        """Wrap a source whose parameters belong to ``head``."""
+        """Wrap a source whose parameters belong to ``head``; see DataConfig for the rest."""
         self.source, self.head, self.device = source, head.to(device), torch.device(device)
-        self.background = background
+        self.background, self.ignore_torso = background, torso == "ignore"
+        self._torsos: dict[int, np.ndarray] = {}
         self._capacity = cache_mb * 2**20
         self._cache: OrderedDict[int, Sample] = OrderedDict()
         self._cached_bytes = 0
@@ -150,24 +159,39 @@ class HeadViews:
         state = self.state(index)
         height, width = sample.alpha.shape
         view = self.view_of(sample, width, height)
+        torso = self._torso(index, sample, state, view)
         rows, columns = slice(0, height), slice(0, width)
         if margin_px >= 0:
-            rows, columns = head_window(state.vertices, view, sample.alpha, margin_px)
+            matte = np.where(torso, 0, sample.alpha)
+            rows, columns = head_window(state.vertices, view, matte, margin_px)
             view = crop_view(view, rows, columns)
         image, alpha = sample.image[rows, columns], sample.alpha[rows, columns]
         depth = np.zeros(alpha.shape, np.float32) if sample.depth is None else sample.depth
         known = self._tensor(depth if sample.depth is None else depth[rows, columns])
         weight = (self._tensor(alpha) / 255)[..., None]
         target = self._tensor(image) / 255 * weight + self.background * (1 - weight)
+        counts = torch.from_numpy(~torso[rows, columns]).to(self.device)
         return Item(
             key=key,
             state=state,
             view=view,
             target=target.permute(2, 0, 1).contiguous(),
-            mask=weight[..., 0] > 0.5,
+            mask=(weight[..., 0] > 0.5) & counts,
+            counts=counts,
             depth=known,
-            depth_valid=known > 0,
+            depth_valid=(known > 0) & counts,
         )
+
+    def _torso(self, index: int, sample: Sample, state: HeadState, view: View) -> np.ndarray:
+        """Torso pixels (H, W) of a sample, found once and kept as bits."""
+        size = sample.alpha.shape
+        if not self.ignore_torso:
+            return np.zeros(size, bool)
+        if index not in self._torsos:
+            mask = torso_mask(self.head, state.vertices, view, sample.alpha, sample.depth)
+            self._torsos[index] = np.packbits(mask)
+        bits = np.unpackbits(self._torsos[index], count=size[0] * size[1])
+        return bits.reshape(size).astype(bool)
 
     def sample(self, index: int) -> Sample:
         """The decoded sample, from memory if it is there."""

@@ -17,7 +17,10 @@ from grmm.model import GRMM, Rendering
 
 Render = Callable[[Item], Rendering]
 Row = dict[str, str | float]
-NUMBERS = ("psnr_db", "psnr_head_db", "ssim", "ssim_head", "psnr_unrefined_db", "depth_mm")
+NUMBERS = (
+    "psnr_db", "psnr_head_db", "psnr_with_torso_db", "ssim", "ssim_head", "psnr_unrefined_db",
+    "depth_mm",
+)  # fmt: skip
 
 
 def training_render(model: GRMM, views: HeadViews) -> Render:
@@ -35,8 +38,9 @@ def training_render(model: GRMM, views: HeadViews) -> Render:
 def evaluate(views: HeadViews, indices: Sequence[int], render: Render) -> list[Row]:
     """One row of numbers per sample.
 
-    ``*_head`` counts pixels of the footage's matte only, so that an easy background cannot
-    flatter; ``depth_mm`` is the median absolute error where both depths are known (NaN: nowhere).
+    ``psnr_db`` and ``ssim`` count every pixel but torso (DataConfig.torso); ``*_head`` pixels of
+    the footage's matte only, so that an easy background cannot flatter; ``depth_mm`` is the median
+    absolute error where both depths are known (NaN: nowhere).
     """
     rows = []
     for index in indices:
@@ -49,11 +53,12 @@ def evaluate(views: HeadViews, indices: Sequence[int], render: Render) -> list[R
                 subject=item.key.subject,
                 expression=item.key.expression,
                 camera=item.key.camera,
-                psnr_db=psnr_db(out.image, item.target),
+                psnr_db=psnr_db(out.image, item.target, item.counts),
                 psnr_head_db=psnr_db(out.image, item.target, item.mask),
-                ssim=ssim_score(out.image, item.target),
-                ssim_head=ssim_score(out.image, item.target, item.mask),
-                psnr_unrefined_db=psnr_db(out.rgb, item.target),
+                psnr_with_torso_db=psnr_db(out.image, item.target),
+                ssim=ssim_score(item.comparable(out.image), item.target),
+                ssim_head=ssim_score(item.comparable(out.image), item.target, item.mask),
+                psnr_unrefined_db=psnr_db(out.rgb, item.target, item.counts),
                 depth_mm=1e3 * float(error.median()) if len(error) else math.nan,
             )
         )

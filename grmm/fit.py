@@ -154,7 +154,7 @@ def invert_codes(state: Fit, late: Callable[[], bool]) -> int:
         rendering = state.model.render(
             state.z_id, z_exp, item.state, item.view, state.views.background
         )
-        loss = _both(rendering, item.target, state.weights)
+        loss = _both(rendering, item, state.weights)
         _finite(loss + settings.codes * losses.codes(state.z_id, z_exp), number, 1).backward()
         optimizer.step()
         done = number + 1
@@ -175,7 +175,7 @@ def tune_decoders(state: Fit, late: Callable[[], bool]) -> int:
         rendering = state.model.render(
             state.z_id, z_exp, item.state, item.view, state.views.background
         )
-        loss = _both(rendering, item.target, state.weights)
+        loss = _both(rendering, item, state.weights)
         if settings.locality and number % settings.locality_every == 0:
             weight = settings.locality * settings.locality_every
             loss = loss + weight * locality_loss(state, item, rng)
@@ -280,11 +280,12 @@ def _index_of(state: Fit, item: Item) -> int:
     return next(i for i in state.given if state.views.keys[i] == item.key)
 
 
-def _both(rendering: Rendering, target: Tensor, weights: LossConfig) -> Tensor:
+def _both(rendering: Rendering, item: Item, weights: LossConfig) -> Tensor:
     """L_rec of the rasterised and, if there is one, the refined image."""
-    loss = losses.reconstruction(rendering.rgb, target, weights)
+    loss = losses.reconstruction(item.comparable(rendering.rgb), item.target, weights)
     if rendering.image is not rendering.rgb:
-        loss = loss + losses.reconstruction(rendering.image, target, weights)
+        image = item.comparable(rendering.image)
+        loss = loss + losses.reconstruction(image, item.target, weights)
     return loss
 
 

@@ -79,6 +79,7 @@ def train(
         source,
         head,
         background=config.data.background,
+        torso=config.data.torso,
         cache_mb=config.data.cache_mb,
         device=device,
     )
@@ -179,7 +180,7 @@ def prepare(views: HeadViews, config: Config, rank: int = 0, world: int = 1) -> 
 
 
 def make_optimizer(model: GRMM, config: Config) -> torch.optim.Optimizer:
-    """Adam with one group each for codes, per-texel parameters and all else."""
+    """Adam with a group each for codes, per-texel parameters, refinement and all else."""
     settings = config.train
     codes = [model.z_id, model.z_exp]
     texels = [
@@ -187,12 +188,14 @@ def make_optimizer(model: GRMM, config: Config) -> torch.optim.Optimizer:
         for ladder in (model.transform, model.opacity, model.colour)
         for parameter in ladder.texel_parameters()
     ]
-    special = {id(parameter) for parameter in codes + texels}
+    refinement = [] if model.refinement is None else list(model.refinement.parameters())
+    special = {id(parameter) for parameter in codes + texels + refinement}
     rest = [parameter for parameter in model.parameters() if id(parameter) not in special]
     groups = [
         {"params": rest, "scale": 1.0},
         {"params": codes, "scale": settings.code_lr_scale},
         {"params": texels, "scale": settings.texel_lr_scale},
+        {"params": refinement, "scale": settings.refine_lr_scale},
     ]
     return torch.optim.Adam(groups, lr=settings.lr, betas=settings.betas, fused=True)
 
@@ -241,15 +244,15 @@ def step(run: Run, parallel: torch.nn.Module, config: Config) -> None:
 def objective(run: Run, rendering: Rendering, item: Item, config: Config) -> dict[str, Tensor]:
     """Weighted terms of the objective by name (paper: Training and Losses)."""
     weights, model = config.loss, run.model
-    terms = {"rgb": losses.reconstruction(rendering.rgb, item.target, weights)}
+    images = {"rgb": item.comparable(rendering.rgb)}
     if model.refinement is not None:
-        terms["image"] = losses.reconstruction(rendering.image, item.target, weights)
+        images["image"] = item.comparable(rendering.image)
+    terms = {n: losses.reconstruction(image, item.target, weights) for n, image in images.items()}
     if run.perceptual is not None and run.iteration % weights.perceptual_every == 0:
-        for name, image in (("image", rendering.image), ("rgb", rendering.rgb)):
-            if name in terms:
-                pair = random_crop((image, item.target), weights.perceptual_crop_px, run.generator)
-                term = weights.perceptual * weights.perceptual_every * run.perceptual(*pair)
-                terms[f"perceptual_{name}"] = term
+        for name, image in images.items():
+            pair = random_crop((image, item.target), weights.perceptual_crop_px, run.generator)
+            term = weights.perceptual * weights.perceptual_every * run.perceptual(*pair)
+            terms[f"perceptual_{name}"] = term
     if bool(item.depth_valid.any()):
         error = losses.depth_dm2(
             rendering.depth, rendering.alpha, item.depth, item.depth_valid, weights.depth_erode_px
@@ -320,6 +323,8 @@ def report(run: Run, config: Config, out: Path) -> dict[str, object]:
         "psnr_heldout_view_head_db": mean(holdout, "psnr_head_db"),
         "psnr_heldout_view_unrefined_db": mean(holdout, "psnr_unrefined_db"),
         "ssim": mean(holdout, "ssim") if holdout else mean(training, "ssim"),
+        "psnr_heldout_view_with_torso_db": mean(holdout, "psnr_with_torso_db"),
+        "psnr_counts": f"all pixels that the camera saw; torso: {config.data.torso}",
         "depth_median_mm": mean(holdout or training, "depth_mm"),
         "heldout_images": len(holdout),
         "heldout_cameras": list(config.data.holdout_cameras),
