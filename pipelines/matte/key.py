@@ -69,8 +69,25 @@ def _pixels(share: float, length: int) -> int:
     return max(1, round(share * length))
 
 
-def _disc(radius: int) -> np.ndarray:
-    return cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
+def eroded(mask: np.ndarray, radius: float) -> np.ndarray:
+    """Pixels (H, W) bool further than `radius` from any outside pixel; the border counts inside.
+
+    By distances, so that the time does not grow with the disc.
+    """
+    if mask.all():
+        return mask > 0
+    distance = cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    return distance > radius
+
+
+def dilated(mask: np.ndarray, radius: float) -> np.ndarray:
+    """Pixels (H, W) bool within `radius` of the mask."""
+    return ~eroded(mask == 0, radius)
+
+
+def opened(mask: np.ndarray, radius: float) -> np.ndarray:
+    """What discs of a radius, wholly inside the mask (H, W), cover of it."""
+    return dilated(eroded(mask, radius), radius)
 
 
 def _window(region: np.ndarray, margin: int) -> tuple[slice, slice]:
@@ -103,9 +120,8 @@ def plate_difference(
         (image @ _LUMA) / np.maximum(model.plate @ _LUMA, 1.0), (1 - shadow) ** (1 / 2.2), 1.0
     )
     shaded = _length(image - model.plate * dark[..., None], model)
-    fits = (shaded < 3.0).astype(np.uint8)
     # Opened by a disc wider than strands and soft edges: what is left is broad.
-    broad = cv2.morphologyEx(fits, cv2.MORPH_OPEN, _disc(_pixels(0.01, length))) > 0
+    broad = opened(shaded < 3.0, _pixels(0.01, length))
     return np.where(broad, np.minimum(difference, shaded), difference)
 
 
@@ -137,24 +153,23 @@ def find_support(firm: np.ndarray, region: np.ndarray, length: int, config: Matt
     # The image's border cuts the subject off; it goes on behind it.
     pad = 4 * radius + edge + 2
     solid = cv2.copyMakeBorder(solid, pad, pad, pad, pad, cv2.BORDER_REPLICATE)
-    thick = cv2.morphologyEx(solid, cv2.MORPH_OPEN, _disc(_pixels(0.006, length)))
-    hull = _filled(cv2.morphologyEx(thick, cv2.MORPH_CLOSE, _disc(2 * edge)), firm.size)
-    inside = cv2.erode(hull, _disc(2 * edge))
-    core = cv2.morphologyEx(solid | inside, cv2.MORPH_OPEN, _disc(radius))
+    thick = opened(solid, _pixels(0.006, length))
+    hull = _filled(eroded(dilated(thick, 2 * edge), 2 * edge), firm.size)
+    core = opened((solid > 0) | eroded(hull, 2 * edge), radius)
     # The outermost pixels of the solid are mixed with plate by lens and sampling.
-    core = cv2.erode(core, _disc(2 if length >= 256 else 1))[pad:-pad, pad:-pad] > 0
-    near = cv2.dilate(region.astype(np.uint8), _disc(1)) > 0
-    return Support(core, near & ~core)
+    core = eroded(core, 2 if length >= 256 else 1)[pad:-pad, pad:-pad]
+    return Support(core, dilated(region, 1) & ~core)
 
 
 def _filled(mask: np.ndarray, pixels: int) -> np.ndarray:
-    """The mask (H, W) uint8 with enclosed holes filled up to LARGEST_HOLE of `pixels`."""
-    _, labels, stats, _ = cv2.connectedComponentsWithStats(1 - mask, connectivity=4)
+    """The mask (H, W) with enclosed holes filled up to LARGEST_HOLE of `pixels`."""
+    holes = (mask == 0).astype(np.uint8)
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(holes, connectivity=4)
     fill = stats[:, cv2.CC_STAT_AREA] < LARGEST_HOLE * pixels
     touching = np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]])
     fill[np.unique(touching)] = False
     fill[0] = False  # the mask itself
-    return ((mask > 0) | fill[labels]).astype(np.uint8)
+    return mask | fill[labels]
 
 
 def subject_difference(
@@ -172,10 +187,9 @@ def subject_difference(
     """
     if not core.any():
         return np.full(core.shape, np.percentile(difference[difference > 0], 98), np.float32)
-    depth = _disc(2 * _pixels(0.012, length))
-    inner = cv2.erode(core.astype(np.uint8), _disc(2), borderValue=1)
-    inner = inner if inner.any() else core.astype(np.uint8)
-    rim = (inner > 0) & (cv2.erode(inner, depth, borderValue=1) == 0)
+    inner = eroded(core, 2)
+    inner = inner if inner.any() else core
+    rim = inner & ~eroded(inner, 2 * _pixels(0.012, length))
     weight = rim.astype(np.float32)
     total = np.zeros_like(image)
     weights = np.full(core.shape, 1e-12, np.float32)

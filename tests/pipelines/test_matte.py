@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 
@@ -15,9 +16,9 @@ from express50.images import read_image
 from express50.index import read_index
 from pipelines.matte import STAGE
 from pipelines.matte.config import MatteConfig
-from pipelines.matte.key import plate_difference
+from pipelines.matte.key import dilated, eroded, plate_difference
 from pipelines.matte.plate import exposed, exposure_gain, fit_plate, plate_from_footage
-from pipelines.matte.smooth import matting_laplacian
+from pipelines.matte.smooth import MattingLaplacian
 from pipelines.matte.stage import Keyer
 from tests.pipelines.matte_scenes import Scene, clutter, make_scene
 
@@ -112,13 +113,27 @@ def test_smoothing_helps_thin_hair_and_keeps_what_is_sure() -> None:
     assert (smooth[180:, 115:140] == plain[180:, 115:140]).all()
 
 
-def test_the_matting_laplacian_ignores_affine_functions_of_colour() -> None:
-    image = np.random.default_rng(14).random((12, 15, 3))
-    laplacian = matting_laplacian(image, np.ones((12, 15), bool))
+def test_the_matting_laplacian_is_symmetric_and_ignores_affine_functions_of_colour() -> None:
+    rng = np.random.default_rng(14)
+    image, band = rng.random((12, 15, 3)), np.ones((12, 15), bool)
+    laplacian = MattingLaplacian(image, band)
+    assert np.abs(laplacian.product(np.full((12, 15), 0.7))).max() < 1e-9
     affine = image @ [0.3, -0.5, 0.2] + 0.4
-    assert np.abs(laplacian @ np.full(180, 0.7)).max() < 1e-12
-    assert affine.ravel() @ laplacian @ affine.ravel() < 1e-2
-    assert abs(laplacian - laplacian.T).max() < 1e-12
+    assert abs(np.sum(affine * laplacian.product(affine))) < 1e-2
+    a, b = rng.random((2, 12, 15))
+    assert np.sum(a * laplacian.product(b)) == pytest.approx(np.sum(b * laplacian.product(a)))
+    one = np.zeros((12, 15))
+    one[4, 6] = 1.0
+    assert laplacian.product(one)[4, 6] == pytest.approx(laplacian.diagonal()[4, 6])
+
+
+def test_discs_by_distance_are_the_morphology() -> None:
+    mask = np.random.default_rng(15).random((50, 40)) > 0.2
+    y, x = np.mgrid[-3:4, -3:4]
+    disc = (x**2 + y**2 <= 9).astype(np.uint8)
+    assert np.array_equal(eroded(mask, 3), cv2.erode(mask.astype(np.uint8), disc) > 0)
+    assert np.array_equal(dilated(mask, 3), cv2.dilate(mask.astype(np.uint8), disc) > 0)
+    assert eroded(np.ones((5, 5), bool), 3).all() and not dilated(np.zeros((5, 5), bool), 3).any()
 
 
 def test_half_scale_is_coarser_but_near() -> None:
