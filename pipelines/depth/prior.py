@@ -12,7 +12,9 @@ from express50.cameras import rays
 from pipelines.depth.grid import Grid, View, sample_image
 from pipelines.depth.sweep import mesh_scene
 
-REACH = 0.020  # metres from the tracked mesh within which it is believed; beyond is hair or cloth
+REACH = (
+    0.025  # metres of hull over the tracked mesh up to which it is believed; more is hair, cloth
+)
 BORDER = 0.015  # metres from the mesh's open border over which belief fades in
 
 
@@ -33,7 +35,8 @@ class Prior:
         band = grid.values < 2 * grid.voxel
         points = grid.points(np.argwhere(band))
         distance = self.distance(points)
-        belief = self.belief(points, np.abs(distance))
+        # the hull's height over the mesh is the same all along a normal, so that no shell is left
+        belief = self.belief(points, distance - grid.values[band])
         values = grid.values.copy()
         values[band] += belief * (np.maximum(distance, values[band]) - values[band])
         return Grid(grid.origin, grid.voxel, values)
@@ -44,9 +47,12 @@ class Prior:
         gap = self.scene.compute_distance(query, nthreads=1).numpy()
         return np.where(self._enclosed(points), -gap, gap)
 
-    def belief(self, points: np.ndarray, gap: np.ndarray) -> np.ndarray:
-        """How far (N,) in [0, 1] the tracked surface counts at points (N, 3)."""
-        near = np.clip(2.0 - gap / REACH, 0, 1)
+    def belief(self, points: np.ndarray, height: np.ndarray) -> np.ndarray:
+        """How far (N,) in [0, 1] the tracked surface counts at points (N, 3).
+
+        ``height`` (N,) is how far, metres, the visual hull rises over the mesh there.
+        """
+        near = np.clip(2.0 - height / REACH, 0, 1)
         if self.border is None:
             return near
         query = o3d.core.Tensor(np.ascontiguousarray(points, np.float32))

@@ -101,6 +101,20 @@ def test_prior_counts_inner_sheets_and_capped_holes_as_inside():
     assert believed.tolist() == [1.0, 0.0]
 
 
+def test_prior_gives_way_where_the_hull_rises_far_above_it():
+    """Hair and shoulders stand over the tracked mesh; they are kept whole, without a shell."""
+    vertices, faces = mesh()
+    prior = make_prior(vertices, faces)
+    axis = np.linspace(-0.25, 0.25, 51)
+    cube = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1)
+    far = Grid(np.full(3, -0.25), 0.01, (np.linalg.norm(cube, axis=-1) - 0.2).astype(np.float32))
+    np.testing.assert_array_equal(prior.merge(far).values, far.values)
+    own = prior.distance(cube.reshape(-1, 3)).reshape(far.values.shape)
+    near = Grid(far.origin, far.voxel, (own - 0.01).astype(np.float32))
+    inside = near.values < 0.02
+    np.testing.assert_allclose(prior.merge(near).values[inside], own[inside], atol=1e-6)
+
+
 def test_fewer_cameras_still_give_a_head(shots):
     few = [make_view(c, rgb, alpha, 1024) for c, rgb, alpha, _ in shots[2:6]]
     assert np.median(errors_mm(reconstruct(few, QUICK), shots[2:6])) < 3.0
