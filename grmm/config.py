@@ -186,6 +186,9 @@ class TrainConfig:
     """Views whose gradients are averaged in a step (4 stands for the paper's four GPUs)."""
     clip_norm: float = 0.0
     """Clip the gradient's norm, 0 = never. Silent in P."""
+    shuffle_directions: float = 0.0
+    """Share of views whose colours are decoded for another training camera's direction. Not in P:
+    with few cameras the colour decoder learns by heart what each sees, and errs in between."""
     warm_start: bool = True
     """Start from the mean texture of the training images. Silent in P; G17."""
     warm_start_images: int = 96
@@ -201,6 +204,7 @@ class TrainConfig:
     """Threads of torch, 0 = leave as it is."""
 
     def __post_init__(self) -> None:
+        _in_range("train.shuffle_directions", self.shuffle_directions, 0.0, 1.0)
         for name in ("iterations", "accumulate", "save_every", "log_every"):
             if getattr(self, name) < 1:
                 raise ConfigError(f"train.{name} is {getattr(self, name)}, expected >= 1")
@@ -220,6 +224,8 @@ class FitConfig:
     """Rate at the end of stage 1 over the rate at its start (1e-2 -> 1e-3)."""
     stage2_lr: float = 1e-4
     stage2_texel_lr_scale: float = 1.0
+    shuffle_directions: float = 0.0
+    """As train.shuffle_directions, in stage 2: one or two views say little of view dependence."""
     tune_refinement: bool = False
     """Fine-tune the refinement too. P names only the decoders."""
     texture_warm_start: bool = False
@@ -235,6 +241,7 @@ class FitConfig:
 
     def __post_init__(self) -> None:
         _in_range("fit.stage1_share", self.stage1_share, 0.0, 1.0)
+        _in_range("fit.shuffle_directions", self.shuffle_directions, 0.0, 1.0)
         _in_range("fit.locality_t", self.locality_t, 0.0, 1.0)
         if self.locality_every < 1:
             raise ConfigError(f"fit.locality_every is {self.locality_every}, expected >= 1")
@@ -302,6 +309,7 @@ PRESETS: dict[str, dict[str, dict[str, Any]]] = {
             "stage2_lr": 1e-3,
             "stage2_texel_lr_scale": 5.0,
             "texture_warm_start": True,
+            "shuffle_directions": 0.5,
             "locality_every": 2,
         },
     },

@@ -29,7 +29,7 @@ from grmm.metrics import UNAVAILABLE
 from grmm.model import GRMM, HeadState, Rendering, View
 from grmm.progress import log
 from grmm.render import comparison_sheet, interpolate_tracked
-from grmm.warm_start import LOGIT_LIMIT, project_texture
+from grmm.warm_start import LOGIT_LIMIT, project_texture, spread_change
 
 
 @dataclass(kw_only=True)
@@ -172,8 +172,9 @@ def tune_decoders(state: Fit, late: Callable[[], bool]) -> int:
     for number, item in _items(state, settings.stage2_iterations, late):
         optimizer.zero_grad()
         z_exp = state.z_exp[item.key.expression]
+        shade = random_camera(state, rng) if rng.random() < settings.shuffle_directions else None
         rendering = state.model.render(
-            state.z_id, z_exp, item.state, item.view, state.views.background
+            state.z_id, z_exp, item.state, item.view, state.views.background, shade
         )
         loss = _both(rendering, item, state.weights)
         if settings.locality and number % settings.locality_every == 0:
@@ -219,22 +220,31 @@ def _decoder_optimizer(state: Fit) -> torch.optim.Optimizer:
 
 
 def start_texture(state: Fit) -> None:
-    """Put the colours that the given views show into the bias, where they show any (FitConfig)."""
+    """Put the colours that the given views show into the bias (FitConfig.texture_warm_start).
+
+    Texels that no view shows change as seen texels do that looked alike before and lie near them
+    or near their mirror image: a paler face comes with paler ears.
+    """
     model = state.model
     shown = []
     for expression, z_exp in state.z_exp.items():
         own = [i for i in state.given if state.views.keys[i].expression == expression]
         shown.append(project_texture(model, state.views, own, state.z_id, z_exp))
-    weight = sum(w for _, w in shown)
-    colours = sum(w[:, None] * c for c, w in shown) / weight.clamp_min(1e-8)[:, None]
+    weight = torch.stack([w for _, w in shown]).sum(0)
+    colours = torch.stack([w[:, None] * c for c, w in shown]).sum(0)
+    colours = colours / weight.clamp_min(1e-8)[:, None]
     item = state.views.item(state.given[0])
     with torch.no_grad():
-        now = model.appearance(state.z_id, item.state, item.view)[:, :3]
+        views = [state.views.item(i).view for i in state.given[:8]]
+        now = torch.stack([model.appearance(state.z_id, item.state, v)[:, :3] for v in views])
+        now = now.mean(0)
         wanted = torch.logit(colours.clamp(LOGIT_LIMIT, 1 - LOGIT_LIMIT))
         change = wanted - torch.logit(now.clamp(LOGIT_LIMIT, 1 - LOGIT_LIMIT))
+        place = model.geometry(state.z_id, next(iter(state.z_exp.values())), item.state).means
+        guess = spread_change(change, weight, now, place)
         # Texels seen at a slant are blurred: trust grows with the squared cosine.
         trust = (weight / 0.25).clamp(0, 1)[:, None]
-        model.colour.bias.flatten(1)[:3, model.texels] += (trust * change).T
+        model.colour.bias.flatten(1)[:3, model.texels] += (trust * change + (1 - trust) * guess).T
 
 
 def locality_loss(state: Fit, item: Item, rng: np.random.Generator) -> Tensor:
@@ -246,8 +256,7 @@ def locality_loss(state: Fit, item: Item, rng: np.random.Generator) -> Tensor:
     """
     frames = sorted(state.loaded.gallery.frames)
     subject, expression = frames[int(rng.integers(len(frames)))]
-    cameras = state.loaded.gallery.cameras
-    view = cameras[sorted(cameras)[int(rng.integers(len(cameras)))]]
+    view = random_camera(state, rng)
     t = state.settings.locality_t
     mine = state.views.sample(_index_of(state, item)).tracked
     head_state, z_id, z_exp = blend(
@@ -260,6 +269,12 @@ def locality_loss(state: Fit, item: Item, rng: np.random.Generator) -> Tensor:
     if state.model.refinement is not None:
         loss = loss + losses.reconstruction(tuned.image, before.image, state.weights)
     return loss
+
+
+def random_camera(state: Fit, rng: np.random.Generator) -> View:
+    """One of the training cameras."""
+    cameras = state.loaded.gallery.cameras
+    return cameras[sorted(cameras)[int(rng.integers(len(cameras)))]]
 
 
 def blend(

@@ -186,18 +186,31 @@ class GRMM(nn.Module):
         return self.z_id[subject], self.z_exp[expression]
 
     def forward(
-        self, subject: int, expression: int, state: HeadState, view: View, background: float = 0.0
+        self,
+        subject: int,
+        expression: int,
+        state: HeadState,
+        view: View,
+        background: float = 0.0,
+        shade_view: View | None = None,
     ) -> Rendering:
         """Render a training subject and expression (indices into the code tables)."""
         z_id, z_exp = self.codes(subject, expression)
-        return self.render(z_id, z_exp, state, view, background)
+        return self.render(z_id, z_exp, state, view, background, shade_view)
 
     def render(
-        self, z_id: Tensor, z_exp: Tensor, state: HeadState, view: View, background: float = 0.0
+        self,
+        z_id: Tensor,
+        z_exp: Tensor,
+        state: HeadState,
+        view: View,
+        background: float = 0.0,
+        shade_view: View | None = None,
     ) -> Rendering:
-        """Render any codes: (z_id,), (z_exp,)."""
+        """Render any codes: (z_id,), (z_exp,); colours as ``shade_view`` sees them, if given."""
         gaussians = self.geometry(z_id, z_exp, state)
-        return self.draw(gaussians, self.appearance(z_id, state, view), view, background)
+        colours = self.appearance(z_id, state, view if shade_view is None else shade_view)
+        return self.draw(gaussians, colours, view, background)
 
     def geometry(self, z_id: Tensor, z_exp: Tensor, state: HeadState) -> Gaussians:
         """Decode everything that does not depend on the view."""

@@ -27,7 +27,7 @@ from grmm.config import Config, as_tables
 from grmm.data import HeadViews, Item, Shuffle, Source, spread
 from grmm.evaluate import evaluate, mean, training_render
 from grmm.metrics import UNAVAILABLE
-from grmm.model import GRMM, Rendering
+from grmm.model import GRMM, Rendering, View
 from grmm.perceptual import load_vgg, random_crop
 from grmm.progress import Interrupt, append_log, deferred_interrupt, log, start_log
 from grmm.render import comparison_sheet
@@ -226,7 +226,10 @@ def step(run: Run, parallel: torch.nn.Module, config: Config) -> None:
         item = run.views.item(run.shuffle.next(), config.data.crop_margin_px)
         subject = run.model.subjects.index(item.key.subject)
         expression = run.model.expressions.index(item.key.expression)
-        rendering = parallel(subject, expression, item.state, item.view, run.views.background)
+        shade_view = other_direction(run, config.train.shuffle_directions)
+        rendering = parallel(
+            subject, expression, item.state, item.view, run.views.background, shade_view
+        )
         terms = objective(run, rendering, item, config)
         loss = torch.stack(list(terms.values())).sum()
         run.terms = {name: float(term.detach()) for name, term in terms.items()}
@@ -239,6 +242,15 @@ def step(run: Run, parallel: torch.nn.Module, config: Config) -> None:
     if config.train.clip_norm:
         torch.nn.utils.clip_grad_norm_(run.model.parameters(), config.train.clip_norm)
     run.optimizer.step()
+
+
+def other_direction(run: Run, share: float) -> View | None:
+    """A random training view in a ``share`` of calls, else None."""
+    if float(torch.rand((), generator=run.generator)) >= share:
+        return None
+    index = run.training[int(torch.randint(len(run.training), (), generator=run.generator))]
+    sample = run.views.sample(index)
+    return run.views.view_of(sample, sample.alpha.shape[1], sample.alpha.shape[0])
 
 
 def objective(run: Run, rendering: Rendering, item: Item, config: Config) -> dict[str, Tensor]:

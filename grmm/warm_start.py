@@ -17,6 +17,7 @@ from grmm.model import GRMM, Gaussians
 
 FACING = 0.25  # cosine of normal and view below which a texel is seen too obliquely
 OCCLUSION_M = 0.012  # a texel this far behind the rendered surface is hidden; hair is this thick
+ALIKE_COLOUR, ALIKE_M = 0.08, 0.04  # how far texels may differ and still change alike
 LOGIT_LIMIT = 0.01  # colours are kept this far from 0 and 1 before the logit
 
 
@@ -112,6 +113,31 @@ def _seen_colours(model: GRMM, gaussians: Gaussians, item: Item) -> tuple[Tensor
     hit = (points[:, 2] > 0) & (points[:, 2] < sampled[:, 3] + OCCLUSION_M)
     seen = hit & (sampled[:, 4:] > 0.99).all(1) & (facing > FACING)
     return sampled[:, :3], seen * facing.square()
+
+
+def spread_change(
+    change: Tensor, weight: Tensor, colours: Tensor, means: Tensor, samples: int = 1024
+) -> Tensor:
+    """What changes of seen texels let one expect at every texel (N, 3).
+
+    A kernel regression on colour before the change and on place, with the head's left and right
+    folded together; at most ``samples`` seen texels, evenly taken, speak for all.
+
+    Args:
+        change: (N, 3), meaningful where ``weight`` is positive.
+        weight: (N,) how well each texel was seen.
+        colours: (N, 3) before the change, in [0, 1].
+        means: (N, 3) head space, metres.
+        samples: bound on the work.
+    """
+    seen = torch.nonzero(weight > 0.25 * weight.max())[:, 0] if bool((weight > 0).any()) else []
+    if not len(seen):
+        return torch.zeros_like(change)
+    seen = seen[:: max(1, len(seen) // samples)]
+    folded = torch.cat([means[:, :1].abs(), means[:, 1:]], 1)
+    traits = torch.cat([colours / ALIKE_COLOUR, folded / ALIKE_M], 1)
+    affinity = -0.5 * torch.cdist(traits, traits[seen]).square()
+    return torch.softmax(affinity + torch.log(weight[seen]), 1) @ change[seen]
 
 
 def fill_texels(values: Tensor, known: Tensor, texels: Tensor, n_g: int) -> Tensor:

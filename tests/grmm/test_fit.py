@@ -19,6 +19,7 @@ from grmm.render import (
     write_video,
 )
 from grmm.train import train
+from grmm.warm_start import spread_change
 from tests.grmm.synthetic import EllipsoidSource, ellipsoid_head, tiny_config
 
 
@@ -167,3 +168,14 @@ def test_turntable_grid_and_interpolation(loaded, tmp_path):
 def test_unknown_frames_are_named(loaded):
     with pytest.raises(FormatError, match="knows no frame S009/e0; expected one such as S000/e0"):
         loaded.state("S009", "e0")
+
+
+def test_unseen_texels_change_like_their_mirror_images():
+    means = torch.tensor([[0.05, 0, 0], [-0.05, 0, 0], [0.0, 0.2, 0], [0.0, -0.2, 0]])
+    colours = torch.tensor([[0.5] * 3, [0.5] * 3, [0.1] * 3, [0.5] * 3])
+    change = torch.tensor([[1.0] * 3, [9.0] * 3, [-1.0] * 3, [9.0] * 3])
+    weight = torch.tensor([1.0, 0.0, 1.0, 0.0])  # the others' values mean nothing
+    guess = spread_change(change, weight, colours, means)
+    torch.testing.assert_close(guess[1], torch.ones(3))  # mirror of the first
+    torch.testing.assert_close(guess[3], torch.ones(3), atol=0.1, rtol=0)  # the first's colour
+    assert torch.equal(spread_change(change, 0 * weight, colours, means), torch.zeros(4, 3))
