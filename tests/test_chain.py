@@ -24,7 +24,8 @@ pytestmark = pytest.mark.slow
 STAGES = ("ingest", "calibrate", "align", "matte", "track", "depth", "pack")
 SETTINGS = {"pack": ["--set", "pack.size=96", "--set", 'pack.test_subjects=["S002"]']}
 RECORDING = [
-    "--subjects=2", "--cameras=6", "--width=192", "--height=192", "--frames-per-expression=4",
+    "--subjects=2", "--cameras=6", "--give-calibration", "--width=192", "--height=192",
+    "--frames-per-expression=4",
     "--expressions=neutral,smile,jaw_open", "--seed=3", "--workers=2",
 ]  # fmt: skip
 
@@ -116,8 +117,8 @@ def test_report_and_training_follow(dataset, tmp_path):
 
     shards = str(dataset.item_dir("pack", "shards"))
     out = dataset.root / "grmm" / "train"
-    assert grmm(["train", shards, str(out), "--preset", "demo", "--iterations", "3"]) == 0
-    assert json.loads((out / "metrics.json").read_text())["iterations"] == 3
+    assert grmm(["train", shards, str(out), "--preset", "demo", "--seconds", "6"]) == 0
+    assert json.loads((out / "metrics.json").read_text())["iterations"] >= 1
     assert main(["report", str(dataset.root), "--out", str(tmp_path)]) == 0
     page = (tmp_path / "index.html").read_text()
     assert "training" in page

@@ -31,7 +31,7 @@ class RandomHead:
 
 @dataclass(frozen=True)
 class View:
-    """A rendered view: rgba (S, S, 4) uint8, landmarks (68, 2) pixels, facing = cosine to camera."""
+    """A rendered view: rgba (S, S, 4) uint8, landmarks (68, 2) pixels, facing: cosine to camera."""
 
     rgba: np.ndarray
     points: np.ndarray

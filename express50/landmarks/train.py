@@ -1,7 +1,8 @@
 """Make `weights.npz`: `python -m express50.landmarks.train --views DIR [--ict PATH]`.
 
 Trains on renders of random heads only (`synthetic.py`): the procedural head and, where a path is
-given, ICT-FaceKit. No photograph of a person is used. The result depends on the arguments alone.
+given, ICT-FaceKit. No photograph of a person is used. The result depends on the
+arguments alone; the shipped file came from several runs in a row (docs/LOG.md).
 """
 
 from __future__ import annotations

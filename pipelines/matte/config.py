@@ -28,7 +28,7 @@ class MatteConfig:
     shadow: float = 0.25
     """Broad darkening of the plate up to this share is taken for a shadow; 0 turns it off."""
     smooth: bool = False
-    """Smooth alpha along the picture's colours in the uncertain band (1.5 times the time; 5 at 4K)."""
+    """Smooth alpha along colours in the uncertain band (1.5 times the time; 5 at 4K)."""
     noise_frames: int = 4
     """Frames that the camera's noise is measured on."""
     noise_floor: float = 1.0

@@ -2,8 +2,8 @@
 
 The matting Laplacian says that alpha is an affine function of colour in every small window (Levin,
 Lischinski and Weiss 2008). Alone, on a trimap made by machine, it loses to the key; as a smoothness
-beside the key, which stays as the data term, it takes a seventh off the squared error. The matrix is
-never formed: its product is a few box filters (He, Sun and Tang 2010), so memory stays that of a
+beside the key, which stays as the data term, it takes a seventh off the squared error. The matrix
+is never formed: its product is a few box filters (He, Sun and Tang 2010), so memory stays that of a
 few images at any size.
 """
 

@@ -276,7 +276,7 @@ def _write_track(
     for name, array in arrays.items():
         if array.dtype.kind == "f" and not np.isfinite(array).all():
             raise StageError(f"{name} holds NaN or infinite values; the fit diverged")
-    np.savez(path, **arrays)
+    np.savez(path, **arrays)  # type: ignore[arg-type]  # numpy types its options only
 
 
 def _metrics(
