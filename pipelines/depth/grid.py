@@ -99,7 +99,7 @@ def hull_distance(views: Sequence[View], points: np.ndarray) -> np.ndarray:
 
     Each view bounds the distance by its silhouette's, scaled from pixels to metres at the point's
     depth; the hull is the intersection, hence the maximum (Laurentini 1994). Points that fewer
-    than two views, or a third of them, see are outside: too little would bound them.
+    than two views, or a third of them, see are outside: phantoms would float before the head.
     """
     distance = np.full(len(points), -UNSEEN, np.float32)
     seen = np.zeros(len(points), np.int8)

@@ -218,7 +218,7 @@ def _depth_picture(view: DepthView) -> np.ndarray:
 
 STAGE = Stage(
     name="depth",
-    version=2,
+    version=3,
     config=DepthConfig,
     presets=PRESETS,
     items=items,

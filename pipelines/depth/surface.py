@@ -199,11 +199,10 @@ def closed(values: np.ndarray) -> np.ndarray:
 
 
 def largest_part(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Faces (F', 3) of the connected parts that hold at least a tenth of the largest one's."""
+    """Faces (F', 3) of the largest connected part: a head is one; what floats beside it is not."""
     graph = sparse.coo_matrix(
         (np.ones(len(faces) * 2), (faces[:, [0, 1]].ravel(), faces[:, [1, 2]].ravel())),
         (len(vertices), len(vertices)),
     )
     label = sparse.csgraph.connected_components(graph, directed=False)[1][faces[:, 0]]
-    sizes = np.bincount(label)
-    return faces[sizes[label] >= 0.1 * sizes.max()]
+    return faces[label == np.bincount(label).argmax()]

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.ndimage import minimum_filter
 
 from express50.cameras import pinhole_camera, project, unproject
 from express50.errors import StageError
@@ -171,9 +172,12 @@ def test_samples_of_two_cameras_agree_on_the_surface(packed):
     pixels, depth = project(camera(second), points)
     column, row = np.floor(pixels).astype(int).T
     ok = (column >= 0) & (row >= 0) & (column < 64) & (row < 64)
-    seen = second["depth"][row[ok], column[ok]]
+    # the nearest of 3 x 3 pixels: at an occluding edge half a pixel decides between two surfaces
+    near = minimum_filter(np.where(second["depth"] > 0, second["depth"], np.inf), 3)
+    seen, nearest = second["depth"][row[ok], column[ok]], near[row[ok], column[ok]]
     gap = (depth[ok] - seen)[seen > 0]
-    assert (gap < -0.01).mean() < 0.02  # nothing stands in front of what the other camera sees
+    in_front = depth[ok] - nearest < -0.01
+    assert in_front[seen > 0].mean() < 0.002  # nothing stands before what the other camera sees
     assert (np.abs(gap) < 0.004).mean() > 0.3  # the rest is hidden from it
     assert first["alpha"][first["valid"]].mean() > 0.9
     assert first["meta"]["track"]["R"] == np.eye(3).tolist()
