@@ -20,6 +20,7 @@ from express50.layout import Dataset
 from express50.twin.truth import Truth, align_worlds
 
 VIEWS_A_PEAK = 2  # views measured of every peak; they walk around the rig from peak to peak
+SHEET_ROWS = 7
 ERROR_RANGE_MM = 8.0  # white in the error pictures
 NEUTRAL = "neutral"
 
@@ -129,8 +130,11 @@ def measure_track(dataset: Dataset, truth: Truth, out: Path | None = None) -> di
 
 
 def measure_depth(dataset: Dataset, truth: Truth, out: Path | None = None) -> dict:
-    """Absolute depth errors over pixels where both know the surface, and how many are covered."""
-    errors, covered, rows, names = [], [], [], []
+    """Absolute depth errors over pixels where both know the surface, and how many are covered.
+
+    The errors of skin are told apart: the truth's hair is single strands, which no surface follows.
+    """
+    errors, skin, covered, rows, names = [], [], [], [], []
     for subject, expression, frame, camera in sampled_views(dataset, truth):
         path = dataset.item_dir("depth", f"{subject}/{expression}") / f"{camera.id}.png"
         if not path.is_file():
@@ -139,6 +143,7 @@ def measure_depth(dataset: Dataset, truth: Truth, out: Path | None = None) -> di
         true, true_valid = truth.render_depth(subject, frame, camera)
         both = valid & true_valid
         errors.append(1e3 * np.abs(depth - true)[both])
+        skin.append(1e3 * np.abs(depth - true)[both & truth.skin(subject, frame, camera)])
         covered.append(both.sum() / max(1, true_valid.sum()))
         rows.append(
             [_depth_grey(depth, valid), _depth_grey(true, true_valid), _heat(depth - true, both)]
@@ -151,6 +156,7 @@ def measure_depth(dataset: Dataset, truth: Truth, out: Path | None = None) -> di
     return {
         "abs_error_mm_median": float(np.median(every)),
         "abs_error_mm_p95": float(np.percentile(every, 95)),
+        "skin_error_mm_median": float(np.median(np.concatenate(skin))),
         "coverage": float(np.mean(covered)),
         "views": len(errors),
     }
@@ -181,6 +187,7 @@ def _sheet(out: Path | None, name: str, rows: list, names: list[str]) -> None:
     if out is None or not rows:
         return
     out.mkdir(parents=True, exist_ok=True)
-    step = max(1, len(rows) // 6)
-    sheet = contact_sheet(rows[::step][:6], names[::step][:6], tile=(240, 240))
+    # an odd step meets every camera of an even rig
+    chosen = range(0, len(rows), max(1, len(rows) // SHEET_ROWS) | 1)
+    sheet = contact_sheet([rows[k] for k in chosen], [names[k] for k in chosen], tile=(240, 240))
     write_image(out / f"{name}.jpg", sheet, quality=88)

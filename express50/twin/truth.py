@@ -28,6 +28,7 @@ from express50.twin.performance import Performance
 from express50.twin.subjects import Look, Subject
 from express50.twin.surface import Caster
 
+SKIN_M = 0.5e-3  # hair roots stand on the skin; what lies this near to it is skin
 _PLAY = ("strength", "expression", "jaw", "neck", "eyes", "R", "t")
 
 
@@ -120,6 +121,13 @@ class Truth:
         """Depth (H, W) float32, camera z in metres, 0 where empty, and validity (H, W) bool."""
         caster, _ = self._scene(subject, frame)
         return render.render_depth(caster, camera)
+
+    def skin(self, subject: str, frame: int, camera: Camera) -> np.ndarray:
+        """Pixels (H, W) bool where the head's own surface is what the camera sees first."""
+        depth, valid = self.render_depth(subject, frame, camera)
+        caster = Caster(self.vertices(subject, frame), self.head_model(subject).faces.numpy())
+        bare, there = render.render_depth(caster, camera)
+        return valid & there & (np.abs(bare - depth) < SKIN_M)
 
     def render_alpha(self, subject: str, frame: int, camera: Camera) -> np.ndarray:
         """Alpha (H, W) float32 in [0, 1] of the subject, from 32 rays a pixel at silhouettes."""
