@@ -44,8 +44,8 @@ def metric_bars(figures: dict[str, dict[str, float]], columns: list[str]) -> Mar
     if not varying:
         return Markup("")
     figure = Figure(figsize=(2.9 * len(varying), 1.8))
-    for place, column in enumerate(varying, 1):
-        axes = figure.add_subplot(1, len(varying), place)
+    figure.subplots(1, len(varying))
+    for axes, column in zip(figure.axes, varying, strict=True):
         values = [row[column] for row in figures.values() if column in row]
         axes.bar(range(len(values)), values, color=_INK)
         axes.set_title(column.replace("_", " "), fontsize=9)
