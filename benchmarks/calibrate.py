@@ -47,7 +47,7 @@ from pipelines.calibrate.intrinsics import (
     with_ideal,
 )
 from pipelines.calibrate.solve import solve_rig
-from pipelines.calibrate.world import meeting_point
+from express50.rigs.world import meeting_point
 
 HEAD_RADIUS_M = 0.13
 

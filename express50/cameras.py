@@ -271,9 +271,19 @@ def read_cameras(path: Path) -> dict[str, Camera]:
         ) from None
     except (json.JSONDecodeError, UnicodeDecodeError) as error:
         raise CalibrationError(f"{path}: not JSON ({error}); write it anew") from None
+    return parse_cameras(table, str(path))
+
+
+def parse_cameras(table: object, where: str) -> dict[str, Camera]:
+    """Cameras of a calibration file's content.
+
+    Raises:
+        CalibrationError: there is none, or one has a field of the wrong shape or value.
+    """
     if not isinstance(table, dict) or not table:
-        raise CalibrationError(f"{path}: expected a table of cameras, got {type(table).__name__}")
-    return {camera_id: _parse_camera(str(path), camera_id, row) for camera_id, row in table.items()}
+        got = "an empty one" if isinstance(table, dict) else type(table).__name__
+        raise CalibrationError(f"{where}: expected a table of cameras, got {got}")
+    return {camera_id: _parse_camera(where, camera_id, row) for camera_id, row in table.items()}
 
 
 def _parse_camera(path: str, camera_id: str, row: object) -> Camera:
@@ -326,7 +336,12 @@ def _numbers(where: str, name: str, value: object, shape: tuple[int, ...]) -> np
 
 def write_cameras(path: Path, cameras: Mapping[str, Camera]) -> None:
     """Write a calibration file that :func:`read_cameras` reads."""
-    table = {
+    Path(path).write_text(json.dumps(camera_rows(cameras), indent=1) + "\n")
+
+
+def camera_rows(cameras: Mapping[str, Camera]) -> dict[str, dict]:
+    """Content of a calibration file, as :func:`parse_cameras` takes it."""
+    return {
         camera_id: {
             "model": camera.model,
             "width": camera.width,
@@ -336,4 +351,3 @@ def write_cameras(path: Path, cameras: Mapping[str, Camera]) -> None:
         }
         for camera_id, camera in sorted(cameras.items())
     }
-    Path(path).write_text(json.dumps(table, indent=1) + "\n")

@@ -19,6 +19,7 @@ AREAS = {
     "twin": ("express50.twin.cli", "record a synthetic capture with known truth"),
     "annotate": ("annotations.cli", "label peak frames, review and export labels"),
     "shards": ("express50.shards_cli", "look into packed shards and verify them"),
+    "cameras": ("express50.rigs.cli", "import and check calibrations"),
     "head": ("express50.head.cli", "look at a head model"),
     "subject": ("express50.subject_cli", "withdraw a person from a dataset"),
     "report": ("express50.report.cli", "gather QC figures into one HTML page"),

@@ -12,8 +12,8 @@ from matplotlib.figure import Figure
 
 from express50.cameras import Camera
 from express50.images import write_image
+from express50.rigs.world import meeting_point
 from pipelines.calibrate.solve import Solution
-from pipelines.calibrate.world import meeting_point
 
 
 def _save(figure: Figure, path: Path) -> None:

@@ -12,6 +12,7 @@ import numpy as np
 
 from express50.cameras import Camera
 from express50.errors import CalibrationError
+from express50.rigs.world import canonical_from_rig, move_cameras
 from pipelines.calibrate import graph
 from pipelines.calibrate.board import Observations, even
 from pipelines.calibrate.bundle import Rig, adjust, residuals
@@ -26,7 +27,6 @@ from pipelines.calibrate.intrinsics import (
     usable,
     with_ideal,
 )
-from pipelines.calibrate.world import canonical_from_rig, move_cameras
 
 # From few to many parameters: a focal length and one radial term, two terms, two focal lengths
 # and tangential terms.

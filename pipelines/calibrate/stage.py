@@ -10,12 +10,12 @@ from express50.cameras import Camera, read_cameras, write_cameras
 from express50.errors import CalibrationError
 from express50.index import Index, index_path, read_index
 from express50.layout import Dataset
+from express50.rigs.world import check_meeting
 from express50.stage import Stage
 from pipelines.calibrate.board import board_from_table, board_points, read_observations
 from pipelines.calibrate.config import PRESETS, CalibrateConfig
 from pipelines.calibrate.pictures import draw_residuals, draw_rig
 from pipelines.calibrate.solve import Solution, solve_rig
-from pipelines.calibrate.world import check_meeting
 
 
 def items(dataset: Dataset) -> list[str]:

@@ -22,7 +22,7 @@ from pipelines.calibrate.bundle import residuals
 from pipelines.calibrate.config import CalibrateConfig
 from pipelines.calibrate.solve import Rig, solve_rig
 from pipelines.calibrate.stage import check_given
-from pipelines.calibrate.world import canonical_from_rig, meeting_point, move_cameras
+from express50.rigs.world import canonical_from_rig, meeting_point, move_cameras
 from tests.pipelines.board_rigs import (
     BOARD,
     POINTS,

@@ -1,0 +1,129 @@
+"""Parts that every importer needs: cameras from K and distortion, names, sizes, scale."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from express50.cameras import Camera, camera_rows, parse_cameras, resized
+from express50.errors import CalibrationError
+
+
+def camera_from_K(
+    camera_id: str,
+    K: np.ndarray,
+    dist: Sequence[float] | np.ndarray,
+    size: tuple[int, int],
+    cam_from_world: np.ndarray,
+) -> Camera:
+    """A camera of the smallest COLMAP model that holds the distortion.
+
+    Args:
+        camera_id: its name.
+        K: (3, 3) pixels, corner origin.
+        dist: OpenCV's order k1 k2 p1 p2 k3 k4 k5 k6; absent ones are 0.
+        size: width and height, pixels.
+        cam_from_world: (4, 4), OpenCV axes.
+
+    Raises:
+        CalibrationError: K has skew, or distortion that no model holds (thin prism, tilt).
+    """
+    K, d = np.asarray(K, dtype=np.float64), np.zeros(14)
+    d[: len(dist)] = np.asarray(dist, dtype=np.float64).ravel()
+    if K.shape != (3, 3) or abs(K[0, 1]) > 1e-3 * abs(K[0, 0]) or d[8:].any():
+        raise CalibrationError(
+            f"camera {camera_id}: K {K.tolist()} or distortion {d.tolist()} is beyond COLMAP's"
+            " FULL_OPENCV model; expected no skew and at most k1 k2 p1 p2 k3 k4 k5 k6: calibrate"
+            " again without thin-prism and tilted models"
+        )
+    params = [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]
+    model, count = "PINHOLE", 0
+    if d.any():
+        model, count = ("OPENCV", 4) if not d[4:].any() else ("FULL_OPENCV", 8)
+    numbers = tuple(float(x) for x in [*params, *d[:count]])
+    pose = np.asarray(cam_from_world, dtype=np.float64)
+    return Camera(camera_id, int(size[0]), int(size[1]), model, numbers, pose)
+
+
+def names_from_files(files: Sequence[str]) -> list[str]:
+    """Camera names of image files: the folder where each folder holds one, else the file's stem.
+
+    ``cam00/000000.jpg, cam01/000000.jpg`` gives ``cam00, cam01``; ``x/a.jpg, x/b.jpg`` ``a, b``.
+    """
+    paths = [Path(f) for f in files]
+    folders = [path.parent.name for path in paths]
+    if all(folders) and len(set(folders)) == len(files) > 1:
+        names = folders
+    elif len({path.parent for path in paths}) == 1:
+        names = [path.stem for path in paths]
+    else:
+        names = [path.with_suffix("").as_posix() for path in paths]
+    return [re.sub(r"[^\w.+-]+", "_", name).strip("_") for name in names]
+
+
+def at_size(cameras: dict[str, Camera], size: tuple[int, int] | None) -> dict[str, Camera]:
+    """The cameras with K scaled to the footage's size (width, height); None leaves them.
+
+    Raises:
+        CalibrationError: the aspect ratio is another, so that a crop and not a scale is missing.
+    """
+    if size is None:
+        return cameras
+    found = {}
+    for name, camera in cameras.items():
+        sx, sy = size[0] / camera.width, size[1] / camera.height
+        if abs(sx / sy - 1) > 0.01:
+            raise CalibrationError(
+                f"camera {name}: calibrated at {camera.width}x{camera.height}, footage of"
+                f" {size[0]}x{size[1]} has another shape; expected the same aspect ratio: was the"
+                " footage cropped or turned?"
+            )
+        found[name] = resized(camera, *size)
+    return found
+
+
+def in_metres(cameras: dict[str, Camera], metres_per_unit: float) -> dict[str, Camera]:
+    """The cameras with positions scaled to metres.
+
+    Raises:
+        CalibrationError: the factor is not a positive finite number.
+    """
+    if not (np.isfinite(metres_per_unit) and metres_per_unit > 0):
+        raise CalibrationError(f"scale {metres_per_unit} m per unit, expected a positive number")
+    found = {}
+    for name, camera in cameras.items():
+        pose = camera.cam_from_world.copy()
+        pose[:3, 3] *= metres_per_unit
+        found[name] = replace(camera, cam_from_world=pose)
+    return found
+
+
+def checked(cameras: dict[str, Camera], path: Path) -> dict[str, Camera]:
+    """The cameras after the checks that our own calibration file must pass.
+
+    Raises:
+        CalibrationError: there are none, or one has a wrong rotation, focal length or number.
+    """
+    return parse_cameras(camera_rows(cameras), str(path))
+
+
+def read_table(path: Path) -> dict:
+    """A JSON table.
+
+    Raises:
+        CalibrationError: the file is missing or is not a JSON table.
+    """
+    try:
+        table = json.loads(path.read_text())
+    except FileNotFoundError:
+        raise CalibrationError(f"{path}: no such file") from None
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise CalibrationError(f"{path}: not JSON ({error})") from None
+    if not isinstance(table, dict):
+        raise CalibrationError(f"{path}: expected a JSON table, got {type(table).__name__}")
+    return table

@@ -1,0 +1,106 @@
+"""Cameras of a ``transforms.json`` (instant-ngp, Nerfstudio, VHAP, GaussianAvatars).
+
+Poses are camera to world with OpenGL axes; intrinsics stand beside each frame or at the top.
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+
+from express50.adapters import cam_from_world_from_opengl
+from express50.cameras import Camera
+from express50.errors import CalibrationError
+from express50.rigs.build import camera_from_K, checked, names_from_files, read_table
+
+_HELD = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE")
+
+
+def is_transforms(path: Path) -> bool:
+    """Whether a file, or a folder's transforms.json, has frames with matrices."""
+    path = _file(path)
+    return path.suffix == ".json" and path.is_file() and "transform_matrix" in path.read_text()
+
+
+def _file(path: Path) -> Path:
+    return path / "transforms.json" if path.is_dir() else path
+
+
+def read_transforms(path: Path, size: tuple[int, int] | None) -> dict[str, Camera]:
+    """One camera a frame, or a camera index where frames of several time steps share cameras.
+
+    Args:
+        path: the file, or the folder that holds transforms.json.
+        size: width and height of the images where the file does not say.
+
+    Raises:
+        CalibrationError: a frame lacks what a camera needs, or a camera moves between frames.
+    """
+    path = _file(path)
+    table = read_table(path)
+    frames = table.get("frames")
+    if not isinstance(frames, list) or not frames:
+        raise CalibrationError(f"{path}: has no frames; expected [{{transform_matrix, ...}}, ...]")
+    names = _names(frames)
+    found: dict[str, Camera] = {}
+    for number, (name, frame) in enumerate(zip(names, frames, strict=True)):
+        camera = _camera(f"{path}: frame {number} ({name})", name, table | frame, size)
+        earlier = found.setdefault(name, camera)
+        if np.abs(earlier.cam_from_world - camera.cam_from_world).max() > 1e-6:
+            raise CalibrationError(
+                f"{path}: camera {name} moves between frames; expected a fixed rig: give each image"
+                " its own name, or export one time step"
+            )
+    return checked(found, path)
+
+
+def _names(frames: list[dict]) -> list[str]:
+    if all("camera_index" in frame for frame in frames):
+        return [f"cam{int(frame['camera_index']):02d}" for frame in frames]
+    return names_from_files(
+        [str(frame.get("file_path", f"frame{n:04d}")) for n, frame in enumerate(frames)]
+    )
+
+
+def _camera(where: str, name: str, row: dict, size: tuple[int, int] | None) -> Camera:
+    model = str(row.get("camera_model", "OPENCV"))
+    if model not in _HELD:
+        raise CalibrationError(
+            f"{where}: camera_model {model}, expected one of {', '.join(_HELD)}; undistort first"
+        )
+    matrix = np.asarray(row.get("transform_matrix"), dtype=object)
+    if matrix.shape not in ((4, 4), (3, 4)):
+        raise CalibrationError(
+            f"{where}: transform_matrix has shape {matrix.shape}, expected (4, 4)"
+        )
+    world_from_cam = np.eye(4)
+    world_from_cam[: len(matrix)] = matrix.astype(np.float64)
+    width, height = _size(where, row, size)
+    K = _K(where, row, width, height)
+    dist = [float(row.get(key, 0.0)) for key in ("k1", "k2", "p1", "p2", "k3", "k4")]
+    if model != "OPENCV":
+        dist = []
+    return camera_from_K(name, K, dist, (width, height), cam_from_world_from_opengl(world_from_cam))
+
+
+def _size(where: str, row: dict, size: tuple[int, int] | None) -> tuple[int, int]:
+    if "w" in row and "h" in row:
+        return int(row["w"]), int(row["h"])
+    if size is None:
+        raise CalibrationError(f"{where}: has no w and h; give --size WIDTHxHEIGHT")
+    return size
+
+
+def _K(where: str, row: dict, width: int, height: int) -> np.ndarray:
+    """K (3, 3) of focal lengths or of the horizontal angle of view."""
+    if "fl_x" in row:
+        fx = float(row["fl_x"])
+    elif "camera_angle_x" in row:
+        fx = 0.5 * width / math.tan(0.5 * float(row["camera_angle_x"]))
+    else:
+        raise CalibrationError(f"{where}: has neither fl_x nor camera_angle_x; add one")
+    fy = float(row.get("fl_y", fx))
+    cx, cy = float(row.get("cx", width / 2)), float(row.get("cy", height / 2))
+    return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])

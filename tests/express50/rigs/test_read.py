@@ -1,0 +1,260 @@
+"""Rigs written in other tools' layouts come back as the cameras they were."""
+
+import json
+
+import cv2
+import h5py
+import numpy as np
+import pycolmap
+import pytest
+
+from express50.adapters import K_to_opencv, opengl_from_cam_from_world
+from express50.cameras import Camera, project, resized, write_cameras
+from express50.errors import CalibrationError
+from express50.rigs.build import names_from_files
+from express50.rigs.read import guess_format, read_rig
+from express50.transforms import look_at, matrix_to_axis_angle
+
+HEAD = np.array([[0.02, 1.3, 0.05], [-0.05, 1.22, -0.03], [0.0, 1.25, 0.0]])
+
+
+def make_rig(count=4, dist=(-0.11, 0.07, 0.001, -0.002), size=(640, 480)):
+    rig = {}
+    for k in range(count):
+        angle = np.radians(-60 + 40 * k)
+        eye = np.array([np.sin(angle), 1.3 + 0.05 * k, np.cos(angle)])
+        pose = look_at(eye, np.array([0, 1.25, 0]), np.array([0, 1.0, 0]))
+        params = (900.0 + k, 905.0, size[0] / 2 + 3, size[1] / 2 - 2, *dist)
+        model = "OPENCV" if dist else "PINHOLE"
+        rig[f"cam{k:02d}"] = Camera(f"cam{k:02d}", *size, model, params, pose)
+    return rig
+
+
+def assert_same(found, expected, tolerance=1e-6):
+    assert sorted(found) == sorted(expected)
+    for name, camera in expected.items():
+        other = found[name]
+        assert (other.width, other.height) == (camera.width, camera.height)
+        np.testing.assert_allclose(
+            project(other, HEAD)[0], project(camera, HEAD)[0], atol=tolerance, rtol=0
+        )
+
+
+def write_colmap(folder, rig):
+    model = pycolmap.Reconstruction()
+    for number, (name, camera) in enumerate(rig.items(), 1):
+        model.add_camera_with_trivial_rig(
+            pycolmap.Camera(
+                model=camera.model, width=camera.width, height=camera.height,
+                params=list(camera.params), camera_id=number,
+            )
+        )  # fmt: skip
+        image = pycolmap.Image(name=f"{name}.png", camera_id=number, image_id=number)
+        pose = pycolmap.Rigid3d(camera.cam_from_world[:3])
+        model.add_image_with_trivial_frame(image, pose)
+    folder.mkdir()
+    model.write_text(str(folder))
+
+
+def write_transforms(path, rig, extra=()):
+    frames = [
+        {
+            "file_path": f"images/{name}.png",
+            "transform_matrix": opengl_from_cam_from_world(camera.cam_from_world).tolist(),
+            "fl_x": camera.K[0, 0], "fl_y": camera.K[1, 1],
+            "cx": camera.K[0, 2], "cy": camera.K[1, 2], "w": camera.width, "h": camera.height,
+            **dict(zip(("k1", "k2", "p1", "p2"), camera.dist[:4].tolist(), strict=True)),
+        }
+        for name, camera in rig.items()
+    ]  # fmt: skip
+    path.write_text(json.dumps({"frames": frames, **dict(extra)}))
+
+
+def write_yaml(folder, rig, rodrigues=False):
+    folder.mkdir()
+    for name, camera in rig.items():
+        storage = cv2.FileStorage(str(folder / f"{name}.yml"), cv2.FILE_STORAGE_WRITE)
+        storage.write("image_width", camera.width)
+        storage.write("image_height", camera.height)
+        storage.write("camera_matrix", K_to_opencv(camera.K))
+        storage.write("distortion_coefficients", camera.dist[:5, None])
+        R = camera.cam_from_world[:3, :3]
+        if rodrigues:
+            storage.write("rvec", matrix_to_axis_angle(R)[:, None])
+        else:
+            storage.write("R", R)
+        storage.write("T", camera.cam_from_world[:3, 3:])
+        storage.release()
+
+
+def test_colmap_round_trip(tmp_path):
+    rig = make_rig()
+    write_colmap(tmp_path / "sparse", rig)
+    assert guess_format(tmp_path / "sparse") == "colmap"
+    assert_same(read_rig(tmp_path / "sparse"), rig)
+
+
+def test_colmap_fisheye_is_refused_by_name(tmp_path):
+    write_colmap(tmp_path / "sparse", make_rig(dist=()))
+    file = tmp_path / "sparse" / "cameras.txt"
+    rows = [row.split() for row in file.read_text().splitlines()]
+    for row in rows:
+        if "PINHOLE" in row:
+            row[1], row[8:] = "OPENCV_FISHEYE", ["0", "0", "0", "0"]
+    file.write_text("\n".join(map(" ".join, rows)))
+    with pytest.raises(CalibrationError, match="OPENCV_FISHEYE.*image_undistorter"):
+        read_rig(tmp_path / "sparse")
+
+
+def test_transforms_round_trip(tmp_path):
+    rig = make_rig()
+    write_transforms(tmp_path / "transforms.json", rig)
+    assert guess_format(tmp_path) == "transforms"
+    assert_same(read_rig(tmp_path), rig)
+
+
+def test_transforms_of_many_time_steps_share_cameras_and_must_not_move(tmp_path):
+    rig = make_rig(count=2)
+    path = tmp_path / "transforms.json"
+    write_transforms(path, rig)
+    frames = json.loads(path.read_text())["frames"]
+    steps = [
+        f | {"file_path": f"images/{t:05d}_{k:02d}.png", "camera_index": k, "timestep_index": t}
+        for t in range(3)
+        for k, f in enumerate(frames)
+    ]
+    path.write_text(json.dumps({"frames": steps}))
+    assert_same(read_rig(path), rig)
+    steps[-1] = steps[-1] | {"transform_matrix": np.eye(4).tolist()}
+    path.write_text(json.dumps({"frames": steps}))
+    with pytest.raises(CalibrationError, match="cam01 moves between frames"):
+        read_rig(path)
+
+
+def test_transforms_by_angle_of_view_need_a_size(tmp_path):
+    pose = opengl_from_cam_from_world(make_rig()["cam00"].cam_from_world).tolist()
+    path = tmp_path / "t.json"
+    frames = [{"file_path": "r_0", "transform_matrix": pose}]
+    path.write_text(json.dumps({"camera_angle_x": np.pi / 2, "frames": frames}))
+    with pytest.raises(CalibrationError, match="--size"):
+        read_rig(path)
+    camera = read_rig(path, size=(800, 600))["r_0"]
+    np.testing.assert_allclose(camera.K, [[400, 0, 400], [0, 400, 300], [0, 0, 1]])
+
+
+@pytest.mark.parametrize("rodrigues", [False, True])
+def test_opencv_yaml_round_trip(tmp_path, rodrigues):
+    rig = make_rig()
+    write_yaml(tmp_path / "yaml", rig, rodrigues)
+    assert guess_format(tmp_path / "yaml") == "opencv"
+    assert_same(read_rig(tmp_path / "yaml"), rig)
+
+
+def test_easymocap_pair_round_trip(tmp_path):
+    rig = make_rig()
+    intrinsics = cv2.FileStorage(str(tmp_path / "intri.yml"), cv2.FILE_STORAGE_WRITE)
+    extrinsics = cv2.FileStorage(str(tmp_path / "extri.yml"), cv2.FILE_STORAGE_WRITE)
+    intrinsics.startWriteStruct("names", cv2.FILE_NODE_SEQ)
+    for name in rig:
+        intrinsics.write("", name)
+    intrinsics.endWriteStruct()
+    for name, camera in rig.items():
+        intrinsics.write(f"K_{name}", K_to_opencv(camera.K))
+        intrinsics.write(f"dist_{name}", camera.dist[None, :5])
+        extrinsics.write(f"Rot_{name}", camera.cam_from_world[:3, :3])
+        extrinsics.write(f"T_{name}", camera.cam_from_world[:3, 3:])
+    intrinsics.release()
+    extrinsics.release()
+    with pytest.raises(CalibrationError, match="--size"):
+        read_rig(tmp_path)
+    assert_same(read_rig(tmp_path, size=(640, 480)), rig)
+
+
+def test_yaml_without_pose_names_file_and_keys(tmp_path):
+    write_yaml(tmp_path / "yaml", make_rig())
+    file = tmp_path / "yaml" / "cam02.yml"
+    file.write_text(file.read_text().replace("\nT:", "\nelsewhere:"))
+    with pytest.raises(CalibrationError, match=r"cam02\.yml: no pose; expected R .* T or"):
+        read_rig(tmp_path / "yaml")
+
+
+def test_nersemble_shared_and_own_intrinsics_scale_to_the_footage(tmp_path):
+    rig = make_rig(dist=(), size=(2200, 3208))
+    serials = {f"2222000{k}": c for k, c in enumerate(rig.values())}
+    table = {
+        "world_2_cam": {s: c.cam_from_world.tolist() for s, c in serials.items()},
+        "intrinsics": {s: K_to_opencv(c.K).tolist() for s, c in serials.items()},
+    }
+    path = tmp_path / "camera_params.json"
+    path.write_text(json.dumps(table))
+    assert guess_format(path) == "nersemble"
+    assert_same(read_rig(path), serials)
+    half = {s: resized(c, 1100, 1604) for s, c in serials.items()}
+    assert_same(read_rig(path, size=(1100, 1604)), half)
+    table["intrinsics"] = table["intrinsics"]["22220000"]
+    path.write_text(json.dumps(table))
+    assert len(read_rig(path)) == 4
+    with pytest.raises(CalibrationError, match="same aspect ratio"):
+        read_rig(path, size=(1100, 1100))
+
+
+def test_renderme_reads_camera_to_world_and_names_the_file_that_has_none(tmp_path):
+    rig = make_rig(dist=(), size=(2448, 2048))
+    path = tmp_path / "0026_e0_anno.smc"
+    with h5py.File(path, "w") as file:
+        file.create_group("Camera").attrs["resolution"] = np.array([2048, 2448])
+        for number, camera in enumerate(rig.values()):
+            group = file.create_group(f"Calibration/{number:02d}")
+            group["K"] = K_to_opencv(camera.K)
+            group["D"] = np.zeros(5)
+            group["RT"] = np.linalg.inv(camera.cam_from_world)
+    assert guess_format(path) == "renderme360"
+    assert_same(read_rig(path), rig)
+    raw = tmp_path / "0026_e0_raw.smc"
+    with h5py.File(raw, "w") as file:
+        file.create_group("Camera")
+    with pytest.raises(CalibrationError, match="0026_e0_anno.smc"):
+        read_rig(raw)
+
+
+def test_units_become_metres(tmp_path):
+    rig = make_rig()
+    write_cameras(tmp_path / "c.json", rig)
+    found = read_rig(tmp_path / "c.json", metres_per_unit=1e-3)
+    np.testing.assert_allclose(found["cam01"].center, 1e-3 * rig["cam01"].center)
+    with pytest.raises(CalibrationError, match="expected a positive number"):
+        read_rig(tmp_path / "c.json", metres_per_unit=float("nan"))
+
+
+@pytest.mark.parametrize("content", ["", "{}", "[1]", "\x00\x01", '{"frames": []}'])
+def test_rubbish_is_one_clear_error(tmp_path, content):
+    path = tmp_path / "rubbish.json"
+    path.write_text(content)
+    with pytest.raises(CalibrationError, match="no known calibration"):
+        read_rig(path)
+    for kind in ("transforms", "nersemble", "express50", "renderme360"):
+        with pytest.raises(CalibrationError, match="rubbish.json"):
+            read_rig(path, kind)
+
+
+def test_thin_prism_distortion_is_refused(tmp_path):
+    write_yaml(tmp_path / "yaml", make_rig(count=1))
+    file = tmp_path / "yaml" / "cam00.yml"
+    storage = cv2.FileStorage(str(file), cv2.FILE_STORAGE_READ)
+    K = storage.getNode("camera_matrix").mat()
+    R, t = storage.getNode("R").mat(), storage.getNode("T").mat()
+    storage.release()
+    storage = cv2.FileStorage(str(file), cv2.FILE_STORAGE_WRITE)
+    rows = {"camera_matrix": K, "dist_coeffs": np.full((12, 1), 0.01), "R": R, "T": t}
+    for key, value in rows.items():
+        storage.write(key, value)
+    storage.release()
+    with pytest.raises(CalibrationError, match="thin-prism"):
+        read_rig(file, size=(640, 480))
+
+
+def test_names_come_from_folders_or_files():
+    assert names_from_files(["cam00/0.jpg", "cam01/0.jpg"]) == ["cam00", "cam01"]
+    assert names_from_files(["a.jpg", "b.jpg"]) == ["a", "b"]
+    assert names_from_files(["images/a b.jpg", "images/c.jpg"]) == ["a_b", "c"]
+    assert names_from_files(["x/a.jpg", "x/b.jpg", "y/a.jpg"]) == ["x_a", "x_b", "y_a"]

@@ -1,0 +1,81 @@
+"""A misread rig is found out, and the right reading named."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from express50.adapters import FLIP_YZ
+from express50.cameras import read_cameras, write_cameras
+from express50.cli import main
+from express50.rigs.verdict import judge
+from tests.express50.rigs.test_read import make_rig, write_transforms
+
+
+def changed(rig, change):
+    return {n: replace(c, cam_from_world=change(c.cam_from_world)) for n, c in rig.items()}
+
+
+def test_a_good_rig_has_no_problem():
+    verdict = judge(make_rig())
+    assert verdict.problem == "" and verdict.remedy == "" and verdict.warnings == ()
+    assert verdict.distance_m == pytest.approx(1.0, abs=0.05) and verdict.miss_mm < 20
+    np.testing.assert_allclose(verdict.meeting, [0, 1.25, 0], atol=0.01)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda T: np.linalg.inv(T), "camera to world: invert"),
+        (lambda T: FLIP_YZ @ T, "OpenGL's: flip"),
+        (lambda T: np.linalg.inv(T) @ FLIP_YZ, "camera to world with OpenGL"),
+    ],
+)
+def test_misread_matrices_are_named(change, words):
+    verdict = judge(changed(make_rig(), change))
+    assert verdict.problem and words in verdict.remedy
+
+
+def test_millimetres_and_a_stray_camera_are_warned_of():
+    rig = make_rig()
+
+    def in_mm(T):
+        out = T.copy()
+        out[:3, 3] *= 1000
+        return out
+
+    assert any("metres" in w for w in judge(changed(rig, in_mm)).warnings)
+    turned = rig["cam02"].cam_from_world.copy()
+    turned[:3] = np.array([[0, 0, 1], [0, 1, 0], [-1, 0, 0.0]]) @ turned[:3]
+    rig["cam02"] = replace(rig["cam02"], cam_from_world=turned)
+    verdict = judge(rig)
+    assert verdict.problem or any("cam02" in w for w in verdict.warnings)
+
+
+def test_one_camera_has_no_meeting_point():
+    assert judge(make_rig(count=1)).meeting is None
+
+
+def test_import_writes_a_calibration_that_is_read_again(tmp_path, capsys):
+    write_transforms(tmp_path / "transforms.json", make_rig())
+    out = tmp_path / "calibration.json"
+    assert main(["cameras", "import", str(tmp_path / "transforms.json"), str(out)]) == 0
+    assert "4 cameras (transforms)" in capsys.readouterr().out
+    assert len(read_cameras(out)) == 4
+    assert main(["cameras", "check", str(out), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["format"] == "express50"
+
+
+def test_check_of_an_inverted_rig_fails_and_import_writes_nothing(tmp_path, capsys):
+    write_cameras(tmp_path / "bad.json", changed(make_rig(), np.linalg.inv))
+    assert main(["cameras", "check", str(tmp_path / "bad.json")]) == 1
+    assert "remedy: the matrices are camera to world" in capsys.readouterr().out
+    assert main(["cameras", "import", str(tmp_path / "bad.json"), str(tmp_path / "o.json")]) == 1
+    assert not (tmp_path / "o.json").exists()
+
+
+def test_wrong_size_is_one_line(tmp_path, capsys):
+    write_cameras(tmp_path / "c.json", make_rig())
+    assert main(["cameras", "check", str(tmp_path / "c.json"), "--size", "big"]) == 2
+    assert "WIDTHxHEIGHT" in capsys.readouterr().err
