@@ -25,7 +25,7 @@ AUTOMATIC = "auto"
 RULE_PREFIX = "rule:"
 FLAG_REASONS = ("failed", "occluded", "not performed", "ambiguous")
 EXCLUSION_ACTIONS = ("exclude", "include")  # of a whole subject; read by express50.exclusions
-_ACTIONS = ("mark", "flag", "undo", "settle", *EXCLUSION_ACTIONS)
+ACTIONS = ("mark", "flag", "undo", "settle", *EXCLUSION_ACTIONS)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -210,8 +210,8 @@ def append_label(dataset: Dataset, label: Label) -> None:
     Raises:
         AnnotationError: the action is unknown.
     """
-    if label.action not in _ACTIONS:
-        raise AnnotationError(f"action {label.action!r}, expected one of {', '.join(_ACTIONS)}")
+    if label.action not in ACTIONS:
+        raise AnnotationError(f"action {label.action!r}, expected one of {', '.join(ACTIONS)}")
     path = dataset.labels_file(label.subject)
     path.parent.mkdir(parents=True, exist_ok=True)
     row = {k: v for k, v in asdict(label).items() if v is not None}

@@ -18,7 +18,7 @@ from express50.layout import Dataset
 PROTOCOLS = ("auto", "halfblock", "tgp", "sixel")
 
 
-def add_ui_command(verbs: argparse._SubParsersAction) -> None:
+def add_verbs(verbs: argparse._SubParsersAction) -> None:
     """Add ``annotate ui``."""
     words = "label peak frames in the terminal"
     parser = verbs.add_parser("ui", help=words, description=words)

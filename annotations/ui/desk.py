@@ -24,6 +24,7 @@ from annotations.ui.view import View
 from annotations.worklist import Task
 from express50.errors import Express50Error
 
+NOTHING = "nothing to label: no expression fits, or nothing is ingested"
 TASKS_AHEAD, FRAMES_AHEAD = 2, 12  # pictures that are made before their task is opened
 
 
@@ -75,7 +76,7 @@ class Desk(Board):
         self.player.stop()
         task = self.session.task
         if task is None:
-            self.say("nothing to label: no expression fits, or nothing is ingested", theme.RED)
+            self.say(NOTHING, theme.RED)
             return
         self.scene = scene = load_scene(self.session.dataset, task, self.session.annotator)
         if scene.suggestion is not None:  # else the camera that was chosen last stays
@@ -176,7 +177,10 @@ class Desk(Board):
     def action_ask_flag(self) -> None:
         """Ask why there is no peak, then flag."""
         self.player.stop()
-        self.app.push_screen(FlagDialog(), self._flag)
+        if self.scene is None:
+            self.say(NOTHING, theme.RED)
+        else:
+            self.app.push_screen(FlagDialog(), self._flag)
 
     def _flag(self, reason: str | None) -> None:
         if reason is not None and self.scene is not None:

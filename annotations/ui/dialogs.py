@@ -18,6 +18,8 @@ from annotations.ui.keymap import GROUPS
 class FlagDialog(ModalScreen[str | None]):
     """Why there is no usable peak: a digit decides at once, ``5`` opens a line of text."""
 
+    AUTO_FOCUS = ""  # digits must reach the dialog, not the text line
+
     def compose(self) -> ComposeResult:
         """A list of reasons, and the line for another."""
         with Vertical(classes="dialog") as box:
@@ -29,10 +31,6 @@ class FlagDialog(ModalScreen[str | None]):
             words = Input(placeholder="reason, then Enter", max_length=200)
             words.display = False
             yield words
-
-    def on_mount(self) -> None:
-        """Digits must reach the dialog, not the text line."""
-        self.set_focus(None)
 
     def on_key(self, event: events.Key) -> None:
         """Choose by digit; leave by Escape."""

@@ -1,4 +1,4 @@
-"""A dataset that needs no camera: two subjects, painted frames, suggestions as align writes them."""
+"""A dataset of painted frames: two subjects, and suggestions as align writes them."""
 
 import json
 
