@@ -27,6 +27,7 @@ from annotations.suggest import (
     Suggestion,
     activity,
     align_crop,
+    candidates,
     suggest_peak,
 )
 from express50.errors import StageError
@@ -97,7 +98,9 @@ def run_item(dataset: Dataset, item: str, config: AlignConfig, out: Path) -> dic
         if label.action == "flag"
     ]
     _write_json(out / "peaks.json", peaks)
-    _write_json(out / "suggestions.json", {e: _suggestion_row(s) for e, s in suggestions.items()})
+    starts = {cue.expression_id: cue.start_frame for cue in index.cues}
+    rows = {e: _suggestion_row(s, starts[e], watchers[0]) for e, s in suggestions.items()}
+    _write_json(out / "suggestions.json", rows)
     _write_sheet(dataset, index, watchers[0], peaks, out)
     return {
         "expressions": len(index.cues),
@@ -178,7 +181,8 @@ def suggest_in_window(
     clips = observe(dataset, index, net, cameras, frames, rests)
     curve = activity(clips, rests, expression)
     found = suggest_peak(curve, 0, at_rest=cue.expression_id == NEUTRAL)
-    return Suggestion(int(frames[found.frame]), found.confidence, found.activity)
+    whole = np.interp(np.arange(frames[0], frames[-1] + 1), frames, found.activity)
+    return Suggestion(int(frames[found.frame]), found.confidence, whole)
 
 
 def accept(
@@ -214,11 +218,15 @@ def _peak_row(label: Label) -> dict[str, object]:
     }
 
 
-def _suggestion_row(suggestion: Suggestion) -> dict[str, object]:
+def _suggestion_row(suggestion: Suggestion, start: int, camera: str) -> dict[str, object]:
     return {
         "frame": suggestion.frame,
         "confidence": round(suggestion.confidence, 4),
+        "start": start,
         "activity": [round(float(a), 3) for a in suggestion.activity],
+        "candidates": candidates(suggestion, start),
+        "kind": "peak",
+        "camera": camera,
     }
 
 
@@ -242,7 +250,7 @@ def _write_sheet(dataset: Dataset, index: Index, camera: str, peaks: dict, out: 
 
 STAGE = Stage(
     name="align",
-    version=1,
+    version=2,
     config=AlignConfig,
     presets={
         "draft": {"cameras": 1, "stride": 2},

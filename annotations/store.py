@@ -1,8 +1,8 @@
 """The label store: one append-only file of events a subject, synced at every mark.
 
 A label names a camera, a decode index, its pts and a perceptual hash, so that it can never point
-at another frame unnoticed. Nothing is ever rewritten: undo is a record of its own, and a person's
-label always stands above a suggestion that was accepted without one.
+at another frame unnoticed. Nothing is ever rewritten: undo is a record of its own. Above all stands
+an adjudication, then what people say, then a rule, then a suggestion accepted without a person.
 """
 
 from __future__ import annotations
@@ -18,11 +18,14 @@ from pathlib import Path
 
 from express50 import __version__
 from express50.errors import AnnotationError
-from express50.index import Index
+from express50.index import CameraSource, Cue, Index
 from express50.layout import Dataset
 
 AUTOMATIC = "auto"
-_ACTIONS = ("mark", "flag", "undo")
+RULE_PREFIX = "rule:"
+FLAG_REASONS = ("failed", "occluded", "not performed", "ambiguous")
+EXCLUSION_ACTIONS = ("exclude", "include")  # of a whole subject; read by express50.exclusions
+ACTIONS = ("mark", "flag", "undo", "settle", *EXCLUSION_ACTIONS)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,15 +33,20 @@ class Label:
     """One event of the store.
 
     Attributes:
-        subject, expression: what is labelled.
-        action: ``mark`` a peak, ``flag`` a failed performance, ``undo`` one's last event.
-        annotator: who; ``auto`` for accepted suggestions.
+        subject, expression: what is labelled; no expression where it is about the whole subject.
+        action: ``mark`` a peak, ``flag`` a performance that has none, ``undo`` one's last event,
+            ``settle`` a disagreement (with a frame, or with a reason in place of a flag),
+            ``exclude`` or ``include`` a subject.
+        annotator: who; ``auto`` for accepted suggestions, ``rule:...`` for rules.
         time: seconds since 1970.
         tool: version of this toolkit.
         frame, camera, pts, dhash: the frame's identity (absent for flag and undo).
+        first, last: the plateau that the frame stands for, both inside, where it was given.
         suggested: the frame that was suggested at that moment.
         confidence: of the suggestion, 0 to 1.
-        reason: why it was flagged.
+        shown: whether the suggestion was visible before the decision.
+        seconds, keys: time and keystrokes that the label took.
+        reason: why it was flagged or excluded.
     """
 
     subject: str
@@ -51,8 +59,13 @@ class Label:
     camera: str | None = None
     pts: int | None = None
     dhash: str | None = None
+    first: int | None = None
+    last: int | None = None
     suggested: int | None = None
     confidence: float | None = None
+    shown: bool | None = None
+    seconds: float | None = None
+    keys: int | None = None
     reason: str | None = None
 
 
@@ -64,12 +77,102 @@ def make_mark(
     annotator: str,
     suggested: int | None = None,
     confidence: float | None = None,
+    *,
+    first: int | None = None,
+    last: int | None = None,
+    seconds: float | None = None,
+    keys: int | None = None,
+    shown: bool | None = None,
+    action: str = "mark",
 ) -> Label:
-    """A mark with the frame's full identity.
+    """A mark (or, with that action, a ``settle``) with the frame's full identity.
 
     Raises:
-        AnnotationError: the expression is not in the cues, the camera not in the capture, or the
-            frame outside the expression's cue window.
+        AnnotationError: the expression is not in the cues, the camera not in the capture, a frame
+            outside the expression's cue window, or the frame outside its plateau.
+    """
+    cue = find_cue(index, expression)
+    source = find_camera(index, camera)
+    for number in (frame, first, last):
+        _check_frame(index, cue, source, number)
+    low, high = frame if first is None else first, frame if last is None else last
+    if not low <= frame <= high:
+        raise AnnotationError(
+            f"{index.subject} {expression}: frame {frame} lies outside its plateau {low} to {high}"
+        )
+    return Label(
+        subject=index.subject,
+        expression=expression,
+        action=action,
+        annotator=annotator,
+        time=time.time(),
+        frame=frame,
+        camera=camera,
+        pts=source.pts[frame],
+        dhash=source.dhash[frame],
+        first=first,
+        last=last,
+        suggested=suggested,
+        confidence=confidence,
+        shown=shown,
+        seconds=seconds,
+        keys=keys,
+    )
+
+
+def make_flag(
+    index: Index,
+    expression: str,
+    reason: str,
+    annotator: str,
+    *,
+    seconds: float | None = None,
+    keys: int | None = None,
+    action: str = "flag",
+) -> Label:
+    """A flag: the expression has no peak, for a reason such as those of ``FLAG_REASONS``.
+
+    Raises:
+        AnnotationError: the expression is not in the cues, or there is no reason.
+    """
+    if not reason.strip():
+        raise AnnotationError(
+            f"{index.subject} {expression}: a flag needs a reason: {', '.join(FLAG_REASONS)}, ..."
+        )
+    find_cue(index, expression)
+    return Label(
+        subject=index.subject,
+        expression=expression,
+        action=action,
+        annotator=annotator,
+        time=time.time(),
+        reason=reason.strip(),
+        seconds=seconds,
+        keys=keys,
+    )
+
+
+def make_undo(index: Index, expression: str, annotator: str) -> Label:
+    """An undo of the annotator's last event on an expression.
+
+    Raises:
+        AnnotationError: the expression is not in the cues.
+    """
+    find_cue(index, expression)
+    return Label(
+        subject=index.subject,
+        expression=expression,
+        action="undo",
+        annotator=annotator,
+        time=time.time(),
+    )
+
+
+def find_cue(index: Index, expression: str) -> Cue:
+    """The cue window of an expression.
+
+    Raises:
+        AnnotationError: it is not in the cues.
     """
     cue = next((c for c in index.cues if c.expression_id == expression), None)
     if cue is None:
@@ -77,28 +180,28 @@ def make_mark(
         raise AnnotationError(
             f"{index.subject}: no expression {expression!r} in cues.csv ({known})"
         )
-    source = index.cameras.get(camera)
-    if source is None:
+    return cue
+
+
+def find_camera(index: Index, camera: str) -> CameraSource:
+    """The footage of a camera.
+
+    Raises:
+        AnnotationError: the capture has no such camera.
+    """
+    if camera not in index.cameras:
         known = ", ".join(index.cameras)
         raise AnnotationError(f"{index.subject}: no camera {camera!r}; expected one of {known}")
-    if not cue.start_frame <= frame <= cue.end_frame or frame >= source.frames:
+    return index.cameras[camera]
+
+
+def _check_frame(index: Index, cue: Cue, source: CameraSource, frame: int | None) -> None:
+    last = min(cue.end_frame, source.frames - 1)
+    if frame is not None and not cue.start_frame <= frame <= last:
         raise AnnotationError(
-            f"{index.subject} {expression}: frame {frame} lies outside the cue window"
-            f" {cue.start_frame} to {min(cue.end_frame, source.frames - 1)}"
+            f"{index.subject} {cue.expression_id}: frame {frame} lies outside the cue window"
+            f" {cue.start_frame} to {last}"
         )
-    return Label(
-        subject=index.subject,
-        expression=expression,
-        action="mark",
-        annotator=annotator,
-        time=time.time(),
-        frame=frame,
-        camera=camera,
-        pts=source.pts[frame],
-        dhash=source.dhash[frame],
-        suggested=suggested,
-        confidence=confidence,
-    )
 
 
 def append_label(dataset: Dataset, label: Label) -> None:
@@ -107,8 +210,8 @@ def append_label(dataset: Dataset, label: Label) -> None:
     Raises:
         AnnotationError: the action is unknown.
     """
-    if label.action not in _ACTIONS:
-        raise AnnotationError(f"action {label.action!r}, expected one of {', '.join(_ACTIONS)}")
+    if label.action not in ACTIONS:
+        raise AnnotationError(f"action {label.action!r}, expected one of {', '.join(ACTIONS)}")
     path = dataset.labels_file(label.subject)
     path.parent.mkdir(parents=True, exist_ok=True)
     row = {k: v for k, v in asdict(label).items() if v is not None}
@@ -158,32 +261,56 @@ def _parse(path: Path, number: int, line: str) -> Label | None:
 
 
 def current_labels(labels: Iterable[Label]) -> dict[str, Label]:
-    """The label in force for each expression: the last one by a person, else the automatic one."""
-    stacks: dict[tuple[str, str], list[Label]] = {}
-    for label in labels:
-        stack = stacks.setdefault((label.expression, label.annotator), [])
-        if label.action == "undo":
-            if stack:
-                stack.pop()
-        else:
-            stack.append(label)
+    """The label in force for each expression: the last of those that rank highest."""
     current: dict[str, Label] = {}
-    for (expression, _), stack in stacks.items():
-        if stack and _stands_above(stack[-1], current.get(expression)):
-            current[expression] = stack[-1]
+    for (expression, _), stack in _stacks(labels).items():
+        for label in stack:
+            old = current.get(expression)
+            if old is None or (_rank(label), label.time) >= (_rank(old), old.time):
+                current[expression] = label
     return dict(sorted(current.items()))
 
 
-def _stands_above(new: Label, old: Label | None) -> bool:
-    if old is None:
-        return True
-    if (new.annotator == AUTOMATIC) != (old.annotator == AUTOMATIC):
-        return old.annotator == AUTOMATIC
-    return new.time >= old.time
+def labels_of(labels: Iterable[Label], annotator: str) -> dict[str, Label]:
+    """What one annotator says of each expression; their adjudications of others are left out."""
+    own = {
+        expression: said[-1]
+        for (expression, who), stack in _stacks(labels).items()
+        if who == annotator and (said := [x for x in stack if x.action != "settle"])
+    }
+    return dict(sorted(own.items()))
+
+
+def _stacks(labels: Iterable[Label]) -> dict[tuple[str, str], list[Label]]:
+    """Events that were not undone, by expression and annotator."""
+    stacks: dict[tuple[str, str], list[Label]] = {}
+    for label in labels:
+        if label.action in EXCLUSION_ACTIONS:
+            continue
+        stack = stacks.setdefault((label.expression, label.annotator), [])
+        if label.action != "undo":
+            stack.append(label)
+        elif stack:
+            stack.pop()
+    return stacks
+
+
+def _rank(label: Label) -> int:
+    """Adjudications stand above people, people above rules, rules above suggestions."""
+    if label.action == "settle":
+        return 3
+    if label.annotator.startswith(RULE_PREFIX):
+        return 1
+    return 0 if label.annotator == AUTOMATIC else 2
+
+
+def is_person(annotator: str) -> bool:
+    """Whether a name is a person's: neither the align stage's nor a rule's."""
+    return annotator != AUTOMATIC and not annotator.startswith(RULE_PREFIX)
 
 
 def human_digest(dataset: Dataset, subject: str) -> str:
-    """Digest of what people decided for a subject; automatic labels do not change it."""
+    """Digest of what people and rules decided for a subject; automatic labels do not change it."""
     rows = [
         (label.expression, label.action, label.frame, label.camera, label.annotator, label.reason)
         for label in current_labels(read_labels(dataset, subject)).values()

@@ -34,6 +34,7 @@ _CONTROL_GROUPS = {
     "cheek": ("mouth",),
 }
 CROP = 48  # side of the aligned face, pixels
+CANDIDATES, CANDIDATE_GAP = 5, 3
 _LANDMARK_FLOOR = 0.004  # of the face's size: what a still face moves by in the detector's eyes
 _LOOK_FLOOR = 0.01  # grey levels of 1: sensor noise after averaging
 
@@ -172,3 +173,20 @@ def suggest_peak(curve: np.ndarray, first_frame: int, at_rest: bool = False) -> 
     middle = float(plateau @ rise / rise.sum()) if rise.sum() > 0 else float(top)
     confidence = float(np.clip((smooth[top] - floor) / (1.0 + smooth[top]), 0.0, 1.0))
     return Suggestion(first_frame + round(middle), confidence, curve)
+
+
+def candidates(suggestion: Suggestion, first_frame: int) -> list[int]:
+    """Frames worth a look, best first: the suggestion, then the curve's other local maxima.
+
+    At most CANDIDATES, at least CANDIDATE_GAP frames apart; absolute frames, the curve's first
+    value being that of ``first_frame``.
+    """
+    curve = suggestion.activity
+    padded = np.pad(curve, 1, constant_values=-np.inf)
+    peaks = np.flatnonzero((curve >= padded[:-2]) & (curve >= padded[2:]))
+    ranked = [first_frame + int(k) for k in peaks[np.argsort(-curve[peaks], kind="stable")]]
+    chosen = [suggestion.frame]
+    for frame in ranked:
+        if len(chosen) < CANDIDATES and all(abs(frame - c) >= CANDIDATE_GAP for c in chosen):
+            chosen.append(frame)
+    return chosen

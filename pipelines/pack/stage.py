@@ -11,6 +11,7 @@ import numpy as np
 
 from express50.cameras import Camera
 from express50.errors import CaptureError, FormatError, StageError
+from express50.exclusions import exclusion_reason
 from express50.frames import read_cameras_of, read_frame, read_peaks
 from express50.images import (
     DEPTH_UNIT_M,
@@ -58,6 +59,9 @@ def inputs(dataset: Dataset, item: str, config: PackConfig) -> dict[str, Path | 
     """Index, cameras, peaks, mattes, track and depth of every subject, as far as there."""
     found: dict[str, Path | str] = {}
     for subject in dataset.subjects():
+        if (reason := exclusion_reason(dataset, subject)) is not None:
+            found[f"{subject} excluded"] = reason
+            continue
         found[f"{subject} index"] = index_path(dataset, subject)
         parts = {
             "calibrate": dataset.item_dir("calibrate", subject) / "cameras.json",
@@ -106,6 +110,9 @@ def run(dataset: Dataset, item: str, config: PackConfig, out: Path) -> dict:
 def _read_subjects(dataset: Dataset, dropped: list[dict[str, str]]) -> list[Subject]:
     subjects = []
     for name in dataset.subjects():
+        if (reason := exclusion_reason(dataset, name)) is not None:
+            dropped.append({"what": name, "why": f"excluded: {reason}"})
+            continue
         try:
             subjects.append(_read_subject(dataset, name))
         except (StageError, FormatError, CaptureError) as error:

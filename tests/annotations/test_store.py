@@ -12,7 +12,10 @@ from annotations.store import (
     append_label,
     current_labels,
     human_digest,
+    labels_of,
+    make_flag,
     make_mark,
+    make_undo,
     read_labels,
 )
 from express50.errors import AnnotationError
@@ -111,3 +114,41 @@ def test_annotators_at_once_lose_nothing(tmp_path):
     labels = read_labels(Dataset(tmp_path), "S1")
     for i in range(3):
         assert [x.frame for x in labels if x.annotator == f"a{i}"] == list(range(50))
+
+
+def test_an_adjudication_stands_above_later_marks_and_keeps_the_originals(tmp_path):
+    index = _index(tmp_path)
+    settle = make_mark(index, "smile", 4, "a", "eve", action="settle")
+    labels = [_mark(3, "ann", 1.0), _mark(5, "eve", 2.0), settle, _mark(6, "bob", 9e9)]
+    assert current_labels(labels)["smile"] == settle
+    assert {who: labels_of(labels, who)["smile"].frame for who in ("ann", "bob", "eve")} == {
+        "ann": 3, "bob": 6, "eve": 5,
+    }  # fmt: skip
+    assert current_labels([*labels, make_undo(index, "smile", "eve")])["smile"].frame == 6
+
+
+def test_a_rule_stands_below_people_and_above_suggestions():
+    labels = [_mark(5, "rule:last-frame", 3.0), _mark(3, AUTOMATIC, 4.0)]
+    assert current_labels(labels)["smile"].frame == 5
+    assert current_labels([*labels, _mark(4, "ann", 1.0)])["smile"].frame == 4
+
+
+def test_plateau_and_effort_are_kept(tmp_path):
+    mark = make_mark(
+        _index(tmp_path), "smile", 4, "a", "ann", first=3, last=5, seconds=2.5, keys=2, shown=True
+    )
+    append_label(Dataset(tmp_path), mark)
+    assert read_labels(Dataset(tmp_path), "S1") == [mark]
+    with pytest.raises(AnnotationError, match="plateau 5 to 5"):
+        make_mark(_index(tmp_path), "smile", 4, "a", "ann", first=5, last=5)
+    with pytest.raises(AnnotationError, match="2 to 6"):
+        make_mark(_index(tmp_path), "smile", 4, "a", "ann", first=1)
+
+
+def test_a_flag_needs_a_reason_and_an_expression(tmp_path):
+    index = _index(tmp_path)
+    assert make_flag(index, "smile", " failed: blinked ", "ann").reason == "failed: blinked"
+    with pytest.raises(AnnotationError, match="not performed"):
+        make_flag(index, "smile", " ", "ann")
+    with pytest.raises(AnnotationError, match="frown"):
+        make_flag(index, "frown", "failed", "ann")

@@ -9,7 +9,9 @@ from annotations.suggest import (
     CROP,
     LIDS,
     ClipObservation,
+    Suggestion,
     activity,
+    candidates,
     displacements,
     landmark_weights,
     suggest_peak,
@@ -88,3 +90,10 @@ def test_every_scripted_expression_has_points_that_take_part():
     for expression in SCRIPT.values():
         assert landmark_weights(expression).sum() > 0
     assert landmark_weights(SCRIPT["smile"])[LIDS].sum() == 0
+
+
+def test_candidates_are_maxima_apart_with_the_suggestion_first():
+    curve = np.array([0, 3, 1, 0, 0, 5, 4.9, 0, 2, 0.0])
+    assert candidates(Suggestion(105, 0.9, curve), 100) == [105, 101, 108]
+    assert candidates(Suggestion(7, 0.1, np.ones(1)), 7) == [7]
+    assert len(candidates(Suggestion(0, 0.5, np.tile([1.0, 0, 0], 40)), 0)) == 5

@@ -238,3 +238,19 @@ def test_depth_stage_drops_a_bad_camera_and_reports_it(tmp_path):
     assert 1.0 < depth[valid].mean() < 1.2 and valid.sum() > 500
     assert not (folder / "cam01.png").exists() and (folder / "qc" / "surface.jpg").exists()
     assert row["voxel_share"] < 1 and row["coverage"] > 0.9
+
+
+def test_an_excluded_subject_is_left_out_with_its_reason(dataset, tmp_path):
+    file = dataset.labels_file("S002")
+    before = file.read_text() if file.exists() else ""
+    file.parent.mkdir(exist_ok=True)
+    event = {"subject": "S002", "expression": "", "action": "exclude", "annotator": "ann"}
+    file.write_text(before + json.dumps(event | {"time": 1.0, "reason": "heavy makeup"}) + "\n")
+    try:
+        config = PackConfig(size=64)
+        assert PACK.inputs(dataset, "shards", config)["S002 excluded"] == "heavy makeup"
+        metrics = PACK.run(dataset, "shards", config, tmp_path)
+    finally:
+        file.write_text(before)
+    assert {"what": "S002", "why": "excluded: heavy makeup"} in metrics["dropped"]
+    assert {e.subject for e in ShardReader(tmp_path).entries} == {"S001"}

@@ -1,0 +1,152 @@
+"""How well annotators agree: frame distances, slips, and Krippendorff's alpha on clip time.
+
+Alpha is taken on time within the clip, 0 to 1: on absolute frame numbers, which spread over a whole
+recording, it is near 1 whatever the annotators do.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+
+from annotations.store import Label, is_person, labels_of, read_labels
+from express50.exclusions import included_subjects
+from express50.index import read_index
+from express50.layout import Dataset
+
+WITHIN = (1, 2, 4)  # frames
+SLIP_FRAMES = 12  # further apart, two people did not mean the same moment
+BOOTSTRAP = 1000
+LEVEL = 0.95
+
+
+@dataclass(frozen=True)
+class Clip:
+    """One clip that several people marked: frames by annotator, and the clip's window."""
+
+    subject: str
+    expression: str
+    start: int
+    length: int
+    frames: dict[str, int]
+
+
+def marked_clips(dataset: Dataset, subjects: Iterable[str] | None = None) -> list[Clip]:
+    """Clips that at least two people marked; excluded subjects are left out."""
+    clips = []
+    for subject in sorted(subjects or included_subjects(dataset)):
+        marks = marks_by_person(read_labels(dataset, subject))
+        for cue in read_index(dataset, subject).cues:
+            said = marks.get(cue.expression_id, {})
+            frames = {who: x.frame for who, x in said.items() if x.frame is not None}
+            if len(frames) > 1:
+                length = cue.end_frame - cue.start_frame + 1
+                clips.append(Clip(subject, cue.expression_id, cue.start_frame, length, frames))
+    return clips
+
+
+def marks_by_person(labels: Sequence[Label]) -> dict[str, dict[str, Label]]:
+    """Marks in force of each person, by expression and annotator; flags are left out."""
+    marks: dict[str, dict[str, Label]] = defaultdict(dict)
+    for who in sorted({x.annotator for x in labels if is_person(x.annotator)}):
+        for expression, label in labels_of(labels, who).items():
+            if label.frame is not None:
+                marks[expression][who] = label
+    return dict(marks)
+
+
+def agreement(clips: Sequence[Clip], seed: int = 0) -> dict[str, object]:
+    """Figures over clips, each pair of annotators of a clip counting once.
+
+    Returns:
+        ``clips``, ``pairs``, ``within_1``, ``within_2``, ``within_4``, ``median_frames``,
+        ``slip_rate``, ``alpha`` and ``alpha_interval`` (95 %, bootstrap over clips); figures are
+        None where there is nothing to compare.
+    """
+    distances = np.array(
+        [abs(a - b) for clip in clips for a, b in combinations(clip.frames.values(), 2)]
+    )
+    if not len(distances):
+        blank = dict.fromkeys((*(f"within_{k}" for k in WITHIN), "median_frames", "slip_rate"))
+        return {"clips": 0, "pairs": 0} | blank | {"alpha": None, "alpha_interval": None}
+    units = [clip_times(clip) for clip in clips]
+    return {
+        "clips": len(clips),
+        "pairs": len(distances),
+        **{f"within_{k}": round(float((distances <= k).mean()), 4) for k in WITHIN},
+        "median_frames": float(np.median(distances)),
+        "slip_rate": round(float((distances > SLIP_FRAMES).mean()), 4),
+        "alpha": _rounded(interval_alpha(units)),
+        "alpha_interval": alpha_interval(units, seed),
+    }
+
+
+def clip_times(clip: Clip) -> np.ndarray:
+    """The marks as shares of the clip, 0 at its first frame and 1 at its last."""
+    frames = np.array(list(clip.frames.values()), dtype=float)
+    return (frames - clip.start) / max(1, clip.length - 1)
+
+
+def interval_alpha(units: Sequence[np.ndarray]) -> float | None:
+    """Krippendorff's alpha with the interval metric; None where all values are the same.
+
+    The mean squared difference of all pairs of values is twice their variance, which gives a closed
+    form without the coincidence matrix (K. Krippendorff, Content Analysis, 2004, chapter 11).
+
+    Args:
+        units: the values of each unit, at least two a unit.
+    """
+    values = np.concatenate(units)
+    expected = 2.0 * values.var(ddof=1)
+    if expected < 1e-15:
+        return None
+    observed = sum(len(unit) * 2.0 * unit.var(ddof=1) for unit in units) / len(values)
+    return float(1.0 - observed / expected)
+
+
+def alpha_interval(units: Sequence[np.ndarray], seed: int = 0) -> list[float] | None:
+    """Bootstrap interval of alpha over clips; None with fewer than three clips or no spread."""
+    if len(units) < 3:
+        return None
+    rng = np.random.default_rng(seed)
+    draws = rng.integers(0, len(units), (BOOTSTRAP, len(units)))
+    found = [interval_alpha([units[k] for k in draw]) for draw in draws]
+    kept = [alpha for alpha in found if alpha is not None]
+    if not kept:
+        return None
+    tails = ((1 - LEVEL) / 2, (1 + LEVEL) / 2)
+    return [round(float(q), 4) for q in np.quantile(kept, tails)]
+
+
+def _rounded(value: float | None) -> float | None:
+    return None if value is None else round(value, 4)
+
+
+def by_expression(clips: Sequence[Clip]) -> dict[str, dict[str, object]]:
+    """Agreement on each expression."""
+    return _grouped(clips, lambda clip: [(clip.expression, clip.frames)])
+
+
+def by_pair(clips: Sequence[Clip]) -> dict[str, dict[str, object]]:
+    """Agreement of each pair of annotators, named ``ann+bob``."""
+
+    def pairs(clip: Clip) -> list[tuple[str, dict[str, int]]]:
+        return [
+            (f"{a}+{b}", {a: clip.frames[a], b: clip.frames[b]})
+            for a, b in combinations(sorted(clip.frames), 2)
+        ]
+
+    return _grouped(clips, pairs)
+
+
+def _grouped(clips: Sequence[Clip], keys) -> dict[str, dict[str, object]]:
+    groups: Mapping[str, list[Clip]] = defaultdict(list)
+    for clip in clips:
+        for key, frames in keys(clip):
+            part = Clip(clip.subject, clip.expression, clip.start, clip.length, frames)
+            groups[key].append(part)
+    return {key: agreement(group) for key, group in groups.items()}

@@ -1,0 +1,53 @@
+"""What labels cost: seconds and keystrokes of each annotator, and how often suggestions held."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterable, Sequence
+from statistics import median
+
+from annotations.store import AUTOMATIC, Label, current_labels, is_person, read_labels
+from express50.exclusions import exclusion_reason
+from express50.index import read_index
+from express50.layout import Dataset
+
+
+def progress(dataset: Dataset, subject: str) -> dict[str, object]:
+    """How far a subject is: expressions by who labelled them."""
+    labels = current_labels(read_labels(dataset, subject)).values()
+    marks = [x for x in labels if x.frame is not None]
+    return {
+        "subject": subject,
+        "expressions": len(read_index(dataset, subject).cues),
+        "by_person": sum(is_person(x.annotator) for x in marks),
+        "by_rule": sum(not is_person(x.annotator) and x.annotator != AUTOMATIC for x in marks),
+        "automatic": sum(x.annotator == AUTOMATIC for x in marks),
+        "flagged": sum(x.frame is None for x in labels),
+        "excluded": exclusion_reason(dataset, subject),
+    }
+
+
+def effort(dataset: Dataset) -> dict[str, dict[str, object]]:
+    """Effort of each person over all subjects: every mark and flag counts, also those undone."""
+    spent: dict[str, list[Label]] = defaultdict(list)
+    for subject in dataset.subjects():
+        for label in read_labels(dataset, subject):
+            if is_person(label.annotator) and label.action in ("mark", "flag"):
+                spent[label.annotator].append(label)
+    return {who: _figures(labels) for who, labels in sorted(spent.items())}
+
+
+def _figures(labels: Sequence[Label]) -> dict[str, object]:
+    followed = [x.frame == x.suggested for x in labels if x.suggested is not None]
+    return {
+        "labels": len(labels),
+        "seconds_median": _median(x.seconds for x in labels),
+        "seconds_total": round(sum(x.seconds or 0.0 for x in labels), 1),
+        "keys_median": _median(x.keys for x in labels),
+        "accepted_share": round(sum(followed) / len(followed), 4) if followed else None,
+    }
+
+
+def _median(values: Iterable[float | None]) -> float | None:
+    known = [v for v in values if v is not None]
+    return round(float(median(known)), 3) if known else None

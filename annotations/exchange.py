@@ -1,0 +1,135 @@
+"""Labels in and out: every event as CSV or JSON, and back without losing or doubling one."""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Iterable
+from dataclasses import MISSING, asdict, fields
+from pathlib import Path
+from typing import Any, get_type_hints
+
+from annotations.store import ACTIONS, Label, append_label, read_labels
+from express50.errors import AnnotationError
+from express50.index import read_index
+from express50.layout import Dataset
+
+FORMATS = (".csv", ".json")
+_FIELDS = tuple(field.name for field in fields(Label))
+_REQUIRED = tuple(field.name for field in fields(Label) if field.default is MISSING)
+
+
+def export_labels(labels: Iterable[Label], path: Path) -> int:
+    """Write events as CSV or JSON, by the file's ending; returns how many.
+
+    Raises:
+        AnnotationError: another ending.
+    """
+    check_format(path)
+    rows = [asdict(label) for label in labels]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if path.suffix == ".json":
+        rows = [{k: v for k, v in row.items() if v is not None} for row in rows]
+        path.write_text(json.dumps(rows, indent=1, sort_keys=True) + "\n", encoding="utf-8")
+        return len(rows)
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, _FIELDS)
+        writer.writeheader()
+        writer.writerows(rows)
+    return len(rows)
+
+
+def import_labels(dataset: Dataset, path: Path) -> tuple[int, int]:
+    """Append the events of a file that the store does not hold yet; returns (new, known).
+
+    Everything is checked before anything is written.
+
+    Raises:
+        AnnotationError: a row is no event, names an unknown subject, or a frame that the footage
+            does not have or whose hash differs.
+    """
+    labels = read_table(path)
+    known: dict[str, set[Label]] = {}
+    for number, label in enumerate(labels, 1):
+        _check_footage(dataset, label, f"{path}: row {number}")
+        if label.subject not in known:
+            known[label.subject] = set(read_labels(dataset, label.subject))
+    new = [label for label in dict.fromkeys(labels) if label not in known[label.subject]]
+    for label in new:
+        append_label(dataset, label)
+    return len(new), len(labels) - len(new)
+
+
+def read_table(path: Path) -> list[Label]:
+    """Events of a CSV or JSON file.
+
+    Raises:
+        AnnotationError: the file cannot be read, or a row is no event.
+    """
+    check_format(path)
+    try:
+        text = path.read_text(encoding="utf-8")
+        rows = json.loads(text) if path.suffix == ".json" else csv.DictReader(text.splitlines())
+        return [_label(row, f"{path}: row {number}") for number, row in enumerate(rows, 1)]
+    except (OSError, ValueError, csv.Error) as error:
+        raise AnnotationError(f"{path}: cannot be read ({error})") from None
+
+
+def check_format(path: Path) -> None:
+    """Refuse another ending than .csv or .json.
+
+    Raises:
+        AnnotationError: it is another.
+    """
+    if path.suffix not in FORMATS:
+        raise AnnotationError(f"{path}: ends in {path.suffix!r}, expected .csv or .json")
+
+
+def _label(row: object, where: str) -> Label:
+    if not isinstance(row, dict):
+        raise AnnotationError(f"{where}: expected an object, got {type(row).__name__}")
+    given = {k: v for k, v in row.items() if v not in (None, "")}
+    given.setdefault("expression", "")  # an exclusion is about no expression
+    unknown = sorted(set(map(str, given)) - set(_FIELDS))
+    missing = sorted(set(_REQUIRED) - set(given))
+    if unknown or missing:
+        raise AnnotationError(f"{where}: unknown columns {unknown}, missing {missing}")
+    if given["action"] not in ACTIONS:
+        raise AnnotationError(
+            f"{where}: action {given['action']!r}, expected one of {', '.join(ACTIONS)}"
+        )
+    try:
+        return Label(**{k: _typed(k, v) for k, v in given.items()})
+    except ValueError as error:
+        raise AnnotationError(f"{where}: {error}") from None
+
+
+def _typed(name: str, value: object) -> Any:
+    """A cell as its column's type; CSV holds text only."""
+    kind = get_type_hints(Label)[name]
+    if kind == bool | None:
+        if str(value) not in ("True", "False"):
+            raise ValueError(f"{name} is {value!r}, expected True or False")
+        return str(value) == "True"
+    for number in (int, float):
+        if kind in (number, number | None):
+            return number(str(value))
+    return str(value)
+
+
+def _check_footage(dataset: Dataset, label: Label, where: str) -> None:
+    """Refuse an event about footage that this dataset does not have."""
+    if label.subject not in dataset.subjects():
+        raise AnnotationError(
+            f"{where}: no subject {label.subject!r}; expected one of"
+            f" {', '.join(dataset.subjects())}"
+        )
+    if label.frame is None:
+        return
+    source = read_index(dataset, label.subject).cameras.get(label.camera or "")
+    found = source.dhash[label.frame] if source and 0 <= label.frame < source.frames else "none"
+    if found != label.dhash:
+        raise AnnotationError(
+            f"{where}: frame {label.frame} of {label.camera} has hash {found}, the label says"
+            f" {label.dhash}; it was made on other footage"
+        )

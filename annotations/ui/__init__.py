@@ -1,0 +1,1 @@
+"""The terminal annotator: state, frames, pictures and the Textual app that joins them."""

@@ -1,0 +1,144 @@
+"""The lines of words around the pictures, as text that fits a width."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+from rich.cells import cell_len
+from rich.text import Text
+
+from annotations.store import Label
+from annotations.ui import theme
+from annotations.ui.keymap import HINTS
+from annotations.ui.picture import Look
+from annotations.ui.scene import Scene
+from annotations.ui.session import Session
+from annotations.ui.view import View
+
+
+def fit(left: Text, right: Text, width: int) -> Text:
+    """Two texts at the ends of a line; the left one is cut where both do not fit."""
+    room = max(0, width - right.cell_len - 1)
+    left = left.copy()
+    left.truncate(room, overflow="ellipsis")
+    left.append(" " * max(0, width - left.cell_len - right.cell_len))
+    left.append_text(right)
+    left.truncate(width)
+    return left
+
+
+def status_line(session: Session, scene: Scene, width: int) -> Text:
+    """Expression and subject; progress, doubt and what the label has cost so far."""
+    left = Text.assemble(
+        (f" {scene.name} ", f"bold {theme.GROUND} on {theme.ACCENT}"),
+        (f"  {scene.task.subject}", f"bold {theme.TEXT}"),
+    )
+    if scene.is_reference:
+        left.append("  the reference", theme.VIOLET)
+    if session.blind:
+        left.append("  blind", theme.RED)
+    spent = session.effort()
+    right = Text(style=theme.FAINT)
+    right.append(f"{session.done}/{len(session.tasks)}", f"bold {theme.TEXT}")
+    right.append(" done")
+    if not session.hidden(scene.task):
+        right.append("  doubt ")
+        right.append(f"{scene.task.doubt:.2f}", _doubt_colour(scene.task.doubt))
+    right.append(f"  {spent.seconds:.0f} s  {spent.keys} key{'' if spent.keys == 1 else 's'} ")
+    return fit(left, right, width)
+
+
+def _doubt_colour(doubt: float) -> str:
+    if doubt >= 0.5:
+        return theme.RED
+    return theme.ACCENT if doubt >= 0.2 else theme.GREEN
+
+
+def words_line(scene: Scene, width: int) -> Text:
+    """What the subject was asked to do."""
+    text = Text(f" {scene.description}", style=theme.TEXT)
+    text.truncate(width, overflow="ellipsis")
+    return text
+
+
+def frame_title(scene: Scene, view: View | None, look: Look | None, width: int) -> Text:
+    """Title of the left picture: position, and what is known of this very frame."""
+    if look is None or view is None:
+        return Text(f" {scene.task.subject}", style=theme.FAINT)
+    left = Text.assemble(
+        (f" frame {view.cursor}", f"bold {theme.TEXT}"),
+        (f"  {view.cursor - view.first + 1} of {view.last - view.first + 1}", theme.FAINT),
+    )
+    for words, colour in frame_tags(scene, view):
+        left.append(f"  {words}", colour)
+    return fit(left, Text(f"{look.camera} {look.zoom} ", style=theme.FAINT), width)
+
+
+def frame_tags(scene: Scene, view: View) -> list[tuple[str, str]]:
+    """Short words, with their colours, on what is known of the frame under the cursor."""
+    tags = []
+    if view.cursor in view.candidates:
+        number = view.candidates.index(view.cursor) + 1
+        tags.append(("suggested" if number == 1 else f"suggestion {number}", theme.GREEN))
+    if scene.mine is not None:
+        if scene.mine.action == "flag":
+            tags.append((f"⚑ {scene.mine.reason}", theme.RED))
+        elif scene.mine.frame == view.cursor:
+            tags.append(("● your mark", theme.BLUE))
+    return tags
+
+
+def reference_title(scene: Scene, look: Look | None, width: int) -> Text:
+    """Title of the right picture."""
+    if scene.reference is None or look is None:
+        return Text(" reference", style=theme.FAINT)
+    left = Text.assemble(
+        (" reference ", f"bold {theme.VIOLET}"),
+        (scene.reference.subject, theme.TEXT),
+        (f"  frame {scene.reference.frame}", theme.FAINT),
+    )
+    by = f"  by {scene.reference.by}"
+    if left.cell_len + len(by) + len(look.camera) + 2 <= width:
+        left.append(by, theme.FAINT)
+    return fit(left, Text(f"{look.camera} ", style=theme.FAINT), width)
+
+
+def blink_title(width: int, reference: bool) -> Text:
+    """Title of the left picture while it blinks."""
+    shown = "the reference" if reference else "the frame"
+    text = Text(f" blink: {shown}  (any key stops)", style=f"bold {theme.ACCENT}")
+    text.truncate(width)
+    return text
+
+
+@lru_cache(maxsize=8)
+def hint_line(width: int) -> Text:
+    """As many keys as fit, the most used first; the last one always is the help's."""
+    text = Text(" ")
+    room = width - cell_len("? help") - 3
+    for keys, words in HINTS:
+        piece = cell_len(keys) + cell_len(words) + 3
+        if keys != "?" and text.cell_len + piece <= room:
+            _hint(text, keys, words)
+    _hint(text, "?", "help")
+    text.truncate(width)
+    return text
+
+
+def _hint(text: Text, keys: str, words: str) -> None:
+    text.append(keys, f"bold {theme.ACCENT}")
+    text.append(f" {words}  ", theme.FAINT)
+
+
+def message_line(words: str, colour: str, width: int) -> Text:
+    """A message in place of the hints."""
+    text = Text(f" {words}", style=colour)
+    text.truncate(width, overflow="ellipsis")
+    return text
+
+
+def saved_words(label: Label) -> str:
+    """What is said once a decision is on disk."""
+    what = f"frame {label.frame}" if label.action == "mark" else f"flagged {label.reason}"
+    cost = f"{label.keys} key{'' if label.keys == 1 else 's'}, {label.seconds:.1f} s"
+    return f"saved: {label.subject} {label.expression} {what} ({cost}); u takes it back"

@@ -1,0 +1,246 @@
+"""An annotator's session: which task is open, what was decided, and what it cost.
+
+No screen is needed: the app calls this, and so do tests. A decision is on disk, synced, when
+``mark`` or ``flag`` returns.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Collection
+from dataclasses import dataclass
+
+from annotations.store import (
+    AUTOMATIC,
+    RULE_PREFIX,
+    Label,
+    append_label,
+    is_person,
+    labels_of,
+    make_flag,
+    make_mark,
+    make_undo,
+    read_labels,
+)
+from annotations.ui.scene import Scene
+from annotations.ui.view import View, plateau_problem
+from annotations.worklist import Task, worklist
+from express50.errors import AnnotationError
+from express50.index import read_index
+from express50.layout import Dataset
+
+IDLE_SECONDS = 60.0  # a longer pause between two keys is a break, and counts as this
+
+
+@dataclass
+class Effort:
+    """What a label has cost so far: keystrokes, and seconds without breaks."""
+
+    keys: int = 0
+    seconds: float = 0.0
+
+
+class Session:
+    """Tasks in order, the one that is open, decisions and their cost."""
+
+    def __init__(
+        self,
+        dataset: Dataset,
+        annotator: str,
+        tasks: list[Task],
+        todo: Collection[Task],
+        *,
+        blind: bool = False,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        if not is_person(annotator):
+            raise AnnotationError(
+                f"annotator {annotator!r}: {AUTOMATIC!r} and {RULE_PREFIX!r}... are the toolkit's"
+                " own names; give yours with --annotator"
+            )
+        self.dataset = dataset
+        self.annotator = annotator
+        self.tasks = tasks
+        self.blind = blind
+        self._clock = clock
+        self._open = {_key(task) for task in todo}
+        self._efforts: dict[tuple[str, str], Effort] = {}
+        self._decided: list[int] = []
+        self._last_key = clock()
+        self.position = next((n for n, t in enumerate(tasks) if _key(t) in self._open), 0)
+
+    @property
+    def task(self) -> Task | None:
+        """The open task; None when there are none at all."""
+        return self.tasks[self.position] if self.tasks else None
+
+    @property
+    def done(self) -> int:
+        """How many tasks this annotator has decided, in this session and before."""
+        return len(self.tasks) - len(self._open)
+
+    @property
+    def finished(self) -> bool:
+        """Whether nothing is left to decide."""
+        return not self._open
+
+    def is_open(self, task: Task) -> bool:
+        """Whether the annotator has not decided a task."""
+        return _key(task) in self._open
+
+    def hidden(self, task: Task) -> bool:
+        """Whether suggestions and others' marks are to be kept from the annotator."""
+        return self.blind and self.is_open(task)
+
+    def begin(self) -> None:
+        """The first task is on the screen: from here on time counts."""
+        self._last_key = self._clock()
+
+    def effort(self) -> Effort:
+        """Cost of the open task so far, the time since the last key included."""
+        spent = self._efforts.get(self._here(), Effort())
+        return Effort(spent.keys, spent.seconds + self._since_last_key())
+
+    def press(self) -> None:
+        """Count a keystroke, and the time since the last one, for the open task."""
+        spent = self._efforts.setdefault(self._here(), Effort())
+        spent.keys += 1
+        spent.seconds += self._since_last_key()
+        self._last_key = self._clock()
+
+    def _since_last_key(self) -> float:
+        return min(max(self._clock() - self._last_key, 0.0), IDLE_SECONDS)
+
+    def _here(self) -> tuple[str, str]:
+        return _key(self.task) if self.task is not None else ("", "")
+
+    def move(self, by: int) -> bool:
+        """Open a neighbouring task, decided or not; False at either end."""
+        target = self.position + by
+        if not 0 <= target < len(self.tasks):
+            return False
+        self._go(target)
+        return True
+
+    def advance(self) -> bool:
+        """Open the next undecided task, round the end; False when none is left."""
+        target = self.following(1)
+        if not target:
+            return False
+        self._go(target[0])
+        return True
+
+    def following(self, count: int) -> list[int]:
+        """Positions of the next undecided tasks after the open one, round the end."""
+        total = len(self.tasks)
+        order = [(self.position + n) % total for n in range(1, total + 1)] if total else []
+        return [n for n in order if _key(self.tasks[n]) in self._open][:count]
+
+    def _go(self, position: int) -> None:
+        self._book()
+        self.position = position
+
+    def _book(self) -> None:
+        """Put the time since the last key to the open task's account."""
+        self._efforts.setdefault(self._here(), Effort()).seconds += self._since_last_key()
+        self._last_key = self._clock()
+
+    def mark(self, scene: Scene, view: View, camera: str) -> Label:
+        """Mark the frame under the cursor; it is on disk when this returns.
+
+        Raises:
+            AnnotationError: the task has no footage, or the plateau leaves the frame out.
+        """
+        problem = scene.problem or plateau_problem(view)
+        if problem is not None or scene.index is None:
+            raise AnnotationError(problem or "this task has no footage")
+        self._book()
+        spent = self._efforts[_key(scene.task)]
+        found = scene.suggestion
+        label = make_mark(
+            scene.index,
+            scene.task.expression,
+            view.cursor,
+            camera,
+            self.annotator,
+            None if found is None else found.frame,
+            None if found is None else found.confidence,
+            first=view.plateau_first,
+            last=view.plateau_last,
+            seconds=round(spent.seconds, 2),
+            keys=spent.keys,
+            shown=found is not None and not self.hidden(scene.task),
+        )
+        self._save(label)
+        return label
+
+    def flag(self, scene: Scene, reason: str) -> Label:
+        """Say that the open task has no usable peak; it is on disk when this returns.
+
+        Raises:
+            AnnotationError: the task has no footage, or the reason is empty.
+        """
+        if scene.index is None:
+            raise AnnotationError(scene.problem or "this task has no footage")
+        self._book()
+        spent = self._efforts[_key(scene.task)]
+        label = make_flag(
+            scene.index,
+            scene.task.expression,
+            reason,
+            self.annotator,
+            seconds=round(spent.seconds, 2),
+            keys=spent.keys,
+        )
+        self._save(label)
+        return label
+
+    def _save(self, label: Label) -> None:
+        append_label(self.dataset, label)
+        self._decided.append(self.position)
+        self._open.discard((label.subject, label.expression))
+        self._efforts.pop((label.subject, label.expression), None)
+
+    def undo(self) -> Task | None:
+        """Take the annotator's last decision of this session back, else that on the open task.
+
+        The task it was about becomes the open one; None when there is nothing to take back.
+        """
+        target = self._decided.pop() if self._decided else self.position
+        if not self.tasks:
+            return None
+        task = self.tasks[target]
+        if task.expression not in self._said(task.subject):
+            return None
+        index = read_index(self.dataset, task.subject)
+        append_label(self.dataset, make_undo(index, task.expression, self.annotator))
+        if task.expression not in self._said(task.subject):
+            self._open.add(_key(task))
+        self._go(target)
+        return task
+
+    def _said(self, subject: str) -> dict[str, Label]:
+        return labels_of(read_labels(self.dataset, subject), self.annotator)
+
+
+def _key(task: Task) -> tuple[str, str]:
+    return task.subject, task.expression
+
+
+def open_session(
+    dataset: Dataset,
+    annotator: str,
+    *,
+    subjects: Collection[str] | None = None,
+    expressions: Collection[str] | None = None,
+    order: str = "doubt",
+    blind: bool = False,
+) -> Session:
+    """A session over a dataset, standing on the first task that the annotator has not decided.
+
+    Raises:
+        AnnotationError: unknown order or subject, or an annotator's name that is the toolkit's.
+    """
+    everything = worklist(dataset, annotator, subjects, expressions, order, everything=True)
+    todo = worklist(dataset, annotator, subjects, expressions, order)
+    return Session(dataset, annotator, everything, todo, blind=blind)

@@ -1,0 +1,212 @@
+"""The cue window on a line: activity and match curves, suggestions, marks and the cursor."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import groupby
+
+from rich.segment import Segment
+from rich.style import Style
+from textual import events
+from textual.geometry import Region
+from textual.message import Message
+from textual.strip import Strip
+from textual.widget import Widget
+
+from annotations.store import Label
+from annotations.ui import theme
+from annotations.ui.view import View
+
+GUTTER = 10  # cells left of the curves, for their names
+WIDEST = 7  # cells of a frame where the window is short
+_BARS = " ▁▂▃▄▅▆▇█"
+
+
+@dataclass(frozen=True, kw_only=True)
+class StripContent:
+    """What the strip shows; the curves start at the window's first frame."""
+
+    view: View
+    activity: tuple[float, ...] = ()
+    match: tuple[float, ...] = ()
+    mine: Label | None = None
+    in_force: Label | None = None
+
+
+Cell = tuple[str, Style]
+Line = list[Cell]
+
+
+def frame_cells(frames: int, width: int) -> tuple[int, int]:
+    """Cells of one frame, and frames of one cell, for a window in so many cells."""
+    if frames <= width:
+        return min(WIDEST, width // frames), 1
+    return 1, -(-frames // width)
+
+
+def column_of(view: View, frame: int, width: int) -> int:
+    """First cell of a frame."""
+    wide, per = frame_cells(view.last - view.first + 1, width)
+    return (frame - view.first) // per * wide
+
+
+def sign_column(view: View, frame: int, width: int) -> int:
+    """The middle cell of a frame, where signs stand."""
+    wide, _ = frame_cells(view.last - view.first + 1, width)
+    return min(column_of(view, frame, width) + wide // 2, width - 1)
+
+
+def frame_at(view: View, column: int, width: int) -> int:
+    """The frame under a cell, the nearest one beyond the curve's ends."""
+    wide, per = frame_cells(view.last - view.first + 1, width)
+    return min(max(view.first + column // wide * per, view.first), view.last)
+
+
+def curve_lines(
+    values: tuple[float, ...], view: View, width: int, height: int, style: Style
+) -> list[Line]:
+    """Bars of a curve, scaled so that its least value is the floor and its largest the ceiling."""
+    wide, per = frame_cells(view.last - view.first + 1, width)
+    low, high = min(values, default=0.0), max(values, default=0.0)
+    span = max(high - low, 1e-9)
+    bars = [max(values[n : n + per]) for n in range(0, len(values), per)]
+    # The lowest value still shows a sliver, so that a frame is told from no frame.
+    levels = [max(1, round((v - low) / span * height * 8)) for v in bars]
+    lines = []
+    for row in range(height):
+        floor = (height - 1 - row) * 8
+        glyphs = (_BARS[min(8, max(0, level - floor))] * wide for level in levels)
+        lines.append([(glyph, style) for glyph in "".join(glyphs)[:width]])
+    return lines
+
+
+def rank_line(view: View, width: int) -> Line:
+    """The suggestions by rank: a digit under each, the surest one bright."""
+    line = _blank(width)
+    for number, frame in reversed(list(enumerate(view.candidates[:5], 1))):
+        style = theme.BEST if number == 1 else theme.CANDIDATE
+        line[sign_column(view, frame, width)] = (str(number), style)
+    return line
+
+
+def mark_line(content: StripContent, width: int) -> Line:
+    """Plateau, the mark in force (○) and the annotator's own (●), the latter on top."""
+    view = content.view
+    line = _blank(width)
+    _draw_plateau(line, view, width)
+    for label, glyph, style in (
+        (content.in_force, "○", theme.IN_FORCE),
+        (content.mine, "●", theme.MINE),
+    ):
+        frame = None if label is None else label.frame
+        if frame is not None and view.first <= frame <= view.last:
+            line[sign_column(view, frame, width)] = (glyph, style)
+    return line
+
+
+def _draw_plateau(line: Line, view: View, width: int) -> None:
+    first, last = view.plateau_first, view.plateau_last
+    wide, _ = frame_cells(view.last - view.first + 1, width)
+    if first is not None and last is not None:
+        for column in range(column_of(view, first, width), column_of(view, last, width)):
+            line[column] = ("━", theme.PLATEAU)
+    if first is not None:
+        line[column_of(view, first, width)] = ("[", theme.PLATEAU)
+    if last is not None:
+        line[min(column_of(view, last, width) + wide - 1, width - 1)] = ("]", theme.PLATEAU)
+
+
+def _blank(width: int) -> Line:
+    return [(" ", theme.PLAIN)] * width
+
+
+class CurveStrip(Widget):
+    """Draws a ``StripContent``; a click moves the cursor there."""
+
+    class Picked(Message):
+        """A frame was clicked."""
+
+        def __init__(self, frame: int) -> None:
+            super().__init__()
+            self.frame = frame
+
+    def __init__(self) -> None:
+        super().__init__(id="strip")
+        self._content: StripContent | None = None
+        self._lines: list[Strip] = []
+
+    def show(self, content: StripContent | None) -> None:
+        """Show other content; nothing is drawn when it is the same."""
+        if content != self._content:
+            self._content = content
+            self._lines = []
+            self.refresh()
+
+    @property
+    def text(self) -> list[str]:
+        """The lines as plain text."""
+        return [line.text for line in self._drawn()]
+
+    def on_resize(self) -> None:
+        """Draw anew."""
+        self._lines = []
+
+    def on_click(self, event: events.Click) -> None:
+        """Tell which frame was clicked."""
+        if self._content is not None and event.x >= GUTTER:
+            frame = frame_at(self._content.view, event.x - GUTTER, self.size.width - GUTTER)
+            self.post_message(self.Picked(frame))
+
+    def render_lines(self, crop: Region) -> list[Strip]:
+        """The lines of the strip, past Textual's cache of styled lines, which is slower."""
+        lines = self._drawn() + [Strip.blank(self.size.width, theme.PLAIN)] * self.size.height
+        return [line.crop(crop.x, crop.right) for line in lines[crop.y : crop.bottom]]
+
+    def _drawn(self) -> list[Strip]:
+        if not self._lines:
+            self._lines = draw_strip(self._content, self.size.width, self.size.height)
+        return self._lines
+
+
+def draw_strip(content: StripContent | None, width: int, height: int) -> list[Strip]:
+    """All lines of a strip of that size; curves take what the two lines of marks leave."""
+    room = width - GUTTER
+    if content is None or room < 1 or height < 1:
+        return [Strip.blank(width, theme.PLAIN)] * height
+    named: list[tuple[str, Line]] = []
+    for name, values, style, rows in _curves(content, height - 2):
+        lines = curve_lines(values, content.view, room, rows, style)
+        named += [(name if n == 0 else "", line) for n, line in enumerate(lines)]
+    named.append(("suggested", rank_line(content.view, room)))
+    named.append(("marks", mark_line(content, room)))
+    wide, _ = frame_cells(content.view.last - content.view.first + 1, room)
+    start = column_of(content.view, content.view.cursor, room)
+    cursor = range(start, min(start + wide, room))
+    return [_finish(name, line, cursor, room) for name, line in named[-height:]]
+
+
+def _curves(content: StripContent, rows: int) -> list[tuple[str, tuple[float, ...], Style, int]]:
+    """Curves with the rows that each gets: the match is what decides, so it gets the odd one."""
+    if rows < 1:
+        return []
+    if content.match and content.activity and rows > 1:
+        top = rows // 2
+        return [
+            ("activity", content.activity, theme.ACTIVITY, top),
+            ("match", content.match, theme.MATCH, rows - top),
+        ]
+    if content.match:
+        return [("match", content.match, theme.MATCH, rows)]
+    return [("activity", content.activity, theme.ACTIVITY, rows)] if content.activity else []
+
+
+def _finish(name: str, line: Line, cursor: range, width: int) -> Strip:
+    """Name, cells and the cursor's column as a strip of the full width."""
+    cells = (line + _blank(width))[:width]
+    for column in cursor:
+        glyph, style = cells[column]
+        cells[column] = glyph, theme.CURSOR_BAR if glyph in _BARS[1:] else style + theme.CURSOR
+    segments = [Segment(f"{name:<{GUTTER}}"[:GUTTER], theme.DIM)]
+    for style, run in groupby(cells, key=lambda cell: cell[1]):
+        segments.append(Segment("".join(glyph for glyph, _ in run), style))
+    return Strip(segments, GUTTER + width)

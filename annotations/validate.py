@@ -1,0 +1,83 @@
+"""Checks every label against the footage it names, and people against each other."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from annotations.review import disagreements
+from annotations.store import Label, current_labels, find_cue, read_labels
+from express50.errors import AnnotationError
+from express50.exclusions import included_subjects
+from express50.index import Index, read_index
+from express50.layout import Dataset
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Something wrong with a label.
+
+    Kinds: ``identity`` (the frame is not the one that was labelled), ``window`` (outside the cue),
+    ``unknown`` (no such expression or camera), ``contradiction`` (a peak for one, none for another,
+    not settled) and ``coverage`` (no label in force).
+    """
+
+    subject: str
+    expression: str
+    kind: str
+    what: str
+
+
+def problems(dataset: Dataset, subjects: list[str] | None = None) -> list[Problem]:
+    """Everything wrong with the labels of some subjects, all that are not excluded by default."""
+    chosen = included_subjects(dataset) if subjects is None else subjects
+    found = [p for subject in chosen for p in _of_subject(dataset, subject)]
+    for row in disagreements(dataset, subjects=chosen):
+        if row.spread is None:
+            said = ", ".join(f"{who}: {what}" for who, what in row.said.items())
+            what = f"{said}; settle it with 'express50 annotate review --settle'"
+            found.append(Problem(row.subject, row.expression, "contradiction", what))
+    return found
+
+
+def _of_subject(dataset: Dataset, subject: str) -> Iterator[Problem]:
+    index, labels = read_index(dataset, subject), read_labels(dataset, subject)
+    for label in labels:
+        for kind, what in _of_label(index, label):
+            yield Problem(subject, label.expression, kind, f"{label.annotator}: {what}")
+    force = current_labels(labels)
+    for cue in index.cues:
+        if cue.expression_id not in force:
+            yield Problem(subject, cue.expression_id, "coverage", "no label")
+
+
+def _of_label(index: Index, label: Label) -> Iterator[tuple[str, str]]:
+    """Kind and words of what is wrong with one event."""
+    if not label.expression:  # about the whole subject
+        return
+    try:
+        cue = find_cue(index, label.expression)
+    except AnnotationError as error:
+        yield "unknown", str(error)
+        return
+    if label.frame is None:
+        return
+    source = index.cameras.get(label.camera or "")
+    if source is None:
+        yield "unknown", f"no camera {label.camera!r}"
+        return
+    for name in ("first", "frame", "last"):
+        frame = getattr(label, name)
+        if frame is not None and not cue.start_frame <= frame <= cue.end_frame:
+            yield (
+                "window",
+                f"{name} {frame} lies outside the cue window {cue.start_frame} to {cue.end_frame}",
+            )
+    if not 0 <= label.frame < source.frames:
+        yield "identity", f"frame {label.frame} does not exist in {label.camera}"
+    elif (source.pts[label.frame], source.dhash[label.frame]) != (label.pts, label.dhash):
+        yield (
+            "identity",
+            f"frame {label.frame} of {label.camera} has pts {source.pts[label.frame]} and hash"
+            f" {source.dhash[label.frame]}, the label says {label.pts} and {label.dhash}",
+        )

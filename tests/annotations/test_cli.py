@@ -1,0 +1,162 @@
+"""Every verb of ``express50 annotate`` without a screen, through the command line."""
+
+import json
+
+import numpy as np
+import pytest
+
+from annotations.agreement import Clip, agreement, interval_alpha
+from express50.cli import main
+from express50.exclusions import included_subjects
+
+from .labelled import EXPRESSIONS, make_dataset, suggest
+
+
+@pytest.fixture
+def dataset(tmp_path):
+    metas = {"S001": {"gender": "female", "age": 31}, "S002": {"gender": "male"}}
+    found = make_dataset(tmp_path / "data", metas=metas)
+    suggest(found, "S001", {"neutral": (2, 0.9), "smile": (14, 0.2)})
+    return found
+
+
+@pytest.fixture
+def annotate(dataset, capsys):
+    def call(verb, *words, code=0):
+        assert main(["annotate", verb, str(dataset.root), *words, "--json"]) == code
+        return json.loads(capsys.readouterr().out)
+
+    return call
+
+
+def mark(annotate, who, expression, frame, subject="S001"):
+    return annotate("mark", subject, expression, str(frame), "--annotator", who)
+
+
+def test_suggestions_come_doubtful_first_and_next_follows_them(annotate):
+    assert [row["expression"] for row in annotate("suggest")] == ["smile", "neutral"]
+    first = annotate("next", "--annotator", "ann", "--subject", "S001")
+    assert [t["expression"] for t in first["tasks"]] == ["wink_left", "smile", "neutral"]
+    mark(annotate, "ann", "wink_left", 24)
+    left = annotate("next", "--annotator", "ann", "--subject", "S001")
+    assert left["left"] == 2
+
+
+def test_mark_keeps_what_was_suggested_and_undo_takes_it_back(annotate):
+    label = mark(annotate, "ann", "smile", 15)
+    assert (label["suggested"], label["confidence"], label["dhash"]) == (14, 0.2, f"{15:016x}")
+    assert [row["frame"] for row in annotate("labels")] == [15]
+    annotate("undo", "S001", "smile", "--annotator", "ann")
+    assert annotate("labels") == []
+
+
+def test_status_counts_people_rules_and_flags(annotate):
+    mark(annotate, "ann", "smile", 14)
+    annotate("flag", "S001", "wink_left", "occluded", "--annotator", "ann")
+    status = annotate("status")
+    row = status["subjects"][0]
+    assert (row["by_person"], row["flagged"], row["expressions"]) == (1, 1, len(EXPRESSIONS))
+    assert status["annotators"]["ann"]["labels"] == 2
+
+
+def test_agreement_is_measured_and_a_disagreement_settled_keeps_both(annotate):
+    for who, smile, wink in (("ann", 12, 24), ("bob", 18, 25)):
+        mark(annotate, who, "smile", smile)
+        mark(annotate, who, "wink_left", wink)
+    found = annotate("agree")
+    assert found["overall"]["within_1"] == 0.5 and found["overall"]["median_frames"] == 3.5
+    assert set(found["pairs"]) == {"ann+bob"} and set(found["expressions"]) == {
+        "smile",
+        "wink_left",
+    }
+    (row,) = annotate("review")
+    assert (row["expression"], row["spread"]) == ("smile", 6)
+    annotate("review", "--settle", "S001", "smile", "bob", "--annotator", "eve")
+    assert annotate("review") == []
+    (settled,) = annotate("review", "--all")
+    assert settled["said"] == {"ann": "frame 12", "bob": "frame 18"}
+    force = {row["expression"]: row["frame"] for row in annotate("labels")}
+    assert force["smile"] == 18
+
+
+def test_alpha_is_krippendorffs_on_time_within_the_clip():
+    # two annotators; the pairwise definition, written out
+    values = [np.array([0.1, 0.2]), np.array([0.5, 0.5]), np.array([0.9, 0.6])]
+    flat = np.concatenate(values)
+    expected = np.mean(
+        [(a - b) ** 2 for i, a in enumerate(flat) for j, b in enumerate(flat) if i != j]
+    )
+    observed = np.mean([(v[0] - v[1]) ** 2 for v in values])
+    assert interval_alpha(values) == pytest.approx(1 - observed / expected)
+    assert interval_alpha([np.array([0.3, 0.3])] * 4) is None
+    far = [Clip("S", f"e{k}", 1000 * k, 11, {"a": 1000 * k, "b": 1000 * k + 10}) for k in range(5)]
+    assert agreement(far)["alpha"] < 0  # frame numbers alone would say nearly 1
+    assert agreement([])["alpha"] is None
+
+
+@pytest.mark.parametrize("ending", ["csv", "json"])
+def test_export_and_import_lose_and_double_nothing(annotate, dataset, tmp_path, ending):
+    mark(annotate, "ann", "smile", 14)
+    annotate("flag", "S002", "smile", "failed: blinked, twice", "--annotator", "bob")
+    annotate("exclude", "S002", "heavy makeup", "--annotator", "bob")
+    file = tmp_path / f"labels.{ending}"
+    assert annotate("export", str(file))["events"] == 3
+    assert annotate("import", str(file)) == {"file": str(file), "new": 0, "known": 3}
+    before = {s: dataset.labels_file(s).read_text() for s in ("S001", "S002")}
+    for subject in before:
+        dataset.labels_file(subject).unlink()
+    assert annotate("import", str(file))["new"] == 3
+    assert {s: dataset.labels_file(s).read_text() for s in before} == before
+
+
+def test_import_of_another_datasets_frame_writes_nothing(annotate, dataset, tmp_path, capsys):
+    mark(annotate, "ann", "smile", 14)
+    file = tmp_path / "labels.json"
+    annotate("export", str(file))
+    rows = json.loads(file.read_text())
+    rows[0]["dhash"] = "f" * 16
+    file.write_text(json.dumps(rows))
+    dataset.labels_file("S001").unlink()
+    assert main(["annotate", "import", str(dataset.root), str(file)]) != 0
+    assert "row 1" in capsys.readouterr().err
+    assert not dataset.labels_file("S001").exists()
+
+
+def test_rule_marks_last_frames_once_and_people_stand_above(annotate):
+    assert annotate("rule") == []  # no RenderMe-360 expression here
+    marks = annotate("rule", "--expression", "smile", "--subject", "S001")
+    assert [m["frame"] for m in marks] == [19]
+    assert annotate("rule", "--expression", "smile", "--subject", "S001") == []
+    mark(annotate, "ann", "smile", 14)
+    assert [row["frame"] for row in annotate("labels")] == [14]
+
+
+def test_exclusion_has_a_reason_and_an_end(annotate, dataset):
+    annotate("exclude", "S002", "large glasses", "--annotator", "ann")
+    report = annotate("coverage")
+    assert report["excluded"] == {"S002": "large glasses"}
+    assert included_subjects(dataset) == ["S001"] and report["gender"] == {"female": 1}
+    annotate("include", "S002", "--annotator", "ann")
+    assert included_subjects(dataset) == ["S001", "S002"]
+
+
+def test_validate_finds_a_frame_that_is_not_the_one_labelled(annotate, dataset):
+    mark(annotate, "ann", "smile", 14)
+    assert annotate("validate")["ok"] is True
+    path = dataset.labels_file("S001")
+    path.write_text(path.read_text().replace(f"{14:016x}", "0" * 16))
+    found = annotate("validate", code=1)
+    assert found["counts"]["identity"] == 1
+
+
+def test_reference_is_the_first_unless_chosen(annotate):
+    assert annotate("reference") == {"reference": "S001"}
+    assert annotate("reference", "S002") == {"reference": "S002"}
+
+
+@pytest.mark.parametrize("verb", ["status", "labels", "coverage", "agree", "suggest", "next"])
+def test_verbs_print_tables_too(annotate, dataset, capsys, verb):
+    mark(annotate, "ann", "smile", 14)
+    words = ["--annotator", "ann"] if verb == "next" else []
+    assert main(["annotate", verb, str(dataset.root), *words]) == 0
+    assert capsys.readouterr().out.strip()

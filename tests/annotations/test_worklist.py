@@ -1,0 +1,99 @@
+"""The reference identity and the order of the work."""
+
+import pytest
+
+from annotations.reference import canonical, choose_reference, reference_subject
+from annotations.store import AUTOMATIC, Label, append_label, make_flag, make_mark
+from annotations.suggestions import read_suggestions
+from annotations.worklist import worklist
+from express50.errors import AnnotationError, FormatError
+from express50.exclusions import exclusion_reason, included_subjects
+from express50.index import read_index
+from tests.annotations.labelled import make_dataset, suggest
+
+
+def _mark(dataset, subject, expression, frame, who):
+    append_label(dataset, make_mark(read_index(dataset, subject), expression, frame, "a", who))
+
+
+def _exclude(dataset, subject, action="exclude"):
+    append_label(
+        dataset,
+        Label(subject=subject, expression="", action=action, annotator="ann", time=1.0,
+              reason="heavy makeup"),
+    )  # fmt: skip
+
+
+def test_the_canonical_frame_is_the_references_label_else_its_suggestion(tmp_path):
+    dataset = make_dataset(tmp_path)
+    assert canonical(dataset, "smile") is None
+    suggest(dataset, "S001", {"smile": (14, 0.8)})
+    assert (canonical(dataset, "smile").frame, canonical(dataset, "smile").by) == (14, "suggestion")
+    _mark(dataset, "S001", "smile", 15, "ann")
+    assert (canonical(dataset, "smile").frame, canonical(dataset, "smile").by) == (15, "ann")
+    append_label(dataset, make_flag(read_index(dataset, "S001"), "smile", "failed", "ann"))
+    assert canonical(dataset, "smile") is None
+
+
+def test_the_reference_is_chosen_or_the_first_who_is_not_excluded(tmp_path):
+    dataset = make_dataset(tmp_path, ("S001", "S002", "S003"))
+    assert reference_subject(dataset) == "S001"
+    _exclude(dataset, "S001")
+    assert reference_subject(dataset) == "S002"
+    choose_reference(dataset, "S003")
+    assert reference_subject(dataset) == "S003"
+    with pytest.raises(AnnotationError, match="S002, S003"):
+        choose_reference(dataset, "S001")
+    _exclude(dataset, "S003")
+    with pytest.raises(AnnotationError, match="excluded"):
+        reference_subject(dataset)
+
+
+def test_exclusion_is_a_record_that_a_later_one_takes_back(tmp_path):
+    dataset = make_dataset(tmp_path)
+    assert exclusion_reason(dataset, "S002") is None
+    _exclude(dataset, "S002")
+    assert exclusion_reason(dataset, "S002") == "heavy makeup"
+    assert included_subjects(dataset) == ["S001"]
+    assert {t.subject for t in worklist(dataset, "ann")} == {"S001"}
+    _exclude(dataset, "S002", "include")
+    assert included_subjects(dataset) == ["S001", "S002"]
+
+
+def test_canonical_frames_come_first_then_doubt(tmp_path):
+    dataset = make_dataset(tmp_path, ("S001", "S002", "S003"))
+    choose_reference(dataset, "S002")
+    for subject, sure in (("S001", 0.9), ("S002", 0.99), ("S003", 0.2)):
+        suggest(dataset, subject, {"smile": (14, sure), "neutral": (3, 0.95)})
+    order = [(t.subject, t.expression) for t in worklist(dataset, "ann")]
+    assert order == [
+        ("S002", "wink_left"), ("S002", "neutral"), ("S002", "smile"),
+        ("S001", "wink_left"), ("S003", "wink_left"), ("S003", "smile"), ("S001", "smile"),
+        ("S001", "neutral"), ("S003", "neutral"),
+    ]  # fmt: skip
+    by_expression = [(t.expression, t.subject) for t in worklist(dataset, "a", order="expression")]
+    assert by_expression[:3] == [("neutral", "S002"), ("neutral", "S001"), ("neutral", "S003")]
+    by_subject = [t.subject for t in worklist(dataset, "a", order="subject")]
+    assert by_subject == ["S002"] * 3 + ["S001"] * 3 + ["S003"] * 3
+
+
+def test_only_ones_own_labels_are_done(tmp_path):
+    dataset = make_dataset(tmp_path)
+    _mark(dataset, "S001", "smile", 15, "ann")
+    _mark(dataset, "S001", "neutral", 5, AUTOMATIC)
+    assert [t.expression for t in worklist(dataset, "ann", ["S001"])] == ["neutral", "wink_left"]
+    assert len(worklist(dataset, "bob")) == 6
+    assert len(worklist(dataset, "ann", everything=True)) == 6
+    assert [t.subject for t in worklist(dataset, "ann", expressions=["smile"])] == ["S002"]
+
+
+def test_unknown_orders_subjects_and_files_are_named(tmp_path):
+    dataset = make_dataset(tmp_path)
+    with pytest.raises(AnnotationError, match="doubt, expression, subject"):
+        worklist(dataset, "ann", order="mood")
+    with pytest.raises(AnnotationError, match="'S009'"):
+        worklist(dataset, "ann", ["S009"])
+    suggest(dataset, "S001", {})
+    (dataset.item_dir("align", "S001") / "suggestions.json").write_text('{"smile": {"x": 1}}')
+    with pytest.raises(FormatError, match="express50 align"):
+        read_suggestions(dataset, "S001")

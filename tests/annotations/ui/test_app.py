@@ -1,0 +1,290 @@
+"""The real app through Textual's pilot: every key, every message, small terminals, no traceback."""
+
+import asyncio
+import json
+import shutil
+
+import pytest
+
+from annotations.store import append_label, current_labels, make_mark, read_labels
+from annotations.ui.keymap import GROUPS
+from annotations.ui.picture import Picture
+from annotations.ui.strip import CurveStrip
+from express50.index import read_index
+
+from .conftest import suggest
+
+
+def drive(app, *keys, size=(100, 32), check=None):
+    """Press keys in the app; returns what ``check`` says of it at the end."""
+
+    async def run():
+        async with app.run_test(size=size) as pilot:
+            await pilot.pause()
+            for key in keys:
+                await pilot.press(key)
+            await pilot.pause()
+            return check(app) if check else None
+
+    return asyncio.run(run())
+
+
+def line(app, name):
+    return app.desk.query_one(f"#{name}").content.plain
+
+
+def labels(dataset, subject="S001"):
+    return read_labels(dataset, subject)
+
+
+def test_one_key_accepts_a_right_suggestion_and_opens_the_next(suggested, make_app):
+    app = make_app(suggested)
+    task = drive(app, "enter", check=lambda app: app.session.task)
+    (label,) = labels(suggested)
+    assert (label.frame, label.keys, label.shown, label.camera) == (4, 1, True, "cam01")
+    assert label.seconds < 30
+    assert task.expression == "smile"
+
+
+def test_every_way_of_moving_is_on_its_key(suggested, make_app):
+    table = [
+        ("right", 21), ("left", 19), (".", 21), (",", 19), ("l", 21), ("h", 19),
+        ("shift+right", 30), ("pagedown", 30), ("L", 30), ("pageup", 16), ("shift+left", 16),
+        ("home", 16), ("0", 16), ("end", 31), ("$", 31), ("tab", 27), ("shift+tab", 27),
+        ("1", 20), ("2", 27), ("5", 20),
+    ]  # fmt: skip
+    app = make_app(suggested, expressions=["smile"], subjects=["S001"])
+
+    async def run():
+        async with app.run_test(size=(90, 26)) as pilot:
+            await pilot.pause()
+            for key, frame in table:
+                await pilot.press("1")
+                assert app.desk.view.cursor == 20
+                await pilot.press(key)
+                assert (key, app.desk.view.cursor) == (key, frame)
+                assert app.desk.query_one("#frame", Picture).look.frame == frame
+            await pilot.press("g", "2", "9", "enter")
+            assert app.desk.view.cursor == 29
+            await pilot.press("g", "7", "escape")
+            assert app.desk.view.cursor == 29
+
+    asyncio.run(run())
+
+
+def test_a_plateau_goes_into_the_label(suggested, make_app):
+    keys = ("left", "left", "[", "right", "right", "right", "]", "left", "enter")
+    drive(make_app(suggested), *keys)
+    (label,) = labels(suggested)
+    assert (label.first, label.frame, label.last, label.keys) == (2, 4, 5, 9)
+
+
+def test_a_frame_outside_its_plateau_is_not_saved_and_the_screen_says_why(suggested, make_app):
+    keys = ("]", "right", "enter")
+    said = drive(make_app(suggested), *keys, check=lambda app: line(app, "message"))
+    assert "not saved" in said
+    assert "outside your plateau" in said
+    assert labels(suggested) == []
+
+
+def test_flags_by_one_digit_or_in_words(suggested, make_app):
+    app = make_app(suggested)
+    drive(app, "f", "2", "f", "escape", "f", "5", *"tongueless", "enter")
+    first, second = labels(suggested)
+    assert (first.action, first.reason, first.keys) == ("flag", "occluded", 2)
+    assert (second.expression, second.reason) == ("smile", "tongueless")
+
+
+def test_undo_brings_the_task_back_and_says_so(suggested, make_app):
+    app = make_app(suggested)
+    said = drive(app, "enter", "u", check=lambda app: line(app, "message"))
+    assert "taken back: S001 neutral" in said
+    assert app.session.task.expression == "neutral"
+    assert current_labels(labels(suggested)) == {}
+    fresh = make_app(suggested, "bob")
+    assert "nothing of yours" in drive(fresh, "u", check=lambda app: line(app, "message"))
+
+
+def test_next_and_previous_leave_tasks_open(suggested, make_app):
+    app = make_app(suggested)
+    drive(app, "n", "n", "p")
+    assert (app.session.task.expression, app.session.done) == ("smile", 0)
+    assert "first task" in drive(make_app(suggested), "p", check=lambda app: line(app, "message"))
+
+
+def test_what_is_marked_stands_on_the_screen_when_one_returns(suggested, make_app):
+    app = make_app(suggested)
+    title, strip = drive(
+        app, "right", "enter", "p",
+        check=lambda app: (line(app, "frame-title"), app.desk.query_one(CurveStrip).text),
+    )  # fmt: skip
+    assert "frame 5" in title
+    assert "● your mark" in title
+    assert "●" in strip[-1]
+
+
+def test_blind_hides_suggestion_curves_and_others_marks_until_one_has_decided(suggested, make_app):
+    append_label(suggested, make_mark(read_index(suggested, "S001"), "smile", 22, "cam00", "bob"))
+    app = make_app(suggested, blind=True, expressions=["smile"], subjects=["S001"])
+
+    def look(app):
+        return app.desk.view.cursor, "".join(app.desk.query_one(CurveStrip).text)
+
+    cursor, strip = drive(app, "tab", check=look)
+    assert cursor == (16 + 31) // 2
+    assert not set(strip) & set("○12▁▂▃▄▅▆▇█")
+    drive(make_app(suggested, blind=True, expressions=["smile"], subjects=["S001"]), "enter")
+    assert [x.shown for x in labels(suggested) if x.annotator == "ann"] == [False]
+    open_again = make_app(suggested, blind=True, expressions=["smile"], subjects=["S001"])
+    cursor, strip = drive(open_again, check=look)
+    assert {"1", "2", "●", "█"} <= set(strip)
+
+
+def test_zoom_camera_blink_play_and_help_leave_the_label_alone(suggested, make_app):
+    app = make_app(suggested)
+
+    async def run():
+        async with app.run_test(size=(120, 40)) as pilot:
+            await pilot.pause()
+            frame = app.desk.query_one("#frame", Picture)
+            zooms, cameras = [], []
+            for _ in range(5):
+                await pilot.press("z")
+                zooms.append(frame.look.zoom)
+            assert zooms == ["mouth", "eyes", "head", "frame", "face"]
+            for key in "cc":
+                await pilot.press(key)
+                reference = app.desk.query_one("#reference", Picture).look
+                cameras.append((frame.look.camera, reference.camera))
+            assert cameras == [("cam00", "cam00"), ("cam01", "cam01")]
+            await pilot.press("n", "n", "n", "b")  # smile of S002, against S001
+            await pilot.pause()
+            assert frame.look.subject == "S001"
+            await pilot.press("left")
+            assert (frame.look.subject, app.desk.player.blinks) == ("S002", False)
+            await pilot.press("home", "space")
+            await pilot.pause(0.3)
+            assert app.desk.view.cursor > app.desk.view.first
+            await pilot.press("enter")  # stops; a moving frame cannot be meant
+            assert not app.desk.player.plays
+            assert labels(suggested, "S002") == []
+            await pilot.press("question_mark", "x")
+
+    asyncio.run(run())
+
+
+def test_play_ends_with_the_window_and_starts_again(suggested, make_app):
+    app = make_app(suggested)
+
+    async def run():
+        async with app.run_test(size=(80, 24)) as pilot:
+            await pilot.pause()
+            await pilot.press("end", "left", "space")
+            await pilot.pause(0.4)
+            assert app.desk.view.cursor == app.desk.view.last
+            assert not app.desk.player.plays
+            await pilot.press("space")
+            assert app.desk.player.plays
+            assert app.desk.view.cursor < app.desk.view.last
+
+    asyncio.run(run())
+
+
+def test_without_suggestions_and_reference_the_middle_is_opened_and_said(dataset, make_app):
+    app = make_app(dataset)
+    cursor, message, right = drive(
+        app,
+        check=lambda app: (
+            app.desk.view.cursor, line(app, "message"), app.desk.query_one("#reference").look,
+        ),
+    )  # fmt: skip
+    assert cursor == 7
+    assert "align" in message
+    assert right is None
+    drive(make_app(dataset), "tab", "b", "enter")
+    (label,) = labels(dataset)
+    assert (label.frame, label.suggested, label.shown) == (7, None, False)
+
+
+def test_missing_proxies_and_footage_are_said_in_plain_words(suggested, make_app, footage):
+    ingest = suggested.root / "ingest"
+    ingest.unlink()
+    shutil.copytree(footage.root / "ingest", ingest)
+    for path in (ingest / "S001" / "proxies").iterdir():
+        path.unlink()
+
+    def picture_words(app):
+        strips = app.desk.query_one("#frame", Picture)._lines
+        return " ".join(" ".join(strip.text for strip in strips).split())
+
+    assert "proxies are missing" in drive(make_app(suggested), check=picture_words)
+    app = make_app(suggested)
+    index = json.loads((ingest / "S001" / "index.json").read_text())
+    index["cues"] = index["cues"][1:]
+    (ingest / "S001" / "index.json").write_text(json.dumps(index))
+    said = drive(app, "enter", "right", "z", "c", "[", "f", "1", "space", "b",
+                 check=lambda app: line(app, "message"))  # fmt: skip
+    assert "no footage of neutral" in said
+    assert labels(suggested) == []
+
+
+def test_nothing_to_label_is_said(suggested, make_app):
+    app = make_app(suggested, expressions=["shout"])
+    assert "nothing to label" in drive(app, "enter", "u", "n", "f", "1",
+                                       check=lambda app: line(app, "message"))  # fmt: skip
+
+
+def test_the_end_of_the_work_is_said_and_everything_can_be_flagged(suggested, make_app):
+    app = make_app(suggested, subjects=["S002"])
+    said = drive(app, *(["f", "3"] * 3), check=lambda app: line(app, "message"))
+    assert "all 3 done" in said
+    assert {x.action for x in labels(suggested, "S002")} == {"flag"}
+
+
+@pytest.mark.parametrize("size", [(40, 12), (80, 24), (200, 60), (20, 6)])
+def test_terminals_of_any_size(suggested, make_app, size):
+    app = make_app(suggested)
+    keys = ("right", "z", "[", "f", "escape", "question_mark", "escape", "n")
+    drive(app, *keys, size=size)
+    assert app.session.task.expression == "smile"
+
+
+def test_a_resize_keeps_the_position(suggested, make_app):
+    app = make_app(suggested)
+
+    async def run():
+        async with app.run_test(size=(120, 40)) as pilot:
+            await pilot.pause()
+            await pilot.press("right")
+            await pilot.resize_terminal(60, 18)
+            await pilot.pause()
+            assert app.desk.view.cursor == 5
+            strip = app.desk.query_one(CurveStrip)
+            assert all(len(text) == 60 for text in strip.text)
+
+    asyncio.run(run())
+
+
+def test_a_click_on_the_strip_moves_the_cursor(suggested, make_app):
+    app = make_app(suggested)
+
+    async def run():
+        async with app.run_test(size=(90, 26)) as pilot:
+            await pilot.pause()
+            await pilot.click(CurveStrip, offset=(10 + 5 * 9 + 1, 0))
+            assert app.desk.view.cursor == 9
+
+    asyncio.run(run())
+
+
+def test_reference_of_another_camera_set_falls_back_to_its_own(suggested, make_app):
+    rows = json.loads((suggested.item_dir("align", "S001") / "suggestions.json").read_text())
+    assert rows["smile"]["camera"] == "cam01"
+    suggest(suggested, {"S002": {"smile": [99]}})  # a suggestion outside the window
+    app = make_app(suggested, subjects=["S002"], expressions=["smile"])
+    assert drive(app, check=lambda app: app.desk.view.cursor) == 23
+
+
+def test_no_key_is_bound_twice():
+    keys = [k for group in GROUPS.values() for key in group for k in key.keys.split(",")]
+    assert len(keys) == len(set(keys))

@@ -1,0 +1,125 @@
+"""Pictures in memory: bounded, decoded ahead, and honest about frames that cannot be read."""
+
+import threading
+import time
+
+import numpy as np
+import pytest
+
+from annotations.ui.faces import Face, zoom_box
+from annotations.ui.frames import FrameCache, Shot, crop_to
+from express50.errors import AnnotationError, CaptureError
+
+WHOLE = (0.0, 0.0, 1.0, 1.0)
+
+
+def shot(frame, size=8):
+    return Shot("S1", "cam", frame, WHOLE, size, size)
+
+
+def painter(dataset, wanted):
+    return np.full((wanted.height, wanted.width, 3), wanted.frame % 256, np.uint8)
+
+
+def wait_until(true, seconds=5.0):
+    end = time.monotonic() + seconds
+    while not true() and time.monotonic() < end:
+        time.sleep(0.005)
+    assert true()
+
+
+def test_memory_is_bounded_and_the_oldest_leaves_first():
+    each = 8 * 8 * 3
+    cache = FrameCache(None, limit_bytes=3 * each, decode=painter)
+    for frame in (1, 2, 3, 1, 4):
+        assert cache.get(shot(frame))[0, 0, 0] == frame
+        assert cache.used_bytes <= 3 * each
+    assert cache.misses == 4
+    cache.get(shot(1))
+    assert cache.misses == 4
+    cache.get(shot(2))
+    assert cache.misses == 5
+
+
+def test_a_picture_larger_than_the_memory_is_shown_all_the_same():
+    cache = FrameCache(None, limit_bytes=10, decode=painter)
+    assert cache.get(shot(5)).shape == (8, 8, 3)
+    assert cache.used_bytes == 0
+
+
+def test_what_is_wanted_is_decoded_ahead_urgent_ones_first():
+    order, gate = [], threading.Event()
+
+    def slow(dataset, wanted):
+        gate.wait(5)
+        order.append(wanted.frame)
+        return painter(dataset, wanted)
+
+    cache = FrameCache(None, decode=slow)
+    cache.want([shot(9)])
+    wait_until(cache.idle)  # the thread has taken 9 and waits at the gate
+    cache.want([shot(7), shot(8)], later=True)
+    cache.want([shot(1), shot(2)])
+    gate.set()
+    wait_until(lambda: len(order) == 5)
+    assert order == [9, 1, 2, 7, 8]
+    wait_until(lambda: cache.used_bytes == 5 * 8 * 8 * 3)
+    misses = cache.misses
+    cache.get(shot(2))
+    assert cache.misses == misses
+    cache.close()
+
+
+@pytest.mark.parametrize(
+    ("error", "words"),
+    [
+        (FileNotFoundError("cam.json"), "proxies are missing"),
+        (CaptureError("no frame 3 of camera 'cam'"), "no frame 3"),
+        (IndexError("list index"), "cannot be read"),
+    ],
+)
+def test_a_frame_that_cannot_be_read_is_told_in_plain_words(error, words):
+    def broken(dataset, wanted):
+        raise error
+
+    cache = FrameCache(None, decode=broken)
+    with pytest.raises(AnnotationError, match=words):
+        cache.get(shot(3))
+    cache.want([shot(3)])  # must not kill the thread
+    wait_until(cache.idle)
+    cache._decode = painter
+    cache.want([shot(4)])
+    wait_until(lambda: cache.used_bytes > 0)
+    cache.close()
+
+
+def test_a_crop_beyond_the_border_is_black_there_and_keeps_its_size():
+    image = np.full((20, 30, 3), 200, np.uint8)
+    out = crop_to(image, (-0.5, 0.0, 0.5, 1.0), 40, 20)
+    assert out.shape == (20, 40, 3)
+    assert out[:, :18].max() == 0
+    assert out[:, 22:].min() == 200
+    assert crop_to(image, (2.0, 2.0, 3.0, 3.0), 4, 4).max() == 0
+    assert crop_to(image, (0.5, 0.5, 0.5, 0.5), 4, 6).shape == (6, 4, 3)
+
+
+@pytest.mark.parametrize("zoom", ["face", "mouth", "eyes", "head", "frame"])
+@pytest.mark.parametrize("pane_aspect", [0.3, 1.0, 2.5])
+def test_a_zoom_keeps_the_footage_undistorted(zoom, pane_aspect):
+    face = Face(0.4, 0.3, 0.12, 0.5625)
+    left, top, right, bottom = zoom_box(face, zoom, pane_aspect, 0.5625)
+    assert (bottom - top) * 0.5625 / (right - left) == pytest.approx(pane_aspect, rel=0.02)
+    if zoom == "frame":
+        assert left <= 0 and top <= 0 and right >= 1 and bottom >= 1
+    else:
+        assert left < 0.4 < right
+
+
+def test_mouth_and_eyes_are_inside_the_face_and_the_face_inside_the_head():
+    face = Face(0.5, 0.4, 0.1, 1.0)
+    mouth, eyes, whole, head = (
+        zoom_box(face, z, 0.75, 1.0) for z in ("mouth", "eyes", "face", "head")
+    )
+    for inner, outer in ((mouth, whole), (eyes, whole), (whole, head)):
+        assert inner[1] > outer[1] and inner[3] < outer[3]
+    assert mouth[1] > eyes[1]

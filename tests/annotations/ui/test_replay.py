@@ -1,0 +1,72 @@
+"""The simulated annotator: the cheapest keys, through the real app."""
+
+import asyncio
+
+import pytest
+
+from annotations.store import read_labels
+from annotations.ui.app import AnnotateApp
+from annotations.ui.replay import MOVES, cheapest_keys, measure_steps, replay
+from annotations.ui.session import open_session
+from annotations.ui.view import open_view
+from express50.errors import AnnotationError
+
+
+@pytest.mark.parametrize(
+    ("frame", "keys"),
+    [(20, 0), (21, 0), (22, 1), (24, 3), (27, 1), (30, 1), (31, 1), (45, 5), (99, 1), (0, 1)],
+)
+def test_the_cheapest_keys_lead_within_the_tolerance(frame, keys):
+    view = open_view(5, 80, (20, 28))
+    found = cheapest_keys(view, frame, tolerance=1)
+    assert len(found) == keys
+    for key in found:
+        view = MOVES[key](view)
+    assert abs(view.cursor - min(max(frame, 5), 80)) <= 1
+
+
+def test_right_suggestions_cost_one_key_and_wrong_ones_their_way(suggested):
+    truth = {
+        ("S001", "neutral"): 5, ("S001", "smile"): 27, ("S002", "neutral"): 7,
+        ("S002", "jaw_open"): 40,
+    }  # fmt: skip
+    result = replay(suggested, truth, order="subject", size=(80, 24))
+    assert result.keystrokes == [1, 2, 3, 1]
+    assert result.errors == [1, 0, 1, 0]
+    assert len(result.steps) == 3
+    assert result.summary()["keystrokes_per_label_median"] == 1.5
+    marks = read_labels(suggested, "S001") + read_labels(suggested, "S002")
+    assert [(m.expression, m.frame) for m in marks] == [
+        ("neutral", 4), ("smile", 27), ("neutral", 6), ("jaw_open", 40),
+    ]  # fmt: skip
+    with pytest.raises(AnnotationError, match="known truth"):
+        replay(suggested, truth, order="subject")
+
+
+def test_steps_are_measured_over_tasks_cameras_and_zooms(suggested):
+    steps = measure_steps(suggested, 12, faces=False, size=(80, 24))
+    assert len(steps) == 12
+    assert min(steps) > 0
+    assert read_labels(suggested, "S001") == []
+
+
+def test_faces_found_late_are_drawn_when_they_are_there(suggested):
+    class Finder:
+        ready = False
+
+        def load(self):
+            self.ready = True
+
+        def find(self, subject, camera, frame):
+            from annotations.ui.faces import Face
+
+            return Face(0.5, 0.5, 0.2, 1.0) if self.ready else None
+
+    app = AnnotateApp(open_session(suggested, "ann"), faces=Finder())
+
+    async def run():
+        async with app.run_test(size=(80, 24)) as pilot:
+            await pilot.pause(0.2)
+            assert app.desk.query_one("#frame").look.face is not None
+
+    asyncio.run(run())

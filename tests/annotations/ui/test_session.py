@@ -1,0 +1,192 @@
+"""A session without a screen: order, cost, undo, and what survives a kill."""
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from annotations.store import append_label, labels_of, make_mark, read_labels
+from annotations.ui.scene import load_scene
+from annotations.ui.session import IDLE_SECONDS, open_session
+from annotations.ui.view import open_view, set_plateau_first, step
+from annotations.worklist import Task
+from express50.errors import AnnotationError
+from express50.index import read_index
+
+from .conftest import suggest
+
+REPOSITORY = Path(__file__).resolve().parents[3]
+
+
+class Clock:
+    def __init__(self):
+        self.now = 100.0
+
+    def __call__(self):
+        return self.now
+
+
+def begin(dataset, **options):
+    session = open_session(dataset, "ann", order="subject", **options)
+    session._clock = Clock()
+    session.begin()
+    return session, session._clock
+
+
+def scene_and_view(session):
+    scene = load_scene(session.dataset, session.task, session.annotator)
+    hidden = session.hidden(session.task)
+    return scene, open_view(scene.first, scene.last, () if hidden else scene.candidates)
+
+
+def mark(session):
+    scene, view = scene_and_view(session)
+    label = session.mark(scene, view, scene.cameras[0])
+    session.advance()
+    return label
+
+
+def test_a_right_suggestion_costs_one_key_and_its_seconds(suggested):
+    session, clock = begin(suggested)
+    clock.now += 3.5
+    session.press()
+    label = mark(session)
+    assert (label.frame, label.suggested, label.confidence) == (4, 4, 0.9)
+    assert (label.keys, label.seconds, label.shown) == (1, 3.5, True)
+    assert read_labels(suggested, "S001") == [label]
+    assert session.task.expression == "smile"
+
+
+def test_a_break_does_not_count_and_a_visit_before_does(suggested):
+    session, clock = begin(suggested)
+    session.press()
+    clock.now += 2
+    session.move(1)
+    clock.now += 4
+    session.move(-1)
+    clock.now += 3600
+    session.press()
+    label = mark(session)
+    assert label.keys == 2
+    assert label.seconds == 2 + IDLE_SECONDS
+
+
+def test_undo_returns_to_the_task_and_is_a_record_of_its_own(suggested):
+    session, _ = begin(suggested)
+    mark(session)
+    mark(session)
+    assert session.done == 2
+    assert session.undo().expression == "smile"
+    assert session.task.expression == "smile"
+    assert session.undo().expression == "neutral"
+    assert session.done == 0
+    assert session.undo() is None
+    events = read_labels(suggested, "S001")
+    assert [e.action for e in events] == ["mark", "mark", "undo", "undo"]
+    assert labels_of(events, "ann") == {}
+
+
+def test_undo_of_a_second_mark_brings_the_first_back(suggested):
+    session, _ = begin(suggested)
+    mark(session)
+    session.move(-1)
+    scene, view = scene_and_view(session)
+    session.mark(scene, step(view, 3), scene.cameras[0])
+    session.undo()
+    assert labels_of(read_labels(suggested, "S001"), "ann")["neutral"].frame == 4
+    assert not session.is_open(session.task)
+
+
+def test_a_session_resumes_at_the_next_undecided_task(suggested):
+    session, _ = begin(suggested)
+    mark(session)
+    scene, _ = scene_and_view(session)
+    session.flag(scene, "occluded")
+    again, _ = begin(suggested)
+    assert (again.done, again.task.expression) == (2, "jaw_open")
+    other = open_session(suggested, "bob", order="subject")
+    assert (other.done, other.task.expression) == (0, "neutral")
+
+
+def test_blind_hides_until_the_first_decision(suggested):
+    session, _ = begin(suggested, blind=True)
+    first = session.task
+    assert session.hidden(first)
+    label = mark(session)
+    assert (label.shown, label.suggested, label.frame) == (False, 4, 7)
+    assert not session.hidden(first)
+    session.move(-1)
+    assert mark(session).shown is True
+
+
+def test_all_flagged_is_finished(suggested):
+    session, _ = begin(suggested, subjects=["S002"])
+    for _ in range(3):
+        scene, _ = scene_and_view(session)
+        label = session.flag(scene, "not performed")
+        more = session.advance()
+    assert (more, session.finished, label.reason) == (False, True, "not performed")
+    assert session.done == len(session.tasks) == 3
+
+
+def test_a_mark_outside_its_plateau_is_refused_and_nothing_is_written(suggested):
+    session, _ = begin(suggested)
+    scene, view = scene_and_view(session)
+    view = step(set_plateau_first(step(view, 2)), -2)
+    with pytest.raises(AnnotationError, match="outside your plateau 6 to 15"):
+        session.mark(scene, view, scene.cameras[0])
+    assert read_labels(suggested, "S001") == []
+
+
+def test_a_label_on_other_footage_is_named(suggested):
+    index = read_index(suggested, "S001")
+    label = make_mark(index, "smile", 20, "cam00", "ann")
+    append_label(suggested, type(label)(**{**vars(label), "dhash": "0" * 16}))
+    scene = load_scene(suggested, Task("S001", "smile", 0.1), "ann")
+    assert any("another picture in today's footage" in note for note in scene.notes)
+
+
+def test_what_is_missing_is_said_not_raised(dataset):
+    scene = load_scene(dataset, Task("S001", "smile", 1.0), "ann")
+    assert scene.problem is None
+    assert any("align" in note for note in scene.notes)
+    assert any("reference" in note for note in scene.notes)
+    assert "no footage of shout" in load_scene(dataset, Task("S001", "shout", 1.0), "ann").problem
+    assert "not ingested" in load_scene(dataset, Task("S9", "smile", 1.0), "ann").problem
+    suggest(dataset, {"S001": {"smile": [20]}})
+    (dataset.item_dir("align", "S001") / "suggestions.json").write_text("[")
+    assert "suggestions" in " ".join(load_scene(dataset, Task("S001", "smile", 1), "ann").notes)
+
+
+@pytest.mark.parametrize("name", ["auto", "rule:last-frame"])
+def test_the_toolkits_own_names_are_refused(suggested, name):
+    with pytest.raises(AnnotationError, match="give yours"):
+        open_session(suggested, name)
+
+
+_KILLED = """
+import sys
+sys.path[:0] = sys.argv[2:]
+from express50.layout import Dataset
+from annotations.ui.session import open_session
+from tests.annotations.ui.test_session import mark
+session = open_session(Dataset(sys.argv[1]), "ann", order="subject")
+while not session.finished:
+    print(mark(session).expression, session.tasks[session.position - 1].subject, flush=True)
+sys.stdin.read()
+"""
+
+
+def test_a_kill_loses_no_acknowledged_mark(suggested):
+    command = [sys.executable, "-c", _KILLED, str(suggested.root), str(REPOSITORY)]
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stdin=subprocess.PIPE, text=True, cwd=REPOSITORY,
+        env=os.environ | {"PYTHONPATH": str(REPOSITORY)},
+    ) as child:  # fmt: skip
+        acknowledged = [child.stdout.readline().split()[0] for _ in range(4)]
+        child.send_signal(signal.SIGKILL)
+    found = [*read_labels(suggested, "S001"), *read_labels(suggested, "S002")]
+    assert [label.expression for label in found][:4] == acknowledged
