@@ -24,6 +24,7 @@ from express50.cameras import Camera, project, transform_camera, triangulate
 from express50.config import resolve_config
 from express50.index import Index, read_index
 from express50.layout import Dataset
+from express50.rigs.world import meeting_point
 from express50.runner import run_stage
 from express50.transforms import invert_transform, matrix_to_axis_angle, rigid_fit
 from express50.twin.config import TwinConfig
@@ -47,7 +48,6 @@ from pipelines.calibrate.intrinsics import (
     with_ideal,
 )
 from pipelines.calibrate.solve import solve_rig
-from express50.rigs.world import meeting_point
 
 HEAD_RADIUS_M = 0.13
 

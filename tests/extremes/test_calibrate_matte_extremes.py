@@ -8,12 +8,12 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from express50.errors import CalibrationError
+from express50.rigs.world import canonical_from_rig, move_cameras
 from pipelines.calibrate.board import gather
 from pipelines.calibrate.config import CalibrateConfig
 from pipelines.calibrate.saddle import refine_corners, square_sides
 from pipelines.calibrate.solve import solve_rig
 from pipelines.calibrate.stage import check_given
-from express50.rigs.world import canonical_from_rig, move_cameras
 from pipelines.matte.config import MatteConfig
 from pipelines.matte.plate import exposure_gain
 from pipelines.matte.stage import Keyer

@@ -9,6 +9,7 @@ import pytest
 
 from express50.cameras import read_cameras, write_cameras
 from express50.errors import CalibrationError
+from express50.rigs.world import canonical_from_rig, meeting_point, move_cameras
 from express50.transforms import axis_angle_to_matrix, make_transform
 from pipelines.calibrate.board import (
     Observations,
@@ -22,7 +23,6 @@ from pipelines.calibrate.bundle import residuals
 from pipelines.calibrate.config import CalibrateConfig
 from pipelines.calibrate.solve import Rig, solve_rig
 from pipelines.calibrate.stage import check_given
-from express50.rigs.world import canonical_from_rig, meeting_point, move_cameras
 from tests.pipelines.board_rigs import (
     BOARD,
     POINTS,
