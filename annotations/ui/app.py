@@ -29,6 +29,8 @@ ModalScreen {{ align: center middle; background: {theme.GROUND} 60%; }}
     border-title-color: {theme.ACCENT}; border-subtitle-color: {theme.FAINT};
 }}
 .dialog Static {{ width: auto; height: auto; }}
+.help {{ width: 108; }}
+.help Static {{ width: 100%; }}
 .dialog Input {{ width: 44; height: 3; border: round {theme.FAINT}; background: {theme.PANEL}; }}
 """
 
