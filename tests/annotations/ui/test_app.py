@@ -177,14 +177,18 @@ def test_zoom_camera_blink_play_and_help_leave_the_label_alone(suggested, make_a
     asyncio.run(run())
 
 
-def test_play_ends_with_the_window_and_starts_again(suggested, make_app):
+def test_play_ends_with_the_window_and_starts_again(suggested, make_app, monkeypatch):
+    monkeypatch.setattr(player, "FASTEST", 4.0)
     app = make_app(suggested)
 
     async def run():
         async with app.run_test(size=(80, 24)) as pilot:
             await pilot.pause()
             await pilot.press("end", "left", "space")
-            await pilot.pause(0.4)
+            for _ in range(100):
+                await pilot.pause(0.1)
+                if not app.desk.player.plays:
+                    break
             assert app.desk.view.cursor == app.desk.view.last
             assert not app.desk.player.plays
             await pilot.press("space")
