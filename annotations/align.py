@@ -1,17 +1,22 @@
-"""The align stage: suggest the peak of every expression, accept it where no person has spoken.
+"""The align stage: for every expression the frame that matches the reference's canonical frame.
 
-Item: a subject. A suggestion that is accepted without a person goes through the same label store
+Item: a subject. What the observe stage saw is compared with the reference identity's labels or
+peaks. A suggestion that is sure enough is accepted without a person, through the same label store
 that an annotator writes to, under the name ``auto``; a person's label always stands above it.
 """
 
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from annotations.match import Reference, Watched, suggest_all, watch
+from annotations.observe import observations_path, read_observations
+from annotations.reference import reference_subject
 from annotations.store import (
     AUTOMATIC,
     Label,
@@ -19,55 +24,51 @@ from annotations.store import (
     current_labels,
     human_digest,
     make_mark,
+    make_undo,
     read_labels,
 )
-from annotations.suggest import (
-    CROP,
-    ClipObservation,
-    Suggestion,
-    activity,
-    align_crop,
-    candidates,
-    suggest_peak,
-)
+from annotations.suggest import Suggestion
 from express50.errors import StageError
-from express50.expressions import Expression, load_script
+from express50.expressions import load_script
 from express50.frames import read_proxy
 from express50.images import contact_sheet, write_image
-from express50.index import Cue, Index, read_index
-from express50.landmarks.detector import detect
-from express50.landmarks.network import LandmarkNet, load_network
+from express50.index import Index, read_index
 from express50.layout import Dataset
 from express50.stage import Stage
-
-NEUTRAL = "neutral"
 
 
 @dataclass(frozen=True, kw_only=True)
 class AlignConfig:
     """Settings of the align stage."""
 
-    cameras: int = 3
-    """How many cameras watch the face; those that see it best at rest are taken."""
-    stride: int = 1
-    """Look at every stride-th frame of a cue window, at least 1."""
-    min_score: float = 0.3
-    """A camera whose median face score at rest is lower does not watch, 0 to 1."""
+    accept: float = 0.0
+    """Suggestions at least this sure are taken without a person, 0 (all) to 1 (none)."""
+    match: bool = True
+    """Match to the reference identity's canonical frames; off, everybody's own peak is taken."""
 
     def __post_init__(self) -> None:
         """Refuse values out of range."""
-        if self.cameras < 1 or self.stride < 1:
-            raise ValueError(f"cameras {self.cameras}, stride {self.stride}: expected at least 1")
-
-
-def list_items(dataset: Dataset) -> list[str]:
-    """Subjects."""
-    return dataset.subjects()
+        if not 0.0 <= self.accept <= 1.0:
+            raise ValueError(f"accept {self.accept}: expected 0 to 1")
 
 
 def item_inputs(dataset: Dataset, item: str, config: AlignConfig) -> dict[str, Path | str]:
-    """The subject's index and proxies, and what people have decided."""
-    return {"ingest": dataset.item_dir("ingest", item), "labels": human_digest(dataset, item)}
+    """The subject's index and observations, the reference's, and what people said of both."""
+    inputs: dict[str, Path | str] = {
+        "index": dataset.item_dir("ingest", item) / "index.json",
+        "observe": _or_absent(observations_path(dataset, item)),
+        "labels": human_digest(dataset, item),
+    }
+    if config.match and (other := reference_subject(dataset)) != item:
+        inputs["reference"] = other
+        inputs["reference_index"] = dataset.item_dir("ingest", other) / "index.json"
+        inputs["reference_observe"] = _or_absent(observations_path(dataset, other))
+        inputs["reference_labels"] = human_digest(dataset, other)
+    return inputs
+
+
+def _or_absent(path: Path) -> Path | str:
+    return path if path.is_file() else "absent"
 
 
 def run_item(dataset: Dataset, item: str, config: AlignConfig, out: Path) -> dict:
@@ -75,158 +76,160 @@ def run_item(dataset: Dataset, item: str, config: AlignConfig, out: Path) -> dic
     index = read_index(dataset, item)
     if not index.cues:
         raise StageError(f"{item}: cues.csv names no expression; add the script's timing")
-    script = {e.id: e for e in load_script()}
-    net = load_network()
-    rest_cue = next((c for c in index.cues if c.expression_id == NEUTRAL), None)
-    watchers = choose_cameras(dataset, index, net, rest_cue or index.cues[0], config)
-    rests = observe(dataset, index, net, watchers, _rest_frames(index, rest_cue), None)
-    suggestions: dict[str, Suggestion] = {}
-    dropped = []
-    for cue in index.cues:
-        frames = np.arange(cue.start_frame, min(cue.end_frame, index.frames - 1) + 1, config.stride)
-        if frames.size == 0:
-            dropped.append({"what": cue.expression_id, "why": "its cue lies beyond the footage"})
-            continue
-        suggestions[cue.expression_id] = suggest_in_window(
-            dataset, index, net, watchers, rests, frames, script.get(cue.expression_id), cue
-        )
-    labels = accept(dataset, index, suggestions, watchers[0])
-    peaks = {e: _peak_row(label) for e, label in labels.items() if label.action == "mark"}
-    dropped += [
-        {"what": e, "why": f"flagged by {label.annotator}: {label.reason or 'no reason given'}"}
-        for e, label in labels.items()
-        if label.action == "flag"
-    ]
+    dropped: list[dict[str, str]] = []
+    rows = suggestion_rows(dataset, index, config, dropped)
+    labels = accept(dataset, index, rows, config.accept)
+    peaks = {e: _peak_row(label) for e, label in labels.items() if label.frame is not None}
+    dropped += _not_taken(index, rows, labels, config.accept)
+    if not peaks:
+        raise StageError(f"{item}: no expression has a frame ({dropped[0]['why']})")
     _write_json(out / "peaks.json", peaks)
-    starts = {cue.expression_id: cue.start_frame for cue in index.cues}
-    rows = {e: _suggestion_row(s, starts[e], watchers[0]) for e, s in suggestions.items()}
     _write_json(out / "suggestions.json", rows)
-    _write_sheet(dataset, index, watchers[0], peaks, out)
+    _write_sheet(dataset, index, peaks, out)
     return {
         "expressions": len(index.cues),
         "peaks": len(peaks),
         "by_person": sum(label.annotator != AUTOMATIC for label in labels.values()),
-        "confidence_median": float(np.median([s.confidence for s in suggestions.values()])),
-        "watching_cameras": watchers,
+        "matched": sum(row["kind"] == "match" for row in rows.values()),
+        "confidence_median": _median([row["confidence"] for row in rows.values()]),
         "dropped": dropped,
     }
 
 
-def _rest_frames(index: Index, cue: Cue | None) -> np.ndarray:
-    """Frames at rest: the neutral clip, or else the first frame of every window."""
-    if cue is not None:
-        return np.arange(cue.start_frame, min(cue.end_frame, index.frames - 1) + 1)
-    return np.array([c.start_frame for c in index.cues if c.start_frame < index.frames])
+def _median(values: list[float]) -> float | None:
+    return round(float(np.median(values)), 4) if values else None
 
 
-def choose_cameras(
-    dataset: Dataset, index: Index, net: LandmarkNet, cue: Cue, config: AlignConfig
-) -> list[str]:
-    """The cameras that see the face best in the middle of a cue, best first.
+def suggestion_rows(
+    dataset: Dataset, index: Index, config: AlignConfig, dropped: list[dict[str, str]]
+) -> dict[str, dict]:
+    """Rows of ``suggestions.json`` by expression; adds to ``dropped`` what stood in the way.
 
-    Raises:
-        StageError: no camera sees a face.
+    Without observations there are none: people's labels are then all there is.
     """
-    middle = min((cue.start_frame + cue.end_frame) // 2, index.frames - 1)
-    scores = {
-        camera: detect(net, read_proxy(dataset, index.subject, camera, middle)).score
-        for camera in index.cameras
+    if not observations_path(dataset, index.subject).is_file():
+        why = f"{index.subject} is not observed: run 'express50 observe' to see why"
+        dropped.append({"what": "suggestions", "why": why})
+        return {}
+    observations = read_observations(dataset, index.subject)
+    subject = watch(index, observations)
+    reference = _reference(dataset, index.subject, config, dropped)
+    script = {entry.id: entry for entry in load_script()}
+    found, canonical = suggest_all(subject, script, reference)
+    rows = {e: _suggestion_row(s, subject, e, index) for e, s in found.items()}
+    if reference is not None:
+        about = {"subject": reference.watched.subject, "camera": reference.watched.camera}
+        for expression, frame in canonical.items():
+            rows[expression] |= {"kind": "match", "reference": about | {"frame": frame}}
+    return rows
+
+
+def _reference(
+    dataset: Dataset, subject: str, config: AlignConfig, dropped: list[dict[str, str]]
+) -> Reference | None:
+    """The reference identity; None for itself, or where nothing is known of it."""
+    other = reference_subject(dataset) if config.match else subject
+    if other == subject:
+        return None
+    if not observations_path(dataset, other).is_file():
+        why = f"the reference {other} is not observed; everybody's own peaks were taken"
+        dropped.append({"what": "matching", "why": why})
+        return None
+    said = {
+        expression: label
+        for expression, label in current_labels(read_labels(dataset, other)).items()
+        if label.annotator != AUTOMATIC
     }
-    seeing = [
-        c for c in sorted(scores, key=lambda c: (-scores[c], c)) if scores[c] >= config.min_score
-    ]
-    if not seeing:
-        best = max(scores, key=lambda c: scores[c])
-        raise StageError(
-            f"{index.subject}: no camera sees a face at frame {middle} (best {best} with score"
-            f" {scores[best]:.2f}, expected {config.min_score}); label it with 'express50 annotate"
-            " mark' or lower align.min_score"
-        )
-    return seeing[: config.cameras]
-
-
-def observe(
-    dataset: Dataset,
-    index: Index,
-    net: LandmarkNet,
-    cameras: list[str],
-    frames: np.ndarray,
-    rests: list[ClipObservation] | None,
-) -> list[ClipObservation]:
-    """Landmarks, scores and aligned faces of some frames, one observation a camera."""
-    out = []
-    for number, camera in enumerate(cameras):
-        images = [read_proxy(dataset, index.subject, camera, int(f)) for f in frames]
-        found = [detect(net, image) for image in images]
-        points = np.stack([d.points for d in found])
-        neutral = np.median(points if rests is None else rests[number].points, axis=0)
-        crops = np.stack(
-            [align_crop(i, p, neutral) for i, p in zip(images, points, strict=True)]
-        ).reshape(-1, CROP, CROP)
-        out.append(ClipObservation(points, np.array([d.score for d in found]), crops))
-    return out
-
-
-def suggest_in_window(
-    dataset: Dataset,
-    index: Index,
-    net: LandmarkNet,
-    cameras: list[str],
-    rests: list[ClipObservation],
-    frames: np.ndarray,
-    expression: Expression | None,
-    cue: Cue,
-) -> Suggestion:
-    """The suggestion for one cue window, sampled at ``frames``."""
-    clips = observe(dataset, index, net, cameras, frames, rests)
-    curve = activity(clips, rests, expression)
-    found = suggest_peak(curve, 0, at_rest=cue.expression_id == NEUTRAL)
-    whole = np.interp(np.arange(frames[0], frames[-1] + 1), frames, found.activity)
-    return Suggestion(int(frames[found.frame]), found.confidence, whole)
+    return Reference(
+        watch(read_index(dataset, other), read_observations(dataset, other)),
+        {e: label.frame for e, label in said.items() if label.frame is not None},
+        frozenset(e for e, label in said.items() if label.frame is None),
+    )
 
 
 def accept(
-    dataset: Dataset, index: Index, suggestions: dict[str, Suggestion], camera: str
+    dataset: Dataset, index: Index, rows: Mapping[str, dict], threshold: float
 ) -> dict[str, Label]:
-    """Append an automatic mark for each suggestion that is news; return the labels in force.
+    """Append an automatic mark for each sure suggestion that is news; return the labels in force.
 
-    A rerun of the same suggestions appends nothing.
+    Automatic marks that no suggestion stands for any more are undone. A rerun appends nothing.
     """
     labels = read_labels(dataset, index.subject)
-    automatic = current_labels(label for label in labels if label.annotator == AUTOMATIC)
-    for expression, suggestion in suggestions.items():
-        known = automatic.get(expression)
-        if known is not None and (known.frame, known.camera) == (suggestion.frame, camera):
+
+    def write(label: Label) -> None:
+        append_label(dataset, label)
+        labels.append(label)
+
+    known = _automatic(labels)
+    for cue in index.cues:
+        expression = cue.expression_id
+        row = rows.get(expression)
+        if row is None or row["confidence"] < threshold:
+            while expression in _automatic(labels):
+                write(make_undo(index, expression, AUTOMATIC))
             continue
-        mark = make_mark(
-            index, expression, suggestion.frame, camera, AUTOMATIC, suggestion.frame,
-            round(suggestion.confidence, 4),
-        )  # fmt: skip
-        append_label(dataset, mark)
-        labels.append(mark)
-    return {e: label for e, label in current_labels(labels).items() if e in suggestions}
+        old = known.get(expression)
+        news = (row["frame"], row["camera"], row["confidence"])
+        if old is None or (old.frame, old.camera, old.confidence) != news:
+            frame, camera, sure = news
+            write(make_mark(index, expression, frame, camera, AUTOMATIC, frame, sure))
+    wanted = {cue.expression_id for cue in index.cues}
+    return {e: label for e, label in current_labels(labels).items() if e in wanted}
+
+
+def _automatic(labels: list[Label]) -> dict[str, Label]:
+    return current_labels(label for label in labels if label.annotator == AUTOMATIC)
+
+
+def _not_taken(
+    index: Index, rows: Mapping[str, dict], labels: Mapping[str, Label], threshold: float
+) -> list[dict[str, str]]:
+    """Why expressions have no frame."""
+    out = []
+    for cue in index.cues:
+        expression = cue.expression_id
+        label, row = labels.get(expression), rows.get(expression)
+        if label is not None and label.frame is None:
+            why = f"flagged by {label.annotator}: {label.reason or 'no reason given'}"
+        elif label is not None:
+            continue
+        elif row is None:
+            why = "nothing was seen in its cue window; label it with 'express50 annotate'"
+        else:
+            why = (
+                f"confidence {row['confidence']:.2f} is below align.accept {threshold:g}; label it"
+                " with 'express50 annotate'"
+            )
+        out.append({"what": expression, "why": why})
+    return out
 
 
 def _peak_row(label: Label) -> dict[str, object]:
-    return {
-        "frame": label.frame,
-        "camera": label.camera,
-        "pts": label.pts,
-        "dhash": label.dhash,
-        "confidence": label.confidence,
-        "annotator": label.annotator,
-    }
+    names = ("frame", "camera", "pts", "dhash", "confidence", "annotator")
+    return {name: getattr(label, name) for name in names}
 
 
-def _suggestion_row(suggestion: Suggestion, start: int, camera: str) -> dict[str, object]:
+def _suggestion_row(
+    suggestion: Suggestion, subject: Watched, expression: str, index: Index
+) -> dict:
+    """A suggestion in frames of the footage; curves have a value for every frame of the window."""
+    frames = subject.frames[subject.windows[expression]]
+    cue = next(c for c in index.cues if c.expression_id == expression)
+    every = np.arange(cue.start_frame, min(cue.end_frame, index.frames - 1) + 1)
+
+    def curve(values: np.ndarray) -> list[float]:
+        return [round(float(v), 3) for v in np.interp(every, frames, values)]
+
     return {
-        "frame": suggestion.frame,
+        "frame": int(frames[suggestion.row]),
         "confidence": round(suggestion.confidence, 4),
-        "start": start,
-        "activity": [round(float(a), 3) for a in suggestion.activity],
-        "candidates": candidates(suggestion, start),
+        "start": cue.start_frame,
+        "activity": curve(suggestion.activity),
+        "candidates": [int(frames[row]) for row in suggestion.candidates],
+        "match": None if suggestion.match is None else curve(suggestion.match),
         "kind": "peak",
-        "camera": camera,
+        "reference": None,
+        "camera": subject.camera,
     }
 
 
@@ -234,30 +237,27 @@ def _write_json(path: Path, table: dict) -> None:
     path.write_text(json.dumps(table, indent=1, sort_keys=True) + "\n")
 
 
-def _write_sheet(dataset: Dataset, index: Index, camera: str, peaks: dict, out: Path) -> None:
+def _write_sheet(dataset: Dataset, index: Index, peaks: dict, out: Path) -> None:
     """QC: the chosen frame of every expression, between its window's first and last frame."""
     rows, names = [], []
     for cue in index.cues:
         if cue.expression_id not in peaks:
             continue
+        peak = peaks[cue.expression_id]
         last = min(cue.end_frame, index.frames - 1)
-        frames = [cue.start_frame, peaks[cue.expression_id]["frame"], last]
-        rows.append([read_proxy(dataset, index.subject, camera, int(f)) for f in frames])
-        names.append(f"{cue.expression_id}: first, peak {frames[1]}, last")
+        frames = [cue.start_frame, peak["frame"], last]
+        rows.append([read_proxy(dataset, index.subject, peak["camera"], int(f)) for f in frames])
+        names.append(f"{cue.expression_id}: first, taken {frames[1]}, last")
     (out / "qc").mkdir()
     write_image(out / "qc" / "peaks.jpg", contact_sheet(rows, names), quality=85)
 
 
 STAGE = Stage(
     name="align",
-    version=2,
+    version=3,
     config=AlignConfig,
-    presets={
-        "draft": {"cameras": 1, "stride": 2},
-        "standard": {},
-        "reference": {"cameras": 6},
-    },
-    items=list_items,
+    presets={"draft": {}, "standard": {}, "reference": {}},
+    items=Dataset.subjects,
     inputs=item_inputs,
     run=run_item,
 )

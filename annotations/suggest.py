@@ -1,192 +1,276 @@
-"""Where in its cue window an expression peaks: activity against the subject's own neutral.
+"""Where an expression happens in its cue window, and which frame of it matches the reference's.
 
-Two measures are taken per frame and camera and scaled by their own noise in the neutral clip, so
-that whichever sees the expression better decides: how far the landmarks moved (only those that the
-script says take part, so that a blink does not pass for a smile), and how much the face looks
-different once it is aligned to the neutral one (a tongue or a gaze moves no landmark).
+All curves are projections of a face's features (``features.py``) on one direction, found from the
+clip itself: the frames that show the expression define it, and it tells which frames show it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 
-from express50.expressions import Expression
-from express50.transforms import similarity_fit
+from annotations.watch import steady
 
-# iBUG-68 points that expressions move least: the nose's bridge and the corners of the eyes.
-STABLE = np.array([27, 28, 29, 30, 36, 39, 42, 45])
-LIDS = np.array([37, 38, 40, 41, 43, 44, 46, 47])
-_GROUPS = {
-    "brow": np.arange(17, 27),
-    "eye": LIDS,
-    "nose": np.arange(31, 36),
-    "mouth": np.concatenate([np.arange(48, 68), np.arange(5, 12)]),
-}
-_CONTROL_GROUPS = {
-    "brow": ("brow",),
-    "eye": ("eye",),
-    "nose": ("nose", "brow"),
-    "nostril": ("nose",),
-    "cheek": ("mouth",),
-}
-CROP = 48  # side of the aligned face, pixels
 CANDIDATES, CANDIDATE_GAP = 5, 3
-_LANDMARK_FLOOR = 0.004  # of the face's size: what a still face moves by in the detector's eyes
-_LOOK_FLOOR = 0.01  # grey levels of 1: sensor noise after averaging
+NEAR_FRAMES = 2.0  # an event's direction is learnt from frames about its apex (sigma)
+OVERRULE = 2.0  # the clip's strongest event yields to one so many times more like the reference's,
+OVERRULE_COSINE = 0.3  # if that goes the reference's way at all: two of noise are both unlike it
+DISPUTED = 0.6  # confidence counts so much where the strongest event is not the likest
+APEX_LEVEL = 0.9  # a canonical frame at this share of its apex or more is an apex
+PLATEAU_SHARE = 0.95  # of the apex: frames that cannot be told from it
+AGREE_FRAMES = 1
+_DRAWS = 24  # random halves of the features that a suggestion is asked again with
 
 
 @dataclass(frozen=True)
-class ClipObservation:
-    """What one camera saw of one subject, over T frames.
+class Event:
+    """One movement of a clip: its apex (row), how far it is done in each frame (T,), direction."""
+
+    apex: int
+    curve: np.ndarray
+    direction: np.ndarray
+
+
+@dataclass(frozen=True)
+class Canonical:
+    """The reference's canonical frame, in the subject's features.
 
     Attributes:
-        points: (T, 68, 2) landmarks, pixels.
-        scores: (T,) how surely a face was seen, 0 to 1.
-        crops: (T, CROP, CROP) float32 grey face aligned to the neutral landmarks.
+        direction: (N,) unit vector of the movement; 0 in features the reference does not have.
+        level: how far the movement was done in that frame, as a share of its apex.
+        side: -1 before the apex, 1 after it, 0 at it.
     """
 
-    points: np.ndarray
-    scores: np.ndarray
-    crops: np.ndarray
+    direction: np.ndarray
+    level: float
+    side: int
 
 
 @dataclass(frozen=True)
 class Suggestion:
-    """A suggested peak: frame (absolute), confidence 0 to 1, and the activity curve (T,)."""
+    """A suggested frame.
 
-    frame: int
+    Attributes:
+        row: of the clip.
+        confidence: share of random halves of the features that say the same within a frame; lowered
+            where the clip's strongest movement is not the one most like the reference's.
+        activity: (T,) how far the face is from rest, in units of noise.
+        match: (T,) likeness to the canonical frame, 0 to 1; None without one.
+        candidates: rows worth a look, best first.
+    """
+
+    row: int
     confidence: float
     activity: np.ndarray
+    match: np.ndarray | None
+    candidates: list[int]
 
 
-def landmark_weights(expression: Expression | None) -> np.ndarray:
-    """Weights (68,) of the points that take part in an expression; all when it is unknown."""
-    weights = np.zeros(68)
-    if expression is None:
-        weights[17:] = 1.0
-        weights[LIDS] = 0.5
-        return weights
-    names = [name for name, value in expression.controls.items() if abs(value) > 0.05]
-    for name in names:
-        prefix = next((p for p in _CONTROL_GROUPS if name.startswith(p)), "")
-        for group in _CONTROL_GROUPS.get(prefix, ("mouth",)):
-            weights[_GROUPS[group]] = 1.0
-    if np.abs(expression.jaw).max() > 0.02:
-        weights[_GROUPS["mouth"]] = 1.0
-    if not weights.any():
-        weights[17:] = 1.0
-        weights[LIDS] = 0.5
-    return weights
-
-
-def align_crop(image: np.ndarray, points: np.ndarray, neutral: np.ndarray) -> np.ndarray:
-    """The face (CROP, CROP) float32 grey of ``image``, moved onto the neutral landmarks (68, 2)."""
-    low, high = neutral.min(0), neutral.max(0)
-    side = float((high - low).max()) * 1.1
-    corner = (low + high) / 2 - side / 2
-    s, R, t = _similarity2d(points[STABLE], (neutral[STABLE] - corner) * (CROP / side))
-    A = np.concatenate([s * R, t[:, None]], axis=1)
-    grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
-    return cv2.warpAffine(grey, A, (CROP, CROP), flags=cv2.INTER_LINEAR).astype(np.float32) / 255
-
-
-def _similarity2d(source: np.ndarray, target: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
-    lift = np.zeros((len(source), 1))
-    s, R, t = similarity_fit(np.hstack([source, lift]), np.hstack([target, lift]))
-    return s, R[:2, :2], t[:2]
-
-
-def displacements(points: np.ndarray, neutral: np.ndarray) -> np.ndarray:
-    """Landmark motion (T, 68, 2) against neutral (68, 2), head motion removed, in face sizes."""
-    size = float((neutral.max(0) - neutral.min(0)).max())
-    moved = np.empty_like(points, dtype=np.float64)
-    for number, frame in enumerate(points):
-        s, R, t = _similarity2d(frame[STABLE], neutral[STABLE])
-        moved[number] = s * frame @ R.T + t - neutral
-    return moved / size
-
-
-def activity(
-    clips: Sequence[ClipObservation],
-    rests: Sequence[ClipObservation],
-    expression: Expression | None,
-) -> np.ndarray:
-    """Activity (T,) of one expression against the subject's rest, over the cameras that see it.
+def suggest(values: np.ndarray, groups: np.ndarray, canonical: Canonical | None) -> Suggestion:
+    """Suggest the frame of a clip that matches the canonical one, or else its apex.
 
     Args:
-        clips: one observation a camera, T frames of the cue window.
-        rests: the same cameras at rest.
-        expression: the script's entry, None when it is not in the script.
-    """
-    weights = landmark_weights(expression)
-    total = np.zeros(len(clips[0].points))
-    for clip, rest in zip(clips, rests, strict=True):
-        neutral = np.median(rest.points, axis=0)
-        look = np.median(rest.crops, axis=0)
-        trust = float(np.median(clip.scores))
-        moved = _motion(displacements(clip.points, neutral), weights)
-        still = _motion(displacements(rest.points, neutral), weights)
-        changed = np.abs(clip.crops - look).mean((1, 2))
-        calm = np.abs(rest.crops - look).mean((1, 2))
-        total += trust * (
-            moved / (np.median(still) + _LANDMARK_FLOOR)
-            + 0.5 * changed / (np.median(calm) + _LOOK_FLOOR)
-        )
-    return total / max(1e-9, sum(float(np.median(c.scores)) for c in clips))
-
-
-def _motion(moved: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Root mean square motion (T,) of the points that take part."""
-    return np.sqrt((moved**2).sum(-1) @ weights / weights.sum())
-
-
-def suggest_peak(curve: np.ndarray, first_frame: int, at_rest: bool = False) -> Suggestion:
-    """The apex of an activity curve (T,), or its calmest frame for the neutral expression.
-
-    The apex is the middle of the plateau (within a tenth of the maximum), not its first frame.
+        values: (T, N) features, 0 at rest, of ``expression_values``.
+        groups: (N,) features of one group go to the same half when halves are drawn.
+        canonical: of the reference; None for the reference itself.
 
     Raises:
-        ValueError: the curve is empty or not finite.
+        ValueError: the clip is empty or not finite.
     """
-    if curve.size == 0 or not np.isfinite(curve).all():
-        raise ValueError(f"activity has {curve.size} values, expected at least one, all finite")
-    padded = np.pad(curve, 1, mode="edge")
-    smooth = 0.25 * padded[:-2] + 0.5 * padded[1:-1] + 0.25 * padded[2:]
-    if at_rest:
-        frame = int(np.argmin(smooth))
-        spread = float(smooth.max() - smooth.min())
-        return Suggestion(first_frame + frame, 1.0 / (1.0 + spread), curve)
-    top = int(np.argmax(smooth))
-    floor = float(smooth.min())
-    level = floor + 0.9 * (float(smooth[top]) - floor)
+    _check(values)
+    own = strongest_event(values)
+    event, certain = choose_event(values, own, canonical)
+    row = matching_row(event, canonical)
+    rng = np.random.default_rng(0)  # the same halves every time: a rerun gives the same bytes
+    names = np.unique(groups)
+    rows = []
+    for _ in range(_DRAWS):
+        kept = np.isin(groups, names[rng.random(len(names)) < 0.5])
+        if not kept.any():
+            continue
+        half = None if canonical is None else _restricted(canonical, kept)
+        part = values[:, kept]
+        rows.append(matching_row(choose_event(part, strongest_event(part), half)[0], half))
+    agreeing = sum(abs(other - row) <= AGREE_FRAMES for other in rows)
+    match = None if canonical is None else _likeness_in_time(event, canonical)
+    confidence = agreeing / (len(rows) + 1) * (1.0 if certain else DISPUTED)
+    return Suggestion(
+        row, confidence if own.curve.max() > 0 else 0.0, own.curve, match,
+        candidate_rows(row, [event.apex, own.apex], own.curve),
+    )  # fmt: skip
+
+
+def suggest_rest(values: np.ndarray, groups: np.ndarray, typical: float) -> Suggestion:
+    """Suggest the calmest frame of a clip at rest; any frame that is as calm is as good.
+
+    Args:
+        values: (T, N) features, 0 at the middle of the clip.
+        groups: as for :func:`suggest`.
+        typical: activity of other expressions at their apex, in the same units.
+
+    Raises:
+        ValueError: the clip is empty or not finite.
+    """
+    _check(values)
+    level = _unrest(values)
+    row = int(np.argmin(level))
+    rng, names, good = np.random.default_rng(0), np.unique(groups), 0
+    for _ in range(_DRAWS):
+        kept = np.isin(groups, names[rng.random(len(names)) < 0.5])
+        good += bool(level[np.argmin(_unrest(values[:, kept]))] <= level[row] + 0.1 * typical)
+    return Suggestion(row, good / (_DRAWS + 1), level, None, candidate_rows(row, [], -level))
+
+
+def _check(values: np.ndarray) -> None:
+    if values.size == 0 or not np.isfinite(values).all():
+        raise ValueError(f"features are {values.shape}, expected a frame or more, all finite")
+
+
+def _unrest(values: np.ndarray) -> np.ndarray:
+    return np.linalg.norm(steady(values), axis=1)
+
+
+def strongest_event(values: np.ndarray) -> Event:
+    """What moves most in a clip (T, N): power iteration from the frames' energies."""
+    curve, direction = _follow(values, (values**2).sum(1), np.ones(len(values)), 8)
+    return Event(apex_of(curve), curve, direction)
+
+
+def likest_event(values: np.ndarray, direction: np.ndarray) -> tuple[Event, np.ndarray]:
+    """The movement most like a direction (N,), and the likeness (T,) it was found by.
+
+    Likeness is how far a frame goes that way, times the cosine of how much else it does.
+    """
+    shared = direction != 0
+    calm = steady(values[:, shared])
+    along = np.maximum(calm @ direction[shared], 0.0)
+    likeness = steady(along**2 / np.maximum(np.linalg.norm(calm, axis=1), 1e-12))
+    found = int(np.argmax(likeness))
+    near = np.exp(-0.5 * ((np.arange(len(values)) - found) / NEAR_FRAMES) ** 2)
+    curve, own = _follow(values, near * likeness, near, 3)
+    return Event(_climb(steady(curve), found), curve, own), likeness
+
+
+def choose_event(values: np.ndarray, own: Event, canonical: Canonical | None) -> tuple[Event, bool]:
+    """The strongest event, unless another is clearly more like the reference's.
+
+    Also whether the two are the same, or there is but one.
+    """
+    if canonical is None or not canonical.direction.any():
+        return own, True
+    other, likeness = likest_event(values, canonical.direction)
+    if abs(other.apex - own.apex) <= AGREE_FRAMES:
+        return own, True
+    likelier = likeness[other.apex] > OVERRULE * likeness[own.apex]
+    chosen = other if likelier and _cosine(other, canonical) > OVERRULE_COSINE else own
+    return chosen, False
+
+
+def _cosine(event: Event, canonical: Canonical) -> float:
+    """Of an event's direction and the canonical one, in the features that both have."""
+    part = event.direction[canonical.direction != 0]
+    along = float(event.direction @ canonical.direction)
+    return along / max(float(np.linalg.norm(part)), 1e-12)
+
+
+def matching_row(event: Event, canonical: Canonical | None) -> int:
+    """The apex; for a canonical frame off the apex, where the movement is as far, same side."""
+    if canonical is None or canonical.side == 0:
+        return event.apex
+    share = steady(event.curve) / max(float(steady(event.curve)[event.apex]), 1e-12)
+    for side in (canonical.side, -canonical.side):
+        slope = _slope(share, event.apex, side)
+        best = int(np.argmin(np.abs(share[slope] - canonical.level)))
+        if abs(share[slope[best]] - canonical.level) <= 0.5 * (1.0 - canonical.level):
+            return int(slope[best])
+    return event.apex
+
+
+def _slope(share: np.ndarray, apex: int, side: int) -> np.ndarray:
+    """Rows from the apex to one side for as long as the movement falls."""
+    rows = [apex]
+    while 0 <= rows[-1] + side < len(share) and share[rows[-1] + side] <= share[rows[-1]] + 0.05:
+        rows.append(rows[-1] + side)
+    return np.array(rows)
+
+
+def canonical_of(values: np.ndarray, row: int, shared: np.ndarray, count: int) -> Canonical:
+    """The canonical frame that a row of the reference's clip is.
+
+    Args:
+        values: (T, M) features of the reference's clip.
+        row: the canonical frame.
+        shared: (2, K) columns of the subject's features and those of the reference's, in pairs.
+        count: how many features the subject has.
+    """
+    near = np.exp(-0.5 * ((np.arange(len(values)) - row) / NEAR_FRAMES) ** 2)
+    curve, own = _follow(values, near * np.linalg.norm(values, axis=1), near, 3)
+    apex = _climb(steady(curve), row)
+    level = float(steady(curve)[row] / max(float(steady(curve)[apex]), 1e-12))
+    direction = np.zeros(count)
+    direction[shared[0]] = own[shared[1]]
+    direction /= max(float(np.linalg.norm(direction)), 1e-12)
+    side = 0 if level >= APEX_LEVEL else int(np.sign(row - apex))
+    return Canonical(direction, min(level, 1.0), side)
+
+
+def apex_of(curve: np.ndarray) -> int:
+    """Row of a curve's (T,) apex: the middle of the frames that cannot be told from it."""
+    even = steady(curve)
+    top = int(np.argmax(even))
     low = high = top
-    while low > 0 and smooth[low - 1] >= level:
+    while low > 0 and even[low - 1] >= PLATEAU_SHARE * even[top]:
         low -= 1
-    while high < len(smooth) - 1 and smooth[high + 1] >= level:
+    while high < len(even) - 1 and even[high + 1] >= PLATEAU_SHARE * even[top]:
         high += 1
-    plateau = np.arange(low, high + 1)
-    rise = smooth[low : high + 1] - floor
-    middle = float(plateau @ rise / rise.sum()) if rise.sum() > 0 else float(top)
-    confidence = float(np.clip((smooth[top] - floor) / (1.0 + smooth[top]), 0.0, 1.0))
-    return Suggestion(first_frame + round(middle), confidence, curve)
+    return round((low + high) / 2)
 
 
-def candidates(suggestion: Suggestion, first_frame: int) -> list[int]:
-    """Frames worth a look, best first: the suggestion, then the curve's other local maxima.
+def candidate_rows(row: int, others: list[int], curve: np.ndarray) -> list[int]:
+    """Rows worth a look, best first: the suggestion, other events, the curve's local maxima.
 
-    At most CANDIDATES, at least CANDIDATE_GAP frames apart; absolute frames, the curve's first
-    value being that of ``first_frame``.
+    At most CANDIDATES, at least CANDIDATE_GAP frames apart.
     """
-    curve = suggestion.activity
     padded = np.pad(curve, 1, constant_values=-np.inf)
     peaks = np.flatnonzero((curve >= padded[:-2]) & (curve >= padded[2:]))
-    ranked = [first_frame + int(k) for k in peaks[np.argsort(-curve[peaks], kind="stable")]]
-    chosen = [suggestion.frame]
-    for frame in ranked:
-        if len(chosen) < CANDIDATES and all(abs(frame - c) >= CANDIDATE_GAP for c in chosen):
-            chosen.append(frame)
+    ranked = [*others, *(int(k) for k in peaks[np.argsort(-curve[peaks], kind="stable")])]
+    chosen = [row]
+    for other in ranked:
+        if len(chosen) < CANDIDATES and all(abs(other - c) >= CANDIDATE_GAP for c in chosen):
+            chosen.append(other)
     return chosen
+
+
+def _follow(
+    values: np.ndarray, weights: np.ndarray, near: np.ndarray, rounds: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Curve (T,) and unit direction (N,) that frames weighted by the curve itself agree on."""
+    curve, direction = weights, np.zeros(values.shape[1])
+    for _ in range(rounds):
+        mean = (near * curve) @ values
+        direction = mean / max(float(np.linalg.norm(mean)), 1e-12)
+        curve = np.maximum(values @ direction, 0.0)
+    return curve, direction
+
+
+def _climb(curve: np.ndarray, row: int) -> int:
+    """The local maximum of a curve that a row leads up to."""
+    while True:
+        around = [r for r in (row - 1, row, row + 1) if 0 <= r < len(curve)]
+        best = max(around, key=lambda r: (curve[r], r == row))
+        if best == row:
+            return row
+        row = best
+
+
+def _likeness_in_time(event: Event, canonical: Canonical) -> np.ndarray:
+    share = steady(event.curve) / max(float(steady(event.curve)[event.apex]), 1e-12)
+    return np.clip(1.0 - np.abs(share - canonical.level), 0.0, 1.0)
+
+
+def _restricted(canonical: Canonical, kept: np.ndarray) -> Canonical:
+    """The canonical frame in some of the features."""
+    part = canonical.direction[kept]
+    part = part / max(float(np.linalg.norm(part)), 1e-12)
+    return Canonical(part, canonical.level, canonical.side)

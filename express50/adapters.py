@@ -39,6 +39,16 @@ def K_from_opencv(K: np.ndarray) -> np.ndarray:
     return shifted
 
 
+def affine_to_opencv(matrix: np.ndarray) -> np.ndarray:
+    """Affine (2, 3) between centre-origin pixels, as ``cv2.warpAffine`` has it.
+
+    ``matrix`` (2, 3) does the same between corner-origin pixels.
+    """
+    shifted = np.array(matrix, dtype=np.float64)
+    shifted[:, 2] += shifted[:, :2] @ [0.5, 0.5] - 0.5
+    return shifted
+
+
 def cam_from_world_from_opengl(world_from_cam_gl: np.ndarray) -> np.ndarray:
     """``cam_from_world`` (4, 4), OpenCV axes, of an OpenGL camera-to-world matrix (4, 4)."""
     return np.linalg.inv(np.asarray(world_from_cam_gl, dtype=np.float64) @ FLIP_YZ)

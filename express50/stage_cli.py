@@ -19,7 +19,8 @@ from express50.threads import cap_threads
 HELP = {
     "ingest": "index raw captures: frames, hashes, proxies",
     "calibrate": "take or solve the cameras",
-    "align": "find and take the labelled peak frame of each expression",
+    "observe": "watch the face through every cue window (align runs it first)",
+    "align": "suggest, match to the reference and take the frame of each expression",
     "matte": "separate the head from the background",
     "track": "fit the head model to the peak frames",
     "depth": "estimate surface and depth maps",
@@ -35,6 +36,13 @@ def stages() -> dict[str, str]:
 def load_stage(name: str) -> Stage:
     """Import one stage."""
     return import_module(stages()[name]).STAGE
+
+
+def with_first(names: Iterable[str]) -> list[str]:
+    """Stages in order, and those that the commands of any of them run first."""
+    first = import_module("pipelines.order").FIRST
+    wanted = {other for name in names for other in (*first.get(name, ()), name)}
+    return [name for name in stages() if name in wanted]
 
 
 def add_stage_commands(subparsers: Any) -> None:
@@ -86,14 +94,15 @@ def config_of(stage: Stage, args: argparse.Namespace) -> Any:
 
 
 def run_one(args: argparse.Namespace) -> int:
-    """Run one stage."""
+    """Run one stage, and what its command runs first."""
+    names = with_first([args.stage])
     for text in args.set:
-        if not text.startswith(args.stage + "."):
+        if not text.startswith(tuple(f"{name}." for name in names)):
             raise ConfigError(
-                f"--set {text!r}: this command runs {args.stage} only; "
+                f"--set {text!r}: this command runs {' and '.join(names)} only; "
                 f"expected {args.stage}.key=value"
             )
-    return _run(args, [args.stage], args.items)
+    return _run(args, names, args.items)
 
 
 def run_all(args: argparse.Namespace) -> int:
@@ -103,7 +112,7 @@ def run_all(args: argparse.Namespace) -> int:
     last = names.index(args.last) if args.last else len(names) - 1
     if first > last:
         raise ConfigError(f"--first {args.first} comes after --last {args.last}; swap them")
-    return _run(args, names[first : last + 1], None)
+    return _run(args, with_first(names[first : last + 1]), None)
 
 
 def _run(args: argparse.Namespace, names: list[str], pattern: str | None) -> int:
@@ -132,7 +141,7 @@ def _run(args: argparse.Namespace, names: list[str], pattern: str | None) -> int
                 say(*summaries[-1].lines())
     if args.json:
         accounts = [summary.to_json() for summary in summaries]
-        say_json(accounts if args.command == "run" else accounts[0])
+        say_json(accounts if args.command == "run" else accounts[-1])
     return OK if all(summary.ok for summary in summaries) else FAILED
 
 

@@ -3,9 +3,13 @@
 STAGES = {
     "ingest": "pipelines.ingest",
     "calibrate": "pipelines.calibrate",
+    "observe": "annotations.observe",
     "align": "annotations.align",
     "matte": "pipelines.matte",
     "track": "pipelines.track",
     "depth": "pipelines.depth",
     "pack": "pipelines.pack",
 }
+
+# Stages that a stage's own command runs first.
+FIRST = {"align": ("observe",)}

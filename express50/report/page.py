@@ -31,7 +31,8 @@ _VIDEO_LIMIT = 8_000_000
 _PURPOSES = {
     "ingest": "Footage indexed frame by frame, with proxies for scrubbing.",
     "calibrate": "Cameras, given or solved from the board.",
-    "align": "The peak frame of every expression, with its cue window's first and last frame.",
+    "observe": "The cameras that watch the face through the cue windows.",
+    "align": "The labelled frame of every expression, with its cue window's first and last frame.",
     "matte": "Alpha of every peak frame.",
     "track": "The head model fitted to landmarks in all views.",
     "depth": "Surface of every peak and the depth raycast from it.",

@@ -1,0 +1,172 @@
+"""A face's expression as numbers that can be compared in time: motion and look, against rest.
+
+Every feature is counted in its own noise, which is measured from the footage itself. What a face
+does at rest (fidgets, sway, the detector's drift) is shrunk, so that the curve of an expression
+rises for what the expression does and for nothing else.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from annotations.observe import Observations
+from annotations.watch import STABLE, face_side, similarity_2d, steady
+from express50.expressions import Expression
+
+LIDS = np.array([37, 38, 40, 41, 43, 44, 46, 47])
+_GROUPS = {
+    "brow": np.arange(17, 27),
+    "eye": LIDS,
+    "nose": np.arange(31, 36),
+    "mouth": np.concatenate([np.arange(48, 68), np.arange(5, 12)]),
+}
+_CONTROL_GROUPS = {
+    "brow": ("brow",),
+    "eye": ("eye",),
+    "nose": ("nose", "brow"),
+    "nostril": ("nose",),
+    "cheek": ("mouth",),
+}
+CELLS = 24  # the aligned face is compared in so many cells a side
+CELL_REACH = 0.12  # of the face's side: a cell further from every landmark shows no face
+LOOK_WEIGHT = 0.5  # of a cell against a landmark's coordinate: there are more of them
+BYSTANDER = 0.3  # weight of features the script does not name: people move more than they should
+REST_DIRECTIONS = 20  # leading directions of unrest that are shrunk
+
+
+@dataclass(frozen=True)
+class Features:
+    """What C cameras saw of a subject in F frames, in units of each feature's noise.
+
+    Attributes:
+        cameras: ids of the cameras.
+        values: (F, N) zero at the subject's neutral; each camera has the same N / C features.
+        owner: (N,) landmark 0 to 67 that a feature belongs to or lies nearest to.
+        camera: (N,) which camera a feature is of, 0 to C - 1.
+        rest: (R,) rows of ``values`` in which the face should be at rest: the neutral clip and
+            both ends of every window. Some that are not do no harm.
+    """
+
+    cameras: tuple[str, ...]
+    values: np.ndarray
+    owner: np.ndarray
+    camera: np.ndarray
+    rest: np.ndarray
+
+
+def measure(
+    observations: Observations, windows: dict[str, np.ndarray], neutral: str = "neutral"
+) -> Features:
+    """Features of all observed frames.
+
+    Args:
+        observations: of one subject.
+        windows: expression id -> rows of ``observations`` in its cue window, in order of time.
+        neutral: the expression that is rest; without it the windows' first frames are.
+    """
+    ends = np.concatenate([rows[[0, -1]] for rows in windows.values()])
+    rest = windows.get(neutral, ends[::2])
+    values, owner, camera = [], [], []
+    for number in range(len(observations.cameras)):
+        points = observations.points[number].astype(np.float64)
+        middle = np.median(points[rest], axis=0)
+        moved = displacements(points, middle, windows).reshape(len(points), -1)
+        cells, nearest = looks(observations.faces[number], middle)
+        cells -= np.median(cells[rest], axis=0)
+        values += [in_noise(moved, windows), LOOK_WEIGHT * in_noise(cells, windows)]
+        owner += [np.repeat(np.arange(68), 2), nearest]
+        camera.append(np.full(moved.shape[1] + cells.shape[1], number))
+    return Features(
+        observations.cameras, np.concatenate(values, axis=1), np.concatenate(owner),
+        np.concatenate(camera), np.unique(np.concatenate([rest, ends])),
+    )  # fmt: skip
+
+
+def displacements(
+    points: np.ndarray, neutral: np.ndarray, windows: dict[str, np.ndarray]
+) -> np.ndarray:
+    """Landmark motion (F, 68, 2) against neutral (68, 2), head motion removed, in face sides."""
+    moved = np.zeros(points.shape)
+    for rows in windows.values():
+        motions = np.stack(
+            [similarity_2d(frame[STABLE], neutral[STABLE]) for frame in points[rows]]
+        )
+        motions = steady(motions)
+        moved[rows] = points[rows] @ motions[:, :, :2].transpose(0, 2, 1) + motions[:, None, :, 2]
+        moved[rows] -= neutral
+    return moved / face_side(neutral)
+
+
+def looks(faces: np.ndarray, neutral: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Local contrast (F, N) of aligned faces (F, S, S) uint8 in cells, and each cell's landmark.
+
+    Contrast against the surroundings, not brightness, so that light and exposure do not count;
+    cells that show no face are 0.
+    """
+    cells = np.stack([_contrast(face) for face in faces]).reshape(len(faces), -1)
+    centre = (neutral.min(0) + neutral.max(0)) / 2
+    layout = (neutral - centre) / face_side(neutral) + 0.5
+    places = (np.arange(CELLS) + 0.5) / CELLS
+    grid = np.stack(np.meshgrid(places, places), axis=-1).reshape(-1, 1, 2)
+    away = np.linalg.norm(grid - layout, axis=-1)
+    cells[:, away.min(1) > CELL_REACH] = 0.0
+    return cells, away.argmin(1)
+
+
+def _contrast(face: np.ndarray) -> np.ndarray:
+    """Cells (CELLS, CELLS) of a grey face: how much lighter than around, in local deviations."""
+    grey = face.astype(np.float32) / 255.0
+    wide = len(face) / 8
+    flat = grey - cv2.GaussianBlur(grey, (0, 0), wide)
+    spread = np.sqrt(cv2.GaussianBlur(flat**2, (0, 0), wide)) + 0.02
+    fine = cv2.GaussianBlur(flat / spread, (0, 0), 0.8)
+    return cv2.resize(fine, (CELLS, CELLS), interpolation=cv2.INTER_AREA)
+
+
+def in_noise(values: np.ndarray, windows: dict[str, np.ndarray]) -> np.ndarray:
+    """Features (F, N) divided by their noise, which second differences in time show.
+
+    Motion is smooth from frame to frame, so that what remains of a second difference is noise, with
+    six times its variance. Half of every scale is the median feature's: none is divided by nothing.
+    """
+    bends = [np.diff(values[rows], n=2, axis=0) for rows in windows.values() if len(rows) > 2]
+    if not bends:
+        return values / max(float(np.abs(values).mean()), 1e-9)
+    noise = np.median(np.abs(np.concatenate(bends)), axis=0) / (0.6745 * np.sqrt(6.0))
+    floor = float(np.median(noise[noise > 0])) if (noise > 0).any() else 1.0
+    return values / (noise + floor)
+
+
+def expression_values(features: Features, expression: Expression | None) -> np.ndarray:
+    """Features (F, N) with those that take part in an expression foremost and unrest shrunk."""
+    weights = np.maximum(landmark_weights(expression)[features.owner], BYSTANDER)
+    values = features.values * weights
+    middle = np.median(values[features.rest], axis=0)
+    still = values[features.rest] - middle
+    power, modes = np.linalg.eigh(still @ still.T / len(still))
+    top = np.argsort(power)[::-1][:REST_DIRECTIONS]
+    top = top[power[top] > 1e-9 * max(float(power.max()), 1e-30)]
+    directions = modes[:, top].T @ still / np.sqrt(power[top] * len(still))[:, None]
+    shrink = 1.0 / np.sqrt(1.0 + power[top]) - 1.0
+    moved = values - middle
+    return moved + ((moved @ directions.T) * shrink) @ directions
+
+
+def landmark_weights(expression: Expression | None) -> np.ndarray:
+    """Weights (68,) of the points that take part in an expression; all when it is unknown."""
+    everywhere = np.zeros(68)
+    everywhere[17:] = 1.0
+    everywhere[LIDS] = 0.5
+    if expression is None:
+        return everywhere
+    weights = np.zeros(68)
+    for name in (name for name, value in expression.controls.items() if abs(value) > 0.05):
+        prefix = next((p for p in _CONTROL_GROUPS if name.startswith(p)), "")
+        for group in _CONTROL_GROUPS.get(prefix, ("mouth",)):
+            weights[_GROUPS[group]] = 1.0
+    if np.abs(expression.jaw).max() > 0.02:
+        weights[_GROUPS["mouth"]] = 1.0
+    return weights if weights.any() else everywhere

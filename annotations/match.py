@@ -1,0 +1,139 @@
+"""Suggestions for a subject's expressions: its own peaks, matched to the reference's frames."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from annotations.features import Features, expression_values, measure
+from annotations.observe import NEUTRAL, Observations
+from annotations.suggest import (
+    Canonical,
+    Suggestion,
+    canonical_of,
+    strongest_event,
+    suggest,
+    suggest_rest,
+)
+from annotations.watch import steady
+from express50.expressions import Expression
+from express50.index import Index
+
+
+@dataclass(frozen=True)
+class Watched:
+    """A subject as the observe stage saw it.
+
+    Attributes:
+        subject: id.
+        camera: that sees the face best.
+        frames: (F,) observed frames.
+        windows: expression id -> rows of ``frames`` in its cue window; none is empty.
+        features: of those rows.
+    """
+
+    subject: str
+    camera: str
+    frames: np.ndarray
+    windows: dict[str, np.ndarray]
+    features: Features
+
+
+@dataclass(frozen=True)
+class Reference:
+    """The reference identity, and the frames that people chose as canonical, by expression."""
+
+    watched: Watched
+    chosen: Mapping[str, int]
+    flagged: frozenset[str] = frozenset()
+
+
+def watch(index: Index, observations: Observations) -> Watched:
+    """Features of a subject, by cue window.
+
+    Expressions whose window holds no observed frame are left out.
+    """
+    windows = {}
+    for cue in index.cues:
+        seen = (observations.frames >= cue.start_frame) & (observations.frames <= cue.end_frame)
+        if seen.any():
+            windows[cue.expression_id] = np.flatnonzero(seen)
+    features = measure(observations, windows, NEUTRAL)
+    return Watched(index.subject, observations.cameras[0], observations.frames, windows, features)
+
+
+def suggest_all(
+    subject: Watched, script: Mapping[str, Expression], reference: Reference | None
+) -> tuple[dict[str, Suggestion], dict[str, int]]:
+    """Suggestions by expression, and the canonical frame of the reference each was matched to.
+
+    Args:
+        subject: whom to suggest for.
+        script: the expressions that are known; others count all of the face.
+        reference: None where the subject is the reference, or nothing is known of it.
+    """
+    groups = subject.features.owner + 68 * subject.features.camera
+    found, canonical = {}, {}
+    for expression, rows in subject.windows.items():
+        entry = script.get(expression)
+        values = expression_values(subject.features, entry)
+        if expression == NEUTRAL:
+            found[expression] = suggest_rest(values[rows], groups, _typical(values, subject))
+            continue
+        target = None if reference is None else canonical_frame(reference, expression, entry)
+        likeness = None
+        if target is not None and reference is not None:
+            canonical[expression] = target
+            likeness = _likeness(subject.features, reference.watched, expression, entry, target)
+        found[expression] = suggest(values[rows], groups, likeness)
+    return found, canonical
+
+
+def canonical_frame(reference: Reference, expression: str, entry: Expression | None) -> int | None:
+    """The frame that people chose, else the apex; None where the reference has none."""
+    rows = reference.watched.windows.get(expression)
+    if rows is None or expression in reference.flagged:
+        return None
+    if expression in reference.chosen:
+        return reference.chosen[expression]
+    values = expression_values(reference.watched.features, entry)[rows]
+    return int(reference.watched.frames[rows[strongest_event(values).apex]])
+
+
+def _likeness(
+    features: Features,
+    reference: Watched,
+    expression: str,
+    entry: Expression | None,
+    frame: int,
+) -> Canonical:
+    """The canonical frame in the subject's features."""
+    rows = reference.windows[expression]
+    values = expression_values(reference.features, entry)[rows]
+    row = int(np.argmin(np.abs(reference.frames[rows] - frame)))
+    shared = shared_columns(features, reference.features)
+    return canonical_of(values, row, shared, features.values.shape[1])
+
+
+def shared_columns(features: Features, other: Features) -> np.ndarray:
+    """Pairs (2, K) of columns that show the same of two subjects.
+
+    Cameras of the same id are paired; where there are none, those that see each face best.
+    """
+    pairs = [(features.cameras.index(c), other.cameras.index(c)) for c in features.cameras
+             if c in other.cameras] or [(0, 0)]  # fmt: skip
+    return np.concatenate(
+        [
+            np.stack([np.flatnonzero(features.camera == a), np.flatnonzero(other.camera == b)])
+            for a, b in pairs
+        ],
+        axis=1,
+    )
+
+
+def _typical(values: np.ndarray, subject: Watched) -> float:
+    """How far expressions usually move the face from rest, in the units of ``values``."""
+    level = steady(np.linalg.norm(values, axis=1))
+    return float(np.median([level[rows].max() for rows in subject.windows.values()]))

@@ -1,0 +1,127 @@
+"""What one camera sees of a face through a clip: landmarks, and the face without head motion.
+
+The network looks through one window a clip, and head motion is averaged over time: both keep the
+trembling of single detections out of the curves in which expressions are looked for.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import cv2
+import numpy as np
+import torch
+
+from express50.adapters import affine_to_opencv
+from express50.landmarks.augment import MIRROR, face_box
+from express50.landmarks.detector import detect
+from express50.landmarks.network import CROP, LandmarkNet
+from express50.transforms import similarity_fit
+
+FACE = 48  # side of the aligned face, pixels
+# iBUG-68 points that expressions move least: the nose's bridge and the corners of the eyes.
+STABLE = np.array([27, 28, 29, 30, 36, 39, 42, 45])
+BATCH = 32
+STRAY_SHARE = 0.1  # of the window: a face further from its centre gets a window of its own
+STRAY_SCORE = 0.7  # of the middle frame's score
+STEADY_FRAMES = 1.0  # heads turn slowly: their motion is averaged over this many frames (sigma)
+
+
+def find_points(net: LandmarkNet, images: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Landmarks (T, 68, 2), corner-origin pixels, and scores (T,) of a clip.
+
+    The face is searched for in the middle frame only; all frames are then looked at through the
+    same window, except those where the face has left it.
+
+    Args:
+        net: from ``load_network``.
+        images: T frames (H, W, 3) uint8, at least one.
+    """
+    middle = detect(net, images[len(images) // 2])
+    centre, side = face_box(middle.points)
+    found = list(_look(net, images, _level_window(middle.points)))
+    points, scores = (np.concatenate(part) for part in zip(*found, strict=True))
+    for row, image in enumerate(images):
+        away = np.linalg.norm(face_box(points[row])[0] - centre)
+        if away > STRAY_SHARE * side or scores[row] < STRAY_SCORE * middle.score:
+            own = detect(net, image)
+            points[row], scores[row] = own.points, own.score
+    return points, scores
+
+
+def align_faces(
+    images: Sequence[np.ndarray], points: np.ndarray, neutral: np.ndarray
+) -> np.ndarray:
+    """Grey faces (T, FACE, FACE) uint8 of a clip, moved onto the neutral landmarks (68, 2)."""
+    low, high = neutral.min(0), neutral.max(0)
+    side = face_side(neutral)
+    layout = (neutral[STABLE] - ((low + high) / 2 - side / 2)) * (FACE / side)
+    motions = steady(np.stack([similarity_2d(frame[STABLE], layout) for frame in points]))
+    grey = (cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in images)
+    return np.stack(
+        [
+            _cut(image, cv2.invertAffineTransform(motion), FACE)
+            for image, motion in zip(grey, motions, strict=True)
+        ]
+    )
+
+
+def face_side(neutral: np.ndarray) -> float:
+    """Side of the square, pixels, about landmarks (68, 2) that the aligned face shows."""
+    return 1.1 * float((neutral.max(0) - neutral.min(0)).max())
+
+
+def similarity_2d(source: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """Affine (2, 3) of the similarity that takes points (N, 2) onto others."""
+    lift = np.zeros((len(source), 1))
+    s, R, t = similarity_fit(np.hstack([source, lift]), np.hstack([target, lift]))
+    return np.concatenate([s * R[:2, :2], t[:2, None]], axis=1)
+
+
+def steady(values: np.ndarray, sigma: float = STEADY_FRAMES) -> np.ndarray:
+    """Values (T, ...) averaged over neighbouring frames with Gaussian weights."""
+    numbers = np.arange(len(values))
+    weights = np.exp(-0.5 * ((numbers[:, None] - numbers) / sigma) ** 2)
+    return np.tensordot(weights / weights.sum(1, keepdims=True), values, axes=1)
+
+
+def _level_window(points: np.ndarray) -> np.ndarray:
+    """Affine (2, 3) from the network's crop to the image, about landmarks with the eyes level."""
+    eyes = points[42:48].mean(0) - points[36:42].mean(0)
+    down = points[8] - points[27]
+    axis = eyes + np.array([down[1], -down[0]])  # the chin tells in profile, where eyes coincide
+    axis /= max(float(np.linalg.norm(axis)), 1e-9)
+    turn = np.array([[axis[0], -axis[1]], [axis[1], axis[0]]])
+    centre, side = face_box(points @ turn)
+    scaled = turn * (max(side, 8.0) / CROP)
+    corner = turn @ centre - scaled @ [CROP / 2, CROP / 2]
+    return np.concatenate([scaled, corner[:, None]], axis=1)
+
+
+def _look(
+    net: LandmarkNet, images: Sequence[np.ndarray], window: np.ndarray
+) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Points and scores of batches of images through one window, mean of it and its mirror."""
+    for start in range(0, len(images), BATCH):
+        crops = np.stack([_cut(image, window, CROP) for image in images[start : start + BATCH]])
+        both = np.concatenate([crops, crops[:, :, ::-1]])
+        with torch.inference_mode():
+            output = net(torch.from_numpy(both).permute(0, 3, 1, 2).float() / 255.0)
+        found = output.points.double().numpy()
+        direct, mirrored = found[: len(crops)], found[len(crops) :][:, MIRROR]
+        mirrored = np.stack([CROP - mirrored[..., 0], mirrored[..., 1]], axis=-1)
+        score = torch.sigmoid(output.logit).double().numpy().reshape(2, -1).mean(0)
+        yield 0.5 * (direct + mirrored) @ window[:, :2].T + window[:, 2], score
+
+
+def _cut(image: np.ndarray, window: np.ndarray, size: int) -> np.ndarray:
+    """Square of an image through an affine (2, 3) from its pixels to the image's, corner origin."""
+    step = float(np.sqrt(abs(np.linalg.det(window[:, :2]))))
+    height, width = image.shape[:2]
+    if step > 1.5:  # averaged first: fine detail would alias
+        small = (max(1, round(width / step)), max(1, round(height / step)))
+        image = cv2.resize(image, small, interpolation=cv2.INTER_AREA)
+    scale = np.array([[image.shape[1] / width], [image.shape[0] / height]])
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    matrix = affine_to_opencv(window * scale)
+    return cv2.warpAffine(image, matrix, (size, size), flags=flags, borderMode=cv2.BORDER_REPLICATE)

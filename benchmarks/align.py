@@ -1,0 +1,265 @@
+"""How well peaks and matches are suggested, and what labelling them through the real UI costs.
+
+``python -m benchmarks.align [--dataset DIR --truth DIR]``; without a dataset one is recorded with
+the digital twin: other subjects than the demo's, the whole script, every clip with its own timing
+and strength. Peaks are judged with everybody on their own, matches with the first subject labelled
+as the reference: at its true peaks, then at frames before or after them. A simulated annotator then
+accepts right suggestions and mends wrong ones in the app, and steps through 24 cameras of 3840 x
+2160 footage are timed. The baseline takes the frame whose landmarks are furthest from neutral. The
+last line printed is one JSON object.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shutil
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from annotations import align, observe
+from annotations.reference import reference_subject
+from annotations.store import append_label, make_mark
+from annotations.suggestions import read_suggestions
+from annotations.ui.replay import measure_steps, replay
+from annotations.watch import STABLE, similarity_2d
+from express50.config import build_config
+from express50.frames import read_proxy
+from express50.images import write_image
+from express50.index import read_index
+from express50.layout import Dataset
+from express50.runner import run_stage
+from express50.stage import Stage
+from express50.twin.config import TwinConfig
+from express50.twin.record import record
+from express50.twin.truth import Truth
+from pipelines import ingest
+from pipelines.ingest import register
+
+NEUTRAL = observe.NEUTRAL
+THRESHOLDS = (0.0, 0.3, 0.5, 0.7, 0.9, 0.95)
+OFF_APEX = (0.45, 0.85)  # strengths at which canonical frames off the apex are taken
+SAME_STRENGTH = 0.05  # frames that differ by less in strength match equally well
+SOURCE = (2160, 3840)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Measure, print a table and the JSON line."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.align", description=__doc__)
+    parser.add_argument("--dataset", type=Path, help="an ingested dataset of twin captures")
+    parser.add_argument("--truth", type=Path, help="truth folder of the recording")
+    parser.add_argument("--subjects", type=int, default=6)
+    parser.add_argument("--frames", type=int, default=12, help="frames an expression")
+    parser.add_argument("--preset", default="standard", choices=sorted(observe.STAGE.presets))
+    options = parser.parse_args(arguments)
+    if (options.dataset is None) != (options.truth is None):
+        parser.error("give both --dataset and --truth, or neither")
+    with tempfile.TemporaryDirectory() as scratch:
+        dataset = Dataset(Path(scratch) / "dataset")
+        if options.dataset is None:
+            truth = record_subjects(Path(scratch), dataset, options.subjects, options.frames)
+        else:  # labels are written: not into somebody's dataset
+            shutil.copytree(options.dataset / "ingest", dataset.root / "ingest")
+            shutil.copy(options.dataset / "captures.json", dataset.captures_file)
+            truth = Truth(options.truth)
+        figures = measure(dataset, truth, options.preset)
+        steps = measure_steps(record_4k(Path(scratch), dataset), 200)
+    figures["seconds_per_frame_step_p95"] = round(float(np.percentile(steps, 95)), 4)
+    print(json.dumps(figures))
+    return 0
+
+
+def measure(dataset: Dataset, truth: Truth, preset: str) -> dict:
+    """All figures but the steps' time."""
+    subjects = dataset.subjects()
+    began = time.perf_counter()
+    run(observe.STAGE, dataset, preset)
+    run(align.STAGE, dataset, preset, match=False)
+    seconds = time.perf_counter() - began
+    alone = peak_errors(dataset, truth)
+    rows = sorted(peak_errors(dataset, truth, with_confidence=True))
+    farthest = [
+        abs(frame - truth.peaks(subject)[expression])
+        for subject in subjects
+        for expression, frame in farthest_frames(dataset, subject)
+    ]
+    matches = match_errors(dataset, truth, preset, off_apex=True)
+    off_apex = within([e for row in matches for e in row[:1]], 2)
+    apex_rows = match_errors(dataset, truth, preset, off_apex=False)
+    figures = {
+        "subjects": len(subjects),
+        "labels": len(alone),
+        "peak_within_1_frame": within([e for _, e in rows], 1),
+        "peak_within_2_frames": within([e for _, e in rows], 2),
+        "baseline_peak_within_1_frame": within(farthest, 1),
+        "match_within_2_frames": within([e for e, _ in apex_rows], 2),
+        "match_within_1_frame": within([e for e, _ in apex_rows], 1),
+        "match_off_apex_within_2_frames": off_apex,
+        "suggest_seconds_per_subject": round(seconds / len(subjects), 3),
+        "frames_per_subject": read_index(dataset, subjects[0]).frames,
+        "acceptance": acceptance(apex_rows),
+    }
+    truths = {(s, e): f for s in subjects for e, f in truth.peaks(s).items() if e != NEUTRAL}
+    return figures | {
+        name: round(value, 4)
+        for name, value in replay(dataset, truths, tolerance=1).summary().items()
+        if name.startswith("keystrokes")
+    }
+
+
+def within(errors: list[int], frames: int) -> float:
+    """Share of errors of at most so many frames."""
+    return round(float(np.mean(np.array(errors) <= frames)), 4)
+
+
+def run(stage: Stage, dataset: Dataset, preset: str, **values: object) -> None:
+    """Run a stage in this process; stops the benchmark when an item fails."""
+    config = build_config(stage, {**stage.presets[preset], **values})
+    summary = run_stage(stage, dataset, config, workers=0, progress=False)
+    if not summary.ok:
+        sys.exit("\n".join(summary.lines()))
+
+
+def peak_errors(
+    dataset: Dataset, truth: Truth, with_confidence: bool = False
+) -> list[tuple[float, int]]:
+    """(confidence, frames off the true peak) of every suggestion but the neutral one's."""
+    return [
+        (
+            found.confidence if with_confidence else 0.0,
+            abs(found.frame - truth.peaks(s)[expression]),
+        )
+        for s in dataset.subjects()
+        for expression, found in read_suggestions(dataset, s).items()
+        if expression != NEUTRAL
+    ]
+
+
+def match_errors(
+    dataset: Dataset, truth: Truth, preset: str, off_apex: bool
+) -> list[tuple[int, float]]:
+    """(frames off the best match, confidence) for all but the reference, who is labelled first."""
+    reference = reference_subject(dataset)
+    index = read_index(dataset, reference)
+    rng, levels = np.random.default_rng(0), {}
+    for cue in index.cues:
+        peak = truth.peaks(reference)[cue.expression_id]
+        strengths = strengths_of(truth, reference, cue.start_frame, cue.end_frame)
+        shares = strengths / strengths.max()
+        frame = peak
+        usable = np.flatnonzero((shares > OFF_APEX[0]) & (shares < OFF_APEX[1]))
+        if off_apex and usable.size:
+            frame = cue.start_frame + int(rng.choice(usable))
+        levels[cue.expression_id] = float(shares[frame - cue.start_frame])
+        camera = next(iter(index.cameras))
+        append_label(dataset, make_mark(index, cue.expression_id, frame, camera, "benchmark"))
+    run(align.STAGE, dataset, preset)
+    return [
+        (match_error(dataset, truth, subject, expression, levels[expression], found.frame),
+         found.confidence)
+        for subject in dataset.subjects() if subject != reference
+        for expression, found in read_suggestions(dataset, subject).items()
+        if expression != NEUTRAL
+    ]  # fmt: skip
+
+
+def match_error(
+    dataset: Dataset, truth: Truth, subject: str, expression: str, level: float, frame: int
+) -> int:
+    """Frames to the nearest of those at which the subject goes as far as the reference did."""
+    cue = next(c for c in read_index(dataset, subject).cues if c.expression_id == expression)
+    strengths = strengths_of(truth, subject, cue.start_frame, cue.end_frame)
+    away = np.abs(strengths / strengths.max() - level)
+    same = cue.start_frame + np.flatnonzero(away <= away.min() + SAME_STRENGTH)
+    return int(np.abs(same - frame).min())
+
+
+def strengths_of(truth: Truth, subject: str, first: int, last: int) -> np.ndarray:
+    """How far the expression is played in each frame of a window, 0 to 1."""
+    frames = range(first, last + 1)
+    return np.array([float(truth.parameters(subject, f)["strength"]) for f in frames])
+
+
+def farthest_frames(dataset: Dataset, subject: str) -> Iterator[tuple[str, int]]:
+    """The baseline: the frame whose landmarks are furthest from neutral, head motion removed."""
+    seen, index = observe.read_observations(dataset, subject), read_index(dataset, subject)
+    points = seen.points[0].astype(np.float64)
+    windows = {
+        c.expression_id: np.searchsorted(seen.frames, observe.cue_frames(index, c))
+        for c in index.cues
+    }
+    neutral = np.median(points[windows[NEUTRAL]], axis=0)
+    for expression, rows in windows.items():
+        moves = [similarity_2d(p[STABLE], neutral[STABLE]) for p in points[rows]]
+        moved = [
+            p @ A[:, :2].T + A[:, 2] - neutral for p, A in zip(points[rows], moves, strict=True)
+        ]
+        if expression != NEUTRAL:
+            yield expression, int(seen.frames[rows[np.argmax([(m**2).sum() for m in moved])]])
+
+
+def acceptance(rows: list[tuple[int, float]]) -> list[dict[str, float | None]]:
+    """What accepting suggestions at least so sure leaves to people, and how far off those are."""
+    errors, sure = (np.array(column, dtype=np.float64) for column in zip(*rows, strict=True))
+    out: list[dict[str, float | None]] = []
+    for threshold in THRESHOLDS:
+        taken = errors[sure >= threshold]
+        out.append(
+            {
+                "accept": threshold,
+                "by_hand": round(1.0 - taken.size / errors.size, 4),
+                "error_frames_mean": round(float(taken.mean()), 4) if taken.size else None,
+                "within_1_frame": round(float((taken <= 1).mean()), 4) if taken.size else None,
+            }
+        )
+    return out
+
+
+def record_subjects(scratch: Path, dataset: Dataset, subjects: int, frames: int) -> Truth:
+    """Record and ingest subjects that nothing was developed on."""
+    config = TwinConfig(
+        subjects=subjects, first_subject=61, cameras=1, width=256, height=256,
+        frames_per_expression=frames, board_frames=0, give_calibration=True, footage="jpg",
+        plates=False, seed=17,
+    )  # fmt: skip
+    record(config, scratch / "twin")
+    register(dataset, sorted((scratch / "twin" / "captures").iterdir()))
+    run(ingest.STAGE, dataset, "standard")
+    return Truth(scratch / "twin" / "truth")
+
+
+def record_4k(scratch: Path, dataset: Dataset, cameras: int = 24, frames: int = 12) -> Dataset:
+    """An ingested capture of 24 cameras at 3840 x 2160: frames of the dataset, blown up."""
+    capture, subject = scratch / "big", dataset.subjects()[0]
+    camera = next(iter(read_index(dataset, subject).cameras))
+    for number in range(cameras):
+        folder = capture / "cameras" / f"cam{number:02d}" / "frames"
+        folder.mkdir(parents=True)
+        for frame in range(2 * frames):
+            path = folder / f"{frame:06d}.jpg"
+            if number:
+                path.hardlink_to(capture / "cameras" / "cam00" / "frames" / path.name)
+                continue
+            image = read_proxy(dataset, subject, camera, frame)
+            square = cv2.resize(image, (SOURCE[0], SOURCE[0]), interpolation=cv2.INTER_CUBIC)
+            canvas = np.zeros((*SOURCE, 3), np.uint8)
+            left = (SOURCE[1] - SOURCE[0]) // 2
+            canvas[:, left : left + SOURCE[0]] = square
+            write_image(path, canvas, quality=90)
+    (capture / "capture.toml").write_text('subject = "BIG"\nfps = 24.0\n')
+    cues = f"neutral,0,{frames - 1}\nsmile,{frames},{2 * frames - 1}\n"
+    (capture / "cues.csv").write_text("expression_id,start_frame,end_frame\n" + cues)
+    big = Dataset(scratch / "big_dataset")
+    register(big, [capture])
+    run(ingest.STAGE, big, "standard")
+    return big
+
+
+if __name__ == "__main__":
+    sys.exit(main())
