@@ -18,6 +18,7 @@ OVERRULE = 2.0  # the clip's strongest event yields to one so many times more li
 OVERRULE_COSINE = 0.3  # if that goes the reference's way at all: two of noise are both unlike it
 DISPUTED = 0.6  # confidence counts so much where the strongest event is not the likest
 APEX_LEVEL = 0.9  # a canonical frame at this share of its apex or more is an apex
+OTHER_SIDE = 0.05  # of the apex: what being on the other side of it counts
 PLATEAU_SHARE = 0.95  # of the apex: frames that cannot be told from it
 AGREE_FRAMES = 1
 _DRAWS = 24  # random halves of the features that a suggestion is asked again with
@@ -146,10 +147,7 @@ def likest_event(values: np.ndarray, direction: np.ndarray) -> tuple[Event, np.n
     calm = steady(values[:, shared])
     along = np.maximum(calm @ direction[shared], 0.0)
     likeness = steady(along**2 / np.maximum(np.linalg.norm(calm, axis=1), 1e-12))
-    found = int(np.argmax(likeness))
-    near = np.exp(-0.5 * ((np.arange(len(values)) - found) / NEAR_FRAMES) ** 2)
-    curve, own = _follow(values, near * likeness, near, 3)
-    return Event(_climb(steady(curve), found), curve, own), likeness
+    return _event_about(values, likeness, int(np.argmax(likeness))), likeness
 
 
 def choose_event(values: np.ndarray, own: Event, canonical: Canonical | None) -> tuple[Event, bool]:
@@ -175,20 +173,26 @@ def _cosine(event: Event, canonical: Canonical) -> float:
 
 
 def matching_row(event: Event, canonical: Canonical | None) -> int:
-    """The apex; for a canonical frame off the apex, where the movement is as far, same side."""
+    """The apex; for a canonical frame off the apex, where the movement is as far.
+
+    On the same side of the apex if both sides offer such a frame.
+    """
     if canonical is None or canonical.side == 0:
         return event.apex
-    share = steady(event.curve) / max(float(steady(event.curve)[event.apex]), 1e-12)
-    for side in (canonical.side, -canonical.side):
-        slope = _slope(share, event.apex, side)
-        best = int(np.argmin(np.abs(share[slope] - canonical.level)))
-        if abs(share[slope[best]] - canonical.level) <= 0.5 * (1.0 - canonical.level):
-            return int(slope[best])
-    return event.apex
+    share = share_of_apex(event)
+    rows = np.concatenate([_slope(share, event.apex, -1), _slope(share, event.apex, 1)])
+    away = np.abs(share[rows] - canonical.level)
+    away += OTHER_SIDE * (np.sign(rows - event.apex) == -canonical.side)
+    return int(rows[np.argmin(away)])
+
+
+def share_of_apex(event: Event) -> np.ndarray:
+    """How far an event is done in each frame (T,), as a share of its apex."""
+    return event.curve / max(float(steady(event.curve)[event.apex]), 1e-12)
 
 
 def _slope(share: np.ndarray, apex: int, side: int) -> np.ndarray:
-    """Rows from the apex to one side for as long as the movement falls."""
+    """Rows from the apex to one side for as long as the movement falls, but for a tremble."""
     rows = [apex]
     while 0 <= rows[-1] + side < len(share) and share[rows[-1] + side] <= share[rows[-1]] + 0.05:
         rows.append(rows[-1] + side)
@@ -204,15 +208,23 @@ def canonical_of(values: np.ndarray, row: int, shared: np.ndarray, count: int) -
         shared: (2, K) columns of the subject's features and those of the reference's, in pairs.
         count: how many features the subject has.
     """
-    near = np.exp(-0.5 * ((np.arange(len(values)) - row) / NEAR_FRAMES) ** 2)
-    curve, own = _follow(values, near * np.linalg.norm(values, axis=1), near, 3)
-    apex = _climb(steady(curve), row)
-    level = float(steady(curve)[row] / max(float(steady(curve)[apex]), 1e-12))
+    event = strongest_event(values)
+    share = share_of_apex(event)
+    if row not in (*_slope(share, event.apex, -1), *_slope(share, event.apex, 1)):
+        event = _event_about(values, np.linalg.norm(values, axis=1), row)
+        share = share_of_apex(event)
     direction = np.zeros(count)
-    direction[shared[0]] = own[shared[1]]
+    direction[shared[0]] = event.direction[shared[1]]
     direction /= max(float(np.linalg.norm(direction)), 1e-12)
-    side = 0 if level >= APEX_LEVEL else int(np.sign(row - apex))
-    return Canonical(direction, min(level, 1.0), side)
+    level = float(np.clip(share[row], 0.0, 1.0))
+    return Canonical(direction, level, 0 if level >= APEX_LEVEL else int(np.sign(row - event.apex)))
+
+
+def _event_about(values: np.ndarray, weights: np.ndarray, row: int) -> Event:
+    """The event that a row belongs to, its direction learnt from frames about it."""
+    near = np.exp(-0.5 * ((np.arange(len(values)) - row) / NEAR_FRAMES) ** 2)
+    curve, direction = _follow(values, near * weights, near, 3)
+    return Event(_climb(steady(curve), row), curve, direction)
 
 
 def apex_of(curve: np.ndarray) -> int:
@@ -265,8 +277,7 @@ def _climb(curve: np.ndarray, row: int) -> int:
 
 
 def _likeness_in_time(event: Event, canonical: Canonical) -> np.ndarray:
-    share = steady(event.curve) / max(float(steady(event.curve)[event.apex]), 1e-12)
-    return np.clip(1.0 - np.abs(share - canonical.level), 0.0, 1.0)
+    return np.clip(1.0 - np.abs(share_of_apex(event) - canonical.level), 0.0, 1.0)
 
 
 def _restricted(canonical: Canonical, kept: np.ndarray) -> Canonical:
