@@ -12,8 +12,7 @@ from annotations.ui.keymap import GROUPS
 from annotations.ui.picture import Picture
 from annotations.ui.strip import CurveStrip
 from express50.index import read_index
-
-from .conftest import suggest
+from tests.annotations.footage import suggest
 
 
 def drive(app, *keys, size=(100, 32), check=None):
