@@ -160,7 +160,7 @@ def test_a_window_of_a_thousand_frames_is_crossed_and_decoded_ahead_in_bounds():
     assert len(ahead) == len(set(ahead)) == 64 and {700, 1300} <= set(ahead)
     assert min(ahead) >= 500
     assert cheapest_keys(view, 1498, tolerance=1) == ["end"]
-    assert len(cheapest_keys(view, 1000, tolerance=1)) == 31  # a suggestion, then by tens
+    assert cheapest_keys(view, 1000, tolerance=1) == ["pagedown"] * 30
     assert moves.step(view, 10**12).cursor == 1499
     assert moves.step(view, -(10**12)).cursor == 500
 
