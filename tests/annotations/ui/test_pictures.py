@@ -248,7 +248,7 @@ def test_the_app_shows_by_kitty_what_it_means_and_characters_below_a_dialog(sugg
     app = Recorder(open_session(suggested, "ann", order="subject"), pictures="kitty")
 
     async def run():
-        async with app.run_test(size=(80, 24)) as pilot:
+        async with app.run_test(size=(80, 22)) as pilot:
             for key in ("right", "right", "left"):
                 await pilot.press(key)
             await pilot.pause()
@@ -280,7 +280,7 @@ def test_the_app_draws_sixels_and_none_over_a_dialog(suggested):
     )
 
     async def run():
-        async with app.run_test(size=(80, 24)) as pilot:
+        async with app.run_test(size=(80, 22)) as pilot:
             await pilot.press("right")
             await pilot.pause()
             pane, picture = shown(app)
