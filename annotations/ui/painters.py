@@ -21,8 +21,9 @@ from annotations.ui.sixel import encode_sixel
 from annotations.ui.terminal import CellSize
 
 KEPT = 32  # pictures kept as text, for going to and fro
-# Pixels of a picture that is sent: as many as an ssh line takes, and a step stays below 50 ms.
-PIXEL_LIMIT = 480 * 540
+# Pixels of a picture that is sent. kitty brings it to its size, and a face in a proxy has no more;
+# sixels are shown as they are, so that fewer would be a smaller picture.
+KITTY_PIXELS, SIXEL_PIXELS = 400 * 400, 480 * 540
 _USUAL_CELL = CellSize(8, 16)
 _LEAST_NUMBER = 1 << 16  # below it other programs in the same terminal count up
 
@@ -106,7 +107,7 @@ class KittyPainter(Painter):
         aspect = self._cell.height / self._cell.width
         sizes = ((n, max(1, int(n * aspect))) for n in range(self._cell.width, 0, -1))
         across, down = next(
-            (s for s in sizes if columns * rows * s[0] * s[1] <= PIXEL_LIMIT), (1, 1)
+            (s for s in sizes if columns * rows * s[0] * s[1] <= KITTY_PIXELS), (1, 1)
         )
         return PaneShape(columns, rows, across, down, aspect)
 
@@ -131,7 +132,7 @@ class SixelPainter(Painter):
     def shape(self, pane: Size) -> PaneShape:
         """The whole pane, or its middle where that is more pixels than the limit."""
         cells = self._cell.width * self._cell.height
-        share = min(1.0, (PIXEL_LIMIT / (max(1, pane.area) * cells)) ** 0.5)
+        share = min(1.0, (SIXEL_PIXELS / (max(1, pane.area) * cells)) ** 0.5)
         columns, rows = (max(1, int(side * share)) for side in pane)
         return PaneShape(columns, rows, *self._cell, self._cell.height / self._cell.width)
 

@@ -181,13 +181,13 @@ def test_sixels_follow_the_panes_last_cell_and_return_the_cursor():
 
 def test_large_panes_send_no_more_pixels_than_the_limit():
     for pane in (Size(400, 150), Size(297, 120), Size(1000, 2)):
-        for painter in (
-            painters.SixelPainter(CellSize(11, 24)),
-            painters.KittyPainter(lambda data: None, iter([1])),
+        for painter, limit in (
+            (painters.SixelPainter(CellSize(11, 24)), painters.SIXEL_PIXELS),
+            (painters.KittyPainter(lambda data: None, iter([1])), painters.KITTY_PIXELS),
         ):
             shape = painter.shape(pane)
             pixels = shape.columns * shape.across * shape.rows * shape.down
-            assert 0.2 * painters.PIXEL_LIMIT < pixels <= painters.PIXEL_LIMIT
+            assert 0.2 * limit < pixels <= limit
 
 
 KITTY = {"TERM": "xterm-kitty", "KITTY_WINDOW_ID": "1"}
