@@ -22,6 +22,8 @@ WITHIN = (1, 2, 4)  # frames
 SLIP_FRAMES = 12  # further apart, two people did not mean the same moment
 BOOTSTRAP = 1000
 LEVEL = 0.95
+# Of times within clips: far below one frame of a day's recording, far above what rounding leaves.
+_NO_SPREAD = 1e-24
 
 
 @dataclass(frozen=True)
@@ -60,13 +62,14 @@ def marks_by_person(labels: Sequence[Label]) -> dict[str, dict[str, Label]]:
 
 
 def agreement(clips: Sequence[Clip], seed: int = 0) -> dict[str, object]:
-    """Figures over clips, each pair of annotators of a clip counting once.
+    """Figures over clips, each pair of annotators of a clip counting once; others do not count.
 
     Returns:
         ``clips``, ``pairs``, ``within_1``, ``within_2``, ``within_4``, ``median_frames``,
         ``slip_rate``, ``alpha`` and ``alpha_interval`` (95 %, bootstrap over clips); figures are
         None where there is nothing to compare.
     """
+    clips = [clip for clip in clips if len(clip.frames) > 1]
     distances = np.array(
         [abs(a - b) for clip in clips for a, b in combinations(clip.frames.values(), 2)]
     )
@@ -102,7 +105,7 @@ def interval_alpha(units: Sequence[np.ndarray]) -> float | None:
     """
     values = np.concatenate(units)
     expected = 2.0 * values.var(ddof=1)
-    if expected < 1e-15:
+    if expected < _NO_SPREAD:
         return None
     observed = sum(len(unit) * 2.0 * unit.var(ddof=1) for unit in units) / len(values)
     return float(1.0 - observed / expected)

@@ -20,6 +20,7 @@ from express50 import __version__
 from express50.errors import AnnotationError
 from express50.index import CameraSource, Cue, Index
 from express50.layout import Dataset
+from express50.publish import sync_directory
 
 AUTOMATIC = "auto"
 RULE_PREFIX = "rule:"
@@ -209,6 +210,7 @@ def append_label(dataset: Dataset, label: Label) -> None:
 
     Raises:
         AnnotationError: the action is unknown.
+        OSError: it could not be written; then it is not there, or a torn line that is passed over.
     """
     if label.action not in ACTIONS:
         raise AnnotationError(f"action {label.action!r}, expected one of {', '.join(ACTIONS)}")
@@ -221,10 +223,19 @@ def append_label(dataset: Dataset, label: Label) -> None:
         fcntl.flock(handle, fcntl.LOCK_EX)
         if _ends_mid_line(handle):  # a writer died half-way: its rest must not swallow this line
             line = b"\n" + line
-        os.write(handle, line)
+        fresh = os.fstat(handle).st_size == 0
+        _write_all(handle, line)
         os.fsync(handle)
     finally:
         os.close(handle)
+    if fresh:  # the file's name must outlive a power cut too
+        sync_directory(path.parent)
+
+
+def _write_all(handle: int, data: bytes) -> None:
+    """Write every byte: a signal or a nearly full disk may cut one write short."""
+    while data:
+        data = data[os.write(handle, data) :]
 
 
 def _ends_mid_line(handle: int) -> bool:
@@ -241,7 +252,7 @@ def read_labels(dataset: Dataset, subject: str) -> list[Label]:
     path = dataset.labels_file(subject)
     if not path.exists():
         return []
-    lines = path.read_text().split("\n")
+    lines = path.read_text(encoding="utf-8", errors="replace").split("\n")
     return [
         label
         for number, line in enumerate(lines, 1)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -42,15 +43,25 @@ def read_suggestions(dataset: Dataset, subject: str) -> dict[str, Suggested]:
     """Suggestions by expression; none when the align stage has not run.
 
     Raises:
-        FormatError: the file is not a table of suggestions.
+        FormatError: the file is not a table of suggestions, or a figure in it is no number.
     """
     path = dataset.item_dir("align", subject) / "suggestions.json"
     if not path.is_file():
         return {}
     try:
         rows = json.loads(path.read_text(encoding="utf-8"))
-        return {expression: Suggested(**row) for expression, row in rows.items()}
+        return {expression: _checked(expression, row) for expression, row in rows.items()}
     except (ValueError, TypeError, AttributeError) as error:
         raise FormatError(
             f"{path}: not a table of suggestions ({error}); run 'express50 align' again"
         ) from None
+
+
+def _checked(expression: str, row: dict[str, Any]) -> Suggested:
+    """A row whose figures can be compared; one that is NaN would upset every order."""
+    found = Suggested(**row)
+    if not 0.0 <= found.confidence <= 1.0:
+        raise ValueError(f"{expression}: confidence is {found.confidence}, expected 0 to 1")
+    if not all(map(math.isfinite, [*found.activity, *(found.match or ())])):
+        raise ValueError(f"{expression}: its curves hold NaN or infinity")
+    return found

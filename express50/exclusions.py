@@ -12,7 +12,8 @@ def exclusion_reason(dataset: Dataset, subject: str) -> str | None:
     """Why a subject is excluded (``express50 annotate exclude``), or None when it is not."""
     path = dataset.labels_file(subject)
     reason = None
-    for line in path.read_text(encoding="utf-8").splitlines() if path.is_file() else ():
+    text = path.read_text(encoding="utf-8", errors="replace") if path.is_file() else ""
+    for line in text.split("\n"):
         with contextlib.suppress(ValueError, AttributeError):  # a torn line says nothing
             row = json.loads(line)
             if row.get("action") in ("exclude", "include"):

@@ -9,8 +9,10 @@ from annotations.ui import theme
 from annotations.ui.desk import Desk
 from annotations.ui.faces import FaceFinder
 from annotations.ui.frames import FrameCache
+from annotations.ui.painters import make_painter, picture_numbers
 from annotations.ui.picture import Picture
 from annotations.ui.session import Session
+from annotations.ui.terminal import CellSize
 
 _STYLE = f"""
 Screen {{ background: {theme.GROUND}; color: {theme.TEXT}; layout: vertical; }}
@@ -43,17 +45,30 @@ class AnnotateApp(App[None]):
     ENABLE_COMMAND_PALETTE = False
 
     def __init__(
-        self, session: Session, *, faces: FaceFinder | None = None, protocol: str = "quadrant"
+        self,
+        session: Session,
+        *,
+        faces: FaceFinder | None = None,
+        pictures: str = "blocks",
+        cell: CellSize | None = None,
     ) -> None:
         super().__init__()
         self.session = session
         self.cache = FrameCache(session.dataset)
         self._faces = faces
-        self._protocol = protocol
+        self._pictures = pictures
+        self._cell = cell
+        self._numbers = picture_numbers()
 
     def _make_picture(self, cache: FrameCache, name: str) -> Picture:
-        """The widget that shows pictures in the terminal's protocol."""
-        return Picture(cache, name, quadrants=self._protocol == "quadrant")
+        """The widget that shows pictures as the terminal can."""
+        painter = make_painter(self._pictures, self.write_raw, self._numbers, self._cell)
+        return Picture(cache, name, painter)
+
+    def write_raw(self, data: str) -> None:
+        """Write to the terminal past Textual's drawing, but in order with it."""
+        if self._driver is not None:
+            self._driver.write(data)
 
     @property
     def desk(self) -> Desk:

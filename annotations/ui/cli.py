@@ -5,17 +5,17 @@ from __future__ import annotations
 import argparse
 import fnmatch
 import getpass
+import os
 import sys
 from collections.abc import Iterable
 from pathlib import Path
 
+from annotations.ui.terminal import WANTED, cell_size, choose_pictures
 from annotations.worklist import ORDERS
 from express50.errors import AnnotationError
 from express50.exclusions import included_subjects
 from express50.index import read_index
 from express50.layout import Dataset
-
-PROTOCOLS = ("auto", "quadrant", "halfblock")
 
 
 def add_verbs(verbs: argparse._SubParsersAction) -> None:
@@ -31,8 +31,9 @@ def add_verbs(verbs: argparse._SubParsersAction) -> None:
         "--blind", action="store_true", help="hide suggestions and others' marks until you decide"
     )
     parser.add_argument(
-        "--protocol", choices=PROTOCOLS, default="auto", help="characters that pictures are made of"
-    )
+        "--pictures", choices=WANTED, default="auto",
+        help="how pictures are shown (default: the best that the terminal is known to have)",
+    )  # fmt: skip
     parser.set_defaults(handler=run_ui)
 
 
@@ -55,12 +56,15 @@ def run_ui(args: argparse.Namespace) -> int:
     )
     if not (sys.stdin.isatty() and sys.stdout.isatty()):
         raise AnnotationError("the annotator needs a terminal; use 'express50 annotate mark' here")
+    pictures = choose_pictures(args.pictures)
+    if pictures in ("kitty", "sixel"):
+        # They have every colour, but ssh does not hand COLORTERM on; kitty finds a picture by one.
+        os.environ.setdefault("COLORTERM", "truecolor")
     from annotations.ui.app import AnnotateApp
     from annotations.ui.faces import FaceFinder
-    from annotations.ui.terminal import choose_protocol
 
-    protocol = choose_protocol(args.protocol)
-    AnnotateApp(session, faces=FaceFinder(dataset), protocol=protocol).run()
+    faces = FaceFinder(dataset)
+    AnnotateApp(session, faces=faces, pictures=pictures, cell=cell_size()).run()
     print(f"{session.done} of {len(session.tasks)} done by {session.annotator}")
     return 0
 

@@ -17,7 +17,8 @@ from annotations.ui.faces import ZOOMS, FaceFinder
 from annotations.ui.frames import Shot
 from annotations.ui.keymap import GROUPS
 from annotations.ui.looks import camera_name, shots_ahead
-from annotations.ui.picture import PaneShape, Picture
+from annotations.ui.painters import PaneShape
+from annotations.ui.picture import Picture
 from annotations.ui.scene import Scene, load_scene
 from annotations.ui.strip import CurveStrip
 from annotations.ui.view import View

@@ -8,7 +8,8 @@ from typing import NamedTuple
 from annotations.suggestions import Suggested
 from annotations.ui.faces import FaceFinder
 from annotations.ui.frames import Shot
-from annotations.ui.picture import Look, PaneShape, shot_of
+from annotations.ui.painters import PaneShape
+from annotations.ui.picture import Look, shot_of
 from annotations.ui.scene import Scene
 from annotations.ui.strip import StripContent
 from annotations.ui.view import View

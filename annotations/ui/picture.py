@@ -1,10 +1,8 @@
-"""The picture widget: one frame, cropped to the zoom, as coloured block characters."""
+"""The picture widget: one frame, cropped to the zoom, painted as the terminal can."""
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 from rich.segment import Segment
 from rich.text import Text
@@ -13,22 +11,10 @@ from textual.strip import Strip
 from textual.widget import Widget
 
 from annotations.ui import theme
-from annotations.ui.blocks import picture_strips
 from annotations.ui.faces import Face, zoom_box
 from annotations.ui.frames import FrameCache, Shot
+from annotations.ui.painters import BlockPainter, Painter, PaneShape
 from express50.errors import AnnotationError
-
-KEPT = 32  # pictures kept as text, for going to and fro
-CELL_ASPECT = 2.0  # a character cell is about twice as high as wide
-
-
-class PaneShape(NamedTuple):
-    """A pane's size in cells, and the pixels that are shown in each of them."""
-
-    columns: int
-    rows: int
-    across: int
-    down: int
 
 
 @dataclass(frozen=True)
@@ -50,7 +36,7 @@ class Look:
 def shot_of(look: Look, shape: PaneShape) -> Shot:
     """The picture of a look that fills a pane."""
     columns, rows = max(1, shape.columns), max(1, shape.rows)
-    box = zoom_box(look.face, look.zoom, CELL_ASPECT * rows / columns, look.aspect)
+    box = zoom_box(look.face, look.zoom, shape.cell_aspect * rows / columns, look.aspect)
     width, height = shape.across * columns, shape.down * rows
     return Shot(look.subject, look.camera, look.frame, box, width, height)
 
@@ -58,14 +44,19 @@ def shot_of(look: Look, shape: PaneShape) -> Shot:
 class Picture(Widget):
     """Shows a look, or words in its place; draws only when what it shows changes."""
 
-    def __init__(self, cache: FrameCache, name: str, quadrants: bool = True) -> None:
+    def __init__(self, cache: FrameCache, name: str, painter: Painter | None = None) -> None:
         super().__init__(id=name)
         self._cache = cache
-        self._across = 2 if quadrants else 1
+        self._blocks = painter if isinstance(painter, BlockPainter) else BlockPainter()
+        self._painter = painter or self._blocks
         self._look: Look | None = None
         self._words = ""
         self._lines: list[Strip] | None = None
-        self._drawn: OrderedDict[Shot, list[Strip]] = OrderedDict()
+        self._covered = False
+
+    def on_mount(self) -> None:
+        """Ask how many colours there are."""
+        self._blocks.few = self.app.console.color_system != "truecolor"
 
     @property
     def look(self) -> Look | None:
@@ -80,8 +71,8 @@ class Picture(Widget):
 
     @property
     def shape(self) -> PaneShape:
-        """The size of the pane, in cells and pixels."""
-        return PaneShape(self.size.width, self.size.height, self._across, 2)
+        """The size of the picture, in cells and pixels."""
+        return self._painter.shape(self.size)
 
     def on_resize(self) -> None:
         """Draw anew."""
@@ -93,7 +84,9 @@ class Picture(Widget):
         That cache rewrites the style of every segment, which costs more than all the rest: a
         picture has thousands, and no border or padding that it would be needed for.
         """
-        if self._lines is None:
+        covered = not self.screen.is_active
+        if self._lines is None or covered != self._covered:
+            self._covered = covered
             self._lines = self._draw()
         return [self._line(y).crop(crop.x, crop.right) for y in range(crop.y, crop.bottom)]
 
@@ -105,18 +98,13 @@ class Picture(Widget):
     def _draw(self) -> list[Strip]:
         if self._look is None:
             return self._written(self._words)
-        shot = shot_of(self._look, self.shape)
-        if shot not in self._drawn:
-            try:
-                picture = self._cache.get(shot)
-            except AnnotationError as error:
-                return self._written(str(error))
-            few = self.app.console.color_system != "truecolor"
-            self._drawn[shot] = picture_strips(picture, quadrants=self._across == 2, few=few)
-        self._drawn.move_to_end(shot)
-        while len(self._drawn) > KEPT:
-            self._drawn.popitem(last=False)
-        return self._drawn[shot]
+        # Below a dialog characters stand in: Textual tints them, and pixels would lie on top.
+        painter = self._blocks if self._covered else self._painter
+        shot = shot_of(self._look, painter.shape(self.size))
+        try:
+            return painter.strips(shot, self.size, self._cache.get)
+        except AnnotationError as error:
+            return self._written(str(error))
 
     def _written(self, words: str) -> list[Strip]:
         """Words in the middle of the pane."""

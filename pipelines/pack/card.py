@@ -6,7 +6,11 @@ import hashlib
 from collections import Counter
 from collections.abc import Mapping, Sequence
 
+from express50.demographics import age_counts, age_summary, gender_counts
 from express50.errors import StageError
+
+# Of fewer people a count says who: one of two subjects is the woman, or the one aged 71.
+LEAST_PEOPLE = 5
 
 
 def split_subjects(
@@ -51,6 +55,7 @@ def write_card(
     metas: Sequence[Mapping],
     dropped: Sequence[Mapping],
     statistics: Mapping[str, object],
+    people: Sequence[Mapping] = (),
 ) -> str:
     """Markdown datasheet of the packed samples.
 
@@ -59,6 +64,7 @@ def write_card(
         metas: meta.json of every sample.
         dropped: what was left out, with reasons.
         statistics: further named numbers.
+        people: what capture.toml says of each packed subject; only counted, never quoted.
     """
     subjects = sorted({meta["subject"] for meta in metas})
     expressions = sorted({meta["expression"] for meta in metas})
@@ -91,6 +97,7 @@ def write_card(
     for expression in expressions:
         row = [str(counts[subject, expression]) for subject in subjects]
         lines.append(f"| {expression} | " + " | ".join(row) + " |")
+    lines += ["", "## People", "", *people_lines(people)]
     lines += ["", f"## Left out: {len(dropped)}", ""]
     reasons = Counter(row["why"] for row in dropped)
     lines += [f"- {count} x {why}" for why, count in sorted(reasons.items())] or ["Nothing."]
@@ -105,6 +112,31 @@ def write_card(
         "",
     ]
     return "\n".join(lines)
+
+
+def people_lines(people: Sequence[Mapping]) -> list[str]:
+    """Gender and age of the subjects as tables of counts, as far as enough captures say."""
+    lines = []
+    genders = gender_counts([meta for meta in people if "gender" in meta])
+    ages = age_summary(people)
+    if sum(genders.values()) >= LEAST_PEOPLE:
+        lines += _count_table("gender", gender_counts(people))
+    if ages is not None and ages["people"] >= LEAST_PEOPLE:
+        span = f"{ages['youngest']:g} to {ages['oldest']:g} years, mean {ages['mean']:g}"
+        lines += [f"Age: {span}, of {ages['people']:g} people.", ""]
+        lines += _count_table("age", age_counts(people))
+    few = f"Gender and age are not stated, or of fewer than {LEAST_PEOPLE} of {len(people)} people."
+    return lines[:-1] or [few]
+
+
+def _count_table(name: str, counts: Mapping[str, int]) -> list[str]:
+    """A table with a bar of one block a person, or a share of forty where there are more."""
+    scale = min(1.0, 40 / max(counts.values()))
+    rows = [
+        f"| {' '.join(value.replace('|', '/').split())} | {count} | {'█' * round(count * scale)} |"
+        for value, count in counts.items()
+    ]
+    return [f"| {name} | subjects | |", "|---|---|---|", *rows, ""]
 
 
 def _values(metas: Sequence[Mapping], key: str) -> str:

@@ -104,7 +104,9 @@ def run(dataset: Dataset, item: str, config: PackConfig, out: Path) -> dict:
     if not metas:
         why = "; ".join(sorted({row["why"] for row in dropped})[:3])
         raise StageError(f"{item}: none of {read} samples can be packed ({why})")
-    return _finish(out, splits, metas, read, dropped, config)
+    packed = sorted({meta["subject"] for meta in metas})
+    people = [read_index(dataset, name).meta for name in packed]
+    return _finish(out, splits, metas, people, read, dropped, config)
 
 
 def _read_subjects(dataset: Dataset, dropped: list[dict[str, str]]) -> list[Subject]:
@@ -238,6 +240,7 @@ def _finish(
     out: Path,
     splits: dict[str, list[str]],
     metas: list[dict],
+    people: list[dict],
     read: int,
     dropped: list[dict[str, str]],
     config: PackConfig,
@@ -253,7 +256,8 @@ def _finish(
         "profile": config.profile,
         "shards": f"{len(shards)}, {size / 1e6:.1f} MB",
     }
-    (out / "card.md").write_text(write_card(splits, metas, dropped, statistics), encoding="utf-8")
+    card = write_card(splits, metas, dropped, statistics, people)
+    (out / "card.md").write_text(card, encoding="utf-8")
     covered = _write_picture(out, reader)
     write_manifest(out)
     return {
@@ -293,7 +297,7 @@ def _write_picture(out: Path, reader: ShardReader) -> float:
 
 STAGE = Stage(
     name="pack",
-    version=2,
+    version=3,
     config=PackConfig,
     presets=PRESETS,
     items=items,

@@ -43,6 +43,7 @@ def _write_capture(capture: Path, subject: str, rig: list[Camera], shots: dict) 
     capture.mkdir(parents=True)
     (capture / "capture.toml").write_text(
         f'subject = "{subject}"\nfps = 24\nconsent = "C-{subject}"\nlicence = "CC0-1.0"\n'
+        'gender = "feminine"\nage = 4711e-2\n'
     )
     rows = [f"{name},{k},{k}" for k, name in enumerate(EXPRESSIONS)]
     (capture / "cues.csv").write_text("expression_id,start_frame,end_frame\n" + "\n".join(rows))

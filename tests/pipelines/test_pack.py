@@ -20,7 +20,7 @@ from express50.transforms import look_at
 from pipelines.depth import STAGE as DEPTH
 from pipelines.depth.config import DepthConfig
 from pipelines.pack import STAGE as PACK
-from pipelines.pack.card import split_subjects
+from pipelines.pack.card import people_lines, split_subjects
 from pipelines.pack.config import PackConfig
 from pipelines.pack.crop import Crop, crop_pinhole, cut_depth, cut_image, head_crop
 from tests.pipelines.bump_dataset import make_dataset, published
@@ -155,6 +155,27 @@ def test_every_view_is_packed_and_the_account_balances(packed):
     assert json.loads((root / "splits.json").read_text())["test"] == ["S002"]
     card = (root / "card.md").read_text()
     assert "CC0-1.0" in card and "C-S001" in card and "| smile | 6 | 6 |" in card
+
+
+def test_gender_and_age_of_a_few_people_stay_out_of_card_and_shards(packed):
+    root, _ = packed
+    assert "fewer than 5 of 2 people" in (root / "card.md").read_text()
+    for path in (p for p in root.rglob("*") if p.is_file()):
+        assert not {w for w in (b"feminine", b"47.11", b'gender"') if w in path.read_bytes()}
+
+
+def test_gender_and_age_of_many_people_are_counted_on_the_card():
+    people = [{"age": 20 + 7 * n, "gender": "female" if n % 3 else "male"} for n in range(6)]
+    lines = people_lines([*people, {"subject": "S007"}])
+    assert lines[2:5] == ["| female | 4 | ████ |", "| male | 2 | ██ |", "| not given | 1 | █ |"]
+    assert "Age: 20 to 55 years, mean 37.5, of 6 people." in lines
+    assert lines[-4:] == [
+        "| 18-29 | 2 | ██ |", "| 30-44 | 2 | ██ |", "| 45-59 | 2 | ██ |", "| not given | 1 | █ |",
+    ]  # fmt: skip
+    ages_only = people_lines([{"age": n} for n in (20, 30, 40, 50, 60, -1, True, "x")])
+    assert "gender" not in "".join(ages_only) and "mean 40, of 5 people" in ages_only[0]
+    hundred = people_lines([{"gender": "a|b\nc"}] * 100)
+    assert hundred == ["| gender | subjects | |", "|---|---|---|", f"| a/b c | 100 | {'█' * 40} |"]
 
 
 def test_samples_of_two_cameras_agree_on_the_surface(packed):

@@ -12,11 +12,10 @@ from annotations.ui.keymap import GROUPS
 from annotations.ui.picture import Picture
 from annotations.ui.strip import CurveStrip
 from express50.index import read_index
+from tests.annotations.footage import suggest
 
-from .conftest import suggest
 
-
-def drive(app, *keys, size=(100, 32), check=None):
+def drive(app, *keys, size=(80, 22), check=None):
     """Press keys in the app; returns what ``check`` says of it at the end."""
 
     async def run():
@@ -57,7 +56,7 @@ def test_every_way_of_moving_is_on_its_key(suggested, make_app):
     app = make_app(suggested, expressions=["smile"], subjects=["S001"])
 
     async def run():
-        async with app.run_test(size=(90, 26)) as pilot:
+        async with app.run_test(size=(80, 22)) as pilot:
             await pilot.pause()
             for key, frame in table:
                 await pilot.press("1")
@@ -116,7 +115,7 @@ def test_next_and_previous_leave_tasks_open(suggested, make_app):
 def test_what_is_marked_stands_on_the_screen_when_one_returns(suggested, make_app):
     app = make_app(suggested)
     title, strip = drive(
-        app, "right", "enter", "p",
+        app, "right", "enter", "p", size=(100, 32),
         check=lambda app: (line(app, "frame-title"), app.desk.query_one(CurveStrip).text),
     )  # fmt: skip
     assert "frame 5" in title
@@ -146,7 +145,7 @@ def test_zoom_camera_blink_play_and_help_leave_the_label_alone(suggested, make_a
     app = make_app(suggested)
 
     async def run():
-        async with app.run_test(size=(120, 40)) as pilot:
+        async with app.run_test(size=(80, 22)) as pilot:
             await pilot.pause()
             frame = app.desk.query_one("#frame", Picture)
             zooms, cameras = [], []
@@ -182,7 +181,7 @@ def test_play_ends_with_the_window_and_starts_again(suggested, make_app, monkeyp
     app = make_app(suggested)
 
     async def run():
-        async with app.run_test(size=(80, 24)) as pilot:
+        async with app.run_test(size=(80, 22)) as pilot:
             await pilot.pause()
             await pilot.press("end", "left", "space")
             for _ in range(100):
@@ -261,7 +260,7 @@ def test_a_resize_keeps_the_position(suggested, make_app):
     app = make_app(suggested)
 
     async def run():
-        async with app.run_test(size=(120, 40)) as pilot:
+        async with app.run_test(size=(80, 22)) as pilot:
             await pilot.pause()
             await pilot.press("right")
             await pilot.resize_terminal(60, 18)

@@ -65,7 +65,7 @@ def test_faces_found_late_are_drawn_when_they_are_there(suggested):
     app = AnnotateApp(open_session(suggested, "ann"), faces=Finder())
 
     async def run():
-        async with app.run_test(size=(80, 24)) as pilot:
+        async with app.run_test(size=(80, 22)) as pilot:
             for _ in range(100):
                 await pilot.pause(0.1)
                 if app.desk.query_one("#frame").look.face is not None:

@@ -15,8 +15,7 @@ from annotations.ui.view import open_view, set_plateau_first, step
 from annotations.worklist import Task
 from express50.errors import AnnotationError
 from express50.index import read_index
-
-from .conftest import suggest
+from tests.annotations.footage import suggest
 
 REPOSITORY = Path(__file__).resolve().parents[3]
 

@@ -1,0 +1,230 @@
+"""What a contact sheet shows: the label of every expression and subject, told apart by its origin.
+
+Nothing here reads pixels; ``annotations.sheet_page`` makes pictures and the page of it.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
+
+from annotations.reference import reference_subject
+from annotations.review import disagreements
+from annotations.store import AUTOMATIC, Label, current_labels, is_person, read_labels
+from annotations.suggestions import Suggested, read_suggestions
+from express50.errors import AnnotationError, FormatError
+from express50.exclusions import exclusion_reason, included_subjects
+from express50.expressions import load_script
+from express50.index import Index, read_index
+from express50.layout import Dataset
+
+STATES = ("person", "rule", "auto", "suggestion", "flagged", "missing")
+SURE = 0.5
+
+
+@dataclass(frozen=True, kw_only=True)
+class Tile:
+    """One expression of one subject.
+
+    Attributes:
+        subject, expression: whose, and of what.
+        state: who chose the frame (``person``, ``rule``, ``auto``: a suggestion accepted by the
+            align stage, ``suggestion``: one that nobody accepted), or ``flagged`` or ``missing``.
+        reference: whether this is the reference's canonical frame.
+        frame, camera: what to show; no frame where there is nothing to show. A flagged tile
+            shows what was suggested, so that the flag can be judged.
+        first, last: the cue window's frames.
+        by: who chose, in words.
+        confidence: of the suggestion where a suggestion was chosen, 0 to 1.
+        words: why it is flagged, missing or doubtful.
+        doubtful: whether somebody should look again.
+    """
+
+    subject: str
+    expression: str
+    state: str = "missing"
+    reference: bool = False
+    frame: int | None = None
+    camera: str = ""
+    first: int = 0
+    last: int = 0
+    by: str = ""
+    confidence: float | None = None
+    words: str = ""
+    doubtful: bool = False
+
+
+@dataclass(frozen=True)
+class Row:
+    """One expression across subjects, the reference first where it is known."""
+
+    expression: str
+    name: str
+    description: str
+    tiles: list[Tile]
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """Rows in the order of the script, the reference, and what the page should warn of."""
+
+    rows: list[Row]
+    reference: str
+    subjects: list[str]
+    notes: list[str]
+
+    def counts(self) -> dict[str, int]:
+        """Tiles by state, and how many are doubtful."""
+        tiles = [tile for row in self.rows for tile in row.tiles]
+        states = Counter(tile.state for tile in tiles)
+        return {s: states[s] for s in STATES} | {"doubtful": sum(t.doubtful for t in tiles)}
+
+
+def make_sheet(
+    dataset: Dataset,
+    subjects: Collection[str] | None = None,
+    expressions: Collection[str] | None = None,
+    camera: str | None = None,
+    sure: float = SURE,
+) -> Sheet:
+    """The sheet of some subjects and expressions, all by default; excluded subjects are left out.
+
+    Args:
+        dataset: an ingested dataset.
+        subjects: only these; the reference is always shown with them.
+        expressions: only these.
+        camera: show this camera wherever a subject has it; by default the one in which the
+            reference's frame was chosen.
+        sure: suggestions less sure than this are doubtful.
+
+    Raises:
+        AnnotationError: an unknown subject, expression or camera; StageError where nothing is
+            ingested.
+    """
+    reference = reference_subject(dataset)
+    chosen = [s for s in included_subjects(dataset) if not subjects or s in subjects]
+    _check_known("subject", subjects, included_subjects(dataset))
+    chosen = [reference, *(s for s in chosen if s != reference)]
+    indexes = {subject: read_index(dataset, subject) for subject in chosen}
+    names = list(dict.fromkeys(c.expression_id for i in indexes.values() for c in i.cues))
+    _check_known("expression", expressions, names)
+    _check_known("camera", camera and [camera], {c for i in indexes.values() for c in i.cameras})
+    notes: list[str] = []
+    columns = {s: _column(dataset, index, sure, notes) for s, index in indexes.items()}
+    rows = []
+    for name in (n for n in names if not expressions or n in expressions):
+        first = columns[reference].get(name, Tile(subject=reference, expression=name))
+        tiles = [replace(first, reference=True)]
+        tiles += [columns[s].get(name, _absent(s, name)) for s in chosen[1:]]
+        wanted = camera or first.camera
+        rows.append(Row(name, *_words(name), [_seen_by(t, wanted, indexes) for t in tiles]))
+    notes += [f"{s} is excluded: {r}" for s in dataset.subjects() if (r := _excluded(dataset, s))]
+    return Sheet(rows, reference, chosen, notes)
+
+
+def _excluded(dataset: Dataset, subject: str) -> str | None:
+    reason = exclusion_reason(dataset, subject)
+    return reason if reason is None else reason or "no reason given"
+
+
+def _check_known(what: str, wanted: Collection[str] | None, known: Collection[str]) -> None:
+    unknown = sorted(set(wanted or ()) - set(known))
+    if unknown:
+        raise AnnotationError(
+            f"no {what} {unknown[0]!r}, or it is excluded; expected one of"
+            f" {', '.join(sorted(known))}"
+        )
+
+
+def _words(expression: str) -> tuple[str, str]:
+    entry = next((e for e in load_script() if e.id == expression), None)
+    return (expression, "") if entry is None else (entry.name, entry.description)
+
+
+def _absent(subject: str, expression: str) -> Tile:
+    return Tile(subject=subject, expression=expression, words="not recorded")
+
+
+def _seen_by(tile: Tile, camera: str, indexes: dict[str, Index]) -> Tile:
+    """The tile in a camera, where the subject's has one of that name that holds the frame."""
+    source = indexes[tile.subject].cameras.get(camera)
+    if tile.frame is None or source is None or tile.frame >= source.frames:
+        return tile
+    return replace(tile, camera=camera)
+
+
+def _column(dataset: Dataset, index: Index, sure: float, notes: list[str]) -> dict[str, Tile]:
+    """All tiles of a subject by expression."""
+    try:
+        suggestions = read_suggestions(dataset, index.subject)
+    except FormatError as error:
+        notes.append(str(error))
+        suggestions = {}
+    force = current_labels(read_labels(dataset, index.subject))
+    disputes = {
+        row.expression: ", ".join(f"{who} {what}" for who, what in row.said.items())
+        for row in disagreements(dataset, subjects=[index.subject])
+    }
+    tiles = {}
+    for cue in index.cues:
+        name = cue.expression_id
+        tile = Tile(
+            subject=index.subject,
+            expression=name,
+            first=cue.start_frame,
+            last=min(cue.end_frame, index.frames - 1),
+        )
+        tile = _filled(tile, index, force.get(name), suggestions.get(name))
+        tiles[name] = _doubted(tile, disputes.get(name), sure)
+    return tiles
+
+
+def _filled(tile: Tile, index: Index, label: Label | None, hint: Suggested | None) -> Tile:
+    """The tile with the label in force, else with the suggestion."""
+    fallback = next(iter(index.cameras))
+    if hint is not None and tile.first <= hint.frame <= tile.last:
+        camera = hint.camera if hint.camera in index.cameras else fallback
+        tile = replace(tile, frame=hint.frame, camera=camera)
+    if label is None:
+        if tile.frame is None or hint is None:
+            return replace(tile, frame=None, words="no label")
+        return replace(tile, state="suggestion", by="suggested", confidence=hint.confidence)
+    if label.frame is None:
+        reason = label.reason or "no reason given"
+        return replace(tile, state="flagged", by=label.annotator, words=reason)
+    automatic = label.annotator == AUTOMATIC
+    state = "auto" if automatic else "person" if is_person(label.annotator) else "rule"
+    return replace(
+        tile,
+        state=state,
+        frame=label.frame,
+        camera=label.camera if label.camera in index.cameras else fallback,
+        by=label.annotator + (", settled" if label.action == "settle" else ""),
+        confidence=label.confidence if automatic else None,
+        words=_other_footage(index, label),
+    )
+
+
+def _other_footage(index: Index, label: Label) -> str:
+    """A warning where the label was made on other footage than what lies here now."""
+    source = index.cameras.get(label.camera or "")
+    frame = label.frame or 0
+    same = source is not None and 0 <= frame < source.frames and source.dhash[frame] == label.dhash
+    return "" if same else "labelled on other footage"
+
+
+def _doubted(tile: Tile, dispute: str | None, sure: float) -> Tile:
+    """The tile with what speaks against it."""
+    doubts = [tile.words] if tile.state not in ("flagged", "missing") and tile.words else []
+    if dispute:
+        doubts.append(dispute)
+    # Not "less than": a confidence that is no number must not pass for a sure one.
+    unsure = tile.confidence is not None and not tile.confidence >= sure
+    words = "; ".join(doubts) or tile.words
+    return replace(tile, words=words, doubtful=bool(doubts) or unsure)
+
+
+def tiles_of(rows: Sequence[Row]) -> list[Tile]:
+    """Every tile, row by row."""
+    return [tile for row in rows for tile in row.tiles]

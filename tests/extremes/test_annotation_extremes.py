@@ -1,0 +1,221 @@
+"""Annotation at its limits: nothing to compare, huge numbers, no number, no room, no pixels."""
+
+import asyncio
+import json
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from annotations.agreement import Clip, agreement, by_expression, by_pair, clip_times, marked_clips
+from annotations.coverage import coverage
+from annotations.review import disagreements
+from annotations.sheet import make_sheet
+from annotations.sheet_page import render_sheet
+from annotations.store import append_label, make_mark, read_labels
+from annotations.suggestions import read_suggestions
+from annotations.ui import view as moves
+from annotations.ui.app import AnnotateApp
+from annotations.ui.looks import frames_ahead
+from annotations.ui.replay import cheapest_keys
+from annotations.ui.session import open_session
+from annotations.ui.strip import GUTTER, StripContent, column_of, draw_strip, frame_at
+from annotations.ui.terminal import CellSize
+from annotations.ui.view import open_view
+from annotations.validate import problems
+from annotations.worklist import worklist
+from express50.cli import main
+from express50.config import resolve_config
+from express50.errors import FormatError
+from express50.index import read_index
+from express50.layout import Dataset
+from express50.runner import run_stage
+from pipelines import ingest
+from tests.annotations.labelled import make_dataset, suggest
+from tests.synth import make_capture
+
+DAY = 60 * 86400  # frames of a day at 60 a second
+
+
+def clips_of(*frames, start=0, length=24):
+    return [
+        Clip("S1", f"e{n}", start, length, dict(zip("abcdef", row, strict=False)))
+        for n, row in enumerate(frames)
+    ]
+
+
+@pytest.mark.parametrize("clips", [[], clips_of((3,)), clips_of((), (5,))])
+def test_one_voice_agrees_with_nobody(clips):
+    found = agreement(clips)
+    assert (found["clips"], found["pairs"], found["alpha"], found["within_1"]) == (0, 0, None, None)
+    assert by_pair(clips) == {}
+    assert all(row["alpha"] is None for row in by_expression(clips).values())
+
+
+def test_all_equal_has_no_alpha_but_all_within():
+    found = agreement(clips_of((4, 4), (4, 4, 4), (4, 4)))
+    assert (found["alpha"], found["alpha_interval"]) == (None, None)
+    assert (found["within_1"], found["median_frames"], found["slip_rate"]) == (1.0, 0.0, 0.0)
+
+
+def test_a_lone_voice_among_pairs_does_not_count():
+    with_lone = agreement(clips_of((4, 5), (9,), (14, 14)))
+    assert with_lone == agreement(
+        [c for c in clips_of((4, 5), (9,), (14, 14)) if len(c.frames) > 1]
+    )
+    assert with_lone["clips"] == 2
+
+
+def test_a_frames_difference_in_a_day_long_clip_is_no_agreement():
+    start = 10**15
+    marks = [(start + 5, start + 6), (start + 5, start + 6), (start + 6, start + 5)]
+    found = agreement(clips_of(*marks, start=start, length=DAY))
+    assert found["alpha"] is not None and found["alpha"] < 0.0
+
+
+@pytest.mark.parametrize("length", [-3, 0, 1])
+def test_a_clip_without_length_gives_numbers(length):
+    clip = Clip("S1", "e", 7, length, {"a": 7, "b": 7})
+    assert np.isfinite(clip_times(clip)).all()
+    assert agreement([clip])["within_1"] == 1.0
+
+
+marks = st.lists(st.lists(st.integers(0, 23), min_size=1, max_size=4), min_size=1, max_size=6)
+
+
+@settings(deadline=None, max_examples=12)
+@given(frames=marks, start=st.sampled_from([0, 1, 10**6, 2**40]))
+def test_agreement_depends_neither_on_where_the_clip_starts_nor_on_who_is_named_first(
+    frames, start
+):
+    here = agreement(clips_of(*frames))
+    moved = [[f + start for f in row] for row in frames]
+    assert agreement(clips_of(*moved, start=start)) == here
+    turned = agreement(clips_of(*(row[::-1] for row in frames)))
+    assert turned["alpha"] == pytest.approx(here["alpha"], abs=1e-3) and (
+        turned["pairs"] == here["pairs"]
+    )
+    if here["pairs"]:
+        assert 0 <= here["within_1"] <= here["within_2"] <= here["within_4"] <= 1
+        assert here["alpha"] is None or here["alpha"] <= 1
+
+
+@pytest.mark.parametrize("wrong", [math.nan, math.inf, -math.inf, -0.1, 1.5])
+def test_a_confidence_that_is_no_share_is_refused_by_name(tmp_path, wrong, capsys):
+    dataset = make_dataset(tmp_path / "data")
+    suggest(dataset, "S001", {"smile": (14, wrong)})
+    with pytest.raises(FormatError, match="smile: confidence"):
+        read_suggestions(dataset, "S001")
+    assert main(["annotate", "next", str(dataset.root)]) == 1
+    assert "express50 align" in capsys.readouterr().err
+    assert "smile: confidence" in make_sheet(dataset).notes[0]  # and the sheet is made all the same
+
+
+def test_a_curve_that_holds_no_number_is_refused(tmp_path):
+    dataset = make_dataset(tmp_path / "data")
+    suggest(dataset, "S001", {"smile": (14, 0.5)})
+    path = dataset.item_dir("align", "S001") / "suggestions.json"
+    path.write_text(path.read_text().replace("[1.0]", "[1.0, NaN]"))
+    with pytest.raises(FormatError, match="curves hold NaN"):
+        read_suggestions(dataset, "S001")
+
+
+def test_a_capture_without_cues_has_no_work_and_no_fault(tmp_path):
+    dataset = make_dataset(tmp_path / "data", expressions=())
+    assert worklist(dataset, "ann") == []
+    assert problems(dataset) == [] and disagreements(dataset) == [] and marked_clips(dataset) == []
+    assert coverage(dataset)["cells"] == {"S001": {}, "S002": {}}
+    sheet = make_sheet(dataset)
+    assert sheet.rows == [] and sum(sheet.counts().values()) == 0
+    assert "0 expressions" in render_sheet(dataset, sheet)
+    assert open_session(dataset, "ann").task is None
+
+
+windows = st.tuples(st.integers(0, 10**9), st.integers(1, 3000))
+
+
+@settings(deadline=None, max_examples=40)
+@given(window=windows, width=st.integers(1, 250), height=st.integers(1, 12), data=st.data())
+def test_any_window_fits_any_strip(window, width, height, data):
+    first, count = window
+    cursor = first + data.draw(st.integers(0, count - 1))
+    view = open_view(first, first + count - 1, (cursor,))
+    curve = tuple(np.sin(np.arange(count) / 7.0).tolist())
+    content = StripContent(view=view, activity=curve, match=curve)
+    lines = draw_strip(content, width, height)
+    assert len(lines) <= height
+    assert {line.cell_length for line in lines} == {max(width, GUTTER) if width > GUTTER else width}
+    if width > GUTTER:
+        room = width - GUTTER
+        assert 0 <= column_of(view, cursor, room) < room
+        under = frame_at(view, column_of(view, cursor, room), room)
+        assert under <= cursor <= under + math.ceil(count / room)
+
+
+def test_a_window_of_a_thousand_frames_is_crossed_and_decoded_ahead_in_bounds():
+    view = open_view(500, 1499, (700, 1300))
+    ahead = frames_ahead(view)
+    assert len(ahead) == len(set(ahead)) == 64 and {700, 1300} <= set(ahead)
+    assert min(ahead) >= 500
+    assert cheapest_keys(view, 1498, tolerance=1) == ["end"]
+    assert cheapest_keys(view, 1000, tolerance=1) == ["pagedown"] * 30
+    assert moves.step(view, 10**12).cursor == 1499
+    assert moves.step(view, -(10**12)).cursor == 500
+
+
+@pytest.fixture(scope="module")
+def speck(tmp_path_factory):
+    """Two subjects filmed with 5 x 5 pixels."""
+    root = tmp_path_factory.mktemp("speck")
+    captures = [root / subject for subject in ("S001", "S002")]
+    for path in captures:
+        make_capture(path, subject=path.name, cameras=1, frames=6, size=5, plates=False)
+    dataset = Dataset(root / "dataset")
+    ingest.register(dataset, captures)
+    config = resolve_config(ingest.STAGE, "draft")
+    assert run_stage(ingest.STAGE, dataset, config, workers=0, progress=False).ok
+    return dataset
+
+
+@pytest.mark.parametrize("pictures", ["blocks", "halfblocks", "kitty", "sixel"])
+@pytest.mark.parametrize("size", [(1, 1), (2, 3), (30, 10)])
+def test_five_pixels_in_a_terminal_of_one_cell(speck, tmp_path, pictures, size):
+    dataset = Dataset(tmp_path)
+    for name in ("ingest", "captures.json"):
+        (tmp_path / name).symlink_to(speck.root / name)
+    session = open_session(dataset, "ann", order="subject")
+    app = AnnotateApp(session, pictures=pictures, cell=CellSize(7, 15))
+
+    async def run():
+        async with app.run_test(size=size) as pilot:
+            await pilot.press("right", "z", "question_mark", "x", "enter")
+            await pilot.pause()
+
+    asyncio.run(run())
+    (label,) = read_labels(dataset, "S001")
+    assert (label.frame, label.expression) == (2, "neutral")
+
+
+def test_a_sheet_of_five_pixels(speck, tmp_path):
+    dataset = Dataset(tmp_path)
+    for name in ("ingest", "captures.json"):
+        (tmp_path / name).symlink_to(speck.root / name)
+    append_label(dataset, make_mark(read_index(dataset, "S001"), "smile", 5, "cam00", "ann"))
+    file = tmp_path / "sheet.html"
+    assert main(["annotate", "sheet", str(tmp_path), str(file), "--around", "1000000"]) == 0
+    assert 'data-count="3"' in file.read_text()  # the window's, not a million
+
+
+def test_huge_frame_numbers_survive_the_store_and_the_exchange(tmp_path):
+    dataset = make_dataset(tmp_path / "data", subjects=("S001",))
+    mark = make_mark(read_index(dataset, "S001"), "smile", 14, "a", "ann")
+    huge = type(mark)(**vars(mark) | {"frame": 2**62, "pts": -(2**63), "time": 1e300})
+    append_label(dataset, huge)
+    assert read_labels(dataset, "S001") == [huge]
+    assert {p.kind for p in problems(dataset)} == {"window", "identity", "coverage"}
+    sheet = make_sheet(dataset)
+    tile = next(t for row in sheet.rows for t in row.tiles if t.expression == "smile")
+    assert tile.doubtful and "other footage" in tile.words
+    assert json.loads(dataset.labels_file("S001").read_text())["frame"] == 2**62
