@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from zipfile import BadZipFile
 
 import numpy as np
 
@@ -84,7 +85,7 @@ def read_observations(dataset: Dataset, subject: str) -> Observations:
                 raise ValueError(f"schema is {table['schema']}, expected {SCHEMA}")
             rest = (table[key] for key in ("frames", "points", "scores", "faces"))
             return Observations(tuple(map(str, table["cameras"])), *rest)
-    except (ValueError, KeyError, OSError) as error:
+    except (ValueError, KeyError, OSError, BadZipFile) as error:
         raise FormatError(f"{path}: no observations ({error}); run 'express50 align'") from None
 
 

@@ -1,4 +1,4 @@
-"""Peaks of activity curves and of synthetic landmark motion."""
+"""Events of synthetic clips: which movement, which frame of it, and how sure."""
 
 import numpy as np
 import pytest
@@ -6,94 +6,133 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from annotations.suggest import (
-    CROP,
-    LIDS,
-    ClipObservation,
-    Suggestion,
-    activity,
-    candidates,
-    displacements,
-    landmark_weights,
-    suggest_peak,
+    Canonical,
+    candidate_rows,
+    canonical_of,
+    strongest_event,
+    suggest,
+    suggest_rest,
 )
-from express50.expressions import load_script
 
-RNG = np.random.default_rng(0)
-FACE = RNG.uniform(0, 100, (68, 2))
-SCRIPT = {e.id: e for e in load_script()}
+N = 120
+GROUPS = np.arange(N) // 4
+SAME = np.stack([np.arange(N), np.arange(N)])
 
 
-def _clip(points, crops=None):
-    frames = len(points)
-    crops = np.zeros((frames, CROP, CROP), np.float32) if crops is None else crops
-    return ClipObservation(points, np.ones(frames), crops)
+def direction(seed):
+    """A unit vector of N features."""
+    vector = np.random.default_rng(seed).normal(size=N)
+    return vector / np.linalg.norm(vector)
+
+
+def bump(frames, apex, width=3.0):
+    """A movement's course (frames,), 1 at its apex."""
+    return np.exp(-0.5 * ((np.arange(frames) - apex) / width) ** 2)
+
+
+def clip(*movements, noise=0.3, seed=0):
+    """Features of a clip: (course, direction seed, strength) of each movement, and noise."""
+    values = sum(strength * np.outer(course, direction(way)) for course, way, strength in movements)
+    return values + noise * np.random.default_rng(seed).normal(size=values.shape)
 
 
 def test_the_middle_of_a_plateau_is_suggested_not_its_first_frame():
-    curve = np.array([0, 0, 1, 4, 4, 4, 4, 4, 1, 0, 0], float)
-    assert suggest_peak(curve, 100).frame == 105
+    course = np.array([0, 0, 1, 4, 4, 4, 4, 4, 1, 0, 0], float)
+    assert suggest(np.outer(course, direction(1)), GROUPS, None).row == 5
 
 
-def test_one_frame_and_a_flat_curve_have_an_answer():
-    assert suggest_peak(np.array([2.0]), 7).frame == 7
-    flat = suggest_peak(np.zeros(5), 0)
-    assert flat.confidence == 0.0
-    assert 0 <= flat.frame < 5
+def test_a_clear_movement_is_found_with_confidence_and_noise_with_little():
+    sure = suggest(clip((bump(30, 17), 1, 20.0)), GROUPS, None)
+    vague = suggest(clip((bump(30, 17), 1, 0.0)), GROUPS, None)
+    assert abs(sure.row - 17) <= 1
+    assert sure.confidence > 0.9
+    assert vague.confidence < 0.5
 
 
-def test_neutral_takes_the_calmest_frame():
-    assert suggest_peak(np.array([3.0, 1, 0, 0, 0, 2, 4]), 0, at_rest=True).frame == 3
+def test_a_face_that_does_not_move_has_an_answer_without_confidence():
+    still = suggest(np.zeros((5, N)), GROUPS, None)
+    assert 0 <= still.row < 5
+    assert still.confidence == 0.0
+    assert suggest(np.ones((1, N)), GROUPS, None).row == 0
 
 
-@pytest.mark.parametrize("curve", [np.array([]), np.array([1.0, np.nan])])
-def test_a_curve_without_numbers_is_refused(curve):
+@pytest.mark.parametrize("values", [np.zeros((0, N)), np.full((3, N), np.nan)])
+def test_features_without_numbers_are_refused(values):
     with pytest.raises(ValueError, match="finite"):
-        suggest_peak(curve, 0)
+        suggest(values, GROUPS, None)
+    with pytest.raises(ValueError, match="finite"):
+        suggest_rest(values, GROUPS, 1.0)
 
 
-@settings(max_examples=40, deadline=None)
-@given(st.lists(st.floats(0, 1e6), min_size=1, max_size=40), st.integers(0, 1000))
-def test_a_suggestion_lies_in_its_window(values, first):
-    found = suggest_peak(np.array(values), first)
-    assert first <= found.frame < first + len(values)
+def test_of_two_movements_the_one_like_the_references_is_taken():
+    reference = canonical_of(clip((bump(30, 12), 1, 20.0)), 12, SAME, N)
+    values = clip((bump(40, 8), 1, 12.0), (bump(40, 28), 2, 25.0))
+    assert strongest_event(values).apex == pytest.approx(28, abs=1)
+    matched = suggest(values, GROUPS, reference)
+    assert matched.row == pytest.approx(8, abs=1)
+    assert matched.confidence < 0.7  # two movements: a person should look
+    assert any(abs(row - 28) <= 1 for row in matched.candidates)
+
+
+def test_a_reference_that_did_something_else_does_not_overrule_the_clip():
+    reference = canonical_of(clip((bump(30, 12), 7, 20.0)), 12, SAME, N)
+    assert suggest(clip((bump(40, 28), 2, 25.0)), GROUPS, reference).row == pytest.approx(28, abs=1)
+
+
+@pytest.mark.parametrize("side", [-1, 1])
+def test_a_canonical_frame_off_the_apex_is_matched_by_how_far_the_face_goes(side):
+    course = bump(40, 15, 5.0)
+    row = 15 + side * 6
+    reference = canonical_of(clip((course, 1, 30.0)), row, SAME, N)
+    assert reference.side == side
+    assert reference.level == pytest.approx(course[row], abs=0.08)
+    other = bump(50, 25, 8.0)
+    found = suggest(clip((other, 1, 18.0), seed=3), GROUPS, reference)
+    assert np.sign(found.row - 25) == side
+    assert other[found.row] == pytest.approx(course[row], abs=0.12)
+    assert found.match is not None
+    assert found.match.max() == pytest.approx(found.match[found.row], abs=0.05)
+
+
+def test_only_features_that_both_have_are_compared():
+    theirs = clip((bump(30, 12), 1, 20.0))
+    shared = np.stack([np.arange(N // 2), np.arange(N // 2)])
+    reference = canonical_of(theirs, 12, shared, N)
+    assert not reference.direction[N // 2 :].any()
+    assert suggest(clip((bump(30, 20), 1, 15.0)), GROUPS, reference).row == pytest.approx(20, abs=1)
+
+
+def test_a_reference_without_movement_matches_like_none():
+    empty = Canonical(np.zeros(N), 1.0, 0)
+    values = clip((bump(30, 20), 1, 15.0))
+    assert suggest(values, GROUPS, empty).row == suggest(values, GROUPS, None).row
+
+
+def test_rest_is_the_calmest_frame_and_any_as_calm_is_as_good():
+    course = np.concatenate([bump(8, 0), np.zeros(12)])
+    found = suggest_rest(clip((course, 1, 20.0)), GROUPS, typical=20.0)
+    assert found.row > 6
+    assert found.confidence > 0.9
+
+
+def test_candidates_are_apart_with_the_suggestion_first():
+    curve = np.array([0, 5, 0, 0, 9, 0, 0, 7, 6.9, 0, 0, 1, 0.0])
+    assert candidate_rows(4, [7], curve) == [4, 7, 1, 11]
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    st.integers(1, 40), st.integers(0, 1000), st.floats(0, 1e6), st.floats(1e-6, 1e3),
+    st.one_of(st.none(), st.floats(0, 1)),
+)  # fmt: skip
+def test_a_suggestion_lies_in_its_clip_and_is_finite(frames, seed, strength, noise, level):
+    values = clip((bump(frames, frames / 2), 1, strength), noise=noise, seed=seed)
+    reference = None if level is None else Canonical(direction(1), level, -1 if level < 0.9 else 0)
+    found = suggest(values, GROUPS, reference)
+    assert 0 <= found.row < frames
     assert 0.0 <= found.confidence <= 1.0
-
-
-def test_head_motion_is_no_expression():
-    angle = 0.3
-    R = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-    moved = 1.4 * FACE @ R.T + [30, -20]
-    np.testing.assert_allclose(displacements(moved[None], FACE), 0.0, atol=1e-9)
-
-
-def test_a_blink_does_not_pass_for_a_smile():
-    frames = 9
-    points = np.repeat(FACE[None], frames, axis=0) + RNG.normal(0, 0.05, (frames, 68, 2))
-    points[2, LIDS] += 6.0  # the blink, stronger than the smile
-    smile = np.exp(-((np.arange(frames) - 6.0) ** 2) / 2)
-    points[:, 48:68] += 3.0 * smile[:, None, None]
-    rest = _clip(np.repeat(FACE[None], 5, axis=0) + RNG.normal(0, 0.05, (5, 68, 2)))
-    curve = activity([_clip(points)], [rest], SCRIPT["smile"])
-    assert suggest_peak(curve, 0).frame == 6
-
-
-def test_looks_alone_can_tell_a_peak():
-    frames = 7
-    crops = np.zeros((frames, CROP, CROP), np.float32)
-    crops[4, 20:40, 20:40] = 0.8  # a tongue that moves no landmark
-    points = np.repeat(FACE[None], frames, axis=0)
-    curve = activity([_clip(points, crops)], [_clip(points[:3])], SCRIPT["neutral"])
-    assert suggest_peak(curve, 0).frame == 4
-
-
-def test_every_scripted_expression_has_points_that_take_part():
-    for expression in SCRIPT.values():
-        assert landmark_weights(expression).sum() > 0
-    assert landmark_weights(SCRIPT["smile"])[LIDS].sum() == 0
-
-
-def test_candidates_are_maxima_apart_with_the_suggestion_first():
-    curve = np.array([0, 3, 1, 0, 0, 5, 4.9, 0, 2, 0.0])
-    assert candidates(Suggestion(105, 0.9, curve), 100) == [105, 101, 108]
-    assert candidates(Suggestion(7, 0.1, np.ones(1)), 7) == [7]
-    assert len(candidates(Suggestion(0, 0.5, np.tile([1.0, 0, 0], 40)), 0)) == 5
+    assert np.isfinite(found.activity).all()
+    assert found.candidates[0] == found.row
+    assert all(0 <= row < frames for row in found.candidates)
+    again = suggest(values, GROUPS, reference)
+    assert (again.row, again.confidence) == (found.row, found.confidence)

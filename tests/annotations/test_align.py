@@ -1,0 +1,191 @@
+"""The observe and align stages over painted footage, with observations of made-up faces."""
+
+import json
+
+import numpy as np
+import pytest
+
+from annotations import align, observe
+from annotations.reference import choose_reference
+from annotations.store import (
+    AUTOMATIC,
+    append_label,
+    current_labels,
+    make_flag,
+    make_mark,
+    read_labels,
+)
+from annotations.suggestions import read_suggestions
+from annotations.watch import FACE
+from express50.cli import main
+from express50.config import build_config
+from express50.errors import FormatError
+from express50.index import read_index
+from express50.runner import run_stage
+from tests.annotations.footage import EXPRESSIONS, FRAMES_EACH
+
+FACE_POINTS = np.random.default_rng(0).uniform(0, 100, (68, 2))
+SMILE = {"S001": 22, "S002": 26}
+JAW = {"S001": 41, "S002": 38}
+
+
+def act(dataset, subject, strength=2.0, stride=1):
+    """Write observations of a face that smiles and opens its mouth at known frames."""
+    frames = np.arange(0, 3 * FRAMES_EACH, stride)
+    rng = np.random.default_rng(int(subject[1:]))
+    points = FACE_POINTS + rng.normal(0, 0.1, (len(frames), 68, 2))
+    for apex, part, way in ((SMILE, slice(48, 68), 0), (JAW, slice(5, 12), 1)):
+        course = np.exp(-0.5 * ((frames - apex[subject]) / 2.0) ** 2)
+        points[:, part, way] += strength * course[:, None]
+    folder = dataset.item_dir("observe", subject)
+    folder.mkdir(parents=True, exist_ok=True)
+    np.savez(
+        folder / "observations.npz", schema=observe.SCHEMA, cameras=np.array(["cam01"]),
+        frames=frames, points=points[None].astype(np.float32),
+        scores=np.ones((1, len(frames)), np.float32),
+        faces=np.full((1, len(frames), FACE, FACE), 99, np.uint8),
+    )  # fmt: skip
+
+
+def run(dataset, items=None, **values):
+    config = build_config(align.STAGE, values)
+    return run_stage(align.STAGE, dataset, config, items, workers=0, progress=False)
+
+
+def peaks(dataset, subject):
+    return json.loads((dataset.item_dir("align", subject) / "peaks.json").read_text())
+
+
+@pytest.fixture
+def watched(dataset):
+    """The footage with observations of both subjects."""
+    for subject in ("S001", "S002"):
+        act(dataset, subject)
+    return dataset
+
+
+def test_peaks_are_found_and_the_others_matched_to_the_reference(watched):
+    assert run(watched).ok
+    for subject in ("S001", "S002"):
+        rows = read_suggestions(watched, subject)
+        assert set(rows) == set(EXPRESSIONS)
+        assert rows["smile"].frame == pytest.approx(SMILE[subject], abs=1)
+        assert rows["jaw_open"].frame == pytest.approx(JAW[subject], abs=1)
+        assert len(rows["smile"].activity) == FRAMES_EACH
+        assert rows["smile"].confidence > 0.8
+    assert read_suggestions(watched, "S001")["smile"].kind == "peak"
+    matched = read_suggestions(watched, "S002")["smile"]
+    assert matched.kind == "match"
+    assert matched.reference == {"subject": "S001", "camera": "cam01", "frame": 22}
+    assert peaks(watched, "S002")["smile"]["frame"] == matched.frame
+
+
+def test_a_rerun_appends_nothing_and_the_references_label_moves_the_others(watched):
+    assert run(watched).ok
+    before = read_labels(watched, "S002")
+    assert run(watched).count("skipped") == 2
+    assert read_labels(watched, "S002") == before
+    mark = make_mark(read_index(watched, "S001"), "smile", 19, "cam01", "ann")  # half way up
+    append_label(watched, mark)
+    assert run(watched).count("done") == 2
+    assert peaks(watched, "S001")["smile"]["annotator"] == "ann"
+    moved = read_suggestions(watched, "S002")["smile"]
+    assert moved.frame == pytest.approx(SMILE["S002"] - 3, abs=1)
+    assert read_suggestions(watched, "S002")["jaw_open"].frame == pytest.approx(38, abs=1)
+
+
+def test_a_flag_of_the_reference_leaves_the_others_their_own_peaks(watched):
+    append_label(watched, make_flag(read_index(watched, "S001"), "smile", "failed", "ann"))
+    assert run(watched).ok
+    assert "smile" not in peaks(watched, "S001")
+    assert read_suggestions(watched, "S002")["smile"].kind == "peak"
+    assert read_suggestions(watched, "S002")["jaw_open"].kind == "match"
+
+
+def test_another_reference_is_matched_to(watched):
+    assert run(watched).ok
+    choose_reference(watched, "S002")
+    assert run(watched).count("done") == 2
+    assert read_suggestions(watched, "S001")["smile"].reference["subject"] == "S002"
+
+
+def test_unsure_suggestions_wait_for_a_person(dataset):
+    act(dataset, "S001", strength=0.02)
+    assert run(dataset, ["S001"]).ok
+    assert set(current_labels(read_labels(dataset, "S001"))) == set(EXPRESSIONS)
+    sure = {e: row.confidence for e, row in read_suggestions(dataset, "S001").items()}
+    threshold = sorted(sure.values())[1]
+    assert run(dataset, ["S001"], accept=threshold).ok
+    unsure = {e for e, confidence in sure.items() if confidence < threshold}
+    assert unsure
+    assert set(peaks(dataset, "S001")) == set(EXPRESSIONS) - unsure
+    assert not unsure & set(current_labels(read_labels(dataset, "S001")))
+    metrics = json.loads((dataset.item_dir("align", "S001") / "metrics.json").read_text())
+    assert {row["what"] for row in metrics["dropped"]} == unsure
+    assert all("align.accept" in row["why"] for row in metrics["dropped"])
+    assert run(dataset, ["S001"]).ok
+    assert set(peaks(dataset, "S001")) == set(EXPRESSIONS)
+
+
+def test_people_can_label_whom_no_camera_saw(dataset):
+    refused = run(dataset, ["S001"])
+    assert not refused.ok
+    assert "not observed" in refused.outcomes[0].reason
+    for expression, frame in (("smile", 20), ("jaw_open", 40)):
+        mark = make_mark(read_index(dataset, "S001"), expression, frame, "cam01", "ann")
+        append_label(dataset, mark)
+    assert run(dataset, ["S001"]).ok
+    assert {e: row["frame"] for e, row in peaks(dataset, "S001").items()} == {
+        "smile": 20, "jaw_open": 40,
+    }  # fmt: skip
+
+
+def test_without_the_references_observations_everybody_keeps_their_own_peak(dataset):
+    act(dataset, "S002")
+    assert run(dataset, ["S002"]).ok
+    assert read_suggestions(dataset, "S002")["smile"].kind == "peak"
+    metrics = json.loads((dataset.item_dir("align", "S002") / "metrics.json").read_text())
+    assert "S001 is not observed" in metrics["dropped"][0]["why"]
+
+
+def test_frames_between_those_observed_get_a_curve_too(dataset):
+    act(dataset, "S001", stride=2)
+    assert run(dataset, ["S001"]).ok
+    row = read_suggestions(dataset, "S001")["smile"]
+    assert len(row.activity) == FRAMES_EACH
+    assert row.frame == pytest.approx(22, abs=2)
+    assert row.frame % 2 == 0
+
+
+def test_damaged_observations_are_named(dataset):
+    act(dataset, "S001")
+    path = observe.observations_path(dataset, "S001")
+    path.write_bytes(path.read_bytes()[:200])
+    with pytest.raises(FormatError, match="express50 align"):
+        observe.read_observations(dataset, "S001")
+
+
+def test_a_suggestion_that_changed_takes_the_place_of_the_old_one(watched):
+    assert run(watched).ok
+    index = read_index(watched, "S001")
+    append_label(watched, make_mark(index, "smile", 30, "cam01", AUTOMATIC, 30, 0.5))
+    assert run(watched, match=False).ok
+    assert peaks(watched, "S001")["smile"]["frame"] == pytest.approx(22, abs=1)
+
+
+def test_the_command_watches_first_and_says_when_there_is_no_face(dataset, capsys):
+    surer = ["--workers", "0", "--set", "observe.min_score=1.0"]
+    code = main(["align", str(dataset.root), *surer])
+    lines = capsys.readouterr().out
+    assert code == 1
+    assert "no camera sees a face" in lines
+    assert "Traceback" not in lines
+    assert main(["align", str(dataset.root), "--set", "matte.method=key"]) == 2
+    assert "observe and align" in capsys.readouterr().err
+
+
+def test_settings_out_of_range_are_refused():
+    with pytest.raises(ValueError, match="0 to 1"):
+        align.AlignConfig(accept=1.5)
+    with pytest.raises(ValueError, match="at least 1"):
+        observe.ObserveConfig(cameras=0)
