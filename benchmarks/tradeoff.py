@@ -16,6 +16,7 @@ from pathlib import Path
 
 from benchmarks import accuracy
 from benchmarks.demo import STAGES
+from benchmarks.document import replace_section
 from express50.layout import Dataset
 from express50.twin.truth import Truth
 
@@ -43,7 +44,7 @@ def main() -> None:
     rows = [sweep_one(base, truth, stage, p, args.out) for stage in args.stages for p in PRESETS]
     write_csv(rows, args.out / "tradeoff.csv")
     plot(rows, args.doc.with_name("tradeoffs.png"))
-    args.doc.write_text(as_markdown(rows))
+    replace_section(args.doc, "Presets of the stages", as_markdown(rows))
     print(json.dumps({"rows": rows}))
 
 
@@ -131,12 +132,10 @@ def plot(rows: list[dict], path: Path) -> None:
     figure.savefig(path, dpi=110)
 
 
-def as_markdown(rows: list[dict]) -> str:
-    """The document."""
+def as_markdown(rows: list[dict]) -> list[str]:
+    """The section of the document."""
     front = pareto(rows)
     lines = [
-        "# Speed against accuracy",
-        "",
         "Made by `make tradeoff` on the demo's synthetic captures (4 subjects, 8 cameras, 320 px),"
         " one process, against ground truth. Seconds are processor seconds, starting the command"
         " included. A star marks what no other preset of the stage beats in both.",
@@ -150,7 +149,7 @@ def as_markdown(rows: list[dict]) -> str:
             f"| {r['stage']} | {r['preset']} | {r['seconds_per_item']:g} | {r['error']:g} |"
             f" {r['measure']} | {star} |"
         )
-    return "\n".join([*lines, "", "![error against seconds](tradeoffs.png)", ""])
+    return [*lines, "", "![error against seconds](tradeoffs.png)"]
 
 
 if __name__ == "__main__":
