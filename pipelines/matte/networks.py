@@ -1,14 +1,15 @@
 """Networks whose weights the user brings, TorchScript or ONNX files, as functions of pictures.
 
-What is read runs no Python: ``torch.jit.load`` parses the archive with its own unpickler, which
-knows TorchScript's classes alone, and ``torch.load``, which would execute a pickle, is not called;
-an ONNX file is data. Yet a network is a program (PyTorch's security policy says so): it can fill
-the memory or never end, so load weights of known origin only.
+``torch.load``, which executes pickles, is never called. ``torch.jit.load`` reads its archive with
+an unpickler of its own: one that names ``os.system`` is refused, a test shows it. That is no proof
+of safety: TorchScript is a program, part of which runs at loading, and PyTorch's documentation
+says to load only what one trusts. So does this module.
 """
 
 from __future__ import annotations
 
 import contextlib
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -18,6 +19,8 @@ import numpy as np
 import torch
 
 from express50.errors import StageError
+
+TORCH_ERRORS = (RuntimeError, torch.jit.Error)
 
 Run = Callable[[Sequence[np.ndarray]], list[np.ndarray]]
 """Batches (1, 3, H, W) float32 in, the network's outputs in order."""
@@ -118,9 +121,12 @@ def _torchscript(path: Path, role: Role) -> Network:
     """A TorchScript module: on CUDA in half precision where there is one, else on the CPU."""
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     try:
-        module = torch.jit.load(str(path), map_location=device).eval()
+        with warnings.catch_warnings():
+            # Of its deprecation; the weights are published in this format.
+            warnings.simplefilter("ignore", DeprecationWarning)
+            module = torch.jit.load(str(path), map_location=device).eval()
         arguments = module.forward.schema.arguments[1:]
-    except (RuntimeError, AttributeError) as error:
+    except (*TORCH_ERRORS, AttributeError) as error:
         raise StageError(
             f"matte.{role.setting} {path}: not TorchScript with a forward ({_reason(error)});"
             " expected a file of torch.jit.save, or .onnx"
@@ -156,7 +162,7 @@ def _run_torchscript(
         torch.manual_seed(0)
         try:
             answer = module(*(torch.from_numpy(b).to(device, dtype) for b in batches))
-        except RuntimeError as error:
+        except TORCH_ERRORS as error:
             shape = tuple(batches[0].shape)
             raise _error(path, role, f"failed on input {shape} ({_reason(error)})") from None
         if isinstance(answer, torch.Tensor):
