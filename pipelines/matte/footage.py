@@ -21,7 +21,7 @@ LEAST_MOTION = 0.06  # share of the image that must differ from the median in ha
 STATIC = 0.95  # share of the time in which a pixel that never changes agrees with its median
 LEAST_KNOWN = 0.3  # share of the image under which nothing is believed
 MOST_DOUBT = 8.0  # 8-bit steps by which filled pixels may be off
-RING = 0.06  # share of the longer side that is hidden to measure what filling is worth
+AGREE = 8.0  # 8-bit steps within which medians of two subjects show the same
 BAND_ROWS = 128  # rows at once, so that memory is that of the frames
 
 
@@ -78,8 +78,9 @@ def plate_over_time(frames: list[np.ndarray]) -> FootagePlate | None:
 def plate_over_subjects(medians: list[np.ndarray]) -> FootagePlate:
     """Plate from time medians (H, W, 3) uint8 of subjects, two or more, before one rig.
 
-    In the exposure of the first. A pixel is known where more than half of the subjects agree, and
-    that place reaches the top or a side of the image: people in like clothes agree in the middle.
+    In the exposure of the first. A pixel is known where more than half of the subjects agree,
+    three at least or both of two, for skin is like skin; and where that place reaches the top or a
+    side of the image, for people in like clothes agree in the middle.
     """
     first = medians[0]
     alike = [np.clip(exposed(m, exposure_gain(first, m)), 0, 255) for m in medians]
@@ -89,13 +90,13 @@ def plate_over_subjects(medians: list[np.ndarray]) -> FootagePlate:
         votes = np.zeros_like(most)
         total = np.zeros_like(plate)
         for other in alike:
-            near = cv2.absdiff(one, other).max(axis=-1) <= MOST_NOISE
+            near = cv2.absdiff(one, other).max(axis=-1) <= AGREE
             votes += near
             total += near[..., None] * other
         better = votes > most
         plate[better] = total[better] / votes[better][:, None]
         most[better] = votes[better]
-    known = _from_outside(most > len(medians) / 2)
+    known = _from_outside(most >= max(min(len(medians), 3), len(medians) // 2 + 1))
     return _completed(np.rint(plate).astype(np.uint8), known)
 
 
@@ -122,9 +123,11 @@ def _completed(plate: np.ndarray, known: np.ndarray) -> FootagePlate:
     if known.all() or not known.any():
         return FootagePlate(plate, known, 0.0)
     image = plate.astype(np.float32)
-    hidden = known & dilated(~known, RING * max(known.shape))
+    # As wide a rim is hidden as half of what has to be bridged.
+    depth = cv2.distanceTransform((~known).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    hidden = known & dilated(~known, max(1.0, float(depth.max()) / 2))
     rest = known & ~hidden
-    doubt = np.inf
+    doubt = 255.0
     if rest.any() and hidden.any():
         off = np.abs(filled(image, rest)[hidden] - image[hidden]).max(axis=-1)
         doubt = 1.4826 * float(np.median(off))
