@@ -2,9 +2,9 @@
 
 Over time: a pixel shows the plate where it holds one colour for most of the time. Over subjects of
 a fixed rig: where most subjects show the same colour. Neither sees behind a head that always
-covers the same place. Such pixels are unknown; they are filled in from around, and what that is
-worth is measured where the plate is known. On a backdrop it is worth much, on clutter nothing, and
-then there is no plate.
+covers the same place; the plate of another subject before the same rig does. Pixels that nothing
+shows are unknown; they are filled in from around, and what that is worth is measured where the
+plate is known. On a backdrop it is worth much, on clutter nothing, and then there is no plate.
 """
 
 from __future__ import annotations
@@ -98,6 +98,19 @@ def plate_over_subjects(medians: list[np.ndarray]) -> FootagePlate:
         most[better] = votes[better]
     known = _from_outside(most >= max(min(len(medians), 3), len(medians) // 2 + 1))
     return _completed(np.rint(plate).astype(np.uint8), known)
+
+
+def plate_of_another(plate: np.ndarray, median: np.ndarray) -> FootagePlate | None:
+    """A plate (H, W, 3) uint8 shot with another subject, in the exposure of a subject's median.
+
+    None where the two do not show one background around the subject: then the camera or the set
+    was moved in between.
+    """
+    shown = np.clip(exposed(plate, exposure_gain(median, plate)), 0, 255)
+    alike = _from_outside(cv2.absdiff(shown, median.astype(np.float32)).max(axis=-1) <= AGREE)
+    if alike.mean() < LEAST_KNOWN:
+        return None
+    return FootagePlate(np.rint(shown).astype(np.uint8), np.ones(alike.shape, bool), 0.0)
 
 
 def time_median(frames: list[np.ndarray]) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Where a camera's plate comes from: the one that was shot, else footage of the same rig."""
+"""Where a camera's plate comes from: the one that was shot, else others' or footage of the rig."""
 
 from __future__ import annotations
 
@@ -9,11 +9,17 @@ import numpy as np
 from express50.adapters import undistort_image
 from express50.cameras import Camera
 from express50.errors import StageError
-from express50.frames import FrameReader, read_plate
+from express50.frames import FrameReader, read_plate, read_srgb8
 from express50.index import Index, read_index
 from express50.layout import Dataset
 from pipelines.matte.config import MatteConfig
-from pipelines.matte.footage import FootagePlate, plate_over_subjects, plate_over_time, time_median
+from pipelines.matte.footage import (
+    FootagePlate,
+    plate_of_another,
+    plate_over_subjects,
+    plate_over_time,
+    time_median,
+)
 
 MOST_SUBJECTS = 8  # of a fixed rig, whose footage stands in for a plate
 LEAST_FRAMES = 5  # of a subject, to take a median of
@@ -38,7 +44,7 @@ def plate_of(dataset: Dataset, item: str, camera: Camera, config: MatteConfig) -
     subject, camera_id = item.split("/")
     image = read_plate(dataset, subject, camera_id, undistort=False)
     if image is None:
-        return _plate_from_footage(dataset, item, camera, config)
+        return _plate_of_the_rig(dataset, item, camera, config)
     if image.shape[:2] != (camera.height, camera.width):
         raise StageError(
             f"{item}: the plate is {image.shape[1]}x{image.shape[0]}, the footage "
@@ -62,18 +68,23 @@ def others_of(dataset: Dataset, index: Index, camera_id: str) -> list[str]:
     return [found[i] for i in np.unique(picks)]
 
 
-def _plate_from_footage(dataset: Dataset, item: str, camera: Camera, config: MatteConfig) -> Plate:
-    """Over the subjects of a fixed rig where that can be believed, else over time."""
+def _plate_of_the_rig(dataset: Dataset, item: str, camera: Camera, config: MatteConfig) -> Plate:
+    """Of another subject before this rig, else over subjects, else over time."""
     subject, camera_id = item.split("/")
     index = read_index(dataset, subject)
     own = _footage(index, camera_id, config.plate_frames)
-    others = [
-        time_median(_footage(read_index(dataset, other), camera_id, config.plate_frames))
-        for other in others_of(dataset, index, camera_id)
-    ]
+    median = time_median(own)
+    others = [read_index(dataset, other) for other in others_of(dataset, index, camera_id)]
+    for other in others:
+        if camera_id in other.plates:
+            theirs = read_srgb8(other.capture / other.plates[camera_id])
+            borrowed = plate_of_another(theirs, median) if theirs.shape == median.shape else None
+            if borrowed:
+                return _undistorted(borrowed, camera, f"the plate of {other.subject}")
     ways: list[tuple[str, FootagePlate | None]] = []
     if others:
-        over = plate_over_subjects([time_median(own), *others])
+        shown = [time_median(_footage(o, camera_id, config.plate_frames)) for o in others]
+        over = plate_over_subjects([median, *shown])
         ways.append((f"footage of {len(others) + 1} subjects", over))
     over_time = plate_over_time(own) if len(own) >= LEAST_FRAMES else None
     ways.append((f"footage of {len(own)} frames", over_time))
@@ -104,7 +115,7 @@ def _undistorted(found: FootagePlate, camera: Camera, source: str) -> Plate:
     seen = undistort_image(np.repeat(found.known[..., None] * np.uint8(255), 3, axis=2), camera)
     doubt = np.where(seen[..., 0] == 255, 0, max(found.doubt, 1.0)).astype(np.float32)
     share = 1 - float(found.known.mean())
-    why = f"estimated from {source}; record a clean plate for better hair"
+    why = f"none was shot; taken from {source}"
     if share > 0:
         why += f"; {share:.1%} is always covered and filled in, off by {found.doubt:.1f} of 255"
     return Plate(image, doubt, source, ({"what": "plate", "why": why},))

@@ -52,6 +52,9 @@ def inputs(dataset: Dataset, item: str, config: MatteConfig) -> dict[str, Path |
     elif config.method != "salient":
         for other in others_of(dataset, index, camera):
             found[f"index of {other}"] = index_path(dataset, other)
+            theirs = read_index(dataset, other)
+            if camera in theirs.plates:
+                found[f"plate of {other}"] = theirs.capture / theirs.plates[camera]
     for setting in ("weights", "segmentation"):
         if getattr(config, setting):
             found[setting] = _weights(config, setting)

@@ -17,9 +17,9 @@ from express50.index import read_index
 from pipelines.matte import STAGE
 from pipelines.matte.config import MatteConfig
 from pipelines.matte.key import dilated, eroded, plate_difference
+from pipelines.matte.keyer import Keyer
 from pipelines.matte.plate import exposed, exposure_gain, fit_plate
 from pipelines.matte.smooth import MattingLaplacian
-from pipelines.matte.stage import Keyer
 from tests.pipelines.matte_scenes import Scene, clutter, make_scene
 
 CONFIG = MatteConfig()

@@ -10,6 +10,7 @@ from pipelines.matte.config import MatteConfig
 from pipelines.matte.footage import (
     MOST_DOUBT,
     filled,
+    plate_of_another,
     plate_over_subjects,
     plate_over_time,
     time_median,
@@ -106,6 +107,18 @@ def test_another_exposure_of_the_other_subject_is_undone(rng) -> None:
     found = plate_over_subjects([still(rng, plate, 0), still(rng, dim, 1)])
     assert np.abs(found.plate - plate).max(axis=-1)[found.known].max() < 8
     assert found.known.mean() > 0.5
+
+
+def test_the_plate_of_another_subject_serves_where_the_set_is_the_same(rng) -> None:
+    plate = clutter(rng, SIZE)
+    shown = np.rint(plate).astype(np.uint8)
+    found = plate_of_another(shown, still(rng, plate, 0))
+    assert found is not None and found.known.all() and not found.flaw
+    assert np.abs(found.plate - plate).max() < 8
+    dim = plate_of_another(shown, still(rng, 0.9 * plate, 0))
+    assert dim is not None and np.abs(dim.plate - 0.9 * plate).mean() < 4
+    moved = np.roll(plate, 9, axis=1)
+    assert plate_of_another(shown, still(rng, moved, 0)) is None
 
 
 def test_clutter_behind_a_head_cannot_be_filled_in(rng) -> None:

@@ -16,6 +16,7 @@ from express50.runner import Summary, run_stage
 from pipelines import calibrate, ingest
 from pipelines.matte import STAGE
 from pipelines.matte.config import PARTS, MatteConfig
+from tests.pipelines.matte_scenes import clutter
 from tests.pipelines.stand_ins import Bad, Difference, Thirds, onnx_bright, torchscript
 from tests.pipelines.test_matte_footage import backdrop, shot
 from tests.synth import make_capture
@@ -170,6 +171,22 @@ def test_without_plates_subjects_of_a_fixed_rig_stand_in_for_them(tmp_path) -> N
     truth = shot(np.random.default_rng(0), plate, 0)[1]
     alpha = read_image(dataset.item_dir("matte", "S000/cam00") / "smile.png") / 255
     assert np.abs(alpha - truth).mean() < 0.01
+
+
+def test_the_plate_of_another_subject_is_used_and_named(tmp_path) -> None:
+    plate = clutter(np.random.default_rng(6), 128)
+    captures = [unplated(tmp_path / "raw", f"S{k:03d}", k, plate) for k in range(2)]
+    (captures[1] / "plates").mkdir()
+    write_image(captures[1] / "plates" / "cam00.png", np.rint(plate).astype(np.uint8))
+    dataset = make_dataset(tmp_path, captures)
+    assert run(dataset).ok
+    figures = metrics_of(dataset, "S000/cam00")
+    assert figures["plate"] == "the plate of S001"
+    assert [w["what"] for w in figures["warnings"]] == ["plate"]
+    truth = shot(np.random.default_rng(0), plate, 0)[1]
+    alpha = read_image(dataset.item_dir("matte", "S000/cam00") / "smile.png") / 255
+    assert np.abs(alpha - truth).mean() < 0.012
+    assert metrics_of(dataset, "S001/cam00")["plate"] == "given"
 
 
 def test_one_subject_that_sits_still_without_a_plate_fails_clearly(tmp_path) -> None:
