@@ -156,7 +156,7 @@ def _run_torchscript(
         stack.enter_context(torch.random.fork_rng(devices=[device] if cuda else []))
         stack.enter_context(torch.inference_mode())
         stack.enter_context(torch.jit.optimized_execution(False))
-        stack.enter_context(torch.backends.cudnn.flags(benchmark=False, deterministic=True))
+        stack.enter_context(torch.backends.cudnn.flags(enabled=True, deterministic=True))
         if cuda and dtype == torch.float32:
             stack.enter_context(torch.autocast("cuda", torch.float16))
         torch.manual_seed(0)

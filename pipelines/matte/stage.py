@@ -100,8 +100,9 @@ def run(dataset: Dataset, item: str, config: MatteConfig, out: Path) -> dict:
         for expression, shares in parts.items()
         if shares["face_neck"] + shares["hair"] == 0
     ]
-    first = sorted(peaks, key=lambda e: all(w["what"] != e for w in odd))  # what is odd leads
-    _write_picture(out, {e: read(peaks[e]) for e in first[:QC_ROWS]})
+    named = {warning["what"] for warning in odd}
+    first = sorted(peaks, key=lambda expression: expression not in named)[:QC_ROWS]
+    _write_picture(out, {e: read(peaks[e]) for e in first}, named)
     return {
         "method": config.method,
         **facts,
@@ -166,15 +167,16 @@ def _write_parts(
     return part_shares(labels)
 
 
-def _write_picture(out: Path, images: dict[str, np.ndarray]) -> None:
-    """Contact sheet of what was written for some expressions."""
+def _write_picture(out: Path, images: dict[str, np.ndarray], odd: set[str]) -> None:
+    """Contact sheet of what was written for some expressions, the odd ones marked."""
     rows = []
     for expression, image in images.items():
         alpha = read_image(out / f"{expression}.png").astype(np.float32) / 255
         path = out / f"{expression}_parts.png"
         rows.append(picture_row(image, alpha, read_image(path) if path.is_file() else None))
     (out / "qc").mkdir()
-    sheet = contact_sheet(rows, list(images), tile=(240, 240))
+    labels = [f"{name}: see warnings" if name in odd else name for name in images]
+    sheet = contact_sheet(rows, labels, tile=(240, 240))
     write_image(out / "qc" / "mattes.jpg", sheet, quality=88)
 
 

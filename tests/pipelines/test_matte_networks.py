@@ -34,6 +34,7 @@ from tests.pipelines.stand_ins import (
     onnx_bright,
     onnx_difference,
     torchscript,
+    traced_thirds,
 )
 
 
@@ -161,6 +162,22 @@ def test_parts_are_named_and_the_torso_goes(tmp_path) -> None:
     assert head[:135, 50].min() == 1 and head[146:, 50].max() == 0
     # What the network calls background goes with the nearer part: strands beside the hair stay.
     assert head[20, 2] == 1 and head[190, 2] == 0
+
+
+def test_a_traced_network_gives_parts_at_the_frames_own_size(tmp_path) -> None:
+    network = load_network(traced_thirds(tmp_path / "parts.pt2"), SAPIENS)
+    frame = np.zeros((101, 77, 3), np.uint8)
+    frame[:50] = 255
+    labels = segment(network, frame)
+    assert part_mask(labels, "hair")[:48].all() and part_mask(labels, "body")[53:].all()
+
+
+def test_a_file_in_half_precision_runs_on_the_cpu_too(tmp_path, rng) -> None:
+    frame, plate = pair(rng, 64, 64)
+    paths = [torchscript(Difference(), tmp_path / "single.pt")]
+    paths.append(torchscript(Difference().half(), tmp_path / "half.pt"))
+    single, half = (background_alpha(load_network(p, BGMV2), frame, plate, 512) for p in paths)
+    assert np.abs(single - half).max() < 2e-3
 
 
 def test_the_class_numbers_are_sapiens_own() -> None:
