@@ -27,7 +27,7 @@ from express50.frames import read_frame, read_plate
 from express50.layout import Dataset
 from express50.twin.truth import Truth
 from pipelines.matte import STAGE
-from pipelines.matte.stage import Keyer
+from pipelines.matte.keyer import Keyer
 
 HARD = (6.0, 10.0, 16.0, 24.0)  # 8-bit steps
 RAMP = ((2.0, 8.0), (3.0, 12.0), (3.0, 25.0), (4.0, 40.0))  # noise deviations

@@ -1,4 +1,4 @@
-"""Mattes of peak frames by keying against the camera's clean plate."""
+"""Mattes of peak frames: by keying against a clean plate, or by the user's own network."""
 
 from pipelines.matte.stage import STAGE
 

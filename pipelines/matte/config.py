@@ -3,14 +3,28 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 from express50.errors import ConfigError
+
+PARTS = ("background", "apparel", "face_neck", "hair", "body", "lips", "teeth", "tongue")
+"""What a label in ``<expression>_parts.png`` means, by its value."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class MatteConfig:
     """Lengths are shares of the image's longer side, differences are in noise deviations."""
 
+    method: Literal["key", "bgmv2", "salient"] = "key"
+    """Key against the plate, or a network: BackgroundMattingV2, or RMBG-2.0 or BiRefNet."""
+    weights: str = ""
+    """File of the network's weights, TorchScript or ONNX; from a known origin, it is a program."""
+    tile: int = 2048
+    """Longest side, pixels, that bgmv2 sees at once; larger frames are cut up."""
+    segmentation: str = ""
+    """File of Sapiens' body-part weights, TorchScript; labels the parts of each peak."""
+    torso: Literal["keep", "remove"] = "keep"
+    """Whether to write mattes of the head alone too; remove needs segmentation."""
     scale: float = 1.0
     """Key at this share of the resolution; below 1 the matte is enlarged afterwards."""
     low: float = 1.2
@@ -34,7 +48,7 @@ class MatteConfig:
     noise_floor: float = 1.0
     """Least noise assumed, in 8-bit steps."""
     plate_frames: int = 31
-    """Frames whose median stands in for a missing plate."""
+    """Frames of a subject that a missing plate is estimated from."""
 
     def __post_init__(self) -> None:
         """Refuse values that key nothing or everything."""
@@ -48,6 +62,18 @@ class MatteConfig:
             raise ConfigError(
                 f"matte.full {self.full}, matte.shadow {self.shadow}: expected 0.1 to 1, 0 to 1"
             )
+        self._check_networks()
+
+    def _check_networks(self) -> None:
+        if (self.method == "key") == bool(self.weights):
+            raise ConfigError(
+                f"matte.method {self.method!r} with matte.weights {self.weights!r}: key takes none,"
+                " bgmv2 and salient need the file of the network's weights"
+            )
+        if self.torso == "remove" and not self.segmentation:
+            raise ConfigError("matte.torso 'remove' needs matte.segmentation, Sapiens' weights")
+        if self.tile < 512 or self.tile % 64:
+            raise ConfigError(f"matte.tile is {self.tile}, expected a multiple of 64, 512 or more")
 
 
 PRESETS: dict[str, dict[str, object]] = {

@@ -161,17 +161,3 @@ def _whitening(scaled: np.ndarray) -> np.ndarray:
     # A tenth of independent noise keeps a direction that only looked quiet from ruling the key.
     values, vectors = np.linalg.eigh(covariance + 0.1 * np.eye(3))
     return ((vectors / np.sqrt(np.maximum(values, 0.1))) @ vectors.T).astype(np.float32)
-
-
-def plate_from_footage(frames: list[np.ndarray], needed: float = 0.06) -> np.ndarray | None:
-    """Median (H, W, 3) uint8 of frames, or None when the subject hardly moved in them.
-
-    A subject that covers a place most of the time is in the median itself, and only its edges
-    then differ from frame to frame; `needed` is the share of the image that must differ from
-    the median in half of the frames for the median to be believed.
-    """
-    stack = np.stack(frames)
-    median = np.median(stack, axis=0).astype(np.uint8)
-    moved = np.abs(stack.astype(np.int16) - median).max(axis=-1) > 2 * MOST_NOISE
-    changed = moved.reshape(len(frames), -1).mean(axis=1)
-    return median if np.median(changed) >= needed else None

@@ -20,10 +20,12 @@ FLAT = 1e-5
 ITERATIONS = 30
 
 
-def smooth_alpha(image: np.ndarray, alpha: np.ndarray, band: np.ndarray) -> np.ndarray:
+def smooth_alpha(
+    image: np.ndarray, alpha: np.ndarray, band: np.ndarray, weight: float = KEY_WEIGHT
+) -> np.ndarray:
     """Smooth alpha (H, W) in `band` (H, W) by an image (H, W, 3) in 8-bit steps; the rest stays.
 
-    Minimises a' L a + KEY_WEIGHT |a - key|^2 over the band by conjugate gradients.
+    Minimises a' L a + weight |a - alpha|^2 over the band by conjugate gradients.
     """
     if not band.any() or min(band.shape) < 3:
         return alpha
@@ -33,13 +35,13 @@ def smooth_alpha(image: np.ndarray, alpha: np.ndarray, band: np.ndarray) -> np.n
     def product(values: np.ndarray) -> np.ndarray:
         spread = np.zeros(band.shape)
         spread[band] = values
-        return laplacian.product(spread)[band] + KEY_WEIGHT * values
+        return laplacian.product(spread)[band] + weight * values
 
     key = alpha[band].astype(np.float64)
     fixed = np.where(band, 0.0, alpha)
-    right = KEY_WEIGHT * key - laplacian.product(fixed)[band]
+    right = weight * key - laplacian.product(fixed)[band]
     # Preconditioned by its diagonal: windows at image borders and flat ones differ in scale.
-    inverse = 1.0 / (laplacian.diagonal()[band] + KEY_WEIGHT)
+    inverse = 1.0 / (laplacian.diagonal()[band] + weight)
     solved, _ = cg(
         LinearOperator((count, count), product, dtype=np.float64),
         right,

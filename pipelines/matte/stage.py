@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -11,19 +11,21 @@ import numpy as np
 from express50.adapters import undistorted_mask
 from express50.cameras import read_cameras
 from express50.errors import StageError
-from express50.frames import read_cameras_of, read_frame, read_peaks, read_plate
-from express50.images import contact_sheet, resize_area, write_image
+from express50.frames import read_cameras_of, read_frame, read_peaks
+from express50.images import contact_sheet, read_image, write_image
 from express50.index import index_path, read_index
 from express50.layout import Dataset
 from express50.stage import Stage
 from pipelines.matte.config import PRESETS, MatteConfig
-from pipelines.matte.key import alpha_of
-from pipelines.matte.plate import PlateModel, exposed, exposure_gain, fit_plate, plate_from_footage
+from pipelines.matte.keyer import Keyer
+from pipelines.matte.plate import exposed, exposure_gain
+from pipelines.matte.qc import border_contact, part_shares, picture_row, warnings
+from pipelines.matte.source import Plate, others_of, plate_of
 
 QC_ROWS = 8
-# A coverage this factor off the camera's median over expressions is reported as a jump.
-JUMP = 1.35
-EMPTY = 0.003
+
+Alpha = Callable[[np.ndarray], np.ndarray]
+"""Frame (H, W, 3) uint8 to opacity (H, W) float32."""
 
 
 def items(dataset: Dataset) -> list[str]:
@@ -37,7 +39,7 @@ def items(dataset: Dataset) -> list[str]:
 
 
 def inputs(dataset: Dataset, item: str, config: MatteConfig) -> dict[str, Path | str]:
-    """The camera's index, plate and footage identity, the calibration and the peaks."""
+    """The camera's index, plate and footage identity, the calibration, the peaks, the weights."""
     subject, camera = item.split("/")
     index = read_index(dataset, subject)
     found: dict[str, Path | str] = {
@@ -47,7 +49,23 @@ def inputs(dataset: Dataset, item: str, config: MatteConfig) -> dict[str, Path |
     }
     if camera in index.plates:
         found["plate"] = index.capture / index.plates[camera]
+    elif config.method != "salient":
+        for other in others_of(dataset, index, camera):
+            found[f"index of {other}"] = index_path(dataset, other)
+            theirs = read_index(dataset, other)
+            if camera in theirs.plates:
+                found[f"plate of {other}"] = theirs.capture / theirs.plates[camera]
+    for setting in ("weights", "segmentation"):
+        if getattr(config, setting):
+            found[setting] = _weights(config, setting)
     return found
+
+
+def _weights(config: MatteConfig, setting: str) -> Path:
+    path = Path(getattr(config, setting)).expanduser()
+    if not path.is_file():
+        raise StageError(f"matte.{setting} {path}: no such file; expected TorchScript or .onnx")
+    return path
 
 
 def run(dataset: Dataset, item: str, config: MatteConfig, out: Path) -> dict:
@@ -63,132 +81,108 @@ def run(dataset: Dataset, item: str, config: MatteConfig, out: Path) -> dict:
     def read(frame: int) -> np.ndarray:
         return read_frame(dataset, subject, camera_id, frame)
 
-    plate, source = read_plate(dataset, subject, camera_id), "given"
-    if plate is None:
-        plate, source = _plate_from_footage(dataset, item, config), "footage"
-    if plate.shape != read(next(iter(peaks.values()))).shape:
-        raise StageError(
-            f"{item}: the plate is {plate.shape[1]}x{plate.shape[0]}, the footage "
-            f"{camera.width}x{camera.height}; record the plate with the capture's settings"
-        )
-    measured = sorted(set(peaks.values()))
-    measured = [
-        measured[i]
-        for i in np.unique(
-            np.linspace(0, len(measured) - 1, config.noise_frames).round().astype(int)
-        )
-    ]
-    keyer = Keyer(plate, [read(frame) for frame in measured], valid, config)
+    plate = None if config.method == "salient" else plate_of(dataset, item, camera, config)
+    alpha_of, facts = _method(plate, [read(f) for f in _measured(peaks, config)], valid, config)
     coverage: dict[str, float] = {}
-    border: dict[str, float] = {}
-    rows: list[tuple[str, list[np.ndarray]]] = []
+    border: dict[str, dict[str, float]] = {}
+    parts: dict[str, dict[str, float]] = {}
     for expression, frame in peaks.items():
         image = read(frame)
-        alpha = keyer.alpha(image)
-        write_image(out / f"{expression}.png", np.rint(alpha * 255).astype(np.uint8))
+        alpha = np.where(valid, alpha_of(image), np.float32(0))
+        _write_alpha(out / f"{expression}.png", alpha)
         coverage[expression] = round(float(alpha.mean()), 6)
-        border[expression] = round(_border_contact(alpha), 4)
-        if len(rows) < QC_ROWS:
-            rows.append((expression, _qc_row(image, alpha)))
-    (out / "qc").mkdir()
-    sheet = contact_sheet([row for _, row in rows], [name for name, _ in rows], tile=(240, 240))
-    write_image(out / "qc" / "mattes.jpg", sheet, quality=88)
+        border[expression] = border_contact(alpha)
+        if config.segmentation:
+            parts[expression] = _write_parts(out, expression, image, alpha, config)
+    odd = warnings(peaks, coverage, border) + list(plate.warnings if plate else ())
+    odd += [
+        {"what": expression, "why": "the segmentation finds no head"}
+        for expression, shares in parts.items()
+        if shares["face_neck"] + shares["hair"] == 0
+    ]
+    named = {warning["what"] for warning in odd}
+    first = sorted(peaks, key=lambda expression: expression not in named)[:QC_ROWS]
+    _write_picture(out, {e: read(peaks[e]) for e in first}, named)
     return {
-        "plate": source,
+        "method": config.method,
+        **facts,
         "coverage": coverage,
         "border_contact": border,
-        "noise_8bit": round(float(np.median(keyer.model.sigma)), 4),
-        "warnings": _warnings(coverage),
+        **({"parts": parts} if parts else {}),
+        "warnings": odd,
         "dropped": [],
     }
 
 
-class Keyer:
-    """One camera's plate with its noise, at the scale the config asks for."""
-
-    def __init__(
-        self,
-        plate: np.ndarray,
-        frames: list[np.ndarray],
-        valid: np.ndarray,
-        config: MatteConfig,
-    ) -> None:
-        """Measure the noise of `frames` (H, W, 3) uint8 around `plate`, inside `valid` (H, W)."""
-        self.config = config
-        self.full_size = (plate.shape[1], plate.shape[0])
-        self.size = tuple(max(8, round(n * config.scale)) for n in self.full_size)
-        self.plate = self._shrink(plate)
-        self.valid = valid
-        self._valid_small = self._shrink(valid.astype(np.uint8) * 255) == 255
-        self.model: PlateModel = fit_plate(
-            self.plate, [self._shrink(f) for f in frames], self._valid_small, config.noise_floor
-        )
-
-    def _shrink(self, image: np.ndarray) -> np.ndarray:
-        return image if self.size == self.full_size else resize_area(image, *self.size)
-
-    def alpha(self, frame: np.ndarray) -> np.ndarray:
-        """Opacity (H, W) float32 in [0, 1] of the subject in a frame (H, W, 3) uint8."""
-        small = self._shrink(frame)
-        plate = exposed(self.plate, exposure_gain(small, self.plate))
-        alpha = alpha_of(small, replace(self.model, plate=plate), self._valid_small, self.config)
-        if self.size != self.full_size:
-            alpha = cv2.resize(alpha, self.full_size, interpolation=cv2.INTER_LINEAR)
-        return np.where(self.valid, alpha, np.float32(0))
+def _measured(peaks: dict[str, int], config: MatteConfig) -> list[int]:
+    """Peak frames that the camera's noise is measured on; none for a network."""
+    if config.method != "key":
+        return []
+    frames = sorted(set(peaks.values()))
+    picks = np.linspace(0, len(frames) - 1, config.noise_frames).round().astype(int)
+    return [frames[i] for i in np.unique(picks)]
 
 
-def _plate_from_footage(dataset: Dataset, item: str, config: MatteConfig) -> np.ndarray:
-    """The median of frames spread over the footage, or a StageError when it cannot be believed."""
-    subject, camera_id = item.split("/")
-    count = read_index(dataset, subject).cameras[camera_id].frames
-    picks = np.unique(np.linspace(0, count - 1, config.plate_frames).round().astype(int))
-    frames = [read_frame(dataset, subject, camera_id, int(frame)) for frame in picks]
-    plate = plate_from_footage(frames) if len(frames) >= 5 else None
+def _method(
+    plate: Plate | None, frames: list[np.ndarray], valid: np.ndarray, config: MatteConfig
+) -> tuple[Alpha, dict[str, object]]:
+    """How the config makes alpha, and facts about that for the metrics."""
+    if config.method == "key" and plate is not None:
+        keyer = Keyer(plate.image, frames, valid, config, plate.doubt)
+        noise = round(float(np.median(keyer.model.sigma)), 4)
+        return keyer.alpha, {"plate": plate.source, "noise_8bit": noise}
+    # Only here, as torch takes seconds to import.
+    from pipelines.matte.learned import BGMV2, SALIENT, background_alpha, salient_alpha
+    from pipelines.matte.networks import load_network
+
+    path = _weights(config, "weights")
     if plate is None:
-        raise StageError(
-            f"{item}: no clean plate, and in {len(frames)} frames the subject moves too little to "
-            f"show what is behind; photograph the empty set as plates/{camera_id}.png and run "
-            "'express50 ingest' again"
-        )
-    return plate
+        salient = load_network(path, SALIENT)
+        return lambda frame: salient_alpha(salient, frame), {"plate": "none"}
+    network, still = load_network(path, BGMV2), plate.image
+
+    def alpha(frame: np.ndarray) -> np.ndarray:
+        shown = exposed(still, exposure_gain(frame, still))
+        return background_alpha(network, frame, shown, config.tile)
+
+    return alpha, {"plate": plate.source}
 
 
-def _border_contact(alpha: np.ndarray) -> float:
-    """Share of the image's border that the subject covers: where it is cut off."""
-    border = np.concatenate([alpha[0], alpha[-1], alpha[1:-1, 0], alpha[1:-1, -1]])
-    return float((border > 0.5).mean())
+def _write_alpha(path: Path, alpha: np.ndarray) -> None:
+    write_image(path, np.rint(alpha * 255).astype(np.uint8))
 
 
-def _qc_row(image: np.ndarray, alpha: np.ndarray) -> list[np.ndarray]:
-    """Frame with the matte's outline, subject on a plain ground, and alpha."""
-    outline = image.copy()
-    edges, _ = cv2.findContours(
-        (alpha > 0.5).astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE
-    )
-    cv2.drawContours(outline, edges, -1, (255, 0, 0), max(1, max(alpha.shape) // 400))
-    # A colour that neither skin nor hair has shows plate that was let through.
-    ground = np.array([40, 200, 90], np.float32)
-    cut = alpha[..., None] * image + (1 - alpha[..., None]) * ground
-    grey = np.repeat((alpha * 255)[..., None], 3, axis=2)
-    return [outline, cut.astype(np.uint8), grey.astype(np.uint8)]
+def _write_parts(
+    out: Path, expression: str, image: np.ndarray, alpha: np.ndarray, config: MatteConfig
+) -> dict[str, float]:
+    """Write the labels of the parts, and the head's own matte where it is asked for."""
+    from pipelines.matte.networks import load_network
+    from pipelines.matte.parts import SAPIENS, head_alpha, segment
+
+    network = load_network(_weights(config, "segmentation"), SAPIENS)
+    labels = segment(network, image)
+    write_image(out / f"{expression}_parts.png", labels)
+    if config.torso == "remove":
+        _write_alpha(out / f"{expression}_head.png", head_alpha(alpha, labels))
+    return part_shares(labels)
 
 
-def _warnings(coverage: dict[str, float]) -> list[dict[str, str]]:
-    """Expressions whose matte is empty or whose area differs much from the camera's median."""
-    middle = float(np.median(list(coverage.values())))
-    found = []
-    for expression, share in coverage.items():
-        if share < EMPTY:
-            found.append({"what": expression, "why": f"covers {share:.2%} of the image: empty"})
-        elif not middle / JUMP <= share <= middle * JUMP:
-            why = f"covers {share:.1%} of the image, the camera's median is {middle:.1%}"
-            found.append({"what": expression, "why": why})
-    return found
+def _write_picture(out: Path, images: dict[str, np.ndarray], odd: set[str]) -> None:
+    """Contact sheet of what was written for some expressions, the odd ones marked."""
+    rows = []
+    for expression, image in images.items():
+        alpha = read_image(out / f"{expression}.png").astype(np.float32) / 255
+        path = out / f"{expression}_parts.png"
+        rows.append(picture_row(image, alpha, read_image(path) if path.is_file() else None))
+    (out / "qc").mkdir()
+    labels = [f"{name}: see warnings" if name in odd else name for name in images]
+    sheet = contact_sheet(rows, labels, tile=(240, 240))
+    write_image(out / "qc" / "mattes.jpg", sheet, quality=88)
 
 
 STAGE = Stage(
     name="matte",
-    version=1,
+    version=2,
     config=MatteConfig,
     presets=PRESETS,
     items=items,

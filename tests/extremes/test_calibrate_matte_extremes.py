@@ -15,8 +15,8 @@ from pipelines.calibrate.saddle import refine_corners, square_sides
 from pipelines.calibrate.solve import solve_rig
 from pipelines.calibrate.stage import check_given
 from pipelines.matte.config import MatteConfig
+from pipelines.matte.keyer import Keyer
 from pipelines.matte.plate import exposure_gain
-from pipelines.matte.stage import Keyer
 from tests.pipelines.board_rigs import (
     POINTS,
     board_motion,

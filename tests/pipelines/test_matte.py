@@ -17,9 +17,9 @@ from express50.index import read_index
 from pipelines.matte import STAGE
 from pipelines.matte.config import MatteConfig
 from pipelines.matte.key import dilated, eroded, plate_difference
-from pipelines.matte.plate import exposed, exposure_gain, fit_plate, plate_from_footage
+from pipelines.matte.keyer import Keyer
+from pipelines.matte.plate import exposed, exposure_gain, fit_plate
 from pipelines.matte.smooth import MattingLaplacian
-from pipelines.matte.stage import Keyer
 from tests.pipelines.matte_scenes import Scene, clutter, make_scene
 
 CONFIG = MatteConfig()
@@ -151,20 +151,6 @@ def test_pixels_without_footage_are_transparent() -> None:
     assert (alpha[~valid] == 0).all() and alpha[120, 128] == 1
 
 
-def test_a_moving_subject_gives_a_plate_and_a_still_one_does_not() -> None:
-    rng = np.random.default_rng(12)
-    plate = clutter(rng, 96).astype(np.uint8)
-
-    def frame(x: int) -> np.ndarray:
-        image = plate.copy()
-        image[30:96, x : x + 24] = (90, 60, 50)
-        return image
-
-    moving = plate_from_footage([frame(int(x)) for x in np.linspace(0, 72, 15)])
-    assert moving is not None and np.abs(moving.astype(int) - plate).mean() < 1
-    assert plate_from_footage([frame(40 + i % 2) for i in range(15)]) is None
-
-
 def test_wrong_settings_are_refused() -> None:
     for change in ({"low": 7.0}, {"scale": 0.0}, {"full": 2.0}, {"shadow": 1.0}):
         with pytest.raises(ConfigError, match="matte"):
@@ -206,6 +192,7 @@ def test_the_stage_writes_one_matte_a_peak_twice_alike(aligned, tmp_path) -> Non
         metrics = STAGE.run(aligned, item, CONFIG, out)
     names = sorted(path.name for path in outs[0].glob("*.png"))
     assert names == ["neutral.png", "smile.png"] and metrics["plate"] == "given"
+    assert metrics["method"] == "key" and metrics["border_contact"]["smile"]["top"] == 0.0
     for path in sorted(outs[0].rglob("*.*")):
         assert path.read_bytes() == (outs[1] / path.relative_to(outs[0])).read_bytes()
     alpha = read_image(outs[0] / "neutral.png")
@@ -215,6 +202,6 @@ def test_the_stage_writes_one_matte_a_peak_twice_alike(aligned, tmp_path) -> Non
 
 
 def test_no_plate_and_a_still_subject_is_one_clear_error(aligned, tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr("pipelines.matte.stage.read_plate", lambda *args: None)
+    monkeypatch.setattr("pipelines.matte.source.read_plate", lambda *args, **more: None)
     with pytest.raises(StageError, match="photograph the empty set as plates/"):
         STAGE.run(aligned, STAGE.items(aligned)[0], CONFIG, tmp_path)

@@ -1,0 +1,54 @@
+"""One camera's key: its plate with the noise around it, at the scale the config asks for."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+
+from express50.images import resize_area
+from pipelines.matte.config import MatteConfig
+from pipelines.matte.key import alpha_of
+from pipelines.matte.plate import PlateModel, exposed, exposure_gain, fit_plate
+
+
+class Keyer:
+    """A plate and its noise; gives the alpha of frames of that camera."""
+
+    def __init__(
+        self,
+        plate: np.ndarray,
+        frames: list[np.ndarray],
+        valid: np.ndarray,
+        config: MatteConfig,
+        doubt: np.ndarray | None = None,
+    ) -> None:
+        """Measure the noise of `frames` (H, W, 3) uint8 around `plate`, inside `valid` (H, W).
+
+        `doubt` (H, W) is how far off the plate may be, in 8-bit steps, 0 where it was seen.
+        """
+        self.config = config
+        self.full_size = (plate.shape[1], plate.shape[0])
+        self.size = tuple(max(8, round(n * config.scale)) for n in self.full_size)
+        self.plate = self._shrink(plate)
+        self.valid = valid
+        self._valid_small = self._shrink(valid.astype(np.uint8) * 255) == 255
+        off = np.zeros(valid.shape, np.float32) if doubt is None else doubt
+        off = self._shrink(off.astype(np.float32))
+        small = [self._shrink(f) for f in frames]
+        seen = self._valid_small & (off == 0)
+        model: PlateModel = fit_plate(self.plate, small, seen, config.noise_floor)
+        self.model = replace(model, sigma=np.hypot(model.sigma, off[..., None]))
+
+    def _shrink(self, image: np.ndarray) -> np.ndarray:
+        return image if self.size == self.full_size else resize_area(image, *self.size)
+
+    def alpha(self, frame: np.ndarray) -> np.ndarray:
+        """Opacity (H, W) float32 in [0, 1] of the subject in a frame (H, W, 3) uint8."""
+        small = self._shrink(frame)
+        plate = exposed(self.plate, exposure_gain(small, self.plate))
+        alpha = alpha_of(small, replace(self.model, plate=plate), self._valid_small, self.config)
+        if self.size != self.full_size:
+            alpha = cv2.resize(alpha, self.full_size, interpolation=cv2.INTER_LINEAR)
+        return np.where(self.valid, alpha, np.float32(0))

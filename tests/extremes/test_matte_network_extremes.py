@@ -1,0 +1,88 @@
+"""Networks on the smallest and the largest pictures, and figures at their limits."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pipelines.matte.learned import BGMV2, SALIENT, background_alpha, salient_alpha
+from pipelines.matte.networks import load_network
+from pipelines.matte.parts import SAPIENS, head_alpha, segment
+from pipelines.matte.qc import border_contact, warnings
+from tests.pipelines.stand_ins import Difference, Thirds, onnx_bright, torchscript
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 300), (3, 2), (65, 1)])
+def test_the_smallest_pictures(tmp_path, shape: tuple[int, int]) -> None:
+    frame, plate = np.full((*shape, 3), 255, np.uint8), np.zeros((*shape, 3), np.uint8)
+    pair = load_network(torchscript(Difference(), tmp_path / "a.pt"), BGMV2)
+    assert background_alpha(pair, frame, plate, 512).shape == shape
+    assert background_alpha(pair, frame, plate, 512).min() > 0.5
+    salient = load_network(onnx_bright(tmp_path / "b.onnx"), SALIENT)
+    assert salient_alpha(salient, frame) == pytest.approx(np.ones(shape), abs=1e-3)
+    labels = segment(load_network(torchscript(Thirds(), tmp_path / "c.pt"), SAPIENS), frame)
+    assert labels.shape == shape
+    assert np.isfinite(head_alpha(np.ones(shape, np.float32), labels)).all()
+
+
+def test_an_odd_4k_frame_goes_through_in_tiles(tmp_path) -> None:
+    rng = np.random.default_rng(0)
+    plate = rng.integers(0, 200, (2161, 3839, 3)).astype(np.uint8)
+    frame = plate.copy()
+    frame[500:1700, 1500:2400] += 50
+    network = load_network(torchscript(Difference(), tmp_path / "net.pt"), BGMV2)
+    seen = []
+
+    def run(batches):
+        seen.append(batches[0].shape[2:])
+        return network.run(batches)
+
+    alpha = background_alpha(replace(network, run=run), frame, plate, 2048)
+    assert len(seen) == 4 and max(max(side) for side in seen) <= 2048
+    inside = np.zeros(alpha.shape, bool)
+    inside[500:1700, 1500:2400] = True
+    assert alpha[501:1699, 1501:2399].min() == 1 and alpha.shape == (2161, 3839)
+    assert alpha[~inside].sum() < 2 * (1200 + 900) + 4
+
+
+def test_an_odd_4k_frame_is_seen_small_and_refined_in_tiles(tmp_path) -> None:
+    frame = np.zeros((2161, 3839, 3), np.uint8)
+    y, x = np.mgrid[:2161, :3839]
+    disc = (x - 1900) ** 2 + (y - 1100) ** 2 < 120**2
+    frame[disc] = 255
+    network = load_network(onnx_bright(tmp_path / "net.onnx", 1024), SALIENT)
+    alpha = salient_alpha(network, frame)
+    assert alpha.shape == disc.shape and np.isfinite(alpha).all()
+    assert np.abs(alpha - disc).sum() < 0.004 * disc.sum()
+
+
+def test_black_and_white_frames(tmp_path) -> None:
+    network = load_network(torchscript(Difference(), tmp_path / "net.pt"), BGMV2)
+    black, white = (np.full((70, 70, 3), v, np.uint8) for v in (0, 255))
+    assert background_alpha(network, black, black, 512).max() == 0
+    assert background_alpha(network, white, black, 512)[1:-1, 1:-1].min() == 1
+
+
+def test_warnings_of_empty_full_and_jumping_mattes() -> None:
+    peaks = {"c": 30, "a": 10, "b": 20}
+    none = dict.fromkeys(("top", "right", "bottom", "left"), 0.0)
+    sides = dict.fromkeys(peaks, none)
+    even = dict.fromkeys(peaks, 0.3)
+    assert warnings(peaks, even, sides) == []
+    assert warnings(peaks, dict.fromkeys(peaks, 0.0), sides)[0]["why"].endswith("empty")
+    odd = warnings(peaks, even | {"b": 0.9}, sides)
+    assert [w["what"] for w in odd] == ["b"] and "median is 30.0%" in odd[0]["why"]
+    # Each is near the median of the three, but between two that follow each other lies a jump.
+    jump = warnings(peaks, {"a": 0.24, "b": 0.3, "c": 0.3} | {"b": 0.34, "a": 0.25}, sides)
+    assert [w["what"] for w in jump] == ["b"] and "at the peak before, a" in jump[0]["why"]
+    full = border_contact(np.ones((4, 6)))
+    assert full == dict.fromkeys(none, 1.0)
+    cut = warnings(peaks, even, sides | {"a": full})
+    assert cut == [
+        {"what": "a", "why": "the subject leaves the image at the top and right and left"
+         " (over 100%)"}
+    ]  # fmt: skip
+    # At the bottom every subject does.
+    assert warnings(peaks, even, sides | {"a": none | {"bottom": 0.9}}) == []
