@@ -140,18 +140,20 @@ def in_noise(values: np.ndarray, windows: dict[str, np.ndarray]) -> np.ndarray:
     return values / (noise + floor)
 
 
-def expression_values(features: Features, expression: Expression | None) -> np.ndarray:
-    """Features (F, N) with those that take part in an expression foremost and unrest shrunk."""
+def expression_values(
+    features: Features, expression: Expression | None, rows: np.ndarray
+) -> np.ndarray:
+    """Features (T, N) of T rows, those foremost that take part in an expression, unrest shrunk."""
     weights = np.maximum(landmark_weights(expression)[features.owner], BYSTANDER)
-    values = features.values * weights
-    middle = np.median(values[features.rest], axis=0)
-    still = values[features.rest] - middle
+    still = features.values[features.rest] * weights
+    middle = np.median(still, axis=0)
+    still -= middle
     power, modes = np.linalg.eigh(still @ still.T / len(still))
     top = np.argsort(power)[::-1][:REST_DIRECTIONS]
     top = top[power[top] > 1e-9 * max(float(power.max()), 1e-30)]
     directions = modes[:, top].T @ still / np.sqrt(power[top] * len(still))[:, None]
     shrink = 1.0 / np.sqrt(1.0 + power[top]) - 1.0
-    moved = values - middle
+    moved = features.values[rows] * weights - middle
     return moved + ((moved @ directions.T) * shrink) @ directions
 
 

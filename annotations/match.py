@@ -78,16 +78,16 @@ def suggest_all(
     found, canonical = {}, {}
     for expression, rows in subject.windows.items():
         entry = script.get(expression)
-        values = expression_values(subject.features, entry)
+        values = expression_values(subject.features, entry, rows)
         if expression == NEUTRAL:
-            found[expression] = suggest_rest(values[rows], groups, _typical(values, subject))
+            found[expression] = suggest_rest(values, groups, _typical(subject, entry))
             continue
         target = None if reference is None else canonical_frame(reference, expression, entry)
         likeness = None
         if target is not None and reference is not None:
             canonical[expression] = target
             likeness = _likeness(subject.features, reference.watched, expression, entry, target)
-        found[expression] = suggest(values[rows], groups, likeness)
+        found[expression] = suggest(values, groups, likeness)
     return found, canonical
 
 
@@ -98,7 +98,7 @@ def canonical_frame(reference: Reference, expression: str, entry: Expression | N
         return None
     if expression in reference.chosen:
         return reference.chosen[expression]
-    values = expression_values(reference.watched.features, entry)[rows]
+    values = expression_values(reference.watched.features, entry, rows)
     return int(reference.watched.frames[rows[strongest_event(values).apex]])
 
 
@@ -111,7 +111,7 @@ def _likeness(
 ) -> Canonical:
     """The canonical frame in the subject's features."""
     rows = reference.windows[expression]
-    values = expression_values(reference.features, entry)[rows]
+    values = expression_values(reference.features, entry, rows)
     row = int(np.argmin(np.abs(reference.frames[rows] - frame)))
     shared = shared_columns(features, reference.features)
     return canonical_of(values, row, shared, features.values.shape[1])
@@ -133,7 +133,10 @@ def shared_columns(features: Features, other: Features) -> np.ndarray:
     )
 
 
-def _typical(values: np.ndarray, subject: Watched) -> float:
-    """How far expressions usually move the face from rest, in the units of ``values``."""
-    level = steady(np.linalg.norm(values, axis=1))
-    return float(np.median([level[rows].max() for rows in subject.windows.values()]))
+def _typical(subject: Watched, entry: Expression | None) -> float:
+    """How far expressions usually move the face from rest, in the units of an entry's values."""
+    tops = [
+        np.linalg.norm(steady(expression_values(subject.features, entry, rows)), axis=1).max()
+        for rows in subject.windows.values()
+    ]
+    return float(np.median(tops))
