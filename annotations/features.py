@@ -34,6 +34,7 @@ CELLS = 24  # the aligned face is compared in so many cells a side
 CELL_REACH = 0.12  # of the face's side: a cell further from every landmark shows no face
 LOOK_WEIGHT = 0.5  # of a cell against a landmark's coordinate: there are more of them
 BYSTANDER = 0.3  # weight of features the script does not name: people move more than they should
+LEAST_NOISE = 1e-4  # of a face's side, or local deviations: what rounding alone may do
 REST_DIRECTIONS = 20  # leading directions of unrest that are shrunk
 
 
@@ -134,10 +135,10 @@ def in_noise(values: np.ndarray, windows: dict[str, np.ndarray]) -> np.ndarray:
     """
     bends = [np.diff(values[rows], n=2, axis=0) for rows in windows.values() if len(rows) > 2]
     if not bends:
-        return values / max(float(np.abs(values).mean()), 1e-9)
+        return values / max(float(np.abs(values).mean()), LEAST_NOISE)
     noise = np.median(np.abs(np.concatenate(bends)), axis=0) / (0.6745 * np.sqrt(6.0))
     floor = float(np.median(noise[noise > 0])) if (noise > 0).any() else 1.0
-    return values / (noise + floor)
+    return values / np.maximum(noise + floor, LEAST_NOISE)
 
 
 def expression_values(

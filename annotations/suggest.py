@@ -21,6 +21,7 @@ APEX_LEVEL = 0.9  # a canonical frame at this share of its apex or more is an ap
 OTHER_SIDE = 0.05  # of the apex: what being on the other side of it counts
 PLATEAU_SHARE = 0.95  # of the apex: frames that cannot be told from it
 AGREE_FRAMES = 1
+STILL = 1.0  # in units of one feature's noise: a face that does less does not move
 _DRAWS = 24  # random halves of the features that a suggestion is asked again with
 
 
@@ -97,7 +98,7 @@ def suggest(values: np.ndarray, groups: np.ndarray, canonical: Canonical | None)
     match = None if canonical is None else _likeness_in_time(event, canonical)
     confidence = agreeing / (len(rows) + 1) * (1.0 if certain else DISPUTED)
     return Suggestion(
-        row, confidence if own.curve.max() > 0 else 0.0, own.curve, match,
+        row, confidence if own.curve.max() > STILL else 0.0, own.curve, match,
         candidate_rows(row, [event.apex, own.apex], own.curve),
     )  # fmt: skip
 

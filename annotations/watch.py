@@ -22,6 +22,7 @@ FACE = 48  # side of the aligned face, pixels
 # iBUG-68 points that expressions move least: the nose's bridge and the corners of the eyes.
 STABLE = np.array([27, 28, 29, 30, 36, 39, 42, 45])
 BATCH = 32
+LEAST_SIDE = 1e-9  # pixels: a face whose points all coincide still has a finite answer
 STRAY_SHARE = 0.1  # of the window: a face further from its centre gets a window of its own
 STRAY_SCORE = 0.7  # of the middle frame's score
 STEADY_FRAMES = 1.0  # heads turn slowly: their motion is averaged over this many frames (sigma)
@@ -68,11 +69,16 @@ def align_faces(
 
 def face_side(neutral: np.ndarray) -> float:
     """Side of the square, pixels, about landmarks (68, 2) that the aligned face shows."""
-    return 1.1 * float((neutral.max(0) - neutral.min(0)).max())
+    return 1.1 * max(float((neutral.max(0) - neutral.min(0)).max()), LEAST_SIDE)
 
 
 def similarity_2d(source: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Affine (2, 3) of the similarity that takes points (N, 2) onto others."""
+    """Affine (2, 3) of the similarity that takes points (N, 2) onto others.
+
+    Points that all coincide are moved, not scaled.
+    """
+    if np.ptp(source, axis=0).max() < LEAST_SIDE:
+        return np.concatenate([np.eye(2), (target.mean(0) - source.mean(0))[:, None]], axis=1)
     lift = np.zeros((len(source), 1))
     s, R, t = similarity_fit(np.hstack([source, lift]), np.hstack([target, lift]))
     return np.concatenate([s * R[:2, :2], t[:2, None]], axis=1)
