@@ -1,4 +1,4 @@
-"""Alignment at the edges: faces without size, huge and tiny ones, still ones, windows of a frame."""
+"""Alignment at the edges: faces without size, huge, tiny or still ones, windows of a frame."""
 
 import numpy as np
 import pytest
