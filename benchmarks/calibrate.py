@@ -4,7 +4,9 @@ The stage's solution stands beside a baseline from the same corners: OpenCV's ca
 camera alone, then relative poses averaged and chained, without a joint adjustment. Rigs are laid
 on the true one by a rigid motion. ``head_px`` is what matters further on: how far, in pixels,
 points in the head's place project from where the true camera has them. The last line is one JSON
-object. Without a demo dataset a small capture is recorded first (some minutes).
+object. Without a dataset named, 24 cameras before a ChArUco board and one neutral face are
+recorded first (some minutes). Then one camera of the solved rig after another is turned by
+``BUMP_DEG`` and must be found in the footage, and nothing may be found in the rig as solved.
 """
 
 from __future__ import annotations
@@ -22,11 +24,20 @@ import numpy as np
 
 from express50.cameras import Camera, project, transform_camera, triangulate
 from express50.config import resolve_config
+from express50.frames import FrameReader
 from express50.index import Index, read_index
+from express50.landmarks.network import load_network
 from express50.layout import Dataset
+from express50.rigs.footage import check_footage
 from express50.rigs.world import meeting_point
 from express50.runner import run_stage
-from express50.transforms import invert_transform, matrix_to_axis_angle, rigid_fit
+from express50.transforms import (
+    axis_angle_to_matrix,
+    invert_transform,
+    make_transform,
+    matrix_to_axis_angle,
+    rigid_fit,
+)
 from express50.twin.config import TwinConfig
 from express50.twin.record import print_progress, record
 from express50.twin.truth import Truth, align_worlds
@@ -50,17 +61,38 @@ from pipelines.calibrate.intrinsics import (
 from pipelines.calibrate.solve import solve_rig
 
 HEAD_RADIUS_M = 0.13
+BUMP_DEG = 0.3
+RIG = TwinConfig(
+    subjects=1,
+    cameras=24,
+    width=540,
+    height=540,
+    expressions=("neutral",),
+    frames_per_expression=4,
+    footage="jpg",
+    board_frames=60,
+    plates=False,
+)
+"""60 board poses, so that the outermost cameras, too, see it some fifteen times."""
 
 
 def main() -> int:
     """Run and print."""
     parser = argparse.ArgumentParser(description=__doc__)
-    add_data_arguments(parser)
+    parser.add_argument("--dataset", type=Path, help="a twin dataset (default: one is recorded)")
+    parser.add_argument("--truth", type=Path, help="its truth")
+    parser.add_argument("--recording", type=Path, default=Path("build/bench-rig"))
+    parser.add_argument("--bumps", type=int, default=3, help="cameras bumped, one after another")
     parser.add_argument("--preset", default="standard")
     parser.add_argument("--set", dest="assignments", action="append", default=[])
     args = parser.parse_args()
     cv2.setNumThreads(1)
-    dataset, truth = dataset_and_truth(args)
+    if (args.dataset is None) != (args.truth is None):
+        sys.exit("name both --dataset and --truth, or neither")
+    if args.dataset is None:
+        dataset, truth = recorded(RIG, args.recording)
+    else:
+        dataset, truth = Dataset(args.dataset), Truth(args.truth)
     config = resolve_config(STAGE, args.preset, None, args.assignments)
     subject = dataset.subjects()[0]
     index, true = read_index(dataset, subject), truth.cameras(subject)
@@ -80,12 +112,13 @@ def main() -> int:
     chain_seconds = time.process_time() - started
     errors = np.linalg.norm(residuals(rig, observations, points), axis=1)
     baseline = figures(rig.cameras, true) | {
-        "reprojection_px": float(np.sqrt(np.mean(errors[np.isfinite(errors)] ** 2))),
+        "reprojection_px_rms": float(np.sqrt(np.mean(errors[np.isfinite(errors)] ** 2))),
         "seconds": detected - start + chain_seconds,
     }
     row: dict[str, object] = {
         **figures(solution.cameras, true),
-        "reprojection_px": rms,
+        "reprojection_px_rms": rms,
+        **bump_figures(solution.cameras, index, args.bumps),
         "seconds": solved - start,
         "seconds_detection": detected - start,
         "corners": len(solution.errors),
@@ -117,15 +150,46 @@ def dataset_and_truth(args: argparse.Namespace) -> tuple[Dataset, Truth]:
         expressions=("neutral", "jaw_open"),
         frames_per_expression=4,
     )
-    record(config, args.small, report=print_progress())
-    dataset = Dataset(args.small / "data")
-    ingest.register(dataset, sorted((args.small / "captures").iterdir()))
+    return recorded(config, args.small)
+
+
+def recorded(config: TwinConfig, folder: Path) -> tuple[Dataset, Truth]:
+    """A twin recording, made where it is not there, and ingested."""
+    record(config, folder, report=print_progress())
+    dataset = Dataset(folder / "data")
+    ingest.register(dataset, sorted((folder / "captures").iterdir()))
     ingested = run_stage(
         ingest.STAGE, dataset, resolve_config(ingest.STAGE, "draft"), workers=0, progress=False
     )
     if not ingested.ok:
-        sys.exit(f"{dataset.root}: ingest failed; run 'express50 ingest' on {args.small}")
-    return dataset, Truth(args.small / "truth")
+        sys.exit(f"{dataset.root}: ingest failed; run 'express50 ingest' on {folder}")
+    return dataset, Truth(folder / "truth")
+
+
+def bump_figures(
+    cameras: Mapping[str, Camera], index: Index, bumps: int, moments: int = 2
+) -> dict[str, object]:
+    """Whether turned cameras, and no others, are found in the footage."""
+    readers = {name: FrameReader(index, name) for name in cameras}
+    numbers = np.linspace(0, index.frames - 1, moments).round().astype(int)
+    frames = {int(k): {name: r.read(int(k)) for name, r in readers.items()} for k in numbers}
+    net = load_network()
+    names, rng = sorted(cameras), np.random.default_rng(0)
+    quiet = check_footage(cameras, frames, net)
+    told = {}
+    for place in np.linspace(0, len(names) - 1, bumps + 2).round().astype(int)[1:-1]:
+        name, axis = names[place], rng.normal(size=3)
+        turn = np.radians(BUMP_DEG) * axis / np.linalg.norm(axis)
+        moved = make_transform(axis_angle_to_matrix(turn), np.zeros(3))
+        bumped = replace(cameras[name], cam_from_world=moved @ cameras[name].cam_from_world)
+        told[name] = sorted(check_footage({**cameras, name: bumped}, frames, net).moved)
+    return {
+        "bump_deg": BUMP_DEG,
+        "bumped_camera_found": bool(told) and all(told[name] == [name] for name in told),
+        "bumps_found": told,
+        "moved_in_the_rig_as_solved": sorted(quiet.moved),
+        "unchecked": sorted(quiet.unchecked),
+    }
 
 
 def board_files(index: Index) -> dict[str, list[Path]]:
@@ -156,8 +220,10 @@ def figures(estimated: Mapping[str, Camera], true: Mapping[str, Camera]) -> dict
     return {
         "rotation_error_deg": float(np.mean(turns)),
         "rotation_error_deg_max": float(np.max(turns)),
-        "position_error_mm": float(np.mean(shifts)),
+        "translation_error_mm": float(np.mean(shifts)),
+        "translation_error_mm_max": float(np.max(shifts)),
         "focal_error_percent": float(np.mean(focals)),
+        "focal_error_percent_max": float(np.max(focals)),
         "head_px": head_error(estimated, true),
         "cameras": len(moved),
     }

@@ -32,6 +32,7 @@ class StageReport:
         items: item ids that are published.
         metrics: item id to its metrics.
         dropped: (item, what, why) of parts that items left out.
+        noted: (item, what, why) of parts that were kept but are doubtful: `weak`, `warnings`.
         pictures: QC pictures, evenly chosen over the items.
         picture_count: how many there are in all.
     """
@@ -40,6 +41,7 @@ class StageReport:
     items: list[str]
     metrics: dict[str, dict]
     dropped: list[tuple[str, str, str]]
+    noted: list[tuple[str, str, str]]
     pictures: list[Picture]
     picture_count: int
 
@@ -49,20 +51,27 @@ def collect_stage(dataset: Dataset, stage: str) -> StageReport:
     root = dataset.stage_dir(stage)
     paths = sorted(root.rglob("metrics.json")) if root.is_dir() else []
     metrics = {str(p.parent.relative_to(root)): json.loads(p.read_text()) for p in paths}
-    dropped = [
-        (item, str(row.get("what")), str(row.get("why")))
-        for item, table in metrics.items()
-        for row in table.get("dropped", [])
-    ]
+    dropped = _reasons(metrics, ("dropped",))
+    noted = _reasons(metrics, ("weak", "warnings"))
     pictures = [
         Picture(path, f"{item}: {path.stem.replace('_', ' ')}")
         for item in metrics
         for path in sorted((root / item / "qc").glob("*.jpg"))
         + sorted((root / item / "qc").glob("*.png"))
     ]
-    return StageReport(
-        stage, list(metrics), metrics, dropped, spread(pictures, _PICTURES_A_STAGE), len(pictures)
-    )
+    shown = spread(pictures, _PICTURES_A_STAGE)
+    return StageReport(stage, list(metrics), metrics, dropped, noted, shown, len(pictures))
+
+
+def _reasons(metrics: dict[str, dict], keys: tuple[str, ...]) -> list[tuple[str, str, str]]:
+    """(item, what, why) of the rows under some keys of all items' metrics."""
+    return [
+        (item, str(row.get("what")), str(row.get("why")))
+        for item, table in metrics.items()
+        for key in keys
+        for row in table.get(key, [])
+        if isinstance(row, dict)
+    ]
 
 
 def spread(pictures: list[Picture], count: int) -> list[Picture]:

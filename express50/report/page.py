@@ -108,6 +108,7 @@ def _stage_view(dataset: Dataset, report: StageReport) -> dict:
         "item_count": len(report.items),
         "failed": [(r.item, r.reason) for r in receipts.values() if r.status == "failed"],
         "dropped": report.dropped,
+        "noted": report.noted,
         "seconds": number(round(sum(r.seconds for r in receipts.values()), 1)),
         "columns": columns,
         "rows": [

@@ -6,7 +6,7 @@ import argparse
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -15,6 +15,9 @@ from express50.console import FAILED, OK, say, say_json
 from express50.errors import ConfigError
 from express50.rigs.read import FORMATS, guess_format, read_rig
 from express50.rigs.verdict import RigVerdict, judge
+
+if TYPE_CHECKING:
+    from express50.rigs.footage import FootageVerdict
 
 
 def add_commands(subparsers: Any) -> None:
@@ -32,6 +35,10 @@ def add_commands(subparsers: Any) -> None:
     checking = actions.add_parser("check", help="say whether a rig's cameras fit together")
     checking.set_defaults(handler=run_check)
     checking.add_argument("source", type=Path, help="calibration in any known format")
+    checking.add_argument(
+        "--footage", type=Path, metavar="CAPTURE", help="also look for cameras that have moved"
+    )
+    checking.add_argument("--frames", type=int, default=4, help="moments looked at (default: 4)")
     for action in (importing, checking):
         action.add_argument("--format", choices=FORMATS, help="what it is (default: guessed)")
         action.add_argument("--size", help="WIDTHxHEIGHT of the footage; K is scaled to it")
@@ -52,11 +59,32 @@ def run_import(args: argparse.Namespace) -> int:
 
 
 def run_check(args: argparse.Namespace) -> int:
-    """Say what was found; exit code 1 when the cameras do not fit together."""
+    """Say what was found; exit code 1 when the cameras fit neither together nor their footage."""
     cameras = _read(args)
     verdict = judge(cameras)
-    _report(args, cameras, verdict, None)
-    return FAILED if verdict.problem else OK
+    footage = None
+    if args.footage is not None and not verdict.problem:
+        footage = _look_at_footage(args, cameras)
+    _report(args, cameras, verdict, None, footage)
+    return FAILED if verdict.problem or (footage and footage.moved) else OK
+
+
+def _look_at_footage(args: argparse.Namespace, cameras: Mapping[str, Camera]) -> FootageVerdict:
+    # Imported here: the other commands need neither torch nor OpenCV's features.
+    from express50.landmarks.network import load_network
+    from express50.rigs.footage import check_footage
+    from express50.rigs.moments import read_moments
+
+    if args.frames < 1:
+        raise ConfigError(f"--frames is {args.frames}, expected 1 or more")
+    frames = read_moments(args.footage, args.frames)
+    shown = {name for images in frames.values() for name in images}
+    known = {name: camera for name, camera in cameras.items() if name in shown}
+    pictures = {
+        frame: {name: image for name, image in images.items() if name in known}
+        for frame, images in frames.items()
+    }
+    return check_footage(known, pictures, load_network())
 
 
 def _read(args: argparse.Namespace) -> dict[str, Camera]:
@@ -73,11 +101,16 @@ def _size(text: str | None) -> tuple[int, int] | None:
 
 
 def _report(
-    args: argparse.Namespace, cameras: Mapping[str, Camera], verdict: RigVerdict, out: Path | None
+    args: argparse.Namespace,
+    cameras: Mapping[str, Camera],
+    verdict: RigVerdict,
+    out: Path | None,
+    footage: FootageVerdict | None = None,
 ) -> None:
     kind = args.format or guess_format(args.source)
     if args.json:
-        say_json({"format": kind, "out": out and str(out), **asdict(verdict)})
+        seen = {"footage": footage.figures()} if footage else {}
+        say_json({"format": kind, "out": out and str(out), **asdict(verdict), **seen})
         return
     say(f"{args.source}: {verdict.cameras} cameras ({kind})")
     say(f"{'camera':16} {'size':>11} {'model':14} {'focal px':>9} {'view deg':>9}")
@@ -96,3 +129,16 @@ def _report(
         say(f"remedy: {verdict.remedy or 'none of the usual misreadings explains it'}")
     elif out is not None:
         say(f"wrote {out}")
+    if footage is not None:
+        _report_footage(footage)
+
+
+def _report_footage(footage: FootageVerdict) -> None:
+    say(f"footage: {footage.points} points, {footage.error_px:.2f} px from the cameras (median)")
+    for name, why in footage.unchecked.items():
+        say(f"warning: {name} cannot be checked: {why}")
+    for name, move in footage.moved.items():
+        say(
+            f"moved: {name}: its picture is {move.shift_px:.1f} px off, as if turned by"
+            f" {move.turn_deg:.2f} deg and shifted by {move.move_mm:.1f} mm; calibrate it again"
+        )

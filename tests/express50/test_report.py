@@ -58,6 +58,16 @@ def test_failures_and_drops_are_named_and_escaped(dataset):
     assert "no plate" in page
 
 
+def test_weak_cameras_and_warnings_are_named(dataset):
+    assert "in doubt" not in render_page(dataset)
+    folder = dataset.root / "calibrate" / "S1"
+    folder.mkdir(parents=True)
+    weak = {"weak": [{"what": "cam7", "why": "9 corners"}], "warnings": ["no row"]}
+    (folder / "metrics.json").write_text(json.dumps(weak))
+    page = render_page(dataset)
+    assert "1 parts kept in doubt" in page and "cam7: 9 corners" in re.sub("<[^>]*>", "", page)
+
+
 def test_truth_and_training_are_silent_where_absent(dataset):
     page = render_page(dataset)
     assert "Accuracy against ground truth" not in page

@@ -1,0 +1,55 @@
+"""Images of a raw capture taken at the same moments, for checks that come before ingest."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from express50.capture import RawCamera, RawCapture, read_capture
+from express50.errors import CaptureError
+from express50.frames import read_srgb8
+from express50.video import iterate_video
+
+
+def read_moments(root: Path, count: int) -> dict[int, dict[str, np.ndarray]]:
+    """Images (H, W, 3) uint8 of all cameras at up to `count` moments, by frame number.
+
+    The moments are spread over the cues' middles, or over the images where there are no cues.
+
+    Raises:
+        CaptureError: the capture is unusable, or a camera has no such frame.
+    """
+    capture = read_capture(root)
+    wanted = moments_of(capture, count)
+    found: dict[int, dict[str, np.ndarray]] = {frame: {} for frame in wanted}
+    for name, camera in sorted(capture.cameras.items()):
+        for frame, image in _read(camera, wanted):
+            found[frame][name] = image
+    return found
+
+
+def moments_of(capture: RawCapture, count: int) -> list[int]:
+    """Frame numbers of up to `count` moments; a video without cues offers its first frame."""
+    middles = [(cue.start_frame + cue.end_frame) // 2 for cue in capture.cues]
+    lengths = [len(camera.names) for camera in capture.cameras.values() if camera.names]
+    frames = sorted(middles) or list(range(min(lengths, default=1)))
+    picks = np.linspace(0, len(frames) - 1, min(count, len(frames))).round().astype(int)
+    return [frames[i] for i in picks]
+
+
+def _read(camera: RawCamera, wanted: list[int]) -> list[tuple[int, np.ndarray]]:
+    if camera.kind == "frames":
+        missing = [frame for frame in wanted if frame >= len(camera.names)]
+        if not missing:
+            return [(frame, read_srgb8(camera.path / camera.names[frame])) for frame in wanted]
+        length = len(camera.names)
+    else:
+        found = []
+        for length, (_, image) in enumerate(iterate_video(camera.path), 1):
+            if length - 1 in wanted:
+                found.append((length - 1, image))
+            if length > max(wanted):
+                return found
+        missing = [frame for frame in wanted if frame >= length]
+    raise CaptureError(f"{camera.path}: has {length} frames, frame {missing[0]} was expected")
