@@ -43,7 +43,7 @@ from pipelines.matte.plate import exposed, exposure_gain
 
 PRESETS = ("draft", "standard", "reference")
 HARD = (4.0, 6.0, 10.0, 16.0, 24.0, 40.0)  # 8-bit steps
-LOW, HIGH = (2.0, 4.0, 8.0, 16.0), (12.0, 25.0, 40.0, 60.0, 90.0)  # noise deviations
+LOW, HIGH = (2.0, 4.0, 8.0, 16.0, 32.0), (12.0, 25.0, 40.0, 60.0, 90.0)  # noise deviations
 RIM = 8.0  # pixels
 Rows = dict[str, list[dict[str, float]]]
 

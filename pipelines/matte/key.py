@@ -65,10 +65,9 @@ def alpha_of(
     part = PlateModel(model.plate[window], model.sigma[window], model.whiten)
     image, difference, region = image[window], difference[window], region[window]
     support = find_support(difference > 2 * config.low, region, length, config)
-    own = subject_difference(image, difference, support.core, part, length)
-    # Knowing the subject's colour, thin hair that only differs no longer counts as solid.
-    firm = difference > np.maximum(config.firm * own, 2 * config.low)
-    support = find_support(firm, region, length, config)
+    if support.core.any():
+        firm = firm_pixels(image, difference, support.core, part, length, config)
+        support = find_support(firm, region, length, config)
     found, doubt = _opacity(image, difference, support, part, length, config)
     if config.smooth:
         light = 255.0 * to_light(image, config.light == "linear")
@@ -240,21 +239,33 @@ def _filled(mask: np.ndarray, pixels: int) -> np.ndarray:
     return mask | fill[labels]
 
 
-def subject_difference(
+def firm_pixels(
     image: np.ndarray,
     difference: np.ndarray,
     core: np.ndarray,
     model: PlateModel,
     length: int,
+    config: MatteConfig,
 ) -> np.ndarray:
-    """Difference (H, W) from the plate that the subject's colour nearby would make at each pixel.
+    """Pixels (H, W) bool that look opaque, knowing the subject's colour about a first core.
 
-    The colour is that of the core's rim, a little inside (outside it is mixed with plate),
-    averaged over the nearest reach that holds any. With no core (only strands in view) the
-    strongest differences stand in for it.
+    Thin hair differs from the plate by less than hair itself does. Skin under dark hair may too,
+    but it is no mixture of hair and plate: what lies off the line between them is subject as well.
     """
-    if not core.any():
-        return np.full(core.shape, np.percentile(difference[difference > 0], 98), np.float32)
+    off = image - model.plate
+    own = subject_colour(image, core, length) - model.plate
+    reach = _length(own, model)
+    firm = difference > np.maximum(config.firm * reach, 2 * config.low)
+    white = cv2.transform(own / model.sigma, model.whiten)
+    along = np.einsum("...i,...i->...", cv2.transform(off / model.sigma, model.whiten), white)
+    share = np.clip(along / (3 * np.maximum(reach, 1e-3) ** 2), 0, 1)
+    misfit = _length(off - share[..., None] * own, model)
+    # Half of the difference at least: light mixes along a curve in 8-bit steps.
+    return firm | (core & (misfit > np.maximum(config.high, 0.5 * difference)))
+
+
+def subject_colour(image: np.ndarray, core: np.ndarray, length: int) -> np.ndarray:
+    """Colour (H, W, 3) of the subject nearby: of the core's rim, the nearest reach that has any."""
     weight = _rim(core, length).astype(np.float32)
     total = np.zeros_like(image)
     weights = np.full(core.shape, 1e-12, np.float32)
@@ -264,7 +275,7 @@ def subject_difference(
         share = np.float32(1e-2**octave)
         total += share * _blur(colours, reach)
         weights += share * _blur(weight, reach)
-    return _length(total / weights[..., None] - model.plate, model)
+    return total / weights[..., None]
 
 
 def _rim(core: np.ndarray, length: int) -> np.ndarray:
