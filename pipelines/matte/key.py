@@ -261,7 +261,7 @@ def firm_pixels(
     share = np.clip(along / (3 * np.maximum(reach, 1e-3) ** 2), 0, 1)
     misfit = _length(off - share[..., None] * own, model)
     # Half of the difference at least: light mixes along a curve in 8-bit steps.
-    return firm | (core & (misfit > np.maximum(config.high, 0.5 * difference)))
+    return firm | (core & (misfit > np.maximum(2 * config.low, 0.5 * difference)))
 
 
 def subject_colour(image: np.ndarray, core: np.ndarray, length: int) -> np.ndarray:
