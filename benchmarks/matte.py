@@ -1,11 +1,19 @@
-"""Mattes against the twin's true alpha, beside baselines: ``python -m benchmarks.matte --help``.
+"""Mattes against known alpha, beside plain keys and textbook matting.
 
-Frames and plates are undistorted with the true cameras, so that only keying is measured.
-Baselines, on the same pictures: ``hard`` (a threshold on the difference from the plate) and
-``ramp`` (a soft ramp on the difference over a measured noise), each with the best of the
-thresholds listed here, chosen on the truth, which favours them. ``sad`` is the sum of absolute
-errors in thousands, ``mse`` is times 1e4 and ``gradient`` the summed squared difference of
-Gaussian gradients (Rhemann et al. 2009), each a picture. The last line is one JSON object.
+``python -m benchmarks.matte`` draws scenes (`benchmarks.matte_scenes`: dark, blond and frizzy
+strands, each before a plain and a cluttered plate) and keys them with every preset; with
+``--twin`` it measures one preset on the peaks of the demo's twin too, undistorted with the true
+cameras so that only keying is measured.
+
+Baselines on the same pictures, with the plate in the frame's exposure as the key has it:
+``hard_key`` (a threshold on the difference), ``soft_key`` (a ramp on the difference in measured
+noise deviations), both with the best of many thresholds for each picture, chosen on the truth,
+which favours them; ``guided_filter`` of the soft key by the frame, and PyMatting's
+``closed_form`` on a trimap made from the soft key. ``mae`` is the mean absolute error, ``sad`` its
+sum in thousands, ``mse`` is times 1e4 and ``gradient_error`` the summed squared difference of
+Gaussian gradients (Rhemann et al. 2009), all means over pictures. ``*_ratio_to_soft_key_rim``
+count the pixels within 8 of soft ones alone: no shadow on the backdrop, no spot inside the subject.
+The last line is one JSON object.
 """
 
 from __future__ import annotations
@@ -14,12 +22,14 @@ import argparse
 import json
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
 from benchmarks.calibrate import add_data_arguments, dataset_and_truth, rounded
+from benchmarks.matte_scenes import make_scenes
 from express50.adapters import undistort_image, undistorted_mask
 from express50.cameras import pinhole
 from express50.config import resolve_config
@@ -27,54 +37,97 @@ from express50.frames import read_frame, read_plate
 from express50.layout import Dataset
 from express50.twin.truth import Truth
 from pipelines.matte import STAGE
+from pipelines.matte.key import dilated, eroded
 from pipelines.matte.keyer import Keyer
+from pipelines.matte.plate import exposed, exposure_gain
 
-HARD = (6.0, 10.0, 16.0, 24.0)  # 8-bit steps
-RAMP = ((2.0, 8.0), (3.0, 12.0), (3.0, 25.0), (4.0, 40.0))  # noise deviations
+PRESETS = ("draft", "standard", "reference")
+HARD = (4.0, 6.0, 10.0, 16.0, 24.0, 40.0)  # 8-bit steps
+LOW, HIGH = (2.0, 4.0, 8.0, 16.0, 32.0), (12.0, 25.0, 40.0, 60.0, 90.0)  # noise deviations
+RIM = 8.0  # pixels
+Rows = dict[str, list[dict[str, float]]]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Picture:
+    """Frame and plate (H, W, 3) uint8, pixels with footage (H, W) and true alpha (H, W)."""
+
+    name: str
+    frame: np.ndarray
+    plate: np.ndarray
+    valid: np.ndarray
+    true: np.ndarray
 
 
 def main() -> int:
     """Run and print."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     add_data_arguments(parser)
-    parser.add_argument("--preset", default="standard")
+    parser.add_argument("--size", type=int, default=640, help="pixels of a scene's side")
     parser.add_argument("--set", dest="assignments", action="append", default=[])
-    parser.add_argument("--pictures", type=int, default=24, help="at most this many")
+    parser.add_argument("--twin", metavar="PRESET", help="measure a preset on the twin too")
+    parser.add_argument("--pictures", type=int, default=24, help="of the twin, at most")
     args = parser.parse_args()
     cv2.setNumThreads(1)
-    dataset, truth = dataset_and_truth(args)
-    config = resolve_config(STAGE, args.preset, None, args.assignments)
-    rows: dict[str, list[dict[str, float]]] = {}
-    for frame, plate, valid, true in pictures(dataset, truth, args.pictures):
-        start = time.process_time()
-        alpha = Keyer(plate, [frame], valid, config).alpha(frame)
-        seconds = time.process_time() - start
-        rows.setdefault("matte", []).append(errors(alpha, true) | {"seconds": seconds})
-        for name, alpha, seconds in baselines(frame, plate, valid):
-            rows.setdefault(name, []).append(errors(alpha, true) | {"seconds": seconds})
-    means = {
-        name: {key: float(np.mean([row[key] for row in found])) for key in found[0]}
-        for name, found in rows.items()
-    }
-    result: dict[str, object] = {
-        "benchmark": "matte",
-        "preset": args.preset,
-        **rounded(means.pop("matte")),
-    }
-    best = {
-        kind: min((n for n in means if n.startswith(kind)), key=lambda n: means[n]["mae"])
-        for kind in ("hard", "ramp")
-    }
-    result["pictures"] = len(rows["matte"])
-    result["baselines"] = {kind: {"setting": n, **rounded(means[n])} for kind, n in best.items()}
+    result: dict[str, object] = {"benchmark": "matte", "size": args.size}
+    result |= measured(scenes(args.size), PRESETS, args.assignments)
+    if args.twin:
+        twin = pictures(*dataset_and_truth(args), args.pictures)
+        result["twin"] = measured(twin, (args.twin,), args.assignments, textbook=False)
     print(json.dumps(result))
     return 0
 
 
-def pictures(
-    dataset: Dataset, truth: Truth, limit: int
-) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]]:
-    """Frame, plate, valid pixels and true alpha of peaks, an even choice of at most `limit`."""
+def measured(
+    found: Iterable[Picture],
+    presets: tuple[str, ...],
+    assignments: list[str],
+    textbook: bool = True,
+) -> dict[str, object]:
+    """Means over pictures of every preset and baseline, and ratios to the soft key."""
+    rows: Rows = {}
+    configs = {name: resolve_config(STAGE, name, None, assignments) for name in presets}
+    for picture in found:
+        for name, config in configs.items():
+            start = time.process_time()
+            keyer = Keyer(picture.plate, [picture.frame], picture.valid, config)
+            alpha = keyer.alpha(picture.frame)
+            _add(rows, name, alpha, picture, time.process_time() - start)
+        for name, alpha, seconds in baselines(picture, textbook):
+            _add(rows, name, alpha, picture, seconds)
+        print(picture.name, rounded({n: r[-1]["sad"] for n, r in rows.items()}), file=sys.stderr)
+    means = {
+        name: {key: float(np.mean([row[key] for row in mine])) for key in mine[0]}
+        for name, mine in rows.items()
+    }
+    soft = means["soft_key"]
+    for name in presets:
+        for key in ("sad", "gradient_error", "sad_rim", "gradient_error_rim"):
+            short = key.replace("_error", "").replace("_rim", "")
+            end = "_rim" if key.endswith("_rim") else ""
+            means[name][f"{short}_ratio_to_soft_key{end}"] = means[name][key] / soft[key]
+    return {"pictures": len(rows["soft_key"])} | {n: rounded(m) for n, m in means.items()}
+
+
+def _add(rows: Rows, name: str, alpha: np.ndarray, picture: Picture, seconds: float) -> None:
+    row = errors(alpha, picture.true)
+    row["seconds_per_megapixel"] = 1e6 * seconds / alpha.size
+    rows.setdefault(name, []).append(row)
+
+
+def scenes(size: int) -> Iterator[Picture]:
+    """The drawn scenes."""
+    for scene in make_scenes(size):
+        whole = np.ones(scene.alpha.shape, bool)
+        yield Picture(
+            name=scene.name, frame=scene.frame, plate=scene.plate, valid=whole, true=scene.alpha
+        )
+
+
+def pictures(dataset: Dataset, truth: Truth, limit: int) -> Iterator[Picture]:
+    """Peaks of the twin, an even choice of at most `limit`."""
     every = [
         (subject, camera, frame)
         for subject in dataset.subjects()
@@ -89,31 +142,76 @@ def pictures(
         image = read_frame(dataset, subject, camera.id, frame, undistort=False)
         valid = undistorted_mask(camera)
         valid = cv2.erode(valid.astype(np.uint8), np.ones((3, 3))) > 0
-        true = truth.render_alpha(subject, frame, pinhole(camera)) * valid
-        yield undistort_image(image, camera), undistort_image(plate, camera), valid, true
+        yield Picture(
+            name=f"{subject} {camera.id} {frame}",
+            frame=undistort_image(image, camera),
+            plate=undistort_image(plate, camera),
+            valid=valid,
+            true=truth.render_alpha(subject, frame, pinhole(camera)) * valid,
+        )
 
 
-def baselines(
-    frame: np.ndarray, plate: np.ndarray, valid: np.ndarray
-) -> Iterator[tuple[str, np.ndarray, float]]:
-    """Name, alpha (H, W) and seconds of every plain key."""
+def baselines(picture: Picture, textbook: bool) -> Iterator[tuple[str, np.ndarray, float]]:
+    """Name, alpha (H, W) and seconds of every plain key and, if asked for, textbook method."""
     start = time.process_time()
-    difference = frame.astype(np.float32) - plate
+    frame, valid = picture.frame, picture.valid
+    shown = exposed(picture.plate, exposure_gain(frame, picture.plate))
+    difference = frame.astype(np.float32) - shown
     largest = np.abs(difference).max(axis=-1) * valid
-    common = time.process_time() - start
-    for threshold in HARD:
-        start = time.process_time()
-        alpha = (largest > threshold).astype(np.float32)
-        yield f"hard {threshold:g}", alpha, common + time.process_time() - start
+    keys = [(largest > threshold).astype(np.float32) for threshold in HARD]
+    seconds = (time.process_time() - start) / len(HARD)
+    yield "hard_key", _best(keys, picture), seconds
     start = time.process_time()
     quiet = largest[valid][largest[valid] < 14]
     sigma = max(1.4826 * float(np.median(quiet)) / 1.8, 0.5) if quiet.size else 1.0
     scaled = np.sqrt((difference**2).mean(axis=-1)) / sigma * valid
-    common += time.process_time() - start
-    for low, high in RAMP:
+    ramps = [
+        np.clip((scaled - low) / (high - low), 0, 1) for low in LOW for high in HIGH if low < high
+    ]
+    seconds = (time.process_time() - start) / len(ramps)
+    soft = _best(ramps, picture)
+    yield "soft_key", soft, seconds
+    if textbook:
         start = time.process_time()
-        alpha = np.clip((scaled - low) / (high - low), 0, 1)
-        yield f"ramp {low:g}-{high:g}", alpha, common + time.process_time() - start
+        filtered = guided_filter(frame, soft, radius=4, epsilon=1e-4)
+        yield "guided_filter", filtered, seconds + time.process_time() - start
+        alpha, spent = closed_form(frame, soft)
+        yield "closed_form", alpha, seconds + spent
+
+
+def _best(alphas: list[np.ndarray], picture: Picture) -> np.ndarray:
+    return min(alphas, key=lambda alpha: float(np.abs(alpha - picture.true).mean()))
+
+
+def guided_filter(frame: np.ndarray, alpha: np.ndarray, radius: int, epsilon: float) -> np.ndarray:
+    """Alpha (H, W) filtered by a frame's (H, W, 3) colours (He, Sun and Tang 2010)."""
+    guide = frame / 255.0
+    side = (2 * radius + 1, 2 * radius + 1)
+
+    def mean(values: np.ndarray) -> np.ndarray:
+        return cv2.blur(values, side)
+
+    products = guide[..., :, None] * guide[..., None, :]
+    centre, average = mean(guide), mean(alpha.astype(np.float64))
+    covariance = mean(products.reshape(*alpha.shape, 9)).reshape(products.shape)
+    covariance -= centre[..., :, None] * centre[..., None, :]
+    together = mean(guide * alpha[..., None]) - centre * average[..., None]
+    slope = np.linalg.solve(covariance + epsilon * np.eye(3), together[..., None])[..., 0]
+    offset = mean(average - np.einsum("...i,...i->...", slope, centre))
+    return np.clip(np.einsum("...i,...i->...", mean(slope), guide) + offset, 0, 1)
+
+
+def closed_form(frame: np.ndarray, soft: np.ndarray) -> tuple[np.ndarray, float]:
+    """Levin's closed form on a trimap of the soft key, and its seconds."""
+    from pymatting import estimate_alpha_cf
+
+    radius = max(2.0, max(soft.shape) / 160)
+    trimap = np.full(soft.shape, 0.5)
+    trimap[eroded(soft > 0.95, radius)] = 1.0
+    trimap[~dilated(soft > 0.05, radius)] = 0.0
+    start = time.process_time()
+    alpha = estimate_alpha_cf(frame / 255.0, trimap)
+    return alpha, time.process_time() - start
 
 
 def errors(alpha: np.ndarray, true: np.ndarray) -> dict[str, float]:
@@ -121,12 +219,15 @@ def errors(alpha: np.ndarray, true: np.ndarray) -> dict[str, float]:
     off = np.abs(alpha.astype(np.float64) - true)
     gradients = (_gradient(alpha) - _gradient(true)) ** 2
     soft = (true > 0.02) & (true < 0.98)
+    rim = dilated(soft, RIM) if soft.any() else soft
     return {
         "mae": float(off.mean()),
         "mae_rim": float(off[soft].mean()) if soft.any() else 0.0,
         "sad": float(off.sum() / 1e3),
+        "sad_rim": float(off[rim].sum() / 1e3),
         "mse": float(1e4 * (off**2).mean()),
-        "gradient": float(gradients.sum()),
+        "gradient_error": float(gradients.sum()),
+        "gradient_error_rim": float(gradients[rim].sum()),
     }
 
 

@@ -28,17 +28,19 @@ class MatteConfig:
     scale: float = 1.0
     """Key at this share of the resolution; below 1 the matte is enlarged afterwards."""
     low: float = 1.2
-    """Difference from the plate up to which a pixel counts as plate."""
+    """Differences of this size are as likely noise as subject; alpha is 0 below."""
     high: float = 6.0
     """Difference that proves foreground; weaker pixels must touch such ones."""
-    full: float = 0.92
-    """A difference of this share of the local foreground's own counts as alpha 1."""
+    light: Literal["linear", "display"] = "linear"
+    """What mixes at soft edges: linear light, as in cameras, or sRGB values, as in composites."""
+    spread: float = 0.2
+    """Share by which hair may be brighter or darker than what is seen of it nearby."""
     firm: float = 0.5
     """A difference of this share of the local foreground's own may belong to the solid inside."""
     core: float = 0.018
     """Radius of the disc that must fit inside a part of the subject for it to be solid."""
     fill: float = 0.012
-    """Plate-coloured spots inside the solid subject are filled where this far from its edge."""
+    """Plate-coloured spots and gaps in the solid subject are filled this far from its edge."""
     shadow: float = 0.25
     """Broad darkening of the plate up to this share is taken for a shadow; 0 turns it off."""
     smooth: bool = False
@@ -58,9 +60,9 @@ class MatteConfig:
             raise ConfigError(
                 f"matte.low {self.low} and matte.high {self.high}: expected 0 < low < high"
             )
-        if not 0.1 <= self.full <= 1.0 or not 0.0 <= self.shadow < 1.0:
+        if not 0.0 <= self.spread <= 1.0 or not 0.0 <= self.shadow < 1.0:
             raise ConfigError(
-                f"matte.full {self.full}, matte.shadow {self.shadow}: expected 0.1 to 1, 0 to 1"
+                f"matte.spread {self.spread}, matte.shadow {self.shadow}: expected 0 to 1, below 1"
             )
         self._check_networks()
 

@@ -1,9 +1,9 @@
 """From a frame and its plate to alpha: what differs from the plate, and by how much.
 
-The key: a pixel's difference from the plate, in noise deviations, over the difference that the
-subject's own colour nearby would make. So alpha needs no fixed ramp: a strand of fair hair over
-a fair plate is as opaque as a dark one. The solid inside is found by shape and is always 1.
-Measured against guided filtering and colour projection, see benchmarks/matte.py.
+What differs from the plate by more than noise, in parts of some size, is the subject's region. The
+solid inside is found by shape and is 1; around it alpha is solved from the plate and the subject's
+colours nearby (`pipelines.matte.opacity`), so that a strand of fair hair over a fair plate is as
+opaque as a dark one. Measured against plain keys and textbook matting in benchmarks/matte.py.
 """
 
 from __future__ import annotations
@@ -14,6 +14,13 @@ import cv2
 import numpy as np
 
 from pipelines.matte.config import MatteConfig
+from pipelines.matte.opacity import (
+    light_noise,
+    local_colours,
+    shrunk,
+    solve_opacity,
+    to_light,
+)
 from pipelines.matte.plate import PlateModel
 from pipelines.matte.smooth import smooth_alpha
 
@@ -21,6 +28,12 @@ from pipelines.matte.smooth import smooth_alpha
 LEAST_PART = 0.02
 # A plate-coloured hole inside the subject is at most this share of the image.
 LARGEST_HOLE = 0.05
+# Least distance, a share of the image's longer side, from which a subject's colours are taken.
+REACH = 0.012
+# Deviations by which a pixel of the solid must be open to count as a gap.
+SURE = 2.0
+# Weight of alpha against smoothness, where smoothed, times the square of its deviation.
+SMOOTH = 1e-2
 _LUMA = np.array([0.299, 0.587, 0.114], dtype=np.float32)
 
 
@@ -52,17 +65,53 @@ def alpha_of(
     part = PlateModel(model.plate[window], model.sigma[window], model.whiten)
     image, difference, region = image[window], difference[window], region[window]
     support = find_support(difference > 2 * config.low, region, length, config)
-    own = subject_difference(image, difference, support.core, part, length)
-    # Knowing the subject's colour, thin hair that only differs no longer counts as solid.
-    firm = difference > np.maximum(config.firm * own, 2 * config.low)
-    support = find_support(firm, region, length, config)
-    own = subject_difference(image, difference, support.core, part, length)
-    soft = (difference - config.low) / np.maximum(config.full * own - config.low, 1.0)
-    soft = np.where(support.near, np.clip(soft, 0, 1), 0.0).astype(np.float32)
-    soft[support.core] = 1.0
-    alpha[window] = smooth_alpha(image, soft, support.near) if config.smooth else soft
+    if support.core.any():
+        firm = firm_pixels(image, difference, support.core, part, length, config)
+        support = find_support(firm, region, length, config)
+    found, doubt = _opacity(image, difference, support, part, length, config)
+    if config.smooth:
+        light = 255.0 * to_light(image, config.light == "linear")
+        found = smooth_alpha(light, found, support.near, SMOOTH / np.maximum(doubt, 0.02) ** 2)
+    alpha[window] = found
     alpha[~valid] = 0.0
     return alpha
+
+
+def _opacity(
+    image: np.ndarray,
+    difference: np.ndarray,
+    support: Support,
+    model: PlateModel,
+    length: int,
+    config: MatteConfig,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Alpha (H, W) float32, 1 deep in the core and 0 off the support, and its deviation (H, W)."""
+    core, linear = support.core, config.light == "linear"
+    alpha, doubt = core.astype(np.float32), np.zeros(core.shape, np.float32)
+    # Between strands the solid looks closed from a distance; near its edge it is measured.
+    todo = support.near | (core & ~eroded(core, _pixels(config.fill, length)))
+    if not todo.any():
+        return alpha, doubt
+    weight = _rim(core, length).astype(np.float32)
+    if not core.any():
+        strong = difference >= np.percentile(difference[difference > 0], 98)
+        weight = (strong & support.near).astype(np.float32)
+    light = to_light(image, linear)
+    reach = REACH * length
+    mean, covariance = local_colours(light, weight, todo, reach, config.spread)
+    plate = model.plate
+    if config.shadow > 0:
+        clear = ~(core | support.near)
+        plate = plate * shade_of_plate(image, model, clear, config.shadow, length)[..., None]
+    noise = light_noise(plate[todo], model.sigma[todo], model.whiten, linear)
+    behind = to_light(plate[todo], linear)
+    value, deviation, at_zero = solve_opacity(light[todo], behind, mean, covariance, noise)
+    # In the core what is not surely open is solid, off it what is not surely subject is plate.
+    solid = 1 - shrunk(1 - value, SURE * deviation)
+    strand = shrunk(value, config.low * at_zero)
+    alpha[todo] = np.clip(np.where(core[todo], solid, strand), 0, 1)
+    doubt[todo] = deviation
+    return alpha, doubt
 
 
 def _pixels(share: float, length: int) -> int:
@@ -115,14 +164,32 @@ def plate_difference(
     difference = _length(image - model.plate, model)
     if shadow <= 0:
         return difference
+    _, broad, shaded = _darkened(image, model, shadow, length)
+    return np.where(broad, np.minimum(difference, shaded), difference)
+
+
+def shade_of_plate(
+    image: np.ndarray, model: PlateModel, clear: np.ndarray, shadow: float, length: int
+) -> np.ndarray:
+    """Factor (H, W) on the plate's sRGB values by the shadow on it, as `clear` (H, W) shows."""
+    dark, broad, _ = _darkened(image, model, shadow, length)
+    weight = (broad & clear).astype(np.float32)
+    reach = REACH * length
+    # Where no plate is in reach there is no telling; no shadow then.
+    return (_blur(dark * weight, reach) + 1e-3) / (_blur(weight, reach) + 1e-3)
+
+
+def _darkened(
+    image: np.ndarray, model: PlateModel, shadow: float, length: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Darkening (H, W), where neighbourhoods are plate but for it, and the difference left."""
     # Darkening linear light by s darkens sRGB values by about s^(1/2.2).
     dark = np.clip(
         (image @ _LUMA) / np.maximum(model.plate @ _LUMA, 1.0), (1 - shadow) ** (1 / 2.2), 1.0
     )
     shaded = _length(image - model.plate * dark[..., None], model)
     # Opened by a disc wider than strands and soft edges: what is left is broad.
-    broad = opened(shaded < 3.0, _pixels(0.01, length))
-    return np.where(broad, np.minimum(difference, shaded), difference)
+    return dark, opened(shaded < 3.0, _pixels(0.01, length)), shaded
 
 
 def subject_region(difference: np.ndarray, high: float) -> np.ndarray:
@@ -172,34 +239,50 @@ def _filled(mask: np.ndarray, pixels: int) -> np.ndarray:
     return mask | fill[labels]
 
 
-def subject_difference(
+def firm_pixels(
     image: np.ndarray,
     difference: np.ndarray,
     core: np.ndarray,
     model: PlateModel,
     length: int,
+    config: MatteConfig,
 ) -> np.ndarray:
-    """Difference (H, W) from the plate that the subject's colour nearby would make at each pixel.
+    """Pixels (H, W) bool that look opaque, knowing the subject's colour about a first core.
 
-    The colour is that of the core's rim, a little inside (outside it is mixed with plate),
-    averaged over the nearest reach that holds any. With no core (only strands in view) the
-    strongest differences stand in for it.
+    Thin hair differs from the plate by less than hair itself does. Skin under dark hair may too,
+    but it is no mixture of hair and plate: what lies off the line between them is subject as well.
     """
-    if not core.any():
-        return np.full(core.shape, np.percentile(difference[difference > 0], 98), np.float32)
-    inner = eroded(core, 2)
-    inner = inner if inner.any() else core
-    rim = inner & ~eroded(inner, 2 * _pixels(0.012, length))
-    weight = rim.astype(np.float32)
+    off = image - model.plate
+    own = subject_colour(image, core, length) - model.plate
+    reach = _length(own, model)
+    firm = difference > np.maximum(config.firm * reach, 2 * config.low)
+    white = cv2.transform(own / model.sigma, model.whiten)
+    along = np.einsum("...i,...i->...", cv2.transform(off / model.sigma, model.whiten), white)
+    share = np.clip(along / (3 * np.maximum(reach, 1e-3) ** 2), 0, 1)
+    misfit = _length(off - share[..., None] * own, model)
+    # Half of the difference at least: light mixes along a curve in 8-bit steps.
+    return firm | (core & (misfit > np.maximum(2 * config.low, 0.5 * difference)))
+
+
+def subject_colour(image: np.ndarray, core: np.ndarray, length: int) -> np.ndarray:
+    """Colour (H, W, 3) of the subject nearby: of the core's rim, the nearest reach that has any."""
+    weight = _rim(core, length).astype(np.float32)
     total = np.zeros_like(image)
     weights = np.full(core.shape, 1e-12, np.float32)
     colours = image * weight[..., None]
     for octave in range(4):
-        reach = 0.012 * length * 2**octave
+        reach = REACH * length * 2**octave
         share = np.float32(1e-2**octave)
         total += share * _blur(colours, reach)
         weights += share * _blur(weight, reach)
-    return _length(total / weights[..., None] - model.plate, model)
+    return total / weights[..., None]
+
+
+def _rim(core: np.ndarray, length: int) -> np.ndarray:
+    """Pixels (H, W) of the core near its edge, but for those that may be mixed with plate."""
+    inner = eroded(core, 2)
+    inner = inner if inner.any() else core
+    return inner & ~eroded(inner, 2 * _pixels(REACH, length))
 
 
 def _blur(image: np.ndarray, sigma: float) -> np.ndarray:

@@ -19,6 +19,8 @@ LEVELS = np.linspace(16.0, 240.0, 8)  # 8-bit intensities at which noise is tabu
 MOST_NOISE = 14.0
 # Below this share of plate in view there is nothing to measure noise or exposure on.
 LEAST_PLATE = 0.05
+# Largest changes of exposure, natural logarithms: a few tenths of a stop as a rule, else two stops.
+GAINS = (0.51, 1.41)
 _LINEAR = srgb_to_linear(np.arange(256) / 255.0).astype(np.float32)
 
 
@@ -39,7 +41,8 @@ def exposure_gain(frame: np.ndarray, plate: np.ndarray) -> np.ndarray:
     """Gain (3,) of linear light from plate to frame, (H, W, 3) uint8 sRGB each.
 
     The plate's pixels form the sharpest peak of the ratios' histogram, whatever the subject
-    does; 1 where no peak stands out (the subject fills the frame).
+    does; 1 where no peak stands out (the subject fills the frame). Another stop is believed only
+    where there is no peak near the plate's own exposure.
     """
     gains = np.ones(3)
     step = max(1, round(np.sqrt(frame.shape[0] * frame.shape[1] / 5e5)))
@@ -49,12 +52,14 @@ def exposure_gain(frame: np.ndarray, plate: np.ndarray) -> np.ndarray:
         ratios = np.log(_LINEAR[a[use]] / _LINEAR[b[use]])
         if ratios.size < 200:
             continue
-        edges = np.arange(-0.51, 0.52, 0.02)
-        counts = np.convolve(np.histogram(ratios, edges)[0], np.ones(3), "same")
-        peak = float(edges[np.argmax(counts)] + 0.01)
-        near = ratios[np.abs(ratios - peak) < 0.06]
-        if near.size > 4 * LEAST_PLATE * ratios.size:
-            gains[channel] = np.exp(np.median(near))
+        for limit in GAINS:
+            edges = np.arange(-limit, limit + 0.01, 0.02)
+            counts = np.convolve(np.histogram(ratios, edges)[0], np.ones(3), "same")
+            peak = float(edges[np.argmax(counts)] + 0.01)
+            near = ratios[np.abs(ratios - peak) < 0.06]
+            if near.size > 4 * LEAST_PLATE * ratios.size:
+                gains[channel] = np.exp(np.median(near))
+                break
     return gains
 
 

@@ -2,9 +2,9 @@
 
 The matting Laplacian says that alpha is an affine function of colour in every small window (Levin,
 Lischinski and Weiss 2008). Alone, on a trimap made by machine, it loses to the key; as a smoothness
-beside the key, which stays as the data term, it takes a seventh off the squared error. The matrix
-is never formed: its product is a few box filters (He, Sun and Tang 2010), so memory stays that of a
-few images at any size.
+beside the key, which stays as the data term where it is sure, it takes a little off the error. The
+matrix is never formed: its product is a few box filters (He, Sun and Tang 2010), so memory stays
+that of a few images at any size.
 """
 
 from __future__ import annotations
@@ -13,35 +13,38 @@ import cv2
 import numpy as np
 from scipy.sparse.linalg import LinearOperator, cg
 
-# Weight of the key against smoothness; the error is flat between 0.03 and 0.3.
-KEY_WEIGHT = 0.1
 # Variance of colour (of 1) that counts as flat, so that noise in flat windows is no edge.
 FLAT = 1e-5
 ITERATIONS = 30
 
 
 def smooth_alpha(
-    image: np.ndarray, alpha: np.ndarray, band: np.ndarray, weight: float = KEY_WEIGHT
+    image: np.ndarray,
+    alpha: np.ndarray,
+    band: np.ndarray,
+    weight: float | np.ndarray,
 ) -> np.ndarray:
     """Smooth alpha (H, W) in `band` (H, W) by an image (H, W, 3) in 8-bit steps; the rest stays.
 
-    Minimises a' L a + weight |a - alpha|^2 over the band by conjugate gradients.
+    Minimises a' L a + weight |a - alpha|^2 over the band by conjugate gradients; the weight, one or
+    (H, W), says what alpha is worth.
     """
     if not band.any() or min(band.shape) < 3:
         return alpha
     laplacian = MattingLaplacian(image / 255.0, band)
     count = int(band.sum())
+    worth = np.broadcast_to(np.asarray(weight, np.float64), band.shape)[band]
 
     def product(values: np.ndarray) -> np.ndarray:
         spread = np.zeros(band.shape)
         spread[band] = values
-        return laplacian.product(spread)[band] + weight * values
+        return laplacian.product(spread)[band] + worth * values
 
     key = alpha[band].astype(np.float64)
     fixed = np.where(band, 0.0, alpha)
-    right = weight * key - laplacian.product(fixed)[band]
+    right = worth * key - laplacian.product(fixed)[band]
     # Preconditioned by its diagonal: windows at image borders and flat ones differ in scale.
-    inverse = 1.0 / (laplacian.diagonal()[band] + weight)
+    inverse = 1.0 / (laplacian.diagonal()[band] + worth)
     solved, _ = cg(
         LinearOperator((count, count), product, dtype=np.float64),
         right,

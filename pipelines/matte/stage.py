@@ -182,7 +182,7 @@ def _write_picture(out: Path, images: dict[str, np.ndarray], odd: set[str]) -> N
 
 STAGE = Stage(
     name="matte",
-    version=2,
+    version=3,
     config=MatteConfig,
     presets=PRESETS,
     items=items,

@@ -8,6 +8,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from express50.errors import CalibrationError
+from express50.frames import read_srgb8
+from express50.images import linear_to_srgb, srgb_to_linear, write_image
 from express50.rigs.world import canonical_from_rig, move_cameras
 from pipelines.calibrate.board import gather
 from pipelines.calibrate.config import CalibrateConfig
@@ -25,6 +27,7 @@ from tests.pipelines.board_rigs import (
     rig_errors,
     sizes_of,
 )
+from tests.pipelines.matte_scenes import make_scene
 
 DRAFT = CalibrateConfig(rounds=2, single_frames=15)
 
@@ -160,6 +163,56 @@ def test_tiny_images(shape: tuple[int, int]) -> None:
     assert alpha(np.full_like(plate, 220), plate).shape == shape
     assert alpha(plate, plate, scale=0.5).shape == shape
     assert alpha(np.full_like(plate, 220), plate, smooth=True).shape == shape
+
+
+def test_a_shirt_in_the_colour_of_the_plate_does_not_harm_the_head() -> None:
+    """Where it reaches the image's border nothing shows it; enclosed by collar and arms it does."""
+    scene = make_scene(30, "dark")
+    open_below, enclosed = scene.frame.copy(), scene.frame.copy()
+    open_below[210:, 112:144] = scene.plate[210:, 112:144]
+    enclosed[205:230, 118:138] = scene.plate[205:230, 118:138]
+    assert np.abs(alpha(open_below, scene.plate) - scene.alpha)[:200].mean() < 0.01
+    assert alpha(enclosed, scene.plate)[205:230, 118:138].min() > 0.95
+
+
+@pytest.mark.parametrize("gain", [0.5, 0.8, 1.25])
+def test_a_plate_of_another_exposure(gain: float) -> None:
+    scene = make_scene(31, "dark")
+    light = srgb_to_linear(scene.frame / 255.0) * gain
+    frame = np.rint(255 * linear_to_srgb(np.clip(light, 0, 1))).astype(np.uint8)
+    assert np.abs(alpha(frame, scene.plate) - scene.alpha).mean() < 0.02
+
+
+def test_blown_highlights_on_skin_before_a_blown_lamp() -> None:
+    """Where both are 255 nothing tells them apart: inside the outline it is the subject."""
+    scene = make_scene(32, "fair")
+    frame, plate = scene.frame.copy(), scene.plate.copy()
+    frame[140:165, 105:150] = 255
+    plate[130:175, 95:160] = 255
+    found = alpha(frame, plate)
+    assert found[142:163, 107:148].min() > 0.95
+    assert np.abs(found - scene.alpha).mean() < 0.012
+
+
+def test_a_shadow_that_moves_from_frame_to_frame() -> None:
+    scene = make_scene(33, "dark")
+    y, x = np.mgrid[0:256, 0:256] / 256
+    keyer = Keyer(scene.plate, [scene.frame], np.ones((256, 256), bool), MatteConfig())
+    for place in (0.12, 0.5, 0.9):
+        dark = 1 - 0.2 * np.exp(-(((x - place) / 0.08) ** 2) - ((y - 0.2) / 0.1) ** 2)
+        behind = np.where(scene.alpha < 0.5, dark, 1.0)[..., None]
+        found = keyer.alpha(np.rint(scene.frame * behind).astype(np.uint8))
+        assert found[:30].mean() < 0.01
+        assert np.abs(found - scene.alpha).mean() < 0.012
+
+
+def test_sixteen_bits_key_as_eight(tmp_path) -> None:
+    scene = make_scene(34, "dark")
+    read = []
+    for name, image in (("frame", scene.frame), ("plate", scene.plate)):
+        write_image(tmp_path / f"{name}.png", image.astype(np.uint16) * 257)
+        read.append(read_srgb8(tmp_path / f"{name}.png"))
+    assert np.array_equal(alpha(*read), alpha(scene.frame, scene.plate))
 
 
 def test_nothing_valid_is_empty() -> None:

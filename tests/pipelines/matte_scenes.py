@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from express50.images import linear_to_srgb, srgb_to_linear
+
 COLOURS = {  # skin and hair, 8-bit steps
     "dark": ((110, 80, 65), (45, 32, 25)),
     "fair": ((215, 170, 150), (205, 175, 120)),
@@ -62,7 +64,7 @@ def make_scene(
     shadow: float = 0.0,
     strands: int = 80,
 ) -> Scene:
-    """Render a scene; alpha is exact area coverage, colours mix in 8-bit sRGB steps.
+    """Render a scene; alpha is exact area coverage, colours mix in linear light.
 
     `gain` scales the frame against the plate, `shadow` darkens a broad patch beside the subject.
     """
@@ -75,10 +77,12 @@ def make_scene(
     subject = np.where(hair[..., None] > 0, colours[1], colours[0]) * (1 + 0.08 * grain)
     opaque = ((skin | hair) > 0).astype(np.float32)
     alpha = cv2.resize(opaque, (size, size), interpolation=cv2.INTER_AREA)
-    front = cv2.resize(subject * opaque[..., None], (size, size), interpolation=cv2.INTER_AREA)
+    light = srgb_to_linear(np.clip(subject, 0, 255) / 255.0).astype(np.float32)
+    front = cv2.resize(light * opaque[..., None], (size, size), interpolation=cv2.INTER_AREA)
     x, y = np.meshgrid(np.arange(size) / size, np.arange(size) / size)
     dark = 1 - shadow * np.exp(-(((x - 0.82) / 0.1) ** 2) - ((y - 0.7) / 0.2) ** 2)
-    frame = (front + (1 - alpha[..., None]) * plate * dark[..., None]) * gain
+    behind = srgb_to_linear(plate * dark[..., None] / 255.0)
+    frame = linear_to_srgb(front + (1 - alpha[..., None]) * behind) * 255.0 * gain
 
     def recorded(image: np.ndarray) -> np.ndarray:
         grown = image + rng.normal(size=image.shape) * noise * (0.5 + image / 255)

@@ -18,6 +18,7 @@ from pipelines.matte import STAGE
 from pipelines.matte.config import MatteConfig
 from pipelines.matte.key import dilated, eroded, plate_difference
 from pipelines.matte.keyer import Keyer
+from pipelines.matte.opacity import local_colours, shrunk, solve_opacity
 from pipelines.matte.plate import exposed, exposure_gain, fit_plate
 from pipelines.matte.smooth import MattingLaplacian
 from tests.pipelines.matte_scenes import Scene, clutter, make_scene
@@ -113,6 +114,62 @@ def test_smoothing_helps_thin_hair_and_keeps_what_is_sure() -> None:
     assert (smooth[180:, 115:140] == plain[180:, 115:140]).all()
 
 
+def test_alpha_of_a_known_mixture_is_exact_where_the_colours_are() -> None:
+    alpha, none = np.linspace(0, 1, 11), np.zeros((11, 3, 3))
+    front, behind = np.array([[0.1, 0.05, 0.02]] * 11), np.array([[0.4, 0.5, 0.6]] * 11)
+    seen = alpha[:, None] * front + (1 - alpha[:, None]) * behind
+    noise = none + 1e-5 * np.eye(3)
+    value, deviation, at_zero = solve_opacity(seen, behind, front, none, noise)
+    assert value == pytest.approx(alpha, abs=1e-9)
+    # One channel's noise over the distance of the colours.
+    assert deviation == pytest.approx(np.sqrt(1e-5) / np.linalg.norm(front - behind, axis=1), 1e-3)
+    assert at_zero == pytest.approx(deviation)
+
+
+def test_a_strand_brighter_than_its_neighbours_is_no_less_open() -> None:
+    alpha = np.linspace(0.2, 0.9, 8)
+    mean, behind = np.array([[0.5, 0.35, 0.15]] * 8), np.array([[0.3, 0.3, 0.32]] * 8)
+    seen = alpha[:, None] * 1.25 * mean + (1 - alpha[:, None]) * behind
+    noise = np.zeros((8, 3, 3)) + 1e-6 * np.eye(3)
+    outer = mean[:, :, None] * mean[:, None, :]
+    rigid = solve_opacity(seen, behind, mean, 0 * outer, noise)[0]
+    spread = solve_opacity(seen, behind, mean, 0.2**2 * outer, noise)[0]
+    assert np.abs(spread - alpha).max() < 0.03 < 0.1 < (rigid - alpha).max()
+
+
+def test_colours_come_from_the_nearest_that_count() -> None:
+    light = np.zeros((40, 60, 3), np.float32)
+    light[:, :30], light[:, 30:] = (0.8, 0.4, 0.2), (0.1, 0.2, 0.3)
+    weight = np.zeros((40, 60), np.float32)
+    weight[10:30, :8] = weight[10:30, 52:] = 1
+    where = np.zeros((40, 60), bool)
+    where[20, 14] = where[20, 46] = True
+    mean, covariance = local_colours(light, weight, where, 3.0, 0.1)
+    assert mean == pytest.approx(np.array([light[0, 0], light[0, 59]]), abs=0.01)
+    for own, found in zip(mean, covariance, strict=True):
+        assert own @ found @ own / (own @ own) ** 2 == pytest.approx(0.1**2, rel=0.3)
+        assert np.linalg.eigvalsh(found).min() > 0
+
+
+def test_shrinking_drops_doubt_and_keeps_what_is_sure() -> None:
+    values = np.array([-0.1, 0.01, 0.019, 0.5, 1.0])
+    shrunk_to = shrunk(values, np.full(5, 0.02))
+    assert (shrunk_to[:3] == 0).all() and shrunk_to[3:] == pytest.approx(values[3:], abs=1e-3)
+
+
+def test_composites_in_srgb_values_are_keyed_as_such() -> None:
+    scene = make_scene(16, "black")
+    front = np.array([14.0, 12.0, 12.0])
+    mixed = scene.alpha[..., None] * front + (1 - scene.alpha[..., None]) * scene.plate
+    scene = replace(scene, frame=np.rint(mixed).astype(np.uint8))
+    assert mae(key(scene, light="display"), scene) < 0.7 * mae(key(scene), scene)
+
+
+def test_strands_before_a_shadow_are_measured_against_the_darkened_plate() -> None:
+    lit, shaded = make_scene(17, "black"), make_scene(17, "black", shadow=0.2)
+    assert mae(key(shaded), shaded) < 1.2 * mae(key(lit), lit) + 1e-3
+
+
 def test_the_matting_laplacian_is_symmetric_and_ignores_affine_functions_of_colour() -> None:
     rng = np.random.default_rng(14)
     image, band = rng.random((12, 15, 3)), np.ones((12, 15), bool)
@@ -152,7 +209,7 @@ def test_pixels_without_footage_are_transparent() -> None:
 
 
 def test_wrong_settings_are_refused() -> None:
-    for change in ({"low": 7.0}, {"scale": 0.0}, {"full": 2.0}, {"shadow": 1.0}):
+    for change in ({"low": 7.0}, {"scale": 0.0}, {"spread": 2.0}, {"shadow": 1.0}):
         with pytest.raises(ConfigError, match="matte"):
             MatteConfig(**change)
 
