@@ -34,6 +34,8 @@ class CalibrateConfig:
     """A camera with fewer accepted corners is reported as weakly tied in."""
     weak_frames: int = 8
     """A camera that shares fewer board images with others is reported as weakly tied in."""
+    check_moments: int = 2
+    """Moments of the footage in which cameras that have moved are looked for; 0 looks at none."""
 
     def __post_init__(self) -> None:
         """Refuse models that a board cannot be solved for."""
@@ -45,7 +47,13 @@ class CalibrateConfig:
 
 
 PRESETS: dict[str, dict[str, object]] = {
-    "draft": {"board_frames": 24, "single_frames": 15, "rounds": 1, "iterations": 30},
+    "draft": {
+        "board_frames": 24,
+        "single_frames": 15,
+        "rounds": 1,
+        "iterations": 30,
+        "check_moments": 0,
+    },
     "standard": {},
     "reference": {
         "board_frames": 0,
@@ -53,5 +61,6 @@ PRESETS: dict[str, dict[str, object]] = {
         "rounds": 5,
         "iterations": 200,
         "reject_sigma": 6.0,
+        "check_moments": 4,
     },
 }

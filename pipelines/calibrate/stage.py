@@ -14,6 +14,7 @@ from express50.rigs.world import check_meeting
 from express50.stage import Stage
 from pipelines.calibrate.board import board_from_table, board_points, read_observations
 from pipelines.calibrate.config import PRESETS, CalibrateConfig
+from pipelines.calibrate.moved import footage_metrics, look_at_footage
 from pipelines.calibrate.pictures import draw_residuals, draw_rig
 from pipelines.calibrate.solve import Solution, solve_rig
 
@@ -39,7 +40,7 @@ def run(dataset: Dataset, item: str, config: CalibrateConfig, out: Path) -> dict
     """Write cameras.json and the pictures of one subject; see CONVENTIONS for the world."""
     index = read_index(dataset, item)
     if index.calibration is not None:
-        return _run_given(index, out)
+        return _run_given(index, config, out)
     if index.board is not None and index.board["cameras"]:
         return _run_board(index, config, out)
     raise CalibrationError(
@@ -49,7 +50,7 @@ def run(dataset: Dataset, item: str, config: CalibrateConfig, out: Path) -> dict
     )
 
 
-def _run_given(index: Index, out: Path) -> dict:
+def _run_given(index: Index, config: CalibrateConfig, out: Path) -> dict:
     path = index.capture / str(index.calibration)
     given = read_cameras(path)
     cameras = {name: given[name] for name in sorted(index.cameras) if name in given}
@@ -65,6 +66,7 @@ def _run_given(index: Index, out: Path) -> dict:
         "models": {name: camera.model for name, camera in cameras.items()},
         "weak": [],
         "dropped": [{"what": name, "why": f"not in {path.name}"} for name in missing],
+        **footage_metrics(look_at_footage(index, cameras, config.check_moments)),
     }
 
 
@@ -104,7 +106,8 @@ def _run_board(index: Index, config: CalibrateConfig, out: Path) -> dict:
     boards = np.array([pose[:3, 3] for pose in solution.boards.values()]).reshape(-1, 3)
     draw_rig(out / "qc" / "rig.jpg", solution.cameras, boards)
     draw_residuals(out / "qc" / "residuals.jpg", solution)
-    return _metrics(solution)
+    seen = look_at_footage(index, solution.cameras, config.check_moments)
+    return _metrics(solution) | footage_metrics(seen)
 
 
 def _metrics(solution: Solution) -> dict:
@@ -129,7 +132,7 @@ def _metrics(solution: Solution) -> dict:
 
 STAGE = Stage(
     name="calibrate",
-    version=1,
+    version=2,
     config=CalibrateConfig,
     presets=PRESETS,
     items=items,

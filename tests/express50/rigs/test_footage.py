@@ -11,6 +11,7 @@ from express50.cameras import Camera, project, rays, write_cameras
 from express50.cli import main
 from express50.errors import CalibrationError, CaptureError
 from express50.images import write_image
+from express50.layout import Dataset
 from express50.rigs.adjust import fit_poses, move_pose, triangulate_tracks
 from express50.rigs.footage import check_footage, reduce_images
 from express50.rigs.moments import read_moments
@@ -181,3 +182,19 @@ def test_moments_follow_the_cues_and_a_short_camera_is_named(footage, tmp_path):
     (tmp_path / "capture" / "cues.csv").write_text(cues)
     with pytest.raises(CaptureError, match="has 1 frames, frame 3 was expected"):
         read_moments(tmp_path / "capture", 2)
+
+
+def test_calibrate_warns_of_the_camera_and_goes_on(footage, tmp_path, capsys):
+    rig, frames = footage
+    write_capture(tmp_path / "capture", rig, frames[0])
+    write_cameras(tmp_path / "capture" / "calibration.json", bumped(rig, "cam03", (0, TURN, 0)))
+    dataset = Dataset(tmp_path / "dataset")
+    assert main(["ingest", str(dataset.root), str(tmp_path / "capture"), "--workers", "0"]) == 0
+    assert main(["calibrate", str(dataset.root), "--workers", "0"]) == 0
+    path = dataset.item_dir("calibrate", "S001") / "metrics.json"
+    told = json.loads(path.read_text())
+    assert [row["what"] for row in told["warnings"]] == ["cam03"]
+    assert "px" in told["warnings"][0]["why"] and told["footage"]["points"] > 20
+    quiet = ["--workers", "0", "--set", "calibrate.check_moments=0"]
+    assert main(["calibrate", str(dataset.root), *quiet]) == 0
+    assert json.loads(path.read_text())["footage"] is None

@@ -1,0 +1,56 @@
+"""Does the footage still fit the cameras it was calibrated with? A rig is bumped between shots."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from express50.cameras import Camera
+from express50.frames import FrameReader
+from express50.index import Index
+from express50.landmarks.network import load_network
+from express50.rigs.footage import FootageVerdict, check_footage
+
+
+def look_at_footage(
+    index: Index, cameras: Mapping[str, Camera], moments: int
+) -> FootageVerdict | None:
+    """What frames at so many moments, spread over the cues, say of the cameras.
+
+    None where there is nothing to say: no moments asked for, or fewer than three cameras.
+    """
+    if moments < 1 or len(cameras) < 3:
+        return None
+    middles = [(c.start_frame + min(c.end_frame, index.frames - 1)) // 2 for c in index.cues]
+    usable = sorted(frame for frame in middles if frame < index.frames) or [index.frames // 2]
+    picks = np.linspace(0, len(usable) - 1, min(moments, len(usable))).round().astype(int)
+    wanted = sorted({usable[pick] for pick in picks})
+    frames: dict[int, dict[str, np.ndarray]] = {frame: {} for frame in wanted}
+    for name in cameras:
+        reader = FrameReader(index, name)
+        for frame in wanted:
+            frames[frame][name] = reader.read(frame)
+    return check_footage(cameras, frames, load_network())
+
+
+def footage_metrics(verdict: FootageVerdict | None) -> dict[str, object]:
+    """The verdict as metrics: figures, and a warning for each camera that has moved."""
+    if verdict is None:
+        return {"footage": None, "warnings": []}
+    return {
+        "footage": {
+            "points": verdict.points,
+            "error_px": round(verdict.error_px, 4) if np.isfinite(verdict.error_px) else None,
+            "unchecked": sorted(verdict.unchecked),
+        },
+        "warnings": [
+            {
+                "what": name,
+                "why": f"seems to have moved since it was calibrated: its picture is off by"
+                f" {move.shift_px:.1f} px (turned {move.turn_deg:.2f} degrees, moved"
+                f" {move.move_mm:.1f} mm); calibrate the rig again, or leave the camera out",
+            }
+            for name, move in verdict.moved.items()
+        ],
+    }
