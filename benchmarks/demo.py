@@ -130,7 +130,7 @@ def pick_views(dataset: Dataset, subject: str) -> tuple[str, list[str]]:
     from express50.frames import read_cameras_of
 
     cameras = read_cameras_of(dataset, subject)
-    metrics = json.loads((dataset.item_dir("align", subject) / "metrics.json").read_text())
+    metrics = json.loads((dataset.item_dir("observe", subject) / "metrics.json").read_text())
     best = next(c for c in metrics["watching_cameras"] if c in cameras)
     forward = {c: camera.cam_from_world[2, :3] for c, camera in cameras.items()}
     ordered = sorted(cameras, key=lambda c: -float(np.dot(forward[c], forward[best])))

@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks.accuracy import measure_dataset
+from benchmarks.demo import pick_views
 from express50.cli import main
 from express50.images import decode_image
 from express50.layout import Dataset
@@ -21,7 +22,7 @@ from express50.shards import ShardReader
 
 pytestmark = pytest.mark.slow
 
-STAGES = ("ingest", "calibrate", "align", "matte", "track", "depth", "pack")
+STAGES = ("ingest", "calibrate", "observe", "align", "matte", "track", "depth", "pack")
 SETTINGS = {"pack": ["--set", "pack.size=96", "--set", 'pack.test_subjects=["S002"]']}
 RECORDING = [
     "--subjects=2", "--cameras=6", "--give-calibration", "--width=192", "--height=192",
@@ -115,6 +116,8 @@ def test_kills_at_random_moments_change_no_byte(dataset, twin, tmp_path):
 def test_report_and_training_follow(dataset, tmp_path):
     from grmm.cli import main as grmm
 
+    held_out, given = pick_views(dataset, "S001")
+    assert len({held_out, *given}) == 3
     shards = str(dataset.item_dir("pack", "shards"))
     out = dataset.root / "grmm" / "train"
     assert grmm(["train", shards, str(out), "--preset", "demo", "--seconds", "6"]) == 0
