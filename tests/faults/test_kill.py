@@ -19,8 +19,8 @@ REPOSITORY = Path(__file__).resolve().parents[2]
 NAMES = [f"item{number}" for number in range(6)] + ["S001/cam00", "S001/cam01"]
 
 
-def start(arguments: list[str]) -> subprocess.Popen:
-    environment = os.environ | {"PYTHONPATH": str(REPOSITORY), "OMP_NUM_THREADS": "1"}
+def start(arguments: list[str], **variables: str) -> subprocess.Popen:
+    environment = os.environ | {"PYTHONPATH": str(REPOSITORY), "OMP_NUM_THREADS": "1"} | variables
     return subprocess.Popen(
         [sys.executable, "-m", *arguments],
         cwd=REPOSITORY,
@@ -105,7 +105,8 @@ def test_killed_ingest_reruns_to_the_same_bytes(tmp_path):
 
 def test_interrupt_stops_soon_and_is_resumable(tmp_path):
     dataset = toy.make_dataset(tmp_path / "data", [f"item{n}" for n in range(30)])
-    process = start(["tests.faults.toy", str(dataset.root), "2"])
+    # Slow enough that no busy machine lets it finish before it is interrupted.
+    process = start(["tests.faults.toy", str(dataset.root), "2"], **{toy.SLOWER: "20"})
     give_up = time.monotonic() + 120
     while not list(dataset.root.glob("toy/*")) and time.monotonic() < give_up:
         time.sleep(0.05)

@@ -19,6 +19,8 @@ from express50.layout import Dataset
 from express50.runner import run_stage
 from express50.stage import Stage
 
+SLOWER = "EXPRESS50_TOY_SLOWER"  # how many times as long to pause: no item's bytes depend on it
+
 
 @dataclass(frozen=True, kw_only=True)
 class ToyConfig:
@@ -48,7 +50,7 @@ def run(dataset: Dataset, item: str, config: ToyConfig, out: Path) -> dict:
     for number in range(config.files):
         block = hashlib.sha256(f"{config.word}{item}{text}{number}".encode()).digest()
         (out / "deep" / f"{number}.bin").write_bytes(block * 2000)
-        time.sleep(config.seconds)
+        time.sleep(config.seconds * float(os.environ.get(SLOWER, "1")))
     print("chatter of a library")
     return misbehave(dataset, item, text)
 
