@@ -14,7 +14,7 @@ import torch
 
 from express50.adapters import affine_to_opencv
 from express50.landmarks.augment import MIRROR, face_box
-from express50.landmarks.detector import detect
+from express50.landmarks.detector import detect, window_about
 from express50.landmarks.network import CROP, LandmarkNet
 from express50.transforms import similarity_fit
 
@@ -40,7 +40,7 @@ def find_points(net: LandmarkNet, images: Sequence[np.ndarray]) -> tuple[np.ndar
     """
     middle = detect(net, images[len(images) // 2])
     centre, side = face_box(middle.points)
-    found = list(_look(net, images, _level_window(middle.points)))
+    found = list(_look(net, images, window_about(middle.points)))
     points, scores = (np.concatenate(part) for part in zip(*found, strict=True))
     for row, image in enumerate(images):
         away = np.linalg.norm(face_box(points[row])[0] - centre)
@@ -89,19 +89,6 @@ def steady(values: np.ndarray, sigma: float = STEADY_FRAMES) -> np.ndarray:
     numbers = np.arange(len(values))
     weights = np.exp(-0.5 * ((numbers[:, None] - numbers) / sigma) ** 2)
     return np.tensordot(weights / weights.sum(1, keepdims=True), values, axes=1)
-
-
-def _level_window(points: np.ndarray) -> np.ndarray:
-    """Affine (2, 3) from the network's crop to the image, about landmarks with the eyes level."""
-    eyes = points[42:48].mean(0) - points[36:42].mean(0)
-    down = points[8] - points[27]
-    axis = eyes + np.array([down[1], -down[0]])  # the chin tells in profile, where eyes coincide
-    axis /= max(float(np.linalg.norm(axis)), 1e-9)
-    turn = np.array([[axis[0], -axis[1]], [axis[1], axis[0]]])
-    centre, side = face_box(points @ turn)
-    scaled = turn * (max(side, 8.0) / CROP)
-    corner = turn @ centre - scaled @ [CROP / 2, CROP / 2]
-    return np.concatenate([scaled, corner[:, None]], axis=1)
 
 
 def _look(

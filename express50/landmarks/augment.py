@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from express50.adapters import affine_to_opencv
 from express50.landmarks.network import CROP
 from express50.landmarks.training_set import ViewSet
 
@@ -78,10 +79,8 @@ def _composite(
     source[..., :3] *= source[..., 3:] / 255.0
     if scale < 0.8:
         source = cv2.GaussianBlur(source, (0, 0), 0.45 / scale)
-    # OpenCV's pixel centres lie on whole numbers, ours on halves.
-    shifted = matrix.copy()
-    shifted[:, 2] += matrix[:, :2] @ np.array([0.5, 0.5]) - 0.5
-    warped = cv2.warpAffine(source, shifted, (CROP, CROP), flags=cv2.INTER_LINEAR)
+    shape = (CROP, CROP)
+    warped = cv2.warpAffine(source, affine_to_opencv(matrix), shape, flags=cv2.INTER_LINEAR)
     return warped[..., :3] + background * (1 - warped[..., 3:] / 255.0)
 
 

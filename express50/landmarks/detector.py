@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 import torch
 
+from express50.adapters import affine_to_opencv
 from express50.landmarks.augment import MIRROR, face_box
 from express50.landmarks.network import CROP, LandmarkNet
 
@@ -59,7 +60,7 @@ def detect(net: LandmarkNet, image: np.ndarray, refinements: int = 3) -> Detecti
     pyramid = _pyramid(image)
     points, sigma, score = _coarse(net, pyramid)
     for step in range(refinements):
-        window = _window_about(points)
+        window = window_about(points)
         last = step == refinements - 1
         views = [window, _mirrored(window)] if last else [window]
         refined = _mean_view(*_run(net, pyramid, views))
@@ -97,8 +98,11 @@ def _window(centre: np.ndarray, side: float, angle: float) -> np.ndarray:
     return np.concatenate([turn, (centre - turn @ [CROP / 2, CROP / 2])[:, None]], axis=1)
 
 
-def _window_about(points: np.ndarray) -> np.ndarray:
-    """The window the network was trained on, about landmarks (68, 2), the eyes level."""
+def window_about(points: np.ndarray) -> np.ndarray:
+    """The window the network was trained on, about landmarks (68, 2), the eyes level.
+
+    Affine (2, 3) from crop pixels to image pixels, corner origin.
+    """
     eyes = points[42:48].mean(0) - points[36:42].mean(0)
     down = points[8] - points[27]
     # The face's own down direction also holds in profile, where the eyes coincide.
@@ -132,12 +136,9 @@ def _sample(pyramid: list[np.ndarray], window: np.ndarray) -> np.ndarray:
     height, width = pyramid[0].shape[:2]
     shape = pyramid[level].shape
     scale = np.array([[shape[1] / width], [shape[0] / height]])
-    matrix = window * scale
-    # OpenCV's pixel centres lie on whole numbers, ours on halves.
-    matrix[:, 2] += matrix[:, :2] @ [0.5, 0.5] - 0.5
     return cv2.warpAffine(
         pyramid[level],
-        matrix,
+        affine_to_opencv(window * scale),
         (CROP, CROP),
         flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
         borderMode=cv2.BORDER_REPLICATE,
