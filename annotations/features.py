@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from annotations.observe import Observations
+from annotations.observe import NEUTRAL, Observations
 from annotations.watch import STABLE, face_side, similarity_2d, steady
 from express50.expressions import Expression
 
@@ -58,18 +58,16 @@ class Features:
     rest: np.ndarray
 
 
-def measure(
-    observations: Observations, windows: dict[str, np.ndarray], neutral: str = "neutral"
-) -> Features:
+def measure(observations: Observations, windows: dict[str, np.ndarray]) -> Features:
     """Features of all observed frames.
 
     Args:
         observations: of one subject.
         windows: expression id -> rows of ``observations`` in its cue window, in order of time.
-        neutral: the expression that is rest; without it the windows' first frames are.
+            Without the neutral expression the windows' first frames are taken for rest.
     """
     ends = np.concatenate([rows[[0, -1]] for rows in windows.values()])
-    rest = windows.get(neutral, ends[::2])
+    rest = windows.get(NEUTRAL, ends[::2])
     values, owner, camera = [], [], []
     for number in range(len(observations.cameras)):
         points = observations.points[number].astype(np.float64)

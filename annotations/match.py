@@ -60,7 +60,7 @@ def watch(index: Index, observations: Observations) -> Watched:
         seen = (observations.frames >= cue.start_frame) & (observations.frames <= cue.end_frame)
         if seen.any():
             windows[cue.expression_id] = np.flatnonzero(seen)
-    features = measure(observations, windows, NEUTRAL)
+    features = measure(observations, windows)
     return Watched(index.subject, observations.cameras[0], observations.frames, windows, features)
 
 
@@ -82,39 +82,34 @@ def suggest_all(
         if expression == NEUTRAL:
             found[expression] = suggest_rest(values, groups, _typical(subject, entry))
             continue
-        target = None if reference is None else canonical_frame(reference, expression, entry)
-        likeness = None
-        if target is not None and reference is not None:
-            canonical[expression] = target
-            likeness = _likeness(subject.features, reference.watched, expression, entry, target)
-        found[expression] = suggest(values, groups, likeness)
+        target = None
+        if reference is not None and expression in reference.watched.windows:
+            target = _target(subject.features, reference, expression, entry)
+        if target is not None:
+            canonical[expression] = target[0]
+        found[expression] = suggest(values, groups, target[1] if target else None)
     return found, canonical
 
 
-def canonical_frame(reference: Reference, expression: str, entry: Expression | None) -> int | None:
-    """The frame that people chose, else the apex; None where the reference has none."""
-    rows = reference.watched.windows.get(expression)
-    if rows is None or expression in reference.flagged:
+def _target(
+    features: Features, reference: Reference, expression: str, entry: Expression | None
+) -> tuple[int, Canonical] | None:
+    """The reference's frame, which people chose or else its apex, in the subject's features.
+
+    None where people flagged the reference's performance.
+    """
+    if expression in reference.flagged:
         return None
+    theirs = reference.watched
+    rows = theirs.windows[expression]
+    values = expression_values(theirs.features, entry, rows)
     if expression in reference.chosen:
-        return reference.chosen[expression]
-    values = expression_values(reference.watched.features, entry, rows)
-    return int(reference.watched.frames[rows[strongest_event(values).apex]])
-
-
-def _likeness(
-    features: Features,
-    reference: Watched,
-    expression: str,
-    entry: Expression | None,
-    frame: int,
-) -> Canonical:
-    """The canonical frame in the subject's features."""
-    rows = reference.windows[expression]
-    values = expression_values(reference.features, entry, rows)
-    row = int(np.argmin(np.abs(reference.frames[rows] - frame)))
-    shared = shared_columns(features, reference.features)
-    return canonical_of(values, row, shared, features.values.shape[1])
+        row = int(np.argmin(np.abs(theirs.frames[rows] - reference.chosen[expression])))
+    else:
+        row = strongest_event(values).apex
+    frame = reference.chosen.get(expression, int(theirs.frames[rows[row]]))
+    shared = shared_columns(features, theirs.features)
+    return frame, canonical_of(values, row, shared, features.values.shape[1])
 
 
 def shared_columns(features: Features, other: Features) -> np.ndarray:

@@ -6,6 +6,7 @@ clip itself: the frames that show the expression define it, and it tells which f
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -84,13 +85,8 @@ def suggest(values: np.ndarray, groups: np.ndarray, canonical: Canonical | None)
     own = strongest_event(values)
     event, certain = choose_event(values, own, canonical)
     row = matching_row(event, canonical)
-    rng = np.random.default_rng(0)  # the same halves every time: a rerun gives the same bytes
-    names = np.unique(groups)
     rows = []
-    for _ in range(_DRAWS):
-        kept = np.isin(groups, names[rng.random(len(names)) < 0.5])
-        if not kept.any():
-            continue
+    for kept in _halves(groups):
         half = None if canonical is None else _restricted(canonical, kept)
         part = values[:, kept]
         rows.append(matching_row(choose_event(part, strongest_event(part), half)[0], half))
@@ -117,16 +113,25 @@ def suggest_rest(values: np.ndarray, groups: np.ndarray, typical: float) -> Sugg
     _check(values)
     level = _unrest(values)
     row = int(np.argmin(level))
-    rng, names, good = np.random.default_rng(0), np.unique(groups), 0
-    for _ in range(_DRAWS):
-        kept = np.isin(groups, names[rng.random(len(names)) < 0.5])
-        good += bool(level[np.argmin(_unrest(values[:, kept]))] <= level[row] + 0.1 * typical)
-    return Suggestion(row, good / (_DRAWS + 1), level, None, candidate_rows(row, [], -level))
+    enough = level[row] + 0.1 * typical
+    good = [level[np.argmin(_unrest(values[:, kept]))] <= enough for kept in _halves(groups)]
+    return Suggestion(
+        row, sum(good) / (len(good) + 1), level, None, candidate_rows(row, [], -level)
+    )
 
 
 def _check(values: np.ndarray) -> None:
     if values.size == 0 or not np.isfinite(values).all():
         raise ValueError(f"features are {values.shape}, expected a frame or more, all finite")
+
+
+def _halves(groups: np.ndarray) -> Iterator[np.ndarray]:
+    """Random halves (N,) bool of the features, always the same: a rerun gives the same bytes."""
+    rng, names = np.random.default_rng(0), np.unique(groups)
+    for _ in range(_DRAWS):
+        kept = np.isin(groups, names[rng.random(len(names)) < 0.5])
+        if kept.any():
+            yield kept
 
 
 def _unrest(values: np.ndarray) -> np.ndarray:
