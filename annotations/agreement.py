@@ -13,7 +13,7 @@ from itertools import combinations
 
 import numpy as np
 
-from annotations.store import Label, is_person, labels_of, read_labels
+from annotations.store import Label, labels_by_person, read_labels
 from express50.exclusions import included_subjects
 from express50.index import read_index
 from express50.layout import Dataset
@@ -54,8 +54,8 @@ def marked_clips(dataset: Dataset, subjects: Iterable[str] | None = None) -> lis
 def marks_by_person(labels: Sequence[Label]) -> dict[str, dict[str, Label]]:
     """Marks in force of each person, by expression and annotator; flags are left out."""
     marks: dict[str, dict[str, Label]] = defaultdict(dict)
-    for who in sorted({x.annotator for x in labels if is_person(x.annotator)}):
-        for expression, label in labels_of(labels, who).items():
+    for who, said in labels_by_person(labels).items():
+        for expression, label in said.items():
             if label.frame is not None:
                 marks[expression][who] = label
     return dict(marks)

@@ -7,8 +7,7 @@ from dataclasses import asdict, dataclass
 from annotations.store import (
     Label,
     current_labels,
-    is_person,
-    labels_of,
+    labels_by_person,
     make_flag,
     make_mark,
     read_labels,
@@ -48,8 +47,7 @@ def disagreements(
     found = []
     for subject in subjects or included_subjects(dataset):
         labels = read_labels(dataset, subject)
-        people = sorted({x.annotator for x in labels if is_person(x.annotator)})
-        said = {who: labels_of(labels, who) for who in people}
+        said = labels_by_person(labels)
         force = current_labels(labels)
         for cue in read_index(dataset, subject).cues:
             expression = cue.expression_id
@@ -109,12 +107,8 @@ def current_voices(dataset: Dataset, subject: str, expression: str) -> dict[str,
     Raises:
         AnnotationError: nobody labelled it.
     """
-    labels = read_labels(dataset, subject)
-    voices = {
-        who: own[expression]
-        for who in sorted({x.annotator for x in labels if is_person(x.annotator)})
-        if expression in (own := labels_of(labels, who))
-    }
+    said = labels_by_person(read_labels(dataset, subject))
+    voices = {who: own[expression] for who, own in said.items() if expression in own}
     if not voices:
         raise AnnotationError(f"{subject} {expression}: nobody has labelled it; nothing to settle")
     return voices

@@ -12,7 +12,7 @@ import hashlib
 import json
 import os
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 
@@ -318,6 +318,12 @@ def _rank(label: Label) -> int:
 def is_person(annotator: str) -> bool:
     """Whether a name is a person's: neither the align stage's nor a rule's."""
     return annotator != AUTOMATIC and not annotator.startswith(RULE_PREFIX)
+
+
+def labels_by_person(labels: Sequence[Label]) -> dict[str, dict[str, Label]]:
+    """What each person says of each expression, by name in order."""
+    people = sorted({label.annotator for label in labels if is_person(label.annotator)})
+    return {who: labels_of(labels, who) for who in people}
 
 
 def human_digest(dataset: Dataset, subject: str) -> str:

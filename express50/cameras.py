@@ -218,7 +218,7 @@ def triangulate(
     check_shape("pixels", pixels, (len(cameras), None, 2))
     seen = np.isfinite(pixels).all(-1)
     w = np.where(seen, 1.0 if weights is None else np.asarray(weights, dtype=np.float64), 0.0)
-    xy = np.stack([_normalised(c, p) for c, p in zip(cameras, pixels, strict=True)])
+    xy = np.stack([normalised(c, p) for c, p in zip(cameras, pixels, strict=True)])
     P = np.stack([c.cam_from_world[:3] for c in cameras])  # (C, 3, 4)
     focal = np.array([np.sqrt(c.K[0, 0] * c.K[1, 1]) for c in cameras])
     points = np.full((pixels.shape[1], 3), np.nan)
@@ -228,7 +228,8 @@ def triangulate(
     return points
 
 
-def _normalised(camera: Camera, pixels: np.ndarray) -> np.ndarray:
+def normalised(camera: Camera, pixels: np.ndarray) -> np.ndarray:
+    """Undistorted coordinates (N, 2) on the plane z = 1 of recorded pixels (N, 2)."""
     K = camera.K
     return undistort(camera, (pixels - K[:2, 2]) / (K[0, 0], K[1, 1]))
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,7 @@ import numpy as np
 from express50.capture import RawCamera, RawCapture, read_capture
 from express50.errors import CaptureError
 from express50.frames import read_srgb8
+from express50.index import Cue
 from express50.video import iterate_video
 
 
@@ -31,9 +33,17 @@ def read_moments(root: Path, count: int) -> dict[int, dict[str, np.ndarray]]:
 
 def moments_of(capture: RawCapture, count: int) -> list[int]:
     """Frame numbers of up to `count` moments; a video without cues offers its first frame."""
-    middles = [(cue.start_frame + cue.end_frame) // 2 for cue in capture.cues]
     lengths = [len(camera.names) for camera in capture.cameras.values() if camera.names]
-    frames = sorted(middles) or list(range(min(lengths, default=1)))
+    return spread_moments(capture.cues, count) or spread(range(min(lengths, default=1)), count)
+
+
+def spread_moments(cues: Sequence[Cue], count: int) -> list[int]:
+    """Middle frames of up to `count` cues, evenly chosen; none where there are no cues."""
+    return spread(sorted((cue.start_frame + cue.end_frame) // 2 for cue in cues), count)
+
+
+def spread(frames: Sequence[int], count: int) -> list[int]:
+    """Up to `count` of some frames, evenly chosen."""
     picks = np.linspace(0, len(frames) - 1, min(count, len(frames))).round().astype(int)
     return [frames[i] for i in picks]
 

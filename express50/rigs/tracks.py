@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from express50.adapters import opencv_pixels_to_corner
-from express50.cameras import Camera, undistort
+from express50.cameras import Camera, normalised
 from express50.landmarks.detector import detect
 from express50.landmarks.network import LandmarkNet
 
@@ -120,8 +120,7 @@ def join_tracks(cameras: Mapping[str, Camera], seen: Mapping[int, Seen], band: f
 def ideal_pixels(camera: Camera, pixels: np.ndarray) -> np.ndarray:
     """Where recorded pixels (N, 2) would be without distortion."""
     K = camera.K
-    scale = K[[0, 1], [0, 1]]
-    return undistort(camera, (pixels - K[:2, 2]) / scale) * scale + K[:2, 2]
+    return normalised(camera, pixels) * K[[0, 1], [0, 1]] + K[:2, 2]
 
 
 def _landmarks(

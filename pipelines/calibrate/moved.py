@@ -11,6 +11,7 @@ from express50.frames import FrameReader
 from express50.index import Index
 from express50.landmarks.network import load_network
 from express50.rigs.footage import FootageVerdict, check_footage
+from express50.rigs.moments import spread_moments
 
 
 def look_at_footage(
@@ -22,10 +23,8 @@ def look_at_footage(
     """
     if moments < 1 or len(cameras) < 3:
         return None
-    middles = [(c.start_frame + min(c.end_frame, index.frames - 1)) // 2 for c in index.cues]
-    usable = sorted(frame for frame in middles if frame < index.frames) or [index.frames // 2]
-    picks = np.linspace(0, len(usable) - 1, min(moments, len(usable))).round().astype(int)
-    wanted = sorted({usable[pick] for pick in picks})
+    cues = [cue for cue in index.cues if cue.end_frame < index.frames]
+    wanted = sorted(set(spread_moments(cues, moments))) or [index.frames // 2]
     frames: dict[int, dict[str, np.ndarray]] = {frame: {} for frame in wanted}
     for name in cameras:
         reader = FrameReader(index, name)
