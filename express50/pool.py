@@ -5,8 +5,9 @@ from __future__ import annotations
 import logging
 import sys
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import CancelledError
+from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
 
@@ -69,33 +70,26 @@ class Pool:
         attempt: int,
     ) -> list[Task]:
         """Keep as many tasks submitted as there are workers; returns those whose worker died."""
-        from distributed import wait
         from distributed.scheduler import KilledWorker
 
         client = self._connect()
         waiting, killed = deque(tasks), []
         running: dict[Any, Task] = {}
         while waiting or running:
-            while waiting and len(running) < self._window():
-                task = waiting.popleft()
-                future = client.submit(run_task, task, pure=False, key=_key(task, attempt))
-                running[future] = task
-            try:
-                with client.as_current():
-                    finished = wait(list(running), POLL_SECONDS, "FIRST_COMPLETED").done
-            except TimeoutError:
-                finished = set()
-            except CancelledError as error:
-                raise StageError("lost the dask scheduler; start it, run the same again") from error
-            for future in finished:
+            with _loss_is_one_error():
+                while waiting and len(running) < self._window():
+                    task = waiting.popleft()
+                    future = client.submit(run_task, task, pure=False, key=_key(task, attempt))
+                    running[future] = task
+                ended = [(future, *_outcome(future)) for future in _finished(client, running)]
+            for future, receipt, failure in ended:
                 task = running.pop(future)
-                failure = future.exception()
-                if isinstance(failure, KilledWorker):
+                if receipt is not None:
+                    settle(replace(receipt, attempts=attempt))
+                elif isinstance(failure, KilledWorker):
                     killed.append(task)
-                elif failure is not None:  # the task did not even start
+                else:  # the task did not even start
                     settle(_failed(task, f"worker: {type(failure).__name__}: {failure}", attempt))
-                else:
-                    settle(replace(future.result(), attempts=attempt))
             tick()
         return killed
 
@@ -113,12 +107,13 @@ class Pool:
         if self.scheduler is not None:
             try:
                 self._client = Client(self.scheduler, timeout=CONNECT_SECONDS, set_as_default=False)
+                has_workers = bool(self._client.nthreads())
             except (OSError, TimeoutError, ValueError) as error:
                 raise StageError(
                     f"scheduler {self.scheduler}: cannot connect ({error}); expected an address "
                     "such as tcp://host:8786 of a running dask scheduler"
                 ) from error
-            if not self._client.nthreads():
+            if not has_workers:
                 sys.stderr.write(f"scheduler {self.scheduler} has no workers yet; waiting\n")
             return self._client
         with dask.config.set(local_settings(self.threads)):
@@ -141,6 +136,37 @@ class Pool:
         if self._cluster is not None:
             self._cluster.close(timeout=10)
         self._client = self._cluster = None
+
+
+@contextmanager
+def _loss_is_one_error() -> Iterator[None]:
+    """Any call to a scheduler may be the one that finds it gone, each with an error of its own."""
+    try:
+        yield
+    except (CancelledError, OSError) as error:  # dask's CommClosedError is an OSError
+        reason = f"{type(error).__name__}: {error}".split("\n")[0]
+        raise StageError(
+            f"lost the dask scheduler ({reason}); start it, run the same again"
+        ) from error
+
+
+def _finished(client: Any, running: Iterable[Any]) -> set[Any]:
+    """The futures that ended, after a wait of at most ``POLL_SECONDS``."""
+    from distributed import wait
+
+    try:
+        with client.as_current():
+            return wait(list(running), POLL_SECONDS, "FIRST_COMPLETED").done
+    except TimeoutError:
+        return set()
+
+
+def _outcome(future: Any) -> tuple[Receipt | None, BaseException | None]:
+    """What a finished task returned, or why it did not run."""
+    failure = future.exception()
+    if isinstance(failure, CancelledError):
+        raise failure
+    return (None, failure) if failure is not None else (future.result(), None)
 
 
 def local_settings(threads: int) -> dict[str, object]:

@@ -8,13 +8,16 @@ import subprocess
 import sys
 import threading
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 
 from express50.errors import ConfigError, StageError
 from express50.ledger import Ledger
+from express50.pool import Pool
 from express50.progress import format_rate
 from express50.runner import run_stage, select_items
+from express50.work import Task
 from tests.faults import toy
 from tests.faults.toy import make_dataset, run_toy, tree
 
@@ -202,6 +205,20 @@ def test_lost_scheduler_is_one_error_and_what_is_done_is_kept(tmp_path):
         )
     timer.join()
     assert run_toy(dataset, seconds=0.001).ok
+
+
+@pytest.mark.parametrize("call", ["nthreads", "submit"])
+def test_whichever_call_finds_the_scheduler_gone_the_error_is_the_same(call):
+    from distributed.comm import CommClosedError
+
+    client = Mock()
+    client.nthreads.return_value = {"worker": 1}
+    getattr(client, call).side_effect = CommClosedError("in <TCP (closed)>: reset by peer")
+    pool = Pool(scheduler="tcp://gone:8786")
+    pool._client = client
+    task = Task(toy.STAGE, toy.Dataset(Path("data")), "item", toy.ToyConfig(), "f" * 64)
+    with pytest.raises(StageError, match="lost the dask scheduler .*reset by peer"):
+        pool.run([task, task], settle=Mock(), tick=Mock())
 
 
 def test_bar_on_a_terminal_shows_count_rate_and_time_left(tmp_path):
