@@ -82,7 +82,7 @@ def measure_matte(dataset: Dataset, truth: Truth, out: Path | None = None) -> di
     """Mean absolute alpha error over whole images, and over the truth's uncertain rim alone."""
     whole, rim, rows, names = [], [], [], []
     for subject, expression, frame, camera in sampled_views(dataset, truth):
-        path = dataset.item_dir("matte", f"{subject}/{camera.id}") / f"{expression}.png"
+        path = dataset.matte_file(subject, expression, camera.id)
         if not path.is_file():
             continue
         alpha = read_image(path).astype(np.float64) / 255.0

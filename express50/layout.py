@@ -58,6 +58,10 @@ class Dataset:
             )
         return {subject: Path(table[subject]) for subject in sorted(table)}
 
+    def matte_file(self, subject: str, expression: str, camera: str) -> Path:
+        """8-bit opacity of one peak frame."""
+        return self.item_dir("matte", f"{subject}/{camera}") / f"{expression}.png"
+
     def labels_file(self, subject: str) -> Path:
         """Append-only label events of one subject."""
         return self.root / "labels" / f"{subject}.jsonl"

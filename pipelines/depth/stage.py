@@ -46,7 +46,7 @@ def inputs(dataset: Dataset, item: str, config: DepthConfig) -> dict[str, Path |
         "frame": str(read_peaks(dataset, subject)[expression]),
     }
     for camera in read_cameras_of(dataset, subject):
-        path = _matte_path(dataset, subject, camera, expression)
+        path = dataset.matte_file(subject, expression, camera)
         if path.is_file():
             found[f"matte {camera}"] = path
     track = _track_path(dataset, subject)
@@ -85,10 +85,6 @@ def run(dataset: Dataset, item: str, config: DepthConfig, out: Path) -> dict:
     return _metrics(surface.numbers, seen, track, extent, dropped)
 
 
-def _matte_path(dataset: Dataset, subject: str, camera: str, expression: str) -> Path:
-    return dataset.item_dir("matte", f"{subject}/{camera}") / f"{expression}.png"
-
-
 def _track_path(dataset: Dataset, subject: str) -> Path:
     return dataset.item_dir("track", subject) / "track.npz"
 
@@ -125,7 +121,7 @@ def _read_pair(
     dataset: Dataset, subject: str, camera_id: str, expression: str, frame: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Undistorted frame (H, W, 3) uint8 and alpha (H, W) float32."""
-    path = _matte_path(dataset, subject, camera_id, expression)
+    path = dataset.matte_file(subject, expression, camera_id)
     if not path.is_file():
         raise StageError("it has no matte")
     matte = read_image(path)

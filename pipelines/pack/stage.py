@@ -189,7 +189,7 @@ def _pack_sample(
     if expression not in subject.tracked:
         return "it is not tracked"
     camera, frame = subject.cameras[camera_id], subject.peaks[expression]
-    matte_path = dataset.item_dir("matte", f"{subject.name}/{camera_id}") / f"{expression}.png"
+    matte_path = dataset.matte_file(subject.name, expression, camera_id)
     folder = dataset.item_dir("depth", f"{subject.name}/{expression}")
     if not matte_path.is_file():
         return "it has no matte"

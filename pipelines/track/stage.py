@@ -200,8 +200,7 @@ def _distances(dataset: Dataset, subject: str, target: Target) -> list:
     """
     found = []
     for camera_id, camera in read_cameras_of(dataset, subject).items():
-        folder = dataset.item_dir("matte", f"{subject}/{camera_id}")
-        path = folder / f"{target.observation.expression}.png"
+        path = dataset.matte_file(subject, target.observation.expression, camera_id)
         if not path.is_file():
             continue
         alpha = read_image(path)
