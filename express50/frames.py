@@ -205,6 +205,28 @@ def _cameras_cached(path: Path, version: tuple[int, ...]) -> dict[str, Camera]:
     return {name: cameras[name] for name in sorted(cameras)}
 
 
+def read_gains(dataset: Dataset, subject: str) -> dict[str, np.ndarray]:
+    """Linear light (3,) of each camera over that of the rig's mean; none where nothing told it.
+
+    Raises:
+        FormatError: the file is not {camera: [red, green, blue]} with numbers above 0.
+    """
+    path = dataset.item_dir("calibrate", subject) / "gains.json"
+    if not path.is_file():
+        return {}
+    try:
+        gains = {name: np.array(row, float) for name, row in json.loads(path.read_text()).items()}
+    except (ValueError, TypeError, AttributeError) as error:
+        raise FormatError(f"{path}: not camera gains ({error}); calibrate again") from error
+    for name, gain in gains.items():
+        if gain.shape != (3,) or not np.isfinite(gain).all() or (gain <= 0).any():
+            raise FormatError(
+                f"{path}: {name} is {gain.tolist()}, expected three numbers above 0; "
+                "calibrate again"
+            )
+    return gains
+
+
 def read_peaks(dataset: Dataset, subject: str) -> dict[str, int]:
     """Peak frame (decode index) of each expression.
 

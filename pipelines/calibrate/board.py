@@ -7,7 +7,7 @@ pixel); OpenCV reports them from that pixel's centre.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -179,11 +179,13 @@ def read_observations(
     files: Mapping[str, Iterable[Path]],
     sizes: Mapping[str, tuple[int, int]],
     limit: int,
+    look: Callable[[str, str, np.ndarray, np.ndarray, np.ndarray], None] | None = None,
 ) -> Observations:
     """Detect the board in each camera's `files`; files of one name were taken at one time.
 
     `limit` images at most are read a camera, evenly spaced over all names (0 = all). An image
     whose (width, height) is not `sizes[camera]` is an error: its pixels are not the footage's.
+    `look` is shown camera, frame, image, ids and pixels of each, as images are read only once.
     """
     by_name = {camera: {path.stem: path for path in paths} for camera, paths in files.items()}
     names = sorted(set().union(*by_name.values()))
@@ -199,7 +201,10 @@ def read_observations(
                     f"of {camera} is {sizes[camera][0]}x{sizes[camera][1]}; record the board "
                     "with the settings of the capture"
                 )
-            found.append((camera, name, *detect_corners(image, detector, board)))
+            ids, pixels = detect_corners(image, detector, board)
+            found.append((camera, name, ids, pixels))
+            if look is not None:
+                look(camera, name, image, ids, pixels)
     return gather(found, by_name)
 
 

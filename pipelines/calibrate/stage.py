@@ -13,6 +13,7 @@ from express50.layout import Dataset
 from express50.rigs.world import check_meeting
 from express50.stage import Stage
 from pipelines.calibrate.board import board_from_table, board_points, read_observations
+from pipelines.calibrate.colour import Palette
 from pipelines.calibrate.config import PRESETS, CalibrateConfig
 from pipelines.calibrate.moved import footage_metrics, look_at_footage
 from pipelines.calibrate.pictures import draw_residuals, draw_rig
@@ -37,7 +38,10 @@ def inputs(dataset: Dataset, item: str, config: CalibrateConfig) -> dict[str, Pa
 
 
 def run(dataset: Dataset, item: str, config: CalibrateConfig, out: Path) -> dict:
-    """Write cameras.json and the pictures of one subject; see CONVENTIONS for the world."""
+    """Write cameras.json and the pictures of one subject, and from a board its cameras' gains.
+
+    CONVENTIONS.md says in which world.
+    """
     index = read_index(dataset, item)
     if index.calibration is not None:
         return _run_given(index, config, out)
@@ -99,7 +103,8 @@ def _run_board(index: Index, config: CalibrateConfig, out: Path) -> dict:
     files = {
         name: [index.capture / file for file in table["cameras"].get(name, [])] for name in sizes
     }
-    observations = read_observations(board, files, sizes, config.board_frames)
+    palette = Palette(board)
+    observations = read_observations(board, files, sizes, config.board_frames, palette.look)
     solution = solve_rig(observations, board_points(board), sizes, config)
     write_cameras(out / "cameras.json", solution.cameras)
     (out / "qc").mkdir()
@@ -107,7 +112,8 @@ def _run_board(index: Index, config: CalibrateConfig, out: Path) -> dict:
     draw_rig(out / "qc" / "rig.jpg", solution.cameras, boards)
     draw_residuals(out / "qc" / "residuals.jpg", solution)
     seen = look_at_footage(index, solution.cameras, config.check_moments)
-    return _metrics(solution) | footage_metrics(seen)
+    colour = palette.write(out / "gains.json", sorted(solution.cameras))
+    return _metrics(solution) | {"colour": colour} | footage_metrics(seen)
 
 
 def _metrics(solution: Solution) -> dict:
@@ -132,7 +138,7 @@ def _metrics(solution: Solution) -> dict:
 
 STAGE = Stage(
     name="calibrate",
-    version=2,
+    version=3,
     config=CalibrateConfig,
     presets=PRESETS,
     items=items,

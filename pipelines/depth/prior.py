@@ -9,8 +9,8 @@ import numpy as np
 import open3d as o3d
 
 from express50.cameras import rays
+from express50.raycast import mesh_scene
 from pipelines.depth.grid import Grid, View, sample_image
-from pipelines.depth.sweep import mesh_scene
 
 REACH = (
     0.025  # metres of hull over the tracked mesh up to which it is believed; more is hair, cloth

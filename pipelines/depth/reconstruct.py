@@ -9,6 +9,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from express50.errors import StageError
+from express50.raycast import mesh_scene
 from pipelines.depth.config import DepthConfig
 from pipelines.depth.grid import (
     UNSEEN,
@@ -31,7 +32,7 @@ from pipelines.depth.surface import (
     rim_targets,
     smooth_displacement,
 )
-from pipelines.depth.sweep import grey_images, mesh_scene, sweep_scores, view_weights
+from pipelines.depth.sweep import grey_images, sweep_scores, view_weights
 
 LEVEL_RATIO = 1.47
 COUPLINGS = (1e3, 3e3, 1e4, 2e4)  # per square metre; a gap of 10 mm costs 0.1 at first, 2 at last

@@ -14,13 +14,13 @@ from express50.head.load import load_head
 from express50.images import contact_sheet, read_image, write_depth_png, write_image
 from express50.index import index_path
 from express50.layout import Dataset
+from express50.raycast import mesh_scene
 from express50.stage import Stage
 from pipelines.depth.config import PRESETS, DepthConfig
 from pipelines.depth.grid import View
 from pipelines.depth.prior import Prior, make_prior, matte_agreement
 from pipelines.depth.raycast import DepthView, cast_view, write_ply
 from pipelines.depth.reconstruct import reconstruct
-from pipelines.depth.sweep import mesh_scene
 from pipelines.depth.views import make_view, without_contradiction
 
 UNITS = (0.05, 1.0)  # metres; a head's box outside this range means other units than metres

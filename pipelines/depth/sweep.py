@@ -27,16 +27,6 @@ def grey_images(views: Sequence[View], blur_px: float) -> list[np.ndarray]:
     return greys
 
 
-def mesh_scene(vertices: np.ndarray, faces: np.ndarray) -> o3d.t.geometry.RaycastingScene:
-    """Embree scene of a mesh (V, 3), (F, 3), on one thread."""
-    scene = o3d.t.geometry.RaycastingScene(nthreads=1)
-    scene.add_triangles(
-        o3d.core.Tensor(np.ascontiguousarray(vertices, np.float32)),
-        o3d.core.Tensor(np.ascontiguousarray(faces, np.uint32)),
-    )
-    return scene
-
-
 def view_weights(
     views: Sequence[View],
     vertices: np.ndarray,

@@ -12,7 +12,7 @@ import numpy as np
 from express50.cameras import Camera
 from express50.errors import CaptureError, FormatError, StageError
 from express50.exclusions import exclusion_reason
-from express50.frames import read_cameras_of, read_frame, read_peaks
+from express50.frames import read_cameras_of, read_frame, read_gains, read_peaks
 from express50.images import (
     DEPTH_UNIT_M,
     contact_sheet,
@@ -21,6 +21,7 @@ from express50.images import (
     encode_png,
     read_depth_png,
     read_image,
+    scale_light,
     write_image,
 )
 from express50.index import index_path, read_index
@@ -39,10 +40,11 @@ QC_SAMPLES = 12
 
 @dataclass(frozen=True)
 class Subject:
-    """What all samples of a subject share: cameras, peaks, track arrays by expression, and meta."""
+    """What a subject's samples share: cameras, gains, peaks, tracks by expression, and meta."""
 
     name: str
     cameras: dict[str, Camera]
+    gains: dict[str, np.ndarray]
     peaks: dict[str, int]
     labels: dict[str, dict]
     tracked: dict[str, dict]
@@ -65,6 +67,7 @@ def inputs(dataset: Dataset, item: str, config: PackConfig) -> dict[str, Path | 
         found[f"{subject} index"] = index_path(dataset, subject)
         parts = {
             "calibrate": dataset.item_dir("calibrate", subject) / "cameras.json",
+            "gains": dataset.item_dir("calibrate", subject) / "gains.json",
             "align": dataset.item_dir("align", subject) / "peaks.json",
             "track": dataset.item_dir("track", subject) / "track.npz",
             "matte": dataset.item_dir("matte", subject),
@@ -157,7 +160,8 @@ def _read_subject(dataset: Dataset, name: str) -> Subject:
         "session": index.meta.get("session"),
     }
     cameras = read_cameras_of(dataset, name)
-    return Subject(name, cameras, peaks, labels, tracked, vertices, meta)
+    gains = read_gains(dataset, name)
+    return Subject(name, cameras, gains, peaks, labels, tracked, vertices, meta)
 
 
 def _pack_group(
@@ -206,6 +210,9 @@ def _pack_sample(
     crop = head_crop(camera, subject.vertices[expression], alpha, config.margin, config.hair)
     if isinstance(crop, str):
         return crop
+    gain = subject.gains.get(camera_id, np.ones(3)) if config.even_colour else np.ones(3)
+    if (gain != 1).any():
+        rgb = scale_light(rgb, 1.0 / gain)
     small, known = cut_depth(depth, valid, crop, config.size)
     members = _encode_rgb(cut_image(rgb, crop, config.size), config.profile)
     members["alpha.png"] = encode_png(cut_image(alpha, crop, config.size))
@@ -215,6 +222,7 @@ def _pack_sample(
         "K": view.K.tolist(),
         "cam_from_world": camera.cam_from_world.tolist(),
         "camera": camera_id,
+        "colour_gain": gain.tolist(),
         "crop": {"x0": crop.x0, "y0": crop.y0, "side": crop.side},
         "depth_scale_m": DEPTH_UNIT_M,
         "expression": expression,
@@ -297,7 +305,7 @@ def _write_picture(out: Path, reader: ShardReader) -> float:
 
 STAGE = Stage(
     name="pack",
-    version=3,
+    version=4,
     config=PackConfig,
     presets=PRESETS,
     items=items,

@@ -15,6 +15,7 @@ import open3d as o3d
 
 from express50.cameras import Camera, resized
 from express50.head.model import HeadModel
+from express50.raycast import mesh_scene
 
 # Head outlines count as about this many independent points a view.
 EFFECTIVE_POINTS = 24
@@ -199,11 +200,7 @@ def _window(vertices: np.ndarray, camera: Camera) -> Camera | None:
 
 def _mask_distance(vertices: np.ndarray, faces: np.ndarray, camera: Camera) -> np.ndarray:
     """Distance (H, W) of each pixel inside the mesh's mask to the mask's edge; 0 outside."""
-    scene = o3d.t.geometry.RaycastingScene(nthreads=1)
-    scene.add_triangles(
-        o3d.core.Tensor(np.ascontiguousarray(vertices, dtype=np.float32)),
-        o3d.core.Tensor(np.ascontiguousarray(faces, dtype=np.uint32)),
-    )
+    scene = mesh_scene(vertices, faces)
     rays = o3d.t.geometry.RaycastingScene.create_rays_pinhole(
         intrinsic_matrix=o3d.core.Tensor(camera.K),
         extrinsic_matrix=o3d.core.Tensor(camera.cam_from_world),

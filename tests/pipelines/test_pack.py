@@ -12,8 +12,9 @@ from scipy.ndimage import minimum_filter
 
 from express50.cameras import pinhole_camera, project, unproject
 from express50.errors import StageError
-from express50.images import read_depth_png, write_image
+from express50.images import read_depth_png, srgb_to_linear, write_image
 from express50.layout import Dataset
+from express50.publish import write_json
 from express50.shards import ShardReader
 from express50.shards_write import verify
 from express50.transforms import look_at
@@ -242,6 +243,31 @@ def test_lossless_profile_keeps_pixels(dataset, tmp_path):
     reader = ShardReader(tmp_path)
     assert "rgb.png" in reader.entries[0].members
     assert reader.sample(0)["rgb"].shape == (64, 64, 3)
+
+
+def test_what_cameras_make_differently_of_light_is_divided_out(dataset, packed, tmp_path):
+    name = ShardReader(packed[0]).select(subjects=["S001"]).sample(0)["meta"]["camera"]
+    gains = dataset.item_dir("calibrate", "S001") / "gains.json"
+    write_json(gains, {name: [1.25, 1.0, 1.0]})
+    try:
+        for even in (True, False):
+            config = PackConfig(size=64, profile="lossless", even_colour=even)
+            (tmp_path / str(even)).mkdir()
+            PACK.run(dataset, "shards", config, tmp_path / str(even))
+    finally:
+        gains.unlink()
+    evened, raw = (
+        ShardReader(tmp_path / str(even)).select(subjects=["S001"], cameras=[name]).sample(0)
+        for even in (True, False)
+    )
+    assert evened["meta"]["colour_gain"] == [1.25, 1, 1] and raw["meta"]["colour_gain"] == [1, 1, 1]
+    assert (evened["rgb"][..., 1:] == raw["rgb"][..., 1:]).all()
+    red = raw["rgb"][..., 0].astype(np.float64)
+    ratio = (
+        srgb_to_linear(evened["rgb"][..., 0] / 255.0)[red > 60]
+        / srgb_to_linear(red / 255)[red > 60]
+    )
+    assert abs(np.median(ratio) - 0.8) < 0.02
 
 
 def test_depth_stage_drops_a_bad_camera_and_reports_it(tmp_path):

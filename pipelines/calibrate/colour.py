@@ -1,0 +1,232 @@
+"""How much brighter each camera is than the others, a channel, from the board's white paper.
+
+Matt paper sends much the same light everywhere, so what one camera makes of a square at one moment,
+against what the others make of it, is its gain. Faces were tried instead and told less: their gloss
+moves with the camera by more than gains differ (docs/LOG.md).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from scipy.sparse.csgraph import connected_components
+
+from express50.images import srgb_to_linear
+from express50.publish import write_json
+from pipelines.calibrate.board import Board, opencv_board
+
+LEAST_AREA_PX = 60.0
+"""Area of a white square below which its edges' blur reaches its middle."""
+WHITE_SHARE = 0.3
+"""Brightest part of a square that is surely paper: the marker leaves more than that."""
+LEAST_CONTRAST = 2.0
+"""Linear light of a square's paper over its ink, under which something else is seen."""
+DARK, BRIGHT = 12, 245
+"""8-bit levels between which a pixel tells light: below is noise, above is clipped."""
+LEAST_SHARED = 12
+"""Squares that two cameras must see together to be tied."""
+ROUNDS = 12
+LEAST_SPREAD = 0.003  # of log light; keeps weights finite where all cameras agree
+
+
+@dataclass(frozen=True)
+class White:
+    """Linear light (3,) of a white square of the board in one camera at one moment."""
+
+    camera: str
+    frame: str
+    square: int
+    light: tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Gains:
+    """What cameras make of the same light.
+
+    Attributes:
+        gain: (C, 3) linear light of a camera over the cameras' mean (geometric); 1 where nothing
+            ties a camera to the others.
+        tied: (C,) bool, whether the gain was measured.
+        before: median departure of a square's light from its mean over cameras, percent; NaN
+            where nothing was seen twice.
+        after: the same once the gains are divided out.
+    """
+
+    gain: np.ndarray
+    tied: np.ndarray
+    before: float
+    after: float
+
+
+class Palette:
+    """Collects what cameras make of the board's white squares while its images are read."""
+
+    def __init__(self, board: Board) -> None:
+        self.squares = white_squares(board)
+        self.whites: list[White] = []
+
+    def look(
+        self, camera: str, frame: str, image: np.ndarray, ids: np.ndarray, pixels: np.ndarray
+    ) -> None:
+        """Take in one image (H, W, 3) uint8 with its corners: ids (N,), pixels (N, 2)."""
+        seen = see_white(image, ids, pixels, self.squares)
+        self.whites += [White(camera, frame, square, light) for square, light in seen.items()]
+
+    def write(self, path: Path, cameras: Sequence[str]) -> dict[str, object]:
+        """Write the gains of the cameras that the board ties together; returns metrics."""
+        gains = gains_of(self.whites, cameras)
+        told = [name for name, tied in zip(cameras, gains.tied, strict=True) if tied]
+        rows = gains.gain[gains.tied]
+        write_json(path, {n: row.round(5).tolist() for n, row in zip(told, rows, strict=True)})
+        known = bool(told)
+        return {
+            "spread_percent": round(gains.before, 3) if known else None,
+            "spread_evened_percent": round(gains.after, 3) if known else None,
+            "squares": len(self.whites),
+            "untold": sorted(set(cameras) - set(told)),
+        }
+
+
+def white_squares(board: Board) -> dict[int, np.ndarray]:
+    """Ids (4,) of the inner corners around each white square, by the number of its marker."""
+    side, across, down = board.square_length_m, board.squares_x - 1, board.squares_y - 1
+    made = opencv_board(board)
+    found = {}
+    for number, marker in zip(made.getIds().ravel(), made.getObjPoints(), strict=True):
+        column, row = np.floor(np.asarray(marker)[:, :2].mean(0) / side).astype(int)
+        if 1 <= column < across and 1 <= row < down:
+            first = (row - 1) * across + column - 1
+            found[int(number)] = np.array([first, first + 1, first + 1 + across, first + across])
+    return found
+
+
+def see_white(
+    image: np.ndarray, ids: np.ndarray, pixels: np.ndarray, squares: Mapping[int, np.ndarray]
+) -> dict[int, tuple[float, float, float]]:
+    """Linear light of the squares' paper in an image (H, W, 3) uint8, by square.
+
+    Args:
+        image: sRGB, as recorded.
+        ids: (N,) detected inner corners.
+        pixels: (N, 2) where they are, first pixel's corner at the origin.
+        squares: from :func:`white_squares`.
+    """
+    place = dict(zip(ids.tolist(), pixels, strict=True))
+    found = {}
+    for number, corners in squares.items():
+        if all(int(corner) in place for corner in corners):
+            light = _paper(image, np.array([place[int(corner)] for corner in corners]))
+            if light is not None:
+                found[number] = light
+    return found
+
+
+def _paper(image: np.ndarray, corners: np.ndarray) -> tuple[float, float, float] | None:
+    """Light of the brightest part of a square with corners (4, 2); None where it cannot tell."""
+    if cv2.contourArea(corners.astype(np.float32)) < LEAST_AREA_PX:
+        return None
+    middle = corners.mean(0)
+    inner = middle + 0.9 * (corners - middle)  # the edge is mixed with black squares
+    low = np.floor(inner.min(0)).astype(int)
+    high = np.ceil(inner.max(0)).astype(int)
+    if (low < 0).any() or high[0] > image.shape[1] or high[1] > image.shape[0]:
+        return None
+    part = image[low[1] : high[1], low[0] : high[0]]
+    mask = np.zeros(part.shape[:2], np.uint8)
+    cv2.fillConvexPoly(mask, np.rint(inner - low - 0.5).astype(np.int32), 1)
+    levels = part[mask > 0]
+    order = np.argsort(levels.sum(1, dtype=np.int32), kind="stable")
+    paper = levels[order[-max(1, round(WHITE_SHARE * len(levels))) :]]
+    ink = levels[order[: max(1, round(0.1 * len(levels)))]]
+    if paper.min() < DARK or paper.max() > BRIGHT:
+        return None
+    light = _LINEAR[paper].mean(0)
+    if light.mean() < LEAST_CONTRAST * _LINEAR[ink].mean():
+        return None
+    return float(light[0]), float(light[1]), float(light[2])
+
+
+def gains_of(whites: Sequence[White], cameras: Sequence[str]) -> Gains:
+    """Gains of some cameras from what they made of the board's white squares."""
+    number = {name: i for i, name in enumerate(cameras)}
+    seen = [white for white in whites if white.camera in number]
+    points = {key: i for i, key in enumerate(sorted({(w.frame, w.square) for w in seen}))}
+    light = np.full((len(points), len(cameras), 3), np.nan)
+    for white in seen:
+        light[points[white.frame, white.square], number[white.camera]] = white.light
+    return fit_gains(light)
+
+
+def fit_gains(light: np.ndarray) -> Gains:
+    """Gains of cameras from linear light (N, C, 3) of the same N patches; NaN where not seen.
+
+    Least squares of log light on a level a patch and a gain a camera, reweighted by Cauchy's loss,
+    as reflections move with the camera. The patches' levels are eliminated, which leaves one
+    equation a camera.
+
+    Raises:
+        ValueError: the shape is another, or light is zero, negative or infinite.
+    """
+    if light.ndim != 3 or light.shape[2] != 3:
+        raise ValueError(f"light has shape {light.shape}, expected (N, C, 3)")
+    if (light <= 0).any() or np.isinf(light).any():
+        raise ValueError("light must be above 0 and finite, or NaN where a patch is not seen")
+    seen = np.isfinite(light).all(-1)
+    seen = seen & (seen.sum(1) >= 2)[:, None]
+    tied = _tied(seen)
+    weights = (seen & tied).astype(np.float64)
+    value = np.log(np.where(seen[..., None], light, 1.0))
+    gain = np.zeros((len(tied), 3))
+    for _ in range(ROUNDS):
+        gain = _solve(value, weights * _trust(value - gain, weights), tied)
+    return Gains(np.exp(gain), tied, _spread(value, weights), _spread(value - gain, weights))
+
+
+def _tied(seen: np.ndarray) -> np.ndarray:
+    """The largest set (C,) of cameras that shared patches (N, C) tie together."""
+    common = seen.T.astype(np.int64) @ seen
+    _, group = connected_components(common >= LEAST_SHARED, directed=False)
+    sizes = np.bincount(group, minlength=1)
+    return (group == sizes.argmax()) & (sizes.max(initial=0) >= 2)
+
+
+def _residuals(value: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Log light (N, C, 3) less the weighted mean of each patch."""
+    total = np.maximum(weights.sum(1), 1e-12)[:, None]
+    return value - ((weights[..., None] * value).sum(1) / total)[:, None]
+
+
+def _trust(value: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Cauchy weights (N, C) of log light without the gains."""
+    length = np.linalg.norm(_residuals(value, weights), axis=-1)
+    used = length[weights > 0]
+    scale = max(float(np.median(used)), LEAST_SPREAD) if used.size else 1.0
+    return 1.0 / (1.0 + (length / (2.0 * scale)) ** 2)
+
+
+def _solve(value: np.ndarray, weights: np.ndarray, tied: np.ndarray) -> np.ndarray:
+    """Log gains (C, 3) with mean 0 over the tied cameras, 0 for the others."""
+    gain = np.zeros((len(tied), 3))
+    if not tied.any():
+        return gain
+    total = np.maximum(weights.sum(1), 1e-12)
+    matrix = np.diag(weights.sum(0)) - weights.T @ (weights / total[:, None])
+    right = (weights[..., None] * _residuals(value, weights)).sum(0)
+    # One gain for all changes nothing, so that their mean is held.
+    held = matrix[np.ix_(tied, tied)] + np.trace(matrix) / tied.sum()
+    gain[tied] = np.linalg.solve(held, right[tied])
+    gain[tied] -= gain[tied].mean(0)
+    return gain
+
+
+def _spread(value: np.ndarray, weights: np.ndarray) -> float:
+    """Median departure of a patch's light from its mean over cameras, percent."""
+    used = np.abs(_residuals(value, weights))[weights > 0]
+    return float(100 * np.expm1(np.median(used))) if used.size else float("nan")
+
+
+_LINEAR = srgb_to_linear(np.arange(256) / 255.0).astype(np.float32)
