@@ -13,6 +13,8 @@ which favours them; ``guided_filter`` of the soft key by the frame, and PyMattin
 sum in thousands, ``mse`` is times 1e4 and ``gradient_error`` the summed squared difference of
 Gaussian gradients (Rhemann et al. 2009), all means over pictures. ``*_ratio_to_soft_key_rim``
 count the pixels within 8 of soft ones alone: no shadow on the backdrop, no spot inside the subject.
+``composite_error`` is that of the subject's light before black in soft pixels, times 1000, with its
+own colours estimated as `pack` does; ``composite_error_footage`` with the frame's colours.
 The last line is one JSON object.
 """
 
@@ -34,9 +36,11 @@ from express50.adapters import undistort_image, undistorted_mask
 from express50.cameras import pinhole
 from express50.config import resolve_config
 from express50.frames import read_frame, read_plate
+from express50.images import srgb_to_linear
 from express50.layout import Dataset
 from express50.twin.truth import Truth
 from pipelines.matte import STAGE
+from pipelines.matte.foreground import own_colours
 from pipelines.matte.key import dilated, eroded
 from pipelines.matte.keyer import Keyer
 from pipelines.matte.plate import exposed, exposure_gain
@@ -50,13 +54,17 @@ Rows = dict[str, list[dict[str, float]]]
 
 @dataclass(frozen=True, kw_only=True)
 class Picture:
-    """Frame and plate (H, W, 3) uint8, pixels with footage (H, W) and true alpha (H, W)."""
+    """Frame and plate (H, W, 3) uint8, pixels with footage (H, W) and true alpha (H, W).
+
+    `front` (H, W, 3) is the subject's part of the frame's light, where that is known.
+    """
 
     name: str
     frame: np.ndarray
     plate: np.ndarray
     valid: np.ndarray
     true: np.ndarray
+    front: np.ndarray | None = None
 
 
 def main() -> int:
@@ -114,7 +122,26 @@ def measured(
 def _add(rows: Rows, name: str, alpha: np.ndarray, picture: Picture, seconds: float) -> None:
     row = errors(alpha, picture.true)
     row["seconds_per_megapixel"] = 1e6 * seconds / alpha.size
+    if picture.front is not None:
+        row |= composite_errors(alpha, picture)
     rows.setdefault(name, []).append(row)
+
+
+def composite_errors(alpha: np.ndarray, picture: Picture) -> dict[str, float]:
+    """Error of the subject before black, mean absolute light in soft pixels, times 1000.
+
+    `composite_error` with the subject's own colours as estimated, `composite_error_footage` with
+    the frame's colours.
+    """
+    steps = np.rint(255 * np.clip(alpha, 0, 1)).astype(np.uint8)
+    plate = exposed(picture.plate, exposure_gain(picture.frame, picture.plate))
+    soft = (steps > 0) & (steps < 255) | (picture.true > 0) & (picture.true < 1)
+    found = {}
+    own = own_colours(picture.frame, steps, plate)
+    for name, image in (("composite_error", own), ("composite_error_footage", picture.frame)):
+        light = srgb_to_linear(image / 255.0) * (steps / 255.0)[..., None]
+        found[name] = 1e3 * float(np.abs(light - picture.front)[soft].mean())
+    return found
 
 
 def scenes(size: int) -> Iterator[Picture]:
@@ -122,7 +149,12 @@ def scenes(size: int) -> Iterator[Picture]:
     for scene in make_scenes(size):
         whole = np.ones(scene.alpha.shape, bool)
         yield Picture(
-            name=scene.name, frame=scene.frame, plate=scene.plate, valid=whole, true=scene.alpha
+            name=scene.name,
+            frame=scene.frame,
+            plate=scene.plate,
+            valid=whole,
+            true=scene.alpha,
+            front=scene.front,
         )
 
 

@@ -33,12 +33,16 @@ PLATES = ("plain", "cluttered")
 
 @dataclass(frozen=True, kw_only=True)
 class Scene:
-    """A frame and its clean plate (H, W, 3) uint8, and the true alpha (H, W) float32."""
+    """A frame and its clean plate (H, W, 3) uint8, and the truth.
+
+    True are `alpha` (H, W) float32 and `front` (H, W, 3), the subject's part of the frame's light.
+    """
 
     name: str
     frame: np.ndarray
     plate: np.ndarray
     alpha: np.ndarray
+    front: np.ndarray
 
 
 def make_scenes(size: int) -> Iterator[Scene]:
@@ -65,12 +69,14 @@ def make_scene(hair: str, backdrop: str, size: int, rng: np.random.Generator) ->
     light = 1.0 + 0.2 * cv2.resize(rng.uniform(-1, 1, (4, 4)), (size, size), interpolation=2)
     plate = (plain if backdrop == "plain" else cluttered)(rng, size)
     shown = plate * (1 - _shadow(size))[..., None]
-    frame = _lens(front * light[..., None]) + (1 - alpha[..., None]) * shown
+    seen = _lens(front * light[..., None])
+    frame = seen + (1 - alpha[..., None]) * shown
     return Scene(
         name=f"{hair} {backdrop}",
         frame=exposed(frame * np.array(GAIN), rng),
         plate=exposed(plate, rng),
         alpha=alpha.astype(np.float32),
+        front=seen * np.array(GAIN),
     )
 
 

@@ -18,6 +18,8 @@ class PackConfig:
     """How far beyond the tracked mesh the matte may widen the crop, as a share of its size."""
     profile: Literal["compact", "fast", "lossless"] = "fast"
     """rgb as JPEG q90 4:2:0 (compact), JPEG q95 4:4:4 (fast) or PNG (lossless)."""
+    foreground: bool = True
+    """Where a pixel mixes subject and background, store the subject's own colour alone."""
     even_colour: bool = True
     """Divide out what the cameras make differently of the same light, where calibration told it."""
     min_confidence: float = 0.0

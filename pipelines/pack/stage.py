@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 
 import cv2
@@ -12,7 +13,7 @@ import numpy as np
 from express50.cameras import Camera
 from express50.errors import CaptureError, FormatError, StageError
 from express50.exclusions import exclusion_reason
-from express50.frames import read_cameras_of, read_frame, read_gains, read_peaks
+from express50.frames import read_cameras_of, read_frame, read_gains, read_peaks, read_plate
 from express50.images import (
     DEPTH_UNIT_M,
     contact_sheet,
@@ -30,9 +31,11 @@ from express50.publish import write_json
 from express50.shards import ShardReader
 from express50.shards_write import PackedSample, ShardWriter, sample_key, write_manifest
 from express50.stage import Stage
+from pipelines.matte.foreground import own_colours
+from pipelines.matte.plate import exposed, exposure_gain
 from pipelines.pack.card import split_subjects, write_card
 from pipelines.pack.config import PRESETS, PackConfig
-from pipelines.pack.crop import crop_pinhole, cut_depth, cut_image, head_crop
+from pipelines.pack.crop import Crop, crop_pinhole, cut_depth, cut_image, head_crop
 
 PARAMETERS = ("expression", "neck", "jaw", "eyes", "R", "t")
 QC_SAMPLES = 12
@@ -65,6 +68,9 @@ def inputs(dataset: Dataset, item: str, config: PackConfig) -> dict[str, Path | 
             found[f"{subject} excluded"] = reason
             continue
         found[f"{subject} index"] = index_path(dataset, subject)
+        if config.foreground:
+            index = read_index(dataset, subject)
+            found |= {f"{subject} {c} plate": index.capture / p for c, p in index.plates.items()}
         parts = {
             "calibrate": dataset.item_dir("calibrate", subject) / "cameras.json",
             "gains": dataset.item_dir("calibrate", subject) / "gains.json",
@@ -210,12 +216,17 @@ def _pack_sample(
     crop = head_crop(camera, subject.vertices[expression], alpha, config.margin, config.hair)
     if isinstance(crop, str):
         return crop
+    picture, matte = cut_image(rgb, crop, config.size), cut_image(alpha, crop, config.size)
+    if config.foreground:
+        picture = own_colours(
+            picture, matte, _behind(dataset, subject.name, camera_id, rgb, crop, config.size)
+        )
     gain = subject.gains.get(camera_id, np.ones(3)) if config.even_colour else np.ones(3)
     if (gain != 1).any():
-        rgb = scale_light(rgb, 1.0 / gain)
+        picture = scale_light(picture, 1.0 / gain)
     small, known = cut_depth(depth, valid, crop, config.size)
-    members = _encode_rgb(cut_image(rgb, crop, config.size), config.profile)
-    members["alpha.png"] = encode_png(cut_image(alpha, crop, config.size))
+    members = _encode_rgb(picture, config.profile)
+    members["alpha.png"] = encode_png(matte)
     members["depth.png"] = encode_png(depth_to_uint16(small, known))
     view = crop_pinhole(camera, crop, config.size)
     meta = subject.meta | {
@@ -236,6 +247,21 @@ def _pack_sample(
     text = json.dumps(meta, sort_keys=True, separators=(",", ":"), allow_nan=False)
     members["meta.json"] = text.encode()
     return PackedSample(subject.name, expression, camera_id, members), meta
+
+
+def _behind(
+    dataset: Dataset, subject: str, camera_id: str, frame: np.ndarray, crop: Crop, size: int
+) -> np.ndarray | None:
+    """The crop of the camera's own plate as the frame exposes it, in 8-bit steps; None without."""
+    plate = _plate(dataset, subject, camera_id)
+    if plate is None:
+        return None
+    return exposed(cut_image(plate, crop, size), exposure_gain(frame, plate))
+
+
+@lru_cache(maxsize=32)  # 25 MB each at 4K; every expression asks for those of all cameras
+def _plate(dataset: Dataset, subject: str, camera_id: str) -> np.ndarray | None:
+    return read_plate(dataset, subject, camera_id)
 
 
 def _encode_rgb(image: np.ndarray, profile: str) -> dict[str, bytes]:
