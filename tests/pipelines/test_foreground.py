@@ -35,7 +35,7 @@ def test_the_subjects_colour_comes_back_whatever_stands_behind(subject, plate):
     own = own_colours(frame, alpha, np.broadcast_to(plate, frame.shape))
     # In light before black: next to a bright plate, rounding alone is a dark subject's colour.
     off = srgb_to_linear(own / 255.0) - srgb_to_linear(subject / 255.0)
-    assert np.abs(off * (alpha / 255.0)[..., None]).max() < 0.006
+    assert np.abs(off * (alpha / 255.0)[..., None]).max() < 0.02  # two levels near white
     assert (own[alpha == 0] == frame[alpha == 0]).all()
     assert (own[alpha == 255] == frame[alpha == 255]).all()
 
