@@ -7,11 +7,14 @@ put the origin at the first pixel's centre; OpenGL's cameras look along -z with 
 
 from __future__ import annotations
 
+from typing import TypeVar
+
 import cv2
 import numpy as np
 
 from express50.cameras import Camera
 
+Places = TypeVar("Places")
 FLIP_YZ = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
@@ -47,6 +50,19 @@ def affine_to_opencv(matrix: np.ndarray) -> np.ndarray:
     shifted = np.array(matrix, dtype=np.float64)
     shifted[:, 2] += shifted[:, :2] @ [0.5, 0.5] - 0.5
     return shifted
+
+
+def corner_to_cell(places: Places) -> Places:
+    """Fractional indices, for interpolation, of corner-origin places; cell 0 spans 0 to 1.
+
+    Takes and returns an array or a tensor of any shape.
+    """
+    return places - 0.5  # type: ignore[operator,return-value]
+
+
+def cell_centres(count: int) -> np.ndarray:
+    """Corner-origin places (count,) of the centres of a row of cells."""
+    return np.arange(count) + 0.5
 
 
 def cam_from_world_from_opengl(world_from_cam_gl: np.ndarray) -> np.ndarray:

@@ -3,7 +3,8 @@
 A coarse pass looks at the whole frame (then at turned and smaller windows, only where that finds no
 face); crops about the points found so far are then refined, levelled by the line of the eyes.
 Points are the projections of the 3D landmarks, also where the head hides them: views of several
-cameras can be triangulated. Hidden points come with a low confidence.
+cameras can be triangulated. Points that the head or something before it hides come with a low
+confidence.
 """
 
 from __future__ import annotations
@@ -33,7 +34,8 @@ class Detection:
     Attributes:
         points: (68, 2) pixels, corner origin, iBUG-68 order.
         sigma: (68,) expected error in pixels (the scale of a Laplace distribution).
-        confidence: (68,) in 0..1, the score included.
+        confidence: (68,) in 0..1: the score, times how surely the point is seen, lowered where
+            sigma is large.
         score: in 0..1, how surely a face looks towards the camera: the network's probability,
             lowered where the points are vague. Low for backs of heads and where there is no head.
     """
@@ -41,6 +43,16 @@ class Detection:
     points: np.ndarray
     sigma: np.ndarray
     confidence: np.ndarray
+    score: float
+
+
+@dataclass(frozen=True)
+class _Place:
+    """A face in an image: points (68, 2), sigma and seen (68,), score; see `Detection`."""
+
+    points: np.ndarray
+    sigma: np.ndarray
+    seen: np.ndarray
     score: float
 
 
@@ -58,37 +70,32 @@ def detect(net: LandmarkNet, image: np.ndarray, refinements: int = 3) -> Detecti
     if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8 or 0 in image.shape:
         raise ValueError(f"image is {image.dtype} {image.shape}, expected uint8 (H, W, 3)")
     pyramid = _pyramid(image)
-    points, sigma, score = _coarse(net, pyramid)
+    place = _coarse(net, pyramid)
     for step in range(refinements):
-        window = window_about(points)
+        window = window_about(place.points)
         last = step == refinements - 1
         views = [window, _mirrored(window)] if last else [window]
-        refined = _mean_view(*_run(net, pyramid, views))
-        if refined[2] < KEEP_SHARE * score:
+        refined = _mean_view(_run(net, pyramid, views))
+        if refined.score < KEEP_SHARE * place.score:
             # The crop went astray, as it may on a profile: the wider view knew better.
             break
-        points, sigma, score = refined
-    relative = sigma / (HALF_CONFIDENCE_SHARE * max(face_box(points)[1], 1e-6))
-    return Detection(points, sigma, score / (1.0 + relative**2), score)
+        place = refined
+    relative = place.sigma / (HALF_CONFIDENCE_SHARE * max(face_box(place.points)[1], 1e-6))
+    confidence = place.score * place.seen / (1.0 + relative**2)
+    return Detection(place.points, place.sigma, confidence, place.score)
 
 
-def _coarse(net: LandmarkNet, pyramid: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray, float]:
+def _coarse(net: LandmarkNet, pyramid: list[np.ndarray]) -> _Place:
     """Best of the whole frame; failing that, of quarter turns and of nine smaller windows."""
     height, width = pyramid[0].shape[:2]
     centre, side = np.array([width, height]) / 2, float(max(width, height))
-    groups = [[_window(centre, side, 0.0)]]
-    groups.append([_window(centre, side, turn * np.pi / 2) for turn in (1, 2, 3)])
     offsets = np.array([-0.2, 0.0, 0.2]) * side
-    groups[1] += [_window(centre + [x, y], 0.6 * side, 0.0) for y in offsets for x in offsets]
-    best: tuple[np.ndarray, np.ndarray, float] | None = None
-    for group in groups:
-        points, sigma, score = _run(net, pyramid, group)
-        top = int(np.argmax(score))
-        if best is None or score[top] > best[2]:
-            best = points[top], sigma[top], float(score[top])
-        if best[2] >= FOUND_SCORE:
-            break
-    return best  # type: ignore[return-value]
+    others = [_window(centre, side, turn * np.pi / 2) for turn in (1, 2, 3)]
+    others += [_window(centre + [x, y], 0.6 * side, 0.0) for y in offsets for x in offsets]
+    whole = _run(net, pyramid, [_window(centre, side, 0.0)])[0]
+    if whole.score >= FOUND_SCORE:
+        return whole
+    return max([whole, *_run(net, pyramid, others)], key=lambda place: place.score)
 
 
 def _window(centre: np.ndarray, side: float, angle: float) -> np.ndarray:
@@ -145,31 +152,37 @@ def _sample(pyramid: list[np.ndarray], window: np.ndarray) -> np.ndarray:
     )
 
 
-def _run(
-    net: LandmarkNet, pyramid: list[np.ndarray], windows: list[np.ndarray]
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Points (N, 68, 2) and sigma (N, 68) in image pixels, scores (N,) of windows."""
+def _run(net: LandmarkNet, pyramid: list[np.ndarray], windows: list[np.ndarray]) -> list[_Place]:
+    """What the network finds in windows."""
     crops = torch.from_numpy(np.stack([_sample(pyramid, window) for window in windows]))
-    crops = crops.permute(0, 3, 1, 2).contiguous(memory_format=torch.channels_last)
+    # (N, H, W, 3) seen as (N, 3, H, W) lies in memory as channels-last already.
     with torch.inference_mode():
-        output = net(crops.float() / 255.0)
-    found, sigma = output.points.double().numpy(), output.log_scale.double().exp().numpy()
-    points = np.empty_like(found)
-    for index, window in enumerate(windows):
-        points[index] = found[index] @ window[:, :2].T + window[:, 2]
+        output = net(crops.permute(0, 3, 1, 2).float() / 255.0)
+    scales = output.log_scale.double().exp().numpy()
+    visible = torch.sigmoid(output.seen).double().numpy()
+    scores = torch.sigmoid(output.logit).double().numpy()
+    places = []
+    for window, found, sigma, seen, score in zip(
+        windows, output.points.double().numpy(), scales, visible, scores, strict=True
+    ):
+        points = found @ window[:, :2].T + window[:, 2]
         determinant = np.linalg.det(window[:, :2])
-        sigma[index] *= np.sqrt(abs(determinant))
+        sigma = sigma * np.sqrt(abs(determinant))
         if determinant < 0:
-            points[index], sigma[index] = points[index][MIRROR], sigma[index][MIRROR]
-    sides = np.array([max(face_box(place)[1], 1e-6) for place in points])
-    vague = np.median(sigma, axis=1) / (VAGUE_SHARE * sides)
-    return points, sigma, torch.sigmoid(output.logit).double().numpy() / (1.0 + vague**2)
+            points, sigma, seen = points[MIRROR], sigma[MIRROR], seen[MIRROR]
+        vague = np.median(sigma) / (VAGUE_SHARE * max(face_box(points)[1], 1e-6))
+        places.append(_Place(points, sigma, seen, float(score / (1.0 + vague**2))))
+    return places
 
 
-def _mean_view(
-    points: np.ndarray, sigma: np.ndarray, score: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, float]:
+def _mean_view(places: list[_Place]) -> _Place:
     """Mean of several views of the same place; their spread adds to the expected error."""
+    points = np.stack([place.points for place in places])
     mean = points.mean(0)
     spread = np.linalg.norm(points - mean, axis=2).mean(0)
-    return mean, np.hypot(sigma.mean(0), spread), float(score.mean())
+    return _Place(
+        mean,
+        np.hypot(np.mean([place.sigma for place in places], axis=0), spread),
+        np.mean([place.seen for place in places], axis=0),
+        float(np.mean([place.score for place in places])),
+    )

@@ -1,8 +1,10 @@
 """The landmark network: a small convolutional encoder-decoder with one heat map a point.
 
 Points come from the expectation over softmax heat maps (integral regression, Sun et al. 2018), so
-they are continuous and have gradients everywhere; each has a learned scale of a two-dimensional
-Laplace distribution, from which the confidence follows.
+they are continuous and have gradients everywhere. A small perceptron that sees all of them at once
+then corrects what does not look like a face, as where a heat map was fooled by an occluder, and
+says of each point how far off it may be (the scale of a two-dimensional Laplace distribution) and
+whether it can be seen.
 """
 
 from __future__ import annotations
@@ -14,6 +16,9 @@ import numpy as np
 import torch
 from torch import nn
 from torch.nn import functional
+from torch.nn.utils.fusion import fuse_conv_bn_eval
+
+from express50.adapters import cell_centres, corner_to_cell
 
 CROP = 128
 POINTS = 68
@@ -28,12 +33,14 @@ class Output(NamedTuple):
     Attributes:
         points: (B, 68, 2) crop pixels.
         log_scale: (B, 68) natural logarithm of the Laplace scale in crop pixels.
-        logit: (B,) whether a face looks towards the camera.
-        heat: (B, 68, 32, 32) heat maps before the softmax.
+        seen: (B, 68) logit of whether nothing hides the point.
+        logit: (B,) logit of whether a face looks towards the camera.
+        heat: (B, 68, H / 4, W / 4) heat maps before the softmax.
     """
 
     points: torch.Tensor
     log_scale: torch.Tensor
+    seen: torch.Tensor
     logit: torch.Tensor
     heat: torch.Tensor
 
@@ -50,21 +57,49 @@ class Residual(nn.Module):
         return functional.relu(x + self.second(functional.relu(self.first(x))))
 
 
+class ShapeHead(nn.Module):
+    """Looks at all points of a face together: corrections, error scales, visibility."""
+
+    def __init__(self, features: int, width: int = 192) -> None:
+        super().__init__()
+        self.look = nn.Linear(features, 64)
+        self.first, self.second = nn.Linear(3 * POINTS + 64, width), nn.Linear(width, 4 * POINTS)
+        self.spread = nn.Parameter(torch.zeros(POINTS))
+        nn.init.zeros_(self.second.weight)
+        nn.init.zeros_(self.second.bias)
+
+    def forward(
+        self, points: torch.Tensor, variance: torch.Tensor, features: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Points (B, P, 2), log scales (B, P) and visibility logits (B, P)."""
+        spread = variance.clamp_min(1e-2).log()
+        place = (points - points.mean(1, keepdim=True)) / (0.25 * CROP)
+        look = functional.relu(self.look(features))
+        hidden = functional.relu(self.first(torch.cat([place.flatten(1), 0.3 * spread, look], 1)))
+        out = self.second(hidden).view(-1, 4, POINTS)
+        log_scale = 1.0 + out[:, 2] + self.spread * spread
+        return points + 8.0 * out[:, :2].transpose(1, 2), log_scale.clamp(-2.0, 4.0), out[:, 3]
+
+
 class LandmarkNet(nn.Module):
-    """Maps crops (B, 3, 128, 128) in [0, 1] to landmarks; see `Output`."""
+    """Maps crops (B, 3, 128, 128) in [0, 1] to landmarks; see `Output`.
+
+    Crops of half the size (64, 64) are understood as well; points are in pixels of 128 all the
+    same. Training begins with them, for a quarter of the time.
+    """
 
     def __init__(self) -> None:
         super().__init__()
-        self.stem1, self.stem2 = _conv(3, 16, 5, 2), _conv(16, 24, 3, 2)
-        self.block32 = Residual(24)
-        self.down16, self.block16 = _conv(24, 64, 3, 2), Residual(64)
+        self.stem1, self.stem2 = _conv(3, 16, 5, 2), _conv(16, 32, 3, 2)
+        self.block32 = Residual(32)
+        self.down16, self.block16 = _conv(32, 64, 3, 2), Residual(64)
         self.down8, self.block8 = _conv(64, 96, 3, 2), Residual(96)
         self.down4, self.block4 = _conv(96, 128, 3, 2), Residual(128)
-        self.side4, self.side8, self.side16 = _conv(128, 96, 1), _conv(96, 64, 1), _conv(64, 24, 1)
-        self.mix16, self.mix32 = _conv(64, 64, 3), _conv(24, 48, 3)
+        self.side4, self.side8, self.side16 = _conv(128, 96, 1), _conv(96, 64, 1), _conv(64, 32, 1)
+        self.mix8 = Residual(96)
+        self.mix16, self.mix32 = _conv(64, 64, 3), _conv(32, 48, 3)
         self.heat = nn.Conv2d(48, POINTS, 1)
-        self.scale = nn.Linear(128, POINTS)
-        self.spread = nn.Parameter(torch.zeros(POINTS))
+        self.shape = ShapeHead(128)
         self.face = nn.Linear(128, 1)
 
     def forward(self, crops: torch.Tensor) -> Output:
@@ -76,14 +111,13 @@ class LandmarkNet(nn.Module):
         x16 = self.block16(functional.relu(self.down16(x32)))
         x8 = self.block8(functional.relu(self.down8(x16)))
         x4 = self.block4(functional.relu(self.down4(x8)))
-        pooled = x4.mean((2, 3))
-        y = self.side8(functional.relu(x8 + _twice(self.side4(x4))))
-        y = functional.relu(self.mix16(functional.relu(x16 + _twice(y))))
+        features = x4.mean((2, 3))
+        y = self.mix8(functional.relu(x8 + _twice(self.side4(x4))))
+        y = functional.relu(self.mix16(functional.relu(x16 + _twice(self.side8(y)))))
         y = functional.relu(self.mix32(functional.relu(x32 + _twice(self.side16(y)))))
         heat = self.heat(y)
-        points, variance = _expectation(heat)
-        log_scale = self.scale(pooled) + self.spread * variance.clamp_min(1e-2).log()
-        return Output(points, log_scale.clamp(-2.0, 4.0), self.face(pooled)[:, 0], heat)
+        points, log_scale, seen = self.shape(*_expectation(heat), features)
+        return Output(points, log_scale, seen, self.face(features)[:, 0], heat)
 
 
 def _conv(inputs: int, outputs: int, size: int, stride: int = 1) -> nn.Sequential:
@@ -100,8 +134,8 @@ def _expectation(heat: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """Mean position (B, P, 2) in crop pixels and variance (B, P) of softmax heat maps."""
     batch, points, height, width = heat.shape
     share = functional.softmax(heat.reshape(batch, points, -1), -1).reshape(heat.shape)
-    axis = torch.arange(width, dtype=heat.dtype, device=heat.device)
-    axis = (((axis + 0.5) / width - 0.5) * STRETCH + 0.5) * CROP
+    axis = torch.from_numpy(cell_centres(width) / width).to(heat)
+    axis = ((axis - 0.5) * STRETCH + 0.5) * CROP
     along_x, along_y = share.sum(2), share.sum(3)
     mean = torch.stack([(along_x * axis).sum(-1), (along_y * axis).sum(-1)], -1)
     square = (along_x * axis**2).sum(-1) + (along_y * axis**2).sum(-1)
@@ -114,7 +148,7 @@ def heat_loss(heat: torch.Tensor, points: torch.Tensor) -> torch.Tensor:
     Its gradient is strong from the first step, where that of the expectation is still faint.
     """
     size = heat.shape[-1]
-    cells = ((points / CROP - 0.5) / STRETCH + 0.5) * size - 0.5
+    cells = corner_to_cell(((points / CROP - 0.5) / STRETCH + 0.5) * size)
     cells = cells.clamp(0.0, size - 1.001)
     low = cells.floor()
     share = cells - low
@@ -143,9 +177,22 @@ def save_network(net: LandmarkNet, path: Path) -> None:
 
 
 def load_network(path: Path = WEIGHTS) -> LandmarkNet:
-    """Read weights written by `save_network`; the network is in evaluation mode."""
+    """Read weights written by `save_network`; the network is ready for evaluation only.
+
+    Batch normalisations are folded into the convolutions before them.
+    """
     net = LandmarkNet()
     with np.load(path, allow_pickle=False) as data:
         state = {key: torch.from_numpy(data[key].astype(np.float32)) for key in data.files}
     net.load_state_dict(state, strict=False)
-    return net.eval().to(memory_format=torch.channels_last)
+    fold(net.eval())
+    return net.to(memory_format=torch.channels_last)
+
+
+def fold(module: nn.Module) -> None:
+    """Fold batch normalisations into convolutions, in place; what is left computes the same."""
+    for name, child in module.named_children():
+        if isinstance(child, nn.Sequential) and isinstance(child[1], nn.BatchNorm2d):
+            setattr(module, name, fuse_conv_bn_eval(child[0], child[1]))
+        else:
+            fold(child)

@@ -1,4 +1,4 @@
-"""Random heads rendered for the training of the landmark detector.
+"""Random heads for the training of the landmark detector.
 
 Domain randomisation on purpose: shapes, skins, hair and light far beyond what is usual, so that the
 detector learns where things are on a face and not how one renderer or one head model paints them.
@@ -9,12 +9,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import open3d as o3d
 import torch
 
 from express50.head.model import HeadModel, landmarks, pose, vertex_normals
+from express50.landmarks.acting import random_parameters
 
-FRAME_SIDE_M = 0.38
 Rng = np.random.Generator
 
 
@@ -29,18 +28,9 @@ class RandomHead:
     gloss: float
 
 
-@dataclass(frozen=True)
-class View:
-    """A rendered view: rgba (S, S, 4) uint8, landmarks (68, 2) pixels, facing: cosine to camera."""
-
-    rgba: np.ndarray
-    points: np.ndarray
-    facing: float
-
-
 def random_head(model: HeadModel, rng: Rng) -> RandomHead:
     """Draw shape, expression, pose, smooth deformation, hair and colours."""
-    draw = _random_parameters(model, rng)
+    draw = random_parameters(model, rng)
     with torch.no_grad():
         vertices = pose(model, **draw)
     vertices = torch.from_numpy(_deform(vertices[0].numpy(), rng))[None]
@@ -52,36 +42,6 @@ def random_head(model: HeadModel, rng: Rng) -> RandomHead:
         normals = vertex_normals(vertices, model.faces)
     gloss = float(rng.uniform(0.0, 0.5))
     return RandomHead(vertices[0].numpy(), normals[0].numpy(), colors, points, gloss)
-
-
-def _random_parameters(model: HeadModel, rng: Rng) -> dict[str, torch.Tensor]:
-    """Random arguments for `pose`, batch of one."""
-    names = model.expression_names
-    shape = rng.normal(size=len(model.shape_names)) * rng.uniform(0.5, 1.4)
-    expression = np.zeros(len(names))
-    if model.unit_expressions:
-        active = rng.choice(len(names), size=rng.integers(0, 9), replace=False)
-        expression[active] = rng.beta(1.0, 1.2, size=active.size)
-        if rng.random() < 0.15:
-            for name in ("eyeBlink_L", "eyeBlink_R"):
-                if name in names:
-                    expression[names.index(name)] = rng.uniform(0.5, 1.0)
-    else:
-        expression = rng.normal(size=len(names))
-    jaw = rng.normal(size=3) * np.array([0.03, 0.03, 0.02])
-    if rng.random() < 0.35:
-        jaw[0] = rng.uniform(0.0, 0.45)
-    gaze = rng.normal(size=2) * np.array([0.2, 0.3])
-    eyes = np.concatenate([gaze, [0.0], gaze, [0.0]])
-    neck = rng.normal(size=3) * 0.15
-
-    def batch(value: np.ndarray) -> torch.Tensor:
-        return torch.from_numpy(value.astype(np.float32))[None]
-
-    return {
-        "shape": batch(shape), "expression": batch(expression),
-        "neck": batch(neck), "jaw": batch(jaw), "eyes": batch(eyes),
-    }  # fmt: skip
 
 
 def _waves(points: np.ndarray, rng: Rng, count: int, low: float, high: float) -> np.ndarray:
@@ -225,110 +185,3 @@ def _color_eyes_and_mouth(
         [1.0, rng.uniform(0.3, 0.8), rng.uniform(0.3, 0.8)]
     )
     colors[region["teeth"]] = rng.uniform(0.5, 1.0) * np.array([1.0, 0.97, rng.uniform(0.8, 1.0)])
-
-
-class HeadScene:
-    """A random head in a ray caster, to be seen from many sides."""
-
-    def __init__(self, model: HeadModel, head: RandomHead) -> None:
-        self.faces = model.faces.numpy()
-        self.head = head
-        self.scene = o3d.t.geometry.RaycastingScene(nthreads=1)
-        self.scene.add_triangles(
-            o3d.core.Tensor(head.vertices), o3d.core.Tensor(self.faces.astype(np.uint32))
-        )
-
-    def render(self, rng: Rng, side: int, turned: bool) -> View:
-        """Render from a random direction; `turned` draws yaw from the full circle."""
-        points = self.head.landmarks
-        K, cam_from_world = _random_camera(points, rng, side, turned)
-        pixels = (points @ cam_from_world[:3, :3].T + cam_from_world[:3, 3]) @ K.T
-        rays = o3d.t.geometry.RaycastingScene.create_rays_pinhole(
-            intrinsic_matrix=o3d.core.Tensor(K),
-            extrinsic_matrix=o3d.core.Tensor(cam_from_world),
-            width_px=side,
-            height_px=side,
-        )
-        rgba = self._shade(rays, rng, side)
-        eye = -cam_from_world[:3, :3].T @ cam_from_world[:3, 3]
-        return View(rgba, pixels[:, :2] / pixels[:, 2:], _facing(points, eye))
-
-    def _shade(self, rays: o3d.core.Tensor, rng: Rng, side: int) -> np.ndarray:
-        """Cast rays and light the hits: rgba (side, side, 4) uint8."""
-        cast = self.scene.cast_rays(rays)
-        distance = cast["t_hit"].numpy()
-        hit = np.isfinite(distance)
-        face = self.faces[cast["primitive_ids"].numpy()[hit]]
-        bary = cast["primitive_uvs"].numpy()[hit]
-        weights = np.stack([1 - bary.sum(1), bary[:, 0], bary[:, 1]], axis=1)[..., None]
-        albedo = (self.head.colors[face] * weights).sum(1)
-        normals = (self.head.normals[face] * weights).sum(1)
-        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-6)
-        rays_hit = rays.numpy()[hit]
-        towards = -rays_hit[:, 3:] / np.linalg.norm(rays_hit[:, 3:], axis=1, keepdims=True)
-        points = rays_hit[:, :3] + rays_hit[:, 3:] * distance[hit][:, None]
-        light = self._light(points, normals, towards, rng)
-        image = np.zeros((side, side, 4), np.uint8)
-        shaded = np.clip(albedo * light[0] + light[1], 0, 1) ** rng.uniform(0.7, 1.4)
-        image[hit, :3] = (255 * shaded).astype(np.uint8)
-        image[hit, 3] = 255
-        return image
-
-    def _light(
-        self, points: np.ndarray, normals: np.ndarray, towards: np.ndarray, rng: Rng
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Diffuse and specular light (N, 3) each of ambient and one to three lamps."""
-        sky = 0.5 + 0.5 * normals @ _unit(rng.normal(size=3))
-        diffuse = rng.uniform(0.1, 0.8) * (0.6 + 0.4 * sky[:, None]) * rng.uniform(0.8, 1.0, 3)
-        specular = np.zeros_like(diffuse)
-        for lamp in range(rng.integers(1, 4)):
-            direction = _unit(rng.normal(size=3) + towards.mean(0) * rng.uniform(0.0, 2.0))
-            color = rng.uniform(0.2, 1.0) * rng.uniform(0.75, 1.0, 3)
-            cosine = np.clip(normals @ direction, 0, None)
-            if lamp == 0 and rng.random() < 0.35:
-                shadow = np.concatenate(
-                    [points + 1e-3 * normals, np.broadcast_to(direction, points.shape)], axis=1
-                )
-                blocked = self.scene.test_occlusions(o3d.core.Tensor(shadow.astype(np.float32)))
-                cosine = cosine * np.where(blocked.numpy(), rng.uniform(0, 0.6), 1.0)
-            half = _unit(direction + towards)
-            shine = np.clip((normals * half).sum(1), 0, None) ** rng.uniform(8, 60)
-            diffuse = diffuse + cosine[:, None] * color
-            specular = specular + self.head.gloss * (shine * (cosine > 0))[:, None] * color
-        return diffuse, specular
-
-
-def _unit(vector: np.ndarray) -> np.ndarray:
-    return vector / np.maximum(np.linalg.norm(vector, axis=-1, keepdims=True), 1e-9)
-
-
-def _facing(points: np.ndarray, eye: np.ndarray) -> float:
-    """Cosine between the face's forward direction and the direction to the camera centre."""
-    across = points[45] - points[36]
-    down = points[8] - points[27]
-    forward = _unit(np.cross(down, across))
-    # Right eye to left eye is +x, brow to chin is -y: (-y) x (+x) = +z.
-    return float(forward @ _unit(eye - points[30]))
-
-
-def _random_camera(
-    points: np.ndarray, rng: Rng, side: int, turned: bool
-) -> tuple[np.ndarray, np.ndarray]:
-    """K (3,3) and cam_from_world (4,4) that frame the whole head, landmarks (68, 3) given."""
-    yaw = rng.uniform(-np.pi, np.pi) if turned else rng.normal() * 0.65
-    pitch = np.clip(rng.normal() * 0.28, -0.8, 0.8)
-    forward = np.array([np.sin(yaw) * np.cos(pitch), np.sin(pitch), np.cos(yaw) * np.cos(pitch)])
-    target = points.mean(0) + np.array([0.0, 0.02, -0.06]) + rng.normal(size=3) * 0.008
-    distance = np.exp(rng.uniform(np.log(0.45), np.log(2.0)))
-    right = _unit(np.cross(np.array([0.0, 1.0, 0.0]), forward))
-    rotation = np.stack([right, -np.cross(forward, right), -forward])
-    roll = rng.normal() * 0.12
-    turn = np.array(
-        [[np.cos(roll), -np.sin(roll), 0], [np.sin(roll), np.cos(roll), 0], [0, 0, 1.0]]
-    )
-    rotation = turn @ rotation
-    cam_from_world = np.eye(4)
-    cam_from_world[:3, :3] = rotation
-    cam_from_world[:3, 3] = -rotation @ (target + distance * forward)
-    focal = side * distance / FRAME_SIDE_M * rng.uniform(0.85, 1.15)
-    return np.array([[focal, 0, side / 2], [0, focal, side / 2], [0, 0, 1.0]]), cam_from_world

@@ -10,6 +10,7 @@ from functools import cache
 import cv2
 import numpy as np
 
+from express50.adapters import cell_centres, corner_to_cell
 from express50.cameras import Camera
 from express50.twin.noise import fractal, make_lattice, noise, random_stream, smoothstep
 from express50.twin.rig import TARGET
@@ -43,8 +44,8 @@ def background(
     az, el = unit_to_spherical(start + reach[:, None] * d)
     room = _room(seed, width)
     height = room.shape[0]
-    x = (az / (2 * np.pi) + 0.5) * width - 0.5
-    y = np.clip((el / (2 * _HIGHEST) + 0.5) * height - 0.5, 0, height - 1.01)
+    x = corner_to_cell((az / (2 * np.pi) + 0.5) * width)
+    y = np.clip(corner_to_cell((el / (2 * _HIGHEST) + 0.5) * height), 0, height - 1.01)
     left, top = np.floor(x), np.floor(y)
     fx, fy = (x - left)[:, None], (y - top)[:, None]
     x0, y0 = left.astype(np.int32), top.astype(np.int32)
@@ -59,8 +60,8 @@ def _room(seed: int, width: int) -> np.ndarray:
     """The room's wall (H, W, 3) float32, by azimuth and elevation from its middle."""
     rng = random_stream(seed, 201)
     height = 2 * round(width * _HIGHEST / (2 * np.pi))
-    az = ((np.arange(width) + 0.5) / width * 2 * np.pi - np.pi).astype(np.float32)
-    el = (((np.arange(height) + 0.5) / height * 2 - 1) * _HIGHEST).astype(np.float32)
+    az = (cell_centres(width) / width * 2 * np.pi - np.pi).astype(np.float32)
+    el = ((cell_centres(height) / height * 2 - 1) * _HIGHEST).astype(np.float32)
     base = np.array([0.17, 0.185, 0.20]) * rng.uniform(0.85, 1.2) * rng.uniform(0.93, 1.07, 3)
     shade = (1 + 0.35 * np.clip(el, -0.8, 0.8))[:, None] * _panels(az, el, make_lattice(rng))
     shade *= _felt(rng, az, el)

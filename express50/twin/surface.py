@@ -6,6 +6,8 @@ import numpy as np
 import open3d as o3d
 import scipy.sparse
 
+from express50.adapters import cell_centres, corner_to_cell
+
 MISS = np.uint32(0xFFFFFFFF)
 
 
@@ -95,8 +97,8 @@ class StarMap:
     def __init__(self, vertices: np.ndarray, faces: np.ndarray, centre: np.ndarray) -> None:
         self.centre = np.asarray(centre, dtype=np.float64)
         self._rows, self._columns = 192, 384
-        az = (np.arange(self._columns) + 0.5) / self._columns * 2 * np.pi - np.pi
-        el = (np.arange(self._rows) + 0.5) / self._rows * np.pi - 0.5 * np.pi
+        az = cell_centres(self._columns) / self._columns * 2 * np.pi - np.pi
+        el = cell_centres(self._rows) / self._rows * np.pi - 0.5 * np.pi
         grid_az, grid_el = np.meshgrid(az, el)
         out = spherical_to_unit(grid_az, grid_el).reshape(-1, 3)
         # From outside inwards: the outermost surface counts, not what lies below it.
@@ -108,8 +110,9 @@ class StarMap:
     def radius(self, directions: np.ndarray) -> np.ndarray:
         """Radius (N,) in unit directions (N, 3), metres, bilinear; 0 where there is no surface."""
         az, el = unit_to_spherical(directions)
-        x = (az + np.pi) / (2 * np.pi) * self._columns - 0.5
-        y = np.clip((el + 0.5 * np.pi) / np.pi * self._rows - 0.5, 0, self._rows - 1.001)
+        x = corner_to_cell((az + np.pi) / (2 * np.pi) * self._columns)
+        y = corner_to_cell((el + 0.5 * np.pi) / np.pi * self._rows)
+        y = np.clip(y, 0, self._rows - 1.001)
         x0, y0 = np.floor(x).astype(int), np.floor(y).astype(int)
         fx, fy = x - x0, y - y0
         xa, xb = x0 % self._columns, (x0 + 1) % self._columns

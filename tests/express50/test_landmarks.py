@@ -8,22 +8,42 @@ import numpy as np
 import pytest
 import torch
 
+from express50.expressions import load_script
+from express50.head.load import load_head
+from express50.landmarks.acting import random_parameters
 from express50.landmarks.augment import (
     MIRROR,
     face_box,
     make_backgrounds,
     random_crop,
 )
-from express50.landmarks.detector import _mirrored, _pyramid, _sample, _window, detect
+from express50.landmarks.detector import (
+    _mirrored,
+    _pyramid,
+    _sample,
+    _window,
+    detect,
+)
 from express50.landmarks.network import (
     CROP,
+    STRETCH,
     WEIGHTS,
     LandmarkNet,
+    _expectation,
+    fold,
     heat_loss,
     load_network,
     save_network,
 )
-from express50.landmarks.training_set import ViewSet
+from express50.landmarks.scene import HeadScene
+from express50.landmarks.synthetic import random_head
+from express50.landmarks.training_set import (
+    FACE_YAW,
+    ViewSet,
+    draw_views,
+    draw_yaws,
+    stack_views,
+)
 
 
 @pytest.fixture(scope="module")
@@ -37,11 +57,11 @@ def test_mirror_table_is_its_own_inverse_and_swaps_sides() -> None:
     assert [MIRROR[k] for k in (0, 8, 17, 36, 48, 31, 60)] == [16, 8, 26, 45, 54, 35, 64]
 
 
-def test_weights_are_small_and_complete(network: LandmarkNet) -> None:
+def test_weights_are_small_and_complete() -> None:
     assert WEIGHTS.stat().st_size < 4_000_000
     with np.load(WEIGHTS, allow_pickle=False) as data:
         assert all(np.isfinite(data[name]).all() for name in data.files)
-        names = {name for name in network.state_dict() if "num_batches" not in name}
+        names = {name for name in LandmarkNet().state_dict() if "num_batches" not in name}
         assert names == set(data.files)
 
 
@@ -49,16 +69,32 @@ def test_saved_weights_come_back_as_half_precision(tmp_path: Path) -> None:
     torch.manual_seed(0)
     net = LandmarkNet()
     save_network(net, tmp_path / "net.npz")
-    back = load_network(tmp_path / "net.npz")
-    for name, value in net.state_dict().items():
-        if "num_batches" not in name:
-            torch.testing.assert_close(back.state_dict()[name], value.half().float())
+    with np.load(tmp_path / "net.npz", allow_pickle=False) as data:
+        for name, value in net.state_dict().items():
+            if "num_batches" not in name:
+                np.testing.assert_array_equal(data[name], value.half().numpy())
+
+
+def test_folded_network_computes_the_same(tmp_path: Path) -> None:
+    torch.manual_seed(1)
+    net = LandmarkNet()
+    crops = torch.rand(2, 3, CROP, CROP)
+    net.train()(crops)
+    before = net.eval()(crops)
+    fold(net)
+    assert not any(isinstance(module, torch.nn.BatchNorm2d) for module in net.modules())
+    for name, value in net(crops)._asdict().items():
+        torch.testing.assert_close(value, getattr(before, name), atol=1e-3, rtol=1e-3)
+
+
+def test_half_resolution_gives_points_of_the_same_crop(network: LandmarkNet) -> None:
+    half = network(torch.rand(1, 3, CROP // 2, CROP // 2))
+    assert half.points.shape == (1, 68, 2)
+    assert half.heat.shape == (1, 68, CROP // 8, CROP // 8)
 
 
 def test_expected_points_follow_a_peak_anywhere_in_the_crop() -> None:
     """A heat map that is one sharp Gaussian has its expectation at the Gaussian's centre."""
-    from express50.landmarks.network import STRETCH, _expectation
-
     grid = (torch.arange(32) + 0.5) / 32
     grid = ((grid - 0.5) * STRETCH + 0.5) * CROP
     target = torch.tensor([[40.3, 90.7]])
@@ -102,7 +138,7 @@ def test_crops_move_points_with_the_picture() -> None:
     x, y = points[30].astype(int)
     rgba[y - 3 : y + 4, x - 3 : x + 4, :3] = 255
     points[30] = [x + 0.5, y + 0.5]
-    views = ViewSet(rgba[None], points[None], np.ones(1, np.float32))
+    views = ViewSet(rgba[None], points[None], np.ones((1, 68), bool), np.ones(1, np.float32))
     backgrounds = make_backgrounds(2, rng) // 16
     errors = []
     for _ in range(40):
@@ -136,18 +172,60 @@ def test_pictures_without_a_head_score_low(
 
 @pytest.fixture(scope="module")
 def unseen_views() -> ViewSet:
-    """Renders of procedural heads with a seed that training never uses."""
-    from express50.head.load import load_head
-    from express50.landmarks.synthetic import HeadScene, random_head
-
+    """Renders of procedural heads with a seed that training never uses: front to profile."""
     model = load_head("procedural")
     rng = np.random.default_rng(987_654)
-    views = [HeadScene(model, random_head(model, rng)).render(rng, 208, False) for _ in range(10)]
-    return ViewSet(
-        np.stack([view.rgba for view in views]),
-        np.stack([view.points for view in views]),
-        np.array([view.facing for view in views]),
-    )
+    views = []
+    for yaw in np.radians([0, 12, -15, 25, -30, 45, -50, 60, 85, -88]):
+        views.append(HeadScene(model, random_head(model, rng)).render(rng, 208, float(yaw)))
+    return stack_views(views)
+
+
+def test_views_are_drawn_the_same_again_and_from_all_around() -> None:
+    model = load_head("procedural")
+    first, again = (stack_views(draw_views(model, 2, np.random.default_rng(5))) for _ in range(2))
+    for name, value in vars(first).items():
+        np.testing.assert_array_equal(value, getattr(again, name))
+    yaws = np.stack([draw_yaws(np.random.default_rng(seed)) for seed in range(200)])
+    front = np.histogram(yaws[:, :-1], bins=5, range=(-FACE_YAW, FACE_YAW))[0]
+    assert (front == 200).all()
+    assert (np.cos(yaws[:, -1]) < np.cos(FACE_YAW) + 1e-9).all()
+
+
+def test_crops_are_drawn_the_same_again(unseen_views: ViewSet) -> None:
+    backgrounds = make_backgrounds(2, np.random.default_rng(0))
+    for size in (CROP, CROP // 2):
+        first, again = (
+            random_crop(unseen_views, 3, backgrounds, np.random.default_rng(1), size)
+            for _ in range(2)
+        )
+        np.testing.assert_array_equal(first.image, again.image)
+        np.testing.assert_array_equal(first.points, again.points)
+        assert first.image.shape == (size, size, 3)
+
+
+def test_half_a_profile_is_hidden(unseen_views: ViewSet) -> None:
+    """From the subject's left, the right eye and the right of the jaw cannot be seen."""
+    left, right = unseen_views.visible[8], unseen_views.visible[9]
+    for near in (left, right[MIRROR]):
+        assert not near[[0, 1, 2, 36, 37, 41]].any()
+        assert near[[12, 13, 14]].any()
+    assert unseen_views.visible[0, 27:36].mean() > 0.7
+
+
+def test_heads_play_the_script_and_wink() -> None:
+    """Over many draws every control of the script moves, and eyes close one at a time too."""
+    model = load_head("procedural")
+    rng = np.random.default_rng(2)
+    names = list(model.expression_names)
+    drawn = np.stack([random_parameters(model, rng)["expression"][0].numpy() for _ in range(600)])
+    used = {name for entry in load_script() for name in entry.controls if name in names}
+    assert all(np.abs(drawn[:, names.index(name)]).max() > 0.3 for name in used)
+    left, right = (drawn[:, names.index(f"eyeBlink_{side}")] for side in "LR")
+    assert ((left > 0.6) & (right < 0.2)).sum() > 10
+    assert ((right > 0.6) & (left < 0.2)).sum() > 10
+    assert np.isfinite(drawn).all()
+    assert np.abs(drawn).max() <= 1.2 + 1e-6
 
 
 def on_canvas(rgba: np.ndarray, seed: int, at: tuple[int, int], size: int = 400) -> np.ndarray:
@@ -173,6 +251,34 @@ def test_finds_heads_it_never_saw_anywhere_in_a_frame(
         errors.append(np.linalg.norm(found.points - truth, axis=1)[17:].mean() / side)
     # Shares of the face box: 0.03 is two pixels of a face 70 pixels tall.
     assert np.median(errors) < 0.03
+
+
+def test_hidden_points_have_a_low_confidence(network: LandmarkNet, unseen_views: ViewSet) -> None:
+    seen, hidden = [], []
+    for index in np.flatnonzero(unseen_views.facing > 0.0):
+        found = detect(network, on_canvas(unseen_views.rgba[index], index, (90, 90)))
+        share = found.confidence / max(found.score, 1e-6)
+        assert ((share >= 0) & (share <= 1)).all()
+        seen += list(share[unseen_views.visible[index]])
+        hidden += list(share[~unseen_views.visible[index]])
+    assert np.median(hidden) < 0.5 * np.median(seen)
+
+
+def test_profiles_are_found_and_backs_of_heads_are_not(
+    network: LandmarkNet, unseen_views: ViewSet
+) -> None:
+    errors = []
+    for index in (7, 8, 9):
+        found = detect(network, on_canvas(unseen_views.rgba[index], index, (90, 90)))
+        _, side = face_box(unseen_views.points[index])
+        errors.append(
+            np.median(np.linalg.norm(found.points - unseen_views.points[index] - 90, axis=1)) / side
+        )
+    assert np.median(errors) < 0.045
+    model, rng = load_head("procedural"), np.random.default_rng(31)
+    for _ in range(4):
+        back = HeadScene(model, random_head(model, rng)).render(rng, 208, np.pi)
+        assert detect(network, on_canvas(back.rgba, 1, (90, 90))).score < 0.3
 
 
 def test_points_follow_the_frame(network: LandmarkNet, unseen_views: ViewSet) -> None:
