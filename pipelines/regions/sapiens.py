@@ -10,25 +10,24 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from pipelines.matte.config import PARTS
-from pipelines.matte.learned import resized
-from pipelines.matte.networks import Network, Role
+from pipelines.networks import Network, Role, resized
+from pipelines.regions.labels import HEAD, LABELS, label_mask
 
-SAPIENS = Role(setting="segmentation", inputs=("image",))
+SAPIENS = Role(setting="regions.segmentation", inputs=("image",))
 HEIGHT, WIDTH = 1024, 768
 MEAN = np.array([123.5, 116.5, 103.5], np.float32)
 DEVIATION = np.array([58.5, 57.0, 57.5], np.float32)
 CLASSES = 28
-HEAD = ("face_neck", "hair", "lips", "teeth", "tongue")
-_IDS = {"apparel": (1,), "face_neck": (2,), "hair": (3,), "lips": (23, 24), "teeth": (25, 26)}
-_IDS |= {"background": (0,), "tongue": (27,), "body": tuple(range(4, 23))}
-_PART_OF_CLASS = np.array(
-    [next(i for i, part in enumerate(PARTS) if k in _IDS[part]) for k in range(CLASSES)], np.uint8
+_IDS = {"background": (0,), "apparel": (1,), "skin": (2,), "hair": (3,), "lips": (23, 24)}
+_IDS |= {"teeth": (25, 26), "tongue": (27,), "torso": tuple(range(4, 23))}
+LABEL_OF_CLASS = np.array(
+    [LABELS.index(next(name for name in _IDS if k in _IDS[name])) for k in range(CLASSES)],
+    np.uint8,
 )
 
 
 def segment(network: Network, frame: np.ndarray) -> np.ndarray:
-    """Labels (H, W) uint8, indices into PARTS, of a frame (H, W, 3) uint8.
+    """Labels (H, W) uint8, indices into LABELS, of a frame (H, W, 3) uint8.
 
     Raises:
         StageError: the network failed, or gave other than 28 finite scores a pixel.
@@ -43,7 +42,7 @@ def segment(network: Network, frame: np.ndarray) -> np.ndarray:
     best = np.full(frame.shape[:2], -np.inf, np.float32)
     labels = np.zeros(frame.shape[:2], np.uint8)
     # Class by class: 28 scores a pixel of a 4K frame would take a gigabyte.
-    for part, score in zip(_PART_OF_CLASS, scores, strict=True):
+    for part, score in zip(LABEL_OF_CLASS, scores, strict=True):
         large = resized(score, *frame.shape[:2])
         wins = large > best
         best[wins] = large[wins]
@@ -51,19 +50,14 @@ def segment(network: Network, frame: np.ndarray) -> np.ndarray:
     return labels
 
 
-def part_mask(labels: np.ndarray, *names: str) -> np.ndarray:
-    """Pixels (H, W) bool of labels (H, W) that show one of the named PARTS."""
-    return np.isin(labels, [PARTS.index(name) for name in names])
-
-
 def head_alpha(alpha: np.ndarray, labels: np.ndarray) -> np.ndarray:
     """Alpha (H, W) of the head alone by labels (H, W) of the parts.
 
-    What is neither head nor body (strands that the network calls background, glasses, hats,
+    What is neither head nor torso (strands that the network calls background, glasses, hats,
     collars) goes with the nearer of the two; the cut is a pixel wide. No head gives an empty
-    matte, no body leaves all.
+    matte, no torso leaves all.
     """
-    head, body = part_mask(labels, *HEAD), part_mask(labels, "body")
+    head, body = label_mask(labels, *HEAD), label_mask(labels, "torso")
     if not head.any() or not body.any():
         return alpha * np.float32(head.any())
     nearer = _distance(body) - _distance(head)

@@ -1,0 +1,1 @@
+"""Labels of what each pixel of a peak frame shows, and the head's own matte without the torso."""

@@ -1,0 +1,17 @@
+"""What a label of a pixel means, and which labels are the head."""
+
+from __future__ import annotations
+
+import numpy as np
+
+LABELS = (
+    "background", "skin", "ears", "lips", "eyes", "teeth", "tongue", "mouth", "hair", "neck",
+    "torso", "apparel",
+)  # fmt: skip
+"""What a value in ``<camera>.png`` means; apparel (glasses, hats) only a network can tell."""
+HEAD = LABELS[1:10]
+
+
+def label_mask(labels: np.ndarray, *names: str) -> np.ndarray:
+    """Pixels (H, W) bool of labels (H, W) that show one of the named LABELS."""
+    return np.isin(labels, [LABELS.index(name) for name in names])
