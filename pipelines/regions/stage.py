@@ -1,0 +1,311 @@
+"""The regions stage: one expression of one subject, labels and the head's matte for every camera."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from express50.cameras import Camera, resized
+from express50.errors import CaptureError, FormatError, StageError
+from express50.frames import read_cameras_of, read_frame, read_peaks
+from express50.head.load import load_head
+from express50.images import contact_sheet, read_depth_png, read_image, resize_area, write_image
+from express50.index import index_path
+from express50.layout import Dataset
+from express50.stage import Stage
+from pipelines.regions.config import PRESETS, RegionsConfig
+from pipelines.regions.labels import LABELS, SCALP, HeadLabels, head_labels
+from pipelines.regions.mesh import TrackedHead, make_head, see
+from pipelines.regions.qc import (
+    label_shares,
+    legend,
+    mesh_fit,
+    picture_row,
+    subject_box,
+    view_warning,
+)
+from pipelines.regions.scalp import BARE, Votes, bare_share, scalp_votes
+from pipelines.regions.view import head_alpha, view_labels
+
+TILE = (260, 260)
+
+
+@dataclass(frozen=True)
+class Seen:
+    """One camera's labels at the working size, with SCALP among them, and where the mesh is."""
+
+    labels: np.ndarray
+    mesh: np.ndarray
+    votes: Votes
+
+
+def items(dataset: Dataset) -> list[str]:
+    """`subject/expression` for every labelled peak of an aligned subject."""
+    found = []
+    for subject in dataset.subjects():
+        if (dataset.item_dir("align", subject) / "peaks.json").is_file():
+            found += [
+                f"{subject}/{expression}" for expression in sorted(read_peaks(dataset, subject))
+            ]
+    return found
+
+
+def inputs(dataset: Dataset, item: str, config: RegionsConfig) -> dict[str, Path | str]:
+    """Index, cameras, the expression's peak, track, mattes and depth maps, and the weights."""
+    subject, expression = item.split("/")
+    found: dict[str, Path | str] = {
+        "index": index_path(dataset, subject),
+        "cameras": dataset.item_dir("calibrate", subject) / "cameras.json",
+        "frame": str(read_peaks(dataset, subject)[expression]),
+        "track": track_file(dataset, subject),
+    }
+    for camera in read_cameras_of(dataset, subject):
+        matte = dataset.matte_file(subject, expression, camera)
+        depth = dataset.item_dir("depth", item) / f"{camera}.png"
+        found |= {f"matte {camera}": matte} if matte.is_file() else {}
+        found |= {f"depth {camera}": depth} if config.depth and depth.is_file() else {}
+    if config.segmentation:
+        found["segmentation"] = _weights(config)
+    return found
+
+
+def run(dataset: Dataset, item: str, config: RegionsConfig, out: Path) -> dict:
+    """Write labels and the head's matte for each camera, and a picture; returns shares of parts."""
+    cv2.setNumThreads(1)  # the runner counts one core an item
+    subject, expression = item.split("/")
+    head = read_head(dataset, subject, expression)
+    frame = read_peaks(dataset, subject)[expression]
+    cameras = read_cameras_of(dataset, subject)
+    seen: dict[str, Seen] = {}
+    dropped = []
+    for name, camera in cameras.items():
+        try:
+            rgb, alpha = _read_pair(dataset, item, camera, frame)
+            depth = _read_depth(dataset, item, camera, config)
+        except (CaptureError, FormatError, StageError) as error:
+            dropped.append({"what": name, "why": str(error)})
+            continue
+        seen[name] = look(head, camera, rgb, alpha, depth, config)
+    if not seen:
+        why = "; ".join(f"{row['what']}: {row['why']}" for row in dropped[:3])
+        raise StageError(f"{item}: no camera has a matte to label ({why}); run 'express50 matte'")
+    bare = bare_share([view.votes for view in seen.values()])
+    scalp = _scalp_label(bare, config)
+    figures, rows = {}, []
+    for name, view in seen.items():
+        rgb, alpha = _read_pair(dataset, item, cameras[name], frame)
+        figures[name], row = _finish(out, name, rgb, alpha, view, scalp, config)
+        rows.append(row)
+    _write_picture(out, list(seen), rows, config.qc_views)
+    return _metrics(head.labels, figures, bare, scalp, config, dropped)
+
+
+def track_file(dataset: Dataset, subject: str) -> Path:
+    """The subject's track.
+
+    Raises:
+        StageError: there is none.
+    """
+    path = dataset.item_dir("track", subject) / "track.npz"
+    if not path.is_file():
+        raise StageError(f"subject {subject!r} is not tracked; run 'express50 track'")
+    return path
+
+
+def read_head(dataset: Dataset, subject: str, expression: str) -> TrackedHead:
+    """The tracked mesh of one expression.
+
+    Raises:
+        StageError: the subject or the expression is not tracked.
+        FormatError: the track does not fit its head model, or is not finite.
+    """
+    path = track_file(dataset, subject)
+    with np.load(path, allow_pickle=False) as table:
+        names = table["expressions"].tolist()
+        if expression not in names:
+            raise StageError(f"{subject}/{expression}: it is not tracked; see the metrics of track")
+        row = names.index(expression)
+        vertices, R = table["vertices"][row].astype(np.float64), table["R"][row].astype(np.float64)
+        labels = _labels_of(str(table["head"]))
+    if vertices.shape != (len(labels.vertices), 3):
+        raise FormatError(
+            f"{path}: vertices {vertices.shape}, expected ({len(labels.vertices)}, 3) of its head"
+            " model; run 'express50 track' again"
+        )
+    if not (np.isfinite(vertices).all() and np.isfinite(R).all()):
+        raise FormatError(
+            f"{path}: {expression} holds NaN or infinity; run 'express50 track' again"
+        )
+    return make_head(vertices, R, labels)
+
+
+@lru_cache(maxsize=2)
+def _labels_of(head: str) -> HeadLabels:
+    return head_labels(load_head(head))
+
+
+def _read_pair(
+    dataset: Dataset, item: str, camera: Camera, frame: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Undistorted frame (H, W, 3) uint8 and alpha (H, W) float32."""
+    subject, expression = item.split("/")
+    path = dataset.matte_file(subject, expression, camera.id)
+    if not path.is_file():
+        raise StageError("it has no matte")
+    matte = read_image(path)
+    if matte.dtype != np.uint8 or matte.shape != (camera.height, camera.width):
+        raise FormatError(
+            f"{path}: {matte.dtype} {matte.shape}, expected an 8-bit grey matte of the camera's"
+            f" {camera.width}x{camera.height}; run 'express50 matte' again"
+        )
+    return read_frame(dataset, subject, camera.id, frame), matte.astype(np.float32) / 255
+
+
+def _read_depth(
+    dataset: Dataset, item: str, camera: Camera, config: RegionsConfig
+) -> np.ndarray | None:
+    """Depth (H, W) metres, 0 where unknown, if there is any and it is wanted."""
+    path = dataset.item_dir("depth", item) / f"{camera.id}.png"
+    if not config.depth or not path.is_file():
+        return None
+    depth, _ = read_depth_png(path)
+    if depth.shape != (camera.height, camera.width):
+        raise FormatError(
+            f"{path}: {depth.shape}, expected the camera's {camera.width}x{camera.height}; run"
+            " 'express50 depth' again"
+        )
+    return depth
+
+
+def look(
+    head: TrackedHead,
+    camera: Camera,
+    rgb: np.ndarray,
+    alpha: np.ndarray,
+    depth: np.ndarray | None,
+    config: RegionsConfig,
+) -> Seen:
+    """Label one camera at the working size.
+
+    Args:
+        head: the tracked head.
+        camera: pinhole.
+        rgb: (H, W, 3) uint8.
+        alpha: (H, W) float32 in [0, 1].
+        depth: (H, W) metres, 0 where unknown; or None.
+        config: the stage's.
+    """
+    scale = config.image_side / max(camera.width, camera.height)
+    if scale < 1:
+        width, height = (max(1, round(n * scale)) for n in (camera.width, camera.height))
+        camera = resized(camera, width, height)
+        rgb, alpha = resize_area(rgb, width, height), resize_area(alpha, width, height)
+        if depth is not None:
+            depth = cv2.resize(depth, (width, height), interpolation=cv2.INTER_NEAREST_EXACT)
+    found = see(head, camera)
+    labels = view_labels(head, camera, found, alpha, depth, config)
+    return Seen(labels, found[0] > 0, scalp_votes(rgb, labels, alpha))
+
+
+def _scalp_label(bare: float | None, config: RegionsConfig) -> str:
+    """What the scalp is called: hair, unless it is asked for or seen to be skin."""
+    if config.scalp != "auto":
+        return config.scalp
+    return "skin" if bare is not None and bare > BARE else "hair"
+
+
+def _weights(config: RegionsConfig) -> Path:
+    path = Path(config.segmentation).expanduser()
+    if not path.is_file():
+        raise StageError(f"regions.segmentation {path}: no such file; expected TorchScript")
+    return path
+
+
+def _finish(
+    out: Path,
+    name: str,
+    rgb: np.ndarray,
+    alpha: np.ndarray,
+    view: Seen,
+    scalp: str,
+    config: RegionsConfig,
+) -> tuple[dict, list[np.ndarray]]:
+    """Write one camera's labels and head matte at full size; figures and a row of pictures."""
+    labels = np.where(view.labels == SCALP, np.uint8(LABELS.index(scalp)), view.labels)
+    size = alpha.shape[1], alpha.shape[0]
+    large = cv2.resize(labels, size, interpolation=cv2.INTER_NEAREST_EXACT)
+    mesh = cv2.resize(view.mesh.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST_EXACT) > 0
+    if config.segmentation:
+        # Only here, as torch takes seconds to import.
+        from pipelines.networks import load_network
+        from pipelines.regions.sapiens import SAPIENS, refined, segment
+
+        labels = large = refined(segment(load_network(_weights(config), SAPIENS), rgb), large)
+    else:
+        large = np.where(alpha > 0.5, large, np.uint8(0))
+    head = head_alpha(alpha, labels)
+    write_image(out / f"{name}.png", large)
+    write_image(out / f"{name}_head.png", np.rint(head * 255).astype(np.uint8))
+    figures = {
+        "labels": label_shares(large),
+        "head": round(float(head.mean()), 6),
+        "mesh_in_frame": bool(mesh.any()),
+        **mesh_fit(mesh, alpha, head),
+    }
+    return figures, picture_row(rgb, large, head, subject_box(large))
+
+
+def _write_picture(out: Path, names: list[str], rows: list[list[np.ndarray]], count: int) -> None:
+    """Contact sheet of evenly chosen cameras: frame, labels, head alone; and a legend."""
+    chosen = np.unique(np.linspace(0, len(names) - 1, count).round().astype(int))
+    pairs = [chosen[k : k + 2] for k in range(0, len(chosen), 2)]
+    sheet = contact_sheet(
+        [[picture for k in pair for picture in rows[k]] for pair in pairs],
+        [", ".join(names[k] for k in pair) for pair in pairs],
+        tile=TILE,
+    )
+    (out / "qc").mkdir()
+    sheet = np.concatenate([legend(sheet.shape[1]), sheet])
+    write_image(out / "qc" / "regions.jpg", sheet, quality=90)
+
+
+def _metrics(
+    labels: HeadLabels,
+    figures: dict[str, dict],
+    bare: float | None,
+    scalp: str,
+    config: RegionsConfig,
+    dropped: list[dict],
+) -> dict:
+    """Figures of the item; means are over the cameras that have the head in their image."""
+    odd = {name: view_warning(row, config.agreement) for name, row in figures.items()}
+    warned = [{"what": name, "why": why} for name, why in odd.items() if why]
+    if "torso" in labels.missing and not config.segmentation:
+        why = "the head model has no boundary, so that nothing tells torso from head: it is kept"
+        warned.append({"what": "torso", "why": why})
+    there = [row for row in figures.values() if row["mesh_in_frame"]]
+    share = float(np.mean([row["mesh_in_matte"] for row in there])) if there else 0.0
+    return {
+        "method": "network and mesh" if config.segmentation else "mesh",
+        "missing": list(labels.missing),
+        "scalp": {"label": scalp, "skin_coloured": None if bare is None else round(bare, 4)},
+        "mesh_in_matte": round(share, 4),
+        "cameras": figures,
+        "warnings": warned,
+        "dropped": dropped,
+    }
+
+
+STAGE = Stage(
+    name="regions",
+    version=1,
+    config=RegionsConfig,
+    presets=PRESETS,
+    items=items,
+    inputs=inputs,
+    run=run,
+)
