@@ -17,9 +17,9 @@ class RegionsConfig:
     image_side: int = 1536
     """Longest side, pixels, that the mesh is seen at; larger frames get enlarged labels."""
     depth: bool = True
-    """Let depth maps, where there are any, tell what stands before or below the tracked mesh."""
-    stand_off_mm: float = 12.0
-    """What the depth maps see this far before the mesh hides it: hair."""
+    """Let depth maps, where there are any, tell how high over the neck's end a pixel is."""
+    colour: bool = True
+    """Let each view's own colours tell hair, skin and torso where geometry is not sure."""
     rim_mm: float = 5.0
     """What juts out this far beyond the mesh still is what the mesh shows there."""
     scalp: Literal["auto", "hair", "skin"] = "auto"
@@ -33,11 +33,8 @@ class RegionsConfig:
         """Check ranges."""
         if self.image_side < 16:
             raise ConfigError(f"regions.image_side is {self.image_side}, expected 16 or more")
-        if self.stand_off_mm <= 0 or self.rim_mm < 0:
-            raise ConfigError(
-                f"regions.stand_off_mm {self.stand_off_mm} and regions.rim_mm {self.rim_mm}:"
-                " expected over 0, and 0 or more"
-            )
+        if self.rim_mm < 0:
+            raise ConfigError(f"regions.rim_mm is {self.rim_mm}, expected 0 or more")
         if not 0 <= self.agreement <= 1 or self.qc_views < 1:
             raise ConfigError(
                 f"regions.agreement {self.agreement} and regions.qc_views {self.qc_views}:"

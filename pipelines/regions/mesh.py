@@ -29,11 +29,11 @@ class NeckEnd:
     R: np.ndarray
     heights: np.ndarray
 
-    def below(self, points: np.ndarray) -> np.ndarray:
-        """Which points (N, 3), world, lie below the end (N,)."""
+    def height(self, points: np.ndarray) -> np.ndarray:
+        """Metres (N,) of points (N, 3), world, over the end; negative below."""
         x, y, z = ((points - self.center) @ self.R).T
         place = np.arctan2(z, x) / (2 * np.pi) * BEARINGS
-        return y < np.interp(place, np.arange(BEARINGS), self.heights, period=BEARINGS)
+        return y - np.interp(place, np.arange(BEARINGS), self.heights, period=BEARINGS)
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -14,7 +15,7 @@ LEAST = 30  # pixels of skin and of scalp that a view needs to have a say
 MOST = 4000  # pixels of each that it gives
 FLOOR = 2.0  # steps of Lab under which a spread of colours is noise
 ALIKE = 4.0  # spreads of the face's own colours from their middle
-BARE = 0.6  # share of the scalp in the face's colours that makes it bare
+BARE = 0.7  # share of the scalp in the face's colours that makes it bare
 
 
 @dataclass(frozen=True)
@@ -25,12 +26,20 @@ class Votes:
     alike: int
 
 
+@dataclass(frozen=True)
+class Scalp:
+    """Whether the scalp is skin, and the share of it in the face's colours; None: not known."""
+
+    is_skin: bool
+    skin_coloured: float | None
+
+
 def scalp_votes(rgb: np.ndarray, labels: np.ndarray, alpha: np.ndarray) -> Votes:
     """Compare the scalp of one view with its face: no camera's gain or light is another's.
 
     Args:
         rgb: (H, W, 3) uint8 sRGB.
-        labels: (H, W) with SCALP among them.
+        labels: (H, W) of the mesh, SCALP among them.
         alpha: (H, W) in [0, 1].
     """
     lab = cv2.cvtColor(rgb, cv2.COLOR_RGB2LAB)
@@ -51,7 +60,10 @@ def _spread(rows: np.ndarray) -> np.ndarray:
     return rows[np.unique(np.linspace(0, len(rows) - 1, MOST).astype(int))] if len(rows) else rows
 
 
-def bare_share(votes: list[Votes]) -> float | None:
-    """Share of the compared scalp that is of the face's colours; None where none was compared."""
+def decide(votes: Sequence[Votes]) -> Scalp:
+    """Bare where most of the compared scalp is of the face's colours."""
     compared = sum(vote.compared for vote in votes)
-    return sum(vote.alike for vote in votes) / compared if compared else None
+    if not compared:
+        return Scalp(False, None)
+    share = round(sum(vote.alike for vote in votes) / compared, 4)
+    return Scalp(share > BARE, share)

@@ -1,7 +1,8 @@
-"""The regions stage: one expression of one subject, labels and the head's matte for every camera."""
+"""The regions stage: one expression of one subject, labels and a head matte for every camera."""
 
 from __future__ import annotations
 
+import contextlib
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -17,8 +18,9 @@ from express50.images import contact_sheet, read_depth_png, read_image, resize_a
 from express50.index import index_path
 from express50.layout import Dataset
 from express50.stage import Stage
+from pipelines.regions.colour import SKIN, by_colour
 from pipelines.regions.config import PRESETS, RegionsConfig
-from pipelines.regions.labels import LABELS, SCALP, HeadLabels, head_labels
+from pipelines.regions.labels import SCALP, HeadLabels, head_labels
 from pipelines.regions.mesh import TrackedHead, make_head, see
 from pipelines.regions.qc import (
     label_shares,
@@ -28,19 +30,19 @@ from pipelines.regions.qc import (
     subject_box,
     view_warning,
 )
-from pipelines.regions.scalp import BARE, Votes, bare_share, scalp_votes
-from pipelines.regions.view import head_alpha, view_labels
+from pipelines.regions.scalp import Scalp, decide, scalp_votes
+from pipelines.regions.view import HAIR, head_alpha, place
 
 TILE = (260, 260)
+VOTERS, VOTING_SIDE = 4, 512  # cameras, and their pixels, that tell whether the scalp is bare
 
 
 @dataclass(frozen=True)
 class Seen:
-    """One camera's labels at the working size, with SCALP among them, and where the mesh is."""
+    """One camera's labels (h, w) at the working size, and where the mesh is (h, w)."""
 
     labels: np.ndarray
     mesh: np.ndarray
-    votes: Votes
 
 
 def items(dataset: Dataset) -> list[str]:
@@ -80,7 +82,8 @@ def run(dataset: Dataset, item: str, config: RegionsConfig, out: Path) -> dict:
     head = read_head(dataset, subject, expression)
     frame = read_peaks(dataset, subject)[expression]
     cameras = read_cameras_of(dataset, subject)
-    seen: dict[str, Seen] = {}
+    bare = _bare(dataset, item, head, frame, config)
+    figures, rows = {}, {}
     dropped = []
     for name, camera in cameras.items():
         try:
@@ -89,19 +92,13 @@ def run(dataset: Dataset, item: str, config: RegionsConfig, out: Path) -> dict:
         except (CaptureError, FormatError, StageError) as error:
             dropped.append({"what": name, "why": str(error)})
             continue
-        seen[name] = look(head, camera, rgb, alpha, depth, config)
-    if not seen:
+        small = look(head, camera, rgb, alpha, depth, bare.is_skin, config)
+        figures[name], rows[name] = _finish(out, name, rgb, alpha, small, config)
+    if not figures:
         why = "; ".join(f"{row['what']}: {row['why']}" for row in dropped[:3])
         raise StageError(f"{item}: no camera has a matte to label ({why}); run 'express50 matte'")
-    bare = bare_share([view.votes for view in seen.values()])
-    scalp = _scalp_label(bare, config)
-    figures, rows = {}, []
-    for name, view in seen.items():
-        rgb, alpha = _read_pair(dataset, item, cameras[name], frame)
-        figures[name], row = _finish(out, name, rgb, alpha, view, scalp, config)
-        rows.append(row)
-    _write_picture(out, list(seen), rows, config.qc_views)
-    return _metrics(head.labels, figures, bare, scalp, config, dropped)
+    _write_picture(out, rows, config.qc_views)
+    return _metrics(head.labels, figures, bare, config, dropped)
 
 
 def track_file(dataset: Dataset, subject: str) -> Path:
@@ -137,9 +134,7 @@ def read_head(dataset: Dataset, subject: str, expression: str) -> TrackedHead:
             " model; run 'express50 track' again"
         )
     if not (np.isfinite(vertices).all() and np.isfinite(R).all()):
-        raise FormatError(
-            f"{path}: {expression} holds NaN or infinity; run 'express50 track' again"
-        )
+        raise FormatError(f"{path}: {expression} holds NaN or Inf; run 'express50 track' again")
     return make_head(vertices, R, labels)
 
 
@@ -187,6 +182,7 @@ def look(
     rgb: np.ndarray,
     alpha: np.ndarray,
     depth: np.ndarray | None,
+    bare: bool,
     config: RegionsConfig,
 ) -> Seen:
     """Label one camera at the working size.
@@ -197,25 +193,44 @@ def look(
         rgb: (H, W, 3) uint8.
         alpha: (H, W) float32 in [0, 1].
         depth: (H, W) metres, 0 where unknown; or None.
+        bare: whether the scalp is skin.
         config: the stage's.
     """
-    scale = config.image_side / max(camera.width, camera.height)
-    if scale < 1:
-        width, height = (max(1, round(n * scale)) for n in (camera.width, camera.height))
-        camera = resized(camera, width, height)
-        rgb, alpha = resize_area(rgb, width, height), resize_area(alpha, width, height)
-        if depth is not None:
-            depth = cv2.resize(depth, (width, height), interpolation=cv2.INTER_NEAREST_EXACT)
-    found = see(head, camera)
-    labels = view_labels(head, camera, found, alpha, depth, config)
-    return Seen(labels, found[0] > 0, scalp_votes(rgb, labels, alpha))
+    camera, rgb, alpha, depth = _shrunk(camera, rgb, alpha, depth, config.image_side)
+    geometry = place(head, camera, alpha, depth, 1e-3 * config.rim_mm)
+    labels = by_colour(rgb, alpha, geometry, bare) if config.colour else geometry.labels()
+    labels = np.where(labels == SCALP, SKIN if bare else HAIR, labels)
+    return Seen(np.where(alpha > 0, labels, np.uint8(0)), geometry.mesh > 0)
 
 
-def _scalp_label(bare: float | None, config: RegionsConfig) -> str:
-    """What the scalp is called: hair, unless it is asked for or seen to be skin."""
+def _shrunk(
+    camera: Camera, rgb: np.ndarray, alpha: np.ndarray, depth: np.ndarray | None, side: int
+) -> tuple[Camera, np.ndarray, np.ndarray, np.ndarray | None]:
+    """Camera, frame, matte and depth map with at most `side` pixels along the longer side."""
+    scale = side / max(camera.width, camera.height)
+    if scale >= 1:
+        return camera, rgb, alpha, depth
+    width, height = (max(1, round(n * scale)) for n in (camera.width, camera.height))
+    if depth is not None:
+        depth = cv2.resize(depth, (width, height), interpolation=cv2.INTER_NEAREST_EXACT)
+    rgb, alpha = resize_area(rgb, width, height), resize_area(alpha, width, height)
+    return resized(camera, width, height), rgb, alpha, depth
+
+
+def _bare(
+    dataset: Dataset, item: str, head: TrackedHead, frame: int, config: RegionsConfig
+) -> Scalp:
+    """Whether the scalp is skin: as asked for, or by the colours of a few cameras."""
     if config.scalp != "auto":
-        return config.scalp
-    return "skin" if bare is not None and bare > BARE else "hair"
+        return Scalp(config.scalp == "skin", None)
+    cameras = list(read_cameras_of(dataset, item.split("/")[0]).values())
+    votes = []
+    for k in np.unique(np.linspace(0, len(cameras) - 1, VOTERS).round().astype(int)):
+        with contextlib.suppress(CaptureError, FormatError, StageError):  # the run names them
+            rgb, alpha = _read_pair(dataset, item, cameras[k], frame)
+            camera, rgb, alpha, _ = _shrunk(cameras[k], rgb, alpha, None, VOTING_SIDE)
+            votes.append(scalp_votes(rgb, see(head, camera)[0], alpha))
+    return decide(votes)
 
 
 def _weights(config: RegionsConfig) -> Path:
@@ -226,19 +241,13 @@ def _weights(config: RegionsConfig) -> Path:
 
 
 def _finish(
-    out: Path,
-    name: str,
-    rgb: np.ndarray,
-    alpha: np.ndarray,
-    view: Seen,
-    scalp: str,
-    config: RegionsConfig,
+    out: Path, name: str, rgb: np.ndarray, alpha: np.ndarray, small: Seen, config: RegionsConfig
 ) -> tuple[dict, list[np.ndarray]]:
     """Write one camera's labels and head matte at full size; figures and a row of pictures."""
-    labels = np.where(view.labels == SCALP, np.uint8(LABELS.index(scalp)), view.labels)
+    labels = small.labels
     size = alpha.shape[1], alpha.shape[0]
     large = cv2.resize(labels, size, interpolation=cv2.INTER_NEAREST_EXACT)
-    mesh = cv2.resize(view.mesh.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST_EXACT) > 0
+    mesh = cv2.resize(small.mesh.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST_EXACT) > 0
     if config.segmentation:
         # Only here, as torch takes seconds to import.
         from pipelines.networks import load_network
@@ -259,13 +268,14 @@ def _finish(
     return figures, picture_row(rgb, large, head, subject_box(large))
 
 
-def _write_picture(out: Path, names: list[str], rows: list[list[np.ndarray]], count: int) -> None:
+def _write_picture(out: Path, rows: dict[str, list[np.ndarray]], count: int) -> None:
     """Contact sheet of evenly chosen cameras: frame, labels, head alone; and a legend."""
+    names = list(rows)
     chosen = np.unique(np.linspace(0, len(names) - 1, count).round().astype(int))
-    pairs = [chosen[k : k + 2] for k in range(0, len(chosen), 2)]
+    pairs = [[names[k] for k in chosen[start : start + 2]] for start in range(0, len(chosen), 2)]
     sheet = contact_sheet(
-        [[picture for k in pair for picture in rows[k]] for pair in pairs],
-        [", ".join(names[k] for k in pair) for pair in pairs],
+        [[picture for name in pair for picture in rows[name]] for pair in pairs],
+        [", ".join(pair) for pair in pairs],
         tile=TILE,
     )
     (out / "qc").mkdir()
@@ -276,8 +286,7 @@ def _write_picture(out: Path, names: list[str], rows: list[list[np.ndarray]], co
 def _metrics(
     labels: HeadLabels,
     figures: dict[str, dict],
-    bare: float | None,
-    scalp: str,
+    bare: Scalp,
     config: RegionsConfig,
     dropped: list[dict],
 ) -> dict:
@@ -292,7 +301,7 @@ def _metrics(
     return {
         "method": "network and mesh" if config.segmentation else "mesh",
         "missing": list(labels.missing),
-        "scalp": {"label": scalp, "skin_coloured": None if bare is None else round(bare, 4)},
+        "scalp": {"label": "skin" if bare.is_skin else "hair", "skin_coloured": bare.skin_coloured},
         "mesh_in_matte": round(share, 4),
         "cameras": figures,
         "warnings": warned,

@@ -1,58 +1,81 @@
-"""Labels of one camera: the tracked mesh, and what of the matte stands before, around, below it."""
+"""Where the matte of one camera lies about the tracked head, and the head's own matte."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
 from express50.cameras import Camera, unproject
-from pipelines.regions.config import RegionsConfig
 from pipelines.regions.labels import HEAD, LABELS, label_mask
-from pipelines.regions.mesh import TrackedHead
+from pipelines.regions.mesh import TrackedHead, see
 
 HAIR, TORSO = np.uint8(LABELS.index("hair")), np.uint8(LABELS.index("torso"))
 
 
-def view_labels(
-    head: TrackedHead,
-    camera: Camera,
-    seen: tuple[np.ndarray, np.ndarray],
-    alpha: np.ndarray,
-    depth: np.ndarray | None,
-    config: RegionsConfig,
-) -> np.ndarray:
-    """Labels (H, W) uint8, SCALP among them, of every pixel that the matte holds any of.
+@dataclass(frozen=True)
+class Geometry:
+    """Every pixel of one camera about the tracked head.
 
-    A pixel that shows the mesh has the mesh's label, unless the depth map sees something well
-    before it. What lies below the neck's end is torso, what lies a little beyond the mesh is as the
-    mesh there, all else is hair. Where the depth map knows nothing, the nearest pixel that it
-    knows stands in; without a depth map, the mesh's own depth.
+    Attributes:
+        mesh: (H, W) uint8 label of the mesh, SCALP among them, 0 where it is not.
+        near: (H, W) uint8 label at the nearest pixel of the mesh; 0 where it is in no pixel.
+        rim: (H, W) bool, just beyond the mesh.
+        height: (H, W) float32 metres over the neck's end; inf where the model does not tell.
+    """
+
+    mesh: np.ndarray
+    near: np.ndarray
+    rim: np.ndarray
+    height: np.ndarray
+
+    def labels(self) -> np.ndarray:
+        """Labels (H, W) uint8 by geometry alone, as if the matte were everywhere.
+
+        The mesh and its rim are what the mesh is; what lies below the neck's end is torso, all
+        else hair.
+        """
+        around = np.where(self.rim, self.near, HAIR)
+        return np.where(
+            self.mesh > 0, self.mesh, np.where(self.height < 0, TORSO, around)
+        )  # fmt: skip
+
+
+def place(
+    head: TrackedHead, camera: Camera, alpha: np.ndarray, depth: np.ndarray | None, rim_m: float
+) -> Geometry:
+    """Place a camera's pixels about a head.
+
+    Where the depth map knows nothing, the nearest pixel of the matte that it knows stands in;
+    without a depth map, the mesh's own depth. Where the mesh is in no pixel, all is far below the
+    neck's end.
 
     Args:
         head: the tracked head.
         camera: pinhole.
-        seen: what the camera sees of the head (``mesh.see``).
         alpha: (H, W) in [0, 1].
         depth: (H, W) camera z, metres, 0 where unknown; or None.
-        config: the stage's.
+        rim_m: width of the rim, metres.
     """
-    mesh, mesh_depth = seen
-    inside, hit = alpha > 0, mesh > 0
-    if not hit.any() or not inside.any():
-        return np.where(inside, TORSO if head.end is not None else HAIR, np.uint8(0))
-    row, column, pixels_off = _nearest(hit)
-    near_depth = mesh_depth[row, column]
-    surface = _filled(near_depth, depth, inside)
-    before = near_depth - surface > 1e-3 * config.stand_off_mm
-    metres_off = pixels_off * near_depth / camera.K[0, 0]
-    as_mesh = (metres_off <= 1e-3 * config.rim_mm) & ~before
-    labels = np.where(as_mesh, mesh[row, column], HAIR)
+    mesh, mesh_depth = see(head, camera)
+    hit = mesh > 0
+    if not hit.any():
+        height = np.full(mesh.shape, np.inf if head.end is None else -np.inf, np.float32)
+        return Geometry(mesh, mesh, hit, height)
+    row, column, pixels = _nearest(hit)
+    surface = mesh_depth[row, column]
+    rim = ~hit & (pixels * surface / camera.K[0, 0] <= rim_m)
+    known = hit if depth is None else (alpha > 0) & (depth > 0)
+    if depth is not None and known.any():
+        there = _nearest(known)[:2]
+        surface = depth[there]
+    height = np.full(mesh.shape, np.inf, np.float32)
     if head.end is not None:
-        y, x = np.nonzero(inside & ~(hit & ~before))
+        y, x = np.nonzero(alpha > 0)
         points = unproject(camera, np.stack([x, y], axis=1) + 0.5, surface[y, x])
-        under = head.end.below(points)
-        labels[y[under], x[under]] = TORSO
-    return np.where(inside, labels, np.uint8(0))
+        height[y, x] = head.end.height(points)
+    return Geometry(mesh, mesh[row, column], rim, height)
 
 
 def _nearest(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -60,19 +83,10 @@ def _nearest(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     distance, cell = cv2.distanceTransformWithLabels(
         (~mask).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
     )
-    place = np.zeros(int(cell.max()) + 1, np.int64)
-    place[cell[mask]] = np.flatnonzero(mask)
-    row, column = np.divmod(place[cell], mask.shape[1])
+    places = np.zeros(int(cell.max()) + 1, np.int64)
+    places[cell[mask]] = np.flatnonzero(mask)
+    row, column = np.divmod(places[cell], mask.shape[1])
     return row, column, distance
-
-
-def _filled(near_depth: np.ndarray, depth: np.ndarray | None, inside: np.ndarray) -> np.ndarray:
-    """Depth (H, W) of what the matte holds, without gaps."""
-    known = inside & (depth > 0) if depth is not None else None
-    if depth is None or known is None or not known.any():
-        return near_depth
-    row, column, _ = _nearest(known)
-    return depth[row, column]
 
 
 def head_alpha(alpha: np.ndarray, labels: np.ndarray) -> np.ndarray:
