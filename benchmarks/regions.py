@@ -28,10 +28,10 @@ from express50.head.load import load_head
 from express50.head.model import landmarks
 from express50.images import read_image
 from express50.layout import Dataset
+from express50.parts import LABELS
 from express50.twin.truth import Truth
 from pipelines.regions import STAGE
-from pipelines.regions.labels import LABELS
-from pipelines.regions.stage import read_head
+from pipelines.regions.read import read_head
 
 CHIN = 8  # of the 68 landmarks
 Figures = dict[str, float | None]

@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from express50.cameras import Camera, resized
+from express50.parts import LABELS
 from express50.twin.body import Material
 from express50.twin.truth import Truth
-from pipelines.regions.labels import LABELS, SCALP, head_labels
+from pipelines.regions.labels import SCALP, head_labels
 
 RAYS = 4  # a side of a pixel, for the share of it that the head fills
 _PLAIN = {

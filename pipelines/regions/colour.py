@@ -12,12 +12,14 @@ import cv2
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
-from pipelines.regions.labels import LABELS, SCALP
+from express50.parts import LABELS
+from pipelines.regions.labels import SCALP
 from pipelines.regions.view import HAIR, TORSO, Geometry
 
 SKIN, NECK, EARS = (np.uint8(LABELS.index(name)) for name in ("skin", "neck", "ears"))
 SOLID = 0.95  # alpha over which a pixel's colour is the subject's alone
 LEAST = 30  # pixels that make a histogram
+ENOUGH = 300  # pixels of the face, with which the neck, which hair may cover, teaches nothing
 CELLS, STEPS = (32, 64, 64), (8, 4, 4)  # of Lab in 8 bits
 SMOOTH = 1.5  # cells
 RARE = 1e-6  # share of a cell that no pixel taught
@@ -32,8 +34,8 @@ FADE = 0.02  # metres of height about the neck's end that count a nat for head o
 MOST_FADE = 8.0  # nats
 NEVER = -20.0
 # Log-priors of hair and skin on the mesh; torso is possible on the neck alone.
-_ON_MESH = {int(SKIN): (-4.0, 0.0), SCALP: (0.0, -1.0), int(EARS): (-1.0, 0.0),
-            int(NECK): (-2.0, 0.0)}  # fmt: skip
+_ON_MESH = {int(SKIN): (-2.0, 0.0), SCALP: (0.0, -1.0), int(EARS): (-1.0, 0.0),
+            int(NECK): (-0.5, 0.0)}  # fmt: skip
 TORSO_ON_NECK, HAIR_ON_RIM, SKIN_BEYOND = -1.0, -1.0, -6.0
 
 
@@ -61,9 +63,10 @@ def _sure(labels: np.ndarray, solid: np.ndarray, geometry: Geometry) -> list[np.
     """Pixels (H, W) that teach the colours of hair, skin, torso."""
     high, low = geometry.height > SURE_HAIR, geometry.height < -SURE_BELOW
     hair = (labels == SCALP) | ((labels == HAIR) & high)
-    neck = (labels == NECK) & (geometry.height > SURE_NECK)
-    skin = (geometry.mesh > 0) & ((labels == SKIN) | neck)
-    return [solid & mask for mask in (hair, skin, (labels == TORSO) & low)]
+    skin = solid & (geometry.mesh > 0) & (labels == SKIN)
+    if skin.sum() < ENOUGH:
+        skin = skin | (solid & (labels == NECK) & (geometry.height > SURE_NECK))
+    return [solid & hair, skin, solid & (labels == TORSO) & low]
 
 
 def _colours(rgb: np.ndarray, taught: list[np.ndarray]) -> np.ndarray:

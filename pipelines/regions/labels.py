@@ -1,4 +1,4 @@
-"""What a label of a pixel means, which labels are the head, and the labels of a head model."""
+"""The labels of a head model's vertices, from its regions."""
 
 from __future__ import annotations
 
@@ -9,13 +9,8 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from express50.head.model import HeadModel
+from express50.parts import LABELS
 
-LABELS = (
-    "background", "skin", "ears", "lips", "eyes", "teeth", "tongue", "mouth", "hair", "neck",
-    "torso", "apparel",
-)  # fmt: skip
-"""What a value in ``<camera>.png`` means; apparel (glasses, hats) only a network can tell."""
-HEAD = LABELS[1:10]
 SCALP = len(LABELS)
 """Skin that may bear hair: a label of the mesh alone, never written."""
 
@@ -76,8 +71,3 @@ def _named_sheets(faces: np.ndarray, named: np.ndarray) -> np.ndarray:
     kept = np.zeros(sheet.max() + 1, bool)
     kept[sheet[named]] = True
     return kept[sheet[faces[:, 0]]]
-
-
-def label_mask(labels: np.ndarray, *names: str) -> np.ndarray:
-    """Pixels (H, W) bool of labels (H, W) that show one of the named LABELS."""
-    return np.isin(labels, [LABELS.index(name) for name in names])

@@ -8,7 +8,8 @@ import numpy as np
 import open3d as o3d
 
 from express50.cameras import Camera, crop_camera, project, rays
-from pipelines.regions.labels import LABELS, SCALP, HeadLabels
+from express50.parts import LABELS
+from pipelines.regions.labels import SCALP, HeadLabels
 
 BEARINGS = 36  # around the neck, at which the height of its lower end is known
 # Sheets that are seen from outside only; from within one looks through the neck's open end.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from pipelines.regions.labels import LABELS
+from express50.parts import LABELS
 
 # One colour a label; the background's is not drawn.
 COLOURS = np.array(

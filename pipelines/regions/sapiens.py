@@ -10,8 +10,8 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
+from express50.parts import LABELS, label_mask
 from pipelines.networks import Network, Role, resized
-from pipelines.regions.labels import LABELS, label_mask
 
 SAPIENS = Role(setting="regions.segmentation", inputs=("image",))
 HEIGHT, WIDTH = 1024, 768

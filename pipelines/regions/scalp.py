@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from pipelines.regions.labels import LABELS, SCALP
+from express50.parts import LABELS
+from pipelines.regions.labels import SCALP
 
 SOLID = 0.99  # alpha over which a pixel's colour is the subject's alone
 LEAST = 30  # pixels of skin and of scalp that a view needs to have a say

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 from dataclasses import dataclass
-from functools import lru_cache
 from pathlib import Path
 
 import cv2
@@ -12,16 +11,15 @@ import numpy as np
 
 from express50.cameras import Camera, resized
 from express50.errors import CaptureError, FormatError, StageError
-from express50.frames import read_cameras_of, read_frame, read_peaks
-from express50.head.load import load_head
-from express50.images import contact_sheet, read_depth_png, read_image, resize_area, write_image
+from express50.frames import read_cameras_of, read_peaks
+from express50.images import contact_sheet, resize_area, write_image
 from express50.index import index_path
 from express50.layout import Dataset
 from express50.stage import Stage
 from pipelines.regions.colour import SKIN, by_colour
 from pipelines.regions.config import PRESETS, RegionsConfig
-from pipelines.regions.labels import SCALP, HeadLabels, head_labels
-from pipelines.regions.mesh import TrackedHead, make_head, see
+from pipelines.regions.labels import SCALP, HeadLabels
+from pipelines.regions.mesh import TrackedHead, see
 from pipelines.regions.qc import (
     label_shares,
     legend,
@@ -30,6 +28,7 @@ from pipelines.regions.qc import (
     subject_box,
     view_warning,
 )
+from pipelines.regions.read import read_depth, read_head, read_pair, track_file
 from pipelines.regions.scalp import Scalp, decide, scalp_votes
 from pipelines.regions.view import HAIR, head_alpha, place
 
@@ -87,8 +86,8 @@ def run(dataset: Dataset, item: str, config: RegionsConfig, out: Path) -> dict:
     dropped = []
     for name, camera in cameras.items():
         try:
-            rgb, alpha = _read_pair(dataset, item, camera, frame)
-            depth = _read_depth(dataset, item, camera, config)
+            rgb, alpha = read_pair(dataset, item, camera, frame)
+            depth = read_depth(dataset, item, camera, config)
         except (CaptureError, FormatError, StageError) as error:
             dropped.append({"what": name, "why": str(error)})
             continue
@@ -99,81 +98,6 @@ def run(dataset: Dataset, item: str, config: RegionsConfig, out: Path) -> dict:
         raise StageError(f"{item}: no camera has a matte to label ({why}); run 'express50 matte'")
     _write_picture(out, rows, config.qc_views)
     return _metrics(head.labels, figures, bare, config, dropped)
-
-
-def track_file(dataset: Dataset, subject: str) -> Path:
-    """The subject's track.
-
-    Raises:
-        StageError: there is none.
-    """
-    path = dataset.item_dir("track", subject) / "track.npz"
-    if not path.is_file():
-        raise StageError(f"subject {subject!r} is not tracked; run 'express50 track'")
-    return path
-
-
-def read_head(dataset: Dataset, subject: str, expression: str) -> TrackedHead:
-    """The tracked mesh of one expression.
-
-    Raises:
-        StageError: the subject or the expression is not tracked.
-        FormatError: the track does not fit its head model, or is not finite.
-    """
-    path = track_file(dataset, subject)
-    with np.load(path, allow_pickle=False) as table:
-        names = table["expressions"].tolist()
-        if expression not in names:
-            raise StageError(f"{subject}/{expression}: it is not tracked; see the metrics of track")
-        row = names.index(expression)
-        vertices, R = table["vertices"][row].astype(np.float64), table["R"][row].astype(np.float64)
-        labels = _labels_of(str(table["head"]))
-    if vertices.shape != (len(labels.vertices), 3):
-        raise FormatError(
-            f"{path}: vertices {vertices.shape}, expected ({len(labels.vertices)}, 3) of its head"
-            " model; run 'express50 track' again"
-        )
-    if not (np.isfinite(vertices).all() and np.isfinite(R).all()):
-        raise FormatError(f"{path}: {expression} holds NaN or Inf; run 'express50 track' again")
-    return make_head(vertices, R, labels)
-
-
-@lru_cache(maxsize=2)
-def _labels_of(head: str) -> HeadLabels:
-    return head_labels(load_head(head))
-
-
-def _read_pair(
-    dataset: Dataset, item: str, camera: Camera, frame: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """Undistorted frame (H, W, 3) uint8 and alpha (H, W) float32."""
-    subject, expression = item.split("/")
-    path = dataset.matte_file(subject, expression, camera.id)
-    if not path.is_file():
-        raise StageError("it has no matte")
-    matte = read_image(path)
-    if matte.dtype != np.uint8 or matte.shape != (camera.height, camera.width):
-        raise FormatError(
-            f"{path}: {matte.dtype} {matte.shape}, expected an 8-bit grey matte of the camera's"
-            f" {camera.width}x{camera.height}; run 'express50 matte' again"
-        )
-    return read_frame(dataset, subject, camera.id, frame), matte.astype(np.float32) / 255
-
-
-def _read_depth(
-    dataset: Dataset, item: str, camera: Camera, config: RegionsConfig
-) -> np.ndarray | None:
-    """Depth (H, W) metres, 0 where unknown, if there is any and it is wanted."""
-    path = dataset.item_dir("depth", item) / f"{camera.id}.png"
-    if not config.depth or not path.is_file():
-        return None
-    depth, _ = read_depth_png(path)
-    if depth.shape != (camera.height, camera.width):
-        raise FormatError(
-            f"{path}: {depth.shape}, expected the camera's {camera.width}x{camera.height}; run"
-            " 'express50 depth' again"
-        )
-    return depth
 
 
 def look(
@@ -227,7 +151,7 @@ def _bare(
     votes = []
     for k in np.unique(np.linspace(0, len(cameras) - 1, VOTERS).round().astype(int)):
         with contextlib.suppress(CaptureError, FormatError, StageError):  # the run names them
-            rgb, alpha = _read_pair(dataset, item, cameras[k], frame)
+            rgb, alpha = read_pair(dataset, item, cameras[k], frame)
             camera, rgb, alpha, _ = _shrunk(cameras[k], rgb, alpha, None, VOTING_SIDE)
             votes.append(scalp_votes(rgb, see(head, camera)[0], alpha))
     return decide(votes)

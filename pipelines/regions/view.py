@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from express50.cameras import Camera, unproject
-from pipelines.regions.labels import HEAD, LABELS, label_mask
+from express50.parts import HEAD, LABELS, label_mask
 from pipelines.regions.mesh import TrackedHead, see
 
 HAIR, TORSO = np.uint8(LABELS.index("hair")), np.uint8(LABELS.index("torso"))
