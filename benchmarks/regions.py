@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.accuracy import true_world_cameras
-from benchmarks.regions_truth import true_head_alpha, true_labels
+from benchmarks.regions_truth import iou_figures, true_head_alpha, true_labels, view_row
 from express50.cameras import Camera, project
 from express50.config import PRESETS, resolve_config
 from express50.frames import read_cameras_of, read_peaks
@@ -28,13 +28,11 @@ from express50.head.load import load_head
 from express50.head.model import landmarks
 from express50.images import read_image
 from express50.layout import Dataset
-from express50.parts import LABELS
 from express50.twin.truth import Truth
 from pipelines.regions import STAGE
 from pipelines.regions.read import read_head
 
 CHIN = 8  # of the 68 landmarks
-Figures = dict[str, float | None]
 
 
 def main() -> int:
@@ -72,7 +70,7 @@ def measure_item(dataset: Dataset, truth: Truth, item: str, configs: dict) -> di
     true = {
         name: (
             true_labels(truth, subject, frame, camera),
-            true_head_alpha(truth, subject, frame, camera),
+            true_head_alpha(truth, subject, frame, camera, rays=4),
         )
         for name, camera in cameras.items()
     }
@@ -93,19 +91,6 @@ def measure_item(dataset: Dataset, truth: Truth, item: str, configs: dict) -> di
         rows = [view_row(*true[camera], cut(camera), None) for camera in true]
         found[name] = {"rows": rows, "seconds": None}
     return found
-
-
-def view_row(
-    true: np.ndarray, true_alpha: np.ndarray, alpha: np.ndarray, labels: np.ndarray | None
-) -> dict:
-    """Errors of a head matte (H, W), and pixels of each label in both and in either."""
-    both = either = np.zeros(len(LABELS), np.int64)
-    if labels is not None:
-        pairs = [(true == k, labels == k) for k in range(len(LABELS))]
-        both = np.array([(a & b).sum() for a, b in pairs])
-        either = np.array([(a | b).sum() for a, b in pairs])
-    error = np.abs(alpha - true_alpha)
-    return {"both": both, "either": either, "sad": error.sum(), "mae": error.mean()}
 
 
 def baselines(dataset: Dataset, item: str) -> dict[str, Callable[[str], np.ndarray]]:
@@ -141,17 +126,11 @@ def _rows_above(camera: Camera, row: float) -> np.ndarray:
 def summary(items: list[dict]) -> dict:
     """Means over all views; a part that neither truth nor labels have is None."""
     rows = [row for item in items for row in item["rows"]]
-    both, either = sum(row["both"] for row in rows), sum(row["either"] for row in rows)
     seconds = [item["seconds"] for item in items if item["seconds"] is not None]
-    iou: Figures = {
-        name: round(float(both[k] / either[k]), 4) if either[k] else None
-        for k, name in enumerate(LABELS)
-    }
-    there = [value for value in iou.values() if value is not None]
     return {
         "head_sad_px": round(float(np.mean([row["sad"] for row in rows])), 1),
         "head_mae": round(float(np.mean([row["mae"] for row in rows])), 5),
-        **({"iou_mean": round(float(np.mean(there)), 4), "iou": iou} if either.any() else {}),
+        **(iou_figures(rows) if any(row["either"].any() for row in rows) else {}),
         "seconds_per_view": round(float(np.mean(seconds)), 3) if seconds else None,
         "views": len(rows),
     }

@@ -1,4 +1,4 @@
-"""True labels and true mattes of the head alone, from the twin's geometry."""
+"""True labels and true mattes of the head alone, from the twin's geometry, and errors by them."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from express50.twin.body import Material
 from express50.twin.truth import Truth
 from pipelines.regions.labels import SCALP, head_labels
 
-RAYS = 4  # a side of a pixel, for the share of it that the head fills
 _PLAIN = {
     Material.EYE: "eyes", Material.TEETH: "teeth", Material.MOUTH: "mouth",
     Material.TONGUE: "tongue", Material.HAIR: "hair", Material.CLOTH: "torso",
@@ -33,9 +32,38 @@ def true_labels(truth: Truth, subject: str, frame: int, camera: Camera) -> np.nd
     return labels
 
 
-def true_head_alpha(truth: Truth, subject: str, frame: int, camera: Camera) -> np.ndarray:
-    """Share (H, W) of each pixel that shows the subject, but not the shirt."""
-    fine = resized(camera, camera.width * RAYS, camera.height * RAYS)
+def true_head_alpha(
+    truth: Truth, subject: str, frame: int, camera: Camera, rays: int = 2
+) -> np.ndarray:
+    """Share (H, W) of each pixel that shows the subject, but not the shirt; rays x rays a pixel."""
+    fine = resized(camera, camera.width * rays, camera.height * rays)
     material, _ = truth.surface(subject, frame, fine)
     head = ((material >= 0) & (material != Material.CLOTH)).astype(np.float32)
-    return head.reshape(camera.height, RAYS, camera.width, RAYS).mean((1, 3))
+    return head.reshape(camera.height, rays, camera.width, rays).mean((1, 3))
+
+
+def view_row(
+    true: np.ndarray, true_alpha: np.ndarray, alpha: np.ndarray, labels: np.ndarray | None
+) -> dict:
+    """Errors of a head matte (H, W), and pixels of each label in both and in either."""
+    both = either = np.zeros(len(LABELS), np.int64)
+    if labels is not None:
+        pairs = [(true == k, labels == k) for k in range(len(LABELS))]
+        both = np.array([(a & b).sum() for a, b in pairs])
+        either = np.array([(a | b).sum() for a, b in pairs])
+    error = np.abs(alpha - true_alpha)
+    return {"both": both, "either": either, "sad": error.sum(), "mae": error.mean()}
+
+
+def iou_figures(rows: list[dict]) -> dict:
+    """IoU of each part over all pixels of views (of ``view_row``), and their mean.
+
+    A part that neither truth nor labels have is None and does not count.
+    """
+    both, either = sum(row["both"] for row in rows), sum(row["either"] for row in rows)
+    iou = {
+        name: round(float(both[k] / either[k]), 4) if either[k] else None
+        for k, name in enumerate(LABELS)
+    }
+    there = [value for value in iou.values() if value is not None]
+    return {"iou_mean": round(float(np.mean(there)), 4), "iou": iou}
