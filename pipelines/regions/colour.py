@@ -49,11 +49,15 @@ def by_colour(rgb: np.ndarray, alpha: np.ndarray, geometry: Geometry, bare: bool
         bare: whether the scalp is skin.
     """
     labels = geometry.labels()
+    taught = _sure(labels, alpha > SOLID, geometry)
+    beyond = SKIN_BEYOND
     if bare:
+        # No scalp teaches hair, and what juts out beyond the mesh is skin as likely.
         labels = np.where(labels == SCALP, SKIN, labels)
-    says = _colours(rgb, _sure(labels, alpha > SOLID, geometry)) + _priors(labels, geometry)
-    best = says.argmax(0)
-    kept = np.isin(geometry.near, (SKIN, NECK, EARS)) & ((geometry.mesh > 0) | geometry.rim)
+        taught[0], beyond = np.zeros_like(taught[0]), 0.0
+    best = (_colours(rgb, taught) + _priors(labels, geometry, beyond)).argmax(0)
+    around = (geometry.mesh > 0) | geometry.rim | bare
+    kept = np.isin(geometry.near, (SKIN, NECK, EARS)) & around
     skin = np.where(kept, geometry.near, SKIN)
     unsure = (geometry.mesh == 0) | np.isin(geometry.mesh, list(_ON_MESH))
     return np.where(unsure, np.choose(best, [HAIR, skin, TORSO]), labels).astype(np.uint8)
@@ -84,14 +88,14 @@ def _colours(rgb: np.ndarray, taught: list[np.ndarray]) -> np.ndarray:
     return np.stack([cv2.GaussianBlur(row, (0, 0), BLUR_PX) for row in says])
 
 
-def _priors(labels: np.ndarray, geometry: Geometry) -> np.ndarray:
-    """Log-prior (3, H, W) of hair, skin and torso by place."""
+def _priors(labels: np.ndarray, geometry: Geometry, beyond: float) -> np.ndarray:
+    """Log-prior (3, H, W) of hair, skin and torso by place; `beyond` the rim, of skin."""
     fade = np.clip(geometry.height / FADE, -MOST_FADE, MOST_FADE)
     above, below = np.maximum(fade, 0), np.minimum(fade, 0)
     on_mesh = geometry.mesh > 0
     skin_rim = geometry.rim & (geometry.near != SCALP)
     hair = below + np.where(skin_rim, HAIR_ON_RIM, 0)
-    skin = np.where(skin_rim, below, SKIN_BEYOND)
+    skin = below + np.where(skin_rim, 0, beyond)
     torso = np.where(on_mesh, NEVER, -above)
     for label, (on_hair, on_skin) in _ON_MESH.items():
         here = on_mesh & (labels == label)

@@ -12,7 +12,7 @@ import numpy as np
 from express50.cameras import Camera, resized
 from express50.errors import CaptureError, FormatError, StageError
 from express50.frames import read_cameras_of, read_peaks
-from express50.images import contact_sheet, resize_area, write_image
+from express50.images import contact_sheet, fit_into, resize_area, write_image
 from express50.index import index_path
 from express50.layout import Dataset
 from express50.stage import Stage
@@ -33,6 +33,7 @@ from pipelines.regions.scalp import Scalp, decide, scalp_votes
 from pipelines.regions.view import HAIR, head_alpha, place
 
 TILE = (260, 260)
+FACE = ("skin", "lips", "eyes")
 VOTERS, VOTING_SIDE = 4, 512  # cameras, and their pixels, that tell whether the scalp is bare
 
 
@@ -80,13 +81,12 @@ def run(dataset: Dataset, item: str, config: RegionsConfig, out: Path) -> dict:
     subject, expression = item.split("/")
     head = read_head(dataset, subject, expression)
     frame = read_peaks(dataset, subject)[expression]
-    cameras = read_cameras_of(dataset, subject)
-    bare = _bare(dataset, item, head, frame, config)
+    bare, read = _bare(dataset, item, head, frame, config)
     figures, rows = {}, {}
     dropped = []
-    for name, camera in cameras.items():
+    for name, camera in read_cameras_of(dataset, subject).items():
         try:
-            rgb, alpha = read_pair(dataset, item, camera, frame)
+            rgb, alpha = read.pop(name, None) or read_pair(dataset, item, camera, frame)
             depth = read_depth(dataset, item, camera, config)
         except (CaptureError, FormatError, StageError) as error:
             dropped.append({"what": name, "why": str(error)})
@@ -96,7 +96,8 @@ def run(dataset: Dataset, item: str, config: RegionsConfig, out: Path) -> dict:
     if not figures:
         why = "; ".join(f"{row['what']}: {row['why']}" for row in dropped[:3])
         raise StageError(f"{item}: no camera has a matte to label ({why}); run 'express50 matte'")
-    _write_picture(out, rows, config.qc_views)
+    shares = {name: row["labels"] for name, row in figures.items()}
+    _write_picture(out, rows, shares, config.qc_views)
     return _metrics(head.labels, figures, bare, config, dropped)
 
 
@@ -143,18 +144,18 @@ def _shrunk(
 
 def _bare(
     dataset: Dataset, item: str, head: TrackedHead, frame: int, config: RegionsConfig
-) -> Scalp:
-    """Whether the scalp is skin: as asked for, or by the colours of a few cameras."""
+) -> tuple[Scalp, dict[str, tuple[np.ndarray, np.ndarray]]]:
+    """Whether the scalp is skin: as asked for, or by a few cameras; and what these showed."""
     if config.scalp != "auto":
-        return Scalp(config.scalp == "skin", None)
+        return Scalp(config.scalp == "skin", None), {}
     cameras = list(read_cameras_of(dataset, item.split("/")[0]).values())
-    votes = []
+    votes, read = [], {}
     for k in np.unique(np.linspace(0, len(cameras) - 1, VOTERS).round().astype(int)):
         with contextlib.suppress(CaptureError, FormatError, StageError):  # the run names them
-            rgb, alpha = read_pair(dataset, item, cameras[k], frame)
+            rgb, alpha = read[cameras[k].id] = read_pair(dataset, item, cameras[k], frame)
             camera, rgb, alpha, _ = _shrunk(cameras[k], rgb, alpha, None, VOTING_SIDE)
             votes.append(scalp_votes(rgb, see(head, camera)[0], alpha))
-    return decide(votes)
+    return decide(votes), read
 
 
 def _weights(config: RegionsConfig) -> Path:
@@ -189,12 +190,15 @@ def _finish(
         "mesh_in_frame": bool(mesh.any()),
         **mesh_fit(mesh, alpha, head),
     }
-    return figures, picture_row(rgb, large, head, subject_box(large))
+    pictures = picture_row(rgb, large, head, subject_box(large))
+    return figures, [fit_into(picture, *TILE) for picture in pictures]
 
 
-def _write_picture(out: Path, rows: dict[str, list[np.ndarray]], count: int) -> None:
-    """Contact sheet of evenly chosen cameras: frame, labels, head alone; and a legend."""
-    names = list(rows)
+def _write_picture(
+    out: Path, rows: dict[str, list[np.ndarray]], shares: dict[str, dict], count: int
+) -> None:
+    """Contact sheet of cameras from front to back: frame, labels, head alone; and a legend."""
+    names = sorted(rows, key=lambda name: -sum(shares[name][part] for part in FACE))
     chosen = np.unique(np.linspace(0, len(names) - 1, count).round().astype(int))
     pairs = [[names[k] for k in chosen[start : start + 2]] for start in range(0, len(chosen), 2)]
     sheet = contact_sheet(
