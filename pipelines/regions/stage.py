@@ -86,7 +86,8 @@ def run(dataset: Dataset, item: str, config: RegionsConfig, out: Path) -> dict:
     dropped = []
     for name, camera in read_cameras_of(dataset, subject).items():
         try:
-            rgb, alpha = read.pop(name, None) or read_pair(dataset, item, camera, frame)
+            known = read.pop(name, None)
+            rgb, alpha = known or read_pair(dataset, item, camera, frame)
             depth = read_depth(dataset, item, camera, config)
         except (CaptureError, FormatError, StageError) as error:
             dropped.append({"what": name, "why": str(error)})
@@ -149,7 +150,8 @@ def _bare(
     if config.scalp != "auto":
         return Scalp(config.scalp == "skin", None), {}
     cameras = list(read_cameras_of(dataset, item.split("/")[0]).values())
-    votes, read = [], {}
+    votes = []
+    read: dict[str, tuple[np.ndarray, np.ndarray]] = {}
     for k in np.unique(np.linspace(0, len(cameras) - 1, VOTERS).round().astype(int)):
         with contextlib.suppress(CaptureError, FormatError, StageError):  # the run names them
             rgb, alpha = read[cameras[k].id] = read_pair(dataset, item, cameras[k], frame)
