@@ -24,6 +24,7 @@ HELP = {
     "matte": "separate the head from the background",
     "track": "fit the head model to the peak frames",
     "depth": "estimate surface and depth maps",
+    "regions": "label skin, hair, eyes, mouth, neck and torso; cut the head off the torso",
     "pack": "write shards, splits and dataset card",
 }
 

@@ -7,9 +7,6 @@ from typing import Literal
 
 from express50.errors import ConfigError
 
-PARTS = ("background", "apparel", "face_neck", "hair", "body", "lips", "teeth", "tongue")
-"""What a label in ``<expression>_parts.png`` means, by its value."""
-
 
 @dataclass(frozen=True, kw_only=True)
 class MatteConfig:
@@ -21,10 +18,6 @@ class MatteConfig:
     """File of the network's weights, TorchScript or ONNX; from a known origin, it is a program."""
     tile: int = 2048
     """Longest side, pixels, that bgmv2 sees at once; larger frames are cut up."""
-    segmentation: str = ""
-    """File of Sapiens' body-part weights, TorchScript; labels the parts of each peak."""
-    torso: Literal["keep", "remove"] = "keep"
-    """Whether to write mattes of the head alone too; remove needs segmentation."""
     scale: float = 1.0
     """Key at this share of the resolution; below 1 the matte is enlarged afterwards."""
     low: float = 1.2
@@ -72,8 +65,6 @@ class MatteConfig:
                 f"matte.method {self.method!r} with matte.weights {self.weights!r}: key takes none,"
                 " bgmv2 and salient need the file of the network's weights"
             )
-        if self.torso == "remove" and not self.segmentation:
-            raise ConfigError("matte.torso 'remove' needs matte.segmentation, Sapiens' weights")
         if self.tile < 512 or self.tile % 64:
             raise ConfigError(f"matte.tile is {self.tile}, expected a multiple of 64, 512 or more")
 

@@ -12,13 +12,13 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from pipelines.matte.networks import Network, Role
 from pipelines.matte.smooth import smooth_alpha
 from pipelines.matte.tiles import in_tiles
+from pipelines.networks import Network, Role, resized
 
-BGMV2 = Role(setting="weights", inputs=("src", "bgr"), outputs=("pha",))
+BGMV2 = Role(setting="matte.weights", inputs=("src", "bgr"), outputs=("pha",))
 SALIENT = Role(
-    setting="weights", inputs=("pixel_values",), outputs=("alphas", "output_image"), place=-1
+    setting="matte.weights", inputs=("pixel_values",), outputs=("alphas", "output_image"), place=-1
 )
 MULTIPLE = 4  # BackgroundMattingV2 refines patches of 4 x 4 pixels
 LEAST_SIDE = 64  # below this its encoder has nothing left to see
@@ -95,13 +95,6 @@ def refined(frame: np.ndarray, alpha: np.ndarray, factor: float) -> np.ndarray:
         return smooth_alpha(frame[part], alpha[part], band[part], ENLARGED_WEIGHT)
 
     return in_tiles(alpha.shape, REFINE_TILE, REFINE_OVERLAP, compute)
-
-
-def resized(image: np.ndarray, height: int, width: int) -> np.ndarray:
-    """An image (H, W[, C]) at another size: averaged to shrink, interpolated to grow."""
-    shrinks = height <= image.shape[0] and width <= image.shape[1]
-    how = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
-    return cv2.resize(np.ascontiguousarray(image), (width, height), interpolation=how)
 
 
 def _padded(image: np.ndarray) -> np.ndarray:

@@ -5,18 +5,11 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from pipelines.matte.config import PARTS
-
 # A coverage this factor off the camera's median, or off the peak before, is reported as a jump.
 JUMP = 1.35
 EMPTY = 0.003
 # Share of the image's top or of a side that the subject may cover before it counts as cut off.
 MOST_CONTACT = 0.02
-# One colour a part, the background's is not drawn.
-COLOURS = np.array(
-    [[0, 0, 0], [255, 160, 0], [230, 60, 60], [70, 110, 255], [60, 190, 90], [255, 0, 255],
-     [255, 255, 255], [160, 0, 40]], np.float32,
-)  # fmt: skip
 
 
 def border_contact(alpha: np.ndarray) -> dict[str, float]:
@@ -62,10 +55,8 @@ def warnings(
     return found
 
 
-def picture_row(
-    image: np.ndarray, alpha: np.ndarray, labels: np.ndarray | None = None
-) -> list[np.ndarray]:
-    """Frame with the matte's outline, subject on a plain ground, alpha, and parts if labelled."""
+def picture_row(image: np.ndarray, alpha: np.ndarray) -> list[np.ndarray]:
+    """Frame with the matte's outline, subject on a plain ground, alpha."""
     outline = image.copy()
     edges, _ = cv2.findContours(
         (alpha > 0.5).astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE
@@ -75,14 +66,4 @@ def picture_row(
     ground = np.array([40, 200, 90], np.float32)
     cut = alpha[..., None] * image + (1 - alpha[..., None]) * ground
     grey = np.repeat((alpha * 255)[..., None], 3, axis=2)
-    row = [outline, cut.astype(np.uint8), grey.astype(np.uint8)]
-    if labels is not None:
-        painted = 0.4 * image + 0.6 * COLOURS[labels]
-        row.append(np.where((labels > 0)[..., None], painted, image).astype(np.uint8))
-    return row
-
-
-def part_shares(labels: np.ndarray) -> dict[str, float]:
-    """Share of the image that each part covers."""
-    counts = np.bincount(labels.ravel(), minlength=len(PARTS)) / labels.size
-    return {part: round(float(share), 6) for part, share in zip(PARTS, counts, strict=True)}
+    return [outline, cut.astype(np.uint8), grey.astype(np.uint8)]

@@ -19,7 +19,7 @@ from express50.stage import Stage
 from pipelines.matte.config import PRESETS, MatteConfig
 from pipelines.matte.keyer import Keyer
 from pipelines.matte.plate import exposed, exposure_gain
-from pipelines.matte.qc import border_contact, part_shares, picture_row, warnings
+from pipelines.matte.qc import border_contact, picture_row, warnings
 from pipelines.matte.source import Plate, others_of, plate_of
 
 QC_ROWS = 8
@@ -55,16 +55,15 @@ def inputs(dataset: Dataset, item: str, config: MatteConfig) -> dict[str, Path |
             theirs = read_index(dataset, other)
             if camera in theirs.plates:
                 found[f"plate of {other}"] = theirs.capture / theirs.plates[camera]
-    for setting in ("weights", "segmentation"):
-        if getattr(config, setting):
-            found[setting] = _weights(config, setting)
+    if config.weights:
+        found["weights"] = _weights(config)
     return found
 
 
-def _weights(config: MatteConfig, setting: str) -> Path:
-    path = Path(getattr(config, setting)).expanduser()
+def _weights(config: MatteConfig) -> Path:
+    path = Path(config.weights).expanduser()
     if not path.is_file():
-        raise StageError(f"matte.{setting} {path}: no such file; expected TorchScript or .onnx")
+        raise StageError(f"matte.weights {path}: no such file; expected TorchScript or .onnx")
     return path
 
 
@@ -85,21 +84,13 @@ def run(dataset: Dataset, item: str, config: MatteConfig, out: Path) -> dict:
     alpha_of, facts = _method(plate, [read(f) for f in _measured(peaks, config)], valid, config)
     coverage: dict[str, float] = {}
     border: dict[str, dict[str, float]] = {}
-    parts: dict[str, dict[str, float]] = {}
     for expression, frame in peaks.items():
         image = read(frame)
         alpha = np.where(valid, alpha_of(image), np.float32(0))
-        _write_alpha(out / f"{expression}.png", alpha)
+        write_image(out / f"{expression}.png", np.rint(alpha * 255).astype(np.uint8))
         coverage[expression] = round(float(alpha.mean()), 6)
         border[expression] = border_contact(alpha)
-        if config.segmentation:
-            parts[expression] = _write_parts(out, expression, image, alpha, config)
     odd = warnings(peaks, coverage, border) + list(plate.warnings if plate else ())
-    odd += [
-        {"what": expression, "why": "the segmentation finds no head"}
-        for expression, shares in parts.items()
-        if shares["face_neck"] + shares["hair"] == 0
-    ]
     named = {warning["what"] for warning in odd}
     first = sorted(peaks, key=lambda expression: expression not in named)[:QC_ROWS]
     _write_picture(out, {e: read(peaks[e]) for e in first}, named)
@@ -108,7 +99,6 @@ def run(dataset: Dataset, item: str, config: MatteConfig, out: Path) -> dict:
         **facts,
         "coverage": coverage,
         "border_contact": border,
-        **({"parts": parts} if parts else {}),
         "warnings": odd,
         "dropped": [],
     }
@@ -133,9 +123,9 @@ def _method(
         return keyer.alpha, {"plate": plate.source, "noise_8bit": noise}
     # Only here, as torch takes seconds to import.
     from pipelines.matte.learned import BGMV2, SALIENT, background_alpha, salient_alpha
-    from pipelines.matte.networks import load_network
+    from pipelines.networks import load_network
 
-    path = _weights(config, "weights")
+    path = _weights(config)
     if plate is None:
         salient = load_network(path, SALIENT)
         return lambda frame: salient_alpha(salient, frame), {"plate": "none"}
@@ -148,32 +138,12 @@ def _method(
     return alpha, {"plate": plate.source}
 
 
-def _write_alpha(path: Path, alpha: np.ndarray) -> None:
-    write_image(path, np.rint(alpha * 255).astype(np.uint8))
-
-
-def _write_parts(
-    out: Path, expression: str, image: np.ndarray, alpha: np.ndarray, config: MatteConfig
-) -> dict[str, float]:
-    """Write the labels of the parts, and the head's own matte where it is asked for."""
-    from pipelines.matte.networks import load_network
-    from pipelines.matte.parts import SAPIENS, head_alpha, segment
-
-    network = load_network(_weights(config, "segmentation"), SAPIENS)
-    labels = segment(network, image)
-    write_image(out / f"{expression}_parts.png", labels)
-    if config.torso == "remove":
-        _write_alpha(out / f"{expression}_head.png", head_alpha(alpha, labels))
-    return part_shares(labels)
-
-
 def _write_picture(out: Path, images: dict[str, np.ndarray], odd: set[str]) -> None:
     """Contact sheet of what was written for some expressions, the odd ones marked."""
     rows = []
     for expression, image in images.items():
         alpha = read_image(out / f"{expression}.png").astype(np.float32) / 255
-        path = out / f"{expression}_parts.png"
-        rows.append(picture_row(image, alpha, read_image(path) if path.is_file() else None))
+        rows.append(picture_row(image, alpha))
     (out / "qc").mkdir()
     labels = [f"{name}: see warnings" if name in odd else name for name in images]
     sheet = contact_sheet(rows, labels, tile=(240, 240))
@@ -182,7 +152,7 @@ def _write_picture(out: Path, images: dict[str, np.ndarray], odd: set[str]) -> N
 
 STAGE = Stage(
     name="matte",
-    version=3,
+    version=4,
     config=MatteConfig,
     presets=PRESETS,
     items=items,

@@ -22,6 +22,8 @@ class PackConfig:
     """Where a pixel mixes subject and background, store the subject's own colour alone."""
     even_colour: bool = True
     """Divide out what the cameras make differently of the same light, where calibration told it."""
+    torso: Literal["remove", "keep"] = "remove"
+    """Alpha without or with shoulders and clothes, where the regions stage told them apart."""
     min_confidence: float = 0.0
     """Depth pixels under this confidence count as not valid, 0 to 1."""
     shard_mb: int = 256

@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 
 from pipelines.matte.learned import BGMV2, SALIENT, background_alpha, salient_alpha
-from pipelines.matte.networks import load_network
-from pipelines.matte.parts import SAPIENS, head_alpha, segment
 from pipelines.matte.qc import border_contact, warnings
-from tests.pipelines.stand_ins import Difference, Thirds, onnx_bright, torchscript
+from pipelines.networks import load_network
+from tests.pipelines.stand_ins import Difference, onnx_bright, torchscript
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 300), (3, 2), (65, 1)])
@@ -22,9 +21,6 @@ def test_the_smallest_pictures(tmp_path, shape: tuple[int, int]) -> None:
     assert background_alpha(pair, frame, plate, 512).min() > 0.5
     salient = load_network(onnx_bright(tmp_path / "b.onnx"), SALIENT)
     assert salient_alpha(salient, frame) == pytest.approx(np.ones(shape), abs=1e-3)
-    labels = segment(load_network(torchscript(Thirds(), tmp_path / "c.pt"), SAPIENS), frame)
-    assert labels.shape == shape
-    assert np.isfinite(head_alpha(np.ones(shape, np.float32), labels)).all()
 
 
 def test_an_odd_4k_frame_goes_through_in_tiles(tmp_path) -> None:

@@ -1,4 +1,4 @@
-"""Networks that users bring: loading, tiling, logits, parts; and every way they can be wrong."""
+"""Networks that users bring: loading, tiling, logits; and every way they can be wrong."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from express50.errors import ConfigError, StageError
-from pipelines.matte.config import PARTS, MatteConfig
+from pipelines.matte.config import MatteConfig
 from pipelines.matte.learned import (
     BGMV2,
     SALIENT,
@@ -21,20 +21,17 @@ from pipelines.matte.learned import (
     refined,
     salient_alpha,
 )
-from pipelines.matte.networks import load_network
-from pipelines.matte.parts import SAPIENS, head_alpha, part_mask, segment
 from pipelines.matte.tiles import in_tiles, spans
+from pipelines.networks import load_network
 from tests.pipelines.matte_scenes import make_scene
 from tests.pipelines.stand_ins import (
     Bad,
     BadPair,
     Bright,
     Difference,
-    Thirds,
     onnx_bright,
     onnx_difference,
     torchscript,
-    traced_thirds,
 )
 
 
@@ -152,47 +149,12 @@ def test_refining_in_tiles_is_refining_the_whole(monkeypatch) -> None:
     assert np.abs(refined(scene.frame, large, 2.0) - whole).mean() < 2e-3
 
 
-def test_parts_are_named_and_the_torso_goes(tmp_path) -> None:
-    network = load_network(torchscript(Thirds(), tmp_path / "parts.pt"), SAPIENS)
-    labels = segment(network, np.zeros((200, 100, 3), np.uint8))
-    middle = [PARTS[label] for label in labels[[20, 100, 180], 50]]
-    assert middle == ["hair", "face_neck", "body"]
-    assert part_mask(labels, "background")[:, [2, 97]].all()
-    head = head_alpha(np.ones((200, 100), np.float32), labels)
-    assert head[:135, 50].min() == 1 and head[146:, 50].max() == 0
-    # What the network calls background goes with the nearer part: strands beside the hair stay.
-    assert head[20, 2] == 1 and head[190, 2] == 0
-
-
-def test_a_traced_network_gives_parts_at_the_frames_own_size(tmp_path) -> None:
-    network = load_network(traced_thirds(tmp_path / "parts.pt2"), SAPIENS)
-    frame = np.zeros((101, 77, 3), np.uint8)
-    frame[:50] = 255
-    labels = segment(network, frame)
-    assert part_mask(labels, "hair")[:48].all() and part_mask(labels, "body")[53:].all()
-
-
 def test_a_file_in_half_precision_runs_on_the_cpu_too(tmp_path, rng) -> None:
     frame, plate = pair(rng, 64, 64)
     paths = [torchscript(Difference(), tmp_path / "single.pt")]
     paths.append(torchscript(Difference().half(), tmp_path / "half.pt"))
     single, half = (background_alpha(load_network(p, BGMV2), frame, plate, 512) for p in paths)
     assert np.abs(single - half).max() < 2e-3
-
-
-def test_the_class_numbers_are_sapiens_own() -> None:
-    from pipelines.matte.parts import _PART_OF_CLASS
-
-    known = {0: "background", 1: "apparel", 2: "face_neck", 3: "hair", 4: "body", 21: "body"}
-    known |= {22: "body", 23: "lips", 24: "lips", 25: "teeth", 26: "teeth", 27: "tongue"}
-    assert {k: PARTS[_PART_OF_CLASS[k]] for k in known} == known
-
-
-def test_no_head_is_empty_and_no_body_keeps_all() -> None:
-    alpha = np.full((9, 9), 0.5, np.float32)
-    for part, expected in (("body", 0.0), ("background", 0.0), ("hair", 0.5)):
-        labels = np.full((9, 9), PARTS.index(part), np.uint8)
-        assert (head_alpha(alpha, labels) == expected).all()
 
 
 @pytest.mark.parametrize(
@@ -213,15 +175,12 @@ def test_a_wrong_answer_is_one_line(tmp_path, how: str, message: str) -> None:
     assert "\n" not in str(caught.value)
 
 
-def test_wrong_answers_to_pairs_and_parts(tmp_path) -> None:
+def test_wrong_answers_to_pairs(tmp_path) -> None:
     black = np.zeros((80, 80, 3), np.uint8)
     for how, message in (("nan", "NaN"), ("small", r"gave shape \(1, 40, 40\)")):
         network = load_network(torchscript(BadPair(how), tmp_path / f"{how}.pt"), BGMV2)
         with pytest.raises(StageError, match=message):
             background_alpha(network, black, black, 512)
-    network = load_network(torchscript(Bright(), tmp_path / "one.pt"), SAPIENS)
-    with pytest.raises(StageError, match=r"matte.segmentation .*expected \(28, height, width\)"):
-        segment(network, black)
 
 
 def test_a_network_for_another_method_is_named(tmp_path) -> None:
@@ -294,7 +253,6 @@ def test_settings_that_do_not_go_together_are_refused() -> None:
     for change in (
         {"method": "bgmv2"},
         {"weights": "net.pt"},
-        {"torso": "remove"},
         {"tile": 100},
         {"tile": 0},
     ):

@@ -1,4 +1,4 @@
-"""The matte stage with networks, with parts and without plates, as the runner runs it."""
+"""The matte stage with networks and without plates, as the runner runs it."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from express50.layout import Dataset
 from express50.runner import Summary, run_stage
 from pipelines import calibrate, ingest
 from pipelines.matte import STAGE
-from pipelines.matte.config import PARTS, MatteConfig
+from pipelines.matte.config import MatteConfig
 from tests.pipelines.matte_scenes import clutter
-from tests.pipelines.stand_ins import Bad, Difference, Thirds, onnx_bright, torchscript
+from tests.pipelines.stand_ins import Bad, Difference, onnx_bright, torchscript
 from tests.pipelines.test_matte_footage import backdrop, shot
 from tests.synth import make_capture
 
@@ -98,25 +98,20 @@ def test_other_weights_run_again_and_the_same_do_not(aligned, tmp_path) -> None:
     assert path.read_bytes() != before
 
 
-def test_a_salient_network_needs_no_plate_and_parts_cut_the_torso(tmp_path) -> None:
+def test_a_salient_network_needs_no_plate(tmp_path) -> None:
     rng = np.random.default_rng(0)
     dataset = make_dataset(tmp_path, [unplated(tmp_path / "raw", "S001", 1, 0.3 * backdrop(rng))])
     settings = {
         "method": "salient",
         "weights": str(onnx_bright(tmp_path / "net.onnx", 128)),
-        "segmentation": str(torchscript(Thirds(), tmp_path / "parts.pt")),
-        "torso": "remove",
     }
     assert run(dataset, **settings).ok
     folder = dataset.item_dir("matte", "S001/cam00")
     names = {p.name for p in folder.glob("*.png")}
-    assert names == {f"{e}{p}.png" for e in ("neutral", "smile") for p in ("", "_head", "_parts")}
-    alpha, head, parts = (read_image(folder / f"smile{p}.png") for p in ("", "_head", "_parts"))
-    assert alpha[64, 64] == head[64, 64] == 255 and alpha[2, 2] == head[2, 2] == 0
-    assert alpha[120, 64] == 255 and head[120, 64] == 0
-    assert PARTS[parts[64, 64]] == "face_neck" and PARTS[parts[120, 64]] == "body"
-    figures = metrics_of(dataset)
-    assert figures["plate"] == "none" and figures["parts"]["smile"]["body"] > 0.1
+    assert names == {"neutral.png", "smile.png"}
+    alpha = read_image(folder / "smile.png")
+    assert alpha[64, 64] == 255 and alpha[2, 2] == 0
+    assert metrics_of(dataset)["plate"] == "none"
     before = {p: p.read_bytes() for p in folder.rglob("*.*")}
     assert run(dataset, **settings, scale=0.9).count("done") == 1  # run anew, the same bytes
     assert {p: p.read_bytes() for p in folder.rglob("*.*")} == before

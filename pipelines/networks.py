@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 
+import cv2
 import numpy as np
 import torch
 
@@ -31,7 +32,7 @@ class Role:
     """What a network must be: pictures it takes, and which of its outputs is the answer.
 
     Attributes:
-        setting: config key that names the file, for messages.
+        setting: config key that names the file, such as matte.weights, for messages.
         inputs: names of the pictures; an ONNX file may order them otherwise.
         outputs: names that mark the answer in an ONNX file.
         place: index of the answer where no name tells it.
@@ -89,7 +90,14 @@ def load_network(path: Path, role: Role) -> Network:
 def check_file(path: Path, setting: str) -> None:
     """Raise StageError where there is no file of weights."""
     if not path.is_file():
-        raise StageError(f"matte.{setting} {path}: no such file; expected TorchScript or .onnx")
+        raise StageError(f"{setting} {path}: no such file; expected TorchScript or .onnx")
+
+
+def resized(image: np.ndarray, height: int, width: int) -> np.ndarray:
+    """An image (H, W[, C]) at another size: averaged to shrink, interpolated to grow."""
+    shrinks = height <= image.shape[0] and width <= image.shape[1]
+    how = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
+    return cv2.resize(np.ascontiguousarray(image), (width, height), interpolation=how)
 
 
 @lru_cache(maxsize=2)
@@ -98,7 +106,7 @@ def _load(path: Path, role: Role, version: tuple[int, int]) -> Network:
 
 
 def _error(path: Path, role: Role, why: str) -> StageError:
-    return StageError(f"matte.{role.setting} {path}: the network {why}")
+    return StageError(f"{role.setting} {path}: the network {why}")
 
 
 def _reason(error: BaseException) -> str:
@@ -113,7 +121,7 @@ def _check_inputs(path: Path, role: Role, least: int, most: int) -> None:
             path,
             role,
             f"takes {least} pictures, expected {len(role.inputs)} ({', '.join(role.inputs)});"
-            " does matte.method fit the file?",
+            " does the setting fit the file?",
         )
 
 
@@ -128,7 +136,7 @@ def _torchscript(path: Path, role: Role) -> Network:
         arguments = module.forward.schema.arguments[1:]
     except (*TORCH_ERRORS, AttributeError) as error:
         raise StageError(
-            f"matte.{role.setting} {path}: not TorchScript with a forward ({_reason(error)});"
+            f"{role.setting} {path}: not TorchScript with a forward ({_reason(error)});"
             " expected a file of torch.jit.save, or .onnx"
         ) from None
     needed = sum(not argument.has_default_value() for argument in arguments)
@@ -187,7 +195,7 @@ def _onnx(path: Path, role: Role) -> Network:
         import onnxruntime
     except ImportError:
         raise StageError(
-            f"matte.{role.setting} {path}: ONNX files need onnxruntime, which is not installed;"
+            f"{role.setting} {path}: ONNX files need onnxruntime, which is not installed;"
             " run pip install 'express50[networks]'"
         ) from None
     errors = _onnx_errors()
@@ -201,7 +209,7 @@ def _onnx(path: Path, role: Role) -> Network:
         session = onnxruntime.InferenceSession(str(path), options, providers=providers)
     except errors as error:
         raise StageError(
-            f"matte.{role.setting} {path}: onnxruntime cannot load it ({_reason(error)})"
+            f"{role.setting} {path}: onnxruntime cannot load it ({_reason(error)})"
         ) from None
     slots = session.get_inputs()
     _check_inputs(path, role, len(slots), len(slots))
