@@ -14,16 +14,16 @@ from express50.errors import ConfigError, StageError
 from express50.frames import dhash, read_frame
 from express50.images import read_image
 from express50.index import read_index
-from pipelines.matte import STAGE
-from pipelines.matte.config import MatteConfig
-from pipelines.matte.key import dilated, eroded, plate_difference
-from pipelines.matte.keyer import Keyer
-from pipelines.matte.opacity import local_colours, shrunk, solve_opacity
-from pipelines.matte.plate import exposed, exposure_gain, fit_plate
-from pipelines.matte.smooth import MattingLaplacian
-from tests.pipelines.matte_scenes import Scene, clutter, make_scene
+from pipelines.alpha import STAGE
+from pipelines.alpha.config import AlphaConfig
+from pipelines.alpha.key import dilated, eroded, plate_difference
+from pipelines.alpha.keyer import Keyer
+from pipelines.alpha.opacity import local_colours, shrunk, solve_opacity
+from pipelines.alpha.plate import exposed, exposure_gain, fit_plate
+from pipelines.alpha.smooth import MattingLaplacian
+from tests.pipelines.alpha_scenes import Scene, clutter, make_scene
 
-CONFIG = MatteConfig()
+CONFIG = AlphaConfig()
 
 
 def key(scene: Scene, **changes) -> np.ndarray:
@@ -210,8 +210,8 @@ def test_pixels_without_footage_are_transparent() -> None:
 
 def test_wrong_settings_are_refused() -> None:
     for change in ({"low": 7.0}, {"scale": 0.0}, {"spread": 2.0}, {"shadow": 1.0}):
-        with pytest.raises(ConfigError, match="matte"):
-            MatteConfig(**change)
+        with pytest.raises(ConfigError, match="alpha"):
+            AlphaConfig(**change)
 
 
 @pytest.fixture
@@ -259,6 +259,6 @@ def test_the_stage_writes_one_matte_a_peak_twice_alike(aligned, tmp_path) -> Non
 
 
 def test_no_plate_and_a_still_subject_is_one_clear_error(aligned, tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr("pipelines.matte.source.read_plate", lambda *args, **more: None)
+    monkeypatch.setattr("pipelines.alpha.source.read_plate", lambda *args, **more: None)
     with pytest.raises(StageError, match="photograph the empty set as plates/"):
         STAGE.run(aligned, STAGE.items(aligned)[0], CONFIG, tmp_path)
