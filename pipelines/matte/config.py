@@ -45,5 +45,5 @@ class MatteConfig:
 PRESETS: dict[str, dict[str, object]] = {
     "draft": {"side": 128, "cells": 64},
     "standard": {},
-    "reference": {"side": 288, "cells": 144},
+    "reference": {"side": 256, "cells": 128},
 }

@@ -23,10 +23,12 @@ from pipelines.matte.hull import (
 )
 
 MOST = 0.75  # share of the other views that must see a place to call it solid
+ERRING = 8  # one of so many views may lack the same spot
+THICK = 0.5  # share of the usual length of a ray in the hull that is no corner of it
 NEIGHBOURS = 4  # cameras that are asked for the colour of a surface
 WIDEST = 0.2  # cosine of the largest angle to them
 SEARCH = (-0.3, 0.1, 17)  # radii before and behind the others' hull in which the surface may lie
-SMALLEST = 2e-4  # share of the image that a filled spot has at least
+SMALLEST = 5e-4  # share of the image that a filled spot has at least
 
 
 @dataclass(frozen=True)
@@ -37,7 +39,7 @@ class Evidence:
         known: whose rays cross the space that is compared.
         possible: whose rays pass a place that the others do not rule out.
         likely: whose rays pass a place that not one of them rules out.
-        solid: whose rays pass a place where every other view that sees it sees the subject.
+        solid: whose rays pass a place where (nearly) every other view that sees it sees the subject.
         front: depth of the nearest such place, in radii; infinite where there is none.
     """
 
@@ -56,7 +58,7 @@ def evidence_of(view: View, space: Space, place: np.ndarray, votes: int) -> Evid
     against = space.clear - (own == CLEAR)
     possible = place & (against < votes)
     seen = space.seen - (own != OUT)
-    sure = (space.solid - (own == SOLID) == seen) & (
+    sure = (space.solid - (own == SOLID) >= seen - seen // ERRING) & (
         seen >= max(3.0, MOST * (len(space.labels) - 1))
     )
     spread = cell_spread(view, space.axis)
@@ -66,6 +68,7 @@ def evidence_of(view: View, space: Space, place: np.ndarray, votes: int) -> Evid
     front = cv2.erode(front[:-1].reshape(shape), disc)
     # As much as the cells were widened, lest a rim of them is taken for solid.
     solid = cv2.erode(np.isfinite(front).astype(np.uint8), disc) > 0
+    solid &= _thick(view, np.bincount(pixels[sure], minlength=front.size + 1)[:-1])
     return Evidence(
         known=splat(shape, pixels, spread),
         possible=splat(shape, pixels[possible], spread),
@@ -73,6 +76,17 @@ def evidence_of(view: View, space: Space, place: np.ndarray, votes: int) -> Evid
         solid=solid,
         front=front,
     )
+
+
+def _thick(view: View, cells: np.ndarray) -> np.ndarray:
+    """Pixels (h, w) bool whose rays pass as many of the solid `cells` (h * w,) as most do.
+
+    Between the tangents of few cameras the hull has corners that stand out from the subject; they
+    are thin along the rays that pass the subject.
+    """
+    chord = cv2.blur(cells.reshape(view.alpha.shape).astype(np.float32), (5, 5))
+    opaque = (view.alpha > INSIDE) & (chord > 0)
+    return chord >= THICK * np.median(chord[opaque]) if opaque.any() else opaque
 
 
 def ruled_out(view: View, evidence: Evidence, config: MatteConfig) -> np.ndarray:
@@ -89,12 +103,15 @@ def ruled_out(view: View, evidence: Evidence, config: MatteConfig) -> np.ndarray
     np.maximum.at(reach, parts, away)
     area = np.bincount(parts.ravel(), minlength=count)
     known = np.bincount(parts.ravel(), weights=evidence.known.ravel(), minlength=count)
-    wrong = (reach > config.strand * max(loose.shape)) & (known > 0.5 * area)
-    wrong[0] = False
+    far = (reach > config.strand * max(loose.shape)) & (known > 0.5 * area)
+    far[0] = False
+    wrong = far[parts]
+    # What hangs together with it is wrong by a single view's word, up to the hull of them all.
+    doubtful = (view.alpha > FAINT) & ~evidence.likely
+    _, parts = cv2.connectedComponents(doubtful.astype(np.uint8), connectivity=8)
+    bad = doubtful & np.isin(parts, np.unique(parts[wrong]))
     # One pixel more, for what is fainter still around it.
-    return cv2.dilate(wrong[parts].astype(np.uint8), np.ones((3, 3))).astype(bool) & (
-        ~evidence.possible
-    )
+    return (cv2.dilate(bad.astype(np.uint8), np.ones((3, 3))) > 0) & ~evidence.likely
 
 
 def shows_surface(
