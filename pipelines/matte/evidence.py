@@ -39,7 +39,7 @@ class Evidence:
         known: whose rays cross the space that is compared.
         possible: whose rays pass a place that the others do not rule out.
         likely: whose rays pass a place that not one of them rules out.
-        solid: whose rays pass a place where (nearly) every other view that sees it sees the subject.
+        solid: whose rays pass a place where nearly all others that see it see the subject.
         front: depth of the nearest such place, in radii; infinite where there is none.
     """
 
@@ -160,13 +160,16 @@ def _smooth(rgb: np.ndarray) -> np.ndarray:
 
 def _neighbours(view: View, others: Sequence[View]) -> list[View]:
     """The cameras that look from nearest by, as seen from the ball's centre."""
-    way = view.center / max(float(np.linalg.norm(view.center)), 1e-9)
+    ranked = sorted(
+        (o for o in others if o.name != view.name), key=lambda o: _cosine(view, o), reverse=True
+    )
+    return [other for other in ranked[:NEIGHBOURS] if _cosine(view, other) > WIDEST]
 
-    def cosine(other: View) -> float:
-        return float(way @ other.center / max(float(np.linalg.norm(other.center)), 1e-9))
 
-    ranked = sorted((o for o in others if o.name != view.name), key=cosine, reverse=True)
-    return [other for other in ranked[:NEIGHBOURS] if cosine(other) > WIDEST]
+def _cosine(a: View, b: View) -> float:
+    """Cosine of the angle between two cameras, as seen from the ball's centre."""
+    length = float(np.linalg.norm(a.center) * np.linalg.norm(b.center))
+    return float(a.center @ b.center) / length if length > 0 else 0.0
 
 
 def _pixels_of(view: View, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -186,11 +189,14 @@ def missed(
     """Pixels (h, w) bool to fill, and the share of what the others see that then still lacks.
 
     Filled are connected spots that lack alpha where the others see something solid, some of it
-    well inside, and whose colour is that of the surface.
+    well inside, and whose colour is that of the surface. Spots that the matte does not enclose
+    count only as deep in the hull as its corners may stand out.
     """
     lacking = evidence.solid & (view.alpha < INSIDE) & view.valid
-    deep = _deep(evidence.solid, config.margin * max(lacking.shape))
-    alike = shows_surface(view, evidence, lacking, others, subject, config.colour)
+    depth = _depth(evidence.solid)
+    deep = depth > config.margin * max(lacking.shape)
+    todo = lacking & (subject[view.name] | (depth > _corner(view, others) * depth.max()))
+    alike = shows_surface(view, evidence, todo, others, subject, config.colour)
     alike = cv2.morphologyEx(alike.astype(np.uint8), cv2.MORPH_OPEN, np.ones((2, 2))) > 0
     count, spots = cv2.connectedComponents(alike.astype(np.uint8), connectivity=8)
     inside = np.bincount(spots[deep], minlength=count)
@@ -202,8 +208,17 @@ def missed(
     return grown & (evidence.solid | (view.alpha >= INSIDE)), left
 
 
-def _deep(mask: np.ndarray, radius: float) -> np.ndarray:
-    """Pixels (h, w) of a mask further than `radius` from its edge; the border counts inside."""
+def _depth(mask: np.ndarray) -> np.ndarray:
+    """Distance (h, w) of a mask's pixels to its edge; the image's border is none."""
     if mask.all():
-        return mask
-    return cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, 5) > radius
+        return np.full(mask.shape, float(max(mask.shape)), np.float32)
+    return cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, 5)
+
+
+def _corner(view: View, others: Sequence[View]) -> float:
+    """How far the hull of the others stands out from a round subject in this view, in its radii.
+
+    The tangents of cameras an angle away to either side meet at 1 / cos(angle) radii.
+    """
+    cosines = sorted((_cosine(view, o) for o in others if o.name != view.name), reverse=True)
+    return 1 / cosines[1] - 1 if len(cosines) > 1 and cosines[1] > WIDEST else 1.0
