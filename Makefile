@@ -10,7 +10,7 @@ SET ?=
 STAGE_FLAGS = --preset $(PRESET) --workers $(WORKERS) $(foreach kv,$(SET),--set $(kv))
 
 .PHONY: help setup demo test check bench tradeoff report clean \
-        ingest calibrate align matte track depth pack train
+        ingest calibrate align matte track depth regions pack train
 
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 14
@@ -44,7 +44,7 @@ tradeoff: $(READY) ## sweep the speed-accuracy knobs into docs/TRADEOFFS.md
 ingest: $(READY) ## index CAPTURES="dir ..." into DATASET
 	$(BIN)/express50 ingest $(DATASET) $(CAPTURES) $(STAGE_FLAGS)
 
-calibrate align matte track depth pack: $(READY) ## one stage over DATASET
+calibrate align matte track depth regions pack: $(READY) ## one stage over DATASET
 	$(BIN)/express50 $@ $(DATASET) $(STAGE_FLAGS)
 
 train: $(READY) ## train GRMM on DATASET's shards

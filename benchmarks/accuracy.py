@@ -12,12 +12,14 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.regions_truth import iou_figures, true_head_alpha, true_labels, view_row
 from express50.cameras import Camera, transform_camera
 from express50.errors import Express50Error
 from express50.frames import read_cameras_of, read_peaks
 from express50.images import contact_sheet, read_depth_png, read_image, write_image
 from express50.layout import Dataset
 from express50.twin.truth import Truth, align_worlds
+from pipelines.regions.qc import COLOURS
 
 VIEWS_A_PEAK = 2  # views measured of every peak; they walk around the rig from peak to peak
 SHEET_ROWS = 7
@@ -34,6 +36,7 @@ def measure_dataset(dataset: Dataset, truth_root: Path, out: Path | None = None)
         "matte": measure_matte,
         "track": measure_track,
         "depth": measure_depth,
+        "regions": measure_regions,
     }
     figures: dict[str, float | int | None] = {}
     for stage, measure in measures.items():
@@ -171,6 +174,29 @@ def measure_depth(dataset: Dataset, truth: Truth, out: Path | None = None) -> di
         "skin_error_mm_median": float(np.median(np.concatenate(skin))),
         "coverage": float(np.mean(covered)),
         "views": len(errors),
+    }
+
+
+def measure_regions(dataset: Dataset, truth: Truth, out: Path | None = None) -> dict:
+    """Mean absolute error of the head's alpha, and the parts' mean intersection over union."""
+    found, rows, names = [], [], []
+    for subject, expression, frame, camera in sampled_views(dataset, truth):
+        folder = dataset.item_dir("regions", f"{subject}/{expression}")
+        if not (folder / f"{camera.id}.png").is_file():
+            continue
+        labels = read_image(folder / f"{camera.id}.png")
+        alpha = read_image(folder / f"{camera.id}_head.png").astype(np.float64) / 255.0
+        true = true_labels(truth, subject, frame, camera)
+        true_alpha = true_head_alpha(truth, subject, frame, camera)
+        found.append(view_row(true, true_alpha, alpha, labels))
+        rows.append([COLOURS[labels].astype(np.uint8), COLOURS[true].astype(np.uint8),
+                     _grey(np.abs(alpha - true_alpha))])  # fmt: skip
+        names.append(f"{subject} {expression} {camera.id}: parts, truth, error of the head's alpha")
+    _sheet(out, "regions_error", rows, names)
+    return {
+        "head_mae": float(np.mean([row["mae"] for row in found])),
+        "iou_mean": iou_figures(found)["iou_mean"],
+        "views": len(found),
     }
 
 

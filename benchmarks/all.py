@@ -7,7 +7,17 @@ import subprocess
 import sys
 from pathlib import Path
 
-SKIPPED = {"__init__", "all", "demo", "document", "tradeoff", "accuracy", "depth"}
+SKIPPED = {
+    "__init__",
+    "all",
+    "demo",
+    "document",
+    "tradeoff",
+    "accuracy",
+    "depth",
+    "regions",
+    "regions_truth",
+}
 
 
 def main() -> int:

@@ -23,7 +23,7 @@ import psutil
 
 from express50.layout import Dataset
 
-STAGES = ("ingest", "calibrate", "align", "matte", "track", "depth", "pack")
+STAGES = ("ingest", "calibrate", "align", "matte", "track", "depth", "regions", "pack")
 # Six expressions that between them open the jaw, move brows, lids, lips and cheeks, and are
 # one-sided; the fourth subject is never trained on.
 EXPRESSIONS = ("neutral", "smile", "jaw_open", "pucker", "brow_raise", "wink_left")
@@ -188,6 +188,8 @@ def summarise(dataset: Path, truth: Path | None, steps: list[Step]) -> dict:
         "track.vertex_rmse_mm": accuracy.get("track.vertex_rmse_mm"),
         "depth.abs_error_mm_median": accuracy.get("depth.abs_error_mm_median"),
         "depth.abs_error_mm_p95": accuracy.get("depth.abs_error_mm_p95"),
+        "regions.head_mae": accuracy.get("regions.head_mae"),
+        "regions.iou_mean": accuracy.get("regions.iou_mean"),
         "train.psnr_heldout_view_db": metric("grmm/train", "psnr_heldout_view_db"),
         "train.iterations_per_second": metric("grmm/train", "iterations_per_second"),
         "fit.psnr_db": metric("grmm/fit", "psnr_db"),

@@ -27,6 +27,7 @@ MEASURES = {
     "matte": (accuracy.measure_matte, "mae"),
     "track": (accuracy.measure_track, "vertex_rmse_mm"),
     "depth": (accuracy.measure_depth, "abs_error_mm_median"),
+    "regions": (accuracy.measure_regions, "head_mae"),
 }
 
 

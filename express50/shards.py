@@ -145,7 +145,8 @@ class ShardReader:
 
         Returns:
             key; rgb (H, W, 3) uint8 sRGB; alpha (H, W) float32 in [0, 1]; depth (H, W) float32
-            metres, 0 where not valid; valid (H, W) bool; meta dict.
+            metres, 0 where not valid; valid (H, W) bool; parts (H, W) uint8 of
+            ``express50.parts.LABELS``, or None where it was packed without; meta dict.
 
         Raises:
             FormatError: a member is damaged or does not have the size that the meta says.
@@ -161,8 +162,14 @@ class ShardReader:
             "alpha": alpha.astype(np.float32) / 255,
             "depth": steps.astype(np.float32) * np.float32(meta["depth_scale_m"]),
             "valid": steps > 0,
+            "parts": self._parts(number, meta),
             "meta": meta,
         }
+
+    def _parts(self, number: int, meta: dict) -> np.ndarray | None:
+        if "parts.png" not in self.entries[number].members:
+            return None
+        return self._image(number, "parts.png", meta, np.uint8, 2)
 
     def iterate(self, seed: int | None = None, epoch: int = 0, start: int = 0) -> Iterator[dict]:
         """Samples of one pass from position ``start``; shuffled by (seed, epoch) unless None."""

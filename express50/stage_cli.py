@@ -25,6 +25,7 @@ HELP = {
     "matte": "let the cameras of a moment agree on their mattes",
     "track": "fit the head model to the peak frames",
     "depth": "estimate surface and depth maps",
+    "regions": "label skin, hair, eyes, mouth, neck and torso; cut the head off the torso",
     "pack": "write shards, splits and dataset card",
 }
 

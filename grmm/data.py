@@ -20,7 +20,7 @@ from torch import Tensor
 from express50.errors import FormatError, TrainError
 from express50.head.model import HeadModel, pose
 from grmm.model import HeadState, View
-from grmm.torso import torso_mask
+from grmm.torso import labelled_torso, torso_mask
 
 WINDOW_STEP = 32  # pixels; windows have sides of whole steps
 
@@ -68,6 +68,7 @@ class Sample:
         K: (3, 3) pixels, corner origin.
         cam_from_world: (4, 4).
         tracked: head-model parameters.
+        parts: (H, W) uint8 of express50.parts.LABELS. None: the shards have none.
     """
 
     image: np.ndarray
@@ -76,6 +77,7 @@ class Sample:
     K: np.ndarray
     cam_from_world: np.ndarray
     tracked: Tracked
+    parts: np.ndarray | None = None
 
 
 class Source(Protocol):
@@ -188,7 +190,10 @@ class HeadViews:
         if not self.ignore_torso:
             return np.zeros(size, bool)
         if index not in self._torsos:
-            mask = torso_mask(self.head, state.vertices, view, sample.alpha, sample.depth)
+            if sample.parts is not None:
+                mask = labelled_torso(sample.parts)
+            else:
+                mask = torso_mask(self.head, state.vertices, view, sample.alpha, sample.depth)
             self._torsos[index] = np.packbits(mask)
         bits = np.unpackbits(self._torsos[index], count=size[0] * size[1])
         return bits.reshape(size).astype(bool)
@@ -233,7 +238,11 @@ class HeadViews:
     def _check(self, sample: Sample, key: Key) -> None:
         where = f"{key.subject}/{key.expression}/{key.camera}"
         size = sample.image.shape[:2]
-        for name, array in (("alpha", sample.alpha), ("depth", sample.depth)):
+        for name, array in (
+            ("alpha", sample.alpha),
+            ("depth", sample.depth),
+            ("parts", sample.parts),
+        ):
             if array is not None and array.shape != size:
                 raise FormatError(
                     f"{where}: {name} is {array.shape}, expected the image's size {size}; "
@@ -321,7 +330,8 @@ def crop_view(view: View, rows: slice, columns: slice) -> View:
 
 def _bytes(sample: Sample) -> int:
     depth = 0 if sample.depth is None else sample.depth.nbytes
-    return sample.image.nbytes + sample.alpha.nbytes + depth
+    parts = 0 if sample.parts is None else sample.parts.nbytes
+    return sample.image.nbytes + sample.alpha.nbytes + depth + parts
 
 
 class Shuffle:

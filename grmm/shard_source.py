@@ -58,6 +58,7 @@ class ShardSource:
             depth=sample["depth"][rows, columns] if sample["valid"].any() else None,
             K=K,
             cam_from_world=_matrix(meta, "cam_from_world", (4, 4), where),
+            parts=None if sample["parts"] is None else sample["parts"][rows, columns],
             tracked=_tracked(meta.get("track"), where),
         )
 

@@ -1,7 +1,8 @@
 """Which footage shows shoulders and clothes: a head model has no Gaussians for them.
 
-The paper's data were masked to the head by a segmentation network. Here the tracked mesh and the
-depth map decide: what stands off the neck, or goes on below its lower end, is torso.
+The paper's data were masked to the head by a segmentation network. Where the shards have labels of
+parts, these tell. Else the tracked mesh and the depth map decide: what stands off the neck, or goes
+on below its lower end, is torso.
 """
 
 from __future__ import annotations
@@ -12,11 +13,18 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from express50.head.model import HeadModel
+from express50.parts import TORSO
 from grmm.model import View
 
 STAND_OFF_M = 0.025  # a point this far off the neck belongs to a shirt, or to hair upon it
 END_M = 0.01  # a point this far off the neck's lower end lies below it
 GROW_PX = 2  # blurred borders
+
+
+def labelled_torso(parts: np.ndarray) -> np.ndarray:
+    """Pixels (H, W) bool that labels (H, W) of ``express50.parts.LABELS`` call torso, grown."""
+    torso = parts == TORSO
+    return binary_dilation(torso, iterations=GROW_PX) if torso.any() else torso
 
 
 def torso_mask(

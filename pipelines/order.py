@@ -9,6 +9,7 @@ STAGES = {
     "matte": "pipelines.matte",
     "track": "pipelines.track",
     "depth": "pipelines.depth",
+    "regions": "pipelines.regions",
     "pack": "pipelines.pack",
 }
 

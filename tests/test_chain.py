@@ -22,7 +22,9 @@ from express50.shards import ShardReader
 
 pytestmark = pytest.mark.slow
 
-STAGES = ("ingest", "calibrate", "observe", "align", "alpha", "matte", "track", "depth", "pack")
+STAGES = (
+    "ingest", "calibrate", "observe", "align", "alpha", "matte", "track", "depth", "regions", "pack"
+)  # fmt: skip
 SETTINGS = {"pack": ["--set", "pack.size=96", "--set", 'pack.test_subjects=["S002"]']}
 RECORDING = [
     "--subjects=2", "--cameras=6", "--give-calibration", "--width=192", "--height=192",
@@ -74,6 +76,7 @@ def test_footage_alone_gives_figures_close_to_the_truth(dataset, twin, tmp_path)
     assert figures["track.vertex_rmse_mm"] < 9
     assert figures["depth.abs_error_mm_median"] < 6
     assert figures["depth.coverage"] > 0.8
+    assert figures["regions.head_mae"] < 0.03 and figures["regions.iou_mean"] > 0.4
     assert (tmp_path / "accuracy" / "depth_error.jpg").exists()
 
 
@@ -82,6 +85,7 @@ def test_shards_hold_every_view_and_split_by_subject(dataset):
     assert len(reader) == 2 * 3 * 6
     sample = reader.sample(0)
     assert sample["rgb"].shape == (96, 96, 3)
+    assert sample["parts"].shape == (96, 96) and sample["meta"]["torso"] == "removed"
     splits = json.loads((dataset.item_dir("pack", "shards") / "splits.json").read_text())
     assert splits["test"] == ["S002"]
 

@@ -37,6 +37,7 @@ _PURPOSES = {
     "matte": "What the cameras of a moment agree on: removed is red, filled is green.",
     "track": "The head model fitted to landmarks in all views.",
     "depth": "Surface of every peak and the depth raycast from it.",
+    "regions": "Labels of every pixel of a peak, and the head without the torso.",
     "pack": "Samples packed into shards.",
 }
 

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from express50.cameras import Camera, read_cameras, write_cameras
+from express50.cameras import Camera, rays, read_cameras, write_cameras
 from express50.errors import CaptureError
 from express50.head.load import load_head
 from express50.head.model import HeadModel
@@ -26,7 +26,7 @@ from express50.twin.body import Body, Extras, assemble, head_vertices, pose_body
 from express50.twin.hair import HairMesh
 from express50.twin.performance import Performance
 from express50.twin.subjects import Look, Subject
-from express50.twin.surface import Caster
+from express50.twin.surface import MISS, Caster
 
 SKIN_M = 0.5e-3  # hair roots stand on the skin; what lies this near to it is skin
 _PLAY = ("strength", "expression", "jaw", "neck", "eyes", "R", "t")
@@ -128,6 +128,29 @@ class Truth:
         caster = Caster(self.vertices(subject, frame), self.head_model(subject).faces.numpy())
         bare, there = render.render_depth(caster, camera)
         return valid & there & (np.abs(bare - depth) < SKIN_M)
+
+    def surface(self, subject: str, frame: int, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+        """What each pixel's centre shows.
+
+        Returns:
+            material (H, W) int16, a `Material`, -1 where nothing is; vertex (H, W) int64, the
+            corner nearest to the hit among ``mesh``'s vertices (the head model's come first).
+        """
+        caster, _ = self._scene(subject, frame)
+        body = self._subject(subject)[0]
+        origin, directions = rays(camera)
+        _, face, uv = caster.cast(origin, directions.reshape(-1, 3))
+        hit = face != MISS
+        corner = np.stack([1 - uv.sum(1), *uv.T], axis=1).argmax(1)
+        face = np.where(hit, face, 0)
+        material = np.where(hit, body.material[face].astype(np.int16), np.int16(-1))
+        vertex = body.faces[face, corner].astype(np.int64)
+        return material.reshape(directions.shape[:2]), vertex.reshape(directions.shape[:2])
+
+    def hairiness(self, subject: str) -> np.ndarray:
+        """How hairy each head vertex's skin is (V,), 0 to 1; 0 everywhere on the bald."""
+        body = self._subject(subject)[0]
+        return body.scalp if len(body.extras.hair.faces) else np.zeros_like(body.scalp)
 
     def render_alpha(self, subject: str, frame: int, camera: Camera) -> np.ndarray:
         """Alpha (H, W) float32 in [0, 1] of the subject, from 32 rays a pixel at silhouettes."""

@@ -18,6 +18,8 @@ class PackConfig:
     """How far beyond the tracked mesh the matte may widen the crop, as a share of its size."""
     profile: Literal["compact", "fast", "lossless"] = "fast"
     """rgb as JPEG q90 4:2:0 (compact), JPEG q95 4:4:4 (fast) or PNG (lossless)."""
+    torso: Literal["remove", "keep"] = "remove"
+    """Alpha without or with shoulders and clothes, where the regions stage told them apart."""
     min_confidence: float = 0.0
     """Depth pixels under this confidence count as not valid, 0 to 1."""
     shard_mb: int = 256

@@ -63,6 +63,12 @@ def cut_image(image: np.ndarray, crop: Crop, size: int) -> np.ndarray:
     return resize_area(_window(image, crop), size, size)
 
 
+def cut_labels(labels: np.ndarray, crop: Crop, size: int) -> np.ndarray:
+    """The crop of labels (H, W) uint8 at (size, size), each the nearest pixel's; 0 outside."""
+    place = np.minimum(((np.arange(size) + 0.5) * (crop.side / size)).astype(int), crop.side - 1)
+    return _window(labels, crop)[np.ix_(place, place)]
+
+
 def _window(image: np.ndarray, crop: Crop) -> np.ndarray:
     window = np.zeros((crop.side, crop.side, *image.shape[2:]), image.dtype)
     y0, x0 = max(crop.y0, 0), max(crop.x0, 0)

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
 
-from express50.cameras import Camera
 from express50.errors import CaptureError, FormatError, StageError
 from express50.exclusions import exclusion_reason
-from express50.frames import read_cameras_of, read_frame, read_peaks
+from express50.frames import read_frame
 from express50.images import (
     DEPTH_UNIT_M,
     contact_sheet,
@@ -31,23 +29,10 @@ from express50.shards_write import PackedSample, ShardWriter, sample_key, write_
 from express50.stage import Stage
 from pipelines.pack.card import split_subjects, write_card
 from pipelines.pack.config import PRESETS, PackConfig
-from pipelines.pack.crop import crop_pinhole, cut_depth, cut_image, head_crop
+from pipelines.pack.crop import crop_pinhole, cut_depth, cut_image, cut_labels, head_crop
+from pipelines.pack.subject import Subject, read_subjects
 
-PARAMETERS = ("expression", "neck", "jaw", "eyes", "R", "t")
 QC_SAMPLES = 12
-
-
-@dataclass(frozen=True)
-class Subject:
-    """What all samples of a subject share: cameras, peaks, track arrays by expression, and meta."""
-
-    name: str
-    cameras: dict[str, Camera]
-    peaks: dict[str, int]
-    labels: dict[str, dict]
-    tracked: dict[str, dict]
-    vertices: dict[str, np.ndarray]
-    meta: dict
 
 
 def items(dataset: Dataset) -> list[str]:
@@ -56,7 +41,7 @@ def items(dataset: Dataset) -> list[str]:
 
 
 def inputs(dataset: Dataset, item: str, config: PackConfig) -> dict[str, Path | str]:
-    """Index, cameras, peaks, mattes, track and depth of every subject, as far as there."""
+    """Index, cameras, peaks, mattes, track, depth and regions of every subject, as far as there."""
     found: dict[str, Path | str] = {}
     for subject in dataset.subjects():
         if (reason := exclusion_reason(dataset, subject)) is not None:
@@ -69,6 +54,7 @@ def inputs(dataset: Dataset, item: str, config: PackConfig) -> dict[str, Path | 
             "track": dataset.item_dir("track", subject) / "track.npz",
             "matte": dataset.item_dir("matte", subject),
             "depth": dataset.item_dir("depth", subject),
+            "regions": dataset.item_dir("regions", subject),
         }
         found |= {f"{subject} {name}": path for name, path in parts.items() if path.exists()}
     return found
@@ -78,7 +64,7 @@ def run(dataset: Dataset, item: str, config: PackConfig, out: Path) -> dict:
     """Write shards, index, manifest, splits and card; returns what was read, kept and dropped."""
     cv2.setNumThreads(1)
     dropped: list[dict[str, str]] = []
-    subjects = _read_subjects(dataset, dropped)
+    subjects = read_subjects(dataset, dropped)
     read = len(dropped)
     if not subjects:
         why = "; ".join(f"{row['what']}: {row['why']}" for row in dropped[:3])
@@ -107,57 +93,6 @@ def run(dataset: Dataset, item: str, config: PackConfig, out: Path) -> dict:
     packed = sorted({meta["subject"] for meta in metas})
     people = [read_index(dataset, name).meta for name in packed]
     return _finish(out, splits, metas, people, read, dropped, config)
-
-
-def _read_subjects(dataset: Dataset, dropped: list[dict[str, str]]) -> list[Subject]:
-    subjects = []
-    for name in dataset.subjects():
-        if (reason := exclusion_reason(dataset, name)) is not None:
-            dropped.append({"what": name, "why": f"excluded: {reason}"})
-            continue
-        try:
-            subjects.append(_read_subject(dataset, name))
-        except (StageError, FormatError, CaptureError) as error:
-            dropped.append({"what": name, "why": str(error)})
-    return subjects
-
-
-def _read_subject(dataset: Dataset, name: str) -> Subject:
-    """Everything that a subject's samples share.
-
-    Raises:
-        StageError: it is not calibrated, aligned or tracked.
-        FormatError: one of these files is malformed.
-    """
-    index = read_index(dataset, name)
-    peaks = read_peaks(dataset, name)
-    labels = json.loads((dataset.item_dir("align", name) / "peaks.json").read_text("utf-8"))
-    path = dataset.item_dir("track", name) / "track.npz"
-    if not path.is_file():
-        raise StageError(f"subject {name!r} is not tracked; run 'express50 track'")
-    tracked, vertices, head = {}, {}, ""
-    try:
-        with np.load(path, allow_pickle=False) as table:
-            head = str(table["head"])
-            for row, expression in enumerate(table["expressions"].tolist()):
-                arrays = {key: table[key][row].tolist() for key in PARAMETERS}
-                tracked[expression] = arrays | {"shape": table["shape"].tolist()}
-                vertices[expression] = table["vertices"][row].astype(np.float64)
-    except (ValueError, KeyError, IndexError, OSError) as error:
-        raise FormatError(f"{path}: not a track ({error}); run 'express50 track' again") from None
-    bad = [one for one, points in vertices.items() if not np.isfinite(points).all()]
-    if bad:
-        raise FormatError(f"{path}: vertices of {', '.join(bad)} are not finite; track again")
-    meta = {
-        "subject": name,
-        "head": head,
-        "fps": index.fps,
-        "consent": index.meta.get("consent_id", index.meta.get("consent")),
-        "licence": index.meta.get("licence", index.meta.get("license")),
-        "session": index.meta.get("session"),
-    }
-    cameras = read_cameras_of(dataset, name)
-    return Subject(name, cameras, peaks, labels, tracked, vertices, meta)
 
 
 def _pack_group(
@@ -198,8 +133,14 @@ def _pack_sample(
     rgb = read_frame(dataset, subject.name, camera_id, frame)
     alpha = read_image(matte_path)
     depth, valid = read_depth_png(folder / f"{camera_id}.png")
-    if not rgb.shape[:2] == alpha.shape == depth.shape == (camera.height, camera.width):
-        return f"frame {rgb.shape}, matte {alpha.shape} and depth {depth.shape} differ in size"
+    regions = _read_regions(dataset, f"{subject.name}/{expression}", camera_id)
+    parts, head = regions or (None, None)
+    sizes = [image.shape[:2] for image in (rgb, alpha, depth, parts, head) if image is not None]
+    if set(sizes) != {(camera.height, camera.width)}:
+        return f"frame, matte, depth and regions differ in size: {', '.join(map(str, sizes))}"
+    if head is not None and config.torso == "remove":
+        # No depth where no colour counts: what is left of the torso would bend the head.
+        alpha, valid = head, valid & (head > 127)
     if config.min_confidence > 0:
         sure = read_image(folder / f"{camera_id}_confidence.png")
         valid = valid & (sure >= round(255 * config.min_confidence))
@@ -209,6 +150,8 @@ def _pack_sample(
     small, known = cut_depth(depth, valid, crop, config.size)
     members = _encode_rgb(cut_image(rgb, crop, config.size), config.profile)
     members["alpha.png"] = encode_png(cut_image(alpha, crop, config.size))
+    if parts is not None:
+        members["parts.png"] = encode_png(cut_labels(parts, crop, config.size))
     members["depth.png"] = encode_png(depth_to_uint16(small, known))
     view = crop_pinhole(camera, crop, config.size)
     meta = subject.meta | {
@@ -221,13 +164,34 @@ def _pack_sample(
         "frame": frame,
         "height": config.size,
         "label": subject.labels[expression],
+        "parts": parts is not None,
         "source_size": [camera.width, camera.height],
+        "torso": "removed" if head is not None and config.torso == "remove" else "kept",
         "track": subject.tracked[expression],
         "width": config.size,
     }
     text = json.dumps(meta, sort_keys=True, separators=(",", ":"), allow_nan=False)
     members["meta.json"] = text.encode()
     return PackedSample(subject.name, expression, camera_id, members), meta
+
+
+def _read_regions(
+    dataset: Dataset, item: str, camera_id: str
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """Labels (H, W) uint8 of the parts and the head's own alpha (H, W) uint8, if there are any.
+
+    Raises:
+        FormatError: one of them is no 8-bit grey image.
+    """
+    folder = dataset.item_dir("regions", item)
+    paths = folder / f"{camera_id}.png", folder / f"{camera_id}_head.png"
+    if not all(path.is_file() for path in paths):
+        return None
+    parts, head = (read_image(path) for path in paths)
+    for path, image in zip(paths, (parts, head), strict=True):
+        if image.dtype != np.uint8 or image.ndim != 2:
+            raise FormatError(f"{path}: {image.dtype} {image.shape}, expected an 8-bit grey image")
+    return parts, head
 
 
 def _encode_rgb(image: np.ndarray, profile: str) -> dict[str, bytes]:
@@ -247,6 +211,8 @@ def _finish(
 ) -> dict:
     """Write splits, card, picture and manifest; returns the metrics."""
     reader = ShardReader(out)
+    bare = sum(meta["torso"] == "removed" for meta in metas)
+    lacking = [meta for meta in metas if not meta["parts"]]
     how = "named" if config.test_subjects else f"hash of seed {config.seed}"
     write_json(out / "splits.json", splits | {"chosen_by": how})
     shards = sorted({entry.shard for entry in reader.entries})
@@ -254,6 +220,8 @@ def _finish(
     statistics = {
         "picture size": f"{config.size} x {config.size}",
         "profile": config.profile,
+        "labels of parts": f"{sum(meta['parts'] for meta in metas)} of {len(metas)} samples",
+        "torso removed": f"{bare} of {len(metas)} samples",
         "shards": f"{len(shards)}, {size / 1e6:.1f} MB",
     }
     card = write_card(splits, metas, dropped, statistics, people)
@@ -270,8 +238,22 @@ def _finish(
             split: sum(meta["split"] == split for meta in metas) for split in splits
         },
         "depth_coverage": covered,
+        "with_parts": len(metas) - len(lacking),
+        "torso_removed": bare,
+        "warnings": _lacking_warning(lacking, len(metas)),
         "dropped": dropped,
     }
+
+
+def _lacking_warning(lacking: list[dict], count: int) -> list[dict[str, str]]:
+    """A warning of samples that the regions stage knows nothing of."""
+    if not lacking:
+        return []
+    why = (
+        f"{len(lacking)} of {count} samples have no labels of parts, and their alpha holds the"
+        " torso; run 'express50 regions', then pack again"
+    )
+    return [{"what": "regions", "why": why}]
 
 
 def _write_picture(out: Path, reader: ShardReader) -> float:
@@ -297,7 +279,7 @@ def _write_picture(out: Path, reader: ShardReader) -> float:
 
 STAGE = Stage(
     name="pack",
-    version=3,
+    version=4,
     config=PackConfig,
     presets=PRESETS,
     items=items,

@@ -1,4 +1,4 @@
-"""Parts of the body by the user's segmentation network, and the head cut off the torso by them.
+"""Parts of the body by the user's segmentation network.
 
 Sapiens (Khirodkar et al. 2024), body-part segmentation as TorchScript: RGB at 1024 x 768 less a
 mean and over a deviation in 8-bit steps, scores of 28 classes out (its ``lite/demo/vis_seg.py``
@@ -10,8 +10,8 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
+from express50.parts import LABELS, label_mask
 from pipelines.networks import Network, Role, resized
-from pipelines.regions.labels import HEAD, LABELS, label_mask
 
 SAPIENS = Role(setting="regions.segmentation", inputs=("image",))
 HEIGHT, WIDTH = 1024, 768
@@ -50,20 +50,11 @@ def segment(network: Network, frame: np.ndarray) -> np.ndarray:
     return labels
 
 
-def head_alpha(alpha: np.ndarray, labels: np.ndarray) -> np.ndarray:
-    """Alpha (H, W) of the head alone by labels (H, W) of the parts.
+def refined(labels: np.ndarray, mesh: np.ndarray) -> np.ndarray:
+    """Labels (H, W) of the network with what the mesh's (H, W) tell of the skin it found.
 
-    What is neither head nor torso (strands that the network calls background, glasses, hats,
-    collars) goes with the nearer of the two; the cut is a pixel wide. No head gives an empty
-    matte, no torso leaves all.
+    The network has no eyes, ears and neck, and an inner mouth only where it shows teeth or tongue.
     """
-    head, body = label_mask(labels, *HEAD), label_mask(labels, "torso")
-    if not head.any() or not body.any():
-        return alpha * np.float32(head.any())
-    nearer = _distance(body) - _distance(head)
-    return alpha * np.clip(0.5 + nearer / 2, 0, 1).astype(np.float32)
-
-
-def _distance(mask: np.ndarray) -> np.ndarray:
-    """Distance (H, W) to the nearest pixel of a mask (H, W)."""
-    return cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    skin = labels == LABELS.index("skin")
+    finer = label_mask(mesh, "ears", "eyes", "teeth", "tongue", "mouth", "neck")
+    return np.where(skin & finer, mesh, labels)

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 
+from express50.parts import TORSO
 from grmm.data import HeadViews
 from grmm.evaluate import evaluate
 from grmm.model import View
@@ -94,3 +95,20 @@ def test_torso_neither_teaches_nor_counts():
     row, row_kept = (evaluate(v, [0], render)[0] for v in (views, kept))
     assert row["psnr_db"] > row["psnr_with_torso_db"] + 3
     assert row_kept["psnr_db"] == row_kept["psnr_with_torso_db"] == row["psnr_with_torso_db"]
+
+
+class Labelled(Dressed):
+    """Dressed, with labels that call other rows torso than the depth map would."""
+
+    def read(self, index):
+        sample = super().read(index)
+        parts = np.ones(sample.alpha.shape, np.uint8)
+        parts[: self.size // 2] = TORSO
+        return replace(sample, parts=parts)
+
+
+def test_labels_of_parts_go_before_distances():
+    item = HeadViews(Labelled(size=64), collared_head()).item(0)
+    assert not item.counts[:34].any() and item.counts[36:].all()
+    assert not item.depth_valid[:34].any() and not item.mask[:34].any()
+    assert HeadViews(Labelled(size=64), collared_head(), torso="keep").item(0).counts.all()

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,8 +14,9 @@ from scipy.ndimage import minimum_filter
 
 from express50.cameras import pinhole_camera, project, unproject
 from express50.errors import StageError
-from express50.images import read_depth_png, write_image
+from express50.images import read_depth_png, read_image, write_image
 from express50.layout import Dataset
+from express50.parts import LABELS
 from express50.shards import ShardReader
 from express50.shards_write import verify
 from express50.transforms import look_at
@@ -22,7 +25,7 @@ from pipelines.depth.config import DepthConfig
 from pipelines.pack import STAGE as PACK
 from pipelines.pack.card import people_lines, split_subjects
 from pipelines.pack.config import PackConfig
-from pipelines.pack.crop import Crop, crop_pinhole, cut_depth, cut_image, head_crop
+from pipelines.pack.crop import Crop, crop_pinhole, cut_depth, cut_image, cut_labels, head_crop
 from tests.pipelines.bump_dataset import make_dataset, published
 
 SMALL = PackConfig(size=64, test_subjects=("S002",))
@@ -275,3 +278,55 @@ def test_an_excluded_subject_is_left_out_with_its_reason(dataset, tmp_path):
         file.write_text(before)
     assert {"what": "S002", "why": "excluded: heavy makeup"} in metrics["dropped"]
     assert {e.subject for e in ShardReader(tmp_path).entries} == {"S001"}
+
+
+def cut_regions(dataset: Dataset, item: str, camera: str, rows: int) -> None:
+    """Regions of one view: all under some rows is torso."""
+    alpha = read_image(dataset.matte_file(*item.split("/"), camera))
+    labels = np.where(alpha > 127, np.uint8(LABELS.index("skin")), np.uint8(0))
+    labels[rows:] = np.where(labels[rows:] > 0, np.uint8(LABELS.index("torso")), 0)
+    head = alpha.copy()
+    head[rows:] = 0
+    folder = dataset.item_dir("regions", item)
+    folder.mkdir(parents=True, exist_ok=True)
+    write_image(folder / f"{camera}.png", labels)
+    write_image(folder / f"{camera}_head.png", head)
+
+
+def test_the_torso_leaves_alpha_and_depth_and_its_labels_are_packed(dataset, packed, tmp_path):
+    assert packed[1]["with_parts"] == packed[1]["torso_removed"] == 0
+    assert "express50 regions" in packed[1]["warnings"][0]["why"]
+    before = ShardReader(packed[0]).select(subjects=["S001"], cameras=["cam02"])
+    assert before.sample(0)["parts"] is None and before.meta(0)["torso"] == "kept"
+    try:
+        for expression in ("neutral", "smile"):
+            cut_regions(dataset, f"S001/{expression}", "cam02", 60)
+        metrics = PACK.run(dataset, "shards", SMALL, tmp_path / "remove")
+        keep = replace(SMALL, torso="keep")
+        PACK.run(dataset, "shards", keep, tmp_path / "keep")
+        assert "S001 regions" in PACK.inputs(dataset, "shards", SMALL)
+    finally:
+        shutil.rmtree(dataset.stage_dir("regions"))
+    assert metrics["with_parts"] == metrics["torso_removed"] == 2
+    assert "22 of 24 samples have no labels" in metrics["warnings"][0]["why"]
+    assert "| torso removed | 2 of 24 samples |" in (tmp_path / "remove" / "card.md").read_text()
+    removed, kept = (
+        ShardReader(tmp_path / how).select(subjects=["S001"], cameras=["cam02"]).sample(0)
+        for how in ("remove", "keep")
+    )
+    assert removed["meta"]["torso"] == "removed" and kept["meta"]["torso"] == "kept"
+    torso = kept["parts"] == LABELS.index("torso")
+    assert torso.any() and set(np.unique(kept["parts"])) <= {0, LABELS.index("skin"), 10}
+    assert kept["alpha"][torso].mean() > 0.9 and kept["valid"][torso].any()
+    # The crop follows what is left, so that the pixels of the two need not be the same.
+    gone = removed["parts"] == LABELS.index("torso")
+    assert removed["alpha"][gone].mean() < 0.05 and not removed["valid"][gone].any()
+
+
+def test_labels_are_cut_by_the_nearest_pixel():
+    labels = np.zeros((40, 60), np.uint8)
+    labels[10:20, 30:50] = 7
+    small = cut_labels(labels, Crop(20, 0, 40), 80)
+    assert set(np.unique(small)) == {0, 7} and (small == 7).sum() == 4 * 200
+    assert (cut_labels(labels, Crop(50, 30, 40), 10) == 0).all()
+    assert cut_labels(labels, Crop(0, 0, 1), 16).shape == (16, 16)

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from express50.errors import StageError
+from express50.parts import LABELS, label_mask
 from pipelines.networks import load_network
-from pipelines.regions.labels import LABELS, label_mask
-from pipelines.regions.sapiens import LABEL_OF_CLASS, SAPIENS, head_alpha, segment
+from pipelines.regions.sapiens import LABEL_OF_CLASS, SAPIENS, segment
+from pipelines.regions.view import head_alpha
 from tests.pipelines.stand_ins import Bright, Thirds, torchscript, traced_thirds
 
 

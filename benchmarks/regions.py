@@ -1,0 +1,140 @@
+"""Labels and head mattes against the twin's truth: ``python -m benchmarks.regions --help``.
+
+Every preset labels the same items anew from the same mattes, tracks and depth maps. Beside it stand
+two simpler ways to lose the torso: keep it (``no_cut``), and cut along the image row of the tracked
+chin (``chin_line``) or of the neck's tracked end (``neck_line``). IoU of a part is over the pixels
+of all views in which the truth or the labels have it. Seconds are processor seconds a view, reading
+included. The last line is one JSON object.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.accuracy import true_world_cameras
+from benchmarks.regions_truth import iou_figures, true_head_alpha, true_labels, view_row
+from express50.cameras import Camera, project
+from express50.config import PRESETS, resolve_config
+from express50.frames import read_cameras_of, read_peaks
+from express50.head.load import load_head
+from express50.head.model import landmarks
+from express50.images import read_image
+from express50.layout import Dataset
+from express50.twin.truth import Truth
+from pipelines.regions import STAGE
+from pipelines.regions.read import read_head
+
+CHIN = 8  # of the 68 landmarks
+
+
+def main() -> int:
+    """Run and print."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--dataset", type=Path, default=Path("build/demo/data/demo"))
+    parser.add_argument("--truth", type=Path, default=Path("build/demo/twin/truth"))
+    parser.add_argument("--presets", nargs="+", default=list(PRESETS), choices=PRESETS)
+    parser.add_argument("--set", dest="assignments", action="append", default=[])
+    parser.add_argument("--items", type=int, default=4, help="this many, evenly chosen; 0: all")
+    args = parser.parse_args()
+    dataset, truth = Dataset(args.dataset), Truth(args.truth)
+    items = [i for i in STAGE.items(dataset) if dataset.item_dir("depth", i).is_dir()]
+    if not items:
+        sys.exit(f"{args.dataset}: no depth maps; run 'make demo' or name --dataset and --truth")
+    if args.items:
+        items = [items[k] for k in np.unique(np.linspace(0, len(items) - 1, args.items, dtype=int))]
+    configs = {p: resolve_config(STAGE, p, None, args.assignments) for p in args.presets}
+    rows: dict[str, list[dict]] = {}
+    for item in items:
+        for name, row in measure_item(dataset, truth, item, configs).items():
+            rows.setdefault(name, []).append(row)
+    result = {name: summary(found) for name, found in rows.items()}
+    for name, figures in result.items():
+        print(name, figures)
+    print(json.dumps({"benchmark": "regions", "items": items, **result}))
+    return 0
+
+
+def measure_item(dataset: Dataset, truth: Truth, item: str, configs: dict) -> dict[str, dict]:
+    """Counts and errors of every preset and baseline on one item."""
+    subject, expression = item.split("/")
+    frame = read_peaks(dataset, subject)[expression]
+    cameras = true_world_cameras(dataset, truth, subject)
+    true = {
+        name: (
+            true_labels(truth, subject, frame, camera),
+            true_head_alpha(truth, subject, frame, camera, rays=4),
+        )
+        for name, camera in cameras.items()
+    }
+    found = {}
+    for preset, config in configs.items():
+        with tempfile.TemporaryDirectory() as folder:
+            out = Path(folder)
+            start = time.process_time()
+            STAGE.run(dataset, item, config, out)
+            seconds = time.process_time() - start
+            rows = [
+                view_row(*true[name], read_image(out / f"{name}_head.png") / 255.0,
+                         read_image(out / f"{name}.png"))
+                for name in true
+            ]  # fmt: skip
+        found[preset] = {"rows": rows, "seconds": seconds / len(true)}
+    for name, cut in baselines(dataset, item).items():
+        rows = [view_row(*true[camera], cut(camera), None) for camera in true]
+        found[name] = {"rows": rows, "seconds": None}
+    return found
+
+
+def baselines(dataset: Dataset, item: str) -> dict[str, Callable[[str], np.ndarray]]:
+    """Head mattes (H, W) by camera: the matte as it is, and cut at an image row."""
+    subject, expression = item.split("/")
+    cameras = read_cameras_of(dataset, subject)
+    head = read_head(dataset, subject, expression)
+    path = dataset.item_dir("track", subject) / "track.npz"
+    with np.load(path, allow_pickle=False) as table:
+        model = load_head(str(table["head"]))
+    chin = landmarks(model, model.template.new_tensor(head.vertices)[None])[0, CHIN].numpy()
+    end = head.vertices[head.labels.end]
+
+    def matte(name: str) -> np.ndarray:
+        return read_image(dataset.matte_file(subject, expression, name)) / 255.0
+
+    def above(name: str, points: np.ndarray) -> np.ndarray:
+        row = float(project(cameras[name], points.reshape(-1, 3))[0][:, 1].mean())
+        return matte(name) * _rows_above(cameras[name], row)
+
+    return {
+        "no_cut": matte,
+        "chin_line": lambda name: above(name, chin),
+        "neck_line": lambda name: above(name, end),
+    }
+
+
+def _rows_above(camera: Camera, row: float) -> np.ndarray:
+    """Share (H, 1) of each row of pixels above an image row."""
+    return np.clip(row - np.arange(camera.height), 0, 1)[:, None]
+
+
+def summary(items: list[dict]) -> dict:
+    """Means over all views; a part that neither truth nor labels have is None."""
+    rows = [row for item in items for row in item["rows"]]
+    seconds = [item["seconds"] for item in items if item["seconds"] is not None]
+    return {
+        "head_sad_px": round(float(np.mean([row["sad"] for row in rows])), 1),
+        "head_mae": round(float(np.mean([row["mae"] for row in rows])), 5),
+        **(iou_figures(rows) if any(row["either"].any() for row in rows) else {}),
+        "seconds_per_view": round(float(np.mean(seconds)), 3) if seconds else None,
+        "views": len(rows),
+    }
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

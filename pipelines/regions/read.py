@@ -1,0 +1,106 @@
+"""What the regions stage reads: tracked heads, frames with their mattes, depth maps."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+
+from express50.cameras import Camera
+from express50.errors import FormatError, StageError
+from express50.frames import read_frame
+from express50.head.load import load_head
+from express50.images import read_depth_png, read_image
+from express50.layout import Dataset
+from pipelines.regions.config import RegionsConfig
+from pipelines.regions.labels import HeadLabels, head_labels
+from pipelines.regions.mesh import TrackedHead, make_head
+
+
+def track_file(dataset: Dataset, subject: str) -> Path:
+    """The subject's track.
+
+    Raises:
+        StageError: there is none.
+    """
+    path = dataset.item_dir("track", subject) / "track.npz"
+    if not path.is_file():
+        raise StageError(f"subject {subject!r} is not tracked; run 'express50 track'")
+    return path
+
+
+def read_head(dataset: Dataset, subject: str, expression: str) -> TrackedHead:
+    """The tracked mesh of one expression.
+
+    Raises:
+        StageError: the subject or the expression is not tracked.
+        FormatError: the track does not fit its head model, or is not finite.
+    """
+    path = track_file(dataset, subject)
+    try:
+        with np.load(path, allow_pickle=False) as table:
+            names, name = table["expressions"].tolist(), str(table["head"])
+            vertices, R = (table[key].astype(np.float64) for key in ("vertices", "R"))
+    except (ValueError, KeyError, OSError) as error:
+        raise FormatError(f"{path}: not a track ({error}); run 'express50 track' again") from None
+    if expression not in names:
+        raise StageError(f"{subject}/{expression}: it is not tracked; see the metrics of track")
+    row, labels = names.index(expression), _labels_of(name)
+    vertices, R = vertices[row], R[row]
+    if vertices.shape != (len(labels.vertices), 3):
+        raise FormatError(
+            f"{path}: vertices {vertices.shape}, expected ({len(labels.vertices)}, 3) of its head"
+            " model; run 'express50 track' again"
+        )
+    if not (np.isfinite(vertices).all() and np.isfinite(R).all()):
+        raise FormatError(f"{path}: {expression} holds NaN or Inf; run 'express50 track' again")
+    return make_head(vertices, R, labels)
+
+
+@lru_cache(maxsize=2)
+def _labels_of(head: str) -> HeadLabels:
+    return head_labels(load_head(head))
+
+
+def read_pair(
+    dataset: Dataset, item: str, camera: Camera, frame: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Undistorted frame (H, W, 3) uint8 and alpha (H, W) float32 of one camera.
+
+    Raises:
+        StageError: it has no matte.
+        FormatError: the matte is no 8-bit grey image of the camera's size.
+        CaptureError: the frame cannot be read.
+    """
+    subject, expression = item.split("/")
+    path = dataset.matte_file(subject, expression, camera.id)
+    if not path.is_file():
+        raise StageError("it has no matte")
+    matte = read_image(path)
+    if matte.dtype != np.uint8 or matte.shape != (camera.height, camera.width):
+        raise FormatError(
+            f"{path}: {matte.dtype} {matte.shape}, expected an 8-bit grey matte of the camera's"
+            f" {camera.width}x{camera.height}; run 'express50 matte' again"
+        )
+    return read_frame(dataset, subject, camera.id, frame), matte.astype(np.float32) / 255
+
+
+def read_depth(
+    dataset: Dataset, item: str, camera: Camera, config: RegionsConfig
+) -> np.ndarray | None:
+    """Depth (H, W) metres, 0 where unknown, if there is any and it is wanted.
+
+    Raises:
+        FormatError: it is no 16-bit depth map of the camera's size.
+    """
+    path = dataset.item_dir("depth", item) / f"{camera.id}.png"
+    if not config.depth or not path.is_file():
+        return None
+    depth, _ = read_depth_png(path)
+    if depth.shape != (camera.height, camera.width):
+        raise FormatError(
+            f"{path}: {depth.shape}, expected the camera's {camera.width}x{camera.height}; run"
+            " 'express50 depth' again"
+        )
+    return depth

@@ -1,0 +1,163 @@
+"""Labels at the edges: no head, no matte, one pixel, far worlds, damaged tracks."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from express50.cameras import pinhole_camera, resized, transform_camera
+from express50.errors import FormatError, StageError
+from express50.images import write_depth_png, write_image
+from express50.parts import LABELS, label_mask
+from express50.transforms import look_at, make_transform
+from pipelines.regions import STAGE
+from pipelines.regions.config import RegionsConfig
+from pipelines.regions.labels import SCALP
+from pipelines.regions.mesh import make_head, see
+from pipelines.regions.qc import label_shares, mesh_fit, subject_box, view_warning
+from pipelines.regions.stage import look
+from pipelines.regions.view import head_alpha
+from tests.pipelines.bump_dataset import make_dataset
+from tests.pipelines.region_scenes import camera_at, make_scene, tracked
+
+SCENE = make_scene(0)
+CONFIG = RegionsConfig()
+
+
+def labels_of(camera, alpha, depth=None, head=SCENE.head, config=CONFIG) -> np.ndarray:
+    """Labels of a view on a grey frame."""
+    rgb = np.full((camera.height, camera.width, 3), 128, np.uint8)
+    return look(head, camera, rgb, np.float32(alpha), depth, False, config).labels
+
+
+def turned_away(distance: float = 1.0):
+    """A camera before the face that looks the other way."""
+    eye = np.array([0.0, 0.0, distance])
+    K = np.array([[100.0, 0, 32], [0, 100, 32], [0, 0, 1]])
+    pose = look_at(eye, 2 * eye, np.array([0.0, 1, 0]))
+    return pinhole_camera("away", K, 64, 64, pose)
+
+
+@pytest.mark.parametrize("config", [CONFIG, RegionsConfig(colour=False, depth=False)])
+def test_a_camera_that_does_not_see_the_head_has_no_head(config) -> None:
+    aside = replace(SCENE.camera, params=(*SCENE.camera.params[:2], 9000.0, 80.0))
+    for camera in (turned_away(), aside):
+        full = np.ones((camera.height, camera.width))
+        assert not see(SCENE.head, camera)[0].any()
+        labels = labels_of(camera, full, config=config)
+        assert label_mask(labels, "torso").all()
+        assert head_alpha(np.float32(full), labels).max() == 0
+
+
+def test_a_camera_inside_the_head_gives_finite_labels() -> None:
+    inside = replace(turned_away(), cam_from_world=np.eye(4))
+    labels, depth = see(SCENE.head, inside)
+    assert np.isfinite(depth).all() and (labels <= SCALP).all()
+    assert (labels_of(inside, np.ones((64, 64))) < len(LABELS)).all()
+
+
+def test_empty_and_full_mattes() -> None:
+    empty = np.zeros(SCENE.alpha.shape)
+    assert not labels_of(SCENE.camera, empty).any()
+    full = labels_of(SCENE.camera, empty + 1)
+    assert (full > 0).all() and {LABELS[k] for k in np.unique(full)} >= {"skin", "torso"}
+    unknown = np.zeros(SCENE.alpha.shape, np.float32)
+    assert np.array_equal(labels_of(SCENE.camera, empty + 1, unknown), full)  # knows nothing
+
+
+def test_a_head_that_is_all_hidden_by_something_keeps_its_place() -> None:
+    """A board before the head is beyond what a mesh can know; the labels stay the mesh's."""
+    depth = np.full(SCENE.alpha.shape, 0.5, np.float32)
+    labels = labels_of(SCENE.camera, np.ones(SCENE.alpha.shape), depth)
+    assert label_mask(labels, "eyes").sum() == label_mask(SCENE.labels, "eyes").sum()
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 7), (5, 1), (2, 3)])
+def test_the_smallest_pictures(size) -> None:
+    camera = resized(SCENE.camera, *size)
+    for alpha in (0.0, 1.0):
+        labels = labels_of(camera, np.full(size[::-1], alpha))
+        assert labels.shape == size[::-1] and bool(labels.any()) is (alpha > 0)
+        head = head_alpha(np.full(size[::-1], alpha, np.float32), labels)
+        assert np.isfinite(head).all() and head.min() >= 0
+        shares = label_shares(labels)
+        assert sum(shares.values()) == pytest.approx(1, abs=1e-5)
+        assert subject_box(labels)
+
+
+def test_a_subject_a_kilometre_from_the_origin_has_the_same_labels() -> None:
+    far = np.array([600.0, -20.0, 800.0])
+    motion = make_transform(np.eye(3), far)
+    camera = transform_camera(SCENE.camera, motion)
+    head = make_head(SCENE.head.vertices + far, np.eye(3), SCENE.head.labels)
+    near = labels_of(SCENE.camera, SCENE.alpha, SCENE.depth)
+    moved = labels_of(camera, SCENE.alpha, SCENE.depth, head)
+    assert (near == moved).mean() > 0.999
+
+
+def test_a_camera_a_kilometre_away_sees_a_head_of_a_few_pixels() -> None:
+    camera = camera_at(0, 8, distance=1000.0)
+    labels, depth = see(tracked(), camera)
+    assert 4 < (labels > 0).sum() < 40 and depth[labels > 0].min() > 999
+    wide = replace(camera, params=(50.0, 50.0, 4.0, 4.0))  # the head is far under a pixel
+    assert (labels_of(wide, np.ones((8, 8))) < len(LABELS)).all()
+
+
+def test_figures_of_nothing_are_numbers_and_named() -> None:
+    nothing = np.zeros((4, 4), bool)
+    fit = mesh_fit(nothing, np.zeros((4, 4)), np.zeros((4, 4)))
+    assert fit == {"mesh_in_matte": 0.0, "mesh_iou_head": 0.0}
+    figures = {"mesh_in_frame": True, "mesh_in_matte": 1.0, "head": 0.5,
+               "labels": label_shares(np.ones((4, 4), np.uint8))}  # fmt: skip
+    assert view_warning(figures, 0.85) is None
+    for change, words in (
+        ({"mesh_in_frame": False}, "no head found"),
+        ({"labels": label_shares(np.zeros((4, 4), np.uint8))}, "matte is empty"),
+        ({"head": 0.0}, "head's matte is empty"),
+        ({"mesh_in_matte": 0.3}, "30% of the tracked mesh"),
+    ):
+        assert words in str(view_warning(figures | change, 0.85))
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "message"),
+    [
+        ("vertices", np.nan, "holds NaN or Inf; run 'express50 track' again"),
+        ("vertices", np.inf, "holds NaN or Inf"),
+        ("R", np.nan, "holds NaN or Inf"),
+        ("vertices", "short", "expected .* of its head model"),
+        ("head", "missing", "not a track"),
+        ("expressions", "other", "it is not tracked"),
+    ],
+)
+def test_damaged_tracks_are_one_clear_line(tmp_path, key, value, message) -> None:
+    dataset = make_dataset(tmp_path, cameras=2, size=32)
+    path = dataset.item_dir("track", "S001") / "track.npz"
+    with np.load(path) as table:
+        arrays = dict(table)
+    if value == "short":
+        arrays[key] = arrays[key][:, :-1]
+    elif value == "missing":
+        del arrays[key]
+    elif value == "other":
+        arrays[key] = np.array(["shout", "wink"])
+    else:
+        arrays[key][-1, 0] = value
+    np.savez(path, **arrays)
+    with pytest.raises((FormatError, StageError), match=message) as caught:
+        STAGE.run(dataset, "S001/smile", CONFIG, tmp_path)
+    assert "\n" not in str(caught.value)
+
+
+def test_mattes_and_depth_maps_of_another_size_are_named(tmp_path) -> None:
+    dataset = make_dataset(tmp_path, cameras=3, size=32)
+    write_image(dataset.matte_file("S001", "smile", "cam00"), np.zeros((8, 8), np.uint8))
+    folder = dataset.item_dir("depth", "S001/smile")
+    folder.mkdir(parents=True)
+    write_depth_png(folder / "cam01.png", np.ones((8, 8)), np.ones((8, 8), bool))
+    metrics = STAGE.run(dataset, "S001/smile", CONFIG, tmp_path)
+    why = {row["what"]: row["why"] for row in metrics["dropped"]}
+    assert "express50 matte" in why["cam00"] and "express50 depth" in why["cam01"]
+    assert set(metrics["cameras"]) == {"cam02"}

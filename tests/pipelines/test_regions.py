@@ -1,0 +1,268 @@
+"""Labels of parts: occlusion, hair and collars, the head's matte, the stage and its figures."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from express50.errors import ConfigError, StageError
+from express50.head.load import load_head
+from express50.head.model import pose
+from express50.images import read_image, write_image
+from express50.parts import HEAD, LABELS, label_mask
+from pipelines.regions import STAGE
+from pipelines.regions.config import RegionsConfig
+from pipelines.regions.labels import SCALP, head_labels
+from pipelines.regions.mesh import make_head, see
+from pipelines.regions.scalp import decide, scalp_votes
+from pipelines.regions.stage import look
+from pipelines.regions.view import head_alpha
+from tests.pipelines.bump_dataset import make_dataset, published
+from tests.pipelines.region_scenes import RegionScene, camera_at, make_scene, tracked
+from tests.pipelines.stand_ins import Thirds, torchscript
+
+PLAIN = RegionsConfig(colour=False, depth=False)
+
+
+def labels_of(scene: RegionScene, bare: bool = False, **settings) -> np.ndarray:
+    """Labels of a scene's one view."""
+    config = RegionsConfig(**settings)
+    depth = scene.depth if config.depth else None
+    return look(scene.head, scene.camera, scene.rgb, scene.alpha, depth, bare, config).labels
+
+
+def overlap(labels: np.ndarray, true: np.ndarray, name: str) -> float:
+    """Intersection over union of one label."""
+    a, b = label_mask(labels, name), label_mask(true, name)
+    return float((a & b).sum() / (a | b).sum())
+
+
+def test_what_lies_behind_is_not_seen() -> None:
+    head = tracked()
+    front = np.unique(see(head, camera_at(0))[0])
+    names = {LABELS[label] for label in front if label < SCALP}
+    assert {"skin", "lips", "eyes", "ears", "neck"} <= names
+    assert "tongue" not in names and "mouth" not in names  # the lips are closed before them
+    back = {LABELS[k] for k in np.unique(see(head, camera_at(180))[0]) if k < SCALP}
+    assert not back & {"eyes", "lips", "teeth", "tongue"}
+    wide = see(tracked(0.35), camera_at(0))[0]
+    assert all(label_mask(wide, name).sum() > 5 for name in ("teeth", "tongue", "mouth"))
+
+
+def test_the_nose_hides_the_cheek_and_lids_hide_the_eyes() -> None:
+    model = load_head("procedural")
+    labels, depth = see(tracked(), camera_at(90))
+    assert (
+        label_mask(labels, "eyes").sum()
+        < 0.5 * label_mask(see(tracked(), camera_at(0))[0], "eyes").sum()
+    )
+    assert (depth[labels > 0] > 0.7).all() and (depth[labels == 0] == 0).all()
+    names = list(model.expression_names)
+    coefficients = torch.zeros(1, len(names))
+    for side in "LR":
+        coefficients[0, names.index(f"eyeBlink_{side}")] = 1.0
+    shut = pose(model, torch.zeros(1, 1), coefficients)[0].double().numpy()
+    closed = see(make_head(shut, np.eye(3), head_labels(model)), camera_at(0))[0]
+    opened = see(tracked(), camera_at(0))[0]
+    assert label_mask(closed, "eyes").sum() < 0.3 * label_mask(opened, "eyes").sum()
+
+
+@pytest.mark.parametrize("azimuth", [0, 60, 180])
+def test_colours_tell_collar_and_locks_from_neck_and_shoulders(azimuth: int) -> None:
+    scene = make_scene(azimuth)
+    labels, plain = labels_of(scene), labels_of(scene, colour=False)
+    for name, least in (("torso", 0.95), ("neck", 0.95), ("hair", 0.88)):
+        assert overlap(labels, scene.labels, name) > least, name
+        assert overlap(labels, scene.labels, name) > overlap(plain, scene.labels, name) + 0.03, name
+    true_head = scene.alpha * label_mask(scene.labels, *HEAD)
+    sad = [np.abs(head_alpha(scene.alpha, found) - true_head).sum() for found in (labels, plain)]
+    assert sad[0] < 0.25 * sad[1]
+
+
+def test_without_colours_the_necks_end_still_takes_most_of_the_torso_away() -> None:
+    scene = make_scene(0)
+    true_head = label_mask(scene.labels, *HEAD)
+    kept = head_alpha(scene.alpha, labels_of(scene, colour=False, depth=False))
+    assert np.abs(kept - true_head).sum() < 0.4 * np.abs(scene.alpha - true_head).sum()
+
+
+def test_a_shirt_in_the_colour_of_the_skin_is_cut_by_place() -> None:
+    scene = make_scene(0, hair=False)
+    same = np.where((scene.labels > 0)[..., None], scene.rgb[80, 80], scene.rgb).astype(np.uint8)
+    labels = labels_of(replace(scene, rgb=same), bare=True)
+    assert overlap(labels, scene.labels, "torso") > 0.6
+    assert not label_mask(labels[:115], "torso").any()  # 14 cm under the eyes and higher
+
+
+def test_the_mesh_alone_labels_itself_exactly() -> None:
+    scene = make_scene(0, jaw=0.35)
+    labels = labels_of(scene)
+    for name in ("eyes", "lips", "teeth", "tongue", "mouth"):
+        assert overlap(labels, scene.labels, name) > 0.98, name
+
+
+def test_a_rim_beyond_the_mesh_is_as_the_mesh_and_what_is_far_off_is_hair() -> None:
+    scene = make_scene(0, hair=False)
+    small = make_head(0.93 * scene.head.vertices, np.eye(3), scene.head.labels)
+    cheek = np.flatnonzero(scene.labels[92])[0]  # leftmost pixel of the head at the mouth's height
+    wide = scene.alpha.copy()
+    wide[20:60, 10:15] = 1  # something 10 cm beside the head
+    config = replace(PLAIN, rim_mm=8.0)
+    labels = look(small, scene.camera, scene.rgb, wide, None, False, config).labels
+    assert LABELS[labels[92, cheek]] in ("skin", "neck") and LABELS[labels[40, 12]] == "hair"
+    none = look(small, scene.camera, scene.rgb, wide, None, False, replace(PLAIN, rim_mm=0)).labels
+    assert LABELS[none[92, cheek]] == "hair"
+
+
+def test_the_cut_is_a_pixel_wide_and_keeps_strands() -> None:
+    labels = np.full((40, 40), LABELS.index("hair"), np.uint8)
+    labels[20:] = LABELS.index("torso")
+    alpha = np.full((40, 40), 0.3, np.float32)
+    head = head_alpha(alpha, labels)
+    assert np.array_equal(head[:20], alpha[:20]) and head[20:].max() == 0
+    # Labels a quarter of the size: the cut stays at its place, a pixel of the matte wide.
+    large = head_alpha(np.ones((160, 160), np.float32), labels)
+    assert large[:79].min() == 1 and large[81:].max() == 0
+    labels[20:, :20] = 0  # what no label claims goes with the nearer
+    assert head_alpha(alpha, labels)[21, 2] > 0 and head_alpha(alpha, labels)[39, 19] == 0
+
+
+def test_a_bald_scalp_is_known_by_its_colours() -> None:
+    for hair in (True, False):
+        scene = make_scene(0, hair=hair)
+        votes = [scalp_votes(scene.rgb, see(scene.head, scene.camera)[0], scene.alpha)]
+        scalp = decide(votes)
+        assert scalp.is_skin is not hair
+        labels = labels_of(scene, bare=scalp.is_skin)
+        assert bool(label_mask(labels[:40], "hair").sum() > 100) is hair
+    assert decide([]).skin_coloured is None and not decide([]).is_skin
+
+
+def test_a_head_model_without_regions_says_what_it_lacks() -> None:
+    model = load_head("procedural")
+    kept = {name: mask for name, mask in model.regions.items() if name in ("face", "scalp")}
+    bare = head_labels(replace(model, regions=kept))
+    assert set(bare.missing) == {
+        "ears", "lips", "eyes", "teeth", "tongue", "mouth", "neck", "torso"
+    }  # fmt: skip
+    assert head_labels(model).missing == ()
+    scene = make_scene(0)
+    head = make_head(scene.head.vertices, np.eye(3), bare)
+    assert head.end is None
+    labels = look(head, scene.camera, scene.rgb, scene.alpha, scene.depth, False, RegionsConfig())
+    assert not label_mask(labels.labels, "torso", "eyes", "neck").any()
+    assert np.array_equal(head_alpha(scene.alpha, labels.labels), scene.alpha)
+
+
+def test_sheets_in_no_region_are_not_seen() -> None:
+    model = load_head("procedural")
+    count = len(model.template)
+    card = torch.tensor([[-0.1, 0.0, 0.3], [0.1, 0.0, 0.3], [0.0, 0.2, 0.3]])
+    cards = torch.cat([model.faces, torch.tensor([[count, count + 1, count + 2]])])
+    grown = _Model(model, torch.cat([model.template, card]), cards)
+    labels = head_labels(grown)
+    assert len(labels.faces) == len(model.faces) and labels.faces.max() < count
+
+
+class _Model:
+    """A head model with more vertices, as far as `head_labels` reads one."""
+
+    def __init__(self, model, template, faces) -> None:
+        more = len(template) - len(model.template)
+        self.template, self.faces = template, faces
+        self.regions = {
+            name: torch.cat([mask, torch.zeros(more, dtype=torch.bool)])
+            for name, mask in model.regions.items()
+        }
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory):
+    """One subject of two expressions and six cameras, up to track."""
+    return make_dataset(tmp_path_factory.mktemp("regions"))
+
+
+def test_the_stage_writes_labels_and_heads_of_every_camera(dataset, tmp_path) -> None:
+    metrics = published(dataset, STAGE, RegionsConfig())
+    assert set(metrics) == {"S001/neutral", "S001/smile"}
+    folder = dataset.item_dir("regions", "S001/smile")
+    names = {path.name for path in folder.glob("*.png")}
+    assert names == {f"cam0{k}{end}.png" for k in range(6) for end in ("", "_head")}
+    alpha = read_image(dataset.matte_file("S001", "smile", "cam02"))
+    labels, head = (read_image(folder / f"cam02{end}.png") for end in ("", "_head"))
+    assert labels.dtype == head.dtype == np.uint8 and labels.shape == head.shape == alpha.shape
+    assert ((labels > 0) == (alpha > 127)).all() and (head <= alpha).all()
+    row = metrics["S001/smile"]["cameras"]["cam02"]
+    assert sum(row["labels"].values()) == pytest.approx(1, abs=1e-4)
+    assert row["mesh_in_matte"] > 0.85 and metrics["S001/smile"]["warnings"] == []
+    assert read_image(folder / "qc" / "regions.jpg").shape[2] == 3
+    again = STAGE.run(dataset, "S001/smile", RegionsConfig(), tmp_path)
+    assert again == metrics["S001/smile"]
+    for path in tmp_path.rglob("*.*"):
+        assert path.read_bytes() == (folder / path.relative_to(tmp_path)).read_bytes()
+
+
+def test_smaller_working_sizes_give_labels_of_the_full_size(dataset, tmp_path) -> None:
+    fine, coarse = tmp_path / "fine", tmp_path / "coarse"
+    for out, side in ((fine, 96), (coarse, 48)):
+        out.mkdir()
+        STAGE.run(dataset, "S001/smile", RegionsConfig(image_side=side), out)
+    a, b = (read_image(out / "cam02.png") for out in (fine, coarse))
+    assert a.shape == b.shape == (96, 96) and (a == b).mean() > 0.93 and (a != b).any()
+
+
+def test_a_track_beside_the_matte_and_missing_mattes_are_told(tmp_path) -> None:
+    dataset = make_dataset(tmp_path)
+    dataset.matte_file("S001", "smile", "cam01").unlink()
+    write_image(dataset.matte_file("S001", "smile", "cam03"), np.zeros((96, 96), np.uint8))
+    path = dataset.item_dir("track", "S001") / "track.npz"
+    with np.load(path) as table:
+        arrays = dict(table)
+    arrays["vertices"] = arrays["vertices"] + np.float32([0.1, 0, 0])
+    np.savez(path, **arrays)
+    metrics = STAGE.run(dataset, "S001/smile", RegionsConfig(depth=False), tmp_path)
+    assert metrics["dropped"] == [{"what": "cam01", "why": "it has no matte"}]
+    why = {row["what"]: row["why"] for row in metrics["warnings"]}
+    assert why["cam03"] == "the matte is empty"
+    assert "mesh and matte disagree" in why["cam02"]
+    json.dumps(metrics, allow_nan=False)
+
+
+def test_the_networks_labels_go_first_and_the_mesh_refines_its_skin(dataset, tmp_path) -> None:
+    weights = torchscript(Thirds(), tmp_path / "parts.pt")
+    config = RegionsConfig(segmentation=str(weights))
+    metrics = STAGE.run(dataset, "S001/smile", config, tmp_path)
+    assert metrics["method"] == "network and mesh"
+    labels = read_image(tmp_path / "cam02.png")
+    # Thirds calls the rows above a quarter hair, those under seven tenths torso, skin between.
+    assert label_mask(labels[5:20, 40:56], "hair").all()
+    assert label_mask(labels[75:, 40:56], "torso").all()
+    middle = {LABELS[k] for k in np.unique(labels[30:60, 30:66])}
+    assert {"skin", "eyes"} <= middle and "hair" not in middle
+    head = read_image(tmp_path / "cam02_head.png")
+    assert head[75:, 40:56].max() == 0 and head[40, 48] == 255
+
+
+def test_items_without_track_or_mattes_fail_in_one_line(tmp_path) -> None:
+    dataset = make_dataset(tmp_path)
+    for path in dataset.stage_dir("matte").rglob("smile.png"):
+        path.unlink()
+    with pytest.raises(StageError, match="no camera has a matte to label .*express50 matte"):
+        STAGE.run(dataset, "S001/smile", RegionsConfig(), tmp_path)
+    with pytest.raises(StageError, match=r"regions.segmentation .*no such file"):
+        STAGE.inputs(dataset, "S001/smile", RegionsConfig(segmentation="nowhere.pt"))
+    (dataset.item_dir("track", "S001") / "track.npz").unlink()
+    with pytest.raises(StageError, match="S001' is not tracked; run 'express50 track'"):
+        STAGE.inputs(dataset, "S001/neutral", RegionsConfig())
+
+
+@pytest.mark.parametrize(
+    "settings", [{"image_side": 8}, {"rim_mm": -1.0}, {"agreement": 1.5}, {"qc_views": 0}]
+)
+def test_settings_out_of_range_are_refused(settings) -> None:
+    with pytest.raises(ConfigError, match="regions"):
+        RegionsConfig(**settings)
