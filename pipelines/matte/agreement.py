@@ -82,7 +82,9 @@ def _named(doubted: dict[str, str]) -> list[dict[str, str]]:
 
 
 def _useless(view: View) -> str:
-    """Why a matte says nothing; empty where it does."""
+    """Why a view says nothing of the others' mattes; empty where it does."""
+    if view.projection[2, 3] <= 1:  # radii from the ball's centre, along its axis
+        return "it stands amid what the others look at, or looks away; left as it was"
     share = float((view.alpha[view.valid] > INSIDE).mean()) if view.valid.any() else 0.0
     if share < EMPTY:
         return f"its matte is empty ({share:.2%} of the image)"

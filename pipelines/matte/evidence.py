@@ -29,6 +29,7 @@ NEIGHBOURS = 4  # cameras that are asked for the colour of a surface
 WIDEST = 0.2  # cosine of the largest angle to them
 SEARCH = (-0.3, 0.1, 17)  # radii before and behind the others' hull in which the surface may lie
 SMALLEST = 5e-4  # share of the image that a filled spot has at least
+LARGEST = 0.4  # share of the subject from which on a matte is wrong rather than holed
 
 
 @dataclass(frozen=True)
@@ -203,6 +204,8 @@ def missed(
     fill = inside > max(1.0, SMALLEST * lacking.size)
     fill[0] = False
     filled = fill[spots]
+    if (filled & deep).sum() > LARGEST * deep.sum():
+        filled = np.zeros_like(filled)
     left = float((lacking & deep & ~filled).sum()) / max(int(deep.sum()), 1)
     grown = cv2.dilate(filled.astype(np.uint8), np.ones((3, 3))) > 0
     return grown & (evidence.solid | (view.alpha >= INSIDE)), left

@@ -57,7 +57,7 @@ class View:
 
 @dataclass(frozen=True)
 class Space:
-    """Counts (n, n, n) uint8 of the views that see a cell, see it clear, see the subject there.
+    """Counts (n, n, n) uint16 of the views that see a cell, see it clear, see the subject there.
 
     Attributes:
         axis: (n,) float32 coordinates of the cells, the same along x, y and z.
@@ -135,7 +135,7 @@ def cells_in(view: View, axis: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def make_space(views: Sequence[View], cells: int, margin: float) -> Space:
     """Count what every view says of every cell; `margin` is in pixels."""
     axis = (CUBE * ((np.arange(cells) + 0.5) / cells * 2 - 1)).astype(np.float32)
-    seen, clear, solid = (np.zeros((cells,) * 3, np.uint8) for _ in range(3))
+    seen, clear, solid = (np.zeros((cells,) * 3, np.uint16) for _ in range(3))
     labels = {}
     for view in views:
         labels[view.name] = label_pixels(view, margin)
@@ -173,6 +173,5 @@ def splat(shape: tuple[int, int], pixels: np.ndarray, spread: int) -> np.ndarray
 
 def cell_spread(view: View, axis: np.ndarray) -> int:
     """Pixels around a cell's own within which its neighbours fall: splats then leave no gap."""
-    depth = max(float(view.projection[2, 3]), 1e-3)
     focal = float(np.linalg.norm(view.projection[0, :3]))
-    return max(1, int(np.ceil(focal * float(axis[1] - axis[0]) / depth / 2)))
+    return max(1, int(np.ceil(focal * float(axis[1] - axis[0]) / float(view.projection[2, 3]) / 2)))
