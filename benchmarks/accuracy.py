@@ -18,8 +18,8 @@ from express50.errors import Express50Error
 from express50.frames import read_cameras_of, read_peaks
 from express50.images import contact_sheet, read_depth_png, read_image, write_image
 from express50.layout import Dataset
+from express50.parts import COLOURS
 from express50.twin.truth import Truth, align_worlds
-from pipelines.regions.qc import COLOURS
 
 VIEWS_A_PEAK = 2  # views measured of every peak; they walk around the rig from peak to peak
 SHEET_ROWS = 7
@@ -189,8 +189,7 @@ def measure_regions(dataset: Dataset, truth: Truth, out: Path | None = None) -> 
         true = true_labels(truth, subject, frame, camera)
         true_alpha = true_head_alpha(truth, subject, frame, camera)
         found.append(view_row(true, true_alpha, alpha, labels))
-        rows.append([COLOURS[labels].astype(np.uint8), COLOURS[true].astype(np.uint8),
-                     _grey(np.abs(alpha - true_alpha))])  # fmt: skip
+        rows.append([COLOURS[labels], COLOURS[true], _grey(np.abs(alpha - true_alpha))])
         names.append(f"{subject} {expression} {camera.id}: parts, truth, error of the head's alpha")
     _sheet(out, "regions_error", rows, names)
     return {
