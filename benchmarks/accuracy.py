@@ -7,7 +7,7 @@ a subject, fitted to the cameras; what is left of calibration error stays in eve
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -18,8 +18,8 @@ from express50.errors import Express50Error
 from express50.frames import read_cameras_of, read_peaks
 from express50.images import contact_sheet, read_depth_png, read_image, write_image
 from express50.layout import Dataset
+from express50.parts import COLOURS
 from express50.twin.truth import Truth, align_worlds
-from pipelines.regions.qc import COLOURS
 
 VIEWS_A_PEAK = 2  # views measured of every peak; they walk around the rig from peak to peak
 SHEET_ROWS = 7
@@ -32,6 +32,7 @@ def measure_dataset(dataset: Dataset, truth_root: Path, out: Path | None = None)
     truth = Truth(truth_root)
     measures = {
         "align": measure_align,
+        "alpha": measure_alpha,
         "matte": measure_matte,
         "track": measure_track,
         "depth": measure_depth,
@@ -81,11 +82,22 @@ def sampled_views(dataset: Dataset, truth: Truth) -> Iterator[tuple[str, str, in
                 turn += 3 if len(cameras) % 3 else 1
 
 
+def measure_alpha(dataset: Dataset, truth: Truth, out: Path | None = None) -> dict:
+    """Errors of each camera's own alpha, as `measure_matte` has them."""
+    return _alpha_errors(dataset, truth, dataset.alpha_file, None)
+
+
 def measure_matte(dataset: Dataset, truth: Truth, out: Path | None = None) -> dict:
     """Mean absolute alpha error over whole images, and over the truth's uncertain rim alone."""
+    return _alpha_errors(dataset, truth, dataset.matte_file, out)
+
+
+def _alpha_errors(
+    dataset: Dataset, truth: Truth, file_of: Callable[[str, str, str], Path], out: Path | None
+) -> dict:
     whole, rim, rows, names = [], [], [], []
     for subject, expression, frame, camera in sampled_views(dataset, truth):
-        path = dataset.matte_file(subject, expression, camera.id)
+        path = file_of(subject, expression, camera.id)
         if not path.is_file():
             continue
         alpha = read_image(path).astype(np.float64) / 255.0
@@ -177,8 +189,7 @@ def measure_regions(dataset: Dataset, truth: Truth, out: Path | None = None) -> 
         true = true_labels(truth, subject, frame, camera)
         true_alpha = true_head_alpha(truth, subject, frame, camera)
         found.append(view_row(true, true_alpha, alpha, labels))
-        rows.append([COLOURS[labels].astype(np.uint8), COLOURS[true].astype(np.uint8),
-                     _grey(np.abs(alpha - true_alpha))])  # fmt: skip
+        rows.append([COLOURS[labels], COLOURS[true], _grey(np.abs(alpha - true_alpha))])
         names.append(f"{subject} {expression} {camera.id}: parts, truth, error of the head's alpha")
     _sheet(out, "regions_error", rows, names)
     return {

@@ -39,11 +39,11 @@ from express50.frames import read_frame, read_plate
 from express50.images import srgb_to_linear
 from express50.layout import Dataset
 from express50.twin.truth import Truth
-from pipelines.matte import STAGE
-from pipelines.matte.foreground import own_colours
-from pipelines.matte.key import dilated, eroded
-from pipelines.matte.keyer import Keyer
-from pipelines.matte.plate import exposed, exposure_gain
+from pipelines.alpha import STAGE
+from pipelines.alpha.foreground import own_colours
+from pipelines.alpha.key import dilated, eroded
+from pipelines.alpha.keyer import Keyer
+from pipelines.alpha.plate import exposed, exposure_gain
 
 PRESETS = ("draft", "standard", "reference")
 HARD = (4.0, 6.0, 10.0, 16.0, 24.0, 40.0)  # 8-bit steps

@@ -27,7 +27,7 @@ from express50.transforms import rigid_fit
 from express50.twin.config import TwinConfig
 from express50.twin.record import record
 from express50.twin.truth import Truth, align_worlds
-from pipelines import calibrate, ingest, matte
+from pipelines import alpha, calibrate, ingest, matte
 from pipelines.ingest import register
 from pipelines.track import STAGE
 
@@ -72,7 +72,8 @@ def record_tiny(scratch: Path, root: Path, subjects: int) -> Path:
     for stage in (ingest.STAGE, calibrate.STAGE):
         run_stage(stage, dataset, build_config(stage, {}), workers=1, progress=False)
     write_true_peaks(dataset, Truth(scratch / "twin" / "truth"))
-    run_stage(matte.STAGE, dataset, build_config(matte.STAGE, {}), workers=1, progress=False)
+    for stage in (alpha.STAGE, matte.STAGE):
+        run_stage(stage, dataset, build_config(stage, {}), workers=1, progress=False)
     return scratch / "twin" / "truth"
 
 

@@ -15,14 +15,15 @@ import sys
 from pathlib import Path
 
 from benchmarks import accuracy
-from benchmarks.demo import STAGES
 from benchmarks.document import replace_section
 from express50.layout import Dataset
 from express50.twin.truth import Truth
+from pipelines.order import FIRST, STAGES
 
 PRESETS = ("draft", "standard", "reference")
 MEASURES = {
     "align": (accuracy.measure_align, "peak_error_frames_mean"),
+    "alpha": (accuracy.measure_alpha, "mae"),
     "matte": (accuracy.measure_matte, "mae"),
     "track": (accuracy.measure_track, "vertex_rmse_mm"),
     "depth": (accuracy.measure_depth, "abs_error_mm_median"),
@@ -53,7 +54,9 @@ def sweep_one(base: Dataset, truth: Truth, stage: str, preset: str, out: Path) -
     """Run one stage with one preset beside the base dataset; seconds an item and its error."""
     dataset = Dataset(out / f"{stage}-{preset}")
     dataset.root.mkdir(parents=True, exist_ok=True)
-    for name in ("captures.json", *STAGES[: STAGES.index(stage)]):
+    before = list(STAGES)[: list(STAGES).index(stage)]
+    # What its own command runs first is run with its preset.
+    for name in ("captures.json", *(n for n in before if n not in FIRST.get(stage, ()))):
         link = dataset.root / name
         if not link.exists():
             link.symlink_to((base.root / name).resolve())

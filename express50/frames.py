@@ -254,6 +254,15 @@ def read_peaks(dataset: Dataset, subject: str) -> dict[str, int]:
     return peaks
 
 
+def peak_items(dataset: Dataset) -> list[str]:
+    """`subject/expression` for every labelled peak of the aligned subjects."""
+    found = []
+    for subject in dataset.subjects():
+        if (dataset.item_dir("align", subject) / "peaks.json").is_file():
+            found += [f"{subject}/{name}" for name in sorted(read_peaks(dataset, subject))]
+    return found
+
+
 def _check_peak(
     index: Index, path: Path, name: str, frame: int, camera_id: str, expected: str
 ) -> None:

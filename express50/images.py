@@ -45,6 +45,18 @@ def read_image(path: Path) -> np.ndarray:
     return array[..., 0] if spec.nchannels == 1 else array[..., :4]
 
 
+def read_alpha(path: Path) -> np.ndarray:
+    """Read an 8-bit grey image (H, W) uint8.
+
+    Raises:
+        FormatError: it cannot be read, or is of another kind.
+    """
+    alpha = read_image(path)
+    if alpha.ndim != 2 or alpha.dtype != np.uint8:
+        raise FormatError(f"{path}: {alpha.dtype} {alpha.shape}, expected an 8-bit grey matte")
+    return alpha
+
+
 def write_image(path: Path, image: np.ndarray, quality: int = 95, half: bool = False) -> None:
     """Write (H, W) or (H, W, C) uint8, uint16 or float32; the ending chooses the format.
 

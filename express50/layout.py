@@ -58,9 +58,13 @@ class Dataset:
             )
         return {subject: Path(table[subject]) for subject in sorted(table)}
 
+    def alpha_file(self, subject: str, expression: str, camera: str) -> Path:
+        """8-bit opacity of one peak frame as the camera alone has it."""
+        return self.item_dir("alpha", f"{subject}/{camera}") / f"{expression}.png"
+
     def matte_file(self, subject: str, expression: str, camera: str) -> Path:
-        """8-bit opacity of one peak frame."""
-        return self.item_dir("matte", f"{subject}/{camera}") / f"{expression}.png"
+        """8-bit opacity of one peak frame after all cameras have agreed."""
+        return self.item_dir("matte", f"{subject}/{expression}") / f"{camera}.png"
 
     def labels_file(self, subject: str) -> Path:
         """Append-only label events of one subject."""

@@ -11,6 +11,12 @@ LABELS = (
 """Names of the labels by value; apparel (glasses, hats) only a network can tell."""
 HEAD = LABELS[1:10]
 TORSO = LABELS.index("torso")
+# One colour a label; the background is black.
+COLOURS = np.array(
+    [[0, 0, 0], [240, 150, 120], [250, 210, 60], [230, 40, 90], [90, 220, 255], [255, 255, 255],
+     [170, 60, 200], [70, 0, 30], [70, 110, 255], [170, 200, 90], [50, 140, 90], [255, 120, 0]],
+    np.uint8,
+)  # fmt: skip
 
 
 def label_mask(labels: np.ndarray, *names: str) -> np.ndarray:

@@ -8,7 +8,8 @@ are. The writer is in :mod:`express50.shards_write`.
 ``meta.json`` of a sample: ids ``subject expression camera``, ``frame``, ``fps``; ``K``,
 ``cam_from_world``, ``width``, ``height`` of the picture as packed; ``depth_scale_m``; ``head`` and
 ``track`` {shape expression neck jaw eyes R t}, the head model and its parameters, with world =
-R @ head + t in the cameras' world; ``label`` (who chose the frame), ``crop``, ``source_size``,
+R @ head + t in the cameras' world; ``label`` (who chose the frame), ``torso`` (removed or
+kept in alpha and depth), ``parts`` (whether there are labels), ``crop``, ``source_size``,
 ``consent``, ``licence``, ``session``.
 """
 

@@ -11,6 +11,7 @@ import numpy as np
 from express50.console import FAILED, OK, say, say_json
 from express50.errors import FormatError
 from express50.images import contact_sheet, write_image
+from express50.parts import COLOURS
 from express50.shards import ShardReader
 from express50.shards_write import verify
 
@@ -73,7 +74,7 @@ def run_show(args: argparse.Namespace) -> int:
 
 
 def sample_picture(sample: dict) -> np.ndarray:
-    """Picture (H, 3 W, 3) uint8 of a sample: rgb, alpha, depth (near is bright)."""
+    """Picture (H, 3 W or 4 W, 3) uint8: rgb, alpha, depth (near is bright), parts if labelled."""
     depth, valid = sample["depth"], sample["valid"]
     shade = np.zeros(depth.shape, np.uint8)
     if valid.any():
@@ -81,4 +82,5 @@ def sample_picture(sample: dict) -> np.ndarray:
         near = np.clip((high - depth) / max(float(high - low), 1e-6), 0, 1)
         shade = np.where(valid, 55 + 200 * near, 0).astype(np.uint8)
     alpha = (sample["alpha"] * 255).astype(np.uint8)
-    return contact_sheet([[sample["rgb"], alpha, shade]], tile=depth.shape)
+    parts = [] if sample["parts"] is None else [COLOURS[sample["parts"]]]
+    return contact_sheet([[sample["rgb"], alpha, shade, *parts]], tile=depth.shape)

@@ -21,7 +21,8 @@ HELP = {
     "calibrate": "take or solve the cameras",
     "observe": "watch the face through every cue window (align runs it first)",
     "align": "suggest, match to the reference and take the frame of each expression",
-    "matte": "separate the head from the background",
+    "alpha": "separate the head from the background, each camera alone (matte runs it first)",
+    "matte": "let the cameras of a moment agree on their mattes",
     "track": "fit the head model to the peak frames",
     "depth": "estimate surface and depth maps",
     "regions": "label skin, hair, eyes, mouth, neck and torso; cut the head off the torso",
@@ -161,7 +162,14 @@ def _choose(
         raise StageError(
             f"{dataset.root}: no such dataset; run 'express50 ingest {dataset.root} CAPTURE'"
         )
-    return select_items(stage, dataset, pattern) if pattern else None
+    if not pattern:
+        return None
+    # A stage that another's command runs first may have other items: those of the same subjects.
+    asked = select_items(load_stage(args.stage), dataset, pattern)
+    if stage.name == args.stage:
+        return asked
+    subjects = {item.split("/")[0] for item in asked}
+    return [item for item in stage.items(dataset) if item.split("/")[0] in subjects]
 
 
 def add_dataset_commands(subparsers: Any) -> None:

@@ -5,6 +5,7 @@ STAGES = {
     "calibrate": "pipelines.calibrate",
     "observe": "annotations.observe",
     "align": "annotations.align",
+    "alpha": "pipelines.alpha",
     "matte": "pipelines.matte",
     "track": "pipelines.track",
     "depth": "pipelines.depth",
@@ -13,4 +14,4 @@ STAGES = {
 }
 
 # Stages that a stage's own command runs first.
-FIRST = {"align": ("observe",)}
+FIRST = {"align": ("observe",), "matte": ("alpha",)}

@@ -22,7 +22,9 @@ from express50.shards import ShardReader
 
 pytestmark = pytest.mark.slow
 
-STAGES = ("ingest", "calibrate", "observe", "align", "matte", "track", "depth", "regions", "pack")
+STAGES = (
+    "ingest", "calibrate", "observe", "align", "alpha", "matte", "track", "depth", "regions", "pack"
+)  # fmt: skip
 SETTINGS = {"pack": ["--set", "pack.size=96", "--set", 'pack.test_subjects=["S002"]']}
 RECORDING = [
     "--subjects=2", "--cameras=6", "--give-calibration", "--width=192", "--height=192",

@@ -11,7 +11,9 @@ from pathlib import Path
 
 from express50.layout import Dataset
 
-STAGES = ("ingest", "calibrate", "observe", "align", "matte", "track", "depth", "regions", "pack")
+STAGES = (
+    "ingest", "calibrate", "observe", "align", "alpha", "matte", "track", "depth", "regions", "pack"
+)  # fmt: skip
 _PICTURES_A_STAGE = 12
 
 

@@ -9,9 +9,9 @@ import numpy as np
 
 from express50.cameras import Camera
 from express50.errors import CaptureError, FormatError, StageError
-from express50.frames import read_cameras_of, read_frame, read_peaks
+from express50.frames import peak_items, read_cameras_of, read_frame, read_peaks
 from express50.head.load import load_head
-from express50.images import contact_sheet, read_image, write_depth_png, write_image
+from express50.images import contact_sheet, read_alpha, write_depth_png, write_image
 from express50.index import index_path
 from express50.layout import Dataset
 from express50.raycast import mesh_scene
@@ -24,17 +24,6 @@ from pipelines.depth.reconstruct import reconstruct
 from pipelines.depth.views import make_view, without_contradiction
 
 UNITS = (0.05, 1.0)  # metres; a head's box outside this range means other units than metres
-
-
-def items(dataset: Dataset) -> list[str]:
-    """`subject/expression` for every labelled peak of an aligned subject."""
-    found = []
-    for subject in dataset.subjects():
-        if (dataset.item_dir("align", subject) / "peaks.json").is_file():
-            found += [
-                f"{subject}/{expression}" for expression in sorted(read_peaks(dataset, subject))
-            ]
-    return found
 
 
 def inputs(dataset: Dataset, item: str, config: DepthConfig) -> dict[str, Path | str]:
@@ -124,10 +113,8 @@ def _read_pair(
     path = dataset.matte_file(subject, expression, camera_id)
     if not path.is_file():
         raise StageError("it has no matte")
-    matte = read_image(path)
-    if matte.ndim != 2 or matte.dtype != np.uint8:
-        raise FormatError(f"{path}: {matte.dtype} {matte.shape}, expected an 8-bit grey matte")
-    return read_frame(dataset, subject, camera_id, frame), matte.astype(np.float32) / 255
+    alpha = read_alpha(path).astype(np.float32) / 255
+    return read_frame(dataset, subject, camera_id, frame), alpha
 
 
 def read_prior(
@@ -217,7 +204,7 @@ STAGE = Stage(
     version=3,
     config=DepthConfig,
     presets=PRESETS,
-    items=items,
+    items=peak_items,
     inputs=inputs,
     run=run,
 )

@@ -1,4 +1,4 @@
-"""Mattes of peak frames: by keying against a clean plate, or by the user's own network."""
+"""Mattes of a moment: what each camera keyed alone, corrected where the other cameras disagree."""
 
 from pipelines.matte.stage import STAGE
 

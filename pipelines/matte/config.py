@@ -3,74 +3,47 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
 
 from express50.errors import ConfigError
 
 
 @dataclass(frozen=True, kw_only=True)
 class MatteConfig:
-    """Lengths are shares of the image's longer side, differences are in noise deviations."""
+    """How finely the cameras of a moment are compared, and what it takes to overrule one."""
 
-    method: Literal["key", "bgmv2", "salient"] = "key"
-    """Key against the plate, or a network: BackgroundMattingV2, or RMBG-2.0 or BiRefNet."""
-    weights: str = ""
-    """File of the network's weights, TorchScript or ONNX; from a known origin, it is a program."""
-    tile: int = 2048
-    """Longest side, pixels, that bgmv2 sees at once; larger frames are cut up."""
-    scale: float = 1.0
-    """Key at this share of the resolution; below 1 the matte is enlarged afterwards."""
-    low: float = 1.2
-    """Differences of this size are as likely noise as subject; alpha is 0 below."""
-    high: float = 6.0
-    """Difference that proves foreground; weaker pixels must touch such ones."""
-    light: Literal["linear", "display"] = "linear"
-    """What mixes at soft edges: linear light, as in cameras, or sRGB values, as in composites."""
-    spread: float = 0.2
-    """Share by which hair may be brighter or darker than what is seen of it nearby."""
-    firm: float = 0.5
-    """A difference of this share of the local foreground's own may belong to the solid inside."""
-    core: float = 0.018
-    """Radius of the disc that must fit inside a part of the subject for it to be solid."""
-    fill: float = 0.012
-    """Plate-coloured spots and gaps in the solid subject are filled this far from its edge."""
-    shadow: float = 0.25
-    """Broad darkening of the plate up to this share is taken for a shadow; 0 turns it off."""
-    smooth: bool = False
-    """Smooth alpha along colours in the uncertain band (1.5 times the time; 5 at 4K)."""
-    noise_frames: int = 4
-    """Frames that the camera's noise is measured on."""
-    noise_floor: float = 1.0
-    """Least noise assumed, in 8-bit steps."""
-    plate_frames: int = 31
-    """Frames of a subject that a missing plate is estimated from."""
+    views: bool = True
+    """Let the cameras correct each other; false leaves every camera's alpha as it is."""
+    side: int = 192
+    """Longest side, pixels, of the images that are compared."""
+    cells: int = 96
+    """Cells along the sides of the cube in which the views are compared."""
+    votes: int = 2
+    """Other cameras that must see clear background before a place counts as empty."""
+    margin: float = 0.01
+    """Distance from a silhouette, a share of the image's longer side, that proves nothing."""
+    strand: float = 0.03
+    """What reaches no further beyond the other views' hull than this share may be hair; kept."""
+    colour: float = 0.1
+    """Largest difference of colour, of full scale, of one surface in neighbouring cameras."""
 
     def __post_init__(self) -> None:
-        """Refuse values that key nothing or everything."""
-        if not 0.1 <= self.scale <= 1.0:
-            raise ConfigError(f"matte.scale is {self.scale}, expected 0.1 to 1")
-        if not 0 < self.low < self.high:
+        """Refuse values that compare nothing or believe anything."""
+        if not 16 <= self.side <= 2048 or not 16 <= self.cells <= 256:
             raise ConfigError(
-                f"matte.low {self.low} and matte.high {self.high}: expected 0 < low < high"
+                f"matte.side {self.side} and matte.cells {self.cells}: expected 16 to 2048 pixels"
+                " and 16 to 256 cells"
             )
-        if not 0.0 <= self.spread <= 1.0 or not 0.0 <= self.shadow < 1.0:
+        if self.votes < 2:
+            raise ConfigError(f"matte.votes is {self.votes}, expected 2 or more: one may be wrong")
+        if not 0 < self.margin <= self.strand < 1 or not 0 < self.colour < 1:
             raise ConfigError(
-                f"matte.spread {self.spread}, matte.shadow {self.shadow}: expected 0 to 1, below 1"
+                f"matte.margin {self.margin}, matte.strand {self.strand}, matte.colour"
+                f" {self.colour}: expected 0 < margin <= strand < 1 and a colour between 0 and 1"
             )
-        self._check_networks()
-
-    def _check_networks(self) -> None:
-        if (self.method == "key") == bool(self.weights):
-            raise ConfigError(
-                f"matte.method {self.method!r} with matte.weights {self.weights!r}: key takes none,"
-                " bgmv2 and salient need the file of the network's weights"
-            )
-        if self.tile < 512 or self.tile % 64:
-            raise ConfigError(f"matte.tile is {self.tile}, expected a multiple of 64, 512 or more")
 
 
 PRESETS: dict[str, dict[str, object]] = {
-    "draft": {"scale": 0.5, "noise_frames": 1, "plate_frames": 15},
+    "draft": {"side": 128, "cells": 64},
     "standard": {},
-    "reference": {"smooth": True, "noise_frames": 12, "plate_frames": 61},
+    "reference": {"side": 256, "cells": 128},
 }

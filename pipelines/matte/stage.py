@@ -1,153 +1,158 @@
-"""The matte stage: one camera of one subject, an 8-bit alpha for every peak expression."""
+"""The matte stage: one moment of one subject, the final 8-bit alpha of every camera."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import shutil
 from pathlib import Path
 
 import cv2
 import numpy as np
 
 from express50.adapters import undistorted_mask
-from express50.cameras import read_cameras
-from express50.errors import StageError
-from express50.frames import read_cameras_of, read_frame, read_peaks
-from express50.images import contact_sheet, read_image, write_image
-from express50.index import index_path, read_index
+from express50.cameras import Camera, pinhole, resized
+from express50.errors import FormatError, StageError
+from express50.frames import peak_items, read_cameras_of, read_frame, read_peaks
+from express50.images import contact_sheet, read_alpha, resize_area, write_image
+from express50.index import index_path
 from express50.layout import Dataset
 from express50.stage import Stage
+from pipelines.matte.agreement import Agreement, agree
 from pipelines.matte.config import PRESETS, MatteConfig
-from pipelines.matte.keyer import Keyer
-from pipelines.matte.plate import exposed, exposure_gain
-from pipelines.matte.qc import border_contact, picture_row, warnings
-from pipelines.matte.source import Plate, others_of, plate_of
+from pipelines.matte.hull import INSIDE, Ball, View, ball_of, center_of, projection_of
 
-QC_ROWS = 8
-
-Alpha = Callable[[np.ndarray], np.ndarray]
-"""Frame (H, W, 3) uint8 to opacity (H, W) float32."""
-
-
-def items(dataset: Dataset) -> list[str]:
-    """`subject/camera` for every calibrated camera."""
-    found = []
-    for subject in dataset.subjects():
-        path = dataset.item_dir("calibrate", subject) / "cameras.json"
-        if path.is_file():
-            found += [f"{subject}/{camera}" for camera in sorted(read_cameras(path))]
-    return found
+COLUMNS = 6  # of the picture
+RED, GREEN = (235, 50, 40), (50, 220, 80)
 
 
 def inputs(dataset: Dataset, item: str, config: MatteConfig) -> dict[str, Path | str]:
-    """The camera's index, plate and footage identity, the calibration, the peaks, the weights."""
-    subject, camera = item.split("/")
-    index = read_index(dataset, subject)
+    """Index, cameras, the expression's peak and every camera's alpha."""
+    subject, expression = item.split("/")
     found: dict[str, Path | str] = {
         "index": index_path(dataset, subject),
         "cameras": dataset.item_dir("calibrate", subject) / "cameras.json",
-        "peaks": dataset.item_dir("align", subject) / "peaks.json",
+        "frame": str(read_peaks(dataset, subject)[expression]),
     }
-    if camera in index.plates:
-        found["plate"] = index.capture / index.plates[camera]
-    elif config.method != "salient":
-        for other in others_of(dataset, index, camera):
-            found[f"index of {other}"] = index_path(dataset, other)
-            theirs = read_index(dataset, other)
-            if camera in theirs.plates:
-                found[f"plate of {other}"] = theirs.capture / theirs.plates[camera]
-    if config.weights:
-        found["weights"] = _weights(config)
+    for camera in read_cameras_of(dataset, subject):
+        path = dataset.alpha_file(subject, expression, camera)
+        if path.is_file():
+            found[f"alpha {camera}"] = path
     return found
 
 
-def _weights(config: MatteConfig) -> Path:
-    path = Path(config.weights).expanduser()
-    if not path.is_file():
-        raise StageError(f"matte.weights {path}: no such file; expected TorchScript or .onnx")
-    return path
-
-
 def run(dataset: Dataset, item: str, config: MatteConfig, out: Path) -> dict:
-    """Write `<expression>.png` for each peak and a contact sheet; returns coverage figures."""
-    subject, camera_id = item.split("/")
-    peaks = read_peaks(dataset, subject)
-    if not peaks:
-        raise StageError(f"{item}: no peak frames; run 'express50 align {dataset.root}'")
-    camera = read_cameras_of(dataset, subject, undistorted=False)[camera_id]
-    # Resampling mixes the outermost pixels with what lies beyond the image.
-    valid = cv2.erode(undistorted_mask(camera).astype(np.uint8), np.ones((3, 3))) > 0
-
-    def read(frame: int) -> np.ndarray:
-        return read_frame(dataset, subject, camera_id, frame)
-
-    plate = None if config.method == "salient" else plate_of(dataset, item, camera, config)
-    alpha_of, facts = _method(plate, [read(f) for f in _measured(peaks, config)], valid, config)
-    coverage: dict[str, float] = {}
-    border: dict[str, dict[str, float]] = {}
-    for expression, frame in peaks.items():
-        image = read(frame)
-        alpha = np.where(valid, alpha_of(image), np.float32(0))
-        write_image(out / f"{expression}.png", np.rint(alpha * 255).astype(np.uint8))
-        coverage[expression] = round(float(alpha.mean()), 6)
-        border[expression] = border_contact(alpha)
-    odd = warnings(peaks, coverage, border) + list(plate.warnings if plate else ())
-    named = {warning["what"] for warning in odd}
-    first = sorted(peaks, key=lambda expression: expression not in named)[:QC_ROWS]
-    _write_picture(out, {e: read(peaks[e]) for e in first}, named)
+    """Write `<camera>.png` for every camera with an alpha, and a picture of what was changed."""
+    cv2.setNumThreads(1)  # the runner counts one core an item
+    subject, expression = item.split("/")
+    cameras = read_cameras_of(dataset, subject, undistorted=False)
+    files = {name: dataset.alpha_file(subject, expression, name) for name in cameras}
+    there = {name: path for name, path in files.items() if path.is_file()}
+    if not there:
+        raise StageError(f"{item}: no camera has an alpha; run 'express50 matte {dataset.root}'")
+    views, found = _compared(dataset, item, {name: cameras[name] for name in there}, config)
+    changes: dict[str, dict[str, float]] = {}
+    for name, path in there.items():
+        if name in found.removed or name in found.filled:
+            before = read_alpha(path)
+            after = corrected(before, found.removed.get(name), found.filled.get(name))
+            write_image(out / f"{name}.png", after)
+            changes[name] = _shares(before, after)
+        else:
+            shutil.copyfile(path, out / f"{name}.png")
+    if views:
+        _write_picture(out, views, found)
     return {
-        "method": config.method,
-        **facts,
-        "coverage": coverage,
-        "border_contact": border,
-        "warnings": odd,
-        "dropped": [],
+        "views": len(views),
+        **({"unchanged": found.unchanged} if found.unchanged else {}),
+        "removed": {name: row["removed"] for name, row in changes.items()},
+        "filled": {name: row["filled"] for name, row in changes.items()},
+        "warnings": found.warnings,
+        "dropped": [
+            {"what": name, "why": "it has no alpha"} for name in files if name not in there
+        ],
     }
 
 
-def _measured(peaks: dict[str, int], config: MatteConfig) -> list[int]:
-    """Peak frames that the camera's noise is measured on; none for a network."""
-    if config.method != "key":
-        return []
-    frames = sorted(set(peaks.values()))
-    picks = np.linspace(0, len(frames) - 1, config.noise_frames).round().astype(int)
-    return [frames[i] for i in np.unique(picks)]
+def _compared(
+    dataset: Dataset, item: str, cameras: dict[str, Camera], config: MatteConfig
+) -> tuple[list[View], Agreement]:
+    """The reduced views, and what they agree on; no views where nothing is to be compared."""
+    if not config.views:
+        return [], Agreement(unchanged="matte.views is off")
+    ball = ball_of(cameras)
+    if ball is None:
+        return [], Agreement(unchanged="the cameras do not look at one place")
+    subject, expression = item.split("/")
+    frame = read_peaks(dataset, subject)[expression]
+    views = []
+    # One camera's full pictures at a time.
+    for name, camera in cameras.items():
+        path = dataset.alpha_file(subject, expression, name)
+        alpha = read_alpha(path)
+        if alpha.shape != (camera.height, camera.width):
+            raise FormatError(
+                f"{path}: {alpha.shape[1]}x{alpha.shape[0]}, expected the camera's"
+                f" {camera.width}x{camera.height}; run 'express50 matte {dataset.root}' again"
+            )
+        image = read_frame(dataset, subject, name, frame)
+        views.append(make_view(camera, ball, image, alpha, config.side))
+    return views, agree(views, config)
 
 
-def _method(
-    plate: Plate | None, frames: list[np.ndarray], valid: np.ndarray, config: MatteConfig
-) -> tuple[Alpha, dict[str, object]]:
-    """How the config makes alpha, and facts about that for the metrics."""
-    if config.method == "key" and plate is not None:
-        keyer = Keyer(plate.image, frames, valid, config, plate.doubt)
-        noise = round(float(np.median(keyer.model.sigma)), 4)
-        return keyer.alpha, {"plate": plate.source, "noise_8bit": noise}
-    # Only here, as torch takes seconds to import.
-    from pipelines.matte.learned import BGMV2, SALIENT, background_alpha, salient_alpha
-    from pipelines.networks import load_network
-
-    path = _weights(config)
-    if plate is None:
-        salient = load_network(path, SALIENT)
-        return lambda frame: salient_alpha(salient, frame), {"plate": "none"}
-    network, still = load_network(path, BGMV2), plate.image
-
-    def alpha(frame: np.ndarray) -> np.ndarray:
-        shown = exposed(still, exposure_gain(frame, still))
-        return background_alpha(network, frame, shown, config.tile)
-
-    return alpha, {"plate": plate.source}
+def make_view(camera: Camera, ball: Ball, image: np.ndarray, alpha: np.ndarray, side: int) -> View:
+    """A view of an undistorted image (H, W, 3) and alpha (H, W), uint8, of a recorded camera."""
+    scale = min(1.0, side / max(camera.width, camera.height))
+    width, height = (max(1, round(n * scale)) for n in (camera.width, camera.height))
+    small = resized(camera, width, height)
+    return View(
+        name=camera.id,
+        projection=projection_of(pinhole(small), ball),
+        center=center_of(camera, ball),
+        rgb=resize_area(image, width, height),
+        alpha=resize_area(alpha, width, height).astype(np.float32) / 255,
+        valid=undistorted_mask(small),
+    )
 
 
-def _write_picture(out: Path, images: dict[str, np.ndarray], odd: set[str]) -> None:
-    """Contact sheet of what was written for some expressions, the odd ones marked."""
-    rows = []
-    for expression, image in images.items():
-        alpha = read_image(out / f"{expression}.png").astype(np.float32) / 255
-        rows.append(picture_row(image, alpha))
+def corrected(
+    alpha: np.ndarray, removed: np.ndarray | None, filled: np.ndarray | None
+) -> np.ndarray:
+    """Alpha (H, W) uint8 less what is `removed` (h, w), with what is `filled`; soft at their edges.
+
+    What neither reaches stays as it is to the bit.
+    """
+    size = (alpha.shape[1], alpha.shape[0])
+    out = alpha.astype(np.float32)
+    if removed is not None:
+        out *= 1 - cv2.resize(removed.astype(np.float32), size, interpolation=cv2.INTER_LINEAR)
+    if filled is not None:
+        weight = cv2.resize(filled.astype(np.float32), size, interpolation=cv2.INTER_LINEAR)
+        out = np.maximum(out, 255 * weight)
+    return np.rint(out).astype(np.uint8)
+
+
+def _shares(before: np.ndarray, after: np.ndarray) -> dict[str, float]:
+    """Share of the image, by opacity, that was removed and filled."""
+    change = after.astype(np.int64) - before
+    share = {"removed": -change[change < 0].sum(), "filled": change[change > 0].sum()}
+    return {key: round(float(value) / 255 / before.size, 6) for key, value in share.items()}
+
+
+def _write_picture(out: Path, views: list[View], found: Agreement) -> None:
+    """Every camera's subject, what was removed red and what was filled green."""
+    odd = {warning["what"] for warning in found.warnings}
+    tiles = []
+    for view in views:
+        tile = np.where(view.alpha[..., None] > INSIDE, view.rgb, view.rgb // 3)
+        for masks, colour in ((found.removed, RED), (found.filled, GREEN)):
+            if view.name in masks:
+                mask = masks[view.name]
+                tile[mask] = (0.3 * tile[mask] + 0.7 * np.array(colour)).astype(np.uint8)
+        tiles.append(tile)
+    rows = [tiles[k : k + COLUMNS] for k in range(0, len(tiles), COLUMNS)]
+    names = [view.name + ("?" if view.name in odd else "") for view in views]
+    labels = ["  ".join(names[k : k + COLUMNS]) for k in range(0, len(tiles), COLUMNS)]
     (out / "qc").mkdir()
-    labels = [f"{name}: see warnings" if name in odd else name for name in images]
-    sheet = contact_sheet(rows, labels, tile=(240, 240))
-    write_image(out / "qc" / "mattes.jpg", sheet, quality=88)
+    write_image(out / "qc" / "agreement.jpg", contact_sheet(rows, labels, (240, 240)), quality=88)
 
 
 STAGE = Stage(
@@ -155,7 +160,7 @@ STAGE = Stage(
     version=4,
     config=MatteConfig,
     presets=PRESETS,
-    items=items,
+    items=peak_items,
     inputs=inputs,
     run=run,
 )

@@ -9,8 +9,8 @@ import numpy as np
 from express50.frames import read_plate
 from express50.images import scale_light
 from express50.layout import Dataset
-from pipelines.matte.foreground import own_colours
-from pipelines.matte.plate import exposed, exposure_gain
+from pipelines.alpha.foreground import own_colours
+from pipelines.alpha.plate import exposed, exposure_gain
 from pipelines.pack.crop import Crop, cut_image
 
 

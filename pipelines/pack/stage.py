@@ -23,6 +23,7 @@ from express50.images import (
 )
 from express50.index import index_path, read_index
 from express50.layout import Dataset
+from express50.parts import COLOURS
 from express50.publish import write_json
 from express50.shards import ShardReader
 from express50.shards_write import PackedSample, ShardWriter, sample_key, write_manifest
@@ -270,7 +271,7 @@ def _lacking_warning(lacking: list[dict], count: int) -> list[dict[str, str]]:
 
 def _write_picture(out: Path, reader: ShardReader) -> float:
     """Contact sheet of evenly chosen samples; returns the share of their mattes with depth."""
-    rows: list[list[np.ndarray]] = [[], [], []]
+    rows: list[list[np.ndarray]] = [[], [], [], []]
     covered = []
     for number in np.unique(np.linspace(0, len(reader) - 1, QC_SAMPLES).astype(int)):
         sample = reader.sample(int(number))
@@ -282,9 +283,11 @@ def _write_picture(out: Path, reader: ShardReader) -> float:
         rows[0].append(sample["rgb"])
         rows[1].append((sample["alpha"] * 255).astype(np.uint8))
         rows[2].append(np.where(valid, 55 + 200 * near, 0).astype(np.uint8))
+        blank = np.zeros(valid.shape, np.uint8)
+        rows[3].append(COLOURS[blank if sample["parts"] is None else sample["parts"]])
     reader.close()
     (out / "qc").mkdir(exist_ok=True)
-    sheet = contact_sheet(rows, ["rgb", "alpha", "depth"], tile=(160, 160))
+    sheet = contact_sheet(rows, ["rgb", "alpha", "depth", "parts"], tile=(160, 160))
     write_image(out / "qc" / "samples.jpg", sheet, quality=90)
     return round(float(np.mean(covered)), 4)
 

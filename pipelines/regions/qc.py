@@ -5,14 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from express50.parts import LABELS
-
-# One colour a label; the background's is not drawn.
-COLOURS = np.array(
-    [[0, 0, 0], [240, 150, 120], [250, 210, 60], [230, 40, 90], [90, 220, 255], [255, 255, 255],
-     [170, 60, 200], [70, 0, 30], [70, 110, 255], [170, 200, 90], [50, 140, 90], [255, 120, 0]],
-    np.float32,
-)  # fmt: skip
+from express50.parts import COLOURS, LABELS
 
 
 def label_shares(labels: np.ndarray) -> dict[str, float]:

@@ -10,7 +10,8 @@ def test_places_follow_the_documented_layout(tmp_path):
     dataset = Dataset(tmp_path)
     relative = {
         dataset.item_dir("track", "S001"): "track/S001",
-        dataset.matte_file("S001", "smile", "cam03"): "matte/S001/cam03/smile.png",
+        dataset.alpha_file("S001", "smile", "cam03"): "alpha/S001/cam03/smile.png",
+        dataset.matte_file("S001", "smile", "cam03"): "matte/S001/smile/cam03.png",
         dataset.captures_file: "captures.json",
         dataset.labels_file("S001"): "labels/S001.jsonl",
         dataset.ledger: "ledger.sqlite",

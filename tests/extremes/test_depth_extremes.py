@@ -171,5 +171,5 @@ def test_depth_crops_outside_the_image_are_unknown_not_zero_metres(crop, valid):
 def test_pictures_of_empty_and_constant_depth(depth):
     flat = np.full((16, 16), depth, np.float32)
     sample = {"rgb": np.zeros((16, 16, 3), np.uint8), "alpha": flat * 0, "depth": flat,
-              "valid": flat > 0}  # fmt: skip
+              "valid": flat > 0, "parts": None}  # fmt: skip
     assert sample_picture(sample).shape == (16, 48, 3)

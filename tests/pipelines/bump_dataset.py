@@ -69,10 +69,10 @@ def write_given(dataset: Dataset, subject: str, rig: list[Camera], shots: dict) 
     }  # fmt: skip
     (dataset.item_dir("align", subject) / "peaks.json").write_text(json.dumps(peaks))
     for name, (_, alpha, _) in shots.items():
-        folder = dataset.item_dir("matte", f"{subject}/{name}")
-        folder.mkdir(parents=True)
         for expression in EXPRESSIONS:
-            write_image(folder / f"{expression}.png", np.rint(alpha * 255).astype(np.uint8))
+            path = dataset.matte_file(subject, expression, name)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write_image(path, np.rint(alpha * 255).astype(np.uint8))
     write_track(dataset, subject)
 
 

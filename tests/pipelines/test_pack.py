@@ -217,7 +217,7 @@ def test_packing_twice_gives_the_same_bytes(dataset, packed, tmp_path):
 
 def test_what_is_missing_is_dropped_with_its_reason(dataset, tmp_path):
     depth = dataset.item_dir("depth", "S001/smile") / "cam01.png"
-    matte = dataset.item_dir("matte", "S001/cam02") / "neutral.png"
+    matte = dataset.matte_file("S001", "neutral", "cam02")
     kept = {path: path.read_bytes() for path in (depth, matte)}
     depth.unlink()
     write_image(matte, np.zeros((96, 96), np.uint8))
@@ -275,9 +275,9 @@ def test_what_cameras_make_differently_of_light_is_divided_out(dataset, packed, 
 
 def test_depth_stage_drops_a_bad_camera_and_reports_it(tmp_path):
     dataset = make_dataset(tmp_path)
-    empty = dataset.item_dir("matte", "S001/cam01") / "smile.png"
+    empty = dataset.matte_file("S001", "smile", "cam01")
     write_image(empty, np.zeros((96, 96), np.uint8))
-    (dataset.item_dir("matte", "S001/cam04") / "smile.png").unlink()
+    dataset.matte_file("S001", "smile", "cam04").unlink()
     metrics = published(dataset, DEPTH, DepthConfig(voxel_mm=6, levels=1))
     row = metrics["S001/smile"]
     assert {d["what"] for d in row["dropped"]} == {"cam01", "cam04"} and row["views"] == 4

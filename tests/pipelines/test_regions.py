@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -249,8 +250,7 @@ def test_the_networks_labels_go_first_and_the_mesh_refines_its_skin(dataset, tmp
 
 def test_items_without_track_or_mattes_fail_in_one_line(tmp_path) -> None:
     dataset = make_dataset(tmp_path)
-    for path in dataset.stage_dir("matte").rglob("smile.png"):
-        path.unlink()
+    shutil.rmtree(dataset.item_dir("matte", "S001/smile"))
     with pytest.raises(StageError, match="no camera has a matte to label .*express50 matte"):
         STAGE.run(dataset, "S001/smile", RegionsConfig(), tmp_path)
     with pytest.raises(StageError, match=r"regions.segmentation .*no such file"):

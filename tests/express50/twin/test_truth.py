@@ -7,6 +7,7 @@ from express50.cameras import project, resized, transform_camera
 from express50.errors import CaptureError
 from express50.images import read_image
 from express50.transforms import axis_angle_to_matrix, make_transform
+from express50.twin.body import Material
 from express50.twin.rig import make_rig
 from express50.twin.truth import Truth, align_worlds
 
@@ -50,6 +51,22 @@ def test_depth_is_that_of_the_vertices(truth):
     # No vertex is in front of the depth map by more than the slope across a pixel.
     assert np.quantile(behind[seen], 0.02) > -0.012
     assert np.isfinite(depth).all() and (depth[valid] > 0.5).all() and (depth[~valid] == 0).all()
+
+
+def test_the_surface_is_where_the_depth_is_and_fills_the_alpha(truth):
+    camera, frame = truth.cameras("S001")["cam01"], 4
+    material, vertex = truth.surface("S001", frame, camera)
+    depth, valid = truth.render_depth("S001", frame, camera)
+    assert np.array_equal(material >= 0, valid)
+    assert {Material.SKIN, Material.EYE, Material.HAIR, Material.CLOTH} <= set(np.unique(material))
+    points, _ = truth.mesh("S001", frame)
+    pixels, z = project(camera, points[vertex[valid]])
+    assert np.quantile(np.abs(z - depth[valid]), 0.9) < 0.02
+    # Skin belongs to the head model, whose vertices come first; cloth does not.
+    heads = len(truth.vertices("S001", frame))
+    assert (vertex[material == Material.SKIN] < heads).all()
+    assert (vertex[material == Material.CLOTH] >= heads).all()
+    assert truth.hairiness("S001").max() > 0.9 and truth.hairiness("S001").min() == 0
 
 
 def test_peak_frames_are_in_their_windows_and_strongest(truth):

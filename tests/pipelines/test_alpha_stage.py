@@ -14,22 +14,22 @@ from express50.index import read_index
 from express50.layout import Dataset
 from express50.runner import Summary, run_stage
 from pipelines import calibrate, ingest
-from pipelines.matte import STAGE
-from pipelines.matte.config import MatteConfig
-from tests.pipelines.matte_scenes import clutter
+from pipelines.alpha import STAGE
+from pipelines.alpha.config import AlphaConfig
+from tests.pipelines.alpha_scenes import clutter
 from tests.pipelines.stand_ins import Bad, Difference, onnx_bright, torchscript
-from tests.pipelines.test_matte_footage import backdrop, shot
+from tests.pipelines.test_alpha_footage import backdrop, shot
 from tests.synth import make_capture
 
 
 def run(dataset: Dataset, **settings) -> Summary:
     """The stage over every item, in this process."""
-    return run_stage(STAGE, dataset, MatteConfig(**settings), workers=0, progress=False)
+    return run_stage(STAGE, dataset, AlphaConfig(**settings), workers=0, progress=False)
 
 
 def metrics_of(dataset: Dataset, item: str = "S001/cam00") -> dict:
     """Figures of one item."""
-    return json.loads((dataset.item_dir("matte", item) / "metrics.json").read_text())
+    return json.loads((dataset.item_dir("alpha", item) / "metrics.json").read_text())
 
 
 def align(dataset: Dataset, subject: str) -> None:
@@ -76,11 +76,11 @@ def unplated(root: Path, subject: str, who: int, plate: np.ndarray) -> Path:
 def test_background_matting_sees_frame_and_plate(aligned, tmp_path) -> None:
     weights = torchscript(Difference(), tmp_path / "net.pt")
     assert run(aligned, method="bgmv2", weights=str(weights)).ok
-    learned = read_image(aligned.item_dir("matte", "S001/cam00") / "smile.png")
+    learned = read_image(aligned.item_dir("alpha", "S001/cam00") / "smile.png")
     figures = metrics_of(aligned)
     assert figures["method"] == "bgmv2" and figures["plate"] == "given"
     assert run(aligned).ok
-    keyed = read_image(aligned.item_dir("matte", "S001/cam00") / "smile.png")
+    keyed = read_image(aligned.item_dir("alpha", "S001/cam00") / "smile.png")
     assert ((learned > 127) == (keyed > 127)).mean() > 0.97 and learned.shape == keyed.shape
 
 
@@ -89,7 +89,7 @@ def test_other_weights_run_again_and_the_same_do_not(aligned, tmp_path) -> None:
     torchscript(Difference(), tmp_path / "net.pt")
     first = run(aligned, **settings)
     assert first.ok and run(aligned, **settings).count("skipped") == 3
-    path = aligned.item_dir("matte", "S001/cam00") / "neutral.png"
+    path = aligned.item_dir("alpha", "S001/cam00") / "neutral.png"
     before = path.read_bytes()
     other = Difference()
     other.gain.data.fill_(2.0)
@@ -106,7 +106,7 @@ def test_a_salient_network_needs_no_plate(tmp_path) -> None:
         "weights": str(onnx_bright(tmp_path / "net.onnx", 128)),
     }
     assert run(dataset, **settings).ok
-    folder = dataset.item_dir("matte", "S001/cam00")
+    folder = dataset.item_dir("alpha", "S001/cam00")
     names = {p.name for p in folder.glob("*.png")}
     assert names == {"neutral.png", "smile.png"}
     alpha = read_image(folder / "smile.png")
@@ -129,13 +129,13 @@ def test_a_bad_network_fails_items_in_one_line_each(aligned, tmp_path, how, mess
     summary = run(aligned, method="salient", weights=str(path))
     assert summary.count("failed") == 3
     for outcome in summary.outcomes:
-        assert outcome.reason.startswith("StageError: matte.weights") and message in outcome.reason
+        assert outcome.reason.startswith("StageError: alpha.weights") and message in outcome.reason
 
 
 def test_one_camera_that_fails_leaves_the_others_done(aligned, tmp_path, monkeypatch) -> None:
     weights = torchscript(Difference(), tmp_path / "net.pt")
     index = read_index(aligned, "S001")
-    monkeypatch.setattr("pipelines.matte.source.read_plate", _wrong_for("cam01"))
+    monkeypatch.setattr("pipelines.alpha.source.read_plate", _wrong_for("cam01"))
     summary = run(aligned, method="bgmv2", weights=str(weights))
     status = {o.item: o.status for o in summary.outcomes}
     assert status == {f"S001/{c}": "failed" if c == "cam01" else "done" for c in index.cameras}
@@ -164,7 +164,7 @@ def test_without_plates_subjects_of_a_fixed_rig_stand_in_for_them(tmp_path) -> N
     words = [w["why"] for w in figures["warnings"] if w["what"] == "plate"]
     assert len(words) == 1 and "always covered and filled in" in words[0]
     truth = shot(np.random.default_rng(0), plate, 0)[1]
-    alpha = read_image(dataset.item_dir("matte", "S000/cam00") / "smile.png") / 255
+    alpha = read_image(dataset.item_dir("alpha", "S000/cam00") / "smile.png") / 255
     assert np.abs(alpha - truth).mean() < 0.01
 
 
@@ -179,7 +179,7 @@ def test_the_plate_of_another_subject_is_used_and_named(tmp_path) -> None:
     assert figures["plate"] == "the plate of S001"
     assert [w["what"] for w in figures["warnings"]] == ["plate"]
     truth = shot(np.random.default_rng(0), plate, 0)[1]
-    alpha = read_image(dataset.item_dir("matte", "S000/cam00") / "smile.png") / 255
+    alpha = read_image(dataset.item_dir("alpha", "S000/cam00") / "smile.png") / 255
     assert np.abs(alpha - truth).mean() < 0.012
     assert metrics_of(dataset, "S001/cam00")["plate"] == "given"
 
@@ -191,4 +191,4 @@ def test_one_subject_that_sits_still_without_a_plate_fails_clearly(tmp_path) -> 
     assert not summary.ok
     reason = summary.outcomes[0].reason
     assert "the subject moves too little" in reason and "plates/cam00.png" in reason
-    assert "set matte.method to salient" in reason
+    assert "set alpha.method to salient" in reason

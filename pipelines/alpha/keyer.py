@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 
 from express50.images import resize_area
-from pipelines.matte.config import MatteConfig
-from pipelines.matte.key import alpha_of
-from pipelines.matte.plate import PlateModel, exposed, exposure_gain, fit_plate
+from pipelines.alpha.config import AlphaConfig
+from pipelines.alpha.key import alpha_of
+from pipelines.alpha.plate import PlateModel, exposed, exposure_gain, fit_plate
 
 
 class Keyer:
@@ -21,7 +21,7 @@ class Keyer:
         plate: np.ndarray,
         frames: list[np.ndarray],
         valid: np.ndarray,
-        config: MatteConfig,
+        config: AlphaConfig,
         doubt: np.ndarray | None = None,
     ) -> None:
         """Measure the noise of `frames` (H, W, 3) uint8 around `plate`, inside `valid` (H, W).

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipelines.matte.learned import BGMV2, SALIENT, background_alpha, salient_alpha
-from pipelines.matte.qc import border_contact, warnings
+from pipelines.alpha.learned import BGMV2, SALIENT, background_alpha, salient_alpha
+from pipelines.alpha.qc import border_contact, warnings
 from pipelines.networks import load_network
 from tests.pipelines.stand_ins import Difference, onnx_bright, torchscript
 

@@ -2,7 +2,7 @@
 
 What differs from the plate by more than noise, in parts of some size, is the subject's region. The
 solid inside is found by shape and is 1; around it alpha is solved from the plate and the subject's
-colours nearby (`pipelines.matte.opacity`), so that a strand of fair hair over a fair plate is as
+colours nearby (`pipelines.alpha.opacity`), so that a strand of fair hair over a fair plate is as
 opaque as a dark one. Measured against plain keys and textbook matting in benchmarks/matte.py.
 """
 
@@ -13,16 +13,16 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from pipelines.matte.config import MatteConfig
-from pipelines.matte.opacity import (
+from pipelines.alpha.config import AlphaConfig
+from pipelines.alpha.opacity import (
     light_noise,
     local_colours,
     shrunk,
     solve_opacity,
     to_light,
 )
-from pipelines.matte.plate import PlateModel
-from pipelines.matte.smooth import smooth_alpha
+from pipelines.alpha.plate import PlateModel
+from pipelines.alpha.smooth import smooth_alpha
 
 # A part of the subject smaller than this share of its largest part is clutter.
 LEAST_PART = 0.02
@@ -46,7 +46,7 @@ class Support:
 
 
 def alpha_of(
-    frame: np.ndarray, model: PlateModel, valid: np.ndarray, config: MatteConfig
+    frame: np.ndarray, model: PlateModel, valid: np.ndarray, config: AlphaConfig
 ) -> np.ndarray:
     """Opacity (H, W) float32 in [0, 1] of the subject in a frame (H, W, 3) uint8.
 
@@ -83,7 +83,7 @@ def _opacity(
     support: Support,
     model: PlateModel,
     length: int,
-    config: MatteConfig,
+    config: AlphaConfig,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Alpha (H, W) float32, 1 deep in the core and 0 off the support, and its deviation (H, W)."""
     core, linear = support.core, config.light == "linear"
@@ -209,7 +209,7 @@ def subject_region(difference: np.ndarray, high: float) -> np.ndarray:
     return (sure & (area >= least))[labels]
 
 
-def find_support(firm: np.ndarray, region: np.ndarray, length: int, config: MatteConfig) -> Support:
+def find_support(firm: np.ndarray, region: np.ndarray, length: int, config: AlphaConfig) -> Support:
     """Split the region (H, W) into the solid inside and the rest, where alpha is to be measured.
 
     `firm` (H, W) marks pixels that look opaque one by one; where they leave no gap that a strand
@@ -245,7 +245,7 @@ def firm_pixels(
     core: np.ndarray,
     model: PlateModel,
     length: int,
-    config: MatteConfig,
+    config: AlphaConfig,
 ) -> np.ndarray:
     """Pixels (H, W) bool that look opaque, knowing the subject's colour about a first core.
 

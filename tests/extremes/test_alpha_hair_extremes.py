@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 from benchmarks.matte_scenes import exposed, make_scene, plain
-from pipelines.matte.config import MatteConfig
-from pipelines.matte.keyer import Keyer
+from pipelines.alpha.config import AlphaConfig
+from pipelines.alpha.keyer import Keyer
 
 
 def keyed(frame: np.ndarray, plate: np.ndarray) -> np.ndarray:
     """Alpha (H, W) with the default settings."""
-    return Keyer(plate, [frame], np.ones(plate.shape[:2], bool), MatteConfig()).alpha(frame)
+    return Keyer(plate, [frame], np.ones(plate.shape[:2], bool), AlphaConfig()).alpha(frame)
 
 
 @pytest.mark.parametrize("blur", [0.0, 0.9])

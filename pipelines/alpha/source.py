@@ -12,8 +12,8 @@ from express50.errors import StageError
 from express50.frames import FrameReader, read_plate, read_srgb8
 from express50.index import Index, read_index
 from express50.layout import Dataset
-from pipelines.matte.config import MatteConfig
-from pipelines.matte.footage import (
+from pipelines.alpha.config import AlphaConfig
+from pipelines.alpha.footage import (
     FootagePlate,
     plate_of_another,
     plate_over_subjects,
@@ -35,7 +35,7 @@ class Plate:
     warnings: tuple[dict[str, str], ...] = ()
 
 
-def plate_of(dataset: Dataset, item: str, camera: Camera, config: MatteConfig) -> Plate:
+def plate_of(dataset: Dataset, item: str, camera: Camera, config: AlphaConfig) -> Plate:
     """The plate that was shot, or one estimated from footage.
 
     Raises:
@@ -68,7 +68,7 @@ def others_of(dataset: Dataset, index: Index, camera_id: str) -> list[str]:
     return [found[i] for i in np.unique(picks)]
 
 
-def _plate_of_the_rig(dataset: Dataset, item: str, camera: Camera, config: MatteConfig) -> Plate:
+def _plate_of_the_rig(dataset: Dataset, item: str, camera: Camera, config: AlphaConfig) -> Plate:
     """Of another subject before this rig, else over subjects, else over time."""
     subject, camera_id = item.split("/")
     index = read_index(dataset, subject)
@@ -96,7 +96,7 @@ def _plate_of_the_rig(dataset: Dataset, item: str, camera: Camera, config: Matte
         flaws.append(f"in {source} {flaw}")
     raise StageError(
         f"{item}: no clean plate, and {'; '.join(flaws)}; photograph the empty set as "
-        f"plates/{camera_id}.png and run 'express50 ingest' again, or set matte.method to salient"
+        f"plates/{camera_id}.png and run 'express50 ingest' again, or set alpha.method to salient"
     )
 
 

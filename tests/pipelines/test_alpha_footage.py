@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
-from pipelines.matte.config import MatteConfig
-from pipelines.matte.footage import (
+from pipelines.alpha.config import AlphaConfig
+from pipelines.alpha.footage import (
     MOST_DOUBT,
     filled,
     plate_of_another,
@@ -15,8 +15,8 @@ from pipelines.matte.footage import (
     plate_over_time,
     time_median,
 )
-from pipelines.matte.keyer import Keyer
-from tests.pipelines.matte_scenes import clutter
+from pipelines.alpha.keyer import Keyer
+from tests.pipelines.alpha_scenes import clutter
 
 SIZE = 128
 PEOPLE = ((110, 80, 65), (215, 170, 150), (60, 42, 36), (150, 110, 85))
@@ -98,7 +98,7 @@ def test_the_key_works_on_an_estimated_plate(rng) -> None:
     found = plate_over_subjects([still(rng, plate, who) for who in (0, 1)])
     frame, alpha = shot(rng, plate, 0)
     doubt = np.where(found.known, 0, max(found.doubt, 1)).astype(np.float32)
-    keyer = Keyer(found.plate, [frame], np.ones((SIZE, SIZE), bool), MatteConfig(), doubt)
+    keyer = Keyer(found.plate, [frame], np.ones((SIZE, SIZE), bool), AlphaConfig(), doubt)
     assert np.abs(keyer.alpha(frame) - alpha).mean() < 0.01
 
 

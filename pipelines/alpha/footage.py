@@ -14,8 +14,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from pipelines.matte.key import dilated, eroded
-from pipelines.matte.plate import MOST_NOISE, exposed, exposure_gain
+from pipelines.alpha.key import dilated, eroded
+from pipelines.alpha.plate import MOST_NOISE, exposed, exposure_gain
 
 LEAST_MOTION = 0.06  # share of the image that must differ from the median in half of the frames
 STATIC = 0.95  # share of the time in which a pixel that never changes agrees with its median

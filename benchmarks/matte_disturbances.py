@@ -1,0 +1,161 @@
+"""What goes wrong on a set, laid on recorded frames: the scenes of ``benchmarks.matte_views``."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+
+from express50.cameras import Camera, pinhole, rays
+from express50.images import linear_to_srgb, srgb_to_linear
+
+SHADE = 0.5  # share of linear light that the shadow takes; the key forgives a quarter
+STAND = (0.06, 0.07, 0.05)  # linear light of the object
+PATCH_M = 0.022  # radius of the patch
+BUMP = (0.09, 0.04, 3.0)  # shares of the image's side, degrees
+
+
+@dataclass(frozen=True, kw_only=True)
+class Shot:
+    """One camera of a moment: undistorted images and their truth.
+
+    Attributes:
+        camera: as recorded, with distortion.
+        frame, plate: (H, W, 3) uint8.
+        valid: (H, W) bool, pixels with footage.
+        true: (H, W) alpha.
+        depth: (H, W) metres, 0 where there is nothing.
+    """
+
+    camera: Camera
+    frame: np.ndarray
+    plate: np.ndarray
+    valid: np.ndarray
+    true: np.ndarray
+    depth: np.ndarray
+
+
+def undisturbed(shots: list[Shot]) -> list[Shot]:
+    """Nothing."""
+    return shots
+
+
+def shadow(shots: list[Shot]) -> list[Shot]:
+    """A deep, soft-edged shadow on the backdrop of three cameras in eight, elsewhere in each."""
+    rng = np.random.default_rng(1)
+    return [
+        _behind(shot, np.zeros(3), SHADE * _blob(shot, rng)) if k % 8 in (0, 3, 5) else shot
+        for k, shot in enumerate(shots)
+    ]
+
+
+def stand(shots: list[Shot]) -> list[Shot]:
+    """A stand and a cable behind the subject, in every fourth camera."""
+    rng = np.random.default_rng(2)
+    return [
+        _behind(shot, np.array(STAND), _stand(shot, rng)) if k % 4 == 0 else shot
+        for k, shot in enumerate(shots)
+    ]
+
+
+def patch(shots: list[Shot]) -> list[Shot]:
+    """A patch of one colour on the skin; two cameras have the same colour behind it."""
+    front = shots[len(shots) // 2]
+    rows, columns = np.nonzero((front.depth > 0) & (front.true > 0.99))
+    height, width = front.true.shape
+    # On the cheek or so: somewhat off the middle of what the camera sees.
+    pick = np.argmin((rows - 0.58 * height) ** 2 + (columns - 0.5 * width) ** 2)
+    at = _points(front)[rows[pick], columns[pick]]
+    colour = np.median(front.plate[front.valid], axis=0)
+    chosen = {len(shots) // 2, len(shots) // 2 - 3}
+    return [_painted(shot, at, colour, k in chosen) for k, shot in enumerate(shots)]
+
+
+def bumped(shots: list[Shot]) -> list[Shot]:
+    """One camera turned and rolled: frame, plate and truth move together."""
+    k = len(shots) // 2 - 3
+    return [*shots[:k], _moved(shots[k]), *shots[k + 1 :]]
+
+
+DISTURBANCES: dict[str, Callable[[list[Shot]], list[Shot]]] = {
+    "undisturbed": undisturbed,
+    "shadow": shadow,
+    "object": stand,
+    "patch": patch,
+    "bumped": bumped,
+}
+
+
+def _behind(shot: Shot, light: np.ndarray, cover: np.ndarray) -> Shot:
+    """The frame with `light` (3,) over the backdrop by `cover` (H, W), behind the subject."""
+    plate = srgb_to_linear(shot.plate / 255)
+    change = ((1 - shot.true) * cover * shot.valid)[..., None] * (light - plate)
+    return replace(shot, frame=_srgb8(srgb_to_linear(shot.frame / 255) + change))
+
+
+def _srgb8(linear: np.ndarray) -> np.ndarray:
+    return np.rint(255 * linear_to_srgb(np.clip(linear, 0, 1))).astype(np.uint8)
+
+
+def _blob(shot: Shot, rng: np.random.Generator) -> np.ndarray:
+    """A round soft shape (H, W) in [0, 1] in the upper half, at the left or right."""
+    height, width = shot.true.shape
+    y, x = np.mgrid[0:height, 0:width] / max(height, width)
+    middle = rng.choice([0.15, 0.85]) + rng.uniform(-0.05, 0.05), rng.uniform(0.2, 0.6)
+    size = rng.uniform(0.1, 0.16), rng.uniform(0.12, 0.2)
+    away = np.hypot((x - middle[0]) / size[0], (y - middle[1]) / size[1])
+    return np.clip((1.05 - away) / 0.1, 0, 1)
+
+
+def _stand(shot: Shot, rng: np.random.Generator) -> np.ndarray:
+    """An upright pole with a box on it and a cable across (H, W) in [0, 1]."""
+    height, width = shot.true.shape
+    image = np.zeros((height, width), np.uint8)
+    x = int(width * (rng.choice([0.1, 0.9]) + rng.uniform(-0.03, 0.03)))
+    half, top = width // 18, int(height * rng.uniform(0.2, 0.4))
+    cv2.rectangle(image, (x - half, top), (x + half, top + 3 * half), 255, -1)
+    cv2.line(image, (x, top), (x, height), 255, max(2, width // 60), cv2.LINE_AA)
+    end = (int(width * rng.uniform(0.3, 0.7)), 0)
+    cv2.line(image, (x, top), end, 255, max(1, width // 120), cv2.LINE_AA)
+    return image / 255
+
+
+def _points(shot: Shot) -> np.ndarray:
+    """World points (H, W, 3) of the true surface."""
+    origin, directions = rays(pinhole(shot.camera))
+    return origin + shot.depth[..., None] * directions
+
+
+def _painted(shot: Shot, at: np.ndarray, colour: np.ndarray, behind: bool) -> Shot:
+    """The surface around a point (3,) in a colour (3,), 8-bit steps, and the plate behind too."""
+    near = (np.linalg.norm(_points(shot) - at, axis=-1) < PATCH_M) & (shot.depth > 0)
+    if not near.any():
+        return shot
+    noise = np.random.default_rng(3).normal(size=(2, *shot.true.shape, 3))
+    on = cv2.blur(near.astype(np.float32), (3, 3))[..., None]
+    frame = shot.frame + on * (colour + noise[0] - shot.frame)
+    plate = shot.plate.astype(np.float64)
+    if behind:
+        wide = cv2.dilate(near.astype(np.uint8), np.ones((5, 5))).astype(bool)[..., None]
+        plate = np.where(wide, colour + noise[1], plate)
+    frame, plate = (np.rint(np.clip(image, 0, 255)).astype(np.uint8) for image in (frame, plate))
+    return replace(shot, frame=frame, plate=plate)
+
+
+def _moved(shot: Shot) -> Shot:
+    height, width = shot.true.shape
+    side = max(height, width)
+    matrix = cv2.getRotationMatrix2D((width / 2, height / 2), BUMP[2], 1.0)
+    matrix[:, 2] += BUMP[0] * side, BUMP[1] * side
+
+    def move(image: np.ndarray) -> np.ndarray:
+        return cv2.warpAffine(
+            image, matrix, (width, height), flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+        )
+
+    return replace(
+        shot, frame=move(shot.frame), plate=move(shot.plate), true=move(shot.true),
+        depth=move(shot.depth), valid=move(shot.valid.astype(np.uint8)) > 0,
+    )  # fmt: skip

@@ -1,0 +1,192 @@
+"""Several views against the key: scenes in which no camera alone can be right.
+
+``python -m benchmarks.matte_views`` records a rig of 24 cameras with the digital twin (a minute),
+or takes ``--dataset`` and ``--truth``, disturbs the peaks and measures the mattes before and after
+the cameras have agreed, with all cameras and with every third:
+
+- ``undisturbed``: nothing may get worse (``sad_ratio_to_key`` at most 1.01);
+- ``shadow``: three cameras in eight see a shadow, too deep for the key, on the backdrop;
+- ``object``: a quarter see a stand with a cable behind the subject;
+- ``patch``: a patch of the skin has one colour in all views, and two have the same behind it;
+- ``bumped``: one camera was turned after calibration, its matte is right where it now looks.
+
+Disturbances are laid on the recorded frames in linear light with the true alpha, and keyed anew.
+``sad`` is the summed absolute error in thousands, ``mae`` its mean, both means over cameras and
+peaks; ``*_key`` is each camera alone. ``named`` counts the cameras that were found wrong, of which
+``bumped`` has one a peak. ``seconds_per_moment`` is processor time, reading and keying excluded.
+The last line is one JSON object.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from benchmarks.calibrate import recorded, rounded
+from benchmarks.matte import errors
+from benchmarks.matte_disturbances import DISTURBANCES, Shot
+from express50.adapters import undistort_image, undistorted_mask
+from express50.cameras import pinhole
+from express50.config import resolve_config
+from express50.frames import read_frame, read_plate
+from express50.images import contact_sheet, write_image
+from express50.layout import Dataset
+from express50.twin.config import TwinConfig
+from express50.twin.truth import Truth
+from pipelines.alpha import STAGE as ALPHA
+from pipelines.alpha.keyer import Keyer
+from pipelines.matte import STAGE
+from pipelines.matte.agreement import agree
+from pipelines.matte.hull import ball_of
+from pipelines.matte.stage import corrected, make_view
+
+PRESETS = ("draft", "standard", "reference")
+RIG = TwinConfig(
+    subjects=1,
+    first_subject=61,
+    cameras=24,
+    width=384,
+    height=384,
+    expressions=("neutral", "jaw_open"),
+    frames_per_expression=4,
+    footage="jpg",
+    board_frames=0,
+    give_calibration=True,
+)
+Figures = dict[str, float]
+
+
+@dataclass(frozen=True)
+class Keyed:
+    """A shot and what its camera alone makes of it, (H, W) uint8."""
+
+    shot: Shot
+    alpha: np.ndarray
+
+
+def main() -> int:
+    """Run and print."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--dataset", type=Path, help="a twin dataset (default: one is recorded)")
+    parser.add_argument("--truth", type=Path, help="its truth")
+    parser.add_argument("--recording", type=Path, default=Path("build/bench-views"))
+    parser.add_argument("--peaks", type=int, default=2, help="moments, at most")
+    parser.add_argument("--set", dest="assignments", action="append", default=[])
+    parser.add_argument("--pictures", type=Path, help="folder for pictures of the standard preset")
+    args = parser.parse_args()
+    cv2.setNumThreads(1)
+    if (args.dataset is None) != (args.truth is None):
+        sys.exit("name both --dataset and --truth, or neither")
+    if args.dataset is None:
+        dataset, truth = recorded(RIG, args.recording)
+    else:
+        dataset, truth = Dataset(args.dataset), Truth(args.truth)
+    configs = {name: resolve_config(STAGE, name, None, args.assignments) for name in PRESETS}
+    rows: dict[tuple[int, str, str], list[Figures]] = {}
+    for subject, frame in moments(dataset, truth, args.peaks):
+        clean = shots_of(dataset, truth, subject, frame)
+        undone: dict[int, Keyed] = {}  # most shots of a scene are untouched, and keyed once
+        for scene, disturb in DISTURBANCES.items():
+            keyed = [undone.get(id(shot)) or key(shot) for shot in disturb(clean)]
+            undone |= {id(k.shot): k for k in keyed if scene == "undisturbed"}
+            for step in (1, 3):
+                for preset, config in configs.items():
+                    row = measure(keyed[::step], config, sheet_of(args, preset, scene, step, frame))
+                    rows.setdefault((len(keyed[::step]), preset, scene), []).append(row)
+                    print(subject, frame, scene, preset, len(keyed[::step]), rounded(row),
+                          file=sys.stderr)  # fmt: skip
+    print(json.dumps({"benchmark": "matte_views", **summary(rows)}))
+    return 0
+
+
+def moments(dataset: Dataset, truth: Truth, limit: int) -> list[tuple[str, int]]:
+    """(subject, frame) of an even choice of the peaks."""
+    every = [(s, frame) for s in dataset.subjects() for frame in truth.peaks(s).values()]
+    picks = np.linspace(0, len(every) - 1, min(limit, len(every))).round().astype(int)
+    return [every[i] for i in np.unique(picks)]
+
+
+def shots_of(dataset: Dataset, truth: Truth, subject: str, frame: int) -> list[Shot]:
+    """Undistorted frames and plates of a moment with their true alpha and depth."""
+    shots = []
+    for camera in truth.cameras(subject).values():
+        plate = read_plate(dataset, subject, camera.id, undistort=False)
+        if plate is None:
+            sys.exit(f"{dataset.root}: {subject}/{camera.id} has no plate; name another --dataset")
+        image = read_frame(dataset, subject, camera.id, frame, undistort=False)
+        valid = cv2.erode(undistorted_mask(camera).astype(np.uint8), np.ones((3, 3))) > 0
+        ideal = pinhole(camera)
+        shots.append(
+            Shot(
+                camera=camera,
+                frame=undistort_image(image, camera),
+                plate=undistort_image(plate, camera),
+                valid=valid,
+                true=truth.render_alpha(subject, frame, ideal) * valid,
+                depth=truth.render_depth(subject, frame, ideal)[0],
+            )
+        )
+    return shots
+
+
+def key(shot: Shot) -> Keyed:
+    """The shot with its camera's own alpha, by the standard preset."""
+    keyer = Keyer(shot.plate, [shot.frame], shot.valid, resolve_config(ALPHA, "standard"))
+    return Keyed(shot, np.rint(255 * keyer.alpha(shot.frame)).astype(np.uint8))
+
+
+def measure(keyed: list[Keyed], config: object, sheet: Path | None) -> Figures:
+    """Errors before and after of one moment, and the seconds between."""
+    started = time.process_time()
+    ball = ball_of({k.shot.camera.id: k.shot.camera for k in keyed})
+    if ball is None:
+        sys.exit("the rig looks at no one place; name another --dataset")
+    views = [make_view(k.shot.camera, ball, k.shot.frame, k.alpha, config.side) for k in keyed]
+    found = agree(views, config)
+    after = [
+        corrected(k.alpha, found.removed.get(k.shot.camera.id), found.filled.get(k.shot.camera.id))
+        for k in keyed
+    ]
+    seconds = time.process_time() - started
+    if sheet is not None:
+        rows = [[k.shot.frame, k.alpha, a] for k, a in zip(keyed, after, strict=True)]
+        sheet.parent.mkdir(parents=True, exist_ok=True)
+        write_image(sheet, contact_sheet(rows[:8], [k.shot.camera.id for k in keyed[:8]]))
+    before = [errors(k.alpha / 255, k.shot.true) for k in keyed]
+    later = [errors(a / 255, k.shot.true) for k, a in zip(keyed, after, strict=True)]
+    row = {name: float(np.mean([e[name] for e in later])) for name in ("sad", "mae")}
+    row |= {f"{name}_key": float(np.mean([e[name] for e in before])) for name in ("sad", "mae")}
+    return row | {"named": float(len(found.warnings)), "seconds_per_moment": seconds}
+
+
+def sheet_of(
+    args: argparse.Namespace, preset: str, scene: str, step: int, frame: int
+) -> Path | None:
+    """Where the picture of a measurement goes, if anywhere."""
+    if args.pictures is None or preset != "standard" or step == 1:
+        return None
+    return args.pictures / f"{scene}-{frame}.png"
+
+
+def summary(rows: dict[tuple[int, str, str], list[Figures]]) -> dict[str, object]:
+    """Means over the peaks by number of cameras, preset and scene, with their ratios."""
+    table: dict[str, dict] = {}
+    for (count, preset, scene), mine in rows.items():
+        means = {name: float(np.mean([row[name] for row in mine])) for name in mine[0]}
+        means["sad_ratio_to_key"] = means["sad"] / means["sad_key"]
+        scenes = table.setdefault(f"cameras_{count}", {}).setdefault(preset, {})
+        scenes[scene] = rounded(means)
+    return table
+
+
+if __name__ == "__main__":
+    sys.exit(main())

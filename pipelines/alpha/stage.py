@@ -1,0 +1,161 @@
+"""The alpha stage: one camera of one subject, an 8-bit alpha for every peak expression."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from express50.adapters import undistorted_mask
+from express50.cameras import read_cameras
+from express50.errors import StageError
+from express50.frames import read_cameras_of, read_frame, read_peaks
+from express50.images import contact_sheet, read_image, write_image
+from express50.index import index_path, read_index
+from express50.layout import Dataset
+from express50.stage import Stage
+from pipelines.alpha.config import PRESETS, AlphaConfig
+from pipelines.alpha.keyer import Keyer
+from pipelines.alpha.plate import exposed, exposure_gain
+from pipelines.alpha.qc import border_contact, picture_row, warnings
+from pipelines.alpha.source import Plate, others_of, plate_of
+
+QC_ROWS = 8
+
+Alpha = Callable[[np.ndarray], np.ndarray]
+"""Frame (H, W, 3) uint8 to opacity (H, W) float32."""
+
+
+def items(dataset: Dataset) -> list[str]:
+    """`subject/camera` for every calibrated camera."""
+    found = []
+    for subject in dataset.subjects():
+        path = dataset.item_dir("calibrate", subject) / "cameras.json"
+        if path.is_file():
+            found += [f"{subject}/{camera}" for camera in sorted(read_cameras(path))]
+    return found
+
+
+def inputs(dataset: Dataset, item: str, config: AlphaConfig) -> dict[str, Path | str]:
+    """The camera's index, plate and footage identity, the calibration, the peaks, the weights."""
+    subject, camera = item.split("/")
+    index = read_index(dataset, subject)
+    found: dict[str, Path | str] = {
+        "index": index_path(dataset, subject),
+        "cameras": dataset.item_dir("calibrate", subject) / "cameras.json",
+        "peaks": dataset.item_dir("align", subject) / "peaks.json",
+    }
+    if camera in index.plates:
+        found["plate"] = index.capture / index.plates[camera]
+    elif config.method != "salient":
+        for other in others_of(dataset, index, camera):
+            found[f"index of {other}"] = index_path(dataset, other)
+            theirs = read_index(dataset, other)
+            if camera in theirs.plates:
+                found[f"plate of {other}"] = theirs.capture / theirs.plates[camera]
+    if config.weights:
+        found["weights"] = _weights(config)
+    return found
+
+
+def _weights(config: AlphaConfig) -> Path:
+    path = Path(config.weights).expanduser()
+    if not path.is_file():
+        raise StageError(f"alpha.weights {path}: no such file; expected TorchScript or .onnx")
+    return path
+
+
+def run(dataset: Dataset, item: str, config: AlphaConfig, out: Path) -> dict:
+    """Write `<expression>.png` for each peak and a contact sheet; returns coverage figures."""
+    subject, camera_id = item.split("/")
+    peaks = read_peaks(dataset, subject)
+    if not peaks:
+        raise StageError(f"{item}: no peak frames; run 'express50 align {dataset.root}'")
+    camera = read_cameras_of(dataset, subject, undistorted=False)[camera_id]
+    # Resampling mixes the outermost pixels with what lies beyond the image.
+    valid = cv2.erode(undistorted_mask(camera).astype(np.uint8), np.ones((3, 3))) > 0
+
+    def read(frame: int) -> np.ndarray:
+        return read_frame(dataset, subject, camera_id, frame)
+
+    plate = None if config.method == "salient" else plate_of(dataset, item, camera, config)
+    alpha_of, facts = _method(plate, [read(f) for f in _measured(peaks, config)], valid, config)
+    coverage: dict[str, float] = {}
+    border: dict[str, dict[str, float]] = {}
+    for expression, frame in peaks.items():
+        image = read(frame)
+        alpha = np.where(valid, alpha_of(image), np.float32(0))
+        write_image(out / f"{expression}.png", np.rint(alpha * 255).astype(np.uint8))
+        coverage[expression] = round(float(alpha.mean()), 6)
+        border[expression] = border_contact(alpha)
+    odd = warnings(peaks, coverage, border) + list(plate.warnings if plate else ())
+    named = {warning["what"] for warning in odd}
+    first = sorted(peaks, key=lambda expression: expression not in named)[:QC_ROWS]
+    _write_picture(out, {e: read(peaks[e]) for e in first}, named)
+    return {
+        "method": config.method,
+        **facts,
+        "coverage": coverage,
+        "border_contact": border,
+        "warnings": odd,
+        "dropped": [],
+    }
+
+
+def _measured(peaks: dict[str, int], config: AlphaConfig) -> list[int]:
+    """Peak frames that the camera's noise is measured on; none for a network."""
+    if config.method != "key":
+        return []
+    frames = sorted(set(peaks.values()))
+    picks = np.linspace(0, len(frames) - 1, config.noise_frames).round().astype(int)
+    return [frames[i] for i in np.unique(picks)]
+
+
+def _method(
+    plate: Plate | None, frames: list[np.ndarray], valid: np.ndarray, config: AlphaConfig
+) -> tuple[Alpha, dict[str, object]]:
+    """How the config makes alpha, and facts about that for the metrics."""
+    if config.method == "key" and plate is not None:
+        keyer = Keyer(plate.image, frames, valid, config, plate.doubt)
+        noise = round(float(np.median(keyer.model.sigma)), 4)
+        return keyer.alpha, {"plate": plate.source, "noise_8bit": noise}
+    # Only here, as torch takes seconds to import.
+    from pipelines.alpha.learned import BGMV2, SALIENT, background_alpha, salient_alpha
+    from pipelines.networks import load_network
+
+    path = _weights(config)
+    if plate is None:
+        salient = load_network(path, SALIENT)
+        return lambda frame: salient_alpha(salient, frame), {"plate": "none"}
+    network, still = load_network(path, BGMV2), plate.image
+
+    def alpha(frame: np.ndarray) -> np.ndarray:
+        shown = exposed(still, exposure_gain(frame, still))
+        return background_alpha(network, frame, shown, config.tile)
+
+    return alpha, {"plate": plate.source}
+
+
+def _write_picture(out: Path, images: dict[str, np.ndarray], odd: set[str]) -> None:
+    """Contact sheet of what was written for some expressions, the odd ones marked."""
+    rows = []
+    for expression, image in images.items():
+        alpha = read_image(out / f"{expression}.png").astype(np.float32) / 255
+        rows.append(picture_row(image, alpha))
+    (out / "qc").mkdir()
+    labels = [f"{name}: see warnings" if name in odd else name for name in images]
+    sheet = contact_sheet(rows, labels, tile=(240, 240))
+    write_image(out / "qc" / "alphas.jpg", sheet, quality=88)
+
+
+STAGE = Stage(
+    name="alpha",
+    version=4,
+    config=AlphaConfig,
+    presets=PRESETS,
+    items=items,
+    inputs=inputs,
+    run=run,
+)

@@ -1,0 +1,119 @@
+"""The cameras of one moment agree on their mattes: what each must remove, and what it must fill.
+
+Removed is what the other views rule out (moving shadows, things that only some cameras see),
+filled what they see solid and this camera could not tell from its background. A camera whose matte
+fits the others neither where it is opaque nor where it is clear is named, and outvoted.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from pipelines.matte.config import MatteConfig
+from pipelines.matte.evidence import Evidence, evidence_of, missed, ruled_out, subject_of
+from pipelines.matte.hull import INSIDE, View, make_space, subject_place
+
+FEWEST = 4  # views; of three, two that err alike would overrule one that does not
+EMPTY, FULL = 0.003, 0.98  # shares of the image
+# Share of a matte elsewhere than the others' subject, and of that which it lacks: together they
+# mean another place. Lacking this much more is enough by itself.
+STRAY, LACKING, MOST_LACKING = 0.05, 0.15, 0.3
+
+
+@dataclass(frozen=True)
+class Misfit:
+    """Share of a matte that lies outside the others' hull, and of their solid that it lacks."""
+
+    stray: float
+    lacking: float
+
+    @property
+    def size(self) -> float:
+        """Over 1 where the matte is wrong as a whole."""
+        elsewhere = min(self.stray / STRAY, self.lacking / LACKING)
+        return max(elsewhere, self.lacking / MOST_LACKING)
+
+    @property
+    def words(self) -> str:
+        """What is wrong, for people."""
+        return (
+            f"its matte lacks {self.lacking:.0%} of what the others see, and {self.stray:.0%} of it"
+            " lies elsewhere; was the camera moved? left as it was"
+        )
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """What to change.
+
+    Attributes:
+        removed, filled: (h, w) bool of each camera that something is changed of.
+        warnings: ``{"what": camera, "why": ...}``.
+        unchanged: why nothing was compared; empty where it was.
+    """
+
+    removed: dict[str, np.ndarray] = field(default_factory=dict)
+    filled: dict[str, np.ndarray] = field(default_factory=dict)
+    warnings: list[dict[str, str]] = field(default_factory=list)
+    unchanged: str = ""
+
+
+def agree(views: Sequence[View], config: MatteConfig) -> Agreement:
+    """Compare the views of one moment."""
+    doubted = {view.name: why for view in views if (why := _useless(view))}
+    while True:
+        used = [view for view in views if view.name not in doubted]
+        if len(used) < FEWEST:
+            few = f"{len(used)} usable cameras, expected {FEWEST} or more to overrule one"
+            return Agreement(warnings=_named(doubted), unchanged=few)
+        removed, filled, misfits = _compare(used, config)
+        worst = max(misfits, key=lambda name: misfits[name].size)
+        # Most cameras must be right, or there is no telling who is wrong.
+        if misfits[worst].size <= 1 or len(doubted) >= len(views) // 3:
+            return Agreement(removed, filled, _named(doubted))
+        doubted[worst] = misfits[worst].words
+
+
+def _named(doubted: dict[str, str]) -> list[dict[str, str]]:
+    return [{"what": name, "why": why} for name, why in sorted(doubted.items())]
+
+
+def _useless(view: View) -> str:
+    """Why a view says nothing of the others' mattes; empty where it does."""
+    if view.projection[2, 3] <= 1:  # radii from the ball's centre, along its axis
+        return "it stands amid what the others look at, or looks away; left as it was"
+    share = float((view.alpha[view.valid] > INSIDE).mean()) if view.valid.any() else 0.0
+    if share < EMPTY:
+        return f"its matte is empty ({share:.2%} of the image)"
+    return f"its matte covers {share:.1%} of the image" if share > FULL else ""
+
+
+def _compare(
+    views: Sequence[View], config: MatteConfig
+) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray], dict[str, Misfit]]:
+    """What to remove and to fill of each view, and how badly it fits the others."""
+    longest = max(max(view.alpha.shape) for view in views)
+    space = make_space(views, config.cells, max(1.5, config.margin * longest))
+    place = subject_place(space, config.votes)
+    found: dict[str, Evidence] = {
+        view.name: evidence_of(view, space, place, config.votes) for view in views
+    }
+    subject = {view.name: subject_of(view, found[view.name]) for view in views}
+    removed: dict[str, np.ndarray] = {}
+    filled: dict[str, np.ndarray] = {}
+    misfits: dict[str, Misfit] = {}
+    for view in views:
+        mine = found[view.name]
+        bad = ruled_out(view, mine, config)
+        spots, lacking = missed(view, mine, views, subject, config)
+        opaque = view.alpha > INSIDE
+        stray = float((opaque & ~mine.likely).sum()) / int(opaque.sum())
+        misfits[view.name] = Misfit(stray, lacking)
+        if bad.any():
+            removed[view.name] = bad
+        if spots.any():
+            filled[view.name] = spots
+    return removed, filled, misfits

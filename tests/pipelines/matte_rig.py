@@ -1,0 +1,46 @@
+"""The bump head seen by a ring of cameras, as views that can be disturbed."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import lru_cache
+
+import numpy as np
+
+from express50.cameras import Camera
+from pipelines.matte.hull import View, ball_of
+from pipelines.matte.stage import make_view
+from tests.pipelines.bump_head import render, ring
+
+SIZE = 96
+
+
+@lru_cache(maxsize=1)
+def shots(count: int = 12) -> tuple[tuple[Camera, np.ndarray, np.ndarray], ...]:
+    """Camera, image (H, W, 3) uint8 and alpha (H, W) float32 of every camera."""
+    return tuple((camera, *render(camera)[:2]) for camera in ring(count, SIZE))
+
+
+def make_views(side: int = SIZE, cameras: list[Camera] | None = None) -> list[View]:
+    """Fresh undisturbed views; `cameras` replace the ring's."""
+    rig = cameras or [camera for camera, _, _ in shots()]
+    ball = ball_of({camera.id: camera for camera in rig})
+    assert ball is not None
+    return [
+        make_view(camera, ball, image, np.rint(alpha * 255).astype(np.uint8), side)
+        for camera, (_, image, alpha) in zip(rig, shots(), strict=False)
+    ]
+
+
+def disc(x: float, y: float, radius: float, size: int = SIZE) -> np.ndarray:
+    """Pixels (size, size) bool of a disc, in shares of the side."""
+    rows, columns = np.mgrid[0:size, 0:size] / size
+    return (columns - x) ** 2 + (rows - y) ** 2 < radius**2
+
+
+def with_alpha(views: list[View], changes: dict[int, np.ndarray]) -> list[View]:
+    """The views with other mattes (h, w) for some."""
+    return [
+        replace(v, alpha=changes[k].astype(np.float32)) if k in changes else v
+        for k, v in enumerate(views)
+    ]

@@ -1,0 +1,264 @@
+"""Mattes against alpha known by construction, and against the plain keys they must beat."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from express50.config import resolve_config
+from express50.errors import ConfigError, StageError
+from express50.frames import dhash, read_frame
+from express50.images import read_image
+from express50.index import read_index
+from pipelines.alpha import STAGE
+from pipelines.alpha.config import AlphaConfig
+from pipelines.alpha.key import dilated, eroded, plate_difference
+from pipelines.alpha.keyer import Keyer
+from pipelines.alpha.opacity import local_colours, shrunk, solve_opacity
+from pipelines.alpha.plate import exposed, exposure_gain, fit_plate
+from pipelines.alpha.smooth import MattingLaplacian
+from tests.pipelines.alpha_scenes import Scene, clutter, make_scene
+
+CONFIG = AlphaConfig()
+
+
+def key(scene: Scene, **changes) -> np.ndarray:
+    """Alpha (H, W) of a scene."""
+    valid = np.ones(scene.alpha.shape, bool)
+    keyer = Keyer(scene.plate, [scene.frame], valid, replace(CONFIG, **changes))
+    return keyer.alpha(scene.frame)
+
+
+def mae(alpha: np.ndarray, scene: Scene) -> float:
+    """Mean absolute error of alpha over the image."""
+    return float(np.abs(alpha - scene.alpha).mean())
+
+
+@pytest.mark.parametrize("look", ["dark", "fair", "black"])
+def test_alpha_is_close_and_beats_plain_keys(look: str) -> None:
+    scene = make_scene(3, look)
+    difference = np.abs(scene.frame.astype(float) - scene.plate).max(axis=-1)
+    ramp = np.clip((difference - 8) / 40, 0, 1)
+    ours = mae(key(scene), scene)
+    assert ours < 0.012
+    assert ours < 0.6 * mae(difference > 24, scene)
+    assert ours < 0.8 * mae(ramp, scene)
+
+
+def test_strands_are_found_and_gaps_between_them_kept() -> None:
+    scene = make_scene(4, "dark")
+    alpha = key(scene)
+    upper = np.s_[: int(0.45 * 256)]
+    soft = (scene.alpha[upper] > 0.1) & (scene.alpha[upper] < 0.9)
+    assert np.abs(alpha[upper] - scene.alpha[upper])[soft].mean() < 0.12
+    assert np.corrcoef(alpha[upper][soft], scene.alpha[upper][soft])[0, 1] > 0.8
+
+
+def test_noise_that_doubles_does_not_reach_the_background() -> None:
+    scene = make_scene(5, "fair", noise=5.0)
+    alpha = key(scene)
+    assert alpha[scene.alpha == 0].mean() < 0.01
+    assert mae(alpha, scene) < 0.03
+
+
+def test_exposure_change_between_plate_and_frame_is_undone() -> None:
+    scene = make_scene(6, "dark", gain=0.9)
+    gain = exposure_gain(scene.frame, scene.plate)
+    # 0.9 in sRGB values is about 0.9^2.2 in light.
+    assert gain == pytest.approx(0.9**2.2, abs=0.03)
+    assert mae(key(scene), scene) < 0.012
+
+
+def test_a_shadow_is_not_the_subject() -> None:
+    scene = make_scene(7, "dark", shadow=0.2)
+    dark = np.s_[int(0.65 * 256) : int(0.75 * 256), int(0.78 * 256) : int(0.88 * 256)]
+    assert key(scene)[dark].mean() < 0.02
+    assert mae(key(scene), scene) < mae(key(scene, shadow=0.0), scene)
+
+
+def test_a_plate_coloured_spot_inside_the_subject_is_filled() -> None:
+    scene = make_scene(8, "dark")
+    frame = scene.frame.copy()
+    spot = np.s_[150:158, 124:132]
+    frame[spot] = scene.plate[spot]
+    assert key(replace(scene, frame=frame))[spot].min() == 1.0
+
+
+def test_the_difference_of_mere_noise_is_one() -> None:
+    rng = np.random.default_rng(9)
+    true = clutter(rng, 200)
+    plate, frame = (
+        np.clip(np.rint(true + rng.normal(size=true.shape) * 3), 0, 255).astype(np.uint8)
+        for _ in range(2)
+    )
+    model = fit_plate(plate, [frame], np.ones(plate.shape[:2], bool), 1.0)
+    assert np.median(model.sigma) == pytest.approx(3 * np.sqrt(2), rel=0.1)
+    difference = plate_difference(frame.astype(np.float32), model, 0.0, 200)
+    assert np.sqrt(np.mean(difference**2)) == pytest.approx(1.0, abs=0.1)
+
+
+def test_no_gain_leaves_the_plate_as_it_is() -> None:
+    plate = np.arange(256, dtype=np.uint8).repeat(3).reshape(16, 16, 3)
+    assert np.array_equal(exposed(plate, np.ones(3)), plate)
+    assert np.abs(exposed(plate, np.full(3, 1.05)) - plate).max() < 8
+
+
+def test_smoothing_helps_thin_hair_and_keeps_what_is_sure() -> None:
+    scene = make_scene(13, "dark", noise=4.0)
+    plain, smooth = key(scene), key(scene, smooth=True)
+    assert np.mean((smooth - scene.alpha) ** 2) < np.mean((plain - scene.alpha) ** 2)
+    assert (smooth[180:, 115:140] == plain[180:, 115:140]).all()
+
+
+def test_alpha_of_a_known_mixture_is_exact_where_the_colours_are() -> None:
+    alpha, none = np.linspace(0, 1, 11), np.zeros((11, 3, 3))
+    front, behind = np.array([[0.1, 0.05, 0.02]] * 11), np.array([[0.4, 0.5, 0.6]] * 11)
+    seen = alpha[:, None] * front + (1 - alpha[:, None]) * behind
+    noise = none + 1e-5 * np.eye(3)
+    value, deviation, at_zero = solve_opacity(seen, behind, front, none, noise)
+    assert value == pytest.approx(alpha, abs=1e-9)
+    # One channel's noise over the distance of the colours.
+    assert deviation == pytest.approx(np.sqrt(1e-5) / np.linalg.norm(front - behind, axis=1), 1e-3)
+    assert at_zero == pytest.approx(deviation)
+
+
+def test_a_strand_brighter_than_its_neighbours_is_no_less_open() -> None:
+    alpha = np.linspace(0.2, 0.9, 8)
+    mean, behind = np.array([[0.5, 0.35, 0.15]] * 8), np.array([[0.3, 0.3, 0.32]] * 8)
+    seen = alpha[:, None] * 1.25 * mean + (1 - alpha[:, None]) * behind
+    noise = np.zeros((8, 3, 3)) + 1e-6 * np.eye(3)
+    outer = mean[:, :, None] * mean[:, None, :]
+    rigid = solve_opacity(seen, behind, mean, 0 * outer, noise)[0]
+    spread = solve_opacity(seen, behind, mean, 0.2**2 * outer, noise)[0]
+    assert np.abs(spread - alpha).max() < 0.03 < 0.1 < (rigid - alpha).max()
+
+
+def test_colours_come_from_the_nearest_that_count() -> None:
+    light = np.zeros((40, 60, 3), np.float32)
+    light[:, :30], light[:, 30:] = (0.8, 0.4, 0.2), (0.1, 0.2, 0.3)
+    weight = np.zeros((40, 60), np.float32)
+    weight[10:30, :8] = weight[10:30, 52:] = 1
+    where = np.zeros((40, 60), bool)
+    where[20, 14] = where[20, 46] = True
+    mean, covariance = local_colours(light, weight, where, 3.0, 0.1)
+    assert mean == pytest.approx(np.array([light[0, 0], light[0, 59]]), abs=0.01)
+    for own, found in zip(mean, covariance, strict=True):
+        assert own @ found @ own / (own @ own) ** 2 == pytest.approx(0.1**2, rel=0.3)
+        assert np.linalg.eigvalsh(found).min() > 0
+
+
+def test_shrinking_drops_doubt_and_keeps_what_is_sure() -> None:
+    values = np.array([-0.1, 0.01, 0.019, 0.5, 1.0])
+    shrunk_to = shrunk(values, np.full(5, 0.02))
+    assert (shrunk_to[:3] == 0).all() and shrunk_to[3:] == pytest.approx(values[3:], abs=1e-3)
+
+
+def test_composites_in_srgb_values_are_keyed_as_such() -> None:
+    scene = make_scene(16, "black")
+    front = np.array([14.0, 12.0, 12.0])
+    mixed = scene.alpha[..., None] * front + (1 - scene.alpha[..., None]) * scene.plate
+    scene = replace(scene, frame=np.rint(mixed).astype(np.uint8))
+    assert mae(key(scene, light="display"), scene) < 0.7 * mae(key(scene), scene)
+
+
+def test_strands_before_a_shadow_are_measured_against_the_darkened_plate() -> None:
+    lit, shaded = make_scene(17, "black"), make_scene(17, "black", shadow=0.2)
+    assert mae(key(shaded), shaded) < 1.2 * mae(key(lit), lit) + 1e-3
+
+
+def test_the_matting_laplacian_is_symmetric_and_ignores_affine_functions_of_colour() -> None:
+    rng = np.random.default_rng(14)
+    image, band = rng.random((12, 15, 3)), np.ones((12, 15), bool)
+    laplacian = MattingLaplacian(image, band)
+    assert np.abs(laplacian.product(np.full((12, 15), 0.7))).max() < 1e-9
+    affine = image @ [0.3, -0.5, 0.2] + 0.4
+    assert abs(np.sum(affine * laplacian.product(affine))) < 1e-2
+    a, b = rng.random((2, 12, 15))
+    assert np.sum(a * laplacian.product(b)) == pytest.approx(np.sum(b * laplacian.product(a)))
+    one = np.zeros((12, 15))
+    one[4, 6] = 1.0
+    assert laplacian.product(one)[4, 6] == pytest.approx(laplacian.diagonal()[4, 6])
+
+
+def test_discs_by_distance_are_the_morphology() -> None:
+    mask = np.random.default_rng(15).random((50, 40)) > 0.2
+    y, x = np.mgrid[-3:4, -3:4]
+    disc = (x**2 + y**2 <= 9).astype(np.uint8)
+    assert np.array_equal(eroded(mask, 3), cv2.erode(mask.astype(np.uint8), disc) > 0)
+    assert np.array_equal(dilated(mask, 3), cv2.dilate(mask.astype(np.uint8), disc) > 0)
+    assert eroded(np.ones((5, 5), bool), 3).all() and not dilated(np.zeros((5, 5), bool), 3).any()
+
+
+def test_half_scale_is_coarser_but_near() -> None:
+    scene = make_scene(10, "dark")
+    assert mae(key(scene), scene) < mae(key(scene, scale=0.5), scene) < 0.03
+
+
+def test_pixels_without_footage_are_transparent() -> None:
+    scene = make_scene(11, "dark")
+    valid = np.ones(scene.alpha.shape, bool)
+    valid[:, :20] = valid[-30:] = False
+    frame = np.where(valid[..., None], scene.frame, 0).astype(np.uint8)
+    plate = np.where(valid[..., None], scene.plate, 0).astype(np.uint8)
+    alpha = Keyer(plate, [frame], valid, CONFIG).alpha(frame)
+    assert (alpha[~valid] == 0).all() and alpha[120, 128] == 1
+
+
+def test_wrong_settings_are_refused() -> None:
+    for change in ({"low": 7.0}, {"scale": 0.0}, {"spread": 2.0}, {"shadow": 1.0}):
+        with pytest.raises(ConfigError, match="alpha"):
+            AlphaConfig(**change)
+
+
+@pytest.fixture
+def aligned(ingested):
+    """S001 with given cameras and its peaks labelled."""
+    from express50.runner import run_stage
+    from pipelines import calibrate
+
+    config = resolve_config(calibrate.STAGE, "draft")
+    assert run_stage(calibrate.STAGE, ingested, config, workers=0, progress=False).ok
+    index = read_index(ingested, "S001")
+    camera = sorted(index.cameras)[0]
+    peaks = {
+        cue.expression_id: {
+            "frame": cue.start_frame,
+            "camera": camera,
+            "pts": 0,
+            "dhash": dhash(read_frame(ingested, "S001", camera, cue.start_frame, undistort=False)),
+            "confidence": 1.0,
+            "annotator": "test",
+        }
+        for cue in index.cues
+    }
+    folder = ingested.item_dir("align", "S001")
+    folder.mkdir(parents=True)
+    (folder / "peaks.json").write_text(json.dumps(peaks))
+    return ingested
+
+
+def test_the_stage_writes_one_matte_a_peak_twice_alike(aligned, tmp_path) -> None:
+    item = STAGE.items(aligned)[0]
+    outs = [tmp_path / "a", tmp_path / "b"]
+    for out in outs:
+        out.mkdir()
+        metrics = STAGE.run(aligned, item, CONFIG, out)
+    names = sorted(path.name for path in outs[0].glob("*.png"))
+    assert names == ["neutral.png", "smile.png"] and metrics["plate"] == "given"
+    assert metrics["method"] == "key" and metrics["border_contact"]["smile"]["top"] == 0.0
+    for path in sorted(outs[0].rglob("*.*")):
+        assert path.read_bytes() == (outs[1] / path.relative_to(outs[0])).read_bytes()
+    alpha = read_image(outs[0] / "neutral.png")
+    assert alpha.shape == (64, 64) and alpha.dtype == np.uint8
+    assert metrics["coverage"]["neutral"] == pytest.approx(alpha.mean() / 255, abs=2e-3)
+    assert 0.05 < metrics["coverage"]["neutral"] < 0.6
+
+
+def test_no_plate_and_a_still_subject_is_one_clear_error(aligned, tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr("pipelines.alpha.source.read_plate", lambda *args, **more: None)
+    with pytest.raises(StageError, match="photograph the empty set as plates/"):
+        STAGE.run(aligned, STAGE.items(aligned)[0], CONFIG, tmp_path)
