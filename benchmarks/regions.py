@@ -1,8 +1,10 @@
 """Labels and head mattes against the twin's truth: ``python -m benchmarks.regions --help``.
 
 Every preset labels the same items anew from the same mattes, tracks and depth maps. Beside it stand
-two simpler ways to lose the torso: keep it (``no_cut``), and cut along the image row of the tracked
-chin (``chin_line``) or of the neck's tracked end (``neck_line``). IoU of a part is over the pixels
+simpler ways to lose the torso: keep it (``no_cut``), cut along the image row of the tracked chin
+(``chin_line``) or of the neck's tracked end (``neck_line``); and two limits: the standard preset on
+the true mesh instead of the tracked one (``true_mesh``), and the same matte without the pixels that
+truly show torso (``true_cut``), whose error is the matte's own. IoU of a part is over the pixels
 of all views in which the truth or the labels have it. Seconds are processor seconds a view, reading
 included. The last line is one JSON object.
 """
@@ -28,9 +30,14 @@ from express50.head.load import load_head
 from express50.head.model import landmarks
 from express50.images import read_image
 from express50.layout import Dataset
+from express50.parts import TORSO
 from express50.twin.truth import Truth
 from pipelines.regions import STAGE
-from pipelines.regions.read import read_head
+from pipelines.regions.labels import head_labels
+from pipelines.regions.mesh import make_head
+from pipelines.regions.read import read_depth, read_head, read_pair
+from pipelines.regions.stage import look
+from pipelines.regions.view import head_alpha
 
 CHIN = 8  # of the 68 landmarks
 
@@ -87,10 +94,32 @@ def measure_item(dataset: Dataset, truth: Truth, item: str, configs: dict) -> di
                 for name in true
             ]  # fmt: skip
         found[preset] = {"rows": rows, "seconds": seconds / len(true)}
+    found["true_mesh"] = {"rows": true_mesh_rows(dataset, truth, item, true), "seconds": None}
+    matte = baselines(dataset, item)["no_cut"]
+    shown = {name: matte(name) * (labels != TORSO) for name, (labels, _) in true.items()}
+    rows = [view_row(*true[name], shown[name], None) for name in true]
+    found["true_cut"] = {"rows": rows, "seconds": None}
     for name, cut in baselines(dataset, item).items():
         rows = [view_row(*true[camera], cut(camera), None) for camera in true]
         found[name] = {"rows": rows, "seconds": None}
     return found
+
+
+def true_mesh_rows(dataset: Dataset, truth: Truth, item: str, true: dict) -> list[dict]:
+    """Errors of the standard preset where tracking is perfect."""
+    subject, expression = item.split("/")
+    frame = read_peaks(dataset, subject)[expression]
+    labels = head_labels(truth.head_model(subject))
+    R = truth.parameters(subject, frame)["R"]
+    head = make_head(truth.vertices(subject, frame), R, labels)
+    config, rows = STAGE.config(), []
+    for name, camera in true_world_cameras(dataset, truth, subject).items():
+        rgb, alpha = read_pair(dataset, item, camera, frame)
+        depth = read_depth(dataset, item, camera, config)
+        small = look(head, camera, rgb, alpha, depth, False, config).labels
+        shown = np.where(alpha > 0.5, small, 0)
+        rows.append(view_row(*true[name], head_alpha(alpha, small), shown))
+    return rows
 
 
 def baselines(dataset: Dataset, item: str) -> dict[str, Callable[[str], np.ndarray]]:

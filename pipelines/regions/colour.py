@@ -2,8 +2,9 @@
 
 Each view teaches itself: the pixels that geometry is sure of give a histogram of the colours of
 hair, of skin and of the torso; every other pixel takes the class of which its colour and its place
-say most (log-likelihood plus log-prior). So a collar before the neck is torso, hair over a shoulder
-is hair, and a fringe over the forehead is hair, as far as their colours differ.
+say most (log-likelihood plus log-prior). Views from behind, where hair may cover all skin, learn
+half of the skin's colours from views of the face. So a collar before the neck is torso, and hair
+over a shoulder or over the forehead is hair, as far as their colours differ.
 """
 
 from __future__ import annotations
@@ -12,13 +13,15 @@ import cv2
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
-from express50.parts import LABELS
+from express50.parts import LABELS, label_mask
 from pipelines.regions.labels import SCALP
 from pipelines.regions.view import HAIR, TORSO, Geometry
 
 SKIN, NECK, EARS = (np.uint8(LABELS.index(name)) for name in ("skin", "neck", "ears"))
 SOLID = 0.95  # alpha over which a pixel's colour is the subject's alone
 LEAST = 30  # pixels that make a histogram
+MOST = 10_000  # pixels that a share of all counts as
+FEATURES = 0.003  # share of the mesh that eyes and lips fill where a view sees the face
 ENOUGH = 300  # pixels of the face, with which the neck, which hair may cover, teaches nothing
 CELLS, STEPS = (32, 64, 64), (8, 4, 4)  # of Lab in 8 bits
 SMOOTH = 1.5  # cells
@@ -39,7 +42,30 @@ _ON_MESH = {int(SKIN): (-2.0, 0.0), SCALP: (0.0, -1.0), int(EARS): (-1.0, 0.0),
 TORSO_ON_NECK, HAIR_ON_RIM, SKIN_BEYOND = -1.0, -1.0, -6.0
 
 
-def by_colour(rgb: np.ndarray, alpha: np.ndarray, geometry: Geometry, bare: bool) -> np.ndarray:
+def face_colours(rgb: np.ndarray, alpha: np.ndarray, mesh: np.ndarray) -> np.ndarray | None:
+    """Counts (CELLS) of the skin's colours in a view of the face; None in others.
+
+    Args:
+        rgb: (H, W, 3) uint8 sRGB.
+        alpha: (H, W) in [0, 1].
+        mesh: (H, W) labels of the mesh alone.
+    """
+    skin = (mesh == SKIN) & (alpha > SOLID)
+    return _counts(_cells(rgb), skin) if _sees_face(mesh) and skin.sum() >= ENOUGH else None
+
+
+def _sees_face(mesh: np.ndarray) -> bool:
+    features = label_mask(mesh, "eyes", "lips").sum()
+    return bool(features > FEATURES * np.count_nonzero(mesh))
+
+
+def by_colour(
+    rgb: np.ndarray,
+    alpha: np.ndarray,
+    geometry: Geometry,
+    bare: bool,
+    skin_colours: np.ndarray | None = None,
+) -> np.ndarray:
     """Labels (H, W) uint8 of geometry, those of hair, skin, ears, neck and torso by colour too.
 
     Args:
@@ -47,15 +73,21 @@ def by_colour(rgb: np.ndarray, alpha: np.ndarray, geometry: Geometry, bare: bool
         alpha: (H, W) in [0, 1].
         geometry: where the pixels are.
         bare: whether the scalp is skin.
+        skin_colours: sum of what `face_colours` gave for other views.
     """
-    labels = geometry.labels()
+    labels, cells = geometry.labels(), _cells(rgb)
     taught = _sure(labels, alpha > SOLID, geometry)
     beyond = SKIN_BEYOND
     if bare:
         # No scalp teaches hair, and what juts out beyond the mesh is skin as likely.
         labels = np.where(labels == SCALP, SKIN, labels)
         taught[0], beyond = np.zeros_like(taught[0]), 0.0
-    best = (_colours(rgb, taught) + _priors(labels, geometry, beyond)).argmax(0)
+    counts = [_counts(cells, mask) for mask in taught]
+    if skin_colours is not None and not bare and not _sees_face(geometry.mesh):
+        # As much of each: the back of a neck may stand in a shadow that no face stands in.
+        own, others = (c / np.float32(max(c.sum(), 1.0)) for c in (counts[1], skin_colours))
+        counts[1] = MOST * (own + others)
+    best = (_likelihoods(cells, counts) + _priors(labels, geometry, beyond)).argmax(0)
     around = (geometry.mesh > 0) | geometry.rim | bare
     kept = np.isin(geometry.near, (SKIN, NECK, EARS)) & around
     skin = np.where(kept, geometry.near, SKIN)
@@ -73,17 +105,29 @@ def _sure(labels: np.ndarray, solid: np.ndarray, geometry: Geometry) -> list[np.
     return [solid & hair, skin, solid & (labels == TORSO) & low]
 
 
-def _colours(rgb: np.ndarray, taught: list[np.ndarray]) -> np.ndarray:
-    """Log-likelihood (3, H, W) of each pixel's colour; any will do for one that nothing taught."""
-    lab = cv2.cvtColor(rgb, cv2.COLOR_RGB2LAB)
-    cell = tuple((lab // np.array(STEPS, np.uint8)).transpose(2, 0, 1).astype(np.int64))
-    says = np.full((3, *rgb.shape[:2]), np.log(UNTAUGHT), np.float32)
-    for row, mask in zip(says, taught, strict=True):
-        if mask.sum() >= LEAST:
-            counts = np.zeros(CELLS, np.float32)
-            np.add.at(counts, tuple(axis[mask] for axis in cell), 1)
-            shares = gaussian_filter(counts, SMOOTH) / mask.sum()
-            row[:] = np.log(np.maximum(shares, 0) + RARE)[cell]
+Cells = tuple[np.ndarray, ...]
+
+
+def _cells(rgb: np.ndarray) -> Cells:
+    """Cell of Lab, three indices (H, W) each, of pixels (H, W, 3)."""
+    lab = cv2.cvtColor(rgb, cv2.COLOR_RGB2LAB) // np.array(STEPS, np.uint8)
+    return tuple(lab.transpose(2, 0, 1).astype(np.int64))
+
+
+def _counts(cells: Cells, mask: np.ndarray) -> np.ndarray:
+    """Pixels of a mask (H, W) in each of the CELLS."""
+    counts = np.zeros(CELLS, np.float32)
+    np.add.at(counts, tuple(axis[mask] for axis in cells), 1)
+    return counts
+
+
+def _likelihoods(cells: Cells, taught: list[np.ndarray]) -> np.ndarray:
+    """Log-likelihood (3, H, W) of each pixel's colour; any will do for what nothing taught."""
+    says = np.full((3, *cells[0].shape), np.log(UNTAUGHT), np.float32)
+    for row, counts in zip(says, taught, strict=True):
+        if counts.sum() >= LEAST:
+            shares = gaussian_filter(counts, SMOOTH) / counts.sum()
+            row[:] = np.log(np.maximum(shares, 0) + RARE)[cells]
     says = np.maximum(says, says.max(0) - CLIP)
     return np.stack([cv2.GaussianBlur(row, (0, 0), BLUR_PX) for row in says])
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -16,7 +16,7 @@ from express50.images import contact_sheet, fit_into, resize_area, write_image
 from express50.index import index_path
 from express50.layout import Dataset
 from express50.stage import Stage
-from pipelines.regions.colour import SKIN, by_colour
+from pipelines.regions.colour import SKIN, by_colour, face_colours
 from pipelines.regions.config import PRESETS, RegionsConfig
 from pipelines.regions.labels import SCALP, HeadLabels
 from pipelines.regions.mesh import TrackedHead, see
@@ -34,7 +34,7 @@ from pipelines.regions.view import HAIR, head_alpha, place
 
 TILE = (260, 260)
 FACE = ("skin", "lips", "eyes")
-VOTERS, VOTING_SIDE = 4, 512  # cameras, and their pixels, that tell whether the scalp is bare
+VOTERS, VOTING_SIDE = 4, 512  # cameras, and their pixels, that tell skin and bare scalps
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ def run(dataset: Dataset, item: str, config: RegionsConfig, out: Path) -> dict:
     subject, expression = item.split("/")
     head = read_head(dataset, subject, expression)
     frame = read_peaks(dataset, subject)[expression]
-    bare, read = _bare(dataset, item, head, frame, config)
+    scalp, skin, read = _person(dataset, item, head, frame, config)
     figures, rows = {}, {}
     dropped = []
     for name, camera in read_cameras_of(dataset, subject).items():
@@ -81,14 +81,14 @@ def run(dataset: Dataset, item: str, config: RegionsConfig, out: Path) -> dict:
         except (CaptureError, FormatError, StageError) as error:
             dropped.append({"what": name, "why": str(error)})
             continue
-        small = look(head, camera, rgb, alpha, depth, bare.is_skin, config)
+        small = look(head, camera, rgb, alpha, depth, scalp.is_skin, config, skin)
         figures[name], rows[name] = _finish(out, name, rgb, alpha, small, config)
     if not figures:
         why = "; ".join(f"{row['what']}: {row['why']}" for row in dropped[:3])
         raise StageError(f"{item}: no camera has a matte to label ({why}); run 'express50 matte'")
     shares = {name: row["labels"] for name, row in figures.items()}
     _write_picture(out, rows, shares, config.qc_views)
-    return _metrics(head.labels, figures, bare, config, dropped)
+    return _metrics(head.labels, figures, scalp, config, dropped)
 
 
 def look(
@@ -99,6 +99,7 @@ def look(
     depth: np.ndarray | None,
     bare: bool,
     config: RegionsConfig,
+    skin_colours: np.ndarray | None = None,
 ) -> Seen:
     """Label one camera at the working size.
 
@@ -110,10 +111,13 @@ def look(
         depth: (H, W) metres, 0 where unknown; or None.
         bare: whether the scalp is skin.
         config: the stage's.
+        skin_colours: of views of the face (``colour.face_colours``).
     """
     camera, rgb, alpha, depth = _shrunk(camera, rgb, alpha, depth, config.image_side)
     geometry = place(head, camera, alpha, depth, 1e-3 * config.rim_mm)
-    labels = by_colour(rgb, alpha, geometry, bare) if config.colour else geometry.labels()
+    labels = geometry.labels()
+    if config.colour:
+        labels = by_colour(rgb, alpha, geometry, bare, skin_colours)
     labels = np.where(labels == SCALP, SKIN if bare else HAIR, labels)
     return Seen(np.where(alpha > 0, labels, np.uint8(0)), geometry.mesh > 0)
 
@@ -132,21 +136,26 @@ def _shrunk(
     return resized(camera, width, height), rgb, alpha, depth
 
 
-def _bare(
+Frames = dict[str, tuple[np.ndarray, np.ndarray]]
+
+
+def _person(
     dataset: Dataset, item: str, head: TrackedHead, frame: int, config: RegionsConfig
-) -> tuple[Scalp, dict[str, tuple[np.ndarray, np.ndarray]]]:
-    """Whether the scalp is skin: as asked for, or by a few cameras; and what these showed."""
-    if config.scalp != "auto":
-        return Scalp(config.scalp == "skin", None), {}
+) -> tuple[Scalp, np.ndarray | None, Frames]:
+    """Whether the scalp is skin, the skin's colours, by a few cameras; and what these showed."""
     cameras = list(read_cameras_of(dataset, item.split("/")[0]).values())
-    votes = []
-    read: dict[str, tuple[np.ndarray, np.ndarray]] = {}
+    votes, colours, read = [], [], Frames()
     for k in np.unique(np.linspace(0, len(cameras) - 1, VOTERS).round().astype(int)):
         with contextlib.suppress(CaptureError, FormatError, StageError):  # the run names them
             rgb, alpha = read[cameras[k].id] = read_pair(dataset, item, cameras[k], frame)
             camera, rgb, alpha, _ = _shrunk(cameras[k], rgb, alpha, None, VOTING_SIDE)
-            votes.append(scalp_votes(rgb, see(head, camera)[0], alpha))
-    return decide(votes), read
+            mesh = see(head, camera)[0]
+            votes.append(scalp_votes(rgb, mesh, alpha))
+            colours += [c for c in (face_colours(rgb, alpha, mesh),) if c is not None]
+    scalp = decide(votes)
+    if config.scalp != "auto":
+        scalp = replace(scalp, is_skin=config.scalp == "skin")
+    return scalp, sum(colours[1:], colours[0]) if colours else None, read
 
 
 def _weights(config: RegionsConfig) -> Path:
@@ -205,7 +214,7 @@ def _write_picture(
 def _metrics(
     labels: HeadLabels,
     figures: dict[str, dict],
-    bare: Scalp,
+    scalp: Scalp,
     config: RegionsConfig,
     dropped: list[dict],
 ) -> dict:
@@ -220,7 +229,10 @@ def _metrics(
     return {
         "method": "network and mesh" if config.segmentation else "mesh",
         "missing": list(labels.missing),
-        "scalp": {"label": "skin" if bare.is_skin else "hair", "skin_coloured": bare.skin_coloured},
+        "scalp": {
+            "label": "skin" if scalp.is_skin else "hair",
+            "skin_coloured": scalp.skin_coloured,
+        },
         "mesh_in_matte": round(share, 4),
         "cameras": figures,
         "warnings": warned,

@@ -16,6 +16,7 @@ from express50.head.model import pose
 from express50.images import read_image, write_image
 from express50.parts import HEAD, LABELS, label_mask
 from pipelines.regions import STAGE
+from pipelines.regions.colour import face_colours
 from pipelines.regions.config import RegionsConfig
 from pipelines.regions.labels import SCALP, head_labels
 from pipelines.regions.mesh import make_head, see
@@ -23,7 +24,7 @@ from pipelines.regions.scalp import decide, scalp_votes
 from pipelines.regions.stage import look
 from pipelines.regions.view import head_alpha
 from tests.pipelines.bump_dataset import make_dataset, published
-from tests.pipelines.region_scenes import RegionScene, camera_at, make_scene, tracked
+from tests.pipelines.region_scenes import COLOURS, RegionScene, camera_at, make_scene, tracked
 from tests.pipelines.stand_ins import Thirds, torchscript
 
 PLAIN = RegionsConfig(colour=False, depth=False)
@@ -141,6 +142,25 @@ def test_a_bald_scalp_is_known_by_its_colours() -> None:
         labels = labels_of(scene, bare=scalp.is_skin)
         assert bool(label_mask(labels[:40], "hair").sum() > 100) is hair
     assert decide([]).skin_coloured is None and not decide([]).is_skin
+
+
+def test_from_behind_the_skin_is_that_of_the_face() -> None:
+    front, back = make_scene(0), make_scene(180)
+    colours = face_colours(front.rgb, front.alpha, see(front.head, front.camera)[0])
+    assert colours is not None and colours.sum() > 1000
+    assert face_colours(back.rgb, back.alpha, see(back.head, back.camera)[0]) is None
+    # Long hair from nape to collar: the view shows no skin at all.
+    bare, neck = label_mask(back.labels, "neck", "skin", "ears"), label_mask(back.labels, "neck")
+    noise = np.random.default_rng(1).normal(0, 4, back.rgb.shape)
+    locks = np.clip(np.array(COLOURS["hair"]) + noise, 0, 255)
+    hair = np.where(bare[..., None], locks, back.rgb).astype(np.uint8)
+    share = []
+    for skin in (colours, None):
+        labels = look(
+            back.head, back.camera, hair, back.alpha, back.depth, False, RegionsConfig(), skin
+        ).labels
+        share.append(label_mask(labels, "hair")[neck].mean())
+    assert share[0] > share[1] + 0.3
 
 
 def test_a_head_model_without_regions_says_what_it_lacks() -> None:
