@@ -13,7 +13,7 @@ from express50.images import linear_to_srgb, srgb_to_linear
 
 SHADE = 0.5  # share of linear light that the shadow takes; the key forgives a quarter
 STAND = (0.06, 0.07, 0.05)  # linear light of the object
-PATCH_M = 0.022  # radius of the patch
+PATCH_M = 0.04  # radius of the patch
 BUMP = (0.09, 0.04, 3.0)  # shares of the image's side, degrees
 
 

@@ -142,7 +142,8 @@ def as_markdown(rows: list[dict]) -> list[str]:
     lines = [
         "Made by `make tradeoff` on the demo's synthetic captures (4 subjects, 8 cameras, 320 px),"
         " one process, against ground truth. Seconds are processor seconds, starting the command"
-        " included. A star marks what no other preset of the stage beats in both.",
+        " included; an item of `matte` is a moment and counts all its cameras' `alpha`, run with"
+        " the same preset. A star marks what no other preset of the stage beats in both.",
         "",
         "| stage | preset | seconds an item | error | measure | |",
         "|---|---|---|---|---|---|",

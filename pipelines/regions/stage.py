@@ -11,7 +11,7 @@ import numpy as np
 
 from express50.cameras import Camera, resized
 from express50.errors import CaptureError, FormatError, StageError
-from express50.frames import read_cameras_of, read_peaks
+from express50.frames import peak_items, read_cameras_of, read_peaks
 from express50.images import contact_sheet, fit_into, resize_area, write_image
 from express50.index import index_path
 from express50.layout import Dataset
@@ -43,17 +43,6 @@ class Seen:
 
     labels: np.ndarray
     mesh: np.ndarray
-
-
-def items(dataset: Dataset) -> list[str]:
-    """`subject/expression` for every labelled peak of an aligned subject."""
-    found = []
-    for subject in dataset.subjects():
-        if (dataset.item_dir("align", subject) / "peaks.json").is_file():
-            found += [
-                f"{subject}/{expression}" for expression in sorted(read_peaks(dataset, subject))
-            ]
-    return found
 
 
 def inputs(dataset: Dataset, item: str, config: RegionsConfig) -> dict[str, Path | str]:
@@ -256,7 +245,7 @@ STAGE = Stage(
     version=1,
     config=RegionsConfig,
     presets=PRESETS,
-    items=items,
+    items=peak_items,
     inputs=inputs,
     run=run,
 )
