@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
 
 import numpy as np
 
@@ -10,8 +10,22 @@ from express50.cameras import Camera
 from express50.frames import FrameReader
 from express50.index import Index
 from express50.landmarks.network import load_network
-from express50.rigs.footage import FootageVerdict, check_footage
-from express50.rigs.moments import spread_moments
+from express50.rigs.footage import FootageVerdict, check_footage, reduce_image
+from express50.rigs.moments import spread, spread_moments
+
+
+def read_footage(
+    index: Index, names: Iterable[str], moments: int
+) -> Iterator[tuple[int, str, np.ndarray]]:
+    """Frame, camera and image (H, W, 3) at so many moments, spread over the cues, one by one."""
+    cues = [cue for cue in index.cues if cue.end_frame < index.frames]
+    wanted = sorted(set(spread_moments(cues, moments)))
+    wanted = wanted or spread(range(index.frames), moments)
+    for name in names:
+        reader = FrameReader(index, name)
+        for frame in wanted:
+            yield frame, name, reader.read(frame)
+        reader.close()
 
 
 def look_at_footage(
@@ -23,13 +37,10 @@ def look_at_footage(
     """
     if moments < 1 or len(cameras) < 3:
         return None
-    cues = [cue for cue in index.cues if cue.end_frame < index.frames]
-    wanted = sorted(set(spread_moments(cues, moments))) or [index.frames // 2]
-    frames: dict[int, dict[str, np.ndarray]] = {frame: {} for frame in wanted}
-    for name in cameras:
-        reader = FrameReader(index, name)
-        for frame in wanted:
-            frames[frame][name] = reader.read(frame)
+    frames: dict[int, dict[str, np.ndarray]] = {}
+    for frame, name, image in read_footage(index, cameras, moments):
+        small = reduce_image(cameras[name], image, f"frame {frame}")
+        frames.setdefault(frame, {})[name] = small
     return check_footage(cameras, frames, load_network())
 
 
