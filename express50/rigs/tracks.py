@@ -81,7 +81,9 @@ def look(
     """Landmarks (none without a network) and features of one moment's images (H, W, 3) uint8."""
     recorded = without_fixed({name: find_features(image) for name, image in images.items()})
     features = {n: (ideal_pixels(cameras[n], p), d) for n, (p, d) in recorded.items()}
-    return Seen(_landmarks(cameras, images, net) if net else [], features)
+    faces = {name: find_face(images[name], net) for name in sorted(images)} if net else {}
+    landmarks = [(n, ideal_pixels(cameras[n], f[0]), f[1]) for n, f in faces.items() if f]
+    return Seen(landmarks, features)
 
 
 def join_tracks(cameras: Mapping[str, Camera], seen: Mapping[int, Seen], band: float) -> Tracks:
@@ -176,19 +178,12 @@ def ideal_pixels(camera: Camera, pixels: np.ndarray) -> np.ndarray:
     return normalised(camera, pixels) * K[[0, 1], [0, 1]] + K[:2, 2]
 
 
-def _landmarks(
-    cameras: Mapping[str, Camera], images: Mapping[str, np.ndarray], net: LandmarkNet
-) -> list[tuple[str, np.ndarray, np.ndarray]]:
-    """Camera, points (68, 2) and sigma (68,) of every view in which a face is found."""
-    found = []
-    for name in sorted(cameras):
-        if name not in images:
-            continue
-        seen = detect(net, images[name])
-        if seen.score >= FACE_SCORE:
-            sigma = LANDMARK_DOUBT * np.maximum(seen.sigma, FEATURE_SIGMA_PX)
-            found.append((name, ideal_pixels(cameras[name], seen.points), sigma))
-    return found
+def find_face(image: np.ndarray, net: LandmarkNet) -> tuple[np.ndarray, np.ndarray] | None:
+    """Recorded landmarks (68, 2) and their expected errors (68,), if a face is surely seen."""
+    seen = detect(net, image)
+    if seen.score < FACE_SCORE:
+        return None
+    return seen.points, LANDMARK_DOUBT * np.maximum(seen.sigma, FEATURE_SIGMA_PX)
 
 
 def _neighbours(cameras: Mapping[str, Camera]) -> list[tuple[str, str]]:

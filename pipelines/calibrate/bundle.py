@@ -50,8 +50,10 @@ def adjust(
     loss_scale_px: float,
     iterations: int,
     refine_distortion: bool = True,
+    refine_focal: bool = True,
+    refine_cameras: bool = True,
 ) -> Rig:
-    """Refine all intrinsics, camera poses and board poses over the observations.
+    """Refine intrinsics, camera poses and board poses over the observations.
 
     Args:
         rig: where to start; every observed camera and frame must be in it.
@@ -60,11 +62,15 @@ def adjust(
         loss_scale_px: residual at which the Cauchy loss begins to flatten.
         iterations: of Levenberg-Marquardt at most.
         refine_distortion: also refine distortion and principal points.
+        refine_focal: also refine focal lengths.
+        refine_cameras: also refine the cameras' poses in the rig.
     """
     reconstruction, names, frames = _build(rig, observations, points)
     options = pycolmap.BundleAdjustmentOptions()
     options.print_summary = False
     options.refine_points3D = False
+    options.refine_focal_length = refine_focal
+    options.refine_sensor_from_rig = refine_cameras
     options.refine_principal_point = refine_distortion
     options.refine_extra_params = refine_distortion
     options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY

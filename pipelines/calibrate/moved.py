@@ -2,30 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Mapping
 
 import numpy as np
 
 from express50.cameras import Camera
-from express50.frames import FrameReader
 from express50.index import Index
 from express50.landmarks.network import load_network
 from express50.rigs.footage import FootageVerdict, check_footage, reduce_image
-from express50.rigs.moments import spread, spread_moments
-
-
-def read_footage(
-    index: Index, names: Iterable[str], moments: int
-) -> Iterator[tuple[int, str, np.ndarray]]:
-    """Frame, camera and image (H, W, 3) at so many moments, spread over the cues, one by one."""
-    cues = [cue for cue in index.cues if cue.end_frame < index.frames]
-    wanted = sorted(set(spread_moments(cues, moments)))
-    wanted = wanted or spread(range(index.frames), moments)
-    for name in names:
-        reader = FrameReader(index, name)
-        for frame in wanted:
-            yield frame, name, reader.read(frame)
-        reader.close()
+from pipelines.calibrate.footage import read_footage
 
 
 def look_at_footage(
