@@ -7,7 +7,16 @@ import subprocess
 import sys
 from pathlib import Path
 
-SKIPPED = {"__init__", "all", "demo", "document", "tradeoff", "accuracy", "depth"}
+SKIPPED = {
+    "__init__",
+    "calibrate_footage",
+    "all",
+    "demo",
+    "document",
+    "tradeoff",
+    "accuracy",
+    "depth",
+}
 
 
 def main() -> int:

@@ -119,7 +119,7 @@ def solve_footage(
     )
     rig = _settle(rig, seen, config.iterations)
     rig, tracks, adjusted = _sharpen(rig, seen, freedom, config.iterations)
-    more = _place_others(rig, {n: start[n] for n in dropped}, seen, tracks, adjusted.points)
+    more = _place_others(rig, {n: start[n] for n in dropped}, seen)
     if more:
         rig, tracks, adjusted = _sharpen(rig | more, seen, freedom, config.iterations)
     metric, moments, spread = _metric(rig, seen, config.eye_distance_mm * 1e-3, where)
@@ -173,46 +173,44 @@ def _sharpen(
 
 
 def _place_others(
-    rig: Mapping[str, Camera],
-    others: Mapping[str, Camera],
-    seen: Mapping[int, Seen],
-    tracks: Tracks,
-    points: np.ndarray,
+    rig: Mapping[str, Camera], others: Mapping[str, Camera], seen: Mapping[int, Seen]
 ) -> dict[str, Camera]:
     """Cameras without a face, placed by features that look like points the rig knows."""
-    known = _known_features(rig, seen, tracks, points)
-    lens = float(np.median([camera.K[0, 0] / max(camera.width, camera.height)
-                            for camera in rig.values()]))  # fmt: skip
+    known = _known_features(rig, seen) if others else {}
+    shares = [c.K[0, 0] / max(c.width, c.height) for c in rig.values()]
     placed = {}
     for name, camera in sorted(others.items()):
         found: list[tuple[np.ndarray, np.ndarray]] = []
         for (frame, _), (where, described) in known.items():
-            pixels, mine = seen[frame].features.get(name, (np.zeros((0, 2)), np.zeros((0, 128))))
-            pairs = match_looks(mine, described)
-            found += [(pixels[i], where[j]) for i, j in pairs]
-        camera = start_camera(name, (camera.width, camera.height),
-                              lens * max(camera.width, camera.height))  # fmt: skip
-        pose = _resection(found, camera)
+            if name in seen[frame].features:
+                pixels, mine = seen[frame].features[name]
+                found += [(pixels[i], where[j]) for i, j in match_looks(mine, described)]
+        focal = float(np.median(shares)) * max(camera.width, camera.height)
+        lens = as_model(start_camera(name, (camera.width, camera.height), focal), camera.model)
+        pose = _resection(found, lens)
         if pose is not None:
-            placed[name] = replace(camera, cam_from_world=pose)
+            placed[name] = replace(lens, cam_from_world=pose)
     return placed
 
 
 def _known_features(
-    rig: Mapping[str, Camera], seen: Mapping[int, Seen], tracks: Tracks, points: np.ndarray
+    rig: Mapping[str, Camera], seen: Mapping[int, Seen]
 ) -> dict[tuple[int, str], tuple[np.ndarray, np.ndarray]]:
     """World points (M, 3) and descriptors (M, 128) of the features in tracks, by frame, camera."""
+    ideal = undistorted(seen, rig)
+    tracks = join_verified(rig, ideal, BANDS[-1])
+    points = triangulate_tracks(rig, tracks)
     known = {}
-    for frame, moment in undistorted(seen, rig).items():
-        for name, (pixels, described) in moment.features.items():
-            mine = np.flatnonzero(tracks.camera == tracks.names.index(name))
-            place = {tuple(np.round(p, 6)): n for p, n in
-                     zip(tracks.pixels[mine], tracks.point[mine], strict=True)}  # fmt: skip
-            rows = [(i, place[key]) for i, p in enumerate(pixels)
-                    if (key := tuple(np.round(p, 6))) in place]  # fmt: skip
-            if rows:
-                at, number = np.array(rows).T
-                known[frame, name] = (points[number], described[at])
+    for index, name in enumerate(tracks.names):
+        mine = np.flatnonzero(tracks.camera == index)
+        number = {p.tobytes(): n for p, n in
+                  zip(tracks.pixels[mine], tracks.point[mine], strict=True)}  # fmt: skip
+        for frame, moment in ideal.items():
+            if name in moment.features:
+                pixels, described = moment.features[name]
+                rows = [i for i, p in enumerate(pixels) if p.tobytes() in number]
+                at = [number[pixels[i].tobytes()] for i in rows]
+                known[frame, name] = (points[at], described[rows])
     return known
 
 
