@@ -4,10 +4,11 @@ The stage's solution stands beside a baseline from the same corners: OpenCV's ca
 camera alone, then relative poses averaged and chained, without a joint adjustment. Rigs are laid
 on the true one by a rigid motion. ``head_px`` is what matters further on: how far, in pixels,
 points in the head's place project from where the true camera has them. The last line is one JSON
-object; ``sfm`` and ``refine`` in it are rigs solved from the footage alone, and given rigs put right
-(the foreign heads of ``../shared/captures`` too, where they are). Without a dataset named, 24 cameras before a ChArUco board and one neutral face are
+object. Without a dataset named, 24 cameras before a ChArUco board and one neutral face are
 recorded first (some minutes). Then one camera of the solved rig after another is turned by
 ``BUMP_DEG`` and must be found in the footage, and nothing may be found in the rig as solved.
+``sfm`` and ``refine`` are rigs solved from footage alone, and perturbed ones put right, on the twin
+and on the foreign heads of ``../shared/captures`` where they are.
 """
 
 from __future__ import annotations

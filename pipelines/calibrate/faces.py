@@ -72,10 +72,11 @@ def pose_of_face(
     """
     ideal = (points - camera.K[:2, 2]) / camera.K[[0, 1], [0, 1]]
     shape, xy, eye = head[INNER], ideal[INNER], np.eye(3)
-    ok, turn, shift = cv2.solvePnP(shape, xy, eye, None, flags=cv2.SOLVEPNP_SQPNP)
-    if not ok:
+    try:
+        _, turn, shift = cv2.solvePnP(shape, xy, eye, None, flags=cv2.SOLVEPNP_SQPNP)
+        turn, shift = cv2.solvePnPRefineLM(shape, xy, eye, None, turn, shift)
+    except cv2.error:  # landmarks on one spot
         return np.eye(4), float("inf")
-    turn, shift = cv2.solvePnPRefineLM(shape, xy, eye, None, turn, shift)
     pose = make_transform(cv2.Rodrigues(turn)[0], shift.ravel())
     placed = shape @ pose[:3, :3].T + pose[:3, 3]
     if not (np.isfinite(pose).all() and placed[:, 2].min() > 0):

@@ -43,8 +43,8 @@ KNOWN_FOCAL, GUESSED_FOCAL = 0.02, 0.3
 CENTRE, BEND = 0.005, 0.02
 """How far principal points are from the middle, and how far lenses bend the image's corner, as
 shares of the diagonal and half of it: footage alone hardly tells either."""
-LEAST_INLIERS, INLIER_PX = 12, 4.0
-"""Known points by which a camera that sees no face may be placed."""
+LEAST_INLIERS, LEAST_SHARE, INLIER_PX = 12, 0.4, 4.0
+"""Known points, and share of those it seems to see, by which a camera without a face is placed."""
 OUTLIER = 4.0
 """Errors, in expected ones, that count as mismatches in what is reported."""
 EYES = (slice(36, 42), slice(42, 48))
@@ -122,6 +122,10 @@ def solve_footage(
     more = _place_others(rig, {n: start[n] for n in dropped}, seen)
     if more:
         rig, tracks, adjusted = _sharpen(rig | more, seen, freedom, config.iterations)
+        loose = set(_weak(tracks)) & set(more)  # neither a face nor features hold these
+        if loose:
+            rig = {name: camera for name, camera in rig.items() if name not in loose}
+            rig, tracks, adjusted = _sharpen(rig, seen, freedom, config.iterations)
     metric, moments, spread = _metric(rig, seen, config.eye_distance_mm * 1e-3, where)
     world, up = _head_pose(metric, seen, head)
     canonical = canonical_from_rig(metric, world, up)
@@ -216,14 +220,21 @@ def _known_features(
 
 def _resection(found: list[tuple[np.ndarray, np.ndarray]], camera: Camera) -> np.ndarray | None:
     """Pose (4, 4) of a camera from pixels of known points; None without enough that agree."""
-    if len(found) < LEAST_INLIERS:
+    # One point is met once for every camera that knows it: samples must not repeat it.
+    rows = np.unique([np.concatenate(pair) for pair in found] or np.zeros((0, 5)), axis=0)
+    if len(np.unique(rows[:, :2], axis=0)) < LEAST_INLIERS:
         return None
-    pixels, where = (np.array(column, float) for column in zip(*found, strict=True))
-    ok, turn, shift, inliers = cv2.solvePnPRansac(
-        where, pixels, camera.K, None, iterationsCount=2000, reprojectionError=INLIER_PX,
-        confidence=0.999, flags=cv2.SOLVEPNP_SQPNP,
-    )  # fmt: skip
-    if not ok or inliers is None or len(np.unique(pixels[inliers[:, 0]], axis=0)) < LEAST_INLIERS:
+    pixels, where = np.ascontiguousarray(rows[:, :2]), np.ascontiguousarray(rows[:, 2:])
+    try:
+        ok, turn, shift, inliers = cv2.solvePnPRansac(
+            where, pixels, camera.K, None, iterationsCount=2000, reprojectionError=INLIER_PX,
+            confidence=0.999, flags=cv2.SOLVEPNP_EPNP,
+        )  # fmt: skip
+    except cv2.error:  # points on a line or on one spot
+        return None
+    good = inliers[:, 0] if ok and inliers is not None else np.zeros(0, int)
+    alike = min(len(np.unique(column[good], axis=0)) for column in (pixels, where))
+    if alike < LEAST_INLIERS or len(good) < LEAST_SHARE * len(rows):
         return None
     return make_transform(cv2.Rodrigues(turn)[0], shift.ravel())
 

@@ -16,8 +16,9 @@ from express50.layout import Dataset
 from express50.rigs.tracks import Seen, undistorted
 from express50.transforms import similarity_fit
 from pipelines.calibrate.config import CalibrateConfig
+from pipelines.calibrate.faces import pose_of_face, start_camera
 from pipelines.calibrate.refine import refine_by_board, refine_by_footage
-from pipelines.calibrate.structure import inliers, solve_footage
+from pipelines.calibrate.structure import _resection, inliers, solve_footage
 from tests.pipelines.board_rigs import POINTS, board_motion, make_rig, observe, rig_errors
 from tests.pipelines.face_rigs import SIZE, face, face_cameras, perturbed, see
 
@@ -194,3 +195,14 @@ def test_one_image_a_camera_without_faces_is_refused_by_the_stage(tmp_path, caps
     assert main(["ingest", str(dataset.root), str(root), "--workers", "0"]) == 0
     assert main(["calibrate", str(dataset.root), "--workers", "0"]) == 1
     assert "a face is seen by none" in capsys.readouterr().out
+
+
+def test_degenerate_faces_and_matches_give_no_pose():
+    camera = start_camera("a", SIZE, 900.0)
+    spot = np.full((68, 2), 200.0)
+    pose, error = pose_of_face(spot, np.ones(68), camera, np.zeros((68, 3)))
+    assert np.isfinite(pose).all() and (error == np.inf or np.isfinite(error))
+    same = [(np.array([10.0 + i, 20.0]), np.zeros(3)) for i in range(40)]
+    once = [(np.array([10.0, 20.0]), np.ones(3))] * 40
+    assert _resection(same, camera) is None and _resection(once, camera) is None
+    assert _resection([], camera) is None
