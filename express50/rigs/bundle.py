@@ -20,6 +20,8 @@ from express50.rigs.tracks import Tracks
 
 UNKNOWNS = 10
 """A camera's: rotation (3), translation (3), log focal length, centre (2), first radial term."""
+ITERATIONS = 60
+"""Enough for rigs of tens of cameras; longer runs move poses by less than they are off."""
 _TWO_FOCALS = ("PINHOLE", "OPENCV", "FULL_OPENCV")
 _NO_BEND = ("SIMPLE_PINHOLE", "PINHOLE")
 

@@ -20,12 +20,8 @@ class CalibrateConfig:
     """COLMAP model to solve for; auto: the simplest that fits, camera by camera."""
     board_frames: int = 80
     """Board images read a camera, evenly spaced; 0 reads all."""
-    single_frames: int = 30
-    """Images used to start one camera's intrinsics (the joint adjustment uses all)."""
     rounds: int = 3
     """Joint adjustments, each followed by rejection of corners."""
-    iterations: int = 60
-    """Levenberg-Marquardt iterations a joint adjustment."""
     reject_sigma: float = 4.0
     """Corners further off than this many robust standard deviations are rejected."""
     min_corners: int = 8
@@ -74,20 +70,7 @@ class CalibrateConfig:
 
 
 PRESETS: dict[str, dict[str, object]] = {
-    "draft": {
-        "board_frames": 24,
-        "single_frames": 15,
-        "rounds": 1,
-        "iterations": 30,
-        "check_moments": 0,
-    },
+    "draft": {"board_frames": 36, "rounds": 1, "solve_moments": 4, "check_moments": 0},
     "standard": {},
-    "reference": {
-        "board_frames": 0,
-        "single_frames": 60,
-        "rounds": 5,
-        "iterations": 200,
-        "reject_sigma": 6.0,
-        "check_moments": 4,
-    },
+    "reference": {"board_frames": 0, "rounds": 5, "solve_moments": 16, "check_moments": 4},
 }

@@ -13,7 +13,7 @@ import numpy as np
 
 from express50.cameras import Camera
 from express50.rigs.adjust import triangulate_tracks
-from express50.rigs.bundle import Freedom, adjust_rig, recorded_pixels
+from express50.rigs.bundle import ITERATIONS, Freedom, adjust_rig, recorded_pixels
 from express50.rigs.footage import LEAST_POINTS, shared_points
 from express50.rigs.tracks import FEATURE_SIGMA_PX, Seen, Tracks, ideal_pixels, join_verified
 from express50.rigs.world import move_cameras
@@ -81,7 +81,7 @@ def refine_by_footage(
         given: the calibration.
         start: the same with those cameras put right that have clearly moved.
         seen: by frame number, undistorted by `given`.
-        config: how far cameras may be off, and iterations.
+        config: how far cameras may be off.
     """
     tracks = join_verified(start, seen, BAND)
     enough = shared_points(tracks) >= LEAST_POINTS
@@ -99,7 +99,7 @@ def refine_by_footage(
     )
     for scale in SCALES:
         # Always from the start: the spreads are about where the cameras were, not a step further.
-        found = adjust_rig(rig, fit, points, freedom, scale, config.iterations)
+        found = adjust_rig(rig, fit, points, freedom, scale, ITERATIONS)
         points = found.points
     before, before_px = _judge({n: given[n] for n in names}, held, given)
     after, after_px = _judge(found.cameras, held, given)
@@ -160,7 +160,7 @@ def refine_by_board(
     solved = start
     for _ in range(max(config.rounds, 2)):
         solved = adjust(
-            solved, fit, points, loss, config.iterations,
+            solved, fit, points, loss,
             refine_distortion=config.refine == "all", refine_focal=config.refine == "all",
         )  # fmt: skip
         loss = max(2 * _median(solved, fit, points), 0.02)
@@ -202,7 +202,7 @@ def _with_boards(
     if len(kept.camera) == 0:
         return rig
     loss = max(2 * _median(rig, kept, points), 0.1)
-    held = adjust(rig, kept, points, loss, config.iterations, False, False, refine_cameras=False)
+    held = adjust(rig, kept, points, loss, False, False, refine_cameras=False)
     return Rig(rig.cameras, {**rig.boards, **held.boards})
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from express50.cameras import Camera, triangulate
 from express50.errors import CalibrationError
 from express50.rigs.adjust import triangulate_tracks
-from express50.rigs.bundle import Adjusted, Freedom, adjust_rig
+from express50.rigs.bundle import ITERATIONS, Adjusted, Freedom, adjust_rig
 from express50.rigs.features import match_looks
 from express50.rigs.footage import LEAST_POINTS, shared_points
 from express50.rigs.tracks import (
@@ -86,7 +86,7 @@ def solve_footage(
         seen: by frame number, landmarks and features in recorded pixels.
         sizes: (width, height) of each camera, pixels.
         focals: focal lengths in pixels, as told by EXIF or capture.toml, of cameras that have one.
-        config: lens model, what is assumed of distances, and iterations.
+        config: lens model, and what is assumed of distances.
         where: the capture, for messages.
 
     Raises:
@@ -117,15 +117,15 @@ def solve_footage(
         centre=CENTRE,
         bend=BEND,
     )
-    rig = _settle(rig, seen, config.iterations)
-    rig, tracks, adjusted = _sharpen(rig, seen, freedom, config.iterations)
+    rig = _settle(rig, seen)
+    rig, tracks, adjusted = _sharpen(rig, seen, freedom)
     more = _place_others(rig, {n: start[n] for n in dropped}, seen)
     if more:
-        rig, tracks, adjusted = _sharpen(rig | more, seen, freedom, config.iterations)
+        rig, tracks, adjusted = _sharpen(rig | more, seen, freedom)
         loose = set(_weak(tracks)) & set(more)  # neither a face nor features hold these
         if loose:
             rig = {name: camera for name, camera in rig.items() if name not in loose}
-            rig, tracks, adjusted = _sharpen(rig, seen, freedom, config.iterations)
+            rig, tracks, adjusted = _sharpen(rig, seen, freedom)
     metric, moments, spread = _metric(rig, seen, config.eye_distance_mm * 1e-3, where)
     world, up = _head_pose(metric, seen, head)
     canonical = canonical_from_rig(metric, world, up)
@@ -152,26 +152,26 @@ def _without_face(
     return {name: lone if name in faces else blind for name in sizes if name not in rig}
 
 
-def _settle(rig: dict[str, Camera], seen: Mapping[int, Seen], iterations: int) -> dict[str, Camera]:
+def _settle(rig: dict[str, Camera], seen: Mapping[int, Seen]) -> dict[str, Camera]:
     """Poses that fit the landmarks, with free points and the lenses as they are."""
     bare = {f: Seen(moment.landmarks, {}) for f, moment in undistorted(seen, rig).items()}
     tracks = tracks_of(rig, bare, {})
     points = triangulate_tracks(rig, tracks)
     for scale in FACE_SCALES:
-        found = adjust_rig(rig, tracks, points, Freedom(), scale, iterations)
+        found = adjust_rig(rig, tracks, points, Freedom(), scale, ITERATIONS)
         rig, points = found.cameras, found.points
     return rig
 
 
 def _sharpen(
-    rig: dict[str, Camera], seen: Mapping[int, Seen], freedom: Freedom, iterations: int
+    rig: dict[str, Camera], seen: Mapping[int, Seen], freedom: Freedom
 ) -> tuple[dict[str, Camera], Tracks, Adjusted]:
     """Poses and lenses that fit landmarks and features, matched anew as the rig gets better."""
     for band in BANDS:
         for scale in FEATURE_SCALES:
             tracks = join_verified(rig, undistorted(seen, rig), band)
             points = triangulate_tracks(rig, tracks)
-            adjusted = adjust_rig(rig, tracks, points, freedom, scale, iterations)
+            adjusted = adjust_rig(rig, tracks, points, freedom, scale, ITERATIONS)
             rig = adjusted.cameras
     return rig, tracks, adjusted
 
