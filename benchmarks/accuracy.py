@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.calibrate import figures as rig_figures
 from benchmarks.regions_truth import iou_figures, true_head_alpha, true_labels, view_row
 from express50.cameras import Camera, transform_camera
 from express50.errors import Express50Error
@@ -31,6 +32,7 @@ def measure_dataset(dataset: Dataset, truth_root: Path, out: Path | None = None)
     """Every figure that the published stages allow, and error pictures below ``out``."""
     truth = Truth(truth_root)
     measures = {
+        "calibrate": measure_calibrate,
         "align": measure_align,
         "alpha": measure_alpha,
         "matte": measure_matte,
@@ -46,6 +48,21 @@ def measure_dataset(dataset: Dataset, truth_root: Path, out: Path | None = None)
         out.mkdir(parents=True, exist_ok=True)
         (out / "accuracy.json").write_text(json.dumps(figures, indent=1) + "\n")
     return figures
+
+
+def measure_calibrate(dataset: Dataset, truth: Truth, out: Path | None = None) -> dict:
+    """Worst rotation, position and head-place error of the cameras over all subjects."""
+    rows = [
+        rig_figures(read_cameras_of(dataset, subject, undistorted=False), truth.cameras(subject))
+        for subject in calibrated_subjects(dataset)
+    ]
+    keys = ("rotation_error_deg_max", "translation_error_mm_max", "head_px")
+    return {key: float(np.max([row[key] for row in rows])) for key in keys}
+
+
+def calibrated_subjects(dataset: Dataset) -> list[str]:
+    """Subjects whose cameras were published."""
+    return [s for s in dataset.subjects() if dataset.item_dir("calibrate", s).is_dir()]
 
 
 def measure_align(dataset: Dataset, truth: Truth, out: Path | None = None) -> dict:

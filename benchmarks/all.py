@@ -9,6 +9,7 @@ from pathlib import Path
 
 SKIPPED = {
     "__init__",
+    "calibrate_footage",
     "all",
     "demo",
     "document",

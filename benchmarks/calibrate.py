@@ -7,12 +7,15 @@ points in the head's place project from where the true camera has them. The last
 object. Without a dataset named, 24 cameras before a ChArUco board and one neutral face are
 recorded first (some minutes). Then one camera of the solved rig after another is turned by
 ``BUMP_DEG`` and must be found in the footage, and nothing may be found in the rig as solved.
+``sfm`` and ``refine`` are rigs solved from footage alone, and perturbed ones put right, on the twin
+and on the foreign heads of ``../shared/captures`` where they are.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import os
 import sys
 import time
 from collections.abc import Mapping
@@ -22,7 +25,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from express50.cameras import Camera, project, transform_camera, triangulate
+from benchmarks.calibrate_footage import refine_figures, see_capture, sfm_figures
+from express50.cameras import Camera, project, read_cameras, transform_camera, triangulate
 from express50.config import resolve_config
 from express50.frames import FrameReader
 from express50.index import Index, read_index
@@ -50,6 +54,7 @@ from pipelines.calibrate.board import (
     read_observations,
 )
 from pipelines.calibrate.bundle import Rig, residuals
+from pipelines.calibrate.config import CalibrateConfig
 from pipelines.calibrate.graph import join, mean_transform, rig_from_board
 from pipelines.calibrate.intrinsics import (
     View,
@@ -123,10 +128,35 @@ def main() -> int:
         "seconds_detection": detected - start,
         "corners": len(solution.errors),
         "dropped": len(solution.dropped),
+        **footage_figures(index, true, (observations, points), config),
         "baseline": {"opencv_chain": rounded(baseline)},
     }
     print(json.dumps({"benchmark": "calibrate", "preset": args.preset, **rounded(row)}))
     return 0
+
+
+def footage_figures(
+    index: Index,
+    true: Mapping[str, Camera],
+    board: tuple[Observations, np.ndarray],
+    config: CalibrateConfig,
+) -> dict[str, object]:
+    """Rigs solved from the footage alone, and perturbed ones refined: the twin's and foreign ones.
+
+    A foreign capture's given calibration is hidden from the solution and is what it is held to.
+    """
+    shared = Path(os.environ.get("EXPRESS50_SHARED", Path(__file__).parents[2] / "shared"))
+    seen = see_capture(index.capture, true, config.solve_moments)
+    sfm, refine = (
+        {"twin": sfm_figures(seen, true, config)},
+        {"twin": refine_figures(seen, true, figures, board)},
+    )
+    for root in sorted((shared / "captures").glob("*/calibration.json")):
+        given = read_cameras(root)
+        seen = see_capture(root.parent, given, config.solve_moments)
+        sfm[root.parent.name] = sfm_figures(seen, given, config)
+        refine[root.parent.name] = refine_figures(seen, given, figures)
+    return {"sfm": sfm, "refine": refine}
 
 
 def add_data_arguments(parser: argparse.ArgumentParser) -> None:

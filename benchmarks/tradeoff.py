@@ -20,8 +20,10 @@ from express50.layout import Dataset
 from express50.twin.truth import Truth
 from pipelines.order import FIRST, STAGES
 
+SECTION = "Presets of the stages"
 PRESETS = ("draft", "standard", "reference")
 MEASURES = {
+    "calibrate": (accuracy.measure_calibrate, "head_px"),
     "align": (accuracy.measure_align, "peak_error_frames_mean"),
     "alpha": (accuracy.measure_alpha, "mae"),
     "matte": (accuracy.measure_matte, "mae"),
@@ -44,9 +46,11 @@ def main() -> None:
     if not base.captures_file.is_file():
         sys.exit(f"{base.root}: no demo dataset; run 'make demo' first")
     rows = [sweep_one(base, truth, stage, p, args.out) for stage in args.stages for p in PRESETS]
+    rows = [*rows_of_others(args.doc, args.stages), *rows]
+    rows.sort(key=lambda row: list(MEASURES).index(row["stage"]))
     write_csv(rows, args.out / "tradeoff.csv")
     plot(rows, args.doc.with_name("tradeoffs.png"))
-    replace_section(args.doc, "Presets of the stages", as_markdown(rows))
+    replace_section(args.doc, SECTION, as_markdown(rows))
     print(json.dumps({"rows": rows}))
 
 
@@ -81,6 +85,20 @@ def sweep_one(base: Dataset, truth: Truth, stage: str, preset: str, out: Path) -
     }
 
 
+def rows_of_others(doc: Path, stages: list[str]) -> list[dict]:
+    """Rows of the document's table for stages that are not swept this time."""
+    text = doc.read_text(encoding="utf-8") if doc.is_file() else ""
+    section = text.partition(f"## {SECTION}\n")[2].partition("\n## ")[0]
+    rows = []
+    for line in section.splitlines():
+        cells = [cell.strip() for cell in line.strip("|").split("|")]
+        if len(cells) == 6 and cells[0] in MEASURES and cells[0] not in stages:
+            keys = ("stage", "preset", "seconds_per_item", "error", "measure")
+            row: dict = dict(zip(keys, cells[:5], strict=True))
+            rows.append(row | {"seconds_per_item": float(cells[2]), "error": float(cells[3])})
+    return rows
+
+
 def children_seconds() -> float:
     """Processor seconds of the finished child processes; other work on the machine adds none."""
     usage = resource.getrusage(resource.RUSAGE_CHILDREN)
@@ -106,7 +124,8 @@ def pareto(rows: list[dict]) -> set[tuple[str, str]]:
 def write_csv(rows: list[dict], path: Path) -> None:
     """The rows as a table for machines."""
     with path.open("w", newline="") as file:
-        writer = csv.DictWriter(file, list(rows[0]))
+        fields = list(dict.fromkeys(key for row in rows for key in row))
+        writer = csv.DictWriter(file, fields, restval="")
         writer.writeheader()
         writer.writerows(rows)
 

@@ -72,19 +72,18 @@ def run_check(args: argparse.Namespace) -> int:
 def _look_at_footage(args: argparse.Namespace, cameras: Mapping[str, Camera]) -> FootageVerdict:
     # Imported here: the other commands need neither torch nor OpenCV's features.
     from express50.landmarks.network import load_network
-    from express50.rigs.footage import check_footage
+    from express50.rigs.footage import check_footage, reduce_image
     from express50.rigs.moments import read_moments
+
+    def reduce(name: str, image: np.ndarray) -> np.ndarray | None:
+        return reduce_image(cameras[name], image, "the footage") if name in cameras else None
 
     if args.frames < 1:
         raise ConfigError(f"--frames is {args.frames}, expected 1 or more")
-    frames = read_moments(args.footage, args.frames)
+    frames = read_moments(args.footage, args.frames, reduce)
     shown = {name for images in frames.values() for name in images}
     known = {name: camera for name, camera in cameras.items() if name in shown}
-    pictures = {
-        frame: {name: image for name, image in images.items() if name in known}
-        for frame, images in frames.items()
-    }
-    return check_footage(known, pictures, load_network())
+    return check_footage(known, frames, load_network())
 
 
 def _read(args: argparse.Namespace) -> dict[str, Camera]:

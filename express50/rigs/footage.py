@@ -123,27 +123,39 @@ def reduce_images(
     cameras: Mapping[str, Camera], frames: Mapping[int, Mapping[str, np.ndarray]]
 ) -> tuple[dict[str, Camera], dict[int, dict[str, np.ndarray]]]:
     """Cameras and images with a long side of `LONG_SIDE` at most."""
-    small = {}
-    for name, camera in cameras.items():
-        share = min(1.0, LONG_SIDE / max(camera.width, camera.height))
-        size = round(camera.width * share), round(camera.height * share)
-        small[name] = camera if share == 1.0 else resized(camera, *size)
-    pictures: dict[int, dict[str, np.ndarray]] = {}
-    for frame, images in frames.items():
-        pictures[frame] = {}
-        for name, image in images.items():
-            camera = cameras[name]
-            if image.shape[:2] != (camera.height, camera.width):
-                raise CalibrationError(
-                    f"camera {name}: frame {frame} is {image.shape[1]}x{image.shape[0]}, the "
-                    f"camera is {camera.width}x{camera.height}; scale the intrinsics"
-                )
-            size = (small[name].width, small[name].height)
-            same = small[name] is camera
-            pictures[frame][name] = (
-                image if same else cv2.resize(image, size, interpolation=cv2.INTER_AREA)
-            )
+    small = {name: reduced_camera(camera) for name, camera in cameras.items()}
+    pictures = {
+        frame: {
+            name: reduce_image(cameras[name], image, f"frame {frame}")
+            for name, image in images.items()
+        }
+        for frame, images in frames.items()
+    }
     return small, pictures
+
+
+def reduced_camera(camera: Camera) -> Camera:
+    """The camera of an image with a long side of `LONG_SIDE` at most."""
+    share = min(1.0, LONG_SIDE / max(camera.width, camera.height))
+    size = round(camera.width * share), round(camera.height * share)
+    return camera if share == 1.0 else resized(camera, *size)
+
+
+def reduce_image(camera: Camera, image: np.ndarray, what: str) -> np.ndarray:
+    """A camera's image (H, W, 3) in the size of `reduced_camera`; one already so passes.
+
+    Reducing each image as it is read keeps a rig's full-size images out of memory.
+    """
+    small = reduced_camera(camera)
+    shape = image.shape[:2]
+    if shape == (small.height, small.width):
+        return image
+    if shape != (camera.height, camera.width):
+        raise CalibrationError(
+            f"camera {camera.id}: {what} is {shape[1]}x{shape[0]}, the "
+            f"camera is {camera.width}x{camera.height}; scale the intrinsics"
+        )
+    return cv2.resize(image, (small.width, small.height), interpolation=cv2.INTER_AREA)
 
 
 def _move_until_quiet(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -14,10 +14,13 @@ from express50.index import Cue
 from express50.video import iterate_video
 
 
-def read_moments(root: Path, count: int) -> dict[int, dict[str, np.ndarray]]:
-    """Images (H, W, 3) uint8 of all cameras at up to `count` moments, by frame number.
+def read_moments(
+    root: Path, count: int, reduce: Callable[[str, np.ndarray], np.ndarray | None]
+) -> dict[int, dict[str, np.ndarray]]:
+    """Images (H, W, 3) uint8 of cameras at up to `count` moments, by frame number.
 
     The moments are spread over the cues' middles, or over the images where there are no cues.
+    Each image is kept as `reduce(camera, image)` returns it, and left out where that is None.
 
     Raises:
         CaptureError: the capture is unusable, or a camera has no such frame.
@@ -27,7 +30,9 @@ def read_moments(root: Path, count: int) -> dict[int, dict[str, np.ndarray]]:
     found: dict[int, dict[str, np.ndarray]] = {frame: {} for frame in wanted}
     for name, camera in sorted(capture.cameras.items()):
         for frame, image in _read(camera, wanted):
-            found[frame][name] = image
+            kept = reduce(name, image)
+            if kept is not None:
+                found[frame][name] = kept
     return found
 
 
@@ -48,18 +53,20 @@ def spread(frames: Sequence[int], count: int) -> list[int]:
     return [frames[i] for i in picks]
 
 
-def _read(camera: RawCamera, wanted: list[int]) -> list[tuple[int, np.ndarray]]:
+def _read(camera: RawCamera, wanted: list[int]) -> Iterator[tuple[int, np.ndarray]]:
+    """Wanted frames one by one, so that no more than one full-size image is held."""
     if camera.kind == "frames":
         missing = [frame for frame in wanted if frame >= len(camera.names)]
         if not missing:
-            return [(frame, read_srgb8(camera.path / camera.names[frame])) for frame in wanted]
+            for frame in wanted:
+                yield frame, read_srgb8(camera.path / camera.names[frame])
+            return
         length = len(camera.names)
     else:
-        found = []
         for length, (_, image) in enumerate(iterate_video(camera.path), 1):
             if length - 1 in wanted:
-                found.append((length - 1, image))
+                yield length - 1, image
             if length > max(wanted):
-                return found
+                return
         missing = [frame for frame in wanted if frame >= length]
     raise CaptureError(f"{camera.path}: has {length} frames, frame {missing[0]} was expected")

@@ -10,22 +10,24 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 
-from express50.adapters import opencv_pixels_to_corner
 from express50.cameras import Camera, normalised
 from express50.landmarks.detector import detect
 from express50.landmarks.network import LandmarkNet
+from express50.rigs.features import (
+    Features,
+    epipolar_distance,
+    find_features,
+    match_features,
+    verified_pairs,
+    without_fixed,
+)
 
-FEATURES = 1500
-"""Features kept an image, strongest first."""
 NEIGHBOURS = 6
 """Cameras whose features a camera's are compared with."""
 WIDEST_DEG = 45.0
 """Angle between optical axes beyond which features do not look alike."""
-RATIO = 0.8
-"""A feature's second-best match must differ by so much more than its best (Lowe 2004)."""
 FEATURE_SIGMA_PX = 0.7
 FACE_SCORE = 0.9
 """Faces less surely seen are profiles and backs of heads, whose landmarks are guessed."""
@@ -65,20 +67,23 @@ class Tracks:
 class Seen:
     """What the cameras saw at one moment, undistorted.
 
-    `landmarks` holds the camera's number, points (68, 2) and sigma (68,) of each view of the face,
+    `landmarks` holds the camera, points (68, 2) and sigma (68,) of each view of the face,
     `features` pixels (N, 2) and descriptors (N, 128) a camera.
     """
 
-    landmarks: list[tuple[int, np.ndarray, np.ndarray]]
-    features: dict[str, tuple[np.ndarray, np.ndarray]]
+    landmarks: list[tuple[str, np.ndarray, np.ndarray]]
+    features: dict[str, Features]
 
 
 def look(
     cameras: Mapping[str, Camera], images: Mapping[str, np.ndarray], net: LandmarkNet | None
 ) -> Seen:
     """Landmarks (none without a network) and features of one moment's images (H, W, 3) uint8."""
-    features = {n: find_features(cameras[n], image) for n, image in images.items()}
-    return Seen(_landmarks(cameras, images, net) if net else [], features)
+    recorded = without_fixed({name: find_features(image) for name, image in images.items()})
+    features = {n: (ideal_pixels(cameras[n], p), d) for n, (p, d) in recorded.items()}
+    faces = {name: find_face(images[name], net) for name in sorted(images)} if net else {}
+    landmarks = [(n, ideal_pixels(cameras[n], f[0]), f[1]) for n, f in faces.items() if f]
+    return Seen(landmarks, features)
 
 
 def join_tracks(cameras: Mapping[str, Camera], seen: Mapping[int, Seen], band: float) -> Tracks:
@@ -90,21 +95,56 @@ def join_tracks(cameras: Mapping[str, Camera], seen: Mapping[int, Seen], band: f
         band: distance from the epipolar line, as a share of the image's diagonal, within which
             a feature may be matched: how far off a camera may be taken to be.
     """
-    names = tuple(sorted(cameras))
-    neighbours = _neighbours(cameras)
-    rows: list[tuple[int, int, np.ndarray, float]] = []
-    count = 0
-    for moment in seen.values():
-        for index, points, sigma in moment.landmarks:
-            rows += [(index, count + k, points[k], sigma[k]) for k in range(68)]
-        count += 68
-        features = moment.features
-        matches = {
+    pairs = _neighbours(cameras)
+    matches = {
+        frame: {
             (a, b): match_features(cameras[a], cameras[b], features[a], features[b], band)
-            for a, b in neighbours
+            for a, b in pairs
             if a in features and b in features
         }
-        for group in _join_matches(matches):
+        for frame, features in ((frame, moment.features) for frame, moment in seen.items())
+    }
+    return tracks_of(cameras, seen, matches)
+
+
+def join_verified(cameras: Mapping[str, Camera], seen: Mapping[int, Seen], band: float) -> Tracks:
+    """Tracks of what was seen, features matched by their looks and by each pair's own geometry.
+
+    The matches owe nothing to the rig but that they lie within `band` of its epipolar lines (as
+    in `join_tracks`), so they can tell that all its cameras are a little off: matches sought along
+    wrong lines would only confirm them. All moments of a pair are judged together.
+    """
+    matches: dict[int, dict[tuple[str, str], np.ndarray]] = {frame: {} for frame in seen}
+    for a, b in _neighbours(cameras):
+        both = {
+            frame: (moment.features[a], moment.features[b])
+            for frame, moment in seen.items()
+            if a in moment.features and b in moment.features
+        }
+        for frame, pairs in verified_pairs(both).items():
+            p, q = (seen[frame].features[n][0][pairs[:, i]] for i, n in enumerate((a, b)))
+            off = epipolar_distance(cameras[a], cameras[b], p, q).diagonal()
+            near = off < band * np.hypot(cameras[b].width, cameras[b].height)
+            matches[frame][a, b] = pairs[near]
+    return tracks_of(cameras, seen, matches)
+
+
+def tracks_of(
+    cameras: Mapping[str, Camera],
+    seen: Mapping[int, Seen],
+    matches: Mapping[int, Mapping[tuple[str, str], np.ndarray]],
+) -> Tracks:
+    """Tracks of the landmarks and of matched features, by frame number and pair of cameras."""
+    names = tuple(sorted(cameras))
+    rows: list[tuple[int, int, np.ndarray, float]] = []
+    count = 0
+    for frame, moment in seen.items():
+        for name, points, sigma in moment.landmarks:
+            if name in cameras:
+                rows += [(names.index(name), count + k, points[k], sigma[k]) for k in range(68)]
+        count += 68
+        features = moment.features
+        for group in _join_matches(matches.get(frame, {})):
             rows += [(names.index(n), count, features[n][0][k], FEATURE_SIGMA_PX) for n, k in group]
             count += 1
     table = Tracks(
@@ -117,39 +157,33 @@ def join_tracks(cameras: Mapping[str, Camera], seen: Mapping[int, Seen], band: f
     return table.select(np.ones(len(rows), bool))
 
 
+def undistorted(seen: Mapping[int, Seen], cameras: Mapping[str, Camera]) -> dict[int, Seen]:
+    """What `cameras` undistort of moments that were looked at without distortion."""
+    return {
+        frame: Seen(
+            [(n, ideal_pixels(cameras[n], p), s) for n, p, s in moment.landmarks if n in cameras],
+            {
+                name: (ideal_pixels(cameras[name], pixels), described)
+                for name, (pixels, described) in moment.features.items()
+                if name in cameras
+            },
+        )
+        for frame, moment in seen.items()
+    }
+
+
 def ideal_pixels(camera: Camera, pixels: np.ndarray) -> np.ndarray:
     """Where recorded pixels (N, 2) would be without distortion."""
     K = camera.K
     return normalised(camera, pixels) * K[[0, 1], [0, 1]] + K[:2, 2]
 
 
-def _landmarks(
-    cameras: Mapping[str, Camera], images: Mapping[str, np.ndarray], net: LandmarkNet
-) -> list[tuple[int, np.ndarray, np.ndarray]]:
-    """Camera index, points (68, 2) and sigma (68,) of every view in which a face is found."""
-    found = []
-    for index, name in enumerate(sorted(cameras)):
-        if name not in images:
-            continue
-        seen = detect(net, images[name])
-        if seen.score >= FACE_SCORE:
-            sigma = LANDMARK_DOUBT * np.maximum(seen.sigma, FEATURE_SIGMA_PX)
-            found.append((index, ideal_pixels(cameras[name], seen.points), sigma))
-    return found
-
-
-def find_features(camera: Camera, image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """SIFT features of an image: undistorted pixels (N, 2), descriptors (N, 128) of length one.
-
-    Descriptors are compared as square roots (Arandjelovic and Zisserman, CVPR 2012).
-    """
-    sift = cv2.SIFT_create(nfeatures=FEATURES, contrastThreshold=0.01)
-    keys, described = sift.detectAndCompute(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), None)
-    if not keys:
-        return np.zeros((0, 2)), np.zeros((0, 128), np.float32)
-    pixels = opencv_pixels_to_corner(np.array([key.pt for key in keys]))
-    total = np.maximum(described.sum(1, keepdims=True), 1e-9)
-    return ideal_pixels(camera, pixels), np.sqrt(described / total)
+def find_face(image: np.ndarray, net: LandmarkNet) -> tuple[np.ndarray, np.ndarray] | None:
+    """Recorded landmarks (68, 2) and their expected errors (68,), if a face is surely seen."""
+    seen = detect(net, image)
+    if seen.score < FACE_SCORE:
+        return None
+    return seen.points, LANDMARK_DOUBT * np.maximum(seen.sigma, FEATURE_SIGMA_PX)
 
 
 def _neighbours(cameras: Mapping[str, Camera]) -> list[tuple[str, str]]:
@@ -162,48 +196,6 @@ def _neighbours(cameras: Mapping[str, Camera]) -> list[tuple[str, str]]:
         near = [j for j in np.argsort(angle[i], kind="stable") if j != i][:NEIGHBOURS]
         pairs |= {(min(i, j), max(i, j)) for j in near if angle[i, j] < WIDEST_DEG}
     return [(names[i], names[j]) for i, j in sorted(pairs)]
-
-
-def match_features(
-    a: Camera,
-    b: Camera,
-    features_a: tuple[np.ndarray, np.ndarray],
-    features_b: tuple[np.ndarray, np.ndarray],
-    band: float,
-) -> np.ndarray:
-    """Pairs (M, 2) of features that are each other's clear best near their epipolar lines.
-
-    `band` is how near, as a share of the image's diagonal.
-    """
-    (pixels_a, described_a), (pixels_b, described_b) = features_a, features_b
-    if min(len(pixels_a), len(pixels_b)) < 2:
-        return np.zeros((0, 2), int)
-    likeness = described_a @ described_b.T
-    off = epipolar_distance(a, b, pixels_a, pixels_b)
-    likeness[off > band * np.hypot(b.width, b.height)] = -1.0
-    distance = np.sqrt(np.maximum(2 - 2 * likeness, 0))
-    best = distance.argmin(1)
-    rows = np.arange(len(best))
-    nearest = np.partition(distance, 1, axis=1)
-    good = nearest[:, 0] < RATIO * np.minimum(nearest[:, 1], 1.0)
-    good &= distance.argmin(0)[best] == rows
-    return np.stack([rows[good], best[good]], axis=1)
-
-
-def epipolar_distance(
-    a: Camera, b: Camera, pixels_a: np.ndarray, pixels_b: np.ndarray
-) -> np.ndarray:
-    """Distance (A, B), pixels in b, of each pixel in b from the epipolar line of each in a.
-
-    Source: Hartley and Zisserman, Multiple View Geometry, 2nd ed., 9.2.
-    """
-    b_from_a = b.cam_from_world @ a.world_from_cam
-    x, y, z = b_from_a[:3, 3]
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    F = np.linalg.inv(b.K).T @ cross @ b_from_a[:3, :3] @ np.linalg.inv(a.K)
-    lines = np.column_stack([pixels_a, np.ones(len(pixels_a))]) @ F.T
-    lines /= np.maximum(np.linalg.norm(lines[:, :2], axis=1, keepdims=True), 1e-12)
-    return np.abs(lines @ np.column_stack([pixels_b, np.ones(len(pixels_b))]).T)
 
 
 def _join_matches(

@@ -2,7 +2,8 @@
 
 The world is made from the cameras alone, so that the same footage always gives the same one:
 - origin: the point nearest to all optical axes (where the rig looks);
-- y: up, against the mean of the cameras' downward image axes;
+- y: up, against the mean of the cameras' downward image axes, or the head's own up where that is
+  known and says that the cameras lie on their sides;
 - z: from the origin towards the mean camera, level; a rig round the whole subject has no such
   side, then towards the first camera by name.
 """
@@ -19,6 +20,8 @@ from express50.transforms import make_transform
 
 # Below this the mean viewing side of a rig is noise: the cameras stand all round.
 CLEAR_SIDE = 0.15
+# Cosine to the head's up below which the cameras, not the head, lie on their side.
+ON_ITS_SIDE = 0.7
 # Axes within about 1 degree of parallel meet nowhere in particular.
 PARALLEL = 3e-4
 
@@ -60,10 +63,13 @@ def check_meeting(cameras: Mapping[str, Camera], where: str) -> None:
         )
 
 
-def canonical_from_rig(cameras: Mapping[str, Camera], fallback: np.ndarray) -> np.ndarray:
+def canonical_from_rig(
+    cameras: Mapping[str, Camera], fallback: np.ndarray, head_up: np.ndarray | None = None
+) -> np.ndarray:
     """Transform (4, 4) from the rig's space to the canonical world of this module.
 
-    `fallback` (3,), rig space, is the origin when the axes do not meet (one camera, or parallel).
+    `fallback` (3,), rig space, is the origin when the axes do not meet (one camera, or parallel);
+    `head_up` (3,) is the direction from chin to crown, where a head is known.
     """
     met = meeting_point(cameras)
     origin = fallback if met is None else met
@@ -72,6 +78,8 @@ def canonical_from_rig(cameras: Mapping[str, Camera], fallback: np.ndarray) -> n
     if np.linalg.norm(up) < CLEAR_SIDE:
         up = -cameras[names[0]].cam_from_world[1, :3]
     y = up / np.linalg.norm(up)
+    if head_up is not None and head_up @ y < ON_ITS_SIDE * np.linalg.norm(head_up):
+        y = head_up / np.linalg.norm(head_up)
     towards = [_level(cameras[name].center - origin, y) for name in names]
     z = np.mean(towards, axis=0)
     if np.linalg.norm(z) < CLEAR_SIDE:

@@ -16,6 +16,9 @@ import pycolmap
 from express50.cameras import Camera, project
 from pipelines.calibrate.board import Observations
 
+ITERATIONS = 60
+"""Of Levenberg-Marquardt at most; rigs before boards settle in fewer than 15."""
+
 
 @dataclass(frozen=True)
 class Rig:
@@ -48,23 +51,27 @@ def adjust(
     observations: Observations,
     points: np.ndarray,
     loss_scale_px: float,
-    iterations: int,
     refine_distortion: bool = True,
+    refine_focal: bool = True,
+    refine_cameras: bool = True,
 ) -> Rig:
-    """Refine all intrinsics, camera poses and board poses over the observations.
+    """Refine intrinsics, camera poses and board poses over the observations.
 
     Args:
         rig: where to start; every observed camera and frame must be in it.
         observations: board corners.
         points: (P, 3) corners on the board, metres.
         loss_scale_px: residual at which the Cauchy loss begins to flatten.
-        iterations: of Levenberg-Marquardt at most.
         refine_distortion: also refine distortion and principal points.
+        refine_focal: also refine focal lengths.
+        refine_cameras: also refine the cameras' poses in the rig.
     """
     reconstruction, names, frames = _build(rig, observations, points)
     options = pycolmap.BundleAdjustmentOptions()
     options.print_summary = False
     options.refine_points3D = False
+    options.refine_focal_length = refine_focal
+    options.refine_sensor_from_rig = refine_cameras
     options.refine_principal_point = refine_distortion
     options.refine_extra_params = refine_distortion
     options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
@@ -72,7 +79,7 @@ def adjust(
     # There are no free points to eliminate, so COLMAP's choice by image count (an iterative
     # solver beyond a thousand) loses to the default, factorising the normal equations.
     options.ceres.auto_select_solver_type = False
-    options.ceres.solver_options.max_num_iterations = iterations
+    options.ceres.solver_options.max_num_iterations = ITERATIONS
     options.ceres.solver_options.function_tolerance = 1e-9
     options.ceres.solver_options.num_threads = 1  # sums in one order: the same bytes every run
     config = pycolmap.BundleAdjustmentConfig()

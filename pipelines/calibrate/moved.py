@@ -7,11 +7,10 @@ from collections.abc import Mapping
 import numpy as np
 
 from express50.cameras import Camera
-from express50.frames import FrameReader
 from express50.index import Index
 from express50.landmarks.network import load_network
-from express50.rigs.footage import FootageVerdict, check_footage
-from express50.rigs.moments import spread_moments
+from express50.rigs.footage import FootageVerdict, check_footage, reduce_image
+from pipelines.calibrate.footage import read_footage
 
 
 def look_at_footage(
@@ -23,13 +22,10 @@ def look_at_footage(
     """
     if moments < 1 or len(cameras) < 3:
         return None
-    cues = [cue for cue in index.cues if cue.end_frame < index.frames]
-    wanted = sorted(set(spread_moments(cues, moments))) or [index.frames // 2]
-    frames: dict[int, dict[str, np.ndarray]] = {frame: {} for frame in wanted}
-    for name in cameras:
-        reader = FrameReader(index, name)
-        for frame in wanted:
-            frames[frame][name] = reader.read(frame)
+    frames: dict[int, dict[str, np.ndarray]] = {}
+    for frame, name, image in read_footage(index, cameras, moments):
+        small = reduce_image(cameras[name], image, f"frame {frame}")
+        frames.setdefault(frame, {})[name] = small
     return check_footage(cameras, frames, load_network())
 
 

@@ -32,6 +32,9 @@ from pipelines.calibrate.intrinsics import (
 # and tangential terms.
 LADDER = ("SIMPLE_RADIAL", "RADIAL", "OPENCV")
 
+# Images that start one camera's lens; the joint adjustment uses all, whatever this is.
+SINGLE_FRAMES = 15
+
 
 @dataclass(frozen=True)
 class Solution:
@@ -142,7 +145,7 @@ def _single_cameras(
     """Intrinsics a camera on its own; returns the cameras and the views each one kept."""
     cameras, kept = {}, {}
     for name, mine in views.items():
-        frames = [sorted(mine)[i] for i in even(len(mine), config.single_frames)]
+        frames = [sorted(mine)[i] for i in even(len(mine), SINGLE_FRAMES)]
         fitted = fit_intrinsics([mine[f] for f in frames], sizes[name], model, config.min_frames)
         if fitted is None:
             dropped[name] = (
@@ -209,8 +212,8 @@ def _refine(
         )
         kept = observations.select(keep)
         if config.camera_model == AUTO and number == min(1, config.rounds - 1):
-            rig = _simplest_models(rig, kept, points, loss_scale, config.iterations)
-        rig = adjust(rig, kept, points, loss_scale, config.iterations)
+            rig = _simplest_models(rig, kept, points, loss_scale)
+        rig = adjust(rig, kept, points, loss_scale)
         errors = residuals(rig, observations, points)
         sigma = _sigma(errors[keep])
         limit, loss_scale = max(config.reject_sigma * sigma, 0.05), 2 * sigma
@@ -219,9 +222,7 @@ def _refine(
     return rig, observations.select(keep), errors[keep]
 
 
-def _simplest_models(
-    rig: Rig, kept: Observations, points: np.ndarray, loss_scale: float, iterations: int
-) -> Rig:
+def _simplest_models(rig: Rig, kept: Observations, points: np.ndarray, loss_scale: float) -> Rig:
     """Give each camera the simplest lens model that its corners do not contradict.
 
     Distortion that is not there takes the principal point and the rotation with it: tangential
@@ -233,7 +234,7 @@ def _simplest_models(
     for model in LADDER:
         start = rigs[-1] if rigs else rig
         start = Rig({n: as_model(c, model) for n, c in start.cameras.items()}, start.boards)
-        solved = adjust(start, kept, points, loss_scale, iterations)
+        solved = adjust(start, kept, points, loss_scale)
         squared = np.sum(residuals(solved, kept, points) ** 2, axis=1)
         robust = loss_scale**2 * np.log1p(np.minimum(squared, 1e6) / loss_scale**2)
         rigs.append(solved)

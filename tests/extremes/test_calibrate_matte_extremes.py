@@ -29,7 +29,7 @@ from tests.pipelines.board_rigs import (
     sizes_of,
 )
 
-DRAFT = CalibrateConfig(rounds=2, single_frames=15)
+DRAFT = CalibrateConfig(rounds=2)
 
 
 def solved(rig, boards, noise: float):

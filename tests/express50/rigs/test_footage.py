@@ -1,8 +1,10 @@
 """A camera that moved after calibration is found in the footage, named and measured."""
 
 import json
+import weakref
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 from scipy.ndimage import map_coordinates
@@ -13,9 +15,10 @@ from express50.errors import CalibrationError, CaptureError
 from express50.images import write_image
 from express50.layout import Dataset
 from express50.rigs.adjust import fit_poses, move_pose, triangulate_tracks
-from express50.rigs.footage import check_footage, reduce_images
+from express50.rigs.features import epipolar_distance, find_features, without_fixed
+from express50.rigs.footage import check_footage, reduce_image, reduce_images
 from express50.rigs.moments import read_moments
-from express50.rigs.tracks import Tracks, epipolar_distance, look
+from express50.rigs.tracks import Tracks, look
 from express50.transforms import look_at
 
 TURN, SHIFT = np.radians(0.3), 5e-3
@@ -125,6 +128,39 @@ def test_large_images_are_reduced_with_their_camera():
     np.testing.assert_allclose(small["a"].K[:2], 0.5 * camera.K[:2])
 
 
+def test_reduced_images_pass_again_and_the_full_ones_are_let_go(footage, tmp_path, monkeypatch):
+    rig, frames = footage
+    monkeypatch.setattr("express50.rigs.footage.LONG_SIDE", 160)
+    write_capture(tmp_path / "capture", rig, frames[0])
+    alive = []
+
+    def reduce(name, image):
+        alive[:] = [ref for ref in alive if ref() is not None]
+        assert len(alive) <= 1  # the image read before this one at most
+        alive.append(weakref.ref(image))
+        return reduce_image(rig[name], image, "frame 0")
+
+    found = read_moments(tmp_path / "capture", 1, reduce)
+    assert {image.shape for image in found[0].values()} == {(160, 160, 3)}
+    again = reduce_images(rig, found)[1]
+    assert all(again[0][name] is found[0][name] for name in rig)
+
+
+def test_noise_fixed_to_the_pixels_of_all_sensors_does_not_accuse(footage):
+    rig, frames = footage
+    noise = cv2.GaussianBlur(np.random.default_rng(5).normal(size=(320, 320, 1)) * 90, (0, 0), 1.5)
+    same = {n: np.clip(i + noise[..., None], 0, 255).astype(np.uint8) for n, i in frames[0].items()}
+    verdict = check_footage(rig, {0: same}, None)
+    assert verdict.moved == {}
+    blank = {n: np.clip(128 + noise[..., None], 0, 255).repeat(3, 2).astype(np.uint8) for n in rig}
+    left = without_fixed({name: find_features(image) for name, image in blank.items()})
+    assert sum(len(pixels) for pixels, _ in left.values()) == 0
+    scene = {name: find_features(image) for name, image in frames[0].items()}
+    kept = without_fixed(scene)
+    for name in rig:
+        assert len(kept[name][0]) > 0.95 * len(scene[name][0])
+
+
 def test_an_epipolar_line_goes_through_every_depth():
     a, b = (make_rig()[n] for n in ("cam01", "cam03"))
     a, b = (replace(c, model="PINHOLE", params=c.params[:4]) for c in (a, b))
@@ -177,11 +213,11 @@ def test_the_command_names_the_camera(footage, tmp_path, capsys):
 def test_moments_follow_the_cues_and_a_short_camera_is_named(footage, tmp_path):
     rig, frames = footage
     write_capture(tmp_path / "capture", rig, frames[0])
-    assert list(read_moments(tmp_path / "capture", 3)) == [0]
+    assert list(read_moments(tmp_path / "capture", 3, lambda name, image: image)) == [0]
     cues = "expression_id,start_frame,end_frame\nneutral,0,0\nsmile,2,4\n"
     (tmp_path / "capture" / "cues.csv").write_text(cues)
     with pytest.raises(CaptureError, match="has 1 frames, frame 3 was expected"):
-        read_moments(tmp_path / "capture", 2)
+        read_moments(tmp_path / "capture", 2, lambda name, image: image)
 
 
 def test_calibrate_warns_of_the_camera_and_goes_on(footage, tmp_path, capsys):

@@ -1,0 +1,254 @@
+"""Rigs solved from footage alone, and given rigs refined, against the true cameras.
+
+Parts of ``python -m benchmarks.calibrate``. COLMAP's incremental mapping on the same features and
+landmarks (all moments of a camera as one picture, since cameras do not move) stands beside the
+solution.
+"""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+
+from express50.cameras import Camera
+from express50.errors import CalibrationError
+from express50.landmarks.network import load_network
+from express50.rigs.adjust import move_pose
+from express50.rigs.features import match_looks
+from express50.rigs.footage import reduce_image, reduced_camera
+from express50.rigs.moments import read_moments
+from express50.rigs.tracks import Seen, look, undistorted
+from express50.transforms import matrix_to_axis_angle, similarity_fit
+from pipelines.calibrate.board import Observations
+from pipelines.calibrate.config import CalibrateConfig
+from pipelines.calibrate.faces import start_camera
+from pipelines.calibrate.refine import Refined, refine_by_board, refine_by_footage
+from pipelines.calibrate.structure import solve_footage
+
+BUMP_DEG, BUMP_MM = 0.3, 5.0
+Judge = Callable[[Mapping[str, Camera], Mapping[str, Camera]], dict[str, float]]
+
+
+def see_capture(root: Path, true: Mapping[str, Camera], moments: int) -> dict[int, Seen]:
+    """What the cameras of a raw capture see, in recorded pixels of `reduced_camera`."""
+
+    def reduce(name: str, image: np.ndarray) -> np.ndarray | None:
+        return reduce_image(true[name], image, "the footage") if name in true else None
+
+    frames = read_moments(root, moments, reduce)
+    net = load_network()
+    blank = {n: start_camera(n, (c.width, c.height), 1.0) for n, c in small(true).items()}
+    return {frame: look(blank, images, net) for frame, images in frames.items()}
+
+
+def small(cameras: Mapping[str, Camera]) -> dict[str, Camera]:
+    """The cameras of reduced images."""
+    return {name: reduced_camera(camera) for name, camera in cameras.items()}
+
+
+def sfm_figures(
+    seen: Mapping[int, Seen], true: Mapping[str, Camera], config: CalibrateConfig
+) -> dict[str, object]:
+    """Errors of rigs solved with unknown and with told focal lengths, and of COLMAP's mapping."""
+    rig = small(true)
+    sizes = {name: (camera.width, camera.height) for name, camera in rig.items()}
+    told = {name: float(camera.K[0, 0]) for name, camera in rig.items()}
+    rows: dict[str, object] = {}
+    for key, focals in (("unknown_focals", {}), ("told_focals", told)):
+        started = time.process_time()
+        try:
+            solved = solve_footage(seen, sizes, focals, config, "footage")
+            row = similar(solved.cameras, rig) | {"weak": len(solved.weak)}
+        except CalibrationError as error:
+            row = {"cameras_registered": 0, "cameras": len(rig), "refused": str(error)}
+        rows[key] = row | {"seconds": round(time.process_time() - started, 2)}
+    rows["baseline"] = {"colmap_mapping": similar(colmap_mapping(seen, rig), rig)}
+    return rows
+
+
+def similar(estimated: Mapping[str, Camera], true: Mapping[str, Camera]) -> dict[str, object]:
+    """Errors of a rig after a similarity onto the true one, and that similarity's scale."""
+    names = sorted(estimated)
+    count: dict[str, object] = {"cameras_registered": len(names), "cameras": len(true)}
+    if len(names) < 3:
+        return count
+    centers = [np.stack([rig[n].center for n in names]) for rig in (estimated, true)]
+    scale, R, t = similarity_fit(*centers)
+    turns = [
+        estimated[n].cam_from_world[:3, :3] @ R.T @ true[n].cam_from_world[:3, :3].T for n in names
+    ]
+    degrees = np.degrees(np.linalg.norm(matrix_to_axis_angle(np.stack(turns)), axis=1))
+    shifts = 1e3 * np.linalg.norm(scale * centers[0] @ R.T + t - centers[1], axis=1)
+    focals = [100 * abs(estimated[n].K[0, 0] / true[n].K[0, 0] - 1) for n in names]
+    return count | {
+        "rotation_error_deg": _five(degrees.mean()),
+        "rotation_error_deg_max": _five(degrees.max()),
+        "translation_error_mm": _five(shifts.mean()),
+        "translation_error_mm_max": _five(shifts.max()),
+        "scale_error_percent": _five(100 * abs(1 / scale - 1)),
+        "focal_error_percent": _five(np.mean(focals)),
+    }
+
+
+def refine_figures(
+    seen: Mapping[int, Seen],
+    true: Mapping[str, Camera],
+    judge: Judge,
+    board: tuple[Observations, np.ndarray] | None = None,
+) -> dict[str, object]:
+    """Errors of a perturbed rig before and after, and whether the true one is left as it is.
+
+    `judge` compares a rig with the true one.
+    """
+    config = CalibrateConfig(refine="poses")
+    bumped = perturbed(true)
+
+    def by_footage(rig: Mapping[str, Camera]) -> Refined:
+        reduced = small(rig)
+        found = refine_by_footage(reduced, reduced, undistorted(seen, reduced), config)
+        poses = {n: c.cam_from_world for n, c in found.cameras.items()}
+        return replace(
+            found, cameras={n: replace(c, cam_from_world=poses[n]) for n, c in rig.items()}
+        )
+
+    rows = {"before": _of(judge(bumped, true)), "footage": _row(by_footage, bumped, true, judge)}
+    if board is not None:
+        observations, points = board
+
+        def by_board(rig: Mapping[str, Camera]) -> Refined:
+            return refine_by_board(rig, observations, points, config)
+
+        rows["board"] = _row(by_board, bumped, true, judge)
+    return rows
+
+
+def _row(
+    refine: Callable[[Mapping[str, Camera]], Refined],
+    bumped: Mapping[str, Camera],
+    true: Mapping[str, Camera],
+    judge: Judge,
+) -> dict[str, object]:
+    started = time.process_time()
+    found = refine(bumped)
+    seconds = time.process_time() - started
+    quiet = refine(true)
+    return {
+        **_of(judge(found.cameras, true)),
+        "kept_given": found.kept,
+        "held_out_before_px": _five(found.before_px),
+        "held_out_after_px": _five(found.after_px),
+        "true_rig_left": quiet.kept,
+        "true_rig_head_px": _five(judge(quiet.cameras, true)["head_px"]),
+        "seconds": round(seconds, 2),
+    }
+
+
+def _of(row: Mapping[str, float]) -> dict[str, object]:
+    keys = ("rotation_error_deg", "rotation_error_deg_max", "translation_error_mm",
+            "translation_error_mm_max", "head_px")  # fmt: skip
+    return {key: _five(row[key]) for key in keys}
+
+
+def perturbed(rig: Mapping[str, Camera]) -> dict[str, Camera]:
+    """Every camera turned by `BUMP_DEG` and moved by `BUMP_MM`, each its own way."""
+    rng = np.random.default_rng(0)
+    found = {}
+    for name, camera in sorted(rig.items()):
+        turn, shift = rng.normal(size=(2, 3))
+        turn *= np.radians(BUMP_DEG) / np.linalg.norm(turn)
+        shift *= 1e-3 * BUMP_MM / np.linalg.norm(shift)
+        pose = move_pose(camera.cam_from_world, np.concatenate([turn, shift]))
+        found[name] = replace(camera, cam_from_world=pose)
+    return found
+
+
+def colmap_mapping(seen: Mapping[int, Seen], rig: Mapping[str, Camera]) -> dict[str, Camera]:
+    """The largest model of COLMAP's incremental mapping; it is told sizes, not focal lengths."""
+    with tempfile.TemporaryDirectory() as folder:
+        root = Path(folder)
+        _write_database(root / "database.db", seen, rig)
+        options = pycolmap.IncrementalPipelineOptions()
+        options.random_seed, options.num_threads = 0, 1
+        options.extract_colors = False
+        options.min_model_size = 3
+        options.mapper.abs_pose_min_num_inliers = 15
+        options.mapper.init_min_num_inliers = 30
+        options.mapper.init_min_tri_angle = 8.0
+        (root / "models").mkdir()
+        models = pycolmap.incremental_mapping(root / "database.db", root, root / "models", options)
+    best = max(models.values(), key=lambda m: m.num_reg_images(), default=None)
+    found = {}
+    for number in best.reg_image_ids() if best is not None else ():
+        image = best.image(number)
+        camera = best.camera(image.camera_id)
+        pose = np.vstack([image.cam_from_world().matrix(), [0, 0, 0, 1]])
+        params = tuple(float(p) for p in camera.params)
+        found[image.name] = Camera(
+            image.name, camera.width, camera.height, "SIMPLE_RADIAL", params, pose
+        )
+    return found
+
+
+def _write_database(path: Path, seen: Mapping[int, Seen], rig: Mapping[str, Camera]) -> None:
+    database = pycolmap.Database.open(path)
+    ids, cameras, points = {}, {}, {}
+    for name, camera in sorted(rig.items()):
+        params = [1.2 * max(camera.width, camera.height), camera.width / 2, camera.height / 2, 0.0]
+        made = pycolmap.Camera(
+            model="SIMPLE_RADIAL", width=camera.width, height=camera.height, params=params
+        )
+        made.camera_id = database.write_camera(made)
+        single = pycolmap.Rig()
+        single.add_ref_sensor(made.sensor_id)
+        number = database.write_rig(single)
+        image = pycolmap.Image(name=name, camera_id=made.camera_id)
+        image.image_id = ids[name] = database.write_image(image)
+        frame = pycolmap.Frame()
+        frame.rig_id = number
+        frame.add_data_id(image.data_id)
+        database.write_frame(frame)
+        cameras[name] = made
+        points[name] = np.concatenate([_pixels(moment, name) for moment in seen.values()])
+        database.write_keypoints(ids[name], points[name].astype(np.float32))
+    options = pycolmap.TwoViewGeometryOptions()
+    options.ransac.random_seed = 0
+    names = sorted(rig)
+    for i, a in enumerate(names):
+        for b in names[i + 1 :]:
+            pairs = _pairs(seen, a, b)
+            if len(pairs) < 15:
+                continue
+            geometry = pycolmap.estimate_two_view_geometry(
+                cameras[a], points[a], cameras[b], points[b], pairs, options
+            )
+            database.write_matches(ids[a], ids[b], pairs)
+            if len(geometry.inlier_matches) >= 15:
+                database.write_two_view_geometry(ids[a], ids[b], geometry)
+    database.close()
+
+
+def _pixels(moment: Seen, name: str) -> np.ndarray:
+    """A camera's pixels at one moment: 68 landmarks (zeros without a face), then features."""
+    faces = {camera: points for camera, points, _ in moment.landmarks}
+    return np.concatenate([faces.get(name, np.zeros((68, 2))), moment.features[name][0]])
+
+
+def _pairs(seen: Mapping[int, Seen], a: str, b: str) -> np.ndarray:
+    """Matches (M, 2) of two cameras, all moments' keypoints counted through."""
+    found, at = [np.zeros((0, 2), int)], np.zeros(2, int)
+    for moment in seen.values():
+        if {a, b} <= {name for name, _, _ in moment.landmarks}:
+            found.append(np.arange(68)[:, None] + at)
+        found.append(match_looks(moment.features[a][1], moment.features[b][1]) + 68 + at)
+        at += [68 + len(moment.features[name][0]) for name in (a, b)]
+    return np.concatenate(found).astype(np.uint32)
+
+
+def _five(value: float) -> float:
+    return float(f"{value:.5g}")

@@ -1,0 +1,208 @@
+"""A rig is solved from its footage, and given cameras are refined, only for the better."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from express50.cameras import camera_rows
+from express50.cli import main
+from express50.errors import CalibrationError, ConfigError
+from express50.images import write_image
+from express50.layout import Dataset
+from express50.rigs.tracks import Seen, undistorted
+from express50.transforms import similarity_fit
+from pipelines.calibrate.config import CalibrateConfig
+from pipelines.calibrate.faces import pose_of_face, start_camera
+from pipelines.calibrate.refine import refine_by_board, refine_by_footage
+from pipelines.calibrate.structure import _resection, inliers, solve_footage
+from tests.pipelines.board_rigs import POINTS, board_motion, make_rig, observe, rig_errors
+from tests.pipelines.face_rigs import SIZE, face, face_cameras, perturbed, see
+
+CONFIG = CalibrateConfig()
+
+
+@pytest.fixture(autouse=True)
+def head(monkeypatch):
+    monkeypatch.setattr("pipelines.calibrate.structure.mean_landmarks", face)
+
+
+def solve(rig, seen, focals=None, **settings):
+    sizes = dict.fromkeys(rig, SIZE)
+    return solve_footage(seen, sizes, focals or {}, CalibrateConfig(**settings), "capture")
+
+
+def scale_to(cameras, true):
+    names = sorted(cameras)
+    centers = [np.stack([rig[n].center for n in names]) for rig in (cameras, true)]
+    return similarity_fit(*centers)[0]
+
+
+@pytest.fixture(scope="module")
+def solved():
+    rig = face_cameras()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("pipelines.calibrate.structure.mean_landmarks", face)
+        return rig, solve(rig, see(rig))
+
+
+def test_a_rig_is_solved_in_metres_from_faces_and_features(solved):
+    rig, structure = solved
+    assert set(structure.cameras) == set(rig) and not structure.dropped and not structure.weak
+    assert scale_to(structure.cameras, rig) == pytest.approx(1.0, abs=0.03)
+    rotation, position, focal = rig_errors(structure.cameras, rig)
+    assert rotation < 0.8 and position < 0.04 and focal < 4
+    kept = structure.errors[inliers(structure)]
+    assert 0.2 < np.sqrt(np.mean(np.sum(kept**2, axis=1))) < 0.8
+
+
+def test_told_focal_lengths_are_kept_to_and_other_eyes_scale_the_rig(solved):
+    rig, structure = solved
+    told = solve(rig, see(rig), {n: c.K[0, 0] for n, c in rig.items()}, eye_distance_mm=126.0)
+    assert rig_errors(told.cameras, rig)[2] < 2
+    assert scale_to(told.cameras, rig) == pytest.approx(0.5, abs=0.02)
+    again = solve(rig, see(rig))
+    assert json.dumps(camera_rows(again.cameras)) == json.dumps(camera_rows(structure.cameras))
+
+
+def test_the_world_is_upright_and_cameras_on_their_side_follow_the_head(solved):
+    rig, structure = solved
+    ups = -np.mean([c.cam_from_world[1, :3] for c in structure.cameras.values()], axis=0)
+    assert ups[1] > 0.95
+    quarter = np.array([[0.0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+    turned = {}
+    for name, c in rig.items():
+        turned[name] = replace(c, cam_from_world=quarter @ c.cam_from_world)
+    sideways = solve(turned, see(turned)).cameras
+    down = np.mean([c.cam_from_world[1, :3] for c in sideways.values()], axis=0)
+    assert abs(down[1]) < 0.3  # their rows do not run along the head's up, and the world's is that
+
+
+def test_a_camera_without_a_face_is_placed_by_features_or_dropped_with_the_reason():
+    rig = face_cameras(7, 100.0)
+    seen = see(rig, blind=("cam05", "cam06"))
+    for moment in seen.values():
+        moment.features["cam06"] = (np.zeros((0, 2)), np.zeros((0, 128), np.float32))
+    structure = solve(rig, seen)
+    assert list(structure.dropped) == ["cam06"] and "no face" in structure.dropped["cam06"]
+    assert rig_errors(structure.cameras, rig)[0] < 1.0
+
+
+def test_of_two_groups_without_a_common_moment_the_larger_stays():
+    rig = face_cameras(5)
+    seen = see(rig, moments=2)
+    lone = {"cam03", "cam04"}
+    parts = {
+        k: Seen([row for row in m.landmarks if (row[0] in lone) == bool(k)],
+                {n: f for n, f in m.features.items() if (n in lone) == bool(k)})
+        for k, m in seen.items()
+    }  # fmt: skip
+    structure = solve(rig, parts)
+    assert set(structure.cameras) == {"cam00", "cam01", "cam02"}
+    assert set(structure.dropped) == lone and "largest group" in structure.dropped["cam03"]
+
+
+def test_no_common_face_is_refused_in_one_line():
+    rig = face_cameras(3)
+    seen = see(rig, moments=1, blind=("cam01", "cam02"))
+    with pytest.raises(CalibrationError, match="a face is seen by cam00: add calibration") as told:
+        solve(rig, seen)
+    assert "\n" not in str(told.value)
+    with pytest.raises(CalibrationError, match="a face is seen by none"):
+        solve(rig, see(rig, moments=1, blind=tuple(rig)))
+
+
+def refined(given, true, **settings):
+    config = CalibrateConfig(refine=settings.pop("refine", "poses"), **settings)
+    seen = undistorted(see(true, **{"moments": 4}), given)
+    return refine_by_footage(given, given, seen, config)
+
+
+def test_footage_puts_a_perturbed_rig_right():
+    true = face_cameras()
+    given = perturbed(true, 0.3, 5e-3)
+    found = refined(given, true)
+    assert not found.kept and found.after_px < 0.6 * found.before_px
+    before, after = rig_errors(given, true), rig_errors(found.cameras, true)
+    assert after[0] < 0.8 * before[0] and after[1] < before[1]
+    figures = found.figures(given)
+    assert set(figures["moves"]) == set(true) and figures["moves"]["cam00"]["turn_deg"] > 0
+
+
+def test_a_rig_that_is_right_stays_to_the_bit():
+    true = face_cameras()
+    found = refined(true, true)
+    assert found.kept and found.cameras == true and found.figures(true)["moves"] == {}
+    blank = {0: Seen([], {n: (np.zeros((0, 2)), np.zeros((0, 128))) for n in true})}
+    nothing = refine_by_footage(true, true, blank, CalibrateConfig(refine="poses"))
+    assert nothing.kept and nothing.figures(true)["held_out_before_px"] is None
+
+
+def test_lenses_are_refined_where_all_may_move():
+    true = face_cameras()
+    given = {
+        n: replace(c, params=(c.params[0] * (1 + 0.02 * (-1) ** i), *c.params[1:]))
+        for i, (n, c) in enumerate(true.items())
+    }
+    found = refined(given, true, refine="all")
+    assert not found.kept
+    assert rig_errors(found.cameras, true)[2] < 0.7 * rig_errors(given, true)[2]
+
+
+def test_the_board_puts_a_perturbed_rig_right_and_leaves_a_right_one():
+    true = make_rig(4)
+    observations = observe(true, board_motion(18, 1), 0.1)
+    given = perturbed(true, 0.3, 5e-3)
+    for refine in ("poses", "all"):
+        config = CalibrateConfig(refine=refine)
+        found = refine_by_board(given, observations, POINTS, config)
+        assert not found.kept and found.after_px < 0.3 * found.before_px
+        rotation, position, _ = rig_errors(found.cameras, true)
+        assert rotation < 0.1 and position < 2e-3
+        assert refine_by_board(true, observations, POINTS, config).cameras == true
+    middle = [np.mean([c.center for c in rig.values()], axis=0) for rig in (found.cameras, given)]
+    assert np.linalg.norm(middle[0] - middle[1]) < 5e-3  # it stands where it stood
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"refine": "some"}, "refine is 'some'; expected none, poses, all"),
+        ({"eye_distance_mm": 0.0}, "eye_distance_mm is 0.0"),
+        ({"distance_m": float("nan")}, "distance_m is nan"),
+    ],
+)
+def test_settings_that_are_none_are_refused(settings, message):
+    with pytest.raises(ConfigError, match=message):
+        CalibrateConfig(**settings)
+
+
+def test_one_image_a_camera_without_faces_is_refused_by_the_stage(tmp_path, capsys):
+    root = tmp_path / "capture"
+    for name in ("a", "b", "c"):
+        (root / "cameras" / name / "frames").mkdir(parents=True)
+        image = np.full((64, 64, 3), 120, np.uint8)
+        write_image(root / "cameras" / name / "frames" / "000000.jpg", image)
+    (root / "capture.toml").write_text('subject = "S001"\nfps = 1\nfocal_px = -3\n')
+    dataset = Dataset(tmp_path / "data")
+    assert main(["ingest", str(dataset.root), str(root), "--workers", "0"]) == 0
+    assert main(["calibrate", str(dataset.root), "--workers", "0"]) == 1
+    assert "focal_px of a is -3, expected a positive" in capsys.readouterr().out
+    (root / "capture.toml").write_text('subject = "S001"\nfps = 1\n')
+    assert main(["ingest", str(dataset.root), str(root), "--workers", "0"]) == 0
+    assert main(["calibrate", str(dataset.root), "--workers", "0"]) == 1
+    assert "a face is seen by none" in capsys.readouterr().out
+
+
+def test_degenerate_faces_and_matches_give_no_pose():
+    camera = start_camera("a", SIZE, 900.0)
+    spot = np.full((68, 2), 200.0)
+    pose, error = pose_of_face(spot, np.ones(68), camera, np.zeros((68, 3)))
+    assert np.isfinite(pose).all() and (error == np.inf or np.isfinite(error))
+    same = [(np.array([10.0 + i, 20.0]), np.zeros(3)) for i in range(40)]
+    once = [(np.array([10.0, 20.0]), np.ones(3))] * 40
+    assert _resection(same, camera) is None and _resection(once, camera) is None
+    assert _resection([], camera) is None
