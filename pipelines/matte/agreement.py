@@ -20,7 +20,7 @@ FEWEST = 4  # views; of three, two that err alike would overrule one that does n
 EMPTY, FULL = 0.003, 0.98  # shares of the image
 # Share of a matte elsewhere than the others' subject, and of that which it lacks: together they
 # mean another place. Lacking this much more is enough by itself.
-STRAY, LACKING, MOST_LACKING = 0.05, 0.15, 0.3
+STRAY, LACKING, MOST_LACKING = 0.03, 0.07, 0.3
 
 
 @dataclass(frozen=True)
