@@ -15,7 +15,7 @@ from pipelines.depth.prior import boundary_loops, make_prior, matte_agreement
 from pipelines.depth.raycast import cast_view, write_ply
 from pipelines.depth.reconstruct import reconstruct
 from pipelines.depth.surface import advance, extract_mesh
-from pipelines.depth.sweep import mesh_scene
+from express50.raycast import mesh_scene
 from pipelines.depth.views import make_view, without_contradiction
 from tests.pipelines.bump_head import mesh, render, ring
 
