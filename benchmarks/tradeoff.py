@@ -23,7 +23,7 @@ from express50.twin.truth import Truth
 SECTION = "Presets of the stages"
 PRESETS = ("draft", "standard", "reference")
 MEASURES = {
-    "calibrate": (accuracy.measure_calibrate, "head_px"),
+    "calibrate": (accuracy.measure_calibrate, "translation_error_mm_max"),
     "align": (accuracy.measure_align, "peak_error_frames_mean"),
     "matte": (accuracy.measure_matte, "mae"),
     "track": (accuracy.measure_track, "vertex_rmse_mm"),

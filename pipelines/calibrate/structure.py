@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import NoReturn
 
 import cv2
 import numpy as np
@@ -94,21 +95,10 @@ def solve_footage(
             the solution and nothing tells the metre.
     """
     head = mean_landmarks()
-    share = focal_at(config.distance_m, seen, sizes, head)
-    model = "SIMPLE_RADIAL" if config.camera_model == AUTO else config.camera_model
-    start = {
-        n: as_model(start_camera(n, size, focals.get(n, share * max(size))), model)
-        for n, size in sizes.items()
-    }
+    start = _start_cameras(seen, sizes, focals, config, head)
     rig = face_rig(start, seen, head)
     if len(rig) < 2:
-        faces = sorted({name for moment in seen.values() for name, _, _ in moment.landmarks})
-        raise CalibrationError(
-            f"{where}: has neither calibration.json nor board images, and to solve its cameras from"
-            f" footage two or more must see a face at the same time; a face is seen by"
-            f" {', '.join(faces) or 'none'}: add calibration.json or board/<camera>/*.png with"
-            " board.toml, then run 'express50 ingest' again"
-        )
+        _refuse(seen, where)
     dropped = _without_face(sizes, seen, rig)
     told = all(name in focals for name in sizes)
     freedom = Freedom(
@@ -127,16 +117,40 @@ def solve_footage(
             rig = {name: camera for name, camera in rig.items() if name not in loose}
             rig, tracks, adjusted = _sharpen(rig, seen, freedom)
     metric, moments, spread = _metric(rig, seen, config.eye_distance_mm * 1e-3, where)
-    world, up = _head_pose(metric, seen, head)
-    canonical = canonical_from_rig(metric, world, up)
     return Structure(
-        cameras=move_cameras(metric, canonical),
+        cameras=move_cameras(metric, canonical_from_rig(metric, *_head_pose(metric, seen, head))),
         tracks=tracks,
         errors=adjusted.errors,
         dropped={n: why for n, why in sorted(dropped.items()) if n not in rig},
         weak=_weak(tracks),
         eye_moments=moments,
         eye_spread=spread,
+    )
+
+
+def _start_cameras(
+    seen: Mapping[int, Seen],
+    sizes: Mapping[str, tuple[int, int]],
+    focals: Mapping[str, float],
+    config: CalibrateConfig,
+    head: np.ndarray,
+) -> dict[str, Camera]:
+    """Cameras at the origin with focal lengths that are told, or that put faces so far away."""
+    share = focal_at(config.distance_m, seen, sizes, head)
+    model = "SIMPLE_RADIAL" if config.camera_model == AUTO else config.camera_model
+    return {
+        name: as_model(start_camera(name, size, focals.get(name, share * max(size))), model)
+        for name, size in sizes.items()
+    }
+
+
+def _refuse(seen: Mapping[int, Seen], where: str) -> NoReturn:
+    faces = sorted({name for moment in seen.values() for name, _, _ in moment.landmarks})
+    raise CalibrationError(
+        f"{where}: has neither calibration.json nor board images, and to solve its cameras from"
+        f" footage two or more must see a face at the same time; a face is seen by"
+        f" {', '.join(faces) or 'none'}: add calibration.json or board/<camera>/*.png with"
+        " board.toml, then run 'express50 ingest' again"
     )
 
 
