@@ -17,8 +17,9 @@ from express50.rigs.tracks import Seen, undistorted
 from express50.transforms import similarity_fit
 from pipelines.calibrate.config import CalibrateConfig
 from pipelines.calibrate.faces import pose_of_face, start_camera
+from pipelines.calibrate.placing import _resection
 from pipelines.calibrate.refine import refine_by_board, refine_by_footage
-from pipelines.calibrate.structure import _resection, inliers, solve_footage
+from pipelines.calibrate.structure import inliers, solve_footage
 from tests.pipelines.board_rigs import POINTS, board_motion, make_rig, observe, rig_errors
 from tests.pipelines.face_rigs import SIZE, face, face_cameras, perturbed, see
 
