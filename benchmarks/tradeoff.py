@@ -23,7 +23,7 @@ from pipelines.order import FIRST, STAGES
 SECTION = "Presets of the stages"
 PRESETS = ("draft", "standard", "reference")
 MEASURES = {
-    "calibrate": (accuracy.measure_calibrate, "head_px"),
+    "calibrate": (accuracy.measure_calibrate, "translation_error_mm_max"),
     "align": (accuracy.measure_align, "peak_error_frames_mean"),
     "alpha": (accuracy.measure_alpha, "mae"),
     "matte": (accuracy.measure_matte, "mae"),

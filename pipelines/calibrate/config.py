@@ -72,5 +72,5 @@ class CalibrateConfig:
 PRESETS: dict[str, dict[str, object]] = {
     "draft": {"board_frames": 36, "rounds": 1, "solve_moments": 4, "check_moments": 0},
     "standard": {},
-    "reference": {"board_frames": 0, "rounds": 5, "solve_moments": 16, "check_moments": 4},
+    "reference": {"board_frames": 0, "solve_moments": 16, "check_moments": 4},
 }

@@ -102,7 +102,10 @@ def _refine_by_footage(
     index: Index, cameras: dict[str, Camera], config: CalibrateConfig
 ) -> Refined:
     checked = look_at_footage(index, cameras, max(1, config.check_moments))
-    start = checked.cameras if checked is not None else cameras
+    # One bumped camera is put right first. Where several seem to have moved, the whole rig is off,
+    # and whom the look blames is not to be trusted.
+    lone = checked is not None and len(checked.moved) == 1
+    start = checked.cameras if checked is not None and lone else cameras
     seen = see_footage(index, cameras, config.solve_moments)
     small = {name: reduced_camera(camera) for name, camera in cameras.items()}
     placed = {n: replace(c, cam_from_world=start[n].cam_from_world) for n, c in small.items()}

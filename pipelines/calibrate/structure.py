@@ -9,15 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import NoReturn
 
-import cv2
 import numpy as np
 
 from express50.cameras import Camera, triangulate
 from express50.errors import CalibrationError
 from express50.rigs.adjust import triangulate_tracks
 from express50.rigs.bundle import ITERATIONS, Adjusted, Freedom, adjust_rig
-from express50.rigs.features import match_looks
 from express50.rigs.footage import LEAST_POINTS, shared_points
 from express50.rigs.tracks import (
     FEATURE_SIGMA_PX,
@@ -28,10 +27,11 @@ from express50.rigs.tracks import (
     undistorted,
 )
 from express50.rigs.world import canonical_from_rig, move_cameras
-from express50.transforms import make_transform, rigid_fit
+from express50.transforms import rigid_fit
 from pipelines.calibrate.config import AUTO, CalibrateConfig
 from pipelines.calibrate.faces import face_rig, focal_at, mean_landmarks, start_camera
 from pipelines.calibrate.intrinsics import as_model
+from pipelines.calibrate.placing import LEAST_INLIERS, place_others
 
 FACE_SCALES, FEATURE_SCALES = (6.0, 2.0), (3.0, 1.5)
 """Cauchy scales of the adjustments, in expected errors, wide ones first."""
@@ -43,8 +43,6 @@ KNOWN_FOCAL, GUESSED_FOCAL = 0.02, 0.3
 CENTRE, BEND = 0.005, 0.02
 """How far principal points are from the middle, and how far lenses bend the image's corner, as
 shares of the diagonal and half of it: footage alone hardly tells either."""
-LEAST_INLIERS, LEAST_SHARE, INLIER_PX = 12, 0.4, 4.0
-"""Known points, and share of those it seems to see, by which a camera without a face is placed."""
 OUTLIER = 4.0
 """Errors, in expected ones, that count as mismatches in what is reported."""
 EYES = (slice(36, 42), slice(42, 48))
@@ -94,21 +92,10 @@ def solve_footage(
             the solution and nothing tells the metre.
     """
     head = mean_landmarks()
-    share = focal_at(config.distance_m, seen, sizes, head)
-    model = "SIMPLE_RADIAL" if config.camera_model == AUTO else config.camera_model
-    start = {
-        n: as_model(start_camera(n, size, focals.get(n, share * max(size))), model)
-        for n, size in sizes.items()
-    }
+    start = _start_cameras(seen, sizes, focals, config, head)
     rig = face_rig(start, seen, head)
     if len(rig) < 2:
-        faces = sorted({name for moment in seen.values() for name, _, _ in moment.landmarks})
-        raise CalibrationError(
-            f"{where}: has neither calibration.json nor board images, and to solve its cameras from"
-            f" footage two or more must see a face at the same time; a face is seen by"
-            f" {', '.join(faces) or 'none'}: add calibration.json or board/<camera>/*.png with"
-            " board.toml, then run 'express50 ingest' again"
-        )
+        _refuse(seen, where)
     dropped = _without_face(sizes, seen, rig)
     told = all(name in focals for name in sizes)
     freedom = Freedom(
@@ -119,7 +106,7 @@ def solve_footage(
     )
     rig = _settle(rig, seen)
     rig, tracks, adjusted = _sharpen(rig, seen, freedom)
-    more = _place_others(rig, {n: start[n] for n in dropped}, seen)
+    more = place_others(rig, {n: start[n] for n in dropped}, undistorted(seen, rig), seen)
     if more:
         rig, tracks, adjusted = _sharpen(rig | more, seen, freedom)
         loose = set(_weak(tracks)) & set(more)  # neither a face nor features hold these
@@ -127,16 +114,40 @@ def solve_footage(
             rig = {name: camera for name, camera in rig.items() if name not in loose}
             rig, tracks, adjusted = _sharpen(rig, seen, freedom)
     metric, moments, spread = _metric(rig, seen, config.eye_distance_mm * 1e-3, where)
-    world, up = _head_pose(metric, seen, head)
-    canonical = canonical_from_rig(metric, world, up)
     return Structure(
-        cameras=move_cameras(metric, canonical),
+        cameras=move_cameras(metric, canonical_from_rig(metric, *_head_pose(metric, seen, head))),
         tracks=tracks,
         errors=adjusted.errors,
         dropped={n: why for n, why in sorted(dropped.items()) if n not in rig},
         weak=_weak(tracks),
         eye_moments=moments,
         eye_spread=spread,
+    )
+
+
+def _start_cameras(
+    seen: Mapping[int, Seen],
+    sizes: Mapping[str, tuple[int, int]],
+    focals: Mapping[str, float],
+    config: CalibrateConfig,
+    head: np.ndarray,
+) -> dict[str, Camera]:
+    """Cameras at the origin with focal lengths that are told, or that put faces so far away."""
+    share = focal_at(config.distance_m, seen, sizes, head)
+    model = "SIMPLE_RADIAL" if config.camera_model == AUTO else config.camera_model
+    return {
+        name: as_model(start_camera(name, size, focals.get(name, share * max(size))), model)
+        for name, size in sizes.items()
+    }
+
+
+def _refuse(seen: Mapping[int, Seen], where: str) -> NoReturn:
+    faces = sorted({name for moment in seen.values() for name, _, _ in moment.landmarks})
+    raise CalibrationError(
+        f"{where}: has neither calibration.json nor board images, and to solve its cameras from"
+        f" footage two or more must see a face at the same time; a face is seen by"
+        f" {', '.join(faces) or 'none'}: add calibration.json or board/<camera>/*.png with"
+        " board.toml, then run 'express50 ingest' again"
     )
 
 
@@ -174,69 +185,6 @@ def _sharpen(
             adjusted = adjust_rig(rig, tracks, points, freedom, scale, ITERATIONS)
             rig = adjusted.cameras
     return rig, tracks, adjusted
-
-
-def _place_others(
-    rig: Mapping[str, Camera], others: Mapping[str, Camera], seen: Mapping[int, Seen]
-) -> dict[str, Camera]:
-    """Cameras without a face, placed by features that look like points the rig knows."""
-    known = _known_features(rig, seen) if others else {}
-    shares = [c.K[0, 0] / max(c.width, c.height) for c in rig.values()]
-    placed = {}
-    for name, camera in sorted(others.items()):
-        found: list[tuple[np.ndarray, np.ndarray]] = []
-        for (frame, _), (where, described) in known.items():
-            if name in seen[frame].features:
-                pixels, mine = seen[frame].features[name]
-                found += [(pixels[i], where[j]) for i, j in match_looks(mine, described)]
-        focal = float(np.median(shares)) * max(camera.width, camera.height)
-        lens = as_model(start_camera(name, (camera.width, camera.height), focal), camera.model)
-        pose = _resection(found, lens)
-        if pose is not None:
-            placed[name] = replace(lens, cam_from_world=pose)
-    return placed
-
-
-def _known_features(
-    rig: Mapping[str, Camera], seen: Mapping[int, Seen]
-) -> dict[tuple[int, str], tuple[np.ndarray, np.ndarray]]:
-    """World points (M, 3) and descriptors (M, 128) of the features in tracks, by frame, camera."""
-    ideal = undistorted(seen, rig)
-    tracks = join_verified(rig, ideal, BANDS[-1])
-    points = triangulate_tracks(rig, tracks)
-    known = {}
-    for index, name in enumerate(tracks.names):
-        mine = np.flatnonzero(tracks.camera == index)
-        number = {p.tobytes(): n for p, n in
-                  zip(tracks.pixels[mine], tracks.point[mine], strict=True)}  # fmt: skip
-        for frame, moment in ideal.items():
-            if name in moment.features:
-                pixels, described = moment.features[name]
-                rows = [i for i, p in enumerate(pixels) if p.tobytes() in number]
-                at = [number[pixels[i].tobytes()] for i in rows]
-                known[frame, name] = (points[at], described[rows])
-    return known
-
-
-def _resection(found: list[tuple[np.ndarray, np.ndarray]], camera: Camera) -> np.ndarray | None:
-    """Pose (4, 4) of a camera from pixels of known points; None without enough that agree."""
-    # One point is met once for every camera that knows it: samples must not repeat it.
-    rows = np.unique([np.concatenate(pair) for pair in found] or np.zeros((0, 5)), axis=0)
-    if len(np.unique(rows[:, :2], axis=0)) < LEAST_INLIERS:
-        return None
-    pixels, where = np.ascontiguousarray(rows[:, :2]), np.ascontiguousarray(rows[:, 2:])
-    try:
-        ok, turn, shift, inliers = cv2.solvePnPRansac(
-            where, pixels, camera.K, None, iterationsCount=2000, reprojectionError=INLIER_PX,
-            confidence=0.999, flags=cv2.SOLVEPNP_EPNP,
-        )  # fmt: skip
-    except cv2.error:  # points on a line or on one spot
-        return None
-    good = inliers[:, 0] if ok and inliers is not None else np.zeros(0, int)
-    alike = min(len(np.unique(column[good], axis=0)) for column in (pixels, where))
-    if alike < LEAST_INLIERS or len(good) < LEAST_SHARE * len(rows):
-        return None
-    return make_transform(cv2.Rodrigues(turn)[0], shift.ravel())
 
 
 def _landmark_points(

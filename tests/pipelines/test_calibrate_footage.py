@@ -6,6 +6,7 @@ import json
 from dataclasses import replace
 
 import numpy as np
+import OpenImageIO as oiio
 import pytest
 
 from express50.cameras import camera_rows
@@ -17,8 +18,10 @@ from express50.rigs.tracks import Seen, undistorted
 from express50.transforms import similarity_fit
 from pipelines.calibrate.config import CalibrateConfig
 from pipelines.calibrate.faces import pose_of_face, start_camera
+from pipelines.calibrate.footage import _film_focal
+from pipelines.calibrate.placing import _resection
 from pipelines.calibrate.refine import refine_by_board, refine_by_footage
-from pipelines.calibrate.structure import _resection, inliers, solve_footage
+from pipelines.calibrate.structure import inliers, solve_footage
 from tests.pipelines.board_rigs import POINTS, board_motion, make_rig, observe, rig_errors
 from tests.pipelines.face_rigs import SIZE, face, face_cameras, perturbed, see
 
@@ -206,3 +209,15 @@ def test_degenerate_faces_and_matches_give_no_pose():
     once = [(np.array([10.0, 20.0]), np.ones(3))] * 40
     assert _resection(same, camera) is None and _resection(once, camera) is None
     assert _resection([], camera) is None
+
+
+def test_exif_tells_the_focal_length_of_film(tmp_path):
+    path = str(tmp_path / "a.jpg")
+    spec = oiio.ImageSpec(36, 24, 3, "uint8")
+    spec.attribute("Exif:FocalLengthIn35mmFilm", "int", 85)
+    file = oiio.ImageOutput.create(path)
+    assert file.open(path, spec) and file.write_image(np.zeros((24, 36, 3), np.uint8))
+    file.close()
+    assert _film_focal(path) == 85.0
+    write_image(tmp_path / "b.jpg", np.zeros((8, 8, 3), np.uint8))
+    assert _film_focal(str(tmp_path / "b.jpg")) == 0.0
