@@ -9,13 +9,13 @@ import pytest
 
 from express50.cameras import rays
 from express50.errors import StageError
+from express50.raycast import mesh_scene
 from pipelines.depth.config import DepthConfig
 from pipelines.depth.grid import Grid, head_box, hull_distance, silhouette_distance
 from pipelines.depth.prior import boundary_loops, make_prior, matte_agreement
 from pipelines.depth.raycast import cast_view, write_ply
 from pipelines.depth.reconstruct import reconstruct
 from pipelines.depth.surface import advance, extract_mesh
-from express50.raycast import mesh_scene
 from pipelines.depth.views import make_view, without_contradiction
 from tests.pipelines.bump_head import mesh, render, ring
 
