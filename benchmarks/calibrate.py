@@ -8,7 +8,8 @@ object. Without a dataset named, 24 cameras before a ChArUco board and one neutr
 recorded first (some minutes). Then one camera of the solved rig after another is turned by
 ``BUMP_DEG`` and must be found in the footage, and nothing may be found in the rig as solved.
 ``sfm`` and ``refine`` are rigs solved from footage alone, and perturbed ones put right, on the twin
-and on the foreign heads of ``../shared/captures`` where they are.
+and on the foreign heads of ``../shared/captures`` where they are. ``colour_gain_error_percent`` is of
+linear light a channel; ``colour_gain_unevened_percent`` leaves the cameras' colours as they are.
 """
 
 from __future__ import annotations
@@ -44,6 +45,8 @@ from express50.transforms import (
 )
 from express50.twin.config import TwinConfig
 from express50.twin.record import print_progress, record
+from express50.twin.rig import make_rig
+from express50.twin.sensor import make_sensor
 from express50.twin.truth import Truth, align_worlds
 from pipelines import ingest
 from pipelines.calibrate import STAGE
@@ -54,6 +57,7 @@ from pipelines.calibrate.board import (
     read_observations,
 )
 from pipelines.calibrate.bundle import Rig, residuals
+from pipelines.calibrate.colour import Palette, gains_of
 from pipelines.calibrate.config import CalibrateConfig
 from pipelines.calibrate.graph import join, mean_transform, rig_from_board
 from pipelines.calibrate.intrinsics import (
@@ -107,7 +111,10 @@ def main() -> int:
     points = board_points(board)
     sizes = {name: (source.width, source.height) for name, source in index.cameras.items()}
     start = time.process_time()
-    observations = read_observations(board, board_files(index), sizes, config.board_frames)
+    palette = Palette(board)
+    observations = read_observations(
+        board, board_files(index), sizes, config.board_frames, palette.look
+    )
     detected = time.process_time()
     solution = solve_rig(observations, points, sizes, config)
     solved = time.process_time()
@@ -131,8 +138,26 @@ def main() -> int:
         **footage_figures(index, true, (observations, points), config),
         "baseline": {"opencv_chain": rounded(baseline)},
     }
+    if args.dataset is None:
+        row |= gain_figures(palette, sorted(solution.cameras))
     print(json.dumps({"benchmark": "calibrate", "preset": args.preset, **rounded(row)}))
     return 0
+
+
+def gain_figures(palette: Palette, names: list[str]) -> dict[str, float]:
+    """Root mean square error of the colour gains, percent, and the same of leaving colours be."""
+    found = gains_of(palette.whites, names)
+    every = sorted(make_rig(RIG.cameras, RIG.width, RIG.height, RIG.seed))
+    true = np.log([make_sensor(every.index(name), RIG.seed).gain for name in names])
+    true -= true.mean(0)
+
+    def rms(errors: np.ndarray) -> float:
+        return 100 * float(np.sqrt(np.mean(errors**2)))
+
+    return {
+        "colour_gain_error_percent": rms(np.log(found.gain) - true),
+        "colour_gain_unevened_percent": rms(true),
+    }
 
 
 def footage_figures(
