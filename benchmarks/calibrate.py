@@ -8,8 +8,9 @@ object. Without a dataset named, 24 cameras before a ChArUco board and one neutr
 recorded first (some minutes). Then one camera of the solved rig after another is turned by
 ``BUMP_DEG`` and must be found in the footage, and nothing may be found in the rig as solved.
 ``sfm`` and ``refine`` are rigs solved from footage alone, and perturbed ones put right, on the twin
-and on the foreign heads of ``../shared/captures`` where they are. ``colour_gain_error_percent`` is of
-linear light a channel; ``colour_gain_unevened_percent`` leaves the cameras' colours as they are.
+and on the foreign heads of ``../shared/captures`` where they are.
+``colour_gain_error_percent`` is of linear light a channel; ``colour_gain_unevened_percent`` leaves
+the cameras' colours as they are.
 """
 
 from __future__ import annotations
