@@ -19,7 +19,7 @@ from express50.frames import read_proxy
 from express50.images import contact_sheet, write_image
 from express50.index import Cue, Index, read_index
 from express50.landmarks.detector import detect
-from express50.landmarks.network import LandmarkNet, load_network
+from express50.landmarks.network import WEIGHTS, LandmarkNet, load_network
 from express50.layout import Dataset
 from express50.stage import Stage
 
@@ -90,8 +90,8 @@ def read_observations(dataset: Dataset, subject: str) -> Observations:
 
 
 def item_inputs(dataset: Dataset, item: str, config: ObserveConfig) -> dict[str, Path | str]:
-    """The subject's index and proxies."""
-    return {"ingest": dataset.item_dir("ingest", item)}
+    """The subject's index and proxies, and the landmark network's weights."""
+    return {"ingest": dataset.item_dir("ingest", item), "weights": WEIGHTS}
 
 
 def run_item(dataset: Dataset, item: str, config: ObserveConfig, out: Path) -> dict:

@@ -18,6 +18,8 @@ SKIPPED = {
     "depth",
     "regions",
     "regions_truth",
+    "matte_scenes",
+    "matte_disturbances",
 }
 
 

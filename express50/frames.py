@@ -158,11 +158,21 @@ def read_frame(
 def read_plate(
     dataset: Dataset, subject: str, camera_id: str, undistort: bool = True
 ) -> np.ndarray | None:
-    """Clean background plate (H, W, 3) uint8 sRGB, or None where the capture has none."""
+    """Clean background plate (H, W, 3) uint8 sRGB, or None where the capture has none.
+
+    Raises:
+        CaptureError: it cannot be read, or is not of the footage's size.
+    """
     index = read_index(dataset, subject)
     if camera_id not in index.plates:
         return None
-    image = read_srgb8(index.capture / index.plates[camera_id])
+    path = index.capture / index.plates[camera_id]
+    image, footage = read_srgb8(path), index.cameras.get(camera_id)
+    if footage is not None and image.shape[:2] != (footage.height, footage.width):
+        raise CaptureError(
+            f"{path}: plate is {image.shape[1]}x{image.shape[0]}, the footage of {camera_id} is "
+            f"{footage.width}x{footage.height}; record the plate with the settings of the capture"
+        )
     return _undistorted(dataset, subject, camera_id, image) if undistort else image
 
 

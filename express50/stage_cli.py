@@ -143,7 +143,8 @@ def _run(args: argparse.Namespace, names: list[str], pattern: str | None) -> int
                 say(*summaries[-1].lines())
     if args.json:
         accounts = [summary.to_json() for summary in summaries]
-        say_json(accounts if args.command == "run" else accounts[-1])
+        before = {"before": accounts[:-1]} if len(accounts) > 1 else {}
+        say_json(accounts if args.command == "run" else accounts[-1] | before)
     return OK if all(summary.ok for summary in summaries) else FAILED
 
 

@@ -53,5 +53,8 @@ def run_withdraw(args: argparse.Namespace) -> int:
         say(*(f"STILL NAMES {done.subject}: {path}" for path in done.remaining))
         if done.capture:
             say(f"the raw capture {done.capture} is outside the dataset: delete it yourself")
-        say("run 'express50 pack' and 'express50 report' again; retrain models that saw the person")
+        say(
+            "run 'express50 matte' again, as others' plates may have come from the person, then "
+            "the stages after it and 'express50 report'; retrain models that saw the person"
+        )
     return FAILED if done.remaining else OK

@@ -9,6 +9,7 @@ import open3d as o3d
 
 from express50.head.model import HeadModel
 from express50.landmarks.synthetic import RandomHead
+from express50.raycast import mesh_scene
 
 FRAME_SIDE_M = 0.38
 # A landmark counts as seen if nothing lies further than this in front of it.
@@ -39,10 +40,7 @@ class HeadScene:
     def __init__(self, model: HeadModel, head: RandomHead) -> None:
         self.faces = model.faces.numpy()
         self.head = head
-        self.scene = o3d.t.geometry.RaycastingScene(nthreads=1)
-        self.scene.add_triangles(
-            o3d.core.Tensor(head.vertices), o3d.core.Tensor(self.faces.astype(np.uint32))
-        )
+        self.scene = mesh_scene(head.vertices, self.faces)
 
     def render(self, rng: Rng, side: int, yaw: float) -> View:
         """Render (side, side) pixels from a yaw in radians, 0 in front; the rest is random."""

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import argparse
 import time
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from pathlib import Path
 
 import numpy as np
@@ -95,7 +95,8 @@ def train(models: list[HeadModel], plan: Plan, folder: Path) -> LandmarkNet:
     backgrounds = make_backgrounds(400, np.random.default_rng([plan.seed, 1]))
     net = LandmarkNet().train().to(memory_format=torch.channels_last)
     optimiser = torch.optim.AdamW(net.parameters(), lr=RATE, weight_decay=1e-3)
-    state = folder / f"training-{'-'.join(model.name for model in models)}-{plan.seed}.pt"
+    name = "-".join([*(m.name for m in models), *(str(value) for value in astuple(plan))])
+    state = folder / f"training-{name}.pt"
     first = _take_up(state, net, optimiser)
     began, losses = time.monotonic(), []
     sets: list[ViewSet] = []

@@ -30,7 +30,7 @@ _COLUMNS = 8
 _VIDEO_LIMIT = 8_000_000
 _PURPOSES = {
     "ingest": "Footage indexed frame by frame, with proxies for scrubbing.",
-    "calibrate": "Cameras, given or solved from the board.",
+    "calibrate": "Cameras: given, or solved from the board or the footage.",
     "observe": "The cameras that watch the face through the cue windows.",
     "align": "The labelled frame of every expression, with its cue window's first and last frame.",
     "alpha": "Alpha of every peak frame, each camera by itself.",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -57,6 +58,14 @@ class AlphaConfig:
             raise ConfigError(
                 f"alpha.spread {self.spread}, alpha.shadow {self.shadow}: expected 0 to 1, below 1"
             )
+        if self.noise_frames < 1 or self.plate_frames < 1:
+            raise ConfigError(
+                f"alpha.noise_frames {self.noise_frames}, alpha.plate_frames {self.plate_frames}:"
+                " expected 1 or more"
+            )
+        for name in ("firm", "core", "fill", "noise_floor"):
+            if not (math.isfinite(value := getattr(self, name)) and value >= 0):
+                raise ConfigError(f"alpha.{name} is {value}, expected a number of 0 or more")
         self._check_networks()
 
     def _check_networks(self) -> None:

@@ -62,8 +62,9 @@ def inputs(dataset: Dataset, item: str, config: AlphaConfig) -> dict[str, Path |
 
 def _weights(config: AlphaConfig) -> Path:
     path = Path(config.weights).expanduser()
-    if not path.is_file():
-        raise StageError(f"alpha.weights {path}: no such file; expected TorchScript or .onnx")
+    from pipelines.networks import check_file  # torch takes seconds to import
+
+    check_file(path, "alpha.weights")
     return path
 
 

@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 from scipy.sparse.csgraph import connected_components
 
+from express50.adapters import corner_to_opencv_pixels
 from express50.images import srgb_to_linear
 from express50.publish import write_json
 from pipelines.calibrate.board import Board, opencv_board
@@ -137,7 +138,7 @@ def _paper(image: np.ndarray, corners: np.ndarray) -> tuple[float, float, float]
         return None
     part = image[low[1] : high[1], low[0] : high[0]]
     mask = np.zeros(part.shape[:2], np.uint8)
-    cv2.fillConvexPoly(mask, np.rint(inner - low - 0.5).astype(np.int32), 1)
+    cv2.fillConvexPoly(mask, np.rint(corner_to_opencv_pixels(inner - low)).astype(np.int32), 1)
     levels = part[mask > 0]
     order = np.argsort(levels.sum(1, dtype=np.int32), kind="stable")
     paper = levels[order[-max(1, round(WHITE_SHARE * len(levels))) :]]

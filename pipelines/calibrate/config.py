@@ -12,6 +12,10 @@ REFINE = ("none", "poses", "all")
 MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
 
 
+LEAST = {"board_frames": 0, "rounds": 1, "min_corners": 4, "min_frames": 1, "weak_corners": 0,
+         "weak_frames": 0, "check_moments": 0}  # fmt: skip
+
+
 @dataclass(frozen=True, kw_only=True)
 class CalibrateConfig:
     """Every field trades time, or strictness, for accuracy; none depends on a rig."""
@@ -62,8 +66,13 @@ class CalibrateConfig:
             )
         if self.refine not in REFINE:
             raise ConfigError(f"calibrate.refine is {self.refine!r}; expected {', '.join(REFINE)}")
-        for name in ("distance_m", "focal_spread", "eye_distance_mm", "refine_turn_deg",
-                     "refine_move_mm", "solve_moments"):  # fmt: skip
+        for name, least in LEAST.items():
+            if getattr(self, name) < least:
+                raise ConfigError(
+                    f"calibrate.{name} is {getattr(self, name)}; expected {least} or more"
+                )
+        for name in ("distance_m", "focal_spread", "eye_distance_mm", "reject_sigma",
+                     "refine_turn_deg", "refine_move_mm", "solve_moments"):  # fmt: skip
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0):
                 raise ConfigError(f"calibrate.{name} is {value}; expected a positive number")

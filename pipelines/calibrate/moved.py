@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
@@ -29,7 +30,7 @@ def look_at_footage(
     return check_footage(cameras, frames, load_network())
 
 
-def footage_metrics(verdict: FootageVerdict | None) -> dict[str, object]:
+def footage_metrics(verdict: FootageVerdict | None) -> dict[str, Any]:
     """The verdict as metrics: figures, and a warning for each camera that has moved."""
     if verdict is None:
         return {"footage": None, "warnings": []}

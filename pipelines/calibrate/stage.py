@@ -8,8 +8,9 @@ from pathlib import Path
 import numpy as np
 
 from express50.cameras import Camera, read_cameras, resized, write_cameras
-from express50.errors import CalibrationError
+from express50.errors import CalibrationError, CaptureError
 from express50.index import Index, index_path, read_index
+from express50.landmarks.network import WEIGHTS
 from express50.layout import Dataset
 from express50.rigs.footage import reduced_camera
 from express50.rigs.tracks import undistorted
@@ -41,9 +42,9 @@ def items(dataset: Dataset) -> list[str]:
 
 
 def inputs(dataset: Dataset, item: str, config: CalibrateConfig) -> dict[str, Path | str]:
-    """The frame index, the calibration file and every board image, as far as there."""
+    """The frame index, the calibration file and every board image, as far as there; weights."""
     index = read_index(dataset, item)
-    found: dict[str, Path | str] = {"index": index_path(dataset, item)}
+    found: dict[str, Path | str] = {"index": index_path(dataset, item), "weights": WEIGHTS}
     if index.calibration is not None:
         found["calibration"] = index.capture / index.calibration
     if index.board is not None:
@@ -71,21 +72,29 @@ def _run_given(index: Index, config: CalibrateConfig, out: Path) -> dict:
     cameras = {name: given[name] for name in sorted(index.cameras) if name in given}
     check_given(cameras, sizes_of(index), str(path))
     facts: dict[str, object] = {}
-    if index.board is not None and index.board["cameras"]:
-        limit = COLOUR_FRAMES if config.refine == "none" else config.board_frames
-        observations, points, palette = _board_seen(index, limit)
-        facts["colour"] = palette.write(out / "gains.json", sorted(cameras))
+    odd: list[dict[str, str]] = []
+    has_board = index.board is not None and bool(index.board["cameras"])
     if config.refine != "none":
-        if facts:
+        if has_board:
+            observations, points, palette = _board_seen(index, config.board_frames)
+            facts["colour"] = palette.write(out / "gains.json", sorted(cameras))
             refined = refine_by_board(cameras, observations, points, config)
         else:
             refined = _refine_by_footage(index, cameras, config)
         facts["refined"] = refined.figures(cameras)
         cameras = refined.cameras
+    elif has_board:
+        try:
+            palette = _board_seen(index, COLOUR_FRAMES)[2]
+            facts["colour"] = palette.write(out / "gains.json", sorted(cameras))
+        except (CalibrationError, CaptureError) as error:
+            # The cameras do not need it: they were given.
+            odd.append({"what": "board", "why": f"tells no colours: {error}"})
     write_cameras(out / "cameras.json", cameras)
     (out / "qc").mkdir()
     draw_rig(out / "qc" / "rig.jpg", cameras, np.zeros((0, 3)))
     missing = sorted(set(index.cameras) - set(cameras))
+    seen = footage_metrics(look_at_footage(index, cameras, config.check_moments))
     return {
         "source": "given",
         "reprojection_px": None,
@@ -94,7 +103,8 @@ def _run_given(index: Index, config: CalibrateConfig, out: Path) -> dict:
         "weak": [],
         "dropped": [{"what": name, "why": f"not in {path.name}"} for name in missing],
         **facts,
-        **footage_metrics(look_at_footage(index, cameras, config.check_moments)),
+        **seen,
+        "warnings": odd + seen["warnings"],
     }
 
 
@@ -152,16 +162,8 @@ def check_given(cameras: dict[str, Camera], sizes: dict[str, tuple[int, int]], w
 
 
 def _run_board(index: Index, config: CalibrateConfig, out: Path) -> dict:
-    table = index.board or {}
-    where = f"{index.capture}: board.toml"
-    board = board_from_table(table["config"], where)
-    sizes = {name: (source.width, source.height) for name, source in index.cameras.items()}
-    files = {
-        name: [index.capture / file for file in table["cameras"].get(name, [])] for name in sizes
-    }
-    palette = Palette(board)
-    observations = read_observations(board, files, sizes, config.board_frames, palette.look)
-    solution = solve_rig(observations, board_points(board), sizes, config)
+    observations, points, palette = _board_seen(index, config.board_frames)
+    solution = solve_rig(observations, points, sizes_of(index), config)
     write_cameras(out / "cameras.json", solution.cameras)
     (out / "qc").mkdir()
     boards = np.array([pose[:3, 3] for pose in solution.boards.values()]).reshape(-1, 3)

@@ -47,7 +47,10 @@ def run(dataset: Dataset, item: str, config: MatteConfig, out: Path) -> dict:
     files = {name: dataset.alpha_file(subject, expression, name) for name in cameras}
     there = {name: path for name, path in files.items() if path.is_file()}
     if not there:
-        raise StageError(f"{item}: no camera has an alpha; run 'express50 matte {dataset.root}'")
+        raise StageError(
+            f"{item}: no camera has an alpha; see what 'express50 status {dataset.root}' says of"
+            " the alpha stage, then run 'express50 matte' again"
+        )
     views, found = _compared(dataset, item, {name: cameras[name] for name in there}, config)
     changes: dict[str, dict[str, float]] = {}
     for name, path in there.items():

@@ -8,6 +8,7 @@ import numpy as np
 
 from express50.frames import read_plate
 from express50.images import scale_light
+from express50.index import read_index
 from express50.layout import Dataset
 from pipelines.alpha.foreground import own_colours
 from pipelines.alpha.plate import exposed, exposure_gain
@@ -32,15 +33,26 @@ def own_picture(
         crop: where to cut.
         size: side of the result, pixels.
     """
-    plate = _plate(dataset, *place)
+    plate = _plate(dataset, *place, _versions(dataset, *place))
     behind = None
     if plate is not None:
         behind = exposed(cut_image(plate, crop, size), exposure_gain(frame, plate))
     return own_colours(cut_image(frame, crop, size), cut_image(matte, crop, size), behind)
 
 
+def _versions(dataset: Dataset, subject: str, camera_id: str) -> tuple[int, ...]:
+    """Times of what the plate is made from: a worker may outlive several of them."""
+    index = read_index(dataset, subject)
+    files = [dataset.item_dir("calibrate", subject) / "cameras.json"]
+    if camera_id in index.plates:
+        files.append(index.capture / index.plates[camera_id])
+    return tuple(path.stat().st_mtime_ns for path in files if path.is_file())
+
+
 @lru_cache(maxsize=32)  # 25 MB each at 4K; every expression asks for those of all cameras
-def _plate(dataset: Dataset, subject: str, camera_id: str) -> np.ndarray | None:
+def _plate(
+    dataset: Dataset, subject: str, camera_id: str, versions: tuple[int, ...]
+) -> np.ndarray | None:
     return read_plate(dataset, subject, camera_id)
 
 

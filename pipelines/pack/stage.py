@@ -17,6 +17,7 @@ from express50.images import (
     depth_to_uint16,
     encode_jpeg,
     encode_png,
+    read_alpha,
     read_depth_png,
     read_image,
     write_image,
@@ -137,7 +138,7 @@ def _pack_sample(
     if not (folder / f"{camera_id}.png").is_file():
         return "it has no depth"
     rgb = read_frame(dataset, subject.name, camera_id, frame)
-    matte = alpha = read_image(matte_path)
+    matte = alpha = read_alpha(matte_path)
     depth, valid = read_depth_png(folder / f"{camera_id}.png")
     regions = _read_regions(dataset, f"{subject.name}/{expression}", camera_id)
     parts, head = regions or (None, None)
@@ -190,8 +191,10 @@ def _pack_sample(
 
 def _read_regions(
     dataset: Dataset, item: str, camera_id: str
-) -> tuple[np.ndarray, np.ndarray] | None:
+) -> tuple[np.ndarray, np.ndarray | None] | None:
     """Labels (H, W) uint8 of the parts and the head's own alpha (H, W) uint8, if there are any.
+
+    The head's is None where nothing told it from the torso.
 
     Raises:
         FormatError: one of them is no 8-bit grey image.
@@ -200,11 +203,9 @@ def _read_regions(
     paths = folder / f"{camera_id}.png", folder / f"{camera_id}_head.png"
     if not all(path.is_file() for path in paths):
         return None
-    parts, head = (read_image(path) for path in paths)
-    for path, image in zip(paths, (parts, head), strict=True):
-        if image.dtype != np.uint8 or image.ndim != 2:
-            raise FormatError(f"{path}: {image.dtype} {image.shape}, expected an 8-bit grey image")
-    return parts, head
+    facts = json.loads((folder / "metrics.json").read_text("utf-8"))
+    kept = "torso" in facts["missing"] and facts["method"] == "mesh"
+    return read_alpha(paths[0]), None if kept else read_alpha(paths[1])
 
 
 def _encode_rgb(image: np.ndarray, profile: str) -> dict[str, bytes]:

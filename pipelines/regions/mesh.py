@@ -9,6 +9,7 @@ import open3d as o3d
 
 from express50.cameras import Camera, crop_camera, project, rays
 from express50.parts import LABELS
+from express50.raycast import mesh_scene
 from pipelines.regions.labels import SCALP, HeadLabels
 
 BEARINGS = 36  # around the neck, at which the height of its lower end is known
@@ -59,11 +60,7 @@ class TrackedHead:
 def make_head(vertices: np.ndarray, R: np.ndarray, labels: HeadLabels) -> TrackedHead:
     """A head of tracked vertices (V, 3), world, and its rotation (3, 3), world from head."""
     center = vertices.mean(0)
-    scene = o3d.t.geometry.RaycastingScene(nthreads=1)
-    scene.add_triangles(
-        o3d.core.Tensor(np.ascontiguousarray(vertices - center, np.float32)),
-        o3d.core.Tensor(np.ascontiguousarray(labels.faces, np.uint32)),
-    )
+    scene = mesh_scene(vertices - center, labels.faces)
     end = None if "torso" in labels.missing else _neck_end(vertices[labels.end], R)
     return TrackedHead(vertices, labels, end, center, scene)
 

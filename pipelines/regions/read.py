@@ -11,7 +11,7 @@ from express50.cameras import Camera
 from express50.errors import FormatError, StageError
 from express50.frames import read_frame
 from express50.head.load import load_head
-from express50.images import read_depth_png, read_image
+from express50.images import read_alpha, read_depth_png
 from express50.layout import Dataset
 from pipelines.regions.config import RegionsConfig
 from pipelines.regions.labels import HeadLabels, head_labels
@@ -77,10 +77,10 @@ def read_pair(
     path = dataset.matte_file(subject, expression, camera.id)
     if not path.is_file():
         raise StageError("it has no matte")
-    matte = read_image(path)
-    if matte.dtype != np.uint8 or matte.shape != (camera.height, camera.width):
+    matte = read_alpha(path)
+    if matte.shape != (camera.height, camera.width):
         raise FormatError(
-            f"{path}: {matte.dtype} {matte.shape}, expected an 8-bit grey matte of the camera's"
+            f"{path}: {matte.shape[1]}x{matte.shape[0]}, expected the camera's"
             f" {camera.width}x{camera.height}; run 'express50 matte' again"
         )
     return read_frame(dataset, subject, camera.id, frame), matte.astype(np.float32) / 255

@@ -160,8 +160,9 @@ def _person(
 
 def _weights(config: RegionsConfig) -> Path:
     path = Path(config.segmentation).expanduser()
-    if not path.is_file():
-        raise StageError(f"regions.segmentation {path}: no such file; expected TorchScript")
+    from pipelines.networks import check_file  # torch takes seconds to import
+
+    check_file(path, "regions.segmentation")
     return path
 
 

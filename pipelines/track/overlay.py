@@ -14,6 +14,7 @@ from express50.frames import read_cameras_of, read_frame
 from express50.head.model import HeadModel, landmarks
 from express50.images import write_image
 from express50.layout import Dataset
+from express50.raycast import mesh_scene
 from pipelines.track.fit import Target
 from pipelines.track.observe import project_pinhole
 
@@ -91,11 +92,7 @@ def _wireframe(
     """Blend visible triangle edges and the mesh's outline into a crop."""
     K = np.diag([matrix[0, 0], matrix[1, 1], 1.0]) @ camera.K
     K[:2, 2] += matrix[:, 2]
-    scene = o3d.t.geometry.RaycastingScene(nthreads=1)
-    faces = model.faces.numpy()
-    scene.add_triangles(
-        o3d.core.Tensor(mesh.astype(np.float32)), o3d.core.Tensor(faces.astype(np.uint32))
-    )
+    scene = mesh_scene(mesh, model.faces.numpy())
     rays = o3d.t.geometry.RaycastingScene.create_rays_pinhole(
         intrinsic_matrix=o3d.core.Tensor(K),
         extrinsic_matrix=o3d.core.Tensor(camera.cam_from_world),

@@ -14,7 +14,7 @@ from express50.errors import CaptureError, StageError
 from express50.frames import read_cameras_of, read_frame, read_peaks
 from express50.head.load import load_head
 from express50.head.model import HeadModel, landmarks, pose
-from express50.images import read_image
+from express50.images import read_alpha
 from express50.index import index_path
 from express50.landmarks.detector import detect
 from express50.landmarks.network import WEIGHTS, LandmarkNet, load_network
@@ -203,8 +203,7 @@ def _distances(dataset: Dataset, subject: str, target: Target) -> list:
         path = dataset.matte_file(subject, target.observation.expression, camera_id)
         if not path.is_file():
             continue
-        alpha = read_image(path)
-        distance = signed_distance(alpha if alpha.ndim == 2 else alpha[..., 0], camera)
+        distance = signed_distance(read_alpha(path), camera)
         if distance is not None:
             found.append(distance)
     return found

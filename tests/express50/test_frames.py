@@ -173,3 +173,11 @@ def test_any_image_becomes_8_bit_srgb(image, expected):
 def test_nan_pixels_are_refused():
     with pytest.raises(ValueError, match="NaN"):
         to_srgb8(np.full((2, 2, 3), np.nan, np.float32))
+
+
+def test_a_plate_of_another_size_is_one_clear_error(tmp_path):
+    make_capture(tmp_path / "raw")
+    dataset = ingest_capture(tmp_path / "data", tmp_path / "raw")
+    write_image(tmp_path / "raw" / "plates" / "cam01.png", np.zeros((20, 30, 3), np.uint8))
+    with pytest.raises(CaptureError, match="plate is 30x20, the footage of cam01 is 64x64"):
+        read_plate(dataset, "S001", "cam01", undistort=False)

@@ -209,7 +209,8 @@ def test_pixels_without_footage_are_transparent() -> None:
 
 
 def test_wrong_settings_are_refused() -> None:
-    for change in ({"low": 7.0}, {"scale": 0.0}, {"spread": 2.0}, {"shadow": 1.0}):
+    for change in ({"low": 7.0}, {"scale": 0.0}, {"spread": 2.0}, {"shadow": 1.0},
+                   {"noise_frames": 0}, {"plate_frames": 0}, {"core": -0.1}):  # fmt: skip
         with pytest.raises(ConfigError, match="alpha"):
             AlphaConfig(**change)
 

@@ -174,6 +174,8 @@ def test_the_board_puts_a_perturbed_rig_right_and_leaves_a_right_one():
     ("settings", "message"),
     [
         ({"refine": "some"}, "refine is 'some'; expected none, poses, all"),
+        ({"board_frames": -3}, "board_frames is -3; expected 0 or more"),
+        ({"rounds": 0}, "rounds is 0"),
         ({"eye_distance_mm": 0.0}, "eye_distance_mm is 0.0"),
         ({"distance_m": float("nan")}, "distance_m is nan"),
     ],

@@ -12,13 +12,19 @@ from hypothesis import strategies as st
 from express50.cameras import pinhole_camera
 from express50.errors import FormatError
 from express50.frames import read_gains
-from express50.images import scale_light, srgb_to_linear
+from express50.images import scale_light, srgb_to_linear, write_image
 from express50.layout import Dataset
 from express50.publish import write_json
+from express50.runner import run_stage
 from express50.transforms import make_transform
+from pipelines.calibrate import STAGE as CALIBRATE
 from pipelines.calibrate.board import detect_corners, make_detector
 from pipelines.calibrate.colour import Palette, fit_gains, see_white, white_squares
+from pipelines.calibrate.config import CalibrateConfig
+from pipelines.ingest import STAGE as INGEST
+from pipelines.ingest import IngestConfig, register
 from tests.pipelines.board_rigs import BOARD, render_board
+from tests.synth import make_capture
 
 FACING = make_transform(np.eye(3), np.array([-0.14, -0.1, 0.55]))
 
@@ -157,3 +163,22 @@ def test_gains_of_a_subject_without_a_board_are_none(tmp_path):
     write_json(tmp_path / "calibrate" / "S001" / "gains.json", {})
     assert read_gains(Dataset(tmp_path), "S001") == {}
     assert json.loads((tmp_path / "calibrate" / "S001" / "gains.json").read_text()) == {}
+
+
+def test_a_bad_board_beside_given_cameras_costs_the_colours_alone(tmp_path):
+    root = tmp_path / "raw"
+    rig = make_capture(root)
+    table = {"squares_x": 7, "squares_y": 5, "square_length_m": 0.04, "marker_length_m": 0.03}
+    lines = [f"{key} = {value}" for key, value in table.items()] + ['dictionary = "DICT_4X4_50"']
+    for name in rig:
+        (root / "board" / name).mkdir(parents=True)
+        write_image(root / "board" / name / "000000.png", np.zeros((20, 30, 3), np.uint8))
+    (root / "board" / "board.toml").write_text("\n".join(lines) + "\n")
+    dataset = Dataset(tmp_path / "data")
+    register(dataset, [root])
+    for stage, config in ((INGEST, IngestConfig()), (CALIBRATE, CalibrateConfig())):
+        assert run_stage(stage, dataset, config, progress=False).ok
+    metrics = json.loads((dataset.item_dir("calibrate", "S001") / "metrics.json").read_text())
+    (warning,) = [row for row in metrics["warnings"] if row["what"] == "board"]
+    assert "tells no colours" in warning["why"] and "30x20" in warning["why"]
+    assert read_gains(dataset, "S001") == {}

@@ -209,7 +209,7 @@ def test_missing_and_misfit_alphas_are_told(keyed, tmp_path):
 
 def test_without_any_alpha_the_stage_says_what_to_run(tmp_path):
     dataset = make_dataset(tmp_path)
-    with pytest.raises(StageError, match="no camera has an alpha; run 'express50 matte"):
+    with pytest.raises(StageError, match="no camera has an alpha; see what 'express50 status"):
         STAGE.run(dataset, "S001/smile", CONFIG, tmp_path)
 
 

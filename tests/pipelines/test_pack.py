@@ -306,7 +306,9 @@ def test_an_excluded_subject_is_left_out_with_its_reason(dataset, tmp_path):
     assert {e.subject for e in ShardReader(tmp_path).entries} == {"S001"}
 
 
-def cut_regions(dataset: Dataset, item: str, camera: str, rows: int) -> None:
+def cut_regions(
+    dataset: Dataset, item: str, camera: str, rows: int, missing: tuple[str, ...] = ()
+) -> None:
     """Regions of one view: all under some rows is torso."""
     alpha = read_image(dataset.matte_file(*item.split("/"), camera))
     labels = np.where(alpha > 127, np.uint8(LABELS.index("skin")), np.uint8(0))
@@ -317,6 +319,16 @@ def cut_regions(dataset: Dataset, item: str, camera: str, rows: int) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     write_image(folder / f"{camera}.png", labels)
     write_image(folder / f"{camera}_head.png", head)
+    write_json(folder / "metrics.json", {"missing": list(missing), "method": "mesh"})
+
+
+def test_a_torso_that_nothing_told_apart_is_not_called_removed(dataset, tmp_path):
+    try:
+        cut_regions(dataset, "S001/neutral", "cam02", 60, missing=("torso",))
+        metrics = PACK.run(dataset, "shards", SMALL, tmp_path)
+    finally:
+        shutil.rmtree(dataset.stage_dir("regions"))
+    assert metrics["with_parts"] == 1 and metrics["torso_removed"] == 0
 
 
 def test_the_torso_leaves_alpha_and_depth_and_its_labels_are_packed(dataset, packed, tmp_path):
