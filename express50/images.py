@@ -173,13 +173,21 @@ def linear_to_srgb(image_linear: np.ndarray) -> np.ndarray:
     )
 
 
+LIGHT_OF_LEVEL = srgb_to_linear(np.arange(256) / 255.0).astype(np.float32)
+"""Linear light (256,) of the levels of 8-bit sRGB."""
+
+
 def scale_light(image: np.ndarray, gain: np.ndarray) -> np.ndarray:
     """Image (H, W, 3) uint8 sRGB with linear light times gain (3,); what exceeds white is white."""
     if not (np.isfinite(gain).all() and (gain > 0).all()):
         raise ValueError(f"gain is {gain}, expected three finite numbers above 0")
-    light = srgb_to_linear(np.arange(256) / 255.0)[:, None] * gain
-    table = np.rint(255.0 * linear_to_srgb(np.minimum(light, 1.0))).astype(np.uint8)
+    table = np.rint(scaled_levels(gain)).astype(np.uint8)
     return np.stack([table[image[..., channel], channel] for channel in range(3)], axis=-1)
+
+
+def scaled_levels(gain: np.ndarray) -> np.ndarray:
+    """What the 256 levels of 8-bit sRGB become (256, 3) when linear light is times gain (3,)."""
+    return np.minimum(255.0 * linear_to_srgb(LIGHT_OF_LEVEL[:, None] * gain), 255.0)
 
 
 def resize_area(image: np.ndarray, width: int, height: int) -> np.ndarray:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from express50.images import linear_to_srgb, srgb_to_linear
+from express50.images import LIGHT_OF_LEVEL, scaled_levels
 
 LEVELS = np.linspace(16.0, 240.0, 8)  # 8-bit intensities at which noise is tabulated
 # Differences above this, in 8-bit steps, are not noise whatever the camera.
@@ -21,7 +21,6 @@ MOST_NOISE = 14.0
 LEAST_PLATE = 0.05
 # Largest changes of exposure, natural logarithms: a few tenths of a stop as a rule, else two stops.
 GAINS = (0.51, 1.41)
-_LINEAR = srgb_to_linear(np.arange(256) / 255.0).astype(np.float32)
 
 
 @dataclass(frozen=True)
@@ -49,7 +48,7 @@ def exposure_gain(frame: np.ndarray, plate: np.ndarray) -> np.ndarray:
     for channel in range(3):
         a, b = frame[::step, ::step, channel], plate[::step, ::step, channel]
         use = (b > 30) & (b < 240) & (a > 8) & (a < 250)
-        ratios = np.log(_LINEAR[a[use]] / _LINEAR[b[use]])
+        ratios = np.log(LIGHT_OF_LEVEL[a[use]] / LIGHT_OF_LEVEL[b[use]])
         if ratios.size < 200:
             continue
         for limit in GAINS:
@@ -67,8 +66,7 @@ def exposed(plate: np.ndarray, gain: np.ndarray) -> np.ndarray:
     """Plate (H, W, 3) uint8 as the frame's exposure would show it: float32, 8-bit steps."""
     if np.abs(gain - 1.0).max() < 0.004:  # within half a step everywhere
         return plate.astype(np.float32)
-    table = linear_to_srgb(_LINEAR[:, None] * gain[None]) * 255.0
-    table = np.minimum(table, 255.0).astype(np.float32)
+    table = scaled_levels(gain).astype(np.float32)
     return np.stack([table[plate[..., c], c] for c in range(3)], axis=-1)
 
 

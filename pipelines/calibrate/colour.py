@@ -16,7 +16,7 @@ import numpy as np
 from scipy.sparse.csgraph import connected_components
 
 from express50.adapters import corner_to_opencv_pixels
-from express50.images import srgb_to_linear
+from express50.images import LIGHT_OF_LEVEL
 from express50.publish import write_json
 from pipelines.calibrate.board import Board, opencv_board
 
@@ -145,8 +145,8 @@ def _paper(image: np.ndarray, corners: np.ndarray) -> tuple[float, float, float]
     ink = levels[order[: max(1, round(0.1 * len(levels)))]]
     if paper.min() < DARK or paper.max() > BRIGHT:
         return None
-    light = _LINEAR[paper].mean(0)
-    if light.mean() < LEAST_CONTRAST * _LINEAR[ink].mean():
+    light = LIGHT_OF_LEVEL[paper].mean(0)
+    if light.mean() < LEAST_CONTRAST * LIGHT_OF_LEVEL[ink].mean():
         return None
     return float(light[0]), float(light[1]), float(light[2])
 
@@ -228,6 +228,3 @@ def _spread(value: np.ndarray, weights: np.ndarray) -> float:
     """Median departure of a patch's light from its mean over cameras, percent."""
     used = np.abs(_residuals(value, weights))[weights > 0]
     return float(100 * np.expm1(np.median(used))) if used.size else float("nan")
-
-
-_LINEAR = srgb_to_linear(np.arange(256) / 255.0).astype(np.float32)

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from express50.adapters import opencv_pixels_to_corner
 from pipelines.matte.config import MatteConfig
 from pipelines.matte.hull import (
     CLEAR,
@@ -130,7 +131,9 @@ def shows_surface(
         return np.zeros(todo.shape, bool)
     offsets = np.linspace(*SEARCH)
     depth = evidence.front[rows, columns] + offsets[:, None].astype(np.float32)  # (D, N)
-    rays = np.stack([columns + 0.5, rows + 0.5, np.ones(len(rows))])  # (3, N)
+    rays = np.vstack(
+        [opencv_pixels_to_corner(np.array([columns, rows])), np.ones(len(rows))]
+    )  # (3, N)
     points = np.linalg.solve(
         view.projection[:, :3].astype(np.float64),
         (rays[:, None] * depth - view.projection[:, 3, None, None]).reshape(3, -1),

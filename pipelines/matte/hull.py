@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 from scipy import ndimage
 
+from express50.adapters import cell_centres
 from express50.cameras import Camera
 from express50.rigs.world import meeting_point
 
@@ -134,7 +135,7 @@ def cells_in(view: View, axis: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def make_space(views: Sequence[View], cells: int, margin: float) -> Space:
     """Count what every view says of every cell; `margin` is in pixels."""
-    axis = (CUBE * ((np.arange(cells) + 0.5) / cells * 2 - 1)).astype(np.float32)
+    axis = (CUBE * (cell_centres(cells) / cells * 2 - 1)).astype(np.float32)
     seen, clear, solid = (np.zeros((cells,) * 3, np.uint16) for _ in range(3))
     labels = {}
     for view in views:

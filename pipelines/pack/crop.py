@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from express50.adapters import cell_centres, corner_to_cell
 from express50.cameras import Camera, crop_camera, project, resized
 from express50.images import resize_area
 
@@ -65,7 +66,7 @@ def cut_image(image: np.ndarray, crop: Crop, size: int) -> np.ndarray:
 
 def cut_labels(labels: np.ndarray, crop: Crop, size: int) -> np.ndarray:
     """The crop of labels (H, W) uint8 at (size, size), each the nearest pixel's; 0 outside."""
-    place = np.minimum(((np.arange(size) + 0.5) * (crop.side / size)).astype(int), crop.side - 1)
+    place = np.minimum((cell_centres(size) * (crop.side / size)).astype(int), crop.side - 1)
     return _window(labels, crop)[np.ix_(place, place)]
 
 
@@ -95,7 +96,7 @@ def cut_depth(
     """
     window, known = _window(depth, crop), _window(valid, crop)
     inverse = np.where(known, 1.0 / np.where(known, window, 1.0), 0.0)
-    place = np.clip((np.arange(size) + 0.5) * (crop.side / size) - 0.5, 0, crop.side - 1)
+    place = np.clip(corner_to_cell(cell_centres(size) * (crop.side / size)), 0, crop.side - 1)
     low = np.minimum(place.astype(int), max(crop.side - 2, 0))
     high = np.minimum(low + 1, crop.side - 1)
     share = place - low

@@ -8,6 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from express50.cameras import Camera
 from express50.errors import CaptureError, FormatError, StageError
 from express50.exclusions import exclusion_reason
 from express50.frames import read_frame
@@ -32,7 +33,7 @@ from express50.stage import Stage
 from pipelines.pack.card import split_subjects, write_card
 from pipelines.pack.colour import evened, own_picture
 from pipelines.pack.config import PRESETS, PackConfig
-from pipelines.pack.crop import crop_pinhole, cut_depth, cut_image, cut_labels, head_crop
+from pipelines.pack.crop import Crop, crop_pinhole, cut_depth, cut_image, cut_labels, head_crop
 from pipelines.pack.subject import Subject, read_subjects
 
 QC_SAMPLES = 12
@@ -166,27 +167,32 @@ def _pack_sample(
     if parts is not None:
         members["parts.png"] = encode_png(cut_labels(parts, crop, config.size))
     members["depth.png"] = encode_png(depth_to_uint16(small, known))
-    view = crop_pinhole(camera, crop, config.size)
-    meta = subject.meta | {
-        "K": view.K.tolist(),
-        "cam_from_world": camera.cam_from_world.tolist(),
-        "camera": camera_id,
+    meta = _meta(subject, expression, camera, crop, config.size) | {
         "colour_gain": gain.tolist(),
-        "crop": {"x0": crop.x0, "y0": crop.y0, "side": crop.side},
-        "depth_scale_m": DEPTH_UNIT_M,
-        "expression": expression,
-        "frame": frame,
-        "height": config.size,
-        "label": subject.labels[expression],
         "parts": parts is not None,
-        "source_size": [camera.width, camera.height],
         "torso": "removed" if head is not None and config.torso == "remove" else "kept",
-        "track": subject.tracked[expression],
-        "width": config.size,
     }
     text = json.dumps(meta, sort_keys=True, separators=(",", ":"), allow_nan=False)
     members["meta.json"] = text.encode()
     return PackedSample(subject.name, expression, camera_id, members), meta
+
+
+def _meta(subject: Subject, expression: str, camera: Camera, crop: Crop, size: int) -> dict:
+    """What a sample of this size says of its subject, its camera and its crop."""
+    return subject.meta | {
+        "K": crop_pinhole(camera, crop, size).K.tolist(),
+        "cam_from_world": camera.cam_from_world.tolist(),
+        "camera": camera.id,
+        "crop": {"x0": crop.x0, "y0": crop.y0, "side": crop.side},
+        "depth_scale_m": DEPTH_UNIT_M,
+        "expression": expression,
+        "frame": subject.peaks[expression],
+        "height": size,
+        "label": subject.labels[expression],
+        "source_size": [camera.width, camera.height],
+        "track": subject.tracked[expression],
+        "width": size,
+    }
 
 
 def _read_regions(

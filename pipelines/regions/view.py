@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from express50.adapters import opencv_pixels_to_corner
 from express50.cameras import Camera, unproject
 from express50.parts import HEAD, LABELS, label_mask
 from pipelines.regions.mesh import TrackedHead, see
@@ -73,7 +74,7 @@ def place(
     height = np.full(mesh.shape, np.inf, np.float32)
     if head.end is not None:
         y, x = np.nonzero(alpha > 0)
-        points = unproject(camera, np.stack([x, y], axis=1) + 0.5, surface[y, x])
+        points = unproject(camera, opencv_pixels_to_corner(np.stack([x, y], axis=1)), surface[y, x])
         height[y, x] = head.end.height(points)
     return Geometry(mesh, mesh[row, column], rim, height)
 
