@@ -272,6 +272,27 @@ def skin(
     identity = torch.eye(3, dtype=rest.dtype, device=rest.device)
     feature = (rotations[:, 1:] - identity).flatten(1)
     corrected = rest + (feature @ pose_dirs).reshape(rest.shape)
+    turn, shift = joint_transforms(joints, rotations, parents)
+    blended_turn = torch.einsum("nj,bjrc->bnrc", skinning, turn)
+    blended_shift = torch.einsum("nj,bjc->bnc", skinning, shift)
+    return (blended_turn @ corrected[..., None])[..., 0] + blended_shift
+
+
+def joint_transforms(
+    joints: torch.Tensor, rotations: torch.Tensor, parents: tuple[int, ...]
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Where each joint takes a point at rest: x -> turn @ x + shift.
+
+    The shift is linear in the joints (there is no constant part).
+
+    Args:
+        joints: (B, J, 3) rest joints.
+        rotations: (B, J, 3, 3), each relative to its parent.
+        parents: parent of each joint, -1 first.
+
+    Returns:
+        turn (B, J, 3, 3), shift (B, J, 3).
+    """
     world_rotations, world_joints = [rotations[:, 0]], [joints[:, 0]]
     for joint, parent in enumerate(parents[1:], start=1):
         bone = (joints[:, joint] - joints[:, parent])[..., None]
@@ -279,10 +300,7 @@ def skin(
         world_rotations.append(world_rotations[parent] @ rotations[:, joint])
     turn = torch.stack(world_rotations, dim=1)
     # x -> turn (x - joint) + world joint, written as turn x + shift so that blending is one matmul.
-    shift = torch.stack(world_joints, dim=1) - (turn @ joints[..., None])[..., 0]
-    blended_turn = torch.einsum("nj,bjrc->bnrc", skinning, turn)
-    blended_shift = torch.einsum("nj,bjc->bnc", skinning, shift)
-    return (blended_turn @ corrected[..., None])[..., 0] + blended_shift
+    return turn, torch.stack(world_joints, dim=1) - (turn @ joints[..., None])[..., 0]
 
 
 def landmarks(model: HeadModel, vertices: torch.Tensor) -> torch.Tensor:

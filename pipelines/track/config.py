@@ -21,18 +21,44 @@ class TrackConfig:
     """Levenberg-Marquardt steps of the landmark fit."""
     silhouette_rounds: int = 3
     """Rounds of outline matching to the mattes (each finds the outline anew); 0 for none."""
-    silhouette_iterations: int = 4
-    """Levenberg-Marquardt steps a round."""
+    photo_rounds: int = 2
+    """Rounds of photometric refinement; 0 for none."""
+    photo_side: int = 512
+    """Pixels of the crops that colours are compared in, the longer side."""
+    samples: int = 4000
+    """Places on the skin at which colours are compared."""
+    relief_rounds: int = 6
+    """Rounds in which the surface is searched for along the normals; 0 for none."""
+    relief_reach: float = 0.008
+    """How far the first search goes, metres."""
+    relief_weight: float = 1.0
+    """Trust in the searched surface."""
+    detail_radius: float = 0.003
+    """Marks of the skin smaller than this are compared, metres; doubled at each coarser level."""
+    photo_weight: float = 0.1
+    """Trust in the photometric term."""
+    photo_tie: float = 0.3
+    """How firmly a moment's colours are tied to those of the other moments, 0 to 1."""
+    round_iterations: int = 4
+    """Levenberg-Marquardt steps a round of outlines and colours."""
     min_score: float = 0.35
     """Views whose face score is lower are left out."""
     min_landmarks: int = 20
     """Landmarks an expression needs after outlier rejection."""
     landmark_floor_px: float = 1.0
     """Least error assumed of a landmark, for a face 128 px tall; scales with the face."""
+    landmark_bias: float = 0.003
+    """Standard deviation of what the detector errs on a face in all frames alike, metres."""
     contour_weight: float = 0.25
     """Weight of the jaw line's landmarks (0..16), which slide along the jaw."""
     shape_prior: float = 1.0
     """Weight of the prior on shape coefficients (standard deviations)."""
+    offset_modes: int = 150
+    """Smooth static offsets of the skin beyond the head's shape directions; 0 for none."""
+    offset_sigma: float = 0.001
+    """Standard deviation of these offsets, metres."""
+    offset_length: float = 0.02
+    """Their correlation length, metres."""
     expression_prior: float = 0.45
     """Standard deviation of expression coefficients; in the neutral frame a fifth of it."""
     neutral: str = "neutral"
@@ -46,8 +72,8 @@ class TrackConfig:
             raise ConfigError(
                 "track: landmark_floor_px, shape_prior and expression_prior must be above 0"
             )
-        if min(self.cameras, self.silhouette_rounds, self.silhouette_iterations) < 0:
-            raise ConfigError("track: cameras and silhouette settings must not be negative")
+        if min(self.cameras, self.silhouette_rounds, self.photo_rounds) < 0:
+            raise ConfigError("track: cameras and rounds must not be negative")
 
 
 PRESETS: dict[str, dict[str, object]] = {

@@ -16,7 +16,9 @@ from express50.transforms import axis_angle_to_matrix
 from pipelines.track.config import TrackConfig
 from pipelines.track.observe import Observation, project_pinhole
 from pipelines.track.outline import Outline
+from pipelines.track.photometry import Photometry
 from pipelines.track.priors import prior
+from pipelines.track.relief import Relief
 from pipelines.track.sparse_head import POSE_SIZE, Basis, Points
 
 HUBER = 1.5
@@ -37,10 +39,16 @@ class Pose:
 
 @dataclass(frozen=True)
 class State:
-    """Shape (S,) and a pose an expression."""
+    """Shape (S,), a pose an expression, and the detector's bias (68, 3) on this face, head space.
+
+    What a detector gets wrong on a face it gets wrong in every frame and much alike in every view:
+    more of them are no independent evidence. The bias says so; landmarks then tell how a face moves
+    rather than what it is.
+    """
 
     shape: np.ndarray
     poses: tuple[Pose, ...]
+    bias: np.ndarray = field(default_factory=lambda: np.zeros((68, 3)))
 
 
 @dataclass(frozen=True)
@@ -51,6 +59,7 @@ class Target:
     sigma: np.ndarray
     neutral: bool
     outlines: tuple[Outline, ...] = ()
+    terms: tuple[Photometry | Relief, ...] = ()
     vertices: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
 
 
@@ -70,12 +79,12 @@ def fit(
     cost = _cost(basis, targets, points, state, config)
     for _ in range(iterations):
         system = [
-            _normal_equations(basis, *item, state.shape, config)
+            _normal_equations(basis, *item, state, config)
             for item in zip(targets, points, state.poses, strict=True)
         ]
         improved = False
         for _ in range(6):
-            trial = _step(state, system, basis.shape_size, damping, config)
+            trial = _step(basis, state, system, damping, config)
             trial_cost = _cost(basis, targets, points, trial, config)
             if trial_cost < cost:
                 improved = True
@@ -99,7 +108,6 @@ def landmark_sigma(observation: Observation, config: TrackConfig) -> np.ndarray:
         height = np.ptp(view.points[17:], axis=0).max()
         floor = config.landmark_floor_px * height / 128.0
         sigma[index] = np.hypot(view.sigma, floor)
-    sigma[:, :17] /= config.contour_weight
     return np.where(observation.inliers, sigma, np.inf)
 
 
@@ -122,24 +130,33 @@ def consistent_sigma(target: Target, marks: np.ndarray) -> np.ndarray:
     return sigma if np.isfinite(sigma).any() else target.sigma
 
 
-def _parameters(state_shape: np.ndarray, pose: Pose) -> np.ndarray:
-    return np.concatenate([state_shape, pose.own])
+def _parameters(basis: Basis, shared: np.ndarray, pose: Pose) -> np.ndarray:
+    return np.concatenate([shared[: basis.shape_size], pose.own])
 
 
-def _residuals(
-    target: Target, positions: np.ndarray
+def _landmarks(positions: np.ndarray, state: State, pose: Pose) -> np.ndarray:
+    """Where the detector would put the landmarks (68, 3): the head's, plus what it always errs."""
+    return positions[:68] + state.bias @ pose.rotation.T
+
+
+def _landmark_blocks(
+    target: Target, marks: np.ndarray
 ) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Blocks (point index (n,), residual (n, k), d residual / d position (n, k, 3))."""
+    """Blocks (point index (n,), residual (n, k), d residual / d position (n, k, 3)), one a view."""
     blocks = []
     for index, view in enumerate(target.observation.views):
         used = np.flatnonzero(np.isfinite(target.sigma[index]))
-        pixels, slope = project_with_slope(view.camera, positions[used])
+        pixels, slope = project_with_slope(view.camera, marks[used])
         sigma = target.sigma[index, used]
         residual = (pixels - view.points[used]) / sigma[:, None]
         blocks.append((used, residual, slope / sigma[:, None, None]))
-    for outline in target.outlines:
-        blocks.append(outline.residuals(positions, project_with_slope))
     return blocks
+
+
+def _outline_blocks(
+    target: Target, positions: np.ndarray
+) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    return [outline.residuals(positions, project_with_slope) for outline in target.outlines]
 
 
 def project_with_slope(camera: object, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -169,67 +186,122 @@ def _cost(
     basis: Basis, targets: list[Target], points: list[Points], state: State, config: TrackConfig
 ) -> float:
     """Total cost of a state."""
-    total = 0.5 * _shape_weight(config, len(targets)) * float(state.shape @ state.shape)
+    shared = _shared(state) * np.sqrt(_shared_weights(basis, config))
+    total = 0.5 * float(shared @ shared)
     for target, model, pose in zip(targets, points, state.poses, strict=True):
-        positions = model.evaluate(_parameters(state.shape, pose), pose.rotation)
-        total += sum(_huber_cost(block[1]) for block in _residuals(target, positions))
+        positions = model.evaluate(_parameters(basis, state.shape, pose), pose.rotation)
+        blocks = _landmark_blocks(target, _landmarks(positions, state, pose))
+        blocks += _outline_blocks(target, positions)
+        total += sum(_huber_cost(residual) for _, residual, _ in blocks)
+        total += sum(term.cost(positions) for term in target.terms)
         residual, _ = prior(basis.model, pose.own, target.neutral, config)
         total += 0.5 * float(residual @ residual)
     return total if np.isfinite(total) else np.inf
 
 
-def _shape_weight(config: TrackConfig, expressions: int) -> float:
-    """Weight of the shape prior: what a detector gets wrong on a face it gets wrong in every frame.
+def _shared(state: State) -> np.ndarray:
+    """Shape, then bias: what all expressions of a face have in common."""
+    return np.concatenate([state.shape, state.bias.ravel()])
 
-    More expressions of the same face are therefore no independent evidence of its shape.
+
+def _shared_weights(basis: Basis, config: TrackConfig) -> np.ndarray:
+    """Inverse variances (S + 204,) of the shared unknowns."""
+    shape = np.full(basis.shape_size, config.shape_prior)
+    bias = np.full((68, 3), config.landmark_bias)
+    bias[:17] /= config.contour_weight
+    return np.r_[shape, bias.ravel() ** -2]
+
+
+def _information(
+    blocks: list[tuple[np.ndarray, np.ndarray, np.ndarray]], count: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Robust Gauss-Newton matrices (count, 3, 3) and gradients (count, 3) by the points' positions.
+
+    However many views see a point, the head's parameters meet their sum only.
     """
-    return config.shape_prior * expressions
+    matrix, gradient = np.zeros((count, 3, 3)), np.zeros((count, 3))
+    for used, residual, slope in blocks:
+        weight = _robust(residual)[:, None]
+        slope, residual = slope * weight[..., None], residual * weight
+        # A block names no point twice.
+        matrix[used] += np.swapaxes(slope, 1, 2) @ slope
+        gradient[used] += np.einsum("nkc,nk->nc", slope, residual)
+    return matrix, gradient
 
 
 def _normal_equations(
-    basis: Basis,
-    target: Target,
-    model: Points,
-    pose: Pose,
-    shape: np.ndarray,
-    config: TrackConfig,
+    basis: Basis, target: Target, model: Points, pose: Pose, state: State, config: TrackConfig
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Hessian (D, D) and gradient (D,) of one expression, D = S + X + 18."""
-    positions, jacobian = model.linearise(_parameters(shape, pose), pose.rotation)
-    size = jacobian.shape[2]
+    """Hessian and gradient of one expression: shape (S), bias (204), own (X + 18)."""
+    positions, jacobian = model.linearise(_parameters(basis, state.shape, pose), pose.rotation)
+    shapes, size = basis.shape_size, jacobian.shape[2] + 204
+    columns = np.r_[:shapes, shapes + 204 : size]
     hessian, gradient = np.zeros((size, size)), np.zeros(size)
-    for used, residual, slope in _residuals(target, positions):
-        weight = _robust(residual)[:, None]
-        rows = (slope * weight[..., None]) @ jacobian[used]
-        rows = rows.reshape(-1, size)
-        hessian += rows.T @ rows
-        gradient += rows.T @ (residual * weight).reshape(-1)
-    residual, slope = prior(basis.model, pose.own, target.neutral, config)
-    own = slice(basis.shape_size, size)
-    hessian[own, own] += slope.T @ slope
-    gradient[own] += slope.T @ residual
+    marks = _landmarks(positions, state, pose)
+    matrix, pull = _information(_landmark_blocks(target, marks), 68)
+    rows = np.zeros((68, 3, size))
+    rows[..., columns] = jacobian[:68]
+    for mark in range(68):
+        rows[mark, :, shapes + 3 * mark : shapes + 3 * mark + 3] = pose.rotation
+    _add(hessian, gradient, rows, matrix, pull)
+    count = 68 + sum(len(outline.index) for outline in target.outlines)
+    matrix, pull = _information(_outline_blocks(target, positions), count)
+    terms = [(jacobian[68:count], matrix[68:], pull[68:])]
+    terms += [_of_samples(term, positions, jacobian) for term in target.terms]
+    base, slope = np.zeros((len(columns), len(columns))), np.zeros(len(columns))
+    for term in terms:
+        _add(base, slope, *term)
+    residual, moved = prior(basis.model, pose.own, target.neutral, config)
+    base[shapes:, shapes:] += moved.T @ moved
+    slope[shapes:] += moved.T @ residual
+    hessian[np.ix_(columns, columns)] += base
+    gradient[columns] += slope
     return hessian, gradient
 
 
+def _add(
+    hessian: np.ndarray,
+    gradient: np.ndarray,
+    rows: np.ndarray,
+    matrix: np.ndarray,
+    pull: np.ndarray,
+) -> None:
+    """Add points' information (n, 3, 3), (n, 3) through their Jacobian rows (n, 3, D), in place."""
+    size = rows.shape[2]
+    # Single precision is plenty for the curvature; the gradient stays in double.
+    single = rows.astype(np.float32)
+    weighted = matrix.astype(np.float32) @ single
+    hessian += single.reshape(-1, size).T @ weighted.reshape(-1, size)
+    gradient += pull.reshape(-1) @ rows.reshape(-1, size)
+
+
+def _of_samples(
+    term: Photometry | Relief, positions: np.ndarray, jacobian: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The samples' Jacobian (S, 3, D) and information (S, 3, 3), (S, 3)."""
+    corners = jacobian[term.rows]
+    return (term.bary[:, :, None, None] * corners).sum(1), *term.normal(positions)
+
+
 def _step(
+    basis: Basis,
     state: State,
     system: list[tuple[np.ndarray, np.ndarray]],
-    shapes: int,
     damping: float,
     config: TrackConfig,
 ) -> State:
     """One damped Gauss-Newton step, expressions eliminated."""
-    weight = _shape_weight(config, len(system))
-    reduced = weight * np.eye(shapes)
-    right = -weight * state.shape
+    shapes = basis.shape_size
+    shared = shapes + 204
+    weight = _shared_weights(basis, config)
+    reduced, right = np.diag(weight), -weight * _shared(state)
     eliminated = []
     for hessian, gradient in system:
-        shared, cross = hessian[:shapes, :shapes], hessian[:shapes, shapes:]
-        inner = hessian[shapes:, shapes:]
+        cross, inner = hessian[:shared, shared:], hessian[shared:, shared:]
         inner = inner + damping * np.diag(np.diag(inner)) + 1e-9 * np.eye(len(inner))
-        solved = np.linalg.solve(inner, np.column_stack([cross.T, gradient[shapes:]]))
-        reduced = reduced + shared - cross @ solved[:, :-1]
-        right = right - gradient[:shapes] + cross @ solved[:, -1]
+        solved = np.linalg.solve(inner, np.column_stack([cross.T, gradient[shared:]]))
+        reduced = reduced + hessian[:shared, :shared] - cross @ solved[:, :-1]
+        right = right - gradient[:shared] + cross @ solved[:, -1]
         eliminated.append(solved)
     reduced = reduced + damping * np.diag(np.diag(reduced))
     change = np.linalg.solve(reduced, right)
@@ -237,7 +309,7 @@ def _step(
         _moved(pose, -(solved[:, -1] + solved[:, :-1] @ change))
         for pose, solved in zip(state.poses, eliminated, strict=True)
     )
-    return State(state.shape + change, poses)
+    return State(state.shape + change[:shapes], poses, state.bias + change[shapes:].reshape(68, 3))
 
 
 def _moved(pose: Pose, change: np.ndarray) -> Pose:

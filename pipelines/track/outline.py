@@ -24,7 +24,7 @@ OUTLINE_SIDE = 192
 EDGE_SIGMA_M = 0.0015
 # Where hair, cloth or shoulders may stand before the skin: standard deviation of their thickness,
 # and the gap (metres) at which what lies inside the matte stops to pull.
-COVER_SIGMA_M, COVER_GAP_M, BARE_GAP_M = 0.008, 0.006, 0.02
+COVER_SIGMA_M, COVER_GAP_M, BARE_GAP_M = 0.008, 0.004, 0.004
 COVERED = ("neck", "scalp", "forehead", "left_ear", "right_ear")
 BARE = ("face", "nose", "lips")
 

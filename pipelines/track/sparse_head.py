@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from express50.head.model import HeadModel, skin
+from express50.head.model import HeadModel, joint_transforms, skin
 from express50.torch_transforms import axis_angle_to_matrix
 
 POSE_SIZE = 18
@@ -79,23 +79,34 @@ class Points:
 
     def __call__(self, parameters: torch.Tensor, rotation: torch.Tensor) -> torch.Tensor:
         """World positions (68 + M, 3) for parameters (D,) about the rotation (3, 3)."""
-        basis = self.basis
-        linear, pose = parameters[:-POSE_SIZE], parameters[-POSE_SIZE:].reshape(6, 3)
-        rest = self.template + self.directions @ linear
-        joints = basis.joints + basis.joint_directions @ linear
-        angles = torch.cat([torch.zeros_like(pose[:1]), pose[:4]])
+        linear, pose = parameters[:-POSE_SIZE], parameters[-POSE_SIZE:]
+        return self._posed(self._rest(linear), self._joints(linear), pose, rotation)
+
+    def _rest(self, linear: torch.Tensor) -> torch.Tensor:
+        return self.template + self.directions @ linear
+
+    def _joints(self, linear: torch.Tensor) -> torch.Tensor:
+        return self.basis.joints + self.basis.joint_directions @ linear
+
+    def _posed(
+        self, rest: torch.Tensor, joints: torch.Tensor, pose: torch.Tensor, rotation: torch.Tensor
+    ) -> torch.Tensor:
         posed = skin(
             rest[None],
             joints[None],
-            axis_angle_to_matrix(angles)[None],
+            _joint_rotations(pose)[None],
             self.skinning,
             self.pose_dirs,
-            basis.model.parents,
+            self.basis.model.parents,
         )[0]
-        corners = posed[:204].reshape(68, 3, 3)
-        marks = (corners * basis.model.landmark_bary[..., None]).sum(1)
-        points = torch.cat([marks, posed[204:]])
-        return points @ (axis_angle_to_matrix(pose[4]) @ rotation).T + pose[5]
+        return self._gathered(posed) @ (axis_angle_to_matrix(pose[12:15]) @ rotation).T + pose[15:]
+
+    def _gathered(self, posed: torch.Tensor) -> torch.Tensor:
+        """Landmarks, then the chosen vertices, of posed vertices (204 + M, 3[, D])."""
+        bary = self.basis.model.landmark_bary
+        corners = posed[:204].reshape(68, 3, *posed.shape[1:])
+        marks = (corners * bary.reshape(68, 3, *[1] * (posed.ndim - 1))).sum(1)
+        return torch.cat([marks, posed[204:]])
 
     def evaluate(self, parameters: np.ndarray, rotation: np.ndarray) -> np.ndarray:
         """Positions (P, 3)."""
@@ -105,12 +116,45 @@ class Points:
     def linearise(
         self, parameters: np.ndarray, rotation: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Positions (P, 3) and their Jacobian (P, 3, D)."""
-        rotation_t = torch.from_numpy(rotation)
+        """Positions (P, 3) and their Jacobian (P, 3, D).
 
-        def both(values: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-            points = self(values, rotation_t)
+        Posed vertices are linear in the coefficients, so only the 18 columns of the pose need
+        forward-mode differentiation.
+        """
+        values, rotation_t = torch.from_numpy(parameters), torch.from_numpy(rotation)
+        linear, pose = values[:-POSE_SIZE], values[-POSE_SIZE:]
+        rest, joints = self._rest(linear), self._joints(linear)
+
+        def both(pose: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+            points = self._posed(rest, joints, pose, rotation_t)
             return points, points
 
-        jacobian, points = torch.func.jacfwd(both, has_aux=True)(torch.from_numpy(parameters))
-        return points.numpy(), jacobian.numpy()
+        by_pose, points = torch.func.jacfwd(both, has_aux=True)(pose)
+        by_coefficient = self._linear_columns(pose, rotation_t)
+        return points.numpy(), torch.cat([by_coefficient, by_pose], dim=2).numpy()
+
+    def turns(self, parameters: np.ndarray, rotation: np.ndarray) -> np.ndarray:
+        """Rotations (M, 3, 3) that take a displacement of a chosen vertex at rest to the world."""
+        pose = torch.from_numpy(parameters[-POSE_SIZE:])
+        turn, _ = self._transforms(pose, self.basis.joints[None])
+        blended = torch.einsum("nj,jrc->nrc", self.skinning[204:], turn[0])
+        return (torch.from_numpy(rotation) @ blended).numpy()
+
+    def _transforms(
+        self, pose: torch.Tensor, joints: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        rotations = _joint_rotations(pose)[None].expand(len(joints), -1, -1, -1)
+        return joint_transforms(joints, rotations, self.basis.model.parents)
+
+    def _linear_columns(self, pose: torch.Tensor, rotation: torch.Tensor) -> torch.Tensor:
+        """Jacobian (P, 3, S + X) by the coefficients."""
+        turn, shift = self._transforms(pose, self.basis.joint_directions.permute(2, 0, 1))
+        blended = torch.einsum("nj,jrc->nrc", self.skinning, turn[0])
+        columns = blended @ self.directions + torch.einsum("nj,djc->ncd", self.skinning, shift)
+        return (axis_angle_to_matrix(pose[12:15]) @ rotation) @ self._gathered(columns)
+
+
+def _joint_rotations(pose: torch.Tensor) -> torch.Tensor:
+    """Rotations (5, 3, 3) of the joints, the root's being the identity, from a pose (18,)."""
+    angles = torch.cat([torch.zeros_like(pose[:3]), pose[:12]]).reshape(5, 3)
+    return axis_angle_to_matrix(angles)

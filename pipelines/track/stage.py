@@ -13,7 +13,7 @@ from express50.cameras import Camera
 from express50.errors import CaptureError, StageError
 from express50.frames import read_cameras_of, read_frame, read_peaks
 from express50.head.load import load_head
-from express50.head.model import HeadModel, landmarks, pose
+from express50.head.model import HeadModel, landmarks
 from express50.images import read_alpha
 from express50.index import index_path
 from express50.landmarks.detector import detect
@@ -30,9 +30,12 @@ from pipelines.track.fit import (
     start_state,
 )
 from pipelines.track.observe import Observation, View, agree, facing, project_pinhole
-from pipelines.track.outline import Outline, outline_regions, outline_vertices, signed_distance
+from pipelines.track.offsets import with_modes
+from pipelines.track.outline import signed_distance
 from pipelines.track.overlay import draw_overlays
-from pipelines.track.sparse_head import POSE_SIZE, Basis, make_basis
+from pipelines.track.refine import Moment, all_vertices, refine
+from pipelines.track.shots import Shot, cut_shot
+from pipelines.track.sparse_head import Basis, make_basis
 from pipelines.track.start import initial_pose
 
 SCHEMA = "express50.track/1"
@@ -65,7 +68,7 @@ def run(dataset: Dataset, item: str, config: TrackConfig, out: Path) -> dict:
     torch.set_num_threads(1)
     cameras = read_cameras_of(dataset, item)
     dropped: list[dict[str, str]] = []
-    basis = _basis(config.head)
+    basis = _basis(config.head, config.offset_modes, config.offset_sigma, config.offset_length)
     observations = _observe(dataset, item, cameras, config, dropped)
     targets, poses = _targets(basis, observations, config, dropped)
     if not targets:
@@ -76,16 +79,17 @@ def run(dataset: Dataset, item: str, config: TrackConfig, out: Path) -> dict:
         replace(target, sigma=consistent_sigma(target, marks))
         for target, marks in zip(targets, _marks(basis.model, state), strict=True)
     ]
-    state, targets = _refine(dataset, item, basis, targets, state, config)
-    vertices = _all_vertices(basis.model, state)
+    moments = _moments(dataset, item, targets, all_vertices(basis.model, state), config)
+    state, targets, _ = refine(basis, targets, state, moments, config)
+    vertices = all_vertices(basis.model, state)
     _write_track(out / "track.npz", config.head, basis, targets, state, vertices)
     draw_overlays(dataset, item, out / "qc", basis.model, targets, vertices)
     return _metrics(basis.model, targets, vertices, dropped)
 
 
 @lru_cache(maxsize=2)
-def _basis(head: str) -> Basis:
-    return make_basis(load_head(head))
+def _basis(head: str, modes: int, sigma: float, length: float) -> Basis:
+    return make_basis(with_modes(load_head(head), modes, sigma, length))
 
 
 @lru_cache(maxsize=1)
@@ -170,80 +174,50 @@ def _targets(
     return targets, poses
 
 
-def _refine(
+def _moments(
+    dataset: Dataset, subject: str, targets: list[Target], meshes: np.ndarray, config: TrackConfig
+) -> list[Moment]:
+    """Outlines and crops of every expression, of all cameras: those behind it see the skull."""
+    cameras = read_cameras_of(dataset, subject)
+    moments = []
+    for target, mesh in zip(targets, meshes, strict=True):
+        observation = target.observation
+        distances, shots = [], []
+        for camera_id, camera in cameras.items():
+            path = dataset.matte_file(subject, observation.expression, camera_id)
+            alpha = read_alpha(path) if path.is_file() else None
+            if alpha is not None and config.silhouette_rounds:
+                distances.append(signed_distance(alpha, camera))
+            if config.photo_rounds:
+                shots.append(
+                    _shot(dataset, subject, camera, observation.frame, alpha, mesh, config)
+                )
+        moments.append(
+            Moment(tuple(d for d in distances if d), tuple(shot for shot in shots if shot))
+        )
+    return moments
+
+
+def _shot(
     dataset: Dataset,
     subject: str,
-    basis: Basis,
-    targets: list[Target],
-    state: State,
+    camera: Camera,
+    frame: int,
+    alpha: np.ndarray | None,
+    mesh: np.ndarray,
     config: TrackConfig,
-) -> tuple[State, list[Target]]:
-    """Alternate between finding the outline on the current mesh and fitting to the mattes."""
-    distances = [_distances(dataset, subject, target) for target in targets]
-    if not config.silhouette_rounds or not any(distances):
-        return state, targets
-    pictures = sum(len(seen) for seen in distances)
-    for _ in range(config.silhouette_rounds):
-        vertices = _all_vertices(basis.model, state)
-        targets = [
-            _with_outlines(basis.model, target, seen, mesh, pictures)
-            for target, seen, mesh in zip(targets, distances, vertices, strict=True)
-        ]
-        state, _ = fit(basis, targets, state, config, config.silhouette_iterations)
-    return state, targets
-
-
-def _distances(dataset: Dataset, subject: str, target: Target) -> list:
-    """Signed distances of the mattes of one expression, cameras without one left out.
-
-    All cameras count, those behind the head too: they see the skull.
-    """
-    found = []
-    for camera_id, camera in read_cameras_of(dataset, subject).items():
-        path = dataset.matte_file(subject, target.observation.expression, camera_id)
-        if not path.is_file():
-            continue
-        distance = signed_distance(read_alpha(path), camera)
-        if distance is not None:
-            found.append(distance)
-    return found
-
-
-def _with_outlines(
-    model: HeadModel, target: Target, distances: list, mesh: np.ndarray, pictures: int
-) -> Target:
-    """The target with the outlines of the current mesh (V, 3)."""
-    allowed, covered = outline_regions(model)
-    faces = model.faces.numpy()
-    outlines, ids, offset = [], [], 68
-    for distance in distances:
-        chosen = outline_vertices(mesh, faces, distance.camera, allowed)
-        if len(chosen) < 8:
-            continue
-        outlines.append(Outline.of(distance, offset, mesh[chosen], covered[chosen], pictures))
-        ids.append(chosen)
-        offset += len(chosen)
-    vertices = np.concatenate(ids) if ids else np.zeros(0, dtype=np.int64)
-    return Target(target.observation, target.sigma, target.neutral, tuple(outlines), vertices)
+) -> Shot | None:
+    """A camera's crop about the head; None where its footage lacks the frame or the head."""
+    try:
+        image = read_frame(dataset, subject, camera.id, frame)
+    except CaptureError:
+        return None
+    return cut_shot(camera, image, alpha, mesh, config.photo_side)
 
 
 def _marks(model: HeadModel, state: State) -> np.ndarray:
     """Fitted landmarks (E, 68, 3) in the world."""
-    return landmarks(model, torch.from_numpy(_all_vertices(model, state))).numpy()
-
-
-def _all_vertices(model: HeadModel, state: State) -> np.ndarray:
-    """World vertices (E, V, 3) of every expression."""
-    own = torch.from_numpy(np.stack([item.own for item in state.poses]))
-    count = model.expression_dirs.shape[2]
-    shape = torch.from_numpy(state.shape)[None].expand(len(own), -1)
-    angles = own[:, count : count + POSE_SIZE - 6]
-    with torch.inference_mode():
-        head = pose(
-            model, shape, own[:, :count], neck=angles[:, :3], jaw=angles[:, 3:6], eyes=angles[:, 6:]
-        ).numpy()
-    rotation = np.stack([item.rotation for item in state.poses])
-    return np.einsum("eij,evj->evi", rotation, head) + own[:, None, -3:].numpy()
+    return landmarks(model, torch.from_numpy(all_vertices(model, state))).numpy()
 
 
 def _write_track(

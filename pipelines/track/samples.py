@@ -1,0 +1,110 @@
+"""Points spread over the skin: the places at which pictures are compared."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import open3d as o3d
+
+from express50.cameras import Camera
+from express50.head.model import HeadModel
+from express50.raycast import mesh_scene
+
+SEEN = (
+    "face", "nose", "lips",
+    "left_eye_region", "right_eye_region", "left_eyeball", "right_eyeball",
+)  # fmt: skip
+HIDDEN = ("mouth_interior", "boundary", "scalp", "teeth", "tongue")
+# A ray may end this far before a sample and still count as reaching it: a tenth of a hair.
+TOUCH_M = 3e-4
+GRAZING = 0.25
+
+
+@dataclass(frozen=True)
+class Samples:
+    """Fixed places on a mesh.
+
+    Attributes:
+        faces: (S,) face ids.
+        corners: (S, 3) vertex ids.
+        bary: (S, 3) weights of the corners.
+    """
+
+    faces: np.ndarray
+    corners: np.ndarray
+    bary: np.ndarray
+
+    def at(self, vertices: np.ndarray) -> np.ndarray:
+        """Positions (S, 3) on vertices (V, 3)."""
+        return np.einsum("sk,skc->sc", self.bary, vertices[self.corners])
+
+
+def spread(model: HeadModel, count: int) -> Samples:
+    """About `count` samples, evenly by area over the skin and eyes of the template.
+
+    The same model and count give the same samples.
+    """
+    faces = model.faces.numpy()
+    allowed = _allowed(model)[faces].all(1)
+    ids = np.flatnonzero(allowed)
+    corners = model.template.double().numpy()[faces[ids]]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    area = np.linalg.norm(normal, axis=1)
+    # Systematic sampling along the faces' running area: no face gets more than its share and one.
+    places = (np.arange(count) + 0.5) / count * area.sum()
+    chosen = ids[np.searchsorted(np.cumsum(area), places).clip(0, len(ids) - 1)]
+    u, v = _spiral(count)
+    root = np.sqrt(u)
+    bary = np.stack([1 - root, root * (1 - v), root * v], axis=1)
+    return Samples(chosen, faces[chosen], bary)
+
+
+def _allowed(model: HeadModel) -> np.ndarray:
+    """Vertices (V,) bool on which the pictures may be compared."""
+    seen = np.any([model.regions[name].numpy() for name in SEEN if name in model.regions], axis=0)
+    for name in HIDDEN:
+        if name in model.regions:
+            seen = seen & ~model.regions[name].numpy()
+    return seen
+
+
+def _spiral(count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Evenly spread pairs in the unit square: the R2 sequence (Roberts 2018)."""
+    step = np.arange(1, count + 1)
+    return (0.5 + 0.7548776662466927 * step) % 1.0, (0.5 + 0.5698402909980532 * step) % 1.0
+
+
+def sample_normals(samples: Samples, vertices: np.ndarray) -> np.ndarray:
+    """Unit normals (S, 3) of the samples' faces on vertices (V, 3)."""
+    a, b, c = (vertices[samples.corners[:, k]] for k in range(3))
+    normal = np.cross(b - a, c - a)
+    return normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
+
+
+class Visibility:
+    """What cameras see of one mesh; the ray tree is built once."""
+
+    def __init__(self, vertices: np.ndarray, faces: np.ndarray) -> None:
+        # Far from the origin float32 rays are too coarse: all is cast about the mesh's centre.
+        self.centre = vertices.mean(0)
+        self.scene = mesh_scene(vertices - self.centre, faces)
+
+    def weights(self, camera: Camera, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
+        """How much a camera's view of points (S, 3) is worth, (S,) in 0..1.
+
+        0 where the mesh hides a point or turns it away, else the cosine to the camera; at a
+        grazing angle a pixel covers much of the surface and a small error of shape moves it far.
+        """
+        ray = points - camera.center
+        distance = np.linalg.norm(ray, axis=1)
+        direction = ray / np.maximum(distance, 1e-12)[:, None]
+        cosine = -(direction * normals).sum(1)
+        chosen = np.flatnonzero(cosine > GRAZING)
+        origin = points[chosen] - self.centre - 0.5 * direction[chosen]
+        cast = np.concatenate([origin, direction[chosen]], axis=1).astype(np.float32)
+        hit = self.scene.cast_rays(o3d.core.Tensor(cast))["t_hit"].numpy()
+        clear = hit > np.minimum(0.5, distance[chosen]) - TOUCH_M
+        weights = np.zeros(len(points))
+        weights[chosen] = np.where(clear, cosine[chosen], 0.0)
+        return weights
