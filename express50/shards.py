@@ -7,10 +7,11 @@ are. The writer is in :mod:`express50.shards_write`.
 
 ``meta.json`` of a sample: ids ``subject expression camera``, ``frame``, ``fps``; ``K``,
 ``cam_from_world``, ``width``, ``height`` of the picture as packed; ``depth_scale_m``; ``head`` and
-``track`` {shape expression neck jaw eyes R t}, the head model and its parameters, with world =
-R @ head + t in the cameras' world; ``label`` (who chose the frame), ``torso`` (removed or
-kept in alpha and depth), ``parts`` (whether there are labels), ``crop``, ``source_size``,
-``consent``, ``licence``, ``session``.
+``track`` {shape offsets expression neck jaw eyes R t}, the head model and its parameters, with
+world = R @ head + t in the cameras' world (``offsets`` says whether ``<subject>.offsets.npy``
+beside the shards is to be added to the rest shape); ``label`` (who chose the frame), ``torso``
+(removed or kept in alpha and depth), ``parts`` (whether there are labels), ``crop``,
+``source_size``, ``consent``, ``licence``, ``session``.
 """
 
 from __future__ import annotations
@@ -167,6 +168,29 @@ class ShardReader:
             "meta": meta,
         }
 
+    def offsets(self, subject: str) -> np.ndarray:
+        """Offsets (V, 3) float32, metres, of a subject's rest shape; of use where meta says so.
+
+        Raises:
+            FormatError: the file is missing, damaged, or holds something else.
+        """
+        path = offsets_file(self.root, subject)
+        again = "copy the shards again or rerun 'express50 pack'"
+        try:
+            with path.open("rb") as file:
+                if file.read(6) != b"\x93NUMPY":
+                    raise ValueError("not a .npy file")
+                file.seek(0)
+                array = np.load(file, allow_pickle=False)
+        except (OSError, ValueError, EOFError, MemoryError, SyntaxError) as error:
+            words = " ".join(str(error).split())
+            raise FormatError(f"{path}: no offsets ({words}); {again}") from None
+        if array.ndim != 2 or array.shape[1] != 3 or array.dtype != np.float32:
+            raise FormatError(f"{path}: {array.dtype} {array.shape}, expected float32 (V, 3)")
+        if not np.isfinite(array).all():
+            raise FormatError(f"{path}: holds NaN or Inf; {again}")
+        return array
+
     def _parts(self, number: int, meta: dict) -> np.ndarray | None:
         if "parts.png" not in self.entries[number].members:
             return None
@@ -212,6 +236,17 @@ class ShardReader:
         if image.dtype != kind or image.ndim != dimensions:
             raise FormatError(f"{where}: {image.dtype} {image.shape}, expected {np.dtype(kind)}")
         return image
+
+
+def offsets_file(root: Path, subject: str) -> Path:
+    """Where the offsets of a subject's rest shape lie, beside the shards.
+
+    Raises:
+        FormatError: the subject's id has other characters than a key may have.
+    """
+    if not KEY.fullmatch(subject):
+        raise FormatError(f"subject id {subject!r}: expected letters, digits, _ and -")
+    return root / f"{subject}.offsets.npy"
 
 
 def image_size(data: bytes, where: str) -> tuple[int, int]:
