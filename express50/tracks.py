@@ -6,6 +6,7 @@ line. Nothing in a file is executed: pickled objects are refused.
 
 from __future__ import annotations
 
+import re
 import zipfile
 import zlib
 from dataclasses import dataclass
@@ -17,6 +18,7 @@ from express50.errors import FormatError, StageError
 from express50.layout import Dataset
 
 SCHEMAS = ("express50.track/1", "express50.track/2")
+NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
 SIZE_LIMIT = 2 << 30  # unpacked bytes; 60 expressions of a 26,000-vertex head take 19 MB
 _WIDTHS = {"neck": (3,), "jaw": (3,), "eyes": (6,), "R": (3, 3), "t": (3,)}
 _AGAIN = "run 'express50 track' again"
@@ -139,6 +141,9 @@ def _shapes(arrays: dict[str, np.ndarray], count: int) -> dict[str, tuple[int | 
 def _check_names(names: np.ndarray) -> None:
     if names.ndim != 1 or names.dtype.kind != "U" or not len(names):
         raise ValueError(f"expressions are {names.dtype} {names.shape}, expected (E,) strings")
+    for name in names.tolist():
+        if not NAME.fullmatch(name):  # they become names of files
+            raise ValueError(f"expression {name!r}, expected letters, digits, _ and -")
     if len(set(names.tolist())) != len(names):
         raise ValueError("an expression appears twice")
 

@@ -59,6 +59,7 @@ def bad(arrays: dict[str, np.ndarray]) -> dict[str, dict[str, np.ndarray]]:
         "shape is <U1": {"shape": np.array(["a"])},
         "frames is float64": {"frames": np.zeros(2)},
         "appears twice": {"expressions": np.array(["smile", "smile"])},
+        "expected letters, digits": {"expressions": np.array(["smile", "../../smile"])},
         "expressions are int64": {"expressions": np.arange(2)},
         "R is no rotation": {"R": 2 * arrays["R"]},
         "differs from 1 by": {"R": -arrays["R"]},
