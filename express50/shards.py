@@ -29,10 +29,10 @@ import numpy as np
 
 from express50.errors import FormatError
 from express50.images import PIXEL_LIMIT, decode_image
+from express50.shards_offsets import KEY, read_offsets
 
 SCHEMA = "express50.shards/1"
 SHARD_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*-[0-9]{6}\.tar")
-KEY = re.compile(r"[A-Za-z0-9_-]{1,80}")
 RGB = ("rgb.jpg", "rgb.png")
 
 
@@ -174,22 +174,7 @@ class ShardReader:
         Raises:
             FormatError: the file is missing, damaged, or holds something else.
         """
-        path = offsets_file(self.root, subject)
-        again = "copy the shards again or rerun 'express50 pack'"
-        try:
-            with path.open("rb") as file:
-                if file.read(6) != b"\x93NUMPY":
-                    raise ValueError("not a .npy file")
-                file.seek(0)
-                array = np.load(file, allow_pickle=False)
-        except (OSError, ValueError, EOFError, MemoryError, SyntaxError) as error:
-            words = " ".join(str(error).split())
-            raise FormatError(f"{path}: no offsets ({words}); {again}") from None
-        if array.ndim != 2 or array.shape[1] != 3 or array.dtype != np.float32:
-            raise FormatError(f"{path}: {array.dtype} {array.shape}, expected float32 (V, 3)")
-        if not np.isfinite(array).all():
-            raise FormatError(f"{path}: holds NaN or Inf; {again}")
-        return array
+        return read_offsets(self.root, subject)
 
     def _parts(self, number: int, meta: dict) -> np.ndarray | None:
         if "parts.png" not in self.entries[number].members:
@@ -236,17 +221,6 @@ class ShardReader:
         if image.dtype != kind or image.ndim != dimensions:
             raise FormatError(f"{where}: {image.dtype} {image.shape}, expected {np.dtype(kind)}")
         return image
-
-
-def offsets_file(root: Path, subject: str) -> Path:
-    """Where the offsets of a subject's rest shape lie, beside the shards.
-
-    Raises:
-        FormatError: the subject's id has other characters than a key may have.
-    """
-    if not KEY.fullmatch(subject):
-        raise FormatError(f"subject id {subject!r}: expected letters, digits, _ and -")
-    return root / f"{subject}.offsets.npy"
 
 
 def image_size(data: bytes, where: str) -> tuple[int, int]:

@@ -15,7 +15,7 @@ import numpy as np
 from express50.adapters import opengl_from_cam_from_world
 from express50.cameras import Camera, transform_camera
 from express50.errors import CaptureError, ConfigError, FormatError, StageError
-from express50.export.parameters import export_shift, write_parameters
+from express50.export.parameters import export_shift, is_flame, write_parameters
 from express50.export.pictures import centred, flattened, rgba_png, seen_by
 from express50.export.select import META, SCHEMA, Head
 from express50.frames import read_cameras_of, read_frame
@@ -66,12 +66,12 @@ def export_avatar(dataset: Dataset, head: Head, options: AvatarOptions, out: Pat
     if not frames:
         reasons = "; ".join(sorted({row["why"] for row in dropped})[:3])
         raise StageError(f"{head.subject}: no view can be exported ({reasons})")
-    is_flame = head.model.name.startswith("flame")
-    write_parameters(head, steps, shift, is_flame, out)
+    flame = is_flame(head.model)
+    write_parameters(head, steps, shift, out)
     targets = {name: centred(camera) for name, camera in cameras.items()}
-    described = [_described(row, targets, shift, is_flame) for row in frames]
+    described = [_described(row, targets, shift, flame) for row in frames]
     _write_tables(described, steps, sorted(cameras), options, out)
-    meta = _meta(head, steps, sorted(cameras), shift, is_flame, options)
+    meta = _meta(head, steps, sorted(cameras), shift, options)
     meta["cameras_centred"] = [name for name in targets if targets[name] is not cameras[name]]
     meta |= {"read": len(frames) + len(dropped), "views": len(frames), "dropped": dropped}
     (out / META).write_bytes(dump_json(meta))
@@ -148,7 +148,7 @@ def _read_view(
 
 
 def _described(
-    row: dict, cameras: dict[str, Camera], shift: np.ndarray, is_flame: bool
+    row: dict, cameras: dict[str, Camera], shift: np.ndarray, flame: bool
 ) -> dict[str, object]:
     """One frame of transforms.json."""
     move = np.eye(4)
@@ -170,7 +170,7 @@ def _described(
         "file_path": f"images/{row['file']}",
         "fg_mask_path": f"fg_masks/{row['file']}",
         "flame_param_path": f"flame_param/{step}.npz",
-    } | ({} if is_flame else {"mesh_path": f"meshes/{step}.obj"})  # fmt: skip
+    } | ({} if flame else {"mesh_path": f"meshes/{step}.obj"})  # fmt: skip
 
 
 def _write_tables(
@@ -209,7 +209,6 @@ def _meta(
     steps: list[str],
     cameras: list[str],
     shift: np.ndarray,
-    is_flame: bool,
     options: AvatarOptions,
 ) -> dict:
     world_from_export = np.eye(4)
@@ -226,9 +225,9 @@ def _meta(
         "units": "metres",
         "world_from_export": world_from_export.tolist(),
         "vertices": "rotation about the root joint, then translation, as FLAME has it",
-        "coefficients": "FLAME" if is_flame else "the head model's own",
+        "coefficients": "FLAME" if is_flame(head.model) else "the head model's own",
     }
-    if not is_flame:
+    if not is_flame(head.model):
         meta["shape_names"] = list(head.model.shape_names)
         meta["expression_names"] = list(head.model.expression_names)
         meta["meshes"] = "meshes/<step>.obj, the tracked vertices; no FLAME model gives them"

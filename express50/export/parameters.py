@@ -20,8 +20,14 @@ from express50.tracks import Track
 from express50.transforms import matrix_to_axis_angle
 
 FLAME_VERTICES = 5143  # of the layout's FLAME: 5023, and 120 of its teeth
+FLAME_SHAPES, FLAME_EXPRESSIONS = 300, 100  # its readers expect that many, or zeros
 CANONICAL_JAW = 0.3  # radians
 FAR_M = 16.0  # from there on, single precision rounds by more than a micrometre
+
+
+def is_flame(model: HeadModel) -> bool:
+    """Whether a reader of FLAME's coefficients gets this model's vertices from them."""
+    return model.name.startswith("flame-")
 
 
 def export_shift(track: Track) -> np.ndarray:
@@ -49,16 +55,14 @@ def flame_motion(
     return matrix_to_axis_angle(R), track.t[row] - shift + R @ joint - joint
 
 
-def write_parameters(
-    head: Head, steps: list[str], shift: np.ndarray, is_flame: bool, out: Path
-) -> None:
+def write_parameters(head: Head, steps: list[str], shift: np.ndarray, out: Path) -> None:
     """A file of parameters a time step, the canonical one, and meshes where it is not FLAME."""
     (out / "flame_param").mkdir()
     shared = _shared_parameters(head)
     for number, name in enumerate(steps):
         arrays = shared | _step_parameters(head, head.track.row(name), shift)
         (out / "flame_param" / f"{number:05d}.npz").write_bytes(npz_bytes(arrays))
-        if not is_flame:
+        if not is_flame(head.model):
             (out / "meshes").mkdir(exist_ok=True)
             vertices = head.track.vertices[head.track.row(name)] - shift
             write_obj(out / "meshes" / f"{number:05d}.obj", vertices, head.model)
@@ -68,19 +72,17 @@ def write_parameters(
 
 
 def _shared_parameters(head: Head) -> dict[str, np.ndarray]:
-    offsets = head.track.offsets[:FLAME_VERTICES] if head.model.name.startswith("flame") else (
-        head.track.offsets
-    )  # fmt: skip
-    return {
-        "shape": _padded(head.track.shape, head.model.shape_dirs.shape[2]),
-        "static_offset": offsets[None].astype(np.float32),
-    }
+    flame = is_flame(head.model)
+    count = max(head.model.shape_dirs.shape[2], FLAME_SHAPES if flame else 0)
+    offsets = head.track.offsets[: FLAME_VERTICES if flame else None]
+    return {"shape": _padded(head.track.shape, count), "static_offset": offsets[None]}
 
 
 def _step_parameters(head: Head, row: int, shift: np.ndarray) -> dict[str, np.ndarray]:
     track = head.track
     rotation, translation = flame_motion(head.model, track, row, shift)
-    count = head.model.expression_dirs.shape[2]
+    flame = is_flame(head.model)
+    count = max(head.model.expression_dirs.shape[2], FLAME_EXPRESSIONS if flame else 0)
     arrays = {
         "translation": translation,
         "rotation": rotation,

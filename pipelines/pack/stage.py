@@ -27,7 +27,8 @@ from express50.index import index_path, read_index
 from express50.layout import Dataset
 from express50.parts import COLOURS
 from express50.publish import write_json
-from express50.shards import ShardReader, offsets_file
+from express50.shards import ShardReader
+from express50.shards_offsets import write_offsets
 from express50.shards_write import PackedSample, ShardWriter, sample_key, write_manifest
 from express50.stage import Stage
 from pipelines.pack.card import split_subjects, write_card
@@ -101,7 +102,7 @@ def run(dataset: Dataset, item: str, config: PackConfig, out: Path) -> dict:
     packed = sorted({meta["subject"] for meta in metas})
     for subject in subjects:
         if subject.offsets is not None and subject.name in packed:
-            np.save(offsets_file(out, subject.name), subject.offsets, allow_pickle=False)
+            write_offsets(out, subject.name, subject.offsets)
     people = [read_index(dataset, name).meta for name in packed]
     return _finish(out, splits, metas, people, read, dropped, config)
 

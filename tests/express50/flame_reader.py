@@ -18,7 +18,8 @@ def flame_vertices(model: HeadModel, arrays: dict[str, np.ndarray]) -> np.ndarra
     """Vertices (V, 3) float64 of a flame_param file's arrays; missing offsets count as zero."""
     parts = {name: array.astype(np.float64) for name, array in arrays.items()}
     directions = np.concatenate([model.shape_dirs.numpy(), model.expression_dirs.numpy()], 2)
-    betas = np.concatenate([parts["shape"], parts["expr"][0]])
+    shapes, expressions = model.shape_dirs.shape[2], model.expression_dirs.shape[2]
+    betas = np.concatenate([parts["shape"][:shapes], parts["expr"][0, :expressions]])
     rest = model.template.numpy().astype(np.float64) + directions @ betas
     offset = parts["static_offset"][0]
     rest[: len(offset)] += offset

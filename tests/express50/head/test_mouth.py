@@ -282,8 +282,9 @@ def test_readers_of_the_layout_get_5143_vertices(path, model, tmp_path) -> None:
     arrays = track_arrays(path, turn=0.5)
     track = read_track(write_track(tmp_path / "track.npz", arrays))
     head = Head(subject="S001", track=track, model=model, albedo=None)
-    write_parameters(head, list(track.expressions), np.zeros(3), True, tmp_path)
+    write_parameters(head, list(track.expressions), np.zeros(3), tmp_path)
     with np.load(tmp_path / "flame_param/00001.npz") as stored:
         assert stored["static_offset"].shape == (1, 5143, 3)
+        assert stored["shape"].shape == (300,) and stored["expr"].shape == (1, 100)
         found = flame_vertices(model, dict(stored))
     np.testing.assert_allclose(found[:5143], arrays["vertices"][1, :5143], atol=5e-6)
