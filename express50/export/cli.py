@@ -38,6 +38,13 @@ def add_commands(subparsers: Any) -> None:
         "--head-only", action="store_true", help="masks without the torso, by the regions stage"
     )
     group.add_argument(
+        "--downscale", type=int, default=1, metavar="N", help="pictures N times smaller [1]"
+    )
+    group.add_argument(
+        "--even-colour", action="store_true",
+        help="divide the cameras' colour gains, measured by calibrate, out of the pictures",
+    )  # fmt: skip
+    group.add_argument(
         "--test-expression", action="append", metavar="ID",
         help="held back for testing; may be repeated [the last three tenths]",
     )  # fmt: skip
@@ -76,6 +83,8 @@ def _write(dataset: Any, head: Any, args: argparse.Namespace, folder: Path) -> d
     options = AvatarOptions(
         background=args.background,
         head_only=args.head_only,
+        downscale=args.downscale,
+        even_colour=args.even_colour,
         test_expressions=held,
         validation_camera=args.validation_camera,
     )

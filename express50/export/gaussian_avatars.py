@@ -13,13 +13,13 @@ from pathlib import Path
 import numpy as np
 
 from express50.adapters import opengl_from_cam_from_world
-from express50.cameras import Camera, transform_camera
+from express50.cameras import Camera, scale_camera, transform_camera
 from express50.errors import CaptureError, ConfigError, FormatError, StageError
 from express50.export.parameters import export_shift, is_flame, write_parameters
 from express50.export.pictures import centred, flattened, rgba_png, seen_by
 from express50.export.select import META, SCHEMA, Head
-from express50.frames import read_cameras_of, read_frame
-from express50.images import encode_png, read_alpha
+from express50.frames import read_cameras_of, read_frame, read_gains
+from express50.images import encode_png, read_alpha, scale_light
 from express50.layout import Dataset
 from express50.publish import dump_json
 from express50.tracks import Track
@@ -34,12 +34,16 @@ class AvatarOptions:
     Attributes:
         background: ``alpha`` (pictures keep it), or what is put behind the head.
         head_only: alpha of the head without the torso, from the regions stage.
+        downscale: whole number of times that pictures are smaller than the footage.
+        even_colour: divide each camera's colour gain, as calibrate measured it, out of its light.
         test_expressions: those held back for testing; None: the last three tenths.
         validation_camera: held back in training; None: the last.
     """
 
     background: str = "alpha"
     head_only: bool = False
+    downscale: int = 1
+    even_colour: bool = False
     test_expressions: tuple[str, ...] | None = None
     validation_camera: str | None = None
 
@@ -68,8 +72,10 @@ def export_avatar(dataset: Dataset, head: Head, options: AvatarOptions, out: Pat
         raise StageError(f"{head.subject}: no view can be exported ({reasons})")
     flame = is_flame(head.model)
     write_parameters(head, steps, shift, out)
-    targets = {name: centred(camera) for name, camera in cameras.items()}
-    described = [_described(row, targets, shift, flame) for row in frames]
+    factor = options.downscale
+    targets = {name: centred(camera, factor) for name, camera in cameras.items()}
+    shown = {name: scale_camera(one, 1 / factor, 1 / factor) for name, one in targets.items()}
+    described = [_described(row, shown, shift, flame) for row in frames]
     _write_tables(described, steps, sorted(cameras), options, out)
     meta = _meta(head, steps, sorted(cameras), shift, options)
     meta["cameras_centred"] = [name for name in targets if targets[name] is not cameras[name]]
@@ -79,6 +85,10 @@ def export_avatar(dataset: Dataset, head: Head, options: AvatarOptions, out: Pat
 
 
 def _check_options(track: Track, cameras: dict[str, Camera], options: AvatarOptions) -> None:
+    if not 1 <= options.downscale <= min(min(c.width, c.height) for c in cameras.values()):
+        raise ConfigError(
+            f"downscale {options.downscale}: expected 1 (full size) up to the images' height"
+        )
     unknown = sorted(set(options.test_expressions or ()) - set(track.expressions))
     if unknown:
         raise ConfigError(
@@ -113,8 +123,9 @@ def _write_views(
         except (CaptureError, FormatError, StageError) as error:
             dropped.append({"what": f"{expression}/{name}", "why": str(error)})
             continue
-        target = centred(camera)
-        image, alpha = seen_by(image, camera, target), seen_by(alpha, camera, target)
+        factor = options.downscale
+        target = centred(camera, factor)
+        image, alpha = (seen_by(one, camera, target, factor) for one in (image, alpha))
         level = BACKGROUNDS[options.background]
         shown = rgba_png(image, alpha) if level is None else encode_png(
             flattened(image, alpha, level)
@@ -144,7 +155,16 @@ def _read_view(
             f"{path}: {alpha.shape[1]}x{alpha.shape[0]}, expected the camera's"
             f" {camera.width}x{camera.height}; run 'express50 {stage}' again"
         )
-    return read_frame(dataset, subject, camera.id, frame), alpha
+    image = read_frame(dataset, subject, camera.id, frame)
+    if options.even_colour:
+        image = _evened(dataset, subject, camera.id, image)
+    return image, alpha
+
+
+def _evened(dataset: Dataset, subject: str, camera_id: str, image: np.ndarray) -> np.ndarray:
+    """The image without its camera's gain, where one was measured."""
+    gain = read_gains(dataset, subject).get(camera_id)
+    return image if gain is None else scale_light(image, 1.0 / gain)
 
 
 def _described(
@@ -221,6 +241,8 @@ def _meta(
         "expressions": steps,
         "cameras": cameras,
         "background": options.background,
+        "downscale": options.downscale,
+        "even_colour": options.even_colour,
         "masks": "head" if options.head_only else "matte",
         "units": "metres",
         "world_from_export": world_from_export.tolist(),

@@ -14,40 +14,47 @@ import numpy as np
 
 from express50.adapters import affine_to_opencv
 from express50.cameras import Camera, pinhole_camera
+from express50.images import resize_area
 
 NEAR_PX = 0.02  # what centring would move pixels by at most: not worth an interpolation
 
 
-def centred(camera: Camera) -> Camera:
+def centred(camera: Camera, factor: int = 1) -> Camera:
     """A pinhole camera at the same place whose image holds the given one's whole view.
 
-    Its focal lengths are equal and its principal point is the middle. The camera itself, where
-    that is true of it already to NEAR_PX.
+    Its focal lengths are equal, its principal point is the middle, and ``factor`` divides its size.
+    The camera itself, where that is true of it already, to NEAR_PX.
     """
     K = camera.K
     f = K[0, 0]
     away = np.abs(K[:2, 2] - (camera.width / 2, camera.height / 2)).max()
-    if away + abs(K[1, 1] / f - 1) * camera.height <= NEAR_PX:
+    divided = camera.width % factor == camera.height % factor == 0
+    if divided and away + abs(K[1, 1] / f - 1) * camera.height <= NEAR_PX:
         return camera
-    width = _whole(2 * max(K[0, 2], camera.width - K[0, 2]))
-    height = _whole(2 * max(K[1, 2], camera.height - K[1, 2]) * f / K[1, 1])
+    width = _whole(2 * max(K[0, 2], camera.width - K[0, 2]), factor)
+    height = _whole(2 * max(K[1, 2], camera.height - K[1, 2]) * f / K[1, 1], factor)
     square = np.array([[f, 0, width / 2], [0, f, height / 2], [0, 0, 1.0]])
     return pinhole_camera(camera.id, square, width, height, camera.cam_from_world)
 
 
-def _whole(length: float) -> int:
-    """Even number of pixels that holds a length, rounding errors aside."""
-    return 2 * math.ceil((length - 1e-6) / 2)
+def _whole(length: float, factor: int) -> int:
+    """Even number of pixels, a multiple of the factor, that holds a length, rounding aside."""
+    return 2 * factor * math.ceil((length - 1e-6) / (2 * factor))
 
 
-def seen_by(image: np.ndarray, camera: Camera, target: Camera) -> np.ndarray:
-    """Image (H, W[, C]) of a pinhole camera as ``target``, at the same place, has it; 0 outside."""
-    if target is camera:
+def seen_by(image: np.ndarray, camera: Camera, target: Camera, factor: int = 1) -> np.ndarray:
+    """Image (H, W[, C]) of a pinhole camera as ``target``, at the same place, has it; 0 outside.
+
+    It is made ``factor`` times smaller by averaging.
+    """
+    if target is not camera:
+        matrix = (target.K @ np.linalg.inv(camera.K))[:2]
+        image = cv2.warpAffine(
+            image, affine_to_opencv(matrix), (target.width, target.height), flags=cv2.INTER_LINEAR
+        )
+    if factor == 1:
         return image
-    matrix = (target.K @ np.linalg.inv(camera.K))[:2]
-    return cv2.warpAffine(
-        image, affine_to_opencv(matrix), (target.width, target.height), flags=cv2.INTER_LINEAR
-    )
+    return resize_area(image, target.width // factor, target.height // factor)
 
 
 def rgba_png(image: np.ndarray, alpha: np.ndarray) -> bytes:

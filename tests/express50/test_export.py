@@ -20,7 +20,7 @@ from express50.cli import main
 from express50.export.pictures import centred, seen_by
 from express50.frames import read_cameras_of, read_frame
 from express50.head.load import load_head
-from express50.images import read_alpha, read_image, write_image
+from express50.images import read_alpha, read_image, srgb_to_linear, write_image
 from express50.layout import Dataset
 from express50.rigs.transforms_json import read_transforms
 from express50.transforms import look_at
@@ -339,6 +339,48 @@ def test_masks_of_the_head_alone_come_from_regions(dataset, tmp_path) -> None:
     np.testing.assert_array_equal(read_image(tmp_path / "S002/fg_masks/00000_02.png"), mask)
 
 
+def test_smaller_pictures_belong_to_smaller_cameras(dataset, tmp_path) -> None:
+    options = ["--subject=S001", "--subject=S002", "--expression=smile", "--downscale=5"]
+    assert export(dataset, tmp_path, "gaussian-avatars", *options) == 0
+    for subject in ("S001", "S002"):
+        table = read_json(tmp_path / subject / "transforms.json")
+        cameras = read_cameras_of(dataset, subject)
+        for row in table["frames"]:
+            image = cv2.imread(str(tmp_path / subject / row["file_path"]), cv2.IMREAD_UNCHANGED)
+            assert image.shape == (row["h"], row["w"], 4) and max(image.shape) <= 12
+            assert (row["cx"], row["cy"]) == (row["w"] / 2, row["h"] / 2)
+            assert row["fl_x"] == pytest.approx(cameras[row["camera_id"]].K[0, 0] / 5)
+            assert row["fl_x"] == pytest.approx(row["fl_y"])
+        # The head's middle, by what is left of the matte, is where the whole picture has it.
+        row = table["frames"][0]
+        small = read_image(tmp_path / subject / row["fg_mask_path"]).astype(float)
+        y, x = np.mgrid[: row["h"], : row["w"]] + 0.5
+        found = np.array([(small * x).sum(), (small * y).sum()]) / small.sum()
+        full = read_alpha(dataset.matte_file(subject, "smile", row["camera_id"])).astype(float)
+        y, x = np.mgrid[:48, :48] + 0.5
+        there = np.array([(full * x).sum(), (full * y).sum(), full.sum()]) / full.sum()
+        ray = np.linalg.inv(cameras[row["camera_id"]].K) @ there
+        expected = [row["fl_x"] * ray[0] + row["cx"], row["fl_y"] * ray[1] + row["cy"]]
+        np.testing.assert_allclose(found, expected, atol=0.02)
+
+
+def test_colour_gains_are_divided_out(dataset, tmp_path) -> None:
+    path = dataset.item_dir("calibrate", "S002") / "gains.json"
+    path.write_text(json.dumps({"cam01": [1.2, 1.0, 0.8]}))
+    try:
+        options = ["--subject=S002", "--expression=neutral", "--even-colour"]
+        assert export(dataset, tmp_path, "gaussian-avatars", *options) == 0
+    finally:
+        path.unlink()
+    for number, gain in ((0, np.ones(3)), (1, np.array([1.2, 1.0, 0.8]))):
+        image = read_frame(dataset, "S002", f"cam0{number}", 0)
+        kept = cv2.imread(str(tmp_path / f"S002/images/00000_0{number}.png"), cv2.IMREAD_UNCHANGED)
+        light = srgb_to_linear(kept[..., 2::-1] / 255.0) * gain
+        unclipped = kept[..., 2::-1].max(-1) < 255
+        expected = srgb_to_linear(image / 255.0)
+        np.testing.assert_allclose(light[unclipped], expected[unclipped], atol=0.006)
+
+
 @pytest.mark.parametrize(
     ("options", "code", "message"),
     [
@@ -348,6 +390,8 @@ def test_masks_of_the_head_alone_come_from_regions(dataset, tmp_path) -> None:
         (["--format=obj", "--expression=wink"], 1, "wink not tracked; expected some of neutral"),
         (["--format=gaussian-avatars", "--validation-camera=x"], 2, "expected one of cam00, cam01"),
         (["--format=gaussian-avatars", "--test-expression=x"], 2, "test expressions x: expected"),
+        (["--format=gaussian-avatars", "--downscale=0"], 2, "downscale 0: expected 1 (full size)"),
+        (["--format=gaussian-avatars", "--downscale=99"], 2, "downscale 99: expected 1"),
         (["--format=gaussian-avatars", "--head-only", "--expression=smile", "--subject=S001"], 1,
          "express50 regions"),
         (["--format=gaussian-avatars", "--test-expression=smile", "--test-expression=neutral"], 2,
