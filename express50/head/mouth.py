@@ -35,6 +35,7 @@ _ROWS = ((0, 1, 0), (1, 1, 0), (0, 0, 0), (1, 0, 0), (0, 1, 1), (0, 0, 1), (1, 1
 _AROUND = ((0, 2, 5, 4), (1, 3, 7, 6))
 # Heights and depths in units of the mean distance of the rings.
 _INSET, _GAP, _ROOT, _OVERJET, _THICK = 1.5, 0.1, 2.0, 0.4, 1.0
+_LIPS = (0.002, 0.03)  # metres the rings may be apart on average: 7.7 mm on FLAME's template
 # The pouch: rings of the loop drawn together to its middle and set back, then one end vertex.
 _POUCH = ((1.0, 0.012), (0.7, 0.026), (0.0, 0.034))  # share of the loop's width, metres behind it
 _STRIP_V = (0.0, 0.4, 0.6, 1.0)  # rows of a jaw in its chart, by their lengths
@@ -78,7 +79,8 @@ def add_mouth(model: HeadModel) -> HeadModel:
     with the identity as the lips before them do. The pouch follows the loop it hangs on.
 
     Raises:
-        HeadModelError: the model's topology is not FLAME's, or its texture map has no room.
+        HeadModelError: the model's topology or lips are not FLAME's, or its texture map has no
+            room.
     """
     if not is_flame_topology(model):
         raise HeadModelError(
@@ -108,6 +110,11 @@ def _teeth(model: HeadModel, charts: tuple[np.ndarray, ...]) -> _Part:
     """Two arches of 15 columns: a strip in front, one behind, and the edge between them."""
     upper, lower = (model.template[list(ring)].double() for ring in (UPPER_RING, LOWER_RING))
     unit = float((upper - lower).norm(dim=1).mean())
+    if not _LIPS[0] < unit < _LIPS[1]:
+        raise HeadModelError(
+            f"head model {model.name!r}: its lips' rings are {1e3 * unit:.3g} mm apart, expected"
+            f" {1e3 * _LIPS[0]:g} to {1e3 * _LIPS[1]:g}; are its vertices FLAME's, in metres?"
+        )
     middle = 0.5 * (upper + lower)
     middle[:, 1] = middle[:, 1].mean()
     middle[:, 2] -= _INSET * unit
