@@ -20,6 +20,7 @@ from express50.frames import read_cameras_of, read_peaks
 from express50.images import contact_sheet, read_depth_png, read_image, write_image
 from express50.layout import Dataset
 from express50.parts import COLOURS
+from express50.tracks import read_track
 from express50.twin.truth import Truth, align_worlds
 
 VIEWS_A_PEAK = 2  # views measured of every peak; they walk around the rig from peak to peak
@@ -142,18 +143,18 @@ def measure_track(dataset: Dataset, truth: Truth, out: Path | None = None) -> di
         if not path.is_file():
             continue
         motion = align_worlds(read_cameras_of(dataset, subject), truth.cameras(subject))
-        with np.load(path, allow_pickle=False) as track:
-            for vertices, frame in zip(track["vertices"], track["frames"], strict=True):
-                moved = vertices @ motion[:3, :3].T + motion[:3, 3]
-                true = truth.vertices(subject, int(frame))
-                if true.shape != moved.shape:
-                    raise Express50Error(
-                        f"{subject}: tracked {moved.shape[0]} vertices, the truth has"
-                        f" {true.shape[0]}; vertex errors need the twin's own head model"
-                    )
-                distance = np.linalg.norm(moved - true, axis=1)
-                squares.append(float((distance**2).mean()))
-                medians.append(float(np.median(distance)))
+        track = read_track(path)
+        for vertices, frame in zip(track.vertices, track.frames, strict=True):
+            moved = vertices @ motion[:3, :3].T + motion[:3, 3]
+            true = truth.vertices(subject, int(frame))
+            if true.shape != moved.shape:
+                raise Express50Error(
+                    f"{subject}: tracked {moved.shape[0]} vertices, the truth has"
+                    f" {true.shape[0]}; vertex errors need the twin's own head model"
+                )
+            distance = np.linalg.norm(moved - true, axis=1)
+            squares.append(float((distance**2).mean()))
+            medians.append(float(np.median(distance)))
     return {
         "vertex_rmse_mm": 1e3 * float(np.sqrt(np.mean(squares))),
         "vertex_median_mm": 1e3 * float(np.median(medians)),

@@ -22,6 +22,7 @@ from express50.config import resolve_config
 from express50.frames import read_peaks
 from express50.head.load import load_head
 from express50.layout import Dataset
+from express50.tracks import read_track
 from express50.twin.truth import Truth, align_worlds
 from pipelines.depth import STAGE
 from pipelines.depth.grid import Grid, head_box, hull_distance
@@ -82,15 +83,14 @@ def measure_item(dataset: Dataset, truth: Truth, item: str, config: object) -> d
     found["visual_hull"] = compare(vertices, faces, pictures, true) | {"s": seconds}
     path = dataset.item_dir("track", subject) / "track.npz"
     if path.is_file():
-        with np.load(path, allow_pickle=False) as table:
-            names = table["expressions"].tolist()
-            if expression in names:
-                mesh = table["vertices"][names.index(expression)].astype(np.float64)
-                head = load_head(str(table["head"])).faces.numpy()
-                found["tracked_mesh"] = compare(mesh, head, pictures, true)
-                both = np.isfinite(found["tracked_mesh"]["errors"])
-                there = np.where(both, found["depth"]["errors"], np.nan)
-                found["tracked_mesh"]["depth_there"] = there
+        track = read_track(path)
+        if expression in track.expressions:
+            mesh = track.vertices[track.row(expression)].astype(np.float64)
+            head = load_head(track.head).faces.numpy()
+            found["tracked_mesh"] = compare(mesh, head, pictures, true)
+            both = np.isfinite(found["tracked_mesh"]["errors"])
+            there = np.where(both, found["depth"]["errors"], np.nan)
+            found["tracked_mesh"]["depth_there"] = there
     return found
 
 

@@ -31,6 +31,7 @@ from express50.head.model import landmarks
 from express50.images import read_image
 from express50.layout import Dataset
 from express50.parts import TORSO
+from express50.tracks import read_track
 from express50.twin.truth import Truth
 from pipelines.regions import STAGE
 from pipelines.regions.labels import head_labels
@@ -128,8 +129,7 @@ def baselines(dataset: Dataset, item: str) -> dict[str, Callable[[str], np.ndarr
     cameras = read_cameras_of(dataset, subject)
     head = read_head(dataset, subject, expression)
     path = dataset.item_dir("track", subject) / "track.npz"
-    with np.load(path, allow_pickle=False) as table:
-        model = load_head(str(table["head"]))
+    model = load_head(read_track(path).head)
     chin = landmarks(model, model.template.new_tensor(head.vertices)[None])[0, CHIN].numpy()
     end = head.vertices[head.labels.end]
 

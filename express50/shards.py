@@ -7,10 +7,11 @@ are. The writer is in :mod:`express50.shards_write`.
 
 ``meta.json`` of a sample: ids ``subject expression camera``, ``frame``, ``fps``; ``K``,
 ``cam_from_world``, ``width``, ``height`` of the picture as packed; ``depth_scale_m``; ``head`` and
-``track`` {shape expression neck jaw eyes R t}, the head model and its parameters, with world =
-R @ head + t in the cameras' world; ``label`` (who chose the frame), ``torso`` (removed or
-kept in alpha and depth), ``parts`` (whether there are labels), ``crop``, ``source_size``,
-``consent``, ``licence``, ``session``.
+``track`` {shape offsets expression neck jaw eyes R t}, the head model and its parameters, with
+world = R @ head + t in the cameras' world (``offsets`` says whether ``<subject>.offsets.npy``
+beside the shards is to be added to the rest shape); ``label`` (who chose the frame), ``torso``
+(removed or kept in alpha and depth), ``parts`` (whether there are labels), ``crop``,
+``source_size``, ``consent``, ``licence``, ``session``.
 """
 
 from __future__ import annotations
@@ -28,10 +29,10 @@ import numpy as np
 
 from express50.errors import FormatError
 from express50.images import PIXEL_LIMIT, decode_image
+from express50.shards_offsets import KEY, read_offsets
 
 SCHEMA = "express50.shards/1"
 SHARD_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*-[0-9]{6}\.tar")
-KEY = re.compile(r"[A-Za-z0-9_-]{1,80}")
 RGB = ("rgb.jpg", "rgb.png")
 
 
@@ -166,6 +167,14 @@ class ShardReader:
             "parts": self._parts(number, meta),
             "meta": meta,
         }
+
+    def offsets(self, subject: str) -> np.ndarray:
+        """Offsets (V, 3) float32, metres, of a subject's rest shape; of use where meta says so.
+
+        Raises:
+            FormatError: the file is missing, damaged, or holds something else.
+        """
+        return read_offsets(self.root, subject)
 
     def _parts(self, number: int, meta: dict) -> np.ndarray | None:
         if "parts.png" not in self.entries[number].members:

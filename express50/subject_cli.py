@@ -55,6 +55,7 @@ def run_withdraw(args: argparse.Namespace) -> int:
             say(f"the raw capture {done.capture} is outside the dataset: delete it yourself")
         say(
             "run 'express50 matte' again, as others' plates may have come from the person, then "
-            "the stages after it and 'express50 report'; retrain models that saw the person"
+            "the stages after it and 'express50 report'; retrain models that saw the person, and "
+            "delete exports of the person outside the dataset"
         )
     return FAILED if done.remaining else OK

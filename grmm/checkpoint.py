@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from pickle import UnpicklingError
 from typing import Any
@@ -21,7 +21,7 @@ from express50.head.load import load_head
 from express50.head.model import HeadModel
 from express50.publish import write_bytes
 from grmm.config import Config, as_tables, from_tables
-from grmm.data import HeadViews, Tracked, pose_state
+from grmm.data import NO_OFFSETS, HeadViews, Tracked, pose_state
 from grmm.model import GRMM, HeadState, View
 
 FORMAT = "grmm.checkpoint/1"
@@ -101,9 +101,14 @@ def save_checkpoint(
         "expressions": list(model.expressions),
         "model": model.state_dict(),
         "frames": [
-            {"subject": s, "expression_id": e, "parameters": _tensors(asdict(tracked))}
+            {"subject": s, "expression_id": e, "parameters": _parameters(tracked)}
             for (s, e), tracked in gallery.frames.items()
         ],
+        # Once a subject: offsets are larger than all other parameters together.
+        "offsets": {
+            s: torch.from_numpy(np.ascontiguousarray(tracked.offsets))
+            for (s, _), tracked in gallery.frames.items()
+        },
         "cameras": {
             name: {
                 "K": view.K.cpu(),
@@ -130,6 +135,7 @@ def load_checkpoint(path: Path, device: torch.device | str = "cpu") -> Loaded:
     content = _read(path)
     config = from_tables(content["config"])
     head = load_head(content["head"]).to(device)
+    offsets = _arrays(content.get("offsets", {}))
     model = GRMM(config.model, head, content["subjects"], content["expressions"]).to(device)
     try:
         model.load_state_dict(content["model"])
@@ -145,7 +151,10 @@ def load_checkpoint(path: Path, device: torch.device | str = "cpu") -> Loaded:
         model=model,
         gallery=Gallery(
             frames={
-                (frame["subject"], frame["expression_id"]): Tracked(**_arrays(frame["parameters"]))
+                (frame["subject"], frame["expression_id"]): Tracked(
+                    **_arrays(frame["parameters"]),
+                    offsets=offsets.get(frame["subject"], NO_OFFSETS),
+                )
                 for frame in content["frames"]
             },
             cameras={
@@ -176,8 +185,13 @@ def _read(path: Path) -> dict[str, Any]:
     return content
 
 
-def _tensors(arrays: dict[str, np.ndarray]) -> dict[str, Tensor]:
-    return {name: torch.from_numpy(np.ascontiguousarray(a)) for name, a in arrays.items()}
+def _parameters(tracked: Tracked) -> dict[str, Tensor]:
+    """All but the offsets, which the frames of a subject share."""
+    return {
+        item.name: torch.from_numpy(np.ascontiguousarray(getattr(tracked, item.name)))
+        for item in fields(tracked)
+        if item.name != "offsets"
+    }
 
 
 def _arrays(tensors: dict[str, Tensor]) -> dict[str, np.ndarray]:

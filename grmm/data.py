@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections import OrderedDict
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
@@ -22,6 +22,7 @@ from express50.head.model import HeadModel, pose
 from grmm.model import HeadState, View
 from grmm.torso import labelled_torso, torso_mask
 
+NO_OFFSETS = np.zeros((0, 3), np.float32)
 WINDOW_STEP = 32  # pixels; windows have sides of whole steps
 
 
@@ -46,6 +47,8 @@ class Tracked:
         eyes: (6,) axis-angles, left then right, radians.
         R: (3, 3).
         t: (3,) metres.
+        offsets: (V, 3) float32 metres, added to the rest shape, one array for all frames of a
+            subject; (0, 3) where there are none.
     """
 
     shape: np.ndarray
@@ -55,6 +58,7 @@ class Tracked:
     eyes: np.ndarray
     R: np.ndarray
     t: np.ndarray
+    offsets: np.ndarray = field(default_factory=lambda: NO_OFFSETS)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -260,6 +264,12 @@ class HeadViews:
                     f"head model {self.head.name!r} has {count}; "
                     "name the head model that the dataset was tracked with"
                 )
+        offsets, vertices = len(sample.tracked.offsets), len(self.head.template)
+        if offsets not in (0, vertices):
+            raise FormatError(
+                f"{where}: offsets of {offsets} vertices, head model {self.head.name!r} has "
+                f"{vertices}; name the head model that the dataset was tracked with"
+            )
 
 
 def pose_state(head: HeadModel, tracked: Tracked) -> HeadState:
@@ -270,8 +280,9 @@ def pose_state(head: HeadModel, tracked: Tracked) -> HeadState:
 
     shape, expression = row(tracked.shape), row(tracked.expression)
     neck, jaw = row(tracked.neck), row(tracked.jaw)
+    offsets = row(tracked.offsets) if len(tracked.offsets) else None
     with torch.no_grad():
-        vertices = pose(head, shape, expression, neck, jaw, row(tracked.eyes))[0]
+        vertices = pose(head, shape, expression, neck, jaw, row(tracked.eyes), offsets=offsets)[0]
     missing = len(head.expression_names) - expression.shape[1]
     return HeadState(
         vertices=vertices,

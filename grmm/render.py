@@ -129,6 +129,7 @@ def transfer(identity: Tracked, expression: Tracked) -> Tracked:
         eyes=expression.eyes,
         R=identity.R,
         t=identity.t,
+        offsets=identity.offsets,
     )
 
 
@@ -147,7 +148,16 @@ def interpolate_tracked(a: Tracked, b: Tracked, t: float) -> Tracked:
         ),
         R=a.R,
         t=a.t,
+        offsets=_blend_offsets(a.offsets, b.offsets, t),
     )
+
+
+def _blend_offsets(a: np.ndarray, b: np.ndarray, t: float) -> np.ndarray:
+    """(1 - t) a + t b (V, 3); (0, 3) stands for zeros."""
+    if not len(a) and not len(b):
+        return a
+    a, b = (x if len(x) else np.zeros_like(max(a, b, key=len)) for x in (a, b))
+    return a if a is b else ((1 - t) * a + t * b).astype(np.float32)
 
 
 def _lerp(a: np.ndarray, b: np.ndarray, t: float) -> np.ndarray:

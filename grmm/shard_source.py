@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +36,7 @@ class ShardSource:
             for entry in self.reader.entries
         ]
         self.head = str(self.reader.meta(0)["head"])
+        self._offsets: dict[str, np.ndarray] = {}
 
     def read(self, index: int) -> Sample:
         """Decode one sample.
@@ -59,8 +61,16 @@ class ShardSource:
             K=K,
             cam_from_world=_matrix(meta, "cam_from_world", (4, 4), where),
             parts=None if sample["parts"] is None else sample["parts"][rows, columns],
-            tracked=_tracked(meta.get("track"), where),
+            tracked=self._tracked(meta, self.keys[index].subject, where),
         )
+
+    def _tracked(self, meta: dict, subject: str, where: str) -> Tracked:
+        tracked = _tracked(meta.get("track"), where)
+        if not meta["track"].get("offsets", False):
+            return tracked
+        if subject not in self._offsets:
+            self._offsets[subject] = self.reader.offsets(subject)
+        return replace(tracked, offsets=self._offsets[subject])
 
 
 def seen_window(meta: dict, where: str) -> tuple[slice, slice]:

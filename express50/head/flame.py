@@ -2,7 +2,8 @@
 
 Four files in one folder: the model pickle, a landmark embedding, FLAME_masks.pkl and the template
 OBJ that carries the texture map. File layouts are as published loaders describe them; nothing in
-the files is executed (`safe_pickle.py`). Vertex and face counts are taken from the file.
+the files is executed (`safe_pickle.py`). Vertex and face counts are taken from the file. Teeth and
+the inside of the mouth, which FLAME lacks, are added (`mouth.py`).
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import torch
 from express50.errors import HeadModelError
 from express50.head.ict import read_obj
 from express50.head.model import PARENTS, REGIONS, HeadModel, check_head
+from express50.head.mouth import add_mouth, is_flame_topology
 from express50.head.safe_pickle import read_object_array, read_pickle, to_array
 
 EMBEDDINGS = (
@@ -33,6 +35,7 @@ def load_flame(
     embedding: str | Path | None = None,
     masks: str | Path | None = None,
     template: str | Path | None = None,
+    mouth: bool = True,
 ) -> HeadModel:
     """Load FLAME.
 
@@ -41,6 +44,7 @@ def load_flame(
         embedding: Landmark embedding, `.npy` or `.pkl`; by default looked for beside the model.
         masks: FLAME_masks.pkl, likewise.
         template: head_template_mesh.obj, likewise.
+        mouth: Add teeth and the inside of the mouth, where the file has FLAME's vertices.
 
     Raises:
         HeadModelError: a file is missing, damaged, unsafe or of another layout.
@@ -60,7 +64,7 @@ def load_flame(
     def tensor(array: np.ndarray) -> torch.Tensor:
         return torch.from_numpy(np.ascontiguousarray(array, dtype=np.float32))
 
-    return check_head(
+    model = check_head(
         HeadModel(
             name=f"flame-{hashlib.sha256(path.read_bytes()).hexdigest()[:12]}",
             template=tensor(arrays["v_template"]),
@@ -83,6 +87,7 @@ def load_flame(
             unit_expressions=False,
         )
     )
+    return check_head(add_mouth(model)) if mouth and is_flame_topology(model) else model
 
 
 def shape_component_count(total: int) -> int:

@@ -16,6 +16,7 @@ from express50.index import index_path
 from express50.layout import Dataset
 from express50.raycast import mesh_scene
 from express50.stage import Stage
+from express50.tracks import read_track
 from pipelines.depth.config import PRESETS, DepthConfig
 from pipelines.depth.grid import View
 from pipelines.depth.prior import Prior, make_prior, matte_agreement
@@ -124,16 +125,15 @@ def read_prior(
     path = _track_path(dataset, subject)
     if not config.use_track or not path.is_file():
         return None, {"used": False, "why": "there is none" if config.use_track else "use_track"}
-    with np.load(path, allow_pickle=False) as table:
-        names = table["expressions"].tolist()
-        if expression not in names:
-            return None, {"used": False, "why": f"{expression} is not tracked"}
-        vertices = table["vertices"][names.index(expression)].astype(np.float64)
-        faces = load_head(str(table["head"])).faces.numpy()
-    if faces.max() >= len(vertices) or not np.isfinite(vertices).all():
+    track = read_track(path)
+    if expression not in track.expressions:
+        return None, {"used": False, "why": f"{expression} is not tracked"}
+    vertices = track.vertices[track.row(expression)].astype(np.float64)
+    faces = load_head(track.head).faces.numpy()
+    if faces.max() >= len(vertices):
         raise FormatError(
-            f"{path}: {len(vertices)} vertices do not fit the head's {faces.max() + 1}, or are not"
-            " finite; run 'express50 track' again"
+            f"{path}: {len(vertices)} vertices do not fit the head's {faces.max() + 1};"
+            " run 'express50 track' again"
         )
     agreement = matte_agreement(views, vertices, faces)
     if agreement < config.track_agreement:

@@ -28,6 +28,7 @@ from express50.layout import Dataset
 from express50.parts import COLOURS
 from express50.publish import write_json
 from express50.shards import ShardReader
+from express50.shards_offsets import write_offsets
 from express50.shards_write import PackedSample, ShardWriter, sample_key, write_manifest
 from express50.stage import Stage
 from pipelines.pack.card import split_subjects, write_card
@@ -99,6 +100,9 @@ def run(dataset: Dataset, item: str, config: PackConfig, out: Path) -> dict:
         why = "; ".join(sorted({row["why"] for row in dropped})[:3])
         raise StageError(f"{item}: none of {read} samples can be packed ({why})")
     packed = sorted({meta["subject"] for meta in metas})
+    for subject in subjects:
+        if subject.offsets is not None and subject.name in packed:
+            write_offsets(out, subject.name, subject.offsets)
     people = [read_index(dataset, name).meta for name in packed]
     return _finish(out, splits, metas, people, read, dropped, config)
 
@@ -301,7 +305,7 @@ def _write_picture(out: Path, reader: ShardReader) -> float:
 
 STAGE = Stage(
     name="pack",
-    version=4,
+    version=5,
     config=PackConfig,
     presets=PRESETS,
     items=items,

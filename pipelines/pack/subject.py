@@ -13,13 +13,18 @@ from express50.exclusions import exclusion_reason
 from express50.frames import read_cameras_of, read_gains, read_peaks
 from express50.index import read_index
 from express50.layout import Dataset
+from express50.tracks import read_track, track_file
 
 PARAMETERS = ("expression", "neck", "jaw", "eyes", "R", "t")
 
 
 @dataclass(frozen=True)
 class Subject:
-    """What a subject's samples share: cameras, gains, peaks, tracks by expression, and meta."""
+    """What a subject's samples share.
+
+    Cameras, gains, peaks, tracks by expression, offsets (V, 3) of the rest shape (None: zeros),
+    and meta.
+    """
 
     name: str
     cameras: dict[str, Camera]
@@ -28,6 +33,7 @@ class Subject:
     labels: dict[str, dict]
     tracked: dict[str, dict]
     vertices: dict[str, np.ndarray]
+    offsets: np.ndarray | None
     meta: dict
 
 
@@ -55,25 +61,16 @@ def _read_subject(dataset: Dataset, name: str) -> Subject:
     index = read_index(dataset, name)
     peaks = read_peaks(dataset, name)
     labels = json.loads((dataset.item_dir("align", name) / "peaks.json").read_text("utf-8"))
-    path = dataset.item_dir("track", name) / "track.npz"
-    if not path.is_file():
-        raise StageError(f"subject {name!r} is not tracked; run 'express50 track'")
-    tracked, vertices, head = {}, {}, ""
-    try:
-        with np.load(path, allow_pickle=False) as table:
-            head = str(table["head"])
-            for row, expression in enumerate(table["expressions"].tolist()):
-                arrays = {key: table[key][row].tolist() for key in PARAMETERS}
-                tracked[expression] = arrays | {"shape": table["shape"].tolist()}
-                vertices[expression] = table["vertices"][row].astype(np.float64)
-    except (ValueError, KeyError, IndexError, OSError) as error:
-        raise FormatError(f"{path}: not a track ({error}); run 'express50 track' again") from None
-    bad = [one for one, points in vertices.items() if not np.isfinite(points).all()]
-    if bad:
-        raise FormatError(f"{path}: vertices of {', '.join(bad)} are not finite; track again")
+    track = read_track(track_file(dataset, name))
+    shared = {"shape": track.shape.tolist(), "offsets": bool(track.offsets.any())}
+    tracked, vertices = {}, {}
+    for row, expression in enumerate(track.expressions):
+        tracked[expression] = {key: getattr(track, key)[row].tolist() for key in PARAMETERS}
+        tracked[expression] |= shared
+        vertices[expression] = track.vertices[row].astype(np.float64)
     meta = {
         "subject": name,
-        "head": head,
+        "head": track.head,
         "fps": index.fps,
         "consent": index.meta.get("consent_id", index.meta.get("consent")),
         "licence": index.meta.get("licence", index.meta.get("license")),
@@ -81,4 +78,5 @@ def _read_subject(dataset: Dataset, name: str) -> Subject:
     }
     cameras = read_cameras_of(dataset, name)
     gains = read_gains(dataset, name)
-    return Subject(name, cameras, gains, peaks, labels, tracked, vertices, meta)
+    offsets = track.offsets if shared["offsets"] else None
+    return Subject(name, cameras, gains, peaks, labels, tracked, vertices, offsets, meta)

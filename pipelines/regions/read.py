@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from functools import lru_cache
-from pathlib import Path
 
 import numpy as np
 
@@ -13,21 +12,10 @@ from express50.frames import read_frame
 from express50.head.load import load_head
 from express50.images import read_alpha, read_depth_png
 from express50.layout import Dataset
+from express50.tracks import read_track, track_file
 from pipelines.regions.config import RegionsConfig
 from pipelines.regions.labels import HeadLabels, head_labels
 from pipelines.regions.mesh import TrackedHead, make_head
-
-
-def track_file(dataset: Dataset, subject: str) -> Path:
-    """The subject's track.
-
-    Raises:
-        StageError: there is none.
-    """
-    path = dataset.item_dir("track", subject) / "track.npz"
-    if not path.is_file():
-        raise StageError(f"subject {subject!r} is not tracked; run 'express50 track'")
-    return path
 
 
 def read_head(dataset: Dataset, subject: str, expression: str) -> TrackedHead:
@@ -38,24 +26,15 @@ def read_head(dataset: Dataset, subject: str, expression: str) -> TrackedHead:
         FormatError: the track does not fit its head model, or is not finite.
     """
     path = track_file(dataset, subject)
-    try:
-        with np.load(path, allow_pickle=False) as table:
-            names, name = table["expressions"].tolist(), str(table["head"])
-            vertices, R = (table[key].astype(np.float64) for key in ("vertices", "R"))
-    except (ValueError, KeyError, OSError) as error:
-        raise FormatError(f"{path}: not a track ({error}); run 'express50 track' again") from None
-    if expression not in names:
-        raise StageError(f"{subject}/{expression}: it is not tracked; see the metrics of track")
-    row, labels = names.index(expression), _labels_of(name)
-    vertices, R = vertices[row], R[row]
+    track = read_track(path)
+    row, labels = track.row(expression), _labels_of(track.head)
+    vertices = track.vertices[row].astype(np.float64)
     if vertices.shape != (len(labels.vertices), 3):
         raise FormatError(
             f"{path}: vertices {vertices.shape}, expected ({len(labels.vertices)}, 3) of its head"
             " model; run 'express50 track' again"
         )
-    if not (np.isfinite(vertices).all() and np.isfinite(R).all()):
-        raise FormatError(f"{path}: {expression} holds NaN or Inf; run 'express50 track' again")
-    return make_head(vertices, R, labels)
+    return make_head(vertices, track.R[row], labels)
 
 
 @lru_cache(maxsize=2)

@@ -16,6 +16,7 @@ from express50.images import contact_sheet, fit_into, resize_area, write_image
 from express50.index import index_path
 from express50.layout import Dataset
 from express50.stage import Stage
+from express50.tracks import track_file
 from pipelines.regions.colour import SKIN, by_colour, face_colours
 from pipelines.regions.config import PRESETS, RegionsConfig
 from pipelines.regions.labels import SCALP, HeadLabels
@@ -28,7 +29,7 @@ from pipelines.regions.qc import (
     subject_box,
     view_warning,
 )
-from pipelines.regions.read import read_depth, read_head, read_pair, track_file
+from pipelines.regions.read import read_depth, read_head, read_pair
 from pipelines.regions.scalp import Scalp, decide, scalp_votes
 from pipelines.regions.view import HAIR, head_alpha, place
 

@@ -29,24 +29,30 @@ def draw_overlays(
     model: HeadModel,
     targets: list[Target],
     vertices: np.ndarray,
-) -> None:
+) -> dict[str, np.ndarray]:
     """Write overlay_<expression>.jpg: frame above, mesh and landmarks below, in four views.
 
     Yellow: detected; green: fitted. Vertices (E, V, 3) world.
+
+    Returns:
+        Expression to the overlay (TILE, TILE, 3) uint8 in its surest view.
     """
     folder.mkdir(parents=True, exist_ok=True)
     cameras = read_cameras_of(dataset, subject)
+    surest = {}
     for target, mesh in zip(targets, vertices, strict=True):
-        columns = []
-        for camera_id in _spread(target, cameras):
+        chosen, columns = _spread(target, cameras), {}
+        for camera_id in sorted(chosen):
             frame = read_frame(dataset, subject, camera_id, target.observation.frame)
-            columns.append(_column(frame, cameras[camera_id], camera_id, model, target, mesh))
+            columns[camera_id] = _column(frame, cameras[camera_id], camera_id, model, target, mesh)
         path = folder / f"overlay_{target.observation.expression}.jpg"
-        write_image(path, np.concatenate(columns, axis=1), quality=88)
+        write_image(path, np.concatenate(list(columns.values()), axis=1), quality=88)
+        surest[target.observation.expression] = columns[chosen[0]][TILE:]
+    return surest
 
 
 def _spread(target: Target, cameras: dict[str, Camera]) -> list[str]:
-    """Up to four cameras: the surest view, then those furthest from all chosen so far."""
+    """Up to four cameras: the surest view first, then those furthest from all chosen so far."""
     views = sorted(target.observation.views, key=lambda v: float(np.median(v.sigma)) / v.score)
     chosen = [views[0].camera_id]
     pool = [view.camera_id for view in views[1:]]
@@ -54,7 +60,7 @@ def _spread(target: Target, cameras: dict[str, Camera]) -> list[str]:
         axes = np.stack([cameras[name].cam_from_world[2, :3] for name in chosen])
         far = [float((axes @ cameras[name].cam_from_world[2, :3]).max()) for name in pool]
         chosen.append(pool.pop(int(np.argmin(far))))
-    return sorted(chosen)
+    return chosen
 
 
 def _column(

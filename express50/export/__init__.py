@@ -1,0 +1,1 @@
+"""Tracked heads in the layouts of other tools: GaussianAvatars, OBJ, PLY, GLB."""

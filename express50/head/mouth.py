@@ -1,0 +1,273 @@
+"""Teeth and the inside of the mouth for heads of FLAME's topology, which have neither.
+
+Facts of the topology: 5023 vertices; two rings of 15 vertices each round the lips, paired by
+index; an open loop of 32 vertices at the back of the lips. The order of the 120 tooth vertices, and
+where they stand, are those that VHAP and GaussianAvatars put behind the 5023, so that their
+parameters and ours give the same 5143 vertices; triangles, texture map and the pouch that closes
+the loop behind the teeth (65 vertices, after the teeth) are our own. GRMM's supplement asks for
+both, each with its own part of the texture map.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+
+from express50.errors import HeadModelError
+from express50.head.model import JOINTS, HeadModel
+from express50.head.uv_room import place_charts
+
+FLAME_VERTICES, TOOTH_VERTICES = 5023, 120
+# Outer rings of the lips from one corner to the other; VHAP's vertex ids.
+UPPER_RING = (
+    1713, 1715, 1716, 1735, 1696, 1694, 1657, 3543, 2774, 2811, 2813, 2850, 2833, 2832, 2830,
+)  # fmt: skip
+LOWER_RING = (
+    1576, 1577, 1773, 1774, 1795, 1802, 1865, 3503, 2948, 2905, 2898, 2881, 2880, 2713, 2712,
+)  # fmt: skip
+CORNERS = (1594, 2730)  # of the loop at the back of the lips
+LOOP_SIZE = 32
+# Rows of 15 tooth vertices in their order: jaw (0 upper, 1 lower), whether root, whether back.
+_ROWS = ((0, 1, 0), (1, 1, 0), (0, 0, 0), (1, 0, 0), (0, 1, 1), (0, 0, 1), (1, 1, 1), (1, 0, 1))
+# Each jaw's rows round the outside: front root, front edge, back edge, back root.
+_AROUND = ((0, 2, 5, 4), (1, 3, 7, 6))
+# Heights and depths in units of the mean distance of the rings.
+_INSET, _GAP, _ROOT, _OVERJET, _THICK = 1.5, 0.1, 2.0, 0.4, 1.0
+_LIPS = (0.002, 0.03)  # metres the rings may be apart on average: 7.7 mm on FLAME's template
+# The pouch: rings of the loop drawn together to its middle and set back, then one end vertex.
+_POUCH = ((1.0, 0.012), (0.7, 0.026), (0.0, 0.034))  # share of the loop's width, metres behind it
+_STRIP_V = (0.0, 0.4, 0.6, 1.0)  # rows of a jaw in its chart, by their lengths
+# Charts (width, height) of pouch, upper and lower teeth: no larger than that on the unit square.
+_CHARTS = ((0.18, 0.18), (0.2, 0.12), (0.2, 0.12))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Part:
+    """Vertices to append: ``weights`` (N, V) take linear bases from the model's own vertices.
+
+    Attributes:
+        places: (N, 3) metres, in the template.
+        shape_from: (N, V) rows sum to 1.
+        motion_from: the same for expression, pose correctives and skinning; rows of 0 for rigid
+            parts.
+        skinning: (N, J) of rigid parts, else 0.
+        faces: (F, 3) into the whole model.
+        uv: (T, 2); uv_faces (F, 3) from 0.
+        uv_faces: (F, 3).
+    """
+
+    places: torch.Tensor
+    shape_from: torch.Tensor
+    motion_from: torch.Tensor
+    skinning: torch.Tensor
+    faces: torch.Tensor
+    uv: torch.Tensor
+    uv_faces: torch.Tensor
+
+
+def is_flame_topology(model: HeadModel) -> bool:
+    """Whether vertex ids mean what they mean in FLAME."""
+    return len(model.template) == FLAME_VERTICES
+
+
+def add_mouth(model: HeadModel) -> HeadModel:
+    """The model with teeth and a pouch behind them; joints, landmarks and old ids stay.
+
+    Upper teeth follow the neck joint, lower teeth the jaw, both keep still in expressions and move
+    with the identity as the lips before them do. The pouch follows the loop it hangs on.
+
+    Raises:
+        HeadModelError: the model's topology or lips are not FLAME's, or its texture map has no
+            room.
+    """
+    if not is_flame_topology(model):
+        raise HeadModelError(
+            f"head model {model.name!r}: {len(model.template)} vertices, expected FLAME's"
+            f" {FLAME_VERTICES}; load it without a mouth"
+        )
+    charts = place_charts(model.uv.numpy(), model.uv_faces.numpy(), _CHARTS, model.name)
+    teeth = _teeth(model, charts[1:])
+    pouch = _pouch(model, charts[0])
+    count = len(model.template)
+    model = _appended(_appended(model, teeth), pouch)
+    number = torch.arange(len(model.template)) - count
+    row_jaw = torch.tensor([jaw for jaw, _, _ in _ROWS]).repeat_interleave(15)
+    jaw = torch.full((len(number),), -1)
+    jaw[count : count + TOOTH_VERTICES] = row_jaw
+    masks = {
+        "upper_teeth": jaw == 0,
+        "lower_teeth": jaw == 1,
+        "teeth": jaw >= 0,
+        "mouth_interior": number >= TOOTH_VERTICES,
+    }
+    regions = {name: mask | masks.get(name, mask) for name, mask in model.regions.items()}
+    return replace(model, name=f"{model.name}+mouth", regions=masks | regions)
+
+
+def _teeth(model: HeadModel, charts: tuple[np.ndarray, ...]) -> _Part:
+    """Two arches of 15 columns: a strip in front, one behind, and the edge between them."""
+    upper, lower = (model.template[list(ring)].double() for ring in (UPPER_RING, LOWER_RING))
+    unit = float((upper - lower).norm(dim=1).mean())
+    if not _LIPS[0] < unit < _LIPS[1]:
+        raise HeadModelError(
+            f"head model {model.name!r}: its lips' rings are {1e3 * unit:.3g} mm apart, expected"
+            f" {1e3 * _LIPS[0]:g} to {1e3 * _LIPS[1]:g}; are its vertices FLAME's, in metres?"
+        )
+    middle = 0.5 * (upper + lower)
+    middle[:, 1] = middle[:, 1].mean()
+    middle[:, 2] -= _INSET * unit
+    places = []
+    for jaw, root, back in _ROWS:
+        up = 1.0 - 2.0 * jaw
+        row = middle.clone()
+        row[:, 1] += up * unit * (_GAP + _ROOT * root)
+        row[:, 2] -= unit * (_OVERJET * jaw + _THICK * back)
+        places.append(row)
+    shape_from = torch.zeros(15, len(model.template))
+    for ring in (UPPER_RING, LOWER_RING):
+        shape_from[torch.arange(15), list(ring)] += 0.5
+    bone = torch.tensor([JOINTS.index("jaw" if jaw else "neck") for jaw, _, _ in _ROWS])
+    skinning = torch.nn.functional.one_hot(bone, len(JOINTS)).repeat_interleave(15, 0)
+    # Seen from before, columns from the subject's left go from right to left.
+    from_left = bool(upper[0, 0] > upper[-1, 0])
+    strips, uv_strips, uv = [], [], []
+    for jaw, rows in enumerate(_AROUND):
+        flip = from_left == bool(jaw)
+        strips.append(_strip(rows, flip))
+        uv_strips.append(_strip(range(4 * jaw, 4 * jaw + 4), flip))
+        uv.append(_strip_uv(charts[jaw], bool(jaw), from_left))
+    return _Part(
+        places=torch.cat(places),
+        shape_from=shape_from.repeat(8, 1),
+        motion_from=torch.zeros(TOOTH_VERTICES, len(model.template)),
+        skinning=skinning,
+        faces=torch.from_numpy(np.concatenate(strips)) + len(model.template),
+        uv=torch.from_numpy(np.concatenate(uv)),
+        uv_faces=torch.from_numpy(np.concatenate(uv_strips)),
+    )
+
+
+def _strip(rows: tuple[int, ...] | range, flip: bool) -> np.ndarray:
+    """Triangles (84, 3) between consecutive rows of 15 vertices, seen from outside."""
+    grid = 15 * np.asarray(rows)[:, None] + np.arange(15)
+    a, b, c, d = grid[:-1, :-1], grid[:-1, 1:], grid[1:, 1:], grid[1:, :-1]
+    faces = np.stack([np.stack([a, b, c], -1), np.stack([a, c, d], -1)], 2).reshape(-1, 3)
+    return faces[:, ::-1].copy() if flip else faces
+
+
+def _strip_uv(chart: np.ndarray, lower: bool, from_left: bool) -> np.ndarray:
+    """UV (60, 2) of a jaw's four rows in a chart (left, bottom, right, top); u rises with x."""
+    u = np.linspace(chart[0], chart[2], 15)[:: -1 if from_left else 1]
+    share = np.asarray(_STRIP_V) if lower else 1 - np.asarray(_STRIP_V)
+    v = chart[1] + share * (chart[3] - chart[1])
+    return np.stack(np.broadcast_arrays(u, v[:, None]), -1).reshape(-1, 2)
+
+
+def _pouch(model: HeadModel, chart: np.ndarray) -> _Part:
+    """Rings behind the loop at the back of the lips, ending in one vertex."""
+    loop = torch.from_numpy(mouth_loop(model.faces.numpy(), model.name))
+    size, first = len(loop), len(model.template) + TOOTH_VERTICES
+    own = torch.nn.functional.one_hot(loop, len(model.template)).double()
+    mean = own.mean(0, keepdim=True).expand_as(own)
+    weights, places = [], []
+    for share, depth in _POUCH:
+        ring = share * own + (1 - share) * mean
+        ring = ring if share else ring[:1]
+        place = ring @ model.template.double()
+        place[:, 2] -= depth
+        weights.append(ring)
+        places.append(place)
+    combined = torch.cat(weights).float()
+    steps = np.concatenate([np.arange(size), np.arange(2 * size + 1) + size])
+    ids = np.concatenate([loop.numpy(), first + np.arange(2 * size + 1)])
+    faces = _funnel(size)
+    return _Part(
+        places=torch.cat(places),
+        shape_from=combined,
+        motion_from=combined,
+        skinning=torch.zeros(len(combined), len(JOINTS)),
+        faces=torch.from_numpy(ids[faces]),
+        uv=torch.from_numpy(_funnel_uv(size, chart)),
+        uv_faces=torch.from_numpy(steps[faces]),
+    )
+
+
+def _funnel(size: int) -> np.ndarray:
+    """Triangles (5 size, 3) of three rings and an end vertex, numbered in that order."""
+    k = np.arange(size)
+    after = (k + 1) % size
+    faces = []
+    for ring in (0, size):
+        a, b, c, d = ring + k, ring + after, ring + size + after, ring + size + k
+        faces += [np.stack([a, b, c], -1), np.stack([a, c, d], -1)]
+    faces.append(np.stack([2 * size + k, 2 * size + after, np.full(size, 3 * size)], -1))
+    return np.concatenate(faces)
+
+
+def _funnel_uv(size: int, chart: np.ndarray) -> np.ndarray:
+    """UV (3 size + 1, 2): concentric rings in a chart (left, bottom, right, top)."""
+    angle = 2 * np.pi * np.arange(size) / size
+    circle = np.stack([np.cos(angle), np.sin(angle)], -1)
+    unit = np.concatenate([circle, circle * 2 / 3, circle / 3, np.zeros((1, 2))])
+    middle, half = 0.5 * (chart[:2] + chart[2:]), 0.5 * (chart[2:] - chart[:2])
+    return middle + half * unit
+
+
+def mouth_loop(faces: np.ndarray, name: str) -> np.ndarray:
+    """Ids (32,) of the open loop at the back of the lips, in the order new faces run along it.
+
+    It starts at the first of CORNERS.
+
+    Raises:
+        HeadModelError: the faces (F, 3) have no such loop.
+    """
+    edges = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+    count = int(faces.max()) + 1
+    keys, back = edges[:, 0] * count + edges[:, 1], edges[:, 1] * count + edges[:, 0]
+    open_edges = edges[~np.isin(keys, back)]
+    # A neighbour across an edge runs along it the other way round.
+    following = {int(b): int(a) for a, b in open_edges}
+    loop = [CORNERS[0]]
+    while len(loop) <= LOOP_SIZE and (after := following.get(loop[-1])) not in (None, loop[0]):
+        loop.append(after)
+    if len(loop) != LOOP_SIZE or CORNERS[1] not in loop:
+        raise HeadModelError(
+            f"head model {name!r}: no open loop of {LOOP_SIZE} vertices through {CORNERS[0]} and"
+            f" {CORNERS[1]} behind the lips, expected FLAME's topology; load it without a mouth"
+        )
+    return np.array(loop)
+
+
+def _appended(model: HeadModel, part: _Part) -> HeadModel:
+    """The model with a part's vertices, faces and chart after its own."""
+    count, added = len(model.template), len(part.places)
+    # Parts are made for the bare head; vertices that came in between lend them nothing.
+    room = count - part.shape_from.shape[1]
+    shape_from, motion_from = (
+        torch.nn.functional.pad(weights, (0, room)).to(model.dtype)
+        for weights in (part.shape_from, part.motion_from)
+    )
+    pose = model.pose_dirs.reshape(-1, count, 3)
+    pose = torch.cat([pose, torch.einsum("nv,pvc->pnc", motion_from, pose)], 1)
+    skinning = part.skinning.to(model.dtype) + motion_from @ model.skinning
+    blank = torch.zeros(added, dtype=torch.bool)
+    return replace(
+        model,
+        template=torch.cat([model.template, part.places.to(model.dtype)]),
+        shape_dirs=_extended(model.shape_dirs, shape_from),
+        expression_dirs=_extended(model.expression_dirs, motion_from),
+        pose_dirs=pose.flatten(1),
+        joint_regressor=torch.nn.functional.pad(model.joint_regressor, (0, added)),
+        skinning=torch.cat([model.skinning, skinning]),
+        faces=torch.cat([model.faces, part.faces]),
+        uv=torch.cat([model.uv, part.uv.to(model.dtype)]),
+        uv_faces=torch.cat([model.uv_faces, part.uv_faces + len(model.uv)]),
+        regions={name: torch.cat([mask, blank]) for name, mask in model.regions.items()},
+    )
+
+
+def _extended(directions: torch.Tensor, weights: torch.Tensor) -> torch.Tensor:
+    """Directions (V, 3, K) with those of appended vertices, weighted means of the old ones."""
+    return torch.cat([directions, torch.einsum("nv,vck->nck", weights, directions)])
