@@ -321,6 +321,22 @@ EXPRESS50_EXPORT int64_t mesh_pairs(const MeshView* view, const double* xyz, int
     return mesh_outline_pairs(*view, xyz, face_count, faces, neighbors, face_id, depth, pairs);
 }
 
+#define EXPRESS50_MESH_ROWS(Real, suffix)                                                         \
+    EXPRESS50_EXPORT void mesh_weigh_##suffix(int64_t n, int64_t channels, const Real* rows,      \
+                                              const Real* coefficients, const int64_t* group,     \
+                                              Real* out) {                                        \
+        weigh_rows<Real>(n, channels, rows, coefficients, group, out);                            \
+    }                                                                                             \
+    EXPRESS50_EXPORT void mesh_weigh_gradient_##suffix(                                           \
+        int64_t n, int64_t channels, const Real* rows, const Real* coefficients,                  \
+        const int64_t* group, const Real* gradient, Real* d_rows, Real* d_coefficients) {         \
+        weigh_rows_gradient<Real>(n, channels, rows, coefficients, group, gradient, d_rows,       \
+                                  d_coefficients);                                                \
+    }
+
+EXPRESS50_MESH_ROWS(float, f32)
+EXPRESS50_MESH_ROWS(double, f64)
+
 // Which source this library was compiled from, so that a stale one is noticed.
 EXPRESS50_EXPORT const char* native_digest() { return EXPRESS50_DIGEST; }
 
