@@ -1,8 +1,8 @@
 """Visibility of triangle meshes: which face each pixel sees, how deep, and where outlines run.
 
-The z-buffer is native (express50/native/mesh.h). One call serves one view on one thread and lets
-go of the interpreter, so callers run views in a thread pool. Without the native library Open3D
-casts rays instead, which is several times slower and finds no outlines. What is differentiable is
+The z-buffer is native (express50/native/mesh.h). One call serves one view on one thread and lets go
+of the interpreter, so callers run views in a thread pool. Without the native library Open3D casts
+rays instead, which is several times slower and finds no outlines. What is differentiable is
 computed from the result by express50/mesh_render.py.
 """
 

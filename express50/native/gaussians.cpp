@@ -1,5 +1,5 @@
 // Differentiable rasterisation of 3D Gaussians on the CPU, behind a plain C ABI; the z-buffer of
-// meshes (mesh.h) is exported here too, so that one library holds all that is native.
+// meshes (mesh*.h) is exported here too, so that one library holds all that is native.
 //
 // forward:  gaussians_project -> gaussians_bin -> gaussians_forward
 // backward: gaussians_backward
@@ -11,7 +11,8 @@
 #include <vector>
 
 #include "blend.h"
-#include "mesh.h"
+#include "mesh_outlines.h"
+#include "mesh_rows.h"
 
 namespace {
 

@@ -1,4 +1,4 @@
-// Visibility of a triangle mesh: a z-buffer, and the pairs of pixels that an outline parts.
+// Visibility of a triangle mesh: a z-buffer.
 //
 // Everything is decided by edge functions of rays in camera space (Olano and Greer 1997, "Triangle
 // scan conversion using 2D homogeneous coordinates"): nothing is divided before a hit is known, so
@@ -21,8 +21,6 @@ struct MeshView {
 };
 
 namespace {
-
-constexpr int kWalkSteps = 64;  // faces that one pixel step may cross on its way to an outline
 
 struct Ray {
     double x, y;  // z is 1
@@ -144,135 +142,6 @@ void mesh_zbuffer(const MeshView& view, const double* xyz, int64_t face_count,
                 face_id[at] = int32_t(id);
                 depth[at] = float(z);
             }
-        }
-    }
-}
-
-struct MeshTable {
-    const MeshView& view;
-    const double* xyz;
-    const int32_t *faces, *neighbors;
-    std::vector<FacePlanes> planes;
-};
-
-// Corner of a face that is on neither end of an edge.
-inline int32_t opposite(const int32_t* face, int32_t i, int32_t j) {
-    for (int k = 0; k < 3; ++k)
-        if (face[k] != i && face[k] != j) return face[k];
-    return -1;
-}
-
-struct WalkEnd {
-    int32_t face, i, j;  // the face where the walk ended; i < 0 when it met no outline
-};
-
-// Walks over adjacent faces along the segment between two rays, from a face that is seen at the
-// first, until an outline is crossed: the rim of the mesh, or an edge that both of its faces lie on
-// the same side of.
-WalkEnd walk_to_outline(const MeshTable& mesh, int32_t face, const Ray& from, const Ray& to) {
-    for (int step = 0; step < kWalkSteps; ++step) {
-        const FacePlanes& f = mesh.planes[face];
-        if (f.offset == 0) break;
-        double first = 1.0;
-        int exit = -1;
-        for (int k = 0; k < 3; ++k) {
-            const double start = dot(f.edge[k], from), end = dot(f.edge[k], to);
-            if (end < 0 && start > end && start <= first * (start - end)) {
-                first = start / (start - end);
-                exit = k;
-            }
-        }
-        if (exit < 0) break;
-        const int32_t* corners = mesh.faces + 3 * int64_t(face);
-        const int32_t i = corners[(exit + 1) % 3], j = corners[(exit + 2) % 3];
-        const int32_t next = mesh.neighbors[3 * int64_t(face) + exit];
-        if (next < 0) return {face, i, j};
-        const int32_t third = opposite(mesh.faces + 3 * int64_t(next), i, j);
-        if (third < 0) break;
-        if (dot3(f.edge[exit], mesh.xyz + 3 * int64_t(third)) > 0) return {face, i, j};
-        face = next;
-    }
-    return {face, -1, -1};
-}
-
-// Whether an edge is seen whole and is steep against the pixel step. Each piece of an outline is
-// then counted along one axis only, the one along which its crossing is well defined.
-bool crosses_steeply(const MeshTable& mesh, int32_t i, int32_t j, bool horizontal) {
-    const double *p = mesh.xyz + 3 * int64_t(i), *q = mesh.xyz + 3 * int64_t(j);
-    if (p[2] < mesh.view.near || q[2] < mesh.view.near) return false;
-    double pu, pv, qu, qv;
-    project_mesh(mesh.view, p, pu, pv);
-    project_mesh(mesh.view, q, qu, qv);
-    const double du = std::abs(qu - pu), dv = std::abs(qv - pv);
-    return horizontal ? dv >= du && dv > 0 : du > dv;
-}
-
-// Pairs of neighbouring pixels with an outline between them, four numbers each: the pixel on the
-// outline's own surface, the other pixel, and the two vertices of the edge. At most two a pixel.
-int64_t mesh_outline_pairs(const MeshView& view, const double* xyz, int64_t face_count,
-                           const int32_t* faces, const int32_t* neighbors, const int32_t* face_id,
-                           const float* depth, int32_t* pairs) {
-    MeshTable mesh{view, xyz, faces, neighbors, {}};
-    mesh.planes.reserve(face_count);
-    for (int64_t id = 0; id < face_count; ++id)
-        mesh.planes.push_back(face_planes(view, xyz, faces + 3 * id));
-    const std::vector<double> xs = ray_axis(view.width, view.fx, view.cx);
-    const std::vector<double> ys = ray_axis(view.height, view.fy, view.cy);
-    int64_t count = 0;
-    for (int y = 0; y < view.height; ++y)
-        for (int x = 0; x < view.width; ++x)
-            for (int axis = 0; axis < 2; ++axis) {
-                const int x2 = x + (axis == 0), y2 = y + (axis == 1);
-                if (x2 >= view.width || y2 >= view.height) continue;
-                int64_t at = int64_t(y) * view.width + x, other = int64_t(y2) * view.width + x2;
-                if (face_id[at] == face_id[other]) continue;
-                Ray from{xs[x], ys[y]}, to{xs[x2], ys[y2]};
-                if (face_id[at] < 0 || (face_id[other] >= 0 && depth[other] < depth[at])) {
-                    std::swap(at, other);
-                    std::swap(from, to);
-                }
-                WalkEnd end = walk_to_outline(mesh, face_id[at], from, to);
-                // A surface that goes on behind the other pixel's is hidden by that one's outline.
-                if (end.i < 0 && end.face != face_id[other] && face_id[other] >= 0) {
-                    std::swap(at, other);
-                    end = walk_to_outline(mesh, face_id[at], to, from);
-                }
-                if (end.i < 0 || !crosses_steeply(mesh, end.i, end.j, axis == 0)) continue;
-                int32_t* pair = pairs + 4 * count++;
-                pair[0] = int32_t(at), pair[1] = int32_t(other);
-                pair[2] = std::min(end.i, end.j), pair[3] = std::max(end.i, end.j);
-            }
-    return count;
-}
-
-// out (n, C) = sum over k of coefficients (n, 3) times the three rows (3, C) of each one's group.
-template <class Real>
-void weigh_rows(int64_t n, int64_t channels, const Real* rows, const Real* coefficients,
-                const int64_t* group, Real* out) {
-    for (int64_t i = 0; i < n; ++i) {
-        const Real *w = coefficients + 3 * i, *row = rows + 3 * channels * group[i];
-        for (int64_t c = 0; c < channels; ++c)
-            out[i * channels + c] =
-                w[0] * row[c] + w[1] * row[channels + c] + w[2] * row[2 * channels + c];
-    }
-}
-
-// Adds to d_rows (zeros on entry) and writes d_coefficients; either may be null.
-template <class Real>
-void weigh_rows_gradient(int64_t n, int64_t channels, const Real* rows, const Real* coefficients,
-                         const int64_t* group, const Real* gradient, Real* d_rows,
-                         Real* d_coefficients) {
-    for (int64_t i = 0; i < n; ++i) {
-        const Real* g = gradient + i * channels;
-        const int64_t start = 3 * channels * group[i];
-        for (int k = 0; k < 3; ++k) {
-            const Real w = coefficients[3 * i + k];
-            Real sum = 0;
-            for (int64_t c = 0; c < channels; ++c) {
-                sum += g[c] * rows[start + k * channels + c];
-                if (d_rows) d_rows[start + k * channels + c] += w * g[c];
-            }
-            if (d_coefficients) d_coefficients[3 * i + k] = sum;
         }
     }
 }

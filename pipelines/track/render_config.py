@@ -35,7 +35,7 @@ class RenderConfig:
     """First step of the head's turn, radians."""
     move_rate: float = 0.001
     """First step of the head's place, metres."""
-    offset_rate: float = 0.0005
+    offset_rate: float = 0.001
     """First step of the static offsets, metres."""
     offset_sigma: float = 0.003
     """Standard deviation of offsets, metres."""

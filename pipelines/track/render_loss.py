@@ -29,6 +29,7 @@ from express50.mesh_render import (
 
 # Mesh outlines that pictures do not show: hair stands over the scalp, a body goes on below.
 COVERED_REGIONS = ("scalp", "boundary")
+OUTLINE_SOFTNESS = 0.1  # blended coverage is right to some hundredths: less counts squared
 STALE = 0.5  # weights so far outside [0, 1] belong to a pixel that its face has left
 
 
@@ -65,7 +66,7 @@ class Appearance:
     """How the subject looks under the rig's light.
 
     Attributes:
-        albedo: (T, T, 3) float32, v up.
+        albedo: (T, T, 3) float32, v up; about as fine as the pictures see the face.
         light: (9, 3) as `sh_light` takes it, in the world's axes.
         gains: camera id -> (3,), what its pictures are multiplied by; ones where missing.
     """
@@ -101,16 +102,21 @@ class Target:
     gain: Tensor
 
 
-def make_look(model: HeadModel, appearance: Appearance) -> Look:
-    """Tensors of a head and its appearance."""
+def make_look(model: HeadModel, appearance: Appearance, divisor: int = 1) -> Look:
+    """Tensors of a head and its appearance for pictures reduced by a divisor.
+
+    The albedo is reduced as the pictures are: one sample a pixel would alias a finer one.
+    """
     check_shape("albedo", appearance.albedo, (None, None, 3), "appearance")
     check_shape("light", appearance.light, (9, 3), "appearance")
     bare = torch.ones(len(model.template), dtype=torch.bool)
     for name in COVERED_REGIONS:
         if name in model.regions:
             bare &= ~model.regions[name]
+    height, width = (max(1, round(n / divisor)) for n in appearance.albedo.shape[:2])
+    albedo = resize_area(np.asarray(appearance.albedo, dtype=np.float32), width, height)
     surface = (model.faces, model.uv.float(), model.uv_faces, bare)
-    return Look(*surface, *(_tensor(x) for x in (appearance.albedo, appearance.light)))
+    return Look(*surface, _tensor(albedo), _tensor(appearance.light))
 
 
 def make_target(shot: Shot, gain: np.ndarray, divisor: int) -> Target:
@@ -188,7 +194,9 @@ def outline(look: Look, target: Target, seen: Covered, vertices: Tensor) -> Tens
     cover[seen.pixels] = 1.0
     cover = cover.reshape(seen.height, seen.width, 1)
     cover = antialias(cover, rim, vertices, target.K, target.cam_from_world).reshape(-1)
-    return (cover[pixels] - target.alpha[pixels]).abs().sum() / len(seen.pixels)
+    apart = cover[pixels] - target.alpha[pixels]
+    apart = (apart.square() + OUTLINE_SOFTNESS**2).sqrt() - OUTLINE_SOFTNESS
+    return apart.sum() / len(seen.pixels)
 
 
 def _against_background(seen: Covered) -> Tensor:

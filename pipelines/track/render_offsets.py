@@ -15,6 +15,8 @@ from express50.head.model import HeadModel
 FIXED_REGIONS = (
     "left_eyeball", "right_eyeball", "teeth", "tongue", "gums", "mouth_interior", "boundary",
 )  # fmt: skip
+# Offsets of vertices a centimetre or two apart go together: about a hundred are one unknown.
+INDEPENDENT = 0.01
 
 
 def movable_vertices(model: HeadModel) -> np.ndarray:
@@ -47,11 +49,16 @@ class OffsetSpace:
         self.movable = movable_vertices(model)
 
     def prior(self, offsets: np.ndarray) -> tuple[float, np.ndarray]:
-        """Half the squared sum of offsets and of their bends in sigmas, and its gradient (V, 3)."""
+        """Energy of offsets (V, 3) and its gradient (V, 3).
+
+        Half the squared sum of offsets and of their bends in standard deviations, for as many
+        vertices as are independent of one another.
+        """
         bends = self._bend @ offsets / self._bend_sigma
         lengths = offsets / self._sigma
-        energy = 0.5 * float((bends**2).sum() + (lengths**2).sum())
-        return energy, self._bend.T @ bends / self._bend_sigma + lengths / self._sigma
+        energy = 0.5 * INDEPENDENT * float((bends**2).sum() + (lengths**2).sum())
+        gradient = self._bend.T @ bends / self._bend_sigma + lengths / self._sigma
+        return energy, INDEPENDENT * gradient
 
     def smooth(self, field: np.ndarray) -> np.ndarray:
         """(1 + smoothing * Laplacian)^-1 of a field (V, 3).

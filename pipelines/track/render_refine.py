@@ -150,7 +150,9 @@ class _Problem:
         loss = self.data_term(self.vertices(index, *leaves), targets, views)
         if not torch.isfinite(loss):
             raise StageError("render refinement diverged; lower its rates or start nearer")
-        found = torch.autograd.grad(loss, leaves, allow_unused=True)
+        # nothing that is trusted or known may be in view
+        seen = loss.requires_grad
+        found = torch.autograd.grad(loss, leaves, allow_unused=True) if seen else (None,) * 3
         data = [
             np.zeros(leaf.shape) if gradient is None else gradient.double().numpy()
             for gradient, leaf in zip(found, leaves, strict=True)
@@ -221,8 +223,9 @@ def refine(
         )
     # Far from the origin float32 is too coarse for tenths of a millimetre.
     origin = np.mean([pose.own[-3:] for pose in state.poses], axis=0) if shots else np.zeros(3)
-    look = make_look(model, appearance)
-    problem = _Problem(model, _shifted(state, -origin), offsets, look, track, config)
+    looks = {divisor: make_look(model, appearance, divisor) for divisor in config.levels}
+    finest = config.levels[-1]
+    problem = _Problem(model, _shifted(state, -origin), offsets, looks[finest], track, config)
     looked_at = [index for index, views in enumerate(shots) if views]
 
     def targets(index: int, divisor: int) -> list[Target]:
@@ -231,11 +234,12 @@ def refine(
     with ThreadPoolExecutor(max_workers=workers) as pool:
 
         def data_term() -> float:
-            finest = ((i, targets(i, config.levels[-1])) for i in looked_at)
-            return sum(problem.measure(i, t, pool) for i, t in finest) / max(1, len(looked_at))
+            terms = (problem.measure(i, targets(i, finest), pool) for i in looked_at)
+            return sum(terms) / max(1, len(looked_at))
 
         before = data_term()
         for place, divisor in enumerate(config.levels):
+            problem.look = looks[divisor]
             for visit in range(config.rounds):
                 done = (place + visit / config.rounds) / len(config.levels)
                 # there and back, so that the shape is not always left to the last expression

@@ -10,7 +10,7 @@ import torch
 
 from benchmarks.mesh_raster import gradient_ratio
 from express50 import mesh_rows
-from express50.cameras import Camera
+from express50.cameras import Camera, resized
 from express50.head.procedural import build_procedural_head
 from express50.mesh_raster import rasterize
 from express50.mesh_render import (
@@ -25,7 +25,7 @@ from express50.mesh_render import (
     sh_light,
 )
 from express50.torch_transforms import axis_angle_to_matrix
-from tests.express50.mesh_scenes import camera, sphere
+from tests.express50.mesh_scenes import camera, head_camera, sphere
 
 F64 = torch.float64
 
@@ -125,6 +125,22 @@ def test_coverage_is_the_area_of_the_disc():
         blended = antialias(cover, drawn.seen, drawn.vertices, *drawn.lens)
         assert blended.min() >= -1e-9 and blended.max() <= 1 + 1e-9
         assert float(blended.sum()) == pytest.approx(math.pi * radius**2, rel=4e-3)
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.8, 2.0])
+def test_coverage_of_a_head_is_that_of_many_rays_a_pixel(angle):
+    """Where several folds end between two pixels, the last one must count."""
+    model = build_procedural_head()
+    mesh = (model.template.double().numpy(), model.faces.numpy())
+    lens = head_camera(128, angle)
+    drawn = View(*mesh, lens)
+    cover = (torch.from_numpy(drawn.raster.face_id) >= 0).double()[..., None]
+    blended = antialias(cover, drawn.seen, drawn.vertices, *drawn.lens)[..., 0]
+    rays = rasterize(*mesh, resized(lens, 1024, 1024), pairs=False).face_id >= 0
+    expected = torch.from_numpy(rays.reshape(128, 8, 128, 8).mean((1, 3)))
+    rim = torch.unique(drawn.seen.pairs[:, :2])
+    apart = (blended - expected).reshape(-1)[rim]
+    assert abs(apart.mean()) < 0.005 and apart.abs().mean() < 0.025 and apart.abs().max() < 0.35
 
 
 def test_crossings_lie_between_the_centres(view):
