@@ -35,8 +35,8 @@ class RenderConfig:
     """First step of the head's turn, radians."""
     move_rate: float = 0.001
     """First step of the head's place, metres."""
-    offset_rate: float = 0.001
-    """First step of the static offsets, metres."""
+    offset_rate: float = 0.0003
+    """First step of the static offsets, metres; they move at the last level only."""
     offset_sigma: float = 0.003
     """Standard deviation of offsets, metres."""
     offset_bend: float = 0.0003

@@ -40,7 +40,8 @@ class Shot:
     Attributes:
         camera: pinhole camera of the picture.
         image: (H, W, 3) float32 in [0, 1], in the space that albedo, light and gains multiply in.
-        weight: (H, W) float32 in [0, 1], how far to trust the colour of a pixel.
+        weight: (H, W) float32 in [0, 1], how far to trust the colour of a pixel: 1 on bare skin, 0
+            on background, hair, clothes and pixels that mix them.
         alpha: (H, W) float32 share of the pixel that shows the subject, NaN where nothing is known
             (hair, clothes, a doubtful matte); None for no outline at all.
     """
@@ -180,9 +181,10 @@ def photometric(
 
 
 def outline(look: Look, target: Target, seen: Covered, vertices: Tensor) -> Tensor:
-    """Area between the bare outlines of mesh and matte over the covered area, along the rim.
+    """Area between the bare outlines of mesh and matte over the covered area, beside the rim.
 
-    Only pixels beside the rim have a gradient, so only they are summed.
+    Only pixels beside the mesh's rim have a gradient, so only they are summed: outlines further
+    apart than a pixel pull as the whole area would, but are not measured.
     """
     bare = look.bare[seen.pairs[:, 2:]].all(1) & _against_background(seen)
     rim = replace(seen, pairs=seen.pairs[bare])

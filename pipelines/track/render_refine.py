@@ -61,8 +61,11 @@ class Refined:
     after: float
 
 
-class _Problem:
-    """The unknowns, their optimisers and what stays the same through all steps."""
+class Problem:
+    """The unknowns, their optimisers and what stays the same through all steps.
+
+    `poses`, `shape` (S,) and `offsets` (V, 3) hold the current values; `look` is set for the level.
+    """
 
     def __init__(
         self,
@@ -88,6 +91,7 @@ class _Problem:
         )
         self.own_steps = [Adam(pose.own.shape) for pose in self.poses]
         self.shape_step = Adam(self.shape.shape)
+        self.offset_rate = config.offset_rate
         self.offset_step = Adam(self.offsets.shape, uniform=True)
 
     def leaves(self, index: int) -> tuple[Tensor, Tensor, Tensor]:
@@ -165,12 +169,12 @@ class _Problem:
         if config.shape_rate > 0:
             gradient = data[0] + weight * self.track.shape_prior * self.shape
             self.shape += rate * config.shape_rate * self.shape_step.step(gradient)
-        if config.offset_rate > 0:
+        if self.offset_rate > 0:
             gradient = data[2] + weight * self.space.prior(self.offsets)[1]
             gradient[~self.space.movable] = 0.0
             smooth = self.space.smooth(self.offset_step.step(self.space.smooth(gradient)))
             smooth[~self.space.movable] = 0.0
-            self.offsets += rate * config.offset_rate * smooth
+            self.offsets += rate * self.offset_rate * smooth
 
 
 def posed_vertices(
@@ -225,11 +229,11 @@ def refine(
     origin = np.mean([pose.own[-3:] for pose in state.poses], axis=0) if shots else np.zeros(3)
     looks = {divisor: make_look(model, appearance, divisor) for divisor in config.levels}
     finest = config.levels[-1]
-    problem = _Problem(model, _shifted(state, -origin), offsets, looks[finest], track, config)
+    problem = Problem(model, _shifted(state, -origin), offsets, looks[finest], track, config)
     looked_at = [index for index, views in enumerate(shots) if views]
 
     def targets(index: int, divisor: int) -> list[Target]:
-        return [_target(shot, appearance, divisor, origin) for shot in shots[index]]
+        return [target_of(shot, appearance, divisor, origin) for shot in shots[index]]
 
     with ThreadPoolExecutor(max_workers=workers) as pool:
 
@@ -240,6 +244,8 @@ def refine(
         before = data_term()
         for place, divisor in enumerate(config.levels):
             problem.look = looks[divisor]
+            # offsets take what shape and pose leave; let in earlier they would take from both
+            problem.offset_rate = config.offset_rate if place == len(config.levels) - 1 else 0.0
             for visit in range(config.rounds):
                 done = (place + visit / config.rounds) / len(config.levels)
                 # there and back, so that the shape is not always left to the last expression
@@ -253,7 +259,7 @@ def refine(
     return Refined(moved, problem.offsets, before, after)
 
 
-def _target(shot: Shot, appearance: Appearance, divisor: int, origin: np.ndarray) -> Target:
+def target_of(shot: Shot, appearance: Appearance, divisor: int, origin: np.ndarray) -> Target:
     """A shot at one resolution in the world whose origin is `origin`."""
     move = make_transform(np.eye(3), -origin)
     near_by = replace(shot, camera=transform_camera(shot.camera, move))

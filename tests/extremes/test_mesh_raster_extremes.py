@@ -7,11 +7,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from express50.cameras import Camera
 from express50.mesh_raster import Raster, rasterize
+from express50.mesh_render import antialias, barycentrics, covered
 from express50.transforms import look_at
 from tests.express50.mesh_scenes import camera, oracle, sphere
 
@@ -137,6 +139,27 @@ def test_off_screen_empty_and_one_pixel():
 def test_coordinates_that_overflow_are_harmless():
     huge = np.array([[-1e200, -1e200, 1], [1e200, -1e200, 1], [0, 1e200, 1.0]])
     assert np.isfinite(rasterize(huge, ONE, camera(8, 8, 8.0)).depth).all()
+
+
+@pytest.mark.parametrize(("focal", "distance"), [(20.0, 1.4), (8000.0, 400.0)])
+def test_derivatives_in_float32_are_finite_and_near_those_of_float64(focal, distance):
+    vertices, faces = sphere(5)
+    vertices, view = vertices + [0, 0, distance], camera(48, 40, focal)
+    seen = covered(rasterize(vertices, faces, view))
+    results = []
+    for dtype in (torch.float32, torch.float64):
+        place = torch.tensor(vertices, dtype=dtype).requires_grad_()
+        lens = [torch.tensor(x, dtype=dtype) for x in (view.K, view.cam_from_world)]
+        weights = barycentrics(seen, place, torch.tensor(faces), *lens)
+        cover = torch.zeros(40 * 48, 1, dtype=dtype)
+        cover[seen.pixels] = 1
+        blended = antialias(cover.reshape(40, 48, 1), seen, place, *lens)
+        loss = blended.square().sum() + (weights[:, 0] * torch.arange(len(weights))).mean() * 1e-3
+        results.append([weights, blended, torch.autograd.grad(loss, place)[0]])
+    for single, double in zip(*results, strict=True):
+        assert torch.isfinite(single).all()
+        scale = float(double.detach().abs().max())
+        torch.testing.assert_close(single.double(), double, atol=5e-3 * scale, rtol=0)
 
 
 coordinates = st.floats(-1.5, 1.5, width=32)
