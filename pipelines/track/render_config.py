@@ -21,6 +21,8 @@ class RenderConfig:
     """Weight of the mean difference of colours."""
     outline: float = 3.0
     """Weight of the area between outlines, as a share of the head's."""
+    bald: bool = False
+    """The scalp's own outline is in the pictures, not that of hair."""
     softness: float = 0.02
     """Differences of colour below it count squared, those above it by their size."""
     prior: float = 2e-5

@@ -27,8 +27,6 @@ from express50.mesh_render import (
     sh_light,
 )
 
-# Mesh outlines that pictures do not show: hair stands over the scalp, a body goes on below.
-COVERED_REGIONS = ("scalp", "boundary")
 OUTLINE_SOFTNESS = 0.1  # blended coverage is right to some hundredths: less counts squared
 STALE = 0.5  # weights so far outside [0, 1] belong to a pixel that its face has left
 
@@ -103,15 +101,18 @@ class Target:
     gain: Tensor
 
 
-def make_look(model: HeadModel, appearance: Appearance, divisor: int = 1) -> Look:
+def make_look(
+    model: HeadModel, appearance: Appearance, divisor: int = 1, bald: bool = False
+) -> Look:
     """Tensors of a head and its appearance for pictures reduced by a divisor.
 
-    The albedo is reduced as the pictures are: one sample a pixel would alias a finer one.
+    The albedo is reduced as the pictures are: one sample a pixel would alias a finer one. Outlines
+    of the scalp are only compared where the head is bald, those of the neck's end never.
     """
     check_shape("albedo", appearance.albedo, (None, None, 3), "appearance")
     check_shape("light", appearance.light, (9, 3), "appearance")
     bare = torch.ones(len(model.template), dtype=torch.bool)
-    for name in COVERED_REGIONS:
+    for name in ("boundary",) if bald else ("boundary", "scalp"):
         if name in model.regions:
             bare &= ~model.regions[name]
     height, width = (max(1, round(n / divisor)) for n in appearance.albedo.shape[:2])

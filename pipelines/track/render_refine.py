@@ -227,7 +227,7 @@ def refine(
         )
     # Far from the origin float32 is too coarse for tenths of a millimetre.
     origin = np.mean([pose.own[-3:] for pose in state.poses], axis=0) if shots else np.zeros(3)
-    looks = {divisor: make_look(model, appearance, divisor) for divisor in config.levels}
+    looks = {d: make_look(model, appearance, d, config.bald) for d in config.levels}
     finest = config.levels[-1]
     problem = Problem(model, _shifted(state, -origin), offsets, looks[finest], track, config)
     looked_at = [index for index, views in enumerate(shots) if views]

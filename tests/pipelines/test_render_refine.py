@@ -204,6 +204,19 @@ def test_the_pull_of_outlines_does_not_depend_on_resolution():
     torch.testing.assert_close(pulls[0], pulls[1], rtol=0.1, atol=0.3)
 
 
+def test_the_scalp_outline_counts_on_bald_heads_only(scene):
+    truth, shots = scene
+    scalp = head().regions["scalp"]
+    target = target_of(shots[0][1], LOOK, 1, PLACE)
+    raster = rasterize(vertices_of(truth, 0) - PLACE, head().faces.numpy(), target.camera)
+    for bald in (False, True):
+        vertices = torch.from_numpy(vertices_of(truth, 0) - PLACE + [0, 0.004, 0]).float()
+        look = make_look(head(), LOOK, 1, bald)
+        term = outline(look, target, covered(raster), vertices.requires_grad_())
+        pulled = torch.autograd.grad(term, vertices)[0].abs().sum(1) > 0
+        assert pulled[~scalp].any() and bool(pulled[scalp].any()) == bald
+
+
 def test_unknown_outlines_and_distrusted_colours_count_for_nothing(scene):
     truth, shots = scene
     start = perturbed(truth, 0.03, 0.004, 0.3)
