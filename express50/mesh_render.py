@@ -26,6 +26,7 @@ class Covered:
     Attributes:
         height, width: size of the image.
         pixels: (N,) int64, flat indices.
+        centres: (N, 2) float32, their centres (x, y).
         seen: (G,) int64, the faces that are seen, ascending.
         counts: (G,) int64, pixels of each.
         group: (N,) int64, which of `seen` a pixel shows.
@@ -35,6 +36,7 @@ class Covered:
     height: int
     width: int
     pixels: Tensor
+    centres: Tensor
     seen: Tensor
     counts: Tensor
     group: Tensor
@@ -52,12 +54,21 @@ def covered(raster: Raster, device: torch.device | str = "cpu") -> Covered:
     counts = np.bincount(faces)
     seen = np.flatnonzero(counts)
     counts = counts[seen]
-    pairs = np.zeros((0, 4), dtype=np.int32) if raster.pairs is None else raster.pairs
     group = np.repeat(np.arange(len(seen)), counts)
-    parts = [
-        torch.from_numpy(np.asarray(a, np.int64)) for a in (pixels, seen, counts, group, pairs)
-    ]
-    return Covered(*raster.face_id.shape, *(part.to(device) for part in parts))
+    pairs = np.zeros((0, 4)) if raster.pairs is None else raster.pairs
+    height, width = raster.face_id.shape
+    centres = np.stack([pixels % width + 0.5, pixels // width + 0.5], axis=1).astype(np.float32)
+
+    def moved(array: np.ndarray) -> Tensor:
+        return torch.from_numpy(array.astype(np.int64)).to(device)
+
+    return Covered(
+        height,
+        width,
+        moved(pixels),
+        torch.from_numpy(centres).to(device),
+        *(moved(array) for array in (seen, counts, group, pairs)),
+    )
 
 
 def barycentrics(
@@ -90,8 +101,7 @@ def barycentrics(
 
 def pixel_rays(seen: Covered, K: Tensor) -> Tensor:
     """Rays (N, 3) in camera space through the centres of the covered pixels, z = 1."""
-    x = (seen.pixels % seen.width).to(K.dtype) + 0.5
-    y = seen.pixels.div(seen.width, rounding_mode="floor").to(K.dtype) + 0.5
+    x, y = seen.centres.to(K.dtype).unbind(1)
     return torch.stack([(x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1], torch.ones_like(x)], 1)
 
 
