@@ -32,8 +32,8 @@ class BuildNative(build_ext):
             BUILD["compile_variant"](variant, Path(self.get_ext_fullpath(ext.name)))
         except BUILD["BuildError"] as error:
             raise CompileError(
-                f"{error}\nThe package works without its native library, but Gaussians are"
-                " rendered by the slow reference. Mend it later with"
+                f"{error}\nThe package works without its native library, but Gaussians and meshes"
+                " are rendered by slow references. Mend it later with"
                 " `python -m express50.native.build`."
             ) from error
 

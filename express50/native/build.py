@@ -17,7 +17,10 @@ from pathlib import Path
 
 HERE = Path(__file__).resolve().parent
 SOURCE = HERE / "gaussians.cpp"
-SOURCES = ("gaussians.cpp", "blend.h", "tiles.h", "projection.h", "lanes.h")
+SOURCES = (
+    "gaussians.cpp", "blend.h", "tiles.h", "projection.h", "lanes.h",
+    "mesh.h", "mesh_outlines.h", "mesh_rows.h",
+)  # fmt: skip
 
 # Best last; their order is what `native_level` in the library returns. No -ffast-math: linking with
 # it would flush denormals to zero in the whole process, and NaN checks would be optimised away.
