@@ -1,8 +1,8 @@
 """Find the 68 landmarks of the one head in a frame, without knowing where it is.
 
-A coarse pass looks at the whole frame (then at turned and smaller windows, only where that finds no
-face); crops about the points found so far are then refined, levelled by the line of the eyes. The last
-look is taken in several crops at once: where these do not agree there is no face.
+A coarse pass looks at the whole frame (then at turned and smaller windows, only where that finds
+no face); crops about the points found so far are then refined, levelled by the line of the eyes.
+The last look is taken in several crops at once: where these do not agree there is no face.
 Points are the projections of the 3D landmarks, also where the head hides them: views of several
 cameras can be triangulated. Points that the head or something before it hides come with a low
 confidence.
