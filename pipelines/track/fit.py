@@ -11,10 +11,11 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from express50.cameras import Camera
 from express50.errors import StageError
 from express50.transforms import axis_angle_to_matrix
 from pipelines.track.config import TrackConfig
-from pipelines.track.observe import Observation, project_pinhole
+from pipelines.track.observe import Marks, Observation, pixel_slope, project_pinhole
 from pipelines.track.outline import Outline
 from pipelines.track.priors import prior
 from pipelines.track.sparse_head import POSE_SIZE, Basis, Points
@@ -50,7 +51,7 @@ class Target:
     observation: Observation
     sigma: np.ndarray
     neutral: bool
-    outlines: tuple[Outline, ...] = ()
+    outlines: tuple[Outline | Marks, ...] = ()
     vertices: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
 
 
@@ -98,7 +99,7 @@ def landmark_sigma(observation: Observation, config: TrackConfig) -> np.ndarray:
     for index, view in enumerate(observation.views):
         height = np.ptp(view.points[17:], axis=0).max()
         floor = config.landmark_floor_px * height / 128.0
-        sigma[index] = np.hypot(view.sigma, floor)
+        sigma[index] = np.hypot(view.sigma, floor) * view.crowd**0.5
     sigma[:, :17] /= config.contour_weight
     return np.where(observation.inliers, sigma, np.inf)
 
@@ -142,15 +143,9 @@ def _residuals(
     return blocks
 
 
-def project_with_slope(camera: object, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def project_with_slope(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Pixels (N, 2) of world points (N, 3) and d pixel / d point (N, 2, 3), pinhole."""
-    pixels, depth = project_pinhole(camera, points)  # type: ignore[arg-type]
-    rotation, K = camera.cam_from_world[:3, :3], camera.K  # type: ignore[attr-defined]
-    focal = K[[0, 1], [0, 1]]
-    safe = np.where(np.abs(depth) > 1e-9, depth, 1e-9)
-    ray = (pixels - K[:2, 2]) / focal
-    slope = (rotation[None, :2] - ray[..., None] * rotation[None, 2:3]) / safe[:, None, None]
-    return pixels, slope * focal[:, None]
+    return project_pinhole(camera, points)[0], pixel_slope(camera, points)
 
 
 def _robust(residual: np.ndarray) -> np.ndarray:

@@ -17,6 +17,7 @@ from express50.head.model import HeadModel, landmarks, pose
 from express50.images import read_alpha
 from express50.index import index_path
 from express50.landmarks.detector import detect
+from express50.landmarks.iris import find_irises
 from express50.landmarks.network import WEIGHTS, LandmarkNet, load_network
 from express50.layout import Dataset
 from express50.stage import Stage
@@ -29,7 +30,8 @@ from pipelines.track.fit import (
     landmark_sigma,
     start_state,
 )
-from pipelines.track.observe import Observation, View, agree, facing, project_pinhole
+from pipelines.track.marks import measure_eyes, with_marks
+from pipelines.track.observe import Marks, Observation, View, agree, facing, project_pinhole
 from pipelines.track.outline import Outline, outline_regions, outline_vertices, signed_distance
 from pipelines.track.overlay import draw_overlays
 from pipelines.track.sparse_head import POSE_SIZE, Basis, make_basis
@@ -37,6 +39,8 @@ from pipelines.track.start import initial_pose
 
 SCHEMA = "express50.track/1"
 MIN_FACING = 0.05
+# Rounds of the fit with irises, and jaw lines where they are seen, if there are no mattes.
+MARK_ROUNDS = 2
 
 
 def items(dataset: Dataset) -> list[str]:
@@ -139,7 +143,8 @@ def _views(
             continue
         seen = detect(_network(), image, config.refinements)
         if seen.score >= config.min_score:
-            views.append(View(camera_id, camera, seen.points, seen.sigma, seen.score))
+            irises = find_irises(image, seen)
+            views.append(View(camera_id, camera, seen.points, seen.sigma, seen.score, irises))
     return views
 
 
@@ -178,19 +183,26 @@ def _refine(
     state: State,
     config: TrackConfig,
 ) -> tuple[State, list[Target]]:
-    """Alternate between finding the outline on the current mesh and fitting to the mattes."""
-    distances = [_distances(dataset, subject, target) for target in targets]
-    if not config.silhouette_rounds or not any(distances):
-        return state, targets
+    """Alternate between finding outlines and marks on the current mesh and fitting to them."""
+    seen_at = [_distances(dataset, subject, target) for target in targets]
+    distances = seen_at if config.silhouette_rounds else [[] for _ in targets]
     pictures = sum(len(seen) for seen in distances)
-    for _ in range(config.silhouette_rounds):
-        vertices = _all_vertices(basis.model, state)
-        targets = [
-            _with_outlines(basis.model, target, seen, mesh, pictures)
-            for target, seen, mesh in zip(targets, distances, vertices, strict=True)
-        ]
-        state, _ = fit(basis, targets, state, config, config.silhouette_iterations)
-    return state, targets
+    eyes = measure_eyes(basis.model, targets, _all_vertices(basis.model, state), _rotations(state))
+    marked = targets
+    for _ in range(config.silhouette_rounds if any(distances) else MARK_ROUNDS):
+        marked = []
+        meshes = _all_vertices(basis.model, state)
+        rows = zip(targets, distances, meshes, _rotations(state), strict=True)
+        for target, seen, mesh, rotation in rows:
+            outlined = _with_outlines(basis.model, target, seen, mesh, pictures)
+            marked.append(with_marks(basis.model, outlined, mesh, rotation, eyes))
+        state, _ = fit(basis, marked, state, config, config.silhouette_iterations)
+    return state, marked
+
+
+def _rotations(state: State) -> np.ndarray:
+    """World from head (E, 3, 3)."""
+    return np.stack([item.rotation for item in state.poses])
 
 
 def _distances(dataset: Dataset, subject: str, target: Target) -> list:
@@ -302,10 +314,15 @@ def _metrics(
         "landmark_rms_px_mean": round(float(np.mean(values)), 4) if values else None,
         "landmarks_used": used,
         "landmarks_seen": total,
-        "outline_views": int(sum(len(target.outlines) for target in targets)),
+        "outline_views": _count(targets, Outline),
+        "marked_views": _count(targets, Marks),
         "head": model.name,
         "dropped": dropped,
     }
+
+
+def _count(targets: list[Target], kind: type) -> int:
+    return sum(isinstance(one, kind) for target in targets for one in target.outlines)
 
 
 STAGE = Stage(
