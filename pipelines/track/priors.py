@@ -9,7 +9,7 @@ from pipelines.track.config import TrackConfig
 
 NEUTRAL_SHARE = 0.2
 NECK_SIGMA = 0.2
-EYE_SIGMA = 0.15
+EYE_SIGMA = 0.3
 EYE_DIFFERENCE_SIGMA = 0.03
 JAW_SIGMA = (0.3, 0.06, 0.04)
 JAW_CLOSED_SIGMA = 0.02

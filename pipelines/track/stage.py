@@ -36,6 +36,7 @@ from pipelines.track.outline import Outline, outline_regions, outline_vertices, 
 from pipelines.track.overlay import draw_overlays
 from pipelines.track.sparse_head import POSE_SIZE, Basis, make_basis
 from pipelines.track.start import initial_pose
+from pipelines.track.suspects import suspect_cameras
 
 SCHEMA = "express50.track/1"
 MIN_FACING = 0.05
@@ -84,7 +85,11 @@ def run(dataset: Dataset, item: str, config: TrackConfig, out: Path) -> dict:
     vertices = _all_vertices(basis.model, state)
     _write_track(out / "track.npz", config.head, basis, targets, state, vertices)
     draw_overlays(dataset, item, out / "qc", basis.model, targets, vertices)
-    return _metrics(basis.model, targets, vertices, dropped)
+    metrics = _metrics(basis.model, targets, vertices, dropped)
+    rotations, marks = _rotations(state), _marks(basis.model, state)
+    return metrics | {
+        "suspect_cameras": suspect_cameras(targets, marks, rotations, vertices.mean(1))
+    }
 
 
 @lru_cache(maxsize=2)
