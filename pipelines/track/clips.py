@@ -11,7 +11,7 @@ from zipfile import BadZipFile
 
 import numpy as np
 
-from express50.digests import text_digest
+from express50.digests import path_digest, text_digest, value_digest
 from express50.errors import StageError
 from express50.index import Cue
 from express50.publish import write_bytes
@@ -20,7 +20,6 @@ from pipelines.track.fit import Pose
 from pipelines.track.marks import Eyes
 from pipelines.track.observe import Observation
 from pipelines.track.sequence import (
-    SequenceSettings,
     Window,
     freeze_shape,
     jitter_mm,
@@ -34,13 +33,37 @@ SCHEMA = "express50.sequence/1"
 Observe = Callable[[str, int], Observation | None]
 
 
+def write_clips(
+    out: Path,
+    basis: Basis,
+    shape: np.ndarray,
+    cues: tuple[Cue, ...],
+    observe: Observe,
+    config: TrackConfig,
+    keep: Path,
+    inputs: dict[str, Path | str],
+    eyes: Eyes | None,
+) -> dict:
+    """Track clips, write out/sequence.npz and return the metrics; see `track_clips`.
+
+    `inputs` is what the stage reads: windows kept by a run with other inputs are not used.
+    """
+    digests = {name: path_digest(p) if isinstance(p, Path) else p for name, p in inputs.items()}
+    arrays, account = track_clips(
+        basis, shape, cues, observe, config, keep, value_digest(digests), eyes
+    )
+    np.savez(out / "sequence.npz", **arrays)  # type: ignore[arg-type]  # numpy types its options
+    # A crash before the stage's outputs are published costs no more than these last windows.
+    shutil.rmtree(keep, ignore_errors=True)
+    return account
+
+
 def track_clips(
     basis: Basis,
     shape: np.ndarray,
     cues: tuple[Cue, ...],
     observe: Observe,
     config: TrackConfig,
-    settings: SequenceSettings,
     keep: Path,
     identity: str,
     eyes: Eyes | None = None,
@@ -48,7 +71,7 @@ def track_clips(
     """Track every frame of every cue window.
 
     Finished windows lie in `keep` under a digest of all that they depend on, so that a run after a
-    crash goes on where the last one stopped; `forget_windows` removes them when all is written.
+    crash goes on where the last one stopped; `write_clips` removes them when all is written.
 
     Args:
         basis: the head model.
@@ -56,7 +79,6 @@ def track_clips(
         cues: windows of frames, both ends inside.
         observe: what the cameras see at a frame of a cue; None where that is no face.
         config: of the fit.
-        settings: of the clips.
         keep: folder for finished windows.
         identity: digest of the inputs (footage, cameras, landmarks, head model).
         eyes: from `measure_eyes`.
@@ -68,19 +90,17 @@ def track_clips(
         StageError: no frame of any cue shows a face.
     """
     person = freeze_shape(basis, shape)
-    key = text_digest(
-        repr((identity, shape.tobytes(), asdict(config), asdict(settings), eyes and vars(eyes)))
-    )
+    key = text_digest(repr((identity, shape.tobytes(), asdict(config), eyes and vars(eyes))))
     rows: list[tuple[str, int, Pose]] = []
     dropped: list[dict[str, str]] = []
     for cue in cues:
-        frames = list(range(cue.start_frame, cue.end_frame + 1, settings.stride))
+        frames = list(range(cue.start_frame, cue.end_frame + 1, config.stride))
         found: dict[int, Pose] = {}
-        for number, window in enumerate(make_windows(frames, settings)):
+        for number, window in enumerate(make_windows(frames, config)):
             file = keep / key[:16] / f"{cue.expression_id}_{number:04d}.npz"
             done = _read_window(file)
             if done is None:
-                done = _track(person, cue.expression_id, window, observe, config, settings, eyes)
+                done = _track(person, cue.expression_id, window, observe, config, eyes)
                 _write_window(file, done, person)
             found |= done
         rows += [(cue.expression_id, frame, found[frame]) for frame in sorted(found)]
@@ -97,14 +117,9 @@ def track_clips(
     arrays |= {"schema": np.array(SCHEMA), "head": np.array(config.head), "shape": shape}
     return arrays, {
         "frames": len(rows),
-        "jitter_mm": _jitter(person, rows, settings.stride),
+        "jitter_mm": _jitter(person, rows, config.stride),
         "dropped": dropped,
     }
-
-
-def forget_windows(keep: Path) -> None:
-    """Remove what was kept: the sequence is written."""
-    shutil.rmtree(keep, ignore_errors=True)
 
 
 def _columns(rows: list[tuple[str, int, Pose]]) -> tuple[list[int], list[str], list[Pose]]:
@@ -118,12 +133,11 @@ def _track(
     window: Window,
     observe: Observe,
     config: TrackConfig,
-    settings: SequenceSettings,
     eyes: Eyes | None,
 ) -> dict[int, Pose]:
     """Poses of the kept frames of a window that show a face."""
     seen = [found for frame in window.frames if (found := observe(cue, frame)) is not None]
-    poses = track_window(person, seen, config, settings, eyes) if seen else []
+    poses = track_window(person, seen, config, eyes) if seen else []
     kept = set(window.frames[window.kept])
     pairs = zip(seen, poses, strict=True)
     return {observation.frame: pose for observation, pose in pairs if observation.frame in kept}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 from express50.errors import ConfigError
 
@@ -13,6 +14,19 @@ class TrackConfig:
 
     head: str = "procedural"
     """Head model: procedural, the path of a FLAME pickle, or of ICT-FaceKit."""
+    landmarks: str = "embedded"
+    """Where landmarks come from: embedded, fan:PATH of FAN's TorchScript weights, or the path of a
+    file of points (docs/FORMAT.md)."""
+    frames: Literal["peaks", "clips"] = "peaks"
+    """What is tracked: the peak frames, or every frame of the cue windows as well."""
+    stride: int = 1
+    """Of clips, every so many frames."""
+    window: int = 48
+    """Frames of a clip that are tracked in one piece, and kept if the run is stopped."""
+    sweeps: int = 2
+    """Smoothing rounds over a clip; 0 for none."""
+    smooth_mm: float = 0.5
+    """How far a point may lie from the middle of the neighbouring frames', millimetres."""
     cameras: int = 0
     """Cameras used in the fit, those that see the face best; 0 uses all."""
     refinements: int = 3
@@ -23,7 +37,7 @@ class TrackConfig:
     """Rounds of outline matching to the mattes (each finds the outline anew); 0 for none."""
     silhouette_iterations: int = 4
     """Levenberg-Marquardt steps a round."""
-    min_score: float = 0.35
+    min_score: float = 0.2
     """Views whose face score is lower are left out."""
     min_landmarks: int = 20
     """Landmarks an expression needs after outlier rejection."""
@@ -40,18 +54,22 @@ class TrackConfig:
 
     def __post_init__(self) -> None:
         """Refuse values that cannot work."""
+        if self.stride < 1 or self.window < 1 or self.sweeps < 0:
+            raise ConfigError("track: stride and window must be at least 1, sweeps at least 0")
         if self.iterations < 1 or self.refinements < 1:
             raise ConfigError("track: iterations and refinements must be at least 1")
-        if min(self.landmark_floor_px, self.shape_prior, self.expression_prior) <= 0:
+        positive = (self.landmark_floor_px, self.shape_prior, self.expression_prior, self.smooth_mm)
+        if min(positive) <= 0:
             raise ConfigError(
-                "track: landmark_floor_px, shape_prior and expression_prior must be above 0"
+                "track: landmark_floor_px, shape_prior, expression_prior and smooth_mm must be "
+                "above 0"
             )
         if min(self.cameras, self.silhouette_rounds, self.silhouette_iterations) < 0:
             raise ConfigError("track: cameras and silhouette settings must not be negative")
 
 
 PRESETS: dict[str, dict[str, object]] = {
-    "draft": {"cameras": 6, "refinements": 2, "iterations": 8, "silhouette_rounds": 0},
+    "draft": {"cameras": 6, "refinements": 2, "iterations": 8, "silhouette_rounds": 0, "sweeps": 1},
     "standard": {},
-    "reference": {"refinements": 5, "iterations": 30, "silhouette_rounds": 6},
+    "reference": {"refinements": 5, "iterations": 30, "silhouette_rounds": 6, "sweeps": 4},
 }

@@ -10,6 +10,7 @@ import numpy as np
 
 from express50.cameras import Camera, triangulate
 from express50.landmarks.iris import Irises
+from express50.landmarks.sources import Marked
 
 PAIR_LIMIT = 120
 INLIER_SIGMA = 3.5
@@ -92,6 +93,15 @@ class Marks:
         pixels, slope = project(self.camera, positions[self.index])
         residual = (pixels - self.pixels) / self.sigma[:, None]
         return self.index, residual, slope / self.sigma[:, None, None]
+
+
+def make_view(camera: Camera, seen: Marked) -> View:
+    """A view of what a source of landmarks found in an undistorted image of a camera."""
+    face = seen.face
+    return View(
+        camera.id, camera, face.points, face.sigma, face.score, seen.irises,
+        visible_contour=seen.visible_contour,
+    )  # fmt: skip
 
 
 def agree(

@@ -30,29 +30,6 @@ MAX_GAP = 3
 MIN_FACING = 0.05
 
 
-@dataclass(frozen=True, kw_only=True)
-class SequenceSettings:
-    """How a clip is tracked.
-
-    Attributes:
-        stride: every so many frames.
-        window: frames of a window.
-        sweeps: smoothing rounds; 0 for none.
-        smooth_mm: how far a point may lie from the middle of its neighbours' (standard deviation),
-            millimetres; larger departures are taken for true.
-    """
-
-    stride: int = 1
-    window: int = 48
-    sweeps: int = 2
-    smooth_mm: float = 0.5
-
-    @property
-    def overlap(self) -> int:
-        """Frames that a window goes on into the next."""
-        return self.sweeps + 2
-
-
 @dataclass(frozen=True)
 class Window:
     """A run of frames: all that are fitted, and which of them are kept."""
@@ -102,12 +79,13 @@ def freeze_shape(basis: Basis, shape: np.ndarray) -> Basis:
     )
 
 
-def make_windows(frames: Sequence[int], settings: SequenceSettings) -> list[Window]:
+def make_windows(frames: Sequence[int], config: TrackConfig) -> list[Window]:
     """Windows over consecutive frames; every frame is kept by exactly one."""
+    overlap = config.sweeps + 2
     windows = []
-    for first in range(0, len(frames), settings.window):
-        last = min(first + settings.window, len(frames))
-        low, high = max(0, first - settings.overlap), min(len(frames), last + settings.overlap)
+    for first in range(0, len(frames), config.window):
+        last = min(first + config.window, len(frames))
+        low, high = max(0, first - overlap), min(len(frames), last + overlap)
         windows.append(Window(tuple(frames[low:high]), slice(first - low, last - low)))
     return windows
 
@@ -116,7 +94,6 @@ def track_window(
     basis: Basis,
     observations: list[Observation],
     config: TrackConfig,
-    settings: SequenceSettings,
     eyes: Eyes | None = None,
 ) -> list[Pose]:
     """Poses of the frames of one window.
@@ -125,7 +102,6 @@ def track_window(
         basis: of one person, from `freeze_shape`.
         observations: F of them, in order of their frames.
         config: of the fit.
-        settings: of the clip.
         eyes: what relates the subject's irises to the model's, from `measure_eyes`.
 
     Raises:
@@ -147,8 +123,8 @@ def track_window(
         targets.append(marked)
         poses.append(state.poses[0])
     frames = [observation.frame for observation in observations]
-    for _ in range(settings.sweeps):
-        poses = _sweep(basis, targets, poses, frames, config, settings)
+    for _ in range(config.sweeps):
+        poses = _sweep(basis, targets, poses, frames, config)
     return poses
 
 
@@ -175,7 +151,6 @@ def _sweep(
     poses: list[Pose],
     frames: list[int],
     config: TrackConfig,
-    settings: SequenceSettings,
 ) -> list[Pose]:
     """Every frame once more, next to where its neighbours were before the sweep."""
     index = np.arange(68 + SPREAD_VERTICES)
@@ -190,13 +165,13 @@ def _sweep(
             points[other]
             for other in (number - 1, number + 1)
             if 0 <= other < len(poses)
-            and abs(frames[other] - frames[number]) <= MAX_GAP * settings.stride
+            and abs(frames[other] - frames[number]) <= MAX_GAP * config.stride
         ]
         if not near:
             swept.append(pose)
             continue
         # The difference to one neighbour spreads more than that to the mean of two.
-        sigma = 1e-3 * settings.smooth_mm * crowd * (2.0 if len(near) == 1 else 1.0)
+        sigma = 1e-3 * config.smooth_mm * crowd * (2.0 if len(near) == 1 else 1.0)
         pull = Neighbours(index, np.mean(near, axis=0), sigma)
         pulled = replace(target, outlines=(*target.outlines, pull))
         state = State(np.zeros(0), (pose,))

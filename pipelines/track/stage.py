@@ -15,12 +15,11 @@ from express50.frames import read_cameras_of, read_frame, read_peaks
 from express50.head.load import load_head
 from express50.head.model import HeadModel, landmarks, pose
 from express50.images import read_alpha
-from express50.index import index_path
-from express50.landmarks.detector import detect
-from express50.landmarks.iris import find_irises
-from express50.landmarks.network import WEIGHTS, LandmarkNet, load_network
+from express50.index import index_path, read_index
+from express50.landmarks.sources import Source, open_source, source_files
 from express50.layout import Dataset
 from express50.stage import Stage
+from pipelines.track.clips import write_clips
 from pipelines.track.config import PRESETS, TrackConfig
 from pipelines.track.fit import (
     State,
@@ -30,8 +29,16 @@ from pipelines.track.fit import (
     landmark_sigma,
     start_state,
 )
-from pipelines.track.marks import measure_eyes, with_marks
-from pipelines.track.observe import Marks, Observation, View, agree, facing, project_pinhole
+from pipelines.track.marks import Eyes, measure_eyes, with_marks
+from pipelines.track.observe import (
+    Marks,
+    Observation,
+    View,
+    agree,
+    facing,
+    make_view,
+    project_pinhole,
+)
 from pipelines.track.outline import Outline, outline_regions, outline_vertices, signed_distance
 from pipelines.track.overlay import draw_overlays
 from pipelines.track.sparse_head import POSE_SIZE, Basis, make_basis
@@ -55,8 +62,7 @@ def inputs(dataset: Dataset, item: str, config: TrackConfig) -> dict[str, Path |
         "index": index_path(dataset, item),
         "cameras": dataset.item_dir("calibrate", item) / "cameras.json",
         "peaks": dataset.item_dir("align", item) / "peaks.json",
-        "weights": WEIGHTS,
-    }
+    } | source_files(config.landmarks)
     mattes = dataset.item_dir("matte", item)
     if config.silhouette_rounds and mattes.is_dir():
         found["mattes"] = mattes
@@ -71,7 +77,8 @@ def run(dataset: Dataset, item: str, config: TrackConfig, out: Path) -> dict:
     cameras = read_cameras_of(dataset, item)
     dropped: list[dict[str, str]] = []
     basis = _basis(config.head)
-    observations = _observe(dataset, item, cameras, config, dropped)
+    source = _open_source(dataset, item, config)
+    observations = _observe(dataset, item, cameras, source, config, dropped)
     targets, poses = _targets(basis, observations, config, dropped)
     if not targets:
         reasons = "; ".join(f"{row['what']}: {row['why']}" for row in dropped[:3])
@@ -81,15 +88,47 @@ def run(dataset: Dataset, item: str, config: TrackConfig, out: Path) -> dict:
         replace(target, sigma=consistent_sigma(target, marks))
         for target, marks in zip(targets, _marks(basis.model, state), strict=True)
     ]
-    state, targets = _refine(dataset, item, basis, targets, state, config)
+    state, targets, eyes = _refine(dataset, item, basis, targets, state, config)
     vertices = _all_vertices(basis.model, state)
     _write_track(out / "track.npz", config.head, basis, targets, state, vertices)
     draw_overlays(dataset, item, out / "qc", basis.model, targets, vertices)
     metrics = _metrics(basis.model, targets, vertices, dropped)
     rotations, marks = _rotations(state), _marks(basis.model, state)
-    return metrics | {
-        "suspect_cameras": suspect_cameras(targets, marks, rotations, vertices.mean(1))
-    }
+    metrics["suspect_cameras"] = suspect_cameras(targets, marks, rotations, vertices.mean(1))
+    if config.frames == "clips":
+        clips = _clips(dataset, item, basis, state.shape, source, eyes, config, out)
+        metrics |= {"dropped": dropped + clips.pop("dropped"), "clips": clips}
+    return metrics
+
+
+def _clips(
+    dataset: Dataset,
+    subject: str,
+    basis: Basis,
+    shape: np.ndarray,
+    source: Source,
+    eyes: Eyes | None,
+    config: TrackConfig,
+    out: Path,
+) -> dict:
+    """Write sequence.npz: every frame of the cue windows with the peaks' shape."""
+    cameras = read_cameras_of(dataset, subject)
+
+    def observe(cue: str, frame: int) -> Observation | None:
+        views = _views(dataset, subject, cameras, frame, source, config)
+        observation = agree(cue, frame, views)[0] if views else None
+        enough = observation and observation.inliers.sum(1).max() >= config.min_landmarks
+        return observation if enough else None
+
+    keep = dataset.windows_dir(subject)
+    paths, cues = inputs(dataset, subject, config), read_index(dataset, subject).cues
+    return write_clips(out, basis, shape, cues, observe, config, keep, paths, eyes)
+
+
+def _open_source(dataset: Dataset, subject: str, config: TrackConfig) -> Source:
+    """The source of landmarks; files of points are of the footage as recorded."""
+    recorded = read_cameras_of(dataset, subject, undistorted=False)
+    return open_source(config.landmarks, recorded, config.refinements)
 
 
 @lru_cache(maxsize=2)
@@ -97,15 +136,11 @@ def _basis(head: str) -> Basis:
     return make_basis(load_head(head))
 
 
-@lru_cache(maxsize=1)
-def _network() -> LandmarkNet:
-    return load_network()
-
-
 def _observe(
     dataset: Dataset,
     subject: str,
     cameras: dict[str, Camera],
+    source: Source,
     config: TrackConfig,
     dropped: list[dict[str, str]],
 ) -> list[Observation]:
@@ -116,7 +151,8 @@ def _observe(
     chosen = list(cameras)
     found = {}
     for expression in order:
-        views = _views(dataset, subject, {n: cameras[n] for n in chosen}, peaks[expression], config)
+        now = {name: cameras[name] for name in chosen}
+        views = _views(dataset, subject, now, peaks[expression], source, config)
         if config.cameras and len(chosen) > config.cameras and len(views) >= config.cameras:
             views = sorted(views, key=lambda view: float(np.median(view.sigma)) / view.score)
             views = views[: config.cameras]
@@ -137,7 +173,12 @@ def _observe(
 
 
 def _views(
-    dataset: Dataset, subject: str, cameras: dict[str, Camera], frame: int, config: TrackConfig
+    dataset: Dataset,
+    subject: str,
+    cameras: dict[str, Camera],
+    frame: int,
+    source: Source,
+    config: TrackConfig,
 ) -> list[View]:
     """Views with a face in them; a camera whose footage lacks the frame is skipped."""
     views = []
@@ -146,10 +187,9 @@ def _views(
             image = read_frame(dataset, subject, camera_id, frame)
         except CaptureError:
             continue
-        seen = detect(_network(), image, config.refinements)
-        if seen.score >= config.min_score:
-            irises = find_irises(image, seen)
-            views.append(View(camera_id, camera, seen.points, seen.sigma, seen.score, irises))
+        seen = source(image, camera_id, frame)
+        if seen.face.score >= config.min_score:
+            views.append(make_view(camera, seen))
     return views
 
 
@@ -187,7 +227,7 @@ def _refine(
     targets: list[Target],
     state: State,
     config: TrackConfig,
-) -> tuple[State, list[Target]]:
+) -> tuple[State, list[Target], Eyes | None]:
     """Alternate between finding outlines and marks on the current mesh and fitting to them."""
     seen_at = [_distances(dataset, subject, target) for target in targets]
     distances = seen_at if config.silhouette_rounds else [[] for _ in targets]
@@ -202,7 +242,7 @@ def _refine(
             outlined = _with_outlines(basis.model, target, seen, mesh, pictures)
             marked.append(with_marks(basis.model, outlined, mesh, rotation, eyes))
         state, _ = fit(basis, marked, state, config, config.silhouette_iterations)
-    return state, marked
+    return state, marked, eyes
 
 
 def _rotations(state: State) -> np.ndarray:
