@@ -18,6 +18,7 @@ from express50.threads import cap_threads
 from pipelines import ingest
 from pipelines.photo.capture import make_photo_capture, subject_id
 from pipelines.photo.focal import Focal
+from pipelines.photo.panel import write_panel
 from pipelines.photo.picture import open_picture
 
 STAGES = ("ingest", "calibrate", "observe", "align", "track")
@@ -78,7 +79,10 @@ def run_photo(args: argparse.Namespace) -> int:
                 summaries.append(run_stage(stage, dataset, config, chosen, pool=pool))
                 if not summaries[-1].ok:
                     break
-    return _account(args, dataset, subject, focal, summaries)
+        picture = dataset.root / "photos" / subject / "panel.jpg"
+        if summaries[-1].ok:
+            write_panel(dataset, subject, configs[-1], picture)
+    return _account(args, dataset, subject, focal, summaries, picture)
 
 
 def _check(args: argparse.Namespace) -> None:
@@ -98,6 +102,7 @@ def _account(
     subject: str,
     focal: Focal,
     summaries: list[Summary],
+    picture: Path,
 ) -> int:
     """Say what was made and how much of it is a guess."""
     done = all(summary.ok for summary in summaries)
@@ -112,5 +117,5 @@ def _account(
         f"by {focal.low:.0f} to {focal.high:.0f} px"
     )
     if done:
-        say(f"track and pictures: {dataset.item_dir('track', subject)}")
+        say(f"track: {dataset.item_dir('track', subject)}", f"picture: {picture}")
     return OK if done else FAILED

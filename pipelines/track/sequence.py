@@ -2,10 +2,10 @@
 
 The shape is folded into the head model's rest, so the same fit as of the peaks serves. A window is
 first tracked frame by frame, each starting from its neighbour; then every frame is fitted again,
-pulled towards the mean of its two neighbours, all at once in every sweep, so that neither direction
-of time comes first. The first and the last frame have one neighbour and are treated alike. Windows
-overlap by more frames than there are sweeps, and what overlaps is dropped: where a window ends does
-not show.
+pulled towards the mean of its two neighbours. A sweep takes every second frame, then the others, so
+that neither direction of time comes first (all at once, the two halves would only swap their
+errors). The first and the last frame have one neighbour and are treated alike. Windows overlap by
+more frames than sweeps reach, and what overlaps is dropped: where a window ends does not show.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ def freeze_shape(basis: Basis, shape: np.ndarray) -> Basis:
 
 def make_windows(frames: Sequence[int], config: TrackConfig) -> list[Window]:
     """Windows over consecutive frames; every frame is kept by exactly one."""
-    overlap = config.sweeps + 2
+    overlap = 2 * config.sweeps + 2
     windows = []
     for first in range(0, len(frames), config.window):
         last = min(first + config.window, len(frames))
@@ -123,8 +123,8 @@ def track_window(
         targets.append(marked)
         poses.append(state.poses[0])
     frames = [observation.frame for observation in observations]
-    for _ in range(config.sweeps):
-        poses = _sweep(basis, targets, poses, frames, config)
+    for half in range(2 * config.sweeps):
+        poses = _sweep(basis, targets, poses, frames, config, half % 2)
     return poses
 
 
@@ -151,32 +151,30 @@ def _sweep(
     poses: list[Pose],
     frames: list[int],
     config: TrackConfig,
+    parity: int,
 ) -> list[Pose]:
-    """Every frame once more, next to where its neighbours were before the sweep."""
+    """Every second frame once more, towards where its neighbours are."""
     index = np.arange(68 + SPREAD_VERTICES)
-    points = [
-        Points(basis, target.vertices).evaluate(pose.own, pose.rotation)[index]
-        for target, pose in zip(targets, poses, strict=True)
-    ]
     crowd = (len(index) / EFFECTIVE_POINTS) ** 0.5
-    swept = []
-    for number, (target, pose) in enumerate(zip(targets, poses, strict=True)):
+    swept = list(poses)
+    for number in range(parity, len(poses), 2):
         near = [
-            points[other]
+            Points(basis, targets[other].vertices).evaluate(poses[other].own, poses[other].rotation)
             for other in (number - 1, number + 1)
             if 0 <= other < len(poses)
             and abs(frames[other] - frames[number]) <= MAX_GAP * config.stride
         ]
         if not near:
-            swept.append(pose)
             continue
+        middle = np.mean([points[index] for points in near], axis=0)
         # The difference to one neighbour spreads more than that to the mean of two.
         sigma = 1e-3 * config.smooth_mm * crowd * (2.0 if len(near) == 1 else 1.0)
-        pull = Neighbours(index, np.mean(near, axis=0), sigma)
-        pulled = replace(target, outlines=(*target.outlines, pull))
-        state = State(np.zeros(0), (pose,))
-        state, _ = fit(basis, [pulled], state, config, config.silhouette_iterations)
-        swept.append(state.poses[0])
+        pull = Neighbours(index, middle, sigma)
+        pulled = replace(targets[number], outlines=(*targets[number].outlines, pull))
+        start = State(np.zeros(0), (poses[number],))
+        swept[number] = fit(basis, [pulled], start, config, config.silhouette_iterations)[0].poses[
+            0
+        ]
     return swept
 
 
