@@ -17,6 +17,7 @@ from express50.errors import ConfigError
 from express50.landmarks.detector import Detection, detect
 from express50.landmarks.fan import find_with_fan, load_fan
 from express50.landmarks.iris import Irises, find_irises
+from express50.landmarks.lips import open_lips
 from express50.landmarks.network import WEIGHTS, load_network
 from express50.landmarks.points_file import IRISES, POINTS, read_points
 
@@ -85,7 +86,7 @@ def _embedded(refinements: int) -> Source:
     net = load_network()
 
     def find(image: np.ndarray, camera_id: str, frame: int) -> Marked:
-        face = detect(net, image, refinements)
+        face = open_lips(image, detect(net, image, refinements))
         return Marked(face, find_irises(image, face), visible_contour=False)
 
     return find

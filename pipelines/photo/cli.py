@@ -23,8 +23,10 @@ from pipelines.photo.picture import open_picture
 
 STAGES = ("ingest", "calibrate", "observe", "align", "track")
 MATTE_STAGES = ("alpha", "matte")
-# One view cannot tell an expression from a shape: coefficients stay nearer to rest.
-PHOTO_SETTINGS = ("track.expression_prior=0.25", "track.min_score=0.2", "observe.min_score=0.2")
+# One view cannot tell an expression or a bent neck from a shape: both stay nearer to rest.
+PHOTO_SETTINGS = (
+    "track.expression_prior=0.25", "track.neck_prior=0.03", "observe.min_score=0.2",
+)  # fmt: skip
 WORDS = "track the face of a bare photograph or video, without calibration"
 
 

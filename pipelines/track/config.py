@@ -49,6 +49,9 @@ class TrackConfig:
     """Weight of the prior on shape coefficients (standard deviations)."""
     expression_prior: float = 0.45
     """Standard deviation of expression coefficients; in the neutral frame a fifth of it."""
+    neck_prior: float = 0.2
+    """Standard deviation of the neck's joint against the head, radians. A single view hardly sees
+    it."""
     neutral: str = "neutral"
     """Expression id that is the resting face; none need exist."""
 
@@ -58,12 +61,9 @@ class TrackConfig:
             raise ConfigError("track: stride and window must be at least 1, sweeps at least 0")
         if self.iterations < 1 or self.refinements < 1:
             raise ConfigError("track: iterations and refinements must be at least 1")
-        positive = (self.landmark_floor_px, self.shape_prior, self.expression_prior, self.smooth_mm)
-        if min(positive) <= 0:
-            raise ConfigError(
-                "track: landmark_floor_px, shape_prior, expression_prior and smooth_mm must be "
-                "above 0"
-            )
+        priors = (self.shape_prior, self.expression_prior, self.neck_prior)
+        if min(self.landmark_floor_px, self.smooth_mm, *priors) <= 0:
+            raise ConfigError("track: landmark_floor_px, smooth_mm and the priors must be above 0")
         if min(self.cameras, self.silhouette_rounds, self.silhouette_iterations) < 0:
             raise ConfigError("track: cameras and silhouette settings must not be negative")
 
