@@ -23,6 +23,8 @@ JAW = 17
 # Cosine of the angle between skin and line of sight: above it a point is in plain view, and within
 # it of a right angle skin forms the rim (triangles are finite).
 FACING, RIM = -0.1, 0.2
+# Metres along the cheek that a point may go further for a cosine nearer to the rim by one.
+RIM_REACH_M = 0.16
 # A point is seen if a place this far before its skin is: the rim itself hides from any sight line.
 CLEAR_M = 0.004
 
@@ -71,7 +73,8 @@ def contour_points(model: HeadModel, vertices: np.ndarray, camera: Camera) -> Co
         rim = line.numpy()[np.abs(facing[line.numpy()]) < RIM]
         moved[point] = True
         if len(rim):
-            best = rim[int(np.linalg.norm(vertices[rim] - own[point], axis=1).argmin())]
+            way = np.linalg.norm(vertices[rim] - own[point], axis=1)
+            best = rim[int((way + RIM_REACH_M * np.abs(facing[rim])).argmin())]
             corners[point], bary[point] = best, (1.0, 0.0, 0.0)
     clear = vertices[corners] + CLEAR_M * normals[corners]
     seen = _seen(vertices, faces, camera, (clear * bary[..., None]).sum(1))
