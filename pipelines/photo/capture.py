@@ -23,7 +23,7 @@ from pipelines.track.sparse_head import make_basis
 
 CAMERA = "photo"
 FACE_SCORE = 0.2
-PROBES = 8
+PROBES, FOCAL_FACES = 8, 3
 FPS = 25.0
 
 
@@ -60,7 +60,8 @@ def make_photo_capture(
     faces = find_faces(picture.path, images)
     start = (focal_px, "given") if focal_px else guess_focal(picture, width, height, film_mm)
     basis = make_basis(load_head(config.head))
-    focal = weigh_focal(basis, faces, (width, height), start, config)
+    surest = sorted(faces, key=lambda face: -face.score)[:FOCAL_FACES]
+    focal = weigh_focal(basis, surest, (width, height), start, config)
     _write_footage(picture, folder / "cameras" / CAMERA)
     camera = single_camera(CAMERA, width, height, focal.pixels)
     write_bytes(folder / "calibration.json", dump_json(camera_rows({CAMERA: camera})))

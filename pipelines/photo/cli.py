@@ -62,7 +62,9 @@ def add_commands(subparsers: Any) -> None:
 def run_photo(args: argparse.Namespace) -> int:
     """Make the capture and run the stages on it."""
     _check(args)
-    args.set = [*PHOTO_SETTINGS, *args.set]
+    picture = open_picture(args.picture)
+    clips = ("track.frames=clips",) if picture.video else ()
+    args.set = [*PHOTO_SETTINGS, *clips, *args.set]
     cap_threads(1)
     subject = args.subject or subject_id(args.picture)
     dataset = Dataset(args.out)
@@ -72,7 +74,7 @@ def run_photo(args: argparse.Namespace) -> int:
         configs = [config_of(stage, args) for stage in loaded]
         folder = dataset.root / "photos" / subject
         focal = make_photo_capture(
-            open_picture(args.picture), folder, subject, configs[-1],
+            picture, folder, subject, configs[-1],
             focal_px=args.focal_px, film_mm=args.film_mm, windows=args.windows,
         )  # fmt: skip
         ingest.register(dataset, [folder])
@@ -83,10 +85,10 @@ def run_photo(args: argparse.Namespace) -> int:
                 summaries.append(run_stage(stage, dataset, config, chosen, pool=pool))
                 if not summaries[-1].ok:
                     break
-        picture = dataset.root / "photos" / subject / "panel.jpg"
+        panel = folder / "panel.jpg"
         if summaries[-1].ok:
-            write_panel(dataset, subject, configs[-1], picture)
-    return _account(args, dataset, subject, focal, summaries, picture)
+            write_panel(dataset, subject, configs[-1], panel)
+    return _account(args, dataset, subject, focal, summaries, panel)
 
 
 def _check(args: argparse.Namespace) -> None:
@@ -106,7 +108,7 @@ def _account(
     subject: str,
     focal: Focal,
     summaries: list[Summary],
-    picture: Path,
+    panel: Path,
 ) -> int:
     """Say what was made and how much of it is a guess."""
     done = all(summary.ok for summary in summaries)
@@ -121,5 +123,5 @@ def _account(
         f"by {focal.low:.0f} to {focal.high:.0f} px"
     )
     if done:
-        say(f"track: {dataset.item_dir('track', subject)}", f"picture: {picture}")
+        say(f"track: {dataset.item_dir('track', subject)}", f"picture: {panel}")
     return OK if done else FAILED

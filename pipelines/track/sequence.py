@@ -4,8 +4,8 @@ The shape is folded into the head model's rest, so the same fit as of the peaks 
 first tracked frame by frame, each starting from its neighbour; then every frame is fitted again,
 pulled towards the mean of its two neighbours. A sweep takes every second frame, then the others, so
 that neither direction of time comes first (all at once, the two halves would only swap their
-errors). The first and the last frame have one neighbour and are treated alike. Windows overlap by
-more frames than sweeps reach, and what overlaps is dropped: where a window ends does not show.
+errors). The first and the last frame, which have one neighbour, are treated alike. Windows overlap
+by more frames than sweeps reach, and what overlaps is dropped: where a window ends does not show.
 """
 
 from __future__ import annotations
@@ -156,26 +156,42 @@ def _sweep(
     """Every second frame once more, towards where its neighbours are."""
     index = np.arange(68 + SPREAD_VERTICES)
     crowd = (len(index) / EFFECTIVE_POINTS) ** 0.5
+    points = [
+        Points(basis, target.vertices).evaluate(pose.own, pose.rotation)[index]
+        for target, pose in zip(targets, poses, strict=True)
+    ]
     swept = list(poses)
     for number in range(parity, len(poses), 2):
-        near = [
-            Points(basis, targets[other].vertices).evaluate(poses[other].own, poses[other].rotation)
-            for other in (number - 1, number + 1)
-            if 0 <= other < len(poses)
-            and abs(frames[other] - frames[number]) <= MAX_GAP * config.stride
-        ]
-        if not near:
+        middle, spread = _expected(points, frames, number, MAX_GAP * config.stride)
+        if middle is None:
             continue
-        middle = np.mean([points[index] for points in near], axis=0)
-        # The difference to one neighbour spreads more than that to the mean of two.
-        sigma = 1e-3 * config.smooth_mm * crowd * (2.0 if len(near) == 1 else 1.0)
-        pull = Neighbours(index, middle, sigma)
+        pull = Neighbours(index, middle, 1e-3 * config.smooth_mm * crowd * spread)
         pulled = replace(targets[number], outlines=(*targets[number].outlines, pull))
         start = State(np.zeros(0), (poses[number],))
-        swept[number] = fit(basis, [pulled], start, config, config.silhouette_iterations)[0].poses[
-            0
-        ]
+        state, _ = fit(basis, [pulled], start, config, config.silhouette_iterations)
+        swept[number] = state.poses[0]
     return swept
+
+
+def _expected(
+    points: list[np.ndarray], frames: list[int], number: int, gap: int
+) -> tuple[np.ndarray | None, float]:
+    """Where a frame's points (n, 3) lie by its neighbours, and how much vaguer than between two.
+
+    Between two neighbours it is the point in the line at the frame's time. A first or last frame
+    goes on as the two beside it do: held to its one neighbour it would lag behind any motion.
+    """
+    order = [(number - 1, number + 1), (number + 1, number + 2), (number - 1, number - 2)]
+    for near, far in order:
+        if not (0 <= near < len(frames) and 0 <= far < len(frames)):
+            continue
+        if max(abs(frames[near] - frames[number]), abs(frames[far] - frames[near])) > 2 * gap:
+            continue
+        share = (frames[number] - frames[near]) / (frames[far] - frames[near])
+        expected = (1 - share) * points[near] + share * points[far]
+        # Of independent errors, over what the mean of two has.
+        return expected, float(np.hypot(np.hypot(1 - share, share), 1.0) / 1.5**0.5)
+    return None, 0.0
 
 
 def _template(basis: Basis) -> np.ndarray:

@@ -20,8 +20,9 @@ from pipelines.track.sequence import freeze_shape, jitter_mm, make_windows, trac
 from pipelines.track.sparse_head import Points
 from tests.pipelines.test_track import CONFIG, RIG, make_scene
 
-SETTINGS = dataclasses.replace(CONFIG, window=6, iterations=8, silhouette_iterations=3)
-FRAMES = 14
+SETTINGS = dataclasses.replace(CONFIG, iterations=6, silhouette_iterations=2)
+QUICK = dataclasses.replace(SETTINGS, window=4, sweeps=0, iterations=2, silhouette_iterations=1)
+FRAMES = 10
 
 
 def true_poses(scene, frames: int = FRAMES) -> list[Pose]:
@@ -97,15 +98,15 @@ def test_sweeps_know_no_direction_of_time() -> None:
     """An odd number of frames, reversed, is smoothed to the same."""
     scene = make_scene()
     person = freeze_shape(scene.basis, scene.shape)
-    seen = observations(scene, 1.0)[:13]
-    config = dataclasses.replace(SETTINGS, iterations=40, silhouette_iterations=10)
+    seen = observations(scene, 1.0)[:7]
+    config = dataclasses.replace(SETTINGS, iterations=25, silhouette_iterations=6)
     ahead = track_window(person, seen, config)
     mirrored = [dataclasses.replace(one, frame=100 - one.frame) for one in reversed(seen)]
     back = track_window(person, mirrored, config)[::-1]
     np.testing.assert_allclose(meshes(person, ahead), meshes(person, back), atol=3e-4)
 
 
-CUES = (Cue("smile", 0, 6), Cue("frown", 7, 13))
+CUES = (Cue("smile", 0, 4), Cue("frown", 5, 9))
 
 
 def run(scene, keep: Path, watched: list[int], fail_at: int | None = None, hide: int | None = None):
@@ -117,23 +118,23 @@ def run(scene, keep: Path, watched: list[int], fail_at: int | None = None, hide:
         watched.append(frame)
         return None if frame == hide else seen[frame]
 
-    return track_clips(scene.basis, scene.shape, CUES, observe, SETTINGS, keep, "inputs")
+    return track_clips(scene.basis, scene.shape, CUES, observe, QUICK, keep, "inputs")
 
 
 def test_a_stopped_run_goes_on_to_the_same_result(tmp_path: Path) -> None:
     scene = make_scene()
     whole, account = run(scene, tmp_path / "a", [])
     assert whole["frames"].tolist() == list(range(FRAMES))
-    assert whole["cues"].tolist() == ["smile"] * 7 + ["frown"] * 7
+    assert whole["cues"].tolist() == ["smile"] * 5 + ["frown"] * 5
     assert str(whole["schema"]) == SCHEMA and account["dropped"] == []
     assert set(account["jitter_mm"]) == {"smile", "frown"}
     watched: list[int] = []
     with pytest.raises(KeyboardInterrupt):
-        run(scene, tmp_path / "b", watched, fail_at=9)
+        run(scene, tmp_path / "b", watched, fail_at=8)
     assert 0 in watched
     watched.clear()
     resumed, _ = run(scene, tmp_path / "b", watched)
-    assert min(watched) == 7, "the first cue is not looked at again"
+    assert min(watched) == 5, "the first cue is not looked at again"
     for name in whole:
         np.testing.assert_array_equal(whole[name], resumed[name])
 
@@ -141,10 +142,10 @@ def test_a_stopped_run_goes_on_to_the_same_result(tmp_path: Path) -> None:
 def test_frames_without_a_face_are_left_out_and_said(tmp_path: Path) -> None:
     arrays, account = run(make_scene(), tmp_path, [], hide=3)
     assert 3 not in arrays["frames"] and len(arrays["frames"]) == FRAMES - 1
-    assert "1 of 7 frames" in account["dropped"][0]["why"]
+    assert "1 of 5 frames" in account["dropped"][0]["why"]
     with pytest.raises(StageError, match="no frame of any clip"):
         scene = make_scene()
-        track_clips(scene.basis, scene.shape, CUES, lambda c, f: None, SETTINGS, tmp_path / "n", "")
+        track_clips(scene.basis, scene.shape, CUES, lambda c, f: None, QUICK, tmp_path / "n", "")
 
 
 def test_kept_windows_go_when_the_sequence_is_written(
@@ -153,7 +154,7 @@ def test_kept_windows_go_when_the_sequence_is_written(
     scene, keep = make_scene(), tmp_path / ".windows" / "S001"
     seen = observations(scene, 0.5)
     (tmp_path / "index.json").write_text("{}")
-    arguments = (tmp_path, scene.basis, scene.shape, CUES, lambda c, f: seen[f], SETTINGS, keep)
+    arguments = (tmp_path, scene.basis, scene.shape, CUES, lambda c, f: seen[f], QUICK, keep)
     kept = []
     savez = clips.np.savez
     monkeypatch.setattr(
