@@ -63,7 +63,7 @@ def contour_points(model: HeadModel, vertices: np.ndarray, camera: Camera) -> Co
     bary = model.landmark_bary[:JAW].numpy().astype(np.float64)
     normals = vertex_normals(torch.from_numpy(vertices)[None], model.faces)[0].numpy()
     towards = camera.center - vertices
-    towards = towards / np.linalg.norm(towards, axis=1, keepdims=True)
+    towards = towards / np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 1e-12)
     facing = (normals * towards).sum(1)
     own = (vertices[corners] * bary[..., None]).sum(1)
     moved = np.zeros(JAW, dtype=bool)
