@@ -68,7 +68,7 @@ def _read_npz(path: Path) -> Table:
         confidence = np.asarray(data["confidence"]) if "confidence" in data else sure
         if confidence.shape != shape[:3]:
             raise ValueError(f"confidence has shape {confidence.shape}, expected {shape[:3]}")
-    rows = np.concatenate([points, confidence[..., None]], axis=-1)
+    rows = np.concatenate([points, np.asarray(confidence)[..., None]], axis=-1)
     return {(c, int(f)): rows[i, j] for i, c in enumerate(cameras) for j, f in enumerate(frames)}
 
 

@@ -15,8 +15,7 @@ from express50.cameras import Camera
 from express50.errors import StageError
 from express50.transforms import axis_angle_to_matrix
 from pipelines.track.config import TrackConfig
-from pipelines.track.observe import Marks, Observation, pixel_slope, project_pinhole
-from pipelines.track.outline import Outline
+from pipelines.track.observe import Observation, Terms, pixel_slope, project_pinhole
 from pipelines.track.priors import prior
 from pipelines.track.sparse_head import POSE_SIZE, Basis, Points
 
@@ -51,7 +50,7 @@ class Target:
     observation: Observation
     sigma: np.ndarray
     neutral: bool
-    outlines: tuple[Outline | Marks, ...] = ()
+    outlines: tuple[Terms, ...] = ()
     vertices: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
 
 

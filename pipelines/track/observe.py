@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import combinations
+from typing import Protocol
 
 import numpy as np
 
@@ -68,6 +69,15 @@ class Observation:
     points: np.ndarray
     covariance: np.ndarray
     refused: tuple[View, ...] = ()
+
+
+class Terms(Protocol):
+    """What a fit is pulled by beside its landmarks: outlines, marks, neighbouring frames."""
+
+    def residuals(
+        self, positions: np.ndarray, project: Callable
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Block (index (n,), residual (n, k), slope (n, k, 3)) of all points' positions (P, 3)."""
 
 
 @dataclass(frozen=True)

@@ -109,7 +109,8 @@ def track_window(
     """
     template = _template(basis)
     spread = _spread_vertices(basis)
-    targets, poses = [], []
+    targets: list[Target] = []
+    poses: list[Pose] = []
     for observation in observations:
         start = start_state(basis, [initial_pose(observation, template)])
         if poses:

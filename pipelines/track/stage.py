@@ -62,7 +62,8 @@ def inputs(dataset: Dataset, item: str, config: TrackConfig) -> dict[str, Path |
         "index": index_path(dataset, item),
         "cameras": dataset.item_dir("calibrate", item) / "cameras.json",
         "peaks": dataset.item_dir("align", item) / "peaks.json",
-    } | source_files(config.landmarks)
+        **source_files(config.landmarks),
+    }
     mattes = dataset.item_dir("matte", item)
     if config.silhouette_rounds and mattes.is_dir():
         found["mattes"] = mattes
