@@ -89,6 +89,10 @@ class Dataset:
         """Unfinished outputs; nothing below it is ever read."""
         return self.root / ".staging"
 
+    def windows_dir(self, subject: str) -> Path:
+        """Finished parts of a subject's unfinished clips; removed when the clips are written."""
+        return self.root / ".windows" / subject
+
     @property
     def stale_dir(self) -> Path:
         """Outputs set aside because a newer run of their item failed or no longer lists it."""

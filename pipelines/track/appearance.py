@@ -132,7 +132,7 @@ def _ridge_fit(B: np.ndarray, target: np.ndarray, w: np.ndarray, start: np.ndarr
 
 
 def _with_albedo(appearance: Appearance, moments: list[Seen]) -> Appearance:
-    mass, total = 0.0, 0.0
+    mass = total = np.zeros_like(moments[0].normals)
     for seen in moments:
         one, sums = albedo_sums(appearance, seen)
         mass, total = mass + one, total + sums

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 from express50.errors import ConfigError
 
@@ -13,6 +14,19 @@ class TrackConfig:
 
     head: str = "procedural"
     """Head model: procedural, the path of a FLAME pickle, or of ICT-FaceKit."""
+    landmarks: str = "embedded"
+    """Where landmarks come from: embedded, fan:PATH of FAN's TorchScript weights, or the path of a
+    file of points (docs/FORMAT.md)."""
+    frames: Literal["peaks", "clips"] = "peaks"
+    """What is tracked: the peak frames, or every frame of the cue windows as well."""
+    stride: int = 1
+    """Of clips, every so many frames."""
+    window: int = 48
+    """Frames of a clip that are tracked in one piece, and kept if the run is stopped."""
+    sweeps: int = 2
+    """Smoothing rounds over a clip; 0 for none."""
+    smooth_mm: float = 0.5
+    """How far a point may lie from the middle of the neighbouring frames', millimetres."""
     cameras: int = 0
     """Cameras used in the fit, those that see the face best; 0 uses all."""
     refinements: int = 3
@@ -41,7 +55,7 @@ class TrackConfig:
     """How firmly a moment's colours are tied to those of the other moments, 0 to 1."""
     round_iterations: int = 4
     """Levenberg-Marquardt steps a round of outlines and colours."""
-    min_score: float = 0.35
+    min_score: float = 0.2
     """Views whose face score is lower are left out."""
     min_landmarks: int = 20
     """Landmarks an expression needs after outlier rejection."""
@@ -61,23 +75,36 @@ class TrackConfig:
     """Their correlation length, metres."""
     expression_prior: float = 0.45
     """Standard deviation of expression coefficients; in the neutral frame a fifth of it."""
+    neck_prior: float = 0.2
+    """Standard deviation of the neck's joint against the head, radians. A single view hardly sees
+    it."""
     neutral: str = "neutral"
     """Expression id that is the resting face; none need exist."""
 
     def __post_init__(self) -> None:
         """Refuse values that cannot work."""
+        if self.stride < 1 or self.window < 1 or self.sweeps < 0:
+            raise ConfigError("track: stride and window must be at least 1, sweeps at least 0")
         if self.iterations < 1 or self.refinements < 1:
             raise ConfigError("track: iterations and refinements must be at least 1")
-        if min(self.landmark_floor_px, self.shape_prior, self.expression_prior) <= 0:
+        priors = (self.shape_prior, self.expression_prior, self.neck_prior)
+        if min(self.landmark_floor_px, self.smooth_mm, self.landmark_bias, *priors) <= 0:
             raise ConfigError(
-                "track: landmark_floor_px, shape_prior and expression_prior must be above 0"
+                "track: landmark_floor_px, landmark_bias, smooth_mm and the priors must be above 0"
             )
-        if min(self.cameras, self.silhouette_rounds, self.photo_rounds) < 0:
-            raise ConfigError("track: cameras and rounds must not be negative")
+        rounds = (self.cameras, self.silhouette_rounds, self.photo_rounds, self.relief_rounds)
+        if min(rounds) < 0 or self.round_iterations < 1:
+            raise ConfigError(
+                "track: cameras and rounds must not be negative, round_iterations at least 1"
+            )
+        if min(self.offset_sigma, self.offset_length, self.relief_reach, self.detail_radius) <= 0:
+            raise ConfigError("track: lengths (offset_*, relief_reach, detail_radius) must be > 0")
+        if not 100 <= self.samples <= 30_000 or not 32 <= self.photo_side <= 8192:
+            raise ConfigError("track: samples must be 100 to 30000, photo_side 32 to 8192")
 
 
 PRESETS: dict[str, dict[str, object]] = {
-    "draft": {"cameras": 6, "refinements": 2, "iterations": 8, "silhouette_rounds": 0},
+    "draft": {"cameras": 6, "refinements": 2, "iterations": 8, "silhouette_rounds": 0, "sweeps": 1},
     "standard": {},
-    "reference": {"refinements": 5, "iterations": 30, "silhouette_rounds": 6},
+    "reference": {"refinements": 5, "iterations": 30, "silhouette_rounds": 6, "sweeps": 4},
 }

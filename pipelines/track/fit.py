@@ -11,11 +11,11 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from express50.cameras import Camera
 from express50.errors import StageError
 from express50.transforms import axis_angle_to_matrix
 from pipelines.track.config import TrackConfig
-from pipelines.track.observe import Observation, project_pinhole
-from pipelines.track.outline import Outline
+from pipelines.track.observe import Observation, Terms, pixel_slope, project_pinhole
 from pipelines.track.photometry import Photometry
 from pipelines.track.priors import prior
 from pipelines.track.relief import Relief
@@ -58,7 +58,7 @@ class Target:
     observation: Observation
     sigma: np.ndarray
     neutral: bool
-    outlines: tuple[Outline, ...] = ()
+    outlines: tuple[Terms, ...] = ()
     terms: tuple[Photometry | Relief, ...] = ()
     vertices: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
 
@@ -107,7 +107,7 @@ def landmark_sigma(observation: Observation, config: TrackConfig) -> np.ndarray:
     for index, view in enumerate(observation.views):
         height = np.ptp(view.points[17:], axis=0).max()
         floor = config.landmark_floor_px * height / 128.0
-        sigma[index] = np.hypot(view.sigma, floor)
+        sigma[index] = np.hypot(view.sigma, floor) * view.crowd**0.5
     return np.where(observation.inliers, sigma, np.inf)
 
 
@@ -134,9 +134,9 @@ def _parameters(basis: Basis, shared: np.ndarray, pose: Pose) -> np.ndarray:
     return np.concatenate([shared[: basis.shape_size], pose.own])
 
 
-def _landmarks(positions: np.ndarray, state: State, pose: Pose) -> np.ndarray:
+def _landmarks(basis: Basis, positions: np.ndarray, state: State, pose: Pose) -> np.ndarray:
     """Where the detector would put the landmarks (68, 3): the head's, plus what it always errs."""
-    return positions[:68] + state.bias @ pose.rotation.T
+    return positions[:68] + (basis.bias + state.bias) @ pose.rotation.T
 
 
 def _landmark_blocks(
@@ -159,15 +159,9 @@ def _outline_blocks(
     return [outline.residuals(positions, project_with_slope) for outline in target.outlines]
 
 
-def project_with_slope(camera: object, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def project_with_slope(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Pixels (N, 2) of world points (N, 3) and d pixel / d point (N, 2, 3), pinhole."""
-    pixels, depth = project_pinhole(camera, points)  # type: ignore[arg-type]
-    rotation, K = camera.cam_from_world[:3, :3], camera.K  # type: ignore[attr-defined]
-    focal = K[[0, 1], [0, 1]]
-    safe = np.where(np.abs(depth) > 1e-9, depth, 1e-9)
-    ray = (pixels - K[:2, 2]) / focal
-    slope = (rotation[None, :2] - ray[..., None] * rotation[None, 2:3]) / safe[:, None, None]
-    return pixels, slope * focal[:, None]
+    return project_pinhole(camera, points)[0], pixel_slope(camera, points)
 
 
 def _robust(residual: np.ndarray) -> np.ndarray:
@@ -190,7 +184,7 @@ def _cost(
     total = 0.5 * float(shared @ shared)
     for target, model, pose in zip(targets, points, state.poses, strict=True):
         positions = model.evaluate(_parameters(basis, state.shape, pose), pose.rotation)
-        blocks = _landmark_blocks(target, _landmarks(positions, state, pose))
+        blocks = _landmark_blocks(target, _landmarks(basis, positions, state, pose))
         blocks += _outline_blocks(target, positions)
         total += sum(_huber_cost(residual) for _, residual, _ in blocks)
         total += sum(term.cost(positions) for term in target.terms)
@@ -237,16 +231,16 @@ def _normal_equations(
     shapes, size = basis.shape_size, jacobian.shape[2] + 204
     columns = np.r_[:shapes, shapes + 204 : size]
     hessian, gradient = np.zeros((size, size)), np.zeros(size)
-    marks = _landmarks(positions, state, pose)
+    marks = _landmarks(basis, positions, state, pose)
     matrix, pull = _information(_landmark_blocks(target, marks), 68)
     rows = np.zeros((68, 3, size))
     rows[..., columns] = jacobian[:68]
     for mark in range(68):
         rows[mark, :, shapes + 3 * mark : shapes + 3 * mark + 3] = pose.rotation
     _add(hessian, gradient, rows, matrix, pull)
-    count = 68 + sum(len(outline.index) for outline in target.outlines)
-    matrix, pull = _information(_outline_blocks(target, positions), count)
-    terms = [(jacobian[68:count], matrix[68:], pull[68:])]
+    blocks = _outline_blocks(target, positions)
+    count = max((int(used.max()) + 1 for used, _, _ in blocks if len(used)), default=0)
+    terms = [(jacobian[:count], *_information(blocks, count))]
     terms += [_of_samples(term, positions, jacobian) for term in target.terms]
     base, slope = np.zeros((len(columns), len(columns))), np.zeros(len(columns))
     for term in terms:

@@ -2,28 +2,50 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from itertools import combinations
+from typing import Protocol
 
 import numpy as np
 
 from express50.cameras import Camera, triangulate
+from express50.landmarks.iris import Irises
+from express50.landmarks.sources import Marked
 
 PAIR_LIMIT = 120
 INLIER_SIGMA = 3.5
 # However vague a landmark, one that is further off than this many shares of the face disagrees.
 SIGMA_SHARE_LIMIT = 0.04
+# Cameras whose lines of sight to the face meet under less than about this angle see it alike.
+SAME_DIRECTION = np.radians(2.0)
 
 
 @dataclass(frozen=True)
 class View:
-    """Landmarks seen by one camera: points (68, 2) pixels, sigma (68,) pixels, face score."""
+    """Landmarks seen by one camera.
+
+    Attributes:
+        camera_id: the camera's id.
+        camera: pinhole.
+        points: (68, 2) pixels.
+        sigma: (68,) pixels; infinite where a point is not known.
+        score: of the face, 0 to 1.
+        irises: iris centres, where they were looked for.
+        crowd: how many cameras, itself included, look at the face from the same direction: they err
+            alike, and count together as one.
+        visible_contour: points 0..16 mark the visible edge of the jaw, as people's marks do, not
+            fixed places of the skin.
+    """
 
     camera_id: str
     camera: Camera
     points: np.ndarray
     sigma: np.ndarray
     score: float
+    irises: Irises | None = None
+    crowd: float = 1.0
+    visible_contour: bool = False
 
 
 @dataclass(frozen=True)
@@ -36,6 +58,8 @@ class Observation:
         views: views that are used.
         inliers: (views, 68) bool, landmarks that agree with the other views.
         points: (68, 3) triangulated, metres in the world; NaN where under two views agree.
+        covariance: (68, 3, 3) of the points, square metres; NaN with them.
+        refused: views left out, as they disagree with the rest.
     """
 
     expression: str
@@ -43,6 +67,51 @@ class Observation:
     views: tuple[View, ...]
     inliers: np.ndarray
     points: np.ndarray
+    covariance: np.ndarray
+    refused: tuple[View, ...] = ()
+
+
+class Terms(Protocol):
+    """What a fit is pulled by beside its landmarks: outlines, marks, neighbouring frames."""
+
+    def residuals(
+        self, positions: np.ndarray, project: Callable
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Block (index (n,), residual (n, k), slope (n, k, 3)) of all points' positions (P, 3)."""
+
+
+@dataclass(frozen=True)
+class Marks:
+    """Vertices that should be seen at given pixels of one view.
+
+    Attributes:
+        camera: pinhole.
+        index: (n,) positions among the fit's points.
+        pixels: (n, 2).
+        sigma: (n,) pixels.
+    """
+
+    camera: Camera
+    index: np.ndarray
+    pixels: np.ndarray
+    sigma: np.ndarray
+
+    def residuals(
+        self, positions: np.ndarray, project: Callable
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Block (index (n,), residual (n, 2), slope (n, 2, 3)) of all points' positions (P, 3)."""
+        pixels, slope = project(self.camera, positions[self.index])
+        residual = (pixels - self.pixels) / self.sigma[:, None]
+        return self.index, residual, slope / self.sigma[:, None, None]
+
+
+def make_view(camera: Camera, seen: Marked) -> View:
+    """A view of what a source of landmarks found in an undistorted image of a camera."""
+    face = seen.face
+    return View(
+        camera.id, camera, face.points, face.sigma, face.score, seen.irises,
+        visible_contour=seen.visible_contour,
+    )  # fmt: skip
 
 
 def agree(
@@ -53,15 +122,32 @@ def agree(
     Returns:
         The observation and the ids of the cameras left out.
     """
-    refused: list[str] = []
+    refused: list[View] = []
+    views = with_crowds(views)
     while True:
         points, inliers = robust_triangulate(views)
-        share = inliers.mean(1) if len(views) > 2 else np.ones(len(views))
+        known = np.stack([np.isfinite(view.sigma) for view in views])
+        share = (inliers & known).sum(1) / np.maximum(known.sum(1), 1)
         if len(views) <= 2 or share.min() >= min_share:
-            return Observation(expression, frame, tuple(views), inliers, points), refused
+            covariance = point_covariance(views, points, inliers & known)
+            found = Observation(
+                expression, frame, tuple(views), inliers & known, points, covariance, tuple(refused)
+            )
+            return found, [view.camera_id for view in refused]
         worst = int(np.argmin(share))
-        refused.append(views[worst].camera_id)
+        refused.append(views[worst])
         views = views[:worst] + views[worst + 1 :]
+
+
+def with_crowds(views: list[View]) -> list[View]:
+    """The views with their `crowd`: cameras within about SAME_DIRECTION count as one."""
+    if len(views) < 2:
+        return views
+    middle = [view.points[np.isfinite(view.sigma)].mean(0) for view in views]
+    rays = np.stack([_rays(v, m[None])[0] for v, m in zip(views, middle, strict=True)])
+    angle = np.arccos(np.clip(rays @ rays.T, -1.0, 1.0))
+    crowd = np.exp(-0.5 * (angle / SAME_DIRECTION) ** 2).sum(1)
+    return [replace(view, crowd=float(c)) for view, c in zip(views, crowd, strict=True)]
 
 
 def robust_triangulate(views: list[View]) -> tuple[np.ndarray, np.ndarray]:
@@ -79,14 +165,39 @@ def robust_triangulate(views: list[View]) -> tuple[np.ndarray, np.ndarray]:
         return np.full((68, 3), np.nan), np.ones((count, 68), dtype=bool)
     candidates = _pair_points(views)
     squared = _squared_errors(views, candidates)
-    cost = np.minimum(squared, INLIER_SIGMA**2).sum(1)
+    crowd = np.array([view.crowd for view in views])
+    cost = (np.minimum(squared, INLIER_SIGMA**2) / crowd[:, None]).sum(1)
     best = np.argmin(cost, axis=0)
     columns = np.arange(68)
     inliers = squared[best, :, columns].T < INLIER_SIGMA**2
     pixels = np.stack([view.points for view in views])
-    weights = np.stack([1.0 / view.sigma**2 for view in views])
+    weights = np.stack([1.0 / (view.crowd * view.sigma**2) for view in views])
     points = triangulate([view.camera for view in views], pixels, weights * inliers)
     return points, inliers
+
+
+def point_covariance(views: list[View], points: np.ndarray, inliers: np.ndarray) -> np.ndarray:
+    """Covariance (68, 3, 3), square metres, of triangulated points.
+
+    The inverse of the normal equations at the points: each view adds J' J / (crowd sigma^2), J
+    (2, 3) being the slope of its pixel and sigma the standard deviation of a coordinate.
+
+    Args:
+        views: C views.
+        points: (68, 3); NaN where there is none.
+        inliers: (C, 68) bool, what the points were triangulated from.
+    """
+    normal = np.zeros((68, 3, 3))
+    known = np.isfinite(points).all(1)
+    for view, used in zip(views, inliers, strict=True):
+        chosen = np.flatnonzero(used & known & np.isfinite(view.sigma))
+        slope = pixel_slope(view.camera, points[chosen])
+        weight = 1.0 / (view.crowd * view.sigma[chosen] ** 2)
+        normal[chosen] += weight[:, None, None] * np.swapaxes(slope, 1, 2) @ slope
+    covariance = np.full((68, 3, 3), np.nan)
+    solid = known & (np.linalg.cond(normal) < 1e12)
+    covariance[solid] = np.linalg.inv(normal[solid])
+    return covariance
 
 
 def facing(view: View, rotation: np.ndarray, translation: np.ndarray) -> float:
@@ -122,10 +233,15 @@ def _pair_points(views: list[View]) -> np.ndarray:
 
 def _landmark_rays(view: View) -> tuple[np.ndarray, np.ndarray]:
     """Camera centre (3,) and unit directions (68, 3) of a pinhole view's landmarks."""
+    return view.camera.center, _rays(view, view.points)
+
+
+def _rays(view: View, pixels: np.ndarray) -> np.ndarray:
+    """Unit world directions (N, 3) of pixels (N, 2) of a pinhole view."""
     K, pose = view.camera.K, view.camera.cam_from_world
-    x = (view.points - K[:2, 2]) / K[[0, 1], [0, 1]]
-    directions = np.concatenate([x, np.ones((68, 1))], axis=1) @ pose[:3, :3]
-    return view.camera.center, directions / np.linalg.norm(directions, axis=1, keepdims=True)
+    x = (pixels - K[:2, 2]) / K[[0, 1], [0, 1]]
+    directions = np.concatenate([x, np.ones((len(x), 1))], axis=1) @ pose[:3, :3]
+    return directions / np.linalg.norm(directions, axis=1, keepdims=True)
 
 
 def _squared_errors(views: list[View], candidates: np.ndarray) -> np.ndarray:
@@ -137,6 +253,17 @@ def _squared_errors(views: list[View], candidates: np.ndarray) -> np.ndarray:
         squared = ((pixels - view.points) ** 2).sum(-1) / np.minimum(view.sigma, limit) ** 2
         errors[:, index] = np.where(depth > 0, squared, np.inf)
     return errors
+
+
+def pixel_slope(camera: Camera, points: np.ndarray) -> np.ndarray:
+    """Return d pixel / d point (N, 2, 3) at world points (N, 3) of an undistorted camera."""
+    rotation, K = camera.cam_from_world[:3, :3], camera.K
+    focal = K[[0, 1], [0, 1]]
+    pixels, depth = project_pinhole(camera, points)
+    safe = np.where(np.abs(depth) > 1e-9, depth, 1e-9)
+    ray = (pixels - K[:2, 2]) / focal
+    slope = (rotation[None, :2] - ray[..., None] * rotation[None, 2:3]) / safe[:, None, None]
+    return slope * focal[:, None]
 
 
 def project_pinhole(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -45,6 +45,15 @@ def with_modes(model: HeadModel, count: int, sigma: float, length: float) -> Hea
     )
 
 
+def split_shape(
+    model: HeadModel, with_offsets: HeadModel, shape: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """A head's own shape coefficients (S,), and the offsets (V, 3) metres that the modes add."""
+    count = model.shape_dirs.shape[2]
+    modes = with_offsets.shape_dirs[..., count:].double().numpy()
+    return shape[:count], modes @ shape[count:]
+
+
 def offset_modes(model: HeadModel, count: int, sigma: float, length: float) -> np.ndarray:
     """The field's broadest modes (V, count), metres a standard deviation; see `with_modes`.
 
@@ -76,14 +85,17 @@ def cotangent_laplacian(
     harm and the matrix is positive semi-definite.
     """
     count = len(vertices)
-    rows, columns, values = [], [], []
+    rows: list[np.ndarray] = []
+    columns: list[np.ndarray] = []
+    values: list[np.ndarray] = []
     mass = np.full(count, 1e-12)
     for k in range(3):
         i, j, o = faces[:, k], faces[:, (k + 1) % 3], faces[:, (k + 2) % 3]
         u, v = vertices[i] - vertices[o], vertices[j] - vertices[o]
         area = np.linalg.norm(np.cross(u, v), axis=1)
-        rows, columns = [*rows, i], [*columns, j]
-        values = [*values, 0.5 * (u * v).sum(1) / np.maximum(area, 1e-14)]
+        rows.append(i)
+        columns.append(j)
+        values.append(0.5 * (u * v).sum(1) / np.maximum(area, 1e-14))
         np.add.at(mass, i, area / 6.0)
     shape = (count, count)
     half = sparse.csr_matrix(

@@ -44,7 +44,8 @@ def draw_overlays(
         chosen, columns = _spread(target, cameras), {}
         for camera_id in sorted(chosen):
             frame = read_frame(dataset, subject, camera_id, target.observation.frame)
-            columns[camera_id] = _column(frame, cameras[camera_id], camera_id, model, target, mesh)
+            seen = [v.points for v in target.observation.views if v.camera_id == camera_id]
+            columns[camera_id] = draw_column(frame, cameras[camera_id], model, mesh, seen)
         path = folder / f"overlay_{target.observation.expression}.jpg"
         write_image(path, np.concatenate(list(columns.values()), axis=1), quality=88)
         surest[target.observation.expression] = columns[chosen[0]][TILE:]
@@ -63,32 +64,40 @@ def _spread(target: Target, cameras: dict[str, Camera]) -> list[str]:
     return chosen
 
 
-def _column(
+def draw_column(
     frame: np.ndarray,
     camera: Camera,
-    camera_id: str,
     model: HeadModel,
-    target: Target,
     mesh: np.ndarray,
+    seen: list[np.ndarray],
+    tile: int = TILE,
 ) -> np.ndarray:
-    """Frame and overlay (2 TILE, TILE, 3) of the part of one view where the head is."""
+    """Frame and overlay (2 tile, tile, 3) of the part of one view where the head is.
+
+    Args:
+        frame: (H, W, 3) uint8, undistorted.
+        camera: pinhole; its id is written on the picture.
+        model: the head model.
+        mesh: (V, 3) world.
+        seen: arrays (N, 2) of detected pixels.
+        tile: side of the picture, pixels.
+    """
     pixels, _ = project_pinhole(camera, mesh)
     low, high = pixels.min(0), pixels.max(0)
     side = 1.08 * float((high - low).max())
     corner = 0.5 * (low + high) - 0.5 * side
-    scale = TILE / side
+    scale = tile / side
     matrix = np.array([[scale, 0, -scale * corner[0]], [0, scale, -scale * corner[1]]])
     # OpenCV's pixel centres lie on whole numbers, ours on halves.
     shifted = matrix + np.array([[0, 0, 0.5 * scale - 0.5]])
     flags = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
-    crop = cv2.warpAffine(frame, shifted, (TILE, TILE), flags=flags)
+    crop = cv2.warpAffine(frame, shifted, (tile, tile), flags=flags)
     shaded = _wireframe(crop, camera, matrix, model, mesh)
     marks = landmarks(model, torch.from_numpy(mesh)[None])[0].numpy()
     _dots(shaded, project_pinhole(camera, marks)[0] @ matrix[:, :2].T + matrix[:, 2], FITTED_COLOR)
-    for view in target.observation.views:
-        if view.camera_id == camera_id:
-            _dots(shaded, view.points @ matrix[:, :2].T + matrix[:, 2], SEEN_COLOR)
-    cv2.putText(shaded, camera_id, (6, 16), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (255, 255, 255), 1)
+    for points in seen:
+        _dots(shaded, points @ matrix[:, :2].T + matrix[:, 2], SEEN_COLOR)
+    cv2.putText(shaded, camera.id, (6, 16), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (255, 255, 255), 1)
     return np.concatenate([crop, shaded])
 
 
@@ -102,8 +111,8 @@ def _wireframe(
     rays = o3d.t.geometry.RaycastingScene.create_rays_pinhole(
         intrinsic_matrix=o3d.core.Tensor(K),
         extrinsic_matrix=o3d.core.Tensor(camera.cam_from_world),
-        width_px=TILE,
-        height_px=TILE,
+        width_px=crop.shape[1],
+        height_px=crop.shape[0],
     )
     cast = scene.cast_rays(rays)
     hit = np.isfinite(cast["t_hit"].numpy())
@@ -120,5 +129,5 @@ def _wireframe(
 def _dots(image: np.ndarray, points: np.ndarray, color: tuple[int, int, int]) -> None:
     """Draw small dots at tile pixels (N, 2), corner origin, in place."""
     for x, y in points:
-        if 0 <= x < TILE and 0 <= y < TILE:
+        if 0 <= x < image.shape[1] and 0 <= y < image.shape[0]:
             cv2.circle(image, (int(x), int(y)), 1, color, -1, cv2.LINE_AA)

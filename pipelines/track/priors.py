@@ -8,8 +8,7 @@ from express50.head.model import HeadModel
 from pipelines.track.config import TrackConfig
 
 NEUTRAL_SHARE = 0.2
-NECK_SIGMA = 0.2
-EYE_SIGMA = 0.15
+EYE_SIGMA = 0.3
 EYE_DIFFERENCE_SIGMA = 0.03
 JAW_SIGMA = (0.3, 0.06, 0.04)
 JAW_CLOSED_SIGMA = 0.02
@@ -31,7 +30,7 @@ def prior(
     sigmas = np.concatenate(
         [
             np.full(count, sigma * share),
-            np.full(3, NECK_SIGMA),
+            np.full(3, config.neck_prior),
             np.array(JAW_SIGMA) * [share, 1.0, 1.0],
             np.full(6, EYE_SIGMA),
         ]

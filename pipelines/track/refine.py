@@ -19,6 +19,7 @@ from pipelines.track.appearance import (
 )
 from pipelines.track.config import TrackConfig
 from pipelines.track.fit import State, Target, fit
+from pipelines.track.marks import Eyes, with_marks
 from pipelines.track.outline import Outline, SignedDistance, outline_regions, outline_vertices
 from pipelines.track.photometry import OBSERVATIONS, Photometry, Picture, look, robust_mean
 from pipelines.track.relief import make_relief, sweep
@@ -29,9 +30,10 @@ from pipelines.track.sparse_head import POSE_SIZE, Basis
 # Light of so many moments tells as much as that of all.
 LIGHT_MOMENTS = 8
 DETAIL_PX = 3.0
+# Irises, and jaw lines where they are seen, are found anew at least so often.
+MARK_ROUNDS = 2
 NOISE_START = 0.02
 SLANT = 0.4
-NONE = np.zeros(0, dtype=np.int64)
 
 
 @dataclass(frozen=True)
@@ -43,7 +45,12 @@ class Moment:
 
 
 def refine(
-    basis: Basis, targets: list[Target], state: State, moments: list[Moment], config: TrackConfig
+    basis: Basis,
+    targets: list[Target],
+    state: State,
+    moments: list[Moment],
+    eyes: Eyes | None,
+    config: TrackConfig,
 ) -> tuple[State, list[Target], Appearance | None]:
     """Alternate between reading the pictures with the current meshes and fitting to what was read.
 
@@ -52,12 +59,17 @@ def refine(
     samples = spread(basis.model, config.samples)
     appearance: Appearance | None = None
     rounds = config.relief_rounds + config.photo_rounds
-    rounds = max(rounds, config.silhouette_rounds)
+    rounds = max(rounds, config.silhouette_rounds, MARK_ROUNDS)
+    plain = targets
     for index in range(rounds):
         meshes = all_vertices(basis.model, state)
-        targets = [replace(target, outlines=(), terms=(), vertices=NONE) for target in targets]
+        targets = plain
         if rounds - index <= config.silhouette_rounds:
             targets = with_outlines(basis.model, targets, moments, meshes)
+        targets = [
+            with_marks(basis.model, target, mesh, rotation, eyes)
+            for target, mesh, rotation in zip(targets, meshes, rotations(state), strict=True)
+        ]
         if config.relief_rounds:
             # Far off, whole patches of skin may match wrongly together: little trust at first.
             left = max(config.relief_rounds - 1 - index, 0)
@@ -289,6 +301,11 @@ def _with_term(
     )
     vertices = np.concatenate([target.vertices, ids])
     return replace(target, vertices=vertices, terms=(*target.terms, photo))
+
+
+def rotations(state: State) -> np.ndarray:
+    """World from head (E, 3, 3)."""
+    return np.stack([item.rotation for item in state.poses])
 
 
 def all_vertices(model: HeadModel, state: State) -> np.ndarray:

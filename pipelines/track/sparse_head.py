@@ -6,7 +6,7 @@ few hundred vertices then costs milliseconds and a full forward-mode Jacobian so
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import torch
@@ -27,6 +27,7 @@ class Basis:
         joints: (J, 3) of the template.
         joint_directions: (J, 3, S + X).
         landmark_vertices: (68, 3) vertex ids.
+        bias: (68, 3) what the detector is known to err on this face, head space.
     """
 
     model: HeadModel
@@ -34,6 +35,7 @@ class Basis:
     joints: torch.Tensor
     joint_directions: torch.Tensor
     landmark_vertices: torch.Tensor
+    bias: np.ndarray = field(default_factory=lambda: np.zeros((68, 3)))
 
     @property
     def shape_size(self) -> int:

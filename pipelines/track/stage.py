@@ -15,11 +15,11 @@ from express50.frames import read_cameras_of, read_frame, read_peaks
 from express50.head.load import load_head
 from express50.head.model import HeadModel, landmarks
 from express50.images import read_alpha
-from express50.index import index_path
-from express50.landmarks.detector import detect
-from express50.landmarks.network import WEIGHTS, LandmarkNet, load_network
+from express50.index import index_path, read_index
+from express50.landmarks.sources import Source, open_source, source_files
 from express50.layout import Dataset
 from express50.stage import Stage
+from pipelines.track.clips import write_clips
 from pipelines.track.config import PRESETS, TrackConfig
 from pipelines.track.fit import (
     State,
@@ -29,16 +29,27 @@ from pipelines.track.fit import (
     landmark_sigma,
     start_state,
 )
-from pipelines.track.observe import Observation, View, agree, facing, project_pinhole
-from pipelines.track.offsets import with_modes
-from pipelines.track.outline import signed_distance
+from pipelines.track.marks import Eyes, measure_eyes
+from pipelines.track.observe import (
+    Marks,
+    Observation,
+    View,
+    agree,
+    facing,
+    make_view,
+    project_pinhole,
+)
+from pipelines.track.offsets import split_shape, with_modes
+from pipelines.track.outline import Outline, signed_distance
 from pipelines.track.overlay import draw_overlays
-from pipelines.track.refine import Moment, all_vertices, refine
+from pipelines.track.refine import Moment, all_vertices, refine, rotations
+from pipelines.track.sheet import write_sheet
 from pipelines.track.shots import Shot, cut_shot
 from pipelines.track.sparse_head import Basis, make_basis
 from pipelines.track.start import initial_pose
+from pipelines.track.suspects import suspect_cameras
 
-SCHEMA = "express50.track/1"
+SCHEMA = "express50.track/2"
 MIN_FACING = 0.05
 
 
@@ -53,7 +64,7 @@ def inputs(dataset: Dataset, item: str, config: TrackConfig) -> dict[str, Path |
         "index": index_path(dataset, item),
         "cameras": dataset.item_dir("calibrate", item) / "cameras.json",
         "peaks": dataset.item_dir("align", item) / "peaks.json",
-        "weights": WEIGHTS,
+        **source_files(config.landmarks),
     }
     mattes = dataset.item_dir("matte", item)
     if config.silhouette_rounds and mattes.is_dir():
@@ -69,7 +80,8 @@ def run(dataset: Dataset, item: str, config: TrackConfig, out: Path) -> dict:
     cameras = read_cameras_of(dataset, item)
     dropped: list[dict[str, str]] = []
     basis = _basis(config.head, config.offset_modes, config.offset_sigma, config.offset_length)
-    observations = _observe(dataset, item, cameras, config, dropped)
+    source = _open_source(dataset, item, config)
+    observations = _observe(dataset, item, cameras, source, config, dropped)
     targets, poses = _targets(basis, observations, config, dropped)
     if not targets:
         reasons = "; ".join(f"{row['what']}: {row['why']}" for row in dropped[:3])
@@ -79,12 +91,52 @@ def run(dataset: Dataset, item: str, config: TrackConfig, out: Path) -> dict:
         replace(target, sigma=consistent_sigma(target, marks))
         for target, marks in zip(targets, _marks(basis.model, state), strict=True)
     ]
-    moments = _moments(dataset, item, targets, all_vertices(basis.model, state), config)
-    state, targets, _ = refine(basis, targets, state, moments, config)
+    meshes = all_vertices(basis.model, state)
+    eyes = measure_eyes(basis.model, targets, meshes, rotations(state))
+    moments = _moments(dataset, item, targets, meshes, config)
+    state, targets, appearance = refine(basis, targets, state, moments, eyes, config)
     vertices = all_vertices(basis.model, state)
     _write_track(out / "track.npz", config.head, basis, targets, state, vertices)
-    draw_overlays(dataset, item, out / "qc", basis.model, targets, vertices)
-    return _metrics(basis.model, targets, vertices, dropped)
+    metrics = _metrics(basis.model, targets, vertices, dropped)
+    tiles = draw_overlays(dataset, item, out / "qc", basis.model, targets, vertices)
+    write_sheet(out / "qc", tiles, metrics["landmark_rms_px"])
+    marks = _marks(basis.model, state)
+    metrics["suspect_cameras"] = suspect_cameras(targets, marks, rotations(state), vertices.mean(1))
+    if config.frames == "clips":
+        clips = _clips(dataset, item, basis, state, source, eyes, config, out)
+        metrics |= {"dropped": dropped + clips.pop("dropped"), "clips": clips}
+    return metrics
+
+
+def _clips(
+    dataset: Dataset,
+    subject: str,
+    basis: Basis,
+    state: State,
+    source: Source,
+    eyes: Eyes | None,
+    config: TrackConfig,
+    out: Path,
+) -> dict:
+    """Write sequence.npz: every frame of the cue windows with the peaks' shape."""
+    cameras = read_cameras_of(dataset, subject)
+
+    def observe(cue: str, frame: int) -> Observation | None:
+        views = _views(dataset, subject, cameras, frame, source, config)
+        observation = agree(cue, frame, views)[0] if views else None
+        enough = observation and observation.inliers.sum(1).max() >= config.min_landmarks
+        return observation if enough else None
+
+    keep = dataset.windows_dir(subject)
+    shape, _ = split_shape(load_head(config.head), basis.model, state.shape)
+    paths, cues = inputs(dataset, subject, config), read_index(dataset, subject).cues
+    return write_clips(out, basis, state, cues, observe, config, keep, paths, eyes, shape)
+
+
+def _open_source(dataset: Dataset, subject: str, config: TrackConfig) -> Source:
+    """The source of landmarks; files of points are of the footage as recorded."""
+    recorded = read_cameras_of(dataset, subject, undistorted=False)
+    return open_source(config.landmarks, recorded, config.refinements)
 
 
 @lru_cache(maxsize=2)
@@ -92,15 +144,11 @@ def _basis(head: str, modes: int, sigma: float, length: float) -> Basis:
     return make_basis(with_modes(load_head(head), modes, sigma, length))
 
 
-@lru_cache(maxsize=1)
-def _network() -> LandmarkNet:
-    return load_network()
-
-
 def _observe(
     dataset: Dataset,
     subject: str,
     cameras: dict[str, Camera],
+    source: Source,
     config: TrackConfig,
     dropped: list[dict[str, str]],
 ) -> list[Observation]:
@@ -111,7 +159,8 @@ def _observe(
     chosen = list(cameras)
     found = {}
     for expression in order:
-        views = _views(dataset, subject, {n: cameras[n] for n in chosen}, peaks[expression], config)
+        now = {name: cameras[name] for name in chosen}
+        views = _views(dataset, subject, now, peaks[expression], source, config)
         if config.cameras and len(chosen) > config.cameras and len(views) >= config.cameras:
             views = sorted(views, key=lambda view: float(np.median(view.sigma)) / view.score)
             views = views[: config.cameras]
@@ -132,7 +181,12 @@ def _observe(
 
 
 def _views(
-    dataset: Dataset, subject: str, cameras: dict[str, Camera], frame: int, config: TrackConfig
+    dataset: Dataset,
+    subject: str,
+    cameras: dict[str, Camera],
+    frame: int,
+    source: Source,
+    config: TrackConfig,
 ) -> list[View]:
     """Views with a face in them; a camera whose footage lacks the frame is skipped."""
     views = []
@@ -141,9 +195,9 @@ def _views(
             image = read_frame(dataset, subject, camera_id, frame)
         except CaptureError:
             continue
-        seen = detect(_network(), image, config.refinements)
-        if seen.score >= config.min_score:
-            views.append(View(camera_id, camera, seen.points, seen.sigma, seen.score))
+        seen = source(image, camera_id, frame)
+        if seen.face.score >= config.min_score:
+            views.append(make_view(camera, seen))
     return views
 
 
@@ -231,12 +285,14 @@ def _write_track(
     """Write track.npz; no pickled objects."""
     own = np.stack([item.own for item in state.poses])
     count = basis.expression_size
+    shape, offsets = split_shape(load_head(head), basis.model, state.shape)
     arrays = {
         "schema": np.array(SCHEMA),
         "head": np.array(head),
         "expressions": np.array([target.observation.expression for target in targets]),
         "frames": np.array([target.observation.frame for target in targets], dtype=np.int64),
-        "shape": state.shape,
+        "shape": shape,
+        "offsets": offsets.astype(np.float32),
         "expression": own[:, :count],
         "neck": own[:, count : count + 3],
         "jaw": own[:, count + 3 : count + 6],
@@ -276,15 +332,20 @@ def _metrics(
         "landmark_rms_px_mean": round(float(np.mean(values)), 4) if values else None,
         "landmarks_used": used,
         "landmarks_seen": total,
-        "outline_views": int(sum(len(target.outlines) for target in targets)),
+        "outline_views": _count(targets, Outline),
+        "marked_views": _count(targets, Marks),
         "head": model.name,
         "dropped": dropped,
     }
 
 
+def _count(targets: list[Target], kind: type) -> int:
+    return sum(isinstance(one, kind) for target in targets for one in target.outlines)
+
+
 STAGE = Stage(
     name="track",
-    version=1,
+    version=2,
     config=TrackConfig,
     presets=PRESETS,
     items=items,

@@ -12,6 +12,8 @@ from pipelines.track.observe import Observation
 # Jaw-line points slide; brows to mouth are what a rigid alignment may trust.
 INNER = np.arange(17, 68)
 MIN_TRIANGULATED = 12
+# How far, one by one, people's landmarks lie from the template's.
+PERSON_M = 0.004
 SCALE_LIMITS = (0.5, 2.0)
 
 
@@ -38,7 +40,10 @@ def initial_pose(observation: Observation, template: np.ndarray) -> tuple[np.nda
             f"{scale:.3g} times a human head in the calibration's units; expected metres, divide "
             f"the camera translations by {scale:.3g} and calibrate again"
         )
-    return rigid_fit(template[seen], observation.points[seen])
+    spread = np.trace(observation.covariance[seen], axis1=1, axis2=2) / 3.0
+    # A point without a covariance is triangulated from all but one direction.
+    spread = np.where(np.isfinite(spread), spread, np.inf)
+    return rigid_fit(template[seen], observation.points[seen], 1.0 / (PERSON_M**2 + spread))
 
 
 def _factor(scale: float) -> str:
@@ -51,6 +56,12 @@ def _from_one_view(observation: Observation, template: np.ndarray) -> tuple[np.n
     """Pose from the view with the smallest expected error."""
     view = min(observation.views, key=lambda view: float(np.median(view.sigma)) / view.score)
     best = np.argsort(view.sigma[INNER])[:36]
+    best = best[np.isfinite(view.sigma[INNER[best]])]
+    if len(best) < MIN_TRIANGULATED:
+        raise StageError(
+            f"{observation.expression}: {len(best)} points between brows and mouth are known in "
+            f"{view.camera_id}, expected {MIN_TRIANGULATED} or more"
+        )
     points, pixels = template[INNER[best]], view.points[INNER[best]]
     # EPnP needs no start; refined by Levenberg-Marquardt. OpenCV's K is given corner-origin pixels
     # together with a corner-origin principal point, so no shift is due.

@@ -16,6 +16,8 @@ from express50.config import build_config
 from express50.errors import ConfigError, StageError
 from express50.head.model import landmarks, pose
 from express50.landmarks.detector import Detection
+from express50.landmarks.iris import Irises
+from express50.landmarks.sources import Marked
 from express50.transforms import axis_angle_to_matrix, look_at
 from pipelines.track.config import TrackConfig
 from pipelines.track.fit import (
@@ -303,6 +305,10 @@ def test_presets_are_valid_and_bad_values_are_refused() -> None:
         TrackConfig(iterations=0)
 
 
+def no_irises() -> Irises:
+    return Irises(np.zeros((2, 2)), np.full(2, np.inf), np.zeros(2))
+
+
 @pytest.fixture
 def tracked_dataset(tmp_path: Path, ingested, monkeypatch: pytest.MonkeyPatch):
     """A calibrated, labelled dataset whose detector is told the landmarks of a tiny head."""
@@ -326,16 +332,13 @@ def tracked_dataset(tmp_path: Path, ingested, monkeypatch: pytest.MonkeyPatch):
     folder.mkdir(parents=True)
     (folder / "peaks.json").write_text(json.dumps(peaks))
     scene = make_scene()
-    answers = []
 
-    def told(network: object, image: np.ndarray, refinements: int) -> Detection:
-        camera = list(read_cameras_of(ingested, "S001").values())[len(answers) % 3]
-        answers.append(camera.id)
-        points = project(camera, scene.marks)[0]
-        return Detection(points, np.ones(68), np.full(68, 0.9), 0.95)
+    def told(image: np.ndarray, camera_id: str, frame: int) -> Marked:
+        points = project(read_cameras_of(ingested, "S001")[camera_id], scene.marks)[0]
+        face = Detection(points, np.ones(68), np.full(68, 0.9), 0.95)
+        return Marked(face, no_irises(), visible_contour=False)
 
-    monkeypatch.setattr(stage, "detect", told)
-    monkeypatch.setattr(stage, "_network", lambda: None)
+    monkeypatch.setattr(stage, "open_source", lambda *unused: told)
     monkeypatch.setattr(stage, "_basis", lambda head: scene.basis)
     return ingested, scene
 
@@ -379,6 +382,7 @@ def test_no_face_anywhere_is_a_clear_error(
 
     dataset, _ = tracked_dataset
     nothing = Detection(np.zeros((68, 2)), np.ones(68), np.zeros(68), 0.0)
-    monkeypatch.setattr(stage, "detect", lambda *_: nothing)
+    blind = Marked(nothing, no_irises(), visible_contour=False)
+    monkeypatch.setattr(stage, "open_source", lambda *unused: lambda *image: blind)
     with pytest.raises(StageError, match="S001: no expression could be tracked"):
         STAGE.run(dataset, "S001", TrackConfig(), tmp_path)

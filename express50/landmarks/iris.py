@@ -1,0 +1,183 @@
+"""Where the irises are: the dark disc within each eye's opening.
+
+Every eye is brought to one size by its corners. A disc and the ring around it, both cut by the
+opening, are compared at every place and a few radii: iris and pupil are darker than the white
+around them (Daugman 1993 has the difference across a circle). Shut eyes say nothing.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from express50.adapters import affine_to_opencv
+from express50.landmarks.detector import Detection
+
+# Subject's left eye first, as the model's joints have it: corners, then the points of each lid.
+EYES = ((42, 45, (43, 44), (47, 46)), (36, 39, (37, 38), (41, 40)))
+SIDE = 64
+# The crop spans this many eye widths; an iris is a fifth of an eye's width in radius, more where
+# the head is turned and the width foreshortened.
+SPAN = 1.5
+RADII = (0.17, 0.2, 0.235, 0.275)
+RING = 1.55
+# Landmarks may cut an opening by this share of its width.
+SLACK = 0.1
+LEAST_WIDTH_PX = 6.0
+SHUT, OPEN = 0.1, 0.2
+# Contrast between disc and ring, of a crop whose mean light is a half: least, and that which gives
+# half of the confidence. Shut lids stay under the first, less than the second is no iris either.
+LEAST_CONTRAST, CONTRAST = 0.12, 0.08
+LEAST_COVER, LEAST_CONFIDENCE = 0.35, 0.2
+# Standard deviation of a sure centre, in eye widths.
+SIGMA = 0.04
+
+
+@dataclass(frozen=True)
+class Irises:
+    """Iris centres of one image, the subject's left eye first.
+
+    Attributes:
+        centres: (2, 2) pixels, corner origin; where the confidence is 0 the eye's middle.
+        sigma: (2,) expected error in pixels; infinite where the confidence is 0.
+        confidence: (2,) in 0..1; 0 for shut, hidden and tiny eyes.
+    """
+
+    centres: np.ndarray
+    sigma: np.ndarray
+    confidence: np.ndarray
+
+
+def find_irises(image: np.ndarray, seen: Detection) -> Irises:
+    """Find both irises of a detected face.
+
+    Args:
+        image: (H, W, 3) uint8 RGB.
+        seen: the face's landmarks in that image.
+    """
+    found = [_find(image, seen, *eye) for eye in EYES]
+    centres, sigma, confidence = (np.array(part) for part in zip(*found, strict=True))
+    return Irises(centres, sigma, confidence)
+
+
+def _find(
+    image: np.ndarray,
+    seen: Detection,
+    first: int,
+    last: int,
+    upper: tuple[int, int],
+    lower: tuple[int, int],
+) -> tuple[np.ndarray, float, float]:
+    """Centre (2,), sigma and confidence of one eye."""
+    points = seen.points
+    ring = points[[first, *upper, last, *reversed(lower)]]
+    middle = ring.mean(0)
+    along = points[last] - points[first]
+    width = float(np.linalg.norm(along))
+    nothing = (middle, np.inf, 0.0)
+    if not np.isfinite(ring).all() or width < LEAST_WIDTH_PX:
+        return nothing
+    opening = abs(_height(points, along / width, upper, lower)) / width
+    surely = float(np.clip((opening - SHUT) / (OPEN - SHUT), 0.0, 1.0))
+    trust = float(np.median(seen.confidence[[first, *upper, last, *lower]]))
+    window = _window(middle, along)
+    if surely * trust <= 0.0 or not _inside(middle, image.shape):
+        return nothing
+    crop = _light(image, window)
+    mask = _opening(np.linalg.inv(np.vstack([window, [0, 0, 1]])), ring)
+    place, contrast, cover = _disc(crop, mask)
+    confidence = trust * surely * cover * contrast / (contrast + CONTRAST)
+    if contrast < LEAST_CONTRAST or cover < LEAST_COVER or confidence < LEAST_CONFIDENCE:
+        return nothing
+    centre = window[:, :2] @ place + window[:, 2]
+    return centre, SIGMA * width / confidence**0.5, confidence
+
+
+def _height(
+    points: np.ndarray, along: np.ndarray, upper: tuple[int, int], lower: tuple[int, int]
+) -> float:
+    """Distance between the lids across the line of the corners, pixels."""
+    across = np.array([-along[1], along[0]])
+    return float((points[list(lower)].mean(0) - points[list(upper)].mean(0)) @ across)
+
+
+def _window(middle: np.ndarray, along: np.ndarray) -> np.ndarray:
+    """Affine (2, 3) from crop to image pixels; the line of the eye's corners lies level."""
+    step = SPAN * along / SIDE
+    turn = np.array([[step[0], -step[1]], [step[1], step[0]]])
+    return np.concatenate([turn, (middle - turn @ [SIDE / 2, SIDE / 2])[:, None]], axis=1)
+
+
+def _inside(point: np.ndarray, shape: tuple[int, ...]) -> bool:
+    return bool((point >= 0).all() and point[0] < shape[1] and point[1] < shape[0])
+
+
+def _light(image: np.ndarray, window: np.ndarray) -> np.ndarray:
+    """Crop (SIDE, SIDE) float32 of mean 0.5; red counts most, as blue irises are dark in it."""
+    crop = cv2.warpAffine(
+        image,
+        affine_to_opencv(window),
+        (SIDE, SIDE),
+        flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
+        borderMode=cv2.BORDER_REPLICATE,
+    ).astype(np.float32)
+    light = 0.6 * crop[..., 0] + 0.4 * crop[..., 1]
+    return light * (0.5 / max(float(light.mean()), 10.0))
+
+
+def _opening(crop_from_image: np.ndarray, ring: np.ndarray) -> np.ndarray:
+    """Mask (SIDE, SIDE) float32 of the opening between the lids, a little widened."""
+    inside = ring @ crop_from_image[:2, :2].T + crop_from_image[:2, 2]
+    mask = np.zeros((SIDE, SIDE), np.uint8)
+    cv2.fillPoly(mask, [np.round(inside).astype(np.int32)], 1)
+    grow = 2 * round(SLACK * SIDE / SPAN) + 1
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (grow, grow))
+    return cv2.dilate(mask, kernel).astype(np.float32)
+
+
+def _disc(crop: np.ndarray, mask: np.ndarray) -> tuple[np.ndarray, float, float]:
+    """Place (2,) in crop pixels, contrast and share of the disc in the opening, of the best."""
+    best = (-np.inf, np.full(2, SIDE / 2), 0.0, 0.0)
+    for radius in RADII:
+        disc, ring = _kernels(radius * SIDE / SPAN)
+        within = cv2.filter2D(mask, -1, disc, borderType=cv2.BORDER_CONSTANT)
+        around = cv2.filter2D(mask, -1, ring, borderType=cv2.BORDER_CONSTANT)
+        light = cv2.filter2D(crop * mask, -1, disc, borderType=cv2.BORDER_CONSTANT)
+        other = cv2.filter2D(crop * mask, -1, ring, borderType=cv2.BORDER_CONSTANT)
+        contrast = other / np.maximum(around, 1e-3) - light / np.maximum(within, 1e-3)
+        score = contrast * np.sqrt(np.clip(within * around, 0.0, None)) * (mask > 0)
+        row, column = np.unravel_index(int(np.argmax(score)), score.shape)
+        if score[row, column] > best[0]:
+            place = np.array([column, row]) + 0.5 + _peak(score, int(row), int(column))
+            best = (
+                float(score[row, column]), place,
+                float(contrast[row, column]), float(min(within[row, column], 1.0)),
+            )  # fmt: skip
+    return best[1], best[2], best[3]
+
+
+def _kernels(radius: float) -> tuple[np.ndarray, np.ndarray]:
+    """Disc and ring, each summing to one."""
+    reach = int(np.ceil(RING * radius))
+    grid = np.arange(-reach, reach + 1)
+    distance = np.hypot(grid[:, None], grid)
+    disc = np.clip(radius + 0.5 - distance, 0.0, 1.0)
+    ring = np.clip(RING * radius + 0.5 - distance, 0.0, 1.0) - disc
+    return (disc / disc.sum()).astype(np.float32), (ring / ring.sum()).astype(np.float32)
+
+
+def _peak(score: np.ndarray, row: int, column: int) -> np.ndarray:
+    """Offset (2,) x, y of a parabola's top through the best place and its neighbours."""
+    offset = np.zeros(2)
+    for axis, (at, size) in enumerate(((column, SIDE), (row, SIDE))):
+        if not 0 < at < size - 1:
+            continue
+        line = (
+            score[row, column - 1 : column + 2] if axis == 0 else score[row - 1 : row + 2, column]
+        )
+        bend = float(line[0] - 2 * line[1] + line[2])
+        if bend < -1e-9:
+            offset[axis] = np.clip(0.5 * float(line[0] - line[2]) / bend, -0.5, 0.5)
+    return offset

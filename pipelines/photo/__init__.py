@@ -1,0 +1,1 @@
+"""One photograph or video of one camera without calibration, made ready for the stages."""

@@ -1,0 +1,131 @@
+"""Make a raw capture of one camera out of a photograph or a video."""
+
+from __future__ import annotations
+
+import re
+import shutil
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from express50.cameras import camera_rows
+from express50.errors import CaptureError
+from express50.head.load import load_head
+from express50.images import encode_png
+from express50.landmarks.detector import Detection, detect
+from express50.landmarks.network import load_network
+from express50.publish import dump_json, write_bytes
+from pipelines.photo.focal import Focal, single_camera, weigh_focal
+from pipelines.photo.picture import Picture, guess_focal, read_upright, spread_frames
+from pipelines.track.config import TrackConfig
+from pipelines.track.sparse_head import make_basis
+
+CAMERA = "photo"
+FACE_SCORE = 0.2
+PROBES, FOCAL_FACES = 8, 3
+FPS = 25.0
+
+
+def make_photo_capture(
+    picture: Picture,
+    folder: Path,
+    subject: str,
+    config: TrackConfig,
+    *,
+    focal_px: float | None = None,
+    film_mm: float = 50.0,
+    windows: int = PROBES,
+) -> Focal:
+    """Write capture.toml, footage, cues and calibration; returns the focal length that was taken.
+
+    A photograph is one cue of one frame; a video is cut into `windows` cues of equal length, from
+    each of which `align` takes a frame for the shared shape.
+
+    Args:
+        picture: from `open_picture`.
+        folder: of the capture; what is there is written over.
+        subject: subject id.
+        config: of the fit that weighs focal lengths.
+        focal_px: focal length, pixels, where it is known.
+        film_mm: focal length on 35 mm film to assume where nothing is told.
+        windows: cues of a video.
+
+    Raises:
+        CaptureError: the picture cannot be read, or shows no face.
+    """
+    torch.set_num_threads(1)
+    images, frames = spread_frames(picture, PROBES)
+    height, width = images[0].shape[:2]
+    faces = find_faces(picture.path, images)
+    start = (focal_px, "given") if focal_px else guess_focal(picture, width, height, film_mm)
+    basis = make_basis(load_head(config.head))
+    surest = sorted(faces, key=lambda face: -face.score)[:FOCAL_FACES]
+    focal = weigh_focal(basis, surest, (width, height), start, config)
+    _write_footage(picture, folder / "cameras" / CAMERA)
+    camera = single_camera(CAMERA, width, height, focal.pixels)
+    write_bytes(folder / "calibration.json", dump_json(camera_rows({CAMERA: camera})))
+    write_bytes(folder / "cues.csv", _cues(frames, windows).encode())
+    write_bytes(folder / "capture.toml", _meta(subject, focal).encode())
+    return focal
+
+
+def find_faces(path: Path, images: list[np.ndarray]) -> list[Detection]:
+    """The faces that are surely seen in images of one person, at least one.
+
+    Raises:
+        CaptureError: there is none.
+    """
+    net = load_network()
+    seen = [detect(net, image) for image in images]
+    faces = [face for face in seen if face.score >= FACE_SCORE]
+    if not faces:
+        best = max(face.score for face in seen)
+        raise CaptureError(
+            f"{path}: no face found (best score {best:.2f}, expected {FACE_SCORE} or more); give a "
+            "picture in which the face is seen from the front or the side"
+        )
+    return faces
+
+
+def subject_id(path: Path) -> str:
+    """A subject id out of a file's name."""
+    name = re.sub(r"[^A-Za-z0-9_-]+", "_", path.stem).strip("_-")
+    return name or "photo"
+
+
+def _write_footage(picture: Picture, folder: Path) -> None:
+    """Copy the file; a photograph whose pixels lie on their side is stored upright."""
+    # A former picture of another kind or suffix would make the footage ambiguous.
+    shutil.rmtree(folder, ignore_errors=True)
+    suffix = picture.path.suffix.lower()
+    name = f"video{suffix}" if picture.video else f"frames/000000{suffix}"
+    target = folder / name
+    target.parent.mkdir(parents=True)
+    if picture.turned:
+        write_bytes(target.with_suffix(".png"), encode_png(read_upright(picture)))
+        return
+    try:
+        shutil.copyfile(picture.path, target)
+    except OSError as error:
+        raise CaptureError(f"{target}: cannot be written ({error.strerror})") from error
+
+
+def _cues(frames: int, windows: int) -> str:
+    """Content of cues.csv: `photo`, or `clip_00` and so on."""
+    rows = ["expression_id,start_frame,end_frame"]
+    if frames == 1:
+        return "\n".join([*rows, "photo,0,0"]) + "\n"
+    edges = np.unique(np.linspace(0, frames, min(windows, frames) + 1).round().astype(int))
+    pairs = zip(edges[:-1], edges[1:], strict=True)
+    rows += [f"clip_{n:02d},{a},{b - 1}" for n, (a, b) in enumerate(pairs)]
+    return "\n".join(rows) + "\n"
+
+
+def _meta(subject: str, focal: Focal) -> str:
+    """Content of capture.toml."""
+    return (
+        f'subject = "{subject}"\nfps = {FPS}\n'
+        f'focal_px = {focal.pixels:.3f}\nfocal_source = "{focal.source}"\n'
+        f"focal_range_px = [{focal.low:.1f}, {focal.high:.1f}]\n"
+    )

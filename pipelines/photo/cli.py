@@ -1,0 +1,127 @@
+"""``express50 photo``: track the face of a bare photograph or of a video of one camera."""
+
+from __future__ import annotations
+
+import argparse
+from contextlib import nullcontext
+from pathlib import Path
+from typing import Any
+
+from express50.capture import NAME
+from express50.console import FAILED, OK, say, say_json, stdout_to_stderr
+from express50.errors import ConfigError
+from express50.layout import Dataset
+from express50.pool import Pool
+from express50.runner import Summary, run_stage
+from express50.stage_cli import add_config_options, config_of, load_stage
+from express50.threads import cap_threads
+from pipelines import ingest
+from pipelines.photo.capture import make_photo_capture, subject_id
+from pipelines.photo.focal import Focal
+from pipelines.photo.panel import write_panel
+from pipelines.photo.picture import open_picture
+
+STAGES = ("ingest", "calibrate", "observe", "align", "track")
+MATTE_STAGES = ("alpha", "matte")
+# One view cannot tell an expression or a bent neck from a shape: both stay nearer to rest. Without
+# mattes and other views the jaw's width hangs on its landmarks alone.
+PHOTO_SETTINGS = (
+    "track.expression_prior=0.25", "track.neck_prior=0.03", "track.contour_weight=0.7",
+    "observe.min_score=0.2",
+)  # fmt: skip
+WORDS = "track the face of a bare photograph or video, without calibration"
+
+
+def add_commands(subparsers: Any) -> None:
+    """Add the ``photo`` command."""
+    parser = subparsers.add_parser(
+        "photo", help=WORDS, description=WORDS,
+        epilog="example: express50 photo portrait.jpg out; see out/track/portrait/qc",
+    )  # fmt: skip
+    parser.add_argument("picture", type=Path, metavar="PICTURE", help="image or video file")
+    parser.add_argument("out", type=Path, metavar="OUT", help="dataset folder to make or extend")
+    parser.add_argument("--subject", metavar="ID", help="subject id (the file's name)")
+    lens = parser.add_mutually_exclusive_group()
+    lens.add_argument("--focal-px", type=float, metavar="F", help="focal length, pixels")
+    lens.add_argument(
+        "--film-mm", type=float, default=50.0, metavar="MM",
+        help="focal length on 35 mm film to assume where EXIF tells none [50]",
+    )  # fmt: skip
+    parser.add_argument(
+        "--windows", type=int, default=8, metavar="N",
+        help="parts of a video; a frame of each is fitted for the shape [8]",
+    )  # fmt: skip
+    parser.add_argument(
+        "--matte", action="store_true", help="matte too, and fit outlines (name alpha.weights)"
+    )
+    add_config_options(parser)
+    parser.add_argument("--json", action="store_true", help="print the account as JSON")
+    parser.set_defaults(handler=run_photo)
+
+
+def run_photo(args: argparse.Namespace) -> int:
+    """Make the capture and run the stages on it."""
+    _check(args)
+    picture = open_picture(args.picture)
+    clips = ("track.frames=clips",) if picture.video else ()
+    args.set = [*PHOTO_SETTINGS, *clips, *args.set]
+    cap_threads(1)
+    subject = args.subject or subject_id(args.picture)
+    dataset = Dataset(args.out)
+    names = [*STAGES[:-1], *(MATTE_STAGES if args.matte else ()), STAGES[-1]]
+    with stdout_to_stderr() if args.json else nullcontext():
+        loaded = [load_stage(name) for name in names]
+        configs = [config_of(stage, args) for stage in loaded]
+        folder = dataset.root / "photos" / subject
+        focal = make_photo_capture(
+            picture, folder, subject, configs[-1],
+            focal_px=args.focal_px, film_mm=args.film_mm, windows=args.windows,
+        )  # fmt: skip
+        ingest.register(dataset, [folder])
+        with Pool(0) as pool:
+            summaries = []
+            for stage, config in zip(loaded, configs, strict=True):
+                chosen = [i for i in stage.items(dataset) if i.split("/")[0] == subject]
+                summaries.append(run_stage(stage, dataset, config, chosen, pool=pool))
+                if not summaries[-1].ok:
+                    break
+        panel = folder / "panel.jpg"
+        if summaries[-1].ok:
+            write_panel(dataset, subject, configs[-1], panel)
+    return _account(args, dataset, subject, focal, summaries, panel)
+
+
+def _check(args: argparse.Namespace) -> None:
+    """Refuse options that cannot work."""
+    if args.subject is not None and not NAME.fullmatch(args.subject):
+        raise ConfigError(f"--subject {args.subject!r}: expected letters, digits, '_' and '-'")
+    for name, value in (("--focal-px", args.focal_px), ("--film-mm", args.film_mm)):
+        if value is not None and not 0 < value < float("inf"):
+            raise ConfigError(f"{name} {value}: expected a number above 0")
+    if args.windows < 1:
+        raise ConfigError(f"--windows {args.windows}: expected at least 1")
+
+
+def _account(
+    args: argparse.Namespace,
+    dataset: Dataset,
+    subject: str,
+    focal: Focal,
+    summaries: list[Summary],
+    panel: Path,
+) -> int:
+    """Say what was made and how much of it is a guess."""
+    done = all(summary.ok for summary in summaries)
+    if args.json:
+        lens = dict(vars(focal))
+        say_json({"focal": lens, "stages": [summary.to_json() for summary in summaries]})
+        return OK if done else FAILED
+    for summary in summaries:
+        say(*summary.lines())
+    say(
+        f"focal length {focal.pixels:.0f} px ({focal.source}); the face alone is explained as well "
+        f"by {focal.low:.0f} to {focal.high:.0f} px"
+    )
+    if done:
+        say(f"track: {dataset.item_dir('track', subject)}", f"picture: {panel}")
+    return OK if done else FAILED

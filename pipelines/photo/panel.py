@@ -1,0 +1,39 @@
+"""One picture that shows a single-view track: the photo, the fit over it, and the head turned."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from express50.frames import read_cameras_of, read_frame
+from express50.head.load import load_head
+from express50.head.preview import render_preview
+from express50.images import write_image
+from express50.landmarks.sources import open_source
+from express50.layout import Dataset
+from pipelines.track.config import TrackConfig
+from pipelines.track.overlay import draw_column
+
+TILE, TURNED = 512, 60.0
+
+
+def write_panel(dataset: Dataset, subject: str, config: TrackConfig, path: Path) -> None:
+    """Write frame, overlay and turned head side by side, of the first frame that was tracked.
+
+    From the side shows what a single view cannot: whether the depth is a head's.
+    """
+    with np.load(dataset.item_dir("track", subject) / "track.npz") as track:
+        frame, mesh = int(track["frames"][0]), track["vertices"][0].astype(np.float64)
+        rotation, translation = track["R"][0], track["t"][0]
+    model = load_head(config.head)
+    ((camera_id, camera),) = read_cameras_of(dataset, subject).items()
+    image = read_frame(dataset, subject, camera_id, frame)
+    recorded = read_cameras_of(dataset, subject, undistorted=False)
+    seen = open_source(config.landmarks, recorded, config.refinements)(image, camera_id, frame)
+    dots = [seen.face.points, seen.irises.centres[seen.irises.confidence > 0]]
+    column = draw_column(image, camera, model.to(dtype=torch.float64), mesh, dots, TILE)
+    head = (mesh - translation) @ rotation
+    turned = render_preview(model, head, yaw=TURNED, size=TILE)
+    write_image(path, np.concatenate([column[:TILE], column[TILE:], turned], axis=1), quality=90)

@@ -1,0 +1,103 @@
+"""Read a bare photograph or video: upright pixels, and the focal length that EXIF tells."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import OpenImageIO as oiio
+
+from express50.capture import IMAGE_SUFFIXES, VIDEO_SUFFIXES
+from express50.errors import CaptureError
+from express50.frames import read_srgb8
+from express50.video import iterate_video
+
+FILM_DIAGONAL_MM = math.hypot(36.0, 24.0)
+# EXIF's orientation -> quarter turns counter-clockwise after an optional left-right flip.
+TURNS = {1: (0, False), 2: (0, True), 3: (2, False), 4: (2, True), 5: (1, True), 6: (3, False),
+         7: (3, True), 8: (1, False)}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Picture:
+    """What is known of a photograph or video before any face was looked for.
+
+    Attributes:
+        path: the file.
+        video: whether it is a video.
+        turned: whether EXIF says that its pixels do not lie upright.
+        film_mm: focal length on 35 mm film with the same diagonal angle of view; 0 where EXIF
+            tells none.
+    """
+
+    path: Path
+    video: bool
+    turned: bool = False
+    film_mm: float = 0.0
+
+
+def open_picture(path: Path) -> Picture:
+    """Look at a file's name and EXIF.
+
+    Raises:
+        CaptureError: no such file, or neither an image nor a video.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise CaptureError(f"{path}: no such file; expected a photograph or a video")
+    suffix = path.suffix.lower()
+    if suffix in VIDEO_SUFFIXES:
+        return Picture(path, video=True)
+    if suffix not in IMAGE_SUFFIXES:
+        raise CaptureError(
+            f"{path}: is no photograph or video by its name; expected one of "
+            f"{' '.join(IMAGE_SUFFIXES + VIDEO_SUFFIXES)}"
+        )
+    orientation, film = _exif(path)
+    return Picture(path, video=False, turned=TURNS[orientation] != (0, False), film_mm=film)
+
+
+def read_upright(picture: Picture) -> np.ndarray:
+    """The photograph (H, W, 3) uint8 sRGB as it should be looked at.
+
+    Raises:
+        CaptureError: it is damaged.
+    """
+    turns, flipped = TURNS[_exif(picture.path)[0]]
+    image = read_srgb8(picture.path)
+    return np.ascontiguousarray(np.rot90(image[:, ::-1] if flipped else image, turns))
+
+
+def spread_frames(picture: Picture, count: int) -> tuple[list[np.ndarray], int]:
+    """Up to `count` frames spread over a picture, and how many frames it has.
+
+    A video is decoded twice, so that not all of its frames are held.
+    """
+    if not picture.video:
+        return [read_upright(picture)], 1
+    frames = sum(1 for _ in iterate_video(picture.path))
+    wanted = set(np.unique(np.linspace(0, frames - 1, count).round().astype(int)).tolist())
+    return [i for n, (_, i) in enumerate(iterate_video(picture.path)) if n in wanted], frames
+
+
+def guess_focal(picture: Picture, width: int, height: int, film_mm: float) -> tuple[float, str]:
+    """Focal length in pixels and where it is from: `exif`, else `guess` by `film_mm`."""
+    diagonal = math.hypot(width, height)
+    if picture.film_mm > 0:
+        return picture.film_mm / FILM_DIAGONAL_MM * diagonal, "exif"
+    return film_mm / FILM_DIAGONAL_MM * diagonal, "guess"
+
+
+def _exif(path: Path) -> tuple[int, float]:
+    """Orientation (1 to 8) and focal length on 35 mm film (0 for none)."""
+    image = oiio.ImageInput.open(str(path))
+    if image is None:
+        raise CaptureError(f"{path}: cannot be read as an image ({oiio.geterror().strip()})")
+    spec = image.spec()
+    orientation = int(spec.getattribute("Orientation") or 1)
+    film = float(spec.getattribute("Exif:FocalLengthIn35mmFilm") or 0.0)
+    image.close()
+    usable = math.isfinite(film) and film > 0
+    return (orientation if orientation in TURNS else 1), (film if usable else 0.0)

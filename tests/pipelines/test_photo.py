@@ -1,0 +1,154 @@
+"""Bare photographs and videos: from one file to a track, without calibration."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import av
+import numpy as np
+import OpenImageIO as oiio
+import pytest
+
+from express50.cameras import read_cameras
+from express50.cli import main
+from express50.errors import CaptureError
+from express50.images import write_image
+from pipelines.photo.capture import subject_id
+from pipelines.photo.picture import guess_focal, open_picture, read_upright
+
+data = pytest.importorskip("skimage.data")
+
+
+@pytest.fixture(scope="module")
+def astronaut() -> np.ndarray:
+    return data.astronaut()
+
+
+@pytest.fixture(scope="module")
+def tracked(tmp_path_factory: pytest.TempPathFactory, astronaut: np.ndarray) -> tuple[Path, dict]:
+    folder = tmp_path_factory.mktemp("photo")
+    write_image(folder / "eva (1).png", astronaut)
+    assert main(["photo", str(folder / "eva (1).png"), str(folder / "out")]) == 0
+    metrics = json.loads((folder / "out/track/eva_1/metrics.json").read_text())
+    return folder / "out", metrics
+
+
+def test_a_bare_photograph_is_tracked(tracked: tuple[Path, dict]) -> None:
+    out, metrics = tracked
+    assert (out / "photos/eva_1/panel.jpg").stat().st_size > 30_000
+    # A face 120 px tall: 2 px are 8 mm of a face's 24 cm at the very most.
+    assert metrics["landmark_rms_px_mean"] < 2.0
+    assert metrics["marked_views"] == 1
+    meta = (out / "photos/eva_1/capture.toml").read_text()
+    assert 'focal_source = "guess"' in meta
+
+
+def test_its_head_is_a_head_from_the_side_too(tracked: tuple[Path, dict]) -> None:
+    """No dimension of a head leaves what adults have, depth least of all."""
+    with np.load(tracked[0] / "track/eva_1/track.npz") as track:
+        head = (track["vertices"][0] - track["t"][0]) @ track["R"][0]
+        assert np.abs(track["shape"]).max() < 3.0
+        assert track["R"][0][1, 1] > 0.9  # upright in a world whose y is up
+        assert 0.5 < -track["t"][0, 2] < 3.0
+    from express50.head.load import load_head
+
+    skull = head[load_head("procedural").regions["scalp"].numpy()]
+    face = head[load_head("procedural").regions["face"].numpy()]
+    depth = max(skull[:, 2].max(), face[:, 2].max()) - skull[:, 2].min()
+    assert 0.16 < depth < 0.25
+    assert 0.12 < np.ptp(skull[:, 0]) < 0.19
+
+
+def test_the_camera_is_at_the_origin_with_its_point_in_the_middle(tracked) -> None:
+    camera = read_cameras(tracked[0] / "photos/eva_1/calibration.json")["photo"]
+    np.testing.assert_allclose(camera.center, 0.0, atol=1e-12)
+    np.testing.assert_allclose(camera.K[:2, 2], [256.0, 256.0])
+    film = camera.K[0, 0] / np.hypot(512, 512) * np.hypot(36, 24)
+    assert film == pytest.approx(50.0, rel=0.01)
+
+
+def test_a_picture_without_a_face_is_one_clear_error(
+    tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    write_image(tmp_path / "wall.png", np.repeat(data.brick()[..., None], 3, axis=2))
+    assert main(["photo", str(tmp_path / "wall.png"), str(tmp_path / "out")]) == 1
+    said = capsys.readouterr().err.strip()
+    assert "no face found" in said and "\n" not in said
+    assert not (tmp_path / "out").exists()
+
+
+def test_wrong_options_and_files_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "a.txt").write_text("no picture")
+    for arguments in (["--focal-px", "-3"], ["--windows", "0"], ["--subject", "a b"]):
+        assert main(["photo", str(tmp_path / "a.txt"), str(tmp_path / "o"), *arguments]) == 2
+    with pytest.raises(CaptureError, match="no photograph or video by its name"):
+        open_picture(tmp_path / "a.txt")
+    with pytest.raises(CaptureError, match="no such file"):
+        open_picture(tmp_path / "b.png")
+    (tmp_path / "c.png").write_text("no picture")
+    with pytest.raises(CaptureError, match="cannot be read"):
+        open_picture(tmp_path / "c.png")
+
+
+def write_exif(path: Path, image: np.ndarray, orientation: int, film: int) -> None:
+    spec = oiio.ImageSpec(image.shape[1], image.shape[0], 3, "uint8")
+    spec.attribute("Orientation", orientation)
+    spec.attribute("Exif:FocalLengthIn35mmFilm", film)
+    file = oiio.ImageOutput.create(str(path))
+    file.open(str(path), spec)
+    file.write_image(np.ascontiguousarray(image))
+    file.close()
+
+
+@pytest.mark.parametrize(
+    ("orientation", "stored"),
+    [
+        (1, lambda i: i),
+        (2, lambda i: i[:, ::-1]),
+        (3, lambda i: i[::-1, ::-1]),
+        (4, lambda i: i[::-1]),
+        (5, lambda i: i.swapaxes(0, 1)),
+        (6, lambda i: np.rot90(i, 1)),
+        (7, lambda i: i[::-1, ::-1].swapaxes(0, 1)),
+        (8, lambda i: np.rot90(i, -1)),
+    ],
+)
+def test_exif_turns_pictures_upright(tmp_path: Path, orientation: int, stored) -> None:
+    """Orientation 6 is a camera held with its right side down: the picture lies turned left."""
+    y, x = np.mgrid[:48, :64]
+    upright = np.stack([4 * x, 5 * y, 0 * x + 90], -1).astype(np.uint8)
+    write_exif(tmp_path / "a.tif", stored(upright), orientation, 28)
+    picture = open_picture(tmp_path / "a.tif")
+    np.testing.assert_array_equal(read_upright(picture), upright)
+    focal, source = guess_focal(picture, 64, 48, 50.0)
+    assert source == "exif" and focal == pytest.approx(28 / np.hypot(36, 24) * 80)
+
+
+def test_subject_ids_are_made_of_file_names() -> None:
+    assert subject_id(Path("my face.jpg")) == "my_face"
+    assert subject_id(Path("???.jpg")) == "photo"
+
+
+def write_video(path: Path, images: list[np.ndarray]) -> None:
+    with av.open(str(path), "w") as file:
+        stream = file.add_stream("libx264", rate=25)
+        stream.height, stream.width = images[0].shape[:2]
+        stream.pix_fmt, stream.options = "yuv420p", {"crf": "12"}
+        for image in images:
+            file.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
+        file.mux(stream.encode())
+
+
+def test_a_video_is_tracked_in_every_frame(tmp_path: Path, astronaut: np.ndarray) -> None:
+    """The photograph moves sideways a pixel a frame; so does the head."""
+    images = [np.ascontiguousarray(astronaut[20:260, 90 - n : 350 - n]) for n in range(5)]
+    write_video(tmp_path / "clip.mp4", images)
+    settings = ["--preset", "draft", "--windows", "2"]
+    command = ["photo", str(tmp_path / "clip.mp4"), str(tmp_path / "out"), "--focal-px", "700"]
+    assert main([*command, *settings]) == 0
+    with np.load(tmp_path / "out/track/clip/sequence.npz", allow_pickle=False) as sequence:
+        assert sequence["frames"].tolist() == [0, 1, 2, 3, 4]
+        moved = sequence["t"][:, 0] / -sequence["t"][:, 2] * 700
+        np.testing.assert_allclose(np.diff(moved), 1.0, atol=1.0)
+        assert moved[-1] - moved[0] == pytest.approx(4.0, abs=1.0)

@@ -1,0 +1,176 @@
+"""Clips: the frozen shape, windows, smoothing both ways, and going on after a crash."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from express50.cameras import project
+from express50.errors import StageError
+from express50.index import Cue
+from express50.transforms import axis_angle_to_matrix
+from pipelines.track import clips
+from pipelines.track.clips import SCHEMA, track_clips, write_clips
+from pipelines.track.fit import Pose
+from pipelines.track.observe import Observation, View, agree
+from pipelines.track.sequence import freeze_shape, jitter_mm, make_windows, track_window
+from pipelines.track.sparse_head import Points
+from tests.pipelines.test_track import CONFIG, RIG, make_scene
+
+SETTINGS = dataclasses.replace(CONFIG, iterations=6, round_iterations=2)
+QUICK = dataclasses.replace(SETTINGS, window=4, sweeps=0, iterations=2, round_iterations=1)
+FRAMES = 10
+
+
+def true_poses(scene, frames: int = FRAMES) -> list[Pose]:
+    """A slow nod with a growing expression."""
+    poses = []
+    for frame in range(frames):
+        own = scene.own.copy()
+        own[0] = 0.1 + 0.04 * frame
+        own[-3:] += [0.001 * frame, 0.0, 0.0]
+        turn = axis_angle_to_matrix(np.array([0.02 * frame, 0.0, 0.0]))
+        poses.append(Pose(own, turn @ scene.rotation))
+    return poses
+
+
+def observations(scene, noise: float, cameras=RIG, order: int = 1) -> list[Observation]:
+    points = Points(scene.basis, np.arange(3))
+    rng = np.random.default_rng(5)
+    found = []
+    for frame, pose in enumerate(true_poses(scene)):
+        marks = points.evaluate(np.concatenate([scene.shape, pose.own]), pose.rotation)[:68]
+        views = []
+        for camera in cameras:
+            pixels = project(camera, marks)[0] + noise * rng.normal(size=(68, 2))
+            views.append(View(camera.id, camera, pixels, np.ones(68), 0.9))
+        found.append(agree("clip", frame, views)[0])
+    return found if order > 0 else found[::-1]
+
+
+def meshes(person, poses: list[Pose]) -> np.ndarray:
+    points = Points(person, np.arange(len(person.model.template)))
+    return np.stack([points.evaluate(pose.own, pose.rotation)[68:] for pose in poses])
+
+
+def test_a_frozen_shape_is_the_same_head() -> None:
+    scene = make_scene()
+    person = freeze_shape(scene.basis, scene.shape, np.zeros((68, 3)))
+    assert person.shape_size == 0 and person.expression_size == scene.basis.expression_size
+    np.testing.assert_allclose(
+        Points(person, np.arange(90)).evaluate(scene.own, scene.rotation)[68:],
+        scene.vertices, atol=1e-12,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(("count", "window", "sweeps"), [(1, 48, 2), (13, 4, 0), (50, 7, 3)])
+def test_every_frame_is_kept_by_one_window(count: int, window: int, sweeps: int) -> None:
+    config = dataclasses.replace(CONFIG, window=window, sweeps=sweeps)
+    windows = make_windows(range(100, 100 + count), config)
+    kept = [frame for one in windows for frame in one.frames[one.kept]]
+    assert kept == list(range(100, 100 + count))
+    for before, after in zip(windows, windows[1:], strict=False):
+        shared = set(before.frames) & set(after.frames)
+        assert len(shared) > 2 * sweeps
+
+
+def test_smoothing_takes_noise_and_leaves_motion() -> None:
+    scene = make_scene()
+    person = freeze_shape(scene.basis, scene.shape, np.zeros((68, 3)))
+    seen = observations(scene, 1.5)
+    truth = meshes(person, true_poses(scene))
+    results = {}
+    for sweeps in (0, 2):
+        config = dataclasses.replace(SETTINGS, sweeps=sweeps)
+        results[sweeps] = meshes(person, track_window(person, seen, config))
+    assert jitter_mm(results[2]) < 0.4 * jitter_mm(results[0])
+    error = {n: np.linalg.norm(mesh - truth, axis=2).mean() for n, mesh in results.items()}
+    assert error[2] < error[0]
+    # The last frame is no worse than the first by more than noise explains.
+    ends = np.linalg.norm(results[2] - truth, axis=2).mean(1)[[0, -1]]
+    assert ends.max() < 3 * ends.min()
+
+
+def test_sweeps_know_no_direction_of_time() -> None:
+    """An odd number of frames, reversed, is smoothed to the same."""
+    scene = make_scene()
+    person = freeze_shape(scene.basis, scene.shape, np.zeros((68, 3)))
+    seen = observations(scene, 1.0)[:7]
+    config = dataclasses.replace(SETTINGS, iterations=25, round_iterations=6)
+    ahead = track_window(person, seen, config)
+    mirrored = [dataclasses.replace(one, frame=100 - one.frame) for one in reversed(seen)]
+    back = track_window(person, mirrored, config)[::-1]
+    np.testing.assert_allclose(meshes(person, ahead), meshes(person, back), atol=3e-4)
+
+
+CUES = (Cue("smile", 0, 4), Cue("frown", 5, 9))
+
+
+def run(scene, keep: Path, watched: list[int], fail_at: int | None = None, hide: int | None = None):
+    seen = observations(scene, 0.5)
+
+    def observe(cue: str, frame: int) -> Observation | None:
+        if frame == fail_at:
+            raise KeyboardInterrupt
+        watched.append(frame)
+        return None if frame == hide else seen[frame]
+
+    return track_clips(scene.basis, State(scene.shape, ()), CUES, observe, QUICK, keep, "inputs")
+
+
+def test_a_stopped_run_goes_on_to_the_same_result(tmp_path: Path) -> None:
+    scene = make_scene()
+    whole, account = run(scene, tmp_path / "a", [])
+    assert whole["frames"].tolist() == list(range(FRAMES))
+    assert whole["cues"].tolist() == ["smile"] * 5 + ["frown"] * 5
+    assert str(whole["schema"]) == SCHEMA and account["dropped"] == []
+    assert set(account["jitter_mm"]) == {"smile", "frown"}
+    watched: list[int] = []
+    with pytest.raises(KeyboardInterrupt):
+        run(scene, tmp_path / "b", watched, fail_at=8)
+    assert 0 in watched
+    watched.clear()
+    resumed, _ = run(scene, tmp_path / "b", watched)
+    assert min(watched) == 5, "the first cue is not looked at again"
+    for name in whole:
+        np.testing.assert_array_equal(whole[name], resumed[name])
+
+
+def test_frames_without_a_face_are_left_out_and_said(tmp_path: Path) -> None:
+    arrays, account = run(make_scene(), tmp_path, [], hide=3)
+    assert 3 not in arrays["frames"] and len(arrays["frames"]) == FRAMES - 1
+    assert "1 of 5 frames" in account["dropped"][0]["why"]
+    with pytest.raises(StageError, match="no frame of any clip"):
+        scene = make_scene()
+        track_clips(
+            scene.basis, State(scene.shape, ()), CUES, lambda c, f: None, QUICK, tmp_path / "n", ""
+        )
+
+
+def test_kept_windows_go_when_the_sequence_is_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scene, keep = make_scene(), tmp_path / ".windows" / "S001"
+    seen = observations(scene, 0.5)
+    (tmp_path / "index.json").write_text("{}")
+    arguments = (
+        tmp_path,
+        scene.basis,
+        State(scene.shape, ()),
+        CUES,
+        lambda c, f: seen[f],
+        QUICK,
+        keep,
+    )
+    kept = []
+    savez = clips.np.savez
+    monkeypatch.setattr(
+        clips.np, "savez", lambda *a, **k: (kept.append(keep.is_dir()), savez(*a, **k))
+    )
+    write_clips(*arguments, {"index": tmp_path / "index.json", "words": "1"}, None, scene.shape)
+    assert kept[-1] and not keep.exists()
+    with np.load(tmp_path / "sequence.npz", allow_pickle=False) as data:
+        assert data["R"].shape == (FRAMES, 3, 3) and data["shape"].shape == (5,)
