@@ -9,15 +9,15 @@ computed from the result by express50/mesh_render.py.
 from __future__ import annotations
 
 import ctypes
-import importlib.util
 import warnings
 from dataclasses import dataclass
 
 import numpy as np
 
 from express50 import native
-from express50.cameras import Camera, rays
+from express50.cameras import Camera
 from express50.checks import check_finite, check_shape
+from express50.mesh_backends import see_nvdiffrast, see_open3d
 
 BACKENDS = ("native", "open3d", "nvdiffrast")
 
@@ -89,12 +89,14 @@ def rasterize(
         raise ValueError(f"backend is {backend!r}, expected auto, {', '.join(BACKENDS)}")
     R, t = camera.cam_from_world[:3, :3], camera.cam_from_world[:3, 3]
     xyz = np.ascontiguousarray(vertices @ R.T + t)
-    see = {"native": _see_native, "open3d": _see_open3d, "nvdiffrast": _see_nvdiffrast}[backend]
+    check_finite("vertices in camera space", xyz, f"rasterize: camera {camera.id!r}")
+    see = {"native": _see_native, "open3d": see_open3d, "nvdiffrast": see_nvdiffrast}[backend]
     face_id, depth = see(xyz, faces, camera, near, cull)
     if not pairs or not native.available():
         return Raster(face_id, depth)
     neighbors = face_neighbors(faces) if neighbors is None else neighbors
-    check_shape("neighbors", neighbors, (len(faces), 3))
+    _check_ids("neighbors", neighbors, -1, len(faces))
+    check_shape("neighbors", neighbors, (len(faces), 3), "rasterize")
     return Raster(
         face_id, depth, _outline_pairs(xyz, faces, neighbors, camera, near, face_id, depth)
     )
@@ -143,11 +145,7 @@ def _checked(
     check_shape("vertices", vertices, (None, 3), "rasterize")
     check_shape("faces", faces, (None, 3), "rasterize")
     check_finite("vertices", vertices, "rasterize")
-    if faces.size and (faces.min() < 0 or faces.max() >= len(vertices)):
-        raise ValueError(
-            f"rasterize: faces hold ids {faces.min()}..{faces.max()}, expected"
-            f" 0..{len(vertices) - 1}"
-        )
+    _check_ids("faces", faces, 0, len(vertices))
     if camera.dist.any():
         raise ValueError(
             f"rasterize: camera {camera.id!r} has distortion ({camera.model}); undistort the"
@@ -156,6 +154,16 @@ def _checked(
     if not near > 0:
         raise ValueError(f"rasterize: near is {near}, expected metres above 0")
     return vertices, np.ascontiguousarray(faces, dtype=np.int32)
+
+
+def _check_ids(name: str, ids: np.ndarray, first: int, end: int) -> None:
+    """Raise a ValueError unless ids are whole numbers in [first, end): they are addresses."""
+    if ids.size and not np.issubdtype(ids.dtype, np.integer):
+        raise ValueError(f"rasterize: {name} are {ids.dtype}, expected whole numbers")
+    if ids.size and (ids.min() < first or ids.max() >= end):
+        raise ValueError(
+            f"rasterize: {name} hold ids {ids.min()}..{ids.max()}, expected {first}..{end - 1}"
+        )
 
 
 def _view(camera: Camera, near: float, cull: bool = False) -> _View:
@@ -208,93 +216,3 @@ def _outline_pairs(
         *(_pointer(array) for array in (faces, neighbors, face_id, depth, pairs)),
     )
     return pairs[:count].copy()
-
-
-def _see_open3d(
-    xyz: np.ndarray, faces: np.ndarray, camera: Camera, near: float, cull: bool
-) -> tuple[np.ndarray, np.ndarray]:
-    """Face ids and depth by Embree's rays through the pixel centres."""
-    import open3d as o3d  # heavy, and only where the native library is missing
-
-    from express50.raycast import mesh_scene
-
-    faces, kept = _seen_faces(xyz, faces, near, cull)
-    empty = np.full((camera.height, camera.width), -1, dtype=np.int32)
-    if not len(faces):
-        return empty, np.zeros(empty.shape, dtype=np.float32)
-    still = Camera(camera.id, camera.width, camera.height, camera.model, camera.params, np.eye(4))
-    directions = rays(still)[1].astype(np.float32)
-    beams = np.concatenate([near * directions, directions], axis=-1).astype(np.float32)
-    hit = mesh_scene(xyz, faces).cast_rays(o3d.core.Tensor(beams), nthreads=1)
-    distance = hit["t_hit"].numpy() + np.float32(near)
-    seen = np.isfinite(distance)
-    face_id = np.where(seen, kept[np.where(seen, hit["primitive_ids"].numpy(), 0)], empty)
-    return face_id.astype(np.int32), np.where(seen, distance, 0.0).astype(np.float32)
-
-
-def _seen_faces(
-    xyz: np.ndarray, faces: np.ndarray, near: float, cull: bool
-) -> tuple[np.ndarray, np.ndarray]:
-    """Faces (K, 3) that reach beyond the near plane and are not culled, and their ids (K,)."""
-    corners = xyz[faces]
-    keep = corners[..., 2].max(axis=1, initial=-np.inf) >= near
-    if cull:
-        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        keep &= (normals * corners[:, 0]).sum(axis=1) < 0
-    kept = np.flatnonzero(keep)
-    return faces[kept], kept
-
-
-def _see_nvdiffrast(
-    xyz: np.ndarray, faces: np.ndarray, camera: Camera, near: float, cull: bool
-) -> tuple[np.ndarray, np.ndarray]:
-    """Face ids by the user's own nvdiffrast on the GPU, and the depth of these faces."""
-    import torch
-
-    if importlib.util.find_spec("nvdiffrast") is None or not torch.cuda.is_available():
-        raise ValueError(
-            "rasterize: backend 'nvdiffrast' needs the package nvdiffrast and a CUDA device;"
-            " install it or use backend='auto'"
-        )
-    import nvdiffrast.torch as dr
-
-    faces, kept = _seen_faces(xyz, faces, near, cull)
-    face_id = np.full((camera.height, camera.width), -1, dtype=np.int32)
-    if not len(faces):
-        return face_id, np.zeros(face_id.shape, dtype=np.float32)
-    clip = torch.from_numpy(clip_space(xyz, camera, near)).float().cuda()[None]
-    index = torch.from_numpy(faces).cuda()
-    context = dr.RasterizeCudaContext()
-    size = [camera.height, camera.width]
-    drawn = dr.rasterize(context, clip, index, resolution=size)[0][0, ..., 3]
-    found = drawn.cpu().numpy().astype(np.int64) - 1
-    face_id = np.where(found >= 0, kept[found], -1).astype(np.int32)
-    return face_id, _plane_depth(xyz, faces, camera, found)
-
-
-def clip_space(xyz: np.ndarray, camera: Camera, near: float) -> np.ndarray:
-    """OpenGL clip coordinates (V, 4) of camera-space vertices (V, 3); row 0 stays the first row.
-
-    The far plane lies just behind the farthest vertex.
-    """
-    K, far = camera.K, max(2.0 * near, 1.01 * float(xyz[:, 2].max(initial=0.0)))
-    z = xyz[:, 2]
-    x = (2 * K[0, 2] / camera.width - 1) * z + 2 * K[0, 0] / camera.width * xyz[:, 0]
-    y = (2 * K[1, 2] / camera.height - 1) * z + 2 * K[1, 1] / camera.height * xyz[:, 1]
-    return np.stack([x, y, ((far + near) * z - 2 * far * near) / (far - near), z], axis=1)
-
-
-def _plane_depth(
-    xyz: np.ndarray, faces: np.ndarray, camera: Camera, found: np.ndarray
-) -> np.ndarray:
-    """Depth (H, W) float32 at which the pixels' rays meet the planes of faces ``found`` (H, W)."""
-    K, (y, x) = camera.K, np.nonzero(found >= 0)
-    a, b, c = (xyz[faces[found[y, x], corner]] for corner in range(3))
-    normal = np.cross(b - a, c - a)
-    ray = np.stack([(x + 0.5 - K[0, 2]) / K[0, 0], (y + 0.5 - K[1, 2]) / K[1, 1], 1.0 + 0 * x], -1)
-    depth = np.zeros(found.shape, dtype=np.float32)
-    slope = (normal * ray).sum(-1)
-    z = (normal * a).sum(-1) / np.where(slope == 0, 1.0, slope)
-    corners_z = np.stack([a[:, 2], b[:, 2], c[:, 2]])
-    depth[y, x] = np.clip(z, corners_z.min(0), corners_z.max(0))
-    return depth

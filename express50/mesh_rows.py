@@ -14,6 +14,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from express50 import native
+from express50.checks import check_shape
 
 _SUFFIX = {torch.float32: "f32", torch.float64: "f64"}
 
@@ -26,7 +27,17 @@ def weigh_rows(rows: Tensor, coefficients: Tensor, group: Tensor, counts: Tensor
         coefficients: (N, 3).
         group: (N,) int64, ascending ids of rows.
         counts: (G,) int64, pixels of each group.
+
+    Raises:
+        ValueError: shapes or dtypes do not fit each other.
     """
+    check_shape("rows", rows, (len(counts), 3, None))
+    check_shape("coefficients", coefficients, (len(group), 3))
+    if rows.dtype != coefficients.dtype:
+        raise ValueError(
+            f"rows are {rows.dtype} and coefficients {coefficients.dtype}, expected one dtype;"
+            " convert attributes, K and cam_from_world to that of the vertices"
+        )
     return _WeighRows.apply(rows, coefficients, group, counts)
 
 

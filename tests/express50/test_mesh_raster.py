@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from express50 import mesh_raster, native
+from express50 import mesh_backends, native
 from express50.cameras import Camera
 from express50.head.procedural import build_procedural_head
 from express50.mesh_raster import face_neighbors, rasterize
@@ -144,9 +144,12 @@ def test_neighbors_meet_in_an_edge():
         ({"vertices": np.zeros((3, 2))}, r"vertices has shape \(3, 2\), expected \(any, 3\)"),
         ({"faces": np.array([[0, 1, 3]])}, r"ids 0..3, expected 0..2"),
         ({"faces": np.array([[0, 1, -1]])}, r"ids -1..1, expected 0..2"),
+        ({"faces": np.array([[0.0, 1, 2]])}, "faces are float64, expected whole numbers"),
+        ({"neighbors": np.array([[0, 1, -1]])}, "neighbors hold ids -1..1, expected -1..0"),
+        ({"camera": camera(4, 4, 4.0, np.full((4, 4), np.nan))}, "vertices in camera space has 9"),
         ({"near": 0.0}, "expected metres above 0"),
         ({"backend": "gpu"}, "backend is 'gpu', expected auto, native"),
-        ({"neighbors": np.zeros((2, 3))}, r"neighbors has shape \(2, 3\)"),
+        ({"neighbors": np.zeros((2, 3), int)}, r"neighbors has shape \(2, 3\)"),
         ({"camera": Camera("c7", 4, 4, "SIMPLE_RADIAL", (4.0, 2, 2, 0.1), np.eye(4))}, "'c7' has"),
     ],
 )
@@ -201,7 +204,7 @@ def test_nvdiffrast_is_asked_with_its_own_signature(monkeypatch):
     package.torch = module
     monkeypatch.setitem(sys.modules, "nvdiffrast", package)
     monkeypatch.setitem(sys.modules, "nvdiffrast.torch", module)
-    monkeypatch.setattr(mesh_raster.importlib.util, "find_spec", lambda name: object())
+    monkeypatch.setattr(mesh_backends.importlib.util, "find_spec", lambda name: object())
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.Tensor, "cuda", lambda self: self)
     got = rasterize(vertices, faces, view, cull=True, backend="nvdiffrast")

@@ -224,3 +224,11 @@ def test_native_rows_and_torch_rows_agree(view, monkeypatch, dtype):
     monkeypatch.setattr(mesh_rows, "_native", lambda rows: False)
     for a, b in zip(native, run(), strict=True):
         torch.testing.assert_close(a, b, rtol=1e-4 if dtype == torch.float32 else 1e-10, atol=1e-4)
+
+
+def test_dtypes_and_shapes_that_do_not_fit_are_refused(view):
+    weights = view.weights(view.vertices)
+    with pytest.raises(ValueError, match="rows are torch.float32 and coefficients torch.float64"):
+        interpolate(view.seen, weights, view.vertices.float(), view.faces)
+    with pytest.raises(ValueError, match="coefficients has shape"):
+        interpolate(view.seen, weights[1:], view.vertices, view.faces)
