@@ -112,8 +112,10 @@ def _consensus(net: LandmarkNet, pyramid: list[np.ndarray], place: _Place) -> _P
     mean = _mean_view(seen)
     spread = np.mean([np.linalg.norm(one.points - mean.points, axis=1) for one in seen], axis=0)
     differ = np.median(spread) / (DIFFER_SHARE * max(face_box(mean.points)[1], 1e-6))
-    kept = mean if mean.score >= KEEP_SHARE * place.score else place
-    return replace(kept, score=float(kept.score / (1.0 + differ**4)))
+    # Where they agree their mean is the better place, even if a profile's score is less so near.
+    kept = mean if differ < 1.0 or mean.score >= KEEP_SHARE * place.score else place
+    score = mean.score if mean.score >= KEEP_SHARE * place.score else place.score
+    return replace(kept, score=float(score / (1.0 + differ**4)))
 
 
 def _window(centre: np.ndarray, side: float, angle: float) -> np.ndarray:
