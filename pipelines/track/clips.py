@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import shutil
 from collections.abc import Callable
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from zipfile import BadZipFile
 
@@ -30,7 +30,6 @@ from pipelines.track.sequence import (
 from pipelines.track.sparse_head import Basis, Points
 
 SCHEMA = "express50.sequence/1"
-KNOWN_BIAS_M = 1e-5
 Observe = Callable[[str, int], Observation | None]
 
 
@@ -96,8 +95,6 @@ def track_clips(
     person = freeze_shape(basis, state.shape, state.bias)
     known = (identity, state.shape.tobytes(), state.bias.tobytes(), asdict(config))
     key = text_digest(repr((*known, eyes and vars(eyes))))
-    # What the detector errs on this face is known by now; a single frame may not change it.
-    config = replace(config, landmark_bias=KNOWN_BIAS_M)
     rows: list[tuple[str, int, Pose]] = []
     dropped: list[dict[str, str]] = []
     for cue in cues:

@@ -22,6 +22,7 @@ from pipelines.track.relief import Relief
 from pipelines.track.sparse_head import POSE_SIZE, Basis, Points
 
 HUBER = 1.5
+KNOWN_BIAS_M = 1e-6
 REJECT_SIGMA, REJECT_SHARE = 4.0, 0.12
 
 
@@ -64,9 +65,16 @@ class Target:
 
 
 def fit(
-    basis: Basis, targets: list[Target], state: State, config: TrackConfig, iterations: int
+    basis: Basis,
+    targets: list[Target],
+    state: State,
+    config: TrackConfig,
+    iterations: int,
+    free_bias: bool = False,
 ) -> tuple[State, float]:
     """Minimise robust residuals plus priors from a start.
+
+    `free_bias` lets the detector err on this face; only pictures of its surface can tell that.
 
     Returns:
         The fitted state and its cost (half the sum of squared, robustly weighted residuals).
@@ -75,8 +83,9 @@ def fit(
         StageError: the cost is not a finite number.
     """
     points = [Points(basis, target.vertices) for target in targets]
+    weights = _shared_weights(basis, len(targets), config, free_bias)
     damping = 1e-3
-    cost = _cost(basis, targets, points, state, config)
+    cost = _cost(basis, targets, points, state, config, weights)
     for _ in range(iterations):
         system = [
             _normal_equations(basis, *item, state, config)
@@ -84,8 +93,8 @@ def fit(
         ]
         improved = False
         for _ in range(6):
-            trial = _step(basis, state, system, damping, config)
-            trial_cost = _cost(basis, targets, points, trial, config)
+            trial = _step(basis, state, system, damping, weights)
+            trial_cost = _cost(basis, targets, points, trial, config, weights)
             if trial_cost < cost:
                 improved = True
                 break
@@ -108,6 +117,7 @@ def landmark_sigma(observation: Observation, config: TrackConfig) -> np.ndarray:
         height = np.ptp(view.points[17:], axis=0).max()
         floor = config.landmark_floor_px * height / 128.0
         sigma[index] = np.hypot(view.sigma, floor) * view.crowd**0.5
+    sigma[:, :17] /= config.contour_weight
     return np.where(observation.inliers, sigma, np.inf)
 
 
@@ -177,10 +187,15 @@ def _huber_cost(residual: np.ndarray) -> float:
 
 
 def _cost(
-    basis: Basis, targets: list[Target], points: list[Points], state: State, config: TrackConfig
+    basis: Basis,
+    targets: list[Target],
+    points: list[Points],
+    state: State,
+    config: TrackConfig,
+    weights: np.ndarray,
 ) -> float:
-    """Total cost of a state."""
-    shared = _shared(state) * np.sqrt(_shared_weights(basis, config))
+    """Total cost of a state; `weights` (S + 204,) are of the prior on shape and bias."""
+    shared = _shared(state) * np.sqrt(weights)
     total = 0.5 * float(shared @ shared)
     for target, model, pose in zip(targets, points, state.poses, strict=True):
         positions = model.evaluate(_parameters(basis, state.shape, pose), pose.rotation)
@@ -198,10 +213,16 @@ def _shared(state: State) -> np.ndarray:
     return np.concatenate([state.shape, state.bias.ravel()])
 
 
-def _shared_weights(basis: Basis, config: TrackConfig) -> np.ndarray:
-    """Inverse variances (S + 204,) of the shared unknowns."""
-    shape = np.full(basis.shape_size, config.shape_prior)
-    bias = np.full((68, 3), config.landmark_bias)
+def _shared_weights(
+    basis: Basis, expressions: int, config: TrackConfig, free_bias: bool
+) -> np.ndarray:
+    """Inverse variances (S + 204,) of the shared unknowns.
+
+    Where the bias is taken as known, what the detector errs in all frames alike must not be taken
+    for shape: more expressions are then no more evidence of it.
+    """
+    shape = np.full(basis.shape_size, config.shape_prior * (1 if free_bias else expressions))
+    bias = np.full((68, 3), config.landmark_bias if free_bias else KNOWN_BIAS_M)
     bias[:17] /= config.contour_weight
     return np.r_[shape, bias.ravel() ** -2]
 
@@ -282,13 +303,12 @@ def _step(
     state: State,
     system: list[tuple[np.ndarray, np.ndarray]],
     damping: float,
-    config: TrackConfig,
+    weights: np.ndarray,
 ) -> State:
     """One damped Gauss-Newton step, expressions eliminated."""
     shapes = basis.shape_size
     shared = shapes + 204
-    weight = _shared_weights(basis, config)
-    reduced, right = np.diag(weight), -weight * _shared(state)
+    reduced, right = np.diag(weights), -weights * _shared(state)
     eliminated = []
     for hessian, gradient in system:
         cross, inner = hessian[:shared, shared:], hessian[shared:, shared:]

@@ -21,6 +21,7 @@ from express50.head.model import HeadModel, vertex_normals
 RIGID = (
     "left_eyeball", "right_eyeball", "teeth", "tongue", "gums", "mouth_interior", "boundary",
 )  # fmt: skip
+MODE = "offset_mode_"
 
 
 def with_modes(model: HeadModel, count: int, sigma: float, length: float) -> HeadModel:
@@ -37,7 +38,7 @@ def with_modes(model: HeadModel, count: int, sigma: float, length: float) -> Hea
     normals = vertex_normals(model.template[None].double(), model.faces)[0]
     heights = torch.from_numpy(offset_modes(model, count, sigma, length))
     modes = (normals[:, :, None] * heights[:, None, :]).to(model.dtype)
-    names = tuple(f"offset_{index}" for index in range(heights.shape[1]))
+    names = tuple(f"{MODE}{index}" for index in range(heights.shape[1]))
     return replace(
         model,
         shape_dirs=torch.cat([model.shape_dirs, modes], dim=2),
@@ -45,13 +46,13 @@ def with_modes(model: HeadModel, count: int, sigma: float, length: float) -> Hea
     )
 
 
-def split_shape(
-    model: HeadModel, with_offsets: HeadModel, shape: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """A head's own shape coefficients (S,), and the offsets (V, 3) metres that the modes add."""
-    count = model.shape_dirs.shape[2]
-    modes = with_offsets.shape_dirs[..., count:].double().numpy()
-    return shape[:count], modes @ shape[count:]
+def split_shape(model: HeadModel, shape: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """A head's own shape coefficients (S,), and the offsets (V, 3) metres that its modes add.
+
+    `model` is as `with_modes` returns it, `shape` (S + modes,) are its coefficients.
+    """
+    count = sum(not name.startswith(MODE) for name in model.shape_names)
+    return shape[:count], model.shape_dirs[..., count:].double().numpy() @ shape[count:]
 
 
 def offset_modes(model: HeadModel, count: int, sigma: float, length: float) -> np.ndarray:

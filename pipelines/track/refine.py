@@ -22,7 +22,7 @@ from pipelines.track.fit import State, Target, fit
 from pipelines.track.marks import Eyes, with_marks
 from pipelines.track.outline import Outline, SignedDistance, outline_regions, outline_vertices
 from pipelines.track.photometry import OBSERVATIONS, Photometry, Picture, look, robust_mean
-from pipelines.track.relief import make_relief, sweep
+from pipelines.track.relief import Relief, make_relief, sweep
 from pipelines.track.samples import Samples, Visibility, sample_normals, spread
 from pipelines.track.shots import Shot, detail, root_light
 from pipelines.track.sparse_head import POSE_SIZE, Basis
@@ -80,7 +80,9 @@ def refine(
             targets, appearance = with_photometry(
                 basis.model, samples, targets, moments, meshes, 0, appearance, config
             )
-        state, _ = fit(basis, targets, state, config, config.round_iterations)
+        # Only a searched surface can tell what the detector errs.
+        free = any(isinstance(term, Relief) for target in targets for term in target.terms)
+        state, _ = fit(basis, targets, state, config, config.round_iterations, free)
     return state, targets, appearance
 
 

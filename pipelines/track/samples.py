@@ -47,7 +47,8 @@ def spread(model: HeadModel, count: int) -> Samples:
     """
     faces = model.faces.numpy()
     allowed = _allowed(model)[faces].all(1)
-    ids = np.flatnonzero(allowed)
+    # A head that names no such region is taken to be skin all over.
+    ids = np.flatnonzero(allowed) if allowed.any() else np.arange(len(faces))
     corners = model.template.double().numpy()[faces[ids]]
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     area = np.linalg.norm(normal, axis=1)
@@ -62,7 +63,8 @@ def spread(model: HeadModel, count: int) -> Samples:
 
 def _allowed(model: HeadModel) -> np.ndarray:
     """Vertices (V,) bool on which the pictures may be compared."""
-    seen = np.any([model.regions[name].numpy() for name in SEEN if name in model.regions], axis=0)
+    named = [model.regions[name].numpy() for name in SEEN if name in model.regions]
+    seen = np.any([np.zeros(len(model.template), dtype=bool), *named], axis=0)
     for name in HIDDEN:
         if name in model.regions:
             seen = seen & ~model.regions[name].numpy()

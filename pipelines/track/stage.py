@@ -128,7 +128,7 @@ def _clips(
         return observation if enough else None
 
     keep = dataset.windows_dir(subject)
-    shape, _ = split_shape(load_head(config.head), basis.model, state.shape)
+    shape, _ = split_shape(basis.model, state.shape)
     paths, cues = inputs(dataset, subject, config), read_index(dataset, subject).cues
     return write_clips(out, basis, state, cues, observe, config, keep, paths, eyes, shape)
 
@@ -285,7 +285,7 @@ def _write_track(
     """Write track.npz; no pickled objects."""
     own = np.stack([item.own for item in state.poses])
     count = basis.expression_size
-    shape, offsets = split_shape(load_head(head), basis.model, state.shape)
+    shape, offsets = split_shape(basis.model, state.shape)
     arrays = {
         "schema": np.array(SCHEMA),
         "head": np.array(head),

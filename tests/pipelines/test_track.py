@@ -339,7 +339,7 @@ def tracked_dataset(tmp_path: Path, ingested, monkeypatch: pytest.MonkeyPatch):
         return Marked(face, no_irises(), visible_contour=False)
 
     monkeypatch.setattr(stage, "open_source", lambda *unused: told)
-    monkeypatch.setattr(stage, "_basis", lambda head: scene.basis)
+    monkeypatch.setattr(stage, "_basis", lambda *unused: scene.basis)
     return ingested, scene
 
 
@@ -354,11 +354,13 @@ def test_stage_writes_the_contracted_file(tracked_dataset, tmp_path: Path) -> No
         metrics = STAGE.run(dataset, "S001", TrackConfig(silhouette_rounds=0), out)
         outputs.append({file.name: file.read_bytes() for file in sorted(out.rglob("*.*"))})
     assert outputs[0] == outputs[1]
-    assert set(outputs[0]) == {"track.npz", "overlay_neutral.jpg", "overlay_smile.jpg"}
+    assert set(outputs[0]) == {
+        "track.npz", "overlay_neutral.jpg", "overlay_smile.jpg", "sheet.jpg",
+    }  # fmt: skip
     assert set(metrics["landmark_rms_px"]) == {"neutral", "smile"}
     with np.load(tmp_path / "out0" / "track.npz", allow_pickle=False) as track:
         shapes = {name: track[name].shape for name in track.files}
-        assert str(track["schema"]) == "express50.track/1"
+        assert str(track["schema"]) == "express50.track/2"
         assert track["vertices"].dtype == np.float32
         model = scene.basis.model
         posed = pose(
@@ -371,7 +373,7 @@ def test_stage_writes_the_contracted_file(tracked_dataset, tmp_path: Path) -> No
     assert shapes == {
         "schema": (), "head": (), "expressions": (2,), "frames": (2,), "shape": (5,),
         "expression": (2, 4), "neck": (2, 3), "jaw": (2, 3), "eyes": (2, 6), "R": (2, 3, 3),
-        "t": (2, 3), "vertices": (2, 90, 3),
+        "t": (2, 3), "vertices": (2, 90, 3), "offsets": (90, 3),
     }  # fmt: skip
 
 
