@@ -25,7 +25,7 @@ class TrackConfig:
     """Frames of a clip that are tracked in one piece, and kept if the run is stopped."""
     sweeps: int = 2
     """Smoothing rounds over a clip; 0 for none."""
-    smooth_mm: float = 0.5
+    smooth_mm: float = 1.0
     """How far a point may lie from the middle of the neighbouring frames', millimetres."""
     cameras: int = 0
     """Cameras used in the fit, those that see the face best; 0 uses all."""
