@@ -104,7 +104,15 @@ class TrackConfig:
 
 
 PRESETS: dict[str, dict[str, object]] = {
-    "draft": {"cameras": 6, "refinements": 2, "iterations": 8, "silhouette_rounds": 0, "sweeps": 1},
+    "draft": {
+        "cameras": 6, "refinements": 2, "iterations": 8, "silhouette_rounds": 2,
+        "relief_rounds": 4, "photo_rounds": 0, "samples": 2000, "offset_modes": 80,
+        "round_iterations": 2, "sweeps": 1,
+    },
     "standard": {},
-    "reference": {"refinements": 5, "iterations": 30, "silhouette_rounds": 6, "sweeps": 4},
-}
+    "reference": {
+        "refinements": 5, "iterations": 30, "silhouette_rounds": 4, "relief_rounds": 8,
+        "photo_rounds": 2, "samples": 8000, "photo_side": 1024, "offset_modes": 250,
+        "round_iterations": 6, "sweeps": 4,
+    },
+}  # fmt: skip

@@ -262,7 +262,8 @@ def _normal_equations(
     blocks = _outline_blocks(target, positions)
     count = max((int(used.max()) + 1 for used, _, _ in blocks if len(used)), default=0)
     terms = [(jacobian[:count], *_information(blocks, count))]
-    terms += [_of_samples(term, positions, jacobian) for term in target.terms]
+    single = jacobian.astype(np.float32)
+    terms += [_of_samples(term, positions, single) for term in target.terms]
     base, slope = np.zeros((len(columns), len(columns))), np.zeros(len(columns))
     for term in terms:
         _add(base, slope, *term)
@@ -283,19 +284,22 @@ def _add(
 ) -> None:
     """Add points' information (n, 3, 3), (n, 3) through their Jacobian rows (n, 3, D), in place."""
     size = rows.shape[2]
-    # Single precision is plenty for the curvature; the gradient stays in double.
-    single = rows.astype(np.float32)
+    # Single precision is plenty: what matters is where the gradient, however scaled, is zero.
+    single = rows.astype(np.float32, copy=False)
     weighted = matrix.astype(np.float32) @ single
     hessian += single.reshape(-1, size).T @ weighted.reshape(-1, size)
-    gradient += pull.reshape(-1) @ rows.reshape(-1, size)
+    gradient += pull.astype(np.float32).reshape(-1) @ single.reshape(-1, size)
 
 
 def _of_samples(
     term: Photometry | Relief, positions: np.ndarray, jacobian: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The samples' Jacobian (S, 3, D) and information (S, 3, 3), (S, 3)."""
-    corners = jacobian[term.rows]
-    return (term.bary[:, :, None, None] * corners).sum(1), *term.normal(positions)
+    moved = np.zeros((len(term.rows), *jacobian.shape[1:]), np.float32)
+    for corner in range(3):
+        share = term.bary[:, corner, None, None].astype(np.float32)
+        moved += share * jacobian[term.rows[:, corner]]
+    return moved, *term.normal(positions)
 
 
 def _step(

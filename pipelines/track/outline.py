@@ -24,7 +24,7 @@ OUTLINE_SIDE = 192
 EDGE_SIGMA_M = 0.0015
 # Where hair, cloth or shoulders may stand before the skin: standard deviation of their thickness,
 # and the gap (metres) at which what lies inside the matte stops to pull.
-COVER_SIGMA_M, COVER_GAP_M, BARE_GAP_M = 0.008, 0.004, 0.004
+COVER_SIGMA_M, HAIR_GAP_M, BALD_GAP_M = 0.008, 0.004, 0.03
 COVERED = ("neck", "scalp", "forehead", "left_ear", "right_ear")
 BARE = ("face", "nose", "lips")
 
@@ -68,12 +68,14 @@ class Outline:
         positions: np.ndarray,
         covered: np.ndarray,
         pictures: int,
+        bald: bool,
     ) -> Outline:
         """Outline of points that start at `first`, now at positions (n, 3).
 
         `covered` (n,) says where hair or cloth may hide the skin. Their thickness is much the same
         in all `pictures` of a subject, so that more pictures are no more evidence of it; likewise
-        neighbours on an outline err alike.
+        neighbours on an outline err alike. Under a `bald` head's outline there is skin, however far
+        off; else only what is near pulls, as hair hides skull, temples and jaw.
         """
         camera, count = distance.camera, len(positions)
         depth = (positions @ camera.cam_from_world[2, :3] + camera.cam_from_world[2, 3]).mean()
@@ -82,7 +84,7 @@ class Outline:
         edge = np.hypot(0.5 * distance.step, EDGE_SIGMA_M * scale)
         cover = np.hypot(edge, COVER_SIGMA_M * scale) * max(1, pictures) ** 0.5
         sigma = np.stack([np.where(covered, cover, edge), np.full(count, edge)], axis=1) * crowd
-        gap = np.where(covered, COVER_GAP_M, BARE_GAP_M) * scale
+        gap = np.full(count, (BALD_GAP_M if bald else HAIR_GAP_M) * scale)
         return cls(distance, np.arange(first, first + count), sigma, gap)
 
     def residuals(
@@ -175,14 +177,14 @@ def outline_vertices(
     return chosen
 
 
-def outline_regions(model: HeadModel) -> tuple[np.ndarray, np.ndarray]:
+def outline_regions(model: HeadModel, bald: bool) -> tuple[np.ndarray, np.ndarray]:
     """Masks (V,) of the vertices that may form an outline, and of those that may be covered."""
 
     def union(names: tuple[str, ...]) -> np.ndarray:
         return np.any([model.regions[name].numpy() for name in names], axis=0)
 
     allowed = union(BARE + COVERED) & ~model.regions["boundary"].numpy()
-    return allowed, union(COVERED)
+    return allowed, union(("neck",) if bald else COVERED)
 
 
 def _window(vertices: np.ndarray, camera: Camera) -> Camera | None:

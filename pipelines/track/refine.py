@@ -19,6 +19,7 @@ from pipelines.track.appearance import (
 )
 from pipelines.track.config import TrackConfig
 from pipelines.track.fit import State, Target, fit
+from pipelines.track.hair import is_bald
 from pipelines.track.marks import Eyes, with_marks
 from pipelines.track.outline import Outline, SignedDistance, outline_regions, outline_vertices
 from pipelines.track.photometry import OBSERVATIONS, Photometry, Picture, look, robust_mean
@@ -61,11 +62,12 @@ def refine(
     rounds = config.relief_rounds + config.photo_rounds
     rounds = max(rounds, config.silhouette_rounds, MARK_ROUNDS)
     plain = targets
+    bald = _bald(basis.model, moments, all_vertices(basis.model, state))
     for index in range(rounds):
         meshes = all_vertices(basis.model, state)
         targets = plain
         if rounds - index <= config.silhouette_rounds:
-            targets = with_outlines(basis.model, targets, moments, meshes)
+            targets = with_outlines(basis.model, targets, moments, meshes, bald)
         targets = [
             with_marks(basis.model, target, mesh, rotation, eyes)
             for target, mesh, rotation in zip(targets, meshes, rotations(state), strict=True)
@@ -84,6 +86,14 @@ def refine(
         free = any(isinstance(term, Relief) for target in targets for term in target.terms)
         state, _ = fit(basis, targets, state, config, config.round_iterations, free)
     return state, targets, appearance
+
+
+def _bald(model: HeadModel, moments: list[Moment], meshes: np.ndarray) -> bool:
+    """Whether the first moment that has pictures shows a bare skull."""
+    for moment, mesh in zip(moments, meshes, strict=True):
+        if moment.shots:
+            return is_bald(model, [root_light(shot, 0) for shot in moment.shots], mesh)
+    return False
 
 
 def with_relief(
@@ -116,10 +126,14 @@ def with_relief(
 
 
 def with_outlines(
-    model: HeadModel, targets: list[Target], moments: list[Moment], meshes: np.ndarray
+    model: HeadModel,
+    targets: list[Target],
+    moments: list[Moment],
+    meshes: np.ndarray,
+    bald: bool,
 ) -> list[Target]:
     """The targets with the outlines of the current meshes (E, V, 3)."""
-    allowed, covered = outline_regions(model)
+    allowed, covered = outline_regions(model, bald)
     faces = model.faces.numpy()
     pictures = sum(len(moment.distances) for moment in moments)
     found = []
@@ -129,7 +143,9 @@ def with_outlines(
             chosen = outline_vertices(mesh, faces, distance.camera, allowed)
             if len(chosen) < 8:
                 continue
-            outlines.append(Outline.of(distance, offset, mesh[chosen], covered[chosen], pictures))
+            outlines.append(
+                Outline.of(distance, offset, mesh[chosen], covered[chosen], pictures, bald)
+            )
             ids.append(chosen)
             offset += len(chosen)
         vertices = np.concatenate(ids) if ids else np.zeros(0, dtype=np.int64)

@@ -19,6 +19,7 @@ from express50.cameras import Camera
 from express50.raycast import mesh_scene
 
 PATCH = 7
+VIEWS = 8
 SPACING_PX = 1.0
 STEP_PX = 0.7
 # What a patch's contrast must stand out from: root of light, 0..1.
@@ -110,7 +111,7 @@ def sweep(
     count, size = len(places), PATCH * PATCH
     total = np.zeros((count, len(heights), size), np.float32)
     mass, square = np.zeros(count), np.zeros(count)
-    for (image, camera), weight in zip(images, weights, strict=True):
+    for (image, camera), weight in zip(images, _best_views(weights), strict=True):
         chosen = np.flatnonzero(weight > 0)
         if not len(chosen):
             continue
@@ -124,6 +125,14 @@ def sweep(
     together = (total[enough].astype(np.float64) ** 2).sum(2)
     score[enough] = (together - square[enough, None]) / pairs[enough, None]
     return _peaks(score, heights, pixel)
+
+
+def _best_views(weights: np.ndarray) -> np.ndarray:
+    """Weights (C, S) with all but each sample's best VIEWS set to zero: more add little."""
+    if len(weights) <= VIEWS:
+        return weights
+    least = np.sort(weights, axis=0)[-VIEWS]
+    return np.where(weights >= least, weights, 0.0)
 
 
 def _pixel_size(images: list[tuple[np.ndarray, Camera]], places: np.ndarray) -> float:
@@ -147,13 +156,16 @@ def _patches(
     """
     centre = places[:, None] + heights[None, :, None] * normals[:, None]
     pixels, slope = _project(camera, centre)
-    where = (pixels[..., None] + slope @ shape[:, None] - 0.5).astype(np.float32)
+    # Image coordinates fit single precision; world coordinates need not.
+    spread = slope.astype(np.float32) @ shape[:, None].astype(np.float32)
+    where = spread + (pixels[..., None] - 0.5).astype(np.float32)
     x, y = (np.ascontiguousarray(where[:, :, k].reshape(len(places), -1)) for k in range(2))
     values = cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     values = values.reshape(len(places), len(heights), -1)
     values -= values.mean(2, keepdims=True)
-    length = np.sqrt((values**2).sum(2, keepdims=True) + (NOISE * PATCH) ** 2)
-    return values / length
+    length = np.einsum("sdk,sdk->sd", values, values) + np.float32((NOISE * PATCH) ** 2)
+    values /= np.sqrt(length)[..., None]
+    return values
 
 
 def _shapes(

@@ -151,9 +151,13 @@ class Points:
     def _linear_columns(self, pose: torch.Tensor, rotation: torch.Tensor) -> torch.Tensor:
         """Jacobian (P, 3, S + X) by the coefficients."""
         turn, shift = self._transforms(pose, self.basis.joint_directions.permute(2, 0, 1))
-        blended = torch.einsum("nj,jrc->nrc", self.skinning, turn[0])
-        columns = blended @ self.directions + torch.einsum("nj,djc->ncd", self.skinning, shift)
-        return (axis_angle_to_matrix(pose[12:15]) @ rotation) @ self._gathered(columns)
+        world = axis_angle_to_matrix(pose[12:15]) @ rotation
+        blended = torch.einsum("nj,jrc->nrc", self.skinning, world @ turn[0])
+        moved = (shift @ world.T).permute(1, 2, 0).flatten(1)
+        columns = torch.addmm((blended @ self.directions).flatten(1), self.skinning, moved).view(
+            self.directions.shape
+        )
+        return self._gathered(columns)
 
 
 def _joint_rotations(pose: torch.Tensor) -> torch.Tensor:

@@ -286,7 +286,7 @@ def test_outline_residual_slope_matches_finite_differences() -> None:
     camera = make_camera(0.3, 300)
     distance = signed_distance(disc_alpha(), camera)
     positions = np.random.default_rng(0).normal(size=(12, 3)) * 0.1
-    outline = Outline.of(distance, 0, positions, np.arange(12) % 2 == 0, 3)
+    outline = Outline.of(distance, 0, positions, np.arange(12) % 2 == 0, 3, bald=False)
     _, residual, slope = outline.residuals(positions, project_with_slope)
     for axis in range(3):
         step = np.eye(3)[axis] * 1e-6
