@@ -111,11 +111,11 @@ def prepare(config: TwinConfig, folder: Path) -> Reference:
     dataset, truth = Dataset(folder / "dataset"), Truth(folder / "truth")
     register(dataset, sorted(seen.iterdir()))
     for stage in (ingest.STAGE, calibrate.STAGE):
-        run_stage(stage, dataset, build_config(stage, {}), workers=1, progress=False)
+        run_stage(stage, dataset, build_config(stage, {}), workers=0, progress=False)
     for subject in dataset.subjects():
         write_peaks(dataset, subject, truth.peaks(subject))
     for stage in (alpha.STAGE, matte.STAGE):
-        run_stage(stage, dataset, build_config(stage, {}), workers=1, progress=False)
+        run_stage(stage, dataset, build_config(stage, {}), workers=0, progress=False)
     return dataset, truth, folder / "captures"
 
 
@@ -168,7 +168,9 @@ def benchmark(source: Reference, presets: tuple[str, ...], count: int, clip: boo
         ),
     }
     for name, values in settings.items():
-        config, rows, figures = build_config(STAGE, values), [], []
+        config = build_config(STAGE, values)
+        rows: list[Errors] = []
+        figures: list[dict] = []
         for subject in subjects:
             errors, found = track(dataset, truth, subject, config, views[subject])
             rows, figures = rows + errors, [*figures, found]
