@@ -28,16 +28,17 @@ NO_SKIN = ("mouth_interior", "teeth", "neck", "boundary")
 
 @dataclass(frozen=True)
 class Errors:
-    """One tracked frame. Lengths in metres, or None where there is nothing to measure on.
+    """One tracked frame.
 
     Attributes:
-        face, head, neck: distances of the regions' vertices, root mean square.
-        baseline: the same of the rigid template.
+        distances: root mean square distance of face, head and neck, metres.
+        baseline: the same of the template laid rigidly on the true landmarks.
         landmark_px: distances of 68 landmarks in the tracking cameras, root mean square.
         jaw_deg: angle between the jaw's rotations.
         expression, true_expression: (X,) coefficients.
         ious: of the head's mask, one a held-out camera.
         psnrs: decibels, one a held-out camera that shows enough of the face.
+        true_psnrs: of the true mesh in their place: highlights, noise and gains alone.
     """
 
     distances: dict[str, float]
@@ -48,6 +49,7 @@ class Errors:
     true_expression: np.ndarray
     ious: list[float]
     psnrs: list[float]
+    true_psnrs: list[float]
 
 
 def compare(
@@ -108,7 +110,10 @@ def frame_errors(
     R, t = rigid_fit(marks_of(model, model.template.double().numpy()), marks_of(model, true))
     template = model.template.double().numpy() @ R.T + t
     views = held_out.get(frame, [])
-    psnrs = [psnr_db(dataset, subject, frame, model, moved, cameras, view) for view in views]
+    psnrs, true_psnrs = (
+        [psnr_db(dataset, subject, frame, model, mesh, cameras, view) for view in views]
+        for mesh in (moved, true)
+    )
     return Errors(
         distances=region_errors(model, moved, true),
         baseline=region_errors(model, template, true),
@@ -118,6 +123,7 @@ def frame_errors(
         true_expression=parameters["expression"],
         ious=[iou(mask_of(model, moved, view.camera), view.mask) for view in views],
         psnrs=[value for value in psnrs if value is not None],
+        true_psnrs=[value for value in true_psnrs if value is not None],
     )
 
 

@@ -98,6 +98,7 @@ def test_jitter_is_of_the_error_not_of_the_motion(source, tmp_path) -> None:
 def test_a_run_without_pictures_says_what_is_missing(source) -> None:
     dataset, truth, _ = source
     result = benchmark((dataset, truth, None), (), 1, False)
+    assert result["true_mesh"] == {"heldout_camera_psnr_db": None}
     row = result["landmark_only"]
     assert row["frames"] == 2 and 0 < row["seconds_per_frame"] < 60
     assert row["vertex_rmse_mm"]["face"] < 6.0 and row["silhouette_iou"] > 0.9
