@@ -36,6 +36,7 @@ class Errors:
         landmark_px: distances of 68 landmarks in the tracking cameras, root mean square.
         jaw_deg: angle between the jaw's rotations.
         expression, true_expression: (X,) coefficients.
+        motion, true_motion: (3 F,) how far these coefficients move the face's vertices, metres.
         ious: of the head's mask, one a held-out camera.
         psnrs: decibels, one a held-out camera that shows enough of the face.
         true_psnrs: of the true mesh in their place: highlights, noise and gains alone.
@@ -47,6 +48,8 @@ class Errors:
     jaw_deg: float
     expression: np.ndarray
     true_expression: np.ndarray
+    motion: np.ndarray
+    true_motion: np.ndarray
     ious: list[float]
     psnrs: list[float]
     true_psnrs: list[float]
@@ -121,6 +124,8 @@ def frame_errors(
         jaw_deg=angle_deg(track.jaw[row], parameters["jaw"]),
         expression=track.expression[row],
         true_expression=parameters["expression"],
+        motion=face_motion(model, track.expression[row]),
+        true_motion=face_motion(model, parameters["expression"]),
         ious=[iou(mask_of(model, moved, view.camera), view.mask) for view in views],
         psnrs=[value for value in psnrs if value is not None],
         true_psnrs=[value for value in true_psnrs if value is not None],
@@ -138,6 +143,12 @@ def regions_of(model: HeadModel) -> dict[str, np.ndarray]:
     away = np.any([model.regions[name].numpy() for name in NO_SKIN], axis=0)
     face, neck = face_of(model), model.regions["neck"].numpy()
     return {"face": face, "head": ~away, "neck": neck}
+
+
+def face_motion(model: HeadModel, expression: np.ndarray) -> np.ndarray:
+    """Displacement (3 F,) of the face's vertices by coefficients (X,), metres."""
+    directions = model.expression_dirs.double().numpy()[face_of(model)]
+    return (directions @ expression).ravel()
 
 
 def landmark_px(
@@ -175,6 +186,9 @@ def iou(a: np.ndarray, b: np.ndarray) -> float:
 
 def summary(rows: list[Errors]) -> dict:
     """Figures over frames: mm and pixels as root mean squares, shares and decibels as means."""
+    tracked, true = (
+        np.stack([getattr(row, name) for row in rows]) for name in ("motion", "true_motion")
+    )
     return {
         "vertex_rmse_mm": pooled([row.distances for row in rows]),
         "landmark_px_true": round(rms(np.array([row.landmark_px for row in rows])), 3),
@@ -183,6 +197,8 @@ def summary(rows: list[Errors]) -> dict:
             np.stack([row.expression for row in rows]),
             np.stack([row.true_expression for row in rows]),
         ),
+        # Coefficients that move the face alike trade places; what they move together is this.
+        "expression_motion_r2": r_squared(tracked, true),
         "jaw_error_deg": round(rms(np.array([row.jaw_deg for row in rows])), 3),
         "heldout_camera_psnr_db": mean([value for row in rows for value in row.psnrs]),
     }
