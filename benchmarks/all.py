@@ -18,6 +18,8 @@ SKIPPED = {
     "depth",
     "regions",
     "regions_truth",
+    "track_truth",
+    "track_views",
     "matte_scenes",
     "matte_disturbances",
 }

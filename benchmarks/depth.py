@@ -22,6 +22,7 @@ from express50.config import resolve_config
 from express50.frames import read_peaks
 from express50.head.load import load_head
 from express50.layout import Dataset
+from express50.raycast import mesh_scene
 from express50.tracks import read_track
 from express50.twin.truth import Truth, align_worlds
 from pipelines.depth import STAGE
@@ -29,7 +30,6 @@ from pipelines.depth.grid import Grid, head_box, hull_distance
 from pipelines.depth.reconstruct import reconstruct
 from pipelines.depth.stage import Pictures, read_prior, read_views
 from pipelines.depth.surface import closed, extract_mesh
-from pipelines.depth.sweep import mesh_scene
 
 
 def main() -> int:

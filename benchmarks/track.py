@@ -1,162 +1,292 @@
-"""How far tracked meshes are from the truth, and what a rigid template would give in the same run.
+"""How far tracked heads are from the truth, what refinement adds, and what a rigid template gives.
 
-``python -m benchmarks.track [--dataset DIR --truth DIR]``; without a dataset a tiny one is recorded
-with the digital twin (other subjects than the demo's) and brought up to mattes. Peaks are the true
-ones, so that the figures speak of tracking alone. The last line printed is one JSON object.
+``python -m benchmarks.track [--dataset DIR --truth DIR [--captures DIR]]``; without a dataset the
+digital twin records subjects that the landmark detector was not trained on, two cameras are held
+out of the capture, and the stages up to mattes are run. Peaks are the true ones, so that the
+figures speak of tracking alone. `landmark_only` is `standard` without outlines, relief and colours.
+Seconds are processor seconds of the stage, reading footage and drawing overlays included. The last
+line printed is one JSON object; `benchmarks.track_truth` says what its figures mean, and
+`benchmarks.track_views` how the held-out cameras' picture is made.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import os
+import shutil
 import sys
 import tempfile
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
+from benchmarks.track_truth import Errors, compare, jitter_mm, mean, pooled, summary
+from benchmarks.track_views import held_out_views
+from express50.cameras import read_cameras, write_cameras
 from express50.config import build_config
-from express50.frames import read_cameras_of
+from express50.frames import read_cameras_of, read_peaks
 from express50.head.load import load_head
-from express50.head.model import landmarks
-from express50.index import read_index
+from express50.index import index_path, index_to_json, read_index
 from express50.layout import Dataset
 from express50.runner import run_stage
-from express50.transforms import rigid_fit
 from express50.twin.config import TwinConfig
 from express50.twin.record import record
-from express50.twin.truth import Truth, align_worlds
+from express50.twin.truth import Truth
 from pipelines import alpha, calibrate, ingest, matte
 from pipelines.ingest import register
 from pipelines.track import STAGE
 
 EXPRESSIONS = ("neutral", "smile", "jaw_open", "pucker", "brow_raise", "wink_left")
+PRESETS = ("draft", "standard", "reference")
+LANDMARK_ONLY: dict[str, object] = {"silhouette_rounds": 0, "relief_rounds": 0, "photo_rounds": 0}
+HELD_OUT = 2
+SCALING_VIEWS, SCALING_SIDES = (4, 8, 16), (256, 512)
+Reference = tuple[Dataset, Truth, Path | None]  # what was recorded; the whole captures, if at hand
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the track stage at a preset and print its errors."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.track", description=__doc__)
-    parser.add_argument("--dataset", type=Path, help="dataset with ingest, calibrate and mattes")
-    parser.add_argument("--truth", type=Path, help="truth folder of the recording")
-    parser.add_argument("--preset", default="standard", choices=sorted(STAGE.presets))
-    parser.add_argument("--subjects", type=int, default=2)
-    options = parser.parse_args(arguments)
-    if (options.dataset is None) != (options.truth is None):
-        parser.error("give both --dataset and --truth, or neither")
+    """Track with every preset and print the errors."""
+    options = parse(arguments)
     with tempfile.TemporaryDirectory() as scratch:
-        root = options.dataset or Path(scratch) / "dataset"
-        truth = options.truth or record_tiny(Path(scratch), root, options.subjects)
-        print(json.dumps(measure(Dataset(root), Truth(truth), options.preset)))
+        if options.dataset is not None:
+            source = Dataset(options.dataset), Truth(options.truth), options.captures
+        else:
+            config = twin_config(options.subjects, options.cameras, options.side)
+            source = prepare(config, Path(scratch) / "twin")
+        result = benchmark(source, options.presets, options.subjects, options.clip)
+        result["scaling"] = scaling(Path(scratch)) if options.scaling else None
+    print(json.dumps(result))
     return 0
 
 
-def record_tiny(scratch: Path, root: Path, subjects: int) -> Path:
-    """Record unseen subjects with given cameras and run the stages that come before tracking."""
-    config = TwinConfig(
-        subjects=subjects,
-        first_subject=41,
-        cameras=8,
-        width=320,
-        height=320,
-        expressions=EXPRESSIONS,
-        frames_per_expression=4,
-        board_frames=0,
-        give_calibration=True,
-        footage="jpg",
-        seed=5,
-    )
-    record(config, scratch / "twin", workers=1)
-    dataset = Dataset(root)
-    register(dataset, sorted((scratch / "twin" / "captures").iterdir()))
+def parse(arguments: list[str] | None) -> argparse.Namespace:
+    """The command line."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.track", description=__doc__)
+    parser.add_argument("--dataset", type=Path, help="dataset with ingest, calibrate and mattes")
+    parser.add_argument("--truth", type=Path, help="truth folder of the recording")
+    parser.add_argument("--captures", type=Path, help="its captures, with the held-out cameras")
+    parser.add_argument("--presets", default="draft,standard,reference", type=preset_names)
+    parser.add_argument("--subjects", type=int, default=2)
+    parser.add_argument("--cameras", type=int, default=18, help=f"of these {HELD_OUT} are held out")
+    parser.add_argument("--side", type=int, default=512, help="pixels of the recorded footage")
+    parser.add_argument("--clip", action=argparse.BooleanOptionalAction, default=True,
+                        help="track one clip for the jitter")  # fmt: skip
+    parser.add_argument("--scaling", action="store_true", help="also over views and pixels")
+    options = parser.parse_args(arguments)
+    if (options.dataset is None) != (options.truth is None):
+        parser.error("give both --dataset and --truth, or neither")
+    if options.captures is not None and options.dataset is None:
+        parser.error("--captures goes with --dataset and --truth")
+    if options.subjects < 1 or options.cameras < HELD_OUT + 2 or options.side < 64:
+        parser.error(f"expected 1 subject, {HELD_OUT + 2} cameras and 64 pixels or more")
+    return options
+
+
+def preset_names(text: str) -> tuple[str, ...]:
+    """Names of presets, from one with commas; empty for landmark_only alone."""
+    names = tuple(name for name in text.split(",") if name and name != "landmark_only")
+    if not set(names) <= set(PRESETS):
+        raise argparse.ArgumentTypeError(f"{text!r}, expected some of {','.join(PRESETS)}")
+    return names
+
+
+def twin_config(subjects: int, cameras: int, side: int) -> TwinConfig:
+    """Subjects other than the demo's and the detector's, with given cameras."""
+    return TwinConfig(
+        subjects=subjects, first_subject=41, cameras=cameras, width=side, height=side,
+        expressions=EXPRESSIONS, frames_per_expression=4, board_frames=0, give_calibration=True,
+        footage="jpg", seed=5,
+    )  # fmt: skip
+
+
+def prepare(config: TwinConfig, folder: Path) -> Reference:
+    """Record, hold cameras out, and run the stages that come before tracking."""
+    record(config, folder, workers=1)
+    seen = folder / "seen"
+    for capture in sorted((folder / "captures").iterdir()):
+        hold_out(capture, seen / capture.name)
+    dataset, truth = Dataset(folder / "dataset"), Truth(folder / "truth")
+    register(dataset, sorted(seen.iterdir()))
     for stage in (ingest.STAGE, calibrate.STAGE):
-        run_stage(stage, dataset, build_config(stage, {}), workers=1, progress=False)
-    write_true_peaks(dataset, Truth(scratch / "twin" / "truth"))
+        run_stage(stage, dataset, build_config(stage, {}), workers=0, progress=False)
+    for subject in dataset.subjects():
+        write_peaks(dataset, subject, truth.peaks(subject))
     for stage in (alpha.STAGE, matte.STAGE):
-        run_stage(stage, dataset, build_config(stage, {}), workers=1, progress=False)
-    return scratch / "twin" / "truth"
+        run_stage(stage, dataset, build_config(stage, {}), workers=0, progress=False)
+    return dataset, truth, folder / "captures"
 
 
-def write_true_peaks(dataset: Dataset, truth: Truth) -> None:
-    """Publish the true peaks as labels."""
-    for subject in dataset.subjects():
-        index = read_index(dataset, subject)
-        camera = sorted(index.cameras)[0]
-        source = index.cameras[camera]
-        rows = {
-            name: {
-                "frame": frame,
-                "camera": camera,
-                "pts": int(source.pts[frame]),
-                "dhash": source.dhash[frame],
-                "confidence": 1.0,
-                "annotator": "truth",
-            }
-            for name, frame in truth.peaks(subject).items()
+def hold_out(capture: Path, out: Path) -> None:
+    """The capture without HELD_OUT cameras, spread over the rig's inside."""
+    names = sorted(path.name for path in (capture / "cameras").iterdir())
+    held = [names[len(names) * (k + 1) // (HELD_OUT + 1) - k] for k in range(HELD_OUT)]
+    shutil.copytree(capture, out, copy_function=os.link)
+    for name in held:
+        shutil.rmtree(out / "cameras" / name)
+        (out / "plates" / f"{name}.png").unlink(missing_ok=True)
+    cameras = read_cameras(out / "calibration.json")
+    (out / "calibration.json").unlink()  # a link to the recording's own
+    write_cameras(out / "calibration.json", {k: v for k, v in cameras.items() if k not in held})
+
+
+def write_peaks(dataset: Dataset, subject: str, peaks: dict[str, int]) -> None:
+    """Publish peaks as labels."""
+    index = read_index(dataset, subject)
+    camera = sorted(index.cameras)[0]
+    source = index.cameras[camera]
+    rows = {
+        name: {
+            "frame": frame,
+            "camera": camera,
+            "pts": int(source.pts[frame]),
+            "dhash": source.dhash[frame],
+            "confidence": 1.0,
+            "annotator": "truth",
         }
-        folder = dataset.item_dir("align", subject)
-        folder.mkdir(parents=True, exist_ok=True)
-        (folder / "peaks.json").write_text(json.dumps(rows))
-
-
-def measure(dataset: Dataset, truth: Truth, preset: str) -> dict:
-    """Track every subject and compare with the truth; lengths in millimetres."""
-    config = build_config(STAGE, STAGE.presets[preset])
-    rows: list[dict[str, float]] = []
-    seconds, frames = 0.0, 0
-    load_head(config.head)
-    pixels = []
-    for subject in dataset.subjects():
-        with tempfile.TemporaryDirectory() as scratch:
-            began = time.perf_counter()
-            metrics = STAGE.run(dataset, subject, config, Path(scratch))
-            seconds += time.perf_counter() - began
-            with np.load(Path(scratch) / "track.npz", allow_pickle=False) as track:
-                rows += compare(dataset, truth, subject, track)
-                frames += len(track["frames"])
-        pixels.append(metrics["landmark_rms_px_mean"])
-    summary = {name: float(np.sqrt(np.mean([row[name] ** 2 for row in rows]))) for name in rows[0]}
-    return {
-        "preset": preset,
-        "frames": frames,
-        "landmark_px": round(float(np.mean(pixels)), 3),
-        "seconds_a_frame": round(seconds / frames, 3),
-        **{name: round(value, 3) for name, value in summary.items()},
+        for name, frame in peaks.items()
     }
+    folder = dataset.item_dir("align", subject)
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "peaks.json").write_text(json.dumps(rows))
 
 
-def compare(
-    dataset: Dataset, truth: Truth, subject: str, track: np.lib.npyio.NpzFile
-) -> list[dict[str, float]]:
-    """RMS distances of one subject's meshes, and of the template laid rigidly on each."""
-    model = load_head(str(track["head"]))
-    motion = align_worlds(read_cameras_of(dataset, subject), truth.cameras(subject))
-    skin = ~(model.regions["mouth_interior"] | model.regions["teeth"]).numpy()
-    face = model.regions["face"].numpy()
-    template = model.template.double().numpy()
-    marks = landmarks(model, model.template[None])[0].double().numpy()
-    rows = []
-    for vertices, frame in zip(track["vertices"], track["frames"], strict=True):
-        moved = vertices @ motion[:3, :3].T + motion[:3, 3]
-        true = truth.vertices(subject, int(frame))
-        R, t = rigid_fit(marks, truth.landmarks(subject, int(frame)))
-        baseline = np.linalg.norm(template @ R.T + t - true, axis=1)
-        error = np.linalg.norm(moved - true, axis=1)
-        rows.append(
-            {
-                "vertex_rmse_mm": 1e3 * rms(error),
-                "face_rmse_mm": 1e3 * rms(error[face]),
-                "skin_rmse_mm": 1e3 * rms(error[skin]),
-                "baseline_rigid_template_mm": 1e3 * rms(baseline),
-                "baseline_face_mm": 1e3 * rms(baseline[face]),
-            }
+def benchmark(source: Reference, presets: tuple[str, ...], count: int, clip: bool) -> dict:
+    """Figures of `landmark_only` and of the presets on the first `count` subjects."""
+    dataset, truth, captures = source
+    subjects = dataset.subjects()[:count]
+    views = {s: held_out_views(dataset, truth, s, captures) for s in subjects}
+    load_head(build_config(STAGE, {}).head)  # else the first preset alone would pay for it
+    settings = {"landmark_only": LANDMARK_ONLY} | {name: STAGE.presets[name] for name in presets}
+    result: dict = {
+        "subjects": subjects,
+        "cameras": len(read_cameras_of(dataset, subjects[0])),
+        "held_out": sorted(
+            {view.camera.id for rows in views[subjects[0]].values() for view in rows}
+        ),
+    }
+    for name, values in settings.items():
+        config = build_config(STAGE, values)
+        rows: list[Errors] = []
+        figures: list[dict] = []
+        for subject in subjects:
+            errors, found = track(dataset, truth, subject, config, views[subject])
+            rows, figures = rows + errors, [*figures, found]
+        result[name] = report(rows, figures, has_footage(views))
+        result[name] |= jitter(dataset, truth, subjects[0], config) if clip else {
+            "jitter_mm": None, "jitter_reason": "--no-clip was given"}  # fmt: skip
+        print(name, json.dumps(result[name]), file=sys.stderr, flush=True)
+        result["baseline"] = {"vertex_rmse_mm": pooled([row.baseline for row in rows])}
+        best = mean([value for row in rows for value in row.true_psnrs])
+        result["true_mesh"] = {"heldout_camera_psnr_db": best}
+    result["photometric_improves"] = None
+    if "standard" in result:
+        face = [result[name]["vertex_rmse_mm"]["face"] for name in ("standard", "landmark_only")]
+        result["photometric_improves"] = bool(face[0] < face[1])
+    return result
+
+
+def has_footage(views: dict) -> bool:
+    """Whether any held-out camera has a picture."""
+    return any(v.image is not None for rows in views.values() for row in rows.values() for v in row)
+
+
+def track(
+    dataset: Dataset,
+    truth: Truth,
+    subject: str,
+    config,
+    views: dict,  # noqa: ANN001
+) -> tuple[list[Errors], dict]:
+    """Errors of a subject's frames, and what the stage itself says and costs."""
+    with tempfile.TemporaryDirectory() as scratch:
+        began = time.process_time()
+        metrics = STAGE.run(dataset, subject, config, Path(scratch))
+        seconds = time.process_time() - began
+        errors = compare(dataset, truth, subject, Path(scratch) / "track.npz", views)
+    return errors, {"seconds": seconds, "detected_px": metrics["landmark_rms_px_mean"]}
+
+
+def report(rows: list[Errors], figures: list[dict], footage: bool) -> dict:
+    """One preset's figures over all subjects."""
+    result = summary(rows)
+    detected = float(np.mean([row["detected_px"] for row in figures]))
+    result["landmark_px"] = {"true": result.pop("landmark_px_true"), "detected": round(detected, 3)}
+    seconds = sum(row["seconds"] for row in figures) / len(rows)
+    result |= {"frames": len(rows), "seconds_per_frame": round(seconds, 3)}
+    if result["heldout_camera_psnr_db"] is None:
+        why = "no held-out camera shows enough of the face" if footage else (
+            "no frames of held-out cameras; give --captures")  # fmt: skip
+        result["heldout_camera_psnr_reason"] = why
+    return result
+
+
+def jitter(dataset: Dataset, truth: Truth, subject: str, config) -> dict:  # noqa: ANN001
+    """Jitter over one expression's clip, with the shape of that and the neutral peak."""
+    peaks = read_peaks(dataset, subject)
+    cue = next(name for name in peaks if name != config.neutral)
+    with tempfile.TemporaryDirectory() as scratch:
+        part = narrowed(dataset, subject, Path(scratch) / "part", cues=(config.neutral, cue))
+        out = Path(scratch) / "out"
+        out.mkdir()
+        STAGE.run(part, subject, replace(config, frames="clips"), out)
+        value, why = jitter_mm(part, truth, subject, cue, out)
+    return {"jitter_mm": value} | ({"jitter_reason": why} if value is None else {})
+
+
+def narrowed(
+    dataset: Dataset,
+    subject: str,
+    out: Path,
+    cues: tuple[str, ...] | None = None,
+    views: int | None = None,
+) -> Dataset:
+    """One subject's dataset in links: peaks of `cues` and the last one's clip, or fewer cameras."""
+    part = Dataset(out)
+    for stage in ("ingest", "calibrate", "align", "matte"):
+        source = dataset.item_dir(stage, subject).resolve()
+        part.item_dir(stage, subject).mkdir(parents=True)
+        for path in source.iterdir():
+            (part.item_dir(stage, subject) / path.name).symlink_to(path)
+    part.captures_file.symlink_to(dataset.captures_file.resolve())
+    if cues is not None:
+        index = read_index(dataset, subject)
+        index = replace(index, cues=tuple(c for c in index.cues if c.expression_id == cues[-1]))
+        index_path(part, subject).unlink()
+        index_path(part, subject).write_text(json.dumps(index_to_json(index)))
+        (part.item_dir("align", subject) / "peaks.json").unlink()
+        peaks = read_peaks(dataset, subject)
+        write_peaks(part, subject, {name: peaks[name] for name in cues if name in peaks})
+    if views is not None:
+        file = part.item_dir("calibrate", subject) / "cameras.json"
+        cameras = read_cameras(file)
+        names = sorted(cameras)
+        chosen = {names[round((len(names) - 1) * (k + 1) / (views + 1))] for k in range(views)}
+        file.unlink()
+        write_cameras(
+            file, {k: v for k, v in cameras.items() if views >= len(names) or k in chosen}
         )
+    return part
+
+
+def scaling(scratch: Path) -> list[dict]:
+    """Seconds and face error of `standard` over views and pixels, one subject recorded anew."""
+    config, rows = build_config(STAGE, STAGE.presets["standard"]), []
+    for side in SCALING_SIDES:
+        cameras = max(SCALING_VIEWS) + HELD_OUT
+        dataset, truth, _ = prepare(twin_config(1, cameras, side), scratch / f"scaling_{side}")
+        subject = dataset.subjects()[0]
+        for views in SCALING_VIEWS:
+            part = narrowed(dataset, subject, scratch / f"part_{side}_{views}", views=views)
+            errors, found = track(part, truth, subject, config, {})
+            face = pooled([row.distances for row in errors])["face"]
+            seconds = round(found["seconds"] / len(errors), 3)
+            rows.append({"views": views, "pixels": side, "seconds_per_frame": seconds,
+                         "vertex_rmse_mm.face": face})  # fmt: skip
+            print(json.dumps(rows[-1]), file=sys.stderr, flush=True)
     return rows
-
-
-def rms(values: np.ndarray) -> float:
-    """Root mean square."""
-    return float(np.sqrt(np.mean(values**2)))
 
 
 if __name__ == "__main__":

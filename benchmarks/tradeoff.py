@@ -65,11 +65,11 @@ def sweep_one(base: Dataset, truth: Truth, stage: str, preset: str, out: Path) -
         if not link.exists():
             link.symlink_to((base.root / name).resolve())
     command = [sys.executable, "-m", "express50.cli", stage, str(dataset.root), "--preset", preset]
-    before = children_seconds()
+    began = children_seconds()
     done = subprocess.run(
         [*command, "--workers", "0", "--json"], stdout=subprocess.PIPE, check=False
     )
-    seconds = children_seconds() - before
+    seconds = children_seconds() - began
     if done.returncode == 2:
         sys.exit(f"tradeoff: {stage} {preset} did not start; see the line above")
     measure, key = MEASURES[stage]

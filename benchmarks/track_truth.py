@@ -1,0 +1,264 @@
+"""Tracked meshes against the twin's truth: millimetres, pixels, coefficients and new views.
+
+All is compared in the true world, where the estimated one is laid by one rigid motion a subject.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from benchmarks.track_views import HeldOut, face_of, mask_of, psnr_db
+from express50.cameras import Camera, pinhole, project, transform_camera
+from express50.errors import Express50Error
+from express50.frames import read_cameras_of
+from express50.head.load import load_head
+from express50.head.model import HeadModel, landmarks, pose
+from express50.layout import Dataset
+from express50.tracks import Track, read_track
+from express50.transforms import axis_angle_to_matrix, rigid_fit
+from express50.twin.truth import Truth, align_worlds
+
+NO_SKIN = ("mouth_interior", "teeth", "neck", "boundary")
+
+
+@dataclass(frozen=True)
+class Errors:
+    """One tracked frame.
+
+    Attributes:
+        distances: root mean square distance of face, head and neck, metres.
+        baseline: the same of the template laid rigidly on the true landmarks.
+        landmark_px: distances of 68 landmarks in the tracking cameras, root mean square.
+        jaw_deg: angle between the jaw's rotations.
+        expression, true_expression: (X,) coefficients.
+        motion, true_motion: (3 F,) how far these coefficients move the face's vertices, metres.
+        ious: of the head's mask, one a held-out camera.
+        psnrs: decibels, one a held-out camera that shows enough of the face.
+        true_psnrs: of the true mesh in their place: highlights, noise and gains alone.
+    """
+
+    distances: dict[str, float]
+    baseline: dict[str, float]
+    landmark_px: float
+    jaw_deg: float
+    expression: np.ndarray
+    true_expression: np.ndarray
+    motion: np.ndarray
+    true_motion: np.ndarray
+    ious: list[float]
+    psnrs: list[float]
+    true_psnrs: list[float]
+
+
+def compare(
+    dataset: Dataset, truth: Truth, subject: str, path: Path, held_out: Mapping[int, list[HeldOut]]
+) -> list[Errors]:
+    """Errors of every frame of a track.
+
+    Args:
+        dataset: what was tracked.
+        truth: of the recording.
+        subject: its id.
+        path: of track.npz.
+        held_out: cameras that the stages did not see, by frame (`held_out_views`).
+
+    Raises:
+        Express50Error: the track is of another head model than the recording.
+    """
+    track = read_track(path)
+    model = load_head(track.head)
+    check_topology(model, truth, subject)
+    motion = align_worlds(read_cameras_of(dataset, subject), truth.cameras(subject))
+    cameras = {
+        name: transform_camera(camera, motion)
+        for name, camera in read_cameras_of(dataset, subject).items()
+    }
+    return [
+        frame_errors(dataset, truth, subject, model, track, row, motion, cameras, held_out)
+        for row in range(len(track.frames))
+    ]
+
+
+def check_topology(model: HeadModel, truth: Truth, subject: str) -> None:
+    """Refuse what has no vertex to vertex errors."""
+    got, expected = len(model.template), len(truth.head_model(subject).template)
+    if got != expected:
+        raise Express50Error(
+            f"{subject}: tracked {got} vertices, the truth has {expected}; vertex errors need the"
+            " twin's own head model, so track with track.head as it was recorded"
+        )
+
+
+def frame_errors(
+    dataset: Dataset,
+    truth: Truth,
+    subject: str,
+    model: HeadModel,
+    track: Track,
+    row: int,
+    motion: np.ndarray,
+    cameras: Mapping[str, Camera],
+    held_out: Mapping[int, list[HeldOut]],
+) -> Errors:
+    """Errors of one row of a track; `cameras` are the estimated ones in the true world."""
+    frame = int(track.frames[row])
+    moved = track.vertices[row].astype(np.float64) @ motion[:3, :3].T + motion[:3, 3]
+    true = truth.vertices(subject, frame)
+    parameters = truth.parameters(subject, frame)
+    R, t = rigid_fit(marks_of(model, model.template.double().numpy()), marks_of(model, true))
+    template = model.template.double().numpy() @ R.T + t
+    views = held_out.get(frame, [])
+    psnrs, true_psnrs = (
+        [psnr_db(dataset, subject, frame, model, mesh, cameras, view) for view in views]
+        for mesh in (moved, true)
+    )
+    return Errors(
+        distances=region_errors(model, moved, true),
+        baseline=region_errors(model, template, true),
+        landmark_px=landmark_px(cameras, truth.cameras(subject), model, moved, true),
+        jaw_deg=angle_deg(track.jaw[row], parameters["jaw"]),
+        expression=track.expression[row],
+        true_expression=parameters["expression"],
+        motion=face_motion(model, track.expression[row]),
+        true_motion=face_motion(model, parameters["expression"]),
+        ious=[iou(mask_of(model, moved, view.camera), view.mask) for view in views],
+        psnrs=[value for value in psnrs if value is not None],
+        true_psnrs=[value for value in true_psnrs if value is not None],
+    )
+
+
+def region_errors(model: HeadModel, vertices: np.ndarray, true: np.ndarray) -> dict[str, float]:
+    """Root mean square distance of face, head (no mouth, neck or cut edge) and neck, metres."""
+    distance = np.linalg.norm(vertices - true, axis=1)
+    return {name: rms(distance[chosen]) for name, chosen in regions_of(model).items()}
+
+
+def regions_of(model: HeadModel) -> dict[str, np.ndarray]:
+    """Vertices (V,) bool of face, head and neck."""
+    away = np.any([model.regions[name].numpy() for name in NO_SKIN], axis=0)
+    face, neck = face_of(model), model.regions["neck"].numpy()
+    return {"face": face, "head": ~away, "neck": neck}
+
+
+def face_motion(model: HeadModel, expression: np.ndarray) -> np.ndarray:
+    """Displacement (3 F,) of the face's vertices by coefficients (X,), metres."""
+    directions = model.expression_dirs.double().numpy()[face_of(model)]
+    return (directions @ expression).ravel()
+
+
+def landmark_px(
+    cameras: Mapping[str, Camera],
+    true_cameras: Mapping[str, Camera],
+    model: HeadModel,
+    vertices: np.ndarray,
+    true: np.ndarray,
+) -> float:
+    """Root mean square distance of 68 landmarks' projections in all tracking cameras, pixels."""
+    errors = []
+    for name, camera in cameras.items():
+        found, _ = project(camera, marks_of(model, vertices))
+        expected, _ = project(pinhole(true_cameras[name]), marks_of(model, true))
+        errors.append(np.linalg.norm(found - expected, axis=1))
+    return rms(np.concatenate(errors))
+
+
+def marks_of(model: HeadModel, vertices: np.ndarray) -> np.ndarray:
+    """The 68 landmarks (68, 3) of vertices (V, 3)."""
+    return landmarks(model.to(dtype=torch.float64), torch.from_numpy(vertices)[None])[0].numpy()
+
+
+def angle_deg(a: np.ndarray, b: np.ndarray) -> float:
+    """Angle between two axis-angle rotations (3,), degrees."""
+    R = axis_angle_to_matrix(a).T @ axis_angle_to_matrix(b)
+    return float(np.degrees(np.arccos(np.clip((np.trace(R) - 1) / 2, -1.0, 1.0))))
+
+
+def iou(a: np.ndarray, b: np.ndarray) -> float:
+    """Intersection over union of two masks; 1 where both are empty."""
+    union = (a | b).sum()
+    return float((a & b).sum() / union) if union else 1.0
+
+
+def summary(rows: list[Errors]) -> dict:
+    """Figures over frames: mm and pixels as root mean squares, shares and decibels as means."""
+    tracked, true = (
+        np.stack([getattr(row, name) for row in rows]) for name in ("motion", "true_motion")
+    )
+    return {
+        "vertex_rmse_mm": pooled([row.distances for row in rows]),
+        "landmark_px_true": round(rms(np.array([row.landmark_px for row in rows])), 3),
+        "silhouette_iou": mean([value for row in rows for value in row.ious]),
+        "expression_r2": r_squared(
+            np.stack([row.expression for row in rows]),
+            np.stack([row.true_expression for row in rows]),
+        ),
+        # Coefficients that move the face alike trade places; what they move together is this.
+        "expression_motion_r2": r_squared(tracked, true),
+        "jaw_error_deg": round(rms(np.array([row.jaw_deg for row in rows])), 3),
+        "heldout_camera_psnr_db": mean([value for row in rows for value in row.psnrs]),
+    }
+
+
+def pooled(rows: list[dict[str, float]]) -> dict[str, float]:
+    """Root mean square over frames, millimetres."""
+    return {name: round(1e3 * rms(np.array([row[name] for row in rows])), 3) for name in rows[0]}
+
+
+def mean(values: list[float]) -> float | None:
+    """Mean; None of nothing."""
+    return round(float(np.mean(values)), 4) if values else None
+
+
+def r_squared(found: np.ndarray, true: np.ndarray) -> float | None:
+    """1 - squared error / variance about each coefficient's mean over frames, of (E, X) arrays.
+
+    Pooled over coefficients; None where nothing varies.
+    """
+    spread = float(((true - true.mean(0)) ** 2).sum())
+    return round(1.0 - float(((found - true) ** 2).sum()) / spread, 4) if spread else None
+
+
+def jitter_mm(
+    dataset: Dataset, truth: Truth, subject: str, cue: str, folder: Path
+) -> tuple[float | None, str]:
+    """Mean second difference of the face's error, mm, over a clip; or None with the reason.
+
+    The error is tracked minus true, so that true motion does not count. `folder` holds
+    sequence.npz and the track.npz of the same run.
+    """
+    track = read_track(folder / "track.npz")
+    with np.load(folder / "sequence.npz", allow_pickle=False) as file:
+        chosen = file["cues"] == cue
+        rows = {
+            k: file[k][chosen] for k in ("frames", "expression", "neck", "jaw", "eyes", "R", "t")
+        }
+    if len(rows["frames"]) < 3 or (np.diff(rows["frames"]) != 1).any():
+        return None, f"{cue}: {len(rows['frames'])} frames in a row were tracked, fewer than 3"
+    motion = align_worlds(read_cameras_of(dataset, subject), truth.cameras(subject))
+    model = load_head(track.head)
+    meshes = clip_meshes(model, track, rows) @ motion[:3, :3].T + motion[:3, 3]
+    true = np.stack([truth.vertices(subject, int(frame)) for frame in rows["frames"]])
+    error = (meshes - true)[:, face_of(model)]
+    return round(1e3 * float(np.linalg.norm(np.diff(error, n=2, axis=0), axis=2).mean()), 4), ""
+
+
+def clip_meshes(model: HeadModel, track: Track, rows: Mapping[str, np.ndarray]) -> np.ndarray:
+    """World vertices (F, V, 3) of a clip's parameters with a track's shape and offsets."""
+    model = model.to(dtype=torch.float64)
+    own = {name: torch.from_numpy(rows[name]).double() for name in ("neck", "jaw", "eyes")}
+    expression = torch.from_numpy(rows["expression"]).double()
+    shape = torch.from_numpy(track.shape)[None].expand(len(expression), -1)
+    offsets = torch.from_numpy(track.offsets).double()[None]
+    with torch.inference_mode():
+        head = pose(model, shape, expression, offsets=offsets, **own).numpy()
+    return np.einsum("fij,fvj->fvi", rows["R"], head) + rows["t"][:, None]
+
+
+def rms(values: np.ndarray) -> float:
+    """Root mean square."""
+    return float(np.sqrt(np.mean(np.asarray(values) ** 2)))

@@ -1,0 +1,162 @@
+"""Held-out cameras: what they truly show, and what a tracked mesh says that they show.
+
+A pixel of a held-out camera whose first surface is the tracked face is a point in space. Its colour
+is the median, over the tracking cameras that see the point on the tracked mesh (not hidden by the
+mesh, not at a slant), of the root of linear light at the point's projection, of the same moment. If
+the mesh is off, cameras look at different skin, and the picture blurs. It is compared in sRGB with
+the held-out camera's frame where it shows the true face's skin first (no hair before it). The same
+for every preset.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from express50.adapters import undistort_image
+from express50.cameras import Camera, pinhole, unproject
+from express50.capture import read_capture
+from express50.frames import read_cameras_of, read_frame, read_srgb8
+from express50.head.model import HeadModel
+from express50.images import LIGHT_OF_LEVEL, linear_to_srgb
+from express50.layout import Dataset
+from express50.mesh_raster import rasterize
+from express50.twin.truth import Truth
+from pipelines.track.photometry import look
+from pipelines.track.samples import Visibility
+
+SLANT = 0.4  # cosine below which a camera's view of a point is not taken
+LEAST_VIEWS = 2
+LEAST_PIXELS = 200  # of the face, for a PSNR
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """What a held-out camera truly shows at a frame.
+
+    Attributes:
+        camera: true pinhole camera.
+        mask: (H, W) bool, the true head mesh.
+        face: (H, W) bool, the face region's skin, seen first.
+        image: (H, W, 3) uint8 sRGB, undistorted; None without the capture's footage.
+    """
+
+    camera: Camera
+    mask: np.ndarray
+    face: np.ndarray
+    image: np.ndarray | None
+
+
+def held_out_views(
+    dataset: Dataset, truth: Truth, subject: str, captures: Path | None
+) -> dict[int, list[HeldOut]]:
+    """Views of all true cameras that the dataset lacks, by frame of a true peak."""
+    known = read_cameras_of(dataset, subject)
+    hidden = {k: v for k, v in truth.cameras(subject).items() if k not in known}
+    footage = read_capture(captures / subject).cameras if captures else {}
+    model = truth.head_model(subject)
+    found: dict[int, list[HeldOut]] = {}
+    for frame in truth.peaks(subject).values():
+        vertices = truth.vertices(subject, frame)
+        for name, camera in hidden.items():
+            plain = pinhole(camera)
+            raw = footage.get(name)
+            image = None
+            if raw is not None and raw.kind == "frames":
+                image = undistort_image(read_srgb8(raw.path / raw.names[frame]), camera)
+            mask, face = mask_of(model, vertices, plain), see_face(model, vertices, plain)[0]
+            face = face & truth.skin(subject, frame, plain)
+            found.setdefault(frame, []).append(HeldOut(plain, mask, face, image))
+    return found
+
+
+def face_of(model: HeadModel) -> np.ndarray:
+    """Vertices (V,) bool of the face."""
+    return model.regions["face"].numpy()
+
+
+def mask_of(model: HeadModel, vertices: np.ndarray, camera: Camera) -> np.ndarray:
+    """Pixels (H, W) bool that the mesh covers, by the z-buffer."""
+    return rasterize(vertices, model.faces.numpy(), camera, pairs=False).face_id >= 0
+
+
+def see_face(
+    model: HeadModel, vertices: np.ndarray, camera: Camera
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Pixels (H, W) bool whose first surface is the face region, face ids and depth."""
+    faces = model.faces.numpy()
+    raster = rasterize(vertices, faces, camera, pairs=False)
+    inside = face_of(model)[faces].all(1)
+    return (raster.face_id >= 0) & inside[raster.face_id], raster.face_id, raster.depth
+
+
+def psnr_db(
+    dataset: Dataset,
+    subject: str,
+    frame: int,
+    model: HeadModel,
+    vertices: np.ndarray,
+    cameras: Mapping[str, Camera],
+    view: HeldOut,
+) -> float | None:
+    """Peak signal to noise ratio of the module docstring's picture, dB; None without enough face.
+
+    Args:
+        dataset: whose frames colour the mesh.
+        subject: its id.
+        frame: decode index.
+        model: of the mesh.
+        vertices: (V, 3) tracked mesh, true world.
+        cameras: tracking cameras, true world.
+        view: what the held-out camera shows.
+    """
+    if view.image is None:
+        return None
+    face, face_id, depth = see_face(model, vertices, view.camera)
+    rows, columns = np.nonzero(face & view.face)
+    if len(rows) < LEAST_PIXELS:
+        return None
+    pixels = np.stack([columns, rows], axis=1) + 0.5
+    places = unproject(view.camera, pixels, depth[rows, columns].astype(np.float64))
+    normals = face_normals(vertices, model.faces.numpy()[face_id[rows, columns]])
+    colours = median_colours(dataset, subject, frame, model, vertices, cameras, places, normals)
+    known = np.isfinite(colours).all(1)
+    if known.sum() < LEAST_PIXELS:
+        return None
+    shown = view.image[rows, columns][known] / 255.0
+    error = linear_to_srgb(colours[known] ** 2) - shown
+    return float(-10.0 * np.log10(np.mean(error**2)))
+
+
+def face_normals(vertices: np.ndarray, corners: np.ndarray) -> np.ndarray:
+    """Unit normals (N, 3) of triangles (N, 3) of vertices."""
+    a, b, c = (vertices[corners[:, k]] for k in range(3))
+    normal = np.cross(b - a, c - a)
+    return normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
+
+
+def median_colours(
+    dataset: Dataset,
+    subject: str,
+    frame: int,
+    model: HeadModel,
+    vertices: np.ndarray,
+    cameras: Mapping[str, Camera],
+    places: np.ndarray,
+    normals: np.ndarray,
+) -> np.ndarray:
+    """Median root of light (N, 3) of places on a mesh in the cameras that see them; else NaN."""
+    visibility = Visibility(vertices, model.faces.numpy())
+    seen = np.full((len(cameras), len(places), 3), np.nan)
+    for row, (name, camera) in enumerate(cameras.items()):
+        clear = visibility.weights(camera, places, normals) > SLANT
+        if clear.any():
+            image = np.sqrt(LIGHT_OF_LEVEL[read_frame(dataset, subject, name, frame)])
+            seen[row, clear] = look(camera, image, places[clear])[0]
+    enough = np.isfinite(seen[..., 0]).sum(0) >= LEAST_VIEWS
+    colours = np.full(places.shape, np.nan)
+    colours[enough] = np.nanmedian(seen[:, enough], axis=0)
+    return colours
