@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -15,10 +16,10 @@ from express50.images import linear_to_srgb, write_image
 from express50.mesh_raster import rasterize
 from pipelines.track.appearance import Appearance, Seen
 from pipelines.track.fit import Target
-from pipelines.track.photometry import robust_mean
-from pipelines.track.refine import Moment, _see
-from pipelines.track.samples import Samples
-from pipelines.track.shots import root_light
+from pipelines.track.photometry import look, robust_mean
+from pipelines.track.refine import Moment, _inside
+from pipelines.track.samples import Samples, Visibility, sample_normals
+from pipelines.track.shots import Shot, root_light
 
 SCHEMA = "express50.appearance/1"
 MOMENTS = 3
@@ -29,7 +30,7 @@ FIRST = 20.0
 SPREAD = 0.02
 # Sum of squared cosines to the cameras from which on a texel is known.
 LEAST_MASS = 0.3
-CHUNK = 50_000
+CHUNK = 10_000
 
 
 def write_texture(
@@ -75,14 +76,13 @@ def bake_albedo(
         (side, side) bool, where it was seen.
     """
     texels, texture = texel_samples(model, side)
+    scenes = [_scene(model, *pair) for pair in zip(moments, meshes, strict=True)]
     known = np.zeros((side, side), dtype=bool)
     root = np.zeros((side, side, 3))
     for start in range(0, len(texels.faces), CHUNK):
         some = slice(start, start + CHUNK)
         part = Samples(texels.faces[some], texels.corners[some], texels.bary[some])
-        seen = [
-            _smooth(model, part, moment, mesh) for moment, mesh in zip(moments, meshes, strict=True)
-        ]
+        seen = [_seen(scene, part) for scene in scenes]
         colour, mass = _agreed(seen, appearance)
         row, column = texture[some].T
         root[row, column], known[row, column] = colour, mass > LEAST_MASS
@@ -134,18 +134,40 @@ def texel_samples(model: HeadModel, side: int) -> tuple[Samples, np.ndarray]:
     return Samples(faces, model.faces.numpy()[faces], bary), texture
 
 
-def _smooth(model: HeadModel, texels: Samples, moment: Moment, mesh: np.ndarray) -> Seen:
-    """What a moment's cameras see of the texels; light falls on the smooth surface, not on facets.
+@dataclass(frozen=True)
+class _Scene:
+    """A moment's mesh with its smooth normals, its pictures, and what hides what."""
 
-    What hides what is judged by the facets all the same.
-    """
+    mesh: np.ndarray
+    normals: np.ndarray
+    shots: tuple[Shot, ...]
+    images: list[tuple[np.ndarray, Camera]]
+    visibility: Visibility
+
+
+def _scene(model: HeadModel, moment: Moment, mesh: np.ndarray) -> _Scene:
+    normals = vertex_normals(torch.from_numpy(mesh)[None], model.faces)[0].numpy()
     images = [root_light(shot, 0) for shot in moment.shots]
-    seen = _see(model, texels, moment, images, mesh)
-    at_vertices = vertex_normals(torch.from_numpy(mesh)[None], model.faces)[0].numpy()
-    normals = texels.at(at_vertices)
+    return _Scene(mesh, normals, moment.shots, images, Visibility(mesh, model.faces.numpy()))
+
+
+def _seen(scene: _Scene, texels: Samples) -> Seen:
+    """What a moment's cameras see of the texels.
+
+    Facets judge what is hidden; light falls on the smooth surface.
+    """
+    places, facets = texels.at(scene.mesh), sample_normals(texels, scene.mesh)
+    weights = np.zeros((len(scene.shots), len(places)))
+    values = np.zeros((*weights.shape, 3))
+    for row, (shot, (image, camera)) in enumerate(zip(scene.shots, scene.images, strict=True)):
+        weight = scene.visibility.weights(camera, places, facets) * _inside(shot, places)
+        chosen = np.flatnonzero(weight)
+        weights[row] = weight
+        values[row, chosen] = look(camera, image, places[chosen])[0]
+    normals = texels.at(scene.normals)
     length = np.linalg.norm(normals, axis=1, keepdims=True)
-    normals = np.where(length > 1e-9, normals / np.maximum(length, 1e-9), seen.normals)
-    return Seen(seen.cameras, seen.values, seen.weights, normals)
+    normals = np.where(length > 1e-9, normals / np.maximum(length, 1e-9), facets)
+    return Seen(tuple(shot.camera_id for shot in scene.shots), values, weights, normals)
 
 
 def _agreed(moments: list[Seen], appearance: Appearance) -> tuple[np.ndarray, np.ndarray]:

@@ -245,7 +245,7 @@ def _moments(
             alpha = read_alpha(path) if path.is_file() else None
             if alpha is not None and config.silhouette_rounds:
                 distances.append(signed_distance(alpha, camera))
-            if config.photo_rounds:
+            if config.photo_rounds or config.relief_rounds:
                 shots.append(
                     _shot(dataset, subject, camera, observation.frame, alpha, mesh, config)
                 )
