@@ -154,7 +154,7 @@ def test_texture_is_baked_the_right_way_up_and_freed_of_gains_and_light() -> Non
 
 
 def test_a_second_moment_tells_what_the_first_hides_and_changes_little_else() -> None:
-    model, cameras = ball_head(), rig()
+    model, cameras = ball_head(), rig((-0.8, -0.6, 0.6, 0.8))
     mesh = model.template.numpy()
     first = Moment((), tuple(shot_of(c, broad) for c in cameras[:2]))
     other = Moment((), tuple(shot_of(c, lambda p: 0.2 + 0 * p) for c in cameras[2:]))
@@ -163,7 +163,10 @@ def test_a_second_moment_tells_what_the_first_hides_and_changes_little_else() ->
     both, more = bake_albedo(model, np.stack([mesh, mesh]), [first, other], look, 64)
     assert more.sum() > 1.1 * seen.sum() and (more | ~seen).all()
     assert np.abs(both[seen].astype(float) - alone[seen]).mean() < 4.0
-    new = more & ~seen
+    # Not seen at all by the first two, not even at a slant.
+    v, u = np.meshgrid(1 - (np.arange(64) + 0.5) / 64, (np.arange(64) + 0.5) / 64, indexing="ij")
+    new = more & ~seen & (u > 0.68) & (np.abs(v - 0.5) < 0.2)
+    assert new.sum() > 20
     assert np.abs(both[new].astype(float) - 255 * linear_to_srgb(0.04)).mean() < 12.0
 
 
@@ -180,7 +183,7 @@ def test_nothing_seen_is_an_even_grey(alpha) -> None:
 def test_texels_lie_where_the_map_says() -> None:
     model, side = ball_head(), 50
     texels, texture = texel_samples(model, side)
-    assert len(texture) > 0.97 * side * side
+    assert len(texture) > 0.9 * side * side
     np.testing.assert_allclose(texels.bary.sum(1), 1.0)
     corners = model.uv.numpy()[model.uv_faces.numpy()[texels.faces]]
     uv = (texels.bary[..., None] * corners).sum(1)
