@@ -91,7 +91,7 @@ def residuals(appearance: Appearance, seen: Seen, albedo: np.ndarray) -> np.ndar
     for camera_id, value in zip(seen.cameras, seen.values, strict=True):
         model = appearance.shade(camera_id, seen.normals) * albedo
         rows.append(np.sqrt(np.nan_to_num((value - model) ** 2).sum(1)))
-    return np.stack(rows)
+    return np.array(rows).reshape(-1, len(seen.normals))
 
 
 def spread_of(lengths: np.ndarray, weights: np.ndarray) -> float:
@@ -154,6 +154,8 @@ def _with_gains(appearance: Appearance, moments: list[Seen]) -> Appearance:
             over[camera_id] += (weight[:, None] * expected * value).sum(0)
             under[camera_id] += (weight[:, None] * expected**2).sum(0)
     gains = {n: np.clip((over[n] + 1e-3) / (under[n] + 1e-3), 0.25, 4.0) for n in over}
+    if not gains:
+        return appearance
     mean = np.exp(np.mean([np.log(gain) for gain in gains.values()], axis=0))
     return Appearance(
         appearance.light, {n: gain / mean for n, gain in gains.items()}, appearance.albedo

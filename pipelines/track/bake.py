@@ -44,13 +44,16 @@ def write_texture(
 ) -> None:
     """Bake the neutral moment and two others, which show what it hides, and write what was found.
 
+    Where no picture shows any of it, nothing is written.
     Arguments are as `bake_albedo` has them, all expressions' in the order of the targets.
     """
     order = sorted(range(len(targets)), key=lambda index: not targets[index].neutral)
     used = [
         order[index] for index in np.unique(np.linspace(0, len(order) - 1, MOMENTS).astype(int))
     ]
-    albedo, _ = bake_albedo(model, meshes[used], [moments[i] for i in used], appearance, side)
+    albedo, known = bake_albedo(model, meshes[used], [moments[i] for i in used], appearance, side)
+    if not known.any():
+        return
     names = [targets[index].observation.expression for index in used]
     write_appearance(out, albedo, appearance, names)
 

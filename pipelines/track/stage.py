@@ -68,7 +68,8 @@ def inputs(dataset: Dataset, item: str, config: TrackConfig) -> dict[str, Path |
         **source_files(config.landmarks),
     }
     mattes = dataset.item_dir("matte", item)
-    if config.silhouette_rounds and mattes.is_dir():
+    rounds = (config.silhouette_rounds, config.relief_rounds, config.photo_rounds)
+    if any(rounds) and mattes.is_dir():
         found["mattes"] = mattes
     if config.head != "procedural":
         found["head"] = Path(config.head).expanduser()

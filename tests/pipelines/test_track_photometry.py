@@ -39,7 +39,9 @@ def make_term(tie: float, sigma: float = 0.02, seed: int = 0):
     for camera, weight in zip(cameras, weights, strict=True):
         gain = rng.uniform(0.8, 1.25, 3)
         shade = np.tile(gain, (len(places), 1)) * (0.9 + 2.0 * places[:, :1])
-        image = smooth(picture(camera, colour=lambda p, g=gain: g * (0.9 + 2 * p[:, :1]) * paint(p)))
+        image = smooth(
+            picture(camera, colour=lambda p, g=gain: g * (0.9 + 2 * p[:, :1]) * paint(p))
+        )
         pictures.append(Picture(camera, image, weight, shade))
     values = np.stack([look(p.camera, p.image, places)[0] for p in pictures])
     albedo = robust_mean(values, np.stack([p.shade for p in pictures]), weights, 20.0)
@@ -158,7 +160,9 @@ def test_pictures_are_read_between_pixels_and_their_slope_is_exact() -> None:
     _, slope = look(camera, shot, places)
     for axis in range(3):
         step = 1e-8 * np.eye(3)[axis]
-        numeric = (look(camera, shot, places + step)[0] - look(camera, shot, places - step)[0]) / 2e-8
+        numeric = (
+            look(camera, shot, places + step)[0] - look(camera, shot, places - step)[0]
+        ) / 2e-8
         np.testing.assert_allclose(slope[..., axis], numeric, atol=1e-3 * np.abs(slope).max())
 
 
