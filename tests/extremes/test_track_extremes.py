@@ -19,6 +19,7 @@ from pipelines.track.relief import Relief
 from pipelines.track.samples import Visibility, spread
 from pipelines.track.shots import Shot, cut_shot
 from tests.pipelines.textured_scenes import (
+    ORIGIN,
     RADIUS,
     ball,
     ball_head,
@@ -33,7 +34,7 @@ CONFIG = TrackConfig(samples=600)
 FAR = (np.array([1000.0, 0, 0]), np.array([-400.0, 1000.0, 1000.0]))
 
 
-def take(camera, centre=np.zeros(3), mesh=None, alpha="true", image=None, side=512) -> Shot | None:
+def take(camera, centre=ORIGIN, mesh=None, alpha="true", image=None, side=512) -> Shot | None:
     """The stage's crop of a picture of the sphere, with its true matte if no other is given."""
     root = picture(camera, centre)
     levels = np.rint(255 * linear_to_srgb(root.astype(float) ** 2)).astype(np.uint8)
@@ -79,7 +80,7 @@ def positions_of(made: Target, mesh: np.ndarray) -> np.ndarray:
     return np.concatenate([np.zeros((68, 3)), mesh[made.vertices]])
 
 
-def head_mesh(offset: float = 0.003, centre=np.zeros(3)) -> np.ndarray:
+def head_mesh(offset: float = 0.003, centre=ORIGIN) -> np.ndarray:
     return ball_head().template.numpy() * (RADIUS + offset) / RADIUS + centre
 
 

@@ -86,7 +86,7 @@ def test_gains_have_mean_one_and_one_camera_has_none() -> None:
                     for s in seen])  # fmt: skip
     np.testing.assert_allclose(got.gains["x"], 1.0)
     many = estimate(moments()[0])
-    product = np.prod([gain for gain in many.gains.values()], axis=0)
+    product = np.prod(list(many.gains.values()), axis=0)
     np.testing.assert_allclose(product, 1.0, rtol=1e-9)
 
 

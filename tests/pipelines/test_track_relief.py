@@ -7,6 +7,7 @@ import pytest
 
 from pipelines.track.relief import Relief, make_relief, sweep
 from tests.pipelines.textured_scenes import (
+    ORIGIN,
     RADIUS,
     ball,
     picture,
@@ -19,7 +20,7 @@ from tests.pipelines.textured_scenes import (
 REACH = 0.006
 
 
-def search(cameras, images, radius=RADIUS + 0.003, weights=None, centre=np.zeros(3)):
+def search(cameras, images, radius=RADIUS + 0.003, weights=None, centre=ORIGIN):
     """Sweep from a sphere of another radius: the sweep, samples, places, normals."""
     vertices, faces = ball(radius, centre=centre)
     samples = places_on(faces, vertices - centre)

@@ -1,4 +1,4 @@
-"""A painted sphere in front of cameras, its pictures solved ray by ray, and a head of that shape."""
+"""A painted sphere before cameras, its pictures solved ray by ray, and a head of that shape."""
 
 from __future__ import annotations
 
@@ -92,7 +92,7 @@ def true_heights(places: np.ndarray, normals: np.ndarray, centre: np.ndarray = O
 
 
 def ball_head(rings: int = 24, regions: dict[str, np.ndarray] | None = None) -> HeadModel:
-    """A head that is the sphere, its map latitude over longitude, v up; all face if nothing else."""
+    """A head that is the sphere, its map latitude over longitude; all face if nothing else."""
     vertices, faces = ball(rings=rings)
     model = tiny_head(vertices=len(vertices), seed=3)
     given = regions or {"face": np.ones(len(vertices), bool)}
