@@ -12,6 +12,8 @@ import numpy as np
 
 LIGHT_FLOOR = 0.05
 RIDGE = 0.02
+# Taking turns closes about a quarter of what gains are off, a round: after two, 4 to 8 % was left.
+ROUNDS = 10
 OUTLIER = 2.5
 NOISE_FLOOR = 0.002
 EVEN_LIGHT = np.repeat(np.eye(9)[:, :1], 3, axis=1)
@@ -66,7 +68,7 @@ def estimate(moments: list[Seen], before: Appearance | None = None) -> Appearanc
     gains = {name: np.ones(3) for name in cameras} | (before.gains if before else {})
     count = moments[0].normals.shape[0]
     appearance = Appearance(light, gains, np.full((count, 3), np.nan))
-    for _ in range(2):
+    for _ in range(ROUNDS):
         appearance = _with_albedo(appearance, moments)
         appearance = _with_gains(appearance, moments)
         appearance = _with_light(appearance, moments)
@@ -89,7 +91,7 @@ def residuals(appearance: Appearance, seen: Seen, albedo: np.ndarray) -> np.ndar
     for camera_id, value in zip(seen.cameras, seen.values, strict=True):
         model = appearance.shade(camera_id, seen.normals) * albedo
         rows.append(np.sqrt(np.nan_to_num((value - model) ** 2).sum(1)))
-    return np.stack(rows)
+    return np.array(rows).reshape(-1, len(seen.normals))
 
 
 def spread_of(lengths: np.ndarray, weights: np.ndarray) -> float:
@@ -127,7 +129,8 @@ def _first_light(moments: list[Seen]) -> np.ndarray:
 def _ridge_fit(B: np.ndarray, target: np.ndarray, w: np.ndarray, start: np.ndarray) -> np.ndarray:
     """Weighted least squares (9, 3), drawn gently to a start."""
     weighted = B * w[:, None]
-    pull = RIDGE * float(w.sum()) * np.eye(9)
+    # Where nothing is seen the start stays.
+    pull = (RIDGE * float(w.sum()) + 1e-9) * np.eye(9)
     return np.linalg.solve(weighted.T @ B + pull, weighted.T @ target + pull @ start)
 
 
@@ -151,6 +154,8 @@ def _with_gains(appearance: Appearance, moments: list[Seen]) -> Appearance:
             over[camera_id] += (weight[:, None] * expected * value).sum(0)
             under[camera_id] += (weight[:, None] * expected**2).sum(0)
     gains = {n: np.clip((over[n] + 1e-3) / (under[n] + 1e-3), 0.25, 4.0) for n in over}
+    if not gains:
+        return appearance
     mean = np.exp(np.mean([np.log(gain) for gain in gains.values()], axis=0))
     return Appearance(
         appearance.light, {n: gain / mean for n, gain in gains.items()}, appearance.albedo

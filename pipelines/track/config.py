@@ -53,6 +53,8 @@ class TrackConfig:
     """Trust in the photometric term."""
     photo_tie: float = 0.3
     """How firmly a moment's colours are tied to those of the other moments, 0 to 1."""
+    texture_side: int = 512
+    """Texels a side of the texture of the subject's colours (albedo.png); 0 for none."""
     round_iterations: int = 4
     """Levenberg-Marquardt steps a round of outlines and colours."""
     min_score: float = 0.2
@@ -99,6 +101,8 @@ class TrackConfig:
             )
         if min(self.offset_sigma, self.offset_length, self.relief_reach, self.detail_radius) <= 0:
             raise ConfigError("track: lengths (offset_*, relief_reach, detail_radius) must be > 0")
+        if not 0 <= self.texture_side <= 8192:
+            raise ConfigError("track: texture_side must be 0 to 8192")
         if not 100 <= self.samples <= 30_000 or not 32 <= self.photo_side <= 8192:
             raise ConfigError("track: samples must be 100 to 30000, photo_side 32 to 8192")
 

@@ -204,7 +204,10 @@ def _with_terms(
 ) -> list[Target]:
     """Photometric terms from the pictures' detail."""
     shades = [
-        np.stack([appearance.shade(name, one.normals) for name in one.cameras]) for one in moments
+        np.array([appearance.shade(name, one.normals) for name in one.cameras]).reshape(
+            one.values.shape
+        )
+        for one in moments
     ]
     sigma = _noise(moments, shades)
     means = [

@@ -198,7 +198,7 @@ def _tangent(normals: np.ndarray) -> np.ndarray:
     """A unit tangent (S, 3) to each normal, the same whichever camera asks."""
     axis = np.where(np.abs(normals[:, 1:2]) < 0.9, [[0.0, 1.0, 0.0]], [[1.0, 0.0, 0.0]])
     across = np.cross(axis, normals)
-    return across / np.linalg.norm(across, axis=1, keepdims=True)
+    return across / np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-12)
 
 
 def _project(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -19,6 +19,7 @@ from express50.index import index_path, read_index
 from express50.landmarks.sources import Source, open_source, source_files
 from express50.layout import Dataset
 from express50.stage import Stage
+from pipelines.track.bake import write_texture
 from pipelines.track.clips import write_clips
 from pipelines.track.config import PRESETS, TrackConfig
 from pipelines.track.fit import (
@@ -67,7 +68,8 @@ def inputs(dataset: Dataset, item: str, config: TrackConfig) -> dict[str, Path |
         **source_files(config.landmarks),
     }
     mattes = dataset.item_dir("matte", item)
-    if config.silhouette_rounds and mattes.is_dir():
+    rounds = (config.silhouette_rounds, config.relief_rounds, config.photo_rounds)
+    if any(rounds) and mattes.is_dir():
         found["mattes"] = mattes
     if config.head != "procedural":
         found["head"] = Path(config.head).expanduser()
@@ -97,6 +99,8 @@ def run(dataset: Dataset, item: str, config: TrackConfig, out: Path) -> dict:
     state, targets, appearance = refine(basis, targets, state, moments, eyes, config)
     vertices = all_vertices(basis.model, state)
     _write_track(out / "track.npz", config.head, basis, targets, state, vertices)
+    if appearance is not None and config.texture_side:
+        write_texture(out, basis.model, targets, vertices, moments, appearance, config.texture_side)
     metrics = _metrics(basis.model, targets, vertices, dropped)
     tiles = draw_overlays(dataset, item, out / "qc", basis.model, targets, vertices)
     write_sheet(out / "qc", tiles, metrics["landmark_rms_px"])
@@ -242,7 +246,7 @@ def _moments(
             alpha = read_alpha(path) if path.is_file() else None
             if alpha is not None and config.silhouette_rounds:
                 distances.append(signed_distance(alpha, camera))
-            if config.photo_rounds:
+            if config.photo_rounds or config.relief_rounds:
                 shots.append(
                     _shot(dataset, subject, camera, observation.frame, alpha, mesh, config)
                 )

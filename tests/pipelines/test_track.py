@@ -347,15 +347,17 @@ def test_stage_writes_the_contracted_file(tracked_dataset, tmp_path: Path) -> No
     from pipelines.track import STAGE
 
     dataset, scene = tracked_dataset
+    quick = TrackConfig(silhouette_rounds=0, relief_rounds=1, photo_rounds=1, texture_side=64)
     outputs = []
     for attempt in range(2):
         out = tmp_path / f"out{attempt}"
         out.mkdir()
-        metrics = STAGE.run(dataset, "S001", TrackConfig(silhouette_rounds=0), out)
+        metrics = STAGE.run(dataset, "S001", quick, out)
         outputs.append({file.name: file.read_bytes() for file in sorted(out.rglob("*.*"))})
     assert outputs[0] == outputs[1]
     assert set(outputs[0]) == {
         "track.npz", "overlay_neutral.jpg", "overlay_smile.jpg", "sheet.jpg",
+        "albedo.png", "appearance.npz",
     }  # fmt: skip
     assert set(metrics["landmark_rms_px"]) == {"neutral", "smile"}
     with np.load(tmp_path / "out0" / "track.npz", allow_pickle=False) as track:
