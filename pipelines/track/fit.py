@@ -218,10 +218,10 @@ def _shared_weights(
 ) -> np.ndarray:
     """Inverse variances (S + 204,) of the shared unknowns.
 
-    Where the bias is taken as known, what the detector errs in all frames alike must not be taken
-    for shape: more expressions are then no more evidence of it.
+    What is read wrongly off a face is read wrongly in all expressions alike, be it by the detector
+    or by a search that highlights mislead: more of them are no more evidence of the shape.
     """
-    shape = np.full(basis.shape_size, config.shape_prior * (1 if free_bias else expressions))
+    shape = np.full(basis.shape_size, config.shape_prior * expressions)
     bias = np.full((68, 3), config.landmark_bias if free_bias else KNOWN_BIAS_M)
     bias[:17] /= config.contour_weight
     return np.r_[shape, bias.ravel() ** -2]
