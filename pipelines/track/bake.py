@@ -17,7 +17,7 @@ from express50.mesh_raster import rasterize
 from pipelines.track.appearance import Appearance, Seen
 from pipelines.track.fit import Target
 from pipelines.track.photometry import look, robust_mean
-from pipelines.track.refine import Moment, _inside
+from pipelines.track.refine import Moment, inside_picture
 from pipelines.track.samples import Samples, Visibility, sample_normals
 from pipelines.track.shots import Shot, root_light
 
@@ -163,7 +163,7 @@ def _seen(scene: _Scene, texels: Samples) -> Seen:
     weights = np.zeros((len(scene.shots), len(places)))
     values = np.zeros((*weights.shape, 3))
     for row, (shot, (image, camera)) in enumerate(zip(scene.shots, scene.images, strict=True)):
-        weight = scene.visibility.weights(camera, places, facets) * _inside(shot, places)
+        weight = scene.visibility.weights(camera, places, facets) * inside_picture(shot, places)
         chosen = np.flatnonzero(weight)
         weights[row] = weight
         values[row, chosen] = look(camera, image, places[chosen])[0]

@@ -111,7 +111,7 @@ PRESETS: dict[str, dict[str, object]] = {
     "draft": {
         "cameras": 6, "refinements": 2, "iterations": 8, "silhouette_rounds": 2,
         "relief_rounds": 4, "photo_rounds": 0, "samples": 2000, "offset_modes": 80,
-        "round_iterations": 2, "sweeps": 1,
+        "round_iterations": 2, "sweeps": 1, "texture_side": 256,
     },
     "standard": {},
     "reference": {

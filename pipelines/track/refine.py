@@ -268,12 +268,14 @@ def _see(
     visibility = Visibility(mesh, model.faces.numpy())
     weights = np.zeros((len(images), len(places)))
     for row, shot in enumerate(moment.shots):
-        weights[row] = visibility.weights(shot.camera, places, normals) * _inside(shot, places)
+        weights[row] = visibility.weights(shot.camera, places, normals) * inside_picture(
+            shot, places
+        )
     names = tuple(shot.camera_id for shot in moment.shots)
     return Seen(names, _values(places, images), weights, normals)
 
 
-def _inside(shot: Shot, places: np.ndarray) -> np.ndarray:
+def inside_picture(shot: Shot, places: np.ndarray) -> np.ndarray:
     """(S,) 0 outside the picture or where the matte says that there is no subject, else to 1."""
     camera = shot.camera
     local = places @ camera.cam_from_world[:3, :3].T + camera.cam_from_world[:3, 3]
