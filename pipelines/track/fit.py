@@ -16,6 +16,7 @@ from express50.errors import StageError
 from express50.transforms import axis_angle_to_matrix
 from pipelines.track.config import TrackConfig
 from pipelines.track.observe import Observation, Terms, pixel_slope, project_pinhole
+from pipelines.track.offsets import MODE
 from pipelines.track.photometry import Photometry
 from pipelines.track.priors import prior
 from pipelines.track.relief import Relief
@@ -23,6 +24,7 @@ from pipelines.track.sparse_head import POSE_SIZE, Basis, Points
 
 HUBER = 1.5
 KNOWN_BIAS_M = 1e-6
+KNOWN_MODE = 1e8
 REJECT_SIGMA, REJECT_SHARE = 4.0, 0.12
 
 
@@ -222,6 +224,8 @@ def _shared_weights(
     or by a search that highlights mislead: more of them are no more evidence of the shape.
     """
     shape = np.full(basis.shape_size, config.shape_prior * expressions)
+    if not free_bias:  # landmarks and outlines tell nothing of the offsets between them
+        shape[[name.startswith(MODE) for name in basis.model.shape_names]] = KNOWN_MODE
     bias = np.full((68, 3), config.landmark_bias if free_bias else KNOWN_BIAS_M)
     bias[:17] /= config.contour_weight
     return np.r_[shape, bias.ravel() ** -2]

@@ -159,7 +159,7 @@ def test_empty_mattes_show_nobody() -> None:
     made, appearance = compare(shots, mesh)
     assert made.terms == () and np.isfinite(appearance.light).all()
     assert signed_distance(empty, rig()[0]) is None
-    outlined = with_outlines(ball_head(), [bare_target()], [Moment((), ())], mesh[None])
+    outlined = with_outlines(ball_head(), [bare_target()], [Moment((), ())], mesh[None], bald=False)
     assert outlined[0].outlines == () and len(outlined[0].vertices) == 0
 
 
