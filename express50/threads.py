@@ -9,6 +9,8 @@ from __future__ import annotations
 import os
 import sys
 
+from threadpoolctl import threadpool_limits
+
 VARIABLES = (
     "OMP_NUM_THREADS",
     "OPENBLAS_NUM_THREADS",
@@ -28,6 +30,10 @@ def thread_environment(threads: int) -> dict[str, str]:
 def cap_threads(threads: int) -> None:
     """Cap pools in this process: by environment, and directly where a library is loaded already."""
     os.environ.update(thread_environment(threads))
+    # A BLAS that is loaded already does not look at the environment; on other numbers of threads it
+    # adds up in another order, and bytes would depend on where an item was worked on.
+    if "numpy" in sys.modules:
+        threadpool_limits(threads, user_api="blas")
     # sys.modules is asked, because importing torch only to cap it would cost seconds.
     if "torch" in sys.modules:
         sys.modules["torch"].set_num_threads(threads)
