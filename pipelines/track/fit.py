@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+import torch
 
 from express50.cameras import Camera
 from express50.errors import StageError
@@ -289,10 +290,19 @@ def _add(
     """Add points' information (n, 3, 3), (n, 3) through their Jacobian rows (n, 3, D), in place."""
     size = rows.shape[2]
     # Single precision is plenty: what matters is where the gradient, however scaled, is zero.
-    single = rows.astype(np.float32, copy=False)
-    weighted = matrix.astype(np.float32) @ single
+    single = _aligned(rows)
+    weighted = _aligned(matrix.astype(np.float32) @ single)
     hessian += single.reshape(-1, size).T @ weighted.reshape(-1, size)
-    gradient += pull.astype(np.float32).reshape(-1) @ single.reshape(-1, size)
+    gradient += _aligned(pull).reshape(-1) @ single.reshape(-1, size)
+
+
+def _aligned(array: np.ndarray) -> np.ndarray:
+    """A single precision copy at a 64-byte boundary: BLAS rounds otherwise where arrays lie
+    otherwise, and the same data must give the same bytes.
+    """
+    copy = torch.empty(array.shape, dtype=torch.float32).numpy()
+    copy[...] = array
+    return copy
 
 
 def _of_samples(

@@ -333,9 +333,9 @@ def rotations(state: State) -> np.ndarray:
 
 def all_vertices(model: HeadModel, state: State) -> np.ndarray:
     """World vertices (E, V, 3) of every expression."""
-    own = torch.from_numpy(np.stack([item.own for item in state.poses]))
+    own = torch.from_numpy(np.stack([item.own for item in state.poses])).clone()
     count = model.expression_dirs.shape[2]
-    shape = torch.from_numpy(state.shape)[None].expand(len(own), -1)
+    shape = torch.from_numpy(state.shape).clone()[None].expand(len(own), -1)
     angles = own[:, count : count + POSE_SIZE - 6]
     with torch.inference_mode():
         head = pose(

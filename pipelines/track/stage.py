@@ -52,6 +52,7 @@ from pipelines.track.suspects import suspect_cameras
 
 SCHEMA = "express50.track/2"
 MIN_FACING = 0.05
+DECIMALS = 7
 
 
 def items(dataset: Dataset) -> list[str]:
@@ -308,6 +309,9 @@ def _write_track(
     for name, array in arrays.items():
         if array.dtype.kind == "f" and not np.isfinite(array).all():
             raise StageError(f"{name} holds NaN or infinite values; the fit diverged")
+        if array.dtype == np.float64:
+            # Where an array lies in memory moves BLAS's last digits (1e-13); files must not follow.
+            arrays[name] = array.round(DECIMALS)
     np.savez(path, **arrays)  # type: ignore[arg-type]  # numpy types its options only
 
 
