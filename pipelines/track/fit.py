@@ -10,7 +10,6 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-import torch
 
 from express50.cameras import Camera
 from express50.errors import StageError
@@ -267,8 +266,7 @@ def _normal_equations(
     blocks = _outline_blocks(target, positions)
     count = max((int(used.max()) + 1 for used, _, _ in blocks if len(used)), default=0)
     terms = [(jacobian[:count], *_information(blocks, count))]
-    single = jacobian.astype(np.float32)
-    terms += [_of_samples(term, positions, single) for term in target.terms]
+    terms += [_of_samples(term, positions, jacobian) for term in target.terms]
     base, slope = np.zeros((len(columns), len(columns))), np.zeros(len(columns))
     for term in terms:
         _add(base, slope, *term)
@@ -289,29 +287,18 @@ def _add(
 ) -> None:
     """Add points' information (n, 3, 3), (n, 3) through their Jacobian rows (n, 3, D), in place."""
     size = rows.shape[2]
-    # Single precision is plenty: what matters is where the gradient, however scaled, is zero.
-    single = _aligned(rows)
-    weighted = _aligned(matrix.astype(np.float32) @ single)
-    hessian += single.reshape(-1, size).T @ weighted.reshape(-1, size)
-    gradient += _aligned(pull).reshape(-1) @ single.reshape(-1, size)
-
-
-def _aligned(array: np.ndarray) -> np.ndarray:
-    """A single precision copy at a 64-byte boundary: BLAS rounds otherwise where arrays lie
-    otherwise, and the same data must give the same bytes.
-    """
-    copy = torch.empty(array.shape, dtype=torch.float32).numpy()
-    copy[...] = array
-    return copy
+    flat = rows.reshape(-1, size).astype(np.float64, copy=False)
+    hessian += flat.T @ (matrix @ rows).reshape(-1, size)
+    gradient += pull.reshape(-1) @ flat
 
 
 def _of_samples(
     term: Photometry | Relief, positions: np.ndarray, jacobian: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The samples' Jacobian (S, 3, D) and information (S, 3, 3), (S, 3)."""
-    moved = np.zeros((len(term.rows), *jacobian.shape[1:]), np.float32)
+    moved = np.zeros((len(term.rows), *jacobian.shape[1:]))
     for corner in range(3):
-        share = term.bary[:, corner, None, None].astype(np.float32)
+        share = term.bary[:, corner, None, None]
         moved += share * jacobian[term.rows[:, corner]]
     return moved, *term.normal(positions)
 
@@ -351,6 +338,14 @@ def _moved(pose: Pose, change: np.ndarray) -> Pose:
     rotation = axis_angle_to_matrix(own[turn]) @ pose.rotation
     own[turn] = 0.0
     return replace(pose, own=own, rotation=rotation)
+
+
+def rounded(state: State, decimals: int) -> State:
+    """The state with its last digits dropped, which follow from where BLAS found its arrays."""
+    poses = tuple(
+        Pose(pose.own.round(decimals), pose.rotation.round(decimals)) for pose in state.poses
+    )
+    return State(state.shape.round(decimals), poses, state.bias.round(decimals))
 
 
 def start_state(basis: Basis, poses: list[tuple[np.ndarray, np.ndarray]]) -> State:

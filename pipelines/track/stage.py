@@ -28,6 +28,7 @@ from pipelines.track.fit import (
     consistent_sigma,
     fit,
     landmark_sigma,
+    rounded,
     start_state,
 )
 from pipelines.track.marks import Eyes, measure_eyes
@@ -98,6 +99,7 @@ def run(dataset: Dataset, item: str, config: TrackConfig, out: Path) -> dict:
     eyes = measure_eyes(basis.model, targets, meshes, rotations(state))
     moments = _moments(dataset, item, targets, meshes, config)
     state, targets, appearance = refine(basis, targets, state, moments, eyes, config)
+    state = rounded(state, DECIMALS)
     vertices = all_vertices(basis.model, state)
     _write_track(out / "track.npz", config.head, basis, targets, state, vertices)
     if appearance is not None and config.texture_side:
@@ -309,9 +311,6 @@ def _write_track(
     for name, array in arrays.items():
         if array.dtype.kind == "f" and not np.isfinite(array).all():
             raise StageError(f"{name} holds NaN or infinite values; the fit diverged")
-        if array.dtype == np.float64:
-            # Where an array lies in memory moves BLAS's last digits (1e-13); files must not follow.
-            arrays[name] = array.round(DECIMALS)
     np.savez(path, **arrays)  # type: ignore[arg-type]  # numpy types its options only
 
 
