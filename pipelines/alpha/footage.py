@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from express50.images import edge_distance
 from pipelines.alpha.key import dilated, eroded
 from pipelines.alpha.plate import MOST_NOISE, exposed, exposure_gain
 
@@ -137,7 +138,7 @@ def _completed(plate: np.ndarray, known: np.ndarray) -> FootagePlate:
         return FootagePlate(plate, known, 0.0)
     image = plate.astype(np.float32)
     # As wide a rim is hidden as half of what has to be bridged.
-    depth = cv2.distanceTransform((~known).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    depth = edge_distance(~known)
     hidden = known & dilated(~known, max(1.0, float(depth.max()) / 2))
     rest = known & ~hidden
     doubt = 255.0

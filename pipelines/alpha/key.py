@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from express50.images import edge_distance
 from pipelines.alpha.config import AlphaConfig
 from pipelines.alpha.opacity import (
     light_noise,
@@ -125,8 +126,7 @@ def eroded(mask: np.ndarray, radius: float) -> np.ndarray:
     """
     if mask.all():
         return mask > 0
-    distance = cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-    return distance > radius
+    return edge_distance(mask) > radius
 
 
 def dilated(mask: np.ndarray, radius: float) -> np.ndarray:

@@ -9,6 +9,7 @@ import numpy as np
 
 from express50.adapters import opencv_pixels_to_corner
 from express50.cameras import Camera, unproject
+from express50.images import edge_distance
 from express50.parts import HEAD, LABELS, label_mask
 from pipelines.regions.mesh import TrackedHead, see
 
@@ -100,14 +101,9 @@ def head_alpha(alpha: np.ndarray, labels: np.ndarray) -> np.ndarray:
     head, torso = label_mask(labels, *HEAD), label_mask(labels, "torso")
     if not head.any() or not torso.any():
         return alpha * np.float32(head.any())
-    nearer = _distance(torso) - _distance(head)
+    nearer = edge_distance(~torso) - edge_distance(~head)
     if labels.shape != alpha.shape:
         size = alpha.shape[1], alpha.shape[0]
         nearer = cv2.resize(nearer, size, interpolation=cv2.INTER_LINEAR)
         nearer *= max(alpha.shape) / max(labels.shape)
     return alpha * np.clip(0.5 + nearer / 2, 0, 1).astype(np.float32)
-
-
-def _distance(mask: np.ndarray) -> np.ndarray:
-    """Distance (H, W) to the nearest pixel of a mask (H, W)."""
-    return cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)

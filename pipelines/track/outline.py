@@ -15,6 +15,7 @@ import open3d as o3d
 
 from express50.cameras import Camera, resized
 from express50.head.model import HeadModel
+from express50.images import edge_distance
 from express50.raycast import mesh_scene
 
 # Head outlines count as about this many independent points a view.
@@ -112,13 +113,11 @@ def signed_distance(alpha: np.ndarray, camera: Camera, side: int = 640) -> Signe
     if step > 1.0:
         size = (max(1, round(alpha.shape[1] / step)), max(1, round(alpha.shape[0] / step)))
         alpha = cv2.resize(alpha, size, interpolation=cv2.INTER_AREA)
-    inside = (alpha >= 128).astype(np.uint8)
+    inside = alpha >= 128
     if inside.all() or not inside.any():
         return None
     # Distances are to the nearest pixel of the other side, half a pixel beyond the edge.
-    out = cv2.distanceTransform(1 - inside, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-    back = cv2.distanceTransform(inside, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-    values = np.where(inside > 0, 0.5 - back, out - 0.5).astype(np.float32)
+    values = np.where(inside, 0.5 - edge_distance(inside), edge_distance(~inside) - 0.5)
     # Full pixels know no part cover; a light blur gives the edge its slope back.
     return SignedDistance(cv2.GaussianBlur(values, (0, 0), 0.8) * step, camera, step)
 
@@ -209,5 +208,4 @@ def _mask_distance(vertices: np.ndarray, faces: np.ndarray, camera: Camera) -> n
         width_px=camera.width,
         height_px=camera.height,
     )
-    mask = scene.test_occlusions(rays).numpy().astype(np.uint8)
-    return cv2.distanceTransform(mask, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    return edge_distance(scene.test_occlusions(rays).numpy())

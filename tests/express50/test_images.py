@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.ndimage import distance_transform_edt
 
 from express50 import images
 from express50.errors import FormatError
@@ -83,3 +84,14 @@ def test_contact_sheet_pads_short_rows():
     row = [np.zeros((10, 20, 3), np.uint8)] * 3
     sheet = images.contact_sheet([row, row[:1]], labels=["a", "b"], tile=(40, 50))
     assert sheet.shape == (80, 150, 3)
+
+
+def test_distances_to_an_edge_are_the_same_wherever_a_mask_lies():
+    """OpenCV's own differ in the last bit with the addresses of its arrays."""
+    mask = np.hypot(*(np.mgrid[:97, :83] - 45.0)) < 31.0
+    expected = distance_transform_edt(mask).astype(np.float32)
+    for offset in range(0, 64, 8):
+        room = np.zeros(mask.size + 64, bool)
+        placed = room[offset : offset + mask.size].reshape(mask.shape)
+        placed[:] = mask
+        assert images.edge_distance(placed).tobytes() == expected.tobytes()
