@@ -60,6 +60,11 @@ def corner_to_cell(places: Places) -> Places:
     return places - 0.5  # type: ignore[operator,return-value]
 
 
+def cell_to_corner(indices: Places) -> Places:
+    """Corner-origin places of fractional indices: the inverse of ``corner_to_cell``."""
+    return indices + 0.5  # type: ignore[operator,return-value]
+
+
 def cell_centres(count: int) -> np.ndarray:
     """Corner-origin places (count,) of the centres of a row of cells."""
     return np.arange(count) + 0.5

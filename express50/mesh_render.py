@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from express50.adapters import cell_to_corner
 from express50.mesh_raster import Raster
 from express50.mesh_rows import weigh_rows
 
@@ -57,7 +58,8 @@ def covered(raster: Raster, device: torch.device | str = "cpu") -> Covered:
     group = np.repeat(np.arange(len(seen)), counts)
     pairs = np.zeros((0, 4)) if raster.pairs is None else raster.pairs
     height, width = raster.face_id.shape
-    centres = np.stack([pixels % width + 0.5, pixels // width + 0.5], axis=1).astype(np.float32)
+    centres = cell_to_corner(np.stack([pixels % width, pixels // width], axis=1))
+    centres = centres.astype(np.float32)
 
     def moved(array: np.ndarray) -> Tensor:
         return torch.from_numpy(array.astype(np.int64)).to(device)
@@ -176,7 +178,7 @@ def crossings(seen: Covered, vertices: Tensor, K: Tensor, cam_from_world: Tensor
     focal = torch.stack([K[0, 0], K[1, 1]])
     p, q = (ends[..., :2] / ends[..., 2:] * focal + K[:2, 2]).unbind(1)
     place = torch.stack([seen.pairs[:, :2] % seen.width, seen.pairs[:, :2] // seen.width], dim=-1)
-    a, b = (place.to(p.dtype) + 0.5).unbind(1)
+    a, b = cell_to_corner(place.to(p.dtype)).unbind(1)
     horizontal = a[:, 1] == b[:, 1]
     p, q, a, b = (torch.where(horizontal[:, None], x, x.flip(1)) for x in (p, q, a, b))
     # now the step is along the first coordinate and the edge is steep along the second

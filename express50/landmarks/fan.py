@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 import torch
 
-from express50.adapters import affine_to_opencv
+from express50.adapters import affine_to_opencv, cell_to_corner
 from express50.errors import ConfigError
 from express50.landmarks.detector import Detection
 
@@ -97,7 +97,7 @@ def _peak(heat: np.ndarray) -> tuple[np.ndarray, float, float]:
     columns = slice(max(column - REACH, 0), column + REACH + 1)
     share = np.clip(heat[rows, columns], 0.0, None)
     total = max(float(share.sum()), 1e-12)
-    y, x = np.mgrid[rows, columns][:, : share.shape[0], : share.shape[1]] + 0.5
+    y, x = cell_to_corner(np.mgrid[rows, columns][:, : share.shape[0], : share.shape[1]])
     place = np.array([(share * x).sum(), (share * y).sum()]) / total
     variance = float((share * ((x - place[0]) ** 2 + (y - place[1]) ** 2)).sum()) / total
     return place, (0.5 * variance) ** 0.5, float(heat[row, column])

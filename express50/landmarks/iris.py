@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from express50.adapters import affine_to_opencv
+from express50.adapters import affine_to_opencv, cell_to_corner
 from express50.landmarks.detector import Detection
 
 # Subject's left eye first, as the model's joints have it: corners, then the points of each lid.
@@ -150,7 +150,7 @@ def _disc(crop: np.ndarray, mask: np.ndarray) -> tuple[np.ndarray, float, float]
         score = contrast * np.sqrt(np.clip(within * around, 0.0, None)) * (mask > 0)
         row, column = np.unravel_index(int(np.argmax(score)), score.shape)
         if score[row, column] > best[0]:
-            place = np.array([column, row]) + 0.5 + _peak(score, int(row), int(column))
+            place = cell_to_corner(np.array([column, row])) + _peak(score, int(row), int(column))
             best = (
                 float(score[row, column]), place,
                 float(contrast[row, column]), float(min(within[row, column], 1.0)),

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import torch
 
+from express50.adapters import cell_to_corner
 from express50.cameras import Camera
 from express50.errors import StageError
 from express50.head.model import HeadModel, vertex_normals
@@ -126,7 +127,7 @@ def texel_samples(model: HeadModel, side: int) -> tuple[Samples, np.ndarray]:
     face_id = rasterize(flat, uv_faces, camera, pairs=False).face_id
     texture = np.argwhere(face_id >= 0)
     faces = face_id[tuple(texture.T)].astype(np.int64)
-    at = (texture[:, ::-1] + 0.5) / side
+    at = cell_to_corner(texture[:, ::-1]) / side
     a, b, c = np.moveaxis(flat[uv_faces[faces], :2], 1, 0)
     u, v, w = b - a, c - a, at - a
     area = u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]
@@ -150,7 +151,7 @@ class _Scene:
 
 def _scene(model: HeadModel, moment: Moment, mesh: np.ndarray) -> _Scene:
     normals = vertex_normals(torch.from_numpy(mesh)[None], model.faces)[0].numpy()
-    images = [root_light(shot, 0) for shot in moment.shots]
+    images = [root_light(shot) for shot in moment.shots]
     return _Scene(mesh, normals, moment.shots, images, Visibility(mesh, model.faces.numpy()))
 
 

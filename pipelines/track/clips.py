@@ -19,6 +19,7 @@ from pipelines.track.config import TrackConfig
 from pipelines.track.fit import Pose, State
 from pipelines.track.marks import Eyes
 from pipelines.track.observe import Observation
+from pipelines.track.offsets import split_shape
 from pipelines.track.sequence import (
     Window,
     freeze_shape,
@@ -43,18 +44,17 @@ def write_clips(
     keep: Path,
     inputs: dict[str, Path | str],
     eyes: Eyes | None,
-    shape: np.ndarray,
 ) -> dict:
     """Track clips, write out/sequence.npz and return the metrics; see `track_clips`.
 
-    `inputs` is what the stage reads: windows kept by a run with other inputs are not used. `shape`
-    (S,) are the head's own coefficients, to be written beside the frames.
+    `inputs` is what the stage reads: windows kept by a run with other inputs are not used. The
+    head's own shape coefficients (S,) are written beside the frames.
     """
     digests = {name: path_digest(p) if isinstance(p, Path) else p for name, p in inputs.items()}
     arrays, account = track_clips(
         basis, state, cues, observe, config, keep, value_digest(digests), eyes
     )
-    arrays |= {"shape": shape}
+    arrays |= {"shape": split_shape(basis.model, state.shape)[0]}
     np.savez(out / "sequence.npz", **arrays)  # type: ignore[arg-type]  # numpy types its options
     # A crash before the stage's outputs are published costs no more than these last windows.
     shutil.rmtree(keep, ignore_errors=True)

@@ -48,7 +48,7 @@ class TrackConfig:
     relief_weight: float = 1.0
     """Trust in the searched surface."""
     detail_radius: float = 0.003
-    """Marks of the skin smaller than this are compared, metres; doubled at each coarser level."""
+    """Marks of the skin smaller than this are compared, metres."""
     photo_weight: float = 0.1
     """Trust in the photometric term."""
     photo_tie: float = 0.3

@@ -11,13 +11,13 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from express50.cameras import Camera
 from express50.errors import StageError
 from express50.transforms import axis_angle_to_matrix
 from pipelines.track.config import TrackConfig
-from pipelines.track.observe import Observation, Terms, pixel_slope, project_pinhole
+from pipelines.track.observe import Observation, Terms
 from pipelines.track.offsets import MODE
 from pipelines.track.photometry import Photometry
+from pipelines.track.pinhole import project_pinhole, project_with_slope
 from pipelines.track.priors import prior
 from pipelines.track.relief import Relief
 from pipelines.track.sparse_head import POSE_SIZE, Basis, Points
@@ -25,6 +25,7 @@ from pipelines.track.sparse_head import POSE_SIZE, Basis, Points
 HUBER = 1.5
 KNOWN_BIAS_M = 1e-6
 KNOWN_MODE = 1e8
+BIAS = 68 * 3
 REJECT_SIGMA, REJECT_SHARE = 4.0, 0.12
 
 
@@ -76,7 +77,8 @@ def fit(
 ) -> tuple[State, float]:
     """Minimise robust residuals plus priors from a start.
 
-    `free_bias` lets the detector err on this face; only pictures of its surface can tell that.
+    `free_bias` lets the detector err on this face and the surface leave the model's shapes by its
+    offset modes; only pictures of the surface can tell either.
 
     Returns:
         The fitted state and its cost (half the sum of squared, robustly weighted residuals).
@@ -142,10 +144,6 @@ def consistent_sigma(target: Target, marks: np.ndarray) -> np.ndarray:
     return sigma if np.isfinite(sigma).any() else target.sigma
 
 
-def _parameters(basis: Basis, shared: np.ndarray, pose: Pose) -> np.ndarray:
-    return np.concatenate([shared[: basis.shape_size], pose.own])
-
-
 def _landmarks(basis: Basis, positions: np.ndarray, state: State, pose: Pose) -> np.ndarray:
     """Where the detector would put the landmarks (68, 3): the head's, plus what it always errs."""
     return positions[:68] + (basis.bias + state.bias) @ pose.rotation.T
@@ -168,12 +166,7 @@ def _landmark_blocks(
 def _outline_blocks(
     target: Target, positions: np.ndarray
 ) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    return [outline.residuals(positions, project_with_slope) for outline in target.outlines]
-
-
-def project_with_slope(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels (N, 2) of world points (N, 3) and d pixel / d point (N, 2, 3), pinhole."""
-    return project_pinhole(camera, points)[0], pixel_slope(camera, points)
+    return [outline.residuals(positions) for outline in target.outlines]
 
 
 def _robust(residual: np.ndarray) -> np.ndarray:
@@ -196,11 +189,11 @@ def _cost(
     config: TrackConfig,
     weights: np.ndarray,
 ) -> float:
-    """Total cost of a state; `weights` (S + 204,) are of the prior on shape and bias."""
+    """Total cost of a state; `weights` (S + BIAS,) are of the prior on shape and bias."""
     shared = _shared(state) * np.sqrt(weights)
     total = 0.5 * float(shared @ shared)
     for target, model, pose in zip(targets, points, state.poses, strict=True):
-        positions = model.evaluate(_parameters(basis, state.shape, pose), pose.rotation)
+        positions = model.evaluate(np.r_[state.shape, pose.own], pose.rotation)
         blocks = _landmark_blocks(target, _landmarks(basis, positions, state, pose))
         blocks += _outline_blocks(target, positions)
         total += sum(_huber_cost(residual) for _, residual, _ in blocks)
@@ -218,7 +211,7 @@ def _shared(state: State) -> np.ndarray:
 def _shared_weights(
     basis: Basis, expressions: int, config: TrackConfig, free_bias: bool
 ) -> np.ndarray:
-    """Inverse variances (S + 204,) of the shared unknowns.
+    """Inverse variances (S + BIAS,) of the shared unknowns.
 
     What is read wrongly off a face is read wrongly in all expressions alike, be it by the detector
     or by a search that highlights mislead: more of them are no more evidence of the shape.
@@ -251,10 +244,10 @@ def _information(
 def _normal_equations(
     basis: Basis, target: Target, model: Points, pose: Pose, state: State, config: TrackConfig
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Hessian and gradient of one expression: shape (S), bias (204), own (X + 18)."""
-    positions, jacobian = model.linearise(_parameters(basis, state.shape, pose), pose.rotation)
-    shapes, size = basis.shape_size, jacobian.shape[2] + 204
-    columns = np.r_[:shapes, shapes + 204 : size]
+    """Hessian and gradient of one expression: shape (S), bias (BIAS), own (X + 18)."""
+    positions, jacobian = model.linearise(np.r_[state.shape, pose.own], pose.rotation)
+    shapes, size = basis.shape_size, jacobian.shape[2] + BIAS
+    columns = np.r_[:shapes, shapes + BIAS : size]
     hessian, gradient = np.zeros((size, size)), np.zeros(size)
     marks = _landmarks(basis, positions, state, pose)
     matrix, pull = _information(_landmark_blocks(target, marks), 68)
@@ -287,7 +280,7 @@ def _add(
 ) -> None:
     """Add points' information (n, 3, 3), (n, 3) through their Jacobian rows (n, 3, D), in place."""
     size = rows.shape[2]
-    flat = rows.reshape(-1, size).astype(np.float64, copy=False)
+    flat = rows.reshape(-1, size)
     hessian += flat.T @ (matrix @ rows).reshape(-1, size)
     gradient += pull.reshape(-1) @ flat
 
@@ -312,7 +305,7 @@ def _step(
 ) -> State:
     """One damped Gauss-Newton step, expressions eliminated."""
     shapes = basis.shape_size
-    shared = shapes + 204
+    shared = shapes + BIAS
     reduced, right = np.diag(weights), -weights * _shared(state)
     eliminated = []
     for hessian, gradient in system:

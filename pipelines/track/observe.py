@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import Protocol
@@ -12,6 +11,7 @@ import numpy as np
 from express50.cameras import Camera, triangulate
 from express50.landmarks.iris import Irises
 from express50.landmarks.sources import Marked
+from pipelines.track.pinhole import project_pinhole, project_with_slope
 
 PAIR_LIMIT = 120
 INLIER_SIGMA = 3.5
@@ -74,9 +74,7 @@ class Observation:
 class Terms(Protocol):
     """What a fit is pulled by beside its landmarks: outlines, marks, neighbouring frames."""
 
-    def residuals(
-        self, positions: np.ndarray, project: Callable
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def residuals(self, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Block (index (n,), residual (n, k), slope (n, k, 3)) of all points' positions (P, 3)."""
 
 
@@ -96,11 +94,9 @@ class Marks:
     pixels: np.ndarray
     sigma: np.ndarray
 
-    def residuals(
-        self, positions: np.ndarray, project: Callable
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def residuals(self, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Block (index (n,), residual (n, 2), slope (n, 2, 3)) of all points' positions (P, 3)."""
-        pixels, slope = project(self.camera, positions[self.index])
+        pixels, slope = project_with_slope(self.camera, positions[self.index])
         residual = (pixels - self.pixels) / self.sigma[:, None]
         return self.index, residual, slope / self.sigma[:, None, None]
 
@@ -191,7 +187,7 @@ def point_covariance(views: list[View], points: np.ndarray, inliers: np.ndarray)
     known = np.isfinite(points).all(1)
     for view, used in zip(views, inliers, strict=True):
         chosen = np.flatnonzero(used & known & np.isfinite(view.sigma))
-        slope = pixel_slope(view.camera, points[chosen])
+        _, slope = project_with_slope(view.camera, points[chosen])
         weight = 1.0 / (view.crowd * view.sigma[chosen] ** 2)
         normal[chosen] += weight[:, None, None] * np.swapaxes(slope, 1, 2) @ slope
     covariance = np.full((68, 3, 3), np.nan)
@@ -253,22 +249,3 @@ def _squared_errors(views: list[View], candidates: np.ndarray) -> np.ndarray:
         squared = ((pixels - view.points) ** 2).sum(-1) / np.minimum(view.sigma, limit) ** 2
         errors[:, index] = np.where(depth > 0, squared, np.inf)
     return errors
-
-
-def pixel_slope(camera: Camera, points: np.ndarray) -> np.ndarray:
-    """Return d pixel / d point (N, 2, 3) at world points (N, 3) of an undistorted camera."""
-    rotation, K = camera.cam_from_world[:3, :3], camera.K
-    focal = K[[0, 1], [0, 1]]
-    pixels, depth = project_pinhole(camera, points)
-    safe = np.where(np.abs(depth) > 1e-9, depth, 1e-9)
-    ray = (pixels - K[:2, 2]) / focal
-    slope = (rotation[None, :2] - ray[..., None] * rotation[None, 2:3]) / safe[:, None, None]
-    return slope * focal[:, None]
-
-
-def project_pinhole(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels (..., 2) and depth (...) of world points (..., 3) in an undistorted camera."""
-    local = points @ camera.cam_from_world[:3, :3].T + camera.cam_from_world[:3, 3]
-    depth = local[..., 2]
-    safe = np.where(np.abs(depth) > 1e-9, depth, 1e-9)
-    return local[..., :2] / safe[..., None] * camera.K[[0, 1], [0, 1]] + camera.K[:2, 2], depth

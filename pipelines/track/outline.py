@@ -6,17 +6,18 @@ current mesh, so no point-to-point matching is needed and the residual is smooth
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 import open3d as o3d
 
+from express50.adapters import corner_to_cell
 from express50.cameras import Camera, resized
 from express50.head.model import HeadModel
 from express50.images import edge_distance
 from express50.raycast import mesh_scene
+from pipelines.track.pinhole import project_with_slope
 
 # Head outlines count as about this many independent points a view.
 EFFECTIVE_POINTS = 24
@@ -88,14 +89,12 @@ class Outline:
         gap = np.full(count, (BALD_GAP_M if bald else HAIR_GAP_M) * scale)
         return cls(distance, np.arange(first, first + count), sigma, gap)
 
-    def residuals(
-        self, positions: np.ndarray, project: Callable
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def residuals(self, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Block (index (n,), residual (n, 1), slope (n, 1, 3)) of all points' positions (P, 3).
 
         Inside the matte the squared residual is Geman and McClure's, v^2 / (1 + v^2 / gap^2).
         """
-        pixels, slope = project(self.distance.camera, positions[self.index])
+        pixels, slope = project_with_slope(self.distance.camera, positions[self.index])
         value, gradient = sample(self.distance, pixels)
         fade = 1.0 + np.where(value < 0, value / self.gap, 0.0) ** 2
         sigma = np.where(value < 0, self.sigma[:, 0], self.sigma[:, 1])
@@ -126,9 +125,8 @@ def sample(distance: SignedDistance, pixels: np.ndarray) -> tuple[np.ndarray, np
     """Bilinear value (n,) and gradient (n, 2) at full-size pixels (n, 2), clamped to the image."""
     values = distance.values
     height, width = values.shape
-    where = pixels / distance.step - 0.5
-    x = np.clip(where[:, 0], 0.0, width - 1.001)
-    y = np.clip(where[:, 1], 0.0, height - 1.001)
+    where = corner_to_cell(pixels / distance.step)
+    x, y = np.clip(where, 0.0, [width - 1.001, height - 1.001]).T
     column, row = x.astype(int), y.astype(int)
     fx, fy = x - column, y - row
     a, b = values[row, column], values[row, column + 1]

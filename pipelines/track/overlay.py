@@ -9,6 +9,7 @@ import numpy as np
 import open3d as o3d
 import torch
 
+from express50.adapters import affine_to_opencv
 from express50.cameras import Camera
 from express50.frames import read_cameras_of, read_frame
 from express50.head.model import HeadModel, landmarks
@@ -16,7 +17,7 @@ from express50.images import write_image
 from express50.layout import Dataset
 from express50.raycast import mesh_scene
 from pipelines.track.fit import Target
-from pipelines.track.observe import project_pinhole
+from pipelines.track.pinhole import project_pinhole
 
 TILE = 384
 SEEN_COLOR, FITTED_COLOR = (255, 210, 0), (0, 255, 120)
@@ -88,10 +89,8 @@ def draw_column(
     corner = 0.5 * (low + high) - 0.5 * side
     scale = tile / side
     matrix = np.array([[scale, 0, -scale * corner[0]], [0, scale, -scale * corner[1]]])
-    # OpenCV's pixel centres lie on whole numbers, ours on halves.
-    shifted = matrix + np.array([[0, 0, 0.5 * scale - 0.5]])
     flags = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
-    crop = cv2.warpAffine(frame, shifted, (tile, tile), flags=flags)
+    crop = cv2.warpAffine(frame, affine_to_opencv(matrix), (tile, tile), flags=flags)
     shaded = _wireframe(crop, camera, matrix, model, mesh)
     marks = landmarks(model, torch.from_numpy(mesh)[None])[0].numpy()
     _dots(shaded, project_pinhole(camera, marks)[0] @ matrix[:, :2].T + matrix[:, 2], FITTED_COLOR)

@@ -15,7 +15,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from express50.adapters import corner_to_cell
 from express50.cameras import Camera
+from pipelines.track.pinhole import project_with_slope
 
 # The most that a moment's pictures may count, as independent observations of the surface.
 OBSERVATIONS = 3000.0
@@ -143,14 +145,9 @@ def robust_mean(
 
 def look(camera: Camera, image: np.ndarray, places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Image values (S, 3) at world points (S, 3) and their slope (S, 3 channels, 3 axes)."""
-    rotation, K = camera.cam_from_world[:3, :3], camera.K
-    local = places @ rotation.T + camera.cam_from_world[:3, 3]
-    depth = np.maximum(local[:, 2:], 1e-6)
-    focal = K[[0, 1], [0, 1]]
-    ray = local[:, :2] / depth
-    value, gradient = bilinear(image, ray * focal + K[:2, 2])
-    slope = (rotation[None, :2] - ray[..., None] * rotation[None, 2:]) / depth[..., None]
-    return value, gradient @ (slope * focal[:, None])
+    pixels, slope = project_with_slope(camera, places)
+    value, gradient = bilinear(image, pixels)
+    return value, gradient @ slope
 
 
 def bilinear(image: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -159,8 +156,7 @@ def bilinear(image: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarray, np.ndar
     Corner origin; outside the image its rim goes on.
     """
     height, width, channels = image.shape
-    x = np.clip(pixels[:, 0] - 0.5, 0.0, width - 1.001)
-    y = np.clip(pixels[:, 1] - 0.5, 0.0, height - 1.001)
+    x, y = np.clip(corner_to_cell(pixels), 0.0, [width - 1.001, height - 1.001]).T
     column, row = x.astype(np.int64), y.astype(np.int64)
     fx, fy = (x - column)[:, None], (y - row)[:, None]
     flat = image.reshape(-1, channels)

@@ -23,6 +23,7 @@ from pipelines.track.hair import is_bald
 from pipelines.track.marks import Eyes, with_marks
 from pipelines.track.outline import Outline, SignedDistance, outline_regions, outline_vertices
 from pipelines.track.photometry import OBSERVATIONS, Photometry, Picture, look, robust_mean
+from pipelines.track.pinhole import project_pinhole
 from pipelines.track.relief import Relief, make_relief, sweep
 from pipelines.track.samples import Samples, Visibility, sample_normals, spread
 from pipelines.track.shots import Shot, detail, root_light
@@ -57,30 +58,32 @@ def refine(
 
     First the relief, searched over millimetres; then colours, which are finer and need to be near.
     """
-    samples = spread(basis.model, config.samples)
+    model = basis.model
+    samples = spread(model, config.samples)
     appearance: Appearance | None = None
     rounds = config.relief_rounds + config.photo_rounds
     rounds = max(rounds, config.silhouette_rounds, MARK_ROUNDS)
     plain = targets
-    bald = _bald(basis.model, moments, all_vertices(basis.model, state))
+    bald = _bald(model, moments, all_vertices(model, state))
     for index in range(rounds):
-        meshes = all_vertices(basis.model, state)
+        meshes = all_vertices(model, state)
         targets = plain
+        sights = [see(model, samples, *seen) for seen in zip(moments, meshes, strict=True)]
         if rounds - index <= config.silhouette_rounds:
-            targets = with_outlines(basis.model, targets, moments, meshes, bald)
+            targets = with_outlines(model, targets, moments, meshes, bald)
         targets = [
-            with_marks(basis.model, target, mesh, rotation, eyes)
+            with_marks(model, target, mesh, rotation, eyes)
             for target, mesh, rotation in zip(targets, meshes, rotations(state), strict=True)
         ]
         if config.relief_rounds:
             # Far off, whole patches of skin may match wrongly together: little trust at first.
             left = max(config.relief_rounds - 1 - index, 0)
             reach = config.relief_reach * 0.6 ** min(index, 3)
-            trust = config.relief_weight * 0.3**left
-            targets = with_relief(basis.model, samples, targets, moments, meshes, reach, trust)
+            weight = config.relief_weight * 0.3**left
+            targets = with_relief(model, samples, targets, moments, sights, meshes, reach, weight)
         if index >= config.relief_rounds and config.photo_rounds:
             targets, appearance = with_photometry(
-                basis.model, samples, targets, moments, meshes, 0, appearance, config
+                samples, targets, moments, sights, meshes, appearance, config
             )
         # Only a searched surface can tell what the detector errs.
         free = any(isinstance(term, Relief) for target in targets for term in target.terms)
@@ -92,7 +95,7 @@ def _bald(model: HeadModel, moments: list[Moment], meshes: np.ndarray) -> bool:
     """Whether the first moment that has pictures shows a bare skull."""
     for moment, mesh in zip(moments, meshes, strict=True):
         if moment.shots:
-            return is_bald(model, [root_light(shot, 0) for shot in moment.shots], mesh)
+            return is_bald(model, [root_light(shot) for shot in moment.shots], mesh)
     return False
 
 
@@ -101,15 +104,15 @@ def with_relief(
     samples: Samples,
     targets: list[Target],
     moments: list[Moment],
+    sights: list[Seen],
     meshes: np.ndarray,
     reach: float,
-    trust: float,
+    weight: float,
 ) -> list[Target]:
     """The targets with points of the surface that the views agree on."""
     made = []
-    for target, moment, mesh in zip(targets, moments, meshes, strict=True):
-        images = [root_light(shot, 0) for shot in moment.shots]
-        seen = _see(model, samples, moment, images, mesh)
+    for target, moment, seen, mesh in zip(targets, moments, sights, meshes, strict=True):
+        images = [root_light(shot) for shot in moment.shots]
         grey = [(image.mean(2), camera) for image, camera in images]
         places = samples.at(mesh)
         # Seen at a slant a patch is another picture; two views are the least.
@@ -117,7 +120,7 @@ def with_relief(
         found = sweep(grey, weights, places, seen.normals, mesh, model.faces.numpy(), reach)
         ids, rows = np.unique(samples.corners, return_inverse=True)
         rows = rows.reshape(-1, 3) + 68 + len(target.vertices)
-        relief = make_relief(found, rows, samples.bary, places, seen.normals, trust)
+        relief = make_relief(found, rows, samples.bary, places, seen.normals, weight)
         if relief is not None:
             vertices = np.concatenate([target.vertices, ids])
             target = replace(target, vertices=vertices, terms=(*target.terms, relief))
@@ -154,29 +157,23 @@ def with_outlines(
 
 
 def with_photometry(
-    model: HeadModel,
     samples: Samples,
     targets: list[Target],
     moments: list[Moment],
+    sights: list[Seen],
     meshes: np.ndarray,
-    level: int,
     before: Appearance | None,
     config: TrackConfig,
 ) -> tuple[list[Target], Appearance]:
     """The targets with photometric terms, and the appearance they rest on."""
-    images = [[root_light(shot, level) for shot in moment.shots] for moment in moments]
-    plain = [
-        _see(model, samples, moment, pictures, mesh)
-        for moment, pictures, mesh in zip(moments, images, meshes, strict=True)
-    ]
-    appearance = _appearance(plain, before)
+    appearance = _appearance(sights, before)
     images = [
-        _details(moment, pictures, mesh, config.detail_radius * 2**level)
-        for moment, pictures, mesh in zip(moments, images, meshes, strict=True)
+        _details(moment, mesh, config.detail_radius)
+        for moment, mesh in zip(moments, meshes, strict=True)
     ]
     fine = [
         replace(one, values=_values(samples.at(mesh), pictures))
-        for one, pictures, mesh in zip(plain, images, meshes, strict=True)
+        for one, pictures, mesh in zip(sights, images, meshes, strict=True)
     ]
     return _with_terms(targets, samples, fine, images, appearance, config), appearance
 
@@ -215,10 +212,11 @@ def _with_terms(
         for one, shade in zip(moments, shades, strict=True)
     ]
     mass = [one.weights.sum(0)[:, None] for one in moments]
+    all_mass = np.sum(mass, axis=0)
     total = np.sum([m * mean for m, mean in zip(mass, means, strict=True)], axis=0)
     made = []
     for target, one, pictures, own, mean in zip(targets, moments, images, mass, means, strict=True):
-        rest = np.sum(mass, axis=0) - own
+        rest = all_mass - own
         albedo = np.where(rest > 0.2, (total - own * mean) / np.maximum(rest, 1e-9), np.nan)
         made.append(_with_term(target, samples, one, pictures, appearance, albedo, sigma, config))
     return made
@@ -237,12 +235,11 @@ def _noise(moments: list[Seen], shades: list[np.ndarray]) -> float:
     return sigma
 
 
-def _details(
-    moment: Moment, images: list[tuple[np.ndarray, Camera]], mesh: np.ndarray, radius: float
-) -> list[tuple[np.ndarray, Camera]]:
+def _details(moment: Moment, mesh: np.ndarray, radius: float) -> list[tuple[np.ndarray, Camera]]:
     """The pictures' detail below a radius in metres, but not below three pixels."""
     made = []
-    for shot, (image, camera) in zip(moment.shots, images, strict=True):
+    for shot in moment.shots:
+        image, camera = root_light(shot)
         depth = float((mesh @ camera.cam_from_world[2, :3] + camera.cam_from_world[2, 3]).mean())
         pixels = radius * camera.K[0, 0] / max(depth, 1e-6)
         made.append((detail(image, shot, max(pixels, DETAIL_PX)), camera))
@@ -256,16 +253,11 @@ def _values(places: np.ndarray, images: list[tuple[np.ndarray, Camera]]) -> np.n
     return np.stack([look(camera, image, places)[0] for image, camera in images])
 
 
-def _see(
-    model: HeadModel,
-    samples: Samples,
-    moment: Moment,
-    images: list[tuple[np.ndarray, Camera]],
-    mesh: np.ndarray,
-) -> Seen:
+def see(model: HeadModel, samples: Samples, moment: Moment, mesh: np.ndarray) -> Seen:
     """Look every sample up in every picture of a moment."""
     places, normals = samples.at(mesh), sample_normals(samples, mesh)
     visibility = Visibility(mesh, model.faces.numpy())
+    images = [root_light(shot) for shot in moment.shots]
     weights = np.zeros((len(images), len(places)))
     for row, shot in enumerate(moment.shots):
         weights[row] = visibility.weights(shot.camera, places, normals) * inside_picture(
@@ -278,11 +270,9 @@ def _see(
 def inside_picture(shot: Shot, places: np.ndarray) -> np.ndarray:
     """(S,) 0 outside the picture or where the matte says that there is no subject, else to 1."""
     camera = shot.camera
-    local = places @ camera.cam_from_world[:3, :3].T + camera.cam_from_world[:3, 3]
-    pixels = local[:, :2] / np.maximum(local[:, 2:], 1e-6) * camera.K[[0, 1], [0, 1]]
-    pixels = pixels + camera.K[:2, 2]
+    pixels, depth = project_pinhole(camera, places)
     size = np.array([camera.width, camera.height])
-    inside = (local[:, 2] > 1e-3) & (pixels >= 1.0).all(1) & (pixels <= size - 1.0).all(1)
+    inside = (depth > 1e-3) & (pixels >= 1.0).all(1) & (pixels <= size - 1.0).all(1)
     if shot.alpha is None:
         return inside.astype(np.float64)
     column, row = np.clip(pixels.astype(np.int64), 0, size - 1).T

@@ -15,8 +15,10 @@ import numpy as np
 import open3d as o3d
 from scipy.spatial import cKDTree
 
+from express50.adapters import corner_to_cell
 from express50.cameras import Camera
 from express50.raycast import mesh_scene
+from pipelines.track.pinhole import project_with_slope
 
 PATCH = 7
 VIEWS = 8
@@ -155,10 +157,10 @@ def _patches(
     `shape` (S, 3, PATCH^2) are the patches' points about their samples.
     """
     centre = places[:, None] + heights[None, :, None] * normals[:, None]
-    pixels, slope = _project(camera, centre)
+    pixels, slope = project_with_slope(camera, centre)
     # Image coordinates fit single precision; world coordinates need not.
     spread = slope.astype(np.float32) @ shape[:, None].astype(np.float32)
-    where = spread + (pixels[..., None] - 0.5).astype(np.float32)
+    where = spread + corner_to_cell(pixels[..., None]).astype(np.float32)
     x, y = (np.ascontiguousarray(where[:, :, k].reshape(len(places), -1)) for k in range(2))
     values = cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     values = values.reshape(len(places), len(heights), -1)
@@ -199,16 +201,6 @@ def _tangent(normals: np.ndarray) -> np.ndarray:
     axis = np.where(np.abs(normals[:, 1:2]) < 0.9, [[0.0, 1.0, 0.0]], [[1.0, 0.0, 0.0]])
     across = np.cross(axis, normals)
     return across / np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-12)
-
-
-def _project(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels (..., 2) of world points (..., 3) and their slope (..., 2, 3)."""
-    rotation, K = camera.cam_from_world[:3, :3], camera.K
-    local = points @ rotation.T + camera.cam_from_world[:3, 3]
-    depth = np.maximum(local[..., 2:], 1e-6)
-    ray, focal = local[..., :2] / depth, K[[0, 1], [0, 1]]
-    slope = (rotation[:2] - ray[..., None] * rotation[2:]) / depth[..., None]
-    return ray * focal + K[:2, 2], slope * focal[:, None]
 
 
 def _peaks(score: np.ndarray, heights: np.ndarray, pixel: float) -> Sweep:

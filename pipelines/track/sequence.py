@@ -10,7 +10,7 @@ by more frames than sweeps reach, and what overlaps is dropped: where a window e
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -52,9 +52,7 @@ class Neighbours:
     middle: np.ndarray
     sigma: float
 
-    def residuals(
-        self, positions: np.ndarray, project: Callable
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def residuals(self, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Block (index (n,), residual (n, 3), slope (n, 3, 3)) of all points' positions (P, 3)."""
         residual = (positions[self.index] - self.middle) / self.sigma
         slope = np.broadcast_to(np.eye(3) / self.sigma, (len(self.index), 3, 3))

@@ -9,6 +9,7 @@ import numpy as np
 
 from express50.cameras import Camera, crop_camera, resized
 from express50.images import LIGHT_OF_LEVEL, resize_area
+from pipelines.track.pinhole import project_pinhole
 
 MARGIN = 0.15
 
@@ -55,10 +56,9 @@ def cut_shot(
 
 def _window(camera: Camera, mesh: np.ndarray) -> tuple[int, int, int, int] | None:
     """Pixel window x0, y0, x1, y1 about the mesh; None where there is next to nothing to see."""
-    local = mesh @ camera.cam_from_world[:3, :3].T + camera.cam_from_world[:3, 3]
-    if (local[:, 2] <= 1e-3).any():
+    pixels, depth = project_pinhole(camera, mesh)
+    if (depth <= 1e-3).any():
         return None
-    pixels = local[:, :2] / local[:, 2:] * camera.K[[0, 1], [0, 1]] + camera.K[:2, 2]
     low, high = pixels.min(0), pixels.max(0)
     grow = MARGIN * (high - low).max()
     x0, y0 = np.maximum(np.floor(low - grow), 0).astype(int)
@@ -66,20 +66,13 @@ def _window(camera: Camera, mesh: np.ndarray) -> tuple[int, int, int, int] | Non
     return (int(x0), int(y0), int(x1), int(y1)) if min(x1 - x0, y1 - y0) >= 8 else None
 
 
-def root_light(shot: Shot, level: int) -> tuple[np.ndarray, Camera]:
-    """Square root of linear light (h, w, 3) float32 at a pyramid level, and its camera.
+def root_light(shot: Shot) -> tuple[np.ndarray, Camera]:
+    """Square root of linear light (h, w, 3) float32, and its camera.
 
     In the root of light a surface's colour, the light on it and a camera's gain still multiply,
     and shot noise is the same everywhere (Anscombe 1948).
     """
-    light = LIGHT_OF_LEVEL[shot.image]
-    camera = shot.camera
-    if level:
-        width = max(4, round(camera.width / 2**level))
-        height = max(4, round(camera.height / 2**level))
-        light = cv2.resize(light, (width, height), interpolation=cv2.INTER_AREA)
-        camera = resized(camera, width, height)
-    return np.sqrt(cv2.GaussianBlur(light, (0, 0), 0.7)), camera
+    return np.sqrt(cv2.GaussianBlur(LIGHT_OF_LEVEL[shot.image], (0, 0), 0.7)), shot.camera
 
 
 def detail(image: np.ndarray, shot: Shot, radius: float) -> np.ndarray:

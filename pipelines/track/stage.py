@@ -39,11 +39,11 @@ from pipelines.track.observe import (
     agree,
     facing,
     make_view,
-    project_pinhole,
 )
 from pipelines.track.offsets import split_shape, with_modes
 from pipelines.track.outline import Outline, signed_distance
 from pipelines.track.overlay import draw_overlays
+from pipelines.track.pinhole import project_pinhole
 from pipelines.track.refine import Moment, all_vertices, refine, rotations
 from pipelines.track.sheet import write_sheet
 from pipelines.track.shots import Shot, cut_shot
@@ -135,9 +135,8 @@ def _clips(
         return observation if enough else None
 
     keep = dataset.windows_dir(subject)
-    shape, _ = split_shape(basis.model, state.shape)
     paths, cues = inputs(dataset, subject, config), read_index(dataset, subject).cues
-    return write_clips(out, basis, state, cues, observe, config, keep, paths, eyes, shape)
+    return write_clips(out, basis, state, cues, observe, config, keep, paths, eyes)
 
 
 def _open_source(dataset: Dataset, subject: str, config: TrackConfig) -> Source:

@@ -22,7 +22,8 @@ from pipelines.photo.focal import single_camera, weigh_focal
 from pipelines.track.config import TrackConfig
 from pipelines.track.contour import contour_points
 from pipelines.track.fit import Target, fit, landmark_sigma, start_state
-from pipelines.track.observe import View, agree, project_pinhole
+from pipelines.track.observe import View, agree
+from pipelines.track.pinhole import project_pinhole
 from pipelines.track.sparse_head import Basis, Points, make_basis
 from pipelines.track.start import initial_pose
 

@@ -14,7 +14,7 @@ from pipelines.track.config import TrackConfig
 from pipelines.track.fit import Target
 from pipelines.track.outline import outline_vertices, signed_distance
 from pipelines.track.photometry import Photometry
-from pipelines.track.refine import Moment, with_outlines, with_photometry, with_relief
+from pipelines.track.refine import Moment, see, with_outlines, with_photometry, with_relief
 from pipelines.track.relief import Relief
 from pipelines.track.samples import Visibility, spread
 from pipelines.track.shots import Shot, cut_shot
@@ -46,19 +46,20 @@ def take(camera, centre=ORIGIN, mesh=None, alpha="true", image=None, side=512) -
 def search(shots, mesh) -> Relief | None:
     """The stage's search on one moment; its relief, if it found any."""
     model, faces = ball_head(), spread(ball_head(), CONFIG.samples)
-    made = with_relief(
-        model, faces, [bare_target()], [Moment((), tuple(shots))], mesh[None], 0.006, 1.0
-    )
+    moment = Moment((), tuple(shots))
+    sights = [see(model, faces, moment, mesh)]
+    made = with_relief(model, faces, [bare_target()], [moment], sights, mesh[None], 0.006, 1.0)
     return made[0].terms[0] if made[0].terms else None
 
 
 def compare(shots, mesh) -> tuple[Target, Appearance]:
     """The stage's comparison of colours on one moment."""
-    model = ball_head()
+    model, moment = ball_head(), Moment((), tuple(shots))
+    samples = spread(model, CONFIG.samples)
+    sights = [see(model, samples, moment, mesh)]
     made, appearance = with_photometry(
-        model, spread(model, CONFIG.samples), [bare_target()], [Moment((), tuple(shots))],
-        mesh[None], 0, None, CONFIG,
-    )  # fmt: skip
+        samples, [bare_target()], [moment], sights, mesh[None], None, CONFIG
+    )
     return made[0], appearance
 
 

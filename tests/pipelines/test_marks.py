@@ -14,7 +14,7 @@ from express50.head.model import HeadModel, landmarks, vertex_normals
 from express50.landmarks.iris import Irises
 from express50.transforms import axis_angle_to_matrix
 from pipelines.track.contour import JAW, contour_points
-from pipelines.track.fit import Target, fit, landmark_sigma, project_with_slope, start_state
+from pipelines.track.fit import Target, fit, landmark_sigma, start_state
 from pipelines.track.marks import iris_vertices, measure_eyes, with_marks
 from pipelines.track.observe import Marks, View, agree, point_covariance
 from pipelines.track.sparse_head import make_basis
@@ -126,10 +126,10 @@ def test_mark_residuals_have_the_slope_they_say() -> None:
     camera = RIG[0]
     positions = np.random.default_rng(0).normal(size=(5, 3)) * 0.1
     marks = Marks(camera, np.array([1, 3]), np.full((2, 2), 200.0), np.array([2.0, 3.0]))
-    index, residual, slope = marks.residuals(positions, project_with_slope)
+    index, residual, slope = marks.residuals(positions)
     np.testing.assert_array_equal(index, [1, 3])
     for axis in range(3):
-        ahead = marks.residuals(positions + np.eye(3)[axis] * 1e-6, project_with_slope)[1]
+        ahead = marks.residuals(positions + np.eye(3)[axis] * 1e-6)[1]
         np.testing.assert_allclose(slope[..., axis], (ahead - residual) / 1e-6, rtol=1e-3, atol=0.1)
 
 

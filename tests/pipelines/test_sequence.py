@@ -170,7 +170,7 @@ def test_kept_windows_go_when_the_sequence_is_written(
     monkeypatch.setattr(
         clips.np, "savez", lambda *a, **k: (kept.append(keep.is_dir()), savez(*a, **k))
     )
-    write_clips(*arguments, {"index": tmp_path / "index.json", "words": "1"}, None, scene.shape)
+    write_clips(*arguments, {"index": tmp_path / "index.json", "words": "1"}, None)
     assert kept[-1] and not keep.exists()
     with np.load(tmp_path / "sequence.npz", allow_pickle=False) as data:
         assert data["R"].shape == (FRAMES, 3, 3) and data["shape"].shape == (5,)

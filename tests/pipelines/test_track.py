@@ -26,11 +26,11 @@ from pipelines.track.fit import (
     consistent_sigma,
     fit,
     landmark_sigma,
-    project_with_slope,
     start_state,
 )
 from pipelines.track.observe import View, agree, robust_triangulate
 from pipelines.track.outline import Outline, outline_vertices, sample, signed_distance
+from pipelines.track.pinhole import project_with_slope
 from pipelines.track.priors import prior
 from pipelines.track.sparse_head import Basis, Points, make_basis
 from pipelines.track.start import initial_pose
@@ -287,10 +287,10 @@ def test_outline_residual_slope_matches_finite_differences() -> None:
     distance = signed_distance(disc_alpha(), camera)
     positions = np.random.default_rng(0).normal(size=(12, 3)) * 0.1
     outline = Outline.of(distance, 0, positions, np.arange(12) % 2 == 0, 3, bald=False)
-    _, residual, slope = outline.residuals(positions, project_with_slope)
+    _, residual, slope = outline.residuals(positions)
     for axis in range(3):
         step = np.eye(3)[axis] * 1e-6
-        ahead = outline.residuals(positions + step, project_with_slope)[1]
+        ahead = outline.residuals(positions + step)[1]
         numeric = (ahead - residual) / 1e-6
         close = np.isclose(slope[:, :, axis], numeric, rtol=0.02, atol=1.0)
         assert close.mean() > 0.9
