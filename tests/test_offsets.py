@@ -28,7 +28,7 @@ from tests.pipelines.bump_dataset import make_dataset, published
 def packed(tmp_path_factory):
     """Folder of shards, and the arrays of the one track with offsets; S002 has none."""
     dataset = make_dataset(tmp_path_factory.mktemp("offsets"), ("S001", "S002"), cameras=3, size=64)
-    published(dataset, DEPTH, DepthConfig(voxel_mm=8, levels=1, use_track=False))
+    published(dataset, DEPTH, DepthConfig(voxel_mm=8, use_track=False))
     arrays = track_arrays("procedural", turn=0.1)
     # The bump head stands in the middle of the rig.
     arrays["t"] -= arrays["vertices"].mean(1)

@@ -9,10 +9,12 @@ from dataclasses import dataclass
 class DepthConfig:
     """How finely the surface is modelled, and how much the photographs may bend it."""
 
-    voxel_mm: float = 2.8
-    """Voxel of the last level, millimetres, 0.3 to 20."""
-    levels: int = 3
-    """Coarse-to-fine levels; each is 1.47 times coarser than the next; 1 to 6."""
+    voxel_mm: float = 1.6
+    """Finest voxel of the last level, millimetres, 0.3 to 20."""
+    voxel_px: float = 1.4
+    """The last level's voxel is no smaller than so many pixels: finer ones would hold guesses."""
+    coarse_mm: float = 6.0
+    """Voxel of the first level, millimetres; each level is 1.47 times finer than the one before."""
     image_side: int = 1024
     """Longest side, pixels, of the images that silhouettes and photo-consistency use."""
     photo: bool = True
@@ -42,8 +44,10 @@ class DepthConfig:
         """Check ranges."""
         if not 0.3 <= self.voxel_mm <= 20:
             raise ValueError(f"voxel_mm is {self.voxel_mm}, expected 0.3 to 20")
-        if not 1 <= self.levels <= 6:
-            raise ValueError(f"levels is {self.levels}, expected 1 to 6")
+        if not 1 <= self.coarse_mm <= 40:
+            raise ValueError(f"coarse_mm is {self.coarse_mm}, expected 1 to 40")
+        if not 0 <= self.voxel_px <= 8:
+            raise ValueError(f"voxel_px is {self.voxel_px}, expected 0 to 8")
         if self.patch_samples < 3 or self.patch_samples % 2 == 0:
             raise ValueError(f"patch_samples is {self.patch_samples}, expected an odd number >= 3")
         if self.min_views < 2:
@@ -53,7 +57,7 @@ class DepthConfig:
 
 
 PRESETS: dict[str, dict[str, object]] = {
-    "draft": {"voxel_mm": 4.0, "levels": 2, "image_side": 512},
+    "draft": {"voxel_mm": 4.0, "image_side": 512},
     "standard": {},
-    "reference": {"voxel_mm": 1.6, "levels": 4, "patch_samples": 7, "image_side": 2048},
+    "reference": {"voxel_mm": 1.0, "patch_samples": 7, "image_side": 2048},
 }

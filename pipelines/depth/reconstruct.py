@@ -37,6 +37,7 @@ from pipelines.depth.sweep import grey_images, sweep_scores, view_weights
 LEVEL_RATIO = 1.47
 COUPLINGS = (1e3, 3e3, 1e4, 2e4)  # per square metre; a gap of 10 mm costs 0.1 at first, 2 at last
 VOXEL_LIMIT = 60_000_000
+LARGEST_M = 3.0  # a head with shoulders is a third of it
 
 
 @dataclass(frozen=True)
@@ -74,7 +75,7 @@ def reconstruct(views: Sequence[View], config: DepthConfig, prior: Prior | None 
     """
     low, high = head_box(views)
     extent = float(np.linalg.norm(high - low))
-    voxels = [config.voxel_mm * 1e-3 * LEVEL_RATIO**k for k in reversed(range(config.levels))]
+    voxels = _voxels(views, (low + high) / 2, config)
     _check_size(low, high, voxels[-1])
     grid = _initial(views, low, high, voxels[0], prior)
     for level, voxel in enumerate(voxels):
@@ -88,13 +89,22 @@ def reconstruct(views: Sequence[View], config: DepthConfig, prior: Prior | None 
     return _finish(views, grid, config)
 
 
+def _voxels(views: Sequence[View], middle: np.ndarray, config: DepthConfig) -> list[float]:
+    """Voxels of the levels, metres, coarse to fine; the last as fine as the pixels allow."""
+    pixel = float(np.median([_pixel_size(view, middle) for view in views]))
+    fine = max(config.voxel_mm * 1e-3, config.voxel_px * pixel)
+    coarser = np.log(config.coarse_mm * 1e-3 / fine) / np.log(LEVEL_RATIO)
+    return [fine * LEVEL_RATIO**k for k in reversed(range(1 + max(0, round(coarser))))]
+
+
 def _check_size(low: np.ndarray, high: np.ndarray, voxel: float) -> None:
     count = float(np.prod((high - low) / voxel))
-    if count > VOXEL_LIMIT:
+    if count > VOXEL_LIMIT or (high - low).max() > LARGEST_M:
         size = " x ".join(f"{side:.2f}" for side in high - low)
         raise StageError(
-            f"the head's box is {size} m, {count:.2g} voxels of {voxel * 1e3:g} mm; expected under"
-            f" {VOXEL_LIMIT:.2g}: is the calibration in metres? else raise depth.voxel_mm"
+            f"the head's box is {size} m, {count:.2g} voxels of {voxel * 1e3:g} mm; expected at"
+            f" most {LARGEST_M:g} m and {VOXEL_LIMIT:.2g} voxels: is the calibration in metres?"
+            " else raise depth.voxel_mm"
         )
 
 
@@ -137,7 +147,7 @@ def _move(
         return grid
     offsets = _offsets(config, voxel, first)
     if config.photo:
-        scores = _scores(views, vertices, normals, faces, offsets, voxel, config)
+        scores = _scores(views, grid, vertices, normals, faces, offsets, config)
     else:
         scores = np.zeros((len(vertices), len(offsets)), np.float32)
     pinned, weight = _pins(views, grid, vertices, extent, config.rim_weight)
@@ -162,21 +172,21 @@ def _offsets(config: DepthConfig, voxel: float, first: bool) -> np.ndarray:
 
 def _scores(
     views: Sequence[View],
+    grid: Grid,
     vertices: np.ndarray,
     normals: np.ndarray,
     faces: np.ndarray,
     offsets: np.ndarray,
-    voxel: float,
     config: DepthConfig,
 ) -> np.ndarray:
-    spacing = 0.66 * voxel
+    spacing = 0.66 * grid.voxel
     pixel = np.median([_pixel_size(view, vertices.mean(0)) for view in views])
     greys = grey_images(views, 0.4 * spacing / pixel)
-    weights = view_weights(views, vertices, normals, mesh_scene(vertices, faces), voxel)
+    weights = view_weights(views, vertices, normals, mesh_scene(vertices, faces), grid.voxel)
     # the samples of a patch lie no closer than the pixels: finer ones would repeat them
     spacing = max(spacing, float(pixel))
     scores = sweep_scores(
-        views, greys, vertices, normals, weights, offsets, spacing, config.noise,
+        views, greys, grid, vertices, normals, weights, offsets, spacing, config.noise,
         config.patch_samples,
     )  # fmt: skip
     # neighbours see the same: chance matches of one patch, frequent in hair, average out
@@ -214,7 +224,7 @@ def _finish(views: Sequence[View], grid: Grid, config: DepthConfig) -> Surface:
         )
     faces = largest_part(vertices, faces)
     offsets = np.array([-1.0, 0.0, 1.0]) * grid.voxel
-    agreement = _scores(views, vertices, normals, faces, offsets, grid.voxel, config)[:, 1]
+    agreement = _scores(views, grid, vertices, normals, faces, offsets, config)[:, 1]
     on_hull = np.abs(hull_distance(views, vertices)) < 0.5 * grid.voxel
     confidence = _averaged(np.clip(agreement, 0, 1), faces, rounds=6)
     used = np.zeros(len(vertices), bool)

@@ -201,7 +201,7 @@ def _depth_picture(view: DepthView) -> np.ndarray:
 
 STAGE = Stage(
     name="depth",
-    version=3,
+    version=4,
     config=DepthConfig,
     presets=PRESETS,
     items=peak_items,

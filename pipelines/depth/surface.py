@@ -7,11 +7,13 @@ from collections.abc import Sequence
 import numpy as np
 import scipy.sparse as sparse
 from scipy.ndimage import gaussian_filter, map_coordinates
-from scipy.sparse.linalg import splu
+from scipy.sparse.linalg import cg
 from skimage.measure import marching_cubes
 
 from express50.cameras import unproject
 from pipelines.depth.grid import Grid, View
+
+OUTLIER_STEPS = 2.0
 
 
 def extract_mesh(grid: Grid) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -92,6 +94,7 @@ def smooth_displacement(
     pinned_weight: np.ndarray,
     stiffness: float,
     couplings: Sequence[float],
+    outlier_steps: float = OUTLIER_STEPS,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Displacements (V,) that score well and bend little, and the trust (V,) in the scores.
 
@@ -107,6 +110,7 @@ def smooth_displacement(
         pinned_weight: (V,) their weights.
         stiffness: weight of the squared Laplacian against a data weight of one.
         couplings: per-metre-squared weights of the alternations, rising.
+        outlier_steps: offsets' steps off its neighbours at which a match is believed by a quarter.
     """
     count = len(scores)
     peak, typical = scores.max(1), np.median(scores, axis=1)
@@ -114,20 +118,35 @@ def smooth_displacement(
     trust = np.clip(3.0 * np.clip(peak, 0, 1) * (peak - typical), 0, 1)
     plate = stiffness * (laplacian.T @ laplacian)
     ridge = 0.01  # a patch that nothing pins stays where it is
-    weight = trust + pinned_weight + ridge
-    solver = splu(
-        (plate + sparse.diags(weight)).tocsc(), permc_spec="MMD_AT_PLUS_A",
-        options={"SymmetricMode": True},
-    )  # fmt: skip
     rows = np.arange(count)
-    displacement = solver.solve(pinned_weight * pinned)
+    step = offsets[1] - offsets[0]
+    displacement = _plate(plate, ridge + trust + pinned_weight, pinned_weight * pinned, step)
+    believed = trust
     for coupling in couplings:
         gap = offsets[None] - displacement[:, None]
         energy = scores - coupling * gap * gap
         best = energy.argmax(1)
-        target = offsets[best] + _parabola(energy, rows, best) * (offsets[1] - offsets[0])
-        displacement = solver.solve(trust * target + pinned_weight * pinned)
+        target = offsets[best] + _parabola(energy, rows, best) * step
+        pull = believed * target + pinned_weight * pinned
+        displacement = _plate(plate, ridge + believed + pinned_weight, pull, step, displacement)
+        # A match that its neighbours contradict is by chance (Geman and McClure 1985).
+        believed = trust / (1.0 + ((target - displacement) / (outlier_steps * step)) ** 2) ** 2
     return displacement, trust
+
+
+def _plate(
+    plate: sparse.csc_matrix,
+    weight: np.ndarray,
+    pull: np.ndarray,
+    step: float,
+    start: np.ndarray | None = None,
+) -> np.ndarray:
+    """Displacements (V,) of a plate held by springs (V,), to a thousandth of a step."""
+    matrix = (plate + sparse.diags(weight)).tocsr()
+    inverse = sparse.diags(1.0 / matrix.diagonal())
+    tolerance = 1e-3 * step * float(weight.mean()) * len(weight) ** 0.5
+    found, _ = cg(matrix, pull, start, rtol=0.0, atol=tolerance, maxiter=2000, M=inverse)
+    return found
 
 
 def _parabola(energy: np.ndarray, rows: np.ndarray, best: np.ndarray) -> np.ndarray:

@@ -1,8 +1,8 @@
-"""Photo-consistency of a surface: oriented patches slid along the normals, compared across views.
+"""Photo-consistency of a surface: patches of it slid along the normals, compared across views.
 
-A patch lies in the surface's tangent plane, so that views far apart see it alike (a fronto-
-parallel sweep fails at the 35 to 45 degrees between neighbours of a sparse ring). The score is
-zero-mean normalised cross-correlation, blind to each camera's gain and offset.
+A patch is curved as the surface is, so that views far apart see it alike: a fronto-parallel sweep
+fails at the 35 to 45 degrees between neighbours of a sparse ring, a flat patch at a nose. The score
+is zero-mean normalised cross-correlation, blind to each camera's gain and offset.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 import open3d as o3d
 
-from pipelines.depth.grid import View, project_fast, sample_image
+from pipelines.depth.grid import Grid, View, project_fast, sample_image
 
 GRAZING = 0.25  # cosine; flatter than this, a patch is squeezed to under a quarter of its width
 
@@ -63,6 +63,7 @@ def view_weights(
 def sweep_scores(
     views: Sequence[View],
     greys: Sequence[np.ndarray],
+    grid: Grid,
     vertices: np.ndarray,
     normals: np.ndarray,
     weights: np.ndarray,
@@ -76,6 +77,7 @@ def sweep_scores(
     Args:
         views: C views.
         greys: their (H, W) float32 images.
+        grid: signed distances, which say how the surface curves about a vertex.
         vertices: (V, 3) of the surface.
         normals: (V, 3) outward.
         weights: (C, V) of :func:`view_weights`.
@@ -88,14 +90,29 @@ def sweep_scores(
     usable = np.flatnonzero((weights > 0).sum(0) >= 2)
     tangents = _tangents(normals)  # (V, 2, 3)
     ticks = (np.arange(side) - (side - 1) / 2) * spacing
-    patch = np.stack(np.meshgrid(ticks, ticks), -1).reshape(-1, 2).astype(np.float32)
+    flat = np.stack(np.meshgrid(ticks, ticks), -1).reshape(-1, 2)
     for chunk in np.array_split(usable, max(1, len(usable) // 1000)):
         if not len(chunk):
             continue
         line = vertices[chunk, None] + normals[chunk, None] * offsets[:, None]  # (n, D, 3)
         weight = weights[:, chunk] ** 2
-        scores[chunk] = _correlate(views, greys, line, tangents[chunk], patch, weight, noise)
+        patch = _patches(grid, vertices[chunk], normals[chunk], tangents[chunk], flat)
+        scores[chunk] = _correlate(views, greys, line, patch, weight, noise)
     return scores
+
+
+def _patches(
+    grid: Grid, vertices: np.ndarray, normals: np.ndarray, tangents: np.ndarray, flat: np.ndarray
+) -> np.ndarray:
+    """Points (n, P, 3) float32 about each vertex, on the surface over the places (P, 2) of a plane.
+
+    Where the surface leaves the plane by more than the plane's extent it is another part of it.
+    """
+    about = flat @ tangents  # (n, P, 3)
+    height = grid.sample((vertices[:, None] + about).reshape(-1, 3)).reshape(about.shape[:2])
+    reach = np.abs(flat).max()
+    rise = np.where(np.abs(height) < reach, -height, 0.0)
+    return (about + rise[..., None] * normals[:, None]).astype(np.float32)
 
 
 def _tangents(normals: np.ndarray) -> np.ndarray:
@@ -110,42 +127,43 @@ def _correlate(
     views: Sequence[View],
     greys: Sequence[np.ndarray],
     line: np.ndarray,
-    tangents: np.ndarray,
     patch: np.ndarray,
     weights: np.ndarray,
     noise: float,
 ) -> np.ndarray:
-    """Weighted mean correlation (n, D) over all pairs of views of patches (P, 2) along lines.
+    """Weighted mean correlation (n, D) over all pairs of views of patches (n, P, 3) along lines.
 
-    Lines (n, D, 3) hold the patches' centres, tangents (n, 2, 3) their axes. With z_c the
-    normalised patch of view c, the sum over pairs is
+    Lines (n, D, 3) hold the patches' centres. With z_c the normalised patch of view c, the sum over
+    pairs is
     (|sum w_c z_c|^2 - sum w_c^2 |z_c|^2) / ((sum w_c)^2 - sum w_c^2).
     """
-    total = np.zeros((*line.shape[:2], len(patch)), np.float32)
+    count = patch.shape[1]
+    total = np.zeros((*line.shape[:2], count), np.float32)
     own = np.zeros(line.shape[:2], np.float32)
     for view, grey, weight in zip(views, greys, weights, strict=True):
         seen = weight > 0
         if not seen.any():
             continue
-        pixels = _patch_pixels(view, line[seen], tangents[seen], patch)
+        pixels = _patch_pixels(view, line[seen], patch[seen])
         z = sample_image(grey, pixels.reshape(-1, 2)).reshape(pixels.shape[:3])
         z -= z.mean(-1, keepdims=True)
         power = np.einsum("ndp,ndp->nd", z, z)
-        share = weight[seen, None] / np.sqrt(power + len(patch) * noise * noise)
+        share = weight[seen, None] / np.sqrt(power + count * noise * noise)
         total[seen] += z * share[..., None]
         own[seen] += power * share * share
     pairs = weights.sum(0) ** 2 - (weights**2).sum(0)
     return (np.einsum("ndp,ndp->nd", total, total) - own) / np.maximum(pairs, 1e-9)[:, None]
 
 
-def _patch_pixels(
-    view: View, line: np.ndarray, tangents: np.ndarray, patch: np.ndarray
-) -> np.ndarray:
+def _patch_pixels(view: View, line: np.ndarray, patch: np.ndarray) -> np.ndarray:
     """Pixels (n, D, P, 2) float32 of patches; affine within one, which spans 1 % of its depth."""
     M = (view.camera.K @ view.camera.cam_from_world[:3]).astype(np.float32)
     p = line.astype(np.float32) @ M[:, :3].T + M[:, 3]  # (n, D, 3)
-    depth = np.maximum(p[..., 2:], 1e-6)
-    center = p[..., :2] / depth
-    t = tangents.astype(np.float32) @ M[:, :3].T  # (n, 2, 3)
-    slope = (t[:, None, :, :2] - center[:, :, None] * t[:, None, :, 2:]) / depth[:, :, None]
-    return center[:, :, None] + patch @ slope
+    depth = np.maximum(p[..., 2], 1e-6)
+    along = patch @ M[:, :3].T  # (n, P, 3)
+    pixels = np.empty((*line.shape[:2], patch.shape[1], 2), np.float32)
+    for axis in range(2):
+        center = p[..., axis] / depth
+        moved = along[:, None, :, axis] - center[..., None] * along[:, None, :, 2]
+        pixels[..., axis] = center[..., None] + moved / depth[..., None]
+    return pixels

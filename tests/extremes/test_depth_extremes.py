@@ -27,7 +27,8 @@ from pipelines.depth.views import make_view
 from pipelines.pack.crop import Crop, cut_depth, cut_image
 from tests.pipelines.bump_head import render, ring
 
-COARSE = DepthConfig(voxel_mm=6.0, levels=1)
+COARSE = DepthConfig(voxel_mm=6.0)
+FLAT = Grid(np.zeros(3), 1.0, np.zeros((2, 2, 2), np.float32))
 
 
 def views_of(cameras, change=lambda rgb: rgb):
@@ -139,11 +140,11 @@ def test_a_vertex_that_nobody_sees_scores_nothing(views):
     weights = np.zeros((len(views), 3), np.float32)
     weights[:2, :] = 1
     scores = sweep_scores(
-        views, grey_images(views, 0.0), vertices, normals, weights, np.array([-0.01, 0, 0.01]),
-        0.002, 1.0,
+        views, grey_images(views, 0.0), FLAT, vertices, normals, weights,
+        np.array([-0.01, 0, 0.01]), 0.002, 1.0,
     )  # fmt: skip
     assert np.isfinite(scores).all() and np.abs(scores).max() <= 1 + 1e-5
-    assert (sweep_scores(views, grey_images(views, 0.0), vertices, normals, weights * 0,
+    assert (sweep_scores(views, grey_images(views, 0.0), FLAT, vertices, normals, weights * 0,
                          np.zeros(1), 0.002, 1.0) == 0).all()  # fmt: skip
 
 

@@ -19,7 +19,7 @@ from pipelines.depth.surface import advance, extract_mesh
 from pipelines.depth.views import make_view, without_contradiction
 from tests.pipelines.bump_head import mesh, render, ring
 
-QUICK = DepthConfig(voxel_mm=4.0, levels=2)
+QUICK = DepthConfig(voxel_mm=4.0)
 
 
 @pytest.fixture(scope="module")

@@ -36,7 +36,7 @@ SMALL = PackConfig(size=64, test_subjects=("S002",))
 def dataset(tmp_path_factory) -> Dataset:
     """Two subjects with depth."""
     made = make_dataset(tmp_path_factory.mktemp("pack"), ("S001", "S002"))
-    published(made, DEPTH, DepthConfig(voxel_mm=6, levels=1))
+    published(made, DEPTH, DepthConfig(voxel_mm=6))
     return made
 
 
@@ -278,7 +278,7 @@ def test_depth_stage_drops_a_bad_camera_and_reports_it(tmp_path):
     empty = dataset.matte_file("S001", "smile", "cam01")
     write_image(empty, np.zeros((96, 96), np.uint8))
     dataset.matte_file("S001", "smile", "cam04").unlink()
-    metrics = published(dataset, DEPTH, DepthConfig(voxel_mm=6, levels=1))
+    metrics = published(dataset, DEPTH, DepthConfig(voxel_mm=6))
     row = metrics["S001/smile"]
     assert {d["what"] for d in row["dropped"]} == {"cam01", "cam04"} and row["views"] == 4
     assert "empty" in row["dropped"][0]["why"]
