@@ -150,11 +150,25 @@ struct PixelList {
     }
 };
 
+// Zeroed memory that starts at a cache line: a vector across two costs twice.
+template <class Real> class Lines {
+    struct alignas(64) Line {
+        Real values[64 / sizeof(Real)];
+    };
+    std::vector<Line> lines;
+
+  public:
+    explicit Lines(size_t size) : lines((size * sizeof(Real) + sizeof(Line) - 1) / sizeof(Line)) {}
+    Real* data() { return lines.data()->values; }
+    const Real* data() const { return lines.data()->values; }
+    void clear() { std::fill(lines.begin(), lines.end(), Line{}); }
+};
+
 // Scratch of one thread.
 template <class Real> struct Workspace {
-    int channels, stride;      // stride: channels padded to whole vectors
+    int channels, stride;  // stride: channels padded to whole vectors
     bool wants_median;
-    std::vector<Real> pixels;  // forward: colours; backward: their gradients
+    Lines<Real> pixels;  // forward: colours; backward: their gradients
     std::vector<Real> color, color_gradient;
     alignas(64) Real transmittance[kPixels], alpha[kPixels], weighted[kPixels], median[kPixels];
     alignas(64) Real weight[kPixels], value[kPixels], before[kPixels], suffix[kPixels];
@@ -225,7 +239,7 @@ int blend_tile(Workspace<Real>& w, const TileFrame& tile, const Splat<Real>* spl
     using V = VecOf<Real>;
     const Centers<Real> centers(tile);
     int open = start_tile(tile, w.transmittance), used = 0;
-    std::fill(w.pixels.begin(), w.pixels.end(), Real(0));
+    w.pixels.clear();
     for (Real* sums : {w.alpha, w.weighted, w.median}) std::fill(sums, sums + kPixels, Real(0));
     for (int64_t i = 0; i < count && open > 0; ++i) {
         const int32_t id = ids[i];
@@ -250,7 +264,7 @@ int blend_tile(Workspace<Real>& w, const TileFrame& tile, const Splat<Real>* spl
                 w.list.template add<Lanes<Real>::N>(at, hit.lanes);
             } else {
                 for (int c = 0; c < w.channels; ++c) {
-                    Real* pixel = &w.pixels[size_t(c) * kPixels + at];
+                    Real* pixel = w.pixels.data() + c * kPixels + at;
                     store(pixel, load(pixel) + weight * color[c]);
                 }
             }

@@ -80,7 +80,7 @@ inline size_t replay(Workspace<Real>& w, const TileFrame& tile, const Centers<Re
             w.list.template add<Lanes<Real>::N>(at, hit.lanes);
         } else {
             for (int c = 0; c < w.channels; ++c) {
-                const V g = load(&w.pixels[size_t(c) * kPixels + at]);
+                const V g = load(w.pixels.data() + c * kPixels + at);
                 value += color[c] * g;
                 planar[c] += weight * g;
             }

@@ -183,7 +183,7 @@ template <class Real>
 void load_gradients(Workspace<Real>& w, const Camera& cam, const TileFrame& tile,
                     const Real* background, const Real* d_image, const Real* d_weighted,
                     const Real* d_alpha, const Real* d_median) {
-    std::fill(w.pixels.begin(), w.pixels.end(), Real(0));
+    w.pixels.clear();
     std::fill(w.alpha, w.alpha + kPixels, Real(0));
     std::fill(w.weighted, w.weighted + kPixels, Real(0));
     std::fill(w.median, w.median + kPixels, Real(0));
@@ -214,6 +214,18 @@ struct RecordIndex {
         int32_t record = 0;
         for (int64_t t = 0; t < tiles; ++t)
             for (int32_t k = 0; k < used[t]; ++k) records[cursor[ids[starts[t] + k]]++] = record++;
+    }
+
+    // Fetches the records of Gaussian i into the cache: they lie wherever its tiles lie.
+    template <class Real>
+    void prefetch(int64_t i, const Real* color_records, int channels,
+                  const Moments<Real>* moments) const {
+        for (int64_t k = first[i]; k < first[i + 1]; ++k) {
+            __builtin_prefetch(moments + records[k]);
+            const Real* colors = color_records + int64_t(records[k]) * channels;
+            for (int c = 0; c < channels; c += 64 / int(sizeof(Real)))
+                __builtin_prefetch(colors + c);
+        }
     }
 };
 
@@ -295,8 +307,11 @@ void backward(const Camera& cam, const Scene<Real>& scene, const Splat<Real>* sp
     std::vector<CameraGradient> partial(chunks, CameraGradient{});
 #pragma omp parallel for num_threads(cam.threads) schedule(dynamic)
     for (int64_t chunk = 0; chunk < chunks; ++chunk)
-        for (int64_t i = chunk * kChunk; i < std::min(n, (chunk + 1) * kChunk); ++i)
-            finish_gaussian(view, scene, i, index, color_records, moments, out, partial[chunk]);
+        for (int64_t i = chunk * kChunk; i < std::min(n, (chunk + 1) * kChunk); ++i) {
+            index.prefetch(std::min(i + kAhead, n - 1), color_records, scene.channels, moments);
+            finish_gaussian(view, scene, i, index, color_records, moments, out,
+                            partial[chunk]);
+        }
     double* total = &d_cam->fx;
     for (const CameraGradient& part : partial)
         for (int k = 0; k < 16; ++k) total[k] += (&part.fx)[k];
