@@ -1,4 +1,4 @@
-"""The scene of ``benchmarks.raster``, and the rival: autograd over explicit Gaussian-pixel pairs."""
+"""The scene of ``benchmarks.raster`` and its rival, autograd over explicit Gaussian-pixel pairs."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from grmm.rasterize.projection import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN, P
 def head(n: int, size: int, channels: int) -> dict[str, Tensor]:
     """N flat splats on an ellipsoid as large as a head, 1 m in front of the camera, float64.
 
-    They lie row by row on an equal-area map, as GRMM's lie on its UV map, and cover two fifths of
+    They lie row by row on an equal-area map, as GRMM's lie on its UV map, and cover a third of
     the picture with 14 to 16 blended splats a pixel of it on average.
     """
     side = math.isqrt(n)
