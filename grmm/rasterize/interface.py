@@ -61,4 +61,4 @@ class RenderBuffers:
         if flat is None or flat.dtype != dtype or flat.numel() < size:
             flat = self._flat[name] = torch.empty(size, dtype=dtype)
         torch.autograd.graph.increment_version(flat)
-        return flat[:size].view(shape)
+        return flat[:size].view(shape).detach()  # no view for autograd, but one version with it

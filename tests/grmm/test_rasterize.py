@@ -138,7 +138,7 @@ def test_native_equals_reference_on_random_scenes(n, channels, width, height, se
 @pytest.mark.parametrize("antialiased", [False, True])
 def test_gradients_match_finite_differences(backend, antialiased):
     scene = random_scene(7, 2, width=8, height=6, seed=3)
-    scene.tensors["scales"] *= 4.0
+    scene.tensors["scales"] *= 10.0
     scene.tensors["opacities"] = 0.5 + 0.4 * scene.tensors["opacities"]
     tensors = {k: v.clone().requires_grad_() for k, v in scene.tensors.items() if k != "K"}
     fx, fy, cx, cy = 9.0, 10.0, 3.0, 3.5
@@ -261,7 +261,7 @@ def test_normals_of_a_plane_face_the_camera(backend, angle):
     out = rasterize(**plane(normal), width=64, height=48, normals=True, backend=backend)
     got = torch.nn.functional.normalize(out.normals, dim=-1)
     # The dilated covariance bends them a little towards the ray.
-    assert (got @ -normal).min() > math.cos(math.radians(3))
+    assert (got @ -normal).min() > math.cos(math.radians(5))
     assert torch.allclose(out.normals.norm(dim=-1), out.alpha, rtol=1e-3)
 
 
