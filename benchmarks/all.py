@@ -22,6 +22,7 @@ SKIPPED = {
     "track_views",
     "matte_scenes",
     "matte_disturbances",
+    "raster_scene",
 }
 
 

@@ -2,14 +2,16 @@
 
 The layout is that of Kerbl et al. 2023: one ``vertex`` element of floats, x y z, nx ny nz
 (ignored), f_dc_0..2 and f_rest_* (spherical harmonics, channel by channel), opacity (logit),
-scale_0..2 (log) and rot_0..3 (wxyz). Other properties are skipped. Only binary little endian files
-are read: that is what every tool writes, and a small parser is easy to keep safe.
+scale_0..2 (log) and rot_0..3 (wxyz). Other properties are skipped. What other tools make of it is
+read too: any order and number type, binary of either byte order, ASCII, and surfels of two scales
+(2DGS, Huang et al. 2024), which are flat. Compressed files (``packed_*``) are refused by name.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from typing import BinaryIO
 
@@ -23,6 +25,7 @@ from express50.errors import FormatError
 
 MAX_HEADER_BYTES = 1 << 16
 MAX_GAUSSIANS = 50_000_000
+_ENCODINGS = ("ascii", "binary_little_endian", "binary_big_endian")
 SH_DC = 0.5 / math.sqrt(math.pi)  # value of the constant spherical harmonic
 _TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "<i2", "int16": "<i2",
@@ -58,14 +61,8 @@ def read_ply(path: str | Path) -> GaussianCloud:
     """
     path = Path(path)
     with path.open("rb") as stream:
-        dtype, count = _read_header(path, stream)
-        have, need = path.stat().st_size - stream.tell(), count * dtype.itemsize
-        if have < need:
-            raise FormatError(
-                f"{path}: {count} vertices need {need} bytes, the file has {have}; it was cut"
-                " short, copy it again"
-            )
-        table = np.fromfile(stream, dtype=dtype, count=count)
+        encoding, dtype, count = _read_header(path, stream)
+        table = _read_table(path, stream, encoding, dtype, count)
     number = sum(name.startswith("f_rest_") for name in dtype.names or ())
     if number not in (0, 9, 24, 45):
         raise FormatError(f"{path}: {number} f_rest properties, expected 0, 9, 24 or 45")
@@ -77,7 +74,7 @@ def read_ply(path: str | Path) -> GaussianCloud:
     cloud = GaussianCloud(
         means=torch.from_numpy(_columns(path, table, ["x", "y", "z"])),
         quats=torch.from_numpy(_columns(path, table, [f"rot_{i}" for i in range(4)])),
-        scales=torch.from_numpy(_columns(path, table, [f"scale_{i}" for i in range(3)])).exp(),
+        scales=torch.from_numpy(_scales(path, table)),
         opacities=torch.from_numpy(_columns(path, table, ["opacity"])[:, 0]).sigmoid(),
         sh=torch.from_numpy(sh),
     )
@@ -174,12 +171,18 @@ def _header_words(path: Path, stream: BinaryIO) -> list[list[str]]:
     return [line for line in lines[1:-1] if line and line[0] not in ("comment", "obj_info")]
 
 
-def _read_header(path: Path, stream: BinaryIO) -> tuple[np.dtype, int]:
-    """Row type and number of the vertices; leaves the stream at the first of them."""
+def _read_header(path: Path, stream: BinaryIO) -> tuple[str, np.dtype, int]:
+    """Encoding, row type and number of the vertices; leaves the stream at the first of them."""
     lines = _header_words(path, stream)
-    if not lines or lines[0] != ["format", "binary_little_endian", "1.0"]:
-        got = " ".join(lines[0]) if lines else "nothing"
-        raise FormatError(f"{path}: got {got}, expected format binary_little_endian 1.0")
+    first = lines[0] if lines else ["nothing"]
+    if first[:1] != ["format"] or first[1:2] not in [[e] for e in _ENCODINGS] or len(first) != 3:
+        expected = ", ".join(_ENCODINGS)
+        raise FormatError(f"{path}: got {' '.join(first)}, expected format {expected} 1.0")
+    if any(line[0] == "property" and line[-1].startswith("packed_") for line in lines):
+        raise FormatError(
+            f"{path}: a compressed splat file (packed_*), expected f_dc_*, scale_* and rot_*;"
+            " export it as an uncompressed .ply"
+        )
     if len(lines) < 2 or lines[1][:2] != ["element", "vertex"]:
         raise FormatError(f"{path}: the first element is not 'vertex'")
     count = int(lines[1][2]) if len(lines[1]) == 3 and lines[1][2].isdecimal() else -1
@@ -194,7 +197,44 @@ def _read_header(path: Path, stream: BinaryIO) -> tuple[np.dtype, int]:
         fields.append((line[2], _TYPES[line[1]]))
     if not fields or len({name for name, _ in fields}) != len(fields):
         raise FormatError(f"{path}: it has no vertex properties, or one is declared twice")
-    return np.dtype(fields), count
+    return first[1], np.dtype(fields), count
+
+
+def _read_table(
+    path: Path, stream: BinaryIO, encoding: str, dtype: np.dtype, count: int
+) -> np.ndarray:
+    """The vertices, in ``dtype`` or its other byte order; FormatError if some are missing."""
+    if encoding == "ascii":
+        rows = list(islice(stream, count))
+        try:
+            values = [tuple(map(float, row.split())) for row in rows]
+            table = np.array(values, np.dtype([(name, "<f8") for name in dtype.names or ()]))
+        except ValueError as error:
+            raise FormatError(f"{path}: a vertex line does not fit the header: {error}") from error
+        if len(rows) < count:
+            raise FormatError(
+                f"{path}: {count} vertices, the file has {len(rows)}; it was cut short, copy it"
+                " again"
+            )
+        return table
+    have, need = path.stat().st_size - stream.tell(), count * dtype.itemsize
+    if have < need:
+        raise FormatError(
+            f"{path}: {count} vertices need {need} bytes, the file has {have}; it was cut"
+            " short, copy it again"
+        )
+    swapped = encoding == "binary_big_endian"
+    return np.fromfile(stream, dtype=dtype.newbyteorder(">") if swapped else dtype, count=count)
+
+
+def _scales(path: Path, table: np.ndarray) -> np.ndarray:
+    """Standard deviations (N, 3); a surfel's third is 0."""
+    names = [f"scale_{i}" for i in range(3)]
+    flat = "scale_2" not in (table.dtype.names or ())
+    logs = _columns(path, table, names[:2] if flat else names)
+    with np.errstate(over="ignore"):  # refused by the caller
+        scales = np.exp(logs)
+    return np.pad(scales, ((0, 0), (0, 3 - scales.shape[1])))
 
 
 def _columns(path: Path, table: np.ndarray, names: list[str]) -> np.ndarray:

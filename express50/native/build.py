@@ -18,7 +18,7 @@ from pathlib import Path
 HERE = Path(__file__).resolve().parent
 SOURCE = HERE / "gaussians.cpp"
 SOURCES = (
-    "gaussians.cpp", "blend.h", "tiles.h", "projection.h", "lanes.h",
+    "gaussians.cpp", "blend.h", "blend_gradient.h", "tiles.h", "projection.h", "lanes.h",
     "mesh.h", "mesh_outlines.h", "mesh_rows.h",
 )  # fmt: skip
 

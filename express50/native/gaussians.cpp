@@ -6,16 +6,21 @@
 // The caller owns all memory (grmm/rasterize/cpu.py). Every sum is taken in an order that does not
 // depend on the number of threads: tiles write records of their own, which are then added for each
 // Gaussian by ascending tile, so images and gradients are the same bits on any number of threads.
+#if defined(__linux__)
+#include <sys/mman.h>
+#endif
+
 #include <cstdint>
 #include <type_traits>
 #include <vector>
 
-#include "blend.h"
+#include "blend_gradient.h"
 #include "mesh_outlines.h"
 #include "mesh_rows.h"
 
 namespace {
 
+constexpr double kLog2E = 1.4426950408889634;
 constexpr int64_t kChunk = 256;  // Gaussians whose camera gradients are added up together
 
 int tile_columns(const Camera& cam) { return (cam.width + kTile - 1) / kTile; }
@@ -38,32 +43,51 @@ void pixel_range(double mean, double extent, int size, int32_t& first, int32_t& 
     last = int32_t(std::clamp(std::floor(mean + reach - 0.5) + 1, 0.0, double(size)));
 }
 
+// The last three channels are written by `project` if the camera asks for normals.
+template <class Real> struct Scene {
+    int64_t n;
+    int channels;
+    const Real *means, *quats, *scales, *opacities;
+};
+
+// Projects one Gaussian for the blending; its box stays empty when it cannot be seen.
 template <class Real>
-int64_t project(const Camera& cam, int64_t n, const Real* means, const Real* quats,
-                const Real* scales, const Real* opacities, Splat<Real>* splats, Real* depths,
-                Box* boxes) {
+void project_splat(const View& view, const Scene<Real>& scene, int64_t i, Splat<Real>& splat,
+                   Real& depth, Box& box, Real* normal) {
+    Projected g;
+    project_one(view, scene.means + 3 * i, scene.quats + 4 * i, scene.scales + 3 * i,
+                scene.opacities[i], g);
+    if (!g.front || g.opacity < kAlphaMin) return;
+    const double level = std::log(g.opacity / kAlphaMin), e = view.cam.eps2d;
+    Box reach;
+    pixel_range(g.mean2d[0], std::sqrt(2 * level * (g.xx + e)), view.cam.width, reach.x0, reach.x1);
+    pixel_range(g.mean2d[1], std::sqrt(2 * level * (g.yy + e)), view.cam.height, reach.y0,
+                reach.y1);
+    if (reach.empty()) return;
+    box = reach;
+    depth = Real(g.p[2]);
+    const double half = 0.5 * kLog2E, root = std::sqrt(half * g.A);
+    // 1 / (yy + e) is what remains of C after the first column of the Cholesky factor.
+    splat = Splat<Real>{Real(g.mean2d[0]), Real(g.mean2d[1]), Real(root),
+                        Real(half * g.B / root), Real(std::sqrt(half / (g.yy + e))),
+                        Real(g.opacity), Real(kLog2E * level + 1e-3), Real(g.length),
+                        Real(g.slope[0]), Real(g.slope[1])};
+    if (normal) std::copy_n(g.normal, 3, normal);
+}
+
+template <class Real>
+int64_t project(const Camera& cam, const Scene<Real>& scene, Splat<Real>* splats, Real* depths,
+                Box* boxes, Real* colors) {
+    const View view(cam);
     int64_t entries = 0;
 #pragma omp parallel for num_threads(cam.threads) schedule(static) reduction(+ : entries)
-    for (int64_t i = 0; i < n; ++i) {
-        Projected g;
+    for (int64_t i = 0; i < scene.n; ++i) {
+        Real* normal = cam.normals ? colors + (i + 1) * scene.channels - 3 : nullptr;
+        if (normal) std::fill(normal, normal + 3, Real(0));
         boxes[i] = Box{0, 0, 0, 0};
         depths[i] = 0;
-        project_one(cam, means + 3 * i, quats + 4 * i, scales + 3 * i, opacities[i], g);
-        if (!g.front || g.opacity < kAlphaMin) continue;
-        const double level = std::log(g.opacity / kAlphaMin), e = cam.eps2d;
-        Box box;
-        pixel_range(g.mean2d[0], std::sqrt(2 * level * (g.xx + e)), cam.width, box.x0, box.x1);
-        pixel_range(g.mean2d[1], std::sqrt(2 * level * (g.yy + e)), cam.height, box.y0, box.y1);
-        if (box.empty()) continue;
-        boxes[i] = box;
-        depths[i] = Real(g.p[2]);
-        const double root = std::sqrt(0.5 * g.A);
-        // 1 / (yy + e) is what remains of C after the first column of the Cholesky factor.
-        splats[i] = Splat<Real>{Real(g.mean2d[0]), Real(g.mean2d[1]), Real(root),
-                                Real(0.5 * g.B / root), Real(std::sqrt(0.5 / (g.yy + e))),
-                                Real(g.opacity), Real(level + 1e-3), Real(g.length),
-                                Real(g.slope[0]), Real(g.slope[1])};
-        entries += box.tiles();
+        project_splat(view, scene, i, splats[i], depths[i], boxes[i], normal);
+        entries += boxes[i].tiles();
     }
     return entries;
 }
@@ -92,7 +116,7 @@ void store_colors(const Workspace<Real>& w, const Camera& cam, const TileFrame& 
     const Real* behind = background ? background : black.data();
     for (int y = 0; y < tile.height; ++y)
         for (int x = 0; x < tile.width; ++x) {
-            const int at = y * kTile + x, channels = w.channels;
+            const int at = Block<Real>::place(x, y), channels = w.channels;
             const Real through = Real(1) - w.alpha[at];
             Real* to = image + (int64_t(tile.top + y) * cam.width + tile.left + x) * channels;
             const Real* from = w.pixels.data() + (w.planar() ? at : at * w.stride);
@@ -110,7 +134,7 @@ void load_color_gradients(Workspace<Real>& w, const Camera& cam, const TileFrame
                           const Real* background, const Real* d_image) {
     for (int y = 0; y < tile.height; ++y)
         for (int x = 0; x < tile.width; ++x) {
-            const int at = y * kTile + x, channels = w.channels;
+            const int at = Block<Real>::place(x, y), channels = w.channels;
             const Real* from =
                 d_image + (int64_t(tile.top + y) * cam.width + tile.left + x) * channels;
             Real* to = w.pixels.data() + (w.planar() ? at : at * w.stride);
@@ -126,12 +150,12 @@ void load_color_gradients(Workspace<Real>& w, const Camera& cam, const TileFrame
 template <class Real>
 int64_t forward(const Camera& cam, int channels, const Splat<Real>* splats, const Box* boxes,
                 const Real* colors, const Real* background, const int64_t* starts, int32_t* ids,
-                int32_t* used, Real* image, Real* weighted, Real* alpha) {
+                int32_t* used, Real* image, Real* weighted, Real* alpha, Real* median) {
     const int64_t tiles = int64_t(tile_columns(cam)) * tile_rows(cam);
     int64_t records = 0;
 #pragma omp parallel num_threads(cam.threads) reduction(+ : records)
     {
-        Workspace<Real> w(channels);
+        Workspace<Real> w(channels, median != nullptr);
 #pragma omp for schedule(dynamic)
         for (int64_t i = 0; i < tiles; ++i) {
             const TileFrame tile = tile_frame(cam, i);
@@ -142,8 +166,11 @@ int64_t forward(const Camera& cam, int channels, const Splat<Real>* splats, cons
             records += used[i];
             for (int y = 0; y < tile.height; ++y) {
                 const int64_t row = int64_t(tile.top + y) * cam.width + tile.left;
-                std::copy_n(w.alpha + y * kTile, tile.width, alpha + row);
-                std::copy_n(w.weighted + y * kTile, tile.width, weighted + row);
+                for (int x = 0; x < tile.width; ++x) {
+                    const int at = Block<Real>::place(x, y);
+                    alpha[row + x] = w.alpha[at], weighted[row + x] = w.weighted[at];
+                    if (median) median[row + x] = w.median[at];
+                }
             }
             store_colors(w, cam, tile, background, image);
         }
@@ -155,15 +182,19 @@ int64_t forward(const Camera& cam, int channels, const Splat<Real>* splats, cons
 template <class Real>
 void load_gradients(Workspace<Real>& w, const Camera& cam, const TileFrame& tile,
                     const Real* background, const Real* d_image, const Real* d_weighted,
-                    const Real* d_alpha) {
-    std::fill(w.pixels.begin(), w.pixels.end(), Real(0));
+                    const Real* d_alpha, const Real* d_median) {
+    w.pixels.clear();
     std::fill(w.alpha, w.alpha + kPixels, Real(0));
     std::fill(w.weighted, w.weighted + kPixels, Real(0));
-    for (int y = 0; y < tile.height; ++y) {
-        const int64_t row = int64_t(tile.top + y) * cam.width + tile.left;
-        if (d_alpha) std::copy_n(d_alpha + row, tile.width, w.alpha + y * kTile);
-        if (d_weighted) std::copy_n(d_weighted + row, tile.width, w.weighted + y * kTile);
-    }
+    std::fill(w.median, w.median + kPixels, Real(0));
+    for (int y = 0; y < tile.height; ++y)
+        for (int x = 0; x < tile.width; ++x) {
+            const int64_t from = int64_t(tile.top + y) * cam.width + tile.left + x;
+            const int at = Block<Real>::place(x, y);
+            if (d_alpha) w.alpha[at] = d_alpha[from];
+            if (d_weighted) w.weighted[at] = d_weighted[from];
+            if (d_median) w.median[at] = d_median[from];
+        }
     if (d_image) load_color_gradients(w, cam, tile, background, d_image);
 }
 
@@ -184,6 +215,18 @@ struct RecordIndex {
         for (int64_t t = 0; t < tiles; ++t)
             for (int32_t k = 0; k < used[t]; ++k) records[cursor[ids[starts[t] + k]]++] = record++;
     }
+
+    // Fetches the records of Gaussian i into the cache: they lie wherever its tiles lie.
+    template <class Real>
+    void prefetch(int64_t i, const Real* color_records, int channels,
+                  const Moments<Real>* moments) const {
+        for (int64_t k = first[i]; k < first[i + 1]; ++k) {
+            __builtin_prefetch(moments + records[k]);
+            const Real* colors = color_records + int64_t(records[k]) * channels;
+            for (int c = 0; c < channels; c += 64 / int(sizeof(Real)))
+                __builtin_prefetch(colors + c);
+        }
+    }
 };
 
 // Gradient by the projected Gaussian from its summed moments.
@@ -198,19 +241,13 @@ SplatGradient splat_gradient(const Projected& g, const double* m) {
     return d;
 }
 
-template <class Real> struct Scene {
-    int64_t n;
-    int channels;
-    const Real *means, *quats, *scales, *opacities;
-};
-
 template <class Real> struct SceneGradient {
     Real *means, *quats, *scales, *opacities, *colors;
 };
 
 // Adds up the records of one Gaussian and takes them through the projection.
 template <class Real>
-void finish_gaussian(const Camera& cam, const Scene<Real>& scene, int64_t i,
+void finish_gaussian(const View& view, const Scene<Real>& scene, int64_t i,
                      const RecordIndex& index, const Real* color_records,
                      const Moments<Real>* moments, const SceneGradient<Real>& out,
                      CameraGradient& d_cam) {
@@ -226,10 +263,12 @@ void finish_gaussian(const Camera& cam, const Scene<Real>& scene, int64_t i,
     }
     if (index.first[i] < index.first[i + 1]) {
         Projected g;
-        project_one(cam, scene.means + 3 * i, scene.quats + 4 * i, scene.scales + 3 * i,
+        project_one(view, scene.means + 3 * i, scene.quats + 4 * i, scene.scales + 3 * i,
                     scene.opacities[i], g);
-        project_gradient(cam, scene.means + 3 * i, scene.scales + 3 * i, scene.opacities[i], g,
-                         splat_gradient<Real>(g, m), mean, quat, scale, &opacity, d_cam);
+        SplatGradient d = splat_gradient<Real>(g, m);
+        if (view.cam.normals) std::copy_n(color + channels - 3, 3, d.normal);
+        project_gradient(view, scene.means + 3 * i, scene.scales + 3 * i, scene.opacities[i], g, d,
+                         mean, quat, scale, &opacity, d_cam);
     }
     std::copy_n(mean, 3, out.means + 3 * i);
     std::copy_n(quat, 4, out.quats + 4 * i);
@@ -241,19 +280,20 @@ template <class Real>
 void backward(const Camera& cam, const Scene<Real>& scene, const Splat<Real>* splats,
               const Box* boxes, const Real* colors, const Real* background, const int64_t* starts,
               const int32_t* ids, const int32_t* used, const Real* d_image,
-              const Real* d_weighted, const Real* d_alpha, Real* color_records,
+              const Real* d_weighted, const Real* d_alpha, const Real* d_median,
+              Real* color_records,
               Moments<Real>* moments, const SceneGradient<Real>& out, CameraGradient* d_cam) {
     const int64_t tiles = int64_t(tile_columns(cam)) * tile_rows(cam), n = scene.n;
     std::vector<int64_t> first_record(tiles + 1, 0);
     for (int64_t i = 0; i < tiles; ++i) first_record[i + 1] = first_record[i] + used[i];
 #pragma omp parallel num_threads(cam.threads)
     {
-        Workspace<Real> w(scene.channels);
+        Workspace<Real> w(scene.channels, d_median != nullptr);
 #pragma omp for schedule(dynamic)
         for (int64_t i = 0; i < tiles; ++i) {
             if (!used[i]) continue;
             const TileFrame tile = tile_frame(cam, i);
-            load_gradients(w, cam, tile, background, d_image, d_weighted, d_alpha);
+            load_gradients(w, cam, tile, background, d_image, d_weighted, d_alpha, d_median);
             with_layout<Real>(scene.channels, [&](auto layout) {
                 blend_tile_gradient<Real, decltype(layout)::value>(
                     w, tile, splats, boxes, colors, ids + starts[i], used[i],
@@ -262,12 +302,16 @@ void backward(const Camera& cam, const Scene<Real>& scene, const Splat<Real>* sp
         }
     }
     const RecordIndex index(n, tiles, starts, ids, used);
+    const View view(cam);
     const int64_t chunks = (n + kChunk - 1) / kChunk;
     std::vector<CameraGradient> partial(chunks, CameraGradient{});
 #pragma omp parallel for num_threads(cam.threads) schedule(dynamic)
     for (int64_t chunk = 0; chunk < chunks; ++chunk)
-        for (int64_t i = chunk * kChunk; i < std::min(n, (chunk + 1) * kChunk); ++i)
-            finish_gaussian(cam, scene, i, index, color_records, moments, out, partial[chunk]);
+        for (int64_t i = chunk * kChunk; i < std::min(n, (chunk + 1) * kChunk); ++i) {
+            index.prefetch(std::min(i + kAhead, n - 1), color_records, scene.channels, moments);
+            finish_gaussian(view, scene, i, index, color_records, moments, out,
+                            partial[chunk]);
+        }
     double* total = &d_cam->fx;
     for (const CameraGradient& part : partial)
         for (int k = 0; k < 16; ++k) total[k] += (&part.fx)[k];
@@ -279,9 +323,11 @@ void backward(const Camera& cam, const Scene<Real>& scene, const Splat<Real>* sp
 
 #define EXPRESS50_GAUSSIANS(Real, suffix)                                                         \
     EXPRESS50_EXPORT int64_t gaussians_project_##suffix(                                          \
-        const Camera* cam, int64_t n, const Real* means, const Real* quats, const Real* scales,   \
-        const Real* opacities, Splat<Real>* splats, Real* depths, Box* boxes) {                   \
-        return project<Real>(*cam, n, means, quats, scales, opacities, splats, depths, boxes);    \
+        const Camera* cam, int64_t n, int64_t channels, const Real* means, const Real* quats,     \
+        const Real* scales, const Real* opacities, Splat<Real>* splats, Real* depths, Box* boxes, \
+        Real* colors) {                                                                           \
+        return project<Real>(*cam, {n, int(channels), means, quats, scales, opacities}, splats,   \
+                             depths, boxes, colors);                                              \
     }                                                                                             \
     EXPRESS50_EXPORT void gaussians_bin_##suffix(const Camera* cam, int64_t n,                    \
                                                  const Real* depths, const Box* boxes,            \
@@ -289,22 +335,23 @@ void backward(const Camera& cam, const Scene<Real>& scene, const Splat<Real>* sp
         bin_into_tiles<Real>(n, depths, boxes, tile_columns(*cam), tile_rows(*cam), starts, ids); \
     }                                                                                             \
     EXPRESS50_EXPORT int64_t gaussians_forward_##suffix(                                          \
-        const Camera* cam, int64_t channels, const Splat<Real>* splats, const Box* boxes,             \
+        const Camera* cam, int64_t channels, const Splat<Real>* splats, const Box* boxes,         \
         const Real* colors, const Real* background, const int64_t* starts, int32_t* ids,          \
-        int32_t* used, Real* image, Real* weighted, Real* alpha) {                                \
-        return forward<Real>(*cam, int(channels), splats, boxes, colors, background, starts, ids,      \
-                             used, image, weighted, alpha);                                       \
+        int32_t* used, Real* image, Real* weighted, Real* alpha, Real* median) {                  \
+        return forward<Real>(*cam, int(channels), splats, boxes, colors, background, starts, ids, \
+                             used, image, weighted, alpha, median);                               \
     }                                                                                             \
     EXPRESS50_EXPORT void gaussians_backward_##suffix(                                            \
-        const Camera* cam, int64_t n, int64_t channels, const Real* means, const Real* quats,        \
+        const Camera* cam, int64_t n, int64_t channels, const Real* means, const Real* quats,     \
         const Real* scales, const Real* opacities, const Splat<Real>* splats, const Box* boxes,   \
         const Real* colors, const Real* background, const int64_t* starts, const int32_t* ids,    \
         const int32_t* used, const Real* d_image, const Real* d_weighted, const Real* d_alpha,    \
-        Real* color_records, Moments<Real>* moments, Real* d_means, Real* d_quats,                \
-        Real* d_scales, Real* d_opacities, Real* d_colors, CameraGradient* d_cam) {               \
-        backward<Real>(*cam, {n, int(channels), means, quats, scales, opacities}, splats, boxes,       \
+        const Real* d_median, Real* color_records, Moments<Real>* moments, Real* d_means,         \
+        Real* d_quats, Real* d_scales, Real* d_opacities, Real* d_colors,                         \
+        CameraGradient* d_cam) {                                                                  \
+        backward<Real>(*cam, {n, int(channels), means, quats, scales, opacities}, splats, boxes,  \
                        colors, background, starts, ids, used, d_image, d_weighted, d_alpha,       \
-                       color_records, moments,                                                    \
+                       d_median, color_records, moments,                                          \
                        {d_means, d_quats, d_scales, d_opacities, d_colors}, d_cam);               \
     }
 
@@ -337,6 +384,18 @@ EXPRESS50_EXPORT int64_t mesh_pairs(const MeshView* view, const double* xyz, int
 
 EXPRESS50_MESH_ROWS(float, f32)
 EXPRESS50_MESH_ROWS(double, f64)
+
+// Asks for huge pages inside [start, start + bytes); where there are none nothing happens.
+EXPRESS50_EXPORT void native_huge_pages(void* start, int64_t bytes) {
+#if defined(__linux__) && defined(MADV_HUGEPAGE)
+    constexpr uintptr_t kPage = 4096;
+    const uintptr_t from = (uintptr_t(start) + kPage - 1) / kPage * kPage;
+    const uintptr_t to = (uintptr_t(start) + uintptr_t(bytes)) / kPage * kPage;
+    if (to > from) madvise(reinterpret_cast<void*>(from), to - from, MADV_HUGEPAGE);
+#else
+    (void)start, (void)bytes;
+#endif
+}
 
 // Which source this library was compiled from, so that a stale one is noticed.
 EXPRESS50_EXPORT const char* native_digest() { return EXPRESS50_DIGEST; }

@@ -46,6 +46,40 @@ template <class Real> inline VecOf<Real> load(const Real* p) {
 
 template <class Real> inline void store(Real* p, VecOf<Real> v) { std::memcpy(p, &v, sizeof v); }
 
+// The first `count` <= N numbers, the other lanes 0; and the same for writing. They touch no memory
+// beyond: rows of channels lie without a gap, and the next may belong to another thread.
+template <class Real> inline VecOf<Real> load_first(const Real* p, int count) {
+    VecOf<Real> v = {};
+    for (int i = 0; i < count; ++i) v[i] = p[i];
+    return v;
+}
+
+template <class Real> inline void store_first(Real* p, VecOf<Real> v, int count) {
+    for (int i = 0; i < count; ++i) p[i] = v[i];
+}
+
+#if defined(__AVX512F__)
+template <> inline VecOf<float> load_first<float>(const float* p, int count) {
+    return (VecOf<float>)_mm512_maskz_loadu_ps(__mmask16((1u << count) - 1), p);
+}
+
+template <> inline void store_first<float>(float* p, VecOf<float> v, int count) {
+    _mm512_mask_storeu_ps(p, __mmask16((1u << count) - 1), (__m512)v);
+}
+#elif defined(__AVX2__)
+inline __m256i first_lanes(int count) {
+    return _mm256_cmpgt_epi32(_mm256_set1_epi32(count), _mm256_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7));
+}
+
+template <> inline VecOf<float> load_first<float>(const float* p, int count) {
+    return (VecOf<float>)_mm256_maskload_ps(p, first_lanes(count));
+}
+
+template <> inline void store_first<float>(float* p, VecOf<float> v, int count) {
+    _mm256_maskstore_ps(p, first_lanes(count), (__m256)v);
+}
+#endif
+
 template <class Real> inline VecOf<Real> broadcast(Real x) { return x - VecOf<Real>{}; }
 
 // One bit a lane, set where the mask is.
@@ -98,23 +132,21 @@ template <> inline float sum<float>(VecOf<float> v) {
 template <> inline float sum<float>(VecOf<float> v) { return _mm512_reduce_add_ps((__m512)v); }
 #endif
 
-// exp(x) for x in [-80, 0]: x = n ln 2 + r with |r| <= ln(2)/2, then a Taylor polynomial in r whose
-// remainder is under half a unit in the last place (degree 7 in float, 13 in double).
-template <class Real> inline VecOf<Real> exp_negative(VecOf<Real> x) {
+// 2^x for x in [-120, 0]; anything else gives garbage, which the caller masks. x = n + r with |r| <=
+// 1/2 exactly, then the series of e^(r ln 2), whose remainder is under half a unit in the last place
+// (degree 7 in float, 13 in double).
+template <class Real> inline VecOf<Real> exp2_negative(VecOf<Real> x) {
     using L = Lanes<Real>;
-    constexpr bool single = sizeof(Real) == 4;
-    const VecOf<Real> shifted = x * Real(1.4426950408889634) + L::kRound;
-    const VecOf<Real> n = shifted - L::kRound;
-    // ln 2 in two parts; the high one has trailing zeros, so that n * high is exact.
-    const Real high = single ? Real(0.693145751953125) : Real(0.69314718036912382);
-    const Real low = single ? Real(1.42860682030941723e-6) : Real(1.90821492927058770e-10);
-    const VecOf<Real> r = (x - n * high) - n * low;
-    constexpr int degree = single ? 7 : 13;
-    constexpr double inverse_factorial[14] = {
-        1.0, 1.0, 1.0 / 2, 1.0 / 6, 1.0 / 24, 1.0 / 120, 1.0 / 720, 1.0 / 5040, 1.0 / 40320,
-        1.0 / 362880, 1.0 / 3628800, 1.0 / 39916800, 1.0 / 479001600, 1.0 / 6227020800.0};
-    VecOf<Real> p = broadcast(Real(inverse_factorial[degree]));
-    for (int k = degree - 1; k >= 0; --k) p = p * r + Real(inverse_factorial[k]);
+    const VecOf<Real> shifted = x + L::kRound;
+    const VecOf<Real> r = x - (shifted - L::kRound);
+    constexpr int degree = sizeof(Real) == 4 ? 7 : 13;
+    constexpr double coefficient[14] = {  // ln(2)^k / k!
+        1.0, 0.6931471805599453, 0.2402265069591007, 0.05550410866482158, 0.009618129107628477,
+        0.0013333558146428443, 0.0001540353039338161, 1.5252733804059841e-05,
+        1.3215486790144309e-06, 1.0178086009239699e-07, 7.054911620801123e-09,
+        4.44553827187081e-10, 2.5678435993488204e-11, 1.3691488853904128e-12};
+    VecOf<Real> p = broadcast(Real(coefficient[degree]));
+    for (int k = degree - 1; k >= 0; --k) p = p * r + Real(coefficient[k]);
     MaskOf<Real> exponent;
     std::memcpy(&exponent, &shifted, sizeof exponent);
     // The low bits of `shifted` are n in two's complement; the rest is shifted out.

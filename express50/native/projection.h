@@ -14,7 +14,20 @@ struct Camera {
     double fx, fy, cx, cy;
     double R[9], t[3];
     double near, eps2d;
-    int32_t width, height, antialiased, threads;
+    int32_t width, height, antialiased, normals, threads;
+};
+
+// A camera and what is the same for all Gaussians in it: divisions are most of a projection's time.
+struct View {
+    const Camera& cam;
+    double focal[2], center[2], low[2], high[2];  // bounds of x/z and y/z in the Jacobian
+    explicit View(const Camera& c) : cam(c), focal{c.fx, c.fy}, center{c.cx, c.cy} {
+        const double size[2] = {double(c.width), double(c.height)};
+        for (int i = 0; i < 2; ++i) {
+            low[i] = -(center[i] + kFovMargin * size[i]) / focal[i];
+            high[i] = (size[i] - center[i] + kFovMargin * size[i]) / focal[i];
+        }
+    }
 };
 
 struct CameraGradient {
@@ -33,6 +46,7 @@ struct Projected {
     double cross[3], det_sharp, det, ratio;
     double A, B, C;  // conic
     double mean2d[2], slope[2], opacity;
+    double normal[3], inverse_steepness;  // see project_normal
 };
 
 inline double dot3(const double* a, const double* b) {
@@ -58,29 +72,38 @@ inline void quaternion_to_matrix(const double* q, double* m) {
     m[6] = 2 * (x * z - w * y), m[7] = 2 * (y * z + w * x), m[8] = 1 - 2 * (x * x + y * y);
 }
 
+// Unit normal, towards the camera, of the plane ray length = l + slope . (pixel - mean2d): minus the
+// derivative of (ray length - slope . pixel) by camera coordinates.
+inline void project_normal(Projected& g) {
+    for (int k = 0; k < 3; ++k)
+        g.normal[k] = g.slope[0] * g.J[k] + g.slope[1] * g.J[3 + k] - g.J[6 + k];
+    const double steepness = std::sqrt(dot3(g.normal, g.normal));
+    g.inverse_steepness = steepness > 0 ? 1 / steepness : 0;
+    for (int k = 0; k < 3; ++k) g.normal[k] *= g.inverse_steepness;
+}
+
 template <class Real>
-inline void project_one(const Camera& cam, const Real* mean, const Real* quat, const Real* scale,
+inline void project_one(const View& view, const Real* mean, const Real* quat, const Real* scale,
                         Real opacity, Projected& g) {
+    const Camera& cam = view.cam;
     for (int i = 0; i < 3; ++i)
         g.p[i] = cam.R[3 * i] * mean[0] + cam.R[3 * i + 1] * mean[1] + cam.R[3 * i + 2] * mean[2] +
                  cam.t[i];
-    const double z = g.p[2];
-    g.front = z > cam.near;
+    g.front = g.p[2] > cam.near;
     if (!g.front) return;
-    const double focal[2] = {cam.fx, cam.fy}, center[2] = {cam.cx, cam.cy};
-    const double size[2] = {double(cam.width), double(cam.height)};
+    const double inverse_z = 1 / g.p[2];
     g.length = std::sqrt(dot3(g.p, g.p));
     for (int i = 0; i < 9; ++i) g.J[i] = 0;
     for (int i = 0; i < 2; ++i) {
-        g.tan_raw[i] = g.p[i] / z;
-        const double low = -(center[i] + kFovMargin * size[i]) / focal[i];
-        const double high = (size[i] - center[i] + kFovMargin * size[i]) / focal[i];
-        g.tan[i] = g.tan_raw[i] < low ? low : (g.tan_raw[i] > high ? high : g.tan_raw[i]);
-        g.J[3 * i + i] = focal[i] / z;
-        g.J[3 * i + 2] = -focal[i] * g.tan[i] / z;
-        g.mean2d[i] = focal[i] * g.tan_raw[i] + center[i];
+        const double raw = g.p[i] * inverse_z, low = view.low[i], high = view.high[i];
+        g.tan_raw[i] = raw;
+        g.tan[i] = raw < low ? low : (raw > high ? high : raw);
+        g.J[3 * i + i] = view.focal[i] * inverse_z;
+        g.J[3 * i + 2] = -g.J[3 * i + i] * g.tan[i];
+        g.mean2d[i] = view.focal[i] * raw + view.center[i];
     }
-    for (int i = 0; i < 3; ++i) g.J[6 + i] = g.p[i] / g.length;
+    const double inverse_length = 1 / g.length;
+    for (int i = 0; i < 3; ++i) g.J[6 + i] = g.p[i] * inverse_length;
 
     const double q[4] = {double(quat[0]), double(quat[1]), double(quat[2]), double(quat[3])};
     const double norm2 = q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3];
@@ -97,19 +120,22 @@ inline void project_one(const Camera& cam, const Real* mean, const Real* quat, c
     cross3(u, v, g.cross);
     g.det_sharp = dot3(g.cross, g.cross);
     g.det = g.det_sharp + e * (g.xx + g.yy) + e * e;
-    g.A = (g.yy + e) / g.det, g.B = -g.xy / g.det, g.C = (g.xx + e) / g.det;
+    const double inverse_det = 1 / g.det;
+    g.A = (g.yy + e) * inverse_det, g.B = -g.xy * inverse_det, g.C = (g.xx + e) * inverse_det;
     double t_v[3], u_t[3];
     cross3(t, v, t_v), cross3(u, t, u_t);
-    g.slope[0] = (e * g.tu + dot3(g.cross, t_v)) / g.det;
-    g.slope[1] = (e * g.tv + dot3(g.cross, u_t)) / g.det;
-    g.ratio = g.det_sharp / g.det;
-    const double compensation = std::sqrt(std::max(g.ratio, kCompensationMin * kCompensationMin));
-    g.opacity = double(opacity) * (cam.antialiased ? compensation : 1.0);
+    g.slope[0] = (e * g.tu + dot3(g.cross, t_v)) * inverse_det;
+    g.slope[1] = (e * g.tv + dot3(g.cross, u_t)) * inverse_det;
+    g.opacity = double(opacity);
+    g.ratio = g.det_sharp * inverse_det;
+    if (cam.antialiased)
+        g.opacity *= std::sqrt(std::max(g.ratio, kCompensationMin * kCompensationMin));
+    if (cam.normals) project_normal(g);
 }
 
 // Gradient of a loss by what the blending reads of one Gaussian.
 struct SplatGradient {
-    double mean2d[2], conic[3], opacity, length, slope[2];
+    double mean2d[2], conic[3], opacity, length, slope[2], normal[3];
 };
 
 // Derivative by the quaternion (before normalisation) of sum(G * Rq).
@@ -126,12 +152,21 @@ inline void quaternion_gradient(const Projected& g, const double* G, double* out
 
 // Writes gradients by mean, quaternion, scale and opacity; adds those by the camera.
 template <class Real>
-inline void project_gradient(const Camera& cam, const Real* mean, const Real* scale, Real opacity,
+inline void project_gradient(const View& view, const Real* mean, const Real* scale, Real opacity,
                              const Projected& g, SplatGradient d, double* d_mean, double* d_quat,
                              double* d_scale, double* d_opacity, CameraGradient& d_cam) {
+    const Camera& cam = view.cam;
     const double *u = g.rows, *v = g.rows + 3, *t = g.rows + 6, e = cam.eps2d;
-    const double n_u = d.slope[0] / g.det, n_v = d.slope[1] / g.det;  // by the numerators
-    double d_det = -(d.conic[0] * g.A + d.conic[1] * g.B + d.conic[2] * g.C) / g.det -
+    double d_steep[3] = {0, 0, 0};  // by the normal before it gets length 1
+    if (cam.normals) {
+        const double along = dot3(g.normal, d.normal);
+        for (int k = 0; k < 3; ++k)
+            d_steep[k] = (d.normal[k] - g.normal[k] * along) * g.inverse_steepness;
+        d.slope[0] += dot3(d_steep, g.J), d.slope[1] += dot3(d_steep, g.J + 3);
+    }
+    const double inverse_det = 1 / g.det;
+    const double n_u = d.slope[0] * inverse_det, n_v = d.slope[1] * inverse_det;  // by numerators
+    double d_det = -(d.conic[0] * g.A + d.conic[1] * g.B + d.conic[2] * g.C) * inverse_det -
                    n_u * g.slope[0] - n_v * g.slope[1];
     double d_sharp = 0;
     *d_opacity = d.opacity;
@@ -140,13 +175,14 @@ inline void project_gradient(const Camera& cam, const Real* mean, const Real* sc
         *d_opacity = d.opacity * root;
         if (g.ratio > kCompensationMin * kCompensationMin) {
             const double d_ratio = d.opacity * double(opacity) * 0.5 / root;
-            d_sharp = d_ratio / g.det;
-            d_det -= d_ratio * g.ratio / g.det;
+            d_sharp = d_ratio * inverse_det;
+            d_det -= d_ratio * g.ratio * inverse_det;
         }
     }
     d_sharp += d_det;
-    const double d_xx = d.conic[2] / g.det + e * d_det, d_yy = d.conic[0] / g.det + e * d_det;
-    const double d_xy = -d.conic[1] / g.det, d_tu = e * n_u, d_tv = e * n_v;
+    const double d_xx = d.conic[2] * inverse_det + e * d_det;
+    const double d_yy = d.conic[0] * inverse_det + e * d_det;
+    const double d_xy = -d.conic[1] * inverse_det, d_tu = e * n_u, d_tv = e * n_v;
     double t_v[3], u_t[3], v_c[3], c_t[3], t_c[3], c_u[3], d_c[3], v_dc[3], dc_u[3];
     cross3(t, v, t_v), cross3(u, t, u_t), cross3(v, g.cross, v_c), cross3(g.cross, t, c_t);
     cross3(t, g.cross, t_c), cross3(g.cross, u, c_u);
@@ -162,6 +198,10 @@ inline void project_gradient(const Camera& cam, const Real* mean, const Real* sc
     for (int k = 0; k < 3; ++k) d_scale[k] = 0;
     for (int i = 0; i < 3; ++i)
         for (int m = 0; m < 3; ++m) d_J[3 * i + m] = dot3(d_rows + 3 * i, g.M + 3 * m);
+    for (int m = 0; m < 3; ++m) {
+        d_J[m] += g.slope[0] * d_steep[m], d_J[3 + m] += g.slope[1] * d_steep[m];
+        d_J[6 + m] -= d_steep[m];
+    }
     for (int m = 0; m < 3; ++m)
         for (int k = 0; k < 3; ++k) {
             const double d_M =
@@ -176,23 +216,24 @@ inline void project_gradient(const Camera& cam, const Real* mean, const Real* sc
         }
     quaternion_gradient(g, d_Rq, d_quat);
 
-    const double focal[2] = {cam.fx, cam.fy}, z = g.p[2];
+    const double* focal = view.focal;
+    const double inverse_z = 1 / g.p[2];
     double d_p[3] = {0, 0, 0}, d_focal[2], d_center[2];
     for (int i = 0; i < 2; ++i) {
         const double d_diagonal = d_J[3 * i + i], d_third = d_J[3 * i + 2];
-        const double d_tan = -focal[i] / z * d_third;
+        const double d_tan = -focal[i] * inverse_z * d_third;
         double d_raw = focal[i] * d.mean2d[i];
-        d_focal[i] = d_diagonal / z - g.tan[i] / z * d_third + g.tan_raw[i] * d.mean2d[i];
+        d_focal[i] = (d_diagonal - g.tan[i] * d_third) * inverse_z + g.tan_raw[i] * d.mean2d[i];
         d_center[i] = d.mean2d[i];
-        d_p[2] += (focal[i] * g.tan[i] * d_third - focal[i] * d_diagonal) / (z * z);
+        d_p[2] += focal[i] * (g.tan[i] * d_third - d_diagonal) * (inverse_z * inverse_z);
         if (g.tan[i] == g.tan_raw[i]) {
             d_raw += d_tan;
         } else {  // the bound itself moves with the intrinsics
             d_center[i] -= d_tan / focal[i];
             d_focal[i] -= d_tan * g.tan[i] / focal[i];
         }
-        d_p[i] += d_raw / z;
-        d_p[2] -= d_raw * g.tan_raw[i] / z;
+        d_p[i] += d_raw * inverse_z;
+        d_p[2] -= d_raw * g.tan_raw[i] * inverse_z;
     }
     const double* ray = g.J + 6;
     const double along = dot3(ray, d_J + 6);

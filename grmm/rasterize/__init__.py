@@ -8,34 +8,18 @@ so that a scene looks the same on each of them.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from express50 import native
+from grmm.rasterize.interface import RenderBuffers, RenderOptions, RenderOutput
 from grmm.rasterize.reference import rasterize_reference
 
-__all__ = ["BACKENDS", "RenderOutput", "rasterize", "resolve_backend"]
+__all__ = ["BACKENDS", "RenderBuffers", "RenderOutput", "rasterize", "resolve_backend"]
 
 LIMIT = 1e30  # of any argument's values
 BACKENDS = ("auto", "reference", "cpu", "gsplat")
-
-
-@dataclass(frozen=True)
-class RenderOutput:
-    """What ``rasterize`` returns.
-
-    Attributes:
-        colors: (H, W, C) blended colours (any channels), background included.
-        depth: (H, W) RaDe expected depth, camera z in metres; 0 where alpha is 0.
-        alpha: (H, W) in [0, 1).
-    """
-
-    colors: Tensor
-    depth: Tensor
-    alpha: Tensor
 
 
 def rasterize(
@@ -53,7 +37,10 @@ def rasterize(
     near: float = 0.01,
     eps2d: float = 0.3,
     antialiased: bool = False,
+    median_depth: bool = False,
+    normals: bool = False,
     backend: str = "auto",
+    buffers: RenderBuffers | None = None,
 ) -> RenderOutput:
     """Render Gaussians into one pinhole image; differentiable in every tensor argument.
 
@@ -72,8 +59,11 @@ def rasterize(
         near: metres; Gaussians whose mean is not beyond it are dropped.
         eps2d: px^2, added to the diagonal of every 2D covariance (> 0).
         antialiased: scale opacity by sqrt(det before / det after dilation) (Mip-Splatting, 2024).
+        median_depth: also give the median depth.
+        normals: also give blended normals.
         backend: ``auto`` takes gsplat for CUDA tensors, else the native kernel if it was built,
             else the reference.
+        buffers: memory to put the images of the native backend into, again and again.
 
     Raises:
         ValueError: wrong shape, dtype or device, NaN or Inf, unknown backend; names the argument.
@@ -86,12 +76,26 @@ def rasterize(
     if background is not None:
         tensors["background"] = background
     _check(tensors, width, height, near, eps2d)
-    run = _backend(resolve_backend(backend, means.device))
-    image, depth, alpha = run(
-        means, quats, scales, opacities, colors, K, cam_from_world,
-        width, height, background, near, eps2d, antialiased,
-    )  # fmt: skip
-    return RenderOutput(image, depth, alpha)
+    options = RenderOptions(
+        width=width,
+        height=height,
+        near=near,
+        eps2d=eps2d,
+        antialiased=antialiased,
+        median_depth=median_depth,
+        normals=normals,
+    )
+    scene = (means, quats, scales, opacities, colors, K, cam_from_world, background)
+    name = resolve_backend(backend, means.device)
+    if name == "cpu":  # imported only when they are used, as gsplat is
+        from grmm.rasterize.cpu import rasterize_cpu
+
+        return rasterize_cpu(*scene, options, buffers)
+    if name == "gsplat":
+        from grmm.rasterize.gsplat_backend import rasterize_gsplat
+
+        return rasterize_gsplat(*scene, options)
+    return rasterize_reference(*scene, options)
 
 
 def resolve_backend(backend: str = "auto", device: torch.device | str = "cpu") -> str:
@@ -110,19 +114,6 @@ def resolve_backend(backend: str = "auto", device: torch.device | str = "cpu") -
         return "cpu"
     warnings.warn(f"rendering with the slow torch reference: {native.why_missing()}", stacklevel=3)
     return "reference"
-
-
-def _backend(name: str) -> Callable[..., tuple[Tensor, Tensor, Tensor]]:
-    """The function of a backend, imported only when it is used."""
-    if name == "cpu":
-        from grmm.rasterize.cpu import rasterize_cpu
-
-        return rasterize_cpu
-    if name == "gsplat":
-        from grmm.rasterize.gsplat_backend import rasterize_gsplat
-
-        return rasterize_gsplat
-    return rasterize_reference
 
 
 def _check(tensors: dict[str, Tensor], width: int, height: int, near: float, eps2d: float) -> None:

@@ -1,8 +1,8 @@
 """The native CPU backend: ``torch.autograd.Function`` over the C ABI of express50/native.
 
 Deterministic: images and gradients are the same bits for any number of threads, which is taken
-from ``torch.get_num_threads()``. A third of the time of a large image with many channels goes into
-fresh memory pages for it: THP_MEM_ALLOC_ENABLE=1 in the environment makes torch use huge pages.
+from ``torch.get_num_threads()``. Large outputs ask for huge pages, since a third of the time of a
+large image with many channels would go into fresh small ones; ``RenderBuffers`` save both.
 """
 
 from __future__ import annotations
@@ -16,11 +16,13 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from express50 import native
-from grmm.rasterize.projection import expected_depth
+from grmm.rasterize.interface import RenderBuffers, RenderOptions, RenderOutput
+from grmm.rasterize.projection import depth_of_rays, expected_depth
 
 _TILE = 16  # kTile of tiles.h
 _SPLAT = 10  # numbers in Splat of blend.h
-_MOMENTS = 9  # numbers in Moments of blend.h
+_MOMENTS = 9  # numbers in Moments of blend_gradient.h
+_HUGE = 1 << 22  # bytes from which huge pages pay
 _SUFFIX = {torch.float32: "f32", torch.float64: "f64"}
 _scratch = threading.local()  # grown, never shrunk: fresh pages cost more than the sums in them
 
@@ -37,6 +39,7 @@ class _Camera(ctypes.Structure):
         ("width", ctypes.c_int32),
         ("height", ctypes.c_int32),
         ("antialiased", ctypes.c_int32),
+        ("normals", ctypes.c_int32),
         ("threads", ctypes.c_int32),
     ]
 
@@ -49,14 +52,11 @@ def rasterize_cpu(
     colors: Tensor,
     K: Tensor,
     cam_from_world: Tensor,
-    width: int,
-    height: int,
     background: Tensor | None,
-    near: float,
-    eps2d: float,
-    antialiased: bool,
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Colours (H, W, C), depth (H, W) and alpha (H, W); arguments as ``grmm.rasterize``.
+    options: RenderOptions,
+    buffers: RenderBuffers | None = None,
+) -> RenderOutput:
+    """Render; arguments as ``grmm.rasterize``.
 
     Raises:
         ValueError: the tensors are not on the CPU, or the Gaussians are too large to be binned.
@@ -64,15 +64,21 @@ def rasterize_cpu(
     """
     if means.device.type != "cpu":
         raise ValueError(f"backend 'cpu' got tensors on {means.device}; use 'auto' or 'gsplat'")
-    options = (width, height, near, eps2d, antialiased)
-    image, weighted, alpha = _Rasterize.apply(
-        means, quats, scales, opacities, colors, K, cam_from_world, background, options
+    image, weighted, alpha, median = _Rasterize.apply(
+        means, quats, scales, opacities, colors, K, cam_from_world, background, options, buffers
     )
-    return image, expected_depth(weighted, alpha, K), alpha
+    channels = colors.shape[1]
+    return RenderOutput(
+        colors=image[..., :channels] if options.normals else image,
+        depth=expected_depth(weighted, alpha, K),
+        alpha=alpha,
+        median_depth=None if median is None else depth_of_rays(median, K),
+        normals=image[..., channels:] if options.normals else None,
+    )
 
 
 class _Rasterize(torch.autograd.Function):
-    """Colours, sum of weight * ray length, and alpha."""
+    """Colours and normals, sum of weight * ray length, alpha and median ray length."""
 
     @staticmethod
     def forward(
@@ -85,41 +91,44 @@ class _Rasterize(torch.autograd.Function):
         K: Tensor,
         cam_from_world: Tensor,
         background: Tensor | None,
-        options: tuple[int, int, float, float, bool],
-    ) -> tuple[Tensor, Tensor, Tensor]:
+        options: RenderOptions,
+        buffers: RenderBuffers | None,
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
         ctx.set_materialize_grads(False)
         # The kernel reads raw memory: a strided view would be read as other numbers.
         geometry = [x.contiguous() for x in (means, quats, scales, opacities)]
-        camera = _camera(K, cam_from_world, *options)
-        splats, boxes, starts, ids = _bin(camera, geometry)
+        camera = _camera(K, cam_from_world, options)
+        if options.normals:  # three more channels, which the projection fills
+            colors = torch.nn.functional.pad(colors, (0, 3))
+            background = None if background is None else torch.nn.functional.pad(background, (0, 3))
+        colors, background = colors.contiguous(), _contiguous(background)
+        splats, boxes, starts, ids = _bin(camera, geometry, colors)
         used = torch.empty(starts.numel() - 1, dtype=torch.int32)
-        blended = (splats, boxes, colors.contiguous(), _contiguous(background), starts, ids, used)
-        size, channels = (camera.height, camera.width), colors.shape[1]
-        image = torch.empty(*size, channels, dtype=means.dtype)
-        weighted = torch.empty(size, dtype=means.dtype)
-        alpha = torch.empty(size, dtype=means.dtype)
+        blended = (splats, boxes, colors, background, starts, ids, used)
+        size, dtype, take = (camera.height, camera.width), means.dtype, (buffers or _fresh).take
+        image = take("image", (*size, colors.shape[1]), dtype)
+        weighted, alpha = take("weighted", size, dtype), take("alpha", size, dtype)
+        median = take("median", size, dtype) if options.median_depth else None
         ctx.records = _call(
-            "forward", means.dtype, camera, channels, *blended, image, weighted, alpha
+            "forward", dtype, camera, colors.shape[1], *blended, image, weighted, alpha, median
         )
         ctx.camera = camera
         ctx.save_for_backward(*geometry, *blended, alpha, K, cam_from_world)
-        return image, weighted, alpha
+        return image, weighted, alpha, median
 
     @staticmethod
     @once_differentiable
-    def backward(
-        ctx: Any, d_image: Tensor | None, d_weighted: Tensor | None, d_alpha: Tensor | None
-    ) -> tuple[Tensor | None, ...]:
+    def backward(ctx: Any, *d_images: Tensor | None) -> tuple[Tensor | None, ...]:
         saved = ctx.saved_tensors
         geometry, blended, (alpha, K, cam_from_world) = saved[:4], saved[4:11], saved[11:]
         colors, background = blended[2:4]
         n, channels = colors.shape
-        grads = [torch.empty_like(x) for x in (*geometry, colors)]
+        grads = [_empty(tuple(x.shape), x.dtype) for x in (*geometry, colors)]
         d_camera = torch.zeros(16, dtype=torch.float64)
         records = _workspace(ctx.records * (channels + _MOMENTS), colors.dtype)
         _call(
             "backward", colors.dtype, ctx.camera, n, channels, *geometry, *blended,
-            *map(_contiguous, (d_image, d_weighted, d_alpha)),
+            *map(_contiguous, d_images),
             records[_MOMENTS * ctx.records :], records, *grads, d_camera,
         )  # fmt: skip
         d_K = torch.zeros(3, 3, dtype=torch.float64)
@@ -127,19 +136,28 @@ class _Rasterize(torch.autograd.Function):
         d_pose = torch.zeros(4, 4, dtype=torch.float64)
         d_pose[:3, :3] = d_camera[4:13].reshape(3, 3)
         d_pose[:3, 3] = d_camera[13:]
-        d_background = None
-        if background is not None and d_image is not None:
-            d_background = torch.einsum("hwc,hw->c", d_image, 1.0 - alpha)
-        return *grads, d_K.to(K.dtype), d_pose.to(cam_from_world.dtype), d_background, None
+        d_background, asked = None, channels - 3 * ctx.camera.normals
+        if background is not None and d_images[0] is not None:
+            d_background = torch.einsum("hwc,hw->c", d_images[0][..., :asked], 1.0 - alpha)
+        grads[4] = grads[4][:, :asked]
+        d_camera_inputs = d_K.to(K.dtype), d_pose.to(cam_from_world.dtype)
+        return *grads, *d_camera_inputs, d_background, None, None
 
 
-def _bin(camera: _Camera, geometry: list[Tensor]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Project, then sort into tiles: splats (N, 10), boxes (N, 4), tile starts and Gaussian ids."""
+def _bin(
+    camera: _Camera, geometry: list[Tensor], colors: Tensor
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Project, then sort into tiles: splats (N, 10), boxes (N, 4), tile starts and Gaussian ids.
+
+    Writes the normals into the last channels of ``colors`` where the camera asks for them.
+    """
     n, dtype = geometry[0].shape[0], geometry[0].dtype
     splats = torch.empty(n, _SPLAT, dtype=dtype)
     depths = torch.empty(n, dtype=dtype)
     boxes = torch.empty(n, 4, dtype=torch.int32)
-    entries = _call("project", dtype, camera, n, *geometry, splats, depths, boxes)
+    entries = _call(
+        "project", dtype, camera, n, colors.shape[1], *geometry, splats, depths, boxes, colors
+    )
     if entries >= 2**31:
         raise ValueError(
             f"the Gaussians cover {entries} tiles in all, expected under 2^31; scales is too large"
@@ -152,15 +170,7 @@ def _bin(camera: _Camera, geometry: list[Tensor]) -> tuple[Tensor, Tensor, Tenso
     return splats, boxes, starts, ids
 
 
-def _camera(
-    K: Tensor,
-    cam_from_world: Tensor,
-    width: int,
-    height: int,
-    near: float,
-    eps2d: float,
-    antialiased: bool,
-) -> _Camera:
+def _camera(K: Tensor, cam_from_world: Tensor, options: RenderOptions) -> _Camera:
     """The camera as the kernel reads it, in float64."""
     (fx, _, cx), (_, fy, cy), _ = K.tolist()
     pose = cam_from_world.tolist()
@@ -168,13 +178,34 @@ def _camera(
         intrinsics=(fx, fy, cx, cy),
         R=tuple(x for row in pose[:3] for x in row[:3]),
         t=tuple(row[3] for row in pose[:3]),
-        near=near,
-        eps2d=eps2d,
-        width=width,
-        height=height,
-        antialiased=antialiased,
+        near=options.near,
+        eps2d=options.eps2d,
+        width=options.width,
+        height=options.height,
+        antialiased=options.antialiased,
+        normals=options.normals,
         threads=torch.get_num_threads(),
     )
+
+
+def _empty(shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
+    """Uninitialised tensor, in huge pages where it is large and the system has them."""
+    tensor = torch.empty(shape, dtype=dtype)
+    size = tensor.numel() * tensor.element_size()
+    if size >= _HUGE:
+        native.load().native_huge_pages(ctypes.c_void_p(tensor.data_ptr()), ctypes.c_int64(size))
+    return tensor
+
+
+class _FreshMemory(RenderBuffers):
+    """Buffers that never use memory again."""
+
+    def take(self, name: str, shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
+        """New memory."""
+        return _empty(shape, dtype)
+
+
+_fresh = _FreshMemory()
 
 
 def _contiguous(tensor: Tensor | None) -> Tensor | None:
@@ -186,7 +217,7 @@ def _workspace(size: int, dtype: torch.dtype) -> Tensor:
     """Uninitialised scratch of this thread, valid until the next call."""
     buffers = _scratch.__dict__
     if dtype not in buffers or buffers[dtype].numel() < size:
-        buffers[dtype] = torch.empty(size, dtype=dtype)
+        buffers[dtype] = _empty((size,), dtype)
     return buffers[dtype]
 
 

@@ -12,7 +12,14 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from grmm.rasterize.projection import Projection, expected_depth, project
+from grmm.rasterize.interface import RenderOptions, RenderOutput
+from grmm.rasterize.projection import (
+    ALPHA_MAX,
+    Projection,
+    depth_of_rays,
+    expected_depth,
+    project,
+)
 
 TILE = 16
 CHUNK = 32  # channels of one pass; more would not fit the shared memory of the backward kernel
@@ -27,36 +34,45 @@ def rasterize_gsplat(
     colors: Tensor,
     K: Tensor,
     cam_from_world: Tensor,
-    width: int,
-    height: int,
     background: Tensor | None,
-    near: float,
-    eps2d: float,
-    antialiased: bool,
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Colours (H, W, C), depth (H, W) and alpha (H, W); arguments as ``grmm.rasterize``.
+    options: RenderOptions,
+) -> RenderOutput:
+    """Render; arguments as ``grmm.rasterize``.
 
     Raises:
         ValueError: the tensors are not float32 on a CUDA device.
         RuntimeError: there is no CUDA device, or gsplat is not installed.
     """
     gsplat = _require_gsplat(means)
+    width, height = options.width, options.height
     splats = project(
-        means, quats, scales, opacities, K, cam_from_world, width, height, near, eps2d, antialiased
-    )
-    offsets, ids = _tiles(gsplat, splats, width, height)
+        means, quats, scales, opacities, K, cam_from_world, width, height,
+        options.near, options.eps2d, options.antialiased,
+    )  # fmt: skip
+    tiles = _tiles(gsplat, splats, width, height)
+    channels = [plane_channels(splats, K), splats.normals[:, : 3 * options.normals], colors]
     passes = []
-    for values in _padded_chunks(torch.cat([plane_channels(splats, K), colors], 1)):
+    for values in _padded_chunks(torch.cat(channels, 1)):
         image, alpha = gsplat.rasterize_to_pixels(
             splats.means2d[None], splats.conics[None].contiguous(), values[None].contiguous(),
-            splats.opacities[None], width, height, TILE, offsets, ids,
+            splats.opacities[None], width, height, TILE, *tiles,
         )  # fmt: skip
         passes.append(image[0])
     values, alpha = torch.cat(passes, -1), alpha[0, ..., 0]
-    image = values[..., 3 : 3 + colors.shape[1]]
+    widths = [part.shape[1] for part in channels]
+    planes, normals, image = values[..., : sum(widths)].split(widths, -1)
     if background is not None:
         image = image + (1.0 - alpha)[..., None] * background
-    return image, expected_depth(combine_planes(values[..., :3], K), alpha, K), alpha
+    median = None
+    if options.median_depth:
+        median = depth_of_rays(_median_ray_length(gsplat, splats, tiles, width, height), K)
+    return RenderOutput(
+        colors=image,
+        depth=expected_depth(combine_planes(planes, K), alpha, K),
+        alpha=alpha,
+        median_depth=median,
+        normals=normals if options.normals else None,
+    )
 
 
 def plane_channels(splats: Projection, K: Tensor) -> Tensor:
@@ -106,6 +122,51 @@ def _tiles(gsplat: Any, splats: Projection, width: int, height: int) -> tuple[Te
         splats.means2d[None], radii[None].contiguous(), splats.depths[None], TILE, columns, rows
     )
     return gsplat.isect_offset_encode(keys, 1, columns, rows), ids
+
+
+def _median_ray_length(
+    gsplat: Any, splats: Projection, tiles: tuple[Tensor, Tensor], width: int, height: int
+) -> Tensor:
+    """Ray length (H, W) of the Gaussian at which each pixel's transmittance passes one half.
+
+    gsplat's kernels do not tell which that is, but list all pairs of Gaussian and pixel in order.
+    """
+    gaussians, pixels = _crossings(gsplat, splats, tiles, width, height)
+    center = torch.stack([pixels % width, pixels // width], 1).to(splats.means2d.dtype) + 0.5
+    length, slopes = splats.planes[gaussians, 0], splats.planes[gaussians, 1:]
+    length = length + (slopes * (center - splats.means2d[gaussians])).sum(1)
+    empty = length.new_zeros(height * width)
+    return empty.index_put((pixels,), length).reshape(height, width)
+
+
+@torch.no_grad()
+def _crossings(
+    gsplat: Any, splats: Projection, tiles: tuple[Tensor, Tensor], width: int, height: int
+) -> tuple[Tensor, Tensor]:
+    """Gaussian and pixel numbers (P,) where the transmittance falls through one half."""
+    offsets, ids = tiles
+    ends = torch.cat([offsets.flatten()[1:], offsets.new_tensor([len(ids)])])
+    batches = -(-int((ends - offsets.flatten()).max()) // TILE**2)
+    through = splats.means2d.new_ones(1, height, width)
+    gaussians, pixels, _ = gsplat.rasterize_to_indices_in_range(
+        0, batches, through, splats.means2d[None], splats.conics[None].contiguous(),
+        splats.opacities[None], width, height, TILE, offsets, ids,
+    )  # fmt: skip
+    center = torch.stack([pixels % width, pixels // width], 1).to(splats.means2d.dtype) + 0.5
+    dx, dy = (center - splats.means2d[gaussians]).unbind(1)
+    xx, xy, yy = splats.conics[gaussians].unbind(1)
+    sigma = 0.5 * (xx * dx * dx + yy * dy * dy) + xy * dx * dy
+    alphas = (splats.opacities[gaussians] * torch.exp(-sigma)).clamp(max=ALPHA_MAX)
+    # One running sum of logarithms over all pixels; float64 keeps its end as exact as its start.
+    logs = torch.log1p(-alphas.double())
+    after = torch.cumsum(logs, 0)
+    first = torch.searchsorted(pixels, pixels)
+    after = torch.exp(after - (after - logs)[first])
+    before = after / (1.0 - alphas.double())
+    # Rounding may show two Gaussians at the half; the first of them is the one.
+    crosses = ((before > 0.5) & (after <= 0.5)).nonzero()[:, 0]
+    crosses = crosses[torch.cat([crosses.new_ones(1), pixels[crosses].diff()])[: len(crosses)] > 0]
+    return gaussians[crosses], pixels[crosses]
 
 
 def _padded_chunks(values: Tensor) -> list[Tensor]:

@@ -33,6 +33,7 @@ class Projection:
         depths: (N,) camera z of the means, metres.
         planes: (N, 3) ray length l at the mean (m) and its slope (s_u, s_v) in m/px, so that the
             Gaussian lies at ray length ``l + s . (pixel - mean2d)``.
+        normals: (N, 3) unit normals of those planes, camera axes, towards the camera.
         opacities: (N,) after the antialiasing compensation, if any.
         extents: (N, 2) half width and height of the box in which alpha reaches 1/255, pixels.
         visible: (N,) bool, in front of the near plane and touching the image.
@@ -42,6 +43,7 @@ class Projection:
     conics: Tensor
     depths: Tensor
     planes: Tensor
+    normals: Tensor
     opacities: Tensor
     extents: Tensor
     visible: Tensor
@@ -73,7 +75,8 @@ def project(
     front = points[:, 2] > near
     # Culled points get a harmless place, so that no division by zero enters the gradients.
     points = torch.where(front[:, None], points, points.new_tensor([0.0, 0.0, 1.0]))
-    rows = _jacobian(points, K, width, height) @ (R @ quat_to_matrix(quats) * scales[:, None, :])
+    jacobian = _jacobian(points, K, width, height)
+    rows = jacobian @ (R @ quat_to_matrix(quats) * scales[:, None, :])
     variances = rows.square().sum(2)  # of u, v and the ray length
     conics, slopes, compensation = _regression(rows, variances, eps2d)
     planes = torch.cat([points.norm(dim=1, keepdim=True), slopes], 1)
@@ -87,6 +90,7 @@ def project(
         conics=conics.to(dtype),
         depths=points[:, 2].to(dtype),
         planes=planes.to(dtype),
+        normals=_normals(jacobian, slopes).to(dtype),
         opacities=opacities.to(dtype),
         extents=extents,
         visible=visible & front,
@@ -147,6 +151,16 @@ def _regression(rows: Tensor, variances: Tensor, eps2d: float) -> tuple[Tensor, 
     return conics, torch.stack([slope_u, slope_v], 1), compensation
 
 
+def _normals(jacobian: Tensor, slopes: Tensor) -> Tensor:
+    """Unit normals (N, 3) of the planes ray length = l + slope . (pixel - mean2d).
+
+    On such a plane (ray length - slope . pixel) is constant, so minus its derivative by camera
+    coordinates, which ``jacobian`` (N, 3, 3) gives, points at the camera (RaDe-GS, section 3).
+    """
+    steep = (slopes[:, :, None] * jacobian[:, :2]).sum(1) - jacobian[:, 2]
+    return torch.nn.functional.normalize(steep, dim=1)
+
+
 @torch.no_grad()
 def _extents(
     means2d: Tensor, variances: Tensor, opacities: Tensor, width: int, height: int
@@ -167,6 +181,12 @@ def ray_lengths(K: Tensor, width: int, height: int) -> Tensor:
     x = (u - K64[0, 2]) / K64[0, 0]
     y = (v - K64[1, 2]) / K64[1, 1]
     return (1.0 + x[None, :].square() + y[:, None].square()).sqrt()
+
+
+def depth_of_rays(ray_length: Tensor, K: Tensor) -> Tensor:
+    """Camera z (H, W) of points at ``ray_length`` (H, W) along the rays of the pixel centres."""
+    height, width = ray_length.shape
+    return ray_length / ray_lengths(K, width, height).to(ray_length.dtype)
 
 
 def expected_depth(weighted_ray_length: Tensor, alpha: Tensor, K: Tensor) -> Tensor:

@@ -9,11 +9,13 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from grmm.rasterize.interface import RenderOptions, RenderOutput
 from grmm.rasterize.projection import (
     ALPHA_MAX,
     ALPHA_MIN,
     TRANSMITTANCE_MIN,
     Projection,
+    depth_of_rays,
     expected_depth,
     project,
 )
@@ -29,37 +31,45 @@ def rasterize_reference(
     colors: Tensor,
     K: Tensor,
     cam_from_world: Tensor,
-    width: int,
-    height: int,
     background: Tensor | None,
-    near: float,
-    eps2d: float,
-    antialiased: bool,
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Colours (H, W, C), depth (H, W) and alpha (H, W); arguments as ``grmm.rasterize``."""
+    options: RenderOptions,
+) -> RenderOutput:
+    """Render; arguments as ``grmm.rasterize``."""
+    width, height = options.width, options.height
     splats = project(
-        means, quats, scales, opacities, K, cam_from_world, width, height, near, eps2d, antialiased
-    )
+        means, quats, scales, opacities, K, cam_from_world, width, height,
+        options.near, options.eps2d, options.antialiased,
+    )  # fmt: skip
     visible = splats.visible.nonzero()[:, 0]
     order = visible[torch.sort(splats.depths[visible].detach(), stable=True).indices]
+    channels = torch.cat([colors, splats.normals], 1) if options.normals else colors
     rows = []
     for top in range(0, height, TILE):
         h = min(TILE, height - top)
         tiles = [
-            _blend(splats, colors, order, left, top, min(TILE, width - left), h)
+            _blend(splats, channels, order, left, top, min(TILE, width - left), h)
             for left in range(0, width, TILE)
         ]
         rows.append([torch.cat(parts, 1) for parts in zip(*tiles, strict=True)])
-    image, weighted, alpha = (torch.cat(parts, 0) for parts in zip(*rows, strict=True))
+    image, weighted, alpha, median = (torch.cat(parts, 0) for parts in zip(*rows, strict=True))
+    image, normals = image.split([colors.shape[1], image.shape[2] - colors.shape[1]], 2)
     if background is not None:
         image = image + (1.0 - alpha)[..., None] * background
-    return image, expected_depth(weighted, alpha, K), alpha
+    return RenderOutput(
+        colors=image,
+        depth=expected_depth(weighted, alpha, K),
+        alpha=alpha,
+        median_depth=depth_of_rays(median, K) if options.median_depth else None,
+        normals=normals if options.normals else None,
+    )
 
 
 def _blend(
     splats: Projection, colors: Tensor, order: Tensor, left: int, top: int, width: int, height: int
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Front-to-back blending of one tile: colours (h, w, C), ray length * weight and alpha (h, w).
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Front-to-back blending of one tile.
+
+    Returns colours (h, w, C), and (h, w) each: ray length * weight, alpha, median ray length.
 
     Guards as gsplat: alpha capped at 0.99, contributions under 1/255 skipped, and a pixel stops
     before the Gaussian that would bring its transmittance to 1e-4 or less.
@@ -78,14 +88,20 @@ def _blend(
     alpha = torch.where((sigma >= 0) & (alpha >= ALPHA_MIN), alpha, torch.zeros_like(alpha))
     after = torch.cumprod(1.0 - alpha, 0)
     before = torch.cat([torch.ones_like(after[:1]), after[:-1]])
-    weights = alpha * before * (after > TRANSMITTANCE_MIN)
+    kept = after > TRANSMITTANCE_MIN
+    weights = alpha * before * kept
     length, slope_u, slope_v = splats.planes[ids][:, :, None].unbind(1)
-    weighted = (weights * (length + slope_u * dx + slope_v * dy)).sum(0)
+    lengths = length + slope_u * dx + slope_v * dy
+    weighted = (weights * lengths).sum(0)
+    # At most one Gaussian a pixel takes the transmittance through one half.
+    crosses = kept & (before > 0.5) & (after <= 0.5)
+    median = torch.where(crosses, lengths, torch.zeros_like(lengths)).sum(0)
     image = weights.T @ colors[ids]
     return (
         image.reshape(height, width, -1),
         weighted.reshape(height, width),
         weights.sum(0).reshape(height, width),
+        median.reshape(height, width),
     )
 
 

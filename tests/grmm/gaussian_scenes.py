@@ -70,10 +70,19 @@ def render(scene: Scene, backend: str, dtype: torch.dtype = torch.float64) -> di
         width=scene.width,
         height=scene.height,
         antialiased=scene.antialiased,
+        median_depth=True,
+        normals=True,
         backend=backend,
     )
+    assert out.median_depth is not None and out.normals is not None
     generator = torch.Generator().manual_seed(7)
-    images = {"image": out.colors, "depth": out.depth, "alpha": out.alpha}
+    images = {
+        "image": out.colors,
+        "depth": out.depth,
+        "alpha": out.alpha,
+        "median_depth": out.median_depth,
+        "normals": out.normals,
+    }
     loss = torch.zeros((), dtype=dtype)
     for image in images.values():
         cotangent = torch.randn(image.shape, generator=generator, dtype=torch.float64)

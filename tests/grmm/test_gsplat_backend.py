@@ -2,50 +2,19 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-
 import pytest
 import torch
 
 from grmm.rasterize import gsplat_backend, rasterize
-from grmm.rasterize.projection import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN, project
+from grmm.rasterize.projection import project
+from tests.grmm import gsplat_kernels
 from tests.grmm.gaussian_scenes import random_scene, relative_error, render
-
-
-def isect_tiles(means2d, radii, depths, tile_size, tile_width, tile_height):
-    """Stand-in: one list for the whole image, nearest first."""
-    shown = (radii[0] > 0).all(1).nonzero()[:, 0]
-    order = shown[torch.sort(depths[0, shown], stable=True).indices]
-    return None, (tile_height, tile_width), order.int()
-
-
-def rasterize_to_pixels(means2d, conics, colors, opacities, width, height, tile, offsets, ids):
-    """Stand-in: dense blending by gsplat's rules."""
-    assert colors.shape[-1] in gsplat_backend.WIDTHS
-    assert offsets.shape == (1, -(-height // tile), -(-width // tile))
-    ids = ids.long()
-    v, u = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
-    dx = u.reshape(1, -1) - means2d[0, ids, :1]
-    dy = v.reshape(1, -1) - means2d[0, ids, 1:]
-    a, b, c = conics[0, ids][..., None].unbind(1)
-    alpha = opacities[0, ids, None] * torch.exp(-0.5 * (a * dx**2 + c * dy**2) - b * dx * dy)
-    alpha = alpha.clamp(max=ALPHA_MAX) * (alpha >= ALPHA_MIN)
-    after = torch.cumprod(1 - alpha, 0)
-    before = torch.cat([torch.ones_like(after[:1]), after[:-1]])
-    weights = alpha * before * (after > TRANSMITTANCE_MIN)
-    image = (weights.T @ colors[0, ids]).reshape(1, height, width, -1)
-    return image, weights.sum(0).reshape(1, height, width, 1)
 
 
 @pytest.mark.parametrize("channels", [0, 3, 35, 70])
 @pytest.mark.parametrize("antialiased", [False, True])
 def test_plane_channels_chunks_and_camera_gradients(channels, antialiased, monkeypatch):
-    fake = SimpleNamespace(
-        isect_tiles=isect_tiles,
-        isect_offset_encode=lambda keys, n, columns, rows: torch.zeros(n, rows, columns),
-        rasterize_to_pixels=rasterize_to_pixels,
-    )
-    monkeypatch.setattr(gsplat_backend, "_require_gsplat", lambda means: fake)
+    monkeypatch.setattr(gsplat_backend, "_require_gsplat", lambda means: gsplat_kernels)
     scene = random_scene(60, channels, width=40, height=33, seed=2, antialiased=antialiased)
     expected, got = render(scene, "reference"), render(scene, "gsplat")
     errors = {name: relative_error(expected[name], got[name]) for name in expected}
@@ -83,9 +52,10 @@ def test_gsplat_matches_the_reference(channels):
     """Boundary-band metric: a few pixels may flip at alpha = 1/255, the others agree closely."""
     scene = random_scene(400, channels, width=128, height=96, seed=6)
     leaves = {k: v.float().cuda().requires_grad_() for k, v in scene.tensors.items()}
-    got = rasterize(**leaves, width=128, height=96, backend="gsplat")
-    expected = rasterize(**scene.tensors, width=128, height=96, backend="reference")
-    for name in ("colors", "depth", "alpha"):
+    extra = {"width": 128, "height": 96, "median_depth": True, "normals": True}
+    got = rasterize(**leaves, **extra, backend="gsplat")
+    expected = rasterize(**scene.tensors, **extra, backend="reference")
+    for name in ("colors", "depth", "alpha", "median_depth", "normals"):
         difference = (getattr(got, name).cpu() - getattr(expected, name)).abs()
         assert (difference < 1e-4).double().mean() > 0.999, name
     got.colors.square().mean().backward()

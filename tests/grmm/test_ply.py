@@ -72,6 +72,33 @@ def test_other_property_order_types_and_elements_are_understood(tmp_path):
     assert got.scales.tolist() == [[1, 1, 1]] * 2
 
 
+@pytest.mark.parametrize("encoding", ["ascii", "binary_big_endian"])
+def test_other_encodings_are_the_same_cloud(tmp_path, encoding):
+    write_ply(tmp_path / "a.ply", **cloud(5, 4))
+    header, _, body = (tmp_path / "a.ply").read_bytes().partition(b"end_header\n")
+    table = np.frombuffer(body, "<f4").reshape(5, -1)
+    lines = "\n".join(" ".join(repr(float(x)) for x in row) for row in table) + "\n"
+    data = lines.encode() if encoding == "ascii" else table.astype(">f4").tobytes()
+    header = header.replace(b"binary_little_endian", encoding.encode())
+    (tmp_path / "b.ply").write_bytes(header + b"end_header\n" + data)
+    expected, got = read_ply(tmp_path / "a.ply"), read_ply(tmp_path / "b.ply")
+    for name in ("means", "quats", "scales", "opacities", "sh"):
+        assert torch.equal(getattr(expected, name), getattr(got, name)), name
+
+
+def test_a_text_file_cut_short_is_named(tmp_path):
+    path = tmp_path / "a.ply"
+    path.write_text(GOOD.replace("binary_little_endian", "ascii").replace("vertex 1", "vertex 3"))
+    with pytest.raises(FormatError, match="3 vertices, the file has 0"):
+        read_ply(path)
+
+
+def test_surfels_of_two_scales_are_flat(tmp_path):
+    path = tmp_path / "a.ply"
+    path.write_bytes(GOOD.replace("property float scale_2\n", "").encode() + bytes(52))
+    assert read_ply(path).scales.tolist() == [[1, 1, 0]]
+
+
 GOOD = "\n".join(
     ["ply", "format binary_little_endian 1.0", "element vertex 1"]
     + [f"property float {n}" for n in ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"]]
@@ -85,7 +112,9 @@ GOOD = "\n".join(
     ("change", "message"),
     [
         (("ply\n", "plx\n"), "starts with b'plx.n', expected 'ply'"),
-        (("binary_little_endian", "ascii"), "got format ascii 1.0, expected"),
+        (("binary_little_endian", "text"), "got format text 1.0, expected format ascii, binary"),
+        (("binary_little_endian", "ascii"), "vertex line does not fit the header"),
+        (("vertex 1", "vertex 1\nproperty uint packed_scale"), "compressed splat file"),
         (("vertex 1", "vertex -1"), "element vertex -1, expected 0 to"),
         (("vertex 1", "vertex 99999999999"), "expected 0 to 50000000 vertices"),
         (("vertex 1", "vertex 2"), "2 vertices need 112 bytes, the file has 56"),

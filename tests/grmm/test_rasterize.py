@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from express50 import native
-from grmm.rasterize import BACKENDS, cpu, rasterize, resolve_backend
+from grmm.rasterize import BACKENDS, RenderBuffers, cpu, rasterize, resolve_backend
 from tests.grmm.gaussian_scenes import GRADIENTS, Scene, random_scene, relative_error, render
 
 CPU_BACKENDS = ["reference", "cpu"]
@@ -138,7 +138,8 @@ def test_native_equals_reference_on_random_scenes(n, channels, width, height, se
 @pytest.mark.parametrize("antialiased", [False, True])
 def test_gradients_match_finite_differences(backend, antialiased):
     scene = random_scene(7, 2, width=8, height=6, seed=3)
-    scene.tensors["scales"] *= 4.0
+    scene.tensors["scales"] *= 10.0
+    scene.tensors["opacities"] = 0.5 + 0.4 * scene.tensors["opacities"]
     tensors = {k: v.clone().requires_grad_() for k, v in scene.tensors.items() if k != "K"}
     fx, fy, cx, cy = 9.0, 10.0, 3.0, 3.5
     intrinsics = torch.tensor([fx, fy, cx, cy], dtype=F64, requires_grad=True)
@@ -155,11 +156,14 @@ def test_gradients_match_finite_differences(backend, antialiased):
             width=8,
             height=6,
             antialiased=antialiased,
+            median_depth=True,
+            normals=True,
             backend=backend,
         )
-        return out.colors, out.depth, out.alpha
+        return out.colors, out.depth, out.alpha, out.median_depth, out.normals
 
     assert images(intrinsics, *tensors.values())[2].max() > 0.3
+    assert (images(intrinsics, *tensors.values())[3] > 0).any()
     assert torch.autograd.gradcheck(
         images, (intrinsics, *tensors.values()), eps=1e-6, atol=1e-6, rtol=1e-4
     )
@@ -248,6 +252,59 @@ def test_depth_of_a_plane(backend, angle):
         # Nearer neighbours win; blending the z of the means is biased by slope times splat size.
         assert error.mean() < 0.15 * (out.colors[..., 0] / out.alpha - truth).abs().mean()
         assert error.max() < 2e-3
+
+
+@pytest.mark.parametrize("backend", CPU_BACKENDS)
+@pytest.mark.parametrize("angle", [0.0, 0.6, -1.0])
+def test_normals_of_a_plane_face_the_camera(backend, angle):
+    normal = torch.tensor([math.sin(angle), 0.0, math.cos(angle)], dtype=F64)
+    out = rasterize(**plane(normal), width=64, height=48, normals=True, backend=backend)
+    got = torch.nn.functional.normalize(out.normals, dim=-1)
+    # The dilated covariance bends them a little towards the ray.
+    assert (got @ -normal).min() > math.cos(math.radians(5))
+    assert torch.allclose(out.normals.norm(dim=-1), out.alpha, rtol=1e-3)
+
+
+@pytest.mark.parametrize("backend", CPU_BACKENDS)
+def test_median_depth_is_that_of_the_gaussian_at_one_half(backend):
+    def median(*opacities):
+        scene = on_axis(*range(1, len(opacities) + 1), opacities=list(opacities))
+        out = rasterize(**scene, width=17, height=17, median_depth=True, backend=backend)
+        return out.median_depth[8, 8].item()
+
+    assert median(0.4, 0.4, 0.4) == pytest.approx(2.0, abs=1e-13)  # T = 0.6, then 0.36
+    assert median(0.5, 0.9) == pytest.approx(1.0, abs=1e-13)  # exactly one half counts
+    assert median(0.2, 0.3) == 0.0  # T = 0.56
+
+
+def test_median_depth_and_normals_come_only_when_asked():
+    scene = random_scene(20, 4).tensors
+    plain = rasterize(**scene, width=61, height=47)
+    assert plain.median_depth is None and plain.normals is None
+    both = rasterize(**scene, width=61, height=47, median_depth=True, normals=True)
+    assert torch.equal(plain.colors, both.colors) and torch.equal(plain.depth, both.depth)
+
+
+def test_buffers_are_used_again_and_change_nothing():
+    buffers = RenderBuffers()
+    places = set()
+    for seed, size in ((0, 40), (1, 40), (2, 30)):
+        scene = random_scene(30, 9, size, size, seed).tensors
+        expected = rasterize(**scene, width=size, height=size, backend="cpu")
+        got = rasterize(**scene, width=size, height=size, backend="cpu", buffers=buffers)
+        assert torch.equal(expected.colors, got.colors) and torch.equal(expected.depth, got.depth)
+        places.add(got.colors.data_ptr())
+    assert len(places) == 1
+
+
+def test_backward_through_an_overwritten_buffer_is_refused():
+    scene = {k: v.requires_grad_() for k, v in random_scene(20, 9).tensors.items()}
+    buffers = RenderBuffers()
+    out = rasterize(**scene, width=61, height=47, backend="cpu", buffers=buffers)
+    loss = out.colors.square().sum()
+    rasterize(**scene, width=61, height=47, backend="cpu", buffers=buffers)
+    with pytest.raises(RuntimeError, match="modified by an inplace operation"):
+        loss.backward()
 
 
 @pytest.mark.parametrize("backend", CPU_BACKENDS)
