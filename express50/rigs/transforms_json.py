@@ -43,7 +43,7 @@ def read_transforms(path: Path, size: tuple[int, int] | None) -> dict[str, Camer
     frames = table.get("frames")
     if not isinstance(frames, list) or not frames:
         raise CalibrationError(f"{path}: has no frames; expected [{{transform_matrix, ...}}, ...]")
-    names = _names(frames)
+    names = camera_names(frames)
     found: dict[str, Camera] = {}
     for number, (name, frame) in enumerate(zip(names, frames, strict=True)):
         camera = _camera(f"{path}: frame {number} ({name})", name, table | frame, size)
@@ -56,7 +56,8 @@ def read_transforms(path: Path, size: tuple[int, int] | None) -> dict[str, Camer
     return checked(found, path)
 
 
-def _names(frames: list[dict]) -> list[str]:
+def camera_names(frames: list[dict]) -> list[str]:
+    """The camera of each frame: its index where all have one, else by its file's name."""
     if all("camera_index" in frame for frame in frames):
         return [f"cam{int(frame['camera_index']):02d}" for frame in frames]
     return names_from_files(
