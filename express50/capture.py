@@ -34,7 +34,7 @@ class RawCamera:
         names: videos or images in order; an image may lie in a container (`express50.media`).
         counts: images of each clip; one clip where it is empty.
         stamps: the layout's own number of each image; its place where it is empty.
-        colour: rows of a polynomial colour correction (`express50.colour_polynomial`), or none.
+        correction: rows of a polynomial colour correction (`express50.colour_polynomial`), or none.
     """
 
     id: str
@@ -43,7 +43,7 @@ class RawCamera:
     names: tuple[str, ...] = ()
     counts: tuple[int, ...] = ()
     stamps: tuple[int, ...] = ()
-    colour: tuple[tuple[float, ...], ...] = ()
+    correction: tuple[tuple[float, ...], ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)

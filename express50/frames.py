@@ -95,8 +95,8 @@ class FrameReader:
         found, expected = dhash(image), self.source.dhash[frame]
         if found != expected:
             raise CaptureError(
-                f"{self._file(frame)}: frame {frame} has hash {found}, the index says {expected}; the "
-                "footage changed since it was ingested, run 'express50 ingest' again"
+                f"{self._file(frame)}: frame {frame} has hash {found}, the index says {expected}; "
+                "the footage changed since it was ingested, run 'express50 ingest' again"
             )
         return image
 
@@ -117,7 +117,7 @@ class FrameReader:
 
 def corrected(image: np.ndarray, source: CameraSource | RawCamera) -> np.ndarray:
     """An image (H, W, 3) uint8 with its camera's own colour correction, if it has one."""
-    return correct_srgb8(image, source.colour) if source.colour else image
+    return correct_srgb8(image, source.correction) if source.correction else image
 
 
 _readers: OrderedDict[tuple, FrameReader] = OrderedDict()

@@ -42,7 +42,7 @@ class CameraSource:
         names: images or videos in order, relative to the source; empty for a single video. An image
             may lie in a container (`express50.media`).
         clips: frames of each clip; empty where all is one.
-        colour: rows of a polynomial colour correction that `express50.frames` applies, or none.
+        correction: rows of a polynomial colour correction that `express50.frames` applies, or none.
     """
 
     kind: str
@@ -55,7 +55,7 @@ class CameraSource:
     sha256: str
     names: tuple[str, ...] = ()
     clips: tuple[int, ...] = ()
-    colour: tuple[tuple[float, ...], ...] = ()
+    correction: tuple[tuple[float, ...], ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -164,7 +164,7 @@ def _camera_to_json(camera: CameraSource) -> dict[str, Any]:
     row["dhash"] = " ".join(camera.dhash)
     row["names"] = list(camera.names)
     # Left out where they say nothing: most captures have one clip and no correction.
-    return {k: v for k, v in row.items() if v or k not in ("clips", "colour")}
+    return {k: v for k, v in row.items() if v or k not in ("clips", "correction")}
 
 
 def index_from_json(content: Mapping[str, Any], capture: Path) -> Index:
@@ -194,7 +194,7 @@ def _camera_from_json(name: str, row: Mapping[str, Any]) -> CameraSource:
     values["dhash"] = tuple(row["dhash"].split())
     values["names"] = tuple(row["names"])
     values["clips"] = tuple(map(int, row.get("clips", ())))
-    values["colour"] = tuple(tuple(map(float, line)) for line in row.get("colour", ()))
+    values["correction"] = tuple(tuple(map(float, line)) for line in row.get("correction", ()))
     camera = CameraSource(**values)
     lengths = {len(camera.pts), len(camera.dhash)}
     if lengths != {camera.frames}:

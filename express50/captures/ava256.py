@@ -35,9 +35,9 @@ def fits(path: Path) -> bool:
 
 
 def subject_of(path: Path) -> str:
-    """The subject part of ``<date>--<time>--<subject>``, or of ``m--<date>--<time>--<subject>--GHS``.
+    """The subject in the folder's name, or the whole name where it has none.
 
-    A folder of another name is taken whole.
+    Names are ``<date>--<time>--<subject>`` or ``m--<date>--<time>--<subject>--GHS``.
     """
     parts = path.name.split("--")
     if parts[0] == "m" and parts[-1] == "GHS":

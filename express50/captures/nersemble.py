@@ -70,7 +70,7 @@ def read(path: Path, wishes: Wishes) -> RawCapture:
         meta={"licence": "research only, see the terms of NeRSemble"},
         cameras={
             serial: RawCamera(
-                id=serial, kind="videos", path=path, names=names, colour=colours.get(serial, ())
+                id=serial, kind="videos", path=path, names=names, correction=colours.get(serial, ())
             )
             for serial, names in line.names.items()
         },

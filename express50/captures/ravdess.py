@@ -42,7 +42,7 @@ class Clip:
 
     @property
     def sequence(self) -> str:
-        """Its name as an expression, such as ``happy_strong_kids_1`` or ``song_sad_normal_dogs_2``."""
+        """Its name as an expression, such as ``happy_strong_kids_1``; songs are ``song_...``."""
         words = [self.emotion, self.intensity, self.statement, str(self.repetition)]
         return "_".join(["song", *words] if self.channel == "song" else words)
 

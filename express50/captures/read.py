@@ -1,9 +1,9 @@
 """Read a capture of any known layout: which one it is, what it holds, what was left out and why.
 
 A layout is a row of a plain table: its name, what it looks like, a test, the subject's id, and a
-reader that turns it into a `RawCapture`. Nothing is copied or unpacked. A folder with a capture.toml
-may name where the footage lies (``source``), which layout it is (``layout``) and which parts of it
-to take, so that read-only datasets need no file of ours beside them.
+reader that turns it into a `RawCapture`. Nothing is copied or unpacked. A folder with capture.toml
+may name where the footage lies (``source``), which layout it is (``layout``) and which parts to
+take, so that read-only datasets need no file of ours beside them.
 """
 
 from __future__ import annotations
@@ -182,7 +182,8 @@ def _judged(raw: RawCapture, path: Path) -> RawCapture:
         raise CalibrationError(
             f"{path}: {verdict.problem}; {verdict.remedy or 'check the calibration'}"
         )
-    return replace(raw, warnings=raw.warnings | {"cameras": w for w in verdict.warnings[:1]})
+    odd = {"cameras": "; ".join(verdict.warnings)} if verdict.warnings else {}
+    return replace(raw, warnings=raw.warnings | odd)
 
 
 def watched(path: Path) -> list[Path]:

@@ -142,7 +142,7 @@ def read(path: Path, wishes: Wishes) -> RawCapture:
     check_wishes(wishes, list(known), sorted(pictures) or list(wishes.cameras))
     _require(path, taken, skipped)
     last = {part: max(k for t in pictures.values() for p, k in t if p == part) for part in taken}
-    line = common_timeline(pictures, list(taken), required={(p, k) for p, k in last.items()})
+    line = common_timeline(pictures, list(taken), required=set(last.items()))
     calibration, warnings = _calibration(taken.values(), set(line.names))
     clips = tuple(names.get(part) or wishes.expression(part) for part in line.sequences)
     return RawCapture(

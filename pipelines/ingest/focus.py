@@ -11,7 +11,7 @@ import numpy as np
 REACH = 8  # pixels on either side of an edge within which its two levels are looked for
 SMOOTH = 0.8  # standard deviation of the filter against noise, pixels; taken off the width again
 STEP = 30.0  # grey levels that an edge must part, so that noise is none
-FEWEST = 40  # edges that a judgement needs
+FEWEST = 20  # edges that a judgement needs
 SHARPEST = 20  # percentile of the widths: a face is soft, its lashes and hair are not
 
 
@@ -29,7 +29,7 @@ def edge_width(image: np.ndarray) -> float | None:
     )
     window = np.ones((2 * REACH + 1, 2 * REACH + 1), np.uint8)
     height = cv2.dilate(grey, window) - cv2.erode(grey, window)
-    steepest = slope == cv2.dilate(slope, np.ones((2 * REACH + 1, 2 * REACH + 1), np.uint8))
+    steepest = slope == cv2.dilate(slope, np.ones((REACH + 1, REACH + 1), np.uint8))
     edges = steepest & (height > STEP) & (slope > 0)
     if edges.sum() < FEWEST:
         return None

@@ -83,7 +83,7 @@ def scan_camera(
         sha256=source_sha256(camera),
         names=camera.names,
         clips=tuple(clips) if camera.kind == "videos" or camera.counts else (),
-        colour=camera.colour,
+        correction=camera.correction,
     )
     return source, watch.seen()
 

@@ -16,7 +16,9 @@ import numpy as np
 SIDE = 96  # longer side of the pictures that movement is measured in
 FEWEST_CAMERAS, FEWEST_FRAMES = 3, 24
 SPAN = 15  # frames whose mean is taken off: views differ in how much they see, not in when
-STEP_COST = 12.0  # what a change of lag costs, in units of log likelihood
+STEP_COST = 10.0  # what a change of lag costs, in units of log likelihood
+FRAME_COST = 1.0  # and every frame of it: few frames are lost more often than many
+START_COST = 7.0  # what being out of step from the start costs
 ALIKE = 0.35  # correlation with the others from which a camera's movement tells anything
 STILL = 0.05  # share of a camera's usual movement below which a frame repeats the one before
 
@@ -112,16 +114,16 @@ def _likeliest(curve: np.ndarray, rest: np.ndarray, reach: int, spread: float) -
     at = np.arange(count)[:, None] + lags
     beyond = (at < 0) | (at >= count)
     miss = (curve[:, None] - rest[np.clip(at, 0, count - 1)]) ** 2 / (2 * spread)
-    # Beyond the clip nothing can be compared: such a frame is as good as a usual one.
-    miss = np.minimum(np.where(beyond, 0.5, miss), 6.0)
-    # A recording starts in step unless that is clearly wrong, and later changes cost the same.
-    total = miss[0] + STEP_COST * (lags != 0)
+    # Beyond the clip nothing can be compared: such a frame is hardly better than a wrong one.
+    miss = np.minimum(np.where(beyond, 1.0, miss), 6.0)
+    total = miss[0] + (START_COST + FRAME_COST * np.abs(lags)) * (lags != 0)
+    far = np.abs(lags[:, None] - lags)
+    change = (STEP_COST + FRAME_COST * far) * (far > 0)
     came = np.zeros((count, len(lags)), dtype=np.int64)
     for t in range(1, count):
-        best = int(total.argmin())
-        stay = total <= total[best] + STEP_COST
-        came[t] = np.where(stay, np.arange(len(lags)), best)
-        total = np.where(stay, total, total[best] + STEP_COST) + miss[t]
+        ways = total[:, None] + change
+        came[t] = ways.argmin(axis=0)
+        total = ways.min(axis=0) + miss[t]
     path = np.zeros(count, dtype=np.int64)
     state = int(total.argmin())
     for t in range(count - 1, -1, -1):
