@@ -17,7 +17,7 @@ from express50.errors import CalibrationError, CaptureError
 from express50.media import inside
 from express50.rigs.build import in_metres, read_table
 from express50.rigs.colmap import is_colmap, read_colmap_images
-from express50.rigs.transforms_json import camera_names, is_transforms, read_transforms
+from express50.rigs.transforms_json import camera_names, read_transforms
 
 FPS = 24.0  # of photographs it means nothing
 MODELS = ("sparse/0", "sparse", ".")
@@ -60,7 +60,9 @@ def read_colmap_folder(path: Path, wishes: Wishes) -> RawCapture:
 
 def fits_transforms(path: Path) -> bool:
     """Whether a folder, or the file itself, is a transforms.json with frames."""
-    return is_transforms(path)
+    if path.is_dir():
+        return (path / "transforms.json").is_file()
+    return path.name.startswith("transforms") and path.suffix == ".json"
 
 
 def read_transforms_folder(path: Path, wishes: Wishes) -> RawCapture:
