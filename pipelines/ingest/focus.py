@@ -11,7 +11,7 @@ import numpy as np
 REACH = 8  # pixels on either side of an edge within which its two levels are looked for
 SMOOTH = 0.8  # standard deviation of the filter against noise, pixels; taken off the width again
 STEP = 30.0  # grey levels that an edge must part, so that noise is none
-FEWEST = 20  # edges that a judgement needs
+FEWEST = 12  # edges that a judgement needs
 SHARPEST = 20  # percentile of the widths: a face is soft, its lashes and hair are not
 
 

@@ -288,10 +288,11 @@ def account(dataset: Dataset, subjects: list[str]) -> Iterator[str]:
         if not path.is_file():
             continue
         told = json.loads(path.read_text(encoding="utf-8"))
-        per_camera = told["frames"] // max(1, told["cameras"])
+        counts = sorted({told["frame_count"], *told["frame_count_differs"].values()})
+        frames = " to ".join(map(str, dict.fromkeys((counts[0], counts[-1]))))
         yield (
-            f"  {subject} ({told.get('layout', OURS)}): {told['cameras']} cameras, {per_camera} "
-            f"frames each, {told['expressions']} expressions"
+            f"  {subject} ({told.get('layout', OURS)}): {told['cameras']} cameras, {frames} frames "
+            f"each, {told['expressions']} expressions"
         )
         for row in told.get("warnings", ()):
             yield f"  warning {subject}: {row['what']}: {row['why']}"

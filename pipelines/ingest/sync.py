@@ -20,6 +20,9 @@ STEP_COST = 10.0  # what a change of lag costs, in units of log likelihood
 FRAME_COST = 1.0  # and every frame of it: few frames are lost more often than many
 START_COST = 7.0  # what being out of step from the start costs
 ALIKE = 0.35  # correlation with the others from which a camera's movement tells anything
+EARLY = 8  # frames before which a change of lag cannot be told from one before the start
+LEAST_SPREAD = 0.15  # of curves of unit variance; views are never more alike than that
+MARGIN = 4  # frames that must be left to compare after a change of lag
 STILL = 0.05  # share of a camera's usual movement below which a frame repeats the one before
 
 
@@ -77,22 +80,35 @@ def look_at_sync(
 
 
 def _of_clip(moves: Mapping[str, np.ndarray], reach: int) -> tuple[dict[str, list[Step]], set[str]]:
-    """Steps by camera of one clip, and the cameras whose movement is like the others'."""
-    names = list(moves)
-    curves = np.stack([_curve(moves[name]) for name in names])
-    rest = [np.median(np.delete(curves, i, axis=0), axis=0) for i in range(len(names))]
-    misses = np.array([np.mean((curves[i] - rest[i])[1:] ** 2) for i in range(len(names))])
-    # The usual camera's miss: that of a camera out of step would excuse itself.
-    spread = max(float(np.median(misses)), 1e-3)
-    steps, alike = {}, set()
-    for i, name in enumerate(names):
-        path = _likeliest(curves[i], rest[i], reach, spread)
-        if _likeness(curves[i], rest[i], path) < ALIKE:
-            continue
-        alike.add(name)
+    """Steps by camera of one clip, and the cameras whose movement is like the others'.
+
+    The camera for which most speaks is taken out first: left in, it would bend what the others are
+    compared with.
+    """
+    curves = {name: _curve(moves[name]) for name in moves}
+    steps: dict[str, list[Step]] = {}
+    alike: set[str] = set()
+    found: set[str] = set()
+    while len(curves) - len(found) >= FEWEST_CAMERAS:
+        left = {name: curve for name, curve in curves.items() if name not in found}
+        rest = {n: np.median([c for m, c in left.items() if m != n], axis=0) for n in left}
+        # How well the usual camera fits: one out of step would excuse itself.
+        misses = [np.mean((left[n] - rest[n])[1:] ** 2) for n in left]
+        spread = max(float(np.median(misses)), LEAST_SPREAD)
+        gains = {}
+        for name in left:
+            path, gain = _likeliest(left[name], rest[name], reach, spread)
+            if _likeness(left[name], rest[name], path) >= ALIKE:
+                alike.add(name)
+                if path.any():
+                    gains[name] = gain, path
+        if not gains:
+            break
+        worst = max(gains, key=lambda name: gains[name][0])
+        found.add(worst)
+        path = gains[worst][1]
         edges = np.flatnonzero(np.diff(path, prepend=0))
-        if edges.size:
-            steps[name] = [Step(int(t), int(path[t])) for t in edges]
+        steps[worst] = [Step(int(t), int(path[t])) for t in edges]
     return steps, alike
 
 
@@ -107,8 +123,10 @@ def _curve(moves: np.ndarray) -> np.ndarray:
     return values / max(float(values.std()), 1e-6)
 
 
-def _likeliest(curve: np.ndarray, rest: np.ndarray, reach: int, spread: float) -> np.ndarray:
-    """Lag of each frame (F,): the path of least misses and changes."""
+def _likeliest(
+    curve: np.ndarray, rest: np.ndarray, reach: int, spread: float
+) -> tuple[np.ndarray, float]:
+    """Lag of each frame (F,), the path of least misses and changes, and what it gains over none."""
     count = len(curve)
     lags = np.arange(-reach, reach + 1)
     at = np.arange(count)[:, None] + lags
@@ -119,17 +137,21 @@ def _likeliest(curve: np.ndarray, rest: np.ndarray, reach: int, spread: float) -
     total = miss[0] + (START_COST + FRAME_COST * np.abs(lags)) * (lags != 0)
     far = np.abs(lags[:, None] - lags)
     change = (STEP_COST + FRAME_COST * far) * (far > 0)
+    never = np.where(far > 0, np.inf, 0.0)
     came = np.zeros((count, len(lags)), dtype=np.int64)
     for t in range(1, count):
-        ways = total[:, None] + change
+        # So near the end a change would be told by frames that nothing is compared with.
+        late = t >= count - reach - MARGIN
+        ways = total[:, None] + (never if late else change)
         came[t] = ways.argmin(axis=0)
         total = ways.min(axis=0) + miss[t]
     path = np.zeros(count, dtype=np.int64)
     state = int(total.argmin())
+    gain = float(miss[:, reach].sum() - total[state])
     for t in range(count - 1, -1, -1):
         path[t] = lags[state]
         state = int(came[t, state])
-    return path
+    return path, gain
 
 
 def _likeness(curve: np.ndarray, rest: np.ndarray, path: np.ndarray) -> float:
@@ -151,9 +173,10 @@ def step_words(steps: Sequence[Step]) -> str:
     for step in steps:
         change = step.lag - before
         what = "loses" if change > 0 else "repeats or gains"
-        where = "from its start" if step.frame == 0 else f"at about frame {step.frame}"
+        early = step.frame < EARLY and before == 0
+        where = "from its start" if early else f"at about frame {step.frame}"
         frames = f"{abs(change)} frame{'s' if abs(change) > 1 else ''}"
-        if step.frame == 0:
+        if early:
             side = "ahead of" if step.lag > 0 else "behind"
             words.append(f"is {frames} {side} the others {where}")
         else:
