@@ -265,14 +265,14 @@ def read_peaks(dataset: Dataset, subject: str) -> dict[str, int]:
     try:
         rows = json.loads(path.read_text(encoding="utf-8"))
         peaks = {name: int(row["frame"]) for name, row in rows.items()}
-        named = [(n, row["camera"], row["dhash"]) for n, row in rows.items()]
+        named = [(n, row["camera"], row["pts"], row["dhash"]) for n, row in rows.items()]
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise FormatError(f"{path}: not a table of peaks ({type(error).__name__}: {error})") from (
             error
         )
     index = read_index(dataset, subject)
-    for name, camera_id, expected in named:
-        _check_peak(index, path, name, peaks[name], camera_id, expected)
+    for name, camera_id, pts, expected in named:
+        _check_peak(index, path, name, peaks[name], camera_id, (pts, expected))
     return peaks
 
 
@@ -286,14 +286,15 @@ def peak_items(dataset: Dataset) -> list[str]:
 
 
 def _check_peak(
-    index: Index, path: Path, name: str, frame: int, camera_id: str, expected: str
+    index: Index, path: Path, name: str, frame: int, camera_id: str, expected: tuple[int, str]
 ) -> None:
     source = index.cameras.get(camera_id)
-    found = source.dhash[frame] if source and 0 <= frame < source.frames else "none"
+    there = source is not None and 0 <= frame < source.frames
+    found = (source.pts[frame], source.dhash[frame]) if source and there else ("none", "none")
     if found != expected:
         raise CaptureError(
-            f"{path}: {name}: frame {frame} of {camera_id} has hash {found}, the label says "
-            f"{expected}; the footage is not the one that was labelled, run 'express50 align' again"
+            f"{path}: {name}: frame {frame} of {camera_id} has hash {found[1]} at time {found[0]}, "
+            f"the label says {expected[1]} at {expected[0]}; the footage is not the one that was labelled, run 'express50 align' again"
         )
 
 

@@ -9,7 +9,7 @@ but that is frame 119 of one and 12 of the other: the release and the frame's ow
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -242,12 +242,12 @@ def _person(performance: Performance) -> dict[str, object]:
 
 
 def _calibration(
-    taken: Sequence[Performance] | object, names: set[str]
+    taken: Iterable[Performance], names: set[str]
 ) -> tuple[dict[str, Camera] | None, dict[str, str]]:
     """Cameras of the first performance that has some, and where others disagree with it."""
     first: dict[str, Camera] | None = None
     warnings = {}
-    for performance in taken:  # type: ignore[attr-defined]
+    for performance in taken:
         if performance.anno is None:
             continue
         cameras = {k: c for k, c in read_renderme(performance.anno).items() if k in names}

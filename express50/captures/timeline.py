@@ -80,8 +80,8 @@ def common_timeline(
     taken = {camera: table for camera, table in pictures.items() if camera not in dropped}
     holes = {m: [c for c, table in taken.items() if m not in table] for m in common}
     for camera in taken:
-        lost = {m for m, without in holes.items() if without and without[0] == camera}
-        skipped |= _reasons(lost, f"{camera} has no picture of")
+        without = {m for m, cameras in holes.items() if cameras and cameras[0] == camera}
+        skipped |= _reasons(without, f"{camera} has no picture of")
     rank = {sequence: number for number, sequence in enumerate(order)}
     whole = [m for m in common if taken and not holes[m]]
     moments = tuple(sorted(whole, key=lambda m: (rank[m[0]], m[1])))

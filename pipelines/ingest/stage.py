@@ -147,7 +147,7 @@ def _calibration(raw: RawCapture, cameras: Mapping[str, CameraSource]) -> dict[s
         return None
     if raw.calibration is None:
         return None
-    found = {}
+    found: dict[str, Camera] = {}
     for name in sorted(raw.calibration.keys() & sizes.keys()):
         found |= at_size({name: raw.calibration[name]}, sizes[name])
     return found

@@ -22,7 +22,6 @@ START_COST = 7.0  # what being out of step from the start costs
 ALIKE = 0.35  # correlation with the others from which a camera's movement tells anything
 EARLY = 8  # frames before which a change of lag cannot be told from one before the start
 LEAST_SPREAD = 0.15  # of curves of unit variance; views are never more alike than that
-MARGIN = 4  # frames that must be left to compare after a change of lag
 STILL = 0.05  # share of a camera's usual movement below which a frame repeats the one before
 
 
@@ -140,8 +139,8 @@ def _likeliest(
     never = np.where(far > 0, np.inf, 0.0)
     came = np.zeros((count, len(lags)), dtype=np.int64)
     for t in range(1, count):
-        # So near the end a change would be told by frames that nothing is compared with.
-        late = t >= count - reach - MARGIN
+        # So near the end a change would be told mostly by frames that nothing is compared with.
+        late = t >= count - 2 * reach
         ways = total[:, None] + (never if late else change)
         came[t] = ways.argmin(axis=0)
         total = ways.min(axis=0) + miss[t]
