@@ -294,7 +294,8 @@ def _check_peak(
     if found != expected:
         raise CaptureError(
             f"{path}: {name}: frame {frame} of {camera_id} has hash {found[1]} at time {found[0]}, "
-            f"the label says {expected[1]} at {expected[0]}; the footage is not the one that was labelled, run 'express50 align' again"
+            f"the label says {expected[1]} at {expected[0]}; the footage is not the one that was "
+            "labelled, run 'express50 align' again"
         )
 
 

@@ -131,8 +131,8 @@ def _likeliest(
     at = np.arange(count)[:, None] + lags
     beyond = (at < 0) | (at >= count)
     miss = (curve[:, None] - rest[np.clip(at, 0, count - 1)]) ** 2 / (2 * spread)
-    # Beyond the clip nothing can be compared: such a frame is hardly better than a wrong one.
-    miss = np.minimum(np.where(beyond, 1.0, miss), 6.0)
+    # Beyond the clip nothing can be compared, so that no lag is better there than being in step.
+    miss = np.minimum(np.where(beyond, miss[:, reach : reach + 1], miss), 6.0)
     total = miss[0] + (START_COST + FRAME_COST * np.abs(lags)) * (lags != 0)
     far = np.abs(lags[:, None] - lags)
     change = (STEP_COST + FRAME_COST * far) * (far > 0)

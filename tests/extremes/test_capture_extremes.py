@@ -59,10 +59,12 @@ def test_a_picture_that_is_no_bytes_or_lies_elsewhere_is_refused(renderme, tmp_p
         "no JPEG": lambda f: f.create_dataset(name, data=np.arange(50, dtype=np.uint8)),
         "no array": lambda f: f.create_group(name),
     }
-    for message, make in wrong.items():
-        rewrite(path, replace(make))
+    for number, (message, make) in enumerate(wrong.items()):
+        copy = renderme / f"{number}.smc"
+        copy.write_bytes(path.read_bytes())
+        rewrite(copy, replace(make))
         with pytest.raises(CaptureError, match=message):
-            read_picture(renderme, f"{path.name}!/{name}")
+            read_picture(renderme, f"{copy.name}!/{name}")
 
 
 @pytest.mark.parametrize(
