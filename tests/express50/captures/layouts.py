@@ -108,7 +108,7 @@ def write_nersemble(root: Path, write_video, sequences=("EMO-1-shout+laugh", "EX
 
 def avif(image: np.ndarray) -> bytes:
     data = io.BytesIO()
-    Image.fromarray(image).save(data, "AVIF", quality=95)
+    Image.fromarray(image).save(data, "AVIF", quality=95, speed=10)
     return data.getvalue()
 
 
@@ -118,10 +118,10 @@ AVA_FRAMES = [("EXP_neutral_peak", n) for n in (100, 103, 106)] + [
 
 
 def write_ava(root: Path, missing=(), unpublished=(), encode=avif) -> Path:
-    """A capture of four cameras; K is for 2668 x 4096, pictures are an eighth; millimetres."""
+    """A capture of four cameras; K is for 2668 x 4096, pictures are a sixteenth; millimetres."""
     path = root / "20220818--1122--ABC123"
     names = [f"cam{n}" for n in (400981, 401031, 401045, 401163)]
-    small = (334, 512)
+    small = (167, 256)
     (path / "decoder/image").mkdir(parents=True)
     rows = []
     for name, camera in rig(names, small).items():

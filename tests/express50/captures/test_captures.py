@@ -158,12 +158,12 @@ def test_ava_reads_transposed_millimetres_and_names_unpublished_frames(tmp_path)
     index = read_index(dataset, subject)
     assert index.cameras["cam401045"].pts == (100, 106, 250, 260, 261)
     assert index.cues == (Cue("EXP_neutral_peak", 0, 1), Cue("EXP_free_face", 2, 4))
-    assert near(read_frame(dataset, subject, "cam401031", 3, False), picture(1, 260, (512, 334, 3)))
+    assert near(read_frame(dataset, subject, "cam401031", 3, False), picture(1, 260, (256, 167, 3)))
     reasons = " ".join(told(dataset, subject).values())
     assert "no camera has a picture of EXP_neutral_peak 103" in reasons
     assert "cam401045 has no picture of EXP_free_face 251" in reasons
     names = [f"cam{n}" for n in (400981, 401031, 401045, 401163)]
-    assert_rig(dataset, subject, rig(names, (334, 512)))
+    assert_rig(dataset, subject, rig(names, (167, 256)))
 
 
 def test_multiface(tmp_path):
@@ -233,7 +233,7 @@ def test_capture_toml_points_at_read_only_data_and_chooses(tmp_path):
     assert "source" not in index.meta
     assert len(index.cameras) == 3 and index.cues == (Cue("neutral", 0, 2),)
     assert told(dataset, subject)["sequence EXP_free_face"] == "not asked for"
-    assert near(read_frame(dataset, subject, "cam401163", 2, False), picture(3, 106, (512, 334, 3)))
+    assert near(read_frame(dataset, subject, "cam401163", 2, False), picture(3, 106, (256, 167, 3)))
     file = wishes / "capture.toml"
     file.write_text(file.read_text().replace("EXP_n*", "EXP_x*"))
     with pytest.raises(CaptureError, match="EXP_x.*which is not there; the layout has EXP_neutral"):
