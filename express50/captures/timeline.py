@@ -67,8 +67,8 @@ def common_timeline(
     """
     seen = Counter(moment for table in pictures.values() for moment in table)
     common = {m for m, count in seen.items() if 2 * count >= len(pictures)}
-    skipped = _reasons(set(listed) - set(seen), "no camera has a picture of")
-    skipped |= _reasons(set(seen) - common, "most cameras have no picture of")
+    skipped = _reasons(set(listed) - set(seen), "no camera", "has a")
+    skipped |= _reasons(set(seen) - common, "most cameras", "have no")
     dropped = {}
     for camera, table in pictures.items():
         lacking = common - set(table)
@@ -81,7 +81,7 @@ def common_timeline(
     holes = {m: [c for c, table in taken.items() if m not in table] for m in common}
     for camera in taken:
         without = {m for m, cameras in holes.items() if cameras and cameras[0] == camera}
-        skipped |= _reasons(without, f"{camera} has no picture of")
+        skipped |= _reasons(without, camera, "has no")
     rank = {sequence: number for number, sequence in enumerate(order)}
     whole = [m for m in common if taken and not holes[m]]
     moments = tuple(sorted(whole, key=lambda m: (rank[m[0]], m[1])))
@@ -89,13 +89,15 @@ def common_timeline(
     return Timeline(moments, names, dropped, skipped)
 
 
-def _reasons(moments: Collection[Moment], why: str) -> dict[str, str]:
+def _reasons(moments: Collection[Moment], who: str, has: str) -> dict[str, str]:
     """One line a sequence that lost moments."""
     found: dict[str, list[Moment]] = {}
     for moment in sorted(moments):
         found.setdefault(moment[0], []).append(moment)
     return {
-        f"{len(lost)} frames of {sequence} ({why.split(' ')[0]})": f"{why} {_words(lost)}"
+        f"{len(lost)} of the frames of {sequence} ({who})": (
+            f"{who} {has} picture of {_words(lost)}"
+        )
         for sequence, lost in found.items()
     }
 

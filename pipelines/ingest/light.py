@@ -17,6 +17,7 @@ CELLS = 16
 DARK, BRIGHT = 0.004, 0.85  # linear light between which a cell tells the camera's gain
 SPAN = 9  # frames over which curves are smoothed: a passing hand is no drift
 FEWEST = 12  # cells that a judgement needs
+FEWEST_FRAMES = 12  # of fewer, a movement cannot be told from a drift
 _CURVE = srgb_to_linear(np.arange(256, dtype=np.float32) / 255.0).astype(np.float32)
 
 
@@ -44,7 +45,7 @@ def cells_of(image: np.ndarray) -> np.ndarray:
 
 def light_drift(cells: np.ndarray) -> Drift | None:
     """Drift of a camera of its frames' cells (F, 16, 16, 3); None where too little tells it."""
-    if len(cells) < 2:
+    if len(cells) < FEWEST_FRAMES:
         return None
     usual = np.median(cells, axis=0)
     told = ((usual > DARK) & (usual < BRIGHT)).all(axis=-1)
