@@ -1,15 +1,18 @@
 """Rules that label without looking: RenderMe-360's key frames are the clips' last frames.
 
 Its 12 expressions are recorded so that the performer holds the target at the end of the clip; the
-dataset's users take the last frame (RenderMe-360's processing tools). A rule's label stands below
-any person's and above a suggestion.
+dataset's users take the last frame (RenderMe-360's processing tools). That is another frame in each
+of its releases, so ingest stores which one was read and the number of its last frame, and a label
+says so. A rule's label stands below any person's and above a suggestion.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 from annotations.store import RULE_PREFIX, Label, current_labels, make_mark, read_labels
+from express50.errors import AnnotationError
 from express50.index import Cue, Index
 from express50.layout import Dataset
 
@@ -18,8 +21,12 @@ RENDERME360_EXPRESSIONS = frozenset(f"e{n:0{width}}" for n in range(12) for widt
 
 
 def ruled_cues(index: Index, expressions: Sequence[str] | None = None) -> list[Cue]:
-    """The cues that the rule is about: RenderMe-360's ids e0 (or e00) to e11, or those named."""
-    wanted = RENDERME360_EXPRESSIONS if expressions is None else expressions
+    """The cues that the rule is about: RenderMe-360's expressions, or those named.
+
+    They are the ones that ingest read out of its files, else those with ids e0 (or e00) to e11.
+    """
+    told = [name for name, row in _told(index).items() if str(row["performance"]).startswith("e")]
+    wanted = (told or RENDERME360_EXPRESSIONS) if expressions is None else expressions
     return [cue for cue in index.cues if cue.expression_id in wanted]
 
 
@@ -35,5 +42,27 @@ def last_frame_marks(
         frame = min(cue.end_frame, source.frames - 1)
         known = said.get(cue.expression_id)
         if frame >= cue.start_frame and (known is None or known.frame != frame):
-            marks.append(make_mark(index, cue.expression_id, frame, camera, LAST_FRAME))
+            mark = make_mark(index, cue.expression_id, frame, camera, LAST_FRAME)
+            row = _told(index).get(cue.expression_id)
+            marks.append(mark if row is None else _with_release(mark, row))
     return marks
+
+
+def _told(index: Index) -> dict[str, dict]:
+    """What ingest read of each expression's clip; empty of other captures."""
+    return index.meta.get("renderme360", {})
+
+
+def _with_release(mark: Label, row: dict) -> Label:
+    """The mark with the release it was made on.
+
+    Raises:
+        AnnotationError: the clip's last frame is not the last of the performance.
+    """
+    if mark.pts != row["last_frame"]:
+        raise AnnotationError(
+            f"{mark.subject} {mark.expression}: the clip ends with frame {mark.pts}, the "
+            f"performance with {row['last_frame']}; run 'express50 ingest' again"
+        )
+    reason = f"{row['release']} release, frame {row['last_frame']} of {row['num_frame']}"
+    return replace(mark, reason=reason)

@@ -10,7 +10,7 @@ import csv
 import math
 import re
 import tomllib
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from express50.cameras import Camera, read_cameras
@@ -25,20 +25,33 @@ NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
 
 @dataclass(frozen=True, kw_only=True)
 class RawCamera:
-    """Footage of one camera: a video file, or a folder of image files in order."""
+    """Footage of one camera, in clips one after another.
+
+    Attributes:
+        id: of the camera.
+        kind: ``video`` (``path`` is the file), ``videos`` (one file a clip) or ``frames`` (images).
+        path: the video, or the folder that ``names`` are relative to.
+        names: videos or images in order; an image may lie in a container (`express50.media`).
+        counts: images of each clip; one clip where it is empty.
+        stamps: the layout's own number of each image; its place where it is empty.
+        correction: rows of a polynomial colour correction (`express50.colour_polynomial`), or none.
+    """
 
     id: str
     kind: str
     path: Path
     names: tuple[str, ...] = ()
+    counts: tuple[int, ...] = ()
+    stamps: tuple[int, ...] = ()
+    correction: tuple[tuple[float, ...], ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)
 class RawCapture:
-    """A raw capture's folder, checked as far as that goes without decoding footage.
+    """A capture of any layout, checked as far as that goes without decoding footage.
 
     Attributes:
-        root: the folder.
+        root: the folder that footage and plates are relative to.
         subject: subject id.
         fps: frames a second.
         meta: content of capture.toml.
@@ -48,6 +61,11 @@ class RawCapture:
         plates: background plates by camera id, relative to the root.
         board: content of board.toml and files by camera, or None.
         cues: scripted expressions in file order.
+        layout: which of `express50.captures` it is; ours is ``express50``.
+        clips: expression of each clip where the footage comes in clips; they make the cues.
+        skipped: what of a layout was left out (sequences, frames), with the reason.
+        found: what the layout told about itself.
+        warnings: what is odd but may be meant, with the reason.
     """
 
     root: Path
@@ -55,11 +73,16 @@ class RawCapture:
     fps: float
     meta: dict
     cameras: dict[str, RawCamera]
-    dropped: dict[str, str]
-    calibration: dict[str, Camera] | None
-    plates: dict[str, str]
-    board: dict | None
-    cues: tuple[Cue, ...]
+    dropped: dict[str, str] = field(default_factory=dict)
+    calibration: dict[str, Camera] | None = None
+    plates: dict[str, str] = field(default_factory=dict)
+    board: dict | None = None
+    cues: tuple[Cue, ...] = ()
+    layout: str = "express50"
+    clips: tuple[str, ...] = ()
+    skipped: dict[str, str] = field(default_factory=dict)
+    found: dict = field(default_factory=dict)
+    warnings: dict[str, str] = field(default_factory=dict)
 
 
 def read_capture(root: Path) -> RawCapture:
@@ -110,11 +133,30 @@ def read_meta(root: Path) -> dict:
         raise CaptureError(
             f"{root}: {what}; expected a capture folder whose capture.toml says subject and fps"
         )
+    meta = read_capture_toml(path)
+    check_identity(path, meta.get("subject"), meta.get("fps"))
+    return meta
+
+
+def read_capture_toml(path: Path) -> dict:
+    """Content of a capture.toml, dates as text; nothing of it is checked.
+
+    Raises:
+        CaptureError: it cannot be read or is not TOML.
+    """
     try:
         meta = tomllib.loads(path.read_text(encoding="utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise CaptureError(f"{path}: not TOML: {error}") from error
-    subject, fps = meta.get("subject"), meta.get("fps")
+    return {key: plain(value) for key, value in meta.items()}
+
+
+def check_identity(path: Path, subject: object, fps: object) -> None:
+    """Refuse a subject or frame rate that cannot be one.
+
+    Raises:
+        CaptureError: a value is missing, of another type or out of range.
+    """
     if not isinstance(subject, str) or not NAME.fullmatch(subject):
         raise CaptureError(
             f"{path}: subject is {subject!r}, expected letters, digits, '_' and '-', such as 'S001'"
@@ -123,7 +165,6 @@ def read_meta(root: Path) -> dict:
         raise CaptureError(f"{path}: fps is {fps!r}, expected a number such as 24")
     if not (math.isfinite(fps) and 0 < fps <= 10_000):
         raise CaptureError(f"{path}: fps is {fps!r}, expected more than 0 and at most 10000")
-    return {key: plain(value) for key, value in meta.items()}
 
 
 def plain(value: object) -> object:

@@ -12,33 +12,17 @@ import numpy as np
 
 from express50.adapters import undistort_image
 from express50.cameras import Camera, pinhole, read_cameras
+from express50.capture import RawCamera
+from express50.colour_polynomial import correct_srgb8
 from express50.errors import CaptureError, FormatError, StageError
-from express50.images import decode_image, linear_to_srgb, read_image
-from express50.index import Index, read_index
+from express50.images import decode_image
+from express50.index import CameraSource, Index, read_index
 from express50.layout import Dataset
+from express50.media import inside, read_picture, read_srgb8
+from express50.media import to_srgb8 as to_srgb8
 from express50.video import VideoReader
 
 OPEN_READERS = 8  # open videos a process keeps; each holds a decoder's picture buffers
-
-
-def to_srgb8(image: np.ndarray) -> np.ndarray:
-    """Image (H, W[, C]) as (H, W, 3) uint8 sRGB; floats are linear light, 16 bits are sRGB.
-
-    Raises:
-        ValueError: the image holds NaN or infinity.
-    """
-    if image.ndim == 2:
-        image = np.repeat(image[..., None], 3, axis=2)
-    if image.shape[2] == 2:  # grey and alpha
-        image = np.repeat(image[..., :1], 3, axis=2)
-    image = image[..., :3]
-    if image.dtype == np.uint16:
-        image = np.rint(image / 257.0)
-    elif image.dtype != np.uint8:
-        if not np.isfinite(image).all():
-            raise ValueError("image holds NaN or infinity")
-        image = np.rint(linear_to_srgb(np.clip(image, 0.0, 1.0)) * 255.0)
-    return np.ascontiguousarray(image.astype(np.uint8))
 
 
 def dhash(image: np.ndarray) -> str:
@@ -65,14 +49,13 @@ class FrameReader:
         self.camera_id = camera_id
         self.source = index.cameras[camera_id]
         self.path = index.capture / self.source.source
-        self._video = VideoReader(self.path, self.source.pts) if self._is_video else None
-
-    @property
-    def _is_video(self) -> bool:
-        return self.source.kind == "video"
+        self._clip = 0
+        self._video: VideoReader | None = None
+        if self.source.kind == "video":
+            self._video = VideoReader(self.path, self.source.pts)
 
     def read(self, frame: int) -> np.ndarray:
-        """Image (H, W, 3) uint8 sRGB of a decode index, as recorded (not undistorted).
+        """Image (H, W, 3) uint8 sRGB of a decode index, not undistorted, its colours corrected.
 
         Raises:
             CaptureError: no such frame, or the footage is not what was ingested.
@@ -81,42 +64,60 @@ class FrameReader:
             raise CaptureError(
                 f"{self.path}: frame {frame} does not exist, expected 0 to {self.source.frames - 1}"
             )
-        if self._video is None:
-            return self._checked(read_srgb8(self.path / self.source.names[frame]), frame)
-        image = self._video.read(frame)
+        return corrected(self._recorded(frame), self.source)
+
+    def _recorded(self, frame: int) -> np.ndarray:
+        """The frame as it was recorded, its hash compared with the index."""
+        if self.source.kind == "frames":
+            return self._checked(read_picture(self.path, self.source.names[frame]), frame)
+        video, number = self._video_of(frame)
+        image = video.read(number)
         if dhash(image) != self.source.dhash[frame]:
             # A decoder may conceal a missing reference after a seek; from the start it cannot.
-            self._video.restart()
-            image = self._video.read(frame)
+            video.restart()
+            image = video.read(number)
         return self._checked(image, frame)
+
+    def _video_of(self, frame: int) -> tuple[VideoReader, int]:
+        """The video that holds a frame, and the frame's number in it; one stays open."""
+        starts = np.concatenate([[0], np.cumsum(self.source.clips or (self.source.frames,))])
+        clip = int(np.searchsorted(starts, frame, side="right")) - 1
+        first, last = int(starts[clip]), int(starts[clip + 1])
+        if self._video is None or clip != self._clip:
+            self.close()
+            names = self.source.names
+            path = inside(self.path, names[clip]) if names else self.path
+            self._video = VideoReader(path, self.source.pts[first:last])
+            self._clip = clip
+        return self._video, frame - first
 
     def _checked(self, image: np.ndarray, frame: int) -> np.ndarray:
         found, expected = dhash(image), self.source.dhash[frame]
         if found != expected:
             raise CaptureError(
-                f"{self.path}: frame {frame} has hash {found}, the index says {expected}; the "
-                "footage changed since it was ingested, run 'express50 ingest' again"
+                f"{self._file(frame)}: frame {frame} has hash {found}, the index says {expected}; "
+                "the footage changed since it was ingested, run 'express50 ingest' again"
             )
         return image
+
+    def _file(self, frame: int) -> str:
+        """Which file a frame lies in, for messages."""
+        if self.source.kind == "video":
+            return str(self.path)
+        if self.source.kind == "frames":
+            return f"{self.path}/{self.source.names[frame]}"
+        return f"{self.path}/{self.source.names[self._clip]}"
 
     def close(self) -> None:
         """Close the video, if there is one."""
         if self._video is not None:
             self._video.close()
+            self._video = None
 
 
-def read_srgb8(path: Path) -> np.ndarray:
-    """Read an image file as (H, W, 3) uint8 sRGB.
-
-    Raises:
-        CaptureError: the file is missing, damaged or holds NaN or infinity.
-    """
-    try:
-        return to_srgb8(read_image(path))
-    except FormatError as error:
-        raise CaptureError(str(error)) from error
-    except ValueError as error:
-        raise CaptureError(f"{path}: {error}; export it again") from error
+def corrected(image: np.ndarray, source: CameraSource | RawCamera) -> np.ndarray:
+    """An image (H, W, 3) uint8 with its camera's own colour correction, if it has one."""
+    return correct_srgb8(image, source.correction) if source.correction else image
 
 
 _readers: OrderedDict[tuple, FrameReader] = OrderedDict()
@@ -167,13 +168,24 @@ def read_plate(
     if camera_id not in index.plates:
         return None
     path = index.capture / index.plates[camera_id]
-    image, footage = read_srgb8(path), index.cameras.get(camera_id)
+    image, footage = read_raw_plate(index, camera_id), index.cameras.get(camera_id)
     if footage is not None and image.shape[:2] != (footage.height, footage.width):
         raise CaptureError(
             f"{path}: plate is {image.shape[1]}x{image.shape[0]}, the footage of {camera_id} is "
             f"{footage.width}x{footage.height}; record the plate with the settings of the capture"
         )
     return _undistorted(dataset, subject, camera_id, image) if undistort else image
+
+
+def read_raw_plate(index: Index, camera_id: str) -> np.ndarray:
+    """A plate that the index has (H, W, 3) uint8, not undistorted, its colours corrected.
+
+    Raises:
+        CaptureError: it cannot be read.
+    """
+    image = read_srgb8(index.capture / index.plates[camera_id])
+    source = index.cameras.get(camera_id)
+    return corrected(image, source) if source else image
 
 
 def _undistorted(dataset: Dataset, subject: str, camera_id: str, image: np.ndarray) -> np.ndarray:
@@ -253,14 +265,14 @@ def read_peaks(dataset: Dataset, subject: str) -> dict[str, int]:
     try:
         rows = json.loads(path.read_text(encoding="utf-8"))
         peaks = {name: int(row["frame"]) for name, row in rows.items()}
-        named = [(n, row["camera"], row["dhash"]) for n, row in rows.items()]
+        named = [(n, row["camera"], row["pts"], row["dhash"]) for n, row in rows.items()]
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise FormatError(f"{path}: not a table of peaks ({type(error).__name__}: {error})") from (
             error
         )
     index = read_index(dataset, subject)
-    for name, camera_id, expected in named:
-        _check_peak(index, path, name, peaks[name], camera_id, expected)
+    for name, camera_id, pts, expected in named:
+        _check_peak(index, path, name, peaks[name], camera_id, (pts, expected))
     return peaks
 
 
@@ -274,14 +286,16 @@ def peak_items(dataset: Dataset) -> list[str]:
 
 
 def _check_peak(
-    index: Index, path: Path, name: str, frame: int, camera_id: str, expected: str
+    index: Index, path: Path, name: str, frame: int, camera_id: str, expected: tuple[int, str]
 ) -> None:
     source = index.cameras.get(camera_id)
-    found = source.dhash[frame] if source and 0 <= frame < source.frames else "none"
+    there = source is not None and 0 <= frame < source.frames
+    found = (source.pts[frame], source.dhash[frame]) if source and there else ("none", "none")
     if found != expected:
         raise CaptureError(
-            f"{path}: {name}: frame {frame} of {camera_id} has hash {found}, the label says "
-            f"{expected}; the footage is not the one that was labelled, run 'express50 align' again"
+            f"{path}: {name}: frame {frame} of {camera_id} has hash {found[1]} at time {found[0]}, "
+            f"the label says {expected[1]} at {expected[0]}; the footage is not the one that was "
+            "labelled, run 'express50 align' again"
         )
 
 

@@ -10,9 +10,11 @@ from pathlib import Path
 from typing import Any
 
 from express50.errors import FormatError, StageError
-from express50.layout import Dataset
+from express50.layout import Dataset, footage_root
 
 SCHEMA = "express50.index/1"
+# `Index.calibration` of a capture in a foreign layout: its cameras stand beside the index.
+TRANSLATED = "ingest:calibration.json"
 
 
 @dataclass(frozen=True)
@@ -29,15 +31,18 @@ class CameraSource:
     """Footage of one camera; sequences are by 0-based decode index.
 
     Attributes:
-        kind: ``video`` or ``frames``.
-        source: video file or frames folder, relative to the capture.
+        kind: ``video``, ``videos`` (one file a clip) or ``frames``.
+        source: video file, or folder of the names, relative to the capture.
         width: of the footage, pixels.
         height: of the footage, pixels.
         frames: how many frames decode.
         pts: presentation time stamp of each frame (the frame's number for image files).
         dhash: 64-bit difference hash of each frame, 16 hexadecimal digits.
         sha256: of the video file, or of the names and digests of the image files.
-        names: image file names in order; empty for a video.
+        names: images or videos in order, relative to the source; empty for a single video. An image
+            may lie in a container (`express50.media`).
+        clips: frames of each clip; empty where all is one.
+        correction: rows of a polynomial colour correction that `express50.frames` applies, or none.
     """
 
     kind: str
@@ -49,6 +54,8 @@ class CameraSource:
     dhash: tuple[str, ...]
     sha256: str
     names: tuple[str, ...] = ()
+    clips: tuple[int, ...] = ()
+    correction: tuple[tuple[float, ...], ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,12 +64,12 @@ class Index:
 
     Attributes:
         subject: id.
-        capture: folder of the raw capture; from the dataset's table, not from the index file.
+        capture: folder of the footage; from the dataset's table, not from the index file.
         fps: frames a second.
         cameras: usable cameras by id.
         plates: clean background plates by camera id, relative to the capture.
         board: ``{"config": board.toml's content, "cameras": {id: [files]}}`` or None.
-        calibration: calibration file relative to the capture, or None.
+        calibration: calibration file relative to the capture, or None; see `calibration_file`.
         cues: scripted expressions, in file order.
         meta: content of capture.toml.
     """
@@ -86,6 +93,15 @@ class Index:
 def index_path(dataset: Dataset, subject: str) -> Path:
     """Index file of a subject."""
     return dataset.item_dir("ingest", subject) / "index.json"
+
+
+def calibration_file(dataset: Dataset, index: Index) -> Path | None:
+    """The given calibration: the capture's own, or the one that ingest translated; else None."""
+    if index.calibration is None:
+        return None
+    if index.calibration == TRANSLATED:
+        return dataset.item_dir("ingest", index.subject) / "calibration.json"
+    return index.capture / index.calibration
 
 
 def read_index(dataset: Dataset, subject: str) -> Index:
@@ -116,8 +132,9 @@ def _read_cached(dataset: Dataset, subject: str, version: tuple[int, ...]) -> In
             f"{dataset.captures_file}: subject {subject!r} has no capture; "
             f"run 'express50 ingest {dataset.root} CAPTURE'"
         )
+    root = footage_root(captures[subject])
     try:
-        return index_from_json(json.loads(path.read_text(encoding="utf-8")), captures[subject])
+        return index_from_json(json.loads(path.read_text(encoding="utf-8")), root)
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise FormatError(
             f"{path}: not an index ({type(error).__name__}: {error}); "
@@ -146,7 +163,8 @@ def _camera_to_json(camera: CameraSource) -> dict[str, Any]:
     row["pts"] = " ".join(map(str, camera.pts))
     row["dhash"] = " ".join(camera.dhash)
     row["names"] = list(camera.names)
-    return row
+    # Left out where they say nothing: most captures have one clip and no correction.
+    return {k: v for k, v in row.items() if v or k not in ("clips", "correction")}
 
 
 def index_from_json(content: Mapping[str, Any], capture: Path) -> Index:
@@ -175,8 +193,12 @@ def _camera_from_json(name: str, row: Mapping[str, Any]) -> CameraSource:
     values["pts"] = tuple(map(int, row["pts"].split()))
     values["dhash"] = tuple(row["dhash"].split())
     values["names"] = tuple(row["names"])
+    values["clips"] = tuple(map(int, row.get("clips", ())))
+    values["correction"] = tuple(tuple(map(float, line)) for line in row.get("correction", ()))
     camera = CameraSource(**values)
     lengths = {len(camera.pts), len(camera.dhash)}
     if lengths != {camera.frames}:
         raise ValueError(f"camera {name}: {sorted(lengths)} entries for {camera.frames} frames")
+    if camera.clips and sum(camera.clips) != camera.frames:
+        raise ValueError(f"camera {name}: clips of {sum(camera.clips)} of {camera.frames} frames")
     return camera

@@ -3,10 +3,46 @@
 from __future__ import annotations
 
 import json
+import tomllib
 from dataclasses import dataclass
 from pathlib import Path
 
-from express50.errors import FormatError
+from express50.errors import CaptureError, FormatError
+
+
+def footage_root(capture: Path) -> Path:
+    """The folder that a registered capture's footage is relative to.
+
+    It is the capture's folder, a file's folder, or what ``source`` in capture.toml names: a capture
+    may be that one file, which says where a read-only dataset lies and how to take it.
+
+    Raises:
+        CaptureError: capture.toml is not TOML, or its source is no existing path.
+    """
+    source = footage_source(Path(capture))
+    return source.parent if source.is_file() else source
+
+
+def footage_source(capture: Path) -> Path:
+    """The file or folder that ``source`` in capture.toml names, the capture itself without one.
+
+    Raises:
+        CaptureError: capture.toml is not TOML, or its source is no existing path.
+    """
+    path = capture / "capture.toml"
+    if not path.is_file():
+        return capture
+    try:
+        source = tomllib.loads(path.read_text(encoding="utf-8")).get("source")
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise CaptureError(f"{path}: not TOML: {error}") from error
+    if source is None:
+        return capture
+    if not isinstance(source, str) or not (capture / source).exists():
+        raise CaptureError(
+            f"{path}: source is {source!r}, expected a file or folder that is there; correct it"
+        )
+    return (capture / source).resolve()
 
 
 @dataclass(frozen=True)

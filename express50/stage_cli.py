@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from contextlib import nullcontext
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from express50.config import PRESETS, config_toml, resolve_config
 from express50.console import FAILED, OK, format_table, say, say_json, stdout_to_stderr
@@ -15,6 +15,9 @@ from express50.errors import ConfigError, StageError
 from express50.layout import Dataset
 from express50.stage import Stage
 from express50.threads import cap_threads
+
+if TYPE_CHECKING:
+    from express50.runner import Summary
 
 HELP = {
     "ingest": "index raw captures: frames, hashes, proxies",
@@ -141,11 +144,19 @@ def _run(args: argparse.Namespace, names: list[str], pattern: str | None) -> int
             summaries.append(run_stage(stage, dataset, config, chosen, pool=pool))
             if not args.json:
                 say(*summaries[-1].lines())
+            if stage.name == "ingest" and not args.json:
+                say(*_ingested(dataset, summaries[-1]))
     if args.json:
         accounts = [summary.to_json() for summary in summaries]
         before = {"before": accounts[:-1]} if len(accounts) > 1 else {}
         say_json(accounts if args.command == "run" else accounts[-1] | before)
     return OK if all(summary.ok for summary in summaries) else FAILED
+
+
+def _ingested(dataset: Dataset, summary: Summary) -> Iterable[str]:
+    """What was found in the captures that were read."""
+    module = import_module(stages()["ingest"])
+    return module.account(dataset, [o.item for o in summary.outcomes if o.status == "done"])
 
 
 def _choose(

@@ -107,6 +107,20 @@ def _decode(
         ) from error
 
 
+def video_fps(path: Path) -> float:
+    """Frames a second that a video's container tells.
+
+    Raises:
+        CaptureError: the file is no video, or tells no rate.
+    """
+    container, stream = _open(path)
+    with container:
+        rate = float(stream.average_rate or 0)
+    if not 0 < rate <= 10_000:
+        raise CaptureError(f"{path}: tells no frame rate; say fps in capture.toml")
+    return rate
+
+
 def iterate_video(path: Path) -> Iterator[tuple[int, np.ndarray]]:
     """Decode a whole video in display order.
 

@@ -122,7 +122,7 @@ def read_table(path: Path) -> dict:
         table = json.loads(path.read_text())
     except FileNotFoundError:
         raise CalibrationError(f"{path}: no such file") from None
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+    except (ValueError, RecursionError) as error:
         raise CalibrationError(f"{path}: not JSON ({error})") from None
     if not isinstance(table, dict):
         raise CalibrationError(f"{path}: expected a JSON table, got {type(table).__name__}")

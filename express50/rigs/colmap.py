@@ -26,6 +26,15 @@ def read_colmap(path: Path) -> dict[str, Camera]:
     Raises:
         CalibrationError: the model cannot be read, or has a camera model that ours lack.
     """
+    return read_colmap_images(path)[0]
+
+
+def read_colmap_images(path: Path) -> tuple[dict[str, Camera], dict[str, str]]:
+    """The cameras as `read_colmap` gives them, and the image file of each.
+
+    Raises:
+        CalibrationError: as there.
+    """
     try:
         model = pycolmap.Reconstruction(str(path))
     except (ValueError, RuntimeError, OSError) as error:
@@ -40,8 +49,9 @@ def read_colmap(path: Path) -> dict[str, Camera]:
             f"{path}: several images share one camera name ({names[0]}, ...); expected one image a"
             " camera: export the model of a single time step"
         )
-    rows = zip(names, images, strict=True)
-    return checked({name: _camera(path, name, image) for name, image in rows}, path)
+    cameras = {n: _camera(path, n, image) for n, image in zip(names, images, strict=True)}
+    files = {name: image.name for name, image in zip(names, images, strict=True)}
+    return checked(cameras, path), files
 
 
 def _camera(path: Path, name: str, image: pycolmap.Image) -> Camera:

@@ -9,11 +9,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import h5py
 import numpy as np
 
 from express50.adapters import K_from_opencv
 from express50.cameras import Camera
-from express50.errors import CalibrationError
+from express50.errors import CalibrationError, CaptureError
+from express50.media import child, open_hdf5, read_array
 from express50.rigs.build import camera_from_K, checked, read_table
 
 NERSEMBLE_SIZE = (2200, 3208)
@@ -55,36 +57,50 @@ def read_renderme(path: Path) -> dict[str, Camera]:
     Raises:
         CalibrationError: the file has no calibration or no resolution, or an array's shape is off.
     """
-    import h5py
-
     try:
-        file = h5py.File(path, "r")
-    except OSError as error:
-        raise CalibrationError(f"{path}: not an HDF5 file ({error})") from None
-    with file:
-        if "Calibration" not in file:
+        file = open_hdf5(path)
+        group = child(file, "Calibration", str(path))
+        if not isinstance(group, h5py.Group):
             raise CalibrationError(
                 f"{path}: has no Calibration; expected it in the anno file of the same performance"
                 f" ({path.name.replace('_raw', '_anno')})"
             )
         height, width = _resolution(path, file)
         found = {}
-        for name, group in file["Calibration"].items():
-            K = _array(path, name, group["K"][()], (3, 3))
-            pose = _array(path, name, group["RT"][()], (4, 4))
-            dist = np.ravel(group["D"][()]) if "D" in group else np.zeros(0)
-            camera_id = f"cam{int(name):02d}"
+        for name in list(group):
+            rows = {key: f"Calibration/{name}/{key}" for key in ("K", "RT", "D")}
+            K = _array(path, name, read_array(file, rows["K"], str(path)), (3, 3))
+            pose = _array(path, name, read_array(file, rows["RT"], str(path)), (4, 4))
+            has_dist = child(file, rows["D"], str(path)) is not None
+            dist = np.ravel(read_array(file, rows["D"], str(path))) if has_dist else np.zeros(0)
+            camera_id = _camera_id(path, name)
             found[camera_id] = camera_from_K(
-                camera_id, K_from_opencv(K), dist, (width, height), np.linalg.inv(pose)
+                camera_id, K_from_opencv(K), dist[:14], (width, height), _inverse(path, name, pose)
             )
+    except CaptureError as error:
+        raise CalibrationError(str(error)) from None
     return checked(found, path)
 
 
-def _resolution(path: Path, file: object) -> tuple[int, int]:
+def _camera_id(path: Path, name: str) -> str:
+    if not name.isdigit() or len(name) > 4:
+        raise CalibrationError(f"{path}: camera {name!r}, expected a number such as 07")
+    return f"cam{int(name):02d}"
+
+
+def _inverse(path: Path, name: str, pose: np.ndarray) -> np.ndarray:
+    try:
+        return np.linalg.inv(pose)
+    except np.linalg.LinAlgError:
+        raise CalibrationError(f"{path}: RT of camera {name} cannot be inverted") from None
+
+
+def _resolution(path: Path, file: h5py.File) -> tuple[int, int]:
     """Height and width, stored in this order; the release's full frame where they are absent."""
-    attributes = dict(file["Camera"].attrs) if "Camera" in file else {}  # type: ignore[operator,index]
+    group = child(file, "Camera", str(path))
+    attributes = group.attrs if isinstance(group, h5py.Group) else {}
     size = np.ravel(attributes.get("resolution", (2048, 2448)))
-    if size.shape != (2,):
+    if size.shape != (2,) or size.dtype.kind not in "ui":
         raise CalibrationError(f"{path}: resolution {size.tolist()}, expected height and width")
     return int(size[0]), int(size[1])
 

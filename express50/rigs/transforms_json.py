@@ -43,7 +43,12 @@ def read_transforms(path: Path, size: tuple[int, int] | None) -> dict[str, Camer
     frames = table.get("frames")
     if not isinstance(frames, list) or not frames:
         raise CalibrationError(f"{path}: has no frames; expected [{{transform_matrix, ...}}, ...]")
-    names = _names(frames)
+    if not all(isinstance(frame, dict) for frame in frames):
+        raise CalibrationError(f"{path}: frames holds something else than tables")
+    try:
+        names = camera_names(frames)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise CalibrationError(f"{path}: camera_index is no number ({error})") from None
     found: dict[str, Camera] = {}
     for number, (name, frame) in enumerate(zip(names, frames, strict=True)):
         camera = _camera(f"{path}: frame {number} ({name})", name, table | frame, size)
@@ -56,7 +61,8 @@ def read_transforms(path: Path, size: tuple[int, int] | None) -> dict[str, Camer
     return checked(found, path)
 
 
-def _names(frames: list[dict]) -> list[str]:
+def camera_names(frames: list[dict]) -> list[str]:
+    """The camera of each frame: its index where all have one, else by its file's name."""
     if all("camera_index" in frame for frame in frames):
         return [f"cam{int(frame['camera_index']):02d}" for frame in frames]
     return names_from_files(
@@ -65,6 +71,13 @@ def _names(frames: list[dict]) -> list[str]:
 
 
 def _camera(where: str, name: str, row: dict, size: tuple[int, int] | None) -> Camera:
+    try:
+        return _camera_of(where, name, row, size)
+    except (TypeError, ValueError, OverflowError, ZeroDivisionError) as error:
+        raise CalibrationError(f"{where}: a value is no number of its kind ({error})") from None
+
+
+def _camera_of(where: str, name: str, row: dict, size: tuple[int, int] | None) -> Camera:
     model = str(row.get("camera_model", "OPENCV"))
     if model not in _HELD:
         raise CalibrationError(

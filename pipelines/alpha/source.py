@@ -9,7 +9,7 @@ import numpy as np
 from express50.adapters import undistort_image
 from express50.cameras import Camera
 from express50.errors import StageError
-from express50.frames import FrameReader, read_plate, read_srgb8
+from express50.frames import FrameReader, read_plate, read_raw_plate
 from express50.index import Index, read_index
 from express50.layout import Dataset
 from pipelines.alpha.config import AlphaConfig
@@ -77,7 +77,7 @@ def _plate_of_the_rig(dataset: Dataset, item: str, camera: Camera, config: Alpha
     others = [read_index(dataset, other) for other in others_of(dataset, index, camera_id)]
     for other in others:
         if camera_id in other.plates:
-            theirs = read_srgb8(other.capture / other.plates[camera_id])
+            theirs = read_raw_plate(other, camera_id)
             borrowed = plate_of_another(theirs, median) if theirs.shape == median.shape else None
             if borrowed:
                 return _undistorted(borrowed, camera, f"the plate of {other.subject}")

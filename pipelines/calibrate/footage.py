@@ -74,7 +74,7 @@ def told_focals(index: Index) -> dict[str, float]:
                     " positive number of pixels"
                 )
             found[name] = float(value)
-        elif source.names:
+        elif source.kind == "frames":
             film = _film_focal(str(index.capture / source.source / source.names[0]))
             if film > 0:
                 diagonal = math.hypot(source.width, source.height)

@@ -9,7 +9,7 @@ import numpy as np
 
 from express50.cameras import Camera, read_cameras, resized, write_cameras
 from express50.errors import CalibrationError, CaptureError
-from express50.index import Index, index_path, read_index
+from express50.index import Index, calibration_file, index_path, read_index
 from express50.landmarks.network import WEIGHTS
 from express50.layout import Dataset
 from express50.rigs.footage import reduced_camera
@@ -45,8 +45,9 @@ def inputs(dataset: Dataset, item: str, config: CalibrateConfig) -> dict[str, Pa
     """The frame index, the calibration file and every board image, as far as there; weights."""
     index = read_index(dataset, item)
     found: dict[str, Path | str] = {"index": index_path(dataset, item), "weights": WEIGHTS}
-    if index.calibration is not None:
-        found["calibration"] = index.capture / index.calibration
+    given = calibration_file(dataset, index)
+    if given is not None:
+        found["calibration"] = given
     if index.board is not None:
         for files in index.board["cameras"].values():
             found |= {name: index.capture / name for name in files}
@@ -59,15 +60,15 @@ def run(dataset: Dataset, item: str, config: CalibrateConfig, out: Path) -> dict
     CONVENTIONS.md says in which world.
     """
     index = read_index(dataset, item)
-    if index.calibration is not None:
-        return _run_given(index, config, out)
+    given = calibration_file(dataset, index)
+    if given is not None:
+        return _run_given(index, given, config, out)
     if index.board is not None and index.board["cameras"]:
         return _run_board(index, config, out)
     return _run_footage(index, config, out)
 
 
-def _run_given(index: Index, config: CalibrateConfig, out: Path) -> dict:
-    path = index.capture / str(index.calibration)
+def _run_given(index: Index, path: Path, config: CalibrateConfig, out: Path) -> dict:
     given = read_cameras(path)
     cameras = {name: given[name] for name in sorted(index.cameras) if name in given}
     check_given(cameras, sizes_of(index), str(path))

@@ -1,0 +1,224 @@
+"""Decode one camera once: frames' identity, proxies, and what the checks need of each frame."""
+
+from __future__ import annotations
+
+import io
+import json
+import tarfile
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from express50.capture import RawCamera, RawCapture
+from express50.digests import file_sha256, text_digest
+from express50.errors import CaptureError
+from express50.frames import corrected, dhash
+from express50.images import encode_jpeg, resize_area
+from express50.index import CameraSource
+from express50.media import WITHIN, inside, read_picture
+from express50.publish import dump_json
+from express50.video import iterate_video
+from pipelines.ingest.config import IngestConfig
+from pipelines.ingest.focus import edge_width
+from pipelines.ingest.light import cells_of
+from pipelines.ingest.sync import movement, small_grey
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What a scan saw of a camera beside its frames' identity.
+
+    Attributes:
+        moves: (F,) movement since the frame before, grey levels.
+        cells: (F, 16, 16, 3) linear light.
+        widths: frame and width of its sharpest edges, pixels, of some frames.
+    """
+
+    moves: np.ndarray
+    cells: np.ndarray
+    widths: tuple[tuple[int, float], ...]
+
+
+def scan_camera(
+    raw: RawCapture, camera: RawCamera, folder: Path, config: IngestConfig
+) -> tuple[CameraSource, Seen]:
+    """Decode one camera, write its proxies, and return its frames' identity and what was seen.
+
+    Raises:
+        CaptureError: the footage is truncated, damaged or changes its size.
+    """
+    pts: list[int] = []
+    hashes: list[str] = []
+    clips: list[int] = []
+    watch = _Watch(config)
+    size: tuple[int, ...] | None = None
+    with ProxyWriter(folder / f"{camera.id}.tar") as proxies:
+        for clip, stamp, image in iterate_camera(camera):
+            size = size or image.shape[:2]
+            if image.shape[:2] != size:
+                raise CaptureError(
+                    f"{camera.path}: frame {len(pts)} is {image.shape[1]}x{image.shape[0]}, "
+                    f"the first is {size[1]}x{size[0]}; all must be of one size"
+                )
+            clips += [0] * (clip + 1 - len(clips))
+            clips[clip] += 1
+            pts.append(stamp)
+            hashes.append(dhash(image))
+            small = shrink(image, config.proxy_long_side)
+            proxies.add(encode_jpeg(corrected(small, camera), config.proxy_quality))
+            watch.look(image, small)
+    if size is None:
+        raise CaptureError(f"{camera.path}: holds no frame; record or copy it again")
+    (folder / f"{camera.id}.json").write_bytes(dump_json(proxies.table))
+    source = CameraSource(
+        kind=camera.kind,
+        source=camera.path.relative_to(raw.root).as_posix(),
+        width=size[1],
+        height=size[0],
+        frames=len(pts),
+        pts=tuple(pts),
+        dhash=tuple(hashes),
+        sha256=source_sha256(camera),
+        names=camera.names,
+        clips=tuple(clips) if camera.kind == "videos" or camera.counts else (),
+        correction=camera.correction,
+    )
+    return source, watch.seen()
+
+
+class _Watch:
+    """Gathers figures of frame after frame."""
+
+    def __init__(self, config: IngestConfig) -> None:
+        self._config = config
+        self._moves: list[float] = []
+        self._cells: list[np.ndarray] = []
+        self._widths: list[tuple[int, float]] = []
+        self._before: np.ndarray | None = None
+
+    def look(self, image: np.ndarray, small: np.ndarray) -> None:
+        """Take a frame (H, W, 3) uint8 and its proxy's pixels."""
+        frame, every = len(self._moves), self._config.focus_every
+        grey = small_grey(small)
+        self._moves.append(movement(self._before, grey))
+        self._before = grey
+        self._cells.append(cells_of(small).astype(np.float16))
+        if every and frame % every == 0:
+            width = edge_width(image)
+            if width is not None:
+                self._widths.append((frame, width))
+
+    def seen(self) -> Seen:
+        """All that was gathered."""
+        return Seen(np.array(self._moves), np.stack(self._cells), tuple(self._widths))
+
+
+def trimmed(
+    source: CameraSource, seen: Seen, counts: tuple[int, ...], table: Path
+) -> tuple[CameraSource, Seen]:
+    """A camera without the frames that its clips have beyond the given counts.
+
+    Args:
+        source: the camera.
+        seen: what was seen of it.
+        counts: frames to keep of each clip.
+        table: its proxies' table, which is written anew.
+    """
+    ends = np.cumsum(source.clips)
+    rows = zip(ends, source.clips, counts, strict=True)
+    keep = np.concatenate([np.arange(end - n, end - n + count) for end, n, count in rows])
+    chosen = keep.tolist()
+    names = source.names if source.kind == "videos" else tuple(source.names[i] for i in chosen)
+    number = {frame: place for place, frame in enumerate(chosen)}
+    rows_of_all = json.loads(table.read_text(encoding="utf-8"))
+    table.write_bytes(dump_json([rows_of_all[i] for i in chosen]))
+    return replace(
+        source,
+        frames=len(chosen),
+        pts=tuple(source.pts[i] for i in chosen),
+        dhash=tuple(source.dhash[i] for i in chosen),
+        names=names,
+        clips=counts,
+    ), Seen(
+        seen.moves[keep],
+        seen.cells[keep],
+        tuple((number[frame], width) for frame, width in seen.widths if frame in number),
+    )
+
+
+def iterate_camera(camera: RawCamera) -> Iterator[tuple[int, int, np.ndarray]]:
+    """Clip, time stamp and recorded image (H, W, 3) uint8 sRGB of every frame."""
+    if camera.kind == "video":
+        yield from ((0, stamp, image) for stamp, image in iterate_video(camera.path))
+    elif camera.kind == "videos":
+        for clip, name in enumerate(camera.names):
+            for stamp, image in iterate_video(inside(camera.path, name)):
+                yield clip, stamp, image
+    else:
+        ends = np.cumsum(camera.counts or (len(camera.names),))
+        for number, name in enumerate(camera.names):
+            clip = int(np.searchsorted(ends, number, side="right"))
+            stamp = camera.stamps[number] if camera.stamps else number
+            yield clip, stamp, read_picture(camera.path, name)
+
+
+def time_gaps(pts: tuple[int, ...], clips: tuple[int, ...] = ()) -> int:
+    """Steps between frames longer than 1.5 usual ones: each tells of a frame the recorder lost.
+
+    Steps from one clip to the next do not count.
+    """
+    steps = np.diff(np.array(pts, dtype=np.int64))
+    within = np.ones(len(steps), dtype=bool)
+    within[np.cumsum(clips[:-1], dtype=np.int64) - 1] = False
+    steps = steps[within]
+    return int((steps > 1.5 * np.median(steps)).sum()) if steps.size else 0
+
+
+def source_sha256(camera: RawCamera) -> str:
+    """Digest of the video file, or of the names and digests of all files that hold the frames."""
+    if camera.kind == "video":
+        return file_sha256(camera.path)
+    files = dict.fromkeys(name.partition(WITHIN)[0] for name in camera.names)
+    if len(files) < len(camera.names):  # containers: the names say which members
+        rows = [f"{n} {file_sha256(inside(camera.path, n))}" for n in files]
+        return text_digest("\n".join([*rows, *camera.names]))
+    return text_digest("\n".join(f"{n} {file_sha256(camera.path / n)}" for n in camera.names))
+
+
+def shrink(image: np.ndarray, long_side: int) -> np.ndarray:
+    """Image (H, W, 3) with its longer side at most ``long_side``."""
+    height, width = image.shape[:2]
+    scale = long_side / max(height, width)
+    if scale >= 1:
+        return image
+    return resize_area(image, max(1, round(width * scale)), max(1, round(height * scale)))
+
+
+class ProxyWriter:
+    """Writes JPEGs into a USTAR tar and keeps (offset, size) of each."""
+
+    def __init__(self, path: Path) -> None:
+        self._tar = tarfile.open(path, "w", format=tarfile.USTAR_FORMAT)  # noqa: SIM115
+        self.table: list[tuple[int, int]] = []
+
+    def __enter__(self) -> ProxyWriter:
+        return self
+
+    def __exit__(self, *unused: object) -> None:
+        self._tar.close()
+
+    def add(self, data: bytes) -> None:
+        """Append one JPEG; time and owner are 0, so that the same frames give the same bytes."""
+        info = tarfile.TarInfo(f"{len(self.table):06d}.jpg")
+        info.size = len(data)
+        # The header is one block; the data follow it.
+        self.table.append((self._tar.offset + tarfile.BLOCKSIZE, len(data)))
+        self._tar.addfile(info, io.BytesIO(data))
+
+
+def remove_proxies(folder: Path, camera_id: str) -> None:
+    """Delete a camera's proxies."""
+    for suffix in (".tar", ".json"):
+        (folder / f"{camera_id}{suffix}").unlink(missing_ok=True)

@@ -1,0 +1,205 @@
+"""Hostile and broken captures of other layouts: one clear error, nothing read from elsewhere."""
+
+import json
+import zipfile
+
+import h5py
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from express50.captures.read import detect, read_any
+from express50.errors import CalibrationError, CaptureError, Express50Error
+from express50.images import PIXEL_LIMIT, encode_png
+from express50.media import BYTES_LIMIT, inside, read_picture
+from tests.express50.captures import layouts
+from tests.synth import write_video
+
+
+@pytest.fixture
+def renderme(tmp_path):
+    return layouts.write_renderme(tmp_path / "set", expressions=1, frames=3)
+
+
+def rewrite(path, change):
+    with h5py.File(path, "a") as file:
+        change(file)
+
+
+def test_a_truncated_smc_is_named(renderme):
+    path = renderme / "0026_e0_raw.smc"
+    path.write_bytes(path.read_bytes()[:3000])
+    with pytest.raises(CaptureError, match="0026_e0_raw.smc: cannot be opened as HDF5"):
+        read_any(renderme)
+
+
+def test_a_picture_that_is_no_bytes_or_lies_elsewhere_is_refused(renderme, tmp_path):
+    path, name = renderme / "0026_e0_raw.smc", "Camera/00/color/0"
+    secret = tmp_path / "secret.h5"
+    with h5py.File(secret, "w") as file:
+        file["x"] = np.zeros(3, np.uint8)
+    layout = h5py.VirtualLayout((3,), np.uint8)
+    layout[:] = h5py.VirtualSource(str(secret), "x", (3,))
+
+    def replace(make):
+        def change(file):
+            del file[name]
+            make(file)
+
+        return change
+
+    wrong = {
+        "expected encoded bytes": lambda f: f.create_dataset(name, data=np.zeros((2, 2))),
+        "expected numbers": lambda f: f.create_virtual_dataset(name, layout),
+        "is a link": lambda f: f.__setitem__(name, h5py.ExternalLink(str(secret), "x")),
+        "expected at most": lambda f: f.create_dataset(
+            name, (BYTES_LIMIT + 1,), np.uint8, chunks=(1 << 20,)
+        ),
+        "no JPEG": lambda f: f.create_dataset(name, data=np.arange(50, dtype=np.uint8)),
+        "no array": lambda f: f.create_group(name),
+    }
+    for number, (message, make) in enumerate(wrong.items()):
+        copy = renderme / f"{number}.smc"
+        copy.write_bytes(path.read_bytes())
+        rewrite(copy, replace(make))
+        with pytest.raises(CaptureError, match=message):
+            read_picture(renderme, f"{copy.name}!/{name}")
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "message"),
+    [
+        ("K", np.zeros((3, 3, 3)), "expected .3, 3."),
+        ("RT", np.full((4, 4), np.nan), "finite"),
+        ("RT", np.zeros((4, 4)), "cannot be inverted"),
+        ("K", np.array([b"x"]), "expected numbers"),
+    ],
+)
+def test_malformed_cameras_are_one_error(renderme, key, value, message):
+    def change(file):
+        del file[f"Calibration/01/{key}"]
+        file[f"Calibration/01/{key}"] = value
+
+    rewrite(renderme.parents[1] / "anno/0026/0026_e0_anno.smc", change)
+    with pytest.raises(CalibrationError, match=message):
+        read_any(renderme)
+
+
+@pytest.mark.parametrize("name", ["../x.png", "/etc/hostname", "a/../../x.png", "a\0b"])
+def test_names_cannot_lead_out(tmp_path, name):
+    with pytest.raises(CaptureError, match="leads out"):
+        inside(tmp_path, name)
+
+
+def test_a_link_out_of_the_folder_is_no_way_out(tmp_path):
+    (tmp_path / "outside.png").write_bytes(encode_png(layouts.picture(0, 0)))
+    folder = tmp_path / "set"
+    folder.mkdir()
+    (folder / "a.png").symlink_to(tmp_path / "outside.png")
+    with pytest.raises(CaptureError, match="leads out"):
+        read_picture(folder, "a.png")
+
+
+def test_transforms_with_paths_out_of_the_folder(tmp_path):
+    path = layouts.write_transforms(tmp_path)
+    table = json.loads((path / "transforms.json").read_text())
+    table["frames"][0]["file_path"] = "../../etc/passwd"
+    (path / "transforms.json").write_text(json.dumps(table))
+    with pytest.raises(CaptureError, match="leads out"):
+        read_any(path)
+
+
+def test_zip_members_that_claim_too_much_or_are_damaged(tmp_path):
+    path = layouts.write_ava(tmp_path)
+    archive = path / "decoder/image/cam400981.zip"
+    data = bytearray(archive.read_bytes())
+    data[60:90] = bytes(30)
+    archive.write_bytes(bytes(data))
+    with pytest.raises(CaptureError, match="cam400981.zip"):
+        read_picture(path, "decoder/image/cam400981.zip!/cam400981/000100.avif")
+    bomb = zipfile.ZipFile(tmp_path / "bomb.zip", "w", zipfile.ZIP_DEFLATED, compresslevel=1)
+    with bomb, bomb.open("a.avif", "w") as member:
+        for _ in range(BYTES_LIMIT >> 24):
+            member.write(bytes(1 << 24))
+        member.write(b"x")
+    with pytest.raises(CaptureError, match="expected at most"):
+        read_picture(tmp_path, "bomb.zip!/a.avif")
+
+
+def test_a_picture_whose_header_claims_too_many_pixels(tmp_path):
+    png = bytearray(encode_png(layouts.picture(0, 0)))
+    side = int(PIXEL_LIMIT**0.5) + 1
+    png[16:24] = side.to_bytes(4, "big") * 2
+    with zipfile.ZipFile(tmp_path / "a.zip", "w") as file:
+        file.writestr("a.png", bytes(png))
+    with pytest.raises(CaptureError, match="over|no JPEG"):
+        read_picture(tmp_path, "a.zip!/a.png")
+
+
+SOUND = {
+    "transforms": layouts.write_transforms,
+    "ava": layouts.write_ava,
+    "multiface": layouts.write_multiface,
+    "nersemble": lambda root: layouts.write_nersemble(root, write_video, sequences=("EXP-1-head",)),
+}
+TABLES = {
+    "transforms": "transforms.json",
+    "ava": "decoder/camera_calibration.json",
+    "multiface": "KRT",
+    "nersemble": "calibration/camera_params.json",
+}
+
+
+@pytest.mark.parametrize("kind", sorted(SOUND))
+def test_damaged_tables_are_one_error_each(kind, tmp_path):
+    path = SOUND[kind](tmp_path)
+    file = path / TABLES[kind]
+    sound = file.read_bytes()
+    read_any(path)
+
+    @settings(max_examples=25, deadline=None, suppress_health_check=list(HealthCheck))
+    @given(st.integers(0, len(sound) - 1), st.binary(min_size=0, max_size=6), st.integers(0, 40))
+    def damaged(place, put, cut):
+        file.write_bytes(sound[:place] + put + sound[place + cut :])
+        try:
+            read_any(path)
+        except Express50Error as error:
+            assert "\n" not in str(error)
+
+    damaged()
+
+
+@pytest.mark.parametrize("text", ["{}", "[]", '{"frames": [1]}', '{"frames": [{}]}', "[" * 5000])
+def test_rubbish_tables(tmp_path, text):
+    path = layouts.write_transforms(tmp_path)
+    (path / "transforms.json").write_text(text)
+    with pytest.raises(Express50Error, match="transforms.json"):
+        read_any(path)
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("cameras = 3", "expected a list"),
+        ("metres_per_unit = nan", "above 0"),
+        ('[expressions]\nphoto = "a b"', "expected a table"),
+        ('source = "nowhere"', "source is 'nowhere'"),
+        ("fps = -1", "fps is -1"),
+        ('subject = "../x"', "subject is"),
+        ('layout = "avi"', "expected one of express50"),
+        ("= 3", "not TOML"),
+    ],
+)
+def test_wishes_that_cannot_be(tmp_path, line, message):
+    path = layouts.write_transforms(tmp_path)
+    (path / "capture.toml").write_text(line)
+    with pytest.raises(CaptureError, match=message):
+        read_any(path)
+
+
+def test_an_empty_folder_and_a_file_without_ending(tmp_path):
+    for path in (tmp_path / "empty", tmp_path / "file"):
+        path.mkdir() if path.name == "empty" else path.write_text("x")
+        with pytest.raises(CaptureError, match="expected one of"):
+            detect(path)
