@@ -118,7 +118,7 @@ class GRMM(nn.Module):
         super().__init__()
         self.config = config
         self.subjects, self.expressions = tuple(subjects), tuple(expressions)
-        self.anchors = make_anchors(head, config.n_g)
+        self.anchors = make_anchors(head, config.n_g, config.mouth)
         self._add_anchor_buffers(head)
         self.z_id = nn.Parameter(CODE_STD * torch.randn(len(subjects), config.z_id))
         self.z_exp = nn.Parameter(CODE_STD * torch.randn(len(expressions), config.z_exp))

@@ -8,7 +8,8 @@ from express50.errors import FormatError
 from express50.images import encode_jpeg, encode_png
 from express50.shards_write import PackedSample, ShardWriter
 from grmm import checkpoint as checkpoint_module
-from grmm.cli import build_parser, main, train_config
+from grmm.cli import build_parser, main
+from grmm.cli.learn import train_config
 from grmm.ply import read_ply
 from grmm.shard_source import ShardSource, seen_window
 from tests.grmm.synthetic import EllipsoidSource, ellipsoid_head
@@ -144,7 +145,7 @@ def test_fit_render_evaluate_export(checkpoint, shards, tmp_path, capsys):
         (["fit", "{checkpoint}", "{shards}", "{out}", "--subject=S002", "--set=train.lr=1"], 2,
          "only fit"),
         (["render", "{out}/absent.pt", "{out}"], 1, "no such checkpoint"),
-        (["render", "{checkpoint}", "{out}", "--subject=S9"], 1, "knows no frame S9"),
+        (["render", "{checkpoint}", "{out}", "--subject=S9"], 2, "knows no subject S9"),
         (["export", "{checkpoint}", "{out}/head.obj"], 2, "expected .ply or .npz"),
     ],
 )  # fmt: skip

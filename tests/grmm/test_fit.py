@@ -9,12 +9,13 @@ from express50.errors import FormatError, TrainError
 from grmm import checkpoint as checkpoint_module
 from grmm.checkpoint import load_checkpoint
 from grmm.data import HeadViews
-from grmm.fit import blend, fit, invert_codes, locality_loss, start, tune_decoders
+from grmm.edit import interpolate_tracked, trained_head, transfer
+from grmm.fit import fit, invert_codes, start, tune_decoders
+from grmm.locality import blend, locality_loss
 from grmm.render import (
     expression_grid,
-    interpolate_tracked,
+    frontal,
     interpolation,
-    transfer,
     turntable,
     write_video,
 )
@@ -150,12 +151,14 @@ def test_transfer_keeps_the_identity_and_takes_the_expression(views):
 
 
 def test_turntable_grid_and_interpolation(loaded, tmp_path):
-    frames = list(turntable(loaded, "S000", "e0", frames=3))
+    start, end = (trained_head(loaded, *frame) for frame in (("S000", "e0"), ("S001", "e1")))
+    view = frontal(loaded)
+    frames = list(turntable(loaded, start, view, frames=3))
     assert len(frames) == 3 and frames[0].shape == (32, 32, 3)
     assert not np.array_equal(frames[0], frames[1])
-    rows = expression_grid(loaded, ["S000", "S001"], ["e0", "e1"])
+    rows = expression_grid(loaded, ["S000", "S001"], ["e0", "e1"], view)
     assert len(rows) == 2 and len(rows[0]) == 2
-    blend_frames = list(interpolation(loaded, ("S000", "e0"), ("S001", "e1"), frames=3))
+    blend_frames = list(interpolation(loaded, start, end, view, frames=3))
     np.testing.assert_array_equal(blend_frames[0], rows[0][0])
     np.testing.assert_array_equal(blend_frames[2], rows[1][1])
     assert write_video(tmp_path / "t.mp4", frames) == 3

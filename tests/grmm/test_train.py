@@ -204,7 +204,7 @@ def test_evaluation_is_written_as_table_and_means(tmp_path, source):
     rows = evaluate(views, [0, 4], training_render(run.model, views))
     summary = write_evaluation(tmp_path, rows)
     lines = (tmp_path / "evaluation.csv").read_text().splitlines()
-    assert len(lines) == 3 and lines[0].startswith("subject,expression,camera,psnr_db")
+    assert len(lines) == 3 and lines[0].startswith("subject,expression,camera,kind,psnr_db")
     assert summary["psnr_db"] == pytest.approx(
         (rows[0]["psnr_db"] + rows[1]["psnr_db"]) / 2, abs=1e-3
     )
