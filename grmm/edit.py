@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 import torch
@@ -149,6 +150,12 @@ def controlled(loaded: Loaded, head: Head, controls: Mapping[str, Sequence[float
 
 def principal_directions(codes: Tensor) -> Tensor:
     """(K, D) directions of codes (S, D), one standard deviation long, the strongest first."""
+    return _directions(codes, codes._version)
+
+
+@lru_cache(maxsize=4)
+def _directions(codes: Tensor, version: int) -> Tensor:
+    """Kept, because sliders ask again and again; a code table that training changes is another."""
     centred = codes.detach().double() - codes.detach().double().mean(0)
     if len(codes) < 2:
         return codes.new_zeros(0, codes.shape[1])
