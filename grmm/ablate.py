@@ -6,6 +6,7 @@ differ from those it was measured with; a half-trained row goes on from its chec
 
 from __future__ import annotations
 
+import fnmatch
 import hashlib
 import json
 from collections.abc import Sequence
@@ -70,11 +71,20 @@ def with_holdout(roots: Sequence[Path], config: Config) -> Config:
     return replace(config, data=replace(config.data, holdout_cameras=(chosen,)))
 
 
-def changed(config: Config, variant: Variant) -> Config:
-    """The configuration of a row."""
+def changed(config: Config, variant: Variant, used: Sequence[Path]) -> Config:
+    """The configuration of a row; what it holds out is what its own datasets have of it."""
     tables = as_tables(config)
     for table, values in variant.changes.items():
         tables[table] |= values
+    if variant.without is not None:
+        keys = open_shards(used, config.data.split).keys
+        cameras = {key.camera for key in keys}
+        frames = {f"{key.subject}/{key.expression}" for key in keys}
+        data = tables["data"]
+        data["holdout_cameras"] = [c for c in data["holdout_cameras"] if c in cameras]
+        data["holdout_expressions"] = [
+            p for p in data["holdout_expressions"] if fnmatch.filter(frames, p)
+        ]
     return from_tables(tables)
 
 
@@ -88,8 +98,8 @@ def _row(
     subjects: Sequence[str],
 ) -> dict:
     """The numbers of one row, from its file if it was measured with these very settings."""
-    settings = changed(config, variant)
     used = [root for root in roots if root != variant.without]
+    settings = changed(config, variant, used)
     digest = _digest(roots, used, settings, protocol, subjects)
     path = out / name / "row.json"
     if path.exists():
