@@ -15,6 +15,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from express50.errors import TrainError
 from express50.publish import write_bytes, write_json
 from grmm.checkpoint import Gallery
 from grmm.config import MetricsConfig
@@ -61,7 +62,15 @@ def compare(image: Tensor, item: Item, judge: Judge) -> dict[str, float]:
 
     ``psnr_db``, ``ssim``, ``rmse``, ``lpips`` count every pixel but torso (DataConfig.torso);
     ``*_head`` pixels of the footage's matte only, so that an easy background cannot flatter.
+
+    Raises:
+        TrainError: the picture is not finite; a mean would pass over it in silence.
     """
+    if not bool(torch.isfinite(image).all()):
+        raise TrainError(
+            f"{item.key}: the rendering holds NaN or Inf; expected colours. The checkpoint is "
+            "damaged or was trained at too high a rate"
+        )
     shown = item.comparable(image)
     return {
         "psnr_db": psnr_db(image, item.target, item.counts),

@@ -26,7 +26,7 @@ TURNS = {  # what a step of 1 means: entry and radians
     "eyes, yaw": ("eyes", 0.4),
 }
 JAW_OPEN = 0.35  # radians
-DEVIATIONS = 2.0  # standard deviations a step of 1 moves a code
+DEVIATIONS = 1.5  # standard deviations a step of 1 moves a code
 
 
 def control_sheet(loaded: Loaded, head: Head, view: View) -> Sheet:

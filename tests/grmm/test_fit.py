@@ -11,7 +11,7 @@ from grmm.checkpoint import load_checkpoint
 from grmm.data import HeadViews
 from grmm.edit import interpolate_tracked, trained_head, transfer
 from grmm.fit import fit, invert_codes, start, tune_decoders
-from grmm.locality import blend, locality_loss
+from grmm.locality import blend, locality_loss, reconstruction
 from grmm.render import (
     expression_grid,
     frontal,
@@ -82,6 +82,15 @@ def test_locality_loss_is_zero_until_the_model_is_tuned(loaded, views):
     with torch.no_grad():
         state.model.colour.bias += 1
     assert float(locality_loss(state, item, np.random.default_rng(0)).detach()) > 1e-3
+
+
+def test_reconstruction_has_the_perceptual_term_where_weights_are_given(loaded, views):
+    state = start(loaded, views, unseen(views))
+    target = views.item(state.given[0]).target
+    plain = reconstruction(state, 0.5 * target, target)
+    state.perceptual = lambda image, other: (image - other).abs().sum()
+    expected = plain + 0.04 * (0.5 * target).sum()
+    torch.testing.assert_close(reconstruction(state, 0.5 * target, target), expected)
 
 
 def test_blend_weighs_the_subject_by_t(loaded, views):
