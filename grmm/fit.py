@@ -11,7 +11,7 @@ import copy
 import math
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -21,13 +21,14 @@ from torch import Tensor
 from express50.errors import TrainError
 from express50.publish import write_json
 from grmm import losses
-from grmm.checkpoint import Gallery, Loaded, collect_gallery, save_checkpoint
+from grmm.checkpoint import Loaded
 from grmm.config import FitConfig, LossConfig
 from grmm.data import HeadViews, Item, Shuffle
 from grmm.evaluate import Render, evaluate, mean
+from grmm.fit_checkpoint import save_fit
 from grmm.judge import Judge
 from grmm.locality import locality_loss, random_camera, reconstruction
-from grmm.model import GRMM, Rendering, View
+from grmm.model import GRMM, Rendering
 from grmm.perceptual import load_vgg
 from grmm.progress import log
 from grmm.render import comparison_sheet
@@ -306,25 +307,3 @@ def _scores(state: Fit, held_out: Sequence[int], render: Render) -> Scores:
     }
     log("fit: " + "  ".join(f"{k} {v}" for k, v in scores.items() if v is not None))
     return scores
-
-
-def save_fit(state: Fit, out: Path) -> None:
-    """A checkpoint of the tuned model, in which the fitted subject is the only one."""
-    subject = state.views.keys[state.given[0]].subject
-    model = GRMM(state.model.config, state.views.head, [subject], list(state.z_exp))
-    content = state.model.state_dict()
-    content["z_id"] = state.z_id[None]
-    content["z_exp"] = torch.stack(list(state.z_exp.values()))
-    model.load_state_dict(content)
-    own = collect_gallery(state.views, state.given)
-    # Training cameras stay for rendering; the subject's own come first.
-    cameras: dict[str, View] = own.cameras | {
-        f"training_{name}": view for name, view in state.loaded.gallery.cameras.items()
-    }
-    save_checkpoint(
-        out / "checkpoint.pt",
-        model=model,
-        config=replace(state.loaded.config),
-        head_spec=state.loaded.head_spec,
-        gallery=Gallery(frames=own.frames, cameras=cameras),
-    )

@@ -34,7 +34,7 @@ def locality_loss(state: Fit, item: Item, rng: np.random.Generator) -> Tensor:
     (paper, supplement); the mesh is posed again from the blend; the camera is a random one of the
     training set; refined and rasterised images both count, as in L_rec's other uses.
     """
-    frames = sorted(state.loaded.gallery.frames)
+    frames = sorted(f for f in state.loaded.gallery.frames if f[0] in state.frozen.subjects)
     subject, expression = frames[int(rng.integers(len(frames)))]
     view = random_camera(state, rng)
     t = state.settings.locality_t

@@ -164,9 +164,9 @@ class Viewer:
                 self._slider(name, reach, 0.0)
         with gui.add_folder("expression coefficients, added", expand_by_default=False):
             for number in strongest_coefficients(self.loaded, COEFFICIENTS):
-                size = max(abs(f.expression[number]) for f in self._frames_with(number))
+                size = 1.5 * max(abs(f.expression[number]) for f in self._frames_with(number))
                 name = self.loaded.head.expression_names[number]
-                self._slider(f"expression {name}", (-1.5 * size - 0.1, 1.5 * size + 0.1), 0.0)
+                self._slider(f"expression {name}", (-max(1.0, size), max(1.0, size)), 0.0)
         with gui.add_folder("residual codes"):
             for code in ("z_id", "z_exp"):
                 self._slider(f"{code} scale", (0.0, 2.0), 1.0)

@@ -126,6 +126,18 @@ def test_fit_improves_on_the_mean_code_and_reports_both_views(loaded, views, tmp
     )
 
 
+def test_a_fitted_person_takes_on_expressions_of_training(loaded, views, tmp_path):
+    fit(loaded, views, unseen(views)[:1], [], tmp_path)
+    again = load_checkpoint(tmp_path / "checkpoint.pt")
+    assert again.model.subjects == ("S002",) and set(again.model.expressions) == {"e0", "e1"}
+    moved = trained_head(again, "S002", "e1")
+    assert moved.tracked.expression[0] == 1
+    torch.testing.assert_close(moved.z_exp, loaded.model.z_exp[1].detach())
+    torch.testing.assert_close(moved.z_id, again.model.z_id[0].detach())
+    tuned = fit(again, views, unseen(views)[:1], [], tmp_path / "again")  # and can be fitted again
+    assert tuned["subject"] == "S002"
+
+
 def test_fit_stops_at_its_time_budget(loaded, views, tmp_path):
     settings = replace(
         loaded.config.fit, stage1_iterations=10_000, stage2_iterations=10_000, seconds=0.4

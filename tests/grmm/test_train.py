@@ -264,7 +264,8 @@ def test_held_out_expressions_are_not_trained_on():
         split_samples(keys, wrong)
 
 
-def test_a_rendering_with_nan_is_refused_not_passed_over(views):
+def test_a_rendering_with_nan_is_refused_not_passed_over(source):
+    views = HeadViews(source, ellipsoid_head())
     render = training_render(prepare(views, tiny_config()).model, views)
 
     def damaged(item):
