@@ -1,5 +1,7 @@
 """A browser for tests: speaks the viewer's websocket, without a screen."""
 
+from contextlib import ExitStack
+
 import msgspec
 import numpy as np
 from websockets.sync.client import connect
@@ -11,11 +13,13 @@ class Browser:
     """Receives every message; keeps the controls by label and the newest picture."""
 
     def __init__(self, port):
-        self.socket = connect(f"ws://127.0.0.1:{port}", max_size=None, compression=None)
+        self.open = ExitStack()
+        address = f"ws://127.0.0.1:{port}"
+        self.socket = self.open.enter_context(connect(address, max_size=None, compression=None))
         self.controls, self.picture, self.pictures = {}, None, 0
 
     def close(self):
-        self.socket.close()
+        self.open.close()
 
     def send(self, kind, **content):
         self.socket.send(msgspec.msgpack.encode({"type": kind, **content}))
