@@ -53,3 +53,9 @@ class Browser:
                     self.picture = decode_image(bytes(message["rgb_data"]))
                     self.pictures += 1
         return self.picture
+
+    def settle(self, height):
+        """The next picture of this height: that of a head at rest, after any that move."""
+        while self.listen(1).shape[0] != height:
+            pass
+        return self.picture.astype(int)
