@@ -27,9 +27,10 @@ from express50.images import read_image
 from express50.twin.config import TwinConfig
 from express50.twin.record import record
 from express50.twin.truth import Truth
-from grmm.config import Config, resolve
+from grmm.config import Config
 from grmm.data import HeadViews, Key, Sample, Source, Tracked, spread
 from grmm.evaluate import evaluate, mean, training_render
+from grmm.presets import resolve
 from grmm.shard_source import ShardSource
 from grmm.train import Run, finished, prepare, set_rates, step
 from grmm.warm_start import warm_start

@@ -45,8 +45,10 @@ class Anchors:
         )
 
 
-def make_anchors(head: HeadModel, n_g: int) -> Anchors:
+def make_anchors(head: HeadModel, n_g: int, mouth: bool = True) -> Anchors:
     """Rasterise the UV map of a head at the centres of n_g x n_g texels.
+
+    Without ``mouth``, faces of teeth, tongue and the inside of the mouth get no Gaussians.
 
     Raises:
         HeadModelError: no triangle covers any texel's centre.
@@ -57,6 +59,8 @@ def make_anchors(head: HeadModel, n_g: int) -> Anchors:
     centre = torch.stack([column, row], -1).double() + 0.5
     weights = _barycentrics(grid[face], centre)
     inside = (weights >= 0).all(1)
+    if not mouth:
+        inside &= ~mouth_faces(head)[face]
     face, weights = face[inside], weights[inside]
     texel = (row * n_g + column)[inside]
     # A stable sort keeps faces in ascending order within a texel: the lowest index wins.
@@ -79,6 +83,12 @@ def make_anchors(head: HeadModel, n_g: int) -> Anchors:
         barycentrics=weights[first].float(),
         overlaps=int((claims > 1).sum()),
     )
+
+
+def mouth_faces(head: HeadModel) -> Tensor:
+    """(F,) bool: faces with a corner on teeth or tongue, or that lie inside the mouth."""
+    solid = (head.regions["teeth"] | head.regions["tongue"])[head.faces].any(1)
+    return (solid | head.regions["mouth_interior"][head.faces].all(1)).cpu()
 
 
 def _candidate_texels(grid: Tensor, n_g: int) -> tuple[Tensor, Tensor, Tensor]:

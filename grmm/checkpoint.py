@@ -20,9 +20,10 @@ from express50.errors import FormatError
 from express50.head.load import load_head
 from express50.head.model import HeadModel
 from express50.publish import write_bytes
-from grmm.config import Config, as_tables, from_tables
+from grmm.config import Config
 from grmm.data import NO_OFFSETS, HeadViews, Tracked, pose_state
 from grmm.model import GRMM, HeadState, View
+from grmm.presets import as_tables, from_tables
 
 FORMAT = "grmm.checkpoint/1"
 

@@ -1,23 +1,15 @@
-"""Every knob of GRMM in frozen dataclasses, with the paper's numbers and three presets.
+"""Every knob of GRMM in frozen dataclasses, with the paper's numbers as defaults.
 
 Each field that the paper leaves silent names where its value comes from. Abbreviations: P = the
 GRMM paper; G = the project's survey of Gaussian head models (numbers of its section 5), which read
 RGCA (Saito 2024), GHA (Xu 2024), ASH (Pang 2024), GaussianAvatars (Qian 2024) and DeepSDF
 (Park 2019).
-
-Presets: ``paper`` (the dimensions of P), ``small`` (one GPU or a patient CPU) and ``demo`` (two CPU
-cores, minutes). Precedence: ``--set table.key=value`` > TOML > preset > the defaults below.
 """
 
 from __future__ import annotations
 
-import tomllib
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from pathlib import Path
-from typing import Any
+from dataclasses import dataclass, field
 
-from express50.config import build_dataclass, config_values, nearest, parse_assignment
 from express50.errors import ConfigError
 
 FRAMES = ("head", "tangent")
@@ -44,6 +36,9 @@ class ModelConfig:
     """Hidden width of both displacement heads; silent in P. G8, after RGCA's geometry decoder."""
     mesh_decoder: bool = True
     """False: no vertex displacements (the paper's ablation "no mesh decoder")."""
+    mouth: bool = True
+    """False: no Gaussians on teeth, tongue and the inside of the mouth (the supplement's ablation
+    of the extended UV map); heads without those regions are drawn all the same."""
     residual_codes: bool = True
     """False: decoders see tracked parameters in place of codes (the ablation "no residuals")."""
     displacement_scale: float = 1e-2
@@ -146,6 +141,9 @@ class DataConfig:
     split: str = "train"
     holdout_cameras: tuple[str, ...] = ()
     """Camera ids that training never sees; metrics.json reports on them."""
+    holdout_expressions: tuple[str, ...] = ()
+    """SUBJECT/EXPRESSION frames that training never sees, as shell patterns (S002/smile, */wink*).
+    Others must show the expression, or it has no code; metrics.json reports on them."""
     background: float = 0.0
     """Grey that footage and renderings are composited on, sRGB in [0, 1]. Silent in P. G15."""
     torso: str = "ignore"
@@ -248,6 +246,16 @@ class FitConfig:
 
 
 @dataclass(frozen=True, kw_only=True)
+class MetricsConfig:
+    """Weights of the networks that LPIPS and FID compare images with; none are distributed."""
+
+    alexnet: str = ""
+    """Path of torchvision's alexnet state dict for LPIPS; empty: n/a. Backbone silent in P. G23."""
+    inception: str = ""
+    """Path of the FID Inception network as TorchScript (inception-2015-12-05.pt); empty: n/a."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Config:
     """Everything; the resolved instance is stored in each checkpoint."""
 
@@ -256,85 +264,7 @@ class Config:
     data: DataConfig = field(default_factory=DataConfig)
     train: TrainConfig = field(default_factory=TrainConfig)
     fit: FitConfig = field(default_factory=FitConfig)
-
-
-PRESETS: dict[str, dict[str, dict[str, Any]]] = {
-    "paper": {"train": {"accumulate": 1, "warm_start": True}},
-    "small": {
-        "model": {
-            "n_g": 256,
-            "z_id": 128,
-            "z_exp": 64,
-            "seed_channels": 128,
-            "ladder": (128, 64, 64, 32),
-            "shared_widths": (256, 128),
-            "mesh_width": 128,
-            "film_width": 128,
-            "refine_unshuffle": 2,
-            "identity_modes": 12,
-            "frame": "tangent",
-        },
-        "train": {"iterations": 20_000, "lr": 5e-4, "code_lr_scale": 10.0, "final_lr": 0.1},
-        "fit": {"stage1_iterations": 200, "stage2_iterations": 200, "texture_warm_start": True},
-    },
-    "demo": {
-        "model": {
-            "n_g": 128,
-            "z_id": 32,
-            "z_exp": 16,
-            "features": 8,
-            "seed_channels": 32,
-            "ladder": (32, 32, 24),
-            "shared_widths": (64, 64),
-            "mesh_width": 48,
-            "film_width": 32,
-            "refine_widths": (24, 32, 48),
-            "refine_unshuffle": 2,
-            "identity_modes": 8,
-            "frame": "tangent",
-            "opacity_init": 0.8,
-            "scale_init": 0.7,
-        },
-        "train": {
-            "iterations": 4000,
-            "lr": 2e-3,
-            "code_lr_scale": 2.0,
-            "texel_lr_scale": 5.0,
-            "refine_lr_scale": 0.25,
-            "final_lr": 0.05,
-        },
-        "fit": {
-            "stage1_iterations": 120,
-            "stage2_iterations": 200,
-            "stage2_lr": 1e-3,
-            "stage2_texel_lr_scale": 5.0,
-            "texture_warm_start": True,
-            "shuffle_directions": 0.5,
-            "locality_every": 2,
-        },
-    },
-}
-
-TABLES = {
-    "model": ModelConfig,
-    "loss": LossConfig,
-    "data": DataConfig,
-    "train": TrainConfig,
-    "fit": FitConfig,
-}
-
-
-def preset(name: str) -> Config:
-    """Return the configuration of a preset.
-
-    Raises:
-        ConfigError: no preset has this name.
-    """
-    _one_of("preset", name, tuple(PRESETS))
-    config = Config()
-    for table, values in PRESETS[name].items():
-        config = replace(config, **{table: replace(getattr(config, table), **values)})
-    return config
+    metrics: MetricsConfig = field(default_factory=MetricsConfig)
 
 
 def _one_of(name: str, value: str, allowed: tuple[str, ...]) -> None:
@@ -345,58 +275,3 @@ def _one_of(name: str, value: str, allowed: tuple[str, ...]) -> None:
 def _in_range(name: str, value: float, low: float, high: float) -> None:
     if not low <= value <= high:
         raise ConfigError(f"{name} is {value}, expected {low} to {high}")
-
-
-def resolve(
-    name: str = "paper", file: Path | None = None, assignments: Sequence[str] = ()
-) -> Config:
-    """Build a configuration: ``table.key=value`` assignments over a TOML file over a preset.
-
-    Raises:
-        ConfigError: unknown preset, table or key, a wrong type, or a value out of range.
-    """
-    tables = as_tables(preset(name))
-    for table, values in _read_toml(file).items():
-        _known_table(table, f"{file}: table [{table}]")
-        tables[table] |= values
-    for text in assignments:
-        table, key, value = parse_assignment(text)
-        _known_table(table, f"--set {text!r}: table {table!r}")
-        tables[table][key] = value
-    return from_tables(tables)
-
-
-def from_tables(tables: Mapping[str, Mapping[str, object]]) -> Config:
-    """Make a configuration from plain tables, as a checkpoint holds them."""
-    return Config(
-        **{table: build_dataclass(table, TABLES[table], values) for table, values in tables.items()}
-    )
-
-
-def as_tables(config: Config) -> dict[str, dict[str, Any]]:
-    """Plain nested dictionary of a configuration; tuples become lists."""
-    return {
-        table: {
-            key: list(value) if isinstance(value, tuple) else value
-            for key, value in config_values(getattr(config, table)).items()
-        }
-        for table in TABLES
-    }
-
-
-def _read_toml(file: Path | None) -> dict[str, dict[str, object]]:
-    if file is None:
-        return {}
-    try:
-        return tomllib.loads(file.read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
-        raise ConfigError(f"--config {file}: no such file") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ConfigError(f"--config {file}: not TOML: {error}") from error
-
-
-def _known_table(table: str, where: str) -> None:
-    if table not in TABLES:
-        raise ConfigError(
-            f"{where} is unknown{nearest(table, TABLES)}; expected {', '.join(TABLES)}"
-        )

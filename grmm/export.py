@@ -1,7 +1,8 @@
-"""Export the Gaussians of one frame: PLY for splat viewers, NPZ for everything else."""
+"""Export one head: PLY for splat viewers, GLB for everything else that draws, NPZ for arrays."""
 
 from __future__ import annotations
 
+import io
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -9,8 +10,14 @@ import numpy as np
 import torch
 
 from express50.errors import ConfigError
+from express50.publish import write_bytes
 from grmm.checkpoint import Loaded
-from grmm.render import frontal
+from grmm.edit import Head
+from grmm.model import View
+from grmm.ply import write_ply
+
+OPAQUE = 0.3  # opacity under which a Gaussian is no point of a GLB: points cannot be translucent
+FORMATS = (".ply", ".glb", ".npz")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -22,7 +29,7 @@ class Cloud:
         quats: (N, 4) wxyz, unit length.
         scales: (N, 3) standard deviations, metres.
         opacities: (N,).
-        colors: (N, 3) in [0, 1], sRGB, as the frontal camera sees them.
+        colors: (N, 3) in [0, 1], sRGB, as the exported view sees them.
     """
 
     means: np.ndarray
@@ -32,14 +39,31 @@ class Cloud:
     colors: np.ndarray
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Surface:
+    """The deformed mesh M_d with the decoded colours as its texture.
+
+    Attributes:
+        vertices: (V, 3) metres, v_rec + v_id + M_face v_exp.
+        faces: (F, 3).
+        uv: (T, 2) in [0, 1], v up.
+        uv_faces: (F, 3) into uv.
+        texture: (n_g, n_g, 3) uint8 sRGB; texels that no face covers carry the mean colour.
+    """
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    uv: np.ndarray
+    uv_faces: np.ndarray
+    texture: np.ndarray
+
+
 @torch.no_grad()
-def cloud(loaded: Loaded, subject: str, expression: str) -> Cloud:
-    """Decode one training (or fitted) frame; colours are those of the frontal view."""
-    model = loaded.model
-    state = loaded.state(subject, expression)
-    z_id, z_exp = model.codes(model.subjects.index(subject), model.expressions.index(expression))
-    gaussians = model.geometry(z_id, z_exp, state)
-    colours = model.appearance(z_id, state, frontal(loaded))[:, :3]
+def cloud(loaded: Loaded, head: Head, view: View) -> Cloud:
+    """Decode a head's Gaussians; colours are those that ``view`` sees, before refinement."""
+    model, state = loaded.model, head.state(loaded)
+    gaussians = model.geometry(head.z_id, head.z_exp, state)
+    colours = model.appearance(head.z_id, state, view)[:, :3]
     low, high = loaded.config.model.scale_bounds_mm
     quats = torch.nn.functional.normalize(gaussians.quats, dim=1)
     return Cloud(
@@ -51,19 +75,92 @@ def cloud(loaded: Loaded, subject: str, expression: str) -> Cloud:
     )
 
 
-def write_cloud(path: Path, gaussians: Cloud) -> None:
-    """Write by extension: .ply (3DGS layout, degree 0) or .npz (arrays named as in `Cloud`).
+@torch.no_grad()
+def surface(loaded: Loaded, head: Head, view: View) -> Surface:
+    """Decode a head's mesh; its texture holds the Gaussians' colours as ``view`` sees them."""
+    model, state = loaded.model, head.state(loaded)
+    vertices = state.vertices + model.geometry(head.z_id, head.z_exp, state).displacement
+    colours = model.appearance(head.z_id, state, view)[:, :3]
+    side = loaded.config.model.n_g
+    texture = colours.mean(0).expand(side * side, 3).clone()
+    texture[model.texels] = colours
+    return Surface(
+        vertices=vertices.cpu().numpy(),
+        faces=loaded.head.faces.cpu().numpy(),
+        uv=loaded.head.uv.cpu().numpy(),
+        uv_faces=loaded.head.uv_faces.cpu().numpy(),
+        texture=(255 * texture.clamp(0, 1)).round().byte().cpu().numpy().reshape(side, side, 3),
+    )
+
+
+def write_export(path: Path, loaded: Loaded, head: Head, view: View, points: bool = False) -> str:
+    """Write by extension; returns what was written, in words.
+
+    ``.ply``: Gaussians in the 3DGS layout, degree 0. ``.glb``: the textured mesh, or with
+    ``points`` the Gaussians' centres. ``.npz``: Gaussians named as in `Cloud`, ``mesh_vertices``,
+    ``mesh_faces``, codes and head-model parameters.
 
     Raises:
         ConfigError: another extension.
     """
-    if path.suffix == ".npz":
-        path.parent.mkdir(parents=True, exist_ok=True)
-        np.savez_compressed(path, **vars(gaussians))
+    if path.suffix not in FORMATS:
+        raise ConfigError(
+            f"{path}: cannot export to {path.suffix!r}, expected .ply or .npz or .glb"
+        )
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if path.suffix == ".glb" and not points:
+        mesh = surface(loaded, head, view)
+        write_bytes(path, mesh_glb(mesh))
+        return f"mesh of {len(mesh.vertices)} vertices, texture {mesh.texture.shape[0]} px"
+    gaussians = cloud(loaded, head, view)
+    if path.suffix == ".glb":
+        write_bytes(path, points_glb(gaussians))
     elif path.suffix == ".ply":
-        from grmm.ply import write_ply
-
-        path.parent.mkdir(parents=True, exist_ok=True)
         write_ply(path, **vars(gaussians))
     else:
-        raise ConfigError(f"{path}: cannot export to {path.suffix!r}, expected .ply or .npz")
+        write_bytes(path, arrays_npz(loaded, head, gaussians, surface(loaded, head, view)))
+    return f"{len(gaussians.means)} Gaussians"
+
+
+def arrays_npz(loaded: Loaded, head: Head, gaussians: Cloud, mesh: Surface) -> bytes:
+    """Everything about one head as one .npz."""
+    tracked = {f"flame_{name}": value for name, value in vars(head.tracked).items()}
+    buffer = io.BytesIO()
+    np.savez_compressed(
+        buffer,
+        **vars(gaussians),
+        mesh_vertices=mesh.vertices,
+        mesh_faces=mesh.faces,
+        z_id=head.z_id.cpu().numpy(),
+        z_exp=head.z_exp.cpu().numpy(),
+        head=np.array(loaded.head_spec),
+        **tracked,
+    )
+    return buffer.getvalue()
+
+
+def mesh_glb(mesh: Surface) -> bytes:
+    """Binary glTF of the textured mesh; vertices are split where the texture map has seams."""
+    import trimesh
+    from PIL import Image
+
+    corners = np.stack([mesh.faces.reshape(-1), mesh.uv_faces.reshape(-1)], 1)
+    pairs, faces = np.unique(corners, axis=0, return_inverse=True)
+    material = trimesh.visual.material.PBRMaterial(
+        baseColorTexture=Image.fromarray(mesh.texture), metallicFactor=0.0, roughnessFactor=1.0
+    )
+    visual = trimesh.visual.TextureVisuals(uv=mesh.uv[pairs[:, 1]], material=material)
+    whole = trimesh.Trimesh(
+        mesh.vertices[pairs[:, 0]], faces.reshape(-1, 3), visual=visual, process=False
+    )
+    return bytes(whole.export(file_type="glb"))
+
+
+def points_glb(gaussians: Cloud) -> bytes:
+    """Binary glTF of the centres of Gaussians whose opacity is over OPAQUE."""
+    import trimesh
+
+    shown = gaussians.opacities > OPAQUE
+    colours = np.round(255 * gaussians.colors[shown].clip(0, 1)).astype(np.uint8)
+    points = trimesh.PointCloud(gaussians.means[shown], colors=colours)
+    return bytes(trimesh.Scene(points).export(file_type="glb"))

@@ -11,7 +11,7 @@ import copy
 import math
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -21,14 +21,17 @@ from torch import Tensor
 from express50.errors import TrainError
 from express50.publish import write_json
 from grmm import losses
-from grmm.checkpoint import Gallery, Loaded, collect_gallery, save_checkpoint
+from grmm.checkpoint import Loaded
 from grmm.config import FitConfig, LossConfig
-from grmm.data import HeadViews, Item, Shuffle, Tracked, pose_state
+from grmm.data import HeadViews, Item, Shuffle
 from grmm.evaluate import Render, evaluate, mean
-from grmm.metrics import UNAVAILABLE
-from grmm.model import GRMM, HeadState, Rendering, View
+from grmm.fit_checkpoint import save_fit
+from grmm.judge import Judge
+from grmm.locality import locality_loss, random_camera, reconstruction
+from grmm.model import GRMM, Rendering
+from grmm.perceptual import load_vgg
 from grmm.progress import log
-from grmm.render import comparison_sheet, interpolate_tracked
+from grmm.render import comparison_sheet
 from grmm.warm_start import LOGIT_LIMIT, project_texture, spread_change
 
 
@@ -45,6 +48,8 @@ class Fit:
     z_exp: dict[str, Tensor]
     weights: LossConfig
     settings: FitConfig
+    perceptual: torch.nn.Module | None
+    generator: torch.Generator
 
 
 def fit(
@@ -59,18 +64,11 @@ def fit(
         TrainError: no views, or views of several subjects.
     """
     state = start(loaded, views, list(given))
-    settings = loaded.config.fit
-    torch.manual_seed(settings.seed)
     render = fitted_render(state)
     held_out = [i for i in held_out if views.keys[i].expression in state.z_exp]
-    stages = {"mean_code": _scores(state, held_out, render)}
-    began = time.perf_counter()
-    first = invert_codes(state, deadline(settings, began, settings.stage1_share))
-    stages["stage1"] = _scores(state, held_out, render)
-    if settings.texture_warm_start and settings.stage2_iterations:
-        start_texture(state)
-    second = tune_decoders(state, deadline(settings, began, 1.0))
-    stages["stage2"] = _scores(state, held_out, render)
+    stages, effort = run_stages(state, lambda: _scores(state, held_out, render))
+    judge = Judge(loaded.config.metrics)
+    rows = evaluate(views, held_out or state.given, render, judge)
     metrics: dict[str, object] = {
         "subject": views.keys[state.given[0]].subject,
         "expressions": sorted(state.z_exp),
@@ -79,17 +77,49 @@ def fit(
         "psnr_db": stages["stage2"]["psnr_held_out_db"] or stages["stage2"]["psnr_given_db"],
         "psnr_is_of": "held-out views" if held_out else "given views: all were given",
         "stages": stages,
-        "stage1_iterations": first,
-        "stage2_iterations": second,
-        "seconds": round(time.perf_counter() - began, 2),
+        "lpips": mean(rows, "lpips"),
+        "rmse": mean(rows, "rmse"),
+        "fid": judge.fid(),
     }
-    metrics |= UNAVAILABLE
+    metrics |= effort | judge.missing()
     save_fit(state, out)
     comparison_sheet(out / "given.jpg", views, state.given[:6], render)
     if held_out:
         comparison_sheet(out / "held_out.jpg", views, list(held_out)[:6], render)
     write_json(out / "metrics.json", metrics)
     return metrics
+
+
+Scores = dict[str, float | None]
+
+
+def run_stages(
+    state: Fit, score: Callable[[], Scores]
+) -> tuple[dict[str, Scores], dict[str, object]]:
+    """Both stages within the time budget: the scores before, between and after, and the effort.
+
+    The time that scoring takes does not count against the budget.
+    """
+    settings = state.settings
+    torch.manual_seed(settings.seed)
+    stages = {"mean_code": score()}
+    began = time.perf_counter()
+    first = invert_codes(state, deadline(settings, began, settings.stage1_share))
+    spent = time.perf_counter() - began
+    stages["stage1"] = score()
+    began = time.perf_counter() - spent
+    if settings.texture_warm_start and settings.stage2_iterations:
+        start_texture(state)
+    second = tune_decoders(state, deadline(settings, began, 1.0))
+    spent = time.perf_counter() - began
+    stages["stage2"] = score()
+    return stages, {
+        "stage1_iterations": first,
+        "stage2_iterations": second,
+        "iterations": first + second,
+        "seconds": round(spent, 2),
+        "budget_seconds": settings.seconds or None,
+    }
 
 
 def start(loaded: Loaded, views: HeadViews, given: list[int]) -> Fit:
@@ -100,7 +130,7 @@ def start(loaded: Loaded, views: HeadViews, given: list[int]) -> Fit:
             f"got views of {len(subjects)} subjects ({', '.join(subjects) or 'none'}), "
             "expected one; check --subject, --expression and --cameras"
         )
-    model = loaded.model
+    model, weights = loaded.model, loaded.config.loss
     z_id = model.z_id.detach().mean(0)
     z_exp = {}
     for expression in sorted({views.keys[i].expression for i in given}):
@@ -117,8 +147,10 @@ def start(loaded: Loaded, views: HeadViews, given: list[int]) -> Fit:
         given=given,
         z_id=z_id,
         z_exp=z_exp,
-        weights=loaded.config.loss,
+        weights=weights,
         settings=loaded.config.fit,
+        perceptual=load_vgg(Path(weights.vgg16)).to(z_id.device) if weights.vgg16 else None,
+        generator=torch.Generator().manual_seed(loaded.config.fit.seed),
     )
 
 
@@ -154,7 +186,7 @@ def invert_codes(state: Fit, late: Callable[[], bool]) -> int:
         rendering = state.model.render(
             state.z_id, z_exp, item.state, item.view, state.views.background
         )
-        loss = _both(rendering, item, state.weights)
+        loss = _both(state, rendering, item)
         _finite(loss + settings.codes * losses.codes(state.z_id, z_exp), number, 1).backward()
         optimizer.step()
         done = number + 1
@@ -176,7 +208,7 @@ def tune_decoders(state: Fit, late: Callable[[], bool]) -> int:
         rendering = state.model.render(
             state.z_id, z_exp, item.state, item.view, state.views.background, shade
         )
-        loss = _both(rendering, item, state.weights)
+        loss = _both(state, rendering, item)
         if settings.locality and number % settings.locality_every == 0:
             weight = settings.locality * settings.locality_every
             loss = loss + weight * locality_loss(state, item, rng)
@@ -247,60 +279,11 @@ def start_texture(state: Fit) -> None:
         model.colour.bias.flatten(1)[:3, model.texels] += (trust * change + (1 - trust) * guess).T
 
 
-def locality_loss(state: Fit, item: Item, rng: np.random.Generator) -> Tensor:
-    """L_rec between the tuned and the frozen model between a training identity and the subject.
-
-    Codes and coefficients are blended at a fixed t (weight of the subject), jaw and neck by SLERP
-    (paper, supplement); the mesh is posed again from the blend; the camera is a random one of the
-    training set; refined and rasterised images both count, as in L_rec's other uses.
-    """
-    frames = sorted(state.loaded.gallery.frames)
-    subject, expression = frames[int(rng.integers(len(frames)))]
-    view = random_camera(state, rng)
-    t = state.settings.locality_t
-    mine = state.views.sample(_index_of(state, item)).tracked
-    head_state, z_id, z_exp = blend(
-        state, (subject, expression), mine, state.z_exp[item.key.expression], t
-    )
-    tuned = state.model.render(z_id, z_exp, head_state, view, state.views.background)
-    with torch.no_grad():
-        before = state.frozen.render(z_id, z_exp, head_state, view, state.views.background)
-    loss = losses.reconstruction(tuned.rgb, before.rgb, state.weights)
-    if state.model.refinement is not None:
-        loss = loss + losses.reconstruction(tuned.image, before.image, state.weights)
-    return loss
-
-
-def random_camera(state: Fit, rng: np.random.Generator) -> View:
-    """One of the training cameras."""
-    cameras = state.loaded.gallery.cameras
-    return cameras[sorted(cameras)[int(rng.integers(len(cameras)))]]
-
-
-def blend(
-    state: Fit, frame: tuple[str, str], mine: Tracked, z_exp: Tensor, t: float
-) -> tuple[HeadState, Tensor, Tensor]:
-    """Parameters and codes between a training frame (t = 0) and the fitted subject (t = 1)."""
-    model, gallery = state.frozen, state.loaded.gallery
-    tracked = interpolate_tracked(gallery.frames[frame], mine, t)
-    subject, expression = model.subjects.index(frame[0]), model.expressions.index(frame[1])
-    return (
-        pose_state(state.views.head, tracked),
-        torch.lerp(model.z_id[subject], state.z_id, t),
-        torch.lerp(model.z_exp[expression], z_exp, t),
-    )
-
-
-def _index_of(state: Fit, item: Item) -> int:
-    return next(i for i in state.given if state.views.keys[i] == item.key)
-
-
-def _both(rendering: Rendering, item: Item, weights: LossConfig) -> Tensor:
+def _both(state: Fit, rendering: Rendering, item: Item) -> Tensor:
     """L_rec of the rasterised and, if there is one, the refined image."""
-    loss = losses.reconstruction(item.comparable(rendering.rgb), item.target, weights)
+    loss = reconstruction(state, item.comparable(rendering.rgb), item.target)
     if rendering.image is not rendering.rgb:
-        image = item.comparable(rendering.image)
-        loss = loss + losses.reconstruction(image, item.target, weights)
+        loss = loss + reconstruction(state, item.comparable(rendering.image), item.target)
     return loss
 
 
@@ -313,7 +296,7 @@ def _finite(loss: Tensor, iteration: int, stage: int) -> Tensor:
     return loss
 
 
-def _scores(state: Fit, held_out: Sequence[int], render: Render) -> dict[str, float | None]:
+def _scores(state: Fit, held_out: Sequence[int], render: Render) -> Scores:
     given = evaluate(state.views, state.given[:12], render)
     other = evaluate(state.views, list(held_out)[:12], render)
     scores = {
@@ -324,25 +307,3 @@ def _scores(state: Fit, held_out: Sequence[int], render: Render) -> dict[str, fl
     }
     log("fit: " + "  ".join(f"{k} {v}" for k, v in scores.items() if v is not None))
     return scores
-
-
-def save_fit(state: Fit, out: Path) -> None:
-    """A checkpoint of the tuned model, in which the fitted subject is the only one."""
-    subject = state.views.keys[state.given[0]].subject
-    model = GRMM(state.model.config, state.views.head, [subject], list(state.z_exp))
-    content = state.model.state_dict()
-    content["z_id"] = state.z_id[None]
-    content["z_exp"] = torch.stack(list(state.z_exp.values()))
-    model.load_state_dict(content)
-    own = collect_gallery(state.views, state.given)
-    # Training cameras stay for rendering; the subject's own come first.
-    cameras: dict[str, View] = own.cameras | {
-        f"training_{name}": view for name, view in state.loaded.gallery.cameras.items()
-    }
-    save_checkpoint(
-        out / "checkpoint.pt",
-        model=model,
-        config=replace(state.loaded.config),
-        head_spec=state.loaded.head_spec,
-        gallery=Gallery(frames=own.frames, cameras=cameras),
-    )

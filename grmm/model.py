@@ -86,6 +86,21 @@ class Gaussians:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
+class Maps:
+    """What the transform and opacity decoders say of N Gaussians.
+
+    Attributes:
+        offsets: (N, 7) raw position and quaternion offsets.
+        scales_mm: (N, 3) unclamped standard deviations.
+        opacities: (N,) in (0, 1).
+    """
+
+    offsets: Tensor
+    scales_mm: Tensor
+    opacities: Tensor
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Rendering:
     """One rendered view.
 
@@ -118,7 +133,7 @@ class GRMM(nn.Module):
         super().__init__()
         self.config = config
         self.subjects, self.expressions = tuple(subjects), tuple(expressions)
-        self.anchors = make_anchors(head, config.n_g)
+        self.anchors = make_anchors(head, config.n_g, config.mouth)
         self._add_anchor_buffers(head)
         self.z_id = nn.Parameter(CODE_STD * torch.randn(len(subjects), config.z_id))
         self.z_exp = nn.Parameter(CODE_STD * torch.randn(len(expressions), config.z_exp))
@@ -212,22 +227,33 @@ class GRMM(nn.Module):
         colours = self.appearance(z_id, state, view if shade_view is None else shade_view)
         return self.draw(gaussians, colours, view, background)
 
-    def geometry(self, z_id: Tensor, z_exp: Tensor, state: HeadState) -> Gaussians:
-        """Decode everything that does not depend on the view."""
+    def geometry(
+        self, z_id: Tensor, z_exp: Tensor, state: HeadState, maps: Maps | None = None
+    ) -> Gaussians:
+        """Decode everything that does not depend on the view; ``maps`` if they are known."""
+        maps = self.decode(z_id, z_exp, state) if maps is None else maps
         z_id, z_exp = self._inputs(z_id, z_exp, state)
         displacement = torch.zeros_like(state.vertices)
         if self.mesh is not None:
             displacement = sum(self.mesh(z_id, z_exp, state.neck, state.jaw, state.expression))
-        vertices = state.vertices + displacement
-        offsets = self._sample(self.transform(torch.cat([z_id, z_exp])))
-        code = torch.cat([z_id, z_exp]) if self.config.opacity_from_expression else z_id
-        means, quats = self._place(vertices, offsets)
+        means, quats = self._place(state.vertices + displacement, maps.offsets)
         return Gaussians(
             means=means,
             quats=quats,
+            scales_mm=maps.scales_mm,
+            opacities=maps.opacities,
+            displacement=displacement,
+        )
+
+    def decode(self, z_id: Tensor, z_exp: Tensor, state: HeadState) -> Maps:
+        """The convolutional maps of transforms and opacity, which no pose changes."""
+        z_id, z_exp = self._inputs(z_id, z_exp, state)
+        offsets = self._sample(self.transform(torch.cat([z_id, z_exp])))
+        code = torch.cat([z_id, z_exp]) if self.config.opacity_from_expression else z_id
+        return Maps(
+            offsets=offsets[:, :7],
             scales_mm=nn.functional.softplus(offsets[:, 7:] + self.scale_bias),
             opacities=torch.sigmoid(self._sample(self.opacity(code))[:, 0]),
-            displacement=displacement,
         )
 
     def appearance(self, z_id: Tensor, state: HeadState, view: View) -> Tensor:
@@ -290,7 +316,7 @@ class GRMM(nn.Module):
         return maps.flatten(1).index_select(1, self.texels).T
 
     def _place(self, vertices: Tensor, offsets: Tensor) -> tuple[Tensor, Tensor]:
-        """Means (N, 3) and quaternions (N, 4) from the mesh and decoded offsets (N, 10).
+        """Means (N, 3) and quaternions (N, 4) from the mesh and decoded offsets (N, 7).
 
         q = normalise(dq + identity), so that zeros mean no rotation (survey point 1).
         """

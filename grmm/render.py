@@ -1,9 +1,10 @@
-"""Pictures and videos from a model: novel views, turntables, grids, transfer, interpolation."""
+"""Pictures and videos from a model: novel views, turntables, grids, controls, interpolation."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import av
@@ -11,14 +12,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from express50.errors import ConfigError
 from express50.images import contact_sheet, write_image
-from express50.torch_transforms import axis_angle_to_quat, quat_to_axis_angle, slerp
 from grmm.checkpoint import Loaded
-from grmm.data import HeadViews, Tracked, pose_state
+from grmm.data import HeadViews
+from grmm.edit import Head, between, trained_head
 from grmm.evaluate import Render
 from grmm.model import View
 
 VIDEO_RATE = 24  # frames a second, as the rig's
+YAWS, PITCHES = (-60, -30, 0, 30, 60), (20, 0, -20)  # degrees of the sheet of novel views
 
 
 def to_uint8(image: Tensor) -> np.ndarray:
@@ -53,16 +56,38 @@ def comparison_sheet(path: Path, views: HeadViews, indices: Sequence[int], rende
     write_image(path, contact_sheet(rows, labels, tile))
 
 
-def orbit(view: View, degrees: float, centre: Tensor) -> View:
-    """The view turned about the vertical axis through ``centre`` (3,) in head space."""
-    angle = math.radians(degrees)
-    turn = torch.eye(4, dtype=torch.float64, device=view.cam_from_head.device)
-    turn[0, 0] = turn[2, 2] = math.cos(angle)
-    turn[0, 2], turn[2, 0] = math.sin(angle), -math.sin(angle)
-    pivot = centre.to(turn)
-    turn[:3, 3] = pivot - turn[:3, :3] @ pivot
+def orbit(view: View, degrees: float, centre: Tensor, pitch: float = 0.0) -> View:
+    """The view turned about ``centre`` (3,) in head space.
+
+    ``degrees`` about the vertical axis, after ``pitch`` degrees about the camera's own horizontal
+    axis (positive: seen from above).
+    """
+    pivot = centre.to(view.cam_from_head.device, torch.float64)
+    turn = _rotation(math.radians(degrees), 0, 2, pivot)
     camera = view.cam_from_head.double() @ turn
-    return View(K=view.K, cam_from_head=camera, width=view.width, height=view.height)
+    if pitch:
+        seen = camera[:3, :3] @ pivot + camera[:3, 3]
+        camera = _rotation(math.radians(-pitch), 1, 2, seen) @ camera
+    return replace(view, cam_from_head=camera)
+
+
+def _rotation(angle: float, first: int, second: int, pivot: Tensor) -> Tensor:
+    """(4, 4) rotation by radians from axis ``second`` to ``first``, about a point (3,)."""
+    turn = torch.eye(4, dtype=torch.float64, device=pivot.device)
+    turn[first, first] = turn[second, second] = math.cos(angle)
+    turn[first, second], turn[second, first] = math.sin(angle), -math.sin(angle)
+    turn[:3, 3] = pivot - turn[:3, :3] @ pivot
+    return turn
+
+
+def resized(view: View, longest_px: int) -> View:
+    """The same camera at a size whose longer side is ``longest_px``."""
+    scale = longest_px / max(view.width, view.height)
+    width, height = (max(1, round(scale * side)) for side in (view.width, view.height))
+    K = view.K.clone()
+    K[0] *= width / view.width
+    K[1] *= height / view.height
+    return replace(view, K=K, width=width, height=height)
 
 
 def frontal(loaded: Loaded) -> View:
@@ -72,125 +97,83 @@ def frontal(loaded: Loaded) -> View:
     return cameras[best]
 
 
+def camera_of(loaded: Loaded, name: str | None, size: int = 0) -> View:
+    """A camera of the checkpoint by id, by default the frontal one; ``size`` 0: its own.
+
+    Raises:
+        ConfigError: the checkpoint has no such camera.
+    """
+    cameras = loaded.gallery.cameras
+    if name is not None and name not in cameras:
+        raise ConfigError(f"the checkpoint knows no camera {name}; it has {', '.join(cameras)}")
+    view = frontal(loaded) if name is None else cameras[name]
+    return resized(view, size) if size else view
+
+
 @torch.no_grad()
-def turntable(
-    loaded: Loaded, subject: str, expression: str, frames: int = 72, degrees: float = 360.0
-) -> Iterable[np.ndarray]:
-    """Yield (H, W, 3) frames of an orbit; geometry is decoded once for all of them."""
-    model = loaded.model
-    state = loaded.state(subject, expression)
-    z_id, z_exp = model.codes(model.subjects.index(subject), model.expressions.index(expression))
-    gaussians = model.geometry(z_id, z_exp, state)
-    first, centre = frontal(loaded), model.head_centre
-    for number in range(frames):
-        view = orbit(first, degrees * number / frames, centre)
-        colours = model.appearance(z_id, state, view)
+def picture(loaded: Loaded, head: Head, view: View) -> np.ndarray:
+    """One head from one view, (H, W, 3) uint8."""
+    background = loaded.config.data.background
+    return to_uint8(
+        loaded.model.render(head.z_id, head.z_exp, head.state(loaded), view, background).image
+    )
+
+
+@torch.no_grad()
+def around(loaded: Loaded, head: Head, views: Iterable[View]) -> Iterable[np.ndarray]:
+    """Yield a head from each view; its geometry is decoded once for all of them."""
+    model, state = loaded.model, head.state(loaded)
+    gaussians = model.geometry(head.z_id, head.z_exp, state)
+    for view in views:
+        colours = model.appearance(head.z_id, state, view)
         yield to_uint8(model.draw(gaussians, colours, view, loaded.config.data.background).image)
 
 
-@torch.no_grad()
+def turntable(
+    loaded: Loaded, head: Head, view: View, frames: int = 72, degrees: float = 360.0
+) -> Iterable[np.ndarray]:
+    """Yield (H, W, 3) frames of an orbit that starts at ``view``."""
+    centre = loaded.model.head_centre
+    return around(
+        loaded, head, (orbit(view, degrees * number / frames, centre) for number in range(frames))
+    )
+
+
+def novel_views(loaded: Loaded, head: Head, view: View) -> list[list[np.ndarray]]:
+    """Rows of PITCHES with columns of YAWS, degrees, around ``view``."""
+    centre = loaded.model.head_centre
+    views = (orbit(view, yaw, centre, pitch) for pitch in PITCHES for yaw in YAWS)
+    pictures = list(around(loaded, head, views))
+    return [pictures[i : i + len(YAWS)] for i in range(0, len(pictures), len(YAWS))]
+
+
 def expression_grid(
-    loaded: Loaded, subjects: Sequence[str], expressions: Sequence[str]
+    loaded: Loaded, subjects: Sequence[str], expressions: Sequence[str], view: View
 ) -> list[list[np.ndarray]]:
-    """Pictures of every subject (rows) with every expression (columns), frontal.
+    """Pictures of every subject (rows) with every expression (columns).
 
     A subject without a tracked frame of an expression gets it by transfer.
     """
-    frames = loaded.gallery.frames
     return [
-        [
-            _picture(loaded, subject, expression, frames.get((subject, expression)))
-            for expression in expressions
-        ]
+        [picture(loaded, trained_head(loaded, subject, e), view) for e in expressions]
         for subject in subjects
     ]
 
 
-def _picture(loaded: Loaded, subject: str, expression: str, tracked: Tracked | None) -> np.ndarray:
-    model = loaded.model
-    if tracked is None:
-        donor = next(s for s, e in loaded.gallery.frames if e == expression)
-        own = next(t for (s, _), t in loaded.gallery.frames.items() if s == subject)
-        tracked = transfer(own, loaded.gallery.frames[donor, expression])
-    state = pose_state(loaded.head, tracked)
-    codes = model.codes(model.subjects.index(subject), model.expressions.index(expression))
-    return to_uint8(
-        model.render(*codes, state, frontal(loaded), loaded.config.data.background).image
-    )
-
-
-def transfer(identity: Tracked, expression: Tracked) -> Tracked:
-    """Expression transfer: one frame's head and place, another's expression, jaw, neck and eyes."""
-    return Tracked(
-        shape=identity.shape,
-        expression=expression.expression,
-        neck=expression.neck,
-        jaw=expression.jaw,
-        eyes=expression.eyes,
-        R=identity.R,
-        t=identity.t,
-        offsets=identity.offsets,
-    )
-
-
-def interpolate_tracked(a: Tracked, b: Tracked, t: float) -> Tracked:
-    """Blend parameters from a (t = 0) to b (1): linear, but jaw, neck and eyes by SLERP.
-
-    Source: the paper's supplement, locality regularisation; place (R, t) stays a's.
-    """
-    return Tracked(
-        shape=_lerp(a.shape, b.shape, t),
-        expression=_lerp(a.expression, b.expression, t),
-        neck=slerp_axis_angle(a.neck, b.neck, t),
-        jaw=slerp_axis_angle(a.jaw, b.jaw, t),
-        eyes=np.concatenate(
-            [slerp_axis_angle(a.eyes[i : i + 3], b.eyes[i : i + 3], t) for i in (0, 3)]
-        ),
-        R=a.R,
-        t=a.t,
-        offsets=_blend_offsets(a.offsets, b.offsets, t),
-    )
-
-
-def _blend_offsets(a: np.ndarray, b: np.ndarray, t: float) -> np.ndarray:
-    """(1 - t) a + t b (V, 3); (0, 3) stands for zeros."""
-    if not len(a) and not len(b):
-        return a
-    a, b = (x if len(x) else np.zeros_like(max(a, b, key=len)) for x in (a, b))
-    return a if a is b else ((1 - t) * a + t * b).astype(np.float32)
-
-
-def _lerp(a: np.ndarray, b: np.ndarray, t: float) -> np.ndarray:
-    """(1 - t) a + t b; the shorter one is padded with zeros."""
-    length = max(len(a), len(b))
-    a, b = (np.pad(x, (0, length - len(x))) for x in (a, b))
-    return (1 - t) * a + t * b
-
-
-def slerp_axis_angle(a: np.ndarray, b: np.ndarray, t: float) -> np.ndarray:
-    """Spherical interpolation of two axis-angle vectors (3,), radians, along the shorter arc."""
-    quats = [
-        axis_angle_to_quat(torch.as_tensor(np.asarray(x), dtype=torch.float64)) for x in (a, b)
-    ]
-    return quat_to_axis_angle(slerp(quats[0], quats[1], t)).numpy()
-
-
-@torch.no_grad()
 def interpolation(
-    loaded: Loaded, start: tuple[str, str], end: tuple[str, str], frames: int = 48
+    loaded: Loaded, start: Head, end: Head, view: View, frames: int = 48
 ) -> Iterable[np.ndarray]:
-    """Yield frames from one (subject, expression) to another: codes and parameters are blended."""
-    model, gallery = loaded.model, loaded.gallery.frames
-    codes = [
-        model.codes(model.subjects.index(subject), model.expressions.index(expression))
-        for subject, expression in (start, end)
-    ]
-    view = frontal(loaded)
+    """Yield frames from one head to another."""
     for number in range(frames):
-        t = number / max(1, frames - 1)
-        state = pose_state(loaded.head, interpolate_tracked(gallery[start], gallery[end], t))
-        z_id, z_exp = (torch.lerp(a, b, t) for a, b in zip(*codes, strict=True))
-        yield to_uint8(model.render(z_id, z_exp, state, view, loaded.config.data.background).image)
+        yield picture(loaded, between(start, end, number / max(1, frames - 1)), view)
+
+
+def write_sheet(
+    path: Path, rows: Sequence[Sequence[np.ndarray]], labels: Sequence[str] | None = None
+) -> None:
+    """Write rows of pictures of one size as one picture."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_image(path, contact_sheet(rows, labels, rows[0][0].shape[:2]))
 
 
 def write_video(path: Path, frames: Iterable[np.ndarray], rate: int = VIDEO_RATE) -> int:

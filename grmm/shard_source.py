@@ -64,6 +64,12 @@ class ShardSource:
             tracked=self._tracked(meta, self.keys[index].subject, where),
         )
 
+    def window(self, index: int) -> tuple[slice, slice, tuple[int, int]]:
+        """Rows and columns of a packed sample that its camera saw, and the packed (H, W)."""
+        meta = self.reader.meta(index)
+        rows, columns = seen_window(meta, f"{self.reader.root}: {self.keys[index]}")
+        return rows, columns, (int(meta["height"]), int(meta["width"]))
+
     def _tracked(self, meta: dict, subject: str, where: str) -> Tracked:
         tracked = _tracked(meta.get("track"), where)
         if not meta["track"].get("offsets", False):
@@ -71,6 +77,56 @@ class ShardSource:
         if subject not in self._offsets:
             self._offsets[subject] = self.reader.offsets(subject)
         return replace(tracked, offsets=self._offsets[subject])
+
+
+class MixedSource:
+    """Several folders of shards as one: EXPRESS-50 and RenderMe-360, for example.
+
+    Expressions of one id share their code (neutral, most often); subjects must differ.
+    """
+
+    def __init__(self, sources: Sequence[ShardSource]) -> None:
+        """Join sources that were tracked with one head model.
+
+        Raises:
+            FormatError: head models differ, or a subject is in two folders.
+        """
+        self.head = sources[0].head
+        owners: dict[str, ShardSource] = {}
+        for source in sources:
+            if source.head != self.head:
+                raise FormatError(
+                    f"{source.reader.root}: tracked with head model {source.head!r}, "
+                    f"{sources[0].reader.root} with {self.head!r}; track both with one"
+                )
+            for subject in sorted({key.subject for key in source.keys}):
+                if owners.setdefault(subject, source) is not source:
+                    raise FormatError(
+                        f"{source.reader.root}: subject {subject} is also in "
+                        f"{owners[subject].reader.root}; expected other ids in every dataset: "
+                        "rename the capture and pack it again"
+                    )
+        self._places = [(source, i) for source in sources for i in range(len(source.keys))]
+        self.keys: Sequence[Key] = [source.keys[i] for source, i in self._places]
+
+    def read(self, index: int) -> Sample:
+        """Decode one sample.
+
+        Raises:
+            FormatError: it is damaged.
+        """
+        source, place = self._places[index]
+        return source.read(place)
+
+
+def open_shards(roots: Sequence[Path], split: str) -> ShardSource | MixedSource:
+    """One folder of shards, or several mixed.
+
+    Raises:
+        FormatError: a folder has no samples of the split, or they do not go together.
+    """
+    sources = [ShardSource(root, split) for root in roots]
+    return sources[0] if len(sources) == 1 else MixedSource(sources)
 
 
 def seen_window(meta: dict, where: str) -> tuple[slice, slice]:

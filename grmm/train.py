@@ -7,9 +7,11 @@ gradients. On a CPU a resumed run continues bit for bit, unless a time budget st
 
 from __future__ import annotations
 
+import fnmatch
 import math
 import os
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -20,17 +22,15 @@ from torch.nn.parallel import DistributedDataParallel
 
 from express50.errors import ConfigError, TrainError
 from express50.head.model import HeadModel
-from express50.publish import write_json
 from grmm import losses
 from grmm.checkpoint import collect_gallery, load_checkpoint, save_checkpoint
-from grmm.config import Config, as_tables
-from grmm.data import HeadViews, Item, Shuffle, Source, spread
-from grmm.evaluate import evaluate, mean, training_render
-from grmm.metrics import UNAVAILABLE
+from grmm.config import Config
+from grmm.data import HeadViews, Item, Key, Shuffle, Source
 from grmm.model import GRMM, Rendering, View
 from grmm.perceptual import load_vgg, random_crop
+from grmm.presets import as_tables
 from grmm.progress import Interrupt, append_log, deferred_interrupt, log, start_log
-from grmm.render import comparison_sheet
+from grmm.train_report import report
 from grmm.warm_start import warm_start
 
 
@@ -139,27 +139,12 @@ def agree(run: Run, interrupt: Interrupt, device: torch.device) -> None:
 
 def prepare(views: HeadViews, config: Config, rank: int = 0, world: int = 1) -> Run:
     """Build model, optimiser and order of samples."""
-    cameras = {key.camera for key in views.keys}
-    unknown = set(config.data.holdout_cameras) - cameras
-    if unknown:
-        raise ConfigError(
-            f"data.holdout_cameras names {', '.join(sorted(unknown))}; "
-            f"the shards have {', '.join(sorted(cameras))}"
-        )
-    holdout = [i for i, key in enumerate(views.keys) if key.camera in config.data.holdout_cameras]
-    training = [i for i in range(len(views)) if i not in set(holdout)]
-    if config.train.overfit:
-        training, holdout = training[: config.train.overfit], []
-    if not training:
-        raise TrainError(
-            f"no views to train on: {len(views)} samples, all by held-out cameras; "
-            "hold out fewer or pack more"
-        )
+    training, holdout = split_samples(views.keys, config)
     keys = [views.keys[i] for i in training]
     subjects = sorted({key.subject for key in keys})
     expressions = sorted({key.expression for key in keys})
     model = GRMM(config.model, views.head, subjects, expressions).to(views.device)
-    # Samples of held-out cameras can be judged only where their codes were trained.
+    # What was held out can be judged only where its codes were trained.
     holdout = [
         i
         for i in holdout
@@ -177,6 +162,45 @@ def prepare(views: HeadViews, config: Config, rank: int = 0, world: int = 1) -> 
         perceptual=perceptual,
         edges=losses.mesh_edges(views.head.faces),
     )
+
+
+def split_samples(keys: Sequence[Key], config: Config) -> tuple[list[int], list[int]]:
+    """Samples to train on and held-out ones: views of held-out cameras, held-out expressions.
+
+    Raises:
+        ConfigError: a held-out name fits no sample.
+        TrainError: nothing is left to train on.
+    """
+    cameras = {key.camera for key in keys}
+    unknown = set(config.data.holdout_cameras) - cameras
+    if unknown:
+        raise ConfigError(
+            f"data.holdout_cameras names {', '.join(sorted(unknown))}; "
+            f"the shards have {', '.join(sorted(cameras))}"
+        )
+    frames = {f"{key.subject}/{key.expression}" for key in keys}
+    held = {p: set(fnmatch.filter(frames, p)) for p in config.data.holdout_expressions}
+    for pattern, found in held.items():
+        if not found:
+            raise ConfigError(
+                f"data.holdout_expressions names {pattern}; expected SUBJECT/EXPRESSION such as "
+                f"{min(frames)}"
+            )
+    unseen = set().union(*held.values())
+    holdout = [
+        i
+        for i, key in enumerate(keys)
+        if key.camera in config.data.holdout_cameras or f"{key.subject}/{key.expression}" in unseen
+    ]
+    training = sorted(set(range(len(keys))) - set(holdout))
+    if config.train.overfit:
+        training, holdout = training[: config.train.overfit], []
+    if not training:
+        raise TrainError(
+            f"no views to train on: {len(keys)} samples, all by held-out cameras or expressions; "
+            "hold out fewer or pack more"
+        )
+    return training, holdout
 
 
 def make_optimizer(model: GRMM, config: Config) -> torch.optim.Optimizer:
@@ -321,44 +345,6 @@ def restore(run: Run, path: Path, config: Config, device: torch.device) -> None:
     run.generator.set_state(loaded.loop["generator"])
     torch.set_rng_state(loaded.loop["torch"])
     run.iteration, run.seconds = loaded.loop["iteration"], loaded.loop["seconds"]
-
-
-def report(run: Run, config: Config, out: Path) -> dict[str, object]:
-    """Evaluate, draw previews and write metrics.json."""
-    render = training_render(run.model, run.views)
-    count = config.train.evaluate_images
-    training = evaluate(run.views, spread(run.training, count), render)
-    holdout = evaluate(run.views, spread(run.holdout, count), render)
-    metrics: dict[str, object] = {
-        "psnr_train_db": mean(training, "psnr_db"),
-        "psnr_heldout_view_db": mean(holdout, "psnr_db"),
-        "psnr_heldout_view_head_db": mean(holdout, "psnr_head_db"),
-        "psnr_heldout_view_unrefined_db": mean(holdout, "psnr_unrefined_db"),
-        "ssim": mean(holdout, "ssim") if holdout else mean(training, "ssim"),
-        "psnr_heldout_view_with_torso_db": mean(holdout, "psnr_with_torso_db"),
-        "psnr_counts": f"all pixels that the camera saw; torso: {config.data.torso}",
-        "depth_median_mm": mean(holdout or training, "depth_mm"),
-        "heldout_images": len(holdout),
-        "heldout_cameras": list(config.data.holdout_cameras),
-        "training_views": len(run.training),
-        "subjects": list(run.model.subjects),
-        "expressions": list(run.model.expressions),
-        "gaussians": len(run.model.texels),
-        "texels": config.model.n_g**2,
-        "parameters": sum(parameter.numel() for parameter in run.model.parameters()),
-        "iterations": run.iteration,
-        "seconds": round(run.seconds, 2),
-        "iterations_per_second": round(run.iteration / max(run.seconds, 1e-9), 3),
-        "terms": {name: round(value, 6) for name, value in run.terms.items()},
-        "perceptual": "on" if run.perceptual else "off: loss.vgg16 names no weights",
-    }
-    metrics |= UNAVAILABLE
-    for name, indices in (("training", run.training), ("heldout", run.holdout)):
-        if indices:
-            path = out / "preview" / f"{name}.jpg"
-            comparison_sheet(path, run.views, spread(indices, 6), render)
-    write_json(out / "metrics.json", metrics)
-    return metrics
 
 
 def progress_line(run: Run, config: Config) -> str:

@@ -12,8 +12,8 @@ from express50.shards import ShardReader
 from express50.shards_write import verify
 from grmm.checkpoint import Gallery, load_checkpoint, save_checkpoint
 from grmm.data import HeadViews, pose_state
+from grmm.edit import interpolate_tracked, transfer
 from grmm.model import GRMM
-from grmm.render import interpolate_tracked, transfer
 from grmm.shard_source import ShardSource
 from pipelines.depth import STAGE as DEPTH
 from pipelines.depth.config import DepthConfig

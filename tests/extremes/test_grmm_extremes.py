@@ -9,10 +9,10 @@ from torch.autograd import gradcheck
 
 from grmm import losses
 from grmm.config import LossConfig
+from grmm.edit import interpolate_tracked, slerp_axis_angle
 from grmm.metrics import psnr_db, ssim_score
 from grmm.model import initial_scales
 from grmm.refine import normalise_depth
-from grmm.render import interpolate_tracked, slerp_axis_angle
 from tests.grmm.synthetic import EllipsoidSource, tiny_config
 
 

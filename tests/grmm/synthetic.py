@@ -9,8 +9,9 @@ import torch
 
 from express50.head.model import REGIONS, HeadModel
 from express50.transforms import look_at
-from grmm.config import Config, resolve
+from grmm.config import Config
 from grmm.data import Key, Sample, Tracked
+from grmm.presets import resolve
 
 AXES = np.array([0.08, 0.11, 0.09])  # metres
 STRETCH = 0.015  # metres the first expression coefficient adds to the y axis

@@ -5,12 +5,13 @@ import numpy as np
 import pytest
 
 from express50.errors import FormatError
-from express50.images import encode_jpeg, encode_png
 from express50.shards_write import PackedSample, ShardWriter
 from grmm import checkpoint as checkpoint_module
-from grmm.cli import build_parser, main, train_config
+from grmm.cli import build_parser, main
+from grmm.cli.learn import train_config
 from grmm.ply import read_ply
 from grmm.shard_source import ShardSource, seen_window
+from tests.grmm.packed import packed, write_shards
 from tests.grmm.synthetic import EllipsoidSource, ellipsoid_head
 
 TINY = [
@@ -20,41 +21,11 @@ TINY = [
 ]  # fmt: skip
 
 
-def packed(source, index):
-    """One sample as the pack stage encodes it."""
-    key, sample = source.keys[index], source.read(index)
-    track = {k: np.asarray(v).tolist() for k, v in vars(sample.tracked).items()}
-    meta = {
-        "subject": key.subject, "expression": key.expression, "camera": key.camera,
-        "K": sample.K.tolist(), "cam_from_world": sample.cam_from_world.tolist(),
-        "width": source.size, "height": source.size, "depth_scale_m": 5e-5,
-        "head": "ellipsoid", "track": track,
-    }  # fmt: skip
-    depth = np.rint(sample.depth / 5e-5).astype(np.uint16)
-    members = {
-        "rgb.jpg": encode_jpeg(sample.image, 98),
-        "alpha.png": encode_png(sample.alpha),
-        "depth.png": encode_png(depth),
-        "meta.json": json.dumps(meta).encode(),
-    }
-    return PackedSample(key.subject, key.expression, key.camera, members)
-
-
 @pytest.fixture(scope="module")
 def shards(tmp_path_factory):
     """Three subjects, the last of them in the test split."""
     root = tmp_path_factory.mktemp("shards")
-    source = EllipsoidSource(subjects=3, size=32)
-    writer = ShardWriter(root, 1 << 24)
-    groups = {}
-    for index, key in enumerate(source.keys):
-        groups.setdefault((key.subject, key.expression), []).append(packed(source, index))
-    for split in ("train", "test"):
-        for (subject, _), samples in groups.items():
-            if (subject == "S002") == (split == "test"):
-                writer.add_group(split, samples)
-    writer.close()
-    return root
+    return write_shards(root, EllipsoidSource(subjects=3, size=32))
 
 
 @pytest.fixture(autouse=True)
@@ -144,7 +115,7 @@ def test_fit_render_evaluate_export(checkpoint, shards, tmp_path, capsys):
         (["fit", "{checkpoint}", "{shards}", "{out}", "--subject=S002", "--set=train.lr=1"], 2,
          "only fit"),
         (["render", "{out}/absent.pt", "{out}"], 1, "no such checkpoint"),
-        (["render", "{checkpoint}", "{out}", "--subject=S9"], 1, "knows no frame S9"),
+        (["render", "{checkpoint}", "{out}", "--subject=S9"], 2, "knows no subject S9"),
         (["export", "{checkpoint}", "{out}/head.obj"], 2, "expected .ply or .npz"),
     ],
 )  # fmt: skip

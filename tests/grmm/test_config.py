@@ -1,7 +1,7 @@
 import pytest
 
 from express50.errors import ConfigError
-from grmm.config import PRESETS, as_tables, from_tables, preset, resolve
+from grmm.presets import PRESETS, as_tables, from_tables, preset, resolve
 
 
 def test_paper_preset_has_the_papers_numbers():

@@ -9,12 +9,13 @@ from express50.errors import FormatError, TrainError
 from grmm import checkpoint as checkpoint_module
 from grmm.checkpoint import load_checkpoint
 from grmm.data import HeadViews
-from grmm.fit import blend, fit, invert_codes, locality_loss, start, tune_decoders
+from grmm.edit import interpolate_tracked, trained_head, transfer
+from grmm.fit import fit, invert_codes, start, tune_decoders
+from grmm.locality import blend, locality_loss, reconstruction
 from grmm.render import (
     expression_grid,
-    interpolate_tracked,
+    frontal,
     interpolation,
-    transfer,
     turntable,
     write_video,
 )
@@ -83,6 +84,15 @@ def test_locality_loss_is_zero_until_the_model_is_tuned(loaded, views):
     assert float(locality_loss(state, item, np.random.default_rng(0)).detach()) > 1e-3
 
 
+def test_reconstruction_has_the_perceptual_term_where_weights_are_given(loaded, views):
+    state = start(loaded, views, unseen(views))
+    target = views.item(state.given[0]).target
+    plain = reconstruction(state, 0.5 * target, target)
+    state.perceptual = lambda image, other: (image - other).abs().sum()
+    expected = plain + 0.04 * (0.5 * target).sum()
+    torch.testing.assert_close(reconstruction(state, 0.5 * target, target), expected)
+
+
 def test_blend_weighs_the_subject_by_t(loaded, views):
     state = start(loaded, views, unseen(views))
     mine = views.sample(state.given[0]).tracked
@@ -114,6 +124,18 @@ def test_fit_improves_on_the_mean_code_and_reports_both_views(loaded, views, tmp
     assert float(-10 * torch.log10(squared)) == pytest.approx(
         stages["stage2"]["psnr_given_db"], abs=2.0
     )
+
+
+def test_a_fitted_person_takes_on_expressions_of_training(loaded, views, tmp_path):
+    fit(loaded, views, unseen(views)[:1], [], tmp_path)
+    again = load_checkpoint(tmp_path / "checkpoint.pt")
+    assert again.model.subjects == ("S002",) and set(again.model.expressions) == {"e0", "e1"}
+    moved = trained_head(again, "S002", "e1")
+    assert moved.tracked.expression[0] == 1
+    torch.testing.assert_close(moved.z_exp, loaded.model.z_exp[1].detach())
+    torch.testing.assert_close(moved.z_id, again.model.z_id[0].detach())
+    tuned = fit(again, views, unseen(views)[:1], [], tmp_path / "again")  # and can be fitted again
+    assert tuned["subject"] == "S002"
 
 
 def test_fit_stops_at_its_time_budget(loaded, views, tmp_path):
@@ -150,12 +172,14 @@ def test_transfer_keeps_the_identity_and_takes_the_expression(views):
 
 
 def test_turntable_grid_and_interpolation(loaded, tmp_path):
-    frames = list(turntable(loaded, "S000", "e0", frames=3))
+    start, end = (trained_head(loaded, *frame) for frame in (("S000", "e0"), ("S001", "e1")))
+    view = frontal(loaded)
+    frames = list(turntable(loaded, start, view, frames=3))
     assert len(frames) == 3 and frames[0].shape == (32, 32, 3)
     assert not np.array_equal(frames[0], frames[1])
-    rows = expression_grid(loaded, ["S000", "S001"], ["e0", "e1"])
+    rows = expression_grid(loaded, ["S000", "S001"], ["e0", "e1"], view)
     assert len(rows) == 2 and len(rows[0]) == 2
-    blend_frames = list(interpolation(loaded, ("S000", "e0"), ("S001", "e1"), frames=3))
+    blend_frames = list(interpolation(loaded, start, end, view, frames=3))
     np.testing.assert_array_equal(blend_frames[0], rows[0][0])
     np.testing.assert_array_equal(blend_frames[2], rows[1][1])
     assert write_video(tmp_path / "t.mp4", frames) == 3

@@ -11,7 +11,7 @@ from grmm.checkpoint import load_checkpoint
 from grmm.data import HeadViews
 from grmm.evaluate import evaluate, summarise, training_render, write_evaluation
 from grmm.perceptual import LAYERS, VGGDistance, load_vgg, random_crop
-from grmm.train import budget_used, prepare, set_rates, train
+from grmm.train import budget_used, prepare, set_rates, split_samples, train
 from grmm.warm_start import fill_texels, project_texture, warm_start
 from tests.grmm.synthetic import EllipsoidSource, ellipsoid_head, tiny_config
 
@@ -204,7 +204,7 @@ def test_evaluation_is_written_as_table_and_means(tmp_path, source):
     rows = evaluate(views, [0, 4], training_render(run.model, views))
     summary = write_evaluation(tmp_path, rows)
     lines = (tmp_path / "evaluation.csv").read_text().splitlines()
-    assert len(lines) == 3 and lines[0].startswith("subject,expression,camera,psnr_db")
+    assert len(lines) == 3 and lines[0].startswith("subject,expression,camera,kind,psnr_db")
     assert summary["psnr_db"] == pytest.approx(
         (rows[0]["psnr_db"] + rows[1]["psnr_db"]) / 2, abs=1e-3
     )
@@ -249,3 +249,29 @@ def test_random_crop_is_the_same_for_both_images():
     a, b = random_crop((image, image.clone()), 8, torch.Generator().manual_seed(0))
     assert a.shape == (3, 8, 8) and torch.equal(a, b)
     assert random_crop((image, image), 0, torch.Generator())[0] is image
+
+
+def test_held_out_expressions_are_not_trained_on():
+    keys = EllipsoidSource(subjects=2, expressions=2, cameras=3).keys
+    config = tiny_config(data={"holdout_cameras": ("cam01",), "holdout_expressions": ("*1/e1",)})
+    training, holdout = split_samples(keys, config)
+    assert {(keys[i].subject, keys[i].expression) for i in training} == {
+        ("S000", "e0"), ("S000", "e1"), ("S001", "e0"),
+    }  # fmt: skip
+    assert sorted(training + holdout) == list(range(12)) and len(training) == 6
+    wrong = tiny_config(data={"holdout_expressions": ("S009/e0",)})
+    with pytest.raises(ConfigError, match="names S009/e0; expected SUBJECT/EXPRESSION such as"):
+        split_samples(keys, wrong)
+
+
+def test_a_rendering_with_nan_is_refused_not_passed_over(source):
+    views = HeadViews(source, ellipsoid_head())
+    render = training_render(prepare(views, tiny_config()).model, views)
+
+    def damaged(item):
+        out = render(item)
+        out.image[0, 0, 0] = float("nan")
+        return out
+
+    with pytest.raises(TrainError, match="the rendering holds NaN"):
+        evaluate(views, [0], damaged)

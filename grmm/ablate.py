@@ -1,0 +1,212 @@
+"""The paper's ablations as one command: rows trained and fitted under one budget, one table.
+
+Finished rows are kept: a row is measured again only when its settings, the shards or the protocol
+differ from those it was measured with; a half-trained row goes on from its checkpoint.
+"""
+
+from __future__ import annotations
+
+import fnmatch
+import hashlib
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+
+from express50.errors import ConfigError
+from express50.head.load import load_head
+from express50.publish import dump_json, write_bytes, write_json
+from grmm.ablation_table import GROUPS, SHOWN, Variant, variants_of, write_tables
+from grmm.checkpoint import Loaded, load_checkpoint
+from grmm.config import Config
+from grmm.data import HeadViews, spread
+from grmm.evaluate import evaluate, kind_of, mean, training_render
+from grmm.judge import Judge
+from grmm.presets import as_tables, from_tables
+from grmm.progress import log
+from grmm.shard_source import open_shards
+from grmm.train import train
+from grmm.unseen import Protocol, evaluate_unseen
+
+
+def ablate(
+    roots: Sequence[Path],
+    out: Path,
+    config: Config,
+    protocol: Protocol,
+    subjects: Sequence[str] = (),
+    names: Sequence[str] = (),
+) -> dict[str, object]:
+    """Measure every row that is not measured yet; writes ablation.json and ablation.md.
+
+    Args:
+        roots: folders of shards; several are mixed.
+        out: a folder a row, and the tables.
+        config: of the full model; its budget is every row's.
+        protocol: how unseen people are fitted.
+        subjects: unseen people; empty: all that the training split lacks.
+        names: rows; empty: all.
+
+    Raises:
+        ConfigError: an unknown row, or nothing is held out.
+    """
+    config = with_holdout(roots, config)
+    variants = variants_of(roots, names)
+    rows: dict[str, dict] = {}
+    for name, variant in variants.items():
+        rows[name] = _row(roots, out, name, variant, config, protocol, subjects)
+        write_tables(out, rows, variants, config)
+    return json.loads((out / "ablation.json").read_bytes())
+
+
+def with_holdout(roots: Sequence[Path], config: Config) -> Config:
+    """Hold out the middle camera by id where the configuration holds out none."""
+    if config.data.holdout_cameras:
+        return config
+    cameras = sorted({key.camera for key in open_shards(roots, config.data.split).keys})
+    if len(cameras) < 2:
+        raise ConfigError(f"{roots[0]}: one camera; expected two or more, to hold one out")
+    chosen = cameras[len(cameras) // 2]
+    log(f"ablate: holding out camera {chosen}")
+    return replace(config, data=replace(config.data, holdout_cameras=(chosen,)))
+
+
+def changed(config: Config, variant: Variant, used: Sequence[Path]) -> Config:
+    """The configuration of a row; what it holds out is what its own datasets have of it."""
+    tables = as_tables(config)
+    for table, values in variant.changes.items():
+        tables[table] |= values
+    if variant.without is not None:
+        keys = open_shards(used, config.data.split).keys
+        cameras = {key.camera for key in keys}
+        frames = {f"{key.subject}/{key.expression}" for key in keys}
+        data = tables["data"]
+        data["holdout_cameras"] = [c for c in data["holdout_cameras"] if c in cameras]
+        data["holdout_expressions"] = [
+            p for p in data["holdout_expressions"] if fnmatch.filter(frames, p)
+        ]
+    return from_tables(tables)
+
+
+def _row(
+    roots: Sequence[Path],
+    out: Path,
+    name: str,
+    variant: Variant,
+    config: Config,
+    protocol: Protocol,
+    subjects: Sequence[str],
+) -> dict:
+    """The numbers of one row, from its file if it was measured with these very settings."""
+    used = [root for root in roots if root != variant.without]
+    settings = changed(config, variant, used)
+    digest = _digest(roots, used, settings, protocol, subjects)
+    path = out / name / "row.json"
+    if path.exists():
+        row = json.loads(path.read_bytes())
+        if row["digest"] == digest:
+            log(f"ablate: {name} is measured")
+            return row
+        log(f"ablate: {name} was measured with other settings: again")
+    folder = out / (variant.trains_as or name)
+    if not variant.trains_as:
+        _train(used, folder, settings)
+    loaded = load_checkpoint(folder / "checkpoint.pt")
+    log(f"ablate: measuring {name}")
+    row = measure(replace(loaded, config=settings), roots, used, protocol, subjects)
+    row |= {"digest": digest, "label": variant.label, "paper_db": variant.paper_db}
+    write_json(path, row)
+    return row
+
+
+def _train(used: Sequence[Path], folder: Path, settings: Config) -> None:
+    """Train a row, or go on where it stopped; another configuration starts afresh."""
+    tables = as_tables(settings)
+    wanted = dump_json({"tables": {k: v for k, v in tables.items() if k not in ("fit", "metrics")}})
+    mark, checkpoint = folder / "settings.json", folder / "checkpoint.pt"
+    same = mark.exists() and mark.read_bytes() == wanted
+    if not same:
+        checkpoint.unlink(missing_ok=True)
+        write_bytes(mark, wanted)
+    source = open_shards(used, settings.data.split)
+    log(f"ablate: training {folder.name}")
+    train(source, load_head(source.head), folder, settings, resume=checkpoint.exists())
+
+
+def measure(
+    loaded: Loaded,
+    roots: Sequence[Path],
+    used: Sequence[Path],
+    protocol: Protocol,
+    subjects: Sequence[str],
+) -> dict:
+    """Held-out views and expressions of training people, and people that training never saw."""
+    data = loaded.config.data
+    views = HeadViews(
+        open_shards(roots, "*"),
+        loaded.head,
+        background=data.background,
+        torso=data.torso,
+        cache_mb=data.cache_mb,
+    )
+    kinds = [kind_of(key, loaded.model.subjects, loaded.gallery) for key in views.keys]
+    groups: dict[str, dict] = {}
+    for group, kind in GROUPS.items():
+        own = [
+            i
+            for i, k in enumerate(kinds)
+            if k == kind and views.keys[i].expression in loaded.model.expressions
+        ]
+        # Without a dataset other people are trained: their views are no comparison.
+        if not own or len(used) < len(roots):
+            continue
+        chosen = spread(own, protocol.images) if protocol.images else own
+        judge = Judge(loaded.config.metrics)
+        rows = evaluate(views, chosen, training_render(loaded.model, views), judge)
+        groups[group] = _means(rows, judge)
+    judge, rows, efforts = Judge(loaded.config.metrics), [], []
+    for subject in subjects or sorted(unseen_subjects(roots, views, data.split)):
+        found, effort = evaluate_unseen(loaded, views, subject, protocol, judge)
+        rows += found
+        efforts.append(effort)
+    for group in ("unseen", "unseen_expression"):
+        own_rows = [row for row in rows if row["kind"] == GROUPS[group]]
+        if own_rows:
+            groups[group] = _means(own_rows, judge, GROUPS[group])
+    return {
+        "groups": groups,
+        "fits": efforts,
+        "gaussians": len(loaded.model.texels),
+        "parameters": sum(parameter.numel() for parameter in loaded.model.parameters()),
+        "iterations": loaded.loop.get("iteration"),
+        "seconds": round(float(loaded.loop.get("seconds", 0.0)), 1),
+    }
+
+
+def unseen_subjects(roots: Sequence[Path], views: HeadViews, split: str) -> set[str]:
+    """People of all splits that no row trains on: those outside the training split."""
+    trained = {key.subject for key in open_shards(roots, split).keys}
+    return {key.subject for key in views.keys} - trained
+
+
+def _means(rows: list, judge: Judge, kind: str | None = None) -> dict:
+    return {n: mean(rows, n) for n in SHOWN} | {"fid": judge.fid(kind), "images": len(rows)}
+
+
+def _digest(
+    roots: Sequence[Path],
+    used: Sequence[Path],
+    settings: Config,
+    protocol: Protocol,
+    subjects: Sequence[str],
+) -> str:
+    """What a row's numbers depend on, but for the code."""
+    indices = [hashlib.sha256((root / "index.json").read_bytes()).hexdigest() for root in roots]
+    content = {
+        "shards": indices,
+        "used": [roots.index(root) for root in used],
+        "config": as_tables(settings),
+        "protocol": asdict(protocol),
+        "subjects": list(subjects),
+    }
+    return hashlib.sha256(dump_json(content)).hexdigest()

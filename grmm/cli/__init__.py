@@ -1,0 +1,34 @@
+"""``grmm``: train, fit, render, export, view, evaluate, score, ablate, study.
+
+Handlers parse, call the library, print.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+
+from express50.console import run_handler
+from grmm.cli import draw, learn, measure, study
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Entry point of the ``grmm`` command; returns the exit code (0 ok, 1 failed, 2 usage)."""
+    args = build_parser().parse_args(arguments)
+    return run_handler("grmm", args.handler, args)
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """The argument parser with all commands."""
+    parser = argparse.ArgumentParser(prog="grmm", description=__doc__)
+    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+    learn.add_train(commands)
+    learn.add_fit(commands)
+    draw.add_render(commands)
+    draw.add_export(commands)
+    draw.add_view(commands)
+    measure.add_evaluate(commands)
+    measure.add_score(commands)
+    measure.add_ablate(commands)
+    study.add_study(commands)
+    return parser

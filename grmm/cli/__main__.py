@@ -1,0 +1,7 @@
+"""``python -m grmm.cli``."""
+
+import sys
+
+from grmm.cli import main
+
+sys.exit(main())

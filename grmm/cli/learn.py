@@ -1,0 +1,141 @@
+"""``grmm train`` and ``grmm fit``."""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import replace
+from pathlib import Path
+
+from express50.console import OK, say, say_json
+from grmm.cli.shared import (
+    add_checkpoint_and_shards,
+    add_metrics,
+    load,
+    metric_settings,
+    open_views,
+    parse_seconds,
+    select,
+    split_names,
+)
+from grmm.config import Config
+from grmm.presets import PRESETS, resolve
+
+
+def add_train(commands: argparse._SubParsersAction) -> None:
+    """Add the parser of ``grmm train``."""
+    parser = commands.add_parser(
+        "train",
+        help="train on packed shards",
+        epilog="example: grmm train data/pack/shards run --preset demo --seconds 240",
+    )
+    parser.add_argument("shards", type=Path, help="folder of shards")
+    parser.add_argument("out", type=Path, help="folder for checkpoint.pt, metrics.json, preview/")
+    add_training(parser)
+    parser.add_argument("--overfit", action="store_true", help="check: train on one view only")
+    parser.add_argument("--resume", action="store_true", help="go on from OUT/checkpoint.pt")
+    parser.add_argument("--json", action="store_true", help="print metrics as JSON")
+    parser.set_defaults(handler=_train)
+
+
+def add_training(parser: argparse.ArgumentParser) -> None:
+    """The arguments that `train_config` reads, and more folders of shards."""
+    parser.add_argument("--preset", default="paper", help=f"{', '.join(PRESETS)} (paper)")
+    parser.add_argument("--config", type=Path, help="TOML file over the preset")
+    parser.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        metavar="TABLE.KEY=VALUE",
+        help="one value over everything else, for example train.lr=1e-3; repeatable",
+    )
+    parser.add_argument(
+        "--also",
+        type=Path,
+        action="append",
+        default=[],
+        metavar="SHARDS",
+        help="mix in; repeatable",
+    )
+    parser.add_argument(
+        "--seconds", "--budget", type=parse_seconds, help="stop after this long: 240, 4m, 2h"
+    )
+    parser.add_argument("--holdout-cameras", default="", help="camera ids to test on: cam02,cam05")
+    parser.add_argument(
+        "--holdout-expressions", default="", metavar="SUBJECT/EXPRESSION,..", help="to test on"
+    )
+    add_metrics(parser)
+
+
+def _train(args: argparse.Namespace) -> int:
+    from express50.head.load import load_head
+    from grmm.shard_source import open_shards
+    from grmm.train import train
+
+    config = train_config(args)
+    source = open_shards([args.shards, *args.also], config.data.split)
+    metrics = train(source, load_head(source.head), args.out, config, resume=args.resume)
+    if args.json:
+        say_json(metrics)
+    else:
+        for name in ("psnr_heldout_view_db", "psnr_train_db", "ssim", "iterations", "gaussians"):
+            say(f"{name}: {metrics.get(name)}")
+        say(f"wrote {args.out / 'checkpoint.pt'}")
+    return OK
+
+
+def train_config(args: argparse.Namespace) -> Config:
+    """Resolved configuration of ``grmm train``: its own flags stand above --set."""
+    config = resolve(args.preset, args.config, [*args.set, *metric_settings(args)])
+    if args.seconds is not None:
+        config = replace(config, train=replace(config.train, seconds=args.seconds))
+    if args.holdout_cameras:
+        cameras = split_names(args.holdout_cameras)
+        config = replace(config, data=replace(config.data, holdout_cameras=cameras))
+    if args.holdout_expressions:
+        frames = split_names(args.holdout_expressions)
+        config = replace(config, data=replace(config.data, holdout_expressions=frames))
+    if getattr(args, "overfit", False):
+        config = replace(config, train=replace(config.train, overfit=1))
+    return config
+
+
+def add_fit(commands: argparse._SubParsersAction) -> None:
+    """Add the parser of ``grmm fit``."""
+    parser = commands.add_parser(
+        "fit",
+        help="fit an unseen subject",
+        epilog="example: grmm fit run/checkpoint.pt shards out --subject S004 "
+        "--expression neutral --cameras cam02,cam03 --budget 60s",
+    )
+    add_checkpoint_and_shards(parser)
+    parser.add_argument("out", type=Path, help="folder for checkpoint.pt, metrics.json, pictures")
+    parser.add_argument("--subject", required=True, help="whom to fit")
+    parser.add_argument("--expression", default="*", help="ids or patterns of expressions to fit")
+    parser.add_argument("--cameras", default="*", help="ids or patterns of the cameras to fit from")
+    parser.add_argument(
+        "--seconds", "--budget", type=parse_seconds, help="stop after this long: 60s, 5m"
+    )
+    parser.add_argument("--set", action="append", default=[], metavar="fit.KEY=VALUE")
+    add_metrics(parser)
+    parser.add_argument("--json", action="store_true", help="print metrics as JSON")
+    parser.set_defaults(handler=_fit)
+
+
+def _fit(args: argparse.Namespace) -> int:
+    from grmm.fit import fit
+
+    loaded = load(args.checkpoint, [*args.set, *metric_settings(args)], args.seconds)
+    views = open_views(loaded, args.shards)
+    given = select(views, args.subject, args.expression, args.cameras)
+    chosen = set(given)
+    rest = [i for i in select(views, args.subject, args.expression, "*") if i not in chosen]
+    metrics = fit(loaded, views, given, rest, args.out)
+    if args.json:
+        say_json(metrics)
+    else:
+        reached = f"{metrics['seconds']} s, {metrics['iterations']} iterations"
+        say(
+            f"psnr_db: {metrics['psnr_db']} ({metrics['psnr_is_of']}), after {reached}",
+            f"wrote {args.out}",
+        )
+    return OK

@@ -1,0 +1,306 @@
+"""Points of the model's space and moves between them: everything a picture needs but a camera.
+
+FLAME's parameters (the tracked mesh) and the residual codes are separate inputs of the model, so
+each can be changed alone: one subject's codes with another's expression, a wider jaw under the
+same codes, a code moved along its principal directions under the same jaw.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from express50.config import nearest
+from express50.errors import ConfigError
+from express50.torch_transforms import axis_angle_to_quat, quat_to_axis_angle, slerp
+from grmm.checkpoint import Loaded
+from grmm.data import NO_OFFSETS, Tracked, pose_state
+from grmm.model import HeadState
+
+ANGLES = {"neck": 3, "jaw": 3, "eyes": 6}  # axis-angles by name, radians
+CODES = ("z_id", "z_exp")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Head:
+    """One head: residual codes and head-model parameters.
+
+    Attributes:
+        z_id: residual identity code.
+        z_exp: residual expression code.
+        tracked: head-model parameters; its place (R, t) moves no picture in head space.
+    """
+
+    z_id: Tensor
+    z_exp: Tensor
+    tracked: Tracked
+
+    def state(self, loaded: Loaded) -> HeadState:
+        """The posed mesh in head space."""
+        return pose_state(loaded.head, self.tracked)
+
+
+def trained_head(loaded: Loaded, subject: str, expression: str) -> Head:
+    """A training subject with a training expression; a frame it never showed comes by transfer.
+
+    Raises:
+        ConfigError: the checkpoint knows no such subject or expression.
+    """
+    model, frames = loaded.model, loaded.gallery.frames
+    _known("subject", subject, model.subjects)
+    _known("expression", expression, model.expressions)
+    tracked = frames.get((subject, expression))
+    if tracked is None:
+        donor = next(s for s, e in frames if e == expression)
+        own = next(frame for (s, _), frame in frames.items() if s == subject)
+        tracked = transfer(own, frames[donor, expression])
+    codes = model.codes(model.subjects.index(subject), model.expressions.index(expression))
+    return Head(z_id=codes[0].detach(), z_exp=codes[1].detach(), tracked=tracked)
+
+
+def with_expression(identity: Head, expression: Head) -> Head:
+    """Expression transfer: one head's identity with all that another's expression is made of."""
+    return Head(
+        z_id=identity.z_id,
+        z_exp=expression.z_exp,
+        tracked=transfer(identity.tracked, expression.tracked),
+    )
+
+
+def between(a: Head, b: Head, t: float) -> Head:
+    """The head at ``t`` from a (0) to b (1): codes and parameters are blended."""
+    return Head(
+        z_id=torch.lerp(a.z_id, b.z_id, t),
+        z_exp=torch.lerp(a.z_exp, b.z_exp, t),
+        tracked=interpolate_tracked(a.tracked, b.tracked, t),
+    )
+
+
+def transfer(identity: Tracked, expression: Tracked) -> Tracked:
+    """One frame's head and place, another's expression, jaw, neck and eyes."""
+    return replace(
+        expression,
+        shape=identity.shape,
+        R=identity.R,
+        t=identity.t,
+        offsets=identity.offsets,
+    )
+
+
+def interpolate_tracked(a: Tracked, b: Tracked, t: float) -> Tracked:
+    """Blend parameters from a (t = 0) to b (1): linear, but jaw, neck and eyes by SLERP.
+
+    Source: the paper's supplement, locality regularisation; place (R, t) stays a's.
+    """
+    return Tracked(
+        shape=_lerp(a.shape, b.shape, t),
+        expression=_lerp(a.expression, b.expression, t),
+        neck=slerp_axis_angle(a.neck, b.neck, t),
+        jaw=slerp_axis_angle(a.jaw, b.jaw, t),
+        eyes=np.concatenate(
+            [slerp_axis_angle(a.eyes[i : i + 3], b.eyes[i : i + 3], t) for i in (0, 3)]
+        ),
+        R=a.R,
+        t=a.t,
+        offsets=_blend_offsets(a.offsets, b.offsets, t),
+    )
+
+
+def slerp_axis_angle(a: np.ndarray, b: np.ndarray, t: float) -> np.ndarray:
+    """Spherical interpolation of two axis-angle vectors (3,), radians, along the shorter arc."""
+    quats = [
+        axis_angle_to_quat(torch.as_tensor(np.asarray(x), dtype=torch.float64)) for x in (a, b)
+    ]
+    return quat_to_axis_angle(slerp(quats[0], quats[1], t)).numpy()
+
+
+def controlled(loaded: Loaded, head: Head, controls: Mapping[str, Sequence[float]]) -> Head:
+    """Change single parameters of a head; all others stay.
+
+    Names: ``jaw``, ``neck``, ``eyes`` (axis-angles, radians; three numbers turn both eyes),
+    ``jaw.0`` for one entry, ``shape.3``, ``expression.NAME`` or ``expression.3`` (coefficients);
+    ``z_id`` and ``z_exp`` scale a code about zero, ``z_id.0`` moves it that many standard
+    deviations along a principal direction of the training codes.
+
+    Raises:
+        ConfigError: no such parameter, a wrong count of numbers, or one that is not finite.
+    """
+    for name, values in controls.items():
+        if not np.isfinite(values).all():
+            raise ConfigError(f"control {name}: got {list(values)}, expected finite numbers")
+        table, _, entry = name.partition(".")
+        if table in CODES:
+            head = _with_code(loaded, head, table, entry, values, name)
+        elif table in (*ANGLES, "shape", "expression"):
+            tracked = _with_parameter(loaded, head.tracked, table, entry, values, name)
+            head = replace(head, tracked=tracked)
+        else:
+            known = (*ANGLES, "shape", "expression", *CODES)
+            raise ConfigError(
+                f"control {name!r} is unknown{nearest(table, known)}; expected {', '.join(known)}, "
+                "with .NUMBER or .NAME for one entry"
+            )
+    return head
+
+
+def principal_directions(codes: Tensor) -> Tensor:
+    """(K, D) directions of codes (S, D), one standard deviation long, the strongest first."""
+    return _directions(codes, codes._version)
+
+
+@lru_cache(maxsize=4)
+def _directions(codes: Tensor, version: int) -> Tensor:
+    """Kept, because sliders ask again and again; a code table that training changes is another."""
+    centred = codes.detach().double() - codes.detach().double().mean(0)
+    if len(codes) < 2:
+        return codes.new_zeros(0, codes.shape[1])
+    _, spread, directions = torch.linalg.svd(centred, full_matrices=False)
+    kept = spread > 1e-9 * spread.max().clamp_min(1e-12)
+    scaled = spread[kept, None] / (len(codes) - 1) ** 0.5 * directions[kept]
+    # The sign of a singular vector is arbitrary: its largest entry shall be positive.
+    largest = scaled.gather(1, scaled.abs().argmax(1, keepdim=True))
+    return (scaled * largest.sign()).to(codes.dtype)
+
+
+def sample_identity(loaded: Loaded, head: Head, rng: np.random.Generator, spread: float) -> Head:
+    """A new person with the given head's expression.
+
+    Codes, shape and offsets are drawn together from the Gaussian that the training subjects
+    span (``spread`` 1 has their covariance), so that a face and its skin still belong together.
+
+    Raises:
+        ConfigError: the checkpoint has fewer than two subjects.
+    """
+    model, frames = loaded.model, loaded.gallery.frames
+    own = [next(t for (s, _), t in frames.items() if s == subject) for subject in model.subjects]
+    weights = _sample_weights(len(own), rng, spread, "subjects")
+    shape = _combine([frame.shape for frame in own], weights)
+    offsets = [frame.offsets for frame in own]
+    longest = max(offsets, key=len)
+    padded = [x if len(x) else np.zeros_like(longest) for x in offsets]
+    mixed = _combine(padded, weights).astype(np.float32) if len(longest) else NO_OFFSETS
+    z_id = torch.as_tensor(weights).to(model.z_id) @ model.z_id.detach()
+    tracked = replace(head.tracked, shape=shape, offsets=mixed)
+    return replace(head, z_id=z_id, tracked=tracked)
+
+
+def sample_expression(loaded: Loaded, head: Head, rng: np.random.Generator, spread: float) -> Head:
+    """The given person with a new expression, drawn as `sample_identity` draws people.
+
+    Coefficients and jaw stay within what training showed: activations have bounds.
+
+    Raises:
+        ConfigError: the checkpoint has fewer than two expressions.
+    """
+    model, frames = loaded.model, loaded.gallery.frames
+    mean = {
+        expression: [frame for (_, e), frame in frames.items() if e == expression]
+        for expression in model.expressions
+    }
+    weights = _sample_weights(len(mean), rng, spread, "expressions")
+    length = max(len(frame.expression) for frame in frames.values())
+
+    def drawn(name: str, size: int) -> np.ndarray:
+        rows = [[_padded(getattr(f, name), size) for f in own] for own in mean.values()]
+        low = np.min([np.min(row, 0) for row in rows], 0)
+        high = np.max([np.max(row, 0) for row in rows], 0)
+        return np.clip(_combine([np.mean(row, 0) for row in rows], weights), low, high)
+
+    tracked = replace(head.tracked, expression=drawn("expression", length), jaw=drawn("jaw", 3))
+    z_exp = torch.as_tensor(weights).to(model.z_exp) @ model.z_exp.detach()
+    return replace(head, z_exp=z_exp, tracked=tracked)
+
+
+def _sample_weights(count: int, rng: np.random.Generator, spread: float, what: str) -> np.ndarray:
+    """Weights (count,) that sum to 1; a weighted sum has the rows' mean and covariance."""
+    if count < 2:
+        raise ConfigError(
+            f"the checkpoint has {count} of {what}, expected two or more to draw from"
+        )
+    noise = spread * rng.standard_normal(count) / np.sqrt(count - 1)
+    return 1 / count + noise - noise.mean()
+
+
+def _combine(rows: Sequence[np.ndarray], weights: np.ndarray) -> np.ndarray:
+    length = max(len(row) for row in rows)
+    return np.tensordot(weights, np.stack([_padded(row, length) for row in rows]), 1)
+
+
+def _padded(values: np.ndarray, length: int) -> np.ndarray:
+    """Missing coefficients are zero."""
+    return np.pad(values, [(0, length - len(values)), *[(0, 0)] * (values.ndim - 1)])
+
+
+def _with_code(
+    loaded: Loaded, head: Head, table: str, entry: str, values: Sequence[float], name: str
+) -> Head:
+    amount = _numbers(values, 1, name)[0]
+    code = getattr(head, table)
+    if not entry:
+        return replace(head, **{table: amount * code})
+    directions = principal_directions(getattr(loaded.model, table))
+    number = _entry(entry, len(directions), name, "principal directions of the training codes")
+    return replace(head, **{table: code + amount * directions[number]})
+
+
+def _with_parameter(
+    loaded: Loaded, tracked: Tracked, table: str, entry: str, values: Sequence[float], name: str
+) -> Tracked:
+    sizes = ANGLES | {
+        "shape": loaded.head.shape_dirs.shape[2],
+        "expression": len(loaded.head.expression_names),
+    }
+    changed = _padded(np.array(getattr(tracked, table), dtype=np.float64), sizes[table])
+    if entry:
+        names = loaded.head.expression_names if table == "expression" else ()
+        place = names.index(entry) if entry in names else None
+        if place is None:
+            place = _entry(entry, sizes[table], name, f"{table} parameters", names)
+        changed[place] = _numbers(values, 1, name)[0]
+    elif table in ANGLES:
+        twice = table == "eyes" and len(values) == 3
+        changed[:] = _numbers([*values, *values] if twice else values, sizes[table], name)
+    else:
+        raise ConfigError(f"control {name!r}: say which entry, for example {table}.0")
+    return replace(tracked, **{table: changed})
+
+
+def _numbers(values: Sequence[float], count: int, name: str) -> Sequence[float]:
+    if len(values) != count:
+        raise ConfigError(f"control {name}: got {len(values)} numbers, expected {count}")
+    return values
+
+
+def _entry(text: str, count: int, name: str, what: str, names: Sequence[str] = ()) -> int:
+    if text.isdecimal() and int(text) < count:
+        return int(text)
+    named = nearest(text, names) if names else ""
+    raise ConfigError(f"control {name!r}: there are {count} {what}, 0 to {count - 1}{named}")
+
+
+def _known(what: str, name: str, known: Sequence[str]) -> None:
+    if name not in known:
+        raise ConfigError(
+            f"the checkpoint knows no {what} {name}{nearest(name, known)}; it has "
+            f"{', '.join(list(known)[:12])}"
+        )
+
+
+def _blend_offsets(a: np.ndarray, b: np.ndarray, t: float) -> np.ndarray:
+    """(1 - t) a + t b (V, 3); (0, 3) stands for zeros."""
+    if not len(a) and not len(b):
+        return a
+    a, b = (x if len(x) else np.zeros_like(max(a, b, key=len)) for x in (a, b))
+    return a if a is b else ((1 - t) * a + t * b).astype(np.float32)
+
+
+def _lerp(a: np.ndarray, b: np.ndarray, t: float) -> np.ndarray:
+    """(1 - t) a + t b; the shorter one is padded with zeros."""
+    length = max(len(a), len(b))
+    a, b = (_padded(x, length) for x in (a, b))
+    return (1 - t) * a + t * b

@@ -1,0 +1,102 @@
+"""Judge a model on people it never saw: fit them from a few views, measure on the others."""
+
+from __future__ import annotations
+
+import fnmatch
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from torch import Tensor
+
+from express50.errors import ConfigError
+from grmm.checkpoint import Loaded
+from grmm.data import HeadViews, Item, spread
+from grmm.evaluate import HELD_IDENTITY, Row, evaluate
+from grmm.fit import Fit, run_stages, start
+from grmm.judge import Judge
+from grmm.model import Rendering
+
+NOVEL_VIEW = f"{HELD_IDENTITY}, novel view"
+NOVEL_EXPRESSION = f"{HELD_IDENTITY}, other expression"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Protocol:
+    """How unseen people are shown to a model.
+
+    Attributes:
+        cameras: patterns of the cameras to fit from; empty: the first by id.
+        expression: the expression to fit; others are rendered with the codes of training.
+        images: at most so many are measured a person and kind, 0 = all.
+    """
+
+    cameras: tuple[str, ...] = ()
+    expression: str = "neutral"
+    images: int = 0
+
+
+def evaluate_unseen(
+    loaded: Loaded,
+    views: HeadViews,
+    subject: str,
+    protocol: Protocol,
+    judge: Judge,
+    keep: Callable[[int, Tensor], None] | None = None,
+) -> tuple[list[Row], dict[str, Any]]:
+    """Fit a person from the protocol's views; rows of its other views and expressions, effort.
+
+    Raises:
+        ConfigError: the shards hold no such views.
+    """
+    given = given_views(views, subject, protocol)
+    cameras = {views.keys[i].camera for i in given}
+    state = start(loaded, views, given)
+    _, effort = run_stages(state, lambda: {})
+    known = {*state.z_exp, *loaded.model.expressions}
+    own = [
+        i
+        for i, key in enumerate(views.keys)
+        if key.subject == subject and key.expression in known and key.camera not in cameras
+    ]
+    rows = []
+    for kind, fitted in ((NOVEL_VIEW, True), (NOVEL_EXPRESSION, False)):
+        chosen = [i for i in own if (views.keys[i].expression in state.z_exp) == fitted]
+        chosen = spread(chosen, protocol.images) if protocol.images else chosen
+        rows += evaluate(
+            views, chosen, any_expression(state), judge, lambda key, kind=kind: kind, keep
+        )
+    return rows, {"subject": subject, "cameras": sorted(cameras)} | effort
+
+
+def given_views(views: HeadViews, subject: str, protocol: Protocol) -> list[int]:
+    """Indices of the views to fit from."""
+    own = [
+        i
+        for i, key in enumerate(views.keys)
+        if key.subject == subject and key.expression == protocol.expression
+    ]
+    cameras = sorted({views.keys[i].camera for i in own})
+    patterns: Sequence[str] = protocol.cameras or cameras[:1]
+    given = [i for i in own if any(fnmatch.fnmatchcase(views.keys[i].camera, p) for p in patterns)]
+    if not given:
+        raise ConfigError(
+            f"{subject}: no view of expression {protocol.expression} by cameras "
+            f"{', '.join(patterns) or 'any'}; its cameras are {', '.join(cameras) or 'none'}"
+        )
+    return given
+
+
+def any_expression(state: Fit) -> Callable[[Item], Rendering]:
+    """How a fitted person is rendered, in fitted expressions and in those of training."""
+    model = state.model
+
+    def render(item: Item) -> Rendering:
+        name = item.key.expression
+        if name in state.z_exp:
+            z_exp = state.z_exp[name]
+        else:
+            z_exp = model.z_exp[model.expressions.index(name)]
+        return model.render(state.z_id, z_exp, item.state, item.view, state.views.background)
+
+    return render

@@ -1,0 +1,180 @@
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from express50.errors import FormatError
+from express50.images import read_image, write_image
+from grmm import ablate as ablate_module
+from grmm import checkpoint as checkpoint_module
+from grmm.ablation_table import VARIANTS
+from grmm.anchors import make_anchors
+from grmm.cli import main
+from grmm.shard_source import open_shards
+from tests.grmm.packed import write_shards
+from tests.grmm.synthetic import EllipsoidSource, ellipsoid_head
+
+TINY = [
+    "--set=model.n_g=32", "--set=model.ladder=[8, 8]", "--set=model.refine_widths=[8]",
+    "--set=model.seed_channels=8", "--set=train.iterations=2", "--set=train.evaluate_images=1",
+    "--set=fit.stage1_iterations=1", "--set=fit.stage2_iterations=1", "--preset=demo",
+    "--set=train.warm_start_images=2",
+]  # fmt: skip
+
+
+def mouth_head():
+    """The ellipsoid with two rings that play the inside of the mouth."""
+    head = ellipsoid_head()
+    v = head.uv[:, 1]
+    head.regions["mouth_interior"][(v > 0.3) & (v < 0.55)] = True
+    return head
+
+
+@pytest.fixture(autouse=True, scope="module")
+def toy_head():
+    from express50.head import load
+
+    with pytest.MonkeyPatch.context() as patch:
+        for module in (load, checkpoint_module, ablate_module):
+            patch.setattr(module, "load_head", lambda spec: mouth_head())
+        yield
+
+
+@pytest.fixture(scope="module")
+def roots(tmp_path_factory):
+    """Two data sets: S000, S001 and the unseen S002; and S003, S004."""
+    source = EllipsoidSource(subjects=5, size=32)
+    base = tmp_path_factory.mktemp("sets")
+    return [
+        write_shards(base / "one", source, subjects=("S000", "S001", "S002")),
+        write_shards(base / "two", source, subjects=("S003", "S004")),
+    ]
+
+
+@pytest.fixture(scope="module")
+def table(roots, tmp_path_factory):
+    out = tmp_path_factory.mktemp("ablation")
+    assert main(command(roots, out)) == 0
+    return out
+
+
+def command(roots, out):
+    return [
+        "ablate", str(roots[0]), str(out), f"--also={roots[1]}", *TINY, "--fit-expression=e0",
+        "--holdout-cameras=cam01", "--holdout-expressions=S001/e1", "--fit-cameras=cam00",
+    ]  # fmt: skip
+
+
+def test_every_ablation_of_the_paper_is_a_row(table):
+    rows = json.loads((table / "ablation.json").read_text())["rows"]
+    assert set(rows) == {*VARIANTS, "without_one", "without_two"}
+    full = rows["full"]["groups"]
+    # Camera cam01 of 4 subjects x 2 expressions, less the held-out frame.
+    assert full["view"]["images"] == 7 and full["expression"]["images"] == 3
+    assert full["unseen"]["images"] == 2 and full["unseen_expression"]["images"] == 2
+    assert set(rows["without_one"]["groups"]) == {"unseen", "unseen_expression"}
+    assert rows["no_locality"]["groups"]["view"] == full["view"]
+    for name, row in rows.items():
+        got = row["difference_db"]["unseen"]
+        assert got == pytest.approx(
+            row["groups"]["unseen"]["psnr_db"] - full["unseen"]["psnr_db"], abs=2e-3
+        ), name
+    assert rows["no_mouth_uv"]["gaussians"] < rows["full"]["gaussians"]
+    assert rows["no_refinement"]["parameters"] < rows["full"]["parameters"]
+    assert not (table / "no_locality" / "checkpoint.pt").exists()
+
+
+def test_the_table_is_the_papers(table):
+    lines = (table / "ablation.md").read_text().splitlines()
+    assert lines[0].startswith("| Method | held-out view: PSNR | SSIM | LPIPS | dB over full |")
+    assert any(line.startswith("| W/o residuals |") and "| -1.63 |" in line for line in lines)
+    assert lines[-1].startswith("FID: n/a:") or lines[-3].startswith("LPIPS: n/a:")
+
+
+def test_finished_rows_are_kept_and_changed_ones_measured_again(table, roots, monkeypatch, capsys):
+    before = {p: p.stat().st_mtime_ns for p in table.rglob("checkpoint.pt")}
+    trained = []
+    monkeypatch.setattr(ablate_module, "train", lambda *a, **k: trained.append(a[2].name))
+    assert main(command(roots, table)) == 0
+    assert trained == [] and all(p.stat().st_mtime_ns == t for p, t in before.items())
+    assert capsys.readouterr().err.count("is measured") == 8
+    (table / "no_residuals" / "row.json").unlink()
+    assert main(command(roots, table)) == 0
+    assert trained == ["no_residuals"]
+
+
+def test_unknown_rows_are_named(roots, tmp_path, capsys):
+    assert main([*command(roots, tmp_path), "--rows=no_residual"]) == 2
+    assert "did you mean 'no_residuals'" in capsys.readouterr().err
+
+
+def test_faces_of_the_mouth_lose_their_gaussians_only():
+    head = mouth_head()
+    whole, without = make_anchors(head, 32), make_anchors(head, 32, mouth=False)
+    gone = sorted(set(whole.texels.tolist()) - set(without.texels.tolist()))
+    faces = {int(f) for t, f in zip(whole.texels, whole.faces, strict=True) if int(t) in set(gone)}
+    inner = head.regions["mouth_interior"][head.faces].all(1)
+    teeth = head.regions["teeth"][head.faces].any(1)
+    assert faces and all(inner[f] or teeth[f] for f in faces)
+    assert not (inner | teeth)[without.faces].any()
+
+
+def test_mixed_data_sets_share_expressions_and_refuse_common_subjects(roots):
+    mixed = open_shards(roots, "train")
+    assert {key.subject for key in mixed.keys} == {"S000", "S001", "S003", "S004"}
+    alone = open_shards(roots[1:], "train")
+    index = next(i for i, key in enumerate(mixed.keys) if key == alone.keys[4])
+    np.testing.assert_array_equal(mixed.read(index).image, alone.read(4).image)
+    with pytest.raises(FormatError, match="subject S000 is also in"):
+        open_shards([roots[0], roots[0]], "train")
+
+
+@pytest.fixture(scope="module")
+def evaluated(table, roots, tmp_path_factory):
+    out = tmp_path_factory.mktemp("evaluated")
+    arguments = [
+        "evaluate", str(table / "full" / "checkpoint.pt"), str(roots[0]), str(out),
+        "--fit-cameras=cam00", "--fit-expression=e0", f"--save={out / 'pictures'}",
+    ]  # fmt: skip
+    assert main(arguments) == 0
+    return out
+
+
+def test_evaluation_tells_what_was_held_out(evaluated):
+    kinds = json.loads((evaluated / "evaluation.json").read_text())["by_kind"]
+    assert {kind: row["images"] for kind, row in kinds.items()} == {
+        "seen view": 6,
+        "held-out view": 3,
+        "held-out expression": 3,
+        "held-out identity, novel view": 2,
+        "held-out identity, other expression": 2,
+    }
+
+
+def test_saved_pictures_score_as_they_were_evaluated(evaluated, roots, tmp_path):
+    arguments = ["score", str(evaluated / "pictures"), str(roots[0]), str(tmp_path), "--partial"]
+    assert main(arguments) == 0
+    ours = json.loads((evaluated / "evaluation.json").read_text())
+    theirs = json.loads((tmp_path / "evaluation.json").read_text())
+    assert theirs["images"] == ours["images"] == 16
+    for name, tolerance in (("psnr_db", 0.05), ("ssim", 2e-3), ("rmse", 2e-3)):  # 8 bits
+        assert theirs[name] == pytest.approx(ours[name], abs=tolerance)
+
+
+def test_missing_and_mis_sized_pictures_are_named(evaluated, roots, tmp_path, capsys):
+    folder = evaluated / "pictures"
+    score = ["score", str(folder), str(roots[0]), str(tmp_path)]
+    assert main(score) == 1
+    assert "2 of 18 pictures are missing: S002_e0_cam00" in capsys.readouterr().err
+    path = Path(folder) / "S000_e0_cam01.png"
+    whole = read_image(path)
+    try:
+        write_image(path, whole[:20])
+        assert main([*score, "--partial"]) == 1
+        assert "S000_e0_cam01.png is 32 x 20, expected 32 x 32" in capsys.readouterr().err
+        path.write_bytes(b"noise")
+        assert main([*score, "--partial"]) == 1
+        assert "cannot be read" in capsys.readouterr().err
+    finally:
+        write_image(path, whole)

@@ -1,0 +1,193 @@
+import numpy as np
+import pytest
+import torch
+
+from express50.errors import ConfigError
+from grmm import checkpoint as checkpoint_module
+from grmm.checkpoint import load_checkpoint
+from grmm.edit import (
+    between,
+    controlled,
+    principal_directions,
+    sample_expression,
+    sample_identity,
+    trained_head,
+    with_expression,
+)
+from grmm.export import cloud, surface, write_export
+from grmm.render import frontal, novel_views, orbit, picture, resized
+from grmm.sheets import control_sheet, residual_sheet, sample_sheet
+from grmm.train import train
+from tests.grmm.synthetic import EllipsoidSource, ellipsoid_head, tiny_config
+
+
+@pytest.fixture(scope="module")
+def loaded(tmp_path_factory):
+    out = tmp_path_factory.mktemp("run")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(checkpoint_module, "load_head", lambda spec: ellipsoid_head())
+        source = EllipsoidSource(subjects=3, expressions=3, size=32)
+        train(source, ellipsoid_head(), out, tiny_config())
+        return load_checkpoint(out / "checkpoint.pt")
+
+
+def test_transfer_takes_all_of_the_expression_and_none_of_the_identity(loaded):
+    a, b = trained_head(loaded, "S000", "e0"), trained_head(loaded, "S001", "e2")
+    moved = with_expression(a, b)
+    assert torch.equal(moved.z_id, a.z_id) and torch.equal(moved.z_exp, b.z_exp)
+    assert moved.tracked.shape is a.tracked.shape
+    assert moved.tracked.expression is b.tracked.expression
+
+
+def test_blending_meets_both_ends(loaded):
+    a, b = trained_head(loaded, "S000", "e0"), trained_head(loaded, "S001", "e2")
+    for t, end in ((0.0, a), (1.0, b)):
+        got = between(a, b, t)
+        torch.testing.assert_close(got.z_id, end.z_id)
+        torch.testing.assert_close(got.z_exp, end.z_exp)
+        np.testing.assert_allclose(got.tracked.expression, end.tracked.expression)
+
+
+@pytest.mark.parametrize(
+    ("name", "values", "field", "expected"),
+    [
+        ("jaw", (0.3, 0.0, 0.1), "jaw", [0.3, 0, 0.1]),
+        ("neck.1", (0.2,), "neck", [0, 0.2, 0]),
+        ("eyes", (0.0, 0.4, 0.0), "eyes", [0, 0.4, 0, 0, 0.4, 0]),
+        ("expression.e3", (0.7,), "expression", [1, 0, 0, 0.7]),
+        ("expression.1", (0.5,), "expression", [1, 0.5, 0, 0]),
+        ("shape.2", (-1.0,), "shape", [0, 0, -1]),
+    ],
+)
+def test_a_control_changes_one_parameter(loaded, name, values, field, expected):
+    head = trained_head(loaded, "S000", "e1")
+    got = controlled(loaded, head, {name: values})
+    np.testing.assert_allclose(getattr(got.tracked, field), expected)
+    others = set(vars(head.tracked)) - {field}
+    assert all(getattr(got.tracked, other) is getattr(head.tracked, other) for other in others)
+    assert got.z_id is head.z_id and got.z_exp is head.z_exp
+
+
+def test_codes_move_alone(loaded):
+    head = trained_head(loaded, "S000", "e1")
+    got = controlled(loaded, head, {"z_exp": (0.0,), "z_id.1": (2.0,)})
+    assert not got.z_exp.any() and got.tracked is head.tracked
+    moved = (got.z_id - head.z_id).double()
+    torch.testing.assert_close(moved, 2 * principal_directions(loaded.model.z_id)[1].double())
+
+
+def test_principal_directions_rebuild_the_covariance(loaded):
+    codes = loaded.model.z_id.detach().double()
+    directions = principal_directions(codes)
+    assert directions.shape == (2, codes.shape[1])  # three subjects
+    torch.testing.assert_close(directions.T @ directions, torch.cov(codes.T), atol=1e-12, rtol=1e-9)
+    assert principal_directions(codes[:1]).shape == (0, codes.shape[1])
+
+
+@pytest.mark.parametrize(
+    ("controls", "message"),
+    [
+        ({"jwa": (1.0,)}, "did you mean 'jaw'"),
+        ({"jaw": (1.0,)}, "got 1 numbers, expected 3"),
+        ({"neck.3": (1.0,)}, "3 neck parameters, 0 to 2"),
+        ({"expression.e9": (1.0,)}, "4 expression parameters"),
+        ({"expression": (1.0,)}, "say which entry"),
+        ({"z_id.2": (1.0,)}, "2 principal directions"),
+        ({"jaw.0": (float("nan"),)}, "expected finite"),
+    ],
+)
+def test_wrong_controls_are_named(loaded, controls, message):
+    with pytest.raises(ConfigError, match=message):
+        controlled(loaded, trained_head(loaded, "S000", "e0"), controls)
+    with pytest.raises(ConfigError, match="knows no subject S9"):
+        trained_head(loaded, "S9", "e0")
+
+
+def test_samples_have_the_mean_and_covariance_of_training(loaded):
+    head = trained_head(loaded, "S000", "e0")
+    rng = np.random.default_rng(0)
+    drawn = torch.stack(
+        [sample_identity(loaded, head, rng, 1.0).z_id for _ in range(4000)]
+    ).double()
+    codes = loaded.model.z_id.detach().double()
+    spread = float(torch.cov(codes.T).diagonal().sum())
+    assert float((drawn.mean(0) - codes.mean(0)).square().sum()) < 4e-3 * spread
+    gap = torch.cov(drawn.T) - torch.cov(codes.T)
+    assert float(gap.norm()) < 0.1 * spread
+
+
+def test_sampled_expressions_stay_within_training_and_keep_the_person(loaded):
+    head = trained_head(loaded, "S000", "e0")
+    rng = np.random.default_rng(0)
+    drawn = [sample_expression(loaded, head, rng, 3.0) for _ in range(20)]
+    values = np.array([one.tracked.expression[0] for one in drawn])
+    assert values.min() >= 0 and values.max() <= 2 and values.std() > 0.1  # e0, e1, e2
+    assert all(one.z_id is head.z_id for one in drawn)
+
+
+def test_orbit_upwards_keeps_distance_and_sees_from_above(loaded):
+    view, centre = frontal(loaded), loaded.model.head_centre.double()
+    up = orbit(view, 0, centre, pitch=30)
+
+    def eye(v):
+        return -v.cam_from_head[:3, :3].T @ v.cam_from_head[:3, 3] - centre
+
+    assert float(eye(up)[1]) > float(eye(view)[1]) + 0.1
+    torch.testing.assert_close(eye(up).norm(), eye(view).norm())
+    seen = up.cam_from_head[:3, :3] @ centre + up.cam_from_head[:3, 3]
+    before = view.cam_from_head[:3, :3] @ centre + view.cam_from_head[:3, 3]
+    torch.testing.assert_close(seen, before)
+
+
+def test_pictures_of_another_size_show_the_same(loaded):
+    head, view = trained_head(loaded, "S000", "e0"), frontal(loaded)
+    large = picture(loaded, head, resized(view, 64)).astype(float)
+    small = picture(loaded, head, view).astype(float)
+    assert large.shape == (64, 64, 3)
+    halved = large.reshape(32, 2, 32, 2, 3).mean((1, 3))
+    assert np.abs(halved - small).mean() < 6
+
+
+def test_sheets_have_a_row_for_everything(loaded):
+    head, view = trained_head(loaded, "S000", "e0"), frontal(loaded)
+    rows, labels = control_sheet(loaded, head, view)
+    assert labels[:3] == ["jaw", "neck, yaw", "eyes, yaw"] and "z_exp.0" in labels
+    stretched = rows[labels.index("e0")]
+    assert not np.array_equal(stretched[0], stretched[-1])
+    (pictures,), _ = residual_sheet(loaded, head, trained_head(loaded, "S001", "e2"), view)
+    assert len(pictures) == 6
+    (rows, _), heads = sample_sheet(loaded, head, view, 2, seed=1)
+    again = sample_sheet(loaded, head, view, 2, seed=1)[0][0]
+    assert [len(row) for row in rows] == [2, 2, 2] and len(heads["both"]) == 2
+    np.testing.assert_array_equal(rows[2][1], again[2][1])
+    assert len(novel_views(loaded, head, view)) == 3
+
+
+def test_glb_holds_the_mesh_with_its_texture(loaded, tmp_path):
+    import trimesh
+
+    head, view = trained_head(loaded, "S001", "e1"), frontal(loaded)
+    for name in ("a.glb", "b.glb"):
+        write_export(tmp_path / name, loaded, head, view)
+    assert (tmp_path / "a.glb").read_bytes() == (tmp_path / "b.glb").read_bytes()
+    mesh = trimesh.load(tmp_path / "a.glb", force="mesh")
+    made = surface(loaded, head, view)
+    assert len(mesh.faces) == len(made.faces)
+    np.testing.assert_allclose(mesh.triangles.mean(1), made.vertices[made.faces].mean(1), atol=1e-6)
+    texture = np.asarray(mesh.visual.material.baseColorTexture.convert("RGB"))
+    np.testing.assert_array_equal(texture, made.texture)
+
+
+def test_glb_of_points_and_npz(loaded, tmp_path):
+    import trimesh
+
+    head, view = trained_head(loaded, "S001", "e1"), frontal(loaded)
+    write_export(tmp_path / "p.glb", loaded, head, view, points=True)
+    points = trimesh.load(tmp_path / "p.glb").geometry.popitem()[1]
+    gaussians = cloud(loaded, head, view)
+    assert len(points.vertices) == (gaussians.opacities > 0.3).sum()
+    write_export(tmp_path / "a.npz", loaded, head, view)
+    arrays = np.load(tmp_path / "a.npz")
+    np.testing.assert_array_equal(arrays["means"], gaussians.means)
+    np.testing.assert_array_equal(arrays["z_exp"], head.z_exp.numpy())
+    assert arrays["flame_jaw"].shape == (3,) and len(arrays["mesh_vertices"]) == 187

@@ -1,0 +1,87 @@
+import threading
+
+import numpy as np
+import pytest
+import torch
+
+from grmm import checkpoint as checkpoint_module
+from grmm.checkpoint import load_checkpoint
+from grmm.edit import controlled, trained_head
+from grmm.preview import Preview
+from grmm.render import frontal, orbit, picture
+from grmm.train import train
+from grmm.viewer import Viewer
+from tests.grmm.browser import Browser
+from tests.grmm.synthetic import EllipsoidSource, ellipsoid_head, tiny_config
+
+
+@pytest.fixture(scope="module")
+def loaded(tmp_path_factory):
+    out = tmp_path_factory.mktemp("run")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(checkpoint_module, "load_head", lambda spec: ellipsoid_head())
+        train(EllipsoidSource(size=32), ellipsoid_head(), out, tiny_config())
+        result = load_checkpoint(out / "checkpoint.pt")
+    generator = torch.Generator().manual_seed(0)
+    with torch.no_grad():  # codes that show in pictures
+        result.model.z_id += torch.randn(result.model.z_id.shape, generator=generator)
+        result.model.colour.bias += 0.5
+    return result
+
+
+def test_a_head_at_rest_is_the_rendered_picture_whatever_came_before(loaded):
+    preview, view = Preview(loaded), frontal(loaded)
+    turned = orbit(view, 40, loaded.model.head_centre)
+    a, b = trained_head(loaded, "S000", "e0"), trained_head(loaded, "S001", "e1")
+    wide = controlled(loaded, a, {"expression.0": (2.0,)})
+    for head, camera in ((a, view), (a, turned), (wide, turned), (b, turned), (a, view)):
+        preview.draw(head, camera, moving=True)
+        np.testing.assert_array_equal(
+            preview.draw(head, camera, moving=False), picture(loaded, head, camera)
+        )
+
+
+def test_moving_pictures_decode_only_what_changed(loaded, monkeypatch):
+    calls = []
+    for name in ("decode", "appearance"):
+        original = getattr(loaded.model, name)
+        spy = lambda *a, name=name, original=original: calls.append(name) or original(*a)  # noqa: E731
+        monkeypatch.setattr(loaded.model, name, spy)
+    preview, view = Preview(loaded), frontal(loaded)
+    head = trained_head(loaded, "S000", "e0")
+    preview.draw(head, view, moving=True)
+    assert calls == ["decode", "appearance"]
+    preview.draw(controlled(loaded, head, {"jaw.0": (0.2,)}), view, moving=True)
+    assert calls == ["decode", "appearance"]
+    preview.draw(head, orbit(view, 0.5, loaded.model.head_centre), moving=True)
+    assert calls == ["decode", "appearance"]
+    preview.draw(head, orbit(view, 20, loaded.model.head_centre), moving=True)
+    assert calls == ["decode", "appearance", "appearance"]
+    preview.draw(trained_head(loaded, "S001", "e0"), view, moving=True)
+    assert calls[3:] == ["decode", "appearance"]
+
+
+def test_a_slider_moved_in_a_browser_changes_the_picture(loaded):
+    viewer = Viewer(loaded, port=18200, moving=48, still=64)
+    thread = threading.Thread(target=viewer.run)
+    thread.start()
+    try:
+        browser = Browser(viewer.port)
+        eye = np.array([0.0, 0.05, 0.7])
+        browser.look(eye)
+        assert browser.listen(1).shape == (48, 48, 3)
+        first = browser.settle(64)
+        assert first.max() > 60
+        labels = set(browser.controls)
+        assert {"jaw open", "neck turn", "expression e0", "z_id 0", "z_exp scale"} <= labels
+        browser.move("expression e0", 1.4)
+        assert np.abs(browser.settle(64) - first).max() > 20
+        browser.look(np.array([0.7, 0.05, 0.0]))
+        side = browser.settle(64)
+        browser.move("subject", "S001")
+        assert np.abs(browser.settle(64) - side).max() > 20
+        browser.close()
+    finally:
+        viewer.stop()
+        thread.join(timeout=10)
+    assert not thread.is_alive()
