@@ -57,6 +57,9 @@ class TrackConfig:
     """Texels a side of the texture of the subject's colours (albedo.png); 0 for none."""
     round_iterations: int = 4
     """Levenberg-Marquardt steps a round of outlines and colours."""
+    render_rounds: int = 0
+    """Visits of every expression at each of two sizes when, after the photometric rounds, the head
+    is rendered and compared with every picture; 0 for none."""
     min_score: float = 0.2
     """Views whose face score is lower are left out."""
     min_landmarks: int = 20
@@ -95,7 +98,7 @@ class TrackConfig:
                 "track: landmark_floor_px, landmark_bias, smooth_mm and the priors must be above 0"
             )
         rounds = (self.cameras, self.silhouette_rounds, self.photo_rounds, self.relief_rounds)
-        if min(rounds) < 0 or self.round_iterations < 1:
+        if min(*rounds, self.render_rounds) < 0 or self.round_iterations < 1:
             raise ConfigError(
                 "track: cameras and rounds must not be negative, round_iterations at least 1"
             )
@@ -117,6 +120,6 @@ PRESETS: dict[str, dict[str, object]] = {
     "reference": {
         "refinements": 5, "iterations": 30, "silhouette_rounds": 4, "relief_rounds": 8,
         "photo_rounds": 2, "samples": 8000, "photo_side": 1024, "offset_modes": 250,
-        "round_iterations": 6, "sweeps": 4,
+        "round_iterations": 6, "sweeps": 4, "render_rounds": 4,
     },
 }  # fmt: skip

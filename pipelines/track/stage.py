@@ -45,6 +45,7 @@ from pipelines.track.outline import Outline, signed_distance
 from pipelines.track.overlay import draw_overlays
 from pipelines.track.pinhole import project_pinhole
 from pipelines.track.refine import Moment, all_vertices, refine, rotations
+from pipelines.track.render import rendered_like_pictures
 from pipelines.track.sheet import write_sheet
 from pipelines.track.shots import Shot, cut_shot
 from pipelines.track.sparse_head import Basis, make_basis
@@ -99,6 +100,8 @@ def run(dataset: Dataset, item: str, config: TrackConfig, out: Path) -> dict:
     eyes = measure_eyes(basis.model, targets, meshes, rotations(state))
     moments = _moments(dataset, item, targets, meshes, config)
     state, targets, appearance = refine(basis, targets, state, moments, eyes, config)
+    if config.render_rounds and appearance is not None:
+        state = rendered_like_pictures(basis.model, targets, state, moments, appearance, config)
     state = rounded(state, DECIMALS)
     vertices = all_vertices(basis.model, state)
     _write_track(out / "track.npz", config.head, basis, targets, state, vertices)

@@ -229,7 +229,7 @@ def aligned(ingested):
         cue.expression_id: {
             "frame": cue.start_frame,
             "camera": camera,
-            "pts": 0,
+            "pts": index.cameras[camera].pts[cue.start_frame],
             "dhash": dhash(read_frame(ingested, "S001", camera, cue.start_frame, undistort=False)),
             "confidence": 1.0,
             "annotator": "test",

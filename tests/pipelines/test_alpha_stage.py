@@ -39,7 +39,8 @@ def align(dataset: Dataset, subject: str) -> None:
     for cue in index.cues:
         frame = read_frame(dataset, subject, "cam00", cue.start_frame, undistort=False)
         rows[cue.expression_id] = {
-            "frame": cue.start_frame, "camera": "cam00", "pts": 0, "dhash": dhash(frame),
+            "frame": cue.start_frame, "camera": "cam00",
+            "pts": index.cameras["cam00"].pts[cue.start_frame], "dhash": dhash(frame),
             "confidence": 1.0, "annotator": "test",
         }  # fmt: skip
     folder = dataset.item_dir("align", subject)

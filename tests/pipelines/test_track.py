@@ -325,7 +325,12 @@ def tracked_dataset(tmp_path: Path, ingested, monkeypatch: pytest.MonkeyPatch):
     camera_id = sorted(index.cameras)[0]
     source = index.cameras[camera_id]
     peaks = {
-        name: {"frame": frame, "camera": camera_id, "pts": 0, "dhash": source.dhash[frame]}
+        name: {
+            "frame": frame,
+            "camera": camera_id,
+            "pts": source.pts[frame],
+            "dhash": source.dhash[frame],
+        }
         for name, frame in (("neutral", 1), ("smile", 4))
     }
     folder = ingested.item_dir("align", "S001")
