@@ -132,7 +132,10 @@ def _clips(
     cameras = read_cameras_of(dataset, subject)
 
     def observe(cue: str, frame: int) -> Observation | None:
-        views = _views(dataset, subject, cameras, frame, source, config)
+        try:
+            views = _views(dataset, subject, cameras, frame, source, config)
+        except CaptureError:
+            return None
         observation = agree(cue, frame, views)[0] if views else None
         enough = observation and observation.inliers.sum(1).max() >= config.min_landmarks
         return observation if enough else None
@@ -169,7 +172,11 @@ def _observe(
     found = {}
     for expression in order:
         now = {name: cameras[name] for name in chosen}
-        views = _views(dataset, subject, now, peaks[expression], source, config)
+        try:
+            views = _views(dataset, subject, now, peaks[expression], source, config)
+        except CaptureError as error:
+            dropped.append({"what": expression, "why": str(error)})
+            continue
         if config.cameras and len(chosen) > config.cameras and len(views) >= config.cameras:
             views = sorted(views, key=lambda view: float(np.median(view.sigma)) / view.score)
             views = views[: config.cameras]
@@ -197,16 +204,23 @@ def _views(
     source: Source,
     config: TrackConfig,
 ) -> list[View]:
-    """Views with a face in them; a camera whose footage lacks the frame is skipped."""
-    views = []
+    """Views with a face in them; a camera whose footage lacks the frame is skipped.
+
+    Raises:
+        CaptureError: no camera's footage has it.
+    """
+    views, missing = [], []
     for camera_id, camera in cameras.items():
         try:
             image = read_frame(dataset, subject, camera_id, frame)
-        except CaptureError:
+        except CaptureError as error:
+            missing.append(error)
             continue
         seen = source(image, camera_id, frame)
         if seen.face.score >= config.min_score:
             views.append(make_view(camera, seen))
+    if missing and len(missing) == len(cameras):
+        raise missing[0]
     return views
 
 

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from express50.cameras import Camera, project
 from express50.config import build_config
-from express50.errors import ConfigError, StageError
+from express50.errors import CaptureError, ConfigError, StageError
 from express50.head.model import landmarks, pose
 from express50.landmarks.detector import Detection
 from express50.landmarks.iris import Irises
@@ -394,4 +394,18 @@ def test_no_face_anywhere_is_a_clear_error(
     blind = Marked(nothing, no_irises(), visible_contour=False)
     monkeypatch.setattr(stage, "open_source", lambda *unused: lambda *image: blind)
     with pytest.raises(StageError, match="S001: no expression could be tracked"):
+        STAGE.run(dataset, "S001", TrackConfig(), tmp_path)
+
+
+def test_footage_that_is_gone_is_told_from_faces_that_are_not_there(
+    tracked_dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from pipelines.track import STAGE, stage
+
+    def gone(*unused):
+        raise CaptureError("cam00: cannot be opened")
+
+    dataset, _ = tracked_dataset
+    monkeypatch.setattr(stage, "read_frame", gone)
+    with pytest.raises(StageError, match="cannot be opened"):
         STAGE.run(dataset, "S001", TrackConfig(), tmp_path)
