@@ -41,9 +41,10 @@ from express50.twin.truth import Truth, align_worlds
 from pipelines import track
 from pipelines.depth import STAGE
 from pipelines.depth.grid import Grid, View, head_box, hull_distance
-from pipelines.depth.reconstruct import reconstruct
+from pipelines.depth.reconstruct import Surface, reconstruct
 from pipelines.depth.stage import read_prior, read_views
 from pipelines.depth.surface import closed, extract_mesh
+from pipelines.depth.trace import trace
 
 PRESETS = ("draft", "standard", "reference")
 BASELINES = ("visual_hull", "tracked_mesh", "tsdf_fusion")
@@ -127,6 +128,8 @@ def measure(dataset_root: Path, truth_root: Path, item: str, name: str) -> dict 
         mesh = made
     found["s"] = None if name == "tracked_mesh" else time.process_time() - start
     found["gib"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+    if name in PRESETS:
+        found["raycast"] = both_ways(surface, [camera for camera, _, _ in pictures[::8]])
     cameras = {camera.id: camera for camera, _, _ in pictures}
     motion = align_worlds(cameras, truth.cameras(subject))
     rows = [
@@ -135,6 +138,33 @@ def measure(dataset_root: Path, truth_root: Path, item: str, name: str) -> dict 
     for key in ("errors", "skin", "degrees"):
         found[key] = np.concatenate([row[key] for row in rows])
     return found | {"covered": float(np.mean([row["covered"] for row in rows]))}
+
+
+def both_ways(surface: Surface, cameras: list[Camera]) -> dict:
+    """Processor milliseconds a megapixel of casting at the mesh and at the distances; difference.
+
+    Building the mesh's tree counts, finding normals and confidence does not.
+    """
+    clock, depths = {}, {}
+    pixels = sum(camera.width * camera.height for camera in cameras)
+    for name in ("mesh", "sdf"):
+        start = time.process_time()
+        if name == "sdf":
+            depths[name] = [trace(surface.grid, camera) for camera in cameras]
+        else:
+            scene = mesh_scene(surface.vertices, surface.faces)
+            hits = [scene.cast_rays(_rows(camera), nthreads=1) for camera in cameras]
+            depths[name] = [hit["t_hit"].numpy() for hit in hits]
+        clock[name] = 1e9 * (time.process_time() - start) / pixels
+    pairs = zip(depths["mesh"], depths["sdf"], strict=True)
+    apart = np.concatenate([np.abs(a - b)[np.isfinite(a) & np.isfinite(b)] for a, b in pairs])
+    return {"ms": clock, "difference_mm": 1e3 * float(np.median(apart))}
+
+
+def _rows(camera: Camera) -> o3d.core.Tensor:
+    origin, directions = rays(camera)
+    row = np.concatenate([np.broadcast_to(origin, directions.shape), directions], -1)
+    return o3d.core.Tensor(row.astype(np.float32))
 
 
 def baseline(
@@ -188,11 +218,7 @@ def cast(mesh: Mesh, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
     )
     hull.compute_vertex_normals()
     own = np.asarray(hull.vertex_normals)
-    origin, directions = rays(camera)
-    row = np.concatenate([np.broadcast_to(origin, directions.shape), directions], -1)
-    hits = mesh_scene(vertices, faces).cast_rays(
-        o3d.core.Tensor(row.astype(np.float32)), nthreads=1
-    )
+    hits = mesh_scene(vertices, faces).cast_rays(_rows(camera), nthreads=1)
     depth = hits["t_hit"].numpy()
     hit = np.isfinite(depth)
     corners = faces[np.where(hit, hits["primitive_ids"].numpy(), 0)]
@@ -225,6 +251,12 @@ def summary(rows: list[dict]) -> dict:
         figures["voxel_mm"] = round(rows[0]["voxel_mm"], 3)
         figures["voxels_allocated"] = max(row["allocated"] for row in rows)
         figures["voxels_dense"] = max(row["dense"] for row in rows)
+        figures["raycast_ms_per_megapixel"] = {
+            way: round(float(np.mean([row["raycast"]["ms"][way] for row in rows])), 1)
+            for way in ("mesh", "sdf")
+        }
+        apart = [row["raycast"]["difference_mm"] for row in rows]
+        figures["raycast_difference_mm"] = round(float(np.mean(apart)), 4)
     return figures
 
 

@@ -37,6 +37,8 @@ class DepthConfig:
     """Gaussian smoothing of the distances before each level, in voxels."""
     min_views: int = 2
     """Fewest usable cameras; at least 2."""
+    raycast: str = "mesh"
+    """What rays are cast at: "mesh" (triangles, fast) or "sdf" (the distances themselves)."""
     qc_views: int = 4
     """Cameras in the quality picture."""
 
@@ -50,6 +52,8 @@ class DepthConfig:
             raise ValueError(f"voxel_px is {self.voxel_px}, expected 0 to 8")
         if self.patch_samples < 3 or self.patch_samples % 2 == 0:
             raise ValueError(f"patch_samples is {self.patch_samples}, expected an odd number >= 3")
+        if self.raycast not in ("mesh", "sdf"):
+            raise ValueError(f"raycast is {self.raycast!r}, expected 'mesh' or 'sdf'")
         if self.min_views < 2:
             raise ValueError(f"min_views is {self.min_views}, expected at least 2")
         if self.noise <= 0 or self.stiffness_voxels <= 0 or self.image_side < 16:
@@ -59,5 +63,5 @@ class DepthConfig:
 PRESETS: dict[str, dict[str, object]] = {
     "draft": {"voxel_mm": 4.0, "image_side": 512},
     "standard": {},
-    "reference": {"voxel_mm": 1.0, "patch_samples": 7, "image_side": 2048},
+    "reference": {"voxel_mm": 1.0, "patch_samples": 7, "image_side": 2048, "raycast": "sdf"},
 }

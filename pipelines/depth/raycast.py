@@ -39,25 +39,41 @@ def cast_view(
     row = np.concatenate([np.broadcast_to(origin, directions.shape), directions], axis=-1)
     hits = scene.cast_rays(o3d.core.Tensor(row.astype(np.float32)), nthreads=1)
     depth = hits["t_hit"].numpy()
+    hit = np.isfinite(depth)
+    faces = surface.faces[hits["primitive_ids"].numpy()[hit]]
+    u, v = hits["primitive_uvs"].numpy()[hit].T
+    corners = np.stack([1 - u - v, u, v], axis=1)  # (n, 3) barycentric
+    normals, confidence = np.zeros((*depth.shape, 3)), np.zeros(depth.shape)
+    normals[hit] = (surface.normals[faces] * corners[..., None]).sum(1)
+    confidence[hit] = (surface.confidence[faces] * corners).sum(1)
+    return depth_view(camera, alpha, depth, normals, confidence)
+
+
+def depth_view(
+    camera: Camera,
+    alpha: np.ndarray,
+    depth: np.ndarray,
+    normals: np.ndarray,
+    confidence: np.ndarray,
+) -> DepthView:
+    """A camera's picture of a surface: valid where it is hit inside the matte (H, W).
+
+    `depth` (H, W) is not finite where nothing is hit; `normals` (H, W, 3) are of the world and of
+    any length; `confidence` (H, W) fades where the surface is seen at a slant.
+    """
     hit = np.isfinite(depth) & (depth > 0)
     inside = alpha > INSIDE
     valid = hit & inside
-    faces = surface.faces[hits["primitive_ids"].numpy()[valid]]
-    u, v = hits["primitive_uvs"].numpy()[valid].T
-    corners = np.stack([1 - u - v, u, v], axis=1)  # (n, 3) barycentric
-    normals = (surface.normals[faces] * corners[..., None]).sum(1)
-    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
-    way = directions[valid]
-    cosine = -(normals * way).sum(1) / np.linalg.norm(way, axis=1)
-    confidence = np.zeros(depth.shape, np.float32)
-    confidence[valid] = (surface.confidence[faces] * corners).sum(1) * np.clip(cosine / STEEP, 0, 1)
-    picture = np.zeros((*depth.shape, 3), np.float32)
-    picture[valid] = normals @ camera.cam_from_world[:3, :3].T
+    normals = normals / np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-9)
+    _, way = rays(camera)
+    cosine = -(normals * way).sum(-1) / np.linalg.norm(way, axis=-1)
+    confidence = np.where(valid, confidence * np.clip(cosine / STEEP, 0, 1), 0.0)
+    picture = np.where(valid[..., None], normals @ camera.cam_from_world[:3, :3].T, 0.0)
     return DepthView(
         depth=np.where(valid, depth, 0).astype(np.float32),
         valid=valid,
-        confidence=np.clip(confidence, 0, 1),
-        normals=picture,
+        confidence=np.clip(confidence, 0, 1).astype(np.float32),
+        normals=picture.astype(np.float32),
         covered=float(valid.sum() / max(int(inside.sum()), 1)),
         spill=float((hit & ~inside).sum() / max(int(hit.sum()), 1)),
     )

@@ -27,6 +27,7 @@ from pipelines.depth.surface import (
     extract_mesh,
     fair,
     graph_laplacian,
+    largest_body,
     largest_part,
     refined,
     rim_targets,
@@ -216,6 +217,7 @@ def _pins(
 
 def _finish(views: Sequence[View], grid: Grid, config: DepthConfig) -> Surface:
     """Mesh, confidence and colours of the final grid."""
+    grid = largest_body(grid)
     vertices, normals, faces = extract_mesh(grid)
     if not len(faces):
         raise StageError(

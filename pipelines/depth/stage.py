@@ -22,6 +22,7 @@ from pipelines.depth.grid import View
 from pipelines.depth.prior import Prior, make_prior, matte_agreement
 from pipelines.depth.raycast import DepthView, cast_view, write_ply
 from pipelines.depth.reconstruct import reconstruct
+from pipelines.depth.trace import trace_view
 from pipelines.depth.views import make_view, without_contradiction
 
 UNITS = (0.05, 1.0)  # metres; a head's box outside this range means other units than metres
@@ -68,7 +69,10 @@ def run(dataset: Dataset, item: str, config: DepthConfig, out: Path) -> dict:
     scene = mesh_scene(surface.vertices, surface.faces)
     seen = {}
     for camera, _, alpha in pictures:
-        seen[camera.id] = cast_view(surface, scene, camera, alpha)
+        if config.raycast == "sdf":
+            seen[camera.id] = trace_view(surface, camera, alpha)
+        else:
+            seen[camera.id] = cast_view(surface, scene, camera, alpha)
         _write_view(out, camera.id, seen[camera.id])
     write_ply(out / "surface.ply", surface)
     _write_picture(out, pictures, seen, config.qc_views)

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import scipy.sparse as sparse
-from scipy.ndimage import gaussian_filter, map_coordinates
+from scipy.ndimage import gaussian_filter, label, map_coordinates
 from scipy.sparse.linalg import cg
 from skimage.measure import marching_cubes
 
@@ -24,10 +24,10 @@ def extract_mesh(grid: Grid) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     if not (grid.values.min() < 0 < grid.values.max()):
         return np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3), np.int64)
     index, faces, _, _ = marching_cubes(grid.values, 0.0, gradient_direction="descent")
-    return grid.points(index), _gradient(grid, index), faces.astype(np.int64)
+    return grid.points(index), grid_normals(grid, index), faces.astype(np.int64)
 
 
-def _gradient(grid: Grid, index: np.ndarray) -> np.ndarray:
+def grid_normals(grid: Grid, index: np.ndarray) -> np.ndarray:
     """Unit gradient (N, 3) at fractional voxel indices (N, 3), from values smoothed by a voxel."""
     smooth = gaussian_filter(grid.values, 1.0)
     step = np.eye(3)
@@ -217,11 +217,22 @@ def closed(values: np.ndarray) -> np.ndarray:
     return values
 
 
+def largest_body(grid: Grid) -> Grid:
+    """The grid with only the largest connected inside; what floats beside it is outside."""
+    inside = grid.values < 0
+    labels, count = label(inside, structure=np.ones((3, 3, 3)))
+    if count < 2:
+        return grid
+    largest = 1 + int(np.bincount(labels.ravel())[1:].argmax())
+    values = np.where(inside & (labels != largest), np.float32(grid.voxel), grid.values)
+    return Grid(grid.origin, grid.voxel, values)
+
+
 def largest_part(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """Faces (F', 3) of the largest connected part: a head is one; what floats beside it is not."""
     graph = sparse.coo_matrix(
         (np.ones(len(faces) * 2), (faces[:, [0, 1]].ravel(), faces[:, [1, 2]].ravel())),
         (len(vertices), len(vertices)),
     )
-    label = sparse.csgraph.connected_components(graph, directed=False)[1][faces[:, 0]]
-    return faces[label == np.bincount(label).argmax()]
+    part = sparse.csgraph.connected_components(graph, directed=False)[1][faces[:, 0]]
+    return faces[part == np.bincount(part).argmax()]

@@ -1,0 +1,85 @@
+"""Depth from signed distances: against a sphere that is known, and against the mesh's."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from express50.cameras import Camera, rays
+from express50.raycast import mesh_scene
+from pipelines.depth.config import DepthConfig
+from pipelines.depth.grid import Grid
+from pipelines.depth.raycast import cast_view
+from pipelines.depth.reconstruct import Surface
+from pipelines.depth.surface import extract_mesh, largest_body
+from pipelines.depth.trace import trace, trace_view
+from tests.pipelines.bump_head import ring
+
+RADIUS, VOXEL = 0.09, 0.003
+
+
+def ball(centre=0.0, radius=RADIUS) -> Grid:
+    origin = np.full(3, -0.15)
+    index = np.stack(np.meshgrid(*[np.arange(101)] * 3, indexing="ij"), -1)
+    values = np.linalg.norm(origin + VOXEL * index - centre, axis=-1) - radius
+    return Grid(origin, VOXEL, np.clip(values, -8 * VOXEL, 8 * VOXEL).astype(np.float32))
+
+
+def surface_of(grid: Grid) -> Surface:
+    vertices, normals, faces = extract_mesh(grid)
+    ones = np.ones(len(vertices), np.float32)
+    return Surface(vertices, normals, faces, ones, np.zeros((len(vertices), 3), np.uint8), grid)
+
+
+def true_depth(camera: Camera) -> np.ndarray:
+    """Depth of the ball, infinite beside it."""
+    origin, way = rays(camera)
+    a, b = (way * way).sum(-1), (way * origin).sum(-1)
+    root = b * b - a * (origin @ origin - RADIUS**2)
+    return np.where(root > 0, (-b - np.sqrt(np.maximum(root, 0))) / a, np.inf)
+
+
+@pytest.mark.parametrize("camera", ring(3, 160), ids=lambda camera: camera.id)
+def test_a_ball_is_found_where_it_is(camera):
+    found, true = trace(ball(), camera), true_depth(camera)
+    both = np.isfinite(found) & np.isfinite(true)
+    assert both.sum() > 500
+    assert (np.isfinite(found) != np.isfinite(true)).sum() < 0.02 * both.sum()  # the very rim
+    assert np.median(np.abs(found - true)[both]) < 0.01 * VOXEL
+    assert np.percentile(np.abs(found - true)[both], 99) < 0.25 * VOXEL
+
+
+def test_mesh_and_distances_agree():
+    camera, surface = ring(1, 160)[0], surface_of(ball())
+    alpha = np.ones((camera.height, camera.width), np.float32)
+    meshed = cast_view(surface, mesh_scene(surface.vertices, surface.faces), camera, alpha)
+    traced = trace_view(surface, camera, alpha)
+    both = meshed.valid & traced.valid
+    assert (meshed.valid != traced.valid).sum() < 0.02 * both.sum()
+    assert np.median(np.abs(meshed.depth - traced.depth)[both]) < 0.02 * VOXEL
+    assert np.median((meshed.normals * traced.normals).sum(-1)[both]) > 0.999
+    np.testing.assert_allclose(meshed.confidence[both], traced.confidence[both], atol=0.1)
+
+
+def test_what_is_not_there_is_not_hit():
+    camera = ring(1, 160)[0]
+    empty = replace(ball(), values=np.full((101, 101, 101), VOXEL, np.float32))
+    assert not np.isfinite(trace(empty, camera)).any()
+    away = replace(camera, cam_from_world=np.diag([1.0, -1.0, -1.0, 1.0]) @ camera.cam_from_world)
+    assert not np.isfinite(trace(ball(), away)).any()
+
+
+def test_only_the_largest_body_stays():
+    grid, speck = ball(), ball(0.12, 0.012)
+    both = replace(grid, values=np.minimum(grid.values, speck.values))
+    left = largest_body(both)
+    assert (left.values[speck.values < 0] > 0).all()
+    assert np.array_equal(left.values < 0, grid.values < 0)
+    assert largest_body(grid) is grid
+
+
+def test_an_unknown_way_of_casting_is_refused():
+    with pytest.raises(ValueError, match="raycast"):
+        DepthConfig(raycast="voxels")
