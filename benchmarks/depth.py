@@ -156,9 +156,9 @@ def both_ways(surface: Surface, cameras: list[Camera]) -> dict:
             hits = [scene.cast_rays(_rows(camera), nthreads=1) for camera in cameras]
             depths[name] = [hit["t_hit"].numpy() for hit in hits]
         clock[name] = 1e9 * (time.process_time() - start) / pixels
-    pairs = zip(depths["mesh"], depths["sdf"], strict=True)
-    apart = np.concatenate([np.abs(a - b)[np.isfinite(a) & np.isfinite(b)] for a, b in pairs])
-    return {"ms": clock, "difference_mm": 1e3 * float(np.median(apart))}
+    mesh, sdf = (np.concatenate([d.ravel() for d in depths[name]]) for name in ("mesh", "sdf"))
+    both = np.isfinite(mesh) & np.isfinite(sdf)
+    return {"ms": clock, "difference_mm": 1e3 * float(np.median(np.abs(mesh[both] - sdf[both])))}
 
 
 def _rows(camera: Camera) -> o3d.core.Tensor:
