@@ -29,21 +29,21 @@ import open3d as o3d
 
 from benchmarks.depth_fusion import fuse
 from benchmarks.track import prepare, twin_config
-from express50.cameras import Camera, rays, transform_camera
+from express50.cameras import Camera, transform_camera
 from express50.config import build_config
 from express50.frames import read_peaks
 from express50.head.load import load_head
 from express50.layout import Dataset
-from express50.raycast import mesh_scene
+from express50.raycast import camera_rays, mesh_scene
 from express50.runner import run_stage
 from express50.tracks import read_track
 from express50.twin.truth import Truth, align_worlds
 from pipelines import track
 from pipelines.depth import STAGE
-from pipelines.depth.grid import Grid, View, head_box, hull_distance
-from pipelines.depth.reconstruct import Surface, reconstruct
+from pipelines.depth.grid import View, head_box
+from pipelines.depth.reconstruct import Surface, hull_grid, reconstruct
 from pipelines.depth.stage import read_prior, read_views
-from pipelines.depth.surface import closed, extract_mesh
+from pipelines.depth.surface import extract_mesh
 from pipelines.depth.trace import trace
 
 PRESETS = ("draft", "standard", "reference")
@@ -119,8 +119,7 @@ def measure(dataset_root: Path, truth_root: Path, item: str, name: str) -> dict 
         prior, _ = read_prior(dataset, subject, expression, views, config)
         surface = reconstruct(views, config, prior)
         mesh = surface.vertices, surface.faces
-        found |= {"dense": surface.numbers["voxels"], "voxel_mm": surface.numbers["voxel_mm"]}
-        found["allocated"] = surface.numbers["voxels"]
+        found |= {"voxels": surface.numbers["voxels"], "voxel_mm": surface.numbers["voxel_mm"]}
     else:
         made = baseline(name, dataset, subject, expression, views)
         if made is None:
@@ -153,18 +152,12 @@ def both_ways(surface: Surface, cameras: list[Camera]) -> dict:
             depths[name] = [trace(surface.grid, camera) for camera in cameras]
         else:
             scene = mesh_scene(surface.vertices, surface.faces)
-            hits = [scene.cast_rays(_rows(camera), nthreads=1) for camera in cameras]
+            hits = [scene.cast_rays(camera_rays(camera), nthreads=1) for camera in cameras]
             depths[name] = [hit["t_hit"].numpy() for hit in hits]
         clock[name] = 1e9 * (time.process_time() - start) / pixels
     mesh, sdf = (np.concatenate([d.ravel() for d in depths[name]]) for name in ("mesh", "sdf"))
     both = np.isfinite(mesh) & np.isfinite(sdf)
     return {"ms": clock, "difference_mm": 1e3 * float(np.median(np.abs(mesh[both] - sdf[both])))}
-
-
-def _rows(camera: Camera) -> o3d.core.Tensor:
-    origin, directions = rays(camera)
-    row = np.concatenate([np.broadcast_to(origin, directions.shape), directions], -1)
-    return o3d.core.Tensor(row.astype(np.float32))
 
 
 def baseline(
@@ -174,11 +167,8 @@ def baseline(
     if name == "tsdf_fusion":
         return fuse(views, BASELINE_VOXEL_M)
     if name == "visual_hull":
-        low, high = head_box(views)
-        shape = np.ceil((high - low) / BASELINE_VOXEL_M).astype(int) + 1
-        index = np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), -1).reshape(-1, 3)
-        values = hull_distance(views, low + BASELINE_VOXEL_M * index).reshape(shape)
-        vertices, _, faces = extract_mesh(Grid(low, BASELINE_VOXEL_M, closed(values)))
+        grid = hull_grid(views, *head_box(views), BASELINE_VOXEL_M)
+        vertices, _, faces = extract_mesh(grid)
         return vertices, faces
     path = dataset.item_dir("track", subject) / "track.npz"
     found = read_track(path) if path.is_file() else None
@@ -218,7 +208,7 @@ def cast(mesh: Mesh, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
     )
     hull.compute_vertex_normals()
     own = np.asarray(hull.vertex_normals)
-    hits = mesh_scene(vertices, faces).cast_rays(_rows(camera), nthreads=1)
+    hits = mesh_scene(vertices, faces).cast_rays(camera_rays(camera), nthreads=1)
     depth = hits["t_hit"].numpy()
     hit = np.isfinite(depth)
     corners = faces[np.where(hit, hits["primitive_ids"].numpy(), 0)]
@@ -247,10 +237,11 @@ def summary(rows: list[dict]) -> dict:
     }
     seconds = [row["s"] for row in rows if row["s"] is not None]
     figures["seconds_per_frame"] = round(float(np.mean(seconds)), 2) if seconds else None
-    if "dense" in rows[0]:
+    if "voxels" in rows[0]:
         figures["voxel_mm"] = round(rows[0]["voxel_mm"], 3)
-        figures["voxels_allocated"] = max(row["allocated"] for row in rows)
-        figures["voxels_dense"] = max(row["dense"] for row in rows)
+        # the grid is dense: as many are allocated as the box holds
+        figures["voxels_allocated"] = max(row["voxels"] for row in rows)
+        figures["voxels_dense"] = figures["voxels_allocated"]
         figures["raycast_ms_per_megapixel"] = {
             way: round(float(np.mean([row["raycast"]["ms"][way] for row in rows])), 1)
             for way in ("mesh", "sdf")

@@ -74,9 +74,10 @@ def _grey(view: View) -> np.ndarray:
 
 
 def _rays_to(one: Camera, other: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """Matrix (3, 3) and vector (3,): depth * A @ (x, y, 1) + b are the other's pixels times z."""
+    """A (3, 3), b (3,): depth * A @ (x, y, 1) + b is the other's pixel times z, as in OpenCV."""
     motion = other.cam_from_world @ np.linalg.inv(one.cam_from_world)
-    return other.K @ motion[:3, :3] @ np.linalg.inv(one.K), other.K @ motion[:3, 3]
+    here, there = K_to_opencv(one.K), K_to_opencv(other.K)
+    return there @ motion[:3, :3] @ np.linalg.inv(here), there @ motion[:3, 3]
 
 
 def _warped(
@@ -89,9 +90,8 @@ def _warped(
     """The other view's picture as seen through a plane at a depth, of a window of this view."""
     matrix = plane * moved[0]
     matrix[:, 2] += moved[1]
-    half = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1.0]])
     window = np.array([[1, 0, corner[0]], [0, 1, corner[1]], [0, 0, 1.0]])
-    matrix = np.linalg.inv(half) @ matrix @ window @ half
+    matrix = matrix @ window
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     return cv2.warpPerspective(grey, matrix, shape[::-1], flags=flags)
 

@@ -7,6 +7,7 @@ import math
 import torch
 from torch import Tensor
 
+from express50.adapters import cell_to_corner, corner_to_cell
 from grmm.rasterize.projection import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN, Projection, project
 
 
@@ -56,8 +57,8 @@ def blended_pairs(scene: dict[str, Tensor], size: int) -> tuple[Tensor, Tensor]:
     visible = splats.visible.nonzero()[:, 0]
     order = visible[torch.sort(splats.depths[visible], stable=True).indices]
     mean, extent = splats.means2d[order].double(), splats.extents[order]
-    low = (mean - extent - 0.5).ceil().clamp(min=0).long()
-    high = (mean + extent - 0.5).floor().clamp(max=size - 1).long() + 1
+    low = corner_to_cell(mean - extent).ceil().clamp(min=0).long()
+    high = corner_to_cell(mean + extent).floor().clamp(max=size - 1).long() + 1
     wide, tall = (high - low).clamp(min=0).unbind(1)
     ids = torch.repeat_interleave(torch.arange(len(order)), wide * tall)
     place = torch.arange(len(ids)) - (torch.cumsum(wide * tall, 0) - wide * tall)[ids]
@@ -74,7 +75,9 @@ def blended_pairs(scene: dict[str, Tensor], size: int) -> tuple[Tensor, Tensor]:
 
 def pair_alphas(splats: Projection, gaussians: Tensor, pixels: Tensor, size: int) -> Tensor:
     """Opacity (M,) of each Gaussian at its pixel."""
-    center = torch.stack([pixels % size, pixels // size], 1).to(splats.means2d.dtype) + 0.5
+    center = cell_to_corner(
+        torch.stack([pixels % size, pixels // size], 1).to(splats.means2d.dtype)
+    )
     dx, dy = (center - splats.means2d[gaussians]).unbind(1)
     xx, xy, yy = splats.conics[gaussians].unbind(1)
     sigma = 0.5 * (xx * dx * dx + yy * dy * dy) + xy * dx * dy
@@ -98,7 +101,7 @@ def render_pairs(
     splats = project(*(scene[name] for name in GEOMETRY), size, size)
     alphas = pair_alphas(splats, gaussians, pixels, size)
     weights = alphas * before(alphas, pixels)
-    center = torch.stack([pixels % size, pixels // size], 1).to(weights.dtype) + 0.5
+    center = cell_to_corner(torch.stack([pixels % size, pixels // size], 1).to(weights.dtype))
     delta = center - splats.means2d[gaussians]
     length = splats.planes[gaussians, 0] + (splats.planes[gaussians, 1:] * delta).sum(1)
     colors = scene["colors"]

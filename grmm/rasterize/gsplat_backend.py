@@ -12,6 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from express50.adapters import cell_to_corner
 from grmm.rasterize.interface import RenderOptions, RenderOutput
 from grmm.rasterize.projection import (
     ALPHA_MAX,
@@ -91,8 +92,8 @@ def combine_planes(blended: Tensor, K: Tensor) -> Tensor:
     """Sum of weight * ray length (H, W) from blended plane channels (H, W, 3)."""
     height, width = blended.shape[:2]
     center = K[:2, 2].to(blended.dtype)
-    u = torch.arange(width, device=blended.device, dtype=blended.dtype) + 0.5 - center[0]
-    v = torch.arange(height, device=blended.device, dtype=blended.dtype) + 0.5 - center[1]
+    u = cell_to_corner(torch.arange(width, device=blended.device, dtype=blended.dtype)) - center[0]
+    v = cell_to_corner(torch.arange(height, device=blended.device, dtype=blended.dtype)) - center[1]
     a, b, c = blended.unbind(-1)
     return a + b * u[None, :] + c * v[:, None]
 
@@ -132,7 +133,9 @@ def _median_ray_length(
     gsplat's kernels do not tell which that is, but list all pairs of Gaussian and pixel in order.
     """
     gaussians, pixels = _crossings(gsplat, splats, tiles, width, height)
-    center = torch.stack([pixels % width, pixels // width], 1).to(splats.means2d.dtype) + 0.5
+    center = cell_to_corner(
+        torch.stack([pixels % width, pixels // width], 1).to(splats.means2d.dtype)
+    )
     length, slopes = splats.planes[gaussians, 0], splats.planes[gaussians, 1:]
     length = length + (slopes * (center - splats.means2d[gaussians])).sum(1)
     empty = length.new_zeros(height * width)
@@ -152,7 +155,9 @@ def _crossings(
         0, batches, through, splats.means2d[None], splats.conics[None].contiguous(),
         splats.opacities[None], width, height, TILE, offsets, ids,
     )  # fmt: skip
-    center = torch.stack([pixels % width, pixels // width], 1).to(splats.means2d.dtype) + 0.5
+    center = cell_to_corner(
+        torch.stack([pixels % width, pixels // width], 1).to(splats.means2d.dtype)
+    )
     dx, dy = (center - splats.means2d[gaussians]).unbind(1)
     xx, xy, yy = splats.conics[gaussians].unbind(1)
     sigma = 0.5 * (xx * dx * dx + yy * dy * dy) + xy * dx * dy

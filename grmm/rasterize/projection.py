@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from express50.adapters import cell_to_corner
 from express50.torch_transforms import quat_to_matrix
 
 ALPHA_MIN = 1.0 / 255.0  # fainter contributions are skipped
@@ -176,8 +177,8 @@ def _extents(
 def ray_lengths(K: Tensor, width: int, height: int) -> Tensor:
     """Length (H, W) of the ray through each pixel centre at camera z = 1; float64 inside."""
     K64 = K.double()
-    u = torch.arange(width, device=K.device, dtype=torch.float64) + 0.5
-    v = torch.arange(height, device=K.device, dtype=torch.float64) + 0.5
+    u = cell_to_corner(torch.arange(width, device=K.device, dtype=torch.float64))
+    v = cell_to_corner(torch.arange(height, device=K.device, dtype=torch.float64))
     x = (u - K64[0, 2]) / K64[0, 0]
     y = (v - K64[1, 2]) / K64[1, 1]
     return (1.0 + x[None, :].square() + y[:, None].square()).sqrt()

@@ -9,6 +9,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from express50.adapters import cell_to_corner
 from grmm.rasterize.interface import RenderOptions, RenderOutput
 from grmm.rasterize.projection import (
     ALPHA_MAX,
@@ -76,8 +77,8 @@ def _blend(
     """
     ids = order[_touches(splats, order, left, top, width, height)]
     dtype, device = colors.dtype, colors.device
-    u = torch.arange(left, left + width, dtype=dtype, device=device) + 0.5
-    v = torch.arange(top, top + height, dtype=dtype, device=device) + 0.5
+    u = cell_to_corner(torch.arange(left, left + width, dtype=dtype, device=device))
+    v = cell_to_corner(torch.arange(top, top + height, dtype=dtype, device=device))
     pixels = torch.stack(torch.meshgrid(u, v, indexing="xy"), -1).reshape(-1, 2)
     delta = pixels[None] - splats.means2d[ids][:, None]  # (n, P, 2)
     dx, dy = delta.unbind(-1)

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 from scipy.ndimage import map_coordinates
 
+from express50.adapters import cell_to_corner, corner_to_cell
 from express50.cameras import Camera, project
 from express50.errors import StageError
 
@@ -75,7 +76,7 @@ def sample_image(image: np.ndarray, pixels: np.ndarray) -> np.ndarray:
     count = len(pixels)
     columns = 4096  # cv2.remap takes at most 32767 rows and columns
     padded = np.zeros((-(-count // columns) * columns, 2), np.float32)
-    padded[:count] = pixels - 0.5
+    padded[:count] = corner_to_cell(pixels)
     maps = padded.reshape(-1, columns, 2)
     out = np.empty(maps.shape[:2], np.float32)
     for start in range(0, len(maps), 8192):
@@ -151,9 +152,8 @@ def _meeting_point(views: Sequence[View]) -> tuple[np.ndarray, np.ndarray]:
     for view in views:
         y, x = np.nonzero(view.alpha > INSIDE)
         K, R = view.camera.K, view.camera.cam_from_world[:3, :3]
-        ray = np.array(
-            [(x.mean() + 0.5 - K[0, 2]) / K[0, 0], (y.mean() + 0.5 - K[1, 2]) / K[1, 1], 1]
-        )
+        middle = cell_to_corner(np.array([x.mean(), y.mean()]))
+        ray = np.r_[(middle - K[:2, 2]) / K[[0, 1], [0, 1]], 1.0]
         ray = R.T @ ray / np.linalg.norm(ray)
         plane = np.eye(3) - np.outer(ray, ray)
         A, b = A + plane, b + plane @ view.camera.center
@@ -172,7 +172,7 @@ def _extent(view: View, center: np.ndarray) -> float:
     """Largest distance, metres, of the matte's outline from ``center`` (3,) at its depth."""
     pixels, depth = project(view.camera, center[None])
     y, x = np.nonzero(view.alpha > INSIDE)
-    offset = np.stack([x + 0.5, y + 0.5], axis=1) - pixels[0]
+    offset = cell_to_corner(np.stack([x, y], axis=1)) - pixels[0]
     if depth[0] <= 0 or not np.isfinite(offset).all():
         raise StageError(
             f"camera {view.camera.id}: the head lies behind it; expected every camera to face the"

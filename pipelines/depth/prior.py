@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import open3d as o3d
 
+from express50.adapters import cell_to_corner
 from express50.cameras import rays
 from express50.raycast import mesh_scene
 from pipelines.depth.grid import Grid, View, sample_image
@@ -132,6 +133,10 @@ def matte_agreement(views: Sequence[View], vertices: np.ndarray, faces: np.ndarr
         row = np.concatenate([np.broadcast_to(origin, way.shape), way], axis=1)
         hit = scene.test_occlusions(o3d.core.Tensor(row.astype(np.float32)), nthreads=1).numpy()
         y, x = np.nonzero(hit.reshape(directions.shape[:2]))
-        inside = sample_image(view.alpha, np.stack([4 * x, 4 * y], 1) + 0.5) if len(x) else [0.0]
+        inside = (
+            sample_image(view.alpha, cell_to_corner(np.stack([4 * x, 4 * y], 1)))
+            if len(x)
+            else [0.0]
+        )
         shares.append(float(np.mean(inside)))
     return float(np.median(shares))

@@ -9,6 +9,7 @@ import numpy as np
 import open3d as o3d
 
 from express50.cameras import Camera, rays
+from express50.raycast import camera_rays
 from pipelines.depth.grid import INSIDE
 from pipelines.depth.reconstruct import Surface
 
@@ -35,9 +36,7 @@ def cast_view(
     surface: Surface, scene: o3d.t.geometry.RaycastingScene, camera: Camera, alpha: np.ndarray
 ) -> DepthView:
     """Raycast one camera; depth is valid where the surface is hit inside the matte (H, W)."""
-    origin, directions = rays(camera)
-    row = np.concatenate([np.broadcast_to(origin, directions.shape), directions], axis=-1)
-    hits = scene.cast_rays(o3d.core.Tensor(row.astype(np.float32)), nthreads=1)
+    hits = scene.cast_rays(camera_rays(camera), nthreads=1)
     depth = hits["t_hit"].numpy()
     hit = np.isfinite(depth)
     faces = surface.faces[hits["primitive_ids"].numpy()[hit]]

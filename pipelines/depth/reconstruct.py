@@ -113,11 +113,15 @@ def _initial(
     views: Sequence[View], low: np.ndarray, high: np.ndarray, voxel: float, prior: Prior | None
 ) -> Grid:
     """Distances to the visual hull, and to the tracked mesh where that is known."""
+    grid = hull_grid(views, low, high, voxel)
+    return grid if prior is None else prior.merge(grid)
+
+
+def hull_grid(views: Sequence[View], low: np.ndarray, high: np.ndarray, voxel: float) -> Grid:
+    """Signed distances to the visual hull in a box with these corners (3,), metres."""
     shape = np.ceil((high - low) / voxel).astype(int) + 1
     index = np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), -1).reshape(-1, 3)
-    values = hull_distance(views, low + voxel * index).reshape(shape)
-    grid = Grid(low, voxel, closed(values))
-    return grid if prior is None else prior.merge(grid)
+    return Grid(low, voxel, closed(hull_distance(views, low + voxel * index).reshape(shape)))
 
 
 def _hull(views: Sequence[View], grid: Grid) -> np.ndarray:

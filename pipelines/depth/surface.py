@@ -10,6 +10,7 @@ from scipy.ndimage import gaussian_filter, label, map_coordinates
 from scipy.sparse.linalg import cg
 from skimage.measure import marching_cubes
 
+from express50.adapters import cell_to_corner
 from express50.cameras import unproject
 from pipelines.depth.grid import Grid, View
 
@@ -83,7 +84,7 @@ def _onto_contour(signed: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarra
     dx = (signed[y, x + 1] - signed[y, x - 1]) / 2
     dy = (signed[y + 1, x] - signed[y - 1, x]) / 2
     scale = signed[y, x] / np.maximum(dx * dx + dy * dy, 0.25)
-    return np.stack([x + 0.5 - dx * scale, y + 0.5 - dy * scale], axis=1)
+    return cell_to_corner(np.stack([x - dx * scale, y - dy * scale], axis=1))
 
 
 def smooth_displacement(

@@ -334,7 +334,7 @@ def _moved(pose: Pose, change: np.ndarray) -> Pose:
 
 
 def rounded(state: State, decimals: int) -> State:
-    """The state with its last digits dropped, which follow from where BLAS found its arrays."""
+    """The state without its last digits, which may differ with another BLAS or machine."""
     poses = tuple(
         Pose(pose.own.round(decimals), pose.rotation.round(decimals)) for pose in state.poses
     )

@@ -68,7 +68,12 @@ def refine(
     for index in range(rounds):
         meshes = all_vertices(model, state)
         targets = plain
-        sights = [see(model, samples, *seen) for seen in zip(moments, meshes, strict=True)]
+        looking = config.relief_rounds or config.photo_rounds
+        sights = (
+            [see(model, samples, *seen) for seen in zip(moments, meshes, strict=True)]
+            if looking
+            else []
+        )
         if rounds - index <= config.silhouette_rounds:
             targets = with_outlines(model, targets, moments, meshes, bald)
         targets = [
