@@ -8,7 +8,7 @@ from itertools import groupby
 from rich.segment import Segment
 from rich.style import Style
 from textual import events
-from textual.geometry import Region
+from textual.geometry import Region, Size
 from textual.message import Message
 from textual.strip import Strip
 from textual.widget import Widget
@@ -134,6 +134,7 @@ class CurveStrip(Widget):
         super().__init__(id="strip")
         self._content: StripContent | None = None
         self._lines: list[Strip] = []
+        self._drawn_size: Size | None = None
 
     def show(self, content: StripContent | None) -> None:
         """Show other content; nothing is drawn when it is the same."""
@@ -147,10 +148,6 @@ class CurveStrip(Widget):
         """The lines as plain text."""
         return [line.text for line in self._drawn()]
 
-    def on_resize(self) -> None:
-        """Draw anew."""
-        self._lines = []
-
     def on_click(self, event: events.Click) -> None:
         """Tell which frame was clicked."""
         if self._content is not None and event.x >= GUTTER:
@@ -163,8 +160,10 @@ class CurveStrip(Widget):
         return [line.crop(crop.x, crop.right) for line in lines[crop.y : crop.bottom]]
 
     def _drawn(self) -> list[Strip]:
-        if not self._lines:
+        # Held against the size itself: the message of a resize may come after the next drawing.
+        if not self._lines or self._drawn_size != self.size:
             self._lines = draw_strip(self._content, self.size.width, self.size.height)
+            self._drawn_size = self.size
         return self._lines
 
 
