@@ -23,7 +23,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.track_truth import Errors, compare, jitter_mm, mean, pooled, summary
+from benchmarks.track_truth import Errors, clip_errors, compare, mean, pooled, summary
 from benchmarks.track_views import held_out_views
 from express50.cameras import read_cameras, write_cameras
 from express50.config import build_config
@@ -42,6 +42,11 @@ from pipelines.track import STAGE
 EXPRESSIONS = ("neutral", "smile", "jaw_open", "pucker", "brow_raise", "wink_left")
 PRESETS = ("draft", "standard", "reference")
 LANDMARK_ONLY: dict[str, object] = {"silhouette_rounds": 0, "relief_rounds": 0, "photo_rounds": 0}
+NO_CLIP = {
+    "jitter_mm": None,
+    "clip_face_rmse_mm": None,
+    "jitter_reason": "--no-clip was given",
+}
 HELD_OUT = 2
 SCALING_VIEWS, SCALING_SIDES = (4, 8, 16), (256, 512)
 Reference = tuple[Dataset, Truth, Path | None]  # what was recorded; the whole captures, if at hand
@@ -175,8 +180,7 @@ def benchmark(source: Reference, presets: tuple[str, ...], count: int, clip: boo
             errors, found = track(dataset, truth, subject, config, views[subject])
             rows, figures = rows + errors, [*figures, found]
         result[name] = report(rows, figures, has_footage(views))
-        result[name] |= jitter(dataset, truth, subjects[0], config) if clip else {
-            "jitter_mm": None, "jitter_reason": "--no-clip was given"}  # fmt: skip
+        result[name] |= jitter(dataset, truth, subjects[0], config) if clip else NO_CLIP
         print(name, json.dumps(result[name]), file=sys.stderr, flush=True)
         result["baseline"] = {"vertex_rmse_mm": pooled([row.baseline for row in rows])}
         best = mean([value for row in rows for value in row.true_psnrs])
@@ -224,7 +228,7 @@ def report(rows: list[Errors], figures: list[dict], footage: bool) -> dict:
 
 
 def jitter(dataset: Dataset, truth: Truth, subject: str, config) -> dict:  # noqa: ANN001
-    """Jitter over one expression's clip, with the shape of that and the neutral peak."""
+    """Errors over one expression's clip, with the shape of that and the neutral peak."""
     peaks = read_peaks(dataset, subject)
     cue = next(name for name in peaks if name != config.neutral)
     with tempfile.TemporaryDirectory() as scratch:
@@ -232,8 +236,7 @@ def jitter(dataset: Dataset, truth: Truth, subject: str, config) -> dict:  # noq
         out = Path(scratch) / "out"
         out.mkdir()
         STAGE.run(part, subject, replace(config, frames="clips"), out)
-        value, why = jitter_mm(part, truth, subject, cue, out)
-    return {"jitter_mm": value} | ({"jitter_reason": why} if value is None else {})
+        return clip_errors(part, truth, subject, cue, out)
 
 
 def narrowed(

@@ -223,13 +223,11 @@ def r_squared(found: np.ndarray, true: np.ndarray) -> float | None:
     return round(1.0 - float(((found - true) ** 2).sum()) / spread, 4) if spread else None
 
 
-def jitter_mm(
-    dataset: Dataset, truth: Truth, subject: str, cue: str, folder: Path
-) -> tuple[float | None, str]:
-    """Mean second difference of the face's error, mm, over a clip; or None with the reason.
+def clip_errors(dataset: Dataset, truth: Truth, subject: str, cue: str, folder: Path) -> dict:
+    """`jitter_mm` and `clip_face_rmse_mm` over a clip, or None with `jitter_reason`.
 
-    The error is tracked minus true, so that true motion does not count. `folder` holds
-    sequence.npz and the track.npz of the same run.
+    Jitter is the mean second difference of the face's error, tracked minus true, so that true
+    motion does not count. `folder` holds sequence.npz and the track.npz of the same run.
     """
     track = read_track(folder / "track.npz")
     with np.load(folder / "sequence.npz", allow_pickle=False) as file:
@@ -238,13 +236,17 @@ def jitter_mm(
             k: file[k][chosen] for k in ("frames", "expression", "neck", "jaw", "eyes", "R", "t")
         }
     if len(rows["frames"]) < 3 or (np.diff(rows["frames"]) != 1).any():
-        return None, f"{cue}: {len(rows['frames'])} frames in a row were tracked, fewer than 3"
+        why = f"{cue}: {len(rows['frames'])} frames in a row were tracked, fewer than 3"
+        return {"jitter_mm": None, "clip_face_rmse_mm": None, "jitter_reason": why}
     motion = align_worlds(read_cameras_of(dataset, subject), truth.cameras(subject))
     model = load_head(track.head)
     meshes = clip_meshes(model, track, rows) @ motion[:3, :3].T + motion[:3, 3]
     true = np.stack([truth.vertices(subject, int(frame)) for frame in rows["frames"]])
-    error = (meshes - true)[:, face_of(model)]
-    return round(1e3 * float(np.linalg.norm(np.diff(error, n=2, axis=0), axis=2).mean()), 4), ""
+    error = 1e3 * (meshes - true)[:, face_of(model)]
+    return {
+        "jitter_mm": round(float(np.linalg.norm(np.diff(error, n=2, axis=0), axis=2).mean()), 4),
+        "clip_face_rmse_mm": round(rms(np.linalg.norm(error, axis=2)), 3),
+    }
 
 
 def clip_meshes(model: HeadModel, track: Track, rows: Mapping[str, np.ndarray]) -> np.ndarray:

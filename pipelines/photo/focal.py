@@ -17,10 +17,11 @@ from express50.errors import StageError
 from express50.head.model import landmarks
 from express50.landmarks.detector import Detection
 from pipelines.track.config import TrackConfig
-from pipelines.track.fit import Target, fit, landmark_sigma, start_state
+from pipelines.track.fit import fit, landmark_sigma
 from pipelines.track.observe import View, agree
 from pipelines.track.sparse_head import Basis
 from pipelines.track.start import initial_pose
+from pipelines.track.state import Target, start_state
 
 LADDER = 2.0 ** np.arange(-2.0, 2.5, 0.5)
 # Of a lens that nothing is told about: two thirds lie within this factor of the guess.

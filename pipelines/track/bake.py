@@ -16,11 +16,11 @@ from express50.head.model import HeadModel, vertex_normals
 from express50.images import linear_to_srgb, write_image
 from express50.mesh_raster import rasterize
 from pipelines.track.appearance import Appearance, Seen
-from pipelines.track.fit import Target
 from pipelines.track.photometry import look, robust_mean
-from pipelines.track.refine import Moment, inside_picture
+from pipelines.track.pictures import Moment, inside_picture
 from pipelines.track.samples import Samples, Visibility, sample_normals
 from pipelines.track.shots import Shot, root_light
+from pipelines.track.state import Target
 
 SCHEMA = "express50.appearance/1"
 MOMENTS = 3

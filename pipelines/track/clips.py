@@ -16,11 +16,11 @@ from express50.errors import StageError
 from express50.index import Cue
 from express50.publish import write_bytes
 from pipelines.track.config import TrackConfig
-from pipelines.track.fit import Pose, State
 from pipelines.track.marks import Eyes
 from pipelines.track.observe import Observation
 from pipelines.track.offsets import split_shape
 from pipelines.track.sequence import (
+    Closer,
     Window,
     freeze_shape,
     jitter_mm,
@@ -29,6 +29,7 @@ from pipelines.track.sequence import (
     track_window,
 )
 from pipelines.track.sparse_head import Basis, Points
+from pipelines.track.state import Pose, State
 
 SCHEMA = "express50.sequence/1"
 Observe = Callable[[str, int], Observation | None]
@@ -44,6 +45,7 @@ def write_clips(
     keep: Path,
     inputs: dict[str, Path | str],
     eyes: Eyes | None,
+    closer: Closer | None = None,
 ) -> dict:
     """Track clips, write out/sequence.npz and return the metrics; see `track_clips`.
 
@@ -52,7 +54,7 @@ def write_clips(
     """
     digests = {name: path_digest(p) if isinstance(p, Path) else p for name, p in inputs.items()}
     arrays, account = track_clips(
-        basis, state, cues, observe, config, keep, value_digest(digests), eyes
+        basis, state, cues, observe, config, keep, value_digest(digests), eyes, closer
     )
     arrays |= {"shape": split_shape(basis.model, state.shape)[0]}
     np.savez(out / "sequence.npz", **arrays)  # type: ignore[arg-type]  # numpy types its options
@@ -70,6 +72,7 @@ def track_clips(
     keep: Path,
     identity: str,
     eyes: Eyes | None = None,
+    closer: Closer | None = None,
 ) -> tuple[dict[str, np.ndarray], dict]:
     """Track every frame of every cue window.
 
@@ -85,6 +88,7 @@ def track_clips(
         keep: folder for finished windows.
         identity: digest of the inputs (footage, cameras, landmarks, head model).
         eyes: from `measure_eyes`.
+        closer: see `track_window`.
 
     Returns:
         Arrays of sequence.npz, and metrics: `frames`, `jitter_mm` a cue and `dropped`.
@@ -104,7 +108,7 @@ def track_clips(
             file = keep / key[:16] / f"{cue.expression_id}_{number:04d}.npz"
             done = _read_window(file)
             if done is None:
-                done = _track(person, cue.expression_id, window, observe, config, eyes)
+                done = _track(person, cue.expression_id, window, observe, config, eyes, closer)
                 _write_window(file, done, person)
             found |= done
         rows += [(cue.expression_id, frame, found[frame]) for frame in sorted(found)]
@@ -138,10 +142,11 @@ def _track(
     observe: Observe,
     config: TrackConfig,
     eyes: Eyes | None,
+    closer: Closer | None,
 ) -> dict[int, Pose]:
     """Poses of the kept frames of a window that show a face."""
     seen = [found for frame in window.frames if (found := observe(cue, frame)) is not None]
-    poses = track_window(person, seen, config, eyes) if seen else []
+    poses = track_window(person, seen, config, eyes, closer) if seen else []
     kept = set(window.frames[window.kept])
     pairs = zip(seen, poses, strict=True)
     return {observation.frame: pose for observation, pose in pairs if observation.frame in kept}

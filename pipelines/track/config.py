@@ -25,6 +25,8 @@ class TrackConfig:
     """Frames of a clip that are tracked in one piece, and kept if the run is stopped."""
     sweeps: int = 2
     """Smoothing rounds over a clip; 0 for none."""
+    clip_rounds: int = 2
+    """Rounds in which a clip's frame is held to its pictures; 0 for landmarks alone."""
     smooth_mm: float = 1.0
     """How far a point may lie from the middle of the neighbouring frames', millimetres."""
     cameras: int = 0
@@ -88,8 +90,10 @@ class TrackConfig:
 
     def __post_init__(self) -> None:
         """Refuse values that cannot work."""
-        if self.stride < 1 or self.window < 1 or self.sweeps < 0:
-            raise ConfigError("track: stride and window must be at least 1, sweeps at least 0")
+        if self.stride < 1 or self.window < 1 or min(self.sweeps, self.clip_rounds) < 0:
+            raise ConfigError(
+                "track: stride and window must be at least 1, sweeps and clip_rounds at least 0"
+            )
         if self.iterations < 1 or self.refinements < 1:
             raise ConfigError("track: iterations and refinements must be at least 1")
         priors = (self.shape_prior, self.expression_prior, self.neck_prior)
@@ -114,12 +118,12 @@ PRESETS: dict[str, dict[str, object]] = {
     "draft": {
         "cameras": 6, "refinements": 2, "iterations": 8, "silhouette_rounds": 2,
         "relief_rounds": 4, "photo_rounds": 0, "samples": 2000, "offset_modes": 80,
-        "round_iterations": 2, "sweeps": 1, "texture_side": 256,
+        "round_iterations": 2, "sweeps": 1, "texture_side": 256, "clip_rounds": 0,
     },
     "standard": {},
     "reference": {
         "refinements": 5, "iterations": 30, "silhouette_rounds": 4, "relief_rounds": 8,
         "photo_rounds": 2, "samples": 8000, "photo_side": 1024, "offset_modes": 250,
-        "round_iterations": 6, "sweeps": 4, "render_rounds": 4,
+        "round_iterations": 6, "sweeps": 4, "render_rounds": 4, "clip_rounds": 3,
     },
 }  # fmt: skip

@@ -7,64 +7,25 @@ the number of expressions. Residuals are in standard deviations; robust weights 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import numpy as np
 
 from express50.errors import StageError
 from express50.transforms import axis_angle_to_matrix
 from pipelines.track.config import TrackConfig
-from pipelines.track.observe import Observation, Terms
+from pipelines.track.observe import Observation
 from pipelines.track.offsets import MODE
-from pipelines.track.photometry import Photometry
 from pipelines.track.pinhole import project_pinhole, project_with_slope
 from pipelines.track.priors import prior
-from pipelines.track.relief import Relief
-from pipelines.track.sparse_head import POSE_SIZE, Basis, Points
+from pipelines.track.sparse_head import Basis, Points
+from pipelines.track.state import Pose, State, SurfaceTerm, Target
 
 HUBER = 1.5
 KNOWN_BIAS_M = 1e-6
 KNOWN_MODE = 1e8
 BIAS = 68 * 3
 REJECT_SIGMA, REJECT_SHARE = 4.0, 0.12
-
-
-@dataclass(frozen=True)
-class Pose:
-    """Unknowns of one expression: own (X + 18,) = expression, neck, jaw, eyes, turn, t; R (3, 3).
-
-    The turn (axis-angle on the world side of R) is folded into R after every step, so it is zero
-    between steps.
-    """
-
-    own: np.ndarray
-    rotation: np.ndarray
-
-
-@dataclass(frozen=True)
-class State:
-    """Shape (S,), a pose an expression, and the detector's bias (68, 3) on this face, head space.
-
-    What a detector gets wrong on a face it gets wrong in every frame and much alike in every view:
-    more of them are no independent evidence. The bias says so; landmarks then tell how a face moves
-    rather than what it is.
-    """
-
-    shape: np.ndarray
-    poses: tuple[Pose, ...]
-    bias: np.ndarray = field(default_factory=lambda: np.zeros((68, 3)))
-
-
-@dataclass(frozen=True)
-class Target:
-    """What one expression is fitted to."""
-
-    observation: Observation
-    sigma: np.ndarray
-    neutral: bool
-    outlines: tuple[Terms, ...] = ()
-    terms: tuple[Photometry | Relief, ...] = ()
-    vertices: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
 
 
 def fit(
@@ -286,7 +247,7 @@ def _add(
 
 
 def _of_samples(
-    term: Photometry | Relief, positions: np.ndarray, jacobian: np.ndarray
+    term: SurfaceTerm, positions: np.ndarray, jacobian: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The samples' Jacobian (S, 3, D) and information (S, 3, 3), (S, 3)."""
     moved = np.zeros((len(term.rows), *jacobian.shape[1:]))
@@ -331,21 +292,3 @@ def _moved(pose: Pose, change: np.ndarray) -> Pose:
     rotation = axis_angle_to_matrix(own[turn]) @ pose.rotation
     own[turn] = 0.0
     return replace(pose, own=own, rotation=rotation)
-
-
-def rounded(state: State, decimals: int) -> State:
-    """The state without its last digits, which may differ with another BLAS or machine."""
-    poses = tuple(
-        Pose(pose.own.round(decimals), pose.rotation.round(decimals)) for pose in state.poses
-    )
-    return State(state.shape.round(decimals), poses, state.bias.round(decimals))
-
-
-def start_state(basis: Basis, poses: list[tuple[np.ndarray, np.ndarray]]) -> State:
-    """Zero coefficients at given rotations (3, 3) and translations (3,)."""
-    made = []
-    for rotation, translation in poses:
-        own = np.zeros(basis.expression_size + POSE_SIZE)
-        own[-3:] = translation
-        made.append(Pose(own, rotation))
-    return State(np.zeros(basis.shape_size), tuple(made))

@@ -13,9 +13,9 @@ import torch
 
 from express50.head.model import HeadModel, vertex_normals
 from pipelines.track.contour import JAW, contour_points
-from pipelines.track.fit import Target
 from pipelines.track.observe import Marks, View
 from pipelines.track.pinhole import project_with_slope
+from pipelines.track.state import Target
 
 # Cosine between where an eye looks and the camera under which its iris is not trusted.
 LOOKS_AT = 0.3

@@ -16,8 +16,8 @@ from express50.head.model import HeadModel, landmarks
 from express50.images import write_image
 from express50.layout import Dataset
 from express50.raycast import mesh_scene
-from pipelines.track.fit import Target
 from pipelines.track.pinhole import project_pinhole
+from pipelines.track.state import Target
 
 TILE = 384
 SEEN_COLOR, FITTED_COLOR = (255, 210, 0), (0, 255, 120)

@@ -14,12 +14,12 @@ from express50.mesh_render import sh_light
 from pipelines.track import appearance as model_of_light
 from pipelines.track.bake import bake_albedo
 from pipelines.track.config import TrackConfig
-from pipelines.track.fit import State, Target
-from pipelines.track.refine import Moment, all_vertices
+from pipelines.track.pictures import Moment
 from pipelines.track.render_config import RenderConfig
 from pipelines.track.render_loss import Appearance, Shot
 from pipelines.track.render_refine import refine
 from pipelines.track.shots import Shot as Crop
+from pipelines.track.state import State, Target, all_vertices
 
 # Near the end of the fit: small steps, and no offsets beyond those that the shape already holds.
 STEPS = RenderConfig(

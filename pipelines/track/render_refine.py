@@ -28,7 +28,6 @@ from express50.transforms import axis_angle_to_matrix as axis_angle_to_array
 from express50.transforms import make_transform
 from pipelines.track.adam import Adam
 from pipelines.track.config import TrackConfig
-from pipelines.track.fit import Pose, State
 from pipelines.track.priors import prior
 from pipelines.track.render_config import RenderConfig
 from pipelines.track.render_loss import (
@@ -43,6 +42,7 @@ from pipelines.track.render_loss import (
     vertex_light,
 )
 from pipelines.track.render_offsets import OffsetSpace
+from pipelines.track.state import Pose, State
 
 
 @dataclass(frozen=True, eq=False)

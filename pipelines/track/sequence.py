@@ -10,24 +10,26 @@ by more frames than sweeps reach, and what overlaps is dropped: where a window e
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 
 from pipelines.track.config import TrackConfig
-from pipelines.track.fit import Pose, State, Target, fit, landmark_sigma, start_state
+from pipelines.track.fit import fit, landmark_sigma
 from pipelines.track.marks import Eyes, with_marks
 from pipelines.track.observe import Observation, facing
 from pipelines.track.sparse_head import POSE_SIZE, Basis, Points
 from pipelines.track.start import initial_pose
+from pipelines.track.state import Pose, State, Target, start_state
 
 # Vertices beside the landmarks that neighbours are compared by, and how many of all count.
 SPREAD_VERTICES, EFFECTIVE_POINTS = 40, 20
 # Frames further apart than so many strides know nothing of each other.
 MAX_GAP = 3
 MIN_FACING = 0.05
+Closer = Callable[[Basis, Target, Pose], tuple[Target, Pose]]
 
 
 @dataclass(frozen=True)
@@ -97,6 +99,7 @@ def track_window(
     observations: list[Observation],
     config: TrackConfig,
     eyes: Eyes | None = None,
+    closer: Closer | None = None,
 ) -> list[Pose]:
     """Poses of the frames of one window.
 
@@ -105,6 +108,7 @@ def track_window(
         observations: F of them, in order of their frames.
         config: of the fit.
         eyes: what relates the subject's irises to the model's, from `measure_eyes`.
+        closer: holds a frame to more than its landmarks, as to its pictures.
 
     Raises:
         StageError: a frame cannot be fitted.
@@ -123,8 +127,11 @@ def track_window(
         state, _ = fit(basis, [target], start, config, config.iterations)
         marked = _marked(basis, target, state.poses[0], eyes)
         state, _ = fit(basis, [marked], state, config, config.round_iterations)
+        found = state.poses[0]
+        if closer is not None:
+            marked, found = closer(basis, marked, found)
         targets.append(marked)
-        poses.append(state.poses[0])
+        poses.append(found)
     frames = [observation.frame for observation in observations]
     for half in range(2 * config.sweeps):
         poses = _sweep(basis, targets, poses, frames, config, half % 2)

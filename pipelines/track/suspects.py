@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipelines.track.fit import Target
 from pipelines.track.observe import View, facing
 from pipelines.track.pinhole import project_pinhole
+from pipelines.track.state import Target
 
 LEAST_EXPRESSIONS, LEAST_CAMERAS = 3, 3
 # A share of the face's size, a multiple of the other cameras' offsets, and of the offset's own

@@ -21,11 +21,12 @@ from pipelines.photo.capture import find_faces
 from pipelines.photo.focal import single_camera, weigh_focal
 from pipelines.track.config import TrackConfig
 from pipelines.track.contour import contour_points
-from pipelines.track.fit import Target, fit, landmark_sigma, start_state
+from pipelines.track.fit import fit, landmark_sigma
 from pipelines.track.observe import View, agree
 from pipelines.track.pinhole import project_pinhole
 from pipelines.track.sparse_head import Basis, Points, make_basis
 from pipelines.track.start import initial_pose
+from pipelines.track.state import Target, start_state
 
 data = pytest.importorskip("skimage.data")
 CONFIG = TrackConfig(iterations=8, expression_prior=0.25, neck_prior=0.03)

@@ -11,13 +11,14 @@ from express50.images import linear_to_srgb
 from pipelines.track.appearance import EVEN_LIGHT, Appearance
 from pipelines.track.bake import bake_albedo
 from pipelines.track.config import TrackConfig
-from pipelines.track.fit import Target
 from pipelines.track.outline import outline_vertices, signed_distance
 from pipelines.track.photometry import Photometry
-from pipelines.track.refine import Moment, see, with_outlines, with_photometry, with_relief
+from pipelines.track.pictures import Moment, see, with_photometry, with_relief
+from pipelines.track.refine import with_outlines
 from pipelines.track.relief import Relief
 from pipelines.track.samples import Visibility, spread
 from pipelines.track.shots import Shot, cut_shot
+from pipelines.track.state import Target
 from tests.pipelines.textured_scenes import (
     ORIGIN,
     RADIUS,

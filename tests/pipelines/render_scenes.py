@@ -14,9 +14,9 @@ from express50.head.procedural import build_procedural_head
 from express50.mesh_raster import rasterize
 from express50.mesh_render import barycentrics, covered, interpolate, sample_texture
 from express50.transforms import axis_angle_to_matrix, look_at
-from pipelines.track.fit import Pose, State
 from pipelines.track.render_loss import Appearance, Shot, make_look, vertex_light
 from pipelines.track.render_refine import posed_vertices
+from pipelines.track.state import Pose, State
 
 FINE = 4  # rays a pixel, each way
 

@@ -14,11 +14,12 @@ from express50.head.model import HeadModel, landmarks, vertex_normals
 from express50.landmarks.iris import Irises
 from express50.transforms import axis_angle_to_matrix
 from pipelines.track.contour import JAW, contour_points
-from pipelines.track.fit import Target, fit, landmark_sigma, start_state
+from pipelines.track.fit import fit, landmark_sigma
 from pipelines.track.marks import iris_vertices, measure_eyes, with_marks
 from pipelines.track.observe import Marks, View, agree, point_covariance
 from pipelines.track.sparse_head import make_basis
 from pipelines.track.start import initial_pose
+from pipelines.track.state import Target, start_state
 from pipelines.track.suspects import suspect_cameras
 from tests.pipelines.test_track import CONFIG, RIG, make_camera, make_scene, make_views
 

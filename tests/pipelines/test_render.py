@@ -12,10 +12,10 @@ from express50.mesh_render import sh_light
 from pipelines.track import appearance as model_of_light
 from pipelines.track.appearance import sh_basis
 from pipelines.track.config import TrackConfig
-from pipelines.track.fit import Pose, State, Target
-from pipelines.track.refine import Moment
+from pipelines.track.pictures import Moment
 from pipelines.track.render import radiance, rendered_like_pictures
 from pipelines.track.shots import Shot
+from pipelines.track.state import Pose, State, Target
 from tests.pipelines.render_scenes import appearance, head, random_state, ring, shoot, vertices_of
 
 PLACE = np.array([0.2, 1.1, -0.3])

@@ -14,10 +14,10 @@ from express50.index import Cue
 from express50.transforms import axis_angle_to_matrix
 from pipelines.track import clips
 from pipelines.track.clips import SCHEMA, track_clips, write_clips
-from pipelines.track.fit import Pose, State
 from pipelines.track.observe import Observation, View, agree
 from pipelines.track.sequence import freeze_shape, jitter_mm, make_windows, track_window
 from pipelines.track.sparse_head import Points
+from pipelines.track.state import Pose, State
 from tests.pipelines.test_track import CONFIG, RIG, make_scene
 
 SETTINGS = dataclasses.replace(CONFIG, iterations=6, round_iterations=2)

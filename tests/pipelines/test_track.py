@@ -20,20 +20,14 @@ from express50.landmarks.iris import Irises
 from express50.landmarks.sources import Marked
 from express50.transforms import axis_angle_to_matrix, look_at
 from pipelines.track.config import TrackConfig
-from pipelines.track.fit import (
-    State,
-    Target,
-    consistent_sigma,
-    fit,
-    landmark_sigma,
-    start_state,
-)
+from pipelines.track.fit import consistent_sigma, fit, landmark_sigma
 from pipelines.track.observe import View, agree, robust_triangulate
 from pipelines.track.outline import Outline, outline_vertices, sample, signed_distance
 from pipelines.track.pinhole import project_with_slope
 from pipelines.track.priors import prior
 from pipelines.track.sparse_head import Basis, Points, make_basis
 from pipelines.track.start import initial_pose
+from pipelines.track.state import State, Target, start_state
 from tests.express50.head.tiny_head import tiny_head
 
 CONFIG = TrackConfig()
@@ -318,7 +312,7 @@ def tracked_dataset(tmp_path: Path, ingested, monkeypatch: pytest.MonkeyPatch):
     from express50.index import read_index
     from express50.runner import run_stage
     from pipelines import calibrate
-    from pipelines.track import stage
+    from pipelines.track import footage, stage
 
     run_stage(calibrate.STAGE, ingested, build_config(calibrate.STAGE, {}), progress=False)
     index = read_index(ingested, "S001")
@@ -343,7 +337,7 @@ def tracked_dataset(tmp_path: Path, ingested, monkeypatch: pytest.MonkeyPatch):
         face = Detection(points, np.ones(68), np.full(68, 0.9), 0.95)
         return Marked(face, no_irises(), visible_contour=False)
 
-    monkeypatch.setattr(stage, "open_source", lambda *unused: told)
+    monkeypatch.setattr(footage, "open_source", lambda *unused: told)
     monkeypatch.setattr(stage, "_basis", lambda *unused: scene.basis)
     return ingested, scene
 
@@ -387,12 +381,12 @@ def test_stage_writes_the_contracted_file(tracked_dataset, tmp_path: Path) -> No
 def test_no_face_anywhere_is_a_clear_error(
     tracked_dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from pipelines.track import STAGE, stage
+    from pipelines.track import STAGE, footage
 
     dataset, _ = tracked_dataset
     nothing = Detection(np.zeros((68, 2)), np.ones(68), np.zeros(68), 0.0)
     blind = Marked(nothing, no_irises(), visible_contour=False)
-    monkeypatch.setattr(stage, "open_source", lambda *unused: lambda *image: blind)
+    monkeypatch.setattr(footage, "open_source", lambda *unused: lambda *image: blind)
     with pytest.raises(StageError, match="S001: no expression could be tracked"):
         STAGE.run(dataset, "S001", TrackConfig(), tmp_path)
 
@@ -400,12 +394,12 @@ def test_no_face_anywhere_is_a_clear_error(
 def test_footage_that_is_gone_is_told_from_faces_that_are_not_there(
     tracked_dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from pipelines.track import STAGE, stage
+    from pipelines.track import STAGE, footage
 
     def gone(*unused):
         raise CaptureError("cam00: cannot be opened")
 
     dataset, _ = tracked_dataset
-    monkeypatch.setattr(stage, "read_frame", gone)
+    monkeypatch.setattr(footage, "read_frame", gone)
     with pytest.raises(StageError, match="cannot be opened"):
         STAGE.run(dataset, "S001", TrackConfig(), tmp_path)

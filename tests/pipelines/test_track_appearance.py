@@ -20,7 +20,7 @@ from pipelines.track.appearance import (
     trust,
 )
 from pipelines.track.bake import bake_albedo, texel_samples, write_appearance
-from pipelines.track.refine import Moment
+from pipelines.track.pictures import Moment
 from pipelines.track.shots import Shot
 from tests.pipelines.textured_scenes import RADIUS, ball_head, paint, picture, rig
 

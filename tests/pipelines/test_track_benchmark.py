@@ -11,7 +11,7 @@ import pytest
 
 import benchmarks
 from benchmarks.track import HELD_OUT, benchmark, narrowed, parse, prepare, twin_config
-from benchmarks.track_truth import compare, jitter_mm, r_squared, summary
+from benchmarks.track_truth import clip_errors, compare, r_squared, summary
 from benchmarks.track_views import held_out_views
 from express50.frames import read_cameras_of, read_peaks
 from express50.index import read_index
@@ -85,15 +85,19 @@ def test_jitter_is_of_the_error_not_of_the_motion(source, tmp_path) -> None:
     with np.load(tmp_path / "track.npz") as track:
         rows = {name: track[name] for name in OWN}
 
-    def jitter(wobble: float, count: int = 4) -> tuple[float | None, str]:
+    def jitter(wobble: float, count: int = 4) -> dict:
         t = rows["t"] + wobble * np.array([[1.0], [-1.0], [1.0], [-1.0]]) * [1.0, 0.0, 0.0]
         sequence = {k: v[:count] for k, v in (rows | {"t": t, "frames": np.array(frames)}).items()}
         np.savez(tmp_path / "sequence.npz", cues=np.array(["smile"] * count), **sequence)
-        return jitter_mm(dataset, truth, SUBJECT, "smile", tmp_path)
+        return clip_errors(dataset, truth, SUBJECT, "smile", tmp_path)
 
-    assert jitter(0.0)[0] < 1e-2
-    assert jitter(1e-3)[0] == pytest.approx(4.0, abs=1e-2)
-    assert jitter(0.0, 2) == (None, "smile: 2 frames in a row were tracked, fewer than 3")
+    assert jitter(0.0)["jitter_mm"] < 1e-2
+    shaken = jitter(1e-3)
+    assert shaken["jitter_mm"] == pytest.approx(4.0, abs=1e-2)
+    assert shaken["clip_face_rmse_mm"] == pytest.approx(1.0, abs=1e-2)
+    few = jitter(0.0, 2)
+    assert few["jitter_mm"] is few["clip_face_rmse_mm"] is None
+    assert few["jitter_reason"] == "smile: 2 frames in a row were tracked, fewer than 3"
 
 
 def test_a_run_without_pictures_says_what_is_missing(source) -> None:

@@ -11,10 +11,11 @@ import torch
 from express50.cameras import project
 from express50.transforms import axis_angle_to_matrix
 from pipelines.track.config import TrackConfig
-from pipelines.track.fit import Pose, State, Target, fit, landmark_sigma
+from pipelines.track.fit import fit, landmark_sigma
 from pipelines.track.observe import View, agree
 from pipelines.track.relief import Relief
 from pipelines.track.sparse_head import Basis, Points, make_basis
+from pipelines.track.state import Pose, State, Target
 from tests.express50.head.tiny_head import tiny_head
 from tests.pipelines.test_track import RIG, make_scene
 
