@@ -170,9 +170,8 @@ def _run_items(
         else:
             tasks.append(Task(stage, dataset, item, config, digest, pool.threads))
     ledger.keep_digests()
-    for task in tasks:
-        # A receipt must not outlive the output it speaks of, should this run be killed half-way.
-        ledger.remove(stage.name, task.item)
+    # A receipt must not outlive the output it speaks of, should this run be killed half-way.
+    ledger.forget(stage.name, [task.item for task in tasks])
     with Progress(stage.name, len(tasks) + len(unreadable), progress) as display:
 
         def settle(receipt: Receipt) -> None:
@@ -208,9 +207,10 @@ def record(dataset: Dataset, ledger: Ledger, receipt: Receipt) -> None:
 
 def retire_items(dataset: Dataset, ledger: Ledger, stage: str, chosen: list[str]) -> None:
     """Set aside outputs of items that the stage no longer has."""
-    for item in set(ledger.read(stage)) - set(chosen):
+    gone = sorted(set(ledger.read(stage)) - set(chosen))
+    for item in gone:
         set_aside(dataset, stage, item)
-        ledger.remove(stage, item)
+    ledger.forget(stage, gone)
 
 
 def save_config(dataset: Dataset, stage: Stage, config: Any) -> None:

@@ -34,7 +34,7 @@ def test_newer_receipt_takes_the_place_of_the_older(ledger):
     ledger.write(receipt(fingerprint="1"))
     ledger.write(receipt(fingerprint="2"))
     assert [r.fingerprint for r in ledger.read("track").values()] == ["2"]
-    ledger.remove("track", "S001")
+    ledger.forget("track", ["S001"])
     assert ledger.read("track") == {}
 
 

@@ -1,0 +1,115 @@
+"""What the runner adds to an item: fingerprints, folders, receipts and their way to the disk.
+
+``python -m benchmarks.stage_overhead`` runs a stage that does nothing over many items: in this
+process, in two worker processes (their start not counted), and once more when all is current. The
+last line printed is one JSON object.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sys
+import tempfile
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+from express50.config import build_config
+from express50.layout import Dataset
+from express50.pool import Pool
+from express50.runner import run_stage
+from express50.stage import Stage
+
+
+@dataclass(frozen=True, kw_only=True)
+class EmptyConfig:
+    """Nothing to set."""
+
+
+def items(dataset: Dataset) -> list[str]:
+    """Names of the input files."""
+    return sorted(path.stem for path in (dataset.root / "in").glob("*.txt"))
+
+
+def inputs(dataset: Dataset, item: str, config: EmptyConfig) -> dict[str, Path | str]:
+    """The item's file."""
+    return {"text": dataset.root / "in" / f"{item}.txt"}
+
+
+def run(dataset: Dataset, item: str, config: EmptyConfig, out: Path) -> dict:
+    """Write nothing."""
+    return {}
+
+
+STAGE = Stage(
+    name="empty",
+    version=1,
+    config=EmptyConfig,
+    presets={"draft": {}, "standard": {}, "reference": {}},
+    items=items,
+    inputs=inputs,
+    run=run,
+)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.stage_overhead", description=__doc__
+    )
+    parser.add_argument("--items", type=int, default=500)
+    count = parser.parse_args(arguments).items
+    with tempfile.TemporaryDirectory(dir=Path.cwd()) as scratch:
+        inline, workers = (make_dataset(Path(scratch) / name, count) for name in ("one", "two"))
+        result = {
+            "milliseconds_per_item": timed(inline, Pool(0), count),
+            "milliseconds_per_current_item": timed(inline, Pool(0), count),
+            "milliseconds_per_item_two_workers": with_workers(workers, count),
+            "milliseconds_per_write_and_sync": syncs(Path(scratch) / "sync", count),
+            "items": count,
+        }
+    print(json.dumps(result))
+    return 0
+
+
+def make_dataset(root: Path, count: int) -> Dataset:
+    """A dataset of `count` small inputs."""
+    (root / "in").mkdir(parents=True)
+    for number in range(count):
+        (root / "in" / f"item{number:05d}.txt").write_text(f"{number}")
+    return Dataset(root)
+
+
+def with_workers(dataset: Dataset, count: int) -> float:
+    """Milliseconds an item in two workers that have started."""
+    first = make_dataset(dataset.root / "first", 4)
+    with Pool(2) as pool:
+        timed(first, pool, 4)
+        return timed(dataset, pool, count)
+
+
+def timed(dataset: Dataset, pool: Pool, count: int) -> float:
+    """Milliseconds an item, by the clock: waiting for the disk counts."""
+    began = time.perf_counter()
+    summary = run_stage(STAGE, dataset, build_config(STAGE, {}), progress=False, pool=pool)
+    seconds = time.perf_counter() - began
+    assert summary.ok
+    return round(1e3 * seconds / count, 3)
+
+
+def syncs(folder: Path, count: int) -> float:
+    """Milliseconds that one small file takes to the disk here: an item cannot cost less."""
+    folder.mkdir()
+    began = time.perf_counter()
+    for number in range(count):
+        with (folder / f"{number}").open("wb") as file:
+            file.write(b"{}\n")
+            file.flush()
+            os.fsync(file.fileno())
+    return round(1e3 * (time.perf_counter() - began) / count, 3)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

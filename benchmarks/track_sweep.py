@@ -1,0 +1,128 @@
+"""What each knob of tracking is worth: face error against seconds, into docs/TRADEOFFS.md.
+
+``python -m benchmarks.track_sweep --dataset DIR --truth DIR --captures DIR`` with what
+`benchmarks.track` takes, or without: the twin then records a subject. From `standard` one thing is
+changed at a time, one subject, three expressions. Seconds are processor seconds of the stage. The
+last line printed is one JSON object.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import tempfile
+from pathlib import Path
+
+from benchmarks.document import replace_section
+from benchmarks.track import narrowed, prepare, track, twin_config
+from benchmarks.track_truth import summary
+from benchmarks.track_views import held_out_views
+from express50.config import build_config
+from express50.frames import read_cameras_of
+from express50.layout import Dataset
+from express50.twin.truth import Truth
+from pipelines.track import STAGE
+
+SECTION = "Knobs of tracking"
+EXPRESSIONS = ("neutral", "jaw_open", "smile")
+VIEWS = (2, 4, 8)
+KNOBS: tuple[tuple[str, dict[str, object]], ...] = (
+    ("standard", {}),
+    ("landmarks alone", {"silhouette_rounds": 0, "relief_rounds": 0, "photo_rounds": 0}),
+    ("refinements 1", {"refinements": 1}),
+    ("iterations 6", {"iterations": 6}),
+    ("round_iterations 2", {"round_iterations": 2}),
+    ("cameras 4", {"cameras": 4}),
+    ("photo_side 256", {"photo_side": 256}),
+    ("samples 1000", {"samples": 1000}),
+    ("samples 8000", {"samples": 8000}),
+    ("no outlines", {"silhouette_rounds": 0}),
+    ("relief_rounds 2", {"relief_rounds": 2}),
+    ("no relief", {"relief_rounds": 0}),
+    ("no colours", {"photo_rounds": 0}),
+    ("no offsets", {"offset_modes": 0}),
+    ("render_rounds 2", {"render_rounds": 2}),
+)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the sweep and write its table."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.track_sweep", description=__doc__)
+    parser.add_argument("--dataset", type=Path)
+    parser.add_argument("--truth", type=Path)
+    parser.add_argument("--captures", type=Path)
+    parser.add_argument("--knobs", nargs="+", choices=[name for name, _ in KNOBS], metavar="KNOB")
+    parser.add_argument("--doc", type=Path, help="file to write the table into")
+    options = parser.parse_args(arguments)
+    given = [options.dataset, options.truth, options.captures]
+    if any(given) and not all(given):
+        parser.error("give --dataset, --truth and --captures, or none of them")
+    with tempfile.TemporaryDirectory() as scratch:
+        if options.dataset is None:
+            dataset, truth, captures = prepare(twin_config(1, 18, 512), Path(scratch) / "twin")
+        else:
+            dataset, truth = Dataset(options.dataset), Truth(options.truth)
+            captures = options.captures
+        rows = sweep(dataset, truth, captures, options.knobs, Path(scratch))
+        cameras = len(read_cameras_of(dataset, dataset.subjects()[0]))
+    if options.doc:
+        replace_section(options.doc, SECTION, as_markdown(rows, cameras))
+    print(json.dumps({"rows": rows}))
+    return 0
+
+
+def sweep(
+    dataset: Dataset, truth: Truth, captures: Path | None, knobs: list[str] | None, scratch: Path
+) -> list[dict]:
+    """A row for each knob, and for fewer cameras in the rig."""
+    subject = dataset.subjects()[0]
+    part = narrowed(dataset, subject, scratch / "part", cues=EXPRESSIONS)
+    views = held_out_views(part, truth, subject, captures)
+    rows = []
+    for name, values in KNOBS:
+        if knobs is None or name in knobs:
+            rows.append(row_of(name, part, truth, subject, values, views))
+    for count in VIEWS if knobs is None else ():
+        few = narrowed(part, subject, scratch / f"views_{count}", views=count)
+        rows.append(row_of(f"{count} cameras in the rig", few, truth, subject, {}, {}))
+    return rows
+
+
+def row_of(
+    name: str, dataset: Dataset, truth: Truth, subject: str, values: dict, views: dict
+) -> dict:
+    """Errors and seconds of `standard` with some values changed."""
+    errors, found = track(dataset, truth, subject, build_config(STAGE, values), views)
+    figures = summary(errors)
+    row = {
+        "setting": name,
+        "face_mm": figures["vertex_rmse_mm"]["face"],
+        "head_mm": figures["vertex_rmse_mm"]["head"],
+        "jaw_deg": figures["jaw_error_deg"],
+        "silhouette_iou": figures["silhouette_iou"],
+        "seconds_per_frame": round(found["seconds"] / len(errors), 2),
+    }
+    print(json.dumps(row), file=sys.stderr, flush=True)
+    return row
+
+
+def as_markdown(rows: list[dict], cameras: int) -> list[str]:
+    """The section's lines."""
+    text = (
+        f"Made by `python -m benchmarks.track_sweep`: one twin subject, {len(EXPRESSIONS)}"
+        f" expressions, {cameras} cameras. One thing is changed at a time from `standard`; errors"
+        " are root mean squares against the truth, seconds are processor seconds a frame."
+    )
+    head = "| setting | face mm | head mm | jaw degrees | outline IoU | seconds |"
+    lines = [
+        f"| {r['setting']} | {r['face_mm']:.2f} | {r['head_mm']:.2f} | {r['jaw_deg']:.2f} |"
+        f" {'n/a' if r['silhouette_iou'] is None else format(r['silhouette_iou'], '.4f')} |"
+        f" {r['seconds_per_frame']:.1f} |"
+        for r in rows
+    ]
+    return [text, "", head, "|---|---|---|---|---|---|", *lines]
+
+
+if __name__ == "__main__":
+    sys.exit(main())
