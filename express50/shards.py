@@ -19,8 +19,6 @@ from __future__ import annotations
 import json
 import os
 import re
-import struct
-import zlib
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,12 +26,11 @@ from pathlib import Path
 import numpy as np
 
 from express50.errors import FormatError
-from express50.images import PIXEL_LIMIT, decode_image
+from express50.shards_codecs import ALPHA, DEPTH, PARTS, RGB, crc32, decode_picture
 from express50.shards_offsets import KEY, read_offsets
 
 SCHEMA = "express50.shards/1"
 SHARD_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*-[0-9]{6}\.tar")
-RGB = ("rgb.jpg", "rgb.png")
 
 
 @dataclass(frozen=True)
@@ -120,27 +117,53 @@ class ShardReader:
         Raises:
             FormatError: there is no such member, or its bytes are damaged.
         """
+        return self.members(number, [name])[name]
+
+    def members(self, number: int, names: Collection[str] | None = None) -> dict[str, bytes]:
+        """Bytes of a sample's members by name, checked by CRC-32 and read in one piece.
+
+        Args:
+            number: of the sample.
+            names: the members wanted; all by default.
+
+        Raises:
+            FormatError: there is no such member, or its bytes are damaged.
+        """
         entry = self.entries[number]
-        where = f"{self.root / entry.shard}: {entry.key}"
+        wanted = (
+            entry.members if names is None else {name: self._place(entry, name) for name in names}
+        )
+        start = min(place[0] for place in wanted.values())
+        end = max(place[0] + place[1] for place in wanted.values())
+        data = os.pread(self._file(entry.shard), end - start, start)
+        found = {}
+        for name, (offset, size, crc) in wanted.items():
+            part = data[offset - start : offset - start + size]
+            if len(part) != size or crc32(part) != crc:
+                raise FormatError(
+                    f"{self.root / entry.shard}: {entry.key}.{name}: damaged, CRC-32"
+                    f" {crc32(part):08x}, expected {crc:08x}; copy the shard again or rerun"
+                    " 'express50 pack'"
+                )
+            found[name] = part
+        return found
+
+    def _place(self, entry: Entry, name: str) -> tuple[int, int, int]:
         if name not in entry.members:
+            where = f"{self.root / entry.shard}: {entry.key}"
             raise FormatError(f"{where}: has no {name}; it has {', '.join(entry.members)}")
-        offset, size, crc = entry.members[name]
-        data = os.pread(self._file(entry.shard), size, offset)
-        if len(data) != size or zlib.crc32(data) != crc:
-            raise FormatError(
-                f"{where}.{name}: damaged, CRC-32 {zlib.crc32(data):08x}, expected {crc:08x};"
-                " copy the shard again or rerun 'express50 pack'"
-            )
-        return data
+        return entry.members[name]
 
     def meta(self, number: int) -> dict:
         """The sample's meta.json."""
-        entry = self.entries[number]
+        return self._meta(number, self.member(number, "meta.json"))
+
+    def _meta(self, number: int, data: bytes) -> dict:
         try:
-            meta = json.loads(self.member(number, "meta.json"))
+            return json.loads(data)
         except ValueError as error:
+            entry = self.entries[number]
             raise FormatError(f"{self.root / entry.shard}: {entry.key}: meta: {error}") from None
-        return meta
 
     def sample(self, number: int) -> dict:
         """Decode one sample.
@@ -153,18 +176,17 @@ class ShardReader:
         Raises:
             FormatError: a member is damaged or does not have the size that the meta says.
         """
-        entry, meta = self.entries[number], self.meta(number)
-        rgb_name = next((name for name in RGB if name in entry.members), RGB[0])
-        rgb = self._image(number, rgb_name, meta, np.uint8, 3)
-        alpha = self._image(number, "alpha.png", meta, np.uint8, 2)
-        steps = self._image(number, "depth.png", meta, np.uint16, 2)
+        entry, members = self.entries[number], self.members(number)
+        meta = self._meta(number, members.get("meta.json", b""))
+        alpha = self._picture(entry, members, ALPHA, meta)
+        steps = self._picture(entry, members, DEPTH, meta)
         return {
             "key": entry.key,
-            "rgb": rgb,
+            "rgb": self._picture(entry, members, RGB, meta),
             "alpha": alpha.astype(np.float32) / 255,
             "depth": steps.astype(np.float32) * np.float32(meta["depth_scale_m"]),
             "valid": steps > 0,
-            "parts": self._parts(number, meta),
+            "parts": self._picture(entry, members, PARTS, meta) if meta.get("parts") else None,
             "meta": meta,
         }
 
@@ -175,11 +197,6 @@ class ShardReader:
             FormatError: the file is missing, damaged, or holds something else.
         """
         return read_offsets(self.root, subject)
-
-    def _parts(self, number: int, meta: dict) -> np.ndarray | None:
-        if "parts.png" not in self.entries[number].members:
-            return None
-        return self._image(number, "parts.png", meta, np.uint8, 2)
 
     def iterate(self, seed: int | None = None, epoch: int = 0, start: int = 0) -> Iterator[dict]:
         """Samples of one pass from position ``start``; shuffled by (seed, epoch) unless None."""
@@ -205,42 +222,17 @@ class ShardReader:
             self._files[shard] = os.open(self.root / shard, os.O_RDONLY)
         return self._files[shard]
 
-    def _image(self, number: int, name: str, meta: dict, kind: type, dimensions: int) -> np.ndarray:
-        entry = self.entries[number]
+    def _picture(
+        self, entry: Entry, members: dict[str, bytes], names: tuple[str, ...], meta: dict
+    ) -> np.ndarray:
+        """The picture that is there under one of several names."""
+        name = next((name for name in names if name in members), names[0])
+        self._place(entry, name)
         where = f"{self.root / entry.shard}: {entry.key}.{name}"
-        data = self.member(number, name)
-        width, height = image_size(data, where)
-        if width * height > PIXEL_LIMIT:
-            raise FormatError(f"{where}: {width}x{height} pixels, over the limit {PIXEL_LIMIT}")
-        if (width, height) != (meta.get("width"), meta.get("height")):
-            raise FormatError(
-                f"{where}: {width}x{height} pixels, expected the meta's"
-                f" {meta.get('width')}x{meta.get('height')}; rerun 'express50 pack'"
-            )
-        image = decode_image(data, where)
-        if image.dtype != kind or image.ndim != dimensions:
-            raise FormatError(f"{where}: {image.dtype} {image.shape}, expected {np.dtype(kind)}")
-        return image
-
-
-def image_size(data: bytes, where: str) -> tuple[int, int]:
-    """Width and height in a PNG's or JPEG's header, before any pixel is decoded.
-
-    Raises:
-        FormatError: the bytes are neither.
-
-    Source: PNG 1.2, 11.2.2 (IHDR); ITU-T T.81, B.2.2 (frame header).
-    """
-    if data[:8] == b"\x89PNG\r\n\x1a\n" and len(data) >= 24:
-        return struct.unpack(">II", data[16:24])
-    position = 2 if data[:2] == b"\xff\xd8" else len(data)
-    while position + 9 < len(data) and data[position] == 0xFF:
-        marker, length = data[position + 1], int.from_bytes(data[position + 2 : position + 4])
-        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
-            height, width = struct.unpack(">HH", data[position + 5 : position + 9])
-            return width, height
-        position += 2 + length
-    raise FormatError(f"{where}: {len(data)} bytes are no PNG or JPEG image")
+        width, height = meta.get("width"), meta.get("height")
+        if not (isinstance(width, int) and isinstance(height, int) and min(width, height) > 0):
+            raise FormatError(f"{where}: meta gives {width!r} x {height!r} pixels")
+        return decode_picture(name, members[name], width, height, where)
 
 
 def read_entries(root: Path) -> tuple[Entry, ...]:

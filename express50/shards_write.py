@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import tarfile
-import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +12,7 @@ from typing import BinaryIO, cast
 
 from express50.errors import FormatError
 from express50.shards import KEY, SCHEMA, SHARD_NAME, ShardReader, read_entries
+from express50.shards_codecs import crc32
 
 BLOCK = tarfile.BLOCKSIZE
 RECORD = tarfile.RECORDSIZE
@@ -143,7 +143,7 @@ def _append(file: BinaryIO, name: str, data: bytes) -> list[int]:
     offset = file.tell()
     file.write(data)
     file.write(bytes(_padded(len(data)) - len(data)))
-    return [offset, len(data), zlib.crc32(data)]
+    return [offset, len(data), crc32(data)]
 
 
 def _padded(size: int) -> int:

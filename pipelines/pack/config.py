@@ -17,7 +17,8 @@ class PackConfig:
     hair: float = 0.3
     """How far beyond the tracked mesh the matte may widen the crop, as a share of its size."""
     profile: Literal["compact", "fast", "lossless"] = "fast"
-    """rgb as JPEG q90 4:2:0 (compact), JPEG q95 4:4:4 (fast) or PNG (lossless)."""
+    """rgb as JPEG q90 4:2:0 (compact), JPEG q95 4:4:4 (fast) or PNG (lossless); alpha, parts and
+    depth as PNG, or as zstd and LERC (fast), which decode in a fraction of the time."""
     foreground: bool = True
     """Where a pixel mixes subject and background, store the subject's own colour alone."""
     even_colour: bool = True

@@ -16,8 +16,6 @@ from express50.images import (
     DEPTH_UNIT_M,
     contact_sheet,
     depth_to_uint16,
-    encode_jpeg,
-    encode_png,
     read_alpha,
     read_depth_png,
     read_image,
@@ -28,6 +26,7 @@ from express50.layout import Dataset
 from express50.parts import COLOURS
 from express50.publish import write_json
 from express50.shards import ShardReader
+from express50.shards_codecs import encode_pictures
 from express50.shards_offsets import write_offsets
 from express50.shards_write import PackedSample, ShardWriter, sample_key, write_manifest
 from express50.stage import Stage
@@ -166,11 +165,13 @@ def _pack_sample(
     else:
         picture = cut_image(rgb, crop, config.size)
     gain = subject.gains.get(camera_id, np.ones(3)) if config.even_colour else np.ones(3)
-    members = _encode_rgb(evened(picture, gain), config.profile)
-    members["alpha.png"] = encode_png(cut_image(alpha, crop, config.size))
-    if parts is not None:
-        members["parts.png"] = encode_png(cut_labels(parts, crop, config.size))
-    members["depth.png"] = encode_png(depth_to_uint16(small, known))
+    members = encode_pictures(
+        evened(picture, gain),
+        cut_image(alpha, crop, config.size),
+        depth_to_uint16(small, known),
+        None if parts is None else cut_labels(parts, crop, config.size),
+        config.profile,
+    )
     meta = _meta(subject, expression, camera, crop, config.size) | {
         "colour_gain": gain.tolist(),
         "parts": parts is not None,
@@ -216,12 +217,6 @@ def _read_regions(
     facts = json.loads((folder / "metrics.json").read_text("utf-8"))
     kept = "torso" in facts["missing"] and facts["method"] == "mesh"
     return read_alpha(paths[0]), None if kept else read_alpha(paths[1])
-
-
-def _encode_rgb(image: np.ndarray, profile: str) -> dict[str, bytes]:
-    if profile == "lossless":
-        return {"rgb.png": encode_png(image)}
-    return {"rgb.jpg": encode_jpeg(image, 90 if profile == "compact" else 95)}
 
 
 def _finish(
@@ -305,7 +300,7 @@ def _write_picture(out: Path, reader: ShardReader) -> float:
 
 STAGE = Stage(
     name="pack",
-    version=5,
+    version=6,
     config=PackConfig,
     presets=PRESETS,
     items=items,
