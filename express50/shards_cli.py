@@ -1,4 +1,4 @@
-"""``express50 shards``: verify packed shards, list their samples, look at one."""
+"""``express50 shards``: verify packed shards, list their samples, look at one, split, merge."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from express50.errors import FormatError
 from express50.images import contact_sheet, write_image
 from express50.parts import COLOURS
 from express50.shards import ShardReader
+from express50.shards_edit import merge_shards, split_shards
 from express50.shards_write import verify
 
 
@@ -34,9 +35,46 @@ def add_commands(subparsers: Any) -> None:
     showing.add_argument("--key", help="sample; the first by default")
     showing.add_argument("--out", type=Path, help="picture of rgb, alpha and depth to write")
     showing.set_defaults(handler=run_show)
+    _add_edits(actions)
     for action in (checking, listing, showing):
         action.add_argument("directory", type=Path, metavar="DIR", help="folder of shards")
         action.add_argument("--json", action="store_true", help="print as JSON")
+
+
+def _add_edits(actions: Any) -> None:
+    """``split`` and ``merge``."""
+    splitting = actions.add_parser(
+        "split",
+        help="write part of the samples as shards of their own",
+        epilog="example: express50 shards split data/pack/shards test_only --split test",
+    )
+    splitting.add_argument("directory", type=Path, metavar="DIR", help="folder of shards")
+    for name in ("subject", "expression", "camera"):
+        splitting.add_argument(f"--{name}", action="append", help="only this; may be repeated")
+    splitting.add_argument("--split", help="only this split")
+    splitting.set_defaults(handler=run_split)
+    merging = actions.add_parser("merge", help="write the samples of several folders as one")
+    merging.add_argument("directories", type=Path, nargs="+", metavar="DIR", help="shards")
+    merging.set_defaults(handler=run_merge)
+    for action in (splitting, merging):
+        action.add_argument("out", type=Path, metavar="OUT", help="empty or absent folder")
+        action.add_argument("--shard-mb", type=int, default=256, help="size of a shard")
+
+
+def run_split(args: argparse.Namespace) -> int:
+    """Copy the samples that match."""
+    count = split_shards(
+        args.directory, args.out, args.shard_mb, args.subject, args.expression, args.camera,
+        args.split,
+    )  # fmt: skip
+    say(f"{args.out}: {count} samples")
+    return OK
+
+
+def run_merge(args: argparse.Namespace) -> int:
+    """Copy the samples of all folders."""
+    say(f"{args.out}: {merge_shards(args.directories, args.out, args.shard_mb)} samples")
+    return OK
 
 
 def run_verify(args: argparse.Namespace) -> int:

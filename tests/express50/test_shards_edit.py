@@ -1,0 +1,78 @@
+"""Shards split and merged: the same samples to the byte, and nothing half-written."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from express50.cli import main
+from express50.errors import FormatError
+from express50.shards import ShardReader
+from express50.shards_edit import merge_shards, split_shards
+from express50.shards_write import ShardWriter, verify, write_manifest
+from tests.express50.test_shards import make_sample, write
+
+
+def content(root: Path) -> dict[str, dict[str, bytes]]:
+    reader = ShardReader(root)
+    return {entry.key: reader.members(n) for n, entry in enumerate(reader.entries)}
+
+
+def test_a_split_folder_merges_to_the_same_samples(tmp_path: Path) -> None:
+    whole = write(tmp_path / "whole")
+    parts = [tmp_path / "train", tmp_path / "test"]
+    for part in parts:
+        assert main(["shards", "split", str(whole), str(part), "--split", part.name]) == 0
+        assert verify(part) == []
+    assert main(["shards", "merge", *map(str, parts), str(tmp_path / "again")]) == 0
+    again = tmp_path / "again"
+    assert verify(again) == [] and content(again) == content(whole)
+    splits = json.loads((again / "splits.json").read_text())
+    assert splits["train"] == ["S001", "S002"] and splits["test"] == ["S003"]
+    assert [e.split for e in ShardReader(again).entries].count("test") == 6
+
+
+def test_parts_are_chosen_by_ids(tmp_path: Path) -> None:
+    whole = write(tmp_path / "whole")
+    count = split_shards(whole, tmp_path / "some", 1, ["S002"], ["neutral"], ["cam00", "cam02"])
+    assert count == 2 and set(content(tmp_path / "some")) == {
+        "S002_neutral_cam00", "S002_neutral_cam02",
+    }  # fmt: skip
+    with pytest.raises(FormatError, match="S009"):
+        split_shards(whole, tmp_path / "none", 1, ["S009"])
+    assert not (tmp_path / "none").exists()
+
+
+def test_twice_the_same_people_are_refused_and_nothing_is_left(tmp_path: Path) -> None:
+    whole = write(tmp_path / "whole")
+    with pytest.raises(FormatError, match="one new"):
+        merge_shards([whole, whole], tmp_path / "out", 1)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["whole"]
+
+
+def test_a_subject_in_two_splits_is_refused(tmp_path: Path) -> None:
+    whole = write(tmp_path / "whole")
+    writer = ShardWriter(tmp_path / "other", 10**6)
+    writer.add_group("test", [make_sample("S001", "smile", "cam00", 0)])
+    writer.close()
+    write_manifest(tmp_path / "other")
+    with pytest.raises(FormatError, match="S001 is in split 'test' here and in 'train'"):
+        merge_shards([whole, tmp_path / "other"], tmp_path / "out", 1)
+
+
+def test_a_damaged_member_and_a_full_folder_are_refused(tmp_path: Path) -> None:
+    whole = write(tmp_path / "whole")
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "file").touch()
+    with pytest.raises(FormatError, match="not empty"):
+        split_shards(whole, tmp_path / "full", 1)
+    entry = ShardReader(whole).entries[0]
+    shard = whole / entry.shard
+    data = bytearray(shard.read_bytes())
+    data[entry.members["rgb.jpg"][0] + 9] ^= 255
+    shard.write_bytes(bytes(data))
+    with pytest.raises(FormatError, match="damaged"):
+        split_shards(whole, tmp_path / "out", 1)
+    assert not (tmp_path / "out").exists()
