@@ -139,10 +139,9 @@ def _append(file: BinaryIO, name: str, data: bytes) -> list[int]:
     """Append one tar member; returns its data's offset, size and CRC-32."""
     info = tarfile.TarInfo(name)  # mtime, uid and gid are 0, mode 0644
     info.size = len(data)
-    file.write(info.tobuf(tarfile.USTAR_FORMAT, "ascii", "strict"))
-    offset = file.tell()
-    file.write(data)
-    file.write(bytes(_padded(len(data)) - len(data)))
+    header = info.tobuf(tarfile.USTAR_FORMAT, "ascii", "strict")
+    offset = file.tell() + len(header)
+    file.writelines((header, data, bytes(_padded(len(data)) - len(data))))
     return [offset, len(data), crc32(data)]
 
 
