@@ -142,7 +142,7 @@ def assemble(
     Raises:
         StageError: more than VOXEL_LIMIT voxels would be held.
     """
-    far = np.float32(BAND * voxel)
+    far = float(np.float32(BAND * voxel))
     table = inside.astype(np.int32)
     constant = np.empty((HELD, BLOCK, BLOCK, BLOCK), np.float32)
     constant[OUTSIDE], constant[INSIDE] = far, -far
@@ -185,13 +185,19 @@ def _check_budget(voxels: int, voxel: float) -> None:
         )
 
 
+def box_shape(extent: np.ndarray, voxel: float) -> tuple[int, int, int]:
+    """Voxels (X, Y, Z) of a box whose sides are (3,) metres long."""
+    x, y, z = np.ceil(extent / voxel - 1e-6).astype(int) + 1
+    return int(x), int(y), int(z)
+
+
 def build(low: np.ndarray, high: np.ndarray, voxel: float, distance: Values) -> Grid:
     """The grid of ``distance``, metres, of points (N, 3), in the box with corners (3,), (3,).
 
     Blocks are chosen by the distance at their middles. Where it jumps, signs of neighbours differ
     without a surface between: these are evaluated too, until none is left.
     """
-    shape = tuple(int(n) for n in np.ceil((high - low) / voxel - 1e-6) + 1)
+    shape = box_shape(high - low, voxel)
     size = tuple(-(-n // BLOCK) for n in shape)
     places = np.stack(np.meshgrid(*map(np.arange, size), indexing="ij"), -1).reshape(-1, 3)
     middle = low + voxel * (places * BLOCK + (BLOCK - 1) / 2)

@@ -15,6 +15,7 @@ from pipelines.depth.blocks import (
     Grid,
     Values,
     assemble,
+    box_shape,
     dilated,
     held,
 )
@@ -63,7 +64,7 @@ def refined(grid: Grid, voxel: float) -> Grid:
     depends on the block's place along it.
     """
     ratio = voxel / grid.voxel
-    shape = tuple(int(n) for n in np.ceil((np.array(grid.shape) - 1) / ratio - 1e-6) + 1)
+    shape = box_shape((np.array(grid.shape) - 1) * grid.voxel, voxel)
     axes = [_coarse_span(-(-n // BLOCK), ratio, m)
             for n, m in zip(shape, grid.table.shape, strict=True)]  # fmt: skip
     below = [grid.table[np.ix_(*ends)] for ends in product(*axes)]
