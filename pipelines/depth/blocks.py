@@ -2,7 +2,7 @@
 
 A table names for every block of the box a row of an array of blocks. Two of the rows are constant
 and shared by all blocks that lie wholly outside or inside. Source: Nießner et al. 2013 and Museth
-2013, with a plain table in the place of a hash or a tree: it takes a 512th of the box's voxels.
+2013, with a plain table in the place of a hash or a tree: it has a 512th of the box's voxels.
 """
 
 from __future__ import annotations
@@ -180,7 +180,7 @@ def _check_budget(voxels: int, voxel: float) -> None:
     if voxels > VOXEL_LIMIT:
         raise StageError(
             f"the surface takes more than {VOXEL_LIMIT:.2g} voxels of {voxel * 1e3:.3g} mm near it,"
-            " expected a head, which takes 2 million at 1.5 mm: is the calibration in metres? else"
+            " expected a head, which takes 3 million of 1.6 mm: is the calibration in metres? else"
             " raise depth.voxel_mm or depth.voxel_px"
         )
 

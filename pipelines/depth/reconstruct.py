@@ -81,7 +81,7 @@ def reconstruct(views: Sequence[View], config: DepthConfig, prior: Prior | None 
         prior: the tracked mesh, or None.
 
     Raises:
-        StageError: the mattes share no volume, or the box is too large for the voxel.
+        StageError: the mattes share no volume, or the box or surface is too large for the voxel.
     """
     low, high = head_box(views)
     extent = float(np.linalg.norm(high - low))

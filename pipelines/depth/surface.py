@@ -43,10 +43,8 @@ def extract_mesh(grid: Grid) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     places = np.argwhere((least < 0) & (most > 0))
     if not len(places):
         return np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3), np.int64)
-    tile, tiles = (
-        BLOCK + 1,
-        math.ceil(len(places) ** (1 / 3)),
-    )  # a cube of them: indices are float32
+    # a cube of them, not a row: the vertices' indices are float32
+    tile, tiles = BLOCK + 1, math.ceil(len(places) ** (1 / 3))
     volume = np.ones((tiles**3, tile, tile, tile), np.float32)
     volume[: len(places)] = _off_zero(windows(grid, places, 0, 1), LEAST_VOXELS * grid.voxel)
     volume = volume.reshape(tiles, tiles, tiles, tile, tile, tile).transpose(0, 3, 1, 4, 2, 5)
