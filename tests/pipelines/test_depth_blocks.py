@@ -143,8 +143,9 @@ def test_the_mesh_is_the_dense_one(distance):
         dense_of(grid, distance), 0.0, gradient_direction="descent"
     )
     assert len(vertices) == len(index) and len(faces) == len(expected)
-    gap, _ = cKDTree(grid.points(index)).query(vertices)
-    assert gap.max() < 0.02 * VOXEL
+    # along the surface a vertex may move: on an edge that lies in it, tiny values decide where
+    gap = vertices - grid.points(index)[cKDTree(index).query((vertices - grid.origin) / VOXEL)[1]]
+    assert np.abs((gap * normals).sum(1)).max() < 0.02 * VOXEL
     ours, theirs = (mesh_area(*m) for m in ((vertices, faces), (grid.points(index), expected)))
     np.testing.assert_allclose(ours, theirs, rtol=1e-4)
     mesh = trimesh.Trimesh(vertices, faces, process=False)
