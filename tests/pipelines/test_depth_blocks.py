@@ -51,7 +51,7 @@ SHAPES = st.builds(
     st.floats(0.03, 0.085),  # the band stays clear of the box's border
     st.floats(0.0, 0.008),
 )
-few = settings(max_examples=4, deadline=None)
+few = settings(max_examples=4, deadline=None, derandomize=True)
 
 
 @few
