@@ -119,7 +119,8 @@ def measure(dataset_root: Path, truth_root: Path, item: str, name: str) -> dict 
         prior, _ = read_prior(dataset, subject, expression, views, config)
         surface = reconstruct(views, config, prior)
         mesh = surface.vertices, surface.faces
-        found |= {"voxels": surface.numbers["voxels"], "voxel_mm": surface.numbers["voxel_mm"]}
+        names = ("voxels_allocated", "voxels_dense", "grid_bytes", "voxel_mm")
+        found |= {key: surface.numbers[key] for key in names}
     else:
         made = baseline(name, dataset, subject, expression, views)
         if made is None:
@@ -237,11 +238,10 @@ def summary(rows: list[dict]) -> dict:
     }
     seconds = [row["s"] for row in rows if row["s"] is not None]
     figures["seconds_per_frame"] = round(float(np.mean(seconds)), 2) if seconds else None
-    if "voxels" in rows[0]:
+    if "voxels_dense" in rows[0]:
         figures["voxel_mm"] = round(rows[0]["voxel_mm"], 3)
-        # the grid is dense: as many are allocated as the box holds
-        figures["voxels_allocated"] = max(row["voxels"] for row in rows)
-        figures["voxels_dense"] = figures["voxels_allocated"]
+        for key in ("voxels_allocated", "voxels_dense", "grid_bytes"):
+            figures[key] = max(row[key] for row in rows)
         figures["raycast_ms_per_megapixel"] = {
             way: round(float(np.mean([row["raycast"]["ms"][way] for row in rows])), 1)
             for way in ("mesh", "sdf")

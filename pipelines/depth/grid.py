@@ -1,4 +1,4 @@
-"""Signed distance grids: sampling, silhouettes turned into distances, the box around a head."""
+"""Views of a head: silhouettes turned into signed distances, the box around their hull."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from scipy.ndimage import map_coordinates
 
 from express50.adapters import cell_to_corner, corner_to_cell
 from express50.cameras import Camera, project
@@ -32,24 +31,6 @@ class View:
     rgb: np.ndarray
     alpha: np.ndarray
     silhouette_px: np.ndarray
-
-
-@dataclass(frozen=True)
-class Grid:
-    """Signed distances (X, Y, Z) float32, metres, negative inside, at origin + voxel * i."""
-
-    origin: np.ndarray
-    voxel: float
-    values: np.ndarray
-
-    def points(self, index: np.ndarray) -> np.ndarray:
-        """World points (N, 3) of fractional voxel indices (N, 3)."""
-        return self.origin + self.voxel * index
-
-    def sample(self, points: np.ndarray) -> np.ndarray:
-        """Trilinear distances (N,) at world points (N, 3), clamped to the grid's border."""
-        index = ((points - self.origin) / self.voxel).T
-        return map_coordinates(self.values, index, order=1, mode="nearest")
 
 
 def silhouette_distance(alpha: np.ndarray, upsample: int = 3) -> np.ndarray:

@@ -11,7 +11,7 @@ import open3d as o3d
 from express50.adapters import cell_to_corner
 from express50.cameras import rays
 from express50.raycast import mesh_scene
-from pipelines.depth.grid import Grid, View, sample_image
+from pipelines.depth.grid import View, sample_image
 
 REACH = (
     0.025  # metres of hull over the tracked mesh up to which it is believed; more is hair, cloth
@@ -31,16 +31,19 @@ class Prior:
     scene: o3d.t.geometry.RaycastingScene
     border: o3d.t.geometry.RaycastingScene | None
 
-    def merge(self, grid: Grid) -> Grid:
-        """The grid with the tracked solid's distances blended in near the tracked surface."""
-        band = grid.values < 2 * grid.voxel
-        points = grid.points(np.argwhere(band))
+    def merge(self, points: np.ndarray, hull: np.ndarray, reach: float) -> np.ndarray:
+        """Distances (N,) to the hull at points (N, 3), the tracked solid's blended in near it.
+
+        What lies ``reach`` metres outside the hull stays.
+        """
+        within = hull < reach
+        points, own = points[within], hull[within]
         distance = self.distance(points)
         # the hull's height over the mesh is the same all along a normal, so that no shell is left
-        belief = self.belief(points, distance - grid.values[band])
-        values = grid.values.copy()
-        values[band] += belief * (np.maximum(distance, values[band]) - values[band])
-        return Grid(grid.origin, grid.voxel, values)
+        belief = self.belief(points, distance - own)
+        merged = hull.copy()
+        merged[within] += belief * (np.maximum(distance, own) - own)
+        return merged
 
     def distance(self, points: np.ndarray) -> np.ndarray:
         """Signed distance (N,) float32, metres, negative inside the closed mesh."""

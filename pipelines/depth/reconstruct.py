@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -10,10 +11,22 @@ from scipy.spatial import cKDTree
 
 from express50.errors import StageError
 from express50.raycast import mesh_scene
+from pipelines.depth.blocks import (
+    BLOCK,
+    VOXEL_LIMIT,
+    Grid,
+    assemble,
+    at,
+    build,
+    combined,
+    held,
+    voxel_index,
+)
+from pipelines.depth.bodies import largest_body
 from pipelines.depth.config import DepthConfig
+from pipelines.depth.filters import refined
 from pipelines.depth.grid import (
     UNSEEN,
-    Grid,
     View,
     head_box,
     hull_distance,
@@ -23,13 +36,10 @@ from pipelines.depth.grid import (
 from pipelines.depth.prior import Prior
 from pipelines.depth.surface import (
     advance,
-    closed,
     extract_mesh,
     fair,
     graph_laplacian,
-    largest_body,
     largest_part,
-    refined,
     rim_targets,
     smooth_displacement,
 )
@@ -37,7 +47,6 @@ from pipelines.depth.sweep import grey_images, sweep_scores, view_weights
 
 LEVEL_RATIO = 1.47
 COUPLINGS = (1e3, 3e3, 1e4, 2e4)  # per square metre; a gap of 10 mm costs 0.1 at first, 2 at last
-VOXEL_LIMIT = 60_000_000
 LARGEST_M = 3.0  # a head with shoulders is a third of it
 
 
@@ -72,7 +81,7 @@ def reconstruct(views: Sequence[View], config: DepthConfig, prior: Prior | None 
         prior: the tracked mesh, or None.
 
     Raises:
-        StageError: the mattes share no volume, or the box is too large for the voxel.
+        StageError: the mattes share no volume, or the box or surface is too large for the voxel.
     """
     low, high = head_box(views)
     extent = float(np.linalg.norm(high - low))
@@ -83,7 +92,7 @@ def reconstruct(views: Sequence[View], config: DepthConfig, prior: Prior | None 
         if level:
             grid = refined(grid, voxel)
         hull = _hull(views, grid)
-        grid = _within_hull(grid, hull)
+        grid = combined(np.maximum, grid, hull)
         if prior is None or level:
             grid = fair(grid, config.fair_voxels * voxel)
         grid = _move(views, grid, hull, config, extent, first=level == 0 and prior is None)
@@ -99,13 +108,13 @@ def _voxels(views: Sequence[View], middle: np.ndarray, config: DepthConfig) -> l
 
 
 def _check_size(low: np.ndarray, high: np.ndarray, voxel: float) -> None:
-    count = float(np.prod((high - low) / voxel))
-    if count > VOXEL_LIMIT or (high - low).max() > LARGEST_M:
+    blocks = float(np.prod((high - low) / (BLOCK * voxel)))
+    if blocks > VOXEL_LIMIT or (high - low).max() > LARGEST_M:
         size = " x ".join(f"{side:.2f}" for side in high - low)
         raise StageError(
-            f"the head's box is {size} m, {count:.2g} voxels of {voxel * 1e3:g} mm; expected at"
-            f" most {LARGEST_M:g} m and {VOXEL_LIMIT:.2g} voxels: is the calibration in metres?"
-            " else raise depth.voxel_mm"
+            f"the head's box is {size} m, {blocks:.2g} blocks of voxels of {voxel * 1e3:g} mm;"
+            f" expected at most {LARGEST_M:g} m and {VOXEL_LIMIT:.2g}: is the calibration in"
+            " metres? else raise depth.voxel_mm"
         )
 
 
@@ -113,34 +122,37 @@ def _initial(
     views: Sequence[View], low: np.ndarray, high: np.ndarray, voxel: float, prior: Prior | None
 ) -> Grid:
     """Distances to the visual hull, and to the tracked mesh where that is known."""
-    grid = hull_grid(views, low, high, voxel)
-    return grid if prior is None else prior.merge(grid)
+    if prior is None:
+        return hull_grid(views, low, high, voxel)
+
+    def distance(points: np.ndarray) -> np.ndarray:
+        return prior.merge(points, hull_distance(views, points), 2 * voxel)
+
+    return build(low, high, voxel, distance)
 
 
 def hull_grid(views: Sequence[View], low: np.ndarray, high: np.ndarray, voxel: float) -> Grid:
     """Signed distances to the visual hull in a box with these corners (3,), metres."""
-    shape = np.ceil((high - low) / voxel).astype(int) + 1
-    index = np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), -1).reshape(-1, 3)
-    return Grid(low, voxel, closed(hull_distance(views, low + voxel * index).reshape(shape)))
+    return build(low, high, voxel, lambda points: hull_distance(views, points))
 
 
-def _hull(views: Sequence[View], grid: Grid) -> np.ndarray:
-    """Distances (X, Y, Z) to the visual hull near the grid's surface, far inside elsewhere."""
-    band = np.abs(grid.values) < 4 * grid.voxel
-    hull = np.full(grid.values.shape, -UNSEEN, np.float32)
-    hull[band] = hull_distance(views, grid.points(np.argwhere(band)))
-    return hull
+def _hull(views: Sequence[View], grid: Grid) -> Grid:
+    """Distances to the visual hull near the grid's surface, inside elsewhere."""
 
+    def values(places: np.ndarray) -> np.ndarray:
+        near = np.abs(at(grid, places)) < 4 * grid.voxel
+        hull = np.full(near.shape, -UNSEEN, np.float32)
+        hull[near] = hull_distance(views, grid.points(voxel_index(places)[near]))
+        return hull
 
-def _within_hull(grid: Grid, hull: np.ndarray) -> Grid:
-    """The grid cut by distances (X, Y, Z) to the visual hull."""
-    return Grid(grid.origin, grid.voxel, closed(np.maximum(grid.values, hull)))
+    inside = np.ones(grid.table.shape, bool)
+    return assemble(grid.origin, grid.voxel, grid.shape, inside, held(grid), values)
 
 
 def _move(
     views: Sequence[View],
     grid: Grid,
-    hull: np.ndarray,
+    hull: Grid,
     config: DepthConfig,
     extent: float,
     first: bool,
@@ -165,7 +177,7 @@ def _move(
         config.stiffness_voxels**4,
         COUPLINGS,
     )
-    return _within_hull(advance(grid, vertices, displacement), hull)
+    return combined(np.maximum, advance(grid, vertices, displacement), hull)
 
 
 def _offsets(config: DepthConfig, voxel: float, first: bool) -> np.ndarray:
@@ -237,8 +249,10 @@ def _finish(views: Sequence[View], grid: Grid, config: DepthConfig) -> Surface:
     used[faces] = True
     numbers = {
         "voxel_mm": grid.voxel * 1e3,
-        "voxels": int(grid.values.size),
-        "voxels_near_surface": int((np.abs(grid.values) < 4 * grid.voxel).sum()),
+        "voxels_allocated": grid.allocated,
+        "voxels_dense": math.prod(grid.shape),
+        "voxel_limit": VOXEL_LIMIT,
+        "grid_bytes": grid.nbytes,
         "vertices": int(used.sum()),
         "photo_agreement_median": float(np.median(agreement[used])),
         "photo_supported": float((confidence[used] > 0.3).mean()),

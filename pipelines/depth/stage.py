@@ -165,7 +165,7 @@ def _metrics(
         "confidence_mean": float(
             np.mean([v.confidence[v.valid].mean() for v in seen.values() if v.valid.any()])
         ),
-        "voxel_share": numbers["voxels_near_surface"] / numbers["voxels"],
+        "voxel_share": numbers["voxels_allocated"] / numbers["voxels_dense"],
         "views": len(seen),
     }
     rounded = {k: round(v, 5) if isinstance(v, float) else v for k, v in table.items()}
@@ -205,7 +205,7 @@ def _depth_picture(view: DepthView) -> np.ndarray:
 
 STAGE = Stage(
     name="depth",
-    version=4,
+    version=5,
     config=DepthConfig,
     presets=PRESETS,
     items=peak_items,

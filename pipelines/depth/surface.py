@@ -2,42 +2,90 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
 import scipy.sparse as sparse
-from scipy.ndimage import gaussian_filter, label, map_coordinates
+from scipy.ndimage import maximum_filter, minimum_filter
 from scipy.sparse.linalg import cg
 from skimage.measure import marching_cubes
 
 from express50.adapters import cell_to_corner
 from express50.cameras import unproject
-from pipelines.depth.grid import Grid, View
+from pipelines.depth.blocks import (
+    BLOCK,
+    HELD,
+    Grid,
+    at,
+    combined,
+    held,
+    replaced,
+    windows,
+)
+from pipelines.depth.filters import smoothed
+from pipelines.depth.grid import View
 
 OUTLIER_STEPS = 2.0
+LEAST_VOXELS = 1e-3  # voxels; distances nearer to 0 are meshed as if they were this
 
 
 def extract_mesh(grid: Grid) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Vertices (V, 3), outward normals (V, 3) and faces (F, 3) of the zero level.
 
-    Source: Lorensen and Cline 1987, as scikit-image has it; normals are the grid's gradient.
+    Source: Lorensen and Cline 1987, as scikit-image has it; normals are the grid's gradient. Blocks
+    with the first voxels of the next ones are laid out as one volume; cubes across its seams are
+    masked, and vertices that two blocks have on their common face become one.
     """
-    if not (grid.values.min() < 0 < grid.values.max()):
+    ends = grid.blocks.min((1, 2, 3))[grid.table], grid.blocks.max((1, 2, 3))[grid.table]
+    least = minimum_filter(ends[0], 2, origin=-1, mode="nearest")
+    most = maximum_filter(ends[1], 2, origin=-1, mode="nearest")
+    places = np.argwhere((least < 0) & (most > 0))
+    if not len(places):
         return np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3), np.int64)
-    index, faces, _, _ = marching_cubes(grid.values, 0.0, gradient_direction="descent")
-    return grid.points(index), grid_normals(grid, index), faces.astype(np.int64)
+    # a cube of them, not a row: the vertices' indices are float32
+    tile, tiles = BLOCK + 1, math.ceil(len(places) ** (1 / 3))
+    volume = np.ones((tiles**3, tile, tile, tile), np.float32)
+    volume[: len(places)] = _off_zero(windows(grid, places, 0, 1), LEAST_VOXELS * grid.voxel)
+    volume = volume.reshape(tiles, tiles, tiles, tile, tile, tile).transpose(0, 3, 1, 4, 2, 5)
+    inner = np.arange(tiles * tile) % tile > 0
+    mask = inner[:, None, None] & inner[:, None] & inner
+    found, faces, _, _ = marching_cubes(
+        volume.reshape(mask.shape), 0.0, mask=mask, gradient_direction="descent"
+    )
+    which = (found // tile).astype(np.int64) @ [tiles * tiles, tiles, 1]
+    index, faces = _welded(found % tile + BLOCK * places[which], faces.astype(np.int64))
+    return grid.points(index), grid_normals(grid, index), faces
+
+
+def _off_zero(values: np.ndarray, least: float) -> np.ndarray:
+    """Values pushed ``least`` away from 0, so that every vertex lies clearly on one edge."""
+    return np.where(np.abs(values) < least, np.copysign(np.float32(least), values), values)
+
+
+def _welded(index: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices (V, 3), in voxels, and faces (F, 3) where a voxel's edge has one vertex only.
+
+    Vertices within a cube, which marching cubes adds where faces are ambiguous, are none's double.
+    """
+    whole = np.floor(index).astype(np.int64)
+    share = index > whole
+    corner = np.ravel_multi_index(tuple(whole.T), tuple(whole.max(0) + 1))
+    key = 3 * corner + share.argmax(1)
+    lone = share.sum(1) > 1
+    key[lone] = -1 - np.arange(lone.sum())
+    _, first, welded = np.unique(key, return_index=True, return_inverse=True)
+    return index[first], welded[faces]
 
 
 def grid_normals(grid: Grid, index: np.ndarray) -> np.ndarray:
     """Unit gradient (N, 3) at fractional voxel indices (N, 3), from values smoothed by a voxel."""
-    smooth = gaussian_filter(grid.values, 1.0)
-    step = np.eye(3)
+    smooth = smoothed(grid, 1.0)
     slope = [
-        map_coordinates(smooth, (index + e).T, order=1, mode="nearest")
-        - map_coordinates(smooth, (index - e).T, order=1, mode="nearest")
-        for e in step
+        smooth.sample(grid.points(index + e)) - smooth.sample(grid.points(index - e))
+        for e in np.eye(3)
     ]
-    normals = np.stack(slope, axis=1)
+    normals = np.stack(slope, axis=1).astype(np.float64)
     return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
 
 
@@ -58,7 +106,7 @@ def rim_targets(views: Sequence[View], grid: Grid, depth_range: float) -> np.nda
     surface lacks (positive: it has shrunk away from the silhouette).
     """
     steps = np.arange(-0.5, 0.5, 1.5 * grid.voxel / depth_range) * depth_range
-    middle = grid.points((np.array(grid.values.shape) - 1) / 2)
+    middle = grid.points((np.array(grid.shape) - 1) / 2)
     found = []
     for view in views:
         edge = (view.silhouette_px > 0) & (view.silhouette_px <= 1.0)
@@ -166,67 +214,44 @@ def advance(grid: Grid, vertices: np.ndarray, displacement: np.ndarray) -> Grid:
     voxel out of its reach lies far from the old and the new surface and stays.
     """
     index = np.rint((vertices - grid.origin) / grid.voxel).astype(int)
-    index = np.ravel_multi_index(
-        tuple(np.clip(index, 0, np.array(grid.values.shape) - 1).T), grid.values.shape
-    )
-    size = grid.values.size
+    index = np.clip(index, 0, np.array(grid.shape) - 1)
     spread = [
-        gaussian_filter(
-            np.bincount(index, weight, size).reshape(grid.values.shape).astype(float),
-            sigma=1.2,
-            truncate=7.0,
-        )
-        for weight in (displacement, None)
+        smoothed(_scattered(grid, index, weight), sigma=1.2, truncate=7.0)
+        for weight in (displacement, np.ones(len(index)))
     ]
-    known = spread[1] > 1e-12
-    values = grid.values.copy()
-    values[known] -= (spread[0][known] / spread[1][known]).astype(np.float32)
-    return Grid(grid.origin, grid.voxel, values)
+
+    def moved(values: np.ndarray, pull: np.ndarray, weight: np.ndarray) -> np.ndarray:
+        known = weight > 1e-12
+        return values - np.where(known, pull / np.where(known, weight, 1), 0)
+
+    return combined(moved, grid, *spread)
+
+
+def _scattered(grid: Grid, index: np.ndarray, weight: np.ndarray) -> Grid:
+    """Sums of weights (N,) at voxels (N, 3), zero elsewhere, in blocks of their own."""
+    places = tuple((index // BLOCK).T)
+    table = np.zeros_like(grid.table)
+    table[places] = HELD
+    table[table == HELD] = HELD + np.arange((table == HELD).sum())
+    inner = np.ravel_multi_index(tuple((index % BLOCK).T), (BLOCK,) * 3)
+    size = (int(table.max()) + 1) * BLOCK**3
+    sums = np.bincount(table[places].astype(np.int64) * BLOCK**3 + inner, weight, size)
+    blocks = sums.astype(np.float32).reshape(-1, BLOCK, BLOCK, BLOCK)
+    return Grid(grid.origin, grid.voxel, grid.shape, table, blocks)
 
 
 def fair(grid: Grid, sigma: float) -> Grid:
     """The grid smoothed by a Gaussian of ``sigma`` metres and scaled back to unit slope."""
-    clipped = np.clip(grid.values, -8 * grid.voxel, 8 * grid.voxel)
-    smooth = gaussian_filter(clipped, sigma / grid.voxel, mode="nearest")
-    slope = np.sqrt(sum(g * g for g in np.gradient(smooth, grid.voxel)))
-    near = np.abs(clipped) < 3 * grid.voxel
-    values = np.where(near, smooth / np.clip(slope, 0.4, 2.0), clipped)
-    return Grid(grid.origin, grid.voxel, values.astype(np.float32))
+    smooth = smoothed(grid, sigma / grid.voxel)
 
+    def values(places: np.ndarray) -> np.ndarray:
+        own, around = at(grid, places), windows(smooth, places, 1, 1)
+        steps = np.gradient(around, grid.voxel, axis=(1, 2, 3))
+        slope = np.sqrt(sum(g * g for g in steps))[:, 1:-1, 1:-1, 1:-1]
+        smoothest = around[:, 1:-1, 1:-1, 1:-1] / np.clip(slope, 0.4, 2.0)
+        return np.where(np.abs(own) < 3 * grid.voxel, smoothest, own)
 
-def refined(grid: Grid, voxel: float) -> Grid:
-    """The same distances on a grid of another voxel size: cubic near the surface, else nearest."""
-    extent = (np.array(grid.values.shape) - 1) * grid.voxel
-    shape = np.ceil(extent / voxel - 1e-6).astype(int) + 1
-    clipped = np.clip(grid.values, -8 * grid.voxel, 8 * grid.voxel)
-    ratio = voxel / grid.voxel
-    axes = [np.minimum(np.rint(np.arange(n) * ratio).astype(int), m - 1)
-            for n, m in zip(shape, grid.values.shape, strict=True)]  # fmt: skip
-    values = clipped[np.ix_(*axes)]
-    near = np.argwhere(np.abs(values) < 3 * grid.voxel)
-    # mode "nearest" with a prefilter would copy the whole grid; the band holds a tenth of it
-    values[tuple(near.T)] = map_coordinates(clipped, near.T * ratio, order=3, mode="mirror")
-    return Grid(grid.origin, voxel, values)
-
-
-def closed(values: np.ndarray) -> np.ndarray:
-    """Distances whose border voxels are outside, so that the surface is closed; in place."""
-    for axis in range(3):
-        edge = np.moveaxis(values, axis, 0)
-        edge[0] = np.maximum(edge[0], 1e-4)
-        edge[-1] = np.maximum(edge[-1], 1e-4)
-    return values
-
-
-def largest_body(grid: Grid) -> Grid:
-    """The grid with only the largest connected inside; what floats beside it is outside."""
-    inside = grid.values < 0
-    labels, count = label(inside, structure=np.ones((3, 3, 3)))
-    if count < 2:
-        return grid
-    largest = 1 + int(np.bincount(labels.ravel())[1:].argmax())
-    values = np.where(inside & (labels != largest), np.float32(grid.voxel), grid.values)
-    return Grid(grid.origin, grid.voxel, values)
+    return replaced(grid, held(grid), values)
 
 
 def largest_part(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:

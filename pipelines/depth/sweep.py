@@ -13,7 +13,8 @@ import cv2
 import numpy as np
 import open3d as o3d
 
-from pipelines.depth.grid import Grid, View, project_fast, sample_image
+from pipelines.depth.blocks import Grid
+from pipelines.depth.grid import View, project_fast, sample_image
 
 GRAZING = 0.25  # cosine; flatter than this, a patch is squeezed to under a quarter of its width
 

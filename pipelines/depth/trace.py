@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from express50.cameras import Camera, rays
-from pipelines.depth.grid import Grid
+from pipelines.depth.blocks import Grid
 from pipelines.depth.raycast import DepthView, depth_view
 from pipelines.depth.reconstruct import Surface
 from pipelines.depth.surface import grid_normals
@@ -66,7 +66,7 @@ def _box_span(
     grid: Grid, origin: np.ndarray, directions: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Where rays (N, 3) enter and leave the grid (N,), (N,); near is not under far if they miss."""
-    high = grid.origin + grid.voxel * (np.array(grid.values.shape) - 1)
+    high = grid.origin + grid.voxel * (np.array(grid.shape) - 1)
     steep = np.where(np.abs(directions) > 1e-12, directions, 1e-12)
     ends = np.stack([(grid.origin - origin) / steep, (high - origin) / steep])
     return np.maximum(ends.min(0).max(1), 1e-6), ends.max(0).min(1)

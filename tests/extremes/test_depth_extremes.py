@@ -13,7 +13,7 @@ from express50.images import depth_from_uint16, depth_to_uint16
 from express50.shards_cli import sample_picture
 from express50.transforms import make_transform
 from pipelines.depth.config import DepthConfig
-from pipelines.depth.grid import Grid, head_box, silhouette_distance
+from pipelines.depth.grid import head_box, silhouette_distance
 from pipelines.depth.reconstruct import reconstruct
 from pipelines.depth.surface import (
     extract_mesh,
@@ -26,9 +26,10 @@ from pipelines.depth.sweep import grey_images, sweep_scores
 from pipelines.depth.views import make_view
 from pipelines.pack.crop import Crop, cut_depth, cut_image
 from tests.pipelines.bump_head import render, ring
+from tests.pipelines.dense_grid import from_dense
 
 COARSE = DepthConfig(voxel_mm=6.0)
-FLAT = Grid(np.zeros(3), 1.0, np.zeros((2, 2, 2), np.float32))
+FLAT = from_dense(np.zeros(3), 1.0, np.zeros((2, 2, 2), np.float32))
 
 
 def views_of(cameras, change=lambda rgb: rgb):
@@ -45,7 +46,7 @@ def views():
 
 
 def finite(surface) -> bool:
-    arrays = (surface.vertices, surface.normals, surface.confidence, surface.grid.values)
+    arrays = (surface.vertices, surface.normals, surface.confidence, surface.grid.blocks)
     return all(np.isfinite(array).all() for array in arrays)
 
 
@@ -110,16 +111,16 @@ def test_silhouette_distance_of_constant_and_tiny_mattes_is_finite(alpha):
     assert np.isfinite(silhouette_distance(alpha.astype(np.float32))).all()
 
 
-@pytest.mark.parametrize("value", [-1.0, 0.0, 1.0])
+@pytest.mark.parametrize("value", [0.0, 1e-9, 1.0, np.inf])
 def test_constant_grids_have_no_surface(value):
-    grid = Grid(np.zeros(3), 0.01, np.full((5, 6, 7), value, np.float32))
+    grid = from_dense(np.zeros(3), 0.01, np.full((5, 6, 7), value, np.float32))
     vertices, _, faces = extract_mesh(grid)
     assert len(vertices) == len(faces) == 0
-    assert np.isfinite(fair(grid, 0.01).values).all()
+    assert np.isfinite(fair(grid, 0.01).blocks).all()
 
 
 def test_no_silhouettes_give_no_targets():
-    grid = Grid(np.zeros(3), 0.01, np.ones((5, 5, 5), np.float32))
+    grid = from_dense(np.zeros(3), 0.01, np.ones((5, 5, 5), np.float32))
     assert rim_targets([], grid, 0.1).shape == (0, 3)
 
 

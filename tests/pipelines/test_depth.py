@@ -10,8 +10,9 @@ import pytest
 from express50.cameras import rays
 from express50.errors import StageError
 from express50.raycast import mesh_scene
+from pipelines.depth.blocks import build
 from pipelines.depth.config import DepthConfig
-from pipelines.depth.grid import Grid, head_box, hull_distance, silhouette_distance
+from pipelines.depth.grid import head_box, hull_distance, silhouette_distance
 from pipelines.depth.prior import boundary_loops, make_prior, matte_agreement
 from pipelines.depth.raycast import cast_view, write_ply
 from pipelines.depth.reconstruct import reconstruct
@@ -105,14 +106,15 @@ def test_prior_gives_way_where_the_hull_rises_far_above_it():
     """Hair and shoulders stand over the tracked mesh; they are kept whole, without a shell."""
     vertices, faces = mesh()
     prior = make_prior(vertices, faces)
-    axis = np.linspace(-0.25, 0.25, 51)
-    cube = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1)
-    far = Grid(np.full(3, -0.25), 0.01, (np.linalg.norm(cube, axis=-1) - 0.2).astype(np.float32))
-    np.testing.assert_array_equal(prior.merge(far).values, far.values)
-    own = prior.distance(cube.reshape(-1, 3)).reshape(far.values.shape)
-    near = Grid(far.origin, far.voxel, (own - 0.01).astype(np.float32))
-    inside = near.values < 0.02
-    np.testing.assert_allclose(prior.merge(near).values[inside], own[inside], atol=1e-6)
+    axis = np.linspace(-0.25, 0.25, 31)
+    cube = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
+    far = (np.linalg.norm(cube, axis=-1) - 0.2).astype(np.float32)
+    np.testing.assert_array_equal(prior.merge(cube, far, 0.02), far)
+    own = prior.distance(cube)
+    near = (own - 0.01).astype(np.float32)
+    merged = prior.merge(cube, near, 0.02)
+    np.testing.assert_allclose(merged[near < 0.02], own[near < 0.02], atol=1e-6)
+    np.testing.assert_array_equal(merged[near >= 0.02], near[near >= 0.02])
 
 
 def test_fewer_cameras_still_give_a_head(shots):
@@ -160,10 +162,8 @@ def test_box_holds_the_head_and_little_more(views):
 
 
 def test_advance_moves_a_sphere_by_the_displacement():
-    axis = np.linspace(-0.15, 0.15, 61)
-    cube = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1)
-    values = (np.linalg.norm(cube, axis=-1) - 0.1).astype(np.float32)
-    grid = Grid(np.full(3, -0.15), 0.005, values)
+    side = np.full(3, 0.15)
+    grid = build(-side, side, 0.005, lambda points: np.linalg.norm(points, axis=1) - 0.1)
     vertices, normals, _ = extract_mesh(grid)
     np.testing.assert_allclose((normals * vertices).sum(1), 0.1, atol=1e-3)
     moved = extract_mesh(advance(grid, vertices, np.full(len(vertices), -0.012)))[0]

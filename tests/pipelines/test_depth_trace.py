@@ -9,22 +9,22 @@ import pytest
 
 from express50.cameras import Camera, rays
 from express50.raycast import mesh_scene
+from pipelines.depth.blocks import Grid, build, combined
+from pipelines.depth.bodies import largest_body
 from pipelines.depth.config import DepthConfig
-from pipelines.depth.grid import Grid
 from pipelines.depth.raycast import cast_view
 from pipelines.depth.reconstruct import Surface
-from pipelines.depth.surface import extract_mesh, largest_body
+from pipelines.depth.surface import extract_mesh
 from pipelines.depth.trace import trace, trace_view
 from tests.pipelines.bump_head import ring
+from tests.pipelines.dense_grid import to_dense
 
 RADIUS, VOXEL = 0.09, 0.003
 
 
 def ball(centre=0.0, radius=RADIUS) -> Grid:
-    origin = np.full(3, -0.15)
-    index = np.stack(np.meshgrid(*[np.arange(101)] * 3, indexing="ij"), -1)
-    values = np.linalg.norm(origin + VOXEL * index - centre, axis=-1) - radius
-    return Grid(origin, VOXEL, np.clip(values, -8 * VOXEL, 8 * VOXEL).astype(np.float32))
+    side = np.full(3, 0.15)
+    return build(-side, side, VOXEL, lambda p: np.linalg.norm(p - centre, axis=1) - radius)
 
 
 def surface_of(grid: Grid) -> Surface:
@@ -65,7 +65,8 @@ def test_mesh_and_distances_agree():
 
 def test_what_is_not_there_is_not_hit():
     camera = ring(1, 160)[0]
-    empty = replace(ball(), values=np.full((101, 101, 101), VOXEL, np.float32))
+    side = np.full(3, 0.15)
+    empty = build(-side, side, VOXEL, lambda points: np.full(len(points), VOXEL))
     assert not np.isfinite(trace(empty, camera)).any()
     away = replace(camera, cam_from_world=np.diag([1.0, -1.0, -1.0, 1.0]) @ camera.cam_from_world)
     assert not np.isfinite(trace(ball(), away)).any()
@@ -73,10 +74,9 @@ def test_what_is_not_there_is_not_hit():
 
 def test_only_the_largest_body_stays():
     grid, speck = ball(), ball(0.12, 0.012)
-    both = replace(grid, values=np.minimum(grid.values, speck.values))
-    left = largest_body(both)
-    assert (left.values[speck.values < 0] > 0).all()
-    assert np.array_equal(left.values < 0, grid.values < 0)
+    left = largest_body(combined(np.minimum, grid, speck))
+    assert (to_dense(left)[to_dense(speck) < 0] > 0).all()
+    assert np.array_equal(to_dense(left) < 0, to_dense(grid) < 0)
     assert largest_body(grid) is grid
 
 

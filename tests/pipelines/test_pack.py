@@ -287,7 +287,9 @@ def test_depth_stage_drops_a_bad_camera_and_reports_it(tmp_path):
     depth, valid = read_depth_png(folder / "cam00.png")
     assert 1.0 < depth[valid].mean() < 1.2 and valid.sum() > 500
     assert not (folder / "cam01.png").exists() and (folder / "qc" / "surface.jpg").exists()
-    assert row["voxel_share"] < 1 and row["coverage"] > 0.9
+    assert 0 < row["voxels_allocated"] < row["voxel_limit"] and row["grid_bytes"] < 2e6
+    assert row["voxel_share"] == round(row["voxels_allocated"] / row["voxels_dense"], 5)
+    assert row["coverage"] > 0.9
 
 
 def test_an_excluded_subject_is_left_out_with_its_reason(dataset, tmp_path):
