@@ -15,9 +15,10 @@ import numpy as np
 from benchmarks.calibrate import figures as rig_figures
 from benchmarks.regions_truth import iou_figures, true_head_alpha, true_labels, view_row
 from express50.cameras import Camera, transform_camera
+from express50.depth_files import depth_file, read_depth
 from express50.errors import Express50Error
 from express50.frames import read_cameras_of, read_peaks
-from express50.images import contact_sheet, read_depth_png, read_image, write_image
+from express50.images import contact_sheet, read_image, write_image
 from express50.layout import Dataset
 from express50.parts import COLOURS
 from express50.tracks import read_track
@@ -169,10 +170,10 @@ def measure_depth(dataset: Dataset, truth: Truth, out: Path | None = None) -> di
     """
     errors, skin, covered, rows, names = [], [], [], [], []
     for subject, expression, frame, camera in sampled_views(dataset, truth):
-        path = dataset.item_dir("depth", f"{subject}/{expression}") / f"{camera.id}.png"
-        if not path.is_file():
+        path = depth_file(dataset.item_dir("depth", f"{subject}/{expression}"), camera.id)
+        if path is None:
             continue
-        depth, valid = read_depth_png(path)
+        depth, valid = read_depth(path)
         true, true_valid = truth.render_depth(subject, frame, camera)
         both = valid & true_valid
         errors.append(1e3 * np.abs(depth - true)[both])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -34,6 +34,7 @@ from pipelines.depth.surface import (
     smooth_displacement,
 )
 from pipelines.depth.sweep import grey_images, sweep_scores, view_weights
+from pipelines.depth.warm import Carried
 
 LEVEL_RATIO = 1.47
 COUPLINGS = (1e3, 3e3, 1e4, 2e4)  # per square metre; a gap of 10 mm costs 0.1 at first, 2 at last
@@ -63,13 +64,19 @@ class Surface:
     numbers: dict = field(default_factory=dict)
 
 
-def reconstruct(views: Sequence[View], config: DepthConfig, prior: Prior | None = None) -> Surface:
+def reconstruct(
+    views: Sequence[View],
+    config: DepthConfig,
+    prior: Prior | None = None,
+    start: Carried | None = None,
+) -> Surface:
     """Reconstruct the surface that the views share.
 
     Args:
         views: usable views, at least two.
         config: the knobs.
         prior: the tracked mesh, or None.
+        start: a surface so near that the coarse levels can be left out; then no prior counts.
 
     Raises:
         StageError: the mattes share no volume, or the box is too large for the voxel.
@@ -78,16 +85,33 @@ def reconstruct(views: Sequence[View], config: DepthConfig, prior: Prior | None 
     extent = float(np.linalg.norm(high - low))
     voxels = _voxels(views, (low + high) / 2, config)
     _check_size(low, high, voxels[-1])
-    grid = _initial(views, low, high, voxels[0], prior)
+    grid = _initial(views, low, high, voxels[0], start or prior)
+    if start is not None:
+        grid, voxels = _skipped(grid, voxels, start, config.warm_levels)
     for level, voxel in enumerate(voxels):
-        if level:
+        if grid.voxel != voxel:
             grid = refined(grid, voxel)
         hull = _hull(views, grid)
         grid = _within_hull(grid, hull)
-        if prior is None or level:
+        if prior is None or start is not None or level:
             grid = fair(grid, config.fair_voxels * voxel)
-        grid = _move(views, grid, hull, config, extent, first=level == 0 and prior is None)
+        deep = level == 0 and prior is None and start is None
+        grid = _move(views, grid, hull, config, extent, first=deep)
     return _finish(views, grid, config)
+
+
+def _skipped(
+    grid: Grid, voxels: list[float], start: Carried, levels: int
+) -> tuple[Grid, list[float]]:
+    """The start on the grid before the last ``levels`` voxels, and these.
+
+    One level coarser than the first to move is fine enough: that one is faired before it moves.
+    """
+    last = voxels[-levels:]
+    before = voxels[max(len(voxels) - levels - 1, 0)]
+    if before < grid.voxel:
+        grid = replace(start, rough=grid).merge(refined(grid, before))
+    return grid, last
 
 
 def _voxels(views: Sequence[View], middle: np.ndarray, config: DepthConfig) -> list[float]:
