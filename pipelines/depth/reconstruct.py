@@ -39,7 +39,7 @@ from pipelines.depth.warm import Carried
 LEVEL_RATIO = 1.47
 COUPLINGS = (1e3, 3e3, 1e4, 2e4)  # per square metre; a gap of 10 mm costs 0.1 at first, 2 at last
 VOXEL_LIMIT = 60_000_000
-LARGEST_M = 3.0  # a head with shoulders is a third of it
+SMALLEST_M, LARGEST_M = 0.03, 3.0  # a head is 0.25 m high, with shoulders under 1 m
 
 
 @dataclass(frozen=True)
@@ -123,8 +123,14 @@ def _voxels(views: Sequence[View], middle: np.ndarray, config: DepthConfig) -> l
 
 
 def _check_size(low: np.ndarray, high: np.ndarray, voxel: float) -> None:
+    extent = float((high - low).max())
+    if extent < SMALLEST_M:
+        raise StageError(
+            f"the head's box is {extent * 1e3:.3g} mm large; expected {SMALLEST_M * 1e3:g} mm and"
+            " more: is the calibration in metres?"
+        )
     count = float(np.prod((high - low) / voxel))
-    if count > VOXEL_LIMIT or (high - low).max() > LARGEST_M:
+    if count > VOXEL_LIMIT or extent > LARGEST_M:
         size = " x ".join(f"{side:.2f}" for side in high - low)
         raise StageError(
             f"the head's box is {size} m, {count:.2g} voxels of {voxel * 1e3:g} mm; expected at"
