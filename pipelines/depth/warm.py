@@ -20,7 +20,7 @@ from express50.frames import read_peaks
 from express50.head.load import load_head
 from express50.layout import Dataset
 from express50.raycast import mesh_scene
-from express50.tracks import read_track
+from express50.tracks import Track, read_track
 from pipelines.depth.config import DepthConfig
 from pipelines.depth.grid import Grid, View
 from pipelines.depth.prior import Prior, matte_agreement
@@ -103,15 +103,26 @@ def carried_start(
         return None, {"used": False, "why": f"{source} could not be reconstructed"}
     subject, expression = item.split("/")
     track = read_track(track_path(dataset, subject))
-    names = (source.split("/")[1], expression)
-    before, after = (track.vertices[track.row(name)].astype(np.float64) for name in names)
-    vertices, faces = read_surface(surface_file(dataset, source))
+    pair = source.split("/")[1], expression
+    start, facts = start_from(read_surface(surface_file(dataset, source)), track, pair, views)
+    facts |= {"from": source}
+    if facts["agreement"] < config.track_agreement:
+        return None, {"used": False, "why": "it does not lie in the mattes"} | facts
+    return start, {"used": True} | facts
+
+
+def start_from(
+    mesh: tuple[np.ndarray, np.ndarray], track: Track, pair: tuple[str, str], views: Sequence[View]
+) -> tuple[Carried, dict]:
+    """A surface (V, 3), (F, 3) carried from one of a ``pair`` of tracked expressions to the other.
+
+    Returns it with its ``agreement``, the share of it that lies in the views' mattes.
+    """
+    before, after = (track.vertices[track.row(name)].astype(np.float64) for name in pair)
+    vertices, faces = mesh
     moved = carry(vertices, faces, before, after, load_head(track.head).faces.numpy())
     agreement = round(matte_agreement(views, moved, faces), 4)
-    facts = {"from": source, "agreement": agreement}
-    if agreement < config.track_agreement:
-        return None, {"used": False, "why": "it does not lie in the mattes"} | facts
-    return Carried(mesh_scene(moved, faces)), {"used": True} | facts
+    return Carried(mesh_scene(moved, faces)), {"agreement": agreement}
 
 
 def carry(
