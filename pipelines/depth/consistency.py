@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 import open3d as o3d
 
@@ -22,6 +23,7 @@ from pipelines.depth.grid import INSIDE, project_fast, sample_image
 NEIGHBOURS = 4  # views that each is compared with, those whose directions are closest
 CONSISTENT_STEPS = 10.0  # 8-bit steps up to which colours agree: noise and highlights take some
 DARK = 16.0  # 8-bit steps; darker pixels tell no gain
+FLAT = 4.0  # tangent of the angle between line of sight and normal from which colours smear
 HIDDEN_M = 0.004  # metres behind the neighbour's own depth at which a point counts as hidden
 
 
@@ -33,11 +35,13 @@ class Shot:
         camera: undistorted pinhole camera.
         colour: (H, W, 3) float32, 8-bit steps.
         depth: (H, W) float32 metres, 0 where there is none.
+        plain: (H, W) whether the pixel is off every edge and the surface not seen too flatly there.
     """
 
     camera: Camera
     colour: np.ndarray
     depth: np.ndarray
+    plain: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -79,7 +83,18 @@ def make_shot(
         alpha = resize_area(alpha, camera.width, camera.height)
     depth = scene.cast_rays(camera_rays(camera), nthreads=1)["t_hit"].numpy()
     seen = np.isfinite(depth) & (alpha > INSIDE)
-    return Shot(camera, rgb.astype(np.float32), np.where(seen, depth, 0).astype(np.float32))
+    depth = np.where(seen, depth, 0).astype(np.float32)
+    return Shot(camera, rgb.astype(np.float32), depth, _plain(camera, depth))
+
+
+def _plain(camera: Camera, depth: np.ndarray) -> np.ndarray:
+    """Pixels (H, W) about which depth (H, W) is known and changes by under FLAT a step sideways.
+
+    At a neighbour's outline colours are mixed with what is behind, and a pixel spans centimetres.
+    """
+    square = np.ones((3, 3), np.uint8)
+    low, high = cv2.erode(depth, square), cv2.dilate(depth, square)
+    return (low > 0) & (high - low < 2 * FLAT * high / camera.K[0, 0])
 
 
 def agreements(shots: Sequence[Shot]) -> list[Agreement]:
@@ -117,8 +132,8 @@ def _difference(colour: np.ndarray, points: np.ndarray, other: Shot) -> np.ndarr
     size = np.array([other.camera.width, other.camera.height])
     there = (depth > 0) & ((pixels >= 1) & (pixels <= size - 1)).all(1)
     column, row = np.floor(pixels[there]).astype(int).T
-    own = other.depth[row, column]
-    there[there] = (own > 0) & (depth[there] - own < HIDDEN_M)
+    hidden = depth[there] - other.depth[row, column] > HIDDEN_M
+    there[there] = other.plain[row, column] & ~hidden
     found = np.full(len(points), np.nan, np.float32)
     if not there.any():
         return found
