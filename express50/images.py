@@ -80,6 +80,8 @@ def write_image(path: Path, image: np.ndarray, quality: int = 95, half: bool = F
     if quality >= 95:
         spec.attribute("jpeg:subsampling", "4:4:4")
     spec.attribute("png:compressionLevel", 3)
+    if Path(path).suffix.lower() == ".exr":  # the time of writing would go into its header
+        spec.attribute("DateTime", "1970:01:01 00:00:00")
     target = oiio.ImageOutput.create(str(path))
     if target is None or not target.open(str(path), spec):
         raise FormatError(f"{path}: cannot be written ({oiio.geterror().strip()})")
