@@ -13,11 +13,13 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.calibrate import figures as rig_figures
+from benchmarks.depth_score import cast
 from benchmarks.regions_truth import iou_figures, true_head_alpha, true_labels, view_row
 from express50.cameras import Camera, transform_camera
+from express50.depth_files import depth_file, read_depth, read_normals
 from express50.errors import Express50Error
 from express50.frames import read_cameras_of, read_peaks
-from express50.images import contact_sheet, read_depth_png, read_image, write_image
+from express50.images import contact_sheet, read_image, write_image
 from express50.layout import Dataset
 from express50.parts import COLOURS
 from express50.tracks import read_track
@@ -25,7 +27,8 @@ from express50.twin.truth import Truth, align_worlds
 
 VIEWS_A_PEAK = 2  # views measured of every peak; they walk around the rig from peak to peak
 SHEET_ROWS = 7
-ERROR_RANGE_MM = 8.0  # white in the error pictures
+ERROR_RANGE_MM = 8.0  # full colour in the error pictures
+ERROR_RANGE_DEG = 45.0  # white in those of normals
 NEUTRAL = "neutral"
 
 
@@ -167,32 +170,54 @@ def measure_depth(dataset: Dataset, truth: Truth, out: Path | None = None) -> di
 
     The errors of skin are told apart: the truth's hair is single strands, which no surface follows.
     """
-    errors, skin, covered, rows, names = [], [], [], [], []
+    errors, skin, degrees, covered, rows, names = [], [], [], [], [], []
     for subject, expression, frame, camera in sampled_views(dataset, truth):
-        path = dataset.item_dir("depth", f"{subject}/{expression}") / f"{camera.id}.png"
-        if not path.is_file():
+        folder = dataset.item_dir("depth", f"{subject}/{expression}")
+        path = depth_file(folder, camera.id)
+        if path is None:
             continue
-        depth, valid = read_depth_png(path)
+        depth, valid = read_depth(path)
         true, true_valid = truth.render_depth(subject, frame, camera)
         both = valid & true_valid
         errors.append(1e3 * np.abs(depth - true)[both])
-        skin.append(1e3 * np.abs(depth - true)[both & truth.skin(subject, frame, camera)])
+        bare = both & truth.skin(subject, frame, camera)
+        skin.append(1e3 * np.abs(depth - true)[bare])
+        turned = _normal_error(folder / f"{camera.id}_normals.png", truth, subject, frame, camera)
+        degrees.append(turned[bare & np.isfinite(turned)])
         covered.append(both.sum() / max(1, true_valid.sum()))
         rows.append(
-            [_depth_grey(depth, valid), _depth_grey(true, true_valid), _heat(depth - true, both)]
+            [
+                _depth_grey(depth, valid),
+                _depth_grey(true, true_valid),
+                _heat(depth - true, both),
+                _grey(np.where(bare, np.nan_to_num(turned) / ERROR_RANGE_DEG, 0.0)),
+            ]
         )
         names.append(
-            f"{subject} {expression} {camera.id}: depth, truth, error to {ERROR_RANGE_MM:g} mm"
+            f"{subject} {expression} {camera.id}: depth, truth, error to {ERROR_RANGE_MM:g} mm,"
+            f" normals on skin to {ERROR_RANGE_DEG:g} degrees"
         )
     _sheet(out, "depth_error", rows, names)
-    every = np.concatenate(errors)
+    every, turns = np.concatenate(errors), np.concatenate(degrees)
     return {
         "abs_error_mm_median": float(np.median(every)),
         "abs_error_mm_p95": float(np.percentile(every, 95)),
         "skin_error_mm_median": float(np.median(np.concatenate(skin))),
+        "normal_error_deg_median": float(np.median(turns)) if len(turns) else None,
         "coverage": float(np.mean(covered)),
         "views": len(errors),
     }
+
+
+def _normal_error(path: Path, truth: Truth, subject: str, frame: int, camera: Camera) -> np.ndarray:
+    """Angles (H, W), degrees, of a normal map to the true head's; NaN where either is unknown."""
+    if not path.is_file():
+        return np.full((camera.height, camera.width), np.nan)
+    found, known = read_normals(path)
+    head = truth.vertices(subject, frame), truth.head_model(subject).faces.numpy()
+    depth, normals = cast(head, camera)
+    cosine = np.clip((found * normals).sum(-1), -1, 1)
+    return np.where(known & np.isfinite(depth), np.degrees(np.arccos(cosine)), np.nan)
 
 
 def measure_regions(dataset: Dataset, truth: Truth, out: Path | None = None) -> dict:

@@ -7,7 +7,9 @@ alone), ``tracked_mesh`` (the track alone) and ``tsdf_fusion`` (plane sweeps fus
 Errors are over all pixels that the matte, the truth and the surface share; ``skin`` are those of
 them where the truth shows the head's own surface, so that hair, whose true depth jumps from strand
 to strand, can be told apart. Normals are compared there. Seconds are processor seconds of one
-thread, peak memory that of a process of its own. The last line is one JSON object.
+thread, peak memory that of a process of its own. ``warm_start`` compares every expression but each
+subject's first, started from that one's surface, with a cold start. ``--sweep`` measures one knob
+at a time instead and writes a table. The last line is one JSON object.
 """
 
 from __future__ import annotations
@@ -25,11 +27,13 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import open3d as o3d
 
 from benchmarks.depth_fusion import fuse
+from benchmarks.depth_score import Mesh, score, summary
+from benchmarks.depth_sweep import sweep
+from benchmarks.depth_warm import warm_start
 from benchmarks.track import prepare, twin_config
-from express50.cameras import Camera, transform_camera
+from express50.cameras import Camera
 from express50.config import build_config
 from express50.frames import read_peaks
 from express50.head.load import load_head
@@ -37,7 +41,7 @@ from express50.layout import Dataset
 from express50.raycast import camera_rays, mesh_scene
 from express50.runner import run_stage
 from express50.tracks import read_track
-from express50.twin.truth import Truth, align_worlds
+from express50.twin.truth import Truth
 from pipelines import track
 from pipelines.depth import STAGE
 from pipelines.depth.grid import View, head_box
@@ -49,7 +53,6 @@ from pipelines.depth.trace import trace
 PRESETS = ("draft", "standard", "reference")
 BASELINES = ("visual_hull", "tracked_mesh", "tsdf_fusion")
 BASELINE_VOXEL_M = 0.003
-Mesh = tuple[np.ndarray, np.ndarray]  # vertices (V, 3), faces (F, 3)
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -59,12 +62,18 @@ def main(arguments: list[str] | None = None) -> int:
         if options.dataset is None:
             options.dataset, options.truth = record(options, Path(scratch) / "twin")
         items = STAGE.items(Dataset(options.dataset))[: options.items or None]
+        if options.sweep:
+            print(json.dumps(sweep(options, items[0])))
+            return 0
         result: dict = {"benchmark": "depth", "items": items}
-        for name in (*options.presets.split(","), *BASELINES):
+        names = () if options.only_warm else (*options.presets.split(","), *BASELINES)
+        for name in names:
             rows = [alone(options.dataset, options.truth, item, name) for item in items]
             result[name] = summary([row for row in rows if row])
             print(name, json.dumps(result[name]), file=sys.stderr, flush=True)
-    medians = [result[name].get("abs_error_mm_median") for name in BASELINES]
+        result["warm_start"] = warm_start(options.dataset, options.truth, items)
+        print("warm_start", json.dumps(result["warm_start"]), file=sys.stderr, flush=True)
+    medians = [result[name].get("abs_error_mm_median") for name in BASELINES if name in result]
     known = [value for value in medians if value is not None]
     if "standard" in result:
         best = result["standard"]["abs_error_mm_median"]
@@ -82,6 +91,10 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
     parser.add_argument("--items", type=int, default=0, help="only so many; 0: all")
     parser.add_argument("--cameras", type=int, default=26, help="recorded; two are not used")
     parser.add_argument("--side", type=int, default=512, help="pixels of the recorded footage")
+    parser.add_argument("--only-warm", action="store_true", help="warm_start alone")
+    parser.add_argument("--sweep", action="store_true", help="one knob at a time, a table")
+    parser.add_argument("--axes", help="knobs of the sweep, of views,pixels,voxel,samples,levels")
+    parser.add_argument("--doc", type=Path, help="document whose section the sweep replaces")
     options = parser.parse_args(arguments)
     if (options.dataset is None) != (options.truth is None):
         parser.error("give both --dataset and --truth, or neither")
@@ -130,14 +143,7 @@ def measure(dataset_root: Path, truth_root: Path, item: str, name: str) -> dict 
     found["gib"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
     if name in PRESETS:
         found["raycast"] = both_ways(surface, [camera for camera, _, _ in pictures[::8]])
-    cameras = {camera.id: camera for camera, _, _ in pictures}
-    motion = align_worlds(cameras, truth.cameras(subject))
-    rows = [
-        compare(mesh, truth, subject, frame, camera, motion, alpha) for camera, _, alpha in pictures
-    ]
-    for key in ("errors", "skin", "degrees"):
-        found[key] = np.concatenate([row[key] for row in rows])
-    return found | {"covered": float(np.mean([row["covered"] for row in rows]))}
+    return found | score(mesh, truth, subject, frame, pictures)
 
 
 def both_ways(surface: Surface, cameras: list[Camera]) -> dict:
@@ -177,78 +183,6 @@ def baseline(
         return None
     vertices = found.vertices[found.row(expression)].astype(np.float64)
     return vertices, load_head(found.head).faces.numpy()
-
-
-def compare(
-    mesh: Mesh, truth: Truth, subject: str, frame: int, camera: Camera, motion: np.ndarray,
-    alpha: np.ndarray,
-) -> dict:  # fmt: skip
-    """One view: absolute errors (N,), millimetres, of all pixels and of skin; skin's normals."""
-    seen = transform_camera(camera, motion)
-    true_depth, true_valid = truth.render_depth(subject, frame, seen)
-    depth, normals = cast(mesh, camera)
-    both = np.isfinite(depth) & (alpha > 0.5) & true_valid
-    errors = 1e3 * np.abs(np.where(both, depth, 0) - true_depth)
-    skin = both & truth.skin(subject, frame, seen)
-    head = truth.vertices(subject, frame), truth.head_model(subject).faces.numpy()
-    _, true_normals = cast(head, seen)
-    cosine = np.clip((normals * true_normals).sum(-1)[skin], -1, 1)
-    return {
-        "errors": errors[both],
-        "skin": errors[skin],
-        "degrees": np.degrees(np.arccos(cosine)),
-        "covered": both.sum() / max(1, true_valid.sum()),
-    }
-
-
-def cast(mesh: Mesh, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """Depth (H, W), infinite where nothing is hit, and smooth normals (H, W, 3), camera axes."""
-    vertices, faces = mesh
-    hull = o3d.geometry.TriangleMesh(
-        o3d.utility.Vector3dVector(vertices), o3d.utility.Vector3iVector(faces)
-    )
-    hull.compute_vertex_normals()
-    own = np.asarray(hull.vertex_normals)
-    hits = mesh_scene(vertices, faces).cast_rays(camera_rays(camera), nthreads=1)
-    depth = hits["t_hit"].numpy()
-    hit = np.isfinite(depth)
-    corners = faces[np.where(hit, hits["primitive_ids"].numpy(), 0)]
-    u, v = np.moveaxis(hits["primitive_uvs"].numpy(), -1, 0)
-    bary = np.stack([1 - u - v, u, v], axis=-1)
-    normals = (own[corners] * bary[..., None]).sum(-2) @ camera.cam_from_world[:3, :3].T
-    return depth, normals / np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-9)
-
-
-def summary(rows: list[dict]) -> dict:
-    """Figures over the pixels of all items; ``n/a`` where nothing could be measured."""
-    if not rows:
-        return {"n/a": "these items have no track"}
-    errors, skin, degrees = (
-        np.concatenate([row[key] for row in rows]) for key in ("errors", "skin", "degrees")
-    )
-    if not len(errors) or not len(skin):
-        return {"n/a": "no surface was found where the truth has one"}
-    figures: dict = {
-        "abs_error_mm_median": round(float(np.median(errors)), 3),
-        "abs_error_mm_p95": round(float(np.percentile(errors, 95)), 3),
-        "skin_error_mm_median": round(float(np.median(skin)), 3),
-        "normal_error_deg_median": round(float(np.median(degrees)), 2),
-        "coverage": round(float(np.mean([row["covered"] for row in rows])), 4),
-        "peak_memory_gib": round(max(row["gib"] for row in rows), 2),
-    }
-    seconds = [row["s"] for row in rows if row["s"] is not None]
-    figures["seconds_per_frame"] = round(float(np.mean(seconds)), 2) if seconds else None
-    if "voxels_dense" in rows[0]:
-        figures["voxel_mm"] = round(rows[0]["voxel_mm"], 3)
-        for key in ("voxels_allocated", "voxels_dense", "grid_bytes"):
-            figures[key] = max(row[key] for row in rows)
-        figures["raycast_ms_per_megapixel"] = {
-            way: round(float(np.mean([row["raycast"]["ms"][way] for row in rows])), 1)
-            for way in ("mesh", "sdf")
-        }
-        apart = [row["raycast"]["difference_mm"] for row in rows]
-        figures["raycast_difference_mm"] = round(float(np.mean(apart)), 4)
-    return figures
 
 
 if __name__ == "__main__":

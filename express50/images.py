@@ -17,6 +17,7 @@ from express50.errors import FormatError
 
 PIXEL_LIMIT = 200_000_000  # refuses decompression bombs; six times a 4K frame of 33 megapixels
 DEPTH_UNIT_M = 5e-5  # one step of a 16-bit depth map; 3.28 m at most, 0.025 mm rounding
+DEPTH_LIMIT_M = DEPTH_UNIT_M * 65535
 
 
 def read_image(path: Path) -> np.ndarray:
@@ -79,6 +80,8 @@ def write_image(path: Path, image: np.ndarray, quality: int = 95, half: bool = F
     if quality >= 95:
         spec.attribute("jpeg:subsampling", "4:4:4")
     spec.attribute("png:compressionLevel", 3)
+    if Path(path).suffix.lower() == ".exr":  # the time of writing would go into its header
+        spec.attribute("DateTime", "1970:01:01 00:00:00")
     target = oiio.ImageOutput.create(str(path))
     if target is None or not target.open(str(path), spec):
         raise FormatError(f"{path}: cannot be written ({oiio.geterror().strip()})")
@@ -128,11 +131,12 @@ def depth_to_uint16(depth: np.ndarray, valid: np.ndarray) -> np.ndarray:
         ValueError: a valid depth is not finite, not positive or over 3.27 m.
     """
     inside = depth[valid]
-    limit = DEPTH_UNIT_M * 65535
     if inside.size and not (
-        np.isfinite(inside).all() and inside.min() > 0 and inside.max() < limit
+        np.isfinite(inside).all() and inside.min() > 0 and inside.max() < DEPTH_LIMIT_M
     ):
-        raise ValueError(f"valid depth must lie in (0, {limit:.3f}) m; is the rig in metres?")
+        raise ValueError(
+            f"valid depth must lie in (0, {DEPTH_LIMIT_M:.3f}) m; is the rig in metres?"
+        )
     steps = np.where(valid, np.maximum(np.rint(depth / DEPTH_UNIT_M), 1), 0)
     return np.nan_to_num(steps).astype(np.uint16)
 

@@ -110,7 +110,8 @@ def run_stage(
         stage: the stage.
         dataset: the dataset.
         config: instance of ``stage.config``.
-        items: ids to run; all by default, and then outputs of items that are no more are set aside.
+        items: ids to run, and what these read of the stage itself; all by default, and then outputs
+            of items that are no more are set aside.
         workers: local processes; 0 or 1 runs in this one.
         scheduler: address of a dask scheduler to use in place of local processes.
         progress: show progress on standard error.
@@ -135,12 +136,43 @@ def run_stage(
         save_config(dataset, stage, config)
         if items is None:
             retire_items(dataset, ledger, stage.name, chosen)
-        outcomes = _run_items(stage, dataset, config, chosen, ledger, workers_pool, progress)
+        waves = waves_of(stage, dataset, config, chosen)
+        chosen = [item for wave in waves for item in wave]
+        outcomes: dict[str, Outcome] = {}
+        for wave in waves:
+            outcomes |= _run_items(stage, dataset, config, wave, ledger, workers_pool, progress)
     missing = set(chosen) - set(outcomes)
     if missing:  # read = done + skipped + failed
         raise StageError(f"{stage.name}: no account of {', '.join(sorted(missing))}; run it again")
     seconds = time.perf_counter() - started
     return Summary(stage.name, tuple(outcomes[item] for item in chosen), seconds)
+
+
+def waves_of(stage: Stage, dataset: Dataset, config: Any, chosen: Sequence[str]) -> list[list[str]]:
+    """The items and their sources, in lists of which each needs the ones before it only.
+
+    Raises:
+        StageError: items wait for each other.
+    """
+    needs: dict[str, list[str]] = {}
+    waiting = list(chosen)
+    while waiting:
+        item = waiting.pop()
+        if item not in needs:
+            try:
+                needs[item] = stage.sources(dataset, item, config)
+            except Express50Error:  # the item says so itself when its inputs are read
+                needs[item] = []
+            waiting += needs[item]
+    order = [*chosen, *sorted(set(needs) - set(chosen))]
+    waves: list[list[str]] = []
+    while order:
+        ready = [item for item in order if not set(needs[item]) & set(order)]
+        if not ready:
+            raise StageError(f"{stage.name}: {', '.join(order[:3])} wait for each other")
+        waves.append(ready)
+        order = [item for item in order if item not in ready]
+    return waves
 
 
 def _run_items(

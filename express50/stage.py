@@ -10,6 +10,11 @@ from typing import Any
 from express50.layout import Dataset
 
 
+def no_sources(dataset: Dataset, item: str, config: Any) -> list[str]:
+    """No item of the stage reads another's output."""
+    return []
+
+
 @dataclass(frozen=True)
 class Stage:
     """One processing step; the runner owns files, retries, receipts and progress.
@@ -25,6 +30,9 @@ class Stage:
             returns deterministic JSON-able metrics (the runner writes ``metrics.json``). Parts of
             the item left out are listed as ``{"dropped": [{"what": ..., "why": ...}]}``. Raises
             Express50Error when the data of this item are bad.
+        sources: items of the same stage whose outputs an item reads. They are run before it,
+            whether they were asked for or not, so that its bytes do not hang on the order; the
+            output read must be among ``inputs``, where it is there.
     """
 
     name: str
@@ -34,3 +42,4 @@ class Stage:
     items: Callable[[Dataset], list[str]]
     inputs: Callable[[Dataset, str, Any], dict[str, Path | str]]
     run: Callable[[Dataset, str, Any, Path], dict]
+    sources: Callable[[Dataset, str, Any], list[str]] = no_sources

@@ -21,7 +21,7 @@ from express50.errors import StageError
 from express50.layout import Dataset
 from express50.publish import write_json
 
-IMAGE_SUFFIXES = {".jpg", ".jpeg", ".png", ".exr", ".tif", ".ply"}
+IMAGE_SUFFIXES = {".jpg", ".jpeg", ".png", ".exr", ".tif", ".ply", ".glb"}
 CHUNK = 1 << 24
 
 
@@ -135,7 +135,7 @@ def files_naming(dataset: Dataset, subject: str) -> Iterator[Path]:
 
 def _names(path: Path, word: re.Pattern[bytes]) -> bool:
     suffix = path.suffix.lower()
-    if suffix in IMAGE_SUFFIXES:  # pixels may hold any four bytes by chance
+    if suffix in IMAGE_SUFFIXES:  # pixels and points may hold any four bytes by chance
         return False
     if suffix == ".tar":
         return _tar_names(path, word)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from express50.depth_files import DEPTH_ENDINGS, NORMAL_STEPS
+
 
 @dataclass(frozen=True, kw_only=True)
 class DepthConfig:
@@ -39,6 +41,18 @@ class DepthConfig:
     """Fewest usable cameras; at least 2."""
     raycast: str = "mesh"
     """What rays are cast at: "mesh" (triangles, fast) or "sdf" (the distances themselves)."""
+    warm_start: bool = False
+    """Start from the surface of the subject's first expression, carried by the tracked motion."""
+    warm_levels: int = 1
+    """Levels that a warm start goes through, the finest ones."""
+    depth_format: str = "png16"
+    """Depth maps on disk: "png16" (0.05 mm steps to 3.27 m), "exr16" (half float), "exr32"."""
+    normal_maps: str = "png8"
+    """Normal maps on disk, camera axes: "png8", "png16" (8 or 16 bits a component), or "none"."""
+    glb: bool = True
+    """Write the mesh as surface.glb too, for viewers; surface.ply is always written."""
+    consistency_side: int = 512
+    """Longest side, pixels, at which views are compared through the depth, for the metrics."""
     qc_views: int = 4
     """Cameras in the quality picture."""
 
@@ -54,6 +68,16 @@ class DepthConfig:
             raise ValueError(f"patch_samples is {self.patch_samples}, expected an odd number >= 3")
         if self.raycast not in ("mesh", "sdf"):
             raise ValueError(f"raycast is {self.raycast!r}, expected 'mesh' or 'sdf'")
+        for name, known in (
+            ("depth_format", DEPTH_ENDINGS),
+            ("normal_maps", (*NORMAL_STEPS, "none")),
+        ):
+            if getattr(self, name) not in known:
+                raise ValueError(f"{name} is {getattr(self, name)!r}, expected one of {[*known]}")
+        if self.warm_levels < 1:
+            raise ValueError(f"warm_levels is {self.warm_levels}, expected at least 1")
+        if self.consistency_side < 16:
+            raise ValueError(f"consistency_side is {self.consistency_side}, expected at least 16")
         if self.min_views < 2:
             raise ValueError(f"min_views is {self.min_views}, expected at least 2")
         if self.noise <= 0 or self.stiffness_voxels <= 0 or self.image_side < 16:

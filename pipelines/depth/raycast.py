@@ -1,9 +1,8 @@
-"""What every camera sees of the surface: depth, confidence, normals, and files of them."""
+"""What every camera sees of the surface: depth, confidence, normals."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import open3d as o3d
@@ -76,26 +75,3 @@ def depth_view(
         covered=float(valid.sum() / max(int(inside.sum()), 1)),
         spill=float((hit & ~inside).sum() / max(int(hit.sum()), 1)),
     )
-
-
-def write_ply(path: Path, surface: Surface) -> None:
-    """Binary PLY of the mesh: position, normal, colour, confidence; unused vertices left out."""
-    used = np.unique(surface.faces)
-    renumber = np.zeros(len(surface.vertices), np.int32)
-    renumber[used] = np.arange(len(used))
-    fields = [(name, "<f4") for name in ("x", "y", "z", "nx", "ny", "nz")]
-    fields += [(name, "u1") for name in ("red", "green", "blue")] + [("confidence", "<f4")]
-    table = np.zeros(len(used), dtype=fields)
-    for k, name in enumerate(("x", "y", "z")):
-        table[name] = surface.vertices[used, k]
-        table[f"n{name}"] = surface.normals[used, k]
-    for k, name in enumerate(("red", "green", "blue")):
-        table[name] = surface.colors[used, k]
-    table["confidence"] = surface.confidence[used]
-    faces = np.zeros(len(surface.faces), dtype=[("count", "u1"), ("index", "<i4", 3)])
-    faces["count"], faces["index"] = 3, renumber[surface.faces]
-    kinds = {"<f4": "float", "u1": "uchar"}
-    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(table)}"]
-    header += [f"property {kinds[kind]} {name}" for name, kind in fields]
-    header += [f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header"]
-    path.write_bytes("\n".join(header).encode() + b"\n" + table.tobytes() + faces.tobytes())

@@ -44,10 +44,11 @@ from pipelines.depth.surface import (
     smooth_displacement,
 )
 from pipelines.depth.sweep import grey_images, sweep_scores, view_weights
+from pipelines.depth.warm import Carried
 
 LEVEL_RATIO = 1.47
 COUPLINGS = (1e3, 3e3, 1e4, 2e4)  # per square metre; a gap of 10 mm costs 0.1 at first, 2 at last
-LARGEST_M = 3.0  # a head with shoulders is a third of it
+SMALLEST_M, LARGEST_M = 0.03, 3.0  # a head is 0.25 m high, with shoulders under 1 m
 
 
 @dataclass(frozen=True)
@@ -72,13 +73,19 @@ class Surface:
     numbers: dict = field(default_factory=dict)
 
 
-def reconstruct(views: Sequence[View], config: DepthConfig, prior: Prior | None = None) -> Surface:
+def reconstruct(
+    views: Sequence[View],
+    config: DepthConfig,
+    prior: Prior | None = None,
+    start: Carried | None = None,
+) -> Surface:
     """Reconstruct the surface that the views share.
 
     Args:
         views: usable views, at least two.
         config: the knobs.
         prior: the tracked mesh, or None.
+        start: a surface so near that the coarse levels can be left out; then no prior counts.
 
     Raises:
         StageError: the mattes share no volume, or the box or surface is too large for the voxel.
@@ -87,15 +94,20 @@ def reconstruct(views: Sequence[View], config: DepthConfig, prior: Prior | None 
     extent = float(np.linalg.norm(high - low))
     voxels = _voxels(views, (low + high) / 2, config)
     _check_size(low, high, voxels[-1])
-    grid = _initial(views, low, high, voxels[0], prior)
+    first = voxels[0]
+    if start is not None:  # one level coarser than the first to move: that one is faired before
+        first = voxels[max(len(voxels) - config.warm_levels - 1, 0)]
+        voxels = voxels[-config.warm_levels :]
+    grid = _initial(views, low, high, first, start or prior)
     for level, voxel in enumerate(voxels):
-        if level:
+        if grid.voxel != voxel:
             grid = refined(grid, voxel)
         hull = _hull(views, grid)
         grid = combined(np.maximum, grid, hull)
-        if prior is None or level:
+        if prior is None or start is not None or level:
             grid = fair(grid, config.fair_voxels * voxel)
-        grid = _move(views, grid, hull, config, extent, first=level == 0 and prior is None)
+        deep = level == 0 and prior is None and start is None
+        grid = _move(views, grid, hull, config, extent, first=deep)
     return _finish(views, grid, config)
 
 
@@ -108,8 +120,14 @@ def _voxels(views: Sequence[View], middle: np.ndarray, config: DepthConfig) -> l
 
 
 def _check_size(low: np.ndarray, high: np.ndarray, voxel: float) -> None:
+    extent = float((high - low).max())
+    if extent < SMALLEST_M:
+        raise StageError(
+            f"the head's box is {extent * 1e3:.3g} mm large; expected {SMALLEST_M * 1e3:g} mm and"
+            " more: is the calibration in metres?"
+        )
     blocks = float(np.prod((high - low) / (BLOCK * voxel)))
-    if blocks > VOXEL_LIMIT or (high - low).max() > LARGEST_M:
+    if blocks > VOXEL_LIMIT or extent > LARGEST_M:
         size = " x ".join(f"{side:.2f}" for side in high - low)
         raise StageError(
             f"the head's box is {size} m, {blocks:.2g} blocks of voxels of {voxel * 1e3:g} mm;"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -10,12 +11,22 @@ import numpy as np
 from express50.cameras import Camera, resized
 from express50.errors import StageError
 from express50.images import resize_area
-from pipelines.depth.grid import INSIDE, View, head_box, hull_distance, silhouette_distance
+from pipelines.depth.grid import (
+    INSIDE,
+    View,
+    head_box,
+    project_fast,
+    sample_image,
+    silhouette_distance,
+)
 
 EMPTY = 0.002  # share of the image below which a matte holds no head
 FULL = 0.98  # share above which a matte cuts nothing out
-CONTRADICTION = 1.8  # growth of the hull without a view that marks its matte as wrong
 VOTERS = 5  # fewest views of which one can be outvoted
+MISSED = 0.001  # share of the mattes that the hull may miss before anyone is suspected
+OUTVOTED = 2.0  # times less must be missed without the view left out than without any other
+CELLS = 64  # along the sides of the box in which views are compared
+HOLE = 0.05  # share of the matte up to which a hole in it is filled
 
 
 def make_view(camera: Camera, rgb: np.ndarray, alpha: np.ndarray, side: int) -> View | str:
@@ -43,42 +54,107 @@ def make_view(camera: Camera, rgb: np.ndarray, alpha: np.ndarray, side: int) -> 
         camera = resized(camera, width, height)
         rgb, alpha = resize_area(rgb, width, height), resize_area(alpha, width, height)
     alpha = np.ascontiguousarray(alpha, np.float32)
-    return View(camera, rgb, alpha, silhouette_distance(_without_specks(alpha)))
+    return View(camera, rgb, alpha, silhouette_distance(_mended(alpha)))
 
 
-def _without_specks(alpha: np.ndarray) -> np.ndarray:
-    """The matte (H, W) without islands under a hundredth of its largest part."""
+def _mended(alpha: np.ndarray) -> np.ndarray:
+    """The matte (H, W) without islands under a hundredth of its largest part, small holes filled.
+
+    A hole drills a tunnel through the whole hull. Where one is real, between strands, filling it
+    costs nothing: its pixels stay outside the matte that depth is valid in.
+    """
     mask = (alpha > INSIDE).astype(np.uint8)
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(mask, connectivity=8)
-    areas = stats[1:, cv2.CC_STAT_AREA]
+    areas, labels = _parts(mask)
     small = np.flatnonzero(areas < 0.01 * areas.max()) + 1
-    return np.where(np.isin(labels, small), 0.0, alpha) if len(small) and count > 2 else alpha
+    kept = np.where(np.isin(labels, small), 0.0, alpha).astype(np.float32)
+    gaps, labels = _parts((kept <= INSIDE).astype(np.uint8))
+    border = np.unique(np.r_[labels[[0, -1]].ravel(), labels[:, [0, -1]].ravel()])
+    holes = np.setdiff1d(np.flatnonzero(gaps < HOLE * mask.sum()) + 1, border)
+    return np.where(np.isin(labels, holes), np.float32(1), kept)
+
+
+def _parts(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Areas (N,) of the connected parts of a mask (H, W), and labels (H, W) from 1."""
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(mask, connectivity=8)
+    return stats[1:, cv2.CC_STAT_AREA], labels
 
 
 def without_contradiction(views: Sequence[View]) -> tuple[list[View], dict[str, str]]:
     """Views whose mattes agree, and why others were left out: {camera: reason}.
 
-    A matte that misses the head or half of it carves the hull away; the hull then grows several
-    times over without that view, but hardly without any other.
+    A matte that misses half of the head, or a camera that is not where it is said to be, carves the
+    common hull away: the hull then no longer fills the mattes, but does without that view.
     """
     if len(views) < VOTERS:
         return list(views), {}
-    low, high = head_box_without_each(views)
-    axes = [np.linspace(a, b, 48) for a, b in zip(low, high, strict=True)]
-    points = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
-    alone = np.stack([hull_distance([view, view], points) < 0 for view in views])
-    votes = alone.sum(0)
-    everyone = max(int((votes == len(views)).sum()), 1)
-    growth = [1 + int(((votes == len(views) - 1) & ~row).sum()) / everyone for row in alone]
-    worst = int(np.argmax(growth))
-    second = float(np.sort(growth)[-2])
-    if growth[worst] < CONTRADICTION * second:
+    silhouettes = _silhouettes(views)
+    everyone = np.ones(len(views), bool)
+    missed = _unfilled(silhouettes, everyone)
+    if missed < MISSED:
+        return list(views), {}
+    without = [_unfilled(silhouettes, np.arange(len(views)) != k) for k in range(len(views))]
+    worst = int(np.argmin(without))
+    second = float(np.sort(without)[1])
+    if without[worst] > second / OUTVOTED or second < MISSED / 2:
         return list(views), {}
     why = (
-        f"its matte contradicts the others (the common hull is {growth[worst]:.1f} times larger"
-        " without it)"
+        f"it contradicts the others (the common hull misses {missed:.1%} of the mattes with it,"
+        f" {without[worst]:.1%} without it): check its matte and its calibration"
     )
     return [v for k, v in enumerate(views) if k != worst], {views[worst].camera.id: why}
+
+
+@dataclass(frozen=True)
+class _Silhouette:
+    """A view's say on cells of space.
+
+    Attributes:
+        allows: (P,) whether the view does not rule the cell out; it lies in the matte or unseen.
+        pixel: (P,) flat pixel of the cell in ``matte``, -1 where unseen.
+        matte: (h, w) bool, about a pixel a cell.
+    """
+
+    allows: np.ndarray
+    pixel: np.ndarray
+    matte: np.ndarray
+
+
+def _silhouettes(views: Sequence[View]) -> list[_Silhouette]:
+    """What every view says of the cells of a box around the head."""
+    low, high = head_box_without_each(views)
+    axes = [np.linspace(a, b, CELLS) for a, b in zip(low, high, strict=True)]
+    points = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
+    cell = float((high - low).max() / (CELLS - 1))
+    return [_silhouette(view, points, cell) for view in views]
+
+
+def _silhouette(view: View, points: np.ndarray, cell: float) -> _Silhouette:
+    pixels, depth = project_fast(view.camera, points)
+    size = np.array([view.camera.width, view.camera.height])
+    seen = (depth > 0) & (pixels >= 0).all(1) & (pixels < size).all(1)
+    near = float(np.median(depth[seen])) if seen.any() else 1.0
+    step = max(1.0, cell * view.camera.K[0, 0] / near)
+    shape = np.maximum(1, np.ceil(size / step)).astype(int)
+    allows = np.ones(len(points), bool)
+    allows[seen] = sample_image(view.silhouette_px, pixels[seen]) > -step / 2
+    column, row = np.minimum((pixels[seen] / step).astype(int), shape - 1).T
+    pixel = np.full(len(points), -1)
+    pixel[seen] = row * shape[0] + column
+    small = resize_area(view.silhouette_px, int(shape[0]), int(shape[1]))
+    return _Silhouette(allows, pixel, small > 0)
+
+
+def _unfilled(silhouettes: Sequence[_Silhouette], used: np.ndarray) -> float:
+    """Share of the mattes, mean over the views ``used`` (C,), that their hull does not fill."""
+    chosen = [one for one, use in zip(silhouettes, used, strict=True) if use]
+    hull = np.stack([one.allows for one in chosen]).all(0)
+    shares = []
+    for one in chosen:
+        filled = np.zeros(one.matte.size, np.uint8)
+        filled[one.pixel[hull & (one.pixel >= 0)]] = 1
+        filled = cv2.dilate(filled.reshape(one.matte.shape), np.ones((3, 3), np.uint8))
+        shares.append(float((filled[one.matte] == 0).mean()) if one.matte.any() else 0.0)
+    return float(np.mean(shares))
 
 
 def head_box_without_each(views: Sequence[View]) -> tuple[np.ndarray, np.ndarray]:

@@ -9,15 +9,16 @@ import cv2
 import numpy as np
 
 from express50.cameras import Camera
+from express50.depth_files import depth_file, read_depth
 from express50.errors import CaptureError, FormatError, StageError
 from express50.exclusions import exclusion_reason
 from express50.frames import read_frame
 from express50.images import (
+    DEPTH_LIMIT_M,
     DEPTH_UNIT_M,
     contact_sheet,
     depth_to_uint16,
     read_alpha,
-    read_depth_png,
     read_image,
     write_image,
 )
@@ -139,11 +140,11 @@ def _pack_sample(
     folder = dataset.item_dir("depth", f"{subject.name}/{expression}")
     if not matte_path.is_file():
         return "it has no matte"
-    if not (folder / f"{camera_id}.png").is_file():
+    if (depth_path := depth_file(folder, camera_id)) is None:
         return "it has no depth"
     rgb = read_frame(dataset, subject.name, camera_id, frame)
     matte = alpha = read_alpha(matte_path)
-    depth, valid = read_depth_png(folder / f"{camera_id}.png")
+    depth, valid = read_depth(depth_path)
     regions = _read_regions(dataset, f"{subject.name}/{expression}", camera_id)
     parts, head = regions or (None, None)
     sizes = [image.shape[:2] for image in (rgb, alpha, depth, parts, head) if image is not None]
@@ -159,6 +160,8 @@ def _pack_sample(
     if isinstance(crop, str):
         return crop
     small, known = cut_depth(depth, valid, crop, config.size)
+    if (farthest := small[known].max(initial=0)) >= DEPTH_LIMIT_M:
+        return f"its depth reaches {farthest:.2f} m; shards hold less than {DEPTH_LIMIT_M:.2f} m"
     if config.foreground:
         place = (subject.name, camera_id)
         picture = own_picture(dataset, place, rgb, matte, crop, config.size)

@@ -7,10 +7,11 @@ from functools import lru_cache
 import numpy as np
 
 from express50.cameras import Camera
+from express50.depth_files import depth_file, read_depth
 from express50.errors import FormatError, StageError
 from express50.frames import read_frame
 from express50.head.load import load_head
-from express50.images import read_alpha, read_depth_png
+from express50.images import read_alpha
 from express50.layout import Dataset
 from express50.tracks import read_track, track_file
 from pipelines.regions.config import RegionsConfig
@@ -65,18 +66,18 @@ def read_pair(
     return read_frame(dataset, subject, camera.id, frame), matte.astype(np.float32) / 255
 
 
-def read_depth(
+def read_depth_of(
     dataset: Dataset, item: str, camera: Camera, config: RegionsConfig
 ) -> np.ndarray | None:
     """Depth (H, W) metres, 0 where unknown, if there is any and it is wanted.
 
     Raises:
-        FormatError: it is no 16-bit depth map of the camera's size.
+        FormatError: it is no depth map of the camera's size.
     """
-    path = dataset.item_dir("depth", item) / f"{camera.id}.png"
-    if not config.depth or not path.is_file():
+    path = depth_file(dataset.item_dir("depth", item), camera.id)
+    if not config.depth or path is None:
         return None
-    depth, _ = read_depth_png(path)
+    depth, _ = read_depth(path)
     if depth.shape != (camera.height, camera.width):
         raise FormatError(
             f"{path}: {depth.shape}, expected the camera's {camera.width}x{camera.height}; run"

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 
 from express50.cameras import Camera, resized
+from express50.depth_files import depth_file
 from express50.errors import CaptureError, FormatError, StageError
 from express50.frames import peak_items, read_cameras_of, read_peaks
 from express50.images import contact_sheet, fit_into, resize_area, write_image
@@ -29,7 +30,7 @@ from pipelines.regions.qc import (
     subject_box,
     view_warning,
 )
-from pipelines.regions.read import read_depth, read_head, read_pair
+from pipelines.regions.read import read_depth_of, read_head, read_pair
 from pipelines.regions.scalp import Scalp, decide, scalp_votes
 from pipelines.regions.view import HAIR, head_alpha, place
 
@@ -57,9 +58,9 @@ def inputs(dataset: Dataset, item: str, config: RegionsConfig) -> dict[str, Path
     }
     for camera in read_cameras_of(dataset, subject):
         matte = dataset.matte_file(subject, expression, camera)
-        depth = dataset.item_dir("depth", item) / f"{camera}.png"
+        depth = depth_file(dataset.item_dir("depth", item), camera)
         found |= {f"matte {camera}": matte} if matte.is_file() else {}
-        found |= {f"depth {camera}": depth} if config.depth and depth.is_file() else {}
+        found |= {f"depth {camera}": depth} if config.depth and depth else {}
     if config.segmentation:
         found["segmentation"] = _weights(config)
     return found
@@ -78,7 +79,7 @@ def run(dataset: Dataset, item: str, config: RegionsConfig, out: Path) -> dict:
         try:
             known = read.pop(name, None)
             rgb, alpha = known or read_pair(dataset, item, camera, frame)
-            depth = read_depth(dataset, item, camera, config)
+            depth = read_depth_of(dataset, item, camera, config)
         except (CaptureError, FormatError, StageError) as error:
             dropped.append({"what": name, "why": str(error)})
             continue

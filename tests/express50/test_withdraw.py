@@ -47,6 +47,15 @@ def test_nothing_of_the_subject_stays_and_the_others_are_untouched(dataset):
         assert list(ledger.read("ingest")) == ["S002"]
 
 
+def test_points_and_pixels_that_spell_an_id_by_chance_name_nobody(dataset):
+    with publishing(dataset, "depth", "S002/smile") as out:
+        for name in ("surface.glb", "surface.ply", "cam00.exr", "cam00_normals.png"):
+            (out / name).write_bytes(b"\x00S001\x00")
+        (out / "metrics.json").write_text("{}")
+    assert withdraw(dataset, "S001").remaining == ()
+    assert len(list(dataset.item_dir("depth", "S002/smile").iterdir())) == 5
+
+
 def test_what_is_left_is_found_and_makes_exit_code_1(dataset, capsys):
     model = dataset.root / "grmm" / "model.pt"
     model.parent.mkdir()

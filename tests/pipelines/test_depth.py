@@ -14,7 +14,8 @@ from pipelines.depth.blocks import build
 from pipelines.depth.config import DepthConfig
 from pipelines.depth.grid import head_box, hull_distance, silhouette_distance
 from pipelines.depth.prior import boundary_loops, make_prior, matte_agreement
-from pipelines.depth.raycast import cast_view, write_ply
+from pipelines.depth.products import write_ply
+from pipelines.depth.raycast import cast_view
 from pipelines.depth.reconstruct import reconstruct
 from pipelines.depth.surface import advance, extract_mesh
 from pipelines.depth.views import make_view, without_contradiction

@@ -1,0 +1,98 @@
+"""Errors of a surface against the twin's truth in every view, and what they come to."""
+
+from __future__ import annotations
+
+import numpy as np
+import open3d as o3d
+
+from express50.cameras import Camera, transform_camera
+from express50.raycast import camera_rays, mesh_scene
+from express50.twin.truth import Truth, align_worlds
+from pipelines.depth.qc import Pictures
+
+Mesh = tuple[np.ndarray, np.ndarray]  # vertices (V, 3), faces (F, 3)
+
+
+def score(mesh: Mesh, truth: Truth, subject: str, frame: int, pictures: Pictures) -> dict:
+    """What :func:`compare` finds in all pictures together."""
+    cameras = {camera.id: camera for camera, _, _ in pictures}
+    motion = align_worlds(cameras, truth.cameras(subject))
+    rows = [
+        compare(mesh, truth, subject, frame, camera, motion, alpha) for camera, _, alpha in pictures
+    ]
+    found: dict = {
+        key: np.concatenate([row[key] for row in rows]) for key in ("errors", "skin", "degrees")
+    }
+    return found | {"covered": float(np.mean([row["covered"] for row in rows]))}
+
+
+def compare(
+    mesh: Mesh, truth: Truth, subject: str, frame: int, camera: Camera, motion: np.ndarray,
+    alpha: np.ndarray,
+) -> dict:  # fmt: skip
+    """One view: absolute errors (N,), millimetres, of all pixels and of skin; skin's normals."""
+    seen = transform_camera(camera, motion)
+    true_depth, true_valid = truth.render_depth(subject, frame, seen)
+    depth, normals = cast(mesh, camera)
+    both = np.isfinite(depth) & (alpha > 0.5) & true_valid
+    errors = 1e3 * np.abs(np.where(both, depth, 0) - true_depth)
+    skin = both & truth.skin(subject, frame, seen)
+    head = truth.vertices(subject, frame), truth.head_model(subject).faces.numpy()
+    _, true_normals = cast(head, seen)
+    cosine = np.clip((normals * true_normals).sum(-1)[skin], -1, 1)
+    return {
+        "errors": errors[both],
+        "skin": errors[skin],
+        "degrees": np.degrees(np.arccos(cosine)),
+        "covered": both.sum() / max(1, true_valid.sum()),
+    }
+
+
+def cast(mesh: Mesh, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """Depth (H, W), infinite where nothing is hit, and smooth normals (H, W, 3), camera axes."""
+    vertices, faces = mesh
+    hull = o3d.geometry.TriangleMesh(
+        o3d.utility.Vector3dVector(vertices), o3d.utility.Vector3iVector(faces)
+    )
+    hull.compute_vertex_normals()
+    own = np.asarray(hull.vertex_normals)
+    hits = mesh_scene(vertices, faces).cast_rays(camera_rays(camera), nthreads=1)
+    depth = hits["t_hit"].numpy()
+    hit = np.isfinite(depth)
+    corners = faces[np.where(hit, hits["primitive_ids"].numpy(), 0)]
+    u, v = np.moveaxis(hits["primitive_uvs"].numpy(), -1, 0)
+    bary = np.stack([1 - u - v, u, v], axis=-1)
+    normals = (own[corners] * bary[..., None]).sum(-2) @ camera.cam_from_world[:3, :3].T
+    return depth, normals / np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-9)
+
+
+def summary(rows: list[dict]) -> dict:
+    """Figures over the pixels of all items; ``n/a`` where nothing could be measured."""
+    if not rows:
+        return {"n/a": "these items have no track"}
+    errors, skin, degrees = (
+        np.concatenate([row[key] for row in rows]) for key in ("errors", "skin", "degrees")
+    )
+    if not len(errors) or not len(skin):
+        return {"n/a": "no surface was found where the truth has one"}
+    figures: dict = {
+        "abs_error_mm_median": round(float(np.median(errors)), 3),
+        "abs_error_mm_p95": round(float(np.percentile(errors, 95)), 3),
+        "skin_error_mm_median": round(float(np.median(skin)), 3),
+        "normal_error_deg_median": round(float(np.median(degrees)), 2),
+        "coverage": round(float(np.mean([row["covered"] for row in rows])), 4),
+        "peak_memory_gib": round(max(row["gib"] for row in rows), 2),
+    }
+    seconds = [row["s"] for row in rows if row["s"] is not None]
+    figures["seconds_per_frame"] = round(float(np.mean(seconds)), 2) if seconds else None
+    if "voxels_dense" in rows[0]:
+        figures["voxel_mm"] = round(rows[0]["voxel_mm"], 3)
+        for key in ("voxels_allocated", "voxels_dense", "grid_bytes"):
+            figures[key] = max(row[key] for row in rows)
+        figures["raycast_ms_per_megapixel"] = {
+            way: round(float(np.mean([row["raycast"]["ms"][way] for row in rows])), 1)
+            for way in ("mesh", "sdf")
+        }
+        apart = [row["raycast"]["difference_mm"] for row in rows]
+        figures["raycast_difference_mm"] = round(float(np.mean(apart)), 4)
+    return figures

@@ -1,0 +1,99 @@
+"""One knob of depth at a time around the standard preset: seconds against errors, as a table."""
+
+from __future__ import annotations
+
+import argparse
+import multiprocessing
+import sys
+import time
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from benchmarks.depth_score import score
+from benchmarks.document import replace_section
+from express50.config import build_config
+from express50.frames import read_peaks
+from express50.layout import Dataset
+from express50.twin.truth import Truth
+from pipelines.depth import STAGE
+from pipelines.depth.reconstruct import reconstruct
+from pipelines.depth.stage import read_prior, read_views
+
+SECTION = "Knobs of depth"
+AXES: dict[str, tuple[str, tuple]] = {
+    "views": ("views", (6, 12, 24)),
+    "pixels": ("image_side", (256, 512, 1024)),
+    "voxel": ("voxel_mm", (4.0, 2.4, 1.6, 1.0)),
+    "samples": ("patch_samples", (3, 5, 7)),
+    "levels": ("coarse_mm", (2.4, 3.5, 6.0)),
+}
+
+
+def sweep(options: argparse.Namespace, item: str) -> dict:
+    """Measure every value of the chosen axes on one item; writes the table where asked to."""
+    chosen = (options.axes or ",".join(AXES)).split(",")
+    if not set(chosen) <= set(AXES):
+        sys.exit(f"--axes {options.axes!r}, expected some of {','.join(AXES)}")
+    rows = []
+    for axis in chosen:
+        for value in AXES[axis][1]:
+            with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
+                task = pool.submit(measure, options.dataset, options.truth, item, axis, value)
+                rows.append(task.result())
+            print(rows[-1], file=sys.stderr, flush=True)
+    if options.doc is not None:
+        replace_section(options.doc, SECTION, as_markdown(rows, item))
+    return {"benchmark": "depth", "sweep": rows, "item": item}
+
+
+def measure(dataset_root: Path, truth_root: Path, item: str, axis: str, value: float) -> dict:
+    """One row: what a value costs and how right the surface is, in every camera of the rig."""
+    cv2.setNumThreads(1)
+    dataset, truth = Dataset(dataset_root), Truth(truth_root)
+    subject, expression = item.split("/")
+    frame = read_peaks(dataset, subject)[expression]
+    config = build_config(STAGE, {})
+    if axis != "views":
+        config = replace(config, **{AXES[axis][0]: value})
+    views, pictures, _ = read_views(dataset, subject, expression, frame, config)
+    if axis == "views":
+        count = min(int(value), len(views))
+        views = [views[k] for k in np.linspace(0, len(views) - 1, count).round().astype(int)]
+    start = time.process_time()
+    prior, _ = read_prior(dataset, subject, expression, views, config)
+    surface = reconstruct(views, config, prior)
+    seconds = time.process_time() - start
+    found = score((surface.vertices, surface.faces), truth, subject, frame, pictures)
+    median, tail = np.percentile(found["errors"], [50, 95])
+    return {
+        "knob": AXES[axis][0],
+        "value": value,
+        "views": len(views),
+        "pixels": max(views[0].camera.width, views[0].camera.height),
+        "voxel_mm": round(surface.grid.voxel * 1e3, 2),
+        "seconds": round(seconds, 1),
+        "abs_error_mm_median": round(float(median), 3),
+        "abs_error_mm_p95": round(float(tail), 2),
+        "skin_error_mm_median": round(float(np.median(found["skin"])), 3),
+        "coverage": round(found["covered"], 4),
+    }
+
+
+def as_markdown(rows: list[dict], item: str) -> list[str]:
+    """The section of the document."""
+    lines = [
+        f"Made by `python -m benchmarks.depth --sweep` on {item} of a synthetic capture: one knob"
+        " at a time around `standard`. Views, pixels (of the longest side) and voxel are those that"
+        " were used, where the footage has less or is too coarse for more. Seconds of one core;"
+        " errors in all cameras of the rig, those left out too.",
+        "",
+        "| knob | value | views | pixels | voxel mm | seconds | median mm | 95 % mm | skin mm |",
+        "|---|---|---|---|---|---|---|---|---|",
+    ]
+    keys = ("knob", "value", "views", "pixels", "voxel_mm", "seconds", "abs_error_mm_median",
+            "abs_error_mm_p95", "skin_error_mm_median")  # fmt: skip
+    return lines + ["| " + " | ".join(f"{row[key]}" for key in keys) + " |" for row in rows]

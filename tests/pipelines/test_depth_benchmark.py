@@ -1,0 +1,47 @@
+"""The benchmark of depth: no error for the truth itself, knobs that exist, a table that is one."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+
+import numpy as np
+
+from benchmarks.depth import parse
+from benchmarks.depth_score import summary
+from benchmarks.depth_sweep import AXES, as_markdown
+from pipelines.depth.config import DepthConfig
+
+
+def test_every_knob_of_the_sweep_is_one_that_the_stage_takes():
+    known = {field.name for field in fields(DepthConfig)}
+    for axis, (knob, values) in AXES.items():
+        assert axis == "views" or knob in known
+        for value in values if axis != "views" else ():
+            DepthConfig(**{knob: value})
+
+
+def test_the_table_has_a_column_for_every_cell():
+    row = {"knob": "voxel_mm", "value": 2.4, "views": 24, "pixels": 512, "voxel_mm": 2.4,
+           "seconds": 20.0, "abs_error_mm_median": 0.5, "abs_error_mm_p95": 7.0,
+           "skin_error_mm_median": 0.4, "coverage": 0.98}  # fmt: skip
+    lines = as_markdown([row], "S001/neutral")
+    assert len({line.count("|") for line in lines[2:]}) == 1
+    assert lines[-1].startswith("| voxel_mm | 2.4 | 24 | 512 |")
+
+
+def test_figures_are_those_of_all_pixels_and_none_where_nothing_was_measured():
+    rows = [{"errors": np.full(3, 1.0), "skin": np.ones(1), "degrees": np.ones(1), "covered": 1.0,
+             "gib": 1.0, "s": 2.0},
+            {"errors": np.full(1, 9.0), "skin": np.ones(1), "degrees": np.ones(1), "covered": 0.5,
+             "gib": 2.0, "s": 4.0}]  # fmt: skip
+    found = summary(rows)
+    assert found["abs_error_mm_median"] == 1 and found["coverage"] == 0.75
+    assert found["seconds_per_frame"] == 3 and found["peak_memory_gib"] == 2
+    assert "n/a" in summary([])
+    empty = rows[0] | {"errors": np.zeros(0), "skin": np.zeros(0), "degrees": np.zeros(0)}
+    assert "n/a" in summary([empty])
+
+
+def test_a_sweep_is_asked_for_by_name():
+    options = parse(["--sweep", "--axes", "views,voxel"])
+    assert options.sweep and options.axes == "views,voxel" and not options.only_warm

@@ -1,0 +1,185 @@
+"""What the depth stage writes: meshes, maps in every format, the photo error, a warm start."""
+
+from __future__ import annotations
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+import trimesh
+
+from express50.cameras import transform_camera
+from express50.depth_files import depth_file, read_depth, read_normals
+from express50.errors import FormatError
+from express50.frames import read_cameras_of
+from express50.images import read_image, srgb_to_linear
+from express50.raycast import mesh_scene
+from express50.runner import run_stage
+from express50.transforms import make_transform
+from pipelines.depth import STAGE
+from pipelines.depth.config import DepthConfig
+from pipelines.depth.consistency import Agreement, agreements, make_shot
+from pipelines.depth.warm import carry, read_surface, source_of
+from pipelines.pack import STAGE as PACK
+from pipelines.pack.config import PackConfig
+from tests.pipelines.bump_dataset import make_dataset, published
+from tests.pipelines.bump_head import mesh, render, ring
+
+QUICK = {"voxel_mm": 8.0, "coarse_mm": 8.0, "patch_samples": 3, "use_track": False}
+ITEMS = ("S001/neutral", "S001/smile")
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory):
+    return make_dataset(tmp_path_factory.mktemp("depth"), cameras=4, size=80)
+
+
+@pytest.fixture(scope="module")
+def written(dataset):
+    """The folder of one item in the standard formats, and its metrics."""
+    table = published(dataset, STAGE, DepthConfig(**QUICK))
+    return dataset.item_dir("depth", ITEMS[0]), table[ITEMS[0]]
+
+
+def test_both_meshes_hold_the_same_coloured_surface(written):
+    folder, _ = written
+    ply = trimesh.load(folder / "surface.ply", process=False)
+    (glb,) = trimesh.load(folder / "surface.glb", process=False).geometry.values()
+    np.testing.assert_array_equal(glb.faces, ply.faces)
+    np.testing.assert_allclose(glb.vertices, ply.vertices, atol=1e-6)
+    assert ply.is_watertight and ply.volume > 0
+    np.testing.assert_allclose(glb.vertex_normals, ply.vertex_normals, atol=1e-2)
+    srgb = ply.visual.vertex_colors[:, :3]
+    linear = glb.visual.vertex_attributes["color"]
+    assert np.ptp(srgb) > 60 and (linear[:, 3] == 255).all()
+    np.testing.assert_allclose(linear[:, :3], 255 * srgb_to_linear(srgb / 255.0), atol=0.51)
+
+
+def test_normal_maps_are_the_slope_of_the_depth_maps(dataset, written):
+    folder, _ = written
+    for name, camera in read_cameras_of(dataset, "S001").items():
+        depth, valid = read_depth(depth_file(folder, name))
+        normals, known = read_normals(folder / f"{name}_normals.png")
+        assert (known == valid).mean() > 0.999 and (normals[known][:, 2] < 0.3).all()
+        y, x = np.mgrid[: camera.height, : camera.width] + 0.5
+        rays = np.stack([(x - camera.K[0, 2]) / camera.K[0, 0],
+                         (y - camera.K[1, 2]) / camera.K[1, 1], np.ones_like(x)], -1)  # fmt: skip
+        points = rays * depth[..., None]
+        across = np.cross(
+            points[2:, 1:-1] - points[:-2, 1:-1], points[1:-1, 2:] - points[1:-1, :-2]
+        )
+        across /= np.maximum(np.linalg.norm(across, axis=-1, keepdims=True), 1e-12)
+        inner = np.stack([valid[1 + a : 79 + a, 1 + b : 79 + b] for a in (-1, 0, 1)
+                          for b in (-1, 0, 1)]).all(0)  # fmt: skip
+        cosine = (across * normals[1:-1, 1:-1]).sum(-1)[inner]
+        assert np.median(cosine) > 0.98
+
+
+def test_every_format_holds_the_same_depth_and_is_packed_alike(tmp_path):
+    data = make_dataset(tmp_path, cameras=3, size=64)
+    shards, depths = {}, {}
+    config = PackConfig(size=64, test_fraction=0.0)
+    for kind in ("png16", "exr32"):
+        published(data, STAGE, DepthConfig(**QUICK, depth_format=kind, normal_maps="none"))
+        folder = data.item_dir("depth", ITEMS[0])
+        path = depth_file(folder, "cam01")
+        assert path.suffix == {"png16": ".png", "exr32": ".exr"}[kind]
+        assert not list(folder.glob("*_normals.png"))
+        depths[kind], _ = read_depth(path)
+        facts = published(data, PACK, config)["shards"]
+        assert facts["kept"] == 6 and not facts["dropped"]
+        shards[kind] = facts["depth_coverage"]
+    assert np.abs(depths["png16"] - depths["exr32"]).max() < 2.6e-5
+    assert shards["png16"] == shards["exr32"] > 0.8
+
+
+def test_colours_agree_through_the_right_surface_and_not_through_a_wrong_one():
+    vertices, faces = mesh()
+    rig = [(camera, *render(camera)[:2]) for camera in ring(6, 128, arc_deg=150)]
+
+    def figures(points):
+        scene = mesh_scene(points, faces)
+        shots = [make_shot(scene, *row, 512) for row in rig]
+        errors = np.concatenate([one.errors.ravel() for one in agreements(shots)])
+        return Agreement(errors, 1.0).numbers()
+
+    right, off = figures(vertices), figures(vertices + [0, 0, 0.006])
+    assert 1 - right["photo_consistent"] < 0.5 * (1 - off["photo_consistent"])
+    assert right["photo_error_median"] < 0.6 * off["photo_error_median"]
+
+
+def test_gains_do_not_count_and_what_nobody_else_sees_is_not_judged():
+    vertices, faces = mesh()
+    scene = mesh_scene(vertices, faces)
+    left, right = ring(2, 128, arc_deg=40)
+    turn = make_transform(np.diag([-1.0, 1.0, -1.0]), np.zeros(3))
+    behind = transform_camera(left, turn)
+    rows = [(camera, *render(camera)[:2]) for camera in (left, right, behind)]
+    dark = (rows[1][0], (rows[1][1] * 0.6).astype(np.uint8), rows[1][2])
+    plain = agreements([make_shot(scene, *row, 512) for row in rows])
+    gained = agreements([make_shot(scene, *row, 512) for row in (rows[0], dark, rows[2])])
+    assert 0.5 < plain[0].compared < 1
+    assert gained[0].numbers()["photo_error_median"] < plain[0].numbers()["photo_error_median"] + 1
+    assert plain[2].compared == 0 and np.isnan(plain[2].errors).all()
+    assert plain[2].numbers() == {"photo_compared": 0.0}
+
+
+def test_the_metrics_and_the_picture_tell_the_photo_error(written):
+    folder, row = written
+    assert 0 < row["photo_error_median"] < row["photo_error_p95"]
+    assert 0.5 < row["photo_consistent"] <= 1 and 0.3 < row["photo_compared"] <= 1
+    assert row["cameras"]["cam01"]["photo_consistent"] > 0.5
+    height, width = read_image(folder / "qc" / "surface.jpg").shape[:2]
+    assert (height, width) == (5 * 240, 4 * 240)
+
+
+def test_a_surface_is_carried_by_the_mesh_and_stays_where_there_is_none():
+    vertices, faces = mesh()
+    angle = 0.1
+    R = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
+    shoulders = vertices + [0, -0.5, 0]
+    both = np.concatenate([1.01 * vertices, shoulders])
+    table = np.concatenate([faces, faces + len(vertices)])
+    moved = carry(both, table, vertices, vertices @ R.T, faces)
+    near, far = np.split(moved, 2)
+    assert np.abs(near - 1.01 * vertices @ R.T).max() < 5e-4
+    np.testing.assert_array_equal(far, shoulders)
+
+
+def test_warm_starts_give_the_same_bytes_in_any_order_and_as_good_a_surface(dataset, tmp_path):
+    config = DepthConfig(**QUICK | {"warm_start": True, "voxel_mm": 5.0, "track_agreement": 0.5})
+    assert source_of(dataset, ITEMS[1], config) == ITEMS[0]
+    assert source_of(dataset, ITEMS[0], config) is None
+    run_stage(STAGE, dataset, config, [ITEMS[1]], workers=0, progress=False)
+    warm = json.loads((dataset.item_dir("depth", ITEMS[1]) / "metrics.json").read_text())
+    assert warm["warm"]["used"] and warm["warm"]["from"] == ITEMS[0]
+    assert warm["warm"]["agreement"] > 0.9
+    first = {path.name: path.read_bytes() for path in files(dataset)}
+    shutil.rmtree(dataset.item_dir("depth", "S001"))
+    table = published(dataset, STAGE, config)
+    assert {path.name: path.read_bytes() for path in files(dataset)} == first
+    cold = table[ITEMS[0]]
+    assert not cold["warm"]["used"]
+    assert warm["photo_error_median"] < 1.15 * cold["photo_error_median"]
+    assert warm["coverage"] > cold["coverage"] - 0.01
+
+
+def files(dataset):
+    return [path for path in dataset.item_dir("depth", ITEMS[1]).iterdir() if path.is_file()]
+
+
+def test_a_surface_that_is_none_is_refused_by_name(tmp_path):
+    for text in (b"", b"ply\nformat ascii 1.0\nelement vertex 0\nend_header\n", b"nonsense"):
+        (tmp_path / "surface.ply").write_bytes(text)
+        with pytest.raises(FormatError, match="surface.ply"):
+            read_surface(tmp_path / "surface.ply")
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("depth_format", "exr"), ("normal_maps", "8"), ("warm_levels", 0), ("consistency_side", 4)],
+)
+def test_unknown_values_are_named(name, value):
+    with pytest.raises(ValueError, match=name):
+        DepthConfig(**{name: value})
