@@ -37,6 +37,16 @@ class DepthConfig:
     """Gaussian smoothing of the distances before each level, in voxels."""
     min_views: int = 2
     """Fewest usable cameras; at least 2."""
+    render_rounds: int = 0
+    """Rounds in which rendering refines the surface, 0 to 50; 0: none."""
+    render_rays: int = 250_000
+    """Pixels a round renders; each round takes others, as far as there are."""
+    render_samples: int = 16
+    """Samples along a ray through the band, at least 4."""
+    render_stiffness: float = 4.0
+    """Length, in voxels, under which a refinement's moves are smoothed."""
+    device: str = "auto"
+    """Where rendering runs: "auto" (CUDA where there is one), "cpu" or "cuda"."""
     raycast: str = "mesh"
     """What rays are cast at: "mesh" (triangles, fast) or "sdf" (the distances themselves)."""
     qc_views: int = 4
@@ -54,6 +64,16 @@ class DepthConfig:
             raise ValueError(f"patch_samples is {self.patch_samples}, expected an odd number >= 3")
         if self.raycast not in ("mesh", "sdf"):
             raise ValueError(f"raycast is {self.raycast!r}, expected 'mesh' or 'sdf'")
+        if self.device not in ("auto", "cpu", "cuda"):
+            raise ValueError(f"device is {self.device!r}, expected 'auto', 'cpu' or 'cuda'")
+        if not 0 <= self.render_rounds <= 50 or self.render_rays < 100 or self.render_samples < 4:
+            raise ValueError(
+                f"render_rounds, render_rays and render_samples are {self.render_rounds},"
+                f" {self.render_rays} and {self.render_samples}, expected 0 to 50, at least 100"
+                " and at least 4"
+            )
+        if self.render_stiffness <= 0:
+            raise ValueError(f"render_stiffness is {self.render_stiffness}, expected over 0")
         if self.min_views < 2:
             raise ValueError(f"min_views is {self.min_views}, expected at least 2")
         if self.noise <= 0 or self.stiffness_voxels <= 0 or self.image_side < 16:
@@ -63,5 +83,11 @@ class DepthConfig:
 PRESETS: dict[str, dict[str, object]] = {
     "draft": {"voxel_mm": 4.0, "image_side": 512},
     "standard": {},
-    "reference": {"voxel_mm": 1.0, "patch_samples": 7, "image_side": 2048, "raycast": "sdf"},
+    "reference": {
+        "voxel_mm": 1.0,
+        "patch_samples": 7,
+        "image_side": 2048,
+        "render_rounds": 5,
+        "raycast": "sdf",
+    },
 }

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -21,6 +21,7 @@ from pipelines.depth.grid import (
     sample_image,
 )
 from pipelines.depth.prior import Prior
+from pipelines.depth.refine import refine
 from pipelines.depth.surface import (
     advance,
     closed,
@@ -87,7 +88,9 @@ def reconstruct(views: Sequence[View], config: DepthConfig, prior: Prior | None 
         if prior is None or level:
             grid = fair(grid, config.fair_voxels * voxel)
         grid = _move(views, grid, hull, config, extent, first=level == 0 and prior is None)
-    return _finish(views, grid, config)
+    grid, rendered = refine(views, grid, config)
+    surface = _finish(views, grid, config)
+    return replace(surface, numbers=surface.numbers | rendered)
 
 
 def _voxels(views: Sequence[View], middle: np.ndarray, config: DepthConfig) -> list[float]:
