@@ -92,7 +92,8 @@ def make_sight(
 
     Args:
         views: C views.
-        origin: (3,) world, metres, and ``voxel``, metres: the coordinates' units.
+        origin: (3,) world, metres, where voxels are counted from.
+        voxel: metres.
         mesh: vertices (V, 3), outward normals (V, 3) and faces (F, 3) of the surface, metres.
         samples: K of a ray.
         budget: rays wanted.

@@ -73,14 +73,12 @@ def refine(views: Sequence[View], grid: Grid, config: DepthConfig) -> tuple[Grid
     if not config.render_rounds or not len(mesh[2]):
         return grid, {}
     device = pick_device(config.device)
-    before, exact = torch.get_num_threads(), torch.are_deterministic_algorithms_enabled()
+    threads = torch.get_num_threads()
     torch.set_num_threads(1)  # sums in one order; the runner counts one core an item
-    torch.use_deterministic_algorithms(True, warn_only=True)
     try:
         return _refine(views, grid, mesh, config, device)
     finally:
-        torch.use_deterministic_algorithms(exact)
-        torch.set_num_threads(before)
+        torch.set_num_threads(threads)
 
 
 def pick_device(name: str) -> torch.device:
@@ -179,7 +177,8 @@ def solve_step(
     Args:
         model: what is moved.
         move: (N,) so far: the plate is of the whole move, so that noise does not pile up.
-        down: (N,) gradient; bend: (N,) curvature of the data.
+        down: (N,) gradient of the data's cost.
+        bend: (N,) its curvature.
         stiffness: voxels under which moves are smoothed where pixels say as much as usual.
     """
     told = bend > 0.05 * bend.mean()

@@ -142,7 +142,8 @@ def errors(
     """What the rendering lacks, weighed by Charbonnier's robust cost.
 
     Args:
-        matrix: (R, N) of :func:`pixel_rows`, and ``opacity`` (R,).
+        matrix: (R, N) of :func:`pixel_rows`.
+        opacity: (R,) of the same.
         look: appearance.
         rays: R rays.
         noise: standard deviation of the colours; taken from their errors where not given.
@@ -152,8 +153,7 @@ def errors(
     gap = torch.where(counts[:, None], gap, 0.0)
     typical = float(gap[counts].abs().median()) if bool(counts.any()) else 1.0
     noise = noise or max(1.4826 * typical, LEAST_NOISE)
-    if noise is None:
-        lack = opacity - rays.alpha
+    lack = opacity - rays.alpha
     colour = (1 + (gap / noise).square().mean(1)).sqrt()
     matte = (1 + (lack / ALPHA_NOISE).square()).sqrt()
     cost = (rays.weight * (colour - 1) + matte - 1).mean(dtype=torch.float64)
@@ -226,7 +226,10 @@ def ray_pull(
         found: (R, K) distances, voxels.
         sharpness: per voxel.
         apart: (R, K, 3) the samples' colours less the pixel's.
-        colour: (R, 3) and opacity: (R,) errors, with weights (R,) of their squares.
+        colour: (R, 3) errors.
+        opacity: (R,) errors.
+        colour_weight: (R,) of the colours' squared errors.
+        opacity_weight: (R,) of the opacities'.
     """
     with torch.enable_grad():
         leaf = found.detach().requires_grad_()
