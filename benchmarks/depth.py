@@ -6,7 +6,8 @@ before depth are run. Baselines see the same mattes, frames and cameras: ``visua
 alone), ``tracked_mesh`` (the track alone) and ``tsdf_fusion`` (plane sweeps fused by Open3D).
 Errors are over all pixels that the matte, the truth and the surface share; ``skin`` are those of
 them where the truth shows the head's own surface, so that hair, whose true depth jumps from strand
-to strand, can be told apart. Normals are compared there. Seconds are processor seconds of one
+to strand, can be told apart. Normals are compared there. A preset that refines by rendering has a
+row ``<preset>_unrendered`` beside it, the same without. Seconds are processor seconds of one
 thread, peak memory that of a process of its own. The last line is one JSON object.
 """
 
@@ -47,8 +48,10 @@ from pipelines.depth.surface import extract_mesh
 from pipelines.depth.trace import trace
 
 PRESETS = ("draft", "standard", "reference")
+UNRENDERED = "_unrendered"  # a preset less its refinement by rendering
 BASELINES = ("visual_hull", "tracked_mesh", "tsdf_fusion")
 BASELINE_VOXEL_M = 0.003
+BAND = ("band_voxels", "band_mib")  # what rendering keeps near the surface
 Mesh = tuple[np.ndarray, np.ndarray]  # vertices (V, 3), faces (F, 3)
 
 
@@ -60,7 +63,7 @@ def main(arguments: list[str] | None = None) -> int:
             options.dataset, options.truth = record(options, Path(scratch) / "twin")
         items = STAGE.items(Dataset(options.dataset))[: options.items or None]
         result: dict = {"benchmark": "depth", "items": items}
-        for name in (*options.presets.split(","), *BASELINES):
+        for name in (*with_and_without(options.presets.split(",")), *BASELINES):
             rows = [alone(options.dataset, options.truth, item, name) for item in items]
             result[name] = summary([row for row in rows if row])
             print(name, json.dumps(result[name]), file=sys.stderr, flush=True)
@@ -71,6 +74,12 @@ def main(arguments: list[str] | None = None) -> int:
         result["standard_beats_baselines"] = all(best < value for value in known)
     print(json.dumps(result))
     return 0
+
+
+def with_and_without(presets: list[str]) -> list[str]:
+    """The presets' names, each that renders followed by itself without rendering."""
+    rendering = [name for name in presets if STAGE.presets[name].get("render_rounds")]
+    return presets + [name + UNRENDERED for name in rendering]
 
 
 def parse(arguments: list[str] | None) -> argparse.Namespace:
@@ -111,15 +120,18 @@ def measure(dataset_root: Path, truth_root: Path, item: str, name: str) -> dict 
     dataset, truth = Dataset(dataset_root), Truth(truth_root)
     subject, expression = item.split("/")
     frame = read_peaks(dataset, subject)[expression]
-    config = build_config(STAGE, STAGE.presets.get(name, {}))
+    preset = name.removesuffix(UNRENDERED)
+    less = {} if preset == name else {"render_rounds": 0}
+    config = build_config(STAGE, STAGE.presets.get(preset, {}) | less)
     views, pictures, _ = read_views(dataset, subject, expression, frame, config)
     start = time.process_time()
     found: dict = {}
-    if name in PRESETS:
+    if preset in PRESETS:
         prior, _ = read_prior(dataset, subject, expression, views, config)
         surface = reconstruct(views, config, prior)
         mesh = surface.vertices, surface.faces
-        found |= {"voxels": surface.numbers["voxels"], "voxel_mm": surface.numbers["voxel_mm"]}
+        shown = ("voxels", "voxel_mm", *BAND)
+        found |= {key: surface.numbers[key] for key in shown if key in surface.numbers}
     else:
         made = baseline(name, dataset, subject, expression, views)
         if made is None:
@@ -127,7 +139,7 @@ def measure(dataset_root: Path, truth_root: Path, item: str, name: str) -> dict 
         mesh = made
     found["s"] = None if name == "tracked_mesh" else time.process_time() - start
     found["gib"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
-    if name in PRESETS:
+    if preset in PRESETS:
         found["raycast"] = both_ways(surface, [camera for camera, _, _ in pictures[::8]])
     cameras = {camera.id: camera for camera, _, _ in pictures}
     motion = align_worlds(cameras, truth.cameras(subject))
@@ -237,6 +249,9 @@ def summary(rows: list[dict]) -> dict:
     }
     seconds = [row["s"] for row in rows if row["s"] is not None]
     figures["seconds_per_frame"] = round(float(np.mean(seconds)), 2) if seconds else None
+    for key in BAND:
+        if key in rows[0]:
+            figures[key] = round(max(row[key] for row in rows), 1)
     if "voxels" in rows[0]:
         figures["voxel_mm"] = round(rows[0]["voxel_mm"], 3)
         # the grid is dense: as many are allocated as the box holds

@@ -40,6 +40,7 @@ LOGISTIC = np.pi / np.sqrt(3)  # standard deviation of the logistic distribution
 EIKONAL = 0.1  # weight of unit slope against what pixels usually say
 APPEARANCE_STEPS, MOVE_STEPS = 8, 150  # of conjugate gradients
 HELD_OUT = 0.1  # share of a round's rays that only judge
+FEWEST_RAYS = 100  # below, there is nothing to render
 
 
 @dataclass(frozen=True)
@@ -107,7 +108,9 @@ def _refine(
     model = make_model(grid, mesh[0], device)
     budget = int(config.render_rays * (config.render_rounds + HELD_OUT))
     sight = make_sight(views, grid.origin, grid.voxel, mesh, config.render_samples, budget)
-    judges = sight.batch(slice(0, int(HELD_OUT * config.render_rays)), device)
+    if sight.count < FEWEST_RAYS:
+        return grid, {"render_kept": False, "render_rays": 0}
+    judges = sight.batch(slice(0, _held(sight, config)), device)
     move = torch.zeros(model.moves.count, device=device)
     bend, rejected = torch.zeros_like(move), 0
     look = plain_appearance(model.band, model.probes, len(views))
@@ -115,14 +118,14 @@ def _refine(
         rays = _batch(sight, k, config, device)
         scene = _scene(model, rays, k / max(1, config.render_rounds - 1))
         values = model.values(move)
-        look, wrong = explain(scene, values, look, 2 if k == 0 else 1)
-        down, turn = pull(scene, values, look.colours[: model.band.count], wrong)
+        seen, wrong = explain(scene, values, look, 2 if k == 0 else 1)
+        down, turn = pull(scene, values, seen.colours[: model.band.count], wrong)
         down, turn = ((model.spread.columns @ x[:, None])[:, 0] for x in (down, turn))
         step = solve_step(model, move, down, bend + turn, config.render_stiffness)
         if not torch.isfinite(step).all():
             rejected += 1
             continue
-        bend = bend + turn
+        look, bend = seen, bend + turn
         move = (move + step.clamp(-MOST_STEP, MOST_STEP)).clamp(-MOST_MOVE, MOST_MOVE)
     rays = _batch(sight, config.render_rounds - 1, config, device)
     old, new = (judge(model, m, look, rays, judges) for m in (torch.zeros_like(move), move))
@@ -135,13 +138,16 @@ def _refine(
     return (written_back(grid, model, move) if kept else grid), numbers
 
 
+def _held(sight: Sight, config: DepthConfig) -> int:
+    return int(HELD_OUT * min(sight.count, config.render_rays))
+
+
 def _batch(sight: Sight, k: int, config: DepthConfig, device: torch.device) -> Rays:
-    """The rays of round k, after those held out; again from the first where pixels run out."""
-    first = int(HELD_OUT * config.render_rays)
-    rest = max(1, sight.count - first)
-    start = first + (k * config.render_rays) % rest
-    start = max(first, min(start, sight.count - config.render_rays))
-    return sight.batch(slice(start, start + config.render_rays), device)
+    """The rays of round k, after those held out; some again where pixels run out."""
+    first, count = _held(sight, config), config.render_rays
+    start = first + (k * count) % (sight.count - first)
+    start = max(first, min(start, sight.count - count))
+    return sight.batch(slice(start, start + count), device)
 
 
 def _scene(model: Model, rays: Rays, progress: float) -> Scene:
@@ -247,9 +253,7 @@ def _numbers(model: Model, move: torch.Tensor, grid: Grid, old: Errors, new: Err
     near = model.start.abs() < 1
     moved = model.values(move)[near] - model.start[near]
     tables = (model.band, model.moves, model.probes)
-    return {
-        "band_voxels": model.band.count,
-        "band_mib": sum(table.bytes for table in tables) / 2**20,
+    found = {
         "render_moved_mm": float(moved.square().mean().sqrt()) * grid.voxel * 1e3,
         "render_cost_before": old.cost,
         "render_cost": new.cost,
@@ -257,4 +261,9 @@ def _numbers(model: Model, move: torch.Tensor, grid: Grid, old: Errors, new: Err
         "render_colour_error": new.colour_error,
         "render_alpha_error_before": float(old.opacity.abs().mean()),
         "render_alpha_error": float(new.opacity.abs().mean()),
+    }
+    known = {key: value if np.isfinite(value) else None for key, value in found.items()}
+    return known | {
+        "band_voxels": model.band.count,
+        "band_mib": sum(table.bytes for table in tables) / 2**20,
     }

@@ -104,13 +104,14 @@ def pixel_rows(scene: Scene, values: torch.Tensor) -> tuple[Matrix, torch.Tensor
         row, column = torch.nonzero(share, as_tuple=True)
         points = some.start[row] + some.along[row, column][:, None] * some.way[row]
         index, weight = scene.band.interpolation(points)
-        entries.append((row[:, None] + at.start, index, weight * share[row, column][:, None]))
+        rays = (row[:, None] + at.start).int()
+        entries.append((rays, index.int(), weight * share[row, column][:, None]))
         entries.append(_probe_entries(scene, some, share, at.start))
     row, column, value = (
         torch.cat([part.expand(full.shape).reshape(-1) for part, full in pairs])
         for pairs in zip(*[[(e[k], e[2]) for k in range(3)] for e in entries], strict=True)
     )
-    order = torch.argsort(row.int(), stable=True)
+    order = torch.argsort(row, stable=True)
     size = scene.band.count + LOBES * scene.probes.count
     matrix = sparse_matrix(row[order], column[order], value[order], (len(scene.rays.camera), size))
     return matrix, torch.cat(opacity)
@@ -129,7 +130,7 @@ def _probe_entries(
     angular = lobes(rays.way[row], rays.normal[row])
     lobe = torch.arange(LOBES, device=probe.device)
     column = scene.band.count + LOBES * probe[..., None] + lobe
-    return (row + first)[:, None, None], column, near[..., None] * angular[:, None]
+    return (row + first).int()[:, None, None], column.int(), near[..., None] * angular[:, None]
 
 
 def errors(

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from express50.errors import ConfigError
 from pipelines.depth.band import (
     grown,
     make_band,
@@ -28,7 +29,7 @@ from pipelines.depth.probes import (
     sparse_matrix,
 )
 from pipelines.depth.rays import make_sight
-from pipelines.depth.refine import make_model, refine
+from pipelines.depth.refine import make_model, pick_device, refine
 from pipelines.depth.render import distances, ray_pull, ray_weights
 from pipelines.depth.surface import extract_mesh
 from pipelines.depth.views import make_view
@@ -37,7 +38,7 @@ from tests.pipelines.bump_head import distance, render, ring
 CPU = torch.device("cpu")
 VOXEL = 0.004
 QUICK = DepthConfig(
-    render_rounds=4, render_rays=25_000, render_samples=12, render_stiffness=2.0, device="cpu"
+    render_rounds=3, render_rays=15_000, render_samples=12, render_stiffness=2.0, device="cpu"
 )
 
 
@@ -265,7 +266,15 @@ def test_broken_pictures_leave_the_surface_as_it_was(views):
     grid = head_grid()
     same, numbers = refine(broken, grid, QUICK)
     assert numbers["render_rounds_rejected"] == QUICK.render_rounds and not numbers["render_kept"]
+    assert numbers["render_cost"] is None
     np.testing.assert_array_equal(same.values, grid.values)
+
+
+def test_cuda_where_there_is_none_is_one_clear_error():
+    if torch.cuda.is_available():
+        pytest.skip("this machine has CUDA")
+    with pytest.raises(ConfigError, match="depth.device"):
+        pick_device("cuda")
 
 
 def test_rays_of_a_thousand_metres_away_see_the_same(views):
