@@ -100,14 +100,15 @@ def make_band(cells: np.ndarray, device: torch.device) -> Band:
     slots[rank * BLOCK**3 + (local[:, 0] * BLOCK + local[:, 1]) * BLOCK + local[:, 2]] = np.arange(
         len(cells)
     )
-    tables = [torch.from_numpy(a).to(device) for a in (cells, low, blocks.reshape(shape), slots)]
-    at = tables[0][:, None]
+    at, *tables = (
+        torch.from_numpy(a).to(device) for a in (cells, low, blocks.reshape(shape), slots)
+    )
     corners, sides = (
-        _find(at + torch.from_numpy(steps).to(device), *tables[1:], len(cells))
+        _find(at[:, None] + torch.from_numpy(steps).to(device), *tables, absent=len(cells))
         for steps in (CORNERS, SIDES)
     )
     nowhere = corners.new_full((1, 8), len(cells))
-    return Band(*tables, torch.cat([corners, nowhere]), sides)
+    return Band(at, *tables, corners=torch.cat([corners, nowhere]), sides=sides)
 
 
 def grown(cells: np.ndarray, rounds: int) -> np.ndarray:

