@@ -100,15 +100,15 @@ def make_band(cells: np.ndarray, device: torch.device) -> Band:
     slots[rank * BLOCK**3 + (local[:, 0] * BLOCK + local[:, 1]) * BLOCK + local[:, 2]] = np.arange(
         len(cells)
     )
-    at, *tables = (
-        torch.from_numpy(a).to(device) for a in (cells, low, blocks.reshape(shape), slots)
-    )
+    tables = (low, blocks.reshape(shape), slots)
+    start, ranks, places = (torch.from_numpy(table).to(device) for table in tables)
+    at = torch.from_numpy(cells).to(device)
     corners, sides = (
-        _find(at[:, None] + torch.from_numpy(steps).to(device), *tables, absent=len(cells))
+        _find(at[:, None] + torch.from_numpy(steps).to(device), start, ranks, places, len(cells))
         for steps in (CORNERS, SIDES)
     )
     nowhere = corners.new_full((1, 8), len(cells))
-    return Band(at, *tables, corners=torch.cat([corners, nowhere]), sides=sides)
+    return Band(at, start, ranks, places, torch.cat([corners, nowhere]), sides)
 
 
 def grown(cells: np.ndarray, rounds: int) -> np.ndarray:

@@ -229,8 +229,8 @@ def make_model(grid: Grid, vertices: np.ndarray, device: torch.device) -> Model:
     moves = make_band(_lattice(cells[near], MOVE_EVERY), device)
     index, weight = moves.interpolation(band.cells.float() / MOVE_EVERY)
     row = torch.arange(band.count, device=device)[:, None].expand(index.shape)
-    entries = (part.reshape(-1) for part in (row, index, weight))
-    spread = sparse_matrix(*entries, (band.count, moves.count))
+    row, index, weight = (part.reshape(-1) for part in (row, index, weight))
+    spread = sparse_matrix(row, index, weight, (band.count, moves.count))
     return Model(band, start, moves, spread, make_band(_lattice(cells[near], PROBE_EVERY), device))
 
 
