@@ -39,7 +39,7 @@ class DepthConfig:
     """Fewest usable cameras; at least 2."""
     render_rounds: int = 0
     """Rounds in which rendering refines the surface, 0 to 50; 0: none."""
-    render_rays: int = 250_000
+    render_rays: int = 150_000
     """Pixels a round renders; each round takes others, as far as there are."""
     render_samples: int = 16
     """Samples along a ray through the band, at least 4."""
@@ -87,7 +87,7 @@ PRESETS: dict[str, dict[str, object]] = {
         "voxel_mm": 1.0,
         "patch_samples": 7,
         "image_side": 2048,
-        "render_rounds": 5,
+        "render_rounds": 4,
         "raycast": "sdf",
     },
 }
