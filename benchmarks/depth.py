@@ -6,7 +6,8 @@ before depth are run. Baselines see the same mattes, frames and cameras: ``visua
 alone), ``tracked_mesh`` (the track alone) and ``tsdf_fusion`` (plane sweeps fused by Open3D).
 Errors are over all pixels that the matte, the truth and the surface share; ``skin`` are those of
 them where the truth shows the head's own surface, so that hair, whose true depth jumps from strand
-to strand, can be told apart. Normals are compared there. Seconds are processor seconds of one
+to strand, can be told apart. Normals are compared there. A preset that refines by rendering has a
+row ``<preset>_unrendered`` beside it, the same without. Seconds are processor seconds of one
 thread, peak memory that of a process of its own. ``warm_start`` compares every expression but each
 subject's first, started from that one's surface, with a cold start. ``--sweep`` measures one knob
 at a time instead and writes a table. The last line is one JSON object.
@@ -51,8 +52,10 @@ from pipelines.depth.surface import extract_mesh
 from pipelines.depth.trace import trace
 
 PRESETS = ("draft", "standard", "reference")
+UNRENDERED = "_unrendered"  # a preset less its refinement by rendering
 BASELINES = ("visual_hull", "tracked_mesh", "tsdf_fusion")
 BASELINE_VOXEL_M = 0.003
+BAND = ("band_voxels", "band_mib")  # what rendering keeps near the surface
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -66,8 +69,8 @@ def main(arguments: list[str] | None = None) -> int:
             print(json.dumps(sweep(options, items[0])))
             return 0
         result: dict = {"benchmark": "depth", "items": items}
-        names = () if options.only_warm else (*options.presets.split(","), *BASELINES)
-        for name in names:
+        presets = with_and_without(options.presets.split(","))
+        for name in () if options.only_warm else (*presets, *BASELINES):
             rows = [alone(options.dataset, options.truth, item, name) for item in items]
             result[name] = summary([row for row in rows if row])
             print(name, json.dumps(result[name]), file=sys.stderr, flush=True)
@@ -80,6 +83,12 @@ def main(arguments: list[str] | None = None) -> int:
         result["standard_beats_baselines"] = all(best < value for value in known)
     print(json.dumps(result))
     return 0
+
+
+def with_and_without(presets: list[str]) -> list[str]:
+    """The presets' names, each that renders followed by itself without rendering."""
+    rendering = [name for name in presets if STAGE.presets[name].get("render_rounds")]
+    return presets + [name + UNRENDERED for name in rendering]
 
 
 def parse(arguments: list[str] | None) -> argparse.Namespace:
@@ -124,16 +133,18 @@ def measure(dataset_root: Path, truth_root: Path, item: str, name: str) -> dict 
     dataset, truth = Dataset(dataset_root), Truth(truth_root)
     subject, expression = item.split("/")
     frame = read_peaks(dataset, subject)[expression]
-    config = build_config(STAGE, STAGE.presets.get(name, {}))
+    preset = name.removesuffix(UNRENDERED)
+    less = {} if preset == name else {"render_rounds": 0}
+    config = build_config(STAGE, STAGE.presets.get(preset, {}) | less)
     views, pictures, _ = read_views(dataset, subject, expression, frame, config)
     start = time.process_time()
     found: dict = {}
-    if name in PRESETS:
+    if preset in PRESETS:
         prior, _ = read_prior(dataset, subject, expression, views, config)
         surface = reconstruct(views, config, prior)
         mesh = surface.vertices, surface.faces
-        names = ("voxels_allocated", "voxels_dense", "grid_bytes", "voxel_mm")
-        found |= {key: surface.numbers[key] for key in names}
+        names = ("voxels_allocated", "voxels_dense", "grid_bytes", "voxel_mm", *BAND)
+        found |= {key: surface.numbers[key] for key in names if key in surface.numbers}
     else:
         made = baseline(name, dataset, subject, expression, views)
         if made is None:
@@ -141,7 +152,7 @@ def measure(dataset_root: Path, truth_root: Path, item: str, name: str) -> dict 
         mesh = made
     found["s"] = None if name == "tracked_mesh" else time.process_time() - start
     found["gib"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
-    if name in PRESETS:
+    if preset in PRESETS:
         found["raycast"] = both_ways(surface, [camera for camera, _, _ in pictures[::8]])
     return found | score(mesh, truth, subject, frame, pictures)
 

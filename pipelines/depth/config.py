@@ -39,6 +39,16 @@ class DepthConfig:
     """Gaussian smoothing of the distances before each level, in voxels."""
     min_views: int = 2
     """Fewest usable cameras; at least 2."""
+    render_rounds: int = 0
+    """Rounds in which rendering refines the surface, 0 to 50; 0: none."""
+    render_rays: int = 150_000
+    """Pixels a round renders; each round takes others, as far as there are."""
+    render_samples: int = 16
+    """Samples along a ray through the band, at least 4."""
+    render_stiffness: float = 5.0
+    """Voxels; where pixels say as much as usual, half of a move 2.6 times as long is followed."""
+    device: str = "auto"
+    """Where rendering runs: "auto" (CUDA where there is one), "cpu" or "cuda"."""
     raycast: str = "mesh"
     """What rays are cast at: "mesh" (triangles, fast) or "sdf" (the distances themselves)."""
     warm_start: bool = False
@@ -78,6 +88,16 @@ class DepthConfig:
             raise ValueError(f"warm_levels is {self.warm_levels}, expected at least 1")
         if self.consistency_side < 16:
             raise ValueError(f"consistency_side is {self.consistency_side}, expected at least 16")
+        if self.device not in ("auto", "cpu", "cuda"):
+            raise ValueError(f"device is {self.device!r}, expected 'auto', 'cpu' or 'cuda'")
+        if not 0 <= self.render_rounds <= 50 or self.render_rays < 100 or self.render_samples < 4:
+            raise ValueError(
+                f"render_rounds, render_rays and render_samples are {self.render_rounds},"
+                f" {self.render_rays} and {self.render_samples}, expected 0 to 50, at least 100"
+                " and at least 4"
+            )
+        if self.render_stiffness <= 0:
+            raise ValueError(f"render_stiffness is {self.render_stiffness}, expected over 0")
         if self.min_views < 2:
             raise ValueError(f"min_views is {self.min_views}, expected at least 2")
         if self.noise <= 0 or self.stiffness_voxels <= 0 or self.image_side < 16:
@@ -87,5 +107,11 @@ class DepthConfig:
 PRESETS: dict[str, dict[str, object]] = {
     "draft": {"voxel_mm": 4.0, "image_side": 512},
     "standard": {},
-    "reference": {"voxel_mm": 1.0, "patch_samples": 7, "image_side": 2048, "raycast": "sdf"},
+    "reference": {
+        "voxel_mm": 1.0,
+        "patch_samples": 7,
+        "image_side": 2048,
+        "render_rounds": 4,
+        "raycast": "sdf",
+    },
 }

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -34,6 +34,7 @@ from pipelines.depth.grid import (
     sample_image,
 )
 from pipelines.depth.prior import Prior
+from pipelines.depth.refine import refine
 from pipelines.depth.surface import (
     advance,
     extract_mesh,
@@ -108,7 +109,9 @@ def reconstruct(
             grid = fair(grid, config.fair_voxels * voxel)
         deep = level == 0 and prior is None and start is None
         grid = _move(views, grid, hull, config, extent, first=deep)
-    return _finish(views, grid, config)
+    grid, rendered = refine(views, grid, config)
+    surface = _finish(views, grid, config)
+    return replace(surface, numbers=surface.numbers | rendered)
 
 
 def _voxels(views: Sequence[View], middle: np.ndarray, config: DepthConfig) -> list[float]:
