@@ -4,7 +4,7 @@
 |---|---|---|---|
 | png16 | steps of 0.05 mm | 3.27 m | 0.025 mm |
 | exr16 (half float) | metres | 65 km | 1/2048 of the depth: 0.49 mm from 1 to 2 m |
-| exr32 (float) | metres | any | 0.0001 mm under 2 m |
+| exr32 (float) | metres | 65 km | 0.0001 mm under 2 m |
 
 0 is unknown in all of them. Normal maps are RGB PNG in camera axes (x right, y down, z forward):
 component c is stored as round(h c) + h + 1, h = 127 or 32767, so that (0, 0, 0) is left for

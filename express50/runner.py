@@ -167,11 +167,12 @@ def waves_of(stage: Stage, dataset: Dataset, config: Any, chosen: Sequence[str])
     order = [*chosen, *sorted(set(needs) - set(chosen))]
     waves: list[list[str]] = []
     while order:
-        ready = [item for item in order if not set(needs[item]) & set(order)]
+        left = set(order)
+        ready = [item for item in order if left.isdisjoint(needs[item])]
         if not ready:
             raise StageError(f"{stage.name}: {', '.join(order[:3])} wait for each other")
         waves.append(ready)
-        order = [item for item in order if item not in ready]
+        order = [item for item in order if not left.isdisjoint(needs[item])]
     return waves
 
 

@@ -72,8 +72,8 @@ def decode_picture(name: str, data: bytes, width: int, height: int, where: str) 
     if name.endswith(".zst"):
         return _unzstd(data, width, height, where)
     image = _decode(name, data, where)
-    kind, dimensions = (np.uint16, 2) if name in DEPTH else (np.uint8, 3 if name in RGB else 2)
-    if image.dtype != kind or image.shape[:2] != (height, width) or image.ndim != dimensions:
+    kind = np.uint16 if name in DEPTH else np.uint8
+    if image.dtype != kind or image.shape != (height, width, 3)[: 3 if name in RGB else 2]:
         raise FormatError(f"{where}: {image.dtype} {image.shape}, expected {np.dtype(kind)}")
     return image
 

@@ -7,7 +7,7 @@ from collections.abc import Collection, Sequence
 from pathlib import Path
 
 from express50.errors import FormatError
-from express50.publish import write_json
+from express50.publish import sync_directory, sync_tree, write_json
 from express50.shards import ShardReader
 from express50.shards_offsets import offsets_file
 from express50.shards_write import PackedSample, ShardWriter, write_manifest
@@ -42,8 +42,13 @@ def merge_shards(roots: Sequence[Path], out: Path, shard_mb: int) -> int:
 
 
 def _write(readers: Sequence[ShardReader], out: Path, shard_mb: int) -> int:
+    out = out.resolve()
+    if out.exists() and not out.is_dir():
+        raise FormatError(f"{out}: is a file; expected an empty or absent folder")
     if out.exists() and any(out.iterdir()):
         raise FormatError(f"{out}: is not empty; expected an empty or absent folder")
+    if shard_mb < 1:
+        raise FormatError(f"--shard-mb is {shard_mb}, expected at least 1")
     if not any(len(reader) for reader in readers):
         raise FormatError(f"{readers[0].root}: no sample matches; 'express50 shards ls' lists them")
     splits = _splits(readers)
@@ -60,9 +65,11 @@ def _write(readers: Sequence[ShardReader], out: Path, shard_mb: int) -> int:
         write_json(aside / "splits.json", names | {"chosen_by": "the shards these are made of"})
         _write_card(readers, aside)
         write_manifest(aside)
+        sync_tree(aside)
         if out.exists():
             out.rmdir()
         aside.rename(out)
+        sync_directory(out.parent)
     finally:
         shutil.rmtree(aside, ignore_errors=True)
         for reader in readers:

@@ -47,8 +47,9 @@ class DepthConfig:
     """Samples along a ray through the band, at least 4."""
     render_stiffness: float = 5.0
     """Voxels; where pixels say as much as usual, half of a move 2.6 times as long is followed."""
-    device: str = "auto"
-    """Where rendering runs: "auto" (CUDA where there is one), "cpu" or "cuda"."""
+    device: str = "cpu"
+    """Where rendering runs: "cpu", "cuda", or "auto" (CUDA where there is one). Only the CPU gives
+    the same bytes on every run: sums on CUDA have no fixed order."""
     raycast: str = "mesh"
     """What rays are cast at: "mesh" (triangles, fast) or "sdf" (the distances themselves)."""
     warm_start: bool = False

@@ -130,12 +130,14 @@ def _refine(
         look, bend = seen, bend + turn
         move = (move + step.clamp(-MOST_STEP, MOST_STEP)).clamp(-MOST_MOVE, MOST_MOVE)
     rays = _batch(sight, config.render_rounds - 1, config, device)
-    old, new = (judge(model, m, look, rays, judges) for m in (torch.zeros_like(move), move))
+    plain = plain_appearance(model.band, model.probes, len(views), mean)  # no start favours either
+    old, new = (judge(model, m, plain, rays, judges) for m in (torch.zeros_like(move), move))
     kept = np.isfinite(new.cost) and new.cost < old.cost
     numbers = _numbers(model, move, grid, old, new) | {
         "render_kept": bool(kept),
         "render_rays": len(rays.camera) * config.render_rounds,
         "render_rounds_rejected": rejected,
+        "render_device": device.type,
     }
     return (written_back(grid, model, move) if kept else grid), numbers
 

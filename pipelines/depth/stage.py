@@ -48,7 +48,8 @@ def inputs(dataset: Dataset, item: str, config: DepthConfig) -> dict[str, Path |
         found["track"] = track
     source = source_of(dataset, item, config)
     if source is not None:
-        found |= {"track": track, "warm start": surface_file(dataset, source)}
+        surface = surface_file(dataset, source)  # none if it could not be made: then a cold start
+        found |= {"track": track, "warm start": surface if surface.is_file() else "none"}
     return found
 
 

@@ -35,7 +35,7 @@ def make_view(camera: Camera, rgb: np.ndarray, alpha: np.ndarray, side: int) -> 
     Args:
         camera: undistorted pinhole camera.
         rgb: (H, W, 3) uint8 sRGB.
-        alpha: (H, W) float32 in [0, 1].
+        alpha: (H, W) float32 in [0, 1]; the view's is without specks and small holes.
         side: longest side, pixels; larger images are averaged down.
     """
     if rgb.shape[:2] != (camera.height, camera.width) or alpha.shape != rgb.shape[:2]:
@@ -53,8 +53,10 @@ def make_view(camera: Camera, rgb: np.ndarray, alpha: np.ndarray, side: int) -> 
         width, height = round(camera.width * scale), round(camera.height * scale)
         camera = resized(camera, width, height)
         rgb, alpha = resize_area(rgb, width, height), resize_area(alpha, width, height)
-    alpha = np.ascontiguousarray(alpha, np.float32)
-    return View(camera, rgb, alpha, silhouette_distance(_mended(alpha)))
+    if not (alpha > INSIDE).any():
+        return f"its matte is empty at {camera.width}x{camera.height}: specks are all it holds"
+    alpha = _mended(alpha)
+    return View(camera, rgb, alpha, silhouette_distance(alpha))
 
 
 def _mended(alpha: np.ndarray) -> np.ndarray:

@@ -15,7 +15,7 @@ from express50.digests import path_digest, text_digest, value_digest
 from express50.errors import StageError
 from express50.index import Cue
 from express50.publish import write_bytes
-from pipelines.track.config import TrackConfig
+from pipelines.track.config import VERSION, TrackConfig
 from pipelines.track.marks import Eyes
 from pipelines.track.observe import Observation
 from pipelines.track.offsets import split_shape
@@ -97,7 +97,7 @@ def track_clips(
         StageError: no frame of any cue shows a face.
     """
     person = freeze_shape(basis, state.shape, state.bias)
-    known = (identity, state.shape.tobytes(), state.bias.tobytes(), asdict(config))
+    known = (VERSION, identity, state.shape.tobytes(), state.bias.tobytes(), asdict(config))
     key = text_digest(repr((*known, eyes and vars(eyes))))
     rows: list[tuple[str, int, Pose]] = []
     dropped: list[dict[str, str]] = []

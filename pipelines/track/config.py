@@ -7,6 +7,8 @@ from typing import Literal
 
 from express50.errors import ConfigError
 
+VERSION = 3  # of the stage: outputs of another are made anew
+
 
 @dataclass(frozen=True, kw_only=True)
 class TrackConfig:
@@ -26,7 +28,8 @@ class TrackConfig:
     sweeps: int = 2
     """Smoothing rounds over a clip; 0 for none."""
     clip_rounds: int = 2
-    """Rounds in which a clip's frame is held to its pictures; 0 for landmarks alone."""
+    """Rounds in which a clip's frame is held to its pictures; 0 for landmarks alone, as without
+    `photo_rounds`, which learn the skin."""
     smooth_mm: float = 1.0
     """How far a point may lie from the middle of the neighbouring frames', millimetres."""
     cameras: int = 0

@@ -19,7 +19,7 @@ from express50.layout import Dataset
 from express50.stage import Stage
 from pipelines.track.bake import write_texture
 from pipelines.track.clips import write_clips
-from pipelines.track.config import PRESETS, TrackConfig
+from pipelines.track.config import PRESETS, VERSION, TrackConfig
 from pipelines.track.fit import consistent_sigma, fit, landmark_sigma
 from pipelines.track.footage import (
     frame_moment,
@@ -108,6 +108,7 @@ def run(dataset: Dataset, item: str, config: TrackConfig, out: Path) -> dict:
         if config.clip_rounds and appearance is not None:
             skin = skin_of(basis.model, moments, vertices, appearance, config)
         clips = _clips(dataset, item, basis, state, source, eyes, skin, config, out)
+        clips["held_to_pictures"] = skin is not None
         metrics |= {"dropped": dropped + clips.pop("dropped"), "clips": clips}
     return metrics
 
@@ -189,7 +190,7 @@ def _marks(model: HeadModel, state: State) -> np.ndarray:
 
 STAGE = Stage(
     name="track",
-    version=2,
+    version=VERSION,
     config=TrackConfig,
     presets=PRESETS,
     items=items,

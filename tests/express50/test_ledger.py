@@ -90,3 +90,15 @@ def test_stat_digest_follows_size_and_time(tmp_path):
 def test_missing_input_names_the_remedy(tmp_path):
     with pytest.raises(StageError, match="run the stage that writes it first"):
         path_digest(tmp_path / "absent")
+
+
+def test_receipts_are_gone_for_good_before_their_outputs_change(ledger):
+    """A kill cannot show it, only a power cut: the disk is waited for, and only there."""
+    said = []
+    ledger._database.set_trace_callback(said.append)
+    ledger.forget("track", ["S001"])
+    ledger.write(receipt())
+    words = [text.split(";")[0] for text in said]
+    full, normal = words.index("PRAGMA synchronous=FULL"), words.index("PRAGMA synchronous=NORMAL")
+    (gone,) = (k for k, text in enumerate(words) if text.startswith("DELETE"))
+    assert full < gone < words.index("COMMIT") < normal

@@ -5,6 +5,7 @@ from __future__ import annotations
 import struct
 import zlib
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -89,6 +90,12 @@ def test_what_would_grow_is_refused_before_it_does() -> None:
     struct.pack_into("<i", deep, 22, 10**6)
     with pytest.raises(FormatError, match="one channel"):
         decode_picture("depth.lerc", bytes(deep), 300, 300, "here")
+
+
+def test_a_picture_of_four_channels_is_refused() -> None:
+    image = np.zeros((8, 8, 4), np.uint8)
+    with pytest.raises(FormatError, match="expected uint8"):
+        decode_picture("rgb.png", cv2.imencode(".png", image)[1].tobytes(), 8, 8, "here")
 
 
 @given(st.binary(max_size=300))

@@ -76,3 +76,16 @@ def test_a_damaged_member_and_a_full_folder_are_refused(tmp_path: Path) -> None:
     with pytest.raises(FormatError, match="damaged"):
         split_shards(whole, tmp_path / "out", 1)
     assert not (tmp_path / "out").exists()
+
+
+def test_odd_places_to_write_to(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = write(tmp_path / "whole")
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    assert split_shards(whole, Path(), 1, split="test") == 6
+    assert verify(tmp_path / "here") == []
+    (tmp_path / "file").touch()
+    with pytest.raises(FormatError, match="is a file"):
+        split_shards(whole, tmp_path / "file", 1)
+    with pytest.raises(FormatError, match="shard-mb is -1"):
+        split_shards(whole, tmp_path / "out", -1)

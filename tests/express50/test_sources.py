@@ -64,3 +64,25 @@ def test_items_that_wait_for_each_other_are_one_error():
     ring = replace(STAGE, sources=lambda dataset, item, config: ["b" if item == "a" else "a"])
     with pytest.raises(StageError, match="wait for each other"):
         waves_of(ring, None, None, ["a"])
+
+
+def test_a_source_that_fails_does_not_take_the_others_along(tmp_path):
+    """As the depth stage does it: what is not there is not read."""
+
+    def perhaps(dataset, item, config):
+        found = dataset.item_dir("toy", "bad") / "deep"
+        read = {} if item == "bad" else {"source": found if found.is_dir() else "none"}
+        return toy.inputs(dataset, item, config) | read
+
+    needing = {"a": ["bad"], "b": ["bad"], "bad": []}
+    stage = replace(toy.STAGE, inputs=perhaps, sources=lambda d, item, c: needing[item])
+    dataset = make_dataset(tmp_path / "data", list(needing))
+
+    def outcome():
+        summary = run_stage(stage, dataset, toy.ToyConfig(), workers=0, progress=False)
+        return {one.item: one.status for one in summary.outcomes}
+
+    assert outcome() == {"a": "done", "b": "done", "bad": "failed"}
+    (dataset.root / "in" / "bad.txt").write_text("mended")
+    assert outcome() == dict.fromkeys(needing, "done")
+    assert outcome() == dict.fromkeys(needing, "skipped")

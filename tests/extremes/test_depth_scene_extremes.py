@@ -177,3 +177,21 @@ def test_a_head_cut_by_the_frames_edge_keeps_its_shape(usual, shift, least_cut):
     kept, why = without_contradiction(views_of(cut))
     errors, covered = errors_mm(reconstruct(kept, CONFIG), cut)
     assert not why and covered > 0.98 and as_good_as(errors, usual, 0.25)
+
+
+def test_a_matte_of_specks_that_vanish_when_shrunk_is_told(shots):
+    camera, rgb, alpha, _ = shots[0]
+    specks = np.zeros_like(alpha)
+    specks[::12, ::12] = 1.0
+    why = make_view(camera, rgb, specks, SIZE // 2)
+    assert isinstance(why, str) and "empty" in why
+    assert not isinstance(make_view(camera, rgb, alpha, SIZE // 2), str)
+
+
+def test_small_holes_are_filled_for_all_that_looks_at_a_matte(shots):
+    camera, rgb, alpha, _ = shots[0]
+    middle = np.argwhere(alpha > 0.99).mean(0).astype(int)
+    holed = alpha.copy()
+    holed[middle[0] - 2 : middle[0] + 3, middle[1] - 2 : middle[1] + 3] = 0.0
+    view = make_view(camera, rgb, holed, SIZE)
+    assert view.alpha[tuple(middle)] == 1.0 and view.silhouette_px[tuple(middle)] > 0
