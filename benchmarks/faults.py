@@ -61,9 +61,7 @@ def measure(scratch: Path, kills: int, rng: random.Random) -> dict:
     count = max(8, 4 * kills)
     calm, hurt = (make_dataset(scratch / name, count) for name in ("calm", "hurt"))
     if start(calm, scratch / "calm-notes", "--workers", "4").wait() != 0:
-        raise SystemExit(
-            "the undisturbed run failed; run benchmarks.fault_stage to see why"
-        )
+        raise SystemExit("the undisturbed run failed; run benchmarks.fault_stage to see why")
     expected = published(calm)
     account, notes = Account(), scratch / "notes"
     wanted = [round(share * kills) for share in SHARES]
