@@ -7,7 +7,6 @@ parameters once per (subject, expression) and kept. The order of samples is a pu
 
 from __future__ import annotations
 
-import math
 from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -21,9 +20,9 @@ from express50.errors import FormatError, TrainError
 from express50.head.model import HeadModel, pose
 from grmm.model import HeadState, View
 from grmm.torso import labelled_torso, torso_mask
+from grmm.window import crop_view, head_window
 
 NO_OFFSETS = np.zeros((0, 3), np.float32)
-WINDOW_STEP = 32  # pixels; windows have sides of whole steps
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -290,52 +289,6 @@ def pose_state(head: HeadModel, tracked: Tracked) -> HeadState:
         expression=torch.nn.functional.pad(expression[0], (0, missing)),
         neck=neck[0],
         jaw=jaw[0],
-    )
-
-
-def head_window(
-    vertices: Tensor, view: View, alpha: np.ndarray, margin_px: int
-) -> tuple[slice, slice]:
-    """Rows and columns that hold the projected mesh (V, 3) and the matte (H, W), with a margin.
-
-    Sizes are rounded up to WINDOW_STEP where the image allows, so that few sizes occur: every new
-    size costs convolutions their set-up.
-    """
-    camera, K = view.cam_from_head.to(vertices.dtype), view.K.to(vertices.dtype)
-    points = vertices @ camera[:3, :3].T + camera[:3, 3]
-    front = points[points[:, 2] > 1e-3]
-    pixels = (front[:, :2] / front[:, 2:]) @ K[:2, :2].T + K[:2, 2]  # (M, 2) as (x, y)
-    spans = []
-    for axis, size in ((1, view.height), (0, view.width)):
-        matte = np.flatnonzero((alpha > 0).any(axis=axis))
-        ends = [*matte[[0, -1]].tolist()] if len(matte) else []
-        if len(pixels):
-            ends += [float(pixels[:, axis].min()), float(pixels[:, axis].max())]
-        low, high = (min(ends), max(ends)) if ends else (0, size)
-        spans.append(_span(low - margin_px, high + 1 + margin_px, size))
-    return spans[0], spans[1]
-
-
-def _span(low: float, high: float, size: int) -> slice:
-    """Whole steps around [low, high) that lie within [0, size); the whole axis if none is left."""
-    low, high = max(0.0, low), min(float(size), high)
-    if high <= low:
-        return slice(0, size)
-    length = min(size, math.ceil((high - low) / WINDOW_STEP) * WINDOW_STEP)
-    start = min(max(0, round((low + high - length) / 2)), size - length)
-    return slice(start, start + length)
-
-
-def crop_view(view: View, rows: slice, columns: slice) -> View:
-    """The same camera, seeing only some rows and columns."""
-    K = view.K.clone()
-    K[0, 2] -= columns.start
-    K[1, 2] -= rows.start
-    return View(
-        K=K,
-        cam_from_head=view.cam_from_head,
-        width=columns.stop - columns.start,
-        height=rows.stop - rows.start,
     )
 
 

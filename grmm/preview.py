@@ -18,7 +18,7 @@ from torch import Tensor
 from grmm.checkpoint import Loaded
 from grmm.edit import Head
 from grmm.model import Gaussians, HeadState, Maps, View
-from grmm.render import to_uint8
+from grmm.render import drawn, to_uint8
 
 SLOW_SECONDS = 0.04  # colours that take longer are not decoded while the camera moves
 TURN_DEGREES = 1.5  # under this the eye sees no other colours
@@ -54,8 +54,7 @@ class Preview:
             self._colour_seconds = time.perf_counter() - began
             self._direction = view.direction()
         assert self._gaussians is not None and self._colours is not None
-        background = self.loaded.config.data.background
-        out = model.draw(self._gaussians, self._colours, view, background, refine=not moving)
+        out = drawn(self.loaded, self._gaussians, self._colours, view, refine=not moving)
         return to_uint8(out.image)
 
     def _take(self, head: Head) -> None:

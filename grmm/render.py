@@ -18,7 +18,8 @@ from grmm.checkpoint import Loaded
 from grmm.data import HeadViews
 from grmm.edit import Head, between, trained_head
 from grmm.evaluate import Render
-from grmm.model import View
+from grmm.model import Gaussians, Rendering, View
+from grmm.window import draw_window
 
 VIDEO_RATE = 24  # frames a second, as the rig's
 YAWS, PITCHES = (-60, -30, 0, 30, 60), (20, 0, -20)  # degrees of the sheet of novel views
@@ -110,12 +111,24 @@ def camera_of(loaded: Loaded, name: str | None, size: int = 0) -> View:
     return resized(view, size) if size else view
 
 
-@torch.no_grad()
 def picture(loaded: Loaded, head: Head, view: View) -> np.ndarray:
     """One head from one view, (H, W, 3) uint8."""
-    background = loaded.config.data.background
-    return to_uint8(
-        loaded.model.render(head.z_id, head.z_exp, head.state(loaded), view, background).image
+    return next(iter(around(loaded, head, [view])))
+
+
+def drawn(
+    loaded: Loaded, gaussians: Gaussians, colours: Tensor, view: View, refine: bool = True
+) -> Rendering:
+    """A decoded head as the checkpoint was trained: in a window if its training had windows."""
+    data = loaded.config.data
+    return draw_window(
+        loaded.model,
+        gaussians,
+        colours,
+        view,
+        data.background,
+        refine=refine,
+        margin_px=data.crop_margin_px,
     )
 
 
@@ -126,7 +139,7 @@ def around(loaded: Loaded, head: Head, views: Iterable[View]) -> Iterable[np.nda
     gaussians = model.geometry(head.z_id, head.z_exp, state)
     for view in views:
         colours = model.appearance(head.z_id, state, view)
-        yield to_uint8(model.draw(gaussians, colours, view, loaded.config.data.background).image)
+        yield to_uint8(drawn(loaded, gaussians, colours, view).image)
 
 
 def turntable(

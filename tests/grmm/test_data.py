@@ -5,9 +5,8 @@ import pytest
 import torch
 
 from express50.errors import FormatError, TrainError
-from grmm.data import HeadViews, Shuffle, crop_view, head_window, pose_state, spread
-from grmm.model import GRMM
-from tests.grmm.synthetic import STRETCH, EllipsoidSource, ellipsoid_head, tiny_config
+from grmm.data import HeadViews, Shuffle, pose_state, spread
+from tests.grmm.synthetic import STRETCH, EllipsoidSource, ellipsoid_head
 
 
 @pytest.fixture(scope="module")
@@ -48,38 +47,6 @@ def test_cache_is_bounded_and_answers_from_memory(source):
     first = roomy.sample(0)
     roomy.sample(1)
     assert roomy.sample(0) is first
-
-
-def test_window_shows_the_same_picture():
-    """The saving: render and compare a window only. The same numbers come out inside it."""
-    views = HeadViews(EllipsoidSource(size=160), ellipsoid_head())
-    config = tiny_config(model={"refine_widths": ()})
-    model = GRMM(config.model, views.head, ("S000",), ("e0",))
-    whole, part = views.item(0), views.item(0, margin_px=6)
-    assert part.view.width < whole.view.width
-    rows, columns = head_window(whole.state.vertices, whole.view, views.sample(0).alpha, 6)
-    with torch.no_grad():
-        a = model(0, 0, whole.state, whole.view).rgb
-        b = model(0, 0, part.state, part.view).rgb
-    torch.testing.assert_close(a[:, rows, columns], b, atol=1e-5, rtol=0)
-    assert torch.equal(whole.target[:, rows, columns], part.target)
-    outside = torch.ones(160, 160, dtype=torch.bool)
-    outside[rows, columns] = False
-    assert float(whole.target[:, outside].max()) == 0 and float(a[:, outside].max()) < 1 / 255
-
-
-def test_window_of_a_head_outside_the_image_is_the_image(views):
-    item = views.item(0)
-    away = replace(item.view, K=item.view.K + torch.tensor([[0, 0, 900.0], [0, 0, 900], [0, 0, 0]]))
-    rows, columns = head_window(item.state.vertices, away, np.zeros((64, 64), np.uint8), 8)
-    assert (rows, columns) == (slice(0, 64), slice(0, 64))
-
-
-def test_crop_moves_the_principal_point(views):
-    view = crop_view(views.item(0).view, slice(3, 20), slice(5, 40))
-    whole = views.item(0).view
-    assert (view.width, view.height) == (35, 17)
-    assert float(whole.K[0, 2] - view.K[0, 2]) == 5 and float(whole.K[1, 2] - view.K[1, 2]) == 3
 
 
 def test_sizes_that_differ_are_named(source):

@@ -1,0 +1,142 @@
+"""The window of an image that holds the head; all else is background.
+
+Training crops to it, and pictures are drawn in it: what lies outside is neither rasterised nor
+refined.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from grmm.model import GRMM, Gaussians, Rendering, View
+
+WINDOW_STEP = 32  # pixels; windows have sides of whole steps
+VISIBLE_ALPHA = 1 / 255  # the rasteriser blends nothing fainter
+NEAR_M = 1e-2  # as the rasteriser's
+
+
+def draw_window(
+    model: GRMM,
+    gaussians: Gaussians,
+    colours: Tensor,
+    view: View,
+    background: float = 0.0,
+    *,
+    refine: bool = True,
+    margin_px: int = 16,
+) -> Rendering:
+    """`GRMM.draw` in the window around the Gaussians, the rest filled with background.
+
+    Colours before refinement, depth and alpha are those of the whole image. Refined ones differ
+    near the window's border as they do in training, whose crops have the same margin.
+
+    Args:
+        model: the model.
+        gaussians: from `GRMM.geometry`.
+        colours: (N, 3 + features) from `GRMM.appearance`.
+        view: the whole image's camera.
+        background: grey, sRGB in [0, 1].
+        refine: as in `GRMM.draw`.
+        margin_px: of training (DataConfig.crop_margin_px); -1 draws the whole image.
+    """
+    if margin_px < 0:
+        return model.draw(gaussians, colours, view, background, refine)
+    low, high = model.config.scale_bounds_mm
+    rows, columns = gaussian_window(gaussians, view, (1e-3 * low, 1e-3 * high), margin_px)
+    out = model.draw(gaussians, colours, crop_view(view, rows, columns), background, refine)
+    if (out.image.shape[1], out.image.shape[2]) == (view.height, view.width):
+        return out
+
+    def paste(window: Tensor, fill: float) -> Tensor:
+        whole = window.new_full((*window.shape[:-2], view.height, view.width), fill)
+        whole[..., rows, columns] = window
+        return whole
+
+    rgb = paste(out.rgb, background)
+    return Rendering(
+        image=rgb if out.image is out.rgb else paste(out.image, background),
+        rgb=rgb,
+        depth=paste(out.depth, 0.0),
+        alpha=paste(out.alpha, 0.0),
+        gaussians=out.gaussians,
+    )
+
+
+def gaussian_window(
+    gaussians: Gaussians, view: View, bounds_m: tuple[float, float], margin_px: int
+) -> tuple[slice, slice]:
+    """Rows and columns that hold every pixel a Gaussian reaches, with a margin.
+
+    A Gaussian is bounded by the sphere of its largest scale at the distance where its alpha falls
+    under a level of 8 bits; the whole image where none is in view.
+    """
+    with torch.no_grad():
+        camera = view.cam_from_head.to(gaussians.means.dtype)
+        points = gaussians.means @ camera[:3, :3].T + camera[:3, 3]
+        reach = gaussians.scales_mm.amax(1).mul(1e-3).clamp(*bounds_m)
+        sigmas = (gaussians.opacities / VISIBLE_ALPHA).clamp_min(1.0).log().mul(2).sqrt()
+        seen = (points[:, 2] > NEAR_M) & (gaussians.opacities > VISIBLE_ALPHA)
+        points, radius = points[seen], (reach * sigmas)[seen]
+        if not len(points):
+            return slice(0, view.height), slice(0, view.width)
+        K = view.K.to(points.dtype)
+        # A sphere off the axis projects to a longer ellipse: by 1 / cosine of its angle.
+        ray = points[:, :2] / points[:, 2:]
+        stretch = 1 + (ray**2).sum(1)
+        extra = margin_px + 2.0  # the rasteriser's blur (variance 0.3) reaches under two pixels
+        spans = []
+        for axis, size in ((1, view.height), (0, view.width)):
+            centre = K[axis, axis] * ray[:, axis] + K[axis, 2]
+            wide = K[axis, axis] * radius / points[:, 2] * stretch + extra
+            spans.append(_span(float((centre - wide).min()), float((centre + wide).max()), size))
+    return spans[0], spans[1]
+
+
+def head_window(
+    vertices: Tensor, view: View, alpha: np.ndarray, margin_px: int
+) -> tuple[slice, slice]:
+    """Rows and columns that hold the projected mesh (V, 3) and the matte (H, W), with a margin.
+
+    Sizes are rounded up to WINDOW_STEP where the image allows, so that few sizes occur: every new
+    size costs convolutions their set-up.
+    """
+    camera, K = view.cam_from_head.to(vertices.dtype), view.K.to(vertices.dtype)
+    points = vertices @ camera[:3, :3].T + camera[:3, 3]
+    front = points[points[:, 2] > 1e-3]
+    pixels = (front[:, :2] / front[:, 2:]) @ K[:2, :2].T + K[:2, 2]  # (M, 2) as (x, y)
+    spans = []
+    for axis, size in ((1, view.height), (0, view.width)):
+        matte = np.flatnonzero((alpha > 0).any(axis=axis))
+        ends = [*matte[[0, -1]].tolist()] if len(matte) else []
+        if len(pixels):
+            ends += [float(pixels[:, axis].min()), float(pixels[:, axis].max())]
+        low, high = (min(ends), max(ends)) if ends else (0, size)
+        spans.append(_span(low - margin_px, high + 1 + margin_px, size))
+    return spans[0], spans[1]
+
+
+def _span(low: float, high: float, size: int) -> slice:
+    """Whole steps around [low, high) that lie within [0, size); the whole axis if none is left."""
+    low, high = max(0.0, low), min(float(size), high)
+    if high <= low:
+        return slice(0, size)
+    length = min(size, math.ceil((high - low) / WINDOW_STEP) * WINDOW_STEP)
+    start = min(max(0, round((low + high - length) / 2)), size - length)
+    return slice(start, start + length)
+
+
+def crop_view(view: View, rows: slice, columns: slice) -> View:
+    """The same camera, seeing only some rows and columns."""
+    K = view.K.clone()
+    K[0, 2] -= columns.start
+    K[1, 2] -= rows.start
+    return View(
+        K=K,
+        cam_from_head=view.cam_from_head,
+        width=columns.stop - columns.start,
+        height=rows.stop - rows.start,
+    )

@@ -1,0 +1,129 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from grmm.data import HeadViews
+from grmm.model import GRMM
+from grmm.render import orbit
+from grmm.window import crop_view, draw_window, gaussian_window, head_window
+from tests.grmm.synthetic import EllipsoidSource, ellipsoid_head, tiny_config
+
+
+@pytest.fixture(scope="module")
+def views():
+    return HeadViews(EllipsoidSource(size=64), ellipsoid_head())
+
+
+@pytest.fixture(scope="module")
+def scene():
+    """A model away from its start, its Gaussians and colours, and a camera twice as wide."""
+    torch.manual_seed(0)
+    views = HeadViews(EllipsoidSource(size=96), ellipsoid_head())
+    config = tiny_config(train={"warm_start": False})
+    model = GRMM(config.model, views.head, ("S000",), ("e0",))
+    with torch.no_grad():
+        for parameter in model.parameters():
+            parameter += 0.02 * torch.randn(parameter.shape)
+        item = views.item(0)
+        gaussians = model.geometry(*model.codes(0, 0), item.state)
+        colours = model.appearance(model.z_id[0], item.state, item.view)
+    shift = torch.tensor([[0, 0, 48.0], [0, 0, 48.0], [0, 0, 0]], dtype=torch.float64)
+    return (
+        model,
+        gaussians,
+        colours,
+        replace(item.view, K=item.view.K + shift, width=192, height=192),
+    )
+
+
+@settings(deadline=None, max_examples=25, derandomize=True)
+@given(
+    yaw=st.floats(-180, 180),
+    dx=st.floats(-150, 150),
+    dy=st.floats(-150, 150),
+    zoom=st.floats(0.1, 3),
+)
+def test_window_draws_what_the_whole_image_shows(scene, yaw, dx, dy, zoom):
+    """The saving: colours before refinement, depth and alpha are the same numbers everywhere."""
+    model, gaussians, colours, view = scene
+    K = view.K.clone()
+    K[:2, :2] *= zoom
+    K[0, 2], K[1, 2] = K[0, 2] + dx, K[1, 2] + dy
+    view = orbit(replace(view, K=K), yaw, model.head_centre)
+    with torch.no_grad():
+        whole = model.draw(gaussians, colours, view, 0.25)
+        window = draw_window(model, gaussians, colours, view, 0.25)
+    assert window.image.shape == (3, 192, 192)
+    for a, b in ((window.rgb, whole.rgb), (window.alpha, whole.alpha)):
+        # Rounding takes a few pixels to the other side of alpha = 1/255, where blending begins.
+        off = (a - b).abs()
+        assert float(off.max()) < 5e-3 and float((off > 1e-5).float().mean()) < 1e-3
+
+
+def test_window_is_smaller_and_refines_alike_inside(scene):
+    model, gaussians, colours, view = scene
+    low, high = model.config.scale_bounds_mm
+    rows, columns = gaussian_window(gaussians, view, (1e-3 * low, 1e-3 * high), 16)
+    assert rows.stop - rows.start < 192 and columns.stop - columns.start < 192
+    with torch.no_grad():
+        out = draw_window(model, gaussians, colours, view, 0.25)
+        part = model.draw(gaussians, colours, crop_view(view, rows, columns), 0.25)
+    assert torch.equal(out.image[:, rows, columns], part.image)
+    outside = torch.ones(192, 192, dtype=torch.bool)
+    outside[rows, columns] = False
+    assert bool((out.image[:, outside] == 0.25).all()) and float(out.depth[outside].max()) == 0
+
+
+def test_nothing_in_view_is_background(scene):
+    model, gaussians, colours, view = scene
+    behind = view.cam_from_head.clone()
+    behind[2, 3] = -5.0
+    with torch.no_grad():
+        out = draw_window(
+            model, gaussians, colours, replace(view, cam_from_head=behind), 0.25, refine=False
+        )
+    assert bool((out.rgb == 0.25).all()) and float(out.alpha.max()) == 0
+
+
+def test_margin_of_minus_one_is_the_whole_image(scene):
+    model, gaussians, colours, view = scene
+    with torch.no_grad():
+        a = draw_window(model, gaussians, colours, view, margin_px=-1)
+        b = model.draw(gaussians, colours, view)
+    assert torch.equal(a.image, b.image)
+
+
+def test_window_shows_the_same_picture():
+    """The saving: render and compare a window only. The same numbers come out inside it."""
+    views = HeadViews(EllipsoidSource(size=160), ellipsoid_head())
+    config = tiny_config(model={"refine_widths": ()})
+    model = GRMM(config.model, views.head, ("S000",), ("e0",))
+    whole, part = views.item(0), views.item(0, margin_px=6)
+    assert part.view.width < whole.view.width
+    rows, columns = head_window(whole.state.vertices, whole.view, views.sample(0).alpha, 6)
+    with torch.no_grad():
+        a = model(0, 0, whole.state, whole.view).rgb
+        b = model(0, 0, part.state, part.view).rgb
+    torch.testing.assert_close(a[:, rows, columns], b, atol=1e-5, rtol=0)
+    assert torch.equal(whole.target[:, rows, columns], part.target)
+    outside = torch.ones(160, 160, dtype=torch.bool)
+    outside[rows, columns] = False
+    assert float(whole.target[:, outside].max()) == 0 and float(a[:, outside].max()) < 1 / 255
+
+
+def test_window_of_a_head_outside_the_image_is_the_image(views):
+    item = views.item(0)
+    away = replace(item.view, K=item.view.K + torch.tensor([[0, 0, 900.0], [0, 0, 900], [0, 0, 0]]))
+    rows, columns = head_window(item.state.vertices, away, np.zeros((64, 64), np.uint8), 8)
+    assert (rows, columns) == (slice(0, 64), slice(0, 64))
+
+
+def test_crop_moves_the_principal_point(views):
+    view = crop_view(views.item(0).view, slice(3, 20), slice(5, 40))
+    whole = views.item(0).view
+    assert (view.width, view.height) == (35, 17)
+    assert float(whole.K[0, 2] - view.K[0, 2]) == 5 and float(whole.K[1, 2] - view.K[1, 2]) == 3
