@@ -16,6 +16,7 @@ import subprocess
 import sys
 import threading
 import time
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -84,15 +85,20 @@ def run_step(name: str, module: str, *arguments: str, fails: bool = True) -> Ste
     return step
 
 
-def record_twin(root: Path, workers: int) -> list[Step]:
+def record_twin(
+    root: Path,
+    workers: int,
+    twin: Mapping[str, int] = TWIN,
+    expressions: Sequence[str] = EXPRESSIONS,
+) -> list[Step]:
     """Record the synthetic captures unless the same ones are there already."""
-    settings = json.dumps(TWIN | {"expressions": EXPRESSIONS})
+    settings = json.dumps({**twin, "expressions": expressions})
     stamp = root / "recorded.json"
     if stamp.exists() and stamp.read_text() == settings:
         return []
     shutil.rmtree(root, ignore_errors=True)
-    flags = [f"--{key}={value}" for key, value in TWIN.items()]
-    flags += [f"--expressions={','.join(EXPRESSIONS)}", f"--workers={workers}", "--seed=0"]
+    flags = [f"--{key}={value}" for key, value in twin.items()]
+    flags += [f"--expressions={','.join(expressions)}", f"--workers={workers}", "--seed=0"]
     step = run_step("record", "express50.cli", "twin", "record", str(root), *flags)
     stamp.write_text(settings)
     return [step]
