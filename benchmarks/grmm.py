@@ -34,8 +34,8 @@ from grmm.edit import trained_head
 from grmm.evaluate import evaluate, mean, training_render
 from grmm.presets import resolve
 from grmm.render import around, frontal, orbit, picture, resized
+from grmm.run import prepare
 from grmm.shard_source import open_shards
-from grmm.train import prepare
 from grmm.unseen import Protocol
 from grmm.warm_start import warm_start
 

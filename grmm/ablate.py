@@ -24,6 +24,7 @@ from grmm.evaluate import evaluate, kind_of, mean, training_render
 from grmm.judge import Judge
 from grmm.presets import as_tables, from_tables
 from grmm.progress import log
+from grmm.run import settle
 from grmm.shard_source import open_shards
 from grmm.train import train
 from grmm.unseen import Protocol, evaluate_unseen
@@ -51,6 +52,9 @@ def ablate(
         ConfigError: an unknown row, or nothing is held out.
     """
     config = with_holdout(roots, config)
+    if not config.model.n_g:  # every row has as many Gaussians as the full model
+        source = open_shards(roots, config.data.split)
+        config = settle(config, HeadViews(source, load_head(source.head)))
     variants = variants_of(roots, names)
     rows: dict[str, dict] = {}
     for name, variant in variants.items():

@@ -14,6 +14,7 @@ from express50.errors import ConfigError
 
 FRAMES = ("head", "tangent")
 DEPTH_NORMALISATIONS = ("minmax", "fixed")
+PRECISIONS = ("float32", "bfloat16")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -21,7 +22,8 @@ class ModelConfig:
     """Dimensions and activations of the networks."""
 
     n_g: int = 512
-    """Side of the UV map of Gaussians, texels. P: N_g = 512."""
+    """Side of the UV map of Gaussians, texels. P: N_g = 512. 0: as many as the head's pixels in the
+    training images call for, at most 512."""
     z_id: int = 512
     """Length of the residual identity code. P."""
     z_exp: int = 256
@@ -81,15 +83,19 @@ class ModelConfig:
     """``minmax`` over the pixels with alpha > 0.5 (P, G10) or ``fixed`` (head centre +- 0.2 m)."""
     backend: str = "auto"
     """Rasteriser: auto, reference, cpu, gsplat."""
+    precision: str = "float32"
+    """What convolutions and perceptrons compute in: ``float32``, or ``bfloat16`` where the machine
+    has it in hardware. Weights, meshes, Gaussians and images are float32. Silent in P."""
 
     def __post_init__(self) -> None:
         side = self.n_g / 2 ** (len(self.ladder) + 1)
-        if side < 2 or side != int(side):
+        if self.n_g and (side < 2 or side != int(side)):
             raise ConfigError(
                 f"model.n_g is {self.n_g}, expected a multiple of {2 ** (len(self.ladder) + 1)}, "
                 f"at least twice it: a ladder of {len(self.ladder)} widths doubles that often"
             )
         _one_of("model.frame", self.frame, FRAMES)
+        _one_of("model.precision", self.precision, PRECISIONS)
         _one_of("model.depth_normalisation", self.depth_normalisation, DEPTH_NORMALISATIONS)
         _in_range("model.opacity_init", self.opacity_init, 0.01, 0.99)
         _in_range("model.scale_min_mm", self.scale_min_mm, 1e-6, self.scale_max_mm)
@@ -184,6 +190,11 @@ class TrainConfig:
     """Views whose gradients are averaged in a step (4 stands for the paper's four GPUs)."""
     clip_norm: float = 0.0
     """Clip the gradient's norm, 0 = never. Silent in P."""
+    ema: float = 0.0
+    """Share of their former mean that averaged weights keep in a step, 0.999 for example; the
+    checkpoint holds the mean then. 0: no averaging. Silent in P."""
+    tensorboard: bool = False
+    """Write OUT/tensorboard too; needs the extra ``tensorboard``."""
     shuffle_directions: float = 0.0
     """Share of views whose colours are decoded for another training camera's direction. Not in P:
     with few cameras the colour decoder learns by heart what each sees, and errs in between."""
@@ -203,6 +214,7 @@ class TrainConfig:
 
     def __post_init__(self) -> None:
         _in_range("train.shuffle_directions", self.shuffle_directions, 0.0, 1.0)
+        _in_range("train.ema", self.ema, 0.0, 0.99999)
         for name in ("iterations", "accumulate", "save_every", "log_every"):
             if getattr(self, name) < 1:
                 raise ConfigError(f"train.{name} is {getattr(self, name)}, expected >= 1")

@@ -235,7 +235,9 @@ class GRMM(nn.Module):
         z_id, z_exp = self._inputs(z_id, z_exp, state)
         displacement = torch.zeros_like(state.vertices)
         if self.mesh is not None:
-            displacement = sum(self.mesh(z_id, z_exp, state.neck, state.jaw, state.expression))
+            with self._precision():
+                parts = self.mesh(z_id, z_exp, state.neck, state.jaw, state.expression)
+            displacement = sum(part.to(state.vertices.dtype) for part in parts)
         means, quats = self._place(state.vertices + displacement, maps.offsets)
         return Gaussians(
             means=means,
@@ -248,18 +250,22 @@ class GRMM(nn.Module):
     def decode(self, z_id: Tensor, z_exp: Tensor, state: HeadState) -> Maps:
         """The convolutional maps of transforms and opacity, which no pose changes."""
         z_id, z_exp = self._inputs(z_id, z_exp, state)
-        offsets = self._sample(self.transform(torch.cat([z_id, z_exp])))
         code = torch.cat([z_id, z_exp]) if self.config.opacity_from_expression else z_id
+        with self._precision():
+            offsets, opacity = self.transform(torch.cat([z_id, z_exp])), self.opacity(code)
+        offsets = self._sample(offsets)
         return Maps(
             offsets=offsets[:, :7],
             scales_mm=nn.functional.softplus(offsets[:, 7:] + self.scale_bias),
-            opacities=torch.sigmoid(self._sample(self.opacity(code))[:, 0]),
+            opacities=torch.sigmoid(self._sample(opacity)[:, 0]),
         )
 
     def appearance(self, z_id: Tensor, state: HeadState, view: View) -> Tensor:
         """Colours in [0, 1] and features (N, 3 + features) as one view sees them."""
         z_id, _ = self._inputs(z_id, self.z_exp[0], state)
-        maps = self._sample(self.colour(z_id, view.direction().to(z_id.dtype)))
+        with self._precision():
+            maps = self.colour(z_id, view.direction().to(z_id.dtype))
+        maps = self._sample(maps)
         return torch.cat([torch.sigmoid(maps[:, :3]), maps[:, 3:]], 1)
 
     def draw(
@@ -293,7 +299,9 @@ class GRMM(nn.Module):
         maps = out.colors.permute(2, 0, 1)
         rgb = image = maps[:3]
         if refinement is not None:
-            image = refinement(self._refinement_input(maps, out.depth, out.alpha, view))
+            given = self._refinement_input(maps, out.depth, out.alpha, view)
+            with self._precision():
+                image = refinement(given)
         return Rendering(
             image=image, rgb=rgb, depth=out.depth, alpha=out.alpha, gaussians=gaussians
         )
@@ -312,8 +320,13 @@ class GRMM(nn.Module):
         return _to_length(state.shape, len(z_id)), _to_length(state.expression, len(z_exp))
 
     def _sample(self, maps: Tensor) -> Tensor:
-        """(C, n_g, n_g) -> (N, C) at the covered texels."""
-        return maps.flatten(1).index_select(1, self.texels).T
+        """(C, n_g, n_g) -> (N, C) at the covered texels, in the precision of the model."""
+        return maps.flatten(1).index_select(1, self.texels).T.to(self.head_centre.dtype)
+
+    def _precision(self) -> torch.autocast:
+        """Networks may compute in bfloat16; what is posed and drawn with their output may not."""
+        low = self.config.precision == "bfloat16"
+        return torch.autocast(self.head_centre.device.type, torch.bfloat16, enabled=low)
 
     def _place(self, vertices: Tensor, offsets: Tensor) -> tuple[Tensor, Tensor]:
         """Means (N, 3) and quaternions (N, 4) from the mesh and decoded offsets (N, 7).

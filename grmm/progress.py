@@ -5,11 +5,12 @@ from __future__ import annotations
 import json
 import signal
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
+from express50.errors import ConfigError
 from express50.publish import write_bytes
 
 
@@ -21,6 +22,32 @@ def append_log(path: Path, iteration: int, seconds: float, terms: dict[str, floa
     entry |= {name: round(value, 8) for name, value in numbers.items()}
     with path.open("a", encoding="utf-8") as file:
         file.write(json.dumps(entry) + "\n")
+
+
+@contextmanager
+def tensorboard(folder: Path, wanted: bool) -> Iterator[Callable[[int, dict[str, float]], None]]:
+    """What writes the terms of an iteration for TensorBoard; nothing where it is not wanted.
+
+    Raises:
+        ConfigError: it is wanted, and the package is not installed.
+    """
+    if not wanted:
+        yield lambda iteration, terms: None
+        return
+    try:
+        from torch.utils.tensorboard import SummaryWriter
+    except ImportError as error:
+        raise ConfigError(
+            "train.tensorboard is true, but tensorboard is not installed; "
+            "pip install 'express50[tensorboard]' or set it to false"
+        ) from error
+    with SummaryWriter(str(folder)) as writer:
+
+        def write(iteration: int, terms: dict[str, float]) -> None:
+            for name, value in ({"loss": sum(terms.values())} | terms).items():
+                writer.add_scalar(f"train/{name}", value, iteration)
+
+        yield write
 
 
 def start_log(path: Path, iteration: int) -> None:

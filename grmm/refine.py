@@ -59,7 +59,7 @@ class Refinement(nn.Module):
             x = nn.functional.interpolate(x, size=skip.shape[2:], mode="nearest")
             x = block(torch.cat([skip, x], 1))
         residual = nn.functional.pixel_shuffle(self.head(x), self.unshuffle)
-        return maps[:3] + residual[0, :, :height, :width]
+        return maps[:3] + residual[0, :, :height, :width].to(maps.dtype)
 
 
 def _block(inputs: int, outputs: int, stride: int = 1) -> nn.Sequential:

@@ -7,49 +7,25 @@ gradients. On a CPU a resumed run continues bit for bit, unless a time budget st
 
 from __future__ import annotations
 
-import fnmatch
-import math
 import os
 import time
-from collections.abc import Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 
 import torch
 import torch.distributed as distributed
-from torch import Tensor
 from torch.nn.parallel import DistributedDataParallel
 
-from express50.errors import ConfigError, TrainError
+from express50.errors import ConfigError
 from express50.head.model import HeadModel
-from grmm import losses
 from grmm.checkpoint import collect_gallery, load_checkpoint, save_checkpoint
 from grmm.config import Config
-from grmm.data import HeadViews, Item, Key, Shuffle, Source
-from grmm.model import GRMM, Rendering, View
-from grmm.perceptual import load_vgg, random_crop
+from grmm.data import HeadViews, Source
+from grmm.objective import step
 from grmm.presets import as_tables
-from grmm.progress import Interrupt, append_log, deferred_interrupt, log, start_log
+from grmm.progress import Interrupt, append_log, deferred_interrupt, log, start_log, tensorboard
+from grmm.run import Run, budget_used, finished, prepare, set_rates, settle
 from grmm.train_report import report
 from grmm.warm_start import warm_start
-
-
-@dataclass(kw_only=True)
-class Run:
-    """Everything the loop changes."""
-
-    model: GRMM
-    views: HeadViews
-    training: list[int]
-    holdout: list[int]
-    optimizer: torch.optim.Optimizer
-    shuffle: Shuffle
-    generator: torch.Generator
-    perceptual: torch.nn.Module | None
-    edges: Tensor
-    iteration: int = 0
-    seconds: float = 0.0
-    terms: dict[str, float] = field(default_factory=dict)
 
 
 def train(
@@ -83,6 +59,7 @@ def train(
         cache_mb=config.data.cache_mb,
         device=device,
     )
+    config = settle(config, views)
     run = prepare(views, config, rank, world)
     checkpoint = out / "checkpoint.pt"
     if resume:
@@ -98,7 +75,8 @@ def train(
             log("the perceptual term is off: loss.vgg16 names no weights")
 
     started = time.perf_counter() - run.seconds
-    with deferred_interrupt() as interrupt:
+    scalars = tensorboard(out / "tensorboard", config.train.tensorboard and rank == 0)
+    with deferred_interrupt() as interrupt, scalars as show:
         while not finished(run, config):
             set_rates(run, config)
             step(run, parallel, config)
@@ -110,6 +88,7 @@ def train(
             if rank == 0 and (run.iteration % config.train.log_every == 0 or last):
                 log(progress_line(run, config))
                 append_log(out / "log.jsonl", run.iteration, run.seconds, run.terms)
+                show(run.iteration, run.terms)
             if rank == 0 and (run.iteration % config.train.save_every == 0 or last):
                 save(run, checkpoint, config, source.head)
             if interrupt.requested:
@@ -137,175 +116,11 @@ def agree(run: Run, interrupt: Interrupt, device: torch.device) -> None:
     run.seconds, interrupt.requested = float(common[0]), bool(common[1] > 0)
 
 
-def prepare(views: HeadViews, config: Config, rank: int = 0, world: int = 1) -> Run:
-    """Build model, optimiser and order of samples."""
-    training, holdout = split_samples(views.keys, config)
-    keys = [views.keys[i] for i in training]
-    subjects = sorted({key.subject for key in keys})
-    expressions = sorted({key.expression for key in keys})
-    model = GRMM(config.model, views.head, subjects, expressions).to(views.device)
-    # What was held out can be judged only where its codes were trained.
-    holdout = [
-        i
-        for i in holdout
-        if views.keys[i].subject in subjects and views.keys[i].expression in expressions
-    ]
-    perceptual = load_vgg(Path(config.loss.vgg16)).to(views.device) if config.loss.vgg16 else None
-    return Run(
-        model=model,
-        views=views,
-        training=training,
-        holdout=holdout,
-        optimizer=make_optimizer(model, config),
-        shuffle=Shuffle(training, config.train.seed, rank, world),
-        generator=torch.Generator().manual_seed(config.train.seed + rank),
-        perceptual=perceptual,
-        edges=losses.mesh_edges(views.head.faces),
-    )
-
-
-def split_samples(keys: Sequence[Key], config: Config) -> tuple[list[int], list[int]]:
-    """Samples to train on and held-out ones: views of held-out cameras, held-out expressions.
-
-    Raises:
-        ConfigError: a held-out name fits no sample.
-        TrainError: nothing is left to train on.
-    """
-    cameras = {key.camera for key in keys}
-    unknown = set(config.data.holdout_cameras) - cameras
-    if unknown:
-        raise ConfigError(
-            f"data.holdout_cameras names {', '.join(sorted(unknown))}; "
-            f"the shards have {', '.join(sorted(cameras))}"
-        )
-    frames = {f"{key.subject}/{key.expression}" for key in keys}
-    held = {p: set(fnmatch.filter(frames, p)) for p in config.data.holdout_expressions}
-    for pattern, found in held.items():
-        if not found:
-            raise ConfigError(
-                f"data.holdout_expressions names {pattern}; expected SUBJECT/EXPRESSION such as "
-                f"{min(frames)}"
-            )
-    unseen = set().union(*held.values())
-    holdout = [
-        i
-        for i, key in enumerate(keys)
-        if key.camera in config.data.holdout_cameras or f"{key.subject}/{key.expression}" in unseen
-    ]
-    training = sorted(set(range(len(keys))) - set(holdout))
-    if config.train.overfit:
-        training, holdout = training[: config.train.overfit], []
-    if not training:
-        raise TrainError(
-            f"no views to train on: {len(keys)} samples, all by held-out cameras or expressions; "
-            "hold out fewer or pack more"
-        )
-    return training, holdout
-
-
-def make_optimizer(model: GRMM, config: Config) -> torch.optim.Optimizer:
-    """Adam with a group each for codes, per-texel parameters, refinement and all else."""
-    settings = config.train
-    codes = [model.z_id, model.z_exp]
-    texels = [
-        parameter
-        for ladder in (model.transform, model.opacity, model.colour)
-        for parameter in ladder.texel_parameters()
-    ]
-    refinement = [] if model.refinement is None else list(model.refinement.parameters())
-    special = {id(parameter) for parameter in codes + texels + refinement}
-    rest = [parameter for parameter in model.parameters() if id(parameter) not in special]
-    groups = [
-        {"params": rest, "scale": 1.0},
-        {"params": codes, "scale": settings.code_lr_scale},
-        {"params": texels, "scale": settings.texel_lr_scale},
-        {"params": refinement, "scale": settings.refine_lr_scale},
-    ]
-    return torch.optim.Adam(groups, lr=settings.lr, betas=settings.betas, fused=True)
-
-
-def finished(run: Run, config: Config) -> bool:
-    """True when iterations or seconds are used up."""
-    return budget_used(run, config) >= 1
-
-
-def budget_used(run: Run, config: Config) -> float:
-    """Share of the budget used, by iterations or by seconds, whichever is further."""
-    by_time = run.seconds / config.train.seconds if config.train.seconds else 0.0
-    return max(run.iteration / config.train.iterations, by_time)
-
-
-def set_rates(run: Run, config: Config) -> None:
-    """Learning rates at this share of the budget: a half cosine from 1 to ``final_lr``."""
-    cosine = 0.5 * (1 + math.cos(math.pi * min(1.0, budget_used(run, config))))
-    factor = config.train.final_lr + (1 - config.train.final_lr) * cosine
-    for group in run.optimizer.param_groups:
-        group["lr"] = config.train.lr * group["scale"] * factor
-
-
-def step(run: Run, parallel: torch.nn.Module, config: Config) -> None:
-    """One optimiser step over ``accumulate`` views."""
-    run.optimizer.zero_grad(set_to_none=True)
-    for _ in range(config.train.accumulate):
-        item = run.views.item(run.shuffle.next(), config.data.crop_margin_px)
-        subject = run.model.subjects.index(item.key.subject)
-        expression = run.model.expressions.index(item.key.expression)
-        shade_view = other_direction(run, config.train.shuffle_directions)
-        rendering = parallel(
-            subject, expression, item.state, item.view, run.views.background, shade_view
-        )
-        terms = objective(run, rendering, item, config)
-        loss = torch.stack(list(terms.values())).sum()
-        run.terms = {name: float(term.detach()) for name, term in terms.items()}
-        if not bool(torch.isfinite(loss)):
-            raise TrainError(
-                f"iteration {run.iteration}: the objective is not finite at {item.key}: "
-                f"{run.terms}; expected finite terms. Lower train.lr or look at this sample"
-            )
-        (loss / config.train.accumulate).backward()
-    if config.train.clip_norm:
-        torch.nn.utils.clip_grad_norm_(run.model.parameters(), config.train.clip_norm)
-    run.optimizer.step()
-
-
-def other_direction(run: Run, share: float) -> View | None:
-    """A random training view in a ``share`` of calls, else None."""
-    if float(torch.rand((), generator=run.generator)) >= share:
-        return None
-    index = run.training[int(torch.randint(len(run.training), (), generator=run.generator))]
-    sample = run.views.sample(index)
-    return run.views.view_of(sample, sample.alpha.shape[1], sample.alpha.shape[0])
-
-
-def objective(run: Run, rendering: Rendering, item: Item, config: Config) -> dict[str, Tensor]:
-    """Weighted terms of the objective by name (paper: Training and Losses)."""
-    weights, model = config.loss, run.model
-    images = {"rgb": item.comparable(rendering.rgb)}
-    if model.refinement is not None:
-        images["image"] = item.comparable(rendering.image)
-    terms = {n: losses.reconstruction(image, item.target, weights) for n, image in images.items()}
-    if run.perceptual is not None and run.iteration % weights.perceptual_every == 0:
-        for name, image in images.items():
-            pair = random_crop((image, item.target), weights.perceptual_crop_px, run.generator)
-            term = weights.perceptual * weights.perceptual_every * run.perceptual(*pair)
-            terms[f"perceptual_{name}"] = term
-    if bool(item.depth_valid.any()):
-        error = losses.depth_dm2(
-            rendering.depth, rendering.alpha, item.depth, item.depth_valid, weights.depth_erode_px
-        )
-        terms["depth"] = weights.depth * error
-    z_id, z_exp = model.codes(
-        model.subjects.index(item.key.subject), model.expressions.index(item.key.expression)
-    )
-    bounds = config.model.scale_bounds_mm
-    return terms | losses.regularisers(rendering, z_id, z_exp, run.edges, bounds, weights)
-
-
 def save(run: Run, path: Path, config: Config, head_spec: str) -> None:
     """Write the checkpoint with the loop's full state."""
     save_checkpoint(
         path,
-        model=run.model,
+        model=run.result,
         config=config,
         head_spec=head_spec,
         gallery=collect_gallery(run.views, run.training),
@@ -316,14 +131,16 @@ def save(run: Run, path: Path, config: Config, head_spec: str) -> None:
             "shuffle": run.shuffle.state(),
             "generator": run.generator.get_state(),
             "torch": torch.get_rng_state(),
-        },
+        }
+        | ({"weights": run.model.state_dict()} if run.average else {}),
     )
 
 
 def restore(run: Run, path: Path, config: Config, device: torch.device) -> None:
     """Put a run back to where its checkpoint was written."""
     loaded = load_checkpoint(path, device)
-    budget = {"iterations", "seconds", "save_every", "log_every", "evaluate_images", "threads"}
+    budget = {"iterations", "seconds", "save_every", "log_every", "evaluate_images", "threads",
+              "tensorboard"}  # fmt: skip
     old, new = as_tables(loaded.config), as_tables(config)
     changed = [
         f"{table}.{key} {old[table][key]!r} -> {value!r}"
@@ -339,7 +156,10 @@ def restore(run: Run, path: Path, config: Config, device: torch.device) -> None:
             f"{path}: cannot resume, these differ: {'; '.join(changed)}. "
             "Resume with the same settings or train into another folder"
         )
-    run.model.load_state_dict(loaded.model.state_dict())
+    run.model.load_state_dict(loaded.loop.get("weights", loaded.model.state_dict()))
+    if run.average is not None:
+        run.average.module.load_state_dict(loaded.model.state_dict())
+        run.average.n_averaged.fill_(loaded.loop["iteration"])
     run.optimizer.load_state_dict(loaded.optimizer)
     run.shuffle.restore(loaded.loop["shuffle"])
     run.generator.set_state(loaded.loop["generator"])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from express50.publish import write_json
 from grmm.config import Config
@@ -11,14 +10,12 @@ from grmm.data import spread
 from grmm.evaluate import evaluate, mean, training_render
 from grmm.judge import Judge
 from grmm.render import comparison_sheet
-
-if TYPE_CHECKING:
-    from grmm.train import Run
+from grmm.run import Run
 
 
 def report(run: Run, config: Config, out: Path) -> dict[str, object]:
     """Evaluate, draw previews and write metrics.json."""
-    render = training_render(run.model, run.views)
+    render = training_render(run.result, run.views)
     count = config.train.evaluate_images
     trained = {(run.views.keys[i].subject, run.views.keys[i].expression) for i in run.training}
     frame_of = {i: (run.views.keys[i].subject, run.views.keys[i].expression) for i in run.holdout}

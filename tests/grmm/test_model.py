@@ -5,8 +5,9 @@ import torch
 from grmm import losses
 from grmm.data import HeadViews
 from grmm.model import GRMM, View, initial_scales, quat_multiply
+from grmm.objective import objective, step
 from grmm.render import orbit
-from grmm.train import make_optimizer, objective, prepare, set_rates, step
+from grmm.run import make_optimizer, prepare, set_rates
 from tests.grmm.synthetic import EllipsoidSource, ellipsoid_head, tiny_config
 
 

@@ -8,8 +8,9 @@ from express50.parts import TORSO
 from grmm.data import HeadViews
 from grmm.evaluate import evaluate
 from grmm.model import View
+from grmm.objective import objective
+from grmm.run import prepare
 from grmm.torso import torso_mask
-from grmm.train import objective, prepare
 from tests.grmm.synthetic import EllipsoidSource, ellipsoid_head, tiny_config
 
 

@@ -11,7 +11,8 @@ from grmm.checkpoint import load_checkpoint
 from grmm.data import HeadViews
 from grmm.evaluate import evaluate, summarise, training_render, write_evaluation
 from grmm.perceptual import LAYERS, VGGDistance, load_vgg, random_crop
-from grmm.train import budget_used, prepare, set_rates, split_samples, train
+from grmm.run import budget_used, prepare, set_rates, split_samples
+from grmm.train import train
 from grmm.warm_start import fill_texels, project_texture, warm_start
 from tests.grmm.synthetic import EllipsoidSource, ellipsoid_head, tiny_config
 
