@@ -1,0 +1,135 @@
+"""Frame rate of GRMM end to end: ``python -m benchmarks.fps [--device cpu --n-g 128 --size 256]``.
+
+Decode, rasterise and refine, features and depth on, at the paper's size (N_g 512, 1024 x 1024) with
+random weights, which cost what trained ones do. Three ways: everything anew for every picture, as
+the paper's 75 frames a second are counted; with what a moving camera leaves alone kept (mesh,
+transforms, opacity) and the picture drawn in the head's window; the same in bfloat16. The last line
+is one JSON object; without a CUDA device, and none other asked for, its figures are ``n/a``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import time
+from collections.abc import Callable
+from dataclasses import replace
+
+import torch
+
+from express50.head.load import load_head
+from grmm.model import GRMM, HeadState, View
+from grmm.presets import preset
+from grmm.render import orbit
+from grmm.window import draw_window
+
+PAPER_FPS, TARGET_FPS = 75, 200  # the paper's, and ours on one H200
+NOISE = 0.01  # of the weights
+DISTANCE_M, FILL = 1.0, 0.7  # camera to head; the head's height over the picture's
+
+
+def scene(device: torch.device, n_g: int, size: int) -> tuple[GRMM, HeadState, View]:
+    """A model of random weights, the template's head and a camera before it."""
+    torch.manual_seed(0)
+    head = load_head("procedural").to(device)
+    settings = preset("paper").model
+    if n_g != settings.n_g:  # as many doublings as fit
+        steps = int(math.log2(n_g // 8))
+        settings = replace(settings, n_g=n_g, ladder=settings.ladder[-(steps - 1) :])
+    model = GRMM(settings, head, ("S000",), ("neutral",)).to(device).eval()
+    with torch.no_grad():
+        for parameter in model.parameters():  # many start at zero
+            parameter += NOISE * torch.randn_like(parameter)
+    zeros = head.template.new_zeros
+    state = HeadState(
+        vertices=head.template,
+        shape=zeros(head.shape_dirs.shape[2]),
+        expression=zeros(len(head.expression_names)),
+        neck=zeros(3),
+        jaw=zeros(3),
+    )
+    height = float(head.template[:, 1].max() - head.template[:, 1].min())
+    focal = FILL * size * DISTANCE_M / height
+    K = torch.tensor([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1]], dtype=torch.float64)
+    camera = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
+    camera[:3, 3] = -camera[:3, :3] @ model.head_centre.cpu().double()
+    camera[2, 3] += DISTANCE_M
+    return (
+        model,
+        state,
+        View(K=K.to(device), cam_from_head=camera.to(device), width=size, height=size),
+    )
+
+
+@torch.no_grad()
+def frames_per_second(draw: Callable[[int], object], device: torch.device, seconds: float) -> float:
+    """Pictures a second by the clock, after five that are not counted."""
+    for number in range(5):
+        draw(number)
+    _wait(device)
+    count, began = 0, time.perf_counter()
+    while time.perf_counter() - began < seconds:
+        draw(count)
+        count += 1
+        _wait(device)
+    return round(count / (time.perf_counter() - began), 2)
+
+
+def _wait(device: torch.device) -> None:
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+
+
+def measure(device: torch.device, n_g: int, size: int, seconds: float) -> dict[str, object]:
+    """Frame rates of the three ways, and how far apart their pictures are."""
+    model, state, front = scene(device, n_g, size)
+    z_id, z_exp = model.z_id[0].detach(), model.z_exp[0].detach()
+    views = [orbit(front, 3.0 * (n % 21 - 10), model.head_centre.cpu()) for n in range(21)]
+
+    def anew(number: int) -> torch.Tensor:
+        return model.render(z_id, z_exp, state, views[number % 21]).image
+
+    with torch.no_grad():
+        kept = model.geometry(z_id, z_exp, state)
+
+    def cached(number: int) -> torch.Tensor:
+        view = views[number % 21]
+        return draw_window(model, kept, model.appearance(z_id, state, view), view).image
+
+    rates: dict[str, object] = {
+        "fps": frames_per_second(anew, device, seconds),
+        "fps_with_savings": frames_per_second(cached, device, seconds),
+    }
+    with torch.no_grad():
+        exact = cached(0)
+        model.config = replace(model.config, precision="bfloat16")
+        low = cached(0)
+    rates["fps_with_savings_bfloat16"] = frames_per_second(cached, device, seconds)
+    rates["bfloat16_mean_abs_difference"] = float((low - exact).abs().mean())
+    return rates | {"gaussians": len(model.texels)}
+
+
+def main() -> None:
+    """Parse, measure, print."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--device", help="cuda where there is one")
+    parser.add_argument("--n-g", type=int, default=512)
+    parser.add_argument("--size", type=int, default=1024)
+    parser.add_argument("--seconds", type=float, default=5.0, help="a way")
+    args = parser.parse_args()
+    name = args.device or ("cuda" if torch.cuda.is_available() else "")
+    report: dict[str, object] = {"benchmark": "fps", "n_g": args.n_g, "size": args.size}
+    report |= {"paper_fps": PAPER_FPS, "target_fps": TARGET_FPS}
+    if not name:
+        reason = "no CUDA device; --device cpu --n-g 128 --size 256 tries the code"
+        report |= {"device": "n/a", "fps": "n/a", "fps_with_savings": "n/a", "reason": reason}
+    else:
+        device = torch.device(name)
+        report["device"] = torch.cuda.get_device_name() if device.type == "cuda" else name
+        report |= measure(device, args.n_g, args.size, args.seconds)
+    print(json.dumps(report))
+
+
+if __name__ == "__main__":
+    main()
