@@ -111,9 +111,11 @@ def subject_of(capture: Path) -> str:
     return tomllib.loads((capture / "capture.toml").read_text())["subject"]
 
 
-def run_stages(dataset: Path, captures: list[Path], unseen: str, workers: int) -> list[Step]:
+def run_stages(
+    dataset: Path, captures: list[Path], unseen: str, workers: int, settings: str = "demo.toml"
+) -> list[Step]:
     """Every stage over the dataset; an item that fails is reported, the chain goes on."""
-    common = ["--workers", str(workers), "--config", str(Path(__file__).with_name("demo.toml"))]
+    common = ["--workers", str(workers), "--config", str(Path(__file__).with_name(settings))]
     steps = []
     for stage in STAGES:
         extra = [str(c) for c in captures] if stage == "ingest" else []

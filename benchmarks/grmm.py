@@ -55,7 +55,7 @@ def make_shards(out: Path, workers: int) -> Path:
     record_twin(out / "twin", workers, TWIN, EXPRESSIONS)
     captures = sorted((out / "twin" / "captures").iterdir())
     (out / "data").mkdir(exist_ok=True)
-    run_stages(out / "data", captures, subject_of(captures[-1]), workers)
+    run_stages(out / "data", captures, subject_of(captures[-1]), workers, "grmm.toml")
     return out / "data" / "pack" / "shards"
 
 

@@ -133,7 +133,7 @@ def as_markdown(rows: list[dict], people: int, cameras: int, size: int) -> list[
     """The section's lines."""
     text = (
         f"Made by `python -m benchmarks.grmm_trade`: {people} people, {cameras} cameras of {size} "
-        "px, one more held out. One thing is changed at a time from `--preset demo`. A budget is "
+        "px, two more held out. One thing is changed at a time from `--preset demo`. A budget is "
         "processor seconds of one core, from the first image read; dB are over all pixels but the "
         "torso, and over the head's alone. A picture is decoded, drawn, refined and compared. One "
         "run a row: a tenth of a dB says nothing. bfloat16 is emulated on processors without it."
