@@ -107,14 +107,21 @@ def preset(name: str) -> Config:
 
 
 def resolve(
-    name: str = "paper", file: Path | None = None, assignments: Sequence[str] = ()
+    name: str = "paper",
+    file: Path | None = None,
+    assignments: Sequence[str] = (),
+    changes: Mapping[str, Mapping[str, Any]] | None = None,
 ) -> Config:
-    """Build a configuration: ``table.key=value`` assignments over a TOML file over a preset.
+    """Build a configuration: assignments over a TOML file over ``changes`` over a preset.
+
+    Assignments read ``table.key=value``.
 
     Raises:
         ConfigError: unknown preset, table or key, a wrong type, or a value out of range.
     """
     tables = as_tables(preset(name))
+    for table, values in (changes or {}).items():
+        tables[table] |= values
     for table, values in _read_toml(file).items():
         _known_table(table, f"{file}: table [{table}]")
         tables[table] |= values

@@ -7,6 +7,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from express50.console import OK, say, say_json
+from express50.errors import ConfigError
+from grmm.budget import choose
 from grmm.cli.shared import (
     add_checkpoint_and_shards,
     add_metrics,
@@ -19,6 +21,9 @@ from grmm.cli.shared import (
 )
 from grmm.config import Config
 from grmm.presets import PRESETS, resolve
+from grmm.progress import log
+
+MEASURED = "measured"  # in place of a preset
 
 
 def add_train(commands: argparse._SubParsersAction) -> None:
@@ -39,7 +44,11 @@ def add_train(commands: argparse._SubParsersAction) -> None:
 
 def add_training(parser: argparse.ArgumentParser) -> None:
     """The arguments that `train_config` reads, and more folders of shards."""
-    parser.add_argument("--preset", default="paper", help=f"{', '.join(PRESETS)} (paper)")
+    parser.add_argument(
+        "--preset",
+        default="paper",
+        help=f"{', '.join(PRESETS)}, or {MEASURED}: the setting that did best in --budget (paper)",
+    )
     parser.add_argument("--config", type=Path, help="TOML file over the preset")
     parser.add_argument(
         "--set",
@@ -85,7 +94,14 @@ def _train(args: argparse.Namespace) -> int:
 
 def train_config(args: argparse.Namespace) -> Config:
     """Resolved configuration of ``grmm train``: its own flags stand above --set."""
-    config = resolve(args.preset, args.config, [*args.set, *metric_settings(args)])
+    name, changes = args.preset, {}
+    if name == MEASURED:
+        if args.seconds is None:
+            raise ConfigError(f"--preset {MEASURED} needs a time, such as --budget 4m")
+        choice = choose(args.seconds)
+        log(f"measured: {choice}")
+        name, changes = "demo", choice.changes
+    config = resolve(name, args.config, [*args.set, *metric_settings(args)], changes)
     if args.seconds is not None:
         config = replace(config, train=replace(config.train, seconds=args.seconds))
     if args.holdout_cameras:

@@ -1,0 +1,61 @@
+import argparse
+
+import pytest
+
+from express50.errors import ConfigError
+from express50.publish import write_json
+from grmm.budget import choose
+from grmm.cli.learn import add_training, train_config
+
+
+@pytest.fixture
+def measured(tmp_path):
+    rows = [
+        {
+            "budget_s": 240.0,
+            "setting": "large",
+            "psnr_db": 30.0,
+            "changes": {"model": {"n_g": 256}},
+        },
+        {"budget_s": 60.0, "setting": "small", "psnr_db": 28.0, "changes": {"model": {"n_g": 64}}},
+    ]
+    write_json(tmp_path / "measured.json", rows)
+    return tmp_path / "measured.json"
+
+
+@pytest.mark.parametrize(
+    ("seconds", "setting"),
+    [(1, "small"), (60, "small"), (239, "small"), (240, "large"), (1e6, "large")],
+)
+def test_the_longest_measured_budget_that_fits(measured, seconds, setting):
+    assert choose(seconds, measured).setting == setting
+
+
+@pytest.mark.parametrize("seconds", [0, -1, float("nan")])
+def test_no_time_is_refused(measured, seconds):
+    with pytest.raises(ConfigError, match="expected more than 0"):
+        choose(seconds, measured)
+
+
+def arguments(*words):
+    parser = argparse.ArgumentParser()
+    add_training(parser)
+    return parser.parse_args(words)
+
+
+def test_command_line_takes_the_measured_setting(capsys):
+    """The shipped table: whatever it says reaches the configuration, and --set stands above it."""
+    choice = choose(60)
+    config = train_config(arguments("--preset", "measured", "--budget", "60s"))
+    for table, values in choice.changes.items():
+        for key, value in values.items():
+            found = getattr(getattr(config, table), key)
+            assert (list(found) if isinstance(found, tuple) else found) == value
+    assert config.train.seconds == 60 and choice.setting in capsys.readouterr().err
+    above = arguments("--preset", "measured", "--budget", "60s", "--set", "model.n_g=32")
+    assert train_config(above).model.n_g == 32
+
+
+def test_a_measured_setting_needs_a_time():
+    with pytest.raises(ConfigError, match="needs a time, such as --budget 4m"):
+        train_config(arguments("--preset", "measured"))
