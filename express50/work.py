@@ -69,7 +69,8 @@ def run_task(task: Task) -> Receipt:
     cap_threads(task.threads)
     reset_peak_memory()
     started = time.perf_counter()
-    reason, metrics, made = "", {}, None
+    reason, made = "", None
+    metrics: dict = {}
     try:
         metrics, files = _run_and_publish(task)
         made = Made(task.inputs, files)

@@ -186,8 +186,16 @@ class _Run:
         elif config is not None:
             state = replace(state, receipts=sound)
             self._judged(stage.name, judge(stage, self.dataset, config, state, self.published))
-        self.broken |= {_subject(item) for item in wrong}
-        self._counts(stage.name, state, known, wrong)
+        receipts = self.states[stage.name].receipts
+        failed = {item for item, receipt in receipts.items() if receipt.status == "failed"}
+        to_do = set(known or ()) - set(receipts) - wrong
+        # None of these has an output: what was made of a former one is right once it is back.
+        self.broken |= {_subject(item) for item in wrong | failed | to_do}
+        if to_do and receipts:
+            count = f"{len(to_do)} of {len(known or ())} items are to do"
+            self.result.notes.append(f"{stage.name}: {count}; run 'express50 {stage.name}'")
+        if failed:
+            self.result.notes.append(f"{stage.name}: {len(failed)} items failed; see status")
 
     def _personal(self, stage: str, wrong: set[str]) -> Iterator[Fault]:
         if stage != "ingest":
@@ -257,16 +265,6 @@ class _Run:
         receipt = self.states[stage].receipts[item]
         self.ledger.write(replace(receipt, made=Made(inputs, files)))
         self.ledger.know(folder, files)
-
-    def _counts(
-        self, stage: str, state: StageState, known: list[str] | None, wrong: set[str]
-    ) -> None:
-        failed = sum(receipt.status == "failed" for receipt in state.receipts.values())
-        missing = len(set(known or ()) - set(self.states[stage].receipts) - wrong)
-        if self.states[stage].receipts and missing:
-            self.result.notes.append(f"{stage}: {missing} of {len(known or ())} items are to do")
-        if failed:
-            self.result.notes.append(f"{stage}: {failed} items failed; see 'express50 status'")
 
     def _waits(self, item: str) -> bool:
         """Whether something that the item may read is broken."""

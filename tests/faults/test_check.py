@@ -88,6 +88,8 @@ def test_harm_is_found_mended_and_made_again_to_the_same_bytes(dataset, kind, ha
     found, result = look(dataset, mend=True)
     assert list(found) == [(kind, "toy S001")] and result.sound
     assert not dataset.item_dir("toy", "S001").exists()
+    found, result = look(dataset, mend=True)  # nor because the good one is not back yet
+    assert found == {} and "toy: 1 of 2 items are to do" in result.notes[0]
     assert [o.status for o in toy.run_toy(dataset).outcomes] == ["done", "skipped"]
     assert toy.tree(dataset.stage_dir("toy")) == before
     assert toy.run_stage_of(LATER, dataset).count("skipped") == 2
@@ -229,7 +231,9 @@ def test_killed_half_way_then_checked_and_made_again(tmp_path):
     process = subprocess.Popen(command, cwd=REPOSITORY, env=variables)
     give_up = time.monotonic() + 60
     while len(list(dataset.root.glob("toy/*"))) < 3 and time.monotonic() < give_up:
-        time.sleep(0.02)
+        time.sleep(0.01)
+    while not list(dataset.staging_dir.glob("toy-*")) and time.monotonic() < give_up:
+        time.sleep(0.01)
     process.send_signal(signal.SIGKILL)
     process.wait()
     result = audit(dataset, [toy.STAGE], mend=True)
