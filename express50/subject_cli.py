@@ -45,7 +45,10 @@ def run_withdraw(args: argparse.Namespace) -> int:
         if args.json:
             say_json({"subject": args.subject, "would_remove": paths})
         else:
-            say(*(f"would remove {path}" for path in paths), "add --yes to remove")
+            say(*(f"would remove {path}" for path in paths))
+            models = [*sorted((dataset.root / "grmm").rglob("*.pt")), *args.checkpoint]
+            say(*(f"would take codes and frames out of {path}" for path in models))
+            say("add --yes to remove")
         return OK
     for path in args.checkpoint:
         if not path.is_file():

@@ -65,6 +65,9 @@ def _own_paths(dataset: Dataset, subject: str) -> Iterator[Path]:
     reference = dataset.root / "labels" / "reference.json"
     if reference.is_file() and subject in _values(reference):
         yield reference  # the next subject becomes the reference
+    test = names(subject)
+    # Settings such as pack.test_subjects; the stage's next run writes its own.
+    yield from (p for p in (dataset.root / "config").glob("*.toml") if says(p, test))
     for path in (dataset.root / "logs").glob("*/*.txt"):
         if path.stem.split("+")[0] == subject:
             yield path
