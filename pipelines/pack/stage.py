@@ -265,7 +265,7 @@ def _finish(
         "depth_coverage": covered,
         "with_parts": len(metas) - len(lacking),
         "torso_removed": bare,
-        "warnings": _lacking_warning(lacking, len(metas)),
+        "warnings": [*_lacking_warning(lacking, len(metas)), *_unstated(metas)],
         "dropped": dropped,
     }
 
@@ -279,6 +279,20 @@ def _lacking_warning(lacking: list[dict], count: int) -> list[dict[str, str]]:
         " torso; run 'express50 regions', then pack again"
     )
     return [{"what": "regions", "why": why}]
+
+
+def _unstated(metas: list[dict]) -> list[dict[str, str]]:
+    """A warning for each subject whose samples carry no consent id or no licence."""
+    keys = {"consent": "consent_id", "licence": "licence"}
+    lacking = {
+        name: [keys[key] for key in keys if meta[key] is None]
+        for name, meta in ((meta["subject"], meta) for meta in metas)
+    }
+    return [
+        {"what": name, "why": f"capture.toml gives no {' and no '.join(what)}; its samples lack it"}
+        for name, what in sorted(lacking.items())
+        if what
+    ]
 
 
 def _write_picture(out: Path, reader: ShardReader) -> float:
