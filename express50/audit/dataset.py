@@ -105,7 +105,8 @@ def _tables(dataset: Dataset, label_problems: Callable[..., Iterable[Any]]) -> I
     try:
         yield from capture_findings(dataset)
     except FormatError as error:
-        yield Finding(kind="capture", what="captures.json", why=str(error), mend="see above")
+        why, _, mend = str(error).removeprefix(f"{dataset.captures_file}: ").partition("; ")
+        yield Finding(kind="capture", what="captures.json", why=why, mend=mend)
         return
     yield from label_findings(dataset, label_problems)
 
@@ -140,7 +141,8 @@ class _Run:
         self.dataset, self.stages, self.ledger = dataset, stages, ledger
         self.result, self.deep, self.mend = result, deep, mend
         # Subjects of damaged items, "" is all; a capture that is gone has its own finding.
-        self.broken = {f.what.split()[-1] for f in result.findings if f.kind == "capture"}
+        self.broken = {f.what.removeprefix("captures.json").split(" ")[-1]
+                       for f in result.findings if f.kind == "capture"}  # fmt: skip
         self.states = {s.name: StageState(receipts=ledger.read(s.name), made=ledger.made(s.name))
                        for s in stages}  # fmt: skip
         sha256 = file_sha256 if deep else ledger.sha256
@@ -212,11 +214,11 @@ class _Run:
             if fault.foreign:
                 mended, how = False, "move what no run wrote out of the folder, then check again"
             elif known is None or fault.item in known:
-                mended, how = self.mend, "--mend sets it aside, then " + again
+                mended, how = self.mend, "--mend, then " + again
             elif fault.kind == "unknown":
                 mended, how = False, f"no item of {stage} today; move it away if nobody needs it"
             else:
-                mended, how = self.mend, "--mend sets it aside; the stage has no such item now"
+                mended, how = self.mend, "--mend; the stage has no such item now"
             if mended:
                 self._set_aside(stage, fault.item)
                 how = f"set aside; make it again: {again}"
@@ -231,7 +233,7 @@ class _Run:
                 self.result.notes.append(f"{stage} {item}: {words}")
                 continue
             why = f"made from another {', '.join(names[:3])}" + ", ..." * (len(names) > 3)
-            how = "--mend sets it aside, then " + again
+            how = "--mend, then " + again
             if self.mend:
                 self._set_aside(stage, item)
                 how = f"set aside; make it again: {again}"

@@ -59,7 +59,8 @@ def label_findings(
         try:
             found = [p for p in problems(dataset, [subject]) if p.kind in WRONG_LABELS]
         except AnnotationError as error:
-            yield Finding(kind="label", what=name, why=str(error), mend="restore the file")
+            why = str(error).removeprefix(f"{path}: ")
+            yield Finding(kind="label", what=name, why=why, mend="restore the file")
             continue
         except Express50Error:  # the index is damaged: a finding of its own
             continue

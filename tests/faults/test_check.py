@@ -267,5 +267,10 @@ def test_command_on_real_stages(tmp_path, capsys):
     assert dataset.labels_file("S001").read_text() == json.dumps(label) + "\n"
     assert main(["ingest", root, "--items", "S001", "--workers", "0"]) == 0
     assert ingest.STAGE.items(dataset) == NAMES
+    dataset.captures_file.write_text("no table")
+    capsys.readouterr()
+    assert main(["check", root]) == 1
+    said = capsys.readouterr().out.splitlines()
+    assert len(said) == 2 and said[0].startswith("captures.json: not JSON")
     assert main(["check", str(tmp_path / "nothing")]) == 1
     assert "nothing" in capsys.readouterr().err
