@@ -190,7 +190,7 @@ def _not_taken(
         expression = cue.expression_id
         label, row = labels.get(expression), rows.get(expression)
         if label is not None and label.frame is None:
-            why = f"flagged by {label.annotator}: {label.reason or 'no reason given'}"
+            why = f"flagged: {label.reason or 'no reason given'}"
         elif label is not None:
             continue
         elif row is None:
@@ -254,7 +254,7 @@ def _write_sheet(dataset: Dataset, index: Index, peaks: dict, out: Path) -> None
 
 STAGE = Stage(
     name="align",
-    version=3,
+    version=4,
     config=AlignConfig,
     presets={"draft": {}, "standard": {}, "reference": {}},
     items=Dataset.subjects,

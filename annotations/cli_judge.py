@@ -112,5 +112,6 @@ def run_coverage(args: argparse.Namespace) -> int:
     say(*(f"{s}: missing {', '.join(gaps)}" for s, gaps in report["missing"].items()))
     say(*(f"{s}: excluded, {reason}" for s, reason in report["excluded"].items()))
     for name in ("gender", "age"):
-        say(f"{name}: " + ", ".join(f"{k} {n}" for k, n in report[name].items()))
+        counts = ", ".join(f"{k} {n}" for k, n in report[name].items())
+        say(f"{name}: {counts or 'too few people to count'}")
     return OK

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from annotations.store import AUTOMATIC, Label, current_labels, is_person, read_labels
-from express50.demographics import age_counts, gender_counts
+from express50.captures.person import read_people
+from express50.demographics import age_counts, gender_counts, shown_counts
 from express50.exclusions import exclusion_reason, included_subjects
 from express50.index import read_index
 from express50.layout import Dataset
@@ -15,7 +16,7 @@ def coverage(dataset: Dataset) -> dict[str, dict]:
     Returns:
         ``cells`` (subject -> expression -> ``person``, ``rule``, ``auto``, ``flagged`` or
         ``missing``), ``missing`` (subject -> expressions), ``excluded`` (subject -> reason),
-        ``gender`` and ``age`` counts as far as captures say.
+        ``gender`` and ``age`` counts of five or more people, as far as captures say.
     """
     cells = {subject: _cells(dataset, subject) for subject in included_subjects(dataset)}
     missing = {
@@ -23,13 +24,13 @@ def coverage(dataset: Dataset) -> dict[str, dict]:
         for subject, row in cells.items()
     }
     reasons = {s: exclusion_reason(dataset, s) for s in dataset.subjects()}
-    metas = [read_index(dataset, subject).meta for subject in cells]
+    people = read_people(dataset, cells)
     return {
         "cells": cells,
         "missing": {subject: row for subject, row in missing.items() if row},
         "excluded": {s: reason for s, reason in reasons.items() if reason is not None},
-        "gender": gender_counts(metas),
-        "age": age_counts(metas),
+        "gender": shown_counts(gender_counts(people)),
+        "age": shown_counts(age_counts(people)),
     }
 
 

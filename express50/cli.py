@@ -22,6 +22,8 @@ AREAS = {
     "cameras": ("express50.rigs.cli", "import and check calibrations"),
     "head": ("express50.head.cli", "look at a head model"),
     "photo": ("pipelines.photo.cli", "track the face of a bare photograph or video"),
+    "check": ("express50.audit.cli", "audit a dataset against its ledger, and mend it"),
+    "plan": ("express50.plan_cli", "what a campaign costs, from a measured dataset's receipts"),
     "subject": ("express50.subject_cli", "withdraw a person from a dataset"),
     "export": ("express50.export.cli", "write tracked heads for other tools"),
     "report": ("express50.report.cli", "gather QC figures into one HTML page"),

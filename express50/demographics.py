@@ -1,4 +1,8 @@
-"""Who the subjects are, counted: gender and age as far as captures say."""
+"""Who the subjects are, counted: gender and age as far as captures say.
+
+What a capture says of a person stays in the capture. A dataset takes over `PUBLIC_KEYS` of its
+capture.toml and nothing else; gender and age are read from the capture when they are counted.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +10,38 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 
 AGE_BANDS = ((0, 17), (18, 29), (30, 44), (45, 59), (60, 200))
+# Of fewer people a count says who: one of two subjects is the woman, or the one aged 71.
+LEAST_PEOPLE = 5
+OTHERS = "others or not given"
+PUBLIC_KEYS = frozenset(
+    {
+        "subject", "fps", "session", "units", "color_space", "metres_per_unit", "synthetic",
+        "consent_id", "consent", "licence", "license",
+        "camera_model", "rig", "focal_px", "focal_source", "focal_range_px",
+        "layout", "sequences", "cameras", "expressions", "renderme360",
+    }
+)  # fmt: skip
+
+
+def public_meta(meta: Mapping) -> dict:
+    """What a dataset may keep of a capture.toml: nothing that describes the person."""
+    return {key: value for key, value in meta.items() if key in PUBLIC_KEYS}
+
+
+def shown_counts(counts: Mapping[str, int], least: int = LEAST_PEOPLE) -> dict[str, int]:
+    """Counts of which each is of ``least`` people or more; what is fewer counts among the others.
+
+    The smallest groups join the others until these are enough too: a single small one could be
+    told from the total. Empty where there are too few people at all, or nothing to tell apart.
+    """
+    left = sorted((n, name) for name, n in counts.items() if name != "not given")
+    others = counts.get("not given", 0)
+    while left and (left[0][0] < least or 0 < others < least):
+        others += left.pop(0)[0]
+    if not left:
+        return {}
+    shown = {name: n for name, n in counts.items() if (n, name) in left}
+    return shown | ({OTHERS: others} if others else {})
 
 
 def gender_counts(metas: Sequence[Mapping]) -> dict[str, int]:
@@ -20,16 +56,10 @@ def age_counts(metas: Sequence[Mapping]) -> dict[str, int]:
     return {name: counts[name] for name in names if counts[name]}
 
 
-def age_summary(metas: Sequence[Mapping]) -> dict[str, float] | None:
-    """``people`` whose age is given, and the ``youngest``, ``oldest`` and ``mean`` in years.
-
-    None where no age is given.
-    """
+def mean_age(metas: Sequence[Mapping], least: int = LEAST_PEOPLE) -> tuple[float, int] | None:
+    """Mean age in years and of how many people; None of fewer than ``least``."""
     ages = [age for m in metas if (age := _age(m)) is not None]
-    if not ages:
-        return None
-    mean = round(sum(ages) / len(ages), 1)
-    return {"people": len(ages), "youngest": min(ages), "oldest": max(ages), "mean": mean}
+    return (round(sum(ages) / len(ages), 1), len(ages)) if len(ages) >= least else None
 
 
 def _age(meta: Mapping) -> float | None:

@@ -71,7 +71,7 @@ class Index:
         board: ``{"config": board.toml's content, "cameras": {id: [files]}}`` or None.
         calibration: calibration file relative to the capture, or None; see `calibration_file`.
         cues: scripted expressions, in file order.
-        meta: content of capture.toml.
+        meta: content of capture.toml but for what describes the person (`express50.demographics`).
     """
 
     subject: str

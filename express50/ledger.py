@@ -1,4 +1,4 @@
-"""The ledger: SQLite receipts that say what was made from what, and digests of files already read.
+"""The ledger: SQLite receipts that say what was made from what, and digests of files.
 
 Only the driver opens it; workers return receipts.
 """
@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import sqlite3
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -22,11 +22,33 @@ CREATE TABLE IF NOT EXISTS receipts (
     peak_memory INTEGER NOT NULL, attempts INTEGER NOT NULL, time REAL NOT NULL,
     PRIMARY KEY (stage, item)
 );
+CREATE TABLE IF NOT EXISTS made (
+    stage TEXT NOT NULL, item TEXT NOT NULL, inputs TEXT NOT NULL, files TEXT NOT NULL,
+    PRIMARY KEY (stage, item)
+);
 CREATE TABLE IF NOT EXISTS digests (
     path TEXT PRIMARY KEY, size INTEGER NOT NULL, mtime_ns INTEGER NOT NULL,
     inode INTEGER NOT NULL, sha256 TEXT NOT NULL
 );
 """
+
+
+@dataclass(frozen=True)
+class FileMark:
+    """A published file: size in bytes, modification time, inode, SHA-256."""
+
+    size: int
+    mtime_ns: int
+    inode: int
+    sha256: str
+
+
+@dataclass(frozen=True)
+class Made:
+    """What an item was made from (digest of every input) and what it consists of."""
+
+    inputs: dict[str, str]
+    files: dict[str, FileMark]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,6 +66,7 @@ class Receipt:
         peak_memory: largest resident memory while it ran, bytes.
         attempts: how often it was tried in that run.
         time: when it ended, seconds since 1970.
+        made: inputs and files of what was published; `Ledger.made` reads it, `Ledger.read` not.
     """
 
     stage: str
@@ -56,6 +79,10 @@ class Receipt:
     peak_memory: int = 0
     attempts: int = 1
     time: float = field(default_factory=time.time)
+    made: Made | None = None
+
+
+COLUMNS = tuple(name for name in Receipt.__dataclass_fields__ if name != "made")
 
 
 class Ledger:
@@ -89,28 +116,50 @@ class Ledger:
 
     def write(self, receipt: Receipt) -> None:
         """Store a receipt in the place of the item's former one."""
-        row = dict(vars(receipt)) | {"metrics": json.dumps(receipt.metrics, sort_keys=True)}
+        row = {name: getattr(receipt, name) for name in COLUMNS}
+        row["metrics"] = json.dumps(receipt.metrics, sort_keys=True)
         marks = ", ".join(f":{name}" for name in row)
+        key = (receipt.stage, receipt.item)
+        self._database.execute("BEGIN IMMEDIATE")
         self._database.execute(
             f"INSERT OR REPLACE INTO receipts ({', '.join(row)}) VALUES ({marks})", row
         )
+        if receipt.made is None:
+            self._database.execute("DELETE FROM made WHERE stage = ? AND item = ?", key)
+        else:
+            self._database.execute(
+                "INSERT OR REPLACE INTO made VALUES (?, ?, ?, ?)", (*key, *_texts(receipt.made))
+            )
+        self._database.execute("COMMIT")
+
+    def made(self, stage: str) -> dict[str, Made]:
+        """Inputs and files of a stage's items, sorted; of those made since these are kept."""
+        rows = self._database.execute(
+            "SELECT item, inputs, files FROM made WHERE stage = ? ORDER BY item", (stage,)
+        )
+        return {
+            item: Made(
+                json.loads(inputs),
+                {name: FileMark(*mark) for name, mark in json.loads(files).items()},
+            )
+            for item, inputs, files in rows
+        }
 
     def read(self, stage: str) -> dict[str, Receipt]:
         """Receipts of a stage by item, sorted."""
-        names = list(Receipt.__dataclass_fields__)
         rows = self._database.execute(
-            f"SELECT {', '.join(names)} FROM receipts WHERE stage = ? ORDER BY item", (stage,)
+            f"SELECT {', '.join(COLUMNS)} FROM receipts WHERE stage = ? ORDER BY item", (stage,)
         )
-        values = [dict(zip(names, row, strict=True)) for row in rows]
+        values = [dict(zip(COLUMNS, row, strict=True)) for row in rows]
         return {v["item"]: Receipt(**v | {"metrics": json.loads(v["metrics"])}) for v in values}
 
     def forget(self, stage: str, items: Iterable[str]) -> None:
         """Remove receipts; when this returns they are gone, even if the power goes."""
         self._database.execute("PRAGMA synchronous=FULL")
         self._database.execute("BEGIN IMMEDIATE")
-        self._database.executemany(
-            "DELETE FROM receipts WHERE stage = ? AND item = ?", [(stage, item) for item in items]
-        )
+        keys = [(stage, item) for item in items]
+        for table in ("receipts", "made"):
+            self._database.executemany(f"DELETE FROM {table} WHERE stage = ? AND item = ?", keys)
         self._database.execute("COMMIT")
         self._database.execute("PRAGMA synchronous=NORMAL")
 
@@ -128,6 +177,12 @@ class Ledger:
         self._fresh[str(path)] = (*key, digest)
         return digest
 
+    def know(self, folder: Path, files: Mapping[str, FileMark]) -> None:
+        """Take over digests of files below a folder, so that no later stage hashes them again."""
+        for name, mark in files.items():
+            path = str(folder / name)
+            self._fresh[path] = (path, mark.size, mark.mtime_ns, mark.inode, mark.sha256)
+
     def keep_digests(self) -> None:
         """Store new digests in one transaction; one each would cost a disk sync a file."""
         self._database.execute("BEGIN IMMEDIATE")
@@ -136,3 +191,15 @@ class Ledger:
         )
         self._database.execute("COMMIT")
         self._fresh.clear()
+
+
+def _texts(made: Made) -> tuple[str, str]:
+    """JSON of inputs and files."""
+    files = {name: [m.size, m.mtime_ns, m.inode, m.sha256] for name, m in made.files.items()}
+    return json.dumps(made.inputs, sort_keys=True), json.dumps(files, sort_keys=True)
+
+
+def mark_file(path: Path) -> FileMark:
+    """Size, time and digest of a file as it is now."""
+    stat = path.stat()
+    return FileMark(stat.st_size, stat.st_mtime_ns, stat.st_ino, file_sha256(path))

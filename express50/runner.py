@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import fcntl
 import fnmatch
 import functools
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import nullcontext
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,11 +15,12 @@ from express50.digests import path_digest
 from express50.errors import ConfigError, Express50Error, StageError
 from express50.layout import Dataset
 from express50.ledger import Ledger, Receipt
+from express50.locks import stage_lock
 from express50.pool import Pool
 from express50.progress import Progress
 from express50.publish import clean_leftovers, discard_stale, set_aside, write_bytes
 from express50.stage import Stage
-from express50.work import Task, fingerprint
+from express50.work import Task, fingerprint, input_digests
 
 
 @dataclass(frozen=True)
@@ -193,15 +193,16 @@ def _run_items(
     digest_of = functools.cache(lambda path: path_digest(path, ledger.sha256))
     for item in chosen:
         try:
-            digest = fingerprint(stage, dataset, item, config, digest_of)
+            inputs = input_digests(stage, dataset, item, config, digest_of)
         except Express50Error as error:
             reason = f"{type(error).__name__}: {error}"
             unreadable.append(_refusal(stage, item, reason))
             continue
+        digest = fingerprint(stage, config, inputs)
         if is_current(dataset, receipts.get(item), digest):
             outcomes[item] = _outcome(receipts[item], status="skipped")
         else:
-            tasks.append(Task(stage, dataset, item, config, digest, pool.threads))
+            tasks.append(Task(stage, dataset, item, config, digest, inputs, pool.threads))
     ledger.keep_digests()
     # A receipt must not outlive the output it speaks of, should this run be killed half-way.
     ledger.forget(stage.name, [task.item for task in tasks])
@@ -215,6 +216,7 @@ def _run_items(
         for receipt in unreadable:
             settle(receipt)
         pool.run(tasks, settle, display.tick)
+    ledger.keep_digests()
     return outcomes
 
 
@@ -236,6 +238,8 @@ def record(dataset: Dataset, ledger: Ledger, receipt: Receipt) -> None:
         discard_stale(dataset, receipt.stage, receipt.item)
         dataset.log_file(receipt.stage, receipt.item).unlink(missing_ok=True)
     ledger.write(receipt)
+    if receipt.made is not None:
+        ledger.know(dataset.item_dir(receipt.stage, receipt.item), receipt.made.files)
 
 
 def retire_items(dataset: Dataset, ledger: Ledger, stage: str, chosen: list[str]) -> None:
@@ -251,25 +255,6 @@ def save_config(dataset: Dataset, stage: Stage, config: Any) -> None:
     path, text = dataset.config_file(stage.name), config_toml(stage.name, config)
     if not path.is_file() or path.read_text(encoding="utf-8") != text:
         write_bytes(path, text.encode())
-
-
-@contextmanager
-def stage_lock(dataset: Dataset, stage: str) -> Iterator[None]:
-    """Hold a stage of a dataset; the system lets go when the process ends, however it ends.
-
-    Raises:
-        StageError: another process holds it.
-    """
-    path = dataset.staging_dir / f".{stage}.lock"
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("w") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise StageError(
-                f"{dataset.root}: another '{stage}' runs on this dataset; wait until it ends"
-            ) from error
-        yield
 
 
 def _refusal(stage: Stage, item: str, reason: str) -> Receipt:

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import argparse
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 from express50.console import FAILED, OK, say, say_json
+from express50.errors import FormatError
 from express50.layout import Dataset
 from express50.withdraw import plan, withdraw
 
@@ -18,12 +20,18 @@ def add_commands(subparsers: Any) -> None:
     action = actions.add_parser(
         "withdraw",
         help="remove all that the dataset holds of a subject",
-        description="Removes a subject's index, derived files, labels, receipts and the packed "
-        "shards, then searches all that is left for the subject's id. Lists only, without --yes.",
+        description="Removes a subject's index, derived files, labels, receipts, the packed shards "
+        "and whatever of others names the person, takes codes and frames out of checkpoints, notes "
+        "in withdrawn.json when that was, then searches all that is left for the subject's id. "
+        "Lists only, without --yes. 'express50 check' proves it at any later time.",
         epilog="example: express50 subject withdraw DATASET S001 --yes",
     )
     action.add_argument("dataset", type=Path, metavar="DATASET")
     action.add_argument("subject", metavar="SUBJECT")
+    action.add_argument(
+        "--checkpoint", type=Path, action="append", default=[], metavar="FILE",
+        help="a model outside the dataset that saw the person; may be repeated",
+    )  # fmt: skip
     action.add_argument("--yes", action="store_true", help="remove")
     action.add_argument("--json", action="store_true", help="print as JSON")
     action.set_defaults(handler=run_withdraw)
@@ -37,12 +45,21 @@ def run_withdraw(args: argparse.Namespace) -> int:
         if args.json:
             say_json({"subject": args.subject, "would_remove": paths})
         else:
-            say(*(f"would remove {path}" for path in paths), "add --yes to remove")
+            say(*(f"would remove {path}" for path in paths))
+            models = [*sorted((dataset.root / "grmm").rglob("*.pt")), *args.checkpoint]
+            say(*(f"would take codes and frames out of {path}" for path in models))
+            say("add --yes to remove")
         return OK
-    done = withdraw(dataset, args.subject)
+    for path in args.checkpoint:
+        if not path.is_file():
+            raise FormatError(f"--checkpoint {path}: no such file; name a model of 'grmm train'")
+    redact = import_module("grmm.withdraw").redact
+    done = withdraw(dataset, args.subject, args.checkpoint, redact)
     account = {
         "subject": done.subject,
         "removed": [str(path) for path in done.removed],
+        "files": done.files,
+        "checkpoints": [str(path) for path in done.checkpoints],
         "remaining": [str(path) for path in done.remaining],
         "raw_capture": str(done.capture) if done.capture else None,
     }
@@ -50,12 +67,13 @@ def run_withdraw(args: argparse.Namespace) -> int:
         say_json(account)
     else:
         say(*(f"removed {path}" for path in done.removed))
+        say(*(f"took codes and frames out of {path}" for path in done.checkpoints))
         say(*(f"STILL NAMES {done.subject}: {path}" for path in done.remaining))
         if done.capture:
             say(f"the raw capture {done.capture} is outside the dataset: delete it yourself")
         say(
             "run 'express50 matte' again, as others' plates may have come from the person, then "
-            "the stages after it and 'express50 report'; retrain models that saw the person, and "
-            "delete exports of the person outside the dataset"
+            "the stages after it and 'express50 report'; train models that saw the person again "
+            "(their other weights keep an influence), and delete exports outside the dataset"
         )
     return FAILED if done.remaining else OK

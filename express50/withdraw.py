@@ -1,38 +1,42 @@
 """Withdrawal of a subject: remove all that the dataset holds of a person, and look whether it did.
 
-Whatever mixes subjects (packed shards, reports) is removed whole and made again without the
-person by running its command. The raw capture lies outside the dataset and stays its owner's task.
+Whatever mixes subjects (packed shards, reports, trained models' pictures) is removed whole and made
+again without the person by running its command; others' outputs that name the person go too. A
+checkpoint loses the person's codes and frames; that its other weights saw the person only a new
+training mends. The raw capture lies outside the dataset and stays its owner's task.
 """
 
 from __future__ import annotations
 
 import json
-import re
 import shutil
 import sqlite3
-import tarfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from pathlib import Path
 
 from express50.digests import text_digest
-from express50.errors import StageError
+from express50.errors import FormatError, StageError
 from express50.layout import Dataset
+from express50.locks import hold_stages
+from express50.names import files_naming, names, says
 from express50.publish import write_json
 
-IMAGE_SUFFIXES = {".jpg", ".jpeg", ".png", ".exr", ".tif", ".ply", ".glb"}
-CHUNK = 1 << 24
+Redact = Callable[[Path, str], bool]
 
 
 @dataclass(frozen=True)
 class Withdrawal:
-    """What was (or would be) removed, and which files still name the subject."""
+    """What was removed, which checkpoints were changed, and which files still name the subject."""
 
     subject: str
     capture: Path | None
     removed: tuple[Path, ...]
+    checkpoints: tuple[Path, ...]
     remaining: tuple[Path, ...]
+    files: int
 
 
 def plan(dataset: Dataset, subject: str) -> list[Path]:
@@ -42,10 +46,15 @@ def plan(dataset: Dataset, subject: str) -> list[Path]:
         StageError: the dataset knows no such subject.
     """
     own = sorted(_own_paths(dataset, subject))
-    if subject not in dataset.captures() and not own:
+    if (
+        subject not in dataset.captures()
+        and not own
+        and text_digest(subject) not in withdrawn(dataset)
+    ):
         known = ", ".join(dataset.captures()) or "none"
         raise StageError(f"{dataset.root}: no subject {subject!r}; subjects: {known}")
-    return own + sorted(_mixed_paths(dataset))
+    paths = own + sorted(_mixed_paths(dataset))
+    return paths + sorted(_naming_items(dataset, subject, paths))
 
 
 def _own_paths(dataset: Dataset, subject: str) -> Iterator[Path]:
@@ -53,9 +62,24 @@ def _own_paths(dataset: Dataset, subject: str) -> Iterator[Path]:
         yield from (path for path in base.glob(f"*/{subject}") if path.is_dir())
     if dataset.labels_file(subject).exists():
         yield dataset.labels_file(subject)
+    reference = dataset.root / "labels" / "reference.json"
+    if reference.is_file() and subject in _values(reference):
+        yield reference  # the next subject becomes the reference
+    test = names(subject)
+    # Settings such as pack.test_subjects; the stage's next run writes its own.
+    yield from (p for p in (dataset.root / "config").glob("*.toml") if says(p, test))
     for path in (dataset.root / "logs").glob("*/*.txt"):
         if path.stem.split("+")[0] == subject:
             yield path
+
+
+def _values(path: Path) -> list[str]:
+    """Values of a JSON table of texts; none where it is not one."""
+    try:
+        table = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError:
+        return []
+    return [str(value) for value in table.values()] if isinstance(table, dict) else []
 
 
 def _mixed_paths(dataset: Dataset) -> Iterator[Path]:
@@ -63,97 +87,145 @@ def _mixed_paths(dataset: Dataset) -> Iterator[Path]:
     subjects = {*dataset.captures(), *dataset.subjects()}
     for base in (dataset.root, dataset.stale_dir):
         for metrics in base.glob("*/*/metrics.json"):
-            if metrics.parent.name not in subjects:
+            if metrics.parent.name not in subjects and base.joinpath("grmm") not in metrics.parents:
                 yield metrics.parent
-    if dataset.report_dir.exists():
-        yield dataset.report_dir
+    yield from (p for p in (dataset.report_dir, dataset.root / "accuracy") if p.exists())
     yield from (path for path in dataset.staging_dir.glob("*") if path.is_dir())
+    for path in (dataset.root / "grmm").rglob("*"):  # pictures and figures of whoever was trained
+        if path.is_file() and path.suffix != ".pt":
+            yield path
 
 
-def withdraw(dataset: Dataset, subject: str) -> Withdrawal:
+def _naming_items(dataset: Dataset, subject: str, gone: list[Path]) -> Iterator[Path]:
+    """Others' outputs that name the subject: their reference's, or whose plate stood in."""
+    for path in files_naming(dataset.root, subject):
+        parents = [path, *path.parents]
+        if not set(parents).isdisjoint(gone):
+            continue
+        for folder in parents:
+            depth = len(folder.relative_to(dataset.root).parts) if folder != dataset.root else 0
+            if depth in (2, 3) and (folder / "metrics.json").is_file():
+                yield folder
+                gone = [*gone, folder]
+                break
+            if depth == 0:
+                break
+
+
+def withdraw(
+    dataset: Dataset,
+    subject: str,
+    checkpoints: Sequence[Path] = (),
+    redact: Redact = lambda path, subject: False,
+) -> Withdrawal:
     """Remove a subject and search what is left for its id.
 
-    The subject's digest is remembered, so that ingest refuses to take the person in again.
+    A record of it is kept (`withdrawn_file`), so that ingest refuses to take the person in again.
+
+    Args:
+        dataset: the dataset.
+        subject: id.
+        checkpoints: files outside the dataset to redact, beside those below ``grmm``.
+        redact: removes a subject from a checkpoint, True where it was in there.
+
+    Raises:
+        StageError: the dataset knows no such subject, or a stage runs.
     """
-    paths = plan(dataset, subject)
-    captures = dataset.captures()
-    capture = captures.pop(subject, None)
-    write_json(withdrawn_file(dataset), sorted(withdrawn(dataset) | {text_digest(subject)}))
-    for path in paths:
-        if path.is_dir():
-            shutil.rmtree(path)
-        else:
-            path.unlink()
-    write_json(dataset.captures_file, {name: str(path) for name, path in captures.items()})
-    _forget(dataset, subject, paths)
-    return Withdrawal(subject, capture, tuple(paths), tuple(files_naming(dataset, subject)))
+    with hold_stages(dataset, sorted(p.stem for p in (dataset.root / "config").glob("*.toml"))):
+        paths = plan(dataset, subject)
+        captures = dataset.captures()
+        capture = captures.pop(subject, None)
+        files = sum(1 if p.is_file() else sum(q.is_file() for q in p.rglob("*")) for p in paths)
+        _record(dataset, subject, files)
+        for path in paths:
+            if path.is_dir():
+                shutil.rmtree(path)
+            else:
+                path.unlink()
+        write_json(dataset.captures_file, {name: str(path) for name, path in captures.items()})
+        _forget(dataset, subject, paths)
+        changed = list(_redacted(dataset, subject, checkpoints, redact))
+    remaining = [
+        *files_naming(dataset.root, subject),
+        *(path for path in _existing(checkpoints) if says(path, names(subject))),
+    ]
+    return Withdrawal(subject, capture, tuple(paths), tuple(changed), tuple(remaining), files)
+
+
+def _existing(paths: Sequence[Path]) -> list[Path]:
+    return [path for path in paths if path.is_file()]
+
+
+def _redacted(
+    dataset: Dataset, subject: str, checkpoints: Sequence[Path], redact: Redact
+) -> Iterator[Path]:
+    for path in [*sorted((dataset.root / "grmm").rglob("*.pt")), *_existing(checkpoints)]:
+        try:
+            if redact(path, subject):
+                yield path
+        except FormatError:
+            continue  # no checkpoint of ours: found below if it names the subject
 
 
 def withdrawn_file(dataset: Dataset) -> Path:
-    """Digests of the ids of withdrawn subjects."""
+    """Records of withdrawals."""
     return dataset.root / "withdrawn.json"
+
+
+def _record(dataset: Dataset, subject: str, files: int) -> None:
+    """Note when somebody was withdrawn and how many files went; the id only as a digest."""
+    path = withdrawn_file(dataset)
+    rows = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else []
+    time = datetime.now(UTC).isoformat(timespec="seconds")
+    write_json(path, [*rows, {"id_sha256": text_digest(subject), "time": time, "files": files}])
 
 
 def withdrawn(dataset: Dataset) -> set[str]:
     """SHA-256 of the ids of withdrawn subjects; the ids themselves are not kept."""
     path = withdrawn_file(dataset)
-    return set(json.loads(path.read_text(encoding="utf-8"))) if path.is_file() else set()
+    if not path.is_file():
+        return set()
+    rows = json.loads(path.read_text(encoding="utf-8"))
+    return {row if isinstance(row, str) else row["id_sha256"] for row in rows}
 
 
 def _forget(dataset: Dataset, subject: str, paths: list[Path]) -> None:
     """Remove receipts and digests, and overwrite the database's freed pages."""
     if not dataset.ledger.is_file():
         return
-    items = {path.relative_to(dataset.root).parts[:2] for path in paths}
+    pairs = {_stage_and_item(path.relative_to(dataset.root)) for path in paths}
     root = str(dataset.root.resolve())
     with closing(sqlite3.connect(dataset.ledger, isolation_level=None)) as database:
         database.execute("PRAGMA secure_delete=ON")
-        for stage, item in (pair for pair in items if len(pair) == 2):
-            database.execute("DELETE FROM receipts WHERE stage = ? AND item = ?", (stage, item))
-        database.execute(
-            "DELETE FROM receipts WHERE item = ? OR substr(item, 1, ?) = ?",
-            (subject, len(subject) + 1, f"{subject}/"),
-        )
+        tables = [row[0] for row in database.execute("SELECT name FROM sqlite_master")]
+        for table in (name for name in ("receipts", "made") if name in tables):
+            database.executemany(f"DELETE FROM {table} WHERE stage = ? AND item = ?", pairs)
+            database.execute(
+                f"DELETE FROM {table} WHERE item = ? OR substr(item, 1, ?) = ?",
+                (subject, len(subject) + 1, f"{subject}/"),
+            )
         for path in paths:
             prefix = f"{root}/{path.relative_to(dataset.root).as_posix()}"
             database.execute(
                 "DELETE FROM digests WHERE path = ? OR substr(path, 1, ?) = ?",
                 (prefix, len(prefix) + 1, f"{prefix}/"),
             )
+        _forget_naming(database, subject)
         database.execute("PRAGMA wal_checkpoint(TRUNCATE)")
         database.execute("VACUUM")
         database.execute("PRAGMA wal_checkpoint(TRUNCATE)")
 
 
-def files_naming(dataset: Dataset, subject: str) -> Iterator[Path]:
-    """Files of a dataset whose path, content or archive members name a subject."""
-    word = re.compile(rb"(?<![A-Za-z0-9])" + re.escape(subject.encode()) + rb"(?![A-Za-z0-9])")
-    for path in sorted(p for p in dataset.root.rglob("*") if p.is_file()):
-        if word.search(str(path.relative_to(dataset.root)).encode()) or _names(path, word):
-            yield path
+def _forget_naming(database: sqlite3.Connection, subject: str) -> None:
+    """Remove what else names the subject: its footage's digests, others' reasons and inputs."""
+    test = names(subject)
+    database.create_function("names", 1, lambda text: test((text or "").encode()))
+    database.execute("DELETE FROM digests WHERE names(path)")
+    database.execute("DELETE FROM receipts WHERE names(reason) OR names(metrics)")
+    if database.execute("SELECT 1 FROM sqlite_master WHERE name = 'made'").fetchone():
+        database.execute("DELETE FROM made WHERE names(inputs) OR names(files)")
 
 
-def _names(path: Path, word: re.Pattern[bytes]) -> bool:
-    suffix = path.suffix.lower()
-    if suffix in IMAGE_SUFFIXES:  # pixels and points may hold any four bytes by chance
-        return False
-    if suffix == ".tar":
-        return _tar_names(path, word)
-    with path.open("rb") as file:
-        tail = b""
-        while block := file.read(CHUNK):
-            if word.search(tail + block):
-                return True
-            tail = block[-256:]
-    return False
-
-
-def _tar_names(path: Path, word: re.Pattern[bytes]) -> bool:
-    with tarfile.open(path, "r:") as tar:
-        for member in tar:
-            if word.search(member.name.encode()):
-                return True
-            file = tar.extractfile(member) if member.name.endswith(".json") else None
-            if file is not None and word.search(file.read()):
-                return True
-    return False
+def _stage_and_item(path: Path) -> tuple[str, str]:
+    stage, *item = path.parts
+    return stage, "/".join(item)

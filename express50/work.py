@@ -13,10 +13,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from express50.digests import value_digest
+from express50.digests import files_of, value_digest
 from express50.errors import Express50Error, StageError
 from express50.layout import Dataset
-from express50.ledger import Receipt
+from express50.ledger import FileMark, Made, Receipt, mark_file
 from express50.publish import dump_json, publishing, write_bytes
 from express50.stage import Stage
 from express50.threads import cap_threads
@@ -31,13 +31,14 @@ class Task:
     item: str
     config: Any
     fingerprint: str
+    inputs: dict[str, str]
     threads: int = 1
 
 
-def fingerprint(
+def input_digests(
     stage: Stage, dataset: Dataset, item: str, config: Any, digest: Callable[[Path], str]
-) -> str:
-    """Digest of stage version, resolved config and inputs of an item.
+) -> dict[str, str]:
+    """Digest of every input of an item, by its name.
 
     Args:
         stage: the stage.
@@ -49,10 +50,15 @@ def fingerprint(
     Raises:
         Express50Error: an input is missing or cannot be read.
     """
-    digests = {}
-    for name, value in stage.inputs(dataset, item, config).items():
-        digests[name] = digest(value) if isinstance(value, Path) else value
-    return value_digest([stage.name, stage.version, vars(config), digests])
+    return {
+        name: digest(value) if isinstance(value, Path) else value
+        for name, value in stage.inputs(dataset, item, config).items()
+    }
+
+
+def fingerprint(stage: Stage, config: Any, inputs: dict[str, str]) -> str:
+    """Digest of stage version, resolved config and inputs of an item."""
+    return value_digest([stage.name, stage.version, vars(config), inputs])
 
 
 def run_task(task: Task) -> Receipt:
@@ -63,9 +69,11 @@ def run_task(task: Task) -> Receipt:
     cap_threads(task.threads)
     reset_peak_memory()
     started = time.perf_counter()
-    reason, metrics = "", {}
+    reason, made = "", None
+    metrics: dict = {}
     try:
-        metrics = _run_and_publish(task)
+        metrics, files = _run_and_publish(task)
+        made = Made(task.inputs, files)
     except Express50Error as error:
         reason = f"{type(error).__name__}: {error}"
     except Exception as error:  # noqa: BLE001
@@ -80,16 +88,19 @@ def run_task(task: Task) -> Receipt:
         metrics=metrics,
         seconds=time.perf_counter() - started,
         peak_memory=peak_memory(),
+        made=made,
     )
 
 
-def _run_and_publish(task: Task) -> dict:
+def _run_and_publish(task: Task) -> tuple[dict, dict[str, FileMark]]:
     with publishing(task.dataset, task.stage.name, task.item) as out:
         # Data belong on standard output, and a library's chatter is none.
         with contextlib.redirect_stdout(sys.stderr):
             metrics = task.stage.run(task.dataset, task.item, task.config, out)
         (out / "metrics.json").write_bytes(_metrics_bytes(metrics))
-    return json.loads(_metrics_bytes(metrics))
+        # Their bytes are still in memory; a rename changes neither time nor inode.
+        files = {p.relative_to(out).as_posix(): mark_file(p) for p in files_of(out)}
+    return json.loads(_metrics_bytes(metrics)), files
 
 
 def _metrics_bytes(metrics: dict) -> bytes:

@@ -133,7 +133,7 @@ def load_checkpoint(path: Path, device: torch.device | str = "cpu") -> Loaded:
     Raises:
         FormatError: no such file, or not a checkpoint of this format.
     """
-    content = _read(path)
+    content = read_content(path)
     config = from_tables(content["config"])
     head = load_head(content["head"]).to(device)
     offsets = _arrays(content.get("offsets", {}))
@@ -173,7 +173,12 @@ def load_checkpoint(path: Path, device: torch.device | str = "cpu") -> Loaded:
     )
 
 
-def _read(path: Path) -> dict[str, Any]:
+def read_content(path: Path) -> dict[str, Any]:
+    """The tables of a checkpoint, as they were saved.
+
+    Raises:
+        FormatError: no such file, or not a checkpoint of this format.
+    """
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
     except FileNotFoundError as error:

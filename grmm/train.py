@@ -139,6 +139,11 @@ def save(run: Run, path: Path, config: Config, head_spec: str) -> None:
 def restore(run: Run, path: Path, config: Config, device: torch.device) -> None:
     """Put a run back to where its checkpoint was written."""
     loaded = load_checkpoint(path, device)
+    if not loaded.loop:
+        raise ConfigError(
+            f"{path}: holds no state to resume from (a person was withdrawn from it, or it is a "
+            "fit); train into another folder"
+        )
     budget = {"iterations", "seconds", "save_every", "log_every", "evaluate_images", "threads",
               "tensorboard"}  # fmt: skip
     old, new = as_tables(loaded.config), as_tables(config)

@@ -20,6 +20,7 @@ import numpy as np
 from express50.cameras import Camera, write_cameras
 from express50.capture import RawCapture, check_calibrated_sizes
 from express50.captures.read import OURS, read_any, subject_of, watched
+from express50.demographics import public_meta
 from express50.digests import stat_digest, text_digest
 from express50.errors import CaptureError, StageError
 from express50.frames import decode_proxy
@@ -247,7 +248,7 @@ def make_index(raw: RawCapture, cameras: dict[str, CameraSource], cues: tuple[Cu
         board=board,
         calibration=_given(raw),
         cues=cues,
-        meta=raw.meta,
+        meta=public_meta(raw.meta),
     )
 
 
@@ -309,7 +310,7 @@ def write_contact_sheet(index: Index, out: Path) -> None:
 
 STAGE = Stage(
     name="ingest",
-    version=2,
+    version=3,
     config=IngestConfig,
     presets=PRESETS,
     items=items,

@@ -6,11 +6,14 @@ import hashlib
 from collections import Counter
 from collections.abc import Mapping, Sequence
 
-from express50.demographics import age_counts, age_summary, gender_counts
+from express50.demographics import (
+    LEAST_PEOPLE,
+    age_counts,
+    gender_counts,
+    mean_age,
+    shown_counts,
+)
 from express50.errors import StageError
-
-# Of fewer people a count says who: one of two subjects is the woman, or the one aged 71.
-LEAST_PEOPLE = 5
 
 
 def split_subjects(
@@ -117,14 +120,12 @@ def write_card(
 def people_lines(people: Sequence[Mapping]) -> list[str]:
     """Gender and age of the subjects as tables of counts, as far as enough captures say."""
     lines = []
-    genders = gender_counts([meta for meta in people if "gender" in meta])
-    ages = age_summary(people)
-    if sum(genders.values()) >= LEAST_PEOPLE:
-        lines += _count_table("gender", gender_counts(people))
-    if ages is not None and ages["people"] >= LEAST_PEOPLE:
-        span = f"{ages['youngest']:g} to {ages['oldest']:g} years, mean {ages['mean']:g}"
-        lines += [f"Age: {span}, of {ages['people']:g} people.", ""]
-        lines += _count_table("age", age_counts(people))
+    if genders := shown_counts(gender_counts(people)):
+        lines += _count_table("gender", genders)
+    if mean := mean_age(people):
+        lines += [f"Age: {mean[0]:g} years in the mean of {mean[1]} people.", ""]
+    if ages := shown_counts(age_counts(people)):
+        lines += _count_table("age", ages)
     few = f"Gender and age are not stated, or of fewer than {LEAST_PEOPLE} of {len(people)} people."
     return lines[:-1] or [few]
 

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 
 from express50.cameras import Camera
+from express50.captures.person import read_people
 from express50.depth_files import depth_file, read_depth
 from express50.errors import CaptureError, FormatError, StageError
 from express50.exclusions import exclusion_reason
@@ -31,7 +32,7 @@ from express50.shards_codecs import encode_pictures
 from express50.shards_offsets import write_offsets
 from express50.shards_write import PackedSample, ShardWriter, sample_key, write_manifest
 from express50.stage import Stage
-from pipelines.pack.card import split_subjects, write_card
+from pipelines.pack.card import people_lines, split_subjects, write_card
 from pipelines.pack.colour import evened, own_picture
 from pipelines.pack.config import PRESETS, PackConfig
 from pipelines.pack.crop import Crop, crop_pinhole, cut_depth, cut_image, cut_labels, head_crop
@@ -66,7 +67,9 @@ def inputs(dataset: Dataset, item: str, config: PackConfig) -> dict[str, Path | 
             "regions": dataset.item_dir("regions", subject),
         }
         found |= {f"{subject} {name}": path for name, path in parts.items() if path.exists()}
-    return found
+    # As they would stand on the card: of fewer people than may be counted nothing is kept.
+    included = [s for s in dataset.subjects() if f"{s} index" in found]
+    return found | {"people": "\n".join(people_lines(read_people(dataset, included)))}
 
 
 def run(dataset: Dataset, item: str, config: PackConfig, out: Path) -> dict:
@@ -103,7 +106,7 @@ def run(dataset: Dataset, item: str, config: PackConfig, out: Path) -> dict:
     for subject in subjects:
         if subject.offsets is not None and subject.name in packed:
             write_offsets(out, subject.name, subject.offsets)
-    people = [read_index(dataset, name).meta for name in packed]
+    people = read_people(dataset, packed)
     return _finish(out, splits, metas, people, read, dropped, config)
 
 
@@ -262,7 +265,7 @@ def _finish(
         "depth_coverage": covered,
         "with_parts": len(metas) - len(lacking),
         "torso_removed": bare,
-        "warnings": _lacking_warning(lacking, len(metas)),
+        "warnings": [*_lacking_warning(lacking, len(metas)), *_unstated(metas)],
         "dropped": dropped,
     }
 
@@ -276,6 +279,20 @@ def _lacking_warning(lacking: list[dict], count: int) -> list[dict[str, str]]:
         " torso; run 'express50 regions', then pack again"
     )
     return [{"what": "regions", "why": why}]
+
+
+def _unstated(metas: list[dict]) -> list[dict[str, str]]:
+    """A warning for each subject whose samples carry no consent id or no licence."""
+    keys = {"consent": "consent_id", "licence": "licence"}
+    lacking = {
+        name: [keys[key] for key in keys if meta[key] is None]
+        for name, meta in ((meta["subject"], meta) for meta in metas)
+    }
+    return [
+        {"what": name, "why": f"capture.toml gives no {' and no '.join(what)}; its samples lack it"}
+        for name, what in sorted(lacking.items())
+        if what
+    ]
 
 
 def _write_picture(out: Path, reader: ShardReader) -> float:
@@ -303,7 +320,7 @@ def _write_picture(out: Path, reader: ShardReader) -> float:
 
 STAGE = Stage(
     name="pack",
-    version=6,
+    version=7,
     config=PackConfig,
     presets=PRESETS,
     items=items,

@@ -60,7 +60,8 @@ def _read_subject(dataset: Dataset, name: str) -> Subject:
     """
     index = read_index(dataset, name)
     peaks = read_peaks(dataset, name)
-    labels = json.loads((dataset.item_dir("align", name) / "peaks.json").read_text("utf-8"))
+    peak_rows = json.loads((dataset.item_dir("align", name) / "peaks.json").read_text("utf-8"))
+    labels = {expression: nameless(row) for expression, row in peak_rows.items()}
     track = read_track(track_file(dataset, name))
     shared = {"shape": track.shape.tolist(), "offsets": bool(track.offsets.any())}
     tracked, vertices = {}, {}
@@ -80,3 +81,10 @@ def _read_subject(dataset: Dataset, name: str) -> Subject:
     gains = read_gains(dataset, name)
     offsets = track.offsets if shared["offsets"] else None
     return Subject(name, cameras, gains, peaks, labels, tracked, vertices, offsets, meta)
+
+
+def nameless(label: dict) -> dict:
+    """A label without its annotator's name: ``person`` stands for whoever is no rule's name."""
+    who = str(label.get("annotator", "unknown"))
+    kept = who in ("auto", "unknown") or who.startswith("rule:")
+    return label | {"annotator": who if kept else "person"}

@@ -216,7 +216,7 @@ def test_whichever_call_finds_the_scheduler_gone_the_error_is_the_same(call):
     getattr(client, call).side_effect = CommClosedError("in <TCP (closed)>: reset by peer")
     pool = Pool(scheduler="tcp://gone:8786")
     pool._client = client
-    task = Task(toy.STAGE, toy.Dataset(Path("data")), "item", toy.ToyConfig(), "f" * 64)
+    task = Task(toy.STAGE, toy.Dataset(Path("data")), "item", toy.ToyConfig(), "f" * 64, {})
     with pytest.raises(StageError, match="lost the dask scheduler .*reset by peer"):
         pool.run([task, task], settle=Mock(), tick=Mock())
 

@@ -1,15 +1,24 @@
 """Withdrawal: nothing of the person stays, nothing of the others goes."""
 
 import json
+import shutil
+import sqlite3
+from datetime import datetime
 
+import numpy as np
 import pytest
 
+from express50.captures.person import read_people
 from express50.cli import main
+from express50.digests import text_digest
 from express50.errors import CaptureError, StageError
+from express50.index import read_index
 from express50.layout import Dataset
-from express50.ledger import Ledger
+from express50.ledger import Ledger, Made, Receipt
+from express50.locks import stage_lock
+from express50.names import files_naming, files_that, names_any_of
 from express50.publish import publishing
-from express50.withdraw import files_naming, withdraw
+from express50.withdraw import withdraw, withdrawn, withdrawn_file
 from pipelines import ingest
 from tests.faults.toy import tree
 from tests.synth import make_capture
@@ -35,10 +44,10 @@ def dataset(tmp_path):
 
 def test_nothing_of_the_subject_stays_and_the_others_are_untouched(dataset):
     others = {k: v for k, v in tree(dataset.root).items() if "S002" in k}
-    assert len(list(files_naming(dataset, "S001"))) > 5
+    assert len(list(files_naming(dataset.root, "S001"))) > 5
     done = withdraw(dataset, "S001")
     assert done.remaining == ()
-    assert list(files_naming(dataset, "S001")) == []
+    assert list(files_naming(dataset.root, "S001")) == []
     assert b"S001" not in dataset.ledger.read_bytes()
     assert {k: v for k, v in tree(dataset.root).items() if "S002" in k} == others
     assert not dataset.item_dir("pack", "shards").exists()
@@ -84,3 +93,107 @@ def test_withdrawn_subject_is_not_taken_in_again(dataset):
 def test_unknown_subject_is_an_error(dataset):
     with pytest.raises(StageError, match="no subject 'S00'; subjects: S001, S002"):
         withdraw(dataset, "S00")
+
+
+def test_what_others_outputs_and_tables_say_of_the_person_goes_too(dataset):
+    with publishing(dataset, "align", "S002") as out:
+        (out / "metrics.json").write_text("{}")
+        (out / "suggestions.json").write_text('{"smile": {"reference": {"subject": "S001"}}}')
+    (dataset.root / "labels" / "reference.json").write_text('{"subject": "S001"}')
+    dataset.config_file("pack").write_text('[pack]\ntest_subjects = ["S001"]\n')
+    footage = dataset.captures()["S001"] / "capture.toml"
+    with Ledger(dataset.ledger) as ledger:
+        done = {"stage": "align", "fingerprint": "f", "status": "done"}
+        ledger.write(Receipt(item="S002", metrics={"reference": "S001"}, **done))
+        ledger.write(Receipt(item="S003", made=Made({"S001 plate": "d"}, {}), **done))
+        ledger.write(Receipt(item="S004", made=Made({"plate": "d"}, {}), **done))
+        ledger.sha256(footage)
+        ledger.keep_digests()
+    done = withdraw(dataset, "S001")
+    assert done.remaining == ()
+    assert not dataset.item_dir("align", "S002").exists()
+    assert not (dataset.root / "labels" / "reference.json").exists()
+    with Ledger(dataset.ledger) as ledger:
+        assert "S002" not in ledger.read("align")
+        assert list(ledger.made("align")) == ["S004"]
+    assert b"S001" not in dataset.ledger.read_bytes()
+
+
+def test_the_record_says_when_and_how_much_but_not_who(dataset):
+    count = len([k for k in tree(dataset.root) if "S001" in k or k.startswith("pack/")])
+    done = withdraw(dataset, "S001")
+    text = withdrawn_file(dataset).read_text()
+    (row,) = json.loads(text)
+    assert row["files"] == done.files == count and "S001" not in text
+    assert datetime.fromisoformat(row["time"]).tzinfo is not None
+    assert withdrawn(dataset) == {row["id_sha256"]} == {text_digest("S001")}
+    withdrawn_file(dataset).write_text(json.dumps([text_digest("S001")]))  # as it once was
+    assert withdrawn(dataset) == {text_digest("S001")}
+
+
+def test_nobody_is_withdrawn_under_a_running_stage(dataset):
+    before = tree(dataset.root)
+    with stage_lock(dataset, "ingest"), pytest.raises(StageError, match="another 'ingest' runs"):
+        withdraw(dataset, "S001")
+    after, before = (
+        {k: v for k, v in files.items() if not k.endswith(".lock")}
+        for files in (tree(dataset.root), before)
+    )
+    assert after == before
+
+
+def test_texts_in_arrays_and_archives_are_read_and_numbers_are_not(tmp_path):
+    np.savez_compressed(tmp_path / "who.npz", subjects=np.array(["S002", "S001"]))
+    np.savez(tmp_path / "chance.npz", values=np.frombuffer(b"\0S001\0\0\0", np.uint8))
+    (tmp_path / "S001_smile.txt").write_text("")
+    (tmp_path / "S0011.txt").write_text("S0011 xS001 S001x")
+    found = {path.name for path in files_naming(tmp_path, "S001")}
+    assert found == {"who.npz", "S001_smile.txt"}
+    by_digest = files_that(names_any_of({text_digest("S001")}), tmp_path)
+    assert {path.name for path in by_digest} == found
+
+
+def test_check_proves_a_withdrawal_and_finds_what_comes_back(dataset, capsys):
+    withdraw(dataset, "S001")
+    shutil.rmtree(dataset.stage_dir("matte"))  # outputs without receipts, made by this test
+    dataset.labels_file("S002").write_text("")
+    assert main(["check", str(dataset.root)]) == 0
+    (dataset.root / "export").mkdir()
+    (dataset.root / "export" / "a.json").write_text('{"key": "S001_smile_cam00"}')
+    capsys.readouterr()
+    assert main(["check", str(dataset.root)]) == 1
+    assert "export/a.json: names a person who was withdrawn" in capsys.readouterr().out
+
+
+PERSON = 'name = "Jane Roe"\nage = 4711e-2\ngender = "feminine"\nconsent_id = "C-77"\n'
+
+
+def test_what_describes_a_person_stays_in_the_capture(dataset, tmp_path):
+    capture = tmp_path / "raw" / "S001" / "capture.toml"
+    capture.write_text(capture.read_text() + PERSON)
+    assert main(["ingest", str(dataset.root), "--workers", "0"]) == 0
+    assert read_index(dataset, "S001").meta["consent_id"] == "C-77"
+    for name, data in tree(dataset.root).items():
+        assert not {w for w in (b"Jane", b"47.11", b"feminine") if w in data}, name
+    assert read_people(dataset, ["S001"]) == [{"gender": "feminine", "age": 47.11}]
+
+
+def test_what_an_older_ingest_kept_of_a_person_is_found_and_mended(dataset, capsys):
+    path = dataset.item_dir("ingest", "S001") / "index.json"
+    content = json.loads(path.read_text())
+    content["meta"]["name"] = "Jane Roe"
+    path.write_text(json.dumps(content))
+    with sqlite3.connect(dataset.ledger) as database:
+        database.execute("DROP TABLE made")
+    shutil.rmtree(dataset.stage_dir("matte"))
+    shutil.rmtree(dataset.stage_dir("pack"))
+    (dataset.root / "labels" / "S001.jsonl").write_text("")
+    (dataset.root / "labels" / "S002.jsonl").write_text("")
+    assert main(["check", str(dataset.root), "--json"]) == 1
+    said = capsys.readouterr().out
+    (finding,) = json.loads(said)["findings"]
+    assert finding["kind"] == "personal" and "holds name" in finding["why"]
+    assert "Jane" not in said
+    assert main(["check", str(dataset.root), "--mend"]) == 0
+    assert main(["ingest", str(dataset.root), "--workers", "0"]) == 0
+    assert "name" not in read_index(dataset, "S001").meta

@@ -128,7 +128,7 @@ def test_interrupt_stops_soon_and_is_resumable(tmp_path):
 
 def test_second_run_on_the_same_stage_is_refused(tmp_path):
     from express50.errors import StageError
-    from express50.runner import stage_lock
+    from express50.locks import stage_lock
 
     dataset = toy.make_dataset(tmp_path / "data", ["item0"])
     with stage_lock(dataset, "toy"), pytest.raises(StageError, match="another 'toy' runs"):

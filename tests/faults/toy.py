@@ -84,6 +84,32 @@ STAGE = Stage(
 )
 
 
+def after_toy() -> Stage:
+    """A stage that reads the toy's folders."""
+
+    def copy(dataset: Dataset, item: str, config: ToyConfig, out: Path) -> dict:
+        data = b"".join(
+            path.read_bytes() for path in sorted((dataset.item_dir("toy", item) / "deep").iterdir())
+        )
+        (out / "sum.txt").write_text(hashlib.sha256(data).hexdigest())
+        return {}
+
+    return Stage(
+        name="after",
+        version=1,
+        config=ToyConfig,
+        presets=STAGE.presets,
+        items=items,
+        inputs=lambda dataset, item, config: {"toy": dataset.item_dir("toy", item)},
+        run=copy,
+    )
+
+
+def run_stage_of(stage: Stage, dataset: Dataset):
+    config = resolve_config(stage, "standard", None, [])
+    return run_stage(stage, dataset, config, workers=0, progress=False)
+
+
 def make_dataset(root: Path, names: list[str]) -> Dataset:
     (root / "in").mkdir(parents=True)
     for name in names:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from express50.cameras import project, read_cameras
+from express50.captures.person import read_people
 from express50.captures.read import detect, read_any, subject_of
 from express50.colour_polynomial import correct_srgb8
 from express50.config import resolve_config
@@ -68,8 +69,8 @@ def test_renderme_full_release(tmp_path):
     assert index.meta["renderme360"]["e2"] == {
         "performance": "e2", "release": "full", "num_frame": 5, "last_frame": 4,
     }  # fmt: skip
-    assert (index.meta["age"], index.meta["gender"]) == (27, "female")
-    assert "weight" not in str(index.meta)
+    assert read_people(dataset, [subject]) == [{"age": 27, "gender": "female"}]
+    assert not {"age", "gender", "weight"} & set(index.meta)
     assert str(tmp_path) not in (dataset.item_dir("ingest", subject) / "index.json").read_text()
     assert_rig(dataset, subject, rig([f"cam{n:02d}" for n in range(4)]))
     config = resolve_config(calibrate.STAGE, "draft", None, ["calibrate.check_moments=0"])
@@ -185,7 +186,8 @@ def test_ravdess_names(tmp_path):
     write_video(path / "02-01-03-02-01-01-05.mp4", noise_video_images(4))
     dataset, subject = ingested(tmp_path, path)
     index = read_index(dataset, subject)
-    assert (subject, index.meta["gender"], index.fps) == ("Actor_05", "male", 24.0)
+    assert (subject, index.fps) == ("Actor_05", 24.0) and "gender" not in index.meta
+    assert read_people(dataset, [subject]) == [{"gender": "male"}]
     assert index.cues == (Cue("song_sad_normal_dogs_1", 0, 4), Cue("happy_strong_kids_1", 5, 8))
     lost = told(dataset, subject)
     assert "the same clip as 01-01-03" in lost["file 02-01-03-02-01-01-05.mp4"]

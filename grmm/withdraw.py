@@ -1,0 +1,50 @@
+"""Take a person out of a checkpoint: codes, tracked frames, offsets and the optimizer's memory."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from express50.publish import write_bytes
+from grmm.checkpoint import read_content
+
+
+def redact(path: Path, subject: str) -> bool:
+    """Remove a subject from a checkpoint in place; True where it was in there.
+
+    A checkpoint of nobody else is deleted. What is left renders the others as before, and cannot be
+    resumed: the optimizer's state had a row for the person. The decoders' weights, which everybody
+    shares, stay as they are.
+
+    Raises:
+        FormatError: the file is no checkpoint of 'grmm train' or 'fit'.
+    """
+    content = read_content(path)
+    named = {*content["subjects"], *content.get("offsets", {})}
+    named |= {frame["subject"] for frame in content["frames"]}
+    if subject not in named:
+        return False
+    if content["subjects"] == [subject]:
+        path.unlink()
+        return True
+    buffer = io.BytesIO()
+    torch.save(_without(content, subject), buffer)
+    write_bytes(path, buffer.getvalue())
+    return True
+
+
+def _without(content: dict[str, Any], subject: str) -> dict[str, Any]:
+    rows = [row for row, name in enumerate(content["subjects"]) if name != subject]
+    # Indexing with a list copies: a view would carry the removed row to the disk.
+    codes = content["model"]["z_id"][rows]
+    return content | {
+        "subjects": [content["subjects"][row] for row in rows],
+        "model": content["model"] | {"z_id": codes},
+        "frames": [frame for frame in content["frames"] if frame["subject"] != subject],
+        "offsets": {k: v for k, v in content.get("offsets", {}).items() if k != subject},
+        "optimizer": {},
+        "loop": {},
+    }

@@ -1,0 +1,106 @@
+"""Plans: figures come from receipts, grow by the stated law, or are absent."""
+
+import json
+import math
+
+import pytest
+
+from express50.cli import main
+from express50.errors import ConfigError
+from express50.layout import Dataset
+from express50.ledger import Ledger
+from express50.plan import TARGETS, Footage, Measured, estimate, measure, target_of
+from express50.stage_cli import stages
+from pipelines import ingest
+from tests.synth import make_capture
+
+SMALL = Footage(subjects=2, expressions=6, views=8, pixels=1e5, frames=36)
+LARGE = Footage(subjects=2, expressions=6, views=16, pixels=4e5, frames=36)
+
+
+def cost(footage, seconds, size=1e6, memory=1e9, preset="draft"):
+    return Measured(
+        footage=footage, items=12, seconds=seconds, bytes=size, memory=memory, preset=preset
+    )
+
+
+def test_express_50_is_scaled_linearly_from_one_dataset():
+    target = target_of("express-50", {}, SMALL)
+    assert target == Footage(subjects=50, expressions=60, views=24, pixels=8294400, frames=360)
+    (row,) = estimate(["depth"], target, [{"depth": cost(SMALL, 2.0)}], workers=10)
+    ratio = 24 * 8294400 / (8 * 1e5)
+    assert row.items == 3000 and row.seconds == pytest.approx(2 * ratio)
+    assert row.core_hours == pytest.approx(3000 * 2 * ratio / 3600)
+    assert row.days == pytest.approx(row.core_hours / 240)
+    assert row.disk == pytest.approx(3000 * 1e6 * ratio)
+    # What does not grow cannot be told from one dataset: no guess is printed.
+    assert (row.memory, row.memory_grows) == (1e9, False)
+
+
+def test_two_datasets_give_an_exponent_and_a_line_of_memory():
+    tables = [{"depth": cost(SMALL, 2.0)}, {"depth": cost(LARGE, 8.0, 2e6, 1.7e9)}]
+    target = Footage(subjects=1, expressions=1, views=16, pixels=8e5, frames=6)
+    (row,) = estimate(["depth"], target, tables, workers=1)
+    power = math.log(4) / math.log(8)
+    assert row.seconds == pytest.approx(8 * 2**power) and f"^{power:.2f}, fitted" in row.how
+    assert row.disk == pytest.approx(2e6 * 2 ** (1 / 3))
+    assert row.memory == pytest.approx(1.7e9 + 0.1e9 * 8) and row.memory_grows
+    (same,) = estimate(["depth"], LARGE, tables[::-1], workers=1)
+    assert same.seconds == pytest.approx(8.0)
+
+
+@pytest.mark.parametrize(
+    "second", [cost(LARGE, 1.0), cost(SMALL, 3.0), cost(LARGE, 8.0, preset="standard")],
+    ids=["faster", "same size", "other preset"],
+)  # fmt: skip
+def test_what_tells_no_growth_is_not_fitted(second):
+    target = Footage(subjects=1, expressions=1, views=8, pixels=2e5, frames=6)
+    (row,) = estimate(["depth"], target, [{"depth": cost(SMALL, 2.0)}, {"depth": second}], 1)
+    assert "fitted" not in row.how
+    if second.preset != "draft":
+        assert row.seconds == pytest.approx(4.0) and row.preset == "draft"
+
+
+def test_one_item_is_not_split_over_workers():
+    (row,) = estimate(["pack"], SMALL, [{"pack": cost(SMALL, 86400.0)}], workers=32)
+    assert row.items == 1 and row.days == pytest.approx(1.0)
+
+
+def test_what_was_not_measured_says_so():
+    rows = estimate(["depth", "track"], SMALL, [{"depth": cost(SMALL, 2.0)}], 1, "reference")
+    assert [row.why for row in rows] == ["measured with draft, not reference", "was not run"]
+    assert all(row.seconds is row.core_hours is row.disk is row.memory is None for row in rows)
+
+
+def test_every_stage_has_a_law_and_every_target_a_size():
+    rows = estimate(list(stages()), SMALL, [], 1)
+    assert [row.stage for row in rows] == list(stages())
+    for name in TARGETS:
+        assert target_of(name, {"frames_per_expression": 90}, SMALL).frames in (5400, 1080)
+    with pytest.raises(ConfigError, match="expected sizes above 0"):
+        target_of(None, {"views": 0}, SMALL)
+
+
+def test_figures_are_those_of_the_receipts(tmp_path, capsys):
+    for name in ("S001", "S002"):
+        make_capture(tmp_path / name, subject=name, cameras=2, frames=4, size=64)
+    root = tmp_path / "data"
+    captures = [str(tmp_path / name) for name in ("S001", "S002")]
+    assert main(["ingest", str(root), *captures, "--workers", "0", "--preset", "draft"]) == 0
+    dataset = Dataset(root)
+    with Ledger(dataset.ledger) as ledger:
+        receipts = ledger.read("ingest").values()
+    found = measure(dataset, [ingest.STAGE])["ingest"]
+    assert found.seconds == pytest.approx(sum(r.seconds for r in receipts) / 2)
+    assert found.memory == max(r.peak_memory for r in receipts) and found.preset == "draft"
+    files = [p for p in dataset.stage_dir("ingest").rglob("*") if p.is_file()]
+    assert found.bytes == sum(p.stat().st_size for p in files) / 2
+    assert found.footage == Footage(subjects=2, expressions=2, views=2, pixels=4096, frames=4)
+    capsys.readouterr()
+    assert main(["plan", str(root), "--size", "128x64", "--subjects", "10", "--json"]) == 0
+    first = json.loads(capsys.readouterr().out)["stages"][0]
+    assert first["items"] == 10 and first["seconds"] == pytest.approx(2 * found.seconds)
+    assert main(["plan", str(root), "--target", "renderme-360"]) == 0
+    said = capsys.readouterr().out
+    assert "was not run" in said and "the sum lacks calibrate" in said
+    assert main(["plan", str(root), "--size", "big"]) == 2
