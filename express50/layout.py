@@ -134,6 +134,11 @@ class Dataset:
         """Outputs set aside because a newer run of their item failed or no longer lists it."""
         return self.root / ".stale"
 
+    @property
+    def slurm_dir(self) -> Path:
+        """Output of SLURM jobs, one file a job."""
+        return self.root / "logs" / "slurm"
+
     def log_file(self, stage: str, item: str) -> Path:
         """Traceback of an unexpected failure of one item."""
         return self.root / "logs" / stage / f"{item.replace('/', '+')}.txt"

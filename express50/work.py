@@ -21,6 +21,8 @@ from express50.publish import dump_json, publishing, write_bytes
 from express50.stage import Stage
 from express50.threads import cap_threads
 
+BATCH_SECONDS = 0.2  # a batch begins no further item after so long
+
 
 @dataclass(frozen=True)
 class Task:
@@ -55,6 +57,16 @@ def fingerprint(
     return value_digest([stage.name, stage.version, vars(config), digests])
 
 
+def run_tasks(tasks: list[Task]) -> list[Receipt]:
+    """Run items one after another for a while; receipts of those that were begun, at least one."""
+    began, receipts = time.perf_counter(), []
+    for task in tasks:
+        receipts.append(run_task(task))
+        if time.perf_counter() - began > BATCH_SECONDS:
+            break
+    return receipts
+
+
 def run_task(task: Task) -> Receipt:
     """Run one item and publish its outputs; whatever goes wrong becomes a receipt.
 
@@ -84,12 +96,24 @@ def run_task(task: Task) -> Receipt:
 
 
 def _run_and_publish(task: Task) -> dict:
+    if task.stage.needs_gpu(task.config):
+        _check_gpu(task)
     with publishing(task.dataset, task.stage.name, task.item) as out:
         # Data belong on standard output, and a library's chatter is none.
         with contextlib.redirect_stdout(sys.stderr):
             metrics = task.stage.run(task.dataset, task.item, task.config, out)
         (out / "metrics.json").write_bytes(_metrics_bytes(metrics))
     return json.loads(_metrics_bytes(metrics))
+
+
+def _check_gpu(task: Task) -> None:
+    """Refuse to do on a CPU what was asked for on a GPU."""
+    import torch
+
+    if not torch.cuda.is_available():
+        raise StageError(
+            f"{task.stage.name} needs a GPU as it is configured; torch finds no CUDA device here"
+        )
 
 
 def _metrics_bytes(metrics: dict) -> bytes:
