@@ -92,7 +92,7 @@ class Pool:
         last = SLURM_ATTEMPTS if job else ATTEMPTS
         left = self._run_window(workers, tasks, settle, tick, begin, 1)
         for attempt in range(2, last + 1):
-            groups = [left] if job else [[task] for task in left]
+            groups = [left] if job and left else [[task] for task in left]
             left = [
                 t
                 for g in groups

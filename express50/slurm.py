@@ -17,7 +17,8 @@ import tempfile
 import time
 import tomllib
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -106,7 +107,8 @@ def _job(text: str, values: Mapping[str, object]) -> SlurmJob:
             f"--slurm {text}: no {' and no '.join(missing)}; expected such as "
             "partition=cpu,time=4:00:00,memory=16G,cores=4,jobs=8, or a file jobs.toml of these"
         )
-    return build_dataclass("slurm", SlurmJob, values)
+    known = ", ".join(field.name for field in fields(SlurmJob))
+    return build_dataclass("slurm", SlurmJob, values, hint=f"; expected one of {known}")
 
 
 def _file_values(path: Path) -> dict[str, Any]:
@@ -129,6 +131,24 @@ def _inline_values(text: str) -> dict[str, Any]:
     return values
 
 
+def check_slurm(submit: bool = True) -> None:
+    """See that jobs can be written, and submitted from here.
+
+    Raises:
+        StageError: dask-jobqueue or sbatch are not there.
+    """
+    if find_spec("dask_jobqueue") is None:
+        raise StageError(
+            "--slurm needs dask-jobqueue, which is not installed; run "
+            "pip install 'express50[slurm]'"
+        )
+    if submit and shutil.which("sbatch") is None:
+        raise StageError(
+            "--slurm: there is no sbatch on PATH; run this where jobs are submitted, on a login "
+            "node, or use --workers"
+        )
+
+
 def job_script(job: SlurmJob, address: str, name: str, threads: int, logs: Path) -> str:
     """The script of one job.
 
@@ -138,17 +158,9 @@ def job_script(job: SlurmJob, address: str, name: str, threads: int, logs: Path)
         name: of the workers.
         threads: that an item may use.
         logs: folder of the jobs' output.
-
-    Raises:
-        StageError: dask-jobqueue is not installed.
     """
-    try:
-        from dask_jobqueue.slurm import SLURMJob
-    except ImportError as error:
-        raise StageError(
-            "--slurm needs dask-jobqueue, which is not installed; "
-            "run pip install 'express50[slurm]'"
-        ) from error
+    from dask_jobqueue.slurm import SLURMJob
+
     processes = job.processes(threads)
     size, unit = MEMORY.fullmatch(job.memory).groups()[:2]  # type: ignore[union-attr]
     # Relative paths of a configuration are those of the folder that the run was started in.
@@ -187,12 +199,7 @@ class SlurmWorkers(RemoteWorkers):
     """A scheduler here and the jobs that work for it; one that has ended is replaced."""
 
     def __init__(self, job: SlurmJob, threads: int, logs: Path) -> None:
-        if shutil.which("sbatch") is None:
-            raise StageError(
-                "--slurm: there is no sbatch on PATH; run this where jobs are submitted, on a "
-                "login node, or use --workers"
-            )
-        job_script(job, "", "", threads, logs)  # tells what is missing before anything starts
+        check_slurm()
         client, self._cluster = start_cluster({}, threads, interface=job.interface or None)
         super().__init__(client)
         self.job, self.threads, self.logs = job, threads, logs

@@ -18,6 +18,7 @@ from express50.threads import cap_threads
 
 if TYPE_CHECKING:
     from express50.runner import Summary
+    from express50.slurm import SlurmJob
 
 HELP = {
     "ingest": "index raw captures: frames, hashes, proxies",
@@ -76,6 +77,14 @@ def _stage_parser(subparsers: Any, name: str, words: str) -> argparse.ArgumentPa
     )
     parser.add_argument("--scheduler", metavar="ADDRESS", help="dask scheduler, tcp://host:port")
     parser.add_argument(
+        "--slurm",
+        metavar="JOBS",
+        help="run in SLURM jobs: partition=P,time=4:00:00,memory=16G,cores=4,jobs=8 or jobs.toml",
+    )
+    parser.add_argument(
+        "--print-job", action="store_true", help="print the script of a SLURM job, and run nothing"
+    )
+    parser.add_argument(
         "--threads", type=int, default=1, metavar="N", help="threads an item may use (default 1)"
     )
     if name != "run":
@@ -131,10 +140,13 @@ def _run(args: argparse.Namespace, names: list[str], pattern: str | None) -> int
     # Before NumPy comes in with a stage: its BLAS reads the cap when it is loaded.
     cap_threads(args.threads)
     dataset = Dataset(args.dataset)
+    slurm = _slurm(args)
+    if args.print_job and slurm:
+        return _print_jobs(dataset, args, names, slurm)
     summaries = []
     with (
         stdout_to_stderr() if args.json else nullcontext(),
-        Pool(args.workers, args.scheduler, args.threads) as pool,
+        Pool(args.workers, args.scheduler, args.threads, slurm) as pool,
     ):
         # Every configuration is checked before the first stage spends hours.
         loaded = [load_stage(name) for name in names]
@@ -151,6 +163,33 @@ def _run(args: argparse.Namespace, names: list[str], pattern: str | None) -> int
         before = {"before": accounts[:-1]} if len(accounts) > 1 else {}
         say_json(accounts if args.command == "run" else accounts[-1] | before)
     return OK if all(summary.ok for summary in summaries) else FAILED
+
+
+def _slurm(args: argparse.Namespace) -> dict[str, SlurmJob] | None:
+    """What the SLURM jobs of every stage ask for, where stages run in such jobs."""
+    if args.slurm is None:
+        if args.print_job:
+            raise ConfigError("--print-job: expected --slurm JOBS beside it")
+        return None
+    if args.scheduler is not None:
+        raise ConfigError("--slurm and --scheduler: expected one of them")
+    from express50.slurm import check_slurm, read_slurm
+
+    check_slurm(submit=not args.print_job)
+    return read_slurm(args.slurm, stages())
+
+
+def _print_jobs(
+    dataset: Dataset, args: argparse.Namespace, names: list[str], slurm: dict[str, SlurmJob]
+) -> int:
+    """Print each script that jobs of these stages would have, once."""
+    from express50.slurm import job_script
+
+    logs = Dataset(dataset.root.resolve()).slurm_dir
+    for job in dict.fromkeys(slurm[name] for name in names):
+        address = "tcp://ADDRESS-OF-THE-RUN"
+        say(job_script(job, address, "express50-N", args.threads, logs).rstrip())
+    return OK
 
 
 def _ingested(dataset: Dataset, summary: Summary) -> Iterable[str]:
