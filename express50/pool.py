@@ -118,8 +118,8 @@ class Pool:
         running: dict[Any, list[Task]] = {}
         while waiting or running:
             with _loss_is_one_error():
-                workers.keep(len(waiting) + sum(map(len, running.values())))
                 slots = workers.slots(name, gpu)
+                workers.keep(len(waiting) + sum(map(len, running.values())))
                 while waiting and len(running) < slots:
                     fair = max(1, len(waiting) // (2 * slots))  # the last ones end together
                     batch = [waiting.popleft() for _ in range(min(size, fair))]
