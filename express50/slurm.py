@@ -235,6 +235,8 @@ class SlurmWorkers(RemoteWorkers):
                     raise
                 sys.stderr.write(f"{error}; going on with {len(self._names)} jobs\n")
                 return
+            if self._count == 1:
+                sys.stderr.write(f"SLURM jobs are submitted; their output is in {self.logs}\n")
 
     def _bury(self, queue: set[str] | None) -> None:
         for number in [] if queue is None else sorted(set(self._names) - queue):

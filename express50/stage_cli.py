@@ -12,8 +12,9 @@ from typing import TYPE_CHECKING, Any
 from express50.config import PRESETS, config_toml, resolve_config
 from express50.console import FAILED, OK, format_table, say, say_json, stdout_to_stderr
 from express50.errors import ConfigError, StageError
-from express50.layout import Dataset
+from express50.layout import Dataset, existing_dataset
 from express50.stage import Stage
+from express50.status_cli import add_status_command
 from express50.threads import cap_threads
 
 if TYPE_CHECKING:
@@ -225,10 +226,7 @@ def _choose(
 
 def add_dataset_commands(subparsers: Any) -> None:
     """Add status, info and config."""
-    parser = subparsers.add_parser("status", help="what is done, what failed, time and memory")
-    parser.add_argument("dataset", type=Path, metavar="DATASET")
-    parser.add_argument("--json", action="store_true", help="print receipts as JSON")
-    parser.set_defaults(handler=show_status)
+    add_status_command(subparsers, stages())
     parser = subparsers.add_parser("info", help="subjects, cameras, frames and expressions")
     parser.add_argument("dataset", type=Path, metavar="DATASET")
     parser.add_argument("--json", action="store_true", help="print as JSON")
@@ -239,50 +237,11 @@ def add_dataset_commands(subparsers: Any) -> None:
     parser.set_defaults(handler=show_config)
 
 
-def _existing(path: Path) -> Dataset:
-    dataset = Dataset(path)
-    if not dataset.ledger.is_file():
-        raise StageError(
-            f"{path}: not a dataset (no ledger.sqlite); run 'express50 ingest {path} CAPTURE'"
-        )
-    return dataset
-
-
-def show_status(args: argparse.Namespace) -> int:
-    """Print receipts by stage; exit code 1 when an item's last run failed."""
-    from express50.ledger import Ledger
-
-    dataset = _existing(args.dataset)
-    with Ledger(dataset.ledger) as ledger:
-        receipts = {name: ledger.read(name) for name in stages()}
-    if args.json:
-        say_json({k: [vars(r) for r in v.values()] for k, v in receipts.items()})
-    else:
-        header = ["stage", "done", "failed", "seconds", "peak MB"]
-        say(*format_table(header, _status_rows(receipts)))
-        for rows in receipts.values():
-            for receipt in rows.values():
-                if receipt.status == "failed":
-                    say(f"failed {receipt.stage} {receipt.item}: {receipt.reason}")
-    failed = any(r.status == "failed" for rows in receipts.values() for r in rows.values())
-    return FAILED if failed else OK
-
-
-def _status_rows(receipts: dict[str, dict[str, Any]]) -> list[list[str]]:
-    rows = []
-    for name, table in receipts.items():
-        done = sum(r.status == "done" for r in table.values())
-        seconds = sum(r.seconds for r in table.values())
-        peak = max((r.peak_memory for r in table.values()), default=0) / 1e6
-        rows.append([name, str(done), str(len(table) - done), f"{seconds:.1f}", f"{peak:.0f}"])
-    return rows
-
-
 def show_info(args: argparse.Namespace) -> int:
     """Print what was ingested."""
     from express50.index import read_index
 
-    dataset = _existing(args.dataset)
+    dataset = existing_dataset(args.dataset)
     indices = [read_index(dataset, subject) for subject in dataset.subjects()]
     header = ["subject", "cameras", "size", "frames", "expressions", "plates", "calibration"]
     rows = [[str(value) for value in _info(index).values()] for index in indices]

@@ -12,7 +12,7 @@ import shutil
 import sqlite3
 import tarfile
 from collections.abc import Iterator
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -61,6 +61,7 @@ def _own_paths(dataset: Dataset, subject: str) -> Iterator[Path]:
 def _mixed_paths(dataset: Dataset) -> Iterator[Path]:
     """Outputs that may hold several subjects: items that are no subject, reports, leftovers."""
     subjects = {*dataset.captures(), *dataset.subjects()}
+    yield from dataset.slurm_dir.glob("*.out")
     for base in (dataset.root, dataset.stale_dir):
         for metrics in base.glob("*/*/metrics.json"):
             if metrics.parent.name not in subjects:
@@ -120,6 +121,8 @@ def _forget(dataset: Dataset, subject: str, paths: list[Path]) -> None:
                 "DELETE FROM digests WHERE path = ? OR substr(path, 1, ?) = ?",
                 (prefix, len(prefix) + 1, f"{prefix}/"),
             )
+        with suppress(sqlite3.OperationalError):  # ledgers of before runs were kept
+            database.execute("UPDATE runs SET running = '{}'")
         database.execute("PRAGMA wal_checkpoint(TRUNCATE)")
         database.execute("VACUUM")
         database.execute("PRAGMA wal_checkpoint(TRUNCATE)")

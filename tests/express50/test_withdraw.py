@@ -7,7 +7,7 @@ import pytest
 from express50.cli import main
 from express50.errors import CaptureError, StageError
 from express50.layout import Dataset
-from express50.ledger import Ledger
+from express50.ledger import Ledger, Run
 from express50.publish import publishing
 from express50.withdraw import files_naming, withdraw
 from pipelines import ingest
@@ -34,6 +34,10 @@ def dataset(tmp_path):
 
 
 def test_nothing_of_the_subject_stays_and_the_others_are_untouched(dataset):
+    with Ledger(dataset.ledger) as ledger:  # of a run that was killed, in SLURM jobs
+        ledger.write_run(Run(stage="track", items=2, running={"S001": 1.0}))
+    dataset.slurm_dir.mkdir(parents=True)
+    (dataset.slurm_dir / "1000.out").write_text("S001: chatter of a library")
     others = {k: v for k, v in tree(dataset.root).items() if "S002" in k}
     assert len(list(files_naming(dataset, "S001"))) > 5
     done = withdraw(dataset, "S001")
