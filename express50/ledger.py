@@ -103,6 +103,8 @@ class Ledger:
             self._database.execute("PRAGMA synchronous=NORMAL")
             self._database.executescript(SCHEMA)
         except sqlite3.DatabaseError as error:
+            if read_only:  # whoever only looks on is not told to delete
+                raise FormatError(f"{path}: cannot be read as a ledger ({error})") from error
             raise FormatError(
                 f"{path}: not a ledger ({error}); delete it and run the stages again, the same "
                 "outputs will be made"

@@ -205,6 +205,13 @@ def test_serve_answers_on_this_machine_alone(tmp_path):
     assert process.returncode == 130
 
 
+def test_what_is_no_ledger_is_one_error_that_tells_nobody_to_delete(tmp_path, capsys):
+    (tmp_path / "ledger.sqlite").write_bytes(b"no database" * 100)
+    assert main(["status", str(tmp_path)]) == 1
+    error = capsys.readouterr().err
+    assert "cannot be read as a ledger" in error and "delete" not in error
+
+
 def test_a_port_in_use_is_one_error(tmp_path, capsys):
     of(tmp_path, None, [], 2.0)
     assert main(["status", str(tmp_path), "--serve", "70000"]) == 2
