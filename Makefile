@@ -7,7 +7,8 @@ CAPTURES ?=
 PRESET ?= standard
 WORKERS ?= 2
 SET ?=
-STAGE_FLAGS = --preset $(PRESET) --workers $(WORKERS) $(foreach kv,$(SET),--set $(kv))
+SLURM ?=
+STAGE_FLAGS = --preset $(PRESET) --workers $(WORKERS) $(foreach kv,$(SET),--set $(kv)) $(if $(SLURM),--slurm $(SLURM))
 
 .PHONY: help setup demo test check bench tradeoff report clean \
         ingest calibrate align matte track depth regions pack train

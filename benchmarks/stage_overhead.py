@@ -1,8 +1,8 @@
 """What the runner adds to an item: fingerprints, folders, receipts and their way to the disk.
 
 ``python -m benchmarks.stage_overhead`` runs a stage that does nothing over many items: in this
-process, in two worker processes (their start not counted), and once more when all is current. The
-last line printed is one JSON object.
+process, in two worker processes (their start not counted) with every item alone and in batches, as
+the runner has them, and once more when all is current. The last line printed is one JSON object.
 """
 
 from __future__ import annotations
@@ -16,9 +16,10 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
+import express50.pool
 from express50.config import build_config
 from express50.layout import Dataset
-from express50.pool import Pool
+from express50.pool import LARGEST_BATCH, Pool
 from express50.runner import run_stage
 from express50.stage import Stage
 
@@ -62,11 +63,13 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--items", type=int, default=500)
     count = parser.parse_args(arguments).items
     with tempfile.TemporaryDirectory(dir=Path.cwd()) as scratch:
-        inline, workers = (make_dataset(Path(scratch) / name, count) for name in ("one", "two"))
+        names = ("inline", "alone", "workers")
+        inline, alone, workers = (make_dataset(Path(scratch) / name, count) for name in names)
         result = {
             "milliseconds_per_item": timed(inline, Pool(0), count),
             "milliseconds_per_current_item": timed(inline, Pool(0), count),
-            "milliseconds_per_item_two_workers": with_workers(workers, count),
+            "milliseconds_per_item_two_workers_alone": with_workers(alone, count, 1),
+            "milliseconds_per_item_two_workers": with_workers(workers, count, LARGEST_BATCH),
             "milliseconds_per_write_and_sync": syncs(Path(scratch) / "sync", count),
             "items": count,
         }
@@ -82,8 +85,9 @@ def make_dataset(root: Path, count: int) -> Dataset:
     return Dataset(root)
 
 
-def with_workers(dataset: Dataset, count: int) -> float:
-    """Milliseconds an item in two workers that have started."""
+def with_workers(dataset: Dataset, count: int, batch: int) -> float:
+    """Milliseconds an item in two workers that have started, in batches of at most so many."""
+    express50.pool.LARGEST_BATCH = batch
     first = make_dataset(dataset.root / "first", 4)
     with Pool(2) as pool:
         timed(first, pool, 4)

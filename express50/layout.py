@@ -7,7 +7,7 @@ import tomllib
 from dataclasses import dataclass
 from pathlib import Path
 
-from express50.errors import CaptureError, FormatError
+from express50.errors import CaptureError, FormatError, StageError
 
 
 def footage_root(capture: Path) -> Path:
@@ -134,6 +134,25 @@ class Dataset:
         """Outputs set aside because a newer run of their item failed or no longer lists it."""
         return self.root / ".stale"
 
+    @property
+    def slurm_dir(self) -> Path:
+        """Output of SLURM jobs, one file a job."""
+        return self.root / "logs" / "slurm"
+
     def log_file(self, stage: str, item: str) -> Path:
         """Traceback of an unexpected failure of one item."""
         return self.root / "logs" / stage / f"{item.replace('/', '+')}.txt"
+
+
+def existing_dataset(path: Path) -> Dataset:
+    """The dataset of a folder that has a ledger.
+
+    Raises:
+        StageError: it has none.
+    """
+    dataset = Dataset(path)
+    if not dataset.ledger.is_file():
+        raise StageError(
+            f"{path}: not a dataset (no ledger.sqlite); run 'express50 ingest {path} CAPTURE'"
+        )
+    return dataset

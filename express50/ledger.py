@@ -1,6 +1,6 @@
 """The ledger: SQLite receipts that say what was made from what, and digests of files.
 
-Only the driver opens it; workers return receipts.
+Only the driver writes it, workers return receipts; others may read meanwhile.
 """
 
 from __future__ import annotations
@@ -9,8 +9,9 @@ import json
 import sqlite3
 import time
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
+from typing import Any
 
 from express50.digests import file_sha256
 from express50.errors import FormatError
@@ -29,6 +30,10 @@ CREATE TABLE IF NOT EXISTS made (
 CREATE TABLE IF NOT EXISTS digests (
     path TEXT PRIMARY KEY, size INTEGER NOT NULL, mtime_ns INTEGER NOT NULL,
     inode INTEGER NOT NULL, sha256 TEXT NOT NULL
+);
+CREATE TABLE IF NOT EXISTS runs (
+    stage TEXT PRIMARY KEY, items INTEGER NOT NULL, current INTEGER NOT NULL,
+    begun REAL NOT NULL, seen REAL NOT NULL, ended REAL NOT NULL, running TEXT NOT NULL
 );
 """
 
@@ -85,13 +90,39 @@ class Receipt:
 COLUMNS = tuple(name for name in Receipt.__dataclass_fields__ if name != "made")
 
 
+@dataclass(frozen=True, kw_only=True)
+class Run:
+    """The last run of a stage; times are seconds since 1970.
+
+    Attributes:
+        stage: stage name.
+        items: how many it was to bring up to date.
+        current: how many of them were already.
+        begun: when it began.
+        seen: when it last gave a sign of life.
+        ended: when it ended; 0 if it did not.
+        running: when each item that is being worked at was begun.
+    """
+
+    stage: str
+    items: int
+    current: int = 0
+    begun: float = 0.0
+    seen: float = 0.0
+    ended: float = 0.0
+    running: dict[str, float] = field(default_factory=dict)
+
+
 class Ledger:
     """Receipts by stage and item, and a cache of file digests."""
 
-    def __init__(self, path: Path) -> None:
-        path.parent.mkdir(parents=True, exist_ok=True)
+    def __init__(self, path: Path, read_only: bool = False) -> None:
         self._fresh: dict[str, tuple] = {}  # digests not yet stored
         try:
+            if read_only:
+                self._database = _open_to_read(path)
+                return
+            path.parent.mkdir(parents=True, exist_ok=True)
             self._database = sqlite3.connect(path, timeout=60, isolation_level=None)
             self._database.execute("PRAGMA journal_mode=WAL")
             # A receipt lost with the power costs an item once more; waiting for the disk after each
@@ -99,6 +130,8 @@ class Ledger:
             self._database.execute("PRAGMA synchronous=NORMAL")
             self._database.executescript(SCHEMA)
         except sqlite3.DatabaseError as error:
+            if read_only:  # whoever only looks on is not told to delete
+                raise FormatError(f"{path}: cannot be read as a ledger ({error})") from error
             raise FormatError(
                 f"{path}: not a ledger ({error}); delete it and run the stages again, the same "
                 "outputs will be made"
@@ -147,11 +180,32 @@ class Ledger:
 
     def read(self, stage: str) -> dict[str, Receipt]:
         """Receipts of a stage by item, sorted."""
-        rows = self._database.execute(
-            f"SELECT {', '.join(COLUMNS)} FROM receipts WHERE stage = ? ORDER BY item", (stage,)
-        )
-        values = [dict(zip(COLUMNS, row, strict=True)) for row in rows]
+        values = self._rows(Receipt, "receipts WHERE stage = ? ORDER BY item", stage)
         return {v["item"]: Receipt(**v | {"metrics": json.loads(v["metrics"])}) for v in values}
+
+    def write_run(self, run: Run) -> None:
+        """Store a run in the place of the stage's former one."""
+        row = dict(vars(run)) | {"running": json.dumps(run.running)}
+        marks = ", ".join(f":{name}" for name in row)
+        self._database.execute(
+            f"INSERT OR REPLACE INTO runs ({', '.join(row)}) VALUES ({marks})", row
+        )
+
+    def runs(self) -> dict[str, Run]:
+        """Last runs by stage."""
+        values = self._rows(Run, "runs")
+        return {v["stage"]: Run(**v | {"running": json.loads(v["running"])}) for v in values}
+
+    def _rows(self, kind: Any, source: str, *values: str) -> list[dict]:
+        """Rows as tables; none where the ledger is being made, or of before its runs were kept."""
+        names = COLUMNS if kind is Receipt else [one.name for one in fields(kind)]
+        try:
+            rows = self._database.execute(f"SELECT {', '.join(names)} FROM {source}", values)
+        except sqlite3.OperationalError as error:
+            if "no such table" not in str(error):
+                raise
+            return []
+        return [dict(zip(names, row, strict=True)) for row in rows]
 
     def forget(self, stage: str, items: Iterable[str]) -> None:
         """Remove receipts; when this returns they are gone, even if the power goes."""
@@ -203,3 +257,17 @@ def mark_file(path: Path) -> FileMark:
     """Size, time and digest of a file as it is now."""
     stat = path.stat()
     return FileMark(stat.st_size, stat.st_mtime_ns, stat.st_ino, file_sha256(path))
+
+
+def _open_to_read(path: Path) -> sqlite3.Connection:
+    """A connection that cannot write, also where the folder cannot be written to."""
+    uri = path.resolve().as_uri()
+    for mode in ("mode=ro", "mode=ro&immutable=1"):
+        database = sqlite3.connect(f"{uri}?{mode}", uri=True, timeout=60, isolation_level=None)
+        try:
+            database.execute("PRAGMA schema_version").fetchone()
+            return database
+        except sqlite3.OperationalError as error:
+            database.close()
+            trouble = error
+    raise trouble

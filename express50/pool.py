@@ -1,35 +1,49 @@
-"""Worker processes: a local dask cluster that starts when first needed, or any scheduler."""
+"""Tasks in worker processes: how many at a time, and what becomes of those whose worker dies."""
 
 from __future__ import annotations
 
-import logging
-import sys
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import CancelledError
 from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
 
+from express50.clusters import GPU, LocalWorkers, RemoteWorkers
 from express50.errors import StageError
 from express50.ledger import Receipt
-from express50.threads import thread_environment
-from express50.work import Task, run_task
+from express50.slurm import SlurmJob, SlurmWorkers
+from express50.work import BATCH_SECONDS, Task, run_task, run_tasks
 
 ATTEMPTS = 2  # an item that killed its worker this often is set aside
+SLURM_ATTEMPTS = 3  # the same where a worker may also have come to its job's time limit
+LARGEST_BATCH = 32
 POLL_SECONDS = 0.5
-CONNECT_SECONDS = 20.0
 
 
 class Pool:
     """Runs tasks in worker processes; one pool serves all stages of a command."""
 
-    def __init__(self, workers: int = 2, scheduler: str | None = None, threads: int = 1) -> None:
+    def __init__(
+        self,
+        workers: int = 2,
+        scheduler: str | None = None,
+        threads: int = 1,
+        slurm: Mapping[str, SlurmJob] | None = None,
+    ) -> None:
+        """Say where to work; nothing is started yet.
+
+        Args:
+            workers: local processes; 0 or 1 item runs in this one.
+            scheduler: address of a dask scheduler to use instead.
+            threads: that an item may use.
+            slurm: jobs of each stage to use instead.
+        """
         self.workers = workers
         self.scheduler = scheduler
         self.threads = threads
-        self._client: Any = None
-        self._cluster: Any = None
+        self.slurm = slurm
+        self._workers: LocalWorkers | RemoteWorkers | None = None
 
     def __enter__(self) -> Pool:
         return self
@@ -39,103 +53,132 @@ class Pool:
 
     def runs_inline(self, count: int) -> bool:
         """Whether starting processes would cost more than it brings."""
-        return self.scheduler is None and (self.workers == 0 or count <= 1)
+        here = self.scheduler is None and self.slurm is None
+        return here and (self.workers == 0 or count <= 1)
 
     def run(
-        self, tasks: Iterable[Task], settle: Callable[[Receipt], None], tick: Callable[[], None]
+        self,
+        tasks: Iterable[Task],
+        settle: Callable[[Receipt], None],
+        tick: Callable[[], None],
+        begin: Callable[[Task], None] = lambda task: None,
     ) -> None:
-        """Run every task and hand each receipt to ``settle`` as it comes.
+        """Run every task of one stage and hand each receipt to ``settle`` as it comes.
 
         A task whose worker died is tried again when nothing else runs, so that neighbours that
-        died with it are not blamed, and is set aside when that fails too.
+        died with it are not blamed, and is set aside when that fails too. SLURM jobs do not share
+        memory but a time limit, so there all of those are tried again together.
+
+        Args:
+            tasks: of one stage and configuration.
+            settle: takes each receipt.
+            tick: called at least every ``POLL_SECONDS`` while workers run.
+            begin: called as a task is handed to a worker.
 
         Raises:
-            StageError: the scheduler cannot be reached or went away.
+            StageError: the scheduler cannot be reached or went away, or offers no GPU that the
+                stage needs.
         """
         tasks = list(tasks)
         if self.runs_inline(len(tasks)):
             for task in tasks:
+                begin(task)
                 settle(run_task(task))
             return
-        suspects = self._run_window(tasks, settle, tick, attempt=1)
-        for task in suspects:
-            for killer in self._run_window([task], settle, tick, attempt=ATTEMPTS):
-                settle(_killed(killer))
+        if not tasks:
+            return
+        workers = self._workers = self._workers_for(tasks[0])
+        job = workers.job if isinstance(workers, SlurmWorkers) else None
+        last = SLURM_ATTEMPTS if job else ATTEMPTS
+        left = self._run_window(workers, tasks, settle, tick, begin, 1)
+        for attempt in range(2, last + 1):
+            groups = [left] if job and left else [[task] for task in left]
+            left = [
+                t
+                for g in groups
+                for t in self._run_window(workers, g, settle, tick, begin, attempt)
+            ]
+        for killer in left:
+            settle(_killed(killer, last, job))
 
     def _run_window(
         self,
+        workers: LocalWorkers | RemoteWorkers,
         tasks: list[Task],
         settle: Callable[[Receipt], None],
         tick: Callable[[], None],
+        begin: Callable[[Task], None],
         attempt: int,
     ) -> list[Task]:
-        """Keep as many tasks submitted as there are workers; returns those whose worker died."""
+        """Keep one batch a worker submitted; returns the tasks whose worker died."""
         from distributed.scheduler import KilledWorker
 
-        client = self._connect()
-        waiting, killed = deque(tasks), []
-        running: dict[Any, Task] = {}
+        waiting, killed, size = deque(tasks), [], 1
+        name, gpu = tasks[0].stage.name, tasks[0].stage.needs_gpu(tasks[0].config)
+        running: dict[Any, list[Task]] = {}
         while waiting or running:
             with _loss_is_one_error():
-                while waiting and len(running) < self._window():
-                    task = waiting.popleft()
-                    future = client.submit(run_task, task, pure=False, key=_key(task, attempt))
-                    running[future] = task
-                ended = [(future, *_outcome(future)) for future in _finished(client, running)]
-            for future, receipt, failure in ended:
-                task = running.pop(future)
-                if receipt is not None:
-                    settle(replace(receipt, attempts=attempt))
+                slots = workers.slots(name, gpu)
+                workers.keep(len(waiting) + sum(map(len, running.values())))
+                while waiting and len(running) < slots:
+                    fair = max(1, len(waiting) // (2 * slots))  # the last ones end together
+                    batch = [waiting.popleft() for _ in range(min(size, fair))]
+                    for task in batch:
+                        begin(task)
+                    running[_submit(workers.client, batch, attempt, gpu)] = batch
+                done = _finished(workers.client, running)
+                ended = [(future, *_outcome(future)) for future in done]
+            for future, receipts, failure in ended:
+                batch = running.pop(future)
+                if receipts is not None:
+                    size = _next_size(size, batch, receipts)
+                    waiting.extendleft(reversed(batch[len(receipts) :]))
+                    for receipt in receipts:
+                        settle(replace(receipt, attempts=attempt))
                 elif isinstance(failure, KilledWorker):
-                    killed.append(task)
-                else:  # the task did not even start
-                    settle(_failed(task, f"worker: {type(failure).__name__}: {failure}", attempt))
+                    killed += batch
+                else:  # the tasks did not even start
+                    for task in batch:
+                        words = f"worker: {type(failure).__name__}: {failure}"
+                        settle(_failed(task, words, attempt))
             tick()
         return killed
 
-    def _window(self) -> int:
-        if self.scheduler is None:
-            return self.workers
-        return max(1, sum(self._client.nthreads().values()))
-
-    def _connect(self) -> Any:
-        if self._client is not None:
-            return self._client
-        import dask
-        from distributed import Client, LocalCluster
-
+    def _workers_for(self, task: Task) -> LocalWorkers | RemoteWorkers:
+        """The workers of a task's stage; those of the stage before where they fit."""
+        job = self.slurm[task.stage.name] if self.slurm else None
+        if isinstance(self._workers, SlurmWorkers) and self._workers.job != job:
+            self.close()
+        if self._workers is not None:
+            return self._workers
+        if job is not None:
+            return SlurmWorkers(job, self.threads, task.dataset.slurm_dir)
         if self.scheduler is not None:
-            try:
-                self._client = Client(self.scheduler, timeout=CONNECT_SECONDS, set_as_default=False)
-                has_workers = bool(self._client.nthreads())
-            except (OSError, TimeoutError, ValueError) as error:
-                raise StageError(
-                    f"scheduler {self.scheduler}: cannot connect ({error}); expected an address "
-                    "such as tcp://host:8786 of a running dask scheduler"
-                ) from error
-            if not has_workers:
-                sys.stderr.write(f"scheduler {self.scheduler} has no workers yet; waiting\n")
-            return self._client
-        with dask.config.set(local_settings(self.threads)):
-            self._cluster = LocalCluster(
-                n_workers=self.workers,
-                threads_per_worker=1,
-                processes=True,
-                dashboard_address=None,
-                memory_limit=0.9 / self.workers,
-                silence_logs=logging.CRITICAL,
-            )
-            self._client = Client(self._cluster, set_as_default=False)
-            self._client.register_plugin(_ignore_interrupts())
-        return self._client
+            return RemoteWorkers.reach(self.scheduler)
+        return LocalWorkers(self.workers, self.threads)
 
     def close(self) -> None:
-        """Stop the local workers; a scheduler of the user's stays as it is."""
-        if self._client is not None:
-            self._client.close(timeout=5)
-        if self._cluster is not None:
-            self._cluster.close(timeout=10)
-        self._client = self._cluster = None
+        """Stop the local workers and cancel jobs; a scheduler of the user's stays as it is."""
+        if self._workers is not None:
+            self._workers.close()
+        self._workers = None
+
+
+def _submit(client: Any, batch: list[Task], attempt: int, gpu: bool) -> Any:
+    key, resources = _key(batch[0], attempt), {GPU: 1} if gpu else None
+    return client.submit(run_tasks, batch, pure=False, key=key, resources=resources)
+
+
+def _next_size(size: int, batch: list[Task], receipts: list[Receipt]) -> int:
+    """Tasks of the next batches: more while they are over at once, one as soon as they are not.
+
+    A round trip to a worker costs 10 ms, which empty items in batches share. What takes longer
+    goes alone, so that a death never costs or blames more than one of these.
+    """
+    if len(receipts) < len(batch):
+        return len(receipts)
+    quick = sum(receipt.seconds for receipt in receipts) < BATCH_SECONDS / 2
+    return max(size, min(2 * len(batch), LARGEST_BATCH)) if quick else len(batch)
 
 
 @contextmanager
@@ -161,53 +204,27 @@ def _finished(client: Any, running: Iterable[Any]) -> set[Any]:
         return set()
 
 
-def _outcome(future: Any) -> tuple[Receipt | None, BaseException | None]:
-    """What a finished task returned, or why it did not run."""
+def _outcome(future: Any) -> tuple[list[Receipt] | None, BaseException | None]:
+    """What a finished batch returned, or why it did not run."""
     failure = future.exception()
     if isinstance(failure, CancelledError):
         raise failure
     return (None, failure) if failure is not None else (future.result(), None)
 
 
-def local_settings(threads: int) -> dict[str, object]:
-    """Settings of dask for a local cluster."""
-    return {
-        "distributed.scheduler.allowed-failures": 0,
-        # A stage may hold the interpreter for minutes in native code; that is not death.
-        "distributed.scheduler.worker-ttl": None,
-        "distributed.scheduler.worker-saturation": 1.0,
-        "distributed.worker.multiprocessing-method": "spawn",
-        "distributed.nanny.pre-spawn-environ": thread_environment(threads),
-    }
-
-
-def _ignore_interrupts() -> Any:
-    """Plug-in by which workers leave Ctrl-C to the driver, which stops them in order."""
-    from distributed import WorkerPlugin
-
-    class IgnoreInterrupts(WorkerPlugin):
-        name = "ignore-interrupts"
-
-        def setup(self, worker: object) -> None:
-            import signal
-            import threading
-
-            if threading.current_thread() is threading.main_thread():
-                signal.signal(signal.SIGINT, signal.SIG_IGN)
-
-    return IgnoreInterrupts()
-
-
 def _key(task: Task, attempt: int) -> str:
     return f"{task.stage.name}-{task.item}-{task.fingerprint[:16]}-{attempt}"
 
 
-def _killed(task: Task) -> Receipt:
+def _killed(task: Task, attempts: int, job: SlurmJob | None) -> Receipt:
+    why, mend = "out of memory or a crash in native code", "give it more memory"
+    if job is not None:
+        why, mend = f"{why}, or its job's {job.time} were over", f"{mend} than {job.memory} or time"
     reason = (
-        f"its worker process died {ATTEMPTS} times (out of memory or a crash in native code); run "
-        "this item with --workers 0 to see, or give it more memory"
+        f"its worker process died {attempts} times ({why}); run "
+        f"this item with --workers 0 to see, or {mend}"
     )
-    return _failed(task, reason, ATTEMPTS)
+    return _failed(task, reason, attempts)
 
 
 def _failed(task: Task, reason: str, attempts: int) -> Receipt:

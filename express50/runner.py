@@ -19,6 +19,7 @@ from express50.locks import stage_lock
 from express50.pool import Pool
 from express50.progress import Progress
 from express50.publish import clean_leftovers, discard_stale, set_aside, write_bytes
+from express50.runlog import RunLog
 from express50.stage import Stage
 from express50.work import Task, fingerprint, input_digests
 
@@ -139,8 +140,11 @@ def run_stage(
         waves = waves_of(stage, dataset, config, chosen)
         chosen = [item for wave in waves for item in wave]
         outcomes: dict[str, Outcome] = {}
-        for wave in waves:
-            outcomes |= _run_items(stage, dataset, config, wave, ledger, workers_pool, progress)
+        with RunLog(dataset.ledger, stage.name, len(chosen)) as log:
+            for wave in waves:
+                outcomes |= _run_items(
+                    stage, dataset, config, wave, ledger, workers_pool, progress, log
+                )
     missing = set(chosen) - set(outcomes)
     if missing:  # read = done + skipped + failed
         raise StageError(f"{stage.name}: no account of {', '.join(sorted(missing))}; run it again")
@@ -184,6 +188,7 @@ def _run_items(
     ledger: Ledger,
     pool: Pool,
     progress: bool,
+    log: RunLog,
 ) -> dict[str, Outcome]:
     """Sort items into current, unreadable and to do; run the last; settle each as it ends."""
     outcomes: dict[str, Outcome] = {}
@@ -206,16 +211,18 @@ def _run_items(
     ledger.keep_digests()
     # A receipt must not outlive the output it speaks of, should this run be killed half-way.
     ledger.forget(stage.name, [task.item for task in tasks])
+    log.current(len(outcomes))
     with Progress(stage.name, len(tasks) + len(unreadable), progress) as display:
 
         def settle(receipt: Receipt) -> None:
             record(dataset, ledger, receipt)
             outcomes[receipt.item] = _outcome(receipt)
             display.settle(receipt)
+            log.settle(receipt.item)
 
         for receipt in unreadable:
             settle(receipt)
-        pool.run(tasks, settle, display.tick)
+        pool.run(tasks, settle, display.tick, lambda task: log.begin(task.item))
     ledger.keep_digests()
     return outcomes
 

@@ -15,6 +15,11 @@ def no_sources(dataset: Dataset, item: str, config: Any) -> list[str]:
     return []
 
 
+def no_gpu(config: Any) -> bool:
+    """The stage runs on CPUs whatever its configuration."""
+    return False
+
+
 @dataclass(frozen=True)
 class Stage:
     """One processing step; the runner owns files, retries, receipts and progress.
@@ -33,6 +38,8 @@ class Stage:
         sources: items of the same stage whose outputs an item reads. They are run before it,
             whether they were asked for or not, so that its bytes do not hang on the order; the
             output read must be among ``inputs``, where it is there.
+        needs_gpu: whether items of this config may only run where there is a GPU; one at a time
+            runs on each.
     """
 
     name: str
@@ -43,3 +50,4 @@ class Stage:
     inputs: Callable[[Dataset, str, Any], dict[str, Path | str]]
     run: Callable[[Dataset, str, Any, Path], dict]
     sources: Callable[[Dataset, str, Any], list[str]] = no_sources
+    needs_gpu: Callable[[Any], bool] = no_gpu

@@ -12,12 +12,14 @@ from typing import TYPE_CHECKING, Any
 from express50.config import PRESETS, config_toml, resolve_config
 from express50.console import FAILED, OK, format_table, say, say_json, stdout_to_stderr
 from express50.errors import ConfigError, StageError
-from express50.layout import Dataset
+from express50.layout import Dataset, existing_dataset
 from express50.stage import Stage
+from express50.status_cli import add_status_command
 from express50.threads import cap_threads
 
 if TYPE_CHECKING:
     from express50.runner import Summary
+    from express50.slurm import SlurmJob
 
 HELP = {
     "ingest": "index raw captures: frames, hashes, proxies",
@@ -76,6 +78,14 @@ def _stage_parser(subparsers: Any, name: str, words: str) -> argparse.ArgumentPa
     )
     parser.add_argument("--scheduler", metavar="ADDRESS", help="dask scheduler, tcp://host:port")
     parser.add_argument(
+        "--slurm",
+        metavar="JOBS",
+        help="run in SLURM jobs: partition=P,time=4:00:00,memory=16G,cores=4,jobs=8 or jobs.toml",
+    )
+    parser.add_argument(
+        "--print-job", action="store_true", help="print the script of a SLURM job, and run nothing"
+    )
+    parser.add_argument(
         "--threads", type=int, default=1, metavar="N", help="threads an item may use (default 1)"
     )
     if name != "run":
@@ -131,10 +141,13 @@ def _run(args: argparse.Namespace, names: list[str], pattern: str | None) -> int
     # Before NumPy comes in with a stage: its BLAS reads the cap when it is loaded.
     cap_threads(args.threads)
     dataset = Dataset(args.dataset)
+    slurm = _slurm(args)
+    if args.print_job and slurm:
+        return _print_jobs(dataset, args, names, slurm)
     summaries = []
     with (
         stdout_to_stderr() if args.json else nullcontext(),
-        Pool(args.workers, args.scheduler, args.threads) as pool,
+        Pool(args.workers, args.scheduler, args.threads, slurm) as pool,
     ):
         # Every configuration is checked before the first stage spends hours.
         loaded = [load_stage(name) for name in names]
@@ -151,6 +164,33 @@ def _run(args: argparse.Namespace, names: list[str], pattern: str | None) -> int
         before = {"before": accounts[:-1]} if len(accounts) > 1 else {}
         say_json(accounts if args.command == "run" else accounts[-1] | before)
     return OK if all(summary.ok for summary in summaries) else FAILED
+
+
+def _slurm(args: argparse.Namespace) -> dict[str, SlurmJob] | None:
+    """What the SLURM jobs of every stage ask for, where stages run in such jobs."""
+    if args.slurm is None:
+        if args.print_job:
+            raise ConfigError("--print-job: expected --slurm JOBS beside it")
+        return None
+    if args.scheduler is not None:
+        raise ConfigError("--slurm and --scheduler: expected one of them")
+    from express50.slurm import check_slurm, read_slurm
+
+    check_slurm(submit=not args.print_job)
+    return read_slurm(args.slurm, stages())
+
+
+def _print_jobs(
+    dataset: Dataset, args: argparse.Namespace, names: list[str], slurm: dict[str, SlurmJob]
+) -> int:
+    """Print each script that jobs of these stages would have, once."""
+    from express50.slurm import job_script
+
+    logs = Dataset(dataset.root.resolve()).slurm_dir
+    for job in dict.fromkeys(slurm[name] for name in names):
+        address = "tcp://ADDRESS-OF-THE-RUN"
+        say(job_script(job, address, "express50-N", args.threads, logs).rstrip())
+    return OK
 
 
 def _ingested(dataset: Dataset, summary: Summary) -> Iterable[str]:
@@ -186,10 +226,7 @@ def _choose(
 
 def add_dataset_commands(subparsers: Any) -> None:
     """Add status, info and config."""
-    parser = subparsers.add_parser("status", help="what is done, what failed, time and memory")
-    parser.add_argument("dataset", type=Path, metavar="DATASET")
-    parser.add_argument("--json", action="store_true", help="print receipts as JSON")
-    parser.set_defaults(handler=show_status)
+    add_status_command(subparsers, stages())
     parser = subparsers.add_parser("info", help="subjects, cameras, frames and expressions")
     parser.add_argument("dataset", type=Path, metavar="DATASET")
     parser.add_argument("--json", action="store_true", help="print as JSON")
@@ -200,55 +237,11 @@ def add_dataset_commands(subparsers: Any) -> None:
     parser.set_defaults(handler=show_config)
 
 
-def _existing(path: Path) -> Dataset:
-    dataset = Dataset(path)
-    if not dataset.ledger.is_file():
-        raise StageError(
-            f"{path}: not a dataset (no ledger.sqlite); run 'express50 ingest {path} CAPTURE'"
-        )
-    return dataset
-
-
-def show_status(args: argparse.Namespace) -> int:
-    """Print receipts by stage; exit code 1 when an item's last run failed."""
-    from express50.ledger import Ledger
-
-    dataset = _existing(args.dataset)
-    with Ledger(dataset.ledger) as ledger:
-        receipts = {name: ledger.read(name) for name in stages()}
-    if args.json:
-        say_json({k: [_row(r) for r in v.values()] for k, v in receipts.items()})
-    else:
-        header = ["stage", "done", "failed", "seconds", "peak MB"]
-        say(*format_table(header, _status_rows(receipts)))
-        for rows in receipts.values():
-            for receipt in rows.values():
-                if receipt.status == "failed":
-                    say(f"failed {receipt.stage} {receipt.item}: {receipt.reason}")
-    failed = any(r.status == "failed" for rows in receipts.values() for r in rows.values())
-    return FAILED if failed else OK
-
-
-def _row(receipt: Any) -> dict[str, Any]:
-    """A receipt but for its files, which ``express50 check`` looks at."""
-    return {name: value for name, value in vars(receipt).items() if name != "made"}
-
-
-def _status_rows(receipts: dict[str, dict[str, Any]]) -> list[list[str]]:
-    rows = []
-    for name, table in receipts.items():
-        done = sum(r.status == "done" for r in table.values())
-        seconds = sum(r.seconds for r in table.values())
-        peak = max((r.peak_memory for r in table.values()), default=0) / 1e6
-        rows.append([name, str(done), str(len(table) - done), f"{seconds:.1f}", f"{peak:.0f}"])
-    return rows
-
-
 def show_info(args: argparse.Namespace) -> int:
     """Print what was ingested."""
     from express50.index import read_index
 
-    dataset = _existing(args.dataset)
+    dataset = existing_dataset(args.dataset)
     indices = [read_index(dataset, subject) for subject in dataset.subjects()]
     header = ["subject", "cameras", "size", "frames", "expressions", "plates", "calibration"]
     rows = [[str(value) for value in _info(index).values()] for index in indices]

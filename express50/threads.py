@@ -6,10 +6,11 @@ differently, and the same data must give the same bytes.
 
 from __future__ import annotations
 
+import functools
 import os
 import sys
 
-from threadpoolctl import threadpool_limits
+from threadpoolctl import ThreadpoolController
 
 VARIABLES = (
     "OMP_NUM_THREADS",
@@ -33,9 +34,15 @@ def cap_threads(threads: int) -> None:
     # A BLAS that is loaded already does not look at the environment; on other numbers of threads it
     # adds up in another order, and bytes would depend on where an item was worked on.
     if "numpy" in sys.modules:
-        threadpool_limits(threads, user_api="blas")
+        _libraries(len(sys.modules)).limit(limits=threads, user_api="blas")
     # sys.modules is asked, because importing torch only to cap it would cost seconds.
     if "torch" in sys.modules:
         sys.modules["torch"].set_num_threads(threads)
     if "cv2" in sys.modules:
         sys.modules["cv2"].setNumThreads(threads)
+
+
+@functools.lru_cache(maxsize=1)
+def _libraries(modules: int) -> ThreadpoolController:
+    """Libraries with a pool; looking for them takes 1.5 ms, and only an import brings new ones."""
+    return ThreadpoolController()

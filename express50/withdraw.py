@@ -12,7 +12,7 @@ import json
 import shutil
 import sqlite3
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -85,6 +85,7 @@ def _values(path: Path) -> list[str]:
 def _mixed_paths(dataset: Dataset) -> Iterator[Path]:
     """Outputs that may hold several subjects: items that are no subject, reports, leftovers."""
     subjects = {*dataset.captures(), *dataset.subjects()}
+    yield from dataset.slurm_dir.glob("*.out")
     for base in (dataset.root, dataset.stale_dir):
         for metrics in base.glob("*/*/metrics.json"):
             if metrics.parent.name not in subjects and base.joinpath("grmm") not in metrics.parents:
@@ -211,6 +212,8 @@ def _forget(dataset: Dataset, subject: str, paths: list[Path]) -> None:
                 (prefix, len(prefix) + 1, f"{prefix}/"),
             )
         _forget_naming(database, subject)
+        with suppress(sqlite3.OperationalError):  # ledgers of before runs were kept
+            database.execute("UPDATE runs SET running = '{}'")
         database.execute("PRAGMA wal_checkpoint(TRUNCATE)")
         database.execute("VACUUM")
         database.execute("PRAGMA wal_checkpoint(TRUNCATE)")

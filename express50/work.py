@@ -21,6 +21,8 @@ from express50.publish import dump_json, publishing, write_bytes
 from express50.stage import Stage
 from express50.threads import cap_threads
 
+BATCH_SECONDS = 0.2  # a batch begins no further item after so long
+
 
 @dataclass(frozen=True)
 class Task:
@@ -61,6 +63,16 @@ def fingerprint(stage: Stage, config: Any, inputs: dict[str, str]) -> str:
     return value_digest([stage.name, stage.version, vars(config), inputs])
 
 
+def run_tasks(tasks: list[Task]) -> list[Receipt]:
+    """Run items one after another for a while; receipts of those that were begun, at least one."""
+    began, receipts = time.perf_counter(), []
+    for task in tasks:
+        receipts.append(run_task(task))
+        if time.perf_counter() - began > BATCH_SECONDS:
+            break
+    return receipts
+
+
 def run_task(task: Task) -> Receipt:
     """Run one item and publish its outputs; whatever goes wrong becomes a receipt.
 
@@ -93,6 +105,8 @@ def run_task(task: Task) -> Receipt:
 
 
 def _run_and_publish(task: Task) -> tuple[dict, dict[str, FileMark]]:
+    if task.stage.needs_gpu(task.config):
+        _check_gpu(task)
     with publishing(task.dataset, task.stage.name, task.item) as out:
         # Data belong on standard output, and a library's chatter is none.
         with contextlib.redirect_stdout(sys.stderr):
@@ -101,6 +115,16 @@ def _run_and_publish(task: Task) -> tuple[dict, dict[str, FileMark]]:
         # Their bytes are still in memory; a rename changes neither time nor inode.
         files = {p.relative_to(out).as_posix(): mark_file(p) for p in files_of(out)}
     return json.loads(_metrics_bytes(metrics)), files
+
+
+def _check_gpu(task: Task) -> None:
+    """Refuse to do on a CPU what was asked for on a GPU."""
+    import torch
+
+    if not torch.cuda.is_available():
+        raise StageError(
+            f"{task.stage.name} needs a GPU as it is configured; torch finds no CUDA device here"
+        )
 
 
 def _metrics_bytes(metrics: dict) -> bytes:

@@ -17,6 +17,8 @@ class AlphaConfig:
     """Key against the plate, or a network: BackgroundMattingV2, or RMBG-2.0 or BiRefNet."""
     weights: str = ""
     """File of the network's weights, TorchScript or ONNX; from a known origin, it is a program."""
+    device: Literal["auto", "cuda"] = "auto"
+    """Where the network runs: on CUDA where there is one, or only where there is one."""
     tile: int = 2048
     """Longest side, pixels, that bgmv2 sees at once; larger frames are cut up."""
     scale: float = 1.0

@@ -151,6 +151,11 @@ def _write_picture(out: Path, images: dict[str, np.ndarray], odd: set[str]) -> N
     write_image(out / "qc" / "alphas.jpg", sheet, quality=88)
 
 
+def needs_gpu(config: AlphaConfig) -> bool:
+    """Whether a network must run on CUDA."""
+    return config.method != "key" and config.device == "cuda"
+
+
 STAGE = Stage(
     name="alpha",
     version=4,
@@ -159,4 +164,5 @@ STAGE = Stage(
     items=items,
     inputs=inputs,
     run=run,
+    needs_gpu=needs_gpu,
 )

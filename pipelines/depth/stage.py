@@ -53,6 +53,11 @@ def inputs(dataset: Dataset, item: str, config: DepthConfig) -> dict[str, Path |
     return found
 
 
+def needs_gpu(config: DepthConfig) -> bool:
+    """Whether rendering must run on CUDA."""
+    return config.device == "cuda" and config.render_rounds > 0
+
+
 def sources(dataset: Dataset, item: str, config: DepthConfig) -> list[str]:
     """The item that this one starts from, if it starts from one."""
     source = source_of(dataset, item, config)
@@ -170,4 +175,5 @@ STAGE = Stage(
     inputs=inputs,
     run=run,
     sources=sources,
+    needs_gpu=needs_gpu,
 )

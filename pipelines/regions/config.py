@@ -14,6 +14,8 @@ class RegionsConfig:
 
     segmentation: str = ""
     """File of Sapiens' body-part weights, TorchScript; its labels go before the mesh's."""
+    device: Literal["auto", "cuda"] = "auto"
+    """Where the network runs: on CUDA where there is one, or only where there is one."""
     image_side: int = 1536
     """Longest side, pixels, that the mesh is seen at; larger frames get enlarged labels."""
     depth: bool = True

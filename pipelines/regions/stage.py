@@ -243,6 +243,11 @@ def _metrics(
     }
 
 
+def needs_gpu(config: RegionsConfig) -> bool:
+    """Whether the network must run on CUDA."""
+    return bool(config.segmentation) and config.device == "cuda"
+
+
 STAGE = Stage(
     name="regions",
     version=1,
@@ -251,4 +256,5 @@ STAGE = Stage(
     items=peak_items,
     inputs=inputs,
     run=run,
+    needs_gpu=needs_gpu,
 )

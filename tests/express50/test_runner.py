@@ -12,6 +12,7 @@ from unittest.mock import Mock
 
 import pytest
 
+from express50.clusters import RemoteWorkers
 from express50.errors import ConfigError, StageError
 from express50.ledger import Ledger
 from express50.pool import Pool
@@ -159,10 +160,10 @@ def test_stage_without_items_and_unmatched_pattern_are_errors(tmp_path):
 
 
 def test_unreachable_scheduler_is_one_error(tmp_path, monkeypatch):
-    from express50 import pool
+    from express50 import clusters
 
     dataset = make_dataset(tmp_path / "data", ["a", "b"])
-    monkeypatch.setattr(pool, "CONNECT_SECONDS", 0.5)
+    monkeypatch.setattr(clusters, "CONNECT_SECONDS", 0.5)
     with pytest.raises(StageError, match="scheduler tcp://127.0.0.1:9: cannot connect"):
         run_stage(
             toy.STAGE, dataset, toy.ToyConfig(), scheduler="tcp://127.0.0.1:9", progress=False
@@ -215,7 +216,7 @@ def test_whichever_call_finds_the_scheduler_gone_the_error_is_the_same(call):
     client.nthreads.return_value = {"worker": 1}
     getattr(client, call).side_effect = CommClosedError("in <TCP (closed)>: reset by peer")
     pool = Pool(scheduler="tcp://gone:8786")
-    pool._client = client
+    pool._workers = RemoteWorkers(client)
     task = Task(toy.STAGE, toy.Dataset(Path("data")), "item", toy.ToyConfig(), "f" * 64, {})
     with pytest.raises(StageError, match="lost the dask scheduler .*reset by peer"):
         pool.run([task, task], settle=Mock(), tick=Mock())

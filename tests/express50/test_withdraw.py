@@ -14,7 +14,7 @@ from express50.digests import text_digest
 from express50.errors import CaptureError, StageError
 from express50.index import read_index
 from express50.layout import Dataset
-from express50.ledger import Ledger, Made, Receipt
+from express50.ledger import Ledger, Made, Receipt, Run
 from express50.locks import stage_lock
 from express50.names import files_naming, files_that, names_any_of
 from express50.publish import publishing
@@ -43,6 +43,10 @@ def dataset(tmp_path):
 
 
 def test_nothing_of_the_subject_stays_and_the_others_are_untouched(dataset):
+    with Ledger(dataset.ledger) as ledger:  # of a run that was killed, in SLURM jobs
+        ledger.write_run(Run(stage="track", items=2, running={"S001": 1.0}))
+    dataset.slurm_dir.mkdir(parents=True)
+    (dataset.slurm_dir / "1000.out").write_text("S001: chatter of a library")
     others = {k: v for k, v in tree(dataset.root).items() if "S002" in k}
     assert len(list(files_naming(dataset.root, "S001"))) > 5
     done = withdraw(dataset, "S001")

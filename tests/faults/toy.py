@@ -1,6 +1,6 @@
 """A toy stage whose items misbehave by name, and a driver to be killed.
 
-Run as ``python -m tests.faults.toy ROOT WORKERS``.
+Run as ``python -m tests.faults.toy ROOT WORKERS``, or ``slurm`` for the workers.
 """
 
 from __future__ import annotations
@@ -16,7 +16,9 @@ from pathlib import Path
 from express50.config import resolve_config
 from express50.errors import StageError
 from express50.layout import Dataset
+from express50.pool import Pool
 from express50.runner import run_stage
+from express50.slurm import SlurmJob
 from express50.stage import Stage
 
 SLOWER = "EXPRESS50_TOY_SLOWER"  # how many times as long to pause: no item's bytes depend on it
@@ -117,6 +119,12 @@ def make_dataset(root: Path, names: list[str]) -> Dataset:
     return Dataset(root)
 
 
+def run_toy_in_jobs(dataset: Dataset):
+    job = SlurmJob(time="10", memory="1G", jobs=1, interface="lo")
+    with Pool(slurm={"toy": job}) as pool:
+        return run_stage(STAGE, dataset, ToyConfig(seconds=0.05), pool=pool, progress=False)
+
+
 def run_toy(dataset: Dataset, workers: int = 0, **values: object):
     assignments = [f"toy.{key}={value!r}" for key, value in values.items()]
     config = resolve_config(STAGE, "standard", None, assignments)
@@ -130,5 +138,7 @@ def tree(root: Path) -> dict[str, bytes]:
 
 
 if __name__ == "__main__":
-    summary = run_toy(Dataset(Path(sys.argv[1])), int(sys.argv[2]), seconds=0.02)
+    dataset = Dataset(Path(sys.argv[1]))
+    jobs = sys.argv[2] == "slurm"
+    summary = run_toy_in_jobs(dataset) if jobs else run_toy(dataset, int(sys.argv[2]), seconds=0.02)
     sys.exit(0 if summary.ok else 1)
