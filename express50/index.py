@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import lru_cache
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 from express50.errors import FormatError, StageError
 from express50.layout import Dataset, footage_root
+from express50.reading import NAME, read_json_table
 
 SCHEMA = "express50.index/1"
 # `Index.calibration` of a capture in a foreign layout: its cameras stand beside the index.
@@ -134,8 +134,8 @@ def _read_cached(dataset: Dataset, subject: str, version: tuple[int, ...]) -> In
         )
     root = footage_root(captures[subject])
     try:
-        return index_from_json(json.loads(path.read_text(encoding="utf-8")), root)
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        return index_from_json(read_json_table(path, FormatError), root)
+    except (ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
         raise FormatError(
             f"{path}: not an index ({type(error).__name__}: {error}); "
             f"delete its folder and run 'express50 ingest {dataset.root}'"
@@ -175,6 +175,11 @@ def index_from_json(content: Mapping[str, Any], capture: Path) -> Index:
     """
     if content.get("schema") != SCHEMA:
         raise ValueError(f"schema is {content.get('schema')!r}, expected {SCHEMA!r}")
+    for name in (*content["cameras"], *(row[0] for row in content["cues"])):
+        if not NAME.fullmatch(name):  # they become names of files
+            raise ValueError(f"id {name!r}, expected letters, digits and _ . + -")
+    for name in content["plates"].values():
+        _check_inside(name)
     return Index(
         subject=content["subject"],
         capture=Path(capture),
@@ -188,6 +193,12 @@ def index_from_json(content: Mapping[str, Any], capture: Path) -> Index:
     )
 
 
+def _check_inside(name: str) -> None:
+    """Refuse a name that leads out of the capture; the pictures' own are checked when read."""
+    if PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts:
+        raise ValueError(f"{name!r} leads out of the capture")
+
+
 def _camera_from_json(name: str, row: Mapping[str, Any]) -> CameraSource:
     values = dict(row)
     values["pts"] = tuple(map(int, row["pts"].split()))
@@ -196,6 +207,7 @@ def _camera_from_json(name: str, row: Mapping[str, Any]) -> CameraSource:
     values["clips"] = tuple(map(int, row.get("clips", ())))
     values["correction"] = tuple(tuple(map(float, line)) for line in row.get("correction", ()))
     camera = CameraSource(**values)
+    _check_inside(camera.source)
     lengths = {len(camera.pts), len(camera.dhash)}
     if lengths != {camera.frames}:
         raise ValueError(f"camera {name}: {sorted(lengths)} entries for {camera.frames} frames")

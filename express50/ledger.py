@@ -8,12 +8,14 @@ from __future__ import annotations
 import json
 import sqlite3
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from express50.digests import file_sha256
 from express50.errors import FormatError
+from express50.reading import parse_json
 
 SCHEMA = """
 CREATE TABLE IF NOT EXISTS receipts (
@@ -27,6 +29,26 @@ CREATE TABLE IF NOT EXISTS digests (
     inode INTEGER NOT NULL, sha256 TEXT NOT NULL
 );
 """
+
+
+DELETE = "delete it and run the stages again, the same outputs will be made"
+KINDS = {"item": str, "fingerprint": str, "status": str, "reason": str, "metrics": dict}
+TABLES = {"receipts", "digests"}
+
+
+def check_schema(database: sqlite3.Connection) -> None:
+    """Refuse a database that holds more than a ledger's tables.
+
+    A file from elsewhere may hold views and triggers, which are programs: they would run, without
+    end if they like, whenever a receipt is read or written.
+
+    Raises:
+        sqlite3.DatabaseError: it does, or is no database.
+    """
+    database.execute("PRAGMA trusted_schema=OFF")
+    for kind, name in database.execute("SELECT type, tbl_name FROM sqlite_master").fetchall():
+        if kind not in ("table", "index") or name not in TABLES:
+            raise sqlite3.DatabaseError(f"it has a {kind} {str(name)[:40]!r}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,24 +86,32 @@ class Ledger:
     def __init__(self, path: Path) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         self._fresh: dict[str, tuple] = {}  # digests not yet stored
-        try:
+        self._path = path
+        with self._damage():
             self._database = sqlite3.connect(path, timeout=60, isolation_level=None)
+            check_schema(self._database)
             self._database.execute("PRAGMA journal_mode=WAL")
             # A receipt lost with the power costs an item once more; waiting for the disk after each
             # would cost every item. What must not be lost, `forget` waits for.
             self._database.execute("PRAGMA synchronous=NORMAL")
             self._database.executescript(SCHEMA)
-        except sqlite3.DatabaseError as error:
-            raise FormatError(
-                f"{path}: not a ledger ({error}); delete it and run the stages again, the same "
-                "outputs will be made"
-            ) from error
 
     def __enter__(self) -> Ledger:
         return self
 
     def __exit__(self, *unused: object) -> None:
         self.close()
+
+    @contextmanager
+    def _damage(self) -> Iterator[None]:
+        """Any statement may be the one that meets a damaged page."""
+        try:
+            yield
+        except (sqlite3.DatabaseError, ValueError, TypeError, OverflowError) as error:
+            raise FormatError(
+                f"{self._path}: not a ledger ({error}); delete it and run the stages again, the "
+                "same outputs will be made"
+            ) from error
 
     def close(self) -> None:
         """Close the database."""
@@ -91,37 +121,53 @@ class Ledger:
         """Store a receipt in the place of the item's former one."""
         row = dict(vars(receipt)) | {"metrics": json.dumps(receipt.metrics, sort_keys=True)}
         marks = ", ".join(f":{name}" for name in row)
-        self._database.execute(
-            f"INSERT OR REPLACE INTO receipts ({', '.join(row)}) VALUES ({marks})", row
-        )
+        with self._damage():
+            self._database.execute(
+                f"INSERT OR REPLACE INTO receipts ({', '.join(row)}) VALUES ({marks})", row
+            )
 
     def read(self, stage: str) -> dict[str, Receipt]:
-        """Receipts of a stage by item, sorted."""
+        """Receipts of a stage by item, sorted.
+
+        Raises:
+            FormatError: a row is damaged.
+        """
         names = list(Receipt.__dataclass_fields__)
-        rows = self._database.execute(
-            f"SELECT {', '.join(names)} FROM receipts WHERE stage = ? ORDER BY item", (stage,)
-        )
-        values = [dict(zip(names, row, strict=True)) for row in rows]
-        return {v["item"]: Receipt(**v | {"metrics": json.loads(v["metrics"])}) for v in values}
+        with self._damage():
+            rows = self._database.execute(
+                f"SELECT {', '.join(names)} FROM receipts WHERE stage = ? ORDER BY item", (stage,)
+            ).fetchall()
+        found = {}
+        for row in rows:
+            values = dict(zip(names, row, strict=True))
+            where = f"{self._path}: {stage}"
+            values["metrics"] = parse_json(values["metrics"], where, FormatError, DELETE)
+            receipt = Receipt(**values)
+            if any(type(getattr(receipt, k)) is not kind for k, kind in KINDS.items()):
+                raise FormatError(f"{where}: the receipt of {receipt.item!r} is damaged; {DELETE}")
+            found[receipt.item] = receipt
+        return found
 
     def forget(self, stage: str, items: Iterable[str]) -> None:
         """Remove receipts; when this returns they are gone, even if the power goes."""
-        self._database.execute("PRAGMA synchronous=FULL")
-        self._database.execute("BEGIN IMMEDIATE")
-        self._database.executemany(
-            "DELETE FROM receipts WHERE stage = ? AND item = ?", [(stage, item) for item in items]
-        )
-        self._database.execute("COMMIT")
-        self._database.execute("PRAGMA synchronous=NORMAL")
+        rows = [(stage, item) for item in items]
+        with self._damage():
+            self._database.execute("PRAGMA synchronous=FULL")
+            self._database.execute("BEGIN IMMEDIATE")
+            self._database.executemany("DELETE FROM receipts WHERE stage = ? AND item = ?", rows)
+            self._database.execute("COMMIT")
+            self._database.execute("PRAGMA synchronous=NORMAL")
 
     def sha256(self, path: Path) -> str:
         """SHA-256 of a file; read again only when its size or modification time changed."""
         stat = path.stat()
         key = (str(path), stat.st_size, stat.st_mtime_ns, stat.st_ino)
-        row = self._database.execute(
-            "SELECT sha256 FROM digests WHERE path = ? AND size = ? AND mtime_ns = ? AND inode = ?",
-            key,
-        ).fetchone()
+        with self._damage():
+            row = self._database.execute(
+                "SELECT sha256 FROM digests"
+                " WHERE path = ? AND size = ? AND mtime_ns = ? AND inode = ?",
+                key,
+            ).fetchone()
         if row is not None:
             return row[0]
         digest = file_sha256(path)
@@ -130,9 +176,10 @@ class Ledger:
 
     def keep_digests(self) -> None:
         """Store new digests in one transaction; one each would cost a disk sync a file."""
-        self._database.execute("BEGIN IMMEDIATE")
-        self._database.executemany(
-            "INSERT OR REPLACE INTO digests VALUES (?, ?, ?, ?, ?)", self._fresh.values()
-        )
-        self._database.execute("COMMIT")
+        with self._damage():
+            self._database.execute("BEGIN IMMEDIATE")
+            self._database.executemany(
+                "INSERT OR REPLACE INTO digests VALUES (?, ?, ?, ?, ?)", self._fresh.values()
+            )
+            self._database.execute("COMMIT")
         self._fresh.clear()

@@ -6,7 +6,7 @@ person by running its command. The raw capture lies outside the dataset and stay
 
 from __future__ import annotations
 
-import json
+import contextlib
 import re
 import shutil
 import sqlite3
@@ -15,11 +15,14 @@ from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
+from typing import IO
 
 from express50.digests import text_digest
-from express50.errors import StageError
+from express50.errors import FormatError, StageError
 from express50.layout import Dataset
+from express50.ledger import check_schema
 from express50.publish import write_json
+from express50.reading import read_json
 
 IMAGE_SUFFIXES = {".jpg", ".jpeg", ".png", ".exr", ".tif", ".ply", ".glb"}
 CHUNK = 1 << 24
@@ -97,16 +100,29 @@ def withdrawn_file(dataset: Dataset) -> Path:
 def withdrawn(dataset: Dataset) -> set[str]:
     """SHA-256 of the ids of withdrawn subjects; the ids themselves are not kept."""
     path = withdrawn_file(dataset)
-    return set(json.loads(path.read_text(encoding="utf-8"))) if path.is_file() else set()
+    if not path.is_file():
+        return set()
+    rows = read_json(path, FormatError, "restore it: it says who must not be taken in again")
+    if not isinstance(rows, list) or not all(isinstance(row, str) for row in rows):
+        raise FormatError(f"{path}: expected a list of digests; restore it")
+    return set(rows)
 
 
 def _forget(dataset: Dataset, subject: str, paths: list[Path]) -> None:
     """Remove receipts and digests, and overwrite the database's freed pages."""
     if not dataset.ledger.is_file():
         return
+    try:
+        _forget_rows(dataset, subject, paths)
+    except sqlite3.DatabaseError as error:
+        raise FormatError(f"{dataset.ledger}: not a ledger ({error}); delete it") from error
+
+
+def _forget_rows(dataset: Dataset, subject: str, paths: list[Path]) -> None:
     items = {path.relative_to(dataset.root).parts[:2] for path in paths}
     root = str(dataset.root.resolve())
     with closing(sqlite3.connect(dataset.ledger, isolation_level=None)) as database:
+        check_schema(database)
         database.execute("PRAGMA secure_delete=ON")
         for stage, item in (pair for pair in items if len(pair) == 2):
             database.execute("DELETE FROM receipts WHERE stage = ? AND item = ?", (stage, item))
@@ -138,22 +154,31 @@ def _names(path: Path, word: re.Pattern[bytes]) -> bool:
     if suffix in IMAGE_SUFFIXES:  # pixels and points may hold any four bytes by chance
         return False
     if suffix == ".tar":
-        return _tar_names(path, word)
-    with path.open("rb") as file:
-        tail = b""
-        while block := file.read(CHUNK):
-            if word.search(tail + block):
-                return True
-            tail = block[-256:]
+        with contextlib.suppress(tarfile.TarError, ValueError, EOFError, OverflowError):
+            return _tar_names(path, word)
+    with path.open("rb") as file:  # of a damaged tar too: it may still name somebody
+        return _holds(file, word)
+
+
+def _holds(file: IO[bytes], word: re.Pattern[bytes]) -> bool:
+    tail = b""
+    while block := file.read(CHUNK):
+        if word.search(tail + block):
+            return True
+        tail = block[-256:]
     return False
 
 
 def _tar_names(path: Path, word: re.Pattern[bytes]) -> bool:
     with tarfile.open(path, "r:") as tar:
         for member in tar:
-            if word.search(member.name.encode()):
+            if word.search(member.name.encode(errors="surrogateescape")):
                 return True
-            file = tar.extractfile(member) if member.name.endswith(".json") else None
-            if file is not None and word.search(file.read()):
+            if member.issparse():  # our shards have none; it may say to be of any size
+                raise tarfile.ReadError("a sparse member")
+            # A link would be followed to another member; only what a member itself holds counts.
+            wanted = member.isreg() and member.name.endswith(".json")
+            file = tar.extractfile(member) if wanted else None
+            if file is not None and _holds(file, word):
                 return True
     return False

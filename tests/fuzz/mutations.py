@@ -55,7 +55,8 @@ def _step(data: bytes, kind: str, at: int, choice: int) -> bytes:
     length = 1 + choice % 64
     match kind:
         case "flip":
-            return data[:at] + bytes(b ^ (1 << choice % 8) for b in data[at : at + 1]) + data[at + 1 :]
+            turned = bytes(b ^ (1 << choice % 8) for b in data[at : at + 1])
+            return data[:at] + turned + data[at + 1 :]
         case "byte":
             return data[:at] + bytes([choice % 256]) + data[at + 1 :]
         case "cut":

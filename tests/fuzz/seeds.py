@@ -15,14 +15,14 @@ import torch
 from annotations.exchange import export_labels, read_table
 from annotations.store import append_label, make_mark, read_labels
 from annotations.suggestions import read_suggestions
-from express50.captures.read import read_any
 from express50.cameras import read_cameras
 from express50.capture import read_cues
+from express50.captures.read import read_any
 from express50.config import resolve_config
 from express50.frames import decode_proxy, read_gains, read_peaks
 from express50.head.flame import load_flame
 from express50.head.ict import read_obj
-from express50.images import decode_image, encode_jpeg, encode_png, read_image, write_image
+from express50.images import decode_image, read_image, write_image
 from express50.index import read_index
 from express50.landmarks.points_file import read_points
 from express50.layout import Dataset
@@ -308,9 +308,10 @@ def _network(root: Path) -> object:
 
 
 def _vgg(root: Path) -> object:
-    from grmm.judge import _read
+    from express50.errors import TrainError
+    from express50.weights import read_weights
 
-    return _read(root / "vgg.pth", "alexnet")
+    return read_weights(root / "vgg.pth", TrainError, "vgg", "a state dict")
 
 
 def readers() -> Iterator[Reader]:
@@ -367,7 +368,8 @@ def readers() -> Iterator[Reader]:
     yield Reader("points.npz", "points.npz", points("points.npz"))
     yield Reader("points.json", "points.json", points("points.json"))
     yield Reader("offsets.npy", "S001.offsets.npy", lambda r: read_offsets(r, "S001"))
-    for name in ("flame.pkl", "landmark_embedding.npy", "FLAME_masks.pkl", "head_template_mesh.obj"):
+    template = "head_template_mesh.obj"
+    for name in ("flame.pkl", "landmark_embedding.npy", "FLAME_masks.pkl", template):
         yield Reader(f"FLAME {name}", f"flame/{name}", lambda r: load_flame(r / "flame/flame.pkl"))
     yield Reader("OBJ", "flame/head_template_mesh.obj",
                  plain(read_obj, "flame/head_template_mesh.obj"))  # fmt: skip
@@ -399,6 +401,6 @@ def readers() -> Iterator[Reader]:
         yield Reader(f"import {name}", name, plain(read_table, name))
     yield Reader("ledger.sqlite", "ledger.sqlite", _ledger)
     yield Reader("stage config", "config.toml",
-                 lambda r: vars(resolve_config(ingest.STAGE, "draft", r / "config.toml")))  # fmt: skip
+                 lambda r: resolve_config(ingest.STAGE, "draft", r / "config.toml"))  # fmt: skip
     yield Reader("grmm config", "grmm.toml", lambda r: resolve("demo", r / "grmm.toml"))
     yield Reader("study.json", "study/study.json", _study)
