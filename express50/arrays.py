@@ -13,6 +13,7 @@ import zlib
 from collections.abc import Collection
 from lzma import LZMAError
 from pathlib import Path
+from tokenize import TokenError
 from typing import BinaryIO
 
 import numpy as np
@@ -25,7 +26,7 @@ HEADER_LIMIT = 4096  # characters of an array's header
 DAMAGE = (
     ValueError, TypeError, EOFError, OSError, KeyError, IndexError, OverflowError, MemoryError,
     NotImplementedError, RuntimeError, SyntaxError, UnicodeError, AttributeError, LZMAError,
-    zipfile.BadZipFile, zlib.error,
+    zipfile.BadZipFile, zlib.error, TokenError,
 )  # fmt: skip
 
 
@@ -103,8 +104,11 @@ def read_header(file: BinaryIO) -> tuple[tuple[int, ...], np.dtype]:
 def _array(file: BinaryIO, size: int) -> np.ndarray:
     """An array from the start of a file of ``size`` bytes."""
     shape, dtype = read_header(file)
-    need, have = math.prod(shape) * dtype.itemsize, size - file.tell()
-    if dtype.hasobject or (math.prod(shape) and not dtype.itemsize) or need > have:
+    count: int = math.prod(list(shape))
+    need, have = count * dtype.itemsize, size - file.tell()
+    if dtype.hasobject:
+        raise ValueError("it holds Python objects, which are not read")
+    if (count and not dtype.itemsize) or need > have:
         raise ValueError(f"an array {dtype} {shape} needs {need} bytes, the file has {have}")
     file.seek(0)
     return np.lib.format.read_array(file, allow_pickle=False)

@@ -57,7 +57,7 @@ def open_image(path: Path) -> oiio.ImageInput:
     """
     source = oiio.ImageInput.open(str(path)) if Path(path).is_file() else None
     if source is None:
-        why = oiio.geterror().strip() or "no such file"
+        why = oiio.geterror().strip() or "it cannot be opened"
         raise FormatError(f"{path}: cannot be read as an image ({why}); copy it again")
     return source
 

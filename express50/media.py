@@ -30,6 +30,7 @@ BYTES_LIMIT = 1 << 28  # of one encoded image, or of one array
 # Pixels a byte of a file: no photograph packs tighter, AVIF's of one colour do.
 PIXELS_A_BYTE = 1 << 14
 ATTRIBUTE_LIMIT = 1 << 16  # bytes
+NAME_LIMIT = 255  # bytes, of each part
 OPEN_FILES = 4  # containers a process keeps open
 # What h5py raises on bad files.
 DAMAGE = (OSError, RuntimeError, KeyError, ValueError, TypeError, OverflowError, AttributeError)
@@ -77,7 +78,10 @@ def inside(root: Path, name: str, where: str = "") -> Path:
     """
     pure = PurePosixPath(name)
     path = root / name
-    out = pure.is_absolute() or ".." in pure.parts or "\0" in name
+    out = pure.is_absolute() or ".." in pure.parts or not name.isprintable()
+    lengths = [len(part.encode(errors="replace")) for part in (name, *pure.parts)]
+    if lengths[0] > 4096 or max(lengths[1:], default=0) > NAME_LIMIT:
+        raise CaptureError(f"{where or root}: {name[:40]!r}... is longer than a name may be")
     if out or not path.resolve().is_relative_to(root.resolve()):
         raise CaptureError(
             f"{where or root}: {name!r} leads out of {root}; expected a name inside it"

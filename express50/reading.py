@@ -19,7 +19,7 @@ from express50.errors import Express50Error
 
 TEXT_LIMIT = 1 << 28  # bytes; the index of 100,000 samples takes 40 MB
 TOML_LIMIT = 1 << 20  # bytes; written by hand
-NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.+-]*")  # of what may become a file or folder
+NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.+-]{0,199}")  # of what may become a file or folder
 AGAIN = "copy or write it again"
 
 Kind = type[Express50Error]
@@ -89,6 +89,8 @@ def parse_json(text: str | bytes, where: str, kind: Kind, mend: str = AGAIN) -> 
         return json.loads(
             text, parse_constant=_finite, parse_float=_finite, object_pairs_hook=_once
         )
+    except NotFiniteError as error:
+        raise kind(f"{where}: {error.located(text)}; {mend}") from None
     except (ValueError, RecursionError) as error:
         raise kind(f"{where}: not JSON ({reason(error)}); {mend}") from None
 
@@ -112,6 +114,8 @@ def parse_toml(text: str, where: str, kind: Kind, mend: str = "correct it") -> d
     try:
         table = tomllib.loads(text, parse_float=_finite)
         json.dumps(table, default=str)  # dotted keys nest without brackets, without end
+    except NotFiniteError as error:
+        raise kind(f"{where}: {error.located(text)}; {mend}") from None
     except (ValueError, RecursionError) as error:
         raise kind(f"{where}: not TOML: {reason(error)}; {mend}") from None
     return table
@@ -125,10 +129,21 @@ def reason(error: BaseException) -> str:
     return " ".join(words.split())[:200]
 
 
+class NotFiniteError(ValueError):
+    """A number that is NaN or infinite, as it is written."""
+
+    def located(self, text: str | bytes) -> str:
+        """What is wrong and where: the line that such a number stands in first."""
+        lines = (text if isinstance(text, str) else text.decode(errors="replace")).split("\n")
+        word = str(self)
+        number = next((n for n, line in enumerate(lines, 1) if word in line), 1)
+        return f"line {number} holds {word[:40]}, which is NaN or infinite; expected finite numbers"
+
+
 def _finite(text: str) -> float:
     value = float(text)
     if not math.isfinite(value):
-        raise ValueError(f"the number {text[:40]} is not finite")
+        raise NotFiniteError(text)
     return value
 
 

@@ -160,7 +160,7 @@ class ShardReader:
         where = f"{self.root / entry.shard}: {entry.key}: meta"
         meta = parse_json(data, where, FormatError, _AGAIN)
         scale = meta.get("depth_scale_m") if isinstance(meta, dict) else None
-        if type(scale) not in (int, float) or not 0 < scale < 1:
+        if not isinstance(scale, float) or not 0 < scale < 1:
             raise FormatError(f"{where}: depth_scale_m is {scale!r}, expected metres; {_AGAIN}")
         return meta
 
@@ -276,8 +276,8 @@ def _shard_entries(root: Path, shard: dict) -> Iterator[Entry]:
             raise FormatError(
                 f"{path}: {row['key']} lies outside the shard; rerun 'express50 pack'"
             )
-        ids = [row["key"], row["subject"], row["expression"], row["camera"], shard["split"]]
-        for text in ids:  # they become names of files
-            if not KEY.fullmatch(text):
-                raise FormatError(f"{path}: id {text!r}, expected letters, digits, _ and -")
-        yield Entry(*ids, name, members)
+        ids = {name: row[name] for name in ("key", "subject", "expression", "camera")}
+        for kind, text in (*ids.items(), ("split", shard["split"])):
+            if not KEY.fullmatch(text):  # they become names of files
+                raise FormatError(f"{path}: {kind} {text!r}, expected letters, digits, _ and -")
+        yield Entry(**ids, split=shard["split"], shard=name, members=members)

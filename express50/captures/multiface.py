@@ -18,12 +18,11 @@ from express50.capture import RawCamera, RawCapture
 from express50.captures.timeline import Moment, common_timeline
 from express50.captures.wishes import Wishes, check_wishes, identifier
 from express50.errors import CalibrationError, CaptureError
-from express50.reading import read_text
+from express50.reading import NAME, read_text
 from express50.rigs.build import camera_from_K, checked, in_metres
 
 SIZE = (1334, 2048)
 FPS = 30.0
-SAFE = re.compile(r"[A-Za-z0-9][\w.+-]*")
 
 
 def fits(path: Path) -> bool:
@@ -103,7 +102,7 @@ def read_krt(path: Path) -> dict[str, Camera]:
     text, found = read_text(path, CalibrationError), {}
     for block in re.split(r"\n\s*\n", text.strip()):
         name, *rows = [line.strip() for line in block.splitlines()] or [""]
-        if not SAFE.fullmatch(name):
+        if not NAME.fullmatch(name):
             raise CalibrationError(f"{path}: camera {name[:40]!r}, expected such as 400002")
         try:
             table = [np.array(row.split(), dtype=np.float64) for row in rows]
@@ -135,7 +134,7 @@ def read_frame_list(path: Path) -> list[Moment]:
         words = line.split()
         if not words:
             continue
-        if len(words) != 2 or not SAFE.fullmatch(words[0]) or not words[1].isdecimal():
+        if len(words) != 2 or not NAME.fullmatch(words[0]) or not words[1].isdecimal():
             raise CaptureError(f"{path}:{number}: {line[:60]!r}, expected a segment and a frame")
         found.append((words[0], int(words[1][:9])))
     return found

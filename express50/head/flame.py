@@ -161,7 +161,7 @@ def read_embedding(
         bary = np.concatenate([turning_bary[0].reshape(-1, 3), bary[:51]])
     if ids.size < 68 or bary.shape != (ids.size, 3) or ids.min() < 0 or ids.max() >= len(faces):
         raise HeadModelError(
-            f"{path}: {ids.size} landmarks, not all of them on faces of the model; expected 68 on "
+            f"{path}: {ids.size} landmarks on faces that are not all the model's; expected 68 on "
             f"faces 0..{len(faces) - 1}"
         )
     contour = None

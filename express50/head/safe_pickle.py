@@ -16,7 +16,7 @@ import pickletools
 from collections import OrderedDict
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, cast
 
 import numpy as np
 
@@ -267,11 +267,12 @@ def _checked_unpickler(file: BinaryIO) -> SafeUnpickler:
     """
     start, end = file.tell(), file.seek(0, io.SEEK_END)
     file.seek(start)
-    opcodes = pickletools.genops(_Bounded(file, end))
+    opcodes = pickletools.genops(cast(BinaryIO, _Bounded(file, end)))
     for count, (opcode, argument, _) in enumerate(opcodes, 1):
-        if opcode.name in ("PUT", "BINPUT", "LONG_BINPUT") and not 0 <= argument <= 16 * count:
-            raise pickle.UnpicklingError(f"memorises under {argument} after {count} steps")
-        if opcode.name == "LONG4" and argument.bit_length() > 1 << 16:
+        number = argument if isinstance(argument, int) else 0
+        if opcode.name in ("PUT", "BINPUT", "LONG_BINPUT") and not 0 <= number <= 16 * count:
+            raise pickle.UnpicklingError(f"memorises under {number} after {count} steps")
+        if opcode.name == "LONG4" and number.bit_length() > 1 << 16:
             raise pickle.UnpicklingError("a whole number of thousands of digits")
     file.seek(start)
     return SafeUnpickler(file, encoding="latin1")

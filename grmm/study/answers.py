@@ -25,9 +25,12 @@ def read_study(out: Path) -> dict:
     study = read_json(path, FormatError, "make the study again")
     if not isinstance(study, dict) or study.get("format") != FORMAT:
         raise FormatError(f"{path}: expected format {FORMAT!r}; make the study again")
-    kinds = {"participants": int, "examples": list, "questions": (list, dict)}
-    for name, kind in kinds.items():
-        if not isinstance(study.get(name), kind):
+    for name, kinds in (
+        ("participants", (int,)),
+        ("examples", (list,)),
+        ("questions", (list, dict)),
+    ):
+        if not isinstance(study.get(name), kinds):
             raise FormatError(f"{path}: {name} is {study.get(name)!r}; make the study again")
     return study
 
