@@ -35,6 +35,7 @@ class RawCamera:
         counts: images of each clip; one clip where it is empty.
         stamps: the layout's own number of each image; its place where it is empty.
         correction: rows of a polynomial colour correction (`express50.colour_polynomial`), or none.
+        orientation: how images are to be turned when they are read (`express50.exif`).
     """
 
     id: str
@@ -44,6 +45,7 @@ class RawCamera:
     counts: tuple[int, ...] = ()
     stamps: tuple[int, ...] = ()
     correction: tuple[tuple[float, ...], ...] = ()
+    orientation: int = 1
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -69,7 +69,8 @@ class FrameReader:
     def _recorded(self, frame: int) -> np.ndarray:
         """The frame as it was recorded, its hash compared with the index."""
         if self.source.kind == "frames":
-            return self._checked(read_picture(self.path, self.source.names[frame]), frame)
+            image = read_picture(self.path, self.source.names[frame], self.source.orientation)
+            return self._checked(image, frame)
         video, number = self._video_of(frame)
         image = video.read(number)
         if dhash(image) != self.source.dhash[frame]:

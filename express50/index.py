@@ -43,6 +43,8 @@ class CameraSource:
             may lie in a container (`express50.media`).
         clips: frames of each clip; empty where all is one.
         correction: rows of a polynomial colour correction that `express50.frames` applies, or none.
+        orientation: how the images are turned when they are read (`express50.exif`); width and
+            height are those of the turned ones.
     """
 
     kind: str
@@ -56,6 +58,7 @@ class CameraSource:
     names: tuple[str, ...] = ()
     clips: tuple[int, ...] = ()
     correction: tuple[tuple[float, ...], ...] = ()
+    orientation: int = 1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -163,8 +166,9 @@ def _camera_to_json(camera: CameraSource) -> dict[str, Any]:
     row["pts"] = " ".join(map(str, camera.pts))
     row["dhash"] = " ".join(camera.dhash)
     row["names"] = list(camera.names)
-    # Left out where they say nothing: most captures have one clip and no correction.
-    return {k: v for k, v in row.items() if v or k not in ("clips", "correction")}
+    # Left out where they say nothing: most captures have one clip, no correction and lie upright.
+    plain = {"clips": (), "correction": (), "orientation": 1}
+    return {k: v for k, v in row.items() if k not in plain or v != plain[k]}
 
 
 def index_from_json(content: Mapping[str, Any], capture: Path) -> Index:
@@ -207,6 +211,8 @@ def _camera_from_json(name: str, row: Mapping[str, Any]) -> CameraSource:
     values["clips"] = tuple(map(int, row.get("clips", ())))
     values["correction"] = tuple(tuple(map(float, line)) for line in row.get("correction", ()))
     camera = CameraSource(**values)
+    if type(camera.orientation) is not int or not 1 <= camera.orientation <= 8:
+        raise ValueError(f"camera {name}: orientation {camera.orientation!r}, expected 1 to 8")
     _check_inside(camera.source)
     lengths = {len(camera.pts), len(camera.dhash)}
     if lengths != {camera.frames}:

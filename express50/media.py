@@ -23,6 +23,7 @@ from PIL import Image
 from express50.arrays import DAMAGE as ZIP_DAMAGE
 from express50.checks import PIXEL_LIMIT
 from express50.errors import CaptureError, FormatError
+from express50.exif import upright
 from express50.images import ROOM_BYTES, decode_cv, linear_to_srgb, read_image
 
 WITHIN = "!/"
@@ -89,12 +90,17 @@ def inside(root: Path, name: str, where: str = "") -> Path:
     return path
 
 
-def read_picture(root: Path, name: str) -> np.ndarray:
-    """Image (H, W, 3) uint8 sRGB of a name below a folder.
+def read_picture(root: Path, name: str, orientation: int = 1) -> np.ndarray:
+    """Image (H, W, 3) uint8 sRGB of a name below a folder, turned by EXIF's orientation.
 
     Raises:
         CaptureError: it is missing, damaged, too large, or its name leads out of the folder.
     """
+    return upright(_stored(root, name), orientation)
+
+
+def _stored(root: Path, name: str) -> np.ndarray:
+    """The image with its pixels as they are stored."""
     container, within, member = name.partition(WITHIN)
     path = inside(root, container)
     if within:
