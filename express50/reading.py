@@ -19,6 +19,8 @@ from express50.errors import Express50Error
 
 TEXT_LIMIT = 1 << 28  # bytes; the index of 100,000 samples takes 40 MB
 TOML_LIMIT = 1 << 20  # bytes; written by hand
+# Of a TOML key; Python's parser keeps every beginning of one, so that long ones fill the memory.
+DOTTED = re.compile(r"""(?<![\w"'-])(?:(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')[ \t]*+\.[ \t]*+){32}""")
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.+-]{0,199}")  # of what may become a file or folder
 AGAIN = "copy or write it again"
 
@@ -111,9 +113,10 @@ def parse_toml(text: str, where: str, kind: Kind, mend: str = "correct it") -> d
     Raises:
         Express50Error: as `read_toml`.
     """
+    if found := DOTTED.search(text):
+        raise kind(f"{where}: {found[0][:40]}... has over 32 parts, expected a short key; {mend}")
     try:
         table = tomllib.loads(text, parse_float=_finite)
-        json.dumps(table, default=str)  # dotted keys nest without brackets, without end
     except NotFiniteError as error:
         raise kind(f"{where}: {error.located(text)}; {mend}") from None
     except (ValueError, RecursionError) as error:

@@ -20,7 +20,7 @@ from typing import Any, BinaryIO, cast
 
 import numpy as np
 
-from express50.arrays import read_header, read_npy
+from express50.arrays import DAMAGE, read_header, read_npy
 from express50.errors import HeadModelError
 
 PICKLE_LIMIT_BYTES = 2 << 30
@@ -249,10 +249,7 @@ def read_object_array(path: Path) -> Any:  # noqa: ANN401 (whatever the file hol
 
 
 # What a damaged pickle makes the standard unpickler and the stand-ins above raise.
-_DAMAGE = (
-    pickle.UnpicklingError, EOFError, ValueError, TypeError, KeyError, IndexError, AttributeError,
-    UnicodeError, OverflowError, MemoryError, ImportError, RecursionError, AssertionError,
-)  # fmt: skip
+_DAMAGE = (*DAMAGE, pickle.UnpicklingError, ImportError, AssertionError)
 
 
 def _load(file: BinaryIO) -> Any:  # noqa: ANN401 (whatever the file holds)
@@ -272,6 +269,8 @@ def _checked_unpickler(file: BinaryIO) -> SafeUnpickler:
         number = argument if isinstance(argument, int) else 0
         if opcode.name in ("PUT", "BINPUT", "LONG_BINPUT") and not 0 <= number <= 16 * count:
             raise pickle.UnpicklingError(f"memorises under {number} after {count} steps")
+        if opcode.name == "FRAME" and not 0 <= number <= end:
+            raise pickle.UnpicklingError(f"a frame of {number} bytes that are not there")
         if opcode.name == "LONG4" and number.bit_length() > 1 << 16:
             raise pickle.UnpicklingError("a whole number of thousands of digits")
     file.seek(start)

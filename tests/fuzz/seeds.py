@@ -19,6 +19,7 @@ from express50.cameras import read_cameras
 from express50.capture import read_cues
 from express50.captures.read import read_any
 from express50.config import resolve_config
+from express50.errors import FormatError
 from express50.frames import decode_proxy, read_gains, read_peaks
 from express50.head.flame import load_flame
 from express50.head.ict import read_obj
@@ -296,6 +297,18 @@ def _study(root: Path) -> object:
     return study, read_answers(root / "study", study)
 
 
+def _verified(root: Path) -> None:
+    """`verify` returns what is wrong."""
+    if faults := verify(root / "shards"):
+        raise FormatError("; ".join(faults))
+
+
+def _searched(root: Path) -> object:
+    """A damaged tar is searched too, and then found damaged."""
+    found = list(files_naming(Dataset(root / "shards"), "S001"))
+    return found, _verified(root)
+
+
 def _surface(root: Path) -> object:
     return read_surface(root / "surface.ply")
 
@@ -376,10 +389,9 @@ def readers() -> Iterator[Reader]:
     yield Reader("Gaussians .ply", "splat.ply", plain(read_ply, "splat.ply"))
     yield Reader("surface .ply", "surface.ply", _surface)
     yield Reader("shards index.json", "shards/index.json", plain(read_entries, "shards"))
-    yield Reader("shards manifest", "shards/manifest.json", plain(verify, "shards"))
+    yield Reader("shards manifest", "shards/manifest.json", _verified)
     yield Reader("shard meta.json", "meta.json", _meta)
-    yield Reader("shard tar, withdrawn", "shards/train-000000.tar",
-                 lambda r: list(files_naming(Dataset(r / "shards"), "S001")))  # fmt: skip
+    yield Reader("shard tar, withdrawn", "shards/train-000000.tar", _searched)
     yield Reader("checkpoint.pt", "checkpoint.pt", _checkpoint)
     yield Reader("VGG weights", "vgg.pth", _vgg)
     yield Reader("TorchScript", "matte.pt", _network, native=True)
