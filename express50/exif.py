@@ -27,9 +27,13 @@ def read_exif(path: Path) -> tuple[int, float]:
         FormatError: the file is no image.
     """
     image = open_image(path)
-    spec = image.spec()
-    told = [spec.getattribute(name) for name in ("Orientation", "Exif:FocalLengthIn35mmFilm")]
-    image.close()
+    try:
+        spec = image.spec()
+        told = [spec.getattribute(name) for name in ("Orientation", "Exif:FocalLengthIn35mmFilm")]
+    except UnicodeDecodeError:  # text in the place of a number, and none at that
+        told = [1, 0.0]
+    finally:
+        image.close()
     orientation, film = (value if isinstance(value, int | float) else 0 for value in told)
     usable = math.isfinite(film) and 0 < film < 1e5
     return (int(orientation) if orientation in TURNS else 1), (float(film) if usable else 0.0)

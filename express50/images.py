@@ -7,7 +7,7 @@ in memory go through OpenCV. Images are RGB, (H, W, 3); files hold sRGB unless a
 from __future__ import annotations
 
 import struct
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import cv2
@@ -42,7 +42,7 @@ def read_image(path: Path) -> np.ndarray:
         _check_image(path, spec, channels * np.dtype("f4" if kind == "float" else kind).itemsize)
         pixels = source.read_image(0, 0, 0, channels, kind)
         if pixels is None:
-            raise FormatError(f"{path}: truncated or damaged ({source.geterror().strip()})")
+            raise FormatError(f"{path}: truncated or damaged ({_said(source.geterror)})")
     finally:
         source.close()
     array = np.asarray(pixels).reshape(spec.height, spec.width, channels)
@@ -57,9 +57,17 @@ def open_image(path: Path) -> oiio.ImageInput:
     """
     source = oiio.ImageInput.open(str(path)) if Path(path).is_file() else None
     if source is None:
-        why = oiio.geterror().strip() or "it cannot be opened"
+        why = _said(oiio.geterror) or "it cannot be opened"
         raise FormatError(f"{path}: cannot be read as an image ({why}); copy it again")
     return source
+
+
+def _said(geterror: Callable[[], str]) -> str:
+    """What OpenImageIO says went wrong; it may quote bytes of the file that are no text."""
+    try:
+        return geterror().strip()
+    except UnicodeDecodeError:
+        return "damaged"
 
 
 def _check_image(path: Path, spec: oiio.ImageSpec, pixel_bytes: int) -> None:

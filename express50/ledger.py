@@ -102,6 +102,17 @@ class Ledger:
     def __exit__(self, *unused: object) -> None:
         self.close()
 
+    def check_whole(self) -> None:
+        """Read every page.
+
+        Raises:
+            FormatError: one is damaged.
+        """
+        with self._damage():
+            told = self._database.execute("PRAGMA quick_check(1)").fetchone()[0]
+            if told != "ok":
+                raise sqlite3.DatabaseError(told)
+
     @contextmanager
     def _damage(self) -> Iterator[None]:
         """Any statement may be the one that meets a damaged page."""

@@ -20,7 +20,7 @@ from typing import IO
 from express50.digests import text_digest
 from express50.errors import FormatError, StageError
 from express50.layout import Dataset
-from express50.ledger import check_schema
+from express50.ledger import Ledger, check_schema
 from express50.publish import write_json
 from express50.reading import read_json
 
@@ -77,8 +77,13 @@ def withdraw(dataset: Dataset, subject: str) -> Withdrawal:
     """Remove a subject and search what is left for its id.
 
     The subject's digest is remembered, so that ingest refuses to take the person in again.
+
+    Raises:
+        StageError: the dataset knows no such subject.
+        FormatError: the ledger is damaged; then nothing was removed.
     """
     paths = plan(dataset, subject)
+    _check_ledger(dataset)  # before anything is removed: half a withdrawal could not be repeated
     captures = dataset.captures()
     capture = captures.pop(subject, None)
     write_json(withdrawn_file(dataset), sorted(withdrawn(dataset) | {text_digest(subject)}))
@@ -90,6 +95,12 @@ def withdraw(dataset: Dataset, subject: str) -> Withdrawal:
     write_json(dataset.captures_file, {name: str(path) for name, path in captures.items()})
     _forget(dataset, subject, paths)
     return Withdrawal(subject, capture, tuple(paths), tuple(files_naming(dataset, subject)))
+
+
+def _check_ledger(dataset: Dataset) -> None:
+    if dataset.ledger.is_file():
+        with Ledger(dataset.ledger) as ledger:
+            ledger.check_whole()
 
 
 def withdrawn_file(dataset: Dataset) -> Path:

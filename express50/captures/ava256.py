@@ -113,7 +113,8 @@ def read_calibration(path: Path) -> dict[str, Camera]:
                 f"{where}: distortionModel {model}, expected RadialAndTangential"
             )
         K, T = _array(where, row["K"], (3, 3)).T, _array(where, row["T"], (4, 4)).T
-        dist = np.ravel(_array(where, [row["distortion"]], (1, np.size(row["distortion"]))))
+        given = row["distortion"]
+        dist = _array(where, given, (len(given) if isinstance(given, list) else 0,))
         pose = np.vstack([T[:3], [0, 0, 0, 1]])
         found[name] = camera_from_K(name, K_from_opencv(K), dist, SIZE, pose)
     return checked(in_metres(found, 1e-3), path)
