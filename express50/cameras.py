@@ -7,6 +7,7 @@ Models and the order of their parameters are COLMAP's.
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,7 +16,7 @@ import numpy as np
 
 from express50.checks import PIXEL_LIMIT, check_shape
 from express50.errors import CalibrationError
-from express50.reading import NAME, read_json
+from express50.reading import read_json
 
 # Where each COLMAP parameter goes: focal x, focal y, then OpenCV's k1 k2 p1 p2 k3 k4 k5 k6.
 _MODELS: dict[str, tuple[str, ...]] = {
@@ -26,6 +27,7 @@ _MODELS: dict[str, tuple[str, ...]] = {
     "OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"),
     "FULL_OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
 }
+ID = re.compile(r"\w[\w.+-]{0,119}")
 LARGEST = 1e12  # of a parameter or a pose, pixels or metres
 _DISTORTION = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 
@@ -286,7 +288,7 @@ def parse_cameras(table: object, where: str) -> dict[str, Camera]:
 def _parse_camera(path: str, camera_id: str, row: object) -> Camera:
     """Check one camera's entry and build it."""
     where = f"{path}: camera {camera_id}"
-    if not NAME.fullmatch(camera_id):  # it becomes the name of files
+    if not ID.fullmatch(camera_id):  # it becomes the name of files
         raise CalibrationError(f"{where}: expected an id of letters, digits and _ . + -")
     if not isinstance(row, Mapping):
         raise CalibrationError(f"{where}: expected a table, got {type(row).__name__}")

@@ -20,7 +20,7 @@ from express50.errors import Express50Error
 TEXT_LIMIT = 1 << 28  # bytes; the index of 100,000 samples takes 40 MB
 TOML_LIMIT = 1 << 20  # bytes; written by hand
 # Of a TOML key; Python's parser keeps every beginning of one, so that long ones fill the memory.
-DOTTED = re.compile(r"""(?<![\w"'-])(?:(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')[ \t]*+\.[ \t]*+){32}""")
+DOTTED = re.compile(r"""(?<![\w"'.-])(?:(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')[ \t]*+\.[ \t]*+){32}""")
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.+-]{0,199}")  # of what may become a file or folder
 AGAIN = "copy or write it again"
 

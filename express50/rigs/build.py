@@ -66,7 +66,7 @@ def names_from_files(files: Sequence[str]) -> list[str]:
         names = [path.stem for path in paths]
     else:
         names = [path.with_suffix("").as_posix() for path in paths]
-    return [re.sub(r"[^\w.+-]+", "_", name).strip("_") for name in names]
+    return [re.sub(r"[^\w.+-]+", "_", name).strip("_.+-") for name in names]
 
 
 def at_size(cameras: dict[str, Camera], size: tuple[int, int] | None) -> dict[str, Camera]:
