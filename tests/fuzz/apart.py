@@ -19,7 +19,8 @@ import torch
 from express50.errors import Express50Error
 from express50.work import peak_memory, reset_peak_memory
 
-SECONDS = 5.0  # of one file; a reader of a small file that takes longer hangs
+SECONDS = 5.0  # of processor time for one file; a reader of a small file that takes longer hangs
+SILENCE = 60.0  # seconds, on however busy a machine, until a child is given up
 RESIDENT = 384 << 20  # bytes that reading a small file may really use
 ADDRESSES = 2 << 30  # bytes that it may ask for
 GOOD = ("read", "refused")
@@ -33,7 +34,7 @@ def judge(read: Callable[[], object]) -> tuple[str, str]:
     """How reading ended, in one word, and what was said."""
     reset_peak_memory()
     before = peak_memory()
-    signal.setitimer(signal.ITIMER_REAL, SECONDS)
+    signal.setitimer(signal.ITIMER_PROF, SECONDS)
     try:
         found = read()
         words = ("read", "") if finite(found) else ("not finite", "")
@@ -46,7 +47,7 @@ def judge(read: Callable[[], object]) -> tuple[str, str]:
     except Exception as error:  # noqa: BLE001  any other is a defect, which is what is counted
         words = ("traceback", f"{type(error).__name__}: {error}")
     finally:
-        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        signal.setitimer(signal.ITIMER_PROF, 0.0)
     if peak_memory() - before > RESIDENT:
         return "memory", f"{(peak_memory() - before) >> 20} MiB; {words[1]}"
     return words
@@ -102,7 +103,7 @@ def _run(cases: list[Callable[[], object]], start: int) -> tuple[list[tuple[str,
     os.close(sink)
     text = b""
     while True:
-        ready, _, _ = select.select([source], [], [], 3 * SECONDS)
+        ready, _, _ = select.select([source], [], [], SILENCE)
         if not ready:  # native code that the alarm does not reach
             os.kill(child, signal.SIGKILL)
         block = os.read(source, 1 << 16)
@@ -121,7 +122,7 @@ def _child(cases: Iterable[Callable[[], object]], sink: int) -> None:
     def stall(number: int, frame: object) -> None:
         raise Stalled
 
-    signal.signal(signal.SIGALRM, stall)
+    signal.signal(signal.SIGPROF, stall)
     limit_memory()
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     null = os.open(os.devnull, os.O_WRONLY)
