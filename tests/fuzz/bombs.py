@@ -26,7 +26,8 @@ from express50.captures.read import read_any
 from express50.errors import FormatError, HeadModelError
 from express50.frames import read_peaks
 from express50.head.ict import read_obj
-from express50.head.safe_pickle import read_object_array, read_pickle, to_array
+from express50.head.pickled_arrays import to_array
+from express50.head.safe_pickle import read_object_array, read_pickle
 from express50.images import decode_image, encode_jpeg, read_image
 from express50.index import read_index
 from express50.layout import Dataset
