@@ -19,7 +19,7 @@ from tests.conftest import REPOSITORY
 from tests.fuzz.mutations import draw_steps, mutate
 from tests.fuzz.seeds import readers
 
-CASES = 20
+CASES = 24
 NAMES = [reader.name for reader in readers()]
 NATIVE = {reader.name for reader in readers() if reader.native}
 
