@@ -13,8 +13,10 @@ from annotations.store import ACTIONS, Label, append_label, read_labels
 from express50.errors import AnnotationError
 from express50.index import read_index
 from express50.layout import Dataset
+from express50.reading import NAME, parse_json, read_text
 
 FORMATS = (".csv", ".json")
+LARGEST = 2**63
 _FIELDS = tuple(field.name for field in fields(Label))
 _REQUIRED = tuple(field.name for field in fields(Label) if field.default is MISSING)
 
@@ -67,12 +69,17 @@ def read_table(path: Path) -> list[Label]:
         AnnotationError: the file cannot be read, or a row is no event.
     """
     check_format(path)
+    text = read_text(path, AnnotationError)
+    if path.suffix == ".json":
+        rows = parse_json(text, str(path), AnnotationError)
+        if not isinstance(rows, list):
+            raise AnnotationError(f"{path}: expected a list of events, got {type(rows).__name__}")
+    else:
+        rows = csv.DictReader(text.splitlines())
     try:
-        text = path.read_text(encoding="utf-8")
-        rows = json.loads(text) if path.suffix == ".json" else csv.DictReader(text.splitlines())
         return [_label(row, f"{path}: row {number}") for number, row in enumerate(rows, 1)]
-    except (OSError, ValueError, csv.Error) as error:
-        raise AnnotationError(f"{path}: cannot be read ({error})") from None
+    except csv.Error as error:
+        raise AnnotationError(f"{path}: not CSV ({error}); export it again") from None
 
 
 def check_format(path: Path) -> None:
@@ -94,6 +101,8 @@ def _label(row: object, where: str) -> Label:
     missing = sorted(set(_REQUIRED) - set(given))
     if unknown or missing:
         raise AnnotationError(f"{where}: unknown columns {unknown}, missing {missing}")
+    if not NAME.fullmatch(str(given["subject"])):  # it becomes the name of a file
+        raise AnnotationError(f"{where}: subject {given['subject']!r} is no id")
     if given["action"] not in ACTIONS:
         raise AnnotationError(
             f"{where}: action {given['action']!r}, expected one of {', '.join(ACTIONS)}"
@@ -113,7 +122,10 @@ def _typed(name: str, value: object) -> Any:
         return str(value) == "True"
     for number in (int, float):
         if kind in (number, number | None):
-            return number(str(value))
+            found = number(str(value))
+            if not abs(found) < LARGEST:  # NaN neither
+                raise ValueError(f"{name} is {str(value)[:40]}, expected a number under 2^63")
+            return found
     return str(value)
 
 

@@ -9,11 +9,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from zipfile import BadZipFile
 
 import numpy as np
 
 from annotations.watch import align_faces, find_points
+from express50.arrays import read_arrays
 from express50.errors import FormatError, StageError
 from express50.frames import read_proxy
 from express50.images import contact_sheet, write_image
@@ -80,12 +80,12 @@ def read_observations(dataset: Dataset, subject: str) -> Observations:
     if not path.is_file():
         raise StageError(f"{path}: {subject!r} is not observed; run 'express50 align' on it")
     try:
-        with np.load(path, allow_pickle=False) as table:
-            if str(table["schema"]) != SCHEMA:
-                raise ValueError(f"schema is {table['schema']}, expected {SCHEMA}")
-            rest = (table[key] for key in ("frames", "points", "scores", "faces"))
-            return Observations(tuple(map(str, table["cameras"])), *rest)
-    except (ValueError, KeyError, OSError, BadZipFile) as error:
+        table = read_arrays(path, FormatError, "observations", mend="run 'express50 align'")
+        if str(table["schema"]) != SCHEMA:
+            raise ValueError(f"schema is {table['schema']}, expected {SCHEMA}")
+        rest = (table[key] for key in ("frames", "points", "scores", "faces"))
+        return Observations(tuple(map(str, table["cameras"])), *rest)
+    except (ValueError, KeyError, TypeError) as error:
         raise FormatError(f"{path}: no observations ({error}); run 'express50 align'") from None
 
 

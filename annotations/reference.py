@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,6 +11,7 @@ from express50.errors import AnnotationError, StageError
 from express50.exclusions import included_subjects
 from express50.layout import Dataset
 from express50.publish import write_json
+from express50.reading import read_json_table
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,8 @@ def reference_subject(dataset: Dataset) -> str:
     path = reference_file(dataset)
     if not path.is_file():
         return subjects[0]
-    chosen = json.loads(path.read_text(encoding="utf-8"))["subject"]
+    again = "choose one with 'express50 annotate reference'"
+    chosen = read_json_table(path, AnnotationError, again).get("subject")
     if chosen not in subjects:
         raise AnnotationError(
             f"{path}: reference {chosen!r} is not ingested or is excluded; choose one of"

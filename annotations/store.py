@@ -13,14 +13,16 @@ import json
 import os
 import time
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import get_type_hints
 
 from express50 import __version__
 from express50.errors import AnnotationError
 from express50.index import CameraSource, Cue, Index
 from express50.layout import Dataset
 from express50.publish import sync_directory
+from express50.reading import parse_json, read_bytes
 
 AUTOMATIC = "auto"
 RULE_PREFIX = "rule:"
@@ -68,6 +70,13 @@ class Label:
     seconds: float | None = None
     keys: int | None = None
     reason: str | None = None
+
+
+# What a field may be; a whole number does for one with a fraction.
+KINDS = {
+    name: int | float if kind is float else kind | int if kind == float | None else kind
+    for name, kind in get_type_hints(Label).items()
+}
 
 
 def make_mark(
@@ -252,7 +261,8 @@ def read_labels(dataset: Dataset, subject: str) -> list[Label]:
     path = dataset.labels_file(subject)
     if not path.exists():
         return []
-    lines = path.read_text(encoding="utf-8", errors="replace").split("\n")
+    data = read_bytes(path, AnnotationError, mend="restore it")
+    lines = data.decode("utf-8", errors="replace").split("\n")
     return [
         label
         for number, line in enumerate(lines, 1)
@@ -261,14 +271,21 @@ def read_labels(dataset: Dataset, subject: str) -> list[Label]:
 
 
 def _parse(path: Path, number: int, line: str) -> Label | None:
-    known = {f.name for f in fields(Label)}
     try:
-        row = json.loads(line)
-        return Label(**{k: v for k, v in row.items() if k in known})
-    except json.JSONDecodeError:
+        row = parse_json(line, str(path), AnnotationError)
+    except AnnotationError:
         return None  # the torn end of a write that a crash cut short
+    try:
+        label = Label(**{k: v for k, v in row.items() if k in KINDS})
     except (TypeError, AttributeError) as error:
         raise AnnotationError(f"{path}: line {number} is no label event ({error})") from None
+    for name, kind in KINDS.items():
+        if not isinstance(getattr(label, name), kind):
+            raise AnnotationError(
+                f"{path}: line {number}: {name} is {getattr(label, name)!r}, expected {kind}; "
+                "remove the line"
+            )
+    return label
 
 
 def current_labels(labels: Iterable[Label]) -> dict[str, Label]:

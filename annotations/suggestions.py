@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import dataclass
 from typing import Any
 
 from express50.errors import FormatError
 from express50.layout import Dataset
+from express50.reading import read_json_table
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,9 +49,9 @@ def read_suggestions(dataset: Dataset, subject: str) -> dict[str, Suggested]:
     if not path.is_file():
         return {}
     try:
-        rows = json.loads(path.read_text(encoding="utf-8"))
+        rows = read_json_table(path, FormatError, "run 'express50 align' again")
         return {expression: _checked(expression, row) for expression, row in rows.items()}
-    except (ValueError, TypeError, AttributeError) as error:
+    except (ValueError, TypeError, AttributeError, OverflowError) as error:
         raise FormatError(
             f"{path}: not a table of suggestions ({error}); run 'express50 align' again"
         ) from None
@@ -60,6 +60,8 @@ def read_suggestions(dataset: Dataset, subject: str) -> dict[str, Suggested]:
 def _checked(expression: str, row: dict[str, Any]) -> Suggested:
     """A row whose figures can be compared; one that is NaN would upset every order."""
     found = Suggested(**row)
+    if not all(type(n) is int for n in (found.frame, found.start, *found.candidates)):
+        raise ValueError(f"{expression}: frames are no whole numbers")
     if not 0.0 <= found.confidence <= 1.0:
         raise ValueError(f"{expression}: confidence is {found.confidence}, expected 0 to 1")
     if not all(map(math.isfinite, [*found.activity, *(found.match or ())])):

@@ -7,14 +7,16 @@ Models and the order of their parameters are COLMAP's.
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from express50.checks import check_shape
+from express50.checks import PIXEL_LIMIT, check_shape
 from express50.errors import CalibrationError
+from express50.reading import read_json
 
 # Where each COLMAP parameter goes: focal x, focal y, then OpenCV's k1 k2 p1 p2 k3 k4 k5 k6.
 _MODELS: dict[str, tuple[str, ...]] = {
@@ -25,6 +27,8 @@ _MODELS: dict[str, tuple[str, ...]] = {
     "OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"),
     "FULL_OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
 }
+ID = re.compile(r"\w[\w.+-]{0,119}")
+LARGEST = 1e12  # of a parameter or a pose, pixels or metres
 _DISTORTION = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 
 
@@ -264,15 +268,9 @@ def read_cameras(path: Path) -> dict[str, Camera]:
     Raises:
         CalibrationError: the file is missing, or a camera has a field of the wrong shape or value.
     """
-    try:
-        table = json.loads(Path(path).read_text())
-    except FileNotFoundError:
-        raise CalibrationError(
-            f"{path}: no such calibration file; run 'express50 calibrate'"
-        ) from None
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise CalibrationError(f"{path}: not JSON ({error}); write it anew") from None
-    return parse_cameras(table, str(path))
+    if not Path(path).exists():
+        raise CalibrationError(f"{path}: no such calibration file; run 'express50 calibrate'")
+    return parse_cameras(read_json(path, CalibrationError, "write it anew"), str(path))
 
 
 def parse_cameras(table: object, where: str) -> dict[str, Camera]:
@@ -290,13 +288,15 @@ def parse_cameras(table: object, where: str) -> dict[str, Camera]:
 def _parse_camera(path: str, camera_id: str, row: object) -> Camera:
     """Check one camera's entry and build it."""
     where = f"{path}: camera {camera_id}"
+    if not ID.fullmatch(camera_id):  # it becomes the name of files
+        raise CalibrationError(f"{where}: expected an id of letters, digits and _ . + -")
     if not isinstance(row, Mapping):
         raise CalibrationError(f"{where}: expected a table, got {type(row).__name__}")
     missing = [k for k in ("model", "width", "height", "params", "world_to_camera") if k not in row]
     if missing:
         raise CalibrationError(f"{where}: has no {', '.join(missing)}; add it in pixels and metres")
     model = row["model"]
-    if model not in _MODELS:
+    if not isinstance(model, str) or model not in _MODELS:
         raise CalibrationError(
             f"{where}: model {model!r} is unknown; expected {', '.join(_MODELS)}"
         )
@@ -315,9 +315,10 @@ def _parse_camera(path: str, camera_id: str, row: object) -> Camera:
             f"{where}: focal length {focals.min():g} px, expected a positive number"
         )
     size = [row["width"], row["height"]]
-    if not all(isinstance(n, int) and n > 0 for n in size):
+    if not all(type(n) is int and n > 0 for n in size) or size[0] * size[1] > PIXEL_LIMIT:
         raise CalibrationError(
-            f"{where}: size {size}, expected two positive whole numbers of pixels"
+            f"{where}: size {size}, expected two positive whole numbers of pixels, together at most"
+            f" {PIXEL_LIMIT}"
         )
     return Camera(camera_id, size[0], size[1], model, tuple(map(float, params)), pose)
 
@@ -326,12 +327,14 @@ def _numbers(where: str, name: str, value: object, shape: tuple[int, ...]) -> np
     """A finite float array of the given shape, or a CalibrationError."""
     try:
         array = np.array(value, dtype=np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise CalibrationError(f"{where}: {name} is not an array of numbers") from None
     if array.shape != shape:
         raise CalibrationError(f"{where}: {name} has shape {array.shape}, expected {shape}")
     if not np.isfinite(array).all():
         raise CalibrationError(f"{where}: {name} holds NaN or Inf, expected finite numbers")
+    if np.abs(array).max(initial=0.0) > LARGEST:  # its square would not be finite
+        raise CalibrationError(f"{where}: {name} holds {np.abs(array).max():.3g}, over {LARGEST:g}")
     return array
 
 

@@ -9,13 +9,13 @@ from __future__ import annotations
 import csv
 import math
 import re
-import tomllib
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from express50.cameras import Camera, read_cameras
 from express50.errors import CalibrationError, CaptureError
 from express50.index import Cue
+from express50.reading import TOML_LIMIT, read_text, read_toml
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".exr")
 VIDEO_SUFFIXES = (".mp4", ".mov", ".mkv", ".avi", ".webm")
@@ -35,6 +35,7 @@ class RawCamera:
         counts: images of each clip; one clip where it is empty.
         stamps: the layout's own number of each image; its place where it is empty.
         correction: rows of a polynomial colour correction (`express50.colour_polynomial`), or none.
+        orientation: how images are to be turned when they are read (`express50.exif`).
     """
 
     id: str
@@ -44,6 +45,7 @@ class RawCamera:
     counts: tuple[int, ...] = ()
     stamps: tuple[int, ...] = ()
     correction: tuple[tuple[float, ...], ...] = ()
+    orientation: int = 1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -144,11 +146,7 @@ def read_capture_toml(path: Path) -> dict:
     Raises:
         CaptureError: it cannot be read or is not TOML.
     """
-    try:
-        meta = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise CaptureError(f"{path}: not TOML: {error}") from error
-    return {key: plain(value) for key, value in meta.items()}
+    return {key: plain(value) for key, value in read_toml(path, CaptureError).items()}
 
 
 def check_identity(path: Path, subject: object, fps: object) -> None:
@@ -216,7 +214,7 @@ def _frame_names(folder: Path) -> tuple[str, ...]:
         raise CaptureError(f"{folder}: holds no image, expected 000000.png and so on")
     for number, name in enumerate(names):
         stem = Path(name).stem
-        if not stem.isdigit() or int(stem) != number:
+        if not stem.isdecimal() or len(stem) > 18 or int(stem) != number:
             raise CaptureError(
                 f"{folder}: frame {number} is missing: found {name}, expected {number:06d} with "
                 f"one of {' '.join(IMAGE_SUFFIXES)}; restore it, or renumber from 000000"
@@ -249,10 +247,7 @@ def _read_board(root: Path, cameras: dict[str, RawCamera]) -> dict | None:
         raise CaptureError(
             f"{folder}: has no board.toml; describe the ChArUco board in it, see docs/FORMAT.md"
         )
-    try:
-        config = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise CaptureError(f"{path}: not TOML: {error}") from error
+    config = read_toml(path, CaptureError)
     files = {name: image_names(folder / name) for name in cameras}
     return {
         "config": plain(config),
@@ -269,8 +264,9 @@ def read_cues(path: Path) -> tuple[Cue, ...]:
     """
     if not path.is_file():
         return ()
-    with path.open(newline="", encoding="utf-8-sig") as file:
-        reader = csv.DictReader(file, skipinitialspace=True)
+    text = read_text(path, CaptureError, TOML_LIMIT)
+    reader = csv.DictReader(text.splitlines(), skipinitialspace=True)
+    try:
         missing = [name for name in CUE_COLUMNS if name not in (reader.fieldnames or ())]
         if missing:
             raise CaptureError(
@@ -278,6 +274,8 @@ def read_cues(path: Path) -> tuple[Cue, ...]:
                 f"{','.join(CUE_COLUMNS)} in the first line"
             )
         cues = [_read_cue(path, reader.line_num, row) for row in reader]
+    except csv.Error as error:
+        raise CaptureError(f"{path}: not CSV ({error}); write it again") from error
     seen: set[str] = set()
     for cue in cues:
         if cue.expression_id in seen:
@@ -299,7 +297,7 @@ def _read_cue(path: Path, line: int, row: dict[str, str]) -> Cue:
             f"{path}:{line}: frames are {row['start_frame']!r} and {row['end_frame']!r}, "
             "expected two whole numbers"
         ) from error
-    if not 0 <= start <= end:
+    if not 0 <= start <= end < 2**31:
         raise CaptureError(
             f"{path}:{line}: {name} runs from {start} to {end}; expected 0 <= start <= end "
             "(the end frame is inside)"

@@ -6,6 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
+PIXEL_LIMIT = 200_000_000  # of an image; refuses decompression bombs; six times an 8K frame
+
 
 def check_shape(
     name: str, array: np.ndarray, expected: Sequence[int | None], where: str = ""

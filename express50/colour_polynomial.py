@@ -38,7 +38,7 @@ def check_matrix(matrix: object, where: str) -> tuple[tuple[float, ...], ...]:
     """
     try:
         array = np.asarray(matrix, dtype=np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         array = np.zeros(0)
     usable = array.ndim == 2 and len(array) == 3 and array.shape[1] in TERMS
     if not usable or not np.isfinite(array).all():

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from express50.errors import ConfigError
+from express50.reading import read_toml
 from express50.stage import Stage
 
 PRESETS = ("draft", "standard", "reference")
@@ -104,7 +105,7 @@ def parse_assignment(text: str) -> tuple[str, str, object]:
         )
     try:
         return table, key, tomllib.loads(f"value = {raw}")["value"]
-    except tomllib.TOMLDecodeError:
+    except (ValueError, RecursionError):
         return table, key, raw.strip()
 
 
@@ -125,12 +126,9 @@ def _assigned_values(stage: str, assignments: Sequence[str], tables: set[str]) -
 def _file_values(stage: str, file: Path | None, tables: set[str]) -> dict:
     if file is None:
         return {}
-    try:
-        content = tomllib.loads(Path(file).read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
-        raise ConfigError(f"--config {file}: no such file") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ConfigError(f"--config {file}: not TOML: {error}") from error
+    if not Path(file).exists():
+        raise ConfigError(f"--config {file}: no such file")
+    content = read_toml(file, ConfigError)
     for table, value in content.items():
         if table not in tables:
             raise ConfigError(

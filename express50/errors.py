@@ -2,9 +2,23 @@
 
 from __future__ import annotations
 
+LONGEST = 1200  # characters; what a hostile file says must not fill a terminal
+
 
 class Express50Error(Exception):
-    """Base of every error that the command line turns into one line and exit code 1."""
+    """Base of every error that the command line turns into one line and exit code 1.
+
+    Libraries' messages that it quotes may run over lines or pages: it folds them into one line,
+    takes out what steers terminals, and leaves out the middle of what is too long, as the end says
+    how to mend it.
+    """
+
+    def __init__(self, message: str) -> None:
+        line = " ".join(message.splitlines())
+        line = "".join(c if c.isprintable() else " " for c in line).strip()
+        if len(line) > LONGEST:
+            line = f"{line[: LONGEST // 2]} [...] {line[-LONGEST // 2 :]}"
+        super().__init__(line)
 
 
 class CaptureError(Express50Error):

@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 import contextlib
-import json
 
+from express50.errors import AnnotationError
 from express50.layout import Dataset
+from express50.reading import parse_json, read_bytes
 
 
 def exclusion_reason(dataset: Dataset, subject: str) -> str | None:
     """Why a subject is excluded (``express50 annotate exclude``), or None when it is not."""
     path = dataset.labels_file(subject)
     reason = None
-    text = path.read_text(encoding="utf-8", errors="replace") if path.is_file() else ""
-    for line in text.split("\n"):
-        with contextlib.suppress(ValueError, AttributeError):  # a torn line says nothing
-            row = json.loads(line)
+    data = read_bytes(path, AnnotationError) if path.is_file() else b""
+    for line in data.decode("utf-8", errors="replace").split("\n"):
+        with contextlib.suppress(AnnotationError, AttributeError):  # a torn line says nothing
+            row = parse_json(line, str(path), AnnotationError)
             if row.get("action") in ("exclude", "include"):
                 reason = row.get("reason") if row["action"] == "exclude" else None
     return reason

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import difflib
 import math
-import tomllib
 from dataclasses import dataclass, field
 from functools import cache
 from importlib import resources
 
 from express50.errors import FormatError
+from express50.reading import parse_toml
 
 CATEGORIES = (
     "neutral", "basic", "mouth", "eyes", "brows", "cheeks", "jaw", "tongue", "asymmetry", "gaze",
@@ -57,10 +57,7 @@ def parse_script(text: str, where: str) -> tuple[Expression, ...]:
         FormatError: not TOML, an unknown field or category, a value of the wrong kind, a repeated
             id, or a first expression that is not ``neutral``.
     """
-    try:
-        rows = tomllib.loads(text).get("expression", [])
-    except tomllib.TOMLDecodeError as error:
-        raise FormatError(f"{where}: not TOML: {error}") from error
+    rows = parse_toml(text, where, FormatError).get("expression", [])
     script = tuple(_parse_row(row, f"{where}: expression {n}") for n, row in enumerate(rows, 1))
     ids = [expression.id for expression in script]
     repeated = sorted({i for i in ids if ids.count(i) > 1})

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections import OrderedDict
 from functools import lru_cache
 from pathlib import Path
@@ -20,6 +19,7 @@ from express50.index import CameraSource, Index, read_index
 from express50.layout import Dataset
 from express50.media import inside, read_picture, read_srgb8
 from express50.media import to_srgb8 as to_srgb8
+from express50.reading import NAME, read_json, read_json_table
 from express50.video import VideoReader
 
 OPEN_READERS = 8  # open videos a process keeps; each holds a decoder's picture buffers
@@ -69,7 +69,8 @@ class FrameReader:
     def _recorded(self, frame: int) -> np.ndarray:
         """The frame as it was recorded, its hash compared with the index."""
         if self.source.kind == "frames":
-            return self._checked(read_picture(self.path, self.source.names[frame]), frame)
+            image = read_picture(self.path, self.source.names[frame], self.source.orientation)
+            return self._checked(image, frame)
         video, number = self._video_of(frame)
         image = video.read(number)
         if dhash(image) != self.source.dhash[frame]:
@@ -237,8 +238,9 @@ def read_gains(dataset: Dataset, subject: str) -> dict[str, np.ndarray]:
     if not path.is_file():
         return {}
     try:
-        gains = {name: np.array(row, float) for name, row in json.loads(path.read_text()).items()}
-    except (ValueError, TypeError, AttributeError) as error:
+        rows = read_json_table(path, FormatError, "calibrate again")
+        gains = {name: np.array(row, float) for name, row in rows.items()}
+    except (ValueError, TypeError, OverflowError) as error:
         raise FormatError(f"{path}: not camera gains ({error}); calibrate again") from error
     for name, gain in gains.items():
         if gain.shape != (3,) or not np.isfinite(gain).all() or (gain <= 0).any():
@@ -263,10 +265,12 @@ def read_peaks(dataset: Dataset, subject: str) -> dict[str, int]:
             f"{path}: subject {subject!r} is not aligned; run 'express50 align {dataset.root}'"
         )
     try:
-        rows = json.loads(path.read_text(encoding="utf-8"))
+        rows = read_json_table(path, FormatError, "run 'express50 align' again")
         peaks = {name: int(row["frame"]) for name, row in rows.items()}
-        named = [(n, row["camera"], row["pts"], row["dhash"]) for n, row in rows.items()]
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        named = [(n, str(row["camera"]), row["pts"], row["dhash"]) for n, row in rows.items()]
+        if strange := [name for name in rows if not NAME.fullmatch(name)]:
+            raise ValueError(f"expression {strange[0]!r} is no id")  # it becomes a folder's name
+    except (ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
         raise FormatError(f"{path}: not a table of peaks ({type(error).__name__}: {error})") from (
             error
         )
@@ -316,12 +320,19 @@ def read_proxy(dataset: Dataset, subject: str, camera_id: str, frame: int) -> np
 def decode_proxy(folder: Path, camera_id: str, frame: int) -> np.ndarray:
     """Proxy (h, w, 3) uint8 sRGB out of a folder of indexed tars."""
     tar, table = folder / f"{camera_id}.tar", folder / f"{camera_id}.json"
-    offset, size = _proxy_table(table, table.stat().st_mtime_ns)[frame]
-    with tar.open("rb") as file:
-        file.seek(offset)
-        return decode_image(file.read(size), f"{tar}: frame {frame}")
+    try:
+        version = (table.stat().st_mtime_ns, table.stat().st_size)
+        offset, size = _proxy_table(table, version)[frame]
+        if min(offset, size) < 0 or offset + size > tar.stat().st_size:
+            raise ValueError(f"frame {frame} lies outside of {tar.name}")
+        with tar.open("rb") as file:
+            file.seek(offset)
+            data = file.read(size)
+    except (OSError, ValueError, TypeError, IndexError) as error:
+        raise FormatError(f"{table}: no table of proxies ({error}); ingest again") from None
+    return decode_image(data, f"{tar}: frame {frame}")
 
 
 @lru_cache(maxsize=256)
-def _proxy_table(path: Path, version: int) -> list[tuple[int, int]]:
-    return [tuple(pair) for pair in json.loads(path.read_text(encoding="utf-8"))]
+def _proxy_table(path: Path, version: tuple[int, int]) -> list[tuple[int, int]]:
+    return [(int(a), int(b)) for a, b in read_json(path, FormatError, "ingest again")]

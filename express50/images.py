@@ -6,16 +6,20 @@ in memory go through OpenCV. Images are RGB, (H, W, 3); files hold sRGB unless a
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import struct
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import cv2
 import numpy as np
 import OpenImageIO as oiio
 
+from express50.checks import PIXEL_LIMIT
 from express50.errors import FormatError
 
-PIXEL_LIMIT = 200_000_000  # refuses decompression bombs; six times a 4K frame of 33 megapixels
+# What an image may unpack to: so much in any case, beyond it so many times its file. Deflate packs
+# zeros 1032-fold, JPEG's blocks of one colour about as much, and no camera comes near.
+ROOM_BYTES, RATIO_LIMIT = 64 << 20, 4096
 DEPTH_UNIT_M = 5e-5  # one step of a 16-bit depth map; 3.28 m at most, 0.025 mm rounding
 DEPTH_LIMIT_M = DEPTH_UNIT_M * 65535
 
@@ -27,23 +31,55 @@ def read_image(path: Path) -> np.ndarray:
         uint8, uint16 or float32 (half is widened) array.
 
     Raises:
-        FormatError: the file is missing, not an image, truncated or over the pixel limit.
+        FormatError: the file is missing, not a flat image, truncated, over the pixel limit, or says
+            that it unpacks to what its bytes cannot hold.
     """
-    source = oiio.ImageInput.open(str(path))
-    if source is None:
-        raise FormatError(f"{path}: cannot be read as an image ({oiio.geterror().strip()})")
+    source = open_image(path)
     try:
         spec = source.spec()
-        if spec.width * spec.height > PIXEL_LIMIT:
-            raise FormatError(f"{path}: {spec.width}x{spec.height} pixels, over {PIXEL_LIMIT}")
         kind = {"uint8": "uint8", "uint16": "uint16"}.get(str(spec.format), "float")
-        pixels = source.read_image(format=kind)
+        channels = min(spec.nchannels, 4)
+        _check_image(path, spec, channels * np.dtype("f4" if kind == "float" else kind).itemsize)
+        pixels = source.read_image(0, 0, 0, channels, kind)
         if pixels is None:
-            raise FormatError(f"{path}: truncated or damaged ({source.geterror().strip()})")
+            raise FormatError(f"{path}: truncated or damaged ({_said(source.geterror)})")
     finally:
         source.close()
-    array = np.asarray(pixels).reshape(spec.height, spec.width, spec.nchannels)
-    return array[..., 0] if spec.nchannels == 1 else array[..., :4]
+    array = np.asarray(pixels).reshape(spec.height, spec.width, channels)
+    return array[..., 0] if channels == 1 else array
+
+
+def open_image(path: Path) -> oiio.ImageInput:
+    """An image file, its header read; close it.
+
+    Raises:
+        FormatError: it is missing or not an image.
+    """
+    source = oiio.ImageInput.open(str(path)) if Path(path).is_file() else None
+    if source is None:
+        why = _said(oiio.geterror) or "it cannot be opened"
+        raise FormatError(f"{path}: cannot be read as an image ({why}); copy it again")
+    return source
+
+
+def _said(geterror: Callable[[], str]) -> str:
+    """What OpenImageIO says went wrong; it may quote bytes of the file that are no text."""
+    try:
+        return geterror().strip()
+    except UnicodeDecodeError:
+        return "damaged"
+
+
+def _check_image(path: Path, spec: oiio.ImageSpec, pixel_bytes: int) -> None:
+    """Refuse what is no flat picture, or says to hold more than it can."""
+    size = f"{spec.width}x{spec.height} pixels of {spec.nchannels} channels"
+    if spec.deep or spec.depth > 1 or min(spec.width, spec.height, spec.nchannels) < 1:
+        raise FormatError(f"{path}: {size}, deep or a volume; expected a flat image")
+    if spec.width * spec.height > PIXEL_LIMIT:
+        raise FormatError(f"{path}: {size}, over {PIXEL_LIMIT}; store it smaller")
+    have = Path(path).stat().st_size
+    if spec.width * spec.height * pixel_bytes > max(ROOM_BYTES, RATIO_LIMIT * have):
+        raise FormatError(f"{path}: {size} in {have} bytes; it is damaged, copy it again")
 
 
 def read_alpha(path: Path) -> np.ndarray:
@@ -111,12 +147,55 @@ def decode_image(data: bytes, name: str = "image") -> np.ndarray:
     """Decode JPEG or PNG bytes to RGB (H, W, 3) or grey (H, W), keeping 8 or 16 bits.
 
     Raises:
-        FormatError: the bytes are no image.
+        FormatError: the bytes are no image, or one over the pixel limit.
     """
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data else None
+    width, height = image_size(data, name)
+    if width * height > min(PIXEL_LIMIT, max(ROOM_BYTES, RATIO_LIMIT * len(data))):
+        raise FormatError(f"{name}: {width}x{height} pixels in {len(data)} bytes; it is damaged")
+    return _swap(decode_cv(data, cv2.IMREAD_UNCHANGED, name))
+
+
+def decode_cv(data: bytes, flags: int, name: str) -> np.ndarray:
+    """The image in encoded bytes as OpenCV has it; look at its size before.
+
+    Raises:
+        FormatError: the bytes are damaged.
+    """
+    try:
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+    except cv2.error as error:
+        raise FormatError(f"{name}: cannot be decoded ({error.err}); copy it again") from None
     if image is None:
-        raise FormatError(f"{name}: {len(data)} bytes are not a JPEG or PNG image")
-    return _swap(image)
+        raise FormatError(f"{name}: {len(data)} bytes are a damaged image; copy it again")
+    return image
+
+
+def image_size(data: bytes, where: str) -> tuple[int, int]:
+    """Width and height in a PNG's or JPEG's header, before any pixel is decoded.
+
+    What decoders would pass over (garbage between segments) is refused: they might find another
+    header there than this one.
+
+    Raises:
+        FormatError: the bytes are neither.
+
+    Source: PNG 1.2, 11.2.2 (IHDR); ITU-T T.81, B.1.1.2 to B.2.2 (markers, frame header).
+    """
+    if data[:8] == b"\x89PNG\r\n\x1a\n" and len(data) >= 24:
+        return struct.unpack(">II", data[16:24])
+    position = 2 if data[:2] == b"\xff\xd8" else len(data)
+    while position + 9 < len(data) and data[position] == 0xFF:
+        marker, length = data[position + 1], int.from_bytes(data[position + 2 : position + 4])
+        if marker == 0xFF:  # a fill byte
+            position += 1
+            continue
+        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
+            height, width = struct.unpack(">HH", data[position + 5 : position + 9])
+            return width, height
+        if marker < 0xC0 or 0xD0 <= marker <= 0xDA:  # has no length, or ends the header
+            break
+        position += 2 + length
+    raise FormatError(f"{where}: {len(data)} bytes are no PNG or JPEG image")
 
 
 def _swap(image: np.ndarray) -> np.ndarray:

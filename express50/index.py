@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import lru_cache
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 from express50.errors import FormatError, StageError
 from express50.layout import Dataset, footage_root
+from express50.reading import NAME, read_json_table
 
 SCHEMA = "express50.index/1"
 # `Index.calibration` of a capture in a foreign layout: its cameras stand beside the index.
@@ -43,6 +43,8 @@ class CameraSource:
             may lie in a container (`express50.media`).
         clips: frames of each clip; empty where all is one.
         correction: rows of a polynomial colour correction that `express50.frames` applies, or none.
+        orientation: how the images are turned when they are read (`express50.exif`); width and
+            height are those of the turned ones.
     """
 
     kind: str
@@ -56,6 +58,7 @@ class CameraSource:
     names: tuple[str, ...] = ()
     clips: tuple[int, ...] = ()
     correction: tuple[tuple[float, ...], ...] = ()
+    orientation: int = 1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -134,8 +137,8 @@ def _read_cached(dataset: Dataset, subject: str, version: tuple[int, ...]) -> In
         )
     root = footage_root(captures[subject])
     try:
-        return index_from_json(json.loads(path.read_text(encoding="utf-8")), root)
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        return index_from_json(read_json_table(path, FormatError), root)
+    except (ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
         raise FormatError(
             f"{path}: not an index ({type(error).__name__}: {error}); "
             f"delete its folder and run 'express50 ingest {dataset.root}'"
@@ -163,8 +166,9 @@ def _camera_to_json(camera: CameraSource) -> dict[str, Any]:
     row["pts"] = " ".join(map(str, camera.pts))
     row["dhash"] = " ".join(camera.dhash)
     row["names"] = list(camera.names)
-    # Left out where they say nothing: most captures have one clip and no correction.
-    return {k: v for k, v in row.items() if v or k not in ("clips", "correction")}
+    # Left out where they say nothing: most captures have one clip, no correction and lie upright.
+    plain = {"clips": (), "correction": (), "orientation": 1}
+    return {k: v for k, v in row.items() if k not in plain or v != plain[k]}
 
 
 def index_from_json(content: Mapping[str, Any], capture: Path) -> Index:
@@ -175,6 +179,11 @@ def index_from_json(content: Mapping[str, Any], capture: Path) -> Index:
     """
     if content.get("schema") != SCHEMA:
         raise ValueError(f"schema is {content.get('schema')!r}, expected {SCHEMA!r}")
+    for name in (*content["cameras"], *(row[0] for row in content["cues"])):
+        if not NAME.fullmatch(name):  # they become names of files
+            raise ValueError(f"id {name!r}, expected letters, digits and _ . + -")
+    for name in content["plates"].values():
+        _check_inside(name)
     return Index(
         subject=content["subject"],
         capture=Path(capture),
@@ -188,6 +197,12 @@ def index_from_json(content: Mapping[str, Any], capture: Path) -> Index:
     )
 
 
+def _check_inside(name: str) -> None:
+    """Refuse a name that leads out of the capture; the pictures' own are checked when read."""
+    if PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts:
+        raise ValueError(f"{name!r} leads out of the capture")
+
+
 def _camera_from_json(name: str, row: Mapping[str, Any]) -> CameraSource:
     values = dict(row)
     values["pts"] = tuple(map(int, row["pts"].split()))
@@ -196,6 +211,9 @@ def _camera_from_json(name: str, row: Mapping[str, Any]) -> CameraSource:
     values["clips"] = tuple(map(int, row.get("clips", ())))
     values["correction"] = tuple(tuple(map(float, line)) for line in row.get("correction", ()))
     camera = CameraSource(**values)
+    if type(camera.orientation) is not int or not 1 <= camera.orientation <= 8:
+        raise ValueError(f"camera {name}: orientation {camera.orientation!r}, expected 1 to 8")
+    _check_inside(camera.source)
     lengths = {len(camera.pts), len(camera.dhash)}
     if lengths != {camera.frames}:
         raise ValueError(f"camera {name}: {sorted(lengths)} entries for {camera.frames} frames")

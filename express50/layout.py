@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import json
-import tomllib
 from dataclasses import dataclass
 from pathlib import Path
 
 from express50.errors import CaptureError, FormatError, StageError
+from express50.reading import NAME, read_json, read_toml
 
 
 def footage_root(capture: Path) -> Path:
@@ -32,10 +31,7 @@ def footage_source(capture: Path) -> Path:
     path = capture / "capture.toml"
     if not path.is_file():
         return capture
-    try:
-        source = tomllib.loads(path.read_text(encoding="utf-8")).get("source")
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise CaptureError(f"{path}: not TOML: {error}") from error
+    source = read_toml(path, CaptureError).get("source")
     if source is None:
         return capture
     if not isinstance(source, str) or not (capture / source).exists():
@@ -80,18 +76,16 @@ class Dataset:
         """
         if not self.captures_file.is_file():
             return {}
-        try:
-            table = json.loads(self.captures_file.read_text(encoding="utf-8"))
-        except ValueError as error:
-            raise FormatError(
-                f"{self.captures_file}: not JSON ({error}); delete it and run 'express50 ingest' "
-                "with every capture again"
-            ) from error
+        mend = "delete it and run 'express50 ingest' with every capture again"
+        table = read_json(self.captures_file, FormatError, mend)
         if not isinstance(table, dict) or not all(isinstance(v, str) for v in table.values()):
             raise FormatError(
                 f"{self.captures_file}: expected an object subject -> path, got "
                 f"{type(table).__name__}; delete it and run 'express50 ingest' again"
             )
+        for subject in table:
+            if not NAME.fullmatch(subject):  # it becomes the name of folders
+                raise FormatError(f"{self.captures_file}: subject {subject!r} is no id; {mend}")
         return {subject: Path(table[subject]) for subject in sorted(table)}
 
     def alpha_file(self, subject: str, expression: str, camera: str) -> Path:

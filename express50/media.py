@@ -9,6 +9,7 @@ it is believed.
 from __future__ import annotations
 
 import io
+import struct
 import zipfile
 from functools import lru_cache
 from pathlib import Path, PurePosixPath
@@ -19,13 +20,21 @@ import h5py
 import numpy as np
 from PIL import Image
 
+from express50.arrays import DAMAGE as ZIP_DAMAGE
+from express50.checks import PIXEL_LIMIT
 from express50.errors import CaptureError, FormatError
-from express50.images import PIXEL_LIMIT, linear_to_srgb, read_image
+from express50.exif import upright
+from express50.images import ROOM_BYTES, decode_cv, linear_to_srgb, read_image
 
 WITHIN = "!/"
 BYTES_LIMIT = 1 << 28  # of one encoded image, or of one array
+# Pixels a byte of a file: no photograph packs tighter, AVIF's of one colour do.
+PIXELS_A_BYTE = 1 << 14
+ATTRIBUTE_LIMIT = 1 << 16  # bytes
+NAME_LIMIT = 255  # bytes, of each part
 OPEN_FILES = 4  # containers a process keeps open
-DAMAGE = (OSError, RuntimeError, KeyError, ValueError, TypeError)  # what h5py raises on bad files
+# What h5py raises on bad files.
+DAMAGE = (OSError, RuntimeError, KeyError, ValueError, TypeError, OverflowError, AttributeError)
 
 
 def to_srgb8(image: np.ndarray) -> np.ndarray:
@@ -70,7 +79,10 @@ def inside(root: Path, name: str, where: str = "") -> Path:
     """
     pure = PurePosixPath(name)
     path = root / name
-    out = pure.is_absolute() or ".." in pure.parts or "\0" in name
+    out = pure.is_absolute() or ".." in pure.parts or not name.isprintable()
+    lengths = [len(part.encode(errors="replace")) for part in (name, *pure.parts)]
+    if lengths[0] > 4096 or max(lengths[1:], default=0) > NAME_LIMIT:
+        raise CaptureError(f"{where or root}: {name[:40]!r}... is longer than a name may be")
     if out or not path.resolve().is_relative_to(root.resolve()):
         raise CaptureError(
             f"{where or root}: {name!r} leads out of {root}; expected a name inside it"
@@ -78,12 +90,17 @@ def inside(root: Path, name: str, where: str = "") -> Path:
     return path
 
 
-def read_picture(root: Path, name: str) -> np.ndarray:
-    """Image (H, W, 3) uint8 sRGB of a name below a folder.
+def read_picture(root: Path, name: str, orientation: int = 1) -> np.ndarray:
+    """Image (H, W, 3) uint8 sRGB of a name below a folder, turned by EXIF's orientation.
 
     Raises:
         CaptureError: it is missing, damaged, too large, or its name leads out of the folder.
     """
+    return upright(_stored(root, name), orientation)
+
+
+def _stored(root: Path, name: str) -> np.ndarray:
+    """The image with its pixels as they are stored."""
     container, within, member = name.partition(WITHIN)
     path = inside(root, container)
     if within:
@@ -109,19 +126,21 @@ def decode_picture(data: bytes, where: str) -> np.ndarray:
         CaptureError: the bytes are no such image, or it has too many pixels.
     """
     try:
-        with Image.open(io.BytesIO(data)) as header:
+        with Image.open(io.BytesIO(data), formats=("JPEG", "PNG", "AVIF")) as header:
             width, height = header.size
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
+    except (*ZIP_DAMAGE, struct.error, Image.DecompressionBombError) as error:
         raise CaptureError(
             f"{where}: {len(data)} bytes are no JPEG, PNG or AVIF image; copy the file again"
         ) from error
-    if width * height > PIXEL_LIMIT:
-        raise CaptureError(f"{where}: {width}x{height} pixels, over {PIXEL_LIMIT}")
-    flags = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
-    if image is None:
-        raise CaptureError(f"{where}: image is damaged; copy the file again")
-    return image
+    if width * height > min(PIXEL_LIMIT, max(ROOM_BYTES, PIXELS_A_BYTE * len(data))):
+        raise CaptureError(
+            f"{where}: {width}x{height} pixels in {len(data)} bytes, over {PIXEL_LIMIT} or more "
+            "than they can hold; copy the file again"
+        )
+    try:
+        return decode_cv(data, cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION, where)
+    except FormatError as error:
+        raise CaptureError(str(error)) from None
 
 
 def member_bytes(path: Path, member: str) -> bytes:
@@ -155,7 +174,7 @@ def open_zip(path: Path) -> zipfile.ZipFile:
     try:
         stat = path.stat()
         return _zip_cached(path, (stat.st_mtime_ns, stat.st_size))
-    except (OSError, zipfile.BadZipFile, NotImplementedError) as error:
+    except ZIP_DAMAGE as error:
         raise CaptureError(f"{path}: no zip archive ({error}); copy it again") from error
 
 
@@ -166,14 +185,14 @@ def _zip_cached(path: Path, version: tuple[int, int]) -> zipfile.ZipFile:
 
 def _zip_bytes(path: Path, member: str) -> bytes:
     archive = open_zip(path)
+    if member not in archive.NameToInfo:
+        raise CaptureError(f"{path}: has no member {member}; copy it again")
     try:
         info = archive.getinfo(member)
         _check_size(info.file_size, f"{path}{WITHIN}{member}")
         with archive.open(info) as file:
             return file.read(info.file_size)
-    except KeyError as error:
-        raise CaptureError(f"{path}: has no member {member}; copy it again") from error
-    except (OSError, RuntimeError, zipfile.BadZipFile, EOFError, NotImplementedError) as error:
+    except (*ZIP_DAMAGE, struct.error) as error:
         raise CaptureError(
             f"{path}{WITHIN}{member}: damaged ({error}); copy the archive again"
         ) from error
@@ -219,6 +238,35 @@ def child(file: h5py.File, name: str, where: str) -> Any:
     except DAMAGE as error:
         raise CaptureError(f"{where}: {name} is damaged ({error}); copy it again") from error
     return node
+
+
+def members(group: h5py.Group, where: str) -> list[str]:
+    """Names in a group of an HDF5 file.
+
+    Raises:
+        CaptureError: the file is damaged.
+    """
+    try:
+        return [str(name) for name in group]
+    except DAMAGE as error:
+        raise CaptureError(f"{where}: a group is damaged ({error}); copy it again") from error
+
+
+def attribute(group: h5py.Group, name: str, default: object, where: str) -> np.ndarray:
+    """A small attribute of a group, or its default, flat.
+
+    Raises:
+        CaptureError: the file is damaged, or the attribute is not small.
+    """
+    try:
+        if name not in group.attrs:
+            return np.ravel(np.asarray(default))
+        kind = group.attrs.get_id(name)
+        if kind.get_storage_size() > ATTRIBUTE_LIMIT:
+            raise CaptureError(f"{where}: attribute {name} has over {ATTRIBUTE_LIMIT} bytes")
+        return np.ravel(np.asarray(group.attrs[name]))
+    except DAMAGE as error:
+        raise CaptureError(f"{where}: attribute {name} is damaged ({error})") from error
 
 
 def read_array(file: h5py.File, name: str, where: str) -> np.ndarray:

@@ -12,11 +12,18 @@ import re
 import sqlite3
 import tarfile
 import zipfile
+import zlib
 from collections.abc import Callable, Collection, Iterator
 from contextlib import closing
 from pathlib import Path
+from typing import IO
 
 from express50.digests import text_digest
+
+DAMAGED = (
+    tarfile.TarError, zipfile.BadZipFile, zlib.error, sqlite3.DatabaseError, ValueError, EOFError,
+    OverflowError, NotImplementedError, RuntimeError,
+)  # fmt: skip
 
 IMAGE_SUFFIXES = {".jpg", ".jpeg", ".png", ".exr", ".tif", ".ply", ".glb", ".mp4"}
 CHUNK = 1 << 24
@@ -81,31 +88,42 @@ def texts_of(path: Path) -> Iterator[bytes]:
         return
     with path.open("rb") as file:
         head = file.read(16)
-    if suffix == ".tar":
-        yield from _tar_texts(path)
-    elif head.startswith(b"SQLite format 3\0"):
-        yield from _ledger_texts(path)
-    elif head.startswith(b"PK\x03\x04") and zipfile.is_zipfile(path):
-        yield from _zip_texts(path)
-    else:
-        yield from _blocks(path)
+    try:
+        if suffix == ".tar":
+            yield from _tar_texts(path)
+        elif head.startswith(b"SQLite format 3\0"):
+            yield from _ledger_texts(path)
+        elif head.startswith(b"PK\x03\x04") and zipfile.is_zipfile(path):
+            yield from _zip_texts(path)
+        else:
+            yield from _blocks(path)
+    except DAMAGED:
+        yield from _blocks(path)  # a damaged archive may still name somebody
 
 
 def _blocks(path: Path) -> Iterator[bytes]:
     with path.open("rb") as file:
-        tail = b""
-        while block := file.read(CHUNK):
-            yield tail + block
-            tail = block[-OVERLAP:]
+        yield from _pieces(file)
+
+
+def _pieces(file: IO[bytes]) -> Iterator[bytes]:
+    tail = b""
+    while block := file.read(CHUNK):
+        yield tail + block
+        tail = block[-OVERLAP:]
 
 
 def _tar_texts(path: Path) -> Iterator[bytes]:
     with tarfile.open(path, "r:") as tar:
         for member in tar:
-            yield member.name.encode()
-            file = tar.extractfile(member) if member.name.endswith(".json") else None
+            yield member.name.encode(errors="surrogateescape")
+            if member.issparse():  # our shards have none; it may say to be of any size
+                raise tarfile.ReadError("a sparse member")
+            # A link would lead to another member; only what a member itself holds counts.
+            wanted = member.isreg() and member.name.endswith(".json")
+            file = tar.extractfile(member) if wanted else None
             if file is not None:
-                yield file.read()
+                yield from _pieces(file)
 
 
 def _zip_texts(path: Path) -> Iterator[bytes]:
@@ -114,7 +132,8 @@ def _zip_texts(path: Path) -> Iterator[bytes]:
         for member in archive.infolist():
             yield member.filename.encode()
             if member.filename.endswith((".pkl", ".json", ".txt")):
-                yield archive.read(member)
+                with archive.open(member) as file:
+                    yield from _pieces(file)
             elif member.filename.endswith(".npy") and member.file_size < TEXT_LIMIT:
                 data = archive.read(member)
                 if b"'descr': '<U" in data[:128] or b"'descr': '|S" in data[:128]:

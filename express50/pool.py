@@ -11,7 +11,7 @@ from typing import Any
 
 from express50.clusters import GPU, LocalWorkers, RemoteWorkers
 from express50.errors import StageError
-from express50.ledger import Receipt
+from express50.receipts import Receipt
 from express50.slurm import SlurmJob, SlurmWorkers
 from express50.work import BATCH_SECONDS, Task, run_task, run_tasks
 

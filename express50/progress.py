@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from typing import Any
 
-from express50.ledger import Receipt
+from express50.receipts import Receipt
 
 
 class Progress:

@@ -13,7 +13,8 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
-from express50.ledger import Ledger, Run
+from express50.ledger import Ledger
+from express50.receipts import Run
 
 BEAT_SECONDS = 2.0
 

@@ -14,11 +14,12 @@ from express50.config import config_toml, nearest
 from express50.digests import path_digest
 from express50.errors import ConfigError, Express50Error, StageError
 from express50.layout import Dataset
-from express50.ledger import Ledger, Receipt
+from express50.ledger import Ledger
 from express50.locks import stage_lock
 from express50.pool import Pool
 from express50.progress import Progress
 from express50.publish import clean_leftovers, discard_stale, set_aside, write_bytes
+from express50.receipts import Receipt
 from express50.runlog import RunLog
 from express50.stage import Stage
 from express50.work import Task, fingerprint, input_digests

@@ -16,7 +16,6 @@ beside the shards is to be added to the rest shape); ``label`` (who chose the fr
 
 from __future__ import annotations
 
-import json
 import os
 import re
 from collections.abc import Collection, Iterator
@@ -26,10 +25,12 @@ from pathlib import Path
 import numpy as np
 
 from express50.errors import FormatError
+from express50.reading import parse_json, read_json
 from express50.shards_codecs import ALPHA, DEPTH, PARTS, RGB, crc32, decode_picture
 from express50.shards_offsets import KEY, read_offsets
 
 SCHEMA = "express50.shards/1"
+_AGAIN = "rerun 'express50 pack'"
 SHARD_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*-[0-9]{6}\.tar")
 
 
@@ -155,11 +156,13 @@ class ShardReader:
         return self._meta(number, self.member(number, "meta.json"))
 
     def _meta(self, number: int, data: bytes) -> dict:
-        try:
-            return json.loads(data)
-        except ValueError as error:
-            entry = self.entries[number]
-            raise FormatError(f"{self.root / entry.shard}: {entry.key}: meta: {error}") from None
+        entry = self.entries[number]
+        where = f"{self.root / entry.shard}: {entry.key}: meta"
+        meta = parse_json(data, where, FormatError, _AGAIN)
+        scale = meta.get("depth_scale_m") if isinstance(meta, dict) else None
+        if not isinstance(scale, float) or not 0 < scale < 1:
+            raise FormatError(f"{where}: depth_scale_m is {scale!r}, expected metres; {_AGAIN}")
+        return meta
 
     def sample(self, number: int) -> dict:
         """Decode one sample.
@@ -239,12 +242,9 @@ def read_entries(root: Path) -> tuple[Entry, ...]:
             member lies outside its shard.
     """
     path = root / "index.json"
-    try:
-        table = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise FormatError(f"{path}: no such index; name the folder that 'pack' wrote") from None
-    except ValueError as error:
-        raise FormatError(f"{path}: not JSON ({error}); rerun 'express50 pack'") from None
+    if not path.exists():
+        raise FormatError(f"{path}: no such index; name the folder that 'pack' wrote")
+    table = read_json(path, FormatError, _AGAIN)
     if not isinstance(table, dict) or table.get("schema") != SCHEMA:
         got = table.get("schema") if isinstance(table, dict) else type(table).__name__
         raise FormatError(f"{path}: schema {got!r}, expected {SCHEMA!r}")
@@ -252,7 +252,7 @@ def read_entries(root: Path) -> tuple[Entry, ...]:
     try:
         for shard in table["shards"]:
             entries += _shard_entries(root, shard)
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
         raise FormatError(
             f"{path}: malformed ({type(error).__name__}: {error}); rerun 'express50 pack'"
         ) from None
@@ -276,9 +276,8 @@ def _shard_entries(root: Path, shard: dict) -> Iterator[Entry]:
             raise FormatError(
                 f"{path}: {row['key']} lies outside the shard; rerun 'express50 pack'"
             )
-        if not KEY.fullmatch(row["key"]):
-            raise FormatError(f"{path}: key {row['key']!r}, expected letters, digits, _ and -")
-        yield Entry(
-            row["key"], row["subject"], row["expression"], row["camera"], shard["split"], name,
-            members,
-        )  # fmt: skip
+        ids = {name: row[name] for name in ("key", "subject", "expression", "camera")}
+        for kind, text in (*ids.items(), ("split", shard["split"])):
+            if not KEY.fullmatch(text):  # they become names of files
+                raise FormatError(f"{path}: {kind} {text!r}, expected letters, digits, _ and -")
+        yield Entry(**ids, split=shard["split"], shard=name, members=members)

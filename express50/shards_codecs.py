@@ -12,8 +12,9 @@ import struct
 import imagecodecs
 import numpy as np
 
+from express50.checks import PIXEL_LIMIT
 from express50.errors import FormatError
-from express50.images import PIXEL_LIMIT, decode_image, encode_jpeg, encode_png
+from express50.images import decode_image, encode_jpeg, encode_png, image_size
 
 PROFILES = ("compact", "fast", "lossless")
 RGB = ("rgb.jpg", "rgb.png")
@@ -21,7 +22,8 @@ ALPHA = ("alpha.png", "alpha.zst")
 PARTS = ("parts.png", "parts.zst")
 DEPTH = ("depth.png", "depth.lerc")
 ZSTD_LEVEL = 3
-LERC_HEADER = struct.Struct("<6siIiii")  # name, version, checksum, rows, columns, depth
+# Name, version, checksum, rows, columns, depth, valid pixels, block, bytes of the blob.
+LERC_HEADER = struct.Struct("<6siIiiiiii")
 
 
 def encode_pictures(
@@ -115,27 +117,9 @@ def lerc_size(data: bytes, where: str) -> tuple[int, int]:
         FormatError: the bytes are no such blob.
     """
     if len(data) >= LERC_HEADER.size:
-        name, version, _, rows, columns, depth = LERC_HEADER.unpack_from(data)
-        if name == b"Lerc2 " and version >= 4 and depth == 1:
+        name, version, _, rows, columns, depth, _, _, size = LERC_HEADER.unpack_from(data)
+        # A second blob behind the first would be a second channel of the whole size.
+        alone = size == len(data) and depth == 1 and min(rows, columns) > 0
+        if name == b"Lerc2 " and 4 <= version <= 6 and alone:
             return columns, rows
     raise FormatError(f"{where}: {len(data)} bytes are no LERC image of one channel")
-
-
-def image_size(data: bytes, where: str) -> tuple[int, int]:
-    """Width and height in a PNG's or JPEG's header, before any pixel is decoded.
-
-    Raises:
-        FormatError: the bytes are neither.
-
-    Source: PNG 1.2, 11.2.2 (IHDR); ITU-T T.81, B.2.2 (frame header).
-    """
-    if data[:8] == b"\x89PNG\r\n\x1a\n" and len(data) >= 24:
-        return struct.unpack(">II", data[16:24])
-    position = 2 if data[:2] == b"\xff\xd8" else len(data)
-    while position + 9 < len(data) and data[position] == 0xFF:
-        marker, length = data[position + 1], int.from_bytes(data[position + 2 : position + 4])
-        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
-            height, width = struct.unpack(">HH", data[position + 5 : position + 9])
-            return width, height
-        position += 2 + length
-    raise FormatError(f"{where}: {len(data)} bytes are no PNG or JPEG image")

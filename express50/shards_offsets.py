@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 
+from express50.arrays import read_npy
 from express50.errors import FormatError
 
 KEY = re.compile(r"[A-Za-z0-9_-]{1,80}")
-MAGIC = b"\x93NUMPY"
 
 
 def offsets_file(root: Path, subject: str) -> Path:
@@ -37,15 +37,7 @@ def read_offsets(root: Path, subject: str) -> np.ndarray:
     """
     path = offsets_file(root, subject)
     again = "copy the shards again or rerun 'express50 pack'"
-    try:
-        with path.open("rb") as file:
-            if file.read(len(MAGIC)) != MAGIC:  # np.load would take an archive too
-                raise ValueError("not a .npy file")
-            file.seek(0)
-            array = np.load(file, allow_pickle=False)
-    except (OSError, ValueError, EOFError, MemoryError, SyntaxError) as error:
-        words = " ".join(str(error).split())
-        raise FormatError(f"{path}: no offsets ({words}); {again}") from None
+    array = read_npy(path, FormatError, "offsets", again)
     if array.ndim != 2 or array.shape[1] != 3 or array.dtype != np.float32:
         raise FormatError(f"{path}: {array.dtype} {array.shape}, expected float32 (V, 3); {again}")
     if not np.isfinite(array).all():

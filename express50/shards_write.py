@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import BinaryIO, cast
 
 from express50.errors import FormatError
+from express50.reading import NAME, read_json
 from express50.shards import KEY, SCHEMA, SHARD_NAME, ShardReader, read_entries
 from express50.shards_codecs import crc32
 
@@ -189,16 +190,18 @@ def verify(root: Path) -> list[str]:
 
 def _manifest_faults(root: Path) -> list[str]:
     path = root / "manifest.json"
-    try:
-        files = json.loads(path.read_text(encoding="utf-8"))["files"]
-        expected = {name: row["sha256"] for name, row in files.items()}
-    except FileNotFoundError:
+    if not path.exists():
         return [f"{path}: no such manifest; rerun 'express50 pack'"]
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
+    try:
+        files = read_json(path, FormatError)["files"]
+        expected = {name: str(row["sha256"]) for name, row in files.items()}
+    except FormatError as error:
+        return [str(error)]
+    except (KeyError, TypeError, AttributeError) as error:
         return [f"{path}: malformed ({error}); rerun 'express50 pack'"]
     faults = []
     for name, digest in sorted(expected.items()):
-        if Path(name).name != name or not (root / name).is_file():
+        if not NAME.fullmatch(name) or not (root / name).is_file():
             faults.append(f"{root / name}: is missing or outside the folder")
         elif _sha256(root / name) != digest:
             faults.append(f"{root / name}: SHA-256 differs from the manifest's {digest[:12]}...")

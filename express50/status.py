@@ -6,7 +6,8 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from express50.ledger import Ledger, Receipt, Run
+from express50.ledger import Ledger
+from express50.receipts import Receipt, Run
 
 SILENT_SECONDS = 15.0  # a run that shows no sign for so long was killed
 RECENT = 50  # items whose rate counts for the time left

@@ -14,7 +14,7 @@ from express50.errors import ConfigError
 from express50.layout import Dataset, existing_dataset
 
 if TYPE_CHECKING:
-    from express50.ledger import Receipt
+    from express50.receipts import Receipt
     from express50.status import StageStatus
 
 PAGE_SECONDS = 3.0  # between two pages while a run goes on

@@ -8,9 +8,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from express50.ledger import Receipt
 from express50.progress import format_rate
 from express50.publish import write_bytes
+from express50.receipts import Receipt
 from express50.status import StageStatus
 
 FAILED_SHOWN = 200

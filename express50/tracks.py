@@ -7,19 +7,17 @@ line. Nothing in a file is executed: pickled objects are refused.
 from __future__ import annotations
 
 import re
-import zipfile
-import zlib
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from express50.arrays import read_arrays
 from express50.errors import FormatError, StageError
 from express50.layout import Dataset
 
 SCHEMAS = ("express50.track/1", "express50.track/2")
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
-SIZE_LIMIT = 2 << 30  # unpacked bytes; 60 expressions of a 26,000-vertex head take 19 MB
 _WIDTHS = {"neck": (3,), "jaw": (3,), "eyes": (6,), "R": (3, 3), "t": (3,)}
 _AGAIN = "run 'express50 track' again"
 
@@ -90,7 +88,7 @@ def read_track(path: Path) -> Track:
     """
     if not path.is_file():
         raise StageError(f"{path}: no such track; run 'express50 track'")
-    arrays = _arrays(path)
+    arrays = read_arrays(path, FormatError, "a track", mend=_AGAIN)
     try:
         schema, head = str(arrays.pop("schema")), str(arrays.pop("head"))
         if schema not in SCHEMAS:
@@ -108,21 +106,6 @@ def read_track(path: Path) -> Track:
         raise FormatError(f"{path}: not a track ({words}); {_AGAIN}") from None
     numbers = {name: _typed(name, arrays[name]) for name in expected}
     return Track(schema=schema, head=head, expressions=tuple(names.tolist()), **numbers)
-
-
-def _arrays(path: Path) -> dict[str, np.ndarray]:
-    """All arrays of an npz file that stays within SIZE_LIMIT; no pickled objects."""
-    try:
-        with zipfile.ZipFile(path) as archive:
-            size = sum(member.file_size for member in archive.infolist())
-        if size > SIZE_LIMIT:
-            raise FormatError(f"{path}: {size} bytes unpacked, over {SIZE_LIMIT}; {_AGAIN}")
-        with np.load(path, allow_pickle=False) as table:
-            return {name: table[name] for name in table.files}
-    except (ValueError, EOFError, OSError, MemoryError, NotImplementedError, RuntimeError,
-            SyntaxError, zipfile.BadZipFile, zlib.error) as error:  # fmt: skip
-        words = " ".join(str(error).split())
-        raise FormatError(f"{path}: not a track ({words}); {_AGAIN}") from None
 
 
 def _shapes(arrays: dict[str, np.ndarray], count: int) -> dict[str, tuple[int | None, ...]]:

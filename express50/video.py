@@ -12,11 +12,17 @@ from pathlib import Path
 import av
 import numpy as np
 
+from express50.checks import PIXEL_LIMIT
 from express50.errors import CaptureError
 
 # Frames before the wanted one at which a seek aims. An H.264 or H.265 picture may be displayed
 # up to 16 pictures away from its place in the stream, so a nearer key frame may lie behind it.
 REORDER = 16
+# What the endings of our video files stand for. FFmpeg goes by content: a playlist named video.mp4
+# would make it read other files.
+CONTAINERS = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi"
+BOXES = 1_000_000  # of one file; a fragment of a second has two
+DAMAGE = (av.FFmpegError, OSError, ValueError, MemoryError, OverflowError)
 
 
 def check_whole(path: Path) -> None:
@@ -30,22 +36,25 @@ def check_whole(path: Path) -> None:
     """
     size = path.stat().st_size
     with path.open("rb") as file:
-        offset = 0
-        kinds: list[bytes] = []
-        while offset + 8 <= size:
+        offset = count = 0
+        kinds: set[bytes] = set()
+        while offset + 8 <= size and count < BOXES:
             file.seek(offset)
             header = file.read(16)
             length, kind = int.from_bytes(header[:4], "big"), header[4:8]
             if not kinds and kind != b"ftyp":
                 return  # another container
-            kinds.append(kind)
+            kinds.add(kind)
+            count += 1
             if length == 1:
                 length = int.from_bytes(header[8:16], "big")
             length = length or size - offset
             if length < 8 or offset + length > size:
                 raise _truncated(path, size, offset + length)
             offset += length
-    if b"ftyp" in kinds and not {b"moov", b"moof"} & set(kinds):
+    if count == BOXES:
+        raise CaptureError(f"{path}: has {BOXES} boxes and more; it is damaged, copy it again")
+    if b"ftyp" in kinds and not {b"moov", b"moof"} & kinds:
         raise CaptureError(
             f"{path}: video has no index (moov box), the recording was cut off; "
             "copy the file again or record it again"
@@ -65,9 +74,10 @@ def decoder_threads() -> int:
 
 
 def _open(path: Path) -> tuple[av.container.InputContainer, av.VideoStream]:
+    limits = {"format_whitelist": CONTAINERS, "protocol_whitelist": "file"}
     try:
-        container = av.open(str(path))
-    except (av.FFmpegError, OSError) as error:
+        container = av.open(str(path), container_options=limits)
+    except DAMAGE as error:
         raise CaptureError(
             f"{path}: cannot be opened as a video ({_reason(error)}); copy or encode it again"
         ) from error
@@ -75,12 +85,28 @@ def _open(path: Path) -> tuple[av.container.InputContainer, av.VideoStream]:
         container.close()
         raise CaptureError(f"{path}: holds no video stream, expected one")
     stream = container.streams.video[0]
-    stream.codec_context.thread_count = decoder_threads()
+    try:
+        stream.codec_context.options = {"max_pixels": str(PIXEL_LIMIT)}
+        stream.codec_context.thread_count = decoder_threads()
+    except (RuntimeError, AttributeError, *DAMAGE) as error:  # a codec that is unknown
+        container.close()
+        raise CaptureError(f"{path}: has no decoder ({_reason(error)}); encode it again") from error
     return container, stream
 
 
 def _reason(error: Exception) -> str:
-    return getattr(error, "strerror", None) or str(error)
+    return getattr(error, "strerror", None) or str(error) or type(error).__name__
+
+
+def _pixels(path: Path, frame: av.VideoFrame) -> np.ndarray:
+    """Pixels (H, W, 3) uint8 of a frame."""
+    size = frame.width * frame.height
+    if not 0 < size <= PIXEL_LIMIT:
+        raise CaptureError(f"{path}: a frame is {frame.width}x{frame.height}, over {PIXEL_LIMIT}")
+    try:
+        return frame.to_ndarray(format="rgb24")
+    except DAMAGE as error:
+        raise CaptureError(f"{path}: a frame cannot be converted ({_reason(error)})") from error
 
 
 def _decode(
@@ -101,7 +127,7 @@ def _decode(
                         "'ffmpeg -i IN -c copy OUT.mp4'"
                     )
                 yield frame
-    except av.FFmpegError as error:
+    except DAMAGE as error:
         raise CaptureError(
             f"{path}: decoding failed ({_reason(error)}); copy the file again"
         ) from error
@@ -136,7 +162,7 @@ def iterate_video(path: Path) -> Iterator[tuple[int, np.ndarray]]:
         count = 0
         for frame in _decode(path, container, stream):
             count += 1
-            yield int(frame.pts), frame.to_ndarray(format="rgb24")
+            yield int(frame.pts), _pixels(path, frame)
     if count == 0:
         raise CaptureError(f"{path}: video holds no frame; record or copy it again")
 
@@ -190,7 +216,11 @@ class VideoReader:
         if target == 0:
             self.restart()
             return
-        self._container.seek(self.pts[target], stream=self._stream, backward=True)
+        try:
+            self._container.seek(self.pts[target], stream=self._stream, backward=True)
+        except DAMAGE:  # no index to seek in: from the start it goes
+            self.restart()
+            return
         self._frames = _decode(self.path, self._container, self._stream)
         self._next = target
 
@@ -200,7 +230,7 @@ class VideoReader:
         for decoded in self._frames:
             if decoded.pts == wanted:
                 self._next = frame + 1
-                return decoded.to_ndarray(format="rgb24")
+                return _pixels(self.path, decoded)
             if decoded.pts > wanted:
                 return None
         return None

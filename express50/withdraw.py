@@ -8,7 +8,6 @@ training mends. The raw capture lies outside the dataset and stays its owner's t
 
 from __future__ import annotations
 
-import json
 import shutil
 import sqlite3
 from collections.abc import Callable, Iterator, Sequence
@@ -16,13 +15,16 @@ from contextlib import closing, suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 from express50.digests import text_digest
 from express50.errors import FormatError, StageError
 from express50.layout import Dataset
+from express50.ledger import Ledger, check_schema
 from express50.locks import hold_stages
 from express50.names import files_naming, names, says
 from express50.publish import write_json
+from express50.reading import read_json
 
 Redact = Callable[[Path, str], bool]
 
@@ -76,8 +78,8 @@ def _own_paths(dataset: Dataset, subject: str) -> Iterator[Path]:
 def _values(path: Path) -> list[str]:
     """Values of a JSON table of texts; none where it is not one."""
     try:
-        table = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError:
+        table = read_json(path, FormatError, "")
+    except FormatError:
         return []
     return [str(value) for value in table.values()] if isinstance(table, dict) else []
 
@@ -131,9 +133,11 @@ def withdraw(
 
     Raises:
         StageError: the dataset knows no such subject, or a stage runs.
+        FormatError: the ledger is damaged; then nothing was removed.
     """
     with hold_stages(dataset, sorted(p.stem for p in (dataset.root / "config").glob("*.toml"))):
         paths = plan(dataset, subject)
+        _check_ledger(dataset)  # before anything is removed: half a withdrawal cannot be repeated
         captures = dataset.captures()
         capture = captures.pop(subject, None)
         files = sum(1 if p.is_file() else sum(q.is_file() for q in p.rglob("*")) for p in paths)
@@ -168,6 +172,12 @@ def _redacted(
             continue  # no checkpoint of ours: found below if it names the subject
 
 
+def _check_ledger(dataset: Dataset) -> None:
+    if dataset.ledger.is_file():
+        with Ledger(dataset.ledger) as ledger:
+            ledger.check_whole()
+
+
 def withdrawn_file(dataset: Dataset) -> Path:
     """Records of withdrawals."""
     return dataset.root / "withdrawn.json"
@@ -176,7 +186,7 @@ def withdrawn_file(dataset: Dataset) -> Path:
 def _record(dataset: Dataset, subject: str, files: int) -> None:
     """Note when somebody was withdrawn and how many files went; the id only as a digest."""
     path = withdrawn_file(dataset)
-    rows = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else []
+    rows = _withdrawals(path) if path.is_file() else []
     time = datetime.now(UTC).isoformat(timespec="seconds")
     write_json(path, [*rows, {"id_sha256": text_digest(subject), "time": time, "files": files}])
 
@@ -186,17 +196,37 @@ def withdrawn(dataset: Dataset) -> set[str]:
     path = withdrawn_file(dataset)
     if not path.is_file():
         return set()
-    rows = json.loads(path.read_text(encoding="utf-8"))
-    return {row if isinstance(row, str) else row["id_sha256"] for row in rows}
+    return {_digest(row) for row in _withdrawals(path)}
+
+
+def _withdrawals(path: Path) -> list:
+    """Records of withdrawals; those of before time and count were kept are digests alone."""
+    mend = "restore it: it says who must not be taken in again"
+    rows = read_json(path, FormatError, mend)
+    if not isinstance(rows, list) or not all(isinstance(_digest(row), str) for row in rows):
+        raise FormatError(f"{path}: expected a list of digests; {mend}")
+    return rows
+
+
+def _digest(row: Any) -> str:
+    return row.get("id_sha256") if isinstance(row, dict) else row
 
 
 def _forget(dataset: Dataset, subject: str, paths: list[Path]) -> None:
     """Remove receipts and digests, and overwrite the database's freed pages."""
     if not dataset.ledger.is_file():
         return
+    try:
+        _forget_rows(dataset, subject, paths)
+    except sqlite3.DatabaseError as error:
+        raise FormatError(f"{dataset.ledger}: not a ledger ({error}); delete it") from error
+
+
+def _forget_rows(dataset: Dataset, subject: str, paths: list[Path]) -> None:
     pairs = {_stage_and_item(path.relative_to(dataset.root)) for path in paths}
     root = str(dataset.root.resolve())
     with closing(sqlite3.connect(dataset.ledger, isolation_level=None)) as database:
+        check_schema(database)
         database.execute("PRAGMA secure_delete=ON")
         tables = [row[0] for row in database.execute("SELECT name FROM sqlite_master")]
         for table in (name for name in ("receipts", "made") if name in tables):

@@ -16,8 +16,8 @@ from typing import Any
 from express50.digests import files_of, value_digest
 from express50.errors import Express50Error, StageError
 from express50.layout import Dataset
-from express50.ledger import FileMark, Made, Receipt, mark_file
 from express50.publish import dump_json, publishing, write_bytes
+from express50.receipts import FileMark, Made, Receipt, mark_file
 from express50.stage import Stage
 from express50.threads import cap_threads
 

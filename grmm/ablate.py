@@ -13,9 +13,10 @@ from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 
-from express50.errors import ConfigError
+from express50.errors import ConfigError, FormatError
 from express50.head.load import load_head
 from express50.publish import dump_json, write_bytes, write_json
+from express50.reading import read_json_table
 from grmm.ablation_table import GROUPS, SHOWN, Variant, variants_of, write_tables
 from grmm.checkpoint import Loaded, load_checkpoint
 from grmm.config import Config
@@ -107,8 +108,8 @@ def _row(
     digest = _digest(roots, used, settings, protocol, subjects)
     path = out / name / "row.json"
     if path.exists():
-        row = json.loads(path.read_bytes())
-        if row["digest"] == digest:
+        row = read_json_table(path, FormatError, "delete it to measure again")
+        if row.get("digest") == digest:
             log(f"ablate: {name} is measured")
             return row
         log(f"ablate: {name} was measured with other settings: again")

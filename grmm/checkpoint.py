@@ -9,7 +9,6 @@ import io
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
-from pickle import UnpicklingError
 from typing import Any
 
 import numpy as np
@@ -20,6 +19,7 @@ from express50.errors import FormatError
 from express50.head.load import load_head
 from express50.head.model import HeadModel
 from express50.publish import write_bytes
+from express50.weights import read_weights
 from grmm.config import Config
 from grmm.data import NO_OFFSETS, HeadViews, Tracked, pose_state
 from grmm.model import GRMM, HeadState, View
@@ -134,9 +134,24 @@ def load_checkpoint(path: Path, device: torch.device | str = "cpu") -> Loaded:
         FormatError: no such file, or not a checkpoint of this format.
     """
     content = read_content(path)
+    try:
+        return _loaded(path, content, device)
+    except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
+        words = f"{type(error).__name__}: {error}"
+        raise FormatError(f"{path}: not a whole checkpoint ({words}); copy it again") from error
+
+
+def _loaded(path: Path, content: dict[str, Any], device: torch.device | str) -> Loaded:
+    """The checkpoint of a file's content, each number of it finite."""
     config = from_tables(content["config"])
+    _check_finite(path, content["model"])
     head = load_head(content["head"]).to(device)
     offsets = _arrays(content.get("offsets", {}))
+    _check_finite(path, content.get("offsets", {}))
+    for frame in content["frames"]:
+        _check_finite(path, frame["parameters"])
+    for camera in content["cameras"].values():
+        _check_finite(path, {name: camera[name] for name in ("K", "cam_from_head")})
     model = GRMM(config.model, head, content["subjects"], content["expressions"]).to(device)
     try:
         model.load_state_dict(content["model"])
@@ -179,16 +194,20 @@ def read_content(path: Path) -> dict[str, Any]:
     Raises:
         FormatError: no such file, or not a checkpoint of this format.
     """
-    try:
-        content = torch.load(path, map_location="cpu", weights_only=True)
-    except FileNotFoundError as error:
-        raise FormatError(f"{path}: no such checkpoint; 'grmm train' writes one") from error
-    except (UnpicklingError, RuntimeError, EOFError) as error:
-        raise FormatError(f"{path}: not a checkpoint that 'grmm train' wrote") from error
+    if not Path(path).is_file():
+        raise FormatError(f"{path}: no such checkpoint; 'grmm train' writes one")
+    mend = "'grmm train' writes one"
+    content = read_weights(path, FormatError, str(path), "a checkpoint that it wrote", mend)
     found = content.get("format") if isinstance(content, dict) else None
     if found != FORMAT:
         raise FormatError(f"{path}: format is {found!r}, expected {FORMAT!r}")
     return content
+
+
+def _check_finite(path: Path, tensors: dict[str, Tensor]) -> None:
+    for name, tensor in tensors.items():
+        if not bool(torch.isfinite(tensor).all()):
+            raise FormatError(f"{path}: {name} holds NaN or Inf; use an earlier checkpoint")
 
 
 def _parameters(tracked: Tracked) -> dict[str, Tensor]:

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from pickle import UnpicklingError
 from unittest import mock
 
 import torch
@@ -19,7 +18,9 @@ from torch import Tensor, nn
 from torchmetrics.functional.image import lpips as torchmetrics_lpips
 from torchmetrics.image.fid import FrechetInceptionDistance
 
+from express50.arrays import DAMAGE
 from express50.errors import ConfigError
+from express50.weights import check_archive, read_weights
 from grmm.config import MetricsConfig
 
 SMALLEST_PX = 32  # five layers of AlexNet leave nothing of smaller images
@@ -136,9 +137,10 @@ def load_inception(path: Path) -> torch.jit.ScriptModule:
     if not path.is_file():
         raise ConfigError(f"metrics.inception {path}: no such file; leave it empty to do without")
     try:
+        check_archive(path)
         network = torch.jit.load(str(path), map_location="cpu").eval()
         found = network(torch.zeros(1, 3, 64, 64, dtype=torch.uint8), return_features=True)
-    except RuntimeError as error:
+    except (*DAMAGE, torch.jit.Error) as error:
         raise ConfigError(
             f"metrics.inception {path}: not FID's Inception as TorchScript, which is called "
             "net(uint8 images, return_features=True)"
@@ -152,13 +154,8 @@ def load_inception(path: Path) -> torch.jit.ScriptModule:
 
 def _read(path: Path, key: str) -> dict[str, Tensor]:
     """A state dict (weights only, nothing in it is executed)."""
-    try:
-        weights = torch.load(path, map_location="cpu", weights_only=True)
-    except FileNotFoundError as error:
-        message = f"metrics.{key} {path}: no such file; leave it empty to do without"
-        raise ConfigError(message) from error
-    except (UnpicklingError, RuntimeError, EOFError) as error:
-        raise ConfigError(f"metrics.{key} {path}: not a torch state dict") from error
+    mend = "leave it empty to do without"
+    weights = read_weights(path, ConfigError, f"metrics.{key} {path}", "a torch state dict", mend)
     if not isinstance(weights, dict):
         raise ConfigError(f"metrics.{key} {path}: holds a {type(weights).__name__}, not a dict")
     return weights

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from pickle import UnpicklingError
 
 import torch
 from torch import Tensor, nn
 
 from express50.errors import TrainError
+from express50.weights import read_weights
 
 # Simonyan and Zisserman 2014, configuration D, up to relu4_3; "M" halves the map.
 LAYERS: tuple[int | str, ...] = (64, 64, "M", 128, 128, "M", 256, 256, 256, "M", 512, 512, 512)
@@ -37,7 +37,11 @@ class VGGDistance(nn.Module):
                 layers.append(nn.MaxPool2d(2))
         self.features = nn.Sequential(*layers)
         wanted = self.features.state_dict()
-        missing = [name for name in wanted if f"features.{name}" not in weights]
+        missing = [
+            name
+            for name, tensor in wanted.items()
+            if getattr(weights.get(f"features.{name}"), "shape", None) != tensor.shape
+        ]
         if missing:
             raise TrainError(
                 f"the VGG16 weights lack features.{missing[0]}; expected the state dict of "
@@ -68,14 +72,8 @@ def load_vgg(path: Path) -> VGGDistance:
     Raises:
         TrainError: no such file, or not that state dict.
     """
-    try:
-        weights = torch.load(path, map_location="cpu", weights_only=True)
-    except FileNotFoundError as error:
-        raise TrainError(
-            f"loss.vgg16 {path}: no such file; leave it empty to do without"
-        ) from error
-    except (UnpicklingError, RuntimeError, EOFError) as error:
-        raise TrainError(f"loss.vgg16 {path}: not a torch state dict") from error
+    mend = "leave it empty to do without"
+    weights = read_weights(path, TrainError, f"loss.vgg16 {path}", "a torch state dict", mend)
     if not isinstance(weights, dict):
         raise TrainError(f"loss.vgg16 {path}: holds a {type(weights).__name__}, expected a dict")
     return VGGDistance(weights)

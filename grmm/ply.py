@@ -60,6 +60,8 @@ def read_ply(path: str | Path) -> GaussianCloud:
         FormatError: not such a file, a property is missing, it is cut short, or holds NaN or Inf.
     """
     path = Path(path)
+    if not path.is_file():
+        raise FormatError(f"{path}: no such file; expected a 3DGS .ply file")
     with path.open("rb") as stream:
         encoding, dtype, count = _read_header(path, stream)
         table = _read_table(path, stream, encoding, dtype, count)
@@ -242,7 +244,8 @@ def _columns(path: Path, table: np.ndarray, names: list[str]) -> np.ndarray:
     missing = [name for name in names if name not in (table.dtype.names or ())]
     if missing:
         raise FormatError(f"{path}: property {missing[0]!r} is missing; is this a 3DGS .ply file?")
-    columns = np.stack([table[name].astype(np.float32) for name in names], 1)
+    with np.errstate(over="ignore", invalid="ignore"):  # infinite then, and refused
+        columns = np.stack([table[name].astype(np.float32) for name in names], 1)
     if not np.isfinite(columns).all():
         raise FormatError(f"{path}: {', '.join(names)} hold values that are not finite")
     return columns

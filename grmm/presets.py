@@ -7,7 +7,6 @@ the defaults of :mod:`grmm.config`.
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -15,6 +14,7 @@ from typing import Any
 
 from express50.config import build_dataclass, config_values, nearest, parse_assignment
 from express50.errors import ConfigError
+from express50.reading import read_toml
 from grmm.config import (
     Config,
     DataConfig,
@@ -124,6 +124,8 @@ def resolve(
         tables[table] |= values
     for table, values in _read_toml(file).items():
         _known_table(table, f"{file}: table [{table}]")
+        if not isinstance(values, dict):
+            raise ConfigError(f"{file}: {table} is a value, expected a table [{table}]")
         tables[table] |= values
     for text in assignments:
         table, key, value = parse_assignment(text)
@@ -153,12 +155,9 @@ def as_tables(config: Config) -> dict[str, dict[str, Any]]:
 def _read_toml(file: Path | None) -> dict[str, dict[str, object]]:
     if file is None:
         return {}
-    try:
-        return tomllib.loads(file.read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
-        raise ConfigError(f"--config {file}: no such file") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ConfigError(f"--config {file}: not TOML: {error}") from error
+    if not file.exists():
+        raise ConfigError(f"--config {file}: no such file")
+    return read_toml(file, ConfigError)
 
 
 def _known_table(table: str, where: str) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import signal
 import sys
@@ -10,8 +11,9 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from express50.errors import ConfigError
+from express50.errors import ConfigError, FormatError, TrainError
 from express50.publish import write_bytes
+from express50.reading import parse_json, read_text
 
 
 def append_log(path: Path, iteration: int, seconds: float, terms: dict[str, float]) -> None:
@@ -54,8 +56,12 @@ def start_log(path: Path, iteration: int) -> None:
     """Keep the lines of the log up to an iteration: a resumed run repeats what came later."""
     if not path.exists():
         return
-    lines = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines() if line]
-    kept = [json.dumps(line) + "\n" for line in lines if line["iteration"] <= iteration]
+    kept = []
+    for line in read_text(path, TrainError).split("\n"):
+        with contextlib.suppress(FormatError):  # the torn end of a line that a kill cut short
+            row = parse_json(line, str(path), FormatError)
+            if isinstance(row, dict) and row.get("iteration", iteration + 1) <= iteration:
+                kept.append(json.dumps(row) + "\n")
     write_bytes(path, "".join(kept).encode())
 
 

@@ -35,7 +35,7 @@ class ShardSource:
             Key(subject=entry.subject, expression=entry.expression, camera=entry.camera)
             for entry in self.reader.entries
         ]
-        self.head = str(self.reader.meta(0)["head"])
+        self.head = str(self.reader.meta(0).get("head"))
         self._offsets: dict[str, np.ndarray] = {}
 
     def read(self, index: int) -> Sample:
@@ -68,7 +68,7 @@ class ShardSource:
         """Rows and columns of a packed sample that its camera saw, and the packed (H, W)."""
         meta = self.reader.meta(index)
         rows, columns = seen_window(meta, f"{self.reader.root}: {self.keys[index]}")
-        return rows, columns, (int(meta["height"]), int(meta["width"]))
+        return rows, columns, (int(meta["height"]), int(meta["width"]))  # checked just before
 
     def _tracked(self, meta: dict, subject: str, where: str) -> Tracked:
         tracked = _tracked(meta.get("track"), where)
@@ -139,13 +139,23 @@ def seen_window(meta: dict, where: str) -> tuple[slice, slice]:
     Raises:
         FormatError: the crop does not touch the footage.
     """
-    size = (int(meta["height"]), int(meta["width"]))
-    crop = meta.get("crop")
-    if not crop:
-        return slice(0, size[0]), slice(0, size[1])
+    try:
+        size = (int(meta["height"]), int(meta["width"]))
+        crop = meta.get("crop")
+        if not crop:
+            return slice(0, size[0]), slice(0, size[1])
+        return _seen_window(crop, meta["source_size"], size, where)
+    except (KeyError, TypeError, ValueError, ArithmeticError, AttributeError) as error:
+        words = f"{type(error).__name__}: {error}"
+        raise FormatError(f"{where}: malformed crop ({words}); rerun 'express50 pack'") from None
+
+
+def _seen_window(
+    crop: dict, source_size: list, size: tuple[int, int], where: str
+) -> tuple[slice, slice]:
     spans = []
     for start, source, length in zip(
-        (crop["y0"], crop["x0"]), reversed(meta["source_size"]), size, strict=True
+        (crop["y0"], crop["x0"]), reversed(source_size), size, strict=True
     ):
         scale = length / crop["side"]
         inner = (INSET_PX - start) * scale, (source - INSET_PX - start) * scale
@@ -172,7 +182,7 @@ def _matrix(table: dict, name: str, size: tuple[int, ...] | None, where: str) ->
         array = np.array(table[name], dtype=np.float64)
     except KeyError:
         raise FormatError(f"{where}: meta has no {name}; rerun 'express50 pack'") from None
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise FormatError(f"{where}: {name} is no array of numbers") from None
     if (array.ndim != 1) if size is None else (array.shape != size):
         raise FormatError(f"{where}: {name} has shape {array.shape}, expected {size or '(any,)'}")

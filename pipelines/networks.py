@@ -19,9 +19,11 @@ import cv2
 import numpy as np
 import torch
 
+from express50.arrays import DAMAGE
 from express50.errors import StageError
+from express50.weights import check_archive
 
-TORCH_ERRORS = (RuntimeError, torch.jit.Error)
+TORCH_ERRORS = (*DAMAGE, torch.jit.Error)
 
 Run = Callable[[Sequence[np.ndarray]], list[np.ndarray]]
 """Batches (1, 3, H, W) float32 in, the network's outputs in order."""
@@ -132,9 +134,10 @@ def _torchscript(path: Path, role: Role) -> Network:
         with warnings.catch_warnings():
             # Of its deprecation; the weights are published in this format.
             warnings.simplefilter("ignore", DeprecationWarning)
+            check_archive(path)
             module = torch.jit.load(str(path), map_location=device).eval()
         arguments = module.forward.schema.arguments[1:]
-    except (*TORCH_ERRORS, AttributeError) as error:
+    except TORCH_ERRORS as error:
         raise StageError(
             f"{role.setting} {path}: not TorchScript with a forward ({_reason(error)});"
             " expected a file of torch.jit.save, or .onnx"

@@ -22,10 +22,11 @@ from express50.audit.sources import (
 from express50.digests import file_sha256, files_of
 from express50.errors import FormatError
 from express50.layout import Dataset
-from express50.ledger import Ledger, Made, mark_file
+from express50.ledger import Ledger
 from express50.locks import hold_stages, is_running
 from express50.names import files_that, names_any_of, says
 from express50.publish import clean_leftovers, set_aside
+from express50.receipts import Made, mark_file
 from express50.stage import Stage
 from express50.withdraw import withdrawn
 

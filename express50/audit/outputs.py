@@ -9,7 +9,7 @@ from pathlib import Path
 from express50.digests import file_sha256, files_of
 from express50.errors import FormatError
 from express50.layout import Dataset
-from express50.ledger import FileMark, Made, Receipt
+from express50.receipts import FileMark, Made, Receipt
 from express50.shards import read_entries
 from express50.shards_write import verify
 

@@ -20,6 +20,7 @@ from express50.captures.timeline import Moment, common_timeline
 from express50.captures.wishes import Wishes, check_wishes, identifier
 from express50.errors import CalibrationError, CaptureError
 from express50.media import WITHIN, open_zip
+from express50.reading import read_text
 from express50.rigs.build import camera_from_K, checked, in_metres, read_table
 
 CAMERAS = Path("decoder/camera_calibration.json")
@@ -112,7 +113,8 @@ def read_calibration(path: Path) -> dict[str, Camera]:
                 f"{where}: distortionModel {model}, expected RadialAndTangential"
             )
         K, T = _array(where, row["K"], (3, 3)).T, _array(where, row["T"], (4, 4)).T
-        dist = _array(where, row["distortion"], (len(row["distortion"]),))
+        given = row["distortion"]
+        dist = _array(where, given, (len(given) if isinstance(given, list) else 0,))
         pose = np.vstack([T[:3], [0, 0, 0, 1]])
         found[name] = camera_from_K(name, K_from_opencv(K), dist, SIZE, pose)
     return checked(in_metres(found, 1e-3), path)
@@ -121,7 +123,7 @@ def read_calibration(path: Path) -> dict[str, Camera]:
 def _array(where: str, value: object, shape: tuple[int, ...]) -> np.ndarray:
     try:
         array = np.asarray(value, dtype=np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         array = np.zeros(0)
     if array.shape != shape or not np.isfinite(array).all() or array.size > 16:
         raise CalibrationError(f"{where}: array of shape {array.shape}, expected {shape}, finite")
@@ -135,9 +137,9 @@ def read_frame_list(path: Path) -> list[Moment]:
         CaptureError: a column is missing, or a frame is no number.
     """
     try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            rows = [(row["seg_id"], int(row["frame_id"])) for row in csv.DictReader(file)]
-    except (OSError, KeyError, TypeError, ValueError, csv.Error) as error:
+        table = csv.DictReader(read_text(path, CaptureError).splitlines())
+        rows = [(row["seg_id"].strip(), int(row["frame_id"][:9])) for row in table]
+    except (AttributeError, KeyError, TypeError, ValueError, csv.Error) as error:
         raise CaptureError(
             f"{path}: no list of frames ({type(error).__name__}: {error}); expected columns seg_id "
             "and frame_id"

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import OpenImageIO as oiio
-
 from express50.capture import VIDEO_SUFFIXES, RawCamera, RawCapture, image_names
 from express50.captures.wishes import Wishes, check_wishes, identifier
-from express50.errors import CaptureError
+from express50.errors import CaptureError, FormatError
+from express50.exif import read_exif
 from express50.video import video_fps
 
 FPS = 24.0  # of photographs it means nothing
@@ -28,6 +27,8 @@ def fits_photos(path: Path) -> bool:
 def read_photos(path: Path, wishes: Wishes) -> RawCapture:
     """Each photograph as a camera of one moment; the cameras are solved from the footage.
 
+    A photograph that lies on its side by its EXIF is read upright.
+
     Raises:
         CaptureError: two names become one camera id, or no photograph can be used.
     """
@@ -44,11 +45,14 @@ def read_photos(path: Path, wishes: Wishes) -> RawCapture:
                 f"{path / name}: becomes camera {camera}, as {cameras[camera].names[0]} does; "
                 "rename one"
             )
-        problem = _sideways(path / name)
-        if problem:
-            dropped[camera] = problem
+        try:
+            orientation, _ = read_exif(path / name)
+        except FormatError as error:
+            dropped[camera] = str(error)
             continue
-        cameras[camera] = RawCamera(id=camera, kind="frames", path=path, names=(name,), counts=(1,))
+        cameras[camera] = RawCamera(
+            id=camera, kind="frames", path=path, names=(name,), counts=(1,), orientation=orientation
+        )
     if not cameras:
         reasons = "; ".join(f"{k}: {v}" for k, v in dropped.items())
         raise CaptureError(f"{path}: no photograph can be used: {reasons or 'none was asked for'}")
@@ -56,19 +60,6 @@ def read_photos(path: Path, wishes: Wishes) -> RawCapture:
         root=path, subject=subject_of(path), fps=FPS, meta={}, cameras=cameras, dropped=dropped,
         layout="photos", clips=(wishes.expression("photo"),),
     )  # fmt: skip
-
-
-def _sideways(path: Path) -> str:
-    """Why a photograph's pixels cannot be taken as they lie; empty where they can."""
-    image = oiio.ImageInput.open(str(path))
-    if image is None:
-        oiio.geterror()
-        return "cannot be read as an image; copy it again"
-    turned = int(image.spec().getattribute("Orientation") or 1) != 1
-    image.close()
-    if turned:
-        return "EXIF says that it lies on its side; store it upright ('mogrify -auto-orient')"
-    return ""
 
 
 def fits_video(path: Path) -> bool:

@@ -18,11 +18,11 @@ from express50.capture import RawCamera, RawCapture
 from express50.captures.timeline import Moment, common_timeline
 from express50.captures.wishes import Wishes, check_wishes, identifier
 from express50.errors import CalibrationError, CaptureError
+from express50.reading import NAME, read_text
 from express50.rigs.build import camera_from_K, checked, in_metres
 
 SIZE = (1334, 2048)
 FPS = 30.0
-SAFE = re.compile(r"[A-Za-z0-9][\w.+-]*")
 
 
 def fits(path: Path) -> bool:
@@ -99,14 +99,10 @@ def read_krt(path: Path) -> dict[str, Camera]:
     Raises:
         CalibrationError: a camera's lines are not what the layout says.
     """
-    try:
-        text = path.read_text(encoding="utf-8")
-    except UnicodeDecodeError as error:
-        raise CalibrationError(f"{path}: not text ({error}); copy it again") from None
-    found = {}
+    text, found = read_text(path, CalibrationError), {}
     for block in re.split(r"\n\s*\n", text.strip()):
-        name, *rows = [line.strip() for line in block.splitlines()]
-        if not SAFE.fullmatch(name):
+        name, *rows = [line.strip() for line in block.splitlines()] or [""]
+        if not NAME.fullmatch(name):
             raise CalibrationError(f"{path}: camera {name[:40]!r}, expected such as 400002")
         try:
             table = [np.array(row.split(), dtype=np.float64) for row in rows]
@@ -132,16 +128,13 @@ def read_frame_list(path: Path) -> list[Moment]:
     Raises:
         CaptureError: a line is something else.
     """
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise CaptureError(f"{path}: cannot be read ({error}); copy it again") from error
+    lines = read_text(path, CaptureError).split("\n")
     found = []
     for number, line in enumerate(lines, 1):
         words = line.split()
         if not words:
             continue
-        if len(words) != 2 or not SAFE.fullmatch(words[0]) or not words[1].isdigit():
+        if len(words) != 2 or not NAME.fullmatch(words[0]) or not words[1].isdecimal():
             raise CaptureError(f"{path}:{number}: {line[:60]!r}, expected a segment and a frame")
         found.append((words[0], int(words[1][:9])))
     return found

@@ -112,7 +112,7 @@ def _assemble(
         )
     wanted = {ids[n]: table for n, table in pictures.items() if table and wishes.wants_camera(n)}
     line = common_timeline(wanted, [MOMENT])
-    if not line.names:
+    if not line.names or not line.moments:
         raise CaptureError(f"{root}: no picture of {len(cameras)} cameras is there; copy them")
     without = {ids[n]: "its picture is not there" for n in cameras if not pictures.get(n)}
     given = {ids[n]: replace(c, id=ids[n]) for n, c in cameras.items() if ids[n] in line.names}

@@ -21,7 +21,7 @@ from express50.capture import RawCamera, RawCapture
 from express50.captures.timeline import Moment, common_timeline
 from express50.captures.wishes import Wishes, check_wishes
 from express50.errors import CaptureError
-from express50.media import WITHIN, child, open_hdf5
+from express50.media import WITHIN, attribute, child, members, open_hdf5
 from express50.rigs.releases import read_renderme
 
 FPS = 30.0
@@ -186,17 +186,19 @@ def _frames(performance: Performance, wishes: Wishes) -> tuple[dict[str, list[in
     if not isinstance(group, h5py.Group):
         raise CaptureError(f"{performance.raw}: has no Camera group; copy the file again")
     found: dict[str, list[int]] = {}
-    for name in list(group):
-        if not name.isdigit() or not wishes.wants_camera(f"cam{name}"):
+    where = str(performance.raw)
+    for name in members(group, where):
+        if not name.isdecimal() or not wishes.wants_camera(f"cam{name}"):
             continue
         colour = child(file, f"Camera/{name}/color", str(performance.raw))
-        keys = list(colour) if isinstance(colour, h5py.Group) else []
+        keys = members(colour, where) if isinstance(colour, h5py.Group) else []
         if keys:  # some have sound only
-            found[f"cam{name}"] = sorted(int(key) for key in keys if key.isdigit() and len(key) < 9)
+            numbers = [key for key in keys if key.isdecimal() and len(key) < 9]
+            found[f"cam{name}"] = sorted(map(int, numbers))
     have = {key for keys in found.values() for key in keys}
     if not have:
         raise CaptureError(f"{performance.raw}: holds no picture; copy the file again")
-    count = _attribute(group, "num_frame", len(have))
+    count = _count(group, len(have), where)
     if performance.part.startswith("e") and max(have) != count - 1 and len(have) != count:
         raise CaptureError(
             f"{performance.raw}: has {len(have)} frames up to number {max(have)}, num_frame is "
@@ -205,8 +207,8 @@ def _frames(performance: Performance, wishes: Wishes) -> tuple[dict[str, list[in
     return found, count
 
 
-def _attribute(group: h5py.Group, name: str, default: int) -> int:
-    value = np.ravel(group.attrs.get(name, default))
+def _count(group: h5py.Group, default: int, where: str) -> int:
+    value = attribute(group, "num_frame", default, where)
     return int(value[0]) if value.size == 1 and value.dtype.kind in "ui" else default
 
 
@@ -231,13 +233,13 @@ def _told(
 
 def _person(performance: Performance) -> dict[str, object]:
     """Age and gender, which dataset cards count; what else the files say of a body stays there."""
-    attributes = open_hdf5(performance.raw).attrs
-    age, gender = np.ravel(attributes.get("age", ())), attributes.get("gender")
+    file, where = open_hdf5(performance.raw), str(performance.raw)
+    age, gender = attribute(file, "age", (), where), attribute(file, "gender", "", where).tolist()
     told: dict[str, object] = {}
     if age.size == 1 and age.dtype.kind in "ui" and 0 < age[0] < 130:
         told["age"] = int(age[0])
-    if isinstance(gender, str) and gender.isalpha() and len(gender) < 20:
-        told["gender"] = gender
+    if len(gender) == 1 and isinstance(gender[0], str) and gender[0].isalpha():
+        told["gender"] = gender[0][:20]
     return told
 
 

@@ -18,7 +18,8 @@ from express50.errors import HeadModelError
 from express50.head.ict import read_obj
 from express50.head.model import PARENTS, REGIONS, HeadModel, check_head
 from express50.head.mouth import add_mouth, is_flame_topology
-from express50.head.safe_pickle import read_object_array, read_pickle, to_array
+from express50.head.pickled_arrays import to_array
+from express50.head.safe_pickle import read_object_array, read_pickle
 
 EMBEDDINGS = (
     "landmark_embedding.npy",
@@ -105,6 +106,8 @@ def read_flame_arrays(path: Path) -> dict[str, np.ndarray]:
         raise HeadModelError(f"{path}: lacks {', '.join(missing)}; expected a FLAME model pickle")
     arrays = {key: to_array(content[key], key, str(path)) for key in _REQUIRED}
     vertices = arrays["v_template"].shape[0] if arrays["v_template"].ndim == 2 else -1
+    if arrays["f"].ndim != 2 or arrays["shapedirs"].ndim != 3 or vertices < 1:
+        raise HeadModelError(f"{path}: v_template, f or shapedirs has no shape of FLAME's")
     expected = {
         "v_template": (vertices, 3),
         "f": (arrays["f"].shape[0], 3),
@@ -117,6 +120,8 @@ def read_flame_arrays(path: Path) -> dict[str, np.ndarray]:
     for key, shape in expected.items():
         if arrays[key].shape != shape:
             raise HeadModelError(f"{path}: {key} has shape {arrays[key].shape}, expected {shape}")
+    if not len(arrays["f"]) or arrays["f"].min() < 0 or arrays["f"].max() >= vertices:
+        raise HeadModelError(f"{path}: f names vertices that the model does not have")
     parents = tuple(int(parent) for parent in arrays["kintree_table"][0, 1:])
     if parents != PARENTS[1:]:
         raise HeadModelError(f"{path}: joint parents {parents}, expected {PARENTS[1:]}")
@@ -144,6 +149,10 @@ def read_embedding(
         ids = get("static_lmk_faces_idx", "lmk_face_idx")
         bary = get("static_lmk_bary_coords", "lmk_b_coords")
     turning, turning_bary = get("dynamic_lmk_faces_idx"), get("dynamic_lmk_bary_coords")
+    if turning is not None and (turning.ndim != 2 or turning.shape[1] != 17 or not len(turning)):
+        raise HeadModelError(f"{path}: the table of contour points has shape {turning.shape}")
+    if turning_bary is not None and (turning is None or turning_bary.shape != (*turning.shape, 3)):
+        raise HeadModelError(f"{path}: contour points lack their barycentric coordinates")
     if ids is None or bary is None or ids.size * 3 != bary.size:
         raise HeadModelError(f"{path}: no landmark face ids with barycentric coordinates")
     ids, bary = ids.reshape(-1).astype(np.int64), bary.reshape(-1, 3).astype(np.float64)
@@ -151,13 +160,13 @@ def read_embedding(
         # Row 0 of the table is the frontal view.
         ids = np.concatenate([turning[0].astype(np.int64), ids[:51]])
         bary = np.concatenate([turning_bary[0].reshape(-1, 3), bary[:51]])
-    if ids.size < 68 or ids.min() < 0 or ids.max() >= len(faces):
+    if ids.size < 68 or bary.shape != (ids.size, 3) or ids.min() < 0 or ids.max() >= len(faces):
         raise HeadModelError(
-            f"{path}: {ids.size} landmarks on faces {ids.min()}..{ids.max()}, expected 68 on faces "
-            f"0..{len(faces) - 1}"
+            f"{path}: {ids.size} landmarks on faces that are not all the model's; expected 68 on "
+            f"faces 0..{len(faces) - 1}"
         )
     contour = None
-    if turning is not None and turning.ndim == 2 and turning.shape[1] == 17:
+    if turning is not None:
         if turning.min() < 0 or turning.max() >= len(faces):
             raise HeadModelError(f"{path}: contour points on faces the model does not have")
         columns = turning.astype(np.int64).T

@@ -13,9 +13,11 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from express50.arrays import read_arrays
 from express50.errors import HeadModelError
 from express50.head.ict_regions import ict_regions
 from express50.head.model import PARENTS, HeadModel, check_head
+from express50.reading import read_text
 
 VERTEX_COUNT = 26719
 METRES_PER_UNIT = 0.01
@@ -61,23 +63,19 @@ def load_ict(path: str | Path) -> HeadModel:
 
 def read_ict_npz(path: Path) -> IctArrays:
     """Read the arrays from one .npz (no pickled objects are accepted)."""
+    data = read_arrays(path, HeadModelError, "an ICT .npz", _NPZ_KEYS)
     try:
-        with np.load(path, allow_pickle=False) as data:
-            missing = [key for key in _NPZ_KEYS if key not in data.files]
-            if missing:
-                raise HeadModelError(f"{path}: ICT .npz lacks {', '.join(missing)}")
-            names = [str(name) for name in data["materials"]]
-            return IctArrays(
-                template=data["v_template"].astype(np.float64),
-                shape_dirs=data["shapedirs"].astype(np.float32),
-                expression_dirs=data["exprdirs"].astype(np.float32),
-                expression_names=tuple(str(name) for name in data["expression_names"]),
-                faces=data["faces"].astype(np.int64),
-                uv=data["uv"].astype(np.float64),
-                uv_faces=data["uv_faces"].astype(np.int64),
-                face_material=np.array(names)[data["face_material"]],
-            )
-    except (OSError, ValueError, IndexError) as error:
+        return IctArrays(
+            template=data["v_template"].astype(np.float64),
+            shape_dirs=data["shapedirs"].astype(np.float32),
+            expression_dirs=data["exprdirs"].astype(np.float32),
+            expression_names=tuple(str(name) for name in data["expression_names"]),
+            faces=data["faces"].astype(np.int64),
+            uv=data["uv"].astype(np.float64),
+            uv_faces=data["uv_faces"].astype(np.int64),
+            face_material=data["materials"].astype(str)[data["face_material"]],
+        )
+    except (ValueError, TypeError, IndexError) as error:
         raise HeadModelError(f"{path}: not a readable ICT .npz: {error}") from error
 
 
@@ -143,10 +141,35 @@ def read_obj(
         faces = index[:, :, 0].astype(np.int64) - 1
         uv_faces = np.where(index[:, :, 1] == "", "1", index[:, :, 1]).astype(np.int64) - 1
         points = np.array(vertices, dtype=np.float64).reshape(-1, 3)
-        coordinates = np.array(uv or [["0", "0"]], dtype=np.float64)
-    except (OSError, ValueError, IndexError) as error:
+        coordinates = np.array(uv or [["0", "0"]], dtype=np.float64).reshape(-1, 2)
+        _check_mesh(points, faces)
+        _check_mesh(coordinates, uv_faces)
+    except (OSError, ValueError, IndexError, OverflowError) as error:
         raise HeadModelError(f"{path}: not a readable OBJ file: {error}") from error
     return points, coordinates, faces, uv_faces, np.array(materials)
+
+
+def _check_mesh(points: np.ndarray, faces: np.ndarray) -> None:
+    """Raise ValueError where a number is not finite or a face names a point that is not there."""
+    if not np.isfinite(points).all():
+        raise ValueError("a coordinate is NaN or infinite")
+    if faces.ndim != 2 or faces.shape[1] != 3 or not len(faces):
+        raise ValueError(f"faces have shape {faces.shape}, expected (F, 3)")
+    if faces.min() < 0 or faces.max() >= len(points):
+        raise ValueError(f"faces name points {faces.min()} to {faces.max()} of {len(points)}")
+
+
+def _check_arrays(arrays: IctArrays) -> None:
+    """Raise ValueError where arrays do not fit each other."""
+    _check_mesh(arrays.template, arrays.faces)
+    _check_mesh(arrays.uv, arrays.uv_faces)
+    for name, dirs in (("shapes", arrays.shape_dirs), ("expressions", arrays.expression_dirs)):
+        if dirs.ndim != 3 or dirs.shape[:2] != (VERTEX_COUNT, 3) or not np.isfinite(dirs).all():
+            raise ValueError(f"{name}: {dirs.shape}, expected finite ({VERTEX_COUNT}, 3, N)")
+    counts = (len(arrays.expression_names), len(arrays.uv_faces), len(arrays.face_material))
+    faces = len(arrays.faces)
+    if counts != (arrays.expression_dirs.shape[2], faces, faces) or arrays.uv.shape[1] != 2:
+        raise ValueError("expression names, texture faces or materials are of other counts")
 
 
 def build_ict_head(arrays: IctArrays, where: str = "ICT") -> HeadModel:
@@ -156,6 +179,10 @@ def build_ict_head(arrays: IctArrays, where: str = "ICT") -> HeadModel:
             f"{where}: template has shape {arrays.template.shape}, expected ({VERTEX_COUNT}, 3), "
             "the topology of ICT-FaceKit's light model"
         )
+    try:
+        _check_arrays(arrays)
+    except ValueError as error:
+        raise HeadModelError(f"{where}: {error}; copy it again") from None
     if "jawOpen" not in arrays.expression_names:
         raise HeadModelError(f"{where}: no jawOpen expression; the jaw joint is derived from it")
     template = arrays.template * METRES_PER_UNIT
@@ -194,7 +221,7 @@ def _offsets(files: list[Path], template: np.ndarray) -> np.ndarray:
     """Vertex offsets (V, 3, files) of OBJ files from the template."""
     columns = []
     for file in files:
-        lines = file.read_text(encoding="utf-8").splitlines()
+        lines = read_text(file, HeadModelError).splitlines()
         try:
             rows = np.array([line.split()[1:4] for line in lines if line.startswith("v ")], float)
         except ValueError as error:

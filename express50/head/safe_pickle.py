@@ -10,17 +10,22 @@ from __future__ import annotations
 
 import codecs
 import io
+import math
 import pickle
+import pickletools
 from collections import OrderedDict
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import Any, BinaryIO, cast
 
 import numpy as np
 
+from express50.arrays import DAMAGE, read_header, read_npy
 from express50.errors import HeadModelError
 
 PICKLE_LIMIT_BYTES = 2 << 30
+# Of an array made from a list, a sparse matrix or a view; FLAME's largest has six million.
+VALUES_LIMIT = 1 << 25
 
 
 class Record:
@@ -64,6 +69,10 @@ class StorageType(Record):
     """Names a torch storage type; never instantiated by what it names."""
 
 
+class ArrayType(Record):
+    """Names numpy.ndarray; itself, called by a pickle, would make arrays of any size."""
+
+
 def _new_record(kind: object = Record, *_: object) -> Record:
     """What copy_reg._reconstructor does, for records alone."""
     if isinstance(kind, type) and issubclass(kind, Record):
@@ -80,7 +89,7 @@ def _encode(text: object, encoding: object = "latin1") -> bytes:
 
 def _reconstruct_array(kind: object, shape: object, code: object) -> np.ndarray:
     """What numpy's _reconstruct does, for plain arrays alone."""
-    if kind is not np.ndarray:
+    if kind is not ArrayType:
         raise pickle.UnpicklingError("numpy array subclass")
     return np.ndarray((0,), np.dtype("b"))
 
@@ -111,6 +120,8 @@ def _tensor(
     last = offset + sum((n - 1) * step for n, step in zip(size, stride, strict=True))
     if 0 not in size and last >= storage.size:
         raise pickle.UnpicklingError("tensor reaches beyond its storage")
+    if math.prod(size) > VALUES_LIMIT:  # a stride of 0 repeats one number for ever
+        raise pickle.UnpicklingError(f"tensor of {math.prod(size)} numbers, over {VALUES_LIMIT}")
     steps = [step * storage.itemsize for step in stride]
     return np.lib.stride_tricks.as_strided(storage[offset:], size, steps).copy()
 
@@ -127,7 +138,7 @@ _ALLOWED = MappingProxyType(
     {
         **{(module, "_reconstruct"): _reconstruct_array for module in _NUMPY},
         **{(module, "scalar"): _scalar for module in _NUMPY},
-        ("numpy", "ndarray"): np.ndarray,
+        ("numpy", "ndarray"): ArrayType,
         ("numpy", "dtype"): _dtype,
         ("_codecs", "encode"): _encode,
         ("copy_reg", "_reconstructor"): _new_record,
@@ -172,8 +183,10 @@ class SafeUnpickler(pickle.Unpickler):
         storages = getattr(self, "storages", None)
         if storages is None or not isinstance(pid, tuple) or len(pid) < 5 or pid[0] != "storage":
             raise pickle.UnpicklingError("a persistent id outside a torch storage")
-        dtype = _STORAGE_DTYPES[pid[1].__name__]
-        return storages.setdefault(str(pid[2]), np.zeros(int(pid[4]), dtype))
+        dtype, count = _STORAGE_DTYPES[pid[1].__name__], int(pid[4])
+        if not 0 <= count <= self.longest:  # type: ignore[attr-defined]
+            raise pickle.UnpicklingError(f"a torch storage of {count} numbers that are not there")
+        return storages.setdefault(str(pid[2]), np.zeros(count, dtype))
 
 
 def _read_torch_storage(data: bytes) -> np.ndarray:
@@ -184,11 +197,11 @@ def _read_torch_storage(data: bytes) -> np.ndarray:
     """
     stream = io.BytesIO(data)
     for _ in range(3):
-        SafeUnpickler(stream).load()
-    reader = SafeUnpickler(stream)
-    reader.storages = {}  # type: ignore[attr-defined]
+        _load(stream)
+    reader = _checked_unpickler(stream)
+    reader.storages, reader.longest = {}, len(data)  # type: ignore[attr-defined]
     storage = reader.load()
-    keys = SafeUnpickler(stream).load()
+    keys = _load(stream)
     if not isinstance(keys, list) or not isinstance(storage, np.ndarray) or len(keys) != 1:
         raise pickle.UnpicklingError("a torch storage with an unknown layout")
     count = int(np.frombuffer(stream.read(8), "<i8", count=1)[0])
@@ -224,17 +237,9 @@ def read_object_array(path: Path) -> Any:  # noqa: ANN401 (whatever the file hol
     """
     try:
         with path.open("rb") as file:
-            version = np.lib.format.read_magic(file)
-            reader = {
-                (1, 0): np.lib.format.read_array_header_1_0,
-                (2, 0): np.lib.format.read_array_header_2_0,
-            }.get(version)
-            if reader is None:
-                raise HeadModelError(f"{path}: .npy version {version}, expected (1, 0) or (2, 0)")
-            shape, _, dtype = reader(file)
+            shape, dtype = read_header(file)
             if not dtype.hasobject:
-                file.seek(0)
-                return np.load(file, allow_pickle=False)
+                return read_npy(path, HeadModelError, "an array")
             content = _load(file)
     except OSError as error:
         raise HeadModelError(f"{path}: cannot be read: {error}") from error
@@ -244,57 +249,47 @@ def read_object_array(path: Path) -> Any:  # noqa: ANN401 (whatever the file hol
 
 
 # What a damaged pickle makes the standard unpickler and the stand-ins above raise.
-_DAMAGE = (
-    pickle.UnpicklingError, EOFError, ValueError, TypeError, KeyError, IndexError, AttributeError,
-    UnicodeError, OverflowError, MemoryError, ImportError,
-)  # fmt: skip
+_DAMAGE = (*DAMAGE, pickle.UnpicklingError, ImportError, AssertionError)
 
 
-def _load(file: io.BufferedReader) -> Any:  # noqa: ANN401 (whatever the file holds)
-    return SafeUnpickler(file, encoding="latin1").load()
+def _load(file: BinaryIO) -> Any:  # noqa: ANN401 (whatever the file holds)
+    return _checked_unpickler(file).load()
+
+
+def _checked_unpickler(file: BinaryIO) -> SafeUnpickler:
+    """An unpickler of what comes next in a file, after a look at its opcodes.
+
+    Python's asks for as much memory as a length in the file says, and for a table as long as the
+    largest number under which something is memorised, before it sees that nothing is there.
+    """
+    start, end = file.tell(), file.seek(0, io.SEEK_END)
+    file.seek(start)
+    opcodes = pickletools.genops(cast(BinaryIO, _Bounded(file, end)))
+    for count, (opcode, argument, _) in enumerate(opcodes, 1):
+        number = argument if isinstance(argument, int) else 0
+        if opcode.name in ("PUT", "BINPUT", "LONG_BINPUT") and not 0 <= number <= 16 * count:
+            raise pickle.UnpicklingError(f"memorises under {number} after {count} steps")
+        if opcode.name == "FRAME" and not 0 <= number <= end:
+            raise pickle.UnpicklingError(f"a frame of {number} bytes that are not there")
+        if opcode.name == "LONG4" and number.bit_length() > 1 << 16:
+            raise pickle.UnpicklingError("a whole number of thousands of digits")
+    file.seek(start)
+    return SafeUnpickler(file, encoding="latin1")
+
+
+class _Bounded:
+    """A file for `pickletools` that refuses to read past its end."""
+
+    def __init__(self, file: BinaryIO, end: int) -> None:
+        self._file, self._end = file, end
+        self.readline, self.tell = file.readline, file.tell
+
+    def read(self, size: int) -> bytes:
+        """So many bytes, all of them there."""
+        if not 0 <= size <= self._end - self._file.tell():
+            raise pickle.UnpicklingError(f"{size} bytes that are not there")
+        return self._file.read(size)
 
 
 def _one_line(error: BaseException) -> str:
     return " ".join(str(error).split()) or type(error).__name__
-
-
-def to_array(value: object, name: str, where: str) -> np.ndarray:
-    """A dense numeric array of what a pickle held: array, chumpy, sparse matrix or list."""
-    if isinstance(value, ChumpyArray):
-        value = next((value.state[key] for key in ("x", "a", "v") if key in value.state), None)
-        return to_array(value, name, where)
-    if isinstance(value, SparseMatrix):
-        return _densify(value, name, where)
-    try:
-        array = np.asarray(value)
-    except ValueError as error:
-        raise HeadModelError(f"{where}: {name} is not an array: {_one_line(error)}") from error
-    if array.dtype.kind not in "fiub":
-        raise HeadModelError(f"{where}: {name} holds {array.dtype}, expected numbers")
-    return array
-
-
-def _densify(matrix: SparseMatrix, name: str, where: str) -> np.ndarray:
-    """Dense (rows, columns) of a compressed sparse matrix, bounds checked."""
-    state = matrix.state
-    shape = state.get("_shape", state.get("shape"))
-    if not isinstance(shape, tuple) or any(
-        key not in state for key in ("data", "indices", "indptr")
-    ):
-        raise HeadModelError(f"{where}: {name} is a sparse matrix without its parts")
-    data, indices, pointers = (np.asarray(state[key]) for key in ("data", "indices", "indptr"))
-    rows, columns = (int(n) for n in shape)
-    major = columns if isinstance(matrix, CscMatrix) else rows
-    minor = rows if isinstance(matrix, CscMatrix) else columns
-    if rows * columns > 1 << 28 or pointers.shape != (major + 1,) or (np.diff(pointers) < 0).any():
-        raise HeadModelError(f"{where}: {name} is a damaged sparse matrix of shape {shape}")
-    owner = np.repeat(np.arange(major), np.diff(pointers))
-    if (
-        owner.size != data.size
-        or indices.shape != data.shape
-        or (data.size and not 0 <= indices.min() <= indices.max() < minor)
-    ):
-        raise HeadModelError(f"{where}: {name} is a damaged sparse matrix of shape {shape}")
-    dense = np.zeros((major, minor))
-    np.add.at(dense, (owner, indices), data)
-    return dense.T if isinstance(matrix, CscMatrix) else dense

@@ -15,8 +15,10 @@ import numpy as np
 import torch
 
 from express50.adapters import affine_to_opencv, cell_to_corner
+from express50.arrays import DAMAGE
 from express50.errors import ConfigError
 from express50.landmarks.detector import Detection
+from express50.weights import check_archive
 
 CROP, HEAT, POINTS = 256, 64, 68
 # A crop spans 200 / 195 times the sum of the sides of the face box that FAN was trained with, whose
@@ -33,10 +35,11 @@ def load_fan(path: Path) -> torch.jit.ScriptModule:
     """
     wanted = f"expected FAN's TorchScript weights, (1, 3, {CROP}, {CROP}) to 68 heat maps"
     try:
+        check_archive(path)
         fan = torch.jit.load(str(path), map_location="cpu").eval()
         with torch.inference_mode():
             output = _heat(fan, torch.zeros(1, 3, CROP, CROP))
-    except (RuntimeError, ValueError, OSError) as error:
+    except (*DAMAGE, torch.jit.Error) as error:
         first = str(error).strip().splitlines()[0] if str(error).strip() else "no reason given"
         raise ConfigError(f"landmarks: {path} cannot be used ({first}); {wanted}") from error
     if tuple(output.shape) != (1, POINTS, HEAT, HEAT):

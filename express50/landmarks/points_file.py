@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
-from zipfile import BadZipFile
 
 import numpy as np
 
+from express50.arrays import read_arrays
 from express50.cameras import Camera, normalised
 from express50.errors import FormatError
+from express50.reading import read_json
 
 SCHEMA = "express50.landmarks/1"
+NAMES = ("schema", "cameras", "frames", "points")
 POINTS, IRISES = 68, 2
 # Points may lie this share of the image outside of it: a chin below the frame is still a chin.
 OUTSIDE = 0.5
@@ -37,7 +38,7 @@ def read_points(path: Path, cameras: Mapping[str, Camera]) -> Table:
     path = Path(path)
     try:
         raw = _read_npz(path) if path.suffix.lower() == ".npz" else _read_json(path)
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, BadZipFile) as error:
+    except (ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
         raise FormatError(
             f"{path}: no file of landmarks ({type(error).__name__}: {error}); expected the layout "
             "of docs/FORMAT.md"
@@ -56,24 +57,24 @@ def read_points(path: Path, cameras: Mapping[str, Camera]) -> Table:
 
 
 def _read_npz(path: Path) -> Table:
-    with np.load(path, allow_pickle=False) as data:
-        if str(data["schema"]) != SCHEMA:
-            raise ValueError(f"schema is {data['schema']}, expected {SCHEMA}")
-        cameras, frames = [str(name) for name in data["cameras"]], data["frames"].tolist()
-        points = np.asarray(data["points"], dtype=np.float64)
-        shape = (len(cameras), len(frames), points.shape[2] if points.ndim == 4 else POINTS, 2)
-        if points.shape != shape:
-            raise ValueError(f"points have shape {points.shape}, expected {shape}")
-        sure = np.isfinite(points).all(-1).astype(np.float64)
-        confidence = np.asarray(data["confidence"]) if "confidence" in data else sure
-        if confidence.shape != shape[:3]:
-            raise ValueError(f"confidence has shape {confidence.shape}, expected {shape[:3]}")
+    data = read_arrays(path, FormatError, "a file of landmarks", NAMES)
+    if str(data["schema"]) != SCHEMA:
+        raise ValueError(f"schema is {data['schema']}, expected {SCHEMA}")
+    cameras, frames = [str(name) for name in data["cameras"]], data["frames"].tolist()
+    points = np.asarray(data["points"], dtype=np.float64)
+    shape = (len(cameras), len(frames), points.shape[2] if points.ndim == 4 else POINTS, 2)
+    if points.shape != shape:
+        raise ValueError(f"points have shape {points.shape}, expected {shape}")
+    sure = np.isfinite(points).all(-1).astype(np.float64)
+    confidence = np.asarray(data.get("confidence", sure), dtype=np.float64)
+    if confidence.shape != shape[:3]:
+        raise ValueError(f"confidence has shape {confidence.shape}, expected {shape[:3]}")
     rows = np.concatenate([points, np.asarray(confidence)[..., None]], axis=-1)
     return {(c, int(f)): rows[i, j] for i, c in enumerate(cameras) for j, f in enumerate(frames)}
 
 
 def _read_json(path: Path) -> Table:
-    content = json.loads(path.read_text(encoding="utf-8"))
+    content = read_json(path, FormatError)
     if content.get("schema") != SCHEMA:
         raise ValueError(f"schema is {content.get('schema')!r}, expected {SCHEMA!r}")
     table: Table = {}

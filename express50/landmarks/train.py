@@ -17,6 +17,7 @@ import numpy as np
 import torch
 from torch.nn import functional
 
+from express50.errors import TrainError
 from express50.head.load import load_head
 from express50.head.model import HeadModel
 from express50.landmarks.augment import Crop, make_backgrounds, random_crop
@@ -29,6 +30,7 @@ from express50.landmarks.network import (
     save_network,
 )
 from express50.landmarks.training_set import FILE_VIEWS, ViewSet, make_views, read_views
+from express50.weights import read_weights
 
 BATCH = 32
 RATE = 2e-3
@@ -149,7 +151,7 @@ def _take_up(path: Path, net: LandmarkNet, optimiser: torch.optim.Optimizer) -> 
     """Read a state that `_keep` wrote, if there is one; the step to go on with."""
     if not path.exists():
         return 0
-    state = torch.load(path, weights_only=True)
+    state = read_weights(path, TrainError, str(path), "a state of training", "delete it")
     net.load_state_dict(state["net"])
     optimiser.load_state_dict(state["optimiser"])
     print(f"going on from step {state['step']} ({path}; delete it to begin anew)")

@@ -5,16 +5,18 @@ Reads files by the dataset's layout alone, so that a stage needs no word here to
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 
+from express50.errors import FormatError
 from express50.layout import Dataset
+from express50.reading import read_json_table
 
 STAGES = (
     "ingest", "calibrate", "observe", "align", "alpha", "matte", "track", "depth", "regions", "pack"
 )  # fmt: skip
 _PICTURES_A_STAGE = 12
+AGAIN = "run its stage again"
 
 
 @dataclass(frozen=True)
@@ -52,7 +54,9 @@ def collect_stage(dataset: Dataset, stage: str) -> StageReport:
     """Read every published item of a stage."""
     root = dataset.stage_dir(stage)
     paths = sorted(root.rglob("metrics.json")) if root.is_dir() else []
-    metrics = {str(p.parent.relative_to(root)): json.loads(p.read_text()) for p in paths}
+    metrics = {
+        str(p.parent.relative_to(root)): read_json_table(p, FormatError, AGAIN) for p in paths
+    }
     dropped = _reasons(metrics, ("dropped",))
     noted = _reasons(metrics, ("weak", "warnings"))
     pictures = [
@@ -97,7 +101,7 @@ def scalar_metrics(report: StageReport) -> dict[str, dict[str, float]]:
 
 def read_json(path: Path) -> dict:
     """A JSON table, empty where the file is absent."""
-    return json.loads(path.read_text()) if path.is_file() else {}
+    return read_json_table(path, FormatError, AGAIN) if path.is_file() else {}
 
 
 def pictures_below(root: Path, limit: int = 24) -> list[Picture]:

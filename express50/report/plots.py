@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import io
-import json
 from pathlib import Path
 
 import matplotlib as mpl
 from markupsafe import Markup
+
+from express50.errors import FormatError
+from express50.reading import parse_json, read_text
 
 mpl.use("Agg")
 from matplotlib.figure import Figure  # noqa: E402  the backend is chosen first
@@ -60,7 +62,8 @@ def loss_curve(log: Path) -> Markup:
     """Training losses of a JSONL log with ``iteration`` and numbers; empty without one."""
     if not log.is_file():
         return Markup("")
-    rows = [json.loads(line) for line in log.read_text().splitlines() if line.strip()]
+    text = read_text(log, FormatError)
+    rows = [parse_json(line, str(log), FormatError) for line in text.split("\n") if line.strip()]
     rows = [r for r in rows if "iteration" in r and "loss" in r]
     if len(rows) < 2:
         return Markup("")

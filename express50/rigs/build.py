@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Sequence
 from dataclasses import replace
@@ -12,6 +11,7 @@ import numpy as np
 
 from express50.cameras import Camera, camera_rows, parse_cameras, resized
 from express50.errors import CalibrationError
+from express50.reading import read_bytes, read_json_table
 
 
 def camera_from_K(
@@ -34,7 +34,10 @@ def camera_from_K(
         CalibrationError: K has skew, or distortion that no model holds (thin prism, tilt).
     """
     K, d = np.asarray(K, dtype=np.float64), np.zeros(14)
-    d[: len(dist)] = np.asarray(dist, dtype=np.float64).ravel()
+    given = np.asarray(dist, dtype=np.float64).ravel()
+    if given.size > d.size:
+        raise CalibrationError(f"camera {camera_id}: {given.size} numbers of distortion, over 14")
+    d[: given.size] = given
     if K.shape != (3, 3) or abs(K[0, 1]) > 1e-3 * abs(K[0, 0]) or d[8:].any():
         raise CalibrationError(
             f"camera {camera_id}: K {K.tolist()} or distortion {d.tolist()} is beyond COLMAP's"
@@ -63,7 +66,7 @@ def names_from_files(files: Sequence[str]) -> list[str]:
         names = [path.stem for path in paths]
     else:
         names = [path.with_suffix("").as_posix() for path in paths]
-    return [re.sub(r"[^\w.+-]+", "_", name).strip("_") for name in names]
+    return [re.sub(r"[^\w.+-]+", "_", name).strip("_.+-") for name in names]
 
 
 def at_size(cameras: dict[str, Camera], size: tuple[int, int] | None) -> dict[str, Camera]:
@@ -112,18 +115,19 @@ def checked(cameras: dict[str, Camera], path: Path) -> dict[str, Camera]:
     return parse_cameras(camera_rows(cameras), str(path))
 
 
+def holds(path: Path, word: str) -> bool:
+    """Whether a file is text with a word in it.
+
+    Raises:
+        CalibrationError: it cannot be read, or is too large to be a calibration.
+    """
+    return word.encode() in read_bytes(path, CalibrationError)
+
+
 def read_table(path: Path) -> dict:
     """A JSON table.
 
     Raises:
         CalibrationError: the file is missing or is not a JSON table.
     """
-    try:
-        table = json.loads(path.read_text())
-    except FileNotFoundError:
-        raise CalibrationError(f"{path}: no such file") from None
-    except (ValueError, RecursionError) as error:
-        raise CalibrationError(f"{path}: not JSON ({error})") from None
-    if not isinstance(table, dict):
-        raise CalibrationError(f"{path}: expected a JSON table, got {type(table).__name__}")
-    return table
+    return read_json_table(path, CalibrationError)

@@ -1,18 +1,45 @@
-"""Cameras of a COLMAP model: ``cameras``, ``images`` (and ``rigs``, ``frames``) as bin or txt."""
+"""Cameras of a COLMAP model: ``cameras`` and ``images``, as .bin or .txt; nothing else is read.
+
+COLMAP's own reader believes the counts in a binary file and asks for as much memory. Source of the
+layout: COLMAP's documentation of its output format.
+"""
 
 from __future__ import annotations
 
+import struct
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
-import pycolmap
 
 from express50.cameras import Camera
 from express50.errors import CalibrationError
+from express50.reading import read_bytes, read_text, reason
 from express50.rigs.build import checked, names_from_files
+from express50.transforms import make_transform, quat_to_matrix
 
-# COLMAP's models that our cameras have under the same name and order.
-HELD = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
+# COLMAP's models that our cameras have under the same name and order, by COLMAP's number: how many
+# parameters each has.
+HELD = {0: ("SIMPLE_PINHOLE", 3), 1: ("PINHOLE", 4), 2: ("SIMPLE_RADIAL", 4), 3: ("RADIAL", 5),
+        4: ("OPENCV", 8), 6: ("FULL_OPENCV", 12)}  # fmt: skip
+SIZE_LIMIT = 1 << 30  # bytes of a file; images hold every observed point
+
+
+class Lens(NamedTuple):
+    """A camera of a model, without pose."""
+
+    model: str
+    width: int
+    height: int
+    params: tuple[float, ...]
+
+
+class Shot(NamedTuple):
+    """A posed image: quaternion (wxyz) and translation, world to camera; its camera's number."""
+
+    name: str
+    camera: int
+    pose: tuple[float, ...]
 
 
 def is_colmap(path: Path) -> bool:
@@ -35,34 +62,82 @@ def read_colmap_images(path: Path) -> tuple[dict[str, Camera], dict[str, str]]:
     Raises:
         CalibrationError: as there.
     """
+    binary = (path / "images.bin").is_file()
     try:
-        model = pycolmap.Reconstruction(str(path))
-    except (ValueError, RuntimeError, OSError) as error:
+        lenses, shots = _read_binary(path) if binary else _read_text(path)
+    except (ValueError, IndexError, struct.error, UnicodeDecodeError) as error:
         raise CalibrationError(
-            f"{path}: COLMAP cannot read it ({str(error).strip().splitlines()[0]}); expected"
-            " cameras and images as .bin or .txt"
+            f"{path}: no COLMAP model ({reason(error)}); expected cameras and images as .bin or"
+            " .txt: export it again"
         ) from None
-    images = sorted((i for i in model.images.values() if i.has_pose), key=lambda i: i.name)
-    names = names_from_files([image.name for image in images])
+    shots = sorted(shots)
+    names = names_from_files([shot.name for shot in shots])
     if len(set(names)) < len(names):
         raise CalibrationError(
             f"{path}: several images share one camera name ({names[0]}, ...); expected one image a"
             " camera: export the model of a single time step"
         )
-    cameras = {n: _camera(path, n, image) for n, image in zip(names, images, strict=True)}
-    files = {name: image.name for name, image in zip(names, images, strict=True)}
-    return checked(cameras, path), files
+    cameras = {n: _camera(path, n, shot, lenses) for n, shot in zip(names, shots, strict=True)}
+    return checked(cameras, path), {n: s.name for n, s in zip(names, shots, strict=True)}
 
 
-def _camera(path: Path, name: str, image: pycolmap.Image) -> Camera:
-    camera = image.camera
-    model = camera.model.name
-    if model not in HELD:
-        raise CalibrationError(
-            f"{path}: image {image.name} has camera model {model}; expected one of"
-            f" {', '.join(HELD)}: undistort with 'colmap image_undistorter' first"
-        )
-    pose = np.eye(4)
-    pose[:3] = image.cam_from_world().matrix()
-    params = tuple(float(x) for x in camera.params)
-    return Camera(name, int(camera.width), int(camera.height), model, params, pose)
+def _camera(path: Path, name: str, shot: Shot, lenses: dict[int, Lens]) -> Camera:
+    lens, turn = lenses.get(shot.camera), np.array(shot.pose[:4])
+    length = float(np.linalg.norm(turn))
+    if lens is None or not (np.isfinite(shot.pose).all() and 0 < length < 1e6):
+        raise CalibrationError(f"{path}: image {shot.name} has no pose or no camera; export again")
+    pose = make_transform(quat_to_matrix(turn / length), np.array(shot.pose[4:]))
+    return Camera(name, lens.width, lens.height, lens.model, lens.params, pose)
+
+
+def _refuse(path: Path, model: str) -> CalibrationError:
+    held = ", ".join(name for name, _ in HELD.values())
+    return CalibrationError(
+        f"{path}: a camera has model {model}; expected one of {held}: undistort with"
+        " 'colmap image_undistorter' first"
+    )
+
+
+def _read_text(path: Path) -> tuple[dict[int, Lens], list[Shot]]:
+    lenses, shots, counts = {}, [], dict(HELD.values())
+    for line in read_text(path / "cameras.txt", CalibrationError, SIZE_LIMIT).split("\n"):
+        words = line.split()
+        if not words or words[0].startswith("#"):
+            continue
+        if words[1] not in counts:
+            raise _refuse(path, words[1][:40])
+        params = tuple(map(float, words[4:]))
+        if len(params) != counts[words[1]]:
+            raise ValueError(f"camera {words[0][:20]} has {len(params)} parameters")
+        lenses[int(words[0])] = Lens(words[1], int(words[2]), int(words[3]), params)
+    lines = iter(read_text(path / "images.txt", CalibrationError, SIZE_LIMIT).split("\n"))
+    for line in lines:
+        words = line.split(maxsplit=9)
+        if not words or words[0].startswith("#"):
+            continue
+        shots.append(Shot(words[9].strip(), int(words[8]), tuple(map(float, words[1:8]))))
+        next(lines, None)  # its points
+    return lenses, shots
+
+
+def _read_binary(path: Path) -> tuple[dict[int, Lens], list[Shot]]:
+    data = read_bytes(path / "cameras.bin", CalibrationError, SIZE_LIMIT)
+    lenses, shots, place = {}, [], 8
+    # A count may say what it likes: what is missing ends the loop.
+    for _ in range(struct.unpack_from("<Q", data)[0]):
+        number, kind, width, height = struct.unpack_from("<IiQQ", data, place)
+        if kind not in HELD:
+            raise _refuse(path, f"number {kind}")
+        model, count = HELD[kind]
+        params = struct.unpack_from(f"<{count}d", data, place + 24)
+        lenses[number] = Lens(model, width, height, params)
+        place += 24 + 8 * count
+    data, place = read_bytes(path / "images.bin", CalibrationError, SIZE_LIMIT), 8
+    for _ in range(struct.unpack_from("<Q", data)[0]):
+        _, *pose, camera = struct.unpack_from("<I7dI", data, place)
+        end = data.index(b"\0", place + 64)
+        shots.append(Shot(data[place + 64 : end].decode(), camera, tuple(pose)))
+        place = end + 9 + 24 * struct.unpack_from("<Q", data, end + 1)[0]
+        if place > len(data):
+            raise ValueError(f"points of image {shots[-1].name} are missing")
+    return lenses, shots

@@ -9,8 +9,8 @@ import numpy as np
 
 from express50.capture import RawCamera, RawCapture, read_capture
 from express50.errors import CaptureError
-from express50.frames import read_srgb8
 from express50.index import Cue
+from express50.media import read_picture
 from express50.video import iterate_video
 
 
@@ -59,7 +59,7 @@ def _read(camera: RawCamera, wanted: list[int]) -> Iterator[tuple[int, np.ndarra
         missing = [frame for frame in wanted if frame >= len(camera.names)]
         if not missing:
             for frame in wanted:
-                yield frame, read_srgb8(camera.path / camera.names[frame])
+                yield frame, read_picture(camera.path, camera.names[frame], camera.orientation)
             return
         length = len(camera.names)
     else:

@@ -5,6 +5,8 @@ OpenCV puts the pixel origin at the first pixel's centre; K is shifted by the ad
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import cv2
@@ -13,6 +15,7 @@ import numpy as np
 from express50.adapters import K_from_opencv
 from express50.cameras import Camera
 from express50.errors import CalibrationError
+from express50.reading import TOML_LIMIT, read_text, reason
 from express50.rigs.build import camera_from_K, checked
 from express50.transforms import axis_angle_to_matrix, make_transform
 
@@ -23,6 +26,7 @@ _ROTATION = ("R", "rotation", "rvec", "Rot")
 _TRANSLATION = ("T", "t", "tvec", "translation")
 _SIZES = (("image_width", "image_height"), ("width", "height"), ("W", "H"))
 YAML = (".yml", ".yaml")
+LEVELS, ENTRIES = 16, 64  # of nesting, and in a matrix
 
 
 def is_opencv_yaml(path: Path) -> bool:
@@ -44,29 +48,61 @@ def read_opencv_yaml(path: Path, size: tuple[int, int] | None) -> dict[str, Came
     """
     folder = path if path.is_dir() else path.parent
     if (folder / "intri.yml").is_file():
-        return checked(_read_easymocap(folder, size), folder)
+        with _damage(folder / "intri.yml"):
+            found = _read_easymocap(folder, size)
+        return checked(found, folder)
     files = sorted(p for p in folder.iterdir() if p.suffix in YAML) if path.is_dir() else [path]
     return checked({f.stem: _read_one(f, size) for f in files}, path)
 
 
 def _open(path: Path) -> cv2.FileStorage:
+    _check_text(path)
     try:
         storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
-    except cv2.error as error:
-        raise CalibrationError(f"{path}: OpenCV cannot read it ({error.err})") from None
+    except (cv2.error, SystemError) as error:
+        raise CalibrationError(f"{path}: OpenCV cannot read it ({_words(error)})") from None
     if not storage.isOpened():
         raise CalibrationError(f"{path}: OpenCV cannot read it; expected its YAML 1.0 format")
     return storage
 
 
+def _check_text(path: Path) -> None:
+    """Refuse what OpenCV's parser, which calls itself for each level, would fall over."""
+    text = read_text(path, CalibrationError, TOML_LIMIT)
+    if not text.startswith("%YAML"):
+        raise CalibrationError(f"{path}: does not begin with %YAML; expected OpenCV's YAML 1.0")
+    level = 0
+    for line in text.split("\n"):
+        lead = len(line) - len(line.lstrip(" -\t"))
+        level = max(0, level + line.count("[") + line.count("{"))
+        if level > LEVELS or lead > 4 * LEVELS:
+            raise CalibrationError(f"{path}: is nested over {LEVELS} deep, expected matrices")
+        level = max(0, level - line.count("]") - line.count("}"))
+
+
+def _words(error: BaseException) -> str:
+    return getattr(error, "err", "") or reason(error)
+
+
+@contextmanager
+def _damage(path: Path) -> Iterator[None]:
+    """OpenCV looks at a value only when it is asked for it."""
+    try:
+        yield
+    except (cv2.error, SystemError, ValueError, OverflowError, TypeError) as error:
+        raise CalibrationError(
+            f"{path}: a value is not of its kind ({_words(error)}); write it again"
+        ) from None
+
+
 def _read_one(path: Path, size: tuple[int, int] | None) -> Camera:
     storage = _open(path)
-    K = _matrix(storage, _K, path)
-    dist = _matrix(storage, _DIST, path, optional=True)
-    pose = _pose(storage, path, _ROTATION, _TRANSLATION)
-    return camera_from_K(
-        path.stem, K_from_opencv(K), dist.ravel(), _size(storage, path, size), pose
-    )
+    with _damage(path):
+        K = _matrix(storage, _K, path)
+        dist = _matrix(storage, _DIST, path, optional=True)
+        pose = _pose(storage, path, _ROTATION, _TRANSLATION)
+        size = _size(storage, path, size)
+        return camera_from_K(path.stem, K_from_opencv(K), dist.ravel(), size, pose)
 
 
 def _read_easymocap(folder: Path, size: tuple[int, int] | None) -> dict[str, Camera]:
@@ -95,9 +131,14 @@ def _matrix(
         node = storage.getNode(key)
         if node.empty():
             continue
-        value = node.mat()
-        if value is None:
-            value = np.array([node.at(i).real() for i in range(node.size())])
+        if node.isMap():  # OpenCV would make a matrix of any size, and then see what is there
+            rows, columns = (int(node.getNode(side).real()) for side in ("rows", "cols"))
+            count = node.getNode("data").size()
+            if not 0 < rows * columns <= ENTRIES or rows * columns != count:
+                raise CalibrationError(f"{path}: {key} is {rows} x {columns} with {count} numbers")
+            value = node.mat()
+        else:
+            value = np.array([node.at(i).real() for i in range(min(node.size(), ENTRIES))])
         if optional or value.shape == (3, 3):
             return np.asarray(value, dtype=np.float64)
         raise CalibrationError(f"{path}: {key} has shape {value.shape}, expected (3, 3)")

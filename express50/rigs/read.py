@@ -6,7 +6,7 @@ from pathlib import Path
 
 from express50.cameras import Camera, read_cameras
 from express50.errors import CalibrationError
-from express50.rigs.build import at_size, in_metres
+from express50.rigs.build import at_size, holds, in_metres
 from express50.rigs.colmap import is_colmap, read_colmap
 from express50.rigs.opencv_yaml import is_opencv_yaml, read_opencv_yaml
 from express50.rigs.releases import is_nersemble, is_renderme, read_nersemble, read_renderme
@@ -29,7 +29,7 @@ def guess_format(path: Path) -> str:
         "colmap": is_colmap,
         "transforms": is_transforms,
         "opencv": is_opencv_yaml,
-        "express50": lambda p: p.is_file() and '"world_to_camera"' in p.read_text(),
+        "express50": lambda p: p.is_file() and holds(p, '"world_to_camera"'),
     }
     found = next((name for name, fits in tests.items() if fits(path)), None)
     if found is None:

@@ -15,15 +15,15 @@ import numpy as np
 from express50.adapters import K_from_opencv
 from express50.cameras import Camera
 from express50.errors import CalibrationError, CaptureError
-from express50.media import child, open_hdf5, read_array
-from express50.rigs.build import camera_from_K, checked, read_table
+from express50.media import attribute, child, members, open_hdf5, read_array
+from express50.rigs.build import camera_from_K, checked, holds, read_table
 
 NERSEMBLE_SIZE = (2200, 3208)
 
 
 def is_nersemble(path: Path) -> bool:
     """Whether a file is NeRSemble's camera_params.json."""
-    return path.is_file() and path.suffix == ".json" and '"world_2_cam"' in path.read_text()
+    return path.is_file() and path.suffix == ".json" and holds(path, '"world_2_cam"')
 
 
 def read_nersemble(path: Path) -> dict[str, Camera]:
@@ -67,7 +67,7 @@ def read_renderme(path: Path) -> dict[str, Camera]:
             )
         height, width = _resolution(path, file)
         found = {}
-        for name in list(group):
+        for name in members(group, str(path)):
             rows = {key: f"Calibration/{name}/{key}" for key in ("K", "RT", "D")}
             K = _array(path, name, read_array(file, rows["K"], str(path)), (3, 3))
             pose = _array(path, name, read_array(file, rows["RT"], str(path)), (4, 4))
@@ -83,7 +83,7 @@ def read_renderme(path: Path) -> dict[str, Camera]:
 
 
 def _camera_id(path: Path, name: str) -> str:
-    if not name.isdigit() or len(name) > 4:
+    if not name.isdecimal() or len(name) > 4:
         raise CalibrationError(f"{path}: camera {name!r}, expected a number such as 07")
     return f"cam{int(name):02d}"
 
@@ -98,8 +98,10 @@ def _inverse(path: Path, name: str, pose: np.ndarray) -> np.ndarray:
 def _resolution(path: Path, file: h5py.File) -> tuple[int, int]:
     """Height and width, stored in this order; the release's full frame where they are absent."""
     group = child(file, "Camera", str(path))
-    attributes = group.attrs if isinstance(group, h5py.Group) else {}
-    size = np.ravel(attributes.get("resolution", (2048, 2448)))
+    usual = np.array((2048, 2448))
+    size = usual
+    if isinstance(group, h5py.Group):
+        size = attribute(group, "resolution", usual, str(path))
     if size.shape != (2,) or size.dtype.kind not in "ui":
         raise CalibrationError(f"{path}: resolution {size.tolist()}, expected height and width")
     return int(size[0]), int(size[1])
@@ -108,7 +110,7 @@ def _resolution(path: Path, file: h5py.File) -> tuple[int, int]:
 def _array(path: Path, name: str, value: object, shape: tuple[int, int]) -> np.ndarray:
     try:
         array = np.asarray(value, dtype=np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         array = np.zeros(0)
     if array.shape != shape or not np.isfinite(array).all():
         raise CalibrationError(

@@ -13,7 +13,7 @@ import numpy as np
 from express50.adapters import cam_from_world_from_opengl
 from express50.cameras import Camera
 from express50.errors import CalibrationError
-from express50.rigs.build import camera_from_K, checked, names_from_files, read_table
+from express50.rigs.build import camera_from_K, checked, holds, names_from_files, read_table
 
 _HELD = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE")
 
@@ -21,7 +21,7 @@ _HELD = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE")
 def is_transforms(path: Path) -> bool:
     """Whether a file, or a folder's transforms.json, has frames with matrices."""
     path = _file(path)
-    return path.suffix == ".json" and path.is_file() and "transform_matrix" in path.read_text()
+    return path.suffix == ".json" and path.is_file() and holds(path, "transform_matrix")
 
 
 def _file(path: Path) -> Path:

@@ -7,6 +7,7 @@ import os
 from pathlib import Path
 
 from express50.errors import FormatError
+from express50.reading import parse_json, read_json
 from grmm.study.design import ANSWERS, FORMAT
 
 FIELDS = ("participant", "example", "question", "answer")
@@ -19,14 +20,18 @@ def read_study(out: Path) -> dict:
         FormatError: there is none.
     """
     path = out / "study.json"
-    try:
-        study = json.loads(path.read_bytes())
-    except FileNotFoundError as error:
-        raise FormatError(f"{path}: no such study; 'grmm study make' writes one") from error
-    except ValueError as error:
-        raise FormatError(f"{path}: not JSON; make the study again") from error
+    if not path.exists():
+        raise FormatError(f"{path}: no such study; 'grmm study make' writes one")
+    study = read_json(path, FormatError, "make the study again")
     if not isinstance(study, dict) or study.get("format") != FORMAT:
         raise FormatError(f"{path}: expected format {FORMAT!r}; make the study again")
+    for name, kinds in (
+        ("participants", (int,)),
+        ("examples", (list,)),
+        ("questions", (list, dict)),
+    ):
+        if not isinstance(study.get(name), kinds):
+            raise FormatError(f"{path}: {name} is {study.get(name)!r}; make the study again")
     return study
 
 
@@ -76,11 +81,13 @@ def read_answers(out: Path, study: dict) -> list[dict]:
         if not line.strip():
             continue
         try:
-            answer = check_answer(study, json.loads(line))
-        except ValueError as error:
+            value = parse_json(line, f"{path}, line {number}", FormatError, "remove it")
+        except FormatError:
             if number == len(lines):  # killed while it was written
                 continue
-            raise FormatError(f"{path}, line {number}: not JSON; remove it") from error
+            raise
+        try:
+            answer = check_answer(study, value)
         except FormatError as error:
             raise FormatError(f"{path}, line {number}: {error}") from error
         answers[answer["participant"], answer["example"], answer["question"]] = answer

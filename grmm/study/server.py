@@ -16,6 +16,7 @@ from threading import Lock
 from urllib.parse import parse_qs, urlsplit
 
 from express50.errors import FormatError
+from express50.reading import parse_json
 from grmm.study.answers import append_answer, check_answer, read_answers, read_study
 from grmm.study.design import trials
 
@@ -62,7 +63,7 @@ def make_server(out: Path, host: str = "127.0.0.1", port: int = 8000) -> Threadi
 
         def _answer(self, body: bytes) -> None:
             try:
-                answer = check_answer(study, json.loads(body))
+                answer = check_answer(study, parse_json(body, "answer", FormatError))
             except (ValueError, FormatError) as error:
                 self._reply(HTTPStatus.BAD_REQUEST, "text/plain", f"{error}\n".encode())
                 return

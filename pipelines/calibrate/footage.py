@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
 
 import numpy as np
-import OpenImageIO as oiio
 
 from express50.cameras import Camera
-from express50.errors import CalibrationError
+from express50.errors import CalibrationError, FormatError
+from express50.exif import read_exif
 from express50.frames import FrameReader
 from express50.index import Index
 from express50.landmarks.network import load_network
@@ -75,18 +76,16 @@ def told_focals(index: Index) -> dict[str, float]:
                 )
             found[name] = float(value)
         elif source.kind == "frames":
-            film = _film_focal(str(index.capture / source.source / source.names[0]))
+            film = _film_focal(index.capture / source.source / source.names[0])
             if film > 0:
                 diagonal = math.hypot(source.width, source.height)
                 found[name] = film / FILM_DIAGONAL_MM * diagonal
     return found
 
 
-def _film_focal(path: str) -> float:
+def _film_focal(path: Path) -> float:
     """The 35 mm equivalent focal length in an image's EXIF, 0 where there is none."""
-    image = oiio.ImageInput.open(path)
-    if image is None:
+    try:
+        return read_exif(path)[1]
+    except FormatError:  # a container's member
         return 0.0
-    value = float(image.spec().getattribute("Exif:FocalLengthIn35mmFilm") or 0.0)
-    image.close()
-    return value if math.isfinite(value) else 0.0

@@ -7,6 +7,8 @@ the finest levels, where only what the track missed is left to be found.
 
 from __future__ import annotations
 
+import io
+import struct
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
@@ -15,11 +17,13 @@ from pathlib import Path
 import numpy as np
 import open3d as o3d
 
+from express50.arrays import DAMAGE
 from express50.errors import FormatError
 from express50.frames import read_peaks
 from express50.head.load import load_head
 from express50.layout import Dataset
 from express50.raycast import mesh_scene
+from express50.reading import read_bytes, reason
 from express50.tracks import Track, read_track
 from pipelines.depth.config import DepthConfig
 from pipelines.depth.grid import View
@@ -27,6 +31,9 @@ from pipelines.depth.prior import Prior, matte_agreement
 from pipelines.depth.surface import graph_laplacian
 
 NEAR, FAR = 0.04, 0.12  # metres off the tracked mesh: what lies nearer moves along, further stays
+SURFACE_LIMIT = 1 << 30  # bytes
+FAR_M = 1e6
+AGAIN = "run 'express50 depth' on it again"
 SMOOTHING = 12  # rounds of averaging of the motion, which jumps where the nearest triangle does
 
 
@@ -146,14 +153,15 @@ def read_surface(path: Path) -> tuple[np.ndarray, np.ndarray]:
     """
     import trimesh
 
+    # From bytes and not by name: a PLY may name a texture, which would be read wherever it lies.
+    data = read_bytes(path, FormatError, SURFACE_LIMIT, AGAIN)
     try:
-        mesh = trimesh.load_mesh(path, process=False)
+        mesh = trimesh.load_mesh(io.BytesIO(data), file_type="ply", process=False)
         vertices, faces = np.asarray(mesh.vertices, float), np.asarray(mesh.faces, np.int64)
-    except (ValueError, IndexError, KeyError, OSError, AttributeError) as error:
-        words = " ".join(str(error).split())
-        raise FormatError(
-            f"{path}: no surface ({words}); run 'express50 depth' on it again"
-        ) from None
-    if not len(faces) or not np.isfinite(vertices).all():
-        raise FormatError(f"{path}: {len(faces)} triangles, expected a surface; run it again")
+    except (*DAMAGE, struct.error, UnboundLocalError) as error:
+        raise FormatError(f"{path}: no surface ({reason(error)}); {AGAIN}") from None
+    if not len(faces) or faces.shape[1:] != (3,) or not np.isfinite(vertices).all():
+        raise FormatError(f"{path}: {len(faces)} triangles, expected a surface; {AGAIN}")
+    if faces.min() < 0 or faces.max() >= len(vertices) or np.abs(vertices).max() > FAR_M:
+        raise FormatError(f"{path}: a triangle or a vertex lies nowhere; {AGAIN}")
     return vertices, faces

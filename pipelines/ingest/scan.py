@@ -84,6 +84,7 @@ def scan_camera(
         names=camera.names,
         clips=tuple(clips) if camera.kind == "videos" or camera.counts else (),
         correction=camera.correction,
+        orientation=camera.orientation,
     )
     return source, watch.seen()
 
@@ -161,7 +162,7 @@ def iterate_camera(camera: RawCamera) -> Iterator[tuple[int, int, np.ndarray]]:
         for number, name in enumerate(camera.names):
             clip = int(np.searchsorted(ends, number, side="right"))
             stamp = camera.stamps[number] if camera.stamps else number
-            yield clip, stamp, read_picture(camera.path, name)
+            yield clip, stamp, read_picture(camera.path, name, camera.orientation)
 
 
 def time_gaps(pts: tuple[int, ...], clips: tuple[int, ...] = ()) -> int:

@@ -9,7 +9,6 @@ checks.json.
 
 from __future__ import annotations
 
-import json
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
@@ -22,12 +21,13 @@ from express50.capture import RawCapture, check_calibrated_sizes
 from express50.captures.read import OURS, read_any, subject_of, watched
 from express50.demographics import public_meta
 from express50.digests import stat_digest, text_digest
-from express50.errors import CaptureError, StageError
+from express50.errors import CaptureError, FormatError, StageError
 from express50.frames import decode_proxy
 from express50.images import contact_sheet, write_image
 from express50.index import TRANSLATED, CameraSource, Cue, Index, index_to_json
 from express50.layout import Dataset
 from express50.publish import dump_json, write_json
+from express50.reading import read_json_table
 from express50.rigs.build import at_size
 from express50.stage import Stage
 from express50.withdraw import withdrawn
@@ -288,7 +288,7 @@ def account(dataset: Dataset, subjects: list[str]) -> Iterator[str]:
         path = dataset.item_dir("ingest", subject) / "metrics.json"
         if not path.is_file():
             continue
-        told = json.loads(path.read_text(encoding="utf-8"))
+        told = read_json_table(path, FormatError, "ingest again")
         counts = sorted({told["frame_count"], *told["frame_count_differs"].values()})
         frames = " to ".join(map(str, dict.fromkeys((counts[0], counts[-1]))))
         yield (

@@ -27,6 +27,7 @@ from express50.index import index_path, read_index
 from express50.layout import Dataset
 from express50.parts import COLOURS
 from express50.publish import write_json
+from express50.reading import read_json_table
 from express50.shards import ShardReader
 from express50.shards_codecs import encode_pictures
 from express50.shards_offsets import write_offsets
@@ -220,7 +221,7 @@ def _read_regions(
     paths = folder / f"{camera_id}.png", folder / f"{camera_id}_head.png"
     if not all(path.is_file() for path in paths):
         return None
-    facts = json.loads((folder / "metrics.json").read_text("utf-8"))
+    facts = read_json_table(folder / "metrics.json", FormatError)
     kept = "torso" in facts["missing"] and facts["method"] == "mesh"
     return read_alpha(paths[0]), None if kept else read_alpha(paths[1])
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,6 +12,7 @@ from express50.exclusions import exclusion_reason
 from express50.frames import read_cameras_of, read_gains, read_peaks
 from express50.index import read_index
 from express50.layout import Dataset
+from express50.reading import read_json_table
 from express50.tracks import read_track, track_file
 
 PARAMETERS = ("expression", "neck", "jaw", "eyes", "R", "t")
@@ -60,7 +60,7 @@ def _read_subject(dataset: Dataset, name: str) -> Subject:
     """
     index = read_index(dataset, name)
     peaks = read_peaks(dataset, name)
-    peak_rows = json.loads((dataset.item_dir("align", name) / "peaks.json").read_text("utf-8"))
+    peak_rows = read_json_table(dataset.item_dir("align", name) / "peaks.json", FormatError)
     labels = {expression: nameless(row) for expression, row in peak_rows.items()}
     track = read_track(track_file(dataset, name))
     shared = {"shape": track.shape.tolist(), "offsets": bool(track.offsets.any())}

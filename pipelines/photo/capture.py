@@ -102,7 +102,7 @@ def _write_footage(picture: Picture, folder: Path) -> None:
     name = f"video{suffix}" if picture.video else f"frames/000000{suffix}"
     target = folder / name
     target.parent.mkdir(parents=True)
-    if picture.turned:
+    if picture.orientation != 1:
         write_bytes(target.with_suffix(".png"), encode_png(read_upright(picture)))
         return
     try:

@@ -7,17 +7,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import OpenImageIO as oiio
 
 from express50.capture import IMAGE_SUFFIXES, VIDEO_SUFFIXES
-from express50.errors import CaptureError
+from express50.errors import CaptureError, FormatError
+from express50.exif import read_exif, upright
 from express50.frames import read_srgb8
 from express50.video import iterate_video
 
 FILM_DIAGONAL_MM = math.hypot(36.0, 24.0)
-# EXIF's orientation -> quarter turns counter-clockwise after an optional left-right flip.
-TURNS = {1: (0, False), 2: (0, True), 3: (2, False), 4: (2, True), 5: (1, True), 6: (3, False),
-         7: (3, True), 8: (1, False)}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -27,14 +24,14 @@ class Picture:
     Attributes:
         path: the file.
         video: whether it is a video.
-        turned: whether EXIF says that its pixels do not lie upright.
+        orientation: EXIF's, 1 to 8; 1 where its pixels lie upright.
         film_mm: focal length on 35 mm film with the same diagonal angle of view; 0 where EXIF
             tells none.
     """
 
     path: Path
     video: bool
-    turned: bool = False
+    orientation: int = 1
     film_mm: float = 0.0
 
 
@@ -55,8 +52,11 @@ def open_picture(path: Path) -> Picture:
             f"{path}: is no photograph or video by its name; expected one of "
             f"{' '.join(IMAGE_SUFFIXES + VIDEO_SUFFIXES)}"
         )
-    orientation, film = _exif(path)
-    return Picture(path, video=False, turned=TURNS[orientation] != (0, False), film_mm=film)
+    try:
+        orientation, film = read_exif(path)
+    except FormatError as error:
+        raise CaptureError(str(error)) from error
+    return Picture(path, video=False, orientation=orientation, film_mm=film)
 
 
 def read_upright(picture: Picture) -> np.ndarray:
@@ -65,9 +65,7 @@ def read_upright(picture: Picture) -> np.ndarray:
     Raises:
         CaptureError: it is damaged.
     """
-    turns, flipped = TURNS[_exif(picture.path)[0]]
-    image = read_srgb8(picture.path)
-    return np.ascontiguousarray(np.rot90(image[:, ::-1] if flipped else image, turns))
+    return upright(read_srgb8(picture.path), picture.orientation)
 
 
 def spread_frames(picture: Picture, count: int) -> tuple[list[np.ndarray], int]:
@@ -88,16 +86,3 @@ def guess_focal(picture: Picture, width: int, height: int, film_mm: float) -> tu
     if picture.film_mm > 0:
         return picture.film_mm / FILM_DIAGONAL_MM * diagonal, "exif"
     return film_mm / FILM_DIAGONAL_MM * diagonal, "guess"
-
-
-def _exif(path: Path) -> tuple[int, float]:
-    """Orientation (1 to 8) and focal length on 35 mm film (0 for none)."""
-    image = oiio.ImageInput.open(str(path))
-    if image is None:
-        raise CaptureError(f"{path}: cannot be read as an image ({oiio.geterror().strip()})")
-    spec = image.spec()
-    orientation = int(spec.getattribute("Orientation") or 1)
-    film = float(spec.getattribute("Exif:FocalLengthIn35mmFilm") or 0.0)
-    image.close()
-    usable = math.isfinite(film) and film > 0
-    return (orientation if orientation in TURNS else 1), (film if usable else 0.0)

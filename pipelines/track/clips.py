@@ -7,12 +7,12 @@ import shutil
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
-from zipfile import BadZipFile
 
 import numpy as np
 
+from express50.arrays import read_arrays
 from express50.digests import path_digest, text_digest, value_digest
-from express50.errors import StageError
+from express50.errors import FormatError, StageError
 from express50.index import Cue
 from express50.publish import write_bytes
 from pipelines.track.config import VERSION, TrackConfig
@@ -169,10 +169,10 @@ def _read_window(file: Path) -> dict[int, Pose] | None:
     if not file.is_file():
         return None
     try:
-        with np.load(file, allow_pickle=False) as data:
-            rows = zip(data["frames"].tolist(), data["own"], data["rotation"], strict=True)
-            return {frame: Pose(own, rotation) for frame, own, rotation in rows}
-    except (OSError, ValueError, KeyError, BadZipFile):
+        data = read_arrays(file, FormatError, "a window", ("frames", "own", "rotation"))
+        rows = zip(data["frames"].tolist(), data["own"], data["rotation"], strict=True)
+        return {frame: Pose(own, rotation) for frame, own, rotation in rows}
+    except (FormatError, ValueError, TypeError):
         return None  # damaged: tracked anew
 
 

@@ -35,7 +35,7 @@ def test_whole_capture_is_read(raw):
         ('subject = "a"', "fps is None, expected a number"),
         ('subject = "a"\nfps = true', "fps is True"),
         ('subject = "a"\nfps = 0', "fps is 0, expected more than 0"),
-        ('subject = "a"\nfps = nan', "fps is nan"),
+        ('subject = "a"\nfps = nan', "line 2 holds nan"),
         ("subject = ", "not TOML"),
     ],
 )

@@ -6,7 +6,8 @@ import pytest
 
 from express50.digests import file_sha256, path_digest, stat_digest
 from express50.errors import FormatError, StageError
-from express50.ledger import Ledger, Receipt
+from express50.ledger import Ledger
+from express50.receipts import Receipt
 
 
 @pytest.fixture

@@ -9,7 +9,8 @@ import pytest
 from express50.cli import main
 from express50.images import write_image
 from express50.layout import Dataset
-from express50.ledger import Ledger, Receipt
+from express50.ledger import Ledger
+from express50.receipts import Receipt
 from express50.report.collect import Picture, spread
 from express50.report.page import number, render_page
 

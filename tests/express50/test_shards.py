@@ -13,9 +13,8 @@ import pytest
 
 from express50.cli import main
 from express50.errors import FormatError
-from express50.images import depth_to_uint16, encode_jpeg, encode_png
+from express50.images import depth_to_uint16, encode_jpeg, encode_png, image_size
 from express50.shards import ShardReader
-from express50.shards_codecs import image_size
 from express50.shards_write import (
     PackedSample,
     ShardWriter,

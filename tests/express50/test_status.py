@@ -16,7 +16,8 @@ import pytest
 
 from express50 import status_cli
 from express50.cli import main
-from express50.ledger import Ledger, Receipt, Run
+from express50.ledger import Ledger
+from express50.receipts import Receipt, Run
 from express50.status import SILENT_SECONDS, read_status
 from express50.status_page import format_seconds, status_page
 from tests.faults import toy

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from express50 import tracks
+import express50.arrays as array_files
 from express50.errors import FormatError, StageError
 from express50.layout import Dataset
 from express50.tracks import read_track, track_file
@@ -63,7 +63,7 @@ def bad(arrays: dict[str, np.ndarray]) -> dict[str, dict[str, np.ndarray]]:
         "expressions are int64": {"expressions": np.arange(2)},
         "R is no rotation": {"R": 2 * arrays["R"]},
         "differs from 1 by": {"R": -arrays["R"]},
-        "Object arrays": {"head": np.array({"a": print}, dtype=object)},
+        "Python objects": {"head": np.array({"a": print}, dtype=object)},
     }
 
 
@@ -116,9 +116,9 @@ def test_foreign_and_hostile_files_are_refused(arrays, tmp_path, monkeypatch) ->
     _archive(path, {"vertices.npy": claim})
     with pytest.raises(FormatError, match="not a track"):
         read_track(path)
-    monkeypatch.setattr(tracks, "SIZE_LIMIT", 1 << 20)
+    monkeypatch.setattr(array_files, "SIZE_LIMIT", 1 << 20)
     _archive(path, {"vertices.npy": bytes(1 << 21)}, zipfile.ZIP_DEFLATED)
-    with pytest.raises(FormatError, match="bytes unpacked, over"):
+    with pytest.raises(FormatError, match="bytes unpacked, expected at most"):
         read_track(path)
 
 

@@ -11,13 +11,14 @@ import pytest
 from express50.captures.person import read_people
 from express50.cli import main
 from express50.digests import text_digest
-from express50.errors import CaptureError, StageError
+from express50.errors import CaptureError, FormatError, StageError
 from express50.index import read_index
 from express50.layout import Dataset
-from express50.ledger import Ledger, Made, Receipt, Run
+from express50.ledger import Ledger
 from express50.locks import stage_lock
 from express50.names import files_naming, files_that, names_any_of
 from express50.publish import publishing
+from express50.receipts import Made, Receipt, Run
 from express50.withdraw import withdraw, withdrawn, withdrawn_file
 from pipelines import ingest
 from tests.faults.toy import tree
@@ -40,6 +41,18 @@ def dataset(tmp_path):
         (out / "metrics.json").write_text("{}")
         (out / "splits.json").write_text('{"train": ["S001", "S002"]}')
     return dataset
+
+
+def test_a_damaged_ledger_stops_a_withdrawal_before_it_removes_anything(dataset):
+    data = bytearray(dataset.ledger.read_bytes())
+    for side in ("-wal", "-shm"):
+        dataset.ledger.with_name(dataset.ledger.name + side).unlink(missing_ok=True)
+    data[200:] = b"\xff" * len(data[200:])
+    dataset.ledger.write_bytes(data)
+    before = {k: v for k, v in tree(dataset.root).items() if "ledger" not in k}
+    with pytest.raises(FormatError, match="not a ledger"):
+        withdraw(dataset, "S001")
+    assert {k: v for k, v in tree(dataset.root).items() if "ledger" not in k} == before
 
 
 def test_nothing_of_the_subject_stays_and_the_others_are_untouched(dataset):

@@ -182,7 +182,7 @@ def test_rubbish_tables(tmp_path, text):
     ("line", "message"),
     [
         ("cameras = 3", "expected a list"),
-        ("metres_per_unit = nan", "above 0"),
+        ("metres_per_unit = nan", "line 1 holds nan"),
         ('[expressions]\nphoto = "a b"', "expected a table"),
         ('source = "nowhere"', "source is 'nowhere'"),
         ("fps = -1", "fps is -1"),

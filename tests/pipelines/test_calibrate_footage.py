@@ -214,12 +214,12 @@ def test_degenerate_faces_and_matches_give_no_pose():
 
 
 def test_exif_tells_the_focal_length_of_film(tmp_path):
-    path = str(tmp_path / "a.jpg")
+    path = tmp_path / "a.jpg"
     spec = oiio.ImageSpec(36, 24, 3, "uint8")
     spec.attribute("Exif:FocalLengthIn35mmFilm", "int", 85)
-    file = oiio.ImageOutput.create(path)
-    assert file.open(path, spec) and file.write_image(np.zeros((24, 36, 3), np.uint8))
+    file = oiio.ImageOutput.create(str(path))
+    assert file.open(str(path), spec) and file.write_image(np.zeros((24, 36, 3), np.uint8))
     file.close()
     assert _film_focal(path) == 85.0
     write_image(tmp_path / "b.jpg", np.zeros((8, 8, 3), np.uint8))
-    assert _film_focal(str(tmp_path / "b.jpg")) == 0.0
+    assert _film_focal(tmp_path / "b.jpg") == 0.0

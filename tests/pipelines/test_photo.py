@@ -13,9 +13,11 @@ import pytest
 from express50.cameras import read_cameras
 from express50.cli import main
 from express50.errors import CaptureError
+from express50.frames import read_srgb8
 from express50.images import write_image
-from pipelines.photo.capture import subject_id
+from pipelines.photo.capture import make_photo_capture, subject_id
 from pipelines.photo.picture import guess_focal, open_picture, read_upright
+from pipelines.track.config import TrackConfig
 
 data = pytest.importorskip("skimage.data")
 
@@ -123,6 +125,24 @@ def test_exif_turns_pictures_upright(tmp_path: Path, orientation: int, stored) -
     np.testing.assert_array_equal(read_upright(picture), upright)
     focal, source = guess_focal(picture, 64, 48, 50.0)
     assert source == "exif" and focal == pytest.approx(28 / np.hypot(36, 24) * 80)
+
+
+def test_a_photograph_on_its_side_is_tracked_as_an_upright_one(
+    tmp_path: Path, astronaut: np.ndarray
+) -> None:
+    """Size, principal point, focal length and face are those of the upright picture."""
+    upright = np.ascontiguousarray(astronaut[:360, 80:360])
+    write_exif(tmp_path / "a.tif", np.rot90(upright, 1), 6, 50)
+    picture = open_picture(tmp_path / "a.tif")
+    config = TrackConfig(iterations=3)
+    focal = make_photo_capture(picture, tmp_path / "out", "a", config)
+    camera = read_cameras(tmp_path / "out/calibration.json")["photo"]
+    assert (camera.width, camera.height) == (280, 360)
+    np.testing.assert_allclose(camera.K[:2, 2], [140, 180])
+    assert focal.source == "exif"
+    assert focal.pixels == pytest.approx(50 / np.hypot(36, 24) * np.hypot(280, 360))
+    stored = read_srgb8(tmp_path / "out/cameras/photo/frames/000000.png")
+    np.testing.assert_array_equal(stored, upright)
 
 
 def test_subject_ids_are_made_of_file_names() -> None:

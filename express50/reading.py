@@ -1,0 +1,159 @@
+"""Text from outside, JSON and TOML above all: nothing of it is believed before it was looked at.
+
+Every format of text is read through here, so that one bound holds for all: a file is a regular one
+of at most ``TEXT_LIMIT`` bytes, nesting ends in an error and not in a full stack, keys come once,
+and every number is finite.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+import stat
+import tomllib
+from pathlib import Path
+from typing import Any
+
+from express50.errors import Express50Error
+
+TEXT_LIMIT = 1 << 28  # bytes; the index of 100,000 samples takes 40 MB
+TOML_LIMIT = 1 << 20  # bytes; written by hand
+# Of a TOML key; Python's parser keeps every beginning of one, so that long ones fill the memory.
+DOTTED = re.compile(r"""(?<![\w"'.-])(?:(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')[ \t]*+\.[ \t]*+){32}""")
+NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.+-]{0,199}")  # of what may become a file or folder
+AGAIN = "copy or write it again"
+
+Kind = type[Express50Error]
+
+
+def read_bytes(path: Path, kind: Kind, limit: int = TEXT_LIMIT, mend: str = AGAIN) -> bytes:
+    """Bytes of a regular file.
+
+    Raises:
+        Express50Error: of the given kind: it is missing, a pipe or a device, unreadable, or larger
+            than ``limit``.
+    """
+    path = Path(path)
+    try:
+        status = path.stat()
+        if not stat.S_ISREG(status.st_mode):
+            raise kind(f"{path}: is a folder, a pipe or a device, expected a file; {mend}")
+        if status.st_size > limit:
+            raise kind(f"{path}: {status.st_size} bytes, expected at most {limit}; {mend}")
+        return path.read_bytes()
+    except (OSError, ValueError) as error:  # ValueError: a name with a zero byte
+        raise kind(f"{path}: cannot be read ({reason(error)}); {mend}") from None
+
+
+def read_text(path: Path, kind: Kind, limit: int = TEXT_LIMIT, mend: str = AGAIN) -> str:
+    """UTF-8 text of a file, a byte order mark left out; line ends become newlines.
+
+    Raises:
+        Express50Error: as `read_bytes`, or it is no such text.
+    """
+    try:
+        text = read_bytes(path, kind, limit, mend).decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise kind(f"{path}: not UTF-8 text ({reason(error)}); {mend}") from None
+    return text.replace("\r\n", "\n").replace("\r", "\n")
+
+
+def read_json(path: Path, kind: Kind, mend: str = AGAIN) -> Any:
+    """Content of a JSON file.
+
+    Raises:
+        Express50Error: as `read_text` and `parse_json`.
+    """
+    return parse_json(read_text(path, kind, mend=mend), str(path), kind, mend)
+
+
+def read_json_table(path: Path, kind: Kind, mend: str = AGAIN) -> dict[str, Any]:
+    """Content of a JSON file that is a table.
+
+    Raises:
+        Express50Error: as `read_json`, or it is something else.
+    """
+    table = read_json(path, kind, mend)
+    if not isinstance(table, dict):
+        raise kind(f"{path}: expected a JSON table, got {type(table).__name__}; {mend}")
+    return table
+
+
+def parse_json(text: str | bytes, where: str, kind: Kind, mend: str = AGAIN) -> Any:
+    """Content of JSON text.
+
+    Raises:
+        Express50Error: it is not JSON, is nested too deeply, has a key twice, or a number that is
+            NaN, infinite or of thousands of digits.
+    """
+    try:
+        return json.loads(
+            text, parse_constant=_finite, parse_float=_finite, object_pairs_hook=_once
+        )
+    except NotFiniteError as error:
+        raise kind(f"{where}: {error.located(text)}; {mend}") from None
+    except (ValueError, RecursionError) as error:
+        raise kind(f"{where}: not JSON ({reason(error)}); {mend}") from None
+
+
+def read_toml(path: Path, kind: Kind, mend: str = "correct it") -> dict[str, Any]:
+    """Content of a TOML file.
+
+    Raises:
+        Express50Error: as `read_text`, or it is not TOML, nested too deeply, or holds a number that
+            is NaN or infinite.
+    """
+    return parse_toml(read_text(path, kind, TOML_LIMIT, mend), str(path), kind, mend)
+
+
+def parse_toml(text: str, where: str, kind: Kind, mend: str = "correct it") -> dict[str, Any]:
+    """Content of TOML text.
+
+    Raises:
+        Express50Error: as `read_toml`.
+    """
+    if found := DOTTED.search(text):
+        raise kind(f"{where}: {found[0][:40]}... has over 32 parts, expected a short key; {mend}")
+    try:
+        table = tomllib.loads(text, parse_float=_finite)
+    except NotFiniteError as error:
+        raise kind(f"{where}: {error.located(text)}; {mend}") from None
+    except (ValueError, RecursionError) as error:
+        raise kind(f"{where}: not TOML: {reason(error)}; {mend}") from None
+    return table
+
+
+def reason(error: BaseException) -> str:
+    """What an error says, in a few words of one line."""
+    if isinstance(error, RecursionError):
+        return "it is nested too deeply"
+    words = getattr(error, "strerror", None) or str(error) or type(error).__name__
+    return " ".join(words.split())[:200]
+
+
+class NotFiniteError(ValueError):
+    """A number that is NaN or infinite, as it is written."""
+
+    def located(self, text: str | bytes) -> str:
+        """What is wrong and where: the line that such a number stands in first."""
+        lines = (text if isinstance(text, str) else text.decode(errors="replace")).split("\n")
+        word = str(self)
+        number = next((n for n, line in enumerate(lines, 1) if word in line), 1)
+        return f"line {number} holds {word[:40]}, which is NaN or infinite; expected finite numbers"
+
+
+def _finite(text: str) -> float:
+    value = float(text)
+    if not math.isfinite(value):
+        raise NotFiniteError(text)
+    return value
+
+
+def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    table = dict(pairs)
+    if len(table) < len(pairs):
+        names = [name for name, _ in pairs]
+        twice = next(name for name in names if names.count(name) > 1)
+        raise ValueError(f"the key {twice[:40]!r} is there twice")
+    return table

@@ -1,0 +1,73 @@
+"""Text from outside: bounds, and what errors name; bombs of every format are in tests/fuzz."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from express50.errors import CaptureError, FormatError
+from express50.reading import parse_json, read_json, read_json_table, read_text, read_toml
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ('{"a": 1,\n"b": NaN}', "line 2 holds NaN, which is NaN or infinite"),
+        ('{"a": 1,\n\n"b": -1e999}', "line 3 holds -1e999, which"),
+        ('{"a": 1, "a": 2}', "the key 'a' is there twice"),
+        ("[" * 100_000, "nested too deeply"),
+        ("9" * 5000, "not JSON"),
+        ("", "not JSON"),
+    ],
+)
+def test_what_json_may_not_hold_is_named(tmp_path: Path, text: str, message: str) -> None:
+    (tmp_path / "a.json").write_text(text)
+    with pytest.raises(FormatError, match=message) as caught:
+        read_json(tmp_path / "a.json", FormatError, "mend it so")
+    assert str(caught.value).startswith(f"{tmp_path / 'a.json'}: ")
+    assert str(caught.value).endswith("; mend it so")
+
+
+def test_plain_json_is_what_json_says() -> None:
+    value = {"a": [1, -2.5, 1e300, None, True, "x\u0000"], "b": {"a": {}}, "": []}
+    assert parse_json(json.dumps(value), "here", FormatError) == value
+    assert parse_json(json.dumps(value).encode(), "here", FormatError) == value
+
+
+def test_a_table_is_asked_for(tmp_path: Path) -> None:
+    (tmp_path / "a.json").write_text("[1]")
+    with pytest.raises(CaptureError, match="expected a JSON table, got list"):
+        read_json_table(tmp_path / "a.json", CaptureError)
+
+
+def test_keys_of_toml_are_short_and_numbers_finite(tmp_path: Path) -> None:
+    file = tmp_path / "a.toml"
+    file.write_text("a.b = [" + "0.5, " * 300 + "]\nc = '" + "a." * 300 + "'\n")
+    assert len(read_toml(file, CaptureError)["a"]["b"]) == 300
+    for text, message in (
+        ("a" + ".a" * 40 + " = 1", "over 32 parts"),
+        ("\nx = inf", "line 2 holds"),
+    ):
+        file.write_text(text)
+        with pytest.raises(CaptureError, match=message):
+            read_toml(file, CaptureError)
+
+
+def test_size_and_kind_of_a_file_are_looked_at(tmp_path: Path) -> None:
+    file = tmp_path / "a.txt"
+    file.write_bytes(b"\xef\xbb\xbfa\r\nb\rc")
+    assert read_text(file, FormatError) == "a\nb\nc"
+    with pytest.raises(FormatError, match="9 bytes, expected at most 8"):
+        read_text(file, FormatError, limit=8)
+    with pytest.raises(FormatError, match="a folder, a pipe or a device"):
+        read_text(tmp_path, FormatError)
+    with pytest.raises(FormatError, match="No such file"):
+        read_text(tmp_path / "b", FormatError)
+
+
+def test_an_error_is_one_line_that_steers_no_terminal_and_keeps_its_ends() -> None:
+    assert str(FormatError("a\nb\r\n\x1b[2Jc\x07")) == "a b  [2Jc"
+    long = str(FormatError("where " + "x" * 100_000 + " mend it"))
+    assert len(long) < 1300 and long.startswith("where x") and long.endswith("x mend it")
