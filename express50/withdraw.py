@@ -208,7 +208,7 @@ def _withdrawals(path: Path) -> list:
     return rows
 
 
-def _digest(row: Any) -> str:
+def _digest(row: Any) -> Any:
     return row.get("id_sha256") if isinstance(row, dict) else row
 
 
