@@ -33,13 +33,13 @@ from express50.index import read_index
 from express50.layout import Dataset
 from express50.ledger import Ledger
 from express50.media import member_bytes, open_hdf5, read_array, read_picture
+from express50.names import files_naming
 from express50.rigs.read import read_rig
 from express50.shards import read_entries
 from express50.shards_codecs import decode_picture
 from express50.tracks import read_track
 from express50.video import iterate_video
 from express50.weights import read_weights
-from express50.withdraw import files_naming
 from grmm.ply import read_ply
 from pipelines.depth.warm import read_surface
 
@@ -265,7 +265,7 @@ def _containers(root: Path, out: Path) -> Iterator[Case]:
 
 def _named(folder: Path) -> None:
     """What names nobody is read to its end, quickly."""
-    if list(files_naming(Dataset(folder), "nobody-has-this-name")):
+    if list(files_naming(folder, "nobody-has-this-name")):
         raise AssertionError("a subject that is not there was found")
     raise FormatError("read to its end")
 

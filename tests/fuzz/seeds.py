@@ -30,6 +30,7 @@ from express50.layout import Dataset
 from express50.ledger import Ledger
 from express50.media import decode_picture as decode_foreign
 from express50.media import read_picture, read_srgb8
+from express50.names import files_naming
 from express50.receipts import Receipt
 from express50.rigs.read import guess_format, read_rig
 from express50.runner import run_stage
@@ -39,7 +40,6 @@ from express50.shards_offsets import read_offsets, write_offsets
 from express50.shards_write import PackedSample, ShardWriter, verify, write_manifest
 from express50.tracks import read_track
 from express50.video import VideoReader, iterate_video
-from express50.withdraw import files_naming
 from grmm.checkpoint import load_checkpoint
 from grmm.ply import read_ply, write_ply
 from grmm.presets import resolve
@@ -306,7 +306,7 @@ def _verified(root: Path) -> None:
 
 def _searched(root: Path) -> object:
     """A damaged tar is searched too, and then found damaged."""
-    found = list(files_naming(Dataset(root / "shards"), "S001"))
+    found = list(files_naming(root / "shards", "S001"))
     return found, _verified(root)
 
 
