@@ -247,17 +247,25 @@ class GRMM(nn.Module):
             displacement=displacement,
         )
 
-    def decode(self, z_id: Tensor, z_exp: Tensor, state: HeadState) -> Maps:
-        """The convolutional maps of transforms and opacity, which no pose changes."""
+    def decode(
+        self, z_id: Tensor, z_exp: Tensor, state: HeadState, opacities: Tensor | None = None
+    ) -> Maps:
+        """The convolutional maps of transforms and opacity, which no pose changes.
+
+        ``opacities`` are those of the same person's last maps, if they are known: in the paper
+        they depend on the identity alone.
+        """
         z_id, z_exp = self._inputs(z_id, z_exp, state)
-        code = torch.cat([z_id, z_exp]) if self.config.opacity_from_expression else z_id
+        both = torch.cat([z_id, z_exp])
         with self._precision():
-            offsets, opacity = self.transform(torch.cat([z_id, z_exp])), self.opacity(code)
-        offsets = self._sample(offsets)
+            offsets = self._sample(self.transform(both))
+            if opacities is None or self.config.opacity_from_expression:
+                code = both if self.config.opacity_from_expression else z_id
+                opacities = torch.sigmoid(self._sample(self.opacity(code))[:, 0])
         return Maps(
             offsets=offsets[:, :7],
             scales_mm=nn.functional.softplus(offsets[:, 7:] + self.scale_bias),
-            opacities=torch.sigmoid(self._sample(opacity)[:, 0]),
+            opacities=opacities,
         )
 
     def appearance(self, z_id: Tensor, state: HeadState, view: View) -> Tensor:

@@ -69,7 +69,8 @@ class Preview:
         if not same_person:
             self._colours = None
         if not same_codes:
-            self._maps = model.decode(head.z_id, head.z_exp, self._state)
+            known = self._maps.opacities if same_person and self._maps is not None else None
+            self._maps = model.decode(head.z_id, head.z_exp, self._state, known)
         self._gaussians = model.geometry(head.z_id, head.z_exp, self._state, self._maps)
         self._head = head
 

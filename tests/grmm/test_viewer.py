@@ -61,6 +61,21 @@ def test_moving_pictures_decode_only_what_changed(loaded, monkeypatch):
     assert calls[3:] == ["decode", "appearance"]
 
 
+def test_opacity_is_decoded_once_a_person(loaded, monkeypatch):
+    """The saving: another expression of the same person has the same opacities, to the bit."""
+    model, calls = loaded.model, []
+    original = model.opacity.forward
+    monkeypatch.setattr(model.opacity, "forward", lambda *a: calls.append(1) or original(*a))
+    preview, view = Preview(loaded), frontal(loaded)
+    preview.draw(trained_head(loaded, "S000", "e0"), view, moving=True)
+    kept = preview.draw(trained_head(loaded, "S000", "e1"), view, moving=True)
+    assert len(calls) == 1
+    anew = Preview(loaded).draw(trained_head(loaded, "S000", "e1"), view, moving=True)
+    assert len(calls) == 2 and np.array_equal(kept, anew)
+    preview.draw(trained_head(loaded, "S001", "e1"), view, moving=True)
+    assert len(calls) == 3
+
+
 def test_a_slider_moved_in_a_browser_changes_the_picture(loaded):
     viewer = Viewer(loaded, port=18200, moving=48, still=64)
     thread = threading.Thread(target=viewer.run)
