@@ -67,7 +67,7 @@ def test_offsets_are_stored_once_a_subject_and_checked(packed, tmp_path) -> None
     try:
         for data in (good[:-8], b"", b"\x80\x04N.", b"PK\x03\x04" + good):
             path.write_bytes(data)
-            with pytest.raises(FormatError, match="S001.offsets.npy: no offsets") as caught:
+            with pytest.raises(FormatError, match=r"S001\.offsets\.npy: not? offsets") as caught:
                 ShardSource(root).read(0)
             assert "\n" not in str(caught.value)
             assert any("SHA-256 differs" in fault for fault in verify(root))
@@ -81,7 +81,7 @@ def test_offsets_are_stored_once_a_subject_and_checked(packed, tmp_path) -> None
         with pytest.raises(FormatError, match=r"float64 \(5, 3\), expected float32 \(V, 3\)"):
             reader.offsets("S001")
         path.unlink()
-        with pytest.raises(FormatError, match="no offsets .*No such file"):
+        with pytest.raises(FormatError, match="not offsets .*No such file"):
             ShardSource(root).read(0)
     finally:
         path.write_bytes(good)

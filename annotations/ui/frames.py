@@ -135,7 +135,7 @@ class FrameCache:
 
 def _plain(shot: Shot, error: Exception) -> str:
     where = f"{shot.subject} {shot.camera} frame {shot.frame}"
-    if isinstance(error, FileNotFoundError):
+    if isinstance(error, FileNotFoundError) or isinstance(error.__cause__, FileNotFoundError):
         return f"{where}: its proxies are missing; run 'express50 ingest' again"
     return f"{where} cannot be read: {error}"
 
