@@ -16,9 +16,11 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 
+import numpy as np
 import torch
 
 from express50.head.load import load_head
+from express50.transforms import look_at
 from grmm.model import GRMM, HeadState, View
 from grmm.presets import preset
 from grmm.render import orbit
@@ -52,9 +54,9 @@ def scene(device: torch.device, n_g: int, size: int) -> tuple[GRMM, HeadState, V
     height = float(head.template[:, 1].max() - head.template[:, 1].min())
     focal = FILL * size * DISTANCE_M / height
     K = torch.tensor([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1]], dtype=torch.float64)
-    camera = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
-    camera[:3, 3] = -camera[:3, :3] @ model.head_centre.cpu().double()
-    camera[2, 3] += DISTANCE_M
+    centre = model.head_centre.cpu().double().numpy()
+    pose = look_at(centre + [0.0, 0.0, DISTANCE_M], centre, np.array([0.0, 1.0, 0.0]))
+    camera = torch.from_numpy(pose)
     return (
         model,
         state,

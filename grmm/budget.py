@@ -43,6 +43,6 @@ def choose(seconds: float, measured: Path = MEASURED) -> Choice:
     """
     if not seconds > 0:
         raise ConfigError(f"budget is {seconds} s, expected more than 0, such as 4m")
-    rows = sorted(json.loads(measured.read_text(encoding="utf-8")), key=lambda r: r["budget_s"])
-    return Choice(**max((r for r in rows if r["budget_s"] <= seconds), default=rows[0],
-                        key=lambda r: r["budget_s"]))  # fmt: skip
+    rows = sorted(json.loads(measured.read_text("utf-8")), key=lambda row: row["budget_s"])
+    fitting = [row for row in rows if row["budget_s"] <= seconds]
+    return Choice(**(fitting or rows[:1])[-1])

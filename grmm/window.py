@@ -13,10 +13,10 @@ import torch
 from torch import Tensor
 
 from grmm.model import GRMM, Gaussians, Rendering, View
+from grmm.rasterize.projection import ALPHA_MIN
 
 WINDOW_STEP = 32  # pixels; windows have sides of whole steps
-VISIBLE_ALPHA = 1 / 255  # the rasteriser blends nothing fainter
-NEAR_M = 1e-2  # as the rasteriser's
+NEAR_M = 1e-2  # the rasteriser's default
 
 
 def draw_window(
@@ -78,8 +78,8 @@ def gaussian_window(
         camera = view.cam_from_head.to(gaussians.means.dtype)
         points = gaussians.means @ camera[:3, :3].T + camera[:3, 3]
         reach = gaussians.scales_mm.amax(1).mul(1e-3).clamp(*bounds_m)
-        sigmas = (gaussians.opacities / VISIBLE_ALPHA).clamp_min(1.0).log().mul(2).sqrt()
-        seen = (points[:, 2] > NEAR_M) & (gaussians.opacities > VISIBLE_ALPHA)
+        sigmas = (gaussians.opacities / ALPHA_MIN).clamp_min(1.0).log().mul(2).sqrt()
+        seen = (points[:, 2] > NEAR_M) & (gaussians.opacities > ALPHA_MIN)
         points, radius = points[seen], (reach * sigmas)[seen]
         if not len(points):
             return slice(0, view.height), slice(0, view.width)

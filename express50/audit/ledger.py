@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import sqlite3
 import time
-from contextlib import closing
 from pathlib import Path
 
 from express50.errors import FormatError
@@ -17,14 +15,12 @@ def ledger_fault(dataset: Dataset) -> str:
     if not dataset.ledger.is_file():
         return "is not there; without it every output counts as made by nobody"
     try:
-        with Ledger(dataset.ledger):
-            pass
-        with closing(sqlite3.connect(dataset.ledger)) as database:
-            said = database.execute("PRAGMA integrity_check(1)").fetchone()[0]
-            rows = database.execute("SELECT metrics FROM receipts").fetchall()
-    except (FormatError, sqlite3.DatabaseError) as error:
-        return f"cannot be read ({str(error).split(';')[0].split(': ', 1)[-1]})"
-    return "" if said == "ok" and rows is not None else f"is damaged ({said})"
+        # Not read-only: such a connection leaves journals behind that it may not remove.
+        with Ledger(dataset.ledger) as ledger:
+            ledger.check_whole()
+    except FormatError as error:  # what to do about it, `--mend` knows better
+        return str(error).removeprefix(f"{dataset.ledger}: ").split(";")[0]
+    return ""
 
 
 def set_ledger_aside(dataset: Dataset) -> Path:
