@@ -41,7 +41,7 @@ SETTINGS: dict[str, tuple[Changes, int]] = {  # name -> changes of tables, pixel
     "n_g by pixels": ({"model": {"n_g": 0}}, 1),
     "no refinement": ({"model": {"refine_widths": []}}, 1),
     "n_g 256, no refinement": ({"model": {"n_g": 256, "refine_widths": []}}, 1),
-    "refinement at a quarter": ({"model": {"refine_unshuffle": 4}}, 1),
+    "refinement at half": ({"model": {"refine_unshuffle": 2}}, 1),
     "half the pixels a side": ({}, 2),
     "bfloat16": ({"model": {"precision": "bfloat16"}}, 1),
     "averaged weights": ({"train": {"ema": 0.99}}, 1),

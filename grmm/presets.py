@@ -56,7 +56,7 @@ PRESETS: dict[str, dict[str, dict[str, Any]]] = {
             "mesh_width": 48,
             "film_width": 32,
             "refine_widths": (24, 32, 48),
-            "refine_unshuffle": 2,
+            "refine_unshuffle": 4,
             "identity_modes": 8,
             "frame": "tangent",
             "opacity_init": 0.8,

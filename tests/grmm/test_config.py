@@ -1,7 +1,9 @@
 import pytest
+import torch
 
 from express50.errors import ConfigError
 from grmm.presets import PRESETS, as_tables, from_tables, preset, resolve
+from grmm.refine import Refinement
 
 
 def test_paper_preset_has_the_papers_numbers():
@@ -15,6 +17,15 @@ def test_paper_preset_has_the_papers_numbers():
     assert (config.fit.locality, config.fit.locality_t) == (0.1, 0.3)
     assert model.scale_bounds_mm == (0.1, 10.0)
     assert (model.frame, model.identity_modes, model.refine_unshuffle) == ("head", 0, 1)
+
+
+def test_the_demos_refinement_sees_a_quarter_of_the_size():
+    model = preset("demo").model
+    net = Refinement(inputs=4, widths=model.refine_widths, unshuffle=model.refine_unshuffle)
+    sizes = []
+    net.enter.register_forward_hook(lambda _, given, out: sizes.append(given[0].shape[2:]))
+    assert net(torch.rand(4, 64, 96)).shape == (3, 64, 96)
+    assert sizes == [(64 // 4, 96 // 4)]
 
 
 @pytest.mark.parametrize("name", PRESETS)
