@@ -6,7 +6,6 @@ import pytest
 import torch
 
 from express50.errors import FormatError, TrainError
-from grmm import checkpoint as checkpoint_module
 from grmm.checkpoint import load_checkpoint
 from grmm.data import HeadViews
 from grmm.edit import interpolate_tracked, trained_head, transfer
@@ -23,6 +22,8 @@ from grmm.train import train
 from grmm.warm_start import spread_change
 from tests.grmm.synthetic import EllipsoidSource, ellipsoid_head, tiny_config
 
+pytestmark = pytest.mark.usefixtures("toy_head")
+
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory):
@@ -30,11 +31,6 @@ def trained(tmp_path_factory):
     out = tmp_path_factory.mktemp("run")
     train(EllipsoidSource(size=32), ellipsoid_head(), out, tiny_config(train={"iterations": 8}))
     return out / "checkpoint.pt"
-
-
-@pytest.fixture(autouse=True)
-def toy_head(monkeypatch):
-    monkeypatch.setattr(checkpoint_module, "load_head", lambda spec: ellipsoid_head())
 
 
 @pytest.fixture

@@ -8,7 +8,6 @@ import pytest
 import torch
 
 from express50.errors import ConfigError
-from grmm import checkpoint as checkpoint_module
 from grmm.checkpoint import load_checkpoint
 from grmm.data import HeadViews
 from grmm.model import GRMM
@@ -17,15 +16,7 @@ from grmm.run import prepare, set_rates, settle
 from grmm.train import train
 from tests.grmm.synthetic import EllipsoidSource, ellipsoid_head, tiny_config
 
-
-@pytest.fixture(autouse=True)
-def toy_head(monkeypatch):
-    monkeypatch.setattr(checkpoint_module, "load_head", lambda spec: ellipsoid_head())
-
-
-@pytest.fixture(scope="module")
-def source():
-    return EllipsoidSource(size=32)
+pytestmark = pytest.mark.usefixtures("toy_head")
 
 
 def test_averaged_weights_are_the_running_mean(source):

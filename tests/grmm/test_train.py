@@ -6,7 +6,6 @@ import pytest
 import torch
 
 from express50.errors import ConfigError, FormatError, TrainError
-from grmm import checkpoint as checkpoint_module
 from grmm.checkpoint import load_checkpoint
 from grmm.data import HeadViews
 from grmm.evaluate import evaluate, summarise, training_render, write_evaluation
@@ -16,15 +15,7 @@ from grmm.train import train
 from grmm.warm_start import fill_texels, project_texture, warm_start
 from tests.grmm.synthetic import EllipsoidSource, ellipsoid_head, tiny_config
 
-
-@pytest.fixture(autouse=True)
-def toy_head(monkeypatch):
-    monkeypatch.setattr(checkpoint_module, "load_head", lambda spec: ellipsoid_head())
-
-
-@pytest.fixture(scope="module")
-def source():
-    return EllipsoidSource(size=32)
+pytestmark = pytest.mark.usefixtures("toy_head")
 
 
 def state_of(path):
@@ -119,8 +110,7 @@ def test_interrupt_leaves_a_checkpoint_to_resume(tmp_path, source, monkeypatch):
     with pytest.raises(KeyboardInterrupt):
         train(source, ellipsoid_head(), tmp_path, tiny_config(train={"iterations": 5}))
     assert state_of(tmp_path)["loop"]["iteration"] == 3
-    monkeypatch.undo()
-    monkeypatch.setattr(checkpoint_module, "load_head", lambda spec: ellipsoid_head())
+    monkeypatch.setattr(module, "step", real)
     config = tiny_config(train={"iterations": 5})
     assert train(source, ellipsoid_head(), tmp_path, config, resume=True)["iterations"] == 5
 
