@@ -17,6 +17,7 @@ from grmm.rasterize.projection import ALPHA_MIN
 
 WINDOW_STEP = 32  # pixels; windows have sides of whole steps
 NEAR_M = 1e-2  # the rasteriser's default
+NEAR_VERTEX_M = 1e-3
 
 
 def draw_window(
@@ -75,25 +76,13 @@ def gaussian_window(
     under a level of 8 bits; the whole image where none is in view.
     """
     with torch.no_grad():
-        camera = view.cam_from_head.to(gaussians.means.dtype)
-        points = gaussians.means @ camera[:3, :3].T + camera[:3, 3]
-        reach = gaussians.scales_mm.amax(1).mul(1e-3).clamp(*bounds_m)
+        visible = gaussians.opacities > ALPHA_MIN
+        largest = gaussians.scales_mm.amax(1).mul(1e-3).clamp(*bounds_m)
         sigmas = (gaussians.opacities / ALPHA_MIN).clamp_min(1.0).log().mul(2).sqrt()
-        seen = (points[:, 2] > NEAR_M) & (gaussians.opacities > ALPHA_MIN)
-        points, radius = points[seen], (reach * sigmas)[seen]
-        if not len(points):
-            return slice(0, view.height), slice(0, view.width)
-        K = view.K.to(points.dtype)
-        # A sphere off the axis projects to a longer ellipse: by 1 / cosine of its angle.
-        ray = points[:, :2] / points[:, 2:]
-        stretch = 1 + (ray**2).sum(1)
         extra = margin_px + 2.0  # the rasteriser's blur (variance 0.3) reaches under two pixels
-        spans = []
-        for axis, size in ((1, view.height), (0, view.width)):
-            centre = K[axis, axis] * ray[:, axis] + K[axis, 2]
-            wide = K[axis, axis] * radius / points[:, 2] * stretch + extra
-            spans.append(_span(float((centre - wide).min()), float((centre + wide).max()), size))
-    return spans[0], spans[1]
+        reach = (largest * sigmas)[visible]
+        columns, rows = _extents(gaussians.means[visible], reach, view, NEAR_M, extra)
+    return _span(*rows, view.height), _span(*columns, view.width)
 
 
 def head_window(
@@ -104,19 +93,45 @@ def head_window(
     Sizes are rounded up to WINDOW_STEP where the image allows, so that few sizes occur: every new
     size costs convolutions their set-up.
     """
-    camera, K = view.cam_from_head.to(vertices.dtype), view.K.to(vertices.dtype)
-    points = vertices @ camera[:3, :3].T + camera[:3, 3]
-    front = points[points[:, 2] > 1e-3]
-    pixels = (front[:, :2] / front[:, 2:]) @ K[:2, :2].T + K[:2, 2]  # (M, 2) as (x, y)
+    extents = _extents(vertices, vertices.new_zeros(len(vertices)), view, NEAR_VERTEX_M)
     spans = []
     for axis, size in ((1, view.height), (0, view.width)):
         matte = np.flatnonzero((alpha > 0).any(axis=axis))
-        ends = [*matte[[0, -1]].tolist()] if len(matte) else []
-        if len(pixels):
-            ends += [float(pixels[:, axis].min()), float(pixels[:, axis].max())]
-        low, high = (min(ends), max(ends)) if ends else (0, size)
+        low, high = extents[axis]
+        if len(matte):
+            low, high = min(low, float(matte[0])), max(high, float(matte[-1]))
         spans.append(_span(low - margin_px, high + 1 + margin_px, size))
     return spans[0], spans[1]
+
+
+def _extents(
+    points: Tensor, radii: Tensor, view: View, near_m: float, margin_px: float = 0.0
+) -> tuple[tuple[float, float], tuple[float, float]]:
+    """From where to where spheres reach, pixels: along x, then y; (inf, -inf) where none is seen.
+
+    Args:
+        points: (N, 3) centres, head space, metres.
+        radii: (N,) metres.
+        view: the camera.
+        near_m: points nearer than this, or behind the camera, are not seen.
+        margin_px: added on all sides.
+    """
+    camera, K = view.cam_from_head.to(points.dtype), view.K.to(points.dtype)
+    points = points @ camera[:3, :3].T + camera[:3, 3]
+    seen = points[:, 2] > near_m
+    points, radii = points[seen], radii[seen]
+    if not len(points):
+        return (math.inf, -math.inf), (math.inf, -math.inf)
+    # A sphere off the axis projects to a longer ellipse: by 1 / cosine of its angle.
+    ray = points[:, :2] / points[:, 2:]
+    stretch = 1 + (ray**2).sum(1)
+
+    def ends(axis: int) -> tuple[float, float]:
+        centre = K[axis, axis] * ray[:, axis] + K[axis, 2]
+        wide = K[axis, axis] * radii / points[:, 2] * stretch + margin_px
+        return float((centre - wide).min()), float((centre + wide).max())
+
+    return ends(0), ends(1)
 
 
 def _span(low: float, high: float, size: int) -> slice:

@@ -122,6 +122,17 @@ def test_window_of_a_head_outside_the_image_is_the_image(views):
     assert (rows, columns) == (slice(0, 64), slice(0, 64))
 
 
+def test_window_of_a_head_behind_the_camera_holds_the_matte(views):
+    item = views.item(0)
+    behind = item.view.cam_from_head.clone()
+    behind[2, 3] = -5.0
+    alpha = np.zeros((64, 64), np.uint8)
+    alpha[40:44, 10:30] = 255
+    view = replace(item.view, cam_from_head=behind)
+    rows, columns = head_window(item.state.vertices, view, alpha, 2)
+    assert (rows, columns) == (slice(26, 58), slice(4, 36))
+
+
 def test_crop_moves_the_principal_point(views):
     view = crop_view(views.item(0).view, slice(3, 20), slice(5, 40))
     whole = views.item(0).view
