@@ -16,13 +16,9 @@ from express50.head.model import HeadModel
 from express50.torch_transforms import matrix_to_quat
 from grmm.anchors import interpolate, make_anchors, tangent_frames, uv_gradients
 from grmm.config import ModelConfig
-from grmm.decoders import Ladder
-from grmm.mesh_decoder import MeshDecoder
+from grmm.networks import Networks
 from grmm.rasterize import rasterize
-from grmm.refine import Refinement, normalise_depth
-
-FEATURE_STD = 0.3  # of features before training; silent in the paper
-CODE_STD = 0.01  # of codes before training; silent in the paper, DeepSDF's habit (survey point 13)
+from grmm.refine import normalise_depth
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -119,8 +115,8 @@ class Rendering:
     gaussians: Gaussians
 
 
-class GRMM(nn.Module):
-    """The morphable model: decoders, refinement, and tables of codes of the training set."""
+class GRMM(Networks):
+    """The morphable model: its networks and codes on the UV map of a head."""
 
     def __init__(
         self,
@@ -130,54 +126,10 @@ class GRMM(nn.Module):
         expressions: Sequence[str],
     ) -> None:
         """Build for a head model; subjects and expressions name the rows of the code tables."""
-        super().__init__()
-        self.config = config
+        super().__init__(config, head, len(subjects), len(expressions))
         self.subjects, self.expressions = tuple(subjects), tuple(expressions)
         self.anchors = make_anchors(head, config.n_g, config.mouth)
         self._add_anchor_buffers(head)
-        self.z_id = nn.Parameter(CODE_STD * torch.randn(len(subjects), config.z_id))
-        self.z_exp = nn.Parameter(CODE_STD * torch.randn(len(expressions), config.z_exp))
-        self.mesh = None
-        if config.mesh_decoder:
-            self.mesh = MeshDecoder(
-                z_id=config.z_id,
-                z_exp=config.z_exp,
-                coefficients=len(head.expression_names),
-                teeth=head.regions["teeth"],
-                shared_widths=config.shared_widths,
-                film_width=config.film_width,
-                head_width=config.mesh_width,
-                displacement_scale=config.displacement_scale,
-            )
-        both = config.z_id + config.z_exp
-        self.transform = self._ladder(both, 10)
-        self.opacity = self._ladder(both if config.opacity_from_expression else config.z_id, 1)
-        self.colour = self._ladder(config.z_id, 3 + config.features, config.view_channels, 3)
-        with torch.no_grad():
-            self.opacity.bias.fill_(_logit(config.opacity_init))
-            # Features tell texels apart to the refinement: from all zeros it learns slowly.
-            self.colour.bias[3:].normal_(0, FEATURE_STD)
-        self.refinement = None
-        if config.refine_widths:
-            self.refinement = Refinement(
-                inputs=3 + config.features + 1 + config.refine_alpha,
-                widths=config.refine_widths,
-                unshuffle=config.refine_unshuffle,
-            )
-
-    def _ladder(
-        self, code: int, outputs: int, view_channels: int = 0, mode_outputs: int | None = None
-    ) -> Ladder:
-        return Ladder(
-            code=code,
-            outputs=outputs,
-            n_g=self.config.n_g,
-            seed_channels=self.config.seed_channels,
-            widths=self.config.ladder,
-            modes=self.config.identity_modes,
-            mode_outputs=mode_outputs,
-            view_channels=view_channels,
-        )
 
     def _add_anchor_buffers(self, head: HeadModel) -> None:
         """Constants of the head model: rebuilt from it, so they are not in the state dict."""
@@ -387,7 +339,3 @@ def quat_multiply(a: Tensor, b: Tensor) -> Tensor:
 
 def _to_length(values: Tensor, length: int) -> Tensor:
     return nn.functional.pad(values[:length], (0, max(0, length - len(values))))
-
-
-def _logit(probability: float) -> float:
-    return float(torch.logit(torch.tensor(probability, dtype=torch.float64)))
