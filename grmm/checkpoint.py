@@ -15,12 +15,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from express50.errors import FormatError
+from express50.checks import PIXEL_LIMIT, check_shape
+from express50.errors import ConfigError, FormatError, HeadModelError
 from express50.head.load import load_head
 from express50.head.model import HeadModel
 from express50.publish import write_bytes
-from express50.weights import read_weights
-from grmm.config import Config
+from express50.reading import reason
+from express50.weights import AtMost, read_weights
+from grmm.config import Config, ModelConfig
 from grmm.data import NO_OFFSETS, HeadViews, Tracked, pose_state
 from grmm.model import GRMM, HeadState, View
 from grmm.presets import as_tables, from_tables
@@ -131,60 +133,84 @@ def load_checkpoint(path: Path, device: torch.device | str = "cpu") -> Loaded:
     """Read a checkpoint and build its model.
 
     Raises:
-        FormatError: no such file, or not a checkpoint of this format.
+        FormatError: no such file, not a checkpoint of this format, or one whose weights are not
+            those of its configuration.
     """
     content = read_content(path)
     try:
         return _loaded(path, content, device)
-    except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
+    except (KeyError, TypeError, ValueError, IndexError, AttributeError, ArithmeticError) as error:
         words = f"{type(error).__name__}: {error}"
         raise FormatError(f"{path}: not a whole checkpoint ({words}); copy it again") from error
 
 
 def _loaded(path: Path, content: dict[str, Any], device: torch.device | str) -> Loaded:
     """The checkpoint of a file's content, each number of it finite."""
-    config = from_tables(content["config"])
+    try:
+        config = from_tables(content["config"])
+    except ConfigError as error:
+        raise FormatError(f"{path}: its configuration: {error}; copy it again") from None
     _check_finite(path, content["model"])
     head = load_head(content["head"]).to(device)
-    offsets = _arrays(content.get("offsets", {}))
-    _check_finite(path, content.get("offsets", {}))
-    for frame in content["frames"]:
-        _check_finite(path, frame["parameters"])
-    for camera in content["cameras"].values():
-        _check_finite(path, {name: camera[name] for name in ("K", "cam_from_head")})
-    model = GRMM(config.model, head, content["subjects"], content["expressions"]).to(device)
-    try:
-        model.load_state_dict(content["model"])
-    except RuntimeError as error:
-        raise FormatError(
-            f"{path}: the weights do not fit head model {content['head']!r} as it is here now; "
-            "use the version that the model was trained with"
-        ) from error
+    model = _build(path, config.model, head, content).to(device)
     return Loaded(
         config=config,
         head_spec=content["head"],
         head=head,
         model=model,
-        gallery=Gallery(
-            frames={
-                (frame["subject"], frame["expression_id"]): Tracked(
-                    **_arrays(frame["parameters"]),
-                    offsets=offsets.get(frame["subject"], NO_OFFSETS),
-                )
-                for frame in content["frames"]
-            },
-            cameras={
-                name: View(
-                    K=camera["K"].to(device),
-                    cam_from_head=camera["cam_from_head"].to(device),
-                    width=camera["width"],
-                    height=camera["height"],
-                )
-                for name, camera in content["cameras"].items()
-            },
-        ),
+        gallery=_gallery(path, content, device),
         optimizer=content["optimizer"],
         loop=content["loop"],
+    )
+
+
+def _build(path: Path, config: ModelConfig, head: HeadModel, content: dict[str, Any]) -> GRMM:
+    """The model of a file's content, in no more memory than its weights take there."""
+    weights = content["model"]
+    try:
+        with AtMost(sum(tensor.numel() for tensor in weights.values())):
+            model = GRMM(config, head, content["subjects"], content["expressions"])
+        model.load_state_dict(weights)
+    except (HeadModelError, RuntimeError, ValueError, TypeError, ArithmeticError) as error:
+        raise FormatError(
+            f"{path}: its weights do not fit its configuration and head model {content['head']!r} "
+            f"as it is here now ({reason(error)}); use the version that the model was trained "
+            "with, or copy it again"
+        ) from None
+    return model
+
+
+def _gallery(path: Path, content: dict[str, Any], device: torch.device | str) -> Gallery:
+    """Frames and cameras of a file's content."""
+    offsets = _arrays(content.get("offsets", {}))
+    _check_finite(path, content.get("offsets", {}))
+    frames = {}
+    for frame in content["frames"]:
+        _check_finite(path, frame["parameters"])
+        frames[frame["subject"], frame["expression_id"]] = Tracked(
+            **_arrays(frame["parameters"]), offsets=offsets.get(frame["subject"], NO_OFFSETS)
+        )
+    cameras = {name: _camera(path, name, row, device) for name, row in content["cameras"].items()}
+    return Gallery(frames=frames, cameras=cameras)
+
+
+def _camera(path: Path, name: str, row: dict[str, Any], device: torch.device | str) -> View:
+    """One camera, of a size that an image may have."""
+    matrices = {"K": row["K"], "cam_from_head": row["cam_from_head"]}
+    _check_finite(path, matrices)
+    check_shape("K", row["K"], (3, 3), f"camera {name}")
+    check_shape("cam_from_head", row["cam_from_head"], (4, 4), f"camera {name}")
+    width, height = size = row["width"], row["height"]
+    if not all(type(n) is int and n > 0 for n in size) or width * height > PIXEL_LIMIT:
+        raise FormatError(
+            f"{path}: camera {name}: size {size}, expected two positive whole numbers of pixels, "
+            f"together at most {PIXEL_LIMIT}; copy it again"
+        )
+    return View(
+        K=row["K"].to(device),
+        cam_from_head=row["cam_from_head"].to(device),
+        width=width,
+        height=height,
     )
 
 

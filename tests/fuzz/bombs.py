@@ -42,6 +42,7 @@ from express50.video import iterate_video
 from express50.weights import read_weights
 from grmm.ply import read_ply
 from pipelines.depth.warm import read_surface
+from tests.fuzz.checkpoints import checkpoint_bombs
 
 Case = tuple[str, Callable[[], object]]
 
@@ -49,7 +50,8 @@ Case = tuple[str, Callable[[], object]]
 def bombs(root: Path) -> Iterator[Case]:
     """Name and reading of every such file, written below a folder that holds the seeds."""
     (root / "bombs").mkdir()
-    for part in (_pictures, _arrays, _pickles, _texts, _containers, _names):
+    parts = (_pictures, _arrays, _pickles, checkpoint_bombs, _texts, _containers, _names)
+    for part in parts:
         yield from part(root, root / "bombs")
 
 

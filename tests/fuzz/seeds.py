@@ -241,7 +241,7 @@ def _meta(root: Path) -> object:
     return source.read(0), source.window(0)
 
 
-def _checkpoint(root: Path) -> object:
+def read_checkpoint(root: Path) -> object:
     import grmm.checkpoint as module
     from tests.grmm.synthetic import ellipsoid_head
 
@@ -393,7 +393,7 @@ def readers() -> Iterator[Reader]:
     yield Reader("shards manifest", "shards/manifest.json", _verified)
     yield Reader("shard meta.json", "meta.json", _meta)
     yield Reader("shard tar, withdrawn", "shards/train-000000.tar", _searched)
-    yield Reader("checkpoint.pt", "checkpoint.pt", _checkpoint)
+    yield Reader("checkpoint.pt", "checkpoint.pt", read_checkpoint)
     yield Reader("VGG weights", "vgg.pth", _vgg)
     yield Reader("TorchScript", "matte.pt", _network, native=True)
     yield Reader("index.json", f"{index}/index.json", lambda r: read_index(dataset(r), "S001"))
