@@ -29,9 +29,10 @@ from express50.work import peak_memory
 from grmm.ablate import ablate
 from grmm.checkpoint import Loaded, load_checkpoint
 from grmm.config import Config
-from grmm.data import HeadViews, spread
+from grmm.data import HeadViews
 from grmm.edit import trained_head
 from grmm.evaluate import evaluate, mean, training_render
+from grmm.order import spread
 from grmm.presets import resolve
 from grmm.render import around, frontal, orbit, picture, resized
 from grmm.run import prepare

@@ -25,9 +25,10 @@ from benchmarks.grmm import held_out
 from express50.head.load import load_head
 from express50.publish import write_json
 from grmm.config import Config
-from grmm.data import HeadViews, Key, Sample, Source, spread
+from grmm.data import HeadViews, Key, Sample, Source
 from grmm.evaluate import evaluate, mean, training_render
 from grmm.objective import step
+from grmm.order import spread
 from grmm.presets import as_tables, from_tables, resolve
 from grmm.run import finished, prepare, set_rates, settle
 from grmm.shard_source import open_shards

@@ -20,9 +20,10 @@ from express50.reading import read_json_table
 from grmm.ablation_table import GROUPS, SHOWN, Variant, variants_of, write_tables
 from grmm.checkpoint import Loaded, load_checkpoint
 from grmm.config import Config
-from grmm.data import HeadViews, spread
+from grmm.data import HeadViews
 from grmm.evaluate import evaluate, kind_of, mean, training_render
 from grmm.judge import Judge
+from grmm.order import spread
 from grmm.presets import as_tables, from_tables
 from grmm.progress import log
 from grmm.run import settle

@@ -1,8 +1,7 @@
 """Training data: packed samples -> tensors in canonical head space.
 
 Geometry is not stored with the samples: the tracked mesh v_rec is posed from head-model
-parameters once per (subject, expression) and kept. The order of samples is a pure function of
-(seed, epoch, position), so that a resumed run goes on exactly where it stopped.
+parameters once per (subject, expression) and kept.
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from express50.errors import FormatError, TrainError
+from express50.errors import FormatError
 from express50.head.model import HeadModel, pose
 from grmm.model import HeadState, View
 from grmm.torso import labelled_torso, torso_mask
@@ -296,48 +295,3 @@ def _bytes(sample: Sample) -> int:
     depth = 0 if sample.depth is None else sample.depth.nbytes
     parts = 0 if sample.parts is None else sample.parts.nbytes
     return sample.image.nbytes + sample.alpha.nbytes + depth + parts
-
-
-class Shuffle:
-    """Endless shuffled order over ``indices``; its state is (epoch, position)."""
-
-    def __init__(self, indices: Sequence[int], seed: int, rank: int = 0, world: int = 1) -> None:
-        """Rank ``rank`` of ``world`` processes takes every world-th entry of the common order."""
-        if not indices:
-            raise TrainError("no samples to train on; check the split and the held-out cameras")
-        self.indices, self.seed, self.rank, self.world = list(indices), seed, rank, world
-        self.epoch, self.position = 0, 0
-        self._order = self._permutation()
-
-    def _permutation(self) -> np.ndarray:
-        return np.random.default_rng([self.seed, self.epoch]).permutation(self.indices)
-
-    def next(self) -> int:
-        """Index of this rank's next sample."""
-        taken = None
-        for rank in range(self.world):
-            if self.position == len(self._order):
-                self.epoch, self.position = self.epoch + 1, 0
-                self._order = self._permutation()
-            if rank == self.rank:
-                taken = int(self._order[self.position])
-            self.position += 1
-        assert taken is not None
-        return taken
-
-    def state(self) -> dict[str, int]:
-        """What `restore` needs."""
-        return {"epoch": self.epoch, "position": self.position}
-
-    def restore(self, state: dict[str, int]) -> None:
-        """Go on after the sample that was taken last when ``state`` was saved."""
-        self.epoch, self.position = state["epoch"], state["position"]
-        self._order = self._permutation()
-
-
-def spread(indices: Sequence[int], count: int) -> list[int]:
-    """At most ``count`` of the indices, evenly chosen (first and last included)."""
-    if len(indices) <= count:
-        return list(indices)
-    steps = np.linspace(0, len(indices) - 1, count).round().astype(int)
-    return [indices[i] for i in steps]

@@ -23,12 +23,13 @@ from express50.publish import write_json
 from grmm import losses
 from grmm.checkpoint import Loaded
 from grmm.config import FitConfig, LossConfig
-from grmm.data import HeadViews, Item, Shuffle
+from grmm.data import HeadViews, Item
 from grmm.evaluate import Render, evaluate, mean
 from grmm.fit_checkpoint import save_fit
 from grmm.judge import Judge
 from grmm.locality import locality_loss, random_camera, reconstruction
 from grmm.model import GRMM, Rendering
+from grmm.order import Shuffle
 from grmm.perceptual import load_vgg
 from grmm.progress import log
 from grmm.render import comparison_sheet

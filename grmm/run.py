@@ -15,8 +15,9 @@ from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 from express50.errors import ConfigError, TrainError
 from grmm import losses
 from grmm.config import Config
-from grmm.data import HeadViews, Key, Shuffle, spread
+from grmm.data import HeadViews, Key
 from grmm.model import GRMM
+from grmm.order import Shuffle, spread
 from grmm.perceptual import load_vgg
 
 COVERED_TEXELS = 0.75  # of a map that head models' layouts use

@@ -6,9 +6,9 @@ from pathlib import Path
 
 from express50.publish import write_json
 from grmm.config import Config
-from grmm.data import spread
 from grmm.evaluate import evaluate, mean, training_render
 from grmm.judge import Judge
+from grmm.order import spread
 from grmm.render import comparison_sheet
 from grmm.run import Run
 

@@ -11,11 +11,12 @@ from torch import Tensor
 
 from express50.errors import ConfigError
 from grmm.checkpoint import Loaded
-from grmm.data import HeadViews, Item, spread
+from grmm.data import HeadViews, Item
 from grmm.evaluate import HELD_IDENTITY, Row, evaluate
 from grmm.fit import Fit, run_stages, start
 from grmm.judge import Judge
 from grmm.model import Rendering
+from grmm.order import spread
 
 NOVEL_VIEW = f"{HELD_IDENTITY}, novel view"
 NOVEL_EXPRESSION = f"{HELD_IDENTITY}, other expression"

@@ -95,7 +95,7 @@ def _split(
     loaded: Loaded, views: HeadViews, args: argparse.Namespace
 ) -> tuple[list[int], list[str]]:
     """Samples that training's codes can draw, and people to be fitted first."""
-    from grmm.data import spread
+    from grmm.order import spread
 
     chosen = select(views, args.subjects, args.expressions, args.cameras)
     people, expressions = loaded.model.subjects, loaded.model.expressions
@@ -154,9 +154,10 @@ def add_score(commands: argparse._SubParsersAction) -> None:
 def _score(args: argparse.Namespace) -> int:
     from express50.head.load import load_head
     from grmm.config import DataConfig, MetricsConfig
-    from grmm.data import HeadViews, spread
+    from grmm.data import HeadViews
     from grmm.evaluate import write_evaluation
     from grmm.judge import Judge
+    from grmm.order import spread
     from grmm.score import score
     from grmm.shard_source import ShardSource
 

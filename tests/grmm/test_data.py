@@ -5,7 +5,8 @@ import pytest
 import torch
 
 from express50.errors import FormatError, TrainError
-from grmm.data import HeadViews, Shuffle, pose_state, spread
+from grmm.data import HeadViews, pose_state
+from grmm.order import Shuffle, spread
 from tests.grmm.synthetic import STRETCH, EllipsoidSource, ellipsoid_head
 
 
