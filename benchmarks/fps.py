@@ -21,9 +21,10 @@ import torch
 
 from express50.head.load import load_head
 from express50.transforms import look_at
-from grmm.model import GRMM, HeadState, View
+from grmm.model import GRMM
 from grmm.presets import preset
 from grmm.render import orbit
+from grmm.scene import HeadState, View
 from grmm.window import draw_window
 
 PAPER_FPS, TARGET_FPS = 75, 200  # the paper's, and ours on one H200

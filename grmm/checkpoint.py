@@ -24,8 +24,9 @@ from express50.reading import reason
 from express50.weights import AtMost, read_weights
 from grmm.config import Config, ModelConfig
 from grmm.data import NO_OFFSETS, HeadViews, Tracked, pose_state
-from grmm.model import GRMM, HeadState, View
+from grmm.model import GRMM
 from grmm.presets import as_tables, from_tables
+from grmm.scene import HeadState, View
 
 FORMAT = "grmm.checkpoint/1"
 

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from express50.errors import FormatError
 from express50.head.model import HeadModel, pose
-from grmm.model import HeadState, View
+from grmm.scene import HeadState, View
 from grmm.torso import labelled_torso, torso_mask
 from grmm.window import crop_view, head_window
 

@@ -20,7 +20,7 @@ from express50.errors import ConfigError
 from express50.torch_transforms import axis_angle_to_quat, quat_to_axis_angle, slerp
 from grmm.checkpoint import Loaded
 from grmm.data import NO_OFFSETS, Tracked, pose_state
-from grmm.model import HeadState
+from grmm.scene import HeadState
 
 ANGLES = {"neck": 3, "jaw": 3, "eyes": 6}  # axis-angles by name, radians
 CODES = ("z_id", "z_exp")

@@ -22,7 +22,8 @@ from grmm.config import MetricsConfig
 from grmm.data import HeadViews, Item, Key
 from grmm.judge import Judge
 from grmm.metrics import psnr_db, rmse, ssim_score
-from grmm.model import GRMM, Rendering
+from grmm.model import GRMM
+from grmm.scene import Rendering
 
 Render = Callable[[Item], Rendering]
 Row = dict[str, str | float]

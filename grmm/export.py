@@ -13,8 +13,8 @@ from express50.errors import ConfigError
 from express50.publish import write_bytes
 from grmm.checkpoint import Loaded
 from grmm.edit import Head
-from grmm.model import View
 from grmm.ply import write_ply
+from grmm.scene import View
 
 OPAQUE = 0.3  # opacity under which a Gaussian is no point of a GLB: points cannot be translucent
 FORMATS = (".ply", ".glb", ".npz")

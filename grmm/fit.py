@@ -28,11 +28,12 @@ from grmm.evaluate import Render, evaluate, mean
 from grmm.fit_checkpoint import save_fit
 from grmm.judge import Judge
 from grmm.locality import locality_loss, random_camera, reconstruction
-from grmm.model import GRMM, Rendering
+from grmm.model import GRMM
 from grmm.order import Shuffle
 from grmm.perceptual import load_vgg
 from grmm.progress import log
 from grmm.render import comparison_sheet
+from grmm.scene import Rendering
 from grmm.warm_start import LOGIT_LIMIT, project_texture, spread_change
 
 

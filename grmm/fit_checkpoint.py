@@ -11,7 +11,8 @@ import torch
 
 from grmm.checkpoint import Gallery, collect_gallery, save_checkpoint
 from grmm.data import NO_OFFSETS, Tracked
-from grmm.model import GRMM, View
+from grmm.model import GRMM
+from grmm.scene import View
 
 if TYPE_CHECKING:
     from grmm.fit import Fit

@@ -11,8 +11,8 @@ from torch import Tensor
 from grmm import losses
 from grmm.data import Item, Tracked, pose_state
 from grmm.edit import interpolate_tracked
-from grmm.model import HeadState, View
 from grmm.perceptual import random_crop
+from grmm.scene import HeadState, View
 
 if TYPE_CHECKING:
     from grmm.fit import Fit

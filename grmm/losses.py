@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from grmm.config import LossConfig
-from grmm.model import Rendering
+from grmm.scene import Rendering
 
 SSIM_WINDOW, SSIM_SIGMA = 11, 1.5
 SSIM_C1, SSIM_C2 = 0.01**2, 0.03**2

@@ -9,9 +9,9 @@ from express50.errors import TrainError
 from grmm import losses
 from grmm.config import Config
 from grmm.data import Item
-from grmm.model import Rendering, View
 from grmm.perceptual import random_crop
 from grmm.run import Run
+from grmm.scene import Rendering, View
 
 
 def step(run: Run, parallel: torch.nn.Module, config: Config) -> None:

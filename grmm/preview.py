@@ -17,8 +17,8 @@ from torch import Tensor
 
 from grmm.checkpoint import Loaded
 from grmm.edit import Head
-from grmm.model import Gaussians, HeadState, Maps, View
 from grmm.render import drawn, to_uint8
+from grmm.scene import Gaussians, HeadState, Maps, View
 
 SLOW_SECONDS = 0.04  # colours that take longer are not decoded while the camera moves
 TURN_DEGREES = 1.5  # under this the eye sees no other colours

@@ -18,7 +18,7 @@ from grmm.checkpoint import Loaded
 from grmm.data import HeadViews
 from grmm.edit import Head, between, trained_head
 from grmm.evaluate import Render
-from grmm.model import Gaussians, Rendering, View
+from grmm.scene import Gaussians, Rendering, View
 from grmm.window import draw_window
 
 VIDEO_RATE = 24  # frames a second, as the rig's

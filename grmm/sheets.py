@@ -16,8 +16,8 @@ from grmm.edit import (
     trained_head,
     transfer,
 )
-from grmm.model import View
 from grmm.render import picture
+from grmm.scene import View
 
 Sheet = tuple[list[list[np.ndarray]], list[str]]
 STEPS = (-1.0, -0.5, 0.0, 0.5, 1.0)

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from express50.head.model import HeadModel
 from express50.parts import TORSO
-from grmm.model import View
+from grmm.scene import View
 
 STAND_OFF_M = 0.025  # a point this far off the neck belongs to a shirt, or to hair upon it
 END_M = 0.01  # a point this far off the neck's lower end lies below it

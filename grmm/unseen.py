@@ -15,8 +15,8 @@ from grmm.data import HeadViews, Item
 from grmm.evaluate import HELD_IDENTITY, Row, evaluate
 from grmm.fit import Fit, run_stages, start
 from grmm.judge import Judge
-from grmm.model import Rendering
 from grmm.order import spread
+from grmm.scene import Rendering
 
 NOVEL_VIEW = f"{HELD_IDENTITY}, novel view"
 NOVEL_EXPRESSION = f"{HELD_IDENTITY}, other expression"

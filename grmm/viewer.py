@@ -21,9 +21,9 @@ from express50.console import stdout_to_stderr
 from express50.transforms import quat_to_matrix
 from grmm.checkpoint import Loaded
 from grmm.edit import Head, between, controlled, principal_directions, trained_head
-from grmm.model import View
 from grmm.preview import Preview
 from grmm.render import frontal
+from grmm.scene import View
 from grmm.sheets import strongest_coefficients
 
 REST_SECONDS = 0.35  # without a change, before the still picture is drawn

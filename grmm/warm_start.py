@@ -13,8 +13,9 @@ from torch import Tensor
 
 from grmm.anchors import tangent_frames
 from grmm.data import HeadViews, Item
-from grmm.model import GRMM, Gaussians
+from grmm.model import GRMM
 from grmm.order import spread
+from grmm.scene import Gaussians
 
 FACING = 0.25  # cosine of normal and view below which a texel is seen too obliquely
 OCCLUSION_M = 0.012  # a texel this far behind the rendered surface is hidden; hair is this thick

@@ -12,8 +12,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from grmm.model import GRMM, Gaussians, Rendering, View
+from grmm.model import GRMM
 from grmm.rasterize.projection import ALPHA_MIN
+from grmm.scene import Gaussians, Rendering, View
 
 WINDOW_STEP = 32  # pixels; windows have sides of whole steps
 NEAR_M = 1e-2  # the rasteriser's default

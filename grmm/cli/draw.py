@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
     from grmm.checkpoint import Loaded
     from grmm.edit import Head
-    from grmm.model import View
+    from grmm.scene import View
 
 
 def add_render(commands: argparse._SubParsersAction) -> None:

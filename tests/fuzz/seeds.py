@@ -207,7 +207,8 @@ def _write_shards(root: Path) -> None:
 def _write_networks(root: Path) -> None:
     from grmm.checkpoint import Gallery, save_checkpoint
     from grmm.data import Tracked
-    from grmm.model import GRMM, View
+    from grmm.model import GRMM
+    from grmm.scene import View
     from tests.grmm.synthetic import ellipsoid_head, tiny_config
 
     head, config = ellipsoid_head(), tiny_config()

@@ -4,10 +4,11 @@ import torch
 
 from grmm import losses
 from grmm.data import HeadViews
-from grmm.model import GRMM, View, initial_scales, quat_multiply
+from grmm.model import GRMM, initial_scales, quat_multiply
 from grmm.objective import objective, step
 from grmm.render import orbit
 from grmm.run import make_optimizer, prepare, set_rates
+from grmm.scene import View
 from tests.grmm.synthetic import EllipsoidSource, ellipsoid_head, tiny_config
 
 

@@ -7,9 +7,9 @@ import torch
 from express50.parts import TORSO
 from grmm.data import HeadViews
 from grmm.evaluate import evaluate
-from grmm.model import View
 from grmm.objective import objective
 from grmm.run import prepare
+from grmm.scene import View
 from grmm.torso import torso_mask
 from tests.grmm.synthetic import EllipsoidSource, ellipsoid_head, tiny_config
 
