@@ -6,7 +6,6 @@ import pytest
 import torch
 
 from express50.errors import ConfigError, FormatError, TrainError
-from grmm.checkpoint import load_checkpoint
 from grmm.data import HeadViews
 from grmm.evaluate import evaluate, summarise, training_render, write_evaluation
 from grmm.perceptual import LAYERS, VGGDistance, load_vgg, random_crop
@@ -177,49 +176,6 @@ def test_objective_that_is_not_finite_stops_with_the_sample_named(source, tmp_pa
 
     with pytest.raises(TrainError, match=r"iteration 0: the objective is not finite at Key"):
         train(Poisoned(size=32), ellipsoid_head(), tmp_path, tiny_config())
-
-
-def test_checkpoint_is_read_with_weights_only_and_damage_is_named(tmp_path):
-    path = tmp_path / "checkpoint.pt"
-    path.write_bytes(b"not a checkpoint")
-    with pytest.raises(FormatError, match="not a checkpoint"):
-        load_checkpoint(path)
-    torch.save({"format": "other/9"}, path)
-    with pytest.raises(FormatError, match="format is 'other/9'"):
-        load_checkpoint(path)
-
-
-@pytest.mark.parametrize(
-    ("key", "size", "message"),
-    [
-        ("n_g", 10**6, "a tensor .* is asked for, of [0-9]+ numbers in all"),
-        ("features", 10**6, "a tensor .* is asked for, of [0-9]+ numbers in all"),
-        ("shared_widths", [8] * 50_000, "a tensor 8 x 8 is asked for, of [0-9]+ numbers in all"),
-        ("n_g", 16, "size mismatch"),
-        ("n_g", 100, "model.n_g is 100, expected a multiple of 8"),
-        ("n_g", 0, "do not fit"),
-        ("z_exp", -1, "do not fit"),
-    ],
-)
-def test_a_configuration_that_the_weights_do_not_have_is_refused(
-    tmp_path, source, key, size, message
-):
-    train(source, ellipsoid_head(), tmp_path, tiny_config(train={"iterations": 1}))
-    content = state_of(tmp_path)
-    content["config"]["model"][key] = size
-    torch.save(content, tmp_path / "checkpoint.pt")
-    with pytest.raises(FormatError, match=f"checkpoint.pt: .*{message}"):
-        load_checkpoint(tmp_path / "checkpoint.pt")
-
-
-@pytest.mark.parametrize("size", [(0, 9), (9, 2.5), (10**6, 10**6)])
-def test_a_camera_of_no_images_size_is_refused(tmp_path, source, size):
-    train(source, ellipsoid_head(), tmp_path, tiny_config(train={"iterations": 1}))
-    content = state_of(tmp_path)
-    content["cameras"]["cam01"] |= {"width": size[0], "height": size[1]}
-    torch.save(content, tmp_path / "checkpoint.pt")
-    with pytest.raises(FormatError, match="camera cam01: size .*, expected two positive whole"):
-        load_checkpoint(tmp_path / "checkpoint.pt")
 
 
 def test_evaluation_is_written_as_table_and_means(tmp_path, source):

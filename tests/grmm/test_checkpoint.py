@@ -1,0 +1,57 @@
+"""Checkpoints that are no checkpoints, or not whole."""
+
+import pytest
+import torch
+
+from express50.errors import FormatError
+from grmm.checkpoint import load_checkpoint
+from grmm.train import train
+from tests.grmm.synthetic import ellipsoid_head, tiny_config
+
+pytestmark = pytest.mark.usefixtures("toy_head")
+
+
+@pytest.fixture
+def path(tmp_path, source):
+    """A checkpoint after one step."""
+    train(source, ellipsoid_head(), tmp_path, tiny_config(train={"iterations": 1}))
+    return tmp_path / "checkpoint.pt"
+
+
+def test_checkpoint_is_read_with_weights_only_and_damage_is_named(tmp_path):
+    path = tmp_path / "checkpoint.pt"
+    path.write_bytes(b"not a checkpoint")
+    with pytest.raises(FormatError, match="not a checkpoint"):
+        load_checkpoint(path)
+    torch.save({"format": "other/9"}, path)
+    with pytest.raises(FormatError, match="format is 'other/9'"):
+        load_checkpoint(path)
+
+
+@pytest.mark.parametrize(
+    ("key", "size", "message"),
+    [
+        ("n_g", 10**6, "a tensor .* is asked for, of [0-9]+ numbers in all"),
+        ("features", 10**6, "a tensor .* is asked for, of [0-9]+ numbers in all"),
+        ("shared_widths", [8] * 50_000, "a tensor 8 x 8 is asked for, of [0-9]+ numbers in all"),
+        ("n_g", 16, "size mismatch"),
+        ("n_g", 100, "model.n_g is 100, expected a multiple of 8"),
+        ("n_g", 0, "do not fit"),
+        ("z_exp", -1, "do not fit"),
+    ],
+)
+def test_a_configuration_that_the_weights_do_not_have_is_refused(path, key, size, message):
+    content = torch.load(path, weights_only=True)
+    content["config"]["model"][key] = size
+    torch.save(content, path)
+    with pytest.raises(FormatError, match=f"checkpoint.pt: .*{message}"):
+        load_checkpoint(path)
+
+
+@pytest.mark.parametrize("size", [(0, 9), (9, 2.5), (10**6, 10**6)])
+def test_a_camera_of_no_images_size_is_refused(path, size):
+    content = torch.load(path, weights_only=True)
+    content["cameras"]["cam01"] |= {"width": size[0], "height": size[1]}
+    torch.save(content, path)
+    with pytest.raises(FormatError, match="camera cam01: size .*, expected two positive whole"):
+        load_checkpoint(path)
