@@ -23,7 +23,7 @@ from express50.publish import write_bytes
 from express50.reading import reason
 from express50.weights import AtMost, read_weights
 from grmm.config import Config, ModelConfig
-from grmm.data import NO_OFFSETS, HeadViews, Tracked, pose_state
+from grmm.data import NO_OFFSETS, HeadViews, Tracked, check_tracked, pose_state
 from grmm.model import GRMM
 from grmm.presets import as_tables, from_tables
 from grmm.scene import HeadState, View
@@ -159,7 +159,7 @@ def _loaded(path: Path, content: dict[str, Any], device: torch.device | str) -> 
         head_spec=content["head"],
         head=head,
         model=model,
-        gallery=_gallery(path, content, device),
+        gallery=_gallery(path, content, head, device),
         optimizer=content["optimizer"],
         loop=content["loop"],
     )
@@ -181,16 +181,19 @@ def _build(path: Path, config: ModelConfig, head: HeadModel, content: dict[str, 
     return model
 
 
-def _gallery(path: Path, content: dict[str, Any], device: torch.device | str) -> Gallery:
+def _gallery(
+    path: Path, content: dict[str, Any], head: HeadModel, device: torch.device | str
+) -> Gallery:
     """Frames and cameras of a file's content."""
     offsets = _arrays(content.get("offsets", {}))
     _check_finite(path, content.get("offsets", {}))
     frames = {}
-    for frame in content["frames"]:
-        _check_finite(path, frame["parameters"])
-        frames[frame["subject"], frame["expression_id"]] = Tracked(
-            **_arrays(frame["parameters"]), offsets=offsets.get(frame["subject"], NO_OFFSETS)
-        )
+    for row in content["frames"]:
+        subject, expression = row["subject"], row["expression_id"]
+        _check_finite(path, row["parameters"])
+        tracked = Tracked(**_arrays(row["parameters"]), offsets=offsets.get(subject, NO_OFFSETS))
+        check_tracked(f"{path}: {subject}/{expression}", tracked, head)
+        frames[subject, expression] = tracked
     cameras = {name: _camera(path, name, row, device) for name, row in content["cameras"].items()}
     return Gallery(frames=frames, cameras=cameras)
 

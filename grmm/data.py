@@ -240,34 +240,32 @@ class HeadViews:
     def _check(self, sample: Sample, key: Key) -> None:
         where = f"{key.subject}/{key.expression}/{key.camera}"
         size = sample.image.shape[:2]
-        for name, array in (
-            ("alpha", sample.alpha),
-            ("depth", sample.depth),
-            ("parts", sample.parts),
-        ):
+        for name in ("alpha", "depth", "parts"):
+            array = getattr(sample, name)
             if array is not None and array.shape != size:
                 raise FormatError(
                     f"{where}: {name} is {array.shape}, expected the image's size {size}; "
                     "pack the dataset again"
                 )
-        counts = {
-            "shape": self.head.shape_dirs.shape[2],
-            "expression": len(self.head.expression_names),
-        }
-        for name, count in counts.items():
-            got = len(getattr(sample.tracked, name))
-            if got > count:
-                raise FormatError(
-                    f"{where}: {got} {name} coefficients, "
-                    f"head model {self.head.name!r} has {count}; "
-                    "name the head model that the dataset was tracked with"
-                )
-        offsets, vertices = len(sample.tracked.offsets), len(self.head.template)
-        if offsets not in (0, vertices):
+        check_tracked(where, sample.tracked, self.head)
+
+
+def check_tracked(where: str, tracked: Tracked, head: HeadModel) -> None:
+    """Refuse, with a FormatError, parameters that the head model does not have."""
+    counts = {"shape": head.shape_dirs.shape[2], "expression": len(head.expression_names)}
+    for name, count in counts.items():
+        got = len(getattr(tracked, name))
+        if got > count:
             raise FormatError(
-                f"{where}: offsets of {offsets} vertices, head model {self.head.name!r} has "
-                f"{vertices}; name the head model that the dataset was tracked with"
+                f"{where}: {got} {name} coefficients, head model {head.name!r} has {count}; "
+                "name the head model that the dataset was tracked with"
             )
+    offsets, vertices = len(tracked.offsets), len(head.template)
+    if offsets not in (0, vertices):
+        raise FormatError(
+            f"{where}: offsets of {offsets} vertices, head model {head.name!r} has "
+            f"{vertices}; name the head model that the dataset was tracked with"
+        )
 
 
 def pose_state(head: HeadModel, tracked: Tracked) -> HeadState:

@@ -55,3 +55,12 @@ def test_a_camera_of_no_images_size_is_refused(path, size):
     torch.save(content, path)
     with pytest.raises(FormatError, match="camera cam01: size .*, expected two positive whole"):
         load_checkpoint(path)
+
+
+@pytest.mark.parametrize(("name", "size"), [("shape", 4), ("expression", 5)])
+def test_a_frame_that_the_head_model_cannot_take_is_refused(path, name, size):
+    content = torch.load(path, weights_only=True)
+    content["frames"][1]["parameters"][name] = torch.zeros(size)
+    torch.save(content, path)
+    with pytest.raises(FormatError, match=f"S000/e1: {size} {name} coefficients, head model"):
+        load_checkpoint(path)
