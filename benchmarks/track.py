@@ -3,9 +3,9 @@
 ``python -m benchmarks.track [--dataset DIR --truth DIR [--captures DIR]]``; without a dataset the
 digital twin records subjects that the landmark detector was not trained on, two cameras are held
 out of the capture, and the stages up to mattes are run. Peaks are the true ones, so that the
-figures speak of tracking alone. `landmark_only` is `standard` without outlines, relief and colours.
-Seconds are processor seconds of the stage, reading footage and drawing overlays included. The last
-line printed is one JSON object; `benchmarks.track_truth` says what its figures mean, and
+figures speak of tracking alone. `landmark_only` is `standard` without outlines, relief, colours and
+charts. Seconds are processor seconds of the stage, reading footage and drawing overlays included.
+The last line printed is one JSON object; `benchmarks.track_truth` says what its figures mean, and
 `benchmarks.track_views` how the held-out cameras' picture is made.
 """
 
@@ -41,7 +41,9 @@ from pipelines.track import STAGE
 
 EXPRESSIONS = ("neutral", "smile", "jaw_open", "pucker", "brow_raise", "wink_left")
 PRESETS = ("draft", "standard", "reference")
-LANDMARK_ONLY: dict[str, object] = {"silhouette_rounds": 0, "relief_rounds": 0, "photo_rounds": 0}
+LANDMARK_ONLY: dict[str, object] = {
+    "silhouette_rounds": 0, "relief_rounds": 0, "photo_rounds": 0, "chart_rounds": 0,
+}  # fmt: skip
 NO_CLIP = {
     "jitter_mm": None,
     "clip_face_rmse_mm": None,

@@ -41,7 +41,8 @@ KNOBS: tuple[tuple[str, dict[str, object]], ...] = (
     ("relief_rounds 2", {"relief_rounds": 2}),
     ("no relief", {"relief_rounds": 0}),
     ("no colours", {"photo_rounds": 0}),
-    ("no offsets", {"offset_modes": 0}),
+    ("no chart", {"chart_rounds": 0}),
+    ("no offsets", {"offset_modes": 0, "offset_along": 0}),
     ("render_rounds 2", {"render_rounds": 2}),
 )
 

@@ -181,11 +181,17 @@ def load_network(path: Path = WEIGHTS) -> LandmarkNet:
 
     Batch normalisations are folded into the convolutions before them.
     """
+    net = trainable_network(path).eval()
+    fold(net)
+    return net.to(memory_format=torch.channels_last)
+
+
+def trainable_network(path: Path = WEIGHTS) -> LandmarkNet:
+    """Read weights written by `save_network`, to train on from them."""
     net = LandmarkNet()
     with np.load(path, allow_pickle=False) as data:
         state = {key: torch.from_numpy(data[key].astype(np.float32)) for key in data.files}
     net.load_state_dict(state, strict=False)
-    fold(net.eval())
     return net.to(memory_format=torch.channels_last)
 
 

@@ -28,14 +28,36 @@ class RandomHead:
     gloss: float
 
 
+@dataclass(frozen=True)
+class Canvas:
+    """Places to paint.
+
+    Attributes:
+        rest: (N, 3) metres, on the head at rest.
+        region: names and which of the places are in it, (N,) bool.
+        marks: (68, 3) landmarks of the head at rest.
+    """
+
+    rest: np.ndarray
+    region: dict[str, np.ndarray]
+    marks: np.ndarray
+
+    @classmethod
+    def of(cls, model: HeadModel) -> Canvas:
+        """A head model's vertices."""
+        region = {name: mask.numpy() for name, mask in model.regions.items()}
+        marks = landmarks(model, model.template[None])[0].numpy()
+        return cls(model.template.numpy(), region, marks)
+
+
 def random_head(model: HeadModel, rng: Rng) -> RandomHead:
     """Draw shape, expression, pose, smooth deformation, hair and colours."""
     draw = random_parameters(model, rng)
     with torch.no_grad():
         vertices = pose(model, **draw)
-    vertices = torch.from_numpy(_deform(vertices[0].numpy(), rng))[None]
+    vertices = torch.from_numpy(deform(vertices[0].numpy(), rng))[None]
     points = landmarks(model, vertices)[0].numpy()
-    colors, hair = _paint(model, rng)
+    colors, hair = paint(Canvas.of(model), rng)
     normals = vertex_normals(vertices, model.faces)
     if hair is not None:
         vertices = vertices + normals * torch.from_numpy(hair)[None, :, None]
@@ -44,7 +66,7 @@ def random_head(model: HeadModel, rng: Rng) -> RandomHead:
     return RandomHead(vertices[0].numpy(), normals[0].numpy(), colors, points, gloss)
 
 
-def _waves(points: np.ndarray, rng: Rng, count: int, low: float, high: float) -> np.ndarray:
+def waves(points: np.ndarray, rng: Rng, count: int, low: float, high: float) -> np.ndarray:
     """Smooth random field (N,) of about unit variance; wave numbers low..high radians a metre."""
     directions = rng.normal(size=(count, 3))
     directions *= (np.exp(rng.uniform(np.log(low), np.log(high), count)))[:, None] / (
@@ -54,25 +76,23 @@ def _waves(points: np.ndarray, rng: Rng, count: int, low: float, high: float) ->
     return np.sin(points @ directions.T + phases).sum(1) * np.sqrt(2.0 / count)
 
 
-def _deform(vertices: np.ndarray, rng: Rng) -> np.ndarray:
+def deform(vertices: np.ndarray, rng: Rng) -> np.ndarray:
     """Anisotropic scale and a smooth random displacement of a few millimetres."""
     centre = vertices.mean(0)
     scaled = (vertices - centre) * rng.uniform(0.9, 1.1, size=3) * rng.uniform(0.9, 1.1)
     amplitude = rng.uniform(0.0, 0.003)
-    moved = np.stack([_waves(vertices, rng, 6, 15.0, 60.0) for _ in range(3)], axis=1)
+    moved = np.stack([waves(vertices, rng, 6, 15.0, 60.0) for _ in range(3)], axis=1)
     return (scaled + centre + amplitude * moved).astype(np.float32)
 
 
-def _paint(model: HeadModel, rng: Rng) -> tuple[np.ndarray, np.ndarray | None]:
-    """Colours (V, 3) in [0, 1] and hair thickness (V,) metres or None, from the rest shape."""
-    rest = model.template.numpy()
-    region = {name: mask.numpy() for name, mask in model.regions.items()}
-    marks = landmarks(model, model.template[None])[0].numpy()
+def paint(canvas: Canvas, rng: Rng) -> tuple[np.ndarray, np.ndarray | None]:
+    """Colours (N, 3) in [0, 1] and hair thickness (N,) metres or None."""
+    rest, region, marks = canvas.rest, canvas.region, canvas.marks
     colors = np.tile(_skin_color(rng), (len(rest), 1))
     # Anything in no region is a small part such as lashes: dark.
     nothing = ~np.any(list(region.values()), axis=0)
-    colors *= 1 + rng.uniform(0, 0.15) * _waves(rest, rng, 12, 20.0, 150.0)[:, None]
-    colors *= 1 + rng.uniform(0, 0.12) * _waves(rest, rng, 24, 150.0, 900.0)[:, None]
+    colors *= 1 + rng.uniform(0, 0.15) * waves(rest, rng, 12, 20.0, 150.0)[:, None]
+    colors *= 1 + rng.uniform(0, 0.12) * waves(rest, rng, 24, 150.0, 900.0)[:, None]
     blush = _blob(rest, marks[[2, 14, 30, 8]][rng.integers(4)], rng.uniform(0.02, 0.05))
     colors = _mix(colors, rng.uniform(0.2, 1.0, 3), blush * rng.uniform(0, 0.3))
     _tint_features(colors, region, rest, marks, rng)
@@ -121,7 +141,7 @@ def _tint_features(
     )
     for line in (marks[17:22], marks[22:27]):
         near = _line_distance(rest[skin], line)
-        ragged = 1 + 0.4 * _waves(rest[skin], rng, 8, 300.0, 1500.0)
+        ragged = 1 + 0.4 * waves(rest[skin], rng, 8, 300.0, 1500.0)
         amount = strength / (1 + np.exp((near - width * ragged) / 0.001))
         colors[skin] = _mix(colors[skin], brow_color, amount)
     for side in ("left", "right"):
@@ -139,15 +159,15 @@ def _grow_hair(
     front = np.array([0.0, brows + rng.uniform(0.15, 0.8) * (crown - brows), marks[27, 2]])
     tilt = rng.uniform(0.2, 1.25)
     height = (rest - front) @ np.array([0.0, np.cos(tilt), -np.sin(tilt)])
-    height += 0.006 * _waves(rest, rng, 10, 40.0, 300.0)
+    height += 0.006 * waves(rest, rng, 10, 40.0, 300.0)
     keep = np.zeros(len(rest))
     keep[region["scalp"] | region["forehead"] | region["neck"]] = 1.0
     keep[region["neck"] & (rest[:, 1] < marks[8, 1] - 0.03)] = 0.0
     amount = keep / (1 + np.exp(-height / 0.004))
     hair_color = rng.uniform(0.02, 0.75) * np.array([1.0, rng.uniform(0.6, 1), rng.uniform(0.3, 1)])
-    strands = 1 + 0.4 * _waves(rest, rng, 30, 200.0, 1500.0)
+    strands = 1 + 0.4 * waves(rest, rng, 30, 200.0, 1500.0)
     colors[:] += (hair_color * strands[:, None] - colors) * amount[:, None]
-    thickness = rng.uniform(0.0, 0.03) * (1 + 0.4 * _waves(rest, rng, 10, 30.0, 200.0))
+    thickness = rng.uniform(0.0, 0.03) * (1 + 0.4 * waves(rest, rng, 10, 30.0, 200.0))
     return (amount * np.maximum(thickness, 0.0)).astype(np.float32)
 
 
@@ -160,7 +180,7 @@ def _tint_beard(
     below = 1 / (1 + np.exp((rest[:, 1] - marks[33, 1] + rng.uniform(0, 0.02)) / 0.003))
     cheek = 1 / (1 + np.exp((marks[33, 2] - rng.uniform(0.02, 0.09) - rest[:, 2]) / 0.004))
     amount = below * cheek * (region["face"] & ~region["lips"]) * rng.uniform(0.2, 0.9)
-    grain = 1 + 0.5 * _waves(rest, rng, 20, 400.0, 2000.0)
+    grain = 1 + 0.5 * waves(rest, rng, 20, 400.0, 2000.0)
     colors[:] = _mix(colors, rng.uniform(0.0, 0.4) * np.ones(3), np.clip(amount * grain, 0, 1))
 
 

@@ -99,7 +99,7 @@ def train(models: list[HeadModel], plan: Plan, folder: Path) -> LandmarkNet:
     optimiser = torch.optim.AdamW(net.parameters(), lr=RATE, weight_decay=1e-3)
     name = "-".join([*(m.name for m in models), *(str(value) for value in astuple(plan))])
     state = folder / f"training-{name}.pt"
-    first = _take_up(state, net, optimiser)
+    first = take_up(state, net, optimiser)
     began, losses = time.monotonic(), []
     sets: list[ViewSet] = []
     for step in range(first, plan.steps):
@@ -126,7 +126,7 @@ def train(models: list[HeadModel], plan: Plan, folder: Path) -> LandmarkNet:
             seconds = (time.monotonic() - began) / (step + 1 - first)
             recent = np.mean(losses[-KEEP_EVERY:])
             print(f"step {step + 1}: loss {recent:.3f}, {seconds:.2f} s", flush=True)
-            _keep(state, net, optimiser, step + 1)
+            keep_state(state, net, optimiser, step + 1)
     return net.eval()
 
 
@@ -141,14 +141,17 @@ def rate_share(step: int, steps: int) -> float:
     return min(1.0, (step + 1) / WARM_UP, max(fall, 0.01))
 
 
-def _keep(path: Path, net: LandmarkNet, optimiser: torch.optim.Optimizer, step: int) -> None:
+def keep_state(
+    path: Path, net: torch.nn.Module, optimiser: torch.optim.Optimizer, step: int
+) -> None:
+    """Write a run's state, from which `take_up` goes on."""
     part = path.with_suffix(".part")
     torch.save({"net": net.state_dict(), "optimiser": optimiser.state_dict(), "step": step}, part)
     part.replace(path)
 
 
-def _take_up(path: Path, net: LandmarkNet, optimiser: torch.optim.Optimizer) -> int:
-    """Read a state that `_keep` wrote, if there is one; the step to go on with."""
+def take_up(path: Path, net: torch.nn.Module, optimiser: torch.optim.Optimizer) -> int:
+    """Read a state that `keep_state` wrote, if there is one; the step to go on with."""
     if not path.exists():
         return 0
     state = read_weights(path, TrainError, str(path), "a state of training", "delete it")

@@ -84,8 +84,8 @@ def bake_albedo(
     known = np.zeros((side, side), dtype=bool)
     root = np.zeros((side, side, 3))
     for start in range(0, len(texels.faces), CHUNK):
-        some = slice(start, start + CHUNK)
-        part = Samples(texels.faces[some], texels.corners[some], texels.bary[some])
+        some = np.arange(start, min(start + CHUNK, len(texels.faces)))
+        part = texels.some(some)
         seen = [_seen(scene, part) for scene in scenes]
         colour, mass = _agreed(seen, appearance)
         row, column = texture[some].T

@@ -7,7 +7,7 @@ from typing import Literal
 
 from express50.errors import ConfigError
 
-VERSION = 3  # of the stage: outputs of another are made anew
+VERSION = 4  # of the stage: outputs of another are made anew
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,6 +52,11 @@ class TrackConfig:
     """How far the first search goes, metres."""
     relief_weight: float = 1.0
     """Trust in the searched surface."""
+    chart_rounds: int = 8
+    """Rounds in which landmarks are found anew on the face laid flat; what the last of them said
+    stays. 0 for none."""
+    chart_weight: float = 2.0
+    """Trust in these landmarks."""
     detail_radius: float = 0.003
     """Marks of the skin smaller than this are compared, metres."""
     photo_weight: float = 0.1
@@ -78,7 +83,10 @@ class TrackConfig:
     shape_prior: float = 1.0
     """Weight of the prior on shape coefficients (standard deviations)."""
     offset_modes: int = 150
-    """Smooth static offsets of the skin beyond the head's shape directions; 0 for none."""
+    """Smooth static offsets of the skin along its normals, beyond the head's shape directions; 0
+    for none."""
+    offset_along: int = 24
+    """The same along the skin, for each of three axes; 0 for none, as without `chart_rounds`."""
     offset_sigma: float = 0.001
     """Standard deviation of these offsets, metres."""
     offset_length: float = 0.02
@@ -104,13 +112,19 @@ class TrackConfig:
             raise ConfigError(
                 "track: landmark_floor_px, landmark_bias, smooth_mm and the priors must be above 0"
             )
-        rounds = (self.cameras, self.silhouette_rounds, self.photo_rounds, self.relief_rounds)
-        if min(*rounds, self.render_rounds) < 0 or self.round_iterations < 1:
+        rounds = [self.cameras, self.silhouette_rounds, self.photo_rounds, self.relief_rounds]
+        rounds += [self.render_rounds, self.chart_rounds, self.offset_along]
+        if min(rounds) < 0 or self.round_iterations < 1:
             raise ConfigError(
-                "track: cameras and rounds must not be negative, round_iterations at least 1"
+                "track: cameras, rounds and offset_along must not be negative, round_iterations"
+                " at least 1"
             )
-        if min(self.offset_sigma, self.offset_length, self.relief_reach, self.detail_radius) <= 0:
-            raise ConfigError("track: lengths (offset_*, relief_reach, detail_radius) must be > 0")
+        lengths = (self.offset_sigma, self.offset_length, self.relief_reach, self.detail_radius)
+        if min(*lengths, self.chart_weight) <= 0:
+            raise ConfigError(
+                "track: chart_weight and lengths (offset_sigma, offset_length, relief_reach,"
+                " detail_radius) must be > 0"
+            )
         if not 0 <= self.texture_side <= 8192:
             raise ConfigError("track: texture_side must be 0 to 8192")
         if not 100 <= self.samples <= 30_000 or not 32 <= self.photo_side <= 8192:
@@ -122,11 +136,13 @@ PRESETS: dict[str, dict[str, object]] = {
         "cameras": 6, "refinements": 2, "iterations": 8, "silhouette_rounds": 2,
         "relief_rounds": 4, "photo_rounds": 0, "samples": 2000, "offset_modes": 80,
         "round_iterations": 2, "sweeps": 1, "texture_side": 256, "clip_rounds": 0,
+        "chart_rounds": 4, "offset_along": 12,
     },
     "standard": {},
     "reference": {
         "refinements": 5, "iterations": 30, "silhouette_rounds": 4, "relief_rounds": 8,
         "photo_rounds": 2, "samples": 8000, "photo_side": 1024, "offset_modes": 250,
         "round_iterations": 6, "sweeps": 4, "render_rounds": 4, "clip_rounds": 3,
+        "chart_rounds": 10, "offset_along": 40,
     },
 }  # fmt: skip

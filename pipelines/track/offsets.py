@@ -1,4 +1,4 @@
-"""What no shape coefficient can say: a smooth static offset of the skin along its normals.
+"""What no shape coefficient can say: a smooth static offset of the skin, off itself and along it.
 
 The prior is a Gaussian field on the surface with a standard deviation and a correlation length in
 metres (the Matern field of Lindgren, Rue and Lindstroem 2011, "An explicit link between Gaussian
@@ -24,24 +24,31 @@ RIGID = (
 MODE = "offset_mode_"
 
 
-def with_modes(model: HeadModel, count: int, sigma: float, length: float) -> HeadModel:
-    """The head with `count` more shape directions, each to be weighted by standard deviations.
+def with_modes(
+    model: HeadModel, count: int, sigma: float, length: float, along: int = 0
+) -> HeadModel:
+    """The head with more shape directions, each to be weighted by standard deviations.
 
     Args:
         model: any head.
-        count: number of modes; 0 returns the head as it is.
+        count: number of modes along the normals.
         sigma: standard deviation of the offsets, metres.
         length: their correlation length, metres.
+        along: number of modes by which the skin slides along itself, each to be had along three
+            axes. Places on skin are told from one another less finely than its depth is, so they
+            are as broad as the broadest of the others.
     """
-    if count == 0:
+    if count == 0 and along == 0:
         return model
     normals = vertex_normals(model.template[None].double(), model.faces)[0]
-    heights = torch.from_numpy(offset_modes(model, count, sigma, length))
-    modes = (normals[:, :, None] * heights[:, None, :]).to(model.dtype)
-    names = tuple(f"{MODE}{index}" for index in range(heights.shape[1]))
+    heights = torch.from_numpy(offset_modes(model, max(count, along), sigma, length))
+    flat = torch.eye(3).double() - normals[:, :, None] * normals[:, None, :]
+    slides = flat[..., None] * heights[:, None, None, :along]
+    modes = torch.cat([normals[:, :, None] * heights[:, None, :count], slides.flatten(2)], dim=2)
+    names = tuple(f"{MODE}{index}" for index in range(modes.shape[2]))
     return replace(
         model,
-        shape_dirs=torch.cat([model.shape_dirs, modes], dim=2),
+        shape_dirs=torch.cat([model.shape_dirs, modes.to(model.dtype)], dim=2),
         shape_names=model.shape_names + names,
     )
 

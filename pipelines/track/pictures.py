@@ -70,7 +70,7 @@ def see(model: HeadModel, samples: Samples, moment: Moment, mesh: np.ndarray) ->
             shot, places
         )
     names = tuple(shot.camera_id for shot in moment.shots)
-    return Seen(names, _values(places, images), weights, normals)
+    return Seen(names, _values(places, images, weights), weights, normals)
 
 
 def inside_picture(shot: Shot, places: np.ndarray) -> np.ndarray:
@@ -231,7 +231,7 @@ def _detail(
 ) -> tuple[Seen, list[tuple[np.ndarray, Camera]]]:
     """What a moment's pictures show of the samples' detail, and the pictures of it."""
     images = _details(moment, mesh, config.detail_radius)
-    return replace(sight, values=_values(samples.at(mesh), images)), images
+    return replace(sight, values=_values(samples.at(mesh), images, sight.weights)), images
 
 
 def _details(moment: Moment, mesh: np.ndarray, radius: float) -> list[tuple[np.ndarray, Camera]]:
@@ -245,11 +245,15 @@ def _details(moment: Moment, mesh: np.ndarray, radius: float) -> list[tuple[np.n
     return made
 
 
-def _values(places: np.ndarray, images: list[tuple[np.ndarray, Camera]]) -> np.ndarray:
-    """What the pictures show (C, S, 3) at world points (S, 3)."""
-    if not images:
-        return np.zeros((0, *places.shape))
-    return np.stack([look(camera, image, places)[0] for image, camera in images])
+def _values(
+    places: np.ndarray, images: list[tuple[np.ndarray, Camera]], weights: np.ndarray
+) -> np.ndarray:
+    """What the pictures show (C, S, 3) at world points (S, 3); 0 where they do not see one."""
+    values = np.zeros((len(images), *places.shape))
+    for row, (image, camera) in enumerate(images):
+        chosen = np.flatnonzero(weights[row])
+        values[row, chosen] = look(camera, image, places[chosen])[0]
+    return values
 
 
 def _with_term(

@@ -8,6 +8,7 @@ import numpy as np
 
 from express50.head.model import HeadModel
 from pipelines.track.appearance import Appearance
+from pipelines.track.chart.network import reading_chart
 from pipelines.track.config import TrackConfig
 from pipelines.track.fit import fit
 from pipelines.track.hair import is_bald
@@ -17,6 +18,7 @@ from pipelines.track.pictures import Moment, see, with_photometry, with_relief
 from pipelines.track.relief import Relief
 from pipelines.track.samples import spread
 from pipelines.track.shots import root_light
+from pipelines.track.slide import Slide, read_slide, with_slides
 from pipelines.track.sparse_head import Basis
 from pipelines.track.state import State, Target, all_vertices, rotations
 
@@ -43,6 +45,8 @@ def refine(
     rounds = max(rounds, config.silhouette_rounds, MARK_ROUNDS)
     plain = targets
     bald = _bald(model, moments, all_vertices(model, state))
+    chart = reading_chart(model) if config.chart_rounds else None
+    slides: list[Slide | None] = [None] * len(targets)
     for index in range(rounds):
         meshes = all_vertices(model, state)
         targets = plain
@@ -68,8 +72,14 @@ def refine(
             targets, appearance = with_photometry(
                 samples, targets, moments, sights, meshes, appearance, config
             )
-        # Only a searched surface can tell what the detector errs.
-        free = any(isinstance(term, Relief) for target in targets for term in target.terms)
+        if chart is not None and index < config.chart_rounds:
+            slides = [
+                read_slide(model, chart, *seen, config.chart_weight)
+                for seen in zip(moments, meshes, strict=True)
+            ]
+        targets = with_slides(targets, slides)
+        # Only a searched surface, or one whose places are known, can tell what the detector errs.
+        free = any(isinstance(t, Relief | Slide) for target in targets for t in target.terms)
         state, _ = fit(basis, targets, state, config, config.round_iterations, free)
     return state, targets, appearance
 

@@ -35,6 +35,10 @@ class Samples:
     corners: np.ndarray
     bary: np.ndarray
 
+    def some(self, ids: np.ndarray) -> Samples:
+        """Those of some indices, or of a mask."""
+        return Samples(self.faces[ids], self.corners[ids], self.bary[ids])
+
     def at(self, vertices: np.ndarray) -> np.ndarray:
         """Positions (S, 3) on vertices (V, 3)."""
         return np.einsum("sk,skc->sc", self.bary, vertices[self.corners])

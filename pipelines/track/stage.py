@@ -18,6 +18,7 @@ from express50.landmarks.sources import Source, source_files
 from express50.layout import Dataset
 from express50.stage import Stage
 from pipelines.track.bake import write_texture
+from pipelines.track.chart.network import WEIGHTS as CHART_WEIGHTS
 from pipelines.track.clips import write_clips
 from pipelines.track.config import PRESETS, VERSION, TrackConfig
 from pipelines.track.fit import consistent_sigma, fit, landmark_sigma
@@ -65,6 +66,8 @@ def inputs(dataset: Dataset, item: str, config: TrackConfig) -> dict[str, Path |
     rounds = (config.silhouette_rounds, config.relief_rounds, config.photo_rounds)
     if any(rounds) and mattes.is_dir():
         found["mattes"] = mattes
+    if config.chart_rounds:
+        found["chart"] = CHART_WEIGHTS
     if config.head != "procedural":
         found["head"] = Path(config.head).expanduser()
     return found
@@ -75,7 +78,7 @@ def run(dataset: Dataset, item: str, config: TrackConfig, out: Path) -> dict:
     torch.set_num_threads(1)
     cameras = read_cameras_of(dataset, item)
     dropped: list[dict[str, str]] = []
-    basis = _basis(config.head, config.offset_modes, config.offset_sigma, config.offset_length)
+    basis = _basis(config)
     source = open_landmarks(dataset, item, config)
     observations = observe_peaks(dataset, item, cameras, source, config, dropped)
     targets, poses = _targets(basis, observations, config, dropped)
@@ -151,9 +154,16 @@ def _closer(dataset: Dataset, subject: str, skin: Skin, config: TrackConfig) -> 
     return closer
 
 
+def _basis(config: TrackConfig) -> Basis:
+    # Only the chart can tell where along itself the skin is.
+    along = config.offset_along if config.chart_rounds else 0
+    offsets = (config.offset_modes, config.offset_sigma, config.offset_length, along)
+    return _basis_of(config.head, *offsets)
+
+
 @lru_cache(maxsize=2)
-def _basis(head: str, modes: int, sigma: float, length: float) -> Basis:
-    return make_basis(with_modes(load_head(head), modes, sigma, length))
+def _basis_of(head: str, modes: int, sigma: float, length: float, along: int) -> Basis:
+    return make_basis(with_modes(load_head(head), modes, sigma, length, along))
 
 
 def _targets(

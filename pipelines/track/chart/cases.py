@@ -1,0 +1,175 @@
+"""What the chart network learns from: painted heads seen on meshes that do not quite fit them.
+
+A head is drawn twice: as it is, and as a tracker that is some millimetres off has it. What several
+cameras see of the first is read at the places of the second, exactly as it is of footage; where
+each place belongs is known. Nothing is rendered: only the rays to the chart's texels are cast.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import open3d as o3d
+import torch
+
+from express50.adapters import corner_to_cell
+from express50.cameras import Camera
+from express50.head.model import HeadModel, pose, vertex_normals
+from express50.landmarks.acting import random_parameters
+from express50.landmarks.synthetic import Canvas, deform, paint, waves
+from express50.raycast import mesh_scene
+from pipelines.track.chart.disturb import Case, covered, photographed
+from pipelines.track.chart.layout import Chart
+from pipelines.track.chart.light import Lamps, draw_cameras, draw_lamps
+from pipelines.track.samples import Visibility, sample_normals
+
+Rng = np.random.Generator
+# Root mean square of what the drawn trackers are off along the skin, metres: from least to most.
+OFF_M = (0.0004, 0.005)
+# Further than this from the true skin a place of the wrong mesh shows nothing to learn from.
+REACH_M = 0.008
+# What lies further off along the skin is another part of the face, such as the other lip.
+FAR_TEXELS = 12.0
+
+
+@dataclass(frozen=True)
+class Person:
+    """Colours of a head: (HEIGHT, WIDTH, 3) of its chart, (V, 3) of what the chart does not show.
+
+    The background's colour (3,) and the skin's gloss come with them.
+    """
+
+    map: np.ndarray
+    vertices: np.ndarray
+    background: np.ndarray
+    gloss: float
+
+
+def draw_person(model: HeadModel, chart: Chart, rng: Rng) -> Person:
+    """Paint a head."""
+    whole = Canvas.of(model)
+    corners, bary = chart.samples.corners, chart.samples.bary
+    region = {name: (mask[corners] * bary).sum(1) for name, mask in whole.region.items()}
+    rest = (whole.rest[corners] * bary[..., None]).sum(1)
+    # Lips end where they end, not where a mesh's edges happen to run.
+    ragged = rng.uniform(0.0, 0.2) * waves(rest, rng, 8, 200.0, 900.0)
+    canvas = Canvas(rest, {n: r > 0.5 + ragged for n, r in region.items()}, whole.marks)
+    background = rng.uniform(0.0, 1.0, 3)
+    return Person(
+        chart.image(paint(canvas, rng)[0]),
+        paint(whole, rng)[0],
+        background.astype(np.float32),
+        float(rng.uniform(0.0, 0.3)),
+    )
+
+
+def draw_case(model: HeadModel, chart: Chart, person: Person, rng: Rng) -> Case:
+    """Let a person act, look from some cameras and read the chart of a mesh that is off."""
+    true, wrong = draw_meshes(model, chart, rng)
+    head = _Head(model, chart, person, true)
+    places, normals = chart.samples.at(wrong), sample_normals(chart.samples, wrong)
+    visibility = Visibility(wrong, model.faces.numpy())
+    lamps = draw_lamps(rng)
+    total, mass = np.zeros_like(places), np.zeros(len(places))
+    for camera in draw_cameras(places, rng):
+        weight = visibility.weights(camera, places, normals) ** 2
+        chosen = np.flatnonzero(weight)
+        color = head.seen(camera, places[chosen], lamps)
+        total[chosen] += weight[chosen, None] * color
+        mass[chosen] += weight[chosen]
+    colors = chart.image(total / np.maximum(mass, 1e-6)[:, None])
+    colors = photographed(covered(colors, rng), rng)
+    flow, valid = head.flow(places, normals)
+    return Case(
+        np.rint(255.0 * np.clip(colors, 0.0, 1.0)).astype(np.uint8),
+        chart.image(np.rint(100.0 * np.minimum(mass, 2.5))[:, None])[..., 0].astype(np.uint8),
+        chart.image(flow).astype(np.float16),
+        chart.image((valid & chart.skin & (mass > 0.02))[:, None])[..., 0],
+    )
+
+
+def draw_meshes(model: HeadModel, chart: Chart, rng: Rng) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices (V, 3), (V, 3) of an acting head and of a tracker's idea of it, float64."""
+    draw = random_parameters(model, rng)
+    other = {name: value.clone() for name, value in draw.items()}
+    other["shape"] += torch.from_numpy(
+        rng.uniform(0.0, 0.6) * rng.normal(size=other["shape"].shape)
+    ).float()
+    muscles = rng.random(other["expression"].shape) < rng.uniform(0.0, 0.4)
+    slips = rng.uniform(0.0, 0.5) * rng.normal(size=muscles.shape) * muscles
+    other["expression"] += torch.from_numpy(slips).float()
+    other["jaw"] += torch.from_numpy(rng.uniform(0.0, 0.05) * rng.normal(size=(1, 3))).float()
+    other["eyes"] += torch.from_numpy(0.05 * rng.normal(size=(1, 6))).float()
+    with torch.inference_mode():
+        played, tracked = (pose(model, **one)[0].double().numpy() for one in (draw, other))
+    true = deform(played.astype(np.float32), rng).astype(np.float64)
+    off = tracked - played
+    for low, high, share in ((10.0, 60.0, 0.003), (60.0, 200.0, 0.001)):
+        field = np.stack([waves(true, rng, 6, low, high) for _ in range(3)], axis=1)
+        off += rng.uniform(0.0, share) * field
+    normals = vertex_normals(torch.from_numpy(true)[None], model.faces)[0].numpy()
+    # Along the normals the views agree better on where the skin is than along it.
+    off -= rng.uniform(0.2, 1.0) * (off * normals).sum(1, keepdims=True) * normals
+    face = np.unique(chart.samples.corners[chart.skin])
+    size = np.sqrt((off[face] ** 2).sum(1).mean())
+    wanted = np.exp(rng.uniform(*np.log(OFF_M)))
+    return true, true + off * (wanted / max(float(size), 1e-9))
+
+
+class _Head:
+    """A true, painted head in a ray caster."""
+
+    def __init__(
+        self, model: HeadModel, chart: Chart, person: Person, vertices: np.ndarray
+    ) -> None:
+        self.chart, self.person, self.faces = chart, person, model.faces.numpy()
+        self.scene = mesh_scene(vertices, self.faces)
+        normals = vertex_normals(torch.from_numpy(vertices)[None], model.faces)[0]
+        self.normals = normals.numpy().astype(np.float32)
+        self.skin = chart.front
+
+    def seen(self, camera: Camera, places: np.ndarray, lamps: Lamps) -> np.ndarray:
+        """Root of light (N, 3) where a camera looks for places (N, 3)."""
+        towards = places - camera.center
+        towards /= np.linalg.norm(towards, axis=1, keepdims=True)
+        origin = np.broadcast_to(camera.center, places.shape)
+        hit, face, bary = self._cast(np.concatenate([origin, towards], axis=1))
+        color = np.tile(self.person.background, (len(places), 1))
+        face, bary = face[hit], bary[hit]
+        albedo = self._albedo(face, bary)
+        normals = (self.normals[self.faces[face]] * bary[..., None]).sum(1)
+        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-6)
+        color[hit] = np.clip(lamps.lit(albedo, normals, -towards[hit], self.person.gloss), 0, 1)
+        return np.sqrt(color)
+
+    def flow(self, places: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Where the true skin at places (N, 3) of the wrong mesh belongs: (N, 2), known (N,)."""
+        rays = np.concatenate([places + REACH_M * normals, -normals], axis=1)
+        hit, face, bary = self._cast(rays, 2 * REACH_M)
+        hit &= self.skin[np.maximum(face, 0)]
+        where = (self.chart.places[self.faces[face]] * bary[..., None]).sum(1)
+        own = self.chart.texels[:, ::-1] + 0.5
+        hit &= np.linalg.norm(where - own, axis=1) < FAR_TEXELS
+        return np.where(hit[:, None], where - own, 0.0), hit
+
+    def _albedo(self, face: np.ndarray, bary: np.ndarray) -> np.ndarray:
+        corners = self.faces[face]
+        plain = (self.person.vertices[corners] * bary[..., None]).sum(1)
+        x, y = corner_to_cell((self.chart.places[corners] * bary[..., None]).sum(1)).T
+        mapped = cv2.remap(
+            self.person.map, x.astype(np.float32), y.astype(np.float32), cv2.INTER_LINEAR,
+            borderMode=cv2.BORDER_REPLICATE,
+        ).reshape(-1, 3)  # fmt: skip
+        return np.where(self.skin[face][:, None], mapped, plain)
+
+    def _cast(
+        self, rays: np.ndarray, far: float = np.inf
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Whether rays (N, 6) hit (N,), the faces (N,) and the shares of their corners (N, 3)."""
+        cast = self.scene.cast_rays(o3d.core.Tensor(rays.astype(np.float32)))
+        distance, u = cast["t_hit"].numpy(), cast["primitive_uvs"].numpy()
+        hit = np.isfinite(distance) & (distance < far)
+        face = np.where(hit, cast["primitive_ids"].numpy(), 0).astype(np.int64)
+        return hit, face, np.stack([1 - u.sum(1), u[:, 0], u[:, 1]], axis=1)

@@ -1,0 +1,111 @@
+"""Readings of charts, and what is done to them so that the network is surprised by little."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from express50.adapters import corner_to_cell
+from pipelines.track.chart.layout import HEIGHT, WIDTH
+
+Rng = np.random.Generator
+# Steps in which the inverse of a displacement is found.
+TURNS = 6
+# Share of the texels about a place whose displacement must be known.
+LEAST_SHARE = 0.25
+# The rims of closed lips touch: a texel to either side tells which lip moves them.
+LIPS_APART = np.zeros((68, 2), np.float32)
+LIPS_APART[[61, 62, 63], 1], LIPS_APART[[65, 66, 67], 1] = -1.2, 1.2
+
+
+@dataclass(frozen=True)
+class Case:
+    """One reading of a chart.
+
+    Attributes:
+        colors: (HEIGHT, WIDTH, 3) uint8, root of light.
+        known: (HEIGHT, WIDTH) uint8, how well it was seen.
+        flow: (HEIGHT, WIDTH, 2) float16 texels: a texel shows what belongs so far to its right and
+            below it.
+        valid: (HEIGHT, WIDTH) bool, texels whose flow is known.
+    """
+
+    colors: np.ndarray
+    known: np.ndarray
+    flow: np.ndarray
+    valid: np.ndarray
+
+
+def covered(colors: np.ndarray, rng: Rng) -> np.ndarray:
+    """Strands of hair and other things before the face, in some of the maps."""
+    if rng.random() < 0.5:
+        return colors
+    out = np.ascontiguousarray(colors, dtype=np.float32)
+    for _ in range(rng.integers(1, 5)):
+        layer = out.copy()
+        start = rng.uniform([0.0, -10.0], [WIDTH, 0.6 * HEIGHT])
+        end = start + rng.normal(size=2) * [25.0, 40.0]
+        ink = tuple(float(v) for v in rng.uniform(0.0, 0.8) * rng.uniform(0.6, 1.0, 3))
+        points = np.rint([start, (start + end) / 2 + rng.normal(size=2) * 8, end]).astype(np.int32)
+        cv2.polylines(layer, [points], False, ink, int(rng.integers(1, 9)))
+        out += rng.uniform(0.3, 1.0) * (layer - out)
+    return out
+
+
+def photographed(colors: np.ndarray, rng: Rng) -> np.ndarray:
+    """Blur and noise of cameras, exposure and contrast of a room."""
+    colors = cv2.GaussianBlur(np.float32(colors), (0, 0), rng.uniform(0.25, 1.4))
+    colors = colors * rng.uniform(0.6, 1.3) + rng.normal(size=3) * 0.02
+    return colors + rng.normal(size=colors.shape) * rng.uniform(0.0, 0.02)
+
+
+def warped(case: Case, rng: Rng) -> Case:
+    """The same reading of a mesh that is off by some more, smooth in the map; maybe mirrored.
+
+    A texel that shows what its neighbour showed belongs where the neighbour's did.
+    """
+    y, x = np.mgrid[:HEIGHT, :WIDTH].astype(np.float32)
+    coarse = rng.normal(size=(2, *rng.integers(2, 6, 2))) * rng.uniform(0.0, 2.0)
+    fields = [cv2.resize(one, (WIDTH, HEIGHT), interpolation=cv2.INTER_CUBIC) for one in coarse]
+    turn = rng.normal(size=(2, 2)) * 0.02
+    broad = np.stack([x - WIDTH / 2, y - HEIGHT / 2], axis=2) @ turn + rng.normal(size=2) * 1.5
+    shift = (rng.random() * (np.stack(fields, axis=2) + broad)).astype(np.float32)
+    at = x + shift[..., 0], y + shift[..., 1]
+    colors = cv2.remap(case.colors, *at, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    known = cv2.remap(case.known, *at, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    flow = cv2.remap(case.flow.astype(np.float32), *at, cv2.INTER_LINEAR) + shift
+    valid = cv2.remap(case.valid.astype(np.float32), *at, cv2.INTER_LINEAR) > 0.99
+    out = Case(colors, known, flow, valid)
+    return mirrored(out) if rng.random() < 0.5 else out
+
+
+def mirrored(case: Case) -> Case:
+    """The same reading with the sides of the face exchanged."""
+    flow = np.ascontiguousarray(case.flow[:, ::-1]) * np.array([-1.0, 1.0], np.float32)
+    colors, known, valid = (
+        np.ascontiguousarray(image[:, ::-1]) for image in (case.colors, case.known, case.valid)
+    )
+    return Case(colors, known, flow, valid)
+
+
+def where_seen(case: Case, texels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Where a chart shows what belongs to texels (N, 2), corner origin; and whether it does (N,).
+
+    Displacements are known where something is seen and asked for where it belongs.
+    """
+    valid = case.valid.astype(np.float32)
+    share = cv2.GaussianBlur(valid, (0, 0), 1.5)
+    flow = cv2.GaussianBlur(case.flow.astype(np.float32) * valid[..., None], (0, 0), 1.5)
+    flow = flow / np.maximum(share, 1e-3)[..., None]
+    own = texels.astype(np.float32) + LIPS_APART
+    at = own
+    for _ in range(TURNS):
+        at = own - _sampled(flow, at)
+    return at - LIPS_APART, _sampled(share, at) > LEAST_SHARE
+
+
+def _sampled(image: np.ndarray, at: np.ndarray) -> np.ndarray:
+    x, y = (np.ascontiguousarray(corner_to_cell(at[:, k : k + 1])) for k in range(2))
+    return cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[:, 0]

@@ -1,0 +1,149 @@
+"""The face as a map: which texel is which place of a head model's skin.
+
+A cylinder about the head is unrolled and warped until the 68 landmarks of any head model lie where
+those of every other do, so that one network reads the maps of all of them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.interpolate import RBFInterpolator
+
+from express50.adapters import cell_to_corner
+from express50.cameras import Camera
+from express50.head.model import HeadModel, landmarks
+from express50.mesh_raster import rasterize
+from pipelines.track.samples import HIDDEN, Samples
+
+# Texels, and how much of the head they cover: about 1.3 mm each on the cheeks.
+WIDTH, HEIGHT = 192, 160
+RIGHT, TOP = 1.35, 1.2
+# Beyond this azimuth a face may straddle the seam at the back.
+BACK = 2.6
+NO_SKIN = (*HIDDEN[:2], "teeth", "tongue", "gums", "left_eyeball", "right_eyeball")
+# What lies further behind what a texel shows is another sheet of skin; outer eye corners' widths.
+SHEET = 0.04
+# Where the landmarks' azimuths (radians) and heights (in widths between the outer eye corners) are
+# put: those of the procedural head, so that it needs no warp.
+MARKS = np.array(
+    [
+        (-1.571, 0.290), (-1.561, 0.079), (-1.552, -0.125), (-1.455, -0.356), (-1.215, -0.547),
+        (-0.874, -0.691), (-0.515, -0.800), (-0.214, -0.872), (0.000, -0.880), (0.214, -0.872),
+        (0.515, -0.800), (0.874, -0.691), (1.215, -0.547), (1.455, -0.356), (1.552, -0.125),
+        (1.561, 0.079), (1.571, 0.290), (-0.657, 0.519), (-0.497, 0.590), (-0.351, 0.611),
+        (-0.219, 0.595), (-0.100, 0.536), (0.100, 0.536), (0.219, 0.595), (0.351, 0.611),
+        (0.497, 0.590), (0.657, 0.519), (0.000, 0.404), (0.000, 0.284), (0.000, 0.153),
+        (0.000, 0.000), (-0.137, -0.128), (-0.076, -0.160), (0.000, -0.169), (0.076, -0.160),
+        (0.137, -0.128), (-0.605, 0.367), (-0.483, 0.401), (-0.328, 0.396), (-0.234, 0.341),
+        (-0.335, 0.309), (-0.484, 0.314), (0.234, 0.341), (0.328, 0.396), (0.483, 0.401),
+        (0.605, 0.367), (0.484, 0.314), (0.335, 0.309), (-0.323, -0.396), (-0.175, -0.340),
+        (-0.053, -0.301), (0.000, -0.313), (0.053, -0.301), (0.175, -0.340), (0.323, -0.396),
+        (0.177, -0.466), (0.056, -0.501), (0.000, -0.508), (-0.056, -0.501), (-0.177, -0.466),
+        (-0.312, -0.396), (-0.156, -0.389), (0.000, -0.398), (0.156, -0.389), (0.312, -0.396),
+        (0.156, -0.390), (0.000, -0.399), (-0.156, -0.390),
+    ]
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Chart:
+    """A head model's map.
+
+    Attributes:
+        samples: T places on the mesh, one a texel that shows the head.
+        texels: (T, 2) their rows and columns.
+        places: (V, 2) column and row of every vertex, corner origin; far off where it has none.
+        front: (F,) bool, faces of skin that the map shows, however small.
+        skin: (T,) bool, texels of skin: not of eyes, teeth or tongue.
+    """
+
+    samples: Samples
+    texels: np.ndarray
+    places: np.ndarray
+    front: np.ndarray
+    skin: np.ndarray
+
+    def image(self, values: np.ndarray) -> np.ndarray:
+        """Values (T, C) as a map (HEIGHT, WIDTH, C), 0 where there is no head."""
+        out = np.zeros((HEIGHT, WIDTH, values.shape[1]), dtype=values.dtype)
+        out[tuple(self.texels.T)] = values
+        return out
+
+    def inner(self, left: int, upper: int, side: int) -> Chart:
+        """The texels of a square window alone."""
+        off = self.texels - (upper, left)
+        some = np.all((off >= 0) & (off < side), axis=1)
+        samples, texels, skin = self.samples.some(some), self.texels[some], self.skin[some]
+        return replace(self, samples=samples, texels=texels, skin=skin)
+
+
+def make_chart(model: HeadModel) -> Chart:
+    """Lay a head model's template flat."""
+    vertices = model.template.double().numpy()
+    marks = landmarks(model, model.template[None].double())[0].double().numpy()
+    turned, radius = unrolled(vertices, marks)
+    places = to_texels(_warp(unrolled(marks, marks)[0])(turned))
+    faces = model.faces.numpy()
+    near = (np.abs(turned[:, 0]) < BACK)[faces].all(1)
+    face_id = _outermost(places, radius, faces, near)
+    texels = np.argwhere(face_id >= 0)
+    of_texel = face_id[tuple(texels.T)].astype(np.int64)
+    bary = _barycentrics(places[faces[of_texel]], cell_to_corner(texels[:, ::-1]))
+    samples = Samples(of_texel, faces[of_texel], bary)
+    named = [model.regions[name].numpy() for name in NO_SKIN if name in model.regions]
+    inside = np.any([np.zeros(len(vertices), dtype=bool), *named], axis=0)[faces].any(1)
+    shown = np.zeros((HEIGHT, WIDTH))
+    shown[tuple(texels.T)] = (radius[samples.corners] * bary).sum(1)
+    column, row = np.clip(places[faces].mean(1), 0, (WIDTH - 1, HEIGHT - 1)).astype(np.int64).T
+    front = near & ~inside & (radius[faces].mean(1) > shown[row, column] - SHEET)
+    return Chart(samples, texels, places, front, ~inside[of_texel])
+
+
+def unrolled(points: np.ndarray, marks: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Azimuth and height (N, 2) about the head's axis, and distance (N,) from it.
+
+    The axis runs upwards between the ends of the jaw line; heights are above the tip of the nose,
+    in widths between the outer corners of the eyes.
+    """
+    axis = marks[[0, 16]].mean(0)
+    unit = float(np.linalg.norm(marks[45] - marks[36]))
+    x, z = points[:, 0] - axis[0], points[:, 2] - axis[2]
+    height = (points[:, 1] - marks[30, 1]) / unit
+    return np.stack([np.arctan2(x, z), height], axis=1), np.hypot(x, z) / unit
+
+
+def to_texels(turned: np.ndarray) -> np.ndarray:
+    """Column and row (N, 2), corner origin, of azimuths and heights (N, 2)."""
+    step = 2.0 * RIGHT / WIDTH
+    return np.stack([WIDTH / 2 + turned[:, 0] / step, (TOP - turned[:, 1]) / step], axis=1)
+
+
+def _warp(marks: np.ndarray) -> RBFInterpolator:
+    """The smoothest map that brings landmarks (68, 2) to where they belong."""
+    return RBFInterpolator(marks, MARKS, kernel="thin_plate_spline", smoothing=1e-4)
+
+
+def _outermost(
+    places: np.ndarray, radius: np.ndarray, faces: np.ndarray, near: np.ndarray
+) -> np.ndarray:
+    """The face (HEIGHT, WIDTH) furthest from the axis at every texel, -1 where there is none."""
+    depth = 10.0 - np.minimum(radius, 5.0)
+    flat = np.column_stack([places * depth[:, None], depth])
+    camera = Camera("chart", WIDTH, HEIGHT, "PINHOLE", (1.0, 1.0, 0.0, 0.0), np.eye(4))
+    ids = np.flatnonzero(near)
+    found = rasterize(flat, faces[ids], camera, pairs=False).face_id
+    return np.where(found >= 0, ids[np.maximum(found, 0)], -1)
+
+
+def _barycentrics(corners: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Shares (N, 3) of triangles' corners (N, 3, 2) at points (N, 2) in or near them."""
+    a, b, c = np.moveaxis(corners, 1, 0)
+    u, v, w = b - a, c - a, points - a
+    area = u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]
+    area = np.where(np.abs(area) < 1e-12, 1e-12, area)
+    second = (w[:, 0] * v[:, 1] - w[:, 1] * v[:, 0]) / area
+    third = (u[:, 0] * w[:, 1] - u[:, 1] * w[:, 0]) / area
+    bary = np.clip(np.stack([1.0 - second - third, second, third], axis=1), 0.0, 1.0)
+    return bary / bary.sum(1, keepdims=True)

@@ -1,0 +1,158 @@
+"""Make `weights.npz` in one run: `python -m pipelines.track.chart.train --cases DIR [--ict PATH]`.
+
+Goes on from the landmark network's weights, on drawn heads only: the procedural one and, where a
+path is given, ICT-FaceKit; the shipped file used both, with the defaults of the other arguments.
+The result depends on the arguments alone, up to how the machine rounds. A run that was interrupted
+goes on from its last state, which is kept in DIR.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from dataclasses import astuple, dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+import torch
+
+from express50.head.load import load_head
+from express50.head.model import HeadModel
+from express50.landmarks.network import LandmarkNet, heat_loss, save_network, trainable_network
+from express50.landmarks.train import keep_state, rate_share, take_up
+from pipelines.track.chart.disturb import Case, warped, where_seen
+from pipelines.track.chart.files import make_cases, read_cases
+from pipelines.track.chart.layout import MARKS, to_texels
+from pipelines.track.chart.network import (
+    FIRST,
+    TEXELS_A_PIXEL,
+    WEIGHTS,
+    load_chart_network,
+    mark_places,
+    to_window,
+    window,
+)
+
+BATCH = 32
+RATE = 1e-3
+KEEP_EVERY = 100
+HELD_OUT = 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Plan:
+    """How to train: batches of charts in all, files of cases a head model, seed."""
+
+    steps: int = 4000
+    files: int = 24
+    seed: int = 0
+
+
+class Batch(NamedTuple):
+    """Windows (B, 3, 128, 128) in [0, 1], landmarks (B, 51, 2) pixels, which are known (B, 51)."""
+
+    images: torch.Tensor
+    points: torch.Tensor
+    known: torch.Tensor
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Draw what is missing, train, save and report the error on held-out heads."""
+    parser = argparse.ArgumentParser(prog="python -m pipelines.track.chart.train")
+    parser.add_argument("--cases", type=Path, required=True, help="folder for drawn cases")
+    parser.add_argument("--ict", help="ICT-FaceKit checkout or .npz to train on as well")
+    parser.add_argument("--files", type=int, default=Plan.files, help="files of cases a head")
+    parser.add_argument("--steps", type=int, default=Plan.steps, help="batches of 32 charts")
+    parser.add_argument("--seed", type=int, default=Plan.seed)
+    parser.add_argument("--out", type=Path, default=WEIGHTS)
+    options = parser.parse_args(arguments)
+    cv2.setNumThreads(1)
+    models = [load_head(spec) for spec in ("procedural", options.ict) if spec]
+    plan = Plan(steps=options.steps, files=options.files, seed=options.seed)
+    save_network(train(models, plan, options.cases), options.out)
+    net = load_chart_network(options.out)
+    for model in models:
+        cases = read_cases(make_cases(options.cases, model, HELD_OUT, plan.seed))
+        print(f"{model.name}: held-out heads {validate(net, cases)}")
+    return 0
+
+
+def train(models: list[HeadModel], plan: Plan, folder: Path) -> LandmarkNet:
+    """Train on cases of the head models; cases and the run's state are kept in a folder."""
+    torch.manual_seed(plan.seed)
+    net = trainable_network()
+    optimiser = torch.optim.AdamW(net.parameters(), lr=RATE, weight_decay=1e-3)
+    name = "-".join([*(m.name for m in models), *(str(value) for value in astuple(plan))])
+    cases = [
+        case
+        for number in range(HELD_OUT + 1, HELD_OUT + 1 + plan.files)
+        for model in models
+        for case in read_cases(make_cases(folder, model, number, plan.seed))
+    ]
+    state = folder / f"chart-training-{name}.pt"
+    first = take_up(state, net, optimiser)
+    began, losses = time.monotonic(), []
+    for step in range(first, plan.steps):
+        optimiser.param_groups[0]["lr"] = RATE * rate_share(step, plan.steps)
+        # Seeded by the step, so that a run taken up again draws what it would have drawn.
+        rng = np.random.default_rng([plan.seed, 2, step])
+        picks = rng.integers(len(cases), size=BATCH)
+        loss, _ = marks_loss(net, make_batch([warped(cases[pick], rng) for pick in picks]))
+        optimiser.zero_grad(set_to_none=True)
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(net.parameters(), 5.0)
+        optimiser.step()
+        losses.append(loss.item())
+        if (step + 1) % KEEP_EVERY == 0:
+            seconds = (time.monotonic() - began) / (step + 1 - first)
+            recent = np.mean(losses[-KEEP_EVERY:])
+            print(f"step {step + 1}: loss {recent:.3f}, {seconds:.2f} s", flush=True)
+            keep_state(state, net, optimiser, step + 1)
+    return net.eval()
+
+
+def make_batch(cases: list[Case]) -> Batch:
+    """Windows of charts, and where their landmarks are seen."""
+    images = np.stack([window(case.colors) for case in cases])
+    found = [where_seen(case, to_texels(MARKS)) for case in cases]
+    points = np.stack([to_window(at[FIRST:]) for at, _ in found])
+    known = np.stack([mask[FIRST:] for _, mask in found])
+    stacked = torch.from_numpy(images).permute(0, 3, 1, 2).float() / 255.0
+    return Batch(
+        stacked.contiguous(memory_format=torch.channels_last),
+        torch.from_numpy(points).float(),
+        torch.from_numpy(known).float(),
+    )
+
+
+def marks_loss(net: LandmarkNet, batch: Batch) -> tuple[torch.Tensor, torch.Tensor]:
+    """Distance, Laplace likelihood and cross entropy of the known landmarks; distances (B, 51)."""
+    output = net(batch.images)
+    # The square root's slope at zero distance is bounded by the added 0.01 px^2.
+    off = (output.points[:, FIRST:] - batch.points).square().sum(-1)
+    distance = (off + 0.01).sqrt()
+    log_scale = output.log_scale[:, FIRST:]
+    likelihood = 2 * log_scale + distance * torch.exp(-log_scale)
+    heat = heat_loss(output.heat[:, FIRST:], batch.points)
+    total = ((0.2 * distance + likelihood + heat) * batch.known).sum()
+    return total / batch.known.sum().clamp_min(1.0), distance.detach()
+
+
+@torch.inference_mode()
+def validate(net: LandmarkNet, cases: list[Case]) -> str:
+    """What is left of the displacements of landmarks in cases as they were drawn."""
+    batch = make_batch(cases)
+    _, after = marks_loss(net, batch)
+    home = torch.from_numpy(to_window(mark_places())).float()
+    before = (batch.points - home).norm(dim=-1)
+    shown = batch.known > 0
+    return (
+        f"{TEXELS_A_PIXEL * float(before[shown].mean()):.2f} texels before, "
+        f"{TEXELS_A_PIXEL * float(after[shown].mean()):.2f} after"
+    )
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

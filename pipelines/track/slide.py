@@ -1,0 +1,158 @@
+"""Where the skin is along itself: landmarks found on the face laid flat.
+
+The relief tells how far the skin lies before or behind the mesh, and colours tell moments from one
+another; neither says that a mouth's corner sits a millimetre too far out in all of them. So the
+face is laid flat as the pictures show it on the current mesh, and landmarks are found again there:
+if a corner of the mouth is seen beside where it belongs, the mesh is to move there.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import cv2
+import numpy as np
+import torch
+
+from express50.adapters import corner_to_cell
+from express50.head.model import HeadModel, vertex_normals
+from express50.landmarks.network import LandmarkNet
+from pipelines.track.chart.layout import HEIGHT, WIDTH, Chart
+from pipelines.track.chart.network import FIRST, load_chart_network, read_marks
+from pipelines.track.photometry import robust_mean
+from pipelines.track.pictures import Moment, see
+from pipelines.track.samples import Samples
+from pipelines.track.state import Target
+
+# Neighbouring landmarks err together: so many count as one.
+CROWD = 2.0
+FLOOR_M, OUTLIER_M = 0.0004, 0.004
+# Standard deviation of root light between views of one place.
+VIEW_NOISE = 0.05
+LEAST_SEEN = 0.1
+# One view cannot tell a move along the skin from one off it.
+LEAST_VIEWS = 2
+# Texels further apart than this lie on two sides of a gap, as between open lips.
+TORN_M = 0.004
+
+
+@dataclass(frozen=True)
+class Slide:
+    """Where S samples belong along the skin.
+
+    Attributes:
+        rows: (S, 3) the samples' corners: vertices, or places among the fit's points.
+        bary: (S, 3).
+        goals: (S, 3) world.
+        normals: (S, 3) world; the distance along them does not count.
+        sigma: (S,) metres.
+    """
+
+    rows: np.ndarray
+    bary: np.ndarray
+    goals: np.ndarray
+    normals: np.ndarray
+    sigma: np.ndarray
+
+    def _off(self, positions: np.ndarray) -> np.ndarray:
+        off = np.einsum("sk,skc->sc", self.bary, positions[self.rows]) - self.goals
+        return off - (off * self.normals).sum(1, keepdims=True) * self.normals
+
+    def cost(self, positions: np.ndarray) -> float:
+        """Half the sum of squared distances over sigma^2, Geman and McClure's beyond a limit."""
+        square = (self._off(positions) ** 2).sum(1)
+        return 0.5 * float((square / (1.0 + square / OUTLIER_M**2) / self.sigma**2).sum())
+
+    def normal(self, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Gauss-Newton matrix (S, 3, 3) and gradient (S, 3) by the samples' positions, metres."""
+        off = self._off(positions)
+        weight = 1.0 / (self.sigma * (1.0 + (off**2).sum(1) / OUTLIER_M**2)) ** 2
+        flat = np.eye(3) - self.normals[:, :, None] * self.normals[:, None, :]
+        return weight[:, None, None] * flat, weight[:, None] * off
+
+
+def with_slides(targets: list[Target], slides: list[Slide | None]) -> list[Target]:
+    """The targets with where the skin belongs; its vertices join the fit's points."""
+    made = []
+    for target, slide in zip(targets, slides, strict=True):
+        if slide is not None:
+            ids, rows = np.unique(slide.rows, return_inverse=True)
+            rows = rows.reshape(-1, 3) + 68 + len(target.vertices)
+            vertices = np.concatenate([target.vertices, ids])
+            terms = (*target.terms, replace(slide, rows=rows))
+            target = replace(target, vertices=vertices, terms=terms)
+        made.append(target)
+    return made
+
+
+def read_slide(
+    model: HeadModel, chart: Chart, moment: Moment, mesh: np.ndarray, weight: float
+) -> Slide | None:
+    """Where one moment's skin belongs, its rows being vertices; None where too little is seen.
+
+    Args:
+        model: the head.
+        chart: its map.
+        moment: pictures.
+        mesh: (V, 3) of the fit so far, world.
+        weight: trust in the reading.
+    """
+    if len(moment.shots) < LEAST_VIEWS:
+        return None
+    colors, mass = read_chart(model, chart, moment, mesh)
+    at, error = read_marks(load_once(), colors)
+    # Single precision is for places about the head, not for those of the world.
+    middle = mesh.mean(0)
+    places = chart.image((chart.samples.at(mesh) - middle).astype(np.float32))
+    goals, step = _between(places, at)
+    seen = _sampled((mass > LEAST_SEEN).astype(np.float32), at)
+    good = np.flatnonzero((seen > 0.99) & (step < TORN_M))
+    if not len(good):
+        return None
+    samples = landmark_samples(model).some(good + FIRST)
+    normals = vertex_normals(torch.from_numpy(mesh)[None], model.faces)[0].numpy()
+    normals = samples.at(normals)
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    sigma = np.hypot(error[good] * step[good], FLOOR_M) * (CROWD / weight) ** 0.5
+    return Slide(samples.corners, samples.bary, goals[good] + middle, normals, sigma)
+
+
+def landmark_samples(model: HeadModel) -> Samples:
+    """The 68 landmarks' places on the mesh."""
+    faces = model.landmark_faces.numpy()
+    bary = model.landmark_bary.double().numpy()
+    return Samples(faces, model.faces.numpy()[faces], bary)
+
+
+def read_chart(
+    model: HeadModel, chart: Chart, moment: Moment, mesh: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Root light (HEIGHT, WIDTH, 3) on which most views agree, and how well it was seen (H, W)."""
+    seen = see(model, chart.samples, moment, mesh)
+    trust = seen.weights**2
+    colors = robust_mean(seen.values, np.ones_like(seen.values), trust, VIEW_NOISE)
+    mass = trust.sum(0)[:, None].astype(np.float32)
+    return chart.image(colors.astype(np.float32)), chart.image(mass)[..., 0]
+
+
+def _sampled(image: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """An image (HEIGHT, WIDTH[, C]) at texels (S, 2), corner origin, as float64."""
+    x, y = (np.ascontiguousarray(corner_to_cell(at[:, k : k + 1]), np.float32) for k in range(2))
+    sampled = cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return sampled[:, 0].astype(np.float64)
+
+
+def _between(places: np.ndarray, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Places (S, 3) at texels (S, 2), and the longest step (S,) from a texel to the next there."""
+    column, row = np.clip(corner_to_cell(at), 0, (WIDTH - 2, HEIGHT - 2)).astype(np.int64).T
+    a, b = places[row, column], places[row, column + 1]
+    c, d = places[row + 1, column], places[row + 1, column + 1]
+    steps = [np.linalg.norm(x - y, axis=1) for x, y in ((a, b), (c, d), (a, c), (b, d))]
+    return _sampled(places, at), np.max(steps, axis=0)
+
+
+@lru_cache(maxsize=1)
+def load_once() -> LandmarkNet:
+    """The shipped network."""
+    return load_chart_network()
