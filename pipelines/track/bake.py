@@ -18,7 +18,7 @@ from express50.mesh_raster import rasterize
 from pipelines.track.appearance import Appearance, Seen
 from pipelines.track.photometry import look, robust_mean
 from pipelines.track.pictures import Moment, inside_picture
-from pipelines.track.samples import Samples, Visibility, sample_normals
+from pipelines.track.samples import Samples, Visibility, flat_barycentrics, sample_normals
 from pipelines.track.shots import Shot, root_light
 from pipelines.track.state import Target
 
@@ -84,7 +84,7 @@ def bake_albedo(
     known = np.zeros((side, side), dtype=bool)
     root = np.zeros((side, side, 3))
     for start in range(0, len(texels.faces), CHUNK):
-        some = np.arange(start, min(start + CHUNK, len(texels.faces)))
+        some = slice(start, start + CHUNK)
         part = texels.some(some)
         seen = [_seen(scene, part) for scene in scenes]
         colour, mass = _agreed(seen, appearance)
@@ -128,13 +128,7 @@ def texel_samples(model: HeadModel, side: int) -> tuple[Samples, np.ndarray]:
     texture = np.argwhere(face_id >= 0)
     faces = face_id[tuple(texture.T)].astype(np.int64)
     at = cell_to_corner(texture[:, ::-1]) / side
-    a, b, c = np.moveaxis(flat[uv_faces[faces], :2], 1, 0)
-    u, v, w = b - a, c - a, at - a
-    area = u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]
-    second = (w[:, 0] * v[:, 1] - w[:, 1] * v[:, 0]) / area
-    third = (u[:, 0] * w[:, 1] - u[:, 1] * w[:, 0]) / area
-    bary = np.clip(np.stack([1.0 - second - third, second, third], axis=1), 0.0, 1.0)
-    bary /= bary.sum(1, keepdims=True)
+    bary = flat_barycentrics(flat[uv_faces[faces], :2], at)
     return Samples(faces, model.faces.numpy()[faces], bary), texture
 
 

@@ -34,12 +34,13 @@ def fit(
     state: State,
     config: TrackConfig,
     iterations: int,
-    free_bias: bool = False,
+    free: tuple[str, ...] = (),
 ) -> tuple[State, float]:
     """Minimise robust residuals plus priors from a start.
 
-    `free_bias` lets the detector err on this face and the surface leave the model's shapes by its
-    offset modes; only pictures of the surface can tell either.
+    Pictures of the surface tell what landmarks and outlines do not: that the detector errs on this
+    face, and how the surface leaves the model's shapes. `free` names the offset modes they tell of
+    (`offsets.OFF`, `offsets.ALONG`); with any of them the detector's bias is free too.
 
     Returns:
         The fitted state and its cost (half the sum of squared, robustly weighted residuals).
@@ -48,7 +49,7 @@ def fit(
         StageError: the cost is not a finite number.
     """
     points = [Points(basis, target.vertices) for target in targets]
-    weights = _shared_weights(basis, len(targets), config, free_bias)
+    weights = _shared_weights(basis, len(targets), config, free)
     damping = 1e-3
     cost = _cost(basis, targets, points, state, config, weights)
     for _ in range(iterations):
@@ -170,7 +171,7 @@ def _shared(state: State) -> np.ndarray:
 
 
 def _shared_weights(
-    basis: Basis, expressions: int, config: TrackConfig, free_bias: bool
+    basis: Basis, expressions: int, config: TrackConfig, free: tuple[str, ...]
 ) -> np.ndarray:
     """Inverse variances (S + BIAS,) of the shared unknowns.
 
@@ -178,9 +179,11 @@ def _shared_weights(
     or by a search that highlights mislead: more of them are no more evidence of the shape.
     """
     shape = np.full(basis.shape_size, config.shape_prior * expressions)
-    if not free_bias:  # landmarks and outlines tell nothing of the offsets between them
-        shape[[name.startswith(MODE) for name in basis.model.shape_names]] = KNOWN_MODE
-    bias = np.full((68, 3), config.landmark_bias if free_bias else KNOWN_BIAS_M)
+    known = [
+        name.startswith(MODE) and not name.startswith(free) for name in basis.model.shape_names
+    ]
+    shape[known] = KNOWN_MODE
+    bias = np.full((68, 3), config.landmark_bias if free else KNOWN_BIAS_M)
     bias[:17] /= config.contour_weight
     return np.r_[shape, bias.ravel() ** -2]
 

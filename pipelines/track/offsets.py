@@ -21,7 +21,9 @@ from express50.head.model import HeadModel, vertex_normals
 RIGID = (
     "left_eyeball", "right_eyeball", "teeth", "tongue", "gums", "mouth_interior", "boundary",
 )  # fmt: skip
-MODE = "offset_mode_"
+# Names of modes: all, those along the normals and those along the skin.
+MODE = "offset_"
+OFF, ALONG = f"{MODE}off_", f"{MODE}along_"
 
 
 def with_modes(
@@ -43,9 +45,11 @@ def with_modes(
     normals = vertex_normals(model.template[None].double(), model.faces)[0]
     heights = torch.from_numpy(offset_modes(model, max(count, along), sigma, length))
     flat = torch.eye(3).double() - normals[:, :, None] * normals[:, None, :]
-    slides = flat[..., None] * heights[:, None, None, :along]
-    modes = torch.cat([normals[:, :, None] * heights[:, None, :count], slides.flatten(2)], dim=2)
-    names = tuple(f"{MODE}{index}" for index in range(modes.shape[2]))
+    lifts = normals[:, :, None] * heights[:, None, :count]
+    slides = (flat[..., None] * heights[:, None, None, :along]).flatten(2)
+    modes = torch.cat([lifts, slides], dim=2)
+    names = tuple(f"{OFF}{index}" for index in range(lifts.shape[2]))
+    names += tuple(f"{ALONG}{index}" for index in range(slides.shape[2]))
     return replace(
         model,
         shape_dirs=torch.cat([model.shape_dirs, modes.to(model.dtype)], dim=2),

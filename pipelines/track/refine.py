@@ -13,6 +13,7 @@ from pipelines.track.config import TrackConfig
 from pipelines.track.fit import fit
 from pipelines.track.hair import is_bald
 from pipelines.track.marks import Eyes, with_marks
+from pipelines.track.offsets import ALONG, OFF
 from pipelines.track.outline import Outline, outline_regions, outline_vertices
 from pipelines.track.pictures import Moment, see, with_photometry, with_relief
 from pipelines.track.relief import Relief
@@ -36,13 +37,14 @@ def refine(
 ) -> tuple[State, list[Target], Appearance | None]:
     """Alternate between reading the pictures with the current meshes and fitting to what was read.
 
-    First the relief, searched over millimetres; then colours, which are finer and need to be near.
+    First the relief, searched over millimetres, and landmarks on the face laid flat; then colours,
+    which are finer and need to be near.
     """
     model = basis.model
     samples = spread(model, config.samples)
     appearance: Appearance | None = None
     rounds = config.relief_rounds + config.photo_rounds
-    rounds = max(rounds, config.silhouette_rounds, MARK_ROUNDS)
+    rounds = max(rounds, config.silhouette_rounds, config.chart_rounds, MARK_ROUNDS)
     plain = targets
     bald = _bald(model, moments, all_vertices(model, state))
     chart = reading_chart(model) if config.chart_rounds else None
@@ -78,10 +80,14 @@ def refine(
                 for seen in zip(moments, meshes, strict=True)
             ]
         targets = with_slides(targets, slides)
-        # Only a searched surface, or one whose places are known, can tell what the detector errs.
-        free = any(isinstance(t, Relief | Slide) for target in targets for t in target.terms)
-        state, _ = fit(basis, targets, state, config, config.round_iterations, free)
+        state, _ = fit(basis, targets, state, config, config.round_iterations, _told(targets))
     return state, targets, appearance
+
+
+def _told(targets: list[Target]) -> tuple[str, ...]:
+    """Kinds of offsets that terms of the targets tell of."""
+    kinds = {type(term) for target in targets for term in target.terms}
+    return tuple(name for kind, name in ((Relief, OFF), (Slide, ALONG)) if kind in kinds)
 
 
 def _bald(model: HeadModel, moments: list[Moment], meshes: np.ndarray) -> bool:

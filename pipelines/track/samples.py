@@ -35,8 +35,8 @@ class Samples:
     corners: np.ndarray
     bary: np.ndarray
 
-    def some(self, ids: np.ndarray) -> Samples:
-        """Those of some indices, or of a mask."""
+    def some(self, ids: np.ndarray | slice) -> Samples:
+        """Those of some indices, of a mask or of a slice."""
         return Samples(self.faces[ids], self.corners[ids], self.bary[ids])
 
     def at(self, vertices: np.ndarray) -> np.ndarray:
@@ -79,6 +79,18 @@ def _spiral(count: int) -> tuple[np.ndarray, np.ndarray]:
     """Evenly spread pairs in the unit square: the R2 sequence (Roberts 2018)."""
     step = np.arange(1, count + 1)
     return (0.5 + 0.7548776662466927 * step) % 1.0, (0.5 + 0.5698402909980532 * step) % 1.0
+
+
+def flat_barycentrics(corners: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Shares (N, 3) of triangles' corners (N, 3, 2) at points (N, 2) in or near them."""
+    a, b, c = np.moveaxis(corners, 1, 0)
+    u, v, w = b - a, c - a, points - a
+    area = u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]
+    area = np.where(np.abs(area) < 1e-12, 1e-12, area)
+    second = (w[:, 0] * v[:, 1] - w[:, 1] * v[:, 0]) / area
+    third = (u[:, 0] * w[:, 1] - u[:, 1] * w[:, 0]) / area
+    bary = np.clip(np.stack([1.0 - second - third, second, third], axis=1), 0.0, 1.0)
+    return bary / bary.sum(1, keepdims=True)
 
 
 def sample_normals(samples: Samples, vertices: np.ndarray) -> np.ndarray:

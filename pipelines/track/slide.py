@@ -18,8 +18,8 @@ import torch
 from express50.adapters import corner_to_cell
 from express50.head.model import HeadModel, vertex_normals
 from express50.landmarks.network import LandmarkNet
-from pipelines.track.chart.layout import HEIGHT, WIDTH, Chart
-from pipelines.track.chart.network import FIRST, load_chart_network, read_marks
+from pipelines.track.chart.layout import HEIGHT, LIPS_APART, WIDTH, Chart
+from pipelines.track.chart.network import FIRST, load_chart_network, mark_places, read_marks
 from pipelines.track.photometry import robust_mean
 from pipelines.track.pictures import Moment, see
 from pipelines.track.samples import Samples
@@ -31,7 +31,6 @@ FLOOR_M, OUTLIER_M = 0.0004, 0.004
 # Standard deviation of root light between views of one place.
 VIEW_NOISE = 0.05
 LEAST_SEEN = 0.1
-# One view cannot tell a move along the skin from one off it.
 LEAST_VIEWS = 2
 # Texels further apart than this lie on two sides of a gap, as between open lips.
 TORN_M = 0.004
@@ -98,39 +97,48 @@ def read_slide(
         mesh: (V, 3) of the fit so far, world.
         weight: trust in the reading.
     """
-    if len(moment.shots) < LEAST_VIEWS:
-        return None
     colors, mass = read_chart(model, chart, moment, mesh)
-    at, error = read_marks(load_once(), colors)
+    if not (mass > LEAST_SEEN).any():
+        return None
+    at, error = read_marks(chart_network(), colors)
+    rims = LIPS_APART[FIRST:]
     # Single precision is for places about the head, not for those of the world.
-    middle = mesh.mean(0)
-    places = chart.image((chart.samples.at(mesh) - middle).astype(np.float32))
-    goals, step = _between(places, at)
-    seen = _sampled((mass > LEAST_SEEN).astype(np.float32), at)
-    good = np.flatnonzero((seen > 0.99) & (step < TORN_M))
+    places = chart.image((chart.samples.at(mesh) - mesh.mean(0)).astype(np.float32))
+    found, step = _between(places, at + rims)
+    home, home_step = _between(places, mark_places() + rims)
+    seen = _sampled((mass > LEAST_SEEN).astype(np.float32), at + rims)
+    good = np.flatnonzero((seen > 0.99) & (np.maximum(step, home_step) < TORN_M))
     if not len(good):
         return None
     samples = landmark_samples(model).some(good + FIRST)
-    normals = vertex_normals(torch.from_numpy(mesh)[None], model.faces)[0].numpy()
-    normals = samples.at(normals)
+    # The chart rounds off where landmarks lie; by how much it says that they move, it says well.
+    goals = samples.at(mesh) + found[good] - home[good]
+    normals = samples.at(vertex_normals(torch.from_numpy(mesh)[None], model.faces)[0].numpy())
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
     sigma = np.hypot(error[good] * step[good], FLOOR_M) * (CROWD / weight) ** 0.5
-    return Slide(samples.corners, samples.bary, goals[good] + middle, normals, sigma)
+    return Slide(samples.corners, samples.bary, goals, normals, sigma)
 
 
 def landmark_samples(model: HeadModel) -> Samples:
     """The 68 landmarks' places on the mesh."""
     faces = model.landmark_faces.numpy()
     bary = model.landmark_bary.double().numpy()
+    # Shares of single precision that miss 1 by 1e-7 are off by a millimetre 10 km from the origin.
+    bary = bary / bary.sum(1, keepdims=True)
     return Samples(faces, model.faces.numpy()[faces], bary)
 
 
 def read_chart(
     model: HeadModel, chart: Chart, moment: Moment, mesh: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Root light (HEIGHT, WIDTH, 3) on which most views agree, and how well it was seen (H, W)."""
+    """Root light (HEIGHT, WIDTH, 3) on which most views agree, and how well it was seen (H, W).
+
+    What fewer than two views see counts as unseen: one view cannot tell a move along the skin from
+    one off it.
+    """
     seen = see(model, chart.samples, moment, mesh)
-    trust = seen.weights**2
+    shared = (seen.weights > 0).sum(0) >= LEAST_VIEWS
+    trust = seen.weights**2 * shared
     colors = robust_mean(seen.values, np.ones_like(seen.values), trust, VIEW_NOISE)
     mass = trust.sum(0)[:, None].astype(np.float32)
     return chart.image(colors.astype(np.float32)), chart.image(mass)[..., 0]
@@ -153,6 +161,6 @@ def _between(places: np.ndarray, at: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 
 @lru_cache(maxsize=1)
-def load_once() -> LandmarkNet:
-    """The shipped network."""
+def chart_network() -> LandmarkNet:
+    """The shipped network, read once."""
     return load_chart_network()

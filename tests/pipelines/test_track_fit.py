@@ -13,6 +13,7 @@ from express50.transforms import axis_angle_to_matrix
 from pipelines.track.config import TrackConfig
 from pipelines.track.fit import fit, landmark_sigma
 from pipelines.track.observe import View, agree
+from pipelines.track.offsets import OFF
 from pipelines.track.relief import Relief
 from pipelines.track.sparse_head import Basis, Points, make_basis
 from pipelines.track.state import Pose, State, Target
@@ -104,7 +105,7 @@ def face_error(basis: Basis, state: State) -> float:
 
 def test_a_free_bias_takes_what_the_detector_errs_and_the_shape_does_not() -> None:
     basis, targets, state = shifted_targets(2, relief=True)
-    free, cost = fit(basis, targets, state, CONFIG, 30, free_bias=True)
+    free, cost = fit(basis, targets, state, CONFIG, 30, free=(OFF,))
     held, worse = fit(basis, targets, state, CONFIG, 30)
     assert cost < 0.5 * worse
     # The inner landmarks; the jaw line's count a quarter.
@@ -137,8 +138,8 @@ def test_without_a_free_bias_more_of_the_same_expression_changes_no_shape() -> N
 def test_terms_take_part_and_the_cost_never_rises() -> None:
     basis, targets, state = shifted_targets(2, relief=True)
     start = State(np.zeros(5), state.poses)
-    costs = [fit(basis, targets, start, CONFIG, n, free_bias=True)[1] for n in (0, 1, 2, 4, 8)]
+    costs = [fit(basis, targets, start, CONFIG, n, free=(OFF,))[1] for n in (0, 1, 2, 4, 8)]
     assert all(b <= a for a, b in zip(costs, costs[1:], strict=False))
     assert costs[-1] < 0.01 * costs[0]
-    end, _ = fit(basis, targets, start, CONFIG, 30, free_bias=True)
+    end, _ = fit(basis, targets, start, CONFIG, 30, free=(OFF,))
     assert face_error(basis, end) < 0.3e-3

@@ -4,14 +4,21 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from express50.cameras import Camera
+from express50.errors import ConfigError
 from express50.head.load import load_head
-from express50.head.model import landmarks
-from pipelines.track.chart.network import reading_chart
+from express50.head.model import landmarks, pose, vertex_normals
+from express50.transforms import look_at
+from pipelines.track.chart.layout import HEIGHT, WIDTH
+from pipelines.track.chart.network import mark_places, reading_chart
+from pipelines.track.config import TrackConfig
 from pipelines.track.offsets import split_shape, with_modes
 from pipelines.track.pictures import Moment
+from pipelines.track.shots import Shot
 from pipelines.track.slide import Slide, landmark_samples, read_slide, with_slides
 from pipelines.track.state import Target
 
@@ -66,17 +73,83 @@ def test_terms_join_the_points_of_a_fit() -> None:
     assert (made.vertices[term.rows - 68] == slide.rows).all() and term.rows.min() >= 70
 
 
-def test_where_nothing_is_seen_nothing_is_said() -> None:
-    model = load_head("procedural")
-    mesh = model.template.double().numpy()
-    chart = reading_chart(model)
-    assert read_slide(model, chart, Moment((), ()), mesh, 1.0) is None
-    marks = landmarks(model, model.template[None])[0].numpy()
-    np.testing.assert_allclose(landmark_samples(model).at(mesh), marks, atol=1e-6)
+@pytest.fixture(scope="module")
+def head():
+    return load_head("procedural")
 
 
-def test_modes_along_the_skin_stay_in_it() -> None:
-    model = load_head("procedural")
+@pytest.fixture(scope="module")
+def chart(head):
+    return reading_chart(head)
+
+
+def told(monkeypatch, shift=0.0, mass=1.0) -> None:
+    """Let every landmark be seen `shift` texels to the right of where it belongs."""
+    at = mark_places() + (shift, 0.0)
+    image = np.zeros((HEIGHT, WIDTH, 3), np.float32)
+    seen = np.full((HEIGHT, WIDTH), mass, np.float32)
+    monkeypatch.setattr("pipelines.track.slide.read_chart", lambda *_: (image, seen))
+    monkeypatch.setattr("pipelines.track.slide.read_marks", lambda *_: (at, np.full(51, 0.5)))
+
+
+def posed(head, jaw=0.0) -> np.ndarray:
+    still = torch.zeros(1, 1)
+    return pose(head, still, still, jaw=torch.tensor([[jaw, 0.0, 0.0]]))[0].double().numpy()
+
+
+@pytest.mark.parametrize("jaw", [0.0, 0.25])
+def test_landmarks_seen_where_they_belong_stay(head, chart, monkeypatch, jaw: float) -> None:
+    told(monkeypatch)
+    mesh = posed(head, jaw)
+    slide = read_slide(head, chart, None, mesh, 1.0)
+    assert len(slide.goals) > 45
+    off = slide.goals - np.einsum("sk,skc->sc", slide.bary, mesh[slide.rows])
+    assert np.abs(off).max() < 1e-6 and slide.cost(mesh) < 1e-9
+
+
+def test_landmarks_seen_aside_pull_the_mesh_there(head, chart, monkeypatch) -> None:
+    told(monkeypatch, shift=2.0)
+    mesh = posed(head)
+    slide = read_slide(head, chart, None, mesh, 1.0)
+    off = slide.goals - np.einsum("sk,skc->sc", slide.bary, mesh[slide.rows])
+    # To the right on the chart is the subject's left, +x; a texel is 1.2 to 1.4 mm in front.
+    front = np.abs(slide.normals[:, 2]) > 0.9
+    assert front.sum() > 15 and 2.0 < 1e3 * np.median(off[front, 0]) < 3.2
+    far = read_slide(head, chart, None, mesh + 10_000.0, 1.0)
+    np.testing.assert_allclose(far.goals - 10_000.0, slide.goals, atol=1e-6)
+    np.testing.assert_allclose(far.sigma, slide.sigma, rtol=1e-4)
+    trusted = read_slide(head, chart, None, mesh, 4.0)
+    np.testing.assert_allclose(trusted.sigma, 0.5 * slide.sigma)
+
+
+def test_what_is_not_seen_says_nothing(head, chart, monkeypatch) -> None:
+    told(monkeypatch, mass=0.05)
+    assert read_slide(head, chart, None, posed(head), 1.0) is None
+
+
+def test_a_place_needs_two_views(head, chart) -> None:
+    mesh = posed(head)
+    front = [shot_of(mesh, angle) for angle in (-0.3, 0.3)]
+    behind = [shot_of(mesh, angle) for angle in (2.8, 3.4)]
+    assert read_slide(head, chart, Moment((), ()), mesh, 1.0) is None
+    assert read_slide(head, chart, Moment((), tuple(behind)), mesh, 1.0) is None
+    assert read_slide(head, chart, Moment((), (front[0], behind[0])), mesh, 1.0) is None
+    assert read_slide(head, chart, Moment((), tuple(front)), mesh, 1.0) is not None
+    marks = landmarks(head, torch.from_numpy(mesh).float()[None])[0].numpy()
+    np.testing.assert_allclose(landmark_samples(head).at(mesh), marks, atol=1e-6)
+
+
+def shot_of(mesh: np.ndarray, angle: float) -> Shot:
+    """A grey picture from an angle about the head, radians; 0 in front."""
+    centre = mesh.mean(0)
+    eye = centre + np.array([np.sin(angle), 0.0, np.cos(angle)])
+    view = look_at(eye, centre, np.array([0.0, 1.0, 0.0]))
+    camera = Camera(f"{angle}", 128, 128, "PINHOLE", (250.0, 250.0, 64.0, 64.0), view)
+    return Shot(camera.id, camera, np.full((128, 128, 3), 128, np.uint8), None)
+
+
+def test_modes_along_the_skin_stay_in_it(head) -> None:
+    model = head
     own = len(model.shape_names)
     more = with_modes(model, 6, 1e-3, 0.02, along=4)
     assert len(more.shape_names) == own + 6 + 3 * 4
@@ -86,5 +159,15 @@ def test_modes_along_the_skin_stay_in_it() -> None:
     assert len(coefficients) == own and not coefficients.any()
     skin = model.regions["face"].numpy()
     assert 1e-4 < np.linalg.norm(offsets[skin], axis=1).mean() < 5e-3
+    normals = vertex_normals(model.template[None].double(), model.faces)[0].numpy()
+    assert np.abs((offsets * normals).sum(1)).max() < 1e-6
     only = with_modes(model, 0, 1e-3, 0.02, along=4)
     assert len(only.shape_names) == own + 12
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"chart_rounds": -1}, {"offset_along": -1}, {"chart_weight": 0.0}]
+)
+def test_settings_that_cannot_work_are_refused(wrong: dict) -> None:
+    with pytest.raises(ConfigError, match="track: "):
+        TrackConfig(**wrong)

@@ -55,7 +55,10 @@ def draw_person(model: HeadModel, chart: Chart, rng: Rng) -> Person:
     rest = (whole.rest[corners] * bary[..., None]).sum(1)
     # Lips end where they end, not where a mesh's edges happen to run.
     ragged = rng.uniform(0.0, 0.2) * waves(rest, rng, 8, 200.0, 900.0)
-    canvas = Canvas(rest, {n: r > 0.5 + ragged for n, r in region.items()}, whole.marks)
+    inside = {name: share > 0.5 for name, share in region.items()}
+    if "lips" in region:
+        inside["lips"] = region["lips"] > 0.5 + ragged
+    canvas = Canvas(rest, inside, whole.marks)
     background = rng.uniform(0.0, 1.0, 3)
     return Person(
         chart.image(paint(canvas, rng)[0]),
@@ -84,7 +87,6 @@ def draw_case(model: HeadModel, chart: Chart, person: Person, rng: Rng) -> Case:
     flow, valid = head.flow(places, normals)
     return Case(
         np.rint(255.0 * np.clip(colors, 0.0, 1.0)).astype(np.uint8),
-        chart.image(np.rint(100.0 * np.minimum(mass, 2.5))[:, None])[..., 0].astype(np.uint8),
         chart.image(flow).astype(np.float16),
         chart.image((valid & chart.skin & (mass > 0.02))[:, None])[..., 0],
     )
@@ -128,7 +130,7 @@ class _Head:
         self.scene = mesh_scene(vertices, self.faces)
         normals = vertex_normals(torch.from_numpy(vertices)[None], model.faces)[0]
         self.normals = normals.numpy().astype(np.float32)
-        self.skin = chart.front
+        self.front = chart.front
 
     def seen(self, camera: Camera, places: np.ndarray, lamps: Lamps) -> np.ndarray:
         """Root of light (N, 3) where a camera looks for places (N, 3)."""
@@ -148,7 +150,7 @@ class _Head:
         """Where the true skin at places (N, 3) of the wrong mesh belongs: (N, 2), known (N,)."""
         rays = np.concatenate([places + REACH_M * normals, -normals], axis=1)
         hit, face, bary = self._cast(rays, 2 * REACH_M)
-        hit &= self.skin[np.maximum(face, 0)]
+        hit &= self.front[face]
         where = (self.chart.places[self.faces[face]] * bary[..., None]).sum(1)
         own = self.chart.texels[:, ::-1] + 0.5
         hit &= np.linalg.norm(where - own, axis=1) < FAR_TEXELS
@@ -162,7 +164,7 @@ class _Head:
             self.person.map, x.astype(np.float32), y.astype(np.float32), cv2.INTER_LINEAR,
             borderMode=cv2.BORDER_REPLICATE,
         ).reshape(-1, 3)  # fmt: skip
-        return np.where(self.skin[face][:, None], mapped, plain)
+        return np.where(self.front[face][:, None], mapped, plain)
 
     def _cast(
         self, rays: np.ndarray, far: float = np.inf

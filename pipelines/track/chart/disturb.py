@@ -8,16 +8,13 @@ import cv2
 import numpy as np
 
 from express50.adapters import corner_to_cell
-from pipelines.track.chart.layout import HEIGHT, WIDTH
+from pipelines.track.chart.layout import HEIGHT, LIPS_APART, WIDTH
 
 Rng = np.random.Generator
 # Steps in which the inverse of a displacement is found.
 TURNS = 6
 # Share of the texels about a place whose displacement must be known.
 LEAST_SHARE = 0.25
-# The rims of closed lips touch: a texel to either side tells which lip moves them.
-LIPS_APART = np.zeros((68, 2), np.float32)
-LIPS_APART[[61, 62, 63], 1], LIPS_APART[[65, 66, 67], 1] = -1.2, 1.2
 
 
 @dataclass(frozen=True)
@@ -26,14 +23,12 @@ class Case:
 
     Attributes:
         colors: (HEIGHT, WIDTH, 3) uint8, root of light.
-        known: (HEIGHT, WIDTH) uint8, how well it was seen.
         flow: (HEIGHT, WIDTH, 2) float16 texels: a texel shows what belongs so far to its right and
             below it.
         valid: (HEIGHT, WIDTH) bool, texels whose flow is known.
     """
 
     colors: np.ndarray
-    known: np.ndarray
     flow: np.ndarray
     valid: np.ndarray
 
@@ -74,20 +69,17 @@ def warped(case: Case, rng: Rng) -> Case:
     shift = (rng.random() * (np.stack(fields, axis=2) + broad)).astype(np.float32)
     at = x + shift[..., 0], y + shift[..., 1]
     colors = cv2.remap(case.colors, *at, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    known = cv2.remap(case.known, *at, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     flow = cv2.remap(case.flow.astype(np.float32), *at, cv2.INTER_LINEAR) + shift
     valid = cv2.remap(case.valid.astype(np.float32), *at, cv2.INTER_LINEAR) > 0.99
-    out = Case(colors, known, flow, valid)
+    out = Case(colors, flow, valid)
     return mirrored(out) if rng.random() < 0.5 else out
 
 
 def mirrored(case: Case) -> Case:
     """The same reading with the sides of the face exchanged."""
     flow = np.ascontiguousarray(case.flow[:, ::-1]) * np.array([-1.0, 1.0], np.float32)
-    colors, known, valid = (
-        np.ascontiguousarray(image[:, ::-1]) for image in (case.colors, case.known, case.valid)
-    )
-    return Case(colors, known, flow, valid)
+    colors, valid = (np.ascontiguousarray(image[:, ::-1]) for image in (case.colors, case.valid))
+    return Case(colors, flow, valid)
 
 
 def where_seen(case: Case, texels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -99,7 +91,7 @@ def where_seen(case: Case, texels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     share = cv2.GaussianBlur(valid, (0, 0), 1.5)
     flow = cv2.GaussianBlur(case.flow.astype(np.float32) * valid[..., None], (0, 0), 1.5)
     flow = flow / np.maximum(share, 1e-3)[..., None]
-    own = texels.astype(np.float32) + LIPS_APART
+    own = (texels + LIPS_APART).astype(np.float32)
     at = own
     for _ in range(TURNS):
         at = own - _sampled(flow, at)

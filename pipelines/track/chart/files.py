@@ -43,5 +43,5 @@ def read_cases(path: Path) -> list[Case]:
         stacks = {name: data[name] for name in Case.__annotations__}
     return [
         Case(**{name: stack[index] for name, stack in stacks.items()})
-        for index in range(len(stacks["known"]))
+        for index in range(len(stacks["valid"]))
     ]

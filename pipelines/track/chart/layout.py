@@ -13,16 +13,19 @@ from scipy.interpolate import RBFInterpolator
 
 from express50.adapters import cell_to_corner
 from express50.cameras import Camera
+from express50.errors import HeadModelError
 from express50.head.model import HeadModel, landmarks
 from express50.mesh_raster import rasterize
-from pipelines.track.samples import HIDDEN, Samples
+from pipelines.track.samples import Samples, flat_barycentrics
 
 # Texels, and how much of the head they cover: about 1.3 mm each on the cheeks.
 WIDTH, HEIGHT = 192, 160
 RIGHT, TOP = 1.35, 1.2
 # Beyond this azimuth a face may straddle the seam at the back.
 BACK = 2.6
-NO_SKIN = (*HIDDEN[:2], "teeth", "tongue", "gums", "left_eyeball", "right_eyeball")
+NO_SKIN = (
+    "mouth_interior", "boundary", "teeth", "tongue", "gums", "left_eyeball", "right_eyeball",
+)  # fmt: skip
 # What lies further behind what a texel shows is another sheet of skin; outer eye corners' widths.
 SHEET = 0.04
 # Where the landmarks' azimuths (radians) and heights (in widths between the outer eye corners) are
@@ -45,6 +48,10 @@ MARKS = np.array(
         (0.156, -0.390), (0.000, -0.399), (-0.156, -0.390),
     ]
 )  # fmt: skip
+
+# The rims of closed lips touch: a texel to either side tells which lip a landmark moves with.
+LIPS_APART = np.zeros((68, 2))
+LIPS_APART[[61, 62, 63], 1], LIPS_APART[[65, 66, 67], 1] = -1.2, 1.2
 
 
 @dataclass(frozen=True)
@@ -80,9 +87,19 @@ class Chart:
 
 
 def make_chart(model: HeadModel) -> Chart:
-    """Lay a head model's template flat."""
+    """Lay a head model's template flat.
+
+    Raises:
+        HeadModelError: the outer corners of the eyes coincide.
+    """
     vertices = model.template.double().numpy()
     marks = landmarks(model, model.template[None].double())[0].double().numpy()
+    if np.linalg.norm(marks[45] - marks[36]) < 1e-6:
+        raise HeadModelError(
+            f"head model {model.name!r}: landmarks 36 and 45, the outer corners of the eyes,"
+            " coincide, so the face cannot be laid flat; mend the model's landmarks or set"
+            " track.chart_rounds=0"
+        )
     turned, radius = unrolled(vertices, marks)
     places = to_texels(_warp(unrolled(marks, marks)[0])(turned))
     faces = model.faces.numpy()
@@ -90,14 +107,15 @@ def make_chart(model: HeadModel) -> Chart:
     face_id = _outermost(places, radius, faces, near)
     texels = np.argwhere(face_id >= 0)
     of_texel = face_id[tuple(texels.T)].astype(np.int64)
-    bary = _barycentrics(places[faces[of_texel]], cell_to_corner(texels[:, ::-1]))
+    bary = flat_barycentrics(places[faces[of_texel]], cell_to_corner(texels[:, ::-1]))
     samples = Samples(of_texel, faces[of_texel], bary)
     named = [model.regions[name].numpy() for name in NO_SKIN if name in model.regions]
     inside = np.any([np.zeros(len(vertices), dtype=bool), *named], axis=0)[faces].any(1)
     shown = np.zeros((HEIGHT, WIDTH))
     shown[tuple(texels.T)] = (radius[samples.corners] * bary).sum(1)
     column, row = np.clip(places[faces].mean(1), 0, (WIDTH - 1, HEIGHT - 1)).astype(np.int64).T
-    front = near & ~inside & (radius[faces].mean(1) > shown[row, column] - SHEET)
+    on_map = ((places[faces] >= 0) & (places[faces] <= (WIDTH, HEIGHT))).all((1, 2))
+    front = near & on_map & ~inside & (radius[faces].mean(1) > shown[row, column] - SHEET)
     return Chart(samples, texels, places, front, ~inside[of_texel])
 
 
@@ -135,15 +153,3 @@ def _outermost(
     ids = np.flatnonzero(near)
     found = rasterize(flat, faces[ids], camera, pairs=False).face_id
     return np.where(found >= 0, ids[np.maximum(found, 0)], -1)
-
-
-def _barycentrics(corners: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Shares (N, 3) of triangles' corners (N, 3, 2) at points (N, 2) in or near them."""
-    a, b, c = np.moveaxis(corners, 1, 0)
-    u, v, w = b - a, c - a, points - a
-    area = u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]
-    area = np.where(np.abs(area) < 1e-12, 1e-12, area)
-    second = (w[:, 0] * v[:, 1] - w[:, 1] * v[:, 0]) / area
-    third = (u[:, 0] * w[:, 1] - u[:, 1] * w[:, 0]) / area
-    bary = np.clip(np.stack([1.0 - second - third, second, third], axis=1), 0.0, 1.0)
-    return bary / bary.sum(1, keepdims=True)

@@ -9,12 +9,21 @@ import numpy as np
 from express50.cameras import Camera
 
 Rng = np.random.Generator
+# At least the first, fewer than the second.
 CAMERAS = (3, 8)
 
 
 @dataclass(frozen=True)
 class Lamps:
-    """Light of a room: even (3,), from above (3,), and lamps' directions and colours (L, 3)."""
+    """Light of a room.
+
+    Attributes:
+        even: (3,) from everywhere.
+        sky: (3,) unit, where the even light is brightest.
+        directions: (L, 3) unit, to the lamps.
+        colors: (L, 3) of the lamps.
+        shine: exponent of highlights.
+    """
 
     even: np.ndarray
     sky: np.ndarray
@@ -27,13 +36,15 @@ class Lamps:
     ) -> np.ndarray:
         """Light (N, 3) that skin of a colour (N, 3) sends towards the camera."""
         diffuse = self.even * (0.6 + 0.4 * (normals @ self.sky))[:, None]
-        shine = np.zeros_like(diffuse)
+        highlights = np.zeros_like(diffuse)
         for direction, color in zip(self.directions, self.colors, strict=True):
-            diffuse = diffuse + np.clip(normals @ direction, 0.0, None)[:, None] * color
+            cosine = np.clip(normals @ direction, 0.0, None)[:, None]
+            diffuse = diffuse + cosine * color
             half = direction + towards
             half /= np.maximum(np.linalg.norm(half, axis=1, keepdims=True), 1e-6)
-            shine += np.clip((normals * half).sum(1), 0.0, None)[:, None] ** self.shine * color
-        return albedo * diffuse + gloss * shine
+            along = np.clip((normals * half).sum(1), 0.0, None)[:, None]
+            highlights += along**self.shine * (cosine > 0) * color
+        return albedo * diffuse + gloss * highlights
 
 
 def draw_lamps(rng: Rng) -> Lamps:

@@ -2,8 +2,8 @@
 
 On a chart every face is upright, turned to the reader and of one size, and what is left to find is
 by how much a mesh is off. So the landmark network, trained on from its weights for whole heads,
-sees the middle of a chart at twice the resolution it has of a head, and tells points to a fraction
-of what it errs there. The jaw line is not among them: a chart does not end at it.
+sees the middle of a chart at twice the resolution it has of a head, and looks again whenever the
+mesh has moved. The jaw line is not among its landmarks: a chart does not end at it.
 """
 
 from __future__ import annotations
