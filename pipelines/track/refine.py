@@ -44,7 +44,7 @@ def refine(
     samples = spread(model, config.samples)
     appearance: Appearance | None = None
     rounds = config.relief_rounds + config.photo_rounds
-    rounds = max(rounds, config.silhouette_rounds, config.chart_rounds, MARK_ROUNDS)
+    rounds = max(rounds, config.silhouette_rounds, MARK_ROUNDS)
     plain = targets
     bald = _bald(model, moments, all_vertices(model, state))
     chart = reading_chart(model) if config.chart_rounds else None
