@@ -11,15 +11,14 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
-import cv2
 import numpy as np
 import torch
 
 from express50.adapters import corner_to_cell
 from express50.head.model import HeadModel, vertex_normals
-from express50.landmarks.network import LandmarkNet
-from pipelines.track.chart.layout import HEIGHT, LIPS_APART, WIDTH, Chart
-from pipelines.track.chart.network import FIRST, load_chart_network, mark_places, read_marks
+from express50.landmarks.network import LandmarkNet, load_network
+from pipelines.track.chart.layout import HEIGHT, LIPS_APART, WIDTH, Chart, sampled
+from pipelines.track.chart.network import FIRST, WEIGHTS, mark_places, read_marks
 from pipelines.track.photometry import robust_mean
 from pipelines.track.pictures import Moment, see
 from pipelines.track.samples import Samples
@@ -106,7 +105,7 @@ def read_slide(
     places = chart.image((chart.samples.at(mesh) - mesh.mean(0)).astype(np.float32))
     found, step = _between(places, at + rims)
     home, home_step = _between(places, mark_places() + rims)
-    seen = _sampled((mass > LEAST_SEEN).astype(np.float32), at + rims)
+    seen = sampled((mass > LEAST_SEEN).astype(np.float32), at + rims)
     good = np.flatnonzero((seen > 0.99) & (np.maximum(step, home_step) < TORN_M))
     if not len(good):
         return None
@@ -144,23 +143,16 @@ def read_chart(
     return chart.image(colors.astype(np.float32)), chart.image(mass)[..., 0]
 
 
-def _sampled(image: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """An image (HEIGHT, WIDTH[, C]) at texels (S, 2), corner origin, as float64."""
-    x, y = (np.ascontiguousarray(corner_to_cell(at[:, k : k + 1]), np.float32) for k in range(2))
-    sampled = cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return sampled[:, 0].astype(np.float64)
-
-
 def _between(places: np.ndarray, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Places (S, 3) at texels (S, 2), and the longest step (S,) from a texel to the next there."""
     column, row = np.clip(corner_to_cell(at), 0, (WIDTH - 2, HEIGHT - 2)).astype(np.int64).T
     a, b = places[row, column], places[row, column + 1]
     c, d = places[row + 1, column], places[row + 1, column + 1]
     steps = [np.linalg.norm(x - y, axis=1) for x, y in ((a, b), (c, d), (a, c), (b, d))]
-    return _sampled(places, at), np.max(steps, axis=0)
+    return sampled(places, at).astype(np.float64), np.max(steps, axis=0)
 
 
 @lru_cache(maxsize=1)
 def chart_network() -> LandmarkNet:
     """The shipped network, read once."""
-    return load_chart_network()
+    return load_network(WEIGHTS)

@@ -9,19 +9,18 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 import open3d as o3d
 import torch
 
-from express50.adapters import corner_to_cell
+from express50.adapters import cell_to_corner
 from express50.cameras import Camera
 from express50.head.model import HeadModel, pose, vertex_normals
 from express50.landmarks.acting import random_parameters
 from express50.landmarks.synthetic import Canvas, deform, paint, waves
 from express50.raycast import mesh_scene
 from pipelines.track.chart.disturb import Case, covered, photographed
-from pipelines.track.chart.layout import Chart
+from pipelines.track.chart.layout import Chart, sampled
 from pipelines.track.chart.light import Lamps, draw_cameras, draw_lamps
 from pipelines.track.samples import Visibility, sample_normals
 
@@ -152,18 +151,14 @@ class _Head:
         hit, face, bary = self._cast(rays, 2 * REACH_M)
         hit &= self.front[face]
         where = (self.chart.places[self.faces[face]] * bary[..., None]).sum(1)
-        own = self.chart.texels[:, ::-1] + 0.5
+        own = cell_to_corner(self.chart.texels[:, ::-1])
         hit &= np.linalg.norm(where - own, axis=1) < FAR_TEXELS
         return np.where(hit[:, None], where - own, 0.0), hit
 
     def _albedo(self, face: np.ndarray, bary: np.ndarray) -> np.ndarray:
         corners = self.faces[face]
         plain = (self.person.vertices[corners] * bary[..., None]).sum(1)
-        x, y = corner_to_cell((self.chart.places[corners] * bary[..., None]).sum(1)).T
-        mapped = cv2.remap(
-            self.person.map, x.astype(np.float32), y.astype(np.float32), cv2.INTER_LINEAR,
-            borderMode=cv2.BORDER_REPLICATE,
-        ).reshape(-1, 3)  # fmt: skip
+        mapped = sampled(self.person.map, (self.chart.places[corners] * bary[..., None]).sum(1))
         return np.where(self.front[face][:, None], mapped, plain)
 
     def _cast(

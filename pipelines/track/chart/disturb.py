@@ -7,8 +7,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from express50.adapters import corner_to_cell
-from pipelines.track.chart.layout import HEIGHT, LIPS_APART, WIDTH
+from pipelines.track.chart.layout import HEIGHT, LIPS_APART, WIDTH, sampled
 
 Rng = np.random.Generator
 # Steps in which the inverse of a displacement is found.
@@ -94,10 +93,5 @@ def where_seen(case: Case, texels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     own = (texels + LIPS_APART).astype(np.float32)
     at = own
     for _ in range(TURNS):
-        at = own - _sampled(flow, at)
-    return at - LIPS_APART, _sampled(share, at) > LEAST_SHARE
-
-
-def _sampled(image: np.ndarray, at: np.ndarray) -> np.ndarray:
-    x, y = (np.ascontiguousarray(corner_to_cell(at[:, k : k + 1])) for k in range(2))
-    return cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[:, 0]
+        at = own - sampled(flow, at)
+    return at - LIPS_APART, sampled(share, at) > LEAST_SHARE

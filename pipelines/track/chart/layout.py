@@ -8,14 +8,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 from scipy.interpolate import RBFInterpolator
 
-from express50.adapters import cell_to_corner
+from express50.adapters import cell_to_corner, corner_to_cell
 from express50.cameras import Camera
 from express50.errors import HeadModelError
 from express50.head.model import HeadModel, landmarks
 from express50.mesh_raster import rasterize
+from pipelines.track.offsets import RIGID
 from pipelines.track.samples import Samples, flat_barycentrics
 
 # Texels, and how much of the head they cover: about 1.3 mm each on the cheeks.
@@ -23,9 +25,6 @@ WIDTH, HEIGHT = 192, 160
 RIGHT, TOP = 1.35, 1.2
 # Beyond this azimuth a face may straddle the seam at the back.
 BACK = 2.6
-NO_SKIN = (
-    "mouth_interior", "boundary", "teeth", "tongue", "gums", "left_eyeball", "right_eyeball",
-)  # fmt: skip
 # What lies further behind what a texel shows is another sheet of skin; outer eye corners' widths.
 SHEET = 0.04
 # Where the landmarks' azimuths (radians) and heights (in widths between the outer eye corners) are
@@ -109,7 +108,7 @@ def make_chart(model: HeadModel) -> Chart:
     of_texel = face_id[tuple(texels.T)].astype(np.int64)
     bary = flat_barycentrics(places[faces[of_texel]], cell_to_corner(texels[:, ::-1]))
     samples = Samples(of_texel, faces[of_texel], bary)
-    named = [model.regions[name].numpy() for name in NO_SKIN if name in model.regions]
+    named = [model.regions[name].numpy() for name in RIGID if name in model.regions]
     inside = np.any([np.zeros(len(vertices), dtype=bool), *named], axis=0)[faces].any(1)
     shown = np.zeros((HEIGHT, WIDTH))
     shown[tuple(texels.T)] = (radius[samples.corners] * bary).sum(1)
@@ -136,6 +135,12 @@ def to_texels(turned: np.ndarray) -> np.ndarray:
     """Column and row (N, 2), corner origin, of azimuths and heights (N, 2)."""
     step = 2.0 * RIGHT / WIDTH
     return np.stack([WIDTH / 2 + turned[:, 0] / step, (TOP - turned[:, 1]) / step], axis=1)
+
+
+def sampled(image: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """A map (HEIGHT, WIDTH[, C]) at texels (S, 2), corner origin; outside it its rim goes on."""
+    x, y = (np.ascontiguousarray(corner_to_cell(at[:, k : k + 1]), np.float32) for k in range(2))
+    return cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[:, 0]
 
 
 def _warp(marks: np.ndarray) -> RBFInterpolator:

@@ -16,7 +16,7 @@ import torch
 
 from express50.head.model import HeadModel
 from express50.landmarks.augment import MIRROR
-from express50.landmarks.network import CROP, LandmarkNet, load_network
+from express50.landmarks.network import CROP, LandmarkNet
 from pipelines.track.chart.layout import MARKS, Chart, make_chart, to_texels
 
 WEIGHTS = Path(__file__).with_name("weights.npz")
@@ -61,11 +61,6 @@ def read_marks(net: LandmarkNet, colors: np.ndarray) -> tuple[np.ndarray, np.nda
     error = np.hypot(0.5 * (scale[0] + scale[1, MIRROR]), apart)
     mean = 0.5 * (points[0] + turned)
     return from_window(mean)[FIRST:], (error * TEXELS_A_PIXEL)[FIRST:]
-
-
-def load_chart_network(path: Path = WEIGHTS) -> LandmarkNet:
-    """The network of the face laid flat, ready for evaluation."""
-    return load_network(path)
 
 
 def reading_chart(model: HeadModel) -> Chart:

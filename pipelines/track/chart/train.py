@@ -1,9 +1,9 @@
-"""Make `weights.npz` in one run: `python -m pipelines.track.chart.train --cases DIR [--ict PATH]`.
+"""Make weights in one run: `python -m pipelines.track.chart.train --cases DIR [--ict PATH]`.
 
 Goes on from the landmark network's weights, on drawn heads only: the procedural one and, where a
-path is given, ICT-FaceKit; the shipped file used both, with the defaults of the other arguments.
-The result depends on the arguments alone, up to how the machine rounds. A run that was interrupted
-goes on from its last state, which is kept in DIR.
+path is given, ICT-FaceKit (how the shipped file was made: docs/LOG.md, 2026-11-22). The result
+depends on the arguments alone, up to how the machine rounds. A run that was interrupted goes on
+from its last state, which is kept in DIR.
 """
 
 from __future__ import annotations
@@ -20,7 +20,13 @@ import torch
 
 from express50.head.load import load_head
 from express50.head.model import HeadModel
-from express50.landmarks.network import LandmarkNet, heat_loss, save_network, trainable_network
+from express50.landmarks.network import (
+    LandmarkNet,
+    heat_loss,
+    load_network,
+    save_network,
+    trainable_network,
+)
 from express50.landmarks.train import keep_state, rate_share, take_up
 from pipelines.track.chart.disturb import Case, warped, where_seen
 from pipelines.track.chart.files import make_cases, read_cases
@@ -29,7 +35,6 @@ from pipelines.track.chart.network import (
     FIRST,
     TEXELS_A_PIXEL,
     WEIGHTS,
-    load_chart_network,
     mark_places,
     to_window,
     window,
@@ -72,7 +77,7 @@ def main(arguments: list[str] | None = None) -> int:
     models = [load_head(spec) for spec in ("procedural", options.ict) if spec]
     plan = Plan(steps=options.steps, files=options.files, seed=options.seed)
     save_network(train(models, plan, options.cases), options.out)
-    net = load_chart_network(options.out)
+    net = load_network(options.out)
     for model in models:
         cases = read_cases(make_cases(options.cases, model, HELD_OUT, plan.seed))
         print(f"{model.name}: held-out heads {validate(net, cases)}")
