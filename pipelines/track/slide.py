@@ -37,24 +37,32 @@ TORN_M = 0.004
 
 @dataclass(frozen=True)
 class Slide:
-    """Where S samples belong along the skin.
+    """Where S landmarks belong along the skin.
 
     Attributes:
-        rows: (S, 3) the samples' corners: vertices, or places among the fit's points.
-        bary: (S, 3).
+        marks: (S,) which of the 68, which are a fit's first points.
         goals: (S, 3) world.
         normals: (S, 3) world; the distance along them does not count.
         sigma: (S,) metres.
     """
 
-    rows: np.ndarray
-    bary: np.ndarray
+    marks: np.ndarray
     goals: np.ndarray
     normals: np.ndarray
     sigma: np.ndarray
 
+    @property
+    def rows(self) -> np.ndarray:
+        """The landmarks themselves (S, 3), three times each."""
+        return np.repeat(self.marks[:, None], 3, axis=1)
+
+    @property
+    def bary(self) -> np.ndarray:
+        """All shares (S, 3) are the first's."""
+        return np.tile([1.0, 0.0, 0.0], (len(self.marks), 1))
+
     def _off(self, positions: np.ndarray) -> np.ndarray:
-        off = np.einsum("sk,skc->sc", self.bary, positions[self.rows]) - self.goals
+        off = positions[self.marks] - self.goals
         return off - (off * self.normals).sum(1, keepdims=True) * self.normals
 
     def cost(self, positions: np.ndarray) -> float:
@@ -71,23 +79,17 @@ class Slide:
 
 
 def with_slides(targets: list[Target], slides: list[Slide | None]) -> list[Target]:
-    """The targets with where the skin belongs; its vertices join the fit's points."""
-    made = []
-    for target, slide in zip(targets, slides, strict=True):
-        if slide is not None:
-            ids, rows = np.unique(slide.rows, return_inverse=True)
-            rows = rows.reshape(-1, 3) + 68 + len(target.vertices)
-            vertices = np.concatenate([target.vertices, ids])
-            terms = (*target.terms, replace(slide, rows=rows))
-            target = replace(target, vertices=vertices, terms=terms)
-        made.append(target)
-    return made
+    """The targets with where the skin belongs."""
+    return [
+        target if slide is None else replace(target, terms=(*target.terms, slide))
+        for target, slide in zip(targets, slides, strict=True)
+    ]
 
 
 def read_slide(
     model: HeadModel, chart: Chart, moment: Moment, mesh: np.ndarray, weight: float
 ) -> Slide | None:
-    """Where one moment's skin belongs, its rows being vertices; None where too little is seen.
+    """Where one moment's skin belongs; None where too little is seen.
 
     Args:
         model: the head.
@@ -115,7 +117,7 @@ def read_slide(
     normals = samples.at(vertex_normals(torch.from_numpy(mesh)[None], model.faces)[0].numpy())
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
     sigma = np.hypot(error[good] * step[good], FLOOR_M) * (CROWD / weight) ** 0.5
-    return Slide(samples.corners, samples.bary, goals, normals, sigma)
+    return Slide(good + FIRST, goals, normals, sigma)
 
 
 def landmark_samples(model: HeadModel) -> Samples:
