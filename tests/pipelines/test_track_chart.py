@@ -13,7 +13,7 @@ from express50.head.load import load_head
 from express50.landmarks.augment import MIRROR
 from express50.landmarks.network import trainable_network
 from pipelines.track.chart.cases import draw_case, draw_meshes, draw_person
-from pipelines.track.chart.disturb import Case, mirrored, warped, where_seen
+from pipelines.track.chart.disturb import Case, creased, mirrored, warped, where_seen
 from pipelines.track.chart.layout import HEIGHT, MARKS, WIDTH, make_chart, to_texels
 from pipelines.track.chart.network import (
     FIRST,
@@ -28,6 +28,9 @@ from pipelines.track.chart.network import (
 from pipelines.track.chart.train import Plan, make_batch, marks_loss, train
 from pipelines.track.slide import chart_network
 from tests.express50.head.tiny_head import tiny_head
+
+# Texels that the mean of all landmarks may lag behind a face that is moved by five.
+SHORT = 0.75
 
 
 @pytest.fixture(scope="module")
@@ -160,6 +163,33 @@ def test_the_shipped_network_finds_landmarks_of_heads_it_has_not_seen(cases) -> 
             before.append(np.linalg.norm(true[FIRST:] - mark_places(), axis=1)[shown].mean())
             after.append(np.linalg.norm(true[FIRST:] - at, axis=1)[shown].mean())
     assert np.mean(after) < 0.75 * np.mean(before), (before, after)
+
+
+@pytest.mark.parametrize("shift", [(5, 0), (-5, 0), (0, 5), (0, -5)])
+def test_what_is_seen_far_from_home_is_not_read_nearer_to_it(cases, shift) -> None:
+    moved = []
+    for case in cases:
+        colors = np.float32(case.colors) / 255.0
+        at, _ = read_marks(chart_network(), colors)
+        there, _ = read_marks(chart_network(), np.roll(colors, shift, axis=(1, 0)))
+        moved.append((there - at).mean(0))
+    assert np.abs(np.mean(moved, axis=0) - shift).max() < SHORT, moved
+
+
+def test_creases_darken_lips_and_lids_that_are_seen_and_nothing_else() -> None:
+    colors = np.full((HEIGHT, WIDTH, 3), 200, np.uint8)
+    at, known = to_texels(MARKS), np.ones(68, dtype=bool)
+    rng = np.random.default_rng(3)
+    darkest = np.min([creased(colors, at, known, rng) for _ in range(20)], axis=0)[..., 0]
+    assert darkest.max() == 200
+    column, row = at[[60, 62, 64, 37, 44]].astype(int).T
+    assert darkest[row, column].max() < 150
+    column, row = at[[8, 19, 24, 30, 41, 57]].astype(int).T
+    assert darkest[row, column].min() > 195
+    known[62] = False
+    lids = np.min([creased(colors, at, known, rng) for _ in range(20)], axis=0)[..., 0]
+    column, row = at[[61, 62, 63]].astype(int).T
+    assert lids[row, column].min() == 200 and lids.min() < 150
 
 
 def test_a_mirror_image_is_read_as_one(cases) -> None:

@@ -27,6 +27,8 @@ from pipelines.track.samples import Visibility, sample_normals
 Rng = np.random.Generator
 # Root mean square of what the drawn trackers are off along the skin, metres: from least to most.
 OFF_M = (0.0004, 0.005)
+# Share of trackers that have the face but miss what some muscles do to it.
+LATE = 0.5
 # Further than this from the true skin a place of the wrong mesh shows nothing to learn from.
 REACH_M = 0.008
 # What lies further off along the skin is another part of the face, such as the other lip.
@@ -95,12 +97,12 @@ def draw_meshes(model: HeadModel, chart: Chart, rng: Rng) -> tuple[np.ndarray, n
     """Vertices (V, 3), (V, 3) of an acting head and of a tracker's idea of it, float64."""
     draw = random_parameters(model, rng)
     other = {name: value.clone() for name, value in draw.items()}
+    # A tracker soon has the face; what it misses longest is what a few muscles do to it.
+    early = 0.1 if rng.random() < LATE else 1.0
     other["shape"] += torch.from_numpy(
-        rng.uniform(0.0, 0.6) * rng.normal(size=other["shape"].shape)
+        early * rng.uniform(0.0, 0.6) * rng.normal(size=other["shape"].shape)
     ).float()
-    muscles = rng.random(other["expression"].shape) < rng.uniform(0.0, 0.4)
-    slips = rng.uniform(0.0, 0.5) * rng.normal(size=muscles.shape) * muscles
-    other["expression"] += torch.from_numpy(slips).float()
+    other["expression"] += torch.from_numpy(_slips(draw["expression"].numpy(), early, rng)).float()
     other["jaw"] += torch.from_numpy(rng.uniform(0.0, 0.05) * rng.normal(size=(1, 3))).float()
     other["eyes"] += torch.from_numpy(0.05 * rng.normal(size=(1, 6))).float()
     with torch.inference_mode():
@@ -109,7 +111,7 @@ def draw_meshes(model: HeadModel, chart: Chart, rng: Rng) -> tuple[np.ndarray, n
     off = tracked - played
     for low, high, share in ((10.0, 60.0, 0.003), (60.0, 200.0, 0.001)):
         field = np.stack([waves(true, rng, 6, low, high) for _ in range(3)], axis=1)
-        off += rng.uniform(0.0, share) * field
+        off += early * rng.uniform(0.0, share) * field
     normals = vertex_normals(torch.from_numpy(true)[None], model.faces)[0].numpy()
     # Along the normals the views agree better on where the skin is than along it.
     off -= rng.uniform(0.2, 1.0) * (off * normals).sum(1, keepdims=True) * normals
@@ -117,6 +119,14 @@ def draw_meshes(model: HeadModel, chart: Chart, rng: Rng) -> tuple[np.ndarray, n
     size = np.sqrt((off[face] ** 2).sum(1).mean())
     wanted = np.exp(rng.uniform(*np.log(OFF_M)))
     return true, true + off * (wanted / max(float(size), 1e-9))
+
+
+def _slips(expression: np.ndarray, early: float, rng: Rng) -> np.ndarray:
+    """What a tracker has wrong of an expression (1, X): any muscle early, late those that act."""
+    muscles = rng.random(expression.shape) < early * rng.uniform(0.0, 0.4)
+    slips = rng.uniform(0.0, 0.5) * rng.normal(size=muscles.shape) * muscles
+    missed = rng.random(expression.shape) < (1.0 - early) * rng.uniform(0.0, 0.8)
+    return slips - missed * rng.uniform(-0.2, 1.0, expression.shape) * expression
 
 
 class _Head:

@@ -12,6 +12,14 @@ from pipelines.track.chart.layout import HEIGHT, LIPS_APART, WIDTH, sampled
 Rng = np.random.Generator
 # Steps in which the inverse of a displacement is found.
 TURNS = 6
+# Landmarks that deep creases run along: where lips meet, twice; the upper lids with their lashes.
+CREASES = (
+    ((60, 61, 62, 63, 64), (60, 67, 66, 65, 64)),
+    ((36, 37, 38, 39),),
+    ((42, 43, 44, 45),),
+)
+# Bits of a texel's fraction that OpenCV is told.
+FINE = 4
 # Share of the texels about a place whose displacement must be known.
 LEAST_SHARE = 0.25
 
@@ -58,14 +66,15 @@ def photographed(colors: np.ndarray, rng: Rng) -> np.ndarray:
 def warped(case: Case, rng: Rng) -> Case:
     """The same reading of a mesh that is off by some more, smooth in the map; maybe mirrored.
 
-    A texel that shows what its neighbour showed belongs where the neighbour's did.
+    A texel that shows what its neighbour showed belongs where the neighbour's did. Displacements
+    are larger than a tracker's: a network that may expect small ones reports too small ones.
     """
     y, x = np.mgrid[:HEIGHT, :WIDTH].astype(np.float32)
-    coarse = rng.normal(size=(2, *rng.integers(2, 6, 2))) * rng.uniform(0.0, 2.0)
+    coarse = rng.normal(size=(2, *rng.integers(2, 9, 2))) * rng.uniform(0.0, 3.5)
     fields = [cv2.resize(one, (WIDTH, HEIGHT), interpolation=cv2.INTER_CUBIC) for one in coarse]
-    turn = rng.normal(size=(2, 2)) * 0.02
-    broad = np.stack([x - WIDTH / 2, y - HEIGHT / 2], axis=2) @ turn + rng.normal(size=2) * 1.5
-    shift = (rng.random() * (np.stack(fields, axis=2) + broad)).astype(np.float32)
+    turn = rng.normal(size=(2, 2)) * 0.04
+    broad = np.stack([x - WIDTH / 2, y - HEIGHT / 2], axis=2) @ turn + rng.normal(size=2) * 2.5
+    shift = (rng.random() ** 0.5 * (np.stack(fields, axis=2) + broad)).astype(np.float32)
     at = x + shift[..., 0], y + shift[..., 1]
     colors = cv2.remap(case.colors, *at, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     flow = cv2.remap(case.flow.astype(np.float32), *at, cv2.INTER_LINEAR) + shift
@@ -95,3 +104,28 @@ def where_seen(case: Case, texels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     for _ in range(TURNS):
         at = own - sampled(flow, at)
     return at - LIPS_APART, sampled(share, at) > LEAST_SHARE
+
+
+def creased(colors: np.ndarray, at: np.ndarray, known: np.ndarray, rng: Rng) -> np.ndarray:
+    """Dark lines where lips meet and along the upper lids, in most of the maps.
+
+    Drawn heads have no shadows, and on a face these lines are what tells best where its parts end.
+
+    Args:
+        colors: (HEIGHT, WIDTH, 3) uint8.
+        at: (68, 2) texels of the landmarks, corner origin.
+        known: (68,) bool, which of them the map shows.
+        rng: of this map.
+    """
+    dark = np.zeros((HEIGHT, WIDTH), np.float32)
+    for lines in CREASES:
+        if rng.random() < 0.25 or not known[list(lines[0])].all():
+            continue
+        one = np.zeros((HEIGHT, WIDTH), np.uint8)
+        for line in lines:
+            points = np.rint((at[list(line)] - 0.5) * 2**FINE).astype(np.int32)
+            width = int(rng.integers(1, 3))
+            cv2.polylines(one, [points], False, 255, width, cv2.LINE_AA, FINE)
+        soft = cv2.GaussianBlur(one.astype(np.float32) / 255.0, (0, 0), rng.uniform(0.3, 1.2))
+        dark = np.maximum(dark, rng.uniform(0.1, 0.9) * soft)
+    return np.rint(colors * (1.0 - dark[..., None])).astype(np.uint8)

@@ -1,14 +1,15 @@
 """Make weights in one run: `python -m pipelines.track.chart.train --cases DIR [--ict PATH]`.
 
-Goes on from the landmark network's weights, on drawn heads only: the procedural one and, where a
-path is given, ICT-FaceKit (how the shipped file was made: docs/LOG.md, 2026-11-22). The result
-depends on the arguments alone, up to how the machine rounds. A run that was interrupted goes on
-from its last state, which is kept in DIR.
+Goes on from the landmark network's weights or from those given by `--start`, on drawn heads only:
+the procedural one and, where a path is given, ICT-FaceKit (how the shipped file was made:
+docs/LOG.md, 2026-11-22). The result depends on the arguments alone, up to how the machine rounds.
+A run that was interrupted goes on from its last state, which is kept in DIR.
 """
 
 from __future__ import annotations
 
 import argparse
+import hashlib
 import time
 from dataclasses import astuple, dataclass
 from pathlib import Path
@@ -20,6 +21,7 @@ import torch
 
 from express50.head.load import load_head
 from express50.head.model import HeadModel
+from express50.landmarks.network import WEIGHTS as START
 from express50.landmarks.network import (
     LandmarkNet,
     heat_loss,
@@ -28,7 +30,7 @@ from express50.landmarks.network import (
     trainable_network,
 )
 from express50.landmarks.train import keep_state, rate_share, take_up
-from pipelines.track.chart.disturb import Case, warped, where_seen
+from pipelines.track.chart.disturb import Case, creased, warped, where_seen
 from pipelines.track.chart.files import make_cases, read_cases
 from pipelines.track.chart.layout import MARKS, to_texels
 from pipelines.track.chart.network import (
@@ -71,12 +73,13 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--files", type=int, default=Plan.files, help="files of cases a head")
     parser.add_argument("--steps", type=int, default=Plan.steps, help="batches of 32 charts")
     parser.add_argument("--seed", type=int, default=Plan.seed)
+    parser.add_argument("--start", type=Path, default=START, help="weights to go on from")
     parser.add_argument("--out", type=Path, default=WEIGHTS)
     options = parser.parse_args(arguments)
     cv2.setNumThreads(1)
     models = [load_head(spec) for spec in ("procedural", options.ict) if spec]
     plan = Plan(steps=options.steps, files=options.files, seed=options.seed)
-    save_network(train(models, plan, options.cases), options.out)
+    save_network(train(models, plan, options.cases, options.start), options.out)
     net = load_network(options.out)
     for model in models:
         cases = read_cases(make_cases(options.cases, model, HELD_OUT, plan.seed))
@@ -84,12 +87,13 @@ def main(arguments: list[str] | None = None) -> int:
     return 0
 
 
-def train(models: list[HeadModel], plan: Plan, folder: Path) -> LandmarkNet:
+def train(models: list[HeadModel], plan: Plan, folder: Path, start: Path = START) -> LandmarkNet:
     """Train on cases of the head models; cases and the run's state are kept in a folder."""
     torch.manual_seed(plan.seed)
-    net = trainable_network()
+    net = trainable_network(start)
     optimiser = torch.optim.AdamW(net.parameters(), lr=RATE, weight_decay=1e-3)
-    name = "-".join([*(m.name for m in models), *(str(value) for value in astuple(plan))])
+    begun = hashlib.sha256(start.read_bytes()).hexdigest()[:8]
+    name = "-".join([*(m.name for m in models), *(str(value) for value in astuple(plan)), begun])
     cases = [
         case
         for number in range(HELD_OUT + 1, HELD_OUT + 1 + plan.files)
@@ -104,7 +108,8 @@ def train(models: list[HeadModel], plan: Plan, folder: Path) -> LandmarkNet:
         # Seeded by the step, so that a run taken up again draws what it would have drawn.
         rng = np.random.default_rng([plan.seed, 2, step])
         picks = rng.integers(len(cases), size=BATCH)
-        loss, _ = marks_loss(net, make_batch([warped(cases[pick], rng) for pick in picks]))
+        batch = make_batch([warped(cases[pick], rng) for pick in picks], rng)
+        loss, _ = marks_loss(net, batch)
         optimiser.zero_grad(set_to_none=True)
         loss.backward()
         torch.nn.utils.clip_grad_norm_(net.parameters(), 5.0)
@@ -118,10 +123,13 @@ def train(models: list[HeadModel], plan: Plan, folder: Path) -> LandmarkNet:
     return net.eval()
 
 
-def make_batch(cases: list[Case]) -> Batch:
-    """Windows of charts, and where their landmarks are seen."""
-    images = np.stack([window(case.colors) for case in cases])
+def make_batch(cases: list[Case], rng: np.random.Generator | None = None) -> Batch:
+    """Windows of charts, with creases drawn into them if `rng` is given, and their landmarks."""
     found = [where_seen(case, to_texels(MARKS)) for case in cases]
+    maps = [case.colors for case in cases]
+    if rng is not None:
+        maps = [creased(one, *marks, rng) for one, marks in zip(maps, found, strict=True)]
+    images = np.stack([window(one) for one in maps])
     points = np.stack([to_window(at[FIRST:]) for at, _ in found])
     known = np.stack([mask[FIRST:] for _, mask in found])
     stacked = torch.from_numpy(images).permute(0, 3, 1, 2).float() / 255.0
