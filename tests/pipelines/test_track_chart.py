@@ -25,7 +25,7 @@ from pipelines.track.chart.network import (
     to_window,
     window,
 )
-from pipelines.track.chart.train import Plan, make_batch, marks_loss, train
+from pipelines.track.chart.train import Plan, main, make_batch, marks_loss, train
 from pipelines.track.slide import chart_network
 from tests.express50.head.tiny_head import tiny_head
 
@@ -241,6 +241,12 @@ def test_training_goes_on_where_it_was_stopped(tmp_path, monkeypatch, head) -> N
     again = train([head], plan, tmp_path / "two").state_dict()
     for name, value in whole.items():
         torch.testing.assert_close(again[name], value)
+
+
+def test_weights_to_go_on_from_must_be_there(tmp_path, capsys) -> None:
+    with pytest.raises(SystemExit):
+        main(["--cases", str(tmp_path), "--start", str(tmp_path / "gone.npz")])
+    assert "gone.npz: no such file of weights" in capsys.readouterr().err
 
 
 def test_training_lowers_the_loss(cases) -> None:

@@ -97,7 +97,8 @@ def draw_meshes(model: HeadModel, chart: Chart, rng: Rng) -> tuple[np.ndarray, n
     """Vertices (V, 3), (V, 3) of an acting head and of a tracker's idea of it, float64."""
     draw = random_parameters(model, rng)
     other = {name: value.clone() for name, value in draw.items()}
-    # A tracker soon has the face; what it misses longest is what a few muscles do to it.
+    # A tracker soon has the face (0.1 of what it is off by is left then); what it misses longest
+    # is what a few muscles do to it.
     early = 0.1 if rng.random() < LATE else 1.0
     other["shape"] += torch.from_numpy(
         early * rng.uniform(0.0, 0.6) * rng.normal(size=other["shape"].shape)
@@ -122,7 +123,7 @@ def draw_meshes(model: HeadModel, chart: Chart, rng: Rng) -> tuple[np.ndarray, n
 
 
 def _slips(expression: np.ndarray, early: float, rng: Rng) -> np.ndarray:
-    """What a tracker has wrong of an expression (1, X): any muscle early, late those that act."""
+    """What a tracker has wrong of an expression (1, X): any muscle early, then such as act."""
     muscles = rng.random(expression.shape) < early * rng.uniform(0.0, 0.4)
     slips = rng.uniform(0.0, 0.5) * rng.normal(size=muscles.shape) * muscles
     missed = rng.random(expression.shape) < (1.0 - early) * rng.uniform(0.0, 0.8)

@@ -119,7 +119,7 @@ def creased(colors: np.ndarray, at: np.ndarray, known: np.ndarray, rng: Rng) -> 
     """
     dark = np.zeros((HEIGHT, WIDTH), np.float32)
     for lines in CREASES:
-        if rng.random() < 0.25 or not known[list(lines[0])].all():
+        if rng.random() < 0.25 or not known[np.concatenate(lines)].all():
             continue
         one = np.zeros((HEIGHT, WIDTH), np.uint8)
         for line in lines:

@@ -76,6 +76,8 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--start", type=Path, default=START, help="weights to go on from")
     parser.add_argument("--out", type=Path, default=WEIGHTS)
     options = parser.parse_args(arguments)
+    if not options.start.is_file():
+        parser.error(f"--start {options.start}: no such file of weights")
     cv2.setNumThreads(1)
     models = [load_head(spec) for spec in ("procedural", options.ict) if spec]
     plan = Plan(steps=options.steps, files=options.files, seed=options.seed)
