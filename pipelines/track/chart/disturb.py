@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from express50.adapters import corner_to_cell
 from pipelines.track.chart.layout import HEIGHT, LIPS_APART, WIDTH, sampled
 
 Rng = np.random.Generator
@@ -123,7 +124,7 @@ def creased(colors: np.ndarray, at: np.ndarray, known: np.ndarray, rng: Rng) -> 
             continue
         one = np.zeros((HEIGHT, WIDTH), np.uint8)
         for line in lines:
-            points = np.rint((at[list(line)] - 0.5) * 2**FINE).astype(np.int32)
+            points = np.rint(corner_to_cell(at[list(line)]) * 2**FINE).astype(np.int32)
             width = int(rng.integers(1, 3))
             cv2.polylines(one, [points], False, 255, width, cv2.LINE_AA, FINE)
         soft = cv2.GaussianBlur(one.astype(np.float32) / 255.0, (0, 0), rng.uniform(0.3, 1.2))
