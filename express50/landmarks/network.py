@@ -19,12 +19,17 @@ from torch.nn import functional
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from express50.adapters import cell_centres, corner_to_cell
+from express50.arrays import read_arrays
+from express50.errors import FormatError
+from express50.reading import AGAIN, reason
 
 CROP = 128
 POINTS = 68
 # Points may lie a little outside the crop: the grid of the heat maps is stretched about its middle.
 STRETCH = 1.15
 WEIGHTS = Path(__file__).with_name("weights.npz")
+# Names of what is not stored end so: batch normalisation counts its batches.
+COUNTERS = "num_batches_tracked"
 
 
 class Output(NamedTuple):
@@ -170,7 +175,7 @@ def save_network(net: LandmarkNet, path: Path) -> None:
     state = {
         key: value.detach().cpu().numpy().astype(np.float16)
         for key, value in net.state_dict().items()
-        if not key.endswith("num_batches_tracked")
+        if not key.endswith(COUNTERS)
     }
     with path.open("wb") as file:
         np.savez_compressed(file, **state)
@@ -187,11 +192,19 @@ def load_network(path: Path = WEIGHTS) -> LandmarkNet:
 
 
 def trainable_network(path: Path = WEIGHTS) -> LandmarkNet:
-    """Read weights written by `save_network`, to train on from them."""
+    """Read weights written by `save_network`, to train on from them.
+
+    Raises:
+        FormatError: the file is missing, damaged or holds something else.
+    """
     net = LandmarkNet()
-    with np.load(path, allow_pickle=False) as data:
-        state = {key: torch.from_numpy(data[key].astype(np.float32)) for key in data.files}
-    net.load_state_dict(state, strict=False)
+    names = [key for key in net.state_dict() if not key.endswith(COUNTERS)]
+    arrays = read_arrays(path, FormatError, "landmark weights", names)
+    try:
+        state = {key: torch.from_numpy(arrays[key].astype(np.float32)) for key in names}
+        net.load_state_dict(state, strict=False)
+    except (RuntimeError, TypeError, ValueError) as error:
+        raise FormatError(f"{path}: not landmark weights ({reason(error)}); {AGAIN}") from None
     return net.to(memory_format=torch.channels_last)
 
 

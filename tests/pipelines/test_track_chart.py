@@ -273,3 +273,27 @@ def test_a_head_whose_eyes_coincide_is_named(head) -> None:
 def test_a_tiny_head_has_a_chart_too() -> None:
     chart = make_chart(tiny_head(vertices=60))
     assert len(chart.texels) > 100 and np.isfinite(chart.samples.bary).all()
+
+
+def test_what_stands_in_the_way_takes_the_light() -> None:
+    square = np.array([[-1.0, 0.0, -1.0], [1.0, 0.0, -1.0], [1.0, 0.0, 1.0], [-1.0, 0.0, 1.0]])
+    lid = 0.05 * square + [0.0, 0.01, 0.0]
+    faces = np.array([[0, 1, 2], [0, 2, 3]])
+    scene = mesh_scene(np.concatenate([square, lid]), np.concatenate([faces, faces + 4]))
+    lamps = Lamps(
+        even=np.ones(3),
+        sky=np.array([0.0, 1.0, 0.0]),
+        directions=np.array([[0.0, 1.0, 0.0], [0.0, -1.0, 0.0]]),
+        colors=np.ones((2, 3)),
+        sizes=np.array([0.01, 0.01]),
+        shine=10.0,
+    )
+    places = np.array([[0.0, 0.0, 0.0], [0.5, 0.0, 0.0], [0.055, 0.0, 0.0]])
+    up = np.tile([0.0, 1.0, 0.0], (3, 1))
+    reach = lamps.reach(scene, places, up, np.random.default_rng(0))
+    # Under the lid all but flat rays end; beside it the lamp above is free; the lower never shines.
+    assert reach[0, 0] < 0.2 and np.array_equal(reach[0, 1:], [0.0, 0.0])
+    assert np.array_equal(reach[1], [1.0, 1.0, 0.0])
+    assert reach[0, 0] < reach[2, 0] < 1.0 and reach[2, 1] == 1.0
+    lit = lamps.lit(np.full((3, 3), 0.5), up, reach, up, gloss=0.1)
+    assert lit[0].max() < 0.2 * lit[1].max()

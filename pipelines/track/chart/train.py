@@ -19,6 +19,7 @@ import cv2
 import numpy as np
 import torch
 
+from express50.errors import FormatError
 from express50.head.load import load_head
 from express50.head.model import HeadModel
 from express50.landmarks.network import WEIGHTS as START
@@ -76,8 +77,10 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--start", type=Path, default=START, help="weights to go on from")
     parser.add_argument("--out", type=Path, default=WEIGHTS)
     options = parser.parse_args(arguments)
-    if not options.start.is_file():
-        parser.error(f"--start {options.start}: no such file of weights")
+    try:
+        trainable_network(options.start)
+    except FormatError as error:
+        parser.error(f"--start {error}")
     cv2.setNumThreads(1)
     models = [load_head(spec) for spec in ("procedural", options.ict) if spec]
     plan = Plan(steps=options.steps, files=options.files, seed=options.seed)
