@@ -7,7 +7,7 @@ from typing import Literal
 
 from express50.errors import ConfigError
 
-VERSION = 5  # of the stage: outputs of another are made anew
+VERSION = 6  # of the stage: outputs of another are made anew
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,7 +55,7 @@ class TrackConfig:
     chart_rounds: int = 8
     """Of the rounds that there are, the first so many in which landmarks are found anew on the face
     laid flat; what the last of them said stays. 0 for none."""
-    chart_weight: float = 1.0
+    chart_weight: float = 1.5
     """Trust in these landmarks."""
     detail_radius: float = 0.003
     """Marks of the skin smaller than this are compared, metres."""
@@ -85,7 +85,7 @@ class TrackConfig:
     offset_modes: int = 150
     """Smooth static offsets of the skin along its normals, beyond the head's shape directions; 0
     for none."""
-    offset_along: int = 24
+    offset_along: int = 40
     """The same along the skin, for each of three axes; 0 for none, as without `chart_rounds`."""
     offset_sigma: float = 0.001
     """Standard deviation of these offsets, metres."""
@@ -143,6 +143,6 @@ PRESETS: dict[str, dict[str, object]] = {
         "refinements": 5, "iterations": 30, "silhouette_rounds": 4, "relief_rounds": 8,
         "photo_rounds": 2, "samples": 8000, "photo_side": 1024, "offset_modes": 250,
         "round_iterations": 6, "sweeps": 4, "render_rounds": 4, "clip_rounds": 3,
-        "chart_rounds": 10, "offset_along": 40,
+        "chart_rounds": 10, "offset_along": 80,
     },
 }  # fmt: skip

@@ -12,9 +12,11 @@ from express50.errors import HeadModelError
 from express50.head.load import load_head
 from express50.landmarks.augment import MIRROR
 from express50.landmarks.network import trainable_network
+from express50.raycast import mesh_scene
 from pipelines.track.chart.cases import draw_case, draw_meshes, draw_person
 from pipelines.track.chart.disturb import Case, creased, mirrored, warped, where_seen
 from pipelines.track.chart.layout import HEIGHT, MARKS, WIDTH, make_chart, to_texels
+from pipelines.track.chart.light import Lamps
 from pipelines.track.chart.network import (
     FIRST,
     SIDE,
@@ -243,10 +245,18 @@ def test_training_goes_on_where_it_was_stopped(tmp_path, monkeypatch, head) -> N
         torch.testing.assert_close(again[name], value)
 
 
-def test_weights_to_go_on_from_must_be_there(tmp_path, capsys) -> None:
+@pytest.mark.parametrize("content", [None, b"no archive", "others", "shapes"])
+def test_weights_to_go_on_from_must_be_such(tmp_path, capsys, content) -> None:
+    path = tmp_path / "start.npz"
+    if isinstance(content, bytes):
+        path.write_bytes(content)
+    elif content:
+        names = trainable_network().state_dict() if content == "shapes" else ["weight"]
+        np.savez(path, **{name: np.zeros(1, np.float16) for name in names})
     with pytest.raises(SystemExit):
-        main(["--cases", str(tmp_path), "--start", str(tmp_path / "gone.npz")])
-    assert "gone.npz: no such file of weights" in capsys.readouterr().err
+        main(["--cases", str(tmp_path), "--start", str(path)])
+    message = capsys.readouterr().err
+    assert "start.npz: not landmark weights" in message and "Traceback" not in message
 
 
 def test_training_lowers_the_loss(cases) -> None:

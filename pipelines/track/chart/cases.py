@@ -72,15 +72,15 @@ def draw_person(model: HeadModel, chart: Chart, rng: Rng) -> Person:
 def draw_case(model: HeadModel, chart: Chart, person: Person, rng: Rng) -> Case:
     """Let a person act, look from some cameras and read the chart of a mesh that is off."""
     true, wrong = draw_meshes(model, chart, rng)
-    head = _Head(model, chart, person, true)
+    lamps = draw_lamps(rng)
+    head = _Head(model, chart, person, true, lamps, rng)
     places, normals = chart.samples.at(wrong), sample_normals(chart.samples, wrong)
     visibility = Visibility(wrong, model.faces.numpy())
-    lamps = draw_lamps(rng)
     total, mass = np.zeros_like(places), np.zeros(len(places))
     for camera in draw_cameras(places, rng):
         weight = visibility.weights(camera, places, normals) ** 2
         chosen = np.flatnonzero(weight)
-        color = head.seen(camera, places[chosen], lamps)
+        color = head.seen(camera, places[chosen])
         total[chosen] += weight[chosen, None] * color
         mass[chosen] += weight[chosen]
     colors = chart.image(total / np.maximum(mass, 1e-6)[:, None])
@@ -131,18 +131,26 @@ def _slips(expression: np.ndarray, early: float, rng: Rng) -> np.ndarray:
 
 
 class _Head:
-    """A true, painted head in a ray caster."""
+    """A true, painted head in a ray caster, and the light that gets to its vertices."""
 
     def __init__(
-        self, model: HeadModel, chart: Chart, person: Person, vertices: np.ndarray
+        self,
+        model: HeadModel,
+        chart: Chart,
+        person: Person,
+        vertices: np.ndarray,
+        lamps: Lamps,
+        rng: Rng,
     ) -> None:
         self.chart, self.person, self.faces = chart, person, model.faces.numpy()
         self.scene = mesh_scene(vertices, self.faces)
         normals = vertex_normals(torch.from_numpy(vertices)[None], model.faces)[0]
         self.normals = normals.numpy().astype(np.float32)
         self.front = chart.front
+        self.lamps = lamps
+        self.reach = lamps.reach(self.scene, vertices, self.normals, rng)
 
-    def seen(self, camera: Camera, places: np.ndarray, lamps: Lamps) -> np.ndarray:
+    def seen(self, camera: Camera, places: np.ndarray) -> np.ndarray:
         """Root of light (N, 3) where a camera looks for places (N, 3)."""
         towards = places - camera.center
         towards /= np.linalg.norm(towards, axis=1, keepdims=True)
@@ -153,7 +161,9 @@ class _Head:
         albedo = self._albedo(face, bary)
         normals = (self.normals[self.faces[face]] * bary[..., None]).sum(1)
         normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-6)
-        color[hit] = np.clip(lamps.lit(albedo, normals, -towards[hit], self.person.gloss), 0, 1)
+        reach = (self.reach[self.faces[face]] * bary[..., None]).sum(1)
+        light = self.lamps.lit(albedo, normals, reach, -towards[hit], self.person.gloss)
+        color[hit] = np.clip(light, 0.0, 1.0)
         return np.sqrt(color)
 
     def flow(self, places: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -110,7 +110,8 @@ def where_seen(case: Case, texels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def creased(colors: np.ndarray, at: np.ndarray, known: np.ndarray, rng: Rng) -> np.ndarray:
     """Dark lines where lips meet and along the upper lids, in most of the maps.
 
-    Drawn heads have no shadows, and on a face these lines are what tells best where its parts end.
+    Drawn shadows are no finer than the head model's vertices, and on a face these lines are what
+    tells best where its parts end.
 
     Args:
         colors: (HEIGHT, WIDTH, 3) uint8.
