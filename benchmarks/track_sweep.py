@@ -42,6 +42,8 @@ KNOBS: tuple[tuple[str, dict[str, object]], ...] = (
     ("no relief", {"relief_rounds": 0}),
     ("no colours", {"photo_rounds": 0}),
     ("no chart", {"chart_rounds": 0}),
+    ("chart_weight 4", {"chart_weight": 4.0}),
+    ("no offsets along the skin", {"offset_along": 0}),
     ("no offsets", {"offset_modes": 0, "offset_along": 0}),
     ("render_rounds 2", {"render_rounds": 2}),
 )

@@ -2,7 +2,8 @@
 
 A head is drawn twice: as it is, and as a tracker that is some millimetres off has it. What several
 cameras see of the first is read at the places of the second, exactly as it is of footage; where
-each place belongs is known. Nothing is rendered: only the rays to the chart's texels are cast.
+each place belongs is known. Nothing is rendered: rays are cast to the chart's texels, and from the
+skin to what lights it.
 """
 
 from __future__ import annotations
