@@ -145,9 +145,9 @@ def test_durations():
     assert words == ["1.3 s", "42 s", "1:00 min", "3:05 min", "2:10 h", "3 d 4 h"]
 
 
-def start(dataset, workers):
+def start(dataset, workers, slower=10):
     command = [sys.executable, "-m", "tests.faults.toy", str(dataset.root), str(workers)]
-    environment = os.environ | {"PYTHONPATH": str(REPOSITORY), toy.SLOWER: "10"}
+    environment = os.environ | {"PYTHONPATH": str(REPOSITORY), toy.SLOWER: str(slower)}
     return subprocess.Popen(command, cwd=REPOSITORY, env=environment, stderr=subprocess.DEVNULL)
 
 
@@ -168,9 +168,9 @@ def test_page_follows_a_run_of_another_process_to_its_end(tmp_path, monkeypatch,
     monkeypatch.setattr(status_cli, "PAGE_SECONDS", 0.2)
     names = [*(f"item{n}" for n in range(8)), "bad1"]
     dataset = toy.make_dataset(tmp_path / "data", names)
-    process = start(dataset, workers)
-    # On a busy machine a run may be over between two looks.
-    row = first_with(dataset, lambda row: row.running or row.done)
+    # Slow enough that a busy machine does not miss a run's middle between two looks.
+    process = start(dataset, workers, slower=25)
+    row = first_with(dataset, lambda row: row.state == "running" and row.running and row.done)
     assert row.done + len(row.failed) + len(row.running) + row.missing == len(names)
     page = tmp_path / "page.html"
     (end,) = status_cli._keep_page(dataset, ["toy"], page)
