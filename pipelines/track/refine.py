@@ -17,7 +17,7 @@ from pipelines.track.offsets import ALONG, OFF
 from pipelines.track.outline import Outline, outline_regions, outline_vertices
 from pipelines.track.pictures import Moment, see, with_photometry, with_relief
 from pipelines.track.relief import Relief
-from pipelines.track.samples import spread
+from pipelines.track.samples import COVERED, spread
 from pipelines.track.shots import root_light
 from pipelines.track.slide import Slide, read_slide, with_slides
 from pipelines.track.sparse_head import Basis
@@ -25,6 +25,8 @@ from pipelines.track.state import State, Target, all_vertices, rotations
 
 # Irises, and jaw lines where they are seen, are found anew at least so often.
 MARK_ROUNDS = 2
+# Of neck and ears, samples for each of the face's, and how far to trust what is found there.
+COVERED_SHARE, COVERED_TRUST = 0.25, 0.3
 
 
 def refine(
@@ -42,6 +44,7 @@ def refine(
     """
     model = basis.model
     samples = spread(model, config.samples)
+    covered = spread(model, round(COVERED_SHARE * config.samples), COVERED)
     appearance: Appearance | None = None
     rounds = config.relief_rounds + config.photo_rounds
     rounds = max(rounds, config.silhouette_rounds, MARK_ROUNDS)
@@ -65,11 +68,12 @@ def refine(
             for target, mesh, rotation in zip(targets, meshes, rotations(state), strict=True)
         ]
         if config.relief_rounds:
-            # Far off, whole patches of skin may match wrongly together: little trust at first.
-            left = max(config.relief_rounds - 1 - index, 0)
-            reach = config.relief_reach * 0.6 ** min(index, 3)
-            weight = config.relief_weight * 0.3**left
-            targets = with_relief(model, samples, targets, moments, sights, meshes, reach, weight)
+            around = [see(model, covered, *seen) for seen in zip(moments, meshes, strict=True)]
+            reach, weight = _search(index, config)
+            for places, seen, trust in ((samples, sights, 1.0), (covered, around, COVERED_TRUST)):
+                targets = with_relief(
+                    model, places, targets, moments, seen, meshes, reach, trust * weight
+                )
         if index >= config.relief_rounds and config.photo_rounds:
             targets, appearance = with_photometry(
                 samples, targets, moments, sights, meshes, appearance, config
@@ -82,6 +86,13 @@ def refine(
         targets = with_slides(targets, slides)
         state, _ = fit(basis, targets, state, config, config.round_iterations, _told(targets))
     return state, targets, appearance
+
+
+def _search(index: int, config: TrackConfig) -> tuple[float, float]:
+    """How far a round searches for the surface, metres, and how far to trust what it finds."""
+    # Far off, whole patches of skin may match wrongly together: little trust at first.
+    left = max(config.relief_rounds - 1 - index, 0)
+    return config.relief_reach * 0.6 ** min(index, 3), config.relief_weight * 0.3**left
 
 
 def _told(targets: list[Target]) -> tuple[str, ...]:

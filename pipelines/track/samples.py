@@ -15,6 +15,8 @@ SEEN = (
     "face", "nose", "lips",
     "left_eye_region", "right_eye_region", "left_eyeball", "right_eyeball",
 )  # fmt: skip
+# Skin that hair and cloth may lie before: its shape can be searched for, its colours not trusted.
+COVERED = ("neck", "left_ear", "right_ear")
 HIDDEN = ("mouth_interior", "boundary", "scalp", "teeth", "tongue")
 # A ray may end this far before a sample and still count as reaching it: a tenth of a hair.
 TOUCH_M = 3e-4
@@ -44,13 +46,13 @@ class Samples:
         return np.einsum("sk,skc->sc", self.bary, vertices[self.corners])
 
 
-def spread(model: HeadModel, count: int) -> Samples:
-    """About `count` samples, evenly by area over the skin and eyes of the template.
+def spread(model: HeadModel, count: int, regions: tuple[str, ...] = SEEN) -> Samples:
+    """About `count` samples, evenly by area over the skin of the template's regions.
 
-    The same model and count give the same samples.
+    The same model, count and regions give the same samples.
     """
     faces = model.faces.numpy()
-    allowed = _allowed(model)[faces].all(1)
+    allowed = _allowed(model, regions)[faces].all(1)
     # A head that names no such region is taken to be skin all over.
     ids = np.flatnonzero(allowed) if allowed.any() else np.arange(len(faces))
     corners = model.template.double().numpy()[faces[ids]]
@@ -65,9 +67,9 @@ def spread(model: HeadModel, count: int) -> Samples:
     return Samples(chosen, faces[chosen], bary)
 
 
-def _allowed(model: HeadModel) -> np.ndarray:
-    """Vertices (V,) bool on which the pictures may be compared."""
-    named = [model.regions[name].numpy() for name in SEEN if name in model.regions]
+def _allowed(model: HeadModel, regions: tuple[str, ...]) -> np.ndarray:
+    """Vertices (V,) bool of some regions on which the pictures may be compared."""
+    named = [model.regions[name].numpy() for name in regions if name in model.regions]
     seen = np.any([np.zeros(len(model.template), dtype=bool), *named], axis=0)
     for name in HIDDEN:
         if name in model.regions:

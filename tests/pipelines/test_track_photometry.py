@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from express50.cameras import Camera
+from express50.head.load import load_head
 from pipelines.track.photometry import Photometry, Picture, bilinear, look, robust_mean
-from pipelines.track.samples import Visibility, spread
+from pipelines.track.samples import COVERED, Visibility, spread
 from pipelines.track.shots import Shot, cut_shot, detail
 from tests.pipelines.textured_scenes import (
     RADIUS,
@@ -231,6 +232,15 @@ def test_samples_are_deterministic_even_and_on_the_allowed_skin_only() -> None:
     assert counts.max() < 1.2 * counts.min()
     around, _ = np.histogram(np.arctan2(places[:, 0], places[:, 2]), np.linspace(-np.pi, np.pi, 9))
     assert around.max() < 1.2 * around.min()
+
+
+def test_samples_of_neck_and_ears_lie_there() -> None:
+    model = load_head("procedural")
+    samples = spread(model, 900, COVERED)
+    inside = np.any([model.regions[name].numpy() for name in COVERED], axis=0)
+    assert inside[samples.corners].all()
+    for name in COVERED:
+        assert model.regions[name].numpy()[samples.corners].all(1).sum() > 50
 
 
 def test_a_head_without_regions_is_skin_all_over() -> None:
