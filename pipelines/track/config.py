@@ -55,7 +55,7 @@ class TrackConfig:
     chart_rounds: int = 8
     """Of the rounds that there are, the first so many in which landmarks are found anew on the face
     laid flat; what the last of them said stays. 0 for none."""
-    chart_weight: float = 1.5
+    chart_weight: float = 1.0
     """Trust in these landmarks."""
     detail_radius: float = 0.003
     """Marks of the skin smaller than this are compared, metres."""
