@@ -59,7 +59,7 @@ class TrackConfig:
     """Trust in these landmarks."""
     detail_radius: float = 0.003
     """Marks of the skin smaller than this are compared, metres."""
-    photo_weight: float = 0.1
+    photo_weight: float = 0.05
     """Trust in the photometric term."""
     photo_tie: float = 0.3
     """How firmly a moment's colours are tied to those of the other moments, 0 to 1."""

@@ -32,10 +32,9 @@ VIEW_NOISE = 0.05
 LEAST_SEEN = 0.1
 LEAST_VIEWS = 2
 # Whole heads tell landmarks more coarsely than the chart, and err otherwise in every expression:
-# there they count with so many times their standard deviation, the few too that a chart which
-# tells most of them leaves out.
+# what a chart tells counts there with so many times its standard deviation. What it does not, as
+# the corners of open mouths, stays.
 SURPASSED = 6.0
-MOST = 26
 # Texels further apart than this lie on two sides of a gap, as between open lips.
 TORN_M = 0.004
 
@@ -84,7 +83,7 @@ class Slide:
 
 
 def with_slides(targets: list[Target], slides: list[Slide | None]) -> list[Target]:
-    """The targets with where the skin belongs, and little trust left in their own landmarks."""
+    """The targets with where the skin belongs, and less trust in the landmarks it tells."""
     return [
         target if slide is None else _with_slide(target, slide)
         for target, slide in zip(targets, slides, strict=True)
@@ -92,9 +91,8 @@ def with_slides(targets: list[Target], slides: list[Slide | None]) -> list[Targe
 
 
 def _with_slide(target: Target, slide: Slide) -> Target:
-    told = slide.marks if len(slide.marks) < MOST else slice(FIRST, None)
     sigma = target.sigma.copy()
-    sigma[:, told] *= SURPASSED
+    sigma[:, slide.marks] *= SURPASSED
     return replace(target, sigma=sigma, terms=(*target.terms, slide))
 
 

@@ -16,13 +16,12 @@ from express50.head.load import load_head
 from express50.head.model import landmarks, pose, vertex_normals
 from express50.transforms import look_at
 from pipelines.track.chart.layout import HEIGHT, WIDTH
-from pipelines.track.chart.network import FIRST, mark_places, reading_chart
+from pipelines.track.chart.network import mark_places, reading_chart
 from pipelines.track.config import TrackConfig
 from pipelines.track.offsets import split_shape, with_modes
 from pipelines.track.pictures import Moment
 from pipelines.track.shots import Shot
 from pipelines.track.slide import (
-    MOST,
     SURPASSED,
     Slide,
     landmark_samples,
@@ -92,14 +91,6 @@ def test_a_chart_takes_trust_from_the_landmarks_it_reads() -> None:
     np.testing.assert_array_equal(made.sigma[:, ~told], target.sigma[:, ~told])
     np.testing.assert_array_equal(made.sigma[:, told], SURPASSED * target.sigma[:, told])
     assert np.nanmax(target.sigma[np.isfinite(target.sigma)]) == 1.5, "not changed in place"
-
-
-def test_a_chart_that_reads_most_landmarks_takes_trust_from_all_but_the_jaw_line() -> None:
-    marks = np.arange(FIRST, FIRST + MOST)
-    zero = np.zeros((MOST, 3))
-    target = target_of(np.ones((1, 68)))
-    (made,) = with_slides([target], [Slide(marks, zero, zero, np.ones(MOST))])
-    assert (made.sigma[:, :FIRST] == 1.0).all() and (made.sigma[:, FIRST:] == SURPASSED).all()
 
 
 @pytest.fixture(scope="module")
