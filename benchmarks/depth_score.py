@@ -10,25 +10,40 @@ from express50.raycast import camera_rays, mesh_scene
 from express50.twin.truth import Truth, align_worlds
 from pipelines.depth.qc import Pictures
 
+SUREST = (0.98, 0.96, 0.9, 0.7)  # shares of the pixels, the most confident ones
+
 Mesh = tuple[np.ndarray, np.ndarray]  # vertices (V, 3), faces (F, 3)
 
 
-def score(mesh: Mesh, truth: Truth, subject: str, frame: int, pictures: Pictures) -> dict:
-    """What :func:`compare` finds in all pictures together."""
+def score(
+    mesh: Mesh,
+    truth: Truth,
+    subject: str,
+    frame: int,
+    pictures: Pictures,
+    sure: dict[str, np.ndarray] | None = None,
+) -> dict:
+    """What :func:`compare` finds in all pictures together, and the confidence of the same pixels.
+
+    ``sure`` holds maps of confidence (H, W) by camera, where there are any.
+    """
     cameras = {camera.id: camera for camera, _, _ in pictures}
     motion = align_worlds(cameras, truth.cameras(subject))
+    none = np.zeros(0)
     rows = [
-        compare(mesh, truth, subject, frame, camera, motion, alpha) for camera, _, alpha in pictures
+        compare(mesh, truth, subject, frame, camera, motion, alpha, (sure or {}).get(camera.id))
+        for camera, _, alpha in pictures
     ]
     found: dict = {
-        key: np.concatenate([row[key] for row in rows]) for key in ("errors", "skin", "degrees")
+        key: np.concatenate([row.get(key, none) for row in rows])
+        for key in ("errors", "skin", "degrees", "sure")
     }
     return found | {"covered": float(np.mean([row["covered"] for row in rows]))}
 
 
 def compare(
     mesh: Mesh, truth: Truth, subject: str, frame: int, camera: Camera, motion: np.ndarray,
-    alpha: np.ndarray,
+    alpha: np.ndarray, sure: np.ndarray | None = None,
 ) -> dict:  # fmt: skip
     """One view: absolute errors (N,), millimetres, of all pixels and of skin; skin's normals."""
     seen = transform_camera(camera, motion)
@@ -40,7 +55,7 @@ def compare(
     head = truth.vertices(subject, frame), truth.head_model(subject).faces.numpy()
     _, true_normals = cast(head, seen)
     cosine = np.clip((normals * true_normals).sum(-1)[skin], -1, 1)
-    return {
+    return ({} if sure is None else {"sure": sure[both]}) | {
         "errors": errors[both],
         "skin": errors[skin],
         "degrees": np.degrees(np.arccos(cosine)),
@@ -66,6 +81,21 @@ def cast(mesh: Mesh, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
     return depth, normals / np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-9)
 
 
+def of_surest(errors: np.ndarray, sure: np.ndarray) -> dict:
+    """95th percentiles, millimetres, of the errors (N,) of the most confident shares of pixels.
+
+    ``sure`` (N,) is the confidence, or empty where a way gives none.
+    """
+    if not len(sure):
+        return {}
+    ordered = errors[np.argsort(-sure, kind="stable")]
+    tails = {
+        f"{share:g}": round(float(np.percentile(ordered[: int(share * len(errors))], 95)), 3)
+        for share in SUREST
+    }
+    return {"abs_error_mm_p95_of_surest": tails}
+
+
 def summary(rows: list[dict]) -> dict:
     """Figures over the pixels of all items; ``n/a`` where nothing could be measured."""
     if not rows:
@@ -83,6 +113,7 @@ def summary(rows: list[dict]) -> dict:
         "coverage": round(float(np.mean([row["covered"] for row in rows])), 4),
         "peak_memory_gib": round(max(row["gib"] for row in rows), 2),
     }
+    figures |= of_surest(errors, np.concatenate([row["sure"] for row in rows]))
     seconds = [row["s"] for row in rows if row["s"] is not None]
     figures["seconds_per_frame"] = round(float(np.mean(seconds)), 2) if seconds else None
     for key in ("band_voxels", "band_mib"):  # what rendering keeps near the surface

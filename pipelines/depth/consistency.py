@@ -9,7 +9,7 @@ little there, a large one always tells (Seitz et al. 2006 compare surfaces so).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -19,12 +19,16 @@ from express50.cameras import Camera, rays, resized
 from express50.images import resize_area
 from express50.raycast import camera_rays
 from pipelines.depth.grid import INSIDE, project_fast, sample_image
+from pipelines.depth.raycast import DepthView, jumps
 
 NEIGHBOURS = 4  # views that each is compared with, those whose directions are closest
 CONSISTENT_STEPS = 10.0  # 8-bit steps up to which colours agree: noise and highlights take some
 DARK = 16.0  # 8-bit steps; darker pixels tell no gain
 FLAT = 4.0  # tangent of the angle between line of sight and normal from which colours smear
 HIDDEN_M = 0.004  # metres behind the neighbour's own depth at which a point counts as hidden
+DOUBT_STEPS = 5.0  # 8-bit steps of error by which confidence falls to 1/e
+UNSEEN_TRUST = 0.2  # what is left of confidence where no neighbour sees the point
+WINDOW = 5  # pixels, odd: colours about a wrong depth agree here and there by chance
 
 
 @dataclass(frozen=True)
@@ -84,17 +88,9 @@ def make_shot(
     depth = scene.cast_rays(camera_rays(camera), nthreads=1)["t_hit"].numpy()
     seen = np.isfinite(depth) & (alpha > INSIDE)
     depth = np.where(seen, depth, 0).astype(np.float32)
-    return Shot(camera, rgb.astype(np.float32), depth, _plain(camera, depth))
-
-
-def _plain(camera: Camera, depth: np.ndarray) -> np.ndarray:
-    """Pixels (H, W) about which depth (H, W) is known and changes by under FLAT a step sideways.
-
-    At a neighbour's outline colours are mixed with what is behind, and a pixel spans centimetres.
-    """
-    square = np.ones((3, 3), np.uint8)
-    low, high = cv2.erode(depth, square), cv2.dilate(depth, square)
-    return (low > 0) & (high - low < 2 * FLAT * high / camera.K[0, 0])
+    # at a neighbour's outline colours are mixed with what is behind, and a pixel spans centimetres
+    plain = jumps(camera, depth) < 2 * FLAT
+    return Shot(camera, rgb.astype(np.float32), depth, plain)
 
 
 def agreements(shots: Sequence[Shot]) -> list[Agreement]:
@@ -107,6 +103,25 @@ def agreements(shots: Sequence[Shot]) -> list[Agreement]:
         _agreement(shot, [shots[k] for k in row if closeness[i, k] > 0])
         for i, (shot, row) in enumerate(zip(shots, order, strict=True))
     ]
+
+
+def vouched(view: DepthView, agreement: Agreement) -> DepthView:
+    """The view with the neighbours' colours in its confidence.
+
+    The root of the product of what the surface and what the colours say: small values, which tell
+    bad depth from worse, keep their differences in 8 bits.
+    """
+    known = np.isfinite(agreement.errors)
+    total, count = (
+        cv2.blur(values.astype(np.float32), (WINDOW, WINDOW))
+        for values in (np.where(known, agreement.errors, 0.0), known)
+    )
+    told = count > 0.5 / WINDOW**2
+    believed = np.exp(-total / np.maximum(count, 1e-6) / DOUBT_STEPS)
+    believed = np.where(told, believed, UNSEEN_TRUST).astype(np.float32)
+    height, width = view.confidence.shape
+    believed = cv2.resize(believed, (width, height), interpolation=cv2.INTER_LINEAR)
+    return replace(view, confidence=np.sqrt(view.confidence * believed))
 
 
 def _agreement(shot: Shot, others: Sequence[Shot]) -> Agreement:

@@ -14,9 +14,9 @@ from express50.raycast import mesh_scene
 from pipelines.depth.grid import View, sample_image
 
 REACH = (
-    0.025  # metres of hull over the tracked mesh up to which it is believed; more is hair, cloth
+    0.015  # metres of hull over the tracked mesh up to which it is believed; more is hair, cloth
 )
-BORDER = 0.015  # metres from the mesh's open border over which belief fades in
+BORDER = 0.03  # metres from the mesh's open border over which belief fades in; collars stand there
 
 
 @dataclass(frozen=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 import open3d as o3d
 
@@ -13,6 +14,7 @@ from pipelines.depth.grid import INSIDE
 from pipelines.depth.reconstruct import Surface
 
 STEEP = 0.25  # cosine between surface and ray below which confidence fades to 0
+BROKEN = 4.0  # pixels' widths between neighbours' depths at which confidence is halved
 
 
 @dataclass(frozen=True)
@@ -57,7 +59,8 @@ def depth_view(
     """A camera's picture of a surface: valid where it is hit inside the matte (H, W).
 
     `depth` (H, W) is not finite where nothing is hit; `normals` (H, W, 3) are of the world and of
-    any length; `confidence` (H, W) fades where the surface is seen at a slant.
+    any length; `confidence` (H, W) fades where the surface is seen at a slant, and where depth
+    jumps: a pixel there is of neither side.
     """
     hit = np.isfinite(depth) & (depth > 0)
     inside = alpha > INSIDE
@@ -65,7 +68,8 @@ def depth_view(
     normals = normals / np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-9)
     _, way = rays(camera)
     cosine = -(normals * way).sum(-1) / np.linalg.norm(way, axis=-1)
-    confidence = np.where(valid, confidence * np.clip(cosine / STEEP, 0, 1), 0.0)
+    whole = np.clip(cosine / STEEP, 0, 1) / (1 + jumps(camera, np.where(valid, depth, 0)) / BROKEN)
+    confidence = np.where(valid, confidence * whole, 0.0)
     picture = np.where(valid[..., None], normals @ camera.cam_from_world[:3, :3].T, 0.0)
     return DepthView(
         depth=np.where(valid, depth, 0).astype(np.float32),
@@ -75,3 +79,14 @@ def depth_view(
         covered=float(valid.sum() / max(int(inside.sum()), 1)),
         spill=float((hit & ~inside).sum() / max(int(hit.sum()), 1)),
     )
+
+
+def jumps(camera: Camera, depth: np.ndarray) -> np.ndarray:
+    """Range (H, W) of depth (H, W; 0: none) over a pixel and its eight neighbours.
+
+    In widths of a pixel at that depth, whatever unit and focal length; infinite at an outline.
+    """
+    square = np.ones((3, 3), np.uint8)
+    low, high = (way(depth.astype(np.float32), square) for way in (cv2.erode, cv2.dilate))
+    with np.errstate(invalid="ignore"):
+        return np.where(low > 0, (high - low) * camera.K[0, 0] / np.maximum(high, 1e-12), np.inf)

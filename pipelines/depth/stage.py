@@ -17,7 +17,7 @@ from express50.raycast import mesh_scene
 from express50.stage import Stage
 from express50.tracks import read_track
 from pipelines.depth.config import PRESETS, DepthConfig
-from pipelines.depth.consistency import agreements, make_shot
+from pipelines.depth.consistency import agreements, make_shot, vouched
 from pipelines.depth.grid import View
 from pipelines.depth.prior import Prior, make_prior, matte_agreement
 from pipelines.depth.products import write_glb, write_maps, write_ply
@@ -95,12 +95,14 @@ def run(dataset: Dataset, item: str, config: DepthConfig, out: Path) -> dict:
             seen[camera.id] = trace_view(surface, camera, alpha)
         else:
             seen[camera.id] = cast_view(surface, scene, camera, alpha)
-        write_maps(out, camera.id, seen[camera.id], config)
     write_ply(out / "surface.ply", surface)
     if config.glb:
         write_glb(out / "surface.glb", surface)
     shots = [make_shot(scene, *picture, config.consistency_side) for picture in pictures]
     photo = dict(zip(seen, agreements(shots), strict=True))
+    seen = {name: vouched(view, photo[name]) for name, view in seen.items()}
+    for name, view in seen.items():
+        write_maps(out, name, view, config)
     write_picture(out, pictures, seen, photo, config.qc_views)
     numbers = surface.numbers | {"extent_m": extent}
     return metrics(numbers, seen, photo) | {"track": track, "warm": warm, "dropped": dropped}
@@ -168,7 +170,7 @@ def read_prior(
 
 STAGE = Stage(
     name="depth",
-    version=5,
+    version=6,
     config=DepthConfig,
     presets=PRESETS,
     items=peak_items,

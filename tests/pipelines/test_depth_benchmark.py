@@ -7,7 +7,7 @@ from dataclasses import fields
 import numpy as np
 
 from benchmarks.depth import parse
-from benchmarks.depth_score import summary
+from benchmarks.depth_score import of_surest, summary
 from benchmarks.depth_sweep import AXES, as_markdown
 from pipelines.depth.config import DepthConfig
 
@@ -31,15 +31,23 @@ def test_the_table_has_a_column_for_every_cell():
 
 def test_figures_are_those_of_all_pixels_and_none_where_nothing_was_measured():
     rows = [{"errors": np.full(3, 1.0), "skin": np.ones(1), "degrees": np.ones(1), "covered": 1.0,
-             "gib": 1.0, "s": 2.0},
+             "gib": 1.0, "s": 2.0, "sure": np.zeros(0)},
             {"errors": np.full(1, 9.0), "skin": np.ones(1), "degrees": np.ones(1), "covered": 0.5,
-             "gib": 2.0, "s": 4.0}]  # fmt: skip
+             "gib": 2.0, "s": 4.0, "sure": np.zeros(0)}]  # fmt: skip
     found = summary(rows)
     assert found["abs_error_mm_median"] == 1 and found["coverage"] == 0.75
     assert found["seconds_per_frame"] == 3 and found["peak_memory_gib"] == 2
-    assert "n/a" in summary([])
+    assert "n/a" in summary([]) and "abs_error_mm_p95_of_surest" not in found
     empty = rows[0] | {"errors": np.zeros(0), "skin": np.zeros(0), "degrees": np.zeros(0)}
     assert "n/a" in summary([empty])
+
+
+def test_the_tail_of_the_surest_pixels_leaves_out_those_of_least_confidence():
+    errors, sure = np.full(1000, 1.0), np.full(1000, 0.9)
+    errors[:80], sure[:80] = 20.0, 0.1
+    found = of_surest(errors, sure)["abs_error_mm_p95_of_surest"]
+    assert found["0.98"] == 20 and found["0.9"] == 1
+    assert of_surest(errors, -sure)["abs_error_mm_p95_of_surest"]["0.7"] == 20
 
 
 def test_a_sweep_is_asked_for_by_name():

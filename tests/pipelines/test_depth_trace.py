@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 
@@ -60,7 +61,8 @@ def test_mesh_and_distances_agree():
     assert (meshed.valid != traced.valid).sum() < 0.02 * both.sum()
     assert np.median(np.abs(meshed.depth - traced.depth)[both]) < 0.02 * VOXEL
     assert np.median((meshed.normals * traced.normals).sum(-1)[both]) > 0.999
-    np.testing.assert_allclose(meshed.confidence[both], traced.confidence[both], atol=0.1)
+    inner = cv2.erode(both.astype(np.uint8), np.ones((3, 3))) > 0  # outlines have none
+    np.testing.assert_allclose(meshed.confidence[inner], traced.confidence[inner], atol=0.1)
 
 
 def test_what_is_not_there_is_not_hit():
