@@ -47,12 +47,9 @@ from express50.tracks import read_track
 from express50.twin.truth import Truth
 from pipelines import track
 from pipelines.depth import STAGE
-from pipelines.depth.consistency import agreements, make_shot, vouched
 from pipelines.depth.grid import View, head_box
-from pipelines.depth.qc import Pictures
-from pipelines.depth.raycast import cast_view
 from pipelines.depth.reconstruct import Surface, hull_grid, reconstruct
-from pipelines.depth.stage import read_prior, read_views
+from pipelines.depth.stage import look, read_prior, read_views
 from pipelines.depth.surface import extract_mesh
 from pipelines.depth.trace import trace
 
@@ -160,18 +157,9 @@ def measure(dataset_root: Path, truth_root: Path, item: str, name: str) -> dict 
     sure = None
     if preset in PRESETS:
         found["raycast"] = both_ways(surface, [camera for camera, _, _ in pictures[::8]])
-        sure = confidences(surface, pictures, config.consistency_side)
+        seen, _ = look(surface, pictures, config)
+        sure = {name: view.confidence for name, view in seen.items()}
     return found | score(mesh, truth, subject, frame, pictures, sure)
-
-
-def confidences(surface: Surface, pictures: Pictures, side: int) -> dict[str, np.ndarray]:
-    """The stage's confidence (H, W) of every camera."""
-    scene = mesh_scene(surface.vertices, surface.faces)
-    found = agreements([make_shot(scene, *picture, side) for picture in pictures])
-    return {
-        camera.id: vouched(cast_view(surface, scene, camera, alpha), agreement).confidence
-        for (camera, _, alpha), agreement in zip(pictures, found, strict=True)
-    }
 
 
 def both_ways(surface: Surface, cameras: list[Camera]) -> dict:

@@ -89,7 +89,7 @@ def make_shot(
     seen = np.isfinite(depth) & (alpha > INSIDE)
     depth = np.where(seen, depth, 0).astype(np.float32)
     # at a neighbour's outline colours are mixed with what is behind, and a pixel spans centimetres
-    plain = jumps(camera, depth) < 2 * FLAT
+    plain = jumps(camera, depth) < 2 * FLAT  # over the two steps from side to side
     return Shot(camera, rgb.astype(np.float32), depth, plain)
 
 

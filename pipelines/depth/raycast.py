@@ -68,11 +68,12 @@ def depth_view(
     normals = normals / np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-9)
     _, way = rays(camera)
     cosine = -(normals * way).sum(-1) / np.linalg.norm(way, axis=-1)
-    whole = np.clip(cosine / STEEP, 0, 1) / (1 + jumps(camera, np.where(valid, depth, 0)) / BROKEN)
+    depth = np.where(valid, depth, 0).astype(np.float32)
+    whole = np.clip(cosine / STEEP, 0, 1) / (1 + jumps(camera, depth) / BROKEN)
     confidence = np.where(valid, confidence * whole, 0.0)
     picture = np.where(valid[..., None], normals @ camera.cam_from_world[:3, :3].T, 0.0)
     return DepthView(
-        depth=np.where(valid, depth, 0).astype(np.float32),
+        depth=depth,
         valid=valid,
         confidence=np.clip(confidence, 0, 1).astype(np.float32),
         normals=picture.astype(np.float32),
@@ -88,5 +89,4 @@ def jumps(camera: Camera, depth: np.ndarray) -> np.ndarray:
     """
     square = np.ones((3, 3), np.uint8)
     low, high = (way(depth.astype(np.float32), square) for way in (cv2.erode, cv2.dilate))
-    with np.errstate(invalid="ignore"):
-        return np.where(low > 0, (high - low) * camera.K[0, 0] / np.maximum(high, 1e-12), np.inf)
+    return np.where(low > 0, (high - low) * camera.K[0, 0] / np.maximum(high, 1e-12), np.inf)

@@ -17,13 +17,13 @@ from express50.raycast import mesh_scene
 from express50.stage import Stage
 from express50.tracks import read_track
 from pipelines.depth.config import PRESETS, DepthConfig
-from pipelines.depth.consistency import agreements, make_shot, vouched
+from pipelines.depth.consistency import Agreement, agreements, make_shot, vouched
 from pipelines.depth.grid import View
 from pipelines.depth.prior import Prior, make_prior, matte_agreement
 from pipelines.depth.products import write_glb, write_maps, write_ply
 from pipelines.depth.qc import Pictures, metrics, write_picture
-from pipelines.depth.raycast import cast_view
-from pipelines.depth.reconstruct import reconstruct
+from pipelines.depth.raycast import DepthView, cast_view
+from pipelines.depth.reconstruct import Surface, reconstruct
 from pipelines.depth.trace import trace_view
 from pipelines.depth.views import make_view, without_contradiction
 from pipelines.depth.warm import carried_start, source_of, surface_file, track_path
@@ -88,24 +88,31 @@ def run(dataset: Dataset, item: str, config: DepthConfig, out: Path) -> dict:
             f"{item}: the surface is {extent:.3g} m large, expected {UNITS[0]} to {UNITS[1] * 3} m;"
             " is the calibration in metres?"
         )
-    scene = mesh_scene(surface.vertices, surface.faces)
-    seen = {}
-    for camera, _, alpha in pictures:
-        if config.raycast == "sdf":
-            seen[camera.id] = trace_view(surface, camera, alpha)
-        else:
-            seen[camera.id] = cast_view(surface, scene, camera, alpha)
     write_ply(out / "surface.ply", surface)
     if config.glb:
         write_glb(out / "surface.glb", surface)
-    shots = [make_shot(scene, *picture, config.consistency_side) for picture in pictures]
-    photo = dict(zip(seen, agreements(shots), strict=True))
-    seen = {name: vouched(view, photo[name]) for name, view in seen.items()}
+    seen, photo = look(surface, pictures, config)
     for name, view in seen.items():
         write_maps(out, name, view, config)
     write_picture(out, pictures, seen, photo, config.qc_views)
     numbers = surface.numbers | {"extent_m": extent}
     return metrics(numbers, seen, photo) | {"track": track, "warm": warm, "dropped": dropped}
+
+
+def look(
+    surface: Surface, pictures: Pictures, config: DepthConfig
+) -> tuple[dict[str, DepthView], dict[str, Agreement]]:
+    """What every camera sees of the surface, and what its neighbours say of that, by camera."""
+    scene = mesh_scene(surface.vertices, surface.faces)
+    photo = agreements([make_shot(scene, *row, config.consistency_side) for row in pictures])
+    seen = {}
+    for (camera, _, alpha), agreement in zip(pictures, photo, strict=True):
+        if config.raycast == "sdf":
+            view = trace_view(surface, camera, alpha)
+        else:
+            view = cast_view(surface, scene, camera, alpha)
+        seen[camera.id] = vouched(view, agreement)
+    return seen, dict(zip(seen, photo, strict=True))
 
 
 def read_views(
