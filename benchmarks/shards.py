@@ -206,7 +206,7 @@ def ours(given: list[Members], folder: Path) -> Callable[[], Passes]:
         writer.add_group("train", [PackedSample("S001", f"e{first:05d}", f"c{k:02d}", one)
                                    for k, one in enumerate(group)])  # fmt: skip
     writer.close()
-    write_manifest(folder)
+    write_manifest(folder, writer.digests)
 
     def passes() -> Passes:
         reader = ShardReader(folder)

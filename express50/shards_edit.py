@@ -64,7 +64,7 @@ def _write(readers: Sequence[ShardReader], out: Path, shard_mb: int) -> int:
         names = {s: sorted(k for k, v in splits.items() if v == s) for s in set(splits.values())}
         write_json(aside / "splits.json", names | {"chosen_by": "the shards these are made of"})
         _write_card(readers, aside)
-        write_manifest(aside)
+        write_manifest(aside, writer.digests)
         sync_tree(aside)
         if out.exists():
             out.rmdir()

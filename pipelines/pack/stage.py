@@ -108,7 +108,9 @@ def run(dataset: Dataset, item: str, config: PackConfig, out: Path) -> dict:
         if subject.offsets is not None and subject.name in packed:
             write_offsets(out, subject.name, subject.offsets)
     people = read_people(dataset, packed)
-    return _finish(out, splits, metas, people, read, dropped, config)
+    metrics = _finish(out, splits, metas, people, read, dropped, config)
+    write_manifest(out, writer.digests)
+    return metrics
 
 
 def _pack_group(
@@ -235,7 +237,7 @@ def _finish(
     dropped: list[dict[str, str]],
     config: PackConfig,
 ) -> dict:
-    """Write splits, card, picture and manifest; returns the metrics."""
+    """Write splits, card and picture; returns the metrics."""
     reader = ShardReader(out)
     bare = sum(meta["torso"] == "removed" for meta in metas)
     lacking = [meta for meta in metas if not meta["parts"]]
@@ -253,7 +255,6 @@ def _finish(
     card = write_card(splits, metas, dropped, statistics, people)
     (out / "card.md").write_text(card, encoding="utf-8")
     covered = _write_picture(out, reader)
-    write_manifest(out)
     return {
         "read": read,
         "kept": len(metas),

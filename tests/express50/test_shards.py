@@ -10,6 +10,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from express50.cli import main
 from express50.errors import FormatError
@@ -19,6 +21,7 @@ from express50.shards_write import (
     PackedSample,
     ShardWriter,
     sample_key,
+    tar_header,
     verify,
     write_manifest,
 )
@@ -56,7 +59,7 @@ def write(root: Path, shard_bytes: int = 30_000) -> Path:
                 writer.add_group(split, group)
                 number += 3
     writer.close()
-    write_manifest(root)
+    write_manifest(root, writer.digests)
     return root
 
 
@@ -70,6 +73,26 @@ def test_writing_twice_gives_the_same_bytes(shards, tmp_path):
     files = sorted(path.name for path in shards.iterdir())
     assert files == sorted(path.name for path in again.iterdir())
     assert all((shards / name).read_bytes() == (again / name).read_bytes() for name in files)
+
+
+def test_digests_taken_while_writing_are_those_of_the_files(tmp_path):
+    root = write(tmp_path / "out")
+    taken = (root / "manifest.json").read_bytes()
+    write_manifest(root)
+    assert (root / "manifest.json").read_bytes() == taken
+
+
+@given(st.text("abcXYZ019_-.", min_size=1, max_size=100), st.integers(0, 8**11 - 1))
+def test_a_header_is_tarfiles_own(name, size):
+    info = tarfile.TarInfo(name)
+    info.size = size
+    assert tar_header(name, size) == info.tobuf(tarfile.USTAR_FORMAT, "ascii", "strict")
+
+
+@pytest.mark.parametrize(("name", "size"), [("a" * 101, 0), ("ä", 0), ("a", 8**11)])
+def test_a_header_that_ustar_cannot_hold_is_refused(name, size):
+    with pytest.raises(FormatError, match="8 GiB"):
+        tar_header(name, size)
 
 
 def test_sample_is_what_was_written(shards):
