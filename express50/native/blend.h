@@ -26,6 +26,10 @@ template <class Real> struct Splat {
 
 struct TileFrame {
     int left, top, width, height;  // pixels; width and height are cut at the image's border
+
+    int64_t pixel(const Camera& cam, int x, int y) const {
+        return int64_t(top + y) * cam.width + left + x;
+    }
 };
 
 // The pixels of one vector: a block as square as the width allows, since splats are round. All
@@ -65,7 +69,8 @@ template <class Real> struct Hit {
     }
     // Lanes whose transmittance falls through one half here: the Gaussian of the median depth.
     MaskOf<Real> crosses() const {
-        return (alpha > VecOf<Real>{}) & (before > Real(0.5)) & (after <= Real(0.5));
+        const VecOf<Real> half = broadcast(Real(0.5));
+        return below(VecOf<Real>{}, alpha) & below(half, before) & at_most(after, half);
     }
 };
 
@@ -80,7 +85,8 @@ inline int walk(const Splat<Real>& s, const Box& box, const TileFrame& tile,
     const int i1 = (std::min(box.y1 - tile.top, tile.height) + B::tall - 1) / B::tall;
     const int j0 = std::max(box.x0 - tile.left, 0) / B::wide;
     const int j1 = (std::min(box.x1 - tile.left, tile.width) + B::wide - 1) / B::wide;
-    const V cutoff = broadcast(s.cutoff), zero = V{}, capped = broadcast(Real(kAlphaMax));
+    const V cutoff = broadcast(s.cutoff), zero = V{}, least = broadcast(Real(kAlphaMin));
+    const V most = broadcast(Real(kAlphaMax)), opaque = broadcast(Real(kTransmittanceMin));
     int finished = 0;
     for (int i = i0; i < i1; ++i) {
         const V dy = centers.y[i] - s.y;
@@ -91,18 +97,21 @@ inline int walk(const Splat<Real>& s, const Box& box, const TileFrame& tile,
             const V before = load(place), dx = centers.x[j] - s.x;
             const V along = s.l11 * dx + shear;
             const V sigma = along * along + base;
-            MaskOf<Real> hit = (sigma <= cutoff) & (before > zero);
+            MaskOf<Real> hit = at_most(sigma, cutoff) & below(zero, before);
             if (!bits(hit)) continue;
             V alpha = s.opacity * exp2_negative<Real>(-sigma);
-            alpha = alpha < capped ? alpha : capped;
-            hit &= alpha >= Real(kAlphaMin);
+            alpha = smaller(alpha, most);
+            hit &= at_most(least, alpha);
             const V after = before * (Real(1) - alpha);
-            const MaskOf<Real> stop = hit & (after <= Real(kTransmittanceMin));
+            const MaskOf<Real> stop = hit & at_most(after, opaque);
             const MaskOf<Real> keep = hit & ~stop;
-            store(place, stop ? -before : (keep ? after : before));
-            if (const unsigned stopped = bits(stop)) finished += __builtin_popcount(stopped);
+            store(place, choose(keep, after, before));
+            if (const unsigned stopped = bits(stop)) {
+                store(place, choose(stop, -before, load(place)));
+                finished += __builtin_popcount(stopped);
+            }
             if (const unsigned lanes = bits(keep))
-                visit(Hit<Real>{dx, dy, keep ? alpha : zero, before, after, block, lanes});
+                visit(Hit<Real>{dx, dy, choose(keep, alpha, zero), before, after, block, lanes});
         }
     }
     return finished;
@@ -122,31 +131,18 @@ template <class Real> constexpr int channel_vectors(int channels) {
     return (channels + Lanes<Real>::N - 1) / Lanes<Real>::N;
 }
 
-// For each byte the places of its set bits, lowest first.
-struct BitPlaces {
-    uint8_t at[256][8] = {};
-    constexpr BitPlaces() {
-        for (int byte = 0; byte < 256; ++byte)
-            for (int bit = 0, n = 0; bit < 8; ++bit)
-                if (byte >> bit & 1) at[byte][n++] = uint8_t(bit);
-    }
-};
-inline constexpr BitPlaces kBitPlaces;
-
-// Pixels of a tile that one Gaussian reached, in the order of the walk.
-struct PixelList {
+// Pixels of a tile that one Gaussian reached, in the order of the walk, with its weight there. The
+// way back adds `value`, the product of its colour and the pixel's gradient.
+template <class Real> struct PixelList {
+    static constexpr int N = Lanes<Real>::N;
     int count = 0;
-    uint8_t at[kPixels + 8];  // eight are written at a time
+    alignas(64) int32_t at[kPixels + N];  // whole vectors are written
+    alignas(64) Real weight[kPixels + N], value[kPixels + N];
 
-    template <int N> void add(int position, unsigned lanes) {
-        for (int first = 0; first < N; first += 8) {
-            const unsigned byte = lanes >> first & 0xff;
-            uint64_t places;
-            std::memcpy(&places, kBitPlaces.at[byte], 8);
-            places += uint64_t(position + first) * 0x0101010101010101u;
-            std::memcpy(at + count, &places, 8);
-            count += __builtin_popcount(byte);
-        }
+    void add(int position, unsigned lanes, VecOf<Real> weights) {
+        pack_places<Real>(lanes, position, at + count);
+        pack<Real>(lanes, weights, weight + count);
+        count += __builtin_popcount(lanes);
     }
 };
 
@@ -171,14 +167,18 @@ template <class Real> struct Workspace {
     Lines<Real> pixels;  // forward: colours; backward: their gradients
     std::vector<Real> color, color_gradient;
     alignas(64) Real transmittance[kPixels], alpha[kPixels], weighted[kPixels], median[kPixels];
-    alignas(64) Real weight[kPixels], value[kPixels], before[kPixels], suffix[kPixels];
-    PixelList list;
+    alignas(64) Real before[kPixels], suffix[kPixels];
+    PixelList<Real> list;
 
     struct Record {  // what the way back needs of a hit
         VecOf<Real> alpha, flow;  // flow: transmittance before * gradient by the weight
+    };
+    struct Where {
         int block;
+        unsigned lanes;
     };
     std::vector<Record> hits;
+    std::vector<Where> where;  // of each hit
     std::vector<size_t> hit_start;
 
     Workspace(int c, bool median_too)
@@ -195,6 +195,13 @@ inline void load_color(const Real* color, int channels, VecOf<Real>* out) {
     out[CV - 1] = load_first<Real>(color + (CV - 1) * N, channels - (CV - 1) * N);
 }
 
+template <class Real, int CV>
+inline void store_color(Real* color, int channels, const VecOf<Real>* in) {
+    constexpr int N = Lanes<Real>::N;
+    for (int k = 0; k < CV - 1; ++k) store(color + k * N, in[k]);
+    store_first<Real>(color + (CV - 1) * N, in[CV - 1], channels - (CV - 1) * N);
+}
+
 // Adds weight * colour to the listed pixels; CV channel vectors, 0 = known at run time only.
 template <class Real, int CV> inline void add_colors(Workspace<Real>& w, const Real* color) {
     constexpr int N = Lanes<Real>::N;
@@ -206,7 +213,7 @@ template <class Real, int CV> inline void add_colors(Workspace<Real>& w, const R
         load_color<Real, CV>(color, w.channels, c);
         for (int h = 0; h < count; ++h) {
             const int at = w.list.at[h];
-            const V weight = broadcast(w.weight[at]);
+            const V weight = broadcast(w.list.weight[h]);
             Real* const pixel = pixels + at * CV * N;
             for (int k = 0; k < CV; ++k) store(pixel + k * N, load(pixel + k * N) + weight * c[k]);
         }
@@ -214,7 +221,7 @@ template <class Real, int CV> inline void add_colors(Workspace<Real>& w, const R
         std::copy(color, color + w.channels, w.color.begin());
         for (int h = 0; h < count; ++h) {
             const int at = w.list.at[h];
-            const V weight = broadcast(w.weight[at]);
+            const V weight = broadcast(w.list.weight[h]);
             Real* const pixel = pixels + size_t(at) * w.stride;
             for (int k = 0; k < w.stride; k += N)
                 store(pixel + k, load(pixel + k) + weight * load(&w.color[k]));
@@ -257,11 +264,10 @@ int blend_tile(Workspace<Real>& w, const TileFrame& tile, const Splat<Real>* spl
             store(weighted, load(weighted) + weight * length);
             if (w.wants_median) {
                 Real* median = w.median + at;
-                store(median, hit.crosses() ? length : load(median));
+                store(median, choose(hit.crosses(), length, load(median)));
             }
             if (CV >= 0) {
-                store(w.weight + at, weight);
-                w.list.template add<Lanes<Real>::N>(at, hit.lanes);
+                w.list.add(at, hit.lanes, weight);
             } else {
                 for (int c = 0; c < w.channels; ++c) {
                     Real* pixel = w.pixels.data() + c * kPixels + at;

@@ -13,7 +13,7 @@ template <class Real> struct Moments {
     Real s, sx, sy, sxx, sxy, syy, w, wx, wy;
 };
 
-// Takes w.value = <colour, pixel gradient> of the listed pixels, and writes the gradient of the
+// Takes the list's value = <colour, pixel gradient>, and writes the gradient of the
 // colour, the sum of weight * pixel gradient.
 template <class Real, int CV>
 inline void gather_colors(Workspace<Real>& w, const Real* color, Real* gradient) {
@@ -24,26 +24,30 @@ inline void gather_colors(Workspace<Real>& w, const Real* color, Real* gradient)
     if constexpr (CV > 0) {
         V c[CV], total[CV] = {};
         load_color<Real, CV>(color, w.channels, c);
-        for (int h = 0; h < count; ++h) {
-            const int at = w.list.at[h];
-            const V weight = broadcast(w.weight[at]);
-            const Real* const pixel = pixels + at * CV * N;
+        const auto take = [&](int h) {
+            const V weight = broadcast(w.list.weight[h]);
+            const Real* const pixel = pixels + w.list.at[h] * CV * N;
             V dot = V{};
             for (int k = 0; k < CV; ++k) {
                 const V g = load(pixel + k * N);
                 dot += g * c[k];
                 total[k] += weight * g;
             }
-            w.value[at] = sum<Real>(dot);
+            return dot;
+        };
+        int h = 0;
+        for (; h + 4 <= count; h += 4) {
+            const V dots[4] = {take(h), take(h + 1), take(h + 2), take(h + 3)};
+            sum_four<Real>(dots, w.list.value + h);
         }
-        for (int k = 0; k < CV - 1; ++k) store(gradient + k * N, total[k]);
-        store_first<Real>(gradient + (CV - 1) * N, total[CV - 1], w.channels - (CV - 1) * N);
+        for (; h < count; ++h) w.list.value[h] = sum<Real>(take(h));
+        store_color<Real, CV>(gradient, w.channels, total);
     } else {
         std::copy(color, color + w.channels, w.color.begin());
         std::fill(w.color_gradient.begin(), w.color_gradient.end(), Real(0));
         for (int h = 0; h < count; ++h) {
             const int at = w.list.at[h];
-            const V weight = broadcast(w.weight[at]);
+            const V weight = broadcast(w.list.weight[h]);
             const Real* const pixel = pixels + size_t(at) * w.stride;
             V dot = V{};
             for (int k = 0; k < w.stride; k += N) {
@@ -51,7 +55,7 @@ inline void gather_colors(Workspace<Real>& w, const Real* color, Real* gradient)
                 dot += g * load(&w.color[k]);
                 store(&w.color_gradient[k], load(&w.color_gradient[k]) + weight * g);
             }
-            w.value[at] = sum<Real>(dot);
+            w.list.value[h] = sum<Real>(dot);
         }
         std::copy_n(w.color_gradient.begin(), w.channels, gradient);
     }
@@ -73,11 +77,11 @@ inline size_t replay(Workspace<Real>& w, const TileFrame& tile, const Centers<Re
         const V weight = hit.alpha * hit.before, by_depth = load(w.weighted + at);
         V value = load(w.alpha + at) + by_depth * hit.length(s);
         V by_length = weight * by_depth;
-        if (w.wants_median) by_length += hit.crosses() ? load(w.median + at) : V{};
+        if (w.wants_median) by_length += choose(hit.crosses(), load(w.median + at), V{});
         depth += by_length, depth_x += by_length * hit.dx, depth_y += by_length * hit.dy;
         if (CV >= 0) {
-            store(w.weight + at, weight), store(w.before + at, hit.before);
-            w.list.template add<Lanes<Real>::N>(at, hit.lanes);
+            store(w.before + at, hit.before);
+            w.list.add(at, hit.lanes, weight);
         } else {
             for (int c = 0; c < w.channels; ++c) {
                 const V g = load(w.pixels.data() + c * kPixels + at);
@@ -86,7 +90,8 @@ inline size_t replay(Workspace<Real>& w, const TileFrame& tile, const Centers<Re
             }
             value *= hit.before;
         }
-        w.hits[hits++] = {hit.alpha, value, hit.block};
+        w.where[hits] = {hit.block, hit.lanes};
+        w.hits[hits++] = {hit.alpha, value};
     });
     m.w = sum<Real>(depth), m.wx = sum<Real>(depth_x), m.wy = sum<Real>(depth_y);
     if (CV < 0) {
@@ -94,12 +99,12 @@ inline size_t replay(Workspace<Real>& w, const TileFrame& tile, const Centers<Re
         return hits;
     }
     gather_colors<Real, (CV > 0 ? CV : 0)>(w, color, color_gradient);
+    const Real* value = w.list.value;
     for (size_t h = first; h < hits; ++h) {
-        auto& hit = w.hits[h];
-        const int at = hit.block * Lanes<Real>::N;
-        // What other Gaussians left in the lanes of a miss is not a number of this one.
-        const V value = hit.alpha > V{} ? load(w.value + at) : V{};
-        hit.flow = load(w.before + at) * (hit.flow + value);
+        const auto [block, lanes] = w.where[h];
+        Real* const before = w.before + block * Lanes<Real>::N;
+        w.hits[h].flow = load(before) * (w.hits[h].flow + unpack<Real>(lanes, value));
+        value += __builtin_popcount(lanes);
     }
     return hits;
 }
@@ -114,14 +119,15 @@ inline void retreat(Workspace<Real>& w, const Centers<Real>& centers, const Spla
     V s = V{}, sx = V{}, sy = V{}, sxx = V{}, sxy = V{}, syy = V{};
     for (size_t h = first; h < last; ++h) {
         const auto& hit = w.hits[h];
-        Real* const suffix = w.suffix + hit.block * B::N;
+        const int block = w.where[h].block;
+        Real* const suffix = w.suffix + block * B::N;
         const V behind = load(suffix);
         const V by_alpha = hit.flow - behind / (Real(1) - hit.alpha);
         store(suffix, behind + hit.alpha * hit.flow);
         // No gradient flows through an alpha that was capped.
         const V by_sigma = hit.alpha < Real(kAlphaMax) ? -hit.alpha * by_alpha : V{};
-        const V dx = centers.x[hit.block % B::columns] - splat.x;
-        const V dy = centers.y[hit.block / B::columns] - splat.y;
+        const V dx = centers.x[block % B::columns] - splat.x;
+        const V dy = centers.y[block / B::columns] - splat.y;
         const V by_dx = by_sigma * dx, by_dy = by_sigma * dy;
         s += by_sigma, sx += by_dx, sy += by_dy;
         sxx += by_dx * dx, sxy += by_dx * dy, syy += by_dy * dy;
@@ -142,7 +148,8 @@ void blend_tile_gradient(Workspace<Real>& w, const TileFrame& tile, const Splat<
     w.hit_start.assign(1, 0);
     size_t hits = 0;
     for (int i = 0; i < used; ++i) {
-        if (w.hits.size() < hits + most) w.hits.resize(2 * (hits + most));
+        if (w.hits.size() < hits + most)
+            w.hits.resize(2 * (hits + most)), w.where.resize(2 * (hits + most));
         prefetch(splats, boxes, colors, w.channels, ids[std::min(i + kAhead, used - 1)]);
         hits = replay<Real, CV>(w, tile, centers, splats[ids[i]], boxes[ids[i]],
                                 colors + int64_t(ids[i]) * w.channels, hits,

@@ -6,6 +6,7 @@
 // The caller owns all memory (grmm/rasterize/cpu.py). Every sum is taken in an order that does not
 // depend on the number of threads: tiles write records of their own, which are then added for each
 // Gaussian by ascending tile, so images and gradients are the same bits on any number of threads.
+// That is done for a band of tiles at a time: all records of a large image would fill the cache.
 #if defined(__linux__)
 #include <sys/mman.h>
 #endif
@@ -22,6 +23,9 @@ namespace {
 
 constexpr double kLog2E = 1.4426950408889634;
 constexpr int64_t kChunk = 256;  // Gaussians whose camera gradients are added up together
+constexpr int64_t kBandTiles = 16;  // tiles of a band for each thread, at least
+constexpr uint32_t kShare = 64;     // neighbouring Gaussians whose records one thread adds up
+constexpr int kMoments = 9;         // numbers in Moments
 
 int tile_columns(const Camera& cam) { return (cam.width + kTile - 1) / kTile; }
 int tile_rows(const Camera& cam) { return (cam.height + kTile - 1) / kTile; }
@@ -108,126 +112,102 @@ template <class Real, class F> void with_layout(int channels, F&& f) {
     }
 }
 
-// Takes the colours of the pixels of a tile to the image.
-template <class Real>
+// Takes the colours of the pixels of a tile to the image; CV as for with_layout.
+template <class Real, int CV>
 void store_colors(const Workspace<Real>& w, const Camera& cam, const TileFrame& tile,
                   const Real* background, Real* image) {
-    const std::vector<Real> black(w.channels, Real(0));
+    const int channels = w.channels;
+    const std::vector<Real> black(channels, Real(0));
     const Real* behind = background ? background : black.data();
+    VecOf<Real> color[std::max(CV, 1)], backdrop[std::max(CV, 1)];
+    if constexpr (CV > 0) load_color<Real, CV>(behind, channels, backdrop);
     for (int y = 0; y < tile.height; ++y)
         for (int x = 0; x < tile.width; ++x) {
-            const int at = Block<Real>::place(x, y), channels = w.channels;
+            const int at = Block<Real>::place(x, y);
             const Real through = Real(1) - w.alpha[at];
-            Real* to = image + (int64_t(tile.top + y) * cam.width + tile.left + x) * channels;
-            const Real* from = w.pixels.data() + (w.planar() ? at : at * w.stride);
-            if (w.planar())
-                for (int c = 0; c < channels; ++c) to[c] = from[c * kPixels] + through * behind[c];
-            else
-                for (int c = 0; c < channels; ++c) to[c] = from[c] + through * behind[c];
+            Real* to = image + tile.pixel(cam, x, y) * channels;
+            const Real* from = w.pixels.data() + (CV < 0 ? at : at * w.stride);
+            if constexpr (CV > 0) {
+                for (int k = 0; k < CV; ++k)
+                    color[k] = load(from + k * Lanes<Real>::N) + through * backdrop[k];
+                store_color<Real, CV>(to, channels, color);
+            } else {
+                for (int c = 0; c < channels; ++c)
+                    to[c] = from[CV < 0 ? c * kPixels : c] + through * behind[c];
+            }
         }
 }
 
 // Takes the gradient of the colours of the pixels of a tile to the workspace. The background is
 // seen through 1 - alpha, so its part joins the gradient of alpha.
-template <class Real>
+template <class Real, int CV>
 void load_color_gradients(Workspace<Real>& w, const Camera& cam, const TileFrame& tile,
                           const Real* background, const Real* d_image) {
+    const int channels = w.channels;
+    VecOf<Real> color[std::max(CV, 1)];
     for (int y = 0; y < tile.height; ++y)
         for (int x = 0; x < tile.width; ++x) {
-            const int at = Block<Real>::place(x, y), channels = w.channels;
-            const Real* from =
-                d_image + (int64_t(tile.top + y) * cam.width + tile.left + x) * channels;
-            Real* to = w.pixels.data() + (w.planar() ? at : at * w.stride);
-            if (w.planar())
-                for (int c = 0; c < channels; ++c) to[c * kPixels] = from[c];
-            else
-                std::copy_n(from, channels, to);
+            const int at = Block<Real>::place(x, y);
+            const Real* from = d_image + tile.pixel(cam, x, y) * channels;
+            Real* to = w.pixels.data() + (CV < 0 ? at : at * w.stride);
+            if constexpr (CV > 0) {
+                load_color<Real, CV>(from, channels, color);
+                for (int k = 0; k < CV; ++k) store(to + k * Lanes<Real>::N, color[k]);
+            } else {
+                for (int c = 0; c < channels; ++c) to[CV < 0 ? c * kPixels : c] = from[c];
+            }
             if (background)
                 for (int c = 0; c < channels; ++c) w.alpha[at] -= from[c] * background[c];
         }
 }
 
 template <class Real>
-int64_t forward(const Camera& cam, int channels, const Splat<Real>* splats, const Box* boxes,
+void forward(const Camera& cam, int channels, const Splat<Real>* splats, const Box* boxes,
                 const Real* colors, const Real* background, const int64_t* starts, int32_t* ids,
                 int32_t* used, Real* image, Real* weighted, Real* alpha, Real* median) {
     const int64_t tiles = int64_t(tile_columns(cam)) * tile_rows(cam);
-    int64_t records = 0;
-#pragma omp parallel num_threads(cam.threads) reduction(+ : records)
+#pragma omp parallel num_threads(cam.threads)
     {
         Workspace<Real> w(channels, median != nullptr);
 #pragma omp for schedule(dynamic)
         for (int64_t i = 0; i < tiles; ++i) {
             const TileFrame tile = tile_frame(cam, i);
             with_layout<Real>(channels, [&](auto layout) {
-                used[i] = blend_tile<Real, decltype(layout)::value>(
-                    w, tile, splats, boxes, colors, ids + starts[i], starts[i + 1] - starts[i]);
+                constexpr int CV = decltype(layout)::value;
+                used[i] = blend_tile<Real, CV>(w, tile, splats, boxes, colors, ids + starts[i],
+                                               starts[i + 1] - starts[i]);
+                store_colors<Real, CV>(w, cam, tile, background, image);
             });
-            records += used[i];
-            for (int y = 0; y < tile.height; ++y) {
-                const int64_t row = int64_t(tile.top + y) * cam.width + tile.left;
+            for (int y = 0; y < tile.height; ++y)
                 for (int x = 0; x < tile.width; ++x) {
                     const int at = Block<Real>::place(x, y);
-                    alpha[row + x] = w.alpha[at], weighted[row + x] = w.weighted[at];
-                    if (median) median[row + x] = w.median[at];
+                    const int64_t to = tile.pixel(cam, x, y);
+                    alpha[to] = w.alpha[at], weighted[to] = w.weighted[at];
+                    if (median) median[to] = w.median[at];
                 }
-            }
-            store_colors(w, cam, tile, background, image);
         }
     }
-    return records;
 }
 
 // Gradients of the pixels of one tile, in the layout of the workspace.
-template <class Real>
+template <class Real, int CV>
 void load_gradients(Workspace<Real>& w, const Camera& cam, const TileFrame& tile,
                     const Real* background, const Real* d_image, const Real* d_weighted,
                     const Real* d_alpha, const Real* d_median) {
-    w.pixels.clear();
+    if (!d_image) w.pixels.clear();
     std::fill(w.alpha, w.alpha + kPixels, Real(0));
     std::fill(w.weighted, w.weighted + kPixels, Real(0));
     std::fill(w.median, w.median + kPixels, Real(0));
     for (int y = 0; y < tile.height; ++y)
         for (int x = 0; x < tile.width; ++x) {
-            const int64_t from = int64_t(tile.top + y) * cam.width + tile.left + x;
+            const int64_t from = tile.pixel(cam, x, y);
             const int at = Block<Real>::place(x, y);
             if (d_alpha) w.alpha[at] = d_alpha[from];
             if (d_weighted) w.weighted[at] = d_weighted[from];
             if (d_median) w.median[at] = d_median[from];
         }
-    if (d_image) load_color_gradients(w, cam, tile, background, d_image);
+    if (d_image) load_color_gradients<Real, CV>(w, cam, tile, background, d_image);
 }
-
-// For each Gaussian the numbers of its records, by ascending tile.
-struct RecordIndex {
-    std::vector<int64_t> first;  // n + 1
-    std::vector<int32_t> records;
-
-    RecordIndex(int64_t n, int64_t tiles, const int64_t* starts, const int32_t* ids,
-                const int32_t* used)
-        : first(n + 1, 0) {
-        for (int64_t t = 0; t < tiles; ++t)
-            for (int32_t k = 0; k < used[t]; ++k) ++first[ids[starts[t] + k] + 1];
-        for (int64_t i = 0; i < n; ++i) first[i + 1] += first[i];
-        records.resize(first[n]);
-        std::vector<int64_t> cursor(first.begin(), first.end() - 1);
-        int32_t record = 0;
-        for (int64_t t = 0; t < tiles; ++t)
-            for (int32_t k = 0; k < used[t]; ++k) records[cursor[ids[starts[t] + k]]++] = record++;
-    }
-
-    // Fetches the records of Gaussian i into the cache: they lie wherever its tiles lie.
-    template <class Real>
-    void prefetch(int64_t i, const Real* color_records, int channels,
-                  const Moments<Real>* moments) const {
-        for (int64_t k = first[i]; k < first[i + 1]; ++k) {
-            __builtin_prefetch(moments + records[k]);
-            const Real* colors = color_records + int64_t(records[k]) * channels;
-            for (int c = 0; c < channels; c += 64 / int(sizeof(Real)))
-                __builtin_prefetch(colors + c);
-        }
-    }
-};
 
 // Gradient by the projected Gaussian from its summed moments.
 template <class Real>
@@ -245,30 +225,53 @@ template <class Real> struct SceneGradient {
     Real *means, *quats, *scales, *opacities, *colors;
 };
 
-// Adds up the records of one Gaussian and takes them through the projection.
+// Sums over the tiles of what the gradient of each Gaussian needs.
+template <class Real> struct Totals {
+    Real* colors;     // (n, channels)
+    double* moments;  // (n, kMoments)
+    std::vector<uint8_t> reached;  // whether anything was added
+
+    template <int CV>
+    void add(int64_t i, const Real* color, int channels, const Moments<Real>& record) {
+        Real* const to = colors + i * channels;
+        double* const total = moments + i * kMoments;
+        const Real* const values = &record.s;
+        const bool first = !reached[i];
+        reached[i] = 1;
+        if (first) std::fill(total, total + kMoments, 0.0);
+        for (int k = 0; k < kMoments; ++k) total[k] += values[k];
+        if constexpr (CV > 0) {
+            VecOf<Real> a[CV], b[CV];
+            load_color<Real, CV>(color, channels, a);
+            if (!first) {
+                load_color<Real, CV>(to, channels, b);
+                for (int k = 0; k < CV; ++k) a[k] += b[k];
+            }
+            store_color<Real, CV>(to, channels, a);
+        } else {
+            for (int c = 0; c < channels; ++c) to[c] = first ? color[c] : to[c] + color[c];
+        }
+    }
+};
+
+// Takes the sums of one Gaussian through the projection.
 template <class Real>
 void finish_gaussian(const View& view, const Scene<Real>& scene, int64_t i,
-                     const RecordIndex& index, const Real* color_records,
-                     const Moments<Real>* moments, const SceneGradient<Real>& out,
+                     const Totals<Real>& totals, const SceneGradient<Real>& out,
                      CameraGradient& d_cam) {
     const int channels = scene.channels;
-    Real* color = out.colors + i * channels;
-    std::fill(color, color + channels, Real(0));
-    double m[9] = {}, mean[3] = {}, quat[4] = {}, scale[3] = {}, opacity = 0;
-    for (int64_t k = index.first[i]; k < index.first[i + 1]; ++k) {
-        const Real* record = color_records + int64_t(index.records[k]) * channels;
-        for (int c = 0; c < channels; ++c) color[c] += record[c];
-        const Real* values = &moments[index.records[k]].s;
-        for (int j = 0; j < 9; ++j) m[j] += values[j];
-    }
-    if (index.first[i] < index.first[i + 1]) {
+    Real* const color = out.colors + i * channels;
+    double mean[3] = {}, quat[4] = {}, scale[3] = {}, opacity = 0;
+    if (totals.reached[i]) {
         Projected g;
         project_one(view, scene.means + 3 * i, scene.quats + 4 * i, scene.scales + 3 * i,
                     scene.opacities[i], g);
-        SplatGradient d = splat_gradient<Real>(g, m);
+        SplatGradient d = splat_gradient<Real>(g, totals.moments + i * kMoments);
         if (view.cam.normals) std::copy_n(color + channels - 3, 3, d.normal);
         project_gradient(view, scene.means + 3 * i, scene.scales + 3 * i, scene.opacities[i], g, d,
                          mean, quat, scale, &opacity, d_cam);
+    } else {
+        std::fill(color, color + channels, Real(0));
     }
     std::copy_n(mean, 3, out.means + 3 * i);
     std::copy_n(quat, 4, out.quats + 4 * i);
@@ -276,42 +279,80 @@ void finish_gaussian(const View& view, const Scene<Real>& scene, int64_t i,
     out.opacities[i] = Real(opacity);
 }
 
+// Tiles [begin, end) whose records are written, then added up, before the next are begun: few
+// enough for the cache, enough for all threads.
+struct Bands {
+    int64_t tiles, step;
+    std::vector<int64_t> first;  // record of each tile
+
+    Bands(const Camera& cam, const int32_t* used)
+        : tiles(int64_t(tile_columns(cam)) * tile_rows(cam)),
+          step(std::max<int64_t>(tile_columns(cam), kBandTiles * cam.threads)),
+          first(tiles + 1, 0) {
+        for (int64_t i = 0; i < tiles; ++i) first[i + 1] = first[i] + used[i];
+    }
+    int64_t end(int64_t begin) const { return std::min(begin + step, tiles); }
+    int64_t most_records() const {
+        int64_t most = 0;
+        for (int64_t i = 0; i < tiles; i += step) most = std::max(most, first[end(i)] - first[i]);
+        return most;
+    }
+};
+
 template <class Real>
 void backward(const Camera& cam, const Scene<Real>& scene, const Splat<Real>* splats,
               const Box* boxes, const Real* colors, const Real* background, const int64_t* starts,
               const int32_t* ids, const int32_t* used, const Real* d_image,
               const Real* d_weighted, const Real* d_alpha, const Real* d_median,
-              Real* color_records,
-              Moments<Real>* moments, const SceneGradient<Real>& out, CameraGradient* d_cam) {
-    const int64_t tiles = int64_t(tile_columns(cam)) * tile_rows(cam), n = scene.n;
-    std::vector<int64_t> first_record(tiles + 1, 0);
-    for (int64_t i = 0; i < tiles; ++i) first_record[i + 1] = first_record[i] + used[i];
-#pragma omp parallel num_threads(cam.threads)
+              double* moments, const SceneGradient<Real>& out, CameraGradient* d_cam) {
+    const int64_t n = scene.n;
+    const int channels = scene.channels;
+    const uint32_t threads = cam.threads;
+    const Bands bands(cam, used);
+    Lines<Real> color_records(bands.most_records() * channels);
+    std::vector<Moments<Real>> records(bands.most_records());
+    Totals<Real> totals{out.colors, moments, std::vector<uint8_t>(n, 0)};
+#pragma omp parallel num_threads(threads)
     {
-        Workspace<Real> w(scene.channels, d_median != nullptr);
+        Workspace<Real> w(channels, d_median != nullptr);
+        for (int64_t begin = 0; begin < bands.tiles; begin += bands.step) {
+            const int64_t end = bands.end(begin), *first = bands.first.data();
 #pragma omp for schedule(dynamic)
-        for (int64_t i = 0; i < tiles; ++i) {
-            if (!used[i]) continue;
-            const TileFrame tile = tile_frame(cam, i);
-            load_gradients(w, cam, tile, background, d_image, d_weighted, d_alpha, d_median);
-            with_layout<Real>(scene.channels, [&](auto layout) {
-                blend_tile_gradient<Real, decltype(layout)::value>(
-                    w, tile, splats, boxes, colors, ids + starts[i], used[i],
-                    color_records + first_record[i] * scene.channels, moments + first_record[i]);
-            });
+            for (int64_t i = begin; i < end; ++i) {
+                if (!used[i]) continue;
+                const TileFrame tile = tile_frame(cam, i);
+                const int64_t at = first[i] - first[begin];
+                with_layout<Real>(channels, [&](auto layout) {
+                    constexpr int CV = decltype(layout)::value;
+                    load_gradients<Real, CV>(w, cam, tile, background, d_image, d_weighted, d_alpha,
+                                             d_median);
+                    blend_tile_gradient<Real, CV>(
+                        w, tile, splats, boxes, colors, ids + starts[i], used[i],
+                        color_records.data() + at * channels, records.data() + at);
+                });
+            }
+            // Each Gaussian's by one thread and in the order of the tiles.
+#pragma omp for schedule(static, 1)
+            for (uint32_t part = 0; part < threads; ++part)
+                with_layout<Real>(channels, [&](auto layout) {
+                    int64_t at = 0;
+                    for (int64_t i = begin; i < end; ++i)
+                        for (int32_t k = 0; k < used[i]; ++k, ++at)
+                            if (const uint32_t id = ids[starts[i] + k];
+                                id / kShare % threads == part)
+                                totals.template add<decltype(layout)::value>(
+                                    id, color_records.data() + at * channels, channels,
+                                    records[at]);
+                });
         }
     }
-    const RecordIndex index(n, tiles, starts, ids, used);
     const View view(cam);
     const int64_t chunks = (n + kChunk - 1) / kChunk;
     std::vector<CameraGradient> partial(chunks, CameraGradient{});
-#pragma omp parallel for num_threads(cam.threads) schedule(dynamic)
+#pragma omp parallel for num_threads(threads) schedule(dynamic)
     for (int64_t chunk = 0; chunk < chunks; ++chunk)
-        for (int64_t i = chunk * kChunk; i < std::min(n, (chunk + 1) * kChunk); ++i) {
-            index.prefetch(std::min(i + kAhead, n - 1), color_records, scene.channels, moments);
-            finish_gaussian(view, scene, i, index, color_records, moments, out,
-                            partial[chunk]);
-        }
+        for (int64_t i = chunk * kChunk; i < std::min(n, (chunk + 1) * kChunk); ++i)
+            finish_gaussian(view, scene, i, totals, out, partial[chunk]);
     double* total = &d_cam->fx;
     for (const CameraGradient& part : partial)
         for (int k = 0; k < 16; ++k) total[k] += (&part.fx)[k];
@@ -334,24 +375,23 @@ void backward(const Camera& cam, const Scene<Real>& scene, const Splat<Real>* sp
                                                  int64_t* starts, int32_t* ids) {                 \
         bin_into_tiles<Real>(n, depths, boxes, tile_columns(*cam), tile_rows(*cam), starts, ids); \
     }                                                                                             \
-    EXPRESS50_EXPORT int64_t gaussians_forward_##suffix(                                          \
+    EXPRESS50_EXPORT void gaussians_forward_##suffix(                                             \
         const Camera* cam, int64_t channels, const Splat<Real>* splats, const Box* boxes,         \
         const Real* colors, const Real* background, const int64_t* starts, int32_t* ids,          \
         int32_t* used, Real* image, Real* weighted, Real* alpha, Real* median) {                  \
-        return forward<Real>(*cam, int(channels), splats, boxes, colors, background, starts, ids, \
-                             used, image, weighted, alpha, median);                               \
+        forward<Real>(*cam, int(channels), splats, boxes, colors, background, starts, ids, used,  \
+                      image, weighted, alpha, median);                                            \
     }                                                                                             \
     EXPRESS50_EXPORT void gaussians_backward_##suffix(                                            \
         const Camera* cam, int64_t n, int64_t channels, const Real* means, const Real* quats,     \
         const Real* scales, const Real* opacities, const Splat<Real>* splats, const Box* boxes,   \
         const Real* colors, const Real* background, const int64_t* starts, const int32_t* ids,    \
         const int32_t* used, const Real* d_image, const Real* d_weighted, const Real* d_alpha,    \
-        const Real* d_median, Real* color_records, Moments<Real>* moments, Real* d_means,         \
-        Real* d_quats, Real* d_scales, Real* d_opacities, Real* d_colors,                         \
-        CameraGradient* d_cam) {                                                                  \
+        const Real* d_median, double* moments, Real* d_means, Real* d_quats, Real* d_scales,      \
+        Real* d_opacities, Real* d_colors, CameraGradient* d_cam) {                               \
         backward<Real>(*cam, {n, int(channels), means, quats, scales, opacities}, splats, boxes,  \
                        colors, background, starts, ids, used, d_image, d_weighted, d_alpha,       \
-                       d_median, color_records, moments,                                          \
+                       d_median, moments,                                                         \
                        {d_means, d_quats, d_scales, d_opacities, d_colors}, d_cam);               \
     }
 

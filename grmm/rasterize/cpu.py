@@ -21,7 +21,7 @@ from grmm.rasterize.projection import depth_of_rays, expected_depth
 
 _TILE = 16  # kTile of tiles.h
 _SPLAT = 10  # numbers in Splat of blend.h
-_MOMENTS = 9  # numbers in Moments of blend_gradient.h
+_MOMENTS = 9  # kMoments of gaussians.cpp
 _HUGE = 1 << 22  # bytes from which huge pages pay
 _SUFFIX = {torch.float32: "f32", torch.float64: "f64"}
 _scratch = threading.local()  # grown, never shrunk: fresh pages cost more than the sums in them
@@ -109,9 +109,7 @@ class _Rasterize(torch.autograd.Function):
         image = take("image", (*size, colors.shape[1]), dtype)
         weighted, alpha = take("weighted", size, dtype), take("alpha", size, dtype)
         median = take("median", size, dtype) if options.median_depth else None
-        ctx.records = _call(
-            "forward", dtype, camera, colors.shape[1], *blended, image, weighted, alpha, median
-        )
+        _call("forward", dtype, camera, colors.shape[1], *blended, image, weighted, alpha, median)
         ctx.camera = camera
         ctx.save_for_backward(*geometry, *blended, alpha, K, cam_from_world)
         return image, weighted, alpha, median
@@ -125,11 +123,11 @@ class _Rasterize(torch.autograd.Function):
         n, channels = colors.shape
         grads = [_empty(tuple(x.shape), x.dtype) for x in (*geometry, colors)]
         d_camera = torch.zeros(16, dtype=torch.float64)
-        records = _workspace(ctx.records * (channels + _MOMENTS), colors.dtype)
+        moments = _workspace(n * _MOMENTS, torch.float64)
         _call(
             "backward", colors.dtype, ctx.camera, n, channels, *geometry, *blended,
             *map(_contiguous, d_images),
-            records[_MOMENTS * ctx.records :], records, *grads, d_camera,
+            moments, *grads, d_camera,
         )  # fmt: skip
         d_K = torch.zeros(3, 3, dtype=torch.float64)
         d_K[[0, 1, 0, 1], [0, 1, 2, 2]] = d_camera[:4]
@@ -224,7 +222,7 @@ def _workspace(size: int, dtype: torch.dtype) -> Tensor:
 def _call(name: str, dtype: torch.dtype, camera: _Camera, *arguments: int | Tensor | None) -> int:
     """Call ``gaussians_<name>`` with tensors as pointers and integers as they are declared."""
     function = getattr(native.load(), f"gaussians_{name}_{_SUFFIX[dtype]}")
-    function.restype = None if name in ("bin", "backward") else ctypes.c_int64
+    function.restype = ctypes.c_int64 if name == "project" else None
     converted: list[Any] = [ctypes.byref(camera)]
     for argument in arguments:
         if isinstance(argument, int):
