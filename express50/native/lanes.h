@@ -2,6 +2,7 @@
 // translation unit is compiled for. Wider vectors than the hardware has are several times slower.
 #pragma once
 
+#include <cmath>
 #include <cstdint>
 #include <cstring>
 #include <type_traits>
@@ -234,6 +235,19 @@ template <> inline float sum<float>(VecOf<float> v) {
 #if defined(__AVX512F__)
 template <> inline float sum<float>(VecOf<float> v) { return _mm512_reduce_add_ps((__m512)v); }
 #endif
+
+inline VecOf<double> square_root(VecOf<double> v) {
+#if defined(__AVX512F__)
+    return (VecOf<double>)_mm512_sqrt_pd((__m512d)v);
+#elif defined(__AVX2__)
+    return (VecOf<double>)_mm256_sqrt_pd((__m256d)v);
+#elif defined(__SSE2__)
+    return (VecOf<double>)_mm_sqrt_pd((__m128d)v);
+#else
+    for (int i = 0; i < Lanes<double>::N; ++i) v[i] = std::sqrt(v[i]);
+    return v;
+#endif
+}
 
 // Sums of four vectors, of use together: their halves are added two vectors at a time.
 template <class Real> inline void sum_four(const VecOf<Real>* v, Real* sums) {
