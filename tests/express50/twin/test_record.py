@@ -6,6 +6,7 @@ import tomllib
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter
 
 from express50.capture import read_capture
 from express50.cli import main
@@ -13,6 +14,7 @@ from express50.console import USAGE
 from express50.errors import CaptureError, ConfigError
 from express50.images import read_image
 from express50.twin.config import TwinConfig
+from express50.twin.footage import VideoFootage
 from express50.twin.record import record
 from express50.twin.studio import film_board, film_subject
 from express50.video import iterate_video
@@ -94,6 +96,25 @@ def test_recording_again_keeps_what_is_there_and_adds_the_rest(tiny_config, tmp_
     assert digests(tmp_path / "captures" / "S001") == before
     with pytest.raises(CaptureError, match="seed differ"):
         record(dataclasses.replace(config, seed=9), tmp_path, workers=1)
+
+
+def test_the_same_pictures_make_the_same_video(tmp_path):
+    """Whatever lay in the memory before: encoders' lookahead has told B-frames by it."""
+    rng = np.random.default_rng(0)
+    ground = gaussian_filter(rng.uniform(0, 255, (120, 200, 3)), (3, 3, 0)) * 2
+    pictures = [
+        np.clip(ground[:, k : k + 160] + rng.normal(0, 2, (120, 160, 3)), 0, 255).astype(np.uint8)
+        for k in (0, 0, 1, 3, 6, 9, 11, 12)
+    ]
+    videos = set()
+    for _ in range(30):
+        junk = [rng.integers(0, 255, rng.integers(1000, 200_000), np.uint8) for _ in range(5)]
+        with VideoFootage(tmp_path, 160, 120, 24.0, 10) as footage:
+            for picture in pictures:
+                footage.write(picture)
+        del junk
+        videos.add(hashlib.sha256((tmp_path / "video.mp4").read_bytes()).hexdigest())
+    assert len(videos) == 1
 
 
 def test_command_line_records(tmp_path, capsys):
