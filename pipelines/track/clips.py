@@ -16,6 +16,7 @@ from express50.errors import FormatError, StageError
 from express50.index import Cue
 from express50.publish import write_bytes
 from pipelines.track.config import VERSION, TrackConfig
+from pipelines.track.lids import shut_lids
 from pipelines.track.marks import Eyes
 from pipelines.track.observe import Observation
 from pipelines.track.offsets import split_shape
@@ -146,6 +147,7 @@ def _track(
 ) -> dict[int, Pose]:
     """Poses of the kept frames of a window that show a face."""
     seen = [found for frame in window.frames if (found := observe(cue, frame)) is not None]
+    seen = shut_lids(seen)
     poses = track_window(person, seen, config, eyes, closer) if seen else []
     kept = set(window.frames[window.kept])
     pairs = zip(seen, poses, strict=True)

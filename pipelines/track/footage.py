@@ -11,6 +11,7 @@ from express50.images import read_alpha
 from express50.landmarks.sources import Source, open_source
 from express50.layout import Dataset
 from pipelines.track.config import TrackConfig
+from pipelines.track.lids import shut_lids
 from pipelines.track.observe import Observation, View, agree, make_view
 from pipelines.track.outline import signed_distance
 from pipelines.track.pictures import Moment
@@ -32,7 +33,7 @@ def observe_peaks(
     config: TrackConfig,
     dropped: list[dict[str, str]],
 ) -> list[Observation]:
-    """Detect landmarks at every peak in every camera and reject what does not agree."""
+    """Detect landmarks at every peak in every camera, reject what does not agree, shut eyes."""
     peaks = read_peaks(dataset, subject)
     # The neutral frame shows which cameras see the face; the others need not look again.
     order = sorted(peaks, key=lambda name: (name != config.neutral, list(peaks).index(name)))
@@ -61,7 +62,7 @@ def observe_peaks(
             dropped.append({"what": expression, "why": f"{count} landmarks agree between cameras"})
             continue
         found[expression] = observation
-    return [found[name] for name in peaks if name in found]
+    return shut_lids([found[name] for name in peaks if name in found])
 
 
 def _views(

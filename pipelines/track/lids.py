@@ -1,0 +1,79 @@
+"""Shut eyes: the lids meet where cameras find no iris that they find at other times.
+
+Whether there is an iris is a matter of contrast, and found or not in some twenty pixels. How far
+apart the lids are is a matter of one or two pixels of a landmark network's crop, which puts shut
+lids nearly as far apart as open ones. Only shut eyes are told; half shut ones stay as seen.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from express50.landmarks.iris import EYES
+from pipelines.track.observe import Observation, View, agree
+
+# A camera tells of an eye if it finds the iris at more than this share of the other times, and the
+# eye is now at least this much of its usual width there: it has not turned away.
+USUAL, WIDE = 0.5, 0.75
+LEAST_CAMERAS = 2
+# As many irises as this share of the telling cameras are found by chance, in lashes and folds.
+CHANCE = 0.25
+# What is left of the gap between the lids.
+GAP = 0.1
+
+
+def shut_lids(observations: list[Observation]) -> list[Observation]:
+    """One person's observations with the upper lids of shut eyes brought down to the lower ones."""
+    shut = np.zeros((len(observations), 2), dtype=bool)
+    for side in range(2):
+        seen = [_irises(observation, side) for observation in observations]
+        shut[:, side] = [_is_shut(now, seen[:k] + seen[k + 1 :]) for k, now in enumerate(seen)]
+    return [
+        _shut(observation, sides) if sides.any() else observation
+        for observation, sides in zip(observations, shut, strict=True)
+    ]
+
+
+def _irises(observation: Observation, side: int) -> dict[str, tuple[bool, float]]:
+    """By camera whether the iris of one eye was found, and the eye's width in pixels."""
+    first, last = EYES[side][:2]
+    return {
+        view.camera_id: (
+            bool(np.isfinite(view.irises.sigma[side])),
+            float(np.linalg.norm(view.points[last] - view.points[first])),
+        )
+        for view in observation.views
+        if view.irises is not None
+    }
+
+
+def _is_shut(
+    now: dict[str, tuple[bool, float]], others: list[dict[str, tuple[bool, float]]]
+) -> bool:
+    if not now:
+        return False
+    telling = 0
+    for camera, (_, width) in now.items():
+        then = [other[camera] for other in others if camera in other]
+        usual = [wide for found, wide in then if found]
+        if len(usual) > USUAL * len(then) and width > WIDE * np.median(usual):
+            telling += 1
+    # Any camera counts here: a head that turned shows its irises to others.
+    finding = sum(found for found, _ in now.values())
+    return telling >= min(LEAST_CAMERAS, len(now)) and finding <= CHANCE * telling
+
+
+def _shut(observation: Observation, sides: np.ndarray) -> Observation:
+    views = [_with_lids(view, sides) for view in observation.views]
+    found, _ = agree(observation.expression, observation.frame, views)
+    return replace(found, refused=observation.refused + found.refused)
+
+
+def _with_lids(view: View, sides: np.ndarray) -> View:
+    points = view.points.copy()
+    for side in np.flatnonzero(sides):
+        upper, lower = (list(lid) for lid in EYES[side][2:])
+        points[upper] = points[lower] + GAP * (points[upper] - points[lower])
+    return replace(view, points=points)

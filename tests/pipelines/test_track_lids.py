@@ -1,0 +1,110 @@
+"""Shut eyes are told by irises that cameras find at other times."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from express50.cameras import project
+from express50.landmarks.iris import EYES, Irises
+from pipelines.track.lids import shut_lids
+from pipelines.track.observe import Observation, View, agree
+from tests.pipelines.test_track import make_camera, make_scene
+
+TIMES = ("neutral", "smile", "wink_left", "pucker")
+LEFT, RIGHT = 0, 1
+RIG = [make_camera(angle) for angle in np.linspace(-0.7, 0.7, 6)]
+
+
+def face() -> np.ndarray:
+    """Landmarks (68, 3) of a head before the rig, the lids a centimetre apart."""
+    marks = make_scene().marks.copy()
+    for side, (first, last, upper, lower) in enumerate(EYES):
+        middle = marks[27] + np.array([0.03 if side == LEFT else -0.03, 0.0, 0.0])
+        marks[first], marks[last] = middle - [0.015, 0, 0], middle + [0.015, 0, 0]
+        for rank, x in enumerate((-0.005, 0.005)):
+            marks[upper[rank]] = middle + [x, 0.005, 0]
+            marks[lower[rank]] = middle + [x, -0.005, 0]
+    return marks
+
+
+def observe(found: np.ndarray, time: str, marks: np.ndarray | None = None) -> Observation:
+    """`found` (cameras, 2): whose irises are found; the first cameras of the rig."""
+    marks = face() if marks is None else marks
+    views = []
+    for camera, sides in zip(RIG, found, strict=False):
+        sigma = np.where(sides, 1.0, np.inf)
+        irises = Irises(np.zeros((2, 2)), sigma, np.where(sides, 0.5, 0.0))
+        pixels = project(camera, marks)[0]
+        views.append(View(camera.id, camera, pixels, np.ones(68), 0.9, irises))
+    return agree(time, TIMES.index(time), views)[0]
+
+
+def gap(observation: Observation, side: int) -> float:
+    """Between the lids of an eye in the first camera, pixels."""
+    upper, lower = (list(lid) for lid in EYES[side][2:])
+    points = observation.views[0].points
+    return float(np.linalg.norm(points[upper] - points[lower], axis=1).mean())
+
+
+def seen(count: int) -> dict[str, np.ndarray]:
+    return {time: np.ones((count, 2), dtype=bool) for time in TIMES}
+
+
+@pytest.mark.parametrize("count", [1, len(RIG)])
+def test_an_eye_without_its_iris_is_shut(count):
+    found = seen(count)
+    found["wink_left"][:, LEFT] = False
+    before = [observe(table, time) for time, table in found.items()]
+    after = shut_lids(before)
+    wink = TIMES.index("wink_left")
+    assert gap(after[wink], LEFT) < 0.2 * gap(before[wink], LEFT)
+    assert gap(after[wink], RIGHT) == gap(before[wink], RIGHT)
+    assert all(a is b for k, (a, b) in enumerate(zip(after, before, strict=True)) if k != wink)
+    if count > 1:
+        upper, lower = (list(lid) for lid in EYES[LEFT][2:])
+        apart = np.linalg.norm(after[wink].points[upper] - after[wink].points[lower], axis=1)
+        assert apart.max() < 0.002
+
+
+def test_one_iris_by_chance_opens_no_eye():
+    found = seen(len(RIG))
+    found["wink_left"][1:, LEFT] = False
+    observations = [observe(table, time) for time, table in found.items()]
+    assert gap(shut_lids(observations)[2], LEFT) < 0.2 * gap(observations[2], LEFT)
+
+
+def test_half_of_the_irises_are_an_open_eye():
+    found = seen(len(RIG))
+    found["wink_left"][::2, LEFT] = False
+    observations = [observe(table, time) for time, table in found.items()]
+    assert all(a is b for a, b in zip(shut_lids(observations), observations, strict=True))
+
+
+def test_cameras_that_never_find_an_iris_say_nothing():
+    found = {time: np.zeros((len(RIG), 2), dtype=bool) for time in TIMES}
+    observations = [observe(table, time) for time, table in found.items()]
+    assert all(a is b for a, b in zip(shut_lids(observations), observations, strict=True))
+
+
+def test_an_eye_that_turned_away_is_not_shut():
+    found = seen(len(RIG))
+    found["wink_left"][:, LEFT] = False
+    observations = [observe(table, time) for time, table in found.items()]
+    narrow = []
+    for view in observations[2].views:
+        points = view.points.copy()
+        first, last = EYES[LEFT][:2]
+        points[last] = points[first] + 0.5 * (points[last] - points[first])
+        narrow.append(replace(view, points=points))
+    observations[2] = replace(observations[2], views=tuple(narrow))
+    assert shut_lids(observations)[2] is observations[2]
+
+
+def test_without_irises_and_without_observations():
+    plain = [observe(table, time) for time, table in seen(2).items()]
+    plain = [replace(o, views=tuple(replace(v, irises=None) for v in o.views)) for o in plain]
+    assert all(a is b for a, b in zip(shut_lids(plain), plain, strict=True))
+    assert shut_lids([]) == []
