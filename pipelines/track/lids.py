@@ -18,8 +18,9 @@ from pipelines.track.observe import Observation, View, agree
 # eye is now at least this much of its usual width there: it has not turned away.
 USUAL, WIDE = 0.5, 0.75
 LEAST_CAMERAS = 2
-# As many irises as this share of the telling cameras are found by chance, in lashes and folds.
-CHANCE = 0.25
+# Lashes and folds are taken for irises now and then, with little confidence. Its squares over the
+# cameras are at most this share of what they are at other times if the eye is shut.
+CHANCE = 0.3
 # What is left of the gap between the lids.
 GAP = 0.1
 
@@ -36,12 +37,12 @@ def shut_lids(observations: list[Observation]) -> list[Observation]:
     ]
 
 
-def _irises(observation: Observation, side: int) -> dict[str, tuple[bool, float]]:
-    """By camera whether the iris of one eye was found, and the eye's width in pixels."""
+def _irises(observation: Observation, side: int) -> dict[str, tuple[float, float]]:
+    """By camera the confidence of one eye's iris, 0 where none was found, and its width, pixels."""
     first, last = EYES[side][:2]
     return {
         view.camera_id: (
-            bool(np.isfinite(view.irises.sigma[side])),
+            float(view.irises.confidence[side]),
             float(np.linalg.norm(view.points[last] - view.points[first])),
         )
         for view in observation.views
@@ -50,19 +51,18 @@ def _irises(observation: Observation, side: int) -> dict[str, tuple[bool, float]
 
 
 def _is_shut(
-    now: dict[str, tuple[bool, float]], others: list[dict[str, tuple[bool, float]]]
+    now: dict[str, tuple[float, float]], others: list[dict[str, tuple[float, float]]]
 ) -> bool:
-    if not now:
-        return False
-    telling = 0
+    usual = []
     for camera, (_, width) in now.items():
         then = [other[camera] for other in others if camera in other]
-        usual = [wide for found, wide in then if found]
-        if len(usual) > USUAL * len(then) and width > WIDE * np.median(usual):
-            telling += 1
+        found = np.array([pair for pair in then if pair[0] > 0]).reshape(-1, 2)
+        if len(found) > USUAL * len(then) and width > WIDE * np.median(found[:, 1]):
+            usual.append(np.median(found[:, 0]))
+    if len(usual) < max(1, min(LEAST_CAMERAS, len(now))):
+        return False
     # Any camera counts here: a head that turned shows its irises to others.
-    finding = sum(found for found, _ in now.values())
-    return telling >= min(LEAST_CAMERAS, len(now)) and finding <= CHANCE * telling
+    return sum(sure**2 for sure, _ in now.values()) <= CHANCE * np.square(usual).sum()
 
 
 def _shut(observation: Observation, sides: np.ndarray) -> Observation:
