@@ -7,12 +7,13 @@ lids nearly as far apart as open ones. Only shut eyes are told; half shut ones s
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from express50.landmarks.iris import EYES
 from pipelines.track.observe import Observation, View, agree
+from pipelines.track.state import SurfaceTerm
 
 # A camera tells of an eye if it finds the iris at more than this share of the other times, and the
 # eye is now at least this much of its usual width there: it has not turned away.
@@ -23,6 +24,43 @@ LEAST_CAMERAS = 2
 CHANCE = 0.3
 # What is left of the gap between the lids.
 GAP = 0.1
+# Standard deviation of the way between the landmarks of shut lids, which is nothing.
+TOUCHING_M = 0.0005
+
+
+@dataclass(frozen=True)
+class ShutLids:
+    """A term of the fit: these eyes' lids touch, wherever that is."""
+
+    shut: tuple[int, ...]
+
+    @property
+    def rows(self) -> np.ndarray:
+        """A sample (S, 3) is made of two landmarks, which are a fit's first points."""
+        pairs = [pair for side in self.shut for pair in zip(*EYES[side][2:], strict=True)]
+        return np.array([(upper, lower, lower) for upper, lower in pairs])
+
+    @property
+    def bary(self) -> np.ndarray:
+        """Shares (S, 3) that sum to nothing: it is the way from the lower one to the upper."""
+        return np.tile([1.0, -1.0, 0.0], (len(self.rows), 1))
+
+    def _way(self, positions: np.ndarray) -> np.ndarray:
+        return (positions[self.rows[:, 0]] - positions[self.rows[:, 1]]) / TOUCHING_M
+
+    def cost(self, positions: np.ndarray) -> float:
+        """Half the sum of squared standard deviations."""
+        return 0.5 * float((self._way(positions) ** 2).sum())
+
+    def normal(self, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Gauss-Newton matrix (S, 3, 3) and gradient (S, 3) by the ways, metres."""
+        way = self._way(positions)
+        return np.tile(np.eye(3) / TOUCHING_M**2, (len(way), 1, 1)), way / TOUCHING_M
+
+
+def lid_terms(observation: Observation) -> tuple[SurfaceTerm, ...]:
+    """What a fit is to know of the observation's shut eyes, if there are any."""
+    return (ShutLids(observation.shut),) if observation.shut else ()
 
 
 def shut_lids(observations: list[Observation]) -> list[Observation]:
@@ -68,7 +106,8 @@ def _is_shut(
 def _shut(observation: Observation, sides: np.ndarray) -> Observation:
     views = [_with_lids(view, sides) for view in observation.views]
     found, _ = agree(observation.expression, observation.frame, views)
-    return replace(found, refused=observation.refused + found.refused)
+    refused = observation.refused + found.refused
+    return replace(found, refused=refused, shut=tuple(np.flatnonzero(sides).tolist()))
 
 
 def _with_lids(view: View, sides: np.ndarray) -> View:

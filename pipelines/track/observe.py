@@ -60,6 +60,7 @@ class Observation:
         points: (68, 3) triangulated, metres in the world; NaN where under two views agree.
         covariance: (68, 3, 3) of the points, square metres; NaN with them.
         refused: views left out, as they disagree with the rest.
+        shut: eyes that are known to be, as indices of `iris.EYES`.
     """
 
     expression: str
@@ -69,6 +70,7 @@ class Observation:
     points: np.ndarray
     covariance: np.ndarray
     refused: tuple[View, ...] = ()
+    shut: tuple[int, ...] = ()
 
 
 class Terms(Protocol):

@@ -18,6 +18,7 @@ import torch
 
 from pipelines.track.config import TrackConfig
 from pipelines.track.fit import fit, landmark_sigma
+from pipelines.track.lids import lid_terms
 from pipelines.track.marks import Eyes, with_marks
 from pipelines.track.observe import Observation, facing
 from pipelines.track.sparse_head import POSE_SIZE, Basis, Points
@@ -145,7 +146,7 @@ def _target(
     sigma = landmark_sigma(observation, config)
     seen = [facing(view, pose.rotation, pose.own[-3:]) for view in observation.views]
     sigma[np.array(seen) < MIN_FACING] = np.inf
-    return Target(observation, sigma, False, vertices=spread)
+    return Target(observation, sigma, False, terms=lid_terms(observation), vertices=spread)
 
 
 def _marked(basis: Basis, target: Target, pose: Pose, eyes: Eyes | None) -> Target:

@@ -30,6 +30,7 @@ from pipelines.track.footage import (
     peak_moments,
 )
 from pipelines.track.frame import held_to_pictures
+from pipelines.track.lids import lid_terms
 from pipelines.track.marks import Eyes, measure_eyes
 from pipelines.track.observe import Observation, facing
 from pipelines.track.offsets import with_modes
@@ -189,7 +190,7 @@ def _targets(
         behind = [facing(view, *pose_found) < MIN_FACING for view in observation.views]
         sigma[np.array(behind)] = np.inf
         neutral = observation.expression == config.neutral
-        targets.append(Target(observation, sigma, neutral))
+        targets.append(Target(observation, sigma, neutral, terms=lid_terms(observation)))
     return targets, poses
 
 

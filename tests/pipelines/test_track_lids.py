@@ -6,11 +6,22 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from express50.cameras import project
+from express50.head.load import load_head
+from express50.head.model import landmarks, pose
 from express50.landmarks.iris import EYES, Irises
-from pipelines.track.lids import shut_lids
+from express50.transforms import axis_angle_to_matrix
+from pipelines.track.config import TrackConfig
+from pipelines.track.fit import fit, landmark_sigma
+from pipelines.track.lids import ShutLids, lid_terms, shut_lids
 from pipelines.track.observe import Observation, View, agree
+from pipelines.track.sparse_head import make_basis
+from pipelines.track.start import initial_pose
+from pipelines.track.state import Target, start_state
 from tests.pipelines.test_track import make_camera, make_scene
 
 TIMES = ("neutral", "smile", "wink_left", "pucker")
@@ -108,3 +119,50 @@ def test_without_irises_and_without_observations():
     plain = [replace(o, views=tuple(replace(v, irises=None) for v in o.views)) for o in plain]
     assert all(a is b for a, b in zip(shut_lids(plain), plain, strict=True))
     assert shut_lids([]) == []
+
+
+@settings(deadline=None, max_examples=20)
+@given(seed=st.integers(0, 1000), shut=st.sampled_from([(0,), (1,), (0, 1)]))
+def test_the_lids_term_has_the_slope_it_says(seed, shut):
+    term, rng = ShutLids(shut), np.random.default_rng(seed)
+    positions = rng.normal(size=(80, 3)) * 0.01
+    matrix, gradient = term.normal(positions)
+    towards = np.zeros_like(positions)
+    sample, axis = rng.integers(len(term.rows)), rng.integers(3)
+    towards[term.rows[sample, 0], axis] = 1e-7
+    slope = (term.cost(positions + towards) - term.cost(positions - towards)) / 2e-7
+    assert slope == pytest.approx(gradient[sample, axis], rel=1e-5, abs=1e-3)
+    bend = term.normal(positions + towards)[1] - gradient
+    assert bend[sample, axis] == pytest.approx(1e-7 * matrix[sample, axis, axis], rel=1e-4)
+    turn = axis_angle_to_matrix(rng.normal(size=3))
+    moved = positions @ turn.T + 1000.0
+    assert term.cost(moved) == pytest.approx(term.cost(positions), rel=1e-6), "the world's frame"
+
+
+def test_eyes_that_are_known_to_be_shut_shut_the_mesh():
+    """The detector sees the lids of a wink nearly as far apart as open ones; the fit shuts them."""
+    head = load_head("procedural")
+    wink = torch.zeros(1, len(head.expression_names))
+    wink[0, head.expression_names.index("eyeBlink_L")] = 0.15
+    still = torch.zeros(1, 1)
+    marks = landmarks(head, pose(head, still, wink))[0].double().numpy()
+    marks = marks - marks.mean(0)
+    found = seen(len(RIG)) | {"wink_left": np.tile([False, True], (len(RIG), 1))}
+    observation = shut_lids([observe(table, time, marks) for time, table in found.items()])[2]
+    assert observation.shut == (LEFT,) and lid_terms(observation) == (ShutLids((LEFT,)),)
+    basis, config = make_basis(head), TrackConfig()
+    template = landmarks(head, head.template[None])[0].double().numpy()
+    start = start_state(basis, [initial_pose(observation, template)])
+    sigma = landmark_sigma(observation, config)
+    fitted = {}
+    for known in (True, False):
+        terms = lid_terms(observation) if known else ()
+        state, _ = fit(basis, [Target(observation, sigma, False, terms=terms)], start, config, 20)
+        blink = state.poses[0].own[[head.expression_names.index(f"eyeBlink_{s}") for s in "LR"]]
+        fitted[known] = blink
+    assert fitted[True][LEFT] > 0.85 > fitted[False][LEFT]
+    assert abs(fitted[True][RIGHT]) < 0.1
+
+
+def test_open_eyes_add_no_term():
+    assert lid_terms(observe(np.ones((3, 2), dtype=bool), "neutral")) == ()
