@@ -29,7 +29,7 @@ STAGES = ("ingest", "calibrate", "align", "matte", "track", "depth", "regions", 
 # one-sided; the fourth subject is never trained on.
 EXPRESSIONS = ("neutral", "smile", "jaw_open", "pucker", "brow_raise", "wink_left")
 TWIN = {"subjects": 4, "cameras": 8, "width": 320, "height": 320, "frames-per-expression": 6}
-TRAIN_SECONDS = 220
+TRAIN_SECONDS = 120
 FIT_SECONDS = 45
 
 
@@ -99,7 +99,7 @@ def record_twin(
     shutil.rmtree(root, ignore_errors=True)
     flags = [f"--{key}={value}" for key, value in twin.items()]
     flags += [f"--expressions={','.join(expressions)}", f"--workers={workers}", "--seed=0"]
-    step = run_step("record", "express50.cli", "twin", "record", str(root), *flags)
+    step = run_step("record", "express50", "twin", "record", str(root), *flags)
     stamp.write_text(settings)
     return [step]
 
@@ -122,7 +122,7 @@ def run_stages(
         if stage == "pack":
             extra += ["--set", f'pack.test_subjects=["{unseen}"]']
         steps.append(
-            run_step(stage, "express50.cli", stage, str(dataset), *extra, *common, fails=False)
+            run_step(stage, "express50", stage, str(dataset), *extra, *common, fails=False)
         )
     return steps
 
@@ -156,15 +156,15 @@ def run_grmm(dataset: Path, unseen: str, seconds: tuple[int, int]) -> list[Step]
     shown = "neutral" if "neutral" in expression else sorted(expression)[0]
     return [
         run_step(
-            "train", "grmm.cli", "train", str(shards), str(out / "train"), "--preset=demo",
+            "train", "grmm", "train", str(shards), str(out / "train"), "--preset=demo",
             f"--seconds={seconds[0]}", f"--holdout-cameras={held_out}",
         ),
         run_step(
-            "fit", "grmm.cli", "fit", checkpoint, str(shards), str(out / "fit"),
+            "fit", "grmm", "fit", checkpoint, str(shards), str(out / "fit"),
             f"--subject={unseen}", f"--expression={shown}", f"--cameras={','.join(given)}",
             f"--seconds={seconds[1]}",
         ),
-        run_step("render", "grmm.cli", "render", checkpoint, str(out / "render"), "--turntable"),
+        run_step("render", "grmm", "render", checkpoint, str(out / "render"), "--turntable"),
     ]  # fmt: skip
 
 
@@ -228,7 +228,7 @@ def main() -> None:
     (dataset / "summary.json").write_text(json.dumps(summary, indent=1) + "\n")
     steps.append(
         run_step(
-            "report", "express50.cli", "report", str(dataset),
+            "report", "express50", "report", str(dataset),
             "--out", str(args.out / "report"), "--title", f"EXPRESS-50 demo: {name}",
         )
     )  # fmt: skip

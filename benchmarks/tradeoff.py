@@ -64,7 +64,7 @@ def sweep_one(base: Dataset, truth: Truth, stage: str, preset: str, out: Path) -
         link = dataset.root / name
         if not link.exists():
             link.symlink_to((base.root / name).resolve())
-    command = [sys.executable, "-m", "express50.cli", stage, str(dataset.root), "--preset", preset]
+    command = [sys.executable, "-m", "express50", stage, str(dataset.root), "--preset", preset]
     began = children_seconds()
     done = subprocess.run(
         [*command, "--workers", "0", "--json"], stdout=subprocess.PIPE, check=False

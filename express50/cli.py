@@ -63,7 +63,3 @@ def main(argv: Sequence[str] | None = None) -> int:
     except SystemExit as stop:  # argparse has said what is wrong
         return stop.code if isinstance(stop.code, int) else USAGE
     return run_handler("express50", args.handler, args)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -110,7 +110,7 @@ def test_kills_at_random_moments_change_no_byte(dataset, twin, tmp_path):
         if name not in ("ingest", "matte", "depth", "pack"):
             assert main([*_stage(name, root, twin), "--workers", "0"]) == 0
             continue
-        command = [sys.executable, "-m", "express50.cli", *_stage(name, root, twin), "--workers=2"]
+        command = [sys.executable, "-m", "express50", *_stage(name, root, twin), "--workers=2"]
         process = subprocess.Popen(
             command, env=environment, start_new_session=True, stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,

@@ -8,8 +8,14 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 
+from express50 import __version__
 from express50.console import run_handler
 from grmm.cli import draw, learn, measure, study
+
+DESCRIPTION = "Train the Gaussian Residual Morphable Model on packed shards, and use it."
+EPILOG = """example:
+  grmm train DATASET/pack/shards OUT --preset measured --budget 10m
+exit codes: 0 done, 1 failed, 2 wrong usage or configuration"""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -20,7 +26,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def build_parser() -> argparse.ArgumentParser:
     """The argument parser with all commands."""
-    parser = argparse.ArgumentParser(prog="grmm", description=__doc__)
+    parser = argparse.ArgumentParser(
+        prog="grmm",
+        description=DESCRIPTION,
+        epilog=EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--version", action="version", version=f"grmm {__version__}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     learn.add_train(commands)
     learn.add_fit(commands)

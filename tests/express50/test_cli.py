@@ -56,7 +56,7 @@ def test_ingest_then_skip_then_status_and_info(run, data, capture):
 
 
 def test_json_is_alone_on_standard_output(data, capture):
-    command = [sys.executable, "-m", "express50.cli", "ingest", str(data), str(capture), "--json"]
+    command = [sys.executable, "-m", "express50", "ingest", str(data), str(capture), "--json"]
     done = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, check=True)
     account = json.loads(done.stdout)
     counts = [account[k] for k in ("stage", "read", "done", "skipped", "failed")]

@@ -195,7 +195,7 @@ def test_a_killed_run_is_told_from_one_that_works(tmp_path):
 
 def test_serve_answers_on_this_machine_alone(tmp_path):
     of(tmp_path, None, [receipt("a", 1.0, stage="ingest")], 2.0)
-    command = [sys.executable, "-u", "-m", "express50.cli", "status", str(tmp_path), "--serve", "0"]
+    command = [sys.executable, "-u", "-m", "express50", "status", str(tmp_path), "--serve", "0"]
     with subprocess.Popen(command, cwd=REPOSITORY, stdout=subprocess.PIPE, text=True) as process:
         address = process.stdout.readline().split()[0]
         assert address.startswith("http://127.0.0.1:")

@@ -17,7 +17,7 @@ from tests.pipelines.bump_dataset import make_dataset
 
 def killed(arguments: list[str], out: Path, files: int) -> bool:
     """Run an export and kill it once that many files are there; False if it ended before."""
-    process = subprocess.Popen([sys.executable, "-m", "express50.cli", *arguments])
+    process = subprocess.Popen([sys.executable, "-m", "express50", *arguments])
     while sum(path.is_file() for path in (out / ".S001.part").rglob("*")) < files:
         if process.poll() is not None:
             return False

@@ -1,9 +1,12 @@
 import io
 import json
+import subprocess
+import sys
 
 import numpy as np
 import pytest
 
+from express50 import __version__
 from express50.errors import FormatError
 from express50.shards_write import PackedSample, ShardWriter
 from grmm import checkpoint as checkpoint_module
@@ -137,10 +140,14 @@ def test_flags_stand_above_assignments():
     assert config.train.seconds == 7 and config.train.overfit == 1
 
 
-def test_help_needs_no_torch():
-    import subprocess
-    import sys
+def test_both_commands_run_as_modules():
+    for name in ("express50", "grmm"):
+        command = [sys.executable, "-m", name, "--version"]
+        shown = subprocess.run(command, check=True, capture_output=True, text=True).stdout
+        assert shown == f"{name} {__version__}\n"
 
+
+def test_help_needs_no_torch():
     code = "import sys, grmm.cli as c; c.build_parser(); sys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 

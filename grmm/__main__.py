@@ -1,4 +1,4 @@
-"""``python -m grmm.cli``."""
+"""``python -m grmm``: the ``grmm`` command."""
 
 import sys
 
