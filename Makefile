@@ -8,6 +8,7 @@ PRESET ?= standard
 WORKERS ?= 2
 SET ?=
 SLURM ?=
+TRAIN ?= --preset measured --budget 1h
 STAGE_FLAGS = --preset $(PRESET) --workers $(WORKERS) $(foreach kv,$(SET),--set $(kv)) $(if $(SLURM),--slurm $(SLURM))
 
 .PHONY: help setup demo test check bench tradeoff report clean \
@@ -48,8 +49,8 @@ ingest: $(READY) ## index CAPTURES="dir ..." into DATASET
 calibrate align matte track depth regions pack: $(READY) ## one stage over DATASET
 	$(BIN)/express50 $@ $(DATASET) $(STAGE_FLAGS)
 
-train: $(READY) ## train GRMM on DATASET's shards
-	$(BIN)/grmm train $(DATASET)/pack/shards $(DATASET)/grmm
+train: $(READY) ## train GRMM on DATASET's shards, or go on with it; TRAIN="--preset paper" on a GPU
+	$(BIN)/grmm train $(DATASET)/pack/shards $(DATASET)/grmm $(TRAIN)
 
 report: $(READY) ## gather DATASET's QC into one HTML page
 	$(BIN)/express50 report $(DATASET)

@@ -156,7 +156,7 @@ def run_grmm(dataset: Path, unseen: str, seconds: tuple[int, int]) -> list[Step]
     shown = "neutral" if "neutral" in expression else sorted(expression)[0]
     return [
         run_step(
-            "train", "grmm", "train", str(shards), str(out / "train"), "--preset=demo",
+            "train", "grmm", "train", str(shards), str(out / "train"), "--anew", "--preset=demo",
             f"--seconds={seconds[0]}", f"--holdout-cameras={held_out}",
         ),
         run_step(

@@ -87,6 +87,8 @@ class Source(Protocol):
 
     keys: Sequence[Key]
     head: str
+    digest: str
+    """Another one if any sample is."""
 
     def read(self, index: int) -> Sample:
         """Decode one sample."""

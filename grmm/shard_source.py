@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -36,6 +37,11 @@ class ShardSource:
             for entry in self.reader.entries
         ]
         self.head = str(self.reader.meta(0).get("head"))
+        self.digest = _digest(
+            f"{entry.key} {name} {size} {crc:08x}"
+            for entry in self.reader.entries
+            for name, (_, size, crc) in sorted(entry.members.items())
+        )
         self._offsets: dict[str, np.ndarray] = {}
 
     def read(self, index: int) -> Sample:
@@ -108,6 +114,7 @@ class MixedSource:
                     )
         self._places = [(source, i) for source in sources for i in range(len(source.keys))]
         self.keys: Sequence[Key] = [source.keys[i] for source, i in self._places]
+        self.digest = _digest(source.digest for source in sources)
 
     def read(self, index: int) -> Sample:
         """Decode one sample.
@@ -127,6 +134,13 @@ def open_shards(roots: Sequence[Path], split: str) -> ShardSource | MixedSource:
     """
     sources = [ShardSource(root, split) for root in roots]
     return sources[0] if len(sources) == 1 else MixedSource(sources)
+
+
+def _digest(lines: Iterable[str]) -> str:
+    digest = hashlib.sha256()
+    for line in lines:
+        digest.update(line.encode() + b"\n")
+    return digest.hexdigest()
 
 
 def seen_window(meta: dict, where: str) -> tuple[slice, slice]:

@@ -128,6 +128,7 @@ def save(run: Run, path: Path, config: Config, head_spec: str) -> None:
         loop={
             "iteration": run.iteration,
             "seconds": run.seconds,
+            "samples": run.views.source.digest,
             "shuffle": run.shuffle.state(),
             "generator": run.generator.get_state(),
             "torch": torch.get_rng_state(),
@@ -142,7 +143,7 @@ def restore(run: Run, path: Path, config: Config, device: torch.device) -> None:
     if not loaded.loop:
         raise ConfigError(
             f"{path}: holds no state to resume from (a person was withdrawn from it, or it is a "
-            "fit); train into another folder"
+            "fit); train into another folder, or start over with --anew"
         )
     budget = {"iterations", "seconds", "save_every", "log_every", "evaluate_images", "threads",
               "tensorboard"}  # fmt: skip
@@ -156,10 +157,12 @@ def restore(run: Run, path: Path, config: Config, device: torch.device) -> None:
     names = (loaded.model.subjects, loaded.model.expressions)
     if names != (run.model.subjects, run.model.expressions):
         changed.append("the subjects or expressions of the shards")
+    elif loaded.loop.get("samples", run.views.source.digest) != run.views.source.digest:
+        changed.append("the samples of the shards")
     if changed:
         raise ConfigError(
             f"{path}: cannot resume, these differ: {'; '.join(changed)}. "
-            "Resume with the same settings or train into another folder"
+            "Go on with the same, train into another folder, or start over with --anew"
         )
     run.model.load_state_dict(loaded.loop.get("weights", loaded.model.state_dict()))
     if run.average is not None:
@@ -170,6 +173,7 @@ def restore(run: Run, path: Path, config: Config, device: torch.device) -> None:
     run.generator.set_state(loaded.loop["generator"])
     torch.set_rng_state(loaded.loop["torch"])
     run.iteration, run.seconds = loaded.loop["iteration"], loaded.loop["seconds"]
+    log(f"{path}: going on from iteration {run.iteration}")
 
 
 def progress_line(run: Run, config: Config) -> str:

@@ -31,13 +31,16 @@ def add_train(commands: argparse._SubParsersAction) -> None:
     parser = commands.add_parser(
         "train",
         help="train on packed shards",
-        epilog="example: grmm train data/pack/shards run --preset demo --seconds 240",
+        epilog="example: grmm train data/pack/shards run --preset demo --seconds 240; the same"
+        " again goes on from run/checkpoint.pt",
     )
     parser.add_argument("shards", type=Path, help="folder of shards")
     parser.add_argument("out", type=Path, help="folder for checkpoint.pt, metrics.json, preview/")
     add_training(parser)
     parser.add_argument("--overfit", action="store_true", help="check: train on one view only")
-    parser.add_argument("--resume", action="store_true", help="go on from OUT/checkpoint.pt")
+    parser.add_argument(
+        "--anew", action="store_true", help="start over, though OUT has a checkpoint"
+    )
     parser.add_argument("--json", action="store_true", help="print metrics as JSON")
     parser.set_defaults(handler=_train)
 
@@ -82,7 +85,8 @@ def _train(args: argparse.Namespace) -> int:
 
     config = train_config(args)
     source = open_shards([args.shards, *args.also], config.data.split)
-    metrics = train(source, load_head(source.head), args.out, config, resume=args.resume)
+    resume = not args.anew and (args.out / "checkpoint.pt").exists()
+    metrics = train(source, load_head(source.head), args.out, config, resume=resume)
     if args.json:
         say_json(metrics)
     else:

@@ -58,6 +58,7 @@ class EllipsoidSource:
     """Subjects (by colour) x expressions (by height) x cameras on a ring."""
 
     head = "ellipsoid"
+    digest = "toy"
 
     def __init__(self, subjects=2, expressions=2, cameras=3, size=40, offset=(0.2, -0.1, 0.3)):
         self.size, self.offset = size, np.array(offset)

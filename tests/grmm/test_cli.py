@@ -84,6 +84,34 @@ def test_train_sees_the_training_split_only(checkpoint):
     assert json.loads(lines[-1])["iteration"] == 3
 
 
+def test_training_again_goes_on_and_refuses_what_differs(shards, tmp_path, capsys, monkeypatch):
+    from express50.head import load
+
+    monkeypatch.setattr(load, "load_head", lambda spec: ellipsoid_head())
+    monkeypatch.setattr(checkpoint_module, "load_head", lambda spec: ellipsoid_head())
+    train = ["train", str(shards), str(tmp_path), *TINY]
+    assert main(train) == 0
+    capsys.readouterr()
+
+    assert main([*train, "--set=train.iterations=4"]) == 0
+    assert "going on from iteration 3" in capsys.readouterr().err
+    steps = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
+    assert [step["iteration"] for step in steps] == [3, 4]
+
+    before = (tmp_path / "checkpoint.pt").read_bytes()
+    assert main([*train, "--set=train.lr=0.5"]) == 2
+    told = capsys.readouterr().err
+    assert "train.lr 0.002 -> 0.5" in told and "--anew" in told
+    write_shards(tmp_path / "others", EllipsoidSource(subjects=3, size=24))
+    assert main(["train", str(tmp_path / "others"), str(tmp_path), *TINY]) == 2
+    assert "the samples of the shards" in capsys.readouterr().err
+    assert (tmp_path / "checkpoint.pt").read_bytes() == before
+
+    assert main([*train, "--anew", "--set=train.lr=0.5"]) == 0
+    assert "going on" not in capsys.readouterr().err
+    assert json.loads((tmp_path / "metrics.json").read_text())["iterations"] == 3
+
+
 def test_fit_render_evaluate_export(checkpoint, shards, tmp_path, capsys):
     fit = ["fit", str(checkpoint), str(shards), str(tmp_path / "fit"), "--subject=S002"]
     assert main([*fit, "--expression=e0", "--cameras=cam00,cam01", "--seconds=30"]) == 0
