@@ -30,15 +30,15 @@ def add_commands(subparsers: Any) -> None:
     showing = actions.add_parser(
         "show",
         help="print a sample's meta and write it as a picture",
-        epilog="example: express50 shards show data/pack/shards --key S001_smile_cam03 --out a.png",
+        epilog="example: express50 shards show data/pack/shards S001_smile_cam03 --out a.png",
     )
-    showing.add_argument("--key", help="sample; the first by default")
     showing.add_argument("--out", type=Path, help="picture of rgb, alpha and depth to write")
     showing.set_defaults(handler=run_show)
     _add_edits(actions)
     for action in (checking, listing, showing):
         action.add_argument("directory", type=Path, metavar="DIR", help="folder of shards")
         action.add_argument("--json", action="store_true", help="print as JSON")
+    showing.add_argument("key", nargs="?", metavar="KEY", help="sample; the first by default")
 
 
 def _add_edits(actions: Any) -> None:

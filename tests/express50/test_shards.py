@@ -283,8 +283,8 @@ def test_ls_and_show(shards, tmp_path, capsys):
     assert main(["shards", "ls", str(shards), "--split", "test"]) == 0
     assert "6 samples" in capsys.readouterr().out
     picture = tmp_path / "picture.png"
-    command = ["shards", "show", str(shards), "--key", "S002_neutral_cam01", "--out", str(picture)]
+    command = ["shards", "show", str(shards), "S002_neutral_cam01", "--out", str(picture)]
     assert main(command) == 0
     assert json.loads(capsys.readouterr().out)["key"] == "S002_neutral_cam01"
     assert image_size(picture.read_bytes(), "x") == (3 * SIZE, SIZE)
-    assert main(["shards", "show", str(shards), "--key", "nobody"]) == 1
+    assert main(["shards", "show", str(shards), "nobody"]) == 1
