@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import fcntl
+import time
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, contextmanager
+from typing import IO
 
 from express50.errors import StageError
 from express50.layout import Dataset
+
+GLANCE_SECONDS = 0.05
 
 
 @contextmanager
@@ -20,13 +24,21 @@ def stage_lock(dataset: Dataset, stage: str) -> Iterator[None]:
     path = dataset.staging_dir / f".{stage}.lock"
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("w") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise StageError(
-                f"{dataset.root}: another '{stage}' runs on this dataset; wait until it ends"
-            ) from error
+        if not _locked(file):
+            time.sleep(GLANCE_SECONDS)  # perhaps `is_running` has just looked
+            if not _locked(file):
+                raise StageError(
+                    f"{dataset.root}: another '{stage}' runs on this dataset; wait until it ends"
+                )
         yield
+
+
+def _locked(file: IO[str]) -> bool:
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return True
 
 
 @contextmanager
@@ -49,7 +61,7 @@ def is_running(dataset: Dataset, stage: str) -> bool:
         return False
     with path.open("r") as file:
         try:
-            # Shared, and let go at once: the stage itself must not find it taken.
+            # Shared, and let go at once; a stage that starts meanwhile tries again.
             fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
         except BlockingIOError:
             return True

@@ -114,7 +114,7 @@ def run_stage(
         config: instance of ``stage.config``.
         items: ids to run, and what these read of the stage itself; all by default, and then outputs
             of items that are no more are set aside.
-        workers: local processes; 0 or 1 runs in this one.
+        workers: local processes; 0 runs in this one.
         scheduler: address of a dask scheduler to use in place of local processes.
         progress: show progress on standard error.
         pool: workers shared with other stages, in place of the two arguments above.

@@ -64,6 +64,11 @@ class ShardReader:
         self._files: dict[str, int] = {}
         self._owner = os.getpid()
 
+    def __del__(self) -> None:
+        """Close what this process opened."""
+        if getattr(self, "_owner", None) == os.getpid():
+            self.close()
+
     def __len__(self) -> int:
         """Number of samples."""
         return len(self.entries)

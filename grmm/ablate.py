@@ -26,7 +26,7 @@ from grmm.judge import Judge
 from grmm.order import spread
 from grmm.presets import as_tables, from_tables
 from grmm.progress import log
-from grmm.run import settle
+from grmm.run import best_device, settle
 from grmm.shard_source import open_shards
 from grmm.train import train
 from grmm.unseen import Protocol, evaluate_unseen
@@ -117,7 +117,7 @@ def _row(
     folder = out / (variant.trains_as or name)
     if not variant.trains_as:
         _train(used, folder, settings)
-    loaded = load_checkpoint(folder / "checkpoint.pt")
+    loaded = load_checkpoint(folder / "checkpoint.pt", best_device())
     log(f"ablate: measuring {name}")
     row = measure(replace(loaded, config=settings), roots, used, protocol, subjects)
     row |= {"digest": digest, "label": variant.label, "paper_db": variant.paper_db}
@@ -126,15 +126,20 @@ def _row(
 
 
 def _train(used: Sequence[Path], folder: Path, settings: Config) -> None:
-    """Train a row, or go on where it stopped; another configuration starts afresh."""
+    """Train a row, or go on where it stopped; other settings or samples start afresh."""
     tables = as_tables(settings)
-    wanted = dump_json({"tables": {k: v for k, v in tables.items() if k not in ("fit", "metrics")}})
+    source = open_shards(used, settings.data.split)
+    wanted = dump_json(
+        {
+            "tables": {k: v for k, v in tables.items() if k not in ("fit", "metrics")},
+            "samples": source.digest,
+        }
+    )
     mark, checkpoint = folder / "settings.json", folder / "checkpoint.pt"
     same = mark.exists() and mark.read_bytes() == wanted
     if not same:
         checkpoint.unlink(missing_ok=True)
         write_bytes(mark, wanted)
-    source = open_shards(used, settings.data.split)
     log(f"ablate: training {folder.name}")
     train(source, load_head(source.head), folder, settings, resume=checkpoint.exists())
 
@@ -154,6 +159,7 @@ def measure(
         background=data.background,
         torso=data.torso,
         cache_mb=data.cache_mb,
+        device=loaded.model.z_id.device,
     )
     kinds = [kind_of(key, loaded.model.subjects, loaded.gallery) for key in views.keys]
     groups: dict[str, dict] = {}

@@ -189,15 +189,14 @@ class HeadViews:
         )
 
     def _torso(self, index: int, sample: Sample, state: HeadState, view: View) -> np.ndarray:
-        """Torso pixels (H, W) of a sample, found once and kept as bits."""
+        """Torso pixels (H, W) of a sample; what takes long is found once and kept as bits."""
         size = sample.alpha.shape
         if not self.ignore_torso:
             return np.zeros(size, bool)
+        if sample.parts is not None:
+            return labelled_torso(sample.parts)
         if index not in self._torsos:
-            if sample.parts is not None:
-                mask = labelled_torso(sample.parts)
-            else:
-                mask = torso_mask(self.head, state.vertices, view, sample.alpha, sample.depth)
+            mask = torso_mask(self.head, state.vertices, view, sample.alpha, sample.depth)
             self._torsos[index] = np.packbits(mask)
         bits = np.unpackbits(self._torsos[index], count=size[0] * size[1])
         return bits.reshape(size).astype(bool)

@@ -29,7 +29,7 @@ from grmm.fit_checkpoint import save_fit
 from grmm.judge import Judge
 from grmm.locality import locality_loss, random_camera, reconstruction
 from grmm.model import GRMM
-from grmm.order import Shuffle
+from grmm.order import Shuffle, spread
 from grmm.perceptual import load_vgg
 from grmm.progress import log
 from grmm.render import comparison_sheet
@@ -76,7 +76,7 @@ def fit(
         "expressions": sorted(state.z_exp),
         "cameras": sorted({views.keys[i].camera for i in state.given}),
         "held_out_cameras": sorted({views.keys[i].camera for i in held_out}),
-        "psnr_db": stages["stage2"]["psnr_held_out_db"] or stages["stage2"]["psnr_given_db"],
+        "psnr_db": mean(rows, "psnr_db"),
         "psnr_is_of": "held-out views" if held_out else "given views: all were given",
         "stages": stages,
         "lpips": mean(rows, "lpips"),
@@ -93,6 +93,7 @@ def fit(
 
 
 Scores = dict[str, float | None]
+LOOKED_AT = 12  # pictures between the stages
 
 
 def run_stages(
@@ -179,6 +180,7 @@ def invert_codes(state: Fit, late: Callable[[], bool]) -> int:
     codes = [state.z_id, *state.z_exp.values()]
     for code in codes:
         code.requires_grad_(True)
+    done = 0
     optimizer = torch.optim.Adam(codes, lr=settings.stage1_lr)
     for number, item in _items(state, settings.stage1_iterations, late):
         share = number / settings.stage1_iterations
@@ -194,7 +196,7 @@ def invert_codes(state: Fit, late: Callable[[], bool]) -> int:
         done = number + 1
     for code in codes:
         code.requires_grad_(False)
-    return done if settings.stage1_iterations else 0
+    return done
 
 
 def tune_decoders(state: Fit, late: Callable[[], bool]) -> int:
@@ -299,8 +301,8 @@ def _finite(loss: Tensor, iteration: int, stage: int) -> Tensor:
 
 
 def _scores(state: Fit, held_out: Sequence[int], render: Render) -> Scores:
-    given = evaluate(state.views, state.given[:12], render)
-    other = evaluate(state.views, list(held_out)[:12], render)
+    given = evaluate(state.views, spread(state.given, LOOKED_AT), render)
+    other = evaluate(state.views, spread(held_out, LOOKED_AT), render)
     scores = {
         "psnr_given_db": mean(given, "psnr_db"),
         "psnr_held_out_db": mean(other, "psnr_db"),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import fnmatch
 import math
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -62,6 +63,13 @@ def settle(config: Config, views: HeadViews) -> Config:
     side = step * math.ceil(math.sqrt(2 * max(areas) / COVERED_TEXELS) / step)
     n_g = max(2 * step, min(side, LARGEST_MAP))
     return replace(config, model=replace(config.model, n_g=n_g))
+
+
+def best_device() -> torch.device:
+    """The CUDA device of this process, as ``torchrun`` numbers them, where there is one."""
+    if not torch.cuda.is_available():
+        return torch.device("cpu")
+    return torch.device(f"cuda:{os.environ.get('LOCAL_RANK', '0')}")
 
 
 def prepare(views: HeadViews, config: Config, rank: int = 0, world: int = 1) -> Run:

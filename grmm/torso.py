@@ -7,8 +7,9 @@ on below its lower end, is torso.
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
-from scipy.ndimage import binary_dilation, distance_transform_edt
+from scipy.ndimage import distance_transform_edt
 from scipy.spatial import cKDTree
 from torch import Tensor
 
@@ -24,7 +25,7 @@ GROW_PX = 2  # blurred borders
 def labelled_torso(parts: np.ndarray) -> np.ndarray:
     """Pixels (H, W) bool that labels (H, W) of ``express50.parts.LABELS`` call torso, grown."""
     torso = parts == TORSO
-    return binary_dilation(torso, iterations=GROW_PX) if torso.any() else torso
+    return _grown(torso)
 
 
 def torso_mask(
@@ -52,7 +53,7 @@ def torso_mask(
     on_neck, on_end = (region.cpu().numpy()[nearest] for region in (neck, end))
     torso = np.zeros_like(foreground)
     torso[rows, columns] = (on_neck & (distance > STAND_OFF_M)) | (on_end & (distance > END_M))
-    return binary_dilation(torso, iterations=GROW_PX) if torso.any() else torso
+    return _grown(torso)
 
 
 def _filled(
@@ -74,3 +75,8 @@ def _points(view: View, rows: np.ndarray, columns: np.ndarray, depth: np.ndarray
     x = (columns + 0.5 - K[0, 2]) / K[0, 0] * z
     y = (rows + 0.5 - K[1, 2]) / K[1, 1] * z
     return (np.stack([x, y, z], 1) - camera[:3, 3]) @ camera[:3, :3]
+
+
+def _grown(mask: np.ndarray) -> np.ndarray:
+    cross = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
+    return cv2.dilate(mask.astype(np.uint8), cross, iterations=GROW_PX, borderValue=0) > 0

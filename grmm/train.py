@@ -23,7 +23,7 @@ from grmm.data import HeadViews, Source
 from grmm.objective import step
 from grmm.presets import as_tables
 from grmm.progress import Interrupt, append_log, deferred_interrupt, log, start_log, tensorboard
-from grmm.run import Run, budget_used, finished, prepare, set_rates, settle
+from grmm.run import Run, best_device, budget_used, finished, prepare, set_rates, settle
 from grmm.train_report import report
 from grmm.warm_start import warm_start
 
@@ -63,7 +63,7 @@ def train(
     run = prepare(views, config, rank, world)
     checkpoint = out / "checkpoint.pt"
     if resume:
-        restore(run, checkpoint, config, device)
+        restore(run, checkpoint, config, device, rank)
     elif config.train.warm_start:
         warm_start(run.model, views, run.training, config.train.warm_start_images)
     if rank == 0:
@@ -101,11 +101,9 @@ def train(
 
 def join_processes() -> tuple[int, int, torch.device]:
     """Rank, number of processes and device; joins the group that ``torchrun`` describes."""
-    world = int(os.environ.get("WORLD_SIZE", "1"))
-    cuda = torch.cuda.is_available()
-    device = torch.device(f"cuda:{os.environ.get('LOCAL_RANK', '0')}" if cuda else "cpu")
+    world, device = int(os.environ.get("WORLD_SIZE", "1")), best_device()
     if world > 1:
-        distributed.init_process_group("nccl" if cuda else "gloo")
+        distributed.init_process_group("nccl" if device.type == "cuda" else "gloo")
     return int(os.environ.get("RANK", "0")), world, device
 
 
@@ -137,8 +135,8 @@ def save(run: Run, path: Path, config: Config, head_spec: str) -> None:
     )
 
 
-def restore(run: Run, path: Path, config: Config, device: torch.device) -> None:
-    """Put a run back to where its checkpoint was written."""
+def restore(run: Run, path: Path, config: Config, device: torch.device, rank: int) -> None:
+    """Put a run back to where its checkpoint was written, which has the state of rank 0."""
     loaded = load_checkpoint(path, device)
     if not loaded.loop:
         raise ConfigError(
@@ -170,7 +168,8 @@ def restore(run: Run, path: Path, config: Config, device: torch.device) -> None:
         run.average.n_averaged.fill_(loaded.loop["iteration"])
     run.optimizer.load_state_dict(loaded.optimizer)
     run.shuffle.restore(loaded.loop["shuffle"])
-    run.generator.set_state(loaded.loop["generator"])
+    if rank == 0:  # the others draw other numbers
+        run.generator.set_state(loaded.loop["generator"])
     torch.set_rng_state(loaded.loop["torch"])
     run.iteration, run.seconds = loaded.loop["iteration"], loaded.loop["seconds"]
     log(f"{path}: going on from iteration {run.iteration}")

@@ -111,7 +111,8 @@ class Viewer:
 
     def _show(self, watcher: Watcher, moving: bool) -> None:
         began = time.perf_counter()
-        view = view_of_camera(watcher.client.camera, self.heights[moving])
+        device = self.loaded.model.z_id.device
+        view = view_of_camera(watcher.client.camera, self.heights[moving], device)
         picture = self.preview.draw(self.head, view, moving)
         watcher.client.scene.set_background_image(
             picture, format="jpeg", jpeg_quality=QUALITY[moving]
@@ -241,7 +242,7 @@ class Viewer:
         return controls
 
 
-def view_of_camera(camera: Any, height: int) -> View:
+def view_of_camera(camera: Any, height: int, device: torch.device | str = "cpu") -> View:
     """A browser's camera (OpenCV axes, head space) as a view of this height, at most 2 : 1 wide."""
     width = max(1, round(height * min(2.0, max(0.5, float(camera.aspect)))))
     focal = height / 2 / np.tan(float(camera.fov) / 2)
@@ -249,4 +250,5 @@ def view_of_camera(camera: Any, height: int) -> View:
     cam_from_head = np.eye(4)
     cam_from_head[:3, :3] = quat_to_matrix(np.asarray(camera.wxyz, dtype=np.float64)).T
     cam_from_head[:3, 3] = -cam_from_head[:3, :3] @ np.asarray(camera.position)
-    return View(K=K, cam_from_head=torch.from_numpy(cam_from_head), width=width, height=height)
+    pose = torch.from_numpy(cam_from_head).to(device)
+    return View(K=K.to(device), cam_from_head=pose, width=width, height=height)

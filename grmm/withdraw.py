@@ -38,12 +38,17 @@ def redact(path: Path, subject: str) -> bool:
 
 def _without(content: dict[str, Any], subject: str) -> dict[str, Any]:
     rows = [row for row, name in enumerate(content["subjects"]) if name != subject]
+    frames = [frame for frame in content["frames"] if frame["subject"] != subject]
+    # Nobody is left to show an expression that this person alone performed.
+    lost = {f["expression_id"] for f in content["frames"]} - {f["expression_id"] for f in frames}
+    kept = [row for row, name in enumerate(content["expressions"]) if name not in lost]
     # Indexing with a list copies: a view would carry the removed row to the disk.
-    codes = content["model"]["z_id"][rows]
+    codes = {"z_id": content["model"]["z_id"][rows], "z_exp": content["model"]["z_exp"][kept]}
     return content | {
         "subjects": [content["subjects"][row] for row in rows],
-        "model": content["model"] | {"z_id": codes},
-        "frames": [frame for frame in content["frames"] if frame["subject"] != subject],
+        "expressions": [content["expressions"][row] for row in kept],
+        "model": content["model"] | codes,
+        "frames": frames,
         "offsets": {k: v for k, v in content.get("offsets", {}).items() if k != subject},
         "optimizer": {},
         "loop": {},

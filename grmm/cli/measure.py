@@ -19,6 +19,7 @@ from grmm.cli.shared import (
     select,
     split_names,
 )
+from grmm.progress import log
 
 if TYPE_CHECKING:
     from grmm.checkpoint import Loaded
@@ -84,7 +85,7 @@ def _evaluate(args: argparse.Namespace) -> int:
     )
     for subject in unseen:
         found, effort = evaluate_unseen(loaded, views, subject, _protocol(args), judge, keep)
-        say(f"{subject}: fitted from {', '.join(effort['cameras'])} in {effort['seconds']} s")
+        log(f"{subject}: fitted from {', '.join(effort['cameras'])} in {effort['seconds']} s")
         rows += found
     summary = write_evaluation(args.out, rows, judge)
     _tell(summary, args.json)
@@ -171,7 +172,7 @@ def _score(args: argparse.Namespace) -> int:
     summary = write_evaluation(args.out, rows, judge)
     _tell(summary, args.json)
     if len(rows) < len(chosen):
-        say(f"scored {len(rows)} of {len(chosen)} samples: the others have no picture")
+        log(f"scored {len(rows)} of {len(chosen)} samples: the others have no picture")
     return OK
 
 

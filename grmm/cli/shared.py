@@ -54,12 +54,13 @@ def metric_settings(args: argparse.Namespace) -> list[str]:
 
 
 def load(path: Path, assignments: Sequence[str] = (), seconds: float | None = None) -> Loaded:
-    """Read a checkpoint; ``fit.*`` and ``metrics.*`` replace what it was trained with."""
+    """Read a checkpoint; ``fit.*``, ``metrics.*`` and ``loss.*`` replace its own settings."""
     from express50.config import parse_assignment
     from grmm.checkpoint import load_checkpoint
     from grmm.presets import as_tables, from_tables
+    from grmm.run import best_device
 
-    loaded = load_checkpoint(path)
+    loaded = load_checkpoint(path, best_device())
     tables = as_tables(loaded.config)
     for text in assignments:
         table, key, value = parse_assignment(text)
@@ -85,6 +86,7 @@ def open_views(loaded: Loaded, shards: Path) -> HeadViews:
         background=data.background,
         torso=data.torso,
         cache_mb=data.cache_mb,
+        device=loaded.model.z_id.device,
     )
 
 

@@ -71,6 +71,10 @@ class DepthConfig:
         """Check ranges."""
         if not 0.3 <= self.voxel_mm <= 20:
             raise ValueError(f"voxel_mm is {self.voxel_mm}, expected 0.3 to 20")
+        if not 0 < self.fair_voxels <= 2:
+            raise ValueError(f"fair_voxels is {self.fair_voxels}, expected over 0, at most 2")
+        if not 0 <= self.inward_mm <= 100:
+            raise ValueError(f"inward_mm is {self.inward_mm}, expected 0 to 100")
         if not 1 <= self.coarse_mm <= 40:
             raise ValueError(f"coarse_mm is {self.coarse_mm}, expected 1 to 40")
         if not 0 <= self.voxel_px <= 8:

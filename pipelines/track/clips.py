@@ -16,7 +16,6 @@ from express50.errors import FormatError, StageError
 from express50.index import Cue
 from express50.publish import write_bytes
 from pipelines.track.config import VERSION, TrackConfig
-from pipelines.track.lids import shut_lids
 from pipelines.track.marks import Eyes
 from pipelines.track.observe import Observation
 from pipelines.track.offsets import split_shape
@@ -59,7 +58,7 @@ def write_clips(
     )
     arrays |= {"shape": split_shape(basis.model, state.shape)[0]}
     np.savez(out / "sequence.npz", **arrays)  # type: ignore[arg-type]  # numpy types its options
-    # A crash before the stage's outputs are published costs no more than these last windows.
+    # Only publishing is left; what ends the run before that costs the clips.
     shutil.rmtree(keep, ignore_errors=True)
     return account
 
@@ -147,7 +146,6 @@ def _track(
 ) -> dict[int, Pose]:
     """Poses of the kept frames of a window that show a face."""
     seen = [found for frame in window.frames if (found := observe(cue, frame)) is not None]
-    seen = shut_lids(seen)
     poses = track_window(person, seen, config, eyes, closer) if seen else []
     kept = set(window.frames[window.kept])
     pairs = zip(seen, poses, strict=True)

@@ -33,7 +33,8 @@ class TrackConfig:
     smooth_mm: float = 1.0
     """How far a point may lie from the middle of the neighbouring frames', millimetres."""
     cameras: int = 0
-    """Cameras used in the fit, those that see the face best; 0 uses all."""
+    """Cameras whose landmarks place the peaks, those that see the face best; 0 uses all. Clips use
+    all."""
     refinements: int = 3
     """Detector crops after the coarse pass."""
     iterations: int = 14

@@ -90,8 +90,8 @@ def landmark_sigma(observation: Observation, config: TrackConfig) -> np.ndarray:
 def consistent_sigma(target: Target, marks: np.ndarray) -> np.ndarray:
     """The target's standard deviations with what the fit contradicts made infinite.
 
-    A landmark is contradicted at REJECT standard deviations; a view half of whose landmarks are is
-    left out as a whole, unless no other is left. `marks` (68, 3) are the fitted landmarks.
+    A landmark is contradicted at REJECT_SIGMA standard deviations; a view half of whose landmarks
+    are is left out as a whole, unless no other is left. `marks` (68, 3) are the fitted landmarks.
     """
     sigma = target.sigma.copy()
     for index, view in enumerate(target.observation.views):

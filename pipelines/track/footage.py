@@ -86,7 +86,7 @@ def _views(
             missing.append(error)
             continue
         seen = source(image, camera_id, frame)
-        if seen.face.score >= config.min_score:
+        if seen.face.score >= config.min_score and np.isfinite(seen.face.sigma).any():
             views.append(make_view(camera, seen))
     if missing and len(missing) == len(cameras):
         raise missing[0]

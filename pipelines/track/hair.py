@@ -11,6 +11,7 @@ import torch
 from express50.cameras import Camera
 from express50.head.model import HeadModel, vertex_normals
 from pipelines.track.photometry import look
+from pipelines.track.pinhole import inside_frame
 from pipelines.track.samples import Visibility
 
 FEATURES = (
@@ -61,7 +62,8 @@ def _colours(
     rows = []
     for image, camera in images:
         value = np.log(np.maximum(look(camera, image, mesh)[0], 0.01))
-        value[visibility.weights(camera, mesh, normals) <= 0] = np.nan
+        seen = visibility.weights(camera, mesh, normals) > 0
+        value[~(seen & inside_frame(camera, mesh)[1])] = np.nan
         rows.append(value)
     if not rows:
         return np.full(mesh.shape, np.nan)

@@ -7,6 +7,7 @@ lids nearly as far apart as open ones. Only shut eyes are told; half shut ones s
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -63,12 +64,24 @@ def lid_terms(observation: Observation) -> tuple[SurfaceTerm, ...]:
     return (ShutLids(observation.shut),) if observation.shut else ()
 
 
-def shut_lids(observations: list[Observation]) -> list[Observation]:
-    """One person's observations with the upper lids of shut eyes brought down to the lower ones."""
+def shut_lids(
+    observations: list[Observation], others: Sequence[Observation] | None = None
+) -> list[Observation]:
+    """One person's observations with the upper lids of shut eyes brought down to the lower ones.
+
+    Args:
+        observations: to be looked at.
+        others: the times to compare each with, in most of which eyes are open; by default those of
+            the observations that it is not itself.
+    """
     shut = np.zeros((len(observations), 2), dtype=bool)
     for side in range(2):
         seen = [_irises(observation, side) for observation in observations]
-        shut[:, side] = [_is_shut(now, seen[:k] + seen[k + 1 :]) for k, now in enumerate(seen)]
+        usual = None if others is None else [_irises(other, side) for other in others]
+        shut[:, side] = [
+            _is_shut(now, seen[:k] + seen[k + 1 :] if usual is None else usual)
+            for k, now in enumerate(seen)
+        ]
     return [
         _shut(observation, sides) if sides.any() else observation
         for observation, sides in zip(observations, shut, strict=True)

@@ -38,12 +38,12 @@ class SignedDistance:
     Attributes:
         values: (H, W) float32 at pixel centres.
         camera: pinhole camera of full size.
-        step: full-size pixels a cell.
+        step: (2,) full-size pixels a cell, x and y.
     """
 
     values: np.ndarray
     camera: Camera
-    step: float
+    step: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -83,7 +83,7 @@ class Outline:
         depth = (positions @ camera.cam_from_world[2, :3] + camera.cam_from_world[2, 3]).mean()
         scale = camera.K[0, 0] / max(float(depth), 1e-6)
         crowd = max(1.0, count / EFFECTIVE_POINTS) ** 0.5
-        edge = np.hypot(0.5 * distance.step, EDGE_SIGMA_M * scale)
+        edge = np.hypot(0.5 * distance.step.max(), EDGE_SIGMA_M * scale)
         cover = np.hypot(edge, COVER_SIGMA_M * scale) * max(1, pictures) ** 0.5
         sigma = np.stack([np.where(covered, cover, edge), np.full(count, edge)], axis=1) * crowd
         gap = np.full(count, (BALD_GAP_M if bald else HAIR_GAP_M) * scale)
@@ -108,17 +108,19 @@ def signed_distance(alpha: np.ndarray, camera: Camera, side: int = 640) -> Signe
 
     Large mattes are averaged down to about `side` pixels first.
     """
-    step = max(1.0, max(alpha.shape) / side)
-    if step > 1.0:
-        size = (max(1, round(alpha.shape[1] / step)), max(1, round(alpha.shape[0] / step)))
-        alpha = cv2.resize(alpha, size, interpolation=cv2.INTER_AREA)
+    full, shrink = np.array(alpha.shape[::-1]), max(alpha.shape) / side
+    if shrink > 1.0:
+        size = np.maximum(np.rint(full / shrink), 1).astype(int)
+        alpha = cv2.resize(alpha, size.tolist(), interpolation=cv2.INTER_AREA)
+    # Sizes are rounded, so that the two directions differ a little.
+    step = full / alpha.shape[::-1]
     inside = alpha >= 128
     if inside.all() or not inside.any():
         return None
     # Distances are to the nearest pixel of the other side, half a pixel beyond the edge.
     values = np.where(inside, 0.5 - edge_distance(inside), edge_distance(~inside) - 0.5)
     # Full pixels know no part cover; a light blur gives the edge its slope back.
-    return SignedDistance(cv2.GaussianBlur(values, (0, 0), 0.8) * step, camera, step)
+    return SignedDistance(cv2.GaussianBlur(values, (0, 0), 0.8) * step.mean(), camera, step)
 
 
 def sample(distance: SignedDistance, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

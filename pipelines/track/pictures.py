@@ -19,7 +19,7 @@ from pipelines.track.appearance import (
 from pipelines.track.config import TrackConfig
 from pipelines.track.outline import SignedDistance
 from pipelines.track.photometry import OBSERVATIONS, Photometry, Picture, look, robust_mean
-from pipelines.track.pinhole import project_pinhole
+from pipelines.track.pinhole import inside_frame
 from pipelines.track.relief import make_relief, sweep
 from pipelines.track.samples import Samples, Visibility, sample_normals, spread
 from pipelines.track.shots import Shot, detail, root_light
@@ -75,12 +75,10 @@ def see(model: HeadModel, samples: Samples, moment: Moment, mesh: np.ndarray) ->
 
 def inside_picture(shot: Shot, places: np.ndarray) -> np.ndarray:
     """(S,) 0 outside the picture or where the matte says that there is no subject, else to 1."""
-    camera = shot.camera
-    pixels, depth = project_pinhole(camera, places)
-    size = np.array([camera.width, camera.height])
-    inside = (depth > 1e-3) & (pixels >= 1.0).all(1) & (pixels <= size - 1.0).all(1)
+    pixels, inside = inside_frame(shot.camera, places)
     if shot.alpha is None:
         return inside.astype(np.float64)
+    size = np.array([shot.camera.width, shot.camera.height])
     column, row = np.clip(pixels.astype(np.int64), 0, size - 1).T
     return inside * (shot.alpha[row, column] / 255.0)
 

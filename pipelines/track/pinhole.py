@@ -15,6 +15,13 @@ def project_pinhole(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.
     return ray * camera.K[[0, 1], [0, 1]] + camera.K[:2, 2], depth
 
 
+def inside_frame(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Pixels (S, 2) of world points (S, 3), and whether (S,) they lie in the image, a pixel in."""
+    pixels, depth = project_pinhole(camera, points)
+    size = np.array([camera.width, camera.height])
+    return pixels, (depth > 1e-3) & (pixels >= 1.0).all(1) & (pixels <= size - 1.0).all(1)
+
+
 def project_with_slope(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Pixels (..., 2) of world points (..., 3) and d pixel / d point (..., 2, 3)."""
     ray, _, safe = _rays(camera, points)

@@ -20,6 +20,8 @@ COVERED = ("neck", "left_ear", "right_ear")
 HIDDEN = ("mouth_interior", "boundary", "scalp", "teeth", "tongue")
 # A ray may end this far before a sample and still count as reaching it: a tenth of a hair.
 TOUCH_M = 3e-4
+# What hides a sample is part of the head: rays begin so far before it, none behind its camera.
+HEAD_M = 0.5
 GRAZING = 0.25
 
 
@@ -121,10 +123,11 @@ class Visibility:
         direction = ray / np.maximum(distance, 1e-12)[:, None]
         cosine = -(direction * normals).sum(1)
         chosen = np.flatnonzero(cosine > GRAZING)
-        origin = points[chosen] - self.centre - 0.5 * direction[chosen]
+        reach = np.minimum(HEAD_M, distance[chosen])
+        origin = points[chosen] - self.centre - reach[:, None] * direction[chosen]
         cast = np.concatenate([origin, direction[chosen]], axis=1).astype(np.float32)
         hit = self.scene.cast_rays(o3d.core.Tensor(cast))["t_hit"].numpy()
-        clear = hit > np.minimum(0.5, distance[chosen]) - TOUCH_M
+        clear = hit > reach - TOUCH_M
         weights = np.zeros(len(points))
         weights[chosen] = np.where(clear, cosine[chosen], 0.0)
         return weights

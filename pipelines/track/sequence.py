@@ -172,7 +172,10 @@ def _sweep(
         for target, pose in zip(targets, poses, strict=True)
     ]
     swept = list(poses)
-    for number in range(parity, len(poses), 2):
+    for number, frame in enumerate(frames):
+        # By the frame, not by its place: it is the same in every window that it is in.
+        if frame // config.stride % 2 != parity:
+            continue
         middle, spread = _expected(points, frames, number, MAX_GAP * config.stride)
         if middle is None:
             continue
@@ -196,7 +199,7 @@ def _expected(
     for near, far in order:
         if not (0 <= near < len(frames) and 0 <= far < len(frames)):
             continue
-        if max(abs(frames[near] - frames[number]), abs(frames[far] - frames[near])) > 2 * gap:
+        if np.diff(sorted((frames[near], frames[number], frames[far]))).max() > gap:
             continue
         share = (frames[number] - frames[near]) / (frames[far] - frames[near])
         expected = (1 - share) * points[near] + share * points[far]

@@ -30,7 +30,7 @@ from pipelines.track.footage import (
     peak_moments,
 )
 from pipelines.track.frame import held_to_pictures
-from pipelines.track.lids import lid_terms
+from pipelines.track.lids import lid_terms, shut_lids
 from pipelines.track.marks import Eyes, measure_eyes
 from pipelines.track.observe import Observation, facing
 from pipelines.track.offsets import with_modes
@@ -42,7 +42,7 @@ from pipelines.track.result import track_metrics, write_track
 from pipelines.track.sequence import Closer
 from pipelines.track.sheet import write_sheet
 from pipelines.track.sparse_head import Basis, make_basis
-from pipelines.track.start import initial_pose
+from pipelines.track.start import RigScaleError, initial_pose
 from pipelines.track.state import Pose, State, Target, all_vertices, rotations, rounded, start_state
 from pipelines.track.suspects import suspect_cameras
 
@@ -111,7 +111,7 @@ def run(dataset: Dataset, item: str, config: TrackConfig, out: Path) -> dict:
         skin = None
         if config.clip_rounds and appearance is not None:
             skin = skin_of(basis.model, moments, vertices, appearance, config)
-        clips = _clips(dataset, item, basis, state, source, eyes, skin, config, out)
+        clips = _clips(dataset, item, basis, state, observations, source, eyes, skin, config, out)
         clips["held_to_pictures"] = skin is not None
         metrics |= {"dropped": dropped + clips.pop("dropped"), "clips": clips}
     return metrics
@@ -122,6 +122,7 @@ def _clips(
     subject: str,
     basis: Basis,
     state: State,
+    peaks: list[Observation],
     source: Source,
     eyes: Eyes | None,
     skin: Skin | None,
@@ -132,7 +133,9 @@ def _clips(
     cameras = read_cameras_of(dataset, subject)
 
     def observe(cue: str, frame: int) -> Observation | None:
-        return observe_frame(dataset, subject, cameras, cue, frame, source, config)
+        found = observe_frame(dataset, subject, cameras, cue, frame, source, config)
+        # A clip may be one long blink: the peaks tell what open eyes look like.
+        return None if found is None else shut_lids([found], peaks)[0]
 
     closer = None
     if skin is not None:
@@ -179,9 +182,9 @@ def _targets(
     for observation in observations:
         try:
             pose_found = initial_pose(observation, template)
+        except RigScaleError:
+            raise
         except StageError as error:
-            if "rig seems" in str(error):
-                raise
             dropped.append({"what": observation.expression, "why": str(error)})
             continue
         poses.append(pose_found)

@@ -17,6 +17,10 @@ PERSON_M = 0.004
 SCALE_LIMITS = (0.5, 2.0)
 
 
+class RigScaleError(StageError):
+    """The calibration's unit is not the metre: no expression can be tracked with it."""
+
+
 def initial_pose(observation: Observation, template: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Rotation (3, 3) and translation (3,) with world = R @ head + t.
 
@@ -28,14 +32,15 @@ def initial_pose(observation: Observation, template: np.ndarray) -> tuple[np.nda
         template: (68, 3) landmarks of the head model, metres.
 
     Raises:
-        StageError: the rig's unit is not the metre, or too few landmarks.
+        RigScaleError: the rig's unit is not the metre.
+        StageError: too few landmarks.
     """
     seen = INNER[np.isfinite(observation.points[INNER]).all(1)]
     if len(seen) < MIN_TRIANGULATED:
         return _from_one_view(observation, template)
     scale = similarity_fit(template[seen], observation.points[seen])[0]
     if not SCALE_LIMITS[0] < scale < SCALE_LIMITS[1]:
-        raise StageError(
+        raise RigScaleError(
             f"{observation.expression}: the rig seems {_factor(scale)} off: the head measures "
             f"{scale:.3g} times a human head in the calibration's units; expected metres, divide "
             f"the camera translations by {scale:.3g} and calibrate again"

@@ -148,6 +148,20 @@ def test_select_by_ids_and_split(shards):
         reader.select(subjects=["S009"])
 
 
+def test_readers_that_are_gone_leave_no_open_files(shards):
+    def open_files() -> int:
+        return len(list(Path("/proc/self/fd").iterdir()))
+
+    before = open_files()
+    for _ in range(5):
+        reader = ShardReader(shards)
+        for number in range(len(reader)):
+            reader.members(number)
+        assert open_files() > before
+        del reader
+    assert open_files() == before
+
+
 def test_order_is_a_function_of_seed_and_epoch_and_resumes(shards):
     reader = ShardReader(shards)
     whole = [sample["key"] for sample in reader.iterate(seed=3, epoch=1)]

@@ -133,3 +133,18 @@ def test_second_run_on_the_same_stage_is_refused(tmp_path):
     dataset = toy.make_dataset(tmp_path / "data", ["item0"])
     with stage_lock(dataset, "toy"), pytest.raises(StageError, match="another 'toy' runs"):
         toy.run_toy(dataset)
+
+
+def test_a_glance_at_a_lock_keeps_no_stage_from_starting(tmp_path, monkeypatch):
+    import fcntl
+
+    from express50 import locks
+
+    dataset = toy.make_dataset(tmp_path / "data", ["item0"])
+    with locks.stage_lock(dataset, "toy"):
+        pass
+    glance = (dataset.staging_dir / ".toy.lock").open("r")
+    fcntl.flock(glance, fcntl.LOCK_SH)
+    monkeypatch.setattr(locks.time, "sleep", lambda _: glance.close())
+    with locks.stage_lock(dataset, "toy"):
+        assert locks.is_running(dataset, "toy")

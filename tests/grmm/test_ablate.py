@@ -13,7 +13,7 @@ from grmm.anchors import make_anchors
 from grmm.cli import main
 from grmm.shard_source import open_shards
 from tests.grmm.packed import write_shards
-from tests.grmm.synthetic import EllipsoidSource, ellipsoid_head
+from tests.grmm.synthetic import EllipsoidSource, ellipsoid_head, tiny_config
 
 TINY = [
     "--set=model.n_g=32", "--set=model.ladder=[8, 8]", "--set=model.refine_widths=[8]",
@@ -102,6 +102,21 @@ def test_finished_rows_are_kept_and_changed_ones_measured_again(table, roots, mo
     (table / "no_residuals" / "row.json").unlink()
     assert main(command(roots, table)) == 0
     assert trained == ["no_residuals"]
+
+
+def test_rows_of_other_samples_are_trained_afresh(tmp_path, monkeypatch):
+    monkeypatch.setattr(ablate_module, "load_head", lambda spec: ellipsoid_head())
+    gone_on = []
+    monkeypatch.setattr(ablate_module, "train", lambda *a, resume, **k: gone_on.append(resume))
+    config = tiny_config()
+    packed = [
+        write_shards(tmp_path / str(size), EllipsoidSource(subjects=3, size=size))
+        for size in (32, 24)
+    ]
+    for shards in (packed[0], packed[0], packed[1]):
+        ablate_module._train([shards], tmp_path / "row", config)
+        (tmp_path / "row" / "checkpoint.pt").touch()
+    assert gone_on == [False, True, False]
 
 
 def test_unknown_rows_are_named(roots, tmp_path, capsys):

@@ -127,6 +127,8 @@ def test_fit_render_evaluate_export(checkpoint, shards, tmp_path, capsys):
     capsys.readouterr()
     assert main([*evaluate, "--cameras=cam01"]) == 0
     assert json.loads(capsys.readouterr().out)["images"] == 4
+    assert main([*evaluate, "--subjects=S002", "--fit-cameras=cam00", "--fit-expression=e0"]) == 0
+    assert json.loads(capsys.readouterr().out)["images"] > 0, "nothing else on standard output"
 
     assert main(["export", str(checkpoint), str(tmp_path / "head.ply"), "--expression=e1"]) == 0
     cloud = read_ply(tmp_path / "head.ply")

@@ -6,6 +6,7 @@ import torch
 from express50.errors import ConfigError, FormatError
 from grmm import checkpoint as checkpoint_module
 from grmm.checkpoint import load_checkpoint, read_content
+from grmm.edit import trained_head
 from grmm.train import train
 from grmm.withdraw import redact
 from tests.grmm.synthetic import EllipsoidSource, ellipsoid_head, tiny_config
@@ -49,6 +50,25 @@ def test_frames_lent_to_another_persons_fit_go(trained):
     left = read_content(path)
     assert left["subjects"] == content["subjects"]
     assert lender not in {frame["subject"] for frame in left["frames"]} | set(left["offsets"])
+
+
+def test_an_expression_that_nobody_else_shows_goes_with_its_code(trained):
+    path = trained[0]
+    content = read_content(path)
+    (first, *_), (own, *rest) = content["subjects"], content["expressions"]
+    content["frames"] = [
+        f for f in content["frames"] if f["expression_id"] != own or f["subject"] == first
+    ]
+    code = content["model"]["z_exp"][0].numpy().tobytes()
+    torch.save(content, path)
+    assert redact(path, first)
+    assert code not in path.read_bytes()
+    left = load_checkpoint(path)
+    assert list(left.model.expressions) == rest
+    assert torch.equal(left.model.z_exp, content["model"]["z_exp"][1:])
+    for subject in left.model.subjects:
+        for expression in left.model.expressions:
+            trained_head(left, subject, expression)
 
 
 def test_a_model_of_nobody_else_is_deleted_and_other_files_are_refused(trained, tmp_path):

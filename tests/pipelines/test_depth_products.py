@@ -178,7 +178,15 @@ def test_a_surface_that_is_none_is_refused_by_name(tmp_path):
 
 @pytest.mark.parametrize(
     ("name", "value"),
-    [("depth_format", "exr"), ("normal_maps", "8"), ("warm_levels", 0), ("consistency_side", 4)],
+    [
+        ("depth_format", "exr"),
+        ("normal_maps", "8"),
+        ("warm_levels", 0),
+        ("consistency_side", 4),
+        ("fair_voxels", 2.2),
+        ("fair_voxels", 0.0),
+        ("inward_mm", -1.0),
+    ],
 )
 def test_unknown_values_are_named(name, value):
     with pytest.raises(ValueError, match=name):

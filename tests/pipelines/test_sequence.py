@@ -15,7 +15,7 @@ from express50.transforms import axis_angle_to_matrix
 from pipelines.track import clips
 from pipelines.track.clips import SCHEMA, track_clips, write_clips
 from pipelines.track.observe import Observation, View, agree
-from pipelines.track.sequence import freeze_shape, jitter_mm, make_windows, track_window
+from pipelines.track.sequence import _expected, freeze_shape, jitter_mm, make_windows, track_window
 from pipelines.track.sparse_head import Points
 from pipelines.track.state import Pose, State
 from tests.pipelines.test_track import CONFIG, RIG, make_scene
@@ -104,6 +104,14 @@ def test_sweeps_know_no_direction_of_time() -> None:
     mirrored = [dataclasses.replace(one, frame=100 - one.frame) for one in reversed(seen)]
     back = track_window(person, mirrored, config)[::-1]
     np.testing.assert_allclose(meshes(person, ahead), meshes(person, back), atol=3e-4)
+
+
+def test_neighbours_beyond_a_gap_are_none() -> None:
+    points = [np.full((3, 3), float(k)) for k in range(3)]
+    assert _expected(points, [0, 1, 2], 1, 3)[0] is not None
+    assert _expected(points, [0, 3, 6], 1, 3)[0] is not None
+    for frames in ([0, 5, 6], [0, 1, 6], [0, 5, 10]):
+        assert all(_expected(points, frames, n, 3)[0] is None for n in range(3)), frames
 
 
 CUES = (Cue("smile", 0, 4), Cue("frown", 5, 9))

@@ -80,6 +80,16 @@ def test_an_eye_without_its_iris_is_shut(count):
         assert apart.max() < 0.002
 
 
+def test_eyes_shut_all_along_are_told_by_other_times():
+    shut, open_ = np.zeros((3, 2), dtype=bool), np.ones((3, 2), dtype=bool)
+    clip = [observe(shut, "neutral") for _ in range(8)]
+    assert all(not seen.shut for seen in shut_lids(clip))
+    peaks = [observe(open_, time) for time in TIMES]
+    assert all(seen.shut == (LEFT, RIGHT) for seen in shut_lids(clip, peaks))
+    assert not shut_lids([observe(open_, "smile")], peaks)[0].shut
+    assert not shut_lids(clip, [])[0].shut
+
+
 def test_one_iris_by_chance_opens_no_eye():
     found = seen(len(RIG))
     found["wink_left"][1:, LEFT] = False

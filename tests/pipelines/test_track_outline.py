@@ -26,6 +26,21 @@ def test_signed_distance_of_a_disc() -> None:
         np.testing.assert_allclose((gradient * (pixels - 150)).sum(1), radius, rtol=0.2)
 
 
+@pytest.mark.parametrize("axis", [0, 1])
+def test_both_directions_of_a_shrunk_matte_keep_their_scale(axis: int) -> None:
+    """2448 x 2048 at 640 x 535.4 cells, which are 535: a pixel and a half at the lower end."""
+    size, errors = np.array([2448, 2048]), []
+    for edge in range(size[axis] - 160, size[axis] - 120, 3):  # edges are known to a cell
+        alpha = np.full(size[::-1], 255, np.uint8)
+        alpha[(slice(None), slice(edge, None)) if axis == 0 else slice(edge, None)] = 0
+        distance = signed_distance(alpha, make_camera(0.0, 300))
+        assert distance is not None and distance.values.shape == (535, 640)
+        pixels = np.tile(size / 2, (41, 1))
+        pixels[:, axis] = edge + np.linspace(-10, 10, 41)
+        errors.append(np.interp(0.0, sample(distance, pixels)[0], pixels[:, axis]) - edge)
+    assert abs(np.mean(errors)) < 0.4
+
+
 @pytest.mark.parametrize("fill", [0, 255])
 def test_a_matte_without_an_edge_says_nothing(fill: int) -> None:
     assert signed_distance(np.full((40, 40), fill, np.uint8), make_camera(0.0, 40)) is None

@@ -10,6 +10,7 @@ import pytest
 
 from express50.cameras import Camera
 from express50.head.load import load_head
+from express50.transforms import look_at
 from pipelines.track.photometry import Photometry, Picture, bilinear, look, robust_mean
 from pipelines.track.samples import COVERED, Visibility, spread
 from pipelines.track.shots import Shot, cut_shot, detail
@@ -247,6 +248,21 @@ def test_a_head_without_regions_is_skin_all_over() -> None:
     model = ball_head()
     bare = replace(model, regions={})
     assert len(np.unique(spread(bare, 2000).faces)) > 1000
+
+
+@pytest.mark.parametrize("distance", [0.05, 0.3, 0.46, 0.6, 3.0])
+def test_a_plate_hides_another_however_near_the_camera(distance: float) -> None:
+    plate = np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]) * 0.01
+    vertices = np.concatenate([plate, plate + [0.0, 0.0, 0.02]])
+    faces = np.array([[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]])
+    camera = Camera(
+        "cam", 100, 100, "PINHOLE", (100.0, 100.0, 50.0, 50.0),
+        look_at(np.array([0.0, 0, 0.02 + distance]), np.zeros(3), np.array([0.0, 1, 0])),
+    )  # fmt: skip
+    places = np.array([[0.001, 0.002, 0.0], [0.001, 0.002, 0.02]])
+    normals = np.tile([0.0, 0.0, 1.0], (2, 1))
+    weights = Visibility(vertices, faces).weights(camera, places, normals)
+    assert weights[0] == 0 and weights[1] > 0.9
 
 
 def test_what_is_hidden_or_turned_away_is_not_seen() -> None:
