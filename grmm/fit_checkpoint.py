@@ -43,7 +43,7 @@ def save_fit(state: Fit, out: Path) -> None:
     save_checkpoint(
         out / "checkpoint.pt",
         model=model,
-        config=replace(state.loaded.config),
+        config=state.loaded.config,
         head_spec=state.loaded.head_spec,
         gallery=Gallery(frames=own.frames | _donors(state, known), cameras=cameras),
     )

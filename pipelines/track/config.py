@@ -92,8 +92,10 @@ class TrackConfig:
     """Standard deviation of these offsets, metres."""
     offset_length: float = 0.02
     """Their correlation length, metres."""
-    expression_prior: float = 0.45
-    """Standard deviation of expression coefficients; in the neutral frame a fifth of it."""
+    expression_prior: float = 0.2
+    """Mean activation that is expected of an expression's muscles, of which few act at a time; in
+    the neutral frame a fifth of it. Of coefficients that are no activations, as FLAME's, 4.5 times
+    it is the standard deviation."""
     neck_prior: float = 0.2
     """Standard deviation of the neck's joint against the head, radians. A single view hardly sees
     it."""

@@ -8,6 +8,11 @@ from express50.head.model import HeadModel
 from pipelines.track.config import TrackConfig
 
 NEUTRAL_SHARE = 0.2
+# Few muscles act at a time (Bouaziz et al. 2013 have the sum of activations in their fit): up to
+# this they count squared, beyond it by their size.
+ACTIVE = 0.05
+# Of coefficients that are no activations, against the mean of those that are.
+SPREAD = 4.5
 EYE_SIGMA = 0.3
 EYE_DIFFERENCE_SIGMA = 0.03
 JAW_SIGMA = (0.3, 0.06, 0.04)
@@ -20,24 +25,24 @@ def prior(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Residuals (r,) and their slope (r, X + 18) by the own unknowns of one expression.
 
-    Tikhonov terms on every coefficient and joint angle, in standard deviations; one-sided walls at
-    0 and 1 where coefficients are activations, and at the closed jaw; both eyes look alike. Turn
-    and translation of the head are free.
+    Activations are few, beyond one-sided walls at 0 and 1 there are none; other coefficients and
+    joint angles are in standard deviations; there is a wall at the closed jaw; both eyes look
+    alike. Turn and translation of the head are free.
     """
     count = model.expression_dirs.shape[2]
     share = NEUTRAL_SHARE if neutral else 1.0
-    sigma = config.expression_prior if model.unit_expressions else 2.0 * config.expression_prior
-    sigmas = np.concatenate(
-        [
-            np.full(count, sigma * share),
-            np.full(3, config.neck_prior),
-            np.array(JAW_SIGMA) * [share, 1.0, 1.0],
-            np.full(6, EYE_SIGMA),
-        ]
-    )
-    size = len(own)
-    rows = [np.eye(len(sigmas), size) / sigmas[:, None]]
-    residuals = [own[: len(sigmas)] / sigmas]
+    size, mean = len(own), share * config.expression_prior
+    if model.unit_expressions:
+        residual, slope = _few(own[:count], share * ACTIVE, mean)
+    else:
+        residual, slope = own[:count] / (SPREAD * mean), np.full(count, 1.0 / (SPREAD * mean))
+    sigmas = np.r_[
+        np.full(3, config.neck_prior),
+        np.array(JAW_SIGMA) * [share, 1.0, 1.0],
+        np.full(6, EYE_SIGMA),
+    ]
+    residuals = [np.r_[residual, own[count : count + 12] / sigmas]]
+    rows = [np.eye(count + 12, size) * np.r_[slope, 1.0 / sigmas][:, None]]
     eyes = count + 6
     difference = np.zeros((3, size))
     difference[:, eyes : eyes + 3] = np.eye(3) / EYE_DIFFERENCE_SIGMA
@@ -52,6 +57,20 @@ def prior(
         residuals.append(residual)
         rows.append(slope)
     return np.concatenate(residuals), np.concatenate(rows)
+
+
+def _few(activations: np.ndarray, active: float, mean: float) -> tuple[np.ndarray, np.ndarray]:
+    """Residuals (X,) whose halved squares are |activation| / mean, smooth at 0, and their slopes.
+
+    The cost is the pseudo-Huber of width `active`: that of an exponential distribution far from 0.
+    """
+    ratio = activations / active
+    root = np.sqrt(1.0 + ratio**2)
+    # sqrt(2 (root - 1)) without the difference of nearly equal numbers.
+    residual = ratio * np.sqrt(2.0 / (1.0 + root))
+    slope = np.sqrt((1.0 + root) / 2.0) / (root * active)
+    scale = np.sqrt(active / mean)
+    return scale * residual, scale * slope
 
 
 def _wall(

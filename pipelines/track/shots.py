@@ -83,9 +83,6 @@ def detail(image: np.ndarray, shot: Shot, radius: float) -> np.ndarray:
     """
     if shot.alpha is None:
         return image - cv2.GaussianBlur(image, (0, 0), radius)
-    inside = cv2.resize(shot.alpha, image.shape[1::-1], interpolation=cv2.INTER_AREA) / np.float32(
-        255.0
-    )
-    inside = inside + np.float32(1e-3)
+    inside = shot.alpha / np.float32(255.0) + np.float32(1e-3)
     mean = cv2.GaussianBlur(image * inside[..., None], (0, 0), radius)
     return image - mean / cv2.GaussianBlur(inside, (0, 0), radius)[..., None]

@@ -130,6 +130,21 @@ def test_prior_slope_matches_finite_differences(seed: int, unit: bool, neutral: 
     np.testing.assert_array_equal(gradient[-6:], 0.0)
 
 
+def test_one_strong_activation_costs_no_more_than_several_weak_ones() -> None:
+    model = tiny_head(vertices=20)
+    assert model.unit_expressions
+
+    def cost(*activations: float) -> float:
+        own = np.zeros(22)
+        own[: len(activations)] = activations
+        residual, _ = prior(model, own, False, CONFIG)
+        return 0.5 * float(residual @ residual)
+
+    assert cost(0.8) < 1.3 * cost(0.2, 0.2, 0.2, 0.2), "of squares it would be four times as much"
+    assert cost(0.8) - cost(0.4) == pytest.approx(0.4 / CONFIG.expression_prior, rel=0.05)
+    assert cost(1e-9) == pytest.approx(0.0, abs=1e-9)
+
+
 def test_triangulation_survives_wild_outliers() -> None:
     scene = make_scene()
     cameras = [make_camera(angle) for angle in np.linspace(-1, 1, 7)]
