@@ -15,6 +15,7 @@ from torch import Tensor
 
 from express50.errors import FormatError
 from express50.images import read_image, write_image
+from express50.shards_write import sample_key
 from grmm.data import HeadViews, Key
 from grmm.evaluate import Row, compare, row_of
 from grmm.judge import Judge
@@ -26,7 +27,7 @@ NAMED = 5  # how many wrong files an error names
 
 def sample_name(key: Key) -> str:
     """What a sample is called in shards, and a picture of it in a folder."""
-    return f"{key.subject}_{key.expression}_{key.camera}"
+    return sample_key(key.subject, key.expression, key.camera)
 
 
 def find_picture(folder: Path, key: Key) -> Path | None:

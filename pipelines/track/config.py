@@ -143,9 +143,7 @@ PRESETS: dict[str, dict[str, object]] = {
     },
     "standard": {},
     "reference": {
-        "refinements": 5, "iterations": 30, "silhouette_rounds": 4, "relief_rounds": 8,
-        "photo_rounds": 2, "samples": 8000, "photo_side": 1024, "offset_modes": 250,
-        "round_iterations": 6, "sweeps": 4, "clip_rounds": 3,
-        "chart_rounds": 10, "offset_along": 80,
+        "refinements": 5, "iterations": 30, "samples": 8000, "photo_side": 1024,
+        "texture_side": 1024, "round_iterations": 6, "sweeps": 4, "clip_rounds": 3,
     },
 }  # fmt: skip

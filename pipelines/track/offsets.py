@@ -18,12 +18,19 @@ from scipy.sparse.linalg import eigsh
 
 from express50.head.model import HeadModel, vertex_normals
 
+# Parts that move as one or are not skin: their shape is the model's.
 RIGID = (
     "left_eyeball", "right_eyeball", "teeth", "tongue", "gums", "mouth_interior", "boundary",
 )  # fmt: skip
 # Names of modes: all, those along the normals and those along the skin.
 MODE = "offset_"
 OFF, ALONG = f"{MODE}off_", f"{MODE}along_"
+
+
+def movable_vertices(model: HeadModel) -> np.ndarray:
+    """Which vertices (V,) bool may leave the model's shapes: skin, not eyes, teeth and mouth."""
+    rigid = [model.regions[name].numpy() for name in RIGID if name in model.regions]
+    return ~np.any([np.zeros(len(model.template), dtype=bool), *rigid], axis=0)
 
 
 def with_modes(
@@ -73,8 +80,7 @@ def offset_modes(model: HeadModel, count: int, sigma: float, length: float) -> n
     """
     vertices = model.template.double().numpy()
     stiffness, mass = cotangent_laplacian(vertices, model.faces.numpy())
-    rigid = np.any([model.regions[n].numpy() for n in RIGID if n in model.regions], axis=0)
-    free = np.flatnonzero(~rigid & (mass > 1e-11))
+    free = np.flatnonzero(movable_vertices(model) & (mass > 1e-11))
     count = min(count, len(free) - 2)
     core = stiffness[free][:, free].tocsc()
     # A fixed start makes the iteration, and so the modes, the same in every run.

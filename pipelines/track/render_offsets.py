@@ -10,19 +10,10 @@ import scipy.sparse as sparse
 from scipy.sparse.linalg import splu
 
 from express50.head.model import HeadModel
+from pipelines.track.offsets import movable_vertices
 
-# Parts that move as one or are not skin: their shape is the model's.
-FIXED_REGIONS = (
-    "left_eyeball", "right_eyeball", "teeth", "tongue", "gums", "mouth_interior", "boundary",
-)  # fmt: skip
 # Offsets of vertices a centimetre or two apart go together: about a hundred are one unknown.
 INDEPENDENT = 0.01
-
-
-def movable_vertices(model: HeadModel) -> np.ndarray:
-    """Which vertices (V,) bool may have offsets."""
-    fixed = [model.regions[name].numpy() for name in FIXED_REGIONS if name in model.regions]
-    return ~np.logical_or.reduce([np.zeros(len(model.template), dtype=bool), *fixed])
 
 
 class OffsetSpace:

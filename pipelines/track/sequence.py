@@ -17,19 +17,18 @@ import numpy as np
 import torch
 
 from pipelines.track.config import TrackConfig
-from pipelines.track.fit import fit, landmark_sigma
+from pipelines.track.fit import fit
 from pipelines.track.lids import lid_terms
 from pipelines.track.marks import Eyes, with_marks
-from pipelines.track.observe import Observation, facing
+from pipelines.track.observe import Observation
 from pipelines.track.sparse_head import POSE_SIZE, Basis, Points
-from pipelines.track.start import initial_pose
+from pipelines.track.start import initial_pose, posed_sigma
 from pipelines.track.state import Pose, State, Target, start_state
 
 # Vertices beside the landmarks that neighbours are compared by, and how many of all count.
 SPREAD_VERTICES, EFFECTIVE_POINTS = 40, 20
 # Frames further apart than so many strides know nothing of each other.
 MAX_GAP = 3
-MIN_FACING = 0.05
 Closer = Callable[[Basis, Target, Pose], tuple[Target, Pose]]
 
 
@@ -143,9 +142,7 @@ def _target(
     observation: Observation, pose: Pose, config: TrackConfig, spread: np.ndarray
 ) -> Target:
     """What a frame is fitted to; views from behind are left out as at the peaks."""
-    sigma = landmark_sigma(observation, config)
-    seen = [facing(view, pose.rotation, pose.own[-3:]) for view in observation.views]
-    sigma[np.array(seen) < MIN_FACING] = np.inf
+    sigma = posed_sigma(observation, config, pose.rotation, pose.own[-3:])
     return Target(observation, sigma, False, terms=lid_terms(observation), vertices=spread)
 
 

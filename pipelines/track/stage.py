@@ -21,7 +21,7 @@ from pipelines.track.bake import write_texture
 from pipelines.track.chart.network import WEIGHTS as CHART_WEIGHTS
 from pipelines.track.clips import write_clips
 from pipelines.track.config import PRESETS, VERSION, TrackConfig
-from pipelines.track.fit import consistent_sigma, fit, landmark_sigma
+from pipelines.track.fit import consistent_sigma, fit
 from pipelines.track.footage import (
     frame_moment,
     observe_frame,
@@ -32,7 +32,7 @@ from pipelines.track.footage import (
 from pipelines.track.frame import held_to_pictures
 from pipelines.track.lids import lid_terms, shut_lids
 from pipelines.track.marks import Eyes, measure_eyes
-from pipelines.track.observe import Observation, facing
+from pipelines.track.observe import Observation
 from pipelines.track.offsets import with_modes
 from pipelines.track.overlay import draw_overlays
 from pipelines.track.pictures import Skin, skin_of
@@ -42,11 +42,10 @@ from pipelines.track.result import track_metrics, write_track
 from pipelines.track.sequence import Closer
 from pipelines.track.sheet import write_sheet
 from pipelines.track.sparse_head import Basis, make_basis
-from pipelines.track.start import RigScaleError, initial_pose
+from pipelines.track.start import RigScaleError, initial_pose, posed_sigma
 from pipelines.track.state import Pose, State, Target, all_vertices, rotations, rounded, start_state
 from pipelines.track.suspects import suspect_cameras
 
-MIN_FACING = 0.05
 DECIMALS = 7
 
 
@@ -188,10 +187,7 @@ def _targets(
             dropped.append({"what": observation.expression, "why": str(error)})
             continue
         poses.append(pose_found)
-        sigma = landmark_sigma(observation, config)
-        # From behind, the detector can only guess; the pose tells which views those are.
-        behind = [facing(view, *pose_found) < MIN_FACING for view in observation.views]
-        sigma[np.array(behind)] = np.inf
+        sigma = posed_sigma(observation, config, *pose_found)
         neutral = observation.expression == config.neutral
         targets.append(Target(observation, sigma, neutral, terms=lid_terms(observation)))
     return targets, poses

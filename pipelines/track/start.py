@@ -7,7 +7,9 @@ import numpy as np
 
 from express50.errors import StageError
 from express50.transforms import rigid_fit, similarity_fit
-from pipelines.track.observe import Observation
+from pipelines.track.config import TrackConfig
+from pipelines.track.fit import landmark_sigma
+from pipelines.track.observe import Observation, facing
 
 # Jaw-line points slide; brows to mouth are what a rigid alignment may trust.
 INNER = np.arange(17, 68)
@@ -15,6 +17,18 @@ MIN_TRIANGULATED = 12
 # How far, one by one, people's landmarks lie from the template's.
 PERSON_M = 0.004
 SCALE_LIMITS = (0.5, 2.0)
+# Cosine to the camera under which a view is one from behind.
+MIN_FACING = 0.05
+
+
+def posed_sigma(
+    observation: Observation, config: TrackConfig, rotation: np.ndarray, translation: np.ndarray
+) -> np.ndarray:
+    """`landmark_sigma` without the views from behind, where a detector can only guess."""
+    sigma = landmark_sigma(observation, config)
+    ahead = [facing(view, rotation, translation) for view in observation.views]
+    sigma[np.array(ahead) < MIN_FACING] = np.inf
+    return sigma
 
 
 class RigScaleError(StageError):

@@ -16,9 +16,10 @@ from express50.mesh_render import covered
 from express50.transforms import axis_angle_to_matrix
 from pipelines.track.adam import Adam
 from pipelines.track.config import TrackConfig
+from pipelines.track.offsets import movable_vertices
 from pipelines.track.render_config import RenderConfig
 from pipelines.track.render_loss import Shot, make_look, outline
-from pipelines.track.render_offsets import OffsetSpace, movable_vertices
+from pipelines.track.render_offsets import OffsetSpace
 from pipelines.track.render_refine import Problem, Refined, refine, target_of
 from pipelines.track.state import Pose, State
 from tests.pipelines.render_scenes import appearance, head, random_state, ring, shoot, vertices_of

@@ -17,7 +17,7 @@ from express50.cameras import Camera
 from express50.errors import HeadModelError
 from express50.head.model import HeadModel, landmarks
 from express50.mesh_raster import rasterize
-from pipelines.track.offsets import RIGID
+from pipelines.track.offsets import movable_vertices
 from pipelines.track.samples import Samples, flat_barycentrics
 
 # Texels, and how much of the head they cover: about 1.3 mm each on the cheeks.
@@ -108,8 +108,7 @@ def make_chart(model: HeadModel) -> Chart:
     of_texel = face_id[tuple(texels.T)].astype(np.int64)
     bary = flat_barycentrics(places[faces[of_texel]], cell_to_corner(texels[:, ::-1]))
     samples = Samples(of_texel, faces[of_texel], bary)
-    named = [model.regions[name].numpy() for name in RIGID if name in model.regions]
-    inside = np.any([np.zeros(len(vertices), dtype=bool), *named], axis=0)[faces].any(1)
+    inside = (~movable_vertices(model))[faces].any(1)
     shown = np.zeros((HEIGHT, WIDTH))
     shown[tuple(texels.T)] = (radius[samples.corners] * bary).sum(1)
     column, row = np.clip(places[faces].mean(1), 0, (WIDTH - 1, HEIGHT - 1)).astype(np.int64).T
