@@ -20,22 +20,26 @@ def run_handler(
 ) -> int:
     """Call a command's handler and turn its ending into an exit code.
 
-    An Express50Error becomes one line on standard error; any other error is a defect and keeps its
-    traceback.
+    An Express50Error becomes one line on standard error, and so does what the system refuses; any
+    other error is a defect and keeps its traceback.
     """
     try:
         with _stop_on_sigterm():
             code = handler(args)
-        sys.stdout.flush()
+        with _whoever_left():
+            sys.stdout.flush()
         return code
     except ConfigError as error:
         return _fail(program, error, USAGE)
     except Express50Error as error:
         return _fail(program, error, FAILED)
     except BrokenPipeError:
-        # The reader of a pipe left; what follows at exit must not complain either.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return OK
+        with _whoever_left():
+            raise
+        return FAILED
+    except OSError as error:  # the machine's, not a defect: permissions, a full disk, a folder
+        sys.stderr.write(f"{program}: {_told(error)}\n")
+        return FAILED
     except KeyboardInterrupt:
         sys.stderr.write(f"{program}: stopped; what is finished is kept, run the same to go on\n")
         return INTERRUPTED
@@ -46,6 +50,22 @@ def _fail(program: str, error: Express50Error, code: int) -> int:
     line = " ".join(" ".join([str(error), *notes]).split())
     sys.stderr.write(f"{program}: {type(error).__name__}: {line}\n")
     return code
+
+
+@contextlib.contextmanager
+def _whoever_left() -> Iterator[None]:
+    """The reader of a pipe may leave: work goes on, and nothing complains at exit."""
+    try:
+        yield
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def _told(error: OSError) -> str:
+    """What the system refused, and where."""
+    place = f" {error.filename}:" if error.filename is not None else ""
+    words = error.strerror or str(error) or "no reason given"
+    return f"{type(error).__name__}:{place} {words}; is the path right, may it be read and written?"
 
 
 @contextlib.contextmanager
@@ -68,8 +88,9 @@ def _stop_on_sigterm() -> Iterator[None]:
 
 def say(*lines: str) -> None:
     """Write lines to standard output."""
-    for line in lines:
-        sys.stdout.write(line + "\n")
+    with _whoever_left():
+        for line in lines:
+            sys.stdout.write(line + "\n")
 
 
 def say_json(value: object) -> None:

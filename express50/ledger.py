@@ -249,6 +249,8 @@ class Ledger:
 
     def keep_digests(self) -> None:
         """Store new digests in one transaction; one each would cost a disk sync a file."""
+        if self._read_only:
+            return
         with self._change() as database:
             database.executemany(
                 "INSERT OR REPLACE INTO digests VALUES (?, ?, ?, ?, ?)", self._fresh.values()

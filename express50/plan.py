@@ -135,7 +135,7 @@ def measure(dataset: Dataset, stages: Sequence[Stage]) -> dict[str, Measured]:
     if not dataset.ledger.is_file():
         raise StageError(f"{dataset.root}: no ledger.sqlite; expected a dataset that was made")
     footage, found = footage_of(dataset), {}
-    with Ledger(dataset.ledger) as ledger:
+    with Ledger(dataset.ledger, read_only=True) as ledger:
         for stage in stages:
             done = [r for r in ledger.read(stage.name).values() if r.status == "done"]
             if not done:
@@ -177,7 +177,8 @@ def target_of(name: str | None, sizes: Mapping[str, float], measured: Footage) -
         ConfigError: a size is not above 0.
     """
     if bad := {key: value for key, value in sizes.items() if not value > 0}:
-        raise ConfigError(f"target: {bad}, expected sizes above 0")
+        told = ", ".join(f"{key} is {value}" for key, value in bad.items())
+        raise ConfigError(f"target: {told}; expected more than 0")
     values = {key: getattr(measured, key) for key in ("subjects", "expressions", "views", "pixels")}
     values |= TARGETS.get(name or "", {}) | dict(sizes)
     each = measured.frames / max(measured.expressions, 1)

@@ -129,9 +129,8 @@ def run_stage(
     dataset = Dataset(dataset.root.resolve())
     chosen = list(stage.items(dataset) if items is None else items)
     if not chosen:
-        raise StageError(
-            f"{dataset.root}: {stage.name} has nothing to do; run the stages before it first"
-        )
+        before = "name a CAPTURE" if stage.name == "ingest" else "run the stages before it first"
+        raise StageError(f"{dataset.root}: {stage.name} has nothing to do; {before}")
     shared = nullcontext(pool) if pool else Pool(workers, scheduler)
     with shared as workers_pool, stage_lock(dataset, stage.name), Ledger(dataset.ledger) as ledger:
         clean_leftovers(dataset, stage.name)
@@ -210,9 +209,18 @@ def _run_items(
         else:
             tasks.append(Task(stage, dataset, item, config, digest, inputs, pool.threads))
     ledger.keep_digests()
-    # A receipt must not outlive the output it speaks of, should this run be killed half-way.
-    ledger.forget(stage.name, [task.item for task in tasks])
+    reasons = {receipt.reason for receipt in unreadable}
+    if len(unreadable) == len(chosen) > 1 and len(reasons) == 1:
+        # A wrong setting rather than bad items: what was made before stays.
+        raise StageError(f"{stage.name}: no item can be made: {reasons.pop()}")
     log.current(len(outcomes))
+
+    def begin(task: Task) -> None:
+        # A receipt must not outlive the output it speaks of, should this run be killed half-way.
+        if task.item in receipts:
+            ledger.forget(stage.name, [task.item])
+        log.begin(task.item)
+
     with Progress(stage.name, len(tasks) + len(unreadable), progress) as display:
 
         def settle(receipt: Receipt) -> None:
@@ -223,7 +231,7 @@ def _run_items(
 
         for receipt in unreadable:
             settle(receipt)
-        pool.run(tasks, settle, display.tick, lambda task: log.begin(task.item))
+        pool.run(tasks, settle, display.tick, begin)
     ledger.keep_digests()
     return outcomes
 

@@ -51,6 +51,7 @@ def _write(readers: Sequence[ShardReader], out: Path, shard_mb: int) -> int:
         raise FormatError(f"--shard-mb is {shard_mb}, expected at least 1")
     if not any(len(reader) for reader in readers):
         raise FormatError(f"{readers[0].root}: no sample matches; 'express50 shards ls' lists them")
+    _refuse_doubles(readers)
     splits = _splits(readers)
     aside = out.with_name(f".{out.name}.unfinished")
     shutil.rmtree(aside, ignore_errors=True)
@@ -75,6 +76,18 @@ def _write(readers: Sequence[ShardReader], out: Path, shard_mb: int) -> int:
         for reader in readers:
             reader.close()
     return sum(len(reader) for reader in readers)
+
+
+def _refuse_doubles(readers: Sequence[ShardReader]) -> None:
+    owners: dict[tuple[str, str], Path] = {}
+    for reader in readers:
+        for group in reader.groups():
+            if group in owners:
+                raise FormatError(
+                    f"{reader.root}: {'/'.join(group)} is in {owners[group]} too; split one of them"
+                    " so that each expression of a subject is in one folder"
+                )
+            owners[group] = reader.root
 
 
 def _splits(readers: Sequence[ShardReader]) -> dict[str, str]:
@@ -106,6 +119,7 @@ def _copy_offsets(readers: Sequence[ShardReader], out: Path) -> None:
         for subject in sorted({entry.subject for entry in reader.entries}):
             source, target = offsets_file(reader.root, subject), offsets_file(out, subject)
             if not source.is_file():
+                _refuse_lost_offsets(reader, subject)
                 continue
             if target.exists() and target.read_bytes() != source.read_bytes():
                 raise FormatError(
@@ -113,6 +127,14 @@ def _copy_offsets(readers: Sequence[ShardReader], out: Path) -> None:
                     " subject in one run"
                 )
             shutil.copyfile(source, target)
+
+
+def _refuse_lost_offsets(reader: ShardReader, subject: str) -> None:
+    """Samples that are to be moved by offsets are of no use without them."""
+    first = next(n for n, entry in enumerate(reader.entries) if entry.subject == subject)
+    track = reader.meta(first).get("track")
+    if isinstance(track, dict) and track.get("offsets"):
+        reader.offsets(subject)  # says what is missing
 
 
 def _write_card(readers: Sequence[ShardReader], out: Path) -> None:

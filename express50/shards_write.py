@@ -81,7 +81,10 @@ class ShardWriter:
         """
         groups = {(sample.subject, sample.expression) for sample in samples}
         if len(groups) != 1 or groups & self._groups:
-            raise FormatError(f"expected one new (subject, expression) group, got {sorted(groups)}")
+            told = ", ".join(f"{subject}/{expression}" for subject, expression in sorted(groups))
+            raise FormatError(
+                f"{self.root}: {told}: expected all samples of one expression of a subject, once"
+            )
         self._groups |= groups
         size = sum(
             BLOCK + _padded(len(data)) for sample in samples for data in sample.members.values()

@@ -65,8 +65,9 @@ def add_stage_commands(subparsers: Any) -> None:
 
 def _stage_parser(subparsers: Any, name: str, words: str) -> argparse.ArgumentParser:
     parser = subparsers.add_parser(
-        name, help=words, description=words, epilog=f"options of a stage: express50 config {name}"
-    )
+        name, help=words, description=words,
+        epilog=f"options of a stage: express50 config {'STAGE' if name == 'run' else name}",
+    )  # fmt: skip
     parser.add_argument("dataset", type=Path, metavar="DATASET", help="folder of the dataset")
     if name in ("ingest", "run"):
         parser.add_argument(
@@ -208,13 +209,13 @@ def _choose(
     if stage.name == "ingest" and args.captures:
         register = import_module(stages()["ingest"]).register
         subjects = register(dataset, args.captures)
-        if args.command == "ingest" and not pattern:
+        if args.command == "ingest" and pattern is None:
             return subjects
     elif not dataset.root.is_dir():
         raise StageError(
             f"{dataset.root}: no such dataset; run 'express50 ingest {dataset.root} CAPTURE'"
         )
-    if not pattern:
+    if pattern is None:
         return None
     # A stage that another's command runs first may have other items: those of the same subjects.
     asked = select_items(load_stage(args.stage), dataset, pattern)

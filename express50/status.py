@@ -64,10 +64,13 @@ def _stage(name: str, table: dict[str, Receipt], run: Run | None, now: float) ->
     open_items = max(0, run.items - run.current - len(settled)) if run is not None else 0
     rate = _rate(settled, run.begun, now if alive else run.ended or run.seen) if run else 0.0
     failed = tuple(r for r in receipts if r.status == "failed")
+    # Items that wait to be made anew have their former receipts still.
+    former = sum(r.status == "done" and r.time < run.begun for r in receipts) if run else 0
+    former = min(open_items, max(0, former - run.current)) if run is not None else 0
     return StageStatus(
         stage=name,
         state=_state(run, alive, open_items, failed, receipts),
-        done=len(receipts) - len(failed),
+        done=len(receipts) - len(failed) - former,
         failed=failed,
         running=running,
         missing=max(0, open_items - len(running)),

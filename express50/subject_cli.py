@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 from express50.console import FAILED, OK, say, say_json
-from express50.errors import FormatError
 from express50.layout import Dataset
 from express50.withdraw import plan, withdraw
 
@@ -40,6 +39,8 @@ def add_commands(subparsers: Any) -> None:
 def run_withdraw(args: argparse.Namespace) -> int:
     """Withdraw; exit code 1 when a file that names the subject is left."""
     dataset = Dataset(args.dataset)
+    for path in args.checkpoint:  # says what is no model of ours, before anything is removed
+        import_module("grmm.checkpoint").read_content(path)
     if not args.yes:
         paths = [str(path) for path in plan(dataset, args.subject)]
         if args.json:
@@ -50,9 +51,6 @@ def run_withdraw(args: argparse.Namespace) -> int:
             say(*(f"would take codes and frames out of {path}" for path in models))
             say("add --yes to remove")
         return OK
-    for path in args.checkpoint:
-        if not path.is_file():
-            raise FormatError(f"--checkpoint {path}: no such file; name a model of 'grmm train'")
     redact = import_module("grmm.withdraw").redact
     done = withdraw(dataset, args.subject, args.checkpoint, redact)
     account = {

@@ -24,7 +24,7 @@ from express50.ledger import Ledger, check_schema
 from express50.locks import hold_stages
 from express50.names import files_naming, names, says
 from express50.publish import write_json
-from express50.reading import read_json
+from express50.reading import NAME, read_json
 
 Redact = Callable[[Path, str], bool]
 
@@ -47,14 +47,13 @@ def plan(dataset: Dataset, subject: str) -> list[Path]:
     Raises:
         StageError: the dataset knows no such subject.
     """
+    known = {*dataset.captures(), *dataset.subjects()}
+    labelled = NAME.fullmatch(subject) and dataset.labels_file(subject).is_file()
+    # Nothing else may pass: '', '..' or 'shards' would name other folders than a person's.
+    if not (subject in known or labelled or text_digest(subject) in withdrawn(dataset)):
+        there = ", ".join(sorted(known)) or "none"
+        raise StageError(f"{dataset.root}: no subject {subject!r}; subjects: {there}")
     own = sorted(_own_paths(dataset, subject))
-    if (
-        subject not in dataset.captures()
-        and not own
-        and text_digest(subject) not in withdrawn(dataset)
-    ):
-        known = ", ".join(dataset.captures()) or "none"
-        raise StageError(f"{dataset.root}: no subject {subject!r}; subjects: {known}")
     paths = own + sorted(_mixed_paths(dataset))
     return paths + sorted(_naming_items(dataset, subject, paths))
 
@@ -243,7 +242,7 @@ def _forget_rows(dataset: Dataset, subject: str, paths: list[Path]) -> None:
             )
         _forget_naming(database, subject)
         with suppress(sqlite3.OperationalError):  # ledgers of before runs were kept
-            database.execute("UPDATE runs SET running = '{}'")
+            database.execute("DELETE FROM runs")  # they count the person's items
         database.execute("PRAGMA wal_checkpoint(TRUNCATE)")
         database.execute("VACUUM")
         database.execute("PRAGMA wal_checkpoint(TRUNCATE)")

@@ -10,7 +10,7 @@ from typing import Any
 
 from express50.audit.finding import Finding
 from express50.audit.inputs import Judgement, Published, items_of, judge
-from express50.audit.ledger import ledger_fault, set_ledger_aside
+from express50.audit.ledger import ledger_fault, open_ledger, set_ledger_aside
 from express50.audit.outputs import Fault, Looked, StageState, output_faults
 from express50.audit.sources import (
     capture_findings,
@@ -85,7 +85,7 @@ def audit(
         if why := ledger_fault(dataset):
             result.findings.append(_broken_ledger(dataset, why, mend))
         else:
-            with Ledger(dataset.ledger) as ledger:
+            with open_ledger(dataset) as ledger:
                 _Run(dataset, stages, ledger, result, deep, mend).stages_in_order()
         result.findings += _people(dataset, checkpoints)
     stale = [path for path in dataset.stale_dir.rglob("*") if path.is_file()]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from pathlib import Path
 
@@ -15,12 +16,20 @@ def ledger_fault(dataset: Dataset) -> str:
     if not dataset.ledger.is_file():
         return "is not there; without it every output counts as made by nobody"
     try:
-        # Not read-only: such a connection leaves journals behind that it may not remove.
-        with Ledger(dataset.ledger) as ledger:
+        with open_ledger(dataset) as ledger:
             ledger.check_whole()
     except FormatError as error:  # what to do about it, `--mend` knows better
         return str(error).removeprefix(f"{dataset.ledger}: ").split(";")[0]
     return ""
+
+
+def open_ledger(dataset: Dataset) -> Ledger:
+    """The ledger, to be written where that is allowed.
+
+    A connection that only reads leaves journals behind that it may not remove, so it is for
+    datasets of others.
+    """
+    return Ledger(dataset.ledger, read_only=not os.access(dataset.root, os.W_OK))
 
 
 def set_ledger_aside(dataset: Dataset) -> Path:

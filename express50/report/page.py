@@ -102,7 +102,7 @@ def _stage_view(dataset: Dataset, report: StageReport) -> dict:
     figures = scalar_metrics(report)
     columns = list(dict.fromkeys(key for row in figures.values() for key in row))[:_COLUMNS]
     shown = list(figures.items())[:_ROWS]
-    with Ledger(dataset.ledger) as ledger:
+    with Ledger(dataset.ledger, read_only=True) as ledger:
         receipts = ledger.read(report.name)
     return {
         "name": report.name,

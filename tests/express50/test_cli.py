@@ -119,6 +119,23 @@ def test_run_goes_through_the_stages_in_order(run, data, capture):
     assert [account["stage"] for account in json.loads(out)] == ["ingest"]
 
 
+def test_what_the_system_refuses_is_one_line(run, data, capture):
+    assert run("ingest", data, capture)[0] == 0
+    code, _, err = run("report", data, "--out", "/proc/none/report.html")
+    assert code == 1 and err.count("\n") == 1
+    assert "/proc/none" in err and "Traceback" not in err
+
+
+def test_a_reader_that_leaves_stops_nothing(data, capture):
+    command = [sys.executable, "-m", "express50", "ingest", str(data), str(capture)]
+    read, write = os.pipe()
+    os.close(read)
+    environment = {**os.environ, "PYTHONPATH": str(REPOSITORY)}
+    ended = subprocess.run(command, stdout=write, stderr=write, env=environment, check=False)
+    os.close(write)
+    assert ended.returncode == 0 and (data / "ingest" / "S001" / "metrics.json").is_file()
+
+
 def test_version_and_help(run):
     assert run("--version")[:2] == (0, "express50 0.1.0\n")
     code, out, _ = run("--help")

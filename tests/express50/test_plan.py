@@ -77,7 +77,7 @@ def test_every_stage_has_a_law_and_every_target_a_size():
     assert [row.stage for row in rows] == list(stages())
     for name in TARGETS:
         assert target_of(name, {"frames_per_expression": 90}, SMALL).frames in (5400, 1080)
-    with pytest.raises(ConfigError, match="expected sizes above 0"):
+    with pytest.raises(ConfigError, match="views is 0; expected more than 0"):
         target_of(None, {"views": 0}, SMALL)
 
 

@@ -18,6 +18,7 @@ from express50.ledger import Ledger
 from express50.pool import Pool
 from express50.progress import format_rate
 from express50.runner import run_stage, select_items
+from express50.status import read_status
 from express50.work import Task
 from tests.faults import toy
 from tests.faults.toy import make_dataset, run_toy, tree
@@ -97,6 +98,49 @@ def test_stale_output_of_a_failed_item_is_set_aside_and_success_clears_it(tmp_pa
     source.write_text("mended")
     assert run_toy(dataset).ok
     assert not (dataset.stale_dir / "toy" / "bad1").exists()
+
+
+def test_a_run_that_is_stopped_costs_only_the_items_it_had_begun(tmp_path, monkeypatch):
+    dataset = make_dataset(tmp_path / "data", ["a", "b", "c", "d"])
+    run_toy(dataset)
+    real = toy.STAGE.run
+
+    def stopped(dataset, item, config, out):
+        if item == "b":
+            raise KeyboardInterrupt
+        return real(dataset, item, config, out)
+
+    mistyped = dataclasses.replace(toy.STAGE, run=stopped)
+    with pytest.raises(KeyboardInterrupt):
+        run_stage(mistyped, dataset, toy.ToyConfig(word="b"), workers=0, progress=False)
+    with Ledger(dataset.ledger) as ledger:
+        (status,) = read_status(ledger, ["toy"])
+    assert (status.state, status.done, status.missing) == ("stopped", 1, 3)
+    assert statuses(run_toy(dataset)) == {"a": "done", "b": "done", "c": "skipped", "d": "skipped"}
+
+
+def test_a_setting_that_fits_no_item_leaves_what_is_made(tmp_path):
+    dataset = make_dataset(tmp_path / "data", ["a", "b"])
+    run_toy(dataset)
+
+    def without(dataset, item, config):
+        raise StageError("toy.weights /nope.pth: no such file")
+
+    broken = dataclasses.replace(toy.STAGE, inputs=without)
+    with pytest.raises(StageError, match="no item can be made: StageError: toy.weights /nope.pth"):
+        run_stage(broken, dataset, toy.ToyConfig(word="b"), workers=0, progress=False)
+    assert statuses(run_toy(dataset)) == {"a": "skipped", "b": "skipped"}
+
+
+def test_an_unreachable_scheduler_leaves_what_is_made(tmp_path):
+    dataset = make_dataset(tmp_path / "data", ["a", "b"])
+    run_toy(dataset)
+    with pytest.raises(StageError):
+        run_stage(
+            toy.STAGE, dataset, toy.ToyConfig(word="b"), scheduler="tcp://127.0.0.1:1",
+            progress=False,
+        )  # fmt: skip
+    assert statuses(run_toy(dataset)) == {"a": "skipped", "b": "skipped"}
 
 
 def test_outputs_of_vanished_items_are_set_aside_only_by_a_full_run(tmp_path):

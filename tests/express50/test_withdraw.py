@@ -19,6 +19,7 @@ from express50.locks import stage_lock
 from express50.names import files_naming, files_that, names_any_of
 from express50.publish import publishing
 from express50.receipts import Made, Receipt, Run
+from express50.status import read_status
 from express50.withdraw import withdraw, withdrawn, withdrawn_file
 from pipelines import ingest
 from tests.faults.toy import tree
@@ -71,6 +72,35 @@ def test_nothing_of_the_subject_stays_and_the_others_are_untouched(dataset):
     assert dataset.subjects() == ["S002"]
     with Ledger(dataset.ledger) as ledger:
         assert list(ledger.read("ingest")) == ["S002"]
+
+
+@pytest.mark.parametrize("name", ["", ".", "..", "../..", "S001/", "S001/cam00", "shards", "S009"])
+def test_what_is_no_subject_removes_nothing(dataset, name):
+    before = tree(dataset.root.parent)
+    with pytest.raises(StageError, match="no subject .*; subjects: S001, S002"):
+        withdraw(dataset, name)
+    assert main(["subject", "withdraw", str(dataset.root), name, "--yes"]) == 1
+    after = tree(dataset.root.parent)
+    assert {k: v for k, v in after.items() if "ledger" not in k and "staging" not in k} == {
+        k: v for k, v in before.items() if "ledger" not in k and "staging" not in k
+    }
+
+
+def test_a_file_that_is_no_checkpoint_is_said_before_anything_goes(dataset, capsys):
+    other = dataset.root.parent / "notes.txt"
+    other.write_text("S001")
+    for path in (other, dataset.root / "nope.pt"):
+        command = ["subject", "withdraw", str(dataset.root), "S001", f"--checkpoint={path}"]
+        assert main([*command, "--yes"]) == 1
+        assert str(path) in capsys.readouterr().err
+    assert dataset.subjects() == ["S001", "S002"]
+
+
+def test_stages_are_done_without_the_person(dataset):
+    withdraw(dataset, "S001")
+    with Ledger(dataset.ledger) as ledger:
+        (status,) = read_status(ledger, ["ingest"])
+    assert (status.state, status.done, status.missing) == ("done", 1, 0)
 
 
 def test_points_and_pixels_that_spell_an_id_by_chance_name_nobody(dataset):
