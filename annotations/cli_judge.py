@@ -10,7 +10,7 @@ from annotations.agreement import agreement, by_expression, by_pair, marked_clip
 from annotations.coverage import coverage
 from annotations.options import add_annotator, add_selection, add_verb, chosen_subjects
 from annotations.review import describe, disagreements, settlement
-from annotations.store import append_label
+from annotations.store import FLAG_REASONS, append_label
 from annotations.validate import problems
 from express50.console import FAILED, OK, format_table, say, say_json
 from express50.index import read_index
@@ -34,7 +34,8 @@ def add_verbs(verbs) -> None:  # noqa: ANN001 - argparse's type is private
     parser.add_argument("--all", action="store_true", help="also what is settled")
     parser.add_argument(
         "--settle", nargs=3, metavar=("SUBJECT", "EXPRESSION", "VERDICT"),
-        help="verdict: a frame, the annotator who is right, or the reason why there is no peak",
+        help="verdict: a frame, the annotator who is right, or why there is no peak: "
+        f"{', '.join(FLAG_REASONS)}, or flag:REASON",
     )  # fmt: skip
     add_verb(verbs, "coverage", "subjects against expressions, and what is missing", run_coverage)
 

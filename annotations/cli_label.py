@@ -13,6 +13,7 @@ from annotations.store import (
     Label,
     append_label,
     current_labels,
+    last_event,
     make_flag,
     make_mark,
     make_undo,
@@ -21,6 +22,7 @@ from annotations.store import (
 from annotations.suggestions import read_suggestions
 from annotations.worklist import ORDERS, worklist
 from express50.console import OK, format_table, say, say_json
+from express50.errors import AnnotationError
 from express50.index import read_index
 
 
@@ -103,6 +105,11 @@ def run_undo(args: argparse.Namespace) -> int:
     """Append an undo."""
     index = read_index(args.dataset, args.subject)
     undo = make_undo(index, args.expression, args.annotator)
+    events = read_labels(args.dataset, args.subject)
+    if last_event(events, args.expression, args.annotator) is None:
+        raise AnnotationError(
+            f"{args.subject} {args.expression}: {args.annotator} has nothing there to take back"
+        )
     return _keep(args, undo, "took the last event back")
 
 

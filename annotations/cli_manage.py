@@ -13,6 +13,7 @@ from annotations.reference import choose_reference, reference_subject
 from annotations.rules import LAST_FRAME, last_frame_marks
 from annotations.store import Label, append_label, read_labels
 from express50.console import OK, say, say_json
+from express50.errors import AnnotationError
 from express50.exclusions import included_subjects
 from express50.index import read_index
 
@@ -78,9 +79,12 @@ def run_rule(args: argparse.Namespace) -> int:
 def run_exclusion(args: argparse.Namespace) -> int:
     """Append an exclusion, or its end."""
     chosen_subjects(args.dataset, [args.subject])
+    reason = args.reason.strip() if args.verb == "exclude" else None
+    if reason == "":
+        raise AnnotationError(f"{args.subject}: an exclusion needs a reason, as 'heavy makeup'")
     event = Label(
         subject=args.subject, expression="", action=args.verb, annotator=args.annotator,
-        time=time.time(), reason=getattr(args, "reason", None),
+        time=time.time(), reason=reason,
     )  # fmt: skip
     append_label(args.dataset, event)
     if args.json:

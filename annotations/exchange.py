@@ -3,13 +3,21 @@
 from __future__ import annotations
 
 import csv
+import io
 import json
 from collections.abc import Iterable
 from dataclasses import MISSING, asdict, fields
 from pathlib import Path
 from typing import Any, get_type_hints
 
-from annotations.store import ACTIONS, Label, append_label, read_labels
+from annotations.store import (
+    ACTIONS,
+    Label,
+    append_label,
+    check_texts,
+    find_cue,
+    read_labels,
+)
 from express50.errors import AnnotationError
 from express50.index import read_index
 from express50.layout import Dataset
@@ -58,6 +66,8 @@ def import_labels(dataset: Dataset, path: Path) -> tuple[int, int]:
             known[label.subject] = set(read_labels(dataset, label.subject))
     new = [label for label in dict.fromkeys(labels) if label not in known[label.subject]]
     for label in new:
+        check_texts(label)
+    for label in new:
         append_label(dataset, label)
     return len(new), len(labels) - len(new)
 
@@ -75,7 +85,7 @@ def read_table(path: Path) -> list[Label]:
         if not isinstance(rows, list):
             raise AnnotationError(f"{path}: expected a list of events, got {type(rows).__name__}")
     else:
-        rows = csv.DictReader(text.splitlines())
+        rows = csv.DictReader(io.StringIO(text, newline=""))
     try:
         return [_label(row, f"{path}: row {number}") for number, row in enumerate(rows, 1)]
     except csv.Error as error:
@@ -107,6 +117,11 @@ def _label(row: object, where: str) -> Label:
         raise AnnotationError(
             f"{where}: action {given['action']!r}, expected one of {', '.join(ACTIONS)}"
         )
+    framed = given["action"] == "mark" or (given["action"] == "settle" and "reason" not in given)
+    needed = {"frame", "camera", "dhash"} if framed else set()
+    needed |= {"reason"} if given["action"] == "flag" else set()
+    if lacking := sorted(needed - set(given)):
+        raise AnnotationError(f"{where}: a {given['action']} without {', '.join(lacking)}")
     try:
         return Label(**{k: _typed(k, v) for k, v in given.items()})
     except ValueError as error:
@@ -136,9 +151,15 @@ def _check_footage(dataset: Dataset, label: Label, where: str) -> None:
             f"{where}: no subject {label.subject!r}; expected one of"
             f" {', '.join(dataset.subjects())}"
         )
+    index = read_index(dataset, label.subject)
+    if label.expression:
+        try:
+            find_cue(index, label.expression)
+        except AnnotationError as error:
+            raise AnnotationError(f"{where}: {error}") from None
     if label.frame is None:
         return
-    source = read_index(dataset, label.subject).cameras.get(label.camera or "")
+    source = index.cameras.get(label.camera or "")
     found = source.dhash[label.frame] if source and 0 <= label.frame < source.frames else "none"
     if found != label.dhash:
         raise AnnotationError(

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 
 from annotations.store import (
+    FLAG_REASONS,
     Label,
     current_labels,
     labels_by_person,
@@ -16,6 +17,8 @@ from express50.errors import AnnotationError
 from express50.exclusions import included_subjects
 from express50.index import Index, read_index
 from express50.layout import Dataset
+
+FLAG = "flag:"  # before a reason in words, which else might be a name mistyped
 
 
 @dataclass(frozen=True)
@@ -82,18 +85,26 @@ def describe(label: Label) -> str:
 def settlement(
     dataset: Dataset, index: Index, expression: str, verdict: str, annotator: str
 ) -> Label:
-    """The adjudication of a clip: a frame's number, an annotator whose label is right, or a reason.
+    """The adjudication of a clip: a frame's number, an annotator whose label is right, or a reason:
+    one of `FLAG_REASONS`, or any after ``flag:``.
 
     Raises:
-        AnnotationError: the expression is unknown, or the frame is outside its window.
+        AnnotationError: the expression is unknown, the frame is outside its window, or the verdict
+            is none of these.
     """
     voices = current_voices(dataset, index.subject, expression)
     chosen = voices.get(verdict)
     if chosen is None and verdict.lstrip("-").isdigit():
         camera = next((x.camera for x in voices.values() if x.camera), next(iter(index.cameras)))
         return make_mark(index, expression, int(verdict), camera, annotator, action="settle")
+    if chosen is None and verdict not in FLAG_REASONS and not verdict.startswith(FLAG):
+        raise AnnotationError(
+            f"{index.subject} {expression}: {verdict!r} is no frame, annotator of it"
+            f" ({', '.join(voices)}) or usual reason ({', '.join(FLAG_REASONS)}); any other reason"
+            f" is {FLAG}REASON"
+        )
     if chosen is None or chosen.frame is None or chosen.camera is None:
-        reason = (chosen.reason if chosen else verdict) or ""
+        reason = (chosen.reason if chosen else verdict.removeprefix(FLAG)) or ""
         return make_flag(index, expression, reason, annotator, action="settle")
     return make_mark(
         index, expression, chosen.frame, chosen.camera, annotator,

@@ -214,15 +214,30 @@ def _check_frame(index: Index, cue: Cue, source: CameraSource, frame: int | None
         )
 
 
+def check_texts(label: Label) -> None:
+    """Refuse what would break tables, or colour terminals.
+
+    Raises:
+        AnnotationError: the annotator's name or the reason is not one line of text.
+    """
+    for name in ("annotator", "reason"):
+        if not (getattr(label, name) or "").isprintable():
+            raise AnnotationError(
+                f"{label.subject} {label.expression}: {name} {getattr(label, name)!r} has line"
+                " breaks or control characters; expected one line of text"
+            )
+
+
 def append_label(dataset: Dataset, label: Label) -> None:
     """Append one event and sync it to disk; several annotators at once lose nothing.
 
     Raises:
-        AnnotationError: the action is unknown.
+        AnnotationError: the action is unknown, or a text is not one line.
         OSError: it could not be written; then it is not there, or a torn line that is passed over.
     """
     if label.action not in ACTIONS:
         raise AnnotationError(f"action {label.action!r}, expected one of {', '.join(ACTIONS)}")
+    check_texts(label)
     path = dataset.labels_file(label.subject)
     path.parent.mkdir(parents=True, exist_ok=True)
     row = {k: v for k, v in asdict(label).items() if v is not None}
@@ -270,6 +285,16 @@ def read_labels(dataset: Dataset, subject: str) -> list[Label]:
     ]
 
 
+def unreadable_lines(dataset: Dataset, subject: str) -> list[int]:
+    """Lines of a subject's file that `read_labels` passes over, from 1: a crash cut them short."""
+    path = dataset.labels_file(subject)
+    if not path.exists():
+        return []
+    data = read_bytes(path, AnnotationError, mend="restore it")
+    lines = data.decode("utf-8", errors="replace").split("\n")
+    return [n for n, line in enumerate(lines, 1) if line.strip() and _parse(path, n, line) is None]
+
+
 def _parse(path: Path, number: int, line: str) -> Label | None:
     try:
         row = parse_json(line, str(path), AnnotationError)
@@ -307,6 +332,12 @@ def labels_of(labels: Iterable[Label], annotator: str) -> dict[str, Label]:
         if who == annotator and (said := [x for x in stack if x.action != "settle"])
     }
     return dict(sorted(own.items()))
+
+
+def last_event(labels: Iterable[Label], expression: str, annotator: str) -> Label | None:
+    """What an undo of an annotator would take back; None where nothing is left of theirs."""
+    stack = _stacks(labels).get((expression, annotator))
+    return stack[-1] if stack else None
 
 
 def _stacks(labels: Iterable[Label]) -> dict[tuple[str, str], list[Label]]:

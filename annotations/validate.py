@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from annotations.review import disagreements
-from annotations.store import Label, current_labels, find_cue, read_labels
+from annotations.store import Label, current_labels, find_cue, read_labels, unreadable_lines
 from express50.errors import AnnotationError
 from express50.exclusions import included_subjects
 from express50.index import Index, read_index
@@ -19,7 +19,8 @@ class Problem:
 
     Kinds: ``identity`` (the frame is not the one that was labelled), ``window`` (outside the cue),
     ``unknown`` (no such expression or camera), ``contradiction`` (a peak for one, none for another,
-    not settled) and ``coverage`` (no label in force).
+    not settled), ``unreadable`` (a line cut short, or damaged) and ``coverage`` (no label in
+    force).
     """
 
     subject: str
@@ -42,6 +43,9 @@ def problems(dataset: Dataset, subjects: list[str] | None = None) -> list[Proble
 
 def _of_subject(dataset: Dataset, subject: str) -> Iterator[Problem]:
     index, labels = read_index(dataset, subject), read_labels(dataset, subject)
+    for number in unreadable_lines(dataset, subject):
+        what = f"line {number} of {dataset.labels_file(subject)} cannot be read; label that again"
+        yield Problem(subject, "", "unreadable", what)
     for label in labels:
         for kind, what in _of_label(index, label):
             yield Problem(subject, label.expression, kind, f"{label.annotator}: {what}")

@@ -52,7 +52,12 @@ def resolve_config(
         )
     tables = {stage.name, *known_stages}
     values: dict[str, object] = dict(stage.presets[preset])
-    values |= _file_values(stage.name, file, tables)
+    if given := _file_values(stage.name, file, tables):
+        try:
+            build_config(stage, values | given)
+        except ConfigError as error:
+            raise ConfigError(f"{file}: {error}") from None
+        values |= given
     values |= _assigned_values(stage.name, assignments, tables)
     return build_config(stage, values)
 

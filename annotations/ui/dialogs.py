@@ -6,13 +6,15 @@ from rich.table import Table
 from rich.text import Text
 from textual import events
 from textual.app import ComposeResult
-from textual.containers import Vertical
+from textual.containers import Vertical, VerticalScroll
 from textual.screen import ModalScreen
 from textual.widgets import Input, Static
 
 from annotations.store import FLAG_REASONS
 from annotations.ui import theme
 from annotations.ui.keymap import GROUPS
+
+SCROLLING = ("up", "down", "pageup", "pagedown", "home", "end")
 
 
 class FlagDialog(ModalScreen[str | None]):
@@ -24,7 +26,7 @@ class FlagDialog(ModalScreen[str | None]):
         """A list of reasons, and the line for another."""
         with Vertical(classes="dialog") as box:
             box.border_title = "flag: why is there no usable peak?"
-            box.border_subtitle = "Esc: do not flag"
+            box.border_subtitle = "press a number; Esc: do not flag"
             for number, reason in enumerate(FLAG_REASONS, 1):
                 yield Static(_choice(str(number), reason))
             yield Static(_choice(str(len(FLAG_REASONS) + 1), "another reason, in words"))
@@ -74,24 +76,29 @@ class FrameDialog(ModalScreen[int | None]):
             self.dismiss(None)
 
     def on_input_submitted(self, event: Input.Submitted) -> None:
-        """A number; anything else stays."""
-        self.dismiss(int(event.value) if event.value.strip("-+").isdigit() else None)
+        """A number; anything else stays, and what lies outside is not taken."""
+        number = int(event.value) if event.value.strip("-+").isdigit() else None
+        if number is None or self._first <= number <= self._last:
+            self.dismiss(number)
+        else:
+            event.input.clear()
 
 
 class HelpDialog(ModalScreen[None]):
-    """Every key; any key leaves."""
+    """Every key; arrows scroll where the terminal is low, any other key leaves."""
 
     def compose(self) -> ComposeResult:
         """Key tables, side by side where there is room."""
-        with Vertical(classes="dialog help") as box:
+        with VerticalScroll(classes="dialog help") as box:
             box.border_title = "keys"
-            box.border_subtitle = "any key: back to the picture"
+            box.border_subtitle = "↑ ↓ more, any other key: back"
             yield Static(help_table(wide=self.app.size.width >= 110))
 
     def on_key(self, event: events.Key) -> None:
-        """Leave."""
-        event.stop()
-        self.dismiss(None)
+        """Scroll, or leave."""
+        if event.key not in SCROLLING:
+            event.stop()
+            self.dismiss(None)
 
 
 def help_table(wide: bool) -> Table:

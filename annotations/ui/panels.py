@@ -15,12 +15,16 @@ from annotations.ui.scene import Scene
 from annotations.ui.session import Session
 from annotations.ui.view import View
 
+LEAST_CELLS = 6  # fewer say nothing
+
 
 def fit(left: Text, right: Text, width: int) -> Text:
-    """Two texts at the ends of a line; the left one is cut where both do not fit."""
-    room = max(0, width - right.cell_len - 1)
-    left = left.copy()
-    left.truncate(room, overflow="ellipsis")
+    """Two texts at the ends of a line; what does not fit beside the left one is cut."""
+    left, right = left.copy(), right.copy()
+    left.truncate(width, overflow="ellipsis")
+    room = width - left.cell_len - 1
+    right = Text() if room < LEAST_CELLS else right
+    right.truncate(room, overflow="ellipsis")
     left.append(" " * max(0, width - left.cell_len - right.cell_len))
     left.append_text(right)
     left.truncate(width)
@@ -111,16 +115,21 @@ def blink_title(width: int, reference: bool) -> Text:
     return text
 
 
+LAST = ("?", "q")
+
+
 @lru_cache(maxsize=8)
 def hint_line(width: int) -> Text:
-    """As many keys as fit, the most used first; the last one always is the help's."""
+    """As many keys as fit, the most used first; help and the way out always are the last."""
     text = Text(" ")
-    room = width - cell_len("? help") - 3
+    room = width - cell_len("? help  q quit")
     for keys, words in HINTS:
         piece = cell_len(keys) + cell_len(words) + 3
-        if keys != "?" and text.cell_len + piece <= room:
+        if keys not in LAST and text.cell_len + piece <= room:
             _hint(text, keys, words)
-    _hint(text, "?", "help")
+    for keys, words in HINTS:
+        if keys in LAST:
+            _hint(text, keys, words)
     text.truncate(width)
     return text
 

@@ -97,6 +97,8 @@ def audit(
 
 def _broken_ledger(dataset: Dataset, why: str, mend: bool) -> Finding:
     again = f"express50 run {dataset.root}: every item is made again, to the same bytes"
+    if dataset.ledger.exists() and not mend:
+        again = f"--mend, then {again}"
     if mend:
         again = f"set aside as {set_ledger_aside(dataset).name}; {again}"
     return Finding(kind="ledger", what="ledger.sqlite", why=why, mend=again, mended=mend)

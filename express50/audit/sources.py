@@ -15,7 +15,7 @@ from express50.index import index_path
 from express50.layout import Dataset, footage_root
 from express50.stage import Stage
 
-WRONG_LABELS = ("identity", "window", "unknown")
+WRONG_LABELS = ("identity", "window", "unknown", "unreadable")
 
 
 def capture_findings(dataset: Dataset) -> Iterator[Finding]:

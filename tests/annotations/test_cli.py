@@ -148,6 +148,62 @@ def test_validate_finds_a_frame_that_is_not_the_one_labelled(annotate, dataset):
     assert found["counts"]["identity"] == 1
 
 
+def test_a_line_that_cannot_be_read_is_named(annotate, dataset):
+    mark(annotate, "ann", "smile", 14)
+    path = dataset.labels_file("S001")
+    path.write_text("garbage\n" + path.read_text() + '{"a')
+    found = annotate("validate", code=1)
+    assert found["counts"]["unreadable"] == 2
+    assert [row["frame"] for row in annotate("labels")] == [14]
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (["review", "--settle", "S001", "smile", "nobody"], "'nobody' is no frame, annotator"),
+        (["undo", "S001", "neutral"], "has nothing there to take back"),
+        (["flag", "S001", "smile", "a\rb"], "has line breaks or control characters"),
+        (["mark", "S001", "smile", "14", "--annotator", "a\x1b[31m"], "control characters"),
+        (["exclude", "S001", " "], "an exclusion needs a reason"),
+    ],
+)
+def test_slips_of_the_hand_are_refused(annotate, dataset, capsys, words, told):
+    mark(annotate, "ann", "smile", 14)
+    before = dataset.labels_file("S001").read_bytes()
+    verb, *rest = words
+    assert main(["annotate", verb, str(dataset.root), *rest]) == 1
+    err = capsys.readouterr().err
+    assert told in err and err.count("\n") == 1
+    assert dataset.labels_file("S001").read_bytes() == before
+
+
+def test_a_disagreement_is_settled_by_a_reason_in_words(annotate):
+    mark(annotate, "ann", "smile", 14)
+    annotate("review", "--settle", "S001", "smile", "flag:eyes shut", "--annotator", "eve")
+    (label,) = annotate("labels")
+    assert (label["action"], label["reason"]) == ("settle", "eyes shut")
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        ({"frame": None}, "a mark without frame"),
+        ({"expression": "nope"}, "no expression 'nope'"),
+        ({"reason": "a\nb"}, "control characters"),
+    ],
+)
+def test_import_refuses_what_no_verb_would_write(annotate, dataset, tmp_path, capsys, change, told):
+    mark(annotate, "ann", "smile", 14)
+    file = tmp_path / "labels.json"
+    annotate("export", str(file))
+    row = json.loads(file.read_text())[0] | {"annotator": "bob"} | change
+    file.write_text(json.dumps([{k: v for k, v in row.items() if v is not None}]))
+    before = dataset.labels_file("S001").read_bytes()
+    assert main(["annotate", "import", str(dataset.root), str(file)]) == 1
+    assert told in capsys.readouterr().err
+    assert dataset.labels_file("S001").read_bytes() == before
+
+
 def test_reference_is_the_first_unless_chosen(annotate):
     assert annotate("reference") == {"reference": "S001"}
     assert annotate("reference", "S002") == {"reference": "S002"}

@@ -5,10 +5,12 @@ import json
 import shutil
 
 import pytest
+from rich.text import Text
 
 from annotations.store import append_label, current_labels, make_mark, read_labels
 from annotations.ui import player
 from annotations.ui.keymap import GROUPS
+from annotations.ui.panels import fit, hint_line
 from annotations.ui.picture import Picture
 from annotations.ui.strip import CurveStrip
 from express50.index import read_index
@@ -138,6 +140,33 @@ def test_blind_hides_suggestion_curves_and_others_marks_until_one_has_decided(su
     open_again = make_app(suggested, blind=True, expressions=["smile"], subjects=["S001"])
     cursor, strip = drive(open_again, check=look)
     assert {"1", "2", "●", "█"} <= set(strip)
+
+
+def test_narrow_lines_keep_what_one_needs():
+    line = fit(Text(" Jaw open  S001"), Text("2/24 done  doubt 0.04  25 s  0 keys "), 40)
+    assert line.plain.startswith(" Jaw open  S001") and line.cell_len == 40
+    assert fit(Text("x" * 50), Text("cam05"), 40).plain == "x" * 39 + "…"
+    for width in (40, 60, 80, 200):
+        assert hint_line(width).plain.rstrip().endswith("? help  q quit")
+
+
+def test_help_scrolls_in_a_low_terminal(suggested, make_app):
+    app = make_app(suggested)
+
+    async def run():
+        async with app.run_test(size=(80, 24)) as pilot:
+            await pilot.press("question_mark")
+            await pilot.pause()
+            box = app.screen.query_one(".help")
+            assert box.max_scroll_y > 0
+            await pilot.press("end")
+            await pilot.pause(0.5)
+            assert box.scroll_y == box.max_scroll_y and len(app.screen_stack) == 3
+            await pilot.press("x")
+            await pilot.pause()
+            assert len(app.screen_stack) == 2
+
+    asyncio.run(run())
 
 
 def test_zoom_camera_blink_play_and_help_leave_the_label_alone(suggested, make_app, monkeypatch):
