@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from express50.errors import StageError
 from express50.frames import dhash, read_frame
 from express50.images import read_image, write_image
 from express50.index import read_index
@@ -118,9 +119,7 @@ def test_a_salient_network_needs_no_plate(tmp_path) -> None:
     assert {p: p.read_bytes() for p in folder.rglob("*.*")} == before
 
 
-@pytest.mark.parametrize(
-    ("how", "message"), [("nan", "gave NaN"), ("missing", "no such file"), ("pair", "takes 2")]
-)
+@pytest.mark.parametrize(("how", "message"), [("nan", "gave NaN"), ("pair", "takes 2")])
 def test_a_bad_network_fails_items_in_one_line_each(aligned, tmp_path, how, message) -> None:
     path = tmp_path / "net.pt"
     if how == "nan":
@@ -131,6 +130,13 @@ def test_a_bad_network_fails_items_in_one_line_each(aligned, tmp_path, how, mess
     assert summary.count("failed") == 3
     for outcome in summary.outcomes:
         assert outcome.reason.startswith("StageError: alpha.weights") and message in outcome.reason
+
+
+def test_weights_that_are_not_there_are_said_once_and_cost_nothing(aligned, tmp_path) -> None:
+    assert run(aligned).count("done") == 3
+    with pytest.raises(StageError, match="no item can be made: .*alpha.weights .*no such file"):
+        run(aligned, method="salient", weights=str(tmp_path / "net.pt"))
+    assert run(aligned).count("skipped") == 3
 
 
 def test_one_camera_that_fails_leaves_the_others_done(aligned, tmp_path, monkeypatch) -> None:
