@@ -5,7 +5,7 @@ from __future__ import annotations
 import fnmatch
 import functools
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
 from typing import Any
@@ -23,6 +23,8 @@ from express50.receipts import Receipt
 from express50.runlog import RunLog
 from express50.stage import Stage
 from express50.work import Task, fingerprint, input_digests
+
+ALIKE = 3  # so many first items that fail for one reason are no accident
 
 
 @dataclass(frozen=True)
@@ -229,11 +231,32 @@ def _run_items(
             display.settle(receipt)
             log.settle(receipt.item)
 
+        def settle_task(receipt: Receipt) -> None:
+            settle(receipt)
+            ended.append(receipt)
+            if len(ended) == ALIKE < len(tasks):
+                _refuse_alike(stage, ended, receipts)
+
+        ended: list[Receipt] = []
         for receipt in unreadable:
             settle(receipt)
-        pool.run(tasks, settle, display.tick, begin)
+        pool.run(tasks, settle_task, display.tick, begin)
     ledger.keep_digests()
     return outcomes
+
+
+def _refuse_alike(stage: Stage, ended: list[Receipt], former: Mapping[str, Receipt]) -> None:
+    """Stop where the first items fail for one reason though they were made before.
+
+    Raises:
+        StageError: they do: a setting is wrong, and the others' outputs are worth keeping.
+    """
+    made = all(r.item in former and former[r.item].status == "done" for r in ended)
+    if made and all(r.status == "failed" and r.reason == ended[0].reason for r in ended):
+        raise StageError(
+            f"{stage.name}: the first {len(ended)} items fail alike, though they were made before:"
+            f" {ended[0].reason}; mend the setting, or run the same again to go on with the others"
+        )
 
 
 def is_current(dataset: Dataset, receipt: Receipt | None, digest: str) -> bool:

@@ -132,6 +132,23 @@ def test_a_setting_that_fits_no_item_leaves_what_is_made(tmp_path):
     assert statuses(run_toy(dataset)) == {"a": "skipped", "b": "skipped"}
 
 
+@pytest.mark.parametrize("workers", [0, 2])
+def test_a_setting_that_every_item_fails_by_costs_a_few(tmp_path, workers):
+    names = [f"a{n}" for n in range(8)]
+    dataset = make_dataset(tmp_path / "data", names)
+    run_toy(dataset)
+    with pytest.raises(StageError, match="first 3 items fail alike, though they were made before"):
+        run_toy(dataset, workers=workers, files=-1)
+    again = statuses(run_toy(dataset))
+    assert list(again.values()).count("skipped") >= 3
+    assert set(again.values()) == {"done", "skipped"}
+
+
+def test_items_that_never_were_made_may_all_fail(tmp_path):
+    dataset = make_dataset(tmp_path / "data", [f"a{n}" for n in range(8)])
+    assert set(statuses(run_toy(dataset, files=-1)).values()) == {"failed"}
+
+
 def test_an_unreachable_scheduler_leaves_what_is_made(tmp_path):
     dataset = make_dataset(tmp_path / "data", ["a", "b"])
     run_toy(dataset)

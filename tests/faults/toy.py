@@ -48,6 +48,8 @@ def inputs(dataset: Dataset, item: str, config: ToyConfig) -> dict[str, Path | s
 
 def run(dataset: Dataset, item: str, config: ToyConfig, out: Path) -> dict:
     text = (dataset.root / "in" / f"{item.replace('/', '+')}.txt").read_text()
+    if config.files < 0:
+        raise StageError(f"toy.files is {config.files}, expected files")
     (out / "deep").mkdir()
     for number in range(config.files):
         block = hashlib.sha256(f"{config.word}{item}{text}{number}".encode()).digest()
