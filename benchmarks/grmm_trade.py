@@ -58,6 +58,7 @@ class Smaller:
         self.source, self.factor = source, factor
         self.keys: Sequence[Key] = source.keys
         self.head = source.head
+        self.digest = f"{source.digest} by {factor}"
 
     def read(self, index: int) -> Sample:
         """One sample, reduced."""
