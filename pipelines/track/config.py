@@ -143,7 +143,7 @@ PRESETS: dict[str, dict[str, object]] = {
     },
     "standard": {},
     "reference": {
-        "refinements": 5, "iterations": 30, "samples": 8000, "photo_side": 1024,
-        "texture_side": 1024, "round_iterations": 6, "sweeps": 4, "clip_rounds": 3,
+        "refinements": 5, "iterations": 30, "photo_side": 1024, "texture_side": 1024,
+        "round_iterations": 6, "sweeps": 4, "clip_rounds": 3,
     },
 }  # fmt: skip
