@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fnmatch
 import functools
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -10,12 +9,13 @@ from contextlib import nullcontext
 from dataclasses import dataclass
 from typing import Any
 
-from express50.config import config_toml, nearest
+from express50.config import config_toml
 from express50.digests import path_digest
-from express50.errors import ConfigError, Express50Error, StageError
+from express50.errors import Express50Error, StageError
 from express50.layout import Dataset
 from express50.ledger import Ledger
 from express50.locks import stage_lock
+from express50.order import waves_of
 from express50.pool import Pool
 from express50.progress import Progress
 from express50.publish import clean_leftovers, discard_stale, set_aside, write_bytes
@@ -81,23 +81,6 @@ class Summary:
                 yield f"  dropped {part['what']} of {outcome.item}: {part['why']}"
 
 
-def select_items(stage: Stage, dataset: Dataset, pattern: str) -> list[str]:
-    """Items of a stage whose id matches a shell pattern.
-
-    Raises:
-        ConfigError: none does.
-    """
-    known = stage.items(dataset)
-    chosen = [item for item in known if fnmatch.fnmatchcase(item, pattern)]
-    if not chosen:
-        some = ", ".join(known[:8]) + (", ..." if len(known) > 8 else "")
-        raise ConfigError(
-            f"--items {pattern!r}: no item of {stage.name} matches{nearest(pattern, known)}; "
-            f"items: {some or 'none'}"
-        )
-    return chosen
-
-
 def run_stage(
     stage: Stage,
     dataset: Dataset,
@@ -152,34 +135,6 @@ def run_stage(
         raise StageError(f"{stage.name}: no account of {', '.join(sorted(missing))}; run it again")
     seconds = time.perf_counter() - started
     return Summary(stage.name, tuple(outcomes[item] for item in chosen), seconds)
-
-
-def waves_of(stage: Stage, dataset: Dataset, config: Any, chosen: Sequence[str]) -> list[list[str]]:
-    """The items and their sources, in lists of which each needs the ones before it only.
-
-    Raises:
-        StageError: items wait for each other.
-    """
-    needs: dict[str, list[str]] = {}
-    waiting = list(chosen)
-    while waiting:
-        item = waiting.pop()
-        if item not in needs:
-            try:
-                needs[item] = stage.sources(dataset, item, config)
-            except Express50Error:  # the item says so itself when its inputs are read
-                needs[item] = []
-            waiting += needs[item]
-    order = [*chosen, *sorted(set(needs) - set(chosen))]
-    waves: list[list[str]] = []
-    while order:
-        left = set(order)
-        ready = [item for item in order if left.isdisjoint(needs[item])]
-        if not ready:
-            raise StageError(f"{stage.name}: {', '.join(order[:3])} wait for each other")
-        waves.append(ready)
-        order = [item for item in order if not left.isdisjoint(needs[item])]
-    return waves
 
 
 def _run_items(

@@ -204,7 +204,7 @@ def _choose(
     stage: Stage, dataset: Dataset, args: argparse.Namespace, pattern: str | None
 ) -> list[str] | None:
     """Items to run; None for all."""
-    from express50.runner import select_items
+    from express50.order import select_items
 
     if stage.name == "ingest" and args.captures:
         register = import_module(stages()["ingest"]).register

@@ -15,9 +15,10 @@ import pytest
 from express50.clusters import RemoteWorkers
 from express50.errors import ConfigError, StageError
 from express50.ledger import Ledger
+from express50.order import select_items
 from express50.pool import Pool
 from express50.progress import format_rate
-from express50.runner import run_stage, select_items
+from express50.runner import run_stage
 from express50.status import read_status
 from express50.work import Task
 from tests.faults import toy
