@@ -12,7 +12,7 @@ import hashlib
 import json
 import os
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import get_type_hints
@@ -273,26 +273,23 @@ def read_labels(dataset: Dataset, subject: str) -> list[Label]:
     Raises:
         AnnotationError: a whole line is not an event.
     """
-    path = dataset.labels_file(subject)
-    if not path.exists():
-        return []
-    data = read_bytes(path, AnnotationError, mend="restore it")
-    lines = data.decode("utf-8", errors="replace").split("\n")
-    return [
-        label
-        for number, line in enumerate(lines, 1)
-        if line.strip() and (label := _parse(path, number, line)) is not None
-    ]
+    return [label for _, label in _lines(dataset, subject) if label is not None]
 
 
 def unreadable_lines(dataset: Dataset, subject: str) -> list[int]:
     """Lines of a subject's file that `read_labels` passes over, from 1: a crash cut them short."""
+    return [number for number, label in _lines(dataset, subject) if label is None]
+
+
+def _lines(dataset: Dataset, subject: str) -> Iterator[tuple[int, Label | None]]:
+    """Numbers and events of a subject's lines; None where a line cannot be read."""
     path = dataset.labels_file(subject)
     if not path.exists():
-        return []
+        return
     data = read_bytes(path, AnnotationError, mend="restore it")
-    lines = data.decode("utf-8", errors="replace").split("\n")
-    return [n for n, line in enumerate(lines, 1) if line.strip() and _parse(path, n, line) is None]
+    for number, line in enumerate(data.decode("utf-8", errors="replace").split("\n"), 1):
+        if line.strip():
+            yield number, _parse(path, number, line)
 
 
 def _parse(path: Path, number: int, line: str) -> Label | None:

@@ -9,6 +9,7 @@ import os
 import signal
 import sys
 from collections.abc import Callable, Iterator
+from typing import IO
 
 from express50.errors import ConfigError, Express50Error
 
@@ -26,17 +27,13 @@ def run_handler(
     try:
         with _stop_on_sigterm():
             code = handler(args)
-        with _whoever_left():
+        with readers_may_leave(sys.stdout):
             sys.stdout.flush()
         return code
     except ConfigError as error:
         return _fail(program, error, USAGE)
     except Express50Error as error:
         return _fail(program, error, FAILED)
-    except BrokenPipeError:
-        with _whoever_left():
-            raise
-        return FAILED
     except OSError as error:  # the machine's, not a defect: permissions, a full disk, a folder
         sys.stderr.write(f"{program}: {_told(error)}\n")
         return FAILED
@@ -53,12 +50,14 @@ def _fail(program: str, error: Express50Error, code: int) -> int:
 
 
 @contextlib.contextmanager
-def _whoever_left() -> Iterator[None]:
-    """The reader of a pipe may leave: work goes on, and nothing complains at exit."""
+def readers_may_leave(stream: IO[str]) -> Iterator[None]:
+    """Whoever reads what is written within may go: work goes on, nothing complains at exit."""
     try:
         yield
     except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nowhere, stream.fileno())
+        os.close(nowhere)
 
 
 def _told(error: OSError) -> str:
@@ -88,7 +87,7 @@ def _stop_on_sigterm() -> Iterator[None]:
 
 def say(*lines: str) -> None:
     """Write lines to standard output."""
-    with _whoever_left():
+    with readers_may_leave(sys.stdout):
         for line in lines:
             sys.stdout.write(line + "\n")
 

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import os
 import sys
 from typing import Any
 
+from express50.console import readers_may_leave
 from express50.receipts import Receipt
 
 
@@ -44,15 +44,9 @@ class Progress:
             if self._bar is not None:
                 self._bar.console.print(line, markup=False, highlight=False, soft_wrap=True)
             else:
-                self._write(line + "\n")
-
-    def _write(self, text: str) -> None:
-        try:
-            sys.stderr.write(text)
-            sys.stderr.flush()
-        except BrokenPipeError:  # nobody reads any more; the items are what counts
-            self.enabled = False
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stderr.fileno())
+                with readers_may_leave(sys.stderr):
+                    sys.stderr.write(line + "\n")
+                    sys.stderr.flush()
 
     def tick(self) -> None:
         """Redraw rate and time left while nothing ends."""

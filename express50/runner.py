@@ -178,6 +178,7 @@ def _run_items(
             ledger.forget(stage.name, [task.item])
         log.begin(task.item)
 
+    ended: list[Receipt] = []
     with Progress(stage.name, len(tasks) + len(unreadable), progress) as display:
 
         def settle(receipt: Receipt) -> None:
@@ -192,7 +193,6 @@ def _run_items(
             if len(ended) == ALIKE < len(tasks):
                 _refuse_alike(stage, ended, receipts)
 
-        ended: list[Receipt] = []
         for receipt in unreadable:
             settle(receipt)
         pool.run(tasks, settle_task, display.tick, begin)

@@ -65,8 +65,10 @@ def _stage(name: str, table: dict[str, Receipt], run: Run | None, now: float) ->
     rate = _rate(settled, run.begun, now if alive else run.ended or run.seen) if run else 0.0
     failed = tuple(r for r in receipts if r.status == "failed")
     # Items that wait to be made anew have their former receipts still.
-    former = sum(r.status == "done" and r.time < run.begun for r in receipts) if run else 0
-    former = min(open_items, max(0, former - run.current)) if run is not None else 0
+    former = 0
+    if run is not None:
+        older = sum(r.status == "done" and r.time < run.begun for r in receipts)
+        former = min(open_items, max(0, older - run.current))
     return StageStatus(
         stage=name,
         state=_state(run, alive, open_items, failed, receipts),

@@ -11,6 +11,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
+from express50.console import readers_may_leave
 from express50.errors import ConfigError, FormatError, TrainError
 from express50.publish import write_bytes
 from express50.reading import parse_json, read_text
@@ -67,8 +68,9 @@ def start_log(path: Path, iteration: int) -> None:
 
 def log(line: str) -> None:
     """Progress goes to standard error: standard output is for results."""
-    sys.stderr.write(line + "\n")
-    sys.stderr.flush()
+    with readers_may_leave(sys.stderr):
+        sys.stderr.write(line + "\n")
+        sys.stderr.flush()
 
 
 @dataclass

@@ -23,12 +23,9 @@ from pipelines.photo.picture import open_picture
 
 STAGES = ("ingest", "calibrate", "observe", "align", "track")
 MATTE_STAGES = ("alpha", "matte")
-# One view cannot tell an expression or a bent neck from a shape: both stay nearer to rest. Without
-# mattes and other views the jaw's width hangs on its landmarks alone.
-PHOTO_SETTINGS = (
-    "track.neck_prior=0.03", "track.contour_weight=0.7",
-    "observe.min_score=0.2",
-)  # fmt: skip
+# One view cannot tell a bent neck from a shape: it stays nearer to rest. Without mattes and other
+# views the jaw's width hangs on its landmarks alone.
+PHOTO_SETTINGS = ("track.neck_prior=0.03", "track.contour_weight=0.7", "observe.min_score=0.2")
 WORDS = "track the face of a bare photograph or video, without calibration"
 
 
