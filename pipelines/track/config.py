@@ -7,7 +7,7 @@ from typing import Literal
 
 from express50.errors import ConfigError
 
-VERSION = 9  # of the stage: outputs of another are made anew
+VERSION = 10  # of the stage: outputs of another are made anew
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,6 +37,9 @@ class TrackConfig:
     all."""
     refinements: int = 3
     """Detector crops after the coarse pass."""
+    search: float = 0.25
+    """Smallest windows searched where no face is found, of the image's longer side. A face is found
+    in windows of up to three times its width; cameras behind the head cost more the smaller."""
     iterations: int = 14
     """Levenberg-Marquardt steps of the landmark fit."""
     silhouette_rounds: int = 3
@@ -110,6 +113,8 @@ class TrackConfig:
             )
         if self.iterations < 1 or self.refinements < 1:
             raise ConfigError("track: iterations and refinements must be at least 1")
+        if not 0.02 <= self.search <= 1:
+            raise ConfigError(f"track: search is {self.search}, expected 0.02 to 1")
         priors = (self.shape_prior, self.expression_prior, self.neck_prior)
         if min(self.landmark_floor_px, self.smooth_mm, self.landmark_bias, *priors) <= 0:
             raise ConfigError(
@@ -136,7 +141,7 @@ class TrackConfig:
 
 PRESETS: dict[str, dict[str, object]] = {
     "draft": {
-        "cameras": 6, "refinements": 2, "iterations": 8, "silhouette_rounds": 2,
+        "cameras": 6, "refinements": 2, "search": 0.5, "iterations": 8, "silhouette_rounds": 2,
         "relief_rounds": 4, "photo_rounds": 0, "samples": 2000, "offset_modes": 80,
         "round_iterations": 2, "sweeps": 1, "texture_side": 256, "clip_rounds": 0,
         "chart_rounds": 4, "offset_along": 12,

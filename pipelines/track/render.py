@@ -21,9 +21,9 @@ from pipelines.track.render_refine import refine
 from pipelines.track.shots import Shot as Crop
 from pipelines.track.state import State, Target, all_vertices
 
-# Near the end of the fit: small steps, and no offsets beyond those that the shape already holds.
+# Near the end of the fit: small steps. Outlines were fitted before, against the whole mattes.
 STEPS = RenderConfig(
-    levels=(2, 1), outline=0.0, offset_rate=0.0, shape_rate=0.01, expression_rate=0.01,
+    levels=(2, 1), outline=0.0, shape_rate=0.01, expression_rate=0.01,
     joint_rate=0.002, turn_rate=0.001, move_rate=0.0003,
 )  # fmt: skip
 TEXTURE_SIDE = 512
@@ -56,9 +56,8 @@ def rendered_like_pictures(
     )
     shots = [[_shot(crop) for crop in moment.shots] for moment in moments]
     neutral = [target.neutral for target in targets]
-    offsets = np.zeros((len(model.template), 3))
     steps = replace(STEPS, rounds=config.render_rounds)
-    found = refine(model, state, offsets, look, shots, neutral, config, steps).state
+    found = refine(model, state, look, shots, neutral, config, steps).state
     return replace(found, bias=state.bias)
 
 

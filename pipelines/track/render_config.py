@@ -21,8 +21,6 @@ class RenderConfig:
     """Weight of the mean difference of colours."""
     outline: float = 3.0
     """Weight of the area between outlines, as a share of the head's."""
-    bald: bool = False
-    """The scalp's own outline is in the pictures, not that of hair."""
     softness: float = 0.02
     """Differences of colour below it count squared, those above it by their size."""
     prior: float = 2e-5
@@ -37,22 +35,14 @@ class RenderConfig:
     """First step of the head's turn, radians."""
     move_rate: float = 0.001
     """First step of the head's place, metres."""
-    offset_rate: float = 0.0003
-    """First step of the static offsets, metres; they move at the last level only."""
-    offset_sigma: float = 0.003
-    """Standard deviation of offsets, metres."""
-    offset_bend: float = 0.0003
-    """Standard deviation of an offset from the mean of those around it, metres."""
-    offset_smoothing: float = 20.0
-    """How far a step of the offsets spreads over the mesh, in squared edges."""
 
     def __post_init__(self) -> None:
         """Refuse values that cannot work."""
         if not self.levels or min(self.levels) < 1 or min(self.rounds, self.steps) < 1:
             raise ConfigError("track: render levels, rounds and steps must be at least 1")
-        if min(self.softness, self.offset_sigma, self.offset_bend) <= 0:
-            raise ConfigError("track: render softness and sigmas must be above 0")
-        weights = (self.photometric, self.outline, self.prior, self.offset_smoothing)
+        if self.softness <= 0:
+            raise ConfigError("track: render softness must be above 0")
+        weights = (self.photometric, self.outline, self.prior)
         rates = (self.shape_rate, self.expression_rate, self.joint_rate, self.turn_rate)
-        if min(*weights, *rates, self.move_rate, self.offset_rate) < 0:
+        if min(*weights, *rates, self.move_rate) < 0:
             raise ConfigError("track: render weights and rates must not be negative")

@@ -101,18 +101,16 @@ class Target:
     gain: Tensor
 
 
-def make_look(
-    model: HeadModel, appearance: Appearance, divisor: int = 1, bald: bool = False
-) -> Look:
+def make_look(model: HeadModel, appearance: Appearance, divisor: int = 1) -> Look:
     """Tensors of a head and its appearance for pictures reduced by a divisor.
 
     The albedo is reduced as the pictures are: one sample a pixel would alias a finer one. Outlines
-    of the scalp are only compared where the head is bald, those of the neck's end never.
+    of the scalp, where hair stands, and of the neck's end are not compared.
     """
     check_shape("albedo", appearance.albedo, (None, None, 3), "appearance")
     check_shape("light", appearance.light, (9, 3), "appearance")
     bare = torch.ones(len(model.template), dtype=torch.bool)
-    for name in ("boundary",) if bald else ("boundary", "scalp"):
+    for name in ("boundary", "scalp"):
         if name in model.regions:
             bare &= ~model.regions[name]
     height, width = (max(1, round(n / divisor)) for n in appearance.albedo.shape[:2])

@@ -1,7 +1,7 @@
 """Render the head, compare it with every picture, follow the gradient: the slow, last refinement.
 
 Each step takes one expression with all its views, poses the mesh once and changes only that
-expression's own parameters, the shared shape and the offsets. Every expression has an optimiser of
+expression's own parameters and the shared shape. Every expression has an optimiser of
 its own, so one that is not looked at does not drift on stale momentum. Visibility is found once a
 visit and kept for its few steps. Coarse to fine.
 """
@@ -9,7 +9,6 @@ visit and kept for its few steps. Coarse to fine.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,7 +16,6 @@ import torch
 from torch import Tensor
 
 from express50.cameras import transform_camera
-from express50.checks import check_shape
 from express50.errors import StageError
 from express50.head.model import HeadModel
 from express50.head.model import pose as pose_head
@@ -41,7 +39,6 @@ from pipelines.track.render_loss import (
     photometric,
     vertex_light,
 )
-from pipelines.track.render_offsets import OffsetSpace
 from pipelines.track.state import Pose, State
 
 
@@ -51,12 +48,10 @@ class Refined:
 
     Attributes:
         state: shape and poses.
-        offsets: (V, 3) float64, rest pose, metres.
         before, after: mean data term of the expressions at the last level.
     """
 
     state: State
-    offsets: np.ndarray
     before: float
     after: float
 
@@ -64,24 +59,19 @@ class Refined:
 class Problem:
     """The unknowns, their optimisers and what stays the same through all steps.
 
-    `poses`, `shape` (S,) and `offsets` (V, 3) hold the current values; `look` is set for the level.
+    `poses` and `shape` (S,) hold the current values; `look` is set for the level.
     """
 
     def __init__(
         self,
         model: HeadModel,
         state: State,
-        offsets: np.ndarray,
         look: Look,
         track: TrackConfig,
         config: RenderConfig,
     ) -> None:
         self.model, self.look, self.track, self.config = model, look, track, config
         self.shape, self.poses = state.shape.copy(), list(state.poses)
-        self.offsets = offsets.astype(np.float64)
-        self.space = OffsetSpace(
-            model, config.offset_sigma, config.offset_bend, config.offset_smoothing
-        )
         self.faces = np.ascontiguousarray(model.faces.numpy(), dtype=np.int32)
         self.neighbors = face_neighbors(self.faces)
         count = model.expression_dirs.shape[2]
@@ -91,21 +81,19 @@ class Problem:
         )
         self.own_steps = [Adam(pose.own.shape) for pose in self.poses]
         self.shape_step = Adam(self.shape.shape)
-        self.offset_rate = config.offset_rate
-        self.offset_step = Adam(self.offsets.shape, uniform=True)
 
-    def leaves(self, index: int) -> tuple[Tensor, Tensor, Tensor]:
-        """Shape, own parameters of an expression and offsets as leaves of a graph."""
-        arrays = (self.shape, self.poses[index].own, self.offsets)
-        shape, own, offsets = (torch.from_numpy(a).float().requires_grad_() for a in arrays)
-        return shape, own, offsets
+    def leaves(self, index: int) -> tuple[Tensor, Tensor]:
+        """Shape and own parameters of an expression as leaves of a graph."""
+        arrays = (self.shape, self.poses[index].own)
+        shape, own = (torch.from_numpy(a).float().requires_grad_() for a in arrays)
+        return shape, own
 
-    def vertices(self, index: int, shape: Tensor, own: Tensor, offsets: Tensor) -> Tensor:
+    def vertices(self, index: int, shape: Tensor, own: Tensor) -> Tensor:
         """World vertices (V, 3) of an expression."""
         rotation = torch.from_numpy(self.poses[index].rotation).float()
-        return posed_vertices(self.model, shape, own, rotation, offsets)
+        return posed_vertices(self.model, shape, own, rotation)
 
-    def see(self, index: int, targets: list[Target], pool: ThreadPoolExecutor) -> list[Covered]:
+    def see(self, index: int, targets: list[Target]) -> list[Covered]:
         """What every camera sees of an expression now."""
         with torch.inference_mode():
             vertices = self.vertices(index, *self.leaves(index)).numpy()
@@ -121,7 +109,7 @@ class Problem:
                 )
             return covered(seen)
 
-        return list(pool.map(look, targets))
+        return [look(target) for target in targets]
 
     def data_term(self, vertices: Tensor, targets: list[Target], views: list[Covered]) -> Tensor:
         """How far the views of one expression are from their pictures."""
@@ -139,9 +127,9 @@ class Problem:
             views
         )
 
-    def measure(self, index: int, targets: list[Target], pool: ThreadPoolExecutor) -> float:
+    def measure(self, index: int, targets: list[Target]) -> float:
         """The data term of an expression as it stands."""
-        views = self.see(index, targets, pool)
+        views = self.see(index, targets)
         with torch.no_grad():
             vertices = self.vertices(index, *self.leaves(index))
             return float(self.data_term(vertices, targets, views))
@@ -149,14 +137,14 @@ class Problem:
     def step(
         self, index: int, neutral: bool, targets: list[Target], views: list[Covered], rate: float
     ) -> None:
-        """One step of an expression, the shape and the offsets."""
+        """One step of an expression and the shape."""
         leaves = self.leaves(index)
         loss = self.data_term(self.vertices(index, *leaves), targets, views)
         if not torch.isfinite(loss):
             raise StageError("render refinement diverged; lower its rates or start nearer")
         # nothing that is trusted or known may be in view
         seen = loss.requires_grad
-        found = torch.autograd.grad(loss, leaves, allow_unused=True) if seen else (None,) * 3
+        found = torch.autograd.grad(loss, leaves, allow_unused=True) if seen else (None,) * 2
         data = [
             np.zeros(leaf.shape) if gradient is None else gradient.double().numpy()
             for gradient, leaf in zip(found, leaves, strict=True)
@@ -169,57 +157,42 @@ class Problem:
         if config.shape_rate > 0:
             gradient = data[0] + weight * self.track.shape_prior * self.shape
             self.shape += rate * config.shape_rate * self.shape_step.step(gradient)
-        if self.offset_rate > 0:
-            gradient = data[2] + weight * self.space.prior(self.offsets)[1]
-            gradient[~self.space.movable] = 0.0
-            smooth = self.space.smooth(self.offset_step.step(self.space.smooth(gradient)))
-            smooth[~self.space.movable] = 0.0
-            self.offsets += rate * self.offset_rate * smooth
 
 
-def posed_vertices(
-    model: HeadModel, shape: Tensor, own: Tensor, rotation: Tensor, offsets: Tensor
-) -> Tensor:
+def posed_vertices(model: HeadModel, shape: Tensor, own: Tensor, rotation: Tensor) -> Tensor:
     """World vertices (V, 3) of one expression's parameters, laid out as in `fit.Pose`."""
     count = model.expression_dirs.shape[2]
     expression, joints, turn, place = own.split([count, 12, 3, 3])
     neck, jaw, eyes = joints[None].split([3, 3, 6], dim=1)
-    head = pose_head(model, shape[None], expression[None], neck, jaw, eyes, offsets=offsets[None])[
-        0
-    ]
+    head = pose_head(model, shape[None], expression[None], neck, jaw, eyes)[0]
     return head @ (axis_angle_to_matrix(turn) @ rotation).T + place
 
 
 def refine(
     model: HeadModel,
     state: State,
-    offsets: np.ndarray,
     appearance: Appearance,
     shots: Sequence[Sequence[Shot]],
     neutral: Sequence[bool],
     track: TrackConfig,
     config: RenderConfig,
-    workers: int = 1,
 ) -> Refined:
     """Refine a fitted head so that its renderings match the pictures. Deterministic.
 
     Args:
         model: the head model.
         state: shape and one pose an expression.
-        offsets: (V, 3) metres in the rest pose.
         appearance: albedo, light and gains; they are not changed.
         shots: for every pose its pictures; an expression without any stays as it is.
         neutral: which poses are the resting face.
         track: the priors' settings.
         config: steps, weights and rates.
-        workers: threads over views that look for visibility; the result does not depend on it.
 
     Raises:
         StageError: the fit diverged, or the native library is missing.
-        ValueError: shapes or lengths do not fit.
+        ValueError: lengths do not fit.
     """
     model = model.to("cpu", torch.float32)
-    check_shape("offsets", offsets, (len(model.template), 3), "render refinement")
     if not len(state.poses) == len(shots) == len(neutral):
         raise ValueError(
             f"render refinement: {len(state.poses)} poses, {len(shots)} lists of shots and"
@@ -227,36 +200,31 @@ def refine(
         )
     # Far from the origin float32 is too coarse for tenths of a millimetre.
     origin = np.mean([pose.own[-3:] for pose in state.poses], axis=0) if shots else np.zeros(3)
-    looks = {d: make_look(model, appearance, d, config.bald) for d in config.levels}
+    looks = {d: make_look(model, appearance, d) for d in config.levels}
     finest = config.levels[-1]
-    problem = Problem(model, _shifted(state, -origin), offsets, looks[finest], track, config)
+    problem = Problem(model, _shifted(state, -origin), looks[finest], track, config)
     looked_at = [index for index, views in enumerate(shots) if views]
 
     def targets(index: int, divisor: int) -> list[Target]:
         return [target_of(shot, appearance, divisor, origin) for shot in shots[index]]
 
-    with ThreadPoolExecutor(max_workers=workers) as pool:
+    def data_term() -> float:
+        terms = (problem.measure(i, targets(i, finest)) for i in looked_at)
+        return sum(terms) / max(1, len(looked_at))
 
-        def data_term() -> float:
-            terms = (problem.measure(i, targets(i, finest), pool) for i in looked_at)
-            return sum(terms) / max(1, len(looked_at))
-
-        before = data_term()
-        for place, divisor in enumerate(config.levels):
-            problem.look = looks[divisor]
-            # offsets take what shape and pose leave; let in earlier they would take from both
-            problem.offset_rate = config.offset_rate if place == len(config.levels) - 1 else 0.0
-            for visit in range(config.rounds):
-                done = (place + visit / config.rounds) / len(config.levels)
-                # there and back, so that the shape is not always left to the last expression
-                for index in looked_at[:: 1 if visit % 2 == 0 else -1]:
-                    views = targets(index, divisor)
-                    seen = problem.see(index, views, pool)
-                    for _ in range(config.steps):
-                        problem.step(index, neutral[index], views, seen, 0.1**done)
-        after = data_term()
-    moved = _shifted(State(problem.shape, tuple(problem.poses)), origin)
-    return Refined(moved, problem.offsets, before, after)
+    before = data_term()
+    for place, divisor in enumerate(config.levels):
+        problem.look = looks[divisor]
+        for visit in range(config.rounds):
+            done = (place + visit / config.rounds) / len(config.levels)
+            # there and back, so that the shape is not always left to the last expression
+            for index in looked_at[:: 1 if visit % 2 == 0 else -1]:
+                views = targets(index, divisor)
+                seen = problem.see(index, views)
+                for _ in range(config.steps):
+                    problem.step(index, neutral[index], views, seen, 0.1**done)
+    after = data_term()
+    return Refined(_shifted(State(problem.shape, tuple(problem.poses)), origin), before, after)
 
 
 def target_of(shot: Shot, appearance: Appearance, divisor: int, origin: np.ndarray) -> Target:

@@ -69,12 +69,11 @@ def random_state(expressions: int, place: np.ndarray, seed: int = 0) -> State:
     return State(shape, tuple(poses))
 
 
-def vertices_of(state: State, index: int, offsets: np.ndarray | None = None) -> np.ndarray:
+def vertices_of(state: State, index: int) -> np.ndarray:
     """World vertices (V, 3) float64."""
     model = head().to(dtype=torch.float64)
     pose = state.poses[index]
-    offsets = np.zeros(model.template.shape) if offsets is None else offsets
-    arrays = (state.shape, pose.own, pose.rotation, offsets)
+    arrays = (state.shape, pose.own, pose.rotation)
     return posed_vertices(model, *(torch.from_numpy(a) for a in arrays)).numpy()
 
 
