@@ -254,7 +254,7 @@ def _write_sheet(dataset: Dataset, index: Index, peaks: dict, out: Path) -> None
 
 STAGE = Stage(
     name="align",
-    version=4,
+    version=5,
     config=AlignConfig,
     presets={"draft": {}, "standard": {}, "reference": {}},
     items=Dataset.subjects,

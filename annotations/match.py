@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from annotations.features import Features, expression_values, measure
-from annotations.observe import NEUTRAL, Observations
+from annotations.observe import NEUTRAL, SEEN_SCORE, Observations
 from annotations.suggest import (
     Canonical,
     Suggestion,
@@ -30,7 +30,8 @@ class Watched:
         subject: id.
         camera: that sees the face best.
         frames: (F,) observed frames.
-        windows: expression id -> rows of ``frames`` in its cue window; none is empty.
+        windows: expression id -> rows of ``frames`` in its cue window that show the face; none is
+            empty.
         features: of those rows.
     """
 
@@ -53,11 +54,13 @@ class Reference:
 def watch(index: Index, observations: Observations) -> Watched:
     """Features of a subject, by cue window.
 
-    Expressions whose window holds no observed frame are left out.
+    Expressions whose window holds no observed frame that shows a face are left out.
     """
     windows = {}
+    shown = observations.scores.max(axis=0) >= SEEN_SCORE
     for cue in index.cues:
         seen = (observations.frames >= cue.start_frame) & (observations.frames <= cue.end_frame)
+        seen &= shown
         if seen.any():
             windows[cue.expression_id] = np.flatnonzero(seen)
     features = measure(observations, windows)

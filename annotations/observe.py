@@ -7,7 +7,9 @@ footage.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +27,8 @@ from express50.stage import Stage
 
 SCHEMA = "express50.observations/1"
 NEUTRAL = "neutral"
+TRIES = 8  # frames all over the clips in which a face is looked for, should rest show none
+SEEN_SCORE = 0.15  # of a frame that shows the face at all
 RANKED_SHARE = 0.8  # of the best camera's score: one that sees less adds more noise than news
 
 
@@ -38,11 +42,15 @@ class ObserveConfig:
     """Look at every stride-th frame of a cue window, at least 1."""
     min_score: float = 0.3
     """A camera whose face score at rest is lower does not watch, 0 to 1."""
+    search: float = 0.25
+    """Smallest windows searched where no face is found, of the image's longer side."""
 
     def __post_init__(self) -> None:
         """Refuse values out of range."""
         if self.cameras < 1 or self.stride < 1:
             raise ValueError(f"cameras {self.cameras}, stride {self.stride}: expected at least 1")
+        if not 0.02 <= self.search <= 1:
+            raise ValueError(f"search {self.search}: expected 0.02 to 1")
 
 
 @dataclass(frozen=True)
@@ -104,10 +112,11 @@ def run_item(dataset: Dataset, item: str, config: ObserveConfig, out: Path) -> d
     rest = windows.get(NEUTRAL)
     if rest is None or not len(rest):
         rest = np.array([frames[0] for frames in windows.values() if len(frames)])
-    middle = int(rest[len(rest) // 2])
-    cameras = choose_cameras(dataset, index, net, middle, config)
     frames = np.unique(np.concatenate(list(windows.values())))
-    views = [_watch(dataset, item, net, camera, windows, rest, frames) for camera in cameras]
+    middle, cameras = choose_cameras(dataset, index, net, _tries(rest, frames), config)
+    rest = np.union1d(rest, [middle])
+    find = partial(find_points, net, smallest=config.search)
+    views = [_watch(dataset, item, find, camera, windows, rest, frames) for camera in cameras]
     points, scores, faces = (np.stack(part) for part in zip(*views, strict=True))
     np.savez_compressed(
         out / "observations.npz", schema=SCHEMA, cameras=np.array(cameras), frames=frames,
@@ -133,33 +142,45 @@ def cue_frames(index: Index, cue: Cue, stride: int = 1) -> np.ndarray:
     return np.arange(cue.start_frame, min(cue.end_frame, index.frames - 1) + 1, stride)
 
 
+def _tries(rest: np.ndarray, frames: np.ndarray) -> list[int]:
+    """Frames in which to look for the face until it is there: at rest, then all over the clips."""
+    spread = [*np.linspace(0, len(rest) - 1, 3)[[1, 0, 2]].astype(int)]
+    others = np.linspace(0, len(frames) - 1, TRIES).astype(int)
+    return list(dict.fromkeys([*(int(rest[i]) for i in spread), *(int(frames[i]) for i in others)]))
+
+
 def choose_cameras(
-    dataset: Dataset, index: Index, net: LandmarkNet, frame: int, config: ObserveConfig
-) -> list[str]:
-    """The cameras that see the face best in a frame, best first.
+    dataset: Dataset, index: Index, net: LandmarkNet, frames: list[int], config: ObserveConfig
+) -> tuple[int, list[str]]:
+    """The first of the frames that shows a face, and the cameras that see it best, best first.
 
     Raises:
-        StageError: no camera sees a face.
+        StageError: no camera sees a face in any.
     """
-    scores = {
-        camera: detect(net, read_proxy(dataset, index.subject, camera, frame)).score
-        for camera in index.cameras
-    }
-    ranked = sorted(scores, key=lambda c: (-scores[c], c))
-    if scores[ranked[0]] < config.min_score:
-        raise StageError(
-            f"{index.subject}: no camera sees a face at frame {frame} (best {ranked[0]} with score"
-            f" {scores[ranked[0]]:.2f}, expected {config.min_score}); label it with 'express50"
-            " annotate mark' or lower observe.min_score"
-        )
-    enough = max(config.min_score, RANKED_SHARE * scores[ranked[0]])
-    return [c for c in ranked[: config.cameras] if scores[c] >= enough]
+    best = 0.0
+    for frame in frames:
+        scores = {
+            camera: detect(
+                net, read_proxy(dataset, index.subject, camera, frame), smallest=config.search
+            ).score
+            for camera in index.cameras
+        }
+        ranked = sorted(scores, key=lambda c: (-scores[c], c))
+        best = max(best, scores[ranked[0]])
+        if scores[ranked[0]] >= config.min_score:
+            enough = max(config.min_score, RANKED_SHARE * scores[ranked[0]])
+            return frame, [c for c in ranked[: config.cameras] if scores[c] >= enough]
+    raise StageError(
+        f"{index.subject}: no camera sees a face in frames {', '.join(map(str, sorted(frames)))}"
+        f" (best score {best:.2f}, expected {config.min_score}); is the face in view? else label"
+        " by 'express50 annotate mark', or lower observe.min_score"
+    )
 
 
 def _watch(
     dataset: Dataset,
     subject: str,
-    net: LandmarkNet,
+    find: Callable[[Sequence[np.ndarray]], tuple[np.ndarray, np.ndarray]],
     camera: str,
     windows: dict[str, np.ndarray],
     rest: np.ndarray,
@@ -170,13 +191,14 @@ def _watch(
     def read(numbers: np.ndarray) -> list[np.ndarray]:
         return [read_proxy(dataset, subject, camera, int(n)) for n in numbers]
 
-    neutral = np.median(find_points(net, read(rest))[0], axis=0)
+    places, sure = find(read(rest))
+    neutral = np.median(places[sure >= min(SEEN_SCORE, sure.max())], axis=0)
     parts = []
     for window in windows.values():
         if not len(window):
             continue
         images = read(window)
-        points, scores = find_points(net, images)
+        points, scores = find(images)
         parts.append((points, scores, align_faces(images, points, neutral)))
     # Windows may overlap: a frame keeps what its last window saw.
     order = np.concatenate([window for window in windows.values() if len(window)])
@@ -192,7 +214,7 @@ def _watch(
 
 STAGE = Stage(
     name="observe",
-    version=1,
+    version=2,
     config=ObserveConfig,
     presets={
         "draft": {"cameras": 1, "stride": 2},

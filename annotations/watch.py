@@ -14,7 +14,7 @@ import torch
 
 from express50.adapters import affine_to_opencv
 from express50.landmarks.augment import MIRROR, face_box
-from express50.landmarks.detector import detect, window_about
+from express50.landmarks.detector import SMALLEST, detect, window_about
 from express50.landmarks.network import CROP, LandmarkNet
 from express50.transforms import similarity_fit
 
@@ -28,7 +28,9 @@ STRAY_SCORE = 0.7  # of the middle frame's score
 STEADY_FRAMES = 1.0  # heads turn slowly: their motion is averaged over this many frames (sigma)
 
 
-def find_points(net: LandmarkNet, images: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+def find_points(
+    net: LandmarkNet, images: Sequence[np.ndarray], smallest: float = SMALLEST
+) -> tuple[np.ndarray, np.ndarray]:
     """Landmarks (T, 68, 2), corner-origin pixels, and scores (T,) of a clip.
 
     The face is searched for in the middle frame only; all frames are then looked at through the
@@ -37,15 +39,16 @@ def find_points(net: LandmarkNet, images: Sequence[np.ndarray]) -> tuple[np.ndar
     Args:
         net: from ``load_network``.
         images: T frames (H, W, 3) uint8, at least one.
+        smallest: windows that are searched, see `detect`.
     """
-    middle = detect(net, images[len(images) // 2])
+    middle = detect(net, images[len(images) // 2], smallest=smallest)
     centre, side = face_box(middle.points)
     found = list(_look(net, images, window_about(middle.points)))
     points, scores = (np.concatenate(part) for part in zip(*found, strict=True))
     for row, image in enumerate(images):
         away = np.linalg.norm(face_box(points[row])[0] - centre)
         if away > STRAY_SHARE * side or scores[row] < STRAY_SCORE * middle.score:
-            own = detect(net, image)
+            own = detect(net, image, smallest=smallest)
             points[row], scores[row] = own.points, own.score
     return points, scores
 

@@ -106,7 +106,8 @@ def parse_assignment(text: str) -> tuple[str, str, object]:
     table, dot, key = name.strip().partition(".")
     if not (equals and dot and table and key):
         raise ConfigError(
-            f"--set {text!r}: expected stage.key=value, for example track.iterations=200"
+            f"--set {text!r}: expected TABLE.KEY=VALUE, for example track.iterations=200 or"
+            " train.lr=1e-3"
         )
     try:
         return table, key, tomllib.loads(f"value = {raw}")["value"]

@@ -1,8 +1,9 @@
 """Find the 68 landmarks of the one head in a frame, without knowing where it is.
 
-A coarse pass looks at the whole frame (then at turned and smaller windows, only where that finds
-no face); crops about the points found so far are then refined, levelled by the line of the eyes.
-The last look is taken in several crops at once: where these do not agree there is no face.
+A coarse pass looks at the whole frame (then at turned and ever smaller windows, only where those
+before show no face); crops about the points found so far are then refined, levelled by the line of
+the eyes. The last look is taken in several crops at once: where these do not agree there is no
+face.
 Points are the projections of the 3D landmarks, also where the head hides them: views of several
 cameras can be triangulated. Points that the head or something before it hides come with a low
 confidence.
@@ -10,6 +11,7 @@ confidence.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import cv2
@@ -24,7 +26,13 @@ from express50.landmarks.network import CROP, LandmarkNet
 HALF_CONFIDENCE_SHARE = 0.025
 # Points of a place that is no face are vague: at this share the score is halved.
 VAGUE_SHARE = 0.06
+# Where nothing scores as much the search goes on.
 FOUND_SCORE = 0.5
+# The network sees a face whose box is 0.5 to 1.4 of the one it was trained on, up to a quarter of
+# the window off its middle: the next windows are smaller by SHRINK, and STEP of their side apart.
+SHRINK, STEP = 0.55, 0.5
+SMALLEST = 0.25
+BATCH = 32  # windows at a time
 KEEP_SHARE = 0.8
 # The last look is taken in several crops, in shares of the trained one. On a face, profiles too,
 # they differ by less than 0.02 of the face box (median point), on walls, coins and backs of heads
@@ -63,7 +71,9 @@ class _Place:
     score: float
 
 
-def detect(net: LandmarkNet, image: np.ndarray, refinements: int = 3) -> Detection:
+def detect(
+    net: LandmarkNet, image: np.ndarray, refinements: int = 3, smallest: float = SMALLEST
+) -> Detection:
     """Detect the landmarks of the most face-like place in an image.
 
     Args:
@@ -71,6 +81,9 @@ def detect(net: LandmarkNet, image: np.ndarray, refinements: int = 3) -> Detecti
         image: (H, W, 3) uint8 RGB; any size.
         refinements: Looks in sequence after the coarse pass; the last is taken in several crops,
             each also mirrored.
+        smallest: Side of the smallest windows searched, of the image's longer side. A face is
+            found in windows of up to three times its width; each further size, SHRINK of the one
+            before, costs about three times as much where no face is.
 
     Raises:
         ValueError: another shape or type.
@@ -78,30 +91,59 @@ def detect(net: LandmarkNet, image: np.ndarray, refinements: int = 3) -> Detecti
     if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8 or 0 in image.shape:
         raise ValueError(f"image is {image.dtype} {image.shape}, expected uint8 (H, W, 3)")
     pyramid = _pyramid(image)
-    place = _coarse(net, pyramid)
+    place: _Place | None = None
+    for windows in _searches(image.shape[1], image.shape[0], smallest):
+        coarse = max(_run(net, pyramid, windows), key=lambda one: one.score)
+        found = _refined(net, pyramid, coarse, refinements)
+        place = found if place is None or found.score > place.score else place
+        if place.score >= FOUND_SCORE:
+            break
+    assert place is not None  # the whole frame is always looked at
+    relative = place.sigma / (HALF_CONFIDENCE_SHARE * max(face_box(place.points)[1], 1e-6))
+    confidence = place.score * place.seen / (1.0 + relative**2)
+    return Detection(place.points, place.sigma, confidence, place.score)
+
+
+def _searches(width: int, height: int, smallest: float) -> Iterator[list[np.ndarray]]:
+    """Windows to look in, in turn: the whole frame, it turned and smaller ones, smaller ones yet.
+
+    At last, where smaller windows than usual are asked for, those of the first size turned: a
+    photograph may lie on its side, the footage of a rig is known to do so or not.
+    """
+    longer = float(max(width, height))
+    turned = [np.pi / 2, np.pi, 1.5 * np.pi]
+    yield _windows(width, height, longer, 0.0)
+    yield _windows(width, height, SHRINK * longer, 0.0) + [
+        window for turn in turned for window in _windows(width, height, longer, turn)
+    ]
+    side = SHRINK
+    while (side := side * SHRINK) >= smallest:
+        yield _windows(width, height, side * longer, 0.0)
+    if smallest < SMALLEST:
+        yield [w for turn in turned for w in _windows(width, height, SHRINK * longer, turn)]
+
+
+def _windows(width: int, height: int, side: float, turn: float) -> list[np.ndarray]:
+    """Windows of one size and turn (radians) that overlap and cover a frame."""
+    rows = []
+    for length in (height, width):
+        room = max(0.0, length - side)
+        count = 1 + int(np.ceil(room / (STEP * side)))
+        rows.append(length / 2 + room * (np.linspace(-0.5, 0.5, count) if room else np.zeros(1)))
+    return [_window(np.array([x, y]), side, turn) for y in rows[0] for x in rows[1]]
+
+
+def _refined(
+    net: LandmarkNet, pyramid: list[np.ndarray], place: _Place, refinements: int
+) -> _Place:
+    """The place as nearer looks see it."""
     for _ in range(refinements - 1):
         refined = _run(net, pyramid, [window_about(place.points)])[0]
         if refined.score < KEEP_SHARE * place.score:
             # The crop went astray, as it may on a profile: the wider view knew better.
             break
         place = refined
-    place = _consensus(net, pyramid, place)
-    relative = place.sigma / (HALF_CONFIDENCE_SHARE * max(face_box(place.points)[1], 1e-6))
-    confidence = place.score * place.seen / (1.0 + relative**2)
-    return Detection(place.points, place.sigma, confidence, place.score)
-
-
-def _coarse(net: LandmarkNet, pyramid: list[np.ndarray]) -> _Place:
-    """Best of the whole frame; failing that, of quarter turns and of nine smaller windows."""
-    height, width = pyramid[0].shape[:2]
-    centre, side = np.array([width, height]) / 2, float(max(width, height))
-    offsets = np.array([-0.2, 0.0, 0.2]) * side
-    others = [_window(centre, side, turn * np.pi / 2) for turn in (1, 2, 3)]
-    others += [_window(centre + [x, y], 0.6 * side, 0.0) for y in offsets for x in offsets]
-    whole = _run(net, pyramid, [_window(centre, side, 0.0)])[0]
-    if whole.score >= FOUND_SCORE:
-        return whole
-    return max([whole, *_run(net, pyramid, others)], key=lambda place: place.score)
+    return _consensus(net, pyramid, place)
 
 
 def _consensus(net: LandmarkNet, pyramid: list[np.ndarray], place: _Place) -> _Place:
@@ -181,6 +223,13 @@ def _sample(pyramid: list[np.ndarray], window: np.ndarray) -> np.ndarray:
 
 def _run(net: LandmarkNet, pyramid: list[np.ndarray], windows: list[np.ndarray]) -> list[_Place]:
     """What the network finds in windows."""
+    parts = [windows[start : start + BATCH] for start in range(0, len(windows), BATCH)]
+    return [place for part in parts for place in _run_batch(net, pyramid, part)]
+
+
+def _run_batch(
+    net: LandmarkNet, pyramid: list[np.ndarray], windows: list[np.ndarray]
+) -> list[_Place]:
     crops = torch.from_numpy(np.stack([_sample(pyramid, window) for window in windows]))
     # (N, H, W, 3) seen as (N, 3, H, W) lies in memory as channels-last already.
     with torch.inference_mode():

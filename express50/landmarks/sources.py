@@ -14,7 +14,7 @@ import numpy as np
 
 from express50.cameras import Camera
 from express50.errors import ConfigError
-from express50.landmarks.detector import Detection, detect
+from express50.landmarks.detector import SMALLEST, Detection, detect
 from express50.landmarks.fan import find_with_fan, load_fan
 from express50.landmarks.iris import Irises, find_irises
 from express50.landmarks.lips import open_lips
@@ -56,7 +56,9 @@ def source_files(landmarks: str) -> dict[str, Path]:
     return {"landmarks": Path(landmarks).expanduser()}
 
 
-def open_source(landmarks: str, cameras: Mapping[str, Camera], refinements: int = 3) -> Source:
+def open_source(
+    landmarks: str, cameras: Mapping[str, Camera], refinements: int = 3, smallest: float = SMALLEST
+) -> Source:
     """Make a source ready.
 
     Args:
@@ -64,6 +66,7 @@ def open_source(landmarks: str, cameras: Mapping[str, Camera], refinements: int 
             (.npz or .json, see docs/FORMAT.md).
         cameras: as recorded, by id; points of a file are undistorted with them.
         refinements: looks of the embedded network.
+        smallest: windows that it searches, see `detect`.
 
     Raises:
         ConfigError: the file is not there, or is no such file.
@@ -76,27 +79,27 @@ def open_source(landmarks: str, cameras: Mapping[str, Camera], refinements: int 
                 "path of FAN's TorchScript weights, or the path of a file of points"
             )
     if landmarks == EMBEDDED:
-        return _embedded(refinements)
+        return _embedded(refinements, smallest)
     if landmarks.startswith(FAN):
-        return _fan(source_files(landmarks)["fan"], refinements)
+        return _fan(source_files(landmarks)["fan"], refinements, smallest)
     return _given(source_files(landmarks)["landmarks"], cameras)
 
 
-def _embedded(refinements: int) -> Source:
+def _embedded(refinements: int, smallest: float) -> Source:
     net = load_network()
 
     def find(image: np.ndarray, camera_id: str, frame: int) -> Marked:
-        face = open_lips(image, detect(net, image, refinements))
+        face = open_lips(image, detect(net, image, refinements, smallest))
         return Marked(face, find_irises(image, face), visible_contour=False)
 
     return find
 
 
-def _fan(path: Path, refinements: int) -> Source:
+def _fan(path: Path, refinements: int, smallest: float) -> Source:
     net, fan = load_network(), load_fan(path)
 
     def find(image: np.ndarray, camera_id: str, frame: int) -> Marked:
-        face = find_with_fan(fan, image, detect(net, image, refinements))
+        face = find_with_fan(fan, image, detect(net, image, refinements, smallest))
         return Marked(face, find_irises(image, face), visible_contour=True)
 
     return find

@@ -57,7 +57,7 @@ def make_photo_capture(
     torch.set_num_threads(1)
     images, frames = spread_frames(picture, PROBES)
     height, width = images[0].shape[:2]
-    faces = find_faces(picture.path, images)
+    faces = find_faces(picture.path, images, config)
     start = (focal_px, "given") if focal_px else guess_focal(picture, width, height, film_mm)
     basis = make_basis(load_head(config.head))
     surest = sorted(faces, key=lambda face: -face.score)[:FOCAL_FACES]
@@ -70,20 +70,21 @@ def make_photo_capture(
     return focal
 
 
-def find_faces(path: Path, images: list[np.ndarray]) -> list[Detection]:
+def find_faces(path: Path, images: list[np.ndarray], config: TrackConfig) -> list[Detection]:
     """The faces that are surely seen in images of one person, at least one.
 
     Raises:
         CaptureError: there is none.
     """
     net = load_network()
-    seen = [detect(net, image) for image in images]
+    seen = [detect(net, image, config.refinements, config.search) for image in images]
     faces = [face for face in seen if face.score >= FACE_SCORE]
     if not faces:
         best = max(face.score for face in seen)
         raise CaptureError(
             f"{path}: no face found (best score {best:.2f}, expected {FACE_SCORE} or more); give a "
-            "picture in which the face is seen from the front or the side"
+            "picture in which the face is seen from the front or the side, whole, and at "
+            f"least {config.search / 3:.0%} of the picture wide, or lower track.search"
         )
     return faces
 

@@ -31,7 +31,8 @@ def write_panel(dataset: Dataset, subject: str, config: TrackConfig, path: Path)
     ((camera_id, camera),) = read_cameras_of(dataset, subject).items()
     image = read_frame(dataset, subject, camera_id, frame)
     recorded = read_cameras_of(dataset, subject, undistorted=False)
-    seen = open_source(config.landmarks, recorded, config.refinements)(image, camera_id, frame)
+    source = open_source(config.landmarks, recorded, config.refinements, config.search)
+    seen = source(image, camera_id, frame)
     dots = [seen.face.points, seen.irises.centres[seen.irises.confidence > 0]]
     column = draw_column(image, camera, model.to(dtype=torch.float64), mesh, dots, TILE)
     head = (mesh - translation) @ rotation

@@ -15,6 +15,7 @@ from express50.digests import path_digest, text_digest, value_digest
 from express50.errors import FormatError, StageError
 from express50.index import Cue
 from express50.publish import write_bytes
+from express50.tracks import SEQUENCE_SCHEMA
 from pipelines.track.config import VERSION, TrackConfig
 from pipelines.track.marks import Eyes
 from pipelines.track.observe import Observation
@@ -31,7 +32,6 @@ from pipelines.track.sequence import (
 from pipelines.track.sparse_head import Basis, Points
 from pipelines.track.state import Pose, State
 
-SCHEMA = "express50.sequence/1"
 Observe = Callable[[str, int], Observation | None]
 
 
@@ -122,7 +122,7 @@ def track_clips(
     for name, array in arrays.items():
         if array.dtype.kind == "f" and not np.isfinite(array).all():
             raise StageError(f"sequence: {name} holds NaN or infinite values; the fit diverged")
-    arrays |= {"schema": np.array(SCHEMA), "head": np.array(config.head)}
+    arrays |= {"schema": np.array(SEQUENCE_SCHEMA), "head": np.array(config.head)}
     return arrays, {
         "frames": len(rows),
         "jitter_mm": _jitter(person, rows, config.stride),

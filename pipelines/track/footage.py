@@ -22,7 +22,7 @@ from pipelines.track.state import Target
 def open_landmarks(dataset: Dataset, subject: str, config: TrackConfig) -> Source:
     """The source of landmarks; files of points are of the footage as recorded."""
     recorded = read_cameras_of(dataset, subject, undistorted=False)
-    return open_source(config.landmarks, recorded, config.refinements)
+    return open_source(config.landmarks, recorded, config.refinements, config.search)
 
 
 def observe_peaks(

@@ -44,7 +44,7 @@ from pipelines.track.sheet import write_sheet
 from pipelines.track.sparse_head import Basis, make_basis
 from pipelines.track.start import RigScaleError, initial_pose, posed_sigma
 from pipelines.track.state import Pose, State, Target, all_vertices, rotations, rounded, start_state
-from pipelines.track.suspects import suspect_cameras
+from pipelines.track.suspects import suspect_cameras, warnings
 
 DECIMALS = 7
 
@@ -105,7 +105,8 @@ def run(dataset: Dataset, item: str, config: TrackConfig, out: Path) -> dict:
     tiles = draw_overlays(dataset, item, out / "qc", basis.model, targets, vertices)
     write_sheet(out / "qc", tiles, metrics["landmark_rms_px"])
     marks = _marks(basis.model, state)
-    metrics["suspect_cameras"] = suspect_cameras(targets, marks, rotations(state), vertices.mean(1))
+    suspects = suspect_cameras(targets, marks, rotations(state), vertices.mean(1))
+    metrics |= {"suspect_cameras": suspects, "warnings": warnings(suspects)}
     if config.frames == "clips":
         skin = None
         if config.clip_rounds and appearance is not None:

@@ -1,11 +1,15 @@
 """Cameras whose landmarks stand off from where all others say, the same way in every expression.
 
 A detector errs differently from face to face; a camera that was bumped, or calibrated wrongly, is
-off by the same pixels every time. Such a camera is named, with the offset, so that its calibration
-gets mended: leaving its landmarks out quietly would only hide it.
+off by the same pixels, the same scale or the same turn every time. Such a camera is named, with
+what it is off by, so that its calibration gets mended: leaving its landmarks out quietly would only
+hide it.
 """
 
 from __future__ import annotations
+
+import math
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -14,11 +18,22 @@ from pipelines.track.pinhole import project_pinhole
 from pipelines.track.state import Target
 
 LEAST_EXPRESSIONS, LEAST_CAMERAS = 3, 3
-# A share of the face's size, a multiple of the other cameras' offsets, and of the offset's own
-# standard error: a suspect passes all three.
-LEAST_SHARE, OVER_OTHERS, OVER_ERROR = 0.03, 3.0, 3.0
+# What a suspect is off by at least: a share of the face's size, a share of its scale, radians.
+LEAST = {"offset": 0.03, "scale": 0.06, "roll": 0.06}
+# And a multiple of the other cameras', and of its own standard error.
+OVER_OTHERS, OVER_ERROR = 3.0, 3.0
 # Landmarks of nearer profiles are too poor to accuse a camera.
 FACING = 0.2
+
+
+@dataclass(frozen=True)
+class _Sight:
+    """What a view sees against what is expected: offset (2,) px, face's size px, ln scale, roll."""
+
+    offset: np.ndarray
+    size: float
+    scale: float
+    roll: float
 
 
 def suspect_cameras(
@@ -34,39 +49,82 @@ def suspect_cameras(
 
     Returns:
         Camera to `offset_px` (mean offset x, y of what is seen from what is expected), `of_face`
-        (a share of the face's size) and `expressions` (how many tell).
+        (a share of the face's size), `scale` (of what is seen to what is expected), `roll_deg`
+        (clockwise in the picture) and `expressions` (how many tell).
     """
-    seen: dict[str, list[tuple[np.ndarray, float]]] = {}
+    seen: dict[str, list[_Sight]] = {}
     for target, points, rotation, middle in zip(targets, marks, rotations, middles, strict=True):
         for view in (*target.observation.views, *target.observation.refused):
             if facing(view, rotation, middle) > FACING:
-                seen.setdefault(view.camera_id, []).append(_offset(view, points))
+                seen.setdefault(view.camera_id, []).append(_sight(view, points))
     told = {name: rows for name, rows in seen.items() if len(rows) >= LEAST_EXPRESSIONS}
     if len(told) < LEAST_CAMERAS:
         return {}
-    shares = {name: np.stack([o / size for o, size in rows]) for name, rows in told.items()}
-    lengths = {name: float(np.linalg.norm(rows.mean(0))) for name, rows in shares.items()}
-    suspects = {}
-    for name in sorted(told):
-        others = float(np.median([lengths[other] for other in told if other != name]))
-        spread = shares[name].std(0, ddof=1)
-        error = float(np.linalg.norm(spread)) / len(shares[name]) ** 0.5
-        if lengths[name] > max(LEAST_SHARE, OVER_OTHERS * others, OVER_ERROR * error):
-            mean = np.mean([offset for offset, _ in told[name]], axis=0)
-            suspects[name] = {
-                "offset_px": [round(float(value), 2) for value in mean],
-                "of_face": round(lengths[name], 4),
-                "expressions": len(told[name]),
-            }
-    return suspects
+    tables = {
+        "offset": {n: np.stack([s.offset / s.size for s in rows]) for n, rows in told.items()},
+        "scale": _from_middle({n: [s.scale for s in rows] for n, rows in told.items()}),
+        "roll": _from_middle({n: [s.roll for s in rows] for n, rows in told.items()}),
+    }
+    off = {name for kind, table in tables.items() for name in _off(table, LEAST[kind])}
+    return {name: _account(told[name]) for name in sorted(off)}
 
 
-def _offset(view: View, points: np.ndarray) -> tuple[np.ndarray, float]:
-    """Median offset (2,) of the points between brows and mouth, pixels, and the face's size."""
+def warnings(suspects: dict[str, dict[str, object]]) -> list[dict[str, str]]:
+    """Lines for people of what `suspect_cameras` found."""
+    return [
+        {
+            "what": f"camera {name}",
+            "why": f"what it sees is off by {row['offset_px']} px ({row['of_face']:.0%} of the"
+            f" face), {row['scale']} times the size expected and turned by {row['roll_deg']}"
+            " degrees, in every expression; check its calibration",
+        }
+        for name, row in suspects.items()
+    ]
+
+
+def _from_middle(table: dict[str, list[float]]) -> dict[str, np.ndarray]:
+    """Numbers (E, 1) by camera, less what all cameras have in common."""
+    middle = float(np.median([np.mean(rows) for rows in table.values()]))
+    return {name: np.array(rows)[:, None] - middle for name, rows in table.items()}
+
+
+def _off(table: dict[str, np.ndarray], least: float) -> list[str]:
+    """Cameras whose numbers (E, D) are large, larger than the others' and sure."""
+    lengths = {name: float(np.linalg.norm(rows.mean(0))) for name, rows in table.items()}
+    found = []
+    for name, rows in table.items():
+        others = float(np.median([lengths[other] for other in table if other != name]))
+        error = float(np.linalg.norm(rows.std(0, ddof=1))) / len(rows) ** 0.5
+        if lengths[name] > max(least, OVER_OTHERS * others, OVER_ERROR * error):
+            found.append(name)
+    return found
+
+
+def _account(rows: list[_Sight]) -> dict[str, object]:
+    mean = np.mean([row.offset for row in rows], axis=0)
+    share = np.mean([row.offset / row.size for row in rows], axis=0)
+    return {
+        "offset_px": [round(float(value), 2) for value in mean],
+        "of_face": round(float(np.linalg.norm(share)), 4),
+        "scale": round(math.exp(float(np.mean([row.scale for row in rows]))), 3),
+        "roll_deg": round(math.degrees(float(np.mean([row.roll for row in rows]))), 2),
+        "expressions": len(rows),
+    }
+
+
+def _sight(view: View, points: np.ndarray) -> _Sight:
+    """How the points between brows and mouth lie against the fitted ones (68, 3)."""
     pixels, _ = project_pinhole(view.camera, points)
     inner = np.isfinite(view.sigma)
     inner[:17] = False
     if not inner.any():
-        return np.zeros(2), 1.0
-    size = float(np.ptp(pixels, axis=0).max())
-    return np.median((view.points - pixels)[inner], axis=0), max(size, 1.0)
+        return _Sight(np.zeros(2), 1.0, 0.0, 0.0)
+    size = max(float(np.ptp(pixels, axis=0).max()), 1.0)
+    offset = np.median((view.points - pixels)[inner], axis=0)
+    seen, expected = (
+        (p[inner] - np.median(p[inner], axis=0)) @ [1, 1j] for p in (view.points, pixels)
+    )
+    ratio = complex((seen * expected.conj()).sum() / max(float((abs(expected) ** 2).sum()), 1e-12))
+    if abs(ratio) < 1e-6:  # all seen points coincide
+        return _Sight(offset, size, 0.0, 0.0)
+    return _Sight(offset, size, math.log(abs(ratio)), math.atan2(ratio.imag, ratio.real))

@@ -1,15 +1,21 @@
 """Alignment at the edges: faces without size, huge, tiny or still ones, windows of a frame."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from annotations import observe
 from annotations.features import expression_values, measure
+from annotations.match import suggest_all, watch
 from annotations.observe import Observations
 from annotations.suggest import suggest
 from annotations.watch import FACE, align_faces, similarity_2d
+from express50.errors import StageError
 from express50.expressions import load_script
+from express50.index import Cue
 
 SHAPE = np.random.default_rng(0).uniform(0, 1, (68, 2))
 SMILE = next(e for e in load_script() if e.id == "smile")
@@ -49,6 +55,35 @@ def test_the_answer_does_not_depend_on_the_faces_size_or_place(scale, origin):
 def test_a_face_without_size_or_motion_has_a_finite_answer_without_confidence(points):
     windows = {"neutral": np.arange(3), "smile": np.arange(3, 6)}
     assert suggested(points, windows).confidence == 0.0
+
+
+def test_frames_without_a_face_are_nobodys_peak():
+    """A grey frame's points lie anywhere, and so far from rest as no expression does."""
+    points = SHAPE * 100 + np.random.default_rng(2).normal(0, 0.2, (30, 68, 2))
+    points[12:20, 48:68] += np.array([0, 1, 2, 3, 3, 2, 1, 0])[:, None, None]
+    points[24:27] = np.random.default_rng(3).uniform(0, 300, (3, 68, 2))
+    seen = observed(points)
+    seen.scores[0, [24, 25, 26, 29]] = 0.02
+    cues = [Cue("neutral", 0, 9), Cue("smile", 10, 28), Cue("pucker", 29, 29)]
+    watched = watch(SimpleNamespace(subject="S001", cues=cues), seen)
+    assert set(watched.windows) == {"neutral", "smile"}
+    found, _ = suggest_all(watched, {"smile": SMILE}, None)
+    assert 14 <= watched.frames[watched.windows["smile"][found["smile"].row]] <= 17
+
+
+def test_a_face_is_looked_for_until_it_is_there(monkeypatch):
+    scores = {3: 0.0, 0: 0.1, 6: 0.05, 40: 0.9}
+    monkeypatch.setattr(observe, "read_proxy", lambda dataset, subject, camera, frame: frame)
+    monkeypatch.setattr(
+        observe, "detect", lambda net, frame, smallest: SimpleNamespace(score=scores.get(frame, 0))
+    )
+    index = SimpleNamespace(subject="S001", cameras={"a": None, "b": None})
+    tries = observe._tries(np.array([0, 3, 6]), np.arange(0, 71, 10))
+    assert tries[:3] == [3, 0, 6] and len(set(tries)) == len(tries)
+    frame, cameras = observe.choose_cameras(None, index, None, tries, observe.ObserveConfig())
+    assert frame == 40 and cameras == ["a", "b"]
+    with pytest.raises(StageError, match=r"in frames 0, 3, 6 .*score 0.10"):
+        observe.choose_cameras(None, index, None, tries[:3], observe.ObserveConfig())
 
 
 def test_windows_of_one_frame_and_windows_that_overlap():

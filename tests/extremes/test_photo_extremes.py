@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -99,7 +100,7 @@ def head_from(yaw: float) -> np.ndarray:
 
 @pytest.mark.parametrize("yaw", [-75.0, 75.0])
 def test_a_profile_is_found_and_fitted(basis, yaw: float) -> None:
-    (face,) = find_faces(Path("profile.png"), [head_from(yaw)])
+    (face,) = find_faces(Path("profile.png"), [head_from(yaw)], TrackConfig())
     camera = single_camera("photo", 256, 256, 256 / 0.34 * 1.2)
     marks, error = fit_one(basis, face, camera)
     assert error < 8.0
@@ -110,14 +111,14 @@ def test_a_profile_is_found_and_fitted(basis, yaw: float) -> None:
 @pytest.mark.parametrize("yaw", [130.0, 180.0])
 def test_the_back_of_a_head_is_no_face(yaw: float) -> None:
     with pytest.raises(CaptureError, match=r"back.png: no face found \(best score 0.0"):
-        find_faces(Path("back.png"), [head_from(yaw)])
+        find_faces(Path("back.png"), [head_from(yaw)], TrackConfig())
 
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 300), (3000, 2)])
 def test_sliver_pictures_have_no_face_and_no_irises(size: tuple[int, int]) -> None:
     image = np.full((*size, 3), 128, np.uint8)
     with pytest.raises(CaptureError, match="no face found"):
-        find_faces(Path("sliver.png"), [image])
+        find_faces(Path("sliver.png"), [image], TrackConfig())
     irises = find_irises(image, detect(load_network(), image))
     assert (irises.confidence == 0).all() and np.isfinite(irises.centres).all()
 
@@ -136,3 +137,23 @@ def test_jaw_lines_of_degenerate_meshes_stay_finite(basis: Basis) -> None:
         line = contour_points(basis.model, mesh, camera)
         assert np.isfinite(line.positions(mesh)).all()
         assert line.corners.shape == (17, 3) and line.usable.dtype == bool
+
+
+@pytest.mark.parametrize(
+    ("width", "turns"), [(48, 0), (96, 0), (192, 0), (192, 1), (192, 2), (192, 3)]
+)
+def test_a_face_is_found_wherever_and_however_small_it_is(width: int, turns: int) -> None:
+    """In a picture of 1000 pixels, among other things; the pasted face is about `width` wide."""
+    from skimage import data
+
+    head = cv2.resize(data.astronaut()[:280, 80:380], None, fx=width / 96, fy=width / 96)
+    picture = cv2.resize(data.coffee(), (1000, 1000))
+    rng = np.random.default_rng(width + turns)
+    y, x = (int(rng.integers(0, 1000 - side)) for side in head.shape[:2])
+    picture[y : y + head.shape[0], x : x + head.shape[1]] = head
+    face = detect(load_network(), np.ascontiguousarray(np.rot90(picture, turns)), smallest=0.08)
+    assert face.score > 0.5
+    middle = np.array([x, y]) + np.array([144, 125]) * width / 96
+    for _ in range(turns):  # as np.rot90 turns it
+        middle = np.array([middle[1], 1000 - middle[0]])
+    assert np.linalg.norm(face.points.mean(0) - middle) < 0.25 * width

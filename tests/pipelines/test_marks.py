@@ -20,7 +20,7 @@ from pipelines.track.observe import Marks, View, agree, point_covariance
 from pipelines.track.sparse_head import make_basis
 from pipelines.track.start import initial_pose
 from pipelines.track.state import Target, start_state
-from pipelines.track.suspects import suspect_cameras
+from pipelines.track.suspects import suspect_cameras, warnings
 from tests.pipelines.test_track import CONFIG, RIG, make_camera, make_scene, make_views
 
 
@@ -176,7 +176,9 @@ def test_a_camera_given_ten_times_counts_as_one() -> None:
     assert np.nanmedian(error) < 2.5e-3
 
 
-def suspects_of(shifts: dict[int, np.ndarray], scenes: int = 4) -> dict:
+def suspects_of(
+    shifts: dict[int, np.ndarray], scenes: int = 4, turned: complex = 1.0, camera: int = 1
+) -> dict:
     cameras = [make_camera(angle) for angle in (-0.7, -0.35, 0.0, 0.35, 0.7)]
     targets, marks = [], []
     for seed in range(scenes):
@@ -184,6 +186,9 @@ def suspects_of(shifts: dict[int, np.ndarray], scenes: int = 4) -> dict:
         views = make_views(scene.marks, 1.0, cameras)
         for number, shift in shifts.items():
             views[number].points[:] += shift
+        middle = views[camera].points.mean(0)
+        seen = ((views[camera].points - middle) @ [1, 1j]) * turned
+        views[camera].points[:] = np.stack([seen.real, seen.imag], axis=1) + middle
         observation, _ = agree(f"e{seed}", seed, views)
         targets.append(Target(observation, landmark_sigma(observation, CONFIG), False))
         marks.append(scene.marks)
@@ -195,6 +200,16 @@ def test_a_wrongly_calibrated_camera_is_named_with_its_offset() -> None:
     found = suspects_of({1: np.array([25.0, -8.0])})
     assert list(found) == [make_camera(-0.35).id]
     np.testing.assert_allclose(next(iter(found.values()))["offset_px"], [25.0, -8.0], atol=1.5)
+
+
+def test_a_wrong_focal_length_and_a_turned_camera_are_named() -> None:
+    (row,) = suspects_of({}, turned=1.15).values()
+    assert row["scale"] == pytest.approx(1.15, abs=0.02) and abs(row["roll_deg"]) < 1
+    (row,) = suspects_of({}, turned=np.exp(0.15j)).values()
+    assert row["roll_deg"] == pytest.approx(np.degrees(0.15), abs=1.0)
+    assert suspects_of({}, turned=1.02 * np.exp(0.02j)) == {}
+    (line,) = warnings(suspects_of({}, turned=1.15))
+    assert "times the size expected" in line["why"] and line["what"].startswith("camera ")
 
 
 def test_sound_cameras_and_single_slips_are_not_named() -> None:

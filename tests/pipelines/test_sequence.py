@@ -11,9 +11,10 @@ import pytest
 from express50.cameras import project
 from express50.errors import StageError
 from express50.index import Cue
+from express50.tracks import SEQUENCE_SCHEMA
 from express50.transforms import axis_angle_to_matrix
 from pipelines.track import clips
-from pipelines.track.clips import SCHEMA, track_clips, write_clips
+from pipelines.track.clips import track_clips, write_clips
 from pipelines.track.observe import Observation, View, agree
 from pipelines.track.sequence import _expected, freeze_shape, jitter_mm, make_windows, track_window
 from pipelines.track.sparse_head import Points
@@ -134,7 +135,7 @@ def test_a_stopped_run_goes_on_to_the_same_result(tmp_path: Path) -> None:
     whole, account = run(scene, tmp_path / "a", [])
     assert whole["frames"].tolist() == list(range(FRAMES))
     assert whole["cues"].tolist() == ["smile"] * 5 + ["frown"] * 5
-    assert str(whole["schema"]) == SCHEMA and account["dropped"] == []
+    assert str(whole["schema"]) == SEQUENCE_SCHEMA and account["dropped"] == []
     assert set(account["jitter_mm"]) == {"smile", "frown"}
     watched: list[int] = []
     with pytest.raises(KeyboardInterrupt):
