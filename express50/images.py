@@ -16,10 +16,12 @@ import OpenImageIO as oiio
 
 from express50.checks import PIXEL_LIMIT
 from express50.errors import FormatError
+from express50.jpeg import cut_short, file_cut_short
 
 # What an image may unpack to: so much in any case, beyond it so many times its file. Deflate packs
 # zeros 1032-fold, JPEG's blocks of one colour about as much, and no camera comes near.
 ROOM_BYTES, RATIO_LIMIT = 64 << 20, 4096
+CUT = "truncated: a JPEG without its end; copy it again"
 DEPTH_UNIT_M = 5e-5  # one step of a 16-bit depth map; 3.28 m at most, 0.025 mm rounding
 DEPTH_LIMIT_M = DEPTH_UNIT_M * 65535
 
@@ -43,6 +45,8 @@ def read_image(path: Path) -> np.ndarray:
         pixels = source.read_image(0, 0, 0, channels, kind)
         if pixels is None:
             raise FormatError(f"{path}: truncated or damaged ({_said(source.geterror)})")
+        if file_cut_short(Path(path)):
+            raise FormatError(f"{path}: {CUT}")
     finally:
         source.close()
     array = np.asarray(pixels).reshape(spec.height, spec.width, channels)
@@ -159,8 +163,10 @@ def decode_cv(data: bytes, flags: int, name: str) -> np.ndarray:
     """The image in encoded bytes as OpenCV has it; look at its size before.
 
     Raises:
-        FormatError: the bytes are damaged.
+        FormatError: the bytes are damaged, or end too soon.
     """
+    if cut_short(data):
+        raise FormatError(f"{name}: {CUT}")
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     except cv2.error as error:

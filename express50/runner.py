@@ -24,6 +24,7 @@ from express50.runlog import RunLog
 from express50.stage import Stage
 from express50.work import Task, fingerprint, input_digests
 
+WARNINGS = 12  # lines; more of them would hide the account
 ALIKE = 3  # so many first items that fail for one reason are no accident
 
 
@@ -36,6 +37,7 @@ class Outcome:
     reason: str = ""
     seconds: float = 0.0
     dropped: tuple[dict, ...] = ()
+    warnings: tuple[dict, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -65,7 +67,9 @@ class Summary:
             "failed": self.count("failed"),
             "seconds": round(self.seconds, 3),
             "items": [
-                dict(vars(o)) | {"dropped": list(o.dropped), "seconds": round(o.seconds, 3)}
+                dict(vars(o))
+                | {"dropped": list(o.dropped), "warnings": list(o.warnings)}
+                | {"seconds": round(o.seconds, 3)}
                 for o in self.outcomes
             ],
         }
@@ -79,6 +83,11 @@ class Summary:
                 yield f"  failed {outcome.item}: {outcome.reason}"
             for part in outcome.dropped:
                 yield f"  dropped {part['what']} of {outcome.item}: {part['why']}"
+        odd = [(o.item, row) for o in self.outcomes for row in o.warnings]
+        for item, row in odd[:WARNINGS]:
+            yield f"  warning {item}: {row['what']}: {row['why']}"
+        if len(odd) > WARNINGS:
+            yield f"  and {len(odd) - WARNINGS} warnings more: see the items' metrics.json"
 
 
 def run_stage(
@@ -264,4 +273,5 @@ def _outcome(receipt: Receipt, status: str = "") -> Outcome:
         reason=receipt.reason,
         seconds=receipt.seconds,
         dropped=tuple(receipt.metrics.get("dropped", ())),
+        warnings=tuple(row for k in ("warnings", "weak") for row in receipt.metrics.get(k, ())),
     )

@@ -283,7 +283,7 @@ def metrics(
 
 
 def account(dataset: Dataset, subjects: list[str]) -> Iterator[str]:
-    """Lines for people: what each capture was found to be, and what is odd about it."""
+    """Lines for people: what each capture was found to be."""
     for subject in subjects:
         path = dataset.item_dir("ingest", subject) / "metrics.json"
         if not path.is_file():
@@ -295,8 +295,6 @@ def account(dataset: Dataset, subjects: list[str]) -> Iterator[str]:
             f"  {subject} ({told.get('layout', OURS)}): {told['cameras']} cameras, {frames} frames "
             f"each, {told['expressions']} expressions"
         )
-        for row in told.get("warnings", ()):
-            yield f"  warning {subject}: {row['what']}: {row['why']}"
 
 
 def write_contact_sheet(index: Index, out: Path) -> None:

@@ -146,7 +146,9 @@ def test_ingest_names_all_faults_and_writes_their_figures(footage, tmp_path):
     dataset = Dataset(tmp_path / "data")
     ingest.register(dataset, [capture])
     config = resolve_config(ingest.STAGE, "reference")
-    assert run_stage(ingest.STAGE, dataset, config, workers=0, progress=False).ok
+    summary = run_stage(ingest.STAGE, dataset, config, workers=0, progress=False)
+    assert summary.ok
+    assert any("warning S001: camera cam02" in line for line in summary.lines())
     folder = dataset.item_dir("ingest", "S001")
     rows = json.loads((folder / "metrics.json").read_text())["warnings"]
     said = {row["what"]: row["why"] for row in rows}
@@ -160,4 +162,3 @@ def test_ingest_names_all_faults_and_writes_their_figures(footage, tmp_path):
     assert figures["light"]["cam00"]["exposure"] == pytest.approx(0.515, abs=0.06)
     lines = list(ingest.account(dataset, ["S001"]))
     assert lines[0] == "  S001 (express50): 5 cameras, 88 to 90 frames each, 0 expressions"
-    assert any("warning S001: camera cam02" in line for line in lines)
