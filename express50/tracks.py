@@ -1,4 +1,4 @@
-"""Reading ``track.npz``, the head-model parameters of a subject's peak frames.
+"""Reading ``track.npz`` and ``sequence.npz``: a subject's head in its peak frames and its clips.
 
 Every package reads tracks through here, so that a damaged, foreign or hostile file ends in one
 line. Nothing in a file is executed: pickled objects are refused.
@@ -17,6 +17,7 @@ from express50.errors import FormatError, StageError
 from express50.layout import Dataset
 
 SCHEMAS = ("express50.track/1", "express50.track/2")
+SEQUENCE_SCHEMA = "express50.sequence/1"
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
 _WIDTHS = {"neck": (3,), "jaw": (3,), "eyes": (6,), "R": (3, 3), "t": (3,)}
 _AGAIN = "run 'express50 track' again"
@@ -66,6 +67,30 @@ class Track:
         return self.expressions.index(expression)
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Sequence:
+    """What was tracked of a subject's clips, F frames; arrays mean what they do in `Track`.
+
+    Attributes:
+        head: head model, as ``load_head`` takes it.
+        cues: (F,) ids of the clips, one a frame.
+        frames: (F,) int64 decode indices.
+        shape: (S,) coefficients.
+        expression, neck, jaw, eyes, R, t: (F, ...).
+    """
+
+    head: str
+    cues: tuple[str, ...]
+    frames: np.ndarray
+    shape: np.ndarray
+    expression: np.ndarray
+    neck: np.ndarray
+    jaw: np.ndarray
+    eyes: np.ndarray
+    R: np.ndarray
+    t: np.ndarray
+
+
 def track_file(dataset: Dataset, subject: str) -> Path:
     """The subject's track.
 
@@ -108,6 +133,37 @@ def read_track(path: Path) -> Track:
     return Track(schema=schema, head=head, expressions=tuple(names.tolist()), **numbers)
 
 
+def read_sequence(path: Path) -> Sequence:
+    """Read and check the frames of a subject's clips.
+
+    Raises:
+        StageError: there is no such file.
+        FormatError: it is no sequence, its arrays do not fit, or one holds NaN or Inf.
+    """
+    if not path.is_file():
+        raise StageError(
+            f"{path}: no such sequence; run 'express50 track --set track.frames=clips', or"
+            " 'express50 photo' on a video"
+        )
+    arrays = read_arrays(path, FormatError, "a sequence", mend=_AGAIN)
+    try:
+        schema, head, cues = str(arrays["schema"]), str(arrays["head"]), arrays["cues"]
+        if schema != SEQUENCE_SCHEMA:
+            raise ValueError(f"schema {schema!r}, expected {SEQUENCE_SCHEMA}")
+        _check_names(cues, alone=False)
+        count = len(cues)
+        expected = {"frames": (count,), "shape": (None,), "expression": (count, None)}
+        expected |= {name: (count, *width) for name, width in _WIDTHS.items()}
+        for name, shape in expected.items():
+            _check(name, arrays[name], shape)
+        _check_rotations(arrays["R"])
+    except (KeyError, ValueError) as error:
+        words = f"has no {error}" if isinstance(error, KeyError) else str(error)
+        raise FormatError(f"{path}: not a sequence ({words}); {_AGAIN}") from None
+    numbers = {name: _typed(name, arrays[name]) for name in expected}
+    return Sequence(head=head, cues=tuple(cues.tolist()), **numbers)
+
+
 def _shapes(arrays: dict[str, np.ndarray], count: int) -> dict[str, tuple[int | None, ...]]:
     """Expected shape of every array of a track with ``count`` expressions."""
     vertices = arrays["vertices"].shape[1] if arrays["vertices"].ndim == 3 else None
@@ -121,13 +177,13 @@ def _shapes(arrays: dict[str, np.ndarray], count: int) -> dict[str, tuple[int | 
     }
 
 
-def _check_names(names: np.ndarray) -> None:
+def _check_names(names: np.ndarray, alone: bool = True) -> None:
     if names.ndim != 1 or names.dtype.kind != "U" or not len(names):
         raise ValueError(f"expressions are {names.dtype} {names.shape}, expected (E,) strings")
     for name in names.tolist():
         if not NAME.fullmatch(name):  # they become names of files
             raise ValueError(f"expression {name!r}, expected letters, digits, _ and -")
-    if len(set(names.tolist())) != len(names):
+    if alone and len(set(names.tolist())) != len(names):
         raise ValueError("an expression appears twice")
 
 

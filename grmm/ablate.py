@@ -29,7 +29,7 @@ from grmm.progress import log
 from grmm.run import best_device, settle
 from grmm.shard_source import open_shards
 from grmm.train import train
-from grmm.unseen import Protocol, evaluate_unseen
+from grmm.unseen import Protocol, evaluate_unseen, given_views
 
 
 def ablate(
@@ -58,11 +58,26 @@ def ablate(
         source = open_shards(roots, config.data.split)
         config = settle(config, HeadViews(source, load_head(source.head)))
     variants = variants_of(roots, names)
+    check_people(roots, config, protocol, subjects)
     rows: dict[str, dict] = {}
     for name, variant in variants.items():
         rows[name] = _row(roots, out, name, variant, config, protocol, subjects)
         write_tables(out, rows, variants, config)
     return json.loads((out / "ablation.json").read_bytes())
+
+
+def check_people(
+    roots: Sequence[Path], config: Config, protocol: Protocol, subjects: Sequence[str]
+) -> None:
+    """Refuse, before hours of training, unseen people whom the shards do not show.
+
+    Raises:
+        ConfigError: a person lacks the views that it is to be fitted from.
+    """
+    source = open_shards(roots, "*")
+    views = HeadViews(source, load_head(source.head))
+    for subject in subjects or unseen_subjects(roots, views, config.data.split):
+        given_views(views, subject, protocol)
 
 
 def with_holdout(roots: Sequence[Path], config: Config) -> Config:

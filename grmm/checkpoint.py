@@ -31,7 +31,7 @@ from grmm.scene import HeadState, View
 FORMAT = "grmm.checkpoint/1"
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@dataclass(frozen=True, kw_only=True, eq=False, repr=False)
 class Gallery:
     """Tracked frames and cameras of the training set, so that a checkpoint renders on its own.
 
@@ -44,7 +44,7 @@ class Gallery:
     cameras: dict[str, View]
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@dataclass(frozen=True, kw_only=True, eq=False, repr=False)
 class Loaded:
     """A checkpoint ready to use; ``loop`` and ``optimizer`` serve `train` alone."""
 

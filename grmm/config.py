@@ -136,6 +136,8 @@ class LossConfig:
     """Weight of the sum of squares of both codes. P; G13."""
 
     def __post_init__(self) -> None:
+        weights = ("l1", "ssim", "perceptual", "depth", "scale", "laplacian", "codes")
+        _not_negative("loss", self, *weights)
         if self.perceptual_every < 1:
             raise ConfigError(f"loss.perceptual_every is {self.perceptual_every}, expected >= 1")
 
@@ -206,6 +208,9 @@ class TrainConfig:
     """Train on only this many views, 0 = all: a check that model and data can meet at all."""
     seed: int = 0
     save_every: int = 1000
+    """Iterations between checkpoints."""
+    save_seconds: float = 120.0
+    """A checkpoint is written after so much time too, 0 = never: what a kill may cost."""
     log_every: int = 20
     evaluate_images: int = 32
     """Images evaluated at the end for metrics.json, evenly chosen."""
@@ -213,6 +218,9 @@ class TrainConfig:
     """Threads of torch, 0 = leave as it is."""
 
     def __post_init__(self) -> None:
+        _not_negative("train", self, "seconds", "save_seconds", "final_lr", "clip_norm")
+        _not_negative("train", self, "code_lr_scale", "texel_lr_scale", "refine_lr_scale")
+        _in_range("train.lr", self.lr, 1e-12, 1.0)
         _in_range("train.shuffle_directions", self.shuffle_directions, 0.0, 1.0)
         _in_range("train.ema", self.ema, 0.0, 0.99999)
         for name in ("iterations", "accumulate", "save_every", "log_every"):
@@ -250,6 +258,10 @@ class FitConfig:
     seed: int = 0
 
     def __post_init__(self) -> None:
+        _not_negative("fit", self, "seconds", "stage1_final_lr", "stage2_texel_lr_scale")
+        _not_negative("fit", self, "locality", "codes")
+        _in_range("fit.stage1_lr", self.stage1_lr, 1e-12, 1.0)
+        _in_range("fit.stage2_lr", self.stage2_lr, 1e-12, 1.0)
         _in_range("fit.stage1_share", self.stage1_share, 0.0, 1.0)
         _in_range("fit.shuffle_directions", self.shuffle_directions, 0.0, 1.0)
         _in_range("fit.locality_t", self.locality_t, 0.0, 1.0)
@@ -282,6 +294,12 @@ class Config:
 def _one_of(name: str, value: str, allowed: tuple[str, ...]) -> None:
     if value not in allowed:
         raise ConfigError(f"{name} is {value!r}, expected one of {', '.join(allowed)}")
+
+
+def _not_negative(table: str, config: object, *names: str) -> None:
+    for name in names:
+        if not 0 <= getattr(config, name) < float("inf"):
+            raise ConfigError(f"{table}.{name} is {getattr(config, name)}, expected 0 or more")
 
 
 def _in_range(name: str, value: float, low: float, high: float) -> None:

@@ -22,9 +22,17 @@ def step(run: Run, parallel: torch.nn.Module, config: Config) -> None:
         subject = run.model.subjects.index(item.key.subject)
         expression = run.model.expressions.index(item.key.expression)
         shade_view = other_direction(run, config.train.shuffle_directions)
-        rendering = parallel(
-            subject, expression, item.state, item.view, run.views.background, shade_view
-        )
+        try:
+            rendering = parallel(
+                subject, expression, item.state, item.view, run.views.background, shade_view
+            )
+        except ValueError as error:
+            if "not finite" not in str(error):
+                raise
+            raise TrainError(
+                f"iteration {run.iteration}: training diverged ({error}); lower train.lr and start "
+                "over with --anew"
+            ) from None
         terms = objective(run, rendering, item, config)
         loss = torch.stack(list(terms.values())).sum()
         run.terms = {name: float(term.detach()) for name, term in terms.items()}

@@ -99,7 +99,10 @@ def preset(name: str) -> Config:
         ConfigError: no preset has this name.
     """
     if name not in PRESETS:
-        raise ConfigError(f"preset is {name!r}, expected one of {', '.join(PRESETS)}")
+        raise ConfigError(
+            f"preset is {name!r}, expected one of {', '.join(PRESETS)} (of 'grmm train': or"
+            " measured)"
+        )
     config = Config()
     for table, values in PRESETS[name].items():
         config = replace(config, **{table: replace(getattr(config, table), **values)})

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
+from collections.abc import Sequence as Many
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,6 +15,7 @@ from torch import Tensor
 
 from express50.errors import ConfigError
 from express50.images import contact_sheet, write_image
+from express50.tracks import Sequence
 from grmm.checkpoint import Loaded
 from grmm.data import HeadViews
 from grmm.edit import Head, between, trained_head
@@ -41,7 +43,7 @@ def depth_picture(depth: Tensor, alpha: Tensor) -> np.ndarray:
 
 
 @torch.no_grad()
-def comparison_sheet(path: Path, views: HeadViews, indices: Sequence[int], render: Render) -> None:
+def comparison_sheet(path: Path, views: HeadViews, indices: Many[int], render: Render) -> None:
     """Write rows of footage | refined | rasterised | depth | error x 4."""
     rows, labels = [], []
     for index in indices:
@@ -161,7 +163,7 @@ def novel_views(loaded: Loaded, head: Head, view: View) -> list[list[np.ndarray]
 
 
 def expression_grid(
-    loaded: Loaded, subjects: Sequence[str], expressions: Sequence[str], view: View
+    loaded: Loaded, subjects: Many[str], expressions: Many[str], view: View
 ) -> list[list[np.ndarray]]:
     """Pictures of every subject (rows) with every expression (columns).
 
@@ -181,9 +183,26 @@ def interpolation(
         yield picture(loaded, between(start, end, number / max(1, frames - 1)), view)
 
 
-def write_sheet(
-    path: Path, rows: Sequence[Sequence[np.ndarray]], labels: Sequence[str] | None = None
-) -> None:
+def driven(loaded: Loaded, head: Head, clips: Sequence, view: View) -> Iterable[np.ndarray]:
+    """Yield the head with the expression, jaw, neck and eyes of every frame of tracked clips.
+
+    Its own shape and residual codes stay.
+
+    Raises:
+        ConfigError: the clips were tracked with another head model.
+    """
+    known = loaded.head.expression_dirs.shape[2]
+    if Path(clips.head).name != Path(loaded.head_spec).name or clips.expression.shape[1] > known:
+        raise ConfigError(
+            f"the clips were tracked with head model {clips.head!r} of {clips.expression.shape[1]}"
+            f" expressions, the checkpoint has {loaded.head_spec!r} of {known}; track them with it"
+        )
+    for row in range(len(clips.frames)):
+        moved = {name: getattr(clips, name)[row] for name in ("expression", "neck", "jaw", "eyes")}
+        yield picture(loaded, replace(head, tracked=replace(head.tracked, **moved)), view)
+
+
+def write_sheet(path: Path, rows: Many[Many[np.ndarray]], labels: Many[str] | None = None) -> None:
     """Write rows of pictures of one size as one picture."""
     path.parent.mkdir(parents=True, exist_ok=True)
     write_image(path, contact_sheet(rows, labels, rows[0][0].shape[:2]))

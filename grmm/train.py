@@ -27,6 +27,9 @@ from grmm.run import Run, best_device, budget_used, finished, prepare, set_rates
 from grmm.train_report import report
 from grmm.warm_start import warm_start
 
+PATIENT = 10_000  # iterations that a CPU does in a day at most
+GREY_DB = 10.0  # what a grey picture scores
+
 
 def train(
     source: Source, head: HeadModel, out: Path, config: Config, *, resume: bool = False
@@ -73,8 +76,13 @@ def train(
         log(f"{run.model.anchors.budget()}; {len(run.training)} views to train on")
         if run.perceptual is None:
             log("the perceptual term is off: loss.vgg16 names no weights")
+        if device.type == "cpu" and not config.train.seconds and config.train.iterations > PATIENT:
+            log(
+                f"{config.train.iterations} iterations take days on a CPU; '--preset measured "
+                "--budget 1h' is the setting that does best in an hour"
+            )
 
-    started = time.perf_counter() - run.seconds
+    started, saved = time.perf_counter() - run.seconds, run.seconds
     scalars = tensorboard(out / "tensorboard", config.train.tensorboard and rank == 0)
     with deferred_interrupt() as interrupt, scalars as show:
         while not finished(run, config):
@@ -85,15 +93,21 @@ def train(
             if world > 1:
                 agree(run, interrupt, device)
             last = finished(run, config) or interrupt.requested
+            due = run.iteration % config.train.save_every == 0 or (
+                0 < config.train.save_seconds <= run.seconds - saved
+            )
             if rank == 0 and (run.iteration % config.train.log_every == 0 or last):
                 log(progress_line(run, config))
                 append_log(out / "log.jsonl", run.iteration, run.seconds, run.terms)
                 show(run.iteration, run.terms)
-            if rank == 0 and (run.iteration % config.train.save_every == 0 or last):
+            if rank == 0 and (due or last):
                 save(run, checkpoint, config, source.head)
+                saved = run.seconds
             if interrupt.requested:
                 raise KeyboardInterrupt
     metrics = report(run, config, out) if rank == 0 else {}
+    if rank == 0 and float(str(metrics["psnr_train_db"])) < GREY_DB:
+        log("pictures of training are worse than grey ones: it diverged; lower train.lr")
     if world > 1:
         distributed.destroy_process_group()
     return metrics
@@ -143,8 +157,8 @@ def restore(run: Run, path: Path, config: Config, device: torch.device, rank: in
             f"{path}: holds no state to resume from (a person was withdrawn from it, or it is a "
             "fit); train into another folder, or start over with --anew"
         )
-    budget = {"iterations", "seconds", "save_every", "log_every", "evaluate_images", "threads",
-              "tensorboard"}  # fmt: skip
+    budget = {"iterations", "seconds", "save_every", "save_seconds", "log_every",
+              "evaluate_images", "threads", "tensorboard"}  # fmt: skip
     old, new = as_tables(loaded.config), as_tables(config)
     changed = [
         f"{table}.{key} {old[table][key]!r} -> {value!r}"
@@ -181,4 +195,13 @@ def progress_line(run: Run, config: Config) -> str:
     used = budget_used(run, config)
     left = run.seconds * (1 - used) / used if used > 0 else 0.0
     terms = " ".join(f"{name} {value:.4f}" for name, value in run.terms.items())
-    return f"iteration {run.iteration}  {rate:.2f}/s  {left:.0f} s left  {terms}"
+    return f"iteration {run.iteration}  {rate:.2f}/s  {in_words(left)} left  {terms}"
+
+
+def in_words(seconds: float) -> str:
+    """A time to go as a person would say it."""
+    seconds = max(0.0, seconds)
+    for unit, length in (("days", 86400), ("h", 3600), ("min", 60)):
+        if seconds >= 2 * length:
+            return f"{seconds / length:.1f} {unit}"
+    return f"{seconds:.0f} s"

@@ -44,22 +44,32 @@ def evaluate_unseen(
     protocol: Protocol,
     judge: Judge,
     keep: Callable[[int, Tensor], None] | None = None,
+    among: Sequence[int] | None = None,
 ) -> tuple[list[Row], dict[str, Any]]:
     """Fit a person from the protocol's views; rows of its other views and expressions, effort.
 
+    ``among`` are the indices to measure, by default all of the person's.
+
     Raises:
-        ConfigError: the shards hold no such views.
+        ConfigError: the shards hold no such views, or nothing is left to measure.
     """
     given = given_views(views, subject, protocol)
     cameras = {views.keys[i].camera for i in given}
-    state = start(loaded, views, given)
-    _, effort = run_stages(state, lambda: {})
-    known = {*state.z_exp, *loaded.model.expressions}
+    known = {protocol.expression, *loaded.model.expressions}
     own = [
         i
-        for i, key in enumerate(views.keys)
-        if key.subject == subject and key.expression in known and key.camera not in cameras
+        for i in (range(len(views.keys)) if among is None else among)
+        if views.keys[i].subject == subject
+        and views.keys[i].expression in known
+        and views.keys[i].camera not in cameras
     ]
+    if not own:
+        raise ConfigError(
+            f"{subject}: no view is left to measure: it is fitted from cameras "
+            f"{', '.join(sorted(cameras))}, and expressions must be {', '.join(sorted(known))}"
+        )
+    state = start(loaded, views, given)
+    _, effort = run_stages(state, lambda: {})
     rows = []
     for kind, fitted in ((NOVEL_VIEW, True), (NOVEL_EXPRESSION, False)):
         chosen = [i for i in own if (views.keys[i].expression in state.z_exp) == fitted]
@@ -83,9 +93,20 @@ def given_views(views: HeadViews, subject: str, protocol: Protocol) -> list[int]
     if not given:
         raise ConfigError(
             f"{subject}: no view of expression {protocol.expression} by cameras "
-            f"{', '.join(patterns) or 'any'}; its cameras are {', '.join(cameras) or 'none'}"
+            f"{', '.join(patterns) or 'any'}; {_what(views, subject, cameras)}"
         )
     return given
+
+
+def _what(views: HeadViews, subject: str, cameras: Sequence[str]) -> str:
+    """What the shards have of a person, for an error."""
+    if cameras:
+        return f"its cameras are {', '.join(cameras)}"
+    people = sorted({key.subject for key in views.keys})
+    if subject not in people:
+        return f"the shards have subjects {', '.join(people)}"
+    shown = sorted({key.expression for key in views.keys if key.subject == subject})
+    return f"its expressions are {', '.join(shown)}"
 
 
 def any_expression(state: Fit) -> Callable[[Item], Rendering]:

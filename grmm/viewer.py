@@ -2,7 +2,8 @@
 
 One thread draws. It always takes the newest camera and the newest sliders, so that a slow machine
 shows fewer pictures, never old ones. Listens on 127.0.0.1 unless told otherwise; pictures of people
-leave the machine by no other way (the library's sharing service is off).
+leave the machine by no other way (the library's sharing service is off). The library's page asks
+Google's tag manager to count its visitors, where the browser has a way there.
 """
 
 from __future__ import annotations
@@ -49,6 +50,13 @@ class Watcher:
     still: bool = False
 
 
+class _Server(viser.ViserServer):
+    """The library's server without its tunnel to a public one."""
+
+    def request_share_url(self, verbose: bool = True) -> None:
+        """Share nothing: hiding the button instead leaves the whole page blank (viser 0.2.23)."""
+
+
 class Viewer:
     """The server, its controls and the drawing thread's loop.
 
@@ -68,9 +76,9 @@ class Viewer:
         self._head_changed = time.perf_counter()
         self.frames_per_second = 0.0
         with stdout_to_stderr():
-            self.server = viser.ViserServer(host=host, port=port, label="GRMM", verbose=False)
+            self.server = _Server(host=host, port=port, label="GRMM", verbose=False)
         self.port = int(self.server.get_port())
-        self.server.gui.configure_theme(show_share_button=False, dark_mode=True)
+        self.server.gui.configure_theme(dark_mode=True)
         self.server.scene.set_up_direction("+y")
         self._add_controls()
         self.head = self._described()

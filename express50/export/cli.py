@@ -29,6 +29,10 @@ def add_commands(subparsers: Any) -> None:
             f"--{name}", action="append", default=[], metavar="ID", help=f"only this {name};"
             " may be repeated",
         )  # fmt: skip
+    parser.add_argument(
+        "--frames", choices=("peaks", "clips"), default="peaks",
+        help="clips: a mesh of every tracked frame (track.frames=clips, or a video's) [peaks]",
+    )  # fmt: skip
     group = parser.add_argument_group("of gaussian-avatars")
     group.add_argument(
         "--background", choices=("alpha", "white", "black"), default="alpha",
@@ -56,15 +60,24 @@ def add_commands(subparsers: Any) -> None:
 def run_export(args: argparse.Namespace) -> int:
     """Export the chosen subjects, one after the other."""
     from express50.console import OK, say, say_json
-    from express50.export.select import exporting, read_tracked, tracked_subjects
+    from express50.errors import ConfigError
+    from express50.export.select import exporting, read_tracked, tracked_subjects, with_clips
     from express50.layout import Dataset
+
+    if args.frames == "clips" and args.format == "gaussian-avatars":
+        raise ConfigError(
+            "--frames clips: gaussian-avatars needs a matte of every frame, and 'matte' makes those"
+            " of peaks alone; export the clips as obj, ply or glb"
+        )
 
     dataset, accounts = Dataset(args.dataset), []
     for subject in tracked_subjects(dataset, args.subject):
         head = read_tracked(dataset, subject, args.expression)
+        head = with_clips(dataset, head, args.expression) if args.frames == "clips" else head
         with exporting(args.out, subject) as folder:
             meta = _write(dataset, head, args, folder)
-        accounts.append({"folder": str(args.out / subject), **meta})
+        what = {"of": "frames"} if args.frames == "clips" else {}
+        accounts.append({"folder": str(args.out / subject), **what, **meta})
         if not args.json:
             say(*_lines(accounts[-1]))
     if args.json:
@@ -92,7 +105,7 @@ def _write(dataset: Any, head: Any, args: argparse.Namespace, folder: Path) -> d
 
 
 def _lines(account: dict) -> list[str]:
-    words = f"{account['folder']}: {len(account['expressions'])} expressions"
+    words = f"{account['folder']}: {len(account['expressions'])} {account.get('of', 'expressions')}"
     if "views" in account:
         words += f", {account['views']} of {account['read']} views"
     lines = [words]

@@ -9,18 +9,20 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
+import torch
 
 from express50.errors import FormatError, StageError
 from express50.exclusions import exclusion_reason
 from express50.head.load import load_head
-from express50.head.model import HeadModel
+from express50.head.model import HeadModel, pose
 from express50.images import read_image
 from express50.layout import Dataset
 from express50.publish import replace_directory, sync_tree
-from express50.tracks import Track, read_track, track_file
+from express50.tracks import Track, read_sequence, read_track, track_file
 
 META = "export.json"
 SCHEMA = "express50.export/1"
+OF_FRAMES = ("frames", "expression", "neck", "jaw", "eyes", "R", "t")
 SHARED = ("schema", "head", "expressions", "shape", "offsets")
 
 
@@ -89,6 +91,42 @@ def read_tracked(dataset: Dataset, subject: str, expressions: Sequence[str]) -> 
     if expressions:
         track = chosen(track, [name for name in track.expressions if name in expressions])
     return Head(subject=subject, track=track, model=model, albedo=_albedo(path.parent))
+
+
+def with_clips(dataset: Dataset, head: Head, wanted: Sequence[str]) -> Head:
+    """The head with every tracked frame of its clips in the place of its peaks.
+
+    The frames' names are the clip's and the frame's, such as ``smile_000123``; where clips are
+    wanted by id, others are left out.
+
+    Raises:
+        StageError: its clips are not tracked, or none of these.
+        FormatError: they are damaged, or were tracked with another head model.
+    """
+    path = track_file(dataset, head.subject).with_name("sequence.npz")
+    clips = read_sequence(path)
+    if clips.head != head.track.head or len(clips.shape) != len(head.track.shape):
+        raise FormatError(f"{path}: is not of the track beside it; run 'express50 track' again")
+    rows = [i for i, cue in enumerate(clips.cues) if not wanted or cue in wanted]
+    if not rows:
+        raise StageError(f"{path}: holds no frame of {', '.join(wanted) or 'any clip'}")
+    own = {name: getattr(clips, name)[rows] for name in OF_FRAMES}
+    names = tuple(f"{clips.cues[i]}_{clips.frames[i]:06d}" for i in rows)
+    vertices = np.stack([_posed(head, {k: v[i] for k, v in own.items()}) for i in range(len(rows))])
+    track = replace(head.track, expressions=names, vertices=vertices, **own)
+    return replace(head, track=track)
+
+
+def _posed(head: Head, row: dict[str, np.ndarray]) -> np.ndarray:
+    """World vertices (V, 3) float32 of one frame's parameters."""
+    batch = {name: torch.from_numpy(row[name])[None] for name in ("neck", "jaw", "eyes")}
+    shape, expression, offsets = (
+        torch.from_numpy(np.asarray(array, np.float64))[None]
+        for array in (head.track.shape, row["expression"], head.track.offsets)
+    )
+    model = head.model.to(dtype=torch.float64)
+    vertices = pose(model, shape, expression, **batch, offsets=offsets)[0].numpy()
+    return (vertices @ row["R"].T + row["t"]).astype(np.float32)
 
 
 def _check_fit(path: Path, track: Track, model: HeadModel) -> None:

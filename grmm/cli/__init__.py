@@ -1,4 +1,4 @@
-"""``grmm``: train, fit, render, export, view, evaluate, score, ablate, study.
+"""``grmm``: train, fit, config, render, export, view, evaluate, score, ablate, study.
 
 Handlers parse, call the library, print.
 """
@@ -36,6 +36,7 @@ def build_parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     learn.add_train(commands)
     learn.add_fit(commands)
+    learn.add_config(commands)
     draw.add_render(commands)
     draw.add_export(commands)
     draw.add_view(commands)

@@ -4,15 +4,25 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from express50.console import OK, say
-from grmm.cli.shared import add_edit, edited_head, frame_head, load
+from express50.errors import ConfigError
+from grmm.cli.shared import (
+    add_edit,
+    at_least,
+    edited_head,
+    frame_head,
+    load,
+    no_file,
+)
 
 if TYPE_CHECKING:
     import numpy as np
 
+    from express50.tracks import Sequence
     from grmm.checkpoint import Loaded
     from grmm.edit import Head
     from grmm.scene import View
@@ -33,14 +43,20 @@ def add_render(commands: argparse._SubParsersAction) -> None:
     parser.add_argument("--pitch", type=float, default=0.0, help="degrees the camera goes up")
     parser.add_argument("--turntable", action="store_true", help="turntable.mp4")
     parser.add_argument("--degrees", type=float, default=360.0, help="how far the turntable goes")
-    parser.add_argument("--frames", type=int, default=72, help="frames of a video")
+    parser.add_argument("--frames", type=at_least(1), default=72, help="frames of a video")
     parser.add_argument("--to", metavar="SUBJECT/EXPRESSION", help="interpolation.mp4 ending there")
+    parser.add_argument(
+        "--drive", type=Path, metavar="SEQUENCE.NPZ", help="driven.mp4: moved as tracked clips are"
+    )
+    parser.add_argument("--drive-cue", metavar="ID", help="only this clip of --drive")
     parser.add_argument("--views", action="store_true", help="views.jpg: novel views")
     parser.add_argument("--controls", action="store_true", help="controls.jpg: one thing at a time")
-    parser.add_argument("--samples", type=int, default=0, help="samples.jpg: new heads, this many")
+    parser.add_argument(
+        "--samples", type=at_least(0), default=0, help="samples.jpg: new heads, this many"
+    )
     parser.add_argument("--spread", type=float, default=1.0, help="of samples, 1 = as trained")
     parser.add_argument("--seed", type=int, default=0, help="of samples")
-    parser.add_argument("--columns", type=int, default=8, help="expressions in grid.jpg")
+    parser.add_argument("--columns", type=at_least(1), default=8, help="expressions in grid.jpg")
     parser.set_defaults(handler=_render)
 
 
@@ -48,6 +64,7 @@ def _render(args: argparse.Namespace) -> int:
     from express50.images import write_image
     from grmm import render
 
+    no_file(args.out)
     loaded = load(args.checkpoint)
     head = edited_head(loaded, args)
     own = render.camera_of(loaded, args.camera, args.size)
@@ -64,6 +81,9 @@ def _render(args: argparse.Namespace) -> int:
             args.out / "interpolation.mp4",
             render.interpolation(loaded, head, end, view, args.frames),
         )
+    if args.drive:
+        frames = render.driven(loaded, head, _clips(args.drive, args.drive_cue), view)
+        _video(args.out / "driven.mp4", frames)
     if args.views:
         _sheet(args.out / "views.jpg", render.novel_views(loaded, head, view))
     _sheets(loaded, head, view, args)
@@ -71,6 +91,21 @@ def _render(args: argparse.Namespace) -> int:
     subjects = loaded.model.subjects[:8]
     _sheet(args.out / "grid.jpg", render.expression_grid(loaded, subjects, expressions, view))
     return OK
+
+
+def _clips(path: Path, cue: str | None) -> Sequence:
+    from express50.tracks import read_sequence
+
+    clips = read_sequence(path)
+    if cue is None:
+        return clips
+    rows = [i for i, name in enumerate(clips.cues) if name == cue]
+    if not rows:
+        known = ", ".join(dict.fromkeys(clips.cues))
+        raise ConfigError(f"--drive-cue {cue}: {path} has no such clip; expected one of {known}")
+    names = ("frames", "expression", "neck", "jaw", "eyes", "R", "t")
+    parts = {name: getattr(clips, name)[rows] for name in names}
+    return replace(clips, cues=(cue,) * len(rows), **parts)
 
 
 def _sheets(loaded: Loaded, head: Head, view: View, args: argparse.Namespace) -> None:
@@ -136,9 +171,13 @@ def add_view(commands: argparse._SubParsersAction) -> None:
     )
     parser.add_argument("checkpoint", type=Path)
     parser.add_argument("--host", default="127.0.0.1", help="address to listen on (this machine)")
-    parser.add_argument("--port", type=int, default=8080)
-    parser.add_argument("--size", type=int, default=320, help="height while things move, pixels")
-    parser.add_argument("--still", type=int, default=512, help="height once they rest, pixels")
+    parser.add_argument("--port", type=at_least(1, 65535), default=8080)
+    parser.add_argument(
+        "--size", type=at_least(16), default=320, help="height while things move, pixels"
+    )
+    parser.add_argument(
+        "--still", type=at_least(16), default=512, help="height once they rest, pixels"
+    )
     parser.set_defaults(handler=_view)
 
 
@@ -146,6 +185,8 @@ def _view(args: argparse.Namespace) -> int:
     from grmm.viewer import Viewer
 
     viewer = Viewer(load(args.checkpoint), args.host, args.port, args.size, args.still)
+    if viewer.port != args.port:
+        say(f"port {args.port} is taken; this is another")
     say(f"http://{args.host}:{viewer.port}  (Ctrl-C stops)")
     viewer.run()
     return OK

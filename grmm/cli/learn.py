@@ -14,13 +14,14 @@ from grmm.cli.shared import (
     add_metrics,
     load,
     metric_settings,
+    no_file,
     open_views,
     parse_seconds,
     select,
     split_names,
 )
 from grmm.config import Config
-from grmm.presets import PRESETS, resolve
+from grmm.presets import PRESETS, TABLES, resolve
 from grmm.progress import log
 
 MEASURED = "measured"  # in place of a preset
@@ -83,6 +84,7 @@ def _train(args: argparse.Namespace) -> int:
     from grmm.shard_source import open_shards
     from grmm.train import train
 
+    no_file(args.out)
     config = train_config(args)
     source = open_shards([args.shards, *args.also], config.data.split)
     resume = not args.anew and (args.out / "checkpoint.pt").exists()
@@ -119,6 +121,29 @@ def train_config(args: argparse.Namespace) -> Config:
     return config
 
 
+def add_config(commands: argparse._SubParsersAction) -> None:
+    """Add the parser of ``grmm config``."""
+    parser = commands.add_parser(
+        "config",
+        help="print every setting with its meaning, as --config takes them",
+        epilog="example: grmm config train fit --preset demo",
+    )
+    parser.add_argument("table", nargs="*", help=f"{', '.join(TABLES)}; default: all")
+    add_training(parser)
+    parser.set_defaults(handler=_config)
+
+
+def _config(args: argparse.Namespace) -> int:
+    from express50.config import config_toml
+
+    config = train_config(args)
+    for table in args.table or TABLES:
+        if table not in TABLES:
+            raise ConfigError(f"no table is {table!r}; expected some of {', '.join(TABLES)}")
+        say(config_toml(table, getattr(config, table)))
+    return OK
+
+
 def add_fit(commands: argparse._SubParsersAction) -> None:
     """Add the parser of ``grmm fit``."""
     parser = commands.add_parser(
@@ -144,7 +169,13 @@ def add_fit(commands: argparse._SubParsersAction) -> None:
 def _fit(args: argparse.Namespace) -> int:
     from grmm.fit import fit
 
+    no_file(args.out)
     loaded = load(args.checkpoint, [*args.set, *metric_settings(args)], args.seconds)
+    if not loaded.loop and len(loaded.model.subjects) == 1:
+        log(
+            f"{args.checkpoint} is a fit of {loaded.model.subjects[0]}: it knows how one person "
+            "looks; people are fitted from what 'grmm train' wrote"
+        )
     views = open_views(loaded, args.shards)
     given = select(views, args.subject, args.expression, args.cameras)
     chosen = set(given)

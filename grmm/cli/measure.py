@@ -12,8 +12,10 @@ from grmm.cli.learn import add_training, train_config
 from grmm.cli.shared import (
     add_checkpoint_and_shards,
     add_metrics,
+    at_least,
     load,
     metric_settings,
+    no_file,
     open_views,
     parse_seconds,
     select,
@@ -49,7 +51,7 @@ def _add_choice(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--subjects", default="*", help="ids or patterns, for example S001,S002")
     parser.add_argument("--expressions", default="*", help="ids or patterns")
     parser.add_argument("--cameras", default="*", help="ids or patterns, for example cam02,cam05")
-    parser.add_argument("--images", type=int, default=0, help="at most so many, 0 = all")
+    parser.add_argument("--images", type=at_least(0), default=0, help="at most so many, 0 = all")
 
 
 def _add_protocol(parser: argparse.ArgumentParser) -> None:
@@ -61,10 +63,12 @@ def _add_protocol(parser: argparse.ArgumentParser) -> None:
 def _evaluate(args: argparse.Namespace) -> int:
     from grmm.evaluate import SEEN, evaluate, kind_of, training_render, write_evaluation
     from grmm.judge import Judge
+    from grmm.order import spread
     from grmm.score import save_pictures
     from grmm.shard_source import ShardSource
     from grmm.unseen import evaluate_unseen
 
+    no_file(args.out)
     loaded = load(args.checkpoint, metric_settings(args), args.fit_budget)
     views = open_views(loaded, args.shards)
     background = loaded.config.data.background
@@ -75,6 +79,13 @@ def _evaluate(args: argparse.Namespace) -> int:
     if args.heldout:
         subjects, gallery = loaded.model.subjects, loaded.gallery
         known = [i for i in known if kind_of(views.keys[i], subjects, gallery) != SEEN]
+    if args.images:
+        known = spread(known, args.images)
+    if not known and not unseen:
+        raise ConfigError(
+            f"{args.shards}: training saw all that was chosen; leave --heldout out, or train with "
+            "--holdout-cameras"
+        )
     rows = evaluate(
         views,
         known,
@@ -83,8 +94,10 @@ def _evaluate(args: argparse.Namespace) -> int:
         lambda key: kind_of(key, loaded.model.subjects, loaded.gallery),
         keep,
     )
-    for subject in unseen:
-        found, effort = evaluate_unseen(loaded, views, subject, _protocol(args), judge, keep)
+    for subject, chosen in unseen.items():
+        found, effort = evaluate_unseen(
+            loaded, views, subject, _protocol(args), judge, keep, chosen
+        )
         log(f"{subject}: fitted from {', '.join(effort['cameras'])} in {effort['seconds']} s")
         rows += found
     summary = write_evaluation(args.out, rows, judge)
@@ -94,10 +107,8 @@ def _evaluate(args: argparse.Namespace) -> int:
 
 def _split(
     loaded: Loaded, views: HeadViews, args: argparse.Namespace
-) -> tuple[list[int], list[str]]:
-    """Samples that training's codes can draw, and people to be fitted first."""
-    from grmm.order import spread
-
+) -> tuple[list[int], dict[str, list[int]]]:
+    """Samples that training's codes can draw, and those of people to be fitted first, by person."""
     chosen = select(views, args.subjects, args.expressions, args.cameras)
     people, expressions = loaded.model.subjects, loaded.model.expressions
     known = [
@@ -105,15 +116,18 @@ def _split(
         for i in chosen
         if views.keys[i].subject in people and views.keys[i].expression in expressions
     ]
-    unseen = sorted({views.keys[i].subject for i in chosen} - set(people))
-    if not args.fit_cameras:
-        if not known:
-            raise ConfigError(
-                f"{args.shards}: no sample of subjects {', '.join(people)} by cameras "
-                f"{args.cameras}; unseen subjects are fitted first: name --fit-cameras"
-            )
-        unseen = []
-    return (spread(known, args.images) if args.images else known), unseen
+    unseen: dict[str, list[int]] = {}
+    for i in chosen:
+        if views.keys[i].subject not in people:
+            unseen.setdefault(views.keys[i].subject, []).append(i)
+    if args.fit_cameras:
+        return known, dict(sorted(unseen.items()))
+    if not known:
+        raise ConfigError(
+            f"{args.shards}: training saw none of {', '.join(sorted(unseen)) or args.expressions}; "
+            "people whom it never saw are fitted first: name --fit-cameras"
+        )
+    return known, {}
 
 
 def _protocol(args: argparse.Namespace) -> Protocol:
@@ -189,7 +203,9 @@ def add_ablate(commands: argparse._SubParsersAction) -> None:
     add_training(parser)
     parser.add_argument("--rows", default="", help="full,no_residuals,..; default: all")
     parser.add_argument("--fit-subjects", default="", help="default: all not trained")
-    parser.add_argument("--images", type=int, default=0, help="measured a protocol, 0 = all")
+    parser.add_argument(
+        "--images", type=at_least(0), default=0, help="measured a protocol, 0 = all"
+    )
     _add_protocol(parser)
     parser.add_argument("--json", action="store_true", help="print the table as JSON")
     parser.set_defaults(handler=_ablate)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import fnmatch
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -33,6 +33,36 @@ def parse_seconds(text: str) -> float:
     if not 0 < seconds < float("inf"):
         raise argparse.ArgumentTypeError(f"{text!r} is no time, expected for example 60s, 5m or 1h")
     return seconds
+
+
+def at_least(low: int, high: int = 1 << 20) -> Callable[[str], int]:
+    """A type of whole numbers from ``low`` to ``high`` for arguments."""
+
+    def number(text: str) -> int:
+        try:
+            value = int(text)
+        except ValueError:
+            value = low - 1
+        if not low <= value <= high:
+            raise argparse.ArgumentTypeError(
+                f"{text!r}, expected a whole number of {low} to {high}"
+            )
+        return value
+
+    return number
+
+
+def no_file(out: Path) -> None:
+    """Refuse, before any work, a folder to write to that cannot be one.
+
+    Raises:
+        ConfigError: it, or one above it, is a file.
+    """
+    for path in (out, *out.parents):
+        if path.is_dir():
+            return
+        if path.exists():
+            raise ConfigError(f"{path} is a file, expected a folder to write to; name another")
 
 
 def add_checkpoint_and_shards(parser: argparse.ArgumentParser) -> None:
@@ -91,11 +121,22 @@ def open_views(loaded: Loaded, shards: Path) -> HeadViews:
 
 
 def select(views: HeadViews, subject: str, expressions: str, cameras: str) -> list[int]:
-    """Indices of samples whose ids match; patterns as in a shell, several joined by commas."""
+    """Indices of samples whose ids match; patterns as in a shell, several joined by commas.
+
+    Raises:
+        ConfigError: a pattern, or all of them together, match nothing.
+    """
 
     def fits(name: str, patterns: str) -> bool:
         return any(fnmatch.fnmatchcase(name, pattern) for pattern in split_names(patterns))
 
+    for kind, patterns in (("subject", subject), ("expression", expressions), ("camera", cameras)):
+        names = {getattr(key, kind) for key in views.keys}
+        for pattern in split_names(patterns):
+            if not fnmatch.filter(names, pattern):
+                raise ConfigError(
+                    f"no {kind} is {pattern}; the shards have {', '.join(sorted(names))}"
+                )
     found = [
         i
         for i, key in enumerate(views.keys)
@@ -134,7 +175,9 @@ def add_edit(parser: argparse.ArgumentParser) -> None:
         "z_exp=0 (scale)  z_id.0=1.5 (principal direction, deviations); repeatable",
     )
     parser.add_argument("--camera", help="a camera of the checkpoint; default: the frontal one")
-    parser.add_argument("--size", type=int, default=0, help="longer side in pixels, 0 = as trained")
+    parser.add_argument(
+        "--size", type=at_least(0, 8192), default=0, help="longer side in pixels, 0 = as trained"
+    )
 
 
 def edited_head(loaded: Loaded, args: argparse.Namespace) -> Head:

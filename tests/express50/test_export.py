@@ -355,3 +355,58 @@ def test_what_cannot_be_exported_is_one_line(
     assert main(["export", str(dataset.root), str(tmp_path / "out"), *options]) == code
     assert message in capsys.readouterr().err
     assert not (tmp_path / "out").exists() or not list((tmp_path / "out").iterdir())
+
+
+def write_sequence(dataset: Dataset, subject: str, **changes: object) -> dict[str, np.ndarray]:
+    """Two clips of three frames, whose parameters are those of the peaks, mixed."""
+    track = track_of(dataset, subject)
+    mixed = {
+        name: track[name][[0, 1, 1, 1, 0, 1]]
+        for name in ("expression", "neck", "jaw", "eyes", "R", "t")
+    }
+    first, second = track["expressions"][:2].tolist()
+    sequence = mixed | {
+        "schema": "express50.sequence/1", "head": str(track["head"]), "shape": track["shape"],
+        "cues": np.array([first] * 3 + [second] * 3), "frames": np.arange(5, 11),
+    } | changes  # fmt: skip
+    np.savez(dataset.item_dir("track", subject) / "sequence.npz", **sequence)
+    return sequence
+
+
+def test_every_frame_of_a_clip_is_a_mesh(dataset, tmp_path):
+    track, sequence = track_of(dataset, "S001"), write_sequence(dataset, "S001")
+    clips = ("--subject", "S001", "--frames", "clips")
+    assert export(dataset, tmp_path, "ply", *clips) == 0
+    first, second = dict.fromkeys(sequence["cues"].tolist())
+    names = [f"{first}_{n:06d}" for n in (5, 6, 7)] + [f"{second}_{n:06d}" for n in (8, 9, 10)]
+    assert sorted(path.stem for path in (tmp_path / "S001").glob("*.ply")) == sorted(names)
+    exact = world_vertices(load_head("procedural"), track, track["offsets"])
+    for name, row in zip(names, (0, 1, 1, 1, 0, 1), strict=True):
+        mesh = trimesh.load(tmp_path / "S001" / f"{name}.ply", process=False)
+        np.testing.assert_allclose(mesh.vertices, exact[row], atol=2e-6)
+    assert export(dataset, tmp_path / "one", "obj", *clips, "--expression", second) == 0
+    assert len(list((tmp_path / "one" / "S001").glob("*.obj"))) == 3
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"schema": "x/1"}, "schema 'x/1'"),
+        ({"frames": np.arange(4)}, "frames is"),
+        ({"R": np.ones((6, 3, 3))}, "R is no rotation"),
+        ({"t": np.full((6, 3), np.nan)}, "NaN"),
+        ({"cues": np.array(["../x"] * 6)}, "expected letters"),
+        ({"head": "other"}, "is not of the track beside it"),
+    ],
+)
+def test_a_damaged_sequence_is_one_line(dataset, tmp_path, capsys, changes, words):
+    write_sequence(dataset, "S001", **changes)
+    assert export(dataset, tmp_path, "obj", "--subject", "S001", "--frames", "clips") == 1
+    assert words in capsys.readouterr().err
+
+
+def test_clips_that_were_not_tracked_or_cannot_be_told(dataset, tmp_path, capsys):
+    assert export(dataset, tmp_path, "obj", "--subject", "S002", "--frames", "clips") == 1
+    assert "track.frames=clips" in capsys.readouterr().err
+    assert export(dataset, tmp_path, "gaussian-avatars", "--frames", "clips") == 2
+    assert "needs a matte of every frame" in capsys.readouterr().err

@@ -1,3 +1,4 @@
+import csv
 import io
 import json
 import subprocess
@@ -34,9 +35,10 @@ def shards(tmp_path_factory):
 @pytest.fixture(autouse=True)
 def toy_head(monkeypatch):
     from express50.head import load
+    from grmm import ablate
 
-    monkeypatch.setattr(checkpoint_module, "load_head", lambda spec: ellipsoid_head())
-    monkeypatch.setattr(load, "load_head", lambda spec: ellipsoid_head())
+    for module in (ablate, checkpoint_module, load):  # whoever was imported before binds its own
+        monkeypatch.setattr(module, "load_head", lambda spec: ellipsoid_head())
 
 
 @pytest.fixture(scope="module")
@@ -84,11 +86,7 @@ def test_train_sees_the_training_split_only(checkpoint):
     assert json.loads(lines[-1])["iteration"] == 3
 
 
-def test_training_again_goes_on_and_refuses_what_differs(shards, tmp_path, capsys, monkeypatch):
-    from express50.head import load
-
-    monkeypatch.setattr(load, "load_head", lambda spec: ellipsoid_head())
-    monkeypatch.setattr(checkpoint_module, "load_head", lambda spec: ellipsoid_head())
+def test_training_again_goes_on_and_refuses_what_differs(shards, tmp_path, capsys):
     train = ["train", str(shards), str(tmp_path), *TINY]
     assert main(train) == 0
     capsys.readouterr()
@@ -144,9 +142,23 @@ def test_fit_render_evaluate_export(checkpoint, shards, tmp_path, capsys):
         (["train", "{shards}", "{out}", "--preset=dmeo"], 2, "expected one of paper, small, demo"),
         (["train", "{out}", "{out}"], 1, "no such index"),
         (["train", "{shards}", "{out}", *TINY, "--holdout-cameras=x"], 2, "names x"),
-        (["fit", "{checkpoint}", "{shards}", "{out}", "--subject=S9"], 2, "no sample has subject"),
+        (["fit", "{checkpoint}", "{shards}", "{out}", "--subject=S9"], 2, "no subject is"),
         (["fit", "{checkpoint}", "{shards}", "{out}", "--subject=S002", "--set=train.lr=1"], 2,
          "only fit"),
+        (["fit", "{checkpoint}", "{shards}", "{out}", "--subject=S002", "--cameras=cam00,cam9"], 2,
+         "no camera is cam9; the shards have cam00, cam01, cam02"),
+        (["train", "{checkpoint}", "{checkpoint}"], 2, "is a file, expected a folder"),
+        (["train", "{shards}", "{out}", *TINY, "--set=loss.l1=-1"], 2, "loss.l1 is -1"),
+        (["train", "{shards}", "{out}", *TINY, "--set=train.lr=-1"], 2, "train.lr is -1"),
+        (["evaluate", "{checkpoint}", "{shards}", "{out}", "--subjects=S002"], 2,
+         "name --fit-cameras"),
+        (["evaluate", "{checkpoint}", "{shards}", "{out}", "--heldout", "--cameras=cam00"], 2,
+         "training saw all"),
+        (["evaluate", "{checkpoint}", "{shards}", "{out}", "--subjects=S002", "--cameras=cam00",
+          "--fit-cameras=cam00", "--fit-expression=e0"], 2, "no view is left to measure"),
+        (["ablate", "{shards}", "{out}", *TINY, "--fit-subjects=S9"], 2,
+         "the shards have subjects S000, S001, S002"),
+        (["config", "trian"], 2, "no table is 'trian'"),
         (["render", "{out}/absent.pt", "{out}"], 1, "no such checkpoint"),
         (["render", "{checkpoint}", "{out}", "--subject=S9"], 2, "knows no subject S9"),
         (["export", "{checkpoint}", "{out}/head.obj"], 2, "expected .ply or .npz"),
@@ -159,6 +171,55 @@ def test_errors_are_one_line_and_set_the_exit_code(
     assert main([a.format(**names) if "{" in a else a for a in arguments]) == code
     error = capsys.readouterr().err.strip().splitlines()[-1]
     assert message in error and error.startswith("grmm: ")
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [["render", "--columns=0"], ["render", "--frames=0"], ["render", "--samples=-1"],
+     ["render", "--size=100000"], ["view", "--port=99999"], ["view", "--size=0"]],
+)  # fmt: skip
+def test_numbers_that_cannot_be_are_refused_at_once(arguments, capsys):
+    command, option = arguments
+    positional = ["x"] if command == "view" else ["x", "y"]
+    with pytest.raises(SystemExit, match="2"):
+        build_parser().parse_args([command, *positional, option])
+    assert "expected a whole number of" in capsys.readouterr().err
+
+
+def test_unseen_people_are_measured_where_it_is_asked(checkpoint, shards, tmp_path):
+    arguments = ["evaluate", str(checkpoint), str(shards), str(tmp_path), "--subjects=S002"]
+    arguments += ["--fit-cameras=cam00", "--fit-expression=e0", "--cameras=cam02"]
+    assert main([*arguments, "--expressions=e1"]) == 0
+    rows = list(csv.DictReader((tmp_path / "evaluation.csv").open()))
+    assert {(row["subject"], row["expression"], row["camera"]) for row in rows} == {
+        ("S002", "e1", "cam02")
+    }
+
+
+def test_config_prints_settings_that_train_takes(tmp_path, capsys):
+    assert main(["config", "train", "fit", "--preset=demo", "--set=train.lr=0.003"]) == 0
+    printed = capsys.readouterr().out
+    assert "# Adam's rate for all parameters. P." in printed and "[fit]" in printed
+    file = tmp_path / "settings.toml"
+    file.write_text(printed)
+    args = build_parser().parse_args(["train", "x", "y", "--preset=demo", f"--config={file}"])
+    assert train_config(args).train.lr == 0.003
+
+
+def test_training_saves_by_time_and_tells_that_it_diverged(shards, tmp_path, capsys, monkeypatch):
+    import grmm.train
+
+    saved, save = [], grmm.train.save
+
+    def spy(run, *rest):
+        saved.append(run.iteration)
+        save(run, *rest)
+
+    monkeypatch.setattr(grmm.train, "save", spy)
+    monkeypatch.setattr(grmm.train, "GREY_DB", 99.0)
+    assert main(["train", str(shards), str(tmp_path), *TINY, "--set=train.save_seconds=1e-6"]) == 0
+    assert saved == [1, 2, 3]
+    assert "lower train.lr" in capsys.readouterr().err
 
 
 def test_flags_stand_above_assignments():
@@ -194,3 +255,36 @@ def test_mixed_head_models_are_refused(tmp_path):
     with pytest.raises(FormatError, match="'other', the first sample with 'ellipsoid'"):
         ShardSource(tmp_path).read(1)
     assert io.BytesIO(samples[0].members["alpha.png"]).read(4) == b"\x89PNG"
+
+
+def test_a_head_is_driven_by_tracked_clips(checkpoint, tmp_path, capsys):
+    from grmm.checkpoint import load_checkpoint
+    from grmm.edit import trained_head, with_expression
+    from grmm.render import driven, frontal, picture
+
+    loaded = load_checkpoint(checkpoint)
+    frames = [loaded.gallery.frames["S001", name] for name in ("e1", "e0")]
+    arrays = {
+        name: np.stack([getattr(frame, name) for frame in frames])
+        for name in ("expression", "neck", "jaw", "eyes", "R", "t")
+    }
+    arrays |= {"shape": frames[0].shape, "frames": np.array([3, 4]), "cues": np.array(["a", "b"])}
+    path = tmp_path / "sequence.npz"
+    np.savez(path, schema="express50.sequence/1", head=loaded.head_spec, **arrays)
+    render = ["render", str(checkpoint), str(tmp_path / "out"), f"--drive={path}"]
+    assert main([*render, "--size=32"]) == 0
+    assert (tmp_path / "out" / "driven.mp4").stat().st_size > 0
+
+    from express50.tracks import read_sequence
+
+    head, view = trained_head(loaded, "S000", "e0"), frontal(loaded)
+    first, _ = driven(loaded, head, read_sequence(path), view)
+    donor = with_expression(head, trained_head(loaded, "S001", "e1"))
+    donor = type(head)(z_id=head.z_id, z_exp=head.z_exp, tracked=donor.tracked)
+    np.testing.assert_array_equal(first, picture(loaded, donor, view))
+
+    assert main([*render, "--drive-cue=c"]) == 2
+    assert "expected one of a, b" in capsys.readouterr().err
+    np.savez(path, schema="express50.sequence/1", head="flame2023.pkl", **arrays)
+    assert main(render) == 2
+    assert "head model 'flame2023.pkl'" in capsys.readouterr().err

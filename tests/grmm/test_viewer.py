@@ -1,3 +1,5 @@
+import shutil
+import subprocess
 import threading
 
 import numpy as np
@@ -100,3 +102,27 @@ def test_a_slider_moved_in_a_browser_changes_the_picture(loaded):
         viewer.stop()
         thread.join(timeout=10)
     assert not thread.is_alive()
+
+
+def test_a_browser_shows_the_controls(loaded, tmp_path):
+    """Every answer over HTTP and the socket was right while the page itself stayed blank."""
+    browser = shutil.which("chromium") or shutil.which("chromium-browser")
+    if browser is None:
+        pytest.skip("chromium is not installed")
+    viewer = Viewer(loaded, port=8330, moving=32, still=32)
+    thread = threading.Thread(target=viewer.run)
+    thread.start()
+    command = [
+        browser, "--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={tmp_path}",
+        "--timeout=8000", "--virtual-time-budget=8000", "--dump-dom",
+        f"http://127.0.0.1:{viewer.port}",
+    ]  # fmt: skip
+    try:
+        for _ in range(3):  # a busy machine may not answer in the browser's time
+            told = subprocess.run(command, capture_output=True, text=True, timeout=90, check=False)
+            if "jaw open" in told.stdout:
+                break
+    finally:
+        viewer.stop()
+        thread.join()
+    assert "jaw open" in told.stdout
