@@ -114,7 +114,6 @@ PRESETS: dict[str, dict[str, object]] = {
     "standard": {},
     "reference": {
         "voxel_mm": 1.0,
-        "patch_samples": 7,
         "image_side": 2048,
         "render_rounds": 4,
         "raycast": "sdf",
