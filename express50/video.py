@@ -147,6 +147,22 @@ def video_fps(path: Path) -> float:
     return rate
 
 
+def video_turn(path: Path) -> int:
+    """Quarter turns counter-clockwise that a video's container asks a player for, 0 to 3.
+
+    Telephones store what they film upright as pictures on their side. A rig's cameras are taken as
+    they are stored, since a calibration belongs to stored pixels.
+
+    Raises:
+        CaptureError: the file is no video, damaged or holds no frame.
+    """
+    container, stream = _open(path)
+    with container:
+        for frame in _decode(path, container, stream):
+            return round(frame.rotation / 90) % 4
+    raise CaptureError(f"{path}: video holds no frame; record or copy it again")
+
+
 def iterate_video(path: Path) -> Iterator[tuple[int, np.ndarray]]:
     """Decode a whole video in display order.
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from express50.cameras import Camera
 from express50.expressions import select
+from express50.footage import ImageFootage, VideoFootage
 from express50.head.load import load_head
 from express50.head.model import HeadModel
 from express50.images import encode_png
@@ -18,7 +19,6 @@ from express50.twin.background import background, room_width
 from express50.twin.board import BoardSpec, board_poses, render_board
 from express50.twin.body import Body, build_body, pose_body
 from express50.twin.config import TwinConfig, subject_number
-from express50.twin.footage import ImageFootage, VideoFootage
 from express50.twin.noise import random_stream
 from express50.twin.performance import Performance, perform
 from express50.twin.render import Band, Sampling, bands, hull_of, render_bands, window_of

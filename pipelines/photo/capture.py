@@ -4,27 +4,42 @@ from __future__ import annotations
 
 import re
 import shutil
+import tomllib
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
 import torch
 
 from express50.cameras import camera_rows
+from express50.capture import IMAGE_SUFFIXES
+from express50.digests import file_sha256
 from express50.errors import CaptureError
+from express50.footage import VideoFootage
 from express50.head.load import load_head
 from express50.images import encode_png
 from express50.landmarks.detector import Detection, detect
 from express50.landmarks.network import load_network
 from express50.publish import dump_json, write_bytes
+from express50.video import video_fps
 from pipelines.photo.focal import Focal, single_camera, weigh_focal
-from pipelines.photo.picture import Picture, guess_focal, read_upright, spread_frames
+from pipelines.photo.picture import (
+    Picture,
+    guess_focal,
+    read_upright,
+    spread_frames,
+    upright_frames,
+)
 from pipelines.track.config import TrackConfig
 from pipelines.track.sparse_head import make_basis
 
 CAMERA = "photo"
 FACE_SCORE = 0.2
 PROBES, FOCAL_FACES = 8, 3
-FPS = 25.0
+PHOTO_FPS = 25.0  # a photograph has no rate, a capture must say one
+# Focal lengths, in longer sides of the picture, beyond which none is a lens before a face.
+FOCAL_LIMITS = (0.1, 100.0)
+TURNED_CRF = 12  # H.264 that no eye tells from the source
 
 
 def make_photo_capture(
@@ -44,7 +59,7 @@ def make_photo_capture(
 
     Args:
         picture: from `open_picture`.
-        folder: of the capture; what is there is written over.
+        folder: of the capture; what was made of the same file is written over.
         subject: subject id.
         config: of the fit that weighs focal lengths.
         focal_px: focal length, pixels, where it is known.
@@ -52,11 +67,15 @@ def make_photo_capture(
         windows: cues of a video.
 
     Raises:
-        CaptureError: the picture cannot be read, or shows no face.
+        CaptureError: the picture cannot be read or shows no face, the folder has another picture,
+            or the focal length is that of no lens.
     """
     torch.set_num_threads(1)
+    _check_same(picture.path, folder, subject)
     images, frames = spread_frames(picture, PROBES)
     height, width = images[0].shape[:2]
+    _check_focal(focal_px, max(width, height))
+    fps = video_fps(picture.path) if picture.video else PHOTO_FPS
     faces = find_faces(picture.path, images, config)
     start = (focal_px, "given") if focal_px else guess_focal(picture, width, height, film_mm)
     basis = make_basis(load_head(config.head))
@@ -66,8 +85,32 @@ def make_photo_capture(
     camera = single_camera(CAMERA, width, height, focal.pixels)
     write_bytes(folder / "calibration.json", dump_json(camera_rows({CAMERA: camera})))
     write_bytes(folder / "cues.csv", _cues(frames, windows).encode())
-    write_bytes(folder / "capture.toml", _meta(subject, focal).encode())
+    meta = _meta(subject, fps, focal, file_sha256(picture.path))
+    write_bytes(folder / "capture.toml", meta.encode())
     return focal
+
+
+def _check_same(path: Path, folder: Path, subject: str) -> None:
+    """Refuse to write over what was made of another picture."""
+    try:
+        known = tomllib.loads((folder / "capture.toml").read_text()).get("picture_sha256")
+    except (OSError, ValueError):  # nothing is there, or nothing that could be lost
+        return
+    if known is not None and known != file_sha256(path):
+        raise CaptureError(
+            f"{path}: {folder} was made of another picture; name this one with --subject, or "
+            "remove that folder"
+        )
+
+
+def _check_focal(focal_px: float | None, side: int) -> None:
+    """Refuse a focal length that no lens has."""
+    low, high = (side * limit for limit in FOCAL_LIMITS)
+    if focal_px is not None and not low <= focal_px <= high:
+        raise CaptureError(
+            f"--focal-px {focal_px:g}: expected {low:g} to {high:g} for a picture {side} px long; "
+            "millimetres on 35 mm film go to --film-mm"
+        )
 
 
 def find_faces(path: Path, images: list[np.ndarray], config: TrackConfig) -> list[Detection]:
@@ -96,20 +139,33 @@ def subject_id(path: Path) -> str:
 
 
 def _write_footage(picture: Picture, folder: Path) -> None:
-    """Copy the file; a photograph whose pixels lie on their side is stored upright."""
+    """Copy the file; what lies on its side, or is of a kind no stage reads, is stored anew."""
     # A former picture of another kind or suffix would make the footage ambiguous.
     shutil.rmtree(folder, ignore_errors=True)
     suffix = picture.path.suffix.lower()
     name = f"video{suffix}" if picture.video else f"frames/000000{suffix}"
     target = folder / name
     target.parent.mkdir(parents=True)
-    if picture.orientation != 1:
+    if not picture.video and (picture.orientation != 1 or suffix not in IMAGE_SUFFIXES):
         write_bytes(target.with_suffix(".png"), encode_png(read_upright(picture)))
+        return
+    if picture.orientation != 1:
+        _turn_video(picture, folder)
         return
     try:
         shutil.copyfile(picture.path, target)
     except OSError as error:
         raise CaptureError(f"{target}: cannot be written ({error.strerror})") from error
+
+
+def _turn_video(picture: Picture, folder: Path) -> None:
+    """Encode a video again, upright."""
+    frames = upright_frames(picture)
+    first = next(frames)
+    height, width = first.shape[:2]
+    with VideoFootage(folder, width, height, video_fps(picture.path), TURNED_CRF) as video:
+        for image in chain([first], frames):
+            video.write(image)
 
 
 def _cues(frames: int, windows: int) -> str:
@@ -123,10 +179,11 @@ def _cues(frames: int, windows: int) -> str:
     return "\n".join(rows) + "\n"
 
 
-def _meta(subject: str, focal: Focal) -> str:
+def _meta(subject: str, fps: float, focal: Focal, sha256: str) -> str:
     """Content of capture.toml."""
     return (
-        f'subject = "{subject}"\nfps = {FPS}\n'
+        f'subject = "{subject}"\nfps = {fps:.6g}\n'
         f'focal_px = {focal.pixels:.3f}\nfocal_source = "{focal.source}"\n'
         f"focal_range_px = [{focal.low:.1f}, {focal.high:.1f}]\n"
+        f'picture_sha256 = "{sha256}"\n'
     )

@@ -23,10 +23,9 @@ from pipelines.photo.picture import open_picture
 
 STAGES = ("ingest", "calibrate", "observe", "align", "track")
 MATTE_STAGES = ("alpha", "matte")
+SEARCH = 0.08  # people fill a rig's pictures, but not all photographs
 # One view cannot tell a bent neck from a shape: it stays nearer to rest. Without mattes and other
 # views the jaw's width hangs on its landmarks alone.
-# People fill a rig's pictures, but not all photographs.
-SEARCH = 0.08
 PHOTO_SETTINGS = (
     "track.neck_prior=0.03", "track.contour_weight=0.7", "observe.min_score=0.2",
     f"track.search={SEARCH}", f"observe.search={SEARCH}",
@@ -124,6 +123,8 @@ def _account(
         f"focal length {focal.pixels:.0f} px ({focal.source}); the face alone is explained as well "
         f"by {focal.low:.0f} to {focal.high:.0f} px"
     )
+    if not focal.low <= focal.pixels <= focal.high:
+        say("warning: the focal length is not among these; check it, or name --focal-px")
     if done:
         say(f"track: {dataset.item_dir('track', subject)}", f"picture: {panel}")
     return OK if done else FAILED

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,11 +11,15 @@ import numpy as np
 
 from express50.capture import IMAGE_SUFFIXES, VIDEO_SUFFIXES
 from express50.errors import CaptureError, FormatError
-from express50.exif import read_exif, upright
+from express50.exif import TURNS, read_exif, upright
 from express50.frames import read_srgb8
-from express50.video import iterate_video
+from express50.video import iterate_video, video_turn
 
+# Read as photographs; a rig's cameras write none of the last two.
+PHOTO_SUFFIXES = (*IMAGE_SUFFIXES, ".webp", ".bmp")
 FILM_DIAGONAL_MM = math.hypot(36.0, 24.0)
+# Quarter turns counter-clockwise without a flip -> EXIF's orientation.
+ORIENTATION = {turns: number for number, (turns, flipped) in TURNS.items() if not flipped}
 
 
 @dataclass(frozen=True)
@@ -24,7 +29,8 @@ class Picture:
     Attributes:
         path: the file.
         video: whether it is a video.
-        orientation: EXIF's, 1 to 8; 1 where its pixels lie upright.
+        orientation: EXIF's, 1 to 8, or what a video's container says in its terms; 1 where its
+            pixels lie upright.
         film_mm: focal length on 35 mm film with the same diagonal angle of view; 0 where EXIF
             tells none.
     """
@@ -42,15 +48,21 @@ def open_picture(path: Path) -> Picture:
         CaptureError: no such file, or neither an image nor a video.
     """
     path = Path(path)
+    if path.is_dir():
+        raise CaptureError(
+            f"{path}: is a folder, expected a photograph or a video; the pictures of several "
+            "cameras are read by 'express50 ingest'"
+        )
     if not path.is_file():
         raise CaptureError(f"{path}: no such file; expected a photograph or a video")
     suffix = path.suffix.lower()
     if suffix in VIDEO_SUFFIXES:
-        return Picture(path, video=True)
-    if suffix not in IMAGE_SUFFIXES:
+        turns = video_turn(path)
+        return Picture(path, video=True, orientation=ORIENTATION[turns])
+    if suffix not in PHOTO_SUFFIXES:
         raise CaptureError(
             f"{path}: is no photograph or video by its name; expected one of "
-            f"{' '.join(IMAGE_SUFFIXES + VIDEO_SUFFIXES)}"
+            f"{' '.join(PHOTO_SUFFIXES + VIDEO_SUFFIXES)}"
         )
     try:
         orientation, film = read_exif(path)
@@ -68,6 +80,12 @@ def read_upright(picture: Picture) -> np.ndarray:
     return upright(read_srgb8(picture.path), picture.orientation)
 
 
+def upright_frames(picture: Picture) -> Iterator[np.ndarray]:
+    """Decode a whole video (H, W, 3) uint8 sRGB as it should be looked at."""
+    for _, image in iterate_video(picture.path):
+        yield upright(image, picture.orientation)
+
+
 def spread_frames(picture: Picture, count: int) -> tuple[list[np.ndarray], int]:
     """Up to `count` frames spread over a picture, and how many frames it has.
 
@@ -75,9 +93,9 @@ def spread_frames(picture: Picture, count: int) -> tuple[list[np.ndarray], int]:
     """
     if not picture.video:
         return [read_upright(picture)], 1
-    frames = sum(1 for _ in iterate_video(picture.path))
+    frames = sum(1 for _ in upright_frames(picture))
     wanted = set(np.unique(np.linspace(0, frames - 1, count).round().astype(int)).tolist())
-    return [i for n, (_, i) in enumerate(iterate_video(picture.path)) if n in wanted], frames
+    return [image for n, image in enumerate(upright_frames(picture)) if n in wanted], frames
 
 
 def guess_focal(picture: Picture, width: int, height: int, film_mm: float) -> tuple[float, str]:

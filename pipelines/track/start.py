@@ -54,10 +54,11 @@ def initial_pose(observation: Observation, template: np.ndarray) -> tuple[np.nda
         return _from_one_view(observation, template)
     scale = similarity_fit(template[seen], observation.points[seen])[0]
     if not SCALE_LIMITS[0] < scale < SCALE_LIMITS[1]:
+        unit = _unit(scale)
         raise RigScaleError(
-            f"{observation.expression}: the rig seems {_factor(scale)} off: the head measures "
+            f"{observation.expression}: the rig seems {unit}x off: the head measures "
             f"{scale:.3g} times a human head in the calibration's units; expected metres, divide "
-            f"the camera translations by {scale:.3g} and calibrate again"
+            f"the camera translations by {unit} and calibrate again"
         )
     spread = np.trace(observation.covariance[seen], axis1=1, axis2=2) / 3.0
     # A point without a covariance is triangulated from all but one direction.
@@ -65,10 +66,10 @@ def initial_pose(observation: Observation, template: np.ndarray) -> tuple[np.nda
     return rigid_fit(template[seen], observation.points[seen], 1.0 / (PERSON_M**2 + spread))
 
 
-def _factor(scale: float) -> str:
-    """How far off a scale is, in words: 100x, 0.001x."""
-    power = round(float(np.log10(scale)))
-    return f"{10.0**power:g}x" if power else f"{scale:.2g}x"
+def _unit(scale: float) -> str:
+    """What to divide by: a power of ten (heads differ, units do not) if one is near, or `scale`."""
+    power = 10.0 ** round(float(np.log10(scale)))
+    return f"{power:g}" if power != 1.0 and 1 / 1.5 < scale / power < 1.5 else f"{scale:.3g}"
 
 
 def _from_one_view(observation: Observation, template: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

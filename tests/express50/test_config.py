@@ -89,8 +89,8 @@ def test_values_are_typed(assignment, key, value):
         ("track.sizes=[1, 'x']", r"track.sizes\[1\]: got 'x'"),
         ("track.window=[1]", "got 1 values, expected 2"),
         ("track.iterations=0", "track: iterations is 0, expected at least 1"),
-        ("track.iterations", "expected stage.key=value"),
-        ("iterations=3", "expected stage.key=value"),
+        ("track.iterations", "expected TABLE.KEY=VALUE"),
+        ("iterations=3", "expected TABLE.KEY=VALUE"),
     ],
 )
 def test_wrong_assignments_say_what_is_wrong(assignment, message):

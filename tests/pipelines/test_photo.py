@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+import struct
 from pathlib import Path
 
 import av
+import cv2
 import numpy as np
 import OpenImageIO as oiio
 import pytest
@@ -15,6 +17,7 @@ from express50.cli import main
 from express50.errors import CaptureError
 from express50.frames import read_srgb8
 from express50.images import write_image
+from express50.video import iterate_video
 from pipelines.photo.capture import make_photo_capture, subject_id
 from pipelines.photo.picture import guess_focal, open_picture, read_upright
 from pipelines.track.config import TrackConfig
@@ -93,6 +96,48 @@ def test_wrong_options_and_files_are_refused(tmp_path: Path) -> None:
         open_picture(tmp_path / "c.png")
 
 
+def test_a_second_picture_of_the_same_name_takes_nobodys_place(
+    tmp_path: Path, astronaut: np.ndarray
+) -> None:
+    config = TrackConfig(iterations=2)
+    for folder, image in (("a", astronaut), ("b", astronaut[:, ::-1])):
+        (tmp_path / folder).mkdir()
+        write_image(tmp_path / folder / "eva.png", np.ascontiguousarray(image))
+    out = tmp_path / "out"
+    make_photo_capture(open_picture(tmp_path / "a/eva.png"), out, "eva", config)
+    before = (out / "cameras/photo/frames/000000.png").read_bytes()
+    with pytest.raises(CaptureError, match="made of another picture; name this one"):
+        make_photo_capture(open_picture(tmp_path / "b/eva.png"), out, "eva", config)
+    assert (out / "cameras/photo/frames/000000.png").read_bytes() == before
+    make_photo_capture(open_picture(tmp_path / "a/eva.png"), out, "eva", config)
+
+
+def test_folders_and_focal_lengths_of_no_lens_are_refused(
+    tmp_path: Path, astronaut: np.ndarray
+) -> None:
+    with pytest.raises(CaptureError, match="is a folder.*express50 ingest"):
+        open_picture(tmp_path)
+    write_image(tmp_path / "eva.png", astronaut)
+    for focal in (50.0, 1e6):
+        with pytest.raises(CaptureError, match="expected 51.2 to 51200 for a picture 512 px long"):
+            make_photo_capture(
+                open_picture(tmp_path / "eva.png"), tmp_path / "out", "eva", TrackConfig(),
+                focal_px=focal,
+            )  # fmt: skip
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("suffix", ["webp", "bmp"])
+def test_photographs_of_kinds_that_no_rig_writes_are_read(
+    tmp_path: Path, astronaut: np.ndarray, suffix: str
+) -> None:
+    path = tmp_path / f"eva.{suffix}"
+    cv2.imwrite(str(path), astronaut[..., ::-1])
+    make_photo_capture(open_picture(path), tmp_path / "out", "eva", TrackConfig(iterations=2))
+    stored = read_srgb8(tmp_path / "out/cameras/photo/frames/000000.png")
+    assert np.abs(stored.astype(int) - astronaut).mean() < 4
+
+
 def write_exif(path: Path, image: np.ndarray, orientation: int, film: int) -> None:
     spec = oiio.ImageSpec(image.shape[1], image.shape[0], 3, "uint8")
     spec.attribute("Orientation", orientation)
@@ -150,14 +195,37 @@ def test_subject_ids_are_made_of_file_names() -> None:
     assert subject_id(Path("???.jpg")) == "photo"
 
 
-def write_video(path: Path, images: list[np.ndarray]) -> None:
+def write_video(path: Path, images: list[np.ndarray], rate: int = 25) -> None:
     with av.open(str(path), "w") as file:
-        stream = file.add_stream("libx264", rate=25)
+        stream = file.add_stream("libx264", rate=rate)
         stream.height, stream.width = images[0].shape[:2]
         stream.pix_fmt, stream.options = "yuv420p", {"crf": "12"}
         for image in images:
             file.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
         file.mux(stream.encode())
+
+
+def turn_video(path: Path) -> None:
+    """Have the container ask for a turn to the right, as a telephone held upright does."""
+    data = bytearray(path.read_bytes())
+    matrix = data.index(b"tkhd") + 44  # ISO/IEC 14496-12, 8.3.2
+    one = 1 << 16
+    data[matrix : matrix + 36] = struct.pack(">9i", 0, one, 0, -one, 0, 0, 0, 0, 1 << 30)
+    path.write_bytes(data)
+
+
+def test_a_telephones_video_is_stored_upright(tmp_path: Path, astronaut: np.ndarray) -> None:
+    upright = np.ascontiguousarray(astronaut[:360, 80:360])
+    write_video(tmp_path / "a.mp4", [np.ascontiguousarray(np.rot90(upright))] * 3, rate=30)
+    turn_video(tmp_path / "a.mp4")
+    picture = open_picture(tmp_path / "a.mp4")
+    make_photo_capture(picture, tmp_path / "out", "a", TrackConfig(iterations=2), windows=1)
+    camera = read_cameras(tmp_path / "out/calibration.json")["photo"]
+    assert (camera.width, camera.height) == (280, 360)
+    stored = [image for _, image in iterate_video(tmp_path / "out/cameras/photo/video.mp4")]
+    assert len(stored) == 3 and stored[0].shape == upright.shape
+    assert np.abs(stored[2].astype(int) - upright).mean() < 6
+    assert "fps = 30" in (tmp_path / "out/capture.toml").read_text()
 
 
 def test_a_video_is_tracked_in_every_frame(tmp_path: Path, astronaut: np.ndarray) -> None:
