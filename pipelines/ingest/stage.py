@@ -118,7 +118,8 @@ def run(dataset: Dataset, item: str, config: IngestConfig, out: Path) -> dict:
     index = make_index(raw, cameras, cues)
     (out / "index.json").write_bytes(dump_json(index_to_json(index)))
     write_contact_sheet(index, out)
-    figures, warnings = look({n: seen[n] for n in cameras}, _clips(index), config)
+    digests = {name: camera.sha256 for name, camera in cameras.items()}
+    figures, warnings = look({n: seen[n] for n in cameras}, digests, _clips(index), config)
     write_json(out / "checks.json", figures)
     lost = {f"camera {k}": why for k, why in sorted(dropped.items())}
     lost |= {f"expression {k}": why for k, why in sorted(beyond.items())} | outside | raw.skipped

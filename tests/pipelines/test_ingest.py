@@ -1,6 +1,7 @@
 """Ingest: the index is true to the footage; bad cameras are dropped, bad captures fail alone."""
 
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -86,6 +87,17 @@ def test_truncated_camera_is_dropped_with_its_reason(dataset):
     names = {p.name for p in (dataset.item_dir("ingest", "S001") / "proxies").iterdir()}
     assert names == {"cam00.tar", "cam00.json", "cam02.tar", "cam02.json"}
     assert summary.outcomes[0].dropped == (dropped,)
+
+
+def test_a_copied_camera_is_named(dataset):
+    assert run(dataset).ok and "warnings" not in metrics(dataset)
+    shutil.copyfile(
+        camera_folder(dataset, "cam00") / "video.mp4", camera_folder(dataset, "cam02") / "video.mp4"
+    )
+    assert run(dataset).ok
+    (warning,) = metrics(dataset)["warnings"]
+    assert warning["what"] == "camera cam02"
+    assert "the very files of camera cam00" in warning["why"]
 
 
 def test_missing_camera_is_dropped(dataset):
