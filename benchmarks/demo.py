@@ -160,7 +160,7 @@ def run_grmm(dataset: Path, unseen: str, seconds: tuple[int, int]) -> list[Step]
             f"--seconds={seconds[0]}", f"--holdout-cameras={held_out}",
         ),
         run_step(
-            "fit", "grmm", "fit", checkpoint, str(shards), str(out / "fit"),
+            "fit", "grmm", "fit", checkpoint, str(shards), str(out / "fit"), "--anew",
             f"--subject={unseen}", f"--expression={shown}", f"--cameras={','.join(given)}",
             f"--seconds={seconds[1]}",
         ),

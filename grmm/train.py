@@ -186,7 +186,13 @@ def restore(run: Run, path: Path, config: Config, device: torch.device, rank: in
         run.generator.set_state(loaded.loop["generator"])
     torch.set_rng_state(loaded.loop["torch"])
     run.iteration, run.seconds = loaded.loop["iteration"], loaded.loop["seconds"]
-    log(f"{path}: going on from iteration {run.iteration}")
+    if finished(run, config):
+        log(
+            f"{path}: has all of its {run.iteration} iterations; to train on, raise "
+            "train.iterations or --seconds"
+        )
+    else:
+        log(f"{path}: going on from iteration {run.iteration}")
 
 
 def progress_line(run: Run, config: Config) -> str:

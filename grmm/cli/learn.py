@@ -161,6 +161,7 @@ def add_fit(commands: argparse._SubParsersAction) -> None:
         "--seconds", "--budget", type=parse_seconds, help="stop after this long: 60s, 5m"
     )
     parser.add_argument("--set", action="append", default=[], metavar="fit.KEY=VALUE")
+    parser.add_argument("--anew", action="store_true", help="write over the fit that OUT has")
     add_metrics(parser)
     parser.add_argument("--json", action="store_true", help="print metrics as JSON")
     parser.set_defaults(handler=_fit)
@@ -170,6 +171,7 @@ def _fit(args: argparse.Namespace) -> int:
     from grmm.fit import fit
 
     no_file(args.out)
+    _check_room(args.out / "checkpoint.pt", args.checkpoint, args.anew)
     loaded = load(args.checkpoint, [*args.set, *metric_settings(args)], args.seconds)
     if not loaded.loop and len(loaded.model.subjects) == 1:
         log(
@@ -190,3 +192,15 @@ def _fit(args: argparse.Namespace) -> int:
             f"wrote {args.out}",
         )
     return OK
+
+
+def _check_room(made: Path, read: Path, anew: bool) -> None:
+    """Refuse to write over a checkpoint that nobody gave up.
+
+    Raises:
+        ConfigError: the folder has one, or it is the one that is read.
+    """
+    if made.exists() and made.samefile(read):
+        raise ConfigError(f"{made} is what is fitted from; fit into another folder")
+    if made.exists() and not anew:
+        raise ConfigError(f"{made} is there; fit into another folder, or write over it with --anew")

@@ -91,6 +91,8 @@ def test_training_again_goes_on_and_refuses_what_differs(shards, tmp_path, capsy
     assert main(train) == 0
     capsys.readouterr()
 
+    assert main(train) == 0
+    assert "has all of its 3 iterations; to train on, raise" in capsys.readouterr().err
     assert main([*train, "--set=train.iterations=4"]) == 0
     assert "going on from iteration 3" in capsys.readouterr().err
     steps = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
@@ -114,6 +116,10 @@ def test_fit_render_evaluate_export(checkpoint, shards, tmp_path, capsys):
     fit = ["fit", str(checkpoint), str(shards), str(tmp_path / "fit"), "--subject=S002"]
     assert main([*fit, "--expression=e0", "--cameras=cam00,cam01", "--seconds=30"]) == 0
     assert "held-out views" in capsys.readouterr().out
+    made = tmp_path / "fit" / "checkpoint.pt"
+    before = made.read_bytes()
+    assert main(fit) == 2 and main([fit[0], str(made), *fit[2:], "--anew"]) == 2
+    assert made.read_bytes() == before, "neither a former fit nor what is read is written over"
     metrics = json.loads((tmp_path / "fit" / "metrics.json").read_text())
     assert metrics["held_out_cameras"] == ["cam02"] and metrics["psnr_db"] > 5
 
