@@ -49,6 +49,8 @@ class ObserveConfig:
         """Refuse values out of range."""
         if self.cameras < 1 or self.stride < 1:
             raise ValueError(f"cameras {self.cameras}, stride {self.stride}: expected at least 1")
+        if not 0 <= self.min_score <= 1:
+            raise ValueError(f"min_score {self.min_score}: expected 0 to 1")
         if not 0.02 <= self.search <= 1:
             raise ValueError(f"search {self.search}: expected 0.02 to 1")
 

@@ -47,8 +47,9 @@ from express50.tracks import read_track
 from express50.twin.truth import Truth
 from pipelines import track
 from pipelines.depth import STAGE
+from pipelines.depth.finish import Surface
 from pipelines.depth.grid import View, head_box
-from pipelines.depth.reconstruct import Surface, hull_grid, reconstruct
+from pipelines.depth.reconstruct import hull_grid, reconstruct
 from pipelines.depth.stage import look, read_prior, read_views
 from pipelines.depth.surface import extract_mesh
 from pipelines.depth.trace import trace

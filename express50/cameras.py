@@ -16,6 +16,7 @@ import numpy as np
 
 from express50.checks import PIXEL_LIMIT, check_shape
 from express50.errors import CalibrationError
+from express50.publish import write_bytes
 from express50.reading import read_json
 
 # Where each COLMAP parameter goes: focal x, focal y, then OpenCV's k1 k2 p1 p2 k3 k4 k5 k6.
@@ -340,7 +341,7 @@ def _numbers(where: str, name: str, value: object, shape: tuple[int, ...]) -> np
 
 def write_cameras(path: Path, cameras: Mapping[str, Camera]) -> None:
     """Write a calibration file that :func:`read_cameras` reads."""
-    Path(path).write_text(json.dumps(camera_rows(cameras), indent=1) + "\n")
+    write_bytes(Path(path), (json.dumps(camera_rows(cameras), indent=1) + "\n").encode())
 
 
 def camera_rows(cameras: Mapping[str, Camera]) -> dict[str, dict]:

@@ -20,6 +20,10 @@ TURNS = {1: (0, False), 2: (0, True), 3: (2, False), 4: (2, True), 5: (1, True),
          7: (3, True), 8: (1, False)}  # fmt: skip
 
 
+# Quarter turns counter-clockwise without a flip -> orientation.
+ORIENTATION = {turns: number for number, (turns, flipped) in TURNS.items() if not flipped}
+
+
 def read_exif(path: Path) -> tuple[int, float]:
     """Orientation, 1 to 8, and focal length on 35 mm film, 0 for none; what cannot be is not told.
 

@@ -14,6 +14,7 @@ from express50.cameras import Camera, pinhole, read_cameras
 from express50.capture import RawCamera
 from express50.colour_polynomial import correct_srgb8
 from express50.errors import CaptureError, FormatError, StageError
+from express50.exif import upright
 from express50.images import decode_image
 from express50.index import CameraSource, Index, read_index
 from express50.layout import Dataset
@@ -72,11 +73,11 @@ class FrameReader:
             image = read_picture(self.path, self.source.names[frame], self.source.orientation)
             return self._checked(image, frame)
         video, number = self._video_of(frame)
-        image = video.read(number)
+        image = upright(video.read(number), self.source.orientation)
         if dhash(image) != self.source.dhash[frame]:
             # A decoder may conceal a missing reference after a seek; from the start it cannot.
             video.restart()
-            image = video.read(number)
+            image = upright(video.read(number), self.source.orientation)
         return self._checked(image, frame)
 
     def _video_of(self, frame: int) -> tuple[VideoReader, int]:

@@ -7,8 +7,8 @@ from pathlib import Path
 from express50.capture import VIDEO_SUFFIXES, RawCamera, RawCapture, image_names
 from express50.captures.wishes import Wishes, check_wishes, identifier
 from express50.errors import CaptureError, FormatError
-from express50.exif import read_exif
-from express50.video import video_fps
+from express50.exif import ORIENTATION, read_exif
+from express50.video import video_fps, video_turn
 
 FPS = 24.0  # of photographs it means nothing
 CAMERA = "video"
@@ -70,11 +70,16 @@ def fits_video(path: Path) -> bool:
 def read_video(path: Path, wishes: Wishes) -> RawCapture:
     """A video as one camera; all of it is one clip, named ``clip`` unless it is told otherwise.
 
+    A video that lies on its side, as telephones store what they film upright, is read upright.
+
     Raises:
         CaptureError: it is no video.
     """
     check_wishes(wishes, ["clip"], [CAMERA])
-    camera = RawCamera(id=CAMERA, kind="videos", path=path.parent, names=(path.name,))
+    orientation = ORIENTATION[video_turn(path)]
+    camera = RawCamera(
+        id=CAMERA, kind="videos", path=path.parent, names=(path.name,), orientation=orientation
+    )
     return RawCapture(
         root=path.parent, subject=subject_of(path), fps=video_fps(path), meta={},
         cameras={CAMERA: camera}, layout="video", clips=(wishes.expression("clip"),),

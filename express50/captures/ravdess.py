@@ -18,7 +18,6 @@ from express50.video import video_fps
 
 NAME = re.compile(r"(\d\d)-(\d\d)-(\d\d)-(\d\d)-(\d\d)-(\d\d)-(\d\d)")
 CAMERA = "front"
-WITH_SOUND, PICTURE_ONLY = "01", "02"
 CHANNELS = {"01": "speech", "02": "song"}
 EMOTIONS = {
     "01": "neutral", "02": "calm", "03": "happy", "04": "sad",

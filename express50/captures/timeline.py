@@ -12,7 +12,9 @@ from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
-LACKING = 0.02  # share of the moments beyond which a camera is dropped rather than the moments
+# Share of the moments beyond which a camera is dropped rather than the moments, unless the camera
+# is a larger share of all cameras: then fewer pictures are lost with the moments.
+LACKING = 0.02
 SHOWN = 4  # moments that a reason names
 
 Moment = tuple[str, int]  # sequence, the layout's own frame number
@@ -70,12 +72,13 @@ def common_timeline(
     skipped = _reasons(set(listed) - set(seen), "no camera", "has a")
     skipped |= _reasons(set(seen) - common, "most cameras", "have no")
     dropped = {}
+    worth = max(LACKING, 1 / len(pictures)) if pictures else LACKING
     for camera, table in pictures.items():
         lacking = common - set(table)
         lost = sorted(lacking & set(required))
         if lost:
             dropped[camera] = f"has no picture of {_words(lost)}, on which the labels stand"
-        elif not table.keys() & common or len(lacking) > max(1, LACKING * len(common)):
+        elif not table.keys() & common or len(lacking) > worth * len(common):
             dropped[camera] = f"has {len(common) - len(lacking)} of {len(common)} frames"
     taken = {camera: table for camera, table in pictures.items() if camera not in dropped}
     holes = {m: [c for c, table in taken.items() if m not in table] for m in common}

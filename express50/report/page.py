@@ -9,9 +9,11 @@ from pathlib import Path
 
 import jinja2
 
+from express50.errors import FormatError
 from express50.images import encode_jpeg, read_image, resize_area
 from express50.layout import Dataset
 from express50.ledger import Ledger
+from express50.receipts import Receipt
 from express50.report import plots
 from express50.report.collect import (
     STAGES,
@@ -44,7 +46,7 @@ _PURPOSES = {
 
 @dataclass(frozen=True)
 class Embedded:
-    """A picture or video as a data address."""
+    """A picture or video as a data address, empty where it cannot be read."""
 
     uri: str
     caption: str
@@ -52,8 +54,11 @@ class Embedded:
 
 
 def embed(picture: Picture) -> Embedded:
-    """The picture, at most PICTURE_WIDTH wide, as a JPEG data address."""
-    image = read_image(picture.path)
+    """The picture, at most PICTURE_WIDTH wide, as a JPEG data address; words alone if damaged."""
+    try:
+        image = read_image(picture.path)
+    except FormatError as error:
+        return Embedded("", f"{picture.caption}: cannot be shown, {error}")
     height, width = image.shape[:2]
     if width > PICTURE_WIDTH:
         image = resize_area(image, PICTURE_WIDTH, max(1, round(height * PICTURE_WIDTH / width)))
@@ -97,21 +102,27 @@ def _rows(table: dict, prefix: str = "") -> list[dict[str, str]]:
     return rows
 
 
-def _stage_view(dataset: Dataset, report: StageReport) -> dict:
+def _receipts(dataset: Dataset) -> dict[str, list[Receipt]]:
+    """Receipts of all stages; none where nobody has run one here."""
+    if not dataset.ledger.is_file():
+        return {name: [] for name in STAGES}
+    with Ledger(dataset.ledger, read_only=True) as ledger:
+        return {name: list(ledger.read(name).values()) for name in STAGES}
+
+
+def _stage_view(report: StageReport, receipts: list[Receipt]) -> dict:
     """What the template needs of one stage."""
     figures = scalar_metrics(report)
     columns = list(dict.fromkeys(key for row in figures.values() for key in row))[:_COLUMNS]
     shown = list(figures.items())[:_ROWS]
-    with Ledger(dataset.ledger, read_only=True) as ledger:
-        receipts = ledger.read(report.name)
     return {
         "name": report.name,
         "purpose": _PURPOSES.get(report.name, ""),
         "item_count": len(report.items),
-        "failed": [(r.item, r.reason) for r in receipts.values() if r.status == "failed"],
+        "failed": [(r.item, r.reason) for r in receipts if r.status == "failed"],
         "dropped": report.dropped,
         "noted": report.noted,
-        "seconds": number(round(sum(r.seconds for r in receipts.values()), 1)),
+        "seconds": number(round(sum(r.seconds for r in receipts), 1)),
         "columns": columns,
         "rows": [
             {"item": item, "cells": [number(row.get(c)) for c in columns]} for item, row in shown
@@ -169,8 +180,10 @@ def render_page(dataset: Dataset, title: str | None = None) -> str:
     Beside the stages' folders it reads, where they exist: ``summary.json`` (figures of the run),
     ``accuracy/`` (errors against truth, made by the benchmarks) and ``grmm/``.
     """
+    receipts = _receipts(dataset)
     reports = [collect_stage(dataset, name) for name in STAGES]
-    reports = [r for r in reports if r.items]
+    # A stage all of whose items failed has published nothing, and is what people look for.
+    reports = [r for r in reports if r.items or any(x.status == "failed" for x in receipts[r.name])]
     summary = read_json(dataset.root / "summary.json")
     accuracy_dir = dataset.root / "accuracy"
     measured = read_json(accuracy_dir / "accuracy.json")
@@ -186,7 +199,7 @@ def render_page(dataset: Dataset, title: str | None = None) -> str:
         title=title or f"Dataset {dataset.root.resolve().name}",
         subtitle=", ".join(dataset.subjects()),
         cards=_cards(dataset, reports, summary),
-        stages=[_stage_view(dataset, r) for r in reports],
+        stages=[_stage_view(r, receipts[r.name]) for r in reports],
         accuracy=accuracy,
         grmm=_grmm_view(dataset.root / "grmm"),
         timing_plot=plots.timing_bars(seconds) if seconds else "",

@@ -63,8 +63,7 @@ def loss_curve(log: Path) -> Markup:
     if not log.is_file():
         return Markup("")
     text = read_text(log, FormatError)
-    rows = [parse_json(line, str(log), FormatError) for line in text.split("\n") if line.strip()]
-    rows = [r for r in rows if "iteration" in r and "loss" in r]
+    rows = [row for line in text.split("\n") if (row := _entry(line, log)) is not None]
     if len(rows) < 2:
         return Markup("")
     figure = Figure(figsize=(9, 2.6))
@@ -75,3 +74,12 @@ def loss_curve(log: Path) -> Markup:
     axes.set_yscale("log")
     axes.spines[["top", "right"]].set_visible(False)
     return _svg(figure)
+
+
+def _entry(line: str, log: Path) -> dict | None:
+    """A line of the log; None of what is no entry, such as half a line before a power cut."""
+    try:
+        row = parse_json(line, str(log), FormatError)
+    except FormatError:
+        return None
+    return row if isinstance(row, dict) and {"iteration", "loss"} <= row.keys() else None

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from express50.cameras import Camera, write_cameras
+from express50.cameras import Camera, camera_rows, read_cameras, write_cameras
 from express50.console import FAILED, OK, say, say_json
-from express50.errors import ConfigError
+from express50.errors import CalibrationError, ConfigError
 from express50.rigs.read import FORMATS, guess_format, read_rig
 from express50.rigs.verdict import RigVerdict, judge
 
@@ -32,6 +32,9 @@ def add_commands(subparsers: Any) -> None:
     importing.set_defaults(handler=run_import)
     importing.add_argument("source", type=Path, help="file or folder of the other tool")
     importing.add_argument("out", type=Path, help="calibration.json to write")
+    importing.add_argument(
+        "--overwrite", action="store_true", help="write over other cameras that OUT holds"
+    )
     checking = actions.add_parser("check", help="say whether a rig's cameras fit together")
     checking.set_defaults(handler=run_check)
     checking.add_argument("source", type=Path, help="calibration in any known format")
@@ -52,10 +55,22 @@ def run_import(args: argparse.Namespace) -> int:
     """Write the cameras and say what was found; exit code 1 when they do not fit together."""
     cameras = _read(args)
     verdict = judge(cameras)
+    if args.out.exists() and not args.overwrite and _differs(args.out, cameras):
+        raise ConfigError(
+            f"{args.out} holds something else; write elsewhere, or over it with --overwrite"
+        )
     if not verdict.problem:
         write_cameras(args.out, cameras)
     _report(args, cameras, verdict, None if verdict.problem else args.out)
     return FAILED if verdict.problem else OK
+
+
+def _differs(path: Path, cameras: Mapping[str, Camera]) -> bool:
+    """Whether a file is not what these cameras would be written as."""
+    try:
+        return camera_rows(read_cameras(path)) != camera_rows(cameras)
+    except CalibrationError:
+        return True
 
 
 def run_check(args: argparse.Namespace) -> int:

@@ -138,13 +138,24 @@ def _matrix(
                 raise CalibrationError(f"{path}: {key} is {rows} x {columns} with {count} numbers")
             value = node.mat()
         else:
-            value = np.array([node.at(i).real() for i in range(min(node.size(), ENTRIES))])
+            value = _numbers(path, key, node)
         if optional or value.shape == (3, 3):
             return np.asarray(value, dtype=np.float64)
         raise CalibrationError(f"{path}: {key} has shape {value.shape}, expected (3, 3)")
     if optional:
         return np.zeros(0)
     raise CalibrationError(f"{path}: has none of {', '.join(keys)}; expected a 3 x 3 matrix")
+
+
+def _numbers(path: Path, key: str, node: cv2.FileNode) -> np.ndarray:
+    """A list of numbers, or a list of rows of them."""
+    entries = [node.at(i) for i in range(min(node.size(), ENTRIES))]
+    if not any(entry.isSeq() for entry in entries):
+        return np.array([entry.real() for entry in entries])
+    if len({entry.size() if entry.isSeq() else -1 for entry in entries}) != 1:
+        raise CalibrationError(f"{path}: {key} has rows of several lengths, expected a matrix")
+    width = min(entries[0].size(), ENTRIES)
+    return np.array([[entry.at(i).real() for i in range(width)] for entry in entries])
 
 
 def _pose(

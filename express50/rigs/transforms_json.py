@@ -49,6 +49,7 @@ def read_transforms(path: Path, size: tuple[int, int] | None) -> dict[str, Camer
         names = camera_names(frames)
     except (TypeError, ValueError, OverflowError) as error:
         raise CalibrationError(f"{path}: camera_index is no number ({error})") from None
+    _check_unique(path, names, frames)
     found: dict[str, Camera] = {}
     for number, (name, frame) in enumerate(zip(names, frames, strict=True)):
         camera = _camera(f"{path}: frame {number} ({name})", name, table | frame, size)
@@ -68,6 +69,17 @@ def camera_names(frames: list[dict]) -> list[str]:
     return names_from_files(
         [str(frame.get("file_path", f"frame{n:04d}")) for n, frame in enumerate(frames)]
     )
+
+
+def _check_unique(path: Path, names: list[str], frames: list[dict]) -> None:
+    """Refuse two pictures whose names come out as one camera's."""
+    files: dict[str, str] = {}
+    for name, frame in zip(names, frames, strict=True):
+        file = str(frame.get("file_path", name))
+        if "camera_index" not in frame and files.setdefault(name, file) != file:
+            raise CalibrationError(
+                f"{path}: {files[name]} and {file} are both camera {name}; rename one"
+            )
 
 
 def _camera(where: str, name: str, row: dict, size: tuple[int, int] | None) -> Camera:
@@ -92,7 +104,11 @@ def _camera_of(where: str, name: str, row: dict, size: tuple[int, int] | None) -
     world_from_cam[: len(matrix)] = matrix.astype(np.float64)
     width, height = _size(where, row, size)
     K = _K(where, row, width, height)
-    dist = [float(row.get(key, 0.0)) for key in ("k1", "k2", "p1", "p2", "k3", "k4")]
+    if row.get("is_fisheye"):
+        raise CalibrationError(f"{where}: is_fisheye, expected a perspective lens; undistort first")
+    if float(row.get("k4", 0.0)):  # Nerfstudio's fourth power of r^2, which OpenCV's model lacks
+        raise CalibrationError(f"{where}: k4 is {row['k4']}, expected 0 or none; undistort first")
+    dist = [float(row.get(key, 0.0)) for key in ("k1", "k2", "p1", "p2", "k3")]
     if model != "OPENCV":
         dist = []
     return camera_from_K(name, K, dist, (width, height), cam_from_world_from_opengl(world_from_cam))
@@ -107,13 +123,19 @@ def _size(where: str, row: dict, size: tuple[int, int] | None) -> tuple[int, int
 
 
 def _K(where: str, row: dict, width: int, height: int) -> np.ndarray:
-    """K (3, 3) of focal lengths or of the horizontal angle of view."""
-    if "fl_x" in row:
-        fx = float(row["fl_x"])
-    elif "camera_angle_x" in row:
-        fx = 0.5 * width / math.tan(0.5 * float(row["camera_angle_x"]))
-    else:
+    """K (3, 3) of focal lengths or of angles of view; pixels are square where one is told."""
+    fx, fy = _focal(row, "x", width), _focal(row, "y", height)
+    if fx is None:
         raise CalibrationError(f"{where}: has neither fl_x nor camera_angle_x; add one")
-    fy = float(row.get("fl_y", fx))
+    fy = fx if fy is None else fy
     cx, cy = float(row.get("cx", width / 2)), float(row.get("cy", height / 2))
     return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
+
+
+def _focal(row: dict, axis: str, side: int) -> float | None:
+    """Focal length along an axis, pixels, or None where nothing is told."""
+    if f"fl_{axis}" in row:
+        return float(row[f"fl_{axis}"])
+    if f"camera_angle_{axis}" in row:
+        return 0.5 * side / math.tan(0.5 * float(row[f"camera_angle_{axis}"]))
+    return None

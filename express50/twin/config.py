@@ -59,6 +59,7 @@ class TwinConfig:
             "crf": (0, 51),
             "board_frames": (0, 1000),
             "noise": (0, 100),
+            "seed": (0, 2**63 - 1),
         }
         for name, (low, high) in limits.items():
             value = getattr(self, name)

@@ -16,6 +16,7 @@ from typing import Any
 
 from express50.errors import CaptureError
 from express50.expressions import select
+from express50.publish import write_bytes
 from express50.threads import cap_threads
 from express50.twin.config import TwinConfig
 
@@ -169,7 +170,8 @@ def _check_settings(config: TwinConfig, out: Path) -> None:
     path = out / "twin.json"
     settings = {k: v for k, v in asdict(config).items() if k not in ("subjects", "first_subject")}
     text = json.dumps(settings, indent=1, sort_keys=True) + "\n"
-    if path.is_file() and path.read_text() != text:
+    begun = any((out / "captures").glob("*"))  # else nothing was recorded with what is noted
+    if begun and path.is_file() and path.read_text() != text:
         former = json.loads(path.read_text())
         changed = sorted(
             k for k in settings if json.dumps(former.get(k)) != json.dumps(settings[k])
@@ -179,7 +181,7 @@ def _check_settings(config: TwinConfig, out: Path) -> None:
             " record into another folder or delete this one"
         )
     out.mkdir(parents=True, exist_ok=True)
-    path.write_text(text)
+    write_bytes(path, text.encode())
 
 
 def print_progress(stream=sys.stderr, every: float = 10.0) -> Callable[[int, int], None]:  # noqa: ANN001

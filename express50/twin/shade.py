@@ -67,7 +67,7 @@ def find_eyes(model: HeadModel) -> Eyes:
     for side in ("left", "right"):
         ball = template[model.regions[f"{side}_eyeball"].numpy()]
         iris = template[model.regions[f"{side}_iris"].numpy()]
-        # The back of the ball is round; the front may bulge with the cornea or be cut open.
+        # Across, the middle of the ball; in depth a radius behind its front, where the iris is.
         centre = 0.5 * (ball.min(0) + ball.max(0))
         centre[2] = ball[:, 2].max() - 0.5 * np.ptp(ball[:, :2], axis=0).mean()
         axis = unit(iris.mean(0) - centre)

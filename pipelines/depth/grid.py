@@ -70,8 +70,9 @@ def sample_image(image: np.ndarray, pixels: np.ndarray) -> np.ndarray:
 
 def project_fast(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Pixels (N, 2) and depths (N,) float32 of points (N, 3) in a pinhole camera; no NaN."""
-    M = camera.K @ camera.cam_from_world[:3]
-    p = points.astype(np.float32) @ M[:, :3].T.astype(np.float32) + M[:, 3].astype(np.float32)
+    # Against the camera before the cast: a rig may stand a kilometre from its world's origin.
+    about = (points - camera.center).astype(np.float32)
+    p = about @ (camera.K @ camera.cam_from_world[:3, :3]).T.astype(np.float32)
     depth = np.maximum(p[:, 2], 1e-6)
     return p[:, :2] / depth[:, None], p[:, 2]
 
@@ -84,7 +85,7 @@ def hull_distance(views: Sequence[View], points: np.ndarray) -> np.ndarray:
     than two views, or a third of them, see are outside: phantoms would float before the head.
     """
     distance = np.full(len(points), -UNSEEN, np.float32)
-    seen = np.zeros(len(points), np.int8)
+    seen = np.zeros(len(points), np.int16)
     for view in views:
         camera = view.camera
         pixels, depth = project_fast(camera, points)

@@ -26,10 +26,13 @@ class Prior:
     Attributes:
         scene: the mesh and the caps over its holes.
         border: scene of the caps over large holes (the neck), or None.
+        low, high: (3,) corners of its box, metres.
     """
 
     scene: o3d.t.geometry.RaycastingScene
     border: o3d.t.geometry.RaycastingScene | None
+    low: np.ndarray
+    high: np.ndarray
 
     def merge(self, points: np.ndarray, hull: np.ndarray, reach: float) -> np.ndarray:
         """Distances (N,) to the hull at points (N, 3), the tracked solid's blended in near it.
@@ -101,7 +104,8 @@ def make_prior(vertices: np.ndarray, faces: np.ndarray) -> Prior:
             borders.append(fan)
     all_points = np.concatenate(points)
     scene = mesh_scene(all_points, np.concatenate([faces, *caps]))
-    return Prior(scene, mesh_scene(all_points, np.concatenate(borders)) if borders else None)
+    border = mesh_scene(all_points, np.concatenate(borders)) if borders else None
+    return Prior(scene, border, vertices.min(0), vertices.max(0))
 
 
 def boundary_loops(faces: np.ndarray) -> list[np.ndarray]:

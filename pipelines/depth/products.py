@@ -10,8 +10,8 @@ from express50.depth_files import write_depth, write_normals
 from express50.errors import StageError
 from express50.images import srgb_to_linear, write_image
 from pipelines.depth.config import DepthConfig
+from pipelines.depth.finish import Surface
 from pipelines.depth.raycast import DepthView
-from pipelines.depth.reconstruct import Surface
 
 
 def write_maps(out: Path, camera_id: str, view: DepthView, config: DepthConfig) -> None:

@@ -10,8 +10,8 @@ import open3d as o3d
 
 from express50.cameras import Camera, rays
 from express50.raycast import camera_rays
+from pipelines.depth.finish import Surface
 from pipelines.depth.grid import INSIDE
-from pipelines.depth.reconstruct import Surface
 
 STEEP = 0.25  # cosine between surface and ray below which confidence fades to 0
 BROKEN = 4.0  # pixels' widths between neighbours' depths at which confidence is halved

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from express50.errors import StageError
-from express50.raycast import mesh_scene
 from pipelines.depth.blocks import (
     BLOCK,
     VOXEL_LIMIT,
@@ -22,16 +20,14 @@ from pipelines.depth.blocks import (
     held,
     voxel_index,
 )
-from pipelines.depth.bodies import largest_body
 from pipelines.depth.config import DepthConfig
 from pipelines.depth.filters import refined
+from pipelines.depth.finish import Surface, finished, patch_scores, pixel_size
 from pipelines.depth.grid import (
     UNSEEN,
     View,
     head_box,
     hull_distance,
-    project_fast,
-    sample_image,
 )
 from pipelines.depth.prior import Prior
 from pipelines.depth.refine import refine
@@ -40,38 +36,14 @@ from pipelines.depth.surface import (
     extract_mesh,
     fair,
     graph_laplacian,
-    largest_part,
     rim_targets,
     smooth_displacement,
 )
-from pipelines.depth.sweep import grey_images, sweep_scores, view_weights
 from pipelines.depth.warm import Carried
 
 LEVEL_RATIO = 1.47
 COUPLINGS = (1e3, 3e3, 1e4, 2e4)  # per square metre; a gap of 10 mm costs 0.1 at first, 2 at last
 SMALLEST_M, LARGEST_M = 0.03, 3.0  # a head is 0.25 m high, with shoulders under 1 m
-
-
-@dataclass(frozen=True)
-class Surface:
-    """The reconstructed head.
-
-    Attributes:
-        vertices (V, 3), normals (V, 3): world, metres, outward.
-        faces: (F, 3).
-        confidence: (V,) in [0, 1]; agreement of the views, 0.3 where only silhouettes speak.
-        colors: (V, 3) uint8 sRGB.
-        grid: signed distances the mesh was taken from.
-        numbers: voxels and agreement for the metrics.
-    """
-
-    vertices: np.ndarray
-    normals: np.ndarray
-    faces: np.ndarray
-    confidence: np.ndarray
-    colors: np.ndarray
-    grid: Grid
-    numbers: dict = field(default_factory=dict)
 
 
 def reconstruct(
@@ -110,13 +82,25 @@ def reconstruct(
         deep = level == 0 and prior is None and start is None
         grid = _move(views, grid, hull, config, extent, first=deep)
     grid, rendered = refine(views, grid, config)
-    surface = _finish(views, grid, config)
+    surface = finished(views, grid, config)
     return replace(surface, numbers=surface.numbers | rendered)
+
+
+def tracked_surface(view: View, config: DepthConfig, prior: Prior) -> Surface:
+    """The tracked head as it is: a single view tells nothing else of depth.
+
+    Raises:
+        StageError: the head is too small or too large for the voxel.
+    """
+    (voxel,) = _voxels([view], (prior.low + prior.high) / 2, config)[-1:]
+    low, high = prior.low - 4 * voxel, prior.high + 4 * voxel
+    _check_size(low, high, voxel)
+    return finished([view], build(low, high, voxel, prior.distance), config)
 
 
 def _voxels(views: Sequence[View], middle: np.ndarray, config: DepthConfig) -> list[float]:
     """Voxels of the levels, metres, coarse to fine; the last as fine as the pixels allow."""
-    pixel = float(np.median([_pixel_size(view, middle) for view in views]))
+    pixel = float(np.median([pixel_size(view, middle) for view in views]))
     fine = max(config.voxel_mm * 1e-3, config.voxel_px * pixel)
     coarser = np.log(config.coarse_mm * 1e-3 / fine) / np.log(LEVEL_RATIO)
     return [fine * LEVEL_RATIO**k for k in reversed(range(1 + max(0, round(coarser))))]
@@ -185,7 +169,7 @@ def _move(
         return grid
     offsets = _offsets(config, voxel, first)
     if config.photo:
-        scores = _scores(views, grid, vertices, normals, faces, offsets, config)
+        scores = patch_scores(views, grid, vertices, normals, faces, offsets, config)
     else:
         scores = np.zeros((len(vertices), len(offsets)), np.float32)
     pinned, weight = _pins(views, grid, vertices, extent, config.rim_weight)
@@ -208,35 +192,6 @@ def _offsets(config: DepthConfig, voxel: float, first: bool) -> np.ndarray:
     return np.arange(-2.0, 2.01, 0.4) * voxel
 
 
-def _scores(
-    views: Sequence[View],
-    grid: Grid,
-    vertices: np.ndarray,
-    normals: np.ndarray,
-    faces: np.ndarray,
-    offsets: np.ndarray,
-    config: DepthConfig,
-) -> np.ndarray:
-    spacing = 0.66 * grid.voxel
-    pixel = np.median([_pixel_size(view, vertices.mean(0)) for view in views])
-    greys = grey_images(views, 0.4 * spacing / pixel)
-    weights = view_weights(views, vertices, normals, mesh_scene(vertices, faces), grid.voxel)
-    # the samples of a patch lie no closer than the pixels: finer ones would repeat them
-    spacing = max(spacing, float(pixel))
-    scores = sweep_scores(
-        views, greys, grid, vertices, normals, weights, offsets, spacing, config.noise,
-        config.patch_samples,
-    )  # fmt: skip
-    # neighbours see the same: chance matches of one patch, frequent in hair, average out
-    return _averaged(scores, faces, rounds=1)
-
-
-def _pixel_size(view: View, point: np.ndarray) -> float:
-    """Metres that a pixel spans at a world point (3,)."""
-    M = view.camera.cam_from_world
-    return float(abs(M[2, :3] @ point + M[2, 3]) / view.camera.K[0, 0])
-
-
 def _pins(
     views: Sequence[View], grid: Grid, vertices: np.ndarray, extent: float, rim_weight: float
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -250,59 +205,3 @@ def _pins(
         np.add.at(pinned, near, lack[close])
         np.add.at(count, near, 1.0)
     return pinned / np.maximum(count, 1), rim_weight * np.minimum(count, 1)
-
-
-def _finish(views: Sequence[View], grid: Grid, config: DepthConfig) -> Surface:
-    """Mesh, confidence and colours of the final grid."""
-    grid = largest_body(grid)
-    vertices, normals, faces = extract_mesh(grid)
-    if not len(faces):
-        raise StageError(
-            f"no surface is left on a grid of {config.voxel_mm} mm voxels; expected a head larger"
-            " than a few voxels: check the mattes, or lower depth.voxel_mm"
-        )
-    faces = largest_part(vertices, faces)
-    offsets = np.array([-1.0, 0.0, 1.0]) * grid.voxel
-    agreement = _scores(views, grid, vertices, normals, faces, offsets, config)[:, 1]
-    on_hull = np.abs(hull_distance(views, vertices)) < 0.5 * grid.voxel
-    confidence = _averaged(np.clip(agreement, 0, 1), faces, rounds=6)
-    used = np.zeros(len(vertices), bool)
-    used[faces] = True
-    numbers = {
-        "voxel_mm": grid.voxel * 1e3,
-        "voxels_allocated": grid.allocated,
-        "voxels_dense": math.prod(grid.shape),
-        "voxel_limit": VOXEL_LIMIT,
-        "grid_bytes": grid.nbytes,
-        "vertices": int(used.sum()),
-        "photo_agreement_median": float(np.median(agreement[used])),
-        "photo_supported": float((confidence[used] > 0.3).mean()),
-        "silhouette_supported": float(on_hull[used].mean()),
-    }
-    confidence = np.maximum(confidence, np.where(on_hull, 0.3, 0.1)).astype(np.float32)
-    colors = _colors(views, vertices, normals, faces, grid.voxel)
-    return Surface(vertices, normals, faces, confidence, colors, grid, numbers)
-
-
-def _averaged(values: np.ndarray, faces: np.ndarray, rounds: int) -> np.ndarray:
-    """Vertex values (V,) or (V, D) averaged over their neighbours, again and again."""
-    laplacian = graph_laplacian(faces, len(values))
-    for _ in range(rounds):
-        values = values - 0.5 * (laplacian @ values)
-    return values
-
-
-def _colors(
-    views: Sequence[View], vertices: np.ndarray, normals: np.ndarray, faces: np.ndarray, lift: float
-) -> np.ndarray:
-    """Mean colour (V, 3) uint8 of the views that see a vertex, weighted by the cosine squared."""
-    weights = view_weights(views, vertices, normals, mesh_scene(vertices, faces), lift) ** 2
-    total = np.zeros((len(vertices), 3))
-    for view, weight in zip(views, weights, strict=True):
-        pixels, _ = project_fast(view.camera, vertices)
-        for channel in range(3):
-            plane = np.ascontiguousarray(view.rgb[..., channel], np.float32)
-            total[:, channel] += weight * sample_image(plane, pixels)
-    seen = weights.sum(0)
-    mean = np.where(seen[:, None] > 0, total / np.maximum(seen, 1e-9)[:, None], 128.0)
-    return np.rint(mean).clip(0, 255).astype(np.uint8)

@@ -18,17 +18,18 @@ from express50.stage import Stage
 from express50.tracks import read_track
 from pipelines.depth.config import PRESETS, DepthConfig
 from pipelines.depth.consistency import Agreement, agreements, make_shot, vouched
+from pipelines.depth.finish import Surface
 from pipelines.depth.grid import View
 from pipelines.depth.prior import Prior, make_prior, matte_agreement
 from pipelines.depth.products import write_glb, write_maps, write_ply
 from pipelines.depth.qc import Pictures, metrics, write_picture
 from pipelines.depth.raycast import DepthView, cast_view
-from pipelines.depth.reconstruct import Surface, reconstruct
+from pipelines.depth.reconstruct import reconstruct, tracked_surface
 from pipelines.depth.trace import trace_view
 from pipelines.depth.views import make_view, without_contradiction
 from pipelines.depth.warm import carried_start, source_of, surface_file, track_path
 
-UNITS = (0.05, 1.0)  # metres; a head's box outside this range means other units than metres
+UNITS = (0.05, 3.0)  # metres; a head's box outside this range means other units than metres
 
 
 def inputs(dataset: Dataset, item: str, config: DepthConfig) -> dict[str, Path | str]:
@@ -70,22 +71,18 @@ def run(dataset: Dataset, item: str, config: DepthConfig, out: Path) -> dict:
     subject, expression = item.split("/")
     frame = read_peaks(dataset, subject)[expression]
     views, pictures, dropped = read_views(dataset, subject, expression, frame, config)
-    if len(views) < config.min_views:
+    alone = len(views) == 1 and not dropped  # a photograph, or a video of one camera
+    if len(views) < config.min_views and not alone:
         why = "; ".join(f"{row['what']}: {row['why']}" for row in dropped)
         raise StageError(
             f"{item}: {len(views)} usable cameras, expected at least {config.min_views} with a"
             f" matte of the head ({why or 'no others are calibrated'}); run 'express50 matte'"
         )
-    start, warm = carried_start(dataset, item, views, config)
-    if start is None:
-        prior, track = read_prior(dataset, subject, expression, views, config)
-    else:
-        prior, track = None, {"used": True}
-    surface = reconstruct(views, config, prior, start)
+    surface, used = make_surface(dataset, item, views, config)
     extent = float(np.ptp(surface.vertices[np.unique(surface.faces)], axis=0).max())
-    if not UNITS[0] < extent < UNITS[1] * 3:
+    if not UNITS[0] < extent < UNITS[1]:
         raise StageError(
-            f"{item}: the surface is {extent:.3g} m large, expected {UNITS[0]} to {UNITS[1] * 3} m;"
+            f"{item}: the surface is {extent:.3g} m large, expected {UNITS[0]} to {UNITS[1]} m;"
             " is the calibration in metres?"
         )
     write_ply(out / "surface.ply", surface)
@@ -96,7 +93,28 @@ def run(dataset: Dataset, item: str, config: DepthConfig, out: Path) -> dict:
         write_maps(out, name, view, config)
     write_picture(out, pictures, seen, photo, config.qc_views)
     numbers = surface.numbers | {"extent_m": extent}
-    return metrics(numbers, seen, photo) | {"track": track, "warm": warm, "dropped": dropped}
+    return metrics(numbers, seen, photo) | used | {"dropped": dropped}
+
+
+def make_surface(
+    dataset: Dataset, item: str, views: list[View], config: DepthConfig
+) -> tuple[Surface, dict]:
+    """The surface, and for the metrics what it was made from beside the views."""
+    subject, expression = item.split("/")
+    if len(views) == 1:  # a photograph, or a video of one camera
+        prior, track = read_prior(dataset, subject, expression, views, config)
+        if prior is None:
+            raise StageError(
+                f"{item}: one camera, so that its depth is the tracked head's, which does not"
+                f" count: {track['why']}; run 'express50 track' and look at its overlays"
+            )
+        surface = tracked_surface(views[0], config, prior)
+        return surface, {"track": track, "warm": {"used": False}}
+    start, warm = carried_start(dataset, item, views, config)
+    if start is not None:
+        return reconstruct(views, config, start=start), {"track": {"used": True}, "warm": warm}
+    prior, track = read_prior(dataset, subject, expression, views, config)
+    return reconstruct(views, config, prior), {"track": track, "warm": warm}
 
 
 def look(

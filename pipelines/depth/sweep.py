@@ -158,10 +158,10 @@ def _correlate(
 
 def _patch_pixels(view: View, line: np.ndarray, patch: np.ndarray) -> np.ndarray:
     """Pixels (n, D, P, 2) float32 of patches; affine within one, which spans 1 % of its depth."""
-    M = (view.camera.K @ view.camera.cam_from_world[:3]).astype(np.float32)
-    p = line.astype(np.float32) @ M[:, :3].T + M[:, 3]  # (n, D, 3)
+    M = (view.camera.K @ view.camera.cam_from_world[:3, :3]).astype(np.float32)
+    p = (line - view.camera.center).astype(np.float32) @ M.T  # (n, D, 3)
     depth = np.maximum(p[..., 2], 1e-6)
-    along = patch @ M[:, :3].T  # (n, P, 3)
+    along = patch @ M.T  # (n, P, 3)
     pixels = np.empty((*line.shape[:2], patch.shape[1], 2), np.float32)
     for axis in range(2):
         center = p[..., axis] / depth

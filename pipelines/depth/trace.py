@@ -11,8 +11,8 @@ from scipy.spatial import cKDTree
 
 from express50.cameras import Camera, rays
 from pipelines.depth.blocks import Grid
+from pipelines.depth.finish import Surface
 from pipelines.depth.raycast import DepthView, depth_view
-from pipelines.depth.reconstruct import Surface
 from pipelines.depth.surface import grid_normals
 
 RELAXATION = 0.8  # distances were moved and smoothed: they are not exact

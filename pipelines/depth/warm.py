@@ -10,7 +10,6 @@ from __future__ import annotations
 import io
 import struct
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
 
@@ -37,11 +36,8 @@ AGAIN = "run 'express50 depth' on it again"
 SMOOTHING = 12  # rounds of averaging of the motion, which jumps where the nearest triangle does
 
 
-@dataclass(frozen=True)
 class Carried(Prior):
     """A closed surface that another expression ended with, in this one's place."""
-
-    border: None = field(default=None)
 
     def distance(self, points: np.ndarray) -> np.ndarray:
         """Signed distance (N,) float32, metres, negative inside."""
@@ -115,7 +111,8 @@ def start_from(
     vertices, faces = mesh
     moved = carry(vertices, faces, before, after, load_head(track.head).faces.numpy())
     agreement = round(matte_agreement(views, moved, faces), 4)
-    return Carried(mesh_scene(moved, faces)), {"agreement": agreement}
+    carried = Carried(mesh_scene(moved, faces), None, moved.min(0), moved.max(0))
+    return carried, {"agreement": agreement}
 
 
 def carry(

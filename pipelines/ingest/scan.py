@@ -14,6 +14,7 @@ import numpy as np
 from express50.capture import RawCamera, RawCapture
 from express50.digests import file_sha256, text_digest
 from express50.errors import CaptureError
+from express50.exif import upright
 from express50.frames import corrected, dhash
 from express50.images import encode_jpeg, resize_area
 from express50.index import CameraSource
@@ -156,7 +157,7 @@ def iterate_camera(camera: RawCamera) -> Iterator[tuple[int, int, np.ndarray]]:
     elif camera.kind == "videos":
         for clip, name in enumerate(camera.names):
             for stamp, image in iterate_video(inside(camera.path, name)):
-                yield clip, stamp, image
+                yield clip, stamp, upright(image, camera.orientation)
     else:
         ends = np.cumsum(camera.counts or (len(camera.names),))
         for number, name in enumerate(camera.names):

@@ -36,6 +36,7 @@ from pipelines.ingest.config import PRESETS, IngestConfig
 from pipelines.ingest.scan import Seen, remove_proxies, scan_camera, time_gaps, trimmed
 
 QC_CAMERAS, QC_COLUMNS = 24, 6
+FILE_ENDINGS = ("head", "confidence", "normals")  # of files beside <camera>.png in later stages
 
 
 def register(dataset: Dataset, captures: list[Path]) -> list[str]:
@@ -102,6 +103,7 @@ def run(dataset: Dataset, item: str, config: IngestConfig, out: Path) -> dict:
         )
     (out / "proxies").mkdir()
     cameras, seen, dropped = _scan(raw, out / "proxies", config)
+    _check_names(raw, cameras)
     calibration = _calibration(raw, cameras)
     raw, outside = _with_cues(raw, cameras, seen, dropped, out / "proxies")
     usual = usual_count(cameras)
@@ -124,6 +126,17 @@ def run(dataset: Dataset, item: str, config: IngestConfig, out: Path) -> dict:
     lost = {f"camera {k}": why for k, why in sorted(dropped.items())}
     lost |= {f"expression {k}": why for k, why in sorted(beyond.items())} | outside | raw.skipped
     return metrics(raw, index, usual, lost, raw.warnings | warnings)
+
+
+def _check_names(raw: RawCapture, cameras: Mapping[str, CameraSource]) -> None:
+    """Refuse cameras whose files would take another camera's place in a later stage."""
+    for name in cameras:
+        first, _, ending = name.rpartition("_")
+        if ending in FILE_ENDINGS and first in cameras:
+            raise CaptureError(
+                f"{raw.root}: cameras {first} and {name} would write files of one name;"
+                f" rename {name}"
+            )
 
 
 def _scan(

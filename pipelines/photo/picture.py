@@ -11,15 +11,13 @@ import numpy as np
 
 from express50.capture import IMAGE_SUFFIXES, VIDEO_SUFFIXES
 from express50.errors import CaptureError, FormatError
-from express50.exif import TURNS, read_exif, upright
+from express50.exif import ORIENTATION, read_exif, upright
 from express50.frames import read_srgb8
 from express50.video import iterate_video, video_turn
 
 # Read as photographs; a rig's cameras write none of the last two.
 PHOTO_SUFFIXES = (*IMAGE_SUFFIXES, ".webp", ".bmp")
 FILM_DIAGONAL_MM = math.hypot(36.0, 24.0)
-# Quarter turns counter-clockwise without a flip -> EXIF's orientation.
-ORIENTATION = {turns: number for number, (turns, flipped) in TURNS.items() if not flipped}
 
 
 @dataclass(frozen=True)

@@ -56,7 +56,9 @@ def suspect_cameras(
     for target, points, rotation, middle in zip(targets, marks, rotations, middles, strict=True):
         for view in (*target.observation.views, *target.observation.refused):
             if facing(view, rotation, middle) > FACING:
-                seen.setdefault(view.camera_id, []).append(_sight(view, points))
+                sight = _sight(view, points)
+                if sight is not None:
+                    seen.setdefault(view.camera_id, []).append(sight)
     told = {name: rows for name, rows in seen.items() if len(rows) >= LEAST_EXPRESSIONS}
     if len(told) < LEAST_CAMERAS:
         return {}
@@ -112,13 +114,13 @@ def _account(rows: list[_Sight]) -> dict[str, object]:
     }
 
 
-def _sight(view: View, points: np.ndarray) -> _Sight:
-    """How the points between brows and mouth lie against the fitted ones (68, 3)."""
+def _sight(view: View, points: np.ndarray) -> _Sight | None:
+    """How points between brows and mouth lie against the fitted ones (68, 3); None if unseen."""
     pixels, _ = project_pinhole(view.camera, points)
     inner = np.isfinite(view.sigma)
     inner[:17] = False
     if not inner.any():
-        return _Sight(np.zeros(2), 1.0, 0.0, 0.0)
+        return None
     size = max(float(np.ptp(pixels, axis=0).max()), 1.0)
     offset = np.median((view.points - pixels)[inner], axis=0)
     seen, expected = (

@@ -59,6 +59,34 @@ def test_failures_and_drops_are_named_and_escaped(dataset):
     assert "no plate" in page
 
 
+def test_a_stage_whose_every_item_failed_is_shown(dataset):
+    with Ledger(dataset.ledger) as ledger:
+        ledger.write(
+            Receipt(stage="track", item="S1", fingerprint="", status="failed", reason="no face")
+        )
+    page = render_page(dataset)
+    assert "no face" in page and 'href="#track"' in page and 'href="#depth"' not in page
+
+
+def test_damaged_pictures_and_logs_cost_themselves_alone(dataset):
+    picture = dataset.root / "align/S1/qc/view.jpg"
+    picture.write_bytes(picture.read_bytes()[:-200])
+    log = dataset.root / "grmm/train/log.jsonl"
+    log.parent.mkdir(parents=True)
+    rows = [json.dumps({"iteration": n, "loss": 1 / n}) for n in (1, 2, 3)]
+    log.write_text("\n".join([*rows, '{"iteration": 4, "lo']))
+    (log.parent / "metrics.json").write_text(json.dumps({"iterations": 3}))
+    page = render_page(dataset)
+    assert page.count("data:image/jpeg;base64,") == 3
+    assert "S1: view: cannot be shown" in page and "Loss over training" in page
+
+
+def test_outputs_without_a_ledger_are_shown(dataset):
+    for path in dataset.root.glob(f"{dataset.ledger.name}*"):
+        path.unlink()
+    assert "no plate" in render_page(dataset)
+
+
 def test_weak_cameras_and_warnings_are_named(dataset):
     assert "in doubt" not in render_page(dataset)
     folder = dataset.root / "calibrate" / "S1"

@@ -13,9 +13,11 @@ from express50.cameras import transform_camera
 from express50.depth_files import depth_file, read_depth, read_normals
 from express50.errors import FormatError
 from express50.frames import read_cameras_of
+from express50.head.load import load_head
 from express50.images import read_image, srgb_to_linear
 from express50.raycast import mesh_scene
 from express50.runner import run_stage
+from express50.tracks import read_track
 from express50.transforms import make_transform
 from pipelines.depth import STAGE
 from pipelines.depth.config import DepthConfig
@@ -191,3 +193,34 @@ def test_a_surface_that_is_none_is_refused_by_name(tmp_path):
 def test_unknown_values_are_named(name, value):
     with pytest.raises(ValueError, match=name):
         DepthConfig(**{name: value})
+
+
+def test_one_camera_has_the_tracked_heads_depth_and_no_trust_in_it(tmp_path):
+    dataset = make_dataset(tmp_path, cameras=1, size=96)
+    (camera,) = read_cameras_of(dataset, "S001").values()
+    published(dataset, STAGE, DepthConfig(voxel_mm=3.0))
+    folder = dataset.item_dir("depth", ITEMS[0])
+    depth, valid = read_depth(depth_file(folder, camera.id))
+    track = read_track(dataset.item_dir("track", "S001") / "track.npz")
+    scene = mesh_scene(track.vertices[0], load_head(track.head).faces.numpy())
+    alpha = read_image(dataset.matte_file("S001", "neutral", camera.id)) / 255.0
+    shot = make_shot(scene, camera, np.zeros((*alpha.shape, 3), np.uint8), alpha, 96)
+    both = valid & (shot.depth > 0)
+    assert both.sum() > 0.9 * (shot.depth > 0).sum()
+    assert np.median(np.abs(depth - shot.depth)[both]) < 1.5e-3
+    assert read_image(folder / f"{camera.id}_confidence.png").max() < 80
+    assert published(dataset, PACK, PackConfig(size=64))["shards"]["kept"] == len(ITEMS)
+
+    (dataset.item_dir("track", "S001") / "track.npz").unlink()
+    config = DepthConfig(voxel_mm=3.0)
+    (outcome, _) = run_stage(STAGE, dataset, config, workers=0, progress=False).outcomes
+    assert "one camera, so that its depth is the tracked head's" in outcome.reason
+
+
+def test_a_rig_of_which_one_camera_is_left_is_refused(tmp_path):
+    dataset = make_dataset(tmp_path, cameras=3, size=48)
+    for name in list(read_cameras_of(dataset, "S001"))[1:]:
+        dataset.matte_file("S001", "neutral", name).unlink()
+    run = run_stage(STAGE, dataset, DepthConfig(**QUICK), items=[ITEMS[0]], workers=0,
+                    progress=False)  # fmt: skip
+    assert "1 usable cameras, expected at least 2" in run.outcomes[0].reason

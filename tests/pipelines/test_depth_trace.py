@@ -13,8 +13,8 @@ from express50.raycast import mesh_scene
 from pipelines.depth.blocks import Grid, build, combined
 from pipelines.depth.bodies import largest_body
 from pipelines.depth.config import DepthConfig
+from pipelines.depth.finish import Surface
 from pipelines.depth.raycast import cast_view
-from pipelines.depth.reconstruct import Surface
 from pipelines.depth.surface import extract_mesh
 from pipelines.depth.trace import trace, trace_view
 from tests.pipelines.bump_head import ring

@@ -100,6 +100,15 @@ def test_a_copied_camera_is_named(dataset):
     assert "the very files of camera cam00" in warning["why"]
 
 
+def test_names_that_would_meet_in_later_stages_are_refused(dataset):
+    camera_folder(dataset, "cam02").rename(camera_folder(dataset, "cam00_head"))
+    (dataset.captures()["S001"] / "calibration.json").unlink(missing_ok=True)
+    summary = run(dataset)
+    assert (
+        "cameras cam00 and cam00_head would write files of one name" in summary.outcomes[0].reason
+    )
+
+
 def test_missing_camera_is_dropped(dataset):
     (camera_folder(dataset, "cam02") / "video.mp4").unlink()
     camera_folder(dataset, "cam02").rmdir()

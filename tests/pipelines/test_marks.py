@@ -177,7 +177,11 @@ def test_a_camera_given_ten_times_counts_as_one() -> None:
 
 
 def suspects_of(
-    shifts: dict[int, np.ndarray], scenes: int = 4, turned: complex = 1.0, camera: int = 1
+    shifts: dict[int, np.ndarray],
+    scenes: int = 4,
+    turned: complex = 1.0,
+    camera: int = 1,
+    blind: int = 0,
 ) -> dict:
     cameras = [make_camera(angle) for angle in (-0.7, -0.35, 0.0, 0.35, 0.7)]
     targets, marks = [], []
@@ -186,6 +190,8 @@ def suspects_of(
         views = make_views(scene.marks, 1.0, cameras)
         for number, shift in shifts.items():
             views[number].points[:] += shift
+            if seed < blind:  # knows the jaw's line alone
+                views[number].sigma[17:] = np.inf
         middle = views[camera].points.mean(0)
         seen = ((views[camera].points - middle) @ [1, 1j]) * turned
         views[camera].points[:] = np.stack([seen.real, seen.imag], axis=1) + middle
@@ -200,6 +206,12 @@ def test_a_wrongly_calibrated_camera_is_named_with_its_offset() -> None:
     found = suspects_of({1: np.array([25.0, -8.0])})
     assert list(found) == [make_camera(-0.35).id]
     np.testing.assert_allclose(next(iter(found.values()))["offset_px"], [25.0, -8.0], atol=1.5)
+
+
+def test_expressions_in_which_a_camera_knows_no_point_say_nothing_for_it() -> None:
+    (row,) = suspects_of({1: np.array([25.0, -8.0])}, scenes=8, blind=4).values()
+    assert row["expressions"] == 4
+    np.testing.assert_allclose(row["offset_px"], [25.0, -8.0], atol=1.5)
 
 
 def test_a_wrong_focal_length_and_a_turned_camera_are_named() -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import struct
 from pathlib import Path
 
 import av
@@ -21,6 +20,7 @@ from express50.video import iterate_video
 from pipelines.photo.capture import make_photo_capture, subject_id
 from pipelines.photo.picture import guess_focal, open_picture, read_upright
 from pipelines.track.config import TrackConfig
+from tests.synth import turn_video
 
 data = pytest.importorskip("skimage.data")
 
@@ -203,15 +203,6 @@ def write_video(path: Path, images: list[np.ndarray], rate: int = 25) -> None:
         for image in images:
             file.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
         file.mux(stream.encode())
-
-
-def turn_video(path: Path) -> None:
-    """Have the container ask for a turn to the right, as a telephone held upright does."""
-    data = bytearray(path.read_bytes())
-    matrix = data.index(b"tkhd") + 44  # ISO/IEC 14496-12, 8.3.2
-    one = 1 << 16
-    data[matrix : matrix + 36] = struct.pack(">9i", 0, one, 0, -one, 0, 0, 0, 0, 1 << 30)
-    path.write_bytes(data)
 
 
 def test_a_telephones_video_is_stored_upright(tmp_path: Path, astronaut: np.ndarray) -> None:

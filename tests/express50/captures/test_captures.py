@@ -8,6 +8,7 @@ import pytest
 from express50.cameras import project, read_cameras
 from express50.captures.person import read_people
 from express50.captures.read import detect, read_any, subject_of
+from express50.captures.timeline import common_timeline
 from express50.colour_polynomial import correct_srgb8
 from express50.config import resolve_config
 from express50.errors import CalibrationError, CaptureError
@@ -19,7 +20,7 @@ from express50.runner import run_stage
 from pipelines import calibrate, ingest
 from tests.express50.captures import layouts
 from tests.express50.captures.layouts import picture, rig
-from tests.synth import noise_video_images, write_video
+from tests.synth import noise_video_images, turn_video, write_video
 
 HEAD = np.array([[0.02, 1.22, 0.05], [-0.05, 1.15, -0.03], [0.0, 1.2, 0.0]])
 
@@ -218,6 +219,27 @@ def test_photos_and_a_video(tmp_path):
     assert shots.calibration is None and shots.cues == (Cue("photo", 0, 0),)
     assert talk.cues == (Cue("clip", 0, 5),)
     assert read_frame(dataset, "talk", "video", 5, False).shape == (64, 64, 3)
+
+
+def test_a_telephones_video_is_read_upright(tmp_path):
+    images = noise_video_images(3)
+    images = [np.ascontiguousarray(image[:48]) for image in images]  # upright: 48 high, 64 wide
+    write_video(tmp_path / "talk.mp4", [np.ascontiguousarray(np.rot90(i)) for i in images])
+    turn_video(tmp_path / "talk.mp4")
+    dataset, _ = ingested(tmp_path, tmp_path / "talk.mp4")
+    camera = read_index(dataset, "talk").cameras["video"]
+    assert (camera.width, camera.height, camera.orientation) == (64, 48, 6)
+    assert near(read_frame(dataset, "talk", "video", 2, False), images[2], 20)
+
+
+def test_a_video_that_one_camera_lacks_costs_the_camera_or_the_video_whichever_is_less():
+    names = [f"c{n:02d}" for n in range(16)]
+    for count, cameras, kept in ((2, 15, 2), (20, 16, 19)):
+        moments = [(f"s{n:02d}", 0) for n in range(count)]
+        videos = {name: dict.fromkeys(moments, "x.mp4") for name in names}
+        del videos["c03"][moments[1]]
+        line = common_timeline(videos, [sequence for sequence, _ in moments])
+        assert (len(line.names), len(line.moments)) == (cameras, kept)
 
 
 def test_capture_toml_points_at_read_only_data_and_chooses(tmp_path):

@@ -113,6 +113,54 @@ def test_transforms_round_trip(tmp_path):
     assert_same(read_rig(tmp_path), rig)
 
 
+@pytest.mark.parametrize(
+    ("extra", "words"),
+    [({"is_fisheye": True}, "is_fisheye.*undistort"), ({"k4": 0.1}, "k4 is 0.1.*undistort")],
+)
+def test_lenses_that_opencv_lacks_are_refused(tmp_path, extra, words):
+    write_transforms(tmp_path / "transforms.json", make_rig(), extra)
+    with pytest.raises(CalibrationError, match=words):
+        read_rig(tmp_path)
+
+
+def test_angles_of_view_give_both_focal_lengths(tmp_path):
+    frame = {"file_path": "a.png", "transform_matrix": np.eye(4).tolist(), "w": 20, "h": 10}
+    for angles, expected in (
+        ({"camera_angle_x": 1.0, "camera_angle_y": 0.9}, 5 / np.tan(0.45)),
+        ({"camera_angle_x": 1.0}, 10 / np.tan(0.5)),
+    ):
+        (tmp_path / "transforms.json").write_text(json.dumps({"frames": [frame], **angles}))
+        K = read_rig(tmp_path)["a"].K
+        assert K[0, 0] == pytest.approx(10 / np.tan(0.5)) and K[1, 1] == pytest.approx(expected)
+
+
+def test_two_files_that_would_be_one_camera_are_refused(tmp_path):
+    frame = {"transform_matrix": np.eye(4).tolist(), "fl_x": 9.0, "w": 20, "h": 10}
+    frames = [frame | {"file_path": f"images/{name}.png"} for name in ("a b", "a_b")]
+    (tmp_path / "transforms.json").write_text(json.dumps({"frames": frames}))
+    with pytest.raises(CalibrationError, match="images/a b.png and images/a_b.png are both camera"):
+        read_rig(tmp_path)
+
+
+def test_matrices_may_be_lists_of_rows(tmp_path):
+    rig = make_rig(count=2)
+    write_yaml(tmp_path / "rig", rig)
+    camera = rig["cam00"]
+    (file,) = (tmp_path / "rig").glob("cam00*")
+    rows = {
+        "camera_matrix": K_to_opencv(camera.K), "R": camera.cam_from_world[:3, :3],
+        "T": camera.cam_from_world[:3, 3:],
+    }  # fmt: skip
+    text = f"%YAML:1.0\n---\nimage_width: {camera.width}\nimage_height: {camera.height}\n"
+    text += "".join(f"{key}: {value.tolist()}\n" for key, value in rows.items())
+    text += f"distortion_coefficients: {camera.dist[:5].tolist()}\n"
+    file.write_text(text)
+    assert_same(read_rig(tmp_path / "rig"), rig)
+    file.write_text(text.replace("R: [[", "R: [[0.5, "))
+    with pytest.raises(CalibrationError, match="R has rows of several lengths"):
+        read_rig(tmp_path / "rig")
+
+
 def test_transforms_of_many_time_steps_share_cameras_and_must_not_move(tmp_path):
     rig = make_rig(count=2)
     path = tmp_path / "transforms.json"

@@ -63,6 +63,13 @@ def test_import_writes_a_calibration_that_is_read_again(tmp_path, capsys):
     assert main(["cameras", "import", str(tmp_path / "transforms.json"), str(out)]) == 0
     assert "4 cameras (transforms)" in capsys.readouterr().out
     assert len(read_cameras(out)) == 4
+    again = ["cameras", "import", str(tmp_path / "transforms.json"), str(out)]
+    assert main(again) == 0, "the same cameras may be written again"
+    out.write_text("{}")
+    assert main(again) == 2 and out.read_text() == "{}"
+    assert "--overwrite" in capsys.readouterr().err
+    assert main([*again, "--overwrite"]) == 0
+    capsys.readouterr()
     assert main(["cameras", "check", str(out), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["format"] == "express50"
 

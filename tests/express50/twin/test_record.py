@@ -98,6 +98,14 @@ def test_recording_again_keeps_what_is_there_and_adds_the_rest(tiny_config, tmp_
         record(dataclasses.replace(config, seed=9), tmp_path, workers=1)
 
 
+def test_settings_of_which_nothing_was_recorded_do_not_bind(tiny_config, tmp_path):
+    config = dataclasses.replace(tiny_config, cameras=1, board_frames=0, plates=False)
+    (tmp_path / "twin.json").write_text("{}")
+    assert record(config, tmp_path, workers=1) == ["S001"]
+    with pytest.raises(ConfigError, match="twin.seed is -1"):
+        dataclasses.replace(config, seed=-1)
+
+
 def test_the_same_pictures_make_the_same_video(tmp_path):
     """Whatever lay in the memory before: encoders' lookahead has told B-frames by it."""
     rng = np.random.default_rng(0)
