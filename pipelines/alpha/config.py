@@ -8,13 +8,16 @@ from typing import Literal
 
 from express50.errors import ConfigError
 
+NETWORKS = ("bgmv2", "salient")
+WITHOUT_PLATE = ("grabcut", "salient")
+
 
 @dataclass(frozen=True, kw_only=True)
 class AlphaConfig:
     """Lengths are shares of the image's longer side, differences are in noise deviations."""
 
-    method: Literal["key", "bgmv2", "salient"] = "key"
-    """Key against the plate, or a network: BackgroundMattingV2, or RMBG-2.0 or BiRefNet."""
+    method: Literal["key", "grabcut", "bgmv2", "salient"] = "key"
+    """Key against the plate, by colours about the face, or by BackgroundMattingV2 or BiRefNet."""
     weights: str = ""
     """File of the network's weights, TorchScript or ONNX; from a known origin, it is a program."""
     device: Literal["auto", "cuda"] = "auto"
@@ -71,10 +74,10 @@ class AlphaConfig:
         self._check_networks()
 
     def _check_networks(self) -> None:
-        if (self.method == "key") == bool(self.weights):
+        if (self.method in NETWORKS) != bool(self.weights):
             raise ConfigError(
-                f"alpha.method {self.method!r} with alpha.weights {self.weights!r}: key takes none,"
-                " bgmv2 and salient need the file of the network's weights"
+                f"alpha.method {self.method!r} with alpha.weights {self.weights!r}: key and grabcut"
+                " take none, bgmv2 and salient need the file of the network's weights"
             )
         if self.tile < 512 or self.tile % 64:
             raise ConfigError(f"alpha.tile is {self.tile}, expected a multiple of 64, 512 or more")

@@ -9,14 +9,14 @@ import cv2
 import numpy as np
 
 from express50.adapters import undistorted_mask
-from express50.cameras import read_cameras
+from express50.cameras import Camera, read_cameras
 from express50.errors import StageError
 from express50.frames import read_cameras_of, read_frame, read_peaks
 from express50.images import contact_sheet, read_image, write_image
 from express50.index import index_path, read_index
 from express50.layout import Dataset
 from express50.stage import Stage
-from pipelines.alpha.config import PRESETS, AlphaConfig
+from pipelines.alpha.config import NETWORKS, PRESETS, WITHOUT_PLATE, AlphaConfig
 from pipelines.alpha.keyer import Keyer
 from pipelines.alpha.plate import exposed, exposure_gain
 from pipelines.alpha.qc import border_contact, picture_row, warnings
@@ -49,7 +49,7 @@ def inputs(dataset: Dataset, item: str, config: AlphaConfig) -> dict[str, Path |
     }
     if camera in index.plates:
         found["plate"] = index.capture / index.plates[camera]
-    elif config.method != "salient":
+    elif config.method not in WITHOUT_PLATE:
         for other in others_of(dataset, index, camera):
             found[f"index of {other}"] = index_path(dataset, other)
             theirs = read_index(dataset, other)
@@ -81,8 +81,12 @@ def run(dataset: Dataset, item: str, config: AlphaConfig, out: Path) -> dict:
     def read(frame: int) -> np.ndarray:
         return read_frame(dataset, subject, camera_id, frame)
 
-    plate = None if config.method == "salient" else plate_of(dataset, item, camera, config)
-    alpha_of, facts = _method(plate, [read(f) for f in _measured(peaks, config)], valid, config)
+    plate = None if config.method in WITHOUT_PLATE else plate_of(dataset, item, camera, config)
+    if config.method == "grabcut":
+        alpha_of, facts = _by_face(read_cameras_of(dataset, subject)[camera_id])
+    else:
+        frames = [read(frame) for frame in _measured(peaks, config)]
+        alpha_of, facts = _method(plate, frames, valid, config)
     coverage: dict[str, float] = {}
     border: dict[str, dict[str, float]] = {}
     for expression, frame in peaks.items():
@@ -112,6 +116,15 @@ def _measured(peaks: dict[str, int], config: AlphaConfig) -> list[int]:
     frames = sorted(set(peaks.values()))
     picks = np.linspace(0, len(frames) - 1, config.noise_frames).round().astype(int)
     return [frames[i] for i in np.unique(picks)]
+
+
+def _by_face(camera: Camera) -> tuple[Alpha, dict[str, object]]:
+    """Alpha by colours about the face that a pinhole camera sees, and facts for the metrics."""
+    from express50.landmarks.network import load_network  # torch takes seconds to import
+    from pipelines.alpha.grabcut import person_alpha
+
+    net = load_network()
+    return lambda frame: person_alpha(net, camera, frame), {"plate": "none"}
 
 
 def _method(
@@ -153,7 +166,7 @@ def _write_picture(out: Path, images: dict[str, np.ndarray], odd: set[str]) -> N
 
 def needs_gpu(config: AlphaConfig) -> bool:
     """Whether a network must run on CUDA."""
-    return config.method != "key" and config.device == "cuda"
+    return config.method in NETWORKS and config.device == "cuda"
 
 
 STAGE = Stage(

@@ -28,7 +28,7 @@ SEARCH = 0.08  # people fill a rig's pictures, but not all photographs
 # views the jaw's width hangs on its landmarks alone.
 PHOTO_SETTINGS = (
     "track.neck_prior=0.03", "track.contour_weight=0.7", "observe.min_score=0.2",
-    f"track.search={SEARCH}", f"observe.search={SEARCH}",
+    f"track.search={SEARCH}", f"observe.search={SEARCH}", "alpha.method=grabcut",
 )  # fmt: skip
 WORDS = "track the face of a bare photograph or video, without calibration"
 
@@ -53,7 +53,10 @@ def add_commands(subparsers: Any) -> None:
         help="parts of a video; a frame of each is fitted for the shape [8]",
     )  # fmt: skip
     parser.add_argument(
-        "--matte", action="store_true", help="matte too, and fit outlines (name alpha.weights)"
+        "--matte",
+        action="store_true",
+        help="matte too, and fit outlines; by colours about the face, or by a network of yours:"
+        " --set alpha.method=salient --set alpha.weights=FILE",
     )
     add_config_options(parser)
     parser.add_argument("--json", action="store_true", help="print the account as JSON")

@@ -1,0 +1,98 @@
+"""Alpha about a face, without plate or weights: a photograph, its edges, and what has no face."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from express50.cli import main
+from express50.errors import ConfigError, StageError
+from express50.images import read_alpha, write_image
+from express50.landmarks.network import load_network
+from express50.layout import Dataset
+from pipelines.alpha.config import AlphaConfig
+from pipelines.alpha.grabcut import person_alpha
+from pipelines.photo.focal import single_camera
+
+data = pytest.importorskip("skimage.data")
+HEAD = [(225, 30), (160, 80), (290, 90), (220, 100), (225, 165), (225, 205)]  # hair, face, collar
+BEHIND = [(350, 40), (100, 60), (480, 60), (310, 130), (130, 120), (225, 5)]
+
+
+def alpha_of(image: np.ndarray) -> np.ndarray:
+    height, width = image.shape[:2]
+    camera = single_camera("photo", width, height, 1.6 * max(width, height))
+    alpha = person_alpha(load_network(), camera, image)
+    assert alpha.shape == image.shape[:2] and alpha.dtype == np.float32
+    assert np.isfinite(alpha).all() and alpha.min() >= 0 and alpha.max() <= 1
+    return alpha
+
+
+@pytest.fixture(scope="module")
+def alpha() -> np.ndarray:
+    return alpha_of(data.astronaut())
+
+
+def test_hair_and_face_are_told_from_the_wall(alpha: np.ndarray) -> None:
+    assert all(alpha[y, x] > 0.95 for x, y in HEAD), [alpha[y, x] for x, y in HEAD]
+    assert all(alpha[y, x] < 0.05 for x, y in BEHIND), [alpha[y, x] for x, y in BEHIND]
+    soft = (alpha[:140] > 0.05) & (alpha[:140] < 0.95)
+    assert 200 < soft.sum() < 6000, "hair has soft edges, and nothing else is in doubt"
+
+
+def test_the_same_picture_gives_the_same_alpha(alpha: np.ndarray) -> None:
+    np.testing.assert_array_equal(alpha, alpha_of(data.astronaut()))
+
+
+@pytest.mark.parametrize("turns", [1, 3])
+def test_a_picture_on_its_side_is_cut_alike(alpha: np.ndarray, turns: int) -> None:
+    turned = np.rot90(alpha_of(np.ascontiguousarray(np.rot90(data.astronaut(), turns))), -turns)
+    head = np.s_[:200, 120:330]
+    assert np.abs(turned - alpha)[head].mean() < 0.04
+
+
+@pytest.mark.parametrize(
+    "crop", [np.s_[60:190, 170:280], np.s_[:200, 225:], np.s_[70:175, 180:270], np.s_[:, 60:400]]
+)
+def test_cut_and_filling_faces_stay_finite(crop: tuple[slice, slice]) -> None:
+    """A face that fills the picture, half a face, one without its hair, one with its torso."""
+    image = np.ascontiguousarray(data.astronaut()[crop])
+    try:
+        found = alpha_of(image)
+    except StageError as error:
+        assert "no face found" in str(error)
+    else:
+        assert found.max() > 0.9
+
+
+@pytest.mark.parametrize("scale", [0.35, 3.0])
+def test_small_and_large_pictures_are_cut_alike(alpha: np.ndarray, scale: float) -> None:
+    interpolation = cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC
+    image = cv2.resize(
+        data.astronaut()[:256], None, fx=scale, fy=scale, interpolation=interpolation
+    )
+    found = cv2.resize(alpha_of(image), (512, 256), interpolation=cv2.INTER_AREA)
+    head = np.s_[:200, 120:330]
+    assert np.abs(found[head] - alpha[head]).mean() < 0.06
+
+
+def test_what_shows_no_face_is_refused() -> None:
+    with pytest.raises(StageError, match="no face found.*alpha.method to salient"):
+        alpha_of(np.repeat(data.brick()[..., None], 3, axis=2))
+    with pytest.raises(ConfigError, match="key and grabcut take none"):
+        AlphaConfig(method="grabcut", weights="net.pt")
+
+
+def test_a_photograph_is_matted_without_plate_or_weights(tmp_path: Path) -> None:
+    write_image(tmp_path / "eva.png", data.astronaut())
+    assert main(["photo", str(tmp_path / "eva.png"), str(tmp_path / "out"), "--matte",
+                 "--preset", "draft"]) == 0  # fmt: skip
+    dataset = Dataset(tmp_path / "out")
+    figures = json.loads((dataset.item_dir("alpha", "eva/photo") / "metrics.json").read_text())
+    assert figures["method"] == "grabcut"
+    matte = read_alpha(dataset.matte_file("eva", "photo", "photo"))
+    assert all(matte[y, x] > 240 for x, y in HEAD) and all(matte[y, x] < 12 for x, y in BEHIND)
