@@ -16,6 +16,7 @@ from express50.head.model import HeadModel, landmarks
 from express50.images import write_image
 from express50.layout import Dataset
 from express50.raycast import mesh_scene
+from pipelines.track.observe import facing
 from pipelines.track.pinhole import project_pinhole
 from pipelines.track.state import Target
 
@@ -30,32 +31,35 @@ def draw_overlays(
     model: HeadModel,
     targets: list[Target],
     vertices: np.ndarray,
+    rotations: np.ndarray,
 ) -> dict[str, np.ndarray]:
     """Write overlay_<expression>.jpg: frame above, mesh and landmarks below, in four views.
 
-    Yellow: detected; green: fitted. Vertices (E, V, 3) world.
+    Yellow: detected; green: fitted. Vertices (E, V, 3) world, rotations (E, 3, 3) from head to it.
 
     Returns:
-        Expression to the overlay (TILE, TILE, 3) uint8 in its surest view.
+        Expression to the overlay (TILE, TILE, 3) uint8 in the view that the face looks at.
     """
     folder.mkdir(parents=True, exist_ok=True)
     cameras = read_cameras_of(dataset, subject)
-    surest = {}
-    for target, mesh in zip(targets, vertices, strict=True):
-        chosen, columns = _spread(target, cameras), {}
+    frontal = {}
+    for target, mesh, rotation in zip(targets, vertices, rotations, strict=True):
+        chosen, columns = _spread(target, cameras, rotation, mesh.mean(0)), {}
         for camera_id in sorted(chosen):
             frame = read_frame(dataset, subject, camera_id, target.observation.frame)
             seen = [v.points for v in target.observation.views if v.camera_id == camera_id]
             columns[camera_id] = draw_column(frame, cameras[camera_id], model, mesh, seen)
         path = folder / f"overlay_{target.observation.expression}.jpg"
         write_image(path, np.concatenate(list(columns.values()), axis=1), quality=88)
-        surest[target.observation.expression] = columns[chosen[0]][TILE:]
-    return surest
+        frontal[target.observation.expression] = columns[chosen[0]][TILE:]
+    return frontal
 
 
-def _spread(target: Target, cameras: dict[str, Camera]) -> list[str]:
-    """Up to four cameras: the surest view first, then those furthest from all chosen so far."""
-    views = sorted(target.observation.views, key=lambda v: float(np.median(v.sigma)) / v.score)
+def _spread(
+    target: Target, cameras: dict[str, Camera], rotation: np.ndarray, middle: np.ndarray
+) -> list[str]:
+    """Up to four cameras: the one the face looks at, then those furthest from all chosen so far."""
+    views = sorted(target.observation.views, key=lambda view: -facing(view, rotation, middle))
     chosen = [views[0].camera_id]
     pool = [view.camera_id for view in views[1:]]
     while pool and len(chosen) < 4:

@@ -102,10 +102,11 @@ def run(dataset: Dataset, item: str, config: TrackConfig, out: Path) -> dict:
     if appearance is not None and config.texture_side:
         write_texture(out, basis.model, targets, vertices, moments, appearance, config.texture_side)
     metrics = track_metrics(basis.model, targets, vertices, dropped)
-    tiles = draw_overlays(dataset, item, out / "qc", basis.model, targets, vertices)
+    turns = rotations(state)
+    tiles = draw_overlays(dataset, item, out / "qc", basis.model, targets, vertices, turns)
     write_sheet(out / "qc", tiles, metrics["landmark_rms_px"])
     marks = _marks(basis.model, state)
-    suspects = suspect_cameras(targets, marks, rotations(state), vertices.mean(1))
+    suspects = suspect_cameras(targets, marks, turns, vertices.mean(1))
     metrics |= {"suspect_cameras": suspects, "warnings": warnings(suspects)}
     if config.frames == "clips":
         skin = None
