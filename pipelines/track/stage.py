@@ -70,6 +70,12 @@ def inputs(dataset: Dataset, item: str, config: TrackConfig) -> dict[str, Path |
         found["chart"] = CHART_WEIGHTS
     if config.head != "procedural":
         found["head"] = Path(config.head).expanduser()
+    for name, setting in (("head", "head"), ("landmarks", "landmarks"), ("fan", "landmarks")):
+        if name in found and not Path(found[name]).exists():
+            raise StageError(
+                f"track.{setting} is {getattr(config, setting)}: there is no such file; give its"
+                " path, or leave the setting out"
+            )
     return found
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import av
@@ -231,3 +232,16 @@ def test_a_video_is_tracked_in_every_frame(tmp_path: Path, astronaut: np.ndarray
         moved = sequence["t"][:, 0] / -sequence["t"][:, 2] * 700
         np.testing.assert_allclose(np.diff(moved), 1.0, atol=1.0)
         assert moved[-1] - moved[0] == pytest.approx(4.0, abs=1.0)
+
+
+@pytest.mark.parametrize(
+    "setting", ["head=flame.pkl", "landmarks=points.npz", "landmarks=fan:x.pt"]
+)
+def test_files_that_settings_name_are_missed_by_the_settings_name(
+    tracked: tuple[Path, dict], tmp_path: Path, setting: str, capsys: pytest.CaptureFixture
+) -> None:
+    shutil.copytree(tracked[0], tmp_path / "out")
+    assert main(["track", str(tmp_path / "out"), "--set", f"track.{setting}"]) == 1
+    told = f"track.{setting.replace('=', ' is ')}: there is no such file"
+    assert told in "".join(capsys.readouterr())
+    assert (tmp_path / "out/track/eva_1/track.npz").is_file()
