@@ -11,7 +11,7 @@ from typing import Any
 
 from express50.config import config_toml
 from express50.digests import path_digest
-from express50.errors import Express50Error, StageError
+from express50.errors import ConfigError, Express50Error, StageError
 from express50.layout import Dataset
 from express50.ledger import Ledger
 from express50.locks import stage_lock
@@ -165,6 +165,8 @@ def _run_items(
     for item in chosen:
         try:
             inputs = input_digests(stage, dataset, item, config, digest_of)
+        except ConfigError:  # a setting is wrong, no item: what was made before stays
+            raise
         except Express50Error as error:
             reason = f"{type(error).__name__}: {error}"
             unreadable.append(_refusal(stage, item, reason))

@@ -20,7 +20,7 @@ import numpy as np
 import torch
 
 from express50.arrays import DAMAGE
-from express50.errors import StageError
+from express50.errors import ConfigError, StageError
 from express50.weights import check_archive
 
 TORCH_ERRORS = (*DAMAGE, torch.jit.Error)
@@ -82,7 +82,8 @@ def load_network(path: Path, role: Role) -> Network:
     """Load a network, or take it from those that this process loaded before.
 
     Raises:
-        StageError: the file is missing or no such network, or onnxruntime is not installed.
+        ConfigError: the file is missing.
+        StageError: it is no such network, or onnxruntime is not installed.
     """
     check_file(path, role.setting)
     stat = path.stat()
@@ -90,9 +91,9 @@ def load_network(path: Path, role: Role) -> Network:
 
 
 def check_file(path: Path, setting: str) -> None:
-    """Raise StageError where there is no file of weights."""
+    """Raise ConfigError where there is no file of weights."""
     if not path.is_file():
-        raise StageError(f"{setting} {path}: no such file; expected TorchScript or .onnx")
+        raise ConfigError(f"{setting} {path}: no such file; expected TorchScript or .onnx")
 
 
 def resized(image: np.ndarray, height: int, width: int) -> np.ndarray:

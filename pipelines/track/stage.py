@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from express50.errors import StageError
+from express50.errors import ConfigError, StageError
 from express50.frames import read_cameras_of
 from express50.head.load import load_head
 from express50.head.model import HeadModel, landmarks
@@ -72,7 +72,7 @@ def inputs(dataset: Dataset, item: str, config: TrackConfig) -> dict[str, Path |
         found["head"] = Path(config.head).expanduser()
     for name, setting in (("head", "head"), ("landmarks", "landmarks"), ("fan", "landmarks")):
         if name in found and not Path(found[name]).exists():
-            raise StageError(
+            raise ConfigError(
                 f"track.{setting} is {getattr(config, setting)}: there is no such file; give its"
                 " path, or leave the setting out"
             )

@@ -195,7 +195,7 @@ def test_a_network_for_another_method_is_named(tmp_path) -> None:
 @pytest.mark.parametrize("name", ["a.pt", "a.onnx"])
 def test_missing_and_damaged_files_are_one_line(tmp_path, name: str) -> None:
     path = tmp_path / name
-    with pytest.raises(StageError, match="no such file"):
+    with pytest.raises(ConfigError, match="no such file"):
         load_network(path, SALIENT)
     for content in (b"", b"not a network", bytes(4096)):
         path.write_bytes(content)

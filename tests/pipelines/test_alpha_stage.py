@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from express50.errors import StageError
+from express50.errors import ConfigError
 from express50.frames import dhash, read_frame
 from express50.images import read_image, write_image
 from express50.index import read_index
@@ -134,7 +134,7 @@ def test_a_bad_network_fails_items_in_one_line_each(aligned, tmp_path, how, mess
 
 def test_weights_that_are_not_there_are_said_once_and_cost_nothing(aligned, tmp_path) -> None:
     assert run(aligned).count("done") == 3
-    with pytest.raises(StageError, match="no item can be made: .*alpha.weights .*no such file"):
+    with pytest.raises(ConfigError, match="alpha.weights .*no such file"):
         run(aligned, method="salient", weights=str(tmp_path / "net.pt"))
     assert run(aligned).count("skipped") == 3
 

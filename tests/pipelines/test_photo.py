@@ -241,7 +241,7 @@ def test_files_that_settings_name_are_missed_by_the_settings_name(
     tracked: tuple[Path, dict], tmp_path: Path, setting: str, capsys: pytest.CaptureFixture
 ) -> None:
     shutil.copytree(tracked[0], tmp_path / "out")
-    assert main(["track", str(tmp_path / "out"), "--set", f"track.{setting}"]) == 1
+    assert main(["track", str(tmp_path / "out"), "--set", f"track.{setting}"]) == 2
     told = f"track.{setting.replace('=', ' is ')}: there is no such file"
     assert told in "".join(capsys.readouterr())
     assert (tmp_path / "out/track/eva_1/track.npz").is_file()

@@ -273,7 +273,7 @@ def test_items_without_track_or_mattes_fail_in_one_line(tmp_path) -> None:
     shutil.rmtree(dataset.item_dir("matte", "S001/smile"))
     with pytest.raises(StageError, match="no camera has a matte to label .*express50 matte"):
         STAGE.run(dataset, "S001/smile", RegionsConfig(), tmp_path)
-    with pytest.raises(StageError, match=r"regions.segmentation .*no such file"):
+    with pytest.raises(ConfigError, match=r"regions.segmentation .*no such file"):
         STAGE.inputs(dataset, "S001/smile", RegionsConfig(segmentation="nowhere.pt"))
     (dataset.item_dir("track", "S001") / "track.npz").unlink()
     with pytest.raises(StageError, match="S001' is not tracked; run 'express50 track'"):
