@@ -117,7 +117,10 @@ def refine_figures(
             found, cameras={n: replace(c, cam_from_world=poses[n]) for n, c in rig.items()}
         )
 
-    rows = {"before": _of(judge(bumped, true)), "footage": _row(by_footage, bumped, true, judge)}
+    rows: dict[str, object] = {
+        "before": _of(judge(bumped, true)),
+        "footage": _row(by_footage, bumped, true, judge),
+    }
     if board is not None:
         observations, points = board
 
@@ -183,8 +186,10 @@ def colmap_mapping(seen: Mapping[int, Seen], rig: Mapping[str, Camera]) -> dict[
         (root / "models").mkdir()
         models = pycolmap.incremental_mapping(root / "database.db", root, root / "models", options)
     best = max(models.values(), key=lambda m: m.num_reg_images(), default=None)
-    found = {}
-    for number in best.reg_image_ids() if best is not None else ():
+    found: dict[str, Camera] = {}
+    if best is None:
+        return found
+    for number in best.reg_image_ids():
         image = best.image(number)
         camera = best.camera(image.camera_id)
         pose = np.vstack([image.cam_from_world().matrix(), [0, 0, 0, 1]])

@@ -74,7 +74,7 @@ def held_out(shards: Path, config: Config) -> tuple[Config, str]:
             facing[key.camera] = float(views.item(index).view.direction()[2])
     order = sorted(facing, key=lambda camera: -facing[camera])
     frames = sorted({(k.subject, k.expression) for k in views.keys if k.expression != "neutral"})
-    subjects = spread(sorted({subject for subject, _ in frames}), HELD_FRAMES)
+    subjects = spread(sorted({person for person, _ in frames}), HELD_FRAMES)
     chosen = []
     for number, subject in enumerate(subjects):  # another expression of each
         own = [f"{s}/{e}" for s, e in frames if s == subject]

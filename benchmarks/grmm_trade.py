@@ -101,8 +101,9 @@ def measure(source: Source, base: Config, name: str, budget: float, images: int)
     """One setting and budget: held-out PSNR at the shards' size, steps, seconds a picture."""
     changes, factor = SETTINGS[name]
     tables = as_tables(base)
-    for table, values in (*changes.items(), ("train", {"seconds": budget, "iterations": 10**6})):
-        tables[table] = tables[table] | dict(values)
+    budgeted = {"seconds": budget, "iterations": 10**6}
+    for table in (*changes, "train"):
+        tables[table] |= changes.get(table, {}) | (budgeted if table == "train" else {})
     head = load_head(source.head)
     whole = HeadViews(source, head)
     views = whole if factor == 1 else HeadViews(Smaller(source, factor), head)
@@ -151,7 +152,7 @@ def as_markdown(rows: list[dict], people: int, cameras: int, size: int) -> list[
 
 def choices(rows: list[dict]) -> list[dict]:
     """For each budget the setting with the best PSNR, as `grmm.budget` reads it."""
-    best = {}
+    best: dict[float, dict] = {}
     for row in rows:
         if row["budget_s"] not in best or row["psnr_db"] > best[row["budget_s"]]["psnr_db"]:
             best[row["budget_s"]] = row

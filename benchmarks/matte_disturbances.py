@@ -140,8 +140,8 @@ def _painted(shot: Shot, at: np.ndarray, colour: np.ndarray, behind: bool) -> Sh
     if behind:
         wide = cv2.dilate(near.astype(np.uint8), np.ones((5, 5))).astype(bool)[..., None]
         plate = np.where(wide, colour + noise[1], plate)
-    frame, plate = (np.rint(np.clip(image, 0, 255)).astype(np.uint8) for image in (frame, plate))
-    return replace(shot, frame=frame, plate=plate)
+    shown = [np.rint(np.clip(image, 0, 255)).astype(np.uint8) for image in (frame, plate)]
+    return replace(shot, frame=shown[0], plate=shown[1])
 
 
 def _moved(shot: Shot) -> Shot:

@@ -25,6 +25,7 @@ import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -44,6 +45,7 @@ from pipelines.alpha import STAGE as ALPHA
 from pipelines.alpha.keyer import Keyer
 from pipelines.matte import STAGE
 from pipelines.matte.agreement import agree
+from pipelines.matte.config import MatteConfig
 from pipelines.matte.hull import ball_of
 from pipelines.matte.stage import corrected, make_view
 
@@ -144,7 +146,7 @@ def key(shot: Shot) -> Keyed:
     return Keyed(shot, np.rint(255 * keyer.alpha(shot.frame)).astype(np.uint8))
 
 
-def measure(keyed: list[Keyed], config: object, sheet: Path | None) -> Figures:
+def measure(keyed: list[Keyed], config: MatteConfig, sheet: Path | None) -> Figures:
     """Errors before and after of one moment, and the seconds between."""
     started = time.process_time()
     ball = ball_of({k.shot.camera.id: k.shot.camera for k in keyed})
@@ -179,7 +181,7 @@ def sheet_of(
 
 def summary(rows: dict[tuple[int, str, str], list[Figures]]) -> dict[str, object]:
     """Means over the peaks by number of cameras, preset and scene, with their ratios."""
-    table: dict[str, dict] = {}
+    table: dict[str, Any] = {}
     for (count, preset, scene), mine in rows.items():
         means = {name: float(np.mean([row[name] for row in mine])) for name in mine[0]}
         means["sad_ratio_to_key"] = means["sad"] / means["sad_key"]

@@ -53,7 +53,7 @@ GEOMETRY = ("means", "quats", "scales", "opacities", "K", "cam_from_world")
 @torch.no_grad()
 def blended_pairs(scene: dict[str, Tensor], size: int) -> tuple[Tensor, Tensor]:
     """Gaussian and pixel numbers (M,) of every blend, by pixel and nearest first within it."""
-    splats = project(*(scene[name] for name in GEOMETRY), size, size)
+    splats = project(**{name: scene[name] for name in GEOMETRY}, width=size, height=size)
     visible = splats.visible.nonzero()[:, 0]
     order = visible[torch.sort(splats.depths[visible], stable=True).indices]
     mean, extent = splats.means2d[order].double(), splats.extents[order]
@@ -98,7 +98,7 @@ def render_pairs(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Colours (P, C), sum of weight * ray length (P,) and alpha (P,), all by torch's autograd."""
     gaussians, pixels = pairs
-    splats = project(*(scene[name] for name in GEOMETRY), size, size)
+    splats = project(**{name: scene[name] for name in GEOMETRY}, width=size, height=size)
     alphas = pair_alphas(splats, gaussians, pixels, size)
     weights = alphas * before(alphas, pixels)
     center = cell_to_corner(torch.stack([pixels % size, pixels // size], 1).to(weights.dtype))

@@ -16,7 +16,7 @@ import json
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -36,11 +36,14 @@ from express50.twin.truth import Truth
 from pipelines.regions import STAGE
 from pipelines.regions.labels import head_labels
 from pipelines.regions.mesh import make_head
-from pipelines.regions.read import read_depth, read_head, read_pair
+from pipelines.regions.read import read_depth_of, read_head, read_pair
 from pipelines.regions.stage import look
 from pipelines.regions.view import head_alpha
 
 CHIN = 8  # of the 68 landmarks
+
+Pair = tuple[np.ndarray, np.ndarray]
+"""True labels and alpha of the head (H, W) of a view."""
 
 
 def main() -> int:
@@ -106,7 +109,9 @@ def measure_item(dataset: Dataset, truth: Truth, item: str, configs: dict) -> di
     return found
 
 
-def true_mesh_rows(dataset: Dataset, truth: Truth, item: str, true: dict) -> list[dict]:
+def true_mesh_rows(
+    dataset: Dataset, truth: Truth, item: str, true: Mapping[str, Pair]
+) -> list[dict]:
     """Errors of the standard preset where tracking is perfect."""
     subject, expression = item.split("/")
     frame = read_peaks(dataset, subject)[expression]
@@ -116,10 +121,11 @@ def true_mesh_rows(dataset: Dataset, truth: Truth, item: str, true: dict) -> lis
     config, rows = STAGE.config(), []
     for name, camera in true_world_cameras(dataset, truth, subject).items():
         rgb, alpha = read_pair(dataset, item, camera, frame)
-        depth = read_depth(dataset, item, camera, config)
+        depth = read_depth_of(dataset, item, camera, config)
         small = look(head, camera, rgb, alpha, depth, False, config).labels
         shown = np.where(alpha > 0.5, small, 0)
-        rows.append(view_row(*true[name], head_alpha(alpha, small), shown))
+        labels_of, alpha_of = true[name]
+        rows.append(view_row(labels_of, alpha_of, head_alpha(alpha, small), shown))
     return rows
 
 

@@ -21,6 +21,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -182,9 +183,13 @@ def measured(
         got = [sample["rgb.jpg"] for sample in one_pass()]
         if len(got) != len(given) or not set(got) <= expected:
             return {"why": f"n/a: {name} gave {len(got)} samples, expected {len(given)}"}
-        seconds = least(lambda one_pass=one_pass: exhaust(one_pass()))
+        seconds = least(partial(_exhaust_pass, one_pass))
         row[f"{name}_per_s"] = round(len(given) / seconds)
     return row
+
+
+def _exhaust_pass(one_pass: Callable[[], Iterator[Members]]) -> None:
+    exhaust(one_pass())
 
 
 def exhaust(samples: Iterator[Members]) -> None:

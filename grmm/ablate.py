@@ -12,6 +12,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Any
 
 from express50.errors import ConfigError, FormatError
 from express50.head.load import load_head
@@ -39,7 +40,7 @@ def ablate(
     protocol: Protocol,
     subjects: Sequence[str] = (),
     names: Sequence[str] = (),
-) -> dict[str, object]:
+) -> dict[str, Any]:
     """Measure every row that is not measured yet; writes ablation.json and ablation.md.
 
     Args:

@@ -7,10 +7,13 @@ exactly where it stopped.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TypeVar
 
 import numpy as np
 
 from express50.errors import TrainError
+
+Item = TypeVar("Item")
 
 
 class Shuffle:
@@ -50,9 +53,9 @@ class Shuffle:
         self._order = self._permutation()
 
 
-def spread(indices: Sequence[int], count: int) -> list[int]:
-    """At most ``count`` of the indices, evenly chosen (first and last included)."""
-    if len(indices) <= count:
-        return list(indices)
-    steps = np.linspace(0, len(indices) - 1, count).round().astype(int)
-    return [indices[i] for i in steps]
+def spread(items: Sequence[Item], count: int) -> list[Item]:
+    """At most ``count`` of the items, evenly chosen (first and last included)."""
+    if len(items) <= count:
+        return list(items)
+    steps = np.linspace(0, len(items) - 1, count).round().astype(int)
+    return [items[i] for i in steps]
