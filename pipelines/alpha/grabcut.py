@@ -21,7 +21,7 @@ from express50.landmarks.network import LandmarkNet
 from pipelines.alpha.learned import refined
 from pipelines.calibrate.faces import mean_landmarks, pose_of_face
 
-FACE_SCORE = 0.2
+FACE_SCORE = 0.3  # heads from behind score up to 0.2, profiles from 0.33 on
 SEARCH = 0.08  # smallest windows searched for the face, of the longer side
 PIXEL_M = 1e-3  # on the head, to which larger pictures are reduced; edges are refined afterwards
 ROUNDS = 6
