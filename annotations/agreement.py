@@ -13,7 +13,8 @@ from itertools import combinations
 
 import numpy as np
 
-from annotations.store import Label, labels_by_person, read_labels
+from annotations.labels import Label
+from annotations.store import labels_by_person, read_labels
 from express50.exclusions import included_subjects
 from express50.index import read_index
 from express50.layout import Dataset

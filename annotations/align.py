@@ -14,19 +14,11 @@ from pathlib import Path
 
 import numpy as np
 
+from annotations.labels import AUTOMATIC, Label, make_mark, make_undo
 from annotations.match import Reference, Watched, suggest_all, watch
 from annotations.observe import observations_path, read_observations
 from annotations.reference import reference_subject
-from annotations.store import (
-    AUTOMATIC,
-    Label,
-    append_label,
-    current_labels,
-    human_digest,
-    make_mark,
-    make_undo,
-    read_labels,
-)
+from annotations.store import append_label, current_labels, human_digest, read_labels
 from annotations.suggest import Suggestion
 from express50.errors import StageError
 from express50.expressions import load_script

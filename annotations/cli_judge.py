@@ -8,9 +8,10 @@ from dataclasses import asdict
 
 from annotations.agreement import agreement, by_expression, by_pair, marked_clips
 from annotations.coverage import coverage
+from annotations.labels import FLAG_REASONS
 from annotations.options import add_annotator, add_selection, add_verb, chosen_subjects
 from annotations.review import describe, disagreements, settlement
-from annotations.store import FLAG_REASONS, append_label
+from annotations.store import append_label
 from annotations.validate import problems
 from express50.console import FAILED, OK, format_table, say, say_json
 from express50.index import read_index

@@ -6,19 +6,10 @@ import argparse
 from dataclasses import asdict
 
 from annotations.effort import effort, progress
+from annotations.labels import FLAG_REASONS, Label, make_flag, make_mark, make_undo
 from annotations.options import add_annotator, add_clip, add_selection, add_verb, chosen_subjects
 from annotations.review import describe
-from annotations.store import (
-    FLAG_REASONS,
-    Label,
-    append_label,
-    current_labels,
-    last_event,
-    make_flag,
-    make_mark,
-    make_undo,
-    read_labels,
-)
+from annotations.store import append_label, current_labels, last_event, read_labels
 from annotations.suggestions import read_suggestions
 from annotations.worklist import ORDERS, worklist
 from express50.console import OK, format_table, say, say_json

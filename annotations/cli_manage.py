@@ -8,10 +8,11 @@ from dataclasses import asdict
 from pathlib import Path
 
 from annotations.exchange import export_labels, import_labels
+from annotations.labels import Label
 from annotations.options import add_annotator, add_selection, add_verb, chosen_subjects
 from annotations.reference import choose_reference, reference_subject
 from annotations.rules import LAST_FRAME, last_frame_marks
-from annotations.store import Label, append_label, read_labels
+from annotations.store import append_label, read_labels
 from express50.console import OK, say, say_json
 from express50.errors import AnnotationError
 from express50.exclusions import included_subjects

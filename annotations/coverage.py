@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from annotations.store import AUTOMATIC, Label, current_labels, is_person, read_labels
+from annotations.labels import AUTOMATIC, Label
+from annotations.store import current_labels, is_person, read_labels
 from express50.captures.person import read_people
 from express50.demographics import age_counts, gender_counts, shown_counts
 from express50.exclusions import exclusion_reason, included_subjects

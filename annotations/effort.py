@@ -6,7 +6,8 @@ from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from statistics import median
 
-from annotations.store import AUTOMATIC, Label, current_labels, is_person, read_labels
+from annotations.labels import AUTOMATIC, Label
+from annotations.store import current_labels, is_person, read_labels
 from express50.exclusions import exclusion_reason
 from express50.index import read_index
 from express50.layout import Dataset

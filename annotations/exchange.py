@@ -10,14 +10,8 @@ from dataclasses import MISSING, asdict, fields
 from pathlib import Path
 from typing import Any, get_type_hints
 
-from annotations.store import (
-    ACTIONS,
-    Label,
-    append_label,
-    check_texts,
-    find_cue,
-    read_labels,
-)
+from annotations.labels import ACTIONS, Label, check_texts, find_cue
+from annotations.store import append_label, read_labels
 from express50.errors import AnnotationError
 from express50.index import read_index
 from express50.layout import Dataset

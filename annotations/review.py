@@ -4,15 +4,8 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass
 
-from annotations.store import (
-    FLAG_REASONS,
-    Label,
-    current_labels,
-    labels_by_person,
-    make_flag,
-    make_mark,
-    read_labels,
-)
+from annotations.labels import FLAG_REASONS, Label, make_flag, make_mark
+from annotations.store import current_labels, labels_by_person, read_labels
 from express50.errors import AnnotationError
 from express50.exclusions import included_subjects
 from express50.index import Index, read_index

@@ -11,7 +11,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-from annotations.store import RULE_PREFIX, Label, current_labels, make_mark, read_labels
+from annotations.labels import RULE_PREFIX, Label, make_mark
+from annotations.store import current_labels, read_labels
 from express50.errors import AnnotationError
 from express50.index import Cue, Index
 from express50.layout import Dataset

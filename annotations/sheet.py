@@ -9,9 +9,10 @@ from collections import Counter
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 
+from annotations.labels import AUTOMATIC, Label
 from annotations.reference import reference_subject
 from annotations.review import disagreements
-from annotations.store import AUTOMATIC, Label, current_labels, is_person, read_labels
+from annotations.store import current_labels, is_person, read_labels
 from annotations.suggestions import Suggested, read_suggestions
 from express50.errors import AnnotationError, FormatError
 from express50.exclusions import exclusion_reason, included_subjects

@@ -1,8 +1,6 @@
 """The label store: one append-only file of events a subject, synced at every mark.
 
-A label names a camera, a decode index, its pts and a perceptual hash, so that it can never point
-at another frame unnoticed. Nothing is ever rewritten: undo is a record of its own. Above all stands
-an adjudication, then what people say, then a rule, then a suggestion accepted without a person.
+Nothing is ever rewritten: undo is a record of its own.
 """
 
 from __future__ import annotations
@@ -11,221 +9,23 @@ import fcntl
 import hashlib
 import json
 import os
-import time
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
-from typing import get_type_hints
 
-from express50 import __version__
+from annotations.labels import (
+    ACTIONS,
+    AUTOMATIC,
+    EXCLUSION_ACTIONS,
+    KINDS,
+    RULE_PREFIX,
+    Label,
+    check_texts,
+)
 from express50.errors import AnnotationError
-from express50.index import CameraSource, Cue, Index
 from express50.layout import Dataset
 from express50.publish import sync_directory
 from express50.reading import parse_json, read_bytes
-
-AUTOMATIC = "auto"
-RULE_PREFIX = "rule:"
-FLAG_REASONS = ("failed", "occluded", "not performed", "ambiguous")
-EXCLUSION_ACTIONS = ("exclude", "include")  # of a whole subject; read by express50.exclusions
-ACTIONS = ("mark", "flag", "undo", "settle", *EXCLUSION_ACTIONS)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Label:
-    """One event of the store.
-
-    Attributes:
-        subject, expression: what is labelled; no expression where it is about the whole subject.
-        action: ``mark`` a peak, ``flag`` a performance that has none, ``undo`` one's last event,
-            ``settle`` a disagreement (with a frame, or with a reason in place of a flag),
-            ``exclude`` or ``include`` a subject.
-        annotator: who; ``auto`` for accepted suggestions, ``rule:...`` for rules.
-        time: seconds since 1970.
-        tool: version of this toolkit.
-        frame, camera, pts, dhash: the frame's identity (absent for flag and undo).
-        first, last: the plateau that the frame stands for, both inside, where it was given.
-        suggested: the frame that was suggested at that moment.
-        confidence: of the suggestion, 0 to 1.
-        shown: whether the suggestion was visible before the decision.
-        seconds, keys: time and keystrokes that the label took.
-        reason: why it was flagged or excluded.
-    """
-
-    subject: str
-    expression: str
-    action: str
-    annotator: str
-    time: float
-    tool: str = __version__
-    frame: int | None = None
-    camera: str | None = None
-    pts: int | None = None
-    dhash: str | None = None
-    first: int | None = None
-    last: int | None = None
-    suggested: int | None = None
-    confidence: float | None = None
-    shown: bool | None = None
-    seconds: float | None = None
-    keys: int | None = None
-    reason: str | None = None
-
-
-# What a field may be; a whole number does for one with a fraction.
-KINDS = {
-    name: int | float if kind is float else kind | int if kind == float | None else kind
-    for name, kind in get_type_hints(Label).items()
-}
-
-
-def make_mark(
-    index: Index,
-    expression: str,
-    frame: int,
-    camera: str,
-    annotator: str,
-    suggested: int | None = None,
-    confidence: float | None = None,
-    *,
-    first: int | None = None,
-    last: int | None = None,
-    seconds: float | None = None,
-    keys: int | None = None,
-    shown: bool | None = None,
-    action: str = "mark",
-) -> Label:
-    """A mark (or, with that action, a ``settle``) with the frame's full identity.
-
-    Raises:
-        AnnotationError: the expression is not in the cues, the camera not in the capture, a frame
-            outside the expression's cue window, or the frame outside its plateau.
-    """
-    cue = find_cue(index, expression)
-    source = find_camera(index, camera)
-    for number in (frame, first, last):
-        _check_frame(index, cue, source, number)
-    low, high = frame if first is None else first, frame if last is None else last
-    if not low <= frame <= high:
-        raise AnnotationError(
-            f"{index.subject} {expression}: frame {frame} lies outside its plateau {low} to {high}"
-        )
-    return Label(
-        subject=index.subject,
-        expression=expression,
-        action=action,
-        annotator=annotator,
-        time=time.time(),
-        frame=frame,
-        camera=camera,
-        pts=source.pts[frame],
-        dhash=source.dhash[frame],
-        first=first,
-        last=last,
-        suggested=suggested,
-        confidence=confidence,
-        shown=shown,
-        seconds=seconds,
-        keys=keys,
-    )
-
-
-def make_flag(
-    index: Index,
-    expression: str,
-    reason: str,
-    annotator: str,
-    *,
-    seconds: float | None = None,
-    keys: int | None = None,
-    action: str = "flag",
-) -> Label:
-    """A flag: the expression has no peak, for a reason such as those of ``FLAG_REASONS``.
-
-    Raises:
-        AnnotationError: the expression is not in the cues, or there is no reason.
-    """
-    if not reason.strip():
-        raise AnnotationError(
-            f"{index.subject} {expression}: a flag needs a reason: {', '.join(FLAG_REASONS)}, ..."
-        )
-    find_cue(index, expression)
-    return Label(
-        subject=index.subject,
-        expression=expression,
-        action=action,
-        annotator=annotator,
-        time=time.time(),
-        reason=reason.strip(),
-        seconds=seconds,
-        keys=keys,
-    )
-
-
-def make_undo(index: Index, expression: str, annotator: str) -> Label:
-    """An undo of the annotator's last event on an expression.
-
-    Raises:
-        AnnotationError: the expression is not in the cues.
-    """
-    find_cue(index, expression)
-    return Label(
-        subject=index.subject,
-        expression=expression,
-        action="undo",
-        annotator=annotator,
-        time=time.time(),
-    )
-
-
-def find_cue(index: Index, expression: str) -> Cue:
-    """The cue window of an expression.
-
-    Raises:
-        AnnotationError: it is not in the cues.
-    """
-    cue = next((c for c in index.cues if c.expression_id == expression), None)
-    if cue is None:
-        known = ", ".join(c.expression_id for c in index.cues)
-        raise AnnotationError(
-            f"{index.subject}: no expression {expression!r} in cues.csv ({known})"
-        )
-    return cue
-
-
-def find_camera(index: Index, camera: str) -> CameraSource:
-    """The footage of a camera.
-
-    Raises:
-        AnnotationError: the capture has no such camera.
-    """
-    if camera not in index.cameras:
-        known = ", ".join(index.cameras)
-        raise AnnotationError(f"{index.subject}: no camera {camera!r}; expected one of {known}")
-    return index.cameras[camera]
-
-
-def _check_frame(index: Index, cue: Cue, source: CameraSource, frame: int | None) -> None:
-    last = min(cue.end_frame, source.frames - 1)
-    if frame is not None and not cue.start_frame <= frame <= last:
-        raise AnnotationError(
-            f"{index.subject} {cue.expression_id}: frame {frame} lies outside the cue window"
-            f" {cue.start_frame} to {last}"
-        )
-
-
-def check_texts(label: Label) -> None:
-    """Refuse what would break tables, or colour terminals.
-
-    Raises:
-        AnnotationError: the annotator's name or the reason is not one line of text.
-    """
-    for name in ("annotator", "reason"):
-        if not (getattr(label, name) or "").isprintable():
-            raise AnnotationError(
-                f"{label.subject} {label.expression}: {name} {getattr(label, name)!r} has line"
-                " breaks or control characters; expected one line of text"
-            )
 
 
 def append_label(dataset: Dataset, label: Label) -> None:

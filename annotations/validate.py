@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 
+from annotations.labels import Label, find_cue
 from annotations.review import disagreements
-from annotations.store import Label, current_labels, find_cue, read_labels, unreadable_lines
+from annotations.store import current_labels, read_labels, unreadable_lines
 from express50.errors import AnnotationError
 from express50.exclusions import included_subjects
 from express50.index import Index, read_index

@@ -24,8 +24,9 @@ import cv2
 import numpy as np
 
 from annotations import align, observe
+from annotations.labels import make_mark
 from annotations.reference import reference_subject
-from annotations.store import append_label, make_mark
+from annotations.store import append_label
 from annotations.suggestions import read_suggestions
 from annotations.ui.replay import measure_steps, replay
 from annotations.watch import STABLE, similarity_2d

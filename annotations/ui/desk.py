@@ -8,7 +8,7 @@ from dataclasses import replace
 from textual import work
 from textual.binding import Binding
 
-from annotations.store import Label
+from annotations.labels import Label
 from annotations.ui import panels, theme
 from annotations.ui import view as moves
 from annotations.ui.board import Board

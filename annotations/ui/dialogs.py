@@ -10,7 +10,7 @@ from textual.containers import Vertical, VerticalScroll
 from textual.screen import ModalScreen
 from textual.widgets import Input, Static
 
-from annotations.store import FLAG_REASONS
+from annotations.labels import FLAG_REASONS
 from annotations.ui import theme
 from annotations.ui.keymap import GROUPS
 

@@ -7,7 +7,7 @@ from functools import lru_cache
 from rich.cells import cell_len
 from rich.text import Text
 
-from annotations.store import Label
+from annotations.labels import Label
 from annotations.ui import theme
 from annotations.ui.keymap import HINTS
 from annotations.ui.picture import Look

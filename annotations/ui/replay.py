@@ -15,7 +15,8 @@ from typing import Any
 import numpy as np
 from textual.pilot import Pilot
 
-from annotations.store import Label, labels_of, read_labels
+from annotations.labels import Label
+from annotations.store import labels_of, read_labels
 from annotations.ui import view as moves
 from annotations.ui.app import AnnotateApp
 from annotations.ui.faces import FaceFinder

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from annotations.labels import Label
 from annotations.reference import CanonicalFrame, canonical, reference_subject
-from annotations.store import Label, current_labels, labels_of, read_labels
+from annotations.store import current_labels, labels_of, read_labels
 from annotations.suggestions import Suggested, read_suggestions
 from annotations.worklist import Task
 from express50.errors import Express50Error

@@ -10,18 +10,8 @@ import time
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
 
-from annotations.store import (
-    AUTOMATIC,
-    RULE_PREFIX,
-    Label,
-    append_label,
-    is_person,
-    labels_of,
-    make_flag,
-    make_mark,
-    make_undo,
-    read_labels,
-)
+from annotations.labels import AUTOMATIC, RULE_PREFIX, Label, make_flag, make_mark, make_undo
+from annotations.store import append_label, is_person, labels_of, read_labels
 from annotations.ui.scene import Scene
 from annotations.ui.view import View, plateau_problem
 from annotations.worklist import Task, worklist

@@ -13,7 +13,7 @@ from textual.message import Message
 from textual.strip import Strip
 from textual.widget import Widget
 
-from annotations.store import Label
+from annotations.labels import Label
 from annotations.ui import theme
 from annotations.ui.view import View
 

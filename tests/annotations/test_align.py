@@ -6,15 +6,9 @@ import numpy as np
 import pytest
 
 from annotations import align, observe
+from annotations.labels import AUTOMATIC, make_flag, make_mark
 from annotations.reference import choose_reference
-from annotations.store import (
-    AUTOMATIC,
-    append_label,
-    current_labels,
-    make_flag,
-    make_mark,
-    read_labels,
-)
+from annotations.store import append_label, current_labels, read_labels
 from annotations.suggestions import read_suggestions
 from annotations.watch import FACE
 from express50.cli import main

@@ -10,7 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from annotations.store import append_label, current_labels, labels_of, make_mark, read_labels
+from annotations.labels import make_mark
+from annotations.store import append_label, current_labels, labels_of, read_labels
 from express50.index import read_index
 
 REPOSITORY = Path(__file__).resolve().parents[2]

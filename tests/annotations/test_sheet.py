@@ -8,9 +8,10 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
+from annotations.labels import AUTOMATIC, make_flag, make_mark
 from annotations.sheet import make_sheet
 from annotations.sheet_page import STRIP_WIDTH, render_sheet, take_pictures
-from annotations.store import AUTOMATIC, append_label, make_flag, make_mark
+from annotations.store import append_label
 from annotations.ui.frames import crop_to
 from express50.cli import main
 from express50.errors import AnnotationError

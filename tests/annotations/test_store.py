@@ -6,18 +6,8 @@ import time
 
 import pytest
 
-from annotations.store import (
-    AUTOMATIC,
-    Label,
-    append_label,
-    current_labels,
-    human_digest,
-    labels_of,
-    make_flag,
-    make_mark,
-    make_undo,
-    read_labels,
-)
+from annotations.labels import AUTOMATIC, Label, make_flag, make_mark, make_undo
+from annotations.store import append_label, current_labels, human_digest, labels_of, read_labels
 from express50.errors import AnnotationError
 from express50.index import CameraSource, Cue, Index
 from express50.layout import Dataset

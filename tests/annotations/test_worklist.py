@@ -2,8 +2,9 @@
 
 import pytest
 
+from annotations.labels import AUTOMATIC, Label, make_flag, make_mark
 from annotations.reference import canonical, choose_reference, reference_subject
-from annotations.store import AUTOMATIC, Label, append_label, make_flag, make_mark
+from annotations.store import append_label
 from annotations.suggestions import read_suggestions
 from annotations.worklist import worklist
 from express50.errors import AnnotationError, FormatError

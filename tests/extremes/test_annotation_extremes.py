@@ -11,10 +11,11 @@ from hypothesis import strategies as st
 
 from annotations.agreement import Clip, agreement, by_expression, by_pair, clip_times, marked_clips
 from annotations.coverage import coverage
+from annotations.labels import make_mark
 from annotations.review import disagreements
 from annotations.sheet import make_sheet
 from annotations.sheet_page import render_sheet
-from annotations.store import append_label, make_mark, read_labels
+from annotations.store import append_label, read_labels
 from annotations.suggestions import read_suggestions
 from annotations.ui import view as moves
 from annotations.ui.app import AnnotateApp

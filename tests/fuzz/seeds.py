@@ -13,7 +13,8 @@ import numpy as np
 import torch
 
 from annotations.exchange import export_labels, read_table
-from annotations.store import append_label, make_mark, read_labels
+from annotations.labels import make_mark
+from annotations.store import append_label, read_labels
 from annotations.suggestions import read_suggestions
 from express50.cameras import read_cameras
 from express50.capture import read_cues

@@ -7,7 +7,8 @@ import shutil
 import pytest
 from rich.text import Text
 
-from annotations.store import append_label, current_labels, make_mark, read_labels
+from annotations.labels import make_mark
+from annotations.store import append_label, current_labels, read_labels
 from annotations.ui import player
 from annotations.ui.keymap import GROUPS
 from annotations.ui.panels import fit, hint_line

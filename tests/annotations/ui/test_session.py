@@ -8,7 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from annotations.store import append_label, labels_of, make_mark, read_labels
+from annotations.labels import make_mark
+from annotations.store import append_label, labels_of, read_labels
 from annotations.ui.scene import load_scene
 from annotations.ui.session import IDLE_SECONDS, open_session
 from annotations.ui.view import open_view, set_plateau_first, step
