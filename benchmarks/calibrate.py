@@ -28,7 +28,8 @@ import cv2
 import numpy as np
 
 from benchmarks.calibrate_footage import refine_figures, see_capture, sfm_figures
-from express50.cameras import Camera, project, read_cameras, transform_camera, triangulate
+from express50.calibration_file import read_cameras
+from express50.cameras import Camera, project, transform_camera, triangulate
 from express50.config import resolve_config
 from express50.frames import FrameReader
 from express50.index import Index, read_index

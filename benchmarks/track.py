@@ -25,7 +25,7 @@ import numpy as np
 
 from benchmarks.track_truth import Errors, clip_errors, compare, mean, pooled, summary
 from benchmarks.track_views import held_out_views
-from express50.cameras import read_cameras, write_cameras
+from express50.calibration_file import read_cameras, write_cameras
 from express50.config import build_config
 from express50.frames import read_cameras_of, read_peaks
 from express50.head.load import load_head

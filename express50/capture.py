@@ -12,7 +12,8 @@ import re
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from express50.cameras import Camera, read_cameras
+from express50.calibration_file import read_cameras
+from express50.cameras import Camera
 from express50.errors import CalibrationError, CaptureError
 from express50.index import Cue
 from express50.reading import TOML_LIMIT, read_text, read_toml

@@ -10,7 +10,8 @@ import cv2
 import numpy as np
 
 from express50.adapters import undistort_image
-from express50.cameras import Camera, pinhole, read_cameras
+from express50.calibration_file import read_cameras
+from express50.cameras import Camera, pinhole
 from express50.capture import RawCamera
 from express50.colour_polynomial import correct_srgb8
 from express50.errors import CaptureError, FormatError, StageError

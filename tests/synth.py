@@ -8,7 +8,8 @@ from pathlib import Path
 import av
 import numpy as np
 
-from express50.cameras import Camera, rays, write_cameras
+from express50.calibration_file import write_cameras
+from express50.cameras import Camera, rays
 from express50.images import write_image
 from express50.transforms import look_at
 

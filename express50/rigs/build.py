@@ -9,7 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from express50.cameras import Camera, camera_rows, parse_cameras, resized
+from express50.calibration_file import camera_rows, parse_cameras
+from express50.cameras import Camera, resized
 from express50.errors import CalibrationError
 from express50.reading import read_bytes, read_json_table
 

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from express50.cameras import Camera, camera_rows, read_cameras, write_cameras
+from express50.calibration_file import camera_rows, read_cameras, write_cameras
+from express50.cameras import Camera
 from express50.console import FAILED, OK, say, say_json
 from express50.errors import CalibrationError, ConfigError
 from express50.rigs.read import FORMATS, guess_format, read_rig

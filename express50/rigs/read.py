@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from express50.cameras import Camera, read_cameras
+from express50.calibration_file import read_cameras
+from express50.cameras import Camera
 from express50.errors import CalibrationError
 from express50.rigs.build import at_size, holds, in_metres
 from express50.rigs.colmap import is_colmap, read_colmap

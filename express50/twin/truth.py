@@ -15,7 +15,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from express50.cameras import Camera, rays, read_cameras, write_cameras
+from express50.calibration_file import read_cameras, write_cameras
+from express50.cameras import Camera, rays
 from express50.errors import CaptureError
 from express50.head.load import load_head
 from express50.head.model import HeadModel

@@ -9,7 +9,8 @@ import cv2
 import numpy as np
 
 from express50.adapters import undistorted_mask
-from express50.cameras import Camera, read_cameras
+from express50.calibration_file import read_cameras
+from express50.cameras import Camera
 from express50.errors import StageError
 from express50.frames import read_cameras_of, read_frame, read_peaks
 from express50.images import contact_sheet, read_image, write_image

@@ -7,7 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from express50.cameras import Camera, read_cameras, resized, write_cameras
+from express50.calibration_file import read_cameras, write_cameras
+from express50.cameras import Camera, resized
 from express50.errors import CalibrationError, CaptureError
 from express50.index import Index, calibration_file, index_path, read_index
 from express50.landmarks.network import WEIGHTS

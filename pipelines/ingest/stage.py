@@ -16,7 +16,8 @@ from pathlib import Path
 
 import numpy as np
 
-from express50.cameras import Camera, write_cameras
+from express50.calibration_file import write_cameras
+from express50.cameras import Camera
 from express50.capture import RawCapture, check_calibrated_sizes
 from express50.captures.read import OURS, read_any, subject_of, watched
 from express50.demographics import public_meta

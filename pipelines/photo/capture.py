@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from express50.cameras import camera_rows
+from express50.calibration_file import camera_rows
 from express50.capture import IMAGE_SUFFIXES
 from express50.digests import file_sha256
 from express50.errors import CaptureError

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from express50 import adapters, cameras, transforms
+from express50 import adapters, calibration_file, cameras, transforms
 from express50.cameras import Camera
 from express50.errors import CalibrationError
 
@@ -120,8 +120,8 @@ def test_undistort_image_moves_features_to_the_pinhole_projection():
 
 def test_calibration_file_round_trip(tmp_path):
     path = tmp_path / "calibration.json"
-    cameras.write_cameras(path, {"a": OPENCV})
-    back = cameras.read_cameras(path)["a"]
+    calibration_file.write_cameras(path, {"a": OPENCV})
+    back = calibration_file.read_cameras(path)["a"]
     assert back.params == OPENCV.params
     np.testing.assert_array_equal(back.cam_from_world, OPENCV.cam_from_world)
 
@@ -142,11 +142,11 @@ def test_a_bad_camera_is_named(tmp_path, change, message):
     import json
 
     path = tmp_path / "calibration.json"
-    cameras.write_cameras(path, {"cam07": OPENCV})
+    calibration_file.write_cameras(path, {"cam07": OPENCV})
     table = json.loads(path.read_text())
     table["cam07"] |= change
     path.write_text(json.dumps(table))
     with pytest.raises(CalibrationError, match=message) as caught:
-        cameras.read_cameras(path)
+        calibration_file.read_cameras(path)
     assert "cam07" in str(caught.value)
     assert "\n" not in str(caught.value)

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from express50.cameras import read_cameras, write_cameras
+from express50.calibration_file import read_cameras, write_cameras
 from express50.cli import main
 from express50.export.pictures import centred
 from express50.frames import read_cameras_of, read_frame

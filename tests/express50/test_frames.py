@@ -8,7 +8,7 @@ import pytest
 
 from express50 import frames
 from express50.adapters import undistort_image
-from express50.cameras import write_cameras
+from express50.calibration_file import write_cameras
 from express50.config import resolve_config
 from express50.errors import CaptureError, FormatError, StageError
 from express50.frames import (

@@ -20,7 +20,7 @@ import numpy as np
 import torch
 
 from annotations.exchange import read_table
-from express50.cameras import read_cameras
+from express50.calibration_file import read_cameras
 from express50.capture import read_capture_toml
 from express50.captures.read import read_any
 from express50.errors import FormatError, HeadModelError

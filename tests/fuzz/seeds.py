@@ -16,7 +16,7 @@ from annotations.exchange import export_labels, read_table
 from annotations.labels import make_mark
 from annotations.store import append_label, read_labels
 from annotations.suggestions import read_suggestions
-from express50.cameras import read_cameras
+from express50.calibration_file import read_cameras
 from express50.capture import read_cues
 from express50.captures.read import read_any
 from express50.config import resolve_config

@@ -8,7 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from express50.cameras import Camera, write_cameras
+from express50.calibration_file import write_cameras
+from express50.cameras import Camera
 from express50.head.load import load_head
 from express50.images import write_image
 from express50.index import read_index

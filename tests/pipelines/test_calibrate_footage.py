@@ -9,7 +9,7 @@ import numpy as np
 import OpenImageIO as oiio
 import pytest
 
-from express50.cameras import camera_rows
+from express50.calibration_file import camera_rows
 from express50.cli import main
 from express50.errors import CalibrationError, ConfigError
 from express50.images import write_image

@@ -12,7 +12,7 @@ import numpy as np
 import OpenImageIO as oiio
 import pytest
 
-from express50.cameras import read_cameras
+from express50.calibration_file import read_cameras
 from express50.cli import main
 from express50.errors import CaptureError
 from express50.frames import read_srgb8

@@ -5,7 +5,8 @@ import json
 import numpy as np
 import pytest
 
-from express50.cameras import project, read_cameras
+from express50.calibration_file import read_cameras
+from express50.cameras import project
 from express50.captures.person import read_people
 from express50.captures.read import detect, read_any, subject_of
 from express50.captures.timeline import common_timeline

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from scipy.ndimage import map_coordinates
 
-from express50.cameras import Camera, project, rays, write_cameras
+from express50.calibration_file import write_cameras
+from express50.cameras import Camera, project, rays
 from express50.cli import main
 from express50.errors import CalibrationError, CaptureError
 from express50.images import write_image

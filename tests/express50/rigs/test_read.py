@@ -9,7 +9,8 @@ import pycolmap
 import pytest
 
 from express50.adapters import K_to_opencv, opengl_from_cam_from_world
-from express50.cameras import Camera, project, resized, write_cameras
+from express50.calibration_file import write_cameras
+from express50.cameras import Camera, project, resized
 from express50.errors import CalibrationError
 from express50.rigs.build import names_from_files
 from express50.rigs.read import guess_format, read_rig
