@@ -14,6 +14,7 @@ from express50.errors import ConfigError, StageError
 from express50.images import read_alpha, write_image
 from express50.landmarks.network import load_network
 from express50.layout import Dataset
+from express50.shards import ShardReader
 from pipelines.alpha.config import AlphaConfig
 from pipelines.alpha.grabcut import person_alpha
 from pipelines.photo.focal import single_camera
@@ -87,7 +88,7 @@ def test_what_shows_no_face_is_refused() -> None:
         AlphaConfig(method="grabcut", weights="net.pt")
 
 
-def test_a_photograph_is_matted_without_plate_or_weights(tmp_path: Path) -> None:
+def test_a_photograph_becomes_a_sample_of_shards_without_plate_or_weights(tmp_path: Path) -> None:
     write_image(tmp_path / "eva.png", data.astronaut())
     assert main(["photo", str(tmp_path / "eva.png"), str(tmp_path / "out"), "--matte",
                  "--preset", "draft"]) == 0  # fmt: skip
@@ -96,3 +97,12 @@ def test_a_photograph_is_matted_without_plate_or_weights(tmp_path: Path) -> None
     assert figures["method"] == "grabcut"
     matte = read_alpha(dataset.matte_file("eva", "photo", "photo"))
     assert all(matte[y, x] > 240 for x, y in HEAD) and all(matte[y, x] < 12 for x, y in BEHIND)
+
+    for stage in ("depth", "regions", "pack"):
+        assert main([stage, str(dataset.root), "--preset", "draft"]) == 0
+    reader = ShardReader(dataset.stage_dir("pack") / "shards")
+    assert reader.keys == ["eva_photo_photo"]
+    sample = reader.sample(0)
+    known, head = sample["valid"], sample["alpha"] > 0.5
+    assert 0.3 < (known & head).sum() / head.sum() < 1
+    assert 0.5 < np.median(sample["depth"][known]) < 3.0
