@@ -41,6 +41,10 @@ class StageError(Express50Error):
     """A stage cannot process one of its items."""
 
 
+class NoFaceError(StageError):
+    """A picture shows no face where one is needed."""
+
+
 class AnnotationError(Express50Error):
     """A label is invalid or contradicts the footage."""
 

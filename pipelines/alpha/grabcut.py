@@ -15,7 +15,7 @@ import numpy as np
 from scipy.ndimage import binary_fill_holes
 
 from express50.cameras import Camera
-from express50.errors import StageError
+from express50.errors import NoFaceError
 from express50.landmarks.detector import detect
 from express50.landmarks.network import LandmarkNet
 from pipelines.alpha.learned import refined
@@ -40,12 +40,12 @@ def person_alpha(net: LandmarkNet, camera: Camera, frame: np.ndarray) -> np.ndar
         frame: without lens distortion.
 
     Raises:
-        StageError: no face is found.
+        NoFaceError: no face is found.
     """
     face = detect(net, frame, smallest=SEARCH)
     pose, error = pose_of_face(face.points, face.sigma, camera, mean_landmarks())
     if face.score < FACE_SCORE or not np.isfinite(error):
-        raise StageError(
+        raise NoFaceError(
             f"no face found (score {face.score:.2f}, expected {FACE_SCORE} or more), and grabcut"
             " starts from one; set alpha.method to salient and alpha.weights, or give a plate"
         )

@@ -11,7 +11,7 @@ import numpy as np
 from express50.adapters import undistorted_mask
 from express50.calibration_file import read_cameras
 from express50.cameras import Camera
-from express50.errors import StageError
+from express50.errors import NoFaceError, StageError
 from express50.frames import read_cameras_of, read_frame, read_peaks
 from express50.images import contact_sheet, read_image, write_image
 from express50.index import index_path, read_index
@@ -90,12 +90,19 @@ def run(dataset: Dataset, item: str, config: AlphaConfig, out: Path) -> dict:
         alpha_of, facts = _method(plate, frames, valid, config)
     coverage: dict[str, float] = {}
     border: dict[str, dict[str, float]] = {}
+    dropped: dict[str, str] = {}
     for expression, frame in peaks.items():
-        image = read(frame)
-        alpha = np.where(valid, alpha_of(image), np.float32(0))
+        try:
+            alpha = np.where(valid, alpha_of(read(frame)), np.float32(0))
+        except NoFaceError as error:
+            dropped[expression] = str(error)
+            continue
         write_image(out / f"{expression}.png", np.rint(alpha * 255).astype(np.uint8))
         coverage[expression] = round(float(alpha.mean()), 6)
         border[expression] = border_contact(alpha)
+    if not coverage:
+        raise StageError(f"{item}: {next(iter(dropped.values()))}")
+    peaks = {expression: frame for expression, frame in peaks.items() if expression in coverage}
     odd = warnings(peaks, coverage, border) + list(plate.warnings if plate else ())
     named = {warning["what"] for warning in odd}
     first = sorted(peaks, key=lambda expression: expression not in named)[:QC_ROWS]
@@ -106,7 +113,7 @@ def run(dataset: Dataset, item: str, config: AlphaConfig, out: Path) -> dict:
         "coverage": coverage,
         "border_contact": border,
         "warnings": odd,
-        "dropped": [],
+        "dropped": [{"what": expression, "why": why} for expression, why in dropped.items()],
     }
 
 

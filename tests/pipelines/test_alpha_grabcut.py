@@ -12,12 +12,20 @@ import pytest
 from express50.cli import main
 from express50.errors import ConfigError, StageError
 from express50.images import read_alpha, write_image
+from express50.index import read_index
 from express50.landmarks.network import load_network
 from express50.layout import Dataset
+from express50.runner import run_stage
 from express50.shards import ShardReader
+from pipelines import calibrate, ingest
+from pipelines.alpha import STAGE as ALPHA
 from pipelines.alpha.config import AlphaConfig
 from pipelines.alpha.grabcut import person_alpha
+from pipelines.photo.capture import make_photo_capture
 from pipelines.photo.focal import single_camera
+from pipelines.photo.picture import open_picture
+from pipelines.track.config import TrackConfig
+from tests.synth import write_video
 
 data = pytest.importorskip("skimage.data")
 HEAD = [(225, 30), (160, 80), (290, 90), (220, 100), (225, 165), (225, 205)]  # hair, face, collar
@@ -106,3 +114,30 @@ def test_a_photograph_becomes_a_sample_of_shards_without_plate_or_weights(tmp_pa
     known, head = sample["valid"], sample["alpha"] > 0.5
     assert 0.3 < (known & head).sum() / head.sum() < 1
     assert 0.5 < np.median(sample["depth"][known]) < 3.0
+
+
+def test_a_frame_without_a_face_costs_itself_alone(tmp_path: Path) -> None:
+    """Of a video whose second half shows a wall, the first half is matted."""
+    face, wall = data.astronaut()[:256, 100:356], np.repeat(data.brick()[:256, :256, None], 3, 2)
+    write_video(tmp_path / "eva.mp4", [np.ascontiguousarray(i) for i in [face] * 4 + [wall] * 4])
+    config = TrackConfig(iterations=2)
+    dataset = Dataset(tmp_path / "out")
+    folder = dataset.root / "photos" / "eva"
+    make_photo_capture(open_picture(tmp_path / "eva.mp4"), folder, "eva", config, windows=2)
+    ingest.register(dataset, [folder])
+    for stage in (ingest.STAGE, calibrate.STAGE):
+        assert run_stage(stage, dataset, stage.config(), workers=0, progress=False).ok
+    seen = read_index(dataset, "eva").cameras["photo"]
+    peaks = {
+        name: {"frame": frame, "camera": "photo", "pts": seen.pts[frame],
+               "dhash": seen.dhash[frame], "confidence": 1.0, "annotator": "auto"}
+        for name, frame in (("clip_00", 1), ("clip_01", 6))
+    }  # fmt: skip
+    dataset.item_dir("align", "eva").mkdir(parents=True)
+    (dataset.item_dir("align", "eva") / "peaks.json").write_text(json.dumps(peaks))
+    run = run_stage(ALPHA, dataset, AlphaConfig(method="grabcut"), workers=0, progress=False)
+    assert run.ok
+    (dropped,) = run.outcomes[0].dropped
+    assert dropped["what"] == "clip_01" and "no face found" in dropped["why"]
+    made = dataset.item_dir("alpha", "eva/photo")
+    assert (made / "clip_00.png").is_file() and not (made / "clip_01.png").exists()
