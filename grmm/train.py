@@ -7,6 +7,7 @@ gradients. On a CPU a resumed run continues bit for bit, unless a time budget st
 
 from __future__ import annotations
 
+import gc
 import os
 import time
 from pathlib import Path
@@ -105,11 +106,11 @@ def train(
                 saved = run.seconds
             if interrupt.requested:
                 raise KeyboardInterrupt
+    del parallel
+    leave_processes()
     metrics = report(run, config, out) if rank == 0 else {}
     if rank == 0 and float(str(metrics["psnr_train_db"])) < GREY_DB:
         log("pictures of training are worse than grey ones: it diverged; lower train.lr")
-    if world > 1:
-        distributed.destroy_process_group()
     return metrics
 
 
@@ -119,6 +120,17 @@ def join_processes() -> tuple[int, int, torch.device]:
     if world > 1:
         distributed.init_process_group("nccl" if device.type == "cuda" else "gloo")
     return int(os.environ.get("RANK", "0")), world, device
+
+
+def leave_processes() -> None:
+    """End the group that `join_processes` joined, if any, and its threads with it.
+
+    Gloo's threads take Python's lock to free tensors; one that does so while the interpreter ends
+    aborts the process. They end with the group's last reference, which cycles may hold.
+    """
+    if distributed.is_initialized():
+        distributed.destroy_process_group()
+        gc.collect()
 
 
 def agree(run: Run, interrupt: Interrupt, device: torch.device) -> None:
