@@ -7,7 +7,6 @@ gradients. On a CPU a resumed run continues bit for bit, unless a time budget st
 
 from __future__ import annotations
 
-import gc
 import os
 import time
 from pathlib import Path
@@ -30,6 +29,7 @@ from grmm.warm_start import warm_start
 
 PATIENT = 10_000  # iterations that a CPU does in a day at most
 GREY_DB = 10.0  # what a grey picture scores
+GLOO_SECONDS = 0.5  # a thread of Gloo frees tensors in a millisecond where nothing holds it up
 
 
 def train(
@@ -106,7 +106,6 @@ def train(
                 saved = run.seconds
             if interrupt.requested:
                 raise KeyboardInterrupt
-    del parallel
     leave_processes()
     metrics = report(run, config, out) if rank == 0 else {}
     if rank == 0 and float(str(metrics["psnr_train_db"])) < GREY_DB:
@@ -123,14 +122,14 @@ def join_processes() -> tuple[int, int, torch.device]:
 
 
 def leave_processes() -> None:
-    """End the group that `join_processes` joined, if any, and its threads with it.
+    """End the group that `join_processes` joined, if any.
 
-    Gloo's threads take Python's lock to free tensors; one that does so while the interpreter ends
-    aborts the process. They end with the group's last reference, which cycles may hold.
+    Gloo's threads outlive it, and take Python's lock to free what the last sum was of; one that
+    does so while the interpreter ends aborts the process. So they are given time to.
     """
     if distributed.is_initialized():
         distributed.destroy_process_group()
-        gc.collect()
+        time.sleep(GLOO_SECONDS)
 
 
 def agree(run: Run, interrupt: Interrupt, device: torch.device) -> None:
