@@ -133,6 +133,9 @@ def read_track(path: Path) -> Track:
     return Track(schema=schema, head=head, expressions=tuple(names.tolist()), **numbers)
 
 
+OF_FRAMES = ("frames", "expression", "neck", "jaw", "eyes", "R", "t")  # a row a frame, with cues
+
+
 def read_sequence(path: Path) -> Sequence:
     """Read and check the frames of a subject's clips.
 

@@ -18,11 +18,10 @@ from express50.head.model import HeadModel, pose
 from express50.images import read_image
 from express50.layout import Dataset
 from express50.publish import replace_directory, sync_tree
-from express50.tracks import Track, read_sequence, read_track, track_file
+from express50.tracks import OF_FRAMES, Track, read_sequence, read_track, track_file
 
 META = "export.json"
 SCHEMA = "express50.export/1"
-OF_FRAMES = ("frames", "expression", "neck", "jaw", "eyes", "R", "t")
 SHARED = ("schema", "head", "expressions", "shape", "offsets")
 
 

@@ -94,7 +94,7 @@ def _render(args: argparse.Namespace) -> int:
 
 
 def _clips(path: Path, cue: str | None) -> Sequence:
-    from express50.tracks import read_sequence
+    from express50.tracks import OF_FRAMES, read_sequence
 
     clips = read_sequence(path)
     if cue is None:
@@ -103,8 +103,7 @@ def _clips(path: Path, cue: str | None) -> Sequence:
     if not rows:
         known = ", ".join(dict.fromkeys(clips.cues))
         raise ConfigError(f"--drive-cue {cue}: {path} has no such clip; expected one of {known}")
-    names = ("frames", "expression", "neck", "jaw", "eyes", "R", "t")
-    parts = {name: getattr(clips, name)[rows] for name in names}
+    parts = {name: getattr(clips, name)[rows] for name in OF_FRAMES}
     return replace(clips, cues=(cue,) * len(rows), **parts)
 
 

@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 from scipy.ndimage import binary_fill_holes
 
+from express50.adapters import corner_to_cell
 from express50.cameras import Camera
 from express50.errors import NoFaceError
 from express50.landmarks.detector import detect
@@ -120,10 +121,11 @@ def _guess(shape: tuple[int, int], face: np.ndarray, pose: np.ndarray, K: np.nda
 
 
 def _fill(mask: np.ndarray, pixels: np.ndarray, value: int) -> None:
-    """Set the convex hull of pixels (N, 2)."""
+    """Set the convex hull of corner-origin pixels (N, 2)."""
     if len(pixels) > 2:
         far = 4 * max(mask.shape)  # OpenCV's polygons are of 16-bit integers
-        hull = cv2.convexHull(np.clip(pixels, -far, far).astype(np.float32))
+        cells = corner_to_cell(np.clip(pixels, -far, far))
+        hull = cv2.convexHull(cells.astype(np.float32))
         cv2.fillConvexPoly(mask, hull.round().astype(np.int32), value)
 
 

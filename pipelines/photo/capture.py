@@ -71,7 +71,7 @@ def make_photo_capture(
             or the focal length is that of no lens.
     """
     torch.set_num_threads(1)
-    _check_same(picture.path, folder, subject)
+    _check_same(picture.path, folder)
     images, frames = spread_frames(picture, PROBES)
     height, width = images[0].shape[:2]
     _check_focal(focal_px, max(width, height))
@@ -90,7 +90,7 @@ def make_photo_capture(
     return focal
 
 
-def _check_same(path: Path, folder: Path, subject: str) -> None:
+def _check_same(path: Path, folder: Path) -> None:
     """Refuse to write over what was made of another picture."""
     try:
         known = tomllib.loads((folder / "capture.toml").read_text()).get("picture_sha256")
