@@ -15,9 +15,9 @@ import numpy as np
 
 from annotations.labels import Label
 from annotations.store import labels_by_person, read_labels
-from express50.exclusions import included_subjects
-from express50.index import read_index
-from express50.layout import Dataset
+from express50.capture.index import read_index
+from express50.contract.exclusions import included_subjects
+from express50.contract.layout import Dataset
 
 WITHIN = (1, 2, 4)  # frames
 SLIP_FRAMES = 12  # further apart, two people did not mean the same moment

@@ -20,13 +20,13 @@ from annotations.observe import observations_path, read_observations
 from annotations.reference import reference_subject
 from annotations.store import append_label, current_labels, human_digest, read_labels
 from annotations.suggest import Suggestion
+from express50.capture.expressions import load_script
+from express50.capture.frames import read_proxy
+from express50.capture.index import Index, read_index
+from express50.contract.layout import Dataset
+from express50.contract.stage import Stage
 from express50.errors import StageError
-from express50.expressions import load_script
-from express50.frames import read_proxy
-from express50.images import contact_sheet, write_image
-from express50.index import Index, read_index
-from express50.layout import Dataset
-from express50.stage import Stage
+from express50.files.images import contact_sheet, write_image
 
 
 @dataclass(frozen=True, kw_only=True)

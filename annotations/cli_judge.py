@@ -13,8 +13,8 @@ from annotations.options import add_annotator, add_selection, add_verb, chosen_s
 from annotations.review import describe, disagreements, settlement
 from annotations.store import append_label
 from annotations.validate import problems
+from express50.capture.index import read_index
 from express50.console import FAILED, OK, format_table, say, say_json
-from express50.index import read_index
 
 _FIGURES = ("clips", "within_1", "within_2", "within_4", "median_frames", "slip_rate", "alpha")
 

@@ -12,9 +12,9 @@ from annotations.review import describe
 from annotations.store import append_label, current_labels, last_event, read_labels
 from annotations.suggestions import read_suggestions
 from annotations.worklist import ORDERS, worklist
+from express50.capture.index import read_index
 from express50.console import OK, format_table, say, say_json
 from express50.errors import AnnotationError
-from express50.index import read_index
 
 
 def add_verbs(verbs) -> None:  # noqa: ANN001 - argparse's type is private

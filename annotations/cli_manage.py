@@ -13,10 +13,10 @@ from annotations.options import add_annotator, add_selection, add_verb, chosen_s
 from annotations.reference import choose_reference, reference_subject
 from annotations.rules import LAST_FRAME, last_frame_marks
 from annotations.store import append_label, read_labels
+from express50.capture.index import read_index
 from express50.console import OK, say, say_json
+from express50.contract.exclusions import included_subjects
 from express50.errors import AnnotationError
-from express50.exclusions import included_subjects
-from express50.index import read_index
 
 
 def add_verbs(verbs) -> None:  # noqa: ANN001 - argparse's type is private

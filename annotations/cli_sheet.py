@@ -34,7 +34,7 @@ def run_sheet(args: argparse.Namespace) -> int:
     """Write the page."""
     from annotations.sheet_page import render_sheet
     from annotations.ui.faces import FaceFinder
-    from express50.publish import write_bytes
+    from express50.files.atomic import write_bytes
 
     wanted = chosen_subjects(args.dataset, args.subject)
     sheet = make_sheet(args.dataset, wanted, args.expression, args.camera, args.sure)

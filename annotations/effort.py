@@ -8,9 +8,9 @@ from statistics import median
 
 from annotations.labels import AUTOMATIC, Label
 from annotations.store import current_labels, is_person, read_labels
-from express50.exclusions import exclusion_reason
-from express50.index import read_index
-from express50.layout import Dataset
+from express50.capture.index import read_index
+from express50.contract.exclusions import exclusion_reason
+from express50.contract.layout import Dataset
 
 
 def progress(dataset: Dataset, subject: str) -> dict[str, object]:

@@ -12,10 +12,10 @@ from typing import Any, get_type_hints
 
 from annotations.labels import ACTIONS, Label, check_texts, find_cue
 from annotations.store import append_label, read_labels
+from express50.capture.index import read_index
+from express50.contract.layout import Dataset
 from express50.errors import AnnotationError
-from express50.index import read_index
-from express50.layout import Dataset
-from express50.reading import NAME, parse_json, read_text
+from express50.files.text import NAME, parse_json, read_text
 
 FORMATS = (".csv", ".json")
 LARGEST = 2**63

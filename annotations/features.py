@@ -14,7 +14,7 @@ import numpy as np
 
 from annotations.observe import NEUTRAL, Observations
 from annotations.watch import STABLE, face_side, similarity_2d, steady
-from express50.expressions import Expression
+from express50.capture.expressions import Expression
 
 LIDS = np.array([37, 38, 40, 41, 43, 44, 46, 47])
 _GROUPS = {

@@ -12,13 +12,16 @@ from dataclasses import dataclass
 from typing import get_type_hints
 
 from express50 import __version__
+from express50.capture.index import CameraSource, Cue, Index
 from express50.errors import AnnotationError
-from express50.index import CameraSource, Cue, Index
 
 AUTOMATIC = "auto"
 RULE_PREFIX = "rule:"
 FLAG_REASONS = ("failed", "occluded", "not performed", "ambiguous")
-EXCLUSION_ACTIONS = ("exclude", "include")  # of a whole subject; read by express50.exclusions
+EXCLUSION_ACTIONS = (
+    "exclude",
+    "include",
+)  # of a whole subject; see contract.exclusions
 ACTIONS = ("mark", "flag", "undo", "settle", *EXCLUSION_ACTIONS)
 
 

@@ -18,8 +18,8 @@ from annotations.suggest import (
     suggest_rest,
 )
 from annotations.watch import steady
-from express50.expressions import Expression
-from express50.index import Index
+from express50.capture.expressions import Expression
+from express50.capture.index import Index
 
 
 @dataclass(frozen=True)

@@ -15,15 +15,15 @@ from pathlib import Path
 import numpy as np
 
 from annotations.watch import align_faces, find_points
-from express50.arrays import read_arrays
+from express50.capture.frames import read_proxy
+from express50.capture.index import Cue, Index, read_index
+from express50.contract.layout import Dataset
+from express50.contract.stage import Stage
 from express50.errors import FormatError, StageError
-from express50.frames import read_proxy
-from express50.images import contact_sheet, write_image
-from express50.index import Cue, Index, read_index
+from express50.files.arrays import read_arrays
+from express50.files.images import contact_sheet, write_image
 from express50.landmarks.detector import detect
 from express50.landmarks.network import WEIGHTS, LandmarkNet, load_network
-from express50.layout import Dataset
-from express50.stage import Stage
 
 SCHEMA = "express50.observations/1"
 NEUTRAL = "neutral"

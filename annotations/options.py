@@ -8,8 +8,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 from annotations.store import is_person
+from express50.contract.layout import Dataset
 from express50.errors import AnnotationError
-from express50.layout import Dataset
 
 Handler = Callable[[argparse.Namespace], int]
 

@@ -7,11 +7,11 @@ from pathlib import Path
 
 from annotations.store import current_labels, read_labels
 from annotations.suggestions import read_suggestions
+from express50.contract.exclusions import included_subjects
+from express50.contract.layout import Dataset
 from express50.errors import AnnotationError, StageError
-from express50.exclusions import included_subjects
-from express50.layout import Dataset
-from express50.publish import write_json
-from express50.reading import read_json_table
+from express50.files.atomic import write_json
+from express50.files.text import read_json_table
 
 
 @dataclass(frozen=True)

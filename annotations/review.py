@@ -6,10 +6,10 @@ from dataclasses import asdict, dataclass
 
 from annotations.labels import FLAG_REASONS, Label, make_flag, make_mark
 from annotations.store import current_labels, labels_by_person, read_labels
+from express50.capture.index import Index, read_index
+from express50.contract.exclusions import included_subjects
+from express50.contract.layout import Dataset
 from express50.errors import AnnotationError
-from express50.exclusions import included_subjects
-from express50.index import Index, read_index
-from express50.layout import Dataset
 
 FLAG = "flag:"  # before a reason in words, which else might be a name mistyped
 

@@ -13,9 +13,9 @@ from dataclasses import replace
 
 from annotations.labels import RULE_PREFIX, Label, make_mark
 from annotations.store import current_labels, read_labels
+from express50.capture.index import Cue, Index
+from express50.contract.layout import Dataset
 from express50.errors import AnnotationError
-from express50.index import Cue, Index
-from express50.layout import Dataset
 
 LAST_FRAME = RULE_PREFIX + "last-frame"
 RENDERME360_EXPRESSIONS = frozenset(f"e{n:0{width}}" for n in range(12) for width in (1, 2))

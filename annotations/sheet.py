@@ -14,11 +14,11 @@ from annotations.reference import reference_subject
 from annotations.review import disagreements
 from annotations.store import current_labels, is_person, read_labels
 from annotations.suggestions import Suggested, read_suggestions
+from express50.capture.expressions import load_script
+from express50.capture.index import Index, read_index
+from express50.contract.exclusions import exclusion_reason, included_subjects
+from express50.contract.layout import Dataset
 from express50.errors import AnnotationError, FormatError
-from express50.exclusions import exclusion_reason, included_subjects
-from express50.expressions import load_script
-from express50.index import Index, read_index
-from express50.layout import Dataset
 
 STATES = ("person", "rule", "auto", "suggestion", "flagged", "missing")
 SURE = 0.5

@@ -12,11 +12,11 @@ import numpy as np
 from annotations.sheet import Sheet, Tile, tiles_of
 from annotations.ui.faces import FaceFinder, zoom_box
 from annotations.ui.frames import crop_to
+from express50.capture.frames import read_proxy
+from express50.capture.index import read_index
+from express50.contract.layout import Dataset
 from express50.errors import Express50Error
-from express50.frames import read_proxy
-from express50.images import encode_jpeg
-from express50.index import read_index
-from express50.layout import Dataset
+from express50.files.images import encode_jpeg
 
 WIDTH, HEIGHT = 176, 220  # pixels of a tile; shown smaller, so that it can be enlarged
 STRIP_WIDTH, STRIP_HEIGHT = 96, 120

@@ -22,10 +22,10 @@ from annotations.labels import (
     Label,
     check_texts,
 )
+from express50.contract.layout import Dataset
 from express50.errors import AnnotationError
-from express50.layout import Dataset
-from express50.publish import sync_directory
-from express50.reading import parse_json, read_bytes
+from express50.files.atomic import sync_directory
+from express50.files.text import parse_json, read_bytes
 
 
 def append_label(dataset: Dataset, label: Label) -> None:

@@ -6,9 +6,9 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
+from express50.contract.layout import Dataset
 from express50.errors import FormatError
-from express50.layout import Dataset
-from express50.reading import read_json_table
+from express50.files.text import read_json_table
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 from annotations.labels import Label, find_cue
 from annotations.review import disagreements
 from annotations.store import current_labels, read_labels, unreadable_lines
+from express50.capture.index import Index, read_index
+from express50.contract.exclusions import included_subjects
+from express50.contract.layout import Dataset
 from express50.errors import AnnotationError
-from express50.exclusions import included_subjects
-from express50.index import Index, read_index
-from express50.layout import Dataset
 
 
 @dataclass(frozen=True)

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 from annotations.reference import reference_subject
 from annotations.store import labels_of, read_labels
 from annotations.suggestions import Suggested, read_suggestions
+from express50.capture.index import read_index
+from express50.contract.exclusions import included_subjects
+from express50.contract.layout import Dataset
 from express50.errors import AnnotationError
-from express50.exclusions import included_subjects
-from express50.index import read_index
-from express50.layout import Dataset
 
 ORDERS = ("doubt", "expression", "subject")
 

@@ -15,14 +15,14 @@ import numpy as np
 from benchmarks.calibrate import figures as rig_figures
 from benchmarks.depth_score import cast
 from benchmarks.regions_truth import iou_figures, true_head_alpha, true_labels, view_row
-from express50.cameras import Camera, transform_camera
-from express50.depth_files import depth_file, read_depth, read_normals
+from express50.capture.frames import read_cameras_of, read_peaks
+from express50.contract.layout import Dataset
+from express50.contract.segmentation_labels import COLOURS
+from express50.dataset.depth_files import depth_file, read_depth, read_normals
+from express50.dataset.tracks import read_track
 from express50.errors import Express50Error
-from express50.frames import read_cameras_of, read_peaks
-from express50.images import contact_sheet, read_image, write_image
-from express50.layout import Dataset
-from express50.parts import COLOURS
-from express50.tracks import read_track
+from express50.files.images import contact_sheet, read_image, write_image
+from express50.geometry.cameras import Camera, transform_camera
 from express50.twin.truth import Truth, align_worlds
 
 VIEWS_A_PEAK = 2  # views measured of every peak; they walk around the rig from peak to peak

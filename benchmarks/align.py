@@ -31,13 +31,13 @@ from annotations.suggestions import read_suggestions
 from annotations.ui.replay import measure_steps, replay
 from annotations.watch import STABLE, similarity_2d
 from benchmarks.document import replace_section
-from express50.config import build_config
-from express50.frames import read_proxy
-from express50.images import write_image
-from express50.index import Cue, read_index
-from express50.layout import Dataset
-from express50.runner import run_stage
-from express50.stage import Stage
+from express50.capture.frames import read_proxy
+from express50.capture.index import Cue, read_index
+from express50.contract.config import build_config
+from express50.contract.layout import Dataset
+from express50.contract.stage import Stage
+from express50.files.images import write_image
+from express50.runner.runner import run_stage
 from express50.twin.config import TwinConfig
 from express50.twin.record import record
 from express50.twin.truth import Truth

@@ -28,23 +28,23 @@ import cv2
 import numpy as np
 
 from benchmarks.calibrate_footage import refine_figures, see_capture, sfm_figures
-from express50.calibration_file import read_cameras
-from express50.cameras import Camera, project, transform_camera, triangulate
-from express50.config import resolve_config
-from express50.frames import FrameReader
-from express50.index import Index, read_index
-from express50.landmarks.network import load_network
-from express50.layout import Dataset
-from express50.rigs.footage import check_footage
-from express50.rigs.world import meeting_point
-from express50.runner import run_stage
-from express50.transforms import (
+from express50.capture.frames import FrameReader
+from express50.capture.index import Index, read_index
+from express50.contract.config import resolve_config
+from express50.contract.layout import Dataset
+from express50.files.calibration import read_cameras
+from express50.geometry.cameras import Camera, project, transform_camera, triangulate
+from express50.geometry.transforms import (
     axis_angle_to_matrix,
     invert_transform,
     make_transform,
     matrix_to_axis_angle,
     rigid_fit,
 )
+from express50.landmarks.network import load_network
+from express50.rigs.footage import check_footage
+from express50.rigs.world_frame import meeting_point
+from express50.runner.runner import run_stage
 from express50.twin.config import TwinConfig
 from express50.twin.record import print_progress, record
 from express50.twin.rig import make_rig

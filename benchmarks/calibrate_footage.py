@@ -16,15 +16,15 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from express50.cameras import Camera
 from express50.errors import CalibrationError
+from express50.geometry.cameras import Camera
+from express50.geometry.transforms import matrix_to_axis_angle, similarity_fit
 from express50.landmarks.network import load_network
 from express50.rigs.adjust import move_pose
 from express50.rigs.features import match_looks
 from express50.rigs.footage import reduce_image, reduced_camera
-from express50.rigs.moments import read_moments
+from express50.rigs.sampling import read_moments
 from express50.rigs.tracks import Seen, look, undistorted
-from express50.transforms import matrix_to_axis_angle, similarity_fit
 from pipelines.calibrate.board import Observations
 from pipelines.calibrate.config import CalibrateConfig
 from pipelines.calibrate.faces import start_camera

@@ -22,7 +22,7 @@ from pathlib import Path
 
 import psutil
 
-from express50.layout import Dataset
+from express50.contract.layout import Dataset
 
 STAGES = ("ingest", "calibrate", "align", "matte", "track", "depth", "regions", "pack")
 # Six expressions that between them open the jaw, move brows, lids, lips and cheeks, and are
@@ -135,7 +135,7 @@ def pick_views(dataset: Dataset, subject: str) -> tuple[str, list[str]]:
     """
     import numpy as np
 
-    from express50.frames import read_cameras_of
+    from express50.capture.frames import read_cameras_of
 
     cameras = read_cameras_of(dataset, subject)
     metrics = json.loads((dataset.item_dir("observe", subject) / "metrics.json").read_text())

@@ -36,14 +36,14 @@ from benchmarks.depth_score import Mesh, score, summary
 from benchmarks.depth_sweep import sweep
 from benchmarks.depth_warm import warm_start
 from benchmarks.track import prepare, twin_config
-from express50.cameras import Camera
-from express50.config import build_config
-from express50.frames import read_peaks
+from express50.capture.frames import read_peaks
+from express50.contract.config import build_config
+from express50.contract.layout import Dataset
+from express50.dataset.tracks import read_track
+from express50.geometry.cameras import Camera
+from express50.geometry.raycast import camera_rays, mesh_scene
 from express50.head.load import load_head
-from express50.layout import Dataset
-from express50.raycast import camera_rays, mesh_scene
-from express50.runner import run_stage
-from express50.tracks import read_track
+from express50.runner.runner import run_stage
 from express50.twin.truth import Truth
 from pipelines import track
 from pipelines.depth import STAGE

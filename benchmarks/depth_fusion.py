@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 import open3d as o3d
 
-from express50.adapters import K_to_opencv
-from express50.cameras import Camera
+from express50.geometry.cameras import Camera
+from express50.geometry.conventions import K_to_opencv
 from pipelines.depth.grid import INSIDE, View, head_box
 
 NEIGHBOURS, PLANES, WINDOW = 4, 128, 9

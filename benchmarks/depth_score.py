@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import open3d as o3d
 
-from express50.cameras import Camera, transform_camera
-from express50.raycast import camera_rays, mesh_scene
+from express50.geometry.cameras import Camera, transform_camera
+from express50.geometry.raycast import camera_rays, mesh_scene
 from express50.twin.truth import Truth, align_worlds
 from pipelines.depth.qc import Pictures
 

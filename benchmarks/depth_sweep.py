@@ -15,9 +15,9 @@ import numpy as np
 
 from benchmarks.depth_score import score
 from benchmarks.document import replace_section
-from express50.config import build_config
-from express50.frames import read_peaks
-from express50.layout import Dataset
+from express50.capture.frames import read_peaks
+from express50.contract.config import build_config
+from express50.contract.layout import Dataset
 from express50.twin.truth import Truth
 from pipelines.depth import STAGE
 from pipelines.depth.reconstruct import reconstruct

@@ -13,10 +13,10 @@ import cv2
 import numpy as np
 
 from benchmarks.depth_score import score, summary
-from express50.config import build_config
-from express50.frames import read_peaks
-from express50.layout import Dataset
-from express50.tracks import read_track
+from express50.capture.frames import read_peaks
+from express50.contract.config import build_config
+from express50.contract.layout import Dataset
+from express50.dataset.tracks import read_track
 from express50.twin.truth import Truth
 from pipelines.depth import STAGE
 from pipelines.depth.config import DepthConfig

@@ -13,11 +13,11 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-from express50.config import build_config
+from express50.contract.config import build_config
+from express50.contract.layout import Dataset
+from express50.contract.stage import Stage
 from express50.errors import Express50Error
-from express50.layout import Dataset
-from express50.runner import run_stage
-from express50.stage import Stage
+from express50.runner.runner import run_stage
 
 PIECES = 4
 

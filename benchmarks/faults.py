@@ -27,7 +27,7 @@ from pathlib import Path
 import psutil
 
 from benchmarks.fault_stage import STAGE, FaultConfig, items
-from express50.layout import Dataset
+from express50.contract.layout import Dataset
 
 KINDS = ("driver", "driver of workers", "worker", "scheduler")
 SHARES = (0.5, 0.2, 0.2, 0.1)

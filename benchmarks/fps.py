@@ -19,8 +19,8 @@ from dataclasses import replace
 import numpy as np
 import torch
 
+from express50.geometry.transforms import look_at
 from express50.head.load import load_head
-from express50.transforms import look_at
 from grmm.model import GRMM
 from grmm.presets import preset
 from grmm.render import orbit

@@ -23,9 +23,9 @@ from pathlib import Path
 import torch
 
 from benchmarks.demo import record_twin, run_stages, subject_of
+from express50.files.atomic import write_json
 from express50.head.load import load_head
-from express50.publish import write_json
-from express50.work import peak_memory
+from express50.runner.worker import peak_memory
 from grmm.ablate import ablate
 from grmm.checkpoint import Loaded, load_checkpoint
 from grmm.config import Config

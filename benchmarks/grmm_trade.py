@@ -22,8 +22,8 @@ import torch
 
 from benchmarks.document import replace_section
 from benchmarks.grmm import held_out
+from express50.files.atomic import write_json
 from express50.head.load import load_head
-from express50.publish import write_json
 from grmm.config import Config
 from grmm.data import HeadViews, Key, Sample, Source
 from grmm.evaluate import evaluate, mean, training_render

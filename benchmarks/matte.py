@@ -32,12 +32,12 @@ import numpy as np
 
 from benchmarks.calibrate import add_data_arguments, dataset_and_truth, rounded
 from benchmarks.matte_scenes import make_scenes
-from express50.adapters import undistort_image, undistorted_mask
-from express50.cameras import pinhole
-from express50.config import resolve_config
-from express50.frames import read_frame, read_plate
-from express50.images import srgb_to_linear
-from express50.layout import Dataset
+from express50.capture.frames import read_frame, read_plate
+from express50.contract.config import resolve_config
+from express50.contract.layout import Dataset
+from express50.files.images import srgb_to_linear
+from express50.geometry.cameras import pinhole
+from express50.geometry.conventions import undistort_image, undistorted_mask
 from express50.twin.truth import Truth
 from pipelines.alpha import STAGE
 from pipelines.alpha.foreground import own_colours

@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from express50.cameras import Camera, pinhole, rays
-from express50.images import linear_to_srgb, srgb_to_linear
+from express50.files.images import linear_to_srgb, srgb_to_linear
+from express50.geometry.cameras import Camera, pinhole, rays
 
 SHADE = 0.5  # share of linear light that the shadow takes; the key forgives a quarter
 STAND = (0.06, 0.07, 0.05)  # linear light of the object

@@ -33,12 +33,12 @@ import numpy as np
 from benchmarks.calibrate import recorded, rounded
 from benchmarks.matte import errors
 from benchmarks.matte_disturbances import DISTURBANCES, Shot
-from express50.adapters import undistort_image, undistorted_mask
-from express50.cameras import pinhole
-from express50.config import resolve_config
-from express50.frames import read_frame, read_plate
-from express50.images import contact_sheet, write_image
-from express50.layout import Dataset
+from express50.capture.frames import read_frame, read_plate
+from express50.contract.config import resolve_config
+from express50.contract.layout import Dataset
+from express50.files.images import contact_sheet, write_image
+from express50.geometry.cameras import pinhole
+from express50.geometry.conventions import undistort_image, undistorted_mask
 from express50.twin.config import TwinConfig
 from express50.twin.truth import Truth
 from pipelines.alpha import STAGE as ALPHA

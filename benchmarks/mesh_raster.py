@@ -22,11 +22,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from express50.cameras import Camera
-from express50.head.model import HeadModel, pose, vertex_normals
-from express50.head.procedural import build_procedural_head
-from express50.mesh_raster import Raster, face_neighbors, rasterize
-from express50.mesh_render import (
+from express50.geometry.cameras import Camera
+from express50.geometry.mesh_raster import Raster, face_neighbors, rasterize
+from express50.geometry.mesh_render import (
     Covered,
     antialias,
     barycentrics,
@@ -36,8 +34,10 @@ from express50.mesh_render import (
     sample_texture,
     sh_light,
 )
-from express50.torch_transforms import axis_angle_to_matrix
-from express50.transforms import look_at
+from express50.geometry.transforms import look_at
+from express50.geometry.transforms_torch import axis_angle_to_matrix
+from express50.head.generator.head import build_procedural_head
+from express50.head.model import HeadModel, pose, vertex_normals
 
 MOTIONS = {"roll": 0.02, "shift": 0.004, "scale": 0.02}  # radians, metres, share
 BAR_MS = {256: 35.0, 512: 73.0}  # of a prototype of the same step on FLAME's topology

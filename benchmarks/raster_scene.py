@@ -7,7 +7,7 @@ import math
 import torch
 from torch import Tensor
 
-from express50.adapters import cell_to_corner, corner_to_cell
+from express50.geometry.conventions import cell_to_corner, corner_to_cell
 from grmm.rasterize.projection import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN, Projection, project
 
 

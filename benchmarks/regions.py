@@ -23,15 +23,15 @@ import numpy as np
 
 from benchmarks.accuracy import true_world_cameras
 from benchmarks.regions_truth import iou_figures, true_head_alpha, true_labels, view_row
-from express50.cameras import Camera, project
-from express50.config import PRESETS, resolve_config
-from express50.frames import read_cameras_of, read_peaks
+from express50.capture.frames import read_cameras_of, read_peaks
+from express50.contract.config import PRESETS, resolve_config
+from express50.contract.layout import Dataset
+from express50.contract.segmentation_labels import TORSO
+from express50.dataset.tracks import read_track
+from express50.files.images import read_image
+from express50.geometry.cameras import Camera, project
 from express50.head.load import load_head
 from express50.head.model import landmarks
-from express50.images import read_image
-from express50.layout import Dataset
-from express50.parts import TORSO
-from express50.tracks import read_track
 from express50.twin.truth import Truth
 from pipelines.regions import STAGE
 from pipelines.regions.labels import head_labels

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from express50.cameras import Camera, resized
-from express50.parts import LABELS
+from express50.contract.segmentation_labels import LABELS
+from express50.geometry.cameras import Camera, resized
 from express50.twin.body import Material
 from express50.twin.truth import Truth
 from pipelines.regions.labels import SCALP, head_labels

@@ -28,9 +28,9 @@ import cv2
 import numpy as np
 from skimage.data import astronaut
 
-from express50.images import resize_area
-from express50.shards import ShardReader
-from express50.shards_codecs import (
+from express50.files.images import resize_area
+from express50.runner.threads import cap_threads
+from express50.shards.codecs import (
     ALPHA,
     DEPTH,
     PARTS,
@@ -39,8 +39,8 @@ from express50.shards_codecs import (
     decode_picture,
     encode_pictures,
 )
-from express50.shards_write import PackedSample, ShardWriter, write_manifest
-from express50.threads import cap_threads
+from express50.shards.reader import ShardReader
+from express50.shards.writer import PackedSample, ShardWriter, write_manifest
 
 DISTINCT, CAMERAS, RANDOM, PASSES = 40, 20, 2000, 3
 SHARD = 256 * 10**6

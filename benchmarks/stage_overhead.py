@@ -16,12 +16,12 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-import express50.pool
-from express50.config import build_config
-from express50.layout import Dataset
-from express50.pool import LARGEST_BATCH, Pool
-from express50.runner import run_stage
-from express50.stage import Stage
+import express50.runner.executor
+from express50.contract.config import build_config
+from express50.contract.layout import Dataset
+from express50.contract.stage import Stage
+from express50.runner.executor import LARGEST_BATCH, Pool
+from express50.runner.runner import run_stage
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,7 +87,7 @@ def make_dataset(root: Path, count: int) -> Dataset:
 
 def with_workers(dataset: Dataset, count: int, batch: int) -> float:
     """Milliseconds an item in two workers that have started, in batches of at most so many."""
-    express50.pool.LARGEST_BATCH = batch
+    express50.runner.executor.LARGEST_BATCH = batch
     first = make_dataset(dataset.root / "first", 4)
     with Pool(2) as pool:
         timed(first, pool, 4)

@@ -25,13 +25,13 @@ import numpy as np
 
 from benchmarks.track_truth import Errors, clip_errors, compare, mean, pooled, summary
 from benchmarks.track_views import held_out_views
-from express50.calibration_file import read_cameras, write_cameras
-from express50.config import build_config
-from express50.frames import read_cameras_of, read_peaks
+from express50.capture.frames import read_cameras_of, read_peaks
+from express50.capture.index import index_path, index_to_json, read_index
+from express50.contract.config import build_config
+from express50.contract.layout import Dataset
+from express50.files.calibration import read_cameras, write_cameras
 from express50.head.load import load_head
-from express50.index import index_path, index_to_json, read_index
-from express50.layout import Dataset
-from express50.runner import run_stage
+from express50.runner.runner import run_stage
 from express50.twin.config import TwinConfig
 from express50.twin.record import record
 from express50.twin.truth import Truth

@@ -18,9 +18,9 @@ from benchmarks.document import replace_section
 from benchmarks.track import narrowed, prepare, track, twin_config
 from benchmarks.track_truth import summary
 from benchmarks.track_views import held_out_views
-from express50.config import build_config
-from express50.frames import read_cameras_of
-from express50.layout import Dataset
+from express50.capture.frames import read_cameras_of
+from express50.contract.config import build_config
+from express50.contract.layout import Dataset
 from express50.twin.truth import Truth
 from pipelines.track import STAGE
 

@@ -13,14 +13,14 @@ import numpy as np
 import torch
 
 from benchmarks.track_views import HeldOut, face_of, mask_of, psnr_db
-from express50.cameras import Camera, pinhole, project, transform_camera
+from express50.capture.frames import read_cameras_of
+from express50.contract.layout import Dataset
+from express50.dataset.tracks import Track, read_track
 from express50.errors import Express50Error
-from express50.frames import read_cameras_of
+from express50.geometry.cameras import Camera, pinhole, project, transform_camera
+from express50.geometry.transforms import axis_angle_to_matrix, rigid_fit
 from express50.head.load import load_head
 from express50.head.model import HeadModel, landmarks, pose
-from express50.layout import Dataset
-from express50.tracks import Track, read_track
-from express50.transforms import axis_angle_to_matrix, rigid_fit
 from express50.twin.truth import Truth, align_worlds
 
 NO_SKIN = ("mouth_interior", "teeth", "neck", "boundary")

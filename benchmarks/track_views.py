@@ -16,14 +16,14 @@ from pathlib import Path
 
 import numpy as np
 
-from express50.adapters import undistort_image
-from express50.cameras import Camera, pinhole, unproject
-from express50.capture import read_capture
-from express50.frames import read_cameras_of, read_frame, read_srgb8
+from express50.capture.frames import read_cameras_of, read_frame, read_srgb8
+from express50.capture.raw import read_capture
+from express50.contract.layout import Dataset
+from express50.files.images import LIGHT_OF_LEVEL, linear_to_srgb
+from express50.geometry.cameras import Camera, pinhole, unproject
+from express50.geometry.conventions import undistort_image
+from express50.geometry.mesh_raster import rasterize
 from express50.head.model import HeadModel
-from express50.images import LIGHT_OF_LEVEL, linear_to_srgb
-from express50.layout import Dataset
-from express50.mesh_raster import rasterize
 from express50.twin.truth import Truth
 from pipelines.track.photometry import look
 from pipelines.track.samples import Visibility

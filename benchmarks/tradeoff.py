@@ -16,7 +16,7 @@ from pathlib import Path
 
 from benchmarks import accuracy
 from benchmarks.document import replace_section
-from express50.layout import Dataset
+from express50.contract.layout import Dataset
 from express50.twin.truth import Truth
 from pipelines.order import FIRST, STAGES
 

@@ -2,6 +2,7 @@
 
 import sys
 
-from express50.cli import main
+from express50.cli.main import main
 
-sys.exit(main())
+if __name__ == "__main__":
+    sys.exit(main())

@@ -15,9 +15,9 @@ from pathlib import Path
 from typing import Any
 
 from express50.errors import ConfigError, FormatError
+from express50.files.atomic import dump_json, write_bytes, write_json
+from express50.files.text import read_json_table
 from express50.head.load import load_head
-from express50.publish import dump_json, write_bytes, write_json
-from express50.reading import read_json_table
 from grmm.ablation_table import GROUPS, SHOWN, Variant, variants_of, write_tables
 from grmm.checkpoint import Loaded, load_checkpoint
 from grmm.config import Config

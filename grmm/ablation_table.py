@@ -6,9 +6,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from express50.config import nearest
+from express50.contract.config import nearest
 from express50.errors import ConfigError
-from express50.publish import write_bytes, write_json
+from express50.files.atomic import write_bytes, write_json
 from grmm.config import Config
 from grmm.evaluate import HELD_EXPRESSION, HELD_VIEW
 from grmm.judge import Judge

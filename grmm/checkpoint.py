@@ -15,13 +15,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from express50.checks import PIXEL_LIMIT, check_shape
 from express50.errors import ConfigError, FormatError, HeadModelError
+from express50.files.atomic import write_bytes
+from express50.files.checkpoints import AtMost, read_weights
+from express50.files.text import reason
+from express50.geometry.shapes import PIXEL_LIMIT, check_shape
 from express50.head.load import load_head
 from express50.head.model import HeadModel
-from express50.publish import write_bytes
-from express50.reading import reason
-from express50.weights import AtMost, read_weights
 from grmm.config import Config, ModelConfig
 from grmm.data import NO_OFFSETS, HeadViews, Tracked, check_tracked, pose_state
 from grmm.model import GRMM

@@ -70,7 +70,7 @@ class Sample:
         K: (3, 3) pixels, corner origin.
         cam_from_world: (4, 4).
         tracked: head-model parameters.
-        parts: (H, W) uint8 of express50.parts.LABELS. None: the shards have none.
+        parts: (H, W) uint8 of segmentation_labels.LABELS. None: the shards have none.
     """
 
     image: np.ndarray

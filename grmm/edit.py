@@ -15,9 +15,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from express50.config import nearest
+from express50.contract.config import nearest
 from express50.errors import ConfigError
-from express50.torch_transforms import axis_angle_to_quat, quat_to_axis_angle, slerp
+from express50.geometry.transforms_torch import axis_angle_to_quat, quat_to_axis_angle, slerp
 from grmm.checkpoint import Loaded
 from grmm.data import NO_OFFSETS, Tracked, pose_state
 from grmm.scene import HeadState

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from express50.errors import TrainError
-from express50.publish import write_bytes, write_json
+from express50.files.atomic import write_bytes, write_json
 from grmm.checkpoint import Gallery
 from grmm.config import MetricsConfig
 from grmm.data import HeadViews, Item, Key

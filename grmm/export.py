@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from express50.errors import ConfigError
-from express50.publish import write_bytes
+from express50.files.atomic import write_bytes
 from grmm.checkpoint import Loaded
 from grmm.edit import Head
 from grmm.ply import write_ply

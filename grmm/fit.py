@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from express50.errors import TrainError
-from express50.publish import write_json
+from express50.files.atomic import write_json
 from grmm import losses
 from grmm.checkpoint import Loaded
 from grmm.config import FitConfig, LossConfig

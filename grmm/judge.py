@@ -18,9 +18,9 @@ from torch import Tensor, nn
 from torchmetrics.functional.image import lpips as torchmetrics_lpips
 from torchmetrics.image.fid import FrechetInceptionDistance
 
-from express50.arrays import DAMAGE
 from express50.errors import ConfigError
-from express50.weights import check_archive, read_weights
+from express50.files.arrays import DAMAGE
+from express50.files.checkpoints import check_archive, read_weights
 from grmm.config import MetricsConfig
 
 SMALLEST_PX = 32  # five layers of AlexNet leave nothing of smaller images

@@ -11,8 +11,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
+from express50.geometry.transforms_torch import matrix_to_quat
 from express50.head.model import HeadModel
-from express50.torch_transforms import matrix_to_quat
 from grmm.anchors import interpolate, make_anchors, tangent_frames, uv_gradients
 from grmm.config import ModelConfig
 from grmm.networks import Networks

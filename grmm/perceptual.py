@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from express50.errors import TrainError
-from express50.weights import read_weights
+from express50.files.checkpoints import read_weights
 
 # Simonyan and Zisserman 2014, configuration D, up to relu4_3; "M" halves the map.
 LAYERS: tuple[int | str, ...] = (64, 64, "M", 128, 128, "M", 256, 256, 256, "M", 512, 512, 512)

@@ -20,8 +20,8 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from express50.checks import check_finite, check_shape
 from express50.errors import FormatError
+from express50.geometry.shapes import check_finite, check_shape
 
 MAX_HEADER_BYTES = 1 << 16
 MAX_GAUSSIANS = 50_000_000

@@ -12,9 +12,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from express50.config import build_dataclass, config_values, nearest, parse_assignment
+from express50.contract.config import build_dataclass, config_values, nearest, parse_assignment
 from express50.errors import ConfigError
-from express50.reading import read_toml
+from express50.files.text import read_toml
 from grmm.config import (
     Config,
     DataConfig,

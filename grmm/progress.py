@@ -13,8 +13,8 @@ from pathlib import Path
 
 from express50.console import readers_may_leave
 from express50.errors import ConfigError, FormatError, TrainError
-from express50.publish import write_bytes
-from express50.reading import parse_json, read_text
+from express50.files.atomic import write_bytes
+from express50.files.text import parse_json, read_text
 
 
 def append_log(path: Path, iteration: int, seconds: float, terms: dict[str, float]) -> None:

@@ -13,9 +13,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from express50.dataset.tracks import Sequence
 from express50.errors import ConfigError
-from express50.images import contact_sheet, write_image
-from express50.tracks import Sequence
+from express50.files.images import contact_sheet, write_image
 from grmm.checkpoint import Loaded
 from grmm.data import HeadViews
 from grmm.edit import Head, between, trained_head

@@ -14,8 +14,8 @@ import torch
 from torch import Tensor
 
 from express50.errors import FormatError
-from express50.images import read_image, write_image
-from express50.shards_write import sample_key
+from express50.files.images import read_image, write_image
+from express50.shards.writer import sample_key
 from grmm.data import HeadViews, Key
 from grmm.evaluate import Row, compare, row_of
 from grmm.judge import Judge

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from express50.errors import FormatError
-from express50.shards import ShardReader
+from express50.shards.reader import ShardReader
 from grmm.data import Key, Sample, Tracked
 
 INSET_PX = 2  # of the footage's border: undistortion has nothing to put there

@@ -13,8 +13,8 @@ from scipy.ndimage import distance_transform_edt
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from express50.contract.segmentation_labels import TORSO
 from express50.head.model import HeadModel
-from express50.parts import TORSO
 from grmm.scene import View
 
 STAND_OFF_M = 0.025  # a point this far off the neck belongs to a shirt, or to hair upon it
@@ -23,7 +23,7 @@ GROW_PX = 2  # blurred borders
 
 
 def labelled_torso(parts: np.ndarray) -> np.ndarray:
-    """Pixels (H, W) bool that labels (H, W) of ``express50.parts.LABELS`` call torso, grown."""
+    """Pixels (H, W) bool that labels (H, W) of ``segmentation_labels.LABELS`` call torso, grown."""
     torso = parts == TORSO
     return _grown(torso)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from express50.publish import write_json
+from express50.files.atomic import write_json
 from grmm.config import Config
 from grmm.evaluate import evaluate, mean, training_render
 from grmm.judge import Judge

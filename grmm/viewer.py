@@ -19,7 +19,7 @@ import torch
 import viser
 
 from express50.console import stdout_to_stderr
-from express50.transforms import quat_to_matrix
+from express50.geometry.transforms import quat_to_matrix
 from grmm.checkpoint import Loaded
 from grmm.edit import Head, between, controlled, principal_directions, trained_head
 from grmm.preview import Preview

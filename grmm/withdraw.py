@@ -8,7 +8,7 @@ from typing import Any
 
 import torch
 
-from express50.publish import write_bytes
+from express50.files.atomic import write_bytes
 from grmm.checkpoint import read_content
 
 

@@ -19,9 +19,9 @@ import cv2
 import numpy as np
 import torch
 
-from express50.arrays import DAMAGE
 from express50.errors import ConfigError, StageError
-from express50.weights import check_archive
+from express50.files.arrays import DAMAGE
+from express50.files.checkpoints import check_archive
 
 TORCH_ERRORS = (*DAMAGE, torch.jit.Error)
 

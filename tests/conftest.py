@@ -10,8 +10,8 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import pytest
 
-from express50.config import resolve_config
-from express50.layout import Dataset
+from express50.contract.config import resolve_config
+from express50.contract.layout import Dataset
 from tests.synth import make_capture
 
 REPOSITORY = Path(__file__).resolve().parent.parent
@@ -42,7 +42,7 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def ingested(tmp_path: Path, capture: Path) -> Dataset:
     """A dataset with S001 ingested."""
-    from express50.runner import run_stage
+    from express50.runner.runner import run_stage
     from pipelines import ingest
 
     dataset = Dataset(tmp_path / "dataset")

@@ -8,10 +8,10 @@ from pathlib import Path
 import av
 import numpy as np
 
-from express50.calibration_file import write_cameras
-from express50.cameras import Camera, rays
-from express50.images import write_image
-from express50.transforms import look_at
+from express50.files.calibration import write_cameras
+from express50.files.images import write_image
+from express50.geometry.cameras import Camera, rays
+from express50.geometry.transforms import look_at
 
 RADIUS_M = 0.1
 EXPRESSIONS = ("neutral", "smile")

@@ -15,10 +15,10 @@ import pytest
 
 from benchmarks.accuracy import measure_dataset
 from benchmarks.demo import pick_views
-from express50.cli import main
-from express50.images import decode_image
-from express50.layout import Dataset
-from express50.shards import ShardReader
+from express50.cli.main import main
+from express50.contract.layout import Dataset
+from express50.files.images import decode_image
+from express50.shards.reader import ShardReader
 
 pytestmark = pytest.mark.slow
 

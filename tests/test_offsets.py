@@ -8,8 +8,8 @@ import torch
 
 from express50.errors import FormatError
 from express50.head.load import load_head
-from express50.shards import ShardReader
-from express50.shards_write import verify
+from express50.shards.reader import ShardReader
+from express50.shards.writer import verify
 from grmm.checkpoint import Gallery, load_checkpoint, save_checkpoint
 from grmm.data import HeadViews, pose_state
 from grmm.edit import interpolate_tracked, transfer

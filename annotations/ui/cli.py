@@ -12,10 +12,10 @@ from pathlib import Path
 
 from annotations.ui.terminal import WANTED, cell_size, choose_pictures
 from annotations.worklist import ORDERS
+from express50.capture.index import read_index
+from express50.contract.exclusions import included_subjects
+from express50.contract.layout import Dataset
 from express50.errors import AnnotationError
-from express50.exclusions import included_subjects
-from express50.index import read_index
-from express50.layout import Dataset
 
 
 def add_verbs(verbs: argparse._SubParsersAction) -> None:

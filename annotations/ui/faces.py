@@ -13,9 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from annotations.ui.frames import Box
+from express50.capture.frames import read_proxy
+from express50.contract.layout import Dataset
 from express50.errors import Express50Error
-from express50.frames import read_proxy
-from express50.layout import Dataset
 
 ZOOMS = ("face", "mouth", "eyes", "head", "frame")
 # Centre below the line of the eyes, and height, in face units; see Face.unit.

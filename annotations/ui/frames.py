@@ -10,9 +10,9 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
+from express50.capture.frames import read_proxy
+from express50.contract.layout import Dataset
 from express50.errors import AnnotationError, Express50Error
-from express50.frames import read_proxy
-from express50.layout import Dataset
 
 LIMIT_BYTES = 192 << 20
 Box = tuple[float, float, float, float]  # left, top, right, bottom as shares of the image's sides

@@ -13,7 +13,7 @@ from annotations.ui.picture import Look, shot_of
 from annotations.ui.scene import Scene
 from annotations.ui.strip import StripContent
 from annotations.ui.view import View
-from express50.index import CameraSource
+from express50.capture.index import CameraSource
 
 AHEAD = 64  # frames about the cursor that are decoded before they are asked for
 

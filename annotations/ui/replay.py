@@ -22,8 +22,8 @@ from annotations.ui.app import AnnotateApp
 from annotations.ui.faces import FaceFinder
 from annotations.ui.session import Session, open_session
 from annotations.ui.view import View
+from express50.contract.layout import Dataset
 from express50.errors import AnnotationError
-from express50.layout import Dataset
 
 SIZE = (120, 40)
 Move = Callable[[View], View]

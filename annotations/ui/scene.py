@@ -9,10 +9,10 @@ from annotations.reference import CanonicalFrame, canonical, reference_subject
 from annotations.store import current_labels, labels_of, read_labels
 from annotations.suggestions import Suggested, read_suggestions
 from annotations.worklist import Task
+from express50.capture.expressions import load_script
+from express50.capture.index import Index, read_index
+from express50.contract.layout import Dataset
 from express50.errors import Express50Error
-from express50.expressions import load_script
-from express50.index import Index, read_index
-from express50.layout import Dataset
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -15,9 +15,9 @@ from annotations.store import append_label, is_person, labels_of, read_labels
 from annotations.ui.scene import Scene
 from annotations.ui.view import View, plateau_problem
 from annotations.worklist import Task, worklist
+from express50.capture.index import read_index
+from express50.contract.layout import Dataset
 from express50.errors import AnnotationError
-from express50.index import read_index
-from express50.layout import Dataset
 
 IDLE_SECONDS = 60.0  # a longer pause between two keys is a break, and counts as this
 

@@ -13,11 +13,11 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from express50.arrays import read_arrays
 from express50.errors import HeadModelError
+from express50.files.arrays import read_arrays
+from express50.files.text import read_text
 from express50.head.ict_regions import ict_regions
 from express50.head.model import PARENTS, HeadModel, check_head
-from express50.reading import read_text
 
 VERTEX_COUNT = 26719
 METRES_PER_UNIT = 0.01

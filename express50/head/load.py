@@ -22,7 +22,7 @@ def load_head(spec: str | Path) -> HeadModel:
         HeadModelError: unknown name, missing file or damaged content.
     """
     if str(spec) == "procedural":
-        from express50.head.procedural import build_procedural_head
+        from express50.head.generator.head import build_procedural_head
 
         return build_procedural_head()
     path = Path(spec).expanduser()

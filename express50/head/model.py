@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, fields, replace
 import torch
 
 from express50.errors import HeadModelError
-from express50.torch_transforms import axis_angle_to_matrix
+from express50.geometry.transforms_torch import axis_angle_to_matrix
 
 JOINTS = ("root", "neck", "jaw", "left_eye", "right_eye")
 PARENTS = (-1, 0, 1, 1, 1)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from express50.errors import HeadModelError
-from express50.head.safe_pickle import VALUES_LIMIT, ChumpyArray, CscMatrix, SparseMatrix
-from express50.reading import reason
+from express50.files.pickles import VALUES_LIMIT, ChumpyArray, CscMatrix, SparseMatrix
+from express50.files.text import reason
 
 
 def to_array(value: object, name: str, where: str) -> np.ndarray:

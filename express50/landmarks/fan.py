@@ -14,11 +14,11 @@ import cv2
 import numpy as np
 import torch
 
-from express50.adapters import affine_to_opencv, cell_to_corner
-from express50.arrays import DAMAGE
 from express50.errors import ConfigError
+from express50.files.arrays import DAMAGE
+from express50.files.checkpoints import check_archive
+from express50.geometry.conventions import affine_to_opencv, cell_to_corner
 from express50.landmarks.detector import Detection
-from express50.weights import check_archive
 
 CROP, HEAT, POINTS = 256, 64, 68
 # A crop spans 200 / 195 times the sum of the sides of the face box that FAN was trained with, whose

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from express50.adapters import affine_to_opencv, cell_to_corner
+from express50.geometry.conventions import affine_to_opencv, cell_to_corner
 from express50.landmarks.detector import Detection
 
 # Subject's left eye first, as the model's joints have it: corners, then the points of each lid.

@@ -12,7 +12,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from express50.adapters import affine_to_opencv
+from express50.geometry.conventions import affine_to_opencv
 from express50.landmarks.detector import Detection
 
 # Outer lip above, inner above, inner below, outer lip below, of each column.

@@ -18,10 +18,10 @@ from torch import nn
 from torch.nn import functional
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
-from express50.adapters import cell_centres, corner_to_cell
-from express50.arrays import read_arrays
 from express50.errors import FormatError
-from express50.reading import AGAIN, reason
+from express50.files.arrays import read_arrays
+from express50.files.text import AGAIN, reason
+from express50.geometry.conventions import cell_centres, corner_to_cell
 
 CROP = 128
 POINTS = 68

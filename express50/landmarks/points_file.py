@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 
-from express50.arrays import read_arrays
-from express50.cameras import Camera, normalised
 from express50.errors import FormatError
-from express50.reading import read_json
+from express50.files.arrays import read_arrays
+from express50.files.text import read_json
+from express50.geometry.cameras import Camera, normalised
 
 SCHEMA = "express50.landmarks/1"
 NAMES = ("schema", "cameras", "frames", "points")

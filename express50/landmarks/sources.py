@@ -12,8 +12,8 @@ from pathlib import Path
 
 import numpy as np
 
-from express50.cameras import Camera
 from express50.errors import ConfigError
+from express50.geometry.cameras import Camera
 from express50.landmarks.detector import SMALLEST, Detection, detect
 from express50.landmarks.fan import find_with_fan, load_fan
 from express50.landmarks.iris import Irises, find_irises

@@ -11,9 +11,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from express50.cameras import Camera
+from express50.geometry.cameras import Camera
+from express50.geometry.transforms import axis_angle_to_matrix, make_transform
 from express50.rigs.tracks import Tracks
-from express50.transforms import axis_angle_to_matrix, make_transform
 
 # How far a camera may be taken to have moved before the footage has a say.
 PRIOR_RAD, PRIOR_M = np.radians(1.0), 0.01

@@ -9,10 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
-from express50.calibration_file import camera_rows, parse_cameras
-from express50.cameras import Camera, resized
 from express50.errors import CalibrationError
-from express50.reading import read_bytes, read_json_table
+from express50.files.calibration import camera_rows, parse_cameras
+from express50.files.text import read_bytes, read_json_table
+from express50.geometry.cameras import Camera, resized
 
 
 def camera_from_K(

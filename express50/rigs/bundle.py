@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy.sparse as sparse
 
-from express50.cameras import Camera, distort
+from express50.geometry.cameras import Camera, distort
 from express50.rigs.adjust import move_pose
 from express50.rigs.tracks import Tracks
 

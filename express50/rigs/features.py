@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 from scipy.spatial import cKDTree
 
-from express50.adapters import opencv_pixels_to_corner
-from express50.cameras import Camera
+from express50.geometry.cameras import Camera
+from express50.geometry.conventions import opencv_pixels_to_corner
 
 Features: TypeAlias = tuple[np.ndarray, np.ndarray]
 """Pixels (N, 2) and descriptors (N, 128)."""

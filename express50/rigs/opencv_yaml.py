@@ -12,12 +12,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from express50.adapters import K_from_opencv
-from express50.cameras import Camera
 from express50.errors import CalibrationError
-from express50.reading import TOML_LIMIT, read_text, reason
+from express50.files.text import TOML_LIMIT, read_text, reason
+from express50.geometry.cameras import Camera
+from express50.geometry.conventions import K_from_opencv
+from express50.geometry.transforms import axis_angle_to_matrix, make_transform
 from express50.rigs.build import camera_from_K, checked
-from express50.transforms import axis_angle_to_matrix, make_transform
 
 # Names in use: OpenCV's calibration sample, its stereo sample, ROS, and hand-written files.
 _K = ("camera_matrix", "cameraMatrix", "K", "M", "intrinsics")

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from express50.calibration_file import read_cameras
-from express50.cameras import Camera
 from express50.errors import CalibrationError
+from express50.files.calibration import read_cameras
+from express50.geometry.cameras import Camera
 from express50.rigs.build import at_size, holds, in_metres
 from express50.rigs.colmap import is_colmap, read_colmap
 from express50.rigs.opencv_yaml import is_opencv_yaml, read_opencv_yaml

@@ -12,10 +12,10 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from express50.adapters import K_from_opencv
-from express50.cameras import Camera
 from express50.errors import CalibrationError, CaptureError
-from express50.media import attribute, child, members, open_hdf5, read_array
+from express50.files.containers import attribute, child, members, open_hdf5, read_array
+from express50.geometry.cameras import Camera
+from express50.geometry.conventions import K_from_opencv
 from express50.rigs.build import camera_from_K, checked, holds, read_table
 
 NERSEMBLE_SIZE = (2200, 3208)

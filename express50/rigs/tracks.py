@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from express50.cameras import Camera, normalised
+from express50.geometry.cameras import Camera, normalised
 from express50.landmarks.detector import detect
 from express50.landmarks.network import LandmarkNet
 from express50.rigs.features import (

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import numpy as np
 
-from express50.adapters import cam_from_world_from_opengl
-from express50.cameras import Camera
 from express50.errors import CalibrationError
+from express50.geometry.cameras import Camera
+from express50.geometry.conventions import cam_from_world_from_opengl
 from express50.rigs.build import camera_from_K, checked, holds, names_from_files, read_table
 
 _HELD = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE")

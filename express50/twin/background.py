@@ -10,8 +10,8 @@ from functools import cache
 import cv2
 import numpy as np
 
-from express50.adapters import cell_centres, corner_to_cell
-from express50.cameras import Camera
+from express50.geometry.cameras import Camera
+from express50.geometry.conventions import cell_centres, corner_to_cell
 from express50.twin.noise import fractal, make_lattice, noise, random_stream, smoothstep
 from express50.twin.rig import TARGET
 from express50.twin.surface import spherical_to_unit, unit, unit_to_spherical

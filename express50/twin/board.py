@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from express50.cameras import Camera, project
-from express50.transforms import axis_angle_to_matrix, make_transform
+from express50.geometry.cameras import Camera, project
+from express50.geometry.transforms import axis_angle_to_matrix, make_transform
 from express50.twin.background import background, room_width
 from express50.twin.noise import random_stream
 from express50.twin.render import bands, ray_pattern

@@ -9,8 +9,8 @@ import numpy as np
 import scipy.sparse
 import torch
 
+from express50.geometry.transforms import rigid_fit
 from express50.head.model import HeadModel, landmarks, pose
-from express50.transforms import rigid_fit
 from express50.twin.hair import HairMesh, grow_hair
 from express50.twin.noise import random_stream, smoothstep
 from express50.twin.performance import Performance

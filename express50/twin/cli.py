@@ -7,7 +7,7 @@ import json
 import os
 from pathlib import Path
 
-from express50.config import field_documents
+from express50.contract.config import field_documents
 from express50.twin.config import TwinConfig
 
 _EPILOG = """example:

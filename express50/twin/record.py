@@ -14,10 +14,10 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from express50.capture.expressions import select
 from express50.errors import CaptureError
-from express50.expressions import select
-from express50.publish import write_bytes
-from express50.threads import cap_threads
+from express50.files.atomic import write_bytes
+from express50.runner.threads import cap_threads
 from express50.twin.config import TwinConfig
 
 _counter: Any = None  # shared count of pictures, set in every worker

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 import scipy.spatial
 
-from express50.cameras import Camera, crop_camera, project, rays
+from express50.geometry.cameras import Camera, crop_camera, project, rays
 from express50.twin.body import Material
 from express50.twin.surface import MISS, Caster
 

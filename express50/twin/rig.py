@@ -6,8 +6,8 @@ import math
 
 import numpy as np
 
-from express50.cameras import Camera
-from express50.transforms import look_at
+from express50.geometry.cameras import Camera
+from express50.geometry.transforms import look_at
 from express50.twin.noise import random_stream
 
 TARGET = np.array([0.0, 1.25, 0.0])  # where heads are: a seated person, y up, metres

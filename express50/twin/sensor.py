@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from express50.images import linear_to_srgb
+from express50.files.images import linear_to_srgb
 from express50.twin.noise import random_stream
 
 _SHOT, _READ = 0.0055, 0.0016  # noise of a clean studio exposure, linear light

@@ -9,12 +9,12 @@ from pathlib import Path
 
 import numpy as np
 
-from express50.cameras import Camera
-from express50.expressions import select
-from express50.footage import ImageFootage, VideoFootage
+from express50.capture.expressions import select
+from express50.files.images import encode_png
+from express50.files.video_writer import ImageFootage, VideoFootage
+from express50.geometry.cameras import Camera
 from express50.head.load import load_head
 from express50.head.model import HeadModel
-from express50.images import encode_png
 from express50.twin.background import background, room_width
 from express50.twin.board import BoardSpec, board_poses, render_board
 from express50.twin.body import Body, build_body, pose_body

@@ -6,7 +6,7 @@ import numpy as np
 import open3d as o3d
 import scipy.sparse
 
-from express50.adapters import cell_centres, corner_to_cell
+from express50.geometry.conventions import cell_centres, corner_to_cell
 
 MISS = np.uint32(0xFFFFFFFF)
 

@@ -15,13 +15,13 @@ from typing import Any
 import numpy as np
 import torch
 
-from express50.calibration_file import read_cameras, write_cameras
-from express50.cameras import Camera, rays
 from express50.errors import CaptureError
+from express50.files.calibration import read_cameras, write_cameras
+from express50.geometry.cameras import Camera, rays
+from express50.geometry.transforms import make_transform
 from express50.head.load import load_head
 from express50.head.model import HeadModel
 from express50.head.model import landmarks as head_landmarks
-from express50.transforms import make_transform
 from express50.twin import render
 from express50.twin.body import Body, Extras, assemble, head_vertices, pose_body
 from express50.twin.hair import HairMesh

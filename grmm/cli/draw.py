@@ -22,7 +22,7 @@ from grmm.cli.shared import (
 if TYPE_CHECKING:
     import numpy as np
 
-    from express50.tracks import Sequence
+    from express50.dataset.tracks import Sequence
     from grmm.checkpoint import Loaded
     from grmm.edit import Head
     from grmm.scene import View
@@ -61,7 +61,7 @@ def add_render(commands: argparse._SubParsersAction) -> None:
 
 
 def _render(args: argparse.Namespace) -> int:
-    from express50.images import write_image
+    from express50.files.images import write_image
     from grmm import render
 
     no_file(args.out)
@@ -94,7 +94,7 @@ def _render(args: argparse.Namespace) -> int:
 
 
 def _clips(path: Path, cue: str | None) -> Sequence:
-    from express50.tracks import OF_FRAMES, read_sequence
+    from express50.dataset.tracks import OF_FRAMES, read_sequence
 
     clips = read_sequence(path)
     if cue is None:

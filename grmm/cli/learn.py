@@ -134,7 +134,7 @@ def add_config(commands: argparse._SubParsersAction) -> None:
 
 
 def _config(args: argparse.Namespace) -> int:
-    from express50.config import config_toml
+    from express50.contract.config import config_toml
 
     config = train_config(args)
     for table in args.table or TABLES:

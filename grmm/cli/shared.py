@@ -85,7 +85,7 @@ def metric_settings(args: argparse.Namespace) -> list[str]:
 
 def load(path: Path, assignments: Sequence[str] = (), seconds: float | None = None) -> Loaded:
     """Read a checkpoint; ``fit.*``, ``metrics.*`` and ``loss.*`` replace its own settings."""
-    from express50.config import parse_assignment
+    from express50.contract.config import parse_assignment
     from grmm.checkpoint import load_checkpoint
     from grmm.presets import as_tables, from_tables
     from grmm.run import best_device

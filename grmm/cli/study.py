@@ -61,7 +61,7 @@ def _serve(args: argparse.Namespace) -> int:
 
 
 def _table(args: argparse.Namespace) -> int:
-    from express50.publish import write_bytes, write_json
+    from express50.files.atomic import write_bytes, write_json
     from grmm.study.answers import read_answers, read_study
     from grmm.study.table import markdown, summarise
 

@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from express50.adapters import cell_to_corner
+from express50.geometry.conventions import cell_to_corner
 from grmm.rasterize.interface import RenderOptions, RenderOutput
 from grmm.rasterize.projection import (
     ALPHA_MAX,

@@ -14,8 +14,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from express50.adapters import cell_to_corner
-from express50.torch_transforms import quat_to_matrix
+from express50.geometry.conventions import cell_to_corner
+from express50.geometry.transforms_torch import quat_to_matrix
 
 ALPHA_MIN = 1.0 / 255.0  # fainter contributions are skipped
 ALPHA_MAX = 0.99  # keeps 1 - alpha away from zero

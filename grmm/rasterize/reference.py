@@ -9,7 +9,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from express50.adapters import cell_to_corner
+from express50.geometry.conventions import cell_to_corner
 from grmm.rasterize.interface import RenderOptions, RenderOutput
 from grmm.rasterize.projection import (
     ALPHA_MAX,

@@ -7,7 +7,7 @@ import os
 from pathlib import Path
 
 from express50.errors import FormatError
-from express50.reading import parse_json, read_json
+from express50.files.text import parse_json, read_json
 from grmm.study.design import ANSWERS, FORMAT
 
 FIELDS = ("participant", "example", "question", "answer")

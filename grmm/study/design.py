@@ -15,8 +15,8 @@ from pathlib import Path
 import numpy as np
 
 from express50.errors import ConfigError, FormatError
-from express50.images import encode_png, read_image
-from express50.publish import write_bytes, write_json
+from express50.files.atomic import write_bytes, write_json
+from express50.files.images import encode_png, read_image
 
 FORMAT = "grmm.study/1"
 QUESTIONS = {

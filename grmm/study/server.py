@@ -16,7 +16,7 @@ from threading import Lock
 from urllib.parse import parse_qs, urlsplit
 
 from express50.errors import FormatError
-from express50.reading import parse_json
+from express50.files.text import parse_json
 from grmm.study.answers import append_answer, check_answer, read_answers, read_study
 from grmm.study.design import trials
 

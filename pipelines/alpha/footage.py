@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from express50.images import edge_distance
+from express50.files.images import edge_distance
 from pipelines.alpha.key import dilated, eroded
 from pipelines.alpha.plate import MOST_NOISE, exposed, exposure_gain
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from express50.images import linear_to_srgb
+from express50.files.images import linear_to_srgb
 from pipelines.alpha.opacity import local_colours, to_light
 
 REACH_SHARE = 0.008  # of the image's longer side: how far away colours may be taken from

@@ -14,9 +14,9 @@ import cv2
 import numpy as np
 from scipy.ndimage import binary_fill_holes
 
-from express50.adapters import corner_to_cell
-from express50.cameras import Camera
 from express50.errors import NoFaceError
+from express50.geometry.cameras import Camera
+from express50.geometry.conventions import corner_to_cell
 from express50.landmarks.detector import detect
 from express50.landmarks.network import LandmarkNet
 from pipelines.alpha.learned import refined

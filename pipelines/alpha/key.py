@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from express50.images import edge_distance
+from express50.files.images import edge_distance
 from pipelines.alpha.config import AlphaConfig
 from pipelines.alpha.opacity import (
     light_noise,

@@ -7,7 +7,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from express50.images import resize_area
+from express50.files.images import resize_area
 from pipelines.alpha.config import AlphaConfig
 from pipelines.alpha.key import alpha_of
 from pipelines.alpha.plate import PlateModel, exposed, exposure_gain, fit_plate

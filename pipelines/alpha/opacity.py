@@ -12,7 +12,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from express50.images import srgb_to_linear
+from express50.files.images import srgb_to_linear
 
 ROUNDS = 3  # the covariance a pixel sees depends on its alpha; settled to 0.01 after two
 OCTAVES = 4  # of reach, in which colours are looked for

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from express50.images import LIGHT_OF_LEVEL, scaled_levels
+from express50.files.images import LIGHT_OF_LEVEL, scaled_levels
 
 LEVELS = np.linspace(16.0, 240.0, 8)  # 8-bit intensities at which noise is tabulated
 # Differences above this, in 8-bit steps, are not noise whatever the camera.

@@ -6,12 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from express50.adapters import undistort_image
-from express50.cameras import Camera
+from express50.capture.frames import FrameReader, read_plate, read_raw_plate
+from express50.capture.index import Index, read_index
+from express50.contract.layout import Dataset
 from express50.errors import StageError
-from express50.frames import FrameReader, read_plate, read_raw_plate
-from express50.index import Index, read_index
-from express50.layout import Dataset
+from express50.geometry.cameras import Camera
+from express50.geometry.conventions import undistort_image
 from pipelines.alpha.config import AlphaConfig
 from pipelines.alpha.footage import (
     FootagePlate,

@@ -8,15 +8,15 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from express50.adapters import undistorted_mask
-from express50.calibration_file import read_cameras
-from express50.cameras import Camera
+from express50.capture.frames import read_cameras_of, read_frame, read_peaks
+from express50.capture.index import index_path, read_index
+from express50.contract.layout import Dataset
+from express50.contract.stage import Stage
 from express50.errors import NoFaceError, StageError
-from express50.frames import read_cameras_of, read_frame, read_peaks
-from express50.images import contact_sheet, read_image, write_image
-from express50.index import index_path, read_index
-from express50.layout import Dataset
-from express50.stage import Stage
+from express50.files.calibration import read_cameras
+from express50.files.images import contact_sheet, read_image, write_image
+from express50.geometry.cameras import Camera
+from express50.geometry.conventions import undistorted_mask
 from pipelines.alpha.config import NETWORKS, PRESETS, WITHOUT_PLATE, AlphaConfig
 from pipelines.alpha.keyer import Keyer
 from pipelines.alpha.plate import exposed, exposure_gain

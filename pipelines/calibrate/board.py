@@ -14,9 +14,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from express50.adapters import opencv_pixels_to_corner
+from express50.capture.frames import read_srgb8
 from express50.errors import CalibrationError
-from express50.frames import read_srgb8
+from express50.geometry.conventions import opencv_pixels_to_corner
 from pipelines.calibrate.saddle import refine_corners, square_sides
 
 REQUIRED = ("squares_x", "squares_y", "square_length_m", "marker_length_m", "dictionary")

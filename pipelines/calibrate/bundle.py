@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pycolmap
 
-from express50.cameras import Camera, project
+from express50.geometry.cameras import Camera, project
 from pipelines.calibrate.board import Observations
 
 ITERATIONS = 60

@@ -15,9 +15,9 @@ import cv2
 import numpy as np
 from scipy.sparse.csgraph import connected_components
 
-from express50.adapters import corner_to_opencv_pixels
-from express50.images import LIGHT_OF_LEVEL
-from express50.publish import write_json
+from express50.files.atomic import write_json
+from express50.files.images import LIGHT_OF_LEVEL
+from express50.geometry.conventions import corner_to_opencv_pixels
 from pipelines.calibrate.board import Board, opencv_board
 
 LEAST_AREA_PX = 60.0

@@ -13,9 +13,9 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from express50.cameras import Camera
+from express50.geometry.cameras import Camera
+from express50.geometry.transforms import invert_transform, make_transform
 from express50.rigs.tracks import Seen
-from express50.transforms import invert_transform, make_transform
 from pipelines.calibrate.graph import join, mean_transform
 
 NOMINAL = 2.5

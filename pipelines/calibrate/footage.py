@@ -8,15 +8,15 @@ from pathlib import Path
 
 import numpy as np
 
-from express50.cameras import Camera
+from express50.capture.frames import FrameReader
+from express50.capture.index import Index
 from express50.errors import CalibrationError, FormatError
-from express50.exif import read_exif
-from express50.frames import FrameReader
-from express50.index import Index
+from express50.files.exif import read_exif
+from express50.geometry.cameras import Camera
 from express50.landmarks.network import load_network
 from express50.rigs.features import Features, find_features, without_fixed
 from express50.rigs.footage import reduce_image
-from express50.rigs.moments import spread, spread_moments
+from express50.rigs.sampling import spread, spread_moments
 from express50.rigs.tracks import Seen, find_face
 
 FILM_DIAGONAL_MM = math.hypot(36.0, 24.0)

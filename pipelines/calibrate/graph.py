@@ -11,8 +11,8 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 
-from express50.cameras import Camera
-from express50.transforms import (
+from express50.geometry.cameras import Camera
+from express50.geometry.transforms import (
     invert_transform,
     make_transform,
     matrix_to_axis_angle,

@@ -10,8 +10,8 @@ from dataclasses import dataclass, field, replace
 import cv2
 import numpy as np
 
-from express50.cameras import Camera
-from express50.transforms import make_transform
+from express50.geometry.cameras import Camera
+from express50.geometry.transforms import make_transform
 
 # A view whose corners span less than this share of the image's diagonal says little of the lens.
 SMALLEST_SPAN = 0.03

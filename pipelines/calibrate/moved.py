@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from express50.cameras import Camera
-from express50.index import Index
+from express50.capture.index import Index
+from express50.geometry.cameras import Camera
 from express50.landmarks.network import load_network
 from express50.rigs.footage import FootageVerdict, check_footage, reduce_image
 from pipelines.calibrate.footage import read_footage

@@ -10,9 +10,9 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from express50.cameras import Camera
-from express50.images import write_image
-from express50.rigs.world import meeting_point
+from express50.files.images import write_image
+from express50.geometry.cameras import Camera
+from express50.rigs.world_frame import meeting_point
 from pipelines.calibrate.solve import Solution
 
 

@@ -8,11 +8,11 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from express50.cameras import Camera
+from express50.geometry.cameras import Camera
+from express50.geometry.transforms import make_transform
 from express50.rigs.adjust import triangulate_tracks
 from express50.rigs.features import match_looks
 from express50.rigs.tracks import Seen, join_verified
-from express50.transforms import make_transform
 from pipelines.calibrate.faces import start_camera
 from pipelines.calibrate.intrinsics import as_model
 

@@ -11,18 +11,18 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from express50.cameras import Camera
-from express50.rigs.adjust import triangulate_tracks
-from express50.rigs.bundle import ITERATIONS, Freedom, adjust_rig, recorded_pixels
-from express50.rigs.footage import LEAST_POINTS, shared_points
-from express50.rigs.tracks import FEATURE_SIGMA_PX, Seen, Tracks, ideal_pixels, join_verified
-from express50.rigs.world import move_cameras
-from express50.transforms import (
+from express50.geometry.cameras import Camera
+from express50.geometry.transforms import (
     invert_transform,
     make_transform,
     matrix_to_axis_angle,
     rigid_fit,
 )
+from express50.rigs.adjust import triangulate_tracks
+from express50.rigs.bundle import ITERATIONS, Freedom, adjust_rig, recorded_pixels
+from express50.rigs.footage import LEAST_POINTS, shared_points
+from express50.rigs.tracks import FEATURE_SIGMA_PX, Seen, Tracks, ideal_pixels, join_verified
+from express50.rigs.world_frame import move_cameras
 from pipelines.calibrate import graph
 from pipelines.calibrate.board import Observations
 from pipelines.calibrate.bundle import Rig, adjust, residuals

@@ -10,9 +10,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from express50.cameras import Camera
 from express50.errors import CalibrationError
-from express50.rigs.world import canonical_from_rig, move_cameras
+from express50.geometry.cameras import Camera
+from express50.rigs.world_frame import canonical_from_rig, move_cameras
 from pipelines.calibrate import graph
 from pipelines.calibrate.board import Observations, even
 from pipelines.calibrate.bundle import Rig, adjust, residuals

@@ -7,16 +7,16 @@ from pathlib import Path
 
 import numpy as np
 
-from express50.calibration_file import read_cameras, write_cameras
-from express50.cameras import Camera, resized
+from express50.capture.index import Index, calibration_file, index_path, read_index
+from express50.contract.layout import Dataset
+from express50.contract.stage import Stage
 from express50.errors import CalibrationError, CaptureError
-from express50.index import Index, calibration_file, index_path, read_index
+from express50.files.calibration import read_cameras, write_cameras
+from express50.geometry.cameras import Camera, resized
 from express50.landmarks.network import WEIGHTS
-from express50.layout import Dataset
 from express50.rigs.footage import reduced_camera
 from express50.rigs.tracks import undistorted
-from express50.rigs.world import check_meeting
-from express50.stage import Stage
+from express50.rigs.world_frame import check_meeting
 from pipelines.calibrate.board import (
     Observations,
     board_from_table,

@@ -13,8 +13,9 @@ from typing import NoReturn
 
 import numpy as np
 
-from express50.cameras import Camera, triangulate
 from express50.errors import CalibrationError
+from express50.geometry.cameras import Camera, triangulate
+from express50.geometry.transforms import rigid_fit
 from express50.rigs.adjust import triangulate_tracks
 from express50.rigs.bundle import ITERATIONS, Adjusted, Freedom, adjust_rig
 from express50.rigs.footage import LEAST_POINTS, shared_points
@@ -26,8 +27,7 @@ from express50.rigs.tracks import (
     tracks_of,
     undistorted,
 )
-from express50.rigs.world import canonical_from_rig, move_cameras
-from express50.transforms import rigid_fit
+from express50.rigs.world_frame import canonical_from_rig, move_cameras
 from pipelines.calibrate.config import AUTO, CalibrateConfig
 from pipelines.calibrate.faces import face_rig, focal_at, mean_landmarks, start_camera
 from pipelines.calibrate.intrinsics import as_model

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from express50.depth_files import DEPTH_ENDINGS, NORMAL_STEPS
+from express50.dataset.depth_files import DEPTH_ENDINGS, NORMAL_STEPS
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -15,9 +15,9 @@ import cv2
 import numpy as np
 import open3d as o3d
 
-from express50.cameras import Camera, rays, resized
-from express50.images import resize_area
-from express50.raycast import camera_rays
+from express50.files.images import resize_area
+from express50.geometry.cameras import Camera, rays, resized
+from express50.geometry.raycast import camera_rays
 from pipelines.depth.grid import INSIDE, project_fast, sample_image
 from pipelines.depth.raycast import DepthView, jumps
 

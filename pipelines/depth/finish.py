@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from express50.errors import StageError
-from express50.raycast import mesh_scene
+from express50.geometry.raycast import mesh_scene
 from pipelines.depth.blocks import VOXEL_LIMIT, Grid
 from pipelines.depth.bodies import largest_body
 from pipelines.depth.config import DepthConfig

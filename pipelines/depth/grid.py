@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from express50.adapters import cell_to_corner, corner_to_cell
-from express50.cameras import Camera, project
 from express50.errors import StageError
+from express50.geometry.cameras import Camera, project
+from express50.geometry.conventions import cell_to_corner, corner_to_cell
 
 INSIDE = 0.5  # alpha at a silhouette
 UNSEEN = 1.0  # metres; the distance given to space that too few cameras see

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 import open3d as o3d
 
-from express50.adapters import cell_to_corner
-from express50.cameras import rays
-from express50.raycast import mesh_scene
+from express50.geometry.cameras import rays
+from express50.geometry.conventions import cell_to_corner
+from express50.geometry.raycast import mesh_scene
 from pipelines.depth.grid import View, sample_image
 
 REACH = (

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from express50.depth_files import write_depth, write_normals
+from express50.dataset.depth_files import write_depth, write_normals
 from express50.errors import StageError
-from express50.images import srgb_to_linear, write_image
+from express50.files.images import srgb_to_linear, write_image
 from pipelines.depth.config import DepthConfig
 from pipelines.depth.finish import Surface
 from pipelines.depth.raycast import DepthView

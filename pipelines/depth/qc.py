@@ -7,8 +7,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from express50.cameras import Camera
-from express50.images import contact_sheet, write_image
+from express50.files.images import contact_sheet, write_image
+from express50.geometry.cameras import Camera
 from pipelines.depth.consistency import Agreement
 from pipelines.depth.raycast import DepthView
 

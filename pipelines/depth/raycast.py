@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 import open3d as o3d
 
-from express50.cameras import Camera, rays
-from express50.raycast import camera_rays
+from express50.geometry.cameras import Camera, rays
+from express50.geometry.raycast import camera_rays
 from pipelines.depth.finish import Surface
 from pipelines.depth.grid import INSIDE
 

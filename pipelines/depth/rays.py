@@ -14,8 +14,8 @@ import numpy as np
 import open3d as o3d
 import torch
 
-from express50.cameras import rays
-from express50.raycast import camera_rays, mesh_scene
+from express50.geometry.cameras import rays
+from express50.geometry.raycast import camera_rays, mesh_scene
 from pipelines.depth.grid import View
 
 MARGIN = 2.0  # voxels from the surface to where samples begin

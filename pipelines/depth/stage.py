@@ -7,15 +7,15 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from express50.capture.frames import peak_items, read_cameras_of, read_frame, read_peaks
+from express50.capture.index import index_path
+from express50.contract.layout import Dataset
+from express50.contract.stage import Stage
+from express50.dataset.tracks import read_track
 from express50.errors import CaptureError, FormatError, StageError
-from express50.frames import peak_items, read_cameras_of, read_frame, read_peaks
+from express50.files.images import read_alpha
+from express50.geometry.raycast import mesh_scene
 from express50.head.load import load_head
-from express50.images import read_alpha
-from express50.index import index_path
-from express50.layout import Dataset
-from express50.raycast import mesh_scene
-from express50.stage import Stage
-from express50.tracks import read_track
 from pipelines.depth.config import PRESETS, DepthConfig
 from pipelines.depth.consistency import Agreement, agreements, make_shot, vouched
 from pipelines.depth.finish import Surface

@@ -11,8 +11,8 @@ from scipy.ndimage import maximum_filter, minimum_filter
 from scipy.sparse.linalg import cg
 from skimage.measure import marching_cubes
 
-from express50.adapters import cell_to_corner
-from express50.cameras import unproject
+from express50.geometry.cameras import unproject
+from express50.geometry.conventions import cell_to_corner
 from pipelines.depth.blocks import (
     BLOCK,
     HELD,

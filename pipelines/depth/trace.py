@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
-from express50.cameras import Camera, rays
+from express50.geometry.cameras import Camera, rays
 from pipelines.depth.blocks import Grid
 from pipelines.depth.finish import Surface
 from pipelines.depth.raycast import DepthView, depth_view

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from express50.cameras import Camera, resized
 from express50.errors import StageError
-from express50.images import resize_area
+from express50.files.images import resize_area
+from express50.geometry.cameras import Camera, resized
 from pipelines.depth.grid import (
     INSIDE,
     View,

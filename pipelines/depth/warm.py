@@ -16,14 +16,14 @@ from pathlib import Path
 import numpy as np
 import open3d as o3d
 
-from express50.arrays import DAMAGE
+from express50.capture.frames import read_peaks
+from express50.contract.layout import Dataset
+from express50.dataset.tracks import Track, read_track
 from express50.errors import FormatError
-from express50.frames import read_peaks
+from express50.files.arrays import DAMAGE
+from express50.files.text import read_bytes, reason
+from express50.geometry.raycast import mesh_scene
 from express50.head.load import load_head
-from express50.layout import Dataset
-from express50.raycast import mesh_scene
-from express50.reading import read_bytes, reason
-from express50.tracks import Track, read_track
 from pipelines.depth.config import DepthConfig
 from pipelines.depth.grid import View
 from pipelines.depth.prior import Prior, matte_agreement

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from express50.images import srgb_to_linear
+from express50.files.images import srgb_to_linear
 
 CELLS = 16
 DARK, BRIGHT = 0.004, 0.85  # linear light between which a cell tells the camera's gain

@@ -11,16 +11,16 @@ from pathlib import Path
 
 import numpy as np
 
-from express50.capture import RawCamera, RawCapture
-from express50.digests import file_sha256, text_digest
+from express50.capture.frames import corrected, dhash
+from express50.capture.index import CameraSource
+from express50.capture.raw import RawCamera, RawCapture
 from express50.errors import CaptureError
-from express50.exif import upright
-from express50.frames import corrected, dhash
-from express50.images import encode_jpeg, resize_area
-from express50.index import CameraSource
-from express50.media import WITHIN, inside, read_picture
-from express50.publish import dump_json
-from express50.video import iterate_video
+from express50.files.atomic import dump_json
+from express50.files.containers import WITHIN, inside, read_picture
+from express50.files.digests import file_sha256, text_digest
+from express50.files.exif import upright
+from express50.files.images import encode_jpeg, resize_area
+from express50.files.video import iterate_video
 from pipelines.ingest.config import IngestConfig
 from pipelines.ingest.focus import edge_width
 from pipelines.ingest.light import cells_of

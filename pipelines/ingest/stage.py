@@ -16,22 +16,22 @@ from pathlib import Path
 
 import numpy as np
 
-from express50.calibration_file import write_cameras
-from express50.cameras import Camera
-from express50.capture import RawCapture, check_calibrated_sizes
-from express50.captures.read import OURS, read_any, subject_of, watched
-from express50.demographics import public_meta
-from express50.digests import stat_digest, text_digest
+from express50.capture.demographics import public_meta
+from express50.capture.frames import decode_proxy
+from express50.capture.index import TRANSLATED, CameraSource, Cue, Index, index_to_json
+from express50.capture.raw import RawCapture, check_calibrated_sizes
+from express50.capture.readers.read import OURS, read_any, subject_of, watched
+from express50.contract.layout import Dataset
+from express50.contract.stage import Stage
+from express50.dataset.withdraw import withdrawn
 from express50.errors import CaptureError, FormatError, StageError
-from express50.frames import decode_proxy
-from express50.images import contact_sheet, write_image
-from express50.index import TRANSLATED, CameraSource, Cue, Index, index_to_json
-from express50.layout import Dataset
-from express50.publish import dump_json, write_json
-from express50.reading import read_json_table
+from express50.files.atomic import dump_json, write_json
+from express50.files.calibration import write_cameras
+from express50.files.digests import stat_digest, text_digest
+from express50.files.images import contact_sheet, write_image
+from express50.files.text import read_json_table
+from express50.geometry.cameras import Camera
 from express50.rigs.build import at_size
-from express50.stage import Stage
-from express50.withdraw import withdrawn
 from pipelines.ingest.checks import look
 from pipelines.ingest.config import PRESETS, IngestConfig
 from pipelines.ingest.scan import Seen, remove_proxies, scan_camera, time_gaps, trimmed

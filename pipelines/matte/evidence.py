@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from express50.adapters import opencv_pixels_to_corner
+from express50.geometry.conventions import opencv_pixels_to_corner
 from pipelines.matte.config import MatteConfig
 from pipelines.matte.hull import (
     CLEAR,

@@ -16,9 +16,9 @@ import cv2
 import numpy as np
 from scipy import ndimage
 
-from express50.adapters import cell_centres
-from express50.cameras import Camera
-from express50.rigs.world import meeting_point
+from express50.geometry.cameras import Camera
+from express50.geometry.conventions import cell_centres
+from express50.rigs.world_frame import meeting_point
 
 CUBE = 1.6  # half side of the cube, in radii of the ball
 BODY = 0.8  # radii that the subject may reach on from where it leaves the ball

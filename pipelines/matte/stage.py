@@ -8,14 +8,14 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from express50.adapters import undistorted_mask
-from express50.cameras import Camera, pinhole, resized
+from express50.capture.frames import peak_items, read_cameras_of, read_frame, read_peaks
+from express50.capture.index import index_path
+from express50.contract.layout import Dataset
+from express50.contract.stage import Stage
 from express50.errors import FormatError, StageError
-from express50.frames import peak_items, read_cameras_of, read_frame, read_peaks
-from express50.images import contact_sheet, read_alpha, resize_area, write_image
-from express50.index import index_path
-from express50.layout import Dataset
-from express50.stage import Stage
+from express50.files.images import contact_sheet, read_alpha, resize_area, write_image
+from express50.geometry.cameras import Camera, pinhole, resized
+from express50.geometry.conventions import undistorted_mask
 from pipelines.matte.agreement import Agreement, agree
 from pipelines.matte.config import PRESETS, MatteConfig
 from pipelines.matte.hull import INSIDE, Ball, View, ball_of, center_of, projection_of

@@ -6,7 +6,7 @@ import hashlib
 from collections import Counter
 from collections.abc import Mapping, Sequence
 
-from express50.demographics import (
+from express50.capture.demographics import (
     LEAST_PEOPLE,
     age_counts,
     gender_counts,

@@ -6,10 +6,10 @@ from functools import lru_cache
 
 import numpy as np
 
-from express50.frames import read_plate
-from express50.images import scale_light
-from express50.index import read_index
-from express50.layout import Dataset
+from express50.capture.frames import read_plate
+from express50.capture.index import read_index
+from express50.contract.layout import Dataset
+from express50.files.images import scale_light
 from pipelines.alpha.foreground import own_colours
 from pipelines.alpha.plate import exposed, exposure_gain
 from pipelines.pack.crop import Crop, cut_image

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from express50.adapters import cell_centres, corner_to_cell
-from express50.cameras import Camera, crop_camera, project, resized
-from express50.images import resize_area
+from express50.files.images import resize_area
+from express50.geometry.cameras import Camera, crop_camera, project, resized
+from express50.geometry.conventions import cell_centres, corner_to_cell
 
 EDGE = 0.01  # neighbours whose depths differ by more than this share lie on two surfaces
 

@@ -8,13 +8,17 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from express50.cameras import Camera
-from express50.captures.person import read_people
-from express50.depth_files import depth_file, read_depth
+from express50.capture.frames import read_frame
+from express50.capture.index import index_path, read_index
+from express50.capture.readers.person import read_people
+from express50.contract.exclusions import exclusion_reason
+from express50.contract.layout import Dataset
+from express50.contract.segmentation_labels import COLOURS
+from express50.contract.stage import Stage
+from express50.dataset.depth_files import depth_file, read_depth
 from express50.errors import CaptureError, FormatError, StageError
-from express50.exclusions import exclusion_reason
-from express50.frames import read_frame
-from express50.images import (
+from express50.files.atomic import write_json
+from express50.files.images import (
     DEPTH_LIMIT_M,
     DEPTH_UNIT_M,
     contact_sheet,
@@ -23,16 +27,12 @@ from express50.images import (
     read_image,
     write_image,
 )
-from express50.index import index_path, read_index
-from express50.layout import Dataset
-from express50.parts import COLOURS
-from express50.publish import write_json
-from express50.reading import read_json_table
-from express50.shards import ShardReader
-from express50.shards_codecs import encode_pictures
-from express50.shards_offsets import write_offsets
-from express50.shards_write import PackedSample, ShardWriter, sample_key, write_manifest
-from express50.stage import Stage
+from express50.files.text import read_json_table
+from express50.geometry.cameras import Camera
+from express50.shards.codecs import encode_pictures
+from express50.shards.offsets import write_offsets
+from express50.shards.reader import ShardReader
+from express50.shards.writer import PackedSample, ShardWriter, sample_key, write_manifest
 from pipelines.pack.card import people_lines, split_subjects, write_card
 from pipelines.pack.colour import evened, own_picture
 from pipelines.pack.config import PRESETS, PackConfig

@@ -6,14 +6,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from express50.cameras import Camera
+from express50.capture.frames import read_cameras_of, read_gains, read_peaks
+from express50.capture.index import read_index
+from express50.contract.exclusions import exclusion_reason
+from express50.contract.layout import Dataset
+from express50.dataset.tracks import read_track, track_file
 from express50.errors import CaptureError, FormatError, StageError
-from express50.exclusions import exclusion_reason
-from express50.frames import read_cameras_of, read_gains, read_peaks
-from express50.index import read_index
-from express50.layout import Dataset
-from express50.reading import read_json_table
-from express50.tracks import read_track, track_file
+from express50.files.text import read_json_table
+from express50.geometry.cameras import Camera
 
 PARAMETERS = ("expression", "neck", "jaw", "eyes", "R", "t")
 

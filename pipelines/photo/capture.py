@@ -11,17 +11,17 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from express50.calibration_file import camera_rows
-from express50.capture import IMAGE_SUFFIXES
-from express50.digests import file_sha256
+from express50.capture.raw import IMAGE_SUFFIXES
 from express50.errors import CaptureError
-from express50.footage import VideoFootage
+from express50.files.atomic import dump_json, write_bytes
+from express50.files.calibration import camera_rows
+from express50.files.digests import file_sha256
+from express50.files.images import encode_png
+from express50.files.video import video_fps
+from express50.files.video_writer import VideoFootage
 from express50.head.load import load_head
-from express50.images import encode_png
 from express50.landmarks.detector import Detection, detect
 from express50.landmarks.network import load_network
-from express50.publish import dump_json, write_bytes
-from express50.video import video_fps
 from pipelines.photo.focal import Focal, single_camera, weigh_focal
 from pipelines.photo.picture import (
     Picture,

@@ -7,14 +7,14 @@ from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
-from express50.capture import NAME
+from express50.capture.raw import NAME
+from express50.cli.stages import add_config_options, config_of, load_stage
 from express50.console import FAILED, OK, say, say_json, stdout_to_stderr
+from express50.contract.layout import Dataset
 from express50.errors import ConfigError
-from express50.layout import Dataset
-from express50.pool import Pool
-from express50.runner import Summary, run_stage
-from express50.stage_cli import add_config_options, config_of, load_stage
-from express50.threads import cap_threads
+from express50.runner.executor import Pool
+from express50.runner.runner import Summary, run_stage
+from express50.runner.threads import cap_threads
 from pipelines import ingest
 from pipelines.photo.capture import make_photo_capture, subject_id
 from pipelines.photo.focal import Focal

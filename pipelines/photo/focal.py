@@ -12,8 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from express50.cameras import Camera, pinhole_camera
 from express50.errors import StageError
+from express50.geometry.cameras import Camera, pinhole_camera
 from express50.head.model import landmarks
 from express50.landmarks.detector import Detection
 from pipelines.track.config import TrackConfig

@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from express50.frames import read_cameras_of, read_frame
+from express50.capture.frames import read_cameras_of, read_frame
+from express50.contract.layout import Dataset
+from express50.files.images import write_image
 from express50.head.load import load_head
 from express50.head.preview import render_preview
-from express50.images import write_image
 from express50.landmarks.sources import open_source
-from express50.layout import Dataset
 from pipelines.track.config import TrackConfig
 from pipelines.track.overlay import draw_column
 

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
-from express50.parts import LABELS, label_mask
+from express50.contract.segmentation_labels import LABELS, label_mask
 from pipelines.regions.labels import SCALP
 from pipelines.regions.view import HAIR, TORSO, Geometry
 

@@ -8,8 +8,8 @@ import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
+from express50.contract.segmentation_labels import LABELS
 from express50.head.model import HeadModel
-from express50.parts import LABELS
 
 SCALP = len(LABELS)
 """Skin that may bear hair: a label of the mesh alone, never written."""

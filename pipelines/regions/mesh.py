@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 import open3d as o3d
 
-from express50.cameras import Camera, crop_camera, project, rays
-from express50.parts import LABELS
-from express50.raycast import mesh_scene
+from express50.contract.segmentation_labels import LABELS
+from express50.geometry.cameras import Camera, crop_camera, project, rays
+from express50.geometry.raycast import mesh_scene
 from pipelines.regions.labels import SCALP, HeadLabels
 
 BEARINGS = 36  # around the neck, at which the height of its lower end is known

@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from express50.parts import COLOURS, LABELS
+from express50.contract.segmentation_labels import COLOURS, LABELS
 
 
 def label_shares(labels: np.ndarray) -> dict[str, float]:

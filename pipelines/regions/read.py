@@ -6,14 +6,14 @@ from functools import lru_cache
 
 import numpy as np
 
-from express50.cameras import Camera
-from express50.depth_files import depth_file, read_depth
+from express50.capture.frames import read_frame
+from express50.contract.layout import Dataset
+from express50.dataset.depth_files import depth_file, read_depth
+from express50.dataset.tracks import read_track, track_file
 from express50.errors import FormatError, StageError
-from express50.frames import read_frame
+from express50.files.images import read_alpha
+from express50.geometry.cameras import Camera
 from express50.head.load import load_head
-from express50.images import read_alpha
-from express50.layout import Dataset
-from express50.tracks import read_track, track_file
 from pipelines.regions.config import RegionsConfig
 from pipelines.regions.labels import HeadLabels, head_labels
 from pipelines.regions.mesh import TrackedHead, make_head

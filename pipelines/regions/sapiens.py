@@ -10,7 +10,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from express50.parts import LABELS, label_mask
+from express50.contract.segmentation_labels import LABELS, label_mask
 from pipelines.networks import Network, Role, resized
 
 SAPIENS = Role(setting="regions.segmentation", inputs=("image",))

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from express50.parts import LABELS
+from express50.contract.segmentation_labels import LABELS
 from pipelines.regions.labels import SCALP
 
 SOLID = 0.99  # alpha over which a pixel's colour is the subject's alone

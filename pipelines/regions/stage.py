@@ -9,15 +9,15 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from express50.cameras import Camera, resized
-from express50.depth_files import depth_file
+from express50.capture.frames import peak_items, read_cameras_of, read_peaks
+from express50.capture.index import index_path
+from express50.contract.layout import Dataset
+from express50.contract.stage import Stage
+from express50.dataset.depth_files import depth_file
+from express50.dataset.tracks import track_file
 from express50.errors import CaptureError, FormatError, StageError
-from express50.frames import peak_items, read_cameras_of, read_peaks
-from express50.images import contact_sheet, fit_into, resize_area, write_image
-from express50.index import index_path
-from express50.layout import Dataset
-from express50.stage import Stage
-from express50.tracks import track_file
+from express50.files.images import contact_sheet, fit_into, resize_area, write_image
+from express50.geometry.cameras import Camera, resized
 from pipelines.regions.colour import SKIN, by_colour, face_colours
 from pipelines.regions.config import PRESETS, RegionsConfig
 from pipelines.regions.labels import SCALP, HeadLabels

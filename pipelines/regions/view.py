@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from express50.adapters import opencv_pixels_to_corner
-from express50.cameras import Camera, unproject
-from express50.images import edge_distance
-from express50.parts import HEAD, LABELS, label_mask
+from express50.contract.segmentation_labels import HEAD, LABELS, label_mask
+from express50.files.images import edge_distance
+from express50.geometry.cameras import Camera, unproject
+from express50.geometry.conventions import opencv_pixels_to_corner
 from pipelines.regions.mesh import TrackedHead, see
 
 HAIR, TORSO = np.uint8(LABELS.index("hair")), np.uint8(LABELS.index("torso"))

@@ -9,12 +9,12 @@ import cv2
 import numpy as np
 import torch
 
-from express50.adapters import cell_to_corner
-from express50.cameras import Camera
 from express50.errors import StageError
+from express50.files.images import linear_to_srgb, write_image
+from express50.geometry.cameras import Camera
+from express50.geometry.conventions import cell_to_corner
+from express50.geometry.mesh_raster import rasterize
 from express50.head.model import HeadModel, vertex_normals
-from express50.images import linear_to_srgb, write_image
-from express50.mesh_raster import rasterize
 from pipelines.track.appearance import Appearance, Seen
 from pipelines.track.photometry import look, robust_mean
 from pipelines.track.pictures import Moment, inside_picture

@@ -10,12 +10,12 @@ from pathlib import Path
 
 import numpy as np
 
-from express50.arrays import read_arrays
-from express50.digests import path_digest, text_digest, value_digest
+from express50.capture.index import Cue
+from express50.dataset.tracks import SEQUENCE_SCHEMA
 from express50.errors import FormatError, StageError
-from express50.index import Cue
-from express50.publish import write_bytes
-from express50.tracks import SEQUENCE_SCHEMA
+from express50.files.arrays import read_arrays
+from express50.files.atomic import write_bytes
+from express50.files.digests import path_digest, text_digest, value_digest
 from pipelines.track.config import VERSION, TrackConfig
 from pipelines.track.marks import Eyes
 from pipelines.track.observe import Observation

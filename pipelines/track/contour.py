@@ -15,9 +15,9 @@ import numpy as np
 import open3d as o3d
 import torch
 
-from express50.cameras import Camera
+from express50.geometry.cameras import Camera
+from express50.geometry.raycast import mesh_scene
 from express50.head.model import HeadModel, vertex_normals
-from express50.raycast import mesh_scene
 
 JAW = 17
 # Cosine of the angle between skin and line of sight: above it a point is in plain view, and within

@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from express50.errors import StageError
-from express50.transforms import axis_angle_to_matrix
+from express50.geometry.transforms import axis_angle_to_matrix
 from pipelines.track.config import TrackConfig
 from pipelines.track.observe import Observation
 from pipelines.track.offsets import MODE

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from express50.cameras import Camera
+from express50.capture.frames import read_cameras_of, read_frame, read_peaks
+from express50.contract.layout import Dataset
 from express50.errors import CaptureError
-from express50.frames import read_cameras_of, read_frame, read_peaks
-from express50.images import read_alpha
+from express50.files.images import read_alpha
+from express50.geometry.cameras import Camera
 from express50.landmarks.sources import Source, open_source
-from express50.layout import Dataset
 from pipelines.track.config import TrackConfig
 from pipelines.track.lids import shut_lids
 from pipelines.track.observe import Observation, View, agree, make_view

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from express50.cameras import Camera
+from express50.geometry.cameras import Camera
 from express50.head.model import HeadModel, vertex_normals
 from pipelines.track.photometry import look
 from pipelines.track.pinhole import inside_frame

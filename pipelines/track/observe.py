@@ -8,7 +8,7 @@ from typing import Protocol
 
 import numpy as np
 
-from express50.cameras import Camera, triangulate
+from express50.geometry.cameras import Camera, triangulate
 from express50.landmarks.iris import Irises
 from express50.landmarks.sources import Marked
 from pipelines.track.pinhole import project_pinhole, project_with_slope

@@ -12,11 +12,11 @@ import cv2
 import numpy as np
 import open3d as o3d
 
-from express50.adapters import corner_to_cell
-from express50.cameras import Camera, resized
+from express50.files.images import edge_distance
+from express50.geometry.cameras import Camera, resized
+from express50.geometry.conventions import corner_to_cell
+from express50.geometry.raycast import mesh_scene
 from express50.head.model import HeadModel
-from express50.images import edge_distance
-from express50.raycast import mesh_scene
 from pipelines.track.pinhole import project_with_slope
 
 # Head outlines count as about this many independent points a view.

@@ -9,13 +9,13 @@ import numpy as np
 import open3d as o3d
 import torch
 
-from express50.adapters import affine_to_opencv
-from express50.cameras import Camera
-from express50.frames import read_cameras_of, read_frame
+from express50.capture.frames import read_cameras_of, read_frame
+from express50.contract.layout import Dataset
+from express50.files.images import write_image
+from express50.geometry.cameras import Camera
+from express50.geometry.conventions import affine_to_opencv
+from express50.geometry.raycast import mesh_scene
 from express50.head.model import HeadModel, landmarks
-from express50.images import write_image
-from express50.layout import Dataset
-from express50.raycast import mesh_scene
 from pipelines.track.observe import facing
 from pipelines.track.pinhole import project_pinhole
 from pipelines.track.state import Target

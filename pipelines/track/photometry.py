@@ -15,8 +15,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from express50.adapters import corner_to_cell
-from express50.cameras import Camera
+from express50.geometry.cameras import Camera
+from express50.geometry.conventions import corner_to_cell
 from pipelines.track.pinhole import project_with_slope
 
 # The most that a moment's pictures may count, as independent observations of the surface.

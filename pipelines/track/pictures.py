@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from express50.cameras import Camera
+from express50.geometry.cameras import Camera
 from express50.head.model import HeadModel
 from pipelines.track.appearance import (
     Appearance,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from express50.cameras import Camera
+from express50.geometry.cameras import Camera
 
 NEAREST_M = 1e-9
 

@@ -15,9 +15,9 @@ import numpy as np
 import open3d as o3d
 from scipy.spatial import cKDTree
 
-from express50.adapters import corner_to_cell
-from express50.cameras import Camera
-from express50.raycast import mesh_scene
+from express50.geometry.cameras import Camera
+from express50.geometry.conventions import corner_to_cell
+from express50.geometry.raycast import mesh_scene
 from pipelines.track.pinhole import project_with_slope
 
 PATCH = 7

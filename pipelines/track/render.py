@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 import torch
 
+from express50.files.images import LIGHT_OF_LEVEL, srgb_to_linear
+from express50.geometry.mesh_render import sh_light
 from express50.head.model import HeadModel
-from express50.images import LIGHT_OF_LEVEL, srgb_to_linear
-from express50.mesh_render import sh_light
 from pipelines.track import appearance as model_of_light
 from pipelines.track.bake import bake_albedo
 from pipelines.track.config import TrackConfig

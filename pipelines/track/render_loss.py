@@ -13,11 +13,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from express50.cameras import Camera, resized
-from express50.checks import check_finite, check_shape
-from express50.head.model import HeadModel, vertex_normals
-from express50.images import resize_area
-from express50.mesh_render import (
+from express50.files.images import resize_area
+from express50.geometry.cameras import Camera, resized
+from express50.geometry.mesh_render import (
     Covered,
     antialias,
     barycentrics,
@@ -26,6 +24,8 @@ from express50.mesh_render import (
     sample_texture,
     sh_light,
 )
+from express50.geometry.shapes import check_finite, check_shape
+from express50.head.model import HeadModel, vertex_normals
 
 OUTLINE_SOFTNESS = 0.1  # blended coverage is right to some hundredths: less counts squared
 STALE = 0.5  # weights so far outside [0, 1] belong to a pixel that its face has left

@@ -15,15 +15,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from express50.cameras import transform_camera
 from express50.errors import StageError
+from express50.geometry.cameras import transform_camera
+from express50.geometry.mesh_raster import face_neighbors, rasterize
+from express50.geometry.mesh_render import Covered, covered
+from express50.geometry.transforms import axis_angle_to_matrix as axis_angle_to_array
+from express50.geometry.transforms import make_transform
+from express50.geometry.transforms_torch import axis_angle_to_matrix
 from express50.head.model import HeadModel
 from express50.head.model import pose as pose_head
-from express50.mesh_raster import face_neighbors, rasterize
-from express50.mesh_render import Covered, covered
-from express50.torch_transforms import axis_angle_to_matrix
-from express50.transforms import axis_angle_to_matrix as axis_angle_to_array
-from express50.transforms import make_transform
 from pipelines.track.adam import Adam
 from pipelines.track.config import TrackConfig
 from pipelines.track.priors import prior

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 import open3d as o3d
 
-from express50.cameras import Camera
+from express50.geometry.cameras import Camera
+from express50.geometry.raycast import mesh_scene
 from express50.head.model import HeadModel
-from express50.raycast import mesh_scene
 
 SEEN = (
     "face", "nose", "lips",

@@ -9,7 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from express50.images import fit_into, write_image
+from express50.files.images import fit_into, write_image
 
 TILE, COLUMNS = 192, 8
 BAND, BAR = 20, 18  # heights of a tile's words and of a camera's row, pixels

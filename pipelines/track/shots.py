@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from express50.cameras import Camera, crop_camera, resized
-from express50.images import LIGHT_OF_LEVEL, resize_area
+from express50.files.images import LIGHT_OF_LEVEL, resize_area
+from express50.geometry.cameras import Camera, crop_camera, resized
 from pipelines.track.pinhole import project_pinhole
 
 MARGIN = 0.15

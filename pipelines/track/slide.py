@@ -14,7 +14,7 @@ from functools import lru_cache
 import numpy as np
 import torch
 
-from express50.adapters import corner_to_cell
+from express50.geometry.conventions import corner_to_cell
 from express50.head.model import HeadModel, vertex_normals
 from express50.landmarks.network import LandmarkNet, load_network
 from pipelines.track.chart.layout import HEIGHT, LIPS_APART, WIDTH, Chart, sampled

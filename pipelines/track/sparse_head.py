@@ -11,8 +11,8 @@ from dataclasses import dataclass, field
 import numpy as np
 import torch
 
+from express50.geometry.transforms_torch import axis_angle_to_matrix
 from express50.head.model import HeadModel, joint_transforms, skin
-from express50.torch_transforms import axis_angle_to_matrix
 
 POSE_SIZE = 18
 

@@ -9,14 +9,14 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from express50.capture.frames import read_cameras_of
+from express50.capture.index import index_path, read_index
+from express50.contract.layout import Dataset
+from express50.contract.stage import Stage
 from express50.errors import ConfigError, StageError
-from express50.frames import read_cameras_of
 from express50.head.load import load_head
 from express50.head.model import HeadModel, landmarks
-from express50.index import index_path, read_index
 from express50.landmarks.sources import Source, source_files
-from express50.layout import Dataset
-from express50.stage import Stage
 from pipelines.track.bake import write_texture
 from pipelines.track.chart.network import WEIGHTS as CHART_WEIGHTS
 from pipelines.track.clips import write_clips

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from express50.errors import StageError
-from express50.transforms import rigid_fit, similarity_fit
+from express50.geometry.transforms import rigid_fit, similarity_fit
 from pipelines.track.config import TrackConfig
 from pipelines.track.fit import landmark_sigma
 from pipelines.track.observe import Observation, facing

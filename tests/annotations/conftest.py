@@ -2,9 +2,9 @@
 
 import pytest
 
-from express50.config import resolve_config
-from express50.layout import Dataset
-from express50.runner import run_stage
+from express50.contract.config import resolve_config
+from express50.contract.layout import Dataset
+from express50.runner.runner import run_stage
 from pipelines import ingest
 from tests.annotations.footage import EXPRESSIONS, suggest
 from tests.synth import make_capture

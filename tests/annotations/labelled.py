@@ -2,8 +2,8 @@
 
 import json
 
-from express50.index import CameraSource, Cue, Index, index_path, index_to_json
-from express50.layout import Dataset
+from express50.capture.index import CameraSource, Cue, Index, index_path, index_to_json
+from express50.contract.layout import Dataset
 
 EXPRESSIONS = ("neutral", "smile", "wink_left")
 LENGTH = 10  # frames of each cue window

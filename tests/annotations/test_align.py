@@ -11,11 +11,11 @@ from annotations.reference import choose_reference
 from annotations.store import append_label, current_labels, read_labels
 from annotations.suggestions import read_suggestions
 from annotations.watch import FACE
-from express50.cli import main
-from express50.config import build_config
+from express50.capture.index import read_index
+from express50.cli.main import main
+from express50.contract.config import build_config
 from express50.errors import FormatError
-from express50.index import read_index
-from express50.runner import run_stage
+from express50.runner.runner import run_stage
 from tests.annotations.footage import EXPRESSIONS, FRAMES_EACH
 
 FACE_POINTS = np.random.default_rng(0).uniform(0, 100, (68, 2))

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from annotations.agreement import Clip, agreement, interval_alpha
-from express50.cli import main
-from express50.exclusions import included_subjects
+from express50.cli.main import main
+from express50.contract.exclusions import included_subjects
 
 from .labelled import EXPRESSIONS, make_dataset, suggest
 

@@ -12,7 +12,7 @@ import pytest
 
 from annotations.labels import make_mark
 from annotations.store import append_label, current_labels, labels_of, read_labels
-from express50.index import read_index
+from express50.capture.index import read_index
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 KILLED = {"bob": 17, "dot": 41}  # after so many acknowledged events
@@ -24,7 +24,7 @@ sys.path[:0] = sys.argv[4:]
 from annotations.ui.scene import load_scene
 from annotations.ui.session import open_session
 from annotations.ui.view import go_to, open_view
-from express50.layout import Dataset
+from express50.contract.layout import Dataset
 
 who = sys.argv[2]
 dice = random.Random(who)

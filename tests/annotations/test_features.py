@@ -16,7 +16,7 @@ from annotations.match import shared_columns
 from annotations.observe import Observations
 from annotations.suggest import strongest_event
 from annotations.watch import FACE, face_side, find_points, steady
-from express50.expressions import load_script
+from express50.capture.expressions import load_script
 from express50.landmarks.network import load_network
 
 FACE_POINTS = np.random.default_rng(0).uniform(0, 100, (68, 2))

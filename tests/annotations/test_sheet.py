@@ -13,11 +13,11 @@ from annotations.sheet import make_sheet
 from annotations.sheet_page import STRIP_WIDTH, render_sheet, take_pictures
 from annotations.store import append_label
 from annotations.ui.frames import crop_to
-from express50.cli import main
+from express50.capture.frames import read_proxy
+from express50.capture.index import read_index
+from express50.cli.main import main
 from express50.errors import AnnotationError
-from express50.frames import read_proxy
-from express50.images import decode_image
-from express50.index import read_index
+from express50.files.images import decode_image
 from tests.annotations.footage import suggest
 
 

@@ -8,9 +8,9 @@ import pytest
 
 from annotations.labels import AUTOMATIC, Label, make_flag, make_mark, make_undo
 from annotations.store import append_label, current_labels, human_digest, labels_of, read_labels
+from express50.capture.index import CameraSource, Cue, Index
+from express50.contract.layout import Dataset
 from express50.errors import AnnotationError
-from express50.index import CameraSource, Cue, Index
-from express50.layout import Dataset
 
 
 def _index(tmp_path):

@@ -7,9 +7,9 @@ from annotations.reference import canonical, choose_reference, reference_subject
 from annotations.store import append_label
 from annotations.suggestions import read_suggestions
 from annotations.worklist import worklist
+from express50.capture.index import read_index
+from express50.contract.exclusions import exclusion_reason, included_subjects
 from express50.errors import AnnotationError, FormatError
-from express50.exclusions import exclusion_reason, included_subjects
-from express50.index import read_index
 from tests.annotations.labelled import make_dataset, suggest
 
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from express50.cameras import Camera
-from express50.transforms import look_at
+from express50.geometry.cameras import Camera
+from express50.geometry.transforms import look_at
 
 
 def camera(

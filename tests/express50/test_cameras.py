@@ -6,9 +6,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from express50 import adapters, calibration_file, cameras, transforms
-from express50.cameras import Camera
 from express50.errors import CalibrationError
+from express50.files import calibration as calibration_file
+from express50.geometry import cameras, transforms
+from express50.geometry import conventions as adapters
+from express50.geometry.cameras import Camera
 
 POSE = transforms.look_at(np.array([0.1, 0.2, 1.0]), np.zeros(3), np.array([0.0, 1.0, 0.0]))
 OPENCV = Camera("a", 64, 48, "OPENCV", (80, 82, 31, 25, 0.1, -0.05, 0.001, 0.002), POSE)

@@ -4,9 +4,9 @@ import json
 
 import pytest
 
-from express50.capture import check_calibrated_sizes, read_capture, read_cues, read_meta
+from express50.capture.index import Cue
+from express50.capture.raw import check_calibrated_sizes, read_capture, read_cues, read_meta
 from express50.errors import CalibrationError, CaptureError
-from express50.index import Cue
 from tests.synth import make_capture
 
 

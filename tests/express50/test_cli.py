@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from express50 import cli
-from express50.cli import main
+from express50.cli import main as cli
+from express50.cli.main import main
 from tests.synth import make_capture
 
 REPOSITORY = Path(__file__).resolve().parents[2]
@@ -147,7 +147,7 @@ def test_version_and_help(run):
 def test_only_the_module_of_the_asked_command_is_imported(data):
     """Seconds of imports must not stand before a short command."""
     code = (
-        "import sys; from express50.cli import main; main(['status', sys.argv[1]]);"
+        "import sys; from express50.cli.main import main; main(['status', sys.argv[1]]);"
         "heavy = {'torch', 'open3d', 'pycolmap', 'cv2', 'numpy', 'av', 'dask', 'distributed'};"
         "print(sorted(heavy & set(sys.modules)))"
     )
@@ -161,7 +161,7 @@ def test_interrupt_keeps_what_is_finished_and_says_so(run, data, capture, monkey
     def stop(*arguments, **options):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("express50.runner.run_stage", stop)
+    monkeypatch.setattr("express50.runner.runner.run_stage", stop)
     code, out, err = run("ingest", data, capture)
     assert (code, out) == (130, "")
     assert "what is finished is kept" in err

@@ -6,12 +6,12 @@ import time
 
 import pytest
 
-from express50 import clusters
-from express50.clusters import LocalWorkers, RemoteWorkers, cuda_devices
 from express50.errors import StageError
-from express50.pool import Pool
-from express50.runner import run_stage
-from express50.slurm import SlurmJob
+from express50.runner import clusters
+from express50.runner.clusters import LocalWorkers, RemoteWorkers, cuda_devices
+from express50.runner.executor import Pool
+from express50.runner.runner import run_stage
+from express50.runner.slurm import SlurmJob
 from pipelines import alpha, depth, regions
 from tests.faults import toy
 

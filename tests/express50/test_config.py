@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from express50.config import config_toml, field_documents, parse_assignment, resolve_config
+from express50.contract.config import config_toml, field_documents, parse_assignment, resolve_config
+from express50.contract.stage import Stage
 from express50.errors import ConfigError
-from express50.stage import Stage
 
 
 @dataclass(frozen=True, kw_only=True)

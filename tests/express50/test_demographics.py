@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from express50.demographics import (
+from express50.capture.demographics import (
     OTHERS,
     age_counts,
     gender_counts,

@@ -7,9 +7,15 @@ import time
 import numpy as np
 import pytest
 
-from express50.depth_files import depth_file, read_depth, read_normals, write_depth, write_normals
+from express50.dataset.depth_files import (
+    depth_file,
+    read_depth,
+    read_normals,
+    write_depth,
+    write_normals,
+)
 from express50.errors import FormatError
-from express50.images import write_image
+from express50.files.images import write_image
 
 MOST_MM = {"png16": 0.025, "exr16": 0.4883, "exr32": 0.0001}  # of depths from 1 to 2 m
 

@@ -8,13 +8,13 @@ import numpy as np
 import OpenImageIO as oiio
 import pytest
 
-from express50.config import resolve_config
+from express50.capture.frames import read_frame, read_proxy
+from express50.capture.index import read_index
+from express50.contract.config import resolve_config
+from express50.contract.layout import Dataset
 from express50.errors import FormatError
-from express50.exif import read_exif, upright
-from express50.frames import read_frame, read_proxy
-from express50.index import read_index
-from express50.layout import Dataset
-from express50.runner import run_stage
+from express50.files.exif import read_exif, upright
+from express50.runner.runner import run_stage
 from pipelines import ingest
 from pipelines.calibrate.footage import told_focals
 
@@ -98,7 +98,7 @@ def test_an_orientation_that_is_none_is_upright(tmp_path: Path, value: int) -> N
 def test_a_forged_orientation_in_the_index_is_refused(dataset: Dataset, orientation) -> None:
     import json
 
-    from express50.index import index_from_json, index_path
+    from express50.capture.index import index_from_json, index_path
 
     content = json.loads(index_path(dataset, "shots").read_text())
     content["cameras"]["p6"]["orientation"] = orientation

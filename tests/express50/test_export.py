@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 import trimesh
 
-from express50.calibration_file import read_cameras, write_cameras
-from express50.cli import main
-from express50.export.pictures import centred
-from express50.frames import read_cameras_of, read_frame
+from express50.capture.frames import read_cameras_of, read_frame
+from express50.cli.main import main
+from express50.contract.layout import Dataset
+from express50.dataset.export.pictures import centred
+from express50.files.calibration import read_cameras, write_cameras
+from express50.files.images import read_alpha, read_image, srgb_to_linear, write_image
 from express50.head.load import load_head
-from express50.images import read_alpha, read_image, srgb_to_linear, write_image
-from express50.layout import Dataset
 from express50.rigs.transforms_json import read_transforms
 from tests.express50.flame_reader import flame_vertices
 from tests.express50.head.flame_files import write_flame

@@ -3,8 +3,8 @@ import re
 import numpy as np
 import pytest
 
+from express50.capture.expressions import CATEGORIES, load_script, parse_script, select
 from express50.errors import FormatError
-from express50.expressions import CATEGORIES, load_script, parse_script, select
 
 
 def test_script_has_sixty_expressions_and_starts_neutral():

@@ -6,12 +6,8 @@ import tarfile
 import numpy as np
 import pytest
 
-from express50 import frames
-from express50.adapters import undistort_image
-from express50.calibration_file import write_cameras
-from express50.config import resolve_config
-from express50.errors import CaptureError, FormatError, StageError
-from express50.frames import (
+from express50.capture import frames
+from express50.capture.frames import (
     FrameReader,
     dhash,
     read_cameras_of,
@@ -21,10 +17,14 @@ from express50.frames import (
     read_proxy,
     to_srgb8,
 )
-from express50.images import write_image
-from express50.index import read_index
-from express50.layout import Dataset
-from express50.runner import run_stage
+from express50.capture.index import read_index
+from express50.contract.config import resolve_config
+from express50.contract.layout import Dataset
+from express50.errors import CaptureError, FormatError, StageError
+from express50.files.calibration import write_cameras
+from express50.files.images import write_image
+from express50.geometry.conventions import undistort_image
+from express50.runner.runner import run_stage
 from pipelines import ingest
 from tests.synth import make_capture, make_rig, render_ball
 

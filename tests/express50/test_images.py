@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.ndimage import distance_transform_edt
 
-from express50 import images
 from express50.errors import FormatError
+from express50.files import images
 
 RNG = np.random.default_rng(0)
 

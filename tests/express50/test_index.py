@@ -4,9 +4,9 @@ import json
 
 import pytest
 
+from express50.capture.index import Cue, index_from_json, index_path, index_to_json, read_index
+from express50.contract.layout import Dataset
 from express50.errors import FormatError, StageError
-from express50.index import Cue, index_from_json, index_path, index_to_json, read_index
-from express50.layout import Dataset
 
 
 def test_index_describes_the_capture(ingested, capture):
@@ -41,7 +41,10 @@ def test_index_is_read_again_when_the_file_changes(ingested):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda c: c.update(schema="express50.index/9"), "schema is 'express50.index/9'"),
+        (
+            lambda c: c.update(schema="express50.index/9"),
+            "schema is 'express50.index/9'",
+        ),
         (lambda c: c["cameras"]["cam00"].update(pts="1 2"), "camera cam00: .* for 6 frames"),
         (lambda c: c.pop("cues"), "KeyError: 'cues'"),
         (lambda c: c["cameras"]["cam00"].update(colour=1), "colour"),

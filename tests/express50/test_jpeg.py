@@ -7,9 +7,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from express50.errors import CaptureError, FormatError
-from express50.images import decode_image, encode_jpeg, read_image
-from express50.jpeg import cut_short
-from express50.media import read_picture
+from express50.files.containers import read_picture
+from express50.files.images import decode_image, encode_jpeg, read_image
+from express50.files.jpeg import cut_short
 
 PICTURE = np.random.default_rng(0).integers(0, 256, (40, 56, 3), dtype=np.uint8)
 PLAIN = encode_jpeg(PICTURE, 90)

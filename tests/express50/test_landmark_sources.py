@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 import torch
 
-from express50.cameras import Camera, project
 from express50.errors import ConfigError, FormatError
+from express50.geometry.cameras import Camera, project
 from express50.landmarks.detector import Detection, detect
 from express50.landmarks.fan import CROP, fan_window, find_with_fan, load_fan
 from express50.landmarks.iris import EYES, find_irises

@@ -8,15 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from express50.expressions import load_script
+from express50.capture.expressions import load_script
 from express50.head.load import load_head
-from express50.landmarks.acting import random_parameters
-from express50.landmarks.augment import (
-    MIRROR,
-    face_box,
-    make_backgrounds,
-    random_crop,
-)
 from express50.landmarks.detector import (
     _mirrored,
     _pyramid,
@@ -35,9 +28,16 @@ from express50.landmarks.network import (
     load_network,
     save_network,
 )
-from express50.landmarks.scene import HeadScene
-from express50.landmarks.synthetic import random_head
-from express50.landmarks.training_set import (
+from express50.landmarks.training.augment import (
+    MIRROR,
+    face_box,
+    make_backgrounds,
+    random_crop,
+)
+from express50.landmarks.training.poses import random_parameters
+from express50.landmarks.training.render import HeadScene
+from express50.landmarks.training.skin import random_head
+from express50.landmarks.training.training_set import (
     FACE_YAW,
     ViewSet,
     draw_views,

@@ -2,8 +2,8 @@
 
 import pytest
 
+from express50.contract.layout import Dataset
 from express50.errors import FormatError
-from express50.layout import Dataset
 
 
 def test_places_follow_the_documented_layout(tmp_path):

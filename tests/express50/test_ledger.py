@@ -4,10 +4,10 @@ import os
 
 import pytest
 
-from express50.digests import file_sha256, path_digest, stat_digest
 from express50.errors import FormatError, StageError
-from express50.ledger import Ledger
-from express50.receipts import Receipt
+from express50.files.digests import file_sha256, path_digest, stat_digest
+from express50.runner.ledger import Ledger
+from express50.runner.receipts import Receipt
 
 
 @pytest.fixture
@@ -52,7 +52,9 @@ def test_digest_is_cached_until_size_time_or_inode_changes(ledger, tmp_path, mon
     first = ledger.sha256(path)
     assert first == file_sha256(path)
     ledger.keep_digests()
-    monkeypatch.setattr("express50.ledger.file_sha256", lambda path: pytest.fail("read again"))
+    monkeypatch.setattr(
+        "express50.runner.ledger.file_sha256", lambda path: pytest.fail("read again")
+    )
     assert ledger.sha256(path) == first
     monkeypatch.undo()
     path.write_bytes(b"two")

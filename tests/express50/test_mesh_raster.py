@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 import torch
 
-from express50 import mesh_backends, native
-from express50.cameras import Camera
-from express50.head.procedural import build_procedural_head
-from express50.mesh_raster import face_neighbors, rasterize
+from express50 import native
+from express50.geometry import mesh_backends
+from express50.geometry.cameras import Camera
+from express50.geometry.mesh_raster import face_neighbors, rasterize
+from express50.head.generator.head import build_procedural_head
 from tests.express50.mesh_scenes import camera, head_camera, oracle, sphere
 
 

@@ -9,11 +9,10 @@ import pytest
 import torch
 
 from benchmarks.mesh_raster import gradient_ratio
-from express50 import mesh_rows
-from express50.cameras import Camera, resized
-from express50.head.procedural import build_procedural_head
-from express50.mesh_raster import rasterize
-from express50.mesh_render import (
+from express50.geometry import mesh_rows
+from express50.geometry.cameras import Camera, resized
+from express50.geometry.mesh_raster import rasterize
+from express50.geometry.mesh_render import (
     antialias,
     barycentrics,
     compose,
@@ -24,7 +23,8 @@ from express50.mesh_render import (
     sample_texture,
     sh_light,
 )
-from express50.torch_transforms import axis_angle_to_matrix
+from express50.geometry.transforms_torch import axis_angle_to_matrix
+from express50.head.generator.head import build_procedural_head
 from tests.express50.mesh_scenes import camera, head_camera, sphere
 
 F64 = torch.float64

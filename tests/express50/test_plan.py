@@ -5,12 +5,12 @@ import math
 
 import pytest
 
-from express50.cli import main
+from express50.cli.main import main
+from express50.cli.stages import stages
+from express50.contract.layout import Dataset
+from express50.dataset.plan import TARGETS, Footage, Measured, estimate, measure, target_of
 from express50.errors import ConfigError
-from express50.layout import Dataset
-from express50.ledger import Ledger
-from express50.plan import TARGETS, Footage, Measured, estimate, measure, target_of
-from express50.stage_cli import stages
+from express50.runner.ledger import Ledger
 from pipelines import ingest
 from tests.synth import make_capture
 

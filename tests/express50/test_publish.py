@@ -4,15 +4,9 @@ import os
 
 import pytest
 
-from express50.layout import Dataset
-from express50.publish import (
-    clean_leftovers,
-    dump_json,
-    publishing,
-    set_aside,
-    write_bytes,
-    write_json,
-)
+from express50.contract.layout import Dataset
+from express50.files.atomic import dump_json, write_bytes, write_json
+from express50.runner.publish import clean_leftovers, publishing, set_aside
 
 
 @pytest.fixture

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from express50.errors import CaptureError, FormatError
-from express50.reading import parse_json, read_json, read_json_table, read_text, read_toml
+from express50.files.text import parse_json, read_json, read_json_table, read_text, read_toml
 
 
 @pytest.mark.parametrize(

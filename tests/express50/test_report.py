@@ -6,13 +6,13 @@ import re
 import numpy as np
 import pytest
 
-from express50.cli import main
-from express50.images import write_image
-from express50.layout import Dataset
-from express50.ledger import Ledger
-from express50.receipts import Receipt
-from express50.report.collect import Picture, spread
-from express50.report.page import number, render_page
+from express50.cli.main import main
+from express50.contract.layout import Dataset
+from express50.dataset.report.collect import Picture, spread
+from express50.dataset.report.page import number, render_page
+from express50.files.images import write_image
+from express50.runner.ledger import Ledger
+from express50.runner.receipts import Receipt
 
 
 @pytest.fixture

@@ -12,15 +12,15 @@ from unittest.mock import Mock
 
 import pytest
 
-from express50.clusters import RemoteWorkers
 from express50.errors import ConfigError, StageError
-from express50.ledger import Ledger
-from express50.order import select_items
-from express50.pool import Pool
-from express50.progress import format_rate
-from express50.runner import run_stage
-from express50.status import read_status
-from express50.work import Task
+from express50.runner.clusters import RemoteWorkers
+from express50.runner.executor import Pool
+from express50.runner.ledger import Ledger
+from express50.runner.progress import format_rate
+from express50.runner.runner import run_stage
+from express50.runner.schedule import select_items
+from express50.runner.status import read_status
+from express50.runner.worker import Task
 from tests.faults import toy
 from tests.faults.toy import make_dataset, run_toy, tree
 
@@ -203,7 +203,7 @@ def test_receipt_counts_time_and_memory(tmp_path):
 
 
 def test_resolved_config_is_saved_and_can_be_given_back(tmp_path):
-    from express50.config import resolve_config
+    from express50.contract.config import resolve_config
 
     dataset = make_dataset(tmp_path / "data", ["a"])
     run_toy(dataset, word="x", files=4)
@@ -222,7 +222,7 @@ def test_stage_without_items_and_unmatched_pattern_are_errors(tmp_path):
 
 
 def test_unreachable_scheduler_is_one_error(tmp_path, monkeypatch):
-    from express50 import clusters
+    from express50.runner import clusters
 
     dataset = make_dataset(tmp_path / "data", ["a", "b"])
     monkeypatch.setattr(clusters, "CONNECT_SECONDS", 0.5)
@@ -289,7 +289,7 @@ def test_bar_on_a_terminal_shows_count_rate_and_time_left(tmp_path):
     dataset = make_dataset(tmp_path / "data", ["a", "b", "bad1"])
     code = (
         "import sys; from pathlib import Path; from tests.faults import toy;"
-        "from express50.runner import run_stage;"
+        "from express50.runner.runner import run_stage;"
         "run_stage(toy.STAGE, toy.Dataset(Path(sys.argv[1])), toy.ToyConfig(seconds=.1), workers=0)"
     )
     driver, terminal = os.openpty()

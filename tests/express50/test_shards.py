@@ -13,11 +13,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from express50.cli import main
+from express50.cli.main import main
 from express50.errors import FormatError
-from express50.images import depth_to_uint16, encode_jpeg, encode_png, image_size
-from express50.shards import ShardReader
-from express50.shards_write import (
+from express50.files.images import depth_to_uint16, encode_jpeg, encode_png, image_size
+from express50.shards.reader import ShardReader
+from express50.shards.writer import (
     PackedSample,
     ShardWriter,
     sample_key,

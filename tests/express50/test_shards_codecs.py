@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from express50.errors import FormatError
-from express50.shards_codecs import (
+from express50.shards.codecs import (
     ALPHA,
     DEPTH,
     PARTS,

@@ -7,11 +7,11 @@ from pathlib import Path
 
 import pytest
 
-from express50.cli import main
+from express50.cli.main import main
 from express50.errors import FormatError
-from express50.shards import ShardReader
-from express50.shards_edit import merge_shards, split_shards
-from express50.shards_write import ShardWriter, verify, write_manifest
+from express50.shards.edit import merge_shards, split_shards
+from express50.shards.reader import ShardReader
+from express50.shards.writer import ShardWriter, verify, write_manifest
 from tests.express50.test_shards import make_sample, write
 
 

@@ -11,13 +11,14 @@ import pytest
 
 pytest.importorskip("dask_jobqueue")
 
-from express50 import pool, slurm
-from express50.cli import main
+from express50.cli.main import main
 from express50.errors import ConfigError, StageError
-from express50.ledger import Ledger
-from express50.pool import Pool
-from express50.runner import run_stage
-from express50.slurm import SlurmJob, job_script, read_slurm
+from express50.runner import executor as pool
+from express50.runner import slurm
+from express50.runner.executor import Pool
+from express50.runner.ledger import Ledger
+from express50.runner.runner import run_stage
+from express50.runner.slurm import SlurmJob, job_script, read_slurm
 from tests import slurm_stand_in
 from tests.faults import toy
 

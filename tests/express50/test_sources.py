@@ -7,8 +7,8 @@ from dataclasses import replace
 import pytest
 
 from express50.errors import StageError
-from express50.order import waves_of
-from express50.runner import run_stage
+from express50.runner.runner import run_stage
+from express50.runner.schedule import waves_of
 from tests.faults import toy
 from tests.faults.toy import make_dataset, tree
 

@@ -14,12 +14,12 @@ from pathlib import Path
 
 import pytest
 
-from express50 import status_cli
-from express50.cli import main
-from express50.ledger import Ledger
-from express50.receipts import Receipt, Run
-from express50.status import SILENT_SECONDS, read_status
-from express50.status_page import format_seconds, status_page
+from express50.cli import status as status_cli
+from express50.cli.main import main
+from express50.runner.ledger import Ledger
+from express50.runner.receipts import Receipt, Run
+from express50.runner.status import SILENT_SECONDS, read_status
+from express50.runner.status_page import format_seconds, status_page
 from tests.faults import toy
 
 REPOSITORY = Path(__file__).resolve().parents[2]

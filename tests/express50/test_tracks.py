@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import express50.arrays as array_files
+import express50.files.arrays as array_files
+from express50.contract.layout import Dataset
+from express50.dataset.tracks import read_track, track_file
 from express50.errors import FormatError, StageError
-from express50.layout import Dataset
-from express50.tracks import read_track, track_file
 from tests.express50.tracked import track_arrays, write_track
 
 

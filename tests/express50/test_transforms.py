@@ -7,7 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from express50 import torch_transforms, transforms
+from express50.geometry import transforms
+from express50.geometry import transforms_torch as torch_transforms
 
 ANGLES = [0.0, 1e-12, 1e-5, 9.9e-4, 1.1e-3, 0.5, np.pi - 1e-9, np.pi, np.pi + 0.1, 2 * np.pi, 11.0]
 AXES = [np.array(a) / np.linalg.norm(a) for a in ([1.0, 0, 0], [0, -1.0, 0], [1.0, 2, -3])]

@@ -4,9 +4,9 @@ import av
 import numpy as np
 import pytest
 
+from express50.capture.frames import dhash
 from express50.errors import CaptureError
-from express50.frames import dhash
-from express50.video import VideoReader, check_whole, iterate_video
+from express50.files.video import VideoReader, check_whole, iterate_video
 from tests.synth import noise_video_images, write_video
 
 FRAMES = 61

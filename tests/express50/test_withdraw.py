@@ -8,19 +8,19 @@ from datetime import datetime
 import numpy as np
 import pytest
 
-from express50.captures.person import read_people
-from express50.cli import main
-from express50.digests import text_digest
+from express50.capture.index import read_index
+from express50.capture.readers.person import read_people
+from express50.cli.main import main
+from express50.contract.layout import Dataset
+from express50.dataset.id_search import files_naming, files_that, names_any_of
+from express50.dataset.withdraw import withdraw, withdrawn, withdrawn_file
 from express50.errors import CaptureError, FormatError, StageError
-from express50.index import read_index
-from express50.layout import Dataset
-from express50.ledger import Ledger
-from express50.locks import stage_lock
-from express50.names import files_naming, files_that, names_any_of
-from express50.publish import publishing
-from express50.receipts import Made, Receipt, Run
-from express50.status import read_status
-from express50.withdraw import withdraw, withdrawn, withdrawn_file
+from express50.files.digests import text_digest
+from express50.runner.ledger import Ledger
+from express50.runner.locks import stage_lock
+from express50.runner.publish import publishing
+from express50.runner.receipts import Made, Receipt, Run
+from express50.runner.status import read_status
 from pipelines import ingest
 from tests.faults.toy import tree
 from tests.synth import make_capture

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from express50.geometry.transforms_torch import axis_angle_to_matrix
 from express50.head.load import load_head
 from express50.head.model import HeadModel, pose
-from express50.torch_transforms import axis_angle_to_matrix
 
 EXPRESSIONS = ("neutral", "smile")
 

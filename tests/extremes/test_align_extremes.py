@@ -13,9 +13,9 @@ from annotations.match import suggest_all, watch
 from annotations.observe import Observations
 from annotations.suggest import suggest
 from annotations.watch import FACE, align_faces, similarity_2d
+from express50.capture.expressions import load_script
+from express50.capture.index import Cue
 from express50.errors import StageError
-from express50.expressions import load_script
-from express50.index import Cue
 
 SHAPE = np.random.default_rng(0).uniform(0, 1, (68, 2))
 SMILE = next(e for e in load_script() if e.id == "smile")

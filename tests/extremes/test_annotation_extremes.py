@@ -27,12 +27,12 @@ from annotations.ui.terminal import CellSize
 from annotations.ui.view import open_view
 from annotations.validate import problems
 from annotations.worklist import worklist
-from express50.cli import main
-from express50.config import resolve_config
+from express50.capture.index import read_index
+from express50.cli.main import main
+from express50.contract.config import resolve_config
+from express50.contract.layout import Dataset
 from express50.errors import FormatError
-from express50.index import read_index
-from express50.layout import Dataset
-from express50.runner import run_stage
+from express50.runner.runner import run_stage
 from pipelines import ingest
 from tests.annotations.labelled import make_dataset, suggest
 from tests.synth import make_capture

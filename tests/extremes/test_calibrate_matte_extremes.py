@@ -7,10 +7,10 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from express50.capture.frames import read_srgb8
 from express50.errors import CalibrationError
-from express50.frames import read_srgb8
-from express50.images import linear_to_srgb, srgb_to_linear, write_image
-from express50.rigs.world import canonical_from_rig, move_cameras
+from express50.files.images import linear_to_srgb, srgb_to_linear, write_image
+from express50.rigs.world_frame import canonical_from_rig, move_cameras
 from pipelines.alpha.config import AlphaConfig
 from pipelines.alpha.keyer import Keyer
 from pipelines.alpha.plate import exposure_gain
@@ -84,8 +84,8 @@ def test_a_board_never_tilted_gives_no_silent_nan() -> None:
 @settings(max_examples=20, deadline=None)
 @given(st.integers(0, 2**31), st.integers(1, 6))
 def test_the_canonical_world_is_a_rigid_motion(seed: int, count: int) -> None:
-    from express50.cameras import Camera
-    from express50.transforms import axis_angle_to_matrix, make_transform
+    from express50.geometry.cameras import Camera
+    from express50.geometry.transforms import axis_angle_to_matrix, make_transform
 
     rng = np.random.default_rng(seed)
     cameras = {

@@ -9,10 +9,10 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from express50.captures.read import detect, read_any
+from express50.capture.readers.read import detect, read_any
 from express50.errors import CalibrationError, CaptureError, Express50Error
-from express50.images import PIXEL_LIMIT, encode_png
-from express50.media import BYTES_LIMIT, inside, read_picture
+from express50.files.containers import BYTES_LIMIT, inside, read_picture
+from express50.files.images import PIXEL_LIMIT, encode_png
 from tests.express50.captures import layouts
 from tests.synth import write_video
 

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from express50.cameras import transform_camera
+from express50.cli.shards import sample_picture
 from express50.errors import StageError
-from express50.images import depth_from_uint16, depth_to_uint16
-from express50.shards_cli import sample_picture
-from express50.transforms import make_transform
+from express50.files.images import depth_from_uint16, depth_to_uint16
+from express50.geometry.cameras import transform_camera
+from express50.geometry.transforms import make_transform
 from pipelines.depth.config import DepthConfig
 from pipelines.depth.grid import head_box, hull_distance, project_fast, silhouette_distance
 from pipelines.depth.reconstruct import reconstruct

@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from express50.cameras import pinhole_camera, rays
 from express50.errors import StageError
-from express50.images import write_image
-from express50.raycast import mesh_scene
-from express50.transforms import axis_angle_to_matrix
+from express50.files.images import write_image
+from express50.geometry.cameras import pinhole_camera, rays
+from express50.geometry.raycast import mesh_scene
+from express50.geometry.transforms import axis_angle_to_matrix
 from pipelines.depth import STAGE
 from pipelines.depth.config import DepthConfig
 from pipelines.depth.consistency import agreements, make_shot

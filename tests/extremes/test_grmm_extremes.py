@@ -134,7 +134,7 @@ def test_metrics_of_equal_and_empty_images():
 
 def rotation_gap(a, b):
     """Angle between the rotations of two axis-angle vectors, radians."""
-    from express50.torch_transforms import axis_angle_to_matrix
+    from express50.geometry.transforms_torch import axis_angle_to_matrix
 
     A, B = (axis_angle_to_matrix(torch.as_tensor(np.asarray(x)).double()) for x in (a, b))
     return float(torch.linalg.norm(A - B)) / 2**0.5

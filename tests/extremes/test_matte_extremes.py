@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from express50.cameras import pinhole_camera, scale_camera, transform_camera
-from express50.transforms import look_at, make_transform
+from express50.geometry.cameras import pinhole_camera, scale_camera, transform_camera
+from express50.geometry.transforms import look_at, make_transform
 from pipelines.matte.agreement import Agreement, agree
 from pipelines.matte.config import MatteConfig
 from pipelines.matte.hull import View, ball_of

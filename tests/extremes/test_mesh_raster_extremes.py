@@ -11,10 +11,10 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from express50.cameras import Camera
-from express50.mesh_raster import Raster, rasterize
-from express50.mesh_render import antialias, barycentrics, covered
-from express50.transforms import look_at
+from express50.geometry.cameras import Camera
+from express50.geometry.mesh_raster import Raster, rasterize
+from express50.geometry.mesh_render import antialias, barycentrics, covered
+from express50.geometry.transforms import look_at
 from tests.express50.mesh_scenes import camera, oracle, sphere
 
 ONE = np.array([[0, 1, 2]])

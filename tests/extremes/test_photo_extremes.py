@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 import torch
 
-from express50.cameras import Camera
 from express50.errors import CaptureError
+from express50.geometry.cameras import Camera
 from express50.head.load import load_head
 from express50.head.model import landmarks, pose
 from express50.head.preview import render_preview

@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from express50.cameras import pinhole_camera, resized, transform_camera
+from express50.contract.segmentation_labels import LABELS, label_mask
 from express50.errors import FormatError, StageError
-from express50.images import write_depth_png, write_image
-from express50.parts import LABELS, label_mask
-from express50.transforms import look_at, make_transform
+from express50.files.images import write_depth_png, write_image
+from express50.geometry.cameras import pinhole_camera, resized, transform_camera
+from express50.geometry.transforms import look_at, make_transform
 from pipelines.regions import STAGE
 from pipelines.regions.config import RegionsConfig
 from pipelines.regions.labels import SCALP

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from express50.images import linear_to_srgb
+from express50.files.images import linear_to_srgb
 from pipelines.track.appearance import EVEN_LIGHT, Appearance
 from pipelines.track.bake import bake_albedo
 from pipelines.track.config import TrackConfig

@@ -4,9 +4,9 @@ import json
 
 import pytest
 
-from express50.cli import main
-from express50.index import read_index
-from express50.layout import Dataset
+from express50.capture.index import read_index
+from express50.cli.main import main
+from express50.contract.layout import Dataset
 from tests.synth import make_capture
 
 

@@ -12,14 +12,14 @@ from pathlib import Path
 
 import pytest
 
-from express50.audit import audit
-from express50.cli import main
-from express50.digests import text_digest
+from express50.cli.main import main
+from express50.contract.layout import Dataset
+from express50.dataset.audit import audit
 from express50.errors import StageError
-from express50.layout import Dataset
-from express50.ledger import Ledger
-from express50.locks import stage_lock
-from express50.publish import write_json
+from express50.files.atomic import write_json
+from express50.files.digests import text_digest
+from express50.runner.ledger import Ledger
+from express50.runner.locks import stage_lock
 from pipelines import ingest
 from tests.faults import toy
 from tests.synth import make_capture

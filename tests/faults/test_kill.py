@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from express50.layout import Dataset
+from express50.contract.layout import Dataset
 from pipelines import ingest
 from tests.faults import toy
 from tests.synth import make_capture
@@ -96,7 +96,7 @@ def test_killed_ingest_reruns_to_the_same_bytes(tmp_path):
     calm, hurt = Dataset(tmp_path / "calm"), Dataset(tmp_path / "hurt")
     for dataset in (calm, hurt):
         ingest.register(dataset, [tmp_path / "S001"])
-    seconds = timed(["express50.cli", "ingest", str(calm.root)])
+    seconds = timed(["express50.cli.main", "ingest", str(calm.root)])
     expected = toy.tree(calm.stage_dir("ingest"))
 
     def check():
@@ -104,7 +104,7 @@ def test_killed_ingest_reruns_to_the_same_bytes(tmp_path):
 
     rng = random.Random(3)
     delays = [seconds * part for part in (0.6, *(rng.uniform(0.1, 0.95) for _ in range(5)))]
-    command = ["express50.cli", "ingest", str(hurt.root)]
+    command = ["express50.cli.main", "ingest", str(hurt.root)]
     assert kill_until_done(command, check, delays) > 0
     assert toy.tree(hurt.stage_dir("ingest")) == expected
 
@@ -128,7 +128,7 @@ def test_interrupt_stops_soon_and_is_resumable(tmp_path):
 
 def test_second_run_on_the_same_stage_is_refused(tmp_path):
     from express50.errors import StageError
-    from express50.locks import stage_lock
+    from express50.runner.locks import stage_lock
 
     dataset = toy.make_dataset(tmp_path / "data", ["item0"])
     with stage_lock(dataset, "toy"), pytest.raises(StageError, match="another 'toy' runs"):
@@ -138,7 +138,7 @@ def test_second_run_on_the_same_stage_is_refused(tmp_path):
 def test_a_glance_at_a_lock_keeps_no_stage_from_starting(tmp_path, monkeypatch):
     import fcntl
 
-    from express50 import locks
+    from express50.runner import locks
 
     dataset = toy.make_dataset(tmp_path / "data", ["item0"])
     with locks.stage_lock(dataset, "toy"):

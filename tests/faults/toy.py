@@ -13,13 +13,13 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-from express50.config import resolve_config
+from express50.contract.config import resolve_config
+from express50.contract.layout import Dataset
+from express50.contract.stage import Stage
 from express50.errors import StageError
-from express50.layout import Dataset
-from express50.pool import Pool
-from express50.runner import run_stage
-from express50.slurm import SlurmJob
-from express50.stage import Stage
+from express50.runner.executor import Pool
+from express50.runner.runner import run_stage
+from express50.runner.slurm import SlurmJob
 
 SLOWER = "EXPRESS50_TOY_SLOWER"  # how many times as long to pause: no item's bytes depend on it
 

@@ -17,7 +17,7 @@ import numpy as np
 import torch
 
 from express50.errors import Express50Error
-from express50.work import peak_memory, reset_peak_memory
+from express50.runner.worker import peak_memory, reset_peak_memory
 
 SECONDS = 5.0  # of processor time for one file; a reader of a small file that takes longer hangs
 SILENCE = 60.0  # seconds, on however busy a machine, until a child is given up

@@ -20,26 +20,26 @@ import numpy as np
 import torch
 
 from annotations.exchange import read_table
-from express50.calibration_file import read_cameras
-from express50.capture import read_capture_toml
-from express50.captures.read import read_any
+from express50.capture.frames import read_peaks
+from express50.capture.index import read_index
+from express50.capture.raw import read_capture_toml
+from express50.capture.readers.read import read_any
+from express50.contract.layout import Dataset
+from express50.dataset.id_search import files_naming
+from express50.dataset.tracks import read_track
 from express50.errors import FormatError, HeadModelError
-from express50.frames import read_peaks
+from express50.files.calibration import read_cameras
+from express50.files.checkpoints import read_weights
+from express50.files.containers import member_bytes, open_hdf5, read_array, read_picture
+from express50.files.images import decode_image, encode_jpeg, read_image
+from express50.files.pickles import read_object_array, read_pickle
+from express50.files.video import iterate_video
 from express50.head.ict import read_obj
 from express50.head.pickled_arrays import to_array
-from express50.head.safe_pickle import read_object_array, read_pickle
-from express50.images import decode_image, encode_jpeg, read_image
-from express50.index import read_index
-from express50.layout import Dataset
-from express50.ledger import Ledger
-from express50.media import member_bytes, open_hdf5, read_array, read_picture
-from express50.names import files_naming
 from express50.rigs.read import read_rig
-from express50.shards import read_entries
-from express50.shards_codecs import decode_picture
-from express50.tracks import read_track
-from express50.video import iterate_video
-from express50.weights import read_weights
+from express50.runner.ledger import Ledger
+from express50.shards.codecs import decode_picture
+from express50.shards.reader import read_entries
 from grmm.ply import read_ply
 from pipelines.depth.warm import read_surface
 from tests.fuzz.checkpoints import checkpoint_bombs

@@ -8,7 +8,7 @@ from pathlib import Path
 import torch
 
 from express50.errors import TrainError
-from express50.weights import read_weights
+from express50.files.checkpoints import read_weights
 from tests.fuzz.seeds import read_checkpoint
 
 HUGE = 10**6

@@ -16,31 +16,31 @@ from annotations.exchange import export_labels, read_table
 from annotations.labels import make_mark
 from annotations.store import append_label, read_labels
 from annotations.suggestions import read_suggestions
-from express50.calibration_file import read_cameras
-from express50.capture import read_cues
-from express50.captures.read import read_any
-from express50.config import resolve_config
+from express50.capture.frames import decode_proxy, read_gains, read_peaks
+from express50.capture.index import read_index
+from express50.capture.raw import read_cues
+from express50.capture.readers.read import read_any
+from express50.contract.config import resolve_config
+from express50.contract.layout import Dataset
+from express50.dataset.id_search import files_naming
+from express50.dataset.tracks import read_track
 from express50.errors import FormatError
-from express50.frames import decode_proxy, read_gains, read_peaks
+from express50.files.calibration import read_cameras
+from express50.files.containers import decode_picture as decode_foreign
+from express50.files.containers import read_picture, read_srgb8
+from express50.files.images import decode_image, read_image, write_image
+from express50.files.video import VideoReader, iterate_video
 from express50.head.flame import load_flame
 from express50.head.ict import read_obj
-from express50.images import decode_image, read_image, write_image
-from express50.index import read_index
 from express50.landmarks.points_file import read_points
-from express50.layout import Dataset
-from express50.ledger import Ledger
-from express50.media import decode_picture as decode_foreign
-from express50.media import read_picture, read_srgb8
-from express50.names import files_naming
-from express50.receipts import Receipt
 from express50.rigs.read import guess_format, read_rig
-from express50.runner import run_stage
-from express50.shards import ShardReader, read_entries
-from express50.shards_codecs import decode_picture, encode_pictures
-from express50.shards_offsets import read_offsets, write_offsets
-from express50.shards_write import PackedSample, ShardWriter, verify, write_manifest
-from express50.tracks import read_track
-from express50.video import VideoReader, iterate_video
+from express50.runner.ledger import Ledger
+from express50.runner.receipts import Receipt
+from express50.runner.runner import run_stage
+from express50.shards.codecs import decode_picture, encode_pictures
+from express50.shards.offsets import read_offsets, write_offsets
+from express50.shards.reader import ShardReader, read_entries
+from express50.shards.writer import PackedSample, ShardWriter, verify, write_manifest
 from grmm.checkpoint import load_checkpoint
 from grmm.ply import read_ply, write_ply
 from grmm.presets import resolve
@@ -63,7 +63,7 @@ from tests.synth import make_capture, noise_video_images, write_video
 @dataclass(frozen=True)
 class Reader:
     """How a file is read. ``native`` libraries may kill the process: a pool's worker, which the
-    runner replaces, and whose item it sets aside after two deaths (`express50.pool`).
+    runner replaces, and whose item it sets aside after two deaths (`express50.runner.executor`).
     """
 
     name: str
@@ -325,7 +325,7 @@ def _network(root: Path) -> object:
 
 def _vgg(root: Path) -> object:
     from express50.errors import TrainError
-    from express50.weights import read_weights
+    from express50.files.checkpoints import read_weights
 
     return read_weights(root / "vgg.pth", TrainError, "vgg", "a state dict")
 

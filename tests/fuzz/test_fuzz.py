@@ -3,7 +3,7 @@
 All readers run in one process of their own (``python -m tests.fuzz``), each file's in a child of it
 with a bound on its memory, so that what kills it is counted and not suffered. A native library that
 crashes on a file is no failure here: in a pool it kills a worker, whose item the runner tries once
-more alone and then sets aside (`express50.pool`); docs/LOG.md says which ones did.
+more alone and then sets aside (`express50.runner.executor`); docs/LOG.md says which ones did.
 """
 
 from __future__ import annotations

@@ -6,7 +6,7 @@ import msgspec
 import numpy as np
 from websockets.sync.client import connect
 
-from express50.images import decode_image
+from express50.files.images import decode_image
 
 
 class Browser:
@@ -29,7 +29,7 @@ class Browser:
         forward /= np.linalg.norm(forward)
         right = np.cross(forward, [0.0, 1.0, 0.0])
         right /= np.linalg.norm(right)
-        from express50.transforms import matrix_to_quat
+        from express50.geometry.transforms import matrix_to_quat
 
         turn = np.stack([right, np.cross(forward, right), forward], 1)
         self.send(

@@ -4,8 +4,8 @@ import json
 
 import numpy as np
 
-from express50.images import encode_jpeg, encode_png
-from express50.shards_write import PackedSample, ShardWriter
+from express50.files.images import encode_jpeg, encode_png
+from express50.shards.writer import PackedSample, ShardWriter
 
 
 def packed(source, index):

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import torch
 
+from express50.geometry.transforms import look_at
 from express50.head.model import REGIONS, HeadModel
-from express50.transforms import look_at
 from grmm.config import Config
 from grmm.data import Key, Sample, Tracked
 from grmm.presets import resolve

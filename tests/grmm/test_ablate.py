@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from express50.errors import FormatError
-from express50.images import read_image, write_image
+from express50.files.images import read_image, write_image
 from grmm import ablate as ablate_module
 from grmm import checkpoint as checkpoint_module
 from grmm.ablation_table import VARIANTS

@@ -3,7 +3,7 @@ import argparse
 import pytest
 
 from express50.errors import ConfigError
-from express50.publish import write_json
+from express50.files.atomic import write_json
 from grmm.budget import choose
 from grmm.cli.learn import add_training, train_config
 

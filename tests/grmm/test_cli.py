@@ -9,7 +9,7 @@ import pytest
 
 from express50 import __version__
 from express50.errors import FormatError
-from express50.shards_write import PackedSample, ShardWriter
+from express50.shards.writer import PackedSample, ShardWriter
 from grmm import checkpoint as checkpoint_module
 from grmm.cli import build_parser, main
 from grmm.cli.learn import train_config
@@ -281,7 +281,7 @@ def test_a_head_is_driven_by_tracked_clips(checkpoint, tmp_path, capsys):
     assert main([*render, "--size=32"]) == 0
     assert (tmp_path / "out" / "driven.mp4").stat().st_size > 0
 
-    from express50.tracks import read_sequence
+    from express50.dataset.tracks import read_sequence
 
     head, view = trained_head(loaded, "S000", "e0"), frontal(loaded)
     first, _ = driven(loaded, head, read_sequence(path), view)

@@ -150,7 +150,7 @@ def test_moving_the_subject_far_away_changes_nothing():
 
 
 def test_quaternion_product_composes_rotations():
-    from express50.torch_transforms import quat_to_matrix
+    from express50.geometry.transforms_torch import quat_to_matrix
 
     a, b = torch.nn.functional.normalize(torch.randn(2, 5, 4, dtype=torch.float64), dim=-1)
     torch.testing.assert_close(

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from express50.errors import ConfigError, FormatError
-from express50.images import write_image
+from express50.files.images import write_image
 from grmm.cli import main
 from grmm.study.answers import append_answer, check_answer, read_answers
 from grmm.study.design import Method, make_study, method_of, trials

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from express50.parts import TORSO
+from express50.contract.segmentation_labels import TORSO
 from grmm.data import HeadViews
 from grmm.evaluate import evaluate
 from grmm.objective import objective

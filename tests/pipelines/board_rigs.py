@@ -5,8 +5,8 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from express50.cameras import Camera, project, rays
-from express50.transforms import axis_angle_to_matrix, look_at, make_transform
+from express50.geometry.cameras import Camera, project, rays
+from express50.geometry.transforms import axis_angle_to_matrix, look_at, make_transform
 from pipelines.calibrate.board import Board, Observations, board_points, gather, opencv_board
 
 BOARD = Board(11, 8, 0.05, 0.037, "DICT_5X5_250")

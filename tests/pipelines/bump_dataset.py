@@ -8,14 +8,14 @@ from pathlib import Path
 
 import numpy as np
 
-from express50.calibration_file import write_cameras
-from express50.cameras import Camera
+from express50.capture.index import read_index
+from express50.contract.layout import Dataset
+from express50.contract.stage import Stage
+from express50.files.calibration import write_cameras
+from express50.files.images import write_image
+from express50.geometry.cameras import Camera
 from express50.head.load import load_head
-from express50.images import write_image
-from express50.index import read_index
-from express50.layout import Dataset
-from express50.runner import run_stage
-from express50.stage import Stage
+from express50.runner.runner import run_stage
 from pipelines.ingest import STAGE as INGEST
 from pipelines.ingest import register
 from tests.pipelines.bump_head import render, ring

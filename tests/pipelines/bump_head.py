@@ -8,8 +8,8 @@ import numpy as np
 import open3d as o3d
 from skimage.measure import marching_cubes
 
-from express50.cameras import Camera, pinhole_camera, rays
-from express50.transforms import look_at
+from express50.geometry.cameras import Camera, pinhole_camera, rays
+from express50.geometry.transforms import look_at
 
 RADII = np.array([0.075, 0.105, 0.09])
 

@@ -7,7 +7,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from express50.cameras import Camera
+from express50.geometry.cameras import Camera
 from pipelines.matte.hull import View, ball_of
 from pipelines.matte.stage import make_view
 from tests.pipelines.bump_head import render, ring

@@ -8,11 +8,11 @@ from functools import lru_cache
 import numpy as np
 import torch
 
-from express50.cameras import Camera, pinhole_camera, rays
+from express50.contract.segmentation_labels import LABELS
+from express50.geometry.cameras import Camera, pinhole_camera, rays
+from express50.geometry.transforms import look_at
 from express50.head.load import load_head
 from express50.head.model import pose
-from express50.parts import LABELS
-from express50.transforms import look_at
 from express50.twin.surface import MISS, Caster
 from pipelines.regions.labels import SCALP, head_labels
 from pipelines.regions.mesh import TrackedHead, make_head

@@ -8,12 +8,12 @@ import math
 import numpy as np
 import torch
 
-from express50.cameras import Camera, resized
+from express50.geometry.cameras import Camera, resized
+from express50.geometry.mesh_raster import rasterize
+from express50.geometry.mesh_render import barycentrics, covered, interpolate, sample_texture
+from express50.geometry.transforms import axis_angle_to_matrix, look_at
+from express50.head.generator.head import build_procedural_head
 from express50.head.model import HeadModel
-from express50.head.procedural import build_procedural_head
-from express50.mesh_raster import rasterize
-from express50.mesh_render import barycentrics, covered, interpolate, sample_texture
-from express50.transforms import axis_angle_to_matrix, look_at
 from pipelines.track.render_loss import Appearance, Shot, make_look, vertex_light
 from pipelines.track.render_refine import posed_vertices
 from pipelines.track.state import Pose, State

@@ -9,11 +9,11 @@ import cv2
 import numpy as np
 import pytest
 
-from express50.config import resolve_config
+from express50.capture.frames import dhash, read_frame
+from express50.capture.index import read_index
+from express50.contract.config import resolve_config
 from express50.errors import ConfigError, StageError
-from express50.frames import dhash, read_frame
-from express50.images import read_image
-from express50.index import read_index
+from express50.files.images import read_image
 from pipelines.alpha import STAGE
 from pipelines.alpha.config import AlphaConfig
 from pipelines.alpha.key import dilated, eroded, plate_difference
@@ -218,7 +218,7 @@ def test_wrong_settings_are_refused() -> None:
 @pytest.fixture
 def aligned(ingested):
     """S001 with given cameras and its peaks labelled."""
-    from express50.runner import run_stage
+    from express50.runner.runner import run_stage
     from pipelines import calibrate
 
     config = resolve_config(calibrate.STAGE, "draft")

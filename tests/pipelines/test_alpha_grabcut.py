@@ -9,14 +9,14 @@ import cv2
 import numpy as np
 import pytest
 
-from express50.cli import main
+from express50.capture.index import read_index
+from express50.cli.main import main
+from express50.contract.layout import Dataset
 from express50.errors import ConfigError, StageError
-from express50.images import read_alpha, write_image
-from express50.index import read_index
+from express50.files.images import read_alpha, write_image
 from express50.landmarks.network import load_network
-from express50.layout import Dataset
-from express50.runner import run_stage
-from express50.shards import ShardReader
+from express50.runner.runner import run_stage
+from express50.shards.reader import ShardReader
 from pipelines import calibrate, ingest
 from pipelines.alpha import STAGE as ALPHA
 from pipelines.alpha.config import AlphaConfig

@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from express50.capture.frames import dhash, read_frame
+from express50.capture.index import read_index
+from express50.contract.layout import Dataset
 from express50.errors import ConfigError
-from express50.frames import dhash, read_frame
-from express50.images import read_image, write_image
-from express50.index import read_index
-from express50.layout import Dataset
-from express50.runner import Summary, run_stage
+from express50.files.images import read_image, write_image
+from express50.runner.runner import Summary, run_stage
 from pipelines import calibrate, ingest
 from pipelines.alpha import STAGE
 from pipelines.alpha.config import AlphaConfig
@@ -150,7 +150,7 @@ def test_one_camera_that_fails_leaves_the_others_done(aligned, tmp_path, monkeyp
 
 
 def _wrong_for(camera: str):
-    from express50.frames import read_plate
+    from express50.capture.frames import read_plate
 
     def read(dataset, subject, camera_id, undistort=True):
         if camera_id == camera:

@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from express50.calibration_file import read_cameras, write_cameras
 from express50.errors import CalibrationError
-from express50.rigs.world import canonical_from_rig, meeting_point, move_cameras
-from express50.transforms import axis_angle_to_matrix, make_transform
+from express50.files.calibration import read_cameras, write_cameras
+from express50.geometry.transforms import axis_angle_to_matrix, make_transform
+from express50.rigs.world_frame import canonical_from_rig, meeting_point, move_cameras
 from pipelines.calibrate.board import (
     Observations,
     board_from_table,

@@ -9,13 +9,13 @@ import numpy as np
 import OpenImageIO as oiio
 import pytest
 
-from express50.calibration_file import camera_rows
-from express50.cli import main
+from express50.cli.main import main
+from express50.contract.layout import Dataset
 from express50.errors import CalibrationError, ConfigError
-from express50.images import write_image
-from express50.layout import Dataset
+from express50.files.calibration import camera_rows
+from express50.files.images import write_image
+from express50.geometry.transforms import similarity_fit
 from express50.rigs.tracks import Seen, undistorted
-from express50.transforms import similarity_fit
 from pipelines.calibrate.config import CalibrateConfig
 from pipelines.calibrate.faces import pose_of_face, start_camera
 from pipelines.calibrate.footage import _film_focal

@@ -9,14 +9,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from express50.cameras import pinhole_camera
+from express50.capture.frames import read_gains
+from express50.contract.layout import Dataset
 from express50.errors import FormatError
-from express50.frames import read_gains
-from express50.images import scale_light, srgb_to_linear, write_image
-from express50.layout import Dataset
-from express50.publish import write_json
-from express50.runner import run_stage
-from express50.transforms import make_transform
+from express50.files.atomic import write_json
+from express50.files.images import scale_light, srgb_to_linear, write_image
+from express50.geometry.cameras import pinhole_camera
+from express50.geometry.transforms import make_transform
+from express50.runner.runner import run_stage
 from pipelines.calibrate import STAGE as CALIBRATE
 from pipelines.calibrate.board import detect_corners, make_detector
 from pipelines.calibrate.colour import Palette, fit_gains, see_white, white_squares

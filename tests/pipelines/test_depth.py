@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from express50.cameras import rays
 from express50.errors import StageError
-from express50.raycast import mesh_scene
+from express50.geometry.cameras import rays
+from express50.geometry.raycast import mesh_scene
 from pipelines.depth.blocks import build
 from pipelines.depth.config import DepthConfig
 from pipelines.depth.grid import head_box, hull_distance, silhouette_distance

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from express50.cameras import Camera
+from express50.geometry.cameras import Camera
 from pipelines.depth.consistency import UNSEEN_TRUST, Agreement, vouched
 from pipelines.depth.raycast import DepthView, depth_view, jumps
 

@@ -9,16 +9,16 @@ import numpy as np
 import pytest
 import trimesh
 
-from express50.cameras import transform_camera
-from express50.depth_files import depth_file, read_depth, read_normals
+from express50.capture.frames import read_cameras_of
+from express50.dataset.depth_files import depth_file, read_depth, read_normals
+from express50.dataset.tracks import read_track
 from express50.errors import FormatError
-from express50.frames import read_cameras_of
+from express50.files.images import read_image, srgb_to_linear
+from express50.geometry.cameras import transform_camera
+from express50.geometry.raycast import mesh_scene
+from express50.geometry.transforms import make_transform
 from express50.head.load import load_head
-from express50.images import read_image, srgb_to_linear
-from express50.raycast import mesh_scene
-from express50.runner import run_stage
-from express50.tracks import read_track
-from express50.transforms import make_transform
+from express50.runner.runner import run_stage
 from pipelines.depth import STAGE
 from pipelines.depth.config import DepthConfig
 from pipelines.depth.consistency import Agreement, agreements, make_shot

@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 import pytest
 
-from express50.cameras import Camera, rays
-from express50.raycast import mesh_scene
+from express50.geometry.cameras import Camera, rays
+from express50.geometry.raycast import mesh_scene
 from pipelines.depth.blocks import Grid, build, combined
 from pipelines.depth.bodies import largest_body
 from pipelines.depth.config import DepthConfig

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from express50.images import linear_to_srgb, srgb_to_linear
+from express50.files.images import linear_to_srgb, srgb_to_linear
 from pipelines.alpha.foreground import own_colours
 
 

@@ -6,13 +6,13 @@ import shutil
 import numpy as np
 import pytest
 
-from express50.config import resolve_config
+from express50.capture.frames import decode_proxy, dhash
+from express50.capture.index import CameraSource, Cue, read_index
+from express50.contract.config import resolve_config
+from express50.contract.layout import Dataset
 from express50.errors import CaptureError, ConfigError, StageError
-from express50.frames import decode_proxy, dhash
-from express50.images import read_image
-from express50.index import CameraSource, Cue, read_index
-from express50.layout import Dataset
-from express50.runner import run_stage
+from express50.files.images import read_image
+from express50.runner.runner import run_stage
 from pipelines import ingest
 from tests.synth import make_capture, noise_video_images, write_video
 

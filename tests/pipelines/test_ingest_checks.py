@@ -6,10 +6,10 @@ import cv2
 import numpy as np
 import pytest
 
-from express50.config import resolve_config
-from express50.images import linear_to_srgb, srgb_to_linear
-from express50.layout import Dataset
-from express50.runner import run_stage
+from express50.contract.config import resolve_config
+from express50.contract.layout import Dataset
+from express50.files.images import linear_to_srgb, srgb_to_linear
+from express50.runner.runner import run_stage
 from pipelines import ingest
 from pipelines.ingest.focus import edge_width
 from pipelines.ingest.light import cells_of, light_drift

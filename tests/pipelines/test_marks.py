@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 import torch
 
-from express50.cameras import project, triangulate
+from express50.geometry.cameras import project, triangulate
+from express50.geometry.transforms import axis_angle_to_matrix
 from express50.head.load import load_head
 from express50.head.model import HeadModel, landmarks, vertex_normals
 from express50.landmarks.iris import Irises
-from express50.transforms import axis_angle_to_matrix
 from pipelines.track.contour import JAW, contour_points
 from pipelines.track.fit import fit, landmark_sigma
 from pipelines.track.marks import iris_vertices, measure_eyes, with_marks

@@ -12,10 +12,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from express50.cli import main
+from express50.cli.main import main
 from express50.errors import ConfigError, FormatError, StageError
-from express50.images import read_image, write_image
-from express50.runner import run_stage
+from express50.files.images import read_image, write_image
+from express50.runner.runner import run_stage
 from pipelines.matte import STAGE
 from pipelines.matte.agreement import agree
 from pipelines.matte.config import MatteConfig

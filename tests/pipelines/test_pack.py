@@ -12,15 +12,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.ndimage import minimum_filter
 
-from express50.cameras import pinhole_camera, project, unproject
+from express50.contract.layout import Dataset
+from express50.contract.segmentation_labels import LABELS
 from express50.errors import StageError
-from express50.images import read_depth_png, read_image, srgb_to_linear, write_image
-from express50.layout import Dataset
-from express50.parts import LABELS
-from express50.publish import write_json
-from express50.shards import ShardReader
-from express50.shards_write import verify
-from express50.transforms import look_at
+from express50.files.atomic import write_json
+from express50.files.images import read_depth_png, read_image, srgb_to_linear, write_image
+from express50.geometry.cameras import pinhole_camera, project, unproject
+from express50.geometry.transforms import look_at
+from express50.shards.reader import ShardReader
+from express50.shards.writer import verify
 from pipelines.depth import STAGE as DEPTH
 from pipelines.depth.config import DepthConfig
 from pipelines.pack import STAGE as PACK

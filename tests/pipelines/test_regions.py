@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 import torch
 
+from express50.contract.segmentation_labels import HEAD, LABELS, label_mask
 from express50.errors import ConfigError, StageError
+from express50.files.images import read_image, write_image
 from express50.head.load import load_head
 from express50.head.model import pose
-from express50.images import read_image, write_image
-from express50.parts import HEAD, LABELS, label_mask
 from pipelines.regions import STAGE
 from pipelines.regions.colour import face_colours
 from pipelines.regions.config import RegionsConfig

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from express50.contract.segmentation_labels import LABELS, label_mask
 from express50.errors import StageError
-from express50.parts import LABELS, label_mask
 from pipelines.networks import load_network
 from pipelines.regions.sapiens import LABEL_OF_CLASS, SAPIENS, segment
 from pipelines.regions.view import head_alpha

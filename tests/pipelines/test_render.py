@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from express50.images import linear_to_srgb
-from express50.mesh_render import sh_light
+from express50.files.images import linear_to_srgb
+from express50.geometry.mesh_render import sh_light
 from pipelines.track import appearance as model_of_light
 from pipelines.track.appearance import sh_basis
 from pipelines.track.config import TrackConfig

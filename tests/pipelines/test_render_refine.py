@@ -10,9 +10,9 @@ import torch
 
 from express50 import native
 from express50.errors import ConfigError, StageError
-from express50.mesh_raster import rasterize
-from express50.mesh_render import covered
-from express50.transforms import axis_angle_to_matrix
+from express50.geometry.mesh_raster import rasterize
+from express50.geometry.mesh_render import covered
+from express50.geometry.transforms import axis_angle_to_matrix
 from pipelines.track.adam import Adam
 from pipelines.track.config import TrackConfig
 from pipelines.track.render_config import RenderConfig

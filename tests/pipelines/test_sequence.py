@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from express50.cameras import project
+from express50.capture.index import Cue
+from express50.dataset.tracks import SEQUENCE_SCHEMA
 from express50.errors import StageError
-from express50.index import Cue
-from express50.tracks import SEQUENCE_SCHEMA
-from express50.transforms import axis_angle_to_matrix
+from express50.geometry.cameras import project
+from express50.geometry.transforms import axis_angle_to_matrix
 from pipelines.track import clips
 from pipelines.track.clips import track_clips, write_clips
 from pipelines.track.observe import Observation, View, agree

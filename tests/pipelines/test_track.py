@@ -11,14 +11,14 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from express50.cameras import Camera, project
-from express50.config import build_config
+from express50.contract.config import build_config
 from express50.errors import CaptureError, ConfigError, StageError
+from express50.geometry.cameras import Camera, project
+from express50.geometry.transforms import axis_angle_to_matrix, look_at
 from express50.head.model import landmarks, pose
 from express50.landmarks.detector import Detection
 from express50.landmarks.iris import Irises
 from express50.landmarks.sources import Marked
-from express50.transforms import axis_angle_to_matrix, look_at
 from pipelines.track.config import TrackConfig
 from pipelines.track.fit import consistent_sigma, fit, landmark_sigma
 from pipelines.track.observe import View, agree, robust_triangulate
@@ -272,9 +272,9 @@ def tracked_dataset(tmp_path: Path, ingested, monkeypatch: pytest.MonkeyPatch):
     """A calibrated, labelled dataset whose detector is told the landmarks of a tiny head."""
     import json
 
-    from express50.frames import read_cameras_of
-    from express50.index import read_index
-    from express50.runner import run_stage
+    from express50.capture.frames import read_cameras_of
+    from express50.capture.index import read_index
+    from express50.runner.runner import run_stage
     from pipelines import calibrate
     from pipelines.track import footage, stage
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from express50.errors import StageError
-from express50.images import linear_to_srgb, read_image
+from express50.files.images import linear_to_srgb, read_image
 from pipelines.track.appearance import (
     EVEN_LIGHT,
     Appearance,
@@ -192,7 +192,7 @@ def test_texels_lie_where_the_map_says() -> None:
 
 
 def test_written_files_are_found_by_the_export(tmp_path) -> None:
-    from express50.export.select import _albedo
+    from express50.dataset.export.select import _albedo
 
     albedo = np.random.default_rng(0).integers(0, 256, (16, 16, 3), dtype=np.uint8)
     gains = {"cam1": np.array([0.5, 1.0, 2.0]), "cam0": np.ones(3)}

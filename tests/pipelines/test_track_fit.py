@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from express50.cameras import project
-from express50.transforms import axis_angle_to_matrix
+from express50.geometry.cameras import project
+from express50.geometry.transforms import axis_angle_to_matrix
 from pipelines.track.config import TrackConfig
 from pipelines.track.fit import fit, landmark_sigma
 from pipelines.track.observe import View, agree

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 import torch
 
-from express50.cameras import Camera, pinhole, project
+from express50.geometry.cameras import Camera, pinhole, project
+from express50.geometry.transforms import look_at
 from express50.head.load import load_head
 from express50.head.model import pose
-from express50.transforms import look_at
 from pipelines.track.hair import bare_share, is_bald
 
 SIZE, FOCAL = 400, 900.0

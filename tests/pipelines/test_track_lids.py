@@ -10,11 +10,11 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from express50.cameras import project
+from express50.geometry.cameras import project
+from express50.geometry.transforms import axis_angle_to_matrix
 from express50.head.load import load_head
 from express50.head.model import landmarks, pose
 from express50.landmarks.iris import EYES, Irises
-from express50.transforms import axis_angle_to_matrix
 from pipelines.track.config import TrackConfig
 from pipelines.track.fit import fit, landmark_sigma
 from pipelines.track.lids import ShutLids, lid_terms, shut_lids

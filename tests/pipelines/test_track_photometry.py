@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 import pytest
 
-from express50.cameras import Camera
+from express50.geometry.cameras import Camera
+from express50.geometry.transforms import look_at
 from express50.head.load import load_head
-from express50.transforms import look_at
 from pipelines.track.photometry import Photometry, Picture, bilinear, look, robust_mean
 from pipelines.track.samples import COVERED, Visibility, spread
 from pipelines.track.shots import Shot, cut_shot, detail

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from express50.images import read_image
+from express50.files.images import read_image
 from pipelines.track.sheet import (
     ALARM,
     BAND,

@@ -10,11 +10,11 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from express50.cameras import Camera
 from express50.errors import ConfigError
+from express50.geometry.cameras import Camera
+from express50.geometry.transforms import look_at
 from express50.head.load import load_head
 from express50.head.model import landmarks, pose, vertex_normals
-from express50.transforms import look_at
 from pipelines.track.chart.layout import HEIGHT, WIDTH
 from pipelines.track.chart.network import mark_places, reading_chart
 from pipelines.track.config import TrackConfig

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from express50.cameras import Camera
+from express50.geometry.cameras import Camera
+from express50.geometry.transforms import look_at
 from express50.head.model import HeadModel
-from express50.transforms import look_at
 from pipelines.track.samples import Samples, Visibility, sample_normals
 from tests.express50.head.tiny_head import tiny_head
 from tests.express50.mesh_scenes import sphere

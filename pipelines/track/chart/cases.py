@@ -14,12 +14,12 @@ import numpy as np
 import open3d as o3d
 import torch
 
-from express50.adapters import cell_to_corner
-from express50.cameras import Camera
+from express50.geometry.cameras import Camera
+from express50.geometry.conventions import cell_to_corner
+from express50.geometry.raycast import mesh_scene
 from express50.head.model import HeadModel, pose, vertex_normals
-from express50.landmarks.acting import random_parameters
-from express50.landmarks.synthetic import Canvas, deform, paint, waves
-from express50.raycast import mesh_scene
+from express50.landmarks.training.poses import random_parameters
+from express50.landmarks.training.skin import Canvas, deform, paint, waves
 from pipelines.track.chart.disturb import Case, covered, photographed
 from pipelines.track.chart.layout import Chart, sampled
 from pipelines.track.chart.light import Lamps, draw_cameras, draw_lamps

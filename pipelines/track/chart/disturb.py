@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from express50.adapters import corner_to_cell
+from express50.geometry.conventions import corner_to_cell
 from pipelines.track.chart.layout import HEIGHT, LIPS_APART, WIDTH, sampled
 
 Rng = np.random.Generator

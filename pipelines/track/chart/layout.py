@@ -12,11 +12,11 @@ import cv2
 import numpy as np
 from scipy.interpolate import RBFInterpolator
 
-from express50.adapters import cell_to_corner, corner_to_cell
-from express50.cameras import Camera
 from express50.errors import HeadModelError
+from express50.geometry.cameras import Camera
+from express50.geometry.conventions import cell_to_corner, corner_to_cell
+from express50.geometry.mesh_raster import rasterize
 from express50.head.model import HeadModel, landmarks
-from express50.mesh_raster import rasterize
 from pipelines.track.offsets import movable_vertices
 from pipelines.track.samples import Samples, flat_barycentrics
 

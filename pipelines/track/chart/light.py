@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import open3d as o3d
 
-from express50.cameras import Camera
+from express50.geometry.cameras import Camera
 
 Rng = np.random.Generator
 # At least the first, fewer than the second.

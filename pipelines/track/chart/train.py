@@ -30,7 +30,7 @@ from express50.landmarks.network import (
     save_network,
     trainable_network,
 )
-from express50.landmarks.train import keep_state, rate_share, take_up
+from express50.landmarks.training.train import keep_state, rate_share, take_up
 from pipelines.track.chart.disturb import Case, creased, warped, where_seen
 from pipelines.track.chart.files import make_cases, read_cases
 from pipelines.track.chart.layout import MARKS, to_texels

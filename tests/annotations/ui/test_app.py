@@ -14,7 +14,7 @@ from annotations.ui.keymap import GROUPS
 from annotations.ui.panels import fit, hint_line
 from annotations.ui.picture import Picture
 from annotations.ui.strip import CurveStrip
-from express50.index import read_index
+from express50.capture.index import read_index
 from tests.annotations.footage import suggest
 
 

@@ -18,7 +18,7 @@ from annotations.ui.picture import Picture, shot_of
 from annotations.ui.session import open_session
 from annotations.ui.sixel import COLOURS, encode_sixel, quantise
 from annotations.ui.terminal import CellSize, choose_pictures
-from express50.images import decode_image
+from express50.files.images import decode_image
 
 SHOT = Shot("S1", "cam", 3, (0.0, 0.0, 1.0, 1.0), 8, 8)
 MESSAGE = re.compile(r"\x1b_G([^;\x1b]*)(?:;([^\x1b]*))?\x1b\\")

@@ -14,8 +14,8 @@ from annotations.ui.scene import load_scene
 from annotations.ui.session import IDLE_SECONDS, open_session
 from annotations.ui.view import open_view, set_plateau_first, step
 from annotations.worklist import Task
+from express50.capture.index import read_index
 from express50.errors import AnnotationError
-from express50.index import read_index
 from tests.annotations.footage import suggest
 
 REPOSITORY = Path(__file__).resolve().parents[3]
@@ -170,7 +170,7 @@ def test_the_toolkits_own_names_are_refused(suggested, name):
 _KILLED = """
 import sys
 sys.path[:0] = sys.argv[2:]
-from express50.layout import Dataset
+from express50.contract.layout import Dataset
 from annotations.ui.session import open_session
 from tests.annotations.ui.test_session import mark
 session = open_session(Dataset(sys.argv[1]), "ann", order="subject")

@@ -13,10 +13,10 @@ import h5py
 import numpy as np
 from PIL import Image
 
-from express50.adapters import K_to_opencv, opengl_from_cam_from_world
-from express50.cameras import Camera, resized
-from express50.images import encode_jpeg, encode_png
-from express50.transforms import look_at
+from express50.files.images import encode_jpeg, encode_png
+from express50.geometry.cameras import Camera, resized
+from express50.geometry.conventions import K_to_opencv, opengl_from_cam_from_world
+from express50.geometry.transforms import look_at
 
 WIDTH, HEIGHT = 64, 96
 SHAPE = (HEIGHT, WIDTH, 3)

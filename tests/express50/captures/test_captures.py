@@ -5,19 +5,19 @@ import json
 import numpy as np
 import pytest
 
-from express50.calibration_file import read_cameras
-from express50.cameras import project
-from express50.captures.person import read_people
-from express50.captures.read import detect, read_any, subject_of
-from express50.captures.timeline import common_timeline
-from express50.colour_polynomial import correct_srgb8
-from express50.config import resolve_config
+from express50.capture.colour_correction import correct_srgb8
+from express50.capture.frames import FrameReader, read_frame, read_plate, read_proxy
+from express50.capture.index import Cue, calibration_file, read_index
+from express50.capture.readers.person import read_people
+from express50.capture.readers.read import detect, read_any, subject_of
+from express50.capture.readers.timeline import common_timeline
+from express50.contract.config import resolve_config
+from express50.contract.layout import Dataset
 from express50.errors import CalibrationError, CaptureError
-from express50.frames import FrameReader, read_frame, read_plate, read_proxy
-from express50.images import encode_png
-from express50.index import Cue, calibration_file, read_index
-from express50.layout import Dataset
-from express50.runner import run_stage
+from express50.files.calibration import read_cameras
+from express50.files.images import encode_png
+from express50.geometry.cameras import project
+from express50.runner.runner import run_stage
 from pipelines import calibrate, ingest
 from tests.express50.captures import layouts
 from tests.express50.captures.layouts import picture, rig

@@ -11,16 +11,16 @@ import pytest
 import torch
 from scipy.ndimage import binary_dilation
 
+from express50.dataset.export.parameters import write_parameters
+from express50.dataset.export.select import Head
+from express50.dataset.tracks import read_track
 from express50.errors import HeadModelError
-from express50.export.parameters import write_parameters
-from express50.export.select import Head
+from express50.geometry.raycast import mesh_scene
+from express50.geometry.transforms import rigid_fit
 from express50.head.flame import load_flame
 from express50.head.model import HeadModel, landmarks, pose
 from express50.head.mouth import CORNERS, LOWER_RING, UPPER_RING, add_mouth, mouth_loop
 from express50.head.uv_room import place_charts
-from express50.raycast import mesh_scene
-from express50.tracks import read_track
-from express50.transforms import rigid_fit
 from tests.express50.flame_reader import flame_vertices
 from tests.express50.head.flame_head import MOUTH, write_flame_size
 from tests.express50.tracked import track_arrays, write_track

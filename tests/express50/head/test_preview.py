@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import torch
 
-from express50.cli import main
+from express50.cli.main import main
 from express50.errors import HeadModelError
+from express50.files.images import read_image
+from express50.head.generator.head import build_procedural_head
 from express50.head.preview import POSES, contact_sheet, expression_vector, render_preview
-from express50.head.procedural import build_procedural_head
-from express50.images import read_image
 
 
 def test_a_head_fills_the_middle_of_the_picture():

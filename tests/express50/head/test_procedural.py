@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from express50.head.generator.head import build_procedural_head, procedural_mesh
 from express50.head.model import REGIONS, landmarks
-from express50.head.procedural import build_procedural_head, procedural_mesh
 
 
 @pytest.fixture(scope="module")

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import torch
 
-from express50.expressions import load_script
+from express50.capture.expressions import load_script
+from express50.head.generator.head import build_procedural_head, procedural_mesh
 from express50.head.model import landmarks, pose
 from express50.head.preview import expression_vector, render_preview
-from express50.head.procedural import build_procedural_head, procedural_mesh
 
 
 @pytest.fixture(scope="module")

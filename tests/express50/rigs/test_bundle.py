@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from express50.cameras import Camera, project
+from express50.geometry.cameras import Camera, project
+from express50.geometry.transforms import look_at
 from express50.rigs.adjust import move_pose, triangulate_tracks
 from express50.rigs.bundle import Freedom, _linearise, _moved, adjust_rig, recorded_pixels
 from express50.rigs.tracks import Tracks, ideal_pixels
-from express50.transforms import look_at
 
 LENSES = {
     "SIMPLE_PINHOLE": (900.0, 320.0, 240.0),

@@ -9,18 +9,18 @@ import numpy as np
 import pytest
 from scipy.ndimage import map_coordinates
 
-from express50.calibration_file import write_cameras
-from express50.cameras import Camera, project, rays
-from express50.cli import main
+from express50.cli.main import main
+from express50.contract.layout import Dataset
 from express50.errors import CalibrationError, CaptureError
-from express50.images import write_image
-from express50.layout import Dataset
+from express50.files.calibration import write_cameras
+from express50.files.images import write_image
+from express50.geometry.cameras import Camera, project, rays
+from express50.geometry.transforms import look_at
 from express50.rigs.adjust import fit_poses, move_pose, triangulate_tracks
 from express50.rigs.features import epipolar_distance, find_features, without_fixed
 from express50.rigs.footage import check_footage, reduce_image, reduce_images
-from express50.rigs.moments import read_moments
+from express50.rigs.sampling import read_moments
 from express50.rigs.tracks import Tracks, look
-from express50.transforms import look_at
 
 TURN, SHIFT = np.radians(0.3), 5e-3
 

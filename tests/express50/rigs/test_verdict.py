@@ -6,10 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from express50.adapters import FLIP_YZ
-from express50.calibration_file import read_cameras, write_cameras
-from express50.cli import main
-from express50.rigs.verdict import judge
+from express50.cli.main import main
+from express50.files.calibration import read_cameras, write_cameras
+from express50.geometry.conventions import FLIP_YZ
+from express50.rigs.rig_check import judge
 from tests.express50.rigs.test_read import make_rig, write_transforms
 
 

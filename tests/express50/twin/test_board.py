@@ -2,8 +2,8 @@ import cv2
 import numpy as np
 import pytest
 
-from express50.adapters import opencv_pixels_to_corner
-from express50.cameras import project
+from express50.geometry.cameras import project
+from express50.geometry.conventions import opencv_pixels_to_corner
 from express50.twin.board import BoardSpec, board_poses, corner_points, render_board
 from express50.twin.rig import make_rig
 from express50.twin.sensor import expose, make_sensor

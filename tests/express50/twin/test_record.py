@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from express50.capture import read_capture
-from express50.cli import main
+from express50.capture.raw import read_capture
+from express50.cli.main import main
 from express50.console import USAGE
 from express50.errors import CaptureError, ConfigError
-from express50.footage import VideoFootage
-from express50.images import read_image
+from express50.files.images import read_image
+from express50.files.video import iterate_video
+from express50.files.video_writer import VideoFootage
 from express50.twin.config import TwinConfig
 from express50.twin.record import record
 from express50.twin.studio import film_board, film_subject
-from express50.video import iterate_video
 
 
 def digests(root):

@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from express50.cameras import Camera, rays
-from express50.transforms import look_at
+from express50.geometry.cameras import Camera, rays
+from express50.geometry.transforms import look_at
 from express50.twin import render
 from express50.twin.surface import Caster
 

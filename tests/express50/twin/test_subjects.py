@@ -3,8 +3,8 @@ import dataclasses
 import numpy as np
 import pytest
 
+from express50.capture.expressions import load_script, select
 from express50.errors import HeadModelError
-from express50.expressions import load_script, select
 from express50.head.load import load_head
 from express50.twin.body import build_body, head_vertices, model_materials, pose_body
 from express50.twin.noise import fractal, make_lattice, noise

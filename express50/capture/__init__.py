@@ -1,0 +1,1 @@
+"""Raw captures: index, frames, calibration, expressions."""

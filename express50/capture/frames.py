@@ -1,0 +1,342 @@
+"""Pixels of a dataset: full-resolution frames, plates, proxies, and the cameras to go with them."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from functools import lru_cache
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from express50.capture.colour_correction import correct_srgb8
+from express50.capture.index import CameraSource, Index, read_index
+from express50.capture.raw import RawCamera
+from express50.contract.layout import Dataset
+from express50.errors import CaptureError, FormatError, StageError
+from express50.files.calibration import read_cameras
+from express50.files.containers import inside, read_picture, read_srgb8
+from express50.files.containers import to_srgb8 as to_srgb8
+from express50.files.exif import upright
+from express50.files.images import decode_image
+from express50.files.text import NAME, read_json, read_json_table
+from express50.files.video import VideoReader
+from express50.geometry.cameras import Camera, pinhole
+from express50.geometry.conventions import undistort_image
+
+OPEN_READERS = 8  # open videos a process keeps; each holds a decoder's picture buffers
+
+
+def dhash(image: np.ndarray) -> str:
+    """64-bit difference hash of an (H, W, 3) uint8 image, 16 hexadecimal digits.
+
+    The image is averaged to 8 rows of 9 grey cells; each bit says whether a cell is darker than
+    its right neighbour. Source: N. Krawetz, "Kind of like that", 2013.
+    """
+    grey = cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2GRAY)
+    cells = cv2.resize(grey, (9, 8), interpolation=cv2.INTER_AREA).astype(np.int16)
+    bits = (cells[:, :-1] < cells[:, 1:]).reshape(-1)
+    return np.packbits(bits).tobytes().hex()
+
+
+class FrameReader:
+    """Full-resolution frames of one camera; reading forward is quick."""
+
+    def __init__(self, index: Index, camera_id: str) -> None:
+        if camera_id not in index.cameras:
+            raise CaptureError(
+                f"{index.subject}: no camera {camera_id!r}; "
+                f"expected one of {', '.join(index.cameras)}"
+            )
+        self.camera_id = camera_id
+        self.source = index.cameras[camera_id]
+        self.path = index.capture / self.source.source
+        self._clip = 0
+        self._video: VideoReader | None = None
+        if self.source.kind == "video":
+            self._video = VideoReader(self.path, self.source.pts)
+
+    def read(self, frame: int) -> np.ndarray:
+        """Image (H, W, 3) uint8 sRGB of a decode index, not undistorted, its colours corrected.
+
+        Raises:
+            CaptureError: no such frame, or the footage is not what was ingested.
+        """
+        if not 0 <= frame < self.source.frames:
+            raise CaptureError(
+                f"{self.path}: frame {frame} does not exist, expected 0 to {self.source.frames - 1}"
+            )
+        return corrected(self._recorded(frame), self.source)
+
+    def _recorded(self, frame: int) -> np.ndarray:
+        """The frame as it was recorded, its hash compared with the index."""
+        if self.source.kind == "frames":
+            image = read_picture(self.path, self.source.names[frame], self.source.orientation)
+            return self._checked(image, frame)
+        video, number = self._video_of(frame)
+        image = upright(video.read(number), self.source.orientation)
+        if dhash(image) != self.source.dhash[frame]:
+            # A decoder may conceal a missing reference after a seek; from the start it cannot.
+            video.restart()
+            image = upright(video.read(number), self.source.orientation)
+        return self._checked(image, frame)
+
+    def _video_of(self, frame: int) -> tuple[VideoReader, int]:
+        """The video that holds a frame, and the frame's number in it; one stays open."""
+        starts = np.concatenate([[0], np.cumsum(self.source.clips or (self.source.frames,))])
+        clip = int(np.searchsorted(starts, frame, side="right")) - 1
+        first, last = int(starts[clip]), int(starts[clip + 1])
+        if self._video is None or clip != self._clip:
+            self.close()
+            names = self.source.names
+            path = inside(self.path, names[clip]) if names else self.path
+            self._video = VideoReader(path, self.source.pts[first:last])
+            self._clip = clip
+        return self._video, frame - first
+
+    def _checked(self, image: np.ndarray, frame: int) -> np.ndarray:
+        found, expected = dhash(image), self.source.dhash[frame]
+        if found != expected:
+            raise CaptureError(
+                f"{self._file(frame)}: frame {frame} has hash {found}, the index says {expected}; "
+                "the footage changed since it was ingested, run 'express50 ingest' again"
+            )
+        return image
+
+    def _file(self, frame: int) -> str:
+        """Which file a frame lies in, for messages."""
+        if self.source.kind == "video":
+            return str(self.path)
+        if self.source.kind == "frames":
+            return f"{self.path}/{self.source.names[frame]}"
+        return f"{self.path}/{self.source.names[self._clip]}"
+
+    def close(self) -> None:
+        """Close the video, if there is one."""
+        if self._video is not None:
+            self._video.close()
+            self._video = None
+
+
+def corrected(image: np.ndarray, source: CameraSource | RawCamera) -> np.ndarray:
+    """An image (H, W, 3) uint8 with its camera's own colour correction, if it has one."""
+    return correct_srgb8(image, source.correction) if source.correction else image
+
+
+_readers: OrderedDict[tuple, FrameReader] = OrderedDict()
+
+
+def _reader(index: Index, camera_id: str) -> FrameReader:
+    """Reader of a camera, kept open while it is among the last few used."""
+    key = (index.capture, index.subject, camera_id)
+    reader = _readers.pop(key, None)
+    if reader is not None and reader.source != index.cameras.get(camera_id):
+        reader.close()
+        reader = None
+    _readers[key] = reader or FrameReader(index, camera_id)
+    while len(_readers) > OPEN_READERS:
+        _readers.popitem(last=False)[1].close()
+    return _readers[key]
+
+
+def read_frame(
+    dataset: Dataset, subject: str, camera_id: str, frame: int, undistort: bool = True
+) -> np.ndarray:
+    """Full-resolution frame (H, W, 3) uint8 sRGB by decode index.
+
+    Args:
+        dataset: the dataset.
+        subject: subject id.
+        camera_id: camera id.
+        frame: 0-based decode index.
+        undistort: as the pinhole camera of ``read_cameras_of`` sees it; needs calibrate.
+
+    Raises:
+        CaptureError: no such camera or frame, or the footage changed.
+        StageError: ingest, or calibrate when undistorting, did not run.
+    """
+    image = _reader(read_index(dataset, subject), camera_id).read(frame)
+    return _undistorted(dataset, subject, camera_id, image) if undistort else image
+
+
+def read_plate(
+    dataset: Dataset, subject: str, camera_id: str, undistort: bool = True
+) -> np.ndarray | None:
+    """Clean background plate (H, W, 3) uint8 sRGB, or None where the capture has none.
+
+    Raises:
+        CaptureError: it cannot be read, or is not of the footage's size.
+    """
+    index = read_index(dataset, subject)
+    if camera_id not in index.plates:
+        return None
+    path = index.capture / index.plates[camera_id]
+    image, footage = read_raw_plate(index, camera_id), index.cameras.get(camera_id)
+    if footage is not None and image.shape[:2] != (footage.height, footage.width):
+        raise CaptureError(
+            f"{path}: plate is {image.shape[1]}x{image.shape[0]}, the footage of {camera_id} is "
+            f"{footage.width}x{footage.height}; record the plate with the settings of the capture"
+        )
+    return _undistorted(dataset, subject, camera_id, image) if undistort else image
+
+
+def read_raw_plate(index: Index, camera_id: str) -> np.ndarray:
+    """A plate that the index has (H, W, 3) uint8, not undistorted, its colours corrected.
+
+    Raises:
+        CaptureError: it cannot be read.
+    """
+    image = read_srgb8(index.capture / index.plates[camera_id])
+    source = index.cameras.get(camera_id)
+    return corrected(image, source) if source else image
+
+
+def _undistorted(dataset: Dataset, subject: str, camera_id: str, image: np.ndarray) -> np.ndarray:
+    cameras = read_cameras_of(dataset, subject, undistorted=False)
+    if camera_id not in cameras:
+        raise StageError(
+            f"{subject}: camera {camera_id!r} is not calibrated; expected one of "
+            f"{', '.join(cameras)}"
+        )
+    return undistort_image(image, cameras[camera_id])
+
+
+def read_cameras_of(dataset: Dataset, subject: str, undistorted: bool = True) -> dict[str, Camera]:
+    """Calibrated cameras of a subject, sorted by id.
+
+    Args:
+        dataset: the dataset.
+        subject: subject id.
+        undistorted: give pinhole cameras, which undistorted frames belong to.
+
+    Raises:
+        StageError: the subject is not calibrated.
+    """
+    path = dataset.item_dir("calibrate", subject) / "cameras.json"
+    try:
+        stat = path.stat()
+    except FileNotFoundError as error:
+        raise StageError(
+            f"{path}: subject {subject!r} is not calibrated; "
+            f"run 'express50 calibrate {dataset.root}'"
+        ) from error
+    cameras = _cameras_cached(path, (stat.st_mtime_ns, stat.st_size, stat.st_ino))
+    return {name: pinhole(c) if undistorted else c for name, c in cameras.items()}
+
+
+@lru_cache(maxsize=64)
+def _cameras_cached(path: Path, version: tuple[int, ...]) -> dict[str, Camera]:
+    cameras = read_cameras(path)
+    return {name: cameras[name] for name in sorted(cameras)}
+
+
+def read_gains(dataset: Dataset, subject: str) -> dict[str, np.ndarray]:
+    """Linear light (3,) of each camera over that of the rig's mean; none where nothing told it.
+
+    Raises:
+        FormatError: the file is not {camera: [red, green, blue]} with numbers above 0.
+    """
+    path = dataset.item_dir("calibrate", subject) / "gains.json"
+    if not path.is_file():
+        return {}
+    try:
+        rows = read_json_table(path, FormatError, "calibrate again")
+        gains = {name: np.array(row, float) for name, row in rows.items()}
+    except (ValueError, TypeError, OverflowError) as error:
+        raise FormatError(f"{path}: not camera gains ({error}); calibrate again") from error
+    for name, gain in gains.items():
+        if gain.shape != (3,) or not np.isfinite(gain).all() or (gain <= 0).any():
+            raise FormatError(
+                f"{path}: {name} is {gain.tolist()}, expected three numbers above 0; "
+                "calibrate again"
+            )
+    return gains
+
+
+def read_peaks(dataset: Dataset, subject: str) -> dict[str, int]:
+    """Peak frame (decode index) of each expression.
+
+    Raises:
+        StageError: the subject is not aligned.
+        FormatError: the file is not a table of peaks.
+        CaptureError: a peak's hash is not that of the indexed frame, so it names another frame.
+    """
+    path = dataset.item_dir("align", subject) / "peaks.json"
+    if not path.is_file():
+        raise StageError(
+            f"{path}: subject {subject!r} is not aligned; run 'express50 align {dataset.root}'"
+        )
+    try:
+        rows = read_json_table(path, FormatError, "run 'express50 align' again")
+        peaks = {name: int(row["frame"]) for name, row in rows.items()}
+        named = [(n, str(row["camera"]), row["pts"], row["dhash"]) for n, row in rows.items()]
+        if strange := [name for name in rows if not NAME.fullmatch(name)]:
+            raise ValueError(f"expression {strange[0]!r} is no id")  # it becomes a folder's name
+    except (ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
+        raise FormatError(f"{path}: not a table of peaks ({type(error).__name__}: {error})") from (
+            error
+        )
+    index = read_index(dataset, subject)
+    for name, camera_id, pts, expected in named:
+        _check_peak(index, path, name, peaks[name], camera_id, (pts, expected))
+    return peaks
+
+
+def peak_items(dataset: Dataset) -> list[str]:
+    """`subject/expression` for every labelled peak of the aligned subjects."""
+    found = []
+    for subject in dataset.subjects():
+        if (dataset.item_dir("align", subject) / "peaks.json").is_file():
+            found += [f"{subject}/{name}" for name in sorted(read_peaks(dataset, subject))]
+    return found
+
+
+def _check_peak(
+    index: Index, path: Path, name: str, frame: int, camera_id: str, expected: tuple[int, str]
+) -> None:
+    source = index.cameras.get(camera_id)
+    there = source is not None and 0 <= frame < source.frames
+    found = (source.pts[frame], source.dhash[frame]) if source and there else ("none", "none")
+    if found != expected:
+        raise CaptureError(
+            f"{path}: {name}: frame {frame} of {camera_id} has hash {found[1]} at time {found[0]}, "
+            f"the label says {expected[1]} at {expected[0]}; the footage is not the one that was "
+            "labelled, run 'express50 align' again"
+        )
+
+
+def read_proxy(dataset: Dataset, subject: str, camera_id: str, frame: int) -> np.ndarray:
+    """Small JPEG copy (h, w, 3) uint8 sRGB of a frame; a random read costs milliseconds.
+
+    Raises:
+        StageError: the subject is not ingested.
+        CaptureError: no such camera or frame.
+    """
+    folder = dataset.item_dir("ingest", subject) / "proxies"
+    index = read_index(dataset, subject)
+    if camera_id not in index.cameras or not 0 <= frame < index.cameras[camera_id].frames:
+        raise CaptureError(f"{folder}: no frame {frame} of camera {camera_id!r}")
+    return decode_proxy(folder, camera_id, frame)
+
+
+def decode_proxy(folder: Path, camera_id: str, frame: int) -> np.ndarray:
+    """Proxy (h, w, 3) uint8 sRGB out of a folder of indexed tars."""
+    tar, table = folder / f"{camera_id}.tar", folder / f"{camera_id}.json"
+    try:
+        version = (table.stat().st_mtime_ns, table.stat().st_size)
+        offset, size = _proxy_table(table, version)[frame]
+        if min(offset, size) < 0 or offset + size > tar.stat().st_size:
+            raise ValueError(f"frame {frame} lies outside of {tar.name}")
+        with tar.open("rb") as file:
+            file.seek(offset)
+            data = file.read(size)
+    except FileNotFoundError as error:
+        raise FormatError(f"{folder}: proxies are missing; run 'express50 ingest' again") from error
+    except (OSError, ValueError, TypeError, IndexError) as error:
+        raise FormatError(f"{table}: no table of proxies ({error}); ingest again") from None
+    return decode_image(data, f"{tar}: frame {frame}")
+
+
+@lru_cache(maxsize=256)
+def _proxy_table(path: Path, version: tuple[int, int]) -> list[tuple[int, int]]:
+    return [(int(a), int(b)) for a, b in read_json(path, FormatError, "ingest again")]

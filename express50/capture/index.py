@@ -1,0 +1,222 @@
+"""The frame index that ingest writes: every camera's frames with their identity, and the cues."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import lru_cache
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+from express50.contract.layout import Dataset, footage_root
+from express50.errors import FormatError, StageError
+from express50.files.text import NAME, read_json_table
+
+SCHEMA = "express50.index/1"
+# `Index.calibration` of a capture in a foreign layout: its cameras stand beside the index.
+TRANSLATED = "ingest:calibration.json"
+
+
+@dataclass(frozen=True)
+class Cue:
+    """Frames in which one scripted expression was performed; both ends are inside."""
+
+    expression_id: str
+    start_frame: int
+    end_frame: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class CameraSource:
+    """Footage of one camera; sequences are by 0-based decode index.
+
+    Attributes:
+        kind: ``video``, ``videos`` (one file a clip) or ``frames``.
+        source: video file, or folder of the names, relative to the capture.
+        width: of the footage, pixels.
+        height: of the footage, pixels.
+        frames: how many frames decode.
+        pts: presentation time stamp of each frame (the frame's number for image files).
+        dhash: 64-bit difference hash of each frame, 16 hexadecimal digits.
+        sha256: of the video file, or of the names and digests of the image files.
+        names: images or videos in order, relative to the source; empty for a single video. An image
+            may lie in a container (`express50.files.containers`).
+        clips: frames of each clip; empty where all is one.
+        correction: rows of a polynomial colour correction that `frames` applies, or none.
+        orientation: how the images are turned when they are read (`files.exif`); width and
+            height are those of the turned ones.
+    """
+
+    kind: str
+    source: str
+    width: int
+    height: int
+    frames: int
+    pts: tuple[int, ...]
+    dhash: tuple[str, ...]
+    sha256: str
+    names: tuple[str, ...] = ()
+    clips: tuple[int, ...] = ()
+    correction: tuple[tuple[float, ...], ...] = ()
+    orientation: int = 1
+
+
+@dataclass(frozen=True, kw_only=True)
+class Index:
+    """Everything the stages need to know of one subject's capture.
+
+    Attributes:
+        subject: id.
+        capture: folder of the footage; from the dataset's table, not from the index file.
+        fps: frames a second.
+        cameras: usable cameras by id.
+        plates: clean background plates by camera id, relative to the capture.
+        board: ``{"config": board.toml's content, "cameras": {id: [files]}}`` or None.
+        calibration: calibration file relative to the capture, or None; see `calibration_file`.
+        cues: scripted expressions, in file order.
+        meta: content of capture.toml but for what describes the person (`demographics`).
+    """
+
+    subject: str
+    capture: Path
+    fps: float
+    cameras: dict[str, CameraSource]
+    plates: dict[str, str]
+    board: dict | None
+    calibration: str | None
+    cues: tuple[Cue, ...]
+    meta: dict = field(default_factory=dict)
+
+    @property
+    def frames(self) -> int:
+        """Frames that every camera has."""
+        return min(camera.frames for camera in self.cameras.values())
+
+
+def index_path(dataset: Dataset, subject: str) -> Path:
+    """Index file of a subject."""
+    return dataset.item_dir("ingest", subject) / "index.json"
+
+
+def calibration_file(dataset: Dataset, index: Index) -> Path | None:
+    """The given calibration: the capture's own, or the one that ingest translated; else None."""
+    if index.calibration is None:
+        return None
+    if index.calibration == TRANSLATED:
+        return dataset.item_dir("ingest", index.subject) / "calibration.json"
+    return index.capture / index.calibration
+
+
+def read_index(dataset: Dataset, subject: str) -> Index:
+    """Read a subject's index (cached until the file changes).
+
+    Raises:
+        StageError: the subject is not ingested, or its capture is no longer registered.
+        FormatError: the file does not follow its schema.
+    """
+    path = index_path(dataset, subject)
+    try:
+        stat = path.stat()
+    except FileNotFoundError as error:
+        known = ", ".join(dataset.subjects()) or "none"
+        raise StageError(
+            f"{path}: subject {subject!r} is not ingested (subjects: {known}); "
+            f"run 'express50 ingest {dataset.root} CAPTURE'"
+        ) from error
+    return _read_cached(dataset, subject, (stat.st_mtime_ns, stat.st_size, stat.st_ino))
+
+
+@lru_cache(maxsize=64)
+def _read_cached(dataset: Dataset, subject: str, version: tuple[int, ...]) -> Index:
+    path = index_path(dataset, subject)
+    captures = dataset.captures()
+    if subject not in captures:
+        raise StageError(
+            f"{dataset.captures_file}: subject {subject!r} has no capture; "
+            f"run 'express50 ingest {dataset.root} CAPTURE'"
+        )
+    root = footage_root(captures[subject])
+    try:
+        return index_from_json(read_json_table(path, FormatError), root)
+    except (ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
+        raise FormatError(
+            f"{path}: not an index ({type(error).__name__}: {error}); "
+            f"delete its folder and run 'express50 ingest {dataset.root}'"
+        ) from error
+
+
+def index_to_json(index: Index) -> dict[str, Any]:
+    """JSON form of an index; machine paths stay out of it."""
+    return {
+        "schema": SCHEMA,
+        "subject": index.subject,
+        "fps": index.fps,
+        "cameras": {name: _camera_to_json(camera) for name, camera in index.cameras.items()},
+        "plates": index.plates,
+        "board": index.board,
+        "calibration": index.calibration,
+        "cues": [[cue.expression_id, cue.start_frame, cue.end_frame] for cue in index.cues],
+        "meta": index.meta,
+    }
+
+
+def _camera_to_json(camera: CameraSource) -> dict[str, Any]:
+    row = dict(vars(camera))
+    # One string each keeps the file small and quick to read: a subject has 10^5 frames.
+    row["pts"] = " ".join(map(str, camera.pts))
+    row["dhash"] = " ".join(camera.dhash)
+    row["names"] = list(camera.names)
+    # Left out where they say nothing: most captures have one clip, no correction and lie upright.
+    plain = {"clips": (), "correction": (), "orientation": 1}
+    return {k: v for k, v in row.items() if k not in plain or v != plain[k]}
+
+
+def index_from_json(content: Mapping[str, Any], capture: Path) -> Index:
+    """Index of its JSON form.
+
+    Raises:
+        ValueError: another schema, or sequences whose lengths differ from the frame count.
+    """
+    if content.get("schema") != SCHEMA:
+        raise ValueError(f"schema is {content.get('schema')!r}, expected {SCHEMA!r}")
+    for name in (*content["cameras"], *(row[0] for row in content["cues"])):
+        if not NAME.fullmatch(name):  # they become names of files
+            raise ValueError(f"id {name!r}, expected letters, digits and _ . + -")
+    for name in content["plates"].values():
+        _check_inside(name)
+    return Index(
+        subject=content["subject"],
+        capture=Path(capture),
+        fps=float(content["fps"]),
+        cameras={k: _camera_from_json(k, content["cameras"][k]) for k in content["cameras"]},
+        plates=dict(content["plates"]),
+        board=content["board"],
+        calibration=content["calibration"],
+        cues=tuple(Cue(str(e), int(a), int(b)) for e, a, b in content["cues"]),
+        meta=dict(content["meta"]),
+    )
+
+
+def _check_inside(name: str) -> None:
+    """Refuse a name that leads out of the capture; the pictures' own are checked when read."""
+    if PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts:
+        raise ValueError(f"{name!r} leads out of the capture")
+
+
+def _camera_from_json(name: str, row: Mapping[str, Any]) -> CameraSource:
+    values = dict(row)
+    values["pts"] = tuple(map(int, row["pts"].split()))
+    values["dhash"] = tuple(row["dhash"].split())
+    values["names"] = tuple(row["names"])
+    values["clips"] = tuple(map(int, row.get("clips", ())))
+    values["correction"] = tuple(tuple(map(float, line)) for line in row.get("correction", ()))
+    camera = CameraSource(**values)
+    if type(camera.orientation) is not int or not 1 <= camera.orientation <= 8:
+        raise ValueError(f"camera {name}: orientation {camera.orientation!r}, expected 1 to 8")
+    _check_inside(camera.source)
+    lengths = {len(camera.pts), len(camera.dhash)}
+    if lengths != {camera.frames}:
+        raise ValueError(f"camera {name}: {sorted(lengths)} entries for {camera.frames} frames")
+    if camera.clips and sum(camera.clips) != camera.frames:
+        raise ValueError(f"camera {name}: clips of {sum(camera.clips)} of {camera.frames} frames")
+    return camera

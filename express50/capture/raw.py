@@ -1,0 +1,326 @@
+"""Raw captures as they come off the rig: read the folder, check it, name what is wrong.
+
+Layout: capture.toml, cameras/<id>/video.mp4 or cameras/<id>/frames/000000.png..., and optionally
+calibration.json, plates/<id>.png, board/<id>/*.png with board/board.toml, cues.csv.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+import re
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from express50.capture.index import Cue
+from express50.errors import CalibrationError, CaptureError
+from express50.files.calibration import read_cameras
+from express50.files.text import TOML_LIMIT, read_text, read_toml
+from express50.geometry.cameras import Camera
+
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".exr")
+VIDEO_SUFFIXES = (".mp4", ".mov", ".mkv", ".avi", ".webm")
+CUE_COLUMNS = ("expression_id", "start_frame", "end_frame")
+NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
+
+
+@dataclass(frozen=True, kw_only=True)
+class RawCamera:
+    """Footage of one camera, in clips one after another.
+
+    Attributes:
+        id: of the camera.
+        kind: ``video`` (``path`` is the file), ``videos`` (one file a clip) or ``frames`` (images).
+        path: the video, or the folder that ``names`` are relative to.
+        names: videos or images in order; an image may lie in a container (`files.containers`).
+        counts: images of each clip; one clip where it is empty.
+        stamps: the layout's own number of each image; its place where it is empty.
+        correction: rows of a polynomial colour correction (`colour_correction`), or none.
+        orientation: how images are to be turned when they are read (`files.exif`).
+    """
+
+    id: str
+    kind: str
+    path: Path
+    names: tuple[str, ...] = ()
+    counts: tuple[int, ...] = ()
+    stamps: tuple[int, ...] = ()
+    correction: tuple[tuple[float, ...], ...] = ()
+    orientation: int = 1
+
+
+@dataclass(frozen=True, kw_only=True)
+class RawCapture:
+    """A capture of any layout, checked as far as that goes without decoding footage.
+
+    Attributes:
+        root: the folder that footage and plates are relative to.
+        subject: subject id.
+        fps: frames a second.
+        meta: content of capture.toml.
+        cameras: footage by camera id.
+        dropped: cameras that cannot be used, with the reason.
+        calibration: given cameras, or None when they are to be solved.
+        plates: background plates by camera id, relative to the root.
+        board: content of board.toml and files by camera, or None.
+        cues: scripted expressions in file order.
+        layout: which of `express50.capture.readers` it is; ours is ``express50``.
+        clips: expression of each clip where the footage comes in clips; they make the cues.
+        skipped: what of a layout was left out (sequences, frames), with the reason.
+        found: what the layout told about itself.
+        warnings: what is odd but may be meant, with the reason.
+    """
+
+    root: Path
+    subject: str
+    fps: float
+    meta: dict
+    cameras: dict[str, RawCamera]
+    dropped: dict[str, str] = field(default_factory=dict)
+    calibration: dict[str, Camera] | None = None
+    plates: dict[str, str] = field(default_factory=dict)
+    board: dict | None = None
+    cues: tuple[Cue, ...] = ()
+    layout: str = "express50"
+    clips: tuple[str, ...] = ()
+    skipped: dict[str, str] = field(default_factory=dict)
+    found: dict = field(default_factory=dict)
+    warnings: dict[str, str] = field(default_factory=dict)
+
+
+def read_capture(root: Path) -> RawCapture:
+    """Read and check a raw capture.
+
+    Raises:
+        CaptureError: a file is missing or malformed so that the whole capture is unusable.
+        CalibrationError: calibration.json is there but malformed.
+    """
+    root = Path(root)
+    meta = read_meta(root)
+    cameras, dropped = _read_cameras(root)
+    calibration = read_cameras(root / "calibration.json") if has_calibration(root) else None
+    if calibration is not None:
+        for name in sorted(set(calibration) - set(cameras) - set(dropped)):
+            dropped[name] = f"calibrated, but {root / 'cameras' / name} is not there"
+        for name in sorted(set(cameras) - set(calibration)):
+            dropped[name] = "not in calibration.json; add it, or delete that file to solve all"
+            del cameras[name]
+    return RawCapture(
+        root=root,
+        subject=meta["subject"],
+        fps=float(meta["fps"]),
+        meta=meta,
+        cameras=cameras,
+        dropped=dropped,
+        calibration=calibration,
+        plates=_read_plates(root, cameras),
+        board=_read_board(root, cameras),
+        cues=read_cues(root / "cues.csv"),
+    )
+
+
+def has_calibration(root: Path) -> bool:
+    """Whether the capture brings its own cameras."""
+    return (root / "calibration.json").is_file()
+
+
+def read_meta(root: Path) -> dict:
+    """Content of capture.toml with checked subject and fps.
+
+    Raises:
+        CaptureError: no such folder or file, not TOML, or a field is missing or out of range.
+    """
+    path = Path(root) / "capture.toml"
+    if not path.is_file():
+        what = "no such folder" if not Path(root).is_dir() else "has no capture.toml"
+        raise CaptureError(
+            f"{root}: {what}; expected a capture folder whose capture.toml says subject and fps"
+        )
+    meta = read_capture_toml(path)
+    check_identity(path, meta.get("subject"), meta.get("fps"))
+    return meta
+
+
+def read_capture_toml(path: Path) -> dict:
+    """Content of a capture.toml, dates as text; nothing of it is checked.
+
+    Raises:
+        CaptureError: it cannot be read or is not TOML.
+    """
+    return {key: plain(value) for key, value in read_toml(path, CaptureError).items()}
+
+
+def check_identity(path: Path, subject: object, fps: object) -> None:
+    """Refuse a subject or frame rate that cannot be one.
+
+    Raises:
+        CaptureError: a value is missing, of another type or out of range.
+    """
+    if not isinstance(subject, str) or not NAME.fullmatch(subject):
+        raise CaptureError(
+            f"{path}: subject is {subject!r}, expected letters, digits, '_' and '-', such as 'S001'"
+        )
+    if isinstance(fps, bool) or not isinstance(fps, int | float):
+        raise CaptureError(f"{path}: fps is {fps!r}, expected a number such as 24")
+    if not (math.isfinite(fps) and 0 < fps <= 10_000):
+        raise CaptureError(f"{path}: fps is {fps!r}, expected more than 0 and at most 10000")
+
+
+def plain(value: object) -> object:
+    """TOML content with dates as text, so that it can go into JSON."""
+    if isinstance(value, dict):
+        return {key: plain(one) for key, one in value.items()}
+    if isinstance(value, list):
+        return [plain(one) for one in value]
+    return value if isinstance(value, str | int | float) else str(value)
+
+
+def _read_cameras(root: Path) -> tuple[dict[str, RawCamera], dict[str, str]]:
+    folder = root / "cameras"
+    if not folder.is_dir():
+        raise CaptureError(f"{folder}: no such folder; expected cameras/<id>/video.mp4 or frames/")
+    cameras, dropped = {}, {}
+    for path in sorted(p for p in folder.iterdir() if not p.name.startswith(".")):
+        if not path.is_dir():
+            continue
+        try:
+            cameras[path.name] = _read_camera(path)
+        except CaptureError as error:
+            dropped[path.name] = str(error)
+    return cameras, dropped
+
+
+def _read_camera(folder: Path) -> RawCamera:
+    if not NAME.fullmatch(folder.name):
+        raise CaptureError(
+            f"{folder}: camera id {folder.name!r}; expected letters, digits, '_' and '-'"
+        )
+    videos = [folder / f"video{suffix}" for suffix in VIDEO_SUFFIXES]
+    found = [video for video in videos if video.is_file()]
+    frames = folder / "frames"
+    if len(found) + frames.is_dir() > 1:
+        names = ", ".join([video.name for video in found] + ["frames/"] * frames.is_dir())
+        raise CaptureError(f"{folder}: holds {names}, expected one of them; move the others away")
+    if found:
+        return RawCamera(id=folder.name, kind="video", path=found[0])
+    if not frames.is_dir():
+        raise CaptureError(f"{folder}: holds no footage, expected video.mp4 or frames/000000.png")
+    return RawCamera(id=folder.name, kind="frames", path=frames, names=_frame_names(frames))
+
+
+def _frame_names(folder: Path) -> tuple[str, ...]:
+    """Image names in order; they must count up from zero, or frames would be mistaken."""
+    names = image_names(folder)
+    if not names:
+        raise CaptureError(f"{folder}: holds no image, expected 000000.png and so on")
+    for number, name in enumerate(names):
+        stem = Path(name).stem
+        if not stem.isdecimal() or len(stem) > 18 or int(stem) != number:
+            raise CaptureError(
+                f"{folder}: frame {number} is missing: found {name}, expected {number:06d} with "
+                f"one of {' '.join(IMAGE_SUFFIXES)}; restore it, or renumber from 000000"
+            )
+    return tuple(names)
+
+
+def image_names(folder: Path) -> list[str]:
+    """Names of the image files in a folder, sorted; none when there is no folder."""
+    if not folder.is_dir():
+        return []
+    return sorted(
+        path.name
+        for path in folder.iterdir()
+        if path.suffix.lower() in IMAGE_SUFFIXES and not path.name.startswith(".")
+    )
+
+
+def _read_plates(root: Path, cameras: dict[str, RawCamera]) -> dict[str, str]:
+    names = image_names(root / "plates")
+    return {Path(n).stem: f"plates/{n}" for n in names if Path(n).stem in cameras}
+
+
+def _read_board(root: Path, cameras: dict[str, RawCamera]) -> dict | None:
+    folder = root / "board"
+    if not folder.is_dir():
+        return None
+    path = folder / "board.toml"
+    if not path.is_file():
+        raise CaptureError(
+            f"{folder}: has no board.toml; describe the ChArUco board in it, see docs/FORMAT.md"
+        )
+    config = read_toml(path, CaptureError)
+    files = {name: image_names(folder / name) for name in cameras}
+    return {
+        "config": plain(config),
+        "cameras": {k: [f"board/{k}/{name}" for name in v] for k, v in files.items() if v},
+    }
+
+
+def read_cues(path: Path) -> tuple[Cue, ...]:
+    """Read ``expression_id,start_frame,end_frame`` rows; no file means no cues.
+
+    Raises:
+        CaptureError: a column is missing, a value is not a frame number, the end is before the
+            start, or an expression appears twice.
+    """
+    if not path.is_file():
+        return ()
+    text = read_text(path, CaptureError, TOML_LIMIT)
+    reader = csv.DictReader(text.splitlines(), skipinitialspace=True)
+    try:
+        missing = [name for name in CUE_COLUMNS if name not in (reader.fieldnames or ())]
+        if missing:
+            raise CaptureError(
+                f"{path}: no column {', '.join(missing)}; got {reader.fieldnames}, expected "
+                f"{','.join(CUE_COLUMNS)} in the first line"
+            )
+        cues = [_read_cue(path, reader.line_num, row) for row in reader]
+    except csv.Error as error:
+        raise CaptureError(f"{path}: not CSV ({error}); write it again") from error
+    seen: set[str] = set()
+    for cue in cues:
+        if cue.expression_id in seen:
+            raise CaptureError(f"{path}: {cue.expression_id} appears twice, expected once")
+        seen.add(cue.expression_id)
+    return tuple(cues)
+
+
+def _read_cue(path: Path, line: int, row: dict[str, str]) -> Cue:
+    name = (row["expression_id"] or "").strip()
+    if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_]*", name):
+        raise CaptureError(
+            f"{path}:{line}: expression_id is {name!r}, expected letters, digits and '_'"
+        )
+    try:
+        start, end = int(row["start_frame"]), int(row["end_frame"])
+    except (TypeError, ValueError) as error:
+        raise CaptureError(
+            f"{path}:{line}: frames are {row['start_frame']!r} and {row['end_frame']!r}, "
+            "expected two whole numbers"
+        ) from error
+    if not 0 <= start <= end < 2**31:
+        raise CaptureError(
+            f"{path}:{line}: {name} runs from {start} to {end}; expected 0 <= start <= end "
+            "(the end frame is inside)"
+        )
+    return Cue(name, start, end)
+
+
+def check_calibrated_sizes(raw: RawCapture, sizes: dict[str, tuple[int, int]]) -> None:
+    """Refuse cameras calibrated for another image size than their footage has.
+
+    Args:
+        raw: the capture.
+        sizes: decoded (width, height) by camera id.
+
+    Raises:
+        CalibrationError: a size differs; guessing a scale here once cost a peer days.
+    """
+    for name, (width, height) in sizes.items():
+        camera = (raw.calibration or {}).get(name)
+        if camera is not None and (camera.width, camera.height) != (width, height):
+            raise CalibrationError(
+                f"{raw.root / 'calibration.json'}: camera {name} is calibrated for "
+                f"{camera.width}x{camera.height}, its footage is {width}x{height}; "
+                "calibrate at the footage's size or scale the intrinsics"
+            )

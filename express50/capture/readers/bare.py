@@ -1,0 +1,86 @@
+"""Footage without any layout: a folder of photographs of one moment, or one video of one camera."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from express50.capture.raw import VIDEO_SUFFIXES, RawCamera, RawCapture, image_names
+from express50.capture.readers.selection import Wishes, check_wishes, identifier
+from express50.errors import CaptureError, FormatError
+from express50.files.exif import ORIENTATION, read_exif
+from express50.files.video import video_fps, video_turn
+
+FPS = 24.0  # of photographs it means nothing
+CAMERA = "video"
+
+
+def subject_of(path: Path) -> str:
+    """The folder's or the video's name."""
+    return identifier(path.stem if path.is_file() else path.resolve().name)
+
+
+def fits_photos(path: Path) -> bool:
+    """Whether a folder holds photographs."""
+    return path.is_dir() and bool(image_names(path))
+
+
+def read_photos(path: Path, wishes: Wishes) -> RawCapture:
+    """Each photograph as a camera of one moment; the cameras are solved from the footage.
+
+    A photograph that lies on its side by its EXIF is read upright.
+
+    Raises:
+        CaptureError: two names become one camera id, or no photograph can be used.
+    """
+    names = image_names(path)
+    ids = {name: identifier(Path(name).stem) for name in names}
+    check_wishes(wishes, ["photo"], sorted(ids.values()))
+    dropped: dict[str, str] = {}
+    cameras: dict[str, RawCamera] = {}
+    for name, camera in ids.items():
+        if not wishes.wants_camera(camera):
+            continue
+        if camera in cameras:
+            raise CaptureError(
+                f"{path / name}: becomes camera {camera}, as {cameras[camera].names[0]} does; "
+                "rename one"
+            )
+        try:
+            orientation, _ = read_exif(path / name)
+        except FormatError as error:
+            dropped[camera] = str(error)
+            continue
+        cameras[camera] = RawCamera(
+            id=camera, kind="frames", path=path, names=(name,), counts=(1,), orientation=orientation
+        )
+    if not cameras:
+        reasons = "; ".join(f"{k}: {v}" for k, v in dropped.items())
+        raise CaptureError(f"{path}: no photograph can be used: {reasons or 'none was asked for'}")
+    return RawCapture(
+        root=path, subject=subject_of(path), fps=FPS, meta={}, cameras=cameras, dropped=dropped,
+        layout="photos", clips=(wishes.expression("photo"),),
+    )  # fmt: skip
+
+
+def fits_video(path: Path) -> bool:
+    """Whether a path is a video file."""
+    return path.is_file() and path.suffix.lower() in VIDEO_SUFFIXES
+
+
+def read_video(path: Path, wishes: Wishes) -> RawCapture:
+    """A video as one camera; all of it is one clip, named ``clip`` unless it is told otherwise.
+
+    A video that lies on its side, as telephones store what they film upright, is read upright.
+
+    Raises:
+        CaptureError: it is no video.
+    """
+    check_wishes(wishes, ["clip"], [CAMERA])
+    orientation = ORIENTATION[video_turn(path)]
+    camera = RawCamera(
+        id=CAMERA, kind="videos", path=path.parent, names=(path.name,), orientation=orientation
+    )
+    return RawCapture(
+        root=path.parent, subject=subject_of(path), fps=video_fps(path), meta={},
+        cameras={CAMERA: camera}, layout="video", clips=(wishes.expression("clip"),),
+    )  # fmt: skip

@@ -1,0 +1,104 @@
+"""NeRSemble v2: a participant's folder, ``018/``, one video a sequence and camera.
+
+Footage is colour-corrected when it is read (``color_calibration.json``: a polynomial a camera, in
+linear light), its files stay as they are. Source: the layout that nersemble-data 0.0.6 reads.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from express50.capture.colour_correction import check_matrix
+from express50.capture.raw import RawCamera, RawCapture
+from express50.capture.readers.selection import Wishes, check_wishes, identifier
+from express50.capture.readers.timeline import Moment, common_timeline
+from express50.errors import CaptureError
+from express50.files.video import video_fps
+from express50.rigs.build import read_table
+from express50.rigs.releases import read_nersemble
+
+CAMERAS = Path("calibration/camera_params.json")
+COLOURS = Path("calibration/color_calibration.json")
+BACKGROUND = "BACKGROUND"
+
+
+def fits(path: Path) -> bool:
+    """Whether a folder is a participant's."""
+    return (path / CAMERAS).is_file() and (path / "sequences").is_dir()
+
+
+def subject_of(path: Path) -> str:
+    """The participant's number."""
+    return identifier(path.name)
+
+
+def read(path: Path, wishes: Wishes) -> RawCapture:
+    """Read a participant's sequences.
+
+    Raises:
+        CaptureError: there is no video.
+        CalibrationError: cameras or colours are malformed.
+    """
+    calibration = read_nersemble(path / CAMERAS)
+    sequences = sorted(
+        p.name for p in (path / "sequences").iterdir() if p.is_dir() and p.name != BACKGROUND
+    )
+    check_wishes(wishes, sequences, sorted(calibration))
+    skipped = {
+        f"sequence {name}": "not asked for" for name in sequences if not wishes.wants_sequence(name)
+    }
+    wanted = [name for name in sequences if wishes.wants_sequence(name)]
+    serials = [serial for serial in sorted(calibration) if wishes.wants_camera(serial)]
+    videos: dict[str, dict[Moment, str]] = {serial: {} for serial in serials}
+    for serial in serials:
+        for sequence in wanted:
+            name = f"sequences/{sequence}/images/cam_{serial}.mp4"
+            if (path / name).is_file():
+                videos[serial][(sequence, 0)] = name
+    line = common_timeline(videos, wanted)
+    if not line.names or not line.moments:
+        raise CaptureError(
+            f"{path}: no video of {len(serials)} cameras and {len(wanted)} sequences; expected "
+            "sequences/<name>/images/cam_<serial>.mp4"
+        )
+    colours, warnings = _colours(path, set(line.names))
+    some = next(iter(line.names.values()))[0]
+    return RawCapture(
+        root=path,
+        subject=subject_of(path),
+        fps=video_fps(path / some),
+        meta={"licence": "research only, see the terms of NeRSemble"},
+        cameras={
+            serial: RawCamera(
+                id=serial, kind="videos", path=path, names=names, correction=colours.get(serial, ())
+            )
+            for serial, names in line.names.items()
+        },
+        dropped={k: v.replace("frames", "videos") for k, v in line.dropped.items()},
+        calibration={k: c for k, c in calibration.items() if k in line.names},
+        plates=_plates(path, set(line.names)),
+        layout="nersemble",
+        clips=tuple(wishes.expression(sequence) for sequence in line.sequences),
+        skipped=skipped | {k.replace("frames", "videos"): v for k, v in line.skipped.items()},
+        found={"colour_corrected": sorted(colours)},
+        warnings=warnings,
+    )
+
+
+def _plates(path: Path, serials: set[str]) -> dict[str, str]:
+    names = {s: f"sequences/{BACKGROUND}/image_{s}.jpg" for s in sorted(serials)}
+    return {serial: name for serial, name in names.items() if (path / name).is_file()}
+
+
+def _colours(path: Path, serials: set[str]) -> tuple[dict, dict[str, str]]:
+    """Correction by camera, and what to say of those without one."""
+    if not (path / COLOURS).is_file():
+        return {}, {"colours": f"{COLOURS} is not there; colours stay as each camera recorded them"}
+    table = read_table(path / COLOURS)
+    found = {
+        serial: check_matrix(table[serial], f"{path / COLOURS}: {serial}")
+        for serial in sorted(serials & set(table))
+    }
+    without = sorted(serials - set(found))
+    words = {f"camera {s}": f"{COLOURS} has no correction of it" for s in without}
+    return found, words

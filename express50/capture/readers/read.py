@@ -1,0 +1,201 @@
+"""Read a capture of any known layout: which one it is, what it holds, what was left out and why.
+
+A layout is a row of a plain table: its name, what it looks like, a test, the subject's id, and a
+reader that turns it into a `RawCapture`. Nothing is copied or unpacked. A folder with capture.toml
+may name where the footage lies (``source``), which layout it is (``layout``) and which parts to
+take, so that read-only datasets need no file of ours beside them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from express50.capture.raw import (
+    RawCapture,
+    check_identity,
+    read_capture,
+    read_capture_toml,
+    read_meta,
+)
+from express50.capture.readers import (
+    ava256,
+    bare,
+    multiface,
+    nersemble,
+    posed,
+    ravdess,
+    renderme,
+)
+from express50.capture.readers.selection import EXPRESSION, Wishes, parse_wishes
+from express50.contract.layout import footage_source
+from express50.errors import CalibrationError, CaptureError
+from express50.rigs.rig_check import judge
+
+OURS = "express50"
+
+
+@dataclass(frozen=True)
+class Layout:
+    """How one layout is known and read.
+
+    Attributes:
+        name: of the layout.
+        looks: what it looks like, in words.
+        fits: whether a file or folder is one.
+        subject_of: the subject's id.
+        read: the capture; wishes choose parts of it.
+    """
+
+    name: str
+    looks: str
+    fits: Callable[[Path], bool]
+    subject_of: Callable[[Path], str]
+    read: Callable[[Path, Wishes], RawCapture]
+
+
+# In order: a layout that another could be mistaken for stands behind it.
+LAYOUTS = (
+    Layout(
+        "renderme360", "<actor>_<performance>_raw.smc",
+        renderme.fits, renderme.subject_of, renderme.read,
+    ),
+    Layout(
+        "nersemble", "calibration/camera_params.json and sequences/",
+        nersemble.fits, nersemble.subject_of, nersemble.read,
+    ),
+    Layout(
+        "ava256", "decoder/camera_calibration.json", ava256.fits, ava256.subject_of, ava256.read
+    ),
+    Layout("multiface", "KRT and images/", multiface.fits, multiface.subject_of, multiface.read),
+    Layout("ravdess", "01-01-03-02-01-01-05.mp4", ravdess.fits, ravdess.subject_of, ravdess.read),
+    Layout(
+        "transforms", "transforms.json",
+        posed.fits_transforms, posed.subject_of, posed.read_transforms_folder,
+    ),
+    Layout(
+        "colmap", "images/ and sparse/0/", posed.fits_colmap, posed.subject_of,
+        posed.read_colmap_folder,
+    ),
+    Layout("photos", "a folder of images", bare.fits_photos, bare.subject_of, bare.read_photos),
+    Layout("video", "a video file", bare.fits_video, bare.subject_of, bare.read_video),
+)  # fmt: skip
+
+
+def detect(path: Path, name: object = None) -> Layout:
+    """The layout of a file or folder; the first that fits, or the named one.
+
+    Raises:
+        CaptureError: it does not exist, no layout has the name, or none fits.
+    """
+    path = Path(path)
+    if not path.exists():
+        raise CaptureError(f"{path}: no such folder or file; expected a capture")
+    names = [layout.name for layout in LAYOUTS]
+    if name is not None and name not in names:
+        raise CaptureError(f"{path}: layout {name!r}, expected one of {OURS}, {', '.join(names)}")
+    for layout in LAYOUTS:
+        if name in (None, layout.name) and layout.fits(path):
+            return layout
+    looks = "; ".join(f"{x.name}: {x.looks}" for x in LAYOUTS if name in (None, x.name))
+    ours = "" if name else f"; {OURS}: capture.toml and cameras/"
+    raise CaptureError(f"{path}: {_holds(path)}, expected one of: {looks}{ours}")
+
+
+def _holds(path: Path) -> str:
+    """What is there instead, in a few words."""
+    if path.is_file():
+        return f"no known layout of a file {path.suffix or 'without an ending'}"
+    names = sorted(p.name for p in path.iterdir() if not p.name.startswith("."))
+    shown = ", ".join(names[:5]) + (", ..." if len(names) > 5 else "")
+    return f"no known layout: it holds {shown or 'nothing'}"
+
+
+def is_ours(path: Path) -> bool:
+    """Whether a path is a capture in our own layout, or is meant as one."""
+    meta = _meta(path)
+    if meta is None:
+        return (path / "cameras").is_dir()  # the error then says what is missing
+    if "source" in meta:
+        return False
+    layout = meta.get("layout", OURS if (path / "cameras").is_dir() else None)
+    # A capture.toml alone says that it is ours; the error then says what is missing.
+    return layout == OURS or (layout is None and not any(x.fits(path) for x in LAYOUTS))
+
+
+def _meta(path: Path) -> dict | None:
+    """Content of a capture.toml, None where there is none."""
+    file = path / "capture.toml"
+    return read_capture_toml(file) if file.is_file() else None
+
+
+def subject_of(path: Path) -> str:
+    """The subject of a capture of any layout, without reading its footage.
+
+    Raises:
+        CaptureError: it is no capture, or its subject cannot be an id.
+    """
+    if is_ours(path):
+        return read_meta(path)["subject"]
+    meta, source = _meta(path) or {}, footage_source(path)
+    layout = detect(source, meta.get("layout"))
+    subject = meta.get("subject") or layout.subject_of(source)
+    check_identity(path / "capture.toml" if path.is_dir() else path, subject, meta.get("fps", FPS))
+    return subject
+
+
+FPS = 24.0  # stands in where only the subject is asked for
+
+
+def read_any(path: Path) -> RawCapture:
+    """Read a capture of any layout.
+
+    Raises:
+        CaptureError: it is no capture, or nothing of it can be used.
+        CalibrationError: its cameras are malformed or do not fit together.
+    """
+    path = Path(path)
+    if is_ours(path):
+        return read_capture(path)
+    meta, source = _meta(path) or {}, footage_source(path)
+    layout = detect(source, meta.get("layout"))
+    wishes = parse_wishes(meta, path / "capture.toml")
+    raw = layout.read(source, wishes)
+    subject, fps = meta.get("subject") or raw.subject, meta.get("fps", raw.fps)
+    check_identity(path / "capture.toml", subject, fps)
+    # Where the footage lies is this machine's matter, not the dataset's.
+    told = {key: value for key, value in meta.items() if key != "source"}
+    described = raw.meta | told | {"subject": subject, "fps": float(fps), "layout": raw.layout}
+    raw = replace(raw, subject=subject, fps=float(fps), meta=described)
+    _check_clips(raw, path)
+    return _judged(raw, path)
+
+
+def _check_clips(raw: RawCapture, path: Path) -> None:
+    doubled = sorted({clip for clip in raw.clips if raw.clips.count(clip) > 1})
+    if doubled or not all(EXPRESSION.fullmatch(clip) for clip in raw.clips):
+        raise CaptureError(
+            f"{path}: {', '.join(doubled) or raw.clips} cannot be the expressions of its "
+            "sequences; give each its own id in [expressions] of capture.toml"
+        )
+
+
+def _judged(raw: RawCapture, path: Path) -> RawCapture:
+    """The capture after the check that its cameras look at one place in front of them."""
+    if not raw.calibration:
+        return raw
+    verdict = judge(raw.calibration)
+    if verdict.problem:
+        raise CalibrationError(
+            f"{path}: {verdict.problem}; {verdict.remedy or 'check the calibration'}"
+        )
+    odd = {"cameras": "; ".join(verdict.warnings)} if verdict.warnings else {}
+    return replace(raw, warnings=raw.warnings | odd)
+
+
+def watched(path: Path) -> list[Path]:
+    """Files and folders whose change makes an ingest stale."""
+    source = footage_source(path)
+    found = [path] if source == path else [path, source]
+    return found + (renderme.companions(source) if renderme.fits(source) else [])

@@ -1,0 +1,269 @@
+"""RenderMe-360: a folder of ``.smc`` files (HDF5) of one actor, or one such file.
+
+Two releases are told apart. The full one (21 actors) has pictures in ``raw/<id>/<id>_e0_raw.smc``
+and cameras in ``anno/<id>/<id>_e0_anno.smc``; the one of 500 actors has both in ``<id>_e0.smc``,
+and of an expression key frames only. An expression's peak is the last frame of its clip in both,
+but that is frame 119 of one and 12 of the other: the release and the frame's own number are stored.
+``RT`` is camera to world. Source: the dataset's published layout and reader.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import h5py
+import numpy as np
+
+from express50.capture.raw import RawCamera, RawCapture
+from express50.capture.readers.selection import Wishes, check_wishes
+from express50.capture.readers.timeline import Moment, common_timeline
+from express50.errors import CaptureError
+from express50.files.containers import WITHIN, attribute, child, members, open_hdf5
+from express50.geometry.cameras import Camera
+from express50.rigs.releases import read_renderme
+
+FPS = 30.0
+FULL, KEY_FRAMES = "full", "key frames"
+USUAL = "e*"  # the twelve expressions; speech (s*) and hair (h*) are taken when asked for
+MOVED_MM = 1.0
+
+
+@dataclass(frozen=True)
+class Performance:
+    """One performance's files: ``raw`` has the pictures, ``anno`` (it may be the same) the rest."""
+
+    part: str
+    raw: Path
+    anno: Path | None
+    release: str
+
+
+def fits(path: Path) -> bool:
+    """Whether a path is an SMC, or a folder that holds some."""
+    if path.is_file():
+        return path.suffix.lower() == ".smc"
+    return any(path.glob("*.smc"))
+
+
+def subject_of(path: Path) -> str:
+    """The actor's number.
+
+    Raises:
+        CaptureError: the folder holds several actors.
+    """
+    actors = sorted({_parts(file)[0] for file in _files(path)})
+    if len(actors) != 1:
+        raise CaptureError(
+            f"{path}: holds {len(actors)} actors ({', '.join(actors[:4])}), expected one; give the "
+            "folder of one actor, such as raw/0026"
+        )
+    return actors[0]
+
+
+def _files(path: Path) -> list[Path]:
+    return [path] if path.is_file() else sorted(path.glob("*.smc"))
+
+
+def _parts(file: Path) -> tuple[str, str, str]:
+    """Actor, performance and kind (``raw``, ``anno`` or empty) of a file's name."""
+    actor, _, rest = file.stem.partition("_")
+    for kind in ("raw", "anno"):
+        if rest.endswith(f"_{kind}"):
+            return actor, rest.removesuffix(f"_{kind}"), kind
+    if not actor.isdigit() or rest[:1] not in ("e", "h", "s"):
+        raise CaptureError(
+            f"{file}: name is no performance of RenderMe-360; expected such as 0026_e0_raw.smc"
+        )
+    return actor, rest, ""
+
+
+def companions(path: Path) -> list[Path]:
+    """Files beside the footage that are read too."""
+    folder = path if path.is_dir() else path.parent
+    other = folder.parent.parent / "anno" / folder.name
+    return [other] if other.is_dir() else []
+
+
+def performances(path: Path) -> dict[str, Performance]:
+    """Performances of a folder in their order: e0 to e11, then the others.
+
+    Raises:
+        CaptureError: there are annotations only.
+    """
+    found = {}
+    for file in _files(path):
+        actor, part, kind = _parts(file)
+        if kind == "anno":
+            continue
+        places = (file.parent, *companions(path))
+        anno = next((p for d in places if (p := d / f"{actor}_{part}_anno.smc").is_file()), None)
+        release = FULL if kind == "raw" else KEY_FRAMES
+        found[part] = Performance(part, file, anno if kind == "raw" else file, release)
+    if not found:
+        raise CaptureError(
+            f"{path}: holds annotations only; give the folder with the pictures, such as raw/0026"
+        )
+    return dict(sorted(found.items(), key=lambda item: (item[0][0] != "e", _number(item[0]))))
+
+
+def _number(part: str) -> tuple[int, str]:
+    digits = "".join(c for c in part[1:].split("_")[0] if c.isdigit())
+    return int(digits or 0), part
+
+
+def read(path: Path, wishes: Wishes) -> RawCapture:
+    """Read an actor's performances.
+
+    Raises:
+        CaptureError: a file is damaged, or none can be used.
+        CalibrationError: the cameras are malformed.
+    """
+    known = performances(path)
+    root = path if path.is_dir() else path.parent
+    names = {"e0": "neutral"} | dict(wishes.expressions)
+    skipped, taken, numbers = {}, {}, {}
+    pictures: dict[str, dict[Moment, str]] = {}
+    for part, performance in known.items():
+        if not wishes.wants_sequence(part, "*" if path.is_file() else USUAL):
+            skipped[f"sequence {part}"] = "no scripted expression; name it in sequences to take it"
+            continue
+        try:
+            frames, count = _frames(performance, wishes)
+        except CaptureError as error:
+            skipped[f"sequence {part}"] = str(error)
+            continue
+        taken[part], numbers[part] = performance, count
+        for camera, keys in frames.items():
+            table = pictures.setdefault(camera, {})
+            prefix = f"{performance.raw.name}{WITHIN}Camera/{camera.removeprefix('cam')}/color"
+            table |= {(part, key): f"{prefix}/{key}" for key in keys}
+    check_wishes(wishes, list(known), sorted(pictures) or list(wishes.cameras))
+    _require(path, taken, skipped)
+    last = {part: max(k for t in pictures.values() for p, k in t if p == part) for part in taken}
+    line = common_timeline(pictures, list(taken), required=set(last.items()))
+    calibration, warnings = _calibration(taken.values(), set(line.names))
+    clips = tuple(names.get(part) or wishes.expression(part) for part in line.sequences)
+    return RawCapture(
+        root=root,
+        subject=subject_of(path),
+        fps=FPS,
+        meta={"licence": "research only, see the terms of RenderMe-360"}
+        | _person(next(iter(taken.values())))
+        | {"renderme360": _told(taken, clips, line.sequences, numbers, last)},
+        cameras={
+            name: RawCamera(
+                id=name, kind="frames", path=root, names=files,
+                counts=line.counts, stamps=line.stamps,
+            )
+            for name, files in line.names.items()
+        },
+        dropped=line.dropped,
+        calibration=calibration,
+        layout="renderme360",
+        clips=clips,
+        skipped=skipped | line.skipped,
+        found={"releases": sorted({p.release for p in taken.values()})},
+        warnings=warnings,
+    )  # fmt: skip
+
+
+def _require(path: Path, taken: dict, skipped: dict[str, str]) -> None:
+    if not taken:
+        reasons = "; ".join(f"{what}: {why}" for what, why in sorted(skipped.items()))
+        raise CaptureError(f"{path}: no performance can be used: {reasons}")
+
+
+def _frames(performance: Performance, wishes: Wishes) -> tuple[dict[str, list[int]], int]:
+    """Frame numbers by camera, and how many frames the file says the clip has.
+
+    Raises:
+        CaptureError: the file is damaged, or a scripted clip lacks its end, where its peak is.
+    """
+    file = open_hdf5(performance.raw)
+    group = child(file, "Camera", str(performance.raw))
+    if not isinstance(group, h5py.Group):
+        raise CaptureError(f"{performance.raw}: has no Camera group; copy the file again")
+    found: dict[str, list[int]] = {}
+    where = str(performance.raw)
+    for name in members(group, where):
+        if not name.isdecimal() or not wishes.wants_camera(f"cam{name}"):
+            continue
+        colour = child(file, f"Camera/{name}/color", str(performance.raw))
+        keys = members(colour, where) if isinstance(colour, h5py.Group) else []
+        if keys:  # some have sound only
+            numbers = [key for key in keys if key.isdecimal() and len(key) < 9]
+            found[f"cam{name}"] = sorted(map(int, numbers))
+    have = {key for keys in found.values() for key in keys}
+    if not have:
+        raise CaptureError(f"{performance.raw}: holds no picture; copy the file again")
+    count = _count(group, len(have), where)
+    if performance.part.startswith("e") and max(have) != count - 1 and len(have) != count:
+        raise CaptureError(
+            f"{performance.raw}: has {len(have)} frames up to number {max(have)}, num_frame is "
+            f"{count}: the end of the clip, where the expression is, is missing; copy it again"
+        )
+    return found, count
+
+
+def _count(group: h5py.Group, default: int, where: str) -> int:
+    value = attribute(group, "num_frame", default, where)
+    return int(value[0]) if value.size == 1 and value.dtype.kind in "ui" else default
+
+
+def _told(
+    taken: dict[str, Performance],
+    clips: Sequence[str],
+    sequences: Sequence[str],
+    numbers: dict[str, int],
+    last: dict[str, int],
+) -> dict[str, dict]:
+    """What the last-frame rule must know of each expression."""
+    return {
+        clip: {
+            "performance": part,
+            "release": taken[part].release,
+            "num_frame": numbers[part],
+            "last_frame": last[part],
+        }
+        for clip, part in zip(clips, sequences, strict=True)
+    }
+
+
+def _person(performance: Performance) -> dict[str, object]:
+    """Age and gender, which dataset cards count; what else the files say of a body stays there."""
+    file, where = open_hdf5(performance.raw), str(performance.raw)
+    age, gender = attribute(file, "age", (), where), attribute(file, "gender", "", where).tolist()
+    told: dict[str, object] = {}
+    if age.size == 1 and age.dtype.kind in "ui" and 0 < age[0] < 130:
+        told["age"] = int(age[0])
+    if len(gender) == 1 and isinstance(gender[0], str) and gender[0].isalpha():
+        told["gender"] = gender[0][:20]
+    return told
+
+
+def _calibration(
+    taken: Iterable[Performance], names: set[str]
+) -> tuple[dict[str, Camera] | None, dict[str, str]]:
+    """Cameras of the first performance that has some, and where others disagree with it."""
+    first: dict[str, Camera] | None = None
+    warnings = {}
+    for performance in taken:
+        if performance.anno is None:
+            continue
+        cameras = {k: c for k, c in read_renderme(performance.anno).items() if k in names}
+        first = first or cameras
+        moved = [
+            name
+            for name in sorted(first.keys() & cameras.keys())
+            if np.linalg.norm(first[name].center - cameras[name].center) > 1e-3 * MOVED_MM
+        ]
+        if moved:
+            warnings[f"calibration of {performance.part}"] = (
+                f"{', '.join(moved[:4])} stand elsewhere than in the first performance, whose "
+                "cameras are taken for all"
+            )
+    if not first:
+        warnings["calibration"] = "no anno file is there; the cameras are solved from the footage"
+    return first or None, warnings

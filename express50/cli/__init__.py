@@ -1,0 +1,1 @@
+"""The express50 command line."""

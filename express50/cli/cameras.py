@@ -1,0 +1,159 @@
+"""``express50 cameras``: bring in another tool's calibration, and check any rig."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from express50.console import FAILED, OK, say, say_json
+from express50.errors import CalibrationError, ConfigError
+from express50.files.calibration import camera_rows, read_cameras, write_cameras
+from express50.geometry.cameras import Camera
+from express50.rigs.read import FORMATS, guess_format, read_rig
+from express50.rigs.rig_check import RigVerdict, judge
+
+if TYPE_CHECKING:
+    from express50.rigs.footage import FootageVerdict
+
+
+def add_commands(subparsers: Any) -> None:
+    """Add ``cameras import`` and ``cameras check``."""
+    parser = subparsers.add_parser("cameras", help="import and check calibrations")
+    actions = parser.add_subparsers(dest="action", metavar="ACTION", required=True)
+    importing = actions.add_parser(
+        "import",
+        help="write another tool's calibration as calibration.json",
+        epilog="example: express50 cameras import sparse/0 capture/calibration.json --scale 0.42",
+    )
+    importing.set_defaults(handler=run_import)
+    importing.add_argument("source", type=Path, help="file or folder of the other tool")
+    importing.add_argument("out", type=Path, help="calibration.json to write")
+    importing.add_argument(
+        "--overwrite", action="store_true", help="write over other cameras that OUT holds"
+    )
+    checking = actions.add_parser("check", help="say whether a rig's cameras fit together")
+    checking.set_defaults(handler=run_check)
+    checking.add_argument("source", type=Path, help="calibration in any known format")
+    checking.add_argument(
+        "--footage", type=Path, metavar="CAPTURE", help="also look for cameras that have moved"
+    )
+    checking.add_argument("--frames", type=int, default=4, help="moments looked at (default: 4)")
+    for action in (importing, checking):
+        action.add_argument("--format", choices=FORMATS, help="what it is (default: guessed)")
+        action.add_argument("--size", help="WIDTHxHEIGHT of the footage; K is scaled to it")
+        action.add_argument(
+            "--scale", type=float, default=1.0, help="metres per unit of its world (default: 1)"
+        )
+        action.add_argument("--json", action="store_true", help="print JSON")
+
+
+def run_import(args: argparse.Namespace) -> int:
+    """Write the cameras and say what was found; exit code 1 when they do not fit together."""
+    cameras = _read(args)
+    verdict = judge(cameras)
+    if args.out.exists() and not args.overwrite and _differs(args.out, cameras):
+        raise ConfigError(
+            f"{args.out} holds something else; write elsewhere, or over it with --overwrite"
+        )
+    if not verdict.problem:
+        write_cameras(args.out, cameras)
+    _report(args, cameras, verdict, None if verdict.problem else args.out)
+    return FAILED if verdict.problem else OK
+
+
+def _differs(path: Path, cameras: Mapping[str, Camera]) -> bool:
+    """Whether a file is not what these cameras would be written as."""
+    try:
+        return camera_rows(read_cameras(path)) != camera_rows(cameras)
+    except CalibrationError:
+        return True
+
+
+def run_check(args: argparse.Namespace) -> int:
+    """Say what was found; exit code 1 when the cameras fit neither together nor their footage."""
+    cameras = _read(args)
+    verdict = judge(cameras)
+    footage = None
+    if args.footage is not None and not verdict.problem:
+        footage = _look_at_footage(args, cameras)
+    _report(args, cameras, verdict, None, footage)
+    return FAILED if verdict.problem or (footage and footage.moved) else OK
+
+
+def _look_at_footage(args: argparse.Namespace, cameras: Mapping[str, Camera]) -> FootageVerdict:
+    # Imported here: the other commands need neither torch nor OpenCV's features.
+    from express50.landmarks.network import load_network
+    from express50.rigs.footage import check_footage, reduce_image
+    from express50.rigs.sampling import read_moments
+
+    def reduce(name: str, image: np.ndarray) -> np.ndarray | None:
+        return reduce_image(cameras[name], image, "the footage") if name in cameras else None
+
+    if args.frames < 1:
+        raise ConfigError(f"--frames is {args.frames}, expected 1 or more")
+    frames = read_moments(args.footage, args.frames, reduce)
+    shown = {name for images in frames.values() for name in images}
+    known = {name: camera for name, camera in cameras.items() if name in shown}
+    return check_footage(known, frames, load_network())
+
+
+def _read(args: argparse.Namespace) -> dict[str, Camera]:
+    return read_rig(args.source, args.format, _size(args.size), args.scale)
+
+
+def _size(text: str | None) -> tuple[int, int] | None:
+    if text is None:
+        return None
+    parts = text.lower().split("x")
+    if len(parts) != 2 or not all(p.isdigit() and int(p) > 0 for p in parts):
+        raise ConfigError(f"--size is {text!r}, expected WIDTHxHEIGHT such as 3840x2160")
+    return int(parts[0]), int(parts[1])
+
+
+def _report(
+    args: argparse.Namespace,
+    cameras: Mapping[str, Camera],
+    verdict: RigVerdict,
+    out: Path | None,
+    footage: FootageVerdict | None = None,
+) -> None:
+    kind = args.format or guess_format(args.source)
+    if args.json:
+        seen = {"footage": footage.figures()} if footage else {}
+        say_json({"format": kind, "out": out and str(out), **asdict(verdict), **seen})
+        return
+    say(f"{args.source}: {verdict.cameras} cameras ({kind})")
+    say(f"{'camera':16} {'size':>11} {'model':14} {'focal px':>9} {'view deg':>9}")
+    for name, camera in cameras.items():
+        fx = camera.K[0, 0]
+        view = 2 * np.degrees(np.arctan(camera.width / (2 * fx)))
+        size = f"{camera.width}x{camera.height}"
+        say(f"{name:16} {size:>11} {camera.model:14} {fx:9.1f} {view:9.1f}")
+    if verdict.meeting is not None:
+        place = ", ".join(f"{x:.3f}" for x in verdict.meeting)
+        say(f"they look at ({place}) m from {verdict.distance_m:.3f} m;"
+            f" axes miss it by {verdict.miss_mm:.0f} mm (median)")  # fmt: skip
+    say(*(f"warning: {warning}" for warning in verdict.warnings))
+    if verdict.problem:
+        say(f"wrong: {verdict.problem}")
+        say(f"remedy: {verdict.remedy or 'none of the usual misreadings explains it'}")
+    elif out is not None:
+        say(f"wrote {out}")
+    if footage is not None:
+        _report_footage(footage)
+
+
+def _report_footage(footage: FootageVerdict) -> None:
+    say(f"footage: {footage.points} points, {footage.error_px:.2f} px from the cameras (median)")
+    for name, why in footage.unchecked.items():
+        say(f"warning: {name} cannot be checked: {why}")
+    for name, move in footage.moved.items():
+        say(
+            f"moved: {name}: its picture is {move.shift_px:.1f} px off, as if turned by"
+            f" {move.turn_deg:.2f} deg and shifted by {move.move_mm:.1f} mm; calibrate it again"
+        )

@@ -1,0 +1,124 @@
+"""``express50 shards``: verify packed shards, list their samples, look at one, split, merge."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from express50.console import FAILED, OK, say, say_json
+from express50.contract.segmentation_labels import COLOURS
+from express50.errors import FormatError
+from express50.files.images import contact_sheet, write_image
+from express50.shards.edit import merge_shards, split_shards
+from express50.shards.reader import ShardReader
+from express50.shards.writer import verify
+
+
+def add_commands(subparsers: Any) -> None:
+    """Add the ``shards`` command."""
+    parser = subparsers.add_parser("shards", help="look into packed shards and verify them")
+    actions = parser.add_subparsers(dest="action", metavar="ACTION", required=True)
+    checking = actions.add_parser("verify", help="check every file and member against checksums")
+    checking.set_defaults(handler=run_verify)
+    listing = actions.add_parser("ls", help="list the samples")
+    listing.add_argument("--subject", action="append", help="only this subject; may be repeated")
+    listing.add_argument("--split", help="only this split")
+    listing.set_defaults(handler=run_ls)
+    showing = actions.add_parser(
+        "show",
+        help="print a sample's meta and write it as a picture",
+        epilog="example: express50 shards show data/pack/shards S001_smile_cam03 --out a.png",
+    )
+    showing.add_argument("--out", type=Path, help="picture of rgb, alpha and depth to write")
+    showing.set_defaults(handler=run_show)
+    _add_edits(actions)
+    for action in (checking, listing, showing):
+        action.add_argument("directory", type=Path, metavar="DIR", help="folder of shards")
+        action.add_argument("--json", action="store_true", help="print as JSON")
+    showing.add_argument("key", nargs="?", metavar="KEY", help="sample; the first by default")
+
+
+def _add_edits(actions: Any) -> None:
+    """``split`` and ``merge``."""
+    splitting = actions.add_parser(
+        "split",
+        help="write part of the samples as shards of their own",
+        epilog="example: express50 shards split data/pack/shards test_only --split test",
+    )
+    splitting.add_argument("directory", type=Path, metavar="DIR", help="folder of shards")
+    for name in ("subject", "expression", "camera"):
+        splitting.add_argument(f"--{name}", action="append", help="only this; may be repeated")
+    splitting.add_argument("--split", help="only this split")
+    splitting.set_defaults(handler=run_split)
+    merging = actions.add_parser("merge", help="write the samples of several folders as one")
+    merging.add_argument("directories", type=Path, nargs="+", metavar="DIR", help="shards")
+    merging.set_defaults(handler=run_merge)
+    for action in (splitting, merging):
+        action.add_argument("out", type=Path, metavar="OUT", help="empty or absent folder")
+        action.add_argument("--shard-mb", type=int, default=256, help="size of a shard")
+
+
+def run_split(args: argparse.Namespace) -> int:
+    """Copy the samples that match."""
+    count = split_shards(
+        args.directory, args.out, args.shard_mb, args.subject, args.expression, args.camera,
+        args.split,
+    )  # fmt: skip
+    say(f"{args.out}: {count} samples")
+    return OK
+
+
+def run_merge(args: argparse.Namespace) -> int:
+    """Copy the samples of all folders."""
+    say(f"{args.out}: {merge_shards(args.directories, args.out, args.shard_mb)} samples")
+    return OK
+
+
+def run_verify(args: argparse.Namespace) -> int:
+    """Print every fault; exit code 1 when there is one."""
+    faults = verify(args.directory)
+    if args.json:
+        say_json({"directory": str(args.directory), "faults": faults})
+    else:
+        say(*faults, f"{args.directory}: {len(faults)} faults" if faults else "all is well")
+    return FAILED if faults else OK
+
+
+def run_ls(args: argparse.Namespace) -> int:
+    """List keys with their split and shard."""
+    reader = ShardReader(args.directory).select(subjects=args.subject, split=args.split)
+    if args.json:
+        say_json([{"key": e.key, "split": e.split, "shard": e.shard} for e in reader.entries])
+    else:
+        say(*(f"{e.key}  {e.split}  {e.shard}" for e in reader.entries))
+        say(f"{len(reader)} samples")
+    return OK
+
+
+def run_show(args: argparse.Namespace) -> int:
+    """Print one sample's meta; with --out write its pictures side by side."""
+    reader = ShardReader(args.directory)
+    keys = reader.keys
+    if not keys or (args.key is not None and args.key not in keys):
+        raise FormatError(f"{args.directory}: no sample {args.key!r}; 'express50 shards ls' lists")
+    sample = reader.sample(keys.index(args.key) if args.key else 0)
+    if args.out is not None:
+        write_image(args.out, sample_picture(sample))
+    say_json(sample["meta"] | {"key": sample["key"]})
+    return OK
+
+
+def sample_picture(sample: dict) -> np.ndarray:
+    """Picture (H, 3 W or 4 W, 3) uint8: rgb, alpha, depth (near is bright), parts if labelled."""
+    depth, valid = sample["depth"], sample["valid"]
+    shade = np.zeros(depth.shape, np.uint8)
+    if valid.any():
+        low, high = np.percentile(depth[valid], [1, 99])
+        near = np.clip((high - depth) / max(float(high - low), 1e-6), 0, 1)
+        shade = np.where(valid, 55 + 200 * near, 0).astype(np.uint8)
+    alpha = (sample["alpha"] * 255).astype(np.uint8)
+    parts = [] if sample["parts"] is None else [COLOURS[sample["parts"]]]
+    return contact_sheet([[sample["rgb"], alpha, shade, *parts]], tile=depth.shape)

@@ -1,0 +1,152 @@
+"""Where everything lies in a dataset folder; the only file that knows the folder names."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from express50.errors import CaptureError, FormatError, StageError
+from express50.files.text import NAME, read_json, read_toml
+
+
+def footage_root(capture: Path) -> Path:
+    """The folder that a registered capture's footage is relative to.
+
+    It is the capture's folder, a file's folder, or what ``source`` in capture.toml names: a capture
+    may be that one file, which says where a read-only dataset lies and how to take it.
+
+    Raises:
+        CaptureError: capture.toml is not TOML, or its source is no existing path.
+    """
+    source = footage_source(Path(capture))
+    return source.parent if source.is_file() else source
+
+
+def footage_source(capture: Path) -> Path:
+    """The file or folder that ``source`` in capture.toml names, the capture itself without one.
+
+    Raises:
+        CaptureError: capture.toml is not TOML, or its source is no existing path.
+    """
+    path = capture / "capture.toml"
+    if not path.is_file():
+        return capture
+    source = read_toml(path, CaptureError).get("source")
+    if source is None:
+        return capture
+    if not isinstance(source, str) or not (capture / source).exists():
+        raise CaptureError(
+            f"{path}: source is {source!r}, expected a file or folder that is there; correct it"
+        )
+    return (capture / source).resolve()
+
+
+@dataclass(frozen=True)
+class Dataset:
+    """A dataset folder: one folder a stage, one folder an item, plus ledger, labels and report."""
+
+    root: Path
+
+    def __post_init__(self) -> None:
+        """Accept a string path."""
+        object.__setattr__(self, "root", Path(self.root))
+
+    def stage_dir(self, stage: str) -> Path:
+        """Folder that holds the items of a stage."""
+        return self.root / stage
+
+    def item_dir(self, stage: str, item: str) -> Path:
+        """Published folder of one item; ``item`` may be nested (``S001/cam03``)."""
+        return self.root / stage / item
+
+    def subjects(self) -> list[str]:
+        """Ingested subjects, sorted."""
+        return sorted(path.parent.name for path in self.stage_dir("ingest").glob("*/index.json"))
+
+    @property
+    def captures_file(self) -> Path:
+        """JSON table subject -> folder of its raw capture."""
+        return self.root / "captures.json"
+
+    def captures(self) -> dict[str, Path]:
+        """Registered raw captures by subject, sorted; empty before the first ingest.
+
+        Raises:
+            FormatError: the table is not a JSON object of strings.
+        """
+        if not self.captures_file.is_file():
+            return {}
+        mend = "delete it and run 'express50 ingest' with every capture again"
+        table = read_json(self.captures_file, FormatError, mend)
+        if not isinstance(table, dict) or not all(isinstance(v, str) for v in table.values()):
+            raise FormatError(
+                f"{self.captures_file}: expected an object subject -> path, got "
+                f"{type(table).__name__}; delete it and run 'express50 ingest' again"
+            )
+        for subject in table:
+            if not NAME.fullmatch(subject):  # it becomes the name of folders
+                raise FormatError(f"{self.captures_file}: subject {subject!r} is no id; {mend}")
+        return {subject: Path(table[subject]) for subject in sorted(table)}
+
+    def alpha_file(self, subject: str, expression: str, camera: str) -> Path:
+        """8-bit opacity of one peak frame as the camera alone has it."""
+        return self.item_dir("alpha", f"{subject}/{camera}") / f"{expression}.png"
+
+    def matte_file(self, subject: str, expression: str, camera: str) -> Path:
+        """8-bit opacity of one peak frame after all cameras have agreed."""
+        return self.item_dir("matte", f"{subject}/{expression}") / f"{camera}.png"
+
+    def labels_file(self, subject: str) -> Path:
+        """Append-only label events of one subject."""
+        return self.root / "labels" / f"{subject}.jsonl"
+
+    @property
+    def ledger(self) -> Path:
+        """SQLite receipts of every stage."""
+        return self.root / "ledger.sqlite"
+
+    def config_file(self, stage: str) -> Path:
+        """Resolved configuration that a stage last ran with."""
+        return self.root / "config" / f"{stage}.toml"
+
+    @property
+    def report_dir(self) -> Path:
+        """Report pages."""
+        return self.root / "report"
+
+    @property
+    def staging_dir(self) -> Path:
+        """Unfinished outputs; nothing below it is ever read."""
+        return self.root / ".staging"
+
+    def windows_dir(self, subject: str) -> Path:
+        """Finished parts of a subject's unfinished clips; removed when the clips are written."""
+        return self.root / ".windows" / subject
+
+    @property
+    def stale_dir(self) -> Path:
+        """Outputs set aside because a newer run of their item failed or no longer lists it."""
+        return self.root / ".stale"
+
+    @property
+    def slurm_dir(self) -> Path:
+        """Output of SLURM jobs, one file a job."""
+        return self.root / "logs" / "slurm"
+
+    def log_file(self, stage: str, item: str) -> Path:
+        """Traceback of an unexpected failure of one item."""
+        return self.root / "logs" / stage / f"{item.replace('/', '+')}.txt"
+
+
+def existing_dataset(path: Path) -> Dataset:
+    """The dataset of a folder that has a ledger.
+
+    Raises:
+        StageError: it has none.
+    """
+    dataset = Dataset(path)
+    if not dataset.ledger.is_file():
+        raise StageError(
+            f"{path}: not a dataset (no ledger.sqlite); run 'express50 ingest {path} CAPTURE'"
+        )
+    return dataset

@@ -1,0 +1,1 @@
+"""Operations over a finished dataset: tracks, audit, report, export, withdrawal."""

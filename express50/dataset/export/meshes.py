@@ -1,0 +1,136 @@
+"""Meshes of tracked heads as OBJ, PLY or GLB, in the user's world, metres.
+
+OBJ keeps the head model's vertices and their order, with texture coordinates a corner; PLY keeps
+them with a colour each; GLB repeats vertices along the seams of the texture, as glTF wants them.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from express50.dataset.export.select import META, SCHEMA, Head
+from express50.files.atomic import dump_json
+from express50.files.images import encode_png
+from express50.geometry.conventions import corner_to_cell
+from express50.head.model import HeadModel
+
+FORMATS = ("obj", "ply", "glb")
+TEXTURE = "albedo.png"
+_PLY_VERTEX = [("x", "<f4"), ("y", "<f4"), ("z", "<f4")]
+_PLY_COLOUR = [("red", "u1"), ("green", "u1"), ("blue", "u1")]
+
+
+def export_meshes(head: Head, kind: str, out: Path) -> dict:
+    """Write ``<expression>.<kind>`` of every expression into ``out``; returns the meta.
+
+    Args:
+        head: what to write.
+        kind: one of FORMATS.
+        out: an empty folder.
+    """
+    if head.albedo is not None and kind == "obj":
+        (out / TEXTURE).write_bytes(encode_png(head.albedo))
+    for name, vertices in zip(head.track.expressions, head.track.vertices, strict=True):
+        path = out / f"{name}.{kind}"
+        if kind == "obj":
+            write_obj(path, vertices, head.model, TEXTURE if head.albedo is not None else None)
+        elif kind == "ply":
+            write_ply(path, vertices, head.model.faces.numpy(), vertex_colours(head))
+        else:
+            write_glb(path, vertices, head.model, head.albedo)
+    meta = {
+        "schema": SCHEMA,
+        "format": kind,
+        "subject": head.subject,
+        "head": head.model.name,
+        "expressions": list(head.track.expressions),
+        "frames": head.track.frames.tolist(),
+        "textured": head.albedo is not None,
+        "units": "metres",
+        "world_from_export": np.eye(4).tolist(),
+    }
+    (out / META).write_bytes(dump_json(meta))
+    return meta
+
+
+def write_obj(
+    path: Path, vertices: np.ndarray, model: HeadModel, texture: str | None = None
+) -> None:
+    """Write an OBJ file with texture coordinates, and with a texture the .mtl that names it.
+
+    Args:
+        path: target; the .mtl gets its name.
+        vertices: (V, 3) metres.
+        model: faces and texture coordinates.
+        texture: file name of the picture, beside the OBJ.
+    """
+    lines = []
+    if texture is not None:
+        material = path.with_suffix(".mtl")
+        material.write_text(f"newmtl head\nKa 0 0 0\nKd 1 1 1\nKs 0 0 0\nmap_Kd {texture}\n")
+        lines = [f"mtllib {material.name}", "usemtl head"]
+    lines += [f"v {x:.7f} {y:.7f} {z:.7f}" for x, y, z in vertices.astype(np.float64)]
+    lines += [f"vt {u:.7f} {v:.7f}" for u, v in model.uv.double().numpy()]
+    corners = np.stack([model.faces.numpy(), model.uv_faces.numpy()], -1).reshape(-1, 6) + 1
+    lines += [f"f {a}/{b} {c}/{d} {e}/{f}" for a, b, c, d, e, f in corners.tolist()]
+    path.write_text("\n".join(lines) + "\n", encoding="ascii")
+
+
+def write_ply(
+    path: Path, vertices: np.ndarray, faces: np.ndarray, colours: np.ndarray | None = None
+) -> None:
+    """Write a binary PLY file of vertices (V, 3), faces (F, 3) and colours (V, 3) uint8 sRGB."""
+    kinds = _PLY_VERTEX + (_PLY_COLOUR if colours is not None else [])
+    table = np.zeros(len(vertices), kinds)
+    for axis, (name, _) in enumerate(_PLY_VERTEX):
+        table[name] = vertices[:, axis]
+    for channel, (name, _) in enumerate(kinds[3:]):
+        table[name] = colours[:, channel]  # type: ignore[index]
+    rows = np.zeros(len(faces), [("count", "u1"), ("corners", "<i4", 3)])
+    rows["count"], rows["corners"] = 3, faces
+    words = {"<f4": "float", "u1": "uchar"}
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(table)}"]
+    header += [f"property {words[kind]} {name}" for name, kind in kinds]
+    header += [f"element face {len(rows)}", "property list uchar int vertex_indices", "end_header"]
+    path.write_bytes(("\n".join(header) + "\n").encode() + table.tobytes() + rows.tobytes())
+
+
+def write_glb(
+    path: Path, vertices: np.ndarray, model: HeadModel, albedo: np.ndarray | None = None
+) -> None:
+    """Write a binary glTF file, with the albedo (H, W, 3) uint8 sRGB as its texture."""
+    import trimesh
+    from PIL import Image
+
+    pairs = np.stack([model.faces.numpy(), model.uv_faces.numpy()], -1).reshape(-1, 2)
+    unique, corners = np.unique(pairs, axis=0, return_inverse=True)
+    skin = trimesh.visual.material.PBRMaterial(
+        baseColorTexture=None if albedo is None else Image.fromarray(albedo),
+        baseColorFactor=[255, 255, 255, 255] if albedo is not None else [190, 190, 190, 255],
+        metallicFactor=0.0,
+        roughnessFactor=0.8,
+    )
+    mesh = trimesh.Trimesh(
+        vertices[unique[:, 0]],
+        corners.reshape(-1, 3),
+        visual=trimesh.visual.TextureVisuals(uv=model.uv.numpy()[unique[:, 1]], material=skin),
+        process=False,
+    )
+    path.write_bytes(trimesh.Scene({"head": mesh}).export(file_type="glb"))
+
+
+def vertex_colours(head: Head) -> np.ndarray | None:
+    """Colours (V, 3) uint8 of the texture at the vertices; None without a texture."""
+    if head.albedo is None:
+        return None
+    height, width = head.albedo.shape[:2]
+    count = len(head.model.template)
+    uv = np.zeros((count, 2))
+    uv[head.model.faces.numpy().ravel()] = head.model.uv.numpy()[
+        head.model.uv_faces.numpy().ravel()
+    ]
+    places = corner_to_cell(np.stack([uv[:, 0] * width, (1 - uv[:, 1]) * height], -1))
+    column, row = np.rint(places).astype(int).T
+    return head.albedo[row.clip(0, height - 1), column.clip(0, width - 1)]

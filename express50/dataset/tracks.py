@@ -1,0 +1,215 @@
+"""Reading ``track.npz`` and ``sequence.npz``: a subject's head in its peak frames and its clips.
+
+Every package reads tracks through here, so that a damaged, foreign or hostile file ends in one
+line. Nothing in a file is executed: pickled objects are refused.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from express50.contract.layout import Dataset
+from express50.errors import FormatError, StageError
+from express50.files.arrays import read_arrays
+
+SCHEMAS = ("express50.track/1", "express50.track/2")
+SEQUENCE_SCHEMA = "express50.sequence/1"
+NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
+_WIDTHS = {"neck": (3,), "jaw": (3,), "eyes": (6,), "R": (3, 3), "t": (3,)}
+_AGAIN = "run 'express50 track' again"
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Track:
+    """What was tracked of a subject. E expressions, V vertices; world = R @ head + t.
+
+    Attributes:
+        schema: of the file, one of SCHEMAS.
+        head: head model, as ``load_head`` takes it.
+        expressions: E ids.
+        frames: (E,) int64 decode indices.
+        shape: (S,) coefficients, shared by all expressions.
+        expression: (E, X) coefficients.
+        neck, jaw: (E, 3) axis-angle, radians.
+        eyes: (E, 6) axis-angles, left then right.
+        R: (E, 3, 3) rotations.
+        t: (E, 3) metres.
+        vertices: (E, V, 3) float32 metres, world.
+        offsets: (V, 3) float32 metres, added to the rest shape; zeros where there are none.
+    """
+
+    schema: str
+    head: str
+    expressions: tuple[str, ...]
+    frames: np.ndarray
+    shape: np.ndarray
+    expression: np.ndarray
+    neck: np.ndarray
+    jaw: np.ndarray
+    eyes: np.ndarray
+    R: np.ndarray
+    t: np.ndarray
+    vertices: np.ndarray
+    offsets: np.ndarray
+
+    def row(self, expression: str) -> int:
+        """Row of an expression.
+
+        Raises:
+            StageError: it is not tracked.
+        """
+        if expression not in self.expressions:
+            raise StageError(f"{expression}: it is not tracked; see the metrics of track")
+        return self.expressions.index(expression)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Sequence:
+    """What was tracked of a subject's clips, F frames; arrays mean what they do in `Track`.
+
+    Attributes:
+        head: head model, as ``load_head`` takes it.
+        cues: (F,) ids of the clips, one a frame.
+        frames: (F,) int64 decode indices.
+        shape: (S,) coefficients.
+        expression, neck, jaw, eyes, R, t: (F, ...).
+    """
+
+    head: str
+    cues: tuple[str, ...]
+    frames: np.ndarray
+    shape: np.ndarray
+    expression: np.ndarray
+    neck: np.ndarray
+    jaw: np.ndarray
+    eyes: np.ndarray
+    R: np.ndarray
+    t: np.ndarray
+
+
+def track_file(dataset: Dataset, subject: str) -> Path:
+    """The subject's track.
+
+    Raises:
+        StageError: there is none.
+    """
+    path = dataset.item_dir("track", subject) / "track.npz"
+    if not path.is_file():
+        raise StageError(f"subject {subject!r} is not tracked; run 'express50 track'")
+    return path
+
+
+def read_track(path: Path) -> Track:
+    """Read and check a track.
+
+    Raises:
+        StageError: there is no such file.
+        FormatError: it is no track of a known schema, its arrays do not fit each other, or one
+            holds NaN or Inf.
+    """
+    if not path.is_file():
+        raise StageError(f"{path}: no such track; run 'express50 track'")
+    arrays = read_arrays(path, FormatError, "a track", mend=_AGAIN)
+    try:
+        schema, head = str(arrays.pop("schema")), str(arrays.pop("head"))
+        if schema not in SCHEMAS:
+            raise ValueError(f"schema {schema!r}, expected one of {', '.join(SCHEMAS)}")
+        if schema == SCHEMAS[0]:
+            arrays["offsets"] = np.zeros(arrays["vertices"].shape[1:], np.float32)
+        names = arrays.pop("expressions")
+        _check_names(names)
+        expected = _shapes(arrays, len(names))
+        for name, shape in expected.items():
+            _check(name, arrays[name], shape)
+        _check_rotations(arrays["R"])
+    except (KeyError, ValueError) as error:
+        words = f"has no {error}" if isinstance(error, KeyError) else str(error)
+        raise FormatError(f"{path}: not a track ({words}); {_AGAIN}") from None
+    numbers = {name: _typed(name, arrays[name]) for name in expected}
+    return Track(schema=schema, head=head, expressions=tuple(names.tolist()), **numbers)
+
+
+OF_FRAMES = ("frames", "expression", "neck", "jaw", "eyes", "R", "t")  # a row a frame, with cues
+
+
+def read_sequence(path: Path) -> Sequence:
+    """Read and check the frames of a subject's clips.
+
+    Raises:
+        StageError: there is no such file.
+        FormatError: it is no sequence, its arrays do not fit, or one holds NaN or Inf.
+    """
+    if not path.is_file():
+        raise StageError(
+            f"{path}: no such sequence; run 'express50 track --set track.frames=clips', or"
+            " 'express50 photo' on a video"
+        )
+    arrays = read_arrays(path, FormatError, "a sequence", mend=_AGAIN)
+    try:
+        schema, head, cues = str(arrays["schema"]), str(arrays["head"]), arrays["cues"]
+        if schema != SEQUENCE_SCHEMA:
+            raise ValueError(f"schema {schema!r}, expected {SEQUENCE_SCHEMA}")
+        _check_names(cues, alone=False)
+        count = len(cues)
+        expected = {"frames": (count,), "shape": (None,), "expression": (count, None)}
+        expected |= {name: (count, *width) for name, width in _WIDTHS.items()}
+        for name, shape in expected.items():
+            _check(name, arrays[name], shape)
+        _check_rotations(arrays["R"])
+    except (KeyError, ValueError) as error:
+        words = f"has no {error}" if isinstance(error, KeyError) else str(error)
+        raise FormatError(f"{path}: not a sequence ({words}); {_AGAIN}") from None
+    numbers = {name: _typed(name, arrays[name]) for name in expected}
+    return Sequence(head=head, cues=tuple(cues.tolist()), **numbers)
+
+
+def _shapes(arrays: dict[str, np.ndarray], count: int) -> dict[str, tuple[int | None, ...]]:
+    """Expected shape of every array of a track with ``count`` expressions."""
+    vertices = arrays["vertices"].shape[1] if arrays["vertices"].ndim == 3 else None
+    return {
+        "frames": (count,),
+        "shape": (None,),
+        "expression": (count, None),
+        **{name: (count, *width) for name, width in _WIDTHS.items()},
+        "vertices": (count, vertices, 3),
+        "offsets": (vertices, 3),
+    }
+
+
+def _check_names(names: np.ndarray, alone: bool = True) -> None:
+    if names.ndim != 1 or names.dtype.kind != "U" or not len(names):
+        raise ValueError(f"expressions are {names.dtype} {names.shape}, expected (E,) strings")
+    for name in names.tolist():
+        if not NAME.fullmatch(name):  # they become names of files
+            raise ValueError(f"expression {name!r}, expected letters, digits, _ and -")
+    if alone and len(set(names.tolist())) != len(names):
+        raise ValueError("an expression appears twice")
+
+
+def _check(name: str, array: np.ndarray, shape: tuple[int | None, ...]) -> None:
+    """Whether an array has a shape (None is any size) and holds finite numbers."""
+    kinds = "iu" if name == "frames" else "fiu"
+    fits = array.ndim == len(shape) and all(
+        want is None or want == got for want, got in zip(shape, array.shape, strict=False)
+    )
+    if not fits or array.dtype.kind not in kinds:
+        wanted = str(shape).replace("None", "any")
+        raise ValueError(f"{name} is {array.dtype} {array.shape}, expected numbers {wanted}")
+    if not np.isfinite(array).all():
+        raise ValueError(f"{name} holds NaN or Inf")
+
+
+def _check_rotations(R: np.ndarray) -> None:
+    error = np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)).max()
+    if error > 1e-3 or (np.linalg.det(R) < 0).any():
+        raise ValueError(f"R is no rotation: R R^T differs from 1 by {error:.2g}")
+
+
+def _typed(name: str, array: np.ndarray) -> np.ndarray:
+    if name == "frames":
+        return array.astype(np.int64)
+    return array.astype(np.float32 if name in ("vertices", "offsets") else np.float64)

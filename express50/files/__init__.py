@@ -1,0 +1,1 @@
+"""Reading and writing of files: text, arrays, pictures, video, checkpoints."""

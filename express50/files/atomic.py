@@ -1,0 +1,74 @@
+"""Crash-safe files: written aside, synced, renamed; after a kill a file is absent or whole."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import uuid
+from pathlib import Path
+
+
+def dump_json(value: object) -> bytes:
+    """Deterministic JSON bytes: sorted keys, no NaN or infinity.
+
+    Raises:
+        ValueError: the value holds a number that is not finite.
+    """
+    text = json.dumps(value, indent=1, sort_keys=True, ensure_ascii=False, allow_nan=False)
+    return (text + "\n").encode()
+
+
+def write_bytes(path: Path, data: bytes) -> None:
+    """Write a file so that a reader or a crash sees the old bytes or the new, nothing between."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    aside = path.with_name(f".{path.name}.{uuid.uuid4().hex}")
+    try:
+        with aside.open("wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        aside.replace(path)
+    finally:
+        aside.unlink(missing_ok=True)
+    sync_directory(path.parent)
+
+
+def write_json(path: Path, value: object) -> None:
+    """Write deterministic JSON in one step."""
+    write_bytes(path, dump_json(value))
+
+
+def replace_directory(source: Path, target: Path) -> None:
+    """Rename ``source`` to ``target``; a former target is moved out of the way and deleted.
+
+    A kill between the two renames leaves the target absent, never mixed.
+    """
+    target.parent.mkdir(parents=True, exist_ok=True)
+    former = source.with_name(source.name + ".former")
+    if target.exists():
+        target.rename(former)
+    source.rename(target)
+    sync_directory(target.parent)
+    shutil.rmtree(former, ignore_errors=True)
+
+
+def sync_tree(root: Path) -> None:
+    """Flush every file and folder below ``root`` to the disk."""
+    for folder, _, names in os.walk(root, topdown=False):
+        for name in names:
+            _sync(Path(folder) / name, os.O_RDONLY)
+        sync_directory(Path(folder))
+
+
+def sync_directory(path: Path) -> None:
+    """Flush a folder's entries to the disk."""
+    _sync(path, os.O_RDONLY | os.O_DIRECTORY)
+
+
+def _sync(path: Path, flags: int) -> None:
+    descriptor = os.open(path, flags)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

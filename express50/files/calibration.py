@@ -1,0 +1,112 @@
+"""The calibration file: cameras by id as JSON, every value checked before it is believed."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from express50.errors import CalibrationError
+from express50.files.atomic import write_bytes
+from express50.files.text import read_json
+from express50.geometry.cameras import MODELS, Camera
+from express50.geometry.shapes import PIXEL_LIMIT
+
+ID = re.compile(r"\w[\w.+-]{0,119}")
+LARGEST = 1e12  # of a parameter or a pose, pixels or metres
+
+
+def read_cameras(path: Path) -> dict[str, Camera]:
+    """Read a calibration file: ``{id: {model, width, height, params, world_to_camera}}``.
+
+    Raises:
+        CalibrationError: the file is missing, or a camera has a field of the wrong shape or value.
+    """
+    if not Path(path).exists():
+        raise CalibrationError(f"{path}: no such calibration file; run 'express50 calibrate'")
+    return parse_cameras(read_json(path, CalibrationError, "write it anew"), str(path))
+
+
+def parse_cameras(table: object, where: str) -> dict[str, Camera]:
+    """Cameras of a calibration file's content.
+
+    Raises:
+        CalibrationError: there is none, or one has a field of the wrong shape or value.
+    """
+    if not isinstance(table, dict) or not table:
+        got = "an empty one" if isinstance(table, dict) else type(table).__name__
+        raise CalibrationError(f"{where}: expected a table of cameras, got {got}")
+    return {camera_id: _parse_camera(where, camera_id, row) for camera_id, row in table.items()}
+
+
+def _parse_camera(path: str, camera_id: str, row: object) -> Camera:
+    """Check one camera's entry and build it."""
+    where = f"{path}: camera {camera_id}"
+    if not ID.fullmatch(camera_id):  # it becomes the name of files
+        raise CalibrationError(f"{where}: expected an id of letters, digits and _ . + -")
+    if not isinstance(row, Mapping):
+        raise CalibrationError(f"{where}: expected a table, got {type(row).__name__}")
+    missing = [k for k in ("model", "width", "height", "params", "world_to_camera") if k not in row]
+    if missing:
+        raise CalibrationError(f"{where}: has no {', '.join(missing)}; add it in pixels and metres")
+    model = row["model"]
+    if not isinstance(model, str) or model not in MODELS:
+        raise CalibrationError(f"{where}: model {model!r} is unknown; expected {', '.join(MODELS)}")
+    params = _numbers(where, "params", row["params"], (len(MODELS[model]),))
+    pose = _numbers(where, "world_to_camera", row["world_to_camera"], (4, 4))
+    R = pose[:3, :3]
+    if np.abs(R @ R.T - np.eye(3)).max() > 1e-4 or np.linalg.det(R) < 0:
+        raise CalibrationError(
+            f"{where}: world_to_camera has no rotation (R R^T differs from 1 by"
+            f" {np.abs(R @ R.T - np.eye(3)).max():.2g}, det {np.linalg.det(R):.3f});"
+            " expected an orthonormal matrix with det 1"
+        )
+    focals = params[: 2 if "fx" in MODELS[model] else 1]
+    if not (focals > 0).all():
+        raise CalibrationError(
+            f"{where}: focal length {focals.min():g} px, expected a positive number"
+        )
+    size = [row["width"], row["height"]]
+    if not all(type(n) is int and n > 0 for n in size) or size[0] * size[1] > PIXEL_LIMIT:
+        raise CalibrationError(
+            f"{where}: size {size}, expected two positive whole numbers of pixels, together at most"
+            f" {PIXEL_LIMIT}"
+        )
+    return Camera(camera_id, size[0], size[1], model, tuple(map(float, params)), pose)
+
+
+def _numbers(where: str, name: str, value: object, shape: tuple[int, ...]) -> np.ndarray:
+    """A finite float array of the given shape, or a CalibrationError."""
+    try:
+        array = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError):
+        raise CalibrationError(f"{where}: {name} is not an array of numbers") from None
+    if array.shape != shape:
+        raise CalibrationError(f"{where}: {name} has shape {array.shape}, expected {shape}")
+    if not np.isfinite(array).all():
+        raise CalibrationError(f"{where}: {name} holds NaN or Inf, expected finite numbers")
+    if np.abs(array).max(initial=0.0) > LARGEST:  # its square would not be finite
+        raise CalibrationError(f"{where}: {name} holds {np.abs(array).max():.3g}, over {LARGEST:g}")
+    return array
+
+
+def write_cameras(path: Path, cameras: Mapping[str, Camera]) -> None:
+    """Write a calibration file that :func:`read_cameras` reads."""
+    write_bytes(Path(path), (json.dumps(camera_rows(cameras), indent=1) + "\n").encode())
+
+
+def camera_rows(cameras: Mapping[str, Camera]) -> dict[str, dict]:
+    """Content of a calibration file, as :func:`parse_cameras` takes it."""
+    return {
+        camera_id: {
+            "model": camera.model,
+            "width": camera.width,
+            "height": camera.height,
+            "params": list(camera.params),
+            "world_to_camera": camera.cam_from_world.tolist(),
+        }
+        for camera_id, camera in sorted(cameras.items())
+    }

@@ -1,0 +1,289 @@
+"""Images by name, in plain files and inside containers, read where they lie.
+
+``decoder/image/cam400.zip!/cam400/000123.avif`` is a member of a zip, and
+``0026_e0_raw.smc!/Camera/03/color/0`` an array of encoded bytes in an HDF5 file. Nothing is ever
+unpacked to the disk, no name leads out of the footage's folder, and every size is looked at before
+it is believed.
+"""
+
+from __future__ import annotations
+
+import io
+import struct
+import zipfile
+from functools import lru_cache
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import cv2
+import h5py
+import numpy as np
+from PIL import Image
+
+from express50.errors import CaptureError, FormatError
+from express50.files.arrays import DAMAGE as ZIP_DAMAGE
+from express50.files.exif import upright
+from express50.files.images import ROOM_BYTES, decode_cv, linear_to_srgb, read_image
+from express50.geometry.shapes import PIXEL_LIMIT
+
+WITHIN = "!/"
+BYTES_LIMIT = 1 << 28  # of one encoded image, or of one array
+# Pixels a byte of a file: no photograph packs tighter, AVIF's of one colour do.
+PIXELS_A_BYTE = 1 << 14
+ATTRIBUTE_LIMIT = 1 << 16  # bytes
+NAME_LIMIT = 255  # bytes, of each part
+OPEN_FILES = 4  # containers a process keeps open
+# What h5py raises on bad files.
+DAMAGE = (OSError, RuntimeError, KeyError, ValueError, TypeError, OverflowError, AttributeError)
+
+
+def to_srgb8(image: np.ndarray) -> np.ndarray:
+    """Image (H, W[, C]) as (H, W, 3) uint8 sRGB; floats are linear light, 16 bits are sRGB.
+
+    Raises:
+        ValueError: the image holds NaN or infinity.
+    """
+    if image.ndim == 2:
+        image = np.repeat(image[..., None], 3, axis=2)
+    if image.shape[2] == 2:  # grey and alpha
+        image = np.repeat(image[..., :1], 3, axis=2)
+    image = image[..., :3]
+    if image.dtype == np.uint16:
+        image = np.rint(image / 257.0)
+    elif image.dtype != np.uint8:
+        if not np.isfinite(image).all():
+            raise ValueError("image holds NaN or infinity")
+        image = np.rint(linear_to_srgb(np.clip(image, 0.0, 1.0)) * 255.0)
+    return np.ascontiguousarray(image.astype(np.uint8))
+
+
+def read_srgb8(path: Path) -> np.ndarray:
+    """Read an image file as (H, W, 3) uint8 sRGB.
+
+    Raises:
+        CaptureError: the file is missing, damaged or holds NaN or infinity.
+    """
+    try:
+        return to_srgb8(read_image(path))
+    except FormatError as error:
+        raise CaptureError(str(error)) from error
+    except ValueError as error:
+        raise CaptureError(f"{path}: {error}; export it again") from error
+
+
+def inside(root: Path, name: str, where: str = "") -> Path:
+    """The path of a name relative to a folder.
+
+    Raises:
+        CaptureError: it is absolute or leads out of the folder.
+    """
+    pure = PurePosixPath(name)
+    path = root / name
+    out = pure.is_absolute() or ".." in pure.parts or not name.isprintable()
+    lengths = [len(part.encode(errors="replace")) for part in (name, *pure.parts)]
+    if lengths[0] > 4096 or max(lengths[1:], default=0) > NAME_LIMIT:
+        raise CaptureError(f"{where or root}: {name[:40]!r}... is longer than a name may be")
+    if out or not path.resolve().is_relative_to(root.resolve()):
+        raise CaptureError(
+            f"{where or root}: {name!r} leads out of {root}; expected a name inside it"
+        )
+    return path
+
+
+def read_picture(root: Path, name: str, orientation: int = 1) -> np.ndarray:
+    """Image (H, W, 3) uint8 sRGB of a name below a folder, turned by EXIF's orientation.
+
+    Raises:
+        CaptureError: it is missing, damaged, too large, or its name leads out of the folder.
+    """
+    return upright(_stored(root, name), orientation)
+
+
+def _stored(root: Path, name: str) -> np.ndarray:
+    """The image with its pixels as they are stored."""
+    container, within, member = name.partition(WITHIN)
+    path = inside(root, container)
+    if within:
+        return decode_picture(member_bytes(path, member), f"{path}{WITHIN}{member}")
+    if path.suffix.lower() == ".avif":
+        return decode_picture(_file_bytes(path), str(path))
+    return read_srgb8(path)
+
+
+def _file_bytes(path: Path) -> bytes:
+    try:
+        size = path.stat().st_size
+        _check_size(size, str(path))
+        return path.read_bytes()
+    except OSError as error:
+        raise CaptureError(f"{path}: cannot be read ({error.strerror}); restore it") from error
+
+
+def decode_picture(data: bytes, where: str) -> np.ndarray:
+    """Image (H, W, 3) uint8 sRGB of JPEG, PNG or AVIF bytes; its header's size is checked first.
+
+    Raises:
+        CaptureError: the bytes are no such image, or it has too many pixels.
+    """
+    try:
+        with Image.open(io.BytesIO(data), formats=("JPEG", "PNG", "AVIF")) as header:
+            width, height = header.size
+    except (*ZIP_DAMAGE, struct.error, Image.DecompressionBombError) as error:
+        raise CaptureError(
+            f"{where}: {len(data)} bytes are no JPEG, PNG or AVIF image; copy the file again"
+        ) from error
+    if width * height > min(PIXEL_LIMIT, max(ROOM_BYTES, PIXELS_A_BYTE * len(data))):
+        raise CaptureError(
+            f"{where}: {width}x{height} pixels in {len(data)} bytes, over {PIXEL_LIMIT} or more "
+            "than they can hold; copy the file again"
+        )
+    try:
+        return decode_cv(data, cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION, where)
+    except FormatError as error:
+        raise CaptureError(str(error)) from None
+
+
+def member_bytes(path: Path, member: str) -> bytes:
+    """Bytes of a member of a container: a zip, else an HDF5 file.
+
+    Raises:
+        CaptureError: the container is damaged, the member missing, too large or of another kind.
+    """
+    if path.suffix.lower() == ".zip":
+        return _zip_bytes(path, member)
+    array = read_array(open_hdf5(path), member, f"{path}")
+    if array.dtype != np.uint8 or array.ndim != 1:
+        raise CaptureError(
+            f"{path}{WITHIN}{member}: {array.dtype} of shape {array.shape}, expected encoded bytes "
+            "(uint8, one dimension)"
+        )
+    return array.tobytes()
+
+
+def _check_size(size: int, where: str) -> None:
+    if size > BYTES_LIMIT:
+        raise CaptureError(f"{where}: {size} bytes, expected at most {BYTES_LIMIT}; it is damaged")
+
+
+def open_zip(path: Path) -> zipfile.ZipFile:
+    """A zip for reading, kept open while it is among the last few.
+
+    Raises:
+        CaptureError: it is missing or no zip.
+    """
+    try:
+        stat = path.stat()
+        return _zip_cached(path, (stat.st_mtime_ns, stat.st_size))
+    except ZIP_DAMAGE as error:
+        raise CaptureError(f"{path}: no zip archive ({error}); copy it again") from error
+
+
+@lru_cache(maxsize=OPEN_FILES)
+def _zip_cached(path: Path, version: tuple[int, int]) -> zipfile.ZipFile:
+    return zipfile.ZipFile(path)
+
+
+def _zip_bytes(path: Path, member: str) -> bytes:
+    archive = open_zip(path)
+    if member not in archive.NameToInfo:
+        raise CaptureError(f"{path}: has no member {member}; copy it again")
+    try:
+        info = archive.getinfo(member)
+        _check_size(info.file_size, f"{path}{WITHIN}{member}")
+        with archive.open(info) as file:
+            return file.read(info.file_size)
+    except (*ZIP_DAMAGE, struct.error) as error:
+        raise CaptureError(
+            f"{path}{WITHIN}{member}: damaged ({error}); copy the archive again"
+        ) from error
+
+
+def open_hdf5(path: Path) -> h5py.File:
+    """An HDF5 file for reading, kept open while it is among the last few.
+
+    Raises:
+        CaptureError: it is missing, truncated or no HDF5 file.
+    """
+    try:
+        stat = path.stat()
+        return _hdf5_cached(path, (stat.st_mtime_ns, stat.st_size))
+    except DAMAGE as error:
+        raise CaptureError(
+            f"{path}: cannot be opened as HDF5 ({error}); copy the file again"
+        ) from error
+
+
+@lru_cache(maxsize=OPEN_FILES)
+def _hdf5_cached(path: Path, version: tuple[int, int]) -> h5py.File:
+    return h5py.File(path, "r")
+
+
+def child(file: h5py.File, name: str, where: str) -> Any:
+    """Group or dataset of a path in an HDF5 file, None where there is none.
+
+    Links are refused: an external one reads any file of the machine.
+
+    Raises:
+        CaptureError: a part of the path is a link, or the file is damaged.
+    """
+    node: Any = file
+    try:
+        for part in name.split("/"):
+            link = node.get(part, getlink=True) if isinstance(node, h5py.Group) else None
+            if link is None:
+                return None
+            if not isinstance(link, h5py.HardLink):
+                raise CaptureError(f"{where}: {name} is a link, expected data in the file itself")
+            node = node[part]
+    except DAMAGE as error:
+        raise CaptureError(f"{where}: {name} is damaged ({error}); copy it again") from error
+    return node
+
+
+def members(group: h5py.Group, where: str) -> list[str]:
+    """Names in a group of an HDF5 file.
+
+    Raises:
+        CaptureError: the file is damaged.
+    """
+    try:
+        return [str(name) for name in group]
+    except DAMAGE as error:
+        raise CaptureError(f"{where}: a group is damaged ({error}); copy it again") from error
+
+
+def attribute(group: h5py.Group, name: str, default: object, where: str) -> np.ndarray:
+    """A small attribute of a group, or its default, flat.
+
+    Raises:
+        CaptureError: the file is damaged, or the attribute is not small.
+    """
+    try:
+        if name not in group.attrs:
+            return np.ravel(np.asarray(default))
+        kind = group.attrs.get_id(name)
+        if kind.get_storage_size() > ATTRIBUTE_LIMIT:
+            raise CaptureError(f"{where}: attribute {name} has over {ATTRIBUTE_LIMIT} bytes")
+        return np.ravel(np.asarray(group.attrs[name]))
+    except DAMAGE as error:
+        raise CaptureError(f"{where}: attribute {name} is damaged ({error})") from error
+
+
+def read_array(file: h5py.File, name: str, where: str) -> np.ndarray:
+    """A dataset's array, after a look at its type and size.
+
+    Raises:
+        CaptureError: it is missing, no plain numbers, too large, or lies in another file.
+    """
+    node = child(file, name, where)
+    if not isinstance(node, h5py.Dataset):
+        raise CaptureError(f"{where}: has no array {name}; copy the file again")
+    try:
+        if node.dtype.kind not in "uif" or node.is_virtual or node.external:
+            raise CaptureError(f"{where}: {name} is {node.dtype}, expected numbers in the file")
+        _check_size(
+            int(np.prod(node.shape, dtype=object)) * node.dtype.itemsize, f"{where}: {name}"
+        )
+        return np.asarray(node[()])
+    except DAMAGE as error:
+        raise CaptureError(f"{where}: {name} is damaged ({error}); copy it again") from error

@@ -1,0 +1,252 @@
+"""Frame-exact video: frames are counted by decoding, and found again by their time stamp.
+
+A container's own frame count is never believed: edit lists and broken muxers make it wrong.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+import av
+import numpy as np
+
+from express50.errors import CaptureError
+from express50.geometry.shapes import PIXEL_LIMIT
+
+# Frames before the wanted one at which a seek aims. An H.264 or H.265 picture may be displayed
+# up to 16 pictures away from its place in the stream, so a nearer key frame may lie behind it.
+REORDER = 16
+# What the endings of our video files stand for. FFmpeg goes by content: a playlist named video.mp4
+# would make it read other files.
+CONTAINERS = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi"
+BOXES = 1_000_000  # of one file; a fragment of a second has two
+DAMAGE = (av.FFmpegError, OSError, ValueError, MemoryError, OverflowError)
+
+
+def check_whole(path: Path) -> None:
+    """Refuse an MP4/MOV file whose boxes go past its end, or that has no index.
+
+    Raises:
+        CaptureError: the file is truncated.
+
+    Source: ISO/IEC 14496-12, 4.2: a box is its size (32 bits, or 64 after size 1), its type and
+    content; size 0 runs to the end of the file.
+    """
+    size = path.stat().st_size
+    with path.open("rb") as file:
+        offset = count = 0
+        kinds: set[bytes] = set()
+        while offset + 8 <= size and count < BOXES:
+            file.seek(offset)
+            header = file.read(16)
+            length, kind = int.from_bytes(header[:4], "big"), header[4:8]
+            if not kinds and kind != b"ftyp":
+                return  # another container
+            kinds.add(kind)
+            count += 1
+            if length == 1:
+                length = int.from_bytes(header[8:16], "big")
+            length = length or size - offset
+            if length < 8 or offset + length > size:
+                raise _truncated(path, size, offset + length)
+            offset += length
+    if count == BOXES:
+        raise CaptureError(f"{path}: has {BOXES} boxes and more; it is damaged, copy it again")
+    if b"ftyp" in kinds and not {b"moov", b"moof"} & kinds:
+        raise CaptureError(
+            f"{path}: video has no index (moov box), the recording was cut off; "
+            "copy the file again or record it again"
+        )
+
+
+def _truncated(path: Path, size: int, expected: int) -> CaptureError:
+    return CaptureError(
+        f"{path}: video is truncated: {size} bytes, its boxes say {expected} or more; "
+        "copy the file again"
+    )
+
+
+def decoder_threads() -> int:
+    """Threads of the decoder: the runner's cap for workers, else what the decoder likes (0)."""
+    return int(os.environ.get("OMP_NUM_THREADS", "0") or 0)
+
+
+def _open(path: Path) -> tuple[av.container.InputContainer, av.VideoStream]:
+    limits = {"format_whitelist": CONTAINERS, "protocol_whitelist": "file"}
+    try:
+        container = av.open(str(path), container_options=limits)
+    except DAMAGE as error:
+        raise CaptureError(
+            f"{path}: cannot be opened as a video ({_reason(error)}); copy or encode it again"
+        ) from error
+    if not container.streams.video:
+        container.close()
+        raise CaptureError(f"{path}: holds no video stream, expected one")
+    stream = container.streams.video[0]
+    try:
+        stream.codec_context.options = {"max_pixels": str(PIXEL_LIMIT)}
+        stream.codec_context.thread_count = decoder_threads()
+    except (RuntimeError, AttributeError, *DAMAGE) as error:  # a codec that is unknown
+        container.close()
+        raise CaptureError(f"{path}: has no decoder ({_reason(error)}); encode it again") from error
+    return container, stream
+
+
+def _reason(error: Exception) -> str:
+    return getattr(error, "strerror", None) or str(error) or type(error).__name__
+
+
+def _pixels(path: Path, frame: av.VideoFrame) -> np.ndarray:
+    """Pixels (H, W, 3) uint8 of a frame."""
+    size = frame.width * frame.height
+    if not 0 < size <= PIXEL_LIMIT:
+        raise CaptureError(f"{path}: a frame is {frame.width}x{frame.height}, over {PIXEL_LIMIT}")
+    try:
+        return frame.to_ndarray(format="rgb24")
+    except DAMAGE as error:
+        raise CaptureError(f"{path}: a frame cannot be converted ({_reason(error)})") from error
+
+
+def _decode(
+    path: Path, container: av.container.InputContainer, stream: av.VideoStream
+) -> Iterator[av.VideoFrame]:
+    """Frames in display order from where the container stands; damage is an error."""
+    try:
+        for packet in container.demux(stream):
+            if packet.is_corrupt:
+                raise CaptureError(
+                    f"{path}: damaged packet at byte {packet.pos}; the file is truncated or "
+                    "damaged, copy it again"
+                )
+            for frame in packet.decode():
+                if frame.pts is None:
+                    raise CaptureError(
+                        f"{path}: frames carry no time stamps; remux it, for example with "
+                        "'ffmpeg -i IN -c copy OUT.mp4'"
+                    )
+                yield frame
+    except DAMAGE as error:
+        raise CaptureError(
+            f"{path}: decoding failed ({_reason(error)}); copy the file again"
+        ) from error
+
+
+def video_fps(path: Path) -> float:
+    """Frames a second that a video's container tells.
+
+    Raises:
+        CaptureError: the file is no video, or tells no rate.
+    """
+    container, stream = _open(path)
+    with container:
+        rate = float(stream.average_rate or 0)
+    if not 0 < rate <= 10_000:
+        raise CaptureError(f"{path}: tells no frame rate; say fps in capture.toml")
+    return rate
+
+
+def video_turn(path: Path) -> int:
+    """Quarter turns counter-clockwise that a video's container asks a player for, 0 to 3.
+
+    Telephones store what they film upright as pictures on their side. A rig's cameras are taken as
+    they are stored, since a calibration belongs to stored pixels.
+
+    Raises:
+        CaptureError: the file is no video, damaged or holds no frame.
+    """
+    container, stream = _open(path)
+    with container:
+        for frame in _decode(path, container, stream):
+            return round(frame.rotation / 90) % 4
+    raise CaptureError(f"{path}: video holds no frame; record or copy it again")
+
+
+def iterate_video(path: Path) -> Iterator[tuple[int, np.ndarray]]:
+    """Decode a whole video in display order.
+
+    Yields:
+        Time stamp (in the stream's own unit) and (H, W, 3) uint8 sRGB image.
+
+    Raises:
+        CaptureError: the file is no video, truncated, damaged or holds no frame.
+    """
+    check_whole(path)
+    container, stream = _open(path)
+    with container:
+        count = 0
+        for frame in _decode(path, container, stream):
+            count += 1
+            yield int(frame.pts), _pixels(path, frame)
+    if count == 0:
+        raise CaptureError(f"{path}: video holds no frame; record or copy it again")
+
+
+class VideoReader:
+    """Reads single frames of a video whose time stamps are known, forward reads being quick."""
+
+    def __init__(self, path: Path, pts: tuple[int, ...]) -> None:
+        self.path = path
+        self.pts = pts
+        self._container, self._stream = _open(path)
+        self._frames = _decode(path, self._container, self._stream)
+        self._next = 0  # decode index of the frame that _frames yields next
+
+    def read(self, frame: int) -> np.ndarray:
+        """Image (H, W, 3) uint8 sRGB of a decode index.
+
+        Raises:
+            CaptureError: no such frame, or the footage no longer has the indexed time stamps.
+        """
+        if not 0 <= frame < len(self.pts):
+            raise CaptureError(
+                f"{self.path}: frame {frame} does not exist, expected 0 to {len(self.pts) - 1}"
+            )
+        if not self._next <= frame < self._next + 2 * REORDER:
+            self._seek(frame)
+        image = self._decode_until(frame)
+        if image is None:
+            self.restart()
+            image = self._decode_until(frame)
+        if image is None:
+            raise CaptureError(
+                f"{self.path}: no frame with time stamp {self.pts[frame]} (frame {frame}); the "
+                "file changed since it was ingested, run 'express50 ingest' again"
+            )
+        return image
+
+    def restart(self) -> None:
+        """Go back to the first frame by opening the file anew."""
+        self._container.close()
+        self._container, self._stream = _open(self.path)
+        self._frames = _decode(self.path, self._container, self._stream)
+        self._next = 0
+
+    def close(self) -> None:
+        """Close the file."""
+        self._container.close()
+
+    def _seek(self, frame: int) -> None:
+        target = max(0, frame - REORDER)
+        if target == 0:
+            self.restart()
+            return
+        try:
+            self._container.seek(self.pts[target], stream=self._stream, backward=True)
+        except DAMAGE:  # no index to seek in: from the start it goes
+            self.restart()
+            return
+        self._frames = _decode(self.path, self._container, self._stream)
+        self._next = target
+
+    def _decode_until(self, frame: int) -> np.ndarray | None:
+        """Decode on to the frame; None when the stream is already past it or ends."""
+        wanted = self.pts[frame]
+        for decoded in self._frames:
+            if decoded.pts == wanted:
+                self._next = frame + 1
+                return _pixels(self.path, decoded)
+            if decoded.pts > wanted:
+                return None
+        return None

@@ -1,0 +1,255 @@
+"""Cameras: projection, rays, distortion, crops and triangulation.
+
+World and camera units are metres, axes are OpenCV's, a pixel's origin is the image's corner.
+Models and the order of their parameters are COLMAP's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from express50.geometry.shapes import check_shape
+
+# Where each COLMAP parameter goes: focal x, focal y, then OpenCV's k1 k2 p1 p2 k3 k4 k5 k6.
+MODELS: dict[str, tuple[str, ...]] = {
+    "SIMPLE_PINHOLE": ("f", "cx", "cy"),
+    "PINHOLE": ("fx", "fy", "cx", "cy"),
+    "SIMPLE_RADIAL": ("f", "cx", "cy", "k1"),
+    "RADIAL": ("f", "cx", "cy", "k1", "k2"),
+    "OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"),
+    "FULL_OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
+}
+_DISTORTION = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+
+
+@dataclass(frozen=True)
+class Camera:
+    """One calibrated camera.
+
+    Attributes:
+        id: the camera's name in the capture.
+        width, height: image size, pixels.
+        model: COLMAP's name of the model.
+        params: the model's parameters in COLMAP's order, pixels and dimensionless.
+        cam_from_world: (4, 4) rigid, OpenCV axes, metres.
+    """
+
+    id: str
+    width: int
+    height: int
+    model: str
+    params: tuple[float, ...]
+    cam_from_world: np.ndarray
+
+    def _named(self) -> dict[str, float]:
+        return dict(zip(MODELS[self.model], self.params, strict=True))
+
+    @property
+    def K(self) -> np.ndarray:
+        """Intrinsics (3, 3), pixels, corner origin."""
+        p = self._named()
+        fx, fy = p.get("fx", p.get("f", 0.0)), p.get("fy", p.get("f", 0.0))
+        return np.array([[fx, 0.0, p["cx"]], [0.0, fy, p["cy"]], [0.0, 0.0, 1.0]])
+
+    @property
+    def dist(self) -> np.ndarray:
+        """Distortion (8,), OpenCV's order k1 k2 p1 p2 k3 k4 k5 k6."""
+        p = self._named()
+        return np.array([p.get(name, 0.0) for name in _DISTORTION])
+
+    @property
+    def world_from_cam(self) -> np.ndarray:
+        """Inverse (4, 4) of ``cam_from_world``."""
+        R, t = self.cam_from_world[:3, :3], self.cam_from_world[:3, 3]
+        out = np.eye(4)
+        out[:3, :3], out[:3, 3] = R.T, -R.T @ t
+        return out
+
+    @property
+    def center(self) -> np.ndarray:
+        """Position (3,) in the world, metres."""
+        return self.world_from_cam[:3, 3]
+
+
+def pinhole_camera(
+    camera_id: str, K: np.ndarray, width: int, height: int, cam_from_world: np.ndarray
+) -> Camera:
+    """A camera without distortion from K (3, 3) and a pose (4, 4)."""
+    check_shape("K", K, (3, 3), camera_id)
+    params = (float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]))
+    return Camera(camera_id, int(width), int(height), "PINHOLE", params, np.asarray(cam_from_world))
+
+
+def pinhole(camera: Camera) -> Camera:
+    """The same camera without distortion: what undistorted images are seen with."""
+    return pinhole_camera(camera.id, camera.K, camera.width, camera.height, camera.cam_from_world)
+
+
+def resized(camera: Camera, width: int, height: int) -> Camera:
+    """The camera of the image resized to (width, height)."""
+    return scale_camera(camera, width / camera.width, height / camera.height)
+
+
+def scale_camera(camera: Camera, sx: float, sy: float) -> Camera:
+    """The camera of the image scaled by (sx, sy); with a corner origin K scales as it is."""
+    width, height = round(camera.width * sx), round(camera.height * sy)
+    K = np.diag([sx, sy, 1.0]) @ camera.K
+    return replace(_with_K(camera, K), width=width, height=height)
+
+
+def crop_camera(camera: Camera, x0: float, y0: float, width: int, height: int) -> Camera:
+    """The camera of the crop whose corner is at pixel (x0, y0) of the image."""
+    K = camera.K.copy()
+    K[:2, 2] -= (x0, y0)
+    return replace(_with_K(camera, K), width=int(width), height=int(height))
+
+
+def _with_K(camera: Camera, K: np.ndarray) -> Camera:
+    """The camera with other intrinsics; a one-focal model becomes its two-focal kin."""
+    p = camera._named() | {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
+    model = {"SIMPLE_PINHOLE": "PINHOLE", "SIMPLE_RADIAL": "OPENCV", "RADIAL": "OPENCV"}.get(
+        camera.model, camera.model
+    )
+    return replace(camera, model=model, params=tuple(float(p.get(n, 0.0)) for n in MODELS[model]))
+
+
+def transform_camera(camera: Camera, new_from_old: np.ndarray) -> Camera:
+    """The camera after the world moved by the rigid transform ``new_from_old`` (4, 4)."""
+    return replace(camera, cam_from_world=camera.cam_from_world @ np.linalg.inv(new_from_old))
+
+
+def distort(camera: Camera, xy: np.ndarray) -> np.ndarray:
+    """Distorted normalised coordinates (N, 2) of ideal ones (N, 2).
+
+    Source: OpenCV's rational model, of which COLMAP's OPENCV and RADIAL are special cases.
+    """
+    k1, k2, p1, p2, k3, k4, k5, k6 = camera.dist
+    x, y = xy[:, 0], xy[:, 1]
+    r2 = x * x + y * y
+    radial = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
+    dx = 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
+    dy = p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
+    return np.stack([x * radial + dx, y * radial + dy], axis=1)
+
+
+def undistort(camera: Camera, xy: np.ndarray, iterations: int = 30) -> np.ndarray:
+    """Ideal normalised coordinates (N, 2) of distorted ones (N, 2), by damped fixed point."""
+    if not camera.dist.any():
+        return np.asarray(xy, dtype=np.float64)
+    ideal = np.array(xy, dtype=np.float64)
+    for _ in range(iterations):
+        error = xy - distort(camera, ideal)
+        ideal = ideal + error
+        if np.nanmax(np.abs(error), initial=0.0) < 1e-12:
+            break
+    return ideal
+
+
+def project(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Project world points into a camera, distortion included.
+
+    Args:
+        camera: the camera.
+        points: (N, 3) world points, metres.
+
+    Returns:
+        pixels (N, 2) as (x, y), NaN where depth <= 0; depth (N,), camera z, metres.
+
+    Raises:
+        ValueError: points are not (N, 3).
+
+    Source: Hartley and Zisserman, Multiple View Geometry, 2nd ed., ch. 6.
+    """
+    points = np.asarray(points, dtype=np.float64)
+    check_shape("points", points, (None, 3))
+    p = points @ camera.cam_from_world[:3, :3].T + camera.cam_from_world[:3, 3]
+    depth = p[:, 2]
+    ahead = depth > 0
+    xy = p[:, :2] / np.where(ahead, depth, np.nan)[:, None]
+    K = camera.K
+    return distort(camera, xy) * (K[0, 0], K[1, 1]) + K[:2, 2], depth
+
+
+def unproject(camera: Camera, pixels: np.ndarray, depth: np.ndarray) -> np.ndarray:
+    """World points (N, 3) at pixels (N, 2) and camera depths (N,), metres."""
+    pixels = np.asarray(pixels, dtype=np.float64)
+    check_shape("pixels", pixels, (None, 2))
+    K = camera.K
+    xy = undistort(camera, (pixels - K[:2, 2]) / (K[0, 0], K[1, 1]))
+    p = np.concatenate([xy, np.ones((len(xy), 1))], axis=1) * np.asarray(depth)[:, None]
+    return (p - camera.cam_from_world[:3, 3]) @ camera.cam_from_world[:3, :3]
+
+
+def rays(camera: Camera, stride: int = 1) -> tuple[np.ndarray, np.ndarray]:
+    """Origin (3,) and directions (H', W', 3) through the centres of every stride-th pixel.
+
+    Directions have camera z 1, so that ``origin + depth * direction`` is the point at a depth.
+    """
+    x, y = np.meshgrid(
+        np.arange(0, camera.width, stride) + 0.5, np.arange(0, camera.height, stride) + 0.5
+    )
+    pixels = np.stack([x.ravel(), y.ravel()], axis=1)
+    ahead = unproject(camera, pixels, np.ones(len(pixels)))
+    return camera.center, (ahead - camera.center).reshape(*x.shape, 3)
+
+
+def triangulate(
+    cameras: Sequence[Camera], pixels: np.ndarray, weights: np.ndarray | None = None
+) -> np.ndarray:
+    """Triangulate points seen by several cameras.
+
+    Args:
+        cameras: C cameras.
+        pixels: (C, N, 2) distorted pixels; NaN where a camera does not see a point.
+        weights: (C, N) non-negative; all ones by default.
+
+    Returns:
+        (N, 3) world points; NaN where fewer than two cameras see one.
+
+    Source: linear triangulation (Hartley and Zisserman, 12.2), then Gauss-Newton on pixels.
+    """
+    pixels = np.asarray(pixels, dtype=np.float64)
+    check_shape("pixels", pixels, (len(cameras), None, 2))
+    seen = np.isfinite(pixels).all(-1)
+    w = np.where(seen, 1.0 if weights is None else np.asarray(weights, dtype=np.float64), 0.0)
+    xy = np.stack([normalised(c, p) for c, p in zip(cameras, pixels, strict=True)])
+    P = np.stack([c.cam_from_world[:3] for c in cameras])  # (C, 3, 4)
+    focal = np.array([np.sqrt(c.K[0, 0] * c.K[1, 1]) for c in cameras])
+    points = np.full((pixels.shape[1], 3), np.nan)
+    enough = (w > 0).sum(0) >= 2
+    for n in np.flatnonzero(enough):
+        points[n] = _triangulate_one(P, xy[:, n], w[:, n], focal)
+    return points
+
+
+def normalised(camera: Camera, pixels: np.ndarray) -> np.ndarray:
+    """Undistorted coordinates (N, 2) on the plane z = 1 of recorded pixels (N, 2)."""
+    K = camera.K
+    return undistort(camera, (pixels - K[:2, 2]) / (K[0, 0], K[1, 1]))
+
+
+def _triangulate_one(P: np.ndarray, xy: np.ndarray, w: np.ndarray, focal: np.ndarray) -> np.ndarray:
+    """One world point (3,) from normalised observations (C, 2) with weights (C,)."""
+    use = w > 0
+    P, xy, w = P[use], xy[use], w[use] * focal[use] ** 2
+    rows = xy[:, :, None] * P[:, 2:3] - P[:, :2]  # (C, 2, 4)
+    homogeneous = np.linalg.svd((rows * np.sqrt(w)[:, None, None]).reshape(-1, 4))[2][-1]
+    if abs(homogeneous[3]) < 1e-12:
+        return np.full(3, np.nan)
+    point = homogeneous[:3] / homogeneous[3]
+    for _ in range(5):
+        p = P[:, :, :3] @ point + P[:, :, 3]
+        if np.any(p[:, 2] <= 1e-9):
+            return point
+        residual = p[:, :2] / p[:, 2:] - xy
+        J = (P[:, :2, :3] - (p[:, :2] / p[:, 2:])[:, :, None] * P[:, 2:, :3]) / p[:, 2:, None]
+        A = np.einsum("cik,cil,c->kl", J, J, w)
+        b = np.einsum("cik,ci,c->k", J, residual, w)
+        step = np.linalg.solve(A + 1e-12 * np.trace(A) * np.eye(3), b)
+        point = point - step
+        if np.linalg.norm(step) < 1e-10:
+            break
+    return point

@@ -1,0 +1,111 @@
+"""The only place where half-pixel shifts and axis flips live.
+
+Inside the project a pixel's origin is the image's corner (the first pixel's centre is
+(0.5, 0.5), as COLMAP and gsplat have it) and cameras have OpenCV axes. OpenCV's own functions
+put the origin at the first pixel's centre; OpenGL's cameras look along -z with y up.
+"""
+
+from __future__ import annotations
+
+from typing import TypeVar
+
+import cv2
+import numpy as np
+
+from express50.geometry.cameras import Camera
+
+Places = TypeVar("Places")
+FLIP_YZ = np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+def opencv_pixels_to_corner(pixels: np.ndarray) -> np.ndarray:
+    """Corner-origin pixels (..., 2) of OpenCV's centre-origin pixels (..., 2)."""
+    return np.asarray(pixels, dtype=np.float64) + 0.5
+
+
+def corner_to_opencv_pixels(pixels: np.ndarray) -> np.ndarray:
+    """OpenCV's centre-origin pixels (..., 2) of corner-origin pixels (..., 2)."""
+    return np.asarray(pixels, dtype=np.float64) - 0.5
+
+
+def K_to_opencv(K: np.ndarray) -> np.ndarray:
+    """K (3, 3) as OpenCV's functions expect it (principal point less half a pixel)."""
+    shifted = np.array(K, dtype=np.float64)
+    shifted[:2, 2] -= 0.5
+    return shifted
+
+
+def K_from_opencv(K: np.ndarray) -> np.ndarray:
+    """Corner-origin K (3, 3) of one that an OpenCV function returned."""
+    shifted = np.array(K, dtype=np.float64)
+    shifted[:2, 2] += 0.5
+    return shifted
+
+
+def affine_to_opencv(matrix: np.ndarray) -> np.ndarray:
+    """Affine (2, 3) between centre-origin pixels, as ``cv2.warpAffine`` has it.
+
+    ``matrix`` (2, 3) does the same between corner-origin pixels.
+    """
+    shifted = np.array(matrix, dtype=np.float64)
+    shifted[:, 2] += shifted[:, :2] @ [0.5, 0.5] - 0.5
+    return shifted
+
+
+def corner_to_cell(places: Places) -> Places:
+    """Fractional indices, for interpolation, of corner-origin places; cell 0 spans 0 to 1.
+
+    Takes and returns an array or a tensor of any shape.
+    """
+    return places - 0.5  # type: ignore[operator,return-value]
+
+
+def cell_to_corner(indices: Places) -> Places:
+    """Corner-origin places of fractional indices: the inverse of ``corner_to_cell``."""
+    return indices + 0.5  # type: ignore[operator,return-value]
+
+
+def cell_centres(count: int) -> np.ndarray:
+    """Corner-origin places (count,) of the centres of a row of cells."""
+    return np.arange(count) + 0.5
+
+
+def cam_from_world_from_opengl(world_from_cam_gl: np.ndarray) -> np.ndarray:
+    """``cam_from_world`` (4, 4), OpenCV axes, of an OpenGL camera-to-world matrix (4, 4)."""
+    return np.linalg.inv(np.asarray(world_from_cam_gl, dtype=np.float64) @ FLIP_YZ)
+
+
+def opengl_from_cam_from_world(cam_from_world: np.ndarray) -> np.ndarray:
+    """OpenGL camera-to-world matrix (4, 4) of ``cam_from_world`` (4, 4), OpenCV axes."""
+    return np.linalg.inv(np.asarray(cam_from_world, dtype=np.float64)) @ FLIP_YZ
+
+
+def undistort_maps(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """Maps (H, W) x and y, float32, for ``cv2.remap`` from ``camera`` to its pinhole camera."""
+    K = K_to_opencv(camera.K)
+    return cv2.initUndistortRectifyMap(
+        K, camera.dist, None, K, (camera.width, camera.height), cv2.CV_32FC1
+    )
+
+
+def undistort_image(image: np.ndarray, camera: Camera) -> np.ndarray:
+    """Image (H, W[, C]) as the pinhole camera ``pinhole(camera)`` would see it; 0 outside.
+
+    Raises:
+        ValueError: the image's size is not the camera's.
+    """
+    if image.shape[:2] != (camera.height, camera.width):
+        raise ValueError(
+            f"camera {camera.id}: image is {image.shape[1]}x{image.shape[0]},"
+            f" expected {camera.width}x{camera.height}"
+        )
+    if not camera.dist.any():
+        return image
+    x, y = undistort_maps(camera)
+    return cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
+
+
+def undistorted_mask(camera: Camera) -> np.ndarray:
+    """Pixels (H, W), bool, of the pinhole camera that the distorted image really covers."""
+    x, y = undistort_maps(camera)
+    return (x >= 0) & (y >= 0) & (x <= camera.width - 1) & (y <= camera.height - 1)

@@ -1,0 +1,122 @@
+"""Rotations in torch: batched, any float type, with gradients that stay finite at 0 and pi.
+
+Quaternions are wxyz; axis-angle vectors are radians. The NumPy twin is ``transforms``.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+
+def axis_angle_to_matrix(axis_angle: Tensor) -> Tensor:
+    """Rotation matrices (..., 3, 3) of axis-angle vectors (..., 3), radians.
+
+    Source: Rodrigues' formula; series below 1e-3 rad keep value and gradient smooth through zero.
+    """
+    theta2 = (axis_angle * axis_angle).sum(-1)[..., None, None]
+    small = theta2 < 1e-6
+    safe = torch.where(small, torch.ones_like(theta2), theta2).sqrt()
+    s = torch.where(small, 1.0 - theta2 / 6.0, torch.sin(safe) / safe)
+    c = torch.where(small, 0.5 - theta2 / 24.0, (1.0 - torch.cos(safe)) / (safe * safe))
+    k = _cross_matrix(axis_angle)
+    eye = torch.eye(3, dtype=axis_angle.dtype, device=axis_angle.device)
+    return eye + s * k + c * (k @ k)
+
+
+def _cross_matrix(a: Tensor) -> Tensor:
+    """Matrices K (..., 3, 3) with K v = a x v."""
+    x, y, z = a.unbind(-1)
+    zero = torch.zeros_like(x)
+    return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).reshape(*a.shape[:-1], 3, 3)
+
+
+def quat_to_matrix(quats: Tensor) -> Tensor:
+    """Rotation matrices (..., 3, 3) of quaternions (..., 4), wxyz, normalised here.
+
+    A quaternion of zero length becomes the identity, with zero gradient.
+    """
+    norm2 = (quats * quats).sum(-1, keepdim=True)
+    zero = norm2 == 0
+    unit = quats / torch.where(zero, torch.ones_like(norm2), norm2).sqrt()
+    identity = torch.zeros_like(quats)
+    identity[..., 0] = 1.0
+    w, x, y, z = torch.where(zero, identity, unit).unbind(-1)
+    entries = [
+        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
+    ]  # fmt: skip
+    return torch.stack(entries, -1).reshape(*quats.shape[:-1], 3, 3)
+
+
+def matrix_to_quat(R: Tensor) -> Tensor:
+    """Unit quaternions (..., 4), wxyz with w >= 0, of rotation matrices (..., 3, 3).
+
+    Takes the best conditioned of four branches (Shepperd 1978).
+    """
+    m = R
+    d0, d1, d2 = m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]
+    squares = torch.stack(
+        [1 + d0 + d1 + d2, 1 + d0 - d1 - d2, 1 - d0 + d1 - d2, 1 - d0 - d1 + d2], -1
+    )
+    x = m[..., 2, 1] - m[..., 1, 2]
+    y = m[..., 0, 2] - m[..., 2, 0]
+    z = m[..., 1, 0] - m[..., 0, 1]
+    xy, xz, yz = (
+        m[..., 1, 0] + m[..., 0, 1],
+        m[..., 0, 2] + m[..., 2, 0],
+        m[..., 2, 1] + m[..., 1, 2],
+    )
+    branches = torch.stack(
+        [
+            torch.stack([squares[..., 0], x, y, z], -1),
+            torch.stack([x, squares[..., 1], xy, xz], -1),
+            torch.stack([y, xy, squares[..., 2], yz], -1),
+            torch.stack([z, xz, yz, squares[..., 3]], -1),
+        ],
+        -2,
+    )
+    best = squares.argmax(-1)[..., None, None].expand(*squares.shape[:-1], 1, 4)
+    q = branches.gather(-2, best)[..., 0, :]
+    q = q / q.norm(dim=-1, keepdim=True)
+    return torch.where(q[..., :1] < 0, -q, q)
+
+
+def axis_angle_to_quat(axis_angle: Tensor) -> Tensor:
+    """Unit quaternions (..., 4), wxyz, of axis-angle vectors (..., 3), radians."""
+    theta2 = (axis_angle * axis_angle).sum(-1, keepdim=True)
+    small = theta2 < 1e-6
+    safe = torch.where(small, torch.ones_like(theta2), theta2).sqrt()
+    s = torch.where(small, 0.5 - theta2 / 48.0, torch.sin(0.5 * safe) / safe)
+    w = torch.where(small, 1.0 - theta2 / 8.0, torch.cos(0.5 * safe))
+    return torch.cat([w, s * axis_angle], -1)
+
+
+def quat_to_axis_angle(quats: Tensor) -> Tensor:
+    """Axis-angle vectors (..., 3), radians in [0, pi], of unit quaternions (..., 4), wxyz."""
+    q = torch.where(quats[..., :1] < 0, -quats, quats)
+    sine2 = (q[..., 1:] ** 2).sum(-1, keepdim=True)
+    small = sine2 < 1e-12
+    sine = torch.where(small, torch.ones_like(sine2), sine2).sqrt()
+    scale = torch.where(
+        small, 2.0 / q[..., :1].clamp_min(1e-6), 2.0 * torch.atan2(sine, q[..., :1]) / sine
+    )
+    return scale * q[..., 1:]
+
+
+def slerp(q0: Tensor, q1: Tensor, t: float) -> Tensor:
+    """Spherical interpolation (..., 4) between unit quaternions, along the shorter arc.
+
+    Source: Shoemake 1985; normalised linear interpolation where the ends nearly meet.
+    """
+    cosine = (q0 * q1).sum(-1, keepdim=True)
+    q1 = torch.where(cosine < 0, -q1, q1)
+    cosine = cosine.abs()
+    near = cosine > 1.0 - 1e-6
+    angle = torch.acos(torch.where(near, torch.zeros_like(cosine), cosine))
+    sine = torch.sin(angle)
+    w0 = torch.where(near, torch.full_like(cosine, 1.0 - t), torch.sin((1.0 - t) * angle) / sine)
+    w1 = torch.where(near, torch.full_like(cosine, t), torch.sin(t * angle) / sine)
+    q = w0 * q0 + w1 * q1
+    return q / q.norm(dim=-1, keepdim=True)

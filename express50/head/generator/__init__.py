@@ -1,0 +1,1 @@
+"""The generator of the built-in head model; only its stored arrays are read at run time."""

@@ -1,0 +1,109 @@
+"""Lip loops of the skin and the mouth cavity, a pocket that starts at the slit between the lips."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from express50.head.generator.eyes import from_front
+from express50.head.generator.field import gradient, skin_field
+from express50.head.generator.mesh import HalfMesh
+from express50.head.generator.rays import labels
+
+Array = np.ndarray
+
+LIP_SEGMENTS = 16
+CORNER_X = 25.5
+_OUTER_CENTER_Y, _OUTER_X, _OUTER_UP, _OUTER_DOWN = -49.0, 41.0, 16.0, 20.0
+
+
+def slit_y(x: Array) -> Array:
+    """Height of the closed lips' line at x (mm): a low bow that dips towards the corners."""
+    t = np.clip(x / CORNER_X, 0, 1)
+    return -48.8 - 0.7 * np.exp(-((x / 7.0) ** 2)) - 0.5 * t**3 + 0.9 * t * (1 - t)
+
+
+def _rows() -> tuple[Array, Array, Array, Array]:
+    """Front views (33,2) of slit, vermilion border and outer loop; and slit x a row point."""
+    s = np.linspace(0, 1, LIP_SEGMENTS + 1)
+    x = CORNER_X * np.sin(0.5 * np.pi * s)
+    t = x / CORNER_X
+    slit = np.stack([x, slit_y(x)], 1)
+    up = 7.6 * (1 - t**1.7) ** 0.9 + 1.2 * np.exp(-(((x - 5.5) / 3.2) ** 2)) + 0.2
+    down = 10.0 * (1 - t**2.2) ** 0.8
+    wide = x * (1 + 0.03 * t**4)
+    upper = np.stack([wide, slit[:, 1] + up], 1)
+    lower = np.stack([wide, slit[:, 1] - down], 1)
+    upper[-1, 1] = lower[-1, 1] = slit[-1, 1]
+    border = np.concatenate([upper, lower[-2::-1]])
+    angle = 0.5 * np.pi * (1 - np.linspace(0, 2, 2 * LIP_SEGMENTS + 1))
+    radius_y = np.where(angle > 0, _OUTER_UP, _OUTER_DOWN)
+    outer = np.stack([_OUTER_X * np.cos(angle), _OUTER_CENTER_Y + radius_y * np.sin(angle)], 1)
+    outer[[0, -1], 0] = 0.0
+    slit = np.concatenate([slit, slit[-2::-1]])
+    return slit, border, outer, np.concatenate([x, x[-2::-1]])
+
+
+def add_lip_rings(half: HalfMesh) -> tuple[Array, Array]:
+    """Loops from the slit to around the mouth. Returns (outer row indices, labels (33,2))."""
+    slit, border, outer, x = _rows()
+    sign = np.concatenate([np.ones(LIP_SEGMENTS), [0.0], -np.ones(LIP_SEGMENTS)])
+    thick = 1 - (x / CORNER_X) ** 4
+    contact = from_front(slit)
+    contact[:, 2] -= 0.3 + 2.2 * thick
+    contact[:, 1] += 0.05 * sign
+    rows = [contact]
+    for f in (0.3, 0.65, 1.0):
+        rows.append(from_front(slit + f * (border - slit)))
+    for f in (0.25, 0.6, 1.0):
+        rows.append(from_front(border + f * (outer - border)))
+    outer_label = np.stack(labels(rows[-1]), 1)
+    slit_label = np.stack(labels(contact), 1)
+    slit_label[:, 1] += 0.5 * sign * thick
+    indices = []
+    for k, (row, f) in enumerate(zip(rows, (0, 0.12, 0.26, 0.4, 0.55, 0.78, 1.0), strict=True)):
+        row[np.abs(row[:, 0]) < 1e-9, 0] = 0.0
+        indices.append(half.add(row, f"lip{k}"))
+        half.label(indices[-1], slit_label + f * (outer_label - slit_label))
+        if k:
+            half.strip("skin", indices[k - 1], indices[k], closed=False)
+    _add_cavity(half, indices[0], contact, sign, thick)
+    return indices[-1], outer_label
+
+
+def _add_cavity(half: HalfMesh, slit: Array, contact: Array, sign: Array, thick: Array) -> None:
+    """Pocket behind the lips, wide enough for teeth and tongue, kept inside the skin."""
+    n = len(slit)
+    angle = 0.5 * np.pi * (1 - np.linspace(0, 2, n))
+    up, out = np.sin(angle), np.cos(angle)
+    out[[0, -1]] = 0.0
+    rows = [slit]
+    radii = np.linspace(1.0, 0.12, 8)
+    half.set_uv("mouth", slit, radii[0] * np.stack([out, up], 1))
+    lip_in = contact + np.stack([0 * up, 1.4 * sign * thick, -4.5 + 0 * up], 1)
+    behind = contact + np.stack([0.04 * contact[:, 0], 6.5 * sign * thick, -7.5 + 0 * up], 1)
+    shapes = [lip_in, behind]
+    for y_up, y_down, width, z_mid, z_side in (
+        (-33, -67, 29, 88, 74), (-29, -70, 31, 76, 60), (-30, -69, 28, 60, 50),
+        (-36, -64, 18, 46, 44), (-44, -57, 9, 40, 40),
+    ):  # fmt: skip
+        y = -50 + np.where(up > 0, (y_up + 50) * up, (y_down + 50) * -up)
+        shapes.append(np.stack([width * out, y, z_mid + (z_side - z_mid) * out**2], 1))
+    for k, shape in enumerate(shapes):
+        shape = _inside(shape, 1.5 if k == 0 else 3.0)
+        shape[[0, -1], 0] = 0.0
+        rows.append(half.add(shape, "cavity"))
+        half.tags[f"cavity{k}"] = rows[-1]
+        half.set_uv("mouth", rows[-1], radii[min(k + 1, 7)] * np.stack([out, up], 1))
+        half.strip("mouth", rows[-2], rows[-1], closed=False)
+    throat = half.tags["throat"] = half.add(np.array([[0.0, -51.0, 37.0]]), "cavity")
+    half.set_uv("mouth", throat, np.array([[0.0, 0.0]]))
+    half.fan("mouth", int(throat[0]), rows[-1], closed=False)
+
+
+def _inside(points: Array, depth: float) -> Array:
+    """Points pushed in where they are less than `depth` mm under the skin."""
+    p = points.copy()
+    for _ in range(4):
+        excess = np.maximum(skin_field(p) + depth, 0.0)
+        p = p - excess[:, None] * gradient(p)
+    return p

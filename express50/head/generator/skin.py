@@ -1,0 +1,202 @@
+"""The skin: feature loops placed on the field, the rest filled by graded points and triangulated.
+
+The half head is triangulated as a convex hull of its label directions on a sphere (a spherical
+Delaunay triangulation); the closing cap on the mid plane and the holes inside loops are dropped.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.ndimage import map_coordinates
+from scipy.spatial import ConvexHull, cKDTree
+
+from express50.head.generator.ears import add_ear
+from express50.head.generator.eyes import add_eye_rings
+from express50.head.generator.field import cast, project
+from express50.head.generator.mesh import HalfMesh
+from express50.head.generator.mouth import add_lip_rings
+from express50.head.generator.nose import add_nostril
+from express50.head.generator.rays import BOTTOM_LATITUDE, rays, sphere
+
+Array = np.ndarray
+
+#          x, y, z, radius of the dense core, spacing there, growth a mm beyond (all mm)
+_DENSITY = np.array([
+    (6, -15, 104, 14, 2.6, 0.12),
+    (32, 20, 75, 22, 3.6, 0.10),
+    (10, -48, 98, 30, 3.8, 0.10),
+    (15, 40, 88, 22, 4.2, 0.10),
+    (0, -85, 85, 20, 4.6, 0.10),
+    (45, -62, 20, 20, 5.5, 0.10),
+    (70, 5, -15, 30, 5.0, 0.12),
+])  # fmt: skip
+_COARSEST = 11.0
+
+
+def spacing(points: Array) -> Array:
+    """Wanted edge length (N,) mm at points (N,3)."""
+    d = np.linalg.norm(points[:, None] - _DENSITY[None, :, :3], axis=-1)
+    h = _DENSITY[:, 4] + _DENSITY[:, 5] * np.maximum(d - _DENSITY[:, 3], 0.0)
+    return np.minimum(h.min(1), _COARSEST)
+
+
+def add_skin(half: HalfMesh) -> None:
+    """Add the whole skin of the left half, with eye, lip, nostril and ear loops."""
+    loops = [add_eye_rings(half), add_nostril(half), add_ear(half)]
+    lips = add_lip_rings(half)
+    mouth_hole = np.concatenate([lips[1], [[0.0, lips[1][-1, 1]]]])
+    holes = [label for _, label in loops] + [mouth_hole]
+    rim = [index for index, _ in loops] + [lips[0]]
+    fixed = _add_midline(half, lips[1][0, 1], lips[1][-1, 1])
+    fixed_label = np.array([half.labels[int(i)] for i in np.concatenate([fixed, *rim])])
+    fixed_index = np.concatenate([fixed, *rim])
+    filled = _add_fill(half, half.array()[fixed_index], holes)
+    index = np.concatenate([fixed_index, filled])
+    label = np.concatenate([fixed_label, [half.labels[int(i)] for i in filled]])
+    faces = _triangulate(label, len(fixed), [len(r) for r in rim])
+    half.add_faces("skin", index[faces])
+    half.tags["filled"], half.tags["grid"] = filled, index
+    _relax(half, index[faces], filled, fixed)
+
+
+def _add_midline(half: HalfMesh, lip_top: float, lip_bottom: float) -> Array:
+    """Mid-plane vertices from lip to crown to nape to collar and lip to collar, and the collar."""
+    groups = []
+    for azimuth, low, high in (
+        (0.0, lip_top, 90.0),
+        (np.pi, BOTTOM_LATITUDE, 90.0),
+        (0.0, BOTTOM_LATITUDE, lip_bottom),
+    ):
+        latitude = np.linspace(low, high, 400)
+        points = cast(*rays(np.full(400, azimuth), latitude))
+        step = np.linalg.norm(np.diff(points, axis=0), axis=1)
+        count = np.concatenate([[0], np.cumsum(step / spacing(points[1:]))])
+        n = int(np.ceil(count[-1]))
+        pick = np.interp(np.arange(n + 1) * count[-1] / n, count, latitude)
+        if azimuth == 0.0:
+            pick = pick[1:] if low == lip_top else pick[:-1]  # the lips' loop has that end
+        else:
+            pick = pick[:-1]  # the crown belongs to the front
+        points = cast(*rays(np.full(len(pick), azimuth), pick))
+        points[:, 0] = 0.0
+        tag = {90.0: "midline_front", lip_bottom: "midline_low"}[high]
+        groups.append(half.add(points, "midline_back" if azimuth else tag))
+        half.label(groups[-1], np.stack([np.full(len(pick), azimuth), pick], 1))
+    around = np.linspace(0, np.pi, 26)[1:-1]
+    collar = np.stack([around, np.full(len(around), BOTTOM_LATITUDE)], 1)
+    groups.append(half.add(cast(*rays(*collar.T)), "collar"))
+    half.label(groups[-1], collar)
+    half.tags["collar"] = np.concatenate([groups[-1], groups[1][:1], groups[2][:1]])
+    return np.concatenate(groups)
+
+
+def _add_fill(half: HalfMesh, fixed: Array, holes: list[Array]) -> Array:
+    """Graded points (dart throwing, seeded) where no loop is; returns their indices."""
+    azimuth, latitude = np.linspace(0, np.pi, 61), np.linspace(BOTTOM_LATITUDE, 90, 69)
+    a, b = np.meshgrid(azimuth, latitude, indexing="ij")
+    table = cast(*rays(a.ravel(), b.ravel())).reshape(61, 69, 3)
+    rng = np.random.default_rng(50)
+    label = rng.random((24000, 2))
+    label = np.stack(
+        [np.pi * label[:, 0], np.degrees(np.arcsin(2 * label[:, 1] - 1))], 1
+    )  # even on the sphere
+    more = rng.random((16000, 2)) * [1.2, 90.0] + [0.0, -60.0]
+    label = np.concatenate([label, more])
+    label = label[label[:, 1] > BOTTOM_LATITUDE + 1]
+    grid = np.stack([label[:, 0] / np.pi * 60, (label[:, 1] + 80) / 170 * 68])
+    points = np.stack([map_coordinates(table[..., k], grid, order=1) for k in range(3)], 1)
+    h = spacing(points)
+    keep = points[:, 0] > 0.6 * h
+    for hole in holes:
+        keep &= ~inside(label, hole)
+    keep[keep] = cKDTree(fixed).query(points[keep])[0] > 0.72 * h[keep]
+    points, label, h = points[keep], label[keep], h[keep]
+    chosen = _darts(points, h)
+    placed = cast(*rays(*label[chosen].T))
+    index = half.add(placed, "fill")
+    half.label(index, label[chosen])
+    return index
+
+
+def _darts(points: Array, h: Array) -> Array:
+    tree = cKDTree(points)
+    alive = np.ones(len(points), bool)
+    chosen = []
+    for i in range(len(points)):
+        if alive[i]:
+            chosen.append(i)
+            alive[tree.query_ball_point(points[i], 0.86 * h[i])] = False
+    return np.array(chosen)
+
+
+def inside(points: Array, polygon: Array) -> Array:
+    """Even-odd test of points (N,2) in a closed polygon (M,2)."""
+    a, b = polygon, np.roll(polygon, -1, axis=0)
+    x, y = points[:, :1], points[:, 1:]
+    crosses = (a[:, 1] > y) != (b[:, 1] > y)
+    slope = (b[:, 0] - a[:, 0]) / np.where(b[:, 1] == a[:, 1], 1e-12, b[:, 1] - a[:, 1])
+    return (crosses & (x < a[:, 0] + (y - a[:, 1]) * slope)).sum(1) % 2 == 1
+
+
+def _triangulate(label: Array, midline: int, rims: list[int]) -> Array:
+    """Hull triangles without the mid-plane cap, the neck's end and the loops' insides."""
+    directions = sphere(*label.T)
+    flat = np.abs(np.sin(label[:, 0])) < 1e-9
+    directions[flat, 0] = 0.0
+    faces = ConvexHull(directions).simplices
+    drop = flat[faces].all(1) | (np.abs(label[:, 1] - BOTTOM_LATITUDE) < 1e-6)[faces].all(1)
+    start = midline
+    for count in rims:
+        member = np.zeros(len(label), bool)
+        member[start : start + count] = True
+        drop |= member[faces].all(1)
+        start += count
+    return faces[~drop]
+
+
+def _relax(half: HalfMesh, faces: Array, free: Array, fixed: Array) -> None:
+    """Even out the filled vertices: average of neighbours, put back on the skin; labels too."""
+    points = half.array()
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    edges = np.unique(np.sort(edges, 1), axis=0)
+    label = np.array([half.labels.get(i, (0.0, 0.0)) for i in range(half.count)])
+    direction = sphere(*label.T)
+    degree = np.bincount(edges.ravel(), minlength=half.count)[:, None].clip(1)
+
+    def average(x: Array) -> Array:
+        total = np.zeros_like(x)
+        np.add.at(total, edges[:, 0], x[edges[:, 1]])
+        np.add.at(total, edges[:, 1], x[edges[:, 0]])
+        return total / degree
+
+    for _ in range(6):
+        points[free] += 0.6 * (average(points) - points)[free]
+        points[free] = project(points[free], 1)
+        direction[free] += 0.6 * (average(direction) - direction)[free]
+    points[free] = project(points[free], 3)
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    half.points = [points]
+    half.label(
+        free,
+        np.stack(
+            [
+                np.arctan2(direction[free, 0], direction[free, 2]),
+                np.degrees(np.arcsin(direction[free, 1])),
+            ],
+            1,
+        ),
+    )
+
+
+def set_skin_uv(half: HalfMesh) -> None:
+    """Skin chart: pseudo-cylindrical, cut along the back, pole at the crown, roomier in front."""
+    index = np.array(sorted(half.labels))
+    azimuth, latitude = np.array([half.labels[int(i)] for i in index]).T
+    width = np.interp(
+        latitude,
+        [-85, -80, -60, -42, -15, 15, 40, 60, 75, 84, 90],
+        [0.8, 0.78, 0.74, 0.92, 1.0, 1.0, 0.84, 0.56, 0.3, 0.14, 0.0],
+    )
+    u = (azimuth / np.pi + 0.19 * np.sin(azimuth)) * width
+    v = np.interp(latitude, [-85, -80, -52, -45, 45, 90], [-0.06, 0.0, 0.11, 0.17, 0.80, 1.0])
+    half.set_uv("skin", index, np.stack([u, v], 1))

@@ -1,0 +1,207 @@
+"""Random heads for the training of the landmark detector.
+
+Domain randomisation on purpose: shapes, skins, hair and light far beyond what is usual, so that the
+detector learns where things are on a face and not how one renderer or one head model paints them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from express50.head.model import HeadModel, landmarks, pose, vertex_normals
+from express50.landmarks.training.poses import random_parameters
+
+Rng = np.random.Generator
+
+
+@dataclass(frozen=True)
+class RandomHead:
+    """One random head: vertices and normals (V, 3), colours (V, 3) in [0, 1], landmarks (68, 3)."""
+
+    vertices: np.ndarray
+    normals: np.ndarray
+    colors: np.ndarray
+    landmarks: np.ndarray
+    gloss: float
+
+
+@dataclass(frozen=True)
+class Canvas:
+    """Places to paint.
+
+    Attributes:
+        rest: (N, 3) metres, on the head at rest.
+        region: names and which of the places are in it, (N,) bool.
+        marks: (68, 3) landmarks of the head at rest.
+    """
+
+    rest: np.ndarray
+    region: dict[str, np.ndarray]
+    marks: np.ndarray
+
+    @classmethod
+    def of(cls, model: HeadModel) -> Canvas:
+        """A head model's vertices."""
+        region = {name: mask.numpy() for name, mask in model.regions.items()}
+        marks = landmarks(model, model.template[None])[0].numpy()
+        return cls(model.template.numpy(), region, marks)
+
+
+def random_head(model: HeadModel, rng: Rng) -> RandomHead:
+    """Draw shape, expression, pose, smooth deformation, hair and colours."""
+    draw = random_parameters(model, rng)
+    with torch.no_grad():
+        vertices = pose(model, **draw)
+    vertices = torch.from_numpy(deform(vertices[0].numpy(), rng))[None]
+    points = landmarks(model, vertices)[0].numpy()
+    colors, hair = paint(Canvas.of(model), rng)
+    normals = vertex_normals(vertices, model.faces)
+    if hair is not None:
+        vertices = vertices + normals * torch.from_numpy(hair)[None, :, None]
+        normals = vertex_normals(vertices, model.faces)
+    gloss = float(rng.uniform(0.0, 0.5))
+    return RandomHead(vertices[0].numpy(), normals[0].numpy(), colors, points, gloss)
+
+
+def waves(points: np.ndarray, rng: Rng, count: int, low: float, high: float) -> np.ndarray:
+    """Smooth random field (N,) of about unit variance; wave numbers low..high radians a metre."""
+    directions = rng.normal(size=(count, 3))
+    directions *= (np.exp(rng.uniform(np.log(low), np.log(high), count)))[:, None] / (
+        np.linalg.norm(directions, axis=1, keepdims=True)
+    )
+    phases = rng.uniform(0, 2 * np.pi, count)
+    return np.sin(points @ directions.T + phases).sum(1) * np.sqrt(2.0 / count)
+
+
+def deform(vertices: np.ndarray, rng: Rng) -> np.ndarray:
+    """Anisotropic scale and a smooth random displacement of a few millimetres."""
+    centre = vertices.mean(0)
+    scaled = (vertices - centre) * rng.uniform(0.9, 1.1, size=3) * rng.uniform(0.9, 1.1)
+    amplitude = rng.uniform(0.0, 0.003)
+    moved = np.stack([waves(vertices, rng, 6, 15.0, 60.0) for _ in range(3)], axis=1)
+    return (scaled + centre + amplitude * moved).astype(np.float32)
+
+
+def paint(canvas: Canvas, rng: Rng) -> tuple[np.ndarray, np.ndarray | None]:
+    """Colours (N, 3) in [0, 1] and hair thickness (N,) metres or None."""
+    rest, region, marks = canvas.rest, canvas.region, canvas.marks
+    colors = np.tile(_skin_color(rng), (len(rest), 1))
+    # Anything in no region is a small part such as lashes: dark.
+    nothing = ~np.any(list(region.values()), axis=0)
+    colors *= 1 + rng.uniform(0, 0.15) * waves(rest, rng, 12, 20.0, 150.0)[:, None]
+    colors *= 1 + rng.uniform(0, 0.12) * waves(rest, rng, 24, 150.0, 900.0)[:, None]
+    blush = _blob(rest, marks[[2, 14, 30, 8]][rng.integers(4)], rng.uniform(0.02, 0.05))
+    colors = _mix(colors, rng.uniform(0.2, 1.0, 3), blush * rng.uniform(0, 0.3))
+    _tint_features(colors, region, rest, marks, rng)
+    colors[nothing] = rng.uniform(0.02, 0.25)
+    hair = _grow_hair(colors, region, rest, marks, rng)
+    _tint_beard(colors, region, rest, marks, rng)
+    _color_eyes_and_mouth(colors, region, rest, rng)
+    return np.clip(colors, 0.0, 1.0).astype(np.float32), hair
+
+
+def _skin_color(rng: Rng) -> np.ndarray:
+    if rng.random() < 0.15:
+        return rng.uniform(0.15, 0.95, 3)
+    light = rng.uniform(0.0, 1.0)
+    skin = (1 - light) * np.array([0.25, 0.15, 0.10]) + light * np.array([0.95, 0.78, 0.68])
+    return np.clip(skin * rng.uniform(0.85, 1.15, 3), 0.05, 1.0)
+
+
+def _mix(colors: np.ndarray, color: np.ndarray, amount: np.ndarray) -> np.ndarray:
+    return colors + (color - colors) * amount[:, None]
+
+
+def _blob(points: np.ndarray, centre: np.ndarray, radius: float) -> np.ndarray:
+    return np.exp(-((points - centre) ** 2).sum(1) / radius**2)
+
+
+def _line_distance(points: np.ndarray, line: np.ndarray) -> np.ndarray:
+    """Distance (N,) of points (N, 3) to a polyline (L, 3)."""
+    start, along = line[:-1], np.diff(line, axis=0)
+    relative = points[:, None] - start[None]
+    share = (relative * along).sum(2) / np.maximum((along**2).sum(1), 1e-12)
+    return np.linalg.norm(relative - np.clip(share, 0, 1)[..., None] * along, axis=2).min(1)
+
+
+def _tint_features(
+    colors: np.ndarray, region: dict[str, np.ndarray], rest: np.ndarray, marks: np.ndarray, rng: Rng
+) -> None:
+    """Lips, brows and eye make-up, in place."""
+    lips = region["lips"].astype(float) * rng.uniform(0.0, 0.9)
+    colors[:] = _mix(colors, colors * rng.uniform([0.7, 0.3, 0.3], [1.2, 0.9, 0.9]), lips)
+    brow_color = rng.uniform(0.0, 0.5) * np.array([1.0, rng.uniform(0.5, 1), rng.uniform(0.3, 1)])
+    skin = np.flatnonzero(region["face"])
+    width, strength = (
+        rng.uniform(0.002, 0.006),
+        rng.choice([0.0, rng.uniform(0.2, 1.0)], p=[0.2, 0.8]),
+    )
+    for line in (marks[17:22], marks[22:27]):
+        near = _line_distance(rest[skin], line)
+        ragged = 1 + 0.4 * waves(rest[skin], rng, 8, 300.0, 1500.0)
+        amount = strength / (1 + np.exp((near - width * ragged) / 0.001))
+        colors[skin] = _mix(colors[skin], brow_color, amount)
+    for side in ("left", "right"):
+        shade = region[f"{side}_eye_region"] * rng.uniform(0.0, 0.4)
+        colors[:] = _mix(colors, rng.uniform(0.0, 0.8, 3), shade)
+
+
+def _grow_hair(
+    colors: np.ndarray, region: dict[str, np.ndarray], rest: np.ndarray, marks: np.ndarray, rng: Rng
+) -> np.ndarray | None:
+    """Paint a hair cap above a tilted plane, in place; returns its thickness or None for bald."""
+    if rng.random() < 0.3:
+        return None
+    brows, crown = marks[17:27, 1].max(), rest[:, 1].max()
+    front = np.array([0.0, brows + rng.uniform(0.15, 0.8) * (crown - brows), marks[27, 2]])
+    tilt = rng.uniform(0.2, 1.25)
+    height = (rest - front) @ np.array([0.0, np.cos(tilt), -np.sin(tilt)])
+    height += 0.006 * waves(rest, rng, 10, 40.0, 300.0)
+    keep = np.zeros(len(rest))
+    keep[region["scalp"] | region["forehead"] | region["neck"]] = 1.0
+    keep[region["neck"] & (rest[:, 1] < marks[8, 1] - 0.03)] = 0.0
+    amount = keep / (1 + np.exp(-height / 0.004))
+    hair_color = rng.uniform(0.02, 0.75) * np.array([1.0, rng.uniform(0.6, 1), rng.uniform(0.3, 1)])
+    strands = 1 + 0.4 * waves(rest, rng, 30, 200.0, 1500.0)
+    colors[:] += (hair_color * strands[:, None] - colors) * amount[:, None]
+    thickness = rng.uniform(0.0, 0.03) * (1 + 0.4 * waves(rest, rng, 10, 30.0, 200.0))
+    return (amount * np.maximum(thickness, 0.0)).astype(np.float32)
+
+
+def _tint_beard(
+    colors: np.ndarray, region: dict[str, np.ndarray], rest: np.ndarray, marks: np.ndarray, rng: Rng
+) -> None:
+    """Stubble, moustache or full beard, in place."""
+    if rng.random() < 0.6:
+        return
+    below = 1 / (1 + np.exp((rest[:, 1] - marks[33, 1] + rng.uniform(0, 0.02)) / 0.003))
+    cheek = 1 / (1 + np.exp((marks[33, 2] - rng.uniform(0.02, 0.09) - rest[:, 2]) / 0.004))
+    amount = below * cheek * (region["face"] & ~region["lips"]) * rng.uniform(0.2, 0.9)
+    grain = 1 + 0.5 * waves(rest, rng, 20, 400.0, 2000.0)
+    colors[:] = _mix(colors, rng.uniform(0.0, 0.4) * np.ones(3), np.clip(amount * grain, 0, 1))
+
+
+def _color_eyes_and_mouth(
+    colors: np.ndarray, region: dict[str, np.ndarray], rest: np.ndarray, rng: Rng
+) -> None:
+    """Sclera, iris, pupil, teeth and mouth cavity, in place."""
+    iris = rng.uniform(0.05, 0.7) * np.array(
+        [rng.uniform(0.4, 1), rng.uniform(0.5, 1), rng.uniform(0.3, 1)]
+    )
+    sclera = rng.uniform(0.6, 1.0) * np.array([1.0, rng.uniform(0.9, 1), rng.uniform(0.85, 1)])
+    for side in ("left", "right"):
+        ball = region[f"{side}_eyeball"]
+        colors[ball] = sclera
+        centre = rest[ball].mean(0)
+        arm = rest[ball] - centre
+        angle = np.arccos(np.clip(arm[:, 2] / np.linalg.norm(arm, axis=1), -1, 1))
+        colors[np.flatnonzero(ball)[angle < rng.uniform(0.42, 0.55)]] = iris
+        colors[np.flatnonzero(ball)[angle < rng.uniform(0.15, 0.28)]] = 0.02
+    inside = region["mouth_interior"] | region["tongue"]
+    colors[inside] = rng.uniform(0.05, 0.6) * np.array(
+        [1.0, rng.uniform(0.3, 0.8), rng.uniform(0.3, 0.8)]
+    )
+    colors[region["teeth"]] = rng.uniform(0.5, 1.0) * np.array([1.0, 0.97, rng.uniform(0.8, 1.0)])

@@ -1,0 +1,231 @@
+"""Make `weights.npz` in one run.
+
+    python -m express50.landmarks.training.train --views DIR [--ict PATH]
+
+Trains on renders of random heads only: the procedural head and, where a path is given,
+ICT-FaceKit; the shipped file used both, with the defaults of the other arguments. No photograph of
+a person is used. The result depends on the arguments alone, up to how the machine rounds. A run
+that was interrupted goes on from its last state, which is kept in DIR, to the same result.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from dataclasses import astuple, dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch.nn import functional
+
+from express50.errors import TrainError
+from express50.files.checkpoints import read_weights
+from express50.head.load import load_head
+from express50.head.model import HeadModel
+from express50.landmarks.network import (
+    CROP,
+    WEIGHTS,
+    LandmarkNet,
+    heat_loss,
+    load_network,
+    save_network,
+)
+from express50.landmarks.training.augment import Crop, make_backgrounds, random_crop
+from express50.landmarks.training.training_set import FILE_VIEWS, ViewSet, make_views, read_views
+
+BATCH = 32
+RATE = 2e-3
+WARM_UP = 100
+# The rate stays high until this share of the run, then falls in a straight line.
+HIGH_SHARE = 0.65
+KEEP_EVERY = 100
+FIRST_FILES = 6
+STEPS_A_FILE = 300
+HELD_OUT = 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Plan:
+    """How to train.
+
+    Attributes:
+        steps: batches of crops in all.
+        small_steps: of these, the first that are at half resolution.
+        files: files of views a head model.
+        seed: of everything random.
+    """
+
+    steps: int = 6000
+    small_steps: int = 3000
+    files: int = 30
+    seed: int = 0
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Render what is missing, train, save and report the error on held-out heads."""
+    parser = argparse.ArgumentParser(
+        prog="python -m express50.landmarks.training.train", description=__doc__
+    )
+    parser.add_argument("--views", type=Path, required=True, help="folder for rendered views")
+    parser.add_argument("--ict", help="ICT-FaceKit checkout or .npz to train on as well")
+    parser.add_argument("--files", type=int, default=Plan.files, help="files of views a head")
+    parser.add_argument("--steps", type=int, default=Plan.steps, help="batches of 32 crops")
+    parser.add_argument(
+        "--small-steps", type=int, default=Plan.small_steps, help="of these, at half resolution"
+    )
+    parser.add_argument("--seed", type=int, default=Plan.seed)
+    parser.add_argument("--out", type=Path, default=WEIGHTS)
+    options = parser.parse_args(arguments)
+    torch.set_num_threads(1)
+    models = [load_head(spec) for spec in ("procedural", options.ict) if spec]
+    plan = Plan(
+        steps=options.steps,
+        small_steps=options.small_steps,
+        files=options.files,
+        seed=options.seed,
+    )
+    save_network(train(models, plan, options.views), options.out)
+    net = load_network(options.out)
+    for model in models:
+        views = read_views(make_views(options.views, model, HELD_OUT, plan.seed))
+        print(f"{model.name}: held-out heads {validate(net, views, plan.seed)}")
+    return 0
+
+
+def train(models: list[HeadModel], plan: Plan, folder: Path) -> LandmarkNet:
+    """Train on views of the head models; views and the run's state are kept in a folder."""
+    torch.manual_seed(plan.seed)
+    backgrounds = make_backgrounds(400, np.random.default_rng([plan.seed, 1]))
+    net = LandmarkNet().train().to(memory_format=torch.channels_last)
+    optimiser = torch.optim.AdamW(net.parameters(), lr=RATE, weight_decay=1e-3)
+    name = "-".join([*(m.name for m in models), *(str(value) for value in astuple(plan))])
+    state = folder / f"training-{name}.pt"
+    first = take_up(state, net, optimiser)
+    began, losses = time.monotonic(), []
+    sets: list[ViewSet] = []
+    for step in range(first, plan.steps):
+        while len(sets) < len(models) * files_in_use(step, plan.files):
+            number = HELD_OUT + 1 + len(sets) // len(models)
+            model = models[len(sets) % len(models)]
+            sets.append(read_views(make_views(folder, model, number, plan.seed)))
+        optimiser.param_groups[0]["lr"] = RATE * rate_share(step, plan.steps)
+        # Seeded by the step, so that a run taken up again draws what it would have drawn.
+        rng = np.random.default_rng([plan.seed, 2, step])
+        size = CROP // 2 if step < plan.small_steps else CROP
+        picks = np.divmod(rng.integers(len(sets) * FILE_VIEWS, size=BATCH), FILE_VIEWS)
+        crops = [
+            random_crop(sets[file], view, backgrounds, rng, size)
+            for file, view in zip(*picks, strict=True)
+        ]
+        loss = crop_loss(net, crops)
+        optimiser.zero_grad(set_to_none=True)
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(net.parameters(), 5.0)
+        optimiser.step()
+        losses.append(loss.item())
+        if (step + 1) % KEEP_EVERY == 0:
+            seconds = (time.monotonic() - began) / (step + 1 - first)
+            recent = np.mean(losses[-KEEP_EVERY:])
+            print(f"step {step + 1}: loss {recent:.3f}, {seconds:.2f} s", flush=True)
+            keep_state(state, net, optimiser, step + 1)
+    return net.eval()
+
+
+def files_in_use(step: int, files: int) -> int:
+    """Files of a head model that a step draws from: a few at first, so that it can begin soon."""
+    return min(files, FIRST_FILES + step // STEPS_A_FILE)
+
+
+def rate_share(step: int, steps: int) -> float:
+    """Learning rate of a step as a share of the highest one."""
+    fall = (steps - step) / (steps * (1.0 - HIGH_SHARE))
+    return min(1.0, (step + 1) / WARM_UP, max(fall, 0.01))
+
+
+def keep_state(
+    path: Path, net: torch.nn.Module, optimiser: torch.optim.Optimizer, step: int
+) -> None:
+    """Write a run's state, from which `take_up` goes on."""
+    part = path.with_suffix(".part")
+    torch.save({"net": net.state_dict(), "optimiser": optimiser.state_dict(), "step": step}, part)
+    part.replace(path)
+
+
+def take_up(path: Path, net: torch.nn.Module, optimiser: torch.optim.Optimizer) -> int:
+    """Read a state that `keep_state` wrote, if there is one; the step to go on with."""
+    if not path.exists():
+        return 0
+    state = read_weights(path, TrainError, str(path), "a state of training", "delete it")
+    net.load_state_dict(state["net"])
+    optimiser.load_state_dict(state["optimiser"])
+    print(f"going on from step {state['step']} ({path}; delete it to begin anew)")
+    return state["step"]
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Stacked crops: images (B, 3, H, W) in [0, 1], points (B, 68, 2), the rest (B[, 68])."""
+
+    images: torch.Tensor
+    points: torch.Tensor
+    visible: torch.Tensor
+    score: torch.Tensor
+    weight: torch.Tensor
+
+
+def crop_batch(crops: list[Crop]) -> Batch:
+    """Stack crops for the network."""
+    images = torch.from_numpy(np.stack([crop.image for crop in crops])).permute(0, 3, 1, 2)
+    return Batch(
+        images.contiguous(memory_format=torch.channels_last).float() / 255.0,
+        torch.from_numpy(np.stack([crop.points for crop in crops])),
+        torch.from_numpy(np.stack([crop.visible for crop in crops])),
+        torch.tensor([crop.score for crop in crops]),
+        torch.tensor([crop.weight for crop in crops]),
+    )
+
+
+def crop_loss(net: LandmarkNet, crops: list[Crop]) -> torch.Tensor:
+    """Distance and Laplace likelihood of the points, cross entropies of heat maps and answers."""
+    batch = crop_batch(crops)
+    output = net(batch.images)
+    # The square root's slope at zero distance is bounded by the added 0.01 px^2.
+    distance = ((output.points - batch.points).square().sum(-1) + 0.01).sqrt()
+    likelihood = 2 * output.log_scale + distance * torch.exp(-output.log_scale)
+    heat = heat_loss(output.heat, batch.points)
+    seen = functional.binary_cross_entropy_with_logits(output.seen, batch.visible, reduction="none")
+    share = batch.weight / batch.weight.sum().clamp_min(1.0)
+    point_loss = ((0.2 * distance + likelihood + heat + 0.5 * seen).mean(1) * share).sum()
+    return point_loss + functional.binary_cross_entropy_with_logits(output.logit, batch.score)
+
+
+@torch.inference_mode()
+def validate(net: LandmarkNet, views: ViewSet, seed: int) -> str:
+    """Errors in crop pixels by how far the head is turned, and how often the answers are right."""
+    rng = np.random.default_rng([seed, 3])
+    backgrounds = make_backgrounds(50, rng)
+    errors, seen, right = [], [], []
+    for start in range(0, len(views.facing), BATCH):
+        picks = range(start, min(start + BATCH, len(views.facing)))
+        batch = crop_batch([random_crop(views, i, backgrounds, rng) for i in picks])
+        output = net(batch.images)
+        error = (output.points - batch.points).norm(dim=-1).mean(1)
+        errors.append(torch.where(batch.weight > 0, error, torch.nan))
+        full = batch.weight >= 1.0
+        seen.append(((output.seen > 0) == (batch.visible > 0.5))[full].float().mean(1))
+        clear = (batch.score <= 0) | (batch.score >= 1)
+        right.append(((output.logit > 0) == (batch.score > 0.5))[clear].float())
+    error, facing = torch.cat(errors), torch.from_numpy(views.facing)
+    parts = [
+        f"{name} {float(error[(facing > low) & (facing <= high)].nanmedian()):.2f}"
+        for name, low, high in (("front", 0.7, 1.0), ("turned", 0.3, 0.7), ("profile", -0.1, 0.3))
+    ]
+    return (
+        f"error median {', '.join(parts)} crop px; visibility right "
+        f"{100 * torch.cat(seen).mean():.1f} %, score {100 * torch.cat(right).mean():.1f} %"
+    )
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,1 @@
+"""The runner: schedules items, publishes outputs, keeps the ledger."""

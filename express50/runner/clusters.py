@@ -1,0 +1,194 @@
+"""Workers that dask runs tasks in: of this machine, GPUs dealt out among them, or a scheduler's."""
+
+from __future__ import annotations
+
+import logging
+import os
+import shutil
+import subprocess
+import sys
+import time
+from typing import Any
+
+from express50.errors import StageError
+from express50.runner.threads import thread_environment
+
+GPU = "GPU"  # name of the resource, of which a worker offers 1 for the device that it sees
+GPU_SECONDS = 60.0  # a GPU worker that died may take so long to come back
+CONNECT_SECONDS = 20.0
+
+
+class LocalWorkers:
+    """Processes on this machine; the first ones have a GPU each, as far as there are any."""
+
+    def __init__(self, count: int, threads: int) -> None:
+        devices = cuda_devices()
+        self.count, self.gpus = count, min(count, len(devices))
+        cluster = start_cluster(local_workers(count, devices), threads, host="127.0.0.1")
+        self.client, self._cluster = cluster
+        self.client.register_plugin(_ignore_interrupts())
+
+    def keep(self, tasks: int) -> None:
+        """Nothing: their nannies replace workers that died."""
+
+    def slots(self, stage: str, gpu: bool) -> int:
+        """How many may work at once.
+
+        Raises:
+            StageError: the stage needs a GPU and there is none.
+        """
+        if gpu and not self.gpus:
+            raise no_gpu(stage, "nvidia-smi lists none on this machine")
+        return self.gpus if gpu else self.count
+
+    def close(self) -> None:
+        """Stop them."""
+        self.client.close(timeout=5)
+        self._cluster.close(timeout=10)
+
+
+class RemoteWorkers:
+    """Workers that report to a scheduler, which stays as it is."""
+
+    def __init__(self, client: Any) -> None:
+        self.client = client
+        self._gpu_seen: float | None = None
+
+    @classmethod
+    def reach(cls, address: str) -> RemoteWorkers:
+        """Connect to a scheduler that runs.
+
+        Raises:
+            StageError: there is none.
+        """
+        from distributed import Client
+
+        try:
+            client = Client(address, timeout=CONNECT_SECONDS, set_as_default=False)
+            has_workers = bool(client.nthreads())
+        except (OSError, TimeoutError, ValueError) as error:
+            raise StageError(
+                f"scheduler {address}: cannot connect ({error}); expected an address "
+                "such as tcp://host:8786 of a running dask scheduler"
+            ) from error
+        if not has_workers:
+            sys.stderr.write(f"scheduler {address} has no workers yet; waiting\n")
+        return cls(client)
+
+    def keep(self, tasks: int) -> None:
+        """Nothing: they are not ours."""
+
+    def slots(self, stage: str, gpu: bool) -> int:
+        """How many may work at once; 1 while there are no workers yet.
+
+        Raises:
+            StageError: the stage needs a GPU and no worker offers one, nor has for a minute.
+        """
+        if not gpu:
+            return max(1, sum(self.client.nthreads().values()))
+        table = self.table()
+        offered = sum(int(worker["resources"].get(GPU, 0)) for worker in table)
+        now = time.monotonic()
+        if offered:
+            self._gpu_seen = now
+        elif table and (self._gpu_seen is None or now - self._gpu_seen > GPU_SECONDS):
+            words = f"none of the scheduler's {len(table)} workers offers one; start some with"
+            raise no_gpu(stage, f"{words} 'dask worker --resources GPU=1'")
+        return max(1, offered)
+
+    def table(self) -> list[dict]:
+        """What the scheduler knows of each worker."""
+        return list(self.client.scheduler_info(n_workers=-1)["workers"].values())
+
+    def close(self) -> None:
+        """Let go of the scheduler."""
+        self.client.close(timeout=5)
+
+
+def no_gpu(stage: str, words: str) -> StageError:
+    """The error of a stage that needs a GPU where there is none."""
+    return StageError(f"{stage} needs a GPU as it is configured, and {words}")
+
+
+def cluster_settings(threads: int) -> dict[str, object]:
+    """Settings of dask for a scheduler in this process."""
+    return {
+        "distributed.scheduler.allowed-failures": 0,
+        # A stage may hold the interpreter for minutes in native code; that is not death.
+        "distributed.scheduler.worker-ttl": None,
+        "distributed.scheduler.worker-saturation": 1.0,
+        "distributed.worker.multiprocessing-method": "spawn",
+        "distributed.nanny.pre-spawn-environ": thread_environment(threads),
+    }
+
+
+def start_cluster(workers: dict[int, dict], threads: int, **scheduler: object) -> tuple[Any, Any]:
+    """A scheduler in this process with local workers, if any: its client and itself."""
+    import dask
+    from distributed import Client, Scheduler, SpecCluster
+
+    options = {"dashboard": False, "dashboard_address": ":0", "port": 0, "protocol": "tcp://"}
+    with dask.config.set(cluster_settings(threads)):
+        cluster = SpecCluster(
+            workers=workers,
+            scheduler={"cls": Scheduler, "options": options | scheduler},
+            silence_logs=logging.CRITICAL,
+        )
+        return Client(cluster, set_as_default=False), cluster
+
+
+def local_workers(count: int, devices: list[str]) -> dict[int, dict]:
+    """Specifications of local workers; the first ones get a GPU each, as far as there are any."""
+    from distributed import Nanny
+
+    shared = {
+        "nthreads": 1,
+        "host": "127.0.0.1",
+        "protocol": "tcp://",
+        "dashboard": False,
+        "memory_limit": 0.9 / count,
+        "silence_logs": logging.CRITICAL,
+    }
+    specifications: dict[int, dict] = {}
+    for number in range(count):
+        mine = {}
+        if number < len(devices):
+            mine = {"env": {"CUDA_VISIBLE_DEVICES": devices[number]}, "resources": {GPU: 1}}
+        specifications[number] = {"cls": Nanny, "options": shared | mine}
+    return specifications
+
+
+def cuda_devices() -> list[str]:
+    """Names of this machine's CUDA devices as ``CUDA_VISIBLE_DEVICES`` takes them.
+
+    The driver's own program is asked: torch takes seconds to import.
+    """
+    visible = os.environ.get("CUDA_VISIBLE_DEVICES")
+    if shutil.which("nvidia-smi") is None:
+        return []
+    if visible is not None:
+        return [name.strip() for name in visible.split(",") if name.strip() not in ("", "-1")]
+    try:
+        listing = subprocess.run(
+            ["nvidia-smi", "-L"], capture_output=True, text=True, timeout=60, check=True
+        ).stdout
+    except (OSError, subprocess.SubprocessError):  # a driver that does not answer has no device
+        return []
+    return [str(n) for n, _ in enumerate(x for x in listing.splitlines() if x.startswith("GPU "))]
+
+
+def _ignore_interrupts() -> Any:
+    """Plug-in by which workers leave Ctrl-C to the driver, which stops them in order."""
+    from distributed import WorkerPlugin
+
+    class IgnoreInterrupts(WorkerPlugin):
+        name = "ignore-interrupts"
+
+        def setup(self, worker: object) -> None:
+            import signal
+            import threading
+
+            if threading.current_thread() is threading.main_thread():
+                signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+    return IgnoreInterrupts()

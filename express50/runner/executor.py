@@ -1,0 +1,238 @@
+"""Tasks in worker processes: how many at a time, and what becomes of those whose worker dies."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from concurrent.futures import CancelledError
+from contextlib import contextmanager
+from dataclasses import replace
+from typing import Any
+
+from express50.errors import StageError
+from express50.runner.clusters import GPU, LocalWorkers, RemoteWorkers
+from express50.runner.receipts import Receipt
+from express50.runner.slurm import SlurmJob, SlurmWorkers
+from express50.runner.worker import BATCH_SECONDS, Task, run_task, run_tasks
+
+ATTEMPTS = 2  # an item that killed its worker this often is set aside
+SLURM_ATTEMPTS = 3  # the same where a worker may also have come to its job's time limit
+LARGEST_BATCH = 32
+POLL_SECONDS = 0.5
+
+
+class Pool:
+    """Runs tasks in worker processes; one pool serves all stages of a command."""
+
+    def __init__(
+        self,
+        workers: int = 2,
+        scheduler: str | None = None,
+        threads: int = 1,
+        slurm: Mapping[str, SlurmJob] | None = None,
+    ) -> None:
+        """Say where to work; nothing is started yet.
+
+        Args:
+            workers: local processes; 0 or 1 item runs in this one.
+            scheduler: address of a dask scheduler to use instead.
+            threads: that an item may use.
+            slurm: jobs of each stage to use instead.
+        """
+        self.workers = workers
+        self.scheduler = scheduler
+        self.threads = threads
+        self.slurm = slurm
+        self._workers: LocalWorkers | RemoteWorkers | None = None
+
+    def __enter__(self) -> Pool:
+        return self
+
+    def __exit__(self, *unused: object) -> None:
+        self.close()
+
+    def runs_inline(self, count: int) -> bool:
+        """Whether starting processes would cost more than it brings."""
+        here = self.scheduler is None and self.slurm is None
+        return here and (self.workers == 0 or count <= 1)
+
+    def run(
+        self,
+        tasks: Iterable[Task],
+        settle: Callable[[Receipt], None],
+        tick: Callable[[], None],
+        begin: Callable[[Task], None] = lambda task: None,
+    ) -> None:
+        """Run every task of one stage and hand each receipt to ``settle`` as it comes.
+
+        A task whose worker died is tried again when nothing else runs, so that neighbours that
+        died with it are not blamed, and is set aside when that fails too. SLURM jobs do not share
+        memory but a time limit, so there all of those are tried again together.
+
+        Args:
+            tasks: of one stage and configuration.
+            settle: takes each receipt.
+            tick: called at least every ``POLL_SECONDS`` while workers run.
+            begin: called as a task is handed to a worker.
+
+        Raises:
+            StageError: the scheduler cannot be reached or went away, or offers no GPU that the
+                stage needs.
+        """
+        tasks = list(tasks)
+        if self.runs_inline(len(tasks)):
+            for task in tasks:
+                begin(task)
+                settle(run_task(task))
+            return
+        if not tasks:
+            return
+        workers = self._workers = self._workers_for(tasks[0])
+        job = workers.job if isinstance(workers, SlurmWorkers) else None
+        last = SLURM_ATTEMPTS if job else ATTEMPTS
+        left = self._run_window(workers, tasks, settle, tick, begin, 1)
+        for attempt in range(2, last + 1):
+            groups = [left] if job and left else [[task] for task in left]
+            left = [
+                t
+                for g in groups
+                for t in self._run_window(workers, g, settle, tick, begin, attempt)
+            ]
+        for killer in left:
+            settle(_killed(killer, last, job))
+
+    def _run_window(
+        self,
+        workers: LocalWorkers | RemoteWorkers,
+        tasks: list[Task],
+        settle: Callable[[Receipt], None],
+        tick: Callable[[], None],
+        begin: Callable[[Task], None],
+        attempt: int,
+    ) -> list[Task]:
+        """Keep one batch a worker submitted; returns the tasks whose worker died."""
+        from distributed.scheduler import KilledWorker
+
+        waiting, killed, size = deque(tasks), [], 1
+        name, gpu = tasks[0].stage.name, tasks[0].stage.needs_gpu(tasks[0].config)
+        running: dict[Any, list[Task]] = {}
+        while waiting or running:
+            with _loss_is_one_error():
+                slots = workers.slots(name, gpu)
+                workers.keep(len(waiting) + sum(map(len, running.values())))
+                while waiting and len(running) < slots:
+                    fair = max(1, len(waiting) // (2 * slots))  # the last ones end together
+                    batch = [waiting.popleft() for _ in range(min(size, fair))]
+                    for task in batch:
+                        begin(task)
+                    running[_submit(workers.client, batch, attempt, gpu)] = batch
+                done = _finished(workers.client, running)
+                ended = [(future, *_outcome(future)) for future in done]
+            for future, receipts, failure in ended:
+                batch = running.pop(future)
+                if receipts is not None:
+                    size = _next_size(size, batch, receipts)
+                    waiting.extendleft(reversed(batch[len(receipts) :]))
+                    for receipt in receipts:
+                        settle(replace(receipt, attempts=attempt))
+                elif isinstance(failure, KilledWorker):
+                    killed += batch
+                else:  # the tasks did not even start
+                    for task in batch:
+                        words = f"worker: {type(failure).__name__}: {failure}"
+                        settle(_failed(task, words, attempt))
+            tick()
+        return killed
+
+    def _workers_for(self, task: Task) -> LocalWorkers | RemoteWorkers:
+        """The workers of a task's stage; those of the stage before where they fit."""
+        job = self.slurm[task.stage.name] if self.slurm else None
+        if isinstance(self._workers, SlurmWorkers) and self._workers.job != job:
+            self.close()
+        if self._workers is not None:
+            return self._workers
+        if job is not None:
+            return SlurmWorkers(job, self.threads, task.dataset.slurm_dir)
+        if self.scheduler is not None:
+            return RemoteWorkers.reach(self.scheduler)
+        return LocalWorkers(self.workers, self.threads)
+
+    def close(self) -> None:
+        """Stop the local workers and cancel jobs; a scheduler of the user's stays as it is."""
+        if self._workers is not None:
+            self._workers.close()
+        self._workers = None
+
+
+def _submit(client: Any, batch: list[Task], attempt: int, gpu: bool) -> Any:
+    key, resources = _key(batch[0], attempt), {GPU: 1} if gpu else None
+    return client.submit(run_tasks, batch, pure=False, key=key, resources=resources)
+
+
+def _next_size(size: int, batch: list[Task], receipts: list[Receipt]) -> int:
+    """Tasks of the next batches: more while they are over at once, one as soon as they are not.
+
+    A round trip to a worker costs 10 ms, which empty items in batches share. What takes longer
+    goes alone, so that a death never costs or blames more than one of these.
+    """
+    if len(receipts) < len(batch):
+        return len(receipts)
+    quick = sum(receipt.seconds for receipt in receipts) < BATCH_SECONDS / 2
+    return max(size, min(2 * len(batch), LARGEST_BATCH)) if quick else len(batch)
+
+
+@contextmanager
+def _loss_is_one_error() -> Iterator[None]:
+    """Any call to a scheduler may be the one that finds it gone, each with an error of its own."""
+    try:
+        yield
+    except (CancelledError, OSError) as error:  # dask's CommClosedError is an OSError
+        reason = f"{type(error).__name__}: {error}".split("\n")[0]
+        raise StageError(
+            f"lost the dask scheduler ({reason}); start it, run the same again"
+        ) from error
+
+
+def _finished(client: Any, running: Iterable[Any]) -> set[Any]:
+    """The futures that ended, after a wait of at most ``POLL_SECONDS``."""
+    from distributed import wait
+
+    try:
+        with client.as_current():
+            return wait(list(running), POLL_SECONDS, "FIRST_COMPLETED").done
+    except TimeoutError:
+        return set()
+
+
+def _outcome(future: Any) -> tuple[list[Receipt] | None, BaseException | None]:
+    """What a finished batch returned, or why it did not run."""
+    failure = future.exception()
+    if isinstance(failure, CancelledError):
+        raise failure
+    return (None, failure) if failure is not None else (future.result(), None)
+
+
+def _key(task: Task, attempt: int) -> str:
+    return f"{task.stage.name}-{task.item}-{task.fingerprint[:16]}-{attempt}"
+
+
+def _killed(task: Task, attempts: int, job: SlurmJob | None) -> Receipt:
+    why, mend = "out of memory or a crash in native code", "give it more memory"
+    if job is not None:
+        why, mend = f"{why}, or its job's {job.time} were over", f"{mend} than {job.memory} or time"
+    reason = (
+        f"its worker process died {attempts} times ({why}); run "
+        f"this item with --workers 0 to see, or {mend}"
+    )
+    return _failed(task, reason, attempts)
+
+
+def _failed(task: Task, reason: str, attempts: int) -> Receipt:
+    return Receipt(
+        stage=task.stage.name,
+        item=task.item,
+        fingerprint=task.fingerprint,
+        status="failed",
+        reason=" ".join(reason.split()),
+        attempts=attempts,
+    )

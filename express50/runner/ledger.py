@@ -1,0 +1,278 @@
+"""The ledger: SQLite receipts that say what was made from what, and digests of files.
+
+Only the driver writes it, workers return receipts; others may read meanwhile.
+"""
+
+from __future__ import annotations
+
+import json
+import sqlite3
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+from express50.errors import FormatError
+from express50.files.digests import file_sha256
+from express50.files.text import parse_json
+from express50.runner.receipts import FileMark, Made, Receipt, Run
+
+SCHEMA = """
+CREATE TABLE IF NOT EXISTS receipts (
+    stage TEXT NOT NULL, item TEXT NOT NULL, fingerprint TEXT NOT NULL, status TEXT NOT NULL,
+    reason TEXT NOT NULL, metrics TEXT NOT NULL, seconds REAL NOT NULL,
+    peak_memory INTEGER NOT NULL, attempts INTEGER NOT NULL, time REAL NOT NULL,
+    PRIMARY KEY (stage, item)
+);
+CREATE TABLE IF NOT EXISTS made (
+    stage TEXT NOT NULL, item TEXT NOT NULL, inputs TEXT NOT NULL, files TEXT NOT NULL,
+    PRIMARY KEY (stage, item)
+);
+CREATE TABLE IF NOT EXISTS digests (
+    path TEXT PRIMARY KEY, size INTEGER NOT NULL, mtime_ns INTEGER NOT NULL,
+    inode INTEGER NOT NULL, sha256 TEXT NOT NULL
+);
+CREATE TABLE IF NOT EXISTS runs (
+    stage TEXT PRIMARY KEY, items INTEGER NOT NULL, current INTEGER NOT NULL,
+    begun REAL NOT NULL, seen REAL NOT NULL, ended REAL NOT NULL, running TEXT NOT NULL
+);
+"""
+TABLES = {"receipts", "made", "digests", "runs"}
+DELETE = "delete it and run the stages again, the same outputs will be made"
+COLUMNS = tuple(one.name for one in fields(Receipt) if one.name != "made")
+KINDS = {"item": str, "fingerprint": str, "status": str, "reason": str, "metrics": dict}
+
+
+def check_schema(database: sqlite3.Connection) -> None:
+    """Refuse a database that holds more than a ledger's tables.
+
+    A file from elsewhere may hold views and triggers, which are programs: they would run, without
+    end if they like, whenever a receipt is read or written.
+
+    Raises:
+        sqlite3.DatabaseError: it does, or is no database.
+    """
+    database.execute("PRAGMA trusted_schema=OFF")
+    for kind, name in database.execute("SELECT type, tbl_name FROM sqlite_master").fetchall():
+        if kind not in ("table", "index") or name not in TABLES:
+            raise sqlite3.DatabaseError(f"it has a {kind} {str(name)[:40]!r}")
+
+
+class Ledger:
+    """Receipts by stage and item, what they are made of, last runs, and a cache of file digests."""
+
+    def __init__(self, path: Path, read_only: bool = False) -> None:
+        self._fresh: dict[str, tuple] = {}  # digests not yet stored
+        self._path, self._read_only = path, read_only
+        with self._damage():
+            if read_only:
+                self._database = _open_to_read(path)
+                check_schema(self._database)
+                return
+            path.parent.mkdir(parents=True, exist_ok=True)
+            self._database = sqlite3.connect(path, timeout=60, isolation_level=None)
+            check_schema(self._database)
+            self._database.execute("PRAGMA journal_mode=WAL")
+            # A receipt lost with the power costs an item once more; waiting for the disk after each
+            # would cost every item. What must not be lost, `forget` waits for.
+            self._database.execute("PRAGMA synchronous=NORMAL")
+            self._database.executescript(SCHEMA)
+
+    def __enter__(self) -> Ledger:
+        return self
+
+    def __exit__(self, *unused: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the database."""
+        self._database.close()
+
+    @contextmanager
+    def _damage(self) -> Iterator[None]:
+        """Any statement may be the one that meets a damaged page, a full disk or a lock."""
+        try:
+            yield
+        except (sqlite3.DatabaseError, ValueError, TypeError, OverflowError) as error:
+            if self._read_only:  # whoever only looks on is not told to delete
+                words = f"cannot be read as a ledger ({error})"
+            elif isinstance(error, sqlite3.OperationalError) and "no such" not in str(error):
+                words = f"the ledger cannot be used ({error}); mend that and run the same again"
+            else:
+                words = f"not a ledger ({error}); {DELETE}"
+            raise FormatError(f"{self._path}: {words}") from error
+
+    @contextmanager
+    def _change(self) -> Iterator[sqlite3.Connection]:
+        """One transaction: all of it or nothing."""
+        with self._damage():
+            self._database.execute("BEGIN IMMEDIATE")
+            try:
+                yield self._database
+                self._database.execute("COMMIT")
+            except BaseException:
+                if self._database.in_transaction:
+                    self._database.execute("ROLLBACK")
+                raise
+
+    def check_whole(self) -> None:
+        """Read every page.
+
+        Raises:
+            FormatError: one is damaged.
+        """
+        with self._damage():
+            told = self._database.execute("PRAGMA quick_check(1)").fetchone()[0]
+            if told != "ok":
+                raise sqlite3.DatabaseError(told)
+
+    def write(self, receipt: Receipt) -> None:
+        """Store a receipt in the place of the item's former one."""
+        row = {name: getattr(receipt, name) for name in COLUMNS}
+        row["metrics"] = json.dumps(receipt.metrics, sort_keys=True)
+        marks = ", ".join(f":{name}" for name in row)
+        key = (receipt.stage, receipt.item)
+        with self._change() as database:
+            database.execute(
+                f"INSERT OR REPLACE INTO receipts ({', '.join(row)}) VALUES ({marks})", row
+            )
+            if receipt.made is None:
+                database.execute("DELETE FROM made WHERE stage = ? AND item = ?", key)
+            else:
+                values = (*key, *_texts(receipt.made))
+                database.execute("INSERT OR REPLACE INTO made VALUES (?, ?, ?, ?)", values)
+
+    def read(self, stage: str) -> dict[str, Receipt]:
+        """Receipts of a stage by item, sorted.
+
+        Raises:
+            FormatError: a row is damaged.
+        """
+        found = {}
+        for values in self._rows(COLUMNS, "receipts WHERE stage = ? ORDER BY item", stage):
+            values["metrics"] = self._parsed(values["metrics"], stage)
+            receipt = Receipt(**values)
+            if any(type(getattr(receipt, k)) is not kind for k, kind in KINDS.items()):
+                raise FormatError(
+                    f"{self._path}: {stage}: the receipt of {receipt.item!r} is damaged; {DELETE}"
+                )
+            found[receipt.item] = receipt
+        return found
+
+    def made(self, stage: str) -> dict[str, Made]:
+        """Inputs and files of a stage's items, sorted; of those made since these are kept.
+
+        Raises:
+            FormatError: a row is damaged.
+        """
+        found = {}
+        columns = ("item", "inputs", "files")
+        for row in self._rows(columns, "made WHERE stage = ? ORDER BY item", stage):
+            inputs, files = (self._parsed(row[name], stage) for name in columns[1:])
+            with self._damage():
+                marks = {name: FileMark(*mark) for name, mark in files.items()}
+                found[row["item"]] = Made(dict(inputs), marks)
+        return found
+
+    def write_run(self, run: Run) -> None:
+        """Store a run in the place of the stage's former one."""
+        row = dict(vars(run)) | {"running": json.dumps(run.running)}
+        marks = ", ".join(f":{name}" for name in row)
+        with self._damage():
+            self._database.execute(
+                f"INSERT OR REPLACE INTO runs ({', '.join(row)}) VALUES ({marks})", row
+            )
+
+    def runs(self) -> dict[str, Run]:
+        """Last runs by stage.
+
+        Raises:
+            FormatError: a row is damaged.
+        """
+        rows = self._rows(tuple(one.name for one in fields(Run)), "runs")
+        return {
+            row["stage"]: Run(**row | {"running": self._parsed(row["running"], "runs")})
+            for row in rows
+        }
+
+    def _parsed(self, text: Any, where: str) -> dict:
+        table = parse_json(text, f"{self._path}: {where}", FormatError, DELETE)
+        if not isinstance(table, dict):
+            raise FormatError(f"{self._path}: {where}: a row is damaged; {DELETE}")
+        return table
+
+    def _rows(self, names: tuple[str, ...], source: str, *values: str) -> list[dict[str, Any]]:
+        """Rows as tables; none where the ledger is being made, or is of before it had the table."""
+        query = f"SELECT {', '.join(names)} FROM {source}"
+        with self._damage():
+            try:
+                rows = self._database.execute(query, values).fetchall()
+            except sqlite3.OperationalError as error:
+                if "no such table" not in str(error):
+                    raise
+                return []
+        return [dict(zip(names, row, strict=True)) for row in rows]
+
+    def forget(self, stage: str, items: Iterable[str]) -> None:
+        """Remove receipts; when this returns they are gone, even if the power goes."""
+        keys = [(stage, item) for item in items]
+        with self._damage():
+            self._database.execute("PRAGMA synchronous=FULL")
+        with self._change() as database:
+            for table in ("receipts", "made"):
+                database.executemany(f"DELETE FROM {table} WHERE stage = ? AND item = ?", keys)
+        with self._damage():
+            self._database.execute("PRAGMA synchronous=NORMAL")
+
+    def sha256(self, path: Path) -> str:
+        """SHA-256 of a file; read again only when its size or modification time changed."""
+        stat = path.stat()
+        key = (str(path), stat.st_size, stat.st_mtime_ns, stat.st_ino)
+        with self._damage():
+            row = self._database.execute(
+                "SELECT sha256 FROM digests"
+                " WHERE path = ? AND size = ? AND mtime_ns = ? AND inode = ?",
+                key,
+            ).fetchone()
+        if row is not None:
+            return row[0]
+        digest = file_sha256(path)
+        self._fresh[str(path)] = (*key, digest)
+        return digest
+
+    def know(self, folder: Path, files: Mapping[str, FileMark]) -> None:
+        """Take over digests of files below a folder, so that no later stage hashes them again."""
+        for name, mark in files.items():
+            path = str(folder / name)
+            self._fresh[path] = (path, mark.size, mark.mtime_ns, mark.inode, mark.sha256)
+
+    def keep_digests(self) -> None:
+        """Store new digests in one transaction; one each would cost a disk sync a file."""
+        if self._read_only:
+            return
+        with self._change() as database:
+            database.executemany(
+                "INSERT OR REPLACE INTO digests VALUES (?, ?, ?, ?, ?)", self._fresh.values()
+            )
+        self._fresh.clear()
+
+
+def _texts(made: Made) -> tuple[str, str]:
+    """JSON of inputs and files."""
+    files = {name: [m.size, m.mtime_ns, m.inode, m.sha256] for name, m in made.files.items()}
+    return json.dumps(made.inputs, sort_keys=True), json.dumps(files, sort_keys=True)
+
+
+def _open_to_read(path: Path) -> sqlite3.Connection:
+    """A connection that cannot write, also where the folder cannot be written to."""
+    uri = path.resolve().as_uri()
+    for mode in ("mode=ro", "mode=ro&immutable=1"):
+        database = sqlite3.connect(f"{uri}?{mode}", uri=True, timeout=60, isolation_level=None)
+        try:
+            database.execute("PRAGMA schema_version").fetchone()
+            return database
+        except sqlite3.OperationalError as error:
+            database.close()
+            trouble = error
+    raise trouble

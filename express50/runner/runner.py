@@ -1,0 +1,280 @@
+"""Runs a stage over its items: skips what is current, isolates what is bad, accounts for all."""
+
+from __future__ import annotations
+
+import functools
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import nullcontext
+from dataclasses import dataclass
+from typing import Any
+
+from express50.contract.config import config_toml
+from express50.contract.layout import Dataset
+from express50.contract.stage import Stage
+from express50.errors import ConfigError, Express50Error, StageError
+from express50.files.atomic import write_bytes
+from express50.files.digests import path_digest
+from express50.runner.executor import Pool
+from express50.runner.ledger import Ledger
+from express50.runner.locks import stage_lock
+from express50.runner.progress import Progress
+from express50.runner.publish import clean_leftovers, discard_stale, set_aside
+from express50.runner.receipts import Receipt
+from express50.runner.runlog import RunLog
+from express50.runner.schedule import waves_of
+from express50.runner.worker import Task, fingerprint, input_digests
+
+WARNINGS = 12  # lines; more of them would hide the account
+ALIKE = 3  # so many first items that fail for one reason are no accident
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of one item: ``done``, ``skipped`` (was current) or ``failed``."""
+
+    item: str
+    status: str
+    reason: str = ""
+    seconds: float = 0.0
+    dropped: tuple[dict, ...] = ()
+    warnings: tuple[dict, ...] = ()
+
+
+@dataclass(frozen=True)
+class Summary:
+    """What became of every item of a stage."""
+
+    stage: str
+    outcomes: tuple[Outcome, ...]
+    seconds: float
+
+    def count(self, status: str) -> int:
+        """Number of items with a status."""
+        return sum(outcome.status == status for outcome in self.outcomes)
+
+    @property
+    def ok(self) -> bool:
+        """Whether no item failed."""
+        return self.count("failed") == 0
+
+    def to_json(self) -> dict[str, Any]:
+        """JSON form, also the machine-readable output of a stage command."""
+        return {
+            "stage": self.stage,
+            "read": len(self.outcomes),
+            "done": self.count("done"),
+            "skipped": self.count("skipped"),
+            "failed": self.count("failed"),
+            "seconds": round(self.seconds, 3),
+            "items": [
+                dict(vars(o))
+                | {"dropped": list(o.dropped), "warnings": list(o.warnings)}
+                | {"seconds": round(o.seconds, 3)}
+                for o in self.outcomes
+            ],
+        }
+
+    def lines(self) -> Iterator[str]:
+        """Lines for people: the account, then every item or part that is not there, and why."""
+        counts = " + ".join(f"{self.count(s)} {s}" for s in ("done", "skipped", "failed"))
+        yield f"{self.stage}: read {len(self.outcomes)} = {counts} in {self.seconds:.1f} s"
+        for outcome in self.outcomes:
+            if outcome.status == "failed":
+                yield f"  failed {outcome.item}: {outcome.reason}"
+            for part in outcome.dropped:
+                yield f"  dropped {part['what']} of {outcome.item}: {part['why']}"
+        odd = [(o.item, row) for o in self.outcomes for row in o.warnings]
+        for item, row in odd[:WARNINGS]:
+            yield f"  warning {item}: {row['what']}: {row['why']}"
+        if len(odd) > WARNINGS:
+            yield f"  and {len(odd) - WARNINGS} warnings more: see the items' metrics.json"
+
+
+def run_stage(
+    stage: Stage,
+    dataset: Dataset,
+    config: Any,
+    items: Sequence[str] | None = None,
+    workers: int = 2,
+    scheduler: str | None = None,
+    progress: bool = True,
+    pool: Pool | None = None,
+) -> Summary:
+    """Bring a stage's outputs up to date.
+
+    Args:
+        stage: the stage.
+        dataset: the dataset.
+        config: instance of ``stage.config``.
+        items: ids to run, and what these read of the stage itself; all by default, and then outputs
+            of items that are no more are set aside.
+        workers: local processes; 0 runs in this one.
+        scheduler: address of a dask scheduler to use in place of local processes.
+        progress: show progress on standard error.
+        pool: workers shared with other stages, in place of the two arguments above.
+
+    Returns:
+        The account of all items. A bad item is in it; it does not raise.
+
+    Raises:
+        StageError: the stage has no items, or another run holds it.
+    """
+    started = time.perf_counter()
+    dataset = Dataset(dataset.root.resolve())
+    chosen = list(stage.items(dataset) if items is None else items)
+    if not chosen:
+        before = "name a CAPTURE" if stage.name == "ingest" else "run the stages before it first"
+        raise StageError(f"{dataset.root}: {stage.name} has nothing to do; {before}")
+    shared = nullcontext(pool) if pool else Pool(workers, scheduler)
+    with shared as workers_pool, stage_lock(dataset, stage.name), Ledger(dataset.ledger) as ledger:
+        clean_leftovers(dataset, stage.name)
+        save_config(dataset, stage, config)
+        if items is None:
+            retire_items(dataset, ledger, stage.name, chosen)
+        waves = waves_of(stage, dataset, config, chosen)
+        chosen = [item for wave in waves for item in wave]
+        outcomes: dict[str, Outcome] = {}
+        with RunLog(dataset.ledger, stage.name, len(chosen)) as log:
+            for wave in waves:
+                outcomes |= _run_items(
+                    stage, dataset, config, wave, ledger, workers_pool, progress, log
+                )
+    missing = set(chosen) - set(outcomes)
+    if missing:  # read = done + skipped + failed
+        raise StageError(f"{stage.name}: no account of {', '.join(sorted(missing))}; run it again")
+    seconds = time.perf_counter() - started
+    return Summary(stage.name, tuple(outcomes[item] for item in chosen), seconds)
+
+
+def _run_items(
+    stage: Stage,
+    dataset: Dataset,
+    config: Any,
+    chosen: list[str],
+    ledger: Ledger,
+    pool: Pool,
+    progress: bool,
+    log: RunLog,
+) -> dict[str, Outcome]:
+    """Sort items into current, unreadable and to do; run the last; settle each as it ends."""
+    outcomes: dict[str, Outcome] = {}
+    receipts = ledger.read(stage.name)
+    tasks, unreadable = [], []
+    # Items share inputs; what a stage reads does not change while it runs.
+    digest_of = functools.cache(lambda path: path_digest(path, ledger.sha256))
+    for item in chosen:
+        try:
+            inputs = input_digests(stage, dataset, item, config, digest_of)
+        except ConfigError:  # a setting is wrong, no item: what was made before stays
+            raise
+        except Express50Error as error:
+            reason = f"{type(error).__name__}: {error}"
+            unreadable.append(_refusal(stage, item, reason))
+            continue
+        digest = fingerprint(stage, config, inputs)
+        if is_current(dataset, receipts.get(item), digest):
+            outcomes[item] = _outcome(receipts[item], status="skipped")
+        else:
+            tasks.append(Task(stage, dataset, item, config, digest, inputs, pool.threads))
+    ledger.keep_digests()
+    reasons = {receipt.reason for receipt in unreadable}
+    if len(unreadable) == len(chosen) > 1 and len(reasons) == 1:
+        # A wrong setting rather than bad items: what was made before stays.
+        raise StageError(f"{stage.name}: no item can be made: {reasons.pop()}")
+    log.current(len(outcomes))
+
+    def begin(task: Task) -> None:
+        # A receipt must not outlive the output it speaks of, should this run be killed half-way.
+        if task.item in receipts:
+            ledger.forget(stage.name, [task.item])
+        log.begin(task.item)
+
+    ended: list[Receipt] = []
+    with Progress(stage.name, len(tasks) + len(unreadable), progress) as display:
+
+        def settle(receipt: Receipt) -> None:
+            record(dataset, ledger, receipt)
+            outcomes[receipt.item] = _outcome(receipt)
+            display.settle(receipt)
+            log.settle(receipt.item)
+
+        def settle_task(receipt: Receipt) -> None:
+            settle(receipt)
+            ended.append(receipt)
+            if len(ended) == ALIKE < len(tasks):
+                _refuse_alike(stage, ended, receipts)
+
+        for receipt in unreadable:
+            settle(receipt)
+        pool.run(tasks, settle_task, display.tick, begin)
+    ledger.keep_digests()
+    return outcomes
+
+
+def _refuse_alike(stage: Stage, ended: list[Receipt], former: Mapping[str, Receipt]) -> None:
+    """Stop where the first items fail for one reason though they were made before.
+
+    Raises:
+        StageError: they do: a setting is wrong, and the others' outputs are worth keeping.
+    """
+    made = all(r.item in former and former[r.item].status == "done" for r in ended)
+    if made and all(r.status == "failed" and r.reason == ended[0].reason for r in ended):
+        raise StageError(
+            f"{stage.name}: the first {len(ended)} items fail alike, though they were made before:"
+            f" {ended[0].reason}; mend the setting, or run the same again to go on with the others"
+        )
+
+
+def is_current(dataset: Dataset, receipt: Receipt | None, digest: str) -> bool:
+    """Whether an item was made from exactly these inputs and its output is there."""
+    return (
+        receipt is not None
+        and receipt.status == "done"
+        and receipt.fingerprint == digest
+        and (dataset.item_dir(receipt.stage, receipt.item) / "metrics.json").is_file()
+    )
+
+
+def record(dataset: Dataset, ledger: Ledger, receipt: Receipt) -> None:
+    """Store a receipt; a failed item's former output is set aside, so that nothing reads it."""
+    if receipt.status == "failed":
+        set_aside(dataset, receipt.stage, receipt.item)
+    else:
+        discard_stale(dataset, receipt.stage, receipt.item)
+        dataset.log_file(receipt.stage, receipt.item).unlink(missing_ok=True)
+    ledger.write(receipt)
+    if receipt.made is not None:
+        ledger.know(dataset.item_dir(receipt.stage, receipt.item), receipt.made.files)
+
+
+def retire_items(dataset: Dataset, ledger: Ledger, stage: str, chosen: list[str]) -> None:
+    """Set aside outputs of items that the stage no longer has."""
+    gone = sorted(set(ledger.read(stage)) - set(chosen))
+    for item in gone:
+        set_aside(dataset, stage, item)
+    ledger.forget(stage, gone)
+
+
+def save_config(dataset: Dataset, stage: Stage, config: Any) -> None:
+    """Save the resolved config of a stage beside its outputs."""
+    path, text = dataset.config_file(stage.name), config_toml(stage.name, config)
+    if not path.is_file() or path.read_text(encoding="utf-8") != text:
+        write_bytes(path, text.encode())
+
+
+def _refusal(stage: Stage, item: str, reason: str) -> Receipt:
+    return Receipt(
+        stage=stage.name, item=item, fingerprint="", status="failed", reason=reason, attempts=0
+    )
+
+
+def _outcome(receipt: Receipt, status: str = "") -> Outcome:
+    return Outcome(
+        item=receipt.item,
+        status=status or receipt.status,
+        reason=receipt.reason,
+        seconds=receipt.seconds,
+        dropped=tuple(receipt.metrics.get("dropped", ())),
+        warnings=tuple(row for k in ("warnings", "weak") for row in receipt.metrics.get(k, ())),
+    )

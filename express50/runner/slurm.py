@@ -1,0 +1,292 @@
+"""Workers as SLURM jobs: what a job asks for, its script, and the jobs of a run.
+
+dask-jobqueue writes the script. Jobs are submitted and watched here, because its own cluster takes
+no notice of an ``sbatch`` that refuses, nor of jobs of several workers that have ended.
+"""
+
+from __future__ import annotations
+
+import getpass
+import os
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+import tomllib
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, fields
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+from express50.contract.config import build_dataclass, nearest
+from express50.errors import ConfigError, StageError
+from express50.runner.clusters import GPU, RemoteWorkers, no_gpu, start_cluster
+from express50.runner.threads import thread_environment
+
+QUEUE_SECONDS = 10.0  # between two looks at the queue
+SILENT_JOBS = 3  # jobs in a row that end before their worker is seen, until the run gives up
+ALONE_SECONDS = 60  # a worker that cannot reach its scheduler for so long ends its job
+
+TIME = re.compile(r"\d+(:\d\d){0,2}|\d+-\d+(:\d\d){0,2}")
+MEMORY = re.compile(r"(\d+)([MGT])(i?B)?")
+
+
+@dataclass(frozen=True, kw_only=True)
+class SlurmJob:
+    """What each job of a stage asks SLURM for."""
+
+    time: str
+    """Time limit in SLURM's forms, such as 4:00:00 or 1-12:00:00."""
+    memory: str
+    """Memory of a job, such as 16G (units of 1024, as SLURM has them)."""
+    cores: int = 1
+    """Cores of a job. It works at cores / --threads items at a time, or at one with a GPU."""
+    jobs: int = 4
+    """Most jobs at a time."""
+    gpus: int = 0
+    """1 for a GPU a job."""
+    partition: str = ""
+    """Partition; SLURM's default when empty."""
+    account: str = ""
+    """Account that is charged."""
+    interface: str = ""
+    """Network interface between workers and this machine, such as ib0."""
+    options: tuple[str, ...] = ()
+    """Further options of sbatch, such as "--qos=long"."""
+    setup: tuple[str, ...] = ()
+    """Lines of shell before the worker starts, such as "module load cuda"."""
+
+    def __post_init__(self) -> None:
+        """Check forms and ranges."""
+        if not TIME.fullmatch(self.time):
+            raise ValueError(f"time is {self.time!r}, expected such as 4:00:00 or 1-12:00:00")
+        if not MEMORY.fullmatch(self.memory):
+            raise ValueError(f"memory is {self.memory!r}, expected such as 16G")
+        if self.cores < 1 or self.jobs < 1:
+            raise ValueError(f"cores {self.cores}, jobs {self.jobs}: expected at least 1")
+        if self.gpus not in (0, 1):
+            raise ValueError(f"gpus is {self.gpus}, expected 0 or 1; ask for more jobs instead")
+        for text in (self.partition, self.account, self.interface, *self.options, *self.setup):
+            if "\n" in text:
+                raise ValueError(f"{text!r} has a line break")
+
+    def processes(self, threads: int) -> int:
+        """Workers of a job, each of which works at one item with so many threads."""
+        return 1 if self.gpus else max(1, self.cores // threads)
+
+
+def read_slurm(text: str, stages: Iterable[str]) -> dict[str, SlurmJob]:
+    """What the jobs of every stage ask for.
+
+    Args:
+        text: ``key=value,...``, or a TOML file of such keys, in which a table named after a stage
+            replaces some for that stage.
+        stages: names of all stages.
+
+    Raises:
+        ConfigError: no such file, unknown keys, wrong values, or time or memory are missing.
+    """
+    names = list(stages)
+    values = _file_values(Path(text)) if text.endswith(".toml") else _inline_values(text)
+    tables = {key: value for key, value in values.items() if isinstance(value, dict)}
+    common = {key: value for key, value in values.items() if key not in tables}
+    for name in tables:
+        if name not in names:
+            raise ConfigError(f"--slurm {text}: unknown table [{name}]{nearest(name, names)}")
+    return {name: _job(text, common | tables.get(name, {})) for name in names}
+
+
+def _job(text: str, values: Mapping[str, object]) -> SlurmJob:
+    missing = [key for key in ("time", "memory") if key not in values]
+    if missing:
+        raise ConfigError(
+            f"--slurm {text}: no {' and no '.join(missing)}; expected such as "
+            "partition=cpu,time=4:00:00,memory=16G,cores=4,jobs=8, or a file jobs.toml of these"
+        )
+    known = ", ".join(field.name for field in fields(SlurmJob))
+    return build_dataclass("slurm", SlurmJob, values, hint=f"; expected one of {known}")
+
+
+def _file_values(path: Path) -> dict[str, Any]:
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError as error:
+        raise ConfigError(f"--slurm {path}: no such file") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ConfigError(f"--slurm {path}: not TOML: {error}") from error
+
+
+def _inline_values(text: str) -> dict[str, Any]:
+    values: dict[str, Any] = {}
+    for part in text.split(","):
+        key, equals, value = (word.strip() for word in part.partition("="))
+        if not equals or not key:
+            raise ConfigError(f"--slurm: {part!r} is not key=value; lists need a file jobs.toml")
+        count = key in ("cores", "jobs", "gpus") and value.isdigit()
+        values[key] = int(value) if count else value
+    return values
+
+
+def check_slurm(submit: bool = True) -> None:
+    """See that jobs can be written, and submitted from here.
+
+    Raises:
+        StageError: dask-jobqueue or sbatch are not there.
+    """
+    if find_spec("dask_jobqueue") is None:
+        raise StageError(
+            "--slurm needs dask-jobqueue, which is not installed; run "
+            "pip install 'express50[slurm]'"
+        )
+    if submit and shutil.which("sbatch") is None:
+        raise StageError(
+            "--slurm: there is no sbatch on PATH; run this where jobs are submitted, on a login "
+            "node, or use --workers"
+        )
+
+
+def job_script(job: SlurmJob, address: str, name: str, threads: int, logs: Path) -> str:
+    """The script of one job.
+
+    Args:
+        job: what it asks for.
+        address: of the scheduler that its workers report to.
+        name: of the workers.
+        threads: that an item may use.
+        logs: folder of the jobs' output.
+    """
+    from dask_jobqueue.slurm import SLURMJob
+
+    processes = job.processes(threads)
+    size, unit = MEMORY.fullmatch(job.memory).groups()[:2]  # type: ignore[union-attr]
+    # Relative paths of a configuration are those of the folder that the run was started in.
+    folder, output = shlex.quote(str(Path.cwd())), shlex.quote(str(logs / "%j.out"))
+    directives = [f"--chdir={folder}", f"--output={output}"]
+    return SLURMJob(
+        scheduler=address,
+        name=name,
+        job_name="express50",
+        queue=job.partition or None,
+        account=job.account or None,
+        walltime=job.time,
+        cores=processes,  # to dask: one item at a time and process, whatever threads it uses
+        job_cpu=job.cores,
+        memory=f"{size}{unit}iB",
+        job_mem=size + unit,
+        processes=processes,
+        interface=job.interface or None,
+        death_timeout=ALONE_SECONDS,
+        python=shlex.quote(sys.executable),
+        job_extra_directives=[*directives, *["--gres=gpu:1"] * job.gpus, *job.options],
+        job_script_prologue=[*_environment(threads), *job.setup],
+        worker_extra_args=["--no-dashboard", *(["--resources", f"{GPU}=1"] if job.gpus else [])],
+    ).job_script()
+
+
+def _environment(threads: int) -> list[str]:
+    """Lines that cap threads, and let workers import what this process can."""
+    values = thread_environment(threads)
+    if "PYTHONPATH" in os.environ:
+        values["PYTHONPATH"] = os.environ["PYTHONPATH"]
+    return [f"export {name}={shlex.quote(value)}" for name, value in values.items()]
+
+
+class SlurmWorkers(RemoteWorkers):
+    """A scheduler here and the jobs that work for it; one that has ended is replaced."""
+
+    def __init__(self, job: SlurmJob, threads: int, logs: Path) -> None:
+        check_slurm()
+        client, self._cluster = start_cluster({}, threads, interface=job.interface or None)
+        super().__init__(client)
+        self.job, self.threads, self.logs = job, threads, logs
+        self._names: dict[str, str] = {}  # of workers, by id of the job
+        self._seen: set[str] = set()
+        self._count = self._silent = 0
+        self._next_look = 0.0
+
+    def slots(self, stage: str, gpu: bool) -> int:
+        """How many may work at once; 1 while there are no workers yet."""
+        if gpu and not self.job.gpus:
+            raise no_gpu(stage, f"--slurm asks for none; add gpus=1, or a table [{stage}] with it")
+        return super().slots(stage, gpu)
+
+    def keep(self, tasks: int) -> None:
+        """Bring the jobs up to what so many unfinished tasks need; looks at the queue seldom.
+
+        Raises:
+            StageError: ``sbatch`` refuses and no job is left, or job after job ends at once.
+        """
+        if time.monotonic() < self._next_look:
+            return
+        self._next_look = time.monotonic() + QUEUE_SECONDS
+        here = [str(worker["name"]) for worker in self.table()]
+        self._seen |= {i for i, name in self._names.items() if any(_of(name, w) for w in here)}
+        self._bury(_queue())
+        processes = self.job.processes(self.threads)
+        while len(self._names) < min(self.job.jobs, -(-tasks // processes)):
+            try:
+                self._submit()
+            except StageError as error:
+                if not self._names:
+                    raise
+                sys.stderr.write(f"{error}; going on with {len(self._names)} jobs\n")
+                return
+            if self._count == 1:
+                sys.stderr.write(f"SLURM jobs are submitted; their output is in {self.logs}\n")
+
+    def _bury(self, queue: set[str] | None) -> None:
+        for number in [] if queue is None else sorted(set(self._names) - queue):
+            del self._names[number]
+            self._silent = 0 if number in self._seen else self._silent + 1
+            if self._silent >= SILENT_JOBS:
+                raise StageError(
+                    f"{SILENT_JOBS} SLURM jobs in a row ended before their workers reached "
+                    f"this machine; {self.logs / f'{number}.out'} may tell why, --print-job "
+                    "shows their script"
+                )
+
+    def _submit(self) -> None:
+        name = f"express50-{os.getpid()}-{self._count}"
+        self._count += 1
+        address = self._cluster.scheduler_address
+        script = job_script(self.job, address, name, self.threads, self.logs)
+        self.logs.mkdir(parents=True, exist_ok=True)
+        with tempfile.NamedTemporaryFile("w", suffix=".sh") as file:
+            file.write(script)
+            file.flush()
+            done = _call("sbatch", "--parsable", file.name)
+        number = done.stdout.strip().split(";")[0]
+        if done.returncode != 0 or not number.isdigit():
+            words = " ".join((done.stderr or done.stdout).split())
+            raise StageError(f"sbatch refused: {words or f'exit code {done.returncode}'}")
+        self._names[number] = name
+
+    def close(self) -> None:
+        """Cancel the jobs that are left, and stop."""
+        if self._names:
+            _call("scancel", *sorted(self._names))
+        self._names.clear()
+        super().close()
+        self._cluster.close(timeout=10)
+
+
+def _of(name: str, worker: str) -> bool:
+    """Whether a worker belongs to the job of this name: dask appends a number to each of many."""
+    return worker == name or worker.rpartition("-")[0] == name
+
+
+def _queue() -> set[str] | None:
+    """Ids of the user's jobs that wait or run; None when the queue does not answer."""
+    done = _call("squeue", "--noheader", "--format=%A", f"--user={getpass.getuser()}")
+    return set(done.stdout.split()) if done.returncode == 0 else None
+
+
+def _call(*command: str) -> subprocess.CompletedProcess:
+    try:
+        return subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    except (OSError, subprocess.TimeoutExpired) as error:
+        return subprocess.CompletedProcess(command, 1, "", f"{command[0]}: {error}")

@@ -1,0 +1,163 @@
+"""One item of one stage, in whatever process: run it, publish its folder, return its receipt."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import resource
+import sys
+import time
+import traceback
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from express50.contract.layout import Dataset
+from express50.contract.stage import Stage
+from express50.errors import Express50Error, StageError
+from express50.files.atomic import dump_json, write_bytes
+from express50.files.digests import files_of, value_digest
+from express50.runner.publish import publishing
+from express50.runner.receipts import FileMark, Made, Receipt, mark_file
+from express50.runner.threads import cap_threads
+
+BATCH_SECONDS = 0.2  # a batch begins no further item after so long
+
+
+@dataclass(frozen=True)
+class Task:
+    """An item to run, with everything a worker needs."""
+
+    stage: Stage
+    dataset: Dataset
+    item: str
+    config: Any
+    fingerprint: str
+    inputs: dict[str, str]
+    threads: int = 1
+
+
+def input_digests(
+    stage: Stage, dataset: Dataset, item: str, config: Any, digest: Callable[[Path], str]
+) -> dict[str, str]:
+    """Digest of every input of an item, by its name.
+
+    Args:
+        stage: the stage.
+        dataset: the dataset.
+        item: item id.
+        config: resolved config.
+        digest: content digest of a file or folder.
+
+    Raises:
+        Express50Error: an input is missing or cannot be read.
+    """
+    return {
+        name: digest(value) if isinstance(value, Path) else value
+        for name, value in stage.inputs(dataset, item, config).items()
+    }
+
+
+def fingerprint(stage: Stage, config: Any, inputs: dict[str, str]) -> str:
+    """Digest of stage version, resolved config and inputs of an item."""
+    return value_digest([stage.name, stage.version, vars(config), inputs])
+
+
+def run_tasks(tasks: list[Task]) -> list[Receipt]:
+    """Run items one after another for a while; receipts of those that were begun, at least one."""
+    began, receipts = time.perf_counter(), []
+    for task in tasks:
+        receipts.append(run_task(task))
+        if time.perf_counter() - began > BATCH_SECONDS:
+            break
+    return receipts
+
+
+def run_task(task: Task) -> Receipt:
+    """Run one item and publish its outputs; whatever goes wrong becomes a receipt.
+
+    Only a receipt travels back to the driver, never data.
+    """
+    cap_threads(task.threads)
+    reset_peak_memory()
+    started = time.perf_counter()
+    reason, made = "", None
+    metrics: dict = {}
+    try:
+        metrics, files = _run_and_publish(task)
+        made = Made(task.inputs, files)
+    except Express50Error as error:
+        reason = f"{type(error).__name__}: {error}"
+    except Exception as error:  # noqa: BLE001
+        # A defect that one item triggers must not stop the others; the traceback goes to a file.
+        reason = _record_defect(task, error)
+    return Receipt(
+        stage=task.stage.name,
+        item=task.item,
+        fingerprint=task.fingerprint,
+        status="failed" if reason else "done",
+        reason=" ".join(reason.split()),
+        metrics=metrics,
+        seconds=time.perf_counter() - started,
+        peak_memory=peak_memory(),
+        made=made,
+    )
+
+
+def _run_and_publish(task: Task) -> tuple[dict, dict[str, FileMark]]:
+    if task.stage.needs_gpu(task.config):
+        _check_gpu(task)
+    with publishing(task.dataset, task.stage.name, task.item) as out:
+        # Data belong on standard output, and a library's chatter is none.
+        with contextlib.redirect_stdout(sys.stderr):
+            metrics = task.stage.run(task.dataset, task.item, task.config, out)
+        (out / "metrics.json").write_bytes(_metrics_bytes(metrics))
+        # Their bytes are still in memory; a rename changes neither time nor inode.
+        files = {p.relative_to(out).as_posix(): mark_file(p) for p in files_of(out)}
+    return json.loads(_metrics_bytes(metrics)), files
+
+
+def _check_gpu(task: Task) -> None:
+    """Refuse to do on a CPU what was asked for on a GPU."""
+    import torch
+
+    if not torch.cuda.is_available():
+        raise StageError(
+            f"{task.stage.name} needs a GPU as it is configured; torch finds no CUDA device here"
+        )
+
+
+def _metrics_bytes(metrics: dict) -> bytes:
+    try:
+        return dump_json(metrics)
+    except (TypeError, ValueError) as error:
+        raise StageError(
+            f"metrics cannot be written ({error}); expected finite numbers, texts, lists and tables"
+        ) from error
+
+
+def _record_defect(task: Task, error: Exception) -> str:
+    log = task.dataset.log_file(task.stage.name, task.item)
+    words = f"{type(error).__name__}: {error}"
+    try:
+        write_bytes(log, "".join(traceback.format_exception(error)).encode())
+    except OSError as trouble:  # a full disk is a usual reason for the error itself
+        return f"{words} (unexpected; its traceback could not be written to {log}: {trouble})"
+    return f"{words} (unexpected; traceback in {log})"
+
+
+def reset_peak_memory() -> None:
+    """Start a new peak for this process where the system can (Linux, see proc(5))."""
+    with contextlib.suppress(OSError):
+        Path("/proc/self/clear_refs").write_text("5")
+
+
+def peak_memory() -> int:
+    """Largest resident memory of this process since the last reset, bytes."""
+    with contextlib.suppress(OSError):
+        for line in Path("/proc/self/status").read_text().splitlines():
+            if line.startswith("VmHWM:"):
+                return int(line.split()[1]) * 1024
+    unit = 1 if sys.platform == "darwin" else 1024
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit

@@ -1,0 +1,1 @@
+"""Packed shards: reading, writing, editing."""

@@ -1,0 +1,288 @@
+"""Packed samples: USTAR tar shards in WebDataset's conventions, read at random by an index.
+
+A folder of shards holds ``<split>-000000.tar`` ..., ``index.json`` (where every member lies, with
+its CRC-32), ``manifest.json`` (SHA-256 of every file). Members of a sample are adjacent; their key
+has no dot, so that ``tar``, ``webdataset`` and Hugging Face ``datasets`` read the shards as they
+are. The writer is in :mod:`express50.shards.writer`.
+
+``meta.json`` of a sample: ids ``subject expression camera``, ``frame``, ``fps``; ``K``,
+``cam_from_world``, ``width``, ``height`` of the picture as packed; ``depth_scale_m``; ``head`` and
+``track`` {shape offsets expression neck jaw eyes R t}, the head model and its parameters, with
+world = R @ head + t in the cameras' world (``offsets`` says whether ``<subject>.offsets.npy``
+beside the shards is to be added to the rest shape); ``label`` (who chose the frame), ``torso``
+(removed or kept in alpha and depth), ``parts`` (whether there are labels), ``crop``,
+``source_size``, ``consent``, ``licence``, ``session``.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from express50.errors import FormatError
+from express50.files.text import parse_json, read_json
+from express50.shards.codecs import ALPHA, DEPTH, PARTS, RGB, crc32, decode_picture
+from express50.shards.offsets import KEY, read_offsets
+
+SCHEMA = "express50.shards/1"
+_AGAIN = "rerun 'express50 pack'"
+SHARD_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*-[0-9]{6}\.tar")
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One sample's place: its ids, its shard, and (offset, size, crc32) of each member."""
+
+    key: str
+    subject: str
+    expression: str
+    camera: str
+    split: str
+    shard: str
+    members: dict[str, tuple[int, int, int]]
+
+
+class ShardReader:
+    """Random access to the samples of a folder of shards; safe to fork and to pickle.
+
+    State: one open file a shard, opened when first used.
+    """
+
+    def __init__(self, root: Path, entries: tuple[Entry, ...] | None = None) -> None:
+        """Read the index of ``root``, or take the given part of it.
+
+        Raises:
+            FormatError: the index is missing, malformed, or does not fit the shards.
+        """
+        self.root = Path(root)
+        self.entries = read_entries(self.root) if entries is None else entries
+        self._files: dict[str, int] = {}
+        self._owner = os.getpid()
+
+    def __del__(self) -> None:
+        """Close what this process opened."""
+        if getattr(self, "_owner", None) == os.getpid():
+            self.close()
+
+    def __len__(self) -> int:
+        """Number of samples."""
+        return len(self.entries)
+
+    def __getstate__(self) -> dict:
+        """Open files stay in the process that opened them."""
+        return self.__dict__ | {"_files": {}}
+
+    @property
+    def keys(self) -> list[str]:
+        """Keys of all samples, in order."""
+        return [entry.key for entry in self.entries]
+
+    def groups(self) -> dict[tuple[str, str], list[int]]:
+        """Sample numbers of every (subject, expression)."""
+        table: dict[tuple[str, str], list[int]] = {}
+        for number, entry in enumerate(self.entries):
+            table.setdefault((entry.subject, entry.expression), []).append(number)
+        return table
+
+    def select(
+        self,
+        subjects: Collection[str] | None = None,
+        expressions: Collection[str] | None = None,
+        cameras: Collection[str] | None = None,
+        split: str | None = None,
+    ) -> ShardReader:
+        """A reader of the samples that match all the given ids; none given means all.
+
+        Raises:
+            FormatError: an id or a split is unknown (the known ones are named).
+        """
+        wanted = {"subject": subjects, "expression": expressions, "camera": cameras}
+        wanted["split"] = None if split is None else [split]
+        chosen = self.entries
+        for name, values in wanted.items():
+            if values is None:
+                continue
+            known = {getattr(entry, name) for entry in self.entries}
+            unknown = sorted(set(values) - known)
+            if unknown:
+                raise FormatError(
+                    f"{self.root}: no {name} {', '.join(unknown)}; expected one of"
+                    f" {', '.join(sorted(known))}"
+                )
+            chosen = tuple(entry for entry in chosen if getattr(entry, name) in values)
+        return ShardReader(self.root, chosen)
+
+    def member(self, number: int, name: str) -> bytes:
+        """Bytes of one member of a sample, checked by CRC-32.
+
+        Raises:
+            FormatError: there is no such member, or its bytes are damaged.
+        """
+        return self.members(number, [name])[name]
+
+    def members(self, number: int, names: Collection[str] | None = None) -> dict[str, bytes]:
+        """Bytes of a sample's members by name, checked by CRC-32.
+
+        Args:
+            number: of the sample.
+            names: the members wanted; all by default.
+
+        Raises:
+            FormatError: there is no such member, or its bytes are damaged.
+        """
+        entry = self.entries[number]
+        file, found = self._file(entry.shard), {}
+        for name in entry.members if names is None else names:
+            offset, size, crc = self._place(entry, name)
+            # A read a member copies once; one read a sample and slices of it take a third longer.
+            data = os.pread(file, size, offset)
+            if len(data) != size or crc32(data) != crc:
+                raise FormatError(
+                    f"{self.root / entry.shard}: {entry.key}.{name}: damaged, CRC-32"
+                    f" {crc32(data):08x}, expected {crc:08x}; copy the shard again or rerun"
+                    " 'express50 pack'"
+                )
+            found[name] = data
+        return found
+
+    def _place(self, entry: Entry, name: str) -> tuple[int, int, int]:
+        if name not in entry.members:
+            where = f"{self.root / entry.shard}: {entry.key}"
+            raise FormatError(f"{where}: has no {name}; it has {', '.join(entry.members)}")
+        return entry.members[name]
+
+    def meta(self, number: int) -> dict:
+        """The sample's meta.json."""
+        return self._meta(number, self.member(number, "meta.json"))
+
+    def _meta(self, number: int, data: bytes) -> dict:
+        entry = self.entries[number]
+        where = f"{self.root / entry.shard}: {entry.key}: meta"
+        meta = parse_json(data, where, FormatError, _AGAIN)
+        scale = meta.get("depth_scale_m") if isinstance(meta, dict) else None
+        if not isinstance(scale, float) or not 0 < scale < 1:
+            raise FormatError(f"{where}: depth_scale_m is {scale!r}, expected metres; {_AGAIN}")
+        return meta
+
+    def sample(self, number: int) -> dict:
+        """Decode one sample.
+
+        Returns:
+            key; rgb (H, W, 3) uint8 sRGB; alpha (H, W) float32 in [0, 1]; depth (H, W) float32
+            metres, 0 where not valid; valid (H, W) bool; parts (H, W) uint8 of
+            ``segmentation_labels.LABELS``, or None where it was packed without; meta dict.
+
+        Raises:
+            FormatError: a member is damaged or does not have the size that the meta says.
+        """
+        entry, members = self.entries[number], self.members(number)
+        meta = self._meta(number, members.get("meta.json", b""))
+        alpha = self._picture(entry, members, ALPHA, meta)
+        steps = self._picture(entry, members, DEPTH, meta)
+        return {
+            "key": entry.key,
+            "rgb": self._picture(entry, members, RGB, meta),
+            "alpha": alpha.astype(np.float32) / 255,
+            "depth": steps.astype(np.float32) * np.float32(meta["depth_scale_m"]),
+            "valid": steps > 0,
+            "parts": self._picture(entry, members, PARTS, meta) if meta.get("parts") else None,
+            "meta": meta,
+        }
+
+    def offsets(self, subject: str) -> np.ndarray:
+        """Offsets (V, 3) float32, metres, of a subject's rest shape; of use where meta says so.
+
+        Raises:
+            FormatError: the file is missing, damaged, or holds something else.
+        """
+        return read_offsets(self.root, subject)
+
+    def iterate(self, seed: int | None = None, epoch: int = 0, start: int = 0) -> Iterator[dict]:
+        """Samples of one pass from position ``start``; shuffled by (seed, epoch) unless None."""
+        for number in self.order(seed, epoch)[start:]:
+            yield self.sample(int(number))
+
+    def order(self, seed: int | None, epoch: int = 0) -> np.ndarray:
+        """Sample numbers (N,) of one pass: a pure function of (seed, epoch), for exact resume."""
+        if seed is None:
+            return np.arange(len(self))
+        return np.random.default_rng([seed, epoch]).permutation(len(self))
+
+    def close(self) -> None:
+        """Close the open shards."""
+        files, self._files = self._files, {}
+        for file in files.values():
+            os.close(file)
+
+    def _file(self, shard: str) -> int:
+        if self._owner != os.getpid():  # a fork shares descriptors; leave the parent's alone
+            self._files, self._owner = {}, os.getpid()
+        if shard not in self._files:
+            self._files[shard] = os.open(self.root / shard, os.O_RDONLY)
+        return self._files[shard]
+
+    def _picture(
+        self, entry: Entry, members: dict[str, bytes], names: tuple[str, ...], meta: dict
+    ) -> np.ndarray:
+        """The picture that is there under one of several names."""
+        name = next((name for name in names if name in members), names[0])
+        self._place(entry, name)
+        where = f"{self.root / entry.shard}: {entry.key}.{name}"
+        width, height = meta.get("width"), meta.get("height")
+        if not (isinstance(width, int) and isinstance(height, int) and min(width, height) > 0):
+            raise FormatError(f"{where}: meta gives {width!r} x {height!r} pixels")
+        return decode_picture(name, members[name], width, height, where)
+
+
+def read_entries(root: Path) -> tuple[Entry, ...]:
+    """Check and read ``index.json``.
+
+    Raises:
+        FormatError: it is missing or malformed, a shard's name would leave the folder, or a
+            member lies outside its shard.
+    """
+    path = root / "index.json"
+    if not path.exists():
+        raise FormatError(f"{path}: no such index; name the folder that 'pack' wrote")
+    table = read_json(path, FormatError, _AGAIN)
+    if not isinstance(table, dict) or table.get("schema") != SCHEMA:
+        got = table.get("schema") if isinstance(table, dict) else type(table).__name__
+        raise FormatError(f"{path}: schema {got!r}, expected {SCHEMA!r}")
+    entries: list[Entry] = []
+    try:
+        for shard in table["shards"]:
+            entries += _shard_entries(root, shard)
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
+        raise FormatError(
+            f"{path}: malformed ({type(error).__name__}: {error}); rerun 'express50 pack'"
+        ) from None
+    if len({entry.key for entry in entries}) != len(entries):
+        raise FormatError(f"{path}: a key appears twice; rerun 'express50 pack'")
+    return tuple(entries)
+
+
+def _shard_entries(root: Path, shard: dict) -> Iterator[Entry]:
+    name = str(shard["file"])
+    if not SHARD_NAME.fullmatch(name):
+        raise FormatError(f"{root}: shard name {name!r}, expected one like train-000000.tar")
+    path = root / name
+    size = path.stat().st_size if path.is_file() else -1
+    if size != shard["bytes"]:
+        got = "is missing" if size < 0 else f"has {size} bytes"
+        raise FormatError(f"{path}: {got}, expected {shard['bytes']}; copy the shard again")
+    for row in shard["samples"]:
+        members = {str(k): (int(a), int(b), int(c)) for k, (a, b, c) in row["members"].items()}
+        if any(a < 0 or b < 0 or a + b > size for a, b, _ in members.values()):
+            raise FormatError(
+                f"{path}: {row['key']} lies outside the shard; rerun 'express50 pack'"
+            )
+        ids = {name: row[name] for name in ("key", "subject", "expression", "camera")}
+        for kind, text in (*ids.items(), ("split", shard["split"])):
+            if not KEY.fullmatch(text):  # they become names of files
+                raise FormatError(f"{path}: {kind} {text!r}, expected letters, digits, _ and -")
+        yield Entry(**ids, split=shard["split"], shard=name, members=members)
