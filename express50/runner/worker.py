@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from express50.contract.layout import Dataset
-from express50.contract.stage import Stage
+from express50.contract.stage import Result, Stage
 from express50.errors import Express50Error, StageError
 from express50.files.atomic import dump_json, write_bytes
 from express50.files.digests import files_of, value_digest
@@ -111,7 +111,8 @@ def _run_and_publish(task: Task) -> tuple[dict, dict[str, FileMark]]:
     with publishing(task.dataset, task.stage.name, task.item) as out:
         # Data belong on standard output, and a library's chatter is none.
         with contextlib.redirect_stdout(sys.stderr):
-            metrics = task.stage.run(task.dataset, task.item, task.config, out)
+            result = task.stage.run(task.dataset, task.item, task.config, out)
+        metrics = result.to_json() if isinstance(result, Result) else result
         (out / "metrics.json").write_bytes(_metrics_bytes(metrics))
         # Their bytes are still in memory; a rename changes neither time nor inode.
         files = {p.relative_to(out).as_posix(): mark_file(p) for p in files_of(out)}
