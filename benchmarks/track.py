@@ -29,6 +29,7 @@ from express50.capture.frames import read_cameras_of, read_peaks
 from express50.capture.index import index_path, index_to_json, read_index
 from express50.contract.config import build_config
 from express50.contract.layout import Dataset
+from express50.contract.stage import Result
 from express50.files.calibration import read_cameras, write_cameras
 from express50.head.load import load_head
 from express50.runner.runner import run_stage
@@ -210,6 +211,7 @@ def track(
     with tempfile.TemporaryDirectory() as scratch:
         began = time.process_time()
         metrics = STAGE.run(dataset, subject, config, Path(scratch))
+        metrics = metrics.to_json() if isinstance(metrics, Result) else metrics
         seconds = time.process_time() - began
         errors = compare(dataset, truth, subject, Path(scratch) / "track.npz", views)
     return errors, {"seconds": seconds, "detected_px": metrics["landmark_rms_px_mean"]}
