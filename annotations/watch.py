@@ -15,8 +15,7 @@ import torch
 from express50.geometry.conventions import affine_to_opencv
 from express50.geometry.transforms import similarity_fit
 from express50.landmarks.detector import SMALLEST, detect, window_about
-from express50.landmarks.network import CROP, LandmarkNet
-from express50.landmarks.training.augment import MIRROR, face_box
+from express50.landmarks.network import CROP, MIRROR, LandmarkNet, face_box
 
 FACE = 48  # side of the aligned face, pixels
 # iBUG-68 points that expressions move least: the nose's bridge and the corners of the eyes.

@@ -48,7 +48,7 @@ from express50.runner.runner import run_stage
 from express50.twin.config import TwinConfig
 from express50.twin.record import print_progress, record
 from express50.twin.rig import make_rig
-from express50.twin.sensor import make_sensor
+from express50.twin.studio import make_sensor
 from express50.twin.truth import Truth, align_worlds
 from pipelines import ingest
 from pipelines.calibrate import STAGE

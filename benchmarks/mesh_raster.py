@@ -36,7 +36,7 @@ from express50.geometry.mesh_render import (
 )
 from express50.geometry.transforms import look_at
 from express50.geometry.transforms_torch import axis_angle_to_matrix
-from express50.head.generator.head import build_procedural_head
+from express50.head.builtin import load_builtin
 from express50.head.model import HeadModel, pose, vertex_normals
 
 MOTIONS = {"roll": 0.02, "shift": 0.004, "scale": 0.02}  # radians, metres, share
@@ -173,7 +173,7 @@ def main() -> int:
     parser.add_argument("--repeats", type=int, default=15, help="runs of each timing")
     args = parser.parse_args()
     torch.set_num_threads(1)
-    model = build_procedural_head()
+    model = load_builtin()
     report: dict[str, object] = {
         "benchmark": "mesh_raster",
         "threads": 1,

@@ -22,9 +22,9 @@ def load_head(spec: str | Path) -> HeadModel:
         HeadModelError: unknown name, missing file or damaged content.
     """
     if str(spec) == "procedural":
-        from express50.head.generator.head import build_procedural_head
+        from express50.head.builtin import load_builtin
 
-        return build_procedural_head()
+        return load_builtin()
     path = Path(spec).expanduser()
     if not path.exists():
         raise HeadModelError(f"head model {str(spec)!r}: no such file or folder; expected {_KINDS}")

@@ -19,8 +19,7 @@ import numpy as np
 import torch
 
 from express50.geometry.conventions import affine_to_opencv
-from express50.landmarks.network import CROP, LandmarkNet
-from express50.landmarks.training.augment import MIRROR, face_box
+from express50.landmarks.network import CROP, MIRROR, LandmarkNet, face_box
 
 # A point whose error scale is this share of the face box has half the confidence.
 HALF_CONFIDENCE_SHARE = 0.025

@@ -27,9 +27,23 @@ CROP = 128
 POINTS = 68
 # Points may lie a little outside the crop: the grid of the heat maps is stretched about its middle.
 STRETCH = 1.15
+# Side of a crop over the longer side of the box of its landmarks.
+CROP_MARGIN = 1.55
+# Partner of each iBUG-68 point in the mirror image.
+MIRROR = np.array(
+    [*range(16, -1, -1), *range(26, 16, -1), 27, 28, 29, 30, 35, 34, 33, 32, 31,
+     45, 44, 43, 42, 47, 46, 39, 38, 37, 36, 41, 40,
+     54, 53, 52, 51, 50, 49, 48, 59, 58, 57, 56, 55, 64, 63, 62, 61, 60, 67, 66, 65]
+)  # fmt: skip
 WEIGHTS = Path(__file__).with_name("weights.npz")
 # Names of what is not stored end so: batch normalisation counts its batches.
 COUNTERS = "num_batches_tracked"
+
+
+def face_box(points: np.ndarray) -> tuple[np.ndarray, float]:
+    """Centre (2,) and side of the square that the detector crops about landmarks (68, 2)."""
+    low, high = points.min(0), points.max(0)
+    return 0.5 * (low + high), CROP_MARGIN * float((high - low).max())
 
 
 class Output(NamedTuple):

@@ -18,8 +18,13 @@ from express50.landmarks.fan import CROP, fan_window, find_with_fan, load_fan
 from express50.landmarks.iris import EYES, find_irises
 from express50.landmarks.lips import open_lips
 from express50.landmarks.network import load_network
-from express50.landmarks.points_file import SCHEMA, read_points
-from express50.landmarks.sources import given_detection, open_source, source_files
+from express50.landmarks.sources import (
+    SCHEMA,
+    given_detection,
+    open_source,
+    read_points,
+    source_files,
+)
 
 SIZE = 200
 LENS = Camera(

@@ -19,21 +19,18 @@ from express50.landmarks.detector import (
 )
 from express50.landmarks.network import (
     CROP,
+    MIRROR,
     STRETCH,
     WEIGHTS,
     LandmarkNet,
     _expectation,
+    face_box,
     fold,
     heat_loss,
     load_network,
     save_network,
 )
-from express50.landmarks.training.augment import (
-    MIRROR,
-    face_box,
-    make_backgrounds,
-    random_crop,
-)
+from express50.landmarks.training.augment import make_backgrounds, random_crop
 from express50.landmarks.training.poses import random_parameters
 from express50.landmarks.training.render import HeadScene
 from express50.landmarks.training.skin import random_head

@@ -14,13 +14,13 @@ from express50 import native
 from express50.geometry import mesh_backends
 from express50.geometry.cameras import Camera
 from express50.geometry.mesh_raster import face_neighbors, rasterize
-from express50.head.generator.head import build_procedural_head
+from express50.head.builtin import load_builtin
 from tests.express50.mesh_scenes import camera, head_camera, oracle, sphere
 
 
 @pytest.fixture(scope="module")
 def head():
-    model = build_procedural_head()
+    model = load_builtin()
     return model.template.double().numpy(), model.faces.numpy()
 
 

@@ -24,7 +24,7 @@ from express50.geometry.mesh_render import (
     sh_light,
 )
 from express50.geometry.transforms_torch import axis_angle_to_matrix
-from express50.head.generator.head import build_procedural_head
+from express50.head.builtin import load_builtin
 from tests.express50.mesh_scenes import camera, head_camera, sphere
 
 F64 = torch.float64
@@ -130,7 +130,7 @@ def test_coverage_is_the_area_of_the_disc():
 @pytest.mark.parametrize("angle", [0.0, 0.8, 2.0])
 def test_coverage_of_a_head_is_that_of_many_rays_a_pixel(angle):
     """Where several folds end between two pixels, the last one must count."""
-    model = build_procedural_head()
+    model = load_builtin()
     mesh = (model.template.double().numpy(), model.faces.numpy())
     lens = head_camera(128, angle)
     drawn = View(*mesh, lens)
@@ -151,7 +151,7 @@ def test_crossings_lie_between_the_centres(view):
 @pytest.mark.parametrize("size", [256, 512])
 @pytest.mark.parametrize("motion", ["roll", "shift", "scale"])
 def test_outline_gradients_match_finite_differences(size, motion):
-    ratio = gradient_ratio(build_procedural_head(), size, motion)
+    ratio = gradient_ratio(load_builtin(), size, motion)
     assert ratio == pytest.approx(1.0, abs=0.03)
 
 

@@ -32,7 +32,7 @@ from express50.files.images import decode_image, read_image, write_image
 from express50.files.video import VideoReader, iterate_video
 from express50.head.flame import load_flame
 from express50.head.ict import read_obj
-from express50.landmarks.points_file import read_points
+from express50.landmarks.sources import read_points
 from express50.rigs.read import guess_format, read_rig
 from express50.runner.ledger import Ledger
 from express50.runner.receipts import Receipt

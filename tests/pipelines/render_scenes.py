@@ -12,7 +12,7 @@ from express50.geometry.cameras import Camera, resized
 from express50.geometry.mesh_raster import rasterize
 from express50.geometry.mesh_render import barycentrics, covered, interpolate, sample_texture
 from express50.geometry.transforms import axis_angle_to_matrix, look_at
-from express50.head.generator.head import build_procedural_head
+from express50.head.builtin import load_builtin
 from express50.head.model import HeadModel
 from pipelines.track.render_loss import Appearance, Shot, make_look, vertex_light
 from pipelines.track.render_refine import posed_vertices
@@ -23,7 +23,7 @@ FINE = 4  # rays a pixel, each way
 
 @functools.cache
 def head() -> HeadModel:
-    return build_procedural_head()
+    return load_builtin()
 
 
 def ring(

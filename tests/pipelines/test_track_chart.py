@@ -11,8 +11,7 @@ import torch
 from express50.errors import HeadModelError
 from express50.geometry.raycast import mesh_scene
 from express50.head.load import load_head
-from express50.landmarks.network import trainable_network
-from express50.landmarks.training.augment import MIRROR
+from express50.landmarks.network import MIRROR, trainable_network
 from pipelines.track.chart.cases import draw_case, draw_meshes, draw_person
 from pipelines.track.chart.disturb import Case, creased, mirrored, warped, where_seen
 from pipelines.track.chart.layout import HEIGHT, MARKS, WIDTH, make_chart, to_texels

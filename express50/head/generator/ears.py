@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from express50.head.generator.field import cast
+from express50.head.generator.field import cast, labels
 from express50.head.generator.mesh import HalfMesh
-from express50.head.generator.rays import labels
 
 Array = np.ndarray
 

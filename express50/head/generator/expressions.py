@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from express50.head.generator.eyes import blink, lid_motion
 from express50.head.generator.influence import (
     Pull,
     displacement,
@@ -11,7 +12,6 @@ from express50.head.generator.influence import (
     settle_eyes,
     window,
 )
-from express50.head.generator.lids import blink, lid_motion
 from express50.head.generator.mesh import WholeMesh
 from express50.head.generator.skinning import JAW, smoothstep
 

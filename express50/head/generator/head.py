@@ -1,4 +1,6 @@
-"""The built-in head, made by code: a full head in FLAME's layout with named directions.
+"""Code that makes the built-in head: a full head in FLAME's layout with named directions.
+
+Run `python -m express50.head.generator.head` after a change here: it rewrites `builtin.npz`.
 
 Measures are millimetres while building and metres in the result. No vertex, weight or direction is
 taken from another model; the placement of features follows anthropometry (Farkas 1994).
@@ -7,16 +9,17 @@ taken from another model; the placement of features follows anthropometry (Farka
 from __future__ import annotations
 
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
+from express50.head.builtin import BUILTIN
 from express50.head.generator.expressions import expression_directions
 from express50.head.generator.eyes import add_eyeball
-from express50.head.generator.landmarks import contour_candidates, embed_landmarks
-from express50.head.generator.mesh import HalfMesh, WholeMesh, mirrored
-from express50.head.generator.regions import region_masks
+from express50.head.generator.mesh import HalfMesh, WholeMesh, mirrored, pack_uv
+from express50.head.generator.mouth import add_teeth, add_tongue
+from express50.head.generator.regions import contour_candidates, embed_landmarks, region_masks
 from express50.head.generator.shapes import shape_directions
 from express50.head.generator.skin import add_skin, set_skin_uv
 from express50.head.generator.skinning import (
@@ -26,9 +29,6 @@ from express50.head.generator.skinning import (
     pose_correctives,
     skinning_weights,
 )
-from express50.head.generator.teeth import add_teeth, add_tongue
-from express50.head.generator.uv import pack_uv
-from express50.head.model import HeadModel, check_head
 
 Array = np.ndarray
 
@@ -77,21 +77,22 @@ def procedural_arrays() -> dict[str, Any]:
     }
 
 
-@cache
-def build_procedural_head() -> HeadModel:
-    """The built-in head as a HeadModel (float32, CPU). Cached: callers share it, do not modify."""
+def write_builtin(path: Path) -> None:
+    """Write the head's arrays as the .npz file that `express50.head.builtin` reads."""
     arrays = procedural_arrays()
+    contour, regions = arrays.pop("contour"), arrays.pop("regions")
+    stored: dict[str, Any] = {
+        name: np.asarray(value, np.float32) if np.asarray(value).dtype.kind == "f" else value
+        for name, value in arrays.items()
+    }
+    stored |= {
+        "contour": np.concatenate(contour),
+        "contour_counts": np.array([len(line) for line in contour]),
+        "region_names": np.array(list(regions)),
+        "regions": np.stack(list(regions.values())),
+    }
+    np.savez_compressed(path, **stored)
 
-    def tensor(value: Array) -> torch.Tensor:
-        kind = torch.float32 if value.dtype.kind == "f" else None
-        return torch.as_tensor(np.ascontiguousarray(value), dtype=kind)
 
-    model = HeadModel(
-        name="procedural",
-        contour=tuple(tensor(line) for line in arrays.pop("contour")),
-        regions={name: tensor(mask) for name, mask in arrays.pop("regions").items()},
-        shape_names=tuple(arrays.pop("shape_names")),
-        expression_names=tuple(arrays.pop("expression_names")),
-        **{name: tensor(value) for name, value in arrays.items()},
-    )
-    return check_head(model)
+if __name__ == "__main__":
+    write_builtin(BUILTIN)

@@ -1,9 +1,11 @@
-"""Region masks of the procedural head (see express50.head.model for the names)."""
+"""Region masks, the 68 iBUG landmarks, and candidates for the visible jaw line."""
 
 from __future__ import annotations
 
 import numpy as np
 
+from express50.head.generator.eyes import from_front
+from express50.head.generator.field import cast, labels, project, rays
 from express50.head.generator.mesh import WholeMesh
 
 Array = np.ndarray
@@ -61,3 +63,79 @@ def region_masks(mesh: WholeMesh) -> dict[str, Array]:
     nose = plain & (y > -29) & (y < 32) & (x < half_width) & (z > 74) & ~eye_region
     regions["nose"] = nose | _mask(mesh, [f"nostril{k}" for k in range(6)] + ["nostril_top"])
     return regions
+
+
+# Subject's left side, from the chin (8) to the ear (16), mm; put on the skin before use.
+_JAW = np.array([(0, -95, 86), (16, -94, 79), (31, -87, 62), (44, -77, 44), (53, -64, 28),
+                 (61, -46, 16), (67, -26, 10), (70, -6, 9), (71, 14, 8)], float)  # fmt: skip
+_BROW = np.array([(9, 36), (19, 41.5), (30, 43), (41, 41), (51, 34.5)], float)
+_BRIDGE = np.array([(0, 24), (0, 13), (0, 1), (0, -13)], float)
+_NOSTRILS = np.array([(0, -28.5), (6.5, -27.5), (13, -25)], float)
+
+
+def embed_landmarks(mesh: WholeMesh) -> tuple[Array, Array]:
+    """Faces (68,) and barycentric weights (68,3) of the landmarks."""
+    jaw, brow = project(_JAW, 6), from_front(_BROW)
+    bridge, nostrils = from_front(_BRIDGE), from_front(_NOSTRILS)
+    points = np.zeros((68, 3))
+    flip = np.array([-1.0, 1, 1])
+    points[8:17], points[0:8] = jaw, (jaw * flip)[:0:-1]
+    points[22:27], points[17:22] = brow, (brow * flip)[::-1]
+    points[27:31] = bridge
+    points[33:36], points[31:33] = nostrils, (nostrils * flip)[:0:-1]
+    for first, side, order in (
+        (42, "left", (0, 7, 13, 20, 27, 33)),
+        (36, "right", (20, 13, 7, 0, 33, 27)),
+    ):
+        points[first : first + 6] = mesh.vertices[mesh.tag("lid0", side)[list(order)]]
+    for first, tag, loop in (
+        (48, "lip3", (-16, -7, -2, 0, 2, 7, 16, 25, 30, 32, -30, -25)),
+        (60, "lip0", (-16, -6, 0, 6, 16, 26, 32, -26)),
+    ):
+        # Positions along the loop from the upper to the lower middle; negative on the right.
+        row = mesh.vertices[mesh.tag(tag, "left")]
+        sign = np.where(np.array(loop) < 0, -1.0, 1.0)[:, None]
+        points[first : first + len(loop)] = row[np.abs(loop)] * np.where([1, 0, 0], sign, 1.0)
+    return _embed(mesh, points)
+
+
+def _embed(mesh: WholeMesh, points: Array) -> tuple[Array, Array]:
+    """Nearest point of the skin's faces: face index and barycentric weights."""
+    skin = np.flatnonzero(mesh.face_chart == "skin")
+    corners = mesh.vertices[mesh.faces[skin]]
+    faces, bary = np.zeros(len(points), np.int64), np.zeros((len(points), 3))
+    for k, point in enumerate(points):
+        weights, distance = _closest(corners, point)
+        best = int(np.argmin(distance))
+        faces[k], bary[k] = skin[best], weights[best]
+    return faces, bary
+
+
+def _closest(corners: Array, p: Array) -> tuple[Array, Array]:
+    """Barycentric weights (F,3), clamped and renormalised, and distances (F,) to a point."""
+    a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
+    ab, ac, ap = b - a, c - a, p - a
+    d00, d01, d11 = (ab * ab).sum(1), (ab * ac).sum(1), (ac * ac).sum(1)
+    d20, d21 = (ap * ab).sum(1), (ap * ac).sum(1)
+    det = np.maximum(d00 * d11 - d01 * d01, 1e-12)
+    v, w = (d11 * d20 - d01 * d21) / det, (d00 * d21 - d01 * d20) / det
+    weights = np.clip(np.stack([1 - v - w, v, w], 1), 0, None)
+    weights /= weights.sum(1, keepdims=True)
+    return weights, np.linalg.norm((weights[..., None] * corners).sum(1) - p, axis=1)
+
+
+def contour_candidates(mesh: WholeMesh) -> tuple[Array, ...]:
+    """For landmarks 0..16 the skin vertices that may lie on the visible jaw line."""
+    azimuth, latitude = labels(project(_JAW, 6))
+    grid = mesh.tag("grid")
+    result = []
+    for sign in (-1, 1):
+        for k in range(9):
+            spread = np.radians(np.linspace(-40, 40, 25)) * min(1.0, 0.25 + k / 4)
+            around = np.maximum(azimuth[k] + spread, 0.0) if k else spread
+            line = cast(*rays(around, np.full(25, latitude[k]))) * [sign, 1, 1]
+            nearest = np.linalg.norm(mesh.vertices[grid][None] - line[:, None], axis=-1).argmin(1)
+            _, first = np.unique(nearest, return_index=True)
+            result.append(grid[nearest[np.sort(first)]].astype(np.int64))
+    right, left = result[:9], result[9:]
+    return tuple(right[:0:-1]) + tuple(left)

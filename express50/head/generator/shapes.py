@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from express50.head.generator.eyes import lid_motion
 from express50.head.generator.influence import (
     Pull,
     displacement,
@@ -11,7 +12,6 @@ from express50.head.generator.influence import (
     scope_weights,
     settle_eyes,
 )
-from express50.head.generator.lids import lid_motion
 from express50.head.generator.mesh import WholeMesh
 
 Array = np.ndarray

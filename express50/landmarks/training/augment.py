@@ -8,16 +8,9 @@ import cv2
 import numpy as np
 
 from express50.geometry.conventions import affine_to_opencv
-from express50.landmarks.network import CROP
+from express50.landmarks.network import CROP, CROP_MARGIN, MIRROR, face_box
 from express50.landmarks.training.training_set import ViewSet
 
-CROP_MARGIN = 1.55
-# Partner of each iBUG-68 point in the mirror image.
-MIRROR = np.array(
-    [*range(16, -1, -1), *range(26, 16, -1), 27, 28, 29, 30, 35, 34, 33, 32, 31,
-     45, 44, 43, 42, 47, 46, 39, 38, 37, 36, 41, 40,
-     54, 53, 52, 51, 50, 49, 48, 59, 58, 57, 56, 55, 64, 63, 62, 61, 60, 67, 66, 65]
-)  # fmt: skip
 Rng = np.random.Generator
 
 
@@ -38,12 +31,6 @@ class Crop:
     visible: np.ndarray
     score: float
     weight: float
-
-
-def face_box(points: np.ndarray) -> tuple[np.ndarray, float]:
-    """Centre (2,) and side of the square that the detector crops about landmarks (68, 2)."""
-    low, high = points.min(0), points.max(0)
-    return 0.5 * (low + high), CROP_MARGIN * float((high - low).max())
 
 
 def random_crop(

@@ -15,8 +15,7 @@ import numpy as np
 import torch
 
 from express50.head.model import HeadModel
-from express50.landmarks.network import CROP, LandmarkNet
-from express50.landmarks.training.augment import MIRROR
+from express50.landmarks.network import CROP, MIRROR, LandmarkNet
 from pipelines.track.chart.layout import MARKS, Chart, make_chart, to_texels
 
 WEIGHTS = Path(__file__).with_name("weights.npz")

@@ -19,8 +19,14 @@ from express50.geometry.raycast import mesh_scene
 from express50.geometry.transforms import rigid_fit
 from express50.head.flame import load_flame
 from express50.head.model import HeadModel, landmarks, pose
-from express50.head.mouth import CORNERS, LOWER_RING, UPPER_RING, add_mouth, mouth_loop
-from express50.head.uv_room import place_charts
+from express50.head.mouth import (
+    CORNERS,
+    LOWER_RING,
+    UPPER_RING,
+    add_mouth,
+    mouth_loop,
+    place_charts,
+)
 from tests.express50.flame_reader import flame_vertices
 from tests.express50.head.flame_head import MOUTH, write_flame_size
 from tests.express50.tracked import track_arrays, write_track

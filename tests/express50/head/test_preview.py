@@ -9,12 +9,12 @@ import torch
 from express50.cli.main import main
 from express50.errors import HeadModelError
 from express50.files.images import read_image
-from express50.head.generator.head import build_procedural_head
+from express50.head.builtin import load_builtin
 from express50.head.preview import POSES, contact_sheet, expression_vector, render_preview
 
 
 def test_a_head_fills_the_middle_of_the_picture():
-    head = build_procedural_head()
+    head = load_builtin()
     image = render_preview(head, head.template, size=64, supersample=1)
     background = image[0, 0].astype(int)
     differs = np.abs(image.astype(int) - background).max(-1) > 20
@@ -23,7 +23,7 @@ def test_a_head_fills_the_middle_of_the_picture():
 
 
 def test_a_name_without_a_side_sets_both():
-    head = build_procedural_head()
+    head = load_builtin()
     vector = expression_vector(head, {"eyeBlink": 0.5})[0]
     named = {head.expression_names[i] for i in torch.nonzero(vector)[:, 0]}
     assert named == {"eyeBlink_L", "eyeBlink_R"}
@@ -32,7 +32,7 @@ def test_a_name_without_a_side_sets_both():
 
 
 def test_contact_sheet_has_a_row_a_pose():
-    sheet = contact_sheet(build_procedural_head(), yaws=(0.0,), size=24)
+    sheet = contact_sheet(load_builtin(), yaws=(0.0,), size=24)
     assert sheet.shape == (24 * len(POSES), 24, 3)
 
 

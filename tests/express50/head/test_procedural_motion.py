@@ -7,14 +7,15 @@ import pytest
 import torch
 
 from express50.capture.expressions import load_script
-from express50.head.generator.head import build_procedural_head, procedural_mesh
+from express50.head.builtin import load_builtin
+from express50.head.generator.head import procedural_mesh
 from express50.head.model import landmarks, pose
 from express50.head.preview import expression_vector, render_preview
 
 
 @pytest.fixture(scope="module")
 def head():
-    return build_procedural_head()
+    return load_builtin()
 
 
 def posed(head, controls=None, jaw=0.0, shape=None):

@@ -6,7 +6,7 @@ from express50.geometry.cameras import project
 from express50.geometry.conventions import opencv_pixels_to_corner
 from express50.twin.board import BoardSpec, board_poses, corner_points, render_board
 from express50.twin.rig import make_rig
-from express50.twin.sensor import expose, make_sensor
+from express50.twin.studio import expose, make_sensor
 
 SPEC = BoardSpec()
 
