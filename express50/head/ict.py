@@ -327,6 +327,6 @@ def _at_vertices(faces: np.ndarray, vertices: np.ndarray) -> tuple[np.ndarray, n
 
 
 def _smoothstep(x: np.ndarray) -> np.ndarray:
-    """0 below 0, 1 above 1, smooth between."""
+    """Step smoothly from 0 at 0 to 1 at 1."""
     x = np.clip(x, 0.0, 1.0)
     return x * x * (3.0 - 2.0 * x)

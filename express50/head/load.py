@@ -36,4 +36,4 @@ def load_head(spec: str | Path) -> HeadModel:
         from express50.head.flame import load_flame
 
         return load_flame(path)
-    raise HeadModelError(f"head model {str(spec)!r}: cannot tell its kind; expected {_KINDS}")
+    raise HeadModelError(f"head model {str(spec)!r}: unknown kind of file; expected {_KINDS}")

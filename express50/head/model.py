@@ -34,9 +34,9 @@ class HeadModel:
     Attributes:
         name: Where the model came from ("procedural", "flame2023", ...).
         template: (V, 3) metres.
-        shape_dirs: (V, 3, S) metres a unit coefficient.
-        expression_dirs: (V, 3, X) metres a unit coefficient.
-        pose_dirs: (9 * (J - 1), V * 3) metres a unit of R - I, row-major.
+        shape_dirs: (V, 3, S) metres per unit coefficient.
+        expression_dirs: (V, 3, X) metres per unit coefficient.
+        pose_dirs: (9 * (J - 1), V * 3) metres per unit of R - I, row-major.
         joint_regressor: (J, V) rows sum to 1.
         parents: parent of each joint, -1 for the root.
         skinning: (V, J) rows sum to 1.
@@ -281,7 +281,7 @@ def skin(
 def joint_transforms(
     joints: torch.Tensor, rotations: torch.Tensor, parents: tuple[int, ...]
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Where each joint takes a point at rest: x -> turn @ x + shift.
+    """Transform of each joint, which takes a point at rest to turn @ x + shift.
 
     The shift is linear in the joints (there is no constant part).
 

@@ -69,7 +69,7 @@ class _Part:
 
 
 def is_flame_topology(model: HeadModel) -> bool:
-    """Whether vertex ids mean what they mean in FLAME."""
+    """Return True if vertex ids have the same meaning as in FLAME."""
     return len(model.template) == FLAME_VERTICES
 
 
@@ -276,7 +276,7 @@ def _extended(directions: torch.Tensor, weights: torch.Tensor) -> torch.Tensor:
 
 GRID = 512  # cells a side of the search
 GUTTER = 3  # cells kept free around a chart, so that neighbours do not bleed into each other
-SHRINK, LEAST = 0.9, 0.15  # of the wanted size: what is tried next, and the smallest taken
+SHRINK, LEAST = 0.9, 0.15  # of the wanted size: factor between tries, and the smallest accepted
 
 
 def place_charts(
@@ -293,7 +293,7 @@ def place_charts(
         name: of the head model, for errors.
 
     Raises:
-        HeadModelError: there is no room for one of them at LEAST of its size.
+        HeadModelError: a chart does not fit even at LEAST of its size.
     """
     taken = covered_cells(uv, uv_faces, GRID)
     taken = cv2.dilate(taken.astype(np.uint8), np.ones((2 * GUTTER + 1,) * 2, np.uint8)) > 0

@@ -23,7 +23,7 @@ from express50.landmarks.network import CROP, MIRROR, LandmarkNet, face_box
 
 # A point whose error scale is this share of the face box has half the confidence.
 HALF_CONFIDENCE_SHARE = 0.025
-# Points of a place that is no face are vague: at this share the score is halved.
+# Points outside a face are vague: at this share the score is halved.
 VAGUE_SHARE = 0.06
 # Where nothing scores as much the search goes on.
 FOUND_SCORE = 0.5
@@ -51,7 +51,7 @@ class Detection:
             sigma is large.
         score: in 0..1, how surely a face looks towards the camera: the network's probability,
             lowered where the points are vague or other crops give other points. Low for backs of
-            heads and where there is no head.
+            heads and where no head is visible.
     """
 
     points: np.ndarray
@@ -221,7 +221,7 @@ def _sample(pyramid: list[np.ndarray], window: np.ndarray) -> np.ndarray:
 
 
 def _run(net: LandmarkNet, pyramid: list[np.ndarray], windows: list[np.ndarray]) -> list[_Place]:
-    """What the network finds in windows."""
+    """Run the network on windows of an image."""
     parts = [windows[start : start + BATCH] for start in range(0, len(windows), BATCH)]
     return [place for part in parts for place in _run_batch(net, pyramid, part)]
 

@@ -1,4 +1,4 @@
-"""Where the irises are: the dark disc within each eye's opening.
+"""Iris detection: finds the dark disc within each eye's opening.
 
 Every eye is brought to one size by its corners. A disc and the ring around it, both cut by the
 opening, are compared at every place and a few radii: iris and pupil are darker than the white
@@ -28,7 +28,7 @@ SLACK = 0.1
 LEAST_WIDTH_PX = 6.0
 SHUT, OPEN = 0.1, 0.2
 # Contrast between disc and ring, of a crop whose mean light is a half: least, and that which gives
-# half of the confidence. Shut lids stay under the first, less than the second is no iris either.
+# half of the confidence. Shut lids stay under the first.
 LEAST_CONTRAST, CONTRAST = 0.12, 0.08
 LEAST_COVER, LEAST_CONFIDENCE = 0.35, 0.2
 # Standard deviation of a sure centre, in eye widths.

@@ -2,7 +2,7 @@
 
 The network sees a mouth in some thirty pixels and often takes a row of teeth for closed lips. Lips
 are redder than teeth, and much lighter than an open mouth's dark. Down each of three columns
-between the outer lips the longest run of pixels that are no lip is taken for the opening.
+between the outer lips the longest run of pixels that do not look like lips is taken as the opening.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ SHUT = 0.08
 # Half the columns' width that is averaged, rows kept clear of the outer lips (shares of the
 # mouth's width), and the least height of an opening.
 HALF, CLEAR, LEAST = 0.03, 0.03, 0.045
-# A pixel is no lip if it is this much less red than the lips, next to the skin's difference from
+# A pixel is not lip if it is this much less red than the lips, next to the skin's difference from
 # grey, or has less than this share of their light.
 PALE, DARK = 0.5, 0.55
 SIGMA = 0.02

@@ -1,4 +1,4 @@
-"""The landmark network: a small convolutional encoder-decoder with one heat map a point.
+"""The landmark network: a small convolutional encoder-decoder with one heat map per point.
 
 Points come from the expectation over softmax heat maps (integral regression, Sun et al. 2018), so
 they are continuous and have gradients everywhere. A small perceptron that sees all of them at once
@@ -36,7 +36,7 @@ MIRROR = np.array(
      54, 53, 52, 51, 50, 49, 48, 59, 58, 57, 56, 55, 64, 63, 62, 61, 60, 67, 66, 65]
 )  # fmt: skip
 WEIGHTS = Path(__file__).with_name("weights.npz")
-# Names of what is not stored end so: batch normalisation counts its batches.
+# Suffix of buffers that are not stored: batch normalisation counts its batches.
 COUNTERS = "num_batches_tracked"
 
 
@@ -47,7 +47,7 @@ def face_box(points: np.ndarray) -> tuple[np.ndarray, float]:
 
 
 class Output(NamedTuple):
-    """What the network says of B crops.
+    """The network's answer for B crops.
 
     Attributes:
         points: (B, 68, 2) crop pixels.
@@ -223,7 +223,7 @@ def trainable_network(path: Path = WEIGHTS) -> LandmarkNet:
 
 
 def fold(module: nn.Module) -> None:
-    """Fold batch normalisations into convolutions, in place; what is left computes the same."""
+    """Fold batch normalisations into convolutions, in place; the result computes the same."""
     for name, child in module.named_children():
         if isinstance(child, nn.Sequential) and isinstance(child[1], nn.BatchNorm2d):
             setattr(module, name, fuse_conv_bn_eval(child[0], child[1]))

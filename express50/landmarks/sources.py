@@ -1,4 +1,4 @@
-"""Where landmarks come from: the embedded network, the user's own FAN weights, or a file of points.
+"""Sources of landmarks: the embedded network, the user's own FAN weights, or a file of points.
 
 A source is called with an image, its camera's id and its frame, and answers with a `Marked` face:
 the frozen `Detection` that all share, the irises, and which convention its jaw line follows.
@@ -70,7 +70,7 @@ def open_source(
         smallest: windows that it searches, see `detect`.
 
     Raises:
-        ConfigError: the file is not there, or is no such file.
+        ConfigError: the file is missing, or is not of the expected kind.
         FormatError: the file of points is malformed.
     """
     for path in source_files(landmarks).values():

@@ -138,7 +138,7 @@ def _meet(
     origin: np.ndarray,
     directions: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Whether rays (h, w, 3) meet the board, and the pattern's tone there."""
+    """Intersect rays (h, w, 3) with the board: hit mask, and the pattern's tone there."""
     R = world_from_board[:3, :3]
     start = R.T @ (origin - world_from_board[:3, 3])
     turned = directions @ R

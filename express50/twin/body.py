@@ -13,13 +13,13 @@ from express50.geometry.transforms import rigid_fit
 from express50.head.model import HeadModel, landmarks, pose
 from express50.twin.hair import HairMesh, grow_hair
 from express50.twin.noise import random_stream, smoothstep
-from express50.twin.performance import Performance
-from express50.twin.subjects import Subject
+from express50.twin.performance import TwinPerformance
+from express50.twin.subjects import TwinSubject
 from express50.twin.surface import Caster, StarMap, face_to_vertex, smooth_over_mesh, vertex_normals
 
 
 class Material(IntEnum):
-    """What a triangle is made of."""
+    """Materials of triangles."""
 
     SKIN = 0
     EYE = 1
@@ -33,7 +33,7 @@ class Material(IntEnum):
 
 @dataclass(frozen=True, kw_only=True)
 class Extras:
-    """What is not the head model, in rest head space.
+    """Geometry besides the head model (hair, clothes), in rest head space.
 
     Attributes:
         hair: strands, rigid with the skull; may be empty.
@@ -65,7 +65,7 @@ class Body:
     """
 
     model: HeadModel
-    subject: Subject
+    subject: TwinSubject
     faces: np.ndarray
     material: np.ndarray
     template: np.ndarray
@@ -75,7 +75,7 @@ class Body:
     incidence: scipy.sparse.csr_matrix
 
 
-def build_body(model: HeadModel, subject: Subject, seed: int, hair_detail: float = 1.0) -> Body:
+def build_body(model: HeadModel, subject: TwinSubject, seed: int, hair_detail: float = 1.0) -> Body:
     """Everything of a subject that no frame changes; a hair detail of 0 makes it bald."""
     template = model.template.double().numpy()
     faces = model.faces.numpy().astype(np.int32)
@@ -107,7 +107,7 @@ def build_body(model: HeadModel, subject: Subject, seed: int, hair_detail: float
 
 
 def assemble(
-    model: HeadModel, subject: Subject, extras: Extras, scalp: np.ndarray, centre: np.ndarray
+    model: HeadModel, subject: TwinSubject, extras: Extras, scalp: np.ndarray, centre: np.ndarray
 ) -> Body:
     """Join head, hair and shoulders into one mesh."""
     faces = model.faces.numpy().astype(np.int32)
@@ -165,13 +165,15 @@ def head_centre(model: HeadModel) -> np.ndarray:
     return np.array([0.0, joints[3:5, 1].mean() - 0.01, middle[2] - 0.01])
 
 
-def neutral_vertices(model: HeadModel, subject: Subject) -> np.ndarray:
+def neutral_vertices(model: HeadModel, subject: TwinSubject) -> np.ndarray:
     """Rest vertices (V, 3) of a subject without expression, float64 metres."""
     dirs = model.shape_dirs.double().numpy()
     return model.template.double().numpy() + dirs @ subject.shape + subject.offsets
 
 
-def head_vertices(model: HeadModel, subject: Subject, play: Performance, frame: int) -> np.ndarray:
+def head_vertices(
+    model: HeadModel, subject: TwinSubject, play: TwinPerformance, frame: int
+) -> np.ndarray:
     """Vertices (V, 3) of the posed head model in the world, metres."""
 
     def row(array: np.ndarray) -> torch.Tensor:
@@ -200,7 +202,7 @@ class Posed:
     head_from_world: np.ndarray
 
 
-def pose_body(body: Body, play: Performance, frame: int, with_normals: bool = True) -> Posed:
+def pose_body(body: Body, play: TwinPerformance, frame: int, with_normals: bool = True) -> Posed:
     """Pose head, hair and shoulders for a frame."""
     extras, hair = body.extras, body.extras.hair
     head = head_vertices(body.model, body.subject, play, frame)

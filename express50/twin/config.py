@@ -1,4 +1,4 @@
-"""What a recording consists of: one frozen dataclass, checked once."""
+"""Settings of a recording: one frozen dataclass, checked once."""
 
 from __future__ import annotations
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from express50.twin.noise import smoothstep
-from express50.twin.subjects import Look
+from express50.twin.subjects import PersonLook
 from express50.twin.surface import StarMap, unit
 
 _CLEARANCE = 2.2e-3  # metres
@@ -19,7 +19,7 @@ _CLEARANCE = 2.2e-3  # metres
 
 @dataclass(frozen=True, kw_only=True)
 class HairStyle:
-    """How strands run; lengths in metres."""
+    """Shape of the strands; lengths in metres."""
 
     strands: int
     steps: int
@@ -65,7 +65,7 @@ def grow_hair(
     faces: np.ndarray,
     scalp: np.ndarray,
     star: StarMap,
-    look: Look,
+    look: PersonLook,
     detail: float = 1.0,
 ) -> HairMesh:
     """Grow a subject's hair.

@@ -1,4 +1,4 @@
-"""How a subject plays the script: timing, intensity, blinks and sway, frame by frame."""
+"""A subject's performance of the script: timing, intensity, blinks and sway per frame."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from express50.twin.rig import TARGET
 
 
 @dataclass(frozen=True, kw_only=True)
-class Performance:
+class TwinPerformance:
     """Parameters of every frame, in head-model terms.
 
     Attributes:
@@ -50,7 +50,7 @@ def perform(
     fps: float,
     number: int,
     seed: int,
-) -> Performance:
+) -> TwinPerformance:
     """Play a script once.
 
     Each window goes rest, onset, apex, offset, rest with the apex anywhere in its middle; how
@@ -85,7 +85,7 @@ def perform(
     expression += (1.0 - strength)[:, None] * rest
     R, t = _sway(random_stream(seed, number, 6), model, count, fps)
     eyes = np.tile(matrix_to_axis_angle(gaze_rotation(gaze)), (1, 2))
-    return Performance(
+    return TwinPerformance(
         cues=tuple(cues), peaks=peaks, strength=strength, expression=expression,
         jaw=jaw, neck=neck, eyes=eyes, R=R, t=t,
     )  # fmt: skip
@@ -113,7 +113,7 @@ def _envelope(rng: np.random.Generator, count: int, fps: float) -> tuple[int, np
     """Peak index and strength (count,), 1 at the peak and less everywhere else."""
     low, high = max(1, round(0.3 * count)), max(2, round(0.72 * count))
     peak = int(rng.integers(low, min(high, count - 2) + 1))
-    # Both ends of the window are near rest, and nobody takes much longer than half a second.
+    # Both ends of the window are near rest; a movement rarely takes over half a second.
     onset = min(rng.uniform(0.2, 0.36) * count, peak + 0.9, 0.7 * fps)
     offset = min(rng.uniform(0.24, 0.42) * count, count - peak - 0.1, 0.7 * fps)
     hold = rng.uniform(0.1, 0.9) * min(0.06 * count, 0.5 * fps)
@@ -132,7 +132,7 @@ def _played(rng: np.random.Generator, entry: Expression, names: dict[str, int]) 
         if name in names:
             out[names[name]] = np.clip(strength * gain * value, -1.0, 1.1)
     if entry.controls:
-        # Nobody moves one muscle alone: a few others join in a little.
+        # People rarely move one muscle alone: a few others join in a little.
         for column in rng.choice(len(names), size=min(3, len(names)), replace=False):
             if list(names)[column].startswith(("mouth", "brow", "cheek", "nose")):
                 out[column] += rng.uniform(0.0, 0.08)

@@ -138,7 +138,7 @@ def _film(config: TwinConfig, task: Task, staging: Path) -> None:
 
 
 def _publish(config: TwinConfig, subject: str, staging: Path, out: Path) -> None:
-    """Add what is not footage, then move a subject's truth and capture into place."""
+    """Add the files besides footage, then move a subject's truth and capture into place."""
     from express50.twin.board import BoardSpec
 
     capture, truth = staging / "captures" / subject, staging / "truth" / subject
@@ -170,7 +170,7 @@ def _check_settings(config: TwinConfig, out: Path) -> None:
     path = out / "twin.json"
     settings = {k: v for k, v in asdict(config).items() if k not in ("subjects", "first_subject")}
     text = json.dumps(settings, indent=1, sort_keys=True) + "\n"
-    begun = any((out / "captures").glob("*"))  # else nothing was recorded with what is noted
+    begun = any((out / "captures").glob("*"))  # otherwise nothing was recorded with these settings
     if begun and path.is_file() and path.read_text() != text:
         former = json.loads(path.read_text())
         changed = sorted(

@@ -38,7 +38,7 @@ class Sampling:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Band:
+class RowBand:
     """Rays of some rows of a camera, halo included, in the world.
 
     Attributes:
@@ -58,7 +58,7 @@ class Band:
     down: np.ndarray
 
 
-def bands(camera: Camera) -> Iterator[Band]:
+def bands(camera: Camera) -> Iterator[RowBand]:
     """The image in bands of at most ``BAND_PIXELS`` pixels, top to bottom."""
     rows = max(1, BAND_PIXELS // camera.width)
     for top in range(0, camera.height, rows):
@@ -69,7 +69,7 @@ def bands(camera: Camera) -> Iterator[Band]:
         # Central differences; one more pixel on every side was cast for them.
         right = 0.5 * (grid[1:-1, 2:] - grid[1:-1, :-2])
         down = 0.5 * (grid[2:, 1:-1] - grid[:-2, 1:-1])
-        yield Band(
+        yield RowBand(
             top=top, bottom=bottom, pad=(top - start, end - bottom),
             origin=origin.astype(np.float32),
             centre=grid[1:-1, 1:-1].astype(np.float32),
@@ -81,7 +81,7 @@ def render_bands(
     caster: Caster,
     material: np.ndarray,
     window: tuple[int, int, int, int],
-    band: Band,
+    band: RowBand,
     sampling: Sampling,
     shade: Shade | None,
 ) -> tuple[np.ndarray, np.ndarray, tuple[int, int, int, int]] | None:

@@ -52,7 +52,7 @@ def make_lighting(number: int, seed: int) -> Lighting:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Eyes:
+class TwinEyes:
     """Both eyeballs on the mean head: centres (2, 3), optical axes (2, 3), iris half-angle."""
 
     centres: np.ndarray
@@ -60,8 +60,8 @@ class Eyes:
     iris: float
 
 
-def find_eyes(model: HeadModel) -> Eyes:
-    """Where the eyeballs of a head model are and how wide their irises."""
+def find_eyes(model: HeadModel) -> TwinEyes:
+    """Centres of a head model's eyeballs and radii of their irises."""
     template = model.template.double().numpy()
     centres, axes, angles = [], [], []
     for side in ("left", "right"):
@@ -75,13 +75,13 @@ def find_eyes(model: HeadModel) -> Eyes:
         centres.append(centre)
         axes.append(axis)
     iris_angle = float(np.clip(np.mean(angles), 0.40, 0.56))
-    return Eyes(
+    return TwinEyes(
         centres=np.array(centres, np.float32), axes=np.array(axes, np.float32), iris=iris_angle
     )
 
 
 @dataclass(frozen=True, kw_only=True)
-class Scene:
+class LitScene:
     """One frame ready for rays: compiled geometry and per-vertex attributes.
 
     ``attributes`` (N, 9 + L) are normal, place or colour, diffuse light that arrives (RGB), and
@@ -91,7 +91,7 @@ class Scene:
     caster: Caster
     body: Body
     texture: SkinTexture
-    eyes: Eyes
+    eyes: TwinEyes
     lighting: Lighting
     attributes: np.ndarray
     hair_tangents: np.ndarray
@@ -100,8 +100,8 @@ class Scene:
 
 
 def build_scene(
-    body: Body, texture: SkinTexture, eyes: Eyes, lighting: Lighting, posed: Posed, seed: int
-) -> Scene:
+    body: Body, texture: SkinTexture, eyes: TwinEyes, lighting: Lighting, posed: Posed, seed: int
+) -> LitScene:
     """Compile one frame: Embree scene, then light at every vertex."""
     caster = Caster(posed.vertices, body.faces)
     heads = len(body.template)
@@ -118,7 +118,7 @@ def build_scene(
     skin[:heads, 0] = model_materials(body.model) == Material.SKIN
     attributes[solid, 6:9] = _diffuse(lighting, posed.normals[solid], reach, skin)
     attributes[solid, 9:] = reach[:, 1:]
-    return Scene(
+    return LitScene(
         caster=caster, body=body, texture=texture, eyes=eyes, lighting=lighting,
         attributes=attributes, hair_tangents=posed.tangents, vertices=posed.vertices,
         iris_lattice=make_lattice(random_stream(seed, body.subject.number, 10)),
@@ -173,7 +173,9 @@ def _diffuse(
     return total
 
 
-def shade(scene: Scene, directions: np.ndarray, face: np.ndarray, bary: np.ndarray) -> np.ndarray:
+def shade(
+    scene: LitScene, directions: np.ndarray, face: np.ndarray, bary: np.ndarray
+) -> np.ndarray:
     """Linear colour (N, 3) of hits.
 
     Args:
@@ -208,7 +210,7 @@ def shade(scene: Scene, directions: np.ndarray, face: np.ndarray, bary: np.ndarr
 
 
 def _surface(
-    scene: Scene, kind: int, place: np.ndarray
+    scene: LitScene, kind: int, place: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray | float, float]:
     """Albedo (N, 3), strength and sharpness of the highlight at places (N, 3) on the mean head."""
     if kind == Material.SKIN:
@@ -227,7 +229,7 @@ def _surface(
     return grain[:, None] * np.array(colour, np.float32), gloss, power
 
 
-def _eye_albedo(scene: Scene, place: np.ndarray) -> np.ndarray:
+def _eye_albedo(scene: LitScene, place: np.ndarray) -> np.ndarray:
     """Iris, pupil and sclera (N, 3) by the angle from the optical axis."""
     eyes = scene.eyes
     side = (place[:, 0] < 0).astype(np.int32)  # the left eye is at +x

@@ -2,7 +2,7 @@
 
 The texture knows nothing of the head model's UV map: a place on the mean head is looked up by its
 azimuth and elevation, so any head model can be painted. What folds behind (nostrils, the back of
-the ear) shares the colour of what is in front of it.
+the ear) shares the colour of the surface in front of it.
 """
 
 from __future__ import annotations
@@ -194,7 +194,7 @@ def _hairiness(
 def _beard(
     marks: np.ndarray, points: np.ndarray, masks: dict[str, np.ndarray], lattices: list[np.ndarray]
 ) -> np.ndarray:
-    """Where a beard grows (N,), as dots of stubble."""
+    """Density of stubble (N,), in dots."""
     mouth, chin = marks[[48, 54]].mean(0), marks[8]
     nose = marks[33]
     below = smoothstep(points[:, 1], nose[1] - 0.001, nose[1] - 0.012)

@@ -20,10 +20,10 @@ from express50.twin.board import BoardSpec, background, board_poses, render_boar
 from express50.twin.body import Body, build_body, pose_body
 from express50.twin.config import TwinConfig, subject_number
 from express50.twin.noise import random_stream
-from express50.twin.performance import Performance, perform
-from express50.twin.render import Band, Sampling, bands, hull_of, render_bands, window_of
+from express50.twin.performance import TwinPerformance, perform
+from express50.twin.render import RowBand, Sampling, bands, hull_of, render_bands, window_of
 from express50.twin.rig import make_rig
-from express50.twin.shade import Scene, build_scene, find_eyes, make_lighting, shade
+from express50.twin.shade import LitScene, build_scene, find_eyes, make_lighting, shade
 from express50.twin.skin import paint_skin, texture_width
 from express50.twin.subjects import make_subject
 from express50.twin.truth import write_truth
@@ -42,7 +42,7 @@ def _head(spec: str) -> HeadModel:
 Film = VideoFootage | ImageFootage
 
 
-def cast_subject(config: TwinConfig, subject_id: str) -> tuple[Body, Performance]:
+def cast_subject(config: TwinConfig, subject_id: str) -> tuple[Body, TwinPerformance]:
     """A subject's body and what it does in every frame."""
     model, number = _head(config.head), subject_number(subject_id)
     subject = make_subject(model, subject_id, number, config.seed)
@@ -54,7 +54,7 @@ def cast_subject(config: TwinConfig, subject_id: str) -> tuple[Body, Performance
     return body, play
 
 
-class View:
+class StudioView:
     """One camera with what every frame shares: sensor, rays, the empty studio."""
 
     def __init__(self, camera: Camera, index: int, seed: int, keep: bool) -> None:
@@ -102,7 +102,7 @@ def film_subject(
     number, seed = body.subject.number, config.seed
     rig = list(make_rig(config.cameras, config.width, config.height, seed).values())
     keep = config.width * config.height * len(camera_indices) <= _KEEP_PIXELS
-    views = [View(rig[k], k, seed, keep) for k in camera_indices]
+    views = [StudioView(rig[k], k, seed, keep) for k in camera_indices]
     texture = paint_skin(body, seed, texture_width(min(config.width, config.height)))
     eyes, lighting = find_eyes(body.model), make_lighting(number, seed)
     with ExitStack() as stack:
@@ -129,7 +129,7 @@ def film_subject(
             )
 
 
-def render_view(scene: Scene, view: View, hull: np.ndarray) -> np.ndarray:
+def render_view(scene: LitScene, view: StudioView, hull: np.ndarray) -> np.ndarray:
     """Linear picture (H, W, 3) of a frame in one camera, before the sensor.
 
     ``hull`` holds the corners of the convex hull of the scene's vertices.
@@ -146,7 +146,7 @@ def render_view(scene: Scene, view: View, hull: np.ndarray) -> np.ndarray:
     return picture
 
 
-def _subject_in(scene: Scene, window: tuple[int, int, int, int], band: Band):  # noqa: ANN202
+def _subject_in(scene: LitScene, window: tuple[int, int, int, int], band: RowBand):  # noqa: ANN202
     return render_bands(
         scene.caster, scene.body.material, window, band, Sampling(), partial(shade, scene)
     )

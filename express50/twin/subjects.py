@@ -38,7 +38,7 @@ HAIR_STYLES = ("short", "side", "curly", "bob", "buzz", "swept")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Look:
+class PersonLook:
     """Appearance of one subject; colours are linear light, the rest 0 to 1 unless it says so."""
 
     skin: np.ndarray
@@ -59,12 +59,12 @@ class Look:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Subject:
+class TwinSubject:
     """One made-up person on a head model.
 
     Attributes:
         id: subject id.
-        number: number in the id; seeds what is random about the subject.
+        number: number in the id; seeds the subject's random traits.
         shape: (S,) shape coefficients.
         offsets: (V, 3) metres, added to the rest shape, orthogonal to the model's shape space.
         look: appearance.
@@ -74,16 +74,16 @@ class Subject:
     number: int
     shape: np.ndarray
     offsets: np.ndarray
-    look: Look
+    look: PersonLook
 
 
-def make_subject(model: HeadModel, subject_id: str, number: int, seed: int) -> Subject:
+def make_subject(model: HeadModel, subject_id: str, number: int, seed: int) -> TwinSubject:
     """Draw one subject; it depends on the seed and the subject's number only."""
     rng = random_stream(seed, number, 1)
     shape = np.clip(0.8 * rng.standard_normal(len(model.shape_names)), -2.0, 2.0)
     offsets = _displacement(model, random_stream(seed, number, 2))
     look = _make_look(random_stream(seed, number, 3), number)
-    return Subject(id=subject_id, number=number, shape=shape, offsets=offsets, look=look)
+    return TwinSubject(id=subject_id, number=number, shape=shape, offsets=offsets, look=look)
 
 
 def soft_mask(model: HeadModel) -> np.ndarray:
@@ -120,7 +120,7 @@ def _displacement(model: HeadModel, rng: np.random.Generator) -> np.ndarray:
     return (field * (OFFSET_RMS_M / rms)).astype(np.float32)
 
 
-def _make_look(rng: np.random.Generator, number: int) -> Look:
+def _make_look(rng: np.random.Generator, number: int) -> PersonLook:
     """Draw an appearance; neighbouring numbers get unlike skin and hair."""
     # A step of 0.38 through [0, 1) visits it evenly, so that even four subjects are varied.
     tone = (0.15 + 0.381966 * number + rng.uniform(-0.08, 0.08)) % 1.0
@@ -135,7 +135,7 @@ def _make_look(rng: np.random.Generator, number: int) -> Look:
     style = HAIR_STYLES[(number + int(rng.integers(0, 2)) * 3) % len(HAIR_STYLES)]
     length = {"short": 0.035, "side": 0.06, "curly": 0.05, "bob": 0.2, "buzz": 0.008, "swept": 0.09}
     eyes = _blend(_EYE_COLOURS, rng.uniform(0.0, 1.0) * (1.0 - 0.8 * float(dark)))
-    return Look(
+    return PersonLook(
         skin=skin,
         flush=float(rng.uniform(0.3, 1.0)),
         freckles=float(rng.uniform(0.0, 1.0) ** 3 * (1.0 - float(dark))),

@@ -43,7 +43,7 @@ class Caster:
         )  # fmt: skip
 
     def blocked(self, origins: np.ndarray, directions: np.ndarray, far: float) -> np.ndarray:
-        """Whether (N,) rays of unit directions (N, 3) meet anything nearer than ``far`` metres."""
+        """Return (N,) True for rays of unit directions (N, 3) that hit within ``far`` metres."""
         rays = np.concatenate([origins, directions], axis=1).astype(np.float32)
         answer = self._scene.test_occlusions(o3d.core.Tensor(rays), tnear=0.0, tfar=far, nthreads=1)
         return answer.numpy()
@@ -92,7 +92,7 @@ def smooth_over_mesh(values: np.ndarray, faces: np.ndarray, rounds: int) -> np.n
 
 
 class StarMap:
-    """How far the outer surface of a head is from its centre, in every direction."""
+    """Distance of a head's outer surface from its centre, in every direction."""
 
     def __init__(self, vertices: np.ndarray, faces: np.ndarray, centre: np.ndarray) -> None:
         self.centre = np.asarray(centre, dtype=np.float64)
@@ -108,7 +108,7 @@ class StarMap:
         self._radius = np.where(np.isfinite(radius) & (radius > 0), radius, 0.0)
 
     def radius(self, directions: np.ndarray) -> np.ndarray:
-        """Radius (N,) in unit directions (N, 3), metres, bilinear; 0 where there is no surface."""
+        """Radius (N,) in unit directions (N, 3), metres, bilinear; 0 where nothing is hit."""
         az, el = unit_to_spherical(directions)
         x = corner_to_cell((az + np.pi) / (2 * np.pi) * self._columns)
         y = corner_to_cell((el + 0.5 * np.pi) / np.pi * self._rows)

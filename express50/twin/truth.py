@@ -25,8 +25,8 @@ from express50.head.model import landmarks as head_landmarks
 from express50.twin import render
 from express50.twin.body import Body, Extras, assemble, head_vertices, pose_body
 from express50.twin.hair import HairMesh
-from express50.twin.performance import Performance
-from express50.twin.subjects import Look, Subject
+from express50.twin.performance import TwinPerformance
+from express50.twin.subjects import PersonLook, TwinSubject
 from express50.twin.surface import MISS, Caster
 
 SKIN_M = 0.5e-3  # hair roots stand on the skin; what lies this near to it is skin
@@ -34,7 +34,7 @@ _PLAY = ("strength", "expression", "jaw", "neck", "eyes", "R", "t")
 
 
 def write_truth(
-    folder: Path, head: str, body: Body, play: Performance, cameras: Mapping[str, Camera]
+    folder: Path, head: str, body: Body, play: TwinPerformance, cameras: Mapping[str, Camera]
 ) -> None:
     """Write a subject's truth: cameras.json, peaks.json, subject.json, frames.npz, body.npz."""
     folder.mkdir(parents=True, exist_ok=True)
@@ -131,7 +131,7 @@ class Truth:
         return valid & there & (np.abs(bare - depth) < SKIN_M)
 
     def surface(self, subject: str, frame: int, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-        """What each pixel's centre shows.
+        """Intersect each pixel's centre ray with the scene.
 
         Returns:
             material (H, W) int16, a `Material`, -1 where nothing is; vertex (H, W) int64, the
@@ -149,7 +149,7 @@ class Truth:
         return material.reshape(directions.shape[:2]), vertex.reshape(directions.shape[:2])
 
     def hairiness(self, subject: str) -> np.ndarray:
-        """How hairy each head vertex's skin is (V,), 0 to 1; 0 everywhere on the bald."""
+        """Hair density per head vertex (V,), 0 to 1; 0 everywhere on bald subjects."""
         body = self._subject(subject)[0]
         return body.scalp if len(body.extras.hair.faces) else np.zeros_like(body.scalp)
 
@@ -164,13 +164,13 @@ class Truth:
         vertices = pose_body(body, play, frame, with_normals=False).vertices
         return Caster(vertices, body.faces), vertices
 
-    def _check_frame(self, subject: str, play: Performance, frame: int) -> None:
+    def _check_frame(self, subject: str, play: TwinPerformance, frame: int) -> None:
         if not 0 <= frame < play.frames:
             raise ValueError(
                 f"{subject}: frame {frame} not in truth, expected 0..{play.frames - 1}"
             )
 
-    def _read_subject(self, subject: str) -> tuple[Body, Performance]:
+    def _read_subject(self, subject: str) -> tuple[Body, TwinPerformance]:
         folder = self.root / subject
         if not (folder / "subject.json").is_file():
             raise CaptureError(
@@ -180,7 +180,7 @@ class Truth:
         peaks = json.loads((folder / "peaks.json").read_text())
         with np.load(folder / "frames.npz", allow_pickle=False) as data:
             arrays = {name: data[name] for name in _PLAY}
-        play = Performance(
+        play = TwinPerformance(
             cues=tuple((str(e), int(a), int(b)) for e, a, b in about["cues"]), peaks=peaks, **arrays
         )
         with np.load(folder / "body.npz", allow_pickle=False) as data:
@@ -193,8 +193,8 @@ def _read_body(about: dict, data: dict[str, np.ndarray]) -> Body:
     fields: dict[str, Any] = about["look"]
     for name, value in fields.items():
         fields[name] = np.array(value) if isinstance(value, list) else value
-    look = Look(**fields)
-    subject = Subject(
+    look = PersonLook(**fields)
+    subject = TwinSubject(
         id=about["id"], number=about["number"], shape=data["shape"], offsets=data["offsets"],
         look=look,
     )  # fmt: skip

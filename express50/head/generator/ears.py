@@ -37,7 +37,7 @@ def _place(pq: Array, x: Array) -> Array:
 
 
 def _flare(pq: Array) -> Array:
-    """How far (mm) the ear's plane stands off the head's side."""
+    """Return the distance (mm) of the ear's plane from the head's side."""
     back = np.logaddexp(0.0, 0.35 * (pq[:, 0] + 5.0)) / 0.35  # a smooth max(0, p + 5)
     return 0.5 + 0.5 * back - 0.0016 * pq[:, 1] ** 2
 

@@ -47,7 +47,7 @@ def displacement(mesh: WholeMesh, pulls: tuple[Pull, ...], scopes: dict[str, Arr
 
 
 def scope_weights(mesh: WholeMesh, regions: dict[str, Array], jaw: Array) -> dict[str, Array]:
-    """Vertex weights (V,) of each scope. `jaw` tells lower from upper lip."""
+    """Vertex weights (V,) of each scope. `jaw` separates the lower lip from the upper."""
     hard = regions["teeth"] | regions["gums"] | regions["tongue"]
     balls = regions["left_eyeball"] | regions["right_eyeball"]
     skin = (~hard & ~balls).astype(float)

@@ -203,7 +203,7 @@ def _turn(offset: Array, angle: Array) -> Array:
 def shape_directions(
     mesh: WholeMesh, regions: dict[str, Array], jaw: Array
 ) -> tuple[tuple[str, ...], Array]:
-    """Names (S) and directions (V,3,S) in mm a unit. `jaw` (V,) tells lower from upper lip."""
+    """Names (S) and directions (V,3,S) in mm per unit. `jaw` (V,) separates the lips."""
     scopes = scope_weights(mesh, regions, jaw)
     result = {}
     for name, pulls in PULLS.items():

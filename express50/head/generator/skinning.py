@@ -34,7 +34,7 @@ def joint_regressor(mesh: WholeMesh, joints: Array) -> Array:
 
 
 def smoothstep(value: Array, low: float, high: float) -> Array:
-    """0 below low, 1 above high (low may exceed high), C1 in between."""
+    """Step smoothly from 0 at low to 1 at high (low may exceed high), C1."""
     t = np.clip((value - low) / (high - low), 0.0, 1.0)
     return t * t * (3 - 2 * t)
 

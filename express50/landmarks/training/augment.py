@@ -15,7 +15,7 @@ Rng = np.random.Generator
 
 
 @dataclass(frozen=True)
-class Crop:
+class TrainingCrop:
     """A training crop.
 
     Attributes:
@@ -35,7 +35,7 @@ class Crop:
 
 def random_crop(
     views: ViewSet, index: int, backgrounds: np.ndarray, rng: Rng, size: int = CROP
-) -> Crop:
+) -> TrainingCrop:
     """Draw one training crop of a view, (size, size) pixels."""
     points = views.points[index].astype(np.float64)
     centre, side = face_box(points)
@@ -60,7 +60,7 @@ def random_crop(
     score = 0.0 if empty else float(np.clip((facing + 0.15) / 0.3, 0.0, 1.0))
     weight = 0.0 if empty else float(np.clip((facing + 0.3) / 0.4, 0.0, 1.0))
     visible = (visible & ~_is_set(covered, points * (size / CROP))).astype(np.float32)
-    return Crop(_spoil(image, rng), points.astype(np.float32), visible, score, weight)
+    return TrainingCrop(_spoil(image, rng), points.astype(np.float32), visible, score, weight)
 
 
 def _crop_matrix(centre: np.ndarray, side: float, angle: float, mirror: bool) -> np.ndarray:
@@ -150,7 +150,7 @@ def _whole(values: np.ndarray) -> tuple[int, int]:
 
 
 def _is_set(mask: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Whether a mask is set at points (P, 2), or they lie outside it."""
+    """Return (P,) True where a mask is set at points (P, 2), or they lie outside it."""
     column, row = np.floor(points).astype(int).T
     inside = (column >= 0) & (row >= 0) & (column < mask.shape[1]) & (row < mask.shape[0])
     out = ~inside

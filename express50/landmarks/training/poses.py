@@ -1,7 +1,7 @@
 """Random shape, expression and pose of the heads that the landmark detector learns from.
 
 Most heads play entries of the 60-expression script, weaker, stronger, lopsided or two at once; the
-others move random muscles, so that what nobody scripted is not unheard of either.
+others move random muscles, so that unscripted expressions occur as well.
 """
 
 from __future__ import annotations

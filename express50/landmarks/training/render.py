@@ -18,7 +18,7 @@ Rng = np.random.Generator
 
 
 @dataclass(frozen=True)
-class View:
+class TrainingView:
     """A rendered view.
 
     Attributes:
@@ -42,7 +42,7 @@ class HeadScene:
         self.head = head
         self.scene = mesh_scene(head.vertices, self.faces)
 
-    def render(self, rng: Rng, side: int, yaw: float) -> View:
+    def render(self, rng: Rng, side: int, yaw: float) -> TrainingView:
         """Render (side, side) pixels from a yaw in radians, 0 in front; the rest is random."""
         points = self.head.landmarks
         K, cam_from_world = _random_camera(points, rng, side, yaw)
@@ -56,10 +56,10 @@ class HeadScene:
         rgba = self._shade(rays, rng, side)
         eye = -cam_from_world[:3, :3].T @ cam_from_world[:3, 3]
         visible = self._visible(eye)
-        return View(rgba, pixels[:, :2] / pixels[:, 2:], visible, _facing(points, eye))
+        return TrainingView(rgba, pixels[:, :2] / pixels[:, 2:], visible, _facing(points, eye))
 
     def _visible(self, eye: np.ndarray) -> np.ndarray:
-        """Which landmarks (68,) a camera at `eye` sees."""
+        """Return (68,) True for landmarks that a camera at `eye` sees."""
         towards = self.head.landmarks - eye
         rays = np.concatenate([np.broadcast_to(eye, towards.shape), towards], axis=1)
         share = self.scene.cast_rays(o3d.core.Tensor(rays.astype(np.float32)))["t_hit"].numpy()

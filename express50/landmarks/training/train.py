@@ -31,7 +31,7 @@ from express50.landmarks.network import (
     load_network,
     save_network,
 )
-from express50.landmarks.training.augment import Crop, make_backgrounds, random_crop
+from express50.landmarks.training.augment import TrainingCrop, make_backgrounds, random_crop
 from express50.landmarks.training.training_set import FILE_VIEWS, ViewSet, make_views, read_views
 
 BATCH = 32
@@ -46,13 +46,13 @@ HELD_OUT = 0
 
 
 @dataclass(frozen=True, kw_only=True)
-class Plan:
-    """How to train.
+class TrainingPlan:
+    """Settings of a training run.
 
     Attributes:
         steps: batches of crops in all.
         small_steps: of these, the first that are at half resolution.
-        files: files of views a head model.
+        files: files of views per head model.
         seed: of everything random.
     """
 
@@ -63,23 +63,28 @@ class Plan:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Render what is missing, train, save and report the error on held-out heads."""
+    """Render missing views, train, save and report the error on held-out heads."""
     parser = argparse.ArgumentParser(
         prog="python -m express50.landmarks.training.train", description=__doc__
     )
     parser.add_argument("--views", type=Path, required=True, help="folder for rendered views")
     parser.add_argument("--ict", help="ICT-FaceKit checkout or .npz to train on as well")
-    parser.add_argument("--files", type=int, default=Plan.files, help="files of views a head")
-    parser.add_argument("--steps", type=int, default=Plan.steps, help="batches of 32 crops")
     parser.add_argument(
-        "--small-steps", type=int, default=Plan.small_steps, help="of these, at half resolution"
+        "--files", type=int, default=TrainingPlan.files, help="files of views per head"
     )
-    parser.add_argument("--seed", type=int, default=Plan.seed)
+    parser.add_argument("--steps", type=int, default=TrainingPlan.steps, help="batches of 32 crops")
+    parser.add_argument(
+        "--small-steps",
+        type=int,
+        default=TrainingPlan.small_steps,
+        help="of these, at half resolution",
+    )
+    parser.add_argument("--seed", type=int, default=TrainingPlan.seed)
     parser.add_argument("--out", type=Path, default=WEIGHTS)
     options = parser.parse_args(arguments)
     torch.set_num_threads(1)
     models = [load_head(spec) for spec in ("procedural", options.ict) if spec]
-    plan = Plan(
+    plan = TrainingPlan(
         steps=options.steps,
         small_steps=options.small_steps,
         files=options.files,
@@ -93,7 +98,7 @@ def main(arguments: list[str] | None = None) -> int:
     return 0
 
 
-def train(models: list[HeadModel], plan: Plan, folder: Path) -> LandmarkNet:
+def train(models: list[HeadModel], plan: TrainingPlan, folder: Path) -> LandmarkNet:
     """Train on views of the head models; views and the run's state are kept in a folder."""
     torch.manual_seed(plan.seed)
     backgrounds = make_backgrounds(400, np.random.default_rng([plan.seed, 1]))
@@ -164,7 +169,7 @@ def take_up(path: Path, net: torch.nn.Module, optimiser: torch.optim.Optimizer) 
 
 
 @dataclass(frozen=True)
-class Batch:
+class LandmarkBatch:
     """Stacked crops: images (B, 3, H, W) in [0, 1], points (B, 68, 2), the rest (B[, 68])."""
 
     images: torch.Tensor
@@ -174,10 +179,10 @@ class Batch:
     weight: torch.Tensor
 
 
-def crop_batch(crops: list[Crop]) -> Batch:
+def crop_batch(crops: list[TrainingCrop]) -> LandmarkBatch:
     """Stack crops for the network."""
     images = torch.from_numpy(np.stack([crop.image for crop in crops])).permute(0, 3, 1, 2)
-    return Batch(
+    return LandmarkBatch(
         images.contiguous(memory_format=torch.channels_last).float() / 255.0,
         torch.from_numpy(np.stack([crop.points for crop in crops])),
         torch.from_numpy(np.stack([crop.visible for crop in crops])),
@@ -186,7 +191,7 @@ def crop_batch(crops: list[Crop]) -> Batch:
     )
 
 
-def crop_loss(net: LandmarkNet, crops: list[Crop]) -> torch.Tensor:
+def crop_loss(net: LandmarkNet, crops: list[TrainingCrop]) -> torch.Tensor:
     """Distance and Laplace likelihood of the points, cross entropies of heat maps and answers."""
     batch = crop_batch(crops)
     output = net(batch.images)

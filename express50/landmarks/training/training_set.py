@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from express50.head.model import HeadModel
-from express50.landmarks.training.render import HeadScene, View
+from express50.landmarks.training.render import HeadScene, TrainingView
 from express50.landmarks.training.skin import random_head
 
 SIDE = 192
@@ -49,9 +49,9 @@ def draw_yaws(rng: np.random.Generator) -> np.ndarray:
     return np.append(front, rng.uniform(FACE_YAW, 2 * np.pi - FACE_YAW))
 
 
-def draw_views(model: HeadModel, count: int, rng: np.random.Generator) -> list[View]:
+def draw_views(model: HeadModel, count: int, rng: np.random.Generator) -> list[TrainingView]:
     """Render `count` views of random heads."""
-    views: list[View] = []
+    views: list[TrainingView] = []
     while len(views) < count:
         scene = HeadScene(model, random_head(model, rng))
         yaws = draw_yaws(rng)[: count - len(views)]
@@ -59,7 +59,7 @@ def draw_views(model: HeadModel, count: int, rng: np.random.Generator) -> list[V
     return views
 
 
-def stack_views(views: list[View]) -> ViewSet:
+def stack_views(views: list[TrainingView]) -> ViewSet:
     """One set of rendered views."""
     return ViewSet(
         **{
