@@ -42,7 +42,6 @@ from express50.geometry.transforms import (
     rigid_fit,
 )
 from express50.landmarks.network import load_network
-from express50.rigs.footage import check_footage
 from express50.rigs.world_frame import meeting_point
 from express50.runner.runner import run_stage
 from express50.twin.config import TwinConfig
@@ -58,7 +57,8 @@ from pipelines.calibrate.board import (
     board_points,
     read_observations,
 )
-from pipelines.calibrate.bundle import Rig, residuals
+from pipelines.calibrate.board_adjust import Rig, residuals
+from pipelines.calibrate.camera_moves import check_footage
 from pipelines.calibrate.colour import Palette, gains_of
 from pipelines.calibrate.config import CalibrateConfig
 from pipelines.calibrate.graph import join, mean_transform, rig_from_board

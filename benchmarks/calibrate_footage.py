@@ -20,16 +20,16 @@ from express50.errors import CalibrationError
 from express50.geometry.cameras import Camera
 from express50.geometry.transforms import matrix_to_axis_angle, similarity_fit
 from express50.landmarks.network import load_network
-from express50.rigs.adjust import move_pose
-from express50.rigs.features import match_looks
-from express50.rigs.footage import reduce_image, reduced_camera
-from express50.rigs.sampling import read_moments
-from express50.rigs.tracks import Seen, look, undistorted
+from pipelines.calibrate.adjust import move_pose
 from pipelines.calibrate.board import Observations
+from pipelines.calibrate.camera_moves import reduce_image, reduced_camera
 from pipelines.calibrate.config import CalibrateConfig
 from pipelines.calibrate.faces import start_camera
+from pipelines.calibrate.features import match_looks
 from pipelines.calibrate.refine import Refined, refine_by_board, refine_by_footage
+from pipelines.calibrate.sampling import read_moments
 from pipelines.calibrate.structure import solve_footage
+from pipelines.calibrate.tracks import Seen, look, undistorted
 
 BUMP_DEG, BUMP_MM = 0.3, 5.0
 Judge = Callable[[Mapping[str, Camera], Mapping[str, Camera]], dict[str, float]]

@@ -19,7 +19,7 @@ AREAS = {
     "twin": ("express50.twin.cli", "record a synthetic capture with known truth"),
     "annotate": ("annotations.cli", "label peak frames, review and export labels"),
     "shards": ("express50.cli.shards", "look into packed shards and verify them"),
-    "cameras": ("express50.cli.cameras", "import and check calibrations"),
+    "cameras": ("pipelines.calibrate.cli", "import and check calibrations"),
     "head": ("express50.cli.head", "look at a head model"),
     "photo": ("pipelines.photo.cli", "track the face of a bare photograph or video"),
     "check": ("express50.cli.check", "audit a dataset against its ledger, and mend it"),

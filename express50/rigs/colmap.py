@@ -16,7 +16,7 @@ from express50.errors import CalibrationError
 from express50.files.text import read_bytes, read_text, reason
 from express50.geometry.cameras import Camera
 from express50.geometry.transforms import make_transform, quat_to_matrix
-from express50.rigs.build import checked, names_from_files
+from express50.rigs.camera_builder import checked, names_from_files
 
 # COLMAP's models that our cameras have under the same name and order, by COLMAP's number: how many
 # parameters each has.

@@ -17,7 +17,7 @@ from express50.files.text import TOML_LIMIT, read_text, reason
 from express50.geometry.cameras import Camera
 from express50.geometry.conventions import K_from_opencv
 from express50.geometry.transforms import axis_angle_to_matrix, make_transform
-from express50.rigs.build import camera_from_K, checked
+from express50.rigs.camera_builder import camera_from_K, checked
 
 # Names in use: OpenCV's calibration sample, its stereo sample, ROS, and hand-written files.
 _K = ("camera_matrix", "cameraMatrix", "K", "M", "intrinsics")

@@ -7,10 +7,10 @@ from pathlib import Path
 from express50.errors import CalibrationError
 from express50.files.calibration import read_cameras
 from express50.geometry.cameras import Camera
-from express50.rigs.build import at_size, holds, in_metres
+from express50.rigs.camera_builder import at_size, holds, in_metres
 from express50.rigs.colmap import is_colmap, read_colmap
+from express50.rigs.dataset_formats import is_nersemble, is_renderme, read_nersemble, read_renderme
 from express50.rigs.opencv_yaml import is_opencv_yaml, read_opencv_yaml
-from express50.rigs.releases import is_nersemble, is_renderme, read_nersemble, read_renderme
 from express50.rigs.transforms_json import is_transforms, read_transforms
 
 FORMATS = ("express50", "colmap", "opencv", "transforms", "nersemble", "renderme360")

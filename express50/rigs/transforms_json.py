@@ -13,7 +13,13 @@ import numpy as np
 from express50.errors import CalibrationError
 from express50.geometry.cameras import Camera
 from express50.geometry.conventions import cam_from_world_from_opengl
-from express50.rigs.build import camera_from_K, checked, holds, names_from_files, read_table
+from express50.rigs.camera_builder import (
+    camera_from_K,
+    checked,
+    holds,
+    names_from_files,
+    read_table,
+)
 
 _HELD = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE")
 

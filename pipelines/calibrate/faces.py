@@ -15,8 +15,8 @@ import numpy as np
 
 from express50.geometry.cameras import Camera
 from express50.geometry.transforms import invert_transform, make_transform
-from express50.rigs.tracks import Seen
 from pipelines.calibrate.graph import join, mean_transform
+from pipelines.calibrate.tracks import Seen
 
 NOMINAL = 2.5
 """Focal length, in the image's longer side, at which distances are first told."""

@@ -10,8 +10,8 @@ import numpy as np
 from express50.capture.index import Index
 from express50.geometry.cameras import Camera
 from express50.landmarks.network import load_network
-from express50.rigs.footage import FootageVerdict, check_footage, reduce_image
-from pipelines.calibrate.footage import read_footage
+from pipelines.calibrate.camera_moves import FootageVerdict, check_footage, reduce_image
+from pipelines.calibrate.footage_views import read_footage
 
 
 def look_at_footage(

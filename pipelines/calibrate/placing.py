@@ -10,11 +10,11 @@ import numpy as np
 
 from express50.geometry.cameras import Camera
 from express50.geometry.transforms import make_transform
-from express50.rigs.adjust import triangulate_tracks
-from express50.rigs.features import match_looks
-from express50.rigs.tracks import Seen, join_verified
+from pipelines.calibrate.adjust import triangulate_tracks
 from pipelines.calibrate.faces import start_camera
+from pipelines.calibrate.features import match_looks
 from pipelines.calibrate.intrinsics import as_model
+from pipelines.calibrate.tracks import Seen, join_verified
 
 LEAST_INLIERS, LEAST_SHARE, INLIER_PX = 12, 0.4, 4.0
 """Known points, and share of those it seems to see, by which a camera without a face is placed."""

@@ -18,16 +18,16 @@ from express50.geometry.transforms import (
     matrix_to_axis_angle,
     rigid_fit,
 )
-from express50.rigs.adjust import triangulate_tracks
-from express50.rigs.bundle import ITERATIONS, Freedom, adjust_rig, recorded_pixels
-from express50.rigs.footage import LEAST_POINTS, shared_points
-from express50.rigs.tracks import FEATURE_SIGMA_PX, Seen, Tracks, ideal_pixels, join_verified
 from express50.rigs.world_frame import move_cameras
 from pipelines.calibrate import graph
+from pipelines.calibrate.adjust import triangulate_tracks
+from pipelines.calibrate.adjuster import ITERATIONS, Freedom, adjust_rig, recorded_pixels
 from pipelines.calibrate.board import Observations
-from pipelines.calibrate.bundle import Rig, adjust, residuals
+from pipelines.calibrate.board_adjust import Rig, adjust, residuals
+from pipelines.calibrate.camera_moves import LEAST_POINTS, shared_points
 from pipelines.calibrate.config import CalibrateConfig
 from pipelines.calibrate.intrinsics import View, board_poses, usable, with_ideal
+from pipelines.calibrate.tracks import FEATURE_SIGMA_PX, Seen, Tracks, ideal_pixels, join_verified
 
 HELD = 5
 """Every fifth point, or board image, judges and is not adjusted to."""

@@ -15,7 +15,7 @@ from express50.geometry.cameras import Camera
 from express50.rigs.world_frame import canonical_from_rig, move_cameras
 from pipelines.calibrate import graph
 from pipelines.calibrate.board import Observations, even
-from pipelines.calibrate.bundle import Rig, adjust, residuals
+from pipelines.calibrate.board_adjust import Rig, adjust, residuals
 from pipelines.calibrate.config import AUTO, CalibrateConfig
 from pipelines.calibrate.intrinsics import (
     View,

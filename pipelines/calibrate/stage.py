@@ -14,8 +14,6 @@ from express50.errors import CalibrationError, CaptureError
 from express50.files.calibration import read_cameras, write_cameras
 from express50.geometry.cameras import Camera, resized
 from express50.landmarks.network import WEIGHTS
-from express50.rigs.footage import reduced_camera
-from express50.rigs.tracks import undistorted
 from express50.rigs.world_frame import check_meeting
 from pipelines.calibrate.board import (
     Observations,
@@ -23,15 +21,17 @@ from pipelines.calibrate.board import (
     board_points,
     read_observations,
 )
+from pipelines.calibrate.camera_moves import reduced_camera
 from pipelines.calibrate.colour import Palette
 from pipelines.calibrate.config import PRESETS, CalibrateConfig
 from pipelines.calibrate.faces import start_camera
-from pipelines.calibrate.footage import see_footage, told_focals
+from pipelines.calibrate.footage_views import see_footage, told_focals
 from pipelines.calibrate.moved import footage_metrics, look_at_footage
 from pipelines.calibrate.pictures import draw_residuals, draw_rig
 from pipelines.calibrate.refine import Refined, refine_by_board, refine_by_footage
 from pipelines.calibrate.solve import Solution, solve_rig
 from pipelines.calibrate.structure import Structure, inliers, solve_footage
+from pipelines.calibrate.tracks import undistorted
 
 COLOUR_FRAMES = 12
 """Board images read a camera where only its colours are to be told."""

@@ -16,10 +16,15 @@ import numpy as np
 from express50.errors import CalibrationError
 from express50.geometry.cameras import Camera, triangulate
 from express50.geometry.transforms import rigid_fit
-from express50.rigs.adjust import triangulate_tracks
-from express50.rigs.bundle import ITERATIONS, Adjusted, Freedom, adjust_rig
-from express50.rigs.footage import LEAST_POINTS, shared_points
-from express50.rigs.tracks import (
+from express50.rigs.world_frame import canonical_from_rig, move_cameras
+from pipelines.calibrate.adjust import triangulate_tracks
+from pipelines.calibrate.adjuster import ITERATIONS, Adjusted, Freedom, adjust_rig
+from pipelines.calibrate.camera_moves import LEAST_POINTS, shared_points
+from pipelines.calibrate.config import AUTO, CalibrateConfig
+from pipelines.calibrate.faces import face_rig, focal_at, mean_landmarks, start_camera
+from pipelines.calibrate.intrinsics import as_model
+from pipelines.calibrate.placing import LEAST_INLIERS, place_others
+from pipelines.calibrate.tracks import (
     FEATURE_SIGMA_PX,
     Seen,
     Tracks,
@@ -27,11 +32,6 @@ from express50.rigs.tracks import (
     tracks_of,
     undistorted,
 )
-from express50.rigs.world_frame import canonical_from_rig, move_cameras
-from pipelines.calibrate.config import AUTO, CalibrateConfig
-from pipelines.calibrate.faces import face_rig, focal_at, mean_landmarks, start_camera
-from pipelines.calibrate.intrinsics import as_model
-from pipelines.calibrate.placing import LEAST_INLIERS, place_others
 
 FACE_SCALES, FEATURE_SCALES = (6.0, 2.0), (3.0, 1.5)
 """Cauchy scales of the adjustments, in expected errors, wide ones first."""

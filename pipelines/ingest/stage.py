@@ -31,7 +31,7 @@ from express50.files.digests import stat_digest, text_digest
 from express50.files.images import contact_sheet, write_image
 from express50.files.text import read_json_table
 from express50.geometry.cameras import Camera
-from express50.rigs.build import at_size
+from express50.rigs.camera_builder import at_size
 from pipelines.ingest.checks import look
 from pipelines.ingest.config import PRESETS, IngestConfig
 from pipelines.ingest.scan import Seen, remove_proxies, scan_camera, time_gaps, trimmed

@@ -16,7 +16,7 @@ from express50.errors import FormatError
 from express50.files.exif import read_exif, upright
 from express50.runner.runner import run_stage
 from pipelines import ingest
-from pipelines.calibrate.footage import told_focals
+from pipelines.calibrate.footage_views import told_focals
 
 WIDTH, HEIGHT, FILM_MM = 64, 48, 28
 # What a camera stores of the upright picture under each orientation, as EXIF defines them: where

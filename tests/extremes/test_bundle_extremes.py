@@ -5,8 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from express50.rigs.bundle import Freedom, adjust_rig
-from tests.express50.rigs.test_bundle import bumped, make_rig, spots, tracks_errors, tracks_in
+from pipelines.calibrate.adjuster import Freedom, adjust_rig
+from tests.pipelines.test_calibrate_adjuster import (
+    bumped,
+    make_rig,
+    spots,
+    tracks_errors,
+    tracks_in,
+)
 
 
 @pytest.mark.parametrize(

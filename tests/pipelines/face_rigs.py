@@ -8,8 +8,8 @@ import numpy as np
 
 from express50.geometry.cameras import Camera, project
 from express50.geometry.transforms import axis_angle_to_matrix, look_at
-from express50.rigs.adjust import move_pose
-from express50.rigs.tracks import Seen
+from pipelines.calibrate.adjust import move_pose
+from pipelines.calibrate.tracks import Seen
 
 SIZE = (640, 480)
 RADII = np.array([0.075, 0.11, 0.09])

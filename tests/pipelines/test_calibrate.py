@@ -19,7 +19,7 @@ from pipelines.calibrate.board import (
     make_detector,
     opencv_board,
 )
-from pipelines.calibrate.bundle import residuals
+from pipelines.calibrate.board_adjust import residuals
 from pipelines.calibrate.config import CalibrateConfig
 from pipelines.calibrate.solve import Rig, solve_rig
 from pipelines.calibrate.stage import check_given

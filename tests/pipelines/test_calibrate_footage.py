@@ -15,13 +15,13 @@ from express50.errors import CalibrationError, ConfigError
 from express50.files.calibration import camera_rows
 from express50.files.images import write_image
 from express50.geometry.transforms import similarity_fit
-from express50.rigs.tracks import Seen, undistorted
 from pipelines.calibrate.config import CalibrateConfig
 from pipelines.calibrate.faces import pose_of_face, start_camera
-from pipelines.calibrate.footage import _film_focal
+from pipelines.calibrate.footage_views import _film_focal
 from pipelines.calibrate.placing import _resection
 from pipelines.calibrate.refine import refine_by_board, refine_by_footage
 from pipelines.calibrate.structure import inliers, solve_footage
+from pipelines.calibrate.tracks import Seen, undistorted
 from tests.pipelines.board_rigs import POINTS, board_motion, make_rig, observe, rig_errors
 from tests.pipelines.face_rigs import SIZE, face, face_cameras, perturbed, see
 

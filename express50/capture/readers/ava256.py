@@ -21,7 +21,7 @@ from express50.files.containers import WITHIN, open_zip
 from express50.files.text import read_text
 from express50.geometry.cameras import Camera
 from express50.geometry.conventions import K_from_opencv
-from express50.rigs.build import camera_from_K, checked, in_metres, read_table
+from express50.rigs.camera_builder import camera_from_K, checked, in_metres, read_table
 
 CAMERAS = Path("decoder/camera_calibration.json")
 FRAMES = Path("decoder/frame_list.csv")

@@ -19,7 +19,7 @@ from express50.errors import CalibrationError, CaptureError
 from express50.files.text import NAME, read_text
 from express50.geometry.cameras import Camera
 from express50.geometry.conventions import K_from_opencv
-from express50.rigs.build import camera_from_K, checked, in_metres
+from express50.rigs.camera_builder import camera_from_K, checked, in_metres
 
 SIZE = (1334, 2048)
 FPS = 30.0

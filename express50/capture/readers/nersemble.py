@@ -14,8 +14,8 @@ from express50.capture.readers.selection import Wishes, check_wishes, identifier
 from express50.capture.readers.timeline import Moment, common_timeline
 from express50.errors import CaptureError
 from express50.files.video import video_fps
-from express50.rigs.build import read_table
-from express50.rigs.releases import read_nersemble
+from express50.rigs.camera_builder import read_table
+from express50.rigs.dataset_formats import read_nersemble
 
 CAMERAS = Path("calibration/camera_params.json")
 COLOURS = Path("calibration/color_calibration.json")

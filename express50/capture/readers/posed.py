@@ -15,7 +15,7 @@ from express50.capture.readers.timeline import Moment, common_timeline
 from express50.errors import CalibrationError, CaptureError
 from express50.files.containers import inside
 from express50.geometry.cameras import Camera
-from express50.rigs.build import in_metres, read_table
+from express50.rigs.camera_builder import in_metres, read_table
 from express50.rigs.colmap import is_colmap, read_colmap_images
 from express50.rigs.transforms_json import camera_names, read_transforms
 

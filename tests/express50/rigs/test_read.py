@@ -13,7 +13,7 @@ from express50.files.calibration import write_cameras
 from express50.geometry.cameras import Camera, project, resized
 from express50.geometry.conventions import K_to_opencv, opengl_from_cam_from_world
 from express50.geometry.transforms import look_at, matrix_to_axis_angle
-from express50.rigs.build import names_from_files
+from express50.rigs.camera_builder import names_from_files
 from express50.rigs.read import guess_format, read_rig
 
 HEAD = np.array([[0.02, 1.3, 0.05], [-0.05, 1.22, -0.03], [0.0, 1.25, 0.0]])

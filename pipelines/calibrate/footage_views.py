@@ -14,10 +14,10 @@ from express50.errors import CalibrationError, FormatError
 from express50.files.exif import read_exif
 from express50.geometry.cameras import Camera
 from express50.landmarks.network import load_network
-from express50.rigs.features import Features, find_features, without_fixed
-from express50.rigs.footage import reduce_image
-from express50.rigs.sampling import spread, spread_moments
-from express50.rigs.tracks import Seen, find_face
+from pipelines.calibrate.camera_moves import reduce_image
+from pipelines.calibrate.features import Features, find_features, without_fixed
+from pipelines.calibrate.sampling import spread, spread_moments
+from pipelines.calibrate.tracks import Seen, find_face
 
 FILM_DIAGONAL_MM = math.hypot(36.0, 24.0)
 

@@ -16,7 +16,7 @@ from express50.errors import CalibrationError, CaptureError
 from express50.files.containers import attribute, child, members, open_hdf5, read_array
 from express50.geometry.cameras import Camera
 from express50.geometry.conventions import K_from_opencv
-from express50.rigs.build import camera_from_K, checked, holds, read_table
+from express50.rigs.camera_builder import camera_from_K, checked, holds, read_table
 
 NERSEMBLE_SIZE = (2200, 3208)
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from express50.geometry.cameras import Camera
 from express50.geometry.transforms import axis_angle_to_matrix, make_transform
-from express50.rigs.tracks import Tracks
+from pipelines.calibrate.tracks import Tracks
 
 # How far a camera may be taken to have moved before the footage has a say.
 PRIOR_RAD, PRIOR_M = np.radians(1.0), 0.01

@@ -15,8 +15,8 @@ import numpy as np
 import scipy.sparse as sparse
 
 from express50.geometry.cameras import Camera, distort
-from express50.rigs.adjust import move_pose
-from express50.rigs.tracks import Tracks
+from pipelines.calibrate.adjust import move_pose
+from pipelines.calibrate.tracks import Tracks
 
 UNKNOWNS = 10
 """A camera's: rotation (3), translation (3), log focal length, centre (2), first radial term."""

@@ -9,9 +9,9 @@ import pytest
 
 from express50.geometry.cameras import Camera, project
 from express50.geometry.transforms import look_at
-from express50.rigs.adjust import move_pose, triangulate_tracks
-from express50.rigs.bundle import Freedom, _linearise, _moved, adjust_rig, recorded_pixels
-from express50.rigs.tracks import Tracks, ideal_pixels
+from pipelines.calibrate.adjust import move_pose, triangulate_tracks
+from pipelines.calibrate.adjuster import Freedom, _linearise, _moved, adjust_rig, recorded_pixels
+from pipelines.calibrate.tracks import Tracks, ideal_pixels
 
 LENSES = {
     "SIMPLE_PINHOLE": (900.0, 320.0, 240.0),

@@ -18,7 +18,7 @@ from express50.rigs.read import FORMATS, guess_format, read_rig
 from express50.rigs.rig_check import RigVerdict, judge
 
 if TYPE_CHECKING:
-    from express50.rigs.footage import FootageVerdict
+    from pipelines.calibrate.camera_moves import FootageVerdict
 
 
 def add_commands(subparsers: Any) -> None:
@@ -88,8 +88,8 @@ def run_check(args: argparse.Namespace) -> int:
 def _look_at_footage(args: argparse.Namespace, cameras: Mapping[str, Camera]) -> FootageVerdict:
     # Imported here: the other commands need neither torch nor OpenCV's features.
     from express50.landmarks.network import load_network
-    from express50.rigs.footage import check_footage, reduce_image
-    from express50.rigs.sampling import read_moments
+    from pipelines.calibrate.camera_moves import check_footage, reduce_image
+    from pipelines.calibrate.sampling import read_moments
 
     def reduce(name: str, image: np.ndarray) -> np.ndarray | None:
         return reduce_image(cameras[name], image, "the footage") if name in cameras else None

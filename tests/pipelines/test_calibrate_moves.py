@@ -16,11 +16,11 @@ from express50.files.calibration import write_cameras
 from express50.files.images import write_image
 from express50.geometry.cameras import Camera, project, rays
 from express50.geometry.transforms import look_at
-from express50.rigs.adjust import fit_poses, move_pose, triangulate_tracks
-from express50.rigs.features import epipolar_distance, find_features, without_fixed
-from express50.rigs.footage import check_footage, reduce_image, reduce_images
-from express50.rigs.sampling import read_moments
-from express50.rigs.tracks import Tracks, look
+from pipelines.calibrate.adjust import fit_poses, move_pose, triangulate_tracks
+from pipelines.calibrate.camera_moves import check_footage, reduce_image, reduce_images
+from pipelines.calibrate.features import epipolar_distance, find_features, without_fixed
+from pipelines.calibrate.sampling import read_moments
+from pipelines.calibrate.tracks import Tracks, look
 
 TURN, SHIFT = np.radians(0.3), 5e-3
 
@@ -131,7 +131,7 @@ def test_large_images_are_reduced_with_their_camera():
 
 def test_reduced_images_pass_again_and_the_full_ones_are_let_go(footage, tmp_path, monkeypatch):
     rig, frames = footage
-    monkeypatch.setattr("express50.rigs.footage.LONG_SIDE", 160)
+    monkeypatch.setattr("pipelines.calibrate.camera_moves.LONG_SIDE", 160)
     write_capture(tmp_path / "capture", rig, frames[0])
     alive = []
 

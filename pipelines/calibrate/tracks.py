@@ -15,7 +15,7 @@ import numpy as np
 from express50.geometry.cameras import Camera, normalised
 from express50.landmarks.detector import detect
 from express50.landmarks.network import LandmarkNet
-from express50.rigs.features import (
+from pipelines.calibrate.features import (
     Features,
     epipolar_distance,
     find_features,

@@ -17,9 +17,9 @@ from express50.errors import CalibrationError
 from express50.geometry.cameras import Camera, pinhole, project, resized
 from express50.geometry.transforms import matrix_to_axis_angle
 from express50.landmarks.network import LandmarkNet
-from express50.rigs.adjust import Fit, cost, fit_poses, lone_steps, triangulate_tracks
-from express50.rigs.adjust import with_poses as at_poses
-from express50.rigs.tracks import Tracks, join_tracks, look
+from pipelines.calibrate.adjust import Fit, cost, fit_poses, lone_steps, triangulate_tracks
+from pipelines.calibrate.adjust import with_poses as at_poses
+from pipelines.calibrate.tracks import Tracks, join_tracks, look
 
 LONG_SIDE = 1280
 """Images are looked at no larger than this, pixels."""
