@@ -1,18 +1,16 @@
-"""Depth against the twin's truth, every preset beside three baselines, in one run.
+"""Measure depth against the twin's ground truth: every preset beside three baselines.
 
 ``python -m benchmarks.depth [--dataset DIR --truth DIR]``; without a dataset the digital twin
 records a subject with 24 cameras at 512 pixels (two more are recorded and unused) and the stages
 before depth are run. Baselines see the same mattes, frames and cameras: ``visual_hull`` (mattes
 alone), ``tracked_mesh`` (the track alone) and ``tsdf_fusion`` (plane sweeps fused by Open3D).
-Errors are over all pixels that the matte, the truth and the surface share; ``skin`` are those of
-them where the truth shows the head's own surface, so that hair, whose true depth jumps from strand
-to strand, can be told apart. Normals are compared there. ``abs_error_mm_p95_of_surest`` is of the
-given shares of the pixels, the most confident ones: honest confidence makes it fall. A preset that
-refines by rendering has a row ``<preset>_unrendered`` beside it, the same without. Seconds are
-processor seconds of one thread, peak memory that of a process of its own. ``warm_start`` compares
-every expression but each subject's first, started from that one's surface, with a cold start.
-``--sweep`` measures one knob at a time instead and writes a table. The last line is one JSON
-object.
+Errors are over all pixels that the matte, the truth and the surface share; ``skin`` counts those
+where the truth shows the head's own surface, because true depth jumps from strand to strand in
+hair. Normals are compared there. ``abs_error_mm_p95_of_surest`` is over the given shares of the
+pixels, the most confident ones: it falls if confidence is honest. Seconds are processor seconds of
+one thread, peak memory that of a process of its own. ``raycast`` compares rays cast at the mesh
+with rays traced through the distances. ``--sweep`` varies one setting at a time instead and writes
+a table. The last line is one JSON object.
 """
 
 from __future__ import annotations
@@ -34,7 +32,7 @@ import numpy as np
 from benchmarks.depth_fusion import fuse
 from benchmarks.depth_score import Mesh, score, summary
 from benchmarks.depth_sweep import sweep
-from benchmarks.depth_warm import warm_start
+from benchmarks.depth_trace import trace
 from benchmarks.track import prepare, twin_config
 from express50.capture.frames import read_peaks
 from express50.contract.config import build_config
@@ -52,13 +50,10 @@ from pipelines.depth.grid import View, head_box
 from pipelines.depth.reconstruct import hull_grid, reconstruct
 from pipelines.depth.stage import look, read_prior, read_views
 from pipelines.depth.surface import extract_mesh
-from pipelines.depth.trace import trace
 
 PRESETS = ("draft", "standard", "reference")
-UNRENDERED = "_unrendered"  # a preset less its refinement by rendering
 BASELINES = ("visual_hull", "tracked_mesh", "tsdf_fusion")
 BASELINE_VOXEL_M = 0.003
-BAND = ("band_voxels", "band_mib")  # what rendering keeps near the surface
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -72,13 +67,10 @@ def main(arguments: list[str] | None = None) -> int:
             print(json.dumps(sweep(options, items[0])))
             return 0
         result: dict = {"benchmark": "depth", "items": items}
-        presets = with_and_without(options.presets.split(","))
-        for name in () if options.only_warm else (*presets, *BASELINES):
+        for name in (*options.presets.split(","), *BASELINES):
             rows = [alone(options.dataset, options.truth, item, name) for item in items]
             result[name] = summary([row for row in rows if row])
             print(name, json.dumps(result[name]), file=sys.stderr, flush=True)
-        result["warm_start"] = warm_start(options.dataset, options.truth, items)
-        print("warm_start", json.dumps(result["warm_start"]), file=sys.stderr, flush=True)
     medians = [result[name].get("abs_error_mm_median") for name in BASELINES if name in result]
     known = [value for value in medians if value is not None]
     if "standard" in result:
@@ -86,12 +78,6 @@ def main(arguments: list[str] | None = None) -> int:
         result["standard_beats_baselines"] = all(best < value for value in known)
     print(json.dumps(result))
     return 0
-
-
-def with_and_without(presets: list[str]) -> list[str]:
-    """The presets' names, each that renders followed by itself without rendering."""
-    rendering = [name for name in presets if STAGE.presets[name].get("render_rounds")]
-    return presets + [name + UNRENDERED for name in rendering]
 
 
 def parse(arguments: list[str] | None) -> argparse.Namespace:
@@ -103,9 +89,8 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
     parser.add_argument("--items", type=int, default=0, help="only so many; 0: all")
     parser.add_argument("--cameras", type=int, default=26, help="recorded; two are not used")
     parser.add_argument("--side", type=int, default=512, help="pixels of the recorded footage")
-    parser.add_argument("--only-warm", action="store_true", help="warm_start alone")
-    parser.add_argument("--sweep", action="store_true", help="one knob at a time, a table")
-    parser.add_argument("--axes", help="knobs of the sweep, of views,pixels,voxel,samples,levels")
+    parser.add_argument("--sweep", action="store_true", help="one setting at a time, a table")
+    parser.add_argument("--axes", help="settings to sweep, of views,pixels,voxel")
     parser.add_argument("--doc", type=Path, help="document whose section the sweep replaces")
     options = parser.parse_args(arguments)
     if (options.dataset is None) != (options.truth is None):
@@ -136,18 +121,16 @@ def measure(dataset_root: Path, truth_root: Path, item: str, name: str) -> dict 
     dataset, truth = Dataset(dataset_root), Truth(truth_root)
     subject, expression = item.split("/")
     frame = read_peaks(dataset, subject)[expression]
-    preset = name.removesuffix(UNRENDERED)
-    less = {} if preset == name else {"render_rounds": 0}
-    config = build_config(STAGE, STAGE.presets.get(preset, {}) | less)
+    config = build_config(STAGE, STAGE.presets.get(name, {}))
     views, pictures, _ = read_views(dataset, subject, expression, frame, config)
     start = time.process_time()
     found: dict = {}
-    if preset in PRESETS:
+    if name in PRESETS:
         prior, _ = read_prior(dataset, subject, expression, views, config)
         surface = reconstruct(views, config, prior)
         mesh = surface.vertices, surface.faces
-        names = ("voxels_allocated", "voxels_dense", "grid_bytes", "voxel_mm", *BAND)
-        found |= {key: surface.numbers[key] for key in names if key in surface.numbers}
+        names = ("voxels_allocated", "voxels_dense", "grid_bytes", "voxel_mm")
+        found |= {key: surface.numbers[key] for key in names}
     else:
         made = baseline(name, dataset, subject, expression, views)
         if made is None:
@@ -156,7 +139,7 @@ def measure(dataset_root: Path, truth_root: Path, item: str, name: str) -> dict 
     found["s"] = None if name == "tracked_mesh" else time.process_time() - start
     found["gib"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
     sure = None
-    if preset in PRESETS:
+    if name in PRESETS:
         found["raycast"] = both_ways(surface, [camera for camera, _, _ in pictures[::8]])
         seen, _ = look(surface, pictures, config)
         sure = {name: view.confidence for name, view in seen.items()}

@@ -116,9 +116,6 @@ def summary(rows: list[dict]) -> dict:
     figures |= of_surest(errors, np.concatenate([row["sure"] for row in rows]))
     seconds = [row["s"] for row in rows if row["s"] is not None]
     figures["seconds_per_frame"] = round(float(np.mean(seconds)), 2) if seconds else None
-    for key in ("band_voxels", "band_mib"):  # what rendering keeps near the surface
-        if key in rows[0]:
-            figures[key] = round(max(row[key] for row in rows), 1)
     if "voxels_dense" in rows[0]:
         figures["voxel_mm"] = round(rows[0]["voxel_mm"], 3)
         for key in ("voxels_allocated", "voxels_dense", "grid_bytes"):

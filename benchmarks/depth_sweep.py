@@ -1,4 +1,4 @@
-"""One knob of depth at a time around the standard preset: seconds against errors, as a table."""
+"""Vary one setting of depth at a time around the standard preset: seconds and errors."""
 
 from __future__ import annotations
 
@@ -28,8 +28,6 @@ AXES: dict[str, tuple[str, tuple]] = {
     "views": ("views", (6, 12, 24)),
     "pixels": ("image_side", (256, 512, 1024)),
     "voxel": ("voxel_mm", (4.0, 2.4, 1.6, 1.0)),
-    "samples": ("patch_samples", (3, 5, 7)),
-    "levels": ("coarse_mm", (2.4, 3.5, 6.0)),
 }
 
 

@@ -39,23 +39,6 @@ class DepthConfig:
     """Gaussian smoothing of the distances before each level, in voxels."""
     min_views: int = 2
     """Fewest usable cameras; at least 2."""
-    render_rounds: int = 0
-    """Rounds in which rendering refines the surface, 0 to 50; 0: none."""
-    render_rays: int = 150_000
-    """Pixels a round renders; each round takes others, as far as there are."""
-    render_samples: int = 16
-    """Samples along a ray through the band, at least 4."""
-    render_stiffness: float = 5.0
-    """Voxels; where pixels say as much as usual, half of a move 2.6 times as long is followed."""
-    device: str = "cpu"
-    """Where rendering runs: "cpu", "cuda", or "auto" (CUDA where there is one). Only the CPU gives
-    the same bytes on every run: sums on CUDA have no fixed order."""
-    raycast: str = "mesh"
-    """What rays are cast at: "mesh" (triangles, fast) or "sdf" (the distances themselves)."""
-    warm_start: bool = False
-    """Start from the surface of the subject's first expression, carried by the tracked motion."""
-    warm_levels: int = 1
-    """Levels that a warm start goes through, the finest ones."""
     depth_format: str = "png16"
     """Depth maps on disk: "png16" (0.05 mm steps to 3.27 m), "exr16" (half float), "exr32"."""
     normal_maps: str = "png8"
@@ -81,28 +64,14 @@ class DepthConfig:
             raise ValueError(f"voxel_px is {self.voxel_px}, expected 0 to 8")
         if self.patch_samples < 3 or self.patch_samples % 2 == 0:
             raise ValueError(f"patch_samples is {self.patch_samples}, expected an odd number >= 3")
-        if self.raycast not in ("mesh", "sdf"):
-            raise ValueError(f"raycast is {self.raycast!r}, expected 'mesh' or 'sdf'")
         for name, known in (
             ("depth_format", DEPTH_ENDINGS),
             ("normal_maps", (*NORMAL_STEPS, "none")),
         ):
             if getattr(self, name) not in known:
                 raise ValueError(f"{name} is {getattr(self, name)!r}, expected one of {[*known]}")
-        if self.warm_levels < 1:
-            raise ValueError(f"warm_levels is {self.warm_levels}, expected at least 1")
         if self.consistency_side < 16:
             raise ValueError(f"consistency_side is {self.consistency_side}, expected at least 16")
-        if self.device not in ("auto", "cpu", "cuda"):
-            raise ValueError(f"device is {self.device!r}, expected 'auto', 'cpu' or 'cuda'")
-        if not 0 <= self.render_rounds <= 50 or self.render_rays < 100 or self.render_samples < 4:
-            raise ValueError(
-                f"render_rounds, render_rays and render_samples are {self.render_rounds},"
-                f" {self.render_rays} and {self.render_samples}, expected 0 to 50, at least 100"
-                " and at least 4"
-            )
-        if self.render_stiffness <= 0:
-            raise ValueError(f"render_stiffness is {self.render_stiffness}, expected over 0")
         if self.min_views < 2:
             raise ValueError(f"min_views is {self.min_views}, expected at least 2")
         if self.noise <= 0 or self.stiffness_voxels <= 0 or self.image_side < 16:
@@ -115,7 +84,5 @@ PRESETS: dict[str, dict[str, object]] = {
     "reference": {
         "voxel_mm": 1.0,
         "image_side": 2048,
-        "render_rounds": 4,
-        "raycast": "sdf",
     },
 }

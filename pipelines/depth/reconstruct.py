@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -30,7 +29,6 @@ from pipelines.depth.grid import (
     hull_distance,
 )
 from pipelines.depth.prior import Prior
-from pipelines.depth.refine import refine
 from pipelines.depth.surface import (
     advance,
     extract_mesh,
@@ -39,7 +37,6 @@ from pipelines.depth.surface import (
     rim_targets,
     smooth_displacement,
 )
-from pipelines.depth.warm import Carried
 
 LEVEL_RATIO = 1.47
 COUPLINGS = (1e3, 3e3, 1e4, 2e4)  # per square metre; a gap of 10 mm costs 0.1 at first, 2 at last
@@ -50,7 +47,6 @@ def reconstruct(
     views: Sequence[View],
     config: DepthConfig,
     prior: Prior | None = None,
-    start: Carried | None = None,
 ) -> Surface:
     """Reconstruct the surface that the views share.
 
@@ -58,7 +54,6 @@ def reconstruct(
         views: usable views, at least two.
         config: the knobs.
         prior: the tracked mesh, or None.
-        start: a surface so near that the coarse levels can be left out; then no prior counts.
 
     Raises:
         StageError: the mattes share no volume, or the box or surface is too large for the voxel.
@@ -67,23 +62,17 @@ def reconstruct(
     extent = float(np.linalg.norm(high - low))
     voxels = _voxels(views, (low + high) / 2, config)
     _check_size(low, high, voxels[-1])
-    first = voxels[0]
-    if start is not None:  # one level coarser than the first to move: that one is faired before
-        first = voxels[max(len(voxels) - config.warm_levels - 1, 0)]
-        voxels = voxels[-config.warm_levels :]
-    grid = _initial(views, low, high, first, start or prior)
+    grid = _initial(views, low, high, voxels[0], prior)
     for level, voxel in enumerate(voxels):
         if grid.voxel != voxel:
             grid = refined(grid, voxel)
         hull = _hull(views, grid)
         grid = combined(np.maximum, grid, hull)
-        if prior is None or start is not None or level:
+        if prior is None or level:
             grid = fair(grid, config.fair_voxels * voxel)
-        deep = level == 0 and prior is None and start is None
+        deep = level == 0 and prior is None
         grid = _move(views, grid, hull, config, extent, first=deep)
-    grid, rendered = refine(views, grid, config)
-    surface = finished(views, grid, config)
-    return replace(surface, numbers=surface.numbers | rendered)
+    return finished(views, grid, config)
 
 
 def tracked_surface(view: View, config: DepthConfig, prior: Prior) -> Surface:

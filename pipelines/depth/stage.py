@@ -25,9 +25,7 @@ from pipelines.depth.products import write_glb, write_maps, write_ply
 from pipelines.depth.qc import Pictures, metrics, write_picture
 from pipelines.depth.raycast import DepthView, cast_view
 from pipelines.depth.reconstruct import reconstruct, tracked_surface
-from pipelines.depth.trace import trace_view
 from pipelines.depth.views import make_view, without_contradiction
-from pipelines.depth.warm import carried_start, source_of, surface_file, track_path
 
 UNITS = (0.05, 3.0)  # metres; a head's box outside this range means other units than metres
 
@@ -44,25 +42,10 @@ def inputs(dataset: Dataset, item: str, config: DepthConfig) -> dict[str, Path |
         path = dataset.matte_file(subject, expression, camera)
         if path.is_file():
             found[f"matte {camera}"] = path
-    track = track_path(dataset, subject)
+    track = dataset.item_dir("track", subject) / "track.npz"
     if config.use_track and track.is_file():
         found["track"] = track
-    source = source_of(dataset, item, config)
-    if source is not None:
-        surface = surface_file(dataset, source)  # none if it could not be made: then a cold start
-        found |= {"track": track, "warm start": surface if surface.is_file() else "none"}
     return found
-
-
-def needs_gpu(config: DepthConfig) -> bool:
-    """Whether rendering must run on CUDA."""
-    return config.device == "cuda" and config.render_rounds > 0
-
-
-def sources(dataset: Dataset, item: str, config: DepthConfig) -> list[str]:
-    """The item that this one starts from, if it starts from one."""
-    source = source_of(dataset, item, config)
-    return [] if source is None else [source]
 
 
 def run(dataset: Dataset, item: str, config: DepthConfig, out: Path) -> dict:
@@ -109,12 +92,9 @@ def make_surface(
                 f" count: {track['why']}; run 'express50 track' and look at its overlays"
             )
         surface = tracked_surface(views[0], config, prior)
-        return surface, {"track": track, "warm": {"used": False}}
-    start, warm = carried_start(dataset, item, views, config)
-    if start is not None:
-        return reconstruct(views, config, start=start), {"track": {"used": True}, "warm": warm}
+        return surface, {"track": track}
     prior, track = read_prior(dataset, subject, expression, views, config)
-    return reconstruct(views, config, prior), {"track": track, "warm": warm}
+    return reconstruct(views, config, prior), {"track": track}
 
 
 def look(
@@ -125,10 +105,7 @@ def look(
     photo = agreements([make_shot(scene, *row, config.consistency_side) for row in pictures])
     seen = {}
     for (camera, _, alpha), agreement in zip(pictures, photo, strict=True):
-        if config.raycast == "sdf":
-            view = trace_view(surface, camera, alpha)
-        else:
-            view = cast_view(surface, scene, camera, alpha)
+        view = cast_view(surface, scene, camera, alpha)
         seen[camera.id] = vouched(view, agreement)
     return seen, dict(zip(seen, photo, strict=True))
 
@@ -173,7 +150,7 @@ def read_prior(
     dataset: Dataset, subject: str, expression: str, views: list[View], config: DepthConfig
 ) -> tuple[Prior | None, dict]:
     """The tracked mesh as a prior, or None, and what was made of it for the metrics."""
-    path = track_path(dataset, subject)
+    path = dataset.item_dir("track", subject) / "track.npz"
     if not config.use_track or not path.is_file():
         return None, {"used": False, "why": "there is none" if config.use_track else "use_track"}
     track = read_track(path)
@@ -195,12 +172,10 @@ def read_prior(
 
 STAGE = Stage(
     name="depth",
-    version=6,
+    version=7,
     config=DepthConfig,
     presets=PRESETS,
     items=peak_items,
     inputs=inputs,
     run=run,
-    sources=sources,
-    needs_gpu=needs_gpu,
 )

@@ -12,7 +12,7 @@ from express50.runner.clusters import LocalWorkers, RemoteWorkers, cuda_devices
 from express50.runner.executor import Pool
 from express50.runner.runner import run_stage
 from express50.runner.slurm import SlurmJob
-from pipelines import alpha, depth, regions
+from pipelines import alpha, regions
 from tests.faults import toy
 
 
@@ -137,8 +137,6 @@ def test_jobs_without_a_gpu_are_refused_before_the_first_is_submitted(tmp_path, 
 @pytest.mark.parametrize(
     ("stage", "without", "more"),
     [
-        (depth.STAGE, {"render_rounds": 1}, {"device": "cuda"}),
-        (depth.STAGE, {"device": "cuda"}, {"render_rounds": 1}),
         (alpha.STAGE, {"method": "salient", "weights": "x.pt"}, {"device": "cuda"}),
         (regions.STAGE, {"segmentation": "x.pt"}, {"device": "cuda"}),
         (regions.STAGE, {"device": "cuda"}, {"segmentation": "x.pt"}),

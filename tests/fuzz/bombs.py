@@ -41,7 +41,6 @@ from express50.runner.ledger import Ledger
 from express50.shards.codecs import decode_picture
 from express50.shards.reader import read_entries
 from grmm.ply import read_ply
-from pipelines.depth.warm import read_surface
 from tests.fuzz.checkpoints import checkpoint_bombs
 
 Case = tuple[str, Callable[[], object]]
@@ -139,9 +138,6 @@ def _arrays(root: Path, out: Path) -> Iterator[Case]:
             f"ply\nformat {encoding} 1.0\nelement vertex 49999999\nproperty float x\nend_header\n"
         )
         yield f"Gaussians {encoding}", lambda h=head: read_ply(_put(out / "g.ply", h.encode()))
-        faces = head.replace("end_header", "element face 4000000000\n"
-                             "property list uchar int vertex_indices\nend_header")  # fmt: skip
-        yield f"surface {encoding}", lambda f=faces: read_surface(_put(out / "s.ply", f.encode()))
     yield "OBJ of a far vertex", lambda: read_obj(_put(out / "a.obj", b"v 1 2 3\nf 1 1 999999\n"))
 
 

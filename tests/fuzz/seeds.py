@@ -47,7 +47,6 @@ from grmm.presets import resolve
 from grmm.shard_source import ShardSource
 from grmm.study.answers import read_answers, read_study
 from pipelines import ingest
-from pipelines.depth.warm import read_surface
 from tests.express50.captures.layouts import (
     write_ava,
     write_colmap,
@@ -186,13 +185,6 @@ def _write_arrays(root: Path) -> None:
         root / "splat.ply", means=rng.normal(size=(9, 3)), quats=rng.normal(size=(9, 4)),
         scales=np.full((9, 3), 0.1), opacities=np.full(9, 0.5), colors=np.full((9, 3), 0.5),
     )  # fmt: skip
-    (root / "surface.ply").write_bytes(_triangles())
-
-
-def _triangles() -> bytes:
-    import trimesh
-
-    return trimesh.creation.icosahedron().export(file_type="ply")
 
 
 def _write_shards(root: Path) -> None:
@@ -312,10 +304,6 @@ def _searched(root: Path) -> object:
     return found, _verified(root)
 
 
-def _surface(root: Path) -> object:
-    return read_surface(root / "surface.ply")
-
-
 def _network(root: Path) -> object:
     from pipelines.networks import Role, load_network
 
@@ -390,7 +378,6 @@ def readers() -> Iterator[Reader]:
     yield Reader("OBJ", "flame/head_template_mesh.obj",
                  plain(read_obj, "flame/head_template_mesh.obj"))  # fmt: skip
     yield Reader("Gaussians .ply", "splat.ply", plain(read_ply, "splat.ply"))
-    yield Reader("surface .ply", "surface.ply", _surface)
     yield Reader("shards index.json", "shards/index.json", plain(read_entries, "shards"))
     yield Reader("shards manifest", "shards/manifest.json", _verified)
     yield Reader("shard meta.json", "meta.json", _meta)

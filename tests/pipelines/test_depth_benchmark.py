@@ -52,4 +52,4 @@ def test_the_tail_of_the_surest_pixels_leaves_out_those_of_least_confidence():
 
 def test_a_sweep_is_asked_for_by_name():
     options = parse(["--sweep", "--axes", "views,voxel"])
-    assert options.sweep and options.axes == "views,voxel" and not options.only_warm
+    assert options.sweep and options.axes == "views,voxel"

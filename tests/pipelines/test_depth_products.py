@@ -1,9 +1,6 @@
-"""What the depth stage writes: meshes, maps in every format, the photo error, a warm start."""
+"""What the depth stage writes: meshes, maps in every format, the photo error."""
 
 from __future__ import annotations
-
-import json
-import shutil
 
 import numpy as np
 import pytest
@@ -12,7 +9,6 @@ import trimesh
 from express50.capture.frames import read_cameras_of
 from express50.dataset.depth_files import depth_file, read_depth, read_normals
 from express50.dataset.tracks import read_track
-from express50.errors import FormatError
 from express50.files.images import read_image, srgb_to_linear
 from express50.geometry.cameras import transform_camera
 from express50.geometry.raycast import mesh_scene
@@ -22,7 +18,6 @@ from express50.runner.runner import run_stage
 from pipelines.depth import STAGE
 from pipelines.depth.config import DepthConfig
 from pipelines.depth.consistency import Agreement, agreements, make_shot
-from pipelines.depth.warm import carry, read_surface, source_of
 from pipelines.pack import STAGE as PACK
 from pipelines.pack.config import PackConfig
 from tests.pipelines.bump_dataset import make_dataset, published
@@ -136,54 +131,11 @@ def test_the_metrics_and_the_picture_tell_the_photo_error(written):
     assert (height, width) == (5 * 240, 4 * 240)
 
 
-def test_a_surface_is_carried_by_the_mesh_and_stays_where_there_is_none():
-    vertices, faces = mesh()
-    angle = 0.1
-    R = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
-    shoulders = vertices + [0, -0.5, 0]
-    both = np.concatenate([1.01 * vertices, shoulders])
-    table = np.concatenate([faces, faces + len(vertices)])
-    moved = carry(both, table, vertices, vertices @ R.T, faces)
-    near, far = np.split(moved, 2)
-    assert np.abs(near - 1.01 * vertices @ R.T).max() < 5e-4
-    np.testing.assert_array_equal(far, shoulders)
-
-
-def test_warm_starts_give_the_same_bytes_in_any_order_and_as_good_a_surface(dataset, tmp_path):
-    config = DepthConfig(**QUICK | {"warm_start": True, "voxel_mm": 5.0, "track_agreement": 0.5})
-    assert source_of(dataset, ITEMS[1], config) == ITEMS[0]
-    assert source_of(dataset, ITEMS[0], config) is None
-    run_stage(STAGE, dataset, config, [ITEMS[1]], workers=0, progress=False)
-    warm = json.loads((dataset.item_dir("depth", ITEMS[1]) / "metrics.json").read_text())
-    assert warm["warm"]["used"] and warm["warm"]["from"] == ITEMS[0]
-    assert warm["warm"]["agreement"] > 0.9
-    first = {path.name: path.read_bytes() for path in files(dataset)}
-    shutil.rmtree(dataset.item_dir("depth", "S001"))
-    table = published(dataset, STAGE, config)
-    assert {path.name: path.read_bytes() for path in files(dataset)} == first
-    cold = table[ITEMS[0]]
-    assert not cold["warm"]["used"]
-    assert warm["photo_error_median"] < 1.15 * cold["photo_error_median"]
-    assert warm["coverage"] > cold["coverage"] - 0.01
-
-
-def files(dataset):
-    return [path for path in dataset.item_dir("depth", ITEMS[1]).iterdir() if path.is_file()]
-
-
-def test_a_surface_that_is_none_is_refused_by_name(tmp_path):
-    for text in (b"", b"ply\nformat ascii 1.0\nelement vertex 0\nend_header\n", b"nonsense"):
-        (tmp_path / "surface.ply").write_bytes(text)
-        with pytest.raises(FormatError, match="surface.ply"):
-            read_surface(tmp_path / "surface.ply")
-
-
 @pytest.mark.parametrize(
     ("name", "value"),
     [
         ("depth_format", "exr"),
         ("normal_maps", "8"),
-        ("warm_levels", 0),
         ("consistency_side", 4),
         ("fair_voxels", 2.2),
         ("fair_voxels", 0.0),
