@@ -1,0 +1,59 @@
+"""Bilinear values of an image at corner-origin points, with a named policy for the border."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import cv2
+import numpy as np
+
+from express50.geometry.conventions import corner_to_cell
+
+Border = Literal["edge", "zero"]
+_BORDERS = {"edge": cv2.BORDER_REPLICATE, "zero": cv2.BORDER_CONSTANT}
+# cv2.remap takes at most 32767 rows and columns; this many points per call fit the cache.
+_COLUMNS, _ROWS = 4096, 2048
+
+
+def bilinear(image: np.ndarray, points: np.ndarray, border: Border = "edge") -> np.ndarray:
+    """Interpolate an image (H, W[, C]) at points (N, 2) quickly: (N[, C]) of the image's type.
+
+    OpenCV rounds places to 1/32 pixel; use `bilinear_slope` where that matters.
+
+    Args:
+        image: uint8, uint16, float32 or float64; at most 4 channels.
+        points: x, y with the corner of the first pixel as origin.
+        border: "edge" repeats the outermost pixels, "zero" fades to 0 within one pixel.
+    """
+    count = len(points)
+    columns = min(_COLUMNS, max(count, 1))
+    padded = np.zeros((-(-count // columns), columns, 2), np.float32)
+    padded.reshape(-1, 2)[:count] = corner_to_cell(points)
+    out = np.empty((*padded.shape[:2], *image.shape[2:]), image.dtype)
+    for start in range(0, len(padded), _ROWS):
+        part = padded[start : start + _ROWS]
+        x, y = np.ascontiguousarray(part[..., 0]), np.ascontiguousarray(part[..., 1])
+        found = cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=_BORDERS[border])
+        out[start : start + _ROWS] = found.reshape(*x.shape, *image.shape[2:])
+    return out.reshape(-1, *image.shape[2:])[:count]
+
+
+def bilinear_slope(image: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Interpolate an image (H, W, C) at points (N, 2) exactly, with the slope per pixel.
+
+    Outside the image the outermost pixels repeat; the slope is that of the nearest cell.
+
+    Returns:
+        float64 values (N, C), and their derivatives (N, C, 2) by x and y.
+    """
+    height, width, channels = image.shape
+    x, y = np.clip(corner_to_cell(points), 0.0, [width - 1.001, height - 1.001]).T
+    column, row = x.astype(np.int64), y.astype(np.int64)
+    fx, fy = (x - column)[:, None], (y - row)[:, None]
+    flat = image.reshape(-1, channels)
+    at = row * width + column
+    a, b = flat[at].astype(np.float64), flat[at + 1].astype(np.float64)
+    c, d = flat[at + width].astype(np.float64), flat[at + width + 1].astype(np.float64)
+    top, low = a + (b - a) * fx, c + (d - c) * fx
+    slope = np.stack([(b - a) * (1 - fy) + (d - c) * fy, low - top], axis=2)
+    return top + (low - top) * fy, slope

@@ -1,0 +1,46 @@
+"""Bilinear sampling against the formula, and the border policies."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from express50.geometry.sampling import bilinear, bilinear_slope
+
+PLANE = np.fromfunction(lambda y, x: 3 * (x + 0.5) - 2 * (y + 0.5) + 7, (20, 30))
+POINTS = np.random.default_rng(0).uniform([0.5, 0.5], [29.4, 19.4], (9000, 2))
+
+
+def test_a_plane_is_reproduced_with_its_slope() -> None:
+    values, slope = bilinear_slope(PLANE[..., None], POINTS)
+    assert np.allclose(values[:, 0], POINTS @ [3, -2] + 7, atol=1e-10)
+    assert np.allclose(slope[:, 0], [3, -2], atol=1e-10)
+
+
+@pytest.mark.parametrize("shape", [(), (3,)])
+def test_quick_sampling_differs_by_the_rounding_of_places_alone(shape: tuple[int, ...]) -> None:
+    image = np.broadcast_to(PLANE.reshape(20, 30, *([1] * len(shape))), (20, 30, *shape))
+    image = np.ascontiguousarray(image, np.float32)
+    exact = (POINTS @ [3, -2] + 7).reshape(-1, *([1] * len(shape)))
+    found = bilinear(image, POINTS)
+    assert found.shape == (9000, *shape)
+    assert found.dtype == np.float32
+    assert np.abs(found - exact).max() < 5 / 64 + 1e-3
+
+
+def test_borders() -> None:
+    image = np.full((4, 5), 8, np.float32)
+    outside = np.array([[-3.0, 2.0], [0.0, 2.0], [2.5, 40.0]])
+    assert bilinear(image, outside).tolist() == [8, 8, 8]
+    assert bilinear(image, outside, "zero").tolist() == [0, 4, 0]
+    assert np.isfinite(bilinear_slope(image[..., None], outside * 1e9)[0]).all()
+
+
+def test_no_points() -> None:
+    assert bilinear(np.zeros((4, 5), np.float32), np.zeros((0, 2))).shape == (0,)
+
+
+def test_many_points() -> None:
+    points = np.tile(POINTS, (1000, 1))
+    image = PLANE.astype(np.float32)
+    assert np.array_equal(bilinear(image, points)[-9000:], bilinear(image, POINTS))
