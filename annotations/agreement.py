@@ -1,23 +1,25 @@
-"""How well annotators agree: frame distances, slips, and Krippendorff's alpha on clip time.
+"""How well annotators agree, where they disagree, and the adjudication that settles it.
 
-Alpha is taken on time within the clip, 0 to 1: on absolute frame numbers, which spread over a whole
-recording, it is near 1 whatever the annotators do.
+Krippendorff's alpha is taken on time within the clip, 0 to 1: on absolute frame numbers, which
+spread over a whole recording, it is near 1 whatever the annotators do. An adjudication keeps both
+originals.
 """
 
 from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from itertools import combinations
 
 import numpy as np
 
-from annotations.labels import Label
-from annotations.store import labels_by_person, read_labels
-from express50.capture.index import read_index
+from annotations.labels import FLAG_REASONS, Label, make_flag, make_mark
+from annotations.store import current_labels, labels_by_person, read_labels
+from express50.capture.index import Index, read_index
 from express50.contract.exclusions import included_subjects
 from express50.contract.layout import Dataset
+from express50.errors import AnnotationError
 
 WITHIN = (1, 2, 4)  # frames
 SLIP_FRAMES = 12  # further apart, two people did not mean the same moment
@@ -28,7 +30,7 @@ _NO_SPREAD = 1e-24
 
 
 @dataclass(frozen=True)
-class Clip:
+class MarkedClip:
     """One clip that several people marked: frames by annotator, and the clip's window."""
 
     subject: str
@@ -38,7 +40,7 @@ class Clip:
     frames: dict[str, int]
 
 
-def marked_clips(dataset: Dataset, subjects: Iterable[str] | None = None) -> list[Clip]:
+def marked_clips(dataset: Dataset, subjects: Iterable[str] | None = None) -> list[MarkedClip]:
     """Clips that at least two people marked; excluded subjects are left out."""
     clips = []
     for subject in sorted(subjects or included_subjects(dataset)):
@@ -48,7 +50,9 @@ def marked_clips(dataset: Dataset, subjects: Iterable[str] | None = None) -> lis
             frames = {who: x.frame for who, x in said.items() if x.frame is not None}
             if len(frames) > 1:
                 length = cue.end_frame - cue.start_frame + 1
-                clips.append(Clip(subject, cue.expression_id, cue.start_frame, length, frames))
+                clips.append(
+                    MarkedClip(subject, cue.expression_id, cue.start_frame, length, frames)
+                )
     return clips
 
 
@@ -62,7 +66,7 @@ def marks_by_person(labels: Sequence[Label]) -> dict[str, dict[str, Label]]:
     return dict(marks)
 
 
-def agreement(clips: Sequence[Clip], seed: int = 0) -> dict[str, object]:
+def agreement(clips: Sequence[MarkedClip], seed: int = 0) -> dict[str, object]:
     """Figures over clips, each pair of annotators of a clip counting once; others do not count.
 
     Returns:
@@ -89,7 +93,7 @@ def agreement(clips: Sequence[Clip], seed: int = 0) -> dict[str, object]:
     }
 
 
-def clip_times(clip: Clip) -> np.ndarray:
+def clip_times(clip: MarkedClip) -> np.ndarray:
     """The marks as shares of the clip, 0 at its first frame and 1 at its last."""
     frames = np.array(list(clip.frames.values()), dtype=float)
     return (frames - clip.start) / max(1, clip.length - 1)
@@ -130,15 +134,15 @@ def _rounded(value: float | None) -> float | None:
     return None if value is None else round(value, 4)
 
 
-def by_expression(clips: Sequence[Clip]) -> dict[str, dict[str, object]]:
+def by_expression(clips: Sequence[MarkedClip]) -> dict[str, dict[str, object]]:
     """Agreement on each expression."""
     return _grouped(clips, lambda clip: [(clip.expression, clip.frames)])
 
 
-def by_pair(clips: Sequence[Clip]) -> dict[str, dict[str, object]]:
+def by_pair(clips: Sequence[MarkedClip]) -> dict[str, dict[str, object]]:
     """Agreement of each pair of annotators, named ``ann+bob``."""
 
-    def pairs(clip: Clip) -> list[tuple[str, dict[str, int]]]:
+    def pairs(clip: MarkedClip) -> list[tuple[str, dict[str, int]]]:
         return [
             (f"{a}+{b}", {a: clip.frames[a], b: clip.frames[b]})
             for a, b in combinations(sorted(clip.frames), 2)
@@ -147,10 +151,117 @@ def by_pair(clips: Sequence[Clip]) -> dict[str, dict[str, object]]:
     return _grouped(clips, pairs)
 
 
-def _grouped(clips: Sequence[Clip], keys) -> dict[str, dict[str, object]]:
-    groups: Mapping[str, list[Clip]] = defaultdict(list)
+def _grouped(clips: Sequence[MarkedClip], keys) -> dict[str, dict[str, object]]:
+    groups: Mapping[str, list[MarkedClip]] = defaultdict(list)
     for clip in clips:
         for key, frames in keys(clip):
-            part = Clip(clip.subject, clip.expression, clip.start, clip.length, frames)
+            part = MarkedClip(clip.subject, clip.expression, clip.start, clip.length, frames)
             groups[key].append(part)
     return {key: agreement(group) for key, group in groups.items()}
+
+
+FLAG = "flag:"  # before a reason in words, which else might be a name mistyped
+
+
+@dataclass(frozen=True)
+class Disagreement:
+    """What people said of one clip; ``spread`` is frames, None where some saw no peak at all."""
+
+    subject: str
+    expression: str
+    spread: int | None
+    said: dict[str, str]
+    settled: str | None
+
+    def to_json(self) -> dict[str, object]:
+        """JSON form."""
+        return asdict(self)
+
+
+def disagreements(
+    dataset: Dataset, beyond: int = 2, settled: bool = False, subjects: list[str] | None = None
+) -> list[Disagreement]:
+    """The review queue, worst first: a flag against a mark, then the widest spread.
+
+    Args:
+        dataset: the dataset.
+        beyond: marks at most this many frames apart agree.
+        settled: also list what was settled already.
+        subjects: only these; all that are not excluded by default.
+    """
+    found = []
+    for subject in subjects or included_subjects(dataset):
+        labels = read_labels(dataset, subject)
+        said = labels_by_person(labels)
+        force = current_labels(labels)
+        for cue in read_index(dataset, subject).cues:
+            expression = cue.expression_id
+            voices = {who: own[expression] for who, own in said.items() if expression in own}
+            row = _compare(subject, expression, voices, force.get(expression), beyond)
+            if row is not None and (settled or row.settled is None):
+                found.append(row)
+    return sorted(found, key=lambda row: (row.spread is not None, -(row.spread or 0)))
+
+
+def _compare(
+    subject: str, expression: str, voices: dict[str, Label], force: Label | None, beyond: int
+) -> Disagreement | None:
+    """The disagreement of one clip, None where all agree."""
+    frames = [x.frame for x in voices.values() if x.frame is not None]
+    torn = 0 < len(frames) < len(voices)  # some mark a peak, some flag that there is none
+    spread = max(frames, default=0) - min(frames, default=0)
+    if not torn and spread <= beyond:
+        return None
+    settled = describe(force) if force is not None and force.action == "settle" else None
+    said = {who: describe(label) for who, label in voices.items()}
+    return Disagreement(subject, expression, None if torn else spread, said, settled)
+
+
+def describe(label: Label) -> str:
+    """A label in a few words: the frame, or why there is none."""
+    if label.frame is not None:
+        return f"frame {label.frame}"
+    return f"flag: {label.reason or 'no reason given'}"
+
+
+def settlement(
+    dataset: Dataset, index: Index, expression: str, verdict: str, annotator: str
+) -> Label:
+    """The adjudication of a clip: a frame's number, an annotator whose label is right, or a reason:
+    one of `FLAG_REASONS`, or any after ``flag:``.
+
+    Raises:
+        AnnotationError: the expression is unknown, the frame is outside its window, or the verdict
+            is none of these.
+    """
+    voices = current_voices(dataset, index.subject, expression)
+    chosen = voices.get(verdict)
+    if chosen is None and verdict.lstrip("-").isdigit():
+        camera = next((x.camera for x in voices.values() if x.camera), next(iter(index.cameras)))
+        return make_mark(index, expression, int(verdict), camera, annotator, action="settle")
+    if chosen is None and verdict not in FLAG_REASONS and not verdict.startswith(FLAG):
+        raise AnnotationError(
+            f"{index.subject} {expression}: {verdict!r} is no frame, annotator of it"
+            f" ({', '.join(voices)}) or usual reason ({', '.join(FLAG_REASONS)}); any other reason"
+            f" is {FLAG}REASON"
+        )
+    if chosen is None or chosen.frame is None or chosen.camera is None:
+        reason = (chosen.reason if chosen else verdict.removeprefix(FLAG)) or ""
+        return make_flag(index, expression, reason, annotator, action="settle")
+    return make_mark(
+        index, expression, chosen.frame, chosen.camera, annotator,
+        first=chosen.first, last=chosen.last, action="settle",
+    )  # fmt: skip
+
+
+def current_voices(dataset: Dataset, subject: str, expression: str) -> dict[str, Label]:
+    """What each person says of one clip.
+
+    Raises:
+        AnnotationError: nobody labelled it.
+    """
+    said = labels_by_person(read_labels(dataset, subject))
+    voices = {who: own[expression] for who, own in said.items() if expression in own}
+    if not voices:
+        raise AnnotationError(f"{subject} {expression}: nobody has labelled it; nothing to settle")
+    return voices

@@ -17,9 +17,9 @@ import numpy as np
 from annotations.labels import AUTOMATIC, Label, make_mark, make_undo
 from annotations.match import Reference, Watched, suggest_all, watch
 from annotations.observe import observations_path, read_observations
-from annotations.reference import reference_subject
 from annotations.store import append_label, current_labels, human_digest, read_labels
 from annotations.suggest import Suggestion
+from annotations.suggestions import reference_subject
 from express50.capture.expressions import load_script
 from express50.capture.frames import read_proxy
 from express50.capture.index import Index, read_index

@@ -1,11 +1,42 @@
-"""``express50 annotate``: labels without a screen; the same store that the screen writes to."""
+"""``express50 annotate``: all verbs, and those that check, compare and manage labels."""
 
 from __future__ import annotations
 
 import argparse
+import time
+from collections import Counter
+from dataclasses import asdict
+from pathlib import Path
 
-from annotations import cli_judge, cli_label, cli_manage, cli_sheet
-from annotations.ui import cli as ui
+from annotations.agreement import (
+    agreement,
+    by_expression,
+    by_pair,
+    describe,
+    disagreements,
+    marked_clips,
+    settlement,
+)
+from annotations.cli_label import (
+    add_annotator,
+    add_label_verbs,
+    add_selection,
+    add_verb,
+    chosen_subjects,
+)
+from annotations.exchange import LAST_FRAME, export_labels, import_labels, last_frame_marks
+from annotations.labels import FLAG_REASONS, Label
+from annotations.status import coverage, effort, progress
+from annotations.store import append_label, read_labels
+from annotations.suggestions import choose_reference, reference_subject
+from annotations.validate import problems
+from express50.capture.index import read_index
+from express50.console import FAILED, OK, format_table, say, say_json
+from express50.contract.exclusions import included_subjects
+from express50.errors import AnnotationError
+
+_FIGURES = ("clips", "within_1", "within_2", "within_4", "median_frames", "slip_rate", "alpha")
+AROUND = 4  # frames on either side where one subject or expression is looked at
 
 
 def add_commands(subparsers: argparse._SubParsersAction) -> None:
@@ -13,5 +44,262 @@ def add_commands(subparsers: argparse._SubParsersAction) -> None:
     words = "label peak frames, compare annotators, review and export"
     annotate = subparsers.add_parser("annotate", help=words, description=words)
     verbs = annotate.add_subparsers(dest="verb", metavar="VERB", required=True)
-    for area in (ui, cli_label, cli_judge, cli_sheet, cli_manage):
-        area.add_verbs(verbs)
+    add_label_verbs(verbs)
+    _add_comparing_verbs(verbs)
+    _add_managing_verbs(verbs)
+
+
+def _add_comparing_verbs(verbs) -> None:  # noqa: ANN001 - argparse's type is private
+    words = "check labels against the footage and each other; exit code 1 when one is wrong"
+    add_selection(add_verb(verbs, "validate", words, run_validate))
+    words = "how well annotators agree, overall, by expression and by pair"
+    add_selection(add_verb(verbs, "agree", words, run_agree))
+    words = "list disagreements, or settle one"
+    parser = add_verb(verbs, "review", words, run_review)
+    add_selection(parser)
+    add_annotator(parser)
+    parser.add_argument(
+        "--beyond", type=int, default=2, metavar="FRAMES", help="marks so close agree [2]"
+    )
+    parser.add_argument("--all", action="store_true", help="also what is settled")
+    parser.add_argument(
+        "--settle", nargs=3, metavar=("SUBJECT", "EXPRESSION", "VERDICT"),
+        help="verdict: a frame, the annotator who is right, or why there is no peak: "
+        f"{', '.join(FLAG_REASONS)}, or flag:REASON",
+    )  # fmt: skip
+    add_verb(verbs, "coverage", "subjects against expressions, and what is missing", run_coverage)
+    add_verb(verbs, "status", "how far each subject is, and what labels cost", run_status)
+    words = "write a contact sheet of all labels, or of a subject or expression, as one HTML file"
+    parser = add_verb(verbs, "sheet", words, run_sheet)
+    parser.add_argument("file", type=Path, metavar="OUT.html")
+    add_selection(parser)
+    parser.add_argument("--expression", action="append", metavar="ID", help="only this; repeatable")
+    parser.add_argument("--camera", metavar="ID", help="show this camera (default: the label's)")
+    parser.add_argument(
+        "--around", type=int, metavar="N",
+        help="frames before and after each label [4 for chosen subjects or expressions, else 0]",
+    )  # fmt: skip
+    parser.add_argument(
+        "--sure", type=float, default=0.5, metavar="P",
+        help="outline suggestions less sure than this [%(default)s]",
+    )  # fmt: skip
+
+
+def _add_managing_verbs(verbs) -> None:  # noqa: ANN001 - argparse's type is private
+    words = "say or choose whose frames the others are matched to"
+    parser = add_verb(verbs, "reference", words, run_reference)
+    parser.add_argument("subject", nargs="?", metavar="SUBJECT", help="new reference")
+    words = "label by RenderMe-360's rule: the last frame of a clip is its peak"
+    parser = add_verb(verbs, "rule", words, run_rule)
+    add_selection(parser)
+    parser.add_argument(
+        "--expression", action="append", metavar="ID", help="repeatable; e0 to e11 by default"
+    )
+    for name, words in (
+        ("exclude", "leave a subject out, with the reason"),
+        ("include", "take an excluded subject back in"),
+    ):
+        parser = add_verb(verbs, name, words, run_exclusion)
+        parser.add_argument("subject", metavar="SUBJECT")
+        if name == "exclude":
+            parser.add_argument("reason", metavar="REASON", help="heavy makeup, large glasses, ...")
+        add_annotator(parser)
+    parser = add_verb(verbs, "export", "write every event as .csv or .json", run_export)
+    add_selection(parser)
+    parser.add_argument("file", type=Path, metavar="FILE")
+    parser = add_verb(verbs, "import", "take events of a .csv or .json in, once each", run_import)
+    parser.add_argument("file", type=Path, metavar="FILE")
+
+
+def run_validate(args: argparse.Namespace) -> int:
+    """Print what is wrong; gaps in coverage alone are no failure."""
+    found = problems(args.dataset, chosen_subjects(args.dataset, args.subject))
+    wrong = [p for p in found if p.kind != "coverage"]
+    counts = dict(sorted(Counter(p.kind for p in found).items()))
+    if args.json:
+        say_json({"ok": not wrong, "counts": counts, "problems": [asdict(p) for p in found]})
+    else:
+        say(*(f"{p.subject} {p.expression}: {p.kind}: {p.what}" for p in wrong))
+        say(f"{len(wrong)} wrong, {counts.get('coverage', 0)} without a label")
+    return FAILED if wrong else OK
+
+
+def run_agree(args: argparse.Namespace) -> int:
+    """Print agreement."""
+    clips = marked_clips(args.dataset, chosen_subjects(args.dataset, args.subject))
+    overall, pairs, expressions = agreement(clips), by_pair(clips), by_expression(clips)
+    if args.json:
+        say_json({"overall": overall, "pairs": pairs, "expressions": expressions})
+    elif not clips:
+        say("no expression was marked by two people yet")
+    else:
+        rows = {"all": overall} | pairs | expressions
+        cells = [[name, *("-" if r[f] is None else str(r[f]) for f in _FIGURES)]
+                 for name, r in rows.items()]  # fmt: skip
+        say(*format_table(["", *(f.replace("_", " ") for f in _FIGURES)], cells))
+        say(f"alpha of all, 95 %: {overall['alpha_interval']}")
+    return OK
+
+
+def run_review(args: argparse.Namespace) -> int:
+    """Print the queue, or settle one of it."""
+    if args.settle:
+        return _settle(args)
+    wanted = chosen_subjects(args.dataset, args.subject)
+    queue = disagreements(args.dataset, args.beyond, args.all, wanted)
+    if args.json:
+        say_json([row.to_json() for row in queue])
+        return OK
+    for row in queue:
+        said = ", ".join(f"{who} {what}" for who, what in row.said.items())
+        say(f"{row.subject} {row.expression}: {said}" + (f" -> {row.settled}" * bool(row.settled)))
+    say(f"{len(queue)} to review")
+    return OK
+
+
+def _settle(args: argparse.Namespace) -> int:
+    subject, expression, verdict = args.settle
+    index = read_index(args.dataset, subject)
+    label = settlement(args.dataset, index, expression, verdict, args.annotator)
+    append_label(args.dataset, label)
+    if args.json:
+        say_json(asdict(label))
+    else:
+        say(f"{subject} {expression}: settled as {describe(label)} by {args.annotator}")
+    return OK
+
+
+def run_coverage(args: argparse.Namespace) -> int:
+    """Print what is missing and who the subjects are."""
+    report = coverage(args.dataset)
+    if args.json:
+        say_json(report)
+        return OK
+    states = ("person", "rule", "auto", "flagged", "missing")
+    rows = [
+        [subject, *(str(list(cells.values()).count(state)) for state in states)]
+        for subject, cells in report["cells"].items()
+    ]
+    say(*format_table(["subject", *states], rows))
+    say(*(f"{s}: missing {', '.join(gaps)}" for s, gaps in report["missing"].items()))
+    say(*(f"{s}: excluded, {reason}" for s, reason in report["excluded"].items()))
+    for name in ("gender", "age"):
+        counts = ", ".join(f"{k} {n}" for k, n in report[name].items())
+        say(f"{name}: {counts or 'too few people to count'}")
+    return OK
+
+
+def run_status(args: argparse.Namespace) -> int:
+    """Count the labels in force, and what people spent on theirs."""
+    subjects = [progress(args.dataset, subject) for subject in args.dataset.subjects()]
+    people = effort(args.dataset)
+    if args.json:
+        say_json({"subjects": subjects, "annotators": people})
+        return OK
+    header = ["subject", "expressions", "by_person", "by_rule", "automatic", "flagged", "excluded"]
+    cells = [["" if row[n] is None else str(row[n]) for n in header] for row in subjects]
+    say(*format_table([name.replace("_", " ") for name in header], cells))
+    if people:
+        figures = next(iter(people.values()))
+        rows = [
+            [who, *("-" if v is None else str(v) for v in row.values())]
+            for who, row in people.items()
+        ]
+        say("", *format_table(["annotator", *(n.replace("_", " ") for n in figures)], rows))
+    return OK
+
+
+def run_sheet(args: argparse.Namespace) -> int:
+    """Write the page."""
+    from annotations.sheet import make_sheet, render_sheet
+    from annotations.ui.frames import FaceFinder
+    from express50.files.atomic import write_bytes
+
+    wanted = chosen_subjects(args.dataset, args.subject)
+    sheet = make_sheet(args.dataset, wanted, args.expression, args.camera, args.sure)
+    chosen = args.subject or args.expression
+    around = args.around if args.around is not None else AROUND if chosen else 0
+    faces = FaceFinder(args.dataset)
+    faces.load()
+    page = render_sheet(args.dataset, sheet, faces=faces, around=max(0, around)).encode()
+    args.file.parent.mkdir(parents=True, exist_ok=True)
+    write_bytes(args.file, page)
+    counts = sheet.counts()
+    if args.json:
+        say_json({"file": str(args.file), "bytes": len(page), "tiles": counts})
+    else:
+        said = ", ".join(f"{name} {count}" for name, count in counts.items() if count)
+        say(f"{args.file} ({len(page):,} bytes): {said}")
+    return OK
+
+
+def run_reference(args: argparse.Namespace) -> int:
+    """Print the reference, or make another subject it."""
+    if args.subject is not None:
+        choose_reference(args.dataset, args.subject)
+    subject = reference_subject(args.dataset)
+    if args.json:
+        say_json({"reference": subject})
+    else:
+        say(f"reference: {subject}")
+    return OK
+
+
+def run_rule(args: argparse.Namespace) -> int:
+    """Append the rule's marks; people's labels stand above them."""
+    chosen = chosen_subjects(args.dataset, args.subject) or included_subjects(args.dataset)
+    marks = [
+        mark
+        for subject in chosen
+        for mark in last_frame_marks(
+            args.dataset, read_index(args.dataset, subject), args.expression
+        )
+    ]
+    for mark in marks:
+        append_label(args.dataset, mark)
+    if args.json:
+        say_json([asdict(mark) for mark in marks])
+    else:
+        say(f"{len(marks)} marks by {LAST_FRAME} in {len(chosen)} subjects")
+    return OK
+
+
+def run_exclusion(args: argparse.Namespace) -> int:
+    """Append an exclusion, or its end."""
+    chosen_subjects(args.dataset, [args.subject])
+    reason = args.reason.strip() if args.verb == "exclude" else None
+    if reason == "":
+        raise AnnotationError(f"{args.subject}: an exclusion needs a reason, as 'heavy makeup'")
+    event = Label(
+        subject=args.subject, expression="", action=args.verb, annotator=args.annotator,
+        time=time.time(), reason=reason,
+    )  # fmt: skip
+    append_label(args.dataset, event)
+    if args.json:
+        say_json(asdict(event))
+    else:
+        reason = f": {event.reason}" if event.reason else ""
+        say(f"{args.subject}: {args.verb}d{reason}")
+    return OK
+
+
+def run_export(args: argparse.Namespace) -> int:
+    """Write the events."""
+    chosen = chosen_subjects(args.dataset, args.subject) or args.dataset.subjects()
+    events = [label for subject in chosen for label in read_labels(args.dataset, subject)]
+    count = export_labels(events, args.file)
+    if args.json:
+        say_json({"file": str(args.file), "events": count})
+    else:
+        say(f"{args.file}: {count} events of {len(chosen)} subjects")
+    return OK
+
+
+def run_import(args: argparse.Namespace) -> int:
+    """Append what is new."""
+    new, known = import_labels(args.dataset, args.file)
+    if args.json:
+        say_json({"file": str(args.file), "new": new, "known": known})
+    else:
+        say(f"{args.file}: {new} new events, {known} known already")
+    return OK

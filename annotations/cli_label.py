@@ -1,24 +1,104 @@
-"""Verbs that give labels and say what is to do: suggest, next, mark, flag, undo, labels, status."""
+"""Verbs of ``express50 annotate`` that give labels: ui, suggest, next, mark, flag, undo, labels."""
 
 from __future__ import annotations
 
 import argparse
+import fnmatch
+import getpass
+import os
+import sys
+from collections.abc import Callable, Iterable
 from dataclasses import asdict
+from pathlib import Path
 
-from annotations.effort import effort, progress
+from annotations.agreement import describe
 from annotations.labels import FLAG_REASONS, Label, make_flag, make_mark, make_undo
-from annotations.options import add_annotator, add_clip, add_selection, add_verb, chosen_subjects
-from annotations.review import describe
-from annotations.store import append_label, current_labels, last_event, read_labels
+from annotations.store import append_label, current_labels, is_person, last_event, read_labels
 from annotations.suggestions import read_suggestions
 from annotations.worklist import ORDERS, worklist
 from express50.capture.index import read_index
 from express50.console import OK, format_table, say, say_json
+from express50.contract.exclusions import included_subjects
+from express50.contract.layout import Dataset
 from express50.errors import AnnotationError
 
+Handler = Callable[[argparse.Namespace], int]
 
-def add_verbs(verbs) -> None:  # noqa: ANN001 - argparse's type is private
+
+def add_verb(verbs, name: str, words: str, handler: Handler) -> argparse.ArgumentParser:
+    """Add a verb with what all have: the dataset and ``--json``."""
+    parser = verbs.add_parser(name, help=words, description=words)
+    parser.add_argument("dataset", type=existing_dataset, metavar="DATASET")
+    parser.add_argument("--json", action="store_true", help="print JSON")
+    parser.set_defaults(handler=handler)
+    return parser
+
+
+def add_clip(parser: argparse.ArgumentParser) -> None:
+    """Add the clip that a verb is about, and who speaks."""
+    parser.add_argument("subject", metavar="SUBJECT")
+    parser.add_argument("expression", metavar="EXPRESSION")
+    add_annotator(parser)
+
+
+def add_annotator(parser: argparse.ArgumentParser) -> None:
+    """Add who speaks."""
+    parser.add_argument(
+        "--annotator", type=person, default=getpass.getuser(), metavar="NAME", help="you by default"
+    )
+
+
+def add_selection(parser: argparse.ArgumentParser) -> None:
+    """Add a choice of subjects."""
+    parser.add_argument("--subject", action="append", metavar="ID", help="only this; repeatable")
+
+
+def existing_dataset(text: str) -> Dataset:
+    """A dataset's folder that is there."""
+    if not Path(text).is_dir():
+        raise argparse.ArgumentTypeError(
+            f"{text}: no such dataset; run 'express50 ingest {text} CAPTURE'"
+        )
+    return Dataset(Path(text))
+
+
+def person(text: str) -> str:
+    """A person's name: not the align stage's, nor a rule's, nor none."""
+    if not text.strip() or not is_person(text):
+        raise argparse.ArgumentTypeError(f"{text!r} is no person's name; give yours")
+    return text
+
+
+def chosen_subjects(dataset: Dataset, wanted: list[str] | None) -> list[str] | None:
+    """The subjects asked for, None for all.
+
+    Raises:
+        AnnotationError: one is not ingested.
+    """
+    for subject in wanted or ():
+        if subject not in dataset.subjects():
+            raise AnnotationError(
+                f"{dataset.root}: no subject {subject!r}; expected one of"
+                f" {', '.join(dataset.subjects()) or 'none: run express50 ingest'}"
+            )
+    return wanted
+
+
+def add_label_verbs(verbs) -> None:  # noqa: ANN001 - argparse's type is private
     """Add the verbs."""
+    parser = add_verb(verbs, "ui", "label peak frames in the terminal", run_ui)
+    add_annotator(parser)
+    parser.add_argument("--subjects", metavar="GLOB", help="only these subjects")
+    parser.add_argument("--expressions", metavar="GLOB", help="only these expressions")
+    parser.add_argument("--order", choices=ORDERS, default="doubt", help="what comes first")
+    parser.add_argument(
+        "--blind", action="store_true", help="hide suggestions and others' marks until you decide"
+    )
+    parser.add_argument(
+        "--pictures", choices=("blocks", "sixel"), default="blocks",
+        help="block characters, or sixels for terminals that draw them (xterm -ti vt340, foot,"
+        " WezTerm, iTerm2) [%(default)s]",
+    )  # fmt: skip
     add_selection(add_verb(verbs, "suggest", "what align suggests, doubtful first", run_suggest))
     parser = add_verb(verbs, "next", "what you still have to label, in the best order", run_next)
     add_selection(parser)
@@ -36,7 +116,58 @@ def add_verbs(verbs) -> None:  # noqa: ANN001 - argparse's type is private
     parser.add_argument("reason", metavar="REASON", help=", ".join(FLAG_REASONS) + ", ...")
     add_clip(add_verb(verbs, "undo", "take your last event on an expression back", run_undo))
     add_selection(add_verb(verbs, "labels", "every label in force", run_labels))
-    add_verb(verbs, "status", "how far each subject is, and what labels cost", run_status)
+
+
+def run_ui(args: argparse.Namespace) -> int:
+    """Open the annotator; the exit code is 0 also when work is left."""
+    from annotations.ui.app import AnnotateApp
+    from annotations.ui.frames import FaceFinder
+    from annotations.ui.images import cell_size
+    from annotations.ui.session import open_session
+
+    dataset = args.dataset
+    subjects = matching(included_subjects(dataset), args.subjects, "subject")
+    if not subjects:
+        raise AnnotationError(f"{dataset.root}: no subject; run 'express50 ingest' first")
+    names = dict.fromkeys(c.expression_id for s in subjects for c in read_index(dataset, s).cues)
+    session = open_session(
+        dataset,
+        args.annotator,
+        subjects=subjects,
+        expressions=matching(names, args.expressions, "expression"),
+        order=args.order,
+        blind=args.blind,
+    )
+    if not (sys.stdin.isatty() and sys.stdout.isatty()):
+        raise AnnotationError("the annotator needs a terminal; use 'express50 annotate mark' here")
+    cell = None
+    if args.pictures == "sixel":
+        cell = cell_size()
+        if cell is None:
+            raise AnnotationError(
+                "--pictures sixel: the terminal does not say how many pixels a cell has;"
+                " use --pictures blocks"
+            )
+        os.environ.setdefault("COLORTERM", "truecolor")  # ssh does not hand it on
+    AnnotateApp(session, faces=FaceFinder(dataset), sixel_cell=cell).run()
+    if args.json:
+        say_json({"done": session.done, "tasks": len(session.tasks)})
+    else:
+        say(f"{session.done} of {len(session.tasks)} done by {session.annotator}")
+    return OK
+
+
+def matching(names: Iterable[str], pattern: str | None, what: str) -> list[str]:
+    """Names that fit a pattern with ``*`` and ``?``; all for None.
+
+    Raises:
+        AnnotationError: none fits.
+    """
+    known = list(names)
+    found = [name for name in known if fnmatch.fnmatchcase(name, pattern or "*")]
+    if pattern is not None and not found:
+        raise AnnotationError(f"no {what} fits {pattern!r}; there are {', '.join(known)}")
+    return found
 
 
 def run_suggest(args: argparse.Namespace) -> int:
@@ -128,24 +259,4 @@ def run_labels(args: argparse.Namespace) -> int:
     else:
         cells = [[x.subject, x.expression, describe(x), x.annotator] for x in rows]
         say(*format_table(["subject", "expression", "label", "by"], cells))
-    return OK
-
-
-def run_status(args: argparse.Namespace) -> int:
-    """Count the labels in force, and what people spent on theirs."""
-    subjects = [progress(args.dataset, subject) for subject in args.dataset.subjects()]
-    people = effort(args.dataset)
-    if args.json:
-        say_json({"subjects": subjects, "annotators": people})
-        return OK
-    header = ["subject", "expressions", "by_person", "by_rule", "automatic", "flagged", "excluded"]
-    cells = [["" if row[n] is None else str(row[n]) for n in header] for row in subjects]
-    say(*format_table([name.replace("_", " ") for name in header], cells))
-    if people:
-        figures = next(iter(people.values()))
-        rows = [
-            [who, *("-" if v is None else str(v) for v in row.values())]
-            for who, row in people.items()
-        ]
-        say("", *format_table(["annotator", *(n.replace("_", " ") for n in figures)], rows))
     return OK

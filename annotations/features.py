@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from annotations.observe import NEUTRAL, Observations
+from annotations.observe import NEUTRAL, FaceObservations
 from annotations.watch import STABLE, face_side, similarity_2d, steady
 from express50.capture.expressions import Expression
 
@@ -58,7 +58,7 @@ class Features:
     rest: np.ndarray
 
 
-def measure(observations: Observations, windows: dict[str, np.ndarray]) -> Features:
+def measure(observations: FaceObservations, windows: dict[str, np.ndarray]) -> Features:
     """Features of all observed frames.
 
     Args:

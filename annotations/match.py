@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from annotations.features import Features, expression_values, measure
-from annotations.observe import NEUTRAL, SEEN_SCORE, Observations
+from annotations.observe import NEUTRAL, SEEN_SCORE, FaceObservations
 from annotations.suggest import (
     Canonical,
     Suggestion,
@@ -51,7 +51,7 @@ class Reference:
     flagged: frozenset[str] = frozenset()
 
 
-def watch(index: Index, observations: Observations) -> Watched:
+def watch(index: Index, observations: FaceObservations) -> Watched:
     """Features of a subject, by cue window.
 
     Expressions whose window holds no observed frame that shows a face are left out.

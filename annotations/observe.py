@@ -56,7 +56,7 @@ class ObserveConfig:
 
 
 @dataclass(frozen=True)
-class Observations:
+class FaceObservations:
     """What C cameras saw of a subject in F frames.
 
     Attributes:
@@ -79,7 +79,7 @@ def observations_path(dataset: Dataset, subject: str) -> Path:
     return dataset.item_dir("observe", subject) / "observations.npz"
 
 
-def read_observations(dataset: Dataset, subject: str) -> Observations:
+def read_observations(dataset: Dataset, subject: str) -> FaceObservations:
     """Read what the stage wrote.
 
     Raises:
@@ -94,7 +94,7 @@ def read_observations(dataset: Dataset, subject: str) -> Observations:
         if str(table["schema"]) != SCHEMA:
             raise ValueError(f"schema is {table['schema']}, expected {SCHEMA}")
         rest = (table[key] for key in ("frames", "points", "scores", "faces"))
-        return Observations(tuple(map(str, table["cameras"])), *rest)
+        return FaceObservations(tuple(map(str, table["cameras"])), *rest)
     except (ValueError, KeyError, TypeError) as error:
         raise FormatError(f"{path}: no observations ({error}); run 'express50 align'") from None
 

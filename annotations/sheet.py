@@ -1,24 +1,28 @@
-"""What a contact sheet shows: the label of every expression and subject, told apart by its origin.
-
-Nothing here reads pixels; ``annotations.sheet_page`` makes pictures and the page of it.
-"""
+"""The contact sheet: every label as a face on one static HTML page, told apart by its origin."""
 
 from __future__ import annotations
 
+import base64
 from collections import Counter
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
+import jinja2
+import numpy as np
+
+from annotations.agreement import disagreements
 from annotations.labels import AUTOMATIC, Label
-from annotations.reference import reference_subject
-from annotations.review import disagreements
 from annotations.store import current_labels, is_person, read_labels
-from annotations.suggestions import Suggested, read_suggestions
+from annotations.suggestions import Suggested, read_suggestions, reference_subject
+from annotations.ui.frames import FaceFinder, crop_to, zoom_box
 from express50.capture.expressions import load_script
+from express50.capture.frames import read_proxy
 from express50.capture.index import Index, read_index
 from express50.contract.exclusions import exclusion_reason, included_subjects
 from express50.contract.layout import Dataset
-from express50.errors import AnnotationError, FormatError
+from express50.errors import AnnotationError, Express50Error, FormatError
+from express50.files.images import encode_jpeg
 
 STATES = ("person", "rule", "auto", "suggestion", "flagged", "missing")
 SURE = 0.5
@@ -57,7 +61,7 @@ class Tile:
 
 
 @dataclass(frozen=True)
-class Row:
+class SheetRow:
     """One expression across subjects, the reference first where it is known."""
 
     expression: str
@@ -70,7 +74,7 @@ class Row:
 class Sheet:
     """Rows in the order of the script, the reference, and what the page should warn of."""
 
-    rows: list[Row]
+    rows: list[SheetRow]
     reference: str
     subjects: list[str]
     notes: list[str]
@@ -119,7 +123,7 @@ def make_sheet(
         tiles = [replace(first, reference=True)]
         tiles += [columns[s].get(name, _absent(s, name)) for s in chosen[1:]]
         wanted = camera or first.camera
-        rows.append(Row(name, *_words(name), [_seen_by(t, wanted, indexes) for t in tiles]))
+        rows.append(SheetRow(name, *_words(name), [_seen_by(t, wanted, indexes) for t in tiles]))
     notes += [f"{s} is excluded: {r}" for s in dataset.subjects() if (r := _excluded(dataset, s))]
     return Sheet(rows, reference, chosen, notes)
 
@@ -226,6 +230,97 @@ def _doubted(tile: Tile, dispute: str | None, sure: float) -> Tile:
     return replace(tile, words=words, doubtful=bool(doubts) or unsure)
 
 
-def tiles_of(rows: Sequence[Row]) -> list[Tile]:
+def tiles_of(rows: Sequence[SheetRow]) -> list[Tile]:
     """Every tile, row by row."""
     return [tile for row in rows for tile in row.tiles]
+
+
+WIDTH, HEIGHT = 176, 220  # pixels of a tile; shown smaller, so that it can be enlarged
+STRIP_WIDTH, STRIP_HEIGHT = 96, 120
+QUALITY = 82
+
+
+@dataclass(frozen=True)
+class Pictures:
+    """A tile's picture and the frames around it, side by side, as data addresses; "" for none.
+
+    Attributes:
+        face: the frame.
+        strip: the frames around it in one picture.
+        first: frame of the strip's first picture.
+        count: how many pictures the strip holds.
+        problem: why there is no picture.
+    """
+
+    face: str = ""
+    strip: str = ""
+    first: int = 0
+    count: int = 0
+    problem: str = ""
+
+
+def render_sheet(
+    dataset: Dataset, sheet: Sheet, *, faces: FaceFinder | None = None, around: int = 0
+) -> str:
+    """The page as text.
+
+    Args:
+        dataset: where the proxies are.
+        sheet: what to show.
+        faces: crops to the faces; whole frames without it.
+        around: how many frames before and after each label to add.
+    """
+    pictures = {
+        (tile.subject, tile.expression): take_pictures(dataset, tile, faces, around)
+        for tile in tiles_of(sheet.rows)
+    }
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("annotations", "."),
+        autoescape=True,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    several = len(sheet.subjects) > 2
+    return environment.get_template("sheet.html").render(
+        title=f"Labels of {dataset.root.resolve().name}",
+        sheet=sheet,
+        counts=sheet.counts(),
+        pictures=pictures,
+        several=several,
+        size=(WIDTH, HEIGHT),
+        caption=caption,
+    )
+
+
+def take_pictures(dataset: Dataset, tile: Tile, faces: FaceFinder | None, around: int) -> Pictures:
+    """The face of a tile's frame and, in the same framing, of the frames around it."""
+    if tile.frame is None:
+        return Pictures()
+    read = partial(read_proxy, dataset, tile.subject, tile.camera)
+    try:
+        source = read_index(dataset, tile.subject).cameras[tile.camera]
+        face = None if faces is None else faces.find(tile.subject, tile.camera, tile.frame)
+        box = zoom_box(face, "face", HEIGHT / WIDTH, source.height / source.width)
+        shown = crop_to(read(tile.frame), box, WIDTH, HEIGHT)
+        near = range(max(tile.first, tile.frame - around), min(tile.last, tile.frame + around) + 1)
+        strip = [crop_to(read(n), box, STRIP_WIDTH, STRIP_HEIGHT) for n in near] if around else []
+    except (Express50Error, OSError, IndexError) as error:
+        return Pictures(problem=f"cannot be read: {error}")
+    if not strip:
+        return Pictures(_data(shown))
+    return Pictures(_data(shown), _data(np.hstack(strip)), near[0], len(near))
+
+
+def _data(image: np.ndarray) -> str:
+    code = base64.b64encode(encode_jpeg(image, QUALITY)).decode()
+    return f"data:image/jpeg;base64,{code}"
+
+
+def caption(tile: Tile) -> str:
+    """Frame, who chose it and how sure that was, in one short line."""
+    if tile.state == "missing":
+        return ""  # the empty tile itself says why
+    if tile.state == "flagged":
+        return f"flagged: {tile.words} ({tile.by})"
+    sure = "" if tile.confidence is None else f" {tile.confidence:.0%}"
+    return f"frame {tile.frame} · {tile.by}{sure}"

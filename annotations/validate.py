@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 
+from annotations.agreement import disagreements
 from annotations.labels import Label, find_cue
-from annotations.review import disagreements
 from annotations.store import current_labels, read_labels, unreadable_lines
 from express50.capture.index import Index, read_index
 from express50.contract.exclusions import included_subjects
@@ -15,7 +15,7 @@ from express50.errors import AnnotationError
 
 
 @dataclass(frozen=True)
-class Problem:
+class LabelProblem:
     """Something wrong with a label.
 
     Kinds: ``identity`` (the frame is not the one that was labelled), ``window`` (outside the cue),
@@ -30,7 +30,7 @@ class Problem:
     what: str
 
 
-def problems(dataset: Dataset, subjects: list[str] | None = None) -> list[Problem]:
+def problems(dataset: Dataset, subjects: list[str] | None = None) -> list[LabelProblem]:
     """Everything wrong with the labels of some subjects, all that are not excluded by default."""
     chosen = included_subjects(dataset) if subjects is None else subjects
     found = [p for subject in chosen for p in _of_subject(dataset, subject)]
@@ -38,22 +38,22 @@ def problems(dataset: Dataset, subjects: list[str] | None = None) -> list[Proble
         if row.spread is None:
             said = ", ".join(f"{who}: {what}" for who, what in row.said.items())
             what = f"{said}; settle it with 'express50 annotate review --settle'"
-            found.append(Problem(row.subject, row.expression, "contradiction", what))
+            found.append(LabelProblem(row.subject, row.expression, "contradiction", what))
     return found
 
 
-def _of_subject(dataset: Dataset, subject: str) -> Iterator[Problem]:
+def _of_subject(dataset: Dataset, subject: str) -> Iterator[LabelProblem]:
     index, labels = read_index(dataset, subject), read_labels(dataset, subject)
     for number in unreadable_lines(dataset, subject):
         what = f"line {number} of {dataset.labels_file(subject)} cannot be read; label that again"
-        yield Problem(subject, "", "unreadable", what)
+        yield LabelProblem(subject, "", "unreadable", what)
     for label in labels:
         for kind, what in _of_label(index, label):
-            yield Problem(subject, label.expression, kind, f"{label.annotator}: {what}")
+            yield LabelProblem(subject, label.expression, kind, f"{label.annotator}: {what}")
     force = current_labels(labels)
     for cue in index.cues:
         if cue.expression_id not in force:
-            yield Problem(subject, cue.expression_id, "coverage", "no label")
+            yield LabelProblem(subject, cue.expression_id, "coverage", "no label")
 
 
 def _of_label(index: Index, label: Label) -> Iterator[tuple[str, str]]:

@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Collection
 from dataclasses import dataclass
 
-from annotations.reference import reference_subject
 from annotations.store import labels_of, read_labels
-from annotations.suggestions import Suggested, read_suggestions
+from annotations.suggestions import Suggested, read_suggestions, reference_subject
 from express50.capture.index import read_index
 from express50.contract.exclusions import included_subjects
 from express50.contract.layout import Dataset
@@ -17,7 +16,7 @@ ORDERS = ("doubt", "expression", "subject")
 
 
 @dataclass(frozen=True)
-class Task:
+class LabelTask:
     """One label to give; doubt is 1 - confidence of the suggestion, 1 where there is none."""
 
     subject: str
@@ -32,7 +31,7 @@ def worklist(
     expressions: Collection[str] | None = None,
     order: str = "doubt",
     everything: bool = False,
-) -> list[Task]:
+) -> list[LabelTask]:
     """Tasks of an annotator, the reference's first in every order.
 
     Args:
@@ -75,14 +74,14 @@ def worklist(
 
 def _tasks_of(
     dataset: Dataset, subject: str, annotator: str, everything: bool
-) -> list[Task | None]:
+) -> list[LabelTask | None]:
     """One entry a cue, None where it is done."""
     done = {} if everything else labels_of(read_labels(dataset, subject), annotator)
     suggestions = read_suggestions(dataset, subject)
     return [
         None
         if cue.expression_id in done
-        else Task(subject, cue.expression_id, _doubt(suggestions.get(cue.expression_id)))
+        else LabelTask(subject, cue.expression_id, _doubt(suggestions.get(cue.expression_id)))
         for cue in read_index(dataset, subject).cues
     ]
 

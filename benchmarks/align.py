@@ -25,12 +25,11 @@ import numpy as np
 
 from annotations import align, observe
 from annotations.labels import make_mark
-from annotations.reference import reference_subject
 from annotations.store import append_label
-from annotations.suggestions import read_suggestions
-from annotations.ui.replay import measure_steps, replay
+from annotations.suggestions import read_suggestions, reference_subject
 from annotations.watch import STABLE, similarity_2d
 from benchmarks.document import replace_section
+from benchmarks.replay import measure_steps, replay
 from express50.capture.frames import read_proxy
 from express50.capture.index import Cue, read_index
 from express50.contract.config import build_config

@@ -1,18 +1,245 @@
-"""The annotator as a Textual app: colours, the desk, and the count of keys."""
+"""The annotator as a Textual app: keys become moves, looks and decisions."""
 
 from __future__ import annotations
 
-from textual import events
-from textual.app import App
+from collections.abc import Callable
+from dataclasses import replace
 
-from annotations.ui import theme
-from annotations.ui.desk import Desk
-from annotations.ui.faces import FaceFinder
-from annotations.ui.frames import FrameCache
-from annotations.ui.painters import make_painter, picture_numbers
-from annotations.ui.picture import Picture
+from textual import events, work
+from textual.app import App
+from textual.binding import Binding
+
+from annotations.labels import Label
+from annotations.ui import panels, theme
+from annotations.ui import view as moves
+from annotations.ui.dialogs import FlagDialog, FrameDialog, HelpDialog
+from annotations.ui.frames import ZOOMS, FaceFinder, FrameCache, FrameCrop
+from annotations.ui.images import CellSize, PaneShape, SixelPainter
+from annotations.ui.keymap import GROUPS
+from annotations.ui.layout import AnnotatorScreen
+from annotations.ui.picture import PicturePane, camera_name, shots_ahead
 from annotations.ui.session import Session
-from annotations.ui.terminal import CellSize
+from annotations.ui.task import TaskScene, load_scene
+from annotations.ui.timeline import CurveStrip
+from annotations.ui.view import CueView
+from annotations.worklist import LabelTask
+from express50.errors import Express50Error
+
+TASKS_AHEAD, FRAMES_AHEAD = 2, 12  # pictures that are made before their task is opened
+
+
+def _bindings() -> list[Binding]:
+    rows = []
+    for key in (key for group in GROUPS.values() for key in group):
+        if key.action == "pick":
+            rows += [Binding(k, f"pick({k})", key.words, show=False) for k in key.keys.split(",")]
+        else:
+            rows.append(Binding(key.keys, key.action, key.words, show=False))
+    return rows
+
+
+def open_view_of(scene: TaskScene, hidden: bool) -> CueView | None:
+    """Where a task opens: on one's own mark, else on the suggestion, else in the middle."""
+    if scene.index is None:
+        return None
+    mine = scene.mine
+    candidates = () if hidden else scene.candidates
+    cursor = None if mine is None else mine.frame
+    view = moves.open_view(scene.first, scene.last, candidates, cursor)
+    if mine is not None:
+        view = replace(view, plateau_first=mine.first, plateau_last=mine.last)
+    return view
+
+
+class Desk(AnnotatorScreen):
+    """Turns keys into moves (view), looks (aim) and decisions (session)."""
+
+    BINDINGS = _bindings()  # type: ignore[assignment]
+
+    def on_mount(self) -> None:
+        """Open the first task; look for faces once the network is there."""
+        if self.faces is not None:
+            self._load_faces(self.faces)
+        self.call_after_refresh(self._begin)
+
+    def _begin(self) -> None:
+        self.open_task()
+        self.session.begin()
+
+    @work(thread=True, group="faces")
+    def _load_faces(self, faces: FaceFinder) -> None:
+        faces.load()
+        self.app.call_from_thread(self.draw)
+
+    def open_task(self) -> None:
+        """Show the session's open task."""
+        self.player.stop()
+        task = self.session.task
+        if task is None:
+            self.say("nothing to label: no expression fits, or nothing is ingested", theme.RED)
+            return
+        self.scene = scene = load_scene(self.session.dataset, task, self.session.annotator)
+        if scene.suggestion is not None:  # else the camera that was chosen last stays
+            self.aim = self.aim._replace(camera=0)
+        self.view = open_view_of(scene, self.session.hidden(task))
+        self.draw()
+        if scene.problem or scene.notes:
+            self.say(scene.problem or " · ".join(scene.notes), theme.ACCENT)
+        ahead = [self.session.tasks[n] for n in self.session.following(TASKS_AHEAD)]
+        self._prepare(ahead, self.query_one("#frame", PicturePane).shape)
+
+    @work(thread=True, exclusive=True, group="ahead")
+    def _prepare(self, tasks: list[LabelTask], shape: PaneShape) -> None:
+        """Read the next tasks, find their faces and ask for their pictures."""
+        shots: list[FrameCrop] = []
+        for task in tasks:
+            scene = load_scene(self.session.dataset, task, self.session.annotator)
+            view = open_view_of(scene, self.session.hidden(task))
+            if view is not None:
+                shots += shots_ahead(scene, view, self.aim, shape, FRAMES_AHEAD)
+        self.cache.want(shots, later=True)
+
+    # Moves and looks
+
+    def _move(self, how: Callable[[CueView], CueView]) -> None:
+        self.player.stop()
+        if self.view is not None:
+            self.view = how(self.view)
+        self.draw()
+
+    def action_step(self, by: int) -> None:
+        """Some frames on or back."""
+        self._move(lambda view: moves.step(view, by))
+
+    def action_go_to(self, where: str) -> None:
+        """An end of the cue window."""
+        self._move(lambda view: moves.go_to(view, getattr(view, where)))
+
+    def action_candidate(self, by: int) -> None:
+        """The next or previous suggestion."""
+        self._move(lambda view: moves.next_candidate(view, by))
+        if self.view is not None and not self.view.candidates:
+            hidden = self.scene is not None and self.session.hidden(self.scene.task)
+            self.say("hidden until you have decided" if hidden else "no suggestion", theme.ACCENT)
+
+    def action_pick(self, number: int) -> None:
+        """A suggestion by its rank."""
+        self._move(lambda view: moves.pick_candidate(view, number - 1))
+
+    def action_plateau_first(self) -> None:
+        """The plateau begins at the cursor."""
+        self._move(moves.set_plateau_first)
+
+    def action_plateau_last(self) -> None:
+        """The plateau ends at the cursor."""
+        self._move(moves.set_plateau_last)
+
+    def on_curve_strip_picked(self, message: CurveStrip.Picked) -> None:
+        """The strip was clicked."""
+        self._move(lambda view: moves.go_to(view, message.frame))
+
+    def action_zoom(self, by: int) -> None:
+        """The next zoom."""
+        number = (ZOOMS.index(self.aim.zoom) + by) % len(ZOOMS)
+        self.aim = self.aim._replace(zoom=ZOOMS[number])
+        self.draw()
+
+    def action_camera(self, by: int) -> None:
+        """The next camera."""
+        if self.scene is not None and self.scene.cameras:
+            number = (self.aim.camera + by) % len(self.scene.cameras)
+            self.aim = self.aim._replace(camera=number)
+            self.draw()
+
+    def action_play(self) -> None:
+        """Play the window, or stop."""
+        self.player.play()
+        self.draw()
+
+    def action_blink(self) -> None:
+        """Show frame and reference in turns in one place, or stop."""
+        self.player.blink()
+        self.draw()
+
+    # Decisions
+
+    def action_mark(self) -> None:
+        """Mark the frame under the cursor and open the next task."""
+        if self.player.plays:  # nobody can mean a frame that moves
+            self.player.stop()
+            self.say("stopped; Enter again marks this frame", theme.ACCENT)
+        elif self.scene is not None and self.view is not None:
+            scene, view, camera = self.scene, self.view, camera_name(self.scene, self.aim.camera)
+            self._decide(lambda: self.session.mark(scene, view, camera))
+        elif self.scene is not None:
+            self.say(self.scene.problem or "nothing to mark", theme.RED)
+
+    def action_ask_flag(self) -> None:
+        """Ask why there is no peak, then flag."""
+        self.player.stop()
+        self.app.push_screen(FlagDialog(), self._flag)
+
+    def _flag(self, reason: str | None) -> None:
+        if reason is not None and self.scene is not None:
+            scene, why = self.scene, reason
+            self._decide(lambda: self.session.flag(scene, why))
+
+    def _decide(self, decide: Callable[[], Label]) -> None:
+        """Save a decision, say so once it is on disk, and open the next task."""
+        try:
+            label = decide()
+        except (Express50Error, OSError) as error:
+            self.say(f"not saved: {error}", theme.RED)
+            return
+        words = panels.saved_words(label)
+        if self.session.advance():
+            self.open_task()
+            self.say(words)
+        else:
+            self.open_task()
+            self.say(f"all {len(self.session.tasks)} done. q leaves, p looks back. {words}")
+
+    def action_undo(self) -> None:
+        """Take the last decision back and show its task."""
+        try:
+            task = self.session.undo()
+        except (Express50Error, OSError) as error:
+            self.say(f"not undone: {error}", theme.RED)
+            return
+        if task is None:
+            self.say("nothing of yours to take back here", theme.ACCENT)
+            return
+        self.open_task()
+        self.say(f"taken back: {task.subject} {task.expression}")
+
+    def action_task(self, by: int) -> None:
+        """A neighbouring task."""
+        if self.session.move(by) or not self.session.tasks:
+            self.open_task()
+        else:
+            self.say(f"this is the {'last' if by > 0 else 'first'} task", theme.ACCENT)
+
+    # Dialogs
+
+    def action_ask_frame(self) -> None:
+        """Ask for a frame's number, then go there."""
+        if self.view is not None:
+            self.player.stop()
+            self.app.push_screen(FrameDialog(self.view.first, self.view.last), self._go_to_frame)
+
+    def _go_to_frame(self, frame: int | None) -> None:
+        if frame is not None:
+            self._move(lambda view: moves.go_to(view, frame))
+
+    def action_help(self) -> None:
+        """Show every key."""
+        self.player.stop()
+        self.app.push_screen(HelpDialog())
+
+    def action_quit(self) -> None:
+        """Leave; every decision is on disk already."""
+        self.app.exit()
+
 
 _STYLE = f"""
 Screen {{ background: {theme.GROUND}; color: {theme.TEXT}; layout: vertical; }}
@@ -49,26 +276,18 @@ class AnnotateApp(App[None]):
         session: Session,
         *,
         faces: FaceFinder | None = None,
-        pictures: str = "blocks",
-        cell: CellSize | None = None,
+        sixel_cell: CellSize | None = None,
     ) -> None:
+        """Show pictures as sixels where the pixels of a terminal's cell are given."""
         super().__init__()
         self.session = session
         self.cache = FrameCache(session.dataset)
         self._faces = faces
-        self._pictures = pictures
-        self._cell = cell
-        self._numbers = picture_numbers()
+        self._sixel_cell = sixel_cell
 
-    def _make_picture(self, cache: FrameCache, name: str) -> Picture:
-        """The widget that shows pictures as the terminal can."""
-        painter = make_painter(self._pictures, self.write_raw, self._numbers, self._cell)
-        return Picture(cache, name, painter)
-
-    def write_raw(self, data: str) -> None:
-        """Write to the terminal past Textual's drawing, but in order with it."""
-        if self._driver is not None:
-            self._driver.write(data)
+    def _make_picture(self, cache: FrameCache, name: str) -> PicturePane:
+        painter = None if self._sixel_cell is None else SixelPainter(self._sixel_cell)
+        return PicturePane(cache, name, painter)
 
     @property
     def desk(self) -> Desk:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 
-class Key(NamedTuple):
+class KeyAction(NamedTuple):
     """Keys (Textual's names) of one action, how they are written for people, and what it does."""
 
     keys: str
@@ -15,37 +15,37 @@ class Key(NamedTuple):
 
 
 MOVE = (
-    Key("left,comma,h", "← , h", "step(-1)", "one frame back"),
-    Key("right,full_stop,l", "→ . l", "step(1)", "one frame on"),
-    Key("shift+left,pageup,H,less_than_sign", "⇧← PgUp H", "step(-10)", "ten frames back"),
-    Key("shift+right,pagedown,L,greater_than_sign", "⇧→ PgDn L", "step(10)", "ten frames on"),
-    Key("home,0", "Home 0", "go_to('first')", "first frame of the cue window"),
-    Key("end,dollar_sign", "End $", "go_to('last')", "last frame of the cue window"),
-    Key("tab", "Tab", "candidate(1)", "next suggestion"),
-    Key("shift+tab", "⇧Tab", "candidate(-1)", "previous suggestion"),
-    Key("1,2,3,4,5", "1 … 5", "pick", "that suggestion, 1 the surest"),
-    Key("g", "g", "ask_frame", "go to a frame by number"),
+    KeyAction("left,comma,h", "← , h", "step(-1)", "one frame back"),
+    KeyAction("right,full_stop,l", "→ . l", "step(1)", "one frame on"),
+    KeyAction("shift+left,pageup,H,less_than_sign", "⇧← PgUp H", "step(-10)", "ten frames back"),
+    KeyAction("shift+right,pagedown,L,greater_than_sign", "⇧→ PgDn L", "step(10)", "ten frames on"),
+    KeyAction("home,0", "Home 0", "go_to('first')", "first frame of the cue window"),
+    KeyAction("end,dollar_sign", "End $", "go_to('last')", "last frame of the cue window"),
+    KeyAction("tab", "Tab", "candidate(1)", "next suggestion"),
+    KeyAction("shift+tab", "⇧Tab", "candidate(-1)", "previous suggestion"),
+    KeyAction("1,2,3,4,5", "1 … 5", "pick", "that suggestion, 1 the surest"),
+    KeyAction("g", "g", "ask_frame", "go to a frame by number"),
 )
 DECIDE = (
-    Key("enter", "Enter", "mark", "mark this frame, open the next task"),
-    Key("left_square_bracket", "[", "plateau_first", "the plateau begins here"),
-    Key("right_square_bracket", "]", "plateau_last", "the plateau ends here"),
-    Key("f", "f", "ask_flag", "flag: no usable peak, with a reason"),
-    Key("u", "u", "undo", "take the last decision back"),
-    Key("n", "n", "task(1)", "next task, this one stays open"),
-    Key("p", "p", "task(-1)", "previous task"),
+    KeyAction("enter", "Enter", "mark", "mark this frame, open the next task"),
+    KeyAction("left_square_bracket", "[", "plateau_first", "the plateau begins here"),
+    KeyAction("right_square_bracket", "]", "plateau_last", "the plateau ends here"),
+    KeyAction("f", "f", "ask_flag", "flag: no usable peak, with a reason"),
+    KeyAction("u", "u", "undo", "take the last decision back"),
+    KeyAction("n", "n", "task(1)", "next task, this one stays open"),
+    KeyAction("p", "p", "task(-1)", "previous task"),
 )
 LOOK = (
-    Key("z", "z", "zoom(1)", "zoom: face, mouth, eyes, head, frame"),
-    Key("Z", "Z", "zoom(-1)", "zoom the other way"),
-    Key("c", "c", "camera(1)", "next camera, in both pictures"),
-    Key("C", "C", "camera(-1)", "previous camera"),
-    Key("b", "b", "blink", "blink: reference and frame in one place"),
-    Key("space", "Space", "play", "play the window, or stop"),
-    Key("question_mark,f1", "?", "help", "this help"),
-    Key("q", "q", "quit", "leave; every mark is already saved"),
+    KeyAction("z", "z", "zoom(1)", "zoom: face, mouth, eyes, head, frame"),
+    KeyAction("Z", "Z", "zoom(-1)", "zoom the other way"),
+    KeyAction("c", "c", "camera(1)", "next camera, in both pictures"),
+    KeyAction("C", "C", "camera(-1)", "previous camera"),
+    KeyAction("b", "b", "blink", "blink: reference and frame in one place"),
+    KeyAction("space", "Space", "play", "play the window, or stop"),
+    KeyAction("question_mark,f1", "?", "help", "this help"),
+    KeyAction("q", "q", "quit", "leave; every mark is already saved"),
 )
-GROUPS = {"Move": MOVE, "Decide": DECIDE, "Look": LOOK}
+GROUPS = {"Move": MOVE, "Decide": DECIDE, "FrameLook": LOOK}
 HINTS = (
     ("←→", "frame"), ("⇧←→", "ten"), ("Tab", "suggestion"), ("Enter", "mark, next"),
     ("[ ]", "plateau"), ("f", "flag"), ("u", "undo"), ("n p", "task"), ("z", "zoom"),

@@ -10,10 +10,10 @@ from rich.text import Text
 from annotations.labels import Label
 from annotations.ui import theme
 from annotations.ui.keymap import HINTS
-from annotations.ui.picture import Look
-from annotations.ui.scene import Scene
+from annotations.ui.picture import FrameLook
 from annotations.ui.session import Session
-from annotations.ui.view import View
+from annotations.ui.task import TaskScene
+from annotations.ui.view import CueView
 
 LEAST_CELLS = 6  # fewer say nothing
 
@@ -31,7 +31,7 @@ def fit(left: Text, right: Text, width: int) -> Text:
     return left
 
 
-def status_line(session: Session, scene: Scene, width: int) -> Text:
+def status_line(session: Session, scene: TaskScene, width: int) -> Text:
     """Expression and subject; progress, doubt and what the label has cost so far."""
     left = Text.assemble(
         (f" {scene.name} ", f"bold {theme.GROUND} on {theme.ACCENT}"),
@@ -58,14 +58,14 @@ def _doubt_colour(doubt: float) -> str:
     return theme.ACCENT if doubt >= 0.2 else theme.GREEN
 
 
-def words_line(scene: Scene, width: int) -> Text:
+def words_line(scene: TaskScene, width: int) -> Text:
     """What the subject was asked to do."""
     text = Text(f" {scene.description}", style=theme.TEXT)
     text.truncate(width, overflow="ellipsis")
     return text
 
 
-def frame_title(scene: Scene, view: View | None, look: Look | None, width: int) -> Text:
+def frame_title(scene: TaskScene, view: CueView | None, look: FrameLook | None, width: int) -> Text:
     """Title of the left picture: position, and what is known of this very frame."""
     if look is None or view is None:
         return Text(f" {scene.task.subject}", style=theme.FAINT)
@@ -78,7 +78,7 @@ def frame_title(scene: Scene, view: View | None, look: Look | None, width: int) 
     return fit(left, Text(f"{look.camera} {look.zoom} ", style=theme.FAINT), width)
 
 
-def frame_tags(scene: Scene, view: View) -> list[tuple[str, str]]:
+def frame_tags(scene: TaskScene, view: CueView) -> list[tuple[str, str]]:
     """Short words, with their colours, on what is known of the frame under the cursor."""
     tags = []
     if view.cursor in view.candidates:
@@ -92,7 +92,7 @@ def frame_tags(scene: Scene, view: View) -> list[tuple[str, str]]:
     return tags
 
 
-def reference_title(scene: Scene, look: Look | None, width: int) -> Text:
+def reference_title(scene: TaskScene, look: FrameLook | None, width: int) -> Text:
     """Title of the right picture."""
     if scene.reference is None or look is None:
         return Text(" reference", style=theme.FAINT)

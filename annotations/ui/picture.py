@@ -1,8 +1,10 @@
-"""The picture widget: one frame, cropped to the zoom, painted as the terminal can."""
+"""The picture panes: which crop of which frame is shown, and the widget that shows it."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 from rich.segment import Segment
 from rich.text import Text
@@ -10,15 +12,19 @@ from textual.geometry import Region
 from textual.strip import Strip
 from textual.widget import Widget
 
+from annotations.suggestions import Suggested
 from annotations.ui import theme
-from annotations.ui.faces import Face, zoom_box
-from annotations.ui.frames import FrameCache, Shot
-from annotations.ui.painters import BlockPainter, Painter, PaneShape
+from annotations.ui.frames import Face, FaceFinder, FrameCache, FrameCrop, zoom_box
+from annotations.ui.images import BlockPainter, Painter, PaneShape
+from annotations.ui.task import TaskScene
+from annotations.ui.timeline import StripContent
+from annotations.ui.view import CueView
+from express50.capture.index import CameraSource
 from express50.errors import AnnotationError
 
 
 @dataclass(frozen=True)
-class Look:
+class FrameLook:
     """Which frame to look at, and how closely; ``aspect`` is the footage's height over width."""
 
     subject: str
@@ -28,20 +34,20 @@ class Look:
     zoom: str
     aspect: float
 
-    def at(self, frame: int) -> Look:
+    def at(self, frame: int) -> FrameLook:
         """The same look at another frame."""
         return replace(self, frame=frame)
 
 
-def shot_of(look: Look, shape: PaneShape) -> Shot:
+def shot_of(look: FrameLook, shape: PaneShape) -> FrameCrop:
     """The picture of a look that fills a pane."""
     columns, rows = max(1, shape.columns), max(1, shape.rows)
     box = zoom_box(look.face, look.zoom, shape.cell_aspect * rows / columns, look.aspect)
     width, height = shape.across * columns, shape.down * rows
-    return Shot(look.subject, look.camera, look.frame, box, width, height)
+    return FrameCrop(look.subject, look.camera, look.frame, box, width, height)
 
 
-class Picture(Widget):
+class PicturePane(Widget):
     """Shows a look, or words in its place; draws only when what it shows changes."""
 
     def __init__(self, cache: FrameCache, name: str, painter: Painter | None = None) -> None:
@@ -49,7 +55,7 @@ class Picture(Widget):
         self._cache = cache
         self._blocks = painter if isinstance(painter, BlockPainter) else BlockPainter()
         self._painter = painter or self._blocks
-        self._look: Look | None = None
+        self._look: FrameLook | None = None
         self._words = ""
         self._lines: list[Strip] | None = None
         self._covered = False
@@ -59,11 +65,11 @@ class Picture(Widget):
         self._blocks.few = self.app.console.color_system != "truecolor"
 
     @property
-    def look(self) -> Look | None:
+    def look(self) -> FrameLook | None:
         """What is shown; None where words stand in its place."""
         return self._look
 
-    def show(self, look: Look | None, words: str = "") -> None:
+    def show(self, look: FrameLook | None, words: str = "") -> None:
         """Show a look, or words where there is none."""
         if (look, words) != (self._look, self._words):
             self._look, self._words, self._lines = look, words, None
@@ -119,3 +125,96 @@ class Picture(Widget):
             strip = Strip([Segment(line.plain, theme.DIM)])
             written.append(strip.adjust_cell_length(width, theme.PLAIN))
         return [blank] * above + written
+
+
+AHEAD = 64  # frames about the cursor that are decoded before they are asked for
+
+
+class Aim(NamedTuple):
+    """How both pictures are looked at: camera (counted from the best), zoom, finder of faces."""
+
+    camera: int
+    zoom: str
+    faces: FaceFinder | None
+
+
+def camera_name(scene: TaskScene, number: int) -> str:
+    """A camera by its number, round and round."""
+    return scene.cameras[number % len(scene.cameras)] if scene.cameras else ""
+
+
+def subject_look(scene: TaskScene, view: CueView, aim: Aim) -> FrameLook | None:
+    """The frame under the cursor; None where there is no footage."""
+    if scene.index is None:
+        return None
+    camera = camera_name(scene, aim.camera)
+    # One framing for the whole window, so that only the face moves when one steps.
+    anchor = view.candidates[0] if view.candidates else (view.first + view.last) // 2
+    face = None if aim.faces is None else aim.faces.find(scene.task.subject, camera, anchor)
+    aspect = _aspect(scene.index.cameras[camera])
+    return FrameLook(scene.task.subject, camera, view.cursor, face, aim.zoom, aspect)
+
+
+def reference_look(scene: TaskScene, aim: Aim) -> FrameLook | None:
+    """The reference's canonical frame, in the same camera where the reference has it."""
+    canonical, index = scene.reference, scene.reference_index
+    if canonical is None or index is None:
+        return None
+    camera = camera_name(scene, aim.camera)
+    if camera not in index.cameras or canonical.frame >= index.cameras[camera].frames:
+        camera = canonical.camera
+    face = None
+    if aim.faces is not None:
+        face = aim.faces.find(canonical.subject, camera, canonical.frame)
+    aspect = _aspect(index.cameras[camera])
+    return FrameLook(canonical.subject, camera, canonical.frame, face, aim.zoom, aspect)
+
+
+def _aspect(source: CameraSource) -> float:
+    return source.height / source.width
+
+
+def frames_ahead(view: CueView, count: int = AHEAD) -> list[int]:
+    """Frames that the next keys may ask for: the nearest, ten on either side, the suggestions."""
+    near = [view.cursor, *view.candidates, view.cursor + 10, view.cursor - 10]
+    for away in range(1, count):
+        near += [view.cursor + away, view.cursor - away]
+    inside = (frame for frame in near if view.first <= frame <= view.last)
+    return list(dict.fromkeys(inside))[:count]
+
+
+def shots_ahead(
+    scene: TaskScene, view: CueView, aim: Aim, shape: PaneShape, count: int = AHEAD
+) -> list[FrameCrop]:
+    """Pictures to decode for a task, most urgent first; finds the faces on the way."""
+    here, there = subject_look(scene, view, aim), reference_look(scene, aim)
+    shots = [shot_of(here.at(n), shape) for n in frames_ahead(view, count)] if here else []
+    if there is not None:
+        shots.insert(1, shot_of(there, shape))
+    return shots
+
+
+def strip_content(scene: TaskScene, view: CueView, hidden: bool) -> StripContent:
+    """What the strip shows; nothing that could sway the annotator while that is hidden."""
+    found = None if hidden else scene.suggestion
+    return StripContent(
+        view=view,
+        activity=curve_in_window(found, None if found is None else found.activity, view),
+        match=curve_in_window(found, None if found is None else found.match, view),
+        mine=scene.mine,
+        in_force=None if hidden else scene.in_force,
+    )
+
+
+def curve_in_window(
+    found: Suggested | None, values: Sequence[float] | None, view: CueView
+) -> tuple[float, ...]:
+    """A curve with one value for each frame of the window; its ends are continued."""
+    if found is None or not values:
+        return ()
+    places = (min(max(n - found.start, 0), len(values) - 1) for n in _frames(view))
+    return tuple(float(values[place]) for place in places)
+
+
+def _frames(view: CueView) -> range:
+    return range(view.first, view.last + 1)

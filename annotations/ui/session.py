@@ -12,9 +12,9 @@ from dataclasses import dataclass
 
 from annotations.labels import AUTOMATIC, RULE_PREFIX, Label, make_flag, make_mark, make_undo
 from annotations.store import append_label, is_person, labels_of, read_labels
-from annotations.ui.scene import Scene
-from annotations.ui.view import View, plateau_problem
-from annotations.worklist import Task, worklist
+from annotations.ui.task import TaskScene
+from annotations.ui.view import CueView, plateau_problem
+from annotations.worklist import LabelTask, worklist
 from express50.capture.index import read_index
 from express50.contract.layout import Dataset
 from express50.errors import AnnotationError
@@ -37,8 +37,8 @@ class Session:
         self,
         dataset: Dataset,
         annotator: str,
-        tasks: list[Task],
-        todo: Collection[Task],
+        tasks: list[LabelTask],
+        todo: Collection[LabelTask],
         *,
         blind: bool = False,
         clock: Callable[[], float] = time.monotonic,
@@ -60,7 +60,7 @@ class Session:
         self.position = next((n for n, t in enumerate(tasks) if _key(t) in self._open), 0)
 
     @property
-    def task(self) -> Task | None:
+    def task(self) -> LabelTask | None:
         """The open task; None when there are none at all."""
         return self.tasks[self.position] if self.tasks else None
 
@@ -74,11 +74,11 @@ class Session:
         """Whether nothing is left to decide."""
         return not self._open
 
-    def is_open(self, task: Task) -> bool:
+    def is_open(self, task: LabelTask) -> bool:
         """Whether the annotator has not decided a task."""
         return _key(task) in self._open
 
-    def hidden(self, task: Task) -> bool:
+    def hidden(self, task: LabelTask) -> bool:
         """Whether suggestions and others' marks are to be kept from the annotator."""
         return self.blind and self.is_open(task)
 
@@ -135,7 +135,7 @@ class Session:
         self._efforts.setdefault(self._here(), Effort()).seconds += self._since_last_key()
         self._last_key = self._clock()
 
-    def mark(self, scene: Scene, view: View, camera: str) -> Label:
+    def mark(self, scene: TaskScene, view: CueView, camera: str) -> Label:
         """Mark the frame under the cursor; it is on disk when this returns.
 
         Raises:
@@ -164,7 +164,7 @@ class Session:
         self._save(label)
         return label
 
-    def flag(self, scene: Scene, reason: str) -> Label:
+    def flag(self, scene: TaskScene, reason: str) -> Label:
         """Say that the open task has no usable peak; it is on disk when this returns.
 
         Raises:
@@ -191,7 +191,7 @@ class Session:
         self._open.discard((label.subject, label.expression))
         self._efforts.pop((label.subject, label.expression), None)
 
-    def undo(self) -> Task | None:
+    def undo(self) -> LabelTask | None:
         """Take the annotator's last decision of this session back, else that on the open task.
 
         The task it was about becomes the open one; None when there is nothing to take back.
@@ -213,7 +213,7 @@ class Session:
         return labels_of(read_labels(self.dataset, subject), self.annotator)
 
 
-def _key(task: Task) -> tuple[str, str]:
+def _key(task: LabelTask) -> tuple[str, str]:
     return task.subject, task.expression
 
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 
 @dataclass(frozen=True, kw_only=True)
-class View:
+class CueView:
     """Position within one task.
 
     Attributes:
@@ -36,25 +36,25 @@ class View:
 
 def open_view(
     first: int, last: int, candidates: tuple[int, ...] = (), cursor: int | None = None
-) -> View:
+) -> CueView:
     """A fresh view: on the given frame, else on the best candidate, else in the window's middle."""
     inside = tuple(dict.fromkeys(c for c in candidates if first <= c <= last))
     if cursor is None or not first <= cursor <= last:
         cursor = inside[0] if inside else (first + last) // 2
-    return View(first=first, last=last, cursor=cursor, candidates=inside)
+    return CueView(first=first, last=last, cursor=cursor, candidates=inside)
 
 
-def go_to(view: View, frame: int) -> View:
+def go_to(view: CueView, frame: int) -> CueView:
     """Move to a frame; the window's ends stop the cursor, it never wraps."""
     return replace(view, cursor=min(max(frame, view.first), view.last))
 
 
-def step(view: View, by: int) -> View:
+def step(view: CueView, by: int) -> CueView:
     """Move by some frames."""
     return go_to(view, view.cursor + by)
 
 
-def next_candidate(view: View, by: int) -> View:
+def next_candidate(view: CueView, by: int) -> CueView:
     """Move to the next (1) or previous (-1) candidate, round and round."""
     if not view.candidates:
         return view
@@ -64,14 +64,14 @@ def next_candidate(view: View, by: int) -> View:
     return pick_candidate(view, here if away and by > 0 else (here + by) % len(view.candidates))
 
 
-def pick_candidate(view: View, number: int) -> View:
+def pick_candidate(view: CueView, number: int) -> CueView:
     """Move to a candidate by its rank, 0 the best; where there is none the view stays."""
     if not 0 <= number < len(view.candidates):
         return view
     return replace(go_to(view, view.candidates[number]), candidate=number)
 
 
-def set_plateau_first(view: View) -> View:
+def set_plateau_first(view: CueView) -> CueView:
     """The plateau begins here; the same key on the same frame takes it back."""
     if view.plateau_first == view.cursor:
         return replace(view, plateau_first=None)
@@ -80,7 +80,7 @@ def set_plateau_first(view: View) -> View:
     return replace(view, plateau_first=view.cursor, plateau_last=last if keep else None)
 
 
-def set_plateau_last(view: View) -> View:
+def set_plateau_last(view: CueView) -> CueView:
     """The plateau ends here; the same key on the same frame takes it back."""
     if view.plateau_last == view.cursor:
         return replace(view, plateau_last=None)
@@ -89,7 +89,7 @@ def set_plateau_last(view: View) -> View:
     return replace(view, plateau_last=view.cursor, plateau_first=first if keep else None)
 
 
-def plateau_problem(view: View) -> str | None:
+def plateau_problem(view: CueView) -> str | None:
     """Why the cursor cannot be marked with this plateau, in plain words; None when it can."""
     low = view.first if view.plateau_first is None else view.plateau_first
     high = view.last if view.plateau_last is None else view.plateau_last

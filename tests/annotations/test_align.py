@@ -7,9 +7,8 @@ import pytest
 
 from annotations import align, observe
 from annotations.labels import AUTOMATIC, make_flag, make_mark
-from annotations.reference import choose_reference
 from annotations.store import append_label, current_labels, read_labels
-from annotations.suggestions import read_suggestions
+from annotations.suggestions import choose_reference, read_suggestions
 from annotations.watch import FACE
 from express50.capture.index import read_index
 from express50.cli.main import main

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from annotations.agreement import Clip, agreement, interval_alpha
+from annotations.agreement import MarkedClip, agreement, interval_alpha
 from express50.cli.main import main
 from express50.contract.exclusions import included_subjects
 
@@ -88,7 +88,10 @@ def test_alpha_is_krippendorffs_on_time_within_the_clip():
     observed = np.mean([(v[0] - v[1]) ** 2 for v in values])
     assert interval_alpha(values) == pytest.approx(1 - observed / expected)
     assert interval_alpha([np.array([0.3, 0.3])] * 4) is None
-    far = [Clip("S", f"e{k}", 1000 * k, 11, {"a": 1000 * k, "b": 1000 * k + 10}) for k in range(5)]
+    far = [
+        MarkedClip("S", f"e{k}", 1000 * k, 11, {"a": 1000 * k, "b": 1000 * k + 10})
+        for k in range(5)
+    ]
     assert agreement(far)["alpha"] < 0  # frame numbers alone would say nearly 1
     assert agreement([])["alpha"] is None
 

@@ -21,7 +21,7 @@ KILLED = {"bob": 17, "dot": 41}  # after so many acknowledged events
 _ANNOTATOR = """
 import json, random, sys
 sys.path[:0] = sys.argv[4:]
-from annotations.ui.scene import load_scene
+from annotations.ui.task import load_scene
 from annotations.ui.session import open_session
 from annotations.ui.view import go_to, open_view
 from express50.contract.layout import Dataset

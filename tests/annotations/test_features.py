@@ -13,7 +13,7 @@ from annotations.features import (
     measure,
 )
 from annotations.match import shared_columns
-from annotations.observe import Observations
+from annotations.observe import FaceObservations
 from annotations.suggest import strongest_event
 from annotations.watch import FACE, face_side, find_points, steady
 from express50.capture.expressions import load_script
@@ -28,7 +28,7 @@ def observations(points, faces=None, cameras=("a",)):
     """What one camera (or several of the same view) saw."""
     faces = np.full((len(points), FACE, FACE), 128, np.uint8) if faces is None else faces
     count = len(cameras)
-    return Observations(
+    return FaceObservations(
         cameras, np.arange(len(points)), np.stack([points] * count),
         np.ones((count, len(points))), np.stack([faces] * count),
     )  # fmt: skip

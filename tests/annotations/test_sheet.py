@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from annotations.labels import AUTOMATIC, make_flag, make_mark
-from annotations.sheet import make_sheet
-from annotations.sheet_page import STRIP_WIDTH, render_sheet, take_pictures
+from annotations.sheet import STRIP_WIDTH, make_sheet, render_sheet, take_pictures
 from annotations.store import append_label
 from annotations.ui.frames import crop_to
 from express50.capture.frames import read_proxy

@@ -3,9 +3,8 @@
 import pytest
 
 from annotations.labels import AUTOMATIC, Label, make_flag, make_mark
-from annotations.reference import canonical, choose_reference, reference_subject
 from annotations.store import append_label
-from annotations.suggestions import read_suggestions
+from annotations.suggestions import canonical, choose_reference, read_suggestions, reference_subject
 from annotations.worklist import worklist
 from express50.capture.index import read_index
 from express50.contract.exclusions import exclusion_reason, included_subjects

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from annotations import observe
 from annotations.features import expression_values, measure
 from annotations.match import suggest_all, watch
-from annotations.observe import Observations
+from annotations.observe import FaceObservations
 from annotations.suggest import suggest
 from annotations.watch import FACE, align_faces, similarity_2d
 from express50.capture.expressions import load_script
@@ -25,7 +25,7 @@ def observed(points, faces=None):
     faces = np.zeros((len(points), FACE, FACE), np.uint8) if faces is None else faces
     frames = np.arange(len(points))
     scores = np.ones((1, len(points)))
-    return Observations(("a",), frames, points[None].astype(np.float32), scores, faces[None])
+    return FaceObservations(("a",), frames, points[None].astype(np.float32), scores, faces[None])
 
 
 def suggested(points, windows, expression="smile"):

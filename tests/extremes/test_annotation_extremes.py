@@ -9,24 +9,30 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from annotations.agreement import Clip, agreement, by_expression, by_pair, clip_times, marked_clips
-from annotations.coverage import coverage
+from annotations.agreement import (
+    MarkedClip,
+    agreement,
+    by_expression,
+    by_pair,
+    clip_times,
+    disagreements,
+    marked_clips,
+)
 from annotations.labels import make_mark
-from annotations.review import disagreements
-from annotations.sheet import make_sheet
-from annotations.sheet_page import render_sheet
+from annotations.sheet import make_sheet, render_sheet
+from annotations.status import coverage
 from annotations.store import append_label, read_labels
 from annotations.suggestions import read_suggestions
 from annotations.ui import view as moves
 from annotations.ui.app import AnnotateApp
-from annotations.ui.looks import frames_ahead
-from annotations.ui.replay import cheapest_keys
+from annotations.ui.images import CellSize
+from annotations.ui.picture import frames_ahead
 from annotations.ui.session import open_session
-from annotations.ui.strip import GUTTER, StripContent, column_of, draw_strip, frame_at
-from annotations.ui.terminal import CellSize
+from annotations.ui.timeline import GUTTER, StripContent, column_of, draw_strip, frame_at
 from annotations.ui.view import open_view
 from annotations.validate import problems
 from annotations.worklist import worklist
+from benchmarks.replay import cheapest_keys
 from express50.capture.index import read_index
 from express50.cli.main import main
 from express50.contract.config import resolve_config
@@ -42,7 +48,7 @@ DAY = 60 * 86400  # frames of a day at 60 a second
 
 def clips_of(*frames, start=0, length=24):
     return [
-        Clip("S1", f"e{n}", start, length, dict(zip("abcdef", row, strict=False)))
+        MarkedClip("S1", f"e{n}", start, length, dict(zip("abcdef", row, strict=False)))
         for n, row in enumerate(frames)
     ]
 
@@ -78,7 +84,7 @@ def test_a_frames_difference_in_a_day_long_clip_is_no_agreement():
 
 @pytest.mark.parametrize("length", [-3, 0, 1])
 def test_a_clip_without_length_gives_numbers(length):
-    clip = Clip("S1", "e", 7, length, {"a": 7, "b": 7})
+    clip = MarkedClip("S1", "e", 7, length, {"a": 7, "b": 7})
     assert np.isfinite(clip_times(clip)).all()
     assert agreement([clip])["within_1"] == 1.0
 
@@ -183,14 +189,14 @@ def speck(tmp_path_factory):
     return dataset
 
 
-@pytest.mark.parametrize("pictures", ["blocks", "halfblocks", "kitty", "sixel"])
+@pytest.mark.parametrize("cell", [None, CellSize(7, 15)])
 @pytest.mark.parametrize("size", [(1, 1), (2, 3), (30, 10)])
-def test_five_pixels_in_a_terminal_of_one_cell(speck, tmp_path, pictures, size):
+def test_five_pixels_in_a_terminal_of_one_cell(speck, tmp_path, cell, size):
     dataset = Dataset(tmp_path)
     for name in ("ingest", "captures.json"):
         (tmp_path / name).symlink_to(speck.root / name)
     session = open_session(dataset, "ann", order="subject")
-    app = AnnotateApp(session, pictures=pictures, cell=CellSize(7, 15))
+    app = AnnotateApp(session, sixel_cell=cell)
 
     async def run():
         async with app.run_test(size=size) as pilot:

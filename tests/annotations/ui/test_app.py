@@ -9,11 +9,11 @@ from rich.text import Text
 
 from annotations.labels import make_mark
 from annotations.store import append_label, current_labels, read_labels
-from annotations.ui import player
+from annotations.ui import layout
 from annotations.ui.keymap import GROUPS
 from annotations.ui.panels import fit, hint_line
-from annotations.ui.picture import Picture
-from annotations.ui.strip import CurveStrip
+from annotations.ui.picture import PicturePane
+from annotations.ui.timeline import CurveStrip
 from express50.capture.index import read_index
 from tests.annotations.footage import suggest
 
@@ -66,7 +66,7 @@ def test_every_way_of_moving_is_on_its_key(suggested, make_app):
                 assert app.desk.view.cursor == 20
                 await pilot.press(key)
                 assert (key, app.desk.view.cursor) == (key, frame)
-                assert app.desk.query_one("#frame", Picture).look.frame == frame
+                assert app.desk.query_one("#frame", PicturePane).look.frame == frame
             await pilot.press("g", "2", "9", "enter")
             assert app.desk.view.cursor == 29
             await pilot.press("g", "7", "escape")
@@ -171,13 +171,13 @@ def test_help_scrolls_in_a_low_terminal(suggested, make_app):
 
 
 def test_zoom_camera_blink_play_and_help_leave_the_label_alone(suggested, make_app, monkeypatch):
-    monkeypatch.setattr(player, "FASTEST", 2.0)  # a busy machine must not reach the window's end
+    monkeypatch.setattr(layout, "FASTEST", 2.0)  # a busy machine must not reach the window's end
     app = make_app(suggested)
 
     async def run():
         async with app.run_test(size=(80, 22)) as pilot:
             await pilot.pause()
-            frame = app.desk.query_one("#frame", Picture)
+            frame = app.desk.query_one("#frame", PicturePane)
             zooms, cameras = [], []
             for _ in range(5):
                 await pilot.press("z")
@@ -185,7 +185,7 @@ def test_zoom_camera_blink_play_and_help_leave_the_label_alone(suggested, make_a
             assert zooms == ["mouth", "eyes", "head", "frame", "face"]
             for key in "cc":
                 await pilot.press(key)
-                reference = app.desk.query_one("#reference", Picture).look
+                reference = app.desk.query_one("#reference", PicturePane).look
                 cameras.append((frame.look.camera, reference.camera))
             assert cameras == [("cam00", "cam00"), ("cam01", "cam01")]
             await pilot.press("n", "n", "n", "b")  # smile of S002, against S001
@@ -207,7 +207,7 @@ def test_zoom_camera_blink_play_and_help_leave_the_label_alone(suggested, make_a
 
 
 def test_play_ends_with_the_window_and_starts_again(suggested, make_app, monkeypatch):
-    monkeypatch.setattr(player, "FASTEST", 4.0)
+    monkeypatch.setattr(layout, "FASTEST", 4.0)
     app = make_app(suggested)
 
     async def run():
@@ -251,7 +251,7 @@ def test_missing_proxies_and_footage_are_said_in_plain_words(suggested, make_app
         path.unlink()
 
     def picture_words(app):
-        strips = app.desk.query_one("#frame", Picture)._lines
+        strips = app.desk.query_one("#frame", PicturePane)._lines
         return " ".join(" ".join(strip.text for strip in strips).split())
 
     assert "proxies are missing" in drive(make_app(suggested), check=picture_words)

@@ -6,15 +6,14 @@ import time
 import numpy as np
 import pytest
 
-from annotations.ui.faces import Face, zoom_box
-from annotations.ui.frames import FrameCache, Shot, crop_to
+from annotations.ui.frames import Face, FrameCache, FrameCrop, crop_to, zoom_box
 from express50.errors import AnnotationError, CaptureError
 
 WHOLE = (0.0, 0.0, 1.0, 1.0)
 
 
 def shot(frame, size=8):
-    return Shot("S1", "cam", frame, WHOLE, size, size)
+    return FrameCrop("S1", "cam", frame, WHOLE, size, size)
 
 
 def painter(dataset, wanted):

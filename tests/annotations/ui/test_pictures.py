@@ -1,73 +1,33 @@
-"""Pictures beyond characters: what is sent is decoded again and is the picture that was meant."""
+"""Sixels that are sent are decoded again and are the picture that was meant."""
 
 import asyncio
-import base64
 import re
-import unicodedata
 
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from textual.geometry import Size
 
-from annotations.ui import kitty, painters
 from annotations.ui.app import AnnotateApp
-from annotations.ui.frames import Shot
-from annotations.ui.picture import Picture, shot_of
+from annotations.ui.frames import FrameCrop
+from annotations.ui.images import (
+    COLOURS,
+    SIXEL_PIXELS,
+    CellSize,
+    SixelPainter,
+    encode_sixel,
+    quantise,
+)
+from annotations.ui.picture import PicturePane, shot_of
 from annotations.ui.session import open_session
-from annotations.ui.sixel import COLOURS, encode_sixel, quantise
-from annotations.ui.terminal import CellSize, choose_pictures
-from express50.files.images import decode_image
 
-SHOT = Shot("S1", "cam", 3, (0.0, 0.0, 1.0, 1.0), 8, 8)
-MESSAGE = re.compile(r"\x1b_G([^;\x1b]*)(?:;([^\x1b]*))?\x1b\\")
-
-
-def noise(height, width, seed=0):
-    return np.random.default_rng(seed).integers(0, 256, (height, width, 3), dtype=np.uint8)
+SHOT = FrameCrop("S1", "cam", 3, (0.0, 0.0, 1.0, 1.0), 8, 8)
 
 
 def smooth(height, width):
     y, x = np.mgrid[:height, :width]
     shade = 150 + 90 * np.sin(x / 17) * np.cos(y / 11)
     return (shade[..., None] * [1.0, 0.8, 0.7] + 20 * np.sin(y / 31)[..., None]).astype(np.uint8)
-
-
-def kitty_pictures(text):
-    """What a terminal would hold after these messages: number to (picture, columns, rows)."""
-    held, data, head = {}, "", {}
-    for keys, payload in MESSAGE.findall(text):
-        said = dict(pair.split("=") for pair in keys.split(","))
-        assert said["q"] == "2"  # an answer would be read as keys
-        if said.get("a") == "d":
-            assert said["d"] == "I"
-            del held[int(said["i"])]
-            continue
-        assert len(payload) <= 4096 and (said["m"] == "0" or len(payload) % 4 == 0)
-        head, data = head | said, data + payload
-        if said["m"] == "0":
-            assert (head["a"], head["U"], head["f"], head["t"]) == ("T", "1", "100", "d")
-            image = decode_image(base64.b64decode(data), "kitty")
-            held[int(head["i"])] = image, int(head["c"]), int(head["r"])
-            data, head = "", {}
-    assert data == ""
-    return held
-
-
-def placed(lines):
-    """Number, and (row, column) of each cell of placeholder lines."""
-    cells, numbers = [], set()
-    signs = kitty.diacritics()
-    for line in lines:
-        for text, style, _ in line:
-            for at in range(0, len(text), 3):
-                mark, row, column = text[at : at + 3]
-                if mark != kitty.PLACEHOLDER:
-                    break
-                cells.append((signs.index(row), signs.index(column)))
-                numbers.add(int.from_bytes(bytes(style.color.triplet), "big"))
-    return numbers, cells
 
 
 def decode_sixel(text):
@@ -98,48 +58,6 @@ def decode_sixel(text):
     return image[:height], image[height:]
 
 
-def test_the_table_of_diacritics_is_kittys():
-    signs = kitty.diacritics()
-    assert len(signs) == len(set(signs)) == 297
-    assert {unicodedata.combining(sign) for sign in signs} == {230}
-    assert [hex(ord(signs[n])) for n in (0, 1, 2, 3, 9, 296)] == [
-        "0x305", "0x30d", "0x30e", "0x310", "0x34a", "0x1d244",
-    ]  # fmt: skip
-
-
-@pytest.mark.parametrize("shape", [(1, 1), (5, 5), (97, 61), (270, 240)])
-def test_kitty_sends_the_very_picture_in_bounded_messages(shape):
-    picture = noise(*shape)
-    text = kitty.transmit(0x123456, kitty.encode_png(picture), 30, 20)
-    assert MESSAGE.sub("", text) == ""
-    (number, (image, columns, rows)) = kitty_pictures(text).popitem()
-    assert (number, columns, rows) == (0x123456, 30, 20)
-    np.testing.assert_array_equal(image, picture)
-
-
-def test_placeholders_name_their_row_and_column_also_when_cut():
-    lines = kitty.placeholder_strips(0xABCDEF, 6, 3)
-    assert placed(lines) == ({0xABCDEF}, [(y, x) for y in range(3) for x in range(6)])
-    assert [line.cell_length for line in lines] == [6, 6, 6]
-    assert placed([lines[1].crop(2, 5)]) == ({0xABCDEF}, [(1, 2), (1, 3), (1, 4)])
-    left, right = lines[2].divide([2, 6])
-    assert (left.cell_length, placed([right])[1]) == (2, [(2, x) for x in range(2, 6)])
-
-
-def test_kitty_forgets_what_is_not_kept_and_sends_nothing_twice():
-    sent = []
-    painter = painters.KittyPainter(sent.append, iter(range(70000, 80000)))
-    pane = Size(4, 2)
-    shots = [SHOT._replace(frame=n) for n in range(painters.KEPT + 3)]
-    for shot in shots:
-        painter.strips(shot, pane, lambda shot: np.full((8, 8, 3), shot.frame, np.uint8))
-    before = len(sent)
-    painter.strips(shots[-1], pane, noise)
-    assert len(sent) == before
-    held = kitty_pictures("".join(sent))
-    assert sorted(image[0, 0, 0] for image, _, _ in held.values()) == list(range(3, len(shots)))
-
-
 @settings(deadline=None, max_examples=40)
 @given(height=st.integers(1, 40), width=st.integers(1, 40), colours=st.integers(1, COLOURS))
 def test_sixels_of_few_colours_are_the_picture(height, width, colours):
@@ -162,7 +80,7 @@ def test_sixels_of_many_colours_are_near_the_picture_and_paint_every_pixel():
 
 def test_sixels_follow_the_panes_last_cell_and_return_the_cursor():
     cell = CellSize(10, 21)
-    painter = painters.SixelPainter(cell)
+    painter = SixelPainter(cell)
     pane = Size(12, 5)
     shape = painter.shape(pane)
     assert (shape.columns, shape.rows, shape.cell_aspect) == (12, 5, 2.1)
@@ -181,56 +99,15 @@ def test_sixels_follow_the_panes_last_cell_and_return_the_cursor():
 
 def test_large_panes_send_no_more_pixels_than_the_limit():
     for pane in (Size(400, 150), Size(297, 120), Size(1000, 2)):
-        for painter, limit in (
-            (painters.SixelPainter(CellSize(11, 24)), painters.SIXEL_PIXELS),
-            (painters.KittyPainter(lambda data: None, iter([1])), painters.KITTY_PIXELS),
-        ):
-            shape = painter.shape(pane)
-            pixels = shape.columns * shape.across * shape.rows * shape.down
-            assert 0.2 * limit < pixels <= limit
-
-
-KITTY = {"TERM": "xterm-kitty", "KITTY_WINDOW_ID": "1"}
-
-
-@pytest.mark.parametrize(
-    ("environ", "expected"),
-    [
-        (KITTY, "kitty"),
-        ({"TERM": "xterm-kitty"}, "kitty"),  # over ssh
-        ({"TERM": "xterm-ghostty"}, "kitty"),
-        ({"TERM": "xterm-256color", "TERM_PROGRAM": "ghostty"}, "kitty"),
-        ({"TERM": "foot"}, "sixel"),
-        ({"TERM": "xterm-256color", "TERM_PROGRAM": "WezTerm"}, "sixel"),
-        ({"TERM": "xterm-256color", "LC_TERMINAL": "iTerm2"}, "sixel"),
-        ({"TERM": "xterm-256color"}, "blocks"),
-        ({}, "blocks"),
-        (KITTY | {"TERM": "tmux-256color", "TMUX": "/tmp/x"}, "blocks"),
-        (KITTY | {"TMUX": "/tmp/x"}, "blocks"),
-        ({"TERM": "screen.xterm-256color"}, "blocks"),
-        ({"TERM": "foot", "STY": "1.pts"}, "blocks"),
-        ({"TERM": "xterm-256color", "KITTY_WINDOW_ID": "1", "TERM_PROGRAM": "vscode"}, "blocks"),
-    ],
-)
-def test_pictures_are_chosen_by_what_the_terminal_says_of_itself(environ, expected, monkeypatch):
-    cell = CellSize(8, 16)
-    assert choose_pictures("auto", environ, is_terminal=True, cell=cell) == expected
-    assert choose_pictures("auto", environ, is_terminal=False, cell=cell) == "blocks"
-    assert choose_pictures("halfblocks", environ, is_terminal=True) == "halfblocks"
-    if expected == "sixel":  # nobody knows how many pixels a pane has
-        monkeypatch.setattr("annotations.ui.terminal.cell_size", lambda: None)
-        assert choose_pictures("auto", environ, is_terminal=True) == "blocks"
+        shape = SixelPainter(CellSize(11, 24)).shape(pane)
+        pixels = shape.columns * shape.across * shape.rows * shape.down
+        assert 0.2 * SIXEL_PIXELS < pixels <= SIXEL_PIXELS
 
 
 class Recorder(AnnotateApp):
-    """The app, with what it writes to the terminal."""
+    """The app, with what it draws."""
 
-    def __init__(self, *args, **options):
-        super().__init__(*args, **options)
-        self.raw, self.drawn = "", ""
-
-    def write_raw(self, data):
-        self.raw += data
+    drawn = ""
 
     def _display(self, screen, renderable):
         super()._display(screen, renderable)
@@ -240,44 +117,12 @@ class Recorder(AnnotateApp):
 
 def shown(app, name="frame"):
     """The picture that a pane is meant to show."""
-    pane = app.desk.query_one(f"#{name}", Picture)
+    pane = app.desk.query_one(f"#{name}", PicturePane)
     return pane, app.cache.get(shot_of(pane.look, pane.shape))
 
 
-def test_the_app_shows_by_kitty_what_it_means_and_characters_below_a_dialog(suggested):
-    app = Recorder(open_session(suggested, "ann", order="subject"), pictures="kitty")
-
-    async def run():
-        async with app.run_test(size=(80, 22)) as pilot:
-            for key in ("right", "right", "left"):
-                await pilot.press(key)
-            await pilot.pause()
-            held = kitty_pictures(app.raw)
-            assert len(held) <= 4  # three frames and the reference, each sent once
-            for name in ("frame", "reference"):
-                pane, picture = shown(app, name)
-                lines = pane.render_lines(pane.size.region)
-                (number,), cells = placed(lines)
-                np.testing.assert_array_equal(held[number][0], picture)
-                assert held[number][1:] == pane.size
-                assert len(cells) == pane.size.area
-            panes = [app.desk.query_one(f"#{name}", Picture) for name in ("frame", "reference")]
-            await pilot.press("question_mark")
-            await pilot.pause()
-            before, app.drawn = app.raw, ""
-            await pilot.press("escape")
-            await pilot.pause()
-            assert app.raw == before
-            cells = sum(pane.size.area for pane in panes)
-            assert app.drawn.count(kitty.PLACEHOLDER) in (cells, 2 * cells)
-
-    asyncio.run(run())
-
-
 def test_the_app_draws_sixels_and_none_over_a_dialog(suggested):
-    app = Recorder(
-        open_session(suggested, "ann", order="subject"), pictures="sixel", cell=CellSize(7, 15)
-    )
+    app = Recorder(open_session(suggested, "ann", order="subject"), sixel_cell=CellSize(7, 15))
 
     async def run():
         async with app.run_test(size=(80, 22)) as pilot:

@@ -6,9 +6,9 @@ import pytest
 
 from annotations.store import read_labels
 from annotations.ui.app import AnnotateApp
-from annotations.ui.replay import MOVES, cheapest_keys, measure_steps, replay
 from annotations.ui.session import open_session
 from annotations.ui.view import open_view
+from benchmarks.replay import MOVES, cheapest_keys, measure_steps, replay
 from express50.errors import AnnotationError
 
 
@@ -58,7 +58,7 @@ def test_faces_found_late_are_drawn_when_they_are_there(suggested):
             self.ready = True
 
         def find(self, subject, camera, frame):
-            from annotations.ui.faces import Face
+            from annotations.ui.frames import Face
 
             return Face(0.5, 0.5, 0.2, 1.0) if self.ready else None
 

@@ -10,10 +10,10 @@ import pytest
 
 from annotations.labels import make_mark
 from annotations.store import append_label, labels_of, read_labels
-from annotations.ui.scene import load_scene
 from annotations.ui.session import IDLE_SECONDS, open_session
+from annotations.ui.task import load_scene
 from annotations.ui.view import open_view, set_plateau_first, step
-from annotations.worklist import Task
+from annotations.worklist import LabelTask
 from express50.capture.index import read_index
 from express50.errors import AnnotationError
 from tests.annotations.footage import suggest
@@ -145,20 +145,24 @@ def test_a_label_on_other_footage_is_named(suggested):
     index = read_index(suggested, "S001")
     label = make_mark(index, "smile", 20, "cam00", "ann")
     append_label(suggested, type(label)(**{**vars(label), "dhash": "0" * 16}))
-    scene = load_scene(suggested, Task("S001", "smile", 0.1), "ann")
+    scene = load_scene(suggested, LabelTask("S001", "smile", 0.1), "ann")
     assert any("another picture in today's footage" in note for note in scene.notes)
 
 
 def test_what_is_missing_is_said_not_raised(dataset):
-    scene = load_scene(dataset, Task("S001", "smile", 1.0), "ann")
+    scene = load_scene(dataset, LabelTask("S001", "smile", 1.0), "ann")
     assert scene.problem is None
     assert any("align" in note for note in scene.notes)
     assert any("reference" in note for note in scene.notes)
-    assert "no footage of shout" in load_scene(dataset, Task("S001", "shout", 1.0), "ann").problem
-    assert "not ingested" in load_scene(dataset, Task("S9", "smile", 1.0), "ann").problem
+    assert (
+        "no footage of shout" in load_scene(dataset, LabelTask("S001", "shout", 1.0), "ann").problem
+    )
+    assert "not ingested" in load_scene(dataset, LabelTask("S9", "smile", 1.0), "ann").problem
     suggest(dataset, {"S001": {"smile": [20]}})
     (dataset.item_dir("align", "S001") / "suggestions.json").write_text("[")
-    assert "suggestions" in " ".join(load_scene(dataset, Task("S001", "smile", 1), "ann").notes)
+    assert "suggestions" in " ".join(
+        load_scene(dataset, LabelTask("S001", "smile", 1), "ann").notes
+    )
 
 
 @pytest.mark.parametrize("name", ["auto", "rule:last-frame"])

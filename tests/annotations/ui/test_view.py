@@ -5,7 +5,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from annotations.ui import view as moves
-from annotations.ui.view import View, open_view
+from annotations.ui.view import CueView, open_view
 
 
 def test_a_task_opens_on_the_suggestion_else_in_the_middle():
@@ -54,7 +54,7 @@ def test_plateau_keys_set_move_and_take_back():
 
 def test_a_cursor_outside_its_window_is_refused():
     with pytest.raises(ValueError, match="outside 2 to 5"):
-        View(first=2, last=5, cursor=6)
+        CueView(first=2, last=5, cursor=6)
 
 
 @settings(max_examples=60, deadline=None)

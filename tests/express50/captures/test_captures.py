@@ -286,7 +286,7 @@ def test_cameras_read_the_wrong_way_round_are_refused(tmp_path):
 
 
 def test_the_last_frame_rule_knows_the_release(tmp_path):
-    from annotations.rules import last_frame_marks
+    from annotations.exchange import last_frame_marks
 
     path = layouts.write_renderme(tmp_path, expressions=2)
     dataset, subject = ingested(tmp_path, path)

@@ -19,14 +19,14 @@ from annotations.labels import Label
 from annotations.store import labels_of, read_labels
 from annotations.ui import view as moves
 from annotations.ui.app import AnnotateApp
-from annotations.ui.faces import FaceFinder
+from annotations.ui.frames import FaceFinder
 from annotations.ui.session import Session, open_session
-from annotations.ui.view import View
+from annotations.ui.view import CueView
 from express50.contract.layout import Dataset
 from express50.errors import AnnotationError
 
 SIZE = (120, 40)
-Move = Callable[[View], View]
+Move = Callable[[CueView], CueView]
 
 
 def _pick(number: int) -> Move:
@@ -163,16 +163,16 @@ async def _label_one(
     result.errors.append(abs((label.frame or 0) - frame))
 
 
-def cheapest_keys(view: View, frame: int, tolerance: int) -> list[str]:
+def cheapest_keys(view: CueView, frame: int, tolerance: int) -> list[str]:
     """The fewest keys from the cursor to a frame within the tolerance, by breadth-first search."""
     goal = min(max(frame, view.first), view.last)
-    seen: dict[View, list[str]] = {view: []}
+    seen: dict[CueView, list[str]] = {view: []}
     edge = [view]
     while edge:
         for here in edge:
             if abs(here.cursor - goal) <= tolerance:
                 return seen[here]
-        following: dict[View, list[str]] = {}
+        following: dict[CueView, list[str]] = {}
         for here in edge:
             for key, move in MOVES.items():
                 there = move(here)

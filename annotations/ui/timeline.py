@@ -15,7 +15,7 @@ from textual.widget import Widget
 
 from annotations.labels import Label
 from annotations.ui import theme
-from annotations.ui.view import View
+from annotations.ui.view import CueView
 
 GUTTER = 10  # cells left of the curves, for their names
 WIDEST = 7  # cells of a frame where the window is short
@@ -26,7 +26,7 @@ _BARS = " ▁▂▃▄▅▆▇█"
 class StripContent:
     """What the strip shows; the curves start at the window's first frame."""
 
-    view: View
+    view: CueView
     activity: tuple[float, ...] = ()
     match: tuple[float, ...] = ()
     mine: Label | None = None
@@ -44,26 +44,26 @@ def frame_cells(frames: int, width: int) -> tuple[int, int]:
     return 1, -(-frames // width)
 
 
-def column_of(view: View, frame: int, width: int) -> int:
+def column_of(view: CueView, frame: int, width: int) -> int:
     """First cell of a frame."""
     wide, per = frame_cells(view.last - view.first + 1, width)
     return (frame - view.first) // per * wide
 
 
-def sign_column(view: View, frame: int, width: int) -> int:
+def sign_column(view: CueView, frame: int, width: int) -> int:
     """The middle cell of a frame, where signs stand."""
     wide, _ = frame_cells(view.last - view.first + 1, width)
     return min(column_of(view, frame, width) + wide // 2, width - 1)
 
 
-def frame_at(view: View, column: int, width: int) -> int:
+def frame_at(view: CueView, column: int, width: int) -> int:
     """The frame under a cell, the nearest one beyond the curve's ends."""
     wide, per = frame_cells(view.last - view.first + 1, width)
     return min(max(view.first + column // wide * per, view.first), view.last)
 
 
 def curve_lines(
-    values: tuple[float, ...], view: View, width: int, height: int, style: Style
+    values: tuple[float, ...], view: CueView, width: int, height: int, style: Style
 ) -> list[Line]:
     """Bars of a curve, scaled so that its least value is the floor and its largest the ceiling."""
     wide, per = frame_cells(view.last - view.first + 1, width)
@@ -80,7 +80,7 @@ def curve_lines(
     return lines
 
 
-def rank_line(view: View, width: int) -> Line:
+def rank_line(view: CueView, width: int) -> Line:
     """The suggestions by rank: a digit under each, the surest one bright."""
     line = _blank(width)
     for number, frame in reversed(list(enumerate(view.candidates[:5], 1))):
@@ -104,7 +104,7 @@ def mark_line(content: StripContent, width: int) -> Line:
     return line
 
 
-def _draw_plateau(line: Line, view: View, width: int) -> None:
+def _draw_plateau(line: Line, view: CueView, width: int) -> None:
     first, last = view.plateau_first, view.plateau_last
     wide, _ = frame_cells(view.last - view.first + 1, width)
     if first is not None and last is not None:

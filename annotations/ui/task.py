@@ -5,10 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from annotations.labels import Label
-from annotations.reference import CanonicalFrame, canonical, reference_subject
 from annotations.store import current_labels, labels_of, read_labels
-from annotations.suggestions import Suggested, read_suggestions
-from annotations.worklist import Task
+from annotations.suggestions import (
+    CanonicalFrame,
+    Suggested,
+    canonical,
+    read_suggestions,
+    reference_subject,
+)
+from annotations.worklist import LabelTask
 from express50.capture.expressions import load_script
 from express50.capture.index import Index, read_index
 from express50.contract.layout import Dataset
@@ -16,7 +21,7 @@ from express50.errors import Express50Error
 
 
 @dataclass(frozen=True, kw_only=True)
-class Scene:
+class TaskScene:
     """One task, ready to be shown.
 
     Attributes:
@@ -35,7 +40,7 @@ class Scene:
         notes: what the annotator should know, in plain words.
     """
 
-    task: Task
+    task: LabelTask
     name: str
     description: str
     index: Index | None = None
@@ -63,22 +68,24 @@ class Scene:
         return () if found is None else (found.frame, *found.candidates)
 
 
-def load_scene(dataset: Dataset, task: Task, annotator: str) -> Scene:
+def load_scene(dataset: Dataset, task: LabelTask, annotator: str) -> TaskScene:
     """Read a task; what is wrong with it becomes ``problem`` or ``notes``, not an exception."""
     name, description = _words(task.expression)
     try:
         return _load(dataset, task, annotator, name, description)
     except (Express50Error, OSError) as error:
-        return Scene(task=task, name=name, description=description, problem=str(error))
+        return TaskScene(task=task, name=name, description=description, problem=str(error))
 
 
-def _load(dataset: Dataset, task: Task, annotator: str, name: str, description: str) -> Scene:
+def _load(
+    dataset: Dataset, task: LabelTask, annotator: str, name: str, description: str
+) -> TaskScene:
     index = read_index(dataset, task.subject)
     cue = next((c for c in index.cues if c.expression_id == task.expression), None)
     last = -1 if cue is None else min(cue.end_frame, index.frames - 1)
     if cue is None or last < cue.start_frame:
         problem = f"{task.subject} has no footage of {task.expression}: see its cues.csv"
-        return Scene(task=task, name=name, description=description, problem=problem)
+        return TaskScene(task=task, name=name, description=description, problem=problem)
     notes: list[str] = []
     suggestion = _suggestion(dataset, task, notes)
     reference, reference_index, is_reference = _reference(dataset, task, notes)
@@ -86,7 +93,7 @@ def _load(dataset: Dataset, task: Task, annotator: str, name: str, description: 
     mine = labels_of(labels, annotator).get(task.expression)
     in_force = current_labels(labels).get(task.expression)
     notes += [n for label in (mine, in_force) if (n := _identity_note(index, label))]
-    return Scene(
+    return TaskScene(
         task=task,
         name=name,
         description=description,
@@ -111,7 +118,7 @@ def _words(expression: str) -> tuple[str, str]:
     return entry.name, entry.description
 
 
-def _suggestion(dataset: Dataset, task: Task, notes: list[str]) -> Suggested | None:
+def _suggestion(dataset: Dataset, task: LabelTask, notes: list[str]) -> Suggested | None:
     try:
         found = read_suggestions(dataset, task.subject).get(task.expression)
     except Express50Error as error:
@@ -123,7 +130,7 @@ def _suggestion(dataset: Dataset, task: Task, notes: list[str]) -> Suggested | N
 
 
 def _reference(
-    dataset: Dataset, task: Task, notes: list[str]
+    dataset: Dataset, task: LabelTask, notes: list[str]
 ) -> tuple[CanonicalFrame | None, Index | None, bool]:
     """Canonical frame, its footage, and whether this task is the reference's own."""
     try:

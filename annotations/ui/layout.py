@@ -1,25 +1,31 @@
-"""The screen's parts and how they are drawn: status, pictures, strip, messages. No key is known."""
+"""The screen: its parts, how they are drawn, and the timers that play and blink."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 from rich.text import Text
 from textual.app import ComposeResult
 from textual.containers import Horizontal, Vertical
 from textual.screen import Screen
+from textual.timer import Timer
 from textual.widgets import Static
 
 from annotations.ui import panels, theme
-from annotations.ui.faces import ZOOMS, FaceFinder
-from annotations.ui.frames import FrameCache
-from annotations.ui.looks import Aim, reference_look, shots_ahead, strip_content, subject_look
-from annotations.ui.picture import Picture
-from annotations.ui.player import Player
-from annotations.ui.scene import Scene
+from annotations.ui.frames import ZOOMS, FaceFinder, FrameCache
+from annotations.ui.picture import (
+    Aim,
+    PicturePane,
+    reference_look,
+    shots_ahead,
+    strip_content,
+    subject_look,
+)
 from annotations.ui.session import Session
-from annotations.ui.strip import CurveStrip
-from annotations.ui.view import View
+from annotations.ui.task import TaskScene
+from annotations.ui.timeline import CurveStrip
+from annotations.ui.view import CueView, go_to, step
 
 SAY_SECONDS = 5.0
 # Rows of the strip by the terminal's height: pictures come first.
@@ -27,7 +33,7 @@ _STRIP_ROWS = ((18, 3), (30, 5), (45, 7))
 _TALLEST_STRIP = 9
 
 
-class Board(Screen[None]):
+class AnnotatorScreen(Screen[None]):
     """Shows a scene, a view of it and what was said; whoever changes them calls ``draw``."""
 
     def __init__(
@@ -35,15 +41,15 @@ class Board(Screen[None]):
         session: Session,
         cache: FrameCache,
         faces: FaceFinder | None,
-        make_picture: Callable[[FrameCache, str], Picture],
+        make_picture: Callable[[FrameCache, str], PicturePane],
     ) -> None:
         super().__init__()
         self._make_picture = make_picture
         self.session = session
         self.cache = cache
         self.faces = faces
-        self.scene: Scene | None = None
-        self.view: View | None = None
+        self.scene: TaskScene | None = None
+        self.view: CueView | None = None
         self.aim = Aim(0, ZOOMS[0], faces)
         self.player = Player(self)
         self._said: tuple[str, str] | None = None
@@ -86,7 +92,7 @@ class Board(Screen[None]):
         self.query_one(CurveStrip).show(content)
         self._draw_message()
         if self.view is not None:
-            shape = self.query_one("#frame", Picture).shape
+            shape = self.query_one("#frame", PicturePane).shape
             self.cache.want(shots_ahead(self.scene, self.view, self.aim, shape))
 
     def _draw_status(self) -> None:
@@ -95,14 +101,14 @@ class Board(Screen[None]):
             self._write("#status", panels.status_line(self.session, self.scene, width))
             self._write("#words", panels.words_line(self.scene, width))
 
-    def _draw_reference(self, scene: Scene) -> None:
-        picture, look = self.query_one("#reference", Picture), reference_look(scene, self.aim)
+    def _draw_reference(self, scene: TaskScene) -> None:
+        picture, look = self.query_one("#reference", PicturePane), reference_look(scene, self.aim)
         picture.show(look, "the reference has no frame of this expression yet")
         title = panels.reference_title(scene, look, picture.size.width)
         self._write("#reference-title", title)
 
-    def _draw_frame(self, scene: Scene) -> None:
-        picture = self.query_one("#frame", Picture)
+    def _draw_frame(self, scene: TaskScene) -> None:
+        picture = self.query_one("#frame", PicturePane)
         look = None if self.view is None else subject_look(scene, self.view, self.aim)
         there = reference_look(scene, self.aim) if self.player.swapped else None
         picture.show(there or look, scene.problem or "")
@@ -138,3 +144,71 @@ class Board(Screen[None]):
         if said == self._saying:
             self._said = None
             self._draw_message()
+
+
+if TYPE_CHECKING:
+    from annotations.ui.layout import AnnotatorScreen
+
+BLINK_SECONDS = 0.45
+SLOWEST, FASTEST = 2.0, 30.0  # frames a second that are played
+
+
+class Player:
+    """Holds the timers; at most one of them runs."""
+
+    def __init__(self, board: AnnotatorScreen) -> None:
+        self._board = board
+        self._playing: Timer | None = None
+        self._blinking: Timer | None = None
+        self.swapped = False
+
+    @property
+    def plays(self) -> bool:
+        """Whether the window is being played."""
+        return self._playing is not None
+
+    @property
+    def blinks(self) -> bool:
+        """Whether frame and reference take turns."""
+        return self._blinking is not None
+
+    def play(self) -> None:
+        """Play from the cursor on, from the start where the cursor stands at the end; or stop."""
+        if self.stop():
+            return
+        board = self._board
+        if board.view is None or board.scene is None or board.scene.index is None:
+            return
+        if board.view.cursor == board.view.last:
+            board.view = go_to(board.view, board.view.first)
+        rate = min(max(board.scene.index.fps, SLOWEST), FASTEST)
+        self._playing = board.set_interval(1.0 / rate, self._next_frame)
+        board.draw()
+
+    def blink(self) -> None:
+        """Show the reference in the frame's place and back, in turns; or stop."""
+        if not self.stop():
+            self._blinking = self._board.set_interval(BLINK_SECONDS, self._swap)
+            self._swap()
+
+    def stop(self) -> bool:
+        """Stop whatever runs; tells whether something did."""
+        ran = self._playing is not None or self._blinking is not None
+        for timer in (self._playing, self._blinking):
+            if timer is not None:
+                timer.stop()
+        self._playing = self._blinking = None
+        self.swapped = False
+        return ran
+
+    def _next_frame(self) -> None:
+        view = self._board.view
+        if view is None or view.cursor == view.last:
+            self.stop()
+        else:
+            self._board.view = step(view, 1)
+        self._board.draw()
+
+    def _swap(self) -> None:
+        self.swapped = not self.swapped
+        self._board.draw()
