@@ -45,7 +45,6 @@ KNOBS: tuple[tuple[str, dict[str, object]], ...] = (
     ("chart_weight 4", {"chart_weight": 4.0}),
     ("no offsets along the skin", {"offset_along": 0}),
     ("no offsets", {"offset_modes": 0, "offset_along": 0}),
-    ("render_rounds 2", {"render_rounds": 2}),
 )
 
 

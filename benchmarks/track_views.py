@@ -22,7 +22,7 @@ from express50.contract.layout import Dataset
 from express50.files.images import LIGHT_OF_LEVEL, linear_to_srgb
 from express50.geometry.cameras import Camera, pinhole, unproject
 from express50.geometry.conventions import undistort_image
-from express50.geometry.mesh_raster import rasterize
+from express50.geometry.raycast import visible_faces
 from express50.head.model import HeadModel
 from express50.twin.truth import Truth
 from pipelines.track.photometry import look
@@ -79,8 +79,8 @@ def face_of(model: HeadModel) -> np.ndarray:
 
 
 def mask_of(model: HeadModel, vertices: np.ndarray, camera: Camera) -> np.ndarray:
-    """Pixels (H, W) bool that the mesh covers, by the z-buffer."""
-    return rasterize(vertices, model.faces.numpy(), camera, pairs=False).face_id >= 0
+    """Pixels (H, W) bool that the mesh covers, by ray casting."""
+    return visible_faces(vertices, model.faces.numpy(), camera)[0] >= 0
 
 
 def see_face(
@@ -88,9 +88,9 @@ def see_face(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Pixels (H, W) bool whose first surface is the face region, face ids and depth."""
     faces = model.faces.numpy()
-    raster = rasterize(vertices, faces, camera, pairs=False)
+    face_id, depth = visible_faces(vertices, faces, camera)
     inside = face_of(model)[faces].all(1)
-    return (raster.face_id >= 0) & inside[raster.face_id], raster.face_id, raster.depth
+    return (face_id >= 0) & inside[face_id], face_id, depth
 
 
 def psnr_db(
@@ -120,7 +120,7 @@ def psnr_db(
     if len(rows) < LEAST_PIXELS:
         return None
     pixels = np.stack([columns, rows], axis=1) + 0.5
-    places = unproject(view.camera, pixels, depth[rows, columns].astype(np.float64))
+    places = unproject(view.camera, pixels, depth[rows, columns])
     normals = face_normals(vertices, model.faces.numpy()[face_id[rows, columns]])
     colours = median_colours(dataset, subject, frame, model, vertices, cameras, places, normals)
     known = np.isfinite(colours).all(1)

@@ -23,3 +23,28 @@ def camera_rays(camera: Camera) -> o3d.core.Tensor:
     origin, directions = rays(camera)
     row = np.concatenate([np.broadcast_to(origin, directions.shape), directions], axis=-1)
     return o3d.core.Tensor(row.astype(np.float32))
+
+
+def visible_faces(
+    vertices: np.ndarray, faces: np.ndarray, camera: Camera
+) -> tuple[np.ndarray, np.ndarray]:
+    """Find the face that each pixel centre sees first.
+
+    Args:
+        vertices: (V, 3) world, metres.
+        faces: (F, 3) vertex ids.
+        camera: pinhole camera.
+
+    Returns:
+        Face ids (H, W) int64, -1 where there is none, and depth (H, W) float64, camera z in
+        metres, infinite there.
+    """
+    # Far from the origin float32 rays are too coarse: everything is cast about the mesh's centre.
+    centre = vertices.mean(0)
+    origin, directions = rays(camera)
+    start = np.broadcast_to(origin - centre, directions.shape)
+    cast = np.concatenate([start, directions], axis=-1).astype(np.float32)
+    hit = mesh_scene(vertices - centre, faces).cast_rays(o3d.core.Tensor(cast))
+    depth = hit["t_hit"].numpy().astype(np.float64)
+    face = hit["primitive_ids"].numpy().astype(np.int64)
+    return np.where(np.isfinite(depth), face, -1), depth

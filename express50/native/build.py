@@ -19,7 +19,7 @@ HERE = Path(__file__).resolve().parent
 SOURCE = HERE / "gaussians.cpp"
 SOURCES = (
     "gaussians.cpp", "render.h", "render_gradient.h", "blend.h", "blend_gradient.h", "tiles.h",
-    "projection.h", "lanes.h", "mesh.h", "mesh_outlines.h", "mesh_rows.h",
+    "projection.h", "lanes.h",
 )  # fmt: skip
 
 # Best last; their order is what `native_level` in the library returns. No -ffast-math: linking with

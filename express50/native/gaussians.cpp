@@ -1,5 +1,4 @@
-// Differentiable rasterisation of 3D Gaussians on the CPU, behind a plain C ABI; the z-buffer of
-// meshes (mesh*.h) is exported here too, so that one library holds all that is native.
+// Differentiable rasterisation of 3D Gaussians on the CPU, behind a plain C ABI.
 //
 // forward:  gaussians_project -> gaussians_bin -> gaussians_forward
 // backward: gaussians_backward
@@ -13,8 +12,6 @@
 
 #include <cstdint>
 
-#include "mesh_outlines.h"
-#include "mesh_rows.h"
 #include "render_gradient.h"
 
 #define EXPRESS50_EXPORT extern "C" __attribute__((visibility("default")))
@@ -54,33 +51,6 @@
 
 EXPRESS50_GAUSSIANS(float, f32)
 EXPRESS50_GAUSSIANS(double, f64)
-
-EXPRESS50_EXPORT void mesh_rasterize(const MeshView* view, const double* xyz, int64_t face_count,
-                                     const int32_t* faces, int32_t* face_id, float* depth) {
-    mesh_zbuffer(*view, xyz, face_count, faces, face_id, depth);
-}
-
-EXPRESS50_EXPORT int64_t mesh_pairs(const MeshView* view, const double* xyz, int64_t face_count,
-                                    const int32_t* faces, const int32_t* neighbors,
-                                    const int32_t* face_id, const float* depth, int32_t* pairs) {
-    return mesh_outline_pairs(*view, xyz, face_count, faces, neighbors, face_id, depth, pairs);
-}
-
-#define EXPRESS50_MESH_ROWS(Real, suffix)                                                         \
-    EXPRESS50_EXPORT void mesh_weigh_##suffix(int64_t n, int64_t channels, const Real* rows,      \
-                                              const Real* coefficients, const int64_t* group,     \
-                                              Real* out) {                                        \
-        weigh_rows<Real>(n, channels, rows, coefficients, group, out);                            \
-    }                                                                                             \
-    EXPRESS50_EXPORT void mesh_weigh_gradient_##suffix(                                           \
-        int64_t n, int64_t channels, const Real* rows, const Real* coefficients,                  \
-        const int64_t* group, const Real* gradient, Real* d_rows, Real* d_coefficients) {         \
-        weigh_rows_gradient<Real>(n, channels, rows, coefficients, group, gradient, d_rows,       \
-                                  d_coefficients);                                                \
-    }
-
-EXPRESS50_MESH_ROWS(float, f32)
-EXPRESS50_MESH_ROWS(double, f64)
 
 // Asks for huge pages inside [start, start + bytes); where there are none nothing happens.
 EXPRESS50_EXPORT void native_huge_pages(void* start, int64_t bytes) {

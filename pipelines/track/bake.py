@@ -13,7 +13,7 @@ from express50.errors import StageError
 from express50.files.images import linear_to_srgb, write_image
 from express50.geometry.cameras import Camera
 from express50.geometry.conventions import cell_to_corner
-from express50.geometry.mesh_raster import rasterize
+from express50.geometry.raycast import visible_faces
 from express50.head.model import HeadModel, vertex_normals
 from pipelines.track.appearance import Appearance, Seen
 from pipelines.track.photometry import look, robust_mean
@@ -124,9 +124,9 @@ def texel_samples(model: HeadModel, side: int) -> tuple[Samples, np.ndarray]:
     # The map a metre before a camera whose focal length is its side: a metre is the map's width.
     flat = np.column_stack([uv[:, 0], 1.0 - uv[:, 1], np.ones(len(uv))])
     camera = Camera("map", side, side, "PINHOLE", (side, side, 0.0, 0.0), np.eye(4))
-    face_id = rasterize(flat, uv_faces, camera, pairs=False).face_id
+    face_id = visible_faces(flat, uv_faces, camera)[0]
     texture = np.argwhere(face_id >= 0)
-    faces = face_id[tuple(texture.T)].astype(np.int64)
+    faces = face_id[tuple(texture.T)]
     at = cell_to_corner(texture[:, ::-1]) / side
     bary = flat_barycentrics(flat[uv_faces[faces], :2], at)
     return Samples(faces, model.faces.numpy()[faces], bary), texture

@@ -71,9 +71,6 @@ class TrackConfig:
     """Texels a side of the texture of the subject's colours (albedo.png); 0 for none."""
     round_iterations: int = 4
     """Levenberg-Marquardt steps a round of outlines and colours."""
-    render_rounds: int = 0
-    """Visits of every expression at each of two sizes when, after the photometric rounds, the head
-    is rendered and compared with every picture; 0 for none."""
     min_score: float = 0.2
     """Views whose face score is lower are left out."""
     min_landmarks: int = 20
@@ -121,7 +118,7 @@ class TrackConfig:
                 "track: landmark_floor_px, landmark_bias, smooth_mm and the priors must be above 0"
             )
         rounds = [self.cameras, self.silhouette_rounds, self.photo_rounds, self.relief_rounds]
-        rounds += [self.render_rounds, self.chart_rounds, self.offset_along]
+        rounds += [self.chart_rounds, self.offset_along]
         if min(rounds) < 0 or self.round_iterations < 1:
             raise ConfigError(
                 "track: cameras, rounds and offset_along must not be negative, round_iterations"

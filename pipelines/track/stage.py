@@ -37,7 +37,6 @@ from pipelines.track.offsets import with_modes
 from pipelines.track.overlay import draw_overlays
 from pipelines.track.pictures import Skin, skin_of
 from pipelines.track.refine import refine
-from pipelines.track.render import rendered_like_pictures
 from pipelines.track.result import track_metrics, write_track
 from pipelines.track.sequence import Closer
 from pipelines.track.sheet import write_sheet
@@ -100,8 +99,6 @@ def run(dataset: Dataset, item: str, config: TrackConfig, out: Path) -> dict:
     eyes = measure_eyes(basis.model, targets, meshes, rotations(state))
     moments = peak_moments(dataset, item, targets, meshes, config)
     state, targets, appearance = refine(basis, targets, state, moments, eyes, config)
-    if config.render_rounds and appearance is not None:
-        state = rendered_like_pictures(basis.model, targets, state, moments, appearance, config)
     state = rounded(state, DECIMALS)
     vertices = all_vertices(basis.model, state)
     write_track(out / "track.npz", config.head, basis, targets, state, vertices)

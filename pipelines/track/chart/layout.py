@@ -15,7 +15,7 @@ from scipy.interpolate import RBFInterpolator
 from express50.errors import HeadModelError
 from express50.geometry.cameras import Camera
 from express50.geometry.conventions import cell_to_corner, corner_to_cell
-from express50.geometry.mesh_raster import rasterize
+from express50.geometry.raycast import visible_faces
 from express50.head.model import HeadModel, landmarks
 from pipelines.track.offsets import movable_vertices
 from pipelines.track.samples import Samples, flat_barycentrics
@@ -105,7 +105,7 @@ def make_chart(model: HeadModel) -> Chart:
     near = (np.abs(turned[:, 0]) < BACK)[faces].all(1)
     face_id = _outermost(places, radius, faces, near)
     texels = np.argwhere(face_id >= 0)
-    of_texel = face_id[tuple(texels.T)].astype(np.int64)
+    of_texel = face_id[tuple(texels.T)]
     bary = flat_barycentrics(places[faces[of_texel]], cell_to_corner(texels[:, ::-1]))
     samples = Samples(of_texel, faces[of_texel], bary)
     inside = (~movable_vertices(model))[faces].any(1)
@@ -155,5 +155,5 @@ def _outermost(
     flat = np.column_stack([places * depth[:, None], depth])
     camera = Camera("chart", WIDTH, HEIGHT, "PINHOLE", (1.0, 1.0, 0.0, 0.0), np.eye(4))
     ids = np.flatnonzero(near)
-    found = rasterize(flat, faces[ids], camera, pairs=False).face_id
+    found, _ = visible_faces(flat, faces[ids], camera)
     return np.where(found >= 0, ids[np.maximum(found, 0)], -1)
