@@ -45,11 +45,13 @@ from express50.runner.runner import run_stage
 from express50.twin.truth import Truth
 from pipelines import track
 from pipelines.depth import STAGE
-from pipelines.depth.finish import Surface
-from pipelines.depth.grid import View, head_box
-from pipelines.depth.reconstruct import hull_grid, reconstruct
-from pipelines.depth.stage import look, read_prior, read_views
+from pipelines.depth.blocks import build
+from pipelines.depth.hull import head_box, hull_distance
+from pipelines.depth.maps import surface_maps
+from pipelines.depth.reconstruct import HeadSurface, reconstruct
+from pipelines.depth.stage import read_tracked, read_views
 from pipelines.depth.surface import extract_mesh
+from pipelines.depth.views import DepthView
 
 PRESETS = ("draft", "standard", "reference")
 BASELINES = ("visual_hull", "tracked_mesh", "tsdf_fusion")
@@ -81,7 +83,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def parse(arguments: list[str] | None) -> argparse.Namespace:
-    """The command line."""
+    """Parse the command line."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.depth", description=__doc__)
     parser.add_argument("--dataset", type=Path, help="dataset with mattes (and tracks)")
     parser.add_argument("--truth", type=Path, help="truth folder of the recording")
@@ -101,7 +103,7 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
 
 
 def record(options: argparse.Namespace, folder: Path) -> tuple[Path, Path]:
-    """Dataset, through tracking, and truth of one subject in two expressions."""
+    """Record one subject in two expressions and run the stages up to tracking."""
     twin = twin_config(1, options.cameras, options.side)
     twin = replace(twin, first_subject=43, expressions=("neutral", "smile"))
     dataset, truth, _ = prepare(twin, folder)
@@ -110,27 +112,27 @@ def record(options: argparse.Namespace, folder: Path) -> tuple[Path, Path]:
 
 
 def alone(dataset: Path, truth: Path, item: str, name: str) -> dict | None:
-    """:func:`measure` in a process of its own, so that memory is its own."""
+    """Run :func:`measure` in a process of its own, so that its memory can be measured."""
     with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
         return pool.submit(measure, dataset, truth, item, name).result()
 
 
 def measure(dataset_root: Path, truth_root: Path, item: str, name: str) -> dict | None:
-    """Errors, cost and coverage of one way on one item; None where there is no track."""
+    """Measure errors, cost and coverage of a preset or baseline; None without a track."""
     cv2.setNumThreads(1)
     dataset, truth = Dataset(dataset_root), Truth(truth_root)
     subject, expression = item.split("/")
     frame = read_peaks(dataset, subject)[expression]
     config = build_config(STAGE, STAGE.presets.get(name, {}))
-    views, pictures, _ = read_views(dataset, subject, expression, frame, config)
+    views, pictures, _ = read_views(dataset, item, config.image_side)
     start = time.process_time()
     found: dict = {}
     if name in PRESETS:
-        prior, _ = read_prior(dataset, subject, expression, views, config)
-        surface = reconstruct(views, config, prior)
+        solid, _ = read_tracked(dataset, item, views, config.track_agreement)
+        surface = reconstruct(views, solid, config.voxel_mm, config.voxel_px, config.noise)
         mesh = surface.vertices, surface.faces
         names = ("voxels_allocated", "voxels_dense", "grid_bytes", "voxel_mm")
-        found |= {key: surface.numbers[key] for key in names}
+        found |= {key: surface.figures[key] for key in names}
     else:
         made = baseline(name, dataset, subject, expression, views)
         if made is None:
@@ -141,15 +143,16 @@ def measure(dataset_root: Path, truth_root: Path, item: str, name: str) -> dict 
     sure = None
     if name in PRESETS:
         found["raycast"] = both_ways(surface, [camera for camera, _, _ in pictures[::8]])
-        seen, _ = look(surface, pictures, config)
-        sure = {name: view.confidence for name, view in seen.items()}
+        maps, _ = surface_maps(surface, pictures)
+        sure = {name: view.confidence for name, view in maps.items()}
     return found | score(mesh, truth, subject, frame, pictures, sure)
 
 
-def both_ways(surface: Surface, cameras: list[Camera]) -> dict:
-    """Processor milliseconds a megapixel of casting at the mesh and at the distances; difference.
+def both_ways(surface: HeadSurface, cameras: list[Camera]) -> dict:
+    """Time rays cast at the mesh and traced through the distances, and compare the depths.
 
-    Building the mesh's tree counts, finding normals and confidence does not.
+    Processor milliseconds per megapixel; building the mesh's tree counts, finding normals and
+    confidence does not.
     """
     clock, depths = {}, {}
     pixels = sum(camera.width * camera.height for camera in cameras)
@@ -168,13 +171,14 @@ def both_ways(surface: Surface, cameras: list[Camera]) -> dict:
 
 
 def baseline(
-    name: str, dataset: Dataset, subject: str, expression: str, views: list[View]
+    name: str, dataset: Dataset, subject: str, expression: str, views: list[DepthView]
 ) -> Mesh | None:
-    """A baseline's surface."""
+    """Make a baseline's surface."""
     if name == "tsdf_fusion":
         return fuse(views, BASELINE_VOXEL_M)
     if name == "visual_hull":
-        grid = hull_grid(views, *head_box(views), BASELINE_VOXEL_M)
+        box = head_box(views)
+        grid = build(*box, BASELINE_VOXEL_M, lambda points: hull_distance(views, points))
         vertices, _, faces = extract_mesh(grid)
         return vertices, faces
     path = dataset.item_dir("track", subject) / "track.npz"

@@ -10,13 +10,14 @@ import open3d as o3d
 
 from express50.geometry.cameras import Camera
 from express50.geometry.conventions import K_to_opencv
-from pipelines.depth.grid import INSIDE, View, head_box
+from pipelines.depth.hull import head_box
+from pipelines.depth.views import INSIDE, DepthView
 
 NEIGHBOURS, PLANES, WINDOW = 4, 128, 9
 AGREE, TRUNCATION_VOXELS = 0.5, 4.0
 
 
-def fuse(views: Sequence[View], voxel: float) -> tuple[np.ndarray, np.ndarray]:
+def fuse(views: Sequence[DepthView], voxel: float) -> tuple[np.ndarray, np.ndarray]:
     """Vertices (V, 3) and faces (F, 3) of the fused surface, voxels in metres.
 
     Source: Curless and Levoy 1996, as Open3D has it.
@@ -40,7 +41,9 @@ def fuse(views: Sequence[View], voxel: float) -> tuple[np.ndarray, np.ndarray]:
     return mesh.vertex.positions.numpy(), mesh.triangle.indices.numpy()
 
 
-def sweep(view: View, others: Sequence[View], low: np.ndarray, high: np.ndarray) -> np.ndarray:
+def sweep(
+    view: DepthView, others: Sequence[DepthView], low: np.ndarray, high: np.ndarray
+) -> np.ndarray:
     """Depth (H, W) float32 of the best of PLANES planes through a box, 0 where views disagree."""
     corners = np.stack(np.meshgrid(*zip(low, high, strict=True), indexing="ij"), -1).reshape(-1, 3)
     z = corners @ view.camera.cam_from_world[2, :3] + view.camera.cam_from_world[2, 3]
@@ -63,13 +66,13 @@ def sweep(view: View, others: Sequence[View], low: np.ndarray, high: np.ndarray)
     return np.where(view.alpha > INSIDE, whole, 0)
 
 
-def _nearest(view: View, views: Sequence[View]) -> list[View]:
+def _nearest(view: DepthView, views: Sequence[DepthView]) -> list[DepthView]:
     others = [other for other in views if other is not view]
     away = [np.linalg.norm(other.camera.center - view.camera.center) for other in others]
     return [others[k] for k in np.argsort(away)[:NEIGHBOURS]]
 
 
-def _grey(view: View) -> np.ndarray:
+def _grey(view: DepthView) -> np.ndarray:
     return cv2.cvtColor(view.rgb, cv2.COLOR_RGB2GRAY).astype(np.float32)
 
 

@@ -21,9 +21,9 @@ from express50.contract.layout import Dataset
 from express50.twin.truth import Truth
 from pipelines.depth import STAGE
 from pipelines.depth.reconstruct import reconstruct
-from pipelines.depth.stage import read_prior, read_views
+from pipelines.depth.stage import read_tracked, read_views
 
-SECTION = "Knobs of depth"
+SECTION = "Settings of depth"
 AXES: dict[str, tuple[str, tuple]] = {
     "views": ("views", (6, 12, 24)),
     "pixels": ("image_side", (256, 512, 1024)),
@@ -49,7 +49,7 @@ def sweep(options: argparse.Namespace, item: str) -> dict:
 
 
 def measure(dataset_root: Path, truth_root: Path, item: str, axis: str, value: float) -> dict:
-    """One row: what a value costs and how right the surface is, in every camera of the rig."""
+    """Measure one value: its cost, and errors in every camera of the rig."""
     cv2.setNumThreads(1)
     dataset, truth = Dataset(dataset_root), Truth(truth_root)
     subject, expression = item.split("/")
@@ -57,18 +57,18 @@ def measure(dataset_root: Path, truth_root: Path, item: str, axis: str, value: f
     config = build_config(STAGE, {})
     if axis != "views":
         config = replace(config, **{AXES[axis][0]: value})
-    views, pictures, _ = read_views(dataset, subject, expression, frame, config)
+    views, pictures, _ = read_views(dataset, item, config.image_side)
     if axis == "views":
         count = min(int(value), len(views))
         views = [views[k] for k in np.linspace(0, len(views) - 1, count).round().astype(int)]
     start = time.process_time()
-    prior, _ = read_prior(dataset, subject, expression, views, config)
-    surface = reconstruct(views, config, prior)
+    solid, _ = read_tracked(dataset, item, views, config.track_agreement)
+    surface = reconstruct(views, solid, config.voxel_mm, config.voxel_px, config.noise)
     seconds = time.process_time() - start
     found = score((surface.vertices, surface.faces), truth, subject, frame, pictures)
     median, tail = np.percentile(found["errors"], [50, 95])
     return {
-        "knob": AXES[axis][0],
+        "setting": AXES[axis][0],
         "value": value,
         "views": len(views),
         "pixels": max(views[0].camera.width, views[0].camera.height),
@@ -82,16 +82,16 @@ def measure(dataset_root: Path, truth_root: Path, item: str, axis: str, value: f
 
 
 def as_markdown(rows: list[dict], item: str) -> list[str]:
-    """The section of the document."""
+    """Format the section of the document."""
     lines = [
-        f"Made by `python -m benchmarks.depth --sweep` on {item} of a synthetic capture: one knob"
-        " at a time around `standard`. Views, pixels (of the longest side) and voxel are those that"
-        " were used, where the footage has less or is too coarse for more. Seconds of one core;"
-        " errors in all cameras of the rig, those left out too.",
+        f"Made by `python -m benchmarks.depth --sweep` on {item} of a synthetic capture: one"
+        " setting at a time around `standard`. Views, pixels (of the longest side) and voxel are"
+        " those that were used, where the footage has less or is too coarse for more. Seconds of"
+        " one core; errors in all cameras of the rig, those left out too.",
         "",
-        "| knob | value | views | pixels | voxel mm | seconds | median mm | 95 % mm | skin mm |",
+        "| setting | value | views | pixels | voxel mm | seconds | median mm | 95 % mm | skin mm |",
         "|---|---|---|---|---|---|---|---|---|",
     ]
-    keys = ("knob", "value", "views", "pixels", "voxel_mm", "seconds", "abs_error_mm_median",
+    keys = ("setting", "value", "views", "pixels", "voxel_mm", "seconds", "abs_error_mm_median",
             "abs_error_mm_p95", "skin_error_mm_median")  # fmt: skip
     return lines + ["| " + " | ".join(f"{row[key]}" for key in keys) + " |" for row in rows]

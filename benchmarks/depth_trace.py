@@ -9,14 +9,14 @@ from __future__ import annotations
 import numpy as np
 
 from express50.geometry.cameras import Camera, rays
-from pipelines.depth.blocks import Grid
+from pipelines.depth.blocks import LevelSet
 
 RELAXATION = 0.8  # distances were moved and smoothed: they are not exact
 LEAST_STEP = 0.25  # voxels; rays along the surface still advance
 MOST_STEPS, ROOT_STEPS = 400, 12
 
 
-def trace(grid: Grid, camera: Camera) -> np.ndarray:
+def trace(grid: LevelSet, camera: Camera) -> np.ndarray:
     """Find the first zero along every ray: depth (H, W), camera z in metres, infinite without one.
 
     Steps are a share of the distance (Hart 1996) until the sign changes; the zero between the last
@@ -47,7 +47,7 @@ def trace(grid: Grid, camera: Camera) -> np.ndarray:
 
 
 def bracketed_root(
-    grid: Grid, origin: np.ndarray, directions: np.ndarray, low: np.ndarray, high: np.ndarray
+    grid: LevelSet, origin: np.ndarray, directions: np.ndarray, low: np.ndarray, high: np.ndarray
 ) -> np.ndarray:
     """Depths (N,) of the zeros between depths outside (N,) and inside (N,)."""
 

@@ -1,5 +1,58 @@
-"""Depth of one expression: a signed distance grid from mattes and photographs, seen per view."""
+"""The depth stage: a surface and depth maps per expression, from mattes, frames and tracks."""
 
-from pipelines.depth.stage import STAGE
+from __future__ import annotations
 
-__all__ = ["STAGE"]
+from pathlib import Path
+
+from express50.contract.layout import Dataset
+from express50.contract.stage import Result, Stage
+from pipelines.depth.config import PRESETS, DepthConfig
+
+
+def items(dataset: Dataset) -> list[str]:
+    """List the expressions that have a peak frame."""
+    from express50.capture.frames import peak_items
+
+    return peak_items(dataset)
+
+
+def inputs(dataset: Dataset, item: str, config: DepthConfig) -> dict[str, Path | str]:
+    """List index, cameras, the expression's peak and mattes, and the track if there is one."""
+    from express50.capture.frames import read_cameras_of, read_peaks
+    from express50.capture.index import index_path
+
+    subject, expression = item.split("/")
+    found: dict[str, Path | str] = {
+        "index": index_path(dataset, subject),
+        "cameras": dataset.item_dir("calibrate", subject) / "cameras.json",
+        "frame": str(read_peaks(dataset, subject)[expression]),
+    }
+    for camera in read_cameras_of(dataset, subject):
+        path = dataset.matte_file(subject, expression, camera)
+        if path.is_file():
+            found[f"matte {camera}"] = path
+    track = dataset.item_dir("track", subject) / "track.npz"
+    if config.use_track and track.is_file():
+        found["track"] = track
+    return found
+
+
+def run(dataset: Dataset, item: str, config: DepthConfig, out: Path) -> Result:
+    """Reconstruct one expression."""
+    from pipelines.depth.stage import run as work
+
+    return work(dataset, item, config, out)
+
+
+STAGE = Stage(
+    name="depth",
+    version=7,
+    config=DepthConfig,
+    presets=PRESETS,
+    items=items,
+    inputs=inputs,
+    run=run,
+    help="reconstruct the head's surface and depth maps of each expression",
+    purpose="A level set starts from the visual hull and the tracked mesh and moves to where the"
+    " views agree; every camera gets depth, normals and confidence.",
+)

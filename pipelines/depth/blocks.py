@@ -1,21 +1,23 @@
-"""Signed distances in blocks of voxels: held near the surface only, so memory follows its area.
+"""Hold signed distances in blocks of voxels near the surface, so that memory follows its area.
 
-A table names for every block of the box a row of an array of blocks. Two of the rows are constant
-and shared by all blocks that lie wholly outside or inside. Source: Nießner et al. 2013 and Museth
-2013, with a plain table in the place of a hash or a tree: it has a 512th of the box's voxels.
+A table gives every block of the box a row in an array of blocks. Two rows are constant and shared
+by all blocks that lie wholly outside or wholly inside. Source: Nießner et al. 2013 and Museth 2013,
+with a plain table instead of a hash or a tree: it has a 512th of the box's voxels.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
 
 import numpy as np
+import scipy.sparse as sparse
 from scipy.ndimage import (
     binary_dilation,
     generate_binary_structure,
+    label,
     maximum_filter,
     minimum_filter,
 )
@@ -29,20 +31,20 @@ OUTSIDE, INSIDE, HELD = 0, 1, 2  # rows of the constant blocks and the first row
 VOXEL_LIMIT = 60_000_000
 BORDER = 1e-4  # metres; the least distance on the box's border, which closes a surface cut by it
 CHUNK = 1024  # blocks worked on at a time
-STEEPEST = 2.0  # how fast a function given to `build` may change, metres a metre
+STEEPEST = 2.0  # how fast a function given to `build` may change, metres per metre
 
 Values = Callable[[np.ndarray], np.ndarray]
 
 
 @dataclass(frozen=True)
-class Grid:
+class LevelSet:
     """Signed distances, metres, negative inside, at origin + voxel * i in a box of voxels.
 
     Attributes:
         origin: (3,) world, metres.
         voxel: metres.
         shape: voxels (X, Y, Z) of the box.
-        table: (A, B, C) int32, the row of every block of the box.
+        table: (A, B, C) int32, the row of each block of the box.
         blocks: (2 + N, BLOCK, BLOCK, BLOCK) float32, within BAND voxels of the surface; the rows
             after the constant two are in the order of their places in the table.
     """
@@ -55,23 +57,23 @@ class Grid:
 
     @property
     def allocated(self) -> int:
-        """Voxels held; a dense array would hold the product of ``shape``."""
+        """Count the voxels held; a dense array would hold the product of ``shape``."""
         return self.blocks[HELD:].size
 
     @property
     def nbytes(self) -> int:
-        """Bytes of the blocks and the table."""
+        """Count the bytes of the blocks and the table."""
         return self.blocks.nbytes + self.table.nbytes
 
     def points(self, index: np.ndarray) -> np.ndarray:
-        """World points (N, 3) of fractional voxel indices (N, 3)."""
+        """Convert fractional voxel indices (N, 3) to world points (N, 3)."""
         return self.origin + self.voxel * index
 
     def sample(self, points: np.ndarray) -> np.ndarray:
-        """Trilinear distances (N,) float32 at world points (N, 3), clamped to the box's border."""
+        """Interpolate distances (N,) float32 at world points (N, 3), clamped to the box."""
         out = np.empty(len(points), np.float32)
         last = np.array(self.shape) - 1
-        for start in range(0, len(points), 1 << 15):  # what the nearest cache holds
+        for start in range(0, len(points), 1 << 15):  # as many as fit into the nearest cache
             part = slice(start, start + (1 << 15))
             out[part] = self._trilinear(
                 np.clip((points[part] - self.origin) / self.voxel, 0, last), last
@@ -79,12 +81,12 @@ class Grid:
         return out
 
     def _trilinear(self, index: np.ndarray, last: np.ndarray) -> np.ndarray:
-        """Values (N,) at fractional voxel indices (N, 3) within the box."""
+        """Interpolate values (N,) at fractional voxel indices (N, 3) within the box."""
         low = np.minimum(index.astype(np.int32), np.maximum(last - 1, 0).astype(np.int32))
         _, b, c = self.table.shape
         block = low >> SHIFT
-        row = self._plain.take(block[:, 0] * (b * c) + block[:, 1] * c + block[:, 2])
-        out = self.blocks[:HELD, 0, 0, 0].take(row & 1)  # right where the surface is far
+        row = self._constant_row.take(block[:, 0] * (b * c) + block[:, 1] * c + block[:, 2])
+        out = self.blocks[:HELD, 0, 0, 0].take(row & 1)  # correct where the surface is far
         near = np.flatnonzero(row < 0)
         low = low[near]
         share = (index[near] - low).astype(np.float32)
@@ -102,25 +104,25 @@ class Grid:
         return out
 
     @cached_property
-    def _plain(self) -> np.ndarray:
-        """Row (A * B * C,) of blocks that are constant like all that follow them, else -1."""
+    def _constant_row(self) -> np.ndarray:
+        """Row (A * B * C,) of blocks that are constant like all blocks after them, else -1."""
         least = minimum_filter(self.table, 2, mode="nearest", origin=-1)
         most = maximum_filter(self.table, 2, mode="nearest", origin=-1)
         return np.where((least == most) & (most < HELD), most, -1).astype(np.int8).ravel()
 
 
-def held(grid: Grid) -> np.ndarray:
-    """Places (N, 3) in the table of the blocks held, in the order of their rows."""
+def held(grid: LevelSet) -> np.ndarray:
+    """List the places (N, 3) in the table of the blocks held, in the order of their rows."""
     return np.argwhere(grid.table >= HELD)
 
 
-def at(grid: Grid, places: np.ndarray) -> np.ndarray:
-    """Blocks (M, BLOCK, BLOCK, BLOCK) at places (M, 3) of the table."""
+def at(grid: LevelSet, places: np.ndarray) -> np.ndarray:
+    """Take the blocks (M, BLOCK, BLOCK, BLOCK) at places (M, 3) of the table."""
     return grid.blocks[grid.table[tuple(places.T)]]
 
 
 def voxel_index(places: np.ndarray) -> np.ndarray:
-    """Voxel indices (M, BLOCK, BLOCK, BLOCK, 3) of the blocks at places (M, 3)."""
+    """List the voxel indices (M, BLOCK, BLOCK, BLOCK, 3) of the blocks at places (M, 3)."""
     inner = np.stack(np.meshgrid(*[np.arange(BLOCK)] * 3, indexing="ij"), -1)
     return places[:, None, None, None] * BLOCK + inner
 
@@ -128,14 +130,14 @@ def voxel_index(places: np.ndarray) -> np.ndarray:
 def assemble(
     origin: np.ndarray, voxel: float, shape: tuple[int, int, int], inside: np.ndarray,
     places: np.ndarray, values: Values,
-) -> Grid:  # fmt: skip
-    """A grid of ``values`` at ``places``; blocks that are constant there are not held.
+) -> LevelSet:  # fmt: skip
+    """Make a grid of ``values`` at ``places``; blocks that are constant there are not held.
 
     Args:
         origin: (3,) world, metres.
         voxel: metres.
         shape: voxels (X, Y, Z) of the box.
-        inside: (A, B, C) whether a block at no place is inside.
+        inside: (A, B, C) whether a block that is not among the places is inside.
         places: (M, 3) in the table's order.
         values: distances (m, BLOCK, BLOCK, BLOCK), metres, of places (m, 3).
 
@@ -147,26 +149,29 @@ def assemble(
     constant = np.empty((HELD, BLOCK, BLOCK, BLOCK), np.float32)
     constant[OUTSIDE], constant[INSIDE] = far, -far
     blocks, count = [constant], HELD
-    for part in _chunks(places):
+    for start in range(0, len(places), CHUNK):
+        part = places[start : start + CHUNK]
         found = np.clip(values(part), -far, far).astype(np.float32, copy=False)
-        _close(found, part, shape, far)
+        _close_border(found, part, shape, far)
         near = (found.min((1, 2, 3)) < far) & (found.max((1, 2, 3)) > -far)
         rows = np.where(found[:, 0, 0, 0] < 0, INSIDE, OUTSIDE)
         rows[near] = count + np.arange(near.sum())
         table[tuple(part.T)] = rows
         blocks.append(found[near])
         count += len(blocks[-1])
-        _check_budget((count - HELD) * BLOCK**3, voxel)
-    return Grid(origin, voxel, shape, table, np.concatenate(blocks))
+        if (count - HELD) * BLOCK**3 > VOXEL_LIMIT:
+            raise StageError(
+                f"the surface takes more than {VOXEL_LIMIT:.2g} voxels of {voxel * 1e3:.3g} mm,"
+                " expected a head, which takes 3 million of 1.6 mm; is the calibration in metres?"
+                " If it is, raise depth.voxel_mm or depth.voxel_px"
+            )
+    return LevelSet(origin, voxel, shape, table, np.concatenate(blocks))
 
 
-def _chunks(places: np.ndarray) -> Iterator[np.ndarray]:
-    for start in range(0, len(places), CHUNK):
-        yield places[start : start + CHUNK]
-
-
-def _close(values: np.ndarray, places: np.ndarray, shape: tuple[int, int, int], far: float) -> None:
-    """Make the box's border, and the voxels of its last blocks beyond it, outside; in place."""
+def _close_border(
+    values: np.ndarray, places: np.ndarray, shape: tuple[int, int, int], far: float
+) -> None:
+    """Make the box's border and the voxels of its last blocks beyond it outside; in place."""
     for axis in range(3):
         index = BLOCK * places[:, axis, None] + np.arange(BLOCK)
         last = shape[axis] - 1
@@ -176,26 +181,17 @@ def _close(values: np.ndarray, places: np.ndarray, shape: tuple[int, int, int], 
             side[hit] = np.maximum(side[hit], np.float32(least))
 
 
-def _check_budget(voxels: int, voxel: float) -> None:
-    if voxels > VOXEL_LIMIT:
-        raise StageError(
-            f"the surface takes more than {VOXEL_LIMIT:.2g} voxels of {voxel * 1e3:.3g} mm near it,"
-            " expected a head, which takes 3 million of 1.6 mm: is the calibration in metres? else"
-            " raise depth.voxel_mm or depth.voxel_px"
-        )
-
-
 def box_shape(extent: np.ndarray, voxel: float) -> tuple[int, int, int]:
-    """Voxels (X, Y, Z) of a box whose sides are (3,) metres long."""
+    """Count the voxels (X, Y, Z) of a box whose sides are (3,) metres long."""
     x, y, z = np.ceil(extent / voxel - 1e-6).astype(int) + 1
     return int(x), int(y), int(z)
 
 
-def build(low: np.ndarray, high: np.ndarray, voxel: float, distance: Values) -> Grid:
-    """The grid of ``distance``, metres, of points (N, 3), in the box with corners (3,), (3,).
+def build(low: np.ndarray, high: np.ndarray, voxel: float, distance: Values) -> LevelSet:
+    """Make the grid of a function of points (N, 3), metres, in the box with corners (3,), (3,).
 
-    Blocks are chosen by the distance at their middles. Where it jumps, signs of neighbours differ
-    without a surface between: these are evaluated too, until none is left.
+    Blocks are chosen by the distance at their middles. Where it jumps, neighbouring signs differ
+    without a surface between them: these blocks are evaluated too, until none is left.
     """
     shape = box_shape(high - low, voxel)
     size = tuple(-(-n // BLOCK) for n in shape)
@@ -216,48 +212,43 @@ def build(low: np.ndarray, high: np.ndarray, voxel: float, distance: Values) -> 
     grid = assemble(low, voxel, shape, guess < 0, np.argwhere(wanted), values)
     while (torn := _torn(grid) & ~wanted).any():
         wanted |= torn
-        grid = _grown(grid, torn, values)
+
+        def grown(part: np.ndarray, old: LevelSet = grid, more: np.ndarray = torn) -> np.ndarray:
+            found, new = at(old, part), more[tuple(part.T)]
+            if new.any():
+                found[new] = values(part[new])
+            return found
+
+        grid = replaced(grid, np.argwhere((grid.table >= HELD) | torn), grown)
     return grid
 
 
-def _grown(grid: Grid, more: np.ndarray, values: Values) -> Grid:
-    """The grid with the values of blocks (A, B, C) that it does not hold."""
-
-    def either(part: np.ndarray) -> np.ndarray:
-        found, new = at(grid, part), more[tuple(part.T)]
-        if new.any():
-            found[new] = values(part[new])
-        return found
-
-    return replaced(grid, np.argwhere((grid.table >= HELD) | more), either)
-
-
-def _torn(grid: Grid) -> np.ndarray:
-    """Blocks (A, B, C) that have both signs in them or in their neighbours across a face."""
+def _torn(grid: LevelSet) -> np.ndarray:
+    """Find blocks (A, B, C) with both signs in them or in their neighbours across a face."""
     near = generate_binary_structure(3, 1)
     least = minimum_filter(grid.blocks.min((1, 2, 3))[grid.table], footprint=near)
     most = maximum_filter(grid.blocks.max((1, 2, 3))[grid.table], footprint=near)
     return (least < 0) & (most > 0)
 
 
-def combined(function: Callable[..., np.ndarray], grid: Grid, *others: Grid) -> Grid:
-    """The grid of a function of several grids' values, wherever any of them holds blocks.
+def combined(function: Callable[..., np.ndarray], grid: LevelSet, *others: LevelSet) -> LevelSet:
+    """Apply a function to several grids' values wherever any of them holds blocks.
 
-    All have the same box and voxel; elsewhere the first one's sign stays.
+    All have the same box and voxel; elsewhere the first grid's sign stays.
     """
     grids = (grid, *others)
     places = np.argwhere(np.any([g.table >= HELD for g in grids], axis=0))
     return replaced(grid, places, lambda part: function(*(at(g, part) for g in grids)))
 
 
-def replaced(grid: Grid, places: np.ndarray, values: Values) -> Grid:
-    """The grid with other values at places (M, 3), which hold at least all blocks held so far."""
+def replaced(grid: LevelSet, places: np.ndarray, values: Values) -> LevelSet:
+    """Replace the values at places (M, 3), which include all blocks held so far."""
     inside = grid.table == INSIDE
     return assemble(grid.origin, grid.voxel, grid.shape, inside, places, values)
 
 
-def windows(grid: Grid, places: np.ndarray, before: int, after: int) -> np.ndarray:
-    """Blocks at places (M, 3) with so many voxels of their neighbours: (M, S, S, S), any dtype."""
+def windows(grid: LevelSet, places: np.ndarray, before: int, after: int) -> np.ndarray:
+    """Take blocks at places (M, 3) with voxels of their neighbours around: (M, S, S, S)."""
     side = before + BLOCK + after
     out = np.empty((len(places), side, side, side), grid.blocks.dtype)
     spans = ((-1, slice(BLOCK - before, BLOCK), slice(0, before)),
@@ -270,10 +261,156 @@ def windows(grid: Grid, places: np.ndarray, before: int, after: int) -> np.ndarr
     return out
 
 
-def dilated(grid: Grid) -> Grid:
-    """The same values with the blocks around those held held too."""
+def dilated(grid: LevelSet) -> LevelSet:
+    """Hold the blocks around those held too; values stay the same."""
     wanted = binary_dilation(grid.table >= HELD, np.ones((3, 3, 3)))
     blocks = np.concatenate([grid.blocks[:HELD], grid.blocks[grid.table[wanted]]])
     table = grid.table.copy()
     table[wanted] = HELD + np.arange(len(blocks) - HELD)
-    return Grid(grid.origin, grid.voxel, grid.shape, table, blocks)
+    return LevelSet(grid.origin, grid.voxel, grid.shape, table, blocks)
+
+
+def largest_body(grid: LevelSet) -> LevelSet:
+    """Keep the largest connected inside; what floats beside it becomes outside."""
+    parts, size = _inside_parts(grid)
+    if np.count_nonzero(size) < 2:
+        return grid
+    largest = int(size.argmax())
+    floats = (parts.blocks > 0) & (parts.blocks != largest)
+    table = np.where(floats[:, 0, 0, 0][parts.table] & (grid.table == INSIDE), OUTSIDE, grid.table)
+    blocks = grid.blocks.copy()
+    blocks[HELD:][floats[HELD : len(blocks)]] = grid.voxel
+    return LevelSet(grid.origin, grid.voxel, grid.shape, table.astype(np.int32), blocks)
+
+
+def _inside_parts(grid: LevelSet) -> tuple[LevelSet, np.ndarray]:
+    """Number the connected inside parts, from 1 (0 is outside), and count their voxels (P,).
+
+    Parts are found within each block, then joined across the blocks' borders (26 neighbours).
+    Blocks wholly inside that touch share a row, after the rows of the grid.
+    """
+    touching = np.ones((3, 3, 3))
+    inside = np.pad(grid.blocks[HELD:] < 0, ((0, 0), (0, 1), (0, 1), (0, 1)))  # a wall after each
+    own, count = label(inside.reshape(-1, BLOCK + 1, BLOCK + 1), touching)
+    own = own.reshape(inside.shape)[:, :BLOCK, :BLOCK, :BLOCK]
+    deep, deeps = label(grid.table == INSIDE, touching)
+    full = np.broadcast_to(np.arange(1 + count, 1 + count + deeps)[:, None, None, None],
+                           (deeps, BLOCK, BLOCK, BLOCK))  # fmt: skip
+    blocks = np.concatenate([np.zeros((HELD, BLOCK, BLOCK, BLOCK), np.int32), own, full])
+    table = np.where(deep > 0, len(grid.blocks) - 1 + deep, grid.table)
+    parts = LevelSet(grid.origin, grid.voxel, grid.shape, table, blocks.astype(np.int32))
+    total = 1 + count + deeps
+    first, second = _touching(parts, held(grid)[own.any((1, 2, 3))], total)
+    graph = sparse.coo_matrix((np.ones(len(first)), (first, second)), (total, total))
+    joined = sparse.csgraph.connected_components(graph, directed=False)[1]
+    size = np.bincount(joined[own.ravel()], minlength=joined.max() + 1)  # outside is part 0
+    size[0] = 0
+    np.add.at(size, joined[1 + count :], BLOCK**3 * np.bincount(deep.ravel())[1:])
+    return replace(parts, blocks=joined[blocks]), size
+
+
+def _touching(parts: LevelSet, places: np.ndarray, count: int) -> np.ndarray:
+    """List the pairs (2, N) of different parts, below ``count``, that touch in these blocks."""
+    around = windows(parts, places, 1, 1).astype(np.int64)
+    middle = around[:, 1:-1, 1:-1, 1:-1]
+    found = []
+    for x, y, z in product((0, 1, 2), repeat=3):
+        other = around[:, x : x + BLOCK, y : y + BLOCK, z : z + BLOCK]
+        key = (middle * count + other)[(middle != other) & (middle > 0) & (other > 0)]
+        # runs of the same pair first: sorting all of them would take most of the time
+        found.append(np.unique(key[np.diff(key, prepend=-1) != 0]))
+    return np.stack(np.divmod(np.concatenate(found), count))
+
+
+def smoothed(grid: LevelSet, sigma: float, truncate: float = 4.0) -> LevelSet:
+    """Convolve with a Gaussian of ``sigma`` voxels, exact in the blocks of ``grid``.
+
+    Passes along the axes need the blocks around, where the result is only a guess.
+    """
+    radius = int(truncate * sigma + 0.5)
+    kernel = np.exp(-0.5 * (np.arange(-radius, radius + 1) / sigma) ** 2)
+    return separably(grid, kernel / kernel.sum())
+
+
+def separably(grid: LevelSet, kernel: np.ndarray) -> LevelSet:
+    """Correlate with a kernel (K,) along each axis in turn, exact in ``grid``'s blocks.
+
+    K is odd and at most 2 BLOCK + 1. A block and its two neighbours make lines of 3 BLOCK voxels,
+    which are multiplied by one matrix.
+    """
+    wide = dilated(grid)
+    radius = len(kernel) // 2
+    matrix = np.zeros((3 * BLOCK, BLOCK), np.float32)
+    for k in range(BLOCK):
+        matrix[BLOCK + k - radius : BLOCK + k + radius + 1, k] = kernel
+    padded, places = np.pad(wide.table, 1), held(wide) + 1
+    for axis in range(3):
+        out = np.zeros_like(wide.blocks)
+        for step, part in zip((-1, 0, 1), np.split(matrix, 3), strict=True):
+            rows = padded[tuple((places + step * np.eye(3, dtype=int)[axis]).T)]
+            rows = np.concatenate([[OUTSIDE, INSIDE], rows])
+            out += np.moveaxis(np.tensordot(wide.blocks[rows], part, (axis + 1, 0)), -1, axis + 1)
+        wide = replace(wide, blocks=out)
+    return wide
+
+
+def refined(grid: LevelSet, voxel: float) -> LevelSet:
+    """Interpolate the distances on a grid of a smaller voxel, by cubic B-splines (Unser 1999).
+
+    A block of the finer grid takes a window of coefficients, and along each axis a matrix that
+    depends on the block's place along it.
+    """
+    ratio = voxel / grid.voxel
+    shape = box_shape((np.array(grid.shape) - 1) * grid.voxel, voxel)
+    axes = [_coarse_span(-(-n // BLOCK), ratio, m)
+            for n, m in zip(shape, grid.table.shape, strict=True)]  # fmt: skip
+    below = [grid.table[np.ix_(*ends)] for ends in product(*axes)]
+    near = np.any([rows >= HELD for rows in below], axis=0) | (np.ptp(below, axis=0) > 0)
+    pole = 3**0.5 - 2
+    kernel = pole ** np.abs(np.arange(-BLOCK, BLOCK + 1))  # samples to coefficients, cut at BLOCK
+    values = _spline_values(separably(grid, kernel / kernel.sum()), ratio)
+    return assemble(grid.origin, voxel, shape, below[0] == INSIDE, np.argwhere(near), values)
+
+
+def _coarse_span(count: int, ratio: float, coarse: int) -> tuple[np.ndarray, np.ndarray]:
+    """Find the first and last coarse block (count,) that each finer block along an axis meets."""
+    first = BLOCK * np.arange(count) * ratio
+    ends = [np.floor(first).astype(int), np.ceil(first + (BLOCK - 1) * ratio).astype(int)]
+    low, high = (np.minimum(end >> SHIFT, coarse - 1) for end in ends)
+    return low, high
+
+
+def _spline_values(spline: LevelSet, ratio: float) -> Values:
+    """Evaluate B-spline coefficients at places of finer blocks; ``ratio`` is fine to coarse."""
+    side = int((BLOCK - 1) * ratio) + 5
+    flat = spline.blocks.reshape(-1)
+    last = np.array(spline.table.shape) * BLOCK - 1
+
+    def values(places: np.ndarray) -> np.ndarray:
+        weights, rows, inner = [], [], []
+        for axis in range(3):
+            position = (BLOCK * places[:, axis, None] + np.arange(BLOCK)) * ratio
+            first = np.floor(position[:, 0]).astype(int) - 1
+            taps = first[:, None] + np.arange(side)
+            weights.append(_cubic(position[..., None] - taps[:, None]).astype(np.float32))
+            taps = np.clip(taps, 0, last[axis])
+            rows.append(taps >> SHIFT)
+            inner.append(taps & (BLOCK - 1))
+        (x, y, z), (i, j, k) = rows, inner
+        found = spline.table[x[:, :, None, None], y[:, None, :, None], z[:, None, None, :]]
+        window = flat[
+            found.astype(np.int64) * BLOCK**3
+            + (i[:, :, None, None] * BLOCK**2 + j[:, None, :, None] * BLOCK + k[:, None, None, :])
+        ]
+        for weight in weights:  # each product moves the axis it made to the end
+            window = np.moveaxis(window, 1, -1) @ weight.transpose(0, 2, 1)[:, None]
+        return window
+
+    return values
+
+
+def _cubic(offset: np.ndarray) -> np.ndarray:
+    """Evaluate the cubic B-spline at offsets from its middle."""
+    away = np.abs(offset)
+    inner = 2 / 3 - away**2 * (1 - away / 2)
+    return np.where(away < 1, inner, np.maximum(2 - away, 0) ** 3 / 6)

@@ -1,9 +1,10 @@
-"""The moving surface: meshes of a signed distance grid, smooth displacements, level-set updates."""
+"""Move a surface: mesh a level set, find smooth displacements, update the level set."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 import scipy.sparse as sparse
@@ -16,37 +17,49 @@ from express50.geometry.conventions import cell_to_corner
 from pipelines.depth.blocks import (
     BLOCK,
     HELD,
-    Grid,
+    LevelSet,
     at,
     combined,
     held,
     replaced,
+    smoothed,
     windows,
 )
-from pipelines.depth.filters import smoothed
-from pipelines.depth.grid import View
+from pipelines.depth.views import DepthView
 
-OUTLIER_STEPS = 2.0
+OUTLIER_STEPS = 2.0  # offsets' steps off its neighbours at which a match is believed by a quarter
 LEAST_VOXELS = 1e-3  # voxels; distances nearer to 0 are meshed as if they were this
+STIFFNESS_VOXELS = 2.2  # length under which displacements are smoothed as by a thin plate
+COUPLINGS = (1e3, 3e3, 1e4, 2e4)  # per square metre; a gap of 10 mm costs 0.1 at first, 2 at last
 
 
-def extract_mesh(grid: Grid) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Vertices (V, 3), outward normals (V, 3) and faces (F, 3) of the zero level.
+class HeadMesh(NamedTuple):
+    """Vertices (V, 3) and outward normals (V, 3), world, metres; faces (F, 3)."""
 
-    Source: Lorensen and Cline 1987, as scikit-image has it; normals are the grid's gradient. Blocks
-    with the first voxels of the next ones are laid out as one volume; cubes across its seams are
-    masked, and vertices that two blocks have on their common face become one.
+    vertices: np.ndarray
+    normals: np.ndarray
+    faces: np.ndarray
+
+
+def extract_mesh(grid: LevelSet) -> HeadMesh:
+    """Mesh the zero level by marching cubes; normals are the grid's gradient.
+
+    Source: Lorensen and Cline 1987, through scikit-image. Blocks with the first voxels of the next
+    ones are laid out as one volume; cubes across its seams are masked, and vertices that two blocks
+    have on their common face become one.
     """
     ends = grid.blocks.min((1, 2, 3))[grid.table], grid.blocks.max((1, 2, 3))[grid.table]
     least = minimum_filter(ends[0], 2, origin=-1, mode="nearest")
     most = maximum_filter(ends[1], 2, origin=-1, mode="nearest")
     places = np.argwhere((least < 0) & (most > 0))
     if not len(places):
-        return np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3), np.int64)
+        return HeadMesh(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3), np.int64))
     # a cube of them, not a row: the vertices' indices are float32
     tile, tiles = BLOCK + 1, math.ceil(len(places) ** (1 / 3))
     volume = np.ones((tiles**3, tile, tile, tile), np.float32)
-    volume[: len(places)] = _off_zero(windows(grid, places, 0, 1), LEAST_VOXELS * grid.voxel)
+    values, least = windows(grid, places, 0, 1), np.float32(LEAST_VOXELS * grid.voxel)
+    # away from 0, so that each vertex lies clearly on one edge
+    volume[: len(places)] = np.where(np.abs(values) < least, np.copysign(least, values), values)
     volume = volume.reshape(tiles, tiles, tiles, tile, tile, tile).transpose(0, 3, 1, 4, 2, 5)
     inner = np.arange(tiles * tile) % tile > 0
     mask = inner[:, None, None] & inner[:, None] & inner
@@ -55,18 +68,13 @@ def extract_mesh(grid: Grid) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     )
     which = (found // tile).astype(np.int64) @ [tiles * tiles, tiles, 1]
     index, faces = _welded(found % tile + BLOCK * places[which], faces.astype(np.int64))
-    return grid.points(index), grid_normals(grid, index), faces
-
-
-def _off_zero(values: np.ndarray, least: float) -> np.ndarray:
-    """Values pushed ``least`` away from 0, so that every vertex lies clearly on one edge."""
-    return np.where(np.abs(values) < least, np.copysign(np.float32(least), values), values)
+    return HeadMesh(grid.points(index), grid_normals(grid, index), faces)
 
 
 def _welded(index: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (V, 3), in voxels, and faces (F, 3) where a voxel's edge has one vertex only.
+    """Weld vertices (V, 3), in voxels, of faces (F, 3), so that a voxel's edge has at most one.
 
-    Vertices within a cube, which marching cubes adds where faces are ambiguous, are none's double.
+    Vertices within a cube, which marching cubes adds where faces are ambiguous, have no double.
     """
     whole = np.floor(index).astype(np.int64)
     share = index > whole
@@ -78,8 +86,8 @@ def _welded(index: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarra
     return index[first], welded[faces]
 
 
-def grid_normals(grid: Grid, index: np.ndarray) -> np.ndarray:
-    """Unit gradient (N, 3) at fractional voxel indices (N, 3), from values smoothed by a voxel."""
+def grid_normals(grid: LevelSet, index: np.ndarray) -> np.ndarray:
+    """Take unit gradients (N, 3) at fractional voxel indices (N, 3), smoothed by a voxel."""
     smooth = smoothed(grid, 1.0)
     slope = [
         smooth.sample(grid.points(index + e)) - smooth.sample(grid.points(index - e))
@@ -90,7 +98,7 @@ def grid_normals(grid: Grid, index: np.ndarray) -> np.ndarray:
 
 
 def graph_laplacian(faces: np.ndarray, count: int) -> sparse.csc_matrix:
-    """Random-walk Laplacian (V, V): each vertex less the mean of its neighbours."""
+    """Build the random-walk Laplacian (V, V): each vertex minus the mean of its neighbours."""
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     ones = np.ones(len(edges))
     adjacent = sparse.coo_matrix((ones, (edges[:, 0], edges[:, 1])), (count, count)).tocsr()
@@ -99,11 +107,19 @@ def graph_laplacian(faces: np.ndarray, count: int) -> sparse.csc_matrix:
     return (sparse.identity(count) - sparse.diags(1.0 / degree) @ adjacent).tocsc()
 
 
-def rim_targets(views: Sequence[View], grid: Grid, depth_range: float) -> np.ndarray:
-    """Points (N, 3) where rays along the silhouettes pass closest to the surface.
+def averaged(values: np.ndarray, faces: np.ndarray, rounds: int) -> np.ndarray:
+    """Average vertex values (V,) or (V, D) over their neighbours, repeatedly."""
+    laplacian = graph_laplacian(faces, len(values))
+    for _ in range(rounds):
+        values = values - 0.5 * (laplacian @ values)
+    return values
+
+
+def rim_targets(views: Sequence[DepthView], grid: LevelSet, depth_range: float) -> np.ndarray:
+    """Find the points (N, 3) where rays along the silhouettes pass closest to the surface.
 
     Such a point should lie on the surface: the grid's distance there is the displacement that the
-    surface lacks (positive: it has shrunk away from the silhouette).
+    surface lacks (positive where it has shrunk away from the silhouette).
     """
     steps = np.arange(-0.5, 0.5, 1.5 * grid.voxel / depth_range) * depth_range
     middle = grid.points((np.array(grid.shape) - 1) / 2)
@@ -128,7 +144,7 @@ def rim_targets(views: Sequence[View], grid: Grid, depth_range: float) -> np.nda
 
 
 def _onto_contour(signed: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Corner-origin pixels (N, 2) moved from pixel centres along the gradient to distance 0."""
+    """Move pixel centres along the gradient to distance 0: corner-origin pixels (N, 2)."""
     dx = (signed[y, x + 1] - signed[y, x - 1]) / 2
     dy = (signed[y + 1, x] - signed[y - 1, x]) / 2
     scale = signed[y, x] / np.maximum(dx * dx + dy * dy, 0.25)
@@ -141,13 +157,10 @@ def smooth_displacement(
     laplacian: sparse.csc_matrix,
     pinned: np.ndarray,
     pinned_weight: np.ndarray,
-    stiffness: float,
-    couplings: Sequence[float],
-    outlier_steps: float = OUTLIER_STEPS,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Displacements (V,) that score well and bend little, and the trust (V,) in the scores.
+    """Find displacements (V,) that score well and bend little, and the trust (V,) in the scores.
 
-    Alternates between the best offset near the current displacement (score less a coupling times
+    Alternates between the best offset near the current displacement (score minus a coupling times
     the squared gap, exhaustive) and a linear solve of a thin plate through these offsets and the
     pinned ones (Steinbruecker et al. 2009; Newcombe et al. 2011).
 
@@ -155,31 +168,28 @@ def smooth_displacement(
         scores: (V, D) photo-consistency at the offsets.
         offsets: (D,) metres, evenly spaced.
         laplacian: (V, V) of the mesh.
-        pinned: (V,) displacements known otherwise, metres.
+        pinned: (V,) displacements known from elsewhere, metres.
         pinned_weight: (V,) their weights.
-        stiffness: weight of the squared Laplacian against a data weight of one.
-        couplings: per-metre-squared weights of the alternations, rising.
-        outlier_steps: offsets' steps off its neighbours at which a match is believed by a quarter.
     """
     count = len(scores)
     peak, typical = scores.max(1), np.median(scores, axis=1)
     # a peak counts by its height and by how far it stands out; 0.33 is what good texture gives
     trust = np.clip(3.0 * np.clip(peak, 0, 1) * (peak - typical), 0, 1)
-    plate = stiffness * (laplacian.T @ laplacian)
+    plate = STIFFNESS_VOXELS**4 * (laplacian.T @ laplacian)  # against a data weight of one
     ridge = 0.01  # a patch that nothing pins stays where it is
     rows = np.arange(count)
     step = offsets[1] - offsets[0]
     displacement = _plate(plate, ridge + trust + pinned_weight, pinned_weight * pinned, step)
     believed = trust
-    for coupling in couplings:
+    for coupling in COUPLINGS:
         gap = offsets[None] - displacement[:, None]
         energy = scores - coupling * gap * gap
         best = energy.argmax(1)
         target = offsets[best] + _parabola(energy, rows, best) * step
         pull = believed * target + pinned_weight * pinned
         displacement = _plate(plate, ridge + believed + pinned_weight, pull, step, displacement)
-        # A match that its neighbours contradict is by chance (Geman and McClure 1985).
-        believed = trust / (1.0 + ((target - displacement) / (outlier_steps * step)) ** 2) ** 2
+        # A match that its neighbours contradict is due to chance (Geman and McClure 1985).
+        believed = trust / (1.0 + ((target - displacement) / (OUTLIER_STEPS * step)) ** 2) ** 2
     return displacement, trust
 
 
@@ -190,7 +200,7 @@ def _plate(
     step: float,
     start: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Displacements (V,) of a plate held by springs (V,), to a thousandth of a step."""
+    """Solve for the displacements (V,) of a plate on springs (V,), to a thousandth of a step."""
     matrix = (plate + sparse.diags(weight)).tocsr()
     inverse = sparse.diags(1.0 / matrix.diagonal())
     tolerance = 1e-3 * step * float(weight.mean()) * len(weight) ** 0.5
@@ -199,7 +209,7 @@ def _plate(
 
 
 def _parabola(energy: np.ndarray, rows: np.ndarray, best: np.ndarray) -> np.ndarray:
-    """Offset in [-0.5, 0.5] of the peak of the parabola through the best sample and its two."""
+    """Find the peak, in [-0.5, 0.5] steps, of the parabola through the best sample and its two."""
     inner = np.clip(best, 1, energy.shape[1] - 2)
     left, mid, right = (energy[rows, inner + k] for k in (-1, 0, 1))
     bend = left - 2 * mid + right
@@ -207,8 +217,8 @@ def _parabola(energy: np.ndarray, rows: np.ndarray, best: np.ndarray) -> np.ndar
     return np.where(best == inner, np.clip(peak, -0.5, 0.5), 0.0)
 
 
-def advance(grid: Grid, vertices: np.ndarray, displacement: np.ndarray) -> Grid:
-    """The grid after its surface moved by ``displacement`` (V,) along the normals.
+def advance(grid: LevelSet, vertices: np.ndarray, displacement: np.ndarray) -> LevelSet:
+    """Move the grid's surface by ``displacement`` (V,) along the normals.
 
     The displacement spreads from the surface into the grid as a normalised Gaussian average; a
     voxel out of its reach lies far from the old and the new surface and stays.
@@ -227,8 +237,8 @@ def advance(grid: Grid, vertices: np.ndarray, displacement: np.ndarray) -> Grid:
     return combined(moved, grid, *spread)
 
 
-def _scattered(grid: Grid, index: np.ndarray, weight: np.ndarray) -> Grid:
-    """Sums of weights (N,) at voxels (N, 3), zero elsewhere, in blocks of their own."""
+def _scattered(grid: LevelSet, index: np.ndarray, weight: np.ndarray) -> LevelSet:
+    """Sum weights (N,) at voxels (N, 3), zero elsewhere, in blocks of their own."""
     places = tuple((index // BLOCK).T)
     table = np.zeros_like(grid.table)
     table[places] = HELD
@@ -237,11 +247,11 @@ def _scattered(grid: Grid, index: np.ndarray, weight: np.ndarray) -> Grid:
     size = (int(table.max()) + 1) * BLOCK**3
     sums = np.bincount(table[places].astype(np.int64) * BLOCK**3 + inner, weight, size)
     blocks = sums.astype(np.float32).reshape(-1, BLOCK, BLOCK, BLOCK)
-    return Grid(grid.origin, grid.voxel, grid.shape, table, blocks)
+    return LevelSet(grid.origin, grid.voxel, grid.shape, table, blocks)
 
 
-def fair(grid: Grid, sigma: float) -> Grid:
-    """The grid smoothed by a Gaussian of ``sigma`` metres and scaled back to unit slope."""
+def fair(grid: LevelSet, sigma: float) -> LevelSet:
+    """Smooth a grid by a Gaussian of ``sigma`` metres and scale it back to unit slope."""
     smooth = smoothed(grid, sigma / grid.voxel)
 
     def values(places: np.ndarray) -> np.ndarray:
@@ -255,7 +265,7 @@ def fair(grid: Grid, sigma: float) -> Grid:
 
 
 def largest_part(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Faces (F', 3) of the largest connected part: a head is one; what floats beside it is not."""
+    """Keep the faces (F', 3) of the largest connected part; what floats beside it is not a head."""
     graph = sparse.coo_matrix(
         (np.ones(len(faces) * 2), (faces[:, [0, 1]].ravel(), faces[:, [1, 2]].ravel())),
         (len(vertices), len(vertices)),

@@ -1,8 +1,11 @@
-"""Photo-consistency of a surface: patches of it slid along the normals, compared across views.
+"""Slide patches of a surface along its normals and compare them across views.
 
 A patch is curved as the surface is, so that views far apart see it alike: a fronto-parallel sweep
 fails at the 35 to 45 degrees between neighbours of a sparse ring, a flat patch at a nose. The score
-is zero-mean normalised cross-correlation, blind to each camera's gain and offset.
+is zero-mean normalised cross-correlation, which ignores each camera's gain and offset.
+
+Tracking searches along normals too, but with other supports: a fixed window of pixels per reference
+view around points of a head model, where this one has metric patches that follow a level set.
 """
 
 from __future__ import annotations
@@ -13,14 +16,38 @@ import cv2
 import numpy as np
 import open3d as o3d
 
-from pipelines.depth.blocks import Grid
-from pipelines.depth.grid import View, project_fast, sample_image
+from express50.geometry.raycast import mesh_scene
+from pipelines.depth.blocks import LevelSet
+from pipelines.depth.surface import HeadMesh, averaged
+from pipelines.depth.views import DepthView, pixel_size, project_fast, sample_image
 
 GRAZING = 0.25  # cosine; flatter than this, a patch is squeezed to under a quarter of its width
+SAMPLES = 5  # along a patch's side: 7 are worse (0.353 for 0.333 mm)
+SPACING_VOXELS = 0.66  # between a patch's samples
 
 
-def grey_images(views: Sequence[View], blur_px: float) -> list[np.ndarray]:
-    """Luma (H, W) float32, in 8-bit steps, of every view, blurred against aliasing."""
+def patch_scores(
+    views: Sequence[DepthView], grid: LevelSet, mesh: HeadMesh, offsets: np.ndarray, noise: float
+) -> np.ndarray:
+    """Score how well the views agree (V, D) on patches moved along normals by offsets (D,) metres.
+
+    ``noise`` is that of :func:`sweep_scores`.
+    """
+    spacing = SPACING_VOXELS * grid.voxel
+    pixel = np.median([pixel_size(view, mesh.vertices.mean(0)) for view in views])
+    greys = grey_images(views, 0.4 * spacing / pixel)
+    weights = view_weights(views, mesh, grid.voxel)
+    # Samples of a patch lie no closer than the pixels: finer ones would repeat them.
+    spacing = max(spacing, float(pixel))
+    scores = sweep_scores(
+        views, greys, grid, mesh.vertices, mesh.normals, weights, offsets, spacing, noise
+    )
+    # Neighbours see the same: chance matches of one patch, frequent in hair, average out.
+    return averaged(scores, mesh.faces, rounds=1)
+
+
+def grey_images(views: Sequence[DepthView], blur_px: float) -> list[np.ndarray]:
+    """Convert views to luma (H, W) float32, in 8-bit steps, blurred against aliasing."""
     greys = []
     for view in views:
         grey = cv2.cvtColor(view.rgb, cv2.COLOR_RGB2GRAY).astype(np.float32)
@@ -28,22 +55,16 @@ def grey_images(views: Sequence[View], blur_px: float) -> list[np.ndarray]:
     return greys
 
 
-def view_weights(
-    views: Sequence[View],
-    vertices: np.ndarray,
-    normals: np.ndarray,
-    scene: o3d.t.geometry.RaycastingScene,
-    lift: float,
-) -> np.ndarray:
-    """How well each view sees each vertex: (C, V) in [0, 1], the cosine to the normal, 0 if hidden.
+def view_weights(views: Sequence[DepthView], mesh: HeadMesh, lift: float) -> np.ndarray:
+    """Weigh each vertex in each view, (C, V) in [0, 1]: the cosine to the normal, 0 if hidden.
 
     Args:
         views: C views.
-        vertices: (V, 3) of the surface.
-        normals: (V, 3) outward.
-        scene: the surface.
-        lift: metres; a vertex counts as seen where the point this far above it is.
+        mesh: the surface.
+        lift: metres; a vertex counts as seen if the point this far above it is.
     """
+    vertices, normals, _ = mesh
+    scene = mesh_scene(vertices, mesh.faces)
     weights = np.zeros((len(views), len(vertices)), np.float32)
     for row, view in zip(weights, views, strict=True):
         towards = view.camera.center - vertices
@@ -62,35 +83,36 @@ def view_weights(
 
 
 def sweep_scores(
-    views: Sequence[View],
+    views: Sequence[DepthView],
     greys: Sequence[np.ndarray],
-    grid: Grid,
+    grid: LevelSet,
     vertices: np.ndarray,
     normals: np.ndarray,
     weights: np.ndarray,
     offsets: np.ndarray,
     spacing: float,
     noise: float,
-    side: int = 5,
 ) -> np.ndarray:
-    """Cross-correlation (V, D) in [-1, 1] at every offset along the normal; 0 under two views.
+    """Correlate views (V, D) in [-1, 1] at each offset along the normal; 0 with under two views.
 
     Args:
         views: C views.
         greys: their (H, W) float32 images.
-        grid: signed distances, which say how the surface curves about a vertex.
+        grid: signed distances, from which patches take their curvature.
         vertices: (V, 3) of the surface.
         normals: (V, 3) outward.
         weights: (C, V) of :func:`view_weights`.
         offsets: (D,) metres along the normal.
         spacing: metres between a patch's samples.
-        noise: standard deviation, 8-bit steps, under which texture counts as none.
-        side: samples along a patch's side.
+        noise: standard deviation, 8-bit steps, under which texture does not count.
     """
     scores = np.zeros((len(vertices), len(offsets)), np.float32)
     usable = np.flatnonzero((weights > 0).sum(0) >= 2)
-    tangents = _tangents(normals)  # (V, 2, 3)
-    ticks = (np.arange(side) - (side - 1) / 2) * spacing
+    axis = np.where(np.abs(normals[:, 1:2]) < 0.8, [[0.0, 1.0, 0.0]], [[1.0, 0.0, 0.0]])
+    first = np.cross(normals, axis)
+    first /= np.maximum(np.linalg.norm(first, axis=1, keepdims=True), 1e-9)
+    tangents = np.stack([first, np.cross(normals, first)], axis=1)  # (V, 2, 3), orthonormal
+    ticks = (np.arange(SAMPLES) - (SAMPLES - 1) / 2) * spacing
     flat = np.stack(np.meshgrid(ticks, ticks), -1).reshape(-1, 2)
     for chunk in np.array_split(usable, max(1, len(usable) // 1000)):
         if not len(chunk):
@@ -103,11 +125,15 @@ def sweep_scores(
 
 
 def _patches(
-    grid: Grid, vertices: np.ndarray, normals: np.ndarray, tangents: np.ndarray, flat: np.ndarray
+    grid: LevelSet,
+    vertices: np.ndarray,
+    normals: np.ndarray,
+    tangents: np.ndarray,
+    flat: np.ndarray,
 ) -> np.ndarray:
-    """Points (n, P, 3) float32 about each vertex, on the surface over the places (P, 2) of a plane.
+    """Lay points (n, P, 3) float32 around vertices, over places (P, 2) of their tangent planes.
 
-    Where the surface leaves the plane by more than the plane's extent it is another part of it.
+    The points follow the surface, except where it is further off than the patch is wide.
     """
     about = flat @ tangents  # (n, P, 3)
     height = grid.sample((vertices[:, None] + about).reshape(-1, 3)).reshape(about.shape[:2])
@@ -116,23 +142,15 @@ def _patches(
     return (about + rise[..., None] * normals[:, None]).astype(np.float32)
 
 
-def _tangents(normals: np.ndarray) -> np.ndarray:
-    """Two orthonormal vectors (V, 2, 3) across each normal (V, 3)."""
-    axis = np.where(np.abs(normals[:, 1:2]) < 0.8, [[0.0, 1.0, 0.0]], [[1.0, 0.0, 0.0]])
-    first = np.cross(normals, axis)
-    first /= np.maximum(np.linalg.norm(first, axis=1, keepdims=True), 1e-9)
-    return np.stack([first, np.cross(normals, first)], axis=1)
-
-
 def _correlate(
-    views: Sequence[View],
+    views: Sequence[DepthView],
     greys: Sequence[np.ndarray],
     line: np.ndarray,
     patch: np.ndarray,
     weights: np.ndarray,
     noise: float,
 ) -> np.ndarray:
-    """Weighted mean correlation (n, D) over all pairs of views of patches (n, P, 3) along lines.
+    """Average the correlation (n, D) of patches (n, P, 3) along lines over all pairs of views.
 
     Lines (n, D, 3) hold the patches' centres. With z_c the normalised patch of view c, the sum over
     pairs is
@@ -156,8 +174,8 @@ def _correlate(
     return (np.einsum("ndp,ndp->nd", total, total) - own) / np.maximum(pairs, 1e-9)[:, None]
 
 
-def _patch_pixels(view: View, line: np.ndarray, patch: np.ndarray) -> np.ndarray:
-    """Pixels (n, D, P, 2) float32 of patches; affine within one, which spans 1 % of its depth."""
+def _patch_pixels(view: DepthView, line: np.ndarray, patch: np.ndarray) -> np.ndarray:
+    """Project patches to pixels (n, D, P, 2) float32: affine within one, 1 % of its depth wide."""
     M = (view.camera.K @ view.camera.cam_from_world[:3, :3]).astype(np.float32)
     p = (line - view.camera.center).astype(np.float32) @ M.T  # (n, D, 3)
     depth = np.maximum(p[..., 2], 1e-6)

@@ -1,8 +1,7 @@
-"""Which cameras of an item can be used, and why the others cannot."""
+"""Prepare the cameras of an item: check and repair mattes, measure distances to silhouettes."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -11,167 +10,133 @@ import numpy as np
 from express50.errors import StageError
 from express50.files.images import resize_area
 from express50.geometry.cameras import Camera, resized
-from pipelines.depth.grid import (
-    INSIDE,
-    View,
-    head_box,
-    project_fast,
-    sample_image,
-    silhouette_distance,
-)
+from express50.geometry.conventions import corner_to_cell
 
+INSIDE = 0.5  # alpha at a silhouette
 EMPTY = 0.002  # share of the image below which a matte holds no head
 FULL = 0.98  # share above which a matte cuts nothing out
-VOTERS = 5  # fewest views of which one can be outvoted
-MISSED = 0.001  # share of the mattes that the hull may miss before anyone is suspected
-OUTVOTED = 2.0  # times less must be missed without the view left out than without any other
-CELLS = 64  # along the sides of the box in which views are compared
+SPECK = 0.01  # share of a matte's largest part below which other parts are dropped
 HOLE = 0.05  # share of the matte up to which a hole in it is filled
 
 
-def make_view(camera: Camera, rgb: np.ndarray, alpha: np.ndarray, side: int) -> View | str:
-    """A view of images at most ``side`` pixels large, or the reason why it cannot be used.
+@dataclass(frozen=True)
+class DepthView:
+    """One usable camera of an item.
+
+    Attributes:
+        camera: undistorted pinhole camera.
+        rgb: (H, W, 3) uint8 sRGB.
+        alpha: (H, W) float32 in [0, 1].
+        silhouette_px: (H, W) float32 signed distance to the silhouette, pixels, positive inside.
+    """
+
+    camera: Camera
+    rgb: np.ndarray
+    alpha: np.ndarray
+    silhouette_px: np.ndarray
+
+
+def make_view(camera: Camera, rgb: np.ndarray, alpha: np.ndarray, side: int) -> DepthView:
+    """Make a view from images reduced to at most ``side`` pixels.
 
     Args:
         camera: undistorted pinhole camera.
         rgb: (H, W, 3) uint8 sRGB.
         alpha: (H, W) float32 in [0, 1]; the view's is without specks and small holes.
         side: longest side, pixels; larger images are averaged down.
+
+    Raises:
+        StageError: the camera cannot be used: sizes differ, or the matte is empty or full.
     """
     if rgb.shape[:2] != (camera.height, camera.width) or alpha.shape != rgb.shape[:2]:
-        return (
+        raise StageError(
             f"frame {rgb.shape[1]}x{rgb.shape[0]} and matte {alpha.shape[1]}x{alpha.shape[0]} are"
-            f" not the camera's {camera.width}x{camera.height}"
+            f" not of the camera's size, {camera.width}x{camera.height}"
         )
     share = float((alpha > INSIDE).mean())
     if share < EMPTY:
-        return f"its matte is empty ({share:.2%} of the image)"
+        raise StageError(f"its matte is empty ({share:.2%} of the image)")
     if share > FULL:
-        return f"its matte covers {share:.1%} of the image and cuts nothing out"
+        raise StageError(f"its matte covers {share:.1%} of the image and cuts nothing out")
     scale = side / max(camera.width, camera.height)
     if scale < 1:
         width, height = round(camera.width * scale), round(camera.height * scale)
         camera = resized(camera, width, height)
         rgb, alpha = resize_area(rgb, width, height), resize_area(alpha, width, height)
     if not (alpha > INSIDE).any():
-        return f"its matte is empty at {camera.width}x{camera.height}: specks are all it holds"
-    alpha = _mended(alpha)
-    return View(camera, rgb, alpha, silhouette_distance(alpha))
+        raise StageError(
+            f"its matte is empty at {camera.width}x{camera.height}: it holds nothing but specks"
+        )
+    alpha = repaired_matte(alpha)
+    return DepthView(camera, rgb, alpha, silhouette_distance(alpha))
 
 
-def _mended(alpha: np.ndarray) -> np.ndarray:
-    """The matte (H, W) without islands under a hundredth of its largest part, small holes filled.
+def repaired_matte(alpha: np.ndarray) -> np.ndarray:
+    """Remove specks from a matte (H, W) and fill small holes.
 
-    A hole drills a tunnel through the whole hull. Where one is real, between strands, filling it
-    costs nothing: its pixels stay outside the matte that depth is valid in.
+    A hole drills a tunnel through the whole hull. Filling a real one, between strands, costs
+    nothing: its pixels stay outside the matte in which depth is valid.
     """
+
+    def parts(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        _, labels, stats, _ = cv2.connectedComponentsWithStats(mask, connectivity=8)
+        return stats[1:, cv2.CC_STAT_AREA], labels
+
     mask = (alpha > INSIDE).astype(np.uint8)
-    areas, labels = _parts(mask)
-    small = np.flatnonzero(areas < 0.01 * areas.max()) + 1
-    kept = np.where(np.isin(labels, small), 0.0, alpha).astype(np.float32)
-    gaps, labels = _parts((kept <= INSIDE).astype(np.uint8))
+    areas, labels = parts(mask)
+    specks = np.flatnonzero(areas < SPECK * areas.max()) + 1
+    kept = np.where(np.isin(labels, specks), 0.0, alpha).astype(np.float32)
+    gaps, labels = parts((kept <= INSIDE).astype(np.uint8))
     border = np.unique(np.r_[labels[[0, -1]].ravel(), labels[:, [0, -1]].ravel()])
     holes = np.setdiff1d(np.flatnonzero(gaps < HOLE * mask.sum()) + 1, border)
     return np.where(np.isin(labels, holes), np.float32(1), kept)
 
 
-def _parts(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Areas (N,) of the connected parts of a mask (H, W), and labels (H, W) from 1."""
-    _, labels, stats, _ = cv2.connectedComponentsWithStats(mask, connectivity=8)
-    return stats[1:, cv2.CC_STAT_AREA], labels
+def silhouette_distance(alpha: np.ndarray, upsample: int = 3) -> np.ndarray:
+    """Measure the signed distance (H, W) float32, pixels, positive inside, to alpha's 0.5 contour.
 
-
-def without_contradiction(views: Sequence[View]) -> tuple[list[View], dict[str, str]]:
-    """Views whose mattes agree, and why others were left out: {camera: reason}.
-
-    A matte that misses half of the head, or a camera that is not where it is said to be, carves the
-    common hull away: the hull then no longer fills the mattes, but does without that view.
+    The matte is enlarged first, so that the contour keeps the matte's subpixel position.
+    Pixels beyond the image are unknown, not empty: a head cut by the border stays inside there.
     """
-    if len(views) < VOTERS:
-        return list(views), {}
-    silhouettes = _silhouettes(views)
-    everyone = np.ones(len(views), bool)
-    missed = _unfilled(silhouettes, everyone)
-    if missed < MISSED:
-        return list(views), {}
-    without = [_unfilled(silhouettes, np.arange(len(views)) != k) for k in range(len(views))]
-    worst = int(np.argmin(without))
-    second = float(np.sort(without)[1])
-    if without[worst] > second / OUTVOTED or second < MISSED / 2:
-        return list(views), {}
-    why = (
-        f"it contradicts the others (the common hull misses {missed:.1%} of the mattes with it,"
-        f" {without[worst]:.1%} without it): check its matte and its calibration"
-    )
-    return [v for k, v in enumerate(views) if k != worst], {views[worst].camera.id: why}
+    height, width = alpha.shape
+    size = (width * upsample, height * upsample)
+    large = cv2.resize(alpha.astype(np.float32), size, interpolation=cv2.INTER_LINEAR)
+    mask = (large > INSIDE).astype(np.uint8)
+    inside = cv2.distanceTransform(mask, cv2.DIST_L2, cv2.DIST_MASK_5)
+    outside = cv2.distanceTransform(1 - mask, cv2.DIST_L2, cv2.DIST_MASK_5)
+    # Distances are to pixel centres across the contour: half a pixel too long on either side.
+    signed = np.where(mask > 0, inside - 0.5, 0.5 - outside) / upsample
+    limit = float(width + height)  # a matte without a contour is infinitely far from one
+    signed = np.clip(signed, -limit, limit).astype(np.float32)
+    return cv2.resize(signed, (width, height), interpolation=cv2.INTER_AREA)
 
 
-@dataclass(frozen=True)
-class _Silhouette:
-    """A view's say on cells of space.
-
-    Attributes:
-        allows: (P,) whether the view does not rule the cell out; it lies in the matte or unseen.
-        pixel: (P,) flat pixel of the cell in ``matte``, -1 where unseen.
-        matte: (h, w) bool, about a pixel a cell.
-    """
-
-    allows: np.ndarray
-    pixel: np.ndarray
-    matte: np.ndarray
-
-
-def _silhouettes(views: Sequence[View]) -> list[_Silhouette]:
-    """What every view says of the cells of a box around the head."""
-    low, high = head_box_without_each(views)
-    axes = [np.linspace(a, b, CELLS) for a, b in zip(low, high, strict=True)]
-    points = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
-    cell = float((high - low).max() / (CELLS - 1))
-    return [_silhouette(view, points, cell) for view in views]
+def sample_image(image: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+    """Sample an image (H, W) bilinearly at corner-origin pixels (N, 2), border values outside."""
+    count = len(pixels)
+    columns = 4096  # cv2.remap takes at most 32767 rows and columns
+    padded = np.zeros((-(-count // columns) * columns, 2), np.float32)
+    padded[:count] = corner_to_cell(pixels)
+    maps = padded.reshape(-1, columns, 2)
+    out = np.empty(maps.shape[:2], np.float32)
+    for start in range(0, len(maps), 8192):
+        block = np.ascontiguousarray(maps[start : start + 8192])
+        out[start : start + 8192] = cv2.remap(
+            image, block[..., 0], block[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+        )
+    return out.reshape(-1)[:count]
 
 
-def _silhouette(view: View, points: np.ndarray, cell: float) -> _Silhouette:
-    pixels, depth = project_fast(view.camera, points)
-    size = np.array([view.camera.width, view.camera.height])
-    seen = (depth > 0) & (pixels >= 0).all(1) & (pixels < size).all(1)
-    near = float(np.median(depth[seen])) if seen.any() else 1.0
-    step = max(1.0, cell * view.camera.K[0, 0] / near)
-    shape = np.maximum(1, np.ceil(size / step)).astype(int)
-    allows = np.ones(len(points), bool)
-    allows[seen] = sample_image(view.silhouette_px, pixels[seen]) > -step / 2
-    column, row = np.minimum((pixels[seen] / step).astype(int), shape - 1).T
-    pixel = np.full(len(points), -1)
-    pixel[seen] = row * shape[0] + column
-    small = resize_area(view.silhouette_px, int(shape[0]), int(shape[1]))
-    return _Silhouette(allows, pixel, small > 0)
+def project_fast(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Project points (N, 3) into a pinhole camera: pixels (N, 2), depths (N,); float32, no NaN."""
+    # Relative to the camera before the cast: a rig may be a kilometre from its world's origin.
+    about = (points - camera.center).astype(np.float32)
+    p = about @ (camera.K @ camera.cam_from_world[:3, :3]).T.astype(np.float32)
+    depth = np.maximum(p[:, 2], 1e-6)
+    return p[:, :2] / depth[:, None], p[:, 2]
 
 
-def _unfilled(silhouettes: Sequence[_Silhouette], used: np.ndarray) -> float:
-    """Share of the mattes, mean over the views ``used`` (C,), that their hull does not fill."""
-    chosen = [one for one, use in zip(silhouettes, used, strict=True) if use]
-    hull = np.stack([one.allows for one in chosen]).all(0)
-    shares = []
-    for one in chosen:
-        filled = np.zeros(one.matte.size, np.uint8)
-        filled[one.pixel[hull & (one.pixel >= 0)]] = 1
-        filled = cv2.dilate(filled.reshape(one.matte.shape), np.ones((3, 3), np.uint8))
-        shares.append(float((filled[one.matte] == 0).mean()) if one.matte.any() else 0.0)
-    return float(np.mean(shares))
-
-
-def head_box_without_each(views: Sequence[View]) -> tuple[np.ndarray, np.ndarray]:
-    """Box (3,), (3,) that holds the hull of the views less any one of them, metres.
-
-    Two halves of the rig, every second view each, span it: one bad view spoils one of them only.
-    """
-    boxes = [_box_or_none(views[0::2]), _box_or_none(views[1::2])]
-    found = [box for box in boxes if box is not None] or [head_box(views)]
-    largest = max(found, key=lambda box: float(np.prod(box[1] - box[0])))
-    return largest
-
-
-def _box_or_none(views: Sequence[View]) -> tuple[np.ndarray, np.ndarray] | None:
-    try:
-        return head_box(views)
-    except StageError:
-        return None
+def pixel_size(view: DepthView, point: np.ndarray) -> float:
+    """Measure the metres that a pixel spans at a world point (3,)."""
+    M = view.camera.cam_from_world
+    return float(abs(M[2, :3] @ point + M[2, 3]) / view.camera.K[0, 0])

@@ -21,7 +21,7 @@ def test_every_knob_of_the_sweep_is_one_that_the_stage_takes():
 
 
 def test_the_table_has_a_column_for_every_cell():
-    row = {"knob": "voxel_mm", "value": 2.4, "views": 24, "pixels": 512, "voxel_mm": 2.4,
+    row = {"setting": "voxel_mm", "value": 2.4, "views": 24, "pixels": 512, "voxel_mm": 2.4,
            "seconds": 20.0, "abs_error_mm_median": 0.5, "abs_error_mm_p95": 7.0,
            "skin_error_mm_median": 0.4, "coverage": 0.98}  # fmt: skip
     lines = as_markdown([row], "S001/neutral")

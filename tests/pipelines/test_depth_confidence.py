@@ -8,8 +8,14 @@ import numpy as np
 import pytest
 
 from express50.geometry.cameras import Camera
-from pipelines.depth.consistency import UNSEEN_TRUST, Agreement, vouched
-from pipelines.depth.raycast import DepthView, depth_view, jumps
+from pipelines.depth.maps import (
+    UNSEEN_TRUST,
+    DepthMaps,
+    PhotoErrors,
+    doubted,
+    jumps,
+    make_maps,
+)
 
 SIDE = 40
 
@@ -19,11 +25,11 @@ def camera(focal: float = 50.0) -> Camera:
     return Camera("cam00", SIDE, SIDE, "PINHOLE", params, np.eye(4))
 
 
-def wall(depth: np.ndarray) -> DepthView:
+def wall(depth: np.ndarray) -> DepthMaps:
     """A wall seen straight on, of full confidence."""
     towards = np.broadcast_to([0.0, 0.0, -1.0], (SIDE, SIDE, 3))
     ones = np.ones((SIDE, SIDE))
-    return depth_view(camera(), ones, depth, towards, ones)
+    return make_maps(camera(), ones, depth, towards, ones)
 
 
 def test_a_jump_and_an_outline_take_confidence_and_a_plane_keeps_it():
@@ -51,10 +57,10 @@ def test_colours_that_contradict_take_confidence_and_few_odd_pixels_do_not():
     errors = np.zeros((SIDE, SIDE), np.float32)
     errors[:, 20:] = 20.0
     errors[10, 10] = 20.0
-    found = vouched(view, Agreement(errors, 1.0)).confidence
+    found = doubted(view, PhotoErrors(errors, 1.0)).confidence
     assert found[30, 5] == pytest.approx(1.0) and found[30, 35] < 0.2
     assert found[10, 10] > 0.85
-    order = [vouched(view, Agreement(np.full_like(errors, e), 1.0)).confidence.mean()
+    order = [doubted(view, PhotoErrors(np.full_like(errors, e), 1.0)).confidence.mean()
              for e in (0, 2, 8, 60)]  # fmt: skip
     assert order == sorted(order, reverse=True) and order[-1] < 0.01
 
@@ -62,8 +68,8 @@ def test_colours_that_contradict_take_confidence_and_few_odd_pixels_do_not():
 def test_what_no_neighbour_sees_is_doubted_and_nothing_is_nan():
     view = wall(np.full((SIDE, SIDE), 1.0))
     unseen = np.full((SIDE // 2, SIDE // 2), np.nan, np.float32)  # compared at half the size
-    found = vouched(view, Agreement(unseen, 0.0)).confidence
+    found = doubted(view, PhotoErrors(unseen, 0.0)).confidence
     np.testing.assert_allclose(found, UNSEEN_TRUST**0.5, rtol=1e-6)
     assert found.shape == view.depth.shape and found.dtype == np.float32
     nothing = replace(view, confidence=np.zeros_like(view.confidence))
-    assert not vouched(nothing, Agreement(unseen, 0.0)).confidence.any()
+    assert not doubted(nothing, PhotoErrors(unseen, 0.0)).confidence.any()

@@ -9,6 +9,7 @@ import trimesh
 from express50.capture.frames import read_cameras_of
 from express50.dataset.depth_files import depth_file, read_depth, read_normals
 from express50.dataset.tracks import read_track
+from express50.errors import ConfigError
 from express50.files.images import read_image, srgb_to_linear
 from express50.geometry.cameras import transform_camera
 from express50.geometry.raycast import mesh_scene
@@ -17,13 +18,13 @@ from express50.head.load import load_head
 from express50.runner.runner import run_stage
 from pipelines.depth import STAGE
 from pipelines.depth.config import DepthConfig
-from pipelines.depth.consistency import Agreement, agreements, make_shot
+from pipelines.depth.maps import PhotoErrors, compared_view, photo_errors
 from pipelines.pack import STAGE as PACK
 from pipelines.pack.config import PackConfig
 from tests.pipelines.bump_dataset import make_dataset, published
 from tests.pipelines.bump_head import mesh, render, ring
 
-QUICK = {"voxel_mm": 8.0, "coarse_mm": 8.0, "patch_samples": 3, "use_track": False}
+QUICK = {"voxel_mm": 8.0, "use_track": False}
 ITEMS = ("S001/neutral", "S001/smile")
 
 
@@ -97,9 +98,9 @@ def test_colours_agree_through_the_right_surface_and_not_through_a_wrong_one():
 
     def figures(points):
         scene = mesh_scene(points, faces)
-        shots = [make_shot(scene, *row, 512) for row in rig]
-        errors = np.concatenate([one.errors.ravel() for one in agreements(shots)])
-        return Agreement(errors, 1.0).numbers()
+        shots = [compared_view(scene, *row, 512) for row in rig]
+        errors = np.concatenate([one.errors.ravel() for one in photo_errors(shots)])
+        return PhotoErrors(errors, 1.0).figures()
 
     right, off = figures(vertices), figures(vertices + [0, 0, 0.006])
     assert 1 - right["photo_consistent"] < 0.5 * (1 - off["photo_consistent"])
@@ -114,12 +115,12 @@ def test_gains_do_not_count_and_what_nobody_else_sees_is_not_judged():
     behind = transform_camera(left, turn)
     rows = [(camera, *render(camera)[:2]) for camera in (left, right, behind)]
     dark = (rows[1][0], (rows[1][1] * 0.6).astype(np.uint8), rows[1][2])
-    plain = agreements([make_shot(scene, *row, 512) for row in rows])
-    gained = agreements([make_shot(scene, *row, 512) for row in (rows[0], dark, rows[2])])
+    plain = photo_errors([compared_view(scene, *row, 512) for row in rows])
+    gained = photo_errors([compared_view(scene, *row, 512) for row in (rows[0], dark, rows[2])])
     assert 0.5 < plain[0].compared < 1
-    assert gained[0].numbers()["photo_error_median"] < plain[0].numbers()["photo_error_median"] + 1
+    assert gained[0].figures()["photo_error_median"] < plain[0].figures()["photo_error_median"] + 1
     assert plain[2].compared == 0 and np.isnan(plain[2].errors).all()
-    assert plain[2].numbers() == {"photo_compared": 0.0}
+    assert plain[2].figures() == {"photo_compared": 0.0}
 
 
 def test_the_metrics_and_the_picture_tell_the_photo_error(written):
@@ -134,16 +135,16 @@ def test_the_metrics_and_the_picture_tell_the_photo_error(written):
 @pytest.mark.parametrize(
     ("name", "value"),
     [
-        ("depth_format", "exr"),
-        ("normal_maps", "8"),
-        ("consistency_side", 4),
-        ("fair_voxels", 2.2),
-        ("fair_voxels", 0.0),
-        ("inward_mm", -1.0),
+        ("voxel_mm", 0.1),
+        ("voxel_px", -1.0),
+        ("image_side", 4),
+        ("noise", 0.0),
+        ("min_views", 1),
+        ("track_agreement", 1.5),
     ],
 )
-def test_unknown_values_are_named(name, value):
-    with pytest.raises(ValueError, match=name):
+def test_values_out_of_range_are_named(name, value):
+    with pytest.raises(ConfigError, match=name):
         DepthConfig(**{name: value})
 
 
@@ -156,7 +157,7 @@ def test_one_camera_has_the_tracked_heads_depth_and_no_trust_in_it(tmp_path):
     track = read_track(dataset.item_dir("track", "S001") / "track.npz")
     scene = mesh_scene(track.vertices[0], load_head(track.head).faces.numpy())
     alpha = read_image(dataset.matte_file("S001", "neutral", camera.id)) / 255.0
-    shot = make_shot(scene, camera, np.zeros((*alpha.shape, 3), np.uint8), alpha, 96)
+    shot = compared_view(scene, camera, np.zeros((*alpha.shape, 3), np.uint8), alpha, 96)
     both = valid & (shot.depth > 0)
     assert both.sum() > 0.9 * (shot.depth > 0).sum()
     assert np.median(np.abs(depth - shot.depth)[both]) < 1.5e-3
@@ -166,7 +167,7 @@ def test_one_camera_has_the_tracked_heads_depth_and_no_trust_in_it(tmp_path):
     (dataset.item_dir("track", "S001") / "track.npz").unlink()
     config = DepthConfig(voxel_mm=3.0)
     (outcome, _) = run_stage(STAGE, dataset, config, workers=0, progress=False).outcomes
-    assert "one camera, so that its depth is the tracked head's" in outcome.reason
+    assert "express50 track" in outcome.reason
 
 
 def test_a_rig_of_which_one_camera_is_left_is_refused(tmp_path):
@@ -175,4 +176,4 @@ def test_a_rig_of_which_one_camera_is_left_is_refused(tmp_path):
         dataset.matte_file("S001", "neutral", name).unlink()
     run = run_stage(STAGE, dataset, DepthConfig(**QUICK), items=[ITEMS[0]], workers=0,
                     progress=False)  # fmt: skip
-    assert "1 usable cameras, expected at least 2" in run.outcomes[0].reason
+    assert "express50 matte" in run.outcomes[0].reason

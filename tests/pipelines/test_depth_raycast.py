@@ -1,4 +1,4 @@
-"""Depth from signed distances: against a sphere that is known, and against the mesh's."""
+"""Compare depth cast at the mesh with depth traced through distances, and both with a ball."""
 
 from __future__ import annotations
 
@@ -10,10 +10,9 @@ import pytest
 from benchmarks.depth_trace import trace
 from express50.geometry.cameras import Camera, rays
 from express50.geometry.raycast import mesh_scene
-from pipelines.depth.blocks import Grid, build, combined
-from pipelines.depth.bodies import largest_body
-from pipelines.depth.finish import Surface
-from pipelines.depth.raycast import cast_view
+from pipelines.depth.blocks import LevelSet, build, combined, largest_body
+from pipelines.depth.maps import cast_maps
+from pipelines.depth.reconstruct import HeadSurface
 from pipelines.depth.surface import extract_mesh, grid_normals
 from tests.pipelines.bump_head import ring
 from tests.pipelines.dense_grid import to_dense
@@ -21,15 +20,15 @@ from tests.pipelines.dense_grid import to_dense
 RADIUS, VOXEL = 0.09, 0.003
 
 
-def ball(centre=0.0, radius=RADIUS) -> Grid:
+def ball(centre=0.0, radius=RADIUS) -> LevelSet:
     side = np.full(3, 0.15)
     return build(-side, side, VOXEL, lambda p: np.linalg.norm(p - centre, axis=1) - radius)
 
 
-def surface_of(grid: Grid) -> Surface:
+def surface_of(grid: LevelSet) -> HeadSurface:
     vertices, normals, faces = extract_mesh(grid)
     ones = np.ones(len(vertices), np.float32)
-    return Surface(vertices, normals, faces, ones, np.zeros((len(vertices), 3), np.uint8), grid)
+    return HeadSurface(vertices, normals, faces, ones, np.zeros((len(vertices), 3), np.uint8), grid)
 
 
 def true_depth(camera: Camera) -> np.ndarray:
@@ -53,7 +52,7 @@ def test_a_ball_is_found_where_it_is(camera):
 def test_mesh_and_distances_agree():
     camera, surface = ring(1, 160)[0], surface_of(ball())
     alpha = np.ones((camera.height, camera.width), np.float32)
-    meshed = cast_view(surface, mesh_scene(surface.vertices, surface.faces), camera, alpha)
+    meshed = cast_maps(surface, mesh_scene(surface.vertices, surface.faces), camera, alpha)
     traced = trace(surface.grid, camera)
     both = meshed.valid & np.isfinite(traced)
     assert (meshed.valid != np.isfinite(traced)).sum() < 0.02 * both.sum()
