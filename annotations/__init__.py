@@ -1,1 +1,17 @@
 """Peak-expression labels: the store, suggestions, and the align stage that joins them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from express50.contract.extensions import Command
+
+
+def add_commands(subparsers: Any) -> None:
+    """Add the command, see `annotations.cli`."""
+    from annotations.cli import add_commands as add
+
+    add(subparsers)
+
+
+COMMAND = Command("label peak frames, review and export labels", add_commands)

@@ -9,11 +9,11 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from annotations.config import AlignConfig
 from annotations.labels import AUTOMATIC, Label, make_mark, make_undo
 from annotations.match import Reference, Watched, suggest_all, watch
 from annotations.observe import observations_path, read_observations
@@ -24,24 +24,8 @@ from express50.capture.expressions import load_script
 from express50.capture.frames import read_proxy
 from express50.capture.index import Index, read_index
 from express50.contract.layout import Dataset
-from express50.contract.stage import Stage
 from express50.errors import StageError
 from express50.files.images import contact_sheet, write_image
-
-
-@dataclass(frozen=True, kw_only=True)
-class AlignConfig:
-    """Settings of the align stage."""
-
-    accept: float = 0.0
-    """Suggestions at least this sure are taken without a person, 0 (all) to 1 (none)."""
-    match: bool = True
-    """Match to the reference identity's canonical frames; off, everybody's own peak is taken."""
-
-    def __post_init__(self) -> None:
-        """Refuse values out of range."""
-        if not 0.0 <= self.accept <= 1.0:
-            raise ValueError(f"accept {self.accept}: expected 0 to 1")
 
 
 def item_inputs(dataset: Dataset, item: str, config: AlignConfig) -> dict[str, Path | str]:
@@ -242,14 +226,3 @@ def _write_sheet(dataset: Dataset, index: Index, peaks: dict, out: Path) -> None
         names.append(f"{cue.expression_id}: first, taken {frames[1]}, last")
     (out / "qc").mkdir()
     write_image(out / "qc" / "peaks.jpg", contact_sheet(rows, names), quality=85)
-
-
-STAGE = Stage(
-    name="align",
-    version=5,
-    config=AlignConfig,
-    presets={"draft": {}, "standard": {}, "reference": {}},
-    items=Dataset.subjects,
-    inputs=item_inputs,
-    run=run_item,
-)

@@ -14,11 +14,11 @@ from pathlib import Path
 
 import numpy as np
 
+from annotations.config import ObserveConfig
 from annotations.watch import align_faces, find_points
 from express50.capture.frames import read_proxy
 from express50.capture.index import Cue, Index, read_index
 from express50.contract.layout import Dataset
-from express50.contract.stage import Stage
 from express50.errors import FormatError, StageError
 from express50.files.arrays import read_arrays
 from express50.files.images import contact_sheet, write_image
@@ -30,29 +30,6 @@ NEUTRAL = "neutral"
 TRIES = 8  # frames all over the clips in which a face is looked for, should rest show none
 SEEN_SCORE = 0.15  # of a frame that shows the face at all
 RANKED_SHARE = 0.8  # of the best camera's score: one that sees less adds more noise than news
-
-
-@dataclass(frozen=True, kw_only=True)
-class ObserveConfig:
-    """Settings of the observe stage."""
-
-    cameras: int = 3
-    """How many cameras watch the face; those that see it best at rest are taken."""
-    stride: int = 1
-    """Look at every stride-th frame of a cue window, at least 1."""
-    min_score: float = 0.3
-    """A camera whose face score at rest is lower does not watch, 0 to 1."""
-    search: float = 0.25
-    """Smallest windows searched where no face is found, of the image's longer side."""
-
-    def __post_init__(self) -> None:
-        """Refuse values out of range."""
-        if self.cameras < 1 or self.stride < 1:
-            raise ValueError(f"cameras {self.cameras}, stride {self.stride}: expected at least 1")
-        if not 0 <= self.min_score <= 1:
-            raise ValueError(f"min_score {self.min_score}: expected 0 to 1")
-        if not 0.02 <= self.search <= 1:
-            raise ValueError(f"search {self.search}: expected 0.02 to 1")
 
 
 @dataclass(frozen=True)
@@ -212,18 +189,3 @@ def _watch(
         placed[rows] = whole
         out.append(placed)
     return out[0], out[1], out[2]
-
-
-STAGE = Stage(
-    name="observe",
-    version=2,
-    config=ObserveConfig,
-    presets={
-        "draft": {"cameras": 1, "stride": 2},
-        "standard": {},
-        "reference": {"cameras": 6},
-    },
-    items=Dataset.subjects,
-    inputs=item_inputs,
-    run=run_item,
-)

@@ -18,7 +18,7 @@ from benchmarks import accuracy
 from benchmarks.document import replace_section
 from express50.contract.layout import Dataset
 from express50.twin.truth import Truth
-from pipelines.order import FIRST, STAGES
+from pipelines.stages import STAGES
 
 SECTION = "Presets of the stages"
 PRESETS = ("draft", "standard", "reference")
@@ -58,9 +58,10 @@ def sweep_one(base: Dataset, truth: Truth, stage: str, preset: str, out: Path) -
     """Run one stage with one preset beside the base dataset; seconds an item and its error."""
     dataset = Dataset(out / f"{stage}-{preset}")
     dataset.root.mkdir(parents=True, exist_ok=True)
-    before = list(STAGES)[: list(STAGES).index(stage)]
+    number = [one.name for one in STAGES].index(stage)
+    before = [one.name for one in STAGES[:number]]
     # What its own command runs first is run with its preset.
-    for name in ("captures.json", *(n for n in before if n not in FIRST.get(stage, ()))):
+    for name in ("captures.json", *(n for n in before if n not in STAGES[number].runs_first)):
         link = dataset.root / name
         if not link.exists():
             link.symlink_to((base.root / name).resolve())

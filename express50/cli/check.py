@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import argparse
 import time
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from express50.cli.stages import load_stage, stages
 from express50.console import FAILED, OK, say, say_json, stdout_to_stderr
+from express50.contract.extensions import hook, stages
 from express50.contract.layout import Dataset
 from express50.errors import StageError
 
@@ -49,14 +48,14 @@ def run_check(args: argparse.Namespace) -> int:
     if not (args.dataset / "ingest").exists() and not (args.dataset / "ledger.sqlite").exists():
         raise StageError(f"{args.dataset}: no dataset; expected one that 'express50 ingest' made")
     for path in args.checkpoint:
-        import_module("grmm.checkpoint").read_content(path)
+        hook("read_checkpoint")(path)
     with stdout_to_stderr():
         result = audit(
             Dataset(args.dataset),
-            [load_stage(name) for name in stages()],
+            list(stages().values()),
             deep=args.deep,
             mend=args.mend,
-            label_problems=import_module("annotations.validate").problems,
+            label_problems=hook("label_problems"),
             checkpoints=args.checkpoint,
         )
     seconds = time.perf_counter() - started

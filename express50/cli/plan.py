@@ -6,9 +6,9 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from express50.cli.stages import load_stage, stages
 from express50.console import OK, format_table, say, say_json, stdout_to_stderr
 from express50.contract.config import PRESETS
+from express50.contract.extensions import stages
 from express50.contract.layout import Dataset
 from express50.dataset.plan import (
     TARGETS,
@@ -59,10 +59,10 @@ def run_plan(args: argparse.Namespace) -> int:
     if args.size is not None:
         sizes["pixels"] = _pixels(args.size)
     with stdout_to_stderr():
-        loaded = [load_stage(name) for name in stages()]
-        measured = [measure(dataset, loaded) for dataset in datasets]
+        known = list(stages().values())
+        measured = [measure(dataset, known) for dataset in datasets]
         target = target_of(args.target, sizes, footage_of(datasets[0]))
-    rows = estimate(list(stages()), target, measured, args.workers, args.preset)
+    rows = estimate(known, target, measured, args.workers, args.preset)
     if args.json:
         footage = [vars(footage_of(dataset)) for dataset in datasets]
         say_json(

@@ -6,15 +6,8 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from express50.console import FAILED, OK, say, say_json
-from express50.contract.segmentation_labels import COLOURS
 from express50.errors import FormatError
-from express50.files.images import contact_sheet, write_image
-from express50.shards.edit import merge_shards, split_shards
-from express50.shards.reader import ShardReader
-from express50.shards.writer import verify
 
 
 def add_commands(subparsers: Any) -> None:
@@ -63,6 +56,8 @@ def _add_edits(actions: Any) -> None:
 
 def run_split(args: argparse.Namespace) -> int:
     """Copy the samples that match."""
+    from express50.shards.edit import split_shards
+
     count = split_shards(
         args.directory, args.out, args.shard_mb, args.subject, args.expression, args.camera,
         args.split,
@@ -73,12 +68,16 @@ def run_split(args: argparse.Namespace) -> int:
 
 def run_merge(args: argparse.Namespace) -> int:
     """Copy the samples of all folders."""
+    from express50.shards.edit import merge_shards
+
     say(f"{args.out}: {merge_shards(args.directories, args.out, args.shard_mb)} samples")
     return OK
 
 
 def run_verify(args: argparse.Namespace) -> int:
     """Print every fault; exit code 1 when there is one."""
+    from express50.shards.writer import verify
+
     faults = verify(args.directory)
     if args.json:
         say_json({"directory": str(args.directory), "faults": faults})
@@ -89,6 +88,8 @@ def run_verify(args: argparse.Namespace) -> int:
 
 def run_ls(args: argparse.Namespace) -> int:
     """List keys with their split and shard."""
+    from express50.shards.reader import ShardReader
+
     reader = ShardReader(args.directory).select(subjects=args.subject, split=args.split)
     if args.json:
         say_json([{"key": e.key, "split": e.split, "shard": e.shard} for e in reader.entries])
@@ -100,6 +101,9 @@ def run_ls(args: argparse.Namespace) -> int:
 
 def run_show(args: argparse.Namespace) -> int:
     """Print one sample's meta; with --out write its pictures side by side."""
+    from express50.files.images import write_image
+    from express50.shards.reader import ShardReader, sample_picture
+
     reader = ShardReader(args.directory)
     keys = reader.keys
     if not keys or (args.key is not None and args.key not in keys):
@@ -109,16 +113,3 @@ def run_show(args: argparse.Namespace) -> int:
         write_image(args.out, sample_picture(sample))
     say_json(sample["meta"] | {"key": sample["key"]})
     return OK
-
-
-def sample_picture(sample: dict) -> np.ndarray:
-    """Picture (H, 3 W or 4 W, 3) uint8: rgb, alpha, depth (near is bright), parts if labelled."""
-    depth, valid = sample["depth"], sample["valid"]
-    shade = np.zeros(depth.shape, np.uint8)
-    if valid.any():
-        low, high = np.percentile(depth[valid], [1, 99])
-        near = np.clip((high - depth) / max(float(high - low), 1e-6), 0, 1)
-        shade = np.where(valid, 55 + 200 * near, 0).astype(np.uint8)
-    alpha = (sample["alpha"] * 255).astype(np.uint8)
-    parts = [] if sample["parts"] is None else [COLOURS[sample["parts"]]]
-    return contact_sheet([[sample["rgb"], alpha, shade, *parts]], tile=depth.shape)

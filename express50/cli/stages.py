@@ -1,75 +1,48 @@
-"""Commands of the stages (one each, ``run`` for all) and of the dataset (status, info, config)."""
+"""Commands that run stages (one each, ``run`` for all), and ``config``, which prints settings."""
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterable
+from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
-from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from express50.cli.status import add_status_command
-from express50.console import FAILED, OK, format_table, say, say_json, stdout_to_stderr
+from express50.console import FAILED, OK, say, say_json, stdout_to_stderr
 from express50.contract.config import PRESETS, config_toml, resolve_config
-from express50.contract.layout import Dataset, existing_dataset
+from express50.contract.extensions import stages, with_required
+from express50.contract.layout import Dataset
 from express50.contract.stage import Stage
 from express50.errors import ConfigError, StageError
-from express50.runner.threads import cap_threads
-
-if TYPE_CHECKING:
-    from express50.runner.runner import Summary
-    from express50.runner.slurm import SlurmJob
-
-HELP = {
-    "ingest": "index raw captures: frames, hashes, proxies",
-    "calibrate": "take or solve the cameras",
-    "observe": "watch the face through every cue window (align runs it first)",
-    "align": "suggest, match to the reference and take the frame of each expression",
-    "alpha": "separate the head from the background, each camera alone (matte runs it first)",
-    "matte": "let the cameras of a moment agree on their mattes",
-    "track": "fit the head model to the peak frames",
-    "depth": "estimate surface and depth maps",
-    "regions": "label skin, hair, eyes, mouth, neck and torso; cut the head off the torso",
-    "pack": "write shards, splits and dataset card",
-}
 
 
-def stages() -> dict[str, str]:
-    """Module of every stage, in order."""
-    return import_module("pipelines.order").STAGES
-
-
-def load_stage(name: str) -> Stage:
-    """Import one stage."""
-    return import_module(stages()[name]).STAGE
-
-
-def with_first(names: Iterable[str]) -> list[str]:
-    """Stages in order, and those that the commands of any of them run first."""
-    first = import_module("pipelines.order").FIRST
-    wanted = {other for name in names for other in (*first.get(name, ()), name)}
-    return [name for name in stages() if name in wanted]
-
-
-def add_stage_commands(subparsers: Any) -> None:
-    """Add one command a stage, and ``run``."""
-    for name in stages():
-        parser = _stage_parser(subparsers, name, HELP.get(name, ""))
-        parser.set_defaults(handler=run_one, stage=name)
-    parser = _stage_parser(subparsers, "run", "run all stages in order")
-    parser.add_argument("--first", metavar="STAGE", choices=list(stages()), help="start here")
-    parser.add_argument("--last", metavar="STAGE", choices=list(stages()), help="end here")
-    parser.set_defaults(handler=run_all)
-
-
-def _stage_parser(subparsers: Any, name: str, words: str) -> argparse.ArgumentParser:
+def add_commands(subparsers: Any) -> None:
+    """Add one command per stage, ``run`` and ``config``."""
+    for stage in stages().values():
+        parser = subparsers.add_parser(
+            stage.name, help=stage.help, description=stage.help,
+            epilog=f"options of the stage: express50 config {stage.name}",
+        )  # fmt: skip
+        _add_run_options(parser, captures=stage.prepare is not None)
+        parser.add_argument("--items", metavar="GLOB", help="only items that match, such as 'S00*'")
+        parser.set_defaults(handler=run_one, stage=stage.name)
+    words, names = "run all stages in order", list(stages())
     parser = subparsers.add_parser(
-        name, help=words, description=words,
-        epilog=f"options of a stage: express50 config {'STAGE' if name == 'run' else name}",
-    )  # fmt: skip
+        "run", help=words, description=words, epilog="options of a stage: express50 config STAGE"
+    )
+    _add_run_options(parser, captures=True)
+    parser.add_argument("--first", metavar="STAGE", choices=names, help="start here")
+    parser.add_argument("--last", metavar="STAGE", choices=names, help="end here")
+    parser.set_defaults(handler=run_all)
+    parser = subparsers.add_parser("config", help="print the configuration of stages as TOML")
+    parser.add_argument("stage", nargs="*", metavar="STAGE", help="all by default")
+    add_config_options(parser)
+    parser.set_defaults(handler=show_config)
+
+
+def _add_run_options(parser: argparse.ArgumentParser, captures: bool) -> None:
     parser.add_argument("dataset", type=Path, metavar="DATASET", help="folder of the dataset")
-    if name in ("ingest", "run"):
+    if captures:
         parser.add_argument(
             "captures", nargs="*", type=Path, metavar="CAPTURE", help="folders of raw captures"
         )
@@ -89,36 +62,33 @@ def _stage_parser(subparsers: Any, name: str, words: str) -> argparse.ArgumentPa
     parser.add_argument(
         "--threads", type=int, default=1, metavar="N", help="threads an item may use (default 1)"
     )
-    if name != "run":
-        parser.add_argument("--items", metavar="GLOB", help="only items that match, such as 'S00*'")
     parser.add_argument("--json", action="store_true", help="print the account as JSON")
-    return parser
 
 
 def add_config_options(parser: argparse.ArgumentParser) -> None:
     """Add the options that make up a configuration."""
     parser.add_argument("--preset", default="standard", metavar="P", help=", ".join(PRESETS))
-    parser.add_argument("--config", type=Path, metavar="FILE", help="TOML, one table a stage")
+    parser.add_argument("--config", type=Path, metavar="FILE", help="TOML, one table per stage")
     parser.add_argument(
         "--set", action="append", default=[], metavar="STAGE.KEY=VALUE", help="set one value"
     )
 
 
 def config_of(stage: Stage, args: argparse.Namespace) -> Any:
-    """Configuration of a stage by the command's options; other stages' values are left alone."""
+    """Build the configuration of a stage from the command's options."""
     return resolve_config(stage, args.preset, args.config, args.set, stages())
 
 
 def run_one(args: argparse.Namespace) -> int:
     """Run one stage, and what its command runs first."""
-    names = with_first([args.stage])
+    chosen = with_required([args.stage])
     for text in args.set:
-        if not text.startswith(tuple(f"{name}." for name in names)):
+        if not text.startswith(tuple(f"{stage.name}." for stage in chosen)):
             raise ConfigError(
-                f"--set {text!r}: this command runs {' and '.join(names)} only; "
+                f"--set {text!r}: this command runs {' and '.join(s.name for s in chosen)} only; "
                 f"expected {args.stage}.key=value"
             )
-    return _run(args, names, args.items)
+    return _run(args, chosen, args.items)
 
 
 def run_all(args: argparse.Namespace) -> int:
@@ -128,12 +98,13 @@ def run_all(args: argparse.Namespace) -> int:
     last = names.index(args.last) if args.last else len(names) - 1
     if first > last:
         raise ConfigError(f"--first {args.first} comes after --last {args.last}; swap them")
-    return _run(args, with_first(names[first : last + 1]), None)
+    return _run(args, with_required(names[first : last + 1]), None)
 
 
-def _run(args: argparse.Namespace, names: list[str], pattern: str | None) -> int:
+def _run(args: argparse.Namespace, chosen: Sequence[Stage], pattern: str | None) -> int:
     from express50.runner.executor import Pool
     from express50.runner.runner import run_stage
+    from express50.runner.threads import cap_threads
 
     if args.workers < 0 or args.threads < 1:
         raise ConfigError(
@@ -142,24 +113,24 @@ def _run(args: argparse.Namespace, names: list[str], pattern: str | None) -> int
     # Before NumPy comes in with a stage: its BLAS reads the cap when it is loaded.
     cap_threads(args.threads)
     dataset = Dataset(args.dataset)
-    slurm = _slurm(args)
-    if args.print_job and slurm:
-        return _print_jobs(dataset, args, names, slurm)
+    slurm = _slurm_jobs(args)
+    if args.print_job:
+        return _print_jobs(dataset, args, chosen, slurm or {})
     summaries = []
     with (
         stdout_to_stderr() if args.json else nullcontext(),
         Pool(args.workers, args.scheduler, args.threads, slurm) as pool,
     ):
         # Every configuration is checked before the first stage spends hours.
-        loaded = [load_stage(name) for name in names]
-        configs = [config_of(stage, args) for stage in loaded]
-        for stage, config in zip(loaded, configs, strict=True):
-            chosen = _choose(stage, dataset, args, pattern)
-            summaries.append(run_stage(stage, dataset, config, chosen, pool=pool))
+        configs = [config_of(stage, args) for stage in chosen]
+        for stage, config in zip(chosen, configs, strict=True):
+            items = _items(stage, dataset, args, pattern)
+            summaries.append(run_stage(stage, dataset, config, items, pool=pool))
             if not args.json:
                 say(*summaries[-1].lines())
-            if stage.name == "ingest" and not args.json:
-                say(*_ingested(dataset, summaries[-1]))
+                if stage.account is not None:
+                    done = [o.item for o in summaries[-1].outcomes if o.status == "done"]
+                    say(*stage.account(dataset, done))
     if args.json:
         accounts = [summary.to_json() for summary in summaries]
         before = {"before": accounts[:-1]} if len(accounts) > 1 else {}
@@ -167,8 +138,8 @@ def _run(args: argparse.Namespace, names: list[str], pattern: str | None) -> int
     return OK if all(summary.ok for summary in summaries) else FAILED
 
 
-def _slurm(args: argparse.Namespace) -> dict[str, SlurmJob] | None:
-    """What the SLURM jobs of every stage ask for, where stages run in such jobs."""
+def _slurm_jobs(args: argparse.Namespace) -> Mapping[str, Any] | None:
+    """Read what the jobs of every stage ask for, where stages run in SLURM jobs."""
     if args.slurm is None:
         if args.print_job:
             raise ConfigError("--print-job: expected --slurm JOBS beside it")
@@ -182,35 +153,28 @@ def _slurm(args: argparse.Namespace) -> dict[str, SlurmJob] | None:
 
 
 def _print_jobs(
-    dataset: Dataset, args: argparse.Namespace, names: list[str], slurm: dict[str, SlurmJob]
+    dataset: Dataset, args: argparse.Namespace, chosen: Sequence[Stage], slurm: Mapping[str, Any]
 ) -> int:
     """Print each script that jobs of these stages would have, once."""
     from express50.runner.slurm import job_script
 
     logs = Dataset(dataset.root.resolve()).slurm_dir
-    for job in dict.fromkeys(slurm[name] for name in names):
+    for job in dict.fromkeys(slurm[stage.name] for stage in chosen):
         address = "tcp://ADDRESS-OF-THE-RUN"
         say(job_script(job, address, "express50-N", args.threads, logs).rstrip())
     return OK
 
 
-def _ingested(dataset: Dataset, summary: Summary) -> Iterable[str]:
-    """What was found in the captures that were read."""
-    module = import_module(stages()["ingest"])
-    return module.account(dataset, [o.item for o in summary.outcomes if o.status == "done"])
-
-
-def _choose(
+def _items(
     stage: Stage, dataset: Dataset, args: argparse.Namespace, pattern: str | None
 ) -> list[str] | None:
-    """Items to run; None for all."""
-    from express50.runner.schedule import select_items
+    """Choose the items to run; None for all."""
+    from express50.runner.runner import select_items
 
-    if stage.name == "ingest" and args.captures:
-        register = import_module(stages()["ingest"]).register
-        subjects = register(dataset, args.captures)
-        if args.command == "ingest" and pattern is None:
-            return subjects
+    if stage.prepare is not None and args.captures:
+        prepared = stage.prepare(dataset, args.captures)
+        if args.command != "run" and pattern is None:
+            return prepared
     elif not dataset.root.is_dir():
         raise StageError(
             f"{dataset.root}: no such dataset; run 'express50 ingest {dataset.root} CAPTURE'"
@@ -218,63 +182,19 @@ def _choose(
     if pattern is None:
         return None
     # A stage that another's command runs first may have other items: those of the same subjects.
-    asked = select_items(load_stage(args.stage), dataset, pattern)
+    asked = select_items(stages()[args.stage], dataset, pattern)
     if stage.name == args.stage:
         return asked
     subjects = {item.split("/")[0] for item in asked}
     return [item for item in stage.items(dataset) if item.split("/")[0] in subjects]
 
 
-def add_dataset_commands(subparsers: Any) -> None:
-    """Add status, info and config."""
-    add_status_command(subparsers, stages())
-    parser = subparsers.add_parser("info", help="subjects, cameras, frames and expressions")
-    parser.add_argument("dataset", type=Path, metavar="DATASET")
-    parser.add_argument("--json", action="store_true", help="print as JSON")
-    parser.set_defaults(handler=show_info)
-    parser = subparsers.add_parser("config", help="print the configuration of stages as TOML")
-    parser.add_argument("stage", nargs="*", metavar="STAGE", help="all by default")
-    add_config_options(parser)
-    parser.set_defaults(handler=show_config)
-
-
-def show_info(args: argparse.Namespace) -> int:
-    """Print what was ingested."""
-    from express50.capture.index import read_index
-
-    dataset = existing_dataset(args.dataset)
-    indices = [read_index(dataset, subject) for subject in dataset.subjects()]
-    header = ["subject", "cameras", "size", "frames", "expressions", "plates", "calibration"]
-    rows = [[str(value) for value in _info(index).values()] for index in indices]
-    if args.json:
-        say_json([_info(index) for index in indices])
-    else:
-        say(*format_table(header, rows))
-    return OK
-
-
-def _info(index: Any) -> dict[str, Any]:
-    sizes = sorted({f"{c.width}x{c.height}" for c in index.cameras.values()})
-    return {
-        "subject": index.subject,
-        "cameras": len(index.cameras),
-        "size": ",".join(sizes),
-        "frames": index.frames,
-        "expressions": len(index.cues),
-        "plates": len(index.plates),
-        "calibration": "given" if index.calibration else "board" if index.board else "none",
-    }
-
-
 def show_config(args: argparse.Namespace) -> int:
     """Print resolved configurations; the output can be given to --config."""
-    say("\n".join(_config_tables(args.stage or stages(), args)).rstrip())
-    return OK
-
-
-def _config_tables(names: Iterable[str], args: argparse.Namespace) -> Iterable[str]:
+    names = args.stage or list(stages())
     for name in names:
         if name not in stages():
             raise ConfigError(f"unknown stage {name!r}; expected one of {', '.join(stages())}")
-        stage = load_stage(name)
-        yield config_toml(name, config_of(stage, args))
+    tables = [config_toml(name, config_of(stages()[name], args)) for name in names]
+    say("\n".join(tables).rstrip())
+    return OK

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import argparse
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 from express50.console import FAILED, OK, say, say_json
+from express50.contract.extensions import hook
 from express50.contract.layout import Dataset
-from express50.dataset.withdraw import plan, withdraw
 
 
 def add_commands(subparsers: Any) -> None:
@@ -38,9 +37,11 @@ def add_commands(subparsers: Any) -> None:
 
 def run_withdraw(args: argparse.Namespace) -> int:
     """Withdraw; exit code 1 when a file that names the subject is left."""
+    from express50.dataset.withdraw import plan, withdraw
+
     dataset = Dataset(args.dataset)
     for path in args.checkpoint:  # says what is no model of ours, before anything is removed
-        import_module("grmm.checkpoint").read_content(path)
+        hook("read_checkpoint")(path)
     if not args.yes:
         paths = [str(path) for path in plan(dataset, args.subject)]
         if args.json:
@@ -51,8 +52,7 @@ def run_withdraw(args: argparse.Namespace) -> int:
             say(*(f"would take codes and frames out of {path}" for path in models))
             say("add --yes to remove")
         return OK
-    redact = import_module("grmm.withdraw").redact
-    done = withdraw(dataset, args.subject, args.checkpoint, redact)
+    done = withdraw(dataset, args.subject, args.checkpoint, hook("redact_checkpoint"))
     account = {
         "subject": done.subject,
         "removed": [str(path) for path in done.removed],

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -38,14 +38,27 @@ class Result:
         return {**self.metrics, **{key: [asdict(n) for n in rows] for key, rows in notes.items()}}
 
 
-def no_sources(dataset: Dataset, item: str, config: Any) -> list[str]:
-    """No item of the stage reads another's output."""
-    return []
-
-
 def no_gpu(config: Any) -> bool:
-    """The stage runs on CPUs whatever its configuration."""
+    """Say that a stage runs on CPUs whatever its configuration."""
     return False
+
+
+@dataclass(frozen=True)
+class Growth:
+    """Sizes of the footage that a stage's cost is proportional to, for ``express50 plan``.
+
+    The sizes are ``subjects``, ``expressions``, ``views`` (cameras), ``pixels`` (of an image) and
+    ``frames`` (of a camera); several are multiplied.
+
+    Attributes:
+        items: number of items.
+        time: seconds per item.
+        disk: bytes per item.
+    """
+
+    items: tuple[str, ...] = ("subjects",)
+    time: tuple[str, ...] = ()
+    disk: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -62,13 +75,15 @@ class Stage:
         run: ``run(dataset, item, config, out_dir)`` writes every file into ``out_dir`` and
             returns a ``Result`` (the runner writes it to ``metrics.json``). Raises Express50Error
             when the data of this item are bad.
-        sources: items of the same stage whose outputs an item reads. They are run before it,
-            whether they were asked for or not, so that its bytes do not hang on the order; the
-            output read must be among ``inputs``, where it is there.
         needs_gpu: whether items of this config may only run where there is a GPU; one at a time
             runs on each.
         help: one line for the command line, in the imperative.
         purpose: one or two sentences for the report.
+        runs_first: stages that the command of this one runs before it.
+        prepare: takes captures that the command names into the dataset and returns the ids of
+            their items; only a stage that has it accepts captures.
+        account: lines for people about items that were made, printed after the stage's account.
+        growth: what its cost is proportional to.
     """
 
     name: str
@@ -78,7 +93,10 @@ class Stage:
     items: Callable[[Dataset], list[str]]
     inputs: Callable[[Dataset, str, Any], dict[str, Path | str]]
     run: Callable[[Dataset, str, Any, Path], Result | dict]
-    sources: Callable[[Dataset, str, Any], list[str]] = no_sources
     needs_gpu: Callable[[Any], bool] = no_gpu
     help: str = ""
     purpose: str = ""
+    runs_first: tuple[str, ...] = ()
+    prepare: Callable[[Dataset, Sequence[Path]], list[str]] | None = None
+    account: Callable[[Dataset, Sequence[str]], Iterable[str]] | None = None
+    growth: Growth = Growth()

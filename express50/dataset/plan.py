@@ -1,9 +1,10 @@
-"""What a capture campaign costs, from the receipts of a dataset that was really made.
+"""The cost of a capture campaign, from the receipts of a dataset that was really made.
 
-Each stage's seconds and bytes an item grow with the footage by the law in `LAWS`: linearly in the
-product of what is named there, or with the exponent that two datasets of different size show.
-Memory has a part that does not grow (libraries, the head model), which one dataset cannot tell: it
-is then given as measured, a lower bound, and from two datasets by the line through both.
+Seconds and bytes per item grow with the footage as each stage declares in its `Growth`: linearly
+in the product of the sizes named there, or with the exponent that two datasets of different size
+show. Memory has a part that does not grow (libraries, the head model); one dataset cannot separate
+it, so memory is then given as measured, a lower bound, and from two datasets by the line through
+both.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from typing import Any
 from express50.capture.index import read_index
 from express50.contract.config import config_toml, resolve_config
 from express50.contract.layout import Dataset
-from express50.contract.stage import Stage
+from express50.contract.stage import Growth, Stage
 from express50.errors import ConfigError, StageError
 from express50.files.digests import files_of, text_digest
 from express50.runner.ledger import Ledger
@@ -43,35 +44,6 @@ class Footage:
 TARGETS: dict[str, dict[str, float]] = {
     "express-50": {"subjects": 50, "expressions": 60, "views": 24, "pixels": 3840 * 2160},
     "renderme-360": {"subjects": 280, "expressions": 12, "views": 60, "pixels": 2448 * 2048},
-}
-
-
-@dataclass(frozen=True)
-class Law:
-    """What a stage has one item for, and what an item's time and bytes grow with."""
-
-    items: tuple[str, ...]
-    time: tuple[str, ...]
-    disk: tuple[str, ...]
-
-
-LAWS = {
-    # Proxies, and what is seen in them, have one size whatever the footage has.
-    "ingest": Law(("subjects",), ("frames", "views", "pixels"), ("frames", "views")),
-    "calibrate": Law(("subjects",), ("views", "pixels"), ("views",)),
-    "observe": Law(("subjects",), ("frames",), ("frames",)),
-    "align": Law(("subjects",), ("frames",), ("frames",)),
-    "alpha": Law(("subjects", "views"), ("expressions", "pixels"), ("expressions", "pixels")),
-    "matte": Law(("subjects", "expressions"), ("views", "pixels"), ("views", "pixels")),
-    "track": Law(("subjects",), ("expressions", "views", "pixels"), ("expressions",)),
-    "depth": Law(("subjects", "expressions"), ("views", "pixels"), ("views", "pixels")),
-    "regions": Law(("subjects", "expressions"), ("views", "pixels"), ("views", "pixels")),
-    # Samples are cut to one size, from pictures that are read whole.
-    "pack": Law(
-        (),
-        ("subjects", "expressions", "views", "pixels"),
-        ("subjects", "expressions", "views"),
-    ),
 }
 
 
@@ -187,7 +159,7 @@ def target_of(name: str | None, sizes: Mapping[str, float], measured: Footage) -
 
 
 def estimate(
-    stages: Sequence[str],
+    stages: Sequence[Stage],
     target: Footage,
     measured: Sequence[Mapping[str, Measured]],
     workers: int,
@@ -196,7 +168,7 @@ def estimate(
     """One row a stage.
 
     Args:
-        stages: names in order.
+        stages: in order.
         target: the campaign.
         measured: one or two datasets' measurements.
         workers: processes of one core each.
@@ -204,28 +176,32 @@ def estimate(
     """
     rows = []
     for stage in stages:
-        law = LAWS[stage]
-        items = round(target.work(law.items))
-        tables = [table[stage] for table in measured if stage in table]
+        items = round(target.work(stage.growth.items))
+        tables = [table[stage.name] for table in measured if stage.name in table]
         # Two presets' figures on one curve would be a fit of nothing.
         wanted = preset or (tables[0].preset if tables else "")
         usable = [m for m in tables if m.preset == wanted]
         if not usable:
             with_others = ", ".join(sorted({m.preset for m in tables}))
             why = f"measured with {with_others}, not {preset}" if tables else "was not run"
-            rows.append(Row(stage=stage, items=items, why=why))
+            rows.append(Row(stage=stage.name, items=items, why=why))
         else:
-            rows.append(_row(stage, law, items, target, usable, workers))
+            rows.append(_row(stage.name, stage.growth, items, target, usable, workers))
     return rows
 
 
 def _row(
-    stage: str, law: Law, items: int, target: Footage, measured: Sequence[Measured], workers: int
+    stage: str,
+    growth: Growth,
+    items: int,
+    target: Footage,
+    measured: Sequence[Measured],
+    workers: int,
 ) -> Row:
-    ordered = sorted(measured, key=lambda m: m.footage.work(law.time))
-    seconds, how = _scaled([m.seconds for m in ordered], ordered, law.time, target)
-    disk, _ = _scaled([m.bytes for m in ordered], ordered, law.disk, target)
-    memory, grows = _memory(ordered, law.time, target)
+    ordered = sorted(measured, key=lambda m: m.footage.work(growth.time))
+    seconds, how = _scaled([m.seconds for m in ordered], ordered, growth.time, target)
+    disk, _ = _scaled([m.bytes for m in ordered], ordered, growth.disk, target)
+    memory, grows = _memory(ordered, growth.time, target)
     hours = items * seconds / 3600
     return Row(
         stage=stage,

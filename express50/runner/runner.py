@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fnmatch
 import functools
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -9,7 +10,7 @@ from contextlib import nullcontext
 from dataclasses import dataclass
 from typing import Any
 
-from express50.contract.config import config_toml
+from express50.contract.config import config_toml, nearest
 from express50.contract.layout import Dataset
 from express50.contract.stage import Stage
 from express50.errors import ConfigError, Express50Error, StageError
@@ -22,7 +23,6 @@ from express50.runner.progress import Progress
 from express50.runner.publish import clean_leftovers, discard_stale, set_aside
 from express50.runner.receipts import Receipt
 from express50.runner.runlog import RunLog
-from express50.runner.schedule import waves_of
 from express50.runner.worker import Task, fingerprint, input_digests
 
 WARNINGS = 12  # lines; more of them would hide the account
@@ -91,6 +91,23 @@ class Summary:
             yield f"  and {len(odd) - WARNINGS} warnings more: see the items' metrics.json"
 
 
+def select_items(stage: Stage, dataset: Dataset, pattern: str) -> list[str]:
+    """Return the items of a stage whose id matches a shell pattern.
+
+    Raises:
+        ConfigError: none does.
+    """
+    known = stage.items(dataset)
+    chosen = [item for item in known if fnmatch.fnmatchcase(item, pattern)]
+    if not chosen:
+        some = ", ".join(known[:8]) + (", ..." if len(known) > 8 else "")
+        raise ConfigError(
+            f"--items {pattern!r}: no item of {stage.name} matches{nearest(pattern, known)}; "
+            f"items: {some or 'none'}"
+        )
+    return chosen
+
+
 def run_stage(
     stage: Stage,
     dataset: Dataset,
@@ -107,8 +124,8 @@ def run_stage(
         stage: the stage.
         dataset: the dataset.
         config: instance of ``stage.config``.
-        items: ids to run, and what these read of the stage itself; all by default, and then outputs
-            of items that are no more are set aside.
+        items: ids to run; all by default, and then outputs of items that are no more are set
+            aside.
         workers: local processes; 0 runs in this one.
         scheduler: address of a dask scheduler to use in place of local processes.
         progress: show progress on standard error.
@@ -124,7 +141,7 @@ def run_stage(
     dataset = Dataset(dataset.root.resolve())
     chosen = list(stage.items(dataset) if items is None else items)
     if not chosen:
-        before = "name a CAPTURE" if stage.name == "ingest" else "run the stages before it first"
+        before = "name a CAPTURE" if stage.prepare else "run the stages before it first"
         raise StageError(f"{dataset.root}: {stage.name} has nothing to do; {before}")
     shared = nullcontext(pool) if pool else Pool(workers, scheduler)
     with shared as workers_pool, stage_lock(dataset, stage.name), Ledger(dataset.ledger) as ledger:
@@ -132,14 +149,10 @@ def run_stage(
         save_config(dataset, stage, config)
         if items is None:
             retire_items(dataset, ledger, stage.name, chosen)
-        waves = waves_of(stage, dataset, config, chosen)
-        chosen = [item for wave in waves for item in wave]
-        outcomes: dict[str, Outcome] = {}
         with RunLog(dataset.ledger, stage.name, len(chosen)) as log:
-            for wave in waves:
-                outcomes |= _run_items(
-                    stage, dataset, config, wave, ledger, workers_pool, progress, log
-                )
+            outcomes = _run_items(
+                stage, dataset, config, chosen, ledger, workers_pool, progress, log
+            )
     missing = set(chosen) - set(outcomes)
     if missing:  # read = done + skipped + failed
         raise StageError(f"{stage.name}: no account of {', '.join(sorted(missing))}; run it again")

@@ -24,7 +24,9 @@ from pathlib import Path
 
 import numpy as np
 
+from express50.contract.segmentation_labels import COLOURS
 from express50.errors import FormatError
+from express50.files.images import contact_sheet
 from express50.files.text import parse_json, read_json
 from express50.shards.codecs import ALPHA, DEPTH, PARTS, RGB, crc32, decode_picture
 from express50.shards.offsets import KEY, read_offsets
@@ -286,3 +288,16 @@ def _shard_entries(root: Path, shard: dict) -> Iterator[Entry]:
             if not KEY.fullmatch(text):  # they become names of files
                 raise FormatError(f"{path}: {kind} {text!r}, expected letters, digits, _ and -")
         yield Entry(**ids, split=shard["split"], shard=name, members=members)
+
+
+def sample_picture(sample: dict) -> np.ndarray:
+    """Picture (H, 3 W or 4 W, 3) uint8: rgb, alpha, depth (near is bright), parts if labelled."""
+    depth, valid = sample["depth"], sample["valid"]
+    shade = np.zeros(depth.shape, np.uint8)
+    if valid.any():
+        low, high = np.percentile(depth[valid], [1, 99])
+        near = np.clip((high - depth) / max(float(high - low), 1e-6), 0, 1)
+        shade = np.where(valid, 55 + 200 * near, 0).astype(np.uint8)
+    alpha = (sample["alpha"] * 255).astype(np.uint8)
+    parts = [] if sample["parts"] is None else [COLOURS[sample["parts"]]]
+    return contact_sheet([[sample["rgb"], alpha, shade, *parts]], tile=depth.shape)

@@ -11,13 +11,12 @@ import numpy as np
 from express50.capture.frames import read_cameras_of, read_frame, read_peaks
 from express50.capture.index import index_path, read_index
 from express50.contract.layout import Dataset
-from express50.contract.stage import Stage
 from express50.errors import NoFaceError, StageError
 from express50.files.calibration import read_cameras
 from express50.files.images import contact_sheet, read_image, write_image
 from express50.geometry.cameras import Camera
 from express50.geometry.conventions import undistorted_mask
-from pipelines.alpha.config import NETWORKS, PRESETS, WITHOUT_PLATE, AlphaConfig
+from pipelines.alpha.config import NETWORKS, WITHOUT_PLATE, AlphaConfig
 from pipelines.alpha.keyer import Keyer
 from pipelines.alpha.plate import exposed, exposure_gain
 from pipelines.alpha.qc import border_contact, picture_row, warnings
@@ -175,15 +174,3 @@ def _write_picture(out: Path, images: dict[str, np.ndarray], odd: set[str]) -> N
 def needs_gpu(config: AlphaConfig) -> bool:
     """Whether a network must run on CUDA."""
     return config.method in NETWORKS and config.device == "cuda"
-
-
-STAGE = Stage(
-    name="alpha",
-    version=4,
-    config=AlphaConfig,
-    presets=PRESETS,
-    items=items,
-    inputs=inputs,
-    run=run,
-    needs_gpu=needs_gpu,
-)

@@ -9,7 +9,6 @@ import numpy as np
 
 from express50.capture.index import Index, calibration_file, index_path, read_index
 from express50.contract.layout import Dataset
-from express50.contract.stage import Stage
 from express50.errors import CalibrationError, CaptureError
 from express50.files.calibration import read_cameras, write_cameras
 from express50.geometry.cameras import Camera, resized
@@ -23,7 +22,7 @@ from pipelines.calibrate.board import (
 )
 from pipelines.calibrate.camera_moves import reduced_camera
 from pipelines.calibrate.colour import Palette
-from pipelines.calibrate.config import PRESETS, CalibrateConfig
+from pipelines.calibrate.config import CalibrateConfig
 from pipelines.calibrate.faces import start_camera
 from pipelines.calibrate.footage_views import see_footage, told_focals
 from pipelines.calibrate.moved import footage_metrics, look_at_footage
@@ -249,14 +248,3 @@ def _metrics(solution: Solution) -> dict:
         "weak": [{"what": name, "why": why} for name, why in solution.weak.items()],
         "dropped": [{"what": name, "why": why} for name, why in solution.dropped.items()],
     }
-
-
-STAGE = Stage(
-    name="calibrate",
-    version=3,
-    config=CalibrateConfig,
-    presets=PRESETS,
-    items=items,
-    inputs=inputs,
-    run=run,
-)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from express50.contract.layout import Dataset
-from express50.contract.stage import Result, Stage
+from express50.contract.stage import Growth, Result, Stage
 from pipelines.depth.config import PRESETS, DepthConfig
 
 
@@ -55,4 +55,7 @@ STAGE = Stage(
     help="reconstruct the head's surface and depth maps of each expression",
     purpose="A level set starts from the visual hull and the tracked mesh and moves to where the"
     " views agree; every camera gets depth, normals and confidence.",
+    growth=Growth(
+        items=("subjects", "expressions"), time=("views", "pixels"), disk=("views", "pixels")
+    ),
 )

@@ -22,7 +22,6 @@ from express50.capture.index import TRANSLATED, CameraSource, Cue, Index, index_
 from express50.capture.raw import RawCapture, check_calibrated_sizes
 from express50.capture.readers.read import OURS, read_any, subject_of, watched
 from express50.contract.layout import Dataset
-from express50.contract.stage import Stage
 from express50.dataset.withdraw import withdrawn
 from express50.errors import CaptureError, FormatError, StageError
 from express50.files.atomic import dump_json, write_json
@@ -33,7 +32,7 @@ from express50.files.text import read_json_table
 from express50.geometry.cameras import Camera
 from express50.rigs.camera_builder import at_size
 from pipelines.ingest.checks import look
-from pipelines.ingest.config import PRESETS, IngestConfig
+from pipelines.ingest.config import IngestConfig
 from pipelines.ingest.scan import Seen, remove_proxies, scan_camera, time_gaps, trimmed
 
 QC_CAMERAS, QC_COLUMNS = 24, 6
@@ -65,11 +64,6 @@ def register(dataset: Dataset, captures: list[Path]) -> list[str]:
     if not added.items() <= table.items():
         write_json(dataset.captures_file, table | added)
     return list(added)
-
-
-def items(dataset: Dataset) -> list[str]:
-    """Registered subjects."""
-    return list(dataset.captures())
 
 
 def inputs(dataset: Dataset, item: str, config: IngestConfig) -> dict[str, Path | str]:
@@ -319,14 +313,3 @@ def write_contact_sheet(index: Index, out: Path) -> None:
     rows = [[decode_proxy(out / "proxies", name, int(frame)) for frame in picks] for name in names]
     (out / "qc").mkdir()
     write_image(out / "qc" / "cameras.jpg", contact_sheet(rows, names), quality=88)
-
-
-STAGE = Stage(
-    name="ingest",
-    version=3,
-    config=IngestConfig,
-    presets=PRESETS,
-    items=items,
-    inputs=inputs,
-    run=run,
-)

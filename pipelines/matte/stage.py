@@ -8,16 +8,15 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from express50.capture.frames import peak_items, read_cameras_of, read_frame, read_peaks
+from express50.capture.frames import read_cameras_of, read_frame, read_peaks
 from express50.capture.index import index_path
 from express50.contract.layout import Dataset
-from express50.contract.stage import Stage
 from express50.errors import FormatError, StageError
 from express50.files.images import contact_sheet, read_alpha, resize_area, write_image
 from express50.geometry.cameras import Camera, pinhole, resized
 from express50.geometry.conventions import undistorted_mask
 from pipelines.matte.agreement import Agreement, agree
-from pipelines.matte.config import PRESETS, MatteConfig
+from pipelines.matte.config import MatteConfig
 from pipelines.matte.hull import INSIDE, Ball, View, ball_of, center_of, projection_of
 
 COLUMNS = 6  # of the picture
@@ -156,14 +155,3 @@ def _write_picture(out: Path, views: list[View], found: Agreement) -> None:
     labels = ["  ".join(names[k : k + COLUMNS]) for k in range(0, len(tiles), COLUMNS)]
     (out / "qc").mkdir()
     write_image(out / "qc" / "agreement.jpg", contact_sheet(rows, labels, (240, 240)), quality=88)
-
-
-STAGE = Stage(
-    name="matte",
-    version=4,
-    config=MatteConfig,
-    presets=PRESETS,
-    items=peak_items,
-    inputs=inputs,
-    run=run,
-)

@@ -14,7 +14,6 @@ from express50.capture.readers.person import read_people
 from express50.contract.exclusions import exclusion_reason
 from express50.contract.layout import Dataset
 from express50.contract.segmentation_labels import COLOURS
-from express50.contract.stage import Stage
 from express50.dataset.depth_files import depth_file, read_depth
 from express50.errors import CaptureError, FormatError, StageError
 from express50.files.atomic import write_json
@@ -35,7 +34,7 @@ from express50.shards.reader import ShardReader
 from express50.shards.writer import PackedSample, ShardWriter, sample_key, write_manifest
 from pipelines.pack.card import people_lines, split_subjects, write_card
 from pipelines.pack.colour import evened, own_picture
-from pipelines.pack.config import PRESETS, PackConfig
+from pipelines.pack.config import PackConfig
 from pipelines.pack.crop import Crop, crop_pinhole, cut_depth, cut_image, cut_labels, head_crop
 from pipelines.pack.subject import Subject, read_subjects
 
@@ -318,14 +317,3 @@ def _write_picture(out: Path, reader: ShardReader) -> float:
     sheet = contact_sheet(rows, ["rgb", "alpha", "depth", "parts"], tile=(160, 160))
     write_image(out / "qc" / "samples.jpg", sheet, quality=90)
     return round(float(np.mean(covered)), 4)
-
-
-STAGE = Stage(
-    name="pack",
-    version=7,
-    config=PackConfig,
-    presets=PRESETS,
-    items=items,
-    inputs=inputs,
-    run=run,
-)

@@ -1,1 +1,17 @@
 """One photograph or video of one camera without calibration, made ready for the stages."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from express50.contract.extensions import Command
+
+
+def add_commands(subparsers: Any) -> None:
+    """Add the command, see `pipelines.photo.cli`."""
+    from pipelines.photo.cli import add_commands as add
+
+    add(subparsers)
+
+
+COMMAND = Command("track the face of a bare photograph or video", add_commands)

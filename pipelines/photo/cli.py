@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from express50.capture.raw import NAME
-from express50.cli.stages import add_config_options, config_of, load_stage
+from express50.cli.stages import add_config_options, config_of
 from express50.console import FAILED, OK, say, say_json, stdout_to_stderr
+from express50.contract.extensions import stages
 from express50.contract.layout import Dataset
 from express50.errors import ConfigError
 from express50.runner.executor import Pool
@@ -74,7 +75,7 @@ def run_photo(args: argparse.Namespace) -> int:
     dataset = Dataset(args.out)
     names = [*STAGES[:-1], *(MATTE_STAGES if args.matte else ()), STAGES[-1]]
     with stdout_to_stderr() if args.json else nullcontext():
-        loaded = [load_stage(name) for name in names]
+        loaded = [stages()[name] for name in names]
         configs = [config_of(stage, args) for stage in loaded]
         folder = dataset.root / "photos" / subject
         focal = make_photo_capture(

@@ -9,17 +9,16 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from express50.capture.frames import peak_items, read_cameras_of, read_peaks
+from express50.capture.frames import read_cameras_of, read_peaks
 from express50.capture.index import index_path
 from express50.contract.layout import Dataset
-from express50.contract.stage import Stage
 from express50.dataset.depth_files import depth_file
 from express50.dataset.tracks import track_file
 from express50.errors import CaptureError, FormatError, StageError
 from express50.files.images import contact_sheet, fit_into, resize_area, write_image
 from express50.geometry.cameras import Camera, resized
 from pipelines.regions.colour import SKIN, by_colour, face_colours
-from pipelines.regions.config import PRESETS, RegionsConfig
+from pipelines.regions.config import RegionsConfig
 from pipelines.regions.labels import SCALP, HeadLabels
 from pipelines.regions.mesh import TrackedHead, see
 from pipelines.regions.qc import (
@@ -246,15 +245,3 @@ def _metrics(
 def needs_gpu(config: RegionsConfig) -> bool:
     """Whether the network must run on CUDA."""
     return bool(config.segmentation) and config.device == "cuda"
-
-
-STAGE = Stage(
-    name="regions",
-    version=1,
-    config=RegionsConfig,
-    presets=PRESETS,
-    items=peak_items,
-    inputs=inputs,
-    run=run,
-    needs_gpu=needs_gpu,
-)

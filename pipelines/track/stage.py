@@ -12,7 +12,6 @@ import torch
 from express50.capture.frames import read_cameras_of
 from express50.capture.index import index_path, read_index
 from express50.contract.layout import Dataset
-from express50.contract.stage import Stage
 from express50.errors import ConfigError, StageError
 from express50.head.load import load_head
 from express50.head.model import HeadModel, landmarks
@@ -20,7 +19,7 @@ from express50.landmarks.sources import Source, source_files
 from pipelines.track.bake import write_texture
 from pipelines.track.chart.network import WEIGHTS as CHART_WEIGHTS
 from pipelines.track.clips import write_clips
-from pipelines.track.config import PRESETS, VERSION, TrackConfig
+from pipelines.track.config import TrackConfig
 from pipelines.track.fit import consistent_sigma, fit
 from pipelines.track.footage import (
     frame_moment,
@@ -201,14 +200,3 @@ def _targets(
 def _marks(model: HeadModel, state: State) -> np.ndarray:
     """Fitted landmarks (E, 68, 3) in the world."""
     return landmarks(model, torch.from_numpy(all_vertices(model, state))).numpy()
-
-
-STAGE = Stage(
-    name="track",
-    version=VERSION,
-    config=TrackConfig,
-    presets=PRESETS,
-    items=items,
-    inputs=inputs,
-    run=run,
-)

@@ -5,8 +5,10 @@ import json
 import numpy as np
 import pytest
 
-from annotations import align, observe
+from annotations import observe
+from annotations.config import AlignConfig, ObserveConfig
 from annotations.labels import AUTOMATIC, make_flag, make_mark
+from annotations.stages import ALIGN
 from annotations.store import append_label, current_labels, read_labels
 from annotations.suggestions import choose_reference, read_suggestions
 from annotations.watch import FACE
@@ -41,8 +43,8 @@ def act(dataset, subject, strength=2.0, stride=1):
 
 
 def run(dataset, items=None, **values):
-    config = build_config(align.STAGE, values)
-    return run_stage(align.STAGE, dataset, config, items, workers=0, progress=False)
+    config = build_config(ALIGN, values)
+    return run_stage(ALIGN, dataset, config, items, workers=0, progress=False)
 
 
 def peaks(dataset, subject):
@@ -179,6 +181,6 @@ def test_the_command_watches_first_and_says_when_there_is_no_face(dataset, capsy
 
 def test_settings_out_of_range_are_refused():
     with pytest.raises(ValueError, match="0 to 1"):
-        align.AlignConfig(accept=1.5)
+        AlignConfig(accept=1.5)
     with pytest.raises(ValueError, match="at least 1"):
-        observe.ObserveConfig(cameras=0)
+        ObserveConfig(cameras=0)

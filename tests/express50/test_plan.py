@@ -6,7 +6,7 @@ import math
 import pytest
 
 from express50.cli.main import main
-from express50.cli.stages import stages
+from express50.contract.extensions import stages
 from express50.contract.layout import Dataset
 from express50.dataset.plan import TARGETS, Footage, Measured, estimate, measure, target_of
 from express50.errors import ConfigError
@@ -27,7 +27,7 @@ def cost(footage, seconds, size=1e6, memory=1e9, preset="draft"):
 def test_express_50_is_scaled_linearly_from_one_dataset():
     target = target_of("express-50", {}, SMALL)
     assert target == Footage(subjects=50, expressions=60, views=24, pixels=8294400, frames=360)
-    (row,) = estimate(["depth"], target, [{"depth": cost(SMALL, 2.0)}], workers=10)
+    (row,) = estimate([stages()["depth"]], target, [{"depth": cost(SMALL, 2.0)}], workers=10)
     ratio = 24 * 8294400 / (8 * 1e5)
     assert row.items == 3000 and row.seconds == pytest.approx(2 * ratio)
     assert row.core_hours == pytest.approx(3000 * 2 * ratio / 3600)
@@ -40,12 +40,12 @@ def test_express_50_is_scaled_linearly_from_one_dataset():
 def test_two_datasets_give_an_exponent_and_a_line_of_memory():
     tables = [{"depth": cost(SMALL, 2.0)}, {"depth": cost(LARGE, 8.0, 2e6, 1.7e9)}]
     target = Footage(subjects=1, expressions=1, views=16, pixels=8e5, frames=6)
-    (row,) = estimate(["depth"], target, tables, workers=1)
+    (row,) = estimate([stages()["depth"]], target, tables, workers=1)
     power = math.log(4) / math.log(8)
     assert row.seconds == pytest.approx(8 * 2**power) and f"^{power:.2f}, fitted" in row.how
     assert row.disk == pytest.approx(2e6 * 2 ** (1 / 3))
     assert row.memory == pytest.approx(1.7e9 + 0.1e9 * 8) and row.memory_grows
-    (same,) = estimate(["depth"], LARGE, tables[::-1], workers=1)
+    (same,) = estimate([stages()["depth"]], LARGE, tables[::-1], workers=1)
     assert same.seconds == pytest.approx(8.0)
 
 
@@ -55,25 +55,29 @@ def test_two_datasets_give_an_exponent_and_a_line_of_memory():
 )  # fmt: skip
 def test_what_tells_no_growth_is_not_fitted(second):
     target = Footage(subjects=1, expressions=1, views=8, pixels=2e5, frames=6)
-    (row,) = estimate(["depth"], target, [{"depth": cost(SMALL, 2.0)}, {"depth": second}], 1)
+    (row,) = estimate(
+        [stages()["depth"]], target, [{"depth": cost(SMALL, 2.0)}, {"depth": second}], 1
+    )
     assert "fitted" not in row.how
     if second.preset != "draft":
         assert row.seconds == pytest.approx(4.0) and row.preset == "draft"
 
 
 def test_one_item_is_not_split_over_workers():
-    (row,) = estimate(["pack"], SMALL, [{"pack": cost(SMALL, 86400.0)}], workers=32)
+    (row,) = estimate([stages()["pack"]], SMALL, [{"pack": cost(SMALL, 86400.0)}], workers=32)
     assert row.items == 1 and row.days == pytest.approx(1.0)
 
 
 def test_what_was_not_measured_says_so():
-    rows = estimate(["depth", "track"], SMALL, [{"depth": cost(SMALL, 2.0)}], 1, "reference")
+    rows = estimate(
+        [stages()["depth"], stages()["track"]], SMALL, [{"depth": cost(SMALL, 2.0)}], 1, "reference"
+    )
     assert [row.why for row in rows] == ["measured with draft, not reference", "was not run"]
     assert all(row.seconds is row.core_hours is row.disk is row.memory is None for row in rows)
 
 
 def test_every_stage_has_a_law_and_every_target_a_size():
-    rows = estimate(list(stages()), SMALL, [], 1)
+    rows = estimate(list(stages().values()), SMALL, [], 1)
     assert [row.stage for row in rows] == list(stages())
     for name in TARGETS:
         assert target_of(name, {"frames_per_expression": 90}, SMALL).frames in (5400, 1080)

@@ -17,8 +17,7 @@ from express50.runner.clusters import RemoteWorkers
 from express50.runner.executor import Pool
 from express50.runner.ledger import Ledger
 from express50.runner.progress import format_rate
-from express50.runner.runner import run_stage
-from express50.runner.schedule import select_items
+from express50.runner.runner import run_stage, select_items
 from express50.runner.status import read_status
 from express50.runner.worker import Task
 from tests.faults import toy

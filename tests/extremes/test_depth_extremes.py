@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from express50.cli.shards import sample_picture
 from express50.errors import StageError
 from express50.files.images import depth_from_uint16, depth_to_uint16
 from express50.geometry.cameras import transform_camera
 from express50.geometry.transforms import make_transform
+from express50.shards.reader import sample_picture
 from pipelines.depth.hull import head_box, hull_distance
 from pipelines.depth.reconstruct import reconstruct
 from pipelines.depth.surface import (

@@ -14,6 +14,8 @@ from express50.errors import CaptureError, ConfigError, StageError
 from express50.files.images import read_image
 from express50.runner.runner import run_stage
 from pipelines import ingest
+from pipelines.ingest.scan import time_gaps
+from pipelines.ingest.stage import usual_count
 from tests.synth import make_capture, noise_video_images, write_video
 
 
@@ -224,15 +226,15 @@ def test_usual_count_prefers_the_common_then_the_larger():
         )
 
     def usual(*counts):
-        return ingest.usual_count({str(i): camera(n) for i, n in enumerate(counts)})
+        return usual_count({str(i): camera(n) for i, n in enumerate(counts)})
 
     assert (usual(), usual(5), usual(5, 9, 5), usual(4, 6)) == (0, 5, 5, 6)
 
 
 def test_lost_frames_show_as_time_gaps():
-    assert ingest.time_gaps((0, 10, 20, 30)) == 0
-    assert ingest.time_gaps((0, 10, 30, 40, 70, 80)) == 2
-    assert ingest.time_gaps((5,)) == ingest.time_gaps(()) == 0
+    assert time_gaps((0, 10, 20, 30)) == 0
+    assert time_gaps((0, 10, 30, 40, 70, 80)) == 2
+    assert time_gaps((5,)) == time_gaps(()) == 0
 
 
 def test_real_size_captures(shared, tmp_path):

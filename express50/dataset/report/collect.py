@@ -12,9 +12,6 @@ from express50.contract.layout import Dataset
 from express50.errors import FormatError
 from express50.files.text import read_json_table
 
-STAGES = (
-    "ingest", "calibrate", "observe", "align", "alpha", "matte", "track", "depth", "regions", "pack"
-)  # fmt: skip
 _PICTURES_A_STAGE = 12
 AGAIN = "run its stage again"
 

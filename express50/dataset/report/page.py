@@ -9,10 +9,10 @@ from pathlib import Path
 
 import jinja2
 
+from express50.contract.extensions import stages
 from express50.contract.layout import Dataset
 from express50.dataset.report import plots
 from express50.dataset.report.collect import (
-    STAGES,
     Picture,
     StageReport,
     collect_stage,
@@ -30,18 +30,6 @@ PICTURE_WIDTH = 900  # pixels of an embedded picture: a page of forty stays belo
 _ROWS = 12
 _COLUMNS = 8
 _VIDEO_LIMIT = 8_000_000
-_PURPOSES = {
-    "ingest": "Footage indexed frame by frame, with proxies for scrubbing.",
-    "calibrate": "Cameras: given, or solved from the board or the footage.",
-    "observe": "The cameras that watch the face through the cue windows.",
-    "align": "The labelled frame of every expression, with its cue window's first and last frame.",
-    "alpha": "Alpha of every peak frame, each camera by itself.",
-    "matte": "What the cameras of a moment agree on: removed is red, filled is green.",
-    "track": "The head model fitted to landmarks in all views.",
-    "depth": "Surface of every peak and the depth raycast from it.",
-    "regions": "Labels of every pixel of a peak, and the head without the torso.",
-    "pack": "Samples packed into shards.",
-}
 
 
 @dataclass(frozen=True)
@@ -105,9 +93,9 @@ def _rows(table: dict, prefix: str = "") -> list[dict[str, str]]:
 def _receipts(dataset: Dataset) -> dict[str, list[Receipt]]:
     """Receipts of all stages; none where nobody has run one here."""
     if not dataset.ledger.is_file():
-        return {name: [] for name in STAGES}
+        return {name: [] for name in stages()}
     with Ledger(dataset.ledger, read_only=True) as ledger:
-        return {name: list(ledger.read(name).values()) for name in STAGES}
+        return {name: list(ledger.read(name).values()) for name in stages()}
 
 
 def _stage_view(report: StageReport, receipts: list[Receipt]) -> dict:
@@ -117,7 +105,7 @@ def _stage_view(report: StageReport, receipts: list[Receipt]) -> dict:
     shown = list(figures.items())[:_ROWS]
     return {
         "name": report.name,
-        "purpose": _PURPOSES.get(report.name, ""),
+        "purpose": stages()[report.name].purpose,
         "item_count": len(report.items),
         "failed": [(r.item, r.reason) for r in receipts if r.status == "failed"],
         "dropped": report.dropped,
@@ -181,7 +169,7 @@ def render_page(dataset: Dataset, title: str | None = None) -> str:
     ``accuracy/`` (errors against truth, made by the benchmarks) and ``grmm/``.
     """
     receipts = _receipts(dataset)
-    reports = [collect_stage(dataset, name) for name in STAGES]
+    reports = [collect_stage(dataset, name) for name in stages()]
     # A stage all of whose items failed has published nothing, and is what people look for.
     reports = [r for r in reports if r.items or any(x.status == "failed" for x in receipts[r.name])]
     summary = read_json(dataset.root / "summary.json")

@@ -1,0 +1,21 @@
+"""The stages in the order in which they run.
+
+This is the only list of them; the entry point ``express50.stages`` leads here. It alone in this
+package imports annotations.
+"""
+
+from annotations.stages import ALIGN, OBSERVE
+from pipelines import alpha, calibrate, depth, ingest, matte, pack, regions, track
+
+STAGES = (
+    ingest.STAGE,
+    calibrate.STAGE,
+    OBSERVE,
+    ALIGN,
+    alpha.STAGE,
+    matte.STAGE,
+    track.STAGE,
+    depth.STAGE,
+    regions.STAGE,
+    pack.STAGE,
+)
