@@ -32,7 +32,8 @@ import numpy as np
 
 from benchmarks.calibrate import add_data_arguments, dataset_and_truth, rounded
 from benchmarks.matte_scenes import make_scenes
-from express50.capture.frames import read_frame, read_plate
+from express50.capture.frames import read_frame, read_recorded_plate
+from express50.capture.index import read_index
 from express50.contract.config import resolve_config
 from express50.contract.layout import Dataset
 from express50.files.images import srgb_to_linear
@@ -168,9 +169,10 @@ def pictures(dataset: Dataset, truth: Truth, limit: int) -> Iterator[Picture]:
     ]
     for i in np.unique(np.linspace(0, len(every) - 1, min(limit, len(every))).round().astype(int)):
         subject, camera, frame = every[i]
-        plate = read_plate(dataset, subject, camera.id, undistort=False)
-        if plate is None:
+        index = read_index(dataset, subject)
+        if camera.id not in index.plates:
             sys.exit(f"{dataset.root}: {subject}/{camera.id} has no plate; name another --dataset")
+        plate = read_recorded_plate(index, camera.id)
         image = read_frame(dataset, subject, camera.id, frame, undistort=False)
         valid = undistorted_mask(camera)
         valid = cv2.erode(valid.astype(np.uint8), np.ones((3, 3))) > 0

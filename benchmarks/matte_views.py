@@ -33,7 +33,8 @@ import numpy as np
 from benchmarks.calibrate import recorded, rounded
 from benchmarks.matte import errors
 from benchmarks.matte_disturbances import DISTURBANCES, Shot
-from express50.capture.frames import read_frame, read_plate
+from express50.capture.frames import read_frame, read_recorded_plate
+from express50.capture.index import read_index
 from express50.contract.config import resolve_config
 from express50.contract.layout import Dataset
 from express50.files.images import contact_sheet, write_image
@@ -121,9 +122,10 @@ def shots_of(dataset: Dataset, truth: Truth, subject: str, frame: int) -> list[S
     """Undistorted frames and plates of a moment with their true alpha and depth."""
     shots = []
     for camera in truth.cameras(subject).values():
-        plate = read_plate(dataset, subject, camera.id, undistort=False)
-        if plate is None:
+        index = read_index(dataset, subject)
+        if camera.id not in index.plates:
             sys.exit(f"{dataset.root}: {subject}/{camera.id} has no plate; name another --dataset")
+        plate = read_recorded_plate(index, camera.id)
         image = read_frame(dataset, subject, camera.id, frame, undistort=False)
         valid = cv2.erode(undistorted_mask(camera).astype(np.uint8), np.ones((3, 3))) > 0
         ideal = pinhole(camera)

@@ -120,7 +120,7 @@ def true_mesh_rows(
     head = make_head(truth.vertices(subject, frame), R, labels)
     config, rows = STAGE.config(), []
     for name, camera in true_world_cameras(dataset, truth, subject).items():
-        rgb, alpha = read_pair(dataset, item, camera, frame)
+        rgb, alpha = read_pair(dataset, item, camera)
         depth = read_depth_of(dataset, item, camera, config)
         small = look(head, camera, rgb, alpha, depth, False, config).labels
         shown = np.where(alpha > 0.5, small, 0)

@@ -16,9 +16,10 @@ from pathlib import Path
 
 import numpy as np
 
-from express50.capture.frames import read_cameras_of, read_frame, read_srgb8
+from express50.capture.frames import read_cameras_of, read_frame
 from express50.capture.raw import read_capture
 from express50.contract.layout import Dataset
+from express50.files.containers import read_srgb8
 from express50.files.images import LIGHT_OF_LEVEL, linear_to_srgb
 from express50.geometry.cameras import Camera, pinhole, unproject
 from express50.geometry.conventions import undistort_image

@@ -5,13 +5,14 @@ package imports annotations.
 """
 
 from annotations.stages import ALIGN, OBSERVE
-from pipelines import alpha, calibrate, depth, ingest, matte, pack, regions, track
+from pipelines import alpha, calibrate, depth, frames, ingest, matte, pack, regions, track
 
 STAGES = (
     ingest.STAGE,
     calibrate.STAGE,
     OBSERVE,
     ALIGN,
+    frames.STAGE,
     alpha.STAGE,
     matte.STAGE,
     track.STAGE,

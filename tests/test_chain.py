@@ -23,7 +23,8 @@ from express50.shards.reader import ShardReader
 pytestmark = pytest.mark.slow
 
 STAGES = (
-    "ingest", "calibrate", "observe", "align", "alpha", "matte", "track", "depth", "regions", "pack"
+    "ingest", "calibrate", "observe", "align", "frames", "alpha", "matte", "track", "depth",
+    "regions", "pack",
 )  # fmt: skip
 SETTINGS = {"pack": ["--set", "pack.size=96", "--set", 'pack.test_subjects=["S002"]']}
 RECORDING = [

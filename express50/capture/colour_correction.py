@@ -61,13 +61,14 @@ def expand(linear: np.ndarray, terms: int) -> np.ndarray:
     return np.stack(columns, axis=-1)
 
 
-def correct_srgb8(image: np.ndarray, matrix: tuple[tuple[float, ...], ...]) -> np.ndarray:
-    """An sRGB image (H, W, 3) uint8 after the correction; what leaves 0 to 1 is clipped."""
+def correct_srgb(image: np.ndarray, matrix: tuple[tuple[float, ...], ...]) -> np.ndarray:
+    """Correct an sRGB image (H, W, 3) uint8 or uint16; what leaves the range is clipped."""
     rows = np.asarray(matrix, dtype=np.float32)
-    curve = srgb_to_linear(np.arange(256, dtype=np.float32) / 255.0).astype(np.float32)
+    white = np.iinfo(image.dtype).max
+    curve = srgb_to_linear(np.arange(white + 1, dtype=np.float32) / white).astype(np.float32)
     out = np.empty_like(image)
     for top in range(0, len(image), STRIPE):
         linear = curve[image[top : top + STRIPE]]
         fixed = np.clip(expand(linear, rows.shape[1]) @ rows.T, 0.0, 1.0)
-        out[top : top + STRIPE] = np.rint(linear_to_srgb(fixed) * 255.0).astype(np.uint8)
+        out[top : top + STRIPE] = np.rint(linear_to_srgb(fixed) * white).astype(image.dtype)
     return out

@@ -1,24 +1,29 @@
-"""Pixels of a dataset: full-resolution frames, plates, proxies, and the cameras to go with them."""
+"""Read the pixels of a dataset: peak frames, clean plates, proxies and recorded footage.
+
+Stages after ``frames`` read the peak frames and plates that it wrote (``read_peak_frame``,
+``read_plate_image``). ``FrameReader`` and ``read_frame`` decode the footage itself.
+"""
 
 from __future__ import annotations
 
 from collections import OrderedDict
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 
 import cv2
+import imagecodecs
 import numpy as np
 
-from express50.capture.colour_correction import correct_srgb8
+from express50.capture.colour_correction import correct_srgb
 from express50.capture.index import CameraSource, Index, read_index
 from express50.capture.raw import RawCamera
 from express50.contract.layout import Dataset
 from express50.errors import CaptureError, FormatError, StageError
 from express50.files.calibration import read_cameras
-from express50.files.containers import inside, read_picture, read_srgb8
-from express50.files.containers import to_srgb8 as to_srgb8
+from express50.files.containers import inside, read_samples, to_srgb8, to_srgb16
 from express50.files.exif import upright
-from express50.files.images import decode_image
+from express50.files.images import decode_image, read_image
 from express50.files.text import NAME, read_json, read_json_table
 from express50.files.video import VideoReader
 from express50.geometry.cameras import Camera, pinhole
@@ -56,8 +61,12 @@ class FrameReader:
         if self.source.kind == "video":
             self._video = VideoReader(self.path, self.source.pts)
 
-    def read(self, frame: int) -> np.ndarray:
-        """Image (H, W, 3) uint8 sRGB of a decode index, not undistorted, its colours corrected.
+    def read(self, frame: int, deep: bool = False) -> np.ndarray:
+        """Image (H, W, 3) sRGB of a decode index, colour-corrected but not undistorted.
+
+        Args:
+            frame: decode index.
+            deep: give uint16 where the footage has more than 8 bits; otherwise uint8.
 
         Raises:
             CaptureError: no such frame, or the footage is not what was ingested.
@@ -66,13 +75,15 @@ class FrameReader:
             raise CaptureError(
                 f"{self.path}: frame {frame} does not exist, expected 0 to {self.source.frames - 1}"
             )
-        return corrected(self._recorded(frame), self.source)
+        return corrected(self._recorded(frame, deep), self.source)
 
-    def _recorded(self, frame: int) -> np.ndarray:
-        """The frame as it was recorded, its hash compared with the index."""
+    def _recorded(self, frame: int, deep: bool) -> np.ndarray:
+        """Read the frame as it was recorded and compare its hash with the index."""
         if self.source.kind == "frames":
-            image = read_picture(self.path, self.source.names[frame], self.source.orientation)
-            return self._checked(image, frame)
+            name = self.source.names[frame]
+            stored = read_samples(self.path, name, self.source.orientation)
+            image = self._checked(_srgb(stored, False, self._file(frame)), frame)
+            return _srgb(stored, True, self._file(frame)) if deep else image
         video, number = self._video_of(frame)
         image = upright(video.read(number), self.source.orientation)
         if dhash(image) != self.source.dhash[frame]:
@@ -118,9 +129,17 @@ class FrameReader:
             self._video = None
 
 
+def _srgb(stored: np.ndarray, deep: bool, where: str) -> np.ndarray:
+    """Convert samples as a file holds them to (H, W, 3) uint8, or uint16 if deep and not 8-bit."""
+    try:
+        return to_srgb16(stored) if deep and stored.dtype != np.uint8 else to_srgb8(stored)
+    except ValueError as error:
+        raise CaptureError(f"{where}: {error}; export it again") from error
+
+
 def corrected(image: np.ndarray, source: CameraSource | RawCamera) -> np.ndarray:
-    """An image (H, W, 3) uint8 with its camera's own colour correction, if it has one."""
-    return correct_srgb8(image, source.correction) if source.correction else image
+    """Apply the camera's own colour correction, if it has one, to an image (H, W, 3)."""
+    return correct_srgb(image, source.correction) if source.correction else image
 
 
 _readers: OrderedDict[tuple, FrameReader] = OrderedDict()
@@ -159,36 +178,90 @@ def read_frame(
     return _undistorted(dataset, subject, camera_id, image) if undistort else image
 
 
-def read_plate(
-    dataset: Dataset, subject: str, camera_id: str, undistort: bool = True
-) -> np.ndarray | None:
-    """Clean background plate (H, W, 3) uint8 sRGB, or None where the capture has none.
+def read_recorded_plate(index: Index, camera_id: str, deep: bool = False) -> np.ndarray:
+    """Read a clean plate (H, W, 3) sRGB of the capture, colour-corrected but not undistorted.
+
+    Args:
+        index: the subject's index; it must list a plate of the camera.
+        camera_id: camera id.
+        deep: give uint16 where the plate has more than 8 bits; otherwise uint8.
 
     Raises:
-        CaptureError: it cannot be read, or is not of the footage's size.
+        CaptureError: it cannot be read, or its size is not that of the footage.
     """
-    index = read_index(dataset, subject)
-    if camera_id not in index.plates:
-        return None
     path = index.capture / index.plates[camera_id]
-    image, footage = read_raw_plate(index, camera_id), index.cameras.get(camera_id)
-    if footage is not None and image.shape[:2] != (footage.height, footage.width):
+    try:
+        stored = read_image(path)
+    except FormatError as error:
+        raise CaptureError(str(error)) from error
+    image = _srgb(stored, deep, str(path))
+    source = index.cameras[camera_id]
+    if image.shape[:2] != (source.height, source.width):
         raise CaptureError(
             f"{path}: plate is {image.shape[1]}x{image.shape[0]}, the footage of {camera_id} is "
-            f"{footage.width}x{footage.height}; record the plate with the settings of the capture"
+            f"{source.width}x{source.height}; record the plate with the settings of the capture"
         )
-    return _undistorted(dataset, subject, camera_id, image) if undistort else image
+    return corrected(image, source)
 
 
-def read_raw_plate(index: Index, camera_id: str) -> np.ndarray:
-    """A plate that the index has (H, W, 3) uint8, not undistorted, its colours corrected.
+def write_frame(path: Path, image: np.ndarray) -> None:
+    """Write an image (H, W, 3) uint8 or uint16 losslessly as JPEG XL; equal images, equal bytes.
+
+    Effort 1 encodes a 3840x2160 frame in 0.03 s to half of a PNG's bytes (docs/LOG.md).
+    """
+    pixels = np.ascontiguousarray(image)
+    path.write_bytes(imagecodecs.jpegxl_encode(pixels, lossless=True, effort=1, numthreads=1))
+
+
+def read_peak_frame(
+    dataset: Dataset, subject: str, expression: str, camera_id: str, deep: bool = False
+) -> np.ndarray:
+    """Read a peak frame (H, W, 3) sRGB, undistorted and colour-corrected.
+
+    Args:
+        dataset: the dataset.
+        subject: subject id.
+        expression: expression id.
+        camera_id: camera id; the frame is that of ``read_cameras_of``'s pinhole camera.
+        deep: give uint16 where the frame has more than 8 bits; otherwise uint8.
+
+    Raises:
+        CaptureError: the frames stage did not write it, or it cannot be read.
+    """
+    path = dataset.frame_file(subject, expression, camera_id)
+    if not path.is_file():
+        raise CaptureError(
+            f"{path}: no frame of {camera_id}; run 'express50 frames {dataset.root}', or see "
+            f"'express50 status {dataset.root}' for the reason"
+        )
+    return _read_written(path, deep)
+
+
+def read_plate_image(
+    dataset: Dataset, subject: str, camera_id: str, deep: bool = False
+) -> np.ndarray | None:
+    """Read a clean plate (H, W, 3) sRGB, undistorted and corrected; None if there is none.
 
     Raises:
         CaptureError: it cannot be read.
     """
-    image = read_srgb8(index.capture / index.plates[camera_id])
-    source = index.cameras.get(camera_id)
-    return corrected(image, source) if source else image
+    path = dataset.plate_file(subject, camera_id)
+    return _read_written(path, deep) if path.is_file() else None
+
+
+def _read_written(path: Path, deep: bool) -> np.ndarray:
+    try:
+        image = read_image(path)
+    except FormatError as error:
+        raise CaptureError(f"{error}; run 'express50 frames' again") from error
+    return image if deep else to_srgb8(image)
+
+
+def frame_inputs(dataset: Dataset, subject: str, expression: str) -> dict[str, Path]:
+    """List the written frames of one expression as inputs of a stage, by name."""
+    cameras = read_cameras_of(dataset, subject)
+    files = {c: dataset.frame_file(subject, expression, c) for c in cameras}
+    return {f"frame {expression} {c}": path for c, path in files.items() if path.is_file()}
 
 
 def _undistorted(dataset: Dataset, subject: str, camera_id: str, image: np.ndarray) -> np.ndarray:
@@ -253,14 +326,35 @@ def read_gains(dataset: Dataset, subject: str) -> dict[str, np.ndarray]:
     return gains
 
 
+@dataclass(frozen=True)
+class Peak:
+    """The labelled frame of one expression, with the identity that the label gave it.
+
+    Attributes:
+        frame: decode index.
+        camera: camera on which the label was made.
+        pts: time stamp of the frame in that camera.
+        dhash: difference hash of the frame in that camera.
+    """
+
+    frame: int
+    camera: str
+    pts: int
+    dhash: str
+
+
 def read_peaks(dataset: Dataset, subject: str) -> dict[str, int]:
-    """Peak frame (decode index) of each expression.
+    """Read the peak frame (decode index) of each expression.
 
     Raises:
         StageError: the subject is not aligned.
         FormatError: the file is not a table of peaks.
-        CaptureError: a peak's hash is not that of the indexed frame, so it names another frame.
     """
+    return {name: peak.frame for name, peak in read_peak_rows(dataset, subject).items()}
+
+
+def read_peak_rows(dataset: Dataset, subject: str) -> dict[str, Peak]:
+    """Read the peak of each expression; raises as ``read_peaks``."""
     path = dataset.item_dir("align", subject) / "peaks.json"
     if not path.is_file():
         raise StageError(
@@ -268,18 +362,33 @@ def read_peaks(dataset: Dataset, subject: str) -> dict[str, int]:
         )
     try:
         rows = read_json_table(path, FormatError, "run 'express50 align' again")
-        peaks = {name: int(row["frame"]) for name, row in rows.items()}
-        named = [(n, str(row["camera"]), row["pts"], row["dhash"]) for n, row in rows.items()]
         if strange := [name for name in rows if not NAME.fullmatch(name)]:
             raise ValueError(f"expression {strange[0]!r} is no id")  # it becomes a folder's name
+        return {
+            name: Peak(int(row["frame"]), str(row["camera"]), row["pts"], row["dhash"])
+            for name, row in rows.items()
+        }
     except (ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
         raise FormatError(f"{path}: not a table of peaks ({type(error).__name__}: {error})") from (
             error
         )
-    index = read_index(dataset, subject)
-    for name, camera_id, pts, expected in named:
-        _check_peak(index, path, name, peaks[name], camera_id, (pts, expected))
-    return peaks
+
+
+def check_peak(index: Index, expression: str, peak: Peak) -> None:
+    """Check that a label's frame is the one that was indexed.
+
+    Raises:
+        CaptureError: time stamp or hash differ, so that the label names another frame.
+    """
+    source = index.cameras.get(peak.camera)
+    there = source is not None and 0 <= peak.frame < source.frames
+    found = (source.pts[peak.frame], source.dhash[peak.frame]) if source and there else None
+    if found != (peak.pts, peak.dhash):
+        raise CaptureError(
+            f"{index.subject}/{expression}: frame {peak.frame} of {peak.camera} has time and hash "
+            f"{found}, the label says {(peak.pts, peak.dhash)}; the footage is not the one that "
+            "was labelled, run 'express50 align' again"
+        )
 
 
 def peak_items(dataset: Dataset) -> list[str]:
@@ -289,20 +398,6 @@ def peak_items(dataset: Dataset) -> list[str]:
         if (dataset.item_dir("align", subject) / "peaks.json").is_file():
             found += [f"{subject}/{name}" for name in sorted(read_peaks(dataset, subject))]
     return found
-
-
-def _check_peak(
-    index: Index, path: Path, name: str, frame: int, camera_id: str, expected: tuple[int, str]
-) -> None:
-    source = index.cameras.get(camera_id)
-    there = source is not None and 0 <= frame < source.frames
-    found = (source.pts[frame], source.dhash[frame]) if source and there else ("none", "none")
-    if found != expected:
-        raise CaptureError(
-            f"{path}: {name}: frame {frame} of {camera_id} has hash {found[1]} at time {found[0]}, "
-            f"the label says {expected[1]} at {expected[0]}; the footage is not the one that was "
-            "labelled, run 'express50 align' again"
-        )
 
 
 def read_proxy(dataset: Dataset, subject: str, camera_id: str, frame: int) -> np.ndarray:

@@ -41,6 +41,9 @@ def footage_source(capture: Path) -> Path:
     return (capture / source).resolve()
 
 
+PLATES = "_plates"  # stands for an expression in the frames stage; no expression begins so
+
+
 @dataclass(frozen=True)
 class Dataset:
     """A dataset folder: one folder a stage, one folder an item, plus ledger, labels and report."""
@@ -87,6 +90,14 @@ class Dataset:
             if not NAME.fullmatch(subject):  # it becomes the name of folders
                 raise FormatError(f"{self.captures_file}: subject {subject!r} is no id; {mend}")
         return {subject: Path(table[subject]) for subject in sorted(table)}
+
+    def frame_file(self, subject: str, expression: str, camera: str) -> Path:
+        """Undistorted, colour-corrected frame of one camera at a peak."""
+        return self.item_dir("frames", f"{subject}/{expression}") / f"{camera}.jxl"
+
+    def plate_file(self, subject: str, camera: str) -> Path:
+        """Undistorted, colour-corrected clean plate of one camera."""
+        return self.frame_file(subject, PLATES, camera)
 
     def alpha_file(self, subject: str, expression: str, camera: str) -> Path:
         """8-bit opacity of one peak frame as the camera alone has it."""

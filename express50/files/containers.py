@@ -38,23 +38,40 @@ DAMAGE = (OSError, RuntimeError, KeyError, ValueError, TypeError, OverflowError,
 
 
 def to_srgb8(image: np.ndarray) -> np.ndarray:
-    """Image (H, W[, C]) as (H, W, 3) uint8 sRGB; floats are linear light, 16 bits are sRGB.
+    """Convert an image (H, W[, C]) to (H, W, 3) uint8 sRGB; floats are linear, 16 bits are sRGB.
 
     Raises:
         ValueError: the image holds NaN or infinity.
     """
-    if image.ndim == 2:
-        image = np.repeat(image[..., None], 3, axis=2)
-    if image.shape[2] == 2:  # grey and alpha
-        image = np.repeat(image[..., :1], 3, axis=2)
-    image = image[..., :3]
     if image.dtype == np.uint16:
-        image = np.rint(image / 257.0)
-    elif image.dtype != np.uint8:
+        return np.rint(_three_channels(image) / 257.0).astype(np.uint8)
+    return _srgb_levels(image, np.uint8)
+
+
+def to_srgb16(image: np.ndarray) -> np.ndarray:
+    """Convert an image (H, W[, C]) uint16 sRGB or float linear to (H, W, 3) uint16 sRGB.
+
+    Raises:
+        ValueError: the image holds NaN or infinity.
+    """
+    return _srgb_levels(image, np.uint16)
+
+
+def _srgb_levels(image: np.ndarray, kind: type) -> np.ndarray:
+    """Levels (H, W, 3) of an unsigned type; integers must be of that type already."""
+    image = _three_channels(image)
+    if image.dtype.kind == "f":
         if not np.isfinite(image).all():
             raise ValueError("image holds NaN or infinity")
-        image = np.rint(linear_to_srgb(np.clip(image, 0.0, 1.0)) * 255.0)
-    return np.ascontiguousarray(image.astype(np.uint8))
+        image = np.rint(linear_to_srgb(np.clip(image, 0.0, 1.0)) * np.iinfo(kind).max)
+    return np.ascontiguousarray(image.astype(kind))
+
+
+def _three_channels(image: np.ndarray) -> np.ndarray:
+    """Repeat grey, and drop alpha."""
+    if image.ndim == 2:
+        image = image[..., None]
+    return np.repeat(image[..., :1], 3, axis=2) if image.shape[2] < 3 else image[..., :3]
 
 
 def read_srgb8(path: Path) -> np.ndarray:
@@ -96,18 +113,30 @@ def read_picture(root: Path, name: str, orientation: int = 1) -> np.ndarray:
     Raises:
         CaptureError: it is missing, damaged, too large, or its name leads out of the folder.
     """
-    return upright(_stored(root, name), orientation)
+    try:
+        return to_srgb8(read_samples(root, name, orientation))
+    except ValueError as error:
+        raise CaptureError(f"{root / name}: {error}; export it again") from error
 
 
-def _stored(root: Path, name: str) -> np.ndarray:
-    """The image with its pixels as they are stored."""
+def read_samples(root: Path, name: str, orientation: int = 1) -> np.ndarray:
+    """Image (H, W[, C]) of a name below a folder, turned upright, in the file's own sample type.
+
+    Raises:
+        CaptureError: it is missing, damaged, too large, or its name leads out of the folder.
+    """
     container, within, member = name.partition(WITHIN)
     path = inside(root, container)
     if within:
-        return decode_picture(member_bytes(path, member), f"{path}{WITHIN}{member}")
-    if path.suffix.lower() == ".avif":
-        return decode_picture(_file_bytes(path), str(path))
-    return read_srgb8(path)
+        stored = decode_picture(member_bytes(path, member), f"{path}{WITHIN}{member}")
+    elif path.suffix.lower() == ".avif":
+        stored = decode_picture(_file_bytes(path), str(path))
+    else:
+        try:
+            stored = read_image(path)
+        except FormatError as error:
+            raise CaptureError(str(error)) from error
+    return upright(stored, orientation)
 
 
 def _file_bytes(path: Path) -> bytes:

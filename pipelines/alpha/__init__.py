@@ -39,7 +39,7 @@ def needs_gpu(config: AlphaConfig) -> bool:
 
 STAGE = Stage(
     name="alpha",
-    version=4,
+    version=5,
     config=AlphaConfig,
     presets=PRESETS,
     items=items,

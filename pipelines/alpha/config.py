@@ -48,8 +48,6 @@ class AlphaConfig:
     """Frames that the camera's noise is measured on."""
     noise_floor: float = 1.0
     """Least noise assumed, in 8-bit steps."""
-    plate_frames: int = 31
-    """Frames of a subject that a missing plate is estimated from."""
 
     def __post_init__(self) -> None:
         """Refuse values that key nothing or everything."""
@@ -63,11 +61,8 @@ class AlphaConfig:
             raise ConfigError(
                 f"alpha.spread {self.spread}, alpha.shadow {self.shadow}: expected 0 to 1, below 1"
             )
-        if self.noise_frames < 1 or self.plate_frames < 1:
-            raise ConfigError(
-                f"alpha.noise_frames {self.noise_frames}, alpha.plate_frames {self.plate_frames}:"
-                " expected 1 or more"
-            )
+        if self.noise_frames < 1:
+            raise ConfigError(f"alpha.noise_frames is {self.noise_frames}, expected 1 or more")
         for name in ("firm", "core", "fill", "noise_floor"):
             if not (math.isfinite(value := getattr(self, name)) and value >= 0):
                 raise ConfigError(f"alpha.{name} is {value}, expected a number of 0 or more")
@@ -84,7 +79,7 @@ class AlphaConfig:
 
 
 PRESETS: dict[str, dict[str, object]] = {
-    "draft": {"scale": 0.5, "noise_frames": 1, "plate_frames": 15},
+    "draft": {"scale": 0.5, "noise_frames": 1},
     "standard": {},
-    "reference": {"smooth": True, "noise_frames": 12, "plate_frames": 61},
+    "reference": {"smooth": True, "noise_frames": 12},
 }

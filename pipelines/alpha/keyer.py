@@ -22,24 +22,16 @@ class Keyer:
         frames: list[np.ndarray],
         valid: np.ndarray,
         config: AlphaConfig,
-        doubt: np.ndarray | None = None,
     ) -> None:
-        """Measure the noise of `frames` (H, W, 3) uint8 around `plate`, inside `valid` (H, W).
-
-        `doubt` (H, W) is how far off the plate may be, in 8-bit steps, 0 where it was seen.
-        """
+        """Measure the noise of `frames` (H, W, 3) uint8 around `plate`, inside `valid` (H, W)."""
         self.config = config
         self.full_size = (plate.shape[1], plate.shape[0])
         self.size = tuple(max(8, round(n * config.scale)) for n in self.full_size)
         self.plate = self._shrink(plate)
         self.valid = valid
         self._valid_small = self._shrink(valid.astype(np.uint8) * 255) == 255
-        off = np.zeros(valid.shape, np.float32) if doubt is None else doubt
-        off = self._shrink(off.astype(np.float32))
         small = [self._shrink(f) for f in frames]
-        seen = self._valid_small & (off == 0)
-        model: PlateModel = fit_plate(self.plate, small, seen, config.noise_floor)
-        self.model = replace(model, sigma=np.hypot(model.sigma, off[..., None]))
+        self.model: PlateModel = fit_plate(self.plate, small, self._valid_small, config.noise_floor)
 
     def _shrink(self, image: np.ndarray) -> np.ndarray:
         return image if self.size == self.full_size else resize_area(image, *self.size)

@@ -8,10 +8,14 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from express50.capture.frames import read_cameras_of, read_frame, read_peaks
-from express50.capture.index import index_path, read_index
+from express50.capture.frames import (
+    read_cameras_of,
+    read_peak_frame,
+    read_peaks,
+    read_plate_image,
+)
 from express50.contract.layout import Dataset
-from express50.errors import NoFaceError, StageError
+from express50.errors import CaptureError, NoFaceError, StageError
 from express50.files.calibration import read_cameras
 from express50.files.images import contact_sheet, read_image, write_image
 from express50.geometry.cameras import Camera
@@ -20,7 +24,6 @@ from pipelines.alpha.config import NETWORKS, WITHOUT_PLATE, AlphaConfig
 from pipelines.alpha.keyer import Keyer
 from pipelines.alpha.plate import exposed, exposure_gain
 from pipelines.alpha.qc import border_contact, picture_row, warnings
-from pipelines.alpha.source import Plate, others_of, plate_of
 
 QC_ROWS = 8
 
@@ -39,22 +42,17 @@ def items(dataset: Dataset) -> list[str]:
 
 
 def inputs(dataset: Dataset, item: str, config: AlphaConfig) -> dict[str, Path | str]:
-    """The camera's index, plate and footage identity, the calibration, the peaks, the weights."""
+    """The camera's frames and plate, the calibration, the peaks, the weights."""
     subject, camera = item.split("/")
-    index = read_index(dataset, subject)
     found: dict[str, Path | str] = {
-        "index": index_path(dataset, subject),
         "cameras": dataset.item_dir("calibrate", subject) / "cameras.json",
         "peaks": dataset.item_dir("align", subject) / "peaks.json",
     }
-    if camera in index.plates:
-        found["plate"] = index.capture / index.plates[camera]
-    elif config.method not in WITHOUT_PLATE:
-        for other in others_of(dataset, index, camera):
-            found[f"index of {other}"] = index_path(dataset, other)
-            theirs = read_index(dataset, other)
-            if camera in theirs.plates:
-                found[f"plate of {other}"] = theirs.capture / theirs.plates[camera]
+    for expression in read_peaks(dataset, subject):
+        if (path := dataset.frame_file(subject, expression, camera)).is_file():
+            found[f"frame {expression}"] = path
+    if (plate := dataset.plate_file(subject, camera)).is_file():
+        found["plate"] = plate
     if config.weights:
         found["weights"] = _weights(config)
     return found
@@ -78,22 +76,30 @@ def run(dataset: Dataset, item: str, config: AlphaConfig, out: Path) -> dict:
     # Resampling mixes the outermost pixels with what lies beyond the image.
     valid = cv2.erode(undistorted_mask(camera).astype(np.uint8), np.ones((3, 3))) > 0
 
-    def read(frame: int) -> np.ndarray:
-        return read_frame(dataset, subject, camera_id, frame)
+    def read(expression: str) -> np.ndarray:
+        return read_peak_frame(dataset, subject, expression, camera_id)
 
-    plate = None if config.method in WITHOUT_PLATE else plate_of(dataset, item, camera, config)
+    plate = None
+    if config.method not in WITHOUT_PLATE:
+        plate = read_plate_image(dataset, subject, camera_id)
+        if plate is None:
+            raise StageError(
+                f"{item}: no clean plate; photograph the empty set as plates/{camera_id}.png and"
+                " run 'express50 ingest' and 'express50 frames' again, or set alpha.method to"
+                " grabcut or salient"
+            )
     if config.method == "grabcut":
         alpha_of, facts = _by_face(read_cameras_of(dataset, subject)[camera_id])
     else:
-        frames = [read(frame) for frame in _measured(peaks, config)]
+        frames = [read(name) for name in _measured(dataset, item, peaks, config)]
         alpha_of, facts = _method(plate, frames, valid, config)
     coverage: dict[str, float] = {}
     border: dict[str, dict[str, float]] = {}
     dropped: dict[str, str] = {}
-    for expression, frame in peaks.items():
+    for expression in peaks:
         try:
-            alpha = np.where(valid, alpha_of(read(frame)), np.float32(0))
-        except NoFaceError as error:
+            alpha = np.where(valid, alpha_of(read(expression)), np.float32(0))
+        except (CaptureError, NoFaceError) as error:
             dropped[expression] = str(error)
             continue
         write_image(out / f"{expression}.png", np.rint(alpha * 255).astype(np.uint8))
@@ -102,10 +108,10 @@ def run(dataset: Dataset, item: str, config: AlphaConfig, out: Path) -> dict:
     if not coverage:
         raise StageError(f"{item}: {next(iter(dropped.values()))}")
     peaks = {expression: frame for expression, frame in peaks.items() if expression in coverage}
-    odd = warnings(peaks, coverage, border) + list(plate.warnings if plate else ())
+    odd = warnings(peaks, coverage, border)
     named = {warning["what"] for warning in odd}
     first = sorted(peaks, key=lambda expression: expression not in named)[:QC_ROWS]
-    _write_picture(out, {e: read(peaks[e]) for e in first}, named)
+    _write_picture(out, {e: read(e) for e in first}, named)
     return {
         "method": config.method,
         **facts,
@@ -116,11 +122,19 @@ def run(dataset: Dataset, item: str, config: AlphaConfig, out: Path) -> dict:
     }
 
 
-def _measured(peaks: dict[str, int], config: AlphaConfig) -> list[int]:
-    """Peak frames that the camera's noise is measured on; none for a network."""
+def _measured(dataset: Dataset, item: str, peaks: dict[str, int], config: AlphaConfig) -> list[str]:
+    """Expressions whose frames the camera's noise is measured on; none for a network."""
     if config.method != "key":
         return []
-    frames = sorted(set(peaks.values()))
+    subject, camera = item.split("/")
+    by_frame = {
+        frame: name
+        for name, frame in peaks.items()
+        if dataset.frame_file(subject, name, camera).is_file()
+    }
+    frames = [by_frame[frame] for frame in sorted(by_frame)]
+    if not frames:
+        raise StageError(f"{item}: no peak frame was written; run 'express50 frames'")
     picks = np.linspace(0, len(frames) - 1, config.noise_frames).round().astype(int)
     return [frames[i] for i in np.unique(picks)]
 
@@ -135,13 +149,13 @@ def _by_face(camera: Camera) -> tuple[Alpha, dict[str, object]]:
 
 
 def _method(
-    plate: Plate | None, frames: list[np.ndarray], valid: np.ndarray, config: AlphaConfig
+    plate: np.ndarray | None, frames: list[np.ndarray], valid: np.ndarray, config: AlphaConfig
 ) -> tuple[Alpha, dict[str, object]]:
     """How the config makes alpha, and facts about that for the metrics."""
     if config.method == "key" and plate is not None:
-        keyer = Keyer(plate.image, frames, valid, config, plate.doubt)
+        keyer = Keyer(plate, frames, valid, config)
         noise = round(float(np.median(keyer.model.sigma)), 4)
-        return keyer.alpha, {"plate": plate.source, "noise_8bit": noise}
+        return keyer.alpha, {"plate": "given", "noise_8bit": noise}
     # Only here, as torch takes seconds to import.
     from pipelines.alpha.learned import BGMV2, SALIENT, background_alpha, salient_alpha
     from pipelines.networks import load_network
@@ -150,13 +164,13 @@ def _method(
     if plate is None:
         salient = load_network(path, SALIENT)
         return lambda frame: salient_alpha(salient, frame), {"plate": "none"}
-    network, still = load_network(path, BGMV2), plate.image
+    network, still = load_network(path, BGMV2), plate
 
     def alpha(frame: np.ndarray) -> np.ndarray:
         shown = exposed(still, exposure_gain(frame, still))
         return background_alpha(network, frame, shown, config.tile)
 
-    return alpha, {"plate": plate.source}
+    return alpha, {"plate": "given"}
 
 
 def _write_picture(out: Path, images: dict[str, np.ndarray], odd: set[str]) -> None:

@@ -14,8 +14,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from express50.capture.frames import read_srgb8
 from express50.errors import CalibrationError
+from express50.files.containers import read_srgb8
 from express50.geometry.conventions import opencv_pixels_to_corner
 from pipelines.calibrate.saddle import refine_corners, square_sides
 

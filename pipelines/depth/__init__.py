@@ -17,15 +17,13 @@ def items(dataset: Dataset) -> list[str]:
 
 
 def inputs(dataset: Dataset, item: str, config: DepthConfig) -> dict[str, Path | str]:
-    """List index, cameras, the expression's peak and mattes, and the track if there is one."""
-    from express50.capture.frames import read_cameras_of, read_peaks
-    from express50.capture.index import index_path
+    """List cameras, frames and mattes of the expression, and the track if there is one."""
+    from express50.capture.frames import frame_inputs, read_cameras_of
 
     subject, expression = item.split("/")
     found: dict[str, Path | str] = {
-        "index": index_path(dataset, subject),
         "cameras": dataset.item_dir("calibrate", subject) / "cameras.json",
-        "frame": str(read_peaks(dataset, subject)[expression]),
+        **frame_inputs(dataset, subject, expression),
     }
     for camera in read_cameras_of(dataset, subject):
         path = dataset.matte_file(subject, expression, camera)
@@ -46,7 +44,7 @@ def run(dataset: Dataset, item: str, config: DepthConfig, out: Path) -> Result:
 
 STAGE = Stage(
     name="depth",
-    version=7,
+    version=8,
     config=DepthConfig,
     presets=PRESETS,
     items=items,

@@ -7,7 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from express50.capture.frames import read_cameras_of, read_frame, read_peaks
+from express50.capture.frames import read_cameras_of, read_peak_frame
 from express50.contract.layout import Dataset
 from express50.contract.stage import Note, Result
 from express50.dataset.tracks import read_track
@@ -70,7 +70,6 @@ def read_views(
 ) -> tuple[list[DepthView], Pictures, list[Note]]:
     """Read the usable views, their full-size pictures, and the cameras that are left out."""
     subject, expression = item.split("/")
-    frame = read_peaks(dataset, subject)[expression]
     views: list[DepthView] = []
     pictures: Pictures = []
     dropped = []
@@ -81,7 +80,7 @@ def read_views(
             continue
         try:
             alpha = read_alpha(path).astype(np.float32) / 255
-            rgb = read_frame(dataset, subject, camera_id, frame)
+            rgb = read_peak_frame(dataset, subject, expression, camera_id)
             views.append(make_view(camera, rgb, alpha, image_side))
         except (CaptureError, FormatError, StageError) as error:
             dropped.append(Note(camera_id, str(error)))

@@ -32,7 +32,7 @@ def run(dataset: Dataset, item: str, config: MatteConfig, out: Path) -> Result |
 
 STAGE = Stage(
     name="matte",
-    version=4,
+    version=5,
     config=MatteConfig,
     presets=PRESETS,
     items=items,

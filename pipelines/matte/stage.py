@@ -8,8 +8,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from express50.capture.frames import read_cameras_of, read_frame, read_peaks
-from express50.capture.index import index_path
+from express50.capture.frames import (
+    frame_inputs,
+    read_cameras_of,
+    read_peak_frame,
+)
 from express50.contract.layout import Dataset
 from express50.errors import FormatError, StageError
 from express50.files.images import contact_sheet, read_alpha, resize_area, write_image
@@ -24,12 +27,11 @@ RED, GREEN = (235, 50, 40), (50, 220, 80)
 
 
 def inputs(dataset: Dataset, item: str, config: MatteConfig) -> dict[str, Path | str]:
-    """Index, cameras, the expression's peak and every camera's alpha."""
+    """Cameras, and every camera's frame and alpha."""
     subject, expression = item.split("/")
     found: dict[str, Path | str] = {
-        "index": index_path(dataset, subject),
         "cameras": dataset.item_dir("calibrate", subject) / "cameras.json",
-        "frame": str(read_peaks(dataset, subject)[expression]),
+        **frame_inputs(dataset, subject, expression),
     }
     for camera in read_cameras_of(dataset, subject):
         path = dataset.alpha_file(subject, expression, camera)
@@ -84,7 +86,6 @@ def _compared(
     if ball is None:
         return [], Agreement(unchanged="the cameras do not look at one place")
     subject, expression = item.split("/")
-    frame = read_peaks(dataset, subject)[expression]
     views = []
     # One camera's full pictures at a time.
     for name, camera in cameras.items():
@@ -95,7 +96,7 @@ def _compared(
                 f"{path}: {alpha.shape[1]}x{alpha.shape[0]}, expected the camera's"
                 f" {camera.width}x{camera.height}; run 'express50 matte {dataset.root}' again"
             )
-        image = read_frame(dataset, subject, name, frame)
+        image = read_peak_frame(dataset, subject, expression, name)
         views.append(make_view(camera, ball, image, alpha, config.side))
     return views, agree(views, config)
 

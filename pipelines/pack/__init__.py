@@ -32,7 +32,7 @@ def run(dataset: Dataset, item: str, config: PackConfig, out: Path) -> Result | 
 
 STAGE = Stage(
     name="pack",
-    version=7,
+    version=8,
     config=PackConfig,
     presets=PRESETS,
     items=items,

@@ -6,8 +6,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from express50.capture.frames import read_plate
-from express50.capture.index import read_index
+from express50.capture.frames import read_plate_image
 from express50.contract.layout import Dataset
 from express50.files.images import scale_light
 from pipelines.alpha.foreground import own_colours
@@ -42,18 +41,15 @@ def own_picture(
 
 def _versions(dataset: Dataset, subject: str, camera_id: str) -> tuple[int, ...]:
     """Times of what the plate is made from: a worker may outlive several of them."""
-    index = read_index(dataset, subject)
-    files = [dataset.item_dir("calibrate", subject) / "cameras.json"]
-    if camera_id in index.plates:
-        files.append(index.capture / index.plates[camera_id])
-    return tuple(path.stat().st_mtime_ns for path in files if path.is_file())
+    path = dataset.plate_file(subject, camera_id)
+    return (path.stat().st_mtime_ns,) if path.is_file() else ()
 
 
 @lru_cache(maxsize=32)  # 25 MB each at 4K; every expression asks for those of all cameras
 def _plate(
     dataset: Dataset, subject: str, camera_id: str, versions: tuple[int, ...]
 ) -> np.ndarray | None:
-    return read_plate(dataset, subject, camera_id)
+    return read_plate_image(dataset, subject, camera_id)
 
 
 def evened(picture: np.ndarray, gain: np.ndarray) -> np.ndarray:

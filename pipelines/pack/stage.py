@@ -8,8 +8,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from express50.capture.frames import read_frame
-from express50.capture.index import index_path, read_index
+from express50.capture.frames import read_peak_frame
+from express50.capture.index import index_path
 from express50.capture.readers.person import read_people
 from express50.contract.exclusions import exclusion_reason
 from express50.contract.layout import Dataset
@@ -54,10 +54,8 @@ def inputs(dataset: Dataset, item: str, config: PackConfig) -> dict[str, Path | 
             found[f"{subject} excluded"] = reason
             continue
         found[f"{subject} index"] = index_path(dataset, subject)
-        if config.foreground:
-            index = read_index(dataset, subject)
-            found |= {f"{subject} {c} plate": index.capture / p for c, p in index.plates.items()}
         parts = {
+            "frames": dataset.item_dir("frames", subject),
             "calibrate": dataset.item_dir("calibrate", subject) / "cameras.json",
             "gains": dataset.item_dir("calibrate", subject) / "gains.json",
             "align": dataset.item_dir("align", subject) / "peaks.json",
@@ -140,14 +138,14 @@ def _pack_sample(
     """One encoded sample and its meta, or the reason why there is none."""
     if expression not in subject.tracked:
         return "it is not tracked"
-    camera, frame = subject.cameras[camera_id], subject.peaks[expression]
+    camera = subject.cameras[camera_id]
     matte_path = dataset.matte_file(subject.name, expression, camera_id)
     folder = dataset.item_dir("depth", f"{subject.name}/{expression}")
     if not matte_path.is_file():
         return "it has no matte"
     if (depth_path := depth_file(folder, camera_id)) is None:
         return "it has no depth"
-    rgb = read_frame(dataset, subject.name, camera_id, frame)
+    rgb = read_peak_frame(dataset, subject.name, expression, camera_id)
     matte = alpha = read_alpha(matte_path)
     depth, valid = read_depth(depth_path)
     regions = _read_regions(dataset, f"{subject.name}/{expression}", camera_id)

@@ -22,7 +22,7 @@ from pipelines.photo.focal import Focal
 from pipelines.photo.panel import write_panel
 from pipelines.photo.picture import open_picture
 
-STAGES = ("ingest", "calibrate", "observe", "align", "track")
+STAGES = ("ingest", "calibrate", "observe", "align", "frames", "track")
 MATTE_STAGES = ("alpha", "matte")
 SEARCH = 0.08  # people fill a rig's pictures, but not all photographs
 # One view cannot tell a bent neck from a shape: it stays nearer to rest. Without mattes and other

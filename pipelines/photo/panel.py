@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from express50.capture.frames import read_cameras_of, read_frame
+from express50.capture.frames import read_cameras_of, read_peak_frame
 from express50.contract.layout import Dataset
 from express50.files.images import write_image
 from express50.head.load import load_head
@@ -26,10 +26,11 @@ def write_panel(dataset: Dataset, subject: str, config: TrackConfig, path: Path)
     """
     with np.load(dataset.item_dir("track", subject) / "track.npz") as track:
         frame, mesh = int(track["frames"][0]), track["vertices"][0].astype(np.float64)
+        expression = str(track["expressions"][0])
         rotation, translation = track["R"][0], track["t"][0]
     model = load_head(config.head)
     ((camera_id, camera),) = read_cameras_of(dataset, subject).items()
-    image = read_frame(dataset, subject, camera_id, frame)
+    image = read_peak_frame(dataset, subject, expression, camera_id)
     recorded = read_cameras_of(dataset, subject, undistorted=False)
     source = open_source(config.landmarks, recorded, config.refinements, config.search)
     seen = source(image, camera_id, frame)

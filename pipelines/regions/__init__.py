@@ -39,7 +39,7 @@ def needs_gpu(config: RegionsConfig) -> bool:
 
 STAGE = Stage(
     name="regions",
-    version=1,
+    version=2,
     config=RegionsConfig,
     presets=PRESETS,
     items=items,

@@ -6,7 +6,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from express50.capture.frames import read_frame
+from express50.capture.frames import read_peak_frame
 from express50.contract.layout import Dataset
 from express50.dataset.depth_files import depth_file, read_depth
 from express50.dataset.tracks import read_track, track_file
@@ -43,9 +43,7 @@ def _labels_of(head: str) -> HeadLabels:
     return head_labels(load_head(head))
 
 
-def read_pair(
-    dataset: Dataset, item: str, camera: Camera, frame: int
-) -> tuple[np.ndarray, np.ndarray]:
+def read_pair(dataset: Dataset, item: str, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
     """Undistorted frame (H, W, 3) uint8 and alpha (H, W) float32 of one camera.
 
     Raises:
@@ -63,7 +61,8 @@ def read_pair(
             f"{path}: {matte.shape[1]}x{matte.shape[0]}, expected the camera's"
             f" {camera.width}x{camera.height}; run 'express50 matte' again"
         )
-    return read_frame(dataset, subject, camera.id, frame), matte.astype(np.float32) / 255
+    image = read_peak_frame(dataset, subject, expression, camera.id)
+    return image, matte.astype(np.float32) / 255
 
 
 def read_depth_of(

@@ -9,8 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from express50.capture.frames import read_cameras_of, read_peaks
-from express50.capture.index import index_path
+from express50.capture.frames import frame_inputs, read_cameras_of
 from express50.contract.layout import Dataset
 from express50.dataset.depth_files import depth_file
 from express50.dataset.tracks import track_file
@@ -47,12 +46,11 @@ class Seen:
 
 
 def inputs(dataset: Dataset, item: str, config: RegionsConfig) -> dict[str, Path | str]:
-    """Index, cameras, the expression's peak, track, mattes and depth maps, and the weights."""
+    """Cameras, frames, track, mattes and depth maps of the expression, and the weights."""
     subject, expression = item.split("/")
     found: dict[str, Path | str] = {
-        "index": index_path(dataset, subject),
         "cameras": dataset.item_dir("calibrate", subject) / "cameras.json",
-        "frame": str(read_peaks(dataset, subject)[expression]),
+        **frame_inputs(dataset, subject, expression),
         "track": track_file(dataset, subject),
     }
     for camera in read_cameras_of(dataset, subject):
@@ -70,14 +68,13 @@ def run(dataset: Dataset, item: str, config: RegionsConfig, out: Path) -> dict:
     cv2.setNumThreads(1)  # the runner counts one core an item
     subject, expression = item.split("/")
     head = read_head(dataset, subject, expression)
-    frame = read_peaks(dataset, subject)[expression]
-    scalp, skin, read = _person(dataset, item, head, frame, config)
+    scalp, skin, read = _person(dataset, item, head, config)
     figures, rows = {}, {}
     dropped = []
     for name, camera in read_cameras_of(dataset, subject).items():
         try:
             known = read.pop(name, None)
-            rgb, alpha = known or read_pair(dataset, item, camera, frame)
+            rgb, alpha = known or read_pair(dataset, item, camera)
             depth = read_depth_of(dataset, item, camera, config)
         except (CaptureError, FormatError, StageError) as error:
             dropped.append({"what": name, "why": str(error)})
@@ -141,14 +138,14 @@ Frames = dict[str, tuple[np.ndarray, np.ndarray]]
 
 
 def _person(
-    dataset: Dataset, item: str, head: TrackedHead, frame: int, config: RegionsConfig
+    dataset: Dataset, item: str, head: TrackedHead, config: RegionsConfig
 ) -> tuple[Scalp, np.ndarray | None, Frames]:
     """Whether the scalp is skin, the skin's colours, by a few cameras; and what these showed."""
     cameras = list(read_cameras_of(dataset, item.split("/")[0]).values())
     votes, colours, read = [], [], Frames()
     for k in np.unique(np.linspace(0, len(cameras) - 1, VOTERS).round().astype(int)):
         with contextlib.suppress(CaptureError, FormatError, StageError):  # the run names them
-            rgb, alpha = read[cameras[k].id] = read_pair(dataset, item, cameras[k], frame)
+            rgb, alpha = read[cameras[k].id] = read_pair(dataset, item, cameras[k])
             camera, rgb, alpha, _ = _shrunk(cameras[k], rgb, alpha, None, VOTING_SIDE)
             mesh = see(head, camera)[0]
             votes.append(scalp_votes(rgb, mesh, alpha))

@@ -7,7 +7,7 @@ from typing import Literal
 
 from express50.errors import ConfigError
 
-VERSION = 10  # of the stage: outputs of another are made anew
+VERSION = 11  # of the stage: outputs of another are made anew
 
 
 @dataclass(frozen=True, kw_only=True)

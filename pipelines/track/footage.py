@@ -2,9 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
-from express50.capture.frames import read_cameras_of, read_frame, read_peaks
+from express50.capture.frames import (
+    read_cameras_of,
+    read_frame,
+    read_peak_frame,
+    read_peaks,
+)
 from express50.contract.layout import Dataset
 from express50.errors import CaptureError
 from express50.files.images import read_alpha
@@ -17,6 +24,9 @@ from pipelines.track.outline import signed_distance
 from pipelines.track.pictures import Moment
 from pipelines.track.shots import Shot, cut_shot
 from pipelines.track.state import Target
+
+Read = Callable[[str], np.ndarray]
+"""Camera id to its undistorted image (H, W, 3) uint8; raises CaptureError."""
 
 
 def open_landmarks(dataset: Dataset, subject: str, config: TrackConfig) -> Source:
@@ -42,7 +52,8 @@ def observe_peaks(
     for expression in order:
         now = {name: cameras[name] for name in chosen}
         try:
-            views = _views(dataset, subject, now, peaks[expression], source, config)
+            read = _peak_reader(dataset, subject, expression)
+            views = _views(read, now, peaks[expression], source, config)
         except CaptureError as error:
             dropped.append({"what": expression, "why": str(error)})
             continue
@@ -65,9 +76,12 @@ def observe_peaks(
     return shut_lids([found[name] for name in peaks if name in found])
 
 
+def _peak_reader(dataset: Dataset, subject: str, expression: str) -> Read:
+    return lambda camera: read_peak_frame(dataset, subject, expression, camera)
+
+
 def _views(
-    dataset: Dataset,
-    subject: str,
+    read: Read,
     cameras: dict[str, Camera],
     frame: int,
     source: Source,
@@ -81,7 +95,7 @@ def _views(
     views, missing = [], []
     for camera_id, camera in cameras.items():
         try:
-            image = read_frame(dataset, subject, camera_id, frame)
+            image = read(camera_id)
         except CaptureError as error:
             missing.append(error)
             continue
@@ -104,7 +118,10 @@ def observe_frame(
 ) -> Observation | None:
     """What the cameras see at a frame of a clip; None where that is no face they agree on."""
     try:
-        views = _views(dataset, subject, cameras, frame, source, config)
+        views = _views(
+            lambda camera: read_frame(dataset, subject, camera, frame),
+            cameras, frame, source, config,
+        )  # fmt: skip
     except CaptureError:
         return None
     observation = agree(cue, frame, views)[0] if views else None
@@ -127,9 +144,8 @@ def peak_moments(
             if alpha is not None and config.silhouette_rounds:
                 distances.append(signed_distance(alpha, camera))
             if config.photo_rounds or config.relief_rounds:
-                shots.append(
-                    _shot(dataset, subject, camera, observation.frame, alpha, mesh, config)
-                )
+                read = _peak_reader(dataset, subject, observation.expression)
+                shots.append(_shot(read, camera, alpha, mesh, config))
         moments.append(
             Moment(tuple(d for d in distances if d), tuple(shot for shot in shots if shot))
         )
@@ -145,22 +161,24 @@ def frame_moment(
     config: TrackConfig,
 ) -> Moment:
     """Crops of a frame of a clip about its mesh (V, 3); such frames have no mattes."""
-    shots = [_shot(dataset, subject, c, frame, None, mesh, config) for c in cameras.values()]
+
+    def read(camera: str) -> np.ndarray:
+        return read_frame(dataset, subject, camera, frame)
+
+    shots = [_shot(read, camera, None, mesh, config) for camera in cameras.values()]
     return Moment((), tuple(shot for shot in shots if shot))
 
 
 def _shot(
-    dataset: Dataset,
-    subject: str,
+    read: Read,
     camera: Camera,
-    frame: int,
     alpha: np.ndarray | None,
     mesh: np.ndarray,
     config: TrackConfig,
 ) -> Shot | None:
     """A camera's crop about the head; None where its footage lacks the frame or the head."""
     try:
-        image = read_frame(dataset, subject, camera.id, frame)
+        image = read(camera.id)
     except CaptureError:
         return None
     return cut_shot(camera, image, alpha, mesh, config.photo_side)

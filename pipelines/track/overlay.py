@@ -9,7 +9,7 @@ import numpy as np
 import open3d as o3d
 import torch
 
-from express50.capture.frames import read_cameras_of, read_frame
+from express50.capture.frames import read_cameras_of, read_peak_frame
 from express50.contract.layout import Dataset
 from express50.files.images import write_image
 from express50.geometry.cameras import Camera
@@ -46,7 +46,7 @@ def draw_overlays(
     for target, mesh, rotation in zip(targets, vertices, rotations, strict=True):
         chosen, columns = _spread(target, cameras, rotation, mesh.mean(0)), {}
         for camera_id in sorted(chosen):
-            frame = read_frame(dataset, subject, camera_id, target.observation.frame)
+            frame = read_peak_frame(dataset, subject, target.observation.expression, camera_id)
             seen = [v.points for v in target.observation.views if v.camera_id == camera_id]
             columns[camera_id] = draw_column(frame, cameras[camera_id], model, mesh, seen)
         path = folder / f"overlay_{target.observation.expression}.jpg"

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from express50.capture.frames import read_cameras_of
+from express50.capture.frames import frame_inputs, read_cameras_of, read_peaks
 from express50.capture.index import index_path, read_index
 from express50.contract.layout import Dataset
 from express50.errors import ConfigError, StageError
@@ -60,6 +60,8 @@ def inputs(dataset: Dataset, item: str, config: TrackConfig) -> dict[str, Path |
         "peaks": dataset.item_dir("align", item) / "peaks.json",
         **source_files(config.landmarks),
     }
+    for expression in read_peaks(dataset, item):
+        found |= frame_inputs(dataset, item, expression)
     mattes = dataset.item_dir("matte", item)
     rounds = (config.silhouette_rounds, config.relief_rounds, config.photo_rounds)
     if any(rounds) and mattes.is_dir():

@@ -9,19 +9,21 @@ import pytest
 from express50.capture import frames
 from express50.capture.frames import (
     FrameReader,
+    check_peak,
     dhash,
     read_cameras_of,
     read_frame,
+    read_peak_rows,
     read_peaks,
-    read_plate,
     read_proxy,
-    to_srgb8,
+    read_recorded_plate,
 )
 from express50.capture.index import read_index
 from express50.contract.config import resolve_config
 from express50.contract.layout import Dataset
 from express50.errors import CaptureError, FormatError, StageError
 from express50.files.calibration import write_cameras
+from express50.files.containers import to_srgb8, to_srgb16
 from express50.files.images import write_image
 from express50.geometry.conventions import undistort_image
 from express50.runner.runner import run_stage
@@ -48,7 +50,7 @@ def test_frames_and_plates_are_the_recorded_pixels(ingested):
     for frame in (0, 5, 2):
         expected = render_ball(rig["cam01"], frame)
         assert np.array_equal(read_frame(ingested, "S001", "cam01", frame, False), expected)
-    plate = read_plate(ingested, "S001", "cam02", undistort=False)
+    plate = read_recorded_plate(read_index(ingested, "S001"), "cam02")
     assert np.array_equal(plate, render_ball(rig["cam02"], None))
 
 
@@ -104,7 +106,6 @@ def test_undistortion_goes_by_the_calibrated_camera(ingested):
     expected = undistort_image(render_ball(camera, 0), bent)
     assert np.array_equal(read_frame(ingested, "S001", "cam00", 0), expected)
     assert not np.array_equal(expected, render_ball(camera, 0))
-    assert read_plate(ingested, "S001", "cam00").shape == (64, 64, 3)
     straight = read_cameras_of(ingested, "S001")
     assert list(straight) == sorted(rig)
     assert not straight["cam00"].dist.any()
@@ -132,10 +133,11 @@ def test_peaks_are_checked_against_the_footage(ingested):
     path.parent.mkdir(parents=True)
     path.write_text(json.dumps({"smile": row}))
     assert read_peaks(ingested, "S001") == {"smile": 1}
+    check_peak(index, "smile", read_peak_rows(ingested, "S001")["smile"])
     for change in ({"dhash": "0" * 16}, {"camera": "cam9"}, {"frame": 99}):
         path.write_text(json.dumps({"smile": row | change}))
-        with pytest.raises(CaptureError, match="not the one that was labelled"):
-            read_peaks(ingested, "S001")
+        with pytest.raises(CaptureError):
+            check_peak(index, "smile", read_peak_rows(ingested, "S001")["smile"])
     path.write_text('{"smile": 3}')
     with pytest.raises(FormatError, match="not a table of peaks"):
         read_peaks(ingested, "S001")
@@ -170,6 +172,14 @@ def test_any_image_becomes_8_bit_srgb(image, expected):
     assert set(result.reshape(-1).tolist()) == {expected}
 
 
+def test_16_bit_levels_are_kept():
+    levels = np.array([[[0, 1, 65535]]], np.uint16)
+    assert np.array_equal(to_srgb16(levels), levels)
+    # IEC 61966-2-1: 128 of 255 is linear 0.2159
+    half = to_srgb16(np.full((2, 2, 3), 0.2159, np.float32))
+    assert half.dtype == np.uint16 and abs(int(half[0, 0, 0]) / 257 - 128) < 0.05
+
+
 def test_nan_pixels_are_refused():
     with pytest.raises(ValueError, match="NaN"):
         to_srgb8(np.full((2, 2, 3), np.nan, np.float32))
@@ -179,5 +189,5 @@ def test_a_plate_of_another_size_is_one_clear_error(tmp_path):
     make_capture(tmp_path / "raw")
     dataset = ingest_capture(tmp_path / "data", tmp_path / "raw")
     write_image(tmp_path / "raw" / "plates" / "cam01.png", np.zeros((20, 30, 3), np.uint8))
-    with pytest.raises(CaptureError, match="plate is 30x20, the footage of cam01 is 64x64"):
-        read_plate(dataset, "S001", "cam01", undistort=False)
+    with pytest.raises(CaptureError, match="30x20.*64x64"):
+        read_recorded_plate(read_index(dataset, "S001"), "cam01")

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from express50.capture.frames import read_srgb8
 from express50.errors import CalibrationError
+from express50.files.containers import read_srgb8
 from express50.files.images import linear_to_srgb, srgb_to_linear, write_image
 from express50.rigs.world_frame import canonical_from_rig, move_cameras
 from pipelines.alpha.config import AlphaConfig

@@ -19,6 +19,7 @@ from express50.runner.runner import run_stage
 from pipelines.ingest import STAGE as INGEST
 from pipelines.ingest import register
 from tests.pipelines.bump_head import render, ring
+from tests.synth import write_peak_frames
 
 EXPRESSIONS = ("neutral", "smile")
 
@@ -37,6 +38,7 @@ def make_dataset(
     run_stage(INGEST, dataset, INGEST.config(), workers=0, progress=False)
     for subject in subjects:
         write_given(dataset, subject, rig, shots)
+    write_peak_frames(dataset)
     return dataset
 
 

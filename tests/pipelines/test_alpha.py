@@ -12,7 +12,7 @@ import pytest
 from express50.capture.frames import dhash, read_frame
 from express50.capture.index import read_index
 from express50.contract.config import resolve_config
-from express50.errors import ConfigError, StageError
+from express50.errors import ConfigError
 from express50.files.images import read_image
 from pipelines.alpha import STAGE
 from pipelines.alpha.config import AlphaConfig
@@ -22,6 +22,7 @@ from pipelines.alpha.opacity import local_colours, shrunk, solve_opacity
 from pipelines.alpha.plate import exposed, exposure_gain, fit_plate
 from pipelines.alpha.smooth import MattingLaplacian
 from tests.pipelines.alpha_scenes import Scene, clutter, make_scene
+from tests.synth import write_peak_frames
 
 CONFIG = AlphaConfig()
 
@@ -210,7 +211,7 @@ def test_pixels_without_footage_are_transparent() -> None:
 
 def test_wrong_settings_are_refused() -> None:
     for change in ({"low": 7.0}, {"scale": 0.0}, {"spread": 2.0}, {"shadow": 1.0},
-                   {"noise_frames": 0}, {"plate_frames": 0}, {"core": -0.1}):  # fmt: skip
+                   {"noise_frames": 0}, {"core": -0.1}):  # fmt: skip
         with pytest.raises(ConfigError, match="alpha"):
             AlphaConfig(**change)
 
@@ -239,6 +240,7 @@ def aligned(ingested):
     folder = ingested.item_dir("align", "S001")
     folder.mkdir(parents=True)
     (folder / "peaks.json").write_text(json.dumps(peaks))
+    write_peak_frames(ingested)
     return ingested
 
 
@@ -257,9 +259,3 @@ def test_the_stage_writes_one_matte_a_peak_twice_alike(aligned, tmp_path) -> Non
     assert alpha.shape == (64, 64) and alpha.dtype == np.uint8
     assert metrics["coverage"]["neutral"] == pytest.approx(alpha.mean() / 255, abs=2e-3)
     assert 0.05 < metrics["coverage"]["neutral"] < 0.6
-
-
-def test_no_plate_and_a_still_subject_is_one_clear_error(aligned, tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr("pipelines.alpha.source.read_plate", lambda *args, **more: None)
-    with pytest.raises(StageError, match="photograph the empty set as plates/"):
-        STAGE.run(aligned, STAGE.items(aligned)[0], CONFIG, tmp_path)

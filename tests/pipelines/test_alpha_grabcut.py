@@ -25,7 +25,7 @@ from pipelines.photo.capture import make_photo_capture
 from pipelines.photo.focal import single_camera
 from pipelines.photo.picture import open_picture
 from pipelines.track.config import TrackConfig
-from tests.synth import write_video
+from tests.synth import write_peak_frames, write_video
 
 data = pytest.importorskip("skimage.data")
 HEAD = [(225, 30), (160, 80), (290, 90), (220, 100), (225, 165), (225, 205)]  # hair, face, collar
@@ -135,6 +135,7 @@ def test_a_frame_without_a_face_costs_itself_alone(tmp_path: Path) -> None:
     }  # fmt: skip
     dataset.item_dir("align", "eva").mkdir(parents=True)
     (dataset.item_dir("align", "eva") / "peaks.json").write_text(json.dumps(peaks))
+    write_peak_frames(dataset)
     run = run_stage(ALPHA, dataset, AlphaConfig(method="grabcut"), workers=0, progress=False)
     assert run.ok
     (dropped,) = run.outcomes[0].dropped

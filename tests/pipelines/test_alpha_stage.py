@@ -17,10 +17,9 @@ from express50.runner.runner import Summary, run_stage
 from pipelines import calibrate, ingest
 from pipelines.alpha import STAGE
 from pipelines.alpha.config import AlphaConfig
-from tests.pipelines.alpha_scenes import clutter
+from tests.pipelines.alpha_scenes import make_scene
 from tests.pipelines.stand_ins import Bad, Difference, onnx_bright, torchscript
-from tests.pipelines.test_alpha_footage import backdrop, shot
-from tests.synth import make_capture
+from tests.synth import make_capture, write_peak_frames
 
 
 def run(dataset: Dataset, **settings) -> Summary:
@@ -57,6 +56,7 @@ def make_dataset(root: Path, captures: list[Path]) -> Dataset:
         assert run_stage(stage, dataset, stage.config(), workers=0, progress=False).ok
     for subject in dataset.subjects():
         align(dataset, subject)
+    write_peak_frames(dataset)
     return dataset
 
 
@@ -66,13 +66,16 @@ def aligned(tmp_path, capture) -> Dataset:
     return make_dataset(tmp_path, [capture])
 
 
-def unplated(root: Path, subject: str, who: int, plate: np.ndarray) -> Path:
-    """A capture with one camera and no plate, of a subject that sits still."""
-    rng = np.random.default_rng(who)
-    make_capture(root / subject, subject=subject, cameras=1, size=128, plates=False)
-    for frame in sorted((root / subject / "cameras" / "cam00" / "frames").iterdir()):
-        write_image(frame, shot(rng, plate, who)[0])
-    return root / subject
+def unplated(root: Path) -> Path:
+    """A capture with one camera and no plate."""
+    path = root / "S001"
+    make_capture(path, cameras=1, size=128, plates=False)
+    rng = np.random.default_rng(0)
+    alpha = make_scene(3, size=128).alpha[..., None]
+    for frame in sorted((path / "cameras" / "cam00" / "frames").iterdir()):
+        image = 200 * alpha + 40 * (1 - alpha) + rng.normal(0, 1, (128, 128, 3))
+        write_image(frame, np.rint(image).astype(np.uint8))
+    return path
 
 
 def test_background_matting_sees_frame_and_plate(aligned, tmp_path) -> None:
@@ -101,8 +104,7 @@ def test_other_weights_run_again_and_the_same_do_not(aligned, tmp_path) -> None:
 
 
 def test_a_salient_network_needs_no_plate(tmp_path) -> None:
-    rng = np.random.default_rng(0)
-    dataset = make_dataset(tmp_path, [unplated(tmp_path / "raw", "S001", 1, 0.3 * backdrop(rng))])
+    dataset = make_dataset(tmp_path, [unplated(tmp_path / "raw")])
     settings = {
         "method": "salient",
         "weights": str(onnx_bright(tmp_path / "net.onnx", 128)),
@@ -139,63 +141,21 @@ def test_weights_that_are_not_there_are_said_once_and_cost_nothing(aligned, tmp_
     assert run(aligned).count("skipped") == 3
 
 
-def test_one_camera_that_fails_leaves_the_others_done(aligned, tmp_path, monkeypatch) -> None:
-    weights = torchscript(Difference(), tmp_path / "net.pt")
-    index = read_index(aligned, "S001")
-    monkeypatch.setattr("pipelines.alpha.source.read_plate", _wrong_for("cam01"))
-    summary = run(aligned, method="bgmv2", weights=str(weights))
-    status = {o.item: o.status for o in summary.outcomes}
-    assert status == {f"S001/{c}": "failed" if c == "cam01" else "done" for c in index.cameras}
-    assert "the plate is 10x10, the footage 64x64" in summary.outcomes[1].reason
+def test_one_camera_that_fails_leaves_the_others_done(aligned) -> None:
+    aligned.plate_file("S001", "cam01").unlink()
+    status = {o.item: o.status for o in run(aligned).outcomes}
+    assert status == {"S001/cam00": "done", "S001/cam01": "failed", "S001/cam02": "done"}
 
 
-def _wrong_for(camera: str):
-    from express50.capture.frames import read_plate
-
-    def read(dataset, subject, camera_id, undistort=True):
-        if camera_id == camera:
-            return np.zeros((10, 10, 3), np.uint8)
-        return read_plate(dataset, subject, camera_id, undistort)
-
-    return read
+def test_a_frame_that_was_not_written_is_dropped(aligned) -> None:
+    aligned.frame_file("S001", "smile", "cam01").unlink()
+    assert run(aligned).ok
+    assert [row["what"] for row in metrics_of(aligned, "S001/cam01")["dropped"]] == ["smile"]
+    assert "smile" in metrics_of(aligned, "S001/cam00")["coverage"]
 
 
-def test_without_plates_subjects_of_a_fixed_rig_stand_in_for_them(tmp_path) -> None:
-    rng = np.random.default_rng(5)
-    plate = backdrop(rng)
-    captures = [unplated(tmp_path / "raw", f"S{k:03d}", k, plate) for k in range(2)]
-    dataset = make_dataset(tmp_path, captures)
-    assert run(dataset).ok
-    figures = metrics_of(dataset)
-    assert figures["plate"] == "footage of 2 subjects"
-    words = [w["why"] for w in figures["warnings"] if w["what"] == "plate"]
-    assert len(words) == 1 and "always covered and filled in" in words[0]
-    truth = shot(np.random.default_rng(0), plate, 0)[1]
-    alpha = read_image(dataset.item_dir("alpha", "S000/cam00") / "smile.png") / 255
-    assert np.abs(alpha - truth).mean() < 0.01
-
-
-def test_the_plate_of_another_subject_is_used_and_named(tmp_path) -> None:
-    plate = clutter(np.random.default_rng(6), 128)
-    captures = [unplated(tmp_path / "raw", f"S{k:03d}", k, plate) for k in range(2)]
-    (captures[1] / "plates").mkdir()
-    write_image(captures[1] / "plates" / "cam00.png", np.rint(plate).astype(np.uint8))
-    dataset = make_dataset(tmp_path, captures)
-    assert run(dataset).ok
-    figures = metrics_of(dataset, "S000/cam00")
-    assert figures["plate"] == "the plate of S001"
-    assert [w["what"] for w in figures["warnings"]] == ["plate"]
-    truth = shot(np.random.default_rng(0), plate, 0)[1]
-    alpha = read_image(dataset.item_dir("alpha", "S000/cam00") / "smile.png") / 255
-    assert np.abs(alpha - truth).mean() < 0.012
-    assert metrics_of(dataset, "S001/cam00")["plate"] == "given"
-
-
-def test_one_subject_that_sits_still_without_a_plate_fails_clearly(tmp_path) -> None:
-    rng = np.random.default_rng(5)
-    dataset = make_dataset(tmp_path, [unplated(tmp_path / "raw", "S001", 0, backdrop(rng))])
+def test_keying_without_a_plate_is_refused(tmp_path) -> None:
+    dataset = make_dataset(tmp_path, [unplated(tmp_path / "raw")])
     summary = run(dataset)
-    assert not summary.ok
-    reason = summary.outcomes[0].reason
-    assert "the subject moves too little" in reason and "plates/cam00.png" in reason
-    assert "set alpha.method to salient" in reason
+    assert [o.status for o in summary.outcomes] == ["failed"]
+    assert "plates/cam00.png" in summary.outcomes[0].reason

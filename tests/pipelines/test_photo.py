@@ -12,10 +12,10 @@ import numpy as np
 import OpenImageIO as oiio
 import pytest
 
-from express50.capture.frames import read_srgb8
 from express50.cli.main import main
 from express50.errors import CaptureError
 from express50.files.calibration import read_cameras
+from express50.files.containers import read_srgb8
 from express50.files.images import write_image
 from express50.files.video import iterate_video
 from pipelines.photo.capture import make_photo_capture, subject_id

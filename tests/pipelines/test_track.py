@@ -28,6 +28,7 @@ from pipelines.track.sparse_head import Basis, Points, make_basis
 from pipelines.track.start import initial_pose
 from pipelines.track.state import State, Target, start_state
 from tests.express50.head.tiny_head import tiny_head
+from tests.synth import write_peak_frames
 
 CONFIG = TrackConfig()
 
@@ -294,6 +295,7 @@ def tracked_dataset(tmp_path: Path, ingested, monkeypatch: pytest.MonkeyPatch):
     folder = ingested.item_dir("align", "S001")
     folder.mkdir(parents=True)
     (folder / "peaks.json").write_text(json.dumps(peaks))
+    write_peak_frames(ingested)
     scene = make_scene()
 
     def told(image: np.ndarray, camera_id: str, frame: int) -> Marked:
@@ -364,6 +366,6 @@ def test_footage_that_is_gone_is_told_from_faces_that_are_not_there(
         raise CaptureError("cam00: cannot be opened")
 
     dataset, _ = tracked_dataset
-    monkeypatch.setattr(footage, "read_frame", gone)
+    monkeypatch.setattr(footage, "read_peak_frame", gone)
     with pytest.raises(StageError, match="cannot be opened"):
         STAGE.run(dataset, "S001", TrackConfig(), tmp_path)

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from express50.capture.frames import read_cameras_of, read_frame, read_gains
+from express50.capture.frames import read_cameras_of, read_gains, read_peak_frame
 from express50.contract.layout import Dataset
 from express50.dataset.export.parameters import export_shift, is_flame, write_parameters
 from express50.dataset.export.pictures import centred, flattened, rgba_png, seen_by
@@ -155,7 +155,7 @@ def _read_view(
             f"{path}: {alpha.shape[1]}x{alpha.shape[0]}, expected the camera's"
             f" {camera.width}x{camera.height}; run 'express50 {stage}' again"
         )
-    image = read_frame(dataset, subject, camera.id, frame)
+    image = read_peak_frame(dataset, subject, expression, camera.id)
     if options.even_colour:
         image = _evened(dataset, subject, camera.id, image)
     return image, alpha

@@ -5,8 +5,8 @@ import json
 import numpy as np
 import pytest
 
-from express50.capture.colour_correction import correct_srgb8
-from express50.capture.frames import FrameReader, read_frame, read_plate, read_proxy
+from express50.capture.colour_correction import correct_srgb
+from express50.capture.frames import FrameReader, read_frame, read_proxy, read_recorded_plate
 from express50.capture.index import Cue, calibration_file, read_index
 from express50.capture.readers.person import read_people
 from express50.capture.readers.read import detect, read_any, subject_of
@@ -118,16 +118,16 @@ def test_nersemble_colours_are_corrected_and_sizes_fitted(tmp_path):
     camera = index.cameras["222200037"]
     assert camera.clips == (5, 5) and camera.correction == tuple(map(tuple, layouts.CCM))
     shape = (160, 110, 3)
-    true = correct_srgb8(picture(1, 3, shape), layouts.CCM)
+    true = correct_srgb(picture(1, 3, shape), layouts.CCM)
     raw = picture(1, 3, shape)
     found = read_frame(dataset, subject, "222200037", 8, False)
     assert near(found, true, 6) and not near(found, raw, 6)
     assert near(read_proxy(dataset, subject, "222200037", 3), true, 8)
-    plate = read_plate(dataset, subject, "222200037", False)
-    assert near(plate, correct_srgb8(picture(1, 99, shape), layouts.CCM), 5)
+    plate = read_recorded_plate(index, "222200037")
+    assert near(plate, correct_srgb(picture(1, 99, shape), layouts.CCM), 5)
     reader = FrameReader(index, "222200036")
     for frame in (9, 0, 6, 4):  # over the joint of two videos and back
-        assert near(reader.read(frame), correct_srgb8(picture(0, frame % 5, shape), layouts.CCM), 6)
+        assert near(reader.read(frame), correct_srgb(picture(0, frame % 5, shape), layouts.CCM), 6)
     assert_rig(dataset, subject, rig(["222200036", "222200037", "222200038"], (110, 160)))
 
 
@@ -143,7 +143,7 @@ def test_nersemble_cameras_of_unequal_length(tmp_path):
     # The second clip's frames stay its own, and so do their proxies.
     assert near(
         read_proxy(dataset, subject, "222200036", 6),
-        correct_srgb8(picture(0, 1, (160, 110, 3)), layouts.CCM), 8,
+        correct_srgb(picture(0, 1, (160, 110, 3)), layouts.CCM), 8,
     )  # fmt: skip
     lost = told(dataset, subject)
     assert "has 4 frames of EXP_1_head, most cameras have 5" in lost["camera 222200038"]

@@ -1,0 +1,80 @@
+"""Write each labelled peak frame once, undistorted and colour-corrected, and the clean plates.
+
+An item is an expression of a subject with all cameras. A seek in 4K H.264 costs half a second
+whichever way the peaks are grouped, and a changed label redoes one expression only. The plates of a
+subject are one more item.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from express50.capture.index import index_path, read_index
+from express50.contract.layout import PLATES, Dataset
+from express50.contract.stage import Growth, Result, Stage
+
+
+@dataclass(frozen=True, kw_only=True)
+class FramesConfig:
+    """Sample depth of the written frames."""
+
+    deep: bool = True
+    """Keep 16 bits per channel where the footage has more than 8; the files are ten times as
+    large."""
+
+
+def items(dataset: Dataset) -> list[str]:
+    """List `subject/expression` of every labelled peak, and `subject/_plates` where there are any.
+
+    Only aligned and calibrated subjects have items.
+    """
+    from express50.capture.frames import peak_items  # imports OpenCV
+
+    peaks = [
+        item
+        for item in peak_items(dataset)
+        if (dataset.item_dir("calibrate", item.split("/")[0]) / "cameras.json").is_file()
+    ]
+    subjects = dict.fromkeys(item.split("/")[0] for item in peaks)
+    return peaks + [f"{s}/{PLATES}" for s in subjects if read_index(dataset, s).plates]
+
+
+def inputs(dataset: Dataset, item: str, config: FramesConfig) -> dict[str, Path | str]:
+    """Name the index, the cameras, and the peak or the plates; the index holds footage hashes."""
+    from express50.capture.frames import read_peak_rows
+
+    subject, expression = item.split("/")
+    found: dict[str, Path | str] = {
+        "index": index_path(dataset, subject),
+        "cameras": dataset.item_dir("calibrate", subject) / "cameras.json",
+    }
+    if expression == PLATES:
+        index = read_index(dataset, subject)
+        paths = {c: index.capture / name for c, name in index.plates.items()}
+        return found | {f"plate {c}": path for c, path in paths.items() if path.is_file()}
+    return found | {"peak": repr(read_peak_rows(dataset, subject)[expression])}
+
+
+def run(dataset: Dataset, item: str, config: FramesConfig, out: Path) -> Result:
+    """Write one file per camera, and a contact sheet."""
+    from pipelines.frames.stage import run as work
+
+    return work(dataset, item, config.deep, out)
+
+
+STAGE = Stage(
+    name="frames",
+    version=1,
+    config=FramesConfig,
+    presets={"draft": {"deep": False}, "standard": {}, "reference": {}},
+    items=items,
+    inputs=inputs,
+    run=run,
+    help="write the labelled peak frames, undistorted and colour-corrected",
+    purpose="Peak frames and clean plates as every later stage reads them: undistorted to the"
+    " calibrated pinhole camera, colour-corrected, lossless.",
+    growth=Growth(
+        items=("subjects", "expressions"), time=("views", "pixels"), disk=("views", "pixels")
+    ),
+)

@@ -1,0 +1,103 @@
+"""Decode the peak frames of one expression, or a subject's clean plates, and write them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from express50.capture.frames import (
+    FrameReader,
+    check_peak,
+    read_cameras_of,
+    read_peak_rows,
+    read_recorded_plate,
+    write_frame,
+)
+from express50.capture.index import read_index
+from express50.contract.layout import PLATES, Dataset
+from express50.contract.stage import Note, Result
+from express50.errors import CaptureError, StageError
+from express50.files.containers import to_srgb8
+from express50.files.images import contact_sheet, resize_area, write_image
+from express50.geometry.conventions import undistort_image
+
+COLUMNS = 6  # of the contact sheet
+TILE = 240  # pixels
+
+Read = Callable[[str], np.ndarray]
+"""Camera id to its recorded image (H, W, 3); raises CaptureError."""
+
+
+def run(dataset: Dataset, item: str, deep: bool, out: Path) -> Result:
+    """Write `<camera>.jxl` per calibrated camera; a camera that cannot be read is dropped.
+
+    Args:
+        dataset: the dataset.
+        item: `subject/expression`, or `subject/_plates`.
+        deep: keep 16 bits per channel where the footage has them.
+        out: folder of the outputs.
+
+    Raises:
+        CaptureError: the labelled frame is not the one that was indexed.
+        StageError: no camera could be read.
+    """
+    cv2.setNumThreads(1)  # the runner counts one core per item
+    subject, expression = item.split("/")
+    cameras = read_cameras_of(dataset, subject, undistorted=False)
+    if expression == PLATES:
+        index = read_index(dataset, subject)
+        cameras = {name: camera for name, camera in cameras.items() if name in index.plates}
+    read = _reader(dataset, subject, expression, deep)
+    dropped: list[Note] = []
+    tiles: dict[str, np.ndarray] = {}
+    bits: dict[str, int] = {}
+    for name, camera in cameras.items():
+        try:
+            image = undistort_image(read(name), camera)
+        except CaptureError as error:
+            dropped.append(Note(name, str(error)))
+            continue
+        write_frame(out / f"{name}.jxl", image)
+        bits[name] = 8 * image.itemsize
+        scale = min(1.0, TILE / max(image.shape[:2]))
+        height, width = (max(1, round(n * scale)) for n in image.shape[:2])
+        tiles[name] = resize_area(to_srgb8(image), width, height)
+    if not tiles:
+        why = "; ".join(f"{note.what}: {note.why}" for note in dropped[:3])
+        raise StageError(f"{item}: no camera could be read ({why or 'none is calibrated'})")
+    _write_picture(out, tiles)
+    return Result({"frames": len(tiles), "bits": bits}, dropped)
+
+
+def _reader(dataset: Dataset, subject: str, expression: str, deep: bool) -> Read:
+    """Make the function that reads one camera's recorded frame or plate."""
+    index = read_index(dataset, subject)
+    if expression == PLATES:
+        return lambda camera: read_recorded_plate(index, camera, deep)
+    peak = read_peak_rows(dataset, subject)[expression]
+    check_peak(index, expression, peak)
+
+    def read(camera: str) -> np.ndarray:
+        reader = FrameReader(index, camera)
+        try:
+            return reader.read(peak.frame, deep)
+        finally:
+            reader.close()
+
+    return read
+
+
+def _write_picture(out: Path, tiles: dict[str, np.ndarray]) -> None:
+    """Write a contact sheet of the cameras."""
+    names = list(tiles)
+    rows = [names[k : k + COLUMNS] for k in range(0, len(names), COLUMNS)]
+    sheet = contact_sheet(
+        [[tiles[name] for name in row] for row in rows],
+        ["  ".join(row) for row in rows],
+        (TILE, TILE),
+    )
+    (out / "qc").mkdir()
+    write_image(out / "qc" / "frames.jpg", sheet, quality=88)
