@@ -14,7 +14,8 @@ from express50.errors import StageError
 from express50.files.images import resize_area
 from express50.geometry.cameras import project
 from express50.geometry.conventions import cell_to_corner
-from pipelines.depth.views import INSIDE, DepthView, project_fast, sample_image
+from express50.geometry.sampling import bilinear
+from pipelines.depth.views import INSIDE, DepthView, project_fast
 
 UNSEEN = 1.0  # metres; the distance given to space that too few cameras see
 BOX_CELLS = 40  # along the sides of the box in which the hull is looked for
@@ -45,7 +46,7 @@ def hull_distance(views: Sequence[DepthView], points: np.ndarray) -> np.ndarray:
             & (pixels[:, 1] <= camera.height)
         )
         focal = float(np.sqrt(camera.K[0, 0] * camera.K[1, 1]))
-        metres = -sample_image(view.silhouette_px, pixels[inside]) * depth[inside] / focal
+        metres = -bilinear(view.silhouette_px, pixels[inside]) * depth[inside] / focal
         distance[inside] = np.maximum(distance[inside], metres)
         seen += inside
     return np.where(seen >= max(2, len(views) / 3), distance, UNSEEN).astype(np.float32)
@@ -174,7 +175,7 @@ def _vote(view: DepthView, points: np.ndarray, cell: float) -> _Vote:
     step = max(1.0, cell * view.camera.K[0, 0] / near)
     shape = np.maximum(1, np.ceil(size / step)).astype(int)
     allows = np.ones(len(points), bool)
-    allows[seen] = sample_image(view.silhouette_px, pixels[seen]) > -step / 2
+    allows[seen] = bilinear(view.silhouette_px, pixels[seen]) > -step / 2
     column, row = np.minimum((pixels[seen] / step).astype(int), shape - 1).T
     pixel = np.full(len(points), -1)
     pixel[seen] = row * shape[0] + column

@@ -19,8 +19,9 @@ import open3d as o3d
 from express50.files.images import resize_area
 from express50.geometry.cameras import Camera, rays, resized
 from express50.geometry.raycast import camera_rays, mesh_scene
+from express50.geometry.sampling import bilinear
 from pipelines.depth.reconstruct import HeadSurface
-from pipelines.depth.views import INSIDE, project_fast, sample_image
+from pipelines.depth.views import INSIDE, project_fast
 
 STEEP = 0.25  # cosine between surface and ray below which confidence fades to 0
 BROKEN = 4.0  # pixels' widths between neighbours' depths at which confidence is halved
@@ -236,8 +237,7 @@ def _difference(colour: np.ndarray, points: np.ndarray, other: ComparedView) -> 
     found = np.full(len(points), np.nan, np.float32)
     if not there.any():
         return found
-    planes = [np.ascontiguousarray(other.colour[..., k]) for k in range(3)]
-    theirs = np.stack([sample_image(plane, pixels[there]) for plane in planes], axis=1)
+    theirs = bilinear(other.colour, pixels[there])
     mine = colour[there]
     bright = (mine > DARK) & (theirs > DARK)
     gain = [

@@ -11,7 +11,8 @@ import open3d as o3d
 from express50.geometry.cameras import rays
 from express50.geometry.conventions import cell_to_corner
 from express50.geometry.raycast import mesh_scene
-from pipelines.depth.views import DepthView, sample_image
+from express50.geometry.sampling import bilinear
+from pipelines.depth.views import DepthView
 
 REACH = 0.015  # metres that the hull may rise above a mesh that is believed; more is hair, cloth
 BORDER = 0.03  # metres from the mesh's open border over which belief fades in; collars are there
@@ -134,9 +135,7 @@ def matte_agreement(views: Sequence[DepthView], vertices: np.ndarray, faces: np.
         hit = scene.test_occlusions(o3d.core.Tensor(row.astype(np.float32)), nthreads=1).numpy()
         y, x = np.nonzero(hit.reshape(directions.shape[:2]))
         inside = (
-            sample_image(view.alpha, cell_to_corner(np.stack([4 * x, 4 * y], 1)))
-            if len(x)
-            else [0.0]
+            bilinear(view.alpha, cell_to_corner(np.stack([4 * x, 4 * y], 1))) if len(x) else [0.0]
         )
         shares.append(float(np.mean(inside)))
     return float(np.median(shares))

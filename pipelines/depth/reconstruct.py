@@ -10,6 +10,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from express50.errors import StageError
+from express50.geometry.sampling import bilinear
 from pipelines.depth.blocks import (
     BLOCK,
     VOXEL_LIMIT,
@@ -37,7 +38,7 @@ from pipelines.depth.surface import (
     smooth_displacement,
 )
 from pipelines.depth.sweep import patch_scores, view_weights
-from pipelines.depth.views import DepthView, pixel_size, project_fast, sample_image
+from pipelines.depth.views import DepthView, pixel_size, project_fast
 
 COARSE_M = 0.006  # voxel of the first level: it spans the gap between hull and face
 LEVEL_RATIO = 1.47  # each level is so many times finer than the one before
@@ -238,9 +239,7 @@ def vertex_colors(views: Sequence[DepthView], mesh: HeadMesh, lift: float) -> np
     total = np.zeros((len(mesh.vertices), 3))
     for view, weight in zip(views, weights, strict=True):
         pixels, _ = project_fast(view.camera, mesh.vertices)
-        for channel in range(3):
-            plane = np.ascontiguousarray(view.rgb[..., channel], np.float32)
-            total[:, channel] += weight * sample_image(plane, pixels)
+        total += weight[:, None] * bilinear(view.rgb.astype(np.float32), pixels)
     seen = weights.sum(0)
     mean = np.where(seen[:, None] > 0, total / np.maximum(seen, 1e-9)[:, None], 128.0)
     return np.rint(mean).clip(0, 255).astype(np.uint8)

@@ -17,9 +17,10 @@ import numpy as np
 import open3d as o3d
 
 from express50.geometry.raycast import mesh_scene
+from express50.geometry.sampling import bilinear
 from pipelines.depth.blocks import LevelSet
 from pipelines.depth.surface import HeadMesh, averaged
-from pipelines.depth.views import DepthView, pixel_size, project_fast, sample_image
+from pipelines.depth.views import DepthView, pixel_size, project_fast
 
 GRAZING = 0.25  # cosine; flatter than this, a patch is squeezed to under a quarter of its width
 SAMPLES = 5  # along a patch's side: 7 are worse (0.353 for 0.333 mm)
@@ -74,7 +75,7 @@ def view_weights(views: Sequence[DepthView], mesh: HeadMesh, lift: float) -> np.
         pixels, depth = project_fast(view.camera, vertices)
         size = np.array([view.camera.width, view.camera.height])
         seen = (cosine > GRAZING) & (depth > 0) & ((pixels > 2) & (pixels < size - 2)).all(1)
-        seen[seen] = sample_image(view.alpha, pixels[seen]) > 0.9
+        seen[seen] = bilinear(view.alpha, pixels[seen]) > 0.9
         rays = np.concatenate([vertices + lift * (normals + towards), towards], axis=1)[seen]
         hidden = scene.test_occlusions(o3d.core.Tensor(rays.astype(np.float32)), nthreads=1)
         seen[seen] = ~hidden.numpy()
@@ -164,7 +165,7 @@ def _correlate(
         if not seen.any():
             continue
         pixels = _patch_pixels(view, line[seen], patch[seen])
-        z = sample_image(grey, pixels.reshape(-1, 2)).reshape(pixels.shape[:3])
+        z = bilinear(grey, pixels.reshape(-1, 2)).reshape(pixels.shape[:3])
         z -= z.mean(-1, keepdims=True)
         power = np.einsum("ndp,ndp->nd", z, z)
         share = weight[seen, None] / np.sqrt(power + count * noise * noise)

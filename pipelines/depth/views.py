@@ -10,7 +10,6 @@ import numpy as np
 from express50.errors import StageError
 from express50.files.images import resize_area
 from express50.geometry.cameras import Camera, resized
-from express50.geometry.conventions import corner_to_cell
 
 INSIDE = 0.5  # alpha at a silhouette
 EMPTY = 0.002  # share of the image below which a matte holds no head
@@ -109,22 +108,6 @@ def silhouette_distance(alpha: np.ndarray, upsample: int = 3) -> np.ndarray:
     limit = float(width + height)  # a matte without a contour is infinitely far from one
     signed = np.clip(signed, -limit, limit).astype(np.float32)
     return cv2.resize(signed, (width, height), interpolation=cv2.INTER_AREA)
-
-
-def sample_image(image: np.ndarray, pixels: np.ndarray) -> np.ndarray:
-    """Sample an image (H, W) bilinearly at corner-origin pixels (N, 2), border values outside."""
-    count = len(pixels)
-    columns = 4096  # cv2.remap takes at most 32767 rows and columns
-    padded = np.zeros((-(-count // columns) * columns, 2), np.float32)
-    padded[:count] = corner_to_cell(pixels)
-    maps = padded.reshape(-1, columns, 2)
-    out = np.empty(maps.shape[:2], np.float32)
-    for start in range(0, len(maps), 8192):
-        block = np.ascontiguousarray(maps[start : start + 8192])
-        out[start : start + 8192] = cv2.remap(
-            image, block[..., 0], block[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
-        )
-    return out.reshape(-1)[:count]
 
 
 def project_fast(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
