@@ -1,12 +1,12 @@
-"""Labels and head mattes against the twin's truth: ``python -m benchmarks.regions --help``.
+"""Measure labels and head mattes against the twin's truth: ``python -m benchmarks.regions``.
 
 Every preset labels the same items anew from the same mattes, tracks and depth maps. Beside it stand
 simpler ways to lose the torso: keep it (``no_cut``), cut along the image row of the tracked chin
 (``chin_line``) or of the neck's tracked end (``neck_line``); and two limits: the standard preset on
 the true mesh instead of the tracked one (``true_mesh``), and the same matte without the pixels that
 truly show torso (``true_cut``), whose error is the matte's own. IoU of a part is over the pixels
-of all views in which the truth or the labels have it. Seconds are processor seconds a view, reading
-included. The last line is one JSON object.
+of all views in which the truth or the labels have it. Seconds are processor seconds per view,
+reading included. The last line is one JSON object.
 """
 
 from __future__ import annotations
@@ -34,11 +34,8 @@ from express50.head.load import load_head
 from express50.head.model import landmarks
 from express50.twin.truth import Truth
 from pipelines.regions import STAGE
-from pipelines.regions.labels import head_labels
-from pipelines.regions.mesh import make_head
-from pipelines.regions.read import read_depth_of, read_head, read_pair
-from pipelines.regions.stage import look
-from pipelines.regions.view import head_alpha
+from pipelines.regions.geometry import head_alpha, head_labels, make_head
+from pipelines.regions.stage import label_view, read_depth_of, read_head, read_pair
 
 CHIN = 8  # of the 68 landmarks
 
@@ -47,7 +44,7 @@ Pair = tuple[np.ndarray, np.ndarray]
 
 
 def main() -> int:
-    """Run and print."""
+    """Run and print the figures."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--dataset", type=Path, default=Path("build/demo/data/demo"))
     parser.add_argument("--truth", type=Path, default=Path("build/demo/twin/truth"))
@@ -74,7 +71,7 @@ def main() -> int:
 
 
 def measure_item(dataset: Dataset, truth: Truth, item: str, configs: dict) -> dict[str, dict]:
-    """Counts and errors of every preset and baseline on one item."""
+    """Measure every preset and baseline on one item."""
     subject, expression = item.split("/")
     frame = read_peaks(dataset, subject)[expression]
     cameras = true_world_cameras(dataset, truth, subject)
@@ -112,17 +109,17 @@ def measure_item(dataset: Dataset, truth: Truth, item: str, configs: dict) -> di
 def true_mesh_rows(
     dataset: Dataset, truth: Truth, item: str, true: Mapping[str, Pair]
 ) -> list[dict]:
-    """Errors of the standard preset where tracking is perfect."""
+    """Measure the standard preset with perfect tracking."""
     subject, expression = item.split("/")
     frame = read_peaks(dataset, subject)[expression]
     labels = head_labels(truth.head_model(subject))
     R = truth.parameters(subject, frame)["R"]
     head = make_head(truth.vertices(subject, frame), R, labels)
-    config, rows = STAGE.config(), []
+    rows = []
     for name, camera in true_world_cameras(dataset, truth, subject).items():
         rgb, alpha = read_pair(dataset, item, camera)
-        depth = read_depth_of(dataset, item, camera, config)
-        small = look(head, camera, rgb, alpha, depth, False, config).labels
+        depth = read_depth_of(dataset, item, camera)
+        small = label_view(head, camera, rgb, alpha, depth, False).labels
         shown = np.where(alpha > 0.5, small, 0)
         labels_of, alpha_of = true[name]
         rows.append(view_row(labels_of, alpha_of, head_alpha(alpha, small), shown))
@@ -130,7 +127,7 @@ def true_mesh_rows(
 
 
 def baselines(dataset: Dataset, item: str) -> dict[str, Callable[[str], np.ndarray]]:
-    """Head mattes (H, W) by camera: the matte as it is, and cut at an image row."""
+    """Make head mattes (H, W) by camera: the matte as it is, and cut at an image row."""
     subject, expression = item.split("/")
     cameras = read_cameras_of(dataset, subject)
     head = read_head(dataset, subject, expression)
@@ -154,12 +151,12 @@ def baselines(dataset: Dataset, item: str) -> dict[str, Callable[[str], np.ndarr
 
 
 def _rows_above(camera: Camera, row: float) -> np.ndarray:
-    """Share (H, 1) of each row of pixels above an image row."""
+    """Measure the share (H, 1) of each row of pixels above an image row."""
     return np.clip(row - np.arange(camera.height), 0, 1)[:, None]
 
 
 def summary(items: list[dict]) -> dict:
-    """Means over all views; a part that neither truth nor labels have is None."""
+    """Average over all views; a part that neither truth nor labels have is None."""
     rows = [row for item in items for row in item["rows"]]
     seconds = [item["seconds"] for item in items if item["seconds"] is not None]
     return {

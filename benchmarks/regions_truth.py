@@ -1,4 +1,4 @@
-"""True labels and true mattes of the head alone, from the twin's geometry, and errors by them."""
+"""Render the twin's true labels and mattes of the head alone, and measure errors against them."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from express50.contract.segmentation_labels import LABELS
 from express50.geometry.cameras import Camera, resized
 from express50.twin.body import Material
 from express50.twin.truth import Truth
-from pipelines.regions.labels import SCALP, head_labels
+from pipelines.regions.geometry import SCALP, head_labels
 
 _PLAIN = {
     Material.EYE: "eyes", Material.TEETH: "teeth", Material.MOUTH: "mouth",
@@ -17,7 +17,7 @@ _PLAIN = {
 
 
 def true_labels(truth: Truth, subject: str, frame: int, camera: Camera) -> np.ndarray:
-    """Labels (H, W) uint8 of what each pixel's centre shows; skin between hairs counts as hair."""
+    """Label what each pixel's centre shows (H, W) uint8; skin between hairs counts as hair."""
     material, vertex = truth.surface(subject, frame, camera)
     found = head_labels(truth.head_model(subject)).vertices
     hairy = truth.hairiness(subject) > 0.5
@@ -35,7 +35,10 @@ def true_labels(truth: Truth, subject: str, frame: int, camera: Camera) -> np.nd
 def true_head_alpha(
     truth: Truth, subject: str, frame: int, camera: Camera, rays: int = 2
 ) -> np.ndarray:
-    """Share (H, W) of each pixel that shows the subject, but not the shirt; rays x rays a pixel."""
+    """Measure the share (H, W) of each pixel that shows the subject without the shirt.
+
+    Each pixel takes ``rays`` x ``rays`` rays.
+    """
     fine = resized(camera, camera.width * rays, camera.height * rays)
     material, _ = truth.surface(subject, frame, fine)
     head = ((material >= 0) & (material != Material.CLOTH)).astype(np.float32)
@@ -45,7 +48,7 @@ def true_head_alpha(
 def view_row(
     true: np.ndarray, true_alpha: np.ndarray, alpha: np.ndarray, labels: np.ndarray | None
 ) -> dict:
-    """Errors of a head matte (H, W), and pixels of each label in both and in either."""
+    """Measure a head matte (H, W), and count pixels of each label in both and in either."""
     both = either = np.zeros(len(LABELS), np.int64)
     if labels is not None:
         pairs = [(true == k, labels == k) for k in range(len(LABELS))]
@@ -56,7 +59,7 @@ def view_row(
 
 
 def iou_figures(rows: list[dict]) -> dict:
-    """IoU of each part over all pixels of views (of ``view_row``), and their mean.
+    """Compute IoU of each part over all pixels of views (of ``view_row``), and their mean.
 
     A part that neither truth nor labels have is None and does not count.
     """

@@ -1,4 +1,4 @@
-"""Labels of what each pixel of a peak frame shows, and the head's own matte without the torso."""
+"""The regions stage: labels of each pixel of a peak frame, and a matte of the head alone."""
 
 from __future__ import annotations
 
@@ -10,31 +10,46 @@ from pipelines.regions.config import PRESETS, RegionsConfig
 
 
 def items(dataset: Dataset) -> list[str]:
-    """List the items, see `pipelines.regions.stage`."""
-    from express50.capture.frames import peak_items as found
+    """List the expressions that have a peak frame."""
+    from express50.capture.frames import peak_items
 
-    return found(dataset)
+    return peak_items(dataset)
 
 
 def inputs(dataset: Dataset, item: str, config: RegionsConfig) -> dict[str, Path | str]:
-    """Name what one item reads, see `pipelines.regions.stage`."""
-    from pipelines.regions.stage import inputs as found
+    """List cameras, frames, track, mattes and depth maps of the expression, and the weights."""
+    from express50.capture.frames import frame_inputs, read_cameras_of
+    from express50.dataset.depth_files import depth_file
+    from express50.dataset.tracks import track_file
 
-    return found(dataset, item, config)
+    subject, expression = item.split("/")
+    found: dict[str, Path | str] = {
+        "cameras": dataset.item_dir("calibrate", subject) / "cameras.json",
+        **frame_inputs(dataset, subject, expression),
+        "track": track_file(dataset, subject),
+    }
+    for camera in read_cameras_of(dataset, subject):
+        matte = dataset.matte_file(subject, expression, camera)
+        depth = depth_file(dataset.item_dir("depth", item), camera)
+        found |= {f"matte {camera}": matte} if matte.is_file() else {}
+        found |= {f"depth {camera}": depth} if config.depth and depth else {}
+    if config.segmentation:
+        from pipelines.regions.sapiens import weights_file
 
-
-def run(dataset: Dataset, item: str, config: RegionsConfig, out: Path) -> Result | dict:
-    """Make one item, see `pipelines.regions.stage`."""
-    from pipelines.regions.stage import run as work
-
-    return work(dataset, item, config, out)
+        found["segmentation"] = weights_file(config.segmentation)
+    return found
 
 
 def needs_gpu(config: RegionsConfig) -> bool:
-    """Say whether a network must run on CUDA."""
-    from pipelines.regions.stage import needs_gpu as found
+    """Ask for a GPU if the network must run on one."""
+    return bool(config.segmentation) and config.device == "cuda"
 
-    return found(config)
+
+def run(dataset: Dataset, item: str, config: RegionsConfig, out: Path) -> Result:
+    """Label one expression."""
+    from pipelines.regions.stage import run as work
+
+    return work(dataset, item, config, out)
 
 
 STAGE = Stage(
@@ -46,8 +61,9 @@ STAGE = Stage(
     inputs=inputs,
     run=run,
     needs_gpu=needs_gpu,
-    help="label skin, hair, eyes, mouth, neck and torso; cut the head off the torso",
-    purpose="Labels of every pixel of a peak frame, and the head without the torso.",
+    help="label skin, hair, neck and torso in each view, and cut the torso from the matte",
+    purpose="The tracked mesh, each view's colours and depth label skin, ears, lips, eyes, mouth,"
+    " hair, neck and torso; a second matte holds the head alone.",
     growth=Growth(
         items=("subjects", "expressions"), time=("views", "pixels"), disk=("views", "pixels")
     ),

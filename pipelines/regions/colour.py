@@ -1,49 +1,69 @@
-"""Hair, skin or torso by colour, where geometry alone does not know.
+"""Tell hair, skin and torso apart by colour where geometry alone is not sure.
 
 Each view teaches itself: the pixels that geometry is sure of give a histogram of the colours of
-hair, of skin and of the torso; every other pixel takes the class of which its colour and its place
-say most (log-likelihood plus log-prior). Views from behind, where hair may cover all skin, learn
-half of the skin's colours from views of the face. So a collar before the neck is torso, and hair
-over a shoulder or over the forehead is hair, as far as their colours differ.
+hair, of skin and of the torso; every other pixel takes the class that its colour and its place make
+most likely (log-likelihood plus log-prior). Views from behind, where hair may cover all skin, learn
+half of the skin's colours from views of the face. So a collar in front of the neck is torso, and
+hair over a shoulder or over the forehead is hair, as far as their colours differ.
+
+The constants were set on the digital twin's four people; `benchmarks.regions` checks them.
 """
 
 from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
 from express50.contract.segmentation_labels import LABELS, label_mask
-from pipelines.regions.labels import SCALP
-from pipelines.regions.view import HAIR, TORSO, Geometry
+from pipelines.regions.geometry import HAIR, SCALP, TORSO, HeadGeometry
 
 SKIN, NECK, EARS = (np.uint8(LABELS.index(name)) for name in ("skin", "neck", "ears"))
-SOLID = 0.95  # alpha over which a pixel's colour is the subject's alone
-LEAST = 30  # pixels that make a histogram
-MOST = 10_000  # pixels that a share of all counts as
-FEATURES = 0.003  # share of the mesh that eyes and lips fill where a view sees the face
+
+# Histograms of Lab colours.
+CELLS, STEPS = (32, 64, 64), (8, 4, 4)  # 8-bit Lab in cells: light varies more than hue does
+SMOOTH = 1.5  # cells; a few hundred pixels fill a smooth histogram
+SOLID = 0.95  # alpha above which a pixel shows the subject's colour alone
+LEAST = 30  # fewest pixels that make a histogram
 ENOUGH = 300  # pixels of the face, with which the neck, which hair may cover, teaches nothing
-CELLS, STEPS = (32, 64, 64), (8, 4, 4)  # of Lab in 8 bits
-SMOOTH = 1.5  # cells
-RARE = 1e-6  # share of a cell that no pixel taught
-# Share of any cell of a class that taught nothing, as if its colours were spread over 8000 cells:
-# what is neither hair nor skin then is torso, though none was sure.
-UNTAUGHT = 1.2e-4
-CLIP = 5.0  # most, in nats, that a colour may say against a class
-BLUR_PX = 0.7  # a pixel's neighbours have a say
-# Metres: as sure of torso this far below the neck's end, of hair and skin this far over it.
-SURE_BELOW, SURE_HAIR, SURE_NECK = 0.01, 0.10, 0.04
-FADE = 0.02  # metres of height about the neck's end that count a nat for head or torso
-MOST_FADE = 8.0  # nats
-NEVER = -20.0
-# Log-priors of hair and skin on the mesh; torso is possible on the neck alone.
-_ON_MESH = {int(SKIN): (-2.0, 0.0), SCALP: (0.0, -1.0), int(EARS): (-1.0, 0.0),
-            int(NECK): (-0.5, 0.0)}  # fmt: skip
-TORSO_ON_NECK, HAIR_ON_RIM, SKIN_BEYOND = -1.0, -1.0, -6.0
+FEATURES = 0.003  # share of the mesh that eyes and lips fill where a view sees the face
+SHARED = 10_000  # pixels that own and other views' skin colours each count as, if both teach
+
+# Log-likelihoods, nats.
+RARE = 1e-6  # share of a cell that no pixel taught: keeps logarithms finite
+UNTAUGHT = 1.2e-4  # share of every cell of a class without pixels: spread over 8000 cells
+CLIP = 5.0  # most that a colour may say against a class: place must be able to overrule it
+BLUR_PX = 0.7  # neighbouring pixels have a say against noise
+
+# Places, metres above the neck's end, where geometry is sure of a class.
+SURE_TORSO, SURE_HAIR, SURE_NECK = -0.01, 0.10, 0.04
+
+# Log-priors by place, nats: UNLIKELY marks what occurs at edges, IMPOSSIBLE what cannot be.
+UNLIKELY, IMPOSSIBLE = -1.0, -20.0
+HAIR_ON_FACE, HAIR_ON_NECK = -2.0, -0.5  # fringes are rarer than hair over a neck
+SKIN_BEYOND = -6.0  # skin off the mesh's rim: the mesh would have to be centimetres off
+FADE, MOST_FADE = 0.02, 8.0  # metres of height per nat for head or torso; most nats
+# Hair and skin on the mesh; torso is possible on the neck alone.
+_ON_MESH = {
+    int(SKIN): (HAIR_ON_FACE, 0.0),
+    SCALP: (0.0, UNLIKELY),
+    int(EARS): (UNLIKELY, 0.0),
+    int(NECK): (HAIR_ON_NECK, 0.0),
+}
+
+# Bare scalps.
+PURE = 0.99  # alpha above which scalp and face are compared: strands leave less
+MOST = 4000  # pixels of scalp and of face that a view compares
+FLOOR = 2.0  # steps of Lab under which a spread of colours is noise
+ALIKE = 4.0  # spreads of the face's own colours from their middle
+BARE = 0.7  # share of the scalp in the face's colours that makes it bare
 
 
 def face_colours(rgb: np.ndarray, alpha: np.ndarray, mesh: np.ndarray) -> np.ndarray | None:
-    """Counts (CELLS) of the skin's colours in a view of the face; None in others.
+    """Count (CELLS) the skin's colours in a view of the face; None in other views.
 
     Args:
         rgb: (H, W, 3) uint8 sRGB.
@@ -62,67 +82,62 @@ def _sees_face(mesh: np.ndarray) -> bool:
 def by_colour(
     rgb: np.ndarray,
     alpha: np.ndarray,
-    geometry: Geometry,
+    geometry: HeadGeometry,
     bare: bool,
     skin_colours: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Labels (H, W) uint8 of geometry, those of hair, skin, ears, neck and torso by colour too.
+    """Label pixels (H, W) uint8 by geometry, and hair, skin, ears, neck and torso by colour too.
 
     Args:
         rgb: (H, W, 3) uint8 sRGB.
         alpha: (H, W) in [0, 1].
-        geometry: where the pixels are.
-        bare: whether the scalp is skin.
-        skin_colours: sum of what `face_colours` gave for other views.
+        geometry: places of the pixels.
+        bare: the scalp is skin.
+        skin_colours: sum of the counts of `face_colours` of other views.
     """
     labels, cells = geometry.labels(), _cells(rgb)
-    taught = _sure(labels, alpha > SOLID, geometry)
+    solid = alpha > SOLID
+    hair = solid & ((labels == SCALP) | ((labels == HAIR) & (geometry.height > SURE_HAIR)))
+    skin = solid & (geometry.mesh > 0) & (labels == SKIN)
+    if skin.sum() < ENOUGH:
+        skin = skin | (solid & (labels == NECK) & (geometry.height > SURE_NECK))
+    torso = solid & (labels == TORSO) & (geometry.height < SURE_TORSO)
     beyond = SKIN_BEYOND
     if bare:
         # No scalp teaches hair, and what juts out beyond the mesh is skin as likely.
         labels = np.where(labels == SCALP, SKIN, labels)
-        taught[0], beyond = np.zeros_like(taught[0]), 0.0
-    counts = [_counts(cells, mask) for mask in taught]
+        hair, beyond = np.zeros_like(hair), 0.0
+    counts = [_counts(cells, mask) for mask in (hair, skin, torso)]
     if skin_colours is not None and not bare and not _sees_face(geometry.mesh):
-        # As much of each: the back of a neck may stand in a shadow that no face stands in.
+        # As much of each: the back of a neck may be in a shadow that no face is in.
         own, others = (c / np.float32(max(c.sum(), 1.0)) for c in (counts[1], skin_colours))
-        counts[1] = MOST * (own + others)
+        counts[1] = SHARED * (own + others)
     best = (_likelihoods(cells, counts) + _priors(labels, geometry, beyond)).argmax(0)
     around = (geometry.mesh > 0) | geometry.rim | bare
     kept = np.isin(geometry.near, (SKIN, NECK, EARS)) & around
-    skin = np.where(kept, geometry.near, SKIN)
+    skin_label = np.where(kept, geometry.near, SKIN)
     unsure = (geometry.mesh == 0) | np.isin(geometry.mesh, list(_ON_MESH))
-    return np.where(unsure, np.choose(best, [HAIR, skin, TORSO]), labels).astype(np.uint8)
-
-
-def _sure(labels: np.ndarray, solid: np.ndarray, geometry: Geometry) -> list[np.ndarray]:
-    """Pixels (H, W) that teach the colours of hair, skin, torso."""
-    high, low = geometry.height > SURE_HAIR, geometry.height < -SURE_BELOW
-    hair = (labels == SCALP) | ((labels == HAIR) & high)
-    skin = solid & (geometry.mesh > 0) & (labels == SKIN)
-    if skin.sum() < ENOUGH:
-        skin = skin | (solid & (labels == NECK) & (geometry.height > SURE_NECK))
-    return [solid & hair, skin, solid & (labels == TORSO) & low]
+    return np.where(unsure, np.choose(best, [HAIR, skin_label, TORSO]), labels).astype(np.uint8)
 
 
 Cells = tuple[np.ndarray, ...]
 
 
 def _cells(rgb: np.ndarray) -> Cells:
-    """Cell of Lab, three indices (H, W) each, of pixels (H, W, 3)."""
+    """Find the cell of Lab, three indices (H, W), of each pixel (H, W, 3)."""
     lab = cv2.cvtColor(rgb, cv2.COLOR_RGB2LAB) // np.array(STEPS, np.uint8)
     return tuple(lab.transpose(2, 0, 1).astype(np.int64))
 
 
 def _counts(cells: Cells, mask: np.ndarray) -> np.ndarray:
-    """Pixels of a mask (H, W) in each of the CELLS."""
+    """Count the pixels of a mask (H, W) in each of the CELLS."""
     counts = np.zeros(CELLS, np.float32)
     np.add.at(counts, tuple(axis[mask] for axis in cells), 1)
     return counts
 
 
-def _likelihoods(cells: Cells, taught: list[np.ndarray]) -> np.ndarray:
-    """Log-likelihood (3, H, W) of each pixel's colour; any will do for what nothing taught."""
+def _likelihoods(cells: Cells, taught: Sequence[np.ndarray]) -> np.ndarray:
+    """Look up the log-likelihood (3, H, W) of each pixel's colour; untaught classes are flat."""
     says = np.full((3, *cells[0].shape), np.log(UNTAUGHT), np.float32)
     for row, counts in zip(says, taught, strict=True):
         if counts.sum() >= LEAST:
@@ -132,17 +147,62 @@ def _likelihoods(cells: Cells, taught: list[np.ndarray]) -> np.ndarray:
     return np.stack([cv2.GaussianBlur(row, (0, 0), BLUR_PX) for row in says])
 
 
-def _priors(labels: np.ndarray, geometry: Geometry, beyond: float) -> np.ndarray:
-    """Log-prior (3, H, W) of hair, skin and torso by place; `beyond` the rim, of skin."""
+def _priors(labels: np.ndarray, geometry: HeadGeometry, beyond: float) -> np.ndarray:
+    """Log-prior (3, H, W) of hair, skin and torso by place; `beyond` is skin's off the rim."""
     fade = np.clip(geometry.height / FADE, -MOST_FADE, MOST_FADE)
     above, below = np.maximum(fade, 0), np.minimum(fade, 0)
     on_mesh = geometry.mesh > 0
     skin_rim = geometry.rim & (geometry.near != SCALP)
-    hair = below + np.where(skin_rim, HAIR_ON_RIM, 0)
+    hair = below + np.where(skin_rim, UNLIKELY, 0)
     skin = below + np.where(skin_rim, 0, beyond)
-    torso = np.where(on_mesh, NEVER, -above)
+    torso = np.where(on_mesh, IMPOSSIBLE, -above)
     for label, (on_hair, on_skin) in _ON_MESH.items():
         here = on_mesh & (labels == label)
         hair, skin = np.where(here, on_hair, hair), np.where(here, on_skin, skin)
-    torso = np.where(on_mesh & (labels == NECK), TORSO_ON_NECK - above, torso)
+    torso = np.where(on_mesh & (labels == NECK), UNLIKELY - above, torso)
     return np.stack([hair, skin, torso])
+
+
+@dataclass(frozen=True)
+class Scalp:
+    """The scalp's state, and the share of it in the face's colours; None: unknown."""
+
+    is_skin: bool
+    skin_coloured: float | None
+
+
+def scalp_votes(rgb: np.ndarray, labels: np.ndarray, alpha: np.ndarray) -> tuple[int, int]:
+    """Count the pixels of scalp compared with the view's own face, and those of its colours.
+
+    A view is compared with itself, so that no other camera's gain or light plays a part.
+
+    Args:
+        rgb: (H, W, 3) uint8 sRGB.
+        labels: (H, W) of the mesh, SCALP among them.
+        alpha: (H, W) in [0, 1].
+    """
+
+    def evenly(rows: np.ndarray) -> np.ndarray:
+        chosen = np.linspace(0, len(rows) - 1, MOST).astype(int)
+        return rows[np.unique(chosen)] if len(rows) else rows
+
+    lab = cv2.cvtColor(rgb, cv2.COLOR_RGB2LAB)
+    skin, scalp = (
+        evenly(lab[(labels == label) & (alpha > PURE)].astype(np.float32))
+        for label in (SKIN, SCALP)
+    )
+    if min(len(skin), len(scalp)) < LEAST:
+        return 0, 0
+    middle = np.median(skin, axis=0)
+    spread = np.maximum(1.4826 * np.median(np.abs(skin - middle), axis=0), FLOOR)
+    away = np.sqrt((((scalp - middle) / spread) ** 2).sum(1))
+    return len(scalp), int((away < ALIKE).sum())
+
+
+def decide(votes: Sequence[tuple[int, int]]) -> Scalp:
+    """Call the scalp bare where most of the compared pixels have the face's colours."""
+    compared = sum(count for count, _ in votes)
+    if not compared:
+        return Scalp(False, None)
+    share = round(sum(alike for _, alike in votes) / compared, 4)
+    return Scalp(share > BARE, share)

@@ -1,17 +1,19 @@
-"""Parts of the body by the user's segmentation network.
+"""Label parts of the body by the user's segmentation network.
 
-Sapiens (Khirodkar et al. 2024), body-part segmentation as TorchScript: RGB at 1024 x 768 less a
-mean and over a deviation in 8-bit steps, scores of 28 classes out (its ``lite/demo/vis_seg.py``
-and ``docs/SEG_README.md``). Face and neck are one class there.
+Sapiens (Khirodkar et al. 2024), body-part segmentation as TorchScript: RGB at 1024 x 768 minus a
+mean and divided by a deviation in 8-bit steps in, scores of 28 classes out (its
+``lite/demo/vis_seg.py`` and ``docs/SEG_README.md``). Face and neck are one class there.
 """
 
 from __future__ import annotations
+
+from pathlib import Path
 
 import cv2
 import numpy as np
 
 from express50.contract.segmentation_labels import LABELS, label_mask
-from pipelines.networks import Network, Role, resized
+from pipelines.networks import Network, Role, check_file, load_network, resized
 
 SAPIENS = Role(setting="regions.segmentation", inputs=("image",))
 HEIGHT, WIDTH = 1024, 768
@@ -26,11 +28,27 @@ LABEL_OF_CLASS = np.array(
 )
 
 
-def segment(network: Network, frame: np.ndarray) -> np.ndarray:
-    """Labels (H, W) uint8, indices into LABELS, of a frame (H, W, 3) uint8.
+def weights_file(segmentation: str) -> Path:
+    """Find the file of weights that the setting names.
 
     Raises:
-        StageError: the network failed, or gave other than 28 finite scores a pixel.
+        ConfigError: there is no such file.
+    """
+    path = Path(segmentation).expanduser()
+    check_file(path, "regions.segmentation")
+    return path
+
+
+def network_labels(segmentation: str, frame: np.ndarray, mesh: np.ndarray) -> np.ndarray:
+    """Label a frame (H, W, 3) by the network in a file, refined by the mesh's labels (H, W)."""
+    return refined(segment(load_network(weights_file(segmentation), SAPIENS), frame), mesh)
+
+
+def segment(network: Network, frame: np.ndarray) -> np.ndarray:
+    """Label a frame (H, W, 3) uint8: indices (H, W) uint8 into LABELS.
+
+    Raises:
+        StageError: the network failed, or did not give 28 finite scores per pixel.
     """
     height, width = network.size or (HEIGHT, WIDTH)
     small = cv2.resize(frame, (width, height), interpolation=cv2.INTER_LINEAR)
@@ -41,7 +59,7 @@ def segment(network: Network, frame: np.ndarray) -> np.ndarray:
         )
     best = np.full(frame.shape[:2], -np.inf, np.float32)
     labels = np.zeros(frame.shape[:2], np.uint8)
-    # Class by class: 28 scores a pixel of a 4K frame would take a gigabyte.
+    # Class by class: 28 scores per pixel of a 4K frame would take a gigabyte.
     for part, score in zip(LABEL_OF_CLASS, scores, strict=True):
         large = resized(score, *frame.shape[:2])
         wins = large > best
@@ -51,7 +69,7 @@ def segment(network: Network, frame: np.ndarray) -> np.ndarray:
 
 
 def refined(labels: np.ndarray, mesh: np.ndarray) -> np.ndarray:
-    """Labels (H, W) of the network with what the mesh's (H, W) tell of the skin it found.
+    """Refine the network's labels (H, W): its skin takes the finer labels (H, W) of the mesh.
 
     The network has no eyes, ears and neck, and an inner mouth only where it shows teeth or tongue.
     """

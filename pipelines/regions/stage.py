@@ -1,104 +1,194 @@
-"""The regions stage: one expression of one subject, labels and a head matte for every camera."""
+"""Label one expression of one subject: parts and a matte of the head in every camera."""
 
 from __future__ import annotations
 
 import contextlib
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 
 import cv2
 import numpy as np
 
-from express50.capture.frames import frame_inputs, read_cameras_of
+from express50.capture.frames import read_cameras_of, read_peak_frame
 from express50.contract.layout import Dataset
-from express50.dataset.depth_files import depth_file
-from express50.dataset.tracks import track_file
+from express50.contract.stage import Note, Result
+from express50.dataset.depth_files import depth_file, read_depth
+from express50.dataset.tracks import read_track, track_file
 from express50.errors import CaptureError, FormatError, StageError
-from express50.files.images import contact_sheet, fit_into, resize_area, write_image
+from express50.files.images import read_alpha, resize_area, write_image
 from express50.geometry.cameras import Camera, resized
-from pipelines.regions.colour import SKIN, by_colour, face_colours
+from express50.head.load import load_head
+from pipelines.regions.colour import SKIN, Scalp, by_colour, decide, face_colours, scalp_votes
 from pipelines.regions.config import RegionsConfig
-from pipelines.regions.labels import SCALP, HeadLabels
-from pipelines.regions.mesh import TrackedHead, see
-from pipelines.regions.qc import (
+from pipelines.regions.geometry import (
+    HAIR,
+    SCALP,
+    HeadLabels,
+    TrackedHead,
+    head_alpha,
+    head_labels,
+    make_head,
+    place,
+    see,
+)
+from pipelines.regions.outputs import (
     label_shares,
-    legend,
     mesh_fit,
     picture_row,
-    subject_box,
     view_warning,
+    write_picture,
 )
-from pipelines.regions.read import read_depth_of, read_head, read_pair
-from pipelines.regions.scalp import Scalp, decide, scalp_votes
-from pipelines.regions.view import HAIR, head_alpha, place
 
-TILE = (260, 260)
-FACE = ("skin", "lips", "eyes")
-VOTERS, VOTING_SIDE = 4, 512  # cameras, and their pixels, that tell skin and bare scalps
+VOTERS, VOTING_SIDE = 4, 512  # cameras, and their pixels, that show skin colours and bare scalps
+UNREADABLE = (CaptureError, FormatError, StageError)
+
+Frames = dict[str, tuple[np.ndarray, np.ndarray]]
+"""Frames (H, W, 3) uint8 and mattes (H, W) float32 by camera."""
 
 
 @dataclass(frozen=True)
-class Seen:
-    """One camera's labels (h, w) at the working size, and where the mesh is (h, w)."""
+class ViewLabels:
+    """One camera's labels (h, w) at the working size, and the mesh's silhouette (h, w) bool."""
 
     labels: np.ndarray
     mesh: np.ndarray
 
 
-def inputs(dataset: Dataset, item: str, config: RegionsConfig) -> dict[str, Path | str]:
-    """Cameras, frames, track, mattes and depth maps of the expression, and the weights."""
-    subject, expression = item.split("/")
-    found: dict[str, Path | str] = {
-        "cameras": dataset.item_dir("calibrate", subject) / "cameras.json",
-        **frame_inputs(dataset, subject, expression),
-        "track": track_file(dataset, subject),
-    }
-    for camera in read_cameras_of(dataset, subject):
-        matte = dataset.matte_file(subject, expression, camera)
-        depth = depth_file(dataset.item_dir("depth", item), camera)
-        found |= {f"matte {camera}": matte} if matte.is_file() else {}
-        found |= {f"depth {camera}": depth} if config.depth and depth else {}
-    if config.segmentation:
-        found["segmentation"] = _weights(config)
-    return found
-
-
-def run(dataset: Dataset, item: str, config: RegionsConfig, out: Path) -> dict:
-    """Write labels and the head's matte for each camera, and a picture; returns shares of parts."""
-    cv2.setNumThreads(1)  # the runner counts one core an item
+def run(dataset: Dataset, item: str, config: RegionsConfig, out: Path) -> Result:
+    """Write labels and the head's matte for each camera, and a contact sheet."""
+    cv2.setNumThreads(1)  # the runner counts one core per item
+    side, use_depth, weights = config.image_side, config.depth, config.segmentation
     subject, expression = item.split("/")
     head = read_head(dataset, subject, expression)
-    scalp, skin, read = _person(dataset, item, head, config)
+    scalp, skin, frames = study_person(dataset, item, head)
+    if config.scalp != "auto":
+        scalp = replace(scalp, is_skin=config.scalp == "skin")
     figures, rows = {}, {}
     dropped = []
     for name, camera in read_cameras_of(dataset, subject).items():
         try:
-            known = read.pop(name, None)
+            known = frames.pop(name) if name in frames else None
             rgb, alpha = known or read_pair(dataset, item, camera)
-            depth = read_depth_of(dataset, item, camera, config)
-        except (CaptureError, FormatError, StageError) as error:
-            dropped.append({"what": name, "why": str(error)})
+            depth = read_depth_of(dataset, item, camera) if use_depth else None
+        except UNREADABLE as error:
+            dropped.append(Note(name, str(error)))
             continue
-        small = look(head, camera, rgb, alpha, depth, scalp.is_skin, config, skin)
-        figures[name], rows[name] = _finish(out, name, rgb, alpha, small, config)
+        view = label_view(head, camera, rgb, alpha, depth, scalp.is_skin, side, skin)
+        figures[name], rows[name] = _write_view(out, name, rgb, alpha, view, weights)
     if not figures:
-        why = "; ".join(f"{row['what']}: {row['why']}" for row in dropped[:3])
+        why = "; ".join(f"{note.what}: {note.why}" for note in dropped[:3])
         raise StageError(f"{item}: no camera has a matte to label ({why}); run 'express50 matte'")
-    shares = {name: row["labels"] for name, row in figures.items()}
-    _write_picture(out, rows, shares, config.qc_views)
-    return _metrics(head.labels, figures, scalp, config, dropped)
+    write_picture(out, rows, figures)
+    doubts = {name: view_warning(row) for name, row in figures.items()}
+    warnings = [Note(name, why) for name, why in doubts.items() if why]
+    if "torso" in head.labels.missing and not weights:
+        why = "the head model does not mark the neck's end, so that the torso cannot be cut off"
+        warnings.append(Note("torso", why))
+    there = [row["mesh_in_matte"] for row in figures.values() if row["mesh_in_frame"]]
+    metrics = {
+        "method": "network and mesh" if weights else "mesh",
+        "missing": list(head.labels.missing),
+        "scalp": {
+            "label": "skin" if scalp.is_skin else "hair",
+            "skin_coloured": scalp.skin_coloured,
+        },
+        "mesh_in_matte": round(float(np.mean(there)) if there else 0.0, 4),
+        "cameras": figures,
+    }
+    return Result(metrics, dropped, warnings)
 
 
-def look(
+def read_head(dataset: Dataset, subject: str, expression: str) -> TrackedHead:
+    """Read the tracked mesh of one expression.
+
+    Raises:
+        StageError: the subject or the expression is not tracked.
+        FormatError: the track does not fit its head model, or is not finite.
+    """
+    path = track_file(dataset, subject)
+    track = read_track(path)
+    row, labels = track.row(expression), _labels_of(track.head)
+    vertices = track.vertices[row].astype(np.float64)
+    if vertices.shape != (len(labels.vertices), 3):
+        raise FormatError(
+            f"{path}: vertices {vertices.shape}, expected ({len(labels.vertices)}, 3) of its head"
+            " model; run 'express50 track' again"
+        )
+    return make_head(vertices, track.R[row], labels)
+
+
+@lru_cache(maxsize=2)
+def _labels_of(head: str) -> HeadLabels:
+    return head_labels(load_head(head))
+
+
+def read_pair(dataset: Dataset, item: str, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """Read the undistorted frame (H, W, 3) uint8 and alpha (H, W) float32 of one camera.
+
+    Raises:
+        StageError: it has no matte.
+        FormatError: the matte is not an 8-bit grey image of the camera's size.
+        CaptureError: the frame cannot be read.
+    """
+    subject, expression = item.split("/")
+    path = dataset.matte_file(subject, expression, camera.id)
+    if not path.is_file():
+        raise StageError("it has no matte")
+    matte = read_alpha(path)
+    if matte.shape != (camera.height, camera.width):
+        raise FormatError(
+            f"{path}: {matte.shape[1]}x{matte.shape[0]}, expected the camera's"
+            f" {camera.width}x{camera.height}; run 'express50 matte' again"
+        )
+    rgb = read_peak_frame(dataset, subject, expression, camera.id)
+    return rgb, matte.astype(np.float32) / 255
+
+
+def read_depth_of(dataset: Dataset, item: str, camera: Camera) -> np.ndarray | None:
+    """Read depth (H, W) metres, 0 where unknown, if there is a map.
+
+    Raises:
+        FormatError: it is not a depth map of the camera's size.
+    """
+    path = depth_file(dataset.item_dir("depth", item), camera.id)
+    if path is None:
+        return None
+    depth, _ = read_depth(path)
+    if depth.shape != (camera.height, camera.width):
+        raise FormatError(
+            f"{path}: {depth.shape}, expected the camera's {camera.width}x{camera.height}; run"
+            " 'express50 depth' again"
+        )
+    return depth
+
+
+def study_person(
+    dataset: Dataset, item: str, head: TrackedHead
+) -> tuple[Scalp, np.ndarray | None, Frames]:
+    """Judge the scalp and count the skin's colours in a few cameras; return their frames too."""
+    cameras = list(read_cameras_of(dataset, item.split("/")[0]).values())
+    votes, colours, frames = [], [], Frames()
+    for k in np.unique(np.linspace(0, len(cameras) - 1, VOTERS).round().astype(int)):
+        with contextlib.suppress(*UNREADABLE):  # the stage names them
+            rgb, alpha = frames[cameras[k].id] = read_pair(dataset, item, cameras[k])
+            camera, rgb, alpha, _ = _shrunk(cameras[k], rgb, alpha, None, VOTING_SIDE)
+            mesh, _ = see(head, camera)
+            votes.append(scalp_votes(rgb, mesh, alpha))
+            colours += [c for c in (face_colours(rgb, alpha, mesh),) if c is not None]
+    return decide(votes), sum(colours[1:], colours[0]) if colours else None, frames
+
+
+def label_view(
     head: TrackedHead,
     camera: Camera,
     rgb: np.ndarray,
     alpha: np.ndarray,
     depth: np.ndarray | None,
     bare: bool,
-    config: RegionsConfig,
+    side: int = RegionsConfig.image_side,
     skin_colours: np.ndarray | None = None,
-) -> Seen:
+) -> ViewLabels:
     """Label one camera at the working size.
 
     Args:
@@ -107,23 +197,21 @@ def look(
         rgb: (H, W, 3) uint8.
         alpha: (H, W) float32 in [0, 1].
         depth: (H, W) metres, 0 where unknown; or None.
-        bare: whether the scalp is skin.
-        config: the stage's.
+        bare: the scalp is skin.
+        side: longest side, pixels, of the labels.
         skin_colours: of views of the face (``colour.face_colours``).
     """
-    camera, rgb, alpha, depth = _shrunk(camera, rgb, alpha, depth, config.image_side)
-    geometry = place(head, camera, alpha, depth, 1e-3 * config.rim_mm)
-    labels = geometry.labels()
-    if config.colour:
-        labels = by_colour(rgb, alpha, geometry, bare, skin_colours)
+    camera, rgb, alpha, depth = _shrunk(camera, rgb, alpha, depth, side)
+    geometry = place(head, camera, alpha, depth)
+    labels = by_colour(rgb, alpha, geometry, bare, skin_colours)
     labels = np.where(labels == SCALP, SKIN if bare else HAIR, labels)
-    return Seen(np.where(alpha > 0, labels, np.uint8(0)), geometry.mesh > 0)
+    return ViewLabels(np.where(alpha > 0, labels, np.uint8(0)), geometry.mesh > 0)
 
 
 def _shrunk(
     camera: Camera, rgb: np.ndarray, alpha: np.ndarray, depth: np.ndarray | None, side: int
 ) -> tuple[Camera, np.ndarray, np.ndarray, np.ndarray | None]:
-    """Camera, frame, matte and depth map with at most `side` pixels along the longer side."""
+    """Reduce camera, frame, matte and depth map to at most `side` pixels on the longer side."""
     scale = side / max(camera.width, camera.height)
     if scale >= 1:
         return camera, rgb, alpha, depth
@@ -134,50 +222,20 @@ def _shrunk(
     return resized(camera, width, height), rgb, alpha, depth
 
 
-Frames = dict[str, tuple[np.ndarray, np.ndarray]]
-
-
-def _person(
-    dataset: Dataset, item: str, head: TrackedHead, config: RegionsConfig
-) -> tuple[Scalp, np.ndarray | None, Frames]:
-    """Whether the scalp is skin, the skin's colours, by a few cameras; and what these showed."""
-    cameras = list(read_cameras_of(dataset, item.split("/")[0]).values())
-    votes, colours, read = [], [], Frames()
-    for k in np.unique(np.linspace(0, len(cameras) - 1, VOTERS).round().astype(int)):
-        with contextlib.suppress(CaptureError, FormatError, StageError):  # the run names them
-            rgb, alpha = read[cameras[k].id] = read_pair(dataset, item, cameras[k])
-            camera, rgb, alpha, _ = _shrunk(cameras[k], rgb, alpha, None, VOTING_SIDE)
-            mesh = see(head, camera)[0]
-            votes.append(scalp_votes(rgb, mesh, alpha))
-            colours += [c for c in (face_colours(rgb, alpha, mesh),) if c is not None]
-    scalp = decide(votes)
-    if config.scalp != "auto":
-        scalp = replace(scalp, is_skin=config.scalp == "skin")
-    return scalp, sum(colours[1:], colours[0]) if colours else None, read
-
-
-def _weights(config: RegionsConfig) -> Path:
-    path = Path(config.segmentation).expanduser()
-    from pipelines.networks import check_file  # torch takes seconds to import
-
-    check_file(path, "regions.segmentation")
-    return path
-
-
-def _finish(
-    out: Path, name: str, rgb: np.ndarray, alpha: np.ndarray, small: Seen, config: RegionsConfig
+def _write_view(
+    out: Path, name: str, rgb: np.ndarray, alpha: np.ndarray, view: ViewLabels, weights: str
 ) -> tuple[dict, list[np.ndarray]]:
-    """Write one camera's labels and head matte at full size; figures and a row of pictures."""
-    labels = small.labels
-    size = alpha.shape[1], alpha.shape[0]
-    large = cv2.resize(labels, size, interpolation=cv2.INTER_NEAREST_EXACT)
-    mesh = cv2.resize(small.mesh.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST_EXACT) > 0
-    if config.segmentation:
-        # Only here, as torch takes seconds to import.
-        from pipelines.networks import load_network
-        from pipelines.regions.sapiens import SAPIENS, refined, segment
+    """Write one camera's labels and head matte at full size; return figures and pictures."""
 
-        labels = large = refined(segment(load_network(_weights(config), SAPIENS), rgb), large)
+    def enlarged(image: np.ndarray) -> np.ndarray:
+        return cv2.resize(image, alpha.shape[::-1], interpolation=cv2.INTER_NEAREST_EXACT)
+
+    labels, large = view.labels, enlarged(view.labels)
+    mesh = enlarged(view.mesh.astype(np.uint8)) > 0
+    if weights:
+        from pipelines.regions.sapiens import network_labels  # torch takes seconds to import
+
+        labels = large = network_labels(weights, rgb, large)
     else:
         large = np.where(alpha > 0.5, large, np.uint8(0))
     head = head_alpha(alpha, labels)
@@ -189,56 +247,4 @@ def _finish(
         "mesh_in_frame": bool(mesh.any()),
         **mesh_fit(mesh, alpha, head),
     }
-    pictures = picture_row(rgb, large, head, subject_box(large))
-    return figures, [fit_into(picture, *TILE) for picture in pictures]
-
-
-def _write_picture(
-    out: Path, rows: dict[str, list[np.ndarray]], shares: dict[str, dict], count: int
-) -> None:
-    """Contact sheet of cameras from front to back: frame, labels, head alone; and a legend."""
-    names = sorted(rows, key=lambda name: -sum(shares[name][part] for part in FACE))
-    chosen = np.unique(np.linspace(0, len(names) - 1, count).round().astype(int))
-    pairs = [[names[k] for k in chosen[start : start + 2]] for start in range(0, len(chosen), 2)]
-    sheet = contact_sheet(
-        [[picture for name in pair for picture in rows[name]] for pair in pairs],
-        [", ".join(pair) for pair in pairs],
-        tile=TILE,
-    )
-    (out / "qc").mkdir()
-    sheet = np.concatenate([legend(sheet.shape[1]), sheet])
-    write_image(out / "qc" / "regions.jpg", sheet, quality=90)
-
-
-def _metrics(
-    labels: HeadLabels,
-    figures: dict[str, dict],
-    scalp: Scalp,
-    config: RegionsConfig,
-    dropped: list[dict],
-) -> dict:
-    """Figures of the item; means are over the cameras that have the head in their image."""
-    odd = {name: view_warning(row, config.agreement) for name, row in figures.items()}
-    warned = [{"what": name, "why": why} for name, why in odd.items() if why]
-    if "torso" in labels.missing and not config.segmentation:
-        why = "the head model has no boundary, so that nothing tells torso from head: it is kept"
-        warned.append({"what": "torso", "why": why})
-    there = [row for row in figures.values() if row["mesh_in_frame"]]
-    share = float(np.mean([row["mesh_in_matte"] for row in there])) if there else 0.0
-    return {
-        "method": "network and mesh" if config.segmentation else "mesh",
-        "missing": list(labels.missing),
-        "scalp": {
-            "label": "skin" if scalp.is_skin else "hair",
-            "skin_coloured": scalp.skin_coloured,
-        },
-        "mesh_in_matte": round(share, 4),
-        "cameras": figures,
-        "warnings": warned,
-        "dropped": dropped,
-    }
-
-
-def needs_gpu(config: RegionsConfig) -> bool:
-    """Whether the network must run on CUDA."""
-    return bool(config.segmentation) and config.device == "cuda"
+    return figures, picture_row(rgb, large, head)

@@ -1,4 +1,4 @@
-"""The built-in head with a shirt and hair of plain shapes, ray-cast: views of known parts."""
+"""Ray-cast the built-in head with a shirt and hair of plain shapes: views of known parts."""
 
 from __future__ import annotations
 
@@ -14,8 +14,7 @@ from express50.geometry.transforms import look_at
 from express50.head.load import load_head
 from express50.head.model import pose
 from express50.twin.surface import MISS, Caster
-from pipelines.regions.labels import SCALP, head_labels
-from pipelines.regions.mesh import TrackedHead, make_head
+from pipelines.regions.geometry import SCALP, TrackedHead, head_labels, make_head
 
 COLOURS = {"skin": (205, 160, 140), "hair": (60, 40, 30), "torso": (70, 110, 170)}
 SHIRT_TOP = -0.17  # metres, head space: over the neck's end, so that it hides some neck
@@ -36,7 +35,7 @@ class RegionScene:
 
 @lru_cache(maxsize=4)
 def tracked(jaw: float = 0.0, offset: tuple[float, float, float] = (0, 0, 0)) -> TrackedHead:
-    """The built-in head with its jaw opened by so many radians, moved by an offset, metres."""
+    """Pose the built-in head: its jaw opened, radians, and moved by an offset, metres."""
     model = load_head("procedural")
     none = torch.zeros(1, 1)
     vertices = pose(model, none, none, jaw=torch.tensor([[jaw, 0.0, 0.0]]))[0].double().numpy()
@@ -47,7 +46,7 @@ def camera_at(
     azimuth_deg: float, size: int = 160, distance: float = 1.0, rise: float = 0.05,
     offset: tuple[float, float, float] = (0, 0, 0),
 ) -> Camera:  # fmt: skip
-    """A camera around the head that sees 45 cm of it."""
+    """Place a camera around the head that sees 45 cm of it."""
     angle = np.radians(azimuth_deg)
     target = np.array([0.0, -0.04, 0.0]) + offset
     eye = target + distance * np.array([np.sin(angle), rise, np.cos(angle)])
@@ -57,7 +56,7 @@ def camera_at(
 
 
 def shirt() -> tuple[np.ndarray, np.ndarray]:
-    """A tube around the neck that opens into shoulders: vertices (N, 3) and faces (M, 3)."""
+    """Make a tube around the neck that opens into shoulders: vertices (N, 3), faces (M, 3)."""
     around, s = np.meshgrid(np.linspace(0, 2 * np.pi, 49)[:-1], np.linspace(0, 1, 9))
     width = 0.075 + (SHIRT_RADII[0] - 0.075) * s
     deep = 0.085 + (SHIRT_RADII[1] - 0.085) * s
@@ -71,7 +70,7 @@ def shirt() -> tuple[np.ndarray, np.ndarray]:
 
 
 def locks(head: TrackedHead) -> tuple[np.ndarray, np.ndarray]:
-    """A cap of hair over the scalp, and one lock that falls over the left shoulder."""
+    """Make a cap of hair over the scalp, and one lock that falls over the left shoulder."""
     scalp = head.labels.vertices == SCALP
     cap = head.labels.faces[scalp[head.labels.faces].all(1)]
     middle = np.array([0.0, 0.03, -0.01])

@@ -1,0 +1,275 @@
+"""Label the pixels of a view by the tracked head's geometry, and cut the torso from its matte."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import open3d as o3d
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+
+from express50.contract.segmentation_labels import HEAD, LABELS, label_mask
+from express50.files.images import edge_distance
+from express50.geometry.cameras import Camera, crop_camera, project, rays, unproject
+from express50.geometry.conventions import opencv_pixels_to_corner
+from express50.geometry.raycast import mesh_scene
+from express50.head.model import HeadModel
+
+SCALP = len(LABELS)
+"""Skin that may bear hair: a label of the mesh alone, never written."""
+HAIR, TORSO = np.uint8(LABELS.index("hair")), np.uint8(LABELS.index("torso"))
+BEARINGS = 36  # around the neck, at which the height of its lower end is known
+RIM_M = 0.005  # what juts out this far beyond the mesh is still what the mesh shows there
+# Sheets that are seen from outside only; from inside one looks through the neck's open end.
+_OUTER = tuple(LABELS.index(name) for name in ("skin", "ears", "lips", "neck")) + (SCALP,)
+
+# Later rows win: lids and lips are skin to some models, teeth are mouth to others.
+_REGIONS = (
+    ("neck", ("neck", "boundary")),
+    ("skin", ("face", "forehead", "nose", "left_eye_region", "right_eye_region")),
+    ("ears", ("left_ear", "right_ear")),
+    ("lips", ("lips",)),
+    ("mouth", ("mouth_interior",)),
+    ("tongue", ("tongue",)),
+    ("teeth", ("teeth", "upper_teeth", "lower_teeth")),
+    ("eyes", ("left_eyeball", "right_eyeball")),
+)
+
+
+@dataclass(frozen=True)
+class HeadLabels:
+    """The labels of a head model.
+
+    Attributes:
+        faces: (F, 3) that can be seen; sheets without any region (lash cards) are left out.
+        vertices: (V,) uint8 indices into LABELS, or SCALP.
+        end: (n,) indices of the vertices around the neck's lower end; empty if unknown.
+        missing: names of LABELS that the model cannot give.
+    """
+
+    faces: np.ndarray
+    vertices: np.ndarray
+    end: np.ndarray
+    missing: tuple[str, ...]
+
+
+def head_labels(model: HeadModel) -> HeadLabels:
+    """Label a model's vertices by its regions; a vertex without one is skin."""
+    masks = {name: mask.cpu().numpy() for name, mask in model.regions.items()}
+    none = np.zeros(len(model.template), bool)
+    scalp = masks.get("scalp", none)
+    labels = np.where(scalp, SCALP, LABELS.index("skin")).astype(np.uint8)
+    for label, names in _REGIONS:
+        for name in names:
+            labels[masks.get(name, none)] = LABELS.index(label)
+    faces = model.faces.cpu().numpy()
+    present = set(np.unique(labels[faces]).tolist()) | {LABELS.index("background")}
+    by_mesh = [label for label, _ in _REGIONS if LABELS.index(label) not in present]
+    end = np.flatnonzero(masks.get("boundary", none))
+    missing = [*by_mesh, *(["torso"] if len(end) < 3 else [])]
+    named = np.any(list(masks.values()), axis=0) if masks else ~none
+    return HeadLabels(faces[_named_sheets(faces, named)], labels, end, tuple(missing))
+
+
+def _named_sheets(faces: np.ndarray, named: np.ndarray) -> np.ndarray:
+    """Mark the faces (F,) of connected sheets that hold a vertex of a region."""
+    count = len(named)
+    edges = np.concatenate([faces[:, :2], faces[:, 1:]])
+    graph = coo_matrix((np.ones(len(edges), np.int8), edges.T), shape=(count, count))
+    _, sheet = connected_components(graph, directed=False)
+    kept = np.zeros(sheet.max() + 1, bool)
+    kept[sheet[named]] = True
+    return kept[sheet[faces[:, 0]]]
+
+
+@dataclass(frozen=True)
+class NeckEnd:
+    """The neck's lower end: a height by bearing, in axes of the head, level beyond the neck.
+
+    Attributes:
+        center: (3,) middle of the end, world.
+        R: (3, 3) world from head axes; y up.
+        heights: (BEARINGS,) metres above the middle.
+    """
+
+    center: np.ndarray
+    R: np.ndarray
+    heights: np.ndarray
+
+    def height(self, points: np.ndarray) -> np.ndarray:
+        """Measure metres (N,) of points (N, 3), world, above the end; negative below."""
+        x, y, z = ((points - self.center) @ self.R).T
+        place = np.arctan2(z, x) / (2 * np.pi) * BEARINGS
+        return y - np.interp(place, np.arange(BEARINGS), self.heights, period=BEARINGS)
+
+
+@dataclass(frozen=True)
+class TrackedHead:
+    """One expression's mesh, ready to be seen.
+
+    Attributes:
+        vertices: (V, 3) world, metres.
+        labels: the head model's.
+        end: the neck's lower end; None if the model does not mark it.
+        center: (3,) origin of the scene, so that far subjects lose no digits.
+        scene: for casting rays.
+    """
+
+    vertices: np.ndarray
+    labels: HeadLabels
+    end: NeckEnd | None
+    center: np.ndarray
+    scene: o3d.t.geometry.RaycastingScene
+
+
+def make_head(vertices: np.ndarray, R: np.ndarray, labels: HeadLabels) -> TrackedHead:
+    """Make a head of tracked vertices (V, 3), world, and its rotation (3, 3), world from head."""
+    center = vertices.mean(0)
+    scene = mesh_scene(vertices - center, labels.faces)
+    if "torso" in labels.missing:
+        return TrackedHead(vertices, labels, None, center, scene)
+    loop = vertices[labels.end]
+    middle = 0.5 * (loop.min(0) + loop.max(0))
+    x, y, z = ((loop - middle) @ R).T
+    place = np.arctan2(z, x) / (2 * np.pi) * BEARINGS
+    order = np.argsort(place, kind="stable")
+    heights = np.interp(np.arange(BEARINGS), place[order], y[order], period=BEARINGS)
+    return TrackedHead(vertices, labels, NeckEnd(middle, R, heights), center, scene)
+
+
+def see(head: TrackedHead, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """Cast a pinhole camera's rays at a head alone.
+
+    Returns:
+        labels (H, W) uint8 and depth (H, W) float32, camera z, metres; both 0 beside the head.
+    """
+    labels = np.zeros((camera.height, camera.width), np.uint8)
+    depth = np.zeros(labels.shape, np.float32)
+    x0, y0, x1, y1 = _window(head.vertices, camera)
+    if x1 <= x0 or y1 <= y0:
+        return labels, depth
+    origin, directions = rays(crop_camera(camera, x0, y0, x1 - x0, y1 - y0))
+    row = np.concatenate(
+        [np.broadcast_to(origin - head.center, directions.shape), directions], axis=-1
+    )
+    hits = head.scene.cast_rays(o3d.core.Tensor(row.astype(np.float32)), nthreads=1)
+    distance = hits["t_hit"].numpy()
+    hit = np.isfinite(distance) & (distance > 0)
+    u, v = hits["primitive_uvs"].numpy()[hit].T
+    corner = np.stack([1 - u - v, u, v], axis=1).argmax(1)
+    vertex = head.labels.faces[hits["primitive_ids"].numpy()[hit], corner]
+    found = head.labels.vertices[vertex]
+    away = (hits["primitive_normals"].numpy()[hit] * directions[hit]).sum(1) > 0
+    found = np.where(away & np.isin(found, _OUTER), np.uint8(0), found)
+    window = np.s_[y0:y1, x0:x1]
+    labels[window][hit] = found
+    depth[window][hit] = np.where(found > 0, distance[hit], 0)
+    return labels, depth
+
+
+def _window(vertices: np.ndarray, camera: Camera) -> tuple[int, int, int, int]:
+    """Find the window x0, y0, x1, y1 of the image outside of which no ray meets the vertices."""
+    pixels, depth = project(camera, vertices)
+    size = np.array([camera.width, camera.height])
+    if not (depth > 0).any():
+        return 0, 0, 0, 0
+    if not (depth > 0).all():
+        return 0, 0, camera.width, camera.height
+    low, high = np.clip([np.floor(pixels.min(0)), np.ceil(pixels.max(0))], 0, size).astype(int)
+    return int(low[0]), int(low[1]), int(high[0]), int(high[1])
+
+
+@dataclass(frozen=True)
+class HeadGeometry:
+    """Every pixel of one camera relative to the tracked head.
+
+    Attributes:
+        mesh: (H, W) uint8 label of the mesh, SCALP among them, 0 beside it.
+        near: (H, W) uint8 label at the nearest pixel of the mesh; 0 if no pixel shows it.
+        rim: (H, W) bool, just beyond the mesh.
+        height: (H, W) float32 metres above the neck's end; inf if the model does not mark it.
+    """
+
+    mesh: np.ndarray
+    near: np.ndarray
+    rim: np.ndarray
+    height: np.ndarray
+
+    def labels(self) -> np.ndarray:
+        """Label all pixels (H, W) uint8 by geometry alone, whatever the matte.
+
+        The mesh and its rim have the mesh's labels; what lies below the neck's end is torso, and
+        everything else is hair.
+        """
+        around = np.where(self.rim, self.near, HAIR)
+        return np.where(self.mesh > 0, self.mesh, np.where(self.height < 0, TORSO, around))
+
+
+def place(
+    head: TrackedHead,
+    camera: Camera,
+    alpha: np.ndarray,
+    depth: np.ndarray | None,
+    rim_m: float = RIM_M,
+) -> HeadGeometry:
+    """Place a camera's pixels relative to a head.
+
+    Where depth is unknown, the nearest known pixel of the matte replaces it; without a depth map,
+    the mesh's own depth does. If no pixel shows the mesh, all pixels are far below the neck's end.
+
+    Args:
+        head: the tracked head.
+        camera: pinhole.
+        alpha: (H, W) in [0, 1].
+        depth: (H, W) camera z, metres, 0 where unknown; or None.
+        rim_m: width of the rim, metres.
+    """
+    mesh, mesh_depth = see(head, camera)
+    hit = mesh > 0
+    if not hit.any():
+        height = np.full(mesh.shape, np.inf if head.end is None else -np.inf, np.float32)
+        return HeadGeometry(mesh, mesh, hit, height)
+    row, column, pixels = _nearest(hit)
+    surface = mesh_depth[row, column]
+    rim = ~hit & (pixels * surface / camera.K[0, 0] <= rim_m)
+    known = hit if depth is None else (alpha > 0) & (depth > 0)
+    if depth is not None and known.any():
+        there = _nearest(known)[:2]
+        surface = depth[there]
+    height = np.full(mesh.shape, np.inf, np.float32)
+    if head.end is not None:
+        y, x = np.nonzero(alpha > 0)
+        points = unproject(camera, opencv_pixels_to_corner(np.stack([x, y], axis=1)), surface[y, x])
+        height[y, x] = head.end.height(points)
+    return HeadGeometry(mesh, mesh[row, column], rim, height)
+
+
+def _nearest(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Find row, column and distance in pixels (H, W) of the nearest pixel of a mask (H, W)."""
+    distance, cell = cv2.distanceTransformWithLabels(
+        (~mask).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    places = np.zeros(int(cell.max()) + 1, np.int64)
+    places[cell[mask]] = np.flatnonzero(mask)
+    row, column = np.divmod(places[cell], mask.shape[1])
+    return row, column, distance
+
+
+def head_alpha(alpha: np.ndarray, labels: np.ndarray) -> np.ndarray:
+    """Keep the alpha (H, W) of the head alone by labels (h, w), which may be smaller.
+
+    What is neither head nor torso (strands that a network calls background, glasses, hats,
+    collars) goes with the nearer of the two; the cut is a pixel of the matte wide. Without a head
+    the matte is empty; without a torso it stays as it is.
+    """
+    head, torso = label_mask(labels, *HEAD), label_mask(labels, "torso")
+    if not head.any() or not torso.any():
+        return alpha * np.float32(head.any())
+    nearer = edge_distance(~torso) - edge_distance(~head)
+    if labels.shape != alpha.shape:
+        size = alpha.shape[1], alpha.shape[0]
+        nearer = cv2.resize(nearer, size, interpolation=cv2.INTER_LINEAR)
+        nearer *= max(alpha.shape) / max(labels.shape)
+    return alpha * np.clip(0.5 + nearer / 2, 0, 1).astype(np.float32)
