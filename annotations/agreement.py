@@ -9,12 +9,12 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from itertools import combinations
 
 import numpy as np
 
-from annotations.labels import FLAG_REASONS, Label, make_flag, make_mark
+from annotations.labels import FLAG_REASONS, Label, make_flag, make_mark, with_plateau
 from annotations.store import current_labels, labels_by_person, read_labels
 from express50.capture.index import Index, read_index
 from express50.contract.exclusions import included_subjects
@@ -238,7 +238,8 @@ def settlement(
     chosen = voices.get(verdict)
     if chosen is None and verdict.lstrip("-").isdigit():
         camera = next((x.camera for x in voices.values() if x.camera), next(iter(index.cameras)))
-        return make_mark(index, expression, int(verdict), camera, annotator, action="settle")
+        mark = make_mark(index, expression, int(verdict), camera, annotator)
+        return replace(mark, action="settle")
     if chosen is None and verdict not in FLAG_REASONS and not verdict.startswith(FLAG):
         raise AnnotationError(
             f"{index.subject} {expression}: {verdict!r} is no frame, annotator of it"
@@ -247,11 +248,9 @@ def settlement(
         )
     if chosen is None or chosen.frame is None or chosen.camera is None:
         reason = (chosen.reason if chosen else verdict.removeprefix(FLAG)) or ""
-        return make_flag(index, expression, reason, annotator, action="settle")
-    return make_mark(
-        index, expression, chosen.frame, chosen.camera, annotator,
-        first=chosen.first, last=chosen.last, action="settle",
-    )  # fmt: skip
+        return replace(make_flag(index, expression, reason, annotator), action="settle")
+    mark = make_mark(index, expression, chosen.frame, chosen.camera, annotator)
+    return replace(with_plateau(mark, index, chosen.first, chosen.last), action="settle")
 
 
 def current_voices(dataset: Dataset, subject: str, expression: str) -> dict[str, Label]:

@@ -8,11 +8,11 @@ import getpass
 import os
 import sys
 from collections.abc import Callable, Iterable
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 from annotations.agreement import describe
-from annotations.labels import FLAG_REASONS, Label, make_flag, make_mark, make_undo
+from annotations.labels import FLAG_REASONS, Label, make_flag, make_mark, make_undo, with_plateau
 from annotations.store import append_label, current_labels, is_person, last_event, read_labels
 from annotations.suggestions import read_suggestions
 from annotations.worklist import ORDERS, worklist
@@ -208,11 +208,10 @@ def run_mark(args: argparse.Namespace) -> int:
     index = read_index(args.dataset, args.subject)
     hint = read_suggestions(args.dataset, args.subject).get(args.expression)
     camera = args.camera or (hint.camera if hint else "") or next(iter(index.cameras))
-    mark = make_mark(
-        index, args.expression, args.frame, camera, args.annotator,
-        hint.frame if hint else None, hint.confidence if hint else None,
-        first=args.first, last=args.last,
-    )  # fmt: skip
+    mark = make_mark(index, args.expression, args.frame, camera, args.annotator)
+    mark = with_plateau(mark, index, args.first, args.last)
+    if hint is not None:
+        mark = replace(mark, suggested=hint.frame, confidence=hint.confidence)
     return _keep(args, mark, f"marked frame {args.frame}")
 
 

@@ -1,14 +1,14 @@
-"""What a label is: one event, checked when it is made.
+"""A label is one event, checked when it is made.
 
 A label names a camera, a decode index, its pts and a perceptual hash, so that it can never point
-at another frame unnoticed. Above all stands an adjudication, then what people say, then a rule,
-then a suggestion accepted without a person.
+at another frame unnoticed. An adjudication ranks highest, then people's labels, then a rule's, then
+a suggestion accepted without a person.
 """
 
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import get_type_hints
 
 from express50 import __version__
@@ -18,10 +18,7 @@ from express50.errors import AnnotationError
 AUTOMATIC = "auto"
 RULE_PREFIX = "rule:"
 FLAG_REASONS = ("failed", "occluded", "not performed", "ambiguous")
-EXCLUSION_ACTIONS = (
-    "exclude",
-    "include",
-)  # of a whole subject; see contract.exclusions
+EXCLUSION_ACTIONS = ("exclude", "include")  # of a whole subject; see contract.exclusions
 ACTIONS = ("mark", "flag", "undo", "settle", *EXCLUSION_ACTIONS)
 
 
@@ -73,68 +70,43 @@ KINDS = {
 }
 
 
-def make_mark(
-    index: Index,
-    expression: str,
-    frame: int,
-    camera: str,
-    annotator: str,
-    suggested: int | None = None,
-    confidence: float | None = None,
-    *,
-    first: int | None = None,
-    last: int | None = None,
-    seconds: float | None = None,
-    keys: int | None = None,
-    shown: bool | None = None,
-    action: str = "mark",
-) -> Label:
-    """A mark (or, with that action, a ``settle``) with the frame's full identity.
+def make_mark(index: Index, expression: str, frame: int, camera: str, annotator: str) -> Label:
+    """Make a mark with the frame's full identity; ``replace`` adds what else is known.
 
     Raises:
-        AnnotationError: the expression is not in the cues, the camera not in the capture, a frame
-            outside the expression's cue window, or the frame outside its plateau.
+        AnnotationError: the expression is not in the cues, the camera not in the capture, or the
+            frame outside the expression's cue window.
     """
     cue = find_cue(index, expression)
     source = find_camera(index, camera)
-    for number in (frame, first, last):
-        _check_frame(index, cue, source, number)
+    _check_frame(index, cue, source, frame)
+    label = _event(index, expression, "mark", annotator)
+    pts, dhash = source.pts[frame], source.dhash[frame]
+    return replace(label, frame=frame, camera=camera, pts=pts, dhash=dhash)
+
+
+def with_plateau(mark: Label, index: Index, first: int | None, last: int | None) -> Label:
+    """Give a mark the plateau that its frame stands for; an end may be open.
+
+    Raises:
+        AnnotationError: an end lies outside the expression's cue window, or the frame outside the
+            plateau.
+    """
+    cue, source = find_cue(index, mark.expression), find_camera(index, mark.camera or "")
+    frame = mark.frame or 0
     low, high = frame if first is None else first, frame if last is None else last
+    for end in (low, high):
+        _check_frame(index, cue, source, end)
     if not low <= frame <= high:
         raise AnnotationError(
-            f"{index.subject} {expression}: frame {frame} lies outside its plateau {low} to {high}"
+            f"{index.subject} {mark.expression}: frame {frame} lies outside its plateau {low} to"
+            f" {high}"
         )
-    return Label(
-        subject=index.subject,
-        expression=expression,
-        action=action,
-        annotator=annotator,
-        time=time.time(),
-        frame=frame,
-        camera=camera,
-        pts=source.pts[frame],
-        dhash=source.dhash[frame],
-        first=first,
-        last=last,
-        suggested=suggested,
-        confidence=confidence,
-        shown=shown,
-        seconds=seconds,
-        keys=keys,
-    )
+    return replace(mark, first=first, last=last)
 
 
-def make_flag(
-    index: Index,
-    expression: str,
-    reason: str,
-    annotator: str,
-    *,
-    seconds: float | None = None,
-    keys: int | None = None,
-    action: str = "flag",
-) -> Label:
-    """A flag: the expression has no peak, for a reason such as those of ``FLAG_REASONS``.
+def make_flag(index: Index, expression: str, reason: str, annotator: str) -> Label:
+    """Make a flag: the expression has no peak, for a reason such as those of ``FLAG_REASONS``.
 
     Raises:
         AnnotationError: the expression is not in the cues, or there is no reason.
@@ -143,30 +115,24 @@ def make_flag(
         raise AnnotationError(
             f"{index.subject} {expression}: a flag needs a reason: {', '.join(FLAG_REASONS)}, ..."
         )
+    return replace(_event(index, expression, "flag", annotator), reason=reason.strip())
+
+
+def make_undo(index: Index, expression: str, annotator: str) -> Label:
+    """Make an undo of the annotator's last event on an expression.
+
+    Raises:
+        AnnotationError: the expression is not in the cues.
+    """
+    return _event(index, expression, "undo", annotator)
+
+
+def _event(index: Index, expression: str, action: str, annotator: str) -> Label:
     find_cue(index, expression)
     return Label(
         subject=index.subject,
         expression=expression,
         action=action,
-        annotator=annotator,
-        time=time.time(),
-        reason=reason.strip(),
-        seconds=seconds,
-        keys=keys,
-    )
-
-
-def make_undo(index: Index, expression: str, annotator: str) -> Label:
-    """An undo of the annotator's last event on an expression.
-
-    Raises:
-        AnnotationError: the expression is not in the cues.
-    """
-    find_cue(index, expression)
-    return Label(
-        subject=index.subject,
-        expression=expression,
-        action="undo",
         annotator=annotator,
         time=time.time(),
     )
@@ -199,9 +165,9 @@ def find_camera(index: Index, camera: str) -> CameraSource:
     return index.cameras[camera]
 
 
-def _check_frame(index: Index, cue: Cue, source: CameraSource, frame: int | None) -> None:
+def _check_frame(index: Index, cue: Cue, source: CameraSource, frame: int) -> None:
     last = min(cue.end_frame, source.frames - 1)
-    if frame is not None and not cue.start_frame <= frame <= last:
+    if not cue.start_frame <= frame <= last:
         raise AnnotationError(
             f"{index.subject} {cue.expression_id}: frame {frame} lies outside the cue window"
             f" {cue.start_frame} to {last}"

@@ -23,12 +23,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from annotations import observe
+from annotations import align, observe
 from annotations.labels import make_mark
-from annotations.stages import ALIGN, OBSERVE
+from annotations.observe.faces import STABLE, similarity_2d
+from annotations.observe.stage import cue_frames
 from annotations.store import append_label
 from annotations.suggestions import read_suggestions, reference_subject
-from annotations.watch import STABLE, similarity_2d
 from benchmarks.document import replace_section
 from benchmarks.replay import measure_steps, replay
 from express50.capture.frames import read_proxy
@@ -58,7 +58,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--truth", type=Path, help="truth folder of the recording")
     parser.add_argument("--subjects", type=int, default=6)
     parser.add_argument("--frames", type=int, default=12, help="frames an expression")
-    parser.add_argument("--preset", default="standard", choices=sorted(OBSERVE.presets))
+    parser.add_argument("--preset", default="standard", choices=sorted(observe.STAGE.presets))
     parser.add_argument("--doc", type=Path, help="write the acceptance table into this document")
     options = parser.parse_args(arguments)
     if (options.dataset is None) != (options.truth is None):
@@ -84,8 +84,8 @@ def measure(dataset: Dataset, truth: Truth, preset: str) -> dict:
     """All figures but the steps' time."""
     subjects = dataset.subjects()
     began = time.perf_counter()
-    run(OBSERVE, dataset, preset)
-    run(ALIGN, dataset, preset, match=False)
+    run(observe.STAGE, dataset, preset)
+    run(align.STAGE, dataset, preset, match=False)
     seconds = time.perf_counter() - began
     peaks = peak_errors(dataset, truth)
     farthest = [
@@ -146,7 +146,7 @@ def match_errors(
     """
     reference = reference_subject(dataset)
     levels = label_reference(dataset, truth, reference, off_apex)
-    run(ALIGN, dataset, preset)
+    run(align.STAGE, dataset, preset)
     errors, confidences = [], []
     for subject in dataset.subjects():
         for expression, found in read_suggestions(dataset, subject).items():
@@ -196,8 +196,7 @@ def farthest_frames(dataset: Dataset, subject: str) -> Iterator[tuple[str, int]]
     seen, index = observe.read_observations(dataset, subject), read_index(dataset, subject)
     points = seen.points[0].astype(np.float64)
     windows = {
-        c.expression_id: np.searchsorted(seen.frames, observe.cue_frames(index, c))
-        for c in index.cues
+        c.expression_id: np.searchsorted(seen.frames, cue_frames(index, c)) for c in index.cues
     }
     neutral = np.median(points[windows[NEUTRAL]], axis=0)
     for expression, rows in windows.items():

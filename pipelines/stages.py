@@ -4,14 +4,14 @@ This is the only list of them; the entry point ``express50.stages`` leads here. 
 package imports annotations.
 """
 
-from annotations.stages import ALIGN, OBSERVE
+from annotations import align, observe
 from pipelines import alpha, calibrate, depth, frames, ingest, matte, pack, regions, track
 
 STAGES = (
     ingest.STAGE,
     calibrate.STAGE,
-    OBSERVE,
-    ALIGN,
+    observe.STAGE,
+    align.STAGE,
     frames.STAGE,
     alpha.STAGE,
     matte.STAGE,

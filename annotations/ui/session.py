@@ -8,9 +8,17 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
-from annotations.labels import AUTOMATIC, RULE_PREFIX, Label, make_flag, make_mark, make_undo
+from annotations.labels import (
+    AUTOMATIC,
+    RULE_PREFIX,
+    Label,
+    make_flag,
+    make_mark,
+    make_undo,
+    with_plateau,
+)
 from annotations.store import append_label, is_person, labels_of, read_labels
 from annotations.ui.task import TaskScene
 from annotations.ui.view import CueView, plateau_problem
@@ -147,16 +155,13 @@ class Session:
         self._book()
         spent = self._efforts[_key(scene.task)]
         found = scene.suggestion
-        label = make_mark(
-            scene.index,
-            scene.task.expression,
-            view.cursor,
-            camera,
-            self.annotator,
-            None if found is None else found.frame,
-            None if found is None else found.confidence,
-            first=view.plateau_first,
-            last=view.plateau_last,
+        expression, index = scene.task.expression, scene.index
+        label = make_mark(index, expression, view.cursor, camera, self.annotator)
+        label = with_plateau(label, index, view.plateau_first, view.plateau_last)
+        if found is not None:
+            label = replace(label, suggested=found.frame, confidence=found.confidence)
+        label = replace(
+            label,
             seconds=round(spent.seconds, 2),
             keys=spent.keys,
             shown=found is not None and not self.hidden(scene.task),
@@ -174,14 +179,8 @@ class Session:
             raise AnnotationError(scene.problem or "this task has no footage")
         self._book()
         spent = self._efforts[_key(scene.task)]
-        label = make_flag(
-            scene.index,
-            scene.task.expression,
-            reason,
-            self.annotator,
-            seconds=round(spent.seconds, 2),
-            keys=spent.keys,
-        )
+        label = make_flag(scene.index, scene.task.expression, reason, self.annotator)
+        label = replace(label, seconds=round(spent.seconds, 2), keys=spent.keys)
         self._save(label)
         return label
 

@@ -1,17 +1,16 @@
 """The observe and align stages over painted footage, with observations of made-up faces."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from annotations import observe
-from annotations.config import AlignConfig, ObserveConfig
+from annotations import align, observe
 from annotations.labels import AUTOMATIC, make_flag, make_mark
-from annotations.stages import ALIGN
+from annotations.observe.faces import FACE
 from annotations.store import append_label, current_labels, read_labels
 from annotations.suggestions import choose_reference, read_suggestions
-from annotations.watch import FACE
 from express50.capture.index import read_index
 from express50.cli.main import main
 from express50.contract.config import build_config
@@ -43,8 +42,8 @@ def act(dataset, subject, strength=2.0, stride=1):
 
 
 def run(dataset, items=None, **values):
-    config = build_config(ALIGN, values)
-    return run_stage(ALIGN, dataset, config, items, workers=0, progress=False)
+    config = build_config(align.STAGE, values)
+    return run_stage(align.STAGE, dataset, config, items, workers=0, progress=False)
 
 
 def peaks(dataset, subject):
@@ -163,7 +162,8 @@ def test_damaged_observations_are_named(dataset):
 def test_a_suggestion_that_changed_takes_the_place_of_the_old_one(watched):
     assert run(watched).ok
     index = read_index(watched, "S001")
-    append_label(watched, make_mark(index, "smile", 30, "cam01", AUTOMATIC, 30, 0.5))
+    mark = make_mark(index, "smile", 30, "cam01", AUTOMATIC)
+    append_label(watched, replace(mark, suggested=30, confidence=0.5))
     assert run(watched, match=False).ok
     assert peaks(watched, "S001")["smile"]["frame"] == pytest.approx(22, abs=1)
 
@@ -181,6 +181,6 @@ def test_the_command_watches_first_and_says_when_there_is_no_face(dataset, capsy
 
 def test_settings_out_of_range_are_refused():
     with pytest.raises(ValueError, match="0 to 1"):
-        AlignConfig(accept=1.5)
+        align.AlignConfig(accept=1.5)
     with pytest.raises(ValueError, match="at least 1"):
-        ObserveConfig(cameras=0)
+        observe.ObserveConfig(cameras=0)

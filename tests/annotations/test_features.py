@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from annotations.features import (
+from annotations.align.features import (
     LIDS,
     displacements,
     expression_values,
@@ -12,10 +12,10 @@ from annotations.features import (
     looks,
     measure,
 )
-from annotations.match import shared_columns
+from annotations.align.match import shared_columns
+from annotations.align.suggest import strongest_event
 from annotations.observe import FaceObservations
-from annotations.suggest import strongest_event
-from annotations.watch import FACE, face_side, find_points, steady
+from annotations.observe.faces import FACE, face_side, find_points, steady
 from express50.capture.expressions import load_script
 from express50.landmarks.network import load_network
 

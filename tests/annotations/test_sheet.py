@@ -3,6 +3,7 @@
 import base64
 import json
 import re
+from dataclasses import replace
 from html.parser import HTMLParser
 
 import numpy as np
@@ -25,10 +26,10 @@ def labelled(suggested):
     """Labels of every kind; nothing at all for jaw_open of S002."""
     first, second = (read_index(suggested, s) for s in ("S001", "S002"))
     for label in (
-        make_mark(first, "neutral", 4, "cam01", AUTOMATIC, 4, 0.9),
+        replace(make_mark(first, "neutral", 4, "cam01", AUTOMATIC), suggested=4, confidence=0.9),
         make_mark(first, "smile", 21, "cam00", "ann"),
         make_mark(first, "jaw_open", 47, "cam00", "rule:last-frame"),
-        make_mark(second, "neutral", 6, "cam01", AUTOMATIC, 6, 0.3),
+        replace(make_mark(second, "neutral", 6, "cam01", AUTOMATIC), suggested=6, confidence=0.3),
         make_flag(second, "smile", "occluded <by> a hand", "bob"),
     ):
         append_label(suggested, label)

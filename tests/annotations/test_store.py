@@ -3,10 +3,11 @@
 import json
 import multiprocessing
 import time
+from dataclasses import replace
 
 import pytest
 
-from annotations.labels import AUTOMATIC, Label, make_flag, make_mark, make_undo
+from annotations.labels import AUTOMATIC, Label, make_flag, make_mark, make_undo, with_plateau
 from annotations.store import append_label, current_labels, human_digest, labels_of, read_labels
 from express50.capture.index import CameraSource, Cue, Index
 from express50.contract.layout import Dataset
@@ -108,7 +109,7 @@ def test_annotators_at_once_lose_nothing(tmp_path):
 
 def test_an_adjudication_stands_above_later_marks_and_keeps_the_originals(tmp_path):
     index = _index(tmp_path)
-    settle = make_mark(index, "smile", 4, "a", "eve", action="settle")
+    settle = replace(make_mark(index, "smile", 4, "a", "eve"), action="settle")
     labels = [_mark(3, "ann", 1.0), _mark(5, "eve", 2.0), settle, _mark(6, "bob", 9e9)]
     assert current_labels(labels)["smile"] == settle
     assert {who: labels_of(labels, who)["smile"].frame for who in ("ann", "bob", "eve")} == {
@@ -124,15 +125,14 @@ def test_a_rule_stands_below_people_and_above_suggestions():
 
 
 def test_plateau_and_effort_are_kept(tmp_path):
-    mark = make_mark(
-        _index(tmp_path), "smile", 4, "a", "ann", first=3, last=5, seconds=2.5, keys=2, shown=True
-    )
+    index = _index(tmp_path)
+    bare = make_mark(index, "smile", 4, "a", "ann")
+    mark = replace(with_plateau(bare, index, 3, 5), seconds=2.5, keys=2, shown=True)
     append_label(Dataset(tmp_path), mark)
     assert read_labels(Dataset(tmp_path), "S1") == [mark]
-    with pytest.raises(AnnotationError, match="plateau 5 to 5"):
-        make_mark(_index(tmp_path), "smile", 4, "a", "ann", first=5, last=5)
-    with pytest.raises(AnnotationError, match="2 to 6"):
-        make_mark(_index(tmp_path), "smile", 4, "a", "ann", first=1)
+    for first, last in ((5, 5), (1, None)):  # without the frame; beyond the cue window
+        with pytest.raises(AnnotationError):
+            with_plateau(bare, index, first, last)
 
 
 def test_a_flag_needs_a_reason_and_an_expression(tmp_path):

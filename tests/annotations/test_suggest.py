@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from annotations.suggest import (
+from annotations.align.suggest import (
     Canonical,
     candidate_rows,
     canonical_of,

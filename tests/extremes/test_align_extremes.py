@@ -7,12 +7,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from annotations import observe
-from annotations.features import expression_values, measure
-from annotations.match import suggest_all, watch
+from annotations.align.features import expression_values, measure
+from annotations.align.match import suggest_all, watch
+from annotations.align.suggest import suggest
 from annotations.observe import FaceObservations
-from annotations.suggest import suggest
-from annotations.watch import FACE, align_faces, similarity_2d
+from annotations.observe.faces import FACE, align_faces, similarity_2d
+from annotations.observe.stage import choose_cameras, frames_to_try
 from express50.capture.expressions import load_script
 from express50.capture.index import Cue
 from express50.errors import StageError
@@ -71,19 +71,15 @@ def test_frames_without_a_face_are_nobodys_peak():
     assert 14 <= watched.frames[watched.windows["smile"][found["smile"].row]] <= 17
 
 
-def test_a_face_is_looked_for_until_it_is_there(monkeypatch):
+def test_the_face_is_searched_for_until_a_frame_shows_it():
     scores = {3: 0.0, 0: 0.1, 6: 0.05, 40: 0.9}
-    monkeypatch.setattr(observe, "read_proxy", lambda dataset, subject, camera, frame: frame)
-    monkeypatch.setattr(
-        observe, "detect", lambda net, frame, smallest: SimpleNamespace(score=scores.get(frame, 0))
-    )
     index = SimpleNamespace(subject="S001", cameras={"a": None, "b": None})
-    tries = observe._tries(np.array([0, 3, 6]), np.arange(0, 71, 10))
+    tries = frames_to_try(np.array([0, 3, 6]), np.arange(0, 71, 10))
     assert tries[:3] == [3, 0, 6] and len(set(tries)) == len(tries)
-    frame, cameras = observe.choose_cameras(None, index, None, tries, observe.ObserveConfig())
+    frame, cameras = choose_cameras(index, lambda camera, frame: scores.get(frame, 0), tries, 0.3)
     assert frame == 40 and cameras == ["a", "b"]
-    with pytest.raises(StageError, match=r"in frames 0, 3, 6 .*score 0.10"):
-        observe.choose_cameras(None, index, None, tries[:3], observe.ObserveConfig())
+    with pytest.raises(StageError, match=r"0, 3, 6 .*0\.10"):
+        choose_cameras(index, lambda camera, frame: scores.get(frame, 0), tries[:3], 0.3)
 
 
 def test_windows_of_one_frame_and_windows_that_overlap():

@@ -6,7 +6,7 @@ import json
 import shutil
 import sqlite3
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -113,7 +113,8 @@ def _write_dataset(root: Path) -> None:
     row = {"frame": 1, "confidence": 0.5, "start": 0, "activity": [0.1, 0.2], "candidates": [1]}
     (align / "suggestions.json").write_text(json.dumps({"neutral": row}))
     (calibrate / "gains.json").write_text(json.dumps({"cam00": [1.0, 1.1, 0.9]}))
-    append_label(dataset, make_mark(index, "neutral", 1, "cam00", "anna", confidence=0.5))
+    mark = make_mark(index, "neutral", 1, "cam00", "anna")
+    append_label(dataset, replace(mark, confidence=0.5))
     labels = read_labels(dataset, "S001")
     export_labels(labels, root / "labels.csv")
     export_labels(labels, root / "labels.json")

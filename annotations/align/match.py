@@ -7,9 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from annotations.features import Features, expression_values, measure
-from annotations.observe import NEUTRAL, SEEN_SCORE, FaceObservations
-from annotations.suggest import (
+from annotations.align.features import Features, expression_values, measure
+from annotations.align.suggest import (
     Canonical,
     Suggestion,
     canonical_of,
@@ -17,7 +16,8 @@ from annotations.suggest import (
     suggest,
     suggest_rest,
 )
-from annotations.watch import steady
+from annotations.observe import NEUTRAL, SEEN_SCORE, FaceObservations
+from annotations.observe.faces import steady
 from express50.capture.expressions import Expression
 from express50.capture.index import Index
 

@@ -1,0 +1,68 @@
+"""The align stage: for every expression the frame that matches the reference's canonical frame.
+
+Item: a subject. Its observations are compared with the reference identity's labels or peaks. A
+suggestion that is sure enough is accepted without a person, through the label store that annotators
+write to, under the name ``auto``; a person's label always ranks above it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from annotations.observe import observations_path
+from annotations.store import human_digest
+from annotations.suggestions import reference_subject
+from express50.contract.layout import Dataset
+from express50.contract.stage import Growth, Result, Stage
+
+
+@dataclass(frozen=True, kw_only=True)
+class AlignConfig:
+    """Settings of the align stage."""
+
+    accept: float = 0.0
+    """Accept suggestions at least this sure without a person, 0 (all) to 1 (none)."""
+    match: bool = True
+    """Match to the reference identity's canonical frames; off, take each subject's own peak."""
+
+    def __post_init__(self) -> None:
+        """Refuse values out of range."""
+        if not 0.0 <= self.accept <= 1.0:
+            raise ValueError(f"accept {self.accept}: expected 0 to 1")
+
+
+def inputs(dataset: Dataset, item: str, config: AlignConfig) -> dict[str, Path | str]:
+    """List index, observations and human labels of the subject and of the reference."""
+    other = reference_subject(dataset) if config.match else item
+    read: dict[str, Path | str] = {} if other == item else {"reference": other}
+    for prefix, subject in {"": item, "reference_": other}.items():
+        if prefix and other == item:
+            continue
+        observations = observations_path(dataset, subject)
+        read[f"{prefix}index"] = dataset.item_dir("ingest", subject) / "index.json"
+        read[f"{prefix}observe"] = observations if observations.is_file() else "absent"
+        read[f"{prefix}labels"] = human_digest(dataset, subject)
+    return read
+
+
+def run(dataset: Dataset, item: str, config: AlignConfig, out: Path) -> Result:
+    """Suggest, accept and write ``suggestions.json``, ``peaks.json`` and a contact sheet."""
+    from annotations.align.stage import run as work
+
+    return work(dataset, item, config, out)
+
+
+STAGE = Stage(
+    name="align",
+    version=5,
+    config=AlignConfig,
+    presets={"draft": {}, "standard": {}, "reference": {}},
+    items=Dataset.subjects,
+    inputs=inputs,
+    run=run,
+    help="suggest, match to the reference and accept the peak frame of each expression",
+    purpose="The labelled frame of every expression, between its cue window's first and last.",
+    runs_first=("observe",),
+    growth=Growth(items=("subjects",), time=("frames",), disk=("frames",)),
+)

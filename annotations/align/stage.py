@@ -1,0 +1,189 @@
+"""The align stage's work: suggestions, those that are accepted, and the peak frames in force."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import numpy as np
+
+from annotations.align import AlignConfig
+from annotations.align.match import Reference, Watched, suggest_all, watch
+from annotations.align.suggest import Suggestion
+from annotations.labels import AUTOMATIC, Label, make_mark, make_undo
+from annotations.observe import observations_path, read_observations
+from annotations.store import append_label, current_labels, read_labels
+from annotations.suggestions import Suggested, reference_subject
+from express50.capture.expressions import load_script
+from express50.capture.frames import read_proxy
+from express50.capture.index import Index, read_index
+from express50.contract.layout import Dataset
+from express50.contract.stage import Note, Result
+from express50.errors import StageError
+from express50.files.images import contact_sheet, write_image
+
+
+def run(dataset: Dataset, item: str, config: AlignConfig, out: Path) -> Result:
+    """Suggest, accept and write ``suggestions.json``, ``peaks.json`` and a contact sheet."""
+    index = read_index(dataset, item)
+    if not index.cues:
+        raise StageError(f"{item}: cues.csv names no expression; add the script's timing")
+    found, dropped = suggest_for(dataset, index, config.match)
+    labels = accept(dataset, index, found, config.accept)
+    dropped += _not_taken(index, found, labels, config.accept)
+    peaks = {e: label for e, label in labels.items() if label.frame is not None}
+    if not peaks:
+        raise StageError(f"{item}: no expression has a frame ({dropped[0].why})")
+    kept = ("frame", "camera", "pts", "dhash", "confidence", "annotator")
+    rows = {e: {name: getattr(label, name) for name in kept} for e, label in peaks.items()}
+    _write_json(out / "peaks.json", rows)
+    _write_json(out / "suggestions.json", {e: asdict(s) for e, s in found.items()})
+    _write_sheet(dataset, index, peaks, out)
+    sure = [suggested.confidence for suggested in found.values()]
+    metrics = {
+        "expressions": len(index.cues),
+        "peaks": len(peaks),
+        "by_person": sum(label.annotator != AUTOMATIC for label in labels.values()),
+        "matched": sum(suggested.kind == "match" for suggested in found.values()),
+        "confidence_median": round(float(np.median(sure)), 4) if sure else None,
+    }
+    return Result(metrics, dropped)
+
+
+def suggest_for(
+    dataset: Dataset, index: Index, match: bool
+) -> tuple[dict[str, Suggested], list[Note]]:
+    """Suggest a frame of every expression, and note what was missing for it.
+
+    Without observations there are no suggestions: only people's labels count then.
+    """
+    if not observations_path(dataset, index.subject).is_file():
+        why = f"{index.subject} is not observed: run 'express50 observe' to see why"
+        return {}, [Note("suggestions", why)]
+    other = reference_subject(dataset) if match else index.subject
+    reference, dropped = None, []
+    if other != index.subject and observations_path(dataset, other).is_file():
+        reference = _read_reference(dataset, other)
+    elif other != index.subject:
+        why = f"the reference {other} is not observed; every subject's own peaks were taken"
+        dropped.append(Note("matching", why))
+    subject = watch(index, read_observations(dataset, index.subject))
+    script = {entry.id: entry for entry in load_script()}
+    found, canonical = suggest_all(subject, script, reference)
+    rows = {e: _in_footage(s, subject, e, index) for e, s in found.items()}
+    if reference is not None:
+        about = {"subject": reference.watched.subject, "camera": reference.watched.camera}
+        for expression, frame in canonical.items():
+            matched = replace(rows[expression], kind="match", reference=about | {"frame": frame})
+            rows[expression] = matched
+    return rows, dropped
+
+
+def _read_reference(dataset: Dataset, subject: str) -> Reference:
+    """Read the reference's observations and the frames that people chose as canonical."""
+    said = {
+        expression: label
+        for expression, label in current_labels(read_labels(dataset, subject)).items()
+        if label.annotator != AUTOMATIC
+    }
+    return Reference(
+        watch(read_index(dataset, subject), read_observations(dataset, subject)),
+        {e: label.frame for e, label in said.items() if label.frame is not None},
+        frozenset(e for e, label in said.items() if label.frame is None),
+    )
+
+
+def accept(
+    dataset: Dataset, index: Index, found: Mapping[str, Suggested], threshold: float
+) -> dict[str, Label]:
+    """Append an automatic mark for each sure suggestion that is news; return the labels in force.
+
+    Automatic marks that no suggestion supports any more are undone. A rerun appends nothing.
+    """
+    labels = read_labels(dataset, index.subject)
+
+    def write(label: Label) -> None:
+        append_label(dataset, label)
+        labels.append(label)
+
+    known = _automatic(labels)
+    for cue in index.cues:
+        expression = cue.expression_id
+        suggested = found.get(expression)
+        if suggested is None or suggested.confidence < threshold:
+            while expression in _automatic(labels):
+                write(make_undo(index, expression, AUTOMATIC))
+            continue
+        frame, camera, sure = suggested.frame, suggested.camera, suggested.confidence
+        old = known.get(expression)
+        if old is None or (old.frame, old.camera, old.confidence) != (frame, camera, sure):
+            mark = make_mark(index, expression, frame, camera, AUTOMATIC)
+            write(replace(mark, suggested=frame, confidence=sure))
+    wanted = {cue.expression_id for cue in index.cues}
+    return {e: label for e, label in current_labels(labels).items() if e in wanted}
+
+
+def _automatic(labels: list[Label]) -> dict[str, Label]:
+    return current_labels(label for label in labels if label.annotator == AUTOMATIC)
+
+
+def _not_taken(
+    index: Index, found: Mapping[str, Suggested], labels: Mapping[str, Label], threshold: float
+) -> list[Note]:
+    """Note the expressions that have no frame, with the reason."""
+    notes = []
+    for expression in (cue.expression_id for cue in index.cues):
+        label, suggested = labels.get(expression), found.get(expression)
+        if label is not None and label.frame is not None:
+            continue
+        if label is not None:
+            why = f"flagged: {label.reason or 'no reason given'}"
+        elif suggested is None:
+            why = "no face was seen in its cue window; label it with 'express50 annotate'"
+        else:
+            why = (
+                f"confidence {suggested.confidence:.2f} is below align.accept {threshold:g};"
+                " label it with 'express50 annotate'"
+            )
+        notes.append(Note(expression, why))
+    return notes
+
+
+def _in_footage(found: Suggestion, subject: Watched, expression: str, index: Index) -> Suggested:
+    """Express a suggestion in the footage's frames, its curves per frame of the cue window."""
+    frames = subject.frames[subject.windows[expression]]
+    cue = next(c for c in index.cues if c.expression_id == expression)
+    every = np.arange(cue.start_frame, min(cue.end_frame, index.frames - 1) + 1)
+
+    def curve(values: np.ndarray) -> list[float]:
+        return [round(float(v), 3) for v in np.interp(every, frames, values)]
+
+    return Suggested(
+        frame=int(frames[found.row]),
+        confidence=round(found.confidence, 4),
+        start=cue.start_frame,
+        activity=curve(found.activity),
+        candidates=[int(frames[row]) for row in found.candidates],
+        match=None if found.match is None else curve(found.match),
+        camera=subject.camera,
+    )
+
+
+def _write_json(path: Path, table: dict) -> None:
+    path.write_text(json.dumps(table, indent=1, sort_keys=True) + "\n")
+
+
+def _write_sheet(dataset: Dataset, index: Index, peaks: Mapping[str, Label], out: Path) -> None:
+    """Show the peak frame of every expression between its window's first and last frame."""
+    rows, names = [], []
+    for cue in index.cues:
+        peak = peaks.get(cue.expression_id)
+        if peak is None or peak.frame is None:
+            continue
+        frames = (cue.start_frame, peak.frame, min(cue.end_frame, index.frames - 1))
+        rows.append([read_proxy(dataset, index.subject, peak.camera or "", f) for f in frames])
+        names.append(f"{cue.expression_id}: first, taken {peak.frame}, last")
+    (out / "qc").mkdir()
+    write_image(out / "qc" / "peaks.jpg", contact_sheet(rows, names), quality=85)
