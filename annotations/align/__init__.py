@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from annotations.observe import observations_path
+from annotations.observe.observations import observations_path
 from annotations.store import human_digest
 from annotations.suggestions import reference_subject
 from express50.contract.layout import Dataset
@@ -50,7 +50,7 @@ def run(dataset: Dataset, item: str, config: AlignConfig, out: Path) -> Result:
     """Suggest, accept and write ``suggestions.json``, ``peaks.json`` and a contact sheet."""
     from annotations.align.stage import run as work
 
-    return work(dataset, item, config, out)
+    return work(dataset, item, out, accept=config.accept, match=config.match)
 
 
 STAGE = Stage(

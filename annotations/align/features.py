@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from annotations.observe import NEUTRAL, FaceObservations
-from annotations.observe.faces import STABLE, face_side, similarity_2d, steady
+from annotations.observe.observations import NEUTRAL, FaceObservations
+from annotations.observe.stage import STABLE, face_side, similarity_2d, steady
 from express50.capture.expressions import Expression
 
 LIDS = np.array([37, 38, 40, 41, 43, 44, 46, 47])

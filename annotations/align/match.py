@@ -16,8 +16,8 @@ from annotations.align.suggest import (
     suggest,
     suggest_rest,
 )
-from annotations.observe import NEUTRAL, SEEN_SCORE, FaceObservations
-from annotations.observe.faces import steady
+from annotations.observe.observations import NEUTRAL, SEEN_SCORE, FaceObservations
+from annotations.observe.stage import steady
 from express50.capture.expressions import Expression
 from express50.capture.index import Index
 

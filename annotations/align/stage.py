@@ -9,11 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
-from annotations.align import AlignConfig
 from annotations.align.match import Reference, Watched, suggest_all, watch
 from annotations.align.suggest import Suggestion
 from annotations.labels import AUTOMATIC, Label, make_mark, make_undo
-from annotations.observe import observations_path, read_observations
+from annotations.observe.observations import observations_path, read_observations
 from annotations.store import append_label, current_labels, read_labels
 from annotations.suggestions import Suggested, reference_subject
 from express50.capture.expressions import load_script
@@ -25,14 +24,14 @@ from express50.errors import StageError
 from express50.files.images import contact_sheet, write_image
 
 
-def run(dataset: Dataset, item: str, config: AlignConfig, out: Path) -> Result:
+def run(dataset: Dataset, item: str, out: Path, *, accept: float, match: bool) -> Result:
     """Suggest, accept and write ``suggestions.json``, ``peaks.json`` and a contact sheet."""
     index = read_index(dataset, item)
     if not index.cues:
         raise StageError(f"{item}: cues.csv names no expression; add the script's timing")
-    found, dropped = suggest_for(dataset, index, config.match)
-    labels = accept(dataset, index, found, config.accept)
-    dropped += _not_taken(index, found, labels, config.accept)
+    found, dropped = suggest_for(dataset, index, match)
+    labels = accept_sure(dataset, index, found, accept)
+    dropped += _not_taken(index, found, labels, accept)
     peaks = {e: label for e, label in labels.items() if label.frame is not None}
     if not peaks:
         raise StageError(f"{item}: no expression has a frame ({dropped[0].why})")
@@ -95,7 +94,7 @@ def _read_reference(dataset: Dataset, subject: str) -> Reference:
     )
 
 
-def accept(
+def accept_sure(
     dataset: Dataset, index: Index, found: Mapping[str, Suggested], threshold: float
 ) -> dict[str, Label]:
     """Append an automatic mark for each sure suggestion that is news; return the labels in force.

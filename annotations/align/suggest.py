@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from annotations.observe.faces import steady
+from annotations.observe.stage import steady
 
 CANDIDATES, CANDIDATE_GAP = 5, 3
 NEAR_FRAMES = 2.0  # an event's direction is learnt from frames about its apex (sigma)

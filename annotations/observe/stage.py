@@ -1,31 +1,47 @@
-"""The observe stage's work: which cameras watch a face, and what they see of it."""
+"""The observe stage's work: which cameras watch a face, and what each sees of it.
+
+The network looks through one window per clip, and head motion is averaged over time: both keep the
+jitter of single detections out of the curves in which expressions are searched for.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
+import cv2
 import numpy as np
+import torch
 
-from annotations.observe import NEUTRAL, SCHEMA, SEEN_SCORE, ObserveConfig
-from annotations.observe.faces import align_faces, find_points
+from annotations.observe.observations import NEUTRAL, SCHEMA, SEEN_SCORE
 from express50.capture.frames import read_proxy
 from express50.capture.index import Cue, Index, read_index
 from express50.contract.layout import Dataset
 from express50.contract.stage import Note, Result
 from express50.errors import StageError
 from express50.files.images import contact_sheet, write_image
-from express50.landmarks.detector import detect
-from express50.landmarks.network import LandmarkNet, load_network
+from express50.geometry.conventions import affine_to_opencv
+from express50.geometry.transforms import similarity_fit
+from express50.landmarks.detector import SMALLEST, detect, window_about
+from express50.landmarks.network import CROP, MIRROR, LandmarkNet, face_box, load_network
 
 TRIES = 8  # frames all over the clips in which a face is searched for, should rest show none
 RANKED_SHARE = 0.8  # of the best camera's score: one that sees less adds more noise than news
 
 
-def run(dataset: Dataset, item: str, config: ObserveConfig, out: Path) -> Result:
+def run(
+    dataset: Dataset,
+    item: str,
+    out: Path,
+    *,
+    cameras: int,
+    stride: int,
+    min_score: float,
+    search: float,
+) -> Result:
     """Write ``observations.npz`` and a picture of the watching cameras at rest."""
     index = read_index(dataset, item)
-    windows = {c.expression_id: cue_frames(index, c, config.stride) for c in index.cues}
+    windows = {c.expression_id: cue_frames(index, c, stride) for c in index.cues}
     if not any(len(frames) for frames in windows.values()):
         raise StageError(f"{item}: cues.csv names no expression in the footage; add its timing")
     net = load_network()
@@ -35,25 +51,25 @@ def run(dataset: Dataset, item: str, config: ObserveConfig, out: Path) -> Result
     frames = np.unique(np.concatenate(list(windows.values())))
 
     def score(camera: str, frame: int) -> float:
-        return detect(net, read_proxy(dataset, item, camera, frame), smallest=config.search).score
+        return detect(net, read_proxy(dataset, item, camera, frame), smallest=search).score
 
     tries = frames_to_try(rest, frames)
-    middle, ranked = choose_cameras(index, score, tries, config.min_score)
-    cameras = ranked[: config.cameras]
+    middle, ranked = choose_cameras(index, score, tries, min_score)
+    watching = ranked[:cameras]
     rest = np.union1d(rest, [middle])
     seen = [c for c in windows.values() if len(c)]
-    views = [_watch(dataset, item, net, camera, seen, rest, config.search) for camera in cameras]
+    views = [_watch(dataset, item, net, camera, seen, rest, search) for camera in watching]
     points, scores, faces = (np.stack(part) for part in zip(*views, strict=True))
     np.savez_compressed(
-        out / "observations.npz", schema=SCHEMA, cameras=np.array(cameras), frames=frames,
+        out / "observations.npz", schema=SCHEMA, cameras=np.array(watching), frames=frames,
         points=points.astype(np.float32), scores=scores.astype(np.float32), faces=faces,
     )  # fmt: skip
     (out / "qc").mkdir()
-    row = [read_proxy(dataset, item, camera, middle) for camera in cameras]
-    write_image(out / "qc" / "cameras.jpg", contact_sheet([row], [", ".join(cameras)]), quality=85)
+    row = [read_proxy(dataset, item, camera, middle) for camera in watching]
+    write_image(out / "qc" / "cameras.jpg", contact_sheet([row], [", ".join(watching)]), quality=85)
     metrics = {
         "frames": len(frames),
-        "watching_cameras": list(cameras),
+        "watching_cameras": watching,
         "score_median": round(float(np.median(scores)), 4),
     }
     beyond = [e for e, window in windows.items() if not len(window)]
@@ -128,3 +144,108 @@ def _watch(
     rows = [seen[number] for number in sorted(seen)]
     points, scores, faces = (np.stack(part) for part in zip(*rows, strict=True))
     return points, scores, faces
+
+
+FACE = 48  # side of the aligned face, pixels
+# iBUG-68 points that expressions move least: the nose's bridge and the corners of the eyes.
+STABLE = np.array([27, 28, 29, 30, 36, 39, 42, 45])
+BATCH = 32
+LEAST_SIDE = 1e-9  # pixels: a face whose points all coincide still has a finite answer
+STRAY_SHARE = 0.1  # of the window: a face further from its centre gets a window of its own
+STRAY_SCORE = 0.7  # of the middle frame's score
+STEADY_FRAMES = 1.0  # heads turn slowly: their motion is averaged over this many frames (sigma)
+
+
+def find_points(
+    net: LandmarkNet, images: Sequence[np.ndarray], smallest: float = SMALLEST
+) -> tuple[np.ndarray, np.ndarray]:
+    """Landmarks (T, 68, 2), corner-origin pixels, and scores (T,) of a clip.
+
+    The face is searched for in the middle frame only; all frames are then looked at through the
+    same window, except those where the face has left it.
+
+    Args:
+        net: from ``load_network``.
+        images: T frames (H, W, 3) uint8, at least one.
+        smallest: windows that are searched, see `detect`.
+    """
+    middle = detect(net, images[len(images) // 2], smallest=smallest)
+    centre, side = face_box(middle.points)
+    found = list(_look(net, images, window_about(middle.points)))
+    points, scores = (np.concatenate(part) for part in zip(*found, strict=True))
+    for row, image in enumerate(images):
+        away = np.linalg.norm(face_box(points[row])[0] - centre)
+        if away > STRAY_SHARE * side or scores[row] < STRAY_SCORE * middle.score:
+            own = detect(net, image, smallest=smallest)
+            points[row], scores[row] = own.points, own.score
+    return points, scores
+
+
+def align_faces(
+    images: Sequence[np.ndarray], points: np.ndarray, neutral: np.ndarray
+) -> np.ndarray:
+    """Grey faces (T, FACE, FACE) uint8 of a clip, moved onto the neutral landmarks (68, 2)."""
+    low, high = neutral.min(0), neutral.max(0)
+    side = face_side(neutral)
+    layout = (neutral[STABLE] - ((low + high) / 2 - side / 2)) * (FACE / side)
+    motions = steady(np.stack([similarity_2d(frame[STABLE], layout) for frame in points]))
+    grey = (cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in images)
+    return np.stack(
+        [
+            _cut(image, cv2.invertAffineTransform(motion), FACE)
+            for image, motion in zip(grey, motions, strict=True)
+        ]
+    )
+
+
+def face_side(neutral: np.ndarray) -> float:
+    """Side of the square, pixels, about landmarks (68, 2) that the aligned face shows."""
+    return 1.1 * max(float((neutral.max(0) - neutral.min(0)).max()), LEAST_SIDE)
+
+
+def similarity_2d(source: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """Affine (2, 3) of the similarity that takes points (N, 2) onto others.
+
+    Points that all coincide are moved, not scaled.
+    """
+    if np.ptp(source, axis=0).max() < LEAST_SIDE:
+        return np.concatenate([np.eye(2), (target.mean(0) - source.mean(0))[:, None]], axis=1)
+    lift = np.zeros((len(source), 1))
+    s, R, t = similarity_fit(np.hstack([source, lift]), np.hstack([target, lift]))
+    return np.concatenate([s * R[:2, :2], t[:2, None]], axis=1)
+
+
+def steady(values: np.ndarray, sigma: float = STEADY_FRAMES) -> np.ndarray:
+    """Values (T, ...) averaged over neighbouring frames with Gaussian weights."""
+    numbers = np.arange(len(values))
+    weights = np.exp(-0.5 * ((numbers[:, None] - numbers) / sigma) ** 2)
+    return np.tensordot(weights / weights.sum(1, keepdims=True), values, axes=1)
+
+
+def _look(
+    net: LandmarkNet, images: Sequence[np.ndarray], window: np.ndarray
+) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Points and scores of batches of images through one window, mean of it and its mirror."""
+    for start in range(0, len(images), BATCH):
+        crops = np.stack([_cut(image, window, CROP) for image in images[start : start + BATCH]])
+        both = np.concatenate([crops, crops[:, :, ::-1]])
+        with torch.inference_mode():
+            output = net(torch.from_numpy(both).permute(0, 3, 1, 2).float() / 255.0)
+        found = output.points.double().numpy()
+        direct, mirrored = found[: len(crops)], found[len(crops) :][:, MIRROR]
+        mirrored = np.stack([CROP - mirrored[..., 0], mirrored[..., 1]], axis=-1)
+        score = torch.sigmoid(output.logit).double().numpy().reshape(2, -1).mean(0)
+        yield 0.5 * (direct + mirrored) @ window[:, :2].T + window[:, 2], score
+
+
+def _cut(image: np.ndarray, window: np.ndarray, size: int) -> np.ndarray:
+    """Square of an image through an affine (2, 3) from its pixels to the image's, corner origin."""
+    step = float(np.sqrt(abs(np.linalg.det(window[:, :2]))))
+    height, width = image.shape[:2]
+    if step > 1.5:  # averaged first: fine detail would alias
+        small = (max(1, round(width / step)), max(1, round(height / step)))
+        image = cv2.resize(image, small, interpolation=cv2.INTER_AREA)
+    scale = np.array([[image.shape[1] / width], [image.shape[0] / height]])
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    matrix = affine_to_opencv(window * scale)
+    return cv2.warpAffine(image, matrix, (size, size), flags=flags, borderMode=cv2.BORDER_REPLICATE)

@@ -8,7 +8,8 @@ import pytest
 
 from annotations import align, observe
 from annotations.labels import AUTOMATIC, make_flag, make_mark
-from annotations.observe.faces import FACE
+from annotations.observe import observations
+from annotations.observe.stage import FACE
 from annotations.store import append_label, current_labels, read_labels
 from annotations.suggestions import choose_reference, read_suggestions
 from express50.capture.index import read_index
@@ -34,7 +35,7 @@ def act(dataset, subject, strength=2.0, stride=1):
     folder = dataset.item_dir("observe", subject)
     folder.mkdir(parents=True, exist_ok=True)
     np.savez(
-        folder / "observations.npz", schema=observe.SCHEMA, cameras=np.array(["cam01"]),
+        folder / "observations.npz", schema=observations.SCHEMA, cameras=np.array(["cam01"]),
         frames=frames, points=points[None].astype(np.float32),
         scores=np.ones((1, len(frames)), np.float32),
         faces=np.full((1, len(frames), FACE, FACE), 99, np.uint8),
@@ -153,10 +154,10 @@ def test_frames_between_those_observed_get_a_curve_too(dataset):
 
 def test_damaged_observations_are_named(dataset):
     act(dataset, "S001")
-    path = observe.observations_path(dataset, "S001")
+    path = observations.observations_path(dataset, "S001")
     path.write_bytes(path.read_bytes()[:200])
     with pytest.raises(FormatError, match="express50 align"):
-        observe.read_observations(dataset, "S001")
+        observations.read_observations(dataset, "S001")
 
 
 def test_a_suggestion_that_changed_takes_the_place_of_the_old_one(watched):

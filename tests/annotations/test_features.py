@@ -14,8 +14,8 @@ from annotations.align.features import (
 )
 from annotations.align.match import shared_columns
 from annotations.align.suggest import strongest_event
-from annotations.observe import FaceObservations
-from annotations.observe.faces import FACE, face_side, find_points, steady
+from annotations.observe.observations import FaceObservations
+from annotations.observe.stage import FACE, face_side, find_points, steady
 from express50.capture.expressions import load_script
 from express50.landmarks.network import load_network
 

@@ -10,9 +10,14 @@ from hypothesis import strategies as st
 from annotations.align.features import expression_values, measure
 from annotations.align.match import suggest_all, watch
 from annotations.align.suggest import suggest
-from annotations.observe import FaceObservations
-from annotations.observe.faces import FACE, align_faces, similarity_2d
-from annotations.observe.stage import choose_cameras, frames_to_try
+from annotations.observe.observations import FaceObservations
+from annotations.observe.stage import (
+    FACE,
+    align_faces,
+    choose_cameras,
+    frames_to_try,
+    similarity_2d,
+)
 from express50.capture.expressions import load_script
 from express50.capture.index import Cue
 from express50.errors import StageError
