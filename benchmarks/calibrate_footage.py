@@ -32,7 +32,7 @@ from pipelines.calibrate.structure import solve_footage
 from pipelines.calibrate.tracks import Seen, look, undistorted
 
 BUMP_DEG, BUMP_MM = 0.3, 5.0
-Judge = Callable[[Mapping[str, Camera], Mapping[str, Camera]], dict[str, float]]
+PerceptualMetrics = Callable[[Mapping[str, Camera], Mapping[str, Camera]], dict[str, float]]
 
 
 def see_capture(root: Path, true: Mapping[str, Camera], moments: int) -> dict[int, Seen]:
@@ -99,7 +99,7 @@ def similar(estimated: Mapping[str, Camera], true: Mapping[str, Camera]) -> dict
 def refine_figures(
     seen: Mapping[int, Seen],
     true: Mapping[str, Camera],
-    judge: Judge,
+    judge: PerceptualMetrics,
     board: tuple[Observations, np.ndarray] | None = None,
 ) -> dict[str, object]:
     """Errors of a perturbed rig before and after, and whether the true one is left as it is.
@@ -135,7 +135,7 @@ def _row(
     refine: Callable[[Mapping[str, Camera]], Refined],
     bumped: Mapping[str, Camera],
     true: Mapping[str, Camera],
-    judge: Judge,
+    judge: PerceptualMetrics,
 ) -> dict[str, object]:
     started = time.process_time()
     found = refine(bumped)

@@ -32,12 +32,12 @@ from grmm.config import Config
 from grmm.data import HeadViews
 from grmm.edit import trained_head
 from grmm.evaluate import evaluate, mean, training_render
-from grmm.order import spread
+from grmm.identity_evaluation import FitProtocol
 from grmm.presets import resolve
 from grmm.render import around, frontal, orbit, picture, resized
-from grmm.run import prepare
+from grmm.sampler import spread
 from grmm.shard_source import open_shards
-from grmm.unseen import Protocol
+from grmm.train_state import prepare
 from grmm.warm_start import warm_start
 
 EXPRESSIONS = (
@@ -66,7 +66,7 @@ def held_out(shards: Path, config: Config) -> tuple[Config, str]:
     Cameras in the order in which they face the first person: the first is fitted from, the second
     and the fifth are held out, one beside the middle and one from the side.
     """
-    source = open_shards([shards], config.data.split)
+    source = open_shards([shards], "train")
     views = HeadViews(source, load_head(source.head))
     facing: dict[str, float] = {}
     for index, key in enumerate(views.keys):
@@ -87,11 +87,11 @@ def held_out(shards: Path, config: Config) -> tuple[Config, str]:
 
 def baseline(shards: Path, config: Config, images: int) -> dict[str, float | None]:
     """The textured tracked mesh on the held-out cameras."""
-    source = open_shards([shards], config.data.split)
+    source = open_shards([shards], "train")
     views = HeadViews(source, load_head(source.head))
     torch.manual_seed(config.train.seed)
     run = prepare(views, config)
-    warm_start(run.model, views, run.training, config.train.warm_start_images)
+    warm_start(run.model, views, run.training)
     own = [i for i in run.holdout if views.keys[i].camera in config.data.holdout_cameras]
     rows = evaluate(views, spread(own, images), training_render(run.model, views))
     return {name: mean(rows, name) for name in ("psnr_db", "psnr_head_db", "ssim", "depth_mm")}
@@ -135,7 +135,7 @@ def measure(shards: Path, out: Path, iterations: int, images: int, rows: list[st
     """Baseline, full model and ablations on one folder of shards."""
     config = resolve("demo", None, [f"train.iterations={iterations}"])
     config, given = held_out(shards, config)
-    protocol = Protocol(cameras=(given,), expression="neutral", images=images)
+    protocol = FitProtocol(cameras=(given,), expression="neutral", images=images)
     table = ablate([shards], out / "ablation", config, protocol, names=rows)["rows"]
     full, groups = table["full"], table["full"]["groups"]
     loaded = load_checkpoint(out / "ablation" / "full" / "checkpoint.pt")

@@ -27,11 +27,11 @@ from express50.head.load import load_head
 from grmm.config import Config
 from grmm.data import HeadViews, Key, Sample, Source
 from grmm.evaluate import evaluate, mean, training_render
-from grmm.objective import step
-from grmm.order import spread
 from grmm.presets import as_tables, from_tables, resolve
-from grmm.run import finished, prepare, set_rates, settle
+from grmm.sampler import spread
 from grmm.shard_source import open_shards
+from grmm.train import step
+from grmm.train_state import finished, prepare, set_rates, with_map_size
 from grmm.warm_start import warm_start
 
 Changes = dict[str, dict[str, object]]
@@ -44,8 +44,6 @@ SETTINGS: dict[str, tuple[Changes, int]] = {  # name -> changes of tables, pixel
     "n_g 256, no refinement": ({"model": {"n_g": 256, "refine_widths": []}}, 1),
     "refinement at half": ({"model": {"refine_unshuffle": 2}}, 1),
     "half the pixels a side": ({}, 2),
-    "bfloat16": ({"model": {"precision": "bfloat16"}}, 1),
-    "averaged weights": ({"train": {"ema": 0.99}}, 1),
 }
 HEADING = "Knobs of GRMM"
 
@@ -88,13 +86,13 @@ def train_for(views: HeadViews, config: Config) -> tuple[torch.nn.Module, int]:
     torch.manual_seed(config.train.seed)
     began = time.process_time()
     run = prepare(views, config)
-    warm_start(run.model, views, run.training, config.train.warm_start_images)
+    warm_start(run.model, views, run.training)
     while not finished(run, config):
         set_rates(run, config)
         step(run, run.model, config)
         run.iteration += 1
         run.seconds = time.process_time() - began
-    return run.result, run.iteration
+    return run.model, run.iteration
 
 
 def measure(source: Source, base: Config, name: str, budget: float, images: int) -> dict:
@@ -107,7 +105,7 @@ def measure(source: Source, base: Config, name: str, budget: float, images: int)
     head = load_head(source.head)
     whole = HeadViews(source, head)
     views = whole if factor == 1 else HeadViews(Smaller(source, factor), head)
-    config = settle(from_tables(tables), views)
+    config = with_map_size(from_tables(tables), views)
     model, steps = train_for(views, config)
     cameras = config.data.holdout_cameras
     own = [
@@ -139,7 +137,7 @@ def as_markdown(rows: list[dict], people: int, cameras: int, size: int) -> list[
         "px, two more held out. One thing is changed at a time from `--preset demo`. A budget is "
         "processor seconds of one core, from the first image read; dB are over all pixels but the "
         "torso, and over the head's alone. A picture is decoded, drawn, refined and compared. One "
-        "run a row: a tenth of a dB says nothing. bfloat16 is emulated on processors without it."
+        "run a row: a tenth of a dB says nothing."
     )
     head = "| setting | budget s | steps | PSNR dB | head dB | SSIM | seconds a picture |"
     lines = [
@@ -151,7 +149,7 @@ def as_markdown(rows: list[dict], people: int, cameras: int, size: int) -> list[
 
 
 def choices(rows: list[dict]) -> list[dict]:
-    """For each budget the setting with the best PSNR, as `grmm.budget` reads it."""
+    """For each budget the setting with the best PSNR, as `grmm.presets.choose` reads it."""
     best: dict[float, dict] = {}
     for row in rows:
         if row["budget_s"] not in best or row["psnr_db"] > best[row["budget_s"]]["psnr_db"]:

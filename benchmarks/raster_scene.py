@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from express50.geometry.conventions import cell_to_corner, corner_to_cell
+from grmm.rasterize.interface import Pinhole, Splats
 from grmm.rasterize.projection import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN, Projection, project
 
 
@@ -47,13 +48,17 @@ def head(n: int, size: int, channels: int) -> dict[str, Tensor]:
     }
 
 
-GEOMETRY = ("means", "quats", "scales", "opacities", "K", "cam_from_world")
+def records(scene: dict[str, Tensor], size: int) -> tuple[Splats, Pinhole]:
+    """The scene as the rasteriser's records."""
+    camera = {name: scene[name] for name in ("K", "cam_from_world")}
+    splats = {name: tensor for name, tensor in scene.items() if name not in camera}
+    return Splats(**splats), Pinhole(**camera, width=size, height=size)
 
 
 @torch.no_grad()
 def blended_pairs(scene: dict[str, Tensor], size: int) -> tuple[Tensor, Tensor]:
     """Gaussian and pixel numbers (M,) of every blend, by pixel and nearest first within it."""
-    splats = project(**{name: scene[name] for name in GEOMETRY}, width=size, height=size)
+    splats = project(*records(scene, size))
     visible = splats.visible.nonzero()[:, 0]
     order = visible[torch.sort(splats.depths[visible], stable=True).indices]
     mean, extent = splats.means2d[order].double(), splats.extents[order]
@@ -98,7 +103,7 @@ def render_pairs(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Colours (P, C), sum of weight * ray length (P,) and alpha (P,), all by torch's autograd."""
     gaussians, pixels = pairs
-    splats = project(**{name: scene[name] for name in GEOMETRY}, width=size, height=size)
+    splats = project(*records(scene, size))
     alphas = pair_alphas(splats, gaussians, pixels, size)
     weights = alphas * before(alphas, pixels)
     center = cell_to_corner(torch.stack([pixels % size, pixels // size], 1).to(weights.dtype))

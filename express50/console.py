@@ -92,6 +92,13 @@ def say(*lines: str) -> None:
             sys.stdout.write(line + "\n")
 
 
+def log(line: str) -> None:
+    """Write a line of progress to standard error: standard output is for results."""
+    with readers_may_leave(sys.stderr):
+        sys.stderr.write(line + "\n")
+        sys.stderr.flush()
+
+
 def say_json(value: object) -> None:
     """Write JSON to standard output."""
     say(json.dumps(value, indent=1, sort_keys=True, ensure_ascii=False))

@@ -9,35 +9,93 @@ from __future__ import annotations
 import fnmatch
 import hashlib
 import json
-from collections.abc import Sequence
-from dataclasses import asdict, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from express50.console import log
+from express50.contract.config import nearest
 from express50.errors import ConfigError, FormatError
 from express50.files.atomic import dump_json, write_bytes, write_json
 from express50.files.text import read_json_table
 from express50.head.load import load_head
-from grmm.ablation_table import GROUPS, SHOWN, Variant, variants_of, write_tables
 from grmm.checkpoint import Loaded, load_checkpoint
 from grmm.config import Config
 from grmm.data import HeadViews
-from grmm.evaluate import evaluate, kind_of, mean, training_render
-from grmm.judge import Judge
-from grmm.order import spread
+from grmm.evaluate import (
+    HELD_EXPRESSION,
+    HELD_VIEW,
+    evaluate,
+    kind_of,
+    mean,
+    training_render,
+)
+from grmm.identity_evaluation import (
+    NOVEL_EXPRESSION,
+    NOVEL_VIEW,
+    FitProtocol,
+    evaluate_unseen,
+    given_views,
+)
+from grmm.perceptual_metrics import PerceptualMetrics
 from grmm.presets import as_tables, from_tables
-from grmm.progress import log
-from grmm.run import best_device, settle
+from grmm.sampler import spread
 from grmm.shard_source import open_shards
 from grmm.train import train
-from grmm.unseen import Protocol, evaluate_unseen, given_views
+from grmm.train_state import best_device, with_map_size
+
+
+@dataclass(frozen=True, kw_only=True)
+class Variant:
+    """One row: what it is called, what it changes, and what the paper found.
+
+    Attributes:
+        label: as in the table.
+        changes: table -> key -> value over the common configuration.
+        paper_db: the paper's PSNR minus that of its full model; None: no figure.
+        trains_as: the row whose checkpoint it uses, where only the fit differs.
+        without: the folder of shards left out.
+    """
+
+    label: str
+    changes: Mapping[str, Mapping[str, object]]
+    paper_db: float | None = None
+    trains_as: str = ""
+    without: Path | None = None
+
+
+VARIANTS = {
+    "full": Variant(label="Full model", changes={}),
+    "no_residuals": Variant(
+        label="W/o residuals", changes={"model": {"residual_codes": False}}, paper_db=-1.63
+    ),
+    "no_mesh_decoder": Variant(
+        label="W/o mesh decoder", changes={"model": {"mesh_decoder": False}}, paper_db=-2.18
+    ),
+    "no_refinement": Variant(
+        label="W/o refinement", changes={"model": {"refine_widths": []}}, paper_db=-0.77
+    ),
+    "no_mouth_uv": Variant(label="W/o mouth UV", changes={"model": {"mouth": False}}),
+    "no_locality": Variant(
+        label="W/o locality loss",
+        changes={"fit": {"locality": 0.0}},
+        paper_db=-0.68,
+        trains_as="full",
+    ),
+}
+DATASET_PREFIX = "without_"
+GROUPS = {"view": HELD_VIEW, "expression": HELD_EXPRESSION, "unseen": NOVEL_VIEW,
+          "unseen_expression": NOVEL_EXPRESSION}  # fmt: skip
+DIGITS = {"psnr_db": 2, "ssim": 3, "lpips": 3}
+SHOWN = ("psnr_db", "psnr_head_db", "ssim", "rmse", "lpips")
 
 
 def ablate(
     roots: Sequence[Path],
     out: Path,
     config: Config,
-    protocol: Protocol,
+    protocol: FitProtocol,
     subjects: Sequence[str] = (),
     names: Sequence[str] = (),
 ) -> dict[str, Any]:
@@ -56,8 +114,8 @@ def ablate(
     """
     config = with_holdout(roots, config)
     if not config.model.n_g:  # every row has as many Gaussians as the full model
-        source = open_shards(roots, config.data.split)
-        config = settle(config, HeadViews(source, load_head(source.head)))
+        source = open_shards(roots, "train")
+        config = with_map_size(config, HeadViews(source, load_head(source.head)))
     variants = variants_of(roots, names)
     check_people(roots, config, protocol, subjects)
     rows: dict[str, dict] = {}
@@ -68,7 +126,7 @@ def ablate(
 
 
 def check_people(
-    roots: Sequence[Path], config: Config, protocol: Protocol, subjects: Sequence[str]
+    roots: Sequence[Path], config: Config, protocol: FitProtocol, subjects: Sequence[str]
 ) -> None:
     """Refuse, before hours of training, unseen people whom the shards do not show.
 
@@ -77,7 +135,7 @@ def check_people(
     """
     source = open_shards(roots, "*")
     views = HeadViews(source, load_head(source.head))
-    for subject in subjects or unseen_subjects(roots, views, config.data.split):
+    for subject in subjects or unseen_subjects(roots, views, "train"):
         given_views(views, subject, protocol)
 
 
@@ -85,7 +143,7 @@ def with_holdout(roots: Sequence[Path], config: Config) -> Config:
     """Hold out the middle camera by id where the configuration holds out none."""
     if config.data.holdout_cameras:
         return config
-    cameras = sorted({key.camera for key in open_shards(roots, config.data.split).keys})
+    cameras = sorted({key.camera for key in open_shards(roots, "train").keys})
     if len(cameras) < 2:
         raise ConfigError(f"{roots[0]}: one camera; expected two or more, to hold one out")
     chosen = cameras[len(cameras) // 2]
@@ -99,7 +157,7 @@ def changed(config: Config, variant: Variant, used: Sequence[Path]) -> Config:
     for table, values in variant.changes.items():
         tables[table] |= values
     if variant.without is not None:
-        keys = open_shards(used, config.data.split).keys
+        keys = open_shards(used, "train").keys
         cameras = {key.camera for key in keys}
         frames = {f"{key.subject}/{key.expression}" for key in keys}
         data = tables["data"]
@@ -116,7 +174,7 @@ def _row(
     name: str,
     variant: Variant,
     config: Config,
-    protocol: Protocol,
+    protocol: FitProtocol,
     subjects: Sequence[str],
 ) -> dict:
     """The numbers of one row, from its file if it was measured with these very settings."""
@@ -144,7 +202,7 @@ def _row(
 def _train(used: Sequence[Path], folder: Path, settings: Config) -> None:
     """Train a row, or go on where it stopped; other settings or samples start afresh."""
     tables = as_tables(settings)
-    source = open_shards(used, settings.data.split)
+    source = open_shards(used, "train")
     wanted = dump_json(
         {
             "tables": {k: v for k, v in tables.items() if k not in ("fit", "metrics")},
@@ -164,7 +222,7 @@ def measure(
     loaded: Loaded,
     roots: Sequence[Path],
     used: Sequence[Path],
-    protocol: Protocol,
+    protocol: FitProtocol,
     subjects: Sequence[str],
 ) -> dict:
     """Held-out views and expressions of training people, and people that training never saw."""
@@ -189,11 +247,11 @@ def measure(
         if not own or len(used) < len(roots):
             continue
         chosen = spread(own, protocol.images) if protocol.images else own
-        judge = Judge(loaded.config.metrics)
+        judge = PerceptualMetrics(loaded.config.metrics)
         rows = evaluate(views, chosen, training_render(loaded.model, views), judge)
         groups[group] = _means(rows, judge)
-    judge, rows, efforts = Judge(loaded.config.metrics), [], []
-    for subject in subjects or sorted(unseen_subjects(roots, views, data.split)):
+    judge, rows, efforts = PerceptualMetrics(loaded.config.metrics), [], []
+    for subject in subjects or sorted(unseen_subjects(roots, views, "train")):
         found, effort = evaluate_unseen(loaded, views, subject, protocol, judge)
         rows += found
         efforts.append(effort)
@@ -217,7 +275,7 @@ def unseen_subjects(roots: Sequence[Path], views: HeadViews, split: str) -> set[
     return {key.subject for key in views.keys} - trained
 
 
-def _means(rows: list, judge: Judge, kind: str | None = None) -> dict:
+def _means(rows: list, judge: PerceptualMetrics, kind: str | None = None) -> dict:
     return {n: mean(rows, n) for n in SHOWN} | {"fid": judge.fid(kind), "images": len(rows)}
 
 
@@ -225,7 +283,7 @@ def _digest(
     roots: Sequence[Path],
     used: Sequence[Path],
     settings: Config,
-    protocol: Protocol,
+    protocol: FitProtocol,
     subjects: Sequence[str],
 ) -> str:
     """What a row's numbers depend on, but for the code."""
@@ -238,3 +296,71 @@ def _digest(
         "subjects": list(subjects),
     }
     return hashlib.sha256(dump_json(content)).hexdigest()
+
+
+def variants_of(roots: Sequence[Path], names: Sequence[str] = ()) -> dict[str, Variant]:
+    """The rows asked for, all by default; with several datasets one row without each.
+
+    Raises:
+        ConfigError: no row has such a name.
+    """
+    rows = dict(VARIANTS)
+    if len(roots) > 1:
+        for root in roots:
+            name = root.parent.parent.name if root.name == "shards" else root.name
+            rows[DATASET_PREFIX + name] = Variant(label=f"W/o {name}", changes={}, without=root)
+    for name in names:
+        if name not in rows:
+            raise ConfigError(
+                f"row {name!r} is unknown{nearest(name, rows)}; expected {', '.join(rows)}"
+            )
+    # The full model comes first: others are compared with it, and no_locality uses its weights.
+    return {name: row for name, row in rows.items() if not names or name in (*names, "full")}
+
+
+def write_tables(
+    out: Path, rows: Mapping[str, dict], variants: Mapping[str, Variant], config: Config
+) -> None:
+    """Write ablation.json and ablation.md of the rows measured so far."""
+    full = rows["full"]["groups"]
+    table = {
+        name: row
+        | {
+            "difference_db": {
+                group: round(numbers["psnr_db"] - full[group]["psnr_db"], 3)
+                for group, numbers in row["groups"].items()
+                if group in full and None not in (numbers["psnr_db"], full[group]["psnr_db"])
+            }
+        }
+        for name, row in rows.items()
+    }
+    budget = {"seconds": config.train.seconds or None, "iterations": config.train.iterations}
+    missing = PerceptualMetrics(config.metrics).missing()
+    write_json(
+        out / "ablation.json",
+        {"rows": table, "budget": budget, "holdout_cameras": list(config.data.holdout_cameras)}
+        | missing,
+    )
+    write_bytes(out / "ablation.md", markdown(table, missing).encode())
+
+
+def markdown(table: Mapping[str, dict], missing: Mapping[str, str]) -> str:
+    """The table as the paper prints its own: one row a model, PSNR, SSIM and LPIPS a protocol."""
+    groups = [g for g in GROUPS if any(g in row["groups"] for row in table.values())]
+    head = ["Method"]
+    for group in groups:
+        head += [f"{GROUPS[group]}: PSNR", "SSIM", "LPIPS", "dB over full"]
+    lines = [head + ["paper, dB"], ["---"] * (len(head) + 1)]
+    for row in table.values():
+        cells = [row["label"]]
+        for group in groups:
+            numbers = row["groups"].get(group, {})
+            cells += [_cell(numbers.get(name), d) for name, d in DIGITS.items()]
+            cells.append(_cell(row["difference_db"].get(group), 2, sign=True))
+        lines.append([*cells, _cell(row["paper_db"], 2, sign=True)])
+    text = "".join("| " + " | ".join(line) + " |\n" for line in lines)
+    return text + "".join(f"\n{name.upper()}: {reason}\n" for name, reason in missing.items())
+
+
+def _cell(value: float | None, digits: int, sign: bool = False) -> str:
+    return "n/a" if value is None else f"{value:{'+' if sign else ''}.{digits}f}"

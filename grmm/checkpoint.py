@@ -26,9 +26,33 @@ from grmm.config import Config, ModelConfig
 from grmm.data import NO_OFFSETS, HeadViews, Tracked, check_tracked, pose_state
 from grmm.model import GRMM
 from grmm.presets import as_tables, from_tables
-from grmm.scene import HeadState, View
+from grmm.scene import HeadState, PinholeView
 
 FORMAT = "grmm.checkpoint/1"
+# Settings of older checkpoints: the value that this version computes with.
+RETIRED: dict[str, dict[str, object]] = {
+    "model": {
+        "displacement_scale": 1e-2, "view_channels": 8, "code_spread": 1.0,
+        "opacity_from_expression": False, "thickness_init": 0.3, "scale_min_mm": 0.1,
+        "scale_max_mm": 10.0, "depth_normalisation": "minmax", "precision": "float32",
+    },
+    "loss": {"depth_erode_px": 2, "perceptual_crop_px": 0, "perceptual_every": 1},
+    "data": {"crop_margin_px": 16},
+    "train": {"ema": 0.0, "clip_norm": 0.0, "overfit": 0, "shuffle_directions": 0.0},
+}  # fmt: skip
+# Settings of older checkpoints that no result depends on.
+DROPPED = {
+    "model": ("backend",),
+    "data": ("split",),
+    "train": (
+        "betas", "tensorboard", "warm_start", "warm_start_images", "save_every", "log_every",
+        "threads",
+    ),
+    "fit": (
+        "stage1_share", "stage1_final_lr", "stage2_texel_lr_scale", "tune_refinement",
+        "locality_t", "codes", "seed",
+    ),
+}  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)
@@ -41,7 +65,7 @@ class Gallery:
     """
 
     frames: dict[tuple[str, str], Tracked]
-    cameras: dict[str, View]
+    cameras: dict[str, PinholeView]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)
@@ -74,7 +98,7 @@ class Loaded:
 def collect_gallery(views: HeadViews, indices: Sequence[int]) -> Gallery:
     """Parameters of every frame, and one view of every camera, among the samples ``indices``."""
     frames: dict[tuple[str, str], Tracked] = {}
-    cameras: dict[str, View] = {}
+    cameras: dict[str, PinholeView] = {}
     for index in indices:
         key = views.keys[index]
         if (key.subject, key.expression) in frames and key.camera in cameras:
@@ -148,7 +172,7 @@ def load_checkpoint(path: Path, device: torch.device | str = "cpu") -> Loaded:
 def _loaded(path: Path, content: dict[str, Any], device: torch.device | str) -> Loaded:
     """The checkpoint of a file's content, each number of it finite."""
     try:
-        config = from_tables(content["config"])
+        config = from_tables(_current_settings(path, content["config"]))
     except ConfigError as error:
         raise FormatError(f"{path}: its configuration: {error}; copy it again") from None
     _check_finite(path, content["model"])
@@ -163,6 +187,26 @@ def _loaded(path: Path, content: dict[str, Any], device: torch.device | str) -> 
         optimizer=content["optimizer"],
         loop=content["loop"],
     )
+
+
+def _current_settings(path: Path, tables: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
+    """Leave out settings that older versions had.
+
+    Raises:
+        FormatError: such a setting has a value that this version cannot compute with.
+    """
+    current = {}
+    for table, values in tables.items():
+        fixed = RETIRED.get(table, {})
+        for key, value in fixed.items():
+            if values.get(key, value) != value:
+                raise FormatError(
+                    f"{path}: was trained with {table}.{key} = {values[key]!r}, expected "
+                    f"{value!r}: the setting is gone. Train again, or use commit c44aa77"
+                )
+        gone = {*fixed, *DROPPED.get(table, ())}
+        current[table] = {key: value for key, value in values.items() if key not in gone}
+    return current
 
 
 def _build(path: Path, config: ModelConfig, head: HeadModel, content: dict[str, Any]) -> GRMM:
@@ -198,7 +242,7 @@ def _gallery(
     return Gallery(frames=frames, cameras=cameras)
 
 
-def _camera(path: Path, name: str, row: dict[str, Any], device: torch.device | str) -> View:
+def _camera(path: Path, name: str, row: dict[str, Any], device: torch.device | str) -> PinholeView:
     """One camera, of a size that an image may have."""
     matrices = {"K": row["K"], "cam_from_head": row["cam_from_head"]}
     _check_finite(path, matrices)
@@ -210,7 +254,7 @@ def _camera(path: Path, name: str, row: dict[str, Any], device: torch.device | s
             f"{path}: camera {name}: size {size}, expected two positive whole numbers of pixels, "
             f"together at most {PIXEL_LIMIT}; copy it again"
         )
-    return View(
+    return PinholeView(
         K=row["K"].to(device),
         cam_from_head=row["cam_from_head"].to(device),
         width=width,

@@ -17,9 +17,8 @@ from torch import Tensor
 
 from express50.errors import FormatError
 from express50.head.model import HeadModel, pose
-from grmm.scene import HeadState, View
-from grmm.torso import labelled_torso, torso_mask
-from grmm.window import crop_view, head_window
+from grmm.head_crop import crop_view, head_window, labelled_torso, torso_mask
+from grmm.scene import HeadState, PinholeView
 
 NO_OFFSETS = np.zeros((0, 3), np.float32)
 
@@ -112,7 +111,7 @@ class Item:
 
     key: Key
     state: HeadState
-    view: View
+    view: PinholeView
     target: Tensor
     mask: Tensor
     counts: Tensor
@@ -155,11 +154,11 @@ class HeadViews:
         """Ids of all samples."""
         return self.source.keys
 
-    def item(self, index: int, margin_px: int = -1) -> Item:
-        """One sample as tensors on the device.
+    def item(self, index: int, *, crop: bool = False) -> Item:
+        """Return one sample as tensors on the device.
 
-        With ``margin_px`` >= 0 only the window around head and matte, that much larger on each
-        side: outside it, footage and rendering are both the background.
+        With ``crop`` only the window around head and matte, as training takes it: outside it,
+        footage and rendering are both the background.
         """
         key, sample = self.keys[index], self.sample(index)
         state = self.state(index)
@@ -167,9 +166,9 @@ class HeadViews:
         view = self.view_of(sample, width, height)
         torso = self._torso(index, sample, state, view)
         rows, columns = slice(0, height), slice(0, width)
-        if margin_px >= 0:
+        if crop:
             matte = np.where(torso, 0, sample.alpha)
-            rows, columns = head_window(state.vertices, view, matte, margin_px)
+            rows, columns = head_window(state.vertices, view, matte)
             view = crop_view(view, rows, columns)
         image, alpha = sample.image[rows, columns], sample.alpha[rows, columns]
         depth = np.zeros(alpha.shape, np.float32) if sample.depth is None else sample.depth
@@ -188,7 +187,7 @@ class HeadViews:
             depth_valid=(known > 0) & counts,
         )
 
-    def _torso(self, index: int, sample: Sample, state: HeadState, view: View) -> np.ndarray:
+    def _torso(self, index: int, sample: Sample, state: HeadState, view: PinholeView) -> np.ndarray:
         """Torso pixels (H, W) of a sample; what takes long is found once and kept as bits."""
         size = sample.alpha.shape
         if not self.ignore_torso:
@@ -223,12 +222,12 @@ class HeadViews:
             self._states[key.subject, key.expression] = pose_state(self.head, tracked)
         return self._states[key.subject, key.expression]
 
-    def view_of(self, sample: Sample, width: int, height: int) -> View:
+    def view_of(self, sample: Sample, width: int, height: int) -> PinholeView:
         """Camera of a sample in head space, float64: subjects may stand far from the origin."""
         head_to_world = np.eye(4)
         head_to_world[:3, :3], head_to_world[:3, 3] = sample.tracked.R, sample.tracked.t
         camera = sample.cam_from_world @ head_to_world
-        return View(
+        return PinholeView(
             K=torch.as_tensor(sample.K, dtype=torch.float64, device=self.device),
             cam_from_head=torch.as_tensor(camera, dtype=torch.float64, device=self.device),
             width=width,

@@ -17,7 +17,13 @@ from torch import Tensor
 
 from express50.contract.config import nearest
 from express50.errors import ConfigError
-from express50.geometry.transforms_torch import axis_angle_to_quat, quat_to_axis_angle, slerp
+from express50.geometry.transforms import (
+    axis_angle_to_matrix,
+    matrix_to_axis_angle,
+    matrix_to_quat,
+    quat_to_matrix,
+    slerp,
+)
 from grmm.checkpoint import Loaded
 from grmm.data import NO_OFFSETS, Tracked, pose_state
 from grmm.scene import HeadState
@@ -27,7 +33,7 @@ CODES = ("z_id", "z_exp")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Head:
+class HeadCodes:
     """One head: residual codes and head-model parameters.
 
     Attributes:
@@ -45,7 +51,7 @@ class Head:
         return pose_state(loaded.head, self.tracked)
 
 
-def trained_head(loaded: Loaded, subject: str, expression: str) -> Head:
+def trained_head(loaded: Loaded, subject: str, expression: str) -> HeadCodes:
     """A training subject with a training expression; a frame it never showed comes by transfer.
 
     Raises:
@@ -60,21 +66,21 @@ def trained_head(loaded: Loaded, subject: str, expression: str) -> Head:
         own = next(frame for (s, _), frame in frames.items() if s == subject)
         tracked = transfer(own, frames[donor, expression])
     codes = model.codes(model.subjects.index(subject), model.expressions.index(expression))
-    return Head(z_id=codes[0].detach(), z_exp=codes[1].detach(), tracked=tracked)
+    return HeadCodes(z_id=codes[0].detach(), z_exp=codes[1].detach(), tracked=tracked)
 
 
-def with_expression(identity: Head, expression: Head) -> Head:
+def with_expression(identity: HeadCodes, expression: HeadCodes) -> HeadCodes:
     """Expression transfer: one head's identity with all that another's expression is made of."""
-    return Head(
+    return HeadCodes(
         z_id=identity.z_id,
         z_exp=expression.z_exp,
         tracked=transfer(identity.tracked, expression.tracked),
     )
 
 
-def between(a: Head, b: Head, t: float) -> Head:
+def between(a: HeadCodes, b: HeadCodes, t: float) -> HeadCodes:
     """The head at ``t`` from a (0) to b (1): codes and parameters are blended."""
-    return Head(
+    return HeadCodes(
         z_id=torch.lerp(a.z_id, b.z_id, t),
         z_exp=torch.lerp(a.z_exp, b.z_exp, t),
         tracked=interpolate_tracked(a.tracked, b.tracked, t),
@@ -112,14 +118,14 @@ def interpolate_tracked(a: Tracked, b: Tracked, t: float) -> Tracked:
 
 
 def slerp_axis_angle(a: np.ndarray, b: np.ndarray, t: float) -> np.ndarray:
-    """Spherical interpolation of two axis-angle vectors (3,), radians, along the shorter arc."""
-    quats = [
-        axis_angle_to_quat(torch.as_tensor(np.asarray(x), dtype=torch.float64)) for x in (a, b)
-    ]
-    return quat_to_axis_angle(slerp(quats[0], quats[1], t)).numpy()
+    """Interpolate axis-angle vectors (3,), radians, spherically along the shorter arc."""
+    start, end = (matrix_to_quat(axis_angle_to_matrix(np.asarray(x, np.float64))) for x in (a, b))
+    return matrix_to_axis_angle(quat_to_matrix(slerp(start, end, t)))
 
 
-def controlled(loaded: Loaded, head: Head, controls: Mapping[str, Sequence[float]]) -> Head:
+def controlled(
+    loaded: Loaded, head: HeadCodes, controls: Mapping[str, Sequence[float]]
+) -> HeadCodes:
     """Change single parameters of a head; all others stay.
 
     Names: ``jaw``, ``neck``, ``eyes`` (axis-angles, radians; three numbers turn both eyes),
@@ -167,7 +173,9 @@ def _directions(codes: Tensor, version: int) -> Tensor:
     return (scaled * largest.sign()).to(codes.dtype)
 
 
-def sample_identity(loaded: Loaded, head: Head, rng: np.random.Generator, spread: float) -> Head:
+def sample_identity(
+    loaded: Loaded, head: HeadCodes, rng: np.random.Generator, spread: float
+) -> HeadCodes:
     """A new person with the given head's expression.
 
     Codes, shape and offsets are drawn together from the Gaussian that the training subjects
@@ -189,7 +197,9 @@ def sample_identity(loaded: Loaded, head: Head, rng: np.random.Generator, spread
     return replace(head, z_id=z_id, tracked=tracked)
 
 
-def sample_expression(loaded: Loaded, head: Head, rng: np.random.Generator, spread: float) -> Head:
+def sample_expression(
+    loaded: Loaded, head: HeadCodes, rng: np.random.Generator, spread: float
+) -> HeadCodes:
     """The given person with a new expression, drawn as `sample_identity` draws people.
 
     Coefficients and jaw stay within what training showed: activations have bounds.
@@ -237,8 +247,8 @@ def _padded(values: np.ndarray, length: int) -> np.ndarray:
 
 
 def _with_code(
-    loaded: Loaded, head: Head, table: str, entry: str, values: Sequence[float], name: str
-) -> Head:
+    loaded: Loaded, head: HeadCodes, table: str, entry: str, values: Sequence[float], name: str
+) -> HeadCodes:
     amount = _numbers(values, 1, name)[0]
     code = getattr(head, table)
     if not entry:

@@ -14,15 +14,16 @@ from pathlib import Path
 
 import torch
 from torch import Tensor
+from torchmetrics.functional.image import structural_similarity_index_measure
+from torchmetrics.functional.regression import mean_squared_error
 
 from express50.errors import TrainError
 from express50.files.atomic import write_bytes, write_json
 from grmm.checkpoint import Gallery
 from grmm.config import MetricsConfig
 from grmm.data import HeadViews, Item, Key
-from grmm.judge import Judge
-from grmm.metrics import psnr_db, rmse, ssim_score
 from grmm.model import GRMM
+from grmm.perceptual_metrics import PerceptualMetrics
 from grmm.scene import Rendering
 
 Render = Callable[[Item], Rendering]
@@ -36,6 +37,53 @@ SEEN, HELD_VIEW, HELD_EXPRESSION, HELD_IDENTITY = (
     "seen view", "held-out view", "held-out expression", "held-out identity",
 )  # fmt: skip
 IDS = ("subject", "expression", "camera", "kind")
+PSNR_LIMIT_DB = 100.0  # equal images: a number that averages, where infinity would not
+SSIM_SIGMA, SSIM_WINDOW = 1.5, 11  # Wang et al. 2004
+
+
+def psnr_db(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
+    """Peak signal-to-noise ratio of (3, H, W) images in [0, 1], decibels, at most 100.
+
+    ``mask`` (H, W) bool limits it to some pixels; NaN if it selects none.
+    """
+    squared = (image.clamp(0, 1).double() - target.double()).square()
+    if mask is not None:
+        squared = squared[:, mask]
+        if squared.numel() == 0:
+            return math.nan
+    return float((-10 * torch.log10(squared.mean())).clamp(max=PSNR_LIMIT_DB))
+
+
+def rmse(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
+    """Root mean squared error of (3, H, W) images in [0, 1]; NaN if the mask selects nothing."""
+    a, b = image.clamp(0, 1).double(), target.double()
+    if mask is not None:
+        a, b = a[:, mask], b[:, mask]
+    if a.numel() == 0:
+        return math.nan
+    return float(mean_squared_error(a.reshape(-1), b.reshape(-1), squared=False))
+
+
+def ssim_score(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
+    """Mean SSIM of (3, H, W) images; with a mask over windows centred on its pixels.
+
+    Windows that reach over the border are left out. NaN where no window fits or is selected.
+    """
+    reach = SSIM_WINDOW // 2
+    if min(image.shape[1:]) < SSIM_WINDOW:
+        return math.nan
+    _, values = structural_similarity_index_measure(
+        image.clamp(0, 1).float()[None],
+        target.float()[None],
+        sigma=SSIM_SIGMA,
+        kernel_size=SSIM_WINDOW,
+        data_range=1.0,
+        return_full_image=True,
+    )
+    inner = values[0, :, reach:-reach, reach:-reach]
+    if mask is not None:
+        inner = inner[:, mask[reach:-reach, reach:-reach]]
+    return float(inner.mean()) if inner.numel() else math.nan
 
 
 def training_render(model: GRMM, views: HeadViews) -> Render:
@@ -58,7 +106,7 @@ def kind_of(key: Key, subjects: Sequence[str], gallery: Gallery) -> str:
     return SEEN if key.camera in gallery.cameras else HELD_VIEW
 
 
-def compare(image: Tensor, item: Item, judge: Judge) -> dict[str, float]:
+def compare(image: Tensor, item: Item, judge: PerceptualMetrics) -> dict[str, float]:
     """The numbers of one picture (3, H, W) in [0, 1] beside its footage.
 
     ``psnr_db``, ``ssim``, ``rmse``, ``lpips`` count every pixel but torso (DataConfig.torso);
@@ -90,7 +138,7 @@ def evaluate(
     views: HeadViews,
     indices: Sequence[int],
     render: Render,
-    judge: Judge | None = None,
+    judge: PerceptualMetrics | None = None,
     kind: Callable[[Key], str] = lambda key: "",
     keep: Callable[[int, Tensor], None] | None = None,
 ) -> list[Row]:
@@ -99,7 +147,7 @@ def evaluate(
     ``depth_mm`` is the median absolute error where both depths are known (NaN: nowhere). ``keep``
     gets every index with its picture (3, H, W).
     """
-    judge = Judge(MetricsConfig()) if judge is None else judge
+    judge = PerceptualMetrics(MetricsConfig()) if judge is None else judge
     rows = []
     for index in indices:
         item = views.item(index)
@@ -136,9 +184,9 @@ def means(rows: Sequence[Row]) -> dict[str, object]:
     return numbers | {"images": len(rows)}
 
 
-def summarise(rows: Sequence[Row], judge: Judge | None = None) -> dict[str, object]:
+def summarise(rows: Sequence[Row], judge: PerceptualMetrics | None = None) -> dict[str, object]:
     """Means over all rows and per kind, subject, expression and camera; reasons for what is n/a."""
-    judge = Judge(MetricsConfig()) if judge is None else judge
+    judge = PerceptualMetrics(MetricsConfig()) if judge is None else judge
     summary: dict[str, object] = means(rows) | {"fid": judge.fid()} | judge.missing()
     for group in IDS:
         values = sorted({str(row[group]) for row in rows if row[group]})
@@ -151,7 +199,7 @@ def summarise(rows: Sequence[Row], judge: Judge | None = None) -> dict[str, obje
 
 
 def write_evaluation(
-    out: Path, rows: Sequence[Row], judge: Judge | None = None
+    out: Path, rows: Sequence[Row], judge: PerceptualMetrics | None = None
 ) -> dict[str, object]:
     """Write evaluation.csv (one row an image) and evaluation.json (means); returns the means."""
     buffer = io.StringIO()

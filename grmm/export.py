@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,17 +12,18 @@ import torch
 
 from express50.errors import ConfigError
 from express50.files.atomic import write_bytes
+from express50.geometry.shapes import check_finite
 from grmm.checkpoint import Loaded
-from grmm.edit import Head
-from grmm.ply import write_ply
-from grmm.scene import View
+from grmm.edit import HeadCodes
+from grmm.scene import PinholeView
 
 OPAQUE = 0.3  # opacity under which a Gaussian is no point of a GLB: points cannot be translucent
 FORMATS = (".ply", ".glb", ".npz")
+SH_DC = 0.5 / math.sqrt(math.pi)  # value of the constant spherical harmonic
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Cloud:
+class GaussianCloud:
     """N Gaussians with one colour each, head space.
 
     Attributes:
@@ -40,7 +42,7 @@ class Cloud:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Surface:
+class TexturedMesh:
     """The deformed mesh M_d with the decoded colours as its texture.
 
     Attributes:
@@ -59,14 +61,14 @@ class Surface:
 
 
 @torch.no_grad()
-def cloud(loaded: Loaded, head: Head, view: View) -> Cloud:
+def cloud(loaded: Loaded, head: HeadCodes, view: PinholeView) -> GaussianCloud:
     """Decode a head's Gaussians; colours are those that ``view`` sees, before refinement."""
     model, state = loaded.model, head.state(loaded)
     gaussians = model.geometry(head.z_id, head.z_exp, state)
     colours = model.appearance(head.z_id, state, view)[:, :3]
     low, high = loaded.config.model.scale_bounds_mm
     quats = torch.nn.functional.normalize(gaussians.quats, dim=1)
-    return Cloud(
+    return GaussianCloud(
         means=gaussians.means.cpu().numpy(),
         quats=quats.cpu().numpy(),
         scales=1e-3 * gaussians.scales_mm.clamp(low, high).cpu().numpy(),
@@ -76,7 +78,7 @@ def cloud(loaded: Loaded, head: Head, view: View) -> Cloud:
 
 
 @torch.no_grad()
-def surface(loaded: Loaded, head: Head, view: View) -> Surface:
+def surface(loaded: Loaded, head: HeadCodes, view: PinholeView) -> TexturedMesh:
     """Decode a head's mesh; its texture holds the Gaussians' colours as ``view`` sees them."""
     model, state = loaded.model, head.state(loaded)
     vertices = state.vertices + model.geometry(head.z_id, head.z_exp, state).displacement
@@ -84,7 +86,7 @@ def surface(loaded: Loaded, head: Head, view: View) -> Surface:
     side = loaded.config.model.n_g
     texture = colours.mean(0).expand(side * side, 3).clone()
     texture[model.texels] = colours
-    return Surface(
+    return TexturedMesh(
         vertices=vertices.cpu().numpy(),
         faces=loaded.head.faces.cpu().numpy(),
         uv=loaded.head.uv.cpu().numpy(),
@@ -93,12 +95,13 @@ def surface(loaded: Loaded, head: Head, view: View) -> Surface:
     )
 
 
-def write_export(path: Path, loaded: Loaded, head: Head, view: View, points: bool = False) -> str:
-    """Write by extension; returns what was written, in words.
+def write_export(
+    path: Path, loaded: Loaded, head: HeadCodes, view: PinholeView, points: bool = False
+) -> str:
+    """Write a head in the format of the extension; returns a description of what was written.
 
-    ``.ply``: Gaussians in the 3DGS layout, degree 0. ``.glb``: the textured mesh, or with
-    ``points`` the Gaussians' centres. ``.npz``: Gaussians named as in `Cloud`, ``mesh_vertices``,
-    ``mesh_faces``, codes and head-model parameters.
+    ``.ply`` holds Gaussians in the 3DGS layout; ``.glb`` the textured mesh, or with ``points`` the
+    Gaussians' centres; ``.npz`` the arrays of `GaussianCloud`, mesh, codes and parameters.
 
     Raises:
         ConfigError: another extension.
@@ -116,13 +119,45 @@ def write_export(path: Path, loaded: Loaded, head: Head, view: View, points: boo
     if path.suffix == ".glb":
         write_bytes(path, points_glb(gaussians))
     elif path.suffix == ".ply":
-        write_ply(path, **vars(gaussians))
+        write_bytes(path, ply_bytes(gaussians))
     else:
         write_bytes(path, arrays_npz(loaded, head, gaussians, surface(loaded, head, view)))
     return f"{len(gaussians.means)} Gaussians"
 
 
-def arrays_npz(loaded: Loaded, head: Head, gaussians: Cloud, mesh: Surface) -> bytes:
+def ply_bytes(gaussians: GaussianCloud) -> bytes:
+    """Encode Gaussians in the layout of 3D Gaussian Splatting (Kerbl et al. 2023), degree 0.
+
+    One ``vertex`` element of floats: x y z, nx ny nz (unused), f_dc_0..2, opacity (logit),
+    scale_0..2 (log) and rot_0..3 (wxyz). Opacities are kept within 1e-6 of 0 and 1 and scales over
+    1e-30, so that logits and logarithms are finite.
+
+    Raises:
+        ValueError: a value is not finite.
+    """
+    for name, array in vars(gaussians).items():
+        check_finite(name, array)
+    count = len(gaussians.means)
+    alpha = gaussians.opacities.astype(np.float64).clip(1e-6, 1 - 1e-6)
+    columns = {
+        ("x", "y", "z"): gaussians.means,
+        ("nx", "ny", "nz"): np.zeros((count, 3)),
+        ("f_dc_0", "f_dc_1", "f_dc_2"): (gaussians.colors.astype(np.float64) - 0.5) / SH_DC,
+        ("opacity",): np.log(alpha / (1 - alpha))[:, None],
+        ("scale_0", "scale_1", "scale_2"): np.log(
+            gaussians.scales.astype(np.float64).clip(min=1e-30)
+        ),
+        ("rot_0", "rot_1", "rot_2", "rot_3"): gaussians.quats,
+    }
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]
+    header += [f"property float {name}" for names in columns for name in names]
+    table = np.concatenate(list(columns.values()), 1).astype("<f4")
+    return "\n".join([*header, "end_header", ""]).encode("ascii") + table.tobytes()
+
+
+def arrays_npz(
+    loaded: Loaded, head: HeadCodes, gaussians: GaussianCloud, mesh: TexturedMesh
+) -> bytes:
     """Everything about one head as one .npz."""
     tracked = {f"flame_{name}": value for name, value in vars(head.tracked).items()}
     buffer = io.BytesIO()
@@ -139,7 +174,7 @@ def arrays_npz(loaded: Loaded, head: Head, gaussians: Cloud, mesh: Surface) -> b
     return buffer.getvalue()
 
 
-def mesh_glb(mesh: Surface) -> bytes:
+def mesh_glb(mesh: TexturedMesh) -> bytes:
     """Binary glTF of the textured mesh; vertices are split where the texture map has seams."""
     import trimesh
     from PIL import Image
@@ -156,7 +191,7 @@ def mesh_glb(mesh: Surface) -> bytes:
     return bytes(whole.export(file_type="glb"))
 
 
-def points_glb(gaussians: Cloud) -> bytes:
+def points_glb(gaussians: GaussianCloud) -> bytes:
     """Binary glTF of the centres of Gaussians whose opacity is over OPAQUE."""
     import trimesh
 

@@ -1,8 +1,8 @@
-"""Fit an unseen identity by inverse rendering, in the paper's two stages.
+"""FitState an unseen person by inverse rendering, in the paper's two stages.
 
 Stage 1 inverts the codes with all networks fixed, starting from the mean code. Stage 2 fixes the
-codes and fine-tunes the decoders, held near the pretrained model by the locality loss. What the
-paper leaves silent (iterations, rates, cameras of the locality loss) follows the survey's point 22.
+codes and fine-tunes the decoders, held near the pretrained model by the locality loss. G22 lists
+what the paper leaves open: iterations, rates, cameras of the locality loss.
 """
 
 from __future__ import annotations
@@ -10,35 +10,40 @@ from __future__ import annotations
 import copy
 import math
 import time
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Container, Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from express50.console import log
 from express50.errors import TrainError
 from express50.files.atomic import write_json
 from grmm import losses
-from grmm.checkpoint import Loaded
+from grmm.checkpoint import Gallery, Loaded, collect_gallery, save_checkpoint
 from grmm.config import FitConfig, LossConfig
-from grmm.data import HeadViews, Item
+from grmm.data import NO_OFFSETS, HeadViews, Item, Tracked, pose_state
+from grmm.edit import interpolate_tracked
 from grmm.evaluate import Render, evaluate, mean
-from grmm.fit_checkpoint import save_fit
-from grmm.judge import Judge
-from grmm.locality import locality_loss, random_camera, reconstruction
+from grmm.losses import load_vgg
 from grmm.model import GRMM
-from grmm.order import Shuffle, spread
-from grmm.perceptual import load_vgg
-from grmm.progress import log
+from grmm.perceptual_metrics import PerceptualMetrics
 from grmm.render import comparison_sheet
-from grmm.scene import Rendering
+from grmm.sampler import Shuffle, spread
+from grmm.scene import HeadState, PinholeView, Rendering
 from grmm.warm_start import LOGIT_LIMIT, project_texture, spread_change
+
+Scores = dict[str, float | None]
+LOOKED_AT = 12  # pictures scored between the stages
+STAGE1_SHARE = 0.35  # of a time budget (G22)
+STAGE1_FINAL_LR = 0.1  # rate at the end of stage 1 over the rate at its start (G22)
+LOCALITY_T = 0.3  # weight of the fitted subject in the interpolation (paper, supplement)
 
 
 @dataclass(kw_only=True)
-class Fit:
+class FitState:
     """What a fit works on: a copy of the model to tune, the frozen one, and the codes sought."""
 
     loaded: Loaded
@@ -50,14 +55,14 @@ class Fit:
     z_exp: dict[str, Tensor]
     weights: LossConfig
     settings: FitConfig
+    seed: int
     perceptual: torch.nn.Module | None
-    generator: torch.Generator
 
 
 def fit(
     loaded: Loaded, views: HeadViews, given: Sequence[int], held_out: Sequence[int], out: Path
 ) -> dict[str, object]:
-    """Fit one subject from the views ``given``; report on them and on ``held_out``.
+    """FitState one subject from the views ``given``; report on them and on ``held_out``.
 
     Every expression among the views gets its own z_exp; z_id is common. Writes OUT/checkpoint.pt
     (the tuned model, whose only subject is the fitted one), OUT/metrics.json and OUT/*.jpg.
@@ -69,7 +74,7 @@ def fit(
     render = fitted_render(state)
     held_out = [i for i in held_out if views.keys[i].expression in state.z_exp]
     stages, effort = run_stages(state, lambda: _scores(state, held_out, render))
-    judge = Judge(loaded.config.metrics)
+    judge = PerceptualMetrics(loaded.config.metrics)
     rows = evaluate(views, held_out or state.given, render, judge)
     metrics: dict[str, object] = {
         "subject": views.keys[state.given[0]].subject,
@@ -92,22 +97,18 @@ def fit(
     return metrics
 
 
-Scores = dict[str, float | None]
-LOOKED_AT = 12  # pictures between the stages
-
-
 def run_stages(
-    state: Fit, score: Callable[[], Scores]
+    state: FitState, score: Callable[[], Scores]
 ) -> tuple[dict[str, Scores], dict[str, object]]:
     """Both stages within the time budget: the scores before, between and after, and the effort.
 
     The time that scoring takes does not count against the budget.
     """
     settings = state.settings
-    torch.manual_seed(settings.seed)
+    torch.manual_seed(state.seed)
     stages = {"mean_code": score()}
     began = time.perf_counter()
-    first = invert_codes(state, deadline(settings, began, settings.stage1_share))
+    first = invert_codes(state, deadline(settings, began, STAGE1_SHARE))
     spent = time.perf_counter() - began
     stages["stage1"] = score()
     began = time.perf_counter() - spent
@@ -125,7 +126,7 @@ def run_stages(
     }
 
 
-def start(loaded: Loaded, views: HeadViews, given: list[int]) -> Fit:
+def start(loaded: Loaded, views: HeadViews, given: list[int]) -> FitState:
     """Mean codes and a frozen copy of the model; codes of known expressions start from theirs."""
     subjects = sorted({views.keys[i].subject for i in given})
     if len(subjects) != 1:
@@ -142,7 +143,7 @@ def start(loaded: Loaded, views: HeadViews, given: list[int]) -> Fit:
         else:
             z_exp[expression] = model.z_exp.detach().mean(0)
     frozen = copy.deepcopy(model).requires_grad_(False)
-    return Fit(
+    return FitState(
         loaded=loaded,
         model=copy.deepcopy(model),
         frozen=frozen,
@@ -152,12 +153,12 @@ def start(loaded: Loaded, views: HeadViews, given: list[int]) -> Fit:
         z_exp=z_exp,
         weights=weights,
         settings=loaded.config.fit,
-        perceptual=load_vgg(Path(weights.vgg16)).to(z_id.device) if weights.vgg16 else None,
-        generator=torch.Generator().manual_seed(loaded.config.fit.seed),
+        seed=loaded.config.train.seed,
+        perceptual=load_vgg(Path(weights.vgg16), z_id.device) if weights.vgg16 else None,
     )
 
 
-def fitted_render(state: Fit) -> Render:
+def fitted_render(state: FitState) -> Render:
     """How an item of the fitted subject is rendered."""
 
     def render(item: Item) -> Rendering:
@@ -173,7 +174,7 @@ def deadline(settings: FitConfig, began: float, share: float) -> Callable[[], bo
     return lambda: time.perf_counter() >= limit
 
 
-def invert_codes(state: Fit, late: Callable[[], bool]) -> int:
+def invert_codes(state: FitState, late: Callable[[], bool]) -> int:
     """Stage 1: optimise z_id and z_exp; returns the iterations done."""
     settings = state.settings
     state.model.requires_grad_(False)
@@ -184,14 +185,14 @@ def invert_codes(state: Fit, late: Callable[[], bool]) -> int:
     optimizer = torch.optim.Adam(codes, lr=settings.stage1_lr)
     for number, item in _items(state, settings.stage1_iterations, late):
         share = number / settings.stage1_iterations
-        optimizer.param_groups[0]["lr"] = settings.stage1_lr * settings.stage1_final_lr**share
+        optimizer.param_groups[0]["lr"] = settings.stage1_lr * STAGE1_FINAL_LR**share
         optimizer.zero_grad()
         z_exp = state.z_exp[item.key.expression]
         rendering = state.model.render(
             state.z_id, z_exp, item.state, item.view, state.views.background
         )
         loss = _both(state, rendering, item)
-        _finite(loss + settings.codes * losses.codes(state.z_id, z_exp), number, 1).backward()
+        _finite(loss + state.weights.codes * losses.codes(state.z_id, z_exp), number, 1).backward()
         optimizer.step()
         done = number + 1
     for code in codes:
@@ -199,11 +200,11 @@ def invert_codes(state: Fit, late: Callable[[], bool]) -> int:
     return done
 
 
-def tune_decoders(state: Fit, late: Callable[[], bool]) -> int:
+def tune_decoders(state: FitState, late: Callable[[], bool]) -> int:
     """Stage 2: fine-tune the decoders with the locality loss; returns the iterations done."""
     settings = state.settings
     optimizer = _decoder_optimizer(state)
-    rng = np.random.default_rng(settings.seed)
+    rng = np.random.default_rng(state.seed)
     done = 0
     for number, item in _items(state, settings.stage2_iterations, late):
         optimizer.zero_grad()
@@ -223,39 +224,37 @@ def tune_decoders(state: Fit, late: Callable[[], bool]) -> int:
     return done
 
 
-def _items(state: Fit, iterations: int, late: Callable[[], bool]) -> Iterator[tuple[int, Item]]:
-    """Given views in shuffled order, until iterations or time are used up (at least one view)."""
-    shuffle = Shuffle(state.given, state.settings.seed)
+def _items(
+    state: FitState, iterations: int, late: Callable[[], bool]
+) -> Iterator[tuple[int, Item]]:
+    """Yield given views in shuffled order until iterations or time run out; at least one."""
+    shuffle = Shuffle(state.given, state.seed)
     for number in range(iterations):
         if number > 0 and late():
             return
-        margin = state.loaded.config.data.crop_margin_px
-        yield number, state.views.item(shuffle.next(), margin)
+        yield number, state.views.item(shuffle.next(), crop=True)
 
 
-def _decoder_optimizer(state: Fit) -> torch.optim.Optimizer:
-    """Adam over D_GRMM (and the refinement if asked): codes stay fixed."""
-    model, settings = state.model, state.settings
+def _decoder_optimizer(state: FitState) -> torch.optim.Optimizer:
+    """Build Adam over the decoders; codes and refinement stay fixed."""
+    model, lr = state.model, state.settings.stage2_lr
     modules = [model.transform, model.opacity, model.colour]
     texels = {id(p): p for ladder in modules for p in ladder.texel_parameters()}
     if model.mesh is not None:
         modules.append(model.mesh)
-    if settings.tune_refinement and model.refinement is not None:
-        modules.append(model.refinement)
     rest = [p for module in modules for p in module.parameters() if id(p) not in texels]
     for parameter in (*rest, *texels.values()):
         parameter.requires_grad_(True)
-    lr = settings.stage2_lr
     return torch.optim.Adam(
         [
             {"params": rest, "lr": lr},
-            {"params": list(texels.values()), "lr": lr * settings.stage2_texel_lr_scale},
+            {"params": list(texels.values()), "lr": lr * state.loaded.config.train.texel_lr_scale},
         ],
         fused=True,
     )
 
 
-def start_texture(state: Fit) -> None:
+def start_texture(state: FitState) -> None:
     """Put the colours that the given views show into the bias (FitConfig.texture_warm_start).
 
     Texels that no view shows change as seen texels do that looked alike before and lie near them
@@ -283,12 +282,62 @@ def start_texture(state: Fit) -> None:
         model.colour.bias.flatten(1)[:3, model.texels] += (trust * change + (1 - trust) * guess).T
 
 
-def _both(state: Fit, rendering: Rendering, item: Item) -> Tensor:
+def reconstruction(state: FitState, image: Tensor, target: Tensor) -> Tensor:
+    """Compute L_rec of (3, H, W) images: L1, SSIM and, with VGG16 weights, the perceptual term."""
+    return losses.reconstruction(image, target, state.weights, state.perceptual)
+
+
+def _both(state: FitState, rendering: Rendering, item: Item) -> Tensor:
     """L_rec of the rasterised and, if there is one, the refined image."""
     loss = reconstruction(state, item.comparable(rendering.rgb), item.target)
     if rendering.image is not rendering.rgb:
         loss = loss + reconstruction(state, item.comparable(rendering.image), item.target)
     return loss
+
+
+def locality_loss(state: FitState, item: Item, rng: np.random.Generator) -> Tensor:
+    """L_rec between the tuned and the frozen model between a training identity and the subject.
+
+    Codes and coefficients are blended at a fixed t (weight of the subject), jaw and neck by SLERP
+    (paper, supplement); the mesh is posed again from the blend; the camera is a random one of the
+    training set; refined and rasterised images both count, as in L_rec's other uses.
+    """
+    frames = sorted(f for f in state.loaded.gallery.frames if f[0] in state.frozen.subjects)
+    subject, expression = frames[int(rng.integers(len(frames)))]
+    view = random_camera(state, rng)
+    t = LOCALITY_T
+    own = next(i for i in state.given if state.views.keys[i] == item.key)
+    mine = state.views.sample(own).tracked
+    head_state, z_id, z_exp = blend(
+        state, (subject, expression), mine, state.z_exp[item.key.expression], t
+    )
+    tuned = state.model.render(z_id, z_exp, head_state, view, state.views.background)
+    with torch.no_grad():
+        before = state.frozen.render(z_id, z_exp, head_state, view, state.views.background)
+    loss = reconstruction(state, tuned.rgb, before.rgb)
+    if state.model.refinement is not None:
+        loss = loss + reconstruction(state, tuned.image, before.image)
+    return loss
+
+
+def random_camera(state: FitState, rng: np.random.Generator) -> PinholeView:
+    """One of the training cameras."""
+    cameras = state.loaded.gallery.cameras
+    return cameras[sorted(cameras)[int(rng.integers(len(cameras)))]]
+
+
+def blend(
+    state: FitState, frame: tuple[str, str], mine: Tracked, z_exp: Tensor, t: float
+) -> tuple[HeadState, Tensor, Tensor]:
+    """Parameters and codes between a training frame (t = 0) and the fitted subject (t = 1)."""
+    model, gallery = state.frozen, state.loaded.gallery
+    tracked = interpolate_tracked(gallery.frames[frame], mine, t)
+    subject, expression = model.subjects.index(frame[0]), model.expressions.index(frame[1])
+    return (
+        pose_state(state.views.head, tracked),
+        torch.lerp(model.z_id[subject], state.z_id, t),
+        torch.lerp(model.z_exp[expression], z_exp, t),
+    )
 
 
 def _finite(loss: Tensor, iteration: int, stage: int) -> Tensor:
@@ -300,7 +349,7 @@ def _finite(loss: Tensor, iteration: int, stage: int) -> Tensor:
     return loss
 
 
-def _scores(state: Fit, held_out: Sequence[int], render: Render) -> Scores:
+def _scores(state: FitState, held_out: Sequence[int], render: Render) -> Scores:
     given = evaluate(state.views, spread(state.given, LOOKED_AT), render)
     other = evaluate(state.views, spread(held_out, LOOKED_AT), render)
     scores = {
@@ -311,3 +360,44 @@ def _scores(state: Fit, held_out: Sequence[int], render: Render) -> Scores:
     }
     log("fit: " + "  ".join(f"{k} {v}" for k, v in scores.items() if v is not None))
     return scores
+
+
+def save_fit(state: FitState, out: Path) -> None:
+    """Write a checkpoint of the tuned model, whose only subject is the fitted one.
+
+    It keeps the expressions of training (their codes, and one frame of parameters each), so that
+    they can be transferred to the subject.
+    """
+    subject = state.views.keys[state.given[0]].subject
+    known = {
+        name: code
+        for name, code in zip(state.frozen.expressions, state.frozen.z_exp.detach(), strict=True)
+        if name not in state.z_exp
+    }
+    model = GRMM(state.model.config, state.views.head, [subject], [*state.z_exp, *known])
+    content = state.model.state_dict()
+    content["z_id"] = state.z_id[None]
+    content["z_exp"] = torch.stack([*state.z_exp.values(), *known.values()])
+    model.load_state_dict(content)
+    own = collect_gallery(state.views, state.given)
+    # Training cameras stay for rendering; the subject's own come first.
+    cameras: dict[str, PinholeView] = own.cameras | {
+        f"training_{name}": view for name, view in state.loaded.gallery.cameras.items()
+    }
+    save_checkpoint(
+        out / "checkpoint.pt",
+        model=model,
+        config=state.loaded.config,
+        head_spec=state.loaded.head_spec,
+        gallery=Gallery(frames=own.frames | _donors(state, known), cameras=cameras),
+    )
+
+
+def _donors(state: FitState, expressions: Container[str]) -> dict[tuple[str, str], Tracked]:
+    """One training frame of each expression; nobody's offsets: only its expression is of use."""
+    found: dict[str, tuple[str, str]] = {}
+    for frame in state.loaded.gallery.frames:
+        if frame[1] in expressions:
+            found.setdefault(frame[1], frame)
+    frames = state.loaded.gallery.frames
+    return {frame: replace(frames[frame], offsets=NO_OFFSETS) for frame in found.values()}

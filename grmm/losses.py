@@ -8,15 +8,24 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import lru_cache
+from pathlib import Path
 
 import torch
 from torch import Tensor, nn
 
+from express50.errors import TrainError
+from express50.files.checkpoints import read_weights
 from grmm.config import LossConfig
 from grmm.scene import Rendering
 
 SSIM_WINDOW, SSIM_SIGMA = 11, 1.5
 SSIM_C1, SSIM_C2 = 0.01**2, 0.03**2
+DEPTH_ERODE_PX = 2  # expected depth bleeds across silhouettes (G11)
+# Simonyan and Zisserman 2014, configuration D, up to relu4_3; "M" halves the map.
+LAYERS: tuple[int | str, ...] = (64, 64, "M", 128, 128, "M", 256, 256, 256, "M", 512, 512, 512)
+COMPARED = (3, 8, 15, 22)  # relu1_2, relu2_2, relu3_3, relu4_3 by torchvision's numbering
+MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # ImageNet, as torchvision trained it
+SMALLEST_PX = 16  # four levels, three halvings
 
 Perceptual = Callable[[Tensor, Tensor], Tensor]
 
@@ -78,7 +87,7 @@ def reconstruction(
 
 
 def depth_dm2(
-    depth: Tensor, alpha: Tensor, target: Tensor, valid: Tensor, erode_px: int = 2
+    depth: Tensor, alpha: Tensor, target: Tensor, valid: Tensor, erode_px: int = DEPTH_ERODE_PX
 ) -> Tensor:
     """Mean squared depth error in decimetres squared over pixels where both depths mean something.
 
@@ -89,7 +98,7 @@ def depth_dm2(
         valid: (H, W) bool, where the target is known.
         erode_px: pixels next to the border of the mask that are left out.
 
-    In metres the term would vanish (5 mm -> 2.5e-5), in millimetres it would rule; survey point 11.
+    In metres the term would vanish (5 mm -> 2.5e-5), in millimetres it would dominate (G11).
     """
     mask = valid & (alpha.detach() > 0.5)
     if erode_px > 0:
@@ -104,7 +113,7 @@ def scale_mm(scales_mm: Tensor, low: float = 0.1, high: float = 10.0) -> Tensor:
     """Keep scales (N, 3), millimetres, within [low, high]: 1 / s below, (s - high)^2 above.
 
     Millimetres as in RGCA, whose constants these are: in metres 1 / s of a 1 mm Gaussian is 1000
-    (survey point 2). The reciprocal stops at 1e-7, as the paper has it.
+    (G2). The reciprocal stops at 1e-7, as the paper has it.
     """
     small = scales_mm < low
     below = 1.0 / torch.where(small, scales_mm.clamp_min(1e-7), torch.ones_like(scales_mm))
@@ -122,7 +131,7 @@ def laplacian_mm2(displacement: Tensor, edges: Tensor) -> Tensor:
     """Mean squared uniform Laplacian of vertex displacements (V, 3), metres in, mm^2 out.
 
     The displacement, not the mesh, is kept smooth, so that the head's own curvature costs nothing
-    (GaussianAvatars; survey point 12). A vertex without edges costs nothing.
+    (GaussianAvatars; G12). A vertex without edges costs nothing.
     """
     field = 1e3 * displacement
     source, target = edges.unbind(1)
@@ -132,7 +141,7 @@ def laplacian_mm2(displacement: Tensor, edges: Tensor) -> Tensor:
 
 
 def codes(z_id: Tensor, z_exp: Tensor) -> Tensor:
-    """Sum of squares of both codes (DeepSDF's form; survey point 13)."""
+    """Sum of squares of both codes (DeepSDF's form; G13)."""
     return z_id.square().sum() + z_exp.square().sum()
 
 
@@ -157,3 +166,65 @@ def _same_shape(a: Tensor, b: Tensor) -> None:
         raise ValueError(
             f"images have shapes {tuple(a.shape)} and {tuple(b.shape)}, expected both (C, H, W)"
         )
+
+
+class VGGDistance(nn.Module):
+    """Squared distance of channel-normalised VGG16 features, averaged over four layers.
+
+    The paper names the backbone only; layers and normalisation are those of LPIPS (Zhang et al.
+    2018) without its learned channel weights. Weights never train.
+    """
+
+    def __init__(self, weights: dict[str, Tensor]) -> None:
+        """Build from torchvision's ``vgg16`` state dict (its ``features.*`` entries are used)."""
+        super().__init__()
+        layers: list[nn.Module] = []
+        channels = 3
+        for entry in LAYERS:
+            if isinstance(entry, int):
+                layers += [nn.Conv2d(channels, entry, 3, padding=1), nn.ReLU()]
+                channels = entry
+            else:
+                layers.append(nn.MaxPool2d(2))
+        self.features = nn.Sequential(*layers)
+        wanted = self.features.state_dict()
+        missing = [
+            name
+            for name, tensor in wanted.items()
+            if getattr(weights.get(f"features.{name}"), "shape", None) != tensor.shape
+        ]
+        if missing:
+            raise TrainError(
+                f"the VGG16 weights lack features.{missing[0]}; expected the state dict of "
+                "torchvision's vgg16. Leave loss.vgg16 empty to train without it"
+            )
+        self.features.load_state_dict({name: weights[f"features.{name}"] for name in wanted})
+        self.requires_grad_(False)
+        self.register_buffer("mean", torch.tensor(MEAN)[:, None, None])
+        self.register_buffer("std", torch.tensor(STD)[:, None, None])
+
+    def forward(self, image: Tensor, target: Tensor) -> Tensor:
+        """Distance of two (3, H, W) images in [0, 1], at least 16 px a side."""
+        if min(image.shape[1:]) < SMALLEST_PX:
+            raise ValueError(f"image is {tuple(image.shape[1:])}, expected at least 16 x 16 pixels")
+        x = (torch.stack([image, target]) - self.mean) / self.std
+        total = x.new_zeros(())
+        for index, layer in enumerate(self.features):
+            x = layer(x)
+            if index in COMPARED:
+                unit = nn.functional.normalize(x, dim=1, eps=1e-6)
+                total = total + (unit[0] - unit[1]).square().sum(0).mean() / len(COMPARED)
+        return total
+
+
+def load_vgg(path: Path, device: torch.device | str = "cpu") -> VGGDistance:
+    """Read torchvision's vgg16 state dict; nothing in the file is executed.
+
+    Raises:
+        TrainError: no such file, or not that state dict.
+    """
+    mend = "leave it empty to do without"
+    weights = read_weights(path, TrainError, f"loss.vgg16 {path}", "a torch state dict", mend)
+    if not isinstance(weights, dict):
+        raise TrainError(f"loss.vgg16 {path}: holds a {type(weights).__name__}, expected a dict")
+    return VGGDistance(weights).to(device)

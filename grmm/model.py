@@ -15,10 +15,11 @@ from express50.geometry.transforms_torch import matrix_to_quat
 from express50.head.model import HeadModel
 from grmm.anchors import interpolate, make_anchors, tangent_frames, uv_gradients
 from grmm.config import ModelConfig
-from grmm.networks import Networks
+from grmm.networks import DISPLACEMENT_M, Networks, normalise_depth
 from grmm.rasterize import rasterize
-from grmm.refine import normalise_depth
-from grmm.scene import Gaussians, HeadState, Maps, Rendering, View
+from grmm.scene import Gaussians, HeadState, Maps, PinholeView, Rendering
+
+THICKNESS = 0.3  # of a Gaussian before training, along the normal over the tangents (G2)
 
 
 class GRMM(Networks):
@@ -63,9 +64,9 @@ class GRMM(Networks):
         subject: int,
         expression: int,
         state: HeadState,
-        view: View,
+        view: PinholeView,
         background: float = 0.0,
-        shade_view: View | None = None,
+        shade_view: PinholeView | None = None,
     ) -> Rendering:
         """Render a training subject and expression (indices into the code tables)."""
         z_id, z_exp = self.codes(subject, expression)
@@ -76,9 +77,9 @@ class GRMM(Networks):
         z_id: Tensor,
         z_exp: Tensor,
         state: HeadState,
-        view: View,
+        view: PinholeView,
         background: float = 0.0,
-        shade_view: View | None = None,
+        shade_view: PinholeView | None = None,
     ) -> Rendering:
         """Render any codes: (z_id,), (z_exp,); colours as ``shade_view`` sees them, if given."""
         gaussians = self.geometry(z_id, z_exp, state)
@@ -93,8 +94,7 @@ class GRMM(Networks):
         z_id, z_exp = self._inputs(z_id, z_exp, state)
         displacement = torch.zeros_like(state.vertices)
         if self.mesh is not None:
-            with self._precision():
-                parts = self.mesh(z_id, z_exp, state.neck, state.jaw, state.expression)
+            parts = self.mesh(z_id, z_exp, state.neck, state.jaw, state.expression)
             displacement = sum(part.to(state.vertices.dtype) for part in parts)
         means, quats = self._place(state.vertices + displacement, maps.offsets)
         return Gaussians(
@@ -110,35 +110,30 @@ class GRMM(Networks):
     ) -> Maps:
         """The convolutional maps of transforms and opacity, which no pose changes.
 
-        ``opacities`` are those of the same person's last maps, if they are known: in the paper
-        they depend on the identity alone.
+        Opacity depends on the identity alone, so a caller may pass the ``opacities`` of the same
+        person's last maps.
         """
         z_id, z_exp = self._inputs(z_id, z_exp, state)
-        both = torch.cat([z_id, z_exp])
-        with self._precision():
-            offsets = self._sample(self.transform(both))
-            if opacities is None or self.config.opacity_from_expression:
-                code = both if self.config.opacity_from_expression else z_id
-                opacities = torch.sigmoid(self._sample(self.opacity(code))[:, 0])
+        offsets = self._sample(self.transform(torch.cat([z_id, z_exp])))
+        if opacities is None:
+            opacities = torch.sigmoid(self._sample(self.opacity(z_id))[:, 0])
         return Maps(
             offsets=offsets[:, :7],
             scales_mm=nn.functional.softplus(offsets[:, 7:] + self.scale_bias),
             opacities=opacities,
         )
 
-    def appearance(self, z_id: Tensor, state: HeadState, view: View) -> Tensor:
+    def appearance(self, z_id: Tensor, state: HeadState, view: PinholeView) -> Tensor:
         """Colours in [0, 1] and features (N, 3 + features) as one view sees them."""
         z_id, _ = self._inputs(z_id, self.z_exp[0], state)
-        with self._precision():
-            maps = self.colour(z_id, view.direction().to(z_id.dtype))
-        maps = self._sample(maps)
+        maps = self._sample(self.colour(z_id, view.direction().to(z_id.dtype)))
         return torch.cat([torch.sigmoid(maps[:, :3]), maps[:, 3:]], 1)
 
     def draw(
         self,
         gaussians: Gaussians,
         colours: Tensor,
-        view: View,
+        view: PinholeView,
         background: float = 0.0,
         refine: bool = True,
     ) -> Rendering:
@@ -160,24 +155,16 @@ class GRMM(Networks):
             view.width,
             view.height,
             background=behind,
-            backend=self.config.backend,
         )
         maps = out.colors.permute(2, 0, 1)
         rgb = image = maps[:3]
         if refinement is not None:
-            given = self._refinement_input(maps, out.depth, out.alpha, view)
-            with self._precision():
-                image = refinement(given)
+            extra = [normalise_depth(out.depth, out.alpha)[None]]
+            extra += [out.alpha[None]] if self.config.refine_alpha else []
+            image = refinement(torch.cat([maps, *extra]))
         return Rendering(
             image=image, rgb=rgb, depth=out.depth, alpha=out.alpha, gaussians=gaussians
         )
-
-    def _refinement_input(self, maps: Tensor, depth: Tensor, alpha: Tensor, view: View) -> Tensor:
-        camera = view.cam_from_head.to(self.head_centre.dtype)
-        centre = camera[2, :3] @ self.head_centre + camera[2, 3]
-        scaled = normalise_depth(depth, alpha, self.config.depth_normalisation, centre)
-        extra = [scaled[None], alpha[None]] if self.config.refine_alpha else [scaled[None]]
-        return torch.cat([maps, *extra])
 
     def _inputs(self, z_id: Tensor, z_exp: Tensor, state: HeadState) -> tuple[Tensor, Tensor]:
         """The codes, or (ablation "no residuals") the tracked parameters in their place."""
@@ -189,18 +176,13 @@ class GRMM(Networks):
         """(C, n_g, n_g) -> (N, C) at the covered texels, in the precision of the model."""
         return maps.flatten(1).index_select(1, self.texels).T.to(self.head_centre.dtype)
 
-    def _precision(self) -> torch.autocast:
-        """Networks may compute in bfloat16; what is posed and drawn with their output may not."""
-        low = self.config.precision == "bfloat16"
-        return torch.autocast(self.head_centre.device.type, torch.bfloat16, enabled=low)
-
     def _place(self, vertices: Tensor, offsets: Tensor) -> tuple[Tensor, Tensor]:
         """Means (N, 3) and quaternions (N, 4) from the mesh and decoded offsets (N, 7).
 
-        q = normalise(dq + identity), so that zeros mean no rotation (survey point 1).
+        q = normalise(dq + identity), so that zeros mean no rotation (G1).
         """
         base = interpolate(vertices, self.faces, self.anchor_faces, self.barycentrics)
-        shift = self.config.displacement_scale * offsets[:, :3]
+        shift = DISPLACEMENT_M * offsets[:, :3]
         unit = offsets.new_tensor([1.0, 0.0, 0.0, 0.0])
         quats = nn.functional.normalize(offsets[:, 3:7] + unit, dim=1, eps=1e-8)
         if self.config.frame == "head":
@@ -221,7 +203,7 @@ def initial_scales(spacing_mm: Tensor, config: ModelConfig) -> Tensor:
     low, high = config.scale_bounds_mm
     along = (config.scale_init * spacing_mm).clamp(1.05 * low, 0.95 * high)
     if config.frame == "tangent":
-        thickness = config.thickness_init * along.amin(1, keepdim=True)
+        thickness = THICKNESS * along.amin(1, keepdim=True)
         scales = torch.cat([along, thickness.clamp_min(1.05 * low)], 1)
     else:
         scales = along.prod(1, keepdim=True).sqrt().expand(-1, 3)

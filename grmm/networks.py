@@ -1,22 +1,30 @@
-"""The networks of GRMM and its tables of codes: all of a model that a checkpoint holds."""
+"""The networks of GRMM and its tables of codes: everything that a checkpoint holds weights of.
+
+Widths and starting values that the paper leaves open are explained in docs/GRMM.md.
+"""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
+
 import torch
-from torch import nn
+from torch import Tensor, nn
+from torch.nn.utils.parametrizations import weight_norm
 
 from express50.head.model import HeadModel
 from grmm.config import ModelConfig
-from grmm.decoders import Ladder
-from grmm.mesh_decoder import MeshDecoder
-from grmm.refine import Refinement
 
-FEATURE_STD = 0.3  # of features before training; silent in the paper
-CODE_STD = 0.01  # of codes before training; silent in the paper, DeepSDF's habit (survey point 13)
+SLOPE = 0.2  # of every leaky ReLU, as RGCA's
+DISPLACEMENT_M = 1e-2  # per unit of network output: displacements are centimetres (G5, G8)
+VIEW_CHANNELS = 8  # the view direction is lifted to so many before it joins the seed (RGCA; G7)
+FEATURE_STD = 0.3  # of features before training
+CODE_STD = 0.01  # of codes before training (DeepSDF; G13)
+EMPTY_RANGE_M = 1e-6  # a depth range thinner than a micrometre carries no shape
 
 
 class Networks(nn.Module):
-    """Decoders, refinement, and tables of codes of the training set."""
+    """The decoders, the refinement, and one code per training subject and expression."""
 
     def __init__(
         self, config: ModelConfig, head: HeadModel, subjects: int, expressions: int
@@ -36,14 +44,13 @@ class Networks(nn.Module):
                 shared_widths=config.shared_widths,
                 film_width=config.film_width,
                 head_width=config.mesh_width,
-                displacement_scale=config.displacement_scale,
             )
         both = config.z_id + config.z_exp
         self.transform = self._ladder(both, 10)
-        self.opacity = self._ladder(both if config.opacity_from_expression else config.z_id, 1)
-        self.colour = self._ladder(config.z_id, 3 + config.features, config.view_channels, 3)
+        self.opacity = self._ladder(config.z_id, 1)
+        self.colour = self._ladder(config.z_id, 3 + config.features, VIEW_CHANNELS, 3)
         with torch.no_grad():
-            self.opacity.bias.fill_(_logit(config.opacity_init))
+            self.opacity.bias.fill_(math.log(config.opacity_init / (1 - config.opacity_init)))
             # Features tell texels apart to the refinement: from all zeros it learns slowly.
             self.colour.bias[3:].normal_(0, FEATURE_STD)
         self.refinement = None
@@ -69,5 +76,230 @@ class Networks(nn.Module):
         )
 
 
-def _logit(probability: float) -> float:
-    return float(torch.logit(torch.tensor(probability, dtype=torch.float64)))
+class Doubling(nn.Module):
+    """Transposed convolution 4 x 4, stride 2, with weight norm and an untied bias."""
+
+    def __init__(self, inputs: int, outputs: int, side: int) -> None:
+        """Map (inputs, side, side) to (outputs, 2 side, 2 side)."""
+        super().__init__()
+        convolution = nn.ConvTranspose2d(inputs, outputs, 4, 2, 1, bias=False)
+        # Glorot with the slope's gain; at stride 2 an output sees 2 x 2 of the 4 x 4 taps.
+        gain = math.sqrt(2 / (1 + SLOPE**2))
+        bound = gain * math.sqrt(3 / (4 * 0.5 * (inputs + outputs)))
+        nn.init.uniform_(convolution.weight, -bound, bound)
+        self.convolution = weight_norm(convolution, dim=1)
+        self.bias = nn.Parameter(torch.zeros(outputs, 2 * side, 2 * side))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(1, inputs, side, side) -> (1, outputs, 2 side, 2 side)."""
+        return nn.functional.leaky_relu(self.convolution(x) + self.bias, SLOPE)
+
+
+class Ladder(nn.Module):
+    """Code -> (outputs, n_g, n_g), zero at the start but for what is written into ``bias``.
+
+    The last layer is a transposed convolution without weight norm (which cannot be zero) whose
+    weights start at zero. ``modes`` (modes, mode_outputs, n_g, n_g) adds a linear, per-texel
+    dependence of the first outputs on the first entries of the code; see
+    ModelConfig.identity_modes.
+    """
+
+    def __init__(
+        self,
+        *,
+        code: int,
+        outputs: int,
+        n_g: int,
+        seed_channels: int,
+        widths: Sequence[int],
+        modes: int = 0,
+        mode_outputs: int | None = None,
+        view_channels: int = 0,
+    ) -> None:
+        """Build; with ``view_channels`` the seed also carries a lifted view direction (RGCA)."""
+        super().__init__()
+        side = n_g // 2 ** (len(widths) + 1)
+        self.seed_shape = (1, seed_channels, side, side)
+        self.seed = nn.Linear(code, seed_channels * side * side)
+        self.view = nn.Linear(3, view_channels) if view_channels else None
+        channels = [seed_channels + view_channels, *widths]
+        self.doublings = nn.ModuleList(
+            Doubling(a, b, side * 2**i)
+            for i, (a, b) in enumerate(zip(channels, channels[1:], strict=False))
+        )
+        self.last = nn.ConvTranspose2d(channels[-1], outputs, 4, 2, 1, bias=False)
+        nn.init.zeros_(self.last.weight)
+        self.bias = nn.Parameter(torch.zeros(outputs, n_g, n_g))
+        self.modes = None
+        if modes:
+            shape = (modes, outputs if mode_outputs is None else mode_outputs, n_g, n_g)
+            self.modes = nn.Parameter(torch.zeros(shape))
+
+    def forward(self, code: Tensor, direction: Tensor | None = None) -> Tensor:
+        """(code,), and (3,) unit view direction if built for one -> (outputs, n_g, n_g)."""
+        x = nn.functional.leaky_relu(self.seed(code), SLOPE).view(self.seed_shape)
+        if self.view is not None:
+            if direction is None:
+                raise ValueError("direction is missing: this decoder depends on the view")
+            lifted = nn.functional.leaky_relu(self.view(direction), SLOPE)
+            tiled = lifted[None, :, None, None].expand(-1, -1, *self.seed_shape[2:])
+            x = torch.cat([x, tiled], 1)
+        x = x.contiguous(memory_format=torch.channels_last)
+        for doubling in self.doublings:
+            x = doubling(x)
+        out = self.last(x)[0] + self.bias
+        if self.modes is not None:
+            change = torch.tensordot(code[: len(self.modes)], self.modes, 1)
+            out = torch.cat([out[: len(change)] + change, out[len(change) :]])
+        return out
+
+    def texel_parameters(self) -> list[nn.Parameter]:
+        """Parameters of the last layer that belong to one texel each."""
+        return [self.bias] if self.modes is None else [self.bias, self.modes]
+
+
+class MeshDecoder(nn.Module):
+    """Decode residual vertex displacements of identity and expression (paper: Mesh Decoder).
+
+    f_base = MLP_shared([z_id, neck, jaw]); identity displacements come from it alone. The
+    expression's come from [f_base, z_exp] modulated by FiLM with the tracked coefficients, and
+    skip the teeth (M_face). The last layers start at zero: no displacement, FiLM the identity.
+    """
+
+    def __init__(
+        self,
+        *,
+        z_id: int,
+        z_exp: int,
+        coefficients: int,
+        teeth: Tensor,
+        shared_widths: Sequence[int],
+        film_width: int,
+        head_width: int,
+    ) -> None:
+        """Build for a mesh whose teeth are marked in ``teeth`` (V,) bool; metres come out."""
+        super().__init__()
+        widths = [z_id + 6, *shared_widths]
+        self.shared = nn.Sequential(
+            *(
+                layer
+                for a, b in zip(widths, widths[1:], strict=False)
+                for layer in (nn.Linear(a, b), nn.LeakyReLU(SLOPE))
+            )
+        )
+        base = widths[-1]
+        self.film = zero_last(mlp(coefficients, film_width, 2 * (base + z_exp)))
+        self.identity = zero_last(mlp(base, head_width, 3 * len(teeth)))
+        self.expression = zero_last(mlp(base + z_exp, head_width, 3 * len(teeth)))
+        self.register_buffer("face_mask", (~teeth).to(torch.get_default_dtype())[:, None])
+
+    def forward(
+        self, z_id: Tensor, z_exp: Tensor, neck: Tensor, jaw: Tensor, coefficients: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Return identity and masked expression displacements, each (V, 3) metres.
+
+        Args:
+            z_id: (Z,) identity code.
+            z_exp: (E,) expression code.
+            neck: (3,) axis-angle.
+            jaw: (3,) axis-angle.
+            coefficients: (X,) tracked expression coefficients.
+        """
+        base = self.shared(torch.cat([z_id, neck, jaw]))
+        feature = self.modulate(torch.cat([base, z_exp]), coefficients)
+        identity = self.identity(base).view(-1, 3) * DISPLACEMENT_M
+        expression = self.expression(feature).view(-1, 3) * DISPLACEMENT_M
+        return identity, self.face_mask * expression
+
+    def modulate(self, feature: Tensor, coefficients: Tensor) -> Tensor:
+        """FiLM: f + gamma * f + beta (Perez et al. 2018, residual form of the paper)."""
+        gamma, beta = self.film(coefficients).chunk(2)
+        return feature + gamma * feature + beta
+
+
+def mlp(inputs: int, width: int, outputs: int) -> nn.Sequential:
+    """One hidden layer with a leaky ReLU."""
+    return nn.Sequential(nn.Linear(inputs, width), nn.LeakyReLU(SLOPE), nn.Linear(width, outputs))
+
+
+def zero_last(network: nn.Sequential) -> nn.Sequential:
+    """Zero the last layer, so that the network starts as the constant 0."""
+    last = network[-1]
+    assert isinstance(last, nn.Linear)
+    nn.init.zeros_(last.weight)
+    nn.init.zeros_(last.bias)
+    return network
+
+
+class Refinement(nn.Module):
+    """I = I_rgb + U-Net([I_rgb, features, normalised depth (, alpha)]).
+
+    The paper names inputs and purpose only; widths, residual, the zero-initialised head and the
+    absence of norms follow the survey's point 9. ``unshuffle`` folds r x r pixels into channels
+    first: a CPU needs that. Images whose sides are no multiple of the stride are padded.
+    """
+
+    def __init__(self, *, inputs: int, widths: Sequence[int], unshuffle: int) -> None:
+        """Build for ``inputs`` channels, of which the first three are the colours refined."""
+        super().__init__()
+        self.unshuffle = unshuffle
+        self.stride = unshuffle * 2 ** (len(widths) - 1)
+        folded = inputs * unshuffle**2
+        self.enter = _block(folded, widths[0])
+        self.down = nn.ModuleList(
+            _block(a, b, stride=2) for a, b in zip(widths, widths[1:], strict=False)
+        )
+        self.up = nn.ModuleList(
+            _block(a + b, a) for a, b in reversed(list(zip(widths, widths[1:], strict=False)))
+        )
+        self.head = nn.Conv2d(widths[0], 3 * unshuffle**2, 3, padding=1)
+        for layer in self.modules():
+            if isinstance(layer, nn.Conv2d):
+                # Without norms torch's default would shrink activations thousandfold on the way.
+                nn.init.kaiming_normal_(layer.weight, a=SLOPE)
+                nn.init.zeros_(layer.bias)
+        nn.init.zeros_(self.head.weight)
+        # As the images are: else weights are reordered in every call, a fifth of its time.
+        self.to(memory_format=torch.channels_last)
+
+    def forward(self, maps: Tensor) -> Tensor:
+        """(inputs, H, W) -> refined colours (3, H, W)."""
+        height, width = maps.shape[1:]
+        pad = (0, -width % self.stride, 0, -height % self.stride)
+        x = nn.functional.pad(maps[None], pad)
+        x = nn.functional.pixel_unshuffle(x, self.unshuffle)
+        x = x.contiguous(memory_format=torch.channels_last)
+        levels = [self.enter(x)]
+        for block in self.down:
+            levels.append(block(levels[-1]))
+        x = levels.pop()
+        for block in self.up:
+            skip = levels.pop()
+            x = nn.functional.interpolate(x, size=skip.shape[2:], mode="nearest")
+            x = block(torch.cat([skip, x], 1))
+        residual = nn.functional.pixel_shuffle(self.head(x), self.unshuffle)
+        return maps[:3] + residual[0, :, :height, :width].to(maps.dtype)
+
+
+def _block(inputs: int, outputs: int, stride: int = 1) -> nn.Sequential:
+    return nn.Sequential(
+        nn.Conv2d(inputs, outputs, 3, stride=stride, padding=1),
+        nn.LeakyReLU(SLOPE),
+        nn.Conv2d(outputs, outputs, 3, padding=1),
+        nn.LeakyReLU(SLOPE),
+    )
+
+
+def normalise_depth(depth: Tensor, alpha: Tensor) -> Tensor:
+    """Stretch the depth (H, W) of covered pixels to [0, 1]; 0 where alpha <= 0.5.
+
+    The limits are detached (G10). A constant or empty depth map gives zeros, not 0 / 0.
+    """
+    mask = (alpha > 0.5) & torch.isfinite(depth)
+    if not bool(mask.any()):
+        return torch.zeros_like(depth)
+    known = torch.where(mask, depth, 0.0)
+    inner = known.detach()[mask]
+    low, extent = inner.min(), inner.max() - inner.min()
+    scaled = (known - low) / extent.clamp_min(EMPTY_RANGE_M)
+    return torch.where(mask, scaled.clamp(0, 1), 0.0)

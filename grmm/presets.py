@@ -1,14 +1,15 @@
-"""Presets of the configuration, TOML files and assignments over them, and plain tables.
+"""Presets as data, and how TOML files and assignments change them.
 
-Presets: ``paper`` (the dimensions of P), ``small`` (one GPU or a patient CPU) and ``demo`` (two CPU
-cores, minutes). Precedence: ``--set table.key=value`` > TOML > preset >
-the defaults of :mod:`grmm.config`.
+``paper`` has the paper's sizes, ``small`` suits one GPU, ``demo`` two CPU cores and minutes.
+``measured`` is the demo preset with what did best in a given time (measured.json). Precedence:
+``--set table.key=value``, then TOML, then the preset, then the defaults of `grmm.config`.
 """
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +27,7 @@ from grmm.config import (
 )
 
 PRESETS: dict[str, dict[str, dict[str, Any]]] = {
-    "paper": {"train": {"accumulate": 1, "warm_start": True}},
+    "paper": {},
     "small": {
         "model": {
             "n_g": 256,
@@ -74,13 +75,14 @@ PRESETS: dict[str, dict[str, dict[str, Any]]] = {
             "stage1_iterations": 120,
             "stage2_iterations": 200,
             "stage2_lr": 1e-3,
-            "stage2_texel_lr_scale": 5.0,
             "texture_warm_start": True,
             "shuffle_directions": 0.5,
             "locality_every": 2,
         },
     },
 }
+
+MEASURED = Path(__file__).with_name("measured.json")  # written by benchmarks.grmm_trade
 
 TABLES = {
     "model": ModelConfig,
@@ -168,3 +170,39 @@ def _known_table(table: str, where: str) -> None:
         raise ConfigError(
             f"{where} is unknown{nearest(table, TABLES)}; expected {', '.join(TABLES)}"
         )
+
+
+@dataclass(frozen=True, kw_only=True)
+class BudgetChoice:
+    """The setting that did best in a budget.
+
+    Attributes:
+        setting: its name in docs/TRADEOFFS.md.
+        changes: table -> key -> value over the demo preset.
+        budget_s: the processor seconds it was measured with.
+        psnr_db: on held-out cameras there.
+    """
+
+    setting: str
+    changes: dict[str, dict[str, Any]]
+    budget_s: float
+    psnr_db: float
+
+    def __str__(self) -> str:
+        return f"{self.setting} ({self.psnr_db:.1f} dB in {self.budget_s:.0f} s where measured)"
+
+
+def choose(seconds: float, measured: Path = MEASURED) -> BudgetChoice:
+    """The best setting of the longest measured budget that fits in ``seconds``.
+
+    Less time than any that was measured gets the choice of the shortest. A machine's speed is not
+    asked: one twice as fast spends the choice of half the time, which is the safe side.
+
+    Raises:
+        ConfigError: the budget is not positive.
+    """
+    if not seconds > 0:
+        raise ConfigError(f"budget is {seconds} s, expected more than 0, such as 4m")
+    rows = sorted(json.loads(measured.read_text("utf-8")), key=lambda row: row["budget_s"])
+    fitting = [row for row in rows if row["budget_s"] <= seconds]
+    return BudgetChoice(**(fitting or rows[:1])[-1])

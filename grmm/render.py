@@ -18,13 +18,30 @@ from express50.errors import ConfigError
 from express50.files.images import contact_sheet, write_image
 from grmm.checkpoint import Loaded
 from grmm.data import HeadViews
-from grmm.edit import Head, between, trained_head
+from grmm.edit import (
+    HeadCodes,
+    between,
+    controlled,
+    principal_directions,
+    sample_expression,
+    sample_identity,
+    trained_head,
+    transfer,
+)
 from grmm.evaluate import Render
-from grmm.scene import Gaussians, Rendering, View
-from grmm.window import draw_window
+from grmm.head_crop import draw_window
+from grmm.scene import Gaussians, PinholeView, Rendering
 
 VIDEO_RATE = 24  # frames a second, as the rig's
 YAWS, PITCHES = (-60, -30, 0, 30, 60), (20, 0, -20)  # degrees of the sheet of novel views
+Sheet = tuple[list[list[np.ndarray]], list[str]]
+STEPS = (-1.0, -0.5, 0.0, 0.5, 1.0)
+TURNS = {  # what a step of 1 means: entry and radians
+    "neck, yaw": ("neck.1", 0.35),
+    "eyes, yaw": ("eyes", 0.4),
+}
+JAW_OPEN = 0.35  # radians
+DEVIATIONS = 1.5  # standard deviations a step of 1 moves a code
 
 
 def to_uint8(image: Tensor) -> np.ndarray:
@@ -59,7 +76,7 @@ def comparison_sheet(path: Path, views: HeadViews, indices: Many[int], render: R
     write_image(path, contact_sheet(rows, labels, tile))
 
 
-def orbit(view: View, degrees: float, centre: Tensor, pitch: float = 0.0) -> View:
+def orbit(view: PinholeView, degrees: float, centre: Tensor, pitch: float = 0.0) -> PinholeView:
     """The view turned about ``centre`` (3,) in head space.
 
     ``degrees`` about the vertical axis, after ``pitch`` degrees about the camera's own horizontal
@@ -83,7 +100,7 @@ def _rotation(angle: float, first: int, second: int, pivot: Tensor) -> Tensor:
     return turn
 
 
-def resized(view: View, longest_px: int) -> View:
+def resized(view: PinholeView, longest_px: int) -> PinholeView:
     """The same camera at a size whose longer side is ``longest_px``."""
     scale = longest_px / max(view.width, view.height)
     width, height = (max(1, round(scale * side)) for side in (view.width, view.height))
@@ -93,14 +110,14 @@ def resized(view: View, longest_px: int) -> View:
     return replace(view, K=K, width=width, height=height)
 
 
-def frontal(loaded: Loaded) -> View:
+def frontal(loaded: Loaded) -> PinholeView:
     """The training camera that looks at the face most nearly along -z."""
     cameras = loaded.gallery.cameras
     best = max(sorted(cameras), key=lambda name: float(cameras[name].direction()[2]))
     return cameras[best]
 
 
-def camera_of(loaded: Loaded, name: str | None, size: int = 0) -> View:
+def camera_of(loaded: Loaded, name: str | None, size: int = 0) -> PinholeView:
     """A camera of the checkpoint by id, by default the frontal one; ``size`` 0: its own.
 
     Raises:
@@ -113,29 +130,21 @@ def camera_of(loaded: Loaded, name: str | None, size: int = 0) -> View:
     return resized(view, size) if size else view
 
 
-def picture(loaded: Loaded, head: Head, view: View) -> np.ndarray:
+def picture(loaded: Loaded, head: HeadCodes, view: PinholeView) -> np.ndarray:
     """One head from one view, (H, W, 3) uint8."""
     return next(iter(around(loaded, head, [view])))
 
 
 def drawn(
-    loaded: Loaded, gaussians: Gaussians, colours: Tensor, view: View, refine: bool = True
+    loaded: Loaded, gaussians: Gaussians, colours: Tensor, view: PinholeView, refine: bool = True
 ) -> Rendering:
-    """A decoded head as the checkpoint was trained: in a window if its training had windows."""
-    data = loaded.config.data
-    return draw_window(
-        loaded.model,
-        gaussians,
-        colours,
-        view,
-        data.background,
-        refine=refine,
-        margin_px=data.crop_margin_px,
-    )
+    """Draw a decoded head in its window, as training did."""
+    background = loaded.config.data.background
+    return draw_window(loaded.model, gaussians, colours, view, background, refine=refine)
 
 
 @torch.no_grad()
-def around(loaded: Loaded, head: Head, views: Iterable[View]) -> Iterable[np.ndarray]:
+def around(loaded: Loaded, head: HeadCodes, views: Iterable[PinholeView]) -> Iterable[np.ndarray]:
     """Yield a head from each view; its geometry is decoded once for all of them."""
     model, state = loaded.model, head.state(loaded)
     gaussians = model.geometry(head.z_id, head.z_exp, state)
@@ -145,7 +154,7 @@ def around(loaded: Loaded, head: Head, views: Iterable[View]) -> Iterable[np.nda
 
 
 def turntable(
-    loaded: Loaded, head: Head, view: View, frames: int = 72, degrees: float = 360.0
+    loaded: Loaded, head: HeadCodes, view: PinholeView, frames: int = 72, degrees: float = 360.0
 ) -> Iterable[np.ndarray]:
     """Yield (H, W, 3) frames of an orbit that starts at ``view``."""
     centre = loaded.model.head_centre
@@ -154,7 +163,7 @@ def turntable(
     )
 
 
-def novel_views(loaded: Loaded, head: Head, view: View) -> list[list[np.ndarray]]:
+def novel_views(loaded: Loaded, head: HeadCodes, view: PinholeView) -> list[list[np.ndarray]]:
     """Rows of PITCHES with columns of YAWS, degrees, around ``view``."""
     centre = loaded.model.head_centre
     views = (orbit(view, yaw, centre, pitch) for pitch in PITCHES for yaw in YAWS)
@@ -163,7 +172,7 @@ def novel_views(loaded: Loaded, head: Head, view: View) -> list[list[np.ndarray]
 
 
 def expression_grid(
-    loaded: Loaded, subjects: Many[str], expressions: Many[str], view: View
+    loaded: Loaded, subjects: Many[str], expressions: Many[str], view: PinholeView
 ) -> list[list[np.ndarray]]:
     """Pictures of every subject (rows) with every expression (columns).
 
@@ -176,14 +185,94 @@ def expression_grid(
 
 
 def interpolation(
-    loaded: Loaded, start: Head, end: Head, view: View, frames: int = 48
+    loaded: Loaded, start: HeadCodes, end: HeadCodes, view: PinholeView, frames: int = 48
 ) -> Iterable[np.ndarray]:
     """Yield frames from one head to another."""
     for number in range(frames):
         yield picture(loaded, between(start, end, number / max(1, frames - 1)), view)
 
 
-def driven(loaded: Loaded, head: Head, clips: Sequence, view: View) -> Iterable[np.ndarray]:
+def control_sheet(loaded: Loaded, head: HeadCodes, view: PinholeView) -> Sheet:
+    """Rows that change one thing each, all else held (the paper's figure of disentangled control).
+
+    Jaw, neck and eyes; the strongest expression coefficients of training; the first principal
+    directions of z_id and z_exp. A code without directions (one subject) has no row.
+    """
+    changes: dict[str, list[dict[str, tuple[float, ...]]]] = {
+        "jaw": [{"jaw": (JAW_OPEN * (step + 1) / 2, 0.0, 0.0)} for step in STEPS]
+    }
+    for label, (name, reach) in TURNS.items():
+        values = [reach * step for step in STEPS]
+        changes[label] = [{name: (0.0, v, 0.0) if name == "eyes" else (v,)} for v in values]
+    for number in strongest_coefficients(loaded, 2):
+        size = max(abs(f.expression[number]) for f in loaded.gallery.frames.values())
+        name = f"expression.{number}"
+        label = loaded.head.expression_names[number]
+        changes[label] = [{name: (size * (step + 1) / 2,)} for step in STEPS]
+    for code in ("z_id", "z_exp"):
+        for number in range(min(2, len(principal_directions(getattr(loaded.model, code))))):
+            name = f"{code}.{number}"
+            changes[name] = [{name: (DEVIATIONS * step,)} for step in STEPS]
+    rows = [
+        [picture(loaded, controlled(loaded, head, change), view) for change in row]
+        for row in changes.values()
+    ]
+    return rows, list(changes)
+
+
+def strongest_coefficients(loaded: Loaded, count: int) -> list[int]:
+    """Numbers of the expression coefficients that vary most over the training frames."""
+    frames = loaded.gallery.frames.values()
+    length = max(len(f.expression) for f in frames)
+    rows = [np.pad(f.expression, (0, length - len(f.expression))) for f in frames]
+    order = np.argsort(-np.std(rows, axis=0), kind="stable")
+    return [int(number) for number in order[:count]]
+
+
+def residual_sheet(
+    loaded: Loaded, identity: HeadCodes, expression: HeadCodes, view: PinholeView
+) -> Sheet:
+    """What transfer is made of: head-model parameters and residual code, alone and together.
+
+    Columns: neither, parameters alone, code alone, both, and both with z_exp = 0, which shows
+    what the expression code carries (the paper's supplement, figure on the extended UV map).
+    """
+    moved = transfer(identity.tracked, expression.tracked)
+    both = replace(identity, tracked=moved, z_exp=expression.z_exp)
+    heads = [
+        identity,
+        replace(identity, tracked=moved),
+        replace(identity, z_exp=expression.z_exp),
+        both,
+        controlled(loaded, both, {"z_exp": (0.0,)}),
+        expression,
+    ]
+    labels = ["identity | FLAME moved | z_exp moved | both | both, z_exp = 0 | donor"]
+    return [[picture(loaded, head, view) for head in heads]], labels
+
+
+def sample_sheet(
+    loaded: Loaded, head: HeadCodes, view: PinholeView, count: int, seed: int, spread: float = 1.0
+) -> tuple[Sheet, dict[str, list[HeadCodes]]]:
+    """Three rows of samples, and their heads: new people, new expressions, both."""
+    rng = np.random.default_rng(seed)
+    neutral = head
+    if "neutral" in loaded.model.expressions:
+        neutral = trained_head(loaded, loaded.model.subjects[0], "neutral")
+    people = [sample_identity(loaded, neutral, rng, spread) for _ in range(count)]
+    faces = [sample_expression(loaded, head, rng, spread) for _ in range(count)]
+    rows = {
+        "new people": people,
+        "new expressions": faces,
+        "both": [sample_expression(loaded, person, rng, spread) for person in people],
+    }
+    pictures = [[picture(loaded, one, view) for one in row] for row in rows.values()]
+    return (pictures, list(rows)), rows
+
+
+def driven(
+    loaded: Loaded, head: HeadCodes, clips: Sequence, view: PinholeView
+) -> Iterable[np.ndarray]:
     """Yield the head with the expression, jaw, neck and eyes of every frame of tracked clips.
 
     Its own shape and residual codes stay.

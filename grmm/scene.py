@@ -1,4 +1,4 @@
-"""What the model is given and gives: tracked heads, cameras, Gaussians and pictures of them."""
+"""The records that the model takes and returns: tracked heads, cameras, Gaussians, renderings."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class HeadState:
-    """What tracking knows of one frame, in head space: (R, t) belong to the camera (`View`).
+    """The tracked head of one frame, in head space: (R, t) belong to the camera (`PinholeView`).
 
     Attributes:
         vertices: (V, 3) tracked mesh v_rec, metres, eye pose included.
@@ -27,7 +27,7 @@ class HeadState:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class View:
+class PinholeView:
     """A pinhole camera in canonical head space: pi' = K E [R t] (paper, equation 2).
 
     Attributes:
@@ -43,7 +43,7 @@ class View:
     height: int
 
     def direction(self) -> Tensor:
-        """(3,) unit vector from the head's origin to the camera (survey point 7)."""
+        """(3,) unit vector from the head's origin to the camera (G7)."""
         centre = -self.cam_from_head[:3, :3].T @ self.cam_from_head[:3, 3]
         return nn.functional.normalize(centre, dim=0)
 
@@ -69,7 +69,7 @@ class Gaussians:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Maps:
-    """What the transform and opacity decoders say of N Gaussians.
+    """The outputs of the transform and opacity decoders for N Gaussians.
 
     Attributes:
         offsets: (N, 7) raw position and quaternion offsets.

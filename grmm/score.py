@@ -18,7 +18,7 @@ from express50.files.images import read_image, write_image
 from express50.shards.writer import sample_key
 from grmm.data import HeadViews, Key
 from grmm.evaluate import Row, compare, row_of
-from grmm.judge import Judge
+from grmm.perceptual_metrics import PerceptualMetrics
 from grmm.shard_source import ShardSource
 
 SUFFIXES = (".png", ".jpg", ".jpeg")
@@ -42,7 +42,7 @@ def score(
     source: ShardSource,
     views: HeadViews,
     indices: Sequence[int],
-    judge: Judge,
+    judge: PerceptualMetrics,
     kind: Callable[[Key], str] = lambda key: "",
     partial: bool = False,
 ) -> list[Row]:

@@ -1,8 +1,9 @@
 """Train GRMM: one loop, read from top to bottom.
 
-One iteration renders ``accumulate`` views (batch size 1 as in the paper), adds up the objective
-and takes one Adam step. Under ``torchrun`` every process takes other views and DDP averages their
-gradients. On a CPU a resumed run continues bit for bit, unless a time budget steers the rate.
+One iteration renders ``accumulate`` views (the paper's batch size is 1), sums the objective and
+takes one Adam step. Under ``torchrun`` each process takes other views and DDP averages their
+gradients. On a CPU a resumed run repeats an uninterrupted one bit for bit, unless a time budget
+steers the rate.
 """
 
 from __future__ import annotations
@@ -13,20 +14,40 @@ from pathlib import Path
 
 import torch
 import torch.distributed as distributed
+from torch import Tensor
 from torch.nn.parallel import DistributedDataParallel
 
-from express50.errors import ConfigError
+from express50.console import log
+from express50.errors import TrainError
+from express50.files.atomic import write_json
 from express50.head.model import HeadModel
-from grmm.checkpoint import collect_gallery, load_checkpoint, save_checkpoint
+from grmm import losses
 from grmm.config import Config
-from grmm.data import HeadViews, Source
-from grmm.objective import step
-from grmm.presets import as_tables
-from grmm.progress import Interrupt, append_log, deferred_interrupt, log, start_log, tensorboard
-from grmm.run import Run, best_device, budget_used, finished, prepare, set_rates, settle
-from grmm.train_report import report
+from grmm.data import HeadViews, Item, Source
+from grmm.evaluate import evaluate, mean, training_render
+from grmm.perceptual_metrics import PerceptualMetrics
+from grmm.rasterize import NotFiniteTensorError
+from grmm.render import comparison_sheet
+from grmm.sampler import spread
+from grmm.scene import Rendering
+from grmm.train_state import (
+    Interrupt,
+    TrainState,
+    append_log,
+    best_device,
+    budget_used,
+    deferred_interrupt,
+    finished,
+    prepare,
+    restore,
+    save,
+    set_rates,
+    start_log,
+    with_map_size,
+)
 from grmm.warm_start import warm_start
 
+LOG_EVERY = 20  # iterations between lines of progress
 PATIENT = 10_000  # iterations that a CPU does in a day at most
 GREY_DB = 10.0  # what a grey picture scores
 GLOO_SECONDS = 0.5  # for Gloo's threads to free tensors; 0.2 was enough in every run
@@ -39,10 +60,10 @@ def train(
 
     Args:
         source: samples; ``source.head`` is how `load_head` finds ``head`` again.
-        head: the head model the samples were tracked with.
+        head: the head model that the samples were tracked with.
         out: folder, made if absent.
         config: resolved configuration.
-        resume: go on from OUT/checkpoint.pt, whose configuration must agree in all but the budget.
+        resume: go on from OUT/checkpoint.pt, whose settings must agree except for the budget.
 
     Returns:
         What metrics.json holds.
@@ -51,9 +72,8 @@ def train(
         TrainError: nothing to train on, or the objective is not finite.
         ConfigError: the configuration differs from the one resumed.
     """
+    # --- Processes, samples, model -------------------------------------------------------------
     rank, world, device = join_processes()
-    if config.train.threads:
-        torch.set_num_threads(config.train.threads)
     torch.manual_seed(config.train.seed)
     views = HeadViews(
         source,
@@ -63,19 +83,18 @@ def train(
         cache_mb=config.data.cache_mb,
         device=device,
     )
-    config = settle(config, views)
-    run = prepare(views, config, rank, world)
+    config = with_map_size(config, views)
+    state = prepare(views, config, rank, world)
     checkpoint = out / "checkpoint.pt"
     if resume:
-        restore(run, checkpoint, config, device, rank)
-    elif config.train.warm_start:
-        warm_start(run.model, views, run.training, config.train.warm_start_images)
+        restore(state, checkpoint, config, device)
+    else:
+        warm_start(state.model, views, state.training)
+    parallel = DistributedDataParallel(state.model) if world > 1 else state.model
     if rank == 0:
-        start_log(out / "log.jsonl", run.iteration)
-    parallel = DistributedDataParallel(run.model) if world > 1 else run.model
-    if rank == 0:
-        log(f"{run.model.anchors.budget()}; {len(run.training)} views to train on")
-        if run.perceptual is None:
+        start_log(out / "log.jsonl", state.iteration)
+        log(f"{state.model.anchors.budget()}; {len(state.training)} views to train on")
+        if state.perceptual is None:
             log("the perceptual term is off: loss.vgg16 names no weights")
         if device.type == "cpu" and not config.train.seconds and config.train.iterations > PATIENT:
             log(
@@ -83,38 +102,138 @@ def train(
                 "--budget 1h' is the setting that does best in an hour"
             )
 
-    started, saved = time.perf_counter() - run.seconds, run.seconds
-    scalars = tensorboard(out / "tensorboard", config.train.tensorboard and rank == 0)
-    with deferred_interrupt() as interrupt, scalars as show:
-        while not finished(run, config):
-            set_rates(run, config)
-            step(run, parallel, config)
-            run.iteration += 1
-            run.seconds = time.perf_counter() - started
+    # --- The loop ------------------------------------------------------------------------------
+    started, saved = time.perf_counter() - state.seconds, state.seconds
+    with deferred_interrupt() as interrupt:
+        while not finished(state, config):
+            set_rates(state, config)
+            step(state, parallel, config)
+            state.iteration += 1
+            state.seconds = time.perf_counter() - started
             if world > 1:
-                agree(run, interrupt, device)
-            last = finished(run, config) or interrupt.requested
-            due = run.iteration % config.train.save_every == 0 or (
-                0 < config.train.save_seconds <= run.seconds - saved
-            )
-            if rank == 0 and (run.iteration % config.train.log_every == 0 or last):
-                log(progress_line(run, config))
-                append_log(out / "log.jsonl", run.iteration, run.seconds, run.terms)
-                show(run.iteration, run.terms)
+                agree(state, interrupt, device)
+            last = finished(state, config) or interrupt.requested
+            due = 0 < config.train.save_seconds <= state.seconds - saved
+            if rank == 0 and (state.iteration % LOG_EVERY == 0 or last):
+                log(progress_line(state, config))
+                append_log(out / "log.jsonl", state)
             if rank == 0 and (due or last):
-                save(run, checkpoint, config, source.head)
-                saved = run.seconds
+                save(state, checkpoint, config, source.head)
+                saved = state.seconds
             if interrupt.requested:
                 raise KeyboardInterrupt
     leave_processes()
-    metrics = report(run, config, out) if rank == 0 else {}
+
+    # --- The report ----------------------------------------------------------------------------
+    metrics = report(state, config, out) if rank == 0 else {}
     if rank == 0 and float(str(metrics["psnr_train_db"])) < GREY_DB:
-        log("pictures of training are worse than grey ones: it diverged; lower train.lr")
+        log("training pictures are worse than grey ones: it diverged; lower train.lr")
+    return metrics
+
+
+def step(state: TrainState, parallel: torch.nn.Module, config: Config) -> None:
+    """Take one optimiser step over ``accumulate`` views.
+
+    Raises:
+        TrainError: Gaussians or objective are not finite.
+    """
+    state.optimizer.zero_grad(set_to_none=True)
+    for _ in range(config.train.accumulate):
+        item = state.views.item(state.shuffle.next(), crop=True)
+        subject = state.model.subjects.index(item.key.subject)
+        expression = state.model.expressions.index(item.key.expression)
+        try:
+            rendering = parallel(subject, expression, item.state, item.view, state.views.background)
+        except NotFiniteTensorError as error:
+            raise TrainError(
+                f"iteration {state.iteration}: training diverged ({error}); lower train.lr and "
+                "start over with --anew"
+            ) from None
+        terms = objective(state, rendering, item, config)
+        loss = torch.stack(list(terms.values())).sum()
+        state.terms = {name: float(term.detach()) for name, term in terms.items()}
+        if not bool(torch.isfinite(loss)):
+            raise TrainError(
+                f"iteration {state.iteration}: the objective is not finite at {item.key}: "
+                f"{state.terms}; expected finite terms. Lower train.lr or look at this sample"
+            )
+        (loss / config.train.accumulate).backward()
+    state.optimizer.step()
+
+
+def objective(
+    state: TrainState, rendering: Rendering, item: Item, config: Config
+) -> dict[str, Tensor]:
+    """Compute the weighted terms of the objective by name (paper: Training and Losses)."""
+    weights, model = config.loss, state.model
+    images = {"rgb": item.comparable(rendering.rgb)}
+    if model.refinement is not None:
+        images["image"] = item.comparable(rendering.image)
+    terms = {n: losses.reconstruction(image, item.target, weights) for n, image in images.items()}
+    if state.perceptual is not None:
+        for name, image in images.items():
+            terms[f"perceptual_{name}"] = weights.perceptual * state.perceptual(image, item.target)
+    if bool(item.depth_valid.any()):
+        error = losses.depth_dm2(rendering.depth, rendering.alpha, item.depth, item.depth_valid)
+        terms["depth"] = weights.depth * error
+    z_id, z_exp = model.codes(
+        model.subjects.index(item.key.subject), model.expressions.index(item.key.expression)
+    )
+    bounds = config.model.scale_bounds_mm
+    return terms | losses.regularisers(rendering, z_id, z_exp, state.edges, bounds, weights)
+
+
+def report(state: TrainState, config: Config, out: Path) -> dict[str, object]:
+    """Evaluate, draw previews and write metrics.json."""
+    model, views, count = state.model, state.views, config.train.evaluate_images
+    render = training_render(model, views)
+    trained = {(views.keys[i].subject, views.keys[i].expression) for i in state.training}
+    frame_of = {i: (views.keys[i].subject, views.keys[i].expression) for i in state.holdout}
+    perceptual = PerceptualMetrics(config.metrics)
+    training = evaluate(views, spread(state.training, count), render)
+    held = [i for i in state.holdout if frame_of[i] in trained]
+    new = [i for i in state.holdout if frame_of[i] not in trained]
+    holdout = evaluate(views, spread(held, count), render, perceptual)
+    expressions = evaluate(views, spread(new, count), render)
+    metrics: dict[str, object] = {
+        "psnr_train_db": mean(training, "psnr_db"),
+        "psnr_heldout_view_db": mean(holdout, "psnr_db"),
+        "psnr_heldout_view_head_db": mean(holdout, "psnr_head_db"),
+        "psnr_heldout_view_unrefined_db": mean(holdout, "psnr_unrefined_db"),
+        "psnr_heldout_expression_db": mean(expressions, "psnr_db"),
+        "ssim": mean(holdout, "ssim") if holdout else mean(training, "ssim"),
+        "rmse": mean(holdout or training, "rmse"),
+        "lpips": mean(holdout, "lpips"),
+        "fid": perceptual.fid(),
+        "psnr_heldout_view_with_torso_db": mean(holdout, "psnr_with_torso_db"),
+        "psnr_counts": f"all pixels that the camera saw; torso: {config.data.torso}",
+        "depth_median_mm": mean(holdout or training, "depth_mm"),
+        "heldout_images": len(holdout),
+        "heldout_expression_images": len(expressions),
+        "heldout_cameras": list(config.data.holdout_cameras),
+        "training_views": len(state.training),
+        "subjects": list(model.subjects),
+        "expressions": list(model.expressions),
+        "gaussians": len(model.texels),
+        "texels": config.model.n_g**2,
+        "parameters": sum(parameter.numel() for parameter in model.parameters()),
+        "iterations": state.iteration,
+        "seconds": round(state.seconds, 2),
+        "iterations_per_second": round(state.iteration / max(state.seconds, 1e-9), 3),
+        "terms": {name: round(value, 6) for name, value in state.terms.items()},
+        "perceptual": "on" if state.perceptual else "off: loss.vgg16 names no weights",
+    }
+    metrics |= perceptual.missing()
+    for name, indices in (("training", state.training), ("heldout", state.holdout)):
+        if indices:
+            path = out / "preview" / f"{name}.jpg"
+            comparison_sheet(path, views, spread(indices, 6), render)
+    write_json(out / "metrics.json", metrics)
     return metrics
 
 
 def join_processes() -> tuple[int, int, torch.device]:
-    """Rank, number of processes and device; joins the group that ``torchrun`` describes."""
+    """Join the group that ``torchrun`` describes; returns rank, number of processes and device."""
     world, device = int(os.environ.get("WORLD_SIZE", "1")), best_device()
     if world > 1:
         distributed.init_process_group("nccl" if device.type == "cuda" else "gloo")
@@ -122,103 +241,31 @@ def join_processes() -> tuple[int, int, torch.device]:
 
 
 def leave_processes() -> None:
-    """End the group that `join_processes` joined, if any.
+    """Leave the group that `join_processes` joined, if any.
 
-    Gloo's threads outlive it, and take Python's lock to free what the last sum was of; one that
-    does so while the interpreter ends aborts the process. So they are given time to.
+    Gloo's threads outlive the group and take Python's lock to free the tensors of the last sum. A
+    thread that does so while the interpreter ends aborts the process, so they get some time.
     """
     if distributed.is_initialized():
         distributed.destroy_process_group()
         time.sleep(GLOO_SECONDS)
 
 
-def agree(run: Run, interrupt: Interrupt, device: torch.device) -> None:
-    """Let all processes see the same clock and the same wish to stop, or they would part ways."""
-    common = torch.tensor([run.seconds, float(interrupt.requested)], device=device)
+def agree(state: TrainState, interrupt: Interrupt, device: torch.device) -> None:
+    """Give all processes the same clock and the same request to stop, or they would deadlock."""
+    common = torch.tensor([state.seconds, float(interrupt.requested)], device=device)
     distributed.all_reduce(common, distributed.ReduceOp.MAX)
-    run.seconds, interrupt.requested = float(common[0]), bool(common[1] > 0)
+    state.seconds, interrupt.requested = float(common[0]), bool(common[1] > 0)
 
 
-def save(run: Run, path: Path, config: Config, head_spec: str) -> None:
-    """Write the checkpoint with the loop's full state."""
-    save_checkpoint(
-        path,
-        model=run.result,
-        config=config,
-        head_spec=head_spec,
-        gallery=collect_gallery(run.views, run.training),
-        optimizer=run.optimizer.state_dict(),
-        loop={
-            "iteration": run.iteration,
-            "seconds": run.seconds,
-            "samples": run.views.source.digest,
-            "shuffle": run.shuffle.state(),
-            "generator": run.generator.get_state(),
-            "torch": torch.get_rng_state(),
-        }
-        | ({"weights": run.model.state_dict()} if run.average else {}),
-    )
-
-
-def restore(run: Run, path: Path, config: Config, device: torch.device, rank: int) -> None:
-    """Put a run back to where its checkpoint was written, which has the state of rank 0."""
-    loaded = load_checkpoint(path, device)
-    if not loaded.loop:
-        raise ConfigError(
-            f"{path}: holds no state to resume from (a person was withdrawn from it, or it is a "
-            "fit); train into another folder, or start over with --anew"
-        )
-    budget = {"iterations", "seconds", "save_every", "save_seconds", "log_every",
-              "evaluate_images", "threads", "tensorboard"}  # fmt: skip
-    old, new = as_tables(loaded.config), as_tables(config)
-    changed = [
-        f"{table}.{key} {old[table][key]!r} -> {value!r}"
-        for table in ("model", "loss", "data", "train")
-        for key, value in new[table].items()
-        if value != old[table][key] and not (table == "train" and key in budget)
-    ]
-    names = (loaded.model.subjects, loaded.model.expressions)
-    if names != (run.model.subjects, run.model.expressions):
-        changed.append("the subjects or expressions of the shards")
-    elif loaded.loop.get("samples", run.views.source.digest) != run.views.source.digest:
-        changed.append("the samples of the shards")
-    if changed:
-        raise ConfigError(
-            f"{path}: cannot resume, these differ: {'; '.join(changed)}. "
-            "Go on with the same, train into another folder, or start over with --anew"
-        )
-    run.model.load_state_dict(loaded.loop.get("weights", loaded.model.state_dict()))
-    if run.average is not None:
-        run.average.module.load_state_dict(loaded.model.state_dict())
-        run.average.n_averaged.fill_(loaded.loop["iteration"])
-    run.optimizer.load_state_dict(loaded.optimizer)
-    run.shuffle.restore(loaded.loop["shuffle"])
-    if rank == 0:  # the others draw other numbers
-        run.generator.set_state(loaded.loop["generator"])
-    torch.set_rng_state(loaded.loop["torch"])
-    run.iteration, run.seconds = loaded.loop["iteration"], loaded.loop["seconds"]
-    if finished(run, config):
-        log(
-            f"{path}: has all of its {run.iteration} iterations; to train on, raise "
-            "train.iterations or --seconds"
-        )
-    else:
-        log(f"{path}: going on from iteration {run.iteration}")
-
-
-def progress_line(run: Run, config: Config) -> str:
-    """Where the run is, how fast it goes and what the terms are."""
-    rate = run.iteration / max(run.seconds, 1e-9)
-    used = budget_used(run, config)
-    left = run.seconds * (1 - used) / used if used > 0 else 0.0
-    terms = " ".join(f"{name} {value:.4f}" for name, value in run.terms.items())
-    return f"iteration {run.iteration}  {rate:.2f}/s  {in_words(left)} left  {terms}"
-
-
-def in_words(seconds: float) -> str:
-    """A time to go as a person would say it."""
-    seconds = max(0.0, seconds)
-    for unit, length in (("days", 86400), ("h", 3600), ("min", 60)):
-        if seconds >= 2 * length:
-            return f"{seconds / length:.1f} {unit}"
-    return f"{seconds:.0f} s"
+def progress_line(state: TrainState, config: Config) -> str:
+    """Describe the iteration, the speed, the time left and the terms in one line."""
+    rate = state.iteration / max(state.seconds, 1e-9)
+    used = budget_used(state, config)
+    left = state.seconds * (1 - used) / used if used > 0 else 0.0
+    words = f"{left:.0f} s"
+    for unit, length in (("min", 60), ("h", 3600), ("days", 86400)):
+        if left >= 2 * length:
+            words = f"{left / length:.1f} {unit}"
+    terms = " ".join(f"{name} {value:.4f}" for name, value in state.terms.items())
+    return f"iteration {state.iteration}  {rate:.2f}/s  {words} left  {terms}"

@@ -8,6 +8,7 @@ Google's tag manager to count its visitors, where the browser has a way there.
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections.abc import Sequence
@@ -17,15 +18,14 @@ from typing import Any
 import numpy as np
 import torch
 import viser
+from torch import Tensor
 
 from express50.console import stdout_to_stderr
 from express50.geometry.transforms import quat_to_matrix
 from grmm.checkpoint import Loaded
-from grmm.edit import Head, between, controlled, principal_directions, trained_head
-from grmm.preview import Preview
-from grmm.render import frontal
-from grmm.scene import View
-from grmm.sheets import strongest_coefficients
+from grmm.edit import HeadCodes, between, controlled, principal_directions, trained_head
+from grmm.render import drawn, frontal, strongest_coefficients, to_uint8
+from grmm.scene import Gaussians, HeadState, Maps, PinholeView
 
 REST_SECONDS = 0.35  # without a change, before the still picture is drawn
 COEFFICIENTS, DIRECTIONS = 10, 4  # sliders of each kind
@@ -38,6 +38,72 @@ TURNS = {  # sliders of joints: control, entry, range in radians
     "neck tilt": ("neck", 2, (-0.4, 0.4)),
 }
 GAZE = {"gaze up, down": (0, (-0.4, 0.4)), "gaze sideways": (1, (-0.5, 0.5))}
+SLOW_SECONDS = 0.04  # colours that take longer are not decoded while the camera moves
+TURN_DEGREES = 1.5  # under this the eye sees no other colours
+
+
+class Preview:
+    """Draws one head again and again, and decodes only what changed since the last picture.
+
+    Maps are decoded when codes change, the mesh is posed when parameters change, colours are
+    decoded when the camera has turned. While things move, refinement is off, and colours that take
+    longer than a frame may lag. At rest a picture is exactly that of ``grmm render``.
+
+    State: the geometry and colours decoded last, and how long colours took.
+    """
+
+    def __init__(self, loaded: Loaded) -> None:
+        """Draw heads of this checkpoint."""
+        self.loaded = loaded
+        self._head: HeadCodes | None = None
+        self._state: HeadState | None = None
+        self._maps: Maps | None = None
+        self._gaussians: Gaussians | None = None
+        self._colours: Tensor | None = None
+        self._direction: Tensor | None = None
+        self._colour_seconds = 0.0
+
+    @torch.no_grad()
+    def draw(self, head: HeadCodes, view: PinholeView, moving: bool) -> np.ndarray:
+        """(H, W, 3) uint8; ``moving`` trades the refinement for speed."""
+        model = self.loaded.model
+        if head is not self._head:
+            self._take(head)
+        if self._needs_colours(view, moving):
+            began = time.perf_counter()
+            assert self._state is not None
+            self._colours = model.appearance(head.z_id, self._state, view)
+            self._colour_seconds = time.perf_counter() - began
+            self._direction = view.direction()
+        assert self._gaussians is not None and self._colours is not None
+        out = drawn(self.loaded, self._gaussians, self._colours, view, refine=not moving)
+        return to_uint8(out.image)
+
+    def _take(self, head: HeadCodes) -> None:
+        """Decode what differs from the last head: colours by person, maps by both codes."""
+        model, last = self.loaded.model, self._head
+        self._state = head.state(self.loaded)
+        # Without residual codes the decoders see head-model parameters: all may have changed.
+        same_person = same_codes = False
+        if last is not None and self.loaded.config.model.residual_codes:
+            same_person = torch.equal(head.z_id, last.z_id)
+            same_codes = same_person and torch.equal(head.z_exp, last.z_exp)
+        if not same_person:
+            self._colours = None
+        if not same_codes:
+            known = self._maps.opacities if same_person and self._maps is not None else None
+            self._maps = model.decode(head.z_id, head.z_exp, self._state, known)
+        self._gaussians = model.geometry(head.z_id, head.z_exp, self._state, self._maps)
+        self._head = head
+
+    def _needs_colours(self, view: PinholeView, moving: bool) -> bool:
+        if self._colours is None or self._direction is None:
+            return True
+        cosine = float((self._direction * view.direction()).sum())
+        if not moving:
+            return cosine < 1 - 1e-9
+        turned = math.degrees(math.acos(max(-1.0, min(1.0, cosine))))
+        return turned > TURN_DEGREES and self._colour_seconds < SLOW_SECONDS
 
 
 @dataclass(kw_only=True)
@@ -212,7 +278,7 @@ class Viewer:
     def _value(self, name: str) -> float:
         return float(self._sliders[name][0].value)
 
-    def _described(self) -> Head:
+    def _described(self) -> HeadCodes:
         """The head that the controls describe."""
         head = trained_head(self.loaded, self._subject.value, self._expression.value)
         if self._code.value != "the same":
@@ -223,7 +289,7 @@ class Viewer:
             head = between(head, goal, self._value("blend"))
         return controlled(self.loaded, head, self._controls(head))
 
-    def _controls(self, head: Head) -> dict[str, tuple[float, ...]]:
+    def _controls(self, head: HeadCodes) -> dict[str, tuple[float, ...]]:
         """What the sliders add to a head, as controls; sliders at rest change nothing."""
         controls: dict[str, tuple[float, ...]] = {}
         for name, (joint, entry, _) in TURNS.items():
@@ -250,7 +316,7 @@ class Viewer:
         return controls
 
 
-def view_of_camera(camera: Any, height: int, device: torch.device | str = "cpu") -> View:
+def view_of_camera(camera: Any, height: int, device: torch.device | str = "cpu") -> PinholeView:
     """A browser's camera (OpenCV axes, head space) as a view of this height, at most 2 : 1 wide."""
     width = max(1, round(height * min(2.0, max(0.5, float(camera.aspect)))))
     focal = height / 2 / np.tan(float(camera.fov) / 2)
@@ -259,4 +325,4 @@ def view_of_camera(camera: Any, height: int, device: torch.device | str = "cpu")
     cam_from_head[:3, :3] = quat_to_matrix(np.asarray(camera.wxyz, dtype=np.float64)).T
     cam_from_head[:3, 3] = -cam_from_head[:3, :3] @ np.asarray(camera.position)
     pose = torch.from_numpy(cam_from_head).to(device)
-    return View(K=K.to(device), cam_from_head=pose, width=width, height=height)
+    return PinholeView(K=K.to(device), cam_from_head=pose, width=width, height=height)

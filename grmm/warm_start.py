@@ -1,7 +1,7 @@
 """A sensible head before the first step: texel colours averaged from footage.
 
 The paper trains from scratch for 250,000 iterations; on a small budget the first thousands would
-go into finding colours that projection gives at once (survey point 17).
+go into finding colours that projection gives at once (G17).
 """
 
 from __future__ import annotations
@@ -14,9 +14,10 @@ from torch import Tensor
 from grmm.anchors import tangent_frames
 from grmm.data import HeadViews, Item
 from grmm.model import GRMM
-from grmm.order import spread
+from grmm.sampler import spread
 from grmm.scene import Gaussians
 
+IMAGES_PER_SUBJECT = 96  # more hardly change the mean texture
 FACING = 0.25  # cosine of normal and view below which a texel is seen too obliquely
 OCCLUSION_M = 0.012  # a texel this far behind the rendered surface is hidden; hair is this thick
 ALIKE_COLOUR, ALIKE_M = 0.08, 0.04  # how far texels may differ and still change alike
@@ -24,7 +25,9 @@ LOGIT_LIMIT = 0.01  # colours are kept this far from 0 and 1 before the logit
 
 
 @torch.no_grad()
-def warm_start(model: GRMM, views: HeadViews, indices: Sequence[int], images: int) -> None:
+def warm_start(
+    model: GRMM, views: HeadViews, indices: Sequence[int], images: int = IMAGES_PER_SUBJECT
+) -> None:
     """Write the mean texture into the colour decoder's bias, and subjects into modes and codes.
 
     With ``identity_modes`` the subjects' deviations from the mean texture are decomposed; each
@@ -53,7 +56,7 @@ def _write_modes(model: GRMM, all_modes: Tensor, logits: Tensor) -> None:
     u, s, v = torch.linalg.svd(deviations.double(), full_matrices=False)
     count = min(len(s) - 1, len(all_modes))
     # Codes of unit spread: every decoder then tells the subjects apart from its first step.
-    scale = u[:, :count].std(0).clamp_min(1e-8) / model.config.code_spread
+    scale = u[:, :count].std(0).clamp_min(1e-8)
     model.z_id[:, :count] = (u[:, :count] / scale).to(model.z_id.dtype)
     basis = (v[:count] * (s[:count] * scale)[:, None]).to(model.z_id.dtype)
     modes = all_modes.flatten(2)

@@ -24,8 +24,8 @@ if TYPE_CHECKING:
 
     from express50.dataset.tracks import Sequence
     from grmm.checkpoint import Loaded
-    from grmm.edit import Head
-    from grmm.scene import View
+    from grmm.edit import HeadCodes
+    from grmm.scene import PinholeView
 
 
 def add_render(commands: argparse._SubParsersAction) -> None:
@@ -107,17 +107,17 @@ def _clips(path: Path, cue: str | None) -> Sequence:
     return replace(clips, cues=(cue,) * len(rows), **parts)
 
 
-def _sheets(loaded: Loaded, head: Head, view: View, args: argparse.Namespace) -> None:
-    from grmm import sheets
+def _sheets(loaded: Loaded, head: HeadCodes, view: PinholeView, args: argparse.Namespace) -> None:
+    from grmm import render
 
     if args.controls:
-        _sheet(args.out / "controls.jpg", *sheets.control_sheet(loaded, head, view))
+        _sheet(args.out / "controls.jpg", *render.control_sheet(loaded, head, view))
     if args.expression_of:
         plain = frame_head(loaded, args.subject or loaded.model.subjects[0])
         donor = frame_head(loaded, args.expression_of)
-        _sheet(args.out / "transfer.jpg", *sheets.residual_sheet(loaded, plain, donor, view))
+        _sheet(args.out / "transfer.jpg", *render.residual_sheet(loaded, plain, donor, view))
     if args.samples:
-        sheet, _ = sheets.sample_sheet(loaded, head, view, args.samples, args.seed, args.spread)
+        sheet, _ = render.sample_sheet(loaded, head, view, args.samples, args.seed, args.spread)
         _sheet(args.out / "samples.jpg", *sheet)
 
 

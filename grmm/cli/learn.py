@@ -6,9 +6,8 @@ import argparse
 from dataclasses import replace
 from pathlib import Path
 
-from express50.console import OK, say, say_json
+from express50.console import OK, log, say, say_json
 from express50.errors import ConfigError
-from grmm.budget import choose
 from grmm.cli.shared import (
     add_checkpoint_and_shards,
     add_metrics,
@@ -21,8 +20,7 @@ from grmm.cli.shared import (
     split_names,
 )
 from grmm.config import Config
-from grmm.presets import PRESETS, TABLES, resolve
-from grmm.progress import log
+from grmm.presets import PRESETS, TABLES, choose, resolve
 
 MEASURED = "measured"  # in place of a preset
 
@@ -38,7 +36,6 @@ def add_train(commands: argparse._SubParsersAction) -> None:
     parser.add_argument("shards", type=Path, help="folder of shards")
     parser.add_argument("out", type=Path, help="folder for checkpoint.pt, metrics.json, preview/")
     add_training(parser)
-    parser.add_argument("--overfit", action="store_true", help="check: train on one view only")
     parser.add_argument(
         "--anew", action="store_true", help="start over, though OUT has a checkpoint"
     )
@@ -86,7 +83,7 @@ def _train(args: argparse.Namespace) -> int:
 
     no_file(args.out)
     config = train_config(args)
-    source = open_shards([args.shards, *args.also], config.data.split)
+    source = open_shards([args.shards, *args.also], "train")
     resume = not args.anew and (args.out / "checkpoint.pt").exists()
     metrics = train(source, load_head(source.head), args.out, config, resume=resume)
     if args.json:
@@ -116,8 +113,6 @@ def train_config(args: argparse.Namespace) -> Config:
     if args.holdout_expressions:
         frames = split_names(args.holdout_expressions)
         config = replace(config, data=replace(config.data, holdout_expressions=frames))
-    if getattr(args, "overfit", False):
-        config = replace(config, train=replace(config.train, overfit=1))
     return config
 
 

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from express50.console import OK, say, say_json
+from express50.console import OK, log, say, say_json
 from express50.errors import ConfigError
 from grmm.cli.learn import add_training, train_config
 from grmm.cli.shared import (
@@ -21,12 +21,11 @@ from grmm.cli.shared import (
     select,
     split_names,
 )
-from grmm.progress import log
 
 if TYPE_CHECKING:
     from grmm.checkpoint import Loaded
     from grmm.data import HeadViews
-    from grmm.unseen import Protocol
+    from grmm.identity_evaluation import FitProtocol
 
 
 def add_evaluate(commands: argparse._SubParsersAction) -> None:
@@ -62,11 +61,11 @@ def _add_protocol(parser: argparse.ArgumentParser) -> None:
 
 def _evaluate(args: argparse.Namespace) -> int:
     from grmm.evaluate import SEEN, evaluate, kind_of, training_render, write_evaluation
-    from grmm.judge import Judge
-    from grmm.order import spread
+    from grmm.identity_evaluation import evaluate_unseen
+    from grmm.perceptual_metrics import PerceptualMetrics
+    from grmm.sampler import spread
     from grmm.score import save_pictures
     from grmm.shard_source import ShardSource
-    from grmm.unseen import evaluate_unseen
 
     no_file(args.out)
     loaded = load(args.checkpoint, metric_settings(args), args.fit_budget)
@@ -74,7 +73,7 @@ def _evaluate(args: argparse.Namespace) -> int:
     background = loaded.config.data.background
     source = ShardSource(args.shards, split="*")
     keep = save_pictures(args.save, source, background) if args.save else None
-    judge = Judge(loaded.config.metrics)
+    judge = PerceptualMetrics(loaded.config.metrics)
     known, unseen = _split(loaded, views, args)
     if args.heldout:
         subjects, gallery = loaded.model.subjects, loaded.gallery
@@ -130,10 +129,10 @@ def _split(
     return known, {}
 
 
-def _protocol(args: argparse.Namespace) -> Protocol:
-    from grmm.unseen import Protocol
+def _protocol(args: argparse.Namespace) -> FitProtocol:
+    from grmm.identity_evaluation import FitProtocol
 
-    return Protocol(
+    return FitProtocol(
         cameras=split_names(args.fit_cameras), expression=args.fit_expression, images=args.images
     )
 
@@ -171,8 +170,8 @@ def _score(args: argparse.Namespace) -> int:
     from grmm.config import DataConfig, MetricsConfig
     from grmm.data import HeadViews
     from grmm.evaluate import write_evaluation
-    from grmm.judge import Judge
-    from grmm.order import spread
+    from grmm.perceptual_metrics import PerceptualMetrics
+    from grmm.sampler import spread
     from grmm.score import score
     from grmm.shard_source import ShardSource
 
@@ -181,7 +180,7 @@ def _score(args: argparse.Namespace) -> int:
     views = HeadViews(source, load_head(source.head), background=data.background, torso=data.torso)
     chosen = select(views, args.subjects, args.expressions, args.cameras)
     chosen = spread(chosen, args.images) if args.images else chosen
-    judge = Judge(MetricsConfig(alexnet=args.alexnet, inception=args.inception))
+    judge = PerceptualMetrics(MetricsConfig(alexnet=args.alexnet, inception=args.inception))
     rows = score(args.renders, source, views, chosen, judge, partial=args.partial)
     summary = write_evaluation(args.out, rows, judge)
     _tell(summary, args.json)

@@ -14,7 +14,7 @@ from express50.errors import ConfigError
 if TYPE_CHECKING:  # torch takes a second to import: --help must not wait for it
     from grmm.checkpoint import Loaded
     from grmm.data import HeadViews
-    from grmm.edit import Head
+    from grmm.edit import HeadCodes
 
 CHANGEABLE = ("fit", "metrics", "loss")  # tables that may differ from those of training
 
@@ -88,7 +88,7 @@ def load(path: Path, assignments: Sequence[str] = (), seconds: float | None = No
     from express50.contract.config import parse_assignment
     from grmm.checkpoint import load_checkpoint
     from grmm.presets import as_tables, from_tables
-    from grmm.run import best_device
+    from grmm.train_state import best_device
 
     loaded = load_checkpoint(path, best_device())
     tables = as_tables(loaded.config)
@@ -180,7 +180,7 @@ def add_edit(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def edited_head(loaded: Loaded, args: argparse.Namespace) -> Head:
+def edited_head(loaded: Loaded, args: argparse.Namespace) -> HeadCodes:
     """The head that the arguments of `add_edit` describe."""
     from grmm.edit import controlled, trained_head, with_expression
 
@@ -196,7 +196,7 @@ def edited_head(loaded: Loaded, args: argparse.Namespace) -> Head:
     return controlled(loaded, head, dict(_control(text) for text in args.control))
 
 
-def frame_head(loaded: Loaded, text: str, expression: str | None = None) -> Head:
+def frame_head(loaded: Loaded, text: str, expression: str | None = None) -> HeadCodes:
     """The head of ``SUBJECT/EXPRESSION``; without the second part ``expression``."""
     from grmm.edit import trained_head
 

@@ -13,10 +13,24 @@ import torch
 from torch import Tensor
 
 from express50 import native
-from grmm.rasterize.interface import RenderBuffers, RenderOptions, RenderOutput
+from grmm.rasterize.interface import (
+    NotFiniteTensorError,
+    Pinhole,
+    RenderBuffers,
+    RenderOptions,
+    RenderOutput,
+    Splats,
+)
 from grmm.rasterize.reference import rasterize_reference
 
-__all__ = ["BACKENDS", "RenderBuffers", "RenderOutput", "rasterize", "resolve_backend"]
+__all__ = [
+    "BACKENDS",
+    "NotFiniteTensorError",
+    "RenderBuffers",
+    "RenderOutput",
+    "rasterize",
+    "resolve_backend",
+]
 
 LIMIT = 1e30  # of any argument's values
 BACKENDS = ("auto", "reference", "cpu", "gsplat")
@@ -66,36 +80,30 @@ def rasterize(
         buffers: memory to put the images of the native backend into, again and again.
 
     Raises:
-        ValueError: wrong shape, dtype or device, NaN or Inf, unknown backend; names the argument.
-        RuntimeError: the backend asked for is not there; the message says how to mend it.
+        NotFiniteTensorError: an argument holds NaN or Inf.
+        ValueError: wrong shape, dtype or device, or unknown backend; names the argument.
+        RuntimeError: the requested backend is unavailable; says how to fix it.
     """
-    tensors = {
-        "means": means, "quats": quats, "scales": scales, "opacities": opacities,
-        "colors": colors, "K": K, "cam_from_world": cam_from_world,
-    }  # fmt: skip
-    if background is not None:
-        tensors["background"] = background
-    _check(tensors, width, height, near, eps2d)
+    splats = Splats(means=means, quats=quats, scales=scales, opacities=opacities, colors=colors)
+    camera = Pinhole(K=K, cam_from_world=cam_from_world, width=width, height=height)
     options = RenderOptions(
-        width=width,
-        height=height,
         near=near,
         eps2d=eps2d,
         antialiased=antialiased,
         median_depth=median_depth,
         normals=normals,
     )
-    scene = (means, quats, scales, opacities, colors, K, cam_from_world, background)
+    _check(splats, camera, background, options)
     name = resolve_backend(backend, means.device)
-    if name == "cpu":  # imported only when they are used, as gsplat is
+    if name == "cpu":  # a backend is imported when it is used: gsplat may start a long build
         from grmm.rasterize.cpu import rasterize_cpu
 
-        return rasterize_cpu(*scene, options, buffers)
+        return rasterize_cpu(splats, camera, background, options, buffers)
     if name == "gsplat":
         from grmm.rasterize.gsplat_backend import rasterize_gsplat
 
-        return rasterize_gsplat(*scene, options)
-    return rasterize_reference(*scene, options)
+        return rasterize_gsplat(splats, camera, background, options)
+    return rasterize_reference(splats, camera, background, options)
 
 
 def resolve_backend(backend: str = "auto", device: torch.device | str = "cpu") -> str:
@@ -116,20 +124,25 @@ def resolve_backend(backend: str = "auto", device: torch.device | str = "cpu") -
     return "reference"
 
 
-def _check(tensors: dict[str, Tensor], width: int, height: int, near: float, eps2d: float) -> None:
-    """Shapes, dtypes, devices and finiteness of all arguments; ValueError names the bad one."""
-    n, channels = tensors["means"].shape[0], tensors["colors"].shape[-1]
+def _check(
+    splats: Splats, camera: Pinhole, background: Tensor | None, options: RenderOptions
+) -> None:
+    """Check shapes, dtypes, devices and values; the ValueError names the argument."""
+    n, channels = splats.means.shape[0], splats.colors.shape[-1]
+    tensors = vars(splats) | {"K": camera.K, "cam_from_world": camera.cam_from_world}
+    if background is not None:
+        tensors["background"] = background
     shapes = {
         "means": (n, 3), "quats": (n, 4), "scales": (n, 3), "opacities": (n,),
         "colors": (n, channels), "K": (3, 3), "cam_from_world": (4, 4), "background": (channels,),
     }  # fmt: skip
-    dtype, device = tensors["means"].dtype, tensors["means"].device
+    dtype, device = splats.means.dtype, splats.means.device
     for name, tensor in tensors.items():
         if tuple(tensor.shape) != shapes[name]:
             raise ValueError(f"{name} has shape {tuple(tensor.shape)}, expected {shapes[name]}")
-        camera = name in ("K", "cam_from_world")
+        of_camera = name in ("K", "cam_from_world")
         if tensor.dtype not in (torch.float32, torch.float64) or (
-            tensor.dtype != dtype and not camera
+            tensor.dtype != dtype and not of_camera
         ):
             raise ValueError(
                 f"{name} is {tensor.dtype}, expected float32 or float64 and the same as means"
@@ -137,15 +150,15 @@ def _check(tensors: dict[str, Tensor], width: int, height: int, near: float, eps
         if tensor.device != device:
             raise ValueError(f"{name} is on {tensor.device}, expected {device} as means")
         _check_finite(name, tensor)
-    if width < 1 or height < 1:
-        raise ValueError(f"image size is {width} x {height}, expected at least 1 x 1")
-    if not near > 0 or not eps2d > 0:
-        raise ValueError(f"near is {near} and eps2d {eps2d}, expected both above 0")
-    _check_intrinsics(tensors["K"].detach())
+    if camera.width < 1 or camera.height < 1:
+        raise ValueError(f"image size is {camera.width} x {camera.height}, expected at least 1 x 1")
+    if not options.near > 0 or not options.eps2d > 0:
+        raise ValueError(f"near is {options.near} and eps2d {options.eps2d}, expected both above 0")
+    _check_intrinsics(camera.K.detach())
 
 
 def _check_finite(name: str, tensor: Tensor) -> None:
-    """ValueError if ``tensor`` holds NaN, Inf or numbers whose squares would overflow."""
+    """Refuse NaN, Inf and numbers whose squares would overflow."""
     if tensor.numel() == 0:
         return
     low, high = torch.aminmax(tensor.detach())
@@ -153,14 +166,14 @@ def _check_finite(name: str, tensor: Tensor) -> None:
         return
     bad = ~(tensor.detach().abs() < LIMIT)
     first = tuple(bad.nonzero()[0].tolist())
-    raise ValueError(
+    raise NotFiniteTensorError(
         f"{name} has {int(bad.sum())} values that are not finite or over {LIMIT:g}, the first at"
         f" {first}; expected finite numbers"
     )
 
 
 def _check_intrinsics(K: Tensor) -> None:
-    """ValueError unless K is a pinhole matrix with positive focal lengths and no skew."""
+    """Refuse a K that is not a pinhole matrix with positive focal lengths and no skew."""
     (fx, skew, _), (below, fy, _), bottom = K.tolist()
     if fx <= 0 or fy <= 0 or skew != 0 or below != 0 or bottom != [0.0, 0.0, 1.0]:
         raise ValueError(

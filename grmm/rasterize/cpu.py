@@ -16,7 +16,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from express50 import native
-from grmm.rasterize.interface import RenderBuffers, RenderOptions, RenderOutput
+from grmm.rasterize.interface import Pinhole, RenderBuffers, RenderOptions, RenderOutput, Splats
 from grmm.rasterize.projection import depth_of_rays, expected_depth
 
 _TILE = 16  # kTile of tiles.h
@@ -45,34 +45,36 @@ class _Camera(ctypes.Structure):
 
 
 def rasterize_cpu(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    colors: Tensor,
-    K: Tensor,
-    cam_from_world: Tensor,
+    scene: Splats,
+    camera: Pinhole,
     background: Tensor | None,
     options: RenderOptions,
     buffers: RenderBuffers | None = None,
 ) -> RenderOutput:
-    """Render; arguments as ``grmm.rasterize``.
+    """Render; see ``grmm.rasterize``.
 
     Raises:
         ValueError: the tensors are not on the CPU, or the Gaussians are too large to be binned.
-        express50.native.NativeLibraryError: the library was not built; says how to mend it.
+        express50.native.NativeLibraryError: the library was not built; says how to fix it.
     """
-    if means.device.type != "cpu":
-        raise ValueError(f"backend 'cpu' got tensors on {means.device}; use 'auto' or 'gsplat'")
+    device = scene.means.device
+    if device.type != "cpu":
+        raise ValueError(f"backend 'cpu' got tensors on {device}; use 'auto' or 'gsplat'")
     image, weighted, alpha, median = _Rasterize.apply(
-        means, quats, scales, opacities, colors, K, cam_from_world, background, options, buffers
+        *vars(scene).values(),
+        camera.K,
+        camera.cam_from_world,
+        background,
+        (camera.width, camera.height),
+        options,
+        buffers,
     )
-    channels = colors.shape[1]
+    channels = scene.colors.shape[1]
     return RenderOutput(
         colors=image[..., :channels] if options.normals else image,
-        depth=expected_depth(weighted, alpha, K),
+        depth=expected_depth(weighted, alpha, camera.K),
         alpha=alpha,
-        median_depth=None if median is None else depth_of_rays(median, K),
+        median_depth=None if median is None else depth_of_rays(median, camera.K),
         normals=image[..., channels:] if options.normals else None,
     )
 
@@ -91,13 +93,14 @@ class _Rasterize(torch.autograd.Function):
         K: Tensor,
         cam_from_world: Tensor,
         background: Tensor | None,
+        size: tuple[int, int],
         options: RenderOptions,
         buffers: RenderBuffers | None,
     ) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
         ctx.set_materialize_grads(False)
         # The kernel reads raw memory: a strided view would be read as other numbers.
         geometry = [x.contiguous() for x in (means, quats, scales, opacities)]
-        camera = _camera(K, cam_from_world, options)
+        camera = _camera(K, cam_from_world, size, options)
         if options.normals:  # three more channels, which the projection fills
             colors = torch.nn.functional.pad(colors, (0, 3))
             background = None if background is None else torch.nn.functional.pad(background, (0, 3))
@@ -105,10 +108,10 @@ class _Rasterize(torch.autograd.Function):
         splats, boxes, starts, ids = _bin(camera, geometry, colors)
         used = torch.empty(starts.numel() - 1, dtype=torch.int32)
         blended = (splats, boxes, colors, background, starts, ids, used)
-        size, dtype, take = (camera.height, camera.width), means.dtype, (buffers or _fresh).take
-        image = take("image", (*size, colors.shape[1]), dtype)
-        weighted, alpha = take("weighted", size, dtype), take("alpha", size, dtype)
-        median = take("median", size, dtype) if options.median_depth else None
+        shape, dtype, take = (camera.height, camera.width), means.dtype, (buffers or _fresh).take
+        image = take("image", (*shape, colors.shape[1]), dtype)
+        weighted, alpha = take("weighted", shape, dtype), take("alpha", shape, dtype)
+        median = take("median", shape, dtype) if options.median_depth else None
         _call("forward", dtype, camera, colors.shape[1], *blended, image, weighted, alpha, median)
         ctx.camera = camera
         ctx.save_for_backward(*geometry, *blended, alpha, K, cam_from_world)
@@ -139,7 +142,7 @@ class _Rasterize(torch.autograd.Function):
             d_background = torch.einsum("hwc,hw->c", d_images[0][..., :asked], 1.0 - alpha)
         grads[4] = grads[4][:, :asked]
         d_camera_inputs = d_K.to(K.dtype), d_pose.to(cam_from_world.dtype)
-        return *grads, *d_camera_inputs, d_background, None, None
+        return *grads, *d_camera_inputs, d_background, None, None, None
 
 
 def _bin(
@@ -168,7 +171,9 @@ def _bin(
     return splats, boxes, starts, ids
 
 
-def _camera(K: Tensor, cam_from_world: Tensor, options: RenderOptions) -> _Camera:
+def _camera(
+    K: Tensor, cam_from_world: Tensor, size: tuple[int, int], options: RenderOptions
+) -> _Camera:
     """The camera as the kernel reads it, in float64."""
     (fx, _, cx), (_, fy, cy), _ = K.tolist()
     pose = cam_from_world.tolist()
@@ -178,8 +183,8 @@ def _camera(K: Tensor, cam_from_world: Tensor, options: RenderOptions) -> _Camer
         t=tuple(row[3] for row in pose[:3]),
         near=options.near,
         eps2d=options.eps2d,
-        width=options.width,
-        height=options.height,
+        width=size[0],
+        height=size[1],
         antialiased=options.antialiased,
         normals=options.normals,
         threads=torch.get_num_threads(),

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from express50.geometry.conventions import cell_to_corner
-from grmm.rasterize.interface import RenderOptions, RenderOutput
+from grmm.rasterize.interface import Pinhole, RenderOptions, RenderOutput, Splats
 from grmm.rasterize.projection import (
     ALPHA_MAX,
     Projection,
@@ -28,30 +28,19 @@ WIDTHS = (1, 2, 3, 4, 5, 8, 9, 16, 17, 32)  # channel counts that every gsplat r
 
 
 def rasterize_gsplat(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    colors: Tensor,
-    K: Tensor,
-    cam_from_world: Tensor,
-    background: Tensor | None,
-    options: RenderOptions,
+    scene: Splats, camera: Pinhole, background: Tensor | None, options: RenderOptions
 ) -> RenderOutput:
-    """Render; arguments as ``grmm.rasterize``.
+    """Render; see ``grmm.rasterize``.
 
     Raises:
         ValueError: the tensors are not float32 on a CUDA device.
         RuntimeError: there is no CUDA device, or gsplat is not installed.
     """
-    gsplat = _require_gsplat(means)
-    width, height = options.width, options.height
-    splats = project(
-        means, quats, scales, opacities, K, cam_from_world, width, height,
-        options.near, options.eps2d, options.antialiased,
-    )  # fmt: skip
+    gsplat = _require_gsplat(scene.means)
+    width, height, K = camera.width, camera.height, camera.K
+    splats = project(scene, camera, options.near, options.eps2d, options.antialiased)
     tiles = _tiles(gsplat, splats, width, height)
-    channels = [plane_channels(splats, K), splats.normals[:, : 3 * options.normals], colors]
+    channels = [plane_channels(splats, K), splats.normals[:, : 3 * options.normals], scene.colors]
     passes = []
     for values in _padded_chunks(torch.cat(channels, 1)):
         image, alpha = gsplat.rasterize_to_pixels(

@@ -1,4 +1,4 @@
-"""What every backend of the rasteriser takes and gives."""
+"""The records that the rasteriser's backends share."""
 
 from __future__ import annotations
 
@@ -8,12 +8,35 @@ import torch
 from torch import Tensor
 
 
-@dataclass(frozen=True, kw_only=True)
-class RenderOptions:
-    """The arguments of ``rasterize`` that are not tensors; see there."""
+class NotFiniteTensorError(ValueError):
+    """An argument of ``rasterize`` holds NaN, Inf or numbers too large to square."""
 
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Splats:
+    """N Gaussians as ``rasterize`` takes them; see there for shapes and units."""
+
+    means: Tensor
+    quats: Tensor
+    scales: Tensor
+    opacities: Tensor
+    colors: Tensor
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Pinhole:
+    """The camera of ``rasterize``; see there."""
+
+    K: Tensor
+    cam_from_world: Tensor
     width: int
     height: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class RenderOptions:
+    """The settings of ``rasterize``; see there."""
+
     near: float
     eps2d: float
     antialiased: bool

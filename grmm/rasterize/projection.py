@@ -16,6 +16,7 @@ from torch import Tensor
 
 from express50.geometry.conventions import cell_to_corner
 from express50.geometry.transforms_torch import quat_to_matrix
+from grmm.rasterize.interface import Pinhole, Splats
 
 ALPHA_MIN = 1.0 / 255.0  # fainter contributions are skipped
 ALPHA_MAX = 0.99  # keeps 1 - alpha away from zero
@@ -51,25 +52,24 @@ class Projection:
 
 
 def project(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    K: Tensor,
-    cam_from_world: Tensor,
-    width: int,
-    height: int,
+    scene: Splats,
+    camera: Pinhole,
     near: float = 0.01,
     eps2d: float = 0.3,
     antialiased: bool = False,
 ) -> Projection:
-    """Project Gaussians: means (N, 3), quats (N, 4) wxyz, scales (N, 3) m, opacities (N,).
-
-    ``K`` is (3, 3) pixels and ``cam_from_world`` (4, 4). Differentiable in all six tensors.
-    """
-    dtype = means.dtype
+    """Project Gaussians into a camera; differentiable in their geometry and in the camera."""
+    dtype, width, height = scene.means.dtype, camera.width, camera.height
     means, quats, scales, opacities, K, cam_from_world = (
-        x.double() for x in (means, quats, scales, opacities, K, cam_from_world)
+        x.double()
+        for x in (
+            scene.means,
+            scene.quats,
+            scene.scales,
+            scene.opacities,
+            camera.K,
+            camera.cam_from_world,
+        )
     )
     R, t = cam_from_world[:3, :3], cam_from_world[:3, 3]
     points = means @ R.T + t

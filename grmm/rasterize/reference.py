@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from express50.geometry.conventions import cell_to_corner
-from grmm.rasterize.interface import RenderOptions, RenderOutput
+from grmm.rasterize.interface import Pinhole, RenderOptions, RenderOutput, Splats
 from grmm.rasterize.projection import (
     ALPHA_MAX,
     ALPHA_MIN,
@@ -25,22 +25,11 @@ TILE = 32  # pixels; only speed and memory depend on it
 
 
 def rasterize_reference(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    colors: Tensor,
-    K: Tensor,
-    cam_from_world: Tensor,
-    background: Tensor | None,
-    options: RenderOptions,
+    scene: Splats, camera: Pinhole, background: Tensor | None, options: RenderOptions
 ) -> RenderOutput:
-    """Render; arguments as ``grmm.rasterize``."""
-    width, height = options.width, options.height
-    splats = project(
-        means, quats, scales, opacities, K, cam_from_world, width, height,
-        options.near, options.eps2d, options.antialiased,
-    )  # fmt: skip
+    """Render; see ``grmm.rasterize``."""
+    width, height, K, colors = camera.width, camera.height, camera.K, scene.colors
+    splats = project(scene, camera, options.near, options.eps2d, options.antialiased)
     visible = splats.visible.nonzero()[:, 0]
     order = visible[torch.sort(splats.depths[visible].detach(), stable=True).indices]
     channels = torch.cat([colors, splats.normals], 1) if options.normals else colors

@@ -40,7 +40,6 @@ from express50.rigs.read import read_rig
 from express50.runner.ledger import Ledger
 from express50.shards.codecs import decode_picture
 from express50.shards.reader import read_entries
-from grmm.ply import read_ply
 from tests.fuzz.checkpoints import checkpoint_bombs
 
 Case = tuple[str, Callable[[], object]]
@@ -133,11 +132,6 @@ def _arrays(root: Path, out: Path) -> Iterator[Case]:
     yield "npz that claims 4 GiB", lambda: read_track(claims)
     long = _put(out / "l.npy", _npy("(" + "1," * 30_000 + ")"))
     yield "npy with a long header", lambda: read_object_array(long)
-    for encoding in ("ascii", "binary_little_endian"):
-        head = (
-            f"ply\nformat {encoding} 1.0\nelement vertex 49999999\nproperty float x\nend_header\n"
-        )
-        yield f"Gaussians {encoding}", lambda h=head: read_ply(_put(out / "g.ply", h.encode()))
     yield "OBJ of a far vertex", lambda: read_obj(_put(out / "a.obj", b"v 1 2 3\nf 1 1 999999\n"))
 
 

@@ -15,8 +15,7 @@ HUGE = 10**6
 SIZES: dict[str, object] = {
     "n_g": HUGE, "z_id": HUGE, "z_exp": HUGE, "features": HUGE, "seed_channels": HUGE,
     "ladder": [HUGE, HUGE], "shared_widths": [HUGE, HUGE], "film_width": HUGE, "mesh_width": HUGE,
-    "refine_widths": [HUGE, HUGE], "refine_unshuffle": HUGE, "view_channels": HUGE,
-    "identity_modes": -1,
+    "refine_widths": [HUGE, HUGE], "refine_unshuffle": HUGE, "identity_modes": -1,
 }  # fmt: skip
 ODD: dict[str, object] = {
     "n_g": 16 * 10**400, "z_id": -HUGE, "features": 1 << 62, "refine_unshuffle": 1 << 40,

@@ -42,7 +42,6 @@ from express50.shards.offsets import read_offsets, write_offsets
 from express50.shards.reader import ShardReader, read_entries
 from express50.shards.writer import PackedSample, ShardWriter, verify, write_manifest
 from grmm.checkpoint import load_checkpoint
-from grmm.ply import read_ply, write_ply
 from grmm.presets import resolve
 from grmm.shard_source import ShardSource
 from grmm.study.answers import read_answers, read_study
@@ -182,10 +181,6 @@ def _write_arrays(root: Path) -> None:
         vertices=np.zeros((2, 9, 3), np.float32), offsets=np.zeros((9, 3), np.float32),
     )  # fmt: skip
     write_offsets(root, "S001", rng.normal(size=(20, 3)))
-    write_ply(
-        root / "splat.ply", means=rng.normal(size=(9, 3)), quats=rng.normal(size=(9, 4)),
-        scales=np.full((9, 3), 0.1), opacities=np.full(9, 0.5), colors=np.full((9, 3), 0.5),
-    )  # fmt: skip
 
 
 def _write_shards(root: Path) -> None:
@@ -202,7 +197,7 @@ def _write_networks(root: Path) -> None:
     from grmm.checkpoint import Gallery, save_checkpoint
     from grmm.data import Tracked
     from grmm.model import GRMM
-    from grmm.scene import View
+    from grmm.scene import PinholeView
     from tests.grmm.synthetic import ellipsoid_head, tiny_config
 
     head, config = ellipsoid_head(), tiny_config()
@@ -211,7 +206,7 @@ def _write_networks(root: Path) -> None:
         shape=np.zeros(1), expression=np.zeros(1), neck=np.zeros(3), jaw=np.zeros(3),
         eyes=np.zeros(6), R=np.eye(3), t=np.zeros(3), offsets=np.zeros((len(head.template), 3)),
     )  # fmt: skip
-    view = View(K=torch.eye(3), cam_from_head=torch.eye(4), width=9, height=9)
+    view = PinholeView(K=torch.eye(3), cam_from_head=torch.eye(4), width=9, height=9)
     gallery = Gallery(frames={("S001", "neutral"): tracked}, cameras={"cam00": view})
     save_checkpoint(
         root / "checkpoint.pt", model=model, config=config, head_spec="ellipsoid", gallery=gallery
@@ -378,7 +373,6 @@ def readers() -> Iterator[Reader]:
         yield Reader(f"FLAME {name}", f"flame/{name}", lambda r: load_flame(r / "flame/flame.pkl"))
     yield Reader("OBJ", "flame/head_template_mesh.obj",
                  plain(read_obj, "flame/head_template_mesh.obj"))  # fmt: skip
-    yield Reader("Gaussians .ply", "splat.ply", plain(read_ply, "splat.ply"))
     yield Reader("shards index.json", "shards/index.json", plain(read_entries, "shards"))
     yield Reader("shards manifest", "shards/manifest.json", _verified)
     yield Reader("shard meta.json", "meta.json", _meta)

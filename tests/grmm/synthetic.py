@@ -126,7 +126,7 @@ def tiny_config(**tables: dict[str, object]) -> Config:
             "shared_widths": (16, 16), "film_width": 8, "mesh_width": 8, "refine_widths": (8, 12),
             "identity_modes": 2,
         },
-        "train": {"iterations": 4, "log_every": 100, "evaluate_images": 2},
+        "train": {"iterations": 4, "evaluate_images": 2},
         "fit": {"stage1_iterations": 3, "stage2_iterations": 3},
     }  # fmt: skip
     for table, values in tables.items():

@@ -8,7 +8,7 @@ from express50.errors import FormatError
 from express50.files.images import read_image, write_image
 from grmm import ablate as ablate_module
 from grmm import checkpoint as checkpoint_module
-from grmm.ablation_table import VARIANTS
+from grmm.ablate import VARIANTS
 from grmm.anchors import make_anchors
 from grmm.cli import main
 from grmm.shard_source import open_shards
@@ -19,7 +19,6 @@ TINY = [
     "--set=model.n_g=32", "--set=model.ladder=[8, 8]", "--set=model.refine_widths=[8]",
     "--set=model.seed_channels=8", "--set=train.iterations=2", "--set=train.evaluate_images=1",
     "--set=fit.stage1_iterations=1", "--set=fit.stage2_iterations=1", "--preset=demo",
-    "--set=train.warm_start_images=2",
 ]  # fmt: skip
 
 

@@ -4,8 +4,8 @@ import pytest
 
 from express50.errors import ConfigError
 from express50.files.atomic import write_json
-from grmm.budget import choose
 from grmm.cli.learn import add_training, train_config
+from grmm.presets import choose
 
 
 @pytest.fixture

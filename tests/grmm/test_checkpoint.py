@@ -64,3 +64,16 @@ def test_a_frame_that_the_head_model_cannot_take_is_refused(path, name, size):
     torch.save(content, path)
     with pytest.raises(FormatError, match=f"S000/e1: {size} {name} coefficients, head model"):
         load_checkpoint(path)
+
+
+def test_settings_that_are_gone_are_left_out_unless_they_changed_the_result(path):
+    content = torch.load(path, weights_only=True)
+    old = {"model": {"precision": "float32"}, "train": {"ema": 0.0, "tensorboard": True}}
+    for table, values in old.items():
+        content["config"][table] |= values
+    torch.save(content, path)
+    assert load_checkpoint(path).config == tiny_config(train={"iterations": 1})
+    content["config"]["model"]["precision"] = "bfloat16"
+    torch.save(content, path)
+    with pytest.raises(FormatError, match=r"model\.precision"):
+        load_checkpoint(path)

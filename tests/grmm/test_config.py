@@ -2,8 +2,9 @@ import pytest
 import torch
 
 from express50.errors import ConfigError
+from grmm.fit import LOCALITY_T
+from grmm.networks import Refinement
 from grmm.presets import PRESETS, as_tables, from_tables, preset, resolve
-from grmm.refine import Refinement
 
 
 def test_paper_preset_has_the_papers_numbers():
@@ -14,7 +15,7 @@ def test_paper_preset_has_the_papers_numbers():
     assert (loss.l1, loss.ssim, loss.perceptual, loss.depth) == (0.8, 0.2, 0.04, 0.5)
     assert (loss.scale, loss.laplacian, loss.codes) == (0.1, 0.01, 0.001)
     assert (config.train.iterations, config.train.lr) == (250_000, 1e-4)
-    assert (config.fit.locality, config.fit.locality_t) == (0.1, 0.3)
+    assert (config.fit.locality, LOCALITY_T) == (0.1, 0.3)
     assert model.scale_bounds_mm == (0.1, 10.0)
     assert (model.frame, model.identity_modes, model.refine_unshuffle) == ("head", 0, 1)
 

@@ -6,7 +6,7 @@ import torch
 
 from express50.errors import FormatError, TrainError
 from grmm.data import HeadViews, pose_state
-from grmm.order import Shuffle, spread
+from grmm.sampler import Shuffle, spread
 from tests.grmm.synthetic import STRETCH, EllipsoidSource, ellipsoid_head
 
 
@@ -80,7 +80,7 @@ def test_missing_depth_is_no_depth(source):
         def read(self, index):
             return replace(super().read(index), depth=None)
 
-    item = HeadViews(Flat(size=32), ellipsoid_head()).item(0, margin_px=4)
+    item = HeadViews(Flat(size=32), ellipsoid_head()).item(0, crop=True)
     assert not item.depth_valid.any()
     assert item.depth.shape == item.mask.shape
 

@@ -20,7 +20,7 @@ def test_two_processes_equal_one_that_accumulates_two_views(tmp_path):
     ]  # fmt: skip
     environment = os.environ | {"PYTHONPATH": str(REPOSITORY), "OMP_NUM_THREADS": "1"}
     subprocess.run(command, check=True, env=environment, cwd=REPOSITORY, timeout=240)
-    settings = {"iterations": 2, "warm_start": False, "accumulate": 2}
+    settings = {"iterations": 2, "accumulate": 2}
     train(
         EllipsoidSource(size=32),
         ellipsoid_head(),

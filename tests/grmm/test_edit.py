@@ -15,8 +15,16 @@ from grmm.edit import (
     with_expression,
 )
 from grmm.export import cloud, surface, write_export
-from grmm.render import frontal, novel_views, orbit, picture, resized
-from grmm.sheets import control_sheet, residual_sheet, sample_sheet
+from grmm.render import (
+    control_sheet,
+    frontal,
+    novel_views,
+    orbit,
+    picture,
+    residual_sheet,
+    resized,
+    sample_sheet,
+)
 from grmm.train import train
 from tests.grmm.synthetic import EllipsoidSource, ellipsoid_head, tiny_config
 

@@ -9,8 +9,7 @@ from express50.errors import FormatError, TrainError
 from grmm.checkpoint import load_checkpoint
 from grmm.data import HeadViews
 from grmm.edit import interpolate_tracked, trained_head, transfer
-from grmm.fit import fit, invert_codes, start, tune_decoders
-from grmm.locality import blend, locality_loss, reconstruction
+from grmm.fit import blend, fit, invert_codes, locality_loss, reconstruction, start, tune_decoders
 from grmm.render import (
     expression_grid,
     frontal,

@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from grmm.rasterize import gsplat_backend, rasterize
+from grmm.rasterize.interface import Pinhole, Splats
 from grmm.rasterize.projection import project
 from tests.grmm import gsplat_kernels
 from tests.grmm.gaussian_scenes import random_scene, relative_error, render
@@ -23,8 +24,9 @@ def test_plane_channels_chunks_and_camera_gradients(channels, antialiased, monke
 
 def test_three_affine_channels_are_the_ray_length_in_float32():
     scene = random_scene(50, 0, seed=8).tensors
-    tensors = [scene[k] for k in ("means", "quats", "scales", "opacities", "K", "cam_from_world")]
-    splats = project(*tensors, 61, 47)
+    camera = Pinhole(K=scene["K"], cam_from_world=scene["cam_from_world"], width=61, height=47)
+    gaussians = {k: scene[k] for k in ("means", "quats", "scales", "opacities", "colors")}
+    splats = project(Splats(**gaussians), camera)
     channels = gsplat_backend.plane_channels(splats, scene["K"]).float()
     pixel = torch.tensor([20.5, 30.5], dtype=torch.float64)
     blended = channels[:, None, :].expand(-1, 61, 3).contiguous()

@@ -5,10 +5,10 @@ import torch
 from grmm import losses
 from grmm.data import HeadViews
 from grmm.model import GRMM, initial_scales, quat_multiply
-from grmm.objective import objective, step
 from grmm.render import orbit
-from grmm.run import make_optimizer, prepare, set_rates
-from grmm.scene import View
+from grmm.scene import PinholeView
+from grmm.train import objective, step
+from grmm.train_state import make_optimizer, prepare, set_rates
 from tests.grmm.synthetic import EllipsoidSource, ellipsoid_head, tiny_config
 
 
@@ -19,7 +19,7 @@ def views():
 
 def build(views, **model):
     torch.manual_seed(0)
-    config = tiny_config(model=model, train={"warm_start": False})
+    config = tiny_config(model=model)
     return config, GRMM(config.model, views.head, ("S000", "S001"), ("e0", "e1"))
 
 
@@ -130,7 +130,7 @@ def test_convention_camera_in_head_space(views):
 
 def test_rendered_depth_and_silhouette_match_the_ray_cast():
     views = HeadViews(EllipsoidSource(size=64), ellipsoid_head(40, 64))
-    config = tiny_config(model={"n_g": 64, "ladder": (8, 8, 8), "thickness_init": 0.1})
+    config = tiny_config(model={"n_g": 64, "ladder": (8, 8, 8)})
     model = GRMM(config.model, views.head, ("S000",), ("e0",))
     item = views.item(0)
     with torch.no_grad():
@@ -164,7 +164,7 @@ def test_orbit_goes_round_and_keeps_its_distance(views):
     back = orbit(there, -90, centre)
     torch.testing.assert_close(back.cam_from_head, view.cam_from_head)
 
-    def distance(v: View):
+    def distance(v: PinholeView):
         m = v.cam_from_head
         return (m[:3, :3] @ centre.double() + m[:3, 3]).norm()
 

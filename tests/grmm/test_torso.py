@@ -7,10 +7,10 @@ import torch
 from express50.contract.segmentation_labels import TORSO
 from grmm.data import HeadViews
 from grmm.evaluate import evaluate
-from grmm.objective import objective
-from grmm.run import prepare
-from grmm.scene import View
-from grmm.torso import torso_mask
+from grmm.head_crop import torso_mask
+from grmm.scene import PinholeView
+from grmm.train import objective
+from grmm.train_state import prepare
 from tests.grmm.synthetic import EllipsoidSource, ellipsoid_head, tiny_config
 
 
@@ -26,7 +26,7 @@ def frontal_view(size=64):
     K = torch.tensor([[140.0, 0, 32], [0, 140, 32], [0, 0, 1]], dtype=torch.float64)
     camera = torch.diag(torch.tensor([1.0, -1, -1, 1], dtype=torch.float64))
     camera[2, 3] = 0.6
-    return View(K=K, cam_from_head=camera, width=size, height=size)
+    return PinholeView(K=K, cam_from_head=camera, width=size, height=size)
 
 
 def test_what_stands_off_the_neck_is_torso_and_the_head_is_not():

@@ -9,10 +9,9 @@ import torch
 from grmm import checkpoint as checkpoint_module
 from grmm.checkpoint import load_checkpoint
 from grmm.edit import controlled, trained_head
-from grmm.preview import Preview
 from grmm.render import frontal, orbit, picture
 from grmm.train import train
-from grmm.viewer import Viewer
+from grmm.viewer import Preview, Viewer
 from tests.grmm.browser import Browser
 from tests.grmm.synthetic import EllipsoidSource, ellipsoid_head, tiny_config
 

@@ -7,9 +7,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from grmm.data import HeadViews
+from grmm.head_crop import crop_view, draw_window, gaussian_window, head_window
 from grmm.model import GRMM
 from grmm.render import orbit
-from grmm.window import crop_view, draw_window, gaussian_window, head_window
 from tests.grmm.synthetic import EllipsoidSource, ellipsoid_head, tiny_config
 
 
@@ -23,7 +23,7 @@ def scene():
     """A model away from its start, its Gaussians and colours, and a camera twice as wide."""
     torch.manual_seed(0)
     views = HeadViews(EllipsoidSource(size=96), ellipsoid_head())
-    config = tiny_config(train={"warm_start": False})
+    config = tiny_config()
     model = GRMM(config.model, views.head, ("S000",), ("e0",))
     with torch.no_grad():
         for parameter in model.parameters():
@@ -67,7 +67,7 @@ def test_window_draws_what_the_whole_image_shows(scene, yaw, dx, dy, zoom):
 def test_window_is_smaller_and_refines_alike_inside(scene):
     model, gaussians, colours, view = scene
     low, high = model.config.scale_bounds_mm
-    rows, columns = gaussian_window(gaussians, view, (1e-3 * low, 1e-3 * high), 16)
+    rows, columns = gaussian_window(gaussians, view, (1e-3 * low, 1e-3 * high))
     assert rows.stop - rows.start < 192 and columns.stop - columns.start < 192
     with torch.no_grad():
         out = draw_window(model, gaussians, colours, view, 0.25)
@@ -89,28 +89,20 @@ def test_nothing_in_view_is_background(scene):
     assert bool((out.rgb == 0.25).all()) and float(out.alpha.max()) == 0
 
 
-def test_margin_of_minus_one_is_the_whole_image(scene):
-    model, gaussians, colours, view = scene
-    with torch.no_grad():
-        a = draw_window(model, gaussians, colours, view, margin_px=-1)
-        b = model.draw(gaussians, colours, view)
-    assert torch.equal(a.image, b.image)
-
-
 def test_window_shows_the_same_picture():
     """The saving: render and compare a window only. The same numbers come out inside it."""
-    views = HeadViews(EllipsoidSource(size=160), ellipsoid_head())
+    views = HeadViews(EllipsoidSource(size=256), ellipsoid_head())
     config = tiny_config(model={"refine_widths": ()})
     model = GRMM(config.model, views.head, ("S000",), ("e0",))
-    whole, part = views.item(0), views.item(0, margin_px=6)
+    whole, part = views.item(0), views.item(0, crop=True)
     assert part.view.width < whole.view.width
-    rows, columns = head_window(whole.state.vertices, whole.view, views.sample(0).alpha, 6)
+    rows, columns = head_window(whole.state.vertices, whole.view, views.sample(0).alpha)
     with torch.no_grad():
         a = model(0, 0, whole.state, whole.view).rgb
         b = model(0, 0, part.state, part.view).rgb
     torch.testing.assert_close(a[:, rows, columns], b, atol=1e-5, rtol=0)
     assert torch.equal(whole.target[:, rows, columns], part.target)
-    outside = torch.ones(160, 160, dtype=torch.bool)
+    outside = torch.ones(256, 256, dtype=torch.bool)
     outside[rows, columns] = False
     assert float(whole.target[:, outside].max()) == 0 and float(a[:, outside].max()) < 1 / 255
 

@@ -27,7 +27,7 @@ SMALLEST_PX = 32  # five layers of AlexNet leave nothing of smaller images
 FID_LEAST_IMAGES = 2  # a covariance needs two; a trustworthy one needs thousands
 
 
-class Judge:
+class PerceptualMetrics:
     """The networks of one evaluation, and the Inception features of all that it has seen.
 
     State: ``features`` by group of images, rows of (footage, rendering).

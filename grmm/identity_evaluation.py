@@ -1,4 +1,4 @@
-"""Judge a model on people it never saw: fit them from a few views, measure on the others."""
+"""Evaluate a model on people it never saw: fit them from a few views, measure on the others."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from express50.errors import ConfigError
 from grmm.checkpoint import Loaded
 from grmm.data import HeadViews, Item
 from grmm.evaluate import HELD_IDENTITY, Row, evaluate
-from grmm.fit import Fit, run_stages, start
-from grmm.judge import Judge
-from grmm.order import spread
+from grmm.fit import FitState, run_stages, start
+from grmm.perceptual_metrics import PerceptualMetrics
+from grmm.sampler import spread
 from grmm.scene import Rendering
 
 NOVEL_VIEW = f"{HELD_IDENTITY}, novel view"
@@ -23,7 +23,7 @@ NOVEL_EXPRESSION = f"{HELD_IDENTITY}, other expression"
 
 
 @dataclass(frozen=True, kw_only=True)
-class Protocol:
+class FitProtocol:
     """How unseen people are shown to a model.
 
     Attributes:
@@ -41,8 +41,8 @@ def evaluate_unseen(
     loaded: Loaded,
     views: HeadViews,
     subject: str,
-    protocol: Protocol,
-    judge: Judge,
+    protocol: FitProtocol,
+    judge: PerceptualMetrics,
     keep: Callable[[int, Tensor], None] | None = None,
     among: Sequence[int] | None = None,
 ) -> tuple[list[Row], dict[str, Any]]:
@@ -80,7 +80,7 @@ def evaluate_unseen(
     return rows, {"subject": subject, "cameras": sorted(cameras)} | effort
 
 
-def given_views(views: HeadViews, subject: str, protocol: Protocol) -> list[int]:
+def given_views(views: HeadViews, subject: str, protocol: FitProtocol) -> list[int]:
     """Indices of the views to fit from."""
     own = [
         i
@@ -109,7 +109,7 @@ def _what(views: HeadViews, subject: str, cameras: Sequence[str]) -> str:
     return f"its expressions are {', '.join(shown)}"
 
 
-def any_expression(state: Fit) -> Callable[[Item], Rendering]:
+def any_expression(state: FitState) -> Callable[[Item], Rendering]:
     """How a fitted person is rendered, in fitted expressions and in those of training."""
     model = state.model
 

@@ -1,9 +1,7 @@
 import pytest
 import torch
 
-from grmm.decoders import Ladder
-from grmm.mesh_decoder import MeshDecoder
-from grmm.refine import Refinement, normalise_depth
+from grmm.networks import Ladder, MeshDecoder, Refinement, normalise_depth
 
 
 def ladder(**changes):
@@ -20,7 +18,6 @@ def mesh_decoder(teeth=None):
         shared_widths=(16, 8),
         film_width=8,
         head_width=8,
-        displacement_scale=1e-2,
     )
 
 
@@ -146,11 +143,3 @@ def test_depth_normalisation_spans_covered_pixels_only():
     alpha = torch.tensor([[0.2, 0.9], [0.9, 0.9]])
     expected = torch.tensor([[0.0, 0.0], [1.0, 0.5]])
     torch.testing.assert_close(normalise_depth(depth, alpha), expected)
-
-
-def test_fixed_depth_normalisation_ignores_the_crop():
-    depth, alpha = torch.linspace(0.9, 1.1, 12).view(3, 4), torch.ones(3, 4)
-    whole = normalise_depth(depth, alpha, "fixed", torch.tensor(1.0))
-    part = normalise_depth(depth[1:], alpha[1:], "fixed", torch.tensor(1.0))
-    assert torch.equal(whole[1:], part)
-    assert not torch.equal(normalise_depth(depth, alpha)[1:], normalise_depth(depth[1:], alpha[1:]))

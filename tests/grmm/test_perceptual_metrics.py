@@ -7,8 +7,8 @@ from torch import nn
 
 from express50.errors import ConfigError
 from grmm.config import MetricsConfig
-from grmm.judge import Judge, alexnet_features, load_lpips
-from grmm.metrics import psnr_db, rmse, ssim_score
+from grmm.evaluate import psnr_db, rmse, ssim_score
+from grmm.perceptual_metrics import PerceptualMetrics, alexnet_features, load_lpips
 
 
 @pytest.fixture(scope="module")
@@ -38,7 +38,7 @@ def images(count=6, size=48):
 
 
 def test_lpips_is_zero_at_equal_images_and_grows(weights):
-    judge = Judge(MetricsConfig(alexnet=str(weights / "alexnet.pth")))
+    judge = PerceptualMetrics(MetricsConfig(alexnet=str(weights / "alexnet.pth")))
     a, noise = images()[:2]
     values = [judge.lpips_of((a + s * (noise - 0.5)).clamp(0, 1), a) for s in (0.0, 0.1, 0.5)]
     assert values[0] == pytest.approx(0, abs=1e-7) and 0 < values[1] < values[2]
@@ -65,12 +65,12 @@ def test_lpips_is_zhangs_formula(weights):
             if number in (1, 4, 7, 9, 11):
                 u, v = (nn.functional.normalize(z, dim=1) for z in (x, y))
                 total += float((next(layers).model[-1].weight * (u - v).square()).sum(1).mean())
-    judge = Judge(MetricsConfig(alexnet=str(weights / "alexnet.pth")))
+    judge = PerceptualMetrics(MetricsConfig(alexnet=str(weights / "alexnet.pth")))
     assert judge.lpips_of(a, b) == pytest.approx(total, rel=1e-4)
 
 
 def test_fid_is_the_distance_of_gaussians(weights):
-    judge = Judge(MetricsConfig(inception=str(weights / "inception.pt")))
+    judge = PerceptualMetrics(MetricsConfig(inception=str(weights / "inception.pt")))
     real, fake = images(12), images(12).flip(0) * torch.linspace(0.5, 1, 12)[:, None, None, None]
     for number, (a, b) in enumerate(zip(fake, real, strict=True)):
         judge.remember("even" if number % 2 == 0 else "odd", a, b)
@@ -88,7 +88,7 @@ def test_fid_is_the_distance_of_gaussians(weights):
 
 
 def test_without_weights_the_reason_is_given():
-    judge = Judge(MetricsConfig())
+    judge = PerceptualMetrics(MetricsConfig())
     a = images()[0]
     assert math.isnan(judge.lpips_of(a, a))
     judge.remember("x", a, a)
@@ -111,7 +111,7 @@ def test_wrong_weights_are_named(weights, tmp_path):
     ]
     for settings, message in wrong:
         with pytest.raises(ConfigError, match=message):
-            Judge(settings)
+            PerceptualMetrics(settings)
 
 
 def test_ssim_and_rmse_agree_with_other_implementations():

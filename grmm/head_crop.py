@@ -1,35 +1,44 @@
-"""The window of an image that holds the head; all else is background.
+"""Which pixels count: the window around the head, and the torso that losses leave out.
 
-Training crops to it, and pictures are drawn in it: what lies outside is neither rasterised nor
-refined.
+Training crops to the window, and pictures are drawn in it: what lies outside is neither rasterised
+nor refined. Shards that `express50 regions` labelled say which pixels are torso. Shards of other
+datasets have no labels; for them the tracked mesh and the depth map decide.
 """
 
 from __future__ import annotations
 
 import math
 
+import cv2
 import numpy as np
 import torch
+from scipy.ndimage import distance_transform_edt
+from scipy.spatial import cKDTree
 from torch import Tensor
 
+from express50.contract.segmentation_labels import TORSO
+from express50.head.model import HeadModel
 from grmm.model import GRMM
 from grmm.rasterize.projection import ALPHA_MIN
-from grmm.scene import Gaussians, Rendering, View
+from grmm.scene import Gaussians, PinholeView, Rendering
 
+CROP_MARGIN_PX = 16  # of the window that training and drawing take
 WINDOW_STEP = 32  # pixels; windows have sides of whole steps
 NEAR_M = 1e-2  # the rasteriser's default
 NEAR_VERTEX_M = 1e-3
+STAND_OFF_M = 0.025  # a point this far off the neck belongs to a shirt, or to hair upon it
+END_M = 0.01  # a point this far off the neck's lower end lies below it
+GROW_PX = 2  # blurred borders
 
 
 def draw_window(
     model: GRMM,
     gaussians: Gaussians,
     colours: Tensor,
-    view: View,
+    view: PinholeView,
     background: float = 0.0,
     *,
     refine: bool = True,
-    margin_px: int = 16,
 ) -> Rendering:
     """`GRMM.draw` in the window around the Gaussians, the rest filled with background.
 
@@ -43,12 +52,9 @@ def draw_window(
         view: the whole image's camera.
         background: grey, sRGB in [0, 1].
         refine: as in `GRMM.draw`.
-        margin_px: of training (DataConfig.crop_margin_px); -1 draws the whole image.
     """
-    if margin_px < 0:
-        return model.draw(gaussians, colours, view, background, refine)
     low, high = model.config.scale_bounds_mm
-    rows, columns = gaussian_window(gaussians, view, (1e-3 * low, 1e-3 * high), margin_px)
+    rows, columns = gaussian_window(gaussians, view, (1e-3 * low, 1e-3 * high))
     out = model.draw(gaussians, colours, crop_view(view, rows, columns), background, refine)
     if (out.image.shape[1], out.image.shape[2]) == (view.height, view.width):
         return out
@@ -69,7 +75,10 @@ def draw_window(
 
 
 def gaussian_window(
-    gaussians: Gaussians, view: View, bounds_m: tuple[float, float], margin_px: int
+    gaussians: Gaussians,
+    view: PinholeView,
+    bounds_m: tuple[float, float],
+    margin_px: int = CROP_MARGIN_PX,
 ) -> tuple[slice, slice]:
     """Rows and columns that hold every pixel a Gaussian reaches, with a margin.
 
@@ -87,7 +96,7 @@ def gaussian_window(
 
 
 def head_window(
-    vertices: Tensor, view: View, alpha: np.ndarray, margin_px: int
+    vertices: Tensor, view: PinholeView, alpha: np.ndarray, margin_px: int = CROP_MARGIN_PX
 ) -> tuple[slice, slice]:
     """Rows and columns that hold the projected mesh (V, 3) and the matte (H, W), with a margin.
 
@@ -106,7 +115,7 @@ def head_window(
 
 
 def _extents(
-    points: Tensor, radii: Tensor, view: View, near_m: float, margin_px: float = 0.0
+    points: Tensor, radii: Tensor, view: PinholeView, near_m: float, margin_px: float = 0.0
 ) -> tuple[tuple[float, float], tuple[float, float]]:
     """From where to where spheres reach, pixels: along x, then y; (inf, -inf) where none is seen.
 
@@ -145,14 +154,80 @@ def _span(low: float, high: float, size: int) -> slice:
     return slice(start, start + length)
 
 
-def crop_view(view: View, rows: slice, columns: slice) -> View:
+def crop_view(view: PinholeView, rows: slice, columns: slice) -> PinholeView:
     """The same camera, seeing only some rows and columns."""
     K = view.K.clone()
     K[0, 2] -= columns.start
     K[1, 2] -= rows.start
-    return View(
+    return PinholeView(
         K=K,
         cam_from_head=view.cam_from_head,
         width=columns.stop - columns.start,
         height=rows.stop - rows.start,
     )
+
+
+def labelled_torso(parts: np.ndarray) -> np.ndarray:
+    """Pixels (H, W) bool that labels (H, W) of ``segmentation_labels.LABELS`` call torso, grown."""
+    torso = parts == TORSO
+    return _grown(torso)
+
+
+def torso_mask(
+    head: HeadModel,
+    vertices: Tensor,
+    view: PinholeView,
+    alpha: np.ndarray,
+    depth: np.ndarray | None,
+) -> np.ndarray:
+    """Pixels (H, W) bool that show the torso.
+
+    Args:
+        head: its regions ``neck`` and ``boundary`` say where the torso begins; without them
+            nothing is torso.
+        vertices: (V, 3) tracked mesh, head space.
+        view: camera in head space.
+        alpha: (H, W) uint8 matte.
+        depth: (H, W) camera z, metres, 0 where unknown; there the nearest known pixel's is taken.
+            None: the mesh's own mean depth stands in.
+    """
+    foreground = alpha > 12
+    neck, end = head.regions.get("neck"), head.regions.get("boundary")
+    if neck is None or end is None or not bool(neck.any()) or not foreground.any():
+        return np.zeros_like(foreground)
+    rows, columns = np.nonzero(foreground)
+    points = _points(view, rows, columns, _filled(depth, foreground, vertices, view))
+    tree = cKDTree(vertices.detach().cpu().double().numpy())
+    distance, nearest = tree.query(points)
+    on_neck, on_end = (region.cpu().numpy()[nearest] for region in (neck, end))
+    torso = np.zeros_like(foreground)
+    torso[rows, columns] = (on_neck & (distance > STAND_OFF_M)) | (on_end & (distance > END_M))
+    return _grown(torso)
+
+
+def _filled(
+    depth: np.ndarray | None, foreground: np.ndarray, vertices: Tensor, view: PinholeView
+) -> np.ndarray:
+    """Depth (H, W) without gaps."""
+    known = np.zeros_like(foreground) if depth is None else depth > 0
+    if depth is None or not known.any():
+        camera = view.cam_from_head.to(vertices.dtype)
+        return np.full(foreground.shape, float((vertices @ camera[2, :3] + camera[2, 3]).mean()))
+    index = distance_transform_edt(~known, return_distances=False, return_indices=True)
+    return depth[tuple(index)]
+
+
+def _points(
+    view: PinholeView, rows: np.ndarray, columns: np.ndarray, depth: np.ndarray
+) -> np.ndarray:
+    """Head-space points (N, 3) of pixels."""
+    K, camera = view.K.cpu().numpy(), view.cam_from_head.cpu().numpy()
+    z = depth[rows, columns].astype(np.float64)
+    x = (columns + 0.5 - K[0, 2]) / K[0, 0] * z
+    y = (rows + 0.5 - K[1, 2]) / K[1, 1] * z
+    return (np.stack([x, y, z], 1) - camera[:3, 3]) @ camera[:3, :3]
+
+
+def _grown(mask: np.ndarray) -> np.ndarray:
+    cross = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
+    return cv2.dilate(mask.astype(np.uint8), cross, iterations=GROW_PX, borderValue=0) > 0

@@ -1,0 +1,288 @@
+"""The state of a training run: what it starts from, what a checkpoint keeps, when it ends."""
+
+from __future__ import annotations
+
+import contextlib
+import fnmatch
+import json
+import math
+import os
+import signal
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from express50.console import log
+from express50.errors import ConfigError, FormatError, TrainError
+from express50.files.atomic import write_bytes
+from express50.files.text import parse_json, read_text
+from grmm import losses
+from grmm.checkpoint import collect_gallery, load_checkpoint, save_checkpoint
+from grmm.config import Config
+from grmm.data import HeadViews, Key
+from grmm.losses import load_vgg
+from grmm.model import GRMM
+from grmm.presets import as_tables
+from grmm.sampler import Shuffle, spread
+
+COVERED_TEXELS = 0.75  # of a map that head models' layouts use
+LARGEST_MAP = 512  # the paper's
+CHANGEABLE = {"iterations", "seconds", "save_seconds", "evaluate_images"}  # when a run is resumed
+
+
+@dataclass(kw_only=True)
+class TrainState:
+    """Everything that the training loop changes, and what it reads in every step."""
+
+    model: GRMM
+    views: HeadViews
+    training: list[int]
+    holdout: list[int]
+    optimizer: torch.optim.Optimizer
+    shuffle: Shuffle
+    perceptual: torch.nn.Module | None
+    edges: Tensor
+    iteration: int = 0
+    seconds: float = 0.0
+    terms: dict[str, float] = field(default_factory=dict)
+
+
+def prepare(views: HeadViews, config: Config, rank: int = 0, world: int = 1) -> TrainState:
+    """Build the model, its optimiser and the order of samples."""
+    training, holdout = split_samples(views.keys, config)
+    keys = [views.keys[i] for i in training]
+    subjects = sorted({key.subject for key in keys})
+    expressions = sorted({key.expression for key in keys})
+    model = GRMM(config.model, views.head, subjects, expressions).to(views.device)
+    # A held-out sample can only be judged where its codes were trained.
+    holdout = [
+        i
+        for i in holdout
+        if views.keys[i].subject in subjects and views.keys[i].expression in expressions
+    ]
+    return TrainState(
+        model=model,
+        views=views,
+        training=training,
+        holdout=holdout,
+        optimizer=make_optimizer(model, config),
+        shuffle=Shuffle(training, config.train.seed, rank, world),
+        perceptual=load_vgg(Path(config.loss.vgg16), views.device) if config.loss.vgg16 else None,
+        edges=losses.mesh_edges(views.head.faces),
+    )
+
+
+def with_map_size(config: Config, views: HeadViews) -> Config:
+    """Replace ``n_g = 0`` by a side that suits the head's size in the images.
+
+    The aim is one texel per pixel: the largest heads show half of their surface, and a map covers
+    three quarters of its texels. More Gaussians than pixels would cost time and show nothing.
+    """
+    if config.model.n_g:
+        return config
+    training, _ = split_samples(views.keys, config)
+    areas = [int(views.item(i).mask.sum()) for i in spread(training, 16)]
+    step = 2 ** (len(config.model.ladder) + 1)
+    side = step * math.ceil(math.sqrt(2 * max(areas) / COVERED_TEXELS) / step)
+    n_g = max(2 * step, min(side, LARGEST_MAP))
+    return replace(config, model=replace(config.model, n_g=n_g))
+
+
+def best_device() -> torch.device:
+    """Return the CUDA device of this process as ``torchrun`` numbers them, else the CPU."""
+    if not torch.cuda.is_available():
+        return torch.device("cpu")
+    return torch.device(f"cuda:{os.environ.get('LOCAL_RANK', '0')}")
+
+
+def split_samples(keys: Sequence[Key], config: Config) -> tuple[list[int], list[int]]:
+    """Split samples into those to train on and those held out by camera or expression.
+
+    Raises:
+        ConfigError: a held-out name fits no sample.
+        TrainError: nothing is left to train on.
+    """
+    cameras = {key.camera for key in keys}
+    unknown = set(config.data.holdout_cameras) - cameras
+    if unknown:
+        raise ConfigError(
+            f"data.holdout_cameras names {', '.join(sorted(unknown))}; "
+            f"the shards have {', '.join(sorted(cameras))}"
+        )
+    frames = {f"{key.subject}/{key.expression}" for key in keys}
+    held = {p: set(fnmatch.filter(frames, p)) for p in config.data.holdout_expressions}
+    for pattern, found in held.items():
+        if not found:
+            raise ConfigError(
+                f"data.holdout_expressions names {pattern}; expected SUBJECT/EXPRESSION such as "
+                f"{min(frames)}"
+            )
+    unseen = set().union(*held.values())
+    holdout = [
+        i
+        for i, key in enumerate(keys)
+        if key.camera in config.data.holdout_cameras or f"{key.subject}/{key.expression}" in unseen
+    ]
+    training = sorted(set(range(len(keys))) - set(holdout))
+    if not training:
+        raise TrainError(
+            f"no views to train on: all {len(keys)} samples are held out by camera or expression; "
+            "hold out fewer or pack more"
+        )
+    return training, holdout
+
+
+def make_optimizer(model: GRMM, config: Config) -> torch.optim.Optimizer:
+    """Build Adam with one group each for codes, texel parameters, refinement and the rest."""
+    settings = config.train
+    codes = [model.z_id, model.z_exp]
+    texels = [
+        parameter
+        for ladder in (model.transform, model.opacity, model.colour)
+        for parameter in ladder.texel_parameters()
+    ]
+    refinement = [] if model.refinement is None else list(model.refinement.parameters())
+    special = {id(parameter) for parameter in codes + texels + refinement}
+    rest = [parameter for parameter in model.parameters() if id(parameter) not in special]
+    groups = [
+        {"params": rest, "scale": 1.0},
+        {"params": codes, "scale": settings.code_lr_scale},
+        {"params": texels, "scale": settings.texel_lr_scale},
+        {"params": refinement, "scale": settings.refine_lr_scale},
+    ]
+    return torch.optim.Adam(groups, lr=settings.lr, fused=True)
+
+
+def budget_used(state: TrainState, config: Config) -> float:
+    """Share of the budget used, by iterations or by seconds, whichever is further."""
+    by_time = state.seconds / config.train.seconds if config.train.seconds else 0.0
+    return max(state.iteration / config.train.iterations, by_time)
+
+
+def finished(state: TrainState, config: Config) -> bool:
+    """True when iterations or seconds are used up."""
+    return budget_used(state, config) >= 1
+
+
+def set_rates(state: TrainState, config: Config) -> None:
+    """Set the rates for this share of the budget: a half cosine from 1 to ``final_lr``."""
+    cosine = 0.5 * (1 + math.cos(math.pi * min(1.0, budget_used(state, config))))
+    factor = config.train.final_lr + (1 - config.train.final_lr) * cosine
+    for group in state.optimizer.param_groups:
+        group["lr"] = config.train.lr * group["scale"] * factor
+
+
+def save(state: TrainState, path: Path, config: Config, head_spec: str) -> None:
+    """Write a checkpoint with the loop's full state."""
+    save_checkpoint(
+        path,
+        model=state.model,
+        config=config,
+        head_spec=head_spec,
+        gallery=collect_gallery(state.views, state.training),
+        optimizer=state.optimizer.state_dict(),
+        loop={
+            "iteration": state.iteration,
+            "seconds": state.seconds,
+            "samples": state.views.source.digest,
+            "shuffle": state.shuffle.state(),
+            "torch": torch.get_rng_state(),
+        },
+    )
+
+
+def restore(state: TrainState, path: Path, config: Config, device: torch.device) -> None:
+    """Put a run back to where rank 0 wrote its checkpoint.
+
+    Raises:
+        ConfigError: settings, subjects or samples differ from those of the checkpoint.
+    """
+    loaded = load_checkpoint(path, device)
+    if not loaded.loop:
+        raise ConfigError(
+            f"{path}: holds no state to resume from (a person was withdrawn from it, or it is a "
+            "fit); train into another folder, or start over with --anew"
+        )
+    old, new = as_tables(loaded.config), as_tables(config)
+    changed = [
+        f"{table}.{key} {old[table][key]!r} -> {value!r}"
+        for table in ("model", "loss", "data", "train")
+        for key, value in new[table].items()
+        if value != old[table][key] and not (table == "train" and key in CHANGEABLE)
+    ]
+    names = (loaded.model.subjects, loaded.model.expressions)
+    if names != (state.model.subjects, state.model.expressions):
+        changed.append("the subjects or expressions of the shards")
+    elif loaded.loop.get("samples", state.views.source.digest) != state.views.source.digest:
+        changed.append("the samples of the shards")
+    if changed:
+        raise ConfigError(
+            f"{path}: cannot resume, these differ: {'; '.join(changed)}. "
+            "Go on with the same, train into another folder, or start over with --anew"
+        )
+    state.model.load_state_dict(loaded.model.state_dict())
+    state.optimizer.load_state_dict(loaded.optimizer)
+    state.shuffle.restore(loaded.loop["shuffle"])
+    torch.set_rng_state(loaded.loop["torch"])
+    state.iteration, state.seconds = loaded.loop["iteration"], loaded.loop["seconds"]
+    if finished(state, config):
+        log(
+            f"{path}: has all of its {state.iteration} iterations; to train on, raise "
+            "train.iterations or --seconds"
+        )
+    else:
+        log(f"{path}: resuming at iteration {state.iteration}")
+
+
+def start_log(path: Path, iteration: int) -> None:
+    """Keep the log's lines up to an iteration: a resumed run repeats the later ones."""
+    if not path.exists():
+        return
+    kept = []
+    for line in read_text(path, TrainError).split("\n"):
+        with contextlib.suppress(FormatError):  # a kill may have cut the last line short
+            row = parse_json(line, str(path), FormatError)
+            if isinstance(row, dict) and row.get("iteration", iteration + 1) <= iteration:
+                kept.append(json.dumps(row) + "\n")
+    write_bytes(path, "".join(kept).encode())
+
+
+def append_log(path: Path, state: TrainState) -> None:
+    """Append where a run is to OUT/log.jsonl, one JSON object per line."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    entry = {"iteration": state.iteration, "seconds": round(state.seconds, 3)}
+    numbers = {"loss": sum(state.terms.values())} | state.terms
+    entry |= {name: round(value, 8) for name, value in numbers.items()}
+    with path.open("a", encoding="utf-8") as file:
+        file.write(json.dumps(entry) + "\n")
+
+
+@dataclass
+class Interrupt:
+    """Set by Ctrl-C or SIGTERM."""
+
+    requested: bool = False
+
+
+@contextmanager
+def deferred_interrupt() -> Iterator[Interrupt]:
+    """Let the current iteration end before Ctrl-C or SIGTERM takes effect."""
+    interrupt = Interrupt()
+
+    def request(number: int, frame: object) -> None:
+        interrupt.requested = True
+
+    try:
+        former = {s: signal.signal(s, request) for s in (signal.SIGINT, signal.SIGTERM)}
+    except ValueError:  # only the main thread gets signals
+        yield interrupt
+        return
+    try:
+        yield interrupt
+    finally:
+        for number, handler in former.items():
+            signal.signal(number, handler)
