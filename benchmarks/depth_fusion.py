@@ -1,4 +1,4 @@
-"""The usual baseline for depth: a plane sweep in every view, fused into a TSDF by Open3D."""
+"""Sweep planes in every view and fuse them into a TSDF by Open3D: the usual baseline for depth."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ AGREE, TRUNCATION_VOXELS = 0.5, 4.0
 
 
 def fuse(views: Sequence[DepthView], voxel: float) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (V, 3) and faces (F, 3) of the fused surface, voxels in metres.
+    """Fuse the views' sweeps: vertices (V, 3) and faces (F, 3); voxels in metres.
 
-    Source: Curless and Levoy 1996, as Open3D has it.
+    Source: Curless and Levoy 1996, through Open3D.
     """
     volume = o3d.t.geometry.VoxelBlockGrid(
         ("tsdf", "weight"), (o3d.core.float32, o3d.core.float32), ((1,), (1,)),
@@ -44,7 +44,7 @@ def fuse(views: Sequence[DepthView], voxel: float) -> tuple[np.ndarray, np.ndarr
 def sweep(
     view: DepthView, others: Sequence[DepthView], low: np.ndarray, high: np.ndarray
 ) -> np.ndarray:
-    """Depth (H, W) float32 of the best of PLANES planes through a box, 0 where views disagree."""
+    """Choose the best of PLANES planes through a box: depth (H, W), 0 where views disagree."""
     corners = np.stack(np.meshgrid(*zip(low, high, strict=True), indexing="ij"), -1).reshape(-1, 3)
     z = corners @ view.camera.cam_from_world[2, :3] + view.camera.cam_from_world[2, 3]
     planes = 1.0 / np.linspace(1.0 / max(z.min(), 1e-3), 1.0 / z.max(), PLANES)

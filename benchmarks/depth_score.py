@@ -1,4 +1,4 @@
-"""Errors of a surface against the twin's truth in every view, and what they come to."""
+"""Measure a surface's errors against the twin's truth in every view, and summarise them."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ def score(
     pictures: Pictures,
     sure: dict[str, np.ndarray] | None = None,
 ) -> dict:
-    """What :func:`compare` finds in all pictures together, and the confidence of the same pixels.
+    """Gather errors over all pictures, and the confidence of the same pixels.
 
-    ``sure`` holds maps of confidence (H, W) by camera, where there are any.
+    ``sure`` holds maps of confidence (H, W) by camera, if there are any.
     """
     cameras = {camera.id: camera for camera, _, _ in pictures}
     motion = align_worlds(cameras, truth.cameras(subject))
@@ -45,7 +45,7 @@ def compare(
     mesh: Mesh, truth: Truth, subject: str, frame: int, camera: Camera, motion: np.ndarray,
     alpha: np.ndarray, sure: np.ndarray | None = None,
 ) -> dict:  # fmt: skip
-    """One view: absolute errors (N,), millimetres, of all pixels and of skin; skin's normals."""
+    """Measure absolute errors (N,), millimetres, of a view's pixels and skin; skin's normals."""
     seen = transform_camera(camera, motion)
     true_depth, true_valid = truth.render_depth(subject, frame, seen)
     depth, normals = cast(mesh, camera)
@@ -64,7 +64,7 @@ def compare(
 
 
 def cast(mesh: Mesh, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """Depth (H, W), infinite where nothing is hit, and smooth normals (H, W, 3), camera axes."""
+    """Cast rays: depth (H, W), infinite without a hit; smooth normals (H, W, 3), camera axes."""
     vertices, faces = mesh
     hull = o3d.geometry.TriangleMesh(
         o3d.utility.Vector3dVector(vertices), o3d.utility.Vector3iVector(faces)
@@ -82,9 +82,9 @@ def cast(mesh: Mesh, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
 
 
 def of_surest(errors: np.ndarray, sure: np.ndarray) -> dict:
-    """95th percentiles, millimetres, of the errors (N,) of the most confident shares of pixels.
+    """Take 95th percentiles, millimetres, of errors (N,) over the most confident pixels.
 
-    ``sure`` (N,) is the confidence, or empty where a way gives none.
+    ``sure`` (N,) is the confidence, or empty for a baseline without one.
     """
     if not len(sure):
         return {}
@@ -97,7 +97,7 @@ def of_surest(errors: np.ndarray, sure: np.ndarray) -> dict:
 
 
 def summary(rows: list[dict]) -> dict:
-    """Figures over the pixels of all items; ``n/a`` where nothing could be measured."""
+    """Summarise the pixels of all items; ``n/a`` if nothing could be measured."""
     if not rows:
         return {"n/a": "these items have no track"}
     errors, skin, degrees = (

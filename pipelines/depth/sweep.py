@@ -4,8 +4,7 @@ A patch is curved as the surface is, so that views far apart see it alike: a fro
 fails at the 35 to 45 degrees between neighbours of a sparse ring, a flat patch at a nose. The score
 is zero-mean normalised cross-correlation, which ignores each camera's gain and offset.
 
-Tracking searches along normals too, but with other supports: a fixed window of pixels per reference
-view around points of a head model, where this one has metric patches that follow a level set.
+Tracking searches along normals too, with other supports and scores (docs/LOG.md, Depth).
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Depth at the edges: constant and empty maps, one camera, other units, far worlds, odd images."""
+"""Test depth at the edges: constant and empty maps, one camera, other units, far worlds."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ def test_a_hundred_and_fifty_views_are_as_good_as_few(views):
 
 
 @pytest.mark.parametrize("factor", [1e3, 1e-3])
-def test_millimetres_and_kilometres_are_refused_as_no_metres(views, factor):
+def test_millimetres_and_kilometres_are_refused(views, factor):
     scaled = []
     for view in views:
         pose = view.camera.cam_from_world.copy()
@@ -134,7 +134,7 @@ def test_no_silhouettes_give_no_targets():
     assert rim_targets([], grid, 0.1).shape == (0, 3)
 
 
-def test_scores_that_say_nothing_do_not_move_the_surface():
+def test_constant_scores_do_not_move_the_surface():
     faces = np.array([[0, 1, 2], [1, 2, 3]])
     zero = np.zeros(4)
     for level in (0.0, 1.0, -1.0):
@@ -145,7 +145,7 @@ def test_scores_that_say_nothing_do_not_move_the_surface():
         assert np.allclose(moved, 0) and np.allclose(trust, 0)
 
 
-def test_a_vertex_that_nobody_sees_scores_nothing(views):
+def test_a_vertex_that_no_view_sees_scores_zero(views):
     vertices = np.array([[0, 0, 0.09], [0, 0, 50.0], [0, 0, -50.0]])
     normals = np.array([[0, 0, 1.0], [0, 0, 0.0], [0, 0, 1.0]])
     weights = np.zeros((len(views), 3), np.float32)

@@ -1,4 +1,4 @@
-"""Depth of one head whose truth is known, under what goes wrong in a studio; errors in numbers."""
+"""Measure depth of a known head under everything that goes wrong in a studio."""
 
 from __future__ import annotations
 
@@ -180,7 +180,7 @@ def test_a_head_cut_by_the_frames_edge_keeps_its_shape(usual, shift, least_cut):
     assert not why and covered > 0.98 and as_good_as(errors, usual, 0.25)
 
 
-def test_a_matte_of_specks_that_vanish_when_shrunk_is_told(shots):
+def test_a_matte_of_specks_that_vanish_when_shrunk_is_refused(shots):
     camera, rgb, alpha, _ = shots[0]
     specks = np.zeros_like(alpha)
     specks[::12, ::12] = 1.0

@@ -1,4 +1,4 @@
-"""Labels at the edges: no head, no matte, one pixel, far worlds, damaged tracks."""
+"""Test labels at the edges: no head, no matte, one pixel, far worlds, damaged tracks."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The depth stage on an analytic head: accuracy, baselines, robustness, files."""
+"""Reconstruct an analytic head: accuracy, baselines, robustness, files."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def test_depth_is_right_to_under_a_millimetre(surface, shots):
     assert np.percentile(error, 95) < 3.0
 
 
-def test_photographs_pay_where_silhouettes_say_nothing(surface, views, shots):
+def test_photographs_help_where_silhouettes_show_nothing(surface, views, shots):
     flat = [replace(view, rgb=np.full_like(view.rgb, 128)) for view in views]
     hull = reconstruct(flat, voxel_mm=QUICK)
     carved, filled = (np.mean(errors_mm(s, shots, views)) for s in (surface, hull))
@@ -104,7 +104,7 @@ def test_prior_counts_inner_sheets_and_capped_holes_as_inside():
 
 
 def test_prior_gives_way_where_the_hull_rises_far_above_it():
-    """Hair and shoulders stand over the tracked mesh; they are kept whole, without a shell."""
+    """Hair and shoulders rise above the tracked mesh; they are kept whole, without a shell."""
     vertices, faces = mesh()
     prior = close_mesh(vertices, faces)
     axis = np.linspace(-0.25, 0.25, 31)
@@ -132,7 +132,7 @@ def test_a_matte_that_contradicts_the_others_is_left_out(shots, views):
     assert without_contradiction(views)[1] == []
 
 
-def test_unusable_mattes_say_why(shots):
+def test_unusable_mattes_are_refused(shots):
     camera, rgb, alpha, _ = shots[0]
     for bad, key in ((np.zeros_like(alpha), "0.00%"), (np.ones_like(alpha), "100.0%"),
                      (alpha[:-1], "160x159")):  # fmt: skip
@@ -178,7 +178,7 @@ def test_two_runs_give_the_same_surface(surface, views):
     assert again.colors.tobytes() == surface.colors.tobytes()
 
 
-def test_confidence_tells_good_depth_from_bad(surface, shots):
+def test_confidence_separates_good_depth_from_bad(surface, shots):
     scene = mesh_scene(surface.vertices, surface.faces)
     sure, unsure = [], []
     for camera, _, alpha, true in shots:

@@ -1,4 +1,4 @@
-"""The benchmark of depth: no error for the truth itself, knobs that exist, a table that is one."""
+"""Check the benchmark of depth: its figures, the swept settings and the table."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from benchmarks.depth_sweep import AXES, as_markdown
 from pipelines.depth.config import DepthConfig
 
 
-def test_every_knob_of_the_sweep_is_one_that_the_stage_takes():
+def test_every_setting_of_the_sweep_exists():
     known = {field.name for field in fields(DepthConfig)}
     for axis, (knob, values) in AXES.items():
         assert axis == "views" or knob in known

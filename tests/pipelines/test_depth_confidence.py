@@ -1,4 +1,4 @@
-"""Confidence of depth: it falls at jumps, at outlines, and where colours contradict the depth."""
+"""Confidence falls at jumps, at outlines, and where colours contradict the depth."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def wall(depth: np.ndarray) -> DepthMaps:
     return make_maps(camera(), ones, depth, towards, ones)
 
 
-def test_a_jump_and_an_outline_take_confidence_and_a_plane_keeps_it():
+def test_jumps_and_outlines_lower_confidence_and_a_plane_keeps_it():
     depth = np.full((SIDE, SIDE), 1.0)
     depth[:, 20:] = 1.2
     depth[30:] = np.inf
@@ -52,7 +52,7 @@ def test_units_and_focal_lengths_do_not_count(scale):
     assert np.isfinite(plain).all() and np.isinf(jumps(camera(), np.zeros((SIDE, SIDE)))).all()
 
 
-def test_colours_that_contradict_take_confidence_and_few_odd_pixels_do_not():
+def test_contradicting_colours_lower_confidence_and_single_pixels_do_not():
     view = wall(np.full((SIDE, SIDE), 1.0))
     errors = np.zeros((SIDE, SIDE), np.float32)
     errors[:, 20:] = 20.0
@@ -65,7 +65,7 @@ def test_colours_that_contradict_take_confidence_and_few_odd_pixels_do_not():
     assert order == sorted(order, reverse=True) and order[-1] < 0.01
 
 
-def test_what_no_neighbour_sees_is_doubted_and_nothing_is_nan():
+def test_points_that_no_neighbour_sees_lose_confidence_without_nan():
     view = wall(np.full((SIDE, SIDE), 1.0))
     unseen = np.full((SIDE // 2, SIDE // 2), np.nan, np.float32)  # compared at half the size
     found = doubted(view, PhotoErrors(unseen, 0.0)).confidence

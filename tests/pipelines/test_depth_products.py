@@ -1,4 +1,4 @@
-"""What the depth stage writes: meshes, maps in every format, the photo error."""
+"""Check the files of the depth stage: meshes, maps in every format, the photo error."""
 
 from __future__ import annotations
 
@@ -107,7 +107,7 @@ def test_colours_agree_through_the_right_surface_and_not_through_a_wrong_one():
     assert right["photo_error_median"] < 0.6 * off["photo_error_median"]
 
 
-def test_gains_do_not_count_and_what_nobody_else_sees_is_not_judged():
+def test_gains_are_evened_and_unseen_points_are_not_compared():
     vertices, faces = mesh()
     scene = mesh_scene(vertices, faces)
     left, right = ring(2, 128, arc_deg=40)
@@ -123,7 +123,7 @@ def test_gains_do_not_count_and_what_nobody_else_sees_is_not_judged():
     assert plain[2].figures() == {"photo_compared": 0.0}
 
 
-def test_the_metrics_and_the_picture_tell_the_photo_error(written):
+def test_metrics_and_contact_sheet_show_the_photo_error(written):
     folder, row = written
     assert 0 < row["photo_error_median"] < row["photo_error_p95"]
     assert 0.5 < row["photo_consistent"] <= 1 and 0.3 < row["photo_compared"] <= 1
@@ -148,7 +148,7 @@ def test_values_out_of_range_are_named(name, value):
         DepthConfig(**{name: value})
 
 
-def test_one_camera_has_the_tracked_heads_depth_and_no_trust_in_it(tmp_path):
+def test_one_camera_gets_the_tracked_heads_depth_at_low_confidence(tmp_path):
     dataset = make_dataset(tmp_path, cameras=1, size=96)
     (camera,) = read_cameras_of(dataset, "S001").values()
     published(dataset, STAGE, DepthConfig(voxel_mm=3.0))

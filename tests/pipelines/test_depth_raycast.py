@@ -64,7 +64,7 @@ def test_mesh_and_distances_agree():
     assert np.median((meshed.normals[both] * turned).sum(-1)) > 0.999
 
 
-def test_what_is_not_there_is_not_hit():
+def test_rays_miss_an_empty_box_and_a_ball_behind_the_camera():
     camera = ring(1, 160)[0]
     side = np.full(3, 0.15)
     empty = build(-side, side, VOXEL, lambda points: np.full(len(points), VOXEL))

@@ -1,4 +1,4 @@
-"""Labels of parts: occlusion, hair and collars, the head's matte, the stage and its figures."""
+"""Label parts: occlusion, hair and collars, the head's matte, the stage and its figures."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def overlap(labels: np.ndarray, true: np.ndarray, name: str) -> float:
     return float((a & b).sum() / (a | b).sum())
 
 
-def test_what_lies_behind_is_not_seen() -> None:
+def test_hidden_parts_are_not_seen() -> None:
     head = tracked()
     front = np.unique(see(head, camera_at(0))[0])
     names = {LABELS[label] for label in front if label < SCALP}
@@ -74,7 +74,7 @@ def test_the_nose_hides_the_cheek_and_lids_hide_the_eyes() -> None:
 
 
 @pytest.mark.parametrize("azimuth", [0, 60, 180])
-def test_colours_tell_collar_and_locks_from_neck_and_shoulders(azimuth: int) -> None:
+def test_colours_separate_collar_and_locks_from_neck_and_shoulders(azimuth: int) -> None:
     scene = make_scene(azimuth)
     labels, plain = labels_of(scene), by_geometry(scene, scene.depth)
     for name, least in (("torso", 0.95), ("neck", 0.95), ("hair", 0.88)):
@@ -132,7 +132,7 @@ def test_the_cut_is_a_pixel_wide_and_keeps_strands() -> None:
     assert head_alpha(alpha, labels)[21, 2] > 0 and head_alpha(alpha, labels)[39, 19] == 0
 
 
-def test_a_bald_scalp_is_known_by_its_colours() -> None:
+def test_a_bald_scalp_is_recognised_by_its_colours() -> None:
     for hair in (True, False):
         scene = make_scene(0, hair=hair)
         votes = [scalp_votes(scene.rgb, see(scene.head, scene.camera)[0], scene.alpha)]
@@ -162,7 +162,7 @@ def test_from_behind_the_skin_is_that_of_the_face() -> None:
     assert share[0] > share[1] + 0.3
 
 
-def test_a_head_model_without_regions_says_what_it_lacks() -> None:
+def test_a_head_model_without_regions_lists_what_it_lacks() -> None:
     model = load_head("procedural")
     kept = {name: mask for name, mask in model.regions.items() if name in ("face", "scalp")}
     bare = head_labels(replace(model, regions=kept))
@@ -235,7 +235,7 @@ def test_smaller_working_sizes_give_labels_of_the_full_size(dataset, tmp_path) -
     assert a.shape == b.shape == (96, 96) and (a == b).mean() > 0.93 and (a != b).any()
 
 
-def test_a_track_beside_the_matte_and_missing_mattes_are_told(tmp_path) -> None:
+def test_a_track_beside_the_matte_and_missing_mattes_are_reported(tmp_path) -> None:
     dataset = make_dataset(tmp_path)
     dataset.matte_file("S001", "smile", "cam01").unlink()
     write_image(dataset.matte_file("S001", "smile", "cam03"), np.zeros((96, 96), np.uint8))
