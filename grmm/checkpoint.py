@@ -17,7 +17,7 @@ from torch import Tensor
 
 from express50.errors import ConfigError, FormatError, HeadModelError
 from express50.files.atomic import write_bytes
-from express50.files.checkpoints import AtMost, read_weights
+from express50.files.pickles import read_weights
 from express50.files.text import reason
 from express50.geometry.shapes import PIXEL_LIMIT, check_shape
 from express50.head.load import load_head
@@ -210,11 +210,10 @@ def _current_settings(path: Path, tables: dict[str, dict[str, Any]]) -> dict[str
 
 
 def _build(path: Path, config: ModelConfig, head: HeadModel, content: dict[str, Any]) -> GRMM:
-    """The model of a file's content, in no more memory than its weights take there."""
+    """Build the model of a file's content."""
     weights = content["model"]
     try:
-        with AtMost(sum(tensor.numel() for tensor in weights.values())):
-            model = GRMM(config, head, content["subjects"], content["expressions"])
+        model = GRMM(config, head, content["subjects"], content["expressions"])
         model.load_state_dict(weights)
     except (HeadModelError, RuntimeError, ValueError, TypeError, ArithmeticError) as error:
         raise FormatError(

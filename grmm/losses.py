@@ -14,7 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from express50.errors import TrainError
-from express50.files.checkpoints import read_weights
+from express50.files.pickles import read_weights
 from grmm.config import LossConfig
 from grmm.scene import Rendering
 

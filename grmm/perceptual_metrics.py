@@ -20,7 +20,7 @@ from torchmetrics.image.fid import FrechetInceptionDistance
 
 from express50.errors import ConfigError
 from express50.files.arrays import DAMAGE
-from express50.files.checkpoints import check_archive, read_weights
+from express50.files.pickles import read_weights
 from grmm.config import MetricsConfig
 
 SMALLEST_PX = 32  # five layers of AlexNet leave nothing of smaller images
@@ -137,7 +137,6 @@ def load_inception(path: Path) -> torch.jit.ScriptModule:
     if not path.is_file():
         raise ConfigError(f"metrics.inception {path}: no such file; leave it empty to do without")
     try:
-        check_archive(path)
         network = torch.jit.load(str(path), map_location="cpu").eval()
         found = network(torch.zeros(1, 3, 64, 64, dtype=torch.uint8), return_features=True)
     except (*DAMAGE, torch.jit.Error) as error:

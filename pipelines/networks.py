@@ -21,7 +21,6 @@ import torch
 
 from express50.errors import ConfigError, StageError
 from express50.files.arrays import DAMAGE
-from express50.files.checkpoints import check_archive
 
 TORCH_ERRORS = (*DAMAGE, torch.jit.Error)
 
@@ -135,7 +134,6 @@ def _torchscript(path: Path, role: Role) -> Network:
         with warnings.catch_warnings():
             # Of its deprecation; the weights are published in this format.
             warnings.simplefilter("ignore", DeprecationWarning)
-            check_archive(path)
             module = torch.jit.load(str(path), map_location=device).eval()
         arguments = module.forward.schema.arguments[1:]
     except TORCH_ERRORS as error:

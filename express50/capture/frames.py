@@ -22,8 +22,7 @@ from express50.contract.layout import Dataset
 from express50.errors import CaptureError, FormatError, StageError
 from express50.files.calibration import read_cameras
 from express50.files.containers import inside, read_samples, to_srgb8, to_srgb16
-from express50.files.exif import upright
-from express50.files.images import decode_image, read_image
+from express50.files.images import decode_image, read_image, upright
 from express50.files.text import NAME, read_json, read_json_table
 from express50.files.video import VideoReader
 from express50.geometry.cameras import Camera, pinhole

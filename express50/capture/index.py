@@ -43,7 +43,7 @@ class CameraSource:
             may lie in a container (`express50.files.containers`).
         clips: frames of each clip; empty where all is one.
         correction: rows of a polynomial colour correction that `frames` applies, or none.
-        orientation: how the images are turned when they are read (`files.exif`); width and
+        orientation: how the images are turned when they are read (`files.images`); width and
             height are those of the turned ones.
     """
 

@@ -15,13 +15,12 @@ from pathlib import Path
 from express50.capture.index import Cue
 from express50.errors import CalibrationError, CaptureError
 from express50.files.calibration import read_cameras
-from express50.files.text import TOML_LIMIT, read_text, read_toml
+from express50.files.text import ID, TOML_LIMIT, read_text, read_toml
 from express50.geometry.cameras import Camera
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".exr")
 VIDEO_SUFFIXES = (".mp4", ".mov", ".mkv", ".avi", ".webm")
 CUE_COLUMNS = ("expression_id", "start_frame", "end_frame")
-NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,7 +35,7 @@ class RawCamera:
         counts: images of each clip; one clip where it is empty.
         stamps: the layout's own number of each image; its place where it is empty.
         correction: rows of a polynomial colour correction (`colour_correction`), or none.
-        orientation: how images are to be turned when they are read (`files.exif`).
+        orientation: how images are to be turned when they are read (`files.images`).
     """
 
     id: str
@@ -156,7 +155,7 @@ def check_identity(path: Path, subject: object, fps: object) -> None:
     Raises:
         CaptureError: a value is missing, of another type or out of range.
     """
-    if not isinstance(subject, str) or not NAME.fullmatch(subject):
+    if not isinstance(subject, str) or not ID.fullmatch(subject):
         raise CaptureError(
             f"{path}: subject is {subject!r}, expected letters, digits, '_' and '-', such as 'S001'"
         )
@@ -191,7 +190,7 @@ def _read_cameras(root: Path) -> tuple[dict[str, RawCamera], dict[str, str]]:
 
 
 def _read_camera(folder: Path) -> RawCamera:
-    if not NAME.fullmatch(folder.name):
+    if not ID.fullmatch(folder.name):
         raise CaptureError(
             f"{folder}: camera id {folder.name!r}; expected letters, digits, '_' and '-'"
         )

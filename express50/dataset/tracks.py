@@ -6,7 +6,6 @@ line. Nothing in a file is executed: pickled objects are refused.
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,10 +14,10 @@ import numpy as np
 from express50.contract.layout import Dataset
 from express50.errors import FormatError, StageError
 from express50.files.arrays import read_arrays
+from express50.files.text import ID
 
 SCHEMAS = ("express50.track/1", "express50.track/2")
 SEQUENCE_SCHEMA = "express50.sequence/1"
-NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
 _WIDTHS = {"neck": (3,), "jaw": (3,), "eyes": (6,), "R": (3, 3), "t": (3,)}
 _AGAIN = "run 'express50 track' again"
 
@@ -184,7 +183,7 @@ def _check_names(names: np.ndarray, alone: bool = True) -> None:
     if names.ndim != 1 or names.dtype.kind != "U" or not len(names):
         raise ValueError(f"expressions are {names.dtype} {names.shape}, expected (E,) strings")
     for name in names.tolist():
-        if not NAME.fullmatch(name):  # they become names of files
+        if not ID.fullmatch(name):  # they become names of files
             raise ValueError(f"expression {name!r}, expected letters, digits, _ and -")
     if alone and len(set(names.tolist())) != len(names):
         raise ValueError("an expression appears twice")

@@ -15,7 +15,7 @@ from express50.files.text import read_json
 from express50.geometry.cameras import MODELS, Camera
 from express50.geometry.shapes import PIXEL_LIMIT
 
-ID = re.compile(r"\w[\w.+-]{0,119}")
+CAMERA_ID = re.compile(r"\w[\w.+-]{0,119}")
 LARGEST = 1e12  # of a parameter or a pose, pixels or metres
 
 
@@ -45,7 +45,7 @@ def parse_cameras(table: object, where: str) -> dict[str, Camera]:
 def _parse_camera(path: str, camera_id: str, row: object) -> Camera:
     """Check one camera's entry and build it."""
     where = f"{path}: camera {camera_id}"
-    if not ID.fullmatch(camera_id):  # it becomes the name of files
+    if not CAMERA_ID.fullmatch(camera_id):  # it becomes the name of files
         raise CalibrationError(f"{where}: expected an id of letters, digits and _ . + -")
     if not isinstance(row, Mapping):
         raise CalibrationError(f"{where}: expected a table, got {type(row).__name__}")

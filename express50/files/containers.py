@@ -1,9 +1,8 @@
-"""Images by name, in plain files and inside containers, read where they lie.
+"""Read images by name, from plain files and from inside containers.
 
 ``decoder/image/cam400.zip!/cam400/000123.avif`` is a member of a zip, and
-``0026_e0_raw.smc!/Camera/03/color/0`` an array of encoded bytes in an HDF5 file. Nothing is ever
-unpacked to the disk, no name leads out of the footage's folder, and every size is looked at before
-it is believed.
+``0026_e0_raw.smc!/Camera/03/color/0`` an array of encoded bytes in an HDF5 file. Nothing is
+unpacked to the disk, no name leads out of the footage's folder, and sizes are checked first.
 """
 
 from __future__ import annotations
@@ -11,7 +10,6 @@ from __future__ import annotations
 import io
 import struct
 import zipfile
-from functools import lru_cache
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -22,15 +20,13 @@ from PIL import Image
 
 from express50.errors import CaptureError, FormatError
 from express50.files.arrays import DAMAGE as ZIP_DAMAGE
-from express50.files.exif import upright
-from express50.files.images import ROOM_BYTES, decode_cv, linear_to_srgb, read_image
+from express50.files.digests import cached_by_file
+from express50.files.images import decode_cv, linear_to_srgb, read_image, upright
+from express50.files.text import read_bytes
 from express50.geometry.shapes import PIXEL_LIMIT
 
 WITHIN = "!/"
 BYTES_LIMIT = 1 << 28  # of one encoded image, or of one array
-# Pixels a byte of a file: no photograph packs tighter, AVIF's of one colour do.
-PIXELS_A_BYTE = 1 << 14
-ATTRIBUTE_LIMIT = 1 << 16  # bytes
 NAME_LIMIT = 255  # bytes, of each part
 OPEN_FILES = 4  # containers a process keeps open
 # What h5py raises on bad files.
@@ -89,7 +85,7 @@ def read_srgb8(path: Path) -> np.ndarray:
 
 
 def inside(root: Path, name: str, where: str = "") -> Path:
-    """The path of a name relative to a folder.
+    """Return the path of a name relative to a folder.
 
     Raises:
         CaptureError: it is absolute or leads out of the folder.
@@ -97,8 +93,7 @@ def inside(root: Path, name: str, where: str = "") -> Path:
     pure = PurePosixPath(name)
     path = root / name
     out = pure.is_absolute() or ".." in pure.parts or not name.isprintable()
-    lengths = [len(part.encode(errors="replace")) for part in (name, *pure.parts)]
-    if lengths[0] > 4096 or max(lengths[1:], default=0) > NAME_LIMIT:
+    if any(len(part.encode(errors="replace")) > NAME_LIMIT for part in pure.parts):
         raise CaptureError(f"{where or root}: {name[:40]!r}... is longer than a name may be")
     if out or not path.resolve().is_relative_to(root.resolve()):
         raise CaptureError(
@@ -108,7 +103,7 @@ def inside(root: Path, name: str, where: str = "") -> Path:
 
 
 def read_picture(root: Path, name: str, orientation: int = 1) -> np.ndarray:
-    """Image (H, W, 3) uint8 sRGB of a name below a folder, turned by EXIF's orientation.
+    """Read an image (H, W, 3) uint8 sRGB by its name below a folder, turned by EXIF's orientation.
 
     Raises:
         CaptureError: it is missing, damaged, too large, or its name leads out of the folder.
@@ -120,7 +115,7 @@ def read_picture(root: Path, name: str, orientation: int = 1) -> np.ndarray:
 
 
 def read_samples(root: Path, name: str, orientation: int = 1) -> np.ndarray:
-    """Image (H, W[, C]) of a name below a folder, turned upright, in the file's own sample type.
+    """Read an image (H, W[, C]) by its name, turned upright, in the file's own sample type.
 
     Raises:
         CaptureError: it is missing, damaged, too large, or its name leads out of the folder.
@@ -130,7 +125,7 @@ def read_samples(root: Path, name: str, orientation: int = 1) -> np.ndarray:
     if within:
         stored = decode_picture(member_bytes(path, member), f"{path}{WITHIN}{member}")
     elif path.suffix.lower() == ".avif":
-        stored = decode_picture(_file_bytes(path), str(path))
+        stored = decode_picture(read_bytes(path, CaptureError, BYTES_LIMIT), str(path))
     else:
         try:
             stored = read_image(path)
@@ -139,33 +134,21 @@ def read_samples(root: Path, name: str, orientation: int = 1) -> np.ndarray:
     return upright(stored, orientation)
 
 
-def _file_bytes(path: Path) -> bytes:
-    try:
-        size = path.stat().st_size
-        _check_size(size, str(path))
-        return path.read_bytes()
-    except OSError as error:
-        raise CaptureError(f"{path}: cannot be read ({error.strerror}); restore it") from error
-
-
 def decode_picture(data: bytes, where: str) -> np.ndarray:
-    """Image (H, W, 3) uint8 sRGB of JPEG, PNG or AVIF bytes; its header's size is checked first.
+    """Decode JPEG, PNG or AVIF bytes to (H, W, 3) uint8 sRGB; the header's size is checked first.
 
     Raises:
-        CaptureError: the bytes are no such image, or it has too many pixels.
+        CaptureError: the bytes are not such an image, or it has too many pixels.
     """
     try:
         with Image.open(io.BytesIO(data), formats=("JPEG", "PNG", "AVIF")) as header:
             width, height = header.size
     except (*ZIP_DAMAGE, struct.error, Image.DecompressionBombError) as error:
         raise CaptureError(
-            f"{where}: {len(data)} bytes are no JPEG, PNG or AVIF image; copy the file again"
+            f"{where}: {len(data)} bytes are not a JPEG, PNG or AVIF image; copy the file again"
         ) from error
-    if width * height > min(PIXEL_LIMIT, max(ROOM_BYTES, PIXELS_A_BYTE * len(data))):
-        raise CaptureError(
-            f"{where}: {width}x{height} pixels in {len(data)} bytes, over {PIXEL_LIMIT} or more "
-            "than they can hold; copy the file again"
-        )
+    if width * height > PIXEL_LIMIT:
+        raise CaptureError(f"{where}: {width}x{height} pixels, expected at most {PIXEL_LIMIT}")
     try:
         return decode_cv(data, cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION, where)
     except FormatError as error:
@@ -173,20 +156,28 @@ def decode_picture(data: bytes, where: str) -> np.ndarray:
 
 
 def member_bytes(path: Path, member: str) -> bytes:
-    """Bytes of a member of a container: a zip, else an HDF5 file.
+    """Read a member of a container: a zip, else an HDF5 file.
 
     Raises:
         CaptureError: the container is damaged, the member missing, too large or of another kind.
     """
-    if path.suffix.lower() == ".zip":
-        return _zip_bytes(path, member)
-    array = read_array(open_hdf5(path), member, f"{path}")
-    if array.dtype != np.uint8 or array.ndim != 1:
-        raise CaptureError(
-            f"{path}{WITHIN}{member}: {array.dtype} of shape {array.shape}, expected encoded bytes "
-            "(uint8, one dimension)"
-        )
-    return array.tobytes()
+    where = f"{path}{WITHIN}{member}"
+    if path.suffix.lower() != ".zip":
+        array = read_array(open_hdf5(path), member, f"{path}")
+        if array.dtype != np.uint8 or array.ndim != 1:
+            raise CaptureError(
+                f"{where}: {array.dtype} of shape {array.shape}, expected encoded bytes (uint8, one"
+                " dimension)"
+            )
+        return array.tobytes()
+    archive = open_zip(path)
+    if member not in archive.NameToInfo:
+        raise CaptureError(f"{path}: has no member {member}; copy it again")
+    try:
+        _check_size(archive.getinfo(member).file_size, where)
+        return archive.read(member)
+    except (*ZIP_DAMAGE, struct.error) as error:
+        raise CaptureError(f"{where}: damaged ({error}); copy the archive again") from error
 
 
 def _check_size(size: int, where: str) -> None:
@@ -195,60 +186,41 @@ def _check_size(size: int, where: str) -> None:
 
 
 def open_zip(path: Path) -> zipfile.ZipFile:
-    """A zip for reading, kept open while it is among the last few.
+    """Open a zip for reading; the last few stay open.
 
     Raises:
-        CaptureError: it is missing or no zip.
+        CaptureError: it is missing or not a zip.
     """
     try:
-        stat = path.stat()
-        return _zip_cached(path, (stat.st_mtime_ns, stat.st_size))
+        return _open_zip(path)
     except ZIP_DAMAGE as error:
-        raise CaptureError(f"{path}: no zip archive ({error}); copy it again") from error
+        raise CaptureError(f"{path}: not a zip archive ({error}); copy it again") from error
 
 
-@lru_cache(maxsize=OPEN_FILES)
-def _zip_cached(path: Path, version: tuple[int, int]) -> zipfile.ZipFile:
-    return zipfile.ZipFile(path)
-
-
-def _zip_bytes(path: Path, member: str) -> bytes:
-    archive = open_zip(path)
-    if member not in archive.NameToInfo:
-        raise CaptureError(f"{path}: has no member {member}; copy it again")
-    try:
-        info = archive.getinfo(member)
-        _check_size(info.file_size, f"{path}{WITHIN}{member}")
-        with archive.open(info) as file:
-            return file.read(info.file_size)
-    except (*ZIP_DAMAGE, struct.error) as error:
-        raise CaptureError(
-            f"{path}{WITHIN}{member}: damaged ({error}); copy the archive again"
-        ) from error
+_open_zip = cached_by_file(OPEN_FILES)(zipfile.ZipFile)
 
 
 def open_hdf5(path: Path) -> h5py.File:
-    """An HDF5 file for reading, kept open while it is among the last few.
+    """Open an HDF5 file for reading; the last few stay open.
 
     Raises:
-        CaptureError: it is missing, truncated or no HDF5 file.
+        CaptureError: it is missing, truncated or not an HDF5 file.
     """
     try:
-        stat = path.stat()
-        return _hdf5_cached(path, (stat.st_mtime_ns, stat.st_size))
+        return _open_hdf5(path)
     except DAMAGE as error:
         raise CaptureError(
             f"{path}: cannot be opened as HDF5 ({error}); copy the file again"
         ) from error
 
 
-@lru_cache(maxsize=OPEN_FILES)
-def _hdf5_cached(path: Path, version: tuple[int, int]) -> h5py.File:
+@cached_by_file(OPEN_FILES)
+def _open_hdf5(path: Path) -> h5py.File:
     return h5py.File(path, "r")
 
 
 def child(file: h5py.File, name: str, where: str) -> Any:
-    """Group or dataset of a path in an HDF5 file, None where there is none.
+    """Return the group or dataset at a path in an HDF5 file, or None.
 
     Links are refused: an external one reads any file of the machine.
 
@@ -270,7 +242,7 @@ def child(file: h5py.File, name: str, where: str) -> Any:
 
 
 def members(group: h5py.Group, where: str) -> list[str]:
-    """Names in a group of an HDF5 file.
+    """List the names in a group of an HDF5 file.
 
     Raises:
         CaptureError: the file is damaged.
@@ -282,27 +254,22 @@ def members(group: h5py.Group, where: str) -> list[str]:
 
 
 def attribute(group: h5py.Group, name: str, default: object, where: str) -> np.ndarray:
-    """A small attribute of a group, or its default, flat.
+    """Read an attribute of a group, or its default, as a flat array.
 
     Raises:
-        CaptureError: the file is damaged, or the attribute is not small.
+        CaptureError: the file is damaged.
     """
     try:
-        if name not in group.attrs:
-            return np.ravel(np.asarray(default))
-        kind = group.attrs.get_id(name)
-        if kind.get_storage_size() > ATTRIBUTE_LIMIT:
-            raise CaptureError(f"{where}: attribute {name} has over {ATTRIBUTE_LIMIT} bytes")
-        return np.ravel(np.asarray(group.attrs[name]))
+        return np.ravel(np.asarray(group.attrs.get(name, default)))
     except DAMAGE as error:
         raise CaptureError(f"{where}: attribute {name} is damaged ({error})") from error
 
 
 def read_array(file: h5py.File, name: str, where: str) -> np.ndarray:
-    """A dataset's array, after a look at its type and size.
+    """Read a dataset's array after checking its type and size.
 
     Raises:
-        CaptureError: it is missing, no plain numbers, too large, or lies in another file.
+        CaptureError: it is missing, not plain numbers, too large, or lies in another file.
     """
     node = child(file, name, where)
     if not isinstance(node, h5py.Dataset):

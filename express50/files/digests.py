@@ -1,28 +1,60 @@
-"""Content digests of files and folders; a file is hashed again only when size or time changed."""
+"""Digest files and folders, and cache what was read from a file until the file changes."""
 
 from __future__ import annotations
 
 import hashlib
 import json
 from collections.abc import Callable
+from functools import lru_cache, wraps
 from pathlib import Path
+from typing import Any, TypeVar
 
 from express50.errors import StageError
 
-CHUNK = 1 << 20
+T = TypeVar("T")
+
+
+def cached_by_file(size: int) -> Callable[[Callable[..., T]], Callable[..., T]]:
+    """Cache the last `size` results of a function of a path until the file there changes.
+
+    The function's first argument is a path, or has a method `__fspath__`; all arguments are
+    hashable. A file counts as changed when its size, time of change or inode is another.
+
+    Raises:
+        OSError: when the function is called and the path cannot be examined.
+    """
+
+    def decorate(function: Callable[..., T]) -> Callable[..., T]:
+        @lru_cache(maxsize=size)
+        def read(version: FileVersion, path: Path, *arguments: Any) -> T:  # noqa: ARG001
+            return function(path, *arguments)
+
+        @wraps(function)
+        def look(path: Path, *arguments: Any) -> T:
+            return read(file_version(path), path, *arguments)
+
+        return look
+
+    return decorate
+
+
+FileVersion = tuple[int, int, int]
+
+
+def file_version(path: Path) -> FileVersion:
+    """Return size, time of change (ns) and inode: another version has other bytes."""
+    stat = Path(path).stat()
+    return stat.st_size, stat.st_mtime_ns, stat.st_ino
 
 
 def file_sha256(path: Path) -> str:
-    """SHA-256 of a file's bytes, hexadecimal."""
-    digest = hashlib.sha256()
+    """Return the SHA-256 of a file's bytes, hexadecimal."""
     with Path(path).open("rb") as file:
-        while chunk := file.read(CHUNK):
-            digest.update(chunk)
-    return digest.hexdigest()
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def files_of(folder: Path) -> list[Path]:
-    """Every file below a folder, sorted by relative path; hidden names are left out."""
+    """List every file below a folder, sorted by relative path, without hidden names."""
     found = (path for path in folder.rglob("*") if path.is_file())
     return sorted(
         path
@@ -32,40 +64,38 @@ def files_of(folder: Path) -> list[Path]:
 
 
 def path_digest(path: Path, sha256: Callable[[Path], str] = file_sha256) -> str:
-    """Digest of a file's content, or of the names and contents of a folder's files.
+    """Digest a file's content, or the names and contents of a folder's files.
 
     Args:
         path: file or folder.
         sha256: digest of one file; the ledger passes a cached one.
 
     Raises:
-        StageError: there is nothing at the path.
+        StageError: the path does not exist.
     """
     if path.is_file():
         return sha256(path)
     if not path.is_dir():
-        raise StageError(f"{path}: input is not there; run the stage that writes it first")
+        raise StageError(f"{path}: input is missing; run the stage that writes it first")
     lines = [f"{file.relative_to(path).as_posix()} {sha256(file)}" for file in files_of(path)]
     return text_digest("\n".join(lines))
 
 
 def stat_digest(path: Path) -> str:
-    """Digest of names, sizes and times of a file or a folder's files: cheap for terabytes."""
-    if path.is_file():
-        stat = path.stat()
-        return text_digest(f"{path.name} {stat.st_size} {stat.st_mtime_ns}")
+    """Digest names, sizes and times of a file or a folder's files: cheap for terabytes."""
+    root, files = (path.parent, [path]) if path.is_file() else (path, files_of(path))
     lines = []
-    for file in files_of(path):
-        stat = file.stat()
-        lines.append(f"{file.relative_to(path).as_posix()} {stat.st_size} {stat.st_mtime_ns}")
+    for file in files:
+        size, time, _ = file_version(file)
+        lines.append(f"{file.relative_to(root).as_posix()} {size} {time}")
     return text_digest("\n".join(lines))
 
 
 def text_digest(text: str) -> str:
-    """SHA-256 of a text, hexadecimal."""
+    """Return the SHA-256 of a text, hexadecimal."""
     return hashlib.sha256(text.encode()).hexdigest()
 
 
 def value_digest(value: object) -> str:
-    """SHA-256 of a value's canonical JSON (tuples are lists, keys are sorted)."""
+    """Return the SHA-256 of a value's canonical JSON (tuples are lists, keys are sorted)."""
     return text_digest(json.dumps(value, sort_keys=True, ensure_ascii=False))

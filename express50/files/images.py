@@ -1,4 +1,4 @@
-"""Image files through OpenImageIO, depth maps, colour curves, resizing and contact sheets.
+"""Read, write, encode and decode images; convert colour and depth; lay out contact sheets.
 
 OpenImageIO reads and writes 8 and 16 bits, half and single float, with one interface; JPEG bytes
 in memory go through OpenCV. Images are RGB, (H, W, 3); files hold sRGB unless a name says linear.
@@ -6,6 +6,8 @@ in memory go through OpenCV. Images are RGB, (H, W, 3); files hold sRGB unless a
 
 from __future__ import annotations
 
+import math
+import mmap
 import struct
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -15,15 +17,16 @@ import numpy as np
 import OpenImageIO as oiio
 
 from express50.errors import FormatError
-from express50.files.jpeg import cut_short, file_cut_short
 from express50.geometry.shapes import PIXEL_LIMIT
 
-# What an image may unpack to: so much in any case, beyond it so many times its file. Deflate packs
-# zeros 1032-fold, JPEG's blocks of one colour about as much, and no camera comes near.
-ROOM_BYTES, RATIO_LIMIT = 64 << 20, 4096
 CUT = "truncated: a JPEG without its end; copy it again"
 DEPTH_UNIT_M = 5e-5  # one step of a 16-bit depth map; 3.28 m at most, 0.025 mm rounding
 DEPTH_LIMIT_M = DEPTH_UNIT_M * 65535
+# Orientation -> quarter turns counter-clockwise after an optional left-right flip (EXIF 2.3).
+TURNS = {1: (0, False), 2: (0, True), 3: (2, False), 4: (2, True), 5: (1, True), 6: (3, False),
+         7: (3, True), 8: (1, False)}  # fmt: skip
+# Quarter turns counter-clockwise without a flip -> orientation.
+ORIENTATION = {turns: number for number, (turns, flipped) in TURNS.items() if not flipped}
 
 
 def read_image(path: Path) -> np.ndarray:
@@ -33,57 +36,84 @@ def read_image(path: Path) -> np.ndarray:
         uint8, uint16 or float32 (half is widened) array.
 
     Raises:
-        FormatError: the file is missing, not a flat image, truncated, over the pixel limit, or says
-            that it unpacks to what its bytes cannot hold.
+        FormatError: the file is missing, truncated, not a flat image, or over the pixel limit.
     """
     source = open_image(path)
     try:
         spec = source.spec()
+        size = f"{spec.width}x{spec.height} pixels of {spec.nchannels} channels"
+        if spec.deep or spec.depth > 1 or min(spec.width, spec.height, spec.nchannels) < 1:
+            raise FormatError(f"{path}: {size}, deep or a volume; expected a flat image")
+        if spec.width * spec.height > PIXEL_LIMIT:
+            raise FormatError(f"{path}: {size}, expected at most {PIXEL_LIMIT}; store it smaller")
         kind = {"uint8": "uint8", "uint16": "uint16"}.get(str(spec.format), "float")
         channels = min(spec.nchannels, 4)
-        _check_image(path, spec, channels * np.dtype("f4" if kind == "float" else kind).itemsize)
         pixels = source.read_image(0, 0, 0, channels, kind)
         if pixels is None:
-            raise FormatError(f"{path}: truncated or damaged ({_said(source.geterror)})")
-        if file_cut_short(Path(path)):
-            raise FormatError(f"{path}: {CUT}")
+            raise FormatError(f"{path}: truncated or damaged ({_error_text(source.geterror)})")
     finally:
         source.close()
+    with (
+        Path(path).open("rb") as file,
+        mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data,
+    ):
+        if is_cut_short(data):
+            raise FormatError(f"{path}: {CUT}")
     array = np.asarray(pixels).reshape(spec.height, spec.width, channels)
     return array[..., 0] if channels == 1 else array
 
 
 def open_image(path: Path) -> oiio.ImageInput:
-    """An image file, its header read; close it.
+    """Open an image file and read its header; the caller closes it.
 
     Raises:
         FormatError: it is missing or not an image.
     """
     source = oiio.ImageInput.open(str(path)) if Path(path).is_file() else None
     if source is None:
-        why = _said(oiio.geterror) or "it cannot be opened"
+        why = _error_text(oiio.geterror) or "it cannot be opened"
         raise FormatError(f"{path}: cannot be read as an image ({why}); copy it again")
     return source
 
 
-def _said(geterror: Callable[[], str]) -> str:
-    """What OpenImageIO says went wrong; it may quote bytes of the file that are no text."""
+def _error_text(geterror: Callable[[], str]) -> str:
+    """Return OpenImageIO's error; it may quote bytes of the file that are not text."""
     try:
         return geterror().strip()
     except UnicodeDecodeError:
         return "damaged"
 
 
-def _check_image(path: Path, spec: oiio.ImageSpec, pixel_bytes: int) -> None:
-    """Refuse what is no flat picture, or says to hold more than it can."""
-    size = f"{spec.width}x{spec.height} pixels of {spec.nchannels} channels"
-    if spec.deep or spec.depth > 1 or min(spec.width, spec.height, spec.nchannels) < 1:
-        raise FormatError(f"{path}: {size}, deep or a volume; expected a flat image")
-    if spec.width * spec.height > PIXEL_LIMIT:
-        raise FormatError(f"{path}: {size}, over {PIXEL_LIMIT}; store it smaller")
-    have = Path(path).stat().st_size
-    if spec.width * spec.height * pixel_bytes > max(ROOM_BYTES, RATIO_LIMIT * have):
-        raise FormatError(f"{path}: {size} in {have} bytes; it is damaged, copy it again")
+def read_exif(path: Path) -> tuple[int, float]:
+    """Read orientation, 1 to 8, and focal length on 35 mm film, 0 if unknown.
+
+    A rig's cameras are used as they are stored, since a calibration belongs to stored pixels. Bare
+    photographs have none: they are turned upright first, so that width, height and principal point
+    are those of the upright picture. The focal length of 35 mm film is that of the same diagonal,
+    which turning does not change.
+
+    Raises:
+        FormatError: the file is not an image.
+    """
+    image = open_image(path)
+    try:
+        spec = image.spec()
+        values = [spec.getattribute(name) for name in ("Orientation", "Exif:FocalLengthIn35mmFilm")]
+    except UnicodeDecodeError:  # undecodable text instead of a number
+        values = [1, 0.0]
+    finally:
+        image.close()
+    orientation, film = (value if isinstance(value, int | float) else 0 for value in values)
+    usable = math.isfinite(film) and 0 < film < 1e5
+    return (int(orientation) if orientation in TURNS else 1), (float(film) if usable else 0.0)
+
+
+def upright(image: np.ndarray, orientation: int) -> np.ndarray:
+    """Turn a stored image upright, as its EXIF orientation (1 to 8) says."""
+    turns, flipped = TURNS[orientation]
+    if (turns, flipped) == (0, False):
+        return image
+    return np.ascontiguousarray(np.rot90(image[:, ::-1] if flipped else image, turns))
 
 
 def read_alpha(path: Path) -> np.ndarray:
@@ -151,21 +181,21 @@ def decode_image(data: bytes, name: str = "image") -> np.ndarray:
     """Decode JPEG or PNG bytes to RGB (H, W, 3) or grey (H, W), keeping 8 or 16 bits.
 
     Raises:
-        FormatError: the bytes are no image, or one over the pixel limit.
+        FormatError: the bytes are not an image, or one over the pixel limit.
     """
     width, height = image_size(data, name)
-    if width * height > min(PIXEL_LIMIT, max(ROOM_BYTES, RATIO_LIMIT * len(data))):
-        raise FormatError(f"{name}: {width}x{height} pixels in {len(data)} bytes; it is damaged")
+    if width * height > PIXEL_LIMIT:
+        raise FormatError(f"{name}: {width}x{height} pixels, expected at most {PIXEL_LIMIT}")
     return _swap(decode_cv(data, cv2.IMREAD_UNCHANGED, name))
 
 
 def decode_cv(data: bytes, flags: int, name: str) -> np.ndarray:
-    """The image in encoded bytes as OpenCV has it; look at its size before.
+    """Decode bytes with OpenCV, refusing a JPEG without its end; check the image's size before.
 
     Raises:
         FormatError: the bytes are damaged, or end too soon.
     """
-    if cut_short(data):
+    if is_cut_short(data):
         raise FormatError(f"{name}: {CUT}")
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
@@ -177,31 +207,53 @@ def decode_cv(data: bytes, flags: int, name: str) -> np.ndarray:
 
 
 def image_size(data: bytes, where: str) -> tuple[int, int]:
-    """Width and height in a PNG's or JPEG's header, before any pixel is decoded.
-
-    What decoders would pass over (garbage between segments) is refused: they might find another
-    header there than this one.
+    """Read width and height from a PNG's or JPEG's header, before any pixel is decoded.
 
     Raises:
         FormatError: the bytes are neither.
 
-    Source: PNG 1.2, 11.2.2 (IHDR); ITU-T T.81, B.1.1.2 to B.2.2 (markers, frame header).
+    Source: PNG 1.2, 11.2.2 (IHDR).
     """
     if data[:8] == b"\x89PNG\r\n\x1a\n" and len(data) >= 24:
         return struct.unpack(">II", data[16:24])
-    position = 2 if data[:2] == b"\xff\xd8" else len(data)
-    while position + 9 < len(data) and data[position] == 0xFF:
+    size, _ = _jpeg_header(data)
+    if size is None:
+        raise FormatError(f"{where}: {len(data)} bytes are not a PNG or JPEG image")
+    return size
+
+
+def is_cut_short(data: bytes | mmap.mmap) -> bool:
+    """Return True if a JPEG stops before its end marker; False for other bytes.
+
+    Decoders fill what is missing with grey and do not report it. Thumbnails in the header have end
+    markers of their own, and some cameras write more after the picture's, so the marker is searched
+    behind the first scan's header. In a scan 0xFF is always followed by a byte that says what it is
+    (ITU-T T.81, B.1.1.5), so nothing else looks like it.
+    """
+    if data[:2] != b"\xff\xd8":
+        return False
+    _, scan = _jpeg_header(data)
+    return scan is None or data.find(b"\xff\xd9", scan) < 0
+
+
+def _jpeg_header(data: bytes | mmap.mmap) -> tuple[tuple[int, int] | None, int | None]:
+    """Return a JPEG's (width, height) and the offset of its first scan; None where not found.
+
+    Source: ITU-T T.81, B.1.1.2 to B.2.2 (markers, frame header).
+    """
+    size, position = None, 2 if data[:2] == b"\xff\xd8" else len(data)
+    while position + 4 <= len(data) and data[position] == 0xFF:
         marker, length = data[position + 1], int.from_bytes(data[position + 2 : position + 4])
         if marker == 0xFF:  # a fill byte
             position += 1
             continue
-        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
-            height, width = struct.unpack(">HH", data[position + 5 : position + 9])
-            return width, height
-        if marker < 0xC0 or 0xD0 <= marker <= 0xDA:  # has no length, or ends the header
-            break
+        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC) and size is None:
+            frame = data[position + 5 : position + 9]
+            size = (int.from_bytes(frame[2:4]), int.from_bytes(frame[:2]))
         position += 2 + length
-    raise FormatError(f"{where}: {len(data)} bytes are no PNG or JPEG image")
+        if marker == 0xDA:
+            return size, position
+    return size, None
 
 
 def _swap(image: np.ndarray) -> np.ndarray:

@@ -1,9 +1,10 @@
-"""Read a user's pickles without executing anything.
+"""Read pickles and torch files without executing anything.
 
 FLAME's files are Python 2 pickles that name chumpy and scipy classes; landmark embeddings hold
 torch tensors. None of those libraries is imported: every class comes from a short allow list, and
 those of chumpy, scipy and torch are replaced by records that only keep their state. A pickle that
-names anything else is refused before anything is called.
+names anything else is refused before anything is called. Torch's own files are read with
+``weights_only``.
 """
 
 from __future__ import annotations
@@ -12,24 +13,29 @@ import codecs
 import io
 import math
 import pickle
-import pickletools
+import struct
 from collections import OrderedDict
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, BinaryIO, cast
+from typing import Any
 
 import numpy as np
+import scipy.sparse
 
 from express50.errors import HeadModelError
-from express50.files.arrays import DAMAGE, read_header, read_npy
+from express50.files.arrays import DAMAGE as ARRAY_DAMAGE
+from express50.files.arrays import read_header, read_npy
+from express50.files.text import AGAIN, Kind, reason
 
 PICKLE_LIMIT_BYTES = 2 << 30
 # Of an array made from a list, a sparse matrix or a view; FLAME's largest has six million.
 VALUES_LIMIT = 1 << 25
+# What damaged files make the standard unpickler, torch and the stand-ins below raise.
+DAMAGE = (*ARRAY_DAMAGE, pickle.UnpicklingError, ImportError, AssertionError, struct.error)
 
 
 class Record:
-    """Stands for an object of a class that is not imported; keeps what the pickle says of it."""
+    """Stands for a class that is not imported; keeps what the pickle says of it."""
 
     state: dict[str, Any]
 
@@ -40,7 +46,7 @@ class Record:
         return made
 
     def __init__(self, *_: object) -> None:
-        """Ignore constructor arguments: the state says all."""
+        """Ignore constructor arguments: the state holds everything."""
 
     def __setstate__(self, state: object) -> None:
         """Keep the state; slots come as a pair (dict, dict)."""
@@ -50,52 +56,52 @@ class Record:
 
 
 class ChumpyArray(Record):
-    """A chumpy.Ch: the array is in state["x"]."""
+    """Stands for a chumpy.Ch: the array is in state["x"]."""
 
 
 class SparseMatrix(Record):
-    """A scipy.sparse csc or csr matrix."""
+    """Stands for a scipy.sparse csc or csr matrix."""
 
 
 class CscMatrix(SparseMatrix):
-    """Column-compressed."""
+    """Stands for a column-compressed matrix."""
 
 
 class CsrMatrix(SparseMatrix):
-    """Row-compressed."""
+    """Stands for a row-compressed matrix."""
 
 
 class StorageType(Record):
-    """Names a torch storage type; never instantiated by what it names."""
+    """Stands for a torch storage type."""
 
 
 class ArrayType(Record):
-    """Names numpy.ndarray; itself, called by a pickle, would make arrays of any size."""
+    """Stands for numpy.ndarray, which, called by a pickle, would make arrays of any size."""
 
 
 def _new_record(kind: object = Record, *_: object) -> Record:
-    """What copy_reg._reconstructor does, for records alone."""
+    """Do what copy_reg._reconstructor does, for records alone."""
     if isinstance(kind, type) and issubclass(kind, Record):
         return kind()
     raise pickle.UnpicklingError("copy_reg._reconstructor of a class that is not allowed")
 
 
 def _encode(text: object, encoding: object = "latin1") -> bytes:
-    """What _codecs.encode does for the byte strings of protocol 2."""
+    """Do what _codecs.encode does for the byte strings of protocol 2."""
     if not isinstance(text, str) or encoding not in ("latin1", "latin-1"):
         raise pickle.UnpicklingError("_codecs.encode of something other than latin-1 text")
     return codecs.latin_1_encode(text)[0]
 
 
 def _reconstruct_array(kind: object, shape: object, code: object) -> np.ndarray:
-    """What numpy's _reconstruct does, for plain arrays alone."""
+    """Do what numpy's _reconstruct does, for plain arrays alone."""
     if kind is not ArrayType:
         raise pickle.UnpicklingError("numpy array subclass")
     return np.ndarray((0,), np.dtype("b"))
 
 
 def _dtype(code: object, *flags: object) -> np.dtype:
-    """numpy.dtype from a type code string."""
+    """Make a numpy.dtype from a type code string."""
     if not isinstance(code, (str, bytes)):
         raise pickle.UnpicklingError("numpy.dtype from something other than a code")
     return np.dtype(code.decode("ascii") if isinstance(code, bytes) else code)
@@ -112,7 +118,7 @@ def _scalar(dtype: np.dtype, data: object) -> np.generic:
 def _tensor(
     storage: object, offset: int, size: tuple[int, ...], stride: tuple[int, ...], *_: object
 ) -> np.ndarray:
-    """What torch._utils._rebuild_tensor_v2 does, on a NumPy storage, bounds checked."""
+    """Do what torch._utils._rebuild_tensor_v2 does on a NumPy storage, bounds checked."""
     if not isinstance(storage, np.ndarray) or storage.ndim != 1 or offset < 0:
         raise pickle.UnpicklingError("tensor without a storage")
     if min((*size, *stride, 0)) < 0:
@@ -126,11 +132,28 @@ def _tensor(
     return np.lib.stride_tricks.as_strided(storage[offset:], size, steps).copy()
 
 
-def _storage_from_bytes(data: object) -> np.ndarray:
-    """What torch.storage._load_from_bytes does: a nested file, read by `_read_torch_storage`."""
+def _read_torch_storage(data: object) -> np.ndarray:
+    """Read a storage pickled into an array file, as torch.storage._load_from_bytes does.
+
+    Layout: pickles of magic, protocol, system information, the storage, its keys; then for each key
+    an int64 count and the raw little-endian numbers.
+    """
     if not isinstance(data, bytes):
         raise pickle.UnpicklingError("torch storage without bytes")
-    return _read_torch_storage(data)
+    stream = io.BytesIO(data)
+    for _ in range(3):
+        SafeUnpickler(stream, encoding="latin1").load()
+    reader = SafeUnpickler(stream, encoding="latin1")
+    reader.storages, reader.longest = {}, len(data)  # type: ignore[attr-defined]
+    storage = reader.load()
+    keys = SafeUnpickler(stream, encoding="latin1").load()
+    if not isinstance(keys, list) or not isinstance(storage, np.ndarray) or len(keys) != 1:
+        raise pickle.UnpicklingError("a torch storage with an unknown layout")
+    count = int(np.frombuffer(stream.read(8), "<i8", count=1)[0])
+    raw = stream.read(storage.nbytes)
+    if count != storage.size or len(raw) != storage.nbytes:
+        raise pickle.UnpicklingError("a torch storage that is cut short")
+    return np.frombuffer(raw, storage.dtype).copy()
 
 
 _NUMPY = ("numpy.core.multiarray", "numpy._core.multiarray")
@@ -149,7 +172,7 @@ _ALLOWED = MappingProxyType(
         ("builtins", "set"): set,
         ("collections", "OrderedDict"): OrderedDict,
         ("torch._utils", "_rebuild_tensor_v2"): _tensor,
-        ("torch.storage", "_load_from_bytes"): _storage_from_bytes,
+        ("torch.storage", "_load_from_bytes"): _read_torch_storage,
     }
 )
 _STORAGE_DTYPES = MappingProxyType(
@@ -162,7 +185,7 @@ _STORAGE_DTYPES = MappingProxyType(
 
 
 class SafeUnpickler(pickle.Unpickler):
-    """Unpickler that resolves names from the allow list only."""
+    """Resolves names from the allow list only."""
 
     def find_class(self, module: str, name: str) -> Any:  # noqa: ANN401 (pickle's own signature)
         """Return the stand-in for a name, or refuse."""
@@ -179,7 +202,7 @@ class SafeUnpickler(pickle.Unpickler):
         raise pickle.UnpicklingError(f"it names {module}.{name}, which is not on the allow list")
 
     def persistent_load(self, pid: object) -> np.ndarray:
-        """Storages of torch's old format: ("storage", type, key, location, count, view)."""
+        """Make a storage of torch's old format: ("storage", type, key, location, count, view)."""
         storages = getattr(self, "storages", None)
         if storages is None or not isinstance(pid, tuple) or len(pid) < 5 or pid[0] != "storage":
             raise pickle.UnpicklingError("a persistent id outside a torch storage")
@@ -189,30 +212,8 @@ class SafeUnpickler(pickle.Unpickler):
         return storages.setdefault(str(pid[2]), np.zeros(count, dtype))
 
 
-def _read_torch_storage(data: bytes) -> np.ndarray:
-    """Read a storage pickled into an array file: torch's old format, magic number first.
-
-    Layout: pickles of magic, protocol, system information, the storage, its keys; then for each key
-    an int64 count and the raw little-endian numbers.
-    """
-    stream = io.BytesIO(data)
-    for _ in range(3):
-        _load(stream)
-    reader = _checked_unpickler(stream)
-    reader.storages, reader.longest = {}, len(data)  # type: ignore[attr-defined]
-    storage = reader.load()
-    keys = _load(stream)
-    if not isinstance(keys, list) or not isinstance(storage, np.ndarray) or len(keys) != 1:
-        raise pickle.UnpicklingError("a torch storage with an unknown layout")
-    count = int(np.frombuffer(stream.read(8), "<i8", count=1)[0])
-    raw = stream.read(storage.nbytes)
-    if count != storage.size or len(raw) != storage.nbytes:
-        raise pickle.UnpicklingError("a torch storage that is cut short")
-    return np.frombuffer(raw, storage.dtype).copy()
-
-
 def read_pickle(path: Path) -> Any:  # noqa: ANN401 (whatever the file holds)
-    """Read a pickle, nothing executed.
+    """Read a pickle without executing anything.
 
     Raises:
         HeadModelError: unreadable, damaged, or naming something that is not on the allow list.
@@ -222,15 +223,13 @@ def read_pickle(path: Path) -> Any:  # noqa: ANN401 (whatever the file holds)
         if size > PICKLE_LIMIT_BYTES:
             raise HeadModelError(f"{path}: {size} bytes, expected at most {PICKLE_LIMIT_BYTES}")
         with path.open("rb") as file:
-            return _load(file)
-    except OSError as error:
-        raise HeadModelError(f"{path}: cannot be read: {error}") from error
-    except _DAMAGE as error:
-        raise HeadModelError(f"{path}: refused or damaged pickle: {_one_line(error)}") from error
+            return SafeUnpickler(file, encoding="latin1").load()
+    except DAMAGE as error:
+        raise HeadModelError(f"{path}: refused or damaged pickle ({reason(error)})") from error
 
 
 def read_object_array(path: Path) -> Any:  # noqa: ANN401 (whatever the file holds)
-    """Read an `.npy` file, also one that holds a pickled object, nothing executed.
+    """Read an `.npy` file, also one that holds a pickled object, without executing anything.
 
     Raises:
         HeadModelError: as `read_pickle`.
@@ -240,56 +239,66 @@ def read_object_array(path: Path) -> Any:  # noqa: ANN401 (whatever the file hol
             shape, dtype = read_header(file)
             if not dtype.hasobject:
                 return read_npy(path, HeadModelError, "an array")
-            content = _load(file)
-    except OSError as error:
-        raise HeadModelError(f"{path}: cannot be read: {error}") from error
-    except _DAMAGE as error:
-        raise HeadModelError(f"{path}: refused or damaged array: {_one_line(error)}") from error
+            content = SafeUnpickler(file, encoding="latin1").load()
+    except DAMAGE as error:
+        raise HeadModelError(f"{path}: refused or damaged array ({reason(error)})") from error
     return content.item() if isinstance(content, np.ndarray) and shape == () else content
 
 
-# What a damaged pickle makes the standard unpickler and the stand-ins above raise.
-_DAMAGE = (*DAMAGE, pickle.UnpicklingError, ImportError, AssertionError)
+def to_array(value: object, name: str, where: str) -> np.ndarray:
+    """Convert what a pickle held (array, chumpy, sparse matrix or list) to a dense array.
 
-
-def _load(file: BinaryIO) -> Any:  # noqa: ANN401 (whatever the file holds)
-    return _checked_unpickler(file).load()
-
-
-def _checked_unpickler(file: BinaryIO) -> SafeUnpickler:
-    """An unpickler of what comes next in a file, after a look at its opcodes.
-
-    Python's asks for as much memory as a length in the file says, and for a table as long as the
-    largest number under which something is memorised, before it sees that nothing is there.
+    Raises:
+        HeadModelError: it is not numbers, is too large, or holds NaN or Inf.
     """
-    start, end = file.tell(), file.seek(0, io.SEEK_END)
-    file.seek(start)
-    opcodes = pickletools.genops(cast(BinaryIO, _Bounded(file, end)))
-    for count, (opcode, argument, _) in enumerate(opcodes, 1):
-        number = argument if isinstance(argument, int) else 0
-        if opcode.name in ("PUT", "BINPUT", "LONG_BINPUT") and not 0 <= number <= 16 * count:
-            raise pickle.UnpicklingError(f"memorises under {number} after {count} steps")
-        if opcode.name == "FRAME" and not 0 <= number <= end:
-            raise pickle.UnpicklingError(f"a frame of {number} bytes that are not there")
-        if opcode.name == "LONG4" and number.bit_length() > 1 << 16:
-            raise pickle.UnpicklingError("a whole number of thousands of digits")
-    file.seek(start)
-    return SafeUnpickler(file, encoding="latin1")
+    for _ in range(8):  # one may hold another; a loop of them holds nothing
+        if isinstance(value, ChumpyArray):
+            value = next((value.state[key] for key in ("x", "a", "v") if key in value.state), None)
+    try:
+        array = _densify(value) if isinstance(value, SparseMatrix) else np.asarray(value)
+    except (ValueError, TypeError, OverflowError, KeyError, IndexError, MemoryError) as error:
+        raise HeadModelError(f"{where}: {name} is not an array ({reason(error)})") from error
+    if array.dtype.kind not in "fiub":
+        raise HeadModelError(f"{where}: {name} holds {array.dtype}, expected numbers")
+    if array.size > VALUES_LIMIT:
+        raise HeadModelError(f"{where}: {name} holds {array.size} numbers, over {VALUES_LIMIT}")
+    if array.dtype.kind == "f" and not np.isfinite(array).all():
+        raise HeadModelError(f"{where}: {name} holds NaN or Inf, expected finite numbers")
+    return array
 
 
-class _Bounded:
-    """A file for `pickletools` that refuses to read past its end."""
+def _densify(matrix: SparseMatrix) -> np.ndarray:
+    """Make a dense (rows, columns) array of a compressed sparse matrix, which SciPy checks."""
+    state = matrix.state
+    rows, columns = state.get("_shape", state.get("shape"))  # type: ignore[misc]
+    if not 0 <= rows * columns <= VALUES_LIMIT:
+        raise ValueError(f"a sparse matrix of {rows} x {columns}")
+    kind = scipy.sparse.csc_array if isinstance(matrix, CscMatrix) else scipy.sparse.csr_array
+    parts = tuple(np.asarray(state[key]) for key in ("data", "indices", "indptr"))
+    made = kind(parts, shape=(rows, columns))
+    made.check_format(full_check=True)
+    return made.toarray()
 
-    def __init__(self, file: BinaryIO, end: int) -> None:
-        self._file, self._end = file, end
-        self.readline, self.tell = file.readline, file.tell
 
-    def read(self, size: int) -> bytes:
-        """So many bytes, all of them there."""
-        if not 0 <= size <= self._end - self._file.tell():
-            raise pickle.UnpicklingError(f"{size} bytes that are not there")
-        return self._file.read(size)
+def read_weights(path: Path, kind: Kind, where: str, what: str, mend: str = AGAIN) -> Any:  # noqa: ANN401
+    """Read a file of ``torch.save`` to the CPU.
 
+    Args:
+        path: the file.
+        kind: class of the errors.
+        where: how messages name the file.
+        what: it is expected to be, such as "a torch state dict".
+        mend: how to fix it.
 
-def _one_line(error: BaseException) -> str:
-    return " ".join(str(error).split()) or type(error).__name__
+    Raises:
+        Express50Error: of the given kind: it is missing, damaged, or names what ``weights_only``
+            does not allow.
+    """
+    import torch
+
+    if not Path(path).is_file():
+        raise kind(f"{where}: no such file; {mend}")
+    try:
+        return torch.load(path, map_location="cpu", weights_only=True)
+    except DAMAGE as error:
+        raise kind(f"{where}: not {what} ({reason(error)}); {mend}") from None

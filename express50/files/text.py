@@ -1,8 +1,6 @@
-"""Text from outside, JSON and TOML above all: nothing of it is believed before it was looked at.
+"""Read text, JSON and TOML files, with errors that name the file and the line.
 
-Every format of text is read through here, so that one bound holds for all: a file is a regular one
-of at most ``TEXT_LIMIT`` bytes, nesting ends in an error and not in a full stack, keys come once,
-and every number is finite.
+A file is a regular one of at most ``TEXT_LIMIT`` bytes, keys come once, and numbers are finite.
 """
 
 from __future__ import annotations
@@ -12,6 +10,7 @@ import math
 import re
 import stat
 import tomllib
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -19,16 +18,17 @@ from express50.errors import Express50Error
 
 TEXT_LIMIT = 1 << 28  # bytes; the index of 100,000 samples takes 40 MB
 TOML_LIMIT = 1 << 20  # bytes; written by hand
-# Of a TOML key; Python's parser keeps every beginning of one, so that long ones fill the memory.
-DOTTED = re.compile(r"""(?<![\w"'.-])(?:(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')[ \t]*+\.[ \t]*+){32}""")
-NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.+-]{0,199}")  # of what may become a file or folder
+NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.+-]{0,199}")
+"""Pattern of a name that may become a file or folder."""
+ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,119}")
+"""Pattern of a subject's or expression's id: a file name without a dot, as keys of shards need."""
 AGAIN = "copy or write it again"
 
 Kind = type[Express50Error]
 
 
 def read_bytes(path: Path, kind: Kind, limit: int = TEXT_LIMIT, mend: str = AGAIN) -> bytes:
-    """Bytes of a regular file.
+    """Read the bytes of a regular file.
 
     Raises:
         Express50Error: of the given kind: it is missing, a pipe or a device, unreadable, or larger
@@ -47,10 +47,10 @@ def read_bytes(path: Path, kind: Kind, limit: int = TEXT_LIMIT, mend: str = AGAI
 
 
 def read_text(path: Path, kind: Kind, limit: int = TEXT_LIMIT, mend: str = AGAIN) -> str:
-    """UTF-8 text of a file, a byte order mark left out; line ends become newlines.
+    """Read a file as UTF-8 without a byte order mark; line ends become newlines.
 
     Raises:
-        Express50Error: as `read_bytes`, or it is no such text.
+        Express50Error: as `read_bytes`, or it is not UTF-8.
     """
     try:
         text = read_bytes(path, kind, limit, mend).decode("utf-8-sig")
@@ -60,7 +60,7 @@ def read_text(path: Path, kind: Kind, limit: int = TEXT_LIMIT, mend: str = AGAIN
 
 
 def read_json(path: Path, kind: Kind, mend: str = AGAIN) -> Any:
-    """Content of a JSON file.
+    """Read a JSON file.
 
     Raises:
         Express50Error: as `read_text` and `parse_json`.
@@ -69,7 +69,7 @@ def read_json(path: Path, kind: Kind, mend: str = AGAIN) -> Any:
 
 
 def read_json_table(path: Path, kind: Kind, mend: str = AGAIN) -> dict[str, Any]:
-    """Content of a JSON file that is a table.
+    """Read a JSON file that holds a table.
 
     Raises:
         Express50Error: as `read_json`, or it is something else.
@@ -81,7 +81,7 @@ def read_json_table(path: Path, kind: Kind, mend: str = AGAIN) -> dict[str, Any]
 
 
 def parse_json(text: str | bytes, where: str, kind: Kind, mend: str = AGAIN) -> Any:
-    """Content of JSON text.
+    """Parse JSON text.
 
     Raises:
         Express50Error: it is not JSON, is nested too deeply, has a key twice, or a number that is
@@ -98,7 +98,7 @@ def parse_json(text: str | bytes, where: str, kind: Kind, mend: str = AGAIN) -> 
 
 
 def read_toml(path: Path, kind: Kind, mend: str = "correct it") -> dict[str, Any]:
-    """Content of a TOML file.
+    """Read a TOML file.
 
     Raises:
         Express50Error: as `read_text`, or it is not TOML, nested too deeply, or holds a number that
@@ -108,24 +108,21 @@ def read_toml(path: Path, kind: Kind, mend: str = "correct it") -> dict[str, Any
 
 
 def parse_toml(text: str, where: str, kind: Kind, mend: str = "correct it") -> dict[str, Any]:
-    """Content of TOML text.
+    """Parse TOML text.
 
     Raises:
         Express50Error: as `read_toml`.
     """
-    if found := DOTTED.search(text):
-        raise kind(f"{where}: {found[0][:40]}... has over 32 parts, expected a short key; {mend}")
     try:
-        table = tomllib.loads(text, parse_float=_finite)
+        return tomllib.loads(text, parse_float=_finite)
     except NotFiniteError as error:
         raise kind(f"{where}: {error.located(text)}; {mend}") from None
     except (ValueError, RecursionError) as error:
         raise kind(f"{where}: not TOML: {reason(error)}; {mend}") from None
-    return table
 
 
 def reason(error: BaseException) -> str:
-    """What an error says, in a few words of one line."""
+    """Return an error's message as at most 200 characters of one line."""
     if isinstance(error, RecursionError):
         return "it is nested too deeply"
     words = getattr(error, "strerror", None) or str(error) or type(error).__name__
@@ -133,10 +130,10 @@ def reason(error: BaseException) -> str:
 
 
 class NotFiniteError(ValueError):
-    """A number that is NaN or infinite, as it is written."""
+    """Names a number that is NaN or infinite, as it is written."""
 
     def located(self, text: str | bytes) -> str:
-        """What is wrong and where: the line that such a number stands in first."""
+        """Say which line holds such a number first."""
         lines = (text if isinstance(text, str) else text.decode(errors="replace")).split("\n")
         word = str(self)
         number = next((n for n, line in enumerate(lines, 1) if word in line), 1)
@@ -153,7 +150,6 @@ def _finite(text: str) -> float:
 def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     table = dict(pairs)
     if len(table) < len(pairs):
-        names = [name for name, _ in pairs]
-        twice = next(name for name in names if names.count(name) > 1)
+        twice, _ = Counter(name for name, _ in pairs).most_common(1)[0]
         raise ValueError(f"the key {twice[:40]!r} is there twice")
     return table

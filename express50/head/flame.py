@@ -15,11 +15,10 @@ import numpy as np
 import torch
 
 from express50.errors import HeadModelError
-from express50.files.pickles import read_object_array, read_pickle
+from express50.files.pickles import read_object_array, read_pickle, to_array
 from express50.head.ict import read_obj
 from express50.head.model import PARENTS, REGIONS, HeadModel, check_head
 from express50.head.mouth import add_mouth, is_flame_topology
-from express50.head.pickled_arrays import to_array
 
 EMBEDDINGS = (
     "landmark_embedding.npy",

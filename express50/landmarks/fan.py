@@ -16,7 +16,6 @@ import torch
 
 from express50.errors import ConfigError
 from express50.files.arrays import DAMAGE
-from express50.files.checkpoints import check_archive
 from express50.geometry.conventions import affine_to_opencv, cell_to_corner
 from express50.landmarks.detector import Detection
 
@@ -35,7 +34,6 @@ def load_fan(path: Path) -> torch.jit.ScriptModule:
     """
     wanted = f"expected FAN's TorchScript weights, (1, 3, {CROP}, {CROP}) to 68 heat maps"
     try:
-        check_archive(path)
         fan = torch.jit.load(str(path), map_location="cpu").eval()
         with torch.inference_mode():
             output = _heat(fan, torch.zeros(1, 3, CROP, CROP))

@@ -11,7 +11,7 @@ import numpy as np
 from express50.capture.frames import FrameReader
 from express50.capture.index import Index
 from express50.errors import CalibrationError, FormatError
-from express50.files.exif import read_exif
+from express50.files.images import read_exif
 from express50.geometry.cameras import Camera
 from express50.landmarks.network import load_network
 from pipelines.calibrate.camera_moves import reduce_image

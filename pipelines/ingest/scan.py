@@ -18,8 +18,7 @@ from express50.errors import CaptureError
 from express50.files.atomic import dump_json
 from express50.files.containers import WITHIN, inside, read_picture
 from express50.files.digests import file_sha256, text_digest
-from express50.files.exif import upright
-from express50.files.images import encode_jpeg, resize_area
+from express50.files.images import encode_jpeg, resize_area, upright
 from express50.files.video import iterate_video
 from pipelines.ingest.config import IngestConfig
 from pipelines.ingest.focus import edge_width

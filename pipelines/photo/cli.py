@@ -7,12 +7,12 @@ from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
-from express50.capture.raw import NAME
 from express50.cli.stages import add_config_options, config_of
 from express50.console import FAILED, OK, say, say_json, stdout_to_stderr
 from express50.contract.extensions import stages
 from express50.contract.layout import Dataset
 from express50.errors import ConfigError
+from express50.files.text import ID
 from express50.runner.executor import Pool
 from express50.runner.runner import Summary, run_stage
 from express50.runner.threads import cap_threads
@@ -98,7 +98,7 @@ def run_photo(args: argparse.Namespace) -> int:
 
 def _check(args: argparse.Namespace) -> None:
     """Refuse options that cannot work."""
-    if args.subject is not None and not NAME.fullmatch(args.subject):
+    if args.subject is not None and not ID.fullmatch(args.subject):
         raise ConfigError(f"--subject {args.subject!r}: expected letters, digits, '_' and '-'")
     for name, value in (("--focal-px", args.focal_px), ("--film-mm", args.film_mm)):
         if value is not None and not 0 < value < float("inf"):

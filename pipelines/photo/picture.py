@@ -12,7 +12,7 @@ import numpy as np
 from express50.capture.raw import IMAGE_SUFFIXES, VIDEO_SUFFIXES
 from express50.errors import CaptureError, FormatError
 from express50.files.containers import read_srgb8
-from express50.files.exif import ORIENTATION, read_exif, upright
+from express50.files.images import ORIENTATION, read_exif, upright
 from express50.files.video import iterate_video, video_turn
 
 # Read as photographs; a rig's cameras write none of the last two.

@@ -13,7 +13,7 @@ from express50.capture.index import read_index
 from express50.contract.config import resolve_config
 from express50.contract.layout import Dataset
 from express50.errors import FormatError
-from express50.files.exif import read_exif, upright
+from express50.files.images import read_exif, upright
 from express50.runner.runner import run_stage
 from pipelines import ingest
 from pipelines.calibrate.footage_views import told_focals

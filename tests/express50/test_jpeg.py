@@ -8,8 +8,7 @@ from hypothesis import strategies as st
 
 from express50.errors import CaptureError, FormatError
 from express50.files.containers import read_picture
-from express50.files.images import decode_image, encode_jpeg, read_image
-from express50.files.jpeg import cut_short
+from express50.files.images import decode_image, encode_jpeg, is_cut_short, read_image
 
 PICTURE = np.random.default_rng(0).integers(0, 256, (40, 56, 3), dtype=np.uint8)
 PLAIN = encode_jpeg(PICTURE, 90)
@@ -25,9 +24,9 @@ def with_thumbnail(data: bytes) -> bytes:
 
 @pytest.mark.parametrize("data", [PLAIN, PROGRESSIVE, RESTARTS])
 def test_whole_pictures_are_whole(data):
-    assert not cut_short(data) and not cut_short(data + b"\0" * 100)
-    assert not cut_short(with_thumbnail(data))
-    assert not cut_short(b"") and not cut_short(b"\x89PNG")
+    assert not is_cut_short(data) and not is_cut_short(data + b"\0" * 100)
+    assert not is_cut_short(with_thumbnail(data))
+    assert not is_cut_short(b"") and not is_cut_short(b"\x89PNG")
 
 
 @given(st.floats(0.0, 0.999))
@@ -35,7 +34,7 @@ def test_what_is_cut_anywhere_is_told(share):
     for data in (PLAIN, PROGRESSIVE, RESTARTS, with_thumbnail(PLAIN)):
         # the very last scan of a progressive file may be cut from its marker on
         cut = data[: max(2, min(int(share * len(data)), len(data) - 2))]
-        assert cut_short(cut)
+        assert is_cut_short(cut)
 
 
 def test_no_reader_takes_half_a_picture(tmp_path):

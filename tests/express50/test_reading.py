@@ -42,17 +42,13 @@ def test_a_table_is_asked_for(tmp_path: Path) -> None:
         read_json_table(tmp_path / "a.json", CaptureError)
 
 
-def test_keys_of_toml_are_short_and_numbers_finite(tmp_path: Path) -> None:
+def test_numbers_of_toml_are_finite(tmp_path: Path) -> None:
     file = tmp_path / "a.toml"
     file.write_text("a.b = [" + "0.5, " * 300 + "]\nc = '" + "a." * 300 + "'\n")
     assert len(read_toml(file, CaptureError)["a"]["b"]) == 300
-    for text, message in (
-        ("a" + ".a" * 40 + " = 1", "over 32 parts"),
-        ("\nx = inf", "line 2 holds"),
-    ):
-        file.write_text(text)
-        with pytest.raises(CaptureError, match=message):
-            read_toml(file, CaptureError)
+    file.write_text("\nx = inf")
+    with pytest.raises(CaptureError, match="line 2"):
+        read_toml(file, CaptureError)
 
 
 def test_size_and_kind_of_a_file_are_looked_at(tmp_path: Path) -> None:

@@ -277,7 +277,7 @@ def test_image_size_is_read_before_decoding():
     assert image_size(encode_png(image), "x") == (1000, 7)
     assert image_size(encode_jpeg(image), "x") == (1000, 7)
     for junk in (b"", b"\xff\xd8", b"\xff\xd8\xff\xc0", b"GIF89a" * 9):
-        with pytest.raises(FormatError, match="no PNG or JPEG"):
+        with pytest.raises(FormatError, match="x: "):
             image_size(junk, "x")
 
 

@@ -1,4 +1,4 @@
-"""The audit finds what was broken by hand, mends what can be made again, and says no more."""
+"""The audit finds what was broken by hand, fixes what can be made again, and reports no more."""
 
 import json
 import os
@@ -44,7 +44,7 @@ def run(dataset):
 
 def look(dataset, **options):
     result = audit(dataset, STAGES, **options)
-    return {(f.kind, f.what): f for f in result.findings}, result
+    return {(f.kind, f.where): f for f in result.findings}, result
 
 
 def output(dataset, item="S001", stage="toy"):
@@ -64,7 +64,7 @@ def test_an_undisturbed_dataset_is_sound_and_nothing_is_written(dataset):
     for deep in (False, True):
         found, result = look(dataset, deep=deep)
         assert found == {} and result.notes == [] and result.sound
-        assert result.looked.files == 12 and (result.looked.hashed > 0) == deep
+        assert result.files == 12 and (result.hashed > 0) == deep
     assert toy.tree(dataset.root) == before
 
 
@@ -85,10 +85,10 @@ def test_harm_is_found_mended_and_made_again_to_the_same_bytes(dataset, kind, ha
     found, result = look(dataset)
     assert list(found) == [(kind, "toy S001")] and not result.sound
     # What was made of the good one stays right: it is not blamed, and not made again.
-    found, result = look(dataset, mend=True)
+    found, result = look(dataset, fix=True)
     assert list(found) == [(kind, "toy S001")] and result.sound
     assert not dataset.item_dir("toy", "S001").exists()
-    found, result = look(dataset, mend=True)  # nor because the good one is not back yet
+    found, result = look(dataset, fix=True)  # nor because the good one is not back yet
     assert found == {} and "toy: 1 of 2 items are to do" in result.notes[0]
     assert [o.status for o in toy.run_toy(dataset).outcomes] == ["done", "skipped"]
     assert toy.tree(dataset.stage_dir("toy")) == before
@@ -105,14 +105,14 @@ def test_a_flipped_bit_under_an_old_time_is_found_by_reading_alone(dataset):
 def test_a_copy_with_other_times_is_sound(dataset, tmp_path):
     shutil.copytree(dataset.root, tmp_path / "copy", copy_function=shutil.copy)
     found, result = look(Dataset(tmp_path / "copy"))
-    assert found == {} and result.looked.hashed > 0
+    assert found == {} and result.hashed > 0
 
 
 def test_output_without_receipt(dataset):
     with Ledger(dataset.ledger) as ledger:
         ledger.forget("toy", ["S001"])
     assert list(look(dataset)[0]) == [("unknown", "toy S001")]
-    assert look(dataset, mend=True)[1].sound
+    assert look(dataset, fix=True)[1].sound
     assert run(dataset).ok and look(dataset)[0] == {}
 
 
@@ -122,9 +122,9 @@ def test_what_nobody_can_make_again_is_never_moved(dataset):
     output(dataset).unlink()
     stranger = dataset.item_dir("toy", "S009")
     shutil.copytree(dataset.item_dir("toy", "S002"), stranger)
-    found, result = look(dataset, mend=True)
+    found, result = look(dataset, fix=True)
     assert set(found) == {("missing", "toy S001"), ("unknown", "toy S009")}
-    assert not any(f.mended for f in found.values()) and not result.sound
+    assert not any(f.fixed for f in found.values()) and not result.sound
     assert own.read_text() == "by hand" and stranger.is_dir()
 
 
@@ -132,8 +132,8 @@ def test_upstream_made_anew_with_other_bytes_blames_what_was_made_of_the_old(dat
     assert toy.run_toy(dataset, word="b").ok
     found, _ = look(dataset)
     assert set(found) == {("outdated", "after S001"), ("outdated", "after S002")}
-    assert "made from another toy" in found["outdated", "after S001"].why
-    assert look(dataset, mend=True)[1].sound
+    assert "made from another toy" in found["outdated", "after S001"].what
+    assert look(dataset, fix=True)[1].sound
     assert toy.run_stage_of(LATER, dataset).count("done") == 2
     assert look(dataset)[0] == {}
 
@@ -145,10 +145,10 @@ def test_downstream_that_read_a_file_replaced_by_hand_is_found(dataset):
     found, _ = look(dataset)
     # The second cannot be judged before the first is mended, and is then.
     assert list(found) == [("changed", "toy S001")]
-    look(dataset, mend=True)
+    look(dataset, fix=True)
     toy.run_toy(dataset)
     assert list(look(dataset)[0]) == [("outdated", "after S001")]
-    look(dataset, mend=True)
+    look(dataset, fix=True)
     run(dataset)
     assert look(dataset)[0] == {} and toy.tree(dataset.stage_dir("after")) == good
 
@@ -156,12 +156,12 @@ def test_downstream_that_read_a_file_replaced_by_hand_is_found(dataset):
 def test_other_settings_are_a_note_and_nothing_is_set_aside(dataset):
     text = dataset.config_file("toy").read_text()
     dataset.config_file("toy").write_text(text.replace("files = 3", "files = 4"))
-    found, result = look(dataset, mend=True)
+    found, result = look(dataset, fix=True)
     assert found == {} and "toy: 2 items were made with other settings" in result.notes[0]
     dataset.config_file("toy").write_text("[toy]\nfils = 3\n")
-    found, result = look(dataset, mend=True)
+    found, result = look(dataset, fix=True)
     assert list(found) == [("config", "config/toy.toml")] and not result.sound
-    assert "did you mean" in found["config", "config/toy.toml"].why
+    assert "did you mean" in found["config", "config/toy.toml"].what
 
 
 def test_leftovers_are_swept_and_a_running_stage_is_left_alone(dataset):
@@ -172,11 +172,11 @@ def test_leftovers_are_swept_and_a_running_stage_is_left_alone(dataset):
         found, result = look(dataset)
         assert found == {} and result.notes == ["toy: runs now; its items were not looked at"]
         with pytest.raises(StageError, match="another 'toy' runs"):
-            look(dataset, mend=True)
+            look(dataset, fix=True)
         assert leftover.is_dir()
     assert set(look(dataset)[0]) == {("leftover", ".staging toy"), ("missing", "toy S001")}
     assert leftover.is_dir()
-    assert look(dataset, mend=True)[1].sound and not leftover.exists()
+    assert look(dataset, fix=True)[1].sound and not leftover.exists()
 
 
 @pytest.mark.parametrize("harm", ["header", "page", "gone"])
@@ -191,7 +191,7 @@ def test_an_unreadable_ledger_is_set_aside_and_outputs_are_made_again(dataset, h
         dataset.ledger.write_bytes(data[:4096] + b"\xff" * (len(data) - 4096))
     found, result = look(dataset)
     assert list(found) == [("ledger", "ledger.sqlite")] and not result.sound
-    assert look(dataset, mend=True)[1].sound
+    assert look(dataset, fix=True)[1].sound
     assert len(list(dataset.root.glob("ledger.sqlite.unreadable-*"))) == (harm != "gone")
     assert run(dataset).ok and toy.tree(dataset.stage_dir("after")) == before
     assert look(dataset)[0] == {}
@@ -203,7 +203,7 @@ def test_a_ledger_of_before_digests_is_told_apart_and_taken_up(dataset):
     flip(output(dataset))
     found, result = look(dataset)
     assert found == {} and sum("have no digests" in note for note in result.notes) == 2
-    look(dataset, mend=True)
+    look(dataset, fix=True)
     flip(output(dataset, "S002"))
     assert ("changed", "toy S002") in look(dataset)[0]
 
@@ -220,7 +220,7 @@ def test_traces_of_the_withdrawn_are_found_by_digest_alone(dataset):
     outside = dataset.root.parent / "model.pt"
     outside.write_bytes(b"codes of S-0_9")
     found, _ = look(dataset, checkpoints=[outside])
-    people = {what for kind, what in found if kind == "person"}
+    people = {where for kind, where in found if kind == "person"}
     assert people == {"ledger.sqlite", "notes/a.json", str(outside)}
 
 
@@ -236,7 +236,7 @@ def test_killed_half_way_then_checked_and_made_again(tmp_path):
         time.sleep(0.01)
     process.send_signal(signal.SIGKILL)
     process.wait()
-    result = audit(dataset, [toy.STAGE], mend=True)
+    result = audit(dataset, [toy.STAGE], fix=True)
     # A kill between the rename and the receipt leaves one output unaccounted for, at most.
     assert result.sound and {f.kind for f in result.findings} <= {"leftover", "unknown"}
     assert any(f.kind == "leftover" for f in result.findings)
@@ -260,9 +260,9 @@ def test_command_on_real_stages(tmp_path, capsys):
     dataset.labels_file("S001").write_text(json.dumps(label) + "\n")
     shutil.rmtree(tmp_path / "S002")
     (dataset.item_dir("ingest", "S001") / "proxies" / "cam01.tar").unlink()
-    assert main(["check", root, "--mend", "--json"]) == 1
+    assert main(["check", root, "--fix", "--json"]) == 1
     account = json.loads(capsys.readouterr().out)
-    kinds = sorted((f["kind"], f["mended"]) for f in account["findings"])
+    kinds = sorted((f["kind"], f["fixed"]) for f in account["findings"])
     assert kinds == [("capture", False), ("label", False), ("label", False), ("missing", True)]
     assert dataset.labels_file("S001").read_text() == json.dumps(label) + "\n"
     assert main(["ingest", root, "--items", "S001", "--workers", "0"]) == 0
@@ -271,6 +271,6 @@ def test_command_on_real_stages(tmp_path, capsys):
     capsys.readouterr()
     assert main(["check", root]) == 1
     said = capsys.readouterr().out.splitlines()
-    assert len(said) == 2 and said[0].startswith("captures.json: not JSON")
+    assert len(said) == 2 and said[0].startswith("captures.json: ")
     assert main(["check", str(tmp_path / "nothing")]) == 1
     assert "nothing" in capsys.readouterr().err

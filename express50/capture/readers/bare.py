@@ -7,7 +7,7 @@ from pathlib import Path
 from express50.capture.raw import VIDEO_SUFFIXES, RawCamera, RawCapture, image_names
 from express50.capture.readers.selection import Wishes, check_wishes, identifier
 from express50.errors import CaptureError, FormatError
-from express50.files.exif import ORIENTATION, read_exif
+from express50.files.images import ORIENTATION, read_exif
 from express50.files.video import video_fps, video_turn
 
 FPS = 24.0  # of photographs it means nothing

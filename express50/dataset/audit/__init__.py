@@ -1,4 +1,4 @@
-"""Audit of a dataset against its ledger: what is wrong, and what of it can be mended."""
+"""Audit a dataset against its ledger: report what is wrong, and set aside what can be remade."""
 
 from express50.dataset.audit.dataset import Audit, audit
 from express50.dataset.audit.finding import Finding

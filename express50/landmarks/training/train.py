@@ -20,7 +20,7 @@ import torch
 from torch.nn import functional
 
 from express50.errors import TrainError
-from express50.files.checkpoints import read_weights
+from express50.files.pickles import read_weights
 from express50.head.load import load_head
 from express50.head.model import HeadModel
 from express50.landmarks.network import (
