@@ -10,7 +10,7 @@ from annotations.labels import AUTOMATIC, Label
 from annotations.store import current_labels, is_person, read_labels
 from express50.capture.demographics import age_counts, gender_counts, shown_counts
 from express50.capture.index import read_index
-from express50.capture.readers.person import read_people
+from express50.capture.readers.read import read_people
 from express50.contract.exclusions import exclusion_reason, included_subjects
 from express50.contract.layout import Dataset
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from express50.capture.frames import read_peak_frame
 from express50.capture.index import index_path
-from express50.capture.readers.person import read_people
+from express50.capture.readers.read import read_people
 from express50.contract.exclusions import exclusion_reason
 from express50.contract.layout import Dataset
 from express50.contract.segmentation_labels import COLOURS

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from express50.capture.index import read_index
-from express50.capture.readers.person import read_people
+from express50.capture.readers.read import read_people
 from express50.cli.main import main
 from express50.contract.layout import Dataset
 from express50.dataset.id_search import files_naming, files_that, names_any_of

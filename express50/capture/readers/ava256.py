@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from express50.capture.raw import RawCamera, RawCapture
-from express50.capture.readers.selection import Wishes, check_wishes, identifier
+from express50.capture.readers.selection import Selection, check_selection, identifier
 from express50.capture.readers.timeline import Moment, common_timeline
 from express50.errors import CalibrationError, CaptureError
 from express50.files.containers import WITHIN, open_zip
@@ -46,7 +46,7 @@ def subject_of(path: Path) -> str:
     return identifier(parts[2] if len(parts) == 3 else path.name)
 
 
-def read(path: Path, wishes: Wishes) -> RawCapture:
+def read(path: Path, selection: Selection) -> RawCapture:
     """Read a capture's segments.
 
     Raises:
@@ -56,12 +56,12 @@ def read(path: Path, wishes: Wishes) -> RawCapture:
     calibration = read_calibration(path / CAMERAS)
     listed = read_frame_list(path / FRAMES)
     segments = list(dict.fromkeys(segment for segment, _ in listed))
-    check_wishes(wishes, segments, sorted(calibration))
-    skipped = {f"sequence {s}": "not asked for" for s in segments if not wishes.wants_sequence(s)}
-    wanted = [moment for moment in listed if wishes.wants_sequence(moment[0])]
+    check_selection(selection, segments, sorted(calibration))
+    skipped = {f"sequence {s}": "not asked for" for s in segments if not selection.has_sequence(s)}
+    wanted = [moment for moment in listed if selection.has_sequence(moment[0])]
     pictures, dropped = {}, {}
     for name in calibration:
-        if not wishes.wants_camera(name):
+        if not selection.has_camera(name):
             continue
         try:
             pictures[name] = _pictures(path, name, wanted)
@@ -86,7 +86,7 @@ def read(path: Path, wishes: Wishes) -> RawCapture:
         dropped=dropped | line.dropped,
         calibration={k: c for k, c in calibration.items() if k in line.names},
         layout="ava256",
-        clips=tuple(wishes.expression(segment) for segment in line.sequences),
+        clips=tuple(selection.expression(segment) for segment in line.sequences),
         skipped=skipped | line.skipped,
         found={"frames_listed": len(wanted)},
     )  # fmt: skip

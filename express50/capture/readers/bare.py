@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from express50.capture.raw import VIDEO_SUFFIXES, RawCamera, RawCapture, image_names
-from express50.capture.readers.selection import Wishes, check_wishes, identifier
+from express50.capture.readers.selection import Selection, check_selection, identifier
 from express50.errors import CaptureError, FormatError
 from express50.files.images import ORIENTATION, read_exif
 from express50.files.video import video_fps, video_turn
@@ -24,7 +24,7 @@ def fits_photos(path: Path) -> bool:
     return path.is_dir() and bool(image_names(path))
 
 
-def read_photos(path: Path, wishes: Wishes) -> RawCapture:
+def read_photos(path: Path, selection: Selection) -> RawCapture:
     """Each photograph as a camera of one moment; the cameras are solved from the footage.
 
     A photograph that lies on its side by its EXIF is read upright.
@@ -34,11 +34,11 @@ def read_photos(path: Path, wishes: Wishes) -> RawCapture:
     """
     names = image_names(path)
     ids = {name: identifier(Path(name).stem) for name in names}
-    check_wishes(wishes, ["photo"], sorted(ids.values()))
+    check_selection(selection, ["photo"], sorted(ids.values()))
     dropped: dict[str, str] = {}
     cameras: dict[str, RawCamera] = {}
     for name, camera in ids.items():
-        if not wishes.wants_camera(camera):
+        if not selection.has_camera(camera):
             continue
         if camera in cameras:
             raise CaptureError(
@@ -58,7 +58,7 @@ def read_photos(path: Path, wishes: Wishes) -> RawCapture:
         raise CaptureError(f"{path}: no photograph can be used: {reasons or 'none was asked for'}")
     return RawCapture(
         root=path, subject=subject_of(path), fps=FPS, meta={}, cameras=cameras, dropped=dropped,
-        layout="photos", clips=(wishes.expression("photo"),),
+        layout="photos", clips=(selection.expression("photo"),),
     )  # fmt: skip
 
 
@@ -67,7 +67,7 @@ def fits_video(path: Path) -> bool:
     return path.is_file() and path.suffix.lower() in VIDEO_SUFFIXES
 
 
-def read_video(path: Path, wishes: Wishes) -> RawCapture:
+def read_video(path: Path, selection: Selection) -> RawCapture:
     """A video as one camera; all of it is one clip, named ``clip`` unless it is told otherwise.
 
     A video that lies on its side, as telephones store what they film upright, is read upright.
@@ -75,12 +75,12 @@ def read_video(path: Path, wishes: Wishes) -> RawCapture:
     Raises:
         CaptureError: it is no video.
     """
-    check_wishes(wishes, ["clip"], [CAMERA])
+    check_selection(selection, ["clip"], [CAMERA])
     orientation = ORIENTATION[video_turn(path)]
     camera = RawCamera(
         id=CAMERA, kind="videos", path=path.parent, names=(path.name,), orientation=orientation
     )
     return RawCapture(
         root=path.parent, subject=subject_of(path), fps=video_fps(path), meta={},
-        cameras={CAMERA: camera}, layout="video", clips=(wishes.expression("clip"),),
+        cameras={CAMERA: camera}, layout="video", clips=(selection.expression("clip"),),
     )  # fmt: skip

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from express50.capture.raw import RawCamera, RawCapture
-from express50.capture.readers.selection import Wishes, check_wishes, identifier
+from express50.capture.readers.selection import Selection, check_selection, identifier
 from express50.capture.readers.timeline import Moment, common_timeline
 from express50.errors import CalibrationError, CaptureError
 from express50.files.text import NAME, read_text
@@ -36,7 +36,7 @@ def subject_of(path: Path) -> str:
     return identifier(parts[3] if len(parts) == 5 else path.name)
 
 
-def read(path: Path, wishes: Wishes) -> RawCapture:
+def read(path: Path, selection: Selection) -> RawCapture:
     """Read a capture's segments.
 
     Raises:
@@ -46,10 +46,10 @@ def read(path: Path, wishes: Wishes) -> RawCapture:
     calibration = read_krt(path / "KRT")
     listed = read_frame_list(path / "frame_list.txt")
     segments = list(dict.fromkeys(segment for segment, _ in listed))
-    check_wishes(wishes, segments, sorted(calibration))
-    skipped = {f"sequence {s}": "not asked for" for s in segments if not wishes.wants_sequence(s)}
-    wanted = [moment for moment in listed if wishes.wants_sequence(moment[0])]
-    names = [name for name in calibration if wishes.wants_camera(name)]
+    check_selection(selection, segments, sorted(calibration))
+    skipped = {f"sequence {s}": "not asked for" for s in segments if not selection.has_sequence(s)}
+    wanted = [moment for moment in listed if selection.has_sequence(moment[0])]
+    names = [name for name in calibration if selection.has_camera(name)]
     pictures: dict[str, dict[Moment, str]] = {name: {} for name in names}
     for name in names:
         have = {
@@ -80,7 +80,7 @@ def read(path: Path, wishes: Wishes) -> RawCapture:
         dropped=line.dropped,
         calibration={k: c for k, c in calibration.items() if k in line.names},
         layout="multiface",
-        clips=tuple(wishes.expression(segment) for segment in line.sequences),
+        clips=tuple(selection.expression(segment) for segment in line.sequences),
         skipped=skipped | line.skipped,
         found={"frames_listed": len(wanted)},
     )  # fmt: skip

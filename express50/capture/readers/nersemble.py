@@ -1,6 +1,6 @@
-"""NeRSemble v2: a participant's folder, ``018/``, one video a sequence and camera.
+"""NeRSemble v2: a participant's folder, ``018/``, one video per sequence and camera.
 
-Footage is colour-corrected when it is read (``color_calibration.json``: a polynomial a camera, in
+Footage is colour-corrected when it is read (``color_calibration.json``: a polynomial per camera, in
 linear light), its files stay as they are. Source: the layout that nersemble-data 0.0.6 reads.
 """
 
@@ -10,7 +10,7 @@ from pathlib import Path
 
 from express50.capture.colour_correction import check_matrix
 from express50.capture.raw import RawCamera, RawCapture
-from express50.capture.readers.selection import Wishes, check_wishes, identifier
+from express50.capture.readers.selection import Selection, check_selection, identifier
 from express50.capture.readers.timeline import Moment, common_timeline
 from express50.errors import CaptureError
 from express50.files.video import video_fps
@@ -23,16 +23,16 @@ BACKGROUND = "BACKGROUND"
 
 
 def fits(path: Path) -> bool:
-    """Whether a folder is a participant's."""
+    """Return whether a folder is a participant's."""
     return (path / CAMERAS).is_file() and (path / "sequences").is_dir()
 
 
 def subject_of(path: Path) -> str:
-    """The participant's number."""
+    """Return the participant's number."""
     return identifier(path.name)
 
 
-def read(path: Path, wishes: Wishes) -> RawCapture:
+def read(path: Path, selection: Selection) -> RawCapture:
     """Read a participant's sequences.
 
     Raises:
@@ -43,19 +43,21 @@ def read(path: Path, wishes: Wishes) -> RawCapture:
     sequences = sorted(
         p.name for p in (path / "sequences").iterdir() if p.is_dir() and p.name != BACKGROUND
     )
-    check_wishes(wishes, sequences, sorted(calibration))
+    check_selection(selection, sequences, sorted(calibration))
     skipped = {
-        f"sequence {name}": "not asked for" for name in sequences if not wishes.wants_sequence(name)
+        f"sequence {name}": "not asked for"
+        for name in sequences
+        if not selection.has_sequence(name)
     }
-    wanted = [name for name in sequences if wishes.wants_sequence(name)]
-    serials = [serial for serial in sorted(calibration) if wishes.wants_camera(serial)]
+    wanted = [name for name in sequences if selection.has_sequence(name)]
+    serials = [serial for serial in sorted(calibration) if selection.has_camera(serial)]
     videos: dict[str, dict[Moment, str]] = {serial: {} for serial in serials}
     for serial in serials:
         for sequence in wanted:
             name = f"sequences/{sequence}/images/cam_{serial}.mp4"
             if (path / name).is_file():
                 videos[serial][(sequence, 0)] = name
-    line = common_timeline(videos, wanted)
+    line = common_timeline(videos, wanted, noun="videos")
     if not line.names or not line.moments:
         raise CaptureError(
             f"{path}: no video of {len(serials)} cameras and {len(wanted)} sequences; expected "
@@ -74,12 +76,12 @@ def read(path: Path, wishes: Wishes) -> RawCapture:
             )
             for serial, names in line.names.items()
         },
-        dropped={k: v.replace("frames", "videos") for k, v in line.dropped.items()},
+        dropped=line.dropped,
         calibration={k: c for k, c in calibration.items() if k in line.names},
         plates=_plates(path, set(line.names)),
         layout="nersemble",
-        clips=tuple(wishes.expression(sequence) for sequence in line.sequences),
-        skipped=skipped | {k.replace("frames", "videos"): v for k, v in line.skipped.items()},
+        clips=tuple(selection.expression(sequence) for sequence in line.sequences),
+        skipped=skipped | line.skipped,
         found={"colour_corrected": sorted(colours)},
         warnings=warnings,
     )
@@ -91,9 +93,9 @@ def _plates(path: Path, serials: set[str]) -> dict[str, str]:
 
 
 def _colours(path: Path, serials: set[str]) -> tuple[dict, dict[str, str]]:
-    """Correction by camera, and what to say of those without one."""
+    """Read the corrections by camera, and warnings about cameras without one."""
     if not (path / COLOURS).is_file():
-        return {}, {"colours": f"{COLOURS} is not there; colours stay as each camera recorded them"}
+        return {}, {"colours": f"{COLOURS} is missing; colours stay as each camera recorded them"}
     table = read_table(path / COLOURS)
     found = {
         serial: check_matrix(table[serial], f"{path / COLOURS}: {serial}")

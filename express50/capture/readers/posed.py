@@ -10,7 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from express50.capture.raw import IMAGE_SUFFIXES, RawCamera, RawCapture
-from express50.capture.readers.selection import Wishes, check_wishes, identifier
+from express50.capture.readers.selection import Selection, check_selection, identifier
 from express50.capture.readers.timeline import Moment, common_timeline
 from express50.errors import CalibrationError, CaptureError
 from express50.files.containers import inside
@@ -38,7 +38,7 @@ def _model(path: Path) -> Path | None:
     return next((path / name for name in MODELS if is_colmap(path / name)), None)
 
 
-def read_colmap_folder(path: Path, wishes: Wishes) -> RawCapture:
+def read_colmap_folder(path: Path, selection: Selection) -> RawCapture:
     """Every posed picture as a camera of one moment.
 
     Raises:
@@ -55,7 +55,7 @@ def read_colmap_folder(path: Path, wishes: Wishes) -> RawCapture:
         for name, file in files.items()
         if _there(path, f"images/{file}")
     }
-    return _assemble(path, "colmap", cameras, pictures, wishes, sorted(files))
+    return _assemble(path, "colmap", cameras, pictures, selection, sorted(files))
 
 
 def fits_transforms(path: Path) -> bool:
@@ -65,7 +65,7 @@ def fits_transforms(path: Path) -> bool:
     return path.name.startswith("transforms") and path.suffix == ".json"
 
 
-def read_transforms_folder(path: Path, wishes: Wishes) -> RawCapture:
+def read_transforms_folder(path: Path, selection: Selection) -> RawCapture:
     """Cameras and time steps of a transforms.json.
 
     Raises:
@@ -83,7 +83,7 @@ def read_transforms_folder(path: Path, wishes: Wishes) -> RawCapture:
         found = _picture(file.parent, str(frame.get("file_path", "")))
         if found is not None:
             pictures[name][(MOMENT, step)] = found
-    return _assemble(file.parent, "transforms", cameras, pictures, wishes, sorted(cameras))
+    return _assemble(file.parent, "transforms", cameras, pictures, selection, sorted(cameras))
 
 
 def _picture(root: Path, name: str) -> str | None:
@@ -101,22 +101,22 @@ def _assemble(
     layout: str,
     cameras: Mapping[str, Camera],
     pictures: Mapping[str, Mapping[Moment, str]],
-    wishes: Wishes,
+    selection: Selection,
     known: list[str],
 ) -> RawCapture:
-    check_wishes(wishes, [MOMENT], known)
+    check_selection(selection, [MOMENT], known)
     ids = {name: identifier(name) for name in cameras}
     if len(set(ids.values())) < len(ids):
         raise CalibrationError(
             f"{root}: camera names {', '.join(list(ids)[:4])} become the same id"
         )
-    wanted = {ids[n]: table for n, table in pictures.items() if table and wishes.wants_camera(n)}
+    wanted = {ids[n]: table for n, table in pictures.items() if table and selection.has_camera(n)}
     line = common_timeline(wanted, [MOMENT])
     if not line.names or not line.moments:
         raise CaptureError(f"{root}: no picture of {len(cameras)} cameras is there; copy them")
     without = {ids[n]: "its picture is not there" for n in cameras if not pictures.get(n)}
     given = {ids[n]: replace(c, id=ids[n]) for n, c in cameras.items() if ids[n] in line.names}
-    scale = wishes.metres_per_unit
+    scale = selection.metres_per_unit
     warnings = {}
     if scale is None:
         warnings["scale"] = (
@@ -138,7 +138,7 @@ def _assemble(
         dropped=without | line.dropped,
         calibration=in_metres(given, scale or 1.0),
         layout=layout,
-        clips=tuple(wishes.expression(sequence) for sequence in line.sequences),
+        clips=tuple(selection.expression(sequence) for sequence in line.sequences),
         skipped=line.skipped,
         found={},
         warnings=warnings,

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from express50.capture.raw import VIDEO_SUFFIXES, RawCamera, RawCapture
-from express50.capture.readers.selection import Wishes, check_wishes
+from express50.capture.readers.selection import Selection, check_selection
 from express50.errors import CaptureError
 from express50.files.video import video_fps
 
@@ -89,7 +89,7 @@ def subject_of(path: Path) -> str:
     return f"Actor_{actors[0]}"
 
 
-def read(path: Path, wishes: Wishes) -> RawCapture:
+def read(path: Path, selection: Selection) -> RawCapture:
     """Read an actor's clips; of a clip with and without sound the one with sound is taken.
 
     Raises:
@@ -106,13 +106,13 @@ def read(path: Path, wishes: Wishes) -> RawCapture:
             skipped[f"file {file.name}"] = "its name is none of RAVDESS"
             continue
         known.append(clip.sequence)
-        if not wishes.wants_sequence(clip.sequence):
+        if not selection.has_sequence(clip.sequence):
             skipped[f"file {file.name}"] = "not asked for"
         elif clip.sequence in taken:  # sorted by name: the one with sound came first
             skipped[f"file {file.name}"] = f"the same clip as {taken[clip.sequence][1]}"
         else:
             taken[clip.sequence] = clip, file.name
-    check_wishes(wishes, known, [CAMERA])
+    check_selection(selection, known, [CAMERA])
     if not taken:
         raise CaptureError(
             f"{path}: no clip can be used; expected such as 01-01-03-02-01-01-05.mp4"
@@ -129,7 +129,7 @@ def read(path: Path, wishes: Wishes) -> RawCapture:
         },
         cameras={CAMERA: RawCamera(id=CAMERA, kind="videos", path=root, names=names)},
         layout="ravdess",
-        clips=tuple(wishes.expression(clip.sequence) for clip, _ in rows),
+        clips=tuple(selection.expression(clip.sequence) for clip, _ in rows),
         skipped=skipped,
         found={"emotions": sorted({clip.emotion for clip, _ in rows})},
     )

@@ -1,4 +1,4 @@
-"""Read a capture of any known layout: which one it is, what it holds, what was left out and why.
+"""Read a capture of any known layout.
 
 A layout is a row of a plain table: its name, what it looks like, a test, the subject's id, and a
 reader that turns it into a `RawCapture`. Nothing is copied or unpacked. A folder with capture.toml
@@ -8,7 +8,7 @@ take, so that read-only datasets need no file of ours beside them.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -28,9 +28,9 @@ from express50.capture.readers import (
     ravdess,
     renderme,
 )
-from express50.capture.readers.selection import EXPRESSION, Wishes, parse_wishes
-from express50.contract.layout import footage_source
-from express50.errors import CalibrationError, CaptureError
+from express50.capture.readers.selection import EXPRESSION, Selection, parse_selection
+from express50.contract.layout import Dataset, footage_source
+from express50.errors import CalibrationError, CaptureError, Express50Error
 from express50.rigs.rig_check import judge
 
 OURS = "express50"
@@ -38,21 +38,21 @@ OURS = "express50"
 
 @dataclass(frozen=True)
 class Layout:
-    """How one layout is known and read.
+    """One layout of captures.
 
     Attributes:
         name: of the layout.
-        looks: what it looks like, in words.
+        looks: its look in words, for errors.
         fits: whether a file or folder is one.
         subject_of: the subject's id.
-        read: the capture; wishes choose parts of it.
+        read: the capture; selection choose parts of it.
     """
 
     name: str
     looks: str
     fits: Callable[[Path], bool]
     subject_of: Callable[[Path], str]
-    read: Callable[[Path, Wishes], RawCapture]
+    read: Callable[[Path, Selection], RawCapture]
 
 
 # In order: a layout that another could be mistaken for stands behind it.
@@ -84,7 +84,7 @@ LAYOUTS = (
 
 
 def detect(path: Path, name: object = None) -> Layout:
-    """The layout of a file or folder; the first that fits, or the named one.
+    """Find the layout of a file or folder: the named one, else the first that fits.
 
     Raises:
         CaptureError: it does not exist, no layout has the name, or none fits.
@@ -104,7 +104,7 @@ def detect(path: Path, name: object = None) -> Layout:
 
 
 def _holds(path: Path) -> str:
-    """What is there instead, in a few words."""
+    """Describe what the path holds instead."""
     if path.is_file():
         return f"no known layout of a file {path.suffix or 'without an ending'}"
     names = sorted(p.name for p in path.iterdir() if not p.name.startswith("."))
@@ -113,7 +113,7 @@ def _holds(path: Path) -> str:
 
 
 def is_ours(path: Path) -> bool:
-    """Whether a path is a capture in our own layout, or is meant as one."""
+    """Return whether a path is a capture in our own layout, or is meant as one."""
     meta = _meta(path)
     if meta is None:
         return (path / "cameras").is_dir()  # the error then says what is missing
@@ -125,16 +125,16 @@ def is_ours(path: Path) -> bool:
 
 
 def _meta(path: Path) -> dict | None:
-    """Content of a capture.toml, None where there is none."""
+    """Read a capture.toml; None where there is none."""
     file = path / "capture.toml"
     return read_capture_toml(file) if file.is_file() else None
 
 
 def subject_of(path: Path) -> str:
-    """The subject of a capture of any layout, without reading its footage.
+    """Find the subject of a capture of any layout without reading its footage.
 
     Raises:
-        CaptureError: it is no capture, or its subject cannot be an id.
+        CaptureError: it is not a capture, or its subject cannot be an id.
     """
     if is_ours(path):
         return read_meta(path)["subject"]
@@ -152,7 +152,7 @@ def read_any(path: Path) -> RawCapture:
     """Read a capture of any layout.
 
     Raises:
-        CaptureError: it is no capture, or nothing of it can be used.
+        CaptureError: it is not a capture, or nothing of it can be used.
         CalibrationError: its cameras are malformed or do not fit together.
     """
     path = Path(path)
@@ -160,13 +160,13 @@ def read_any(path: Path) -> RawCapture:
         return read_capture(path)
     meta, source = _meta(path) or {}, footage_source(path)
     layout = detect(source, meta.get("layout"))
-    wishes = parse_wishes(meta, path / "capture.toml")
-    raw = layout.read(source, wishes)
+    selection = parse_selection(meta, path / "capture.toml")
+    raw = layout.read(source, selection)
     subject, fps = meta.get("subject") or raw.subject, meta.get("fps", raw.fps)
     check_identity(path / "capture.toml", subject, fps)
     # Where the footage lies is this machine's matter, not the dataset's.
-    told = {key: value for key, value in meta.items() if key != "source"}
-    described = raw.meta | told | {"subject": subject, "fps": float(fps), "layout": raw.layout}
+    given = {key: value for key, value in meta.items() if key != "source"}
+    described = raw.meta | given | {"subject": subject, "fps": float(fps), "layout": raw.layout}
     raw = replace(raw, subject=subject, fps=float(fps), meta=described)
     _check_clips(raw, path)
     return _judged(raw, path)
@@ -182,7 +182,7 @@ def _check_clips(raw: RawCapture, path: Path) -> None:
 
 
 def _judged(raw: RawCapture, path: Path) -> RawCapture:
-    """The capture after the check that its cameras look at one place in front of them."""
+    """Check that the cameras look at one place in front of them; add what is odd as warnings."""
     if not raw.calibration:
         return raw
     verdict = judge(raw.calibration)
@@ -195,7 +195,25 @@ def _judged(raw: RawCapture, path: Path) -> RawCapture:
 
 
 def watched(path: Path) -> list[Path]:
-    """Files and folders whose change makes an ingest stale."""
+    """List files and folders whose change makes an ingest stale."""
     source = footage_source(path)
     found = [path] if source == path else [path, source]
     return found + (renderme.companions(source) if renderme.fits(source) else [])
+
+
+def read_people(dataset: Dataset, subjects: Iterable[str]) -> list[dict]:
+    """Read gender and age of subjects, in order, from their captures.
+
+    They are read for counts and kept nowhere; an entry is empty where the capture is gone or says
+    nothing.
+    """
+    captures = dataset.captures()
+    people = []
+    for subject in subjects:
+        try:
+            capture = captures[subject]
+            meta = read_meta(capture) if is_ours(capture) else read_any(capture).meta
+        except (KeyError, Express50Error, OSError):
+            meta = {}
+        people.append({key: meta[key] for key in ("gender", "age") if key in meta})
+    return people

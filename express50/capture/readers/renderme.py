@@ -17,7 +17,7 @@ import h5py
 import numpy as np
 
 from express50.capture.raw import RawCamera, RawCapture
-from express50.capture.readers.selection import Wishes, check_wishes
+from express50.capture.readers.selection import Selection, check_selection
 from express50.capture.readers.timeline import Moment, common_timeline
 from express50.errors import CaptureError
 from express50.files.containers import WITHIN, attribute, child, members, open_hdf5
@@ -113,7 +113,7 @@ def _number(part: str) -> tuple[int, str]:
     return int(digits or 0), part
 
 
-def read(path: Path, wishes: Wishes) -> RawCapture:
+def read(path: Path, selection: Selection) -> RawCapture:
     """Read an actor's performances.
 
     Raises:
@@ -122,15 +122,15 @@ def read(path: Path, wishes: Wishes) -> RawCapture:
     """
     known = performances(path)
     root = path if path.is_dir() else path.parent
-    names = {"e0": "neutral"} | dict(wishes.expressions)
+    names = {"e0": "neutral"} | dict(selection.expressions)
     skipped, taken, numbers = {}, {}, {}
     pictures: dict[str, dict[Moment, str]] = {}
     for part, performance in known.items():
-        if not wishes.wants_sequence(part, "*" if path.is_file() else USUAL):
+        if not selection.has_sequence(part, "*" if path.is_file() else USUAL):
             skipped[f"sequence {part}"] = "no scripted expression; name it in sequences to take it"
             continue
         try:
-            frames, count = _frames(performance, wishes)
+            frames, count = _frames(performance, selection)
         except CaptureError as error:
             skipped[f"sequence {part}"] = str(error)
             continue
@@ -139,12 +139,12 @@ def read(path: Path, wishes: Wishes) -> RawCapture:
             table = pictures.setdefault(camera, {})
             prefix = f"{performance.raw.name}{WITHIN}Camera/{camera.removeprefix('cam')}/color"
             table |= {(part, key): f"{prefix}/{key}" for key in keys}
-    check_wishes(wishes, list(known), sorted(pictures) or list(wishes.cameras))
+    check_selection(selection, list(known), sorted(pictures) or list(selection.cameras))
     _require(path, taken, skipped)
     last = {part: max(k for t in pictures.values() for p, k in t if p == part) for part in taken}
     line = common_timeline(pictures, list(taken), required=set(last.items()))
     calibration, warnings = _calibration(taken.values(), set(line.names))
-    clips = tuple(names.get(part) or wishes.expression(part) for part in line.sequences)
+    clips = tuple(names.get(part) or selection.expression(part) for part in line.sequences)
     return RawCapture(
         root=root,
         subject=subject_of(path),
@@ -175,7 +175,7 @@ def _require(path: Path, taken: dict, skipped: dict[str, str]) -> None:
         raise CaptureError(f"{path}: no performance can be used: {reasons}")
 
 
-def _frames(performance: Performance, wishes: Wishes) -> tuple[dict[str, list[int]], int]:
+def _frames(performance: Performance, selection: Selection) -> tuple[dict[str, list[int]], int]:
     """Frame numbers by camera, and how many frames the file says the clip has.
 
     Raises:
@@ -188,7 +188,7 @@ def _frames(performance: Performance, wishes: Wishes) -> tuple[dict[str, list[in
     found: dict[str, list[int]] = {}
     where = str(performance.raw)
     for name in members(group, where):
-        if not name.isdecimal() or not wishes.wants_camera(f"cam{name}"):
+        if not name.isdecimal() or not selection.has_camera(f"cam{name}"):
             continue
         colour = child(file, f"Camera/{name}/color", str(performance.raw))
         keys = members(colour, where) if isinstance(colour, h5py.Group) else []

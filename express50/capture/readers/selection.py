@@ -1,4 +1,4 @@
-"""What a capture.toml may ask of a foreign layout: which parts, under which names."""
+"""Selection of parts of a foreign layout, under which names, as a capture.toml states it."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ EXPRESSION = re.compile(r"[A-Za-z0-9][A-Za-z0-9_]*")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Wishes:
-    """A reader's choice of a layout's parts; the names are the layout's own.
+class Selection:
+    """Parts of a layout to read; the names are the layout's own.
 
     Attributes:
         sequences: shell patterns of sequences to take; none takes the layout's usual ones.
         cameras: shell patterns of cameras to take; none takes all.
         expressions: our expression id by sequence.
-        metres_per_unit: what one unit of the calibration's world is; None where nothing is said.
+        metres_per_unit: length of one unit of the calibration's world; None where it is not given.
     """
 
     sequences: tuple[str, ...] = ()
@@ -31,27 +31,27 @@ class Wishes:
     expressions: Mapping[str, str] = field(default_factory=dict)
     metres_per_unit: float | None = None
 
-    def wants_sequence(self, name: str, usual: str = "*") -> bool:
-        """Whether a sequence is to be taken."""
+    def has_sequence(self, name: str, usual: str = "*") -> bool:
+        """Return whether a sequence is selected."""
         return any(fnmatch.fnmatchcase(name, p) for p in self.sequences or (usual,))
 
-    def wants_camera(self, name: str) -> bool:
-        """Whether a camera is to be taken."""
+    def has_camera(self, name: str) -> bool:
+        """Return whether a camera is selected."""
         return not self.cameras or any(fnmatch.fnmatchcase(name, p) for p in self.cameras)
 
     def expression(self, sequence: str) -> str:
-        """Expression id of a sequence: the one that was asked for, else its name made one."""
+        """Return the expression id of a sequence: the given one, else one made of its name."""
         return self.expressions.get(sequence) or identifier(sequence, "_")
 
 
 def identifier(text: str, other: str = "_-") -> str:
-    """An id out of any text: letters, digits and ``other``; what else there is becomes ``_``."""
+    """Make an id of any text: what is not a letter, a digit or in ``other`` becomes ``_``."""
     clean = re.sub(rf"[^A-Za-z0-9{re.escape(other)}]+", "_", text).strip("_-")
     return clean or "unnamed"
 
 
-def parse_wishes(meta: Mapping[str, Any], where: Path) -> Wishes:
-    """Wishes of a capture.toml's content.
+def parse_selection(meta: Mapping[str, Any], where: Path) -> Selection:
+    """Selection of a capture.toml's content.
 
     Raises:
         CaptureError: a value is of another type, or an expression id cannot be one.
@@ -68,7 +68,7 @@ def parse_wishes(meta: Mapping[str, Any], where: Path) -> Wishes:
             f"{where}: expressions is {names!r}, expected a table from sequence to an id of "
             "letters, digits and '_'"
         )
-    return Wishes(
+    return Selection(
         sequences=_patterns(meta, "sequences", where),
         cameras=_patterns(meta, "cameras", where),
         expressions=names,
@@ -83,15 +83,15 @@ def _patterns(meta: Mapping[str, Any], key: str, where: Path) -> tuple[str, ...]
     return tuple(value)
 
 
-def check_wishes(wishes: Wishes, sequences: Sequence[str], cameras: Sequence[str]) -> None:
-    """Refuse patterns that nothing matches: a slip there would look like missing data.
+def check_selection(selection: Selection, sequences: Sequence[str], cameras: Sequence[str]) -> None:
+    """Refuse patterns that match nothing: a typing error would look like missing data.
 
     Raises:
         CaptureError: a wish fits nothing of the layout.
     """
     for what, patterns, known in (
-        ("sequences", (*wishes.sequences, *wishes.expressions), sequences),
-        ("cameras", wishes.cameras, cameras),
+        ("sequences", (*selection.sequences, *selection.expressions), sequences),
+        ("cameras", selection.cameras, cameras),
     ):
         for pattern in patterns:
             if not fnmatch.filter(known, pattern):

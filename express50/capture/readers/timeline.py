@@ -1,7 +1,7 @@
 """One timeline for all cameras: frame 17 of one is frame 17 of all, whatever files are missing.
 
-A layout tells, camera by camera, which moments it has a picture of. Datasets lack some by design
-(AVA-256 lists frames that were never published), so that the n-th files of two cameras may be of
+A layout lists, camera by camera, the moments it has a picture of. Datasets lack some by design
+(AVA-256 lists frames that were never published), so that the n-th files of two cameras may show
 different moments. Moments that a camera lacks are left out for all; a camera that lacks many is
 left out itself.
 """
@@ -58,49 +58,65 @@ def common_timeline(
     order: Sequence[str],
     listed: Collection[Moment] = (),
     required: Collection[Moment] = (),
+    noun: str = "frames",
 ) -> Timeline:
-    """The moments that cameras share.
+    """Find the moments that all cameras share.
 
     Args:
         pictures: name of each picture by moment, by camera.
         order: sequences in the order they are to have.
         listed: moments that the layout's own list names, though no camera may have them.
         required: moments that must not be lost, so that a camera without them is dropped.
+        noun: plural of what a camera has of a moment, for the reasons.
     """
-    seen = Counter(moment for table in pictures.values() for moment in table)
-    common = {m for m, count in seen.items() if 2 * count >= len(pictures)}
-    skipped = _reasons(set(listed) - set(seen), "no camera", "has a")
-    skipped |= _reasons(set(seen) - common, "most cameras", "have no")
-    dropped = {}
-    worth = max(LACKING, 1 / len(pictures)) if pictures else LACKING
-    for camera, table in pictures.items():
-        lacking = common - set(table)
-        lost = sorted(lacking & set(required))
-        if lost:
-            dropped[camera] = f"has no picture of {_words(lost)}, on which the labels stand"
-        elif not table.keys() & common or len(lacking) > worth * len(common):
-            dropped[camera] = f"has {len(common) - len(lacking)} of {len(common)} frames"
+    seen = {moment for table in pictures.values() for moment in table}
+    common = common_moments(pictures)
+    dropped = lacking_cameras(pictures, common, required, noun)
     taken = {camera: table for camera, table in pictures.items() if camera not in dropped}
-    holes = {m: [c for c, table in taken.items() if m not in table] for m in common}
-    for camera in taken:
-        without = {m for m, cameras in holes.items() if cameras and cameras[0] == camera}
-        skipped |= _reasons(without, camera, "has no")
+    skipped = _reasons(set(listed) - seen, "no camera", "has a", noun)
+    skipped |= _reasons(seen - common, "most cameras", "have no", noun)
+    whole = set(common) if taken else set()
+    for camera, table in taken.items():
+        skipped |= _reasons(whole - table.keys(), camera, "has no", noun)
+        whole &= table.keys()
     rank = {sequence: number for number, sequence in enumerate(order)}
-    whole = [m for m in common if taken and not holes[m]]
     moments = tuple(sorted(whole, key=lambda m: (rank[m[0]], m[1])))
     names = {camera: tuple(table[m] for m in moments) for camera, table in taken.items()}
     return Timeline(moments, names, dropped, skipped)
 
 
-def _reasons(moments: Collection[Moment], who: str, has: str) -> dict[str, str]:
-    """One line a sequence that lost moments."""
+def common_moments(pictures: Mapping[str, Mapping[Moment, str]]) -> set[Moment]:
+    """Find the moments of which at least half of the cameras have a picture."""
+    seen = Counter(moment for table in pictures.values() for moment in table)
+    return {moment for moment, count in seen.items() if 2 * count >= len(pictures)}
+
+
+def lacking_cameras(
+    pictures: Mapping[str, Mapping[Moment, str]],
+    common: Collection[Moment],
+    required: Collection[Moment],
+    noun: str,
+) -> dict[str, str]:
+    """Find the cameras that lack so many common moments that they are dropped, with the reason."""
+    worth = max(LACKING, 1 / len(pictures)) if pictures else LACKING
+    dropped = {}
+    for camera, table in pictures.items():
+        lacking = set(common) - table.keys()
+        lost = sorted(lacking & set(required))
+        if lost:
+            dropped[camera] = f"lacks {_words(lost)}, which is labelled"
+        elif len(lacking) == len(common) or len(lacking) > worth * len(common):
+            dropped[camera] = f"has {len(common) - len(lacking)} of {len(common)} {noun}"
+    return dropped
+
+
+def _reasons(moments: Collection[Moment], who: str, has: str, noun: str) -> dict[str, str]:
+    """Write one line per sequence that lost moments."""
     found: dict[str, list[Moment]] = {}
     for moment in sorted(moments):
         found.setdefault(moment[0], []).append(moment)
     return {
-        f"{len(lost)} of the frames of {sequence} ({who})": (
-            f"{who} {has} picture of {_words(lost)}"
-        )
+        f"{len(lost)} of the {noun} of {sequence} ({who})": f"{who} {has} picture of {_words(lost)}"
         for sequence, lost in found.items()
     }
 
