@@ -1,10 +1,15 @@
-"""``express50 export``: tracked heads in the layouts of other tools."""
+"""``express50 export`` writes tracked heads for other tools; ``express50 report`` one HTML page."""
 
 from __future__ import annotations
 
 import argparse
+import json
 from pathlib import Path
 from typing import Any
+
+from express50.console import OK, say, say_json
+from express50.contract.layout import Dataset
+from express50.errors import ConfigError, StageError
 
 FORMATS = ("gaussian-avatars", "obj", "ply", "glb")
 _EPILOG = """example:
@@ -13,7 +18,7 @@ writes OUT/<subject>/, replacing a former export of the subject whole"""
 
 
 def add_commands(subparsers: Any) -> None:
-    """Add ``export``."""
+    """Add ``export`` and ``report``."""
     parser = subparsers.add_parser(
         "export",
         help="write tracked heads for other tools",
@@ -22,7 +27,7 @@ def add_commands(subparsers: Any) -> None:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("dataset", type=Path, metavar="DATASET")
-    parser.add_argument("out", type=Path, metavar="OUT", help="folder that gets one a subject")
+    parser.add_argument("out", type=Path, metavar="OUT", help="folder that gets one per subject")
     parser.add_argument("--format", required=True, choices=FORMATS, help="what to write")
     for name in ("subject", "expression"):
         parser.add_argument(
@@ -55,19 +60,24 @@ def add_commands(subparsers: Any) -> None:
     group.add_argument("--validation-camera", metavar="ID", help="held back in training [the last]")
     parser.add_argument("--json", action="store_true", help="print the account as JSON")
     parser.set_defaults(handler=run_export)
+    parser = subparsers.add_parser(
+        "report", help="gather QC into one self-contained HTML page", description=run_report.__doc__
+    )
+    parser.add_argument("dataset", type=Path)
+    parser.add_argument("--out", type=Path, help="folder of the page (default: DATASET/report)")
+    parser.add_argument("--title", help="heading of the page")
+    parser.add_argument("--json", action="store_true", help="print JSON")
+    parser.set_defaults(handler=run_report)
 
 
 def run_export(args: argparse.Namespace) -> int:
     """Export the chosen subjects, one after the other."""
-    from express50.console import OK, say, say_json
-    from express50.contract.layout import Dataset
     from express50.dataset.export.select import (
         exporting,
         read_tracked,
         tracked_subjects,
         with_clips,
     )
-    from express50.errors import ConfigError
 
     if args.frames == "clips" and args.format == "gaussian-avatars":
         raise ConfigError(
@@ -122,3 +132,23 @@ def _lines(account: dict) -> list[str]:
     if account["format"] == "gaussian-avatars" and account["coefficients"] != "FLAME":
         lines.append(f"head model {account['head']} is not FLAME: use the meshes, see export.json")
     return lines
+
+
+def run_report(args: argparse.Namespace) -> int:
+    """Write DATASET/report/index.html from what the stages left behind."""
+    from express50.dataset.report.page import render_page
+    from express50.files.atomic import write_bytes
+
+    dataset = Dataset(args.dataset)
+    if not dataset.subjects():
+        raise StageError(f"{args.dataset}: nothing is ingested; run 'express50 ingest' first")
+    path = (args.out or dataset.report_dir) / "index.html"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_bytes(path, render_page(dataset, args.title).encode())
+    size = path.stat().st_size
+    say(
+        json.dumps({"report": str(path), "bytes": size})
+        if args.json
+        else f"{path} ({size:,} bytes)"
+    )
+    return OK

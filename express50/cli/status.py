@@ -13,8 +13,7 @@ from express50.console import FAILED, OK, format_table, say, say_json
 from express50.contract.extensions import stages
 from express50.contract.layout import Dataset, existing_dataset
 from express50.errors import ConfigError
-from express50.runner.ledger import Ledger
-from express50.runner.receipts import Receipt
+from express50.runner.ledger import Ledger, Receipt
 from express50.runner.status import StageStatus, read_status
 
 PAGE_SECONDS = 3.0  # between two pages while a run goes on
@@ -58,7 +57,7 @@ def _read(dataset: Dataset) -> list[StageStatus]:
 
 def _page(dataset: Dataset, live: bool | None) -> tuple[str, list[StageStatus]]:
     """The page and what is on it; it loads itself again if ``live``, None: while a run goes on."""
-    from express50.runner.status_page import status_page
+    from express50.runner.status import status_page
 
     table = _read(dataset)
     again = any(row.state == "running" for row in table) if live is None else live
@@ -67,7 +66,7 @@ def _page(dataset: Dataset, live: bool | None) -> tuple[str, list[StageStatus]]:
 
 
 def _keep_page(dataset: Dataset, path: Path) -> list[StageStatus]:
-    from express50.runner.status_page import write_page
+    from express50.runner.status import write_page
 
     said = False
     while True:

@@ -24,7 +24,7 @@ from express50.files.atomic import write_json
 from express50.files.digests import text_digest
 from express50.files.text import NAME, read_json
 from express50.runner.ledger import Ledger, check_schema
-from express50.runner.locks import hold_stages
+from express50.runner.publish import hold_stages
 
 Redact = Callable[[Path, str], bool]
 

@@ -11,7 +11,7 @@ from typing import Any
 
 from express50.errors import StageError
 from express50.runner.clusters import GPU, LocalWorkers, RemoteWorkers
-from express50.runner.receipts import Receipt
+from express50.runner.ledger import Receipt
 from express50.runner.slurm import SlurmJob, SlurmWorkers
 from express50.runner.worker import BATCH_SECONDS, Task, run_task, run_tasks
 

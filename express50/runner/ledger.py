@@ -1,22 +1,101 @@
-"""The ledger: SQLite receipts that say what was made from what, and digests of files.
+"""The ledger: SQLite receipts of what was made from what, last runs, and digests of files.
 
-Only the driver writes it, workers return receipts; others may read meanwhile.
+Only the driver writes it; workers return receipts, and others may read meanwhile.
 """
 
 from __future__ import annotations
 
 import json
 import sqlite3
+import time
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import fields
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
 from express50.errors import FormatError
 from express50.files.digests import file_sha256
 from express50.files.text import parse_json
-from express50.runner.receipts import FileMark, Made, Receipt, Run
+
+
+@dataclass(frozen=True)
+class FileMark:
+    """Size in bytes, modification time, inode and SHA-256 of a published file."""
+
+    size: int
+    mtime_ns: int
+    inode: int
+    sha256: str
+
+
+@dataclass(frozen=True)
+class Made:
+    """Digests of the inputs that an item was made from, and the files that it consists of."""
+
+    inputs: dict[str, str]
+    files: dict[str, FileMark]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Receipt:
+    """The result of one item's last attempt.
+
+    Attributes:
+        stage: stage name.
+        item: item id.
+        fingerprint: digest of stage version, config and inputs.
+        status: ``done`` or ``failed``.
+        reason: one line for a failure, else empty.
+        metrics: what the stage returned.
+        seconds: wall time of the last attempt.
+        peak_memory: largest resident memory while it ran, bytes.
+        attempts: number of tries in that run.
+        time: when it ended, seconds since 1970.
+        made: inputs and files of what was published; read by `Ledger.made`, not by `Ledger.read`.
+    """
+
+    stage: str
+    item: str
+    fingerprint: str
+    status: str
+    reason: str = ""
+    metrics: dict = field(default_factory=dict)
+    seconds: float = 0.0
+    peak_memory: int = 0
+    attempts: int = 1
+    time: float = field(default_factory=time.time)
+    made: Made | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Run:
+    """The last run of a stage; times are seconds since 1970.
+
+    Attributes:
+        stage: stage name.
+        items: number of items to bring up to date.
+        current: number of those that already were.
+        begun: when it began.
+        seen: when it last gave a sign of life.
+        ended: when it ended; 0 if it did not.
+        running: start time of each item in work.
+    """
+
+    stage: str
+    items: int
+    current: int = 0
+    begun: float = 0.0
+    seen: float = 0.0
+    ended: float = 0.0
+    running: dict[str, float] = field(default_factory=dict)
+
+
+def mark_file(path: Path) -> FileMark:
+    """Read size, time and digest of a file as it is now."""
+    stat = path.stat()
+    return FileMark(stat.st_size, stat.st_mtime_ns, stat.st_ino, file_sha256(path))
+
 
 SCHEMA = """
 CREATE TABLE IF NOT EXISTS receipts (
@@ -47,11 +126,11 @@ KINDS = {"item": str, "fingerprint": str, "status": str, "reason": str, "metrics
 def check_schema(database: sqlite3.Connection) -> None:
     """Refuse a database that holds more than a ledger's tables.
 
-    A file from elsewhere may hold views and triggers, which are programs: they would run, without
-    end if they like, whenever a receipt is read or written.
+    A file from elsewhere may hold views and triggers, which run as programs whenever a receipt is
+    read or written.
 
     Raises:
-        sqlite3.DatabaseError: it does, or is no database.
+        sqlite3.DatabaseError: it does, or it is not a database.
     """
     database.execute("PRAGMA trusted_schema=OFF")
     for kind, name in database.execute("SELECT type, tbl_name FROM sqlite_master").fetchall():
@@ -60,7 +139,7 @@ def check_schema(database: sqlite3.Connection) -> None:
 
 
 class Ledger:
-    """Receipts by stage and item, what they are made of, last runs, and a cache of file digests."""
+    """Receipts by stage and item, the inputs and files of each, last runs, and digests of files."""
 
     def __init__(self, path: Path, read_only: bool = False) -> None:
         self._fresh: dict[str, tuple] = {}  # digests not yet stored
@@ -74,8 +153,8 @@ class Ledger:
             self._database = sqlite3.connect(path, timeout=60, isolation_level=None)
             check_schema(self._database)
             self._database.execute("PRAGMA journal_mode=WAL")
-            # A receipt lost with the power costs an item once more; waiting for the disk after each
-            # would cost every item. What must not be lost, `forget` waits for.
+            # A receipt lost in a power failure costs making one item again; waiting for the disk
+            # after each would slow every item. `forget` waits, as its removals must not be lost.
             self._database.execute("PRAGMA synchronous=NORMAL")
             self._database.executescript(SCHEMA)
 
@@ -91,21 +170,21 @@ class Ledger:
 
     @contextmanager
     def _damage(self) -> Iterator[None]:
-        """Any statement may be the one that meets a damaged page, a full disk or a lock."""
+        """Turn what any statement may meet (a damaged page, a full disk, a lock) into one error."""
         try:
             yield
         except (sqlite3.DatabaseError, ValueError, TypeError, OverflowError) as error:
-            if self._read_only:  # whoever only looks on is not told to delete
+            if self._read_only:  # a reader must not be advised to delete
                 words = f"cannot be read as a ledger ({error})"
             elif isinstance(error, sqlite3.OperationalError) and "no such" not in str(error):
-                words = f"the ledger cannot be used ({error}); mend that and run the same again"
+                words = f"the ledger cannot be used ({error}); fix that and run the same again"
             else:
                 words = f"not a ledger ({error}); {DELETE}"
             raise FormatError(f"{self._path}: {words}") from error
 
     @contextmanager
     def _change(self) -> Iterator[sqlite3.Connection]:
-        """One transaction: all of it or nothing."""
+        """Run one transaction: all of it is stored, or nothing."""
         with self._damage():
             self._database.execute("BEGIN IMMEDIATE")
             try:
@@ -123,12 +202,12 @@ class Ledger:
             FormatError: one is damaged.
         """
         with self._damage():
-            told = self._database.execute("PRAGMA quick_check(1)").fetchone()[0]
-            if told != "ok":
-                raise sqlite3.DatabaseError(told)
+            verdict = self._database.execute("PRAGMA quick_check(1)").fetchone()[0]
+            if verdict != "ok":
+                raise sqlite3.DatabaseError(verdict)
 
     def write(self, receipt: Receipt) -> None:
-        """Store a receipt in the place of the item's former one."""
+        """Store a receipt; it replaces the item's former one."""
         row = {name: getattr(receipt, name) for name in COLUMNS}
         row["metrics"] = json.dumps(receipt.metrics, sort_keys=True)
         marks = ", ".join(f":{name}" for name in row)
@@ -140,11 +219,12 @@ class Ledger:
             if receipt.made is None:
                 database.execute("DELETE FROM made WHERE stage = ? AND item = ?", key)
             else:
-                values = (*key, *_texts(receipt.made))
-                database.execute("INSERT OR REPLACE INTO made VALUES (?, ?, ?, ?)", values)
+                files = {name: list(vars(m).values()) for name, m in receipt.made.files.items()}
+                texts = (json.dumps(t, sort_keys=True) for t in (receipt.made.inputs, files))
+                database.execute("INSERT OR REPLACE INTO made VALUES (?, ?, ?, ?)", (*key, *texts))
 
     def read(self, stage: str) -> dict[str, Receipt]:
-        """Receipts of a stage by item, sorted.
+        """Read the receipts of a stage by item, sorted.
 
         Raises:
             FormatError: a row is damaged.
@@ -161,7 +241,7 @@ class Ledger:
         return found
 
     def made(self, stage: str) -> dict[str, Made]:
-        """Inputs and files of a stage's items, sorted; of those made since these are kept.
+        """Read inputs and files of a stage's items, sorted; old ledgers lack them.
 
         Raises:
             FormatError: a row is damaged.
@@ -176,7 +256,7 @@ class Ledger:
         return found
 
     def write_run(self, run: Run) -> None:
-        """Store a run in the place of the stage's former one."""
+        """Store a run; it replaces the stage's former one."""
         row = dict(vars(run)) | {"running": json.dumps(run.running)}
         marks = ", ".join(f":{name}" for name in row)
         with self._damage():
@@ -185,7 +265,7 @@ class Ledger:
             )
 
     def runs(self) -> dict[str, Run]:
-        """Last runs by stage.
+        """Read the last run of each stage.
 
         Raises:
             FormatError: a row is damaged.
@@ -203,7 +283,7 @@ class Ledger:
         return table
 
     def _rows(self, names: tuple[str, ...], source: str, *values: str) -> list[dict[str, Any]]:
-        """Rows as tables; none where the ledger is being made, or is of before it had the table."""
+        """Read rows as tables; none where the ledger is new, or older than the table."""
         query = f"SELECT {', '.join(names)} FROM {source}"
         with self._damage():
             try:
@@ -215,7 +295,7 @@ class Ledger:
         return [dict(zip(names, row, strict=True)) for row in rows]
 
     def forget(self, stage: str, items: Iterable[str]) -> None:
-        """Remove receipts; when this returns they are gone, even if the power goes."""
+        """Remove receipts; once this returns, they stay removed even if the power fails."""
         keys = [(stage, item) for item in items]
         with self._damage():
             self._database.execute("PRAGMA synchronous=FULL")
@@ -226,7 +306,7 @@ class Ledger:
             self._database.execute("PRAGMA synchronous=NORMAL")
 
     def sha256(self, path: Path) -> str:
-        """SHA-256 of a file; read again only when its size or modification time changed."""
+        """Return the SHA-256 of a file; it is read again only when its size or time changed."""
         stat = path.stat()
         key = (str(path), stat.st_size, stat.st_mtime_ns, stat.st_ino)
         with self._damage():
@@ -242,13 +322,13 @@ class Ledger:
         return digest
 
     def know(self, folder: Path, files: Mapping[str, FileMark]) -> None:
-        """Take over digests of files below a folder, so that no later stage hashes them again."""
+        """Take over digests of files below a folder, so that no later stage hashes them."""
         for name, mark in files.items():
             path = str(folder / name)
             self._fresh[path] = (path, mark.size, mark.mtime_ns, mark.inode, mark.sha256)
 
     def keep_digests(self) -> None:
-        """Store new digests in one transaction; one each would cost a disk sync a file."""
+        """Store new digests in one transaction; one per file would cost a disk sync each."""
         if self._read_only:
             return
         with self._change() as database:
@@ -258,14 +338,8 @@ class Ledger:
         self._fresh.clear()
 
 
-def _texts(made: Made) -> tuple[str, str]:
-    """JSON of inputs and files."""
-    files = {name: [m.size, m.mtime_ns, m.inode, m.sha256] for name, m in made.files.items()}
-    return json.dumps(made.inputs, sort_keys=True), json.dumps(files, sort_keys=True)
-
-
 def _open_to_read(path: Path) -> sqlite3.Connection:
-    """A connection that cannot write, also where the folder cannot be written to."""
+    """Open a connection that cannot write, also in a folder that cannot be written to."""
     uri = path.resolve().as_uri()
     for mode in ("mode=ro", "mode=ro&immutable=1"):
         database = sqlite3.connect(f"{uri}?{mode}", uri=True, timeout=60, isolation_level=None)

@@ -1,14 +1,18 @@
-"""Crash-safe outputs of stages: an item's folder appears whole, in one rename."""
+"""Crash-safe outputs: an item appears whole, in one rename; a stage runs once at a time."""
 
 from __future__ import annotations
 
+import fcntl
 import shutil
+import time
 import uuid
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Iterable, Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from typing import IO
 
 from express50.contract.layout import Dataset
+from express50.errors import StageError
 from express50.files.atomic import replace_directory, sync_directory, sync_tree
 
 
@@ -38,15 +42,11 @@ def set_aside(dataset: Dataset, stage: str, item: str) -> bool:
     stale.parent.mkdir(parents=True, exist_ok=True)
     target.rename(stale)
     sync_directory(target.parent)
-    _remove_empty(target.parent, dataset.stage_dir(stage))
-    return True
-
-
-def _remove_empty(folder: Path, top: Path) -> None:
-    """Remove empty folders of nested items, so that no stage takes one for an item."""
-    while folder != top and not any(folder.iterdir()):
+    folder = target.parent  # empty folders of nested items must not be taken for items
+    while folder != dataset.stage_dir(stage) and not any(folder.iterdir()):
         folder.rmdir()
         folder = folder.parent
+    return True
 
 
 def discard_stale(dataset: Dataset, stage: str, item: str) -> None:
@@ -60,3 +60,60 @@ def clean_leftovers(dataset: Dataset, stage: str) -> int:
     for path in leftovers:
         shutil.rmtree(path, ignore_errors=True)
     return len(leftovers)
+
+
+GLANCE_SECONDS = 0.05
+
+
+@contextmanager
+def stage_lock(dataset: Dataset, stage: str) -> Iterator[None]:
+    """Hold a stage of a dataset; the system lets go when the process ends, however it ends.
+
+    Raises:
+        StageError: another process holds it.
+    """
+    path = dataset.staging_dir / f".{stage}.lock"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("w") as file:
+        if not _locked(file):
+            time.sleep(GLANCE_SECONDS)  # perhaps `is_running` has just looked
+            if not _locked(file):
+                raise StageError(
+                    f"{dataset.root}: another '{stage}' runs on this dataset; wait until it ends"
+                )
+        yield
+
+
+def _locked(file: IO[str]) -> bool:
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return True
+
+
+@contextmanager
+def hold_stages(dataset: Dataset, names: Iterable[str]) -> Iterator[None]:
+    """Hold several stages, so that none of them runs meanwhile.
+
+    Raises:
+        StageError: one of them runs.
+    """
+    with ExitStack() as stack:
+        for name in names:
+            stack.enter_context(stage_lock(dataset, name))
+        yield
+
+
+def is_running(dataset: Dataset, stage: str) -> bool:
+    """Whether some process runs a stage at this moment."""
+    path = dataset.staging_dir / f".{stage}.lock"
+    if not path.is_file():
+        return False
+    with path.open("r") as file:
+        try:
+            # Shared, and let go at once; a stage that starts meanwhile tries again.
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return True
+    return False

@@ -1,49 +1,53 @@
-"""Runs a stage over its items: skips what is current, isolates what is bad, accounts for all."""
+"""Runs a stage over its items: skips current ones, isolates bad ones, accounts for all."""
 
 from __future__ import annotations
 
 import fnmatch
 import functools
 import time
+import tomllib
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 from express50.contract.config import config_toml, nearest
 from express50.contract.layout import Dataset
-from express50.contract.stage import Stage
+from express50.contract.stage import Note, Stage
 from express50.errors import ConfigError, Express50Error, StageError
 from express50.files.atomic import write_bytes
 from express50.files.digests import path_digest
 from express50.runner.executor import Pool
-from express50.runner.ledger import Ledger
-from express50.runner.locks import stage_lock
-from express50.runner.progress import Progress
-from express50.runner.publish import clean_leftovers, discard_stale, set_aside
-from express50.runner.receipts import Receipt
-from express50.runner.runlog import RunLog
+from express50.runner.ledger import Ledger, Made, Receipt
+from express50.runner.progress import Progress, RunLog
+from express50.runner.publish import clean_leftovers, discard_stale, set_aside, stage_lock
 from express50.runner.worker import Task, fingerprint, input_digests
 
 WARNINGS = 12  # lines; more of them would hide the account
-ALIKE = 3  # so many first items that fail for one reason are no accident
+ALIKE = 3  # so many first items that fail for one reason show a wrong setting
+NAMED = 3  # changed inputs that are named
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of one item: ``done``, ``skipped`` (was current) or ``failed``."""
+    """The result of one item: ``done``, ``skipped`` (was current) or ``failed``.
+
+    ``again`` says why an item was made that a former run had made already.
+    """
 
     item: str
     status: str
     reason: str = ""
     seconds: float = 0.0
-    dropped: tuple[dict, ...] = ()
-    warnings: tuple[dict, ...] = ()
+    dropped: tuple[Note, ...] = ()
+    warnings: tuple[Note, ...] = ()
+    again: str = ""
 
 
 @dataclass(frozen=True)
 class Summary:
-    """What became of every item of a stage."""
+    """The results of all items of a stage."""
 
     stage: str
     outcomes: tuple[Outcome, ...]
@@ -59,7 +63,7 @@ class Summary:
         return self.count("failed") == 0
 
     def to_json(self) -> dict[str, Any]:
-        """JSON form, also the machine-readable output of a stage command."""
+        """Return the JSON form, which is also what a stage command prints with --json."""
         return {
             "stage": self.stage,
             "read": len(self.outcomes),
@@ -68,27 +72,27 @@ class Summary:
             "failed": self.count("failed"),
             "seconds": round(self.seconds, 3),
             "items": [
-                dict(vars(o))
-                | {"dropped": list(o.dropped), "warnings": list(o.warnings)}
-                | {"seconds": round(o.seconds, 3)}
-                for o in self.outcomes
+                asdict(outcome) | {"seconds": round(outcome.seconds, 3)}
+                for outcome in self.outcomes
             ],
         }
 
     def lines(self) -> Iterator[str]:
-        """Lines for people: the account, then every item or part that is not there, and why."""
+        """Yield the account for people, then what was made again, dropped or failed, and why."""
         counts = " + ".join(f"{self.count(s)} {s}" for s in ("done", "skipped", "failed"))
         yield f"{self.stage}: read {len(self.outcomes)} = {counts} in {self.seconds:.1f} s"
+        for why, count in Counter(o.again for o in self.outcomes if o.again).most_common():
+            yield f"  made again {count}: {why}"
         for outcome in self.outcomes:
             if outcome.status == "failed":
                 yield f"  failed {outcome.item}: {outcome.reason}"
             for part in outcome.dropped:
-                yield f"  dropped {part['what']} of {outcome.item}: {part['why']}"
-        odd = [(o.item, row) for o in self.outcomes for row in o.warnings]
-        for item, row in odd[:WARNINGS]:
-            yield f"  warning {item}: {row['what']}: {row['why']}"
-        if len(odd) > WARNINGS:
-            yield f"  and {len(odd) - WARNINGS} warnings more: see the items' metrics.json"
+                yield f"  dropped {part.what} of {outcome.item}: {part.why}"
+        doubtful = [(o.item, note) for o in self.outcomes for note in o.warnings]
+        for item, note in doubtful[:WARNINGS]:
+            yield f"  warning {item}: {note.what}: {note.why}"
+        if len(doubtful) > WARNINGS:
+            yield f"  and {len(doubtful) - WARNINGS} more warnings: see the items' metrics.json"
 
 
 def select_items(stage: Stage, dataset: Dataset, pattern: str) -> list[str]:
@@ -146,12 +150,12 @@ def run_stage(
     shared = nullcontext(pool) if pool else Pool(workers, scheduler)
     with shared as workers_pool, stage_lock(dataset, stage.name), Ledger(dataset.ledger) as ledger:
         clean_leftovers(dataset, stage.name)
-        save_config(dataset, stage, config)
+        changed = save_config(dataset, stage, config)
         if items is None:
             retire_items(dataset, ledger, stage.name, chosen)
         with RunLog(dataset.ledger, stage.name, len(chosen)) as log:
             outcomes = _run_items(
-                stage, dataset, config, chosen, ledger, workers_pool, progress, log
+                stage, dataset, config, chosen, ledger, workers_pool, progress, log, changed
             )
     missing = set(chosen) - set(outcomes)
     if missing:  # read = done + skipped + failed
@@ -169,36 +173,48 @@ def _run_items(
     pool: Pool,
     progress: bool,
     log: RunLog,
+    changed: list[str],
 ) -> dict[str, Outcome]:
-    """Sort items into current, unreadable and to do; run the last; settle each as it ends."""
+    """Sort items into current, unreadable and to do; run the last; settle each as it ends.
+
+    ``changed`` has the settings that differ from those of the former run.
+    """
     outcomes: dict[str, Outcome] = {}
-    receipts = ledger.read(stage.name)
-    tasks, unreadable = [], []
+    receipts, made = ledger.read(stage.name), ledger.made(stage.name)
+    tasks, unreadable, again = [], [], {}
     # Items share inputs; what a stage reads does not change while it runs.
     digest_of = functools.cache(lambda path: path_digest(path, ledger.sha256))
     for item in chosen:
         try:
             inputs = input_digests(stage, dataset, item, config, digest_of)
-        except ConfigError:  # a setting is wrong, no item: what was made before stays
+        except ConfigError:  # a setting is wrong, not an item: former outputs stay
             raise
         except Express50Error as error:
             reason = f"{type(error).__name__}: {error}"
-            unreadable.append(_refusal(stage, item, reason))
+            unreadable.append(
+                Receipt(
+                    stage=stage.name, item=item, fingerprint="", status="failed", reason=reason,
+                    attempts=0,
+                )
+            )  # fmt: skip
             continue
         digest = fingerprint(stage, config, inputs)
         if is_current(dataset, receipts.get(item), digest):
             outcomes[item] = _outcome(receipts[item], status="skipped")
         else:
             tasks.append(Task(stage, dataset, item, config, digest, inputs, pool.threads))
+            again[item] = why_again(
+                stage, receipts.get(item), digest, made.get(item), inputs, changed
+            )
     ledger.keep_digests()
     reasons = {receipt.reason for receipt in unreadable}
     if len(unreadable) == len(chosen) > 1 and len(reasons) == 1:
-        # A wrong setting rather than bad items: what was made before stays.
+        # A setting is wrong rather than all items: former outputs stay.
         raise StageError(f"{stage.name}: no item can be made: {reasons.pop()}")
     log.current(len(outcomes))
 
     def begin(task: Task) -> None:
-        # A receipt must not outlive the output it speaks of, should this run be killed half-way.
+        # A receipt must not outlive its output, should this run be killed half-way.
         if task.item in receipts:
             ledger.forget(stage.name, [task.item])
         log.begin(task.item)
@@ -208,7 +224,7 @@ def _run_items(
 
         def settle(receipt: Receipt) -> None:
             record(dataset, ledger, receipt)
-            outcomes[receipt.item] = _outcome(receipt)
+            outcomes[receipt.item] = _outcome(receipt, again=again.get(receipt.item, ""))
             display.settle(receipt)
             log.settle(receipt.item)
 
@@ -229,18 +245,18 @@ def _refuse_alike(stage: Stage, ended: list[Receipt], former: Mapping[str, Recei
     """Stop where the first items fail for one reason though they were made before.
 
     Raises:
-        StageError: they do: a setting is wrong, and the others' outputs are worth keeping.
+        StageError: they do; a setting is wrong, and the others' outputs are worth keeping.
     """
     made = all(r.item in former and former[r.item].status == "done" for r in ended)
     if made and all(r.status == "failed" and r.reason == ended[0].reason for r in ended):
         raise StageError(
             f"{stage.name}: the first {len(ended)} items fail alike, though they were made before:"
-            f" {ended[0].reason}; mend the setting, or run the same again to go on with the others"
+            f" {ended[0].reason}; fix the setting, or run the same again to go on with the others"
         )
 
 
 def is_current(dataset: Dataset, receipt: Receipt | None, digest: str) -> bool:
-    """Whether an item was made from exactly these inputs and its output is there."""
+    """Say whether an item was made from exactly these inputs and its output is there."""
     return (
         receipt is not None
         and receipt.status == "done"
@@ -250,7 +266,7 @@ def is_current(dataset: Dataset, receipt: Receipt | None, digest: str) -> bool:
 
 
 def record(dataset: Dataset, ledger: Ledger, receipt: Receipt) -> None:
-    """Store a receipt; a failed item's former output is set aside, so that nothing reads it."""
+    """Store a receipt; the former output of a failed item is set aside, unread."""
     if receipt.status == "failed":
         set_aside(dataset, receipt.stage, receipt.item)
     else:
@@ -269,25 +285,62 @@ def retire_items(dataset: Dataset, ledger: Ledger, stage: str, chosen: list[str]
     ledger.forget(stage, gone)
 
 
-def save_config(dataset: Dataset, stage: Stage, config: Any) -> None:
-    """Save the resolved config of a stage beside its outputs."""
+def save_config(dataset: Dataset, stage: Stage, config: Any) -> list[str]:
+    """Save the resolved config of a stage; returns the settings that changed."""
     path, text = dataset.config_file(stage.name), config_toml(stage.name, config)
-    if not path.is_file() or path.read_text(encoding="utf-8") != text:
-        write_bytes(path, text.encode())
+    former = path.read_text(encoding="utf-8", errors="replace") if path.is_file() else ""
+    if former == text:
+        return []
+    write_bytes(path, text.encode())
+    try:
+        before, now = (tomllib.loads(t).get(stage.name, {}) for t in (former, text))
+    except (tomllib.TOMLDecodeError, AttributeError):
+        return []
+    return sorted(k for k in before.keys() | now.keys() if before.get(k) != now.get(k))
 
 
-def _refusal(stage: Stage, item: str, reason: str) -> Receipt:
-    return Receipt(
-        stage=stage.name, item=item, fingerprint="", status="failed", reason=reason, attempts=0
-    )
+def why_again(
+    stage: Stage,
+    receipt: Receipt | None,
+    digest: str,
+    made: Made | None,
+    inputs: Mapping[str, str],
+    changed: Sequence[str],
+) -> str:
+    """Say why an item is made that a former run had made; empty where none had.
+
+    Args:
+        stage: the stage.
+        receipt: of the former run.
+        digest: fingerprint of the item now.
+        made: inputs and files of the former run, where the ledger has them.
+        inputs: digests of the inputs now.
+        changed: settings that differ from those of the former run.
+    """
+    if receipt is None or receipt.status != "done":
+        return ""
+    if receipt.fingerprint == digest:
+        return "output missing"
+    before = made.inputs if made is not None else inputs
+    names = [n for n in sorted({*before, *inputs}) if before.get(n) != inputs.get(n)]
+    if names:
+        return f"inputs changed: {', '.join(names[:NAMED])}{', ...' if names[NAMED:] else ''}"
+    if changed:
+        return f"settings changed: {', '.join(changed)}"
+    return f"stage version changed, it is {stage.version} now"
 
 
-def _outcome(receipt: Receipt, status: str = "") -> Outcome:
+def _outcome(receipt: Receipt, status: str = "", again: str = "") -> Outcome:
+    def notes(*keys: str) -> tuple[Note, ...]:
+        rows = (row for key in keys for row in receipt.metrics.get(key, ()))
+        return tuple(Note(str(row["what"]), str(row["why"])) for row in rows)
+
     return Outcome(
         item=receipt.item,
         status=status or receipt.status,
         reason=receipt.reason,
         seconds=receipt.seconds,
-        dropped=tuple(receipt.metrics.get("dropped", ())),
-        warnings=tuple(row for k in ("warnings", "weak") for row in receipt.metrics.get(k, ())),
+        dropped=notes("dropped"),
+        warnings=notes("warnings", "weak"),
+        again=again,
     )

@@ -18,8 +18,8 @@ from express50.contract.stage import Result, Stage
 from express50.errors import Express50Error, StageError
 from express50.files.atomic import dump_json, write_bytes
 from express50.files.digests import files_of, value_digest
+from express50.runner.ledger import FileMark, Made, Receipt, mark_file
 from express50.runner.publish import publishing
-from express50.runner.receipts import FileMark, Made, Receipt, mark_file
 from express50.runner.threads import cap_threads
 
 BATCH_SECONDS = 0.2  # a batch begins no further item after so long

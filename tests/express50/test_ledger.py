@@ -6,8 +6,7 @@ import pytest
 
 from express50.errors import FormatError, StageError
 from express50.files.digests import file_sha256, path_digest, stat_digest
-from express50.runner.ledger import Ledger
-from express50.runner.receipts import Receipt
+from express50.runner.ledger import Ledger, Receipt
 
 
 @pytest.fixture

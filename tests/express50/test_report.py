@@ -11,8 +11,7 @@ from express50.contract.layout import Dataset
 from express50.dataset.report.collect import Picture, spread
 from express50.dataset.report.page import number, render_page
 from express50.files.images import write_image
-from express50.runner.ledger import Ledger
-from express50.runner.receipts import Receipt
+from express50.runner.ledger import Ledger, Receipt
 
 
 @pytest.fixture

@@ -16,10 +16,8 @@ import pytest
 
 from express50.cli import status as status_cli
 from express50.cli.main import main
-from express50.runner.ledger import Ledger
-from express50.runner.receipts import Receipt, Run
-from express50.runner.status import SILENT_SECONDS, read_status
-from express50.runner.status_page import format_seconds, status_page
+from express50.runner.ledger import Ledger, Receipt, Run
+from express50.runner.status import SILENT_SECONDS, format_seconds, read_status, status_page
 from tests.faults import toy
 
 REPOSITORY = Path(__file__).resolve().parents[2]
@@ -151,12 +149,18 @@ def start(dataset, workers, slower=10):
     return subprocess.Popen(command, cwd=REPOSITORY, env=environment, stderr=subprocess.DEVNULL)
 
 
+def status_of_toy(dataset, now=None):
+    with Ledger(dataset.ledger, read_only=True) as ledger:
+        (row,) = read_status(ledger, ["toy"], now)
+    return row
+
+
 def first_with(dataset, seen, patience=60.0):
     """The first status of which something is true."""
     give_up = time.monotonic() + patience
     while time.monotonic() < give_up:
         if dataset.ledger.is_file():
-            (row,) = status_cli._read(dataset, ["toy"])
+            row = status_of_toy(dataset)
             if seen(row):
                 return row
         time.sleep(0.05)
@@ -173,11 +177,13 @@ def test_page_follows_a_run_of_another_process_to_its_end(tmp_path, monkeypatch,
     row = first_with(dataset, lambda row: row.state == "running" and row.running and row.done)
     assert row.done + len(row.failed) + len(row.running) + row.missing == len(names)
     page = tmp_path / "page.html"
-    (end,) = status_cli._keep_page(dataset, ["toy"], page)
+    monkeypatch.setattr(status_cli, "stages", lambda: {"toy": toy.STAGE})
+    assert main(["status", str(dataset.root), "--page", str(page)]) == 1
     assert process.wait(timeout=60) == 1
+    end = status_of_toy(dataset)
     assert (end.state, end.done, len(end.failed), end.missing) == ("failed", 8, 1, 0)
     text = page.read_text()
-    assert "bad1" in text and "expected &#39;mended&#39;" in text
+    assert "bad1" in text and "expected &#39;repaired&#39;" in text
     assert "script" not in parsed(text).seen
 
 
@@ -187,8 +193,7 @@ def test_a_killed_run_is_told_from_one_that_works(tmp_path):
     first_with(dataset, lambda row: row.running)
     process.send_signal(signal.SIGKILL)
     process.wait()
-    with Ledger(dataset.ledger, read_only=True) as ledger:
-        (row,) = read_status(ledger, ["toy"], time.time() + SILENT_SECONDS)
+    row = status_of_toy(dataset, time.time() + SILENT_SECONDS)
     assert row.state == "stopped"
     assert row.missing + row.done == 40 and row.missing > 0
 

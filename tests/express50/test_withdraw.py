@@ -16,10 +16,8 @@ from express50.dataset.id_search import files_naming, files_that, names_any_of
 from express50.dataset.withdraw import withdraw, withdrawn, withdrawn_file
 from express50.errors import CaptureError, FormatError, StageError
 from express50.files.digests import text_digest
-from express50.runner.ledger import Ledger
-from express50.runner.locks import stage_lock
-from express50.runner.publish import publishing
-from express50.runner.receipts import Made, Receipt, Run
+from express50.runner.ledger import Ledger, Made, Receipt, Run
+from express50.runner.publish import publishing, stage_lock
 from express50.runner.status import read_status
 from pipelines import ingest
 from tests.faults.toy import tree

@@ -19,7 +19,7 @@ from express50.errors import StageError
 from express50.files.atomic import write_json
 from express50.files.digests import text_digest
 from express50.runner.ledger import Ledger
-from express50.runner.locks import stage_lock
+from express50.runner.publish import stage_lock
 from pipelines import ingest
 from tests.faults import toy
 from tests.synth import make_capture

@@ -128,7 +128,7 @@ def test_interrupt_stops_soon_and_is_resumable(tmp_path):
 
 def test_second_run_on_the_same_stage_is_refused(tmp_path):
     from express50.errors import StageError
-    from express50.runner.locks import stage_lock
+    from express50.runner.publish import stage_lock
 
     dataset = toy.make_dataset(tmp_path / "data", ["item0"])
     with stage_lock(dataset, "toy"), pytest.raises(StageError, match="another 'toy' runs"):
@@ -138,13 +138,13 @@ def test_second_run_on_the_same_stage_is_refused(tmp_path):
 def test_a_glance_at_a_lock_keeps_no_stage_from_starting(tmp_path, monkeypatch):
     import fcntl
 
-    from express50.runner import locks
+    from express50.runner import publish
 
     dataset = toy.make_dataset(tmp_path / "data", ["item0"])
-    with locks.stage_lock(dataset, "toy"):
+    with publish.stage_lock(dataset, "toy"):
         pass
     glance = (dataset.staging_dir / ".toy.lock").open("r")
     fcntl.flock(glance, fcntl.LOCK_SH)
-    monkeypatch.setattr(locks.time, "sleep", lambda _: glance.close())
-    with locks.stage_lock(dataset, "toy"):
-        assert locks.is_running(dataset, "toy")
+    monkeypatch.setattr(publish.time, "sleep", lambda _: glance.close())
+    with publish.stage_lock(dataset, "toy"):
+        assert publish.is_running(dataset, "toy")

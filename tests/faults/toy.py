@@ -15,7 +15,7 @@ from pathlib import Path
 
 from express50.contract.config import resolve_config
 from express50.contract.layout import Dataset
-from express50.contract.stage import Stage
+from express50.contract.stage import Note, Result, Stage
 from express50.errors import StageError
 from express50.runner.executor import Pool
 from express50.runner.runner import run_stage
@@ -46,7 +46,7 @@ def inputs(dataset: Dataset, item: str, config: ToyConfig) -> dict[str, Path | s
     return {"text": dataset.root / "in" / f"{item.replace('/', '+')}.txt", "kind": "toy"}
 
 
-def run(dataset: Dataset, item: str, config: ToyConfig, out: Path) -> dict:
+def run(dataset: Dataset, item: str, config: ToyConfig, out: Path) -> Result:
     text = (dataset.root / "in" / f"{item.replace('/', '+')}.txt").read_text()
     if config.files < 0:
         raise StageError(f"toy.files is {config.files}, expected files")
@@ -59,13 +59,13 @@ def run(dataset: Dataset, item: str, config: ToyConfig, out: Path) -> dict:
     return misbehave(dataset, item, text)
 
 
-def misbehave(dataset: Dataset, item: str, text: str) -> dict:
-    if item.startswith("bad") and text != "mended":
-        raise StageError(f"{item}: text is {text!r}, expected 'mended'")
+def misbehave(dataset: Dataset, item: str, text: str) -> Result:
+    if item.startswith("bad") and text != "repaired":
+        raise StageError(f"{item}: text is {text!r}, expected 'repaired'")
     if item.startswith("bug"):
-        return {}["absent"]
+        raise KeyError("absent")
     if item.startswith("nan"):
-        return {"value": float("nan")}
+        return Result({"value": float("nan")})
     if item.startswith("poison"):
         os.kill(os.getpid(), signal.SIGKILL)
     if item.startswith("once"):
@@ -73,8 +73,8 @@ def misbehave(dataset: Dataset, item: str, text: str) -> dict:
         if not mark.exists():
             mark.touch()
             os.kill(os.getpid(), signal.SIGKILL)
-    dropped = [{"what": "cam03", "why": "dark"}] if item.startswith("drop") else []
-    return {"length": len(text), "dropped": dropped}
+    dropped = [Note("cam03", "dark")] if item.startswith("drop") else []
+    return Result({"length": len(text)}, dropped)
 
 
 STAGE = Stage(
@@ -91,12 +91,12 @@ STAGE = Stage(
 def after_toy() -> Stage:
     """A stage that reads the toy's folders."""
 
-    def copy(dataset: Dataset, item: str, config: ToyConfig, out: Path) -> dict:
+    def copy(dataset: Dataset, item: str, config: ToyConfig, out: Path) -> Result:
         data = b"".join(
             path.read_bytes() for path in sorted((dataset.item_dir("toy", item) / "deep").iterdir())
         )
         (out / "sum.txt").write_text(hashlib.sha256(data).hexdigest())
-        return {}
+        return Result()
 
     return Stage(
         name="after",

@@ -33,8 +33,7 @@ from express50.files.video import VideoReader, iterate_video
 from express50.head.flame import load_flame
 from express50.landmarks.sources import read_points
 from express50.rigs.read import guess_format, read_rig
-from express50.runner.ledger import Ledger
-from express50.runner.receipts import Receipt
+from express50.runner.ledger import Ledger, Receipt
 from express50.runner.runner import run_stage
 from express50.shards.codecs import decode_picture, encode_pictures
 from express50.shards.offsets import read_offsets, write_offsets

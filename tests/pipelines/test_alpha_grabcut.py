@@ -139,6 +139,6 @@ def test_a_frame_without_a_face_costs_itself_alone(tmp_path: Path) -> None:
     run = run_stage(ALPHA, dataset, AlphaConfig(method="grabcut"), workers=0, progress=False)
     assert run.ok
     (dropped,) = run.outcomes[0].dropped
-    assert dropped["what"] == "clip_01" and "no face found" in dropped["why"]
+    assert dropped.what == "clip_01" and "no face found" in dropped.why
     made = dataset.item_dir("alpha", "eva/photo")
     assert (made / "clip_00.png").is_file() and not (made / "clip_01.png").exists()

@@ -10,6 +10,7 @@ from express50.capture.frames import decode_proxy, dhash
 from express50.capture.index import CameraSource, Cue, read_index
 from express50.contract.config import resolve_config
 from express50.contract.layout import Dataset
+from express50.contract.stage import Note
 from express50.errors import CaptureError, ConfigError, StageError
 from express50.files.images import read_image
 from express50.runner.runner import run_stage
@@ -88,7 +89,7 @@ def test_truncated_camera_is_dropped_with_its_reason(dataset):
     assert list(read_index(dataset, "S001").cameras) == ["cam00", "cam02"]
     names = {p.name for p in (dataset.item_dir("ingest", "S001") / "proxies").iterdir()}
     assert names == {"cam00.tar", "cam00.json", "cam02.tar", "cam02.json"}
-    assert summary.outcomes[0].dropped == (dropped,)
+    assert summary.outcomes[0].dropped == (Note(**dropped),)
 
 
 def test_a_copied_camera_is_named(dataset):

@@ -17,7 +17,7 @@ from express50.dataset.id_search import files_that, names_any_of, says
 from express50.dataset.withdraw import withdrawn
 from express50.errors import AnnotationError, Express50Error, FormatError
 from express50.runner.ledger import Ledger
-from express50.runner.locks import hold_stages
+from express50.runner.publish import hold_stages
 
 WRONG_LABELS = ("identity", "window", "unknown", "unreadable")
 LabelProblems = Callable[[Dataset, list[str]], Iterable[Any]]

@@ -15,10 +15,8 @@ from express50.contract.stage import Stage
 from express50.dataset.audit.finding import Audit, Finding
 from express50.errors import ConfigError, Express50Error, FormatError
 from express50.files.digests import file_sha256, files_of, path_digest, text_digest
-from express50.runner.ledger import Ledger
-from express50.runner.locks import is_running
-from express50.runner.publish import clean_leftovers, set_aside
-from express50.runner.receipts import FileMark, Made, Receipt, mark_file
+from express50.runner.ledger import FileMark, Ledger, Made, Receipt, mark_file
+from express50.runner.publish import clean_leftovers, is_running, set_aside
 from express50.runner.worker import fingerprint, input_digests
 from express50.shards.reader import read_entries
 from express50.shards.writer import verify

@@ -23,8 +23,7 @@ from express50.dataset.report.collect import (
 )
 from express50.errors import FormatError
 from express50.files.images import encode_jpeg, read_image, resize_area
-from express50.runner.ledger import Ledger
-from express50.runner.receipts import Receipt
+from express50.runner.ledger import Ledger, Receipt
 
 PICTURE_WIDTH = 900  # pixels of an embedded picture: a page of forty stays below ten megabytes
 _ROWS = 12
