@@ -54,7 +54,7 @@ def run(dataset: Dataset, item: str, config: RegionsConfig, out: Path) -> Result
 
 STAGE = Stage(
     name="regions",
-    version=2,
+    version=3,
     config=RegionsConfig,
     presets=PRESETS,
     items=items,

@@ -6,7 +6,7 @@ most likely (log-likelihood plus log-prior). Views from behind, where hair may c
 half of the skin's colours from views of the face. So a collar in front of the neck is torso, and
 hair over a shoulder or over the forehead is hair, as far as their colours differ.
 
-The constants were set on the digital twin's four people; `benchmarks.regions` checks them.
+The constants were set on the digital twin's four people (docs/LOG.md, Parts).
 """
 
 from __future__ import annotations
@@ -23,39 +23,32 @@ from pipelines.regions.geometry import HAIR, SCALP, TORSO, HeadGeometry
 
 SKIN, NECK, EARS = (np.uint8(LABELS.index(name)) for name in ("skin", "neck", "ears"))
 
+SOLID = 0.99  # alpha above which a pixel shows the subject's colour alone
+
 # Histograms of Lab colours.
 CELLS, STEPS = (32, 64, 64), (8, 4, 4)  # 8-bit Lab in cells: light varies more than hue does
 SMOOTH = 1.5  # cells; a few hundred pixels fill a smooth histogram
-SOLID = 0.95  # alpha above which a pixel shows the subject's colour alone
 LEAST = 30  # fewest pixels that make a histogram
-ENOUGH = 300  # pixels of the face, with which the neck, which hair may cover, teaches nothing
 FEATURES = 0.003  # share of the mesh that eyes and lips fill where a view sees the face
 SHARED = 10_000  # pixels that own and other views' skin colours each count as, if both teach
-
-# Log-likelihoods, nats.
 RARE = 1e-6  # share of a cell that no pixel taught: keeps logarithms finite
 UNTAUGHT = 1.2e-4  # share of every cell of a class without pixels: spread over 8000 cells
-CLIP = 5.0  # most that a colour may say against a class: place must be able to overrule it
-BLUR_PX = 0.7  # neighbouring pixels have a say against noise
 
 # Places, metres above the neck's end, where geometry is sure of a class.
-SURE_TORSO, SURE_HAIR, SURE_NECK = -0.01, 0.10, 0.04
+SURE_BELOW, SURE_ABOVE = -0.01, 0.10
 
 # Log-priors by place, nats: UNLIKELY marks what occurs at edges, IMPOSSIBLE what cannot be.
 UNLIKELY, IMPOSSIBLE = -1.0, -20.0
-HAIR_ON_FACE, HAIR_ON_NECK = -2.0, -0.5  # fringes are rarer than hair over a neck
-SKIN_BEYOND = -6.0  # skin off the mesh's rim: the mesh would have to be centimetres off
-FADE, MOST_FADE = 0.02, 8.0  # metres of height per nat for head or torso; most nats
-# Hair and skin on the mesh; torso is possible on the neck alone.
+FADE = 0.02  # metres of height per nat for head or torso
+# Hair and skin on the mesh; torso is possible on the neck alone. Hair often falls over necks.
 _ON_MESH = {
-    int(SKIN): (HAIR_ON_FACE, 0.0),
-    SCALP: (0.0, UNLIKELY),
+    int(SKIN): (UNLIKELY, 0.0),
+    SCALP: (0.0, 0.0),
     int(EARS): (UNLIKELY, 0.0),
-    int(NECK): (HAIR_ON_NECK, 0.0),
+    int(NECK): (-0.5, 0.0),
 }
 
 # Bare scalps.
-PURE = 0.99  # alpha above which scalp and face are compared: strands leave less
 MOST = 4000  # pixels of scalp and of face that a view compares
 FLOOR = 2.0  # steps of Lab under which a spread of colours is noise
 ALIKE = 4.0  # spreads of the face's own colours from their middle
@@ -71,7 +64,7 @@ def face_colours(rgb: np.ndarray, alpha: np.ndarray, mesh: np.ndarray) -> np.nda
         mesh: (H, W) labels of the mesh alone.
     """
     skin = (mesh == SKIN) & (alpha > SOLID)
-    return _counts(_cells(rgb), skin) if _sees_face(mesh) and skin.sum() >= ENOUGH else None
+    return _counts(_cells(rgb), skin) if _sees_face(mesh) and skin.sum() >= LEAST else None
 
 
 def _sees_face(mesh: np.ndarray) -> bool:
@@ -97,12 +90,12 @@ def by_colour(
     """
     labels, cells = geometry.labels(), _cells(rgb)
     solid = alpha > SOLID
-    hair = solid & ((labels == SCALP) | ((labels == HAIR) & (geometry.height > SURE_HAIR)))
+    hair = solid & ((labels == SCALP) | ((labels == HAIR) & (geometry.height > SURE_ABOVE)))
     skin = solid & (geometry.mesh > 0) & (labels == SKIN)
-    if skin.sum() < ENOUGH:
-        skin = skin | (solid & (labels == NECK) & (geometry.height > SURE_NECK))
-    torso = solid & (labels == TORSO) & (geometry.height < SURE_TORSO)
-    beyond = SKIN_BEYOND
+    if skin.sum() < LEAST:  # the neck, which hair may cover, teaches only where no face does
+        skin = skin | (solid & (labels == NECK) & (geometry.height > SURE_ABOVE))
+    torso = solid & (labels == TORSO) & (geometry.height < SURE_BELOW)
+    beyond = IMPOSSIBLE
     if bare:
         # No scalp teaches hair, and what juts out beyond the mesh is skin as likely.
         labels = np.where(labels == SCALP, SKIN, labels)
@@ -143,13 +136,12 @@ def _likelihoods(cells: Cells, taught: Sequence[np.ndarray]) -> np.ndarray:
         if counts.sum() >= LEAST:
             shares = gaussian_filter(counts, SMOOTH) / counts.sum()
             row[:] = np.log(np.maximum(shares, 0) + RARE)[cells]
-    says = np.maximum(says, says.max(0) - CLIP)
-    return np.stack([cv2.GaussianBlur(row, (0, 0), BLUR_PX) for row in says])
+    return says
 
 
 def _priors(labels: np.ndarray, geometry: HeadGeometry, beyond: float) -> np.ndarray:
     """Log-prior (3, H, W) of hair, skin and torso by place; `beyond` is skin's off the rim."""
-    fade = np.clip(geometry.height / FADE, -MOST_FADE, MOST_FADE)
+    fade = np.clip(geometry.height / FADE, IMPOSSIBLE, -IMPOSSIBLE)
     above, below = np.maximum(fade, 0), np.minimum(fade, 0)
     on_mesh = geometry.mesh > 0
     skin_rim = geometry.rim & (geometry.near != SCALP)
@@ -188,7 +180,7 @@ def scalp_votes(rgb: np.ndarray, labels: np.ndarray, alpha: np.ndarray) -> tuple
 
     lab = cv2.cvtColor(rgb, cv2.COLOR_RGB2LAB)
     skin, scalp = (
-        evenly(lab[(labels == label) & (alpha > PURE)].astype(np.float32))
+        evenly(lab[(labels == label) & (alpha > SOLID)].astype(np.float32))
         for label in (SKIN, SCALP)
     )
     if min(len(skin), len(scalp)) < LEAST:
