@@ -1,4 +1,4 @@
-"""How well annotators agree, where they disagree, and the adjudication that settles it.
+"""Agreement between annotators, their disagreements, and the adjudications that settle them.
 
 Krippendorff's alpha is taken on time within the clip, 0 to 1: on absolute frame numbers, which
 spread over a whole recording, it is near 1 whatever the annotators do. An adjudication keeps both
@@ -41,7 +41,7 @@ class MarkedClip:
 
 
 def marked_clips(dataset: Dataset, subjects: Iterable[str] | None = None) -> list[MarkedClip]:
-    """Clips that at least two people marked; excluded subjects are left out."""
+    """Find the clips that at least two people marked; excluded subjects are left out."""
     clips = []
     for subject in sorted(subjects or included_subjects(dataset)):
         marks = marks_by_person(read_labels(dataset, subject))
@@ -57,7 +57,7 @@ def marked_clips(dataset: Dataset, subjects: Iterable[str] | None = None) -> lis
 
 
 def marks_by_person(labels: Sequence[Label]) -> dict[str, dict[str, Label]]:
-    """Marks in force of each person, by expression and annotator; flags are left out."""
+    """Return the marks in force by expression and annotator; flags are left out."""
     marks: dict[str, dict[str, Label]] = defaultdict(dict)
     for who, said in labels_by_person(labels).items():
         for expression, label in said.items():
@@ -67,7 +67,7 @@ def marks_by_person(labels: Sequence[Label]) -> dict[str, dict[str, Label]]:
 
 
 def agreement(clips: Sequence[MarkedClip], seed: int = 0) -> dict[str, object]:
-    """Figures over clips, each pair of annotators of a clip counting once; others do not count.
+    """Compute figures over clips; each pair of annotators of a clip counts once.
 
     Returns:
         ``clips``, ``pairs``, ``within_1``, ``within_2``, ``within_4``, ``median_frames``,
@@ -94,7 +94,7 @@ def agreement(clips: Sequence[MarkedClip], seed: int = 0) -> dict[str, object]:
 
 
 def clip_times(clip: MarkedClip) -> np.ndarray:
-    """The marks as shares of the clip, 0 at its first frame and 1 at its last."""
+    """Return the marks as shares of the clip, 0 at its first frame and 1 at its last."""
     frames = np.array(list(clip.frames.values()), dtype=float)
     return (frames - clip.start) / max(1, clip.length - 1)
 
@@ -106,7 +106,7 @@ def interval_alpha(units: Sequence[np.ndarray]) -> float | None:
     form without the coincidence matrix (K. Krippendorff, Content Analysis, 2004, chapter 11).
 
     Args:
-        units: the values of each unit, at least two a unit.
+        units: the values of each unit, at least two per unit.
     """
     values = np.concatenate(units)
     expected = 2.0 * values.var(ddof=1)
@@ -135,12 +135,12 @@ def _rounded(value: float | None) -> float | None:
 
 
 def by_expression(clips: Sequence[MarkedClip]) -> dict[str, dict[str, object]]:
-    """Agreement on each expression."""
+    """Compute the agreement on each expression."""
     return _grouped(clips, lambda clip: [(clip.expression, clip.frames)])
 
 
 def by_pair(clips: Sequence[MarkedClip]) -> dict[str, dict[str, object]]:
-    """Agreement of each pair of annotators, named ``ann+bob``."""
+    """Compute the agreement of each pair of annotators, named ``ann+bob``."""
 
     def pairs(clip: MarkedClip) -> list[tuple[str, dict[str, int]]]:
         return [
@@ -165,7 +165,7 @@ FLAG = "flag:"  # before a reason in words, which else might be a name mistyped
 
 @dataclass(frozen=True)
 class Disagreement:
-    """What people said of one clip; ``spread`` is frames, None where some saw no peak at all."""
+    """Different labels of one clip; ``spread`` in frames, None where some saw no peak at all."""
 
     subject: str
     expression: str
@@ -181,7 +181,7 @@ class Disagreement:
 def disagreements(
     dataset: Dataset, beyond: int = 2, settled: bool = False, subjects: list[str] | None = None
 ) -> list[Disagreement]:
-    """The review queue, worst first: a flag against a mark, then the widest spread.
+    """List the disagreements, worst first: a flag against a mark, then the widest spread.
 
     Args:
         dataset: the dataset.
@@ -206,7 +206,7 @@ def disagreements(
 def _compare(
     subject: str, expression: str, voices: dict[str, Label], force: Label | None, beyond: int
 ) -> Disagreement | None:
-    """The disagreement of one clip, None where all agree."""
+    """Compare the labels of one clip; None where all agree."""
     frames = [x.frame for x in voices.values() if x.frame is not None]
     torn = 0 < len(frames) < len(voices)  # some mark a peak, some flag that there is none
     spread = max(frames, default=0) - min(frames, default=0)
@@ -218,7 +218,7 @@ def _compare(
 
 
 def describe(label: Label) -> str:
-    """A label in a few words: the frame, or why there is none."""
+    """Describe a label in a few words: its frame, or why it has none."""
     if label.frame is not None:
         return f"frame {label.frame}"
     return f"flag: {label.reason or 'no reason given'}"
@@ -227,8 +227,10 @@ def describe(label: Label) -> str:
 def settlement(
     dataset: Dataset, index: Index, expression: str, verdict: str, annotator: str
 ) -> Label:
-    """The adjudication of a clip: a frame's number, an annotator whose label is right, or a reason:
-    one of `FLAG_REASONS`, or any after ``flag:``.
+    """Make the adjudication of a clip.
+
+    The verdict is a frame's number, an annotator whose label is right, or a reason: one of
+    `FLAG_REASONS`, or any after ``flag:``.
 
     Raises:
         AnnotationError: the expression is unknown, the frame is outside its window, or the verdict
@@ -242,9 +244,9 @@ def settlement(
         return replace(mark, action="settle")
     if chosen is None and verdict not in FLAG_REASONS and not verdict.startswith(FLAG):
         raise AnnotationError(
-            f"{index.subject} {expression}: {verdict!r} is no frame, annotator of it"
-            f" ({', '.join(voices)}) or usual reason ({', '.join(FLAG_REASONS)}); any other reason"
-            f" is {FLAG}REASON"
+            f"{index.subject} {expression}: {verdict!r} is not a frame, an annotator of it"
+            f" ({', '.join(voices)}) or a usual reason ({', '.join(FLAG_REASONS)}); write any other"
+            f" reason as {FLAG}REASON"
         )
     if chosen is None or chosen.frame is None or chosen.camera is None:
         reason = (chosen.reason if chosen else verdict.removeprefix(FLAG)) or ""
@@ -254,7 +256,7 @@ def settlement(
 
 
 def current_voices(dataset: Dataset, subject: str, expression: str) -> dict[str, Label]:
-    """What each person says of one clip.
+    """Read each person's label of one clip.
 
     Raises:
         AnnotationError: nobody labelled it.

@@ -26,7 +26,7 @@ Handler = Callable[[argparse.Namespace], int]
 
 
 def add_verb(verbs, name: str, words: str, handler: Handler) -> argparse.ArgumentParser:
-    """Add a verb with what all have: the dataset and ``--json``."""
+    """Add a verb with the dataset and ``--json``."""
     parser = verbs.add_parser(name, help=words, description=words)
     parser.add_argument("dataset", type=existing_dataset, metavar="DATASET")
     parser.add_argument("--json", action="store_true", help="print JSON")
@@ -35,14 +35,14 @@ def add_verb(verbs, name: str, words: str, handler: Handler) -> argparse.Argumen
 
 
 def add_clip(parser: argparse.ArgumentParser) -> None:
-    """Add the clip that a verb is about, and who speaks."""
+    """Add the clip that a verb is about, and the annotator."""
     parser.add_argument("subject", metavar="SUBJECT")
     parser.add_argument("expression", metavar="EXPRESSION")
     add_annotator(parser)
 
 
 def add_annotator(parser: argparse.ArgumentParser) -> None:
-    """Add who speaks."""
+    """Add the annotator's name."""
     parser.add_argument(
         "--annotator", type=person, default=getpass.getuser(), metavar="NAME", help="you by default"
     )
@@ -54,7 +54,7 @@ def add_selection(parser: argparse.ArgumentParser) -> None:
 
 
 def existing_dataset(text: str) -> Dataset:
-    """A dataset's folder that is there."""
+    """Parse the folder of an existing dataset."""
     if not Path(text).is_dir():
         raise argparse.ArgumentTypeError(
             f"{text}: no such dataset; run 'express50 ingest {text} CAPTURE'"
@@ -63,14 +63,14 @@ def existing_dataset(text: str) -> Dataset:
 
 
 def person(text: str) -> str:
-    """A person's name: not the align stage's, nor a rule's, nor none."""
+    """Parse a person's name: neither the align stage's, nor a rule's, nor empty."""
     if not text.strip() or not is_person(text):
-        raise argparse.ArgumentTypeError(f"{text!r} is no person's name; give yours")
+        raise argparse.ArgumentTypeError(f"{text!r} is not a valid annotator name; give yours")
     return text
 
 
 def chosen_subjects(dataset: Dataset, wanted: list[str] | None) -> list[str] | None:
-    """The subjects asked for, None for all.
+    """Check the subjects asked for; None for all.
 
     Raises:
         AnnotationError: one is not ingested.
@@ -158,7 +158,7 @@ def run_ui(args: argparse.Namespace) -> int:
 
 
 def matching(names: Iterable[str], pattern: str | None, what: str) -> list[str]:
-    """Names that fit a pattern with ``*`` and ``?``; all for None.
+    """Find the names that fit a pattern with ``*`` and ``?``; all for None.
 
     Raises:
         AnnotationError: none fits.

@@ -56,8 +56,8 @@ def import_labels(dataset: Dataset, path: Path) -> tuple[int, int]:
     Everything is checked before anything is written.
 
     Raises:
-        AnnotationError: a row is no event, names an unknown subject, or a frame that the footage
-            does not have or whose hash differs.
+        AnnotationError: a row is not an event, or names an unknown subject, or a frame that the
+            footage does not have or whose hash differs.
     """
     labels = read_table(path)
     known: dict[str, set[Label]] = {}
@@ -74,10 +74,10 @@ def import_labels(dataset: Dataset, path: Path) -> tuple[int, int]:
 
 
 def read_table(path: Path) -> list[Label]:
-    """Events of a CSV or JSON file.
+    """Read the events of a CSV or JSON file.
 
     Raises:
-        AnnotationError: the file cannot be read, or a row is no event.
+        AnnotationError: the file cannot be read, or a row is not an event.
     """
     check_format(path)
     text = read_text(path, AnnotationError)
@@ -113,7 +113,7 @@ def _label(row: object, where: str) -> Label:
     if unknown or missing:
         raise AnnotationError(f"{where}: unknown columns {unknown}, missing {missing}")
     if not NAME.fullmatch(str(given["subject"])):  # it becomes the name of a file
-        raise AnnotationError(f"{where}: subject {given['subject']!r} is no id")
+        raise AnnotationError(f"{where}: subject {given['subject']!r} is not an id")
     if given["action"] not in ACTIONS:
         raise AnnotationError(
             f"{where}: action {given['action']!r}, expected one of {', '.join(ACTIONS)}"
@@ -130,7 +130,7 @@ def _label(row: object, where: str) -> Label:
 
 
 def _typed(name: str, value: object) -> Any:
-    """A cell as its column's type; CSV holds text only."""
+    """Convert a cell to its column's type; CSV holds text only."""
     kind = get_type_hints(Label)[name]
     if kind == bool | None:
         if str(value) not in ("True", "False"):
@@ -174,19 +174,23 @@ RENDERME360_EXPRESSIONS = frozenset(f"e{n:0{width}}" for n in range(12) for widt
 
 
 def ruled_cues(index: Index, expressions: Sequence[str] | None = None) -> list[Cue]:
-    """The cues that the rule is about: RenderMe-360's expressions, or those named.
+    """List the cues that the rule covers: RenderMe-360's expressions, or those named.
 
     They are the ones that ingest read out of its files, else those with ids e0 (or e00) to e11.
     """
-    told = [name for name, row in _told(index).items() if str(row["performance"]).startswith("e")]
-    wanted = (told or RENDERME360_EXPRESSIONS) if expressions is None else expressions
+    recorded = [
+        name
+        for name, row in _release_facts(index).items()
+        if str(row["performance"]).startswith("e")
+    ]
+    wanted = (recorded or RENDERME360_EXPRESSIONS) if expressions is None else expressions
     return [cue for cue in index.cues if cue.expression_id in wanted]
 
 
 def last_frame_marks(
     dataset: Dataset, index: Index, expressions: Sequence[str] | None = None
 ) -> list[Label]:
-    """New marks of the rule for a subject; none where it has said the same before."""
+    """Make the rule's new marks of a subject; none where it made the same marks before."""
     labels = read_labels(dataset, index.subject)
     said = current_labels(x for x in labels if x.annotator == LAST_FRAME)
     camera, source = next(iter(index.cameras.items()))
@@ -196,18 +200,18 @@ def last_frame_marks(
         known = said.get(cue.expression_id)
         if frame >= cue.start_frame and (known is None or known.frame != frame):
             mark = make_mark(index, cue.expression_id, frame, camera, LAST_FRAME)
-            row = _told(index).get(cue.expression_id)
+            row = _release_facts(index).get(cue.expression_id)
             marks.append(mark if row is None else _with_release(mark, row))
     return marks
 
 
-def _told(index: Index) -> dict[str, dict]:
-    """What ingest read of each expression's clip; empty of other captures."""
+def _release_facts(index: Index) -> dict[str, dict]:
+    """Return the facts that ingest recorded about RenderMe-360's clips; empty for others."""
     return index.meta.get("renderme360", {})
 
 
 def _with_release(mark: Label, row: dict) -> Label:
-    """The mark with the release it was made on.
+    """Add the release on which a mark was made.
 
     Raises:
         AnnotationError: the clip's last frame is not the last of the performance.

@@ -1,4 +1,4 @@
-"""The contact sheet: every label as a face on one static HTML page, told apart by its origin."""
+"""The contact sheet: every label as a face on one static HTML page, styled by its origin."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How far the labels are, subjects against expressions, and what each annotator spent on them."""
+"""Progress: coverage of subjects and expressions, and the effort of each annotator."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from express50.contract.layout import Dataset
 
 
 def coverage(dataset: Dataset) -> dict[str, dict]:
-    """Coverage of the subjects that are not excluded.
+    """Compute the coverage of the subjects that are not excluded.
 
     Returns:
         ``cells`` (subject -> expression -> ``person``, ``rule``, ``auto``, ``flagged`` or
         ``missing``), ``missing`` (subject -> expressions), ``excluded`` (subject -> reason),
-        ``gender`` and ``age`` counts of five or more people, as far as captures say.
+        ``gender`` and ``age`` counts of five or more people, where captures state them.
     """
     cells = {subject: _cells(dataset, subject) for subject in included_subjects(dataset)}
     missing = {
@@ -56,7 +56,7 @@ def _state(label: Label | None) -> str:
 
 
 def progress(dataset: Dataset, subject: str) -> dict[str, object]:
-    """How far a subject is: expressions by who labelled them."""
+    """Count a subject's expressions by who labelled them."""
     labels = current_labels(read_labels(dataset, subject)).values()
     marks = [x for x in labels if x.frame is not None]
     return {
@@ -71,7 +71,7 @@ def progress(dataset: Dataset, subject: str) -> dict[str, object]:
 
 
 def effort(dataset: Dataset) -> dict[str, dict[str, object]]:
-    """Effort of each person over all subjects: every mark and flag counts, also those undone."""
+    """Sum each person's effort over all subjects; marks and flags that were undone count too."""
     spent: dict[str, list[Label]] = defaultdict(list)
     for subject in dataset.subjects():
         for label in read_labels(dataset, subject):

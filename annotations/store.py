@@ -1,4 +1,4 @@
-"""The label store: one append-only file of events a subject, synced at every mark.
+"""The label store: one append-only file of events per subject, synced at every mark.
 
 Nothing is ever rewritten: undo is a record of its own.
 """
@@ -33,7 +33,7 @@ def append_label(dataset: Dataset, label: Label) -> None:
 
     Raises:
         AnnotationError: the action is unknown, or a text is not one line.
-        OSError: it could not be written; then it is not there, or a torn line that is passed over.
+        OSError: it could not be written; then it is missing, or a torn line that readers pass over.
     """
     if label.action not in ACTIONS:
         raise AnnotationError(f"action {label.action!r}, expected one of {', '.join(ACTIONS)}")
@@ -45,7 +45,7 @@ def append_label(dataset: Dataset, label: Label) -> None:
     handle = os.open(path, os.O_RDWR | os.O_APPEND | os.O_CREAT, 0o644)
     try:
         fcntl.flock(handle, fcntl.LOCK_EX)
-        if _ends_mid_line(handle):  # a writer died half-way: its rest must not swallow this line
+        if _ends_mid_line(handle):  # a writer died half-way: its torn line must not absorb this one
             line = b"\n" + line
         fresh = os.fstat(handle).st_size == 0
         _write_all(handle, line)
@@ -68,7 +68,7 @@ def _ends_mid_line(handle: int) -> bool:
 
 
 def read_labels(dataset: Dataset, subject: str) -> list[Label]:
-    """All events of a subject in the order they were written; torn last lines are left out.
+    """Read all events of a subject in the order they were written; torn last lines are left out.
 
     Raises:
         AnnotationError: a whole line is not an event.
@@ -77,7 +77,7 @@ def read_labels(dataset: Dataset, subject: str) -> list[Label]:
 
 
 def unreadable_lines(dataset: Dataset, subject: str) -> list[int]:
-    """Lines of a subject's file that `read_labels` passes over, from 1: a crash cut them short."""
+    """List the lines, from 1, that `read_labels` passes over because a crash cut them short."""
     return [number for number, label in _lines(dataset, subject) if label is None]
 
 
@@ -100,7 +100,7 @@ def _parse(path: Path, number: int, line: str) -> Label | None:
     try:
         label = Label(**{k: v for k, v in row.items() if k in KINDS})
     except (TypeError, AttributeError) as error:
-        raise AnnotationError(f"{path}: line {number} is no label event ({error})") from None
+        raise AnnotationError(f"{path}: line {number} is not a label event ({error})") from None
     for name, kind in KINDS.items():
         if not isinstance(getattr(label, name), kind):
             raise AnnotationError(
@@ -111,7 +111,7 @@ def _parse(path: Path, number: int, line: str) -> Label | None:
 
 
 def current_labels(labels: Iterable[Label]) -> dict[str, Label]:
-    """The label in force for each expression: the last of those that rank highest."""
+    """Return the label in force for each expression: the last of those that rank highest."""
     current: dict[str, Label] = {}
     for (expression, _), stack in _stacks(labels).items():
         for label in stack:
@@ -122,7 +122,7 @@ def current_labels(labels: Iterable[Label]) -> dict[str, Label]:
 
 
 def labels_of(labels: Iterable[Label], annotator: str) -> dict[str, Label]:
-    """What one annotator says of each expression; their adjudications of others are left out."""
+    """Return one annotator's labels by expression; their adjudications of others are left out."""
     own = {
         expression: said[-1]
         for (expression, who), stack in _stacks(labels).items()
@@ -132,7 +132,7 @@ def labels_of(labels: Iterable[Label], annotator: str) -> dict[str, Label]:
 
 
 def last_event(labels: Iterable[Label], expression: str, annotator: str) -> Label | None:
-    """What an undo of an annotator would take back; None where nothing is left of theirs."""
+    """Return the event that an undo would take back; None where nothing of theirs is left."""
     stack = _stacks(labels).get((expression, annotator))
     return stack[-1] if stack else None
 
@@ -161,18 +161,18 @@ def _rank(label: Label) -> int:
 
 
 def is_person(annotator: str) -> bool:
-    """Whether a name is a person's: neither the align stage's nor a rule's."""
+    """Return whether a name is a person's: neither the align stage's nor a rule's."""
     return annotator != AUTOMATIC and not annotator.startswith(RULE_PREFIX)
 
 
 def labels_by_person(labels: Sequence[Label]) -> dict[str, dict[str, Label]]:
-    """What each person says of each expression, by name in order."""
+    """Return each person's labels by expression, in the order of their names."""
     people = sorted({label.annotator for label in labels if is_person(label.annotator)})
     return {who: labels_of(labels, who) for who in people}
 
 
 def human_digest(dataset: Dataset, subject: str) -> str:
-    """Digest of what people and rules decided for a subject; automatic labels do not change it."""
+    """Digest the decisions of people and rules; automatic labels do not change the digest."""
     rows = [
         (label.expression, label.action, label.frame, label.camera, label.annotator, label.reason)
         for label in current_labels(read_labels(dataset, subject)).values()

@@ -23,9 +23,9 @@ class Suggested:
         frame: the suggested frame.
         confidence: probability that it is at most one frame off, 0 to 1.
         start: frame of the curves' first value.
-        activity: how far the face is from rest, one value a frame of the cue window.
+        activity: how far the face is from rest, one value per frame of the cue window.
         candidates: frames worth a look, best first, at least three frames apart.
-        match: similarity to the reference's canonical frame, 0 to 1 a frame; None for the
+        match: similarity to the reference's canonical frame, 0 to 1 per frame; None for the
             reference itself and where it has no canonical frame.
         kind: ``match`` where the reference decided, else ``peak``.
         reference: ``subject``, ``frame`` and ``camera`` of the canonical frame, or None.
@@ -44,10 +44,10 @@ class Suggested:
 
 
 def read_suggestions(dataset: Dataset, subject: str) -> dict[str, Suggested]:
-    """Suggestions by expression; none when the align stage has not run.
+    """Read the suggestions by expression; none when the align stage has not run.
 
     Raises:
-        FormatError: the file is not a table of suggestions, or a figure in it is no number.
+        FormatError: the file is not a table of suggestions, or a figure in it is not a number.
     """
     path = dataset.item_dir("align", subject) / "suggestions.json"
     if not path.is_file():
@@ -62,10 +62,10 @@ def read_suggestions(dataset: Dataset, subject: str) -> dict[str, Suggested]:
 
 
 def _checked(expression: str, row: dict[str, Any]) -> Suggested:
-    """A row whose figures can be compared; one that is NaN would upset every order."""
+    """Check that a row's figures can be compared: NaN would upset every order."""
     found = Suggested(**row)
     if not all(type(n) is int for n in (found.frame, found.start, *found.candidates)):
-        raise ValueError(f"{expression}: frames are no whole numbers")
+        raise ValueError(f"{expression}: frames are not whole numbers")
     if not 0.0 <= found.confidence <= 1.0:
         raise ValueError(f"{expression}: confidence is {found.confidence}, expected 0 to 1")
     if not all(map(math.isfinite, [*found.activity, *(found.match or ())])):
@@ -84,12 +84,12 @@ class CanonicalFrame:
 
 
 def reference_file(dataset: Dataset) -> Path:
-    """Where the choice of the reference is kept."""
+    """Return the file that holds the choice of the reference."""
     return dataset.root / "labels" / "reference.json"
 
 
 def reference_subject(dataset: Dataset) -> str:
-    """The reference identity: the one that was chosen, else the first that is not excluded.
+    """Find the reference identity: the one that was chosen, else the first that is not excluded.
 
     Raises:
         StageError: nothing is ingested, or everybody is excluded.
@@ -127,7 +127,7 @@ def choose_reference(dataset: Dataset, subject: str) -> None:
 
 
 def canonical(dataset: Dataset, expression: str) -> CanonicalFrame | None:
-    """The reference's frame of an expression: its label in force, else its suggestion.
+    """Find the reference's frame of an expression: its label in force, else its suggestion.
 
     None where the reference has neither, or its performance is flagged.
     """

@@ -1,4 +1,4 @@
-"""Checks every label against the footage it names, and people against each other."""
+"""Checks of every label against the footage it names, and of people against each other."""
 
 from __future__ import annotations
 

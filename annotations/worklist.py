@@ -1,4 +1,4 @@
-"""What an annotator still has to label, in an order that pays: canonical frames, then doubt."""
+"""The worklist of an annotator: canonical frames first, then the least sure suggestions."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def worklist(
     order: str = "doubt",
     everything: bool = False,
 ) -> list[LabelTask]:
-    """Tasks of an annotator, the reference's first in every order.
+    """List the tasks of an annotator, the reference's first in every order.
 
     Args:
         dataset: the dataset; excluded subjects have no tasks.
@@ -75,7 +75,7 @@ def worklist(
 def _tasks_of(
     dataset: Dataset, subject: str, annotator: str, everything: bool
 ) -> list[LabelTask | None]:
-    """One entry a cue, None where it is done."""
+    """List one entry per cue, None where it is done."""
     done = {} if everything else labels_of(read_labels(dataset, subject), annotator)
     suggestions = read_suggestions(dataset, subject)
     return [

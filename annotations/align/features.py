@@ -30,7 +30,7 @@ _CONTROL_GROUPS = {
     "nostril": ("nose",),
     "cheek": ("mouth",),
 }
-CELLS = 24  # the aligned face is compared in so many cells a side
+CELLS = 24  # the aligned face is compared in so many cells per side
 CELL_REACH = 0.12  # of the face's side: a cell further from every landmark shows no face
 LOOK_WEIGHT = 0.5  # of a cell against a landmark's coordinate: there are more of them
 BYSTANDER = 0.3  # weight of features the script does not name: people move more than they should

@@ -24,7 +24,7 @@ from express50.capture.index import Index
 
 @dataclass(frozen=True)
 class Watched:
-    """A subject as the observe stage saw it.
+    """A subject's features by cue window.
 
     Attributes:
         subject: id.
@@ -52,7 +52,7 @@ class Reference:
 
 
 def watch(index: Index, observations: FaceObservations) -> Watched:
-    """Features of a subject, by cue window.
+    """Measure the features of a subject by cue window.
 
     Expressions whose window holds no observed frame that shows a face are left out.
     """
@@ -70,12 +70,12 @@ def watch(index: Index, observations: FaceObservations) -> Watched:
 def suggest_all(
     subject: Watched, script: Mapping[str, Expression], reference: Reference | None
 ) -> tuple[dict[str, Suggestion], dict[str, int]]:
-    """Suggestions by expression, and the canonical frame of the reference each was matched to.
+    """Suggest a frame of every expression; name the canonical frame it was matched to.
 
     Args:
-        subject: whom to suggest for.
-        script: the expressions that are known; others count all of the face.
-        reference: None where the subject is the reference, or nothing is known of it.
+        subject: the subject to suggest for.
+        script: the known expressions; for others all of the face counts.
+        reference: None where the subject is the reference, or it is not observed.
     """
     groups = subject.features.owner + 68 * subject.features.camera
     found, canonical = {}, {}
@@ -97,9 +97,9 @@ def suggest_all(
 def _target(
     features: Features, reference: Reference, expression: str, entry: Expression | None
 ) -> tuple[int, Canonical] | None:
-    """The reference's frame, which people chose or else its apex, in the subject's features.
+    """Express the reference's frame, chosen or else its apex, in the subject's features.
 
-    None where people flagged the reference's performance.
+    Return None where people flagged the reference's performance.
     """
     if expression in reference.flagged:
         return None
@@ -116,7 +116,7 @@ def _target(
 
 
 def shared_columns(features: Features, other: Features) -> np.ndarray:
-    """Pairs (2, K) of columns that show the same of two subjects.
+    """Pair the columns (2, K) that measure the same on two subjects.
 
     Cameras of the same id are paired; where there are none, those that see each face best.
     """
@@ -132,7 +132,7 @@ def shared_columns(features: Features, other: Features) -> np.ndarray:
 
 
 def _typical(subject: Watched, entry: Expression | None) -> float:
-    """How far expressions usually move the face from rest, in the units of an entry's values."""
+    """Measure how far expressions usually move the face from rest, in units of noise."""
     tops = [
         np.linalg.norm(steady(expression_values(subject.features, entry, rows)), axis=1).max()
         for rows in subject.windows.values()

@@ -1,7 +1,7 @@
-"""Where an expression happens in its cue window, and which frame of it matches the reference's.
+"""Suggestion of the frame of a clip that matches the reference's, or else its apex.
 
 All curves are projections of a face's features (``features.py``) on one direction, found from the
-clip itself: the frames that show the expression define it, and it tells which frames show it.
+clip itself: frames that show the expression define the direction, which in turn ranks the frames.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ OVERRULE_COSINE = 0.3  # if that goes the reference's way at all: two of noise a
 DISPUTED = 0.6  # confidence counts so much where the strongest event is not the likest
 APEX_LEVEL = 0.9  # a canonical frame at this share of its apex or more is an apex
 OTHER_SIDE = 0.05  # of the apex: what being on the other side of it counts
-PLATEAU_SHARE = 0.95  # of the apex: frames that cannot be told from it
+PLATEAU_SHARE = 0.95  # of the apex: frames that are equal to it within noise
 AGREE_FRAMES = 1
 STILL = 1.0  # in units of one feature's noise: a face that does less does not move
-_DRAWS = 24  # random halves of the features that a suggestion is asked again with
+_DRAWS = 24  # random halves of the features that a suggestion is repeated with
 
 
 @dataclass(frozen=True)
@@ -139,7 +139,7 @@ def _unrest(values: np.ndarray) -> np.ndarray:
 
 
 def strongest_event(values: np.ndarray) -> Event:
-    """What moves most in a clip (T, N): power iteration from the frames' energies."""
+    """Find the strongest movement of a clip (T, N): power iteration from the frames' energies."""
     curve, direction = _follow(values, (values**2).sum(1), np.ones(len(values)), 8)
     return Event(apex_of(curve), curve, direction)
 
@@ -193,7 +193,7 @@ def matching_row(event: Event, canonical: Canonical | None) -> int:
 
 
 def share_of_apex(event: Event) -> np.ndarray:
-    """How far an event is done in each frame (T,), as a share of its apex."""
+    """Return the progress of an event in each frame (T,), as a share of its apex."""
     return event.curve / max(float(steady(event.curve)[event.apex]), 1e-12)
 
 
@@ -234,7 +234,7 @@ def _event_about(values: np.ndarray, weights: np.ndarray, row: int) -> Event:
 
 
 def apex_of(curve: np.ndarray) -> int:
-    """Row of a curve's (T,) apex: the middle of the frames that cannot be told from it."""
+    """Row of a curve's (T,) apex: the middle of the frames that are equal to it within noise."""
     even = steady(curve)
     top = int(np.argmax(even))
     low = high = top

@@ -159,7 +159,7 @@ STEADY_FRAMES = 1.0  # heads turn slowly: their motion is averaged over this man
 def find_points(
     net: LandmarkNet, images: Sequence[np.ndarray], smallest: float = SMALLEST
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Landmarks (T, 68, 2), corner-origin pixels, and scores (T,) of a clip.
+    """Find landmarks (T, 68, 2), corner-origin pixels, and scores (T,) of a clip.
 
     The face is searched for in the middle frame only; all frames are then looked at through the
     same window, except those where the face has left it.
@@ -184,7 +184,7 @@ def find_points(
 def align_faces(
     images: Sequence[np.ndarray], points: np.ndarray, neutral: np.ndarray
 ) -> np.ndarray:
-    """Grey faces (T, FACE, FACE) uint8 of a clip, moved onto the neutral landmarks (68, 2)."""
+    """Cut grey faces (T, FACE, FACE) uint8 of a clip, moved onto neutral landmarks (68, 2)."""
     low, high = neutral.min(0), neutral.max(0)
     side = face_side(neutral)
     layout = (neutral[STABLE] - ((low + high) / 2 - side / 2)) * (FACE / side)
@@ -204,7 +204,7 @@ def face_side(neutral: np.ndarray) -> float:
 
 
 def similarity_2d(source: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Affine (2, 3) of the similarity that takes points (N, 2) onto others.
+    """Fit the similarity (2, 3) that takes points (N, 2) onto others.
 
     Points that all coincide are moved, not scaled.
     """
@@ -216,7 +216,7 @@ def similarity_2d(source: np.ndarray, target: np.ndarray) -> np.ndarray:
 
 
 def steady(values: np.ndarray, sigma: float = STEADY_FRAMES) -> np.ndarray:
-    """Values (T, ...) averaged over neighbouring frames with Gaussian weights."""
+    """Average values (T, ...) over neighbouring frames with Gaussian weights."""
     numbers = np.arange(len(values))
     weights = np.exp(-0.5 * ((numbers[:, None] - numbers) / sigma) ** 2)
     return np.tensordot(weights / weights.sum(1, keepdims=True), values, axes=1)
@@ -239,7 +239,7 @@ def _look(
 
 
 def _cut(image: np.ndarray, window: np.ndarray, size: int) -> np.ndarray:
-    """Square of an image through an affine (2, 3) from its pixels to the image's, corner origin."""
+    """Cut a square through an affine (2, 3) from its pixels to the image's, corner origin."""
     step = float(np.sqrt(abs(np.linalg.det(window[:, :2]))))
     height, width = image.shape[:2]
     if step > 1.5:  # averaged first: fine detail would alias

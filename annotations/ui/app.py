@@ -39,7 +39,7 @@ def _bindings() -> list[Binding]:
 
 
 def open_view_of(scene: TaskScene, hidden: bool) -> CueView | None:
-    """Where a task opens: on one's own mark, else on the suggestion, else in the middle."""
+    """Open a task on the annotator's own mark, else on the suggestion, else in the middle."""
     if scene.index is None:
         return None
     mine = scene.mine

@@ -18,7 +18,7 @@ SCROLLING = ("up", "down", "pageup", "pagedown", "home", "end")
 
 
 class FlagDialog(ModalScreen[str | None]):
-    """Why there is no usable peak: a digit decides at once, ``5`` opens a line of text."""
+    """Asks why there is no usable peak: a digit decides at once, ``5`` opens a line of text."""
 
     AUTO_FOCUS = ""  # digits must reach the dialog, not the line of text
 
@@ -51,7 +51,7 @@ class FlagDialog(ModalScreen[str | None]):
             words.focus()
 
     def on_input_submitted(self, event: Input.Submitted) -> None:
-        """A reason in words; none at all is no reason."""
+        """A reason in words; an empty one is refused."""
         if event.value.strip():
             self.dismiss(event.value.strip())
 

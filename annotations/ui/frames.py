@@ -70,7 +70,7 @@ class FrameCache:
         return self._read(shot)
 
     def want(self, shots: Sequence[FrameCrop], *, later: bool = False) -> None:
-        """Decode these in the background, in this order; earlier wishes of the kind are forgotten.
+        """Decode these in the background, in this order; earlier requests of the kind are dropped.
 
         What is wanted later waits until nothing else is wanted.
         """
@@ -91,7 +91,7 @@ class FrameCache:
         return self._bytes
 
     def idle(self) -> bool:
-        """Whether nothing is left to decode ahead."""
+        """Return whether nothing is left to decode ahead."""
         with self._wake:
             return not self._wanted and not self._later
 
@@ -117,7 +117,7 @@ class FrameCache:
             try:
                 self._read(shot)
             except AnnotationError:
-                continue  # whoever asks for it with get is told
+                continue  # get raises it for whoever needs the picture
 
     def _read(self, shot: FrameCrop) -> np.ndarray:
         try:

@@ -175,13 +175,13 @@ def cell_colours(picture: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarra
 
 
 def _to_step(colours: np.ndarray) -> np.ndarray:
-    """Colours rounded to the steps that are kept, the brightest to white."""
+    """Round colours to the steps that are kept, the brightest to white."""
     level = np.rint(np.asarray(colours, np.float32) / _STEP)
     return np.minimum(level * _STEP, 255).astype(np.uint8)
 
 
 def to_256(colours: np.ndarray) -> np.ndarray:
-    """Colours (..., 3) uint8 moved to the cube and greys that a 256-colour terminal has."""
+    """Move colours (..., 3) uint8 to the cube and greys that a 256-colour terminal has."""
     levels = np.array([0, 95, 135, 175, 215, 255])
     bounds = (levels[1:] + levels[:-1]) / 2
     cube = levels[np.searchsorted(bounds, colours)]
@@ -231,7 +231,7 @@ def _colour(value: int) -> Color:
 
 
 def encode_sixel(picture: np.ndarray) -> str:
-    """A picture (H, W, 3) uint8 as one escape sequence that draws it at the cursor."""
+    """Encode a picture (H, W, 3) uint8 as one escape sequence that draws it at the cursor."""
     height, width = picture.shape[:2]
     palette, numbers = quantise(picture)
     percent = np.rint(palette * (100 / 255)).astype(int)
@@ -241,10 +241,11 @@ def encode_sixel(picture: np.ndarray) -> str:
 
 
 def quantise(picture: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """At most COLOURS colours (N, 3) float and the number of each pixel's, (H, W) uint8.
+    """Reduce a picture to COLOURS colours (N, 3) float and each pixel's number (H, W) uint8.
 
     Median cut (P. Heckbert, Color image quantization for frame buffer display, 1982) over colours
-    of five bits a channel: the box with most pixels times its longest side is halved at its median.
+    of five bits per channel: the box with most pixels times its longest side is halved at its
+    median.
     """
     channels = (picture >> 3).astype(np.int32)
     codes = channels[..., 0] << 10 | channels[..., 1] << 5 | channels[..., 2]
@@ -268,7 +269,7 @@ def quantise(picture: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _median_cut(cells: np.ndarray, counts: np.ndarray) -> list[np.ndarray]:
-    """Boxes of colours, each the rows of ``cells`` (N, 3) in it."""
+    """Split colours into boxes, each given by its rows of ``cells`` (N, 3)."""
     boxes = [np.arange(len(cells))]
     worth = [_worth(cells, counts)]
     while len(boxes) < COLOURS and max(worth) > 0:
@@ -287,7 +288,7 @@ def _median_cut(cells: np.ndarray, counts: np.ndarray) -> list[np.ndarray]:
 
 
 def _worth(cells: np.ndarray, counts: np.ndarray) -> float:
-    """How much a box gains by being halved; 0 for a single colour."""
+    """Rate the gain of halving a box; 0 for a single colour."""
     return float(np.ptp(cells, axis=0).max()) * float(counts.sum()) if len(cells) > 1 else 0.0
 
 

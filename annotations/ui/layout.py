@@ -192,7 +192,7 @@ class Player:
             self._swap()
 
     def stop(self) -> bool:
-        """Stop whatever runs; tells whether something did."""
+        """Stop whatever runs; return whether something did."""
         ran = self._playing is not None or self._blinking is not None
         for timer in (self._playing, self._blinking):
             if timer is not None:

@@ -32,7 +32,7 @@ def fit(left: Text, right: Text, width: int) -> Text:
 
 
 def status_line(session: Session, scene: TaskScene, width: int) -> Text:
-    """Expression and subject; progress, doubt and what the label has cost so far."""
+    """Show expression and subject; progress, doubt and the label's cost so far."""
     left = Text.assemble(
         (f" {scene.name} ", f"bold {theme.GROUND} on {theme.ACCENT}"),
         (f"  {scene.task.subject}", f"bold {theme.TEXT}"),
@@ -59,7 +59,7 @@ def _doubt_colour(doubt: float) -> str:
 
 
 def words_line(scene: TaskScene, width: int) -> Text:
-    """What the subject was asked to do."""
+    """Show what the subject was asked to do."""
     text = Text(f" {scene.description}", style=theme.TEXT)
     text.truncate(width, overflow="ellipsis")
     return text
@@ -147,7 +147,7 @@ def message_line(words: str, colour: str, width: int) -> Text:
 
 
 def saved_words(label: Label) -> str:
-    """What is said once a decision is on disk."""
+    """Say that a decision is on disk."""
     what = f"frame {label.frame}" if label.action == "mark" else f"flagged {label.reason}"
     cost = f"{label.keys} key{'' if label.keys == 1 else 's'}, {label.seconds:.1f} s"
     return f"saved: {label.subject} {label.expression} {what} ({cost}); u takes it back"

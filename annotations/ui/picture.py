@@ -25,7 +25,7 @@ from express50.errors import AnnotationError
 
 @dataclass(frozen=True)
 class FrameLook:
-    """Which frame to look at, and how closely; ``aspect`` is the footage's height over width."""
+    """One frame and how closely to look at it; ``aspect`` is the footage's height over width."""
 
     subject: str
     camera: str
@@ -66,7 +66,7 @@ class PicturePane(Widget):
 
     @property
     def look(self) -> FrameLook | None:
-        """What is shown; None where words stand in its place."""
+        """The look that is shown; None where words replace it."""
         return self._look
 
     def show(self, look: FrameLook | None, words: str = "") -> None:
@@ -131,7 +131,7 @@ AHEAD = 64  # frames about the cursor that are decoded before they are asked for
 
 
 class Aim(NamedTuple):
-    """How both pictures are looked at: camera (counted from the best), zoom, finder of faces."""
+    """The view of both pictures: camera (counted from the best), zoom, finder of faces."""
 
     camera: int
     zoom: str
@@ -195,7 +195,7 @@ def shots_ahead(
 
 
 def strip_content(scene: TaskScene, view: CueView, hidden: bool) -> StripContent:
-    """What the strip shows; nothing that could sway the annotator while that is hidden."""
+    """Collect the timeline's content, without what could sway the annotator while it is hidden."""
     found = None if hidden else scene.suggestion
     return StripContent(
         view=view,

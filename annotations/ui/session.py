@@ -74,7 +74,7 @@ class Session:
 
     @property
     def done(self) -> int:
-        """How many tasks this annotator has decided, in this session and before."""
+        """Number of tasks this annotator has decided, in this session and before."""
         return len(self.tasks) - len(self._open)
 
     @property
@@ -83,11 +83,11 @@ class Session:
         return not self._open
 
     def is_open(self, task: LabelTask) -> bool:
-        """Whether the annotator has not decided a task."""
+        """Return whether the annotator has not decided a task."""
         return _key(task) in self._open
 
     def hidden(self, task: LabelTask) -> bool:
-        """Whether suggestions and others' marks are to be kept from the annotator."""
+        """Return whether suggestions and others' marks are hidden from the annotator."""
         return self.blind and self.is_open(task)
 
     def begin(self) -> None:

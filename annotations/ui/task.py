@@ -1,4 +1,4 @@
-"""What one task shows: footage, suggestion, reference and labels, read from the dataset at once."""
+"""The data of one task: footage, suggestion, reference and labels, read at once."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ class TaskScene:
 
 
 def load_scene(dataset: Dataset, task: LabelTask, annotator: str) -> TaskScene:
-    """Read a task; what is wrong with it becomes ``problem`` or ``notes``, not an exception."""
+    """Read a task; faults become ``problem`` or ``notes``, not exceptions."""
     name, description = _words(task.expression)
     try:
         return _load(dataset, task, annotator, name, description)

@@ -70,7 +70,7 @@ def curve_lines(
     low, high = min(values, default=0.0), max(values, default=0.0)
     span = max(high - low, 1e-9)
     bars = [max(values[n : n + per]) for n in range(0, len(values), per)]
-    # The lowest value still shows a sliver, so that a frame is told from no frame.
+    # The lowest value still shows a sliver, so that a frame differs from no frame.
     levels = [max(1, round((v - low) / span * height * 8)) for v in bars]
     lines = []
     for row in range(height):
@@ -149,7 +149,7 @@ class CurveStrip(Widget):
         return [line.text for line in self._drawn()]
 
     def on_click(self, event: events.Click) -> None:
-        """Tell which frame was clicked."""
+        """Post the frame that was clicked."""
         if self._content is not None and event.x >= GUTTER:
             frame = frame_at(self._content.view, event.x - GUTTER, self.size.width - GUTTER)
             self.post_message(self.Picked(frame))

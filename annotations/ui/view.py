@@ -1,4 +1,4 @@
-"""Where the annotator stands in one cue window: cursor, candidates and plateau, as pure functions.
+"""The annotator's position in one cue window: cursor, candidates and plateau, as pure functions.
 
 Every function takes a view and returns another; none reads a file or knows of a screen.
 """
@@ -90,7 +90,7 @@ def set_plateau_last(view: CueView) -> CueView:
 
 
 def plateau_problem(view: CueView) -> str | None:
-    """Why the cursor cannot be marked with this plateau, in plain words; None when it can."""
+    """Say why the cursor cannot be marked with this plateau; None when it can."""
     low = view.first if view.plateau_first is None else view.plateau_first
     high = view.last if view.plateau_last is None else view.plateau_last
     if low <= view.cursor <= high:

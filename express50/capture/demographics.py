@@ -1,4 +1,4 @@
-"""Who the subjects are, counted: gender and age as far as captures say.
+"""Counts of the subjects' gender and age, where captures state them.
 
 What a capture says of a person stays in the capture. A dataset takes over `PUBLIC_KEYS` of its
 capture.toml and nothing else; gender and age are read from the capture when they are counted.
@@ -24,7 +24,7 @@ PUBLIC_KEYS = frozenset(
 
 
 def public_meta(meta: Mapping) -> dict:
-    """What a dataset may keep of a capture.toml: nothing that describes the person."""
+    """Return what a dataset may keep of a capture.toml: nothing that describes the person."""
     return {key: value for key, value in meta.items() if key in PUBLIC_KEYS}
 
 
@@ -32,7 +32,7 @@ def shown_counts(counts: Mapping[str, int], least: int = LEAST_PEOPLE) -> dict[s
     """Counts of which each is of ``least`` people or more; what is fewer counts among the others.
 
     The smallest groups join the others until these are enough too: a single small one could be
-    told from the total. Empty where there are too few people at all, or nothing to tell apart.
+    inferred from the total. Empty where there are too few people at all, or only one group.
     """
     left = sorted((n, name) for name, n in counts.items() if name != "not given")
     others = counts.get("not given", 0)
@@ -45,12 +45,12 @@ def shown_counts(counts: Mapping[str, int], least: int = LEAST_PEOPLE) -> dict[s
 
 
 def gender_counts(metas: Sequence[Mapping]) -> dict[str, int]:
-    """How many subjects of each gender, in the captures' own words."""
+    """Count the subjects of each gender, in the captures' own words."""
     return dict(sorted(Counter(str(m.get("gender", "not given")) for m in metas).items()))
 
 
 def age_counts(metas: Sequence[Mapping]) -> dict[str, int]:
-    """How many subjects in each band of years."""
+    """Count the subjects in each band of years."""
     counts = Counter(_band(_age(m)) for m in metas)
     names = [*(_name(band) for band in AGE_BANDS), "not given"]
     return {name: counts[name] for name in names if counts[name]}

@@ -55,7 +55,7 @@ class RawCapture:
     Attributes:
         root: the folder that footage and plates are relative to.
         subject: subject id.
-        fps: frames a second.
+        fps: frames per second.
         meta: content of capture.toml.
         cameras: footage by camera id.
         dropped: cameras that cannot be used, with the reason.
@@ -66,7 +66,7 @@ class RawCapture:
         layout: which of `express50.capture.readers` it is; ours is ``express50``.
         clips: expression of each clip where the footage comes in clips; they make the cues.
         skipped: what of a layout was left out (sequences, frames), with the reason.
-        found: what the layout told about itself.
+        found: facts of the layout, for metrics.
         warnings: what is odd but may be meant, with the reason.
     """
 
@@ -119,7 +119,7 @@ def read_capture(root: Path) -> RawCapture:
 
 
 def has_calibration(root: Path) -> bool:
-    """Whether the capture brings its own cameras."""
+    """Whether the capture has calibrated cameras of its own."""
     return (root / "calibration.json").is_file()
 
 
@@ -223,7 +223,7 @@ def _frame_names(folder: Path) -> tuple[str, ...]:
 
 
 def image_names(folder: Path) -> list[str]:
-    """Names of the image files in a folder, sorted; none when there is no folder."""
+    """List the image files in a folder, sorted; none when there is no folder."""
     if not folder.is_dir():
         return []
     return sorted(

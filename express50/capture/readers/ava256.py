@@ -31,7 +31,7 @@ FPS = 30.0
 
 
 def fits(path: Path) -> bool:
-    """Whether a folder is a capture of AVA-256."""
+    """Return whether a folder is a capture of AVA-256."""
     return (path / CAMERAS).is_file()
 
 
@@ -134,7 +134,7 @@ def read_frame_list(path: Path) -> list[Moment]:
     """Segment and frame number of each row.
 
     Raises:
-        CaptureError: a column is missing, or a frame is no number.
+        CaptureError: a column is missing, or a frame is not a number.
     """
     try:
         table = csv.DictReader(read_text(path, CaptureError).splitlines())

@@ -10,22 +10,22 @@ from express50.errors import CaptureError, FormatError
 from express50.files.images import ORIENTATION, read_exif
 from express50.files.video import video_fps, video_turn
 
-FPS = 24.0  # of photographs it means nothing
+FPS = 24.0  # meaningless for photographs
 CAMERA = "video"
 
 
 def subject_of(path: Path) -> str:
-    """The folder's or the video's name."""
+    """Return the folder's or the video's name."""
     return identifier(path.stem if path.is_file() else path.resolve().name)
 
 
 def fits_photos(path: Path) -> bool:
-    """Whether a folder holds photographs."""
+    """Return whether a folder holds photographs."""
     return path.is_dir() and bool(image_names(path))
 
 
 def read_photos(path: Path, selection: Selection) -> RawCapture:
-    """Each photograph as a camera of one moment; the cameras are solved from the footage.
+    """Read each photograph as a camera of one moment; calibrate solves the cameras.
 
     A photograph that lies on its side by its EXIF is read upright.
 
@@ -63,17 +63,17 @@ def read_photos(path: Path, selection: Selection) -> RawCapture:
 
 
 def fits_video(path: Path) -> bool:
-    """Whether a path is a video file."""
+    """Return whether a path is a video file."""
     return path.is_file() and path.suffix.lower() in VIDEO_SUFFIXES
 
 
 def read_video(path: Path, selection: Selection) -> RawCapture:
-    """A video as one camera; all of it is one clip, named ``clip`` unless it is told otherwise.
+    """Read a video as one camera and one clip, named ``clip`` unless the selection names it.
 
     A video that lies on its side, as telephones store what they film upright, is read upright.
 
     Raises:
-        CaptureError: it is no video.
+        CaptureError: it is not a video.
     """
     check_selection(selection, ["clip"], [CAMERA])
     orientation = ORIENTATION[video_turn(path)]

@@ -26,7 +26,7 @@ FPS = 30.0
 
 
 def fits(path: Path) -> bool:
-    """Whether a folder is a capture of Multiface."""
+    """Return whether a folder is a capture of Multiface."""
     return (path / "KRT").is_file() and (path / "images").is_dir()
 
 

@@ -30,7 +30,7 @@ def subject_of(path: Path) -> str:
 
 
 def fits_colmap(path: Path) -> bool:
-    """Whether a folder holds a COLMAP model and its pictures."""
+    """Return whether a folder holds a COLMAP model and its pictures."""
     return path.is_dir() and _model(path) is not None and (path / "images").is_dir()
 
 
@@ -59,7 +59,7 @@ def read_colmap_folder(path: Path, selection: Selection) -> RawCapture:
 
 
 def fits_transforms(path: Path) -> bool:
-    """Whether a folder, or the file itself, is a transforms.json with frames."""
+    """Return whether a folder, or the file itself, is a transforms.json with frames."""
     if path.is_dir():
         return (path / "transforms.json").is_file()
     return path.name.startswith("transforms") and path.suffix == ".json"

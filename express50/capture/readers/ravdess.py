@@ -47,7 +47,7 @@ class Clip:
 
 
 def parse_name(stem: str) -> Clip | None:
-    """What a file's name (without its ending) says; None where it is none of RAVDESS."""
+    """Parse a file's name without its ending; None where it is not one of RAVDESS."""
     match = NAME.fullmatch(stem)
     if match is None:
         return None
@@ -68,7 +68,7 @@ def parse_name(stem: str) -> Clip | None:
 
 
 def fits(path: Path) -> bool:
-    """Whether a path is such a clip or a folder of such clips."""
+    """Return whether a path is such a clip or a folder of such clips."""
     return any(parse_name(file.stem) for file in _videos(path))
 
 

@@ -1,6 +1,6 @@
 """RenderMe-360: a folder of ``.smc`` files (HDF5) of one actor, or one such file.
 
-Two releases are told apart. The full one (21 actors) has pictures in ``raw/<id>/<id>_e0_raw.smc``
+There are two releases. The full one (21 actors) has pictures in ``raw/<id>/<id>_e0_raw.smc``
 and cameras in ``anno/<id>/<id>_e0_anno.smc``; the one of 500 actors has both in ``<id>_e0.smc``,
 and of an expression key frames only. An expression's peak is the last frame of its clip in both,
 but that is frame 119 of one and 12 of the other: the release and the frame's own number are stored.
@@ -41,7 +41,7 @@ class Performance:
 
 
 def fits(path: Path) -> bool:
-    """Whether a path is an SMC, or a folder that holds some."""
+    """Return whether a path is an SMC, or a folder that holds some."""
     if path.is_file():
         return path.suffix.lower() == ".smc"
     return any(path.glob("*.smc"))
@@ -74,7 +74,7 @@ def _parts(file: Path) -> tuple[str, str, str]:
             return actor, rest.removesuffix(f"_{kind}"), kind
     if not actor.isdigit() or rest[:1] not in ("e", "h", "s"):
         raise CaptureError(
-            f"{file}: name is no performance of RenderMe-360; expected such as 0026_e0_raw.smc"
+            f"{file}: name is not a performance of RenderMe-360; expected such as 0026_e0_raw.smc"
         )
     return actor, rest, ""
 
@@ -151,7 +151,7 @@ def read(path: Path, selection: Selection) -> RawCapture:
         fps=FPS,
         meta={"licence": "research only, see the terms of RenderMe-360"}
         | _person(next(iter(taken.values())))
-        | {"renderme360": _told(taken, clips, line.sequences, numbers, last)},
+        | {"renderme360": _release_facts(taken, clips, line.sequences, numbers, last)},
         cameras={
             name: RawCamera(
                 id=name, kind="frames", path=root, names=files,
@@ -212,14 +212,14 @@ def _count(group: h5py.Group, default: int, where: str) -> int:
     return int(value[0]) if value.size == 1 and value.dtype.kind in "ui" else default
 
 
-def _told(
+def _release_facts(
     taken: dict[str, Performance],
     clips: Sequence[str],
     sequences: Sequence[str],
     numbers: dict[str, int],
     last: dict[str, int],
 ) -> dict[str, dict]:
-    """What the last-frame rule must know of each expression."""
+    """Collect the facts that the last-frame rule needs of each expression."""
     return {
         clip: {
             "performance": part,
@@ -235,12 +235,12 @@ def _person(performance: Performance) -> dict[str, object]:
     """Age and gender, which dataset cards count; what else the files say of a body stays there."""
     file, where = open_hdf5(performance.raw), str(performance.raw)
     age, gender = attribute(file, "age", (), where), attribute(file, "gender", "", where).tolist()
-    told: dict[str, object] = {}
+    person: dict[str, object] = {}
     if age.size == 1 and age.dtype.kind in "ui" and 0 < age[0] < 130:
-        told["age"] = int(age[0])
+        person["age"] = int(age[0])
     if len(gender) == 1 and isinstance(gender[0], str) and gender[0].isalpha():
-        told["gender"] = gender[0][:20]
-    return told
+        person["gender"] = gender[0][:20]
+    return person
 
 
 def _calibration(
