@@ -1,4 +1,4 @@
-"""The frame of every command line: one line for an error, exit codes 0, 1 and 2, clean stops."""
+"""Shared frame of the command lines: one-line errors, exit codes 0, 1 and 2, clean stops."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def run_handler(
 ) -> int:
     """Call a command's handler and turn its ending into an exit code.
 
-    An Express50Error becomes one line on standard error, and so does what the system refuses; any
+    An Express50Error or an error of the operating system becomes one line on standard error; any
     other error is a defect and keeps its traceback.
     """
     try:
@@ -35,7 +35,7 @@ def run_handler(
     except Express50Error as error:
         return _fail(program, error, FAILED)
     except OSError as error:  # the machine's, not a defect: permissions, a full disk, a folder
-        sys.stderr.write(f"{program}: {_told(error)}\n")
+        sys.stderr.write(f"{program}: {_describe(error)}\n")
         return FAILED
     except KeyboardInterrupt:
         sys.stderr.write(f"{program}: stopped; what is finished is kept, run the same to go on\n")
@@ -51,7 +51,7 @@ def _fail(program: str, error: Express50Error, code: int) -> int:
 
 @contextlib.contextmanager
 def readers_may_leave(stream: IO[str]) -> Iterator[None]:
-    """Whoever reads what is written within may go: work goes on, nothing complains at exit."""
+    """Continue without complaint when the reader of a stream has closed it."""
     try:
         yield
     except BrokenPipeError:
@@ -60,8 +60,8 @@ def readers_may_leave(stream: IO[str]) -> Iterator[None]:
         os.close(nowhere)
 
 
-def _told(error: OSError) -> str:
-    """What the system refused, and where."""
+def _describe(error: OSError) -> str:
+    """Say what the system refused, and at which path."""
     place = f" {error.filename}:" if error.filename is not None else ""
     words = error.strerror or str(error) or "no reason given"
     return f"{type(error).__name__}:{place} {words}; is the path right, may it be read and written?"
@@ -69,7 +69,7 @@ def _told(error: OSError) -> str:
 
 @contextlib.contextmanager
 def _stop_on_sigterm() -> Iterator[None]:
-    """Let SIGTERM, as batch systems send it, stop a command like Ctrl-C does."""
+    """Let SIGTERM, which batch systems send, stop a command as Ctrl-C does."""
 
     def stop(number: int, frame: object) -> None:
         raise KeyboardInterrupt
@@ -106,7 +106,7 @@ def say_json(value: object) -> None:
 
 @contextlib.contextmanager
 def stdout_to_stderr() -> Iterator[None]:
-    """Send whatever is written to standard output, also by native code, to standard error."""
+    """Send what is written to standard output, also by native code, to standard error."""
     sys.stdout.flush()
     with contextlib.redirect_stdout(sys.stderr):
         saved = os.dup(1)
@@ -119,7 +119,7 @@ def stdout_to_stderr() -> Iterator[None]:
 
 
 def format_table(header: list[str], rows: list[list[str]]) -> Iterator[str]:
-    """Lines of a table with aligned columns."""
+    """Yield the lines of a table with aligned columns."""
     widths = [max(len(row[i]) for row in [header, *rows]) for i in range(len(header))]
     for row in [header, *rows]:
         cells = (cell.ljust(width) for cell, width in zip(row, widths, strict=True))

@@ -1,4 +1,4 @@
-"""The errors a user sees: one line each, saying where, what, got, expected and how to mend."""
+"""The errors a user sees: one line each, saying where, what, got, expected and how to fix it."""
 
 from __future__ import annotations
 
@@ -8,9 +8,8 @@ LONGEST = 1200  # characters; what a hostile file says must not fill a terminal
 class Express50Error(Exception):
     """Base of every error that the command line turns into one line and exit code 1.
 
-    Libraries' messages that it quotes may run over lines or pages: it folds them into one line,
-    takes out what steers terminals, and leaves out the middle of what is too long, as the end says
-    how to mend it.
+    Quoted messages of libraries may run over pages: they are folded into one line without control
+    characters, and the middle is left out where they are too long, as the end says what to do.
     """
 
     def __init__(self, message: str) -> None:

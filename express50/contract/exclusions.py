@@ -1,4 +1,4 @@
-"""Which subjects are excluded, and why: the last such event in a subject's label file decides."""
+"""Exclusion of subjects: the last such event in a subject's label file decides."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from express50.files.text import parse_json, read_bytes
 
 
 def exclusion_reason(dataset: Dataset, subject: str) -> str | None:
-    """Why a subject is excluded (``express50 annotate exclude``), or None when it is not."""
+    """Return why a subject is excluded (``express50 annotate exclude``), or None if it is not."""
     path = dataset.labels_file(subject)
     reason = None
     data = read_bytes(path, AnnotationError) if path.is_file() else b""
@@ -23,5 +23,5 @@ def exclusion_reason(dataset: Dataset, subject: str) -> str | None:
 
 
 def included_subjects(dataset: Dataset) -> list[str]:
-    """Ingested subjects that are not excluded, sorted."""
+    """List ingested subjects that are not excluded, sorted."""
     return [s for s in dataset.subjects() if exclusion_reason(dataset, s) is None]

@@ -1,4 +1,7 @@
-"""Where everything lies in a dataset folder; the only file that knows the folder names."""
+"""Paths of a dataset folder that several parts of the toolkit use.
+
+A stage names the files inside its own items' folders.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +13,7 @@ from express50.files.text import NAME, read_json, read_toml
 
 
 def footage_root(capture: Path) -> Path:
-    """The folder that a registered capture's footage is relative to.
+    """Return the folder that a registered capture's footage is relative to.
 
     It is the capture's folder, a file's folder, or what ``source`` in capture.toml names: a capture
     may be that one file, which says where a read-only dataset lies and how to take it.
@@ -23,7 +26,7 @@ def footage_root(capture: Path) -> Path:
 
 
 def footage_source(capture: Path) -> Path:
-    """The file or folder that ``source`` in capture.toml names, the capture itself without one.
+    """Return what ``source`` in capture.toml names; the capture itself where it names nothing.
 
     Raises:
         CaptureError: capture.toml is not TOML, or its source is no existing path.
@@ -46,7 +49,7 @@ PLATES = "_plates"  # stands for an expression in the frames stage; no expressio
 
 @dataclass(frozen=True)
 class Dataset:
-    """A dataset folder: one folder a stage, one folder an item, plus ledger, labels and report."""
+    """A dataset folder: a folder per stage, in it a folder per item; ledger, labels and report."""
 
     root: Path
 
@@ -79,8 +82,8 @@ class Dataset:
         """
         if not self.captures_file.is_file():
             return {}
-        mend = "delete it and run 'express50 ingest' with every capture again"
-        table = read_json(self.captures_file, FormatError, mend)
+        fix = "delete it and run 'express50 ingest' with every capture again"
+        table = read_json(self.captures_file, FormatError, fix)
         if not isinstance(table, dict) or not all(isinstance(v, str) for v in table.values()):
             raise FormatError(
                 f"{self.captures_file}: expected an object subject -> path, got "
@@ -88,7 +91,7 @@ class Dataset:
             )
         for subject in table:
             if not NAME.fullmatch(subject):  # it becomes the name of folders
-                raise FormatError(f"{self.captures_file}: subject {subject!r} is no id; {mend}")
+                raise FormatError(f"{self.captures_file}: subject {subject!r} is not an id; {fix}")
         return {subject: Path(table[subject]) for subject in sorted(table)}
 
     def frame_file(self, subject: str, expression: str, camera: str) -> Path:
@@ -141,7 +144,7 @@ class Dataset:
 
     @property
     def slurm_dir(self) -> Path:
-        """Output of SLURM jobs, one file a job."""
+        """Output of SLURM jobs, one file per job."""
         return self.root / "logs" / "slurm"
 
     def log_file(self, stage: str, item: str) -> Path:
@@ -150,7 +153,7 @@ class Dataset:
 
 
 def existing_dataset(path: Path) -> Dataset:
-    """The dataset of a folder that has a ledger.
+    """Open the dataset of a folder that has a ledger.
 
     Raises:
         StageError: it has none.

@@ -1,4 +1,4 @@
-"""Parts of a subject: what a value in a picture of labels means, and which parts are the head."""
+"""Segmentation labels: their names, their colours and those that belong to the head."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ LABELS = (
     "background", "skin", "ears", "lips", "eyes", "teeth", "tongue", "mouth", "hair", "neck",
     "torso", "apparel",
 )  # fmt: skip
-"""Names of the labels by value; apparel (glasses, hats) only a network can tell."""
+"""Names of the labels by value; only a network finds apparel (glasses, hats)."""
 HEAD = LABELS[1:10]
 TORSO = LABELS.index("torso")
-# One colour a label; the background is black.
+# One colour per label; the background is black.
 COLOURS = np.array(
     [[0, 0, 0], [240, 150, 120], [250, 210, 60], [230, 40, 90], [90, 220, 255], [255, 255, 255],
      [170, 60, 200], [70, 0, 30], [70, 110, 255], [170, 200, 90], [50, 140, 90], [255, 120, 0]],
@@ -20,5 +20,5 @@ COLOURS = np.array(
 
 
 def label_mask(labels: np.ndarray, *names: str) -> np.ndarray:
-    """Pixels (H, W) bool of labels (H, W) that show one of the named LABELS."""
+    """Return the pixels (H, W) bool of labels (H, W) that show one of the named LABELS."""
     return np.isin(labels, [LABELS.index(name) for name in names])

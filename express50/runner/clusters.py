@@ -1,4 +1,4 @@
-"""Workers that dask runs tasks in: of this machine, GPUs dealt out among them, or a scheduler's."""
+"""Workers of dask: local processes that share the GPUs, or those of a given scheduler."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ CONNECT_SECONDS = 20.0
 
 
 class LocalWorkers:
-    """Processes on this machine; the first ones have a GPU each, as far as there are any."""
+    """Processes on this machine; the first ones get one GPU each."""
 
     def __init__(self, count: int, threads: int) -> None:
         devices = cuda_devices()
@@ -29,10 +29,10 @@ class LocalWorkers:
         self.client.register_plugin(_ignore_interrupts())
 
     def keep(self, tasks: int) -> None:
-        """Nothing: their nannies replace workers that died."""
+        """Do nothing: nannies replace workers that died."""
 
     def slots(self, stage: str, gpu: bool) -> int:
-        """How many may work at once.
+        """Return the number of tasks that may run at once.
 
         Raises:
             StageError: the stage needs a GPU and there is none.
@@ -48,7 +48,7 @@ class LocalWorkers:
 
 
 class RemoteWorkers:
-    """Workers that report to a scheduler, which stays as it is."""
+    """Workers of a scheduler that somebody else runs."""
 
     def __init__(self, client: Any) -> None:
         self.client = client
@@ -76,10 +76,10 @@ class RemoteWorkers:
         return cls(client)
 
     def keep(self, tasks: int) -> None:
-        """Nothing: they are not ours."""
+        """Do nothing: the workers are not ours."""
 
     def slots(self, stage: str, gpu: bool) -> int:
-        """How many may work at once; 1 while there are no workers yet.
+        """Return the number of tasks that may run at once; 1 while there are no workers yet.
 
         Raises:
             StageError: the stage needs a GPU and no worker offers one, nor has for a minute.
@@ -97,21 +97,21 @@ class RemoteWorkers:
         return max(1, offered)
 
     def table(self) -> list[dict]:
-        """What the scheduler knows of each worker."""
+        """Return what the scheduler knows of each worker."""
         return list(self.client.scheduler_info(n_workers=-1)["workers"].values())
 
     def close(self) -> None:
-        """Let go of the scheduler."""
+        """Disconnect from the scheduler."""
         self.client.close(timeout=5)
 
 
 def no_gpu(stage: str, words: str) -> StageError:
-    """The error of a stage that needs a GPU where there is none."""
+    """Make the error of a stage that needs a GPU where there is none."""
     return StageError(f"{stage} needs a GPU as it is configured, and {words}")
 
 
 def cluster_settings(threads: int) -> dict[str, object]:
-    """Settings of dask for a scheduler in this process."""
+    """Return dask's settings for a scheduler in this process."""
     return {
         "distributed.scheduler.allowed-failures": 0,
         # A stage may hold the interpreter for minutes in native code; that is not death.
@@ -123,7 +123,7 @@ def cluster_settings(threads: int) -> dict[str, object]:
 
 
 def start_cluster(workers: dict[int, dict], threads: int, **scheduler: object) -> tuple[Any, Any]:
-    """A scheduler in this process with local workers, if any: its client and itself."""
+    """Start a scheduler with local workers, if any; returns its client and the cluster."""
     import dask
     from distributed import Client, Scheduler, SpecCluster
 
@@ -138,7 +138,7 @@ def start_cluster(workers: dict[int, dict], threads: int, **scheduler: object) -
 
 
 def local_workers(count: int, devices: list[str]) -> dict[int, dict]:
-    """Specifications of local workers; the first ones get a GPU each, as far as there are any."""
+    """Specify local workers; the first ones get one GPU each."""
     from distributed import Nanny
 
     shared = {
@@ -159,7 +159,7 @@ def local_workers(count: int, devices: list[str]) -> dict[int, dict]:
 
 
 def cuda_devices() -> list[str]:
-    """Names of this machine's CUDA devices as ``CUDA_VISIBLE_DEVICES`` takes them.
+    """List this machine's CUDA devices as ``CUDA_VISIBLE_DEVICES`` takes them.
 
     The driver's own program is asked: torch takes seconds to import.
     """
@@ -178,7 +178,7 @@ def cuda_devices() -> list[str]:
 
 
 def _ignore_interrupts() -> Any:
-    """Plug-in by which workers leave Ctrl-C to the driver, which stops them in order."""
+    """Make the plug-in by which workers leave Ctrl-C to the driver, which stops them in order."""
     from distributed import WorkerPlugin
 
     class IgnoreInterrupts(WorkerPlugin):

@@ -1,4 +1,4 @@
-"""Tasks in worker processes: how many at a time, and what becomes of those whose worker dies."""
+"""Run tasks in worker processes; tasks whose worker died are tried again, then given up."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Pool:
         threads: int = 1,
         slurm: Mapping[str, SlurmJob] | None = None,
     ) -> None:
-        """Say where to work; nothing is started yet.
+        """Choose the workers; nothing is started yet.
 
         Args:
             workers: local processes; 0 or 1 item runs in this one.
@@ -52,7 +52,7 @@ class Pool:
         self.close()
 
     def runs_inline(self, count: int) -> bool:
-        """Whether starting processes would cost more than it brings."""
+        """Say whether starting processes would cost more than it gains."""
         here = self.scheduler is None and self.slurm is None
         return here and (self.workers == 0 or count <= 1)
 
@@ -110,7 +110,7 @@ class Pool:
         begin: Callable[[Task], None],
         attempt: int,
     ) -> list[Task]:
-        """Keep one batch a worker submitted; returns the tasks whose worker died."""
+        """Keep one batch per worker submitted; returns the tasks whose worker died."""
         from distributed.scheduler import KilledWorker
 
         waiting, killed, size = deque(tasks), [], 1
@@ -145,7 +145,7 @@ class Pool:
         return killed
 
     def _workers_for(self, task: Task) -> LocalWorkers | RemoteWorkers:
-        """The workers of a task's stage; those of the stage before where they fit."""
+        """Return the workers for a task's stage; those of the stage before where they fit."""
         job = self.slurm[task.stage.name] if self.slurm else None
         if isinstance(self._workers, SlurmWorkers) and self._workers.job != job:
             self.close()
@@ -170,10 +170,10 @@ def _submit(client: Any, batch: list[Task], attempt: int, gpu: bool) -> Any:
 
 
 def _next_size(size: int, batch: list[Task], receipts: list[Receipt]) -> int:
-    """Tasks of the next batches: more while they are over at once, one as soon as they are not.
+    """Return the size of the next batches: larger while tasks are quick, else one.
 
-    A round trip to a worker costs 10 ms, which empty items in batches share. What takes longer
-    goes alone, so that a death never costs or blames more than one of these.
+    A round trip to a worker costs 10 ms, which quick items share in a batch. Slow items go alone,
+    so that the death of a worker costs one of them at most.
     """
     if len(receipts) < len(batch):
         return len(receipts)
@@ -183,7 +183,7 @@ def _next_size(size: int, batch: list[Task], receipts: list[Receipt]) -> int:
 
 @contextmanager
 def _loss_is_one_error() -> Iterator[None]:
-    """Any call to a scheduler may be the one that finds it gone, each with an error of its own."""
+    """Turn the errors by which calls find a scheduler gone into one StageError."""
     try:
         yield
     except (CancelledError, OSError) as error:  # dask's CommClosedError is an OSError
@@ -194,7 +194,7 @@ def _loss_is_one_error() -> Iterator[None]:
 
 
 def _finished(client: Any, running: Iterable[Any]) -> set[Any]:
-    """The futures that ended, after a wait of at most ``POLL_SECONDS``."""
+    """Return the futures that ended, after a wait of at most ``POLL_SECONDS``."""
     from distributed import wait
 
     try:
@@ -205,7 +205,7 @@ def _finished(client: Any, running: Iterable[Any]) -> set[Any]:
 
 
 def _outcome(future: Any) -> tuple[list[Receipt] | None, BaseException | None]:
-    """What a finished batch returned, or why it did not run."""
+    """Return the receipts of a finished batch, or why it did not run."""
     failure = future.exception()
     if isinstance(failure, CancelledError):
         raise failure

@@ -48,7 +48,7 @@ class SlurmJob:
     jobs: int = 4
     """Most jobs at a time."""
     gpus: int = 0
-    """1 for a GPU a job."""
+    """1 for a GPU per job."""
     partition: str = ""
     """Partition; SLURM's default when empty."""
     account: str = ""
@@ -75,12 +75,12 @@ class SlurmJob:
                 raise ValueError(f"{text!r} has a line break")
 
     def processes(self, threads: int) -> int:
-        """Workers of a job, each of which works at one item with so many threads."""
+        """Return the number of workers of a job, each with so many threads."""
         return 1 if self.gpus else max(1, self.cores // threads)
 
 
 def read_slurm(text: str, stages: Iterable[str]) -> dict[str, SlurmJob]:
-    """What the jobs of every stage ask for.
+    """Read what the jobs of every stage ask for.
 
     Args:
         text: ``key=value,...``, or a TOML file of such keys, in which a table named after a stage
@@ -132,7 +132,7 @@ def _inline_values(text: str) -> dict[str, Any]:
 
 
 def check_slurm(submit: bool = True) -> None:
-    """See that jobs can be written, and submitted from here.
+    """Check that jobs can be written, and submitted from here.
 
     Raises:
         StageError: dask-jobqueue or sbatch are not there.
@@ -150,7 +150,7 @@ def check_slurm(submit: bool = True) -> None:
 
 
 def job_script(job: SlurmJob, address: str, name: str, threads: int, logs: Path) -> str:
-    """The script of one job.
+    """Write the script of one job.
 
     Args:
         job: what it asks for.
@@ -188,7 +188,7 @@ def job_script(job: SlurmJob, address: str, name: str, threads: int, logs: Path)
 
 
 def _environment(threads: int) -> list[str]:
-    """Lines that cap threads, and let workers import what this process can."""
+    """Return lines that cap threads and pass PYTHONPATH on to workers."""
     values = thread_environment(threads)
     if "PYTHONPATH" in os.environ:
         values["PYTHONPATH"] = os.environ["PYTHONPATH"]
@@ -245,7 +245,7 @@ class SlurmWorkers(RemoteWorkers):
             if self._silent >= SILENT_JOBS:
                 raise StageError(
                     f"{SILENT_JOBS} SLURM jobs in a row ended before their workers reached "
-                    f"this machine; {self.logs / f'{number}.out'} may tell why, --print-job "
+                    f"this machine; {self.logs / f'{number}.out'} may say why, --print-job "
                     "shows their script"
                 )
 
@@ -275,12 +275,12 @@ class SlurmWorkers(RemoteWorkers):
 
 
 def _of(name: str, worker: str) -> bool:
-    """Whether a worker belongs to the job of this name: dask appends a number to each of many."""
+    """Say whether a worker belongs to a job: dask appends a number to each of many workers."""
     return worker == name or worker.rpartition("-")[0] == name
 
 
 def _queue() -> set[str] | None:
-    """Ids of the user's jobs that wait or run; None when the queue does not answer."""
+    """List the user's jobs that wait or run; None when the queue does not answer."""
     done = _call("squeue", "--noheader", "--format=%A", f"--user={getpass.getuser()}")
     return set(done.stdout.split()) if done.returncode == 0 else None
 

@@ -1,4 +1,4 @@
-"""One item of one stage, in whatever process: run it, publish its folder, return its receipt."""
+"""Run one item of a stage in any process: publish its folder and return its receipt."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ BATCH_SECONDS = 0.2  # a batch begins no further item after so long
 
 @dataclass(frozen=True)
 class Task:
-    """An item to run, with everything a worker needs."""
+    """An item to run, with all that a worker needs."""
 
     stage: Stage
     dataset: Dataset
@@ -41,7 +41,7 @@ class Task:
 def input_digests(
     stage: Stage, dataset: Dataset, item: str, config: Any, digest: Callable[[Path], str]
 ) -> dict[str, str]:
-    """Digest of every input of an item, by its name.
+    """Compute the digest of every input of an item, by name.
 
     Args:
         stage: the stage.
@@ -60,12 +60,12 @@ def input_digests(
 
 
 def fingerprint(stage: Stage, config: Any, inputs: dict[str, str]) -> str:
-    """Digest of stage version, resolved config and inputs of an item."""
+    """Compute the digest of stage version, resolved config and inputs of an item."""
     return value_digest([stage.name, stage.version, vars(config), inputs])
 
 
 def run_tasks(tasks: list[Task]) -> list[Receipt]:
-    """Run items one after another for a while; receipts of those that were begun, at least one."""
+    """Run items in turn for a while; returns the receipts of those begun, at least one."""
     began, receipts = time.perf_counter(), []
     for task in tasks:
         receipts.append(run_task(task))
@@ -75,7 +75,7 @@ def run_tasks(tasks: list[Task]) -> list[Receipt]:
 
 
 def run_task(task: Task) -> Receipt:
-    """Run one item and publish its outputs; whatever goes wrong becomes a receipt.
+    """Run one item and publish its outputs; any failure becomes a receipt.
 
     Only a receipt travels back to the driver, never data.
     """
@@ -109,7 +109,7 @@ def _run_and_publish(task: Task) -> tuple[dict, dict[str, FileMark]]:
     if task.stage.needs_gpu(task.config):
         _check_gpu(task)
     with publishing(task.dataset, task.stage.name, task.item) as out:
-        # Data belong on standard output, and a library's chatter is none.
+        # Standard output is for data; libraries' messages go to standard error.
         with contextlib.redirect_stdout(sys.stderr):
             result = task.stage.run(task.dataset, task.item, task.config, out)
         metrics = result.to_json() if isinstance(result, Result) else result
@@ -120,7 +120,7 @@ def _run_and_publish(task: Task) -> tuple[dict, dict[str, FileMark]]:
 
 
 def _check_gpu(task: Task) -> None:
-    """Refuse to do on a CPU what was asked for on a GPU."""
+    """Refuse to run on a CPU what was asked for on a GPU."""
     import torch
 
     if not torch.cuda.is_available():
@@ -155,7 +155,7 @@ def reset_peak_memory() -> None:
 
 
 def peak_memory() -> int:
-    """Largest resident memory of this process since the last reset, bytes."""
+    """Return the largest resident memory of this process since the last reset, bytes."""
     with contextlib.suppress(OSError):
         for line in Path("/proc/self/status").read_text().splitlines():
             if line.startswith("VmHWM:"):
