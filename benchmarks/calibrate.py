@@ -52,24 +52,24 @@ from express50.twin.truth import Truth, align_worlds
 from pipelines import ingest
 from pipelines.calibrate import STAGE
 from pipelines.calibrate.board import (
-    Observations,
+    BoardCorners,
     board_from_table,
     board_points,
-    read_observations,
+    read_corners,
 )
-from pipelines.calibrate.board_adjust import Rig, residuals
+from pipelines.calibrate.board_adjust import BoardRig, corner_errors
+from pipelines.calibrate.board_rig import solve_rig
 from pipelines.calibrate.camera_moves import check_footage
-from pipelines.calibrate.colour import Palette, gains_of
+from pipelines.calibrate.colour_gains import WhiteCollector
 from pipelines.calibrate.config import CalibrateConfig
-from pipelines.calibrate.graph import join, mean_transform, rig_from_board
 from pipelines.calibrate.intrinsics import (
-    View,
+    BoardView,
     board_poses,
     camera_params,
     fit_intrinsics,
     with_ideal,
 )
-from pipelines.calibrate.solve import solve_rig
+from pipelines.calibrate.rig_graph import join_rig, mean_transform, rig_from_board
 
 HEAD_RADIUS_M = 0.13
 BUMP_DEG = 0.3
@@ -113,18 +113,16 @@ def main() -> int:
     points = board_points(board)
     sizes = {name: (source.width, source.height) for name, source in index.cameras.items()}
     start = time.process_time()
-    palette = Palette(board)
-    observations = read_observations(
-        board, board_files(index), sizes, config.board_frames, palette.look
-    )
+    palette = WhiteCollector(board)
+    observations = read_corners(board, board_files(index), sizes, config.board_frames, palette.look)
     detected = time.process_time()
-    solution = solve_rig(observations, points, sizes, config)
+    solution = solve_rig(observations, points, sizes, config.camera_model, config.rounds)
     solved = time.process_time()
     rms = float(np.sqrt(np.mean(np.sum(solution.errors**2, axis=1))))
     started = time.process_time()
     rig = chained(observations, points, sizes)
     chain_seconds = time.process_time() - started
-    errors = np.linalg.norm(residuals(rig, observations, points), axis=1)
+    errors = np.linalg.norm(corner_errors(rig, observations, points), axis=1)
     baseline = figures(rig.cameras, true) | {
         "reprojection_px_rms": float(np.sqrt(np.mean(errors[np.isfinite(errors)] ** 2))),
         "seconds": detected - start + chain_seconds,
@@ -146,9 +144,10 @@ def main() -> int:
     return 0
 
 
-def gain_figures(palette: Palette, names: list[str]) -> dict[str, float]:
+def gain_figures(palette: WhiteCollector, names: list[str]) -> dict[str, float]:
     """Root mean square error of the colour gains, percent, and the same of leaving colours be."""
-    found = gains_of(palette.whites, names)
+    found = palette.gains(names)
+    measured = np.array([found.gain.get(name, np.ones(3)) for name in names])
     every = sorted(make_rig(RIG.cameras, RIG.width, RIG.height, RIG.seed))
     true = np.log([make_sensor(every.index(name), RIG.seed).gain for name in names])
     true -= true.mean(0)
@@ -157,7 +156,7 @@ def gain_figures(palette: Palette, names: list[str]) -> dict[str, float]:
         return 100 * float(np.sqrt(np.mean(errors**2)))
 
     return {
-        "colour_gain_error_percent": rms(np.log(found.gain) - true),
+        "colour_gain_error_percent": rms(np.log(measured) - true),
         "colour_gain_unevened_percent": rms(true),
     }
 
@@ -165,7 +164,7 @@ def gain_figures(palette: Palette, names: list[str]) -> dict[str, float]:
 def footage_figures(
     index: Index,
     true: Mapping[str, Camera],
-    board: tuple[Observations, np.ndarray],
+    board: tuple[BoardCorners, np.ndarray],
     config: CalibrateConfig,
 ) -> dict[str, object]:
     """Rigs solved from the footage alone, and perturbed ones refined: the twin's and foreign ones.
@@ -308,16 +307,16 @@ def head_error(estimated: Mapping[str, Camera], true: Mapping[str, Camera]) -> f
 
 
 def chained(
-    observations: Observations, points: np.ndarray, sizes: Mapping[str, tuple[int, int]]
-) -> Rig:
+    observations: BoardCorners, points: np.ndarray, sizes: Mapping[str, tuple[int, int]]
+) -> BoardRig:
     """OpenCV a camera, the mean relative pose a pair, and the best tree of pairs: no adjustment."""
     lone: dict[str, Camera] = {}
-    views: dict[str, dict[int, View]] = {}
+    views: dict[str, dict[int, BoardView]] = {}
     for i, name in enumerate(observations.cameras):
         mine = observations.camera == i
         frames = {int(f): mine & (observations.frame == f) for f in observations.frame[mine]}
         found = [
-            View(f, points[observations.corner[rows]], observations.pixels[rows])
+            BoardView(f, points[observations.corner[rows]], observations.pixels[rows])
             for f, rows in sorted(frames.items())
             if rows.sum() >= 8
         ]
@@ -336,14 +335,14 @@ def chained(
         for b in sorted(lone):
             shared = sorted(set(poses[a]) & set(poses[b])) if a < b else []
             if shared:
-                told = [poses[b][f][0] @ invert_transform(poses[a][f][0]) for f in shared]
+                votes = [poses[b][f][0] @ invert_transform(poses[a][f][0]) for f in shared]
                 weights = np.array([float(len(views[b][f].points)) for f in shared])
-                edges[a, b] = (mean_transform(told, weights), float(weights.sum()))
-    placed = join(sorted(lone), edges, sweeps=0)
+                edges[a, b] = (mean_transform(np.stack(votes), weights), float(weights.sum()))
+    placed = join_rig(sorted(lone), edges, sweeps=0)
     shown = sorted({f for name in placed for f in poses[name]})
     boards = {f: rig_from_board(f, placed, lone, views, poses) for f in shown}
     cameras = {name: replace(lone[name], cam_from_world=pose) for name, pose in placed.items()}
-    return Rig(cameras, {f: pose for f, pose in boards.items() if pose is not None})
+    return BoardRig(cameras, {f: pose for f, pose in boards.items() if pose is not None})
 
 
 def rounded(row: Mapping[str, object]) -> dict[str, object]:

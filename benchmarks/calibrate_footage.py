@@ -20,31 +20,27 @@ from express50.errors import CalibrationError
 from express50.geometry.cameras import Camera
 from express50.geometry.transforms import matrix_to_axis_angle, similarity_fit
 from express50.landmarks.network import load_network
-from pipelines.calibrate.adjust import move_pose
-from pipelines.calibrate.board import Observations
-from pipelines.calibrate.camera_moves import reduce_image, reduced_camera
+from pipelines.calibrate.adjuster import move_pose
+from pipelines.calibrate.board import BoardCorners
 from pipelines.calibrate.config import CalibrateConfig
-from pipelines.calibrate.faces import start_camera
-from pipelines.calibrate.features import match_looks
-from pipelines.calibrate.refine import Refined, refine_by_board, refine_by_footage
-from pipelines.calibrate.sampling import read_moments
-from pipelines.calibrate.structure import solve_footage
-from pipelines.calibrate.tracks import Seen, look, undistorted
+from pipelines.calibrate.footage import read_capture_frames, reduce_image, reduced_camera
+from pipelines.calibrate.footage_rig import solve_footage
+from pipelines.calibrate.refine import RefinedRig, refine_by_board, refine_by_footage
+from pipelines.calibrate.tracks import FrameSetPoints, find_points, match_descriptors
 
 BUMP_DEG, BUMP_MM = 0.3, 5.0
-PerceptualMetrics = Callable[[Mapping[str, Camera], Mapping[str, Camera]], dict[str, float]]
+RigJudge = Callable[[Mapping[str, Camera], Mapping[str, Camera]], dict[str, float]]
 
 
-def see_capture(root: Path, true: Mapping[str, Camera], moments: int) -> dict[int, Seen]:
+def see_capture(root: Path, true: Mapping[str, Camera], moments: int) -> dict[int, FrameSetPoints]:
     """What the cameras of a raw capture see, in recorded pixels of `reduced_camera`."""
 
     def reduce(name: str, image: np.ndarray) -> np.ndarray | None:
         return reduce_image(true[name], image, "the footage") if name in true else None
 
-    frames = read_moments(root, moments, reduce)
+    frames = read_capture_frames(root, moments, reduce)
     net = load_network()
-    blank = {n: start_camera(n, (c.width, c.height), 1.0) for n, c in small(true).items()}
-    return {frame: look(blank, images, net) for frame, images in frames.items()}
+    return {frame: find_points(images, net) for frame, images in frames.items()}
 
 
 def small(cameras: Mapping[str, Camera]) -> dict[str, Camera]:
@@ -53,7 +49,7 @@ def small(cameras: Mapping[str, Camera]) -> dict[str, Camera]:
 
 
 def sfm_figures(
-    seen: Mapping[int, Seen], true: Mapping[str, Camera], config: CalibrateConfig
+    seen: Mapping[int, FrameSetPoints], true: Mapping[str, Camera], config: CalibrateConfig
 ) -> dict[str, object]:
     """Errors of rigs solved with unknown and with told focal lengths, and of COLMAP's mapping."""
     rig = small(true)
@@ -63,7 +59,11 @@ def sfm_figures(
     for key, focals in (("unknown_focals", {}), ("told_focals", told)):
         started = time.process_time()
         try:
-            solved = solve_footage(seen, sizes, focals, config, "footage")
+            solved = solve_footage(
+                seen, sizes, focals, "footage",
+                model=config.camera_model, distance_m=config.distance_m,
+                eye_distance_mm=config.eye_distance_mm,
+            )  # fmt: skip
             row = similar(solved.cameras, rig) | {"weak": len(solved.weak)}
         except CalibrationError as error:
             row = {"cameras_registered": 0, "cameras": len(rig), "refused": str(error)}
@@ -97,21 +97,24 @@ def similar(estimated: Mapping[str, Camera], true: Mapping[str, Camera]) -> dict
 
 
 def refine_figures(
-    seen: Mapping[int, Seen],
+    seen: Mapping[int, FrameSetPoints],
     true: Mapping[str, Camera],
-    judge: PerceptualMetrics,
-    board: tuple[Observations, np.ndarray] | None = None,
+    judge: RigJudge,
+    board: tuple[BoardCorners, np.ndarray] | None = None,
 ) -> dict[str, object]:
     """Errors of a perturbed rig before and after, and whether the true one is left as it is.
 
     `judge` compares a rig with the true one.
     """
-    config = CalibrateConfig(refine="poses")
+    config = CalibrateConfig()
     bumped = perturbed(true)
 
-    def by_footage(rig: Mapping[str, Camera]) -> Refined:
+    def by_footage(rig: Mapping[str, Camera]) -> RefinedRig:
         reduced = small(rig)
-        found = refine_by_footage(reduced, reduced, undistorted(seen, reduced), config)
+        found = refine_by_footage(
+            reduced, reduced, seen,
+            turn_deg=config.refine_turn_deg, move_mm=config.refine_move_mm, lenses=False,
+        )  # fmt: skip
         poses = {n: c.cam_from_world for n, c in found.cameras.items()}
         return replace(
             found, cameras={n: replace(c, cam_from_world=poses[n]) for n, c in rig.items()}
@@ -124,18 +127,18 @@ def refine_figures(
     if board is not None:
         observations, points = board
 
-        def by_board(rig: Mapping[str, Camera]) -> Refined:
-            return refine_by_board(rig, observations, points, config)
+        def by_board(rig: Mapping[str, Camera]) -> RefinedRig:
+            return refine_by_board(rig, observations, points, rounds=config.rounds, lenses=False)
 
         rows["board"] = _row(by_board, bumped, true, judge)
     return rows
 
 
 def _row(
-    refine: Callable[[Mapping[str, Camera]], Refined],
+    refine: Callable[[Mapping[str, Camera]], RefinedRig],
     bumped: Mapping[str, Camera],
     true: Mapping[str, Camera],
-    judge: PerceptualMetrics,
+    judge: RigJudge,
 ) -> dict[str, object]:
     started = time.process_time()
     found = refine(bumped)
@@ -171,7 +174,9 @@ def perturbed(rig: Mapping[str, Camera]) -> dict[str, Camera]:
     return found
 
 
-def colmap_mapping(seen: Mapping[int, Seen], rig: Mapping[str, Camera]) -> dict[str, Camera]:
+def colmap_mapping(
+    seen: Mapping[int, FrameSetPoints], rig: Mapping[str, Camera]
+) -> dict[str, Camera]:
     """The largest model of COLMAP's incremental mapping; it is told sizes, not focal lengths."""
     with tempfile.TemporaryDirectory() as folder:
         root = Path(folder)
@@ -200,7 +205,9 @@ def colmap_mapping(seen: Mapping[int, Seen], rig: Mapping[str, Camera]) -> dict[
     return found
 
 
-def _write_database(path: Path, seen: Mapping[int, Seen], rig: Mapping[str, Camera]) -> None:
+def _write_database(
+    path: Path, seen: Mapping[int, FrameSetPoints], rig: Mapping[str, Camera]
+) -> None:
     database = pycolmap.Database.open(path)
     ids, cameras, points = {}, {}, {}
     for name, camera in sorted(rig.items()):
@@ -238,19 +245,19 @@ def _write_database(path: Path, seen: Mapping[int, Seen], rig: Mapping[str, Came
     database.close()
 
 
-def _pixels(moment: Seen, name: str) -> np.ndarray:
+def _pixels(moment: FrameSetPoints, name: str) -> np.ndarray:
     """A camera's pixels at one moment: 68 landmarks (zeros without a face), then features."""
     faces = {camera: points for camera, points, _ in moment.landmarks}
     return np.concatenate([faces.get(name, np.zeros((68, 2))), moment.features[name][0]])
 
 
-def _pairs(seen: Mapping[int, Seen], a: str, b: str) -> np.ndarray:
+def _pairs(seen: Mapping[int, FrameSetPoints], a: str, b: str) -> np.ndarray:
     """Matches (M, 2) of two cameras, all moments' keypoints counted through."""
     found, at = [np.zeros((0, 2), int)], np.zeros(2, int)
     for moment in seen.values():
         if {a, b} <= {name for name, _, _ in moment.landmarks}:
             found.append(np.arange(68)[:, None] + at)
-        found.append(match_looks(moment.features[a][1], moment.features[b][1]) + 68 + at)
+        found.append(match_descriptors(moment.features[a][1], moment.features[b][1]) + 68 + at)
         at += [68 + len(moment.features[name][0]) for name in (a, b)]
     return np.concatenate(found).astype(np.uint32)
 

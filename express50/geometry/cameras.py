@@ -136,13 +136,17 @@ def distort(camera: Camera, xy: np.ndarray) -> np.ndarray:
 
 
 def undistort(camera: Camera, xy: np.ndarray, iterations: int = 30) -> np.ndarray:
-    """Ideal normalised coordinates (N, 2) of distorted ones (N, 2), by damped fixed point."""
+    """Ideal normalised coordinates (N, 2) of distorted ones (N, 2), by damped fixed point.
+
+    Where the lens folds there is no solution: the result is then finite but does not distort back.
+    """
     if not camera.dist.any():
         return np.asarray(xy, dtype=np.float64)
     ideal = np.array(xy, dtype=np.float64)
     for _ in range(iterations):
         error = xy - distort(camera, ideal)
-        ideal = ideal + error
+        # Without the bound a diverging point overflows; 20 is 87 degrees off the axis.
+        ideal = np.clip(ideal + error, -20.0, 20.0)
         if np.nanmax(np.abs(error), initial=0.0) < 1e-12:
             break
     return ideal

@@ -20,7 +20,7 @@ from express50.geometry.conventions import corner_to_cell
 from express50.landmarks.detector import detect
 from express50.landmarks.network import LandmarkNet
 from pipelines.alpha.learned import refined
-from pipelines.calibrate.faces import mean_landmarks, pose_of_face
+from pipelines.calibrate.first_guess import mean_landmarks, pose_of_face
 
 FACE_SCORE = 0.3  # heads from behind score up to 0.2, profiles from 0.33 on
 SEARCH = 0.08  # smallest windows searched for the face, of the longer side

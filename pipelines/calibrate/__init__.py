@@ -1,32 +1,42 @@
-"""Calibration of a rig: given cameras are checked, others are solved from ChArUco images."""
+"""Calibration of a rig: given cameras are checked, others are solved from board or footage."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import Any
 
+from express50.capture.index import calibration_file, index_path, read_index
 from express50.contract.extensions import Command
 from express50.contract.layout import Dataset
 from express50.contract.stage import Growth, Result, Stage
 from pipelines.calibrate.config import PRESETS, CalibrateConfig
 
+__all__ = ["COMMAND", "STAGE", "CalibrateConfig"]
+
 
 def items(dataset: Dataset) -> list[str]:
-    """List the items, see `pipelines.calibrate.stage`."""
-    from pipelines.calibrate.stage import items as found
-
-    return found(dataset)
+    """List the subjects: a rig may be bumped between two, so each has its own cameras."""
+    return dataset.subjects()
 
 
 def inputs(dataset: Dataset, item: str, config: CalibrateConfig) -> dict[str, Path | str]:
-    """Name what one item reads, see `pipelines.calibrate.stage`."""
-    from pipelines.calibrate.stage import inputs as found
+    """List the frame index, the landmark weights, and calibration and board images if given."""
+    # Imported here, as everything heavy: listing the stages must stay quick.
+    from express50.landmarks.network import WEIGHTS
 
-    return found(dataset, item, config)
+    index = read_index(dataset, item)
+    found: dict[str, Path | str] = {"index": index_path(dataset, item), "weights": WEIGHTS}
+    given = calibration_file(dataset, index)
+    if given is not None:
+        found["calibration"] = given
+    if index.board is not None:
+        for files in index.board["cameras"].values():
+            found |= {name: index.capture / name for name in files}
+    return found
 
 
-def run(dataset: Dataset, item: str, config: CalibrateConfig, out: Path) -> Result | dict:
-    """Make one item, see `pipelines.calibrate.stage`."""
+def run(dataset: Dataset, item: str, config: CalibrateConfig, out: Path) -> Result:
+    """Write the cameras of one subject, plots, and from a board the cameras' colour gains."""
     from pipelines.calibrate.stage import run as work
 
     return work(dataset, item, config, out)
@@ -34,7 +44,7 @@ def run(dataset: Dataset, item: str, config: CalibrateConfig, out: Path) -> Resu
 
 STAGE = Stage(
     name="calibrate",
-    version=3,
+    version=4,
     config=CalibrateConfig,
     presets=PRESETS,
     items=items,
@@ -47,7 +57,7 @@ STAGE = Stage(
 
 
 def add_commands(subparsers: Any) -> None:
-    """Add the command, see `pipelines.calibrate.cli`."""
+    """Add ``express50 cameras``, see `pipelines.calibrate.cli`."""
     from pipelines.calibrate.cli import add_commands as add
 
     add(subparsers)

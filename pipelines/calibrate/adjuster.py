@@ -1,37 +1,35 @@
-"""Bundle adjustment of whole rigs over footage: poses, lenses and points at once.
+"""Bundle adjustment of a rig over footage: poses, lenses and points at once, with priors.
 
-COLMAP's adjuster, which the board uses, takes all observations for equally good and knows nothing
-of what is likely. Footage is seen through landmarks off by many pixels beside features off by a
-fraction of one, and says little of a lens: here every observation has its own expected error, and
-every unknown a spread about where it starts.
+COLMAP's adjuster, which the board uses, takes all observations for equally good and has no priors
+on lenses. Footage is seen through landmarks that are off by many pixels beside features that are
+off by a fraction of one, and says little about a lens. So every observation has its own sigma here,
+and every unknown a prior. SciPy's sparse least squares applies its loss to priors too and cannot
+eliminate the points; here they are eliminated as by Triggs et al., Bundle Adjustment, a Modern
+Synthesis, 2000, section 6.1.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import scipy.sparse as sparse
 
-from express50.geometry.cameras import Camera, distort
-from pipelines.calibrate.adjust import move_pose
-from pipelines.calibrate.tracks import Tracks
+from express50.geometry.cameras import Camera, distort, normalised
+from express50.geometry.transforms import axis_angle_to_matrix, make_transform
+from pipelines.calibrate.tracks import PointTracks
 
 UNKNOWNS = 10
-"""A camera's: rotation (3), translation (3), log focal length, centre (2), first radial term."""
+"""Per camera: rotation (3), translation (3), log focal length, centre (2), first radial term."""
 ITERATIONS = 60
 """Enough for rigs of tens of cameras; longer runs move poses by less than they are off."""
-_TWO_FOCALS = ("PINHOLE", "OPENCV", "FULL_OPENCV")
-_NO_BEND = ("SIMPLE_PINHOLE", "PINHOLE")
+BEHIND = 1e4
+"""Residual of a point behind its camera, in sigmas."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Freedom:
-    """How far unknowns may be from where they start, as standard deviations.
-
-    0 holds them, infinity frees them.
-    """
+class RigPriors:
+    """Standard deviations of the unknowns about where they start: 0 holds them, inf frees them."""
 
     turn_rad: float = np.inf
     """Rotation of a camera."""
@@ -44,139 +42,204 @@ class Freedom:
     centre: float = 0.0
     """Principal point, as a share of the image's diagonal."""
     bend: float = 0.0
-    """First radial term, as what it does at the image's corner: a share of the half diagonal."""
+    """First radial term, by its effect at the image's corner, as a share of half the diagonal."""
 
 
 @dataclass(frozen=True)
-class Adjusted:
-    """Cameras and points (P, 3) that fit, and the errors (N, 2), pixels, of the observations."""
+class AdjustedRig:
+    """Cameras and points (P, 3) that fit, the errors (N, 2) in pixels, and their robust cost."""
 
     cameras: dict[str, Camera]
     points: np.ndarray
     errors: np.ndarray
+    cost: float
 
 
 @dataclass(frozen=True)
 class _Linear:
-    """Derivatives (N, 2, 10) by the cameras and (N, 2, 3) by the points, errors (N, 2)."""
+    """Errors (N, 2), their derivatives by cameras (N, 2, 10) and points (N, 2, 3), and sizes (N,).
 
-    of_cameras: np.ndarray
-    of_points: np.ndarray
+    `sizes` are the lengths of the errors in sigmas.
+    """
+
     errors: np.ndarray
-    ahead: np.ndarray
+    by_camera: np.ndarray
+    by_point: np.ndarray
+    sizes: np.ndarray
+
+    def cost(self, scale: float) -> float:
+        """Half the squared sizes, flattened by Cauchy's loss."""
+        return 0.5 * scale**2 * float(np.log1p((self.sizes / scale) ** 2).sum())
 
 
 def adjust_rig(
     cameras: Mapping[str, Camera],
-    tracks: Tracks,
+    tracks: PointTracks,
     points: np.ndarray,
-    freedom: Freedom,
-    scale: float,
-    iterations: int,
-) -> Adjusted:
-    """Fit cameras and points to tracks by Levenberg and Marquardt's method.
+    priors: RigPriors,
+    scales: Sequence[float],
+    free: Collection[str] | None = None,
+    iterations: int = ITERATIONS,
+) -> AdjustedRig:
+    """Fit cameras and points to tracks by the method of Levenberg and Marquardt.
 
     Args:
-        cameras: where to start; those of `tracks.names`.
-        tracks: pixels undistorted by these very cameras.
-        points: (P, 3) where the points are thought to be.
-        freedom: what may move, and how far.
-        scale: where Cauchy's weight of an observation has fallen to a half, in expected errors.
-        iterations: at most.
-
-    Source: Triggs et al., Bundle Adjustment, a Modern Synthesis, 2000.
+        cameras: start values of the cameras in `tracks.names`.
+        tracks: observations.
+        points: (P, 3) start values.
+        priors: how far unknowns may move from the start.
+        scales: residuals, in sigmas, at which Cauchy's weight has fallen to a half. One fit after
+            the other, wide scales first.
+        free: cameras that may change at all; None frees all.
+        iterations: limit per scale.
     """
-    names = tracks.names
-    rig = [cameras[name] for name in names]
-    seen = recorded_pixels(rig, tracks)
-    prior, columns = _prior(rig, freedom)
-    start = np.array([np.log(_focal(camera)) for camera in rig])
+    rig = [cameras[name] for name in tracks.names]
+    information, columns = _information(rig, priors, free)
+    ties, logs = _focal_ties(rig, priors), np.log([_focal(camera) for camera in rig])
     moved = np.zeros((len(rig), UNKNOWNS))
-    at = _linearise(rig, tracks, seen, points)
-    lowest, damping = _cost(at, tracks, scale, prior, moved, start), 1e-3
-    for _ in range(iterations):
-        step, shifts = _solve(at, tracks, scale, prior, columns, moved, start, damping)
-        tried = [_moved(camera, row) for camera, row in zip(rig, step, strict=True)]
-        then = _linearise(tried, tracks, seen, points + shifts)
-        cost = _cost(then, tracks, scale, prior, moved + step, start)
-        if not cost < lowest:
-            damping *= 8
-            if damping > 1e8:
+
+    def prior_gradient(moved: np.ndarray) -> np.ndarray:
+        gradient = information * moved
+        gradient[:, 6] += ties @ (logs + moved[:, 6])
+        return gradient.reshape(-1)
+
+    def prior_cost(moved: np.ndarray) -> float:
+        focals = logs + moved[:, 6]
+        return 0.5 * float((information * moved**2).sum() + focals @ ties @ focals)
+
+    at = _linearise(rig, tracks, points)
+    for scale in scales:
+        lowest, damping = at.cost(scale) + prior_cost(moved), 1e-3
+        for _ in range(iterations):
+            normal = _eliminate_points(at, tracks, scale, len(rig), damping)
+            H = normal.cameras + np.diag(information.reshape(-1))
+            H[6::UNKNOWNS, 6::UNKNOWNS] += ties
+            H += damping * np.diag(normal.diagonal + information.reshape(-1))
+            block = H[np.ix_(columns, columns)]
+            block += 1e-12 * np.trace(block) * np.eye(len(columns))
+            step = np.zeros(moved.size)
+            step[columns] = np.linalg.solve(block, (normal.right - prior_gradient(moved))[columns])
+            shifts = normal.point_steps(step)
+            step = step.reshape(moved.shape)
+            tried = [_moved(camera, step[i]) for i, camera in enumerate(rig)]
+            then = _linearise(tried, tracks, points + shifts)
+            cost = then.cost(scale) + prior_cost(moved + step)
+            if not cost < lowest:
+                damping *= 8
+                if damping > 1e8:
+                    break
+                continue
+            gain = (lowest - cost) / max(lowest, 1e-12)
+            rig, points, moved, at, lowest = tried, points + shifts, moved + step, then, cost
+            damping = max(damping / 5, 1e-9)
+            if gain < 1e-7:
                 break
-            continue
-        gain = (lowest - cost) / max(lowest, 1e-12)
-        rig, points, moved, at, lowest = tried, points + shifts, moved + step, then, cost
-        damping = max(damping / 5, 1e-9)
-        if gain < 1e-7:
-            break
-    return Adjusted(dict(zip(names, rig, strict=True)), points, at.errors)
+    found = dict(zip(tracks.names, rig, strict=True))
+    return AdjustedRig(found, points, at.errors, at.cost(scales[-1]))
 
 
-def recorded_pixels(rig: list[Camera], tracks: Tracks) -> np.ndarray:
-    """Where the cameras recorded the tracks' undistorted pixels (N, 2)."""
-    out = tracks.pixels.copy()
+def single_camera_gains(
+    fit: AdjustedRig, tracks: PointTracks, priors: RigPriors, scale: float, free: Collection[str]
+) -> np.ndarray:
+    """Estimate (C,) how much the cost would fall if each camera alone joined the `free` ones.
+
+    To first order, with all points following; 0 for cameras that are free already.
+    """
+    rig = [fit.cameras[name] for name in tracks.names]
+    normal = _eliminate_points(_linearise(rig, tracks, fit.points), tracks, scale, len(rig), 0.0)
+    H = normal.cameras + np.diag(_information(rig, priors, None)[0].reshape(-1))
+    pose = [UNKNOWNS * i + np.arange(6) for i in range(len(rig))]
+    already = [tracks.names.index(name) for name in free]
+    gains = np.zeros(len(rig))
+    for index in set(range(len(rig))) - set(already):
+        columns = np.concatenate([pose[i] for i in (*already, index)])
+        step = np.linalg.solve(H[np.ix_(columns, columns)], normal.right[columns])
+        gains[index] = 0.5 * normal.right[pose[index]] @ step[-6:]
+    return gains
+
+
+def triangulate_tracks(cameras: Mapping[str, Camera], tracks: PointTracks) -> np.ndarray:
+    """Triangulate (P, 3) the points nearest to their rays, reweighted robustly in three rounds."""
+    rig = [cameras[name] for name in tracks.names]
+    xy = np.zeros_like(tracks.pixels)
     for index, camera in enumerate(rig):
         mine = tracks.camera == index
-        K = camera.K
-        xy = (tracks.pixels[mine] - K[:2, 2]) / K[[0, 1], [0, 1]]
-        out[mine] = distort(camera, xy) * K[[0, 1], [0, 1]] + K[:2, 2]
-    return out
+        xy[mine] = np.nan_to_num(normalised(camera, tracks.pixels[mine]))
+    pose = np.stack([camera.cam_from_world for camera in rig])[tracks.camera]
+    focal = np.array([_focal(camera) for camera in rig])[tracks.camera] / tracks.sigma
+    d = np.einsum("nji,nj->ni", pose[:, :3, :3], np.column_stack([xy, np.ones(len(xy))]))
+    d /= np.linalg.norm(d, axis=1, keepdims=True)
+    centre = -np.einsum("nji,nj->ni", pose[:, :3, :3], pose[:, :3, 3])
+    across = np.eye(3) - d[:, :, None] * d[:, None, :]
+    weight = focal**2
+    count = int(tracks.point.max(initial=-1)) + 1
+    for _ in range(3):
+        A = _sum_by(weight[:, None, None] * across, tracks.point, count)
+        right = np.einsum("nij,nj->ni", across, centre) * weight[:, None]
+        right = _sum_by(right, tracks.point, count)
+        trace = np.trace(A, axis1=1, axis2=2)[:, None, None]
+        points = np.linalg.solve(A + 1e-9 * trace * np.eye(3), right[..., None])[..., 0]
+        gap = np.einsum("nij,nj->ni", across, points[tracks.point] - centre)
+        reach = np.maximum(np.linalg.norm(points[tracks.point] - centre, axis=1), 1e-6)
+        angle = np.linalg.norm(gap, axis=1) / reach * focal
+        weight = (focal / reach) ** 2 / (1 + (angle / 3) ** 2)
+    return points
+
+
+def move_pose(cam_from_world: np.ndarray, step: np.ndarray) -> np.ndarray:
+    """Apply a small rotation and translation (6,), in the camera's axes, to a pose (4, 4)."""
+    return make_transform(axis_angle_to_matrix(step[:3]), step[3:]) @ cam_from_world
 
 
 def _focal(camera: Camera) -> float:
     return float(np.sqrt(camera.K[0, 0] * camera.K[1, 1]))
 
 
+def _has_bend(camera: Camera) -> bool:
+    return camera.model not in ("SIMPLE_PINHOLE", "PINHOLE")
+
+
 def _moved(camera: Camera, step: np.ndarray) -> Camera:
-    """The camera after a step (10,) of its unknowns."""
+    """Apply a step (10,) of its unknowns to a camera."""
     p = list(camera.params)
-    focals = 2 if camera.model in _TWO_FOCALS else 1
+    focals = 2 if camera.model in ("PINHOLE", "OPENCV", "FULL_OPENCV") else 1
     for i in range(focals):
         p[i] *= float(np.exp(np.clip(step[6], -0.5, 0.5)))
     p[focals] += float(step[7])
     p[focals + 1] += float(step[8])
-    if camera.model not in _NO_BEND:
+    if _has_bend(camera):
         p[focals + 2] += float(step[9])
     return replace(
         camera, params=tuple(p), cam_from_world=move_pose(camera.cam_from_world, step[:6])
     )
 
 
-def _prior(rig: list[Camera], freedom: Freedom) -> tuple[np.ndarray, np.ndarray]:
-    """Information matrix (10C, 10C) of the unknowns' spreads, and the columns that are free.
-
-    Its part for the focal lengths' common mean acts on the logarithms themselves.
-    """
-    spreads = np.zeros((len(rig), UNKNOWNS))
-    spreads[:, :3], spreads[:, 3:6] = freedom.turn_rad, freedom.move_m
-    for row, camera in zip(spreads, rig, strict=True):
-        diagonal = float(np.hypot(camera.width, camera.height))
-        row[6], row[7:9] = freedom.focal, freedom.centre * diagonal
-        reach = diagonal / 2 / _focal(camera)
-        row[9] = 0.0 if camera.model in _NO_BEND else freedom.bend / reach**2
-    flat = spreads.reshape(-1)
-    columns = np.flatnonzero(flat > 0)
-    information = np.zeros(len(flat))
-    information[columns] = flat[columns] ** -2.0
-    prior = np.diag(information)
-    if freedom.focal > 0 and freedom.focal_spread > 0 and np.isfinite(freedom.focal_spread):
-        focals = np.arange(len(rig)) * UNKNOWNS + 6
-        centring = np.eye(len(rig)) - 1 / len(rig)
-        prior[np.ix_(focals, focals)] += centring / freedom.focal_spread**2
-    return prior, columns
+def _information(
+    rig: list[Camera], priors: RigPriors, free: Collection[str] | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the inverse variances (C, 10) of the unknowns, and the flat indices of free ones."""
+    sigma = np.zeros((len(rig), UNKNOWNS))
+    for row, camera in zip(sigma, rig, strict=True):
+        if free is None or camera.id in free:
+            diagonal = float(np.hypot(camera.width, camera.height))
+            row[:3], row[3:6], row[6] = priors.turn_rad, priors.move_m, priors.focal
+            row[7:9] = priors.centre * diagonal
+            row[9] = _has_bend(camera) * priors.bend / (diagonal / 2 / _focal(camera)) ** 2
+    information = np.zeros_like(sigma)
+    information[sigma > 0] = sigma[sigma > 0] ** -2.0
+    return information, np.flatnonzero(sigma)
 
 
-def _offsets(prior: np.ndarray, moved: np.ndarray, start: np.ndarray) -> np.ndarray:
-    """What the prior pulls on (10C,): steps so far, and the focal lengths' own differences."""
-    pulled = moved.copy()
-    if (prior[6::UNKNOWNS, 6::UNKNOWNS] - np.diag(np.diag(prior)[6::UNKNOWNS])).any():
-        pulled[:, 6] += start - start.mean()
-    return pulled.reshape(-1)
+def _focal_ties(rig: list[Camera], priors: RigPriors) -> np.ndarray:
+    """Information matrix (C, C) of log focal lengths about their common mean."""
+    if priors.focal == 0 or not (np.isfinite(priors.focal_spread) and priors.focal_spread > 0):
+        return np.zeros((len(rig), len(rig)))
+    return (np.eye(len(rig)) - 1 / len(rig)) / priors.focal_spread**2
 
 
-def _linearise(rig: list[Camera], tracks: Tracks, seen: np.ndarray, points: np.ndarray) -> _Linear:
-    count = len(seen)
-    of_cameras, of_points = np.zeros((count, 2, UNKNOWNS)), np.zeros((count, 2, 3))
+def _linearise(rig: list[Camera], tracks: PointTracks, points: np.ndarray) -> _Linear:
+    count = len(tracks.pixels)
+    by_camera, by_point = np.zeros((count, 2, UNKNOWNS)), np.zeros((count, 2, 3))
     errors, ahead = np.zeros((count, 2)), np.zeros(count, bool)
     for index, camera in enumerate(rig):
         mine = np.flatnonzero(tracks.camera == index)
@@ -186,101 +249,78 @@ def _linearise(rig: list[Camera], tracks: Tracks, seen: np.ndarray, points: np.n
         z = np.where(ahead[mine], local[:, 2], 1.0)
         xy = np.clip(local[:, :2] / z[:, None], -5, 5)
         focal = camera.K[[0, 1], [0, 1]]
-        bent, by_xy, by_k1 = _lens(camera, xy)
-        errors[mine] = bent * focal + camera.K[:2, 2] - seen[mine]
-        by_xy *= focal[:, None]
-        by_local = (
-            np.concatenate([by_xy, -np.einsum("nij,nj->ni", by_xy, xy)[:, :, None]], axis=2)
-            / z[:, None, None]
-        )
-        of_points[mine] = by_local @ R
-        of_cameras[mine, :, :3] = -by_local @ _cross(local)
-        of_cameras[mine, :, 3:6] = by_local
-        of_cameras[mine, :, 6] = bent * focal
-        of_cameras[mine[:, None], [0, 1], [7, 8]] = 1.0
-        of_cameras[mine, :, 9] = by_k1 * focal
-    return _Linear(of_cameras, of_points, errors, ahead)
+        bent, step = distort(camera, xy), 1e-6
+        errors[mine] = bent * focal + camera.K[:2, 2] - tracks.pixels[mine]
+        by_xy = [(distort(camera, xy + d) - bent) * (focal / step) for d in step * np.eye(2)]
+        plane = np.stack(by_xy, axis=2)
+        by_local = np.concatenate([plane, -np.einsum("nij,nj->ni", plane, xy)[..., None]], axis=2)
+        by_local /= z[:, None, None]
+        by_point[mine] = by_local @ R
+        by_camera[mine, :, :3] = np.cross(local[:, None, :], by_local)  # of a turn w: w x local
+        by_camera[mine, :, 3:6] = by_local
+        by_camera[mine, :, 6] = bent * focal
+        by_camera[mine[:, None], [0, 1], [7, 8]] = 1.0
+        if _has_bend(camera):
+            nudged = _moved(camera, step * np.eye(UNKNOWNS)[9])
+            by_camera[mine, :, 9] = (distort(nudged, xy) - bent) * (focal / step)
+    sizes = np.where(ahead, np.linalg.norm(errors, axis=1) / tracks.sigma, BEHIND)
+    by_camera[~ahead], by_point[~ahead] = 0.0, 0.0
+    return _Linear(errors, by_camera, by_point, sizes)
 
 
-def _lens(camera: Camera, xy: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Distorted coordinates (N, 2) and their derivatives by xy (N, 2, 2) and by k1 (N, 2)."""
-    bent, step = distort(camera, xy), 1e-6
-    by_xy = np.stack([(distort(camera, xy + d) - bent) / step for d in step * np.eye(2)], axis=2)
-    if camera.model in _NO_BEND:
-        return bent, by_xy, np.zeros_like(bent)
-    nudge = np.zeros(UNKNOWNS)
-    nudge[9] = step
-    return bent, by_xy, (distort(_moved(camera, nudge), xy) - bent) / step
+@dataclass(frozen=True)
+class _Normal:
+    """Normal equations with the points eliminated.
+
+    `cameras` (10C, 10C) and `right` (10C,) are the reduced system, `diagonal` (10C,) that of the
+    full one. `inverse` (P, 3, 3), `coupling` (P, 10C, 3) and `pull` (P, 3) give the points' steps.
+    """
+
+    cameras: np.ndarray
+    right: np.ndarray
+    diagonal: np.ndarray
+    inverse: np.ndarray
+    coupling: np.ndarray
+    pull: np.ndarray
+
+    def point_steps(self, step: np.ndarray) -> np.ndarray:
+        """Steps (P, 3) of the points that follow a step (10C,) of the cameras."""
+        moved = self.pull + np.tensordot(step, self.coupling, (0, 1))
+        return -(self.inverse @ moved[..., None])[..., 0]
 
 
-def _cross(v: np.ndarray) -> np.ndarray:
-    """Matrices (N, 3, 3) of the cross product with v (N, 3)."""
-    out = np.zeros((len(v), 3, 3))
-    out[:, [0, 1, 2], [1, 2, 0]] = -v[:, [2, 0, 1]]
-    out[:, [1, 2, 0], [0, 1, 2]] = v[:, [2, 0, 1]]
+def _eliminate_points(
+    at: _Linear, tracks: PointTracks, scale: float, cameras: int, damping: float
+) -> _Normal:
+    total, size = int(tracks.point.max(initial=-1)) + 1, cameras * UNKNOWNS
+    root = (1 / tracks.sigma / np.sqrt(1 + (at.sizes / scale) ** 2))[:, None]
+    Jc, Jp, errors = at.by_camera * root[..., None], at.by_point * root[..., None], at.errors * root
+    V = _sum_by(Jp.transpose(0, 2, 1) @ Jp, tracks.point, total)
+    V += damping * V * np.eye(3)
+    V += 1e-9 * (1 + np.trace(V, axis1=1, axis2=2))[:, None, None] * np.eye(3)
+    inverse = np.linalg.inv(V)
+    blocks = np.zeros((total, cameras, UNKNOWNS, 3))
+    blocks[tracks.point, tracks.camera] = Jc.transpose(0, 2, 1) @ Jp
+    coupling = blocks.reshape(total, size, 3)
+    scaled = coupling @ inverse
+    pull = _sum_by(np.einsum("nki,nk->ni", Jp, errors), tracks.point, total)
+    push = _sum_by(np.einsum("nki,nk->ni", Jc, errors), tracks.camera, cameras).reshape(-1)
+    own = np.arange(cameras)
+    squares = np.zeros((cameras, UNKNOWNS, cameras, UNKNOWNS))
+    squares[own, :, own] = _sum_by(Jc.transpose(0, 2, 1) @ Jc, tracks.camera, cameras)
+    full = squares.reshape(size, size)
+    return _Normal(
+        cameras=full - np.tensordot(scaled, coupling, ((0, 2), (0, 2))),
+        right=np.tensordot(scaled, pull, ((0, 2), (0, 1))) - push,
+        diagonal=np.diag(full).copy(),
+        inverse=inverse,
+        coupling=coupling,
+        pull=pull,
+    )
+
+
+def _sum_by(rows: np.ndarray, group: np.ndarray, count: int) -> np.ndarray:
+    """Sums (count, ...) of rows (N, ...) by their group (N,)."""
+    out = np.zeros((count, *rows.shape[1:]))
+    np.add.at(out, group, rows)
     return out
-
-
-def _sizes(at: _Linear, tracks: Tracks) -> np.ndarray:
-    """Errors (N,) in expected ones; a point behind its camera is far off."""
-    return np.where(at.ahead, np.linalg.norm(at.errors, axis=1) / tracks.sigma, 1e4)
-
-
-def _cost(
-    at: _Linear,
-    tracks: Tracks,
-    scale: float,
-    prior: np.ndarray,
-    moved: np.ndarray,
-    start: np.ndarray,
-) -> float:
-    pulled = _offsets(prior, moved, start)
-    robust = scale**2 * np.log1p((_sizes(at, tracks) / scale) ** 2).sum()
-    return 0.5 * float(robust + pulled @ prior @ pulled)
-
-
-def _solve(
-    at: _Linear,
-    tracks: Tracks,
-    scale: float,
-    prior: np.ndarray,
-    columns: np.ndarray,
-    moved: np.ndarray,
-    start: np.ndarray,
-    damping: float,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Damped steps (C, 10) of the cameras and (P, 3) of the points, points eliminated."""
-    count, total = len(moved), int(tracks.point.max(initial=-1)) + 1
-    weights = 1 / tracks.sigma**2 / (1 + (_sizes(at, tracks) / scale) ** 2)
-    root = np.where(at.ahead, np.sqrt(weights), 0.0)[:, None]
-    Jc = _rows(at.of_cameras * root[..., None], tracks.camera, count)
-    Jp = _rows(at.of_points * root[..., None], tracks.point, total)
-    errors = (at.errors * root).reshape(-1)
-    U = (Jc.T @ Jc).toarray() + prior
-    right = -(Jc.T @ errors) - prior @ _offsets(prior, moved, start)
-    heavy = at.of_points * root[..., None]
-    V = np.zeros((total, 3, 3))
-    np.add.at(V, tracks.point, np.einsum("nki,nkj->nij", heavy, heavy))
-    V += damping * V * np.eye(3) + 1e-9 * (1 + np.trace(V, axis1=1, axis2=2))[
-        :, None, None
-    ] * np.eye(3)
-    inverse = sparse.bsr_matrix(
-        (np.linalg.inv(V), np.arange(total), np.arange(total + 1)), shape=(3 * total, 3 * total)
-    ).tocsr()
-    W = (Jc.T @ Jp).tocsr()
-    Y = W @ inverse
-    pull = Jp.T @ errors
-    S = U - (Y @ W.T).toarray() + damping * np.diag(np.diag(U))
-    step = np.zeros(count * UNKNOWNS)
-    block = S[np.ix_(columns, columns)]
-    block += 1e-12 * np.trace(block) * np.eye(len(columns))
-    step[columns] = np.linalg.solve(block, (right + Y @ pull)[columns])
-    shifts = inverse @ (-pull - W.T @ step)
-    return step.reshape(count, UNKNOWNS), shifts.reshape(total, 3)
-
-
-def _rows(blocks: np.ndarray, group: np.ndarray, count: int) -> sparse.csr_matrix:
-    """Sparse (2N, count * width) matrix of blocks (N, 2, width), each in its group's columns."""
-    n, _, width = blocks.shape
-    matrix = sparse.bsr_matrix((blocks, group, np.arange(n + 1)), shape=(2 * n, count * width))
-    return matrix.tocsr()

@@ -18,7 +18,7 @@ from express50.rigs.read import FORMATS, guess_format, read_rig
 from express50.rigs.rig_check import RigVerdict, judge
 
 if TYPE_CHECKING:
-    from pipelines.calibrate.camera_moves import FootageVerdict
+    from pipelines.calibrate.camera_moves import FootageCheck
 
 
 def add_commands(subparsers: Any) -> None:
@@ -85,18 +85,18 @@ def run_check(args: argparse.Namespace) -> int:
     return FAILED if verdict.problem or (footage and footage.moved) else OK
 
 
-def _look_at_footage(args: argparse.Namespace, cameras: Mapping[str, Camera]) -> FootageVerdict:
+def _look_at_footage(args: argparse.Namespace, cameras: Mapping[str, Camera]) -> FootageCheck:
     # Imported here: the other commands need neither torch nor OpenCV's features.
     from express50.landmarks.network import load_network
-    from pipelines.calibrate.camera_moves import check_footage, reduce_image
-    from pipelines.calibrate.sampling import read_moments
+    from pipelines.calibrate.camera_moves import check_footage
+    from pipelines.calibrate.footage import read_capture_frames, reduce_image
 
     def reduce(name: str, image: np.ndarray) -> np.ndarray | None:
         return reduce_image(cameras[name], image, "the footage") if name in cameras else None
 
     if args.frames < 1:
         raise ConfigError(f"--frames is {args.frames}, expected 1 or more")
-    frames = read_moments(args.footage, args.frames, reduce)
+    frames = read_capture_frames(args.footage, args.frames, reduce)
     shown = {name for images in frames.values() for name in images}
     known = {name: camera for name, camera in cameras.items() if name in shown}
     return check_footage(known, frames, load_network())
@@ -120,11 +120,11 @@ def _report(
     cameras: Mapping[str, Camera],
     verdict: RigVerdict,
     out: Path | None,
-    footage: FootageVerdict | None = None,
+    footage: FootageCheck | None = None,
 ) -> None:
     kind = args.format or guess_format(args.source)
     if args.json:
-        seen = {"footage": footage.figures()} if footage else {}
+        seen = {"footage": _footage_row(footage)} if footage else {}
         say_json({"format": kind, "out": out and str(out), **asdict(verdict), **seen})
         return
     say(f"{args.source}: {verdict.cameras} cameras ({kind})")
@@ -148,8 +148,15 @@ def _report(
         _report_footage(footage)
 
 
-def _report_footage(footage: FootageVerdict) -> None:
-    say(f"footage: {footage.points} points, {footage.error_px:.2f} px from the cameras (median)")
+def _footage_row(footage: FootageCheck) -> dict[str, object]:
+    moved = {name: asdict(move) for name, move in footage.moved.items()}
+    figures = {"points": footage.points, "error_px": footage.error_px}
+    return figures | {"moved": moved, "unchecked": footage.unchecked}
+
+
+def _report_footage(footage: FootageCheck) -> None:
+    error = "" if footage.error_px is None else f", off by {footage.error_px:.2f} px (median)"
+    say(f"footage: {footage.points} points{error}")
     for name, why in footage.unchecked.items():
         say(f"warning: {name} cannot be checked: {why}")
     for name, move in footage.moved.items():

@@ -12,53 +12,36 @@ REFINE = ("none", "poses", "all")
 MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
 
 
-LEAST = {"board_frames": 0, "rounds": 1, "min_corners": 4, "min_frames": 1, "weak_corners": 0,
-         "weak_frames": 0, "check_moments": 0}  # fmt: skip
-
-
 @dataclass(frozen=True, kw_only=True)
 class CalibrateConfig:
-    """Every field trades time, or strictness, for accuracy; none depends on a rig."""
+    """Settings that trade time for accuracy, or state what is known about the rig."""
 
     camera_model: str = AUTO
     """COLMAP model to solve for; auto: the simplest that fits, camera by camera."""
     board_frames: int = 80
-    """Board images read a camera, evenly spaced; 0 reads all."""
+    """Board images read per camera, evenly spaced; 0 reads all."""
     rounds: int = 3
-    """Joint adjustments, each followed by rejection of corners."""
-    reject_sigma: float = 4.0
-    """Corners further off than this many robust standard deviations are rejected."""
-    min_corners: int = 8
-    """Corners a board image needs to count."""
-    min_frames: int = 4
-    """Board images a camera needs; fewer and it is dropped."""
-    weak_corners: int = 200
-    """A camera with fewer accepted corners is reported as weakly tied in."""
-    weak_frames: int = 8
-    """A camera that shares fewer board images with others is reported as weakly tied in."""
+    """Joint adjustments to the board, each followed by rejection of corners."""
     solve_moments: int = 8
-    """Moments of the footage from which cameras are solved where there is neither a calibration
-    nor a board."""
+    """Frame sets from which cameras are solved if there is neither a calibration nor a board."""
     distance_m: float = 1.0
-    """About how far cameras stand from the head: where the solution from footage starts when
-    neither EXIF nor capture.toml tells the focal lengths."""
-    focal_spread: float = 0.03
-    """How much focal lengths of one rig differ, as a share (a standard deviation)."""
+    """Rough distance of cameras from the head: where the solution from footage starts if neither
+    EXIF nor capture.toml gives the focal lengths."""
     eye_distance_mm: float = 63.0
     """Distance between the subject's pupils, which gives a solution from footage its metre. Adult
     mean (Dodgson 2004, Variation and extrema of human interpupillary distance); measure it."""
     refine: str = "none"
-    """What of a given calibration is put right by the board, or without one by the footage:
-    "none", "poses", or "all" (lenses too). What fits held-out points no better stays as given."""
+    """What the board, or else the footage, corrects in a given calibration: "none", "poses", or
+    "all" (lenses too). Cameras are only changed if held-out points then fit better."""
     refine_turn_deg: float = 0.2
     """How far given cameras may be turned, without a board (a standard deviation)."""
     refine_move_mm: float = 3.0
     """How far given cameras may have moved, without a board (a standard deviation)."""
     check_moments: int = 2
-    """Moments of the footage in which cameras that have moved are looked for; 0 looks at none."""
+    """Frame sets in which cameras that have moved are searched; 0 does not search."""
 
     def __post_init__(self) -> None:
-        """Refuse models that cannot be solved for, and quantities that are none."""
+        """Check names and ranges."""
         if self.camera_model not in (AUTO, *MODELS):
             raise ConfigError(
                 f"calibrate.camera_model is {self.camera_model!r}; expected {AUTO} or "
@@ -66,13 +49,13 @@ class CalibrateConfig:
             )
         if self.refine not in REFINE:
             raise ConfigError(f"calibrate.refine is {self.refine!r}; expected {', '.join(REFINE)}")
-        for name, least in LEAST.items():
-            if getattr(self, name) < least:
+        least = {"board_frames": 0, "rounds": 1, "solve_moments": 1, "check_moments": 0}
+        for name, value in least.items():
+            if getattr(self, name) < value:
                 raise ConfigError(
-                    f"calibrate.{name} is {getattr(self, name)}; expected {least} or more"
+                    f"calibrate.{name} is {getattr(self, name)}; expected {value} or more"
                 )
-        for name in ("distance_m", "focal_spread", "eye_distance_mm", "reject_sigma",
-                     "refine_turn_deg", "refine_move_mm", "solve_moments"):  # fmt: skip
+        for name in ("distance_m", "eye_distance_mm", "refine_turn_deg", "refine_move_mm"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0):
                 raise ConfigError(f"calibrate.{name} is {value}; expected a positive number")
@@ -81,5 +64,6 @@ class CalibrateConfig:
 PRESETS: dict[str, dict[str, object]] = {
     "draft": {"board_frames": 36, "rounds": 1, "solve_moments": 4, "check_moments": 0},
     "standard": {},
-    "reference": {"board_frames": 0, "solve_moments": 16, "check_moments": 4},
+    # More board images and frame sets take longer and gain nothing (docs/TRADEOFFS.md).
+    "reference": {},
 }

@@ -1,6 +1,6 @@
 """Intrinsics of one camera from its own views of the board, and the poses each view allows.
 
-These start the joint solution, so they must survive bad frames rather than be exact.
+They start the joint solution, so surviving bad frames matters more than being exact.
 """
 
 from __future__ import annotations
@@ -12,15 +12,14 @@ import numpy as np
 
 from express50.geometry.cameras import Camera
 from express50.geometry.transforms import make_transform
+from pipelines.calibrate.board import BoardCorners
 
-# A view whose corners span less than this share of the image's diagonal says little of the lens.
-SMALLEST_SPAN = 0.03
-# The mirrored pose of a flat target is ruled out when its error is this factor above the other's.
-CLEARLY_WORSE = 2.5
+MIN_CORNERS = 8
+"""Corners that a board image needs to count."""
 
 
 @dataclass(frozen=True)
-class View:
+class BoardView:
     """Corners of one board image: object points (N, 3) metres and pixels (N, 2).
 
     `ideal` (N, 2) are the pixels in normalised coordinates without distortion, once the camera
@@ -33,34 +32,47 @@ class View:
     ideal: np.ndarray = field(default_factory=lambda: np.zeros((0, 2)))
 
 
-def seen_from_front(view: View) -> bool:
-    """Tell whether the corners run round the board in the sense its printed side shows.
+def seen_from_front(view: BoardView) -> bool:
+    """Check that the corners run round the board in the sense that its printed side shows.
 
-    A mirrored image (or wrong ids) turns the sense round, and no camera can then explain it.
+    Mirrored images and wrong ids reverse the sense, and no camera can then explain them.
     """
     flat = np.column_stack([view.points[:, :2], np.ones(len(view.points))])
     affine, _, rank, _ = np.linalg.lstsq(flat, view.pixels, rcond=None)
     return bool(rank == 3 and np.linalg.det(affine[:2]) > 0)
 
 
-def usable(view: View, size: tuple[int, int], min_corners: int) -> bool:
-    """Tell whether a view has enough corners, spread over two directions, to hold a pose."""
-    if len(view.pixels) < min_corners:
-        return False
-    centred = view.points[:, :2] - view.points[:, :2].mean(0)
-    spread = np.linalg.svd(centred, compute_uv=False)
-    span = np.linalg.norm(np.ptp(view.pixels, axis=0)) / np.hypot(*size)
-    return bool(spread[1] > 0.1 * spread[0] and span > SMALLEST_SPAN)
+def board_views(
+    corners: BoardCorners, camera: str, points: np.ndarray, size: tuple[int, int]
+) -> list[BoardView]:
+    """List a camera's board images that hold a pose, in order of frame.
+
+    They have enough corners, spread over two directions and over more than 3 % of the diagonal of
+    an image of `size` (width, height). `points` (P, 3) are the corners on the board.
+    """
+    mine = corners.camera == corners.cameras.index(camera)
+    found = []
+    for frame in np.unique(corners.frame[mine]):
+        rows = mine & (corners.frame == frame)
+        view = BoardView(int(frame), points[corners.corner[rows]], corners.pixels[rows])
+        if len(view.pixels) < MIN_CORNERS:
+            continue
+        flat = view.points[:, :2] - view.points[:, :2].mean(0)
+        spread = np.linalg.svd(flat, compute_uv=False)
+        span = np.linalg.norm(np.ptp(view.pixels, axis=0)) / np.hypot(*size)
+        if spread[1] > 0.1 * spread[0] and span > 0.03:
+            found.append(view)
+    return found
 
 
 def fit_intrinsics(
-    views: list[View], size: tuple[int, int], model: str, min_frames: int
+    views: list[BoardView], size: tuple[int, int], model: str, min_frames: int
 ) -> tuple[np.ndarray, np.ndarray, list[int]] | None:
     """Fit focal lengths, principal point and distortion to views of a flat board.
 
-    Views that fit three times worse than the median view are put aside and the rest fitted
+    Views that fit three times worse than the median view are set aside and the rest fitted
     again, at most three times. Returns K (3, 3), distortion (5,) in OpenCV's order and the
-    indices of the views used, or None when fewer than `min_frames` views hold together.
+    indices of the views used, or None if fewer than `min_frames` views agree.
     """
     use = list(range(len(views)))
     for _ in range(4):
@@ -78,7 +90,7 @@ def fit_intrinsics(
 
 
 def _calibrate(
-    views: list[View], size: tuple[int, int], model: str
+    views: list[BoardView], size: tuple[int, int], model: str
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
     """Run OpenCV's calibration (Zhang 2000); K, distortion (5,), rms (V,) pixels."""
     points = [view.points.astype(np.float32) for view in views]
@@ -91,7 +103,7 @@ def _calibrate(
     if model in ("SIMPLE_PINHOLE", "PINHOLE"):
         flags |= cv2.CALIB_FIX_K1
     for extra in (0, cv2.CALIB_FIX_PRINCIPAL_POINT | cv2.CALIB_FIX_K2):
-        # A long lens and few views let the principal point run away: then hold it at the middle.
+        # With a long lens and few views the principal point diverges: then hold it at the middle.
         try:
             _, K, dist, *_, errors = cv2.calibrateCameraExtended(
                 points, pixels, size, None, None, flags=flags | extra
@@ -118,27 +130,27 @@ def camera_params(K: np.ndarray, dist: np.ndarray, model: str) -> tuple[float, .
 
 
 def as_model(camera: Camera, model: str) -> Camera:
-    """The camera in another model; distortion that the model does not have is left out."""
+    """Convert a camera to another model; distortion that the model lacks is left out."""
     return replace(camera, model=model, params=camera_params(camera.K, camera.dist, model))
 
 
-def with_ideal(camera: Camera, view: View) -> View:
-    """The view with its normalised, undistorted coordinates in this camera."""
+def with_ideal(camera: Camera, view: BoardView) -> BoardView:
+    """Add the normalised, undistorted coordinates of this camera to a view."""
     ideal = cv2.undistortPoints(view.pixels[:, None], camera.K, camera.dist[None])[:, 0]
     return replace(view, ideal=ideal)
 
 
-def board_poses(view: View) -> list[np.ndarray]:
-    """Poses cam_from_board (4, 4) that explain a view (with `ideal` set), best first.
+def board_poses(view: BoardView) -> list[np.ndarray]:
+    """List the poses cam_from_board (4, 4) that explain a view (with `ideal` set), best first.
 
     A small flat target has two of them that may reproject almost alike (IPPE, Collins and Bartoli
-    2014); which one is true only the other cameras can tell. The second is left out where it
-    fits clearly worse.
+    2014), and only the other cameras can decide. The second is left out where it fits 2.5 times
+    worse.
     """
-    # Object points are centred because IPPE asks for it; the shift is put back into the pose.
+    # IPPE needs centred object points; the shift is put back into the pose.
     middle = view.points.mean(0)
     centred, eye = view.points - middle, np.eye(3)
-    count, rotations, translations, _ = cv2.solvePnPGeneric(
+    _, rotations, translations, _ = cv2.solvePnPGeneric(
         centred, view.ideal, eye, None, flags=cv2.SOLVEPNP_IPPE
     )
     found = []
@@ -151,5 +163,5 @@ def board_poses(view: View) -> list[np.ndarray]:
             error = placed[:, :2] / placed[:, 2:] - view.ideal
             found.append((float(np.sqrt(np.mean(error**2))), pose))
     found.sort(key=lambda item: item[0])
-    limit = CLEARLY_WORSE * max(found[0][0], 1e-6) if found else 0.0
+    limit = 2.5 * max(found[0][0], 1e-6) if found else 0.0
     return [pose for error, pose in found if error <= limit]

@@ -1,6 +1,6 @@
-"""Given cameras put right: adjusted to the board, or to the footage, where that makes them better.
+"""Refine given cameras by the board or the footage, and keep the result only if it is better.
 
-What part of the observations is held out judges: cameras are only replaced where points that the
+Part of the observations is held out and judges: cameras are only replaced if points that the
 adjustment never saw fit clearly better.
 """
 
@@ -19,34 +19,31 @@ from express50.geometry.transforms import (
     rigid_fit,
 )
 from express50.rigs.world_frame import move_cameras
-from pipelines.calibrate import graph
-from pipelines.calibrate.adjust import triangulate_tracks
-from pipelines.calibrate.adjuster import ITERATIONS, Freedom, adjust_rig, recorded_pixels
-from pipelines.calibrate.board import Observations
-from pipelines.calibrate.board_adjust import Rig, adjust, residuals
-from pipelines.calibrate.camera_moves import LEAST_POINTS, shared_points
-from pipelines.calibrate.config import CalibrateConfig
-from pipelines.calibrate.intrinsics import View, board_poses, usable, with_ideal
-from pipelines.calibrate.tracks import FEATURE_SIGMA_PX, Seen, Tracks, ideal_pixels, join_verified
+from pipelines.calibrate.adjuster import RigPriors, adjust_rig, triangulate_tracks
+from pipelines.calibrate.board import BoardCorners
+from pipelines.calibrate.board_adjust import BoardRig, adjust_board_rig, corner_errors
+from pipelines.calibrate.intrinsics import board_poses, board_views, with_ideal
+from pipelines.calibrate.rig_graph import NEAR, rig_from_board
+from pipelines.calibrate.tracks import LEAST_POINTS, FrameSetPoints, PointTracks, join_tracks
 
 HELD = 5
 """Every fifth point, or board image, judges and is not adjusted to."""
 CLEARLY = 0.8
-"""Held-out errors must fall to this share of what they were: tracks of footage follow a rig that
-is bent to them a little even where it was right."""
+"""Held-out errors must fall to this share of what they were. Tracks of footage follow a rig that
+is bent to them a little even where it was right: true rigs gain up to 6 %."""
 BAND = 0.03
 """How far features may be from the given rig's epipolar lines, as a share of the diagonal."""
 SCALES = (3.0, 1.5)
-LENS = {"focal": 0.005, "focal_spread": 0.005, "centre": 0.002, "bend": 0.005}
-"""What given lenses may be off when they, too, are refined (as `Freedom` has it)."""
+LENS = RigPriors(focal=0.005, focal_spread=0.005, centre=0.002, bend=0.005)
+"""How far given lenses may be off if they, too, are refined."""
 
 
 @dataclass(frozen=True)
-class Refined:
-    """Cameras after refinement, and what is reported of it.
+class RefinedRig:
+    """Cameras after refinement, and what is reported about it.
 
     `before_px` and `after_px` are the median errors of held-out points in the given and in the
-    adjusted rig; `kept` tells that the given cameras stayed, and `why`.
+    adjusted rig. `kept` says that the given cameras stayed, and `why` gives the reason.
     """
 
     cameras: dict[str, Camera]
@@ -57,136 +54,125 @@ class Refined:
     why: str
 
     def figures(self, given: Mapping[str, Camera]) -> dict[str, object]:
-        """As metrics."""
-        moves = {} if self.kept else {n: _move(given[n], c) for n, c in self.cameras.items()}
+        """Return metrics, including how far each camera was turned and moved."""
+        moves = {}
+        for name, after in {} if self.kept else self.cameras.items():
+            before = given[name]
+            turn = (after.cam_from_world @ invert_transform(before.cam_from_world))[:3, :3]
+            moves[name] = {
+                "turn_deg": round(float(np.degrees(np.linalg.norm(matrix_to_axis_angle(turn)))), 4),
+                "move_mm": round(1e3 * float(np.linalg.norm(after.center - before.center)), 3),
+            }
+        errors = {"before": self.before_px, "after": self.after_px}
         return {
             "by": self.by,
-            "held_out_before_px": _number(self.before_px),
-            "held_out_after_px": _number(self.after_px),
+            **{f"held_out_{k}_px": round(v, 4) if np.isfinite(v) else None
+               for k, v in errors.items()},
             "kept_given": self.kept,
             "why": self.why,
             "moves": moves,
-        }
+        }  # fmt: skip
 
 
 def refine_by_footage(
     given: Mapping[str, Camera],
     start: Mapping[str, Camera],
-    seen: Mapping[int, Seen],
-    config: CalibrateConfig,
-) -> Refined:
-    """Refine cameras by what they saw at the same moments.
+    seen: Mapping[int, FrameSetPoints],
+    *,
+    turn_deg: float,
+    move_mm: float,
+    lenses: bool,
+) -> RefinedRig:
+    """Refine cameras by points they saw at the same instants.
 
     Args:
         given: the calibration.
-        start: the same with those cameras put right that have clearly moved.
-        seen: by frame number, undistorted by `given`.
-        config: how far cameras may be off.
+        start: the same, with corrected poses of cameras that have clearly moved.
+        seen: points by frame number.
+        turn_deg: how far cameras may be turned (a standard deviation).
+        move_mm: how far cameras may have moved (a standard deviation).
+        lenses: also refine lenses.
     """
-    tracks = join_verified(start, seen, BAND)
-    enough = shared_points(tracks) >= LEAST_POINTS
+    tracks = join_tracks(start, seen, BAND)
+    enough = tracks.shared_points() >= LEAST_POINTS
     names = tuple(n for n, ok in zip(tracks.names, enough, strict=True) if ok)
-    tracks = _of(tracks, names)
-    held = tracks.select(tracks.point % HELD == 0)
+    tracks = tracks.of_cameras(names)
+    held, fit = (tracks.select((tracks.point % HELD == 0) == side) for side in (True, False))
     if len(names) < 3 or len(held.camera) < LEAST_POINTS:
-        return Refined(dict(given), "footage", np.nan, np.nan, True, "cameras share too few points")
-    fit = tracks.select(tracks.point % HELD != 0)
-    points, rig = triangulate_tracks(start, fit), {n: start[n] for n in names}
-    freedom = Freedom(
-        turn_rad=np.radians(config.refine_turn_deg),
-        move_m=config.refine_move_mm * 1e-3,
-        **(LENS if config.refine == "all" else {}),
+        why = "cameras share too few points"
+        return RefinedRig(dict(given), "footage", np.nan, np.nan, True, why)
+    priors = replace(
+        LENS if lenses else RigPriors(), turn_rad=np.radians(turn_deg), move_m=move_mm * 1e-3
     )
-    for scale in SCALES:
-        # Always from the start: the spreads are about where the cameras were, not a step further.
-        found = adjust_rig(rig, fit, points, freedom, scale, ITERATIONS)
-        points = found.points
-    before, before_px = _judge({n: given[n] for n in names}, held, given)
-    after, after_px = _judge(found.cameras, held, given)
+    found = adjust_rig(start, fit, triangulate_tracks(start, fit), priors, SCALES).cameras
+    before, before_px = _judge(given, held)
+    after, after_px = _judge(found, held)
     if not after < CLEARLY * before:
-        return Refined(
-            dict(given), "footage", before_px, after_px, True, "held-out points fit no better"
-        )
-    return Refined({**given, **found.cameras}, "footage", before_px, after_px, False, "")
+        why = "held-out points fit no better"
+        return RefinedRig(dict(given), "footage", before_px, after_px, True, why)
+    return RefinedRig({**given, **found}, "footage", before_px, after_px, False, "")
 
 
-def _of(tracks: Tracks, names: tuple[str, ...]) -> Tracks:
-    """The tracks of some of the cameras, which are numbered anew."""
-    number = {tracks.names.index(name): i for i, name in enumerate(names)}
-    kept = tracks.select(np.isin(tracks.camera, list(number)))
-    return replace(kept, names=names, camera=np.array([number[c] for c in kept.camera], int))
-
-
-def _judge(
-    cameras: Mapping[str, Camera], held: Tracks, lenses: Mapping[str, Camera]
-) -> tuple[float, float]:
-    """Mean robust cost and median feature error, pixels, of held-out tracks in a rig.
-
-    Their points are free and the cameras are not. `lenses` undistorted the tracks.
-    """
-    recorded = recorded_pixels([lenses[name] for name in held.names], held)
-    pixels = recorded.copy()
-    for index, name in enumerate(held.names):
-        mine = held.camera == index
-        pixels[mine] = ideal_pixels(cameras[name], recorded[mine])
-    tracks = replace(held, pixels=pixels)
-    fixed = Freedom(turn_rad=0.0, move_m=0.0)
-    points = triangulate_tracks(cameras, tracks)
-    errors = np.linalg.norm(
-        adjust_rig(cameras, tracks, points, fixed, SCALES[-1], 15).errors, axis=1
-    )
-    features = errors[held.sigma == FEATURE_SIGMA_PX]
-    cost = np.log1p((errors / held.sigma / SCALES[-1]) ** 2).mean()
-    return float(cost), float(np.median(features if len(features) else errors))
+def _judge(cameras: Mapping[str, Camera], held: PointTracks) -> tuple[float, float]:
+    """Mean robust cost and median feature error, pixels, of held-out tracks in a fixed rig."""
+    points = triangulate_tracks(cameras, held)
+    fit = adjust_rig(cameras, held, points, RigPriors(), SCALES[-1:], free=(), iterations=15)
+    errors = np.linalg.norm(fit.errors, axis=1)
+    features = errors[held.features()]
+    median = float(np.median(features if len(features) else errors))
+    return fit.cost / len(errors), median
 
 
 def refine_by_board(
     given: Mapping[str, Camera],
-    observations: Observations,
+    corners: BoardCorners,
     points: np.ndarray,
-    config: CalibrateConfig,
-) -> Refined:
-    """Refine cameras by a ChArUco board seen by several at once; `points` (P, 3) are its corners.
+    *,
+    rounds: int,
+    lenses: bool,
+) -> RefinedRig:
+    """Refine cameras by a ChArUco board that several see at once.
 
     The scale becomes the print's; where the rig stands is kept, by a rigid motion.
+
+    Args:
+        given: the calibration.
+        corners: the board's corners in the images.
+        points: (P, 3) corners on the board, metres.
+        rounds: adjustments, each with a loss scale from the errors before.
+        lenses: also refine lenses.
     """
-    held = observations.frame % HELD == 0
-    fit, judge = observations.select(~held), observations.select(held)
-    start = _with_boards(given, fit, points, config)
-    fit = fit.select(_placed(start, fit, points))
-    if len(set(fit.camera)) < 2 or len(start.boards) < config.min_frames:
-        return Refined(dict(given), "board", np.nan, np.nan, True, "cameras share too few corners")
-    loss = max(2 * _median(start, fit, points), 0.1)
+    held = corners.frame % HELD == 0
+    fit, judge = corners.select(~held), corners.select(held)
+    start = _with_boards(given, fit, points)
+    fit = fit.select(_near(start, fit, points))
+    if len(set(fit.camera)) < 2 or len(start.boards) < 4:
+        why = "cameras share too few corners"
+        return RefinedRig(dict(given), "board", np.nan, np.nan, True, why)
+    loss = max(2 * _median_error(start, fit, points), 0.1)
     solved = start
-    for _ in range(max(config.rounds, 2)):
-        solved = adjust(
-            solved, fit, points, loss,
-            refine_distortion=config.refine == "all", refine_focal=config.refine == "all",
-        )  # fmt: skip
-        loss = max(2 * _median(solved, fit, points), 0.02)
+    for _ in range(max(rounds, 2)):
+        solved = adjust_board_rig(solved, fit, points, loss, distortion=lenses, focal=lenses)
+        loss = max(2 * _median_error(solved, fit, points), 0.02)
     found = _over(solved.cameras, given)
-    before = _median(_with_boards(given, judge, points, config), judge, points)
-    after = _median(_with_boards({**given, **found}, judge, points, config), judge, points)
+    before = _median_error(_with_boards(given, judge, points), judge, points)
+    after = _median_error(_with_boards({**given, **found}, judge, points), judge, points)
     if not after < CLEARLY * before:
-        return Refined(dict(given), "board", before, after, True, "held-out corners fit no better")
-    return Refined({**given, **found}, "board", before, after, False, "")
+        why = "held-out corners fit no better"
+        return RefinedRig(dict(given), "board", before, after, True, why)
+    return RefinedRig({**given, **found}, "board", before, after, False, "")
 
 
 def _with_boards(
-    cameras: Mapping[str, Camera],
-    observations: Observations,
-    points: np.ndarray,
-    config: CalibrateConfig,
-) -> Rig:
-    """The cameras with the board's poses that fit them best, adjusted with the cameras held."""
-    views: dict[str, dict[int, View]] = {}
-    for index, name in enumerate(observations.cameras):
-        for frame in sorted(set(observations.frame[observations.camera == index])):
-            rows = (observations.camera == index) & (observations.frame == frame)
-            view = View(int(frame), points[observations.corner[rows]], observations.pixels[rows])
-            size = (cameras[name].width, cameras[name].height) if name in cameras else (1, 1)
-            if name in cameras and usable(view, size, config.min_corners):
-                views.setdefault(name, {})[int(frame)] = with_ideal(cameras[name], view)
+    cameras: Mapping[str, Camera], corners: BoardCorners, points: np.ndarray
+) -> BoardRig:
+    """Add the board poses that fit the cameras best, with the cameras held."""
+    views = {}
+    for name in sorted(set(corners.cameras) & set(cameras)):
+        size = (cameras[name].width, cameras[name].height)
+        mine = board_views(corners, name, points, size)
+        if mine:
+            views[name] = {v.frame: with_ideal(cameras[name], v) for v in mine}
     poses = {
         name: {f: found for f, view in mine.items() if (found := board_poses(view))}
         for name, mine in views.items()
@@ -194,33 +180,33 @@ def _with_boards(
     placed = {name: cameras[name].cam_from_world for name in views}
     boards = {}
     for frame in sorted({f for mine in poses.values() for f in mine}):
-        pose = graph.rig_from_board(frame, placed, cameras, views, poses)
+        pose = rig_from_board(frame, placed, cameras, views, poses)
         if pose is not None:
             boards[frame] = pose
-    rig = Rig({name: cameras[name] for name in views}, boards)
-    kept = observations.select(_placed(rig, observations, points))
+    rig = BoardRig({name: cameras[name] for name in views}, boards)
+    kept = corners.select(_near(rig, corners, points))
     if len(kept.camera) == 0:
         return rig
-    loss = max(2 * _median(rig, kept, points), 0.1)
-    held = adjust(rig, kept, points, loss, False, False, refine_cameras=False)
-    return Rig(rig.cameras, {**rig.boards, **held.boards})
+    loss = max(2 * _median_error(rig, kept, points), 0.1)
+    held = adjust_board_rig(rig, kept, points, loss, distortion=False, focal=False, cameras=False)
+    return BoardRig(rig.cameras, {**rig.boards, **held.boards})
 
 
-def _placed(rig: Rig, observations: Observations, points: np.ndarray) -> np.ndarray:
-    """Rows (N,) of cameras and frames that the rig has, that are not far off."""
-    errors = np.linalg.norm(residuals(rig, observations, points), axis=1)
+def _near(rig: BoardRig, corners: BoardCorners, points: np.ndarray) -> np.ndarray:
+    """Mark the rows (N,) of cameras and frames in the rig that are not far off."""
+    errors = np.linalg.norm(corner_errors(rig, corners, points), axis=1)
     widths = [np.hypot(c.width, c.height) for c in rig.cameras.values()]
-    return errors < 2 * graph.NEAR * max(widths, default=0.0)
+    return errors < 2 * NEAR * max(widths, default=0.0)
 
 
-def _median(rig: Rig, observations: Observations, points: np.ndarray) -> float:
-    errors = np.linalg.norm(residuals(rig, observations, points), axis=1)
+def _median_error(rig: BoardRig, corners: BoardCorners, points: np.ndarray) -> float:
+    errors = np.linalg.norm(corner_errors(rig, corners, points), axis=1)
     errors = errors[np.isfinite(errors)]
     return float(np.median(errors)) if len(errors) else float("nan")
 
 
 def _over(solved: Mapping[str, Camera], given: Mapping[str, Camera]) -> dict[str, Camera]:
-    """Solved cameras laid over the given ones by the rigid motion that most of them agree on."""
+    """Lay solved cameras over the given ones by the rigid motion that most of them agree on."""
     names = sorted(solved)
     new, old = (np.stack([rig[n].center for n in names]) for rig in (solved, given))
     if len(names) < 3:
@@ -232,15 +218,3 @@ def _over(solved: Mapping[str, Camera], given: Mapping[str, Camera]) -> dict[str
         off = np.linalg.norm(new @ R.T + t - old, axis=1)
         weights = 1 / (1 + (off / max(float(np.median(off)), 1e-6)) ** 2)
     return move_cameras(solved, make_transform(R, t))
-
-
-def _move(before: Camera, after: Camera) -> dict[str, float]:
-    turn = (after.cam_from_world @ invert_transform(before.cam_from_world))[:3, :3]
-    return {
-        "turn_deg": round(float(np.degrees(np.linalg.norm(matrix_to_axis_angle(turn)))), 4),
-        "move_mm": round(1e3 * float(np.linalg.norm(after.center - before.center)), 3),
-    }
-
-
-def _number(value: float) -> float | None:
-    return round(value, 4) if np.isfinite(value) else None

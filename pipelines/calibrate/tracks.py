@@ -1,49 +1,53 @@
-"""Points that several cameras see at one time: facial landmarks and image features.
+"""Points that several cameras see at one instant: facial landmarks and image features.
 
-Landmarks tie cameras that look at the face from any two sides, to a few pixels; features (SIFT, of
-skin, hair, cloth and room) tie neighbours, to a fraction of one. Pixels leave this file undistorted
-and in units of the camera's `K`.
+Landmarks tie any two cameras that see the face, to a few pixels. Features (SIFT, on skin, hair,
+cloth and room) tie neighbouring cameras, to a fraction of a pixel.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import TypeAlias
 
+import cv2
 import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 
-from express50.geometry.cameras import Camera, normalised
+from express50.geometry.cameras import Camera, distort, normalised
+from express50.geometry.conventions import opencv_pixels_to_corner
 from express50.landmarks.detector import detect
 from express50.landmarks.network import LandmarkNet
-from pipelines.calibrate.features import (
-    Features,
-    epipolar_distance,
-    find_features,
-    match_features,
-    verified_pairs,
-    without_fixed,
-)
 
-NEIGHBOURS = 6
-"""Cameras whose features a camera's are compared with."""
-WIDEST_DEG = 45.0
-"""Angle between optical axes beyond which features do not look alike."""
+Features: TypeAlias = tuple[np.ndarray, np.ndarray]
+"""Recorded pixels (N, 2) and descriptors (N, 128) of length one."""
+FEATURES = 1500
+"""Features kept per image, strongest first."""
+RATIO = 0.8
+"""A match counts if its distance is below this share of the second-best one's (Lowe 2004)."""
 FEATURE_SIGMA_PX = 0.7
 FACE_SCORE = 0.9
-"""Faces less surely seen are profiles and backs of heads, whose landmarks are guessed."""
-LANDMARK_DOUBT = 3.0
-"""Landmarks of a view err together, all to one side: so much wider than a single one's error."""
+"""Faces with a lower score are profiles and backs of heads, whose landmarks are guessed."""
+LANDMARK_INFLATION = 3.0
+"""Landmark errors within a view are correlated; their sigma is inflated by this factor."""
+NEIGHBOURS, WIDEST_DEG = 6, 45.0
+"""Features are compared between each camera and so many neighbours, if their axes differ by less
+than the angle: beyond it features no longer look alike."""
+LEAST_POINTS = 20
+"""Points that a camera must share with two others to be judged by them."""
 
 
 @dataclass(frozen=True)
-class Tracks:
-    """Observations of points, one row each, by camera and point.
+class PointTracks:
+    """Observations of points, one row per camera and point; no camera sees a point twice.
 
     Attributes:
-        names: cameras that `camera` counts.
+        names: cameras that `camera` indexes.
         camera: (N,) index into `names`.
-        point: (N,) number of the point; rows of one number show the same point.
-        pixels: (N, 2) undistorted.
+        point: (N,) number of the point; rows with one number show the same point.
+        pixels: (N, 2) as recorded.
         sigma: (N,) expected error, pixels.
     """
 
@@ -53,101 +57,138 @@ class Tracks:
     pixels: np.ndarray
     sigma: np.ndarray
 
-    def select(self, keep: np.ndarray) -> Tracks:
-        """The rows where `keep` (N,) is true, of points that two cameras still see, renumbered."""
+    def select(self, keep: np.ndarray) -> PointTracks:
+        """Keep the rows where `keep` (N,) is true, of points that two cameras still see."""
         twice = np.bincount(self.point[keep], minlength=1 + self.point.max(initial=-1)) >= 2
         keep = keep & twice[self.point]
         columns = (self.camera, self.point, self.pixels, self.sigma)
         camera, point, pixels, sigma = (column[keep] for column in columns)
         number = np.unique(point, return_inverse=True)[1]
-        return Tracks(self.names, camera, number, pixels, sigma)
+        return PointTracks(self.names, camera, number, pixels, sigma)
+
+    def of_cameras(self, names: tuple[str, ...]) -> PointTracks:
+        """Keep the observations of some cameras and index these anew."""
+        number = np.array([names.index(n) if n in names else -1 for n in self.names], int)
+        kept = self.select(number[self.camera] >= 0)
+        return replace(kept, names=names, camera=number[kept.camera])
+
+    def features(self) -> np.ndarray:
+        """Mark the rows (N,) that are features, not landmarks."""
+        return self.sigma == FEATURE_SIGMA_PX
+
+    def shared_points(self) -> np.ndarray:
+        """Count the points (C,) that each camera sees together with two others."""
+        views = np.bincount(self.point, minlength=1)
+        rows = views[self.point] >= 3
+        return np.bincount(self.camera[rows], minlength=len(self.names))
 
 
 @dataclass(frozen=True)
-class Seen:
-    """What the cameras saw at one moment, undistorted.
+class FrameSetPoints:
+    """Landmarks and features that the cameras of one frame set saw, in recorded pixels.
 
-    `landmarks` holds the camera, points (68, 2) and sigma (68,) of each view of the face,
-    `features` pixels (N, 2) and descriptors (N, 128) a camera.
+    Attributes:
+        landmarks: camera, points (68, 2) and sigma (68,) of each view of the face.
+        features: features by camera.
     """
 
     landmarks: list[tuple[str, np.ndarray, np.ndarray]]
     features: dict[str, Features]
 
 
-def look(
-    cameras: Mapping[str, Camera], images: Mapping[str, np.ndarray], net: LandmarkNet | None
-) -> Seen:
-    """Landmarks (none without a network) and features of one moment's images (H, W, 3) uint8."""
-    recorded = without_fixed({name: find_features(image) for name, image in images.items()})
-    features = {n: (ideal_pixels(cameras[n], p), d) for n, (p, d) in recorded.items()}
+def find_points(images: Mapping[str, np.ndarray], net: LandmarkNet | None) -> FrameSetPoints:
+    """Find landmarks (none without a network) and features in images (H, W, 3) uint8."""
     faces = {name: find_face(images[name], net) for name in sorted(images)} if net else {}
-    landmarks = [(n, ideal_pixels(cameras[n], f[0]), f[1]) for n, f in faces.items() if f]
-    return Seen(landmarks, features)
+    features = {name: find_features(image) for name, image in images.items()}
+    landmarks = [(name, *face) for name, face in faces.items() if face]
+    return FrameSetPoints(landmarks, without_fixed(features))
 
 
-def join_tracks(cameras: Mapping[str, Camera], seen: Mapping[int, Seen], band: float) -> Tracks:
-    """Tracks of what was seen, by frame number.
+def find_face(image: np.ndarray, net: LandmarkNet) -> tuple[np.ndarray, np.ndarray] | None:
+    """Return landmarks (68, 2) and their sigmas (68,), or None unless a face is seen clearly."""
+    seen = detect(net, image)
+    if seen.score < FACE_SCORE:
+        return None
+    return seen.points, LANDMARK_INFLATION * np.maximum(seen.sigma, FEATURE_SIGMA_PX)
+
+
+def find_features(image: np.ndarray) -> Features:
+    """Find SIFT features in an image (H, W, 3) uint8.
+
+    Descriptors are compared as square roots (Arandjelovic and Zisserman, CVPR 2012).
+    """
+    sift = cv2.SIFT_create(nfeatures=FEATURES, contrastThreshold=0.01)
+    keys, described = sift.detectAndCompute(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), None)
+    if not keys:
+        return np.zeros((0, 2)), np.zeros((0, 128), np.float32)
+    pixels = opencv_pixels_to_corner(np.array([key.pt for key in keys]))
+    return pixels, np.sqrt(described / np.maximum(described.sum(1, keepdims=True), 1e-9))
+
+
+def without_fixed(features: Mapping[str, Features]) -> dict[str, Features]:
+    """Remove features that three or more cameras of a frame set have at the same pixel.
+
+    They belong to the sensors, not to the scene: dust, a watermark, fixed-pattern noise.
+    """
+    names = sorted(features)
+    owner = np.concatenate([np.full(len(features[n][0]), i) for i, n in enumerate(names)])
+    pixels = np.concatenate([features[n][0] for n in names])
+    described = np.concatenate([features[n][1] for n in names])
+    pairs = cKDTree(pixels).query_pairs(0.75, output_type="ndarray")
+    alike = np.einsum("ij,ij->i", described[pairs[:, 0]], described[pairs[:, 1]]) > 0.9
+    first, second = pairs[alike & (owner[pairs[:, 0]] != owner[pairs[:, 1]])].T
+    seen = np.zeros((len(owner), len(names)), bool)
+    seen[first, owner[second]] = seen[second, owner[first]] = True
+    keep = seen.sum(1) < 2
+    return {n: tuple(c[keep[owner == i]] for c in features[n]) for i, n in enumerate(names)}
+
+
+def join_tracks(
+    cameras: Mapping[str, Camera],
+    seen: Mapping[int, FrameSetPoints],
+    band: float,
+    verified: bool = True,
+) -> PointTracks:
+    """Join landmarks and matched features into tracks.
 
     Args:
-        cameras: the rig as it is believed to be; features are only matched where it allows.
-        seen: from `look`.
-        band: distance from the epipolar line, as a share of the image's diagonal, within which
-            a feature may be matched: how far off a camera may be taken to be.
+        cameras: the rig as it is believed to be.
+        seen: points by frame number.
+        band: largest distance of a match from its epipolar line, as a share of the image's
+            diagonal: how far off a camera may be.
+        verified: match features by their descriptors and the pair's own fundamental matrix over
+            all frames, and use `cameras` only for the band. Such matches can show that a whole
+            rig is a little off; matches searched along wrong epipolar lines would confirm it.
+            False searches along the lines, which finds more where most cameras are right.
     """
-    pairs = _neighbours(cameras)
-    matches = {
-        frame: {
-            (a, b): match_features(cameras[a], cameras[b], features[a], features[b], band)
-            for a, b in pairs
-            if a in features and b in features
-        }
-        for frame, features in ((frame, moment.features) for frame, moment in seen.items())
-    }
-    return tracks_of(cameras, seen, matches)
-
-
-def join_verified(cameras: Mapping[str, Camera], seen: Mapping[int, Seen], band: float) -> Tracks:
-    """Tracks of what was seen, features matched by their looks and by each pair's own geometry.
-
-    The matches owe nothing to the rig but that they lie within `band` of its epipolar lines (as
-    in `join_tracks`), so they can tell that all its cameras are a little off: matches sought along
-    wrong lines would only confirm them. All moments of a pair are judged together.
-    """
-    matches: dict[int, dict[tuple[str, str], np.ndarray]] = {frame: {} for frame in seen}
-    for a, b in _neighbours(cameras):
-        both = {
-            frame: (moment.features[a], moment.features[b])
-            for frame, moment in seen.items()
-            if a in moment.features and b in moment.features
-        }
-        for frame, pairs in verified_pairs(both).items():
-            p, q = (seen[frame].features[n][0][pairs[:, i]] for i, n in enumerate((a, b)))
-            off = epipolar_distance(cameras[a], cameras[b], p, q).diagonal()
-            near = off < band * np.hypot(cameras[b].width, cameras[b].height)
-            matches[frame][a, b] = pairs[near]
-    return tracks_of(cameras, seen, matches)
-
-
-def tracks_of(
-    cameras: Mapping[str, Camera],
-    seen: Mapping[int, Seen],
-    matches: Mapping[int, Mapping[tuple[str, str], np.ndarray]],
-) -> Tracks:
-    """Tracks of the landmarks and of matched features, by frame number and pair of cameras."""
     names = tuple(sorted(cameras))
+    ideal = {f: {n: _undistorted(cameras[n], p.features[n]) for n in names if n in p.features}
+             for f, p in seen.items()}  # fmt: skip
+    matches: dict[int, list[tuple[str, str, np.ndarray]]] = {frame: [] for frame in seen}
+    for a, b in _neighbours(cameras):
+        both = {f: (found[a], found[b]) for f, found in ideal.items() if a in found and b in found}
+        reach = band * np.hypot(cameras[b].width, cameras[b].height)
+        if verified:
+            for frame, pairs in verified_pairs(both).items():
+                p, q = (both[frame][i][0][pairs[:, i]] for i in range(2))
+                near = epipolar_distance(cameras[a], cameras[b], p, q).diagonal() < reach
+                matches[frame].append((a, b, pairs[near]))
+        else:
+            for frame, ((p, looks_p), (q, looks_q)) in both.items():
+                near = epipolar_distance(cameras[a], cameras[b], p, q) < reach
+                matches[frame].append((a, b, match_descriptors(looks_p, looks_q, near)))
     rows: list[tuple[int, int, np.ndarray, float]] = []
     count = 0
-    for frame, moment in seen.items():
-        for name, points, sigma in moment.landmarks:
+    for frame, points in seen.items():
+        for name, pixels, sigma in points.landmarks:
             if name in cameras:
-                rows += [(names.index(name), count + k, points[k], sigma[k]) for k in range(68)]
+                rows += [(names.index(name), count + k, pixels[k], sigma[k]) for k in range(68)]
         count += 68
-        features = moment.features
-        for group in _join_matches(matches.get(frame, {})):
-            rows += [(names.index(n), count, features[n][0][k], FEATURE_SIGMA_PX) for n, k in group]
+        for group in _chain(names, matches[frame]):
+            rows += [(c, count, points.features[names[c]][0][k], FEATURE_SIGMA_PX)
+                     for c, k in group]  # fmt: skip
             count += 1
-    table = Tracks(
+    table = PointTracks(
         names,
         np.array([row[0] for row in rows], int),
         np.array([row[1] for row in rows], int),
@@ -157,37 +198,21 @@ def tracks_of(
     return table.select(np.ones(len(rows), bool))
 
 
-def undistorted(seen: Mapping[int, Seen], cameras: Mapping[str, Camera]) -> dict[int, Seen]:
-    """What `cameras` undistort of moments that were looked at without distortion."""
-    return {
-        frame: Seen(
-            [(n, ideal_pixels(cameras[n], p), s) for n, p, s in moment.landmarks if n in cameras],
-            {
-                name: (ideal_pixels(cameras[name], pixels), described)
-                for name, (pixels, described) in moment.features.items()
-                if name in cameras
-            },
-        )
-        for frame, moment in seen.items()
-    }
+def _undistorted(camera: Camera, features: Features) -> Features:
+    """Features in the pixels of the undistorted image.
 
-
-def ideal_pixels(camera: Camera, pixels: np.ndarray) -> np.ndarray:
-    """Where recorded pixels (N, 2) would be without distortion."""
-    K = camera.K
-    return normalised(camera, pixels) * K[[0, 1], [0, 1]] + K[:2, 2]
-
-
-def find_face(image: np.ndarray, net: LandmarkNet) -> tuple[np.ndarray, np.ndarray] | None:
-    """Recorded landmarks (68, 2) and their expected errors (68,), if a face is surely seen."""
-    seen = detect(net, image)
-    if seen.score < FACE_SCORE:
-        return None
-    return seen.points, LANDMARK_DOUBT * np.maximum(seen.sigma, FEATURE_SIGMA_PX)
+    Where the lens folds (a trial lens may, in the corners) there is no such pixel. These features
+    get descriptors of zeros, which match nothing.
+    """
+    K, (pixels, described) = camera.K, features
+    xy = normalised(camera, pixels)
+    again = distort(camera, xy) * K[[0, 1], [0, 1]] + K[:2, 2]
+    valid = np.linalg.norm(again - pixels, axis=1) < 0.01
+    return xy * K[[0, 1], [0, 1]] + K[:2, 2], described * valid[:, None]
 
 
 def _neighbours(cameras: Mapping[str, Camera]) -> list[tuple[str, str]]:
-    """Pairs of cameras, in order of name, of which one is among the other's nearest."""
+    """List the pairs of cameras, in order of name, of which one is among the other's nearest."""
     names = sorted(cameras)
     axes = np.stack([cameras[name].cam_from_world[2, :3] for name in names])
     angle = np.degrees(np.arccos(np.clip(axes @ axes.T, -1, 1)))
@@ -198,22 +223,83 @@ def _neighbours(cameras: Mapping[str, Camera]) -> list[tuple[str, str]]:
     return [(names[i], names[j]) for i, j in sorted(pairs)]
 
 
-def _join_matches(
-    matches: Mapping[tuple[str, str], np.ndarray],
-) -> list[list[tuple[str, int]]]:
-    """Chains of matches as groups of (camera, feature); one camera twice dissolves a group."""
-    above: dict[tuple[str, int], tuple[str, int]] = {}
+def _chain(
+    names: tuple[str, ...], matches: list[tuple[str, str, np.ndarray]]
+) -> list[list[tuple[int, int]]]:
+    """Chain pairwise matches into groups of (camera, feature).
 
-    def root(node: tuple[str, int]) -> tuple[str, int]:
-        while above.setdefault(node, node) != node:
-            above[node] = above[above[node]]
-            node = above[node]
-        return node
+    A group that holds two features of one camera contradicts itself and is left out.
+    """
+    ends = [
+        np.concatenate([np.full((len(pairs), 1), names.index(n)), pairs[:, i : i + 1]], axis=1)
+        for i in range(2)
+        for n, pairs in ((match[i], match[2]) for match in matches)
+    ]
+    if not ends:
+        return []
+    nodes, number = np.unique(np.concatenate(ends), axis=0, return_inverse=True)
+    first, second = number.reshape(2, -1)
+    graph = coo_array((np.ones(len(first)), (first, second)), shape=(len(nodes),) * 2)
+    label = connected_components(graph, directed=False)[1]
+    groups: dict[int, list[tuple[int, int]]] = {}
+    for (camera, feature), group in zip(nodes.tolist(), label.tolist(), strict=True):
+        groups.setdefault(group, []).append((camera, feature))
+    return [g for g in groups.values() if len({camera for camera, _ in g}) == len(g)]
 
-    for (a, b), pairs in matches.items():
-        for i, j in pairs:
-            above[root((a, int(i)))] = root((b, int(j)))
-    groups: dict[tuple[str, int], list[tuple[str, int]]] = {}
-    for node in sorted(above):
-        groups.setdefault(root(node), []).append(node)
-    return [g for g in groups.values() if len({name for name, _ in g}) == len(g)]
+
+def match_descriptors(
+    a: np.ndarray, b: np.ndarray, allowed: np.ndarray | None = None
+) -> np.ndarray:
+    """Match descriptors (A, 128) and (B, 128): pairs (M, 2) that are each other's clear best.
+
+    Only pairs that are `allowed` (A, B) are compared; None allows all.
+    """
+    if min(len(a), len(b)) < 2:
+        return np.zeros((0, 2), int)
+    likeness = a @ b.T
+    if allowed is not None:
+        likeness[~allowed] = -1.0
+    distance = np.sqrt(np.maximum(2 - 2 * likeness, 0))
+    best = distance.argmin(1)
+    rows = np.arange(len(best))
+    nearest = np.partition(distance, 1, axis=1)
+    good = nearest[:, 0] < RATIO * np.minimum(nearest[:, 1], 1.0)
+    good &= distance.argmin(0)[best] == rows
+    return np.stack([rows[good], best[good]], axis=1)
+
+
+def epipolar_distance(
+    a: Camera, b: Camera, pixels_a: np.ndarray, pixels_b: np.ndarray
+) -> np.ndarray:
+    """Measure (A, B), pixels in b, how far each pixel in b is from the epipolar line of each in a.
+
+    Pixels are undistorted. Source: Hartley and Zisserman, Multiple View Geometry, 2nd ed., 9.2.
+    """
+    b_from_a = b.cam_from_world @ a.world_from_cam
+    x, y, z = b_from_a[:3, 3]
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    F = np.linalg.inv(b.K).T @ cross @ b_from_a[:3, :3] @ np.linalg.inv(a.K)
+    lines = np.column_stack([pixels_a, np.ones(len(pixels_a))]) @ F.T
+    lines /= np.maximum(np.linalg.norm(lines[:, :2], axis=1, keepdims=True), 1e-12)
+    return np.abs(lines @ np.column_stack([pixels_b, np.ones(len(pixels_b))]).T)
+
+
+def verified_pairs(features: Mapping[int, tuple[Features, Features]]) -> dict[int, np.ndarray]:
+    """Return the matches (M, 2) by frame that one fundamental matrix of two cameras explains.
+
+    Empty where it explains fewer than 12 matches, or fewer than two fifths of them.
+    """
+    looks = {frame: match_descriptors(a[1], b[1]) for frame, (a, b) in features.items()}
+    counts = [len(pairs) for pairs in looks.values()]
+    if sum(counts) < 12:
+        return {}
+    p, q = (
+        np.concatenate([features[f][i][0][pairs[:, i]] for f, pairs in looks.items()])
+        for i in range(2)
+    )
+    F, mask = cv2.findFundamentalMat(p, q, cv2.USAC_MAGSAC, 1.5, 0.999, 10_000)
+    good = np.zeros(len(p), bool) if F is None else mask.ravel() > 0
+    if good.sum() < 12 or good.mean() < 0.4:
+        return {}
+    parts = np.split(good, np.cumsum(counts)[:-1])
+    return {f: pairs[ok] for (f, pairs), ok in zip(looks.items(), parts, strict=True)}

@@ -16,7 +16,7 @@ from express50.errors import FormatError
 from express50.files.images import read_exif, upright
 from express50.runner.runner import run_stage
 from pipelines import ingest
-from pipelines.calibrate.footage_views import told_focals
+from pipelines.calibrate.footage import known_focals
 
 WIDTH, HEIGHT, FILM_MM = 64, 48, 28
 # What a camera stores of the upright picture under each orientation, as EXIF defines them: where
@@ -77,7 +77,7 @@ def test_a_folder_of_photographs_is_upright(dataset: Dataset, number: int) -> No
         assert image.shape == (HEIGHT, WIDTH, 3)
         assert np.abs(image.astype(int) - scene()).mean() < 3.0
     diagonal = np.hypot(WIDTH, HEIGHT)
-    assert told_focals(index)[name] == pytest.approx(FILM_MM / np.hypot(36, 24) * diagonal)
+    assert known_focals(index)[name] == pytest.approx(FILM_MM / np.hypot(36, 24) * diagonal)
 
 
 @pytest.mark.parametrize("suffix", [".jpg", ".tif", ".png"])

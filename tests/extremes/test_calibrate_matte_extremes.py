@@ -14,10 +14,8 @@ from express50.rigs.world_frame import canonical_from_rig, move_cameras
 from pipelines.alpha.config import AlphaConfig
 from pipelines.alpha.keyer import Keyer
 from pipelines.alpha.plate import exposure_gain
-from pipelines.calibrate.board import gather
-from pipelines.calibrate.config import CalibrateConfig
-from pipelines.calibrate.saddle import refine_corners, square_sides
-from pipelines.calibrate.solve import solve_rig
+from pipelines.calibrate.board import gather, refine_corners, square_sides
+from pipelines.calibrate.board_rig import solve_rig
 from pipelines.calibrate.stage import check_given
 from tests.pipelines.alpha_scenes import make_scene
 from tests.pipelines.board_rigs import (
@@ -29,12 +27,10 @@ from tests.pipelines.board_rigs import (
     sizes_of,
 )
 
-DRAFT = CalibrateConfig(rounds=2)
-
 
 def solved(rig, boards, noise: float):
     """Calibrate a rig from its observations of boards."""
-    return solve_rig(observe(rig, boards, noise), POINTS, sizes_of(rig), DRAFT)
+    return solve_rig(observe(rig, boards, noise), POINTS, sizes_of(rig), rounds=2)
 
 
 @pytest.mark.parametrize(
@@ -74,7 +70,7 @@ def test_a_board_never_tilted_gives_no_silent_nan() -> None:
     view = observe(rig, [board_motion(1, 5, shift=0.0)[0]], 0.0)
     rows = [("cam00", f"{i}", view.corner, view.pixels + 2.0 * i) for i in range(8)]
     try:
-        solution = solve_rig(gather(rows, rig), POINTS, sizes_of(rig), DRAFT)
+        solution = solve_rig(gather(rows, rig), POINTS, sizes_of(rig), rounds=2)
     except CalibrationError as error:
         assert "no camera can be calibrated" in str(error)
     else:

@@ -7,7 +7,7 @@ import numpy as np
 
 from express50.geometry.cameras import Camera, project, rays
 from express50.geometry.transforms import axis_angle_to_matrix, look_at, make_transform
-from pipelines.calibrate.board import Board, Observations, board_points, gather, opencv_board
+from pipelines.calibrate.board import Board, BoardCorners, board_points, gather, opencv_board
 
 BOARD = Board(11, 8, 0.05, 0.037, "DICT_5X5_250")
 POINTS = board_points(BOARD)
@@ -56,7 +56,7 @@ def board_motion(
 
 def observe(
     rig: dict[str, Camera], boards: list[np.ndarray], noise_px: float, seed: int = 0
-) -> Observations:
+) -> BoardCorners:
     """Corners in view from the print's side, with normal noise."""
     rng = np.random.default_rng(seed)
     rows = []

@@ -8,8 +8,8 @@ import numpy as np
 
 from express50.geometry.cameras import Camera, project
 from express50.geometry.transforms import axis_angle_to_matrix, look_at
-from pipelines.calibrate.adjust import move_pose
-from pipelines.calibrate.tracks import Seen
+from pipelines.calibrate.adjuster import move_pose
+from pipelines.calibrate.tracks import FrameSetPoints
 
 SIZE = (640, 480)
 RADII = np.array([0.075, 0.11, 0.09])
@@ -47,7 +47,7 @@ def see(
     landmark_px: float = 2.0,
     blind: tuple[str, ...] = (),
     wrong: float = 0.1,
-) -> dict[int, Seen]:
+) -> dict[int, FrameSetPoints]:
     """Landmarks and features in recorded pixels; a share `wrong` of each camera's looks is mixed.
 
     Features are seen within 75 degrees of the surface's normal, faces by all but `blind` cameras.
@@ -79,7 +79,7 @@ def see(
             own[mixed] = own[np.roll(mixed, 1)]
             own /= np.linalg.norm(own, axis=1, keepdims=True)
             found[name] = (pixels, own.astype(np.float32))
-        seen[moment] = Seen(landmarks, found)
+        seen[moment] = FrameSetPoints(landmarks, found)
     return seen
 
 

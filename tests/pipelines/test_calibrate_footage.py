@@ -16,26 +16,24 @@ from express50.files.calibration import camera_rows
 from express50.files.images import write_image
 from express50.geometry.transforms import similarity_fit
 from pipelines.calibrate.config import CalibrateConfig
-from pipelines.calibrate.faces import pose_of_face, start_camera
-from pipelines.calibrate.footage_views import _film_focal
-from pipelines.calibrate.placing import _resection
+from pipelines.calibrate.first_guess import pose_of_face, resect, start_camera
+from pipelines.calibrate.footage import film_focal_mm
+from pipelines.calibrate.footage_rig import solve_footage
 from pipelines.calibrate.refine import refine_by_board, refine_by_footage
-from pipelines.calibrate.structure import inliers, solve_footage
-from pipelines.calibrate.tracks import Seen, undistorted
+from pipelines.calibrate.tracks import FrameSetPoints
 from tests.pipelines.board_rigs import POINTS, board_motion, make_rig, observe, rig_errors
 from tests.pipelines.face_rigs import SIZE, face, face_cameras, perturbed, see
-
-CONFIG = CalibrateConfig()
 
 
 @pytest.fixture(autouse=True)
 def head(monkeypatch):
-    monkeypatch.setattr("pipelines.calibrate.structure.mean_landmarks", face)
+    monkeypatch.setattr("pipelines.calibrate.footage_rig.mean_landmarks", face)
 
 
 def solve(rig, seen, focals=None, **settings):
     sizes = dict.fromkeys(rig, SIZE)
-    return solve_footage(seen, sizes, focals or {}, CalibrateConfig(**settings), "capture")
+    given = {"model": "auto", "distance_m": 1.0, "eye_distance_mm": 63.0} | settings
+    return solve_footage(seen, sizes, focals or {}, "capture", **given)
 
 
 def scale_to(cameras, true):
@@ -48,7 +46,7 @@ def scale_to(cameras, true):
 def solved():
     rig = face_cameras()
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("pipelines.calibrate.structure.mean_landmarks", face)
+        patch.setattr("pipelines.calibrate.footage_rig.mean_landmarks", face)
         return rig, solve(rig, see(rig))
 
 
@@ -58,7 +56,7 @@ def test_a_rig_is_solved_in_metres_from_faces_and_features(solved):
     assert scale_to(structure.cameras, rig) == pytest.approx(1.0, abs=0.03)
     rotation, position, focal = rig_errors(structure.cameras, rig)
     assert rotation < 0.8 and position < 0.04 and focal < 4
-    kept = structure.errors[inliers(structure)]
+    kept = structure.errors[structure.inliers]
     assert 0.2 < np.sqrt(np.mean(np.sum(kept**2, axis=1))) < 0.8
 
 
@@ -99,7 +97,7 @@ def test_of_two_groups_without_a_common_moment_the_larger_stays():
     seen = see(rig, moments=2)
     lone = {"cam03", "cam04"}
     parts = {
-        k: Seen([row for row in m.landmarks if (row[0] in lone) == bool(k)],
+        k: FrameSetPoints([row for row in m.landmarks if (row[0] in lone) == bool(k)],
                 {n: f for n, f in m.features.items() if (n in lone) == bool(k)})
         for k, m in seen.items()
     }  # fmt: skip
@@ -118,10 +116,11 @@ def test_no_common_face_is_refused_in_one_line():
         solve(rig, see(rig, moments=1, blind=tuple(rig)))
 
 
+POSES = {"turn_deg": 0.2, "move_mm": 3.0, "lenses": False}
+
+
 def refined(given, true, **settings):
-    config = CalibrateConfig(refine=settings.pop("refine", "poses"), **settings)
-    seen = undistorted(see(true, **{"moments": 4}), given)
-    return refine_by_footage(given, given, seen, config)
+    return refine_by_footage(given, given, see(true, moments=4), **(POSES | settings))
 
 
 def test_footage_puts_a_perturbed_rig_right():
@@ -139,8 +138,8 @@ def test_a_rig_that_is_right_stays_to_the_bit():
     true = face_cameras()
     found = refined(true, true)
     assert found.kept and found.cameras == true and found.figures(true)["moves"] == {}
-    blank = {0: Seen([], {n: (np.zeros((0, 2)), np.zeros((0, 128))) for n in true})}
-    nothing = refine_by_footage(true, true, blank, CalibrateConfig(refine="poses"))
+    blank = {0: FrameSetPoints([], {n: (np.zeros((0, 2)), np.zeros((0, 128))) for n in true})}
+    nothing = refine_by_footage(true, true, blank, **POSES)
     assert nothing.kept and nothing.figures(true)["held_out_before_px"] is None
 
 
@@ -150,7 +149,7 @@ def test_lenses_are_refined_where_all_may_move():
         n: replace(c, params=(c.params[0] * (1 + 0.02 * (-1) ** i), *c.params[1:]))
         for i, (n, c) in enumerate(true.items())
     }
-    found = refined(given, true, refine="all")
+    found = refined(given, true, lenses=True)
     assert not found.kept
     assert rig_errors(found.cameras, true)[2] < 0.7 * rig_errors(given, true)[2]
 
@@ -159,13 +158,13 @@ def test_the_board_puts_a_perturbed_rig_right_and_leaves_a_right_one():
     true = make_rig(4)
     observations = observe(true, board_motion(18, 1), 0.1)
     given = perturbed(true, 0.3, 5e-3)
-    for refine in ("poses", "all"):
-        config = CalibrateConfig(refine=refine)
-        found = refine_by_board(given, observations, POINTS, config)
+    for lenses in (False, True):
+        found = refine_by_board(given, observations, POINTS, rounds=3, lenses=lenses)
         assert not found.kept and found.after_px < 0.3 * found.before_px
         rotation, position, _ = rig_errors(found.cameras, true)
         assert rotation < 0.1 and position < 2e-3
-        assert refine_by_board(true, observations, POINTS, config).cameras == true
+        quiet = refine_by_board(true, observations, POINTS, rounds=3, lenses=lenses)
+        assert quiet.kept and quiet.cameras == true
     middle = [np.mean([c.center for c in rig.values()], axis=0) for rig in (found.cameras, given)]
     assert np.linalg.norm(middle[0] - middle[1]) < 5e-3  # it stands where it stood
 
@@ -207,10 +206,10 @@ def test_degenerate_faces_and_matches_give_no_pose():
     spot = np.full((68, 2), 200.0)
     pose, error = pose_of_face(spot, np.ones(68), camera, np.zeros((68, 3)))
     assert np.isfinite(pose).all() and (error == np.inf or np.isfinite(error))
-    same = [(np.array([10.0 + i, 20.0]), np.zeros(3)) for i in range(40)]
-    once = [(np.array([10.0, 20.0]), np.ones(3))] * 40
-    assert _resection(same, camera) is None and _resection(once, camera) is None
-    assert _resection([], camera) is None
+    same = np.array([[10.0 + i, 20.0, 0, 0, 0] for i in range(40)])
+    once = np.array([[10.0, 20.0, 1, 1, 1]] * 40)
+    assert resect(same, camera.K) is None and resect(once, camera.K) is None
+    assert resect(np.zeros((0, 5)), camera.K) is None
 
 
 def test_exif_tells_the_focal_length_of_film(tmp_path):
@@ -220,6 +219,6 @@ def test_exif_tells_the_focal_length_of_film(tmp_path):
     file = oiio.ImageOutput.create(str(path))
     assert file.open(str(path), spec) and file.write_image(np.zeros((24, 36, 3), np.uint8))
     file.close()
-    assert _film_focal(path) == 85.0
+    assert film_focal_mm(path) == 85.0
     write_image(tmp_path / "b.jpg", np.zeros((8, 8, 3), np.uint8))
-    assert _film_focal(tmp_path / "b.jpg") == 0.0
+    assert film_focal_mm(tmp_path / "b.jpg") == 0.0

@@ -16,11 +16,16 @@ from express50.files.calibration import write_cameras
 from express50.files.images import write_image
 from express50.geometry.cameras import Camera, project, rays
 from express50.geometry.transforms import look_at
-from pipelines.calibrate.adjust import fit_poses, move_pose, triangulate_tracks
-from pipelines.calibrate.camera_moves import check_footage, reduce_image, reduce_images
-from pipelines.calibrate.features import epipolar_distance, find_features, without_fixed
-from pipelines.calibrate.sampling import read_moments
-from pipelines.calibrate.tracks import Tracks, look
+from pipelines.calibrate.adjuster import RigPriors, adjust_rig, move_pose, triangulate_tracks
+from pipelines.calibrate.camera_moves import check_footage
+from pipelines.calibrate.footage import read_capture_frames, reduce_image, reduced_camera
+from pipelines.calibrate.tracks import (
+    PointTracks,
+    epipolar_distance,
+    find_features,
+    find_points,
+    without_fixed,
+)
 
 TURN, SHIFT = np.radians(0.3), 5e-3
 
@@ -124,14 +129,14 @@ def test_two_cameras_and_wrong_sizes_are_refused(footage):
 
 def test_large_images_are_reduced_with_their_camera():
     camera = replace(make_rig(1)["cam00"], width=2560, height=1920)
-    small, pictures = reduce_images({"a": camera}, {3: {"a": np.zeros((1920, 2560, 3), np.uint8)}})
-    assert pictures[3]["a"].shape == (960, 1280, 3)
-    np.testing.assert_allclose(small["a"].K[:2], 0.5 * camera.K[:2])
+    image = reduce_image(camera, np.zeros((1920, 2560, 3), np.uint8), "frame 3")
+    assert image.shape == (960, 1280, 3)
+    np.testing.assert_allclose(reduced_camera(camera).K[:2], 0.5 * camera.K[:2])
 
 
 def test_reduced_images_pass_again_and_the_full_ones_are_let_go(footage, tmp_path, monkeypatch):
     rig, frames = footage
-    monkeypatch.setattr("pipelines.calibrate.camera_moves.LONG_SIDE", 160)
+    monkeypatch.setattr("pipelines.calibrate.footage.LONG_SIDE", 160)
     write_capture(tmp_path / "capture", rig, frames[0])
     alive = []
 
@@ -141,10 +146,9 @@ def test_reduced_images_pass_again_and_the_full_ones_are_let_go(footage, tmp_pat
         alive.append(weakref.ref(image))
         return reduce_image(rig[name], image, "frame 0")
 
-    found = read_moments(tmp_path / "capture", 1, reduce)
+    found = read_capture_frames(tmp_path / "capture", 1, reduce)
     assert {image.shape for image in found[0].values()} == {(160, 160, 3)}
-    again = reduce_images(rig, found)[1]
-    assert all(again[0][name] is found[0][name] for name in rig)
+    assert all(reduce_image(rig[n], found[0][n], "frame 0") is found[0][n] for n in rig)
 
 
 def test_noise_fixed_to_the_pixels_of_all_sensors_does_not_accuse(footage):
@@ -176,17 +180,22 @@ def test_freed_poses_return_to_the_truth():
     points = np.random.default_rng(2).uniform(-0.1, 0.1, (80, 3))
     pixels = np.concatenate([project(camera, points)[0] for camera in rig.values()])
     camera, point = np.divmod(np.arange(len(pixels)), len(points))
-    tracks = Tracks(tuple(rig), camera, point, pixels, np.full(len(pixels), 0.01))
+    tracks = PointTracks(tuple(rig), camera, point, pixels, np.full(len(pixels), 0.01))
     assert np.abs(triangulate_tracks(rig, tracks) - points).max() < 1e-8
     wrong = bumped(rig, "cam02", (TURN, -TURN, TURN), (SHIFT, SHIFT, -SHIFT))
-    fit = fit_poses(wrong, tracks, triangulate_tracks(wrong, tracks), ("cam02",))
-    assert np.abs(fit.poses[2] - rig["cam02"].cam_from_world).max() < 1e-4
+    priors = RigPriors(turn_rad=np.radians(1.0), move_m=0.01)
+    points_then = triangulate_tracks(wrong, tracks)
+    fit = adjust_rig(wrong, tracks, points_then, priors, (6.0, 1.5), free=("cam02",))
+    pose = fit.cameras["cam02"].cam_from_world
+    assert np.abs(pose - rig["cam02"].cam_from_world).max() < 1e-4
+    held = [n for n in rig if n != "cam02"]
+    assert all((fit.cameras[n].cam_from_world == wrong[n].cam_from_world).all() for n in held)
     assert np.abs(fit.points - points).max() < 1e-4
 
 
 def test_no_network_means_no_landmarks_and_blank_images_no_features(footage):
     rig, frames = footage
-    seen = look(rig, {"cam00": np.zeros((320, 320, 3), np.uint8)}, None)
+    seen = find_points({"cam00": np.zeros((320, 320, 3), np.uint8)}, None)
     assert seen.landmarks == [] and seen.features["cam00"][0].shape == (0, 2)
 
 
@@ -214,11 +223,11 @@ def test_the_command_names_the_camera(footage, tmp_path, capsys):
 def test_moments_follow_the_cues_and_a_short_camera_is_named(footage, tmp_path):
     rig, frames = footage
     write_capture(tmp_path / "capture", rig, frames[0])
-    assert list(read_moments(tmp_path / "capture", 3, lambda name, image: image)) == [0]
+    assert list(read_capture_frames(tmp_path / "capture", 3, lambda name, image: image)) == [0]
     cues = "expression_id,start_frame,end_frame\nneutral,0,0\nsmile,2,4\n"
     (tmp_path / "capture" / "cues.csv").write_text(cues)
     with pytest.raises(CaptureError, match="has 1 frames, frame 3 was expected"):
-        read_moments(tmp_path / "capture", 2, lambda name, image: image)
+        read_capture_frames(tmp_path / "capture", 2, lambda name, image: image)
 
 
 def test_calibrate_warns_of_the_camera_and_goes_on(footage, tmp_path, capsys):

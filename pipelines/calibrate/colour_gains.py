@@ -1,42 +1,30 @@
-"""How much brighter each camera is than the others, a channel, from the board's white paper.
+"""Colour gains of cameras against each other, per channel, from the board's white paper.
 
-Matt paper sends much the same light everywhere, so what one camera makes of a square at one moment,
-against what the others make of it, is its gain. Faces were tried instead and told less: their gloss
-moves with the camera by more than gains differ (docs/LOG.md).
+Matt paper reflects much the same light everywhere, so a camera's gain is the light it records of a
+square, against what the others record at the same instant. Faces were tried instead and are worse:
+their gloss moves with the camera by more than gains differ (docs/LOG.md).
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import cv2
 import numpy as np
 from scipy.sparse.csgraph import connected_components
 
-from express50.files.atomic import write_json
 from express50.files.images import LIGHT_OF_LEVEL
 from express50.geometry.conventions import corner_to_opencv_pixels
 from pipelines.calibrate.board import Board, opencv_board
 
-LEAST_AREA_PX = 60.0
-"""Area of a white square below which its edges' blur reaches its middle."""
-WHITE_SHARE = 0.3
-"""Brightest part of a square that is surely paper: the marker leaves more than that."""
-LEAST_CONTRAST = 2.0
-"""Linear light of a square's paper over its ink, under which something else is seen."""
-DARK, BRIGHT = 12, 245
-"""8-bit levels between which a pixel tells light: below is noise, above is clipped."""
 LEAST_SHARED = 12
-"""Squares that two cameras must see together to be tied."""
-ROUNDS = 12
-LEAST_SPREAD = 0.003  # of log light; keeps weights finite where all cameras agree
+"""Squares that two cameras must see together to be compared."""
 
 
 @dataclass(frozen=True)
-class White:
-    """Linear light (3,) of a white square of the board in one camera at one moment."""
+class WhiteSquare:
+    """Linear light (3,) of a white square of the board in one camera and frame."""
 
     camera: str
     frame: str
@@ -45,16 +33,15 @@ class White:
 
 
 @dataclass(frozen=True)
-class Gains:
-    """What cameras make of the same light.
+class GainFit:
+    """Gains of cameras, in the order given.
 
     Attributes:
-        gain: (C, 3) linear light of a camera over the cameras' mean (geometric); 1 where nothing
-            ties a camera to the others.
+        gain: (C, 3), 1 where nothing ties a camera to the others.
         tied: (C,) bool, whether the gain was measured.
-        before: median departure of a square's light from its mean over cameras, percent; NaN
-            where nothing was seen twice.
-        after: the same once the gains are divided out.
+        before: median departure of light from its mean over cameras, percent; NaN if no patch was
+            seen twice.
+        after: the same with the gains divided out.
     """
 
     gain: np.ndarray
@@ -63,37 +50,56 @@ class Gains:
     after: float
 
 
-class Palette:
-    """Collects what cameras make of the board's white squares while its images are read."""
+@dataclass(frozen=True)
+class ColourGains:
+    """How cameras record the same light.
+
+    Attributes:
+        gain: linear light (3,) of a camera over the cameras' mean (geometric), of the cameras
+            whose gain could be measured.
+        before: median departure of a square's light from its mean over cameras, percent; None
+            if no square was seen twice.
+        after: the same with the gains divided out.
+        squares: observations of white squares.
+    """
+
+    gain: dict[str, np.ndarray]
+    before: float | None
+    after: float | None
+    squares: int
+
+
+class WhiteCollector:
+    """Collects the light of the board's white squares while its images are read."""
 
     def __init__(self, board: Board) -> None:
         self.squares = white_squares(board)
-        self.whites: list[White] = []
+        self.whites: list[WhiteSquare] = []
 
     def look(
         self, camera: str, frame: str, image: np.ndarray, ids: np.ndarray, pixels: np.ndarray
     ) -> None:
-        """Take in one image (H, W, 3) uint8 with its corners: ids (N,), pixels (N, 2)."""
-        seen = see_white(image, ids, pixels, self.squares)
-        self.whites += [White(camera, frame, square, light) for square, light in seen.items()]
+        """Add one image (H, W, 3) uint8 with its corners: ids (N,), pixels (N, 2)."""
+        light = white_light(image, ids, pixels, self.squares)
+        self.whites += [WhiteSquare(camera, frame, n, value) for n, value in light.items()]
 
-    def write(self, path: Path, cameras: Sequence[str]) -> dict[str, object]:
-        """Write the gains of the cameras that the board ties together; returns metrics."""
-        gains = gains_of(self.whites, cameras)
-        told = [name for name, tied in zip(cameras, gains.tied, strict=True) if tied]
-        rows = gains.gain[gains.tied]
-        write_json(path, {n: row.round(5).tolist() for n, row in zip(told, rows, strict=True)})
-        known = bool(told)
-        return {
-            "spread_percent": round(gains.before, 3) if known else None,
-            "spread_evened_percent": round(gains.after, 3) if known else None,
-            "squares": len(self.whites),
-            "untold": sorted(set(cameras) - set(told)),
-        }
+    def gains(self, cameras: Sequence[str]) -> ColourGains:
+        """Measure the gains of some cameras."""
+        number = {name: i for i, name in enumerate(cameras)}
+        seen = [white for white in self.whites if white.camera in number]
+        points = {key: i for i, key in enumerate(sorted({(w.frame, w.square) for w in seen}))}
+        light = np.full((len(points), len(cameras), 3), np.nan)
+        for white in seen:
+            light[points[white.frame, white.square], number[white.camera]] = white.light
+        fit = fit_gains(light)
+        found = {name: fit.gain[i] for i, name in enumerate(cameras) if fit.tied[i]}
+        if not found:
+            return ColourGains({}, None, None, len(self.whites))
+        return ColourGains(found, fit.before, fit.after, len(self.whites))
 
 
 def white_squares(board: Board) -> dict[int, np.ndarray]:
-    """Ids (4,) of the inner corners around each white square, by the number of its marker."""
+    """Return the ids (4,) of the corners around each white square, by its marker's number."""
     side, across, down = board.square_length_m, board.squares_x - 1, board.squares_y - 1
     made = opencv_board(board)
     found = {}
@@ -105,10 +111,10 @@ def white_squares(board: Board) -> dict[int, np.ndarray]:
     return found
 
 
-def see_white(
+def white_light(
     image: np.ndarray, ids: np.ndarray, pixels: np.ndarray, squares: Mapping[int, np.ndarray]
 ) -> dict[int, tuple[float, float, float]]:
-    """Linear light of the squares' paper in an image (H, W, 3) uint8, by square.
+    """Measure the linear light (3,) of the squares' paper in an image (H, W, 3) uint8, by square.
 
     Args:
         image: sRGB, as recorded.
@@ -127,8 +133,8 @@ def see_white(
 
 
 def _paper(image: np.ndarray, corners: np.ndarray) -> tuple[float, float, float] | None:
-    """Light of the brightest part of a square with corners (4, 2); None where it cannot tell."""
-    if cv2.contourArea(corners.astype(np.float32)) < LEAST_AREA_PX:
+    """Light of the brightest part of a square with corners (4, 2); None if it is unusable."""
+    if cv2.contourArea(corners.astype(np.float32)) < 60.0:  # blurred edges reach the middle
         return None
     middle = corners.mean(0)
     inner = middle + 0.9 * (corners - middle)  # the edge is mixed with black squares
@@ -141,36 +147,26 @@ def _paper(image: np.ndarray, corners: np.ndarray) -> tuple[float, float, float]
     cv2.fillConvexPoly(mask, np.rint(corner_to_opencv_pixels(inner - low)).astype(np.int32), 1)
     levels = part[mask > 0]
     order = np.argsort(levels.sum(1, dtype=np.int32), kind="stable")
-    paper = levels[order[-max(1, round(WHITE_SHARE * len(levels))) :]]
+    # The marker leaves more than this part white.
+    paper = levels[order[-max(1, round(0.3 * len(levels))) :]]
     ink = levels[order[: max(1, round(0.1 * len(levels)))]]
-    if paper.min() < DARK or paper.max() > BRIGHT:
+    if paper.min() < 12 or paper.max() > 245:  # noise, or clipped
         return None
     light = LIGHT_OF_LEVEL[paper].mean(0)
-    if light.mean() < LEAST_CONTRAST * LIGHT_OF_LEVEL[ink].mean():
+    if light.mean() < 2.0 * LIGHT_OF_LEVEL[ink].mean():  # this is not a printed square
         return None
     return float(light[0]), float(light[1]), float(light[2])
 
 
-def gains_of(whites: Sequence[White], cameras: Sequence[str]) -> Gains:
-    """Gains of some cameras from what they made of the board's white squares."""
-    number = {name: i for i, name in enumerate(cameras)}
-    seen = [white for white in whites if white.camera in number]
-    points = {key: i for i, key in enumerate(sorted({(w.frame, w.square) for w in seen}))}
-    light = np.full((len(points), len(cameras), 3), np.nan)
-    for white in seen:
-        light[points[white.frame, white.square], number[white.camera]] = white.light
-    return fit_gains(light)
+def fit_gains(light: np.ndarray) -> GainFit:
+    """Fit gains of cameras to linear light (N, C, 3) of the same N patches; NaN where not seen.
 
-
-def fit_gains(light: np.ndarray) -> Gains:
-    """Gains of cameras from linear light (N, C, 3) of the same N patches; NaN where not seen.
-
-    Least squares of log light on a level a patch and a gain a camera, reweighted by Cauchy's loss,
-    as reflections move with the camera. The patches' levels are eliminated, which leaves one
-    equation a camera.
+    Least squares of log light on a level per patch and a gain per camera, reweighted by Cauchy's
+    loss, as reflections move with the camera. The patches' levels are eliminated, which leaves one
+    equation per camera.
 
     Raises:
-        ValueError: the shape is another, or light is zero, negative or infinite.
+        ValueError: the shape is wrong, or light is zero, negative or infinite.
     """
     if light.ndim != 3 or light.shape[2] != 3:
         raise ValueError(f"light has shape {light.shape}, expected (N, C, 3)")
@@ -182,13 +178,13 @@ def fit_gains(light: np.ndarray) -> Gains:
     weights = (seen & tied).astype(np.float64)
     value = np.log(np.where(seen[..., None], light, 1.0))
     gain = np.zeros((len(tied), 3))
-    for _ in range(ROUNDS):
+    for _ in range(12):
         gain = _solve(value, weights * _trust(value - gain, weights), tied)
-    return Gains(np.exp(gain), tied, _spread(value, weights), _spread(value - gain, weights))
+    return GainFit(np.exp(gain), tied, _spread(value, weights), _spread(value - gain, weights))
 
 
 def _tied(seen: np.ndarray) -> np.ndarray:
-    """The largest set (C,) of cameras that shared patches (N, C) tie together."""
+    """Mark the largest set (C,) of cameras that shared patches (N, C) connect."""
     common = seen.T.astype(np.int64) @ seen
     _, group = connected_components(common >= LEAST_SHARED, directed=False)
     sizes = np.bincount(group, minlength=1)
@@ -205,7 +201,8 @@ def _trust(value: np.ndarray, weights: np.ndarray) -> np.ndarray:
     """Cauchy weights (N, C) of log light without the gains."""
     length = np.linalg.norm(_residuals(value, weights), axis=-1)
     used = length[weights > 0]
-    scale = max(float(np.median(used)), LEAST_SPREAD) if used.size else 1.0
+    # The least scale keeps weights finite where all cameras agree.
+    scale = max(float(np.median(used)), 0.003) if used.size else 1.0
     return 1.0 / (1.0 + (length / (2.0 * scale)) ** 2)
 
 
@@ -217,7 +214,7 @@ def _solve(value: np.ndarray, weights: np.ndarray, tied: np.ndarray) -> np.ndarr
     total = np.maximum(weights.sum(1), 1e-12)
     matrix = np.diag(weights.sum(0)) - weights.T @ (weights / total[:, None])
     right = (weights[..., None] * _residuals(value, weights)).sum(0)
-    # One gain for all changes nothing, so that their mean is held.
+    # A common gain changes nothing, so the mean is held.
     held = matrix[np.ix_(tied, tied)] + np.trace(matrix) / tied.sum()
     gain[tied] = np.linalg.solve(held, right[tied])
     gain[tied] -= gain[tied].mean(0)

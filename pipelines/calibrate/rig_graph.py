@@ -1,8 +1,8 @@
-"""First guess of the rig: relative poses through shared board frames, joined over the best tree.
+"""First guess of a rig: relative poses through shared board frames, joined over the best tree.
 
-Every camera brings, for each frame, the poses of the board it can tell (two, since a flat target
-is ambiguous). A pair of cameras agrees on one relative pose over all its shared frames, which
-settles the ambiguity and shows cameras that are out of step.
+Each camera has, for each frame, the board poses its view allows (two, since a flat target is
+ambiguous). A pair of cameras agrees on one relative pose over all its shared frames, which
+resolves the ambiguity and reveals cameras that are not synchronised.
 """
 
 from __future__ import annotations
@@ -18,27 +18,24 @@ from express50.geometry.transforms import (
     matrix_to_axis_angle,
 )
 from pipelines.calibrate.board import even
-from pipelines.calibrate.intrinsics import View
+from pipelines.calibrate.intrinsics import BoardView
 
-# A pair of cameras is believed when its relative pose explains this share of its shared frames.
-AGREEMENT = 0.5
-# How far, as a share of the image's diagonal, a board may be predicted from where it was seen:
-# generous, because both poses come from one view each with unpolished intrinsics.
 NEAR = 0.02
+"""Largest error of a predicted board, as a share of the image's diagonal: generous, because both
+poses come from one view each with rough intrinsics."""
 
 Poses = Mapping[str, Mapping[int, list[np.ndarray]]]
-Views = Mapping[str, Mapping[int, View]]
+Views = Mapping[str, Mapping[int, BoardView]]
 
 
-def mean_transform(transforms: list[np.ndarray], weights: np.ndarray) -> np.ndarray:
-    """Weighted mean (4, 4): chordal mean of the rotations, mean of the translations."""
-    stack = np.stack(transforms)
-    U, _, Vt = np.linalg.svd(np.tensordot(weights, stack[:, :3, :3], 1))
+def mean_transform(transforms: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Average transforms (N, 4, 4): chordal mean of the rotations, mean of the translations."""
+    U, _, Vt = np.linalg.svd(np.tensordot(weights, transforms[:, :3, :3], 1))
     R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
-    return make_transform(R, weights @ stack[:, :3, 3] / weights.sum())
+    return make_transform(R, weights @ transforms[:, :3, 3] / weights.sum())
 
 
-def pose_error(cam_from_board: np.ndarray, view: View, focal: float) -> float:
+def _pose_error(cam_from_board: np.ndarray, view: BoardView, focal: float) -> float:
     """Rms distance, pixels, of a view's corners from where a pose puts them (inf if behind)."""
     placed = view.points @ cam_from_board[:3, :3].T + cam_from_board[:3, 3]
     if placed[:, 2].min() <= 0:
@@ -49,15 +46,15 @@ def pose_error(cam_from_board: np.ndarray, view: View, focal: float) -> float:
 
 def relative_pose(
     camera: Camera,
-    views: Mapping[int, View],
+    views: Mapping[int, BoardView],
     from_poses: Mapping[int, list[np.ndarray]],
     to_poses: Mapping[int, list[np.ndarray]],
 ) -> tuple[np.ndarray, float] | None:
-    """Pose to_from_from (4, 4) on which the shared frames agree, and its weight in corners.
+    """Find the pose to_from_from (4, 4) on which shared frames agree, and its weight in corners.
 
     `camera` and `views` are those of the camera the pose leads to. Every combination in a frame
     is a candidate; the one that predicts most corners in the other frames wins and is averaged
-    with those near it. None when it explains less than half of the frames.
+    with those near it. Returns None if it explains less than half of the frames.
     """
     shared = sorted(set(from_poses) & set(to_poses))
     candidates = [
@@ -76,21 +73,22 @@ def relative_pose(
     errors = np.stack([predict(candidate) for candidate in sample])
     best = int(np.argmin(np.minimum(errors, near).sum(1)))
     agreed = float(np.mean(errors[best] < near))
-    if agreed < AGREEMENT:
+    if agreed < 0.5:
         return None
     weight = agreed * sum(len(views[f].points) for f in shared)
-    return _average_near(sample[best], candidates), weight
+    stack = np.stack(candidates)
+    return mean_transform(stack, _nearness(sample[best], stack)), weight
 
 
 def _predictor(
-    views: list[View], poses: list[list[np.ndarray]], camera: Camera
+    views: list[BoardView], poses: list[list[np.ndarray]], camera: Camera
 ) -> Callable[[np.ndarray], np.ndarray]:
-    """Function from a relative pose to the error (F,), pixels, of its prediction in each view."""
+    """Return a function from a relative pose to its prediction's error (F,), pixels, per view."""
     counts = np.array([len(view.points) for view in views])
     starts = np.concatenate([[0], np.cumsum(counts)[:-1]])
     ideal = np.concatenate([view.ideal for view in views])
     focal = float(np.sqrt(camera.K[0, 0] * camera.K[1, 1]))
-    # One stack of points a pose alternative; a view with one pose only repeats it.
+    # One stack of points per alternative; a view with a single pose repeats it.
     stacks = [
         np.concatenate(
             [
@@ -113,24 +111,19 @@ def _predictor(
     return predict
 
 
-def _average_near(best: np.ndarray, candidates: list[np.ndarray]) -> np.ndarray:
-    """Average the candidates near the best one, nearer ones counting more."""
-    return mean_transform(candidates, 1.0 / (1.0 + _distances(best, candidates) ** 2) ** 2)
-
-
-def _distances(pose: np.ndarray, others: list[np.ndarray]) -> np.ndarray:
-    """How far (N,) other poses are from one, in units of 2 degrees and 5 % of its distance."""
-    stack = np.stack(others)
-    angles = np.linalg.norm(matrix_to_axis_angle(pose[:3, :3].T @ stack[:, :3, :3]), axis=1)
-    shifts = np.linalg.norm(stack[:, :3, 3] - pose[:3, 3], axis=1)
+def _nearness(pose: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """Robust weights (N,) of other poses; a quarter at 2 degrees or 5 % of the pose's distance."""
+    angles = np.linalg.norm(matrix_to_axis_angle(pose[:3, :3].T @ others[:, :3, :3]), axis=1)
+    shifts = np.linalg.norm(others[:, :3, 3] - pose[:3, 3], axis=1)
     scale = max(float(np.linalg.norm(pose[:3, 3])), 1e-3)
-    return angles / np.radians(2.0) + shifts / (0.05 * scale)
+    distances = angles / np.radians(2.0) + shifts / (0.05 * scale)
+    return 1.0 / (1.0 + distances**2) ** 2
 
 
 def pair_edges(
     cameras: Mapping[str, Camera], views: Views, poses: Poses
 ) -> dict[tuple[str, str], tuple[np.ndarray, float]]:
-    """Relative poses b_from_a and weights of every pair (a, b), a before b, that agrees."""
+    """Find relative poses b_from_a and weights of all pairs (a, b), a before b, that agree."""
     names = sorted(cameras)
     edges = {}
     for i, a in enumerate(names):
@@ -141,10 +134,10 @@ def pair_edges(
     return edges
 
 
-def join(
+def join_rig(
     names: list[str], edges: Mapping[tuple[str, str], tuple[np.ndarray, float]], sweeps: int = 20
 ) -> dict[str, np.ndarray]:
-    """Poses cam_from_rig (4, 4) of the largest connected group of cameras.
+    """Place the largest connected group of cameras: poses cam_from_rig (4, 4).
 
     The maximum spanning tree (Kruskal) by shared corners gives the poses, then sweeps of
     averaging over all edges spread the error of closing loops.
@@ -169,31 +162,20 @@ def join(
             if other not in poses:
                 poses[other] = other_from_at @ poses[at]
                 queue.append(other)
-    return _relax(poses, edges, root, sweeps)
-
-
-def _relax(
-    poses: dict[str, np.ndarray],
-    edges: Mapping[tuple[str, str], tuple[np.ndarray, float]],
-    root: str,
-    sweeps: int,
-) -> dict[str, np.ndarray]:
-    """Move each pose to the mean of what its neighbours say; those far off hardly count."""
     for _ in range(sweeps):
-        for name in sorted(poses):
-            if name == root:
-                continue
-            told, weights = [], []
+        for name in sorted(set(poses) - {root}):
+            votes, weights = [], []
             for (a, b), (b_from_a, weight) in sorted(edges.items()):
                 if name == b and a in poses:
-                    told.append(b_from_a @ poses[a])
+                    votes.append(b_from_a @ poses[a])
                 elif name == a and b in poses:
-                    told.append(invert_transform(b_from_a) @ poses[b])
+                    votes.append(invert_transform(b_from_a) @ poses[b])
                 else:
                     continue
                 weights.append(weight)
-            doubt = _distances(poses[name], told)
-            poses[name] = mean_transform(told, np.array(weights) / (1.0 + doubt**2) ** 2)
+            stack = np.stack(votes)
+            near = _nearness(poses[name], stack)
+            poses[name] = mean_transform(stack, np.array(weights) * near)
     return poses
 
 
@@ -204,7 +186,7 @@ def rig_from_board(
     views: Views,
     poses: Poses,
 ) -> np.ndarray | None:
-    """The board's pose (4, 4) in one frame: the candidate that fits all its cameras best."""
+    """Choose the board's pose (4, 4) in one frame: the candidate that fits its cameras best."""
     seen = [name for name in sorted(cam_from_rig) if frame in poses[name]]
     best, lowest = None, float("inf")
     for name in seen:
@@ -212,7 +194,7 @@ def rig_from_board(
             candidate = invert_transform(cam_from_rig[name]) @ pose
             # The median keeps one bad camera from choosing the pose of all.
             errors = [
-                pose_error(cam_from_rig[o] @ candidate, views[o][frame], cameras[o].K[0, 0])
+                _pose_error(cam_from_rig[o] @ candidate, views[o][frame], cameras[o].K[0, 0])
                 for o in seen
             ]
             error = float(np.median(errors))

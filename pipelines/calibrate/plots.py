@@ -1,4 +1,4 @@
-"""Pictures of a calibration: the rig in space, and what the board's corners still miss by."""
+"""Plots of a calibration: the rig in space, and the errors of the board's corners."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from express50.files.images import write_image
 from express50.geometry.cameras import Camera
 from express50.rigs.world_frame import meeting_point
-from pipelines.calibrate.solve import Solution
+from pipelines.calibrate.board_rig import BoardSolution
 
 
 def _save(figure: Figure, path: Path) -> None:
@@ -23,7 +23,7 @@ def _save(figure: Figure, path: Path) -> None:
 
 
 def _frustum(camera: Camera, length: float) -> np.ndarray:
-    """Corners (5, 3) in the world: the camera's centre, then its image plane at a depth."""
+    """Return (5, 3) world points: the camera's centre, then its image plane's corners."""
     K = camera.K
     x = (np.array([0, camera.width, camera.width, 0]) - K[0, 2]) / K[0, 0]
     y = (np.array([0, 0, camera.height, camera.height]) - K[1, 2]) / K[1, 1]
@@ -35,7 +35,7 @@ def _frustum(camera: Camera, length: float) -> np.ndarray:
 def draw_rig(path: Path, cameras: Mapping[str, Camera], boards: np.ndarray) -> None:
     """Draw the cameras' frusta from above and from the front; `boards` (B, 3) are board origins.
 
-    Lengths are metres; the grey lines are optical axes up to the point they meet in.
+    Lengths are metres; the grey lines are optical axes up to the point in which they meet.
     """
     figure = Figure(figsize=(11, 5.2), dpi=100, layout="tight")
     met = meeting_point(cameras)
@@ -79,13 +79,13 @@ def _draw_camera(
     axes.annotate(name, corners[0], fontsize=6, textcoords="offset points", xytext=(3, 3))
 
 
-def draw_residuals(path: Path, solution: Solution) -> None:
-    """Draw the scatter of corner errors, their mean over the image, and the rms a camera.
+def draw_residuals(path: Path, solution: BoardSolution) -> None:
+    """Draw the scatter of corner errors, their mean over the image, and the rms per camera.
 
     A round scatter and arrows without a pattern mean that the lens model is sufficient.
     """
     figure = Figure(figsize=(13, 4.2), dpi=100, layout="tight")
-    kept, errors = solution.observations, solution.errors
+    kept, errors = solution.corners, solution.errors
     scatter, field, bars = (figure.add_subplot(1, 3, i + 1) for i in range(3))
     limit = max(float(np.percentile(np.abs(errors), 99.5)) * 1.2, 1e-6)
     scatter.hexbin(errors[:, 0], errors[:, 1], gridsize=40, extent=(-limit, limit) * 2, mincnt=1)
@@ -100,13 +100,13 @@ def draw_residuals(path: Path, solution: Solution) -> None:
     colours = ["tab:red" if n in solution.weak else "tab:blue" for n in names]
     bars.bar(range(len(names)), rms, color=colours)
     bars.set_xticks(range(len(names)), names, rotation=90, fontsize=7)
-    bars.set_title("rms a camera [px]; red: weakly tied in", fontsize=10)
+    bars.set_title("rms per camera [px]; red: weakly tied in", fontsize=10)
     _save(figure, path)
 
 
-def _draw_field(axes: Axes, solution: Solution, cells: int = 12) -> None:
-    """Arrows of the mean error in each cell of the image, all cameras laid over each other."""
-    kept = solution.observations
+def _draw_field(axes: Axes, solution: BoardSolution, cells: int = 12) -> None:
+    """Draw the mean error in each cell of the image, over all cameras, as arrows."""
+    kept = solution.corners
     sizes = np.array(
         [
             (solution.cameras[n].width, solution.cameras[n].height)
