@@ -3,8 +3,8 @@
 ``python -m benchmarks.track [--dataset DIR --truth DIR [--captures DIR]]``; without a dataset the
 digital twin records subjects that the landmark detector was not trained on, two cameras are held
 out of the capture, and the stages up to mattes are run. Peaks are the true ones, so that the
-figures speak of tracking alone. `landmark_only` is `standard` without outlines, relief, colours and
-charts. Seconds are processor seconds of the stage, reading footage and drawing overlays included.
+figures speak of tracking alone. `landmark_only` is `standard` without outlines, patches and
+UV landmarks. Seconds are processor seconds of the stage, reading and overlays included.
 The last line printed is one JSON object; `benchmarks.track_truth` says what its figures mean, and
 `benchmarks.track_views` how the held-out cameras' picture is made.
 """
@@ -43,7 +43,7 @@ from pipelines.track import STAGE
 EXPRESSIONS = ("neutral", "smile", "jaw_open", "pucker", "brow_raise", "wink_left")
 PRESETS = ("draft", "standard", "reference")
 LANDMARK_ONLY: dict[str, object] = {
-    "silhouette_rounds": 0, "relief_rounds": 0, "photo_rounds": 0, "chart_rounds": 0,
+    "outline_rounds": 0, "patch_rounds": 0, "uv_rounds": 0,
 }  # fmt: skip
 NO_CLIP = {
     "jitter_mm": None,

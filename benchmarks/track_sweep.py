@@ -29,22 +29,17 @@ EXPRESSIONS = ("neutral", "jaw_open", "smile")
 VIEWS = (2, 4, 8)
 KNOBS: tuple[tuple[str, dict[str, object]], ...] = (
     ("standard", {}),
-    ("landmarks alone", {"silhouette_rounds": 0, "relief_rounds": 0, "photo_rounds": 0}),
-    ("refinements 1", {"refinements": 1}),
-    ("iterations 6", {"iterations": 6}),
-    ("round_iterations 2", {"round_iterations": 2}),
+    ("landmarks alone", {"outline_rounds": 0, "patch_rounds": 0, "uv_rounds": 0}),
     ("cameras 4", {"cameras": 4}),
     ("photo_side 256", {"photo_side": 256}),
     ("samples 1000", {"samples": 1000}),
     ("samples 8000", {"samples": 8000}),
-    ("no outlines", {"silhouette_rounds": 0}),
-    ("relief_rounds 2", {"relief_rounds": 2}),
-    ("no relief", {"relief_rounds": 0}),
-    ("no colours", {"photo_rounds": 0}),
-    ("no chart", {"chart_rounds": 0}),
-    ("chart_weight 4", {"chart_weight": 4.0}),
-    ("no offsets along the skin", {"offset_along": 0}),
-    ("no offsets", {"offset_modes": 0, "offset_along": 0}),
+    ("no outlines", {"outline_rounds": 0}),
+    ("patch_rounds 2", {"patch_rounds": 2}),
+    ("patch_rounds 8", {"patch_rounds": 8, "uv_rounds": 8}),
+    ("no patches", {"patch_rounds": 0}),
+    ("no UV landmarks", {"uv_rounds": 0}),
+    ("no offsets", {"offset_modes": 0}),
 )
 
 

@@ -26,8 +26,8 @@ from express50.geometry.conventions import undistort_image
 from express50.geometry.raycast import visible_faces
 from express50.head.model import HeadModel
 from express50.twin.truth import Truth
-from pipelines.track.photometry import look
-from pipelines.track.samples import Visibility
+from pipelines.track.crops import look_up
+from pipelines.track.surface import Visibility
 
 SLANT = 0.4  # cosine below which a camera's view of a point is not taken
 LEAST_VIEWS = 2
@@ -156,7 +156,7 @@ def median_colours(
         clear = visibility.weights(camera, places, normals) > SLANT
         if clear.any():
             image = np.sqrt(LIGHT_OF_LEVEL[read_frame(dataset, subject, name, frame)])
-            seen[row, clear] = look(camera, image, places[clear])[0]
+            seen[row, clear] = look_up(camera, image, places[clear])
     enough = np.isfinite(seen[..., 0]).sum(0) >= LEAST_VIEWS
     colours = np.full(places.shape, np.nan)
     colours[enough] = np.nanmedian(seen[:, enough], axis=0)

@@ -30,8 +30,9 @@ from pipelines.photo.picture import (
     spread_frames,
     upright_frames,
 )
+from pipelines.track.basis import make_basis
 from pipelines.track.config import TrackConfig
-from pipelines.track.sparse_head import make_basis
+from pipelines.track.read_inputs import DETECTOR_PASSES
 
 CAMERA = "photo"
 FACE_SCORE = 0.2
@@ -80,7 +81,7 @@ def make_photo_capture(
     start = (focal_px, "given") if focal_px else guess_focal(picture, width, height, film_mm)
     basis = make_basis(load_head(config.head))
     surest = sorted(faces, key=lambda face: -face.score)[:FOCAL_FACES]
-    focal = weigh_focal(basis, surest, (width, height), start, config)
+    focal = weigh_focal(basis, surest, (width, height), start)
     _write_footage(picture, folder / "cameras" / CAMERA)
     camera = single_camera(CAMERA, width, height, focal.pixels)
     write_bytes(folder / "calibration.json", dump_json(camera_rows({CAMERA: camera})))
@@ -120,7 +121,7 @@ def find_faces(path: Path, images: list[np.ndarray], config: TrackConfig) -> lis
         CaptureError: there is none.
     """
     net = load_network()
-    seen = [detect(net, image, config.refinements, config.search) for image in images]
+    seen = [detect(net, image, DETECTOR_PASSES, config.search) for image in images]
     faces = [face for face in seen if face.score >= FACE_SCORE]
     if not faces:
         best = max(face.score for face in seen)

@@ -25,11 +25,9 @@ from pipelines.photo.picture import open_picture
 STAGES = ("ingest", "calibrate", "observe", "align", "frames", "track")
 MATTE_STAGES = ("alpha", "matte")
 SEARCH = 0.08  # people fill a rig's pictures, but not all photographs
-# One view cannot tell a bent neck from a shape: it stays nearer to rest. Without mattes and other
-# views the jaw's width hangs on its landmarks alone.
 PHOTO_SETTINGS = (
-    "track.neck_prior=0.03", "track.contour_weight=0.7", "observe.min_score=0.2",
-    f"track.search={SEARCH}", f"observe.search={SEARCH}", "alpha.method=grabcut",
+    "observe.min_score=0.2", f"track.search={SEARCH}", f"observe.search={SEARCH}",
+    "alpha.method=grabcut",
 )  # fmt: skip
 WORDS = "track the face of a bare photograph or video, without calibration"
 

@@ -16,12 +16,11 @@ from express50.errors import StageError
 from express50.geometry.cameras import Camera, pinhole_camera
 from express50.head.model import landmarks
 from express50.landmarks.detector import Detection
-from pipelines.track.config import TrackConfig
-from pipelines.track.fit import fit, landmark_sigma
-from pipelines.track.observe import View, agree
-from pipelines.track.sparse_head import Basis
-from pipelines.track.start import initial_pose
-from pipelines.track.state import Target, start_state
+from pipelines.track.basis import Basis
+from pipelines.track.fit import fit
+from pipelines.track.observe import LandmarkView, agree, landmark_sigma
+from pipelines.track.schedule import LANDMARK_STEPS
+from pipelines.track.state import Target, initial_pose, start_state
 
 LADDER = 2.0 ** np.arange(-2.0, 2.5, 0.5)
 # Of a lens that nothing is told about: two thirds lie within this factor of the guess.
@@ -63,7 +62,6 @@ def weigh_focal(
     detections: list[Detection],
     size: tuple[int, int],
     start: tuple[float, str],
-    config: TrackConfig,
 ) -> Focal:
     """Move a guessed focal length to where the fit is best, if the fit can tell.
 
@@ -74,13 +72,12 @@ def weigh_focal(
         detections: faces of the same person in the same camera.
         size: image width and height.
         start: focal length in pixels and its source.
-        config: of the fit.
 
     Raises:
         StageError: no focal length of the ladder explains the landmarks.
     """
     focals = start[0] * LADDER
-    costs = np.array([_cost(basis, detections, size, focal, config) for focal in focals])
+    costs = np.array([_cost(basis, detections, size, focal) for focal in focals])
     if not np.isfinite(costs).any():
         raise StageError("no pose of a head explains the landmarks; the face may be hidden")
     evidence = INDEPENDENT * costs / len(detections)
@@ -98,21 +95,20 @@ def _cost(
     detections: list[Detection],
     size: tuple[int, int],
     focal: float,
-    config: TrackConfig,
 ) -> float:
     """Cost of the landmark fit with a focal length; infinite where none starts."""
     camera = single_camera("photo", *size, focal)
     template = landmarks(basis.model, basis.model.template[None])[0].numpy()
     targets, poses = [], []
     for number, seen in enumerate(detections):
-        view = View(camera.id, camera, seen.points, seen.sigma, seen.score)
+        view = LandmarkView(camera.id, camera, seen.points, seen.sigma, seen.score)
         observation, _ = agree(f"frame {number}", number, [view])
         try:
             poses.append(initial_pose(observation, template))
         except StageError:
             return math.inf
-        targets.append(Target(observation, landmark_sigma(observation, config), False))
-    return fit(basis, targets, start_state(basis, poses), config, config.iterations)[1]
+        targets.append(Target(observation, landmark_sigma(observation), False))
+    return fit(basis, targets, start_state(basis, poses), LANDMARK_STEPS)[1]
 
 
 def _lowest(x: np.ndarray, y: np.ndarray) -> float:

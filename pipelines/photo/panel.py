@@ -14,7 +14,8 @@ from express50.head.load import load_head
 from express50.head.preview import render_preview
 from express50.landmarks.sources import open_source
 from pipelines.track.config import TrackConfig
-from pipelines.track.overlay import draw_column
+from pipelines.track.read_inputs import DETECTOR_PASSES
+from pipelines.track.report import draw_column
 
 TILE, TURNED = 512, 60.0
 
@@ -32,7 +33,7 @@ def write_panel(dataset: Dataset, subject: str, config: TrackConfig, path: Path)
     ((camera_id, camera),) = read_cameras_of(dataset, subject).items()
     image = read_peak_frame(dataset, subject, expression, camera_id)
     recorded = read_cameras_of(dataset, subject, undistorted=False)
-    source = open_source(config.landmarks, recorded, config.refinements, config.search)
+    source = open_source(config.landmarks, recorded, DETECTOR_PASSES, config.search)
     seen = source(image, camera_id, frame)
     dots = [seen.face.points, seen.irises.centres[seen.irises.confidence > 0]]
     column = draw_column(image, camera, model.to(dtype=torch.float64), mesh, dots, TILE)

@@ -1,4 +1,4 @@
-"""Tracking: a head model is fitted to every peak frame of a subject, seen by all its cameras."""
+"""Tracking: fit a head model to every peak frame of a subject, seen by all its cameras."""
 
 from __future__ import annotations
 
@@ -6,28 +6,52 @@ from pathlib import Path
 
 from express50.contract.layout import Dataset
 from express50.contract.stage import Growth, Result, Stage
-from pipelines.track.config import PRESETS, VERSION, TrackConfig
+from express50.errors import ConfigError
+from pipelines.track.config import PRESETS, UV_WEIGHTS, VERSION, TrackConfig
+
+__all__ = ["STAGE"]
 
 
 def items(dataset: Dataset) -> list[str]:
-    """List the items, see `pipelines.track.stage`."""
-    from pipelines.track.stage import items as found
-
-    return found(dataset)
+    """List subjects: all expressions of one share the shape."""
+    return dataset.subjects()
 
 
 def inputs(dataset: Dataset, item: str, config: TrackConfig) -> dict[str, Path | str]:
-    """Name what one item reads, see `pipelines.track.stage`."""
-    from pipelines.track.stage import inputs as found
+    """Name index, cameras, peaks, mattes, network weights and the head model's file."""
+    from express50.capture.frames import frame_inputs, read_peaks
+    from express50.capture.index import index_path
+    from express50.landmarks.sources import source_files
 
-    return found(dataset, item, config)
+    found: dict[str, Path | str] = {
+        "index": index_path(dataset, item),
+        "cameras": dataset.item_dir("calibrate", item) / "cameras.json",
+        "peaks": dataset.item_dir("align", item) / "peaks.json",
+        **source_files(config.landmarks),
+    }
+    for expression in read_peaks(dataset, item):
+        found |= frame_inputs(dataset, item, expression)
+    mattes = dataset.item_dir("matte", item)
+    if (config.outline_rounds or config.patch_rounds) and mattes.is_dir():
+        found["mattes"] = mattes
+    if config.uv_rounds:
+        found["face_uv"] = UV_WEIGHTS
+    if config.head != "procedural":
+        found["head"] = Path(config.head).expanduser()
+    for name, setting in (("head", "head"), ("landmarks", "landmarks"), ("fan", "landmarks")):
+        if name in found and not Path(found[name]).exists():
+            raise ConfigError(
+                f"track.{setting} is {getattr(config, setting)}: no such file; give its path, or"
+                " leave the setting out"
+            )
+    return found
 
 
-def run(dataset: Dataset, item: str, config: TrackConfig, out: Path) -> Result | dict:
-    """Make one item, see `pipelines.track.stage`."""
+def run(dataset: Dataset, item: str, config: TrackConfig, out: Path) -> Result:
+    """Track one subject; see `pipelines.track.stage`."""
     from pipelines.track.stage import run as work
 
-    return work(dataset, item, config, out)
+    return work(dataset, item, config, out, inputs(dataset, item, config))
 
 
 STAGE = Stage(
@@ -38,8 +62,9 @@ STAGE = Stage(
     items=items,
     inputs=inputs,
     run=run,
-    help="fit the head model to the peak frames",
-    purpose="The head model fitted to landmarks in all views.",
+    help="fit a head model to every peak frame",
+    purpose="A head model is fitted to every peak frame: shape per subject, expression and pose"
+    " per frame, and an albedo texture.",
     growth=Growth(
         items=("subjects",), time=("expressions", "views", "pixels"), disk=("expressions",)
     ),

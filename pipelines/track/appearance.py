@@ -1,27 +1,59 @@
-"""Colour of the skin, light of the room and gain of each camera, from pictures and a mesh.
+"""The subject's albedo texture, and the light and camera gains that it is freed of.
 
-Root of light everywhere: picture = root gain x root light x root albedo. All three are found in
-closed form, one after the other.
+Everything is in root light: picture = root gain x root light x root albedo. The three are found in
+closed form, one after the other, at samples of the skin; the texture is then baked with the light
+and gains from the neutral frame set and two others, which show what it hides.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 
+import cv2
 import numpy as np
+import torch
+
+from express50.errors import StageError
+from express50.files.images import linear_to_srgb, write_image
+from express50.geometry.cameras import Camera
+from express50.geometry.conventions import cell_to_corner
+from express50.geometry.raycast import visible_faces
+from express50.geometry.spherical_harmonics import sh_polynomials
+from express50.head.model import HeadModel, vertex_normals
+from pipelines.track.crops import FrameSetCrops, look_up, root_light
+from pipelines.track.state import Target
+from pipelines.track.surface import (
+    Samples,
+    Visibility,
+    flat_barycentrics,
+    sample_normals,
+    spread,
+    view_weights,
+)
 
 LIGHT_FLOOR = 0.05
 RIDGE = 0.02
-# Taking turns closes about a quarter of what gains are off, a round: after two, 4 to 8 % was left.
+# A round removes about a quarter of the gains' error: after two, 4 to 8 % was left.
 ROUNDS = 10
 OUTLIER = 2.5
 NOISE_FLOOR = 0.002
+VIEW_OUTLIER = 4.0  # standard deviations at which a view's colour is outvoted
+LIGHT_FRAME_SETS = 8  # light of so many frame sets is as good as that of all
+SCHEMA = "express50.appearance/1"
+TEXTURE_FRAME_SETS = 3
+# Two frame sets never align exactly, and their mean is blurred: the first one's views count this
+# many times, so the others fill in what it does not show.
+FIRST_WEIGHT = 20.0
+SPREAD = 0.02  # root light; what matt skin under distant light does not explain
+LEAST_WEIGHT = 0.3  # sum of squared cosines to the cameras from which on a texel is known
+CHUNK = 10_000
 EVEN_LIGHT = np.repeat(np.eye(9)[:, :1], 3, axis=1)
 
 
 @dataclass(frozen=True)
-class Seen:
-    """What C cameras show at S samples at one moment.
+class SampleColours:
+    """The colours that C cameras show at S samples of one frame set.
 
     Attributes:
         cameras: C camera ids.
@@ -38,55 +70,34 @@ class Seen:
 
 @dataclass(frozen=True)
 class Appearance:
-    """Light (9, 3) of the room, root gain (3,) a camera, root albedo (S, 3), NaN where unseen."""
+    """Light (9, 3) of the room, root gain (3,) per camera, root albedo (S, 3), NaN where unseen."""
 
     light: np.ndarray
     gains: dict[str, np.ndarray]
     albedo: np.ndarray
 
     def shade(self, camera_id: str, normals: np.ndarray) -> np.ndarray:
-        """What root albedo is multiplied with at normals (S, 3) in a camera's pictures: (S, 3)."""
+        """Return the factor (S, 3) of root albedo at normals (S, 3) in a camera's pictures."""
         gain = self.gains.get(camera_id, np.ones(3))
-        return gain * np.sqrt(np.maximum(sh_basis(normals) @ self.light, LIGHT_FLOOR))
+        return gain * np.sqrt(np.maximum(sh_polynomials(normals) @ self.light, LIGHT_FLOOR))
 
 
-def sh_basis(normals: np.ndarray) -> np.ndarray:
-    """Real spherical harmonics (S, 9) to order two, each scaled to 1, x, y, z, xy, yz, ...
-
-    The irradiance of any distant light is a combination of these to about a per cent (Ramamoorthi
-    and Hanrahan 2001); constants are left to the coefficients, so that the first is the mean light.
-    """
-    x, y, z = normals.T
-    columns = [np.ones_like(x), y, z, x, x * y, y * z, 3 * z * z - 1, x * z, x * x - y * y]
-    return np.stack(columns, axis=1)
-
-
-def estimate(moments: list[Seen], before: Appearance | None = None) -> Appearance:
-    """Albedo, light and gains that explain the moments best; `before` gives light and gains."""
-    cameras = sorted({name for seen in moments for name in seen.cameras})
-    light = _first_light(moments) if before is None else before.light
+def estimate(frame_sets: list[SampleColours], before: Appearance | None = None) -> Appearance:
+    """Find albedo, light and gains that explain the frame sets; `before` gives a start."""
+    cameras = sorted({name for seen in frame_sets for name in seen.cameras})
+    light = _first_light(frame_sets) if before is None else before.light
     gains = {name: np.ones(3) for name in cameras} | (before.gains if before else {})
-    count = moments[0].normals.shape[0]
+    count = frame_sets[0].normals.shape[0]
     appearance = Appearance(light, gains, np.full((count, 3), np.nan))
     for _ in range(ROUNDS):
-        appearance = _with_albedo(appearance, moments)
-        appearance = _with_gains(appearance, moments)
-        appearance = _with_light(appearance, moments)
-    return _with_albedo(appearance, moments)
+        appearance = _with_albedo(appearance, frame_sets)
+        appearance = _with_gains(appearance, frame_sets)
+        appearance = _with_light(appearance, frame_sets)
+    return _with_albedo(appearance, frame_sets)
 
 
-def albedo_sums(appearance: Appearance, seen: Seen) -> tuple[np.ndarray, np.ndarray]:
-    """Mass and weighted sum (S, 3) of one moment's root albedo."""
-    mass, total = np.zeros_like(seen.normals), np.zeros_like(seen.normals)
-    for camera_id, value, weight in zip(seen.cameras, seen.values, seen.weights, strict=True):
-        shade = appearance.shade(camera_id, seen.normals)
-        mass += weight[:, None] * shade**2
-        total += weight[:, None] * shade * value
-    return mass, total
-
-
-def residuals(appearance: Appearance, seen: Seen, albedo: np.ndarray) -> np.ndarray:
-    """Lengths (C, S) of picture minus model over the channels; 0 where nothing is known."""
+def residuals(appearance: Appearance, seen: SampleColours, albedo: np.ndarray) -> np.ndarray:
+    """Return lengths (C, S) of picture minus model over the channels; 0 where unknown."""
     rows = []
     for camera_id, value in zip(seen.cameras, seen.values, strict=True):
         model = appearance.shade(camera_id, seen.normals) * albedo
@@ -95,24 +106,24 @@ def residuals(appearance: Appearance, seen: Seen, albedo: np.ndarray) -> np.ndar
 
 
 def spread_of(lengths: np.ndarray, weights: np.ndarray) -> float:
-    """Robust standard deviation of residual lengths (C, S) over three channels."""
+    """Return the robust standard deviation of residual lengths (C, S) over three channels."""
     seen = lengths[weights > 0]
     # The median length of three unit normals is 1.538.
     return max(float(np.median(seen)) / 1.538, NOISE_FLOOR) if seen.size else NOISE_FLOOR
 
 
 def trust(lengths: np.ndarray, sigma: float) -> np.ndarray:
-    """Geman and McClure's weights in 0..1: hair, highlights and cast shadows count for little."""
+    """Weigh residuals, 0..1 (Geman and McClure): hair, highlights, shadows count for little."""
     return 1.0 / (1.0 + (lengths / (3.0**0.5 * OUTLIER * sigma)) ** 2) ** 2
 
 
-def _first_light(moments: list[Seen]) -> np.ndarray:
-    """Light (9, 3) if all skin had one colour, with mean 1 over the samples."""
+def _first_light(frame_sets: list[SampleColours]) -> np.ndarray:
+    """Find the light (9, 3) if all skin had one colour, with mean 1 over the samples."""
     basis, light, weights = [], [], []
-    for seen in moments:
+    for seen in frame_sets:
         mass = seen.weights.sum(0)
         mean = (seen.weights[..., None] * seen.values).sum(0) / np.maximum(mass, 1e-9)[:, None]
-        basis.append(sh_basis(seen.normals))
+        basis.append(sh_polynomials(seen.normals))
         light.append(mean**2)
         weights.append(mass)
     B, L, w = np.concatenate(basis), np.concatenate(light), np.concatenate(weights)
@@ -127,28 +138,30 @@ def _first_light(moments: list[Seen]) -> np.ndarray:
 
 
 def _ridge_fit(B: np.ndarray, target: np.ndarray, w: np.ndarray, start: np.ndarray) -> np.ndarray:
-    """Weighted least squares (9, 3), drawn gently to a start."""
+    """Solve weighted least squares (9, 3), drawn gently to a start."""
     weighted = B * w[:, None]
     # Where nothing is seen the start stays.
     pull = (RIDGE * float(w.sum()) + 1e-9) * np.eye(9)
     return np.linalg.solve(weighted.T @ B + pull, weighted.T @ target + pull @ start)
 
 
-def _with_albedo(appearance: Appearance, moments: list[Seen]) -> Appearance:
-    mass = total = np.zeros_like(moments[0].normals)
-    for seen in moments:
-        one, sums = albedo_sums(appearance, seen)
-        mass, total = mass + one, total + sums
+def _with_albedo(appearance: Appearance, frame_sets: list[SampleColours]) -> Appearance:
+    mass = total = np.zeros_like(frame_sets[0].normals)
+    for seen in frame_sets:
+        for camera_id, value, weight in zip(seen.cameras, seen.values, seen.weights, strict=True):
+            shade = appearance.shade(camera_id, seen.normals)
+            mass = mass + weight[:, None] * shade**2
+            total = total + weight[:, None] * shade * value
     albedo = np.where(mass > 1e-6, total / np.maximum(mass, 1e-6), np.nan)
     return Appearance(appearance.light, appearance.gains, albedo)
 
 
-def _with_gains(appearance: Appearance, moments: list[Seen]) -> Appearance:
-    """Root gains by least squares, their geometric mean one: the rest is albedo."""
+def _with_gains(appearance: Appearance, frame_sets: list[SampleColours]) -> Appearance:
+    """Solve root gains by least squares with a geometric mean of one: the rest is albedo."""
     over: dict[str, np.ndarray] = {name: np.zeros(3) for name in appearance.gains}
     under: dict[str, np.ndarray] = {name: np.zeros(3) for name in appearance.gains}
     plain = Appearance(appearance.light, {}, appearance.albedo)
-    for seen in moments:
+    for seen in frame_sets:
         expected = np.nan_to_num(plain.shade("", seen.normals) * appearance.albedo)
         for camera_id, value, weight in zip(seen.cameras, seen.values, seen.weights, strict=True):
             over[camera_id] += (weight[:, None] * expected * value).sum(0)
@@ -162,15 +175,15 @@ def _with_gains(appearance: Appearance, moments: list[Seen]) -> Appearance:
     )
 
 
-def _with_light(appearance: Appearance, moments: list[Seen]) -> Appearance:
-    """Light by least squares about the light so far: heads turn, so that normals vary."""
+def _with_light(appearance: Appearance, frame_sets: list[SampleColours]) -> Appearance:
+    """Solve the light by least squares about the light so far: heads turn, so normals vary."""
     basis, target, weights = [], [], []
     albedo = np.nan_to_num(appearance.albedo)
-    for seen in moments:
+    for seen in frame_sets:
         for camera_id, value, weight in zip(seen.cameras, seen.values, seen.weights, strict=True):
             chosen = np.flatnonzero(weight > 0)
             scale = np.maximum((appearance.gains[camera_id] * albedo[chosen]) ** 2, 1e-4)
-            basis.append(sh_basis(seen.normals[chosen]))
+            basis.append(sh_polynomials(seen.normals[chosen]))
             target.append(np.clip(value[chosen] ** 2 / scale, 0.0, 4.0))
             weights.append(weight[chosen])
     if not basis:
@@ -179,3 +192,208 @@ def _with_light(appearance: Appearance, moments: list[Seen]) -> Appearance:
         np.concatenate(basis), np.concatenate(target), np.concatenate(weights), appearance.light
     )
     return Appearance(light, appearance.gains, appearance.albedo)
+
+
+def robust_mean(
+    values: np.ndarray, shade: np.ndarray, trust: np.ndarray, sigma: float
+) -> np.ndarray:
+    """Find root albedo (S, 3) on which most views agree: values (C, S, 3) = shade (C, S, 3) * mean.
+
+    Hair, highlights and what stands before the skin in one view (trust (C, S)) count for little.
+    """
+    weights = trust
+    for _ in range(3):
+        mass = (weights[..., None] * shade**2).sum(0)
+        mean = (weights[..., None] * shade * values).sum(0) / np.maximum(mass, 1e-12)
+        off = ((values - shade * mean) ** 2).sum(2)
+        weights = trust / (1.0 + off / (3.0 * sigma**2 * VIEW_OUTLIER**2)) ** 2
+    return mean
+
+
+def write_texture(
+    out: Path,
+    model: HeadModel,
+    targets: list[Target],
+    meshes: np.ndarray,
+    pictures: list[FrameSetCrops],
+    samples: int,
+    side: int,
+) -> bool:
+    """Estimate light and gains, bake albedo.png and write it with appearance.npz.
+
+    Nothing is written if no picture shows any of the head; the result says whether one did.
+
+    Args:
+        out: folder.
+        model: the head.
+        targets: E expressions.
+        meshes: (E, V, 3) world.
+        pictures: of the E frame sets.
+        samples: places on the skin at which light and gains are estimated.
+        side: texels per side.
+    """
+    skin = spread(model, samples)
+    some = range(0, len(pictures), -(-len(pictures) // LIGHT_FRAME_SETS))
+    seen = [_colours(_scene(model, pictures[k], meshes[k]), skin) for k in some]
+    appearance = estimate(seen)
+    # Hair, highlights and shadows disagree with it and are left out the second time.
+    lengths = [residuals(appearance, one, appearance.albedo) for one in seen]
+    sigma = spread_of(np.concatenate(lengths), np.concatenate([one.weights for one in seen]))
+    seen = [
+        replace(one, weights=one.weights * trust(length, sigma))
+        for one, length in zip(seen, lengths, strict=True)
+    ]
+    appearance = estimate(seen, appearance)
+    order = sorted(range(len(targets)), key=lambda index: not targets[index].neutral)
+    places = np.unique(np.linspace(0, len(order) - 1, TEXTURE_FRAME_SETS).astype(int))
+    used = [order[index] for index in places]
+    albedo, known = bake_albedo(model, meshes[used], [pictures[k] for k in used], appearance, side)
+    if known.any():
+        names = [targets[index].observation.expression for index in used]
+        write_appearance(out, albedo, appearance, names)
+    return bool(known.any())
+
+
+def bake_albedo(
+    model: HeadModel,
+    meshes: np.ndarray,
+    pictures: list[FrameSetCrops],
+    appearance: Appearance,
+    side: int,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Bake the head's colours freed of light and gains.
+
+    Args:
+        model: the head.
+        meshes: (E, V, 3) world.
+        pictures: of the E frame sets; the first (best the neutral one) counts most.
+        appearance: light and gains.
+        side: texels per side.
+
+    Returns:
+        (side, side, 3) uint8 sRGB, first row at v = 1, continued over what was not seen; and
+        (side, side) bool, where it was seen.
+    """
+    texels, texture = texel_samples(model, side)
+    scenes = [_scene(model, *pair) for pair in zip(pictures, meshes, strict=True)]
+    known = np.zeros((side, side), dtype=bool)
+    root = np.zeros((side, side, 3))
+    for start in range(0, len(texels.faces), CHUNK):
+        some = slice(start, start + CHUNK)
+        part = texels.some(some)
+        seen = [_colours(scene, part) for scene in scenes]
+        colour, mass = _agreed(seen, appearance)
+        row, column = texture[some].T
+        root[row, column], known[row, column] = colour, mass > LEAST_WEIGHT
+    light = np.where(known[..., None], root**2, 0.0)
+    srgb = linear_to_srgb(np.clip(_filled(light, known), 0.0, 1.0))
+    return np.rint(255.0 * srgb).astype(np.uint8), known
+
+
+def write_appearance(
+    out: Path, albedo: np.ndarray, appearance: Appearance, expressions: list[str]
+) -> None:
+    """Write albedo.png and appearance.npz (docs/FORMAT.md); gains in linear light, not its root.
+
+    Raises:
+        StageError: light or gains are not finite.
+    """
+    cameras = sorted(appearance.gains)
+    gains = np.array([appearance.gains[name] ** 2 for name in cameras]).reshape(-1, 3)
+    if not (np.isfinite(appearance.light).all() and np.isfinite(gains).all()):
+        raise StageError("light or gains hold NaN or infinite values; check the mattes")
+    write_image(out / "albedo.png", albedo)
+    np.savez(
+        out / "appearance.npz",
+        schema=np.array(SCHEMA),
+        light=appearance.light,
+        cameras=np.array(cameras),
+        gains=gains,
+        expressions=np.array(expressions),
+    )
+
+
+def texel_samples(model: HeadModel, side: int) -> tuple[Samples, np.ndarray]:
+    """Find the places on the mesh of the texture's texels, and their rows and columns (S, 2)."""
+    uv, uv_faces = model.uv.double().numpy(), model.uv_faces.numpy()
+    # The map a metre before a camera whose focal length is its side: a metre is the map's width.
+    flat = np.column_stack([uv[:, 0], 1.0 - uv[:, 1], np.ones(len(uv))])
+    camera = Camera("map", side, side, "PINHOLE", (side, side, 0.0, 0.0), np.eye(4))
+    face_id = visible_faces(flat, uv_faces, camera)[0]
+    texture = np.argwhere(face_id >= 0)
+    faces = face_id[tuple(texture.T)]
+    at = cell_to_corner(texture[:, ::-1]) / side
+    bary = flat_barycentrics(flat[uv_faces[faces], :2], at)
+    return Samples(faces, model.faces.numpy()[faces], bary), texture
+
+
+@dataclass(frozen=True)
+class _Scene:
+    """A frame set's mesh with its smooth normals, its pictures and its ray tree."""
+
+    mesh: np.ndarray
+    normals: np.ndarray
+    pictures: FrameSetCrops
+    images: list[tuple[np.ndarray, Camera]]
+    visibility: Visibility
+
+
+def _scene(model: HeadModel, pictures: FrameSetCrops, mesh: np.ndarray) -> _Scene:
+    normals = vertex_normals(torch.from_numpy(mesh)[None], model.faces)[0].numpy()
+    images = [root_light(crop) for crop in pictures.crops]
+    return _Scene(mesh, normals, pictures, images, Visibility(mesh, model.faces.numpy()))
+
+
+def _colours(scene: _Scene, samples: Samples) -> SampleColours:
+    """Look samples up in every picture: facets decide visibility, light falls on smooth normals."""
+    places, facets = samples.at(scene.mesh), sample_normals(samples, scene.mesh)
+    weights = view_weights(scene.visibility, scene.pictures, places, facets)
+    values = np.zeros((*weights.shape, 3))
+    for row, (image, camera) in enumerate(scene.images):
+        chosen = np.flatnonzero(weights[row])
+        values[row, chosen] = look_up(camera, image, places[chosen])
+    normals = samples.at(scene.normals)
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    normals = np.where(length > 1e-9, normals / np.maximum(length, 1e-9), facets)
+    names = tuple(crop.camera_id for crop in scene.pictures.crops)
+    return SampleColours(names, values, weights, normals)
+
+
+def _agreed(
+    frame_sets: list[SampleColours], appearance: Appearance
+) -> tuple[np.ndarray, np.ndarray]:
+    """Find root albedo (S, 3) that most views agree on, and how well it was seen (S,)."""
+    count = len(frame_sets[0].normals)
+    shade = [appearance.shade(name, one.normals) for one in frame_sets for name in one.cameras]
+    values = [value for one in frame_sets for value in one.values]
+    if not values:
+        return np.zeros((count, 3)), np.zeros(count)
+    mass = np.concatenate([one.weights**2 for one in frame_sets])
+    weight = mass.copy()
+    weight[: len(frame_sets[0].cameras)] *= FIRST_WEIGHT
+    return robust_mean(np.stack(values), np.stack(shade), weight, SPREAD), mass.sum(0)
+
+
+def _filled(image: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """Fill unknown pixels of an image (H, W, 3) from their surroundings by a pyramid of means.
+
+    Known pixels stay. Gortler et al. 1996 ("The Lumigraph") fill holes like this.
+    """
+    mass = known.astype(np.float64)[..., None]
+    if not mass.any():
+        return np.full_like(image, 0.5)
+    return _pulled(image * mass, mass)
+
+
+def _pulled(total: np.ndarray, mass: np.ndarray) -> np.ndarray:
+    height, width = mass.shape[:2]
+    if mass.all() or min(height, width) == 1:
+        return total / np.maximum(mass, 1e-12)
+    size = (max(1, width // 2), max(1, height // 2))
+    less, few = (cv2.resize(x, size, interpolation=cv2.INTER_AREA) for x in (total, mass))
+    few = few.reshape(*few.shape[:2], 1)
+    share = np.minimum(4.0 * few, 1.0) / np.maximum(few, 1e-12)
+    coarse = cv2.resize(
+        _pulled(less * share, few * share), (width, height), interpolation=cv2.INTER_LINEAR
+    )
+    return total + (1.0 - mass) * coarse

@@ -1,97 +1,105 @@
-"""Levenberg-Marquardt fit of one shape and many expressions to landmarks and outlines.
+"""Levenberg-Marquardt fit of one shape and many expressions to the residuals of `terms`.
 
-Per-expression unknowns meet only in the shared shape, so the normal equations are solved by
-eliminating them one expression at a time (Schur complement): time and memory grow linearly with
-the number of expressions. Residuals are in standard deviations; robust weights are Huber's.
+The unknowns are x = (shape, bias, own_1, ..., own_E) and the cost is the sum, over expressions and
+their terms, of the loss of the squared residuals, plus half the squared residuals of the priors. An
+expression's terms are first summed over the mesh: a sparse matrix W and a gradient over its chosen
+vertices p, since every residual is about weighted sums of vertices. With the head's Jacobian
+J = dp/dx the Gauss-Newton system of the expression is J' W J, however many views see a vertex.
+Expressions share only the shape and the detector's bias, so their own unknowns are eliminated one
+expression at a time (Schur complement): time and memory grow linearly with their number.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
+import scipy.sparse as sparse
 
 from express50.errors import StageError
+from express50.geometry.pinhole import project_pinhole
 from express50.geometry.transforms import axis_angle_to_matrix
-from pipelines.track.config import TrackConfig
-from pipelines.track.observe import Observation
-from pipelines.track.offsets import MODE
-from pipelines.track.pinhole import project_pinhole, project_with_slope
-from pipelines.track.priors import prior
-from pipelines.track.sparse_head import Basis, Points
-from pipelines.track.state import Pose, State, SurfaceTerm, Target
+from pipelines.track.basis import MODE, Basis, Points
+from pipelines.track.observe import JAW_LINE_WEIGHT
+from pipelines.track.state import Pose, State, Target, prior
+from pipelines.track.terms import (
+    Anchors,
+    PixelTerm,
+    Sighting,
+    Term,
+    cost,
+    information,
+    landmark_anchors,
+)
 
-HUBER = 1.5
-KNOWN_BIAS_M = 1e-6
-KNOWN_MODE = 1e8
+LANDMARK_BIAS_M = 0.003  # standard deviation of the detector's constant error on a face
+KNOWN_BIAS_M, KNOWN_MODE = 1e-6, 1e8  # what is not free is held this firmly
 BIAS = 68 * 3
 REJECT_SIGMA, REJECT_SHARE = 4.0, 0.12
 
 
 def fit(
-    basis: Basis,
-    targets: list[Target],
-    state: State,
-    config: TrackConfig,
-    iterations: int,
-    free: tuple[str, ...] = (),
+    basis: Basis, targets: list[Target], state: State, steps: int, free: tuple[str, ...] = ()
 ) -> tuple[State, float]:
-    """Minimise robust residuals plus priors from a start.
+    """Minimise the targets' cost plus priors from a start.
 
-    Pictures of the surface tell what landmarks and outlines do not: that the detector errs on this
-    face, and how the surface leaves the model's shapes. `free` names the offset modes they tell of
-    (`offsets.OFF`, `offsets.ALONG`); with any of them the detector's bias is free too.
+    Args:
+        basis: the head model.
+        targets: one per expression.
+        state: the start.
+        steps: most Levenberg-Marquardt steps.
+        free: offset modes that the terms can determine (`basis.OFF`, `basis.ALONG`). With any of
+            them the detector's bias is free too: the surface then shows how landmarks err.
 
     Returns:
-        The fitted state and its cost (half the sum of squared, robustly weighted residuals).
+        The fitted state and its cost.
 
     Raises:
         StageError: the cost is not a finite number.
     """
-    points = [Points(basis, target.vertices) for target in targets]
-    weights = _shared_weights(basis, len(targets), config, free)
+    expressions = [_Expression.of(basis, target) for target in targets]
+    weights = _shared_weights(basis, len(targets), free)
     damping = 1e-3
-    cost = _cost(basis, targets, points, state, config, weights)
-    for _ in range(iterations):
+    least = _cost(basis, expressions, state, weights)
+    for _ in range(steps):
         system = [
-            _normal_equations(basis, *item, state, config)
-            for item in zip(targets, points, state.poses, strict=True)
+            _normal_equations(basis, *item, state)
+            for item in zip(expressions, state.poses, strict=True)
         ]
         improved = False
         for _ in range(6):
             trial = _step(basis, state, system, damping, weights)
-            trial_cost = _cost(basis, targets, points, trial, config, weights)
-            if trial_cost < cost:
+            trial_cost = _cost(basis, expressions, trial, weights)
+            if trial_cost < least:
                 improved = True
                 break
             damping = min(damping * 8.0, 1e8)
         if not improved:
             break
-        gain = (cost - trial_cost) / max(cost, 1e-12)
-        state, cost, damping = trial, trial_cost, max(damping * 0.25, 1e-7)
+        gain = (least - trial_cost) / max(least, 1e-12)
+        state, least, damping = trial, trial_cost, max(damping * 0.25, 1e-7)
         if gain < 1e-5:
             break
-    if not np.isfinite(cost):
+    if not np.isfinite(least):
         raise StageError("the fit diverged; check the calibration and the landmark overlays")
-    return state, cost
+    return state, least
 
 
-def landmark_sigma(observation: Observation, config: TrackConfig) -> np.ndarray:
-    """Standard deviations (views, 68) in pixels; infinite where a landmark is not used."""
-    sigma = np.empty((len(observation.views), 68))
-    for index, view in enumerate(observation.views):
-        height = np.ptp(view.points[17:], axis=0).max()
-        floor = config.landmark_floor_px * height / 128.0
-        sigma[index] = np.hypot(view.sigma, floor) * view.crowd**0.5
-    sigma[:, :17] /= config.contour_weight
-    return np.where(observation.inliers, sigma, np.inf)
+def landmark_term(basis: Basis, target: Target) -> PixelTerm:
+    """Make the term of a target's landmarks in all its views."""
+    sightings = []
+    for view, sigma in zip(target.observation.views, target.sigma, strict=True):
+        rows = np.flatnonzero(np.isfinite(sigma))
+        sightings.append(Sighting(view.camera, rows, view.points[rows], sigma[rows]))
+    return PixelTerm(landmark_anchors(basis.model), tuple(sightings))
 
 
 def consistent_sigma(target: Target, marks: np.ndarray) -> np.ndarray:
-    """The target's standard deviations with what the fit contradicts made infinite.
+    """Return the target's standard deviations with landmarks that contradict the fit left out.
 
-    A landmark is contradicted at REJECT_SIGMA standard deviations; a view half of whose landmarks
-    are is left out as a whole, unless no other is left. `marks` (68, 3) are the fitted landmarks.
+    A landmark contradicts at REJECT_SIGMA standard deviations; a view with more than half of its
+    landmarks contradicting is left out as a whole, unless no other remains. `marks` (68, 3) are the
+    fitted landmarks.
     """
     sigma = target.sigma.copy()
     for index, view in enumerate(target.observation.views):
@@ -106,158 +114,117 @@ def consistent_sigma(target: Target, marks: np.ndarray) -> np.ndarray:
     return sigma if np.isfinite(sigma).any() else target.sigma
 
 
-def _landmarks(basis: Basis, positions: np.ndarray, state: State, pose: Pose) -> np.ndarray:
-    """Where the detector would put the landmarks (68, 3): the head's, plus what it always errs."""
-    return positions[:68] + (basis.bias + state.bias) @ pose.rotation.T
+@dataclass(frozen=True)
+class _Expression:
+    """One expression's terms, the landmarks' first, on the vertices that they are about.
+
+    `anchors` are the terms' anchors with vertices counted among those of `points`.
+    """
+
+    terms: tuple[Term, ...]
+    anchors: tuple[Anchors, ...]
+    points: Points
+    neutral: bool
+    single_view: bool
+
+    @classmethod
+    def of(cls, basis: Basis, target: Target) -> _Expression:
+        terms = (landmark_term(basis, target), *target.terms)
+        ids = np.unique(np.concatenate([term.anchors.vertices.ravel() for term in terms]))
+        anchors = tuple(
+            Anchors(np.searchsorted(ids, term.anchors.vertices), term.anchors.weights)
+            for term in terms
+        )
+        single = len(target.observation.views) == 1
+        return cls(terms, anchors, Points(basis, ids), target.neutral, single)
+
+    def places(self, basis: Basis, positions: np.ndarray, state: State, pose: Pose) -> list:
+        """Return the terms' places (n, 3); the landmarks' are where the detector would put them."""
+        found = [anchors.at(positions) for anchors in self.anchors]
+        found[0] = found[0] + (basis.bias + state.bias) @ pose.rotation.T
+        return found
 
 
-def _landmark_blocks(
-    target: Target, marks: np.ndarray
-) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Blocks (point index (n,), residual (n, k), d residual / d position (n, k, 3)), one a view."""
-    blocks = []
-    for index, view in enumerate(target.observation.views):
-        used = np.flatnonzero(np.isfinite(target.sigma[index]))
-        pixels, slope = project_with_slope(view.camera, marks[used])
-        sigma = target.sigma[index, used]
-        residual = (pixels - view.points[used]) / sigma[:, None]
-        blocks.append((used, residual, slope / sigma[:, None, None]))
-    return blocks
+def _shared(state: State) -> np.ndarray:
+    """Concatenate what all expressions have in common: shape, then bias."""
+    return np.concatenate([state.shape, state.bias.ravel()])
 
 
-def _outline_blocks(
-    target: Target, positions: np.ndarray
-) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    return [outline.residuals(positions) for outline in target.outlines]
+def _shared_weights(basis: Basis, expressions: int, free: tuple[str, ...]) -> np.ndarray:
+    """Return inverse variances (S + BIAS,) of the shared unknowns.
+
+    Systematic errors of the detector or the patch search recur in every expression, so more
+    expressions are not more evidence of the shape.
+    """
+    shape = np.full(basis.shape_size, float(expressions))
+    held = [name.startswith(MODE) and not name.startswith(free) for name in basis.model.shape_names]
+    shape[held] = KNOWN_MODE
+    bias = np.full((68, 3), LANDMARK_BIAS_M if free else KNOWN_BIAS_M)
+    bias[:17] /= JAW_LINE_WEIGHT
+    return np.r_[shape, bias.ravel() ** -2]
 
 
-def _robust(residual: np.ndarray) -> np.ndarray:
-    """Square roots of Huber weights (n,) for residual vectors (n, k)."""
-    length = np.linalg.norm(residual, axis=1)
-    return np.sqrt(np.minimum(1.0, HUBER / np.maximum(length, 1e-9)))
-
-
-def _huber_cost(residual: np.ndarray) -> float:
-    length = np.linalg.norm(residual, axis=1)
-    inside = length <= HUBER
-    return float(np.where(inside, 0.5 * length**2, HUBER * (length - 0.5 * HUBER)).sum())
-
-
-def _cost(
-    basis: Basis,
-    targets: list[Target],
-    points: list[Points],
-    state: State,
-    config: TrackConfig,
-    weights: np.ndarray,
-) -> float:
-    """Total cost of a state; `weights` (S + BIAS,) are of the prior on shape and bias."""
+def _cost(basis: Basis, expressions: list[_Expression], state: State, weights: np.ndarray) -> float:
     shared = _shared(state) * np.sqrt(weights)
     total = 0.5 * float(shared @ shared)
-    for target, model, pose in zip(targets, points, state.poses, strict=True):
-        positions = model.evaluate(np.r_[state.shape, pose.own], pose.rotation)
-        blocks = _landmark_blocks(target, _landmarks(basis, positions, state, pose))
-        blocks += _outline_blocks(target, positions)
-        total += sum(_huber_cost(residual) for _, residual, _ in blocks)
-        total += sum(term.cost(positions) for term in target.terms)
-        residual, _ = prior(basis.model, pose.own, target.neutral, config)
+    for one, pose in zip(expressions, state.poses, strict=True):
+        positions = one.points.evaluate(np.r_[state.shape, pose.own], pose.rotation)
+        places = one.places(basis, positions, state, pose)
+        total += sum(cost(*pair) for pair in zip(one.terms, places, strict=True))
+        residual, _ = prior(basis.model, pose.own, one.neutral, one.single_view)
         total += 0.5 * float(residual @ residual)
     return total if np.isfinite(total) else np.inf
 
 
-def _shared(state: State) -> np.ndarray:
-    """Shape, then bias: what all expressions of a face have in common."""
-    return np.concatenate([state.shape, state.bias.ravel()])
-
-
-def _shared_weights(
-    basis: Basis, expressions: int, config: TrackConfig, free: tuple[str, ...]
-) -> np.ndarray:
-    """Inverse variances (S + BIAS,) of the shared unknowns.
-
-    What is read wrongly off a face is read wrongly in all expressions alike, be it by the detector
-    or by a search that highlights mislead: more of them are no more evidence of the shape.
-    """
-    shape = np.full(basis.shape_size, config.shape_prior * expressions)
-    known = [
-        name.startswith(MODE) and not name.startswith(free) for name in basis.model.shape_names
-    ]
-    shape[known] = KNOWN_MODE
-    bias = np.full((68, 3), config.landmark_bias if free else KNOWN_BIAS_M)
-    bias[:17] /= config.contour_weight
-    return np.r_[shape, bias.ravel() ** -2]
-
-
-def _information(
-    blocks: list[tuple[np.ndarray, np.ndarray, np.ndarray]], count: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """Robust Gauss-Newton matrices (count, 3, 3) and gradients (count, 3) by the points' positions.
-
-    However many views see a point, the head's parameters meet their sum only.
-    """
-    matrix, gradient = np.zeros((count, 3, 3)), np.zeros((count, 3))
-    for used, residual, slope in blocks:
-        weight = _robust(residual)[:, None]
-        slope, residual = slope * weight[..., None], residual * weight
-        # A block names no point twice.
-        matrix[used] += np.swapaxes(slope, 1, 2) @ slope
-        gradient[used] += np.einsum("nkc,nk->nc", slope, residual)
-    return matrix, gradient
-
-
 def _normal_equations(
-    basis: Basis, target: Target, model: Points, pose: Pose, state: State, config: TrackConfig
+    basis: Basis, one: _Expression, pose: Pose, state: State
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Hessian and gradient of one expression: shape (S), bias (BIAS), own (X + 18)."""
-    positions, jacobian = model.linearise(np.r_[state.shape, pose.own], pose.rotation)
-    shapes, size = basis.shape_size, jacobian.shape[2] + BIAS
+    """Return Hessian and gradient of one expression: shape (S), bias (BIAS), own (X + 18)."""
+    positions, jacobian = one.points.linearise(np.r_[state.shape, pose.own], pose.rotation)
+    places = one.places(basis, positions, state, pose)
+    found = [information(*pair) for pair in zip(one.terms, places, strict=True)]
+    W, pull = _over_vertices(one.anchors, found, len(positions))
+    flat = jacobian.reshape(3 * len(positions), -1)
+    shapes, size = basis.shape_size, flat.shape[1] + BIAS
     columns = np.r_[:shapes, shapes + BIAS : size]
     hessian, gradient = np.zeros((size, size)), np.zeros(size)
-    marks = _landmarks(basis, positions, state, pose)
-    matrix, pull = _information(_landmark_blocks(target, marks), 68)
-    rows = np.zeros((68, 3, size))
-    rows[..., columns] = jacobian[:68]
-    for mark in range(68):
-        rows[mark, :, shapes + 3 * mark : shapes + 3 * mark + 3] = pose.rotation
-    _add(hessian, gradient, rows, matrix, pull)
-    blocks = _outline_blocks(target, positions)
-    count = max((int(used.max()) + 1 for used, _, _ in blocks if len(used)), default=0)
-    terms = [(jacobian[:count], *_information(blocks, count))]
-    terms += [_of_samples(term, positions, jacobian) for term in target.terms]
-    base, slope = np.zeros((len(columns), len(columns))), np.zeros(len(columns))
-    for term in terms:
-        _add(base, slope, *term)
-    residual, moved = prior(basis.model, pose.own, target.neutral, config)
+    base, slope = flat.T @ (W @ flat), flat.T @ pull
+    residual, moved = prior(basis.model, pose.own, one.neutral, one.single_view)
     base[shapes:, shapes:] += moved.T @ moved
     slope[shapes:] += moved.T @ residual
-    hessian[np.ix_(columns, columns)] += base
-    gradient[columns] += slope
+    hessian[np.ix_(columns, columns)] = base
+    gradient[columns] = slope
+    # A landmark's bias b moves its place by R b.
+    matrix, towards = found[0][0] @ pose.rotation, found[0][1] @ pose.rotation
+    marks = np.einsum("nk,nkcd->ncd", one.anchors[0].weights, jacobian[one.anchors[0].vertices])
+    cross = np.einsum("ncd,nce->dne", marks, matrix).reshape(flat.shape[1], BIAS)
+    bias = np.arange(shapes, shapes + BIAS)
+    hessian[np.ix_(columns, bias)] = cross
+    hessian[np.ix_(bias, columns)] = cross.T
+    hessian[np.ix_(bias, bias)] = sparse.block_diag(list(pose.rotation.T @ matrix)).toarray()
+    gradient[bias] = towards.ravel()
     return hessian, gradient
 
 
-def _add(
-    hessian: np.ndarray,
-    gradient: np.ndarray,
-    rows: np.ndarray,
-    matrix: np.ndarray,
-    pull: np.ndarray,
-) -> None:
-    """Add points' information (n, 3, 3), (n, 3) through their Jacobian rows (n, 3, D), in place."""
-    size = rows.shape[2]
-    flat = rows.reshape(-1, size)
-    hessian += flat.T @ (matrix @ rows).reshape(-1, size)
-    gradient += pull.reshape(-1) @ flat
-
-
-def _of_samples(
-    term: SurfaceTerm, positions: np.ndarray, jacobian: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The samples' Jacobian (S, 3, D) and information (S, 3, 3), (S, 3)."""
-    moved = np.zeros((len(term.rows), *jacobian.shape[1:]))
-    for corner in range(3):
-        share = term.bary[:, corner, None, None]
-        moved += share * jacobian[term.rows[:, corner]]
-    return moved, *term.normal(positions)
+def _over_vertices(
+    anchors: tuple[Anchors, ...], found: list[tuple[np.ndarray, np.ndarray]], count: int
+) -> tuple[sparse.csr_matrix, np.ndarray]:
+    """Sum the terms over M vertices: information W (3 M, 3 M) and gradient (3 M,)."""
+    axes, gradient = np.arange(3), np.zeros((count, 3))
+    rows, columns, values = [], [], []
+    for places, (matrix, pull) in zip(anchors, found, strict=True):
+        ids, weights = places.vertices, places.weights
+        np.add.at(gradient, ids, weights[..., None] * pull[:, None])
+        block = weights[:, :, None, None, None] * weights[:, None, :, None, None]
+        value = block * matrix[:, None, None]
+        row = 3 * ids[:, :, None, None, None] + axes[:, None]
+        column = 3 * ids[:, None, :, None, None] + axes
+        rows.append(np.broadcast_to(row, value.shape).ravel())
+        columns.append(np.broadcast_to(column, value.shape).ravel())
+        values.append(value.ravel())
+    index = (np.concatenate(rows), np.concatenate(columns))
+    shape = (3 * count, 3 * count)
+    return sparse.csr_matrix((np.concatenate(values), index), shape=shape), gradient.ravel()
 
 
 def _step(
@@ -267,7 +234,7 @@ def _step(
     damping: float,
     weights: np.ndarray,
 ) -> State:
-    """One damped Gauss-Newton step, expressions eliminated."""
+    """Take one damped Gauss-Newton step, expressions eliminated."""
     shapes = basis.shape_size
     shared = shapes + BIAS
     reduced, right = np.diag(weights), -weights * _shared(state)

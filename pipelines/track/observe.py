@@ -1,19 +1,21 @@
-"""Landmarks of one expression in all cameras, and which of them agree with each other."""
+"""Landmarks of one frame set in all cameras, and consensus among the views."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from itertools import combinations
-from typing import Protocol
 
 import numpy as np
 
 from express50.geometry.cameras import Camera, triangulate
+from express50.geometry.pinhole import project_pinhole, project_with_slope
 from express50.landmarks.iris import Irises
 from express50.landmarks.sources import Marked
-from pipelines.track.pinhole import project_pinhole, project_with_slope
 
 PAIR_LIMIT = 120
+LANDMARK_FLOOR_PX = 1.0  # least error assumed of a landmark, for a face 128 px tall
+# Landmarks 0..16 slide along the jaw; in a single view the jaw's width depends on them alone.
+JAW_LINE_WEIGHT, SINGLE_VIEW_JAW_WEIGHT = 0.25, 0.7
 INLIER_SIGMA = 3.5
 # However vague a landmark, one that is further off than this many shares of the face disagrees.
 SIGMA_SHARE_LIMIT = 0.04
@@ -22,7 +24,7 @@ SAME_DIRECTION = np.radians(2.0)
 
 
 @dataclass(frozen=True)
-class View:
+class LandmarkView:
     """Landmarks seen by one camera.
 
     Attributes:
@@ -32,8 +34,8 @@ class View:
         sigma: (68,) pixels; infinite where a point is not known.
         score: of the face, 0 to 1.
         irises: iris centres, where they were looked for.
-        crowd: how many cameras, itself included, look at the face from the same direction: they err
-            alike, and count together as one.
+        redundancy: number of cameras, itself included, that look at the face from the same
+            direction. They err alike and count together as one.
         visible_contour: points 0..16 mark the visible edge of the jaw, as people's marks do, not
             fixed places of the skin.
     """
@@ -44,7 +46,7 @@ class View:
     sigma: np.ndarray
     score: float
     irises: Irises | None = None
-    crowd: float = 1.0
+    redundancy: float = 1.0
     visible_contour: bool = False
 
 
@@ -65,63 +67,33 @@ class Observation:
 
     expression: str
     frame: int
-    views: tuple[View, ...]
+    views: tuple[LandmarkView, ...]
     inliers: np.ndarray
     points: np.ndarray
     covariance: np.ndarray
-    refused: tuple[View, ...] = ()
+    refused: tuple[LandmarkView, ...] = ()
     shut: tuple[int, ...] = ()
 
 
-class Terms(Protocol):
-    """What a fit is pulled by beside its landmarks: outlines, marks, neighbouring frames."""
-
-    def residuals(self, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Block (index (n,), residual (n, k), slope (n, k, 3)) of all points' positions (P, 3)."""
-
-
-@dataclass(frozen=True)
-class Marks:
-    """Vertices that should be seen at given pixels of one view.
-
-    Attributes:
-        camera: pinhole.
-        index: (n,) positions among the fit's points.
-        pixels: (n, 2).
-        sigma: (n,) pixels.
-    """
-
-    camera: Camera
-    index: np.ndarray
-    pixels: np.ndarray
-    sigma: np.ndarray
-
-    def residuals(self, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Block (index (n,), residual (n, 2), slope (n, 2, 3)) of all points' positions (P, 3)."""
-        pixels, slope = project_with_slope(self.camera, positions[self.index])
-        residual = (pixels - self.pixels) / self.sigma[:, None]
-        return self.index, residual, slope / self.sigma[:, None, None]
-
-
-def make_view(camera: Camera, seen: Marked) -> View:
-    """A view of what a source of landmarks found in an undistorted image of a camera."""
+def make_view(camera: Camera, seen: Marked) -> LandmarkView:
+    """Make a view of what a source of landmarks found in an undistorted image of a camera."""
     face = seen.face
-    return View(
+    return LandmarkView(
         camera.id, camera, face.points, face.sigma, face.score, seen.irises,
         visible_contour=seen.visible_contour,
     )  # fmt: skip
 
 
 def agree(
-    expression: str, frame: int, views: list[View], min_share: float = 0.4
+    expression: str, frame: int, views: list[LandmarkView], min_share: float = 0.4
 ) -> tuple[Observation, list[str]]:
     """Triangulate robustly and leave out whole views that disagree with the rest.
 
     Returns:
         The observation and the ids of the cameras left out.
     """
-    refused: list[View] = []
-    views = with_crowds(views)
+    refused: list[LandmarkView] = []
+    views = with_redundancy(views)
     while True:
         points, inliers = robust_triangulate(views)
         known = np.stack([np.isfinite(view.sigma) for view in views])
@@ -137,19 +109,19 @@ def agree(
         views = views[:worst] + views[worst + 1 :]
 
 
-def with_crowds(views: list[View]) -> list[View]:
-    """The views with their `crowd`: cameras within about SAME_DIRECTION count as one."""
+def with_redundancy(views: list[LandmarkView]) -> list[LandmarkView]:
+    """Set the `redundancy` of views: cameras within about SAME_DIRECTION count as one."""
     if len(views) < 2:
         return views
     middle = [view.points[np.isfinite(view.sigma)].mean(0) for view in views]
     rays = np.stack([_rays(v, m[None])[0] for v, m in zip(views, middle, strict=True)])
     angle = np.arccos(np.clip(rays @ rays.T, -1.0, 1.0))
-    crowd = np.exp(-0.5 * (angle / SAME_DIRECTION) ** 2).sum(1)
-    return [replace(view, crowd=float(c)) for view, c in zip(views, crowd, strict=True)]
+    redundancy = np.exp(-0.5 * (angle / SAME_DIRECTION) ** 2).sum(1)
+    return [replace(view, redundancy=float(c)) for view, c in zip(views, redundancy, strict=True)]
 
 
-def robust_triangulate(views: list[View]) -> tuple[np.ndarray, np.ndarray]:
-    """Consensus over pairs of views, a landmark at a time.
+def robust_triangulate(views: list[LandmarkView]) -> tuple[np.ndarray, np.ndarray]:
+    """Triangulate each landmark by consensus over pairs of views.
 
     Every pair gives a candidate point; the one with the lowest truncated squared error over all
     views wins, its inliers are triangulated again, weighted by 1 / sigma^2.
@@ -163,21 +135,23 @@ def robust_triangulate(views: list[View]) -> tuple[np.ndarray, np.ndarray]:
         return np.full((68, 3), np.nan), np.ones((count, 68), dtype=bool)
     candidates = _pair_points(views)
     squared = _squared_errors(views, candidates)
-    crowd = np.array([view.crowd for view in views])
-    cost = (np.minimum(squared, INLIER_SIGMA**2) / crowd[:, None]).sum(1)
+    redundancy = np.array([view.redundancy for view in views])
+    cost = (np.minimum(squared, INLIER_SIGMA**2) / redundancy[:, None]).sum(1)
     best = np.argmin(cost, axis=0)
     columns = np.arange(68)
     inliers = squared[best, :, columns].T < INLIER_SIGMA**2
     pixels = np.stack([view.points for view in views])
-    weights = np.stack([1.0 / (view.crowd * view.sigma**2) for view in views])
+    weights = np.stack([1.0 / (view.redundancy * view.sigma**2) for view in views])
     points = triangulate([view.camera for view in views], pixels, weights * inliers)
     return points, inliers
 
 
-def point_covariance(views: list[View], points: np.ndarray, inliers: np.ndarray) -> np.ndarray:
-    """Covariance (68, 3, 3), square metres, of triangulated points.
+def point_covariance(
+    views: list[LandmarkView], points: np.ndarray, inliers: np.ndarray
+) -> np.ndarray:
+    """Return the covariance (68, 3, 3) of triangulated points, square metres.
 
-    The inverse of the normal equations at the points: each view adds J' J / (crowd sigma^2), J
+    The inverse of the normal equations at the points: each view adds J' J / (redundancy sigma^2), J
     (2, 3) being the slope of its pixel and sigma the standard deviation of a coordinate.
 
     Args:
@@ -190,7 +164,7 @@ def point_covariance(views: list[View], points: np.ndarray, inliers: np.ndarray)
     for view, used in zip(views, inliers, strict=True):
         chosen = np.flatnonzero(used & known & np.isfinite(view.sigma))
         _, slope = project_with_slope(view.camera, points[chosen])
-        weight = 1.0 / (view.crowd * view.sigma[chosen] ** 2)
+        weight = 1.0 / (view.redundancy * view.sigma[chosen] ** 2)
         normal[chosen] += weight[:, None, None] * np.swapaxes(slope, 1, 2) @ slope
     covariance = np.full((68, 3, 3), np.nan)
     solid = known & (np.linalg.cond(normal) < 1e12)
@@ -198,8 +172,20 @@ def point_covariance(views: list[View], points: np.ndarray, inliers: np.ndarray)
     return covariance
 
 
-def facing(view: View, rotation: np.ndarray, translation: np.ndarray) -> float:
-    """Cosine between the face's forward direction and the direction to a camera.
+def landmark_sigma(observation: Observation) -> np.ndarray:
+    """Return standard deviations (views, 68) in pixels, infinite where a landmark is not used."""
+    sigma = np.empty((len(observation.views), 68))
+    for index, view in enumerate(observation.views):
+        height = np.ptp(view.points[17:], axis=0).max()
+        floor = LANDMARK_FLOOR_PX * height / 128.0
+        sigma[index] = np.hypot(view.sigma, floor) * view.redundancy**0.5
+    single = len(observation.views) == 1
+    sigma[:, :17] /= SINGLE_VIEW_JAW_WEIGHT if single else JAW_LINE_WEIGHT
+    return np.where(observation.inliers, sigma, np.inf)
+
+
+def facing(view: LandmarkView, rotation: np.ndarray, translation: np.ndarray) -> float:
+    """Return the cosine between the face's forward direction and the direction to a camera.
 
     The head is at world = rotation @ head + translation; it looks along +z.
     """
@@ -207,9 +193,10 @@ def facing(view: View, rotation: np.ndarray, translation: np.ndarray) -> float:
     return float(rotation[:, 2] @ towards / max(float(np.linalg.norm(towards)), 1e-9))
 
 
-def _pair_points(views: list[View]) -> np.ndarray:
-    """Midpoints (pairs, 68, 3) of closest approach of the rays of pairs of views."""
-    origins, directions = zip(*(_landmark_rays(view) for view in views), strict=True)
+def _pair_points(views: list[LandmarkView]) -> np.ndarray:
+    """Return midpoints (pairs, 68, 3) of closest approach of the rays of pairs of views."""
+    origins = [view.camera.center for view in views]
+    directions = [_rays(view, view.points) for view in views]
     pairs = list(combinations(range(len(views)), 2))
     if len(pairs) > PAIR_LIMIT:
         # The surest views first: their pairs span the rig well enough.
@@ -229,21 +216,16 @@ def _pair_points(views: list[View]) -> np.ndarray:
     return midpoints
 
 
-def _landmark_rays(view: View) -> tuple[np.ndarray, np.ndarray]:
-    """Camera centre (3,) and unit directions (68, 3) of a pinhole view's landmarks."""
-    return view.camera.center, _rays(view, view.points)
-
-
-def _rays(view: View, pixels: np.ndarray) -> np.ndarray:
-    """Unit world directions (N, 3) of pixels (N, 2) of a pinhole view."""
+def _rays(view: LandmarkView, pixels: np.ndarray) -> np.ndarray:
+    """Return unit world directions (N, 3) of pixels (N, 2) of a pinhole view."""
     K, pose = view.camera.K, view.camera.cam_from_world
     x = (pixels - K[:2, 2]) / K[[0, 1], [0, 1]]
     directions = np.concatenate([x, np.ones((len(x), 1))], axis=1) @ pose[:3, :3]
     return directions / np.linalg.norm(directions, axis=1, keepdims=True)
 
 
-def _squared_errors(views: list[View], candidates: np.ndarray) -> np.ndarray:
-    """Squared reprojection errors over sigma (pairs, views, 68); infinite behind a camera."""
+def _squared_errors(views: list[LandmarkView], candidates: np.ndarray) -> np.ndarray:
+    """Return squared errors over sigma (pairs, views, 68); infinite behind a camera."""
     errors = np.empty((len(candidates), len(views), 68))
     for index, view in enumerate(views):
         pixels, depth = project_pinhole(view.camera, candidates)

@@ -1,11 +1,11 @@
-"""Every frame of a clip, with the shape of the peaks: windows that run apart, smoothed both ways.
+"""Track one window of a clip with the peaks' shape: frame by frame, then smoothed both ways.
 
-The shape is folded into the head model's rest, so the same fit as of the peaks serves. A window is
-first tracked frame by frame, each starting from its neighbour; then every frame is fitted again,
-pulled towards the mean of its two neighbours. A sweep takes every second frame, then the others, so
-that neither direction of time comes first (all at once, the two halves would only swap their
-errors). The first and the last frame, which have one neighbour, are treated alike. Windows overlap
-by more frames than sweeps reach, and what overlaps is dropped: where a window ends does not show.
+The shape is folded into the head model's rest, so the fit of the peaks serves here too. Each frame
+starts from its neighbour and is fitted to its landmarks, then to the surface that its pictures
+agree on. Sweeps then fit every frame again, pulled towards the mean of its two neighbours: every
+second frame first, then the others, so that neither direction of time comes first. The first and
+the last frame, which have one neighbour, are treated alike. Windows overlap by more frames than the
+sweeps reach, and the overlap is dropped, so window ends do not show.
 """
 
 from __future__ import annotations
@@ -16,56 +16,70 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from pipelines.track.config import TrackConfig
+from pipelines.track.basis import POSE_SIZE, Basis
+from pipelines.track.crops import FrameSetCrops
+from pipelines.track.eyes_and_jaw import EyeOffsets, lid_terms, with_irises_and_jaw
 from pipelines.track.fit import fit
-from pipelines.track.lids import lid_terms
-from pipelines.track.marks import Eyes, with_marks
 from pipelines.track.observe import Observation
-from pipelines.track.sparse_head import POSE_SIZE, Basis, Points
-from pipelines.track.start import initial_pose, posed_sigma
-from pipelines.track.state import Pose, State, Target, start_state
+from pipelines.track.photo_consistency import SkinSamples, patch_terms
+from pipelines.track.schedule import LANDMARK_STEPS, PATCH_REACH_M, ROUND_STEPS
+from pipelines.track.state import (
+    Pose,
+    State,
+    Target,
+    all_vertices,
+    initial_pose,
+    posed_sigma,
+    start_state,
+)
+from pipelines.track.terms import Anchors, PointTerm, landmark_anchors
 
-# Vertices beside the landmarks that neighbours are compared by, and how many of all count.
+WINDOW = 48  # frames tracked in one piece, and kept if the run is stopped
+SWEEPS = 2  # 1 leaves a third more jitter, 4 changes little
+SMOOTH_M = 0.001  # standard deviation of a point about the middle of the neighbouring frames'
+# Vertices beside the landmarks that neighbours are compared by, and the effective number of all.
 SPREAD_VERTICES, EFFECTIVE_POINTS = 40, 20
-# Frames further apart than so many strides know nothing of each other.
-MAX_GAP = 3
-Closer = Callable[[Basis, Target, Pose], tuple[Target, Pose]]
+MAX_GAP = 3  # strides beyond which frames do not constrain each other
+# Landmarks and the frame before leave a millimetre or two: half of what the peaks' search spans.
+REACH_SHARE, FIRST_TRUST = 0.5, 0.3
+
+Pictures = Callable[[int, np.ndarray], FrameSetCrops]
+"""Crops of a frame about its mesh (V, 3)."""
 
 
 @dataclass(frozen=True)
-class Window:
-    """A run of frames: all that are fitted, and which of them are kept."""
+class ClipTracker:
+    """What tracking a window needs beside its observations.
+
+    Attributes:
+        person: basis of one person, from `freeze_shape`.
+        stride: frames between tracked frames.
+        eyes: from `measure_eyes`.
+        skin: where the surface is searched for.
+        pictures: reads a frame's crops; None fits landmarks alone.
+        rounds: of searching for the surface per frame.
+        sweeps: of smoothing.
+    """
+
+    person: Basis
+    stride: int = 1
+    eyes: EyeOffsets | None = None
+    skin: SkinSamples | None = None
+    pictures: Pictures | None = None
+    rounds: int = 0
+    sweeps: int = SWEEPS
+
+
+@dataclass(frozen=True)
+class ClipWindow:
+    """A run of frames to fit, and the slice of them to keep."""
 
     frames: tuple[int, ...]
     kept: slice
 
 
-@dataclass(frozen=True)
-class Neighbours:
-    """Pulls points towards where the neighbouring frames have them.
-
-    Attributes:
-        index: (n,) positions among the fit's points.
-        middle: (n, 3) world.
-        sigma: metres.
-    """
-
-    index: np.ndarray
-    middle: np.ndarray
-    sigma: float
-
-    def residuals(self, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Block (index (n,), residual (n, 3), slope (n, 3, 3)) of all points' positions (P, 3)."""
-        residual = (positions[self.index] - self.middle) / self.sigma
-        slope = np.broadcast_to(np.eye(3) / self.sigma, (len(self.index), 3, 3))
-        return self.index, residual, slope
-
-
 def freeze_shape(basis: Basis, shape: np.ndarray, bias: np.ndarray) -> Basis:
-    """The basis of one person: shape (S,) is part of the rest, no shape coefficient is left.
-
-    `bias` (68, 3) is what the detector errs on this person.
-    """
+    """Fold a person's shape (S,) and detector bias (68, 3) into the basis; poses are left."""
     coefficients, size = torch.from_numpy(np.asarray(shape, dtype=np.float64)), basis.shape_size
     model = replace(
         basis.model,
@@ -83,103 +97,99 @@ def freeze_shape(basis: Basis, shape: np.ndarray, bias: np.ndarray) -> Basis:
     )
 
 
-def make_windows(frames: Sequence[int], config: TrackConfig) -> list[Window]:
-    """Windows over consecutive frames; every frame is kept by exactly one."""
-    overlap = 2 * config.sweeps + 2
+def make_windows(
+    frames: Sequence[int], size: int = WINDOW, sweeps: int = SWEEPS
+) -> list[ClipWindow]:
+    """Cut frames into overlapping windows; every frame is kept by exactly one."""
+    overlap = 2 * sweeps + 2
     windows = []
-    for first in range(0, len(frames), config.window):
-        last = min(first + config.window, len(frames))
+    for first in range(0, len(frames), size):
+        last = min(first + size, len(frames))
         low, high = max(0, first - overlap), min(len(frames), last + overlap)
-        windows.append(Window(tuple(frames[low:high]), slice(first - low, last - low)))
+        windows.append(ClipWindow(tuple(frames[low:high]), slice(first - low, last - low)))
     return windows
 
 
-def track_window(
-    basis: Basis,
-    observations: list[Observation],
-    config: TrackConfig,
-    eyes: Eyes | None = None,
-    closer: Closer | None = None,
-) -> list[Pose]:
-    """Poses of the frames of one window.
+def track_window(tracker: ClipTracker, observations: list[Observation]) -> list[Pose]:
+    """Find the poses of the frames of one window.
 
     Args:
-        basis: of one person, from `freeze_shape`.
+        tracker: person and settings.
         observations: F of them, in order of their frames.
-        config: of the fit.
-        eyes: what relates the subject's irises to the model's, from `measure_eyes`.
-        closer: holds a frame to more than its landmarks, as to its pictures.
 
     Raises:
         StageError: a frame cannot be fitted.
     """
-    template = _template(basis)
-    spread = _spread_vertices(basis)
+    person = tracker.person
+    anchors = landmark_anchors(person.model)
+    template = anchors.at(person.model.template.numpy())
     targets: list[Target] = []
     poses: list[Pose] = []
     for observation in observations:
-        start = start_state(basis, [initial_pose(observation, template)])
+        start = start_state(person, [initial_pose(observation, template)])
+        pose = start.poses[0]
+        # Views from behind are left out as at the peaks.
+        sigma = posed_sigma(observation, pose.rotation, pose.own[-3:])
+        terms = lid_terms(person.model, observation)
+        target = Target(observation, sigma, False, terms)
         if poses:
             own = poses[-1].own.copy()
-            own[-3:] = start.poses[0].own[-3:]
-            start = State(start.shape, (Pose(own, start.poses[0].rotation),))
-        target = _target(observation, start.poses[0], config, spread)
-        state, _ = fit(basis, [target], start, config, config.iterations)
-        marked = _marked(basis, target, state.poses[0], eyes)
-        state, _ = fit(basis, [marked], state, config, config.round_iterations)
-        found = state.poses[0]
-        if closer is not None:
-            marked, found = closer(basis, marked, found)
-        targets.append(marked)
+            own[-3:] = pose.own[-3:]
+            start = State(start.shape, (Pose(own, pose.rotation),))
+        state, _ = fit(person, [target], start, LANDMARK_STEPS)
+        mesh = all_vertices(person.model, state)[0]
+        rotation = state.poses[0].rotation
+        target = with_irises_and_jaw(person.model, target, mesh, rotation, tracker.eyes)
+        state, _ = fit(person, [target], state, ROUND_STEPS)
+        target, found = fit_to_pictures(tracker, target, state.poses[0])
+        targets.append(target)
         poses.append(found)
-    frames = [observation.frame for observation in observations]
-    for half in range(2 * config.sweeps):
-        poses = _sweep(basis, targets, poses, frames, config, half % 2)
+    for half in range(2 * tracker.sweeps):
+        poses = _sweep(tracker, targets, poses, half % 2)
     return poses
 
 
-def _target(
-    observation: Observation, pose: Pose, config: TrackConfig, spread: np.ndarray
-) -> Target:
-    """What a frame is fitted to; views from behind are left out as at the peaks."""
-    sigma = posed_sigma(observation, config, pose.rotation, pose.own[-3:])
-    return Target(observation, sigma, False, terms=lid_terms(observation), vertices=spread)
-
-
-def _marked(basis: Basis, target: Target, pose: Pose, eyes: Eyes | None) -> Target:
-    """The target with irises and jaw lines where the first fit shows them."""
-    everything = np.arange(len(basis.model.template))
-    mesh = Points(basis, everything).evaluate(pose.own, pose.rotation)[68:]
-    return with_marks(basis.model, target, mesh, pose.rotation, eyes)
+def fit_to_pictures(tracker: ClipTracker, target: Target, pose: Pose) -> tuple[Target, Pose]:
+    """Fit a frame to the surface its pictures agree on; returns the target with that surface."""
+    person, seen = tracker.person, target
+    if tracker.pictures is None or tracker.skin is None or not tracker.rounds:
+        return target, pose
+    state = State(np.zeros(0), (pose,))
+    pictures = tracker.pictures(target.observation.frame, all_vertices(person.model, state)[0])
+    if not pictures.crops:
+        return target, pose
+    for done in range(tracker.rounds):
+        mesh = all_vertices(person.model, state)[0]
+        reach = REACH_SHARE * PATCH_REACH_M * 0.6**done
+        trust = FIRST_TRUST ** (tracker.rounds - 1 - done)
+        found = patch_terms(person.model, tracker.skin, pictures, mesh, reach, trust)
+        seen = replace(target, terms=(*target.terms, *found))
+        state, _ = fit(person, [seen], state, ROUND_STEPS)
+    return seen, state.poses[0]
 
 
 def _sweep(
-    basis: Basis,
-    targets: list[Target],
-    poses: list[Pose],
-    frames: list[int],
-    config: TrackConfig,
-    parity: int,
+    tracker: ClipTracker, targets: list[Target], poses: list[Pose], parity: int
 ) -> list[Pose]:
-    """Every second frame once more, towards where its neighbours are."""
-    index = np.arange(68 + SPREAD_VERTICES)
-    crowd = (len(index) / EFFECTIVE_POINTS) ** 0.5
-    points = [
-        Points(basis, target.vertices).evaluate(pose.own, pose.rotation)[index]
-        for target, pose in zip(targets, poses, strict=True)
-    ]
+    """Fit every second frame once more, towards where its neighbours are."""
+    person, stride = tracker.person, tracker.stride
+    marks = landmark_anchors(person.model)
+    spread = Anchors.of_vertices(_spread_vertices(person))
+    redundancy = ((len(marks.vertices) + SPREAD_VERTICES) / EFFECTIVE_POINTS) ** 0.5
+    frames = [target.observation.frame for target in targets]
+    meshes = [all_vertices(person.model, State(np.zeros(0), (pose,)))[0] for pose in poses]
     swept = list(poses)
     for number, frame in enumerate(frames):
         # By the frame, not by its place: it is the same in every window that it is in.
-        if frame // config.stride % 2 != parity:
+        if frame // stride % 2 != parity:
             continue
-        middle, spread = _expected(points, frames, number, MAX_GAP * config.stride)
-        if middle is None:
+        expected, vagueness = _expected(meshes, frames, number, MAX_GAP * stride)
+        if expected is None:
             continue
-        pull = Neighbours(index, middle, 1e-3 * config.smooth_mm * crowd * spread)
-        pulled = replace(targets[number], outlines=(*targets[number].outlines, pull))
-        start = State(np.zeros(0), (poses[number],))
-        state, _ = fit(basis, [pulled], start, config, config.round_iterations)
+        sigma = SMOOTH_M * redundancy * vagueness
+        pull = tuple(PointTerm(one, one.at(expected), sigma) for one in (marks, spread))
+        target = replace(targets[number], terms=(*targets[number].terms, *pull))
+        state, _ = fit(person, [target], State(np.zeros(0), (poses[number],)), ROUND_STEPS)
         swept[number] = state.poses[0]
     return swept
 
@@ -187,10 +197,10 @@ def _sweep(
 def _expected(
     points: list[np.ndarray], frames: list[int], number: int, gap: int
 ) -> tuple[np.ndarray | None, float]:
-    """Where a frame's points (n, 3) lie by its neighbours, and how much vaguer than between two.
+    """Predict a frame's points (n, 3) from its neighbours; also how much vaguer than between two.
 
-    Between two neighbours it is the point in the line at the frame's time. A first or last frame
-    goes on as the two beside it do: held to its one neighbour it would lag behind any motion.
+    Between two neighbours the points are interpolated at the frame's time. A first or last frame
+    is extrapolated from the two beside it: held to its one neighbour it would lag behind a motion.
     """
     order = [(number - 1, number + 1), (number + 1, number + 2), (number - 1, number - 2)]
     for near, far in order:
@@ -205,14 +215,8 @@ def _expected(
     return None, 0.0
 
 
-def _template(basis: Basis) -> np.ndarray:
-    """Landmarks (68, 3) of the person at rest."""
-    corners = basis.model.template[basis.landmark_vertices]
-    return (corners * basis.model.landmark_bary[..., None]).sum(1).numpy()
-
-
 def _spread_vertices(basis: Basis) -> np.ndarray:
-    """Vertices (SPREAD_VERTICES,) all over the head, each the furthest from those before it."""
+    """Choose vertices all over the head, each the furthest from those before it."""
     places = basis.model.template.numpy()
     chosen = [0]
     nearest = np.linalg.norm(places - places[0], axis=1)
@@ -225,7 +229,7 @@ def _spread_vertices(basis: Basis) -> np.ndarray:
 def sequence_arrays(
     basis: Basis, frames: list[int], cues: list[str], poses: list[Pose]
 ) -> dict[str, np.ndarray]:
-    """Arrays of sequence.npz, with the meaning they have in track.npz."""
+    """Make the arrays of sequence.npz, with the meaning they have in track.npz."""
     own, count = np.stack([pose.own for pose in poses]), basis.expression_size
     return {
         "frames": np.array(frames, dtype=np.int64),
@@ -240,7 +244,7 @@ def sequence_arrays(
 
 
 def jitter_mm(vertices: np.ndarray) -> float:
-    """Mean length of the second difference in time of vertices (F, V, 3), millimetres."""
+    """Return the mean second difference in time of vertices (F, V, 3), millimetres."""
     if len(vertices) < 3:
         return 0.0
     return 1e3 * float(np.linalg.norm(np.diff(vertices, n=2, axis=0), axis=2).mean())

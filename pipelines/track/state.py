@@ -1,16 +1,38 @@
-"""What the fit solves for, and what it is fitted to."""
+"""The unknowns of tracking, their start from geometry alone, and their prior."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Protocol
 
+import cv2
 import numpy as np
 import torch
 
+from express50.errors import StageError
+from express50.geometry.transforms import rigid_fit, similarity_fit
 from express50.head.model import HeadModel, pose
-from pipelines.track.observe import Observation, Terms
-from pipelines.track.sparse_head import POSE_SIZE, Basis
+from pipelines.track.basis import POSE_SIZE, Basis
+from pipelines.track.observe import Observation, facing, landmark_sigma
+from pipelines.track.terms import Term
+
+# The initial pose. Jaw-line points slide; brows to mouth are what a rigid alignment may trust.
+INNER = np.arange(17, 68)
+MIN_TRIANGULATED = 12
+PERSON_M = 0.004  # standard deviation of one person's landmarks about the template's
+SCALE_LIMITS = (0.5, 2.0)
+MIN_FACING = 0.05  # cosine to the camera below which a view is one from behind
+
+# The prior. Few muscles act at a time (Bouaziz et al. 2013 penalise the sum of activations): small
+# activations count squared, larger ones by their size.
+EXPRESSION_MEAN = 0.2  # expected activation
+ACTIVE = 0.05
+NEUTRAL_SHARE = 0.2  # of both, in the neutral frame
+SPREAD = 4.5  # standard deviation of coefficients that are not activations, over EXPRESSION_MEAN
+# Radians. A single view cannot distinguish a bent neck from a shape: it stays nearer to rest.
+NECK_SIGMA, SINGLE_VIEW_NECK_SIGMA = 0.2, 0.03
+EYE_SIGMA, EYE_DIFFERENCE_SIGMA = 0.3, 0.03
+JAW_SIGMA, JAW_CLOSED_SIGMA = (0.3, 0.06, 0.04), 0.02
+BELOW_SIGMA, ABOVE_SIGMA = 0.04, 0.12  # of activations below 0 and above 1
 
 
 @dataclass(frozen=True)
@@ -27,11 +49,10 @@ class Pose:
 
 @dataclass(frozen=True)
 class State:
-    """Shape (S,), a pose an expression, and the detector's bias (68, 3) on this face, head space.
+    """Shape (S,), one pose per expression, and the detector's bias (68, 3), head space.
 
-    What a detector gets wrong on a face it gets wrong in every frame and much alike in every view:
-    more of them are no independent evidence. The bias says so; landmarks then tell how a face moves
-    rather than what it is.
+    A detector makes much the same error on a face in every frame and view, so more of them are not
+    independent evidence. With the bias, landmarks say how a face moves rather than what it is.
     """
 
     shape: np.ndarray
@@ -39,38 +60,25 @@ class State:
     bias: np.ndarray = field(default_factory=lambda: np.zeros((68, 3)))
 
 
-class SurfaceTerm(Protocol):
-    """What is known of S samples of the surface, each between three of the fit's points (P, 3)."""
-
-    @property
-    def rows(self) -> np.ndarray:
-        """The points (S, 3) that a sample lies between."""
-
-    @property
-    def bary(self) -> np.ndarray:
-        """Their shares (S, 3)."""
-
-    def cost(self, positions: np.ndarray) -> float:
-        """Half the sum of squared, robustly weighted residuals."""
-
-    def normal(self, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Matrices (S, 3, 3) and gradients (S, 3) of the cost by the samples' positions."""
-
-
 @dataclass(frozen=True)
 class Target:
-    """What one expression is fitted to."""
+    """The evidence that one expression is fitted to.
+
+    Attributes:
+        observation: landmarks in all cameras.
+        sigma: (views, 68) pixels, infinite where a landmark is not used.
+        neutral: the expression is the resting face.
+        terms: residuals beside the landmarks'.
+    """
 
     observation: Observation
     sigma: np.ndarray
     neutral: bool
-    outlines: tuple[Terms, ...] = ()
-    terms: tuple[SurfaceTerm, ...] = ()
-    vertices: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    terms: tuple[Term, ...] = ()
 
 
 def rounded(state: State, decimals: int) -> State:
-    """The state without its last digits, which may differ with another BLAS or machine."""
+    """Drop the last digits, which may differ with another BLAS or machine."""
     poses = tuple(
         Pose(pose.own.round(decimals), pose.rotation.round(decimals)) for pose in state.poses
     )
@@ -78,7 +86,7 @@ def rounded(state: State, decimals: int) -> State:
 
 
 def start_state(basis: Basis, poses: list[tuple[np.ndarray, np.ndarray]]) -> State:
-    """Zero coefficients at given rotations (3, 3) and translations (3,)."""
+    """Start from zero coefficients at given rotations (3, 3) and translations (3,)."""
     made = []
     for rotation, translation in poses:
         own = np.zeros(basis.expression_size + POSE_SIZE)
@@ -88,12 +96,12 @@ def start_state(basis: Basis, poses: list[tuple[np.ndarray, np.ndarray]]) -> Sta
 
 
 def rotations(state: State) -> np.ndarray:
-    """World from head (E, 3, 3)."""
+    """Stack the rotations (E, 3, 3), world from head."""
     return np.stack([item.rotation for item in state.poses])
 
 
 def all_vertices(model: HeadModel, state: State) -> np.ndarray:
-    """World vertices (E, V, 3) of every expression."""
+    """Pose the mesh of every expression: world vertices (E, V, 3)."""
     own = torch.from_numpy(np.stack([item.own for item in state.poses])).clone()
     count = model.expression_dirs.shape[2]
     shape = torch.from_numpy(state.shape).clone()[None].expand(len(own), -1)
@@ -102,5 +110,143 @@ def all_vertices(model: HeadModel, state: State) -> np.ndarray:
         head = pose(
             model, shape, own[:, :count], neck=angles[:, :3], jaw=angles[:, 3:6], eyes=angles[:, 6:]
         ).numpy()
-    rotation = np.stack([item.rotation for item in state.poses])
-    return np.einsum("eij,evj->evi", rotation, head) + own[:, None, -3:].numpy()
+    return np.einsum("eij,evj->evi", rotations(state), head) + own[:, None, -3:].numpy()
+
+
+class RigScaleError(StageError):
+    """The calibration's unit is not the metre: no expression can be tracked with it."""
+
+
+def posed_sigma(
+    observation: Observation, rotation: np.ndarray, translation: np.ndarray
+) -> np.ndarray:
+    """Return `landmark_sigma` without views from behind, where a detector can only guess."""
+    sigma = landmark_sigma(observation)
+    ahead = [facing(view, rotation, translation) for view in observation.views]
+    sigma[np.array(ahead) < MIN_FACING] = np.inf
+    return sigma
+
+
+def initial_pose(observation: Observation, template: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Find rotation (3, 3) and translation (3,) with world = R @ head + t.
+
+    Uses triangulated landmarks where enough exist (and checks that their size is a head's), else
+    perspective-n-point in the surest view.
+
+    Args:
+        observation: Views of one expression.
+        template: (68, 3) landmarks of the head model, metres.
+
+    Raises:
+        RigScaleError: the rig's unit is not the metre.
+        StageError: too few landmarks.
+    """
+    seen = INNER[np.isfinite(observation.points[INNER]).all(1)]
+    if len(seen) < MIN_TRIANGULATED:
+        return _from_one_view(observation, template)
+    scale = similarity_fit(template[seen], observation.points[seen])[0]
+    if not SCALE_LIMITS[0] < scale < SCALE_LIMITS[1]:
+        # Heads differ, units do not: name a power of ten if one is near.
+        power = 10.0 ** round(float(np.log10(scale)))
+        near = power != 1.0 and 1 / 1.5 < scale / power < 1.5
+        unit = f"{power:g}" if near else f"{scale:.3g}"
+        raise RigScaleError(
+            f"{observation.expression}: the rig seems {unit}x off: the head measures "
+            f"{scale:.3g} times a human head in the calibration's units; expected metres, divide "
+            f"the camera translations by {unit} and calibrate again"
+        )
+    spread = np.trace(observation.covariance[seen], axis1=1, axis2=2) / 3.0
+    # A point without a covariance is triangulated from all but one direction.
+    spread = np.where(np.isfinite(spread), spread, np.inf)
+    return rigid_fit(template[seen], observation.points[seen], 1.0 / (PERSON_M**2 + spread))
+
+
+def _from_one_view(observation: Observation, template: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Find the pose by the view with the smallest expected error."""
+    view = min(observation.views, key=lambda view: float(np.median(view.sigma)) / view.score)
+    best = np.argsort(view.sigma[INNER])[:36]
+    best = best[np.isfinite(view.sigma[INNER[best]])]
+    if len(best) < MIN_TRIANGULATED:
+        raise StageError(
+            f"{observation.expression}: {len(best)} points between brows and mouth are known in "
+            f"{view.camera_id}, expected {MIN_TRIANGULATED} or more"
+        )
+    points, pixels = template[INNER[best]], view.points[INNER[best]]
+    # EPnP needs no start; refined by Levenberg-Marquardt. OpenCV's K is given corner-origin pixels
+    # together with a corner-origin principal point, so no shift is due.
+    arguments = (np.ascontiguousarray(points), np.ascontiguousarray(pixels), view.camera.K, None)
+    found, turn, shift = cv2.solvePnP(*arguments, flags=cv2.SOLVEPNP_EPNP)
+    if not found:
+        raise StageError(
+            f"{observation.expression}: no pose explains the landmarks of {view.camera_id}; "
+            "look at its overlay, the face may be hidden"
+        )
+    turn, shift = cv2.solvePnPRefineLM(*arguments, turn, shift)
+    cam_from_head = np.eye(4)
+    cam_from_head[:3, :3], cam_from_head[:3, 3] = cv2.Rodrigues(turn)[0], shift[:, 0]
+    world = np.linalg.inv(view.camera.cam_from_world) @ cam_from_head
+    return world[:3, :3], world[:3, 3]
+
+
+def prior(
+    model: HeadModel, own: np.ndarray, neutral: bool, single_view: bool = False
+) -> tuple[np.ndarray, np.ndarray]:
+    """Evaluate the prior: residuals (r,) and their slope (r, X + 18) by one expression's unknowns.
+
+    Activations are sparse and kept between 0 and 1 by one-sided walls; other coefficients and joint
+    angles are Gaussian; a wall keeps the jaw from closing further; both eyes look alike. Turn and
+    translation of the head are free.
+    """
+    count = model.expression_dirs.shape[2]
+    share = NEUTRAL_SHARE if neutral else 1.0
+    size, mean = len(own), share * EXPRESSION_MEAN
+    if model.unit_expressions:
+        residual, slope = _few(own[:count], share * ACTIVE, mean)
+    else:
+        residual, slope = own[:count] / (SPREAD * mean), np.full(count, 1.0 / (SPREAD * mean))
+    sigmas = np.r_[
+        np.full(3, SINGLE_VIEW_NECK_SIGMA if single_view else NECK_SIGMA),
+        np.array(JAW_SIGMA) * [share, 1.0, 1.0],
+        np.full(6, EYE_SIGMA),
+    ]
+    residuals = [np.r_[residual, own[count : count + 12] / sigmas]]
+    rows = [np.eye(count + 12, size) * np.r_[slope, 1.0 / sigmas][:, None]]
+    eyes = count + 6
+    difference = np.zeros((3, size))
+    difference[:, eyes : eyes + 3] = np.eye(3) / EYE_DIFFERENCE_SIGMA
+    difference[:, eyes + 3 : eyes + 6] = -np.eye(3) / EYE_DIFFERENCE_SIGMA
+    rows.append(difference)
+    residuals.append(difference @ own)
+    walls = [_wall(own, size, np.array([count + 3]), 0.0, -JAW_CLOSED_SIGMA)]
+    if model.unit_expressions:
+        ids = np.arange(count)
+        walls += [_wall(own, size, ids, 0.0, -BELOW_SIGMA), _wall(own, size, ids, 1.0, ABOVE_SIGMA)]
+    for residual, slope in walls:
+        residuals.append(residual)
+        rows.append(slope)
+    return np.concatenate(residuals), np.concatenate(rows)
+
+
+def _few(activations: np.ndarray, active: float, mean: float) -> tuple[np.ndarray, np.ndarray]:
+    """Evaluate residuals (X,) whose halved squares are |activation| / mean, smooth at 0; slopes.
+
+    The cost is the pseudo-Huber of width `active`: that of an exponential distribution far from 0.
+    """
+    ratio = activations / active
+    root = np.sqrt(1.0 + ratio**2)
+    # sqrt(2 (root - 1)) without the difference of nearly equal numbers.
+    residual = ratio * np.sqrt(2.0 / (1.0 + root))
+    slope = np.sqrt((1.0 + root) / 2.0) / (root * active)
+    scale = np.sqrt(active / mean)
+    return scale * residual, scale * slope
+
+
+def _wall(
+    own: np.ndarray, size: int, ids: np.ndarray, limit: float, sigma: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Penalise unknowns beyond a limit; a negative sigma is a wall from below."""
+    beyond = np.maximum((own[ids] - limit) / sigma, 0.0)
+    active = np.flatnonzero(beyond > 0)
+    slope = np.zeros((len(active), size))
+    slope[np.arange(len(active)), ids[active]] = 1.0 / sigma
+    return beyond[active], slope

@@ -1,9 +1,10 @@
-"""Cameras whose landmarks stand off from where all others say, the same way in every expression.
+"""Find cameras whose landmarks are displaced in the same way in every expression.
 
-A detector errs differently from face to face; a camera that was bumped, or calibrated wrongly, is
-off by the same pixels, the same scale or the same turn every time. Such a camera is named, with
-what it is off by, so that its calibration gets mended: leaving its landmarks out quietly would only
-hide it.
+A detector errs differently from face to face; a camera that was moved or calibrated wrongly is off
+by the same pixels, scale or turn every time. Such a camera is named, with its error, so that its
+calibration can be corrected; leaving its landmarks out quietly would only hide it. `calibrate`
+checks cameras too, on features of its own frames; this check sees the frames that are tracked, and
+so a camera that was moved between calibration and take.
 """
 
 from __future__ import annotations
@@ -13,8 +14,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipelines.track.observe import View, facing
-from pipelines.track.pinhole import project_pinhole
+from express50.contract.stage import Note
+from express50.geometry.pinhole import project_pinhole
+from pipelines.track.observe import LandmarkView, facing
 from pipelines.track.state import Target
 
 LEAST_EXPRESSIONS, LEAST_CAMERAS = 3, 3
@@ -27,8 +29,8 @@ FACING = 0.2
 
 
 @dataclass(frozen=True)
-class _Sight:
-    """What a view sees against what is expected: offset (2,) px, face's size px, ln scale, roll."""
+class _Deviation:
+    """A view's landmarks against the fit's: offset (2,) px, face size px, ln scale, roll."""
 
     offset: np.ndarray
     size: float
@@ -39,59 +41,59 @@ class _Sight:
 def suspect_cameras(
     targets: list[Target], marks: np.ndarray, rotations: np.ndarray, middles: np.ndarray
 ) -> dict[str, dict[str, object]]:
-    """Cameras that seem wrongly calibrated, with how far off they are.
+    """Find cameras that seem wrongly calibrated, and their errors.
 
     Args:
-        targets: E expressions; views that were refused speak here too.
+        targets: E expressions; views that were refused count here too.
         marks: (E, 68, 3) fitted landmarks, world.
         rotations: (E, 3, 3) world from head.
         middles: (E, 3) middle of each head, world.
 
     Returns:
-        Camera to `offset_px` (mean offset x, y of what is seen from what is expected), `of_face`
-        (a share of the face's size), `scale` (of what is seen to what is expected), `roll_deg`
-        (clockwise in the picture) and `expressions` (how many tell).
+        Camera to `offset_px` (mean offset x, y from the expected place), `of_face` (that as a
+        share of the face's size), `scale` (seen over expected), `roll_deg` (clockwise in the
+        picture) and `expressions` (their number).
     """
-    seen: dict[str, list[_Sight]] = {}
+    seen: dict[str, list[_Deviation]] = {}
     for target, points, rotation, middle in zip(targets, marks, rotations, middles, strict=True):
         for view in (*target.observation.views, *target.observation.refused):
             if facing(view, rotation, middle) > FACING:
-                sight = _sight(view, points)
-                if sight is not None:
-                    seen.setdefault(view.camera_id, []).append(sight)
-    told = {name: rows for name, rows in seen.items() if len(rows) >= LEAST_EXPRESSIONS}
-    if len(told) < LEAST_CAMERAS:
+                one = _deviation(view, points)
+                if one is not None:
+                    seen.setdefault(view.camera_id, []).append(one)
+    enough = {name: rows for name, rows in seen.items() if len(rows) >= LEAST_EXPRESSIONS}
+    if len(enough) < LEAST_CAMERAS:
         return {}
     tables = {
-        "offset": {n: np.stack([s.offset / s.size for s in rows]) for n, rows in told.items()},
-        "scale": _from_middle({n: [s.scale for s in rows] for n, rows in told.items()}),
-        "roll": _from_middle({n: [s.roll for s in rows] for n, rows in told.items()}),
+        "offset": {n: np.stack([s.offset / s.size for s in rows]) for n, rows in enough.items()},
+        "scale": _from_middle({n: [s.scale for s in rows] for n, rows in enough.items()}),
+        "roll": _from_middle({n: [s.roll for s in rows] for n, rows in enough.items()}),
     }
     off = {name for kind, table in tables.items() for name in _off(table, LEAST[kind])}
-    return {name: _account(told[name]) for name in sorted(off)}
+    return {name: _account(enough[name]) for name in sorted(off)}
 
 
-def warnings(suspects: dict[str, dict[str, object]]) -> list[dict[str, str]]:
-    """Lines for people of what `suspect_cameras` found."""
+def camera_warnings(suspects: dict[str, dict[str, object]]) -> list[Note]:
+    """Write the result of `suspect_cameras` as warnings."""
     return [
-        {
-            "what": f"camera {name}",
-            "why": f"what it sees is off by {row['offset_px']} px ({row['of_face']:.0%} of the"
-            f" face), {row['scale']} times the size expected and turned by {row['roll_deg']}"
-            " degrees, in every expression; check its calibration",
-        }
+        Note(
+            f"camera {name}",
+            f"its landmarks are off by {row['offset_px']} px ({row['of_face']:.0%} of the face),"
+            f" {row['scale']} times the expected size and turned by {row['roll_deg']} degrees, in"
+            " every expression; check its calibration",
+        )
         for name, row in suspects.items()
     ]
 
 
 def _from_middle(table: dict[str, list[float]]) -> dict[str, np.ndarray]:
-    """Numbers (E, 1) by camera, less what all cameras have in common."""
+    """Subtract from the numbers (E, 1) per camera what all cameras have in common."""
     middle = float(np.median([np.mean(rows) for rows in table.values()]))
     return {name: np.array(rows)[:, None] - middle for name, rows in table.items()}
 
 
 def _off(table: dict[str, np.ndarray], least: float) -> list[str]:
-    """Cameras whose numbers (E, D) are large, larger than the others' and sure."""
+    """Find cameras whose numbers (E, D) are large, larger than the others' and significant."""
     lengths = {name: float(np.linalg.norm(rows.mean(0))) for name, rows in table.items()}
     found = []
     for name, rows in table.items():
@@ -102,7 +104,7 @@ def _off(table: dict[str, np.ndarray], least: float) -> list[str]:
     return found
 
 
-def _account(rows: list[_Sight]) -> dict[str, object]:
+def _account(rows: list[_Deviation]) -> dict[str, object]:
     mean = np.mean([row.offset for row in rows], axis=0)
     share = np.mean([row.offset / row.size for row in rows], axis=0)
     return {
@@ -114,8 +116,8 @@ def _account(rows: list[_Sight]) -> dict[str, object]:
     }
 
 
-def _sight(view: View, points: np.ndarray) -> _Sight | None:
-    """How points between brows and mouth lie against the fitted ones (68, 3); None if unseen."""
+def _deviation(view: LandmarkView, points: np.ndarray) -> _Deviation | None:
+    """Compare points between brows and mouth with the fitted ones (68, 3); None if unseen."""
     pixels, _ = project_pinhole(view.camera, points)
     inner = np.isfinite(view.sigma)
     inner[:17] = False
@@ -128,5 +130,5 @@ def _sight(view: View, points: np.ndarray) -> _Sight | None:
     )
     ratio = complex((seen * expected.conj()).sum() / max(float((abs(expected) ** 2).sum()), 1e-12))
     if abs(ratio) < 1e-6:  # all seen points coincide
-        return _Sight(offset, size, 0.0, 0.0)
-    return _Sight(offset, size, math.log(abs(ratio)), math.atan2(ratio.imag, ratio.real))
+        return _Deviation(offset, size, 0.0, 0.0)
+    return _Deviation(offset, size, math.log(abs(ratio)), math.atan2(ratio.imag, ratio.real))

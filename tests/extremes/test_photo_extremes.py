@@ -12,6 +12,7 @@ import torch
 
 from express50.errors import CaptureError
 from express50.geometry.cameras import Camera
+from express50.geometry.pinhole import project_pinhole
 from express50.head.load import load_head
 from express50.head.model import landmarks, pose
 from express50.head.preview import render_preview
@@ -20,17 +21,15 @@ from express50.landmarks.iris import find_irises
 from express50.landmarks.network import load_network
 from pipelines.photo.capture import find_faces
 from pipelines.photo.focal import single_camera, weigh_focal
+from pipelines.track.basis import Basis, Points, make_basis
 from pipelines.track.config import TrackConfig
-from pipelines.track.contour import contour_points
-from pipelines.track.fit import fit, landmark_sigma
-from pipelines.track.observe import View, agree
-from pipelines.track.pinhole import project_pinhole
-from pipelines.track.sparse_head import Basis, Points, make_basis
-from pipelines.track.start import initial_pose
-from pipelines.track.state import Target, start_state
+from pipelines.track.eyes_and_jaw import contour_points
+from pipelines.track.fit import fit
+from pipelines.track.observe import LandmarkView, agree, landmark_sigma
+from pipelines.track.state import Target, initial_pose, start_state
+from pipelines.track.terms import landmark_anchors
 
 data = pytest.importorskip("skimage.data")
-CONFIG = TrackConfig(iterations=8, expression_prior=0.25, neck_prior=0.03)
 
 
 @pytest.fixture(scope="module")
@@ -45,15 +44,17 @@ def seen() -> Detection:
 
 def fit_one(basis: Basis, face: Detection, camera: Camera) -> tuple[np.ndarray, float]:
     """World landmarks (68, 3) of a single-view fit, and their error between brows and mouth, px."""
-    view = View(camera.id, camera, face.points, face.sigma, face.score)
+    view = LandmarkView(camera.id, camera, face.points, face.sigma, face.score)
     observation, _ = agree("photo", 0, [view])
     template = landmarks(basis.model, basis.model.template[None])[0].numpy()
     start = start_state(basis, [initial_pose(observation, template)])
-    target = Target(observation, landmark_sigma(observation, CONFIG), False)
-    state, cost = fit(basis, [target], start, CONFIG, CONFIG.iterations)
+    target = Target(observation, landmark_sigma(observation), False)
+    state, cost = fit(basis, [target], start, 8)
     assert np.isfinite(cost)
     own = np.concatenate([state.shape, state.poses[0].own])
-    marks = Points(basis, np.zeros(0, np.int64)).evaluate(own, state.poses[0].rotation)
+    everything = Points(basis, np.arange(len(basis.model.template)))
+    mesh = everything.evaluate(own, state.poses[0].rotation)
+    marks = landmark_anchors(basis.model).at(mesh)
     pixels, _ = project_pinhole(camera, marks)
     return marks, float(np.sqrt(((pixels - face.points)[17:] ** 2).sum(1).mean()))
 
@@ -125,8 +126,7 @@ def test_sliver_pictures_have_no_face_and_no_irises(size: tuple[int, int]) -> No
 
 def test_a_face_hardly_tells_its_lens(basis, seen) -> None:
     """The range of focal lengths is wide, holds the guess, and a told one is kept."""
-    quick = replace(CONFIG, iterations=5)
-    found = weigh_focal(basis, [seen], (512, 512), (836.0, "guess"), quick)
+    found = weigh_focal(basis, [seen], (512, 512), (836.0, "guess"))
     assert found.source == "guess" and found.pixels == 836.0
     assert found.low < 600 < 1300 < found.high
 

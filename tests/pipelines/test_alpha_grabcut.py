@@ -120,7 +120,7 @@ def test_a_frame_without_a_face_costs_itself_alone(tmp_path: Path) -> None:
     """Of a video whose second half shows a wall, the first half is matted."""
     face, wall = data.astronaut()[:256, 100:356], np.repeat(data.brick()[:256, :256, None], 3, 2)
     write_video(tmp_path / "eva.mp4", [np.ascontiguousarray(i) for i in [face] * 4 + [wall] * 4])
-    config = TrackConfig(iterations=2)
+    config = TrackConfig()
     dataset = Dataset(tmp_path / "out")
     folder = dataset.root / "photos" / "eva"
     make_photo_capture(open_picture(tmp_path / "eva.mp4"), folder, "eva", config, windows=2)

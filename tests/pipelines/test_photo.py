@@ -100,7 +100,7 @@ def test_wrong_options_and_files_are_refused(tmp_path: Path) -> None:
 def test_a_second_picture_of_the_same_name_takes_nobodys_place(
     tmp_path: Path, astronaut: np.ndarray
 ) -> None:
-    config = TrackConfig(iterations=2)
+    config = TrackConfig()
     for folder, image in (("a", astronaut), ("b", astronaut[:, ::-1])):
         (tmp_path / folder).mkdir()
         write_image(tmp_path / folder / "eva.png", np.ascontiguousarray(image))
@@ -134,7 +134,7 @@ def test_photographs_of_kinds_that_no_rig_writes_are_read(
 ) -> None:
     path = tmp_path / f"eva.{suffix}"
     cv2.imwrite(str(path), astronaut[..., ::-1])
-    make_photo_capture(open_picture(path), tmp_path / "out", "eva", TrackConfig(iterations=2))
+    make_photo_capture(open_picture(path), tmp_path / "out", "eva", TrackConfig())
     stored = read_srgb8(tmp_path / "out/cameras/photo/frames/000000.png")
     assert np.abs(stored.astype(int) - astronaut).mean() < 4
 
@@ -180,7 +180,7 @@ def test_a_photograph_on_its_side_is_tracked_as_an_upright_one(
     upright = np.ascontiguousarray(astronaut[:360, 80:360])
     write_exif(tmp_path / "a.tif", np.rot90(upright, 1), 6, 50)
     picture = open_picture(tmp_path / "a.tif")
-    config = TrackConfig(iterations=3)
+    config = TrackConfig()
     focal = make_photo_capture(picture, tmp_path / "out", "a", config)
     camera = read_cameras(tmp_path / "out/calibration.json")["photo"]
     assert (camera.width, camera.height) == (280, 360)
@@ -211,7 +211,7 @@ def test_a_telephones_video_is_stored_upright(tmp_path: Path, astronaut: np.ndar
     write_video(tmp_path / "a.mp4", [np.ascontiguousarray(np.rot90(upright))] * 3, rate=30)
     turn_video(tmp_path / "a.mp4")
     picture = open_picture(tmp_path / "a.mp4")
-    make_photo_capture(picture, tmp_path / "out", "a", TrackConfig(iterations=2), windows=1)
+    make_photo_capture(picture, tmp_path / "out", "a", TrackConfig(), windows=1)
     camera = read_cameras(tmp_path / "out/calibration.json")["photo"]
     assert (camera.width, camera.height) == (280, 360)
     stored = [image for _, image in iterate_video(tmp_path / "out/cameras/photo/video.mp4")]

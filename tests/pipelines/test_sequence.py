@@ -14,15 +14,21 @@ from express50.errors import StageError
 from express50.geometry.cameras import project
 from express50.geometry.transforms import axis_angle_to_matrix
 from pipelines.track import clips
+from pipelines.track.basis import Points
 from pipelines.track.clips import track_clips, write_clips
-from pipelines.track.observe import Observation, View, agree
-from pipelines.track.sequence import _expected, freeze_shape, jitter_mm, make_windows, track_window
-from pipelines.track.sparse_head import Points
-from pipelines.track.state import Pose, State
-from tests.pipelines.test_track import CONFIG, RIG, make_scene
+from pipelines.track.observe import LandmarkView, Observation, agree
+from pipelines.track.sequence import (
+    ClipTracker,
+    _expected,
+    freeze_shape,
+    jitter_mm,
+    make_windows,
+    track_window,
+)
+from pipelines.track.state import Pose
+from pipelines.track.terms import landmark_anchors
+from tests.pipelines.test_track import RIG, make_scene
 
-SETTINGS = dataclasses.replace(CONFIG, iterations=6, round_iterations=2)
-QUICK = dataclasses.replace(SETTINGS, window=4, sweeps=0, iterations=2, round_iterations=1)
 FRAMES = 10
 
 
@@ -39,22 +45,23 @@ def true_poses(scene, frames: int = FRAMES) -> list[Pose]:
 
 
 def observations(scene, noise: float, cameras=RIG, order: int = 1) -> list[Observation]:
-    points = Points(scene.basis, np.arange(3))
+    points = Points(scene.basis, np.arange(90))
     rng = np.random.default_rng(5)
     found = []
     for frame, pose in enumerate(true_poses(scene)):
-        marks = points.evaluate(np.concatenate([scene.shape, pose.own]), pose.rotation)[:68]
+        mesh = points.evaluate(np.concatenate([scene.shape, pose.own]), pose.rotation)
+        marks = landmark_anchors(scene.basis.model).at(mesh)
         views = []
         for camera in cameras:
             pixels = project(camera, marks)[0] + noise * rng.normal(size=(68, 2))
-            views.append(View(camera.id, camera, pixels, np.ones(68), 0.9))
+            views.append(LandmarkView(camera.id, camera, pixels, np.ones(68), 0.9))
         found.append(agree("clip", frame, views)[0])
     return found if order > 0 else found[::-1]
 
 
 def meshes(person, poses: list[Pose]) -> np.ndarray:
     points = Points(person, np.arange(len(person.model.template)))
-    return np.stack([points.evaluate(pose.own, pose.rotation)[68:] for pose in poses])
+    return np.stack([points.evaluate(pose.own, pose.rotation) for pose in poses])
 
 
 def test_a_frozen_shape_is_the_same_head() -> None:
@@ -62,15 +69,14 @@ def test_a_frozen_shape_is_the_same_head() -> None:
     person = freeze_shape(scene.basis, scene.shape, np.zeros((68, 3)))
     assert person.shape_size == 0 and person.expression_size == scene.basis.expression_size
     np.testing.assert_allclose(
-        Points(person, np.arange(90)).evaluate(scene.own, scene.rotation)[68:],
+        Points(person, np.arange(90)).evaluate(scene.own, scene.rotation),
         scene.vertices, atol=1e-12,
     )  # fmt: skip
 
 
 @pytest.mark.parametrize(("count", "window", "sweeps"), [(1, 48, 2), (13, 4, 0), (50, 7, 3)])
 def test_every_frame_is_kept_by_one_window(count: int, window: int, sweeps: int) -> None:
-    config = dataclasses.replace(CONFIG, window=window, sweeps=sweeps)
-    windows = make_windows(range(100, 100 + count), config)
+    windows = make_windows(range(100, 100 + count), window, sweeps)
     kept = [frame for one in windows for frame in one.frames[one.kept]]
     assert kept == list(range(100, 100 + count))
     for before, after in zip(windows, windows[1:], strict=False):
@@ -85,8 +91,7 @@ def test_smoothing_takes_noise_and_leaves_motion() -> None:
     truth = meshes(person, true_poses(scene))
     results = {}
     for sweeps in (0, 2):
-        config = dataclasses.replace(SETTINGS, sweeps=sweeps)
-        results[sweeps] = meshes(person, track_window(person, seen, config))
+        results[sweeps] = meshes(person, track_window(ClipTracker(person, sweeps=sweeps), seen))
     assert jitter_mm(results[2]) < 0.4 * jitter_mm(results[0])
     error = {n: np.linalg.norm(mesh - truth, axis=2).mean() for n, mesh in results.items()}
     assert error[2] < error[0]
@@ -100,10 +105,10 @@ def test_sweeps_know_no_direction_of_time() -> None:
     scene = make_scene()
     person = freeze_shape(scene.basis, scene.shape, np.zeros((68, 3)))
     seen = observations(scene, 1.0)[:7]
-    config = dataclasses.replace(SETTINGS, iterations=25, round_iterations=6)
-    ahead = track_window(person, seen, config)
+    tracker = ClipTracker(person)
+    ahead = track_window(tracker, seen)
     mirrored = [dataclasses.replace(one, frame=100 - one.frame) for one in reversed(seen)]
-    back = track_window(person, mirrored, config)[::-1]
+    back = track_window(tracker, mirrored)[::-1]
     np.testing.assert_allclose(meshes(person, ahead), meshes(person, back), atol=3e-4)
 
 
@@ -127,36 +132,38 @@ def run(scene, keep: Path, watched: list[int], fail_at: int | None = None, hide:
         watched.append(frame)
         return None if frame == hide else seen[frame]
 
-    return track_clips(scene.basis, State(scene.shape, ()), CUES, observe, QUICK, keep, "inputs")
+    return track_clips(quick(scene), CUES, observe, keep, "inputs")
+
+
+def quick(scene) -> ClipTracker:
+    person = freeze_shape(scene.basis, scene.shape, np.zeros((68, 3)))
+    return ClipTracker(person, sweeps=0)
 
 
 def test_a_stopped_run_goes_on_to_the_same_result(tmp_path: Path) -> None:
     scene = make_scene()
-    whole, account = run(scene, tmp_path / "a", [])
+    whole, account, dropped = run(scene, tmp_path / "a", [])
     assert whole["frames"].tolist() == list(range(FRAMES))
     assert whole["cues"].tolist() == ["smile"] * 5 + ["frown"] * 5
-    assert str(whole["schema"]) == SEQUENCE_SCHEMA and account["dropped"] == []
+    assert str(whole["schema"]) == SEQUENCE_SCHEMA and dropped == []
     assert set(account["jitter_mm"]) == {"smile", "frown"}
     watched: list[int] = []
     with pytest.raises(KeyboardInterrupt):
         run(scene, tmp_path / "b", watched, fail_at=8)
     assert 0 in watched
     watched.clear()
-    resumed, _ = run(scene, tmp_path / "b", watched)
+    resumed, *_ = run(scene, tmp_path / "b", watched)
     assert min(watched) == 5, "the first cue is not looked at again"
     for name in whole:
         np.testing.assert_array_equal(whole[name], resumed[name])
 
 
 def test_frames_without_a_face_are_left_out_and_said(tmp_path: Path) -> None:
-    arrays, account = run(make_scene(), tmp_path, [], hide=3)
+    arrays, _, dropped = run(make_scene(), tmp_path, [], hide=3)
     assert 3 not in arrays["frames"] and len(arrays["frames"]) == FRAMES - 1
-    assert "1 of 5 frames" in account["dropped"][0]["why"]
+    assert "1 of 5 frames" in dropped[0].why
     with pytest.raises(StageError, match="no frame of any clip"):
-        scene = make_scene()
-        track_clips(
-            scene.basis, State(scene.shape, ()), CUES, lambda c, f: None, QUICK, tmp_path / "n", ""
-        )
+        track_clips(quick(make_scene()), CUES, lambda c, f: None, tmp_path / "n", "")
 
 
 def test_kept_windows_go_when_the_sequence_is_written(
@@ -164,22 +171,14 @@ def test_kept_windows_go_when_the_sequence_is_written(
 ) -> None:
     scene, keep = make_scene(), tmp_path / ".windows" / "S001"
     seen = observations(scene, 0.5)
-    (tmp_path / "index.json").write_text("{}")
-    arguments = (
-        tmp_path,
-        scene.basis,
-        State(scene.shape, ()),
-        CUES,
-        lambda c, f: seen[f],
-        QUICK,
-        keep,
-    )
     kept = []
     savez = clips.np.savez
     monkeypatch.setattr(
         clips.np, "savez", lambda *a, **k: (kept.append(keep.is_dir()), savez(*a, **k))
     )
-    write_clips(*arguments, {"index": tmp_path / "index.json", "words": "1"}, None)
+    write_clips(
+        tmp_path, quick(scene), "tiny", scene.shape, CUES, lambda c, f: seen[f], keep, "inputs"
+    )
     assert kept[-1] and not keep.exists()
     with np.load(tmp_path / "sequence.npz", allow_pickle=False) as data:
         assert data["R"].shape == (FRAMES, 3, 3) and data["shape"].shape == (5,)

@@ -14,23 +14,20 @@ from hypothesis import strategies as st
 from express50.contract.config import build_config
 from express50.errors import CaptureError, ConfigError, StageError
 from express50.geometry.cameras import Camera, project
+from express50.geometry.pinhole import project_with_slope
 from express50.geometry.transforms import axis_angle_to_matrix, look_at
 from express50.head.model import landmarks, pose
 from express50.landmarks.detector import Detection
 from express50.landmarks.iris import Irises
 from express50.landmarks.sources import Marked
+from pipelines.track.basis import Basis, Points, make_basis
 from pipelines.track.config import TrackConfig
-from pipelines.track.fit import consistent_sigma, fit, landmark_sigma
-from pipelines.track.observe import View, agree, robust_triangulate
-from pipelines.track.pinhole import project_with_slope
-from pipelines.track.priors import prior
-from pipelines.track.sparse_head import Basis, Points, make_basis
-from pipelines.track.start import initial_pose
-from pipelines.track.state import State, Target, start_state
+from pipelines.track.fit import consistent_sigma, fit
+from pipelines.track.observe import LandmarkView, agree, landmark_sigma, robust_triangulate
+from pipelines.track.state import EXPRESSION_MEAN, State, Target, initial_pose, prior, start_state
+from pipelines.track.terms import landmark_anchors
 from tests.express50.head.tiny_head import tiny_head
 from tests.synth import write_peak_frames
-
-CONFIG = TrackConfig()
 
 
 def make_camera(angle: float, size: int = 400, name: str = "") -> Camera:
@@ -66,14 +63,19 @@ def make_scene(seed: int = 0, expression: float = 0.6) -> Scene:
     own[-3:] = rng.normal(size=3) * 0.03
     rotation = axis_angle_to_matrix(rng.normal(size=3) * 0.2)
     points = Points(basis, np.arange(90))
-    everything = points.evaluate(np.concatenate([shape, own]), rotation)
-    return Scene(basis, shape, own, rotation, everything[68:], everything[:68])
+    vertices = points.evaluate(np.concatenate([shape, own]), rotation)
+    marks = landmark_anchors(model).at(vertices)
+    return Scene(basis, shape, own, rotation, vertices, marks)
 
 
-def make_views(marks: np.ndarray, noise: float = 0.0, cameras: list[Camera] = RIG) -> list[View]:
+def make_views(
+    marks: np.ndarray, noise: float = 0.0, cameras: list[Camera] = RIG
+) -> list[LandmarkView]:
     rng = np.random.default_rng(7)
     return [
-        View(c.id, c, project(c, marks)[0] + noise * rng.normal(size=(68, 2)), np.ones(68), 0.9)
+        LandmarkView(
+            c.id, c, project(c, marks)[0] + noise * rng.normal(size=(68, 2)), np.ones(68), 0.9
+        )
         for c in cameras
     ]
 
@@ -121,8 +123,8 @@ def test_projection_slope_matches_finite_differences() -> None:
 def test_prior_slope_matches_finite_differences(seed: int, unit: bool, neutral: bool) -> None:
     model = dataclasses.replace(tiny_head(vertices=20), unit_expressions=unit)
     own = np.random.default_rng(seed).normal(size=22)
-    cost = lambda x: 0.5 * float((prior(model, x, neutral, CONFIG)[0] ** 2).sum())  # noqa: E731
-    residual, slope = prior(model, own, neutral, CONFIG)
+    cost = lambda x: 0.5 * float((prior(model, x, neutral)[0] ** 2).sum())  # noqa: E731
+    residual, slope = prior(model, own, neutral)
     gradient = slope.T @ residual
     for column in range(22):
         step = np.eye(22)[column] * 1e-6
@@ -138,11 +140,11 @@ def test_one_strong_activation_costs_no_more_than_several_weak_ones() -> None:
     def cost(*activations: float) -> float:
         own = np.zeros(22)
         own[: len(activations)] = activations
-        residual, _ = prior(model, own, False, CONFIG)
+        residual, _ = prior(model, own, False)
         return 0.5 * float(residual @ residual)
 
     assert cost(0.8) < 1.3 * cost(0.2, 0.2, 0.2, 0.2), "of squares it would be four times as much"
-    assert cost(0.8) - cost(0.4) == pytest.approx(0.4 / CONFIG.expression_prior, rel=0.05)
+    assert cost(0.8) - cost(0.4) == pytest.approx(0.4 / EXPRESSION_MEAN, rel=0.05)
     assert cost(1e-9) == pytest.approx(0.0, abs=1e-9)
 
 
@@ -185,24 +187,23 @@ def test_a_rig_in_another_unit_is_named(scale: float) -> None:
         initial_pose(observation, template)
 
 
-def targets_of(scene: Scene, views: list[View]) -> tuple[list[Target], list]:
+def targets_of(scene: Scene, views: list[LandmarkView]) -> tuple[list[Target], list]:
     observation, _ = agree("smile", 0, views)
     model = scene.basis.model
     start = initial_pose(observation, landmarks(model, model.template[None])[0].numpy())
-    return [Target(observation, landmark_sigma(observation, CONFIG), False)], [start]
+    return [Target(observation, landmark_sigma(observation), False)], [start]
 
 
 def test_exact_landmarks_give_the_mesh_back() -> None:
     """Weak priors, exact data: the fitted mesh is the true one, vertices without landmarks too."""
     scene = make_scene()
-    config = dataclasses.replace(CONFIG, shape_prior=1e-3, landmark_floor_px=0.01)
     observation, _ = agree("smile", 0, make_views(scene.marks))
     views = tuple(dataclasses.replace(view, sigma=np.full(68, 0.02)) for view in observation.views)
     observation = dataclasses.replace(observation, views=views)
     template = landmarks(scene.basis.model, scene.basis.model.template[None])[0].numpy()
-    targets = [Target(observation, landmark_sigma(observation, config), False)]
+    targets = [Target(observation, np.full((3, 68), 0.005), False)]
     start = start_state(scene.basis, [initial_pose(observation, template)])
-    state, _ = fit(scene.basis, targets, start, config, 60)
+    state, _ = fit(scene.basis, targets, start, 60)
     got = fitted_vertices(scene.basis, state)
     assert np.sqrt(((got - scene.vertices) ** 2).sum(1).mean()) < 2e-4
 
@@ -210,7 +211,7 @@ def test_exact_landmarks_give_the_mesh_back() -> None:
 def fitted_vertices(basis: Basis, state: State) -> np.ndarray:
     points = Points(basis, np.arange(len(basis.model.template)))
     pose_ = state.poses[0]
-    return points.evaluate(np.concatenate([state.shape, pose_.own]), pose_.rotation)[68:]
+    return points.evaluate(np.concatenate([state.shape, pose_.own]), pose_.rotation)
 
 
 def test_fit_never_raises_its_own_cost_and_shares_one_shape() -> None:
@@ -218,7 +219,7 @@ def test_fit_never_raises_its_own_cost_and_shares_one_shape() -> None:
     pairs = [targets_of(scene, make_views(scene.marks, 1.0)) for scene in scenes]
     targets = [pair[0][0] for pair in pairs]
     state = start_state(scenes[0].basis, [pair[1][0] for pair in pairs])
-    costs = [fit(scenes[0].basis, targets, state, CONFIG, n)[1] for n in (0, 1, 2, 4, 8, 16)]
+    costs = [fit(scenes[0].basis, targets, state, n)[1] for n in (0, 1, 2, 4, 8, 16)]
     assert all(later <= earlier + 1e-9 for earlier, later in zip(costs, costs[1:], strict=False))
     assert costs[-1] < 0.5 * costs[0]
 
@@ -228,7 +229,7 @@ def test_few_cameras_stay_stable(count: int) -> None:
     """One camera cannot see depth: the prior keeps coefficients sane and the mesh near."""
     scene = make_scene()
     targets, poses = targets_of(scene, make_views(scene.marks, 0.5, RIG[1 : 1 + count] or RIG[:1]))
-    state, _ = fit(scene.basis, targets, start_state(scene.basis, poses), CONFIG, 20)
+    state, _ = fit(scene.basis, targets, start_state(scene.basis, poses), 20)
     assert np.abs(state.shape).max() < 4.0
     assert -0.2 < state.poses[0].own[:4].min() <= state.poses[0].own[:4].max() < 1.4
     pixels = project(RIG[1], fitted_vertices(scene.basis, state))[0]
@@ -239,7 +240,7 @@ def test_few_cameras_stay_stable(count: int) -> None:
 def test_fitted_rotations_stay_rotations() -> None:
     scene = make_scene()
     targets, poses = targets_of(scene, make_views(scene.marks, 2.0))
-    state, _ = fit(scene.basis, targets, start_state(scene.basis, poses), CONFIG, 15)
+    state, _ = fit(scene.basis, targets, start_state(scene.basis, poses), 15)
     R = state.poses[0].rotation
     np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-9)
     assert np.linalg.det(R) > 0
@@ -260,8 +261,9 @@ def test_presets_are_valid_and_bad_values_are_refused() -> None:
 
     for values in STAGE.presets.values():
         build_config(STAGE, values)
-    with pytest.raises(ConfigError, match="iterations"):
-        TrackConfig(iterations=0)
+    for name, value in (("stride", 0), ("search", 2.0), ("patch_rounds", -1), ("samples", 5)):
+        with pytest.raises(ConfigError, match=f"track: {name} is"):
+            TrackConfig(**{name: value})
 
 
 def no_irises() -> Irises:
@@ -277,7 +279,7 @@ def tracked_dataset(tmp_path: Path, ingested, monkeypatch: pytest.MonkeyPatch):
     from express50.capture.index import read_index
     from express50.runner.runner import run_stage
     from pipelines import calibrate
-    from pipelines.track import footage, stage
+    from pipelines.track import read_inputs, stage
 
     run_stage(calibrate.STAGE, ingested, build_config(calibrate.STAGE, {}), progress=False)
     index = read_index(ingested, "S001")
@@ -303,7 +305,7 @@ def tracked_dataset(tmp_path: Path, ingested, monkeypatch: pytest.MonkeyPatch):
         face = Detection(points, np.ones(68), np.full(68, 0.9), 0.95)
         return Marked(face, no_irises(), visible_contour=False)
 
-    monkeypatch.setattr(footage, "open_source", lambda *unused: told)
+    monkeypatch.setattr(read_inputs, "open_source", lambda *unused: told)
     monkeypatch.setattr(stage, "_basis", lambda *unused: scene.basis)
     return ingested, scene
 
@@ -312,12 +314,12 @@ def test_stage_writes_the_contracted_file(tracked_dataset, tmp_path: Path) -> No
     from pipelines.track import STAGE
 
     dataset, scene = tracked_dataset
-    quick = TrackConfig(silhouette_rounds=0, relief_rounds=1, photo_rounds=1, texture_side=64)
+    quick = TrackConfig(outline_rounds=0, patch_rounds=1, texture_side=64)
     outputs = []
     for attempt in range(2):
         out = tmp_path / f"out{attempt}"
         out.mkdir()
-        metrics = STAGE.run(dataset, "S001", quick, out)
+        metrics = STAGE.run(dataset, "S001", quick, out).metrics
         outputs.append({file.name: file.read_bytes() for file in sorted(out.rglob("*.*"))})
     assert outputs[0] == outputs[1]
     assert set(outputs[0]) == {
@@ -325,6 +327,7 @@ def test_stage_writes_the_contracted_file(tracked_dataset, tmp_path: Path) -> No
         "albedo.png", "appearance.npz",
     }  # fmt: skip
     assert set(metrics["landmark_rms_px"]) == {"neutral", "smile"}
+    assert [row["patch_reach_m"] for row in metrics["schedule"]] == [0.008, 0.0048]
     with np.load(tmp_path / "out0" / "track.npz", allow_pickle=False) as track:
         shapes = {name: track[name].shape for name in track.files}
         assert str(track["schema"]) == "express50.track/2"
@@ -347,12 +350,12 @@ def test_stage_writes_the_contracted_file(tracked_dataset, tmp_path: Path) -> No
 def test_no_face_anywhere_is_a_clear_error(
     tracked_dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from pipelines.track import STAGE, footage
+    from pipelines.track import STAGE, read_inputs
 
     dataset, _ = tracked_dataset
     nothing = Detection(np.zeros((68, 2)), np.ones(68), np.zeros(68), 0.0)
     blind = Marked(nothing, no_irises(), visible_contour=False)
-    monkeypatch.setattr(footage, "open_source", lambda *unused: lambda *image: blind)
+    monkeypatch.setattr(read_inputs, "open_source", lambda *unused: lambda *image: blind)
     with pytest.raises(StageError, match="S001: no expression could be tracked"):
         STAGE.run(dataset, "S001", TrackConfig(), tmp_path)
 
@@ -360,12 +363,12 @@ def test_no_face_anywhere_is_a_clear_error(
 def test_footage_that_is_gone_is_told_from_faces_that_are_not_there(
     tracked_dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from pipelines.track import STAGE, footage
+    from pipelines.track import STAGE, read_inputs
 
     def gone(*unused):
         raise CaptureError("cam00: cannot be opened")
 
     dataset, _ = tracked_dataset
-    monkeypatch.setattr(footage, "read_peak_frame", gone)
+    monkeypatch.setattr(read_inputs, "read_peak_frame", gone)
     with pytest.raises(StageError, match="cannot be opened"):
         STAGE.run(dataset, "S001", TrackConfig(), tmp_path)

@@ -9,19 +9,20 @@ import pytest
 
 from express50.errors import StageError
 from express50.files.images import linear_to_srgb, read_image
+from express50.geometry.spherical_harmonics import sh_polynomials
 from pipelines.track.appearance import (
     EVEN_LIGHT,
     Appearance,
-    Seen,
+    SampleColours,
+    bake_albedo,
     estimate,
     residuals,
-    sh_basis,
     spread_of,
+    texel_samples,
     trust,
+    write_appearance,
 )
-from pipelines.track.bake import bake_albedo, texel_samples, write_appearance
-from pipelines.track.pictures import Moment
-from pipelines.track.shots import Shot
+from pipelines.track.crops import FrameSetCrops, HeadCrop
 from tests.pipelines.textured_scenes import RADIUS, ball_head, paint, picture, rig
 
 NAMES = ("a", "b", "c", "d", "e")
@@ -52,7 +53,7 @@ def moments(count: int = 4, samples: int = 600, seed: int = 0, noise: float = 0.
         values += rng.normal(size=values.shape) * noise
         axes = [np.array([np.sin(a), 0, np.cos(a)]) for a in np.linspace(-1.5, 1.5, 5)]
         weights = np.stack([np.maximum(normals @ axis, 0.0) for axis in axes])
-        made.append(Seen(NAMES, values, np.where(weights > 0.25, weights, 0.0), normals))
+        made.append(SampleColours(NAMES, values, np.where(weights > 0.25, weights, 0.0), normals))
     return made, truth
 
 
@@ -73,7 +74,7 @@ def test_light_and_albedo_are_recovered_up_to_their_common_scale() -> None:
     for _ in range(3):
         got = estimate(seen, got)
     normals = np.concatenate([one.normals[one.weights.sum(0) > 0] for one in seen])
-    shown, true = (sh_basis(normals) @ x for x in (got.light, truth.light))
+    shown, true = (sh_polynomials(normals) @ x for x in (got.light, truth.light))
     np.testing.assert_allclose(shown / shown.mean(0), true / true.mean(0), atol=0.1)
     # Without the light's estimate brightness would go into the skin.
     error = np.abs(shown / shown.mean(0) - true / true.mean(0)).mean()
@@ -112,9 +113,9 @@ def test_spread_is_that_of_the_noise_and_outliers_lose_trust() -> None:
     assert weights[:, :500].max() < 0.01 and np.median(weights[:, 500:]) > 0.7
 
 
-def shot_of(camera, colour=paint, alpha=None) -> Shot:
+def crop_of(camera, colour=paint, alpha=None) -> HeadCrop:
     level = np.rint(255 * linear_to_srgb(picture(camera, colour=colour).astype(float) ** 2))
-    return Shot(camera.id, camera, level.astype(np.uint8), alpha)
+    return HeadCrop(camera.id, camera, level.astype(np.uint8), alpha)
 
 
 def plain(cameras) -> Appearance:
@@ -131,10 +132,10 @@ def test_texture_is_baked_the_right_way_up_and_freed_of_gains_and_light() -> Non
     rng = np.random.default_rng(0)
     given = Appearance(light(), {c.id: rng.uniform(0.8, 1.2, 3) for c in cameras}, np.zeros((0, 3)))
     shots = tuple(
-        shot_of(c, lambda p, n=c.id: broad(p) * given.shade(n, p / RADIUS)) for c in cameras
+        crop_of(c, lambda p, n=c.id: broad(p) * given.shade(n, p / RADIUS)) for c in cameras
     )
     mesh = model.template.numpy()
-    albedo, known = bake_albedo(model, mesh[None], [Moment((), shots)], given, side)
+    albedo, known = bake_albedo(model, mesh[None], [FrameSetCrops((), shots)], given, side)
     assert albedo.shape == (side, side, 3) and albedo.dtype == np.uint8
     v, u = np.meshgrid(1 - (np.arange(side) + 0.5) / side, (np.arange(side) + 0.5) / side,
                        indexing="ij")  # fmt: skip
@@ -149,15 +150,15 @@ def test_texture_is_baked_the_right_way_up_and_freed_of_gains_and_light() -> Non
     # What nobody saw goes on from what was seen.
     assert np.abs(albedo[~known].astype(float) - albedo[known].mean(0)).mean() < 60.0
     np.testing.assert_array_equal(
-        albedo, bake_albedo(model, mesh[None], [Moment((), shots)], given, side)[0]
+        albedo, bake_albedo(model, mesh[None], [FrameSetCrops((), shots)], given, side)[0]
     )
 
 
 def test_a_second_moment_tells_what_the_first_hides_and_changes_little_else() -> None:
     model, cameras = ball_head(), rig((-0.8, -0.6, 0.6, 0.8))
     mesh = model.template.numpy()
-    first = Moment((), tuple(shot_of(c, broad) for c in cameras[:2]))
-    other = Moment((), tuple(shot_of(c, lambda p: 0.2 + 0 * p) for c in cameras[2:]))
+    first = FrameSetCrops((), tuple(crop_of(c, broad) for c in cameras[:2]))
+    other = FrameSetCrops((), tuple(crop_of(c, lambda p: 0.2 + 0 * p) for c in cameras[2:]))
     look = plain(cameras)
     alone, seen = bake_albedo(model, mesh[None], [first], look, 64)
     both, more = bake_albedo(model, np.stack([mesh, mesh]), [first, other], look, 64)
@@ -173,9 +174,9 @@ def test_a_second_moment_tells_what_the_first_hides_and_changes_little_else() ->
 @pytest.mark.parametrize("alpha", [None, np.zeros((256, 256), np.uint8)])
 def test_nothing_seen_is_an_even_grey(alpha) -> None:
     model, cameras = ball_head(12), rig()
-    shots = () if alpha is None else tuple(shot_of(c, alpha=alpha) for c in cameras)
+    shots = () if alpha is None else tuple(crop_of(c, alpha=alpha) for c in cameras)
     albedo, known = bake_albedo(
-        model, model.template.numpy()[None], [Moment((), shots)], plain(cameras), 32
+        model, model.template.numpy()[None], [FrameSetCrops((), shots)], plain(cameras), 32
     )
     assert not known.any() and len(np.unique(albedo)) == 1
 

@@ -15,13 +15,13 @@ from express50.geometry.transforms import axis_angle_to_matrix
 from express50.head.load import load_head
 from express50.head.model import landmarks, pose
 from express50.landmarks.iris import EYES, Irises
-from pipelines.track.config import TrackConfig
-from pipelines.track.fit import fit, landmark_sigma
-from pipelines.track.lids import ShutLids, lid_terms, shut_lids
-from pipelines.track.observe import Observation, View, agree
-from pipelines.track.sparse_head import make_basis
-from pipelines.track.start import initial_pose
-from pipelines.track.state import Target, start_state
+from pipelines.track.basis import make_basis
+from pipelines.track.eyes_and_jaw import lid_terms, shut_lids
+from pipelines.track.fit import fit
+from pipelines.track.observe import LandmarkView, Observation, agree, landmark_sigma
+from pipelines.track.state import Target, initial_pose, start_state
+from tests.express50.head.tiny_head import tiny_head
+from tests.pipelines.term_checks import cost_at, gradient_at, slope_along
 from tests.pipelines.test_track import make_camera, make_scene
 
 TIMES = ("neutral", "smile", "wink_left", "pucker")
@@ -49,7 +49,7 @@ def observe(found: np.ndarray, time: str, marks: np.ndarray | None = None) -> Ob
         sigma = np.where(sides, 1.0, np.inf)
         irises = Irises(np.zeros((2, 2)), sigma, np.where(sides, 0.5, 0.0))
         pixels = project(camera, marks)[0]
-        views.append(View(camera.id, camera, pixels, np.ones(68), 0.9, irises))
+        views.append(LandmarkView(camera.id, camera, pixels, np.ones(68), 0.9, irises))
     return agree(time, TIMES.index(time), views)[0]
 
 
@@ -134,19 +134,17 @@ def test_without_irises_and_without_observations():
 @settings(deadline=None, max_examples=20)
 @given(seed=st.integers(0, 1000), shut=st.sampled_from([(0,), (1,), (0, 1)]))
 def test_the_lids_term_has_the_slope_it_says(seed, shut):
-    term, rng = ShutLids(shut), np.random.default_rng(seed)
-    positions = rng.normal(size=(80, 3)) * 0.01
-    matrix, gradient = term.normal(positions)
-    towards = np.zeros_like(positions)
-    sample, axis = rng.integers(len(term.rows)), rng.integers(3)
-    towards[term.rows[sample, 0], axis] = 1e-7
-    slope = (term.cost(positions + towards) - term.cost(positions - towards)) / 2e-7
-    assert slope == pytest.approx(gradient[sample, axis], rel=1e-5, abs=1e-3)
-    bend = term.normal(positions + towards)[1] - gradient
-    assert bend[sample, axis] == pytest.approx(1e-7 * matrix[sample, axis, axis], rel=1e-4)
+    rng = np.random.default_rng(seed)
+    observation = replace(observe(np.ones((3, 2), dtype=bool), "neutral"), shut=shut)
+    (term,) = lid_terms(tiny_head(), observation)
+    assert len(term.anchors.vertices) == 2 * len(shut)
+    vertices = rng.normal(size=(200, 3)) * 0.01
+    way = rng.normal(size=vertices.shape)
+    slope = (gradient_at(term, vertices) * way).sum()
+    assert slope_along(term, vertices, way) == pytest.approx(slope, rel=1e-5, abs=1e-3)
     turn = axis_angle_to_matrix(rng.normal(size=3))
-    moved = positions @ turn.T + 1000.0
-    assert term.cost(moved) == pytest.approx(term.cost(positions), rel=1e-6), "the world's frame"
+    moved = vertices @ turn.T + 1000.0
+    assert cost_at(term, moved) == pytest.approx(cost_at(term, vertices), rel=1e-5)
 
 
 def test_eyes_that_are_known_to_be_shut_shut_the_mesh():
@@ -159,15 +157,15 @@ def test_eyes_that_are_known_to_be_shut_shut_the_mesh():
     marks = marks - marks.mean(0)
     found = seen(len(RIG)) | {"wink_left": np.tile([False, True], (len(RIG), 1))}
     observation = shut_lids([observe(table, time, marks) for time, table in found.items()])[2]
-    assert observation.shut == (LEFT,) and lid_terms(observation) == (ShutLids((LEFT,)),)
-    basis, config = make_basis(head), TrackConfig()
+    assert observation.shut == (LEFT,) and len(lid_terms(head, observation)) == 1
+    basis = make_basis(head)
     template = landmarks(head, head.template[None])[0].double().numpy()
     start = start_state(basis, [initial_pose(observation, template)])
-    sigma = landmark_sigma(observation, config)
+    sigma = landmark_sigma(observation)
     fitted = {}
     for known in (True, False):
-        terms = lid_terms(observation) if known else ()
-        state, _ = fit(basis, [Target(observation, sigma, False, terms=terms)], start, config, 20)
+        terms = lid_terms(head, observation) if known else ()
+        state, _ = fit(basis, [Target(observation, sigma, False, terms=terms)], start, 20)
         blink = state.poses[0].own[[head.expression_names.index(f"eyeBlink_{s}") for s in "LR"]]
         fitted[known] = blink
     assert fitted[True][LEFT] > max(0.94, fitted[False][LEFT])
@@ -175,4 +173,4 @@ def test_eyes_that_are_known_to_be_shut_shut_the_mesh():
 
 
 def test_open_eyes_add_no_term():
-    assert lid_terms(observe(np.ones((3, 2), dtype=bool), "neutral")) == ()
+    assert lid_terms(tiny_head(), observe(np.ones((3, 2), dtype=bool), "neutral")) == ()

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from pipelines.track.outline import Outline, outline_vertices, sample, signed_distance
+from pipelines.track.outline import OutlineTerm, outline_vertices, sample_distance, signed_distance
 from tests.pipelines.test_track import make_camera
 
 
@@ -21,7 +21,7 @@ def test_signed_distance_of_a_disc() -> None:
     angle = np.linspace(0, 6, 40)
     for radius in (60.0, 80.0, 110.0):
         pixels = 150 + radius * np.stack([np.cos(angle), np.sin(angle)], 1)
-        value, gradient = sample(distance, pixels)
+        value, gradient = sample_distance(distance, pixels)
         np.testing.assert_allclose(value, radius - 80.0, atol=0.8)
         np.testing.assert_allclose((gradient * (pixels - 150)).sum(1), radius, rtol=0.2)
 
@@ -37,7 +37,7 @@ def test_both_directions_of_a_shrunk_matte_keep_their_scale(axis: int) -> None:
         assert distance is not None and distance.values.shape == (535, 640)
         pixels = np.tile(size / 2, (41, 1))
         pixels[:, axis] = edge + np.linspace(-10, 10, 41)
-        errors.append(np.interp(0.0, sample(distance, pixels)[0], pixels[:, axis]) - edge)
+        errors.append(np.interp(0.0, sample_distance(distance, pixels)[0], pixels[:, axis]) - edge)
     assert abs(np.mean(errors)) < 0.4
 
 
@@ -64,7 +64,9 @@ def test_outline_residual_slope_matches_finite_differences() -> None:
     camera = make_camera(0.3, 300)
     distance = signed_distance(disc_alpha(), camera)
     positions = np.random.default_rng(0).normal(size=(12, 3)) * 0.1
-    outline = Outline.of(distance, 0, positions, np.arange(12) % 2 == 0, 3, bald=False)
+    outline = OutlineTerm.of(
+        distance, np.arange(12), positions, np.arange(12) % 2 == 0, 3, bald=False
+    )
     _, residual, slope = outline.residuals(positions)
     for axis in range(3):
         step = np.eye(3)[axis] * 1e-6

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from express50.files.images import read_image
-from pipelines.track.sheet import (
+from pipelines.track.report import (
     ALARM,
     BAND,
     DIM,
-    TILE,
+    SHEET_TILE,
     camera_bars,
     camera_residuals,
     contact_sheet,
@@ -41,11 +41,13 @@ def test_residuals_are_means_of_squares() -> None:
 def test_every_expression_has_its_tile(count) -> None:
     tiles = {f"e{k}": flat(60 + 3 * k) for k in range(count)}
     sheet = contact_sheet(tiles)
-    rows, columns = sheet.shape[0] // (TILE + BAND), sheet.shape[1] // TILE
+    rows, columns = sheet.shape[0] // (SHEET_TILE + BAND), sheet.shape[1] // SHEET_TILE
     assert (rows - 1) * columns < count <= rows * columns
     for k in range(count):
         row, column = divmod(k, columns)
-        place = sheet[row * (TILE + BAND) + TILE // 2, column * TILE + TILE // 2]
+        place = sheet[
+            row * (SHEET_TILE + BAND) + SHEET_TILE // 2, column * SHEET_TILE + SHEET_TILE // 2
+        ]
         assert (place == 60 + 3 * k).all()
 
 
@@ -79,7 +81,7 @@ def test_bars_are_as_long_as_the_residuals() -> None:
 def test_any_track_gives_a_page(tmp_path, tiles, table) -> None:
     write_sheet(tmp_path / "qc", tiles, table)
     page = read_image(tmp_path / "qc" / "sheet.jpg")
-    assert page.shape[1] >= TILE and page.max() > 100  # words at least
+    assert page.shape[1] >= SHEET_TILE and page.max() > 100  # words at least
 
 
 def test_the_same_track_gives_the_same_bytes(tmp_path) -> None:

@@ -10,7 +10,7 @@ import torch
 from express50.geometry.cameras import Camera
 from express50.geometry.transforms import look_at
 from express50.head.model import HeadModel
-from pipelines.track.samples import Samples, Visibility, sample_normals
+from pipelines.track.surface import Samples, Visibility, sample_normals
 from tests.express50.head.tiny_head import tiny_head
 from tests.express50.mesh_scenes import sphere
 

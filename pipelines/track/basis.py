@@ -1,0 +1,258 @@
+"""The head model as tracking needs it: a few posed vertices with derivatives, and smooth offsets.
+
+The joints are linear in the coefficients, so their regressor is folded into a basis once. Posing a
+few hundred vertices then costs milliseconds and their Jacobian some tens of milliseconds.
+
+Offsets express what shape coefficients cannot: a smooth static displacement of the skin, along its
+normals and along itself. The prior is a Gaussian field on the surface with a standard deviation and
+a correlation length in metres (the Matern field of Lindgren, Rue and Lindstroem 2011, "An explicit
+link between Gaussian fields and Gaussian Markov random fields"), so it does not depend on the
+mesh's resolution. Its broadest modes, eigenfunctions of the Laplacian, join the head's shape
+directions; both are fitted at once.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import scipy.sparse as sparse
+import torch
+from scipy.sparse.linalg import eigsh
+
+from express50.geometry.transforms_torch import axis_angle_to_matrix
+from express50.head.model import HeadModel, joint_transforms, skin, vertex_normals
+
+POSE_SIZE = 18
+# Parts that move as one or are not skin: their shape is the model's.
+RIGID = (
+    "left_eyeball", "right_eyeball", "teeth", "tongue", "gums", "mouth_interior", "boundary",
+)  # fmt: skip
+# Names of modes: all, those along the normals and those along the skin.
+MODE = "offset_"
+OFF, ALONG = f"{MODE}off_", f"{MODE}along_"
+OFFSET_SIGMA_M, OFFSET_LENGTH_M = 0.001, 0.02  # standard deviation, correlation length
+
+
+@dataclass(frozen=True)
+class Basis:
+    """Joints of a head model as a linear function of its coefficients, float64.
+
+    Attributes:
+        model: the head model in float64.
+        directions: (V, 3, S + X).
+        joints: (J, 3) of the template.
+        joint_directions: (J, 3, S + X).
+        bias: (68, 3) the known error of the landmark detector on this face, head space.
+    """
+
+    model: HeadModel
+    directions: torch.Tensor
+    joints: torch.Tensor
+    joint_directions: torch.Tensor
+    bias: np.ndarray = field(default_factory=lambda: np.zeros((68, 3)))
+
+    @property
+    def shape_size(self) -> int:
+        """Number of shape coefficients."""
+        return self.model.shape_dirs.shape[2]
+
+    @property
+    def expression_size(self) -> int:
+        """Number of expression coefficients."""
+        return self.model.expression_dirs.shape[2]
+
+
+def make_basis(model: HeadModel) -> Basis:
+    """Fold the joint regressor into the bases."""
+    model = model.to(dtype=torch.float64)
+    directions = torch.cat([model.shape_dirs, model.expression_dirs], dim=2)
+    return Basis(
+        model,
+        directions,
+        model.joint_regressor @ model.template,
+        torch.einsum("jv,vcd->jcd", model.joint_regressor, directions),
+    )
+
+
+class Points:
+    """Chosen vertices of the head as a function of the fit's parameters.
+
+    Parameters of one expression, in order: shape (S), expression (X), neck (3), jaw (3), left eye
+    (3), right eye (3), turn of the head (3, axis-angle on the world side of R), t (3).
+    """
+
+    def __init__(self, basis: Basis, vertices: np.ndarray) -> None:
+        model = basis.model
+        self.basis = basis
+        ids = torch.from_numpy(np.asarray(vertices, dtype=np.int64))
+        self.template, self.directions = model.template[ids], basis.directions[ids]
+        self.skinning = model.skinning[ids]
+        width = model.pose_dirs.shape[0]
+        self.pose_dirs = model.pose_dirs.reshape(width, -1, 3)[:, ids].reshape(width, -1)
+
+    def __call__(self, parameters: torch.Tensor, rotation: torch.Tensor) -> torch.Tensor:
+        """Evaluate world positions (M, 3) for parameters (D,) about the rotation (3, 3)."""
+        linear, pose = parameters[:-POSE_SIZE], parameters[-POSE_SIZE:]
+        return self._posed(self._rest(linear), self._joints(linear), pose, rotation)
+
+    def _rest(self, linear: torch.Tensor) -> torch.Tensor:
+        return self.template + self.directions @ linear
+
+    def _joints(self, linear: torch.Tensor) -> torch.Tensor:
+        return self.basis.joints + self.basis.joint_directions @ linear
+
+    def _posed(
+        self, rest: torch.Tensor, joints: torch.Tensor, pose: torch.Tensor, rotation: torch.Tensor
+    ) -> torch.Tensor:
+        posed = skin(
+            rest[None],
+            joints[None],
+            _joint_rotations(pose)[None],
+            self.skinning,
+            self.pose_dirs,
+            self.basis.model.parents,
+        )[0]
+        return posed @ (axis_angle_to_matrix(pose[12:15]) @ rotation).T + pose[15:]
+
+    def evaluate(self, parameters: np.ndarray, rotation: np.ndarray) -> np.ndarray:
+        """Evaluate positions (M, 3)."""
+        with torch.inference_mode():
+            return self(torch.from_numpy(parameters), torch.from_numpy(rotation)).numpy()
+
+    def linearise(
+        self, parameters: np.ndarray, rotation: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Evaluate positions (M, 3) and their Jacobian (M, 3, D).
+
+        Posed vertices are linear in the coefficients, so only the 18 columns of the pose need
+        forward-mode differentiation.
+        """
+        values, rotation_t = torch.from_numpy(parameters), torch.from_numpy(rotation)
+        linear, pose = values[:-POSE_SIZE], values[-POSE_SIZE:]
+        rest, joints = self._rest(linear), self._joints(linear)
+
+        def both(pose: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+            points = self._posed(rest, joints, pose, rotation_t)
+            return points, points
+
+        by_pose, points = torch.func.jacfwd(both, has_aux=True)(pose)
+        by_coefficient = self._linear_columns(pose, rotation_t)
+        return points.numpy(), torch.cat([by_coefficient, by_pose], dim=2).numpy()
+
+    def _transforms(
+        self, pose: torch.Tensor, joints: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        rotations = _joint_rotations(pose)[None].expand(len(joints), -1, -1, -1)
+        return joint_transforms(joints, rotations, self.basis.model.parents)
+
+    def _linear_columns(self, pose: torch.Tensor, rotation: torch.Tensor) -> torch.Tensor:
+        """Return the Jacobian (M, 3, S + X) by the coefficients."""
+        turn, shift = self._transforms(pose, self.basis.joint_directions.permute(2, 0, 1))
+        world = axis_angle_to_matrix(pose[12:15]) @ rotation
+        blended = torch.einsum("nj,jrc->nrc", self.skinning, world @ turn[0])
+        moved = (shift @ world.T).permute(1, 2, 0).flatten(1)
+        columns = torch.addmm((blended @ self.directions).flatten(1), self.skinning, moved)
+        return columns.view(self.directions.shape)
+
+
+def _joint_rotations(pose: torch.Tensor) -> torch.Tensor:
+    """Convert a pose (18,) to rotations (5, 3, 3) of the joints; the root's is the identity."""
+    angles = torch.cat([torch.zeros_like(pose[:3]), pose[:12]]).reshape(5, 3)
+    return axis_angle_to_matrix(angles)
+
+
+def movable_vertices(model: HeadModel) -> np.ndarray:
+    """Mark the vertices (V,) that may leave the model's shapes: skin, not eyes, teeth and mouth."""
+    rigid = [model.regions[name].numpy() for name in RIGID if name in model.regions]
+    return ~np.any([np.zeros(len(model.template), dtype=bool), *rigid], axis=0)
+
+
+def with_modes(model: HeadModel, count: int, along: int = 0) -> HeadModel:
+    """Add the field's modes to the head's shape directions, weighted by standard deviations.
+
+    Args:
+        model: any head.
+        count: number of modes along the normals.
+        along: number of modes by which the skin slides along itself, each for three axes. Skin is
+            located less finely along itself than in depth, so these are the broadest modes.
+    """
+    if count == 0 and along == 0:
+        return model
+    normals = vertex_normals(model.template[None].double(), model.faces)[0]
+    heights = torch.from_numpy(offset_modes(model, max(count, along)))
+    flat = torch.eye(3).double() - normals[:, :, None] * normals[:, None, :]
+    lifts = normals[:, :, None] * heights[:, None, :count]
+    slides = (flat[..., None] * heights[:, None, None, :along]).flatten(2)
+    modes = torch.cat([lifts, slides], dim=2)
+    names = tuple(f"{OFF}{index}" for index in range(lifts.shape[2]))
+    names += tuple(f"{ALONG}{index}" for index in range(slides.shape[2]))
+    return replace(
+        model,
+        shape_dirs=torch.cat([model.shape_dirs, modes.to(model.dtype)], dim=2),
+        shape_names=model.shape_names + names,
+    )
+
+
+def split_shape(model: HeadModel, shape: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Split a fit into the head's shape coefficients (S,) and the modes' offsets (V, 3), metres.
+
+    `model` is as `with_modes` returns it, `shape` (S + modes,) are its coefficients.
+    """
+    count = sum(not name.startswith(MODE) for name in model.shape_names)
+    return shape[:count], model.shape_dirs[..., count:].double().numpy() @ shape[count:]
+
+
+def offset_modes(
+    model: HeadModel,
+    count: int,
+    sigma: float = OFFSET_SIGMA_M,
+    length: float = OFFSET_LENGTH_M,
+) -> np.ndarray:
+    """Compute the field's broadest modes (V, count), metres per standard deviation.
+
+    Eyes, teeth and the inside of the mouth stay where they are.
+    """
+    vertices = model.template.double().numpy()
+    stiffness, mass = cotangent_laplacian(vertices, model.faces.numpy())
+    free = np.flatnonzero(movable_vertices(model) & (mass > 1e-11))
+    count = min(count, len(free) - 2)
+    core = stiffness[free][:, free].tocsc()
+    # A fixed start makes the iteration, and so the modes, the same in every run.
+    values, modes = eigsh(
+        core, count, sparse.diags(mass[free]).tocsc(), sigma=-1.0, v0=np.ones(len(free))
+    )
+    kappa = 1.0 / length
+    root_tau = 1.0 / (np.sqrt(4.0 * np.pi) * kappa * sigma)
+    heights = np.zeros((len(vertices), count))
+    heights[free] = modes / (root_tau * (kappa**2 + np.maximum(values, 0.0)))
+    return heights
+
+
+def cotangent_laplacian(
+    vertices: np.ndarray, faces: np.ndarray
+) -> tuple[sparse.csr_matrix, np.ndarray]:
+    """Return cotangent stiffness (V, V) and lumped mass (V,) of a mesh (V, 3), (F, 3).
+
+    Source: Pinkall and Polthier 1993. Only edges' positive weights are kept, so that slivers do no
+    harm and the matrix is positive semi-definite.
+    """
+    count = len(vertices)
+    rows: list[np.ndarray] = []
+    columns: list[np.ndarray] = []
+    values: list[np.ndarray] = []
+    mass = np.full(count, 1e-12)
+    for k in range(3):
+        i, j, o = faces[:, k], faces[:, (k + 1) % 3], faces[:, (k + 2) % 3]
+        u, v = vertices[i] - vertices[o], vertices[j] - vertices[o]
+        area = np.linalg.norm(np.cross(u, v), axis=1)
+        rows.append(i)
+        columns.append(j)
+        values.append(0.5 * (u * v).sum(1) / np.maximum(area, 1e-14))
+        np.add.at(mass, i, area / 6.0)
+    shape = (count, count)
+    half = sparse.csr_matrix(
+        (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))), shape=shape
+    )
+    weights = (half + half.T).maximum(0.0).minimum(20.0)
+    return sparse.diags(np.asarray(weights.sum(1)).ravel()) - weights, mass

@@ -1,0 +1,340 @@
+"""Eyes and the jaw line: irises turn the eyes, shut lids meet, the jaw line is seen on the rim.
+
+**Irises** are pixels that the iris vertices should project to. An eyeball misplaced by a millimetre
+turns the gaze by five degrees in every expression alike, so the median offset over a subject's
+expressions is attributed to misplacement, and only the rest to gaze.
+
+**Lids**: an eye is shut if cameras find no iris that they find at other times. Contrast decides
+that over some twenty pixels, whereas the distance between the lids is one or two pixels of the
+landmark network's crop, which puts shut lids nearly as far apart as open ones. Half-shut eyes stay
+as seen.
+
+**Jaw line**: people, and networks trained on their marks, mark the visible edge of the cheek where
+the head turns away. A landmark whose skin faces the camera keeps its place in the embedding, one
+that turned past the rim moves along its line of candidates to the rim, and one that the head hides
+is left out. The choice is made anew for every mesh. The embedded network marks fixed places and
+needs none of this.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import open3d as o3d
+import torch
+
+from express50.geometry.cameras import Camera
+from express50.geometry.pinhole import project_with_slope
+from express50.geometry.raycast import mesh_scene
+from express50.head.model import HeadModel, vertex_normals
+from express50.landmarks.iris import EYES
+from pipelines.track.observe import LandmarkView, Observation, agree
+from pipelines.track.state import Target
+from pipelines.track.terms import Anchors, LidTerm, PixelTerm, Sighting, landmark_anchors
+
+LOOKS_AT = 0.3  # cosine between gaze and camera below which an iris is not trusted
+# An eyeball's misplacement: standard deviation of what is left of it, and of all of it (prior).
+EYEBALL_M, OFFSET_M = 0.0005, 0.002
+GUESSED_EXPRESSIONS = 1  # weight of the guess that eyeballs are in place, in expressions
+RIM_SHARE = 0.012  # error of a rim's place along the cheek, as a share of the face
+
+# A camera counts for an eye if it finds the iris in more than this share of the other frame sets
+# and the eye is now at least this share of its usual width there: it has not turned away.
+USUAL, WIDE = 0.5, 0.75
+LEAST_CAMERAS = 2
+# Lashes and folds are sometimes mistaken for irises, with little confidence. An eye is shut if the
+# squared confidences over the cameras sum to at most this share of the usual.
+CHANCE = 0.3
+GAP = 0.1  # share of the gap between the lids that is left
+
+JAW = 17
+# Cosine between skin and line of sight: above it a point is in plain view, and within RIM of a
+# right angle skin forms the rim (triangles are finite).
+FACING, RIM = -0.1, 0.2
+RIM_REACH_M = 0.16  # metres further along the cheek per unit of cosine nearer to the rim
+CLEAR_M = 0.004  # visibility is tested this far off the skin: the rim hides itself from any ray
+
+
+@dataclass(frozen=True)
+class EyeOffsets:
+    """Offsets between a subject's irises and the model's.
+
+    Attributes:
+        vertices: in the middle of the left and right iris.
+        offsets: (2, 3) head space, metres, the median over the expressions.
+    """
+
+    vertices: tuple[int, int]
+    offsets: np.ndarray
+
+
+def measure_eyes(
+    model: HeadModel, targets: list[Target], meshes: np.ndarray, rotations: np.ndarray
+) -> EyeOffsets | None:
+    """Measure where irises are seen against a fit without them; shrunk with few expressions.
+
+    Args:
+        model: the head model.
+        targets: E expressions.
+        meshes: (E, V, 3) of the fit, world.
+        rotations: (E, 3, 3) world from head.
+
+    Returns:
+        None where the model names no irises.
+    """
+    vertices = iris_vertices(model)
+    if vertices is None:
+        return None
+    offsets = np.zeros((2, 3))
+    for side, vertex in enumerate(vertices):
+        found = [
+            rotation.T @ offset
+            for target, mesh, rotation in zip(targets, meshes, rotations, strict=True)
+            if (offset := _offset(model, target, mesh, side, vertex)) is not None
+        ]
+        if found:
+            share = len(found) / (len(found) + GUESSED_EXPRESSIONS)
+            offsets[side] = share * np.median(found, axis=0)
+    return EyeOffsets(vertices, offsets)
+
+
+def _offset(
+    model: HeadModel, target: Target, mesh: np.ndarray, side: int, vertex: int
+) -> np.ndarray | None:
+    """Return the world offset (3,) that brings one iris vertex to where the views see it."""
+    normal, count = np.eye(3) / OFFSET_M**2, 0
+    right = np.zeros(3)
+    for view, centre, sigma in _seeing(model, target, mesh, side, vertex):
+        pixel, slope = project_with_slope(view.camera, mesh[vertex][None])
+        weighted = slope[0] / sigma**2
+        normal += weighted.T @ slope[0]
+        right += weighted.T @ (centre - pixel[0])
+        count += 1
+    return np.linalg.solve(normal, right) if count else None
+
+
+def _seeing(
+    model: HeadModel, target: Target, mesh: np.ndarray, side: int, vertex: int
+) -> list[tuple[LandmarkView, np.ndarray, float]]:
+    """Return the views that one eye looks at, with its iris' pixel (2,) and sigma."""
+    normal = vertex_normals(torch.from_numpy(mesh)[None], model.faces)[0, vertex].numpy()
+    found = []
+    for view, sigma in zip(target.observation.views, target.sigma, strict=True):
+        if view.irises is None or not np.isfinite(sigma).any():
+            continue
+        towards = view.camera.center - mesh[vertex]
+        looks = normal @ towards / max(float(np.linalg.norm(towards)), 1e-9)
+        if np.isfinite(view.irises.sigma[side]) and looks > LOOKS_AT:
+            found.append((view, view.irises.centres[side], float(view.irises.sigma[side])))
+    return found
+
+
+def iris_vertices(model: HeadModel) -> tuple[int, int] | None:
+    """Find the vertices in the middle of the left and right iris; None without irises."""
+    found = []
+    for side in ("left", "right"):
+        names = [f"{side}_pupil", f"{side}_iris"]
+        masks = [model.regions[name].numpy() for name in names if name in model.regions]
+        masks = [mask for mask in masks if mask.any()]
+        if not masks:
+            return None
+        ids = np.flatnonzero(masks[0])
+        places = model.template.numpy()[ids]
+        found.append(int(ids[np.linalg.norm(places - places.mean(0), axis=1).argmin()]))
+    return found[0], found[1]
+
+
+def with_irises_and_jaw(
+    model: HeadModel,
+    target: Target,
+    mesh: np.ndarray,
+    rotation: np.ndarray,
+    eyes: EyeOffsets | None,
+) -> Target:
+    """Add irises to a target and move the jaw line to where the current mesh shows it.
+
+    Args:
+        model: the head model.
+        target: evidence of one expression, without irises.
+        mesh: (V, 3) of the current fit, world.
+        rotation: (3, 3) world from head.
+        eyes: from `measure_eyes`.
+    """
+    sigma, terms = target.sigma.copy(), list(target.terms)
+    if eyes is not None:
+        terms.append(_iris_term(model, target, mesh, rotation, eyes))
+    for row, view in enumerate(target.observation.views):
+        if view.visible_contour and np.isfinite(sigma[row]).any():
+            terms.append(_jaw_term(model, view, mesh, sigma[row]))
+    return replace(target, sigma=sigma, terms=tuple(terms))
+
+
+def _iris_term(
+    model: HeadModel,
+    target: Target,
+    mesh: np.ndarray,
+    rotation: np.ndarray,
+    eyes: EyeOffsets,
+) -> PixelTerm:
+    sightings = []
+    for side, vertex in enumerate(eyes.vertices):
+        views = _seeing(model, target, mesh, side, vertex)
+        for view, centre, sigma in views:
+            _, slope = project_with_slope(view.camera, mesh[vertex][None])
+            pixel = centre - slope[0] @ rotation @ eyes.offsets[side]
+            # An eyeball is equally misplaced in every view: more views are not more evidence.
+            common = EYEBALL_M * float(np.linalg.norm(slope[0], axis=1).max()) * len(views) ** 0.5
+            spread = np.array([np.hypot(sigma, common)])
+            sightings.append(Sighting(view.camera, np.array([side]), pixel[None], spread))
+    return PixelTerm(Anchors.of_vertices(np.array(eyes.vertices)), tuple(sightings))
+
+
+def _jaw_term(
+    model: HeadModel, view: LandmarkView, mesh: np.ndarray, sigma: np.ndarray
+) -> PixelTerm:
+    """Make the term of the jaw's points on the rim.
+
+    `sigma` (68,) is changed here: it loses these points, and those that the head hides, as fixed
+    landmarks.
+    """
+    line = contour_points(model, mesh, view.camera)
+    size = float(np.ptp(view.points, axis=0).max())
+    spread = np.hypot(view.sigma[:JAW], RIM_SHARE * size)
+    taken = np.flatnonzero(np.isfinite(sigma[:JAW]) & line.moved & line.usable)
+    sigma[:JAW][line.moved | ~line.usable] = np.inf
+    seen = Sighting(view.camera, np.arange(len(taken)), view.points[taken], spread[taken])
+    return PixelTerm(Anchors.of_vertices(line.corners[taken, 0]), (seen,))
+
+
+def lid_terms(model: HeadModel, observation: Observation) -> tuple[LidTerm, ...]:
+    """Make the term of an observation's shut eyes, if there are any."""
+    if not observation.shut:
+        return ()
+    marks = landmark_anchors(model)
+    upper, lower = (
+        np.concatenate([EYES[side][lid] for side in observation.shut]) for lid in (2, 3)
+    )
+    return (LidTerm(marks.some(upper).minus(marks.some(lower))),)
+
+
+def shut_lids(
+    observations: list[Observation], others: Sequence[Observation] | None = None
+) -> list[Observation]:
+    """Find shut eyes in one person's observations and move their upper lids to the lower ones.
+
+    Args:
+        observations: frame sets to examine.
+        others: frame sets to compare each with, in most of which eyes are open; by default the
+            other observations.
+    """
+    shut = np.zeros((len(observations), 2), dtype=bool)
+    for side in range(2):
+        seen = [_irises(observation, side) for observation in observations]
+        usual = None if others is None else [_irises(other, side) for other in others]
+        shut[:, side] = [
+            _is_shut(now, seen[:k] + seen[k + 1 :] if usual is None else usual)
+            for k, now in enumerate(seen)
+        ]
+    return [
+        _shut(observation, sides) if sides.any() else observation
+        for observation, sides in zip(observations, shut, strict=True)
+    ]
+
+
+def _irises(observation: Observation, side: int) -> dict[str, tuple[float, float]]:
+    """Map cameras to the confidence of one eye's iris, 0 if none, and the eye's width, pixels."""
+    first, last = EYES[side][:2]
+    return {
+        view.camera_id: (
+            float(view.irises.confidence[side]),
+            float(np.linalg.norm(view.points[last] - view.points[first])),
+        )
+        for view in observation.views
+        if view.irises is not None
+    }
+
+
+def _is_shut(
+    now: dict[str, tuple[float, float]], others: list[dict[str, tuple[float, float]]]
+) -> bool:
+    usual = []
+    for camera, (_, width) in now.items():
+        then = [other[camera] for other in others if camera in other]
+        found = np.array([pair for pair in then if pair[0] > 0]).reshape(-1, 2)
+        if len(found) > USUAL * len(then) and width > WIDE * np.median(found[:, 1]):
+            usual.append(np.median(found[:, 0]))
+    if len(usual) < max(1, min(LEAST_CAMERAS, len(now))):
+        return False
+    # Any camera counts here: a head that turned shows its irises to others.
+    return sum(sure**2 for sure, _ in now.values()) <= CHANCE * np.square(usual).sum()
+
+
+def _shut(observation: Observation, sides: np.ndarray) -> Observation:
+    views = []
+    for view in observation.views:
+        points = view.points.copy()
+        for side in np.flatnonzero(sides):
+            upper, lower = (list(lid) for lid in EYES[side][2:])
+            points[upper] = points[lower] + GAP * (points[upper] - points[lower])
+        views.append(replace(view, points=points))
+    found, _ = agree(observation.expression, observation.frame, views)
+    refused = observation.refused + found.refused
+    return replace(found, refused=refused, shut=tuple(np.flatnonzero(sides).tolist()))
+
+
+@dataclass(frozen=True)
+class JawLine:
+    """The jaw line in one view.
+
+    Attributes:
+        corners: (17, 3) vertex ids.
+        bary: (17, 3) their weights.
+        moved: (17,) bool, points that left the embedding for the rim.
+        usable: (17,) bool, points that the camera sees.
+    """
+
+    corners: np.ndarray
+    bary: np.ndarray
+    moved: np.ndarray
+    usable: np.ndarray
+
+    def positions(self, vertices: np.ndarray) -> np.ndarray:
+        """Place the points (17, 3) on a mesh (V, 3)."""
+        return (vertices[self.corners] * self.bary[..., None]).sum(1)
+
+
+def contour_points(model: HeadModel, vertices: np.ndarray, camera: Camera) -> JawLine:
+    """Choose the 17 points of the jaw line that a camera sees.
+
+    Args:
+        model: the head model; without `contour` candidates every point keeps its place.
+        vertices: (V, 3) of the current mesh, world.
+        camera: pinhole.
+    """
+    faces = model.faces.numpy()
+    corners = faces[model.landmark_faces[:JAW].numpy()].copy()
+    bary = model.landmark_bary[:JAW].numpy().astype(np.float64)
+    normals = vertex_normals(torch.from_numpy(vertices)[None], model.faces)[0].numpy()
+    towards = camera.center - vertices
+    towards = towards / np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 1e-12)
+    facing = (normals * towards).sum(1)
+    own = (vertices[corners] * bary[..., None]).sum(1)
+    moved = np.zeros(JAW, dtype=bool)
+    for point, line in enumerate(model.contour or ()):
+        if (facing[corners[point]] * bary[point]).sum() > FACING:
+            continue
+        rim = line.numpy()[np.abs(facing[line.numpy()]) < RIM]
+        moved[point] = True
+        if len(rim):
+            way = np.linalg.norm(vertices[rim] - own[point], axis=1)
+            best = rim[int((way + RIM_REACH_M * np.abs(facing[rim])).argmin())]
+            corners[point], bary[point] = best, (1.0, 0.0, 0.0)
+    clear = vertices[corners] + CLEAR_M * normals[corners]
+    sight = (clear * bary[..., None]).sum(1) - camera.center
+    rays = np.concatenate([np.broadcast_to(camera.center, sight.shape), sight], axis=1)
+    hits = mesh_scene(vertices, faces).cast_rays(o3d.core.Tensor(rays.astype(np.float32)))
+    # Directions are not unit vectors: the ray's parameter is 1 at the point.
+    seen = hits["t_hit"].numpy() > 0.999
+    return JawLine(corners, bary, moved, seen)

@@ -1,0 +1,208 @@
+"""The face UV map: the texels of a head model's face, and a network that reads landmarks on it.
+
+A cylinder about the head is unrolled and warped until the 68 landmarks of any head model lie where
+those of every other do, so one network reads the maps of all of them. On the map every face is
+upright, turned to the reader and of one size, and what is left to find is the mesh's error. The
+landmark network, trained on from its weights for whole heads, sees the middle of the map at twice
+the resolution it has of a head. The jaw line is not among its landmarks: the map does not end
+there.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+import torch
+from scipy.interpolate import RBFInterpolator
+
+from express50.errors import HeadModelError
+from express50.geometry.cameras import Camera
+from express50.geometry.conventions import cell_to_corner
+from express50.geometry.raycast import visible_faces
+from express50.head.model import HeadModel, landmarks
+from express50.landmarks.network import CROP, MIRROR, LandmarkNet
+from pipelines.track.basis import movable_vertices
+from pipelines.track.surface import Samples, flat_barycentrics
+
+# Texels, and how much of the head they cover: about 1.3 mm each on the cheeks.
+WIDTH, HEIGHT = 192, 160
+RIGHT, TOP = 1.35, 1.2
+# Beyond this azimuth a face may straddle the seam at the back.
+BACK = 2.6
+# What lies further behind what a texel shows is another sheet of skin; outer eye corners' widths.
+SHEET = 0.04
+# Where the landmarks' azimuths (radians) and heights (in widths between the outer eye corners) are
+# put: those of the procedural head, so that it needs no warp.
+MARKS = np.array(
+    [
+        (-1.571, 0.290), (-1.561, 0.079), (-1.552, -0.125), (-1.455, -0.356), (-1.215, -0.547),
+        (-0.874, -0.691), (-0.515, -0.800), (-0.214, -0.872), (0.000, -0.880), (0.214, -0.872),
+        (0.515, -0.800), (0.874, -0.691), (1.215, -0.547), (1.455, -0.356), (1.552, -0.125),
+        (1.561, 0.079), (1.571, 0.290), (-0.657, 0.519), (-0.497, 0.590), (-0.351, 0.611),
+        (-0.219, 0.595), (-0.100, 0.536), (0.100, 0.536), (0.219, 0.595), (0.351, 0.611),
+        (0.497, 0.590), (0.657, 0.519), (0.000, 0.404), (0.000, 0.284), (0.000, 0.153),
+        (0.000, 0.000), (-0.137, -0.128), (-0.076, -0.160), (0.000, -0.169), (0.076, -0.160),
+        (0.137, -0.128), (-0.605, 0.367), (-0.483, 0.401), (-0.328, 0.396), (-0.234, 0.341),
+        (-0.335, 0.309), (-0.484, 0.314), (0.234, 0.341), (0.328, 0.396), (0.483, 0.401),
+        (0.605, 0.367), (0.484, 0.314), (0.335, 0.309), (-0.323, -0.396), (-0.175, -0.340),
+        (-0.053, -0.301), (0.000, -0.313), (0.053, -0.301), (0.175, -0.340), (0.323, -0.396),
+        (0.177, -0.466), (0.056, -0.501), (0.000, -0.508), (-0.056, -0.501), (-0.177, -0.466),
+        (-0.312, -0.396), (-0.156, -0.389), (0.000, -0.398), (0.156, -0.389), (0.312, -0.396),
+        (0.156, -0.390), (0.000, -0.399), (-0.156, -0.390),
+    ]
+)  # fmt: skip
+
+# The rims of closed lips touch: a texel to either side tells which lip a landmark moves with.
+LIPS_APART = np.zeros((68, 2))
+LIPS_APART[[61, 62, 63], 1], LIPS_APART[[65, 66, 67], 1] = -1.2, 1.2
+# First landmark that is read; first column and row of the part of the map that is read; its side.
+FIRST = 17
+LEFT, UPPER, SIDE = 36, 34, 120
+TEXELS_PER_PIXEL = SIDE / CROP
+
+
+@dataclass(frozen=True)
+class FaceUvMap:
+    """The UV map of a head model's face.
+
+    Attributes:
+        samples: T places on the mesh, one per texel that shows the head.
+        texels: (T, 2) their rows and columns.
+        places: (V, 2) column and row of every vertex, corner origin; far off where it has none.
+        front: (F,) bool, faces of skin that the map shows, however small.
+        skin: (T,) bool, texels of skin: not of eyes, teeth or tongue.
+    """
+
+    samples: Samples
+    texels: np.ndarray
+    places: np.ndarray
+    front: np.ndarray
+    skin: np.ndarray
+
+    def image(self, values: np.ndarray) -> np.ndarray:
+        """Spread values (T, C) over the map (HEIGHT, WIDTH, C), 0 where there is no head."""
+        out = np.zeros((HEIGHT, WIDTH, values.shape[1]), dtype=values.dtype)
+        out[tuple(self.texels.T)] = values
+        return out
+
+    def inner(self, left: int, upper: int, side: int) -> FaceUvMap:
+        """Keep the texels of a square window alone."""
+        off = self.texels - (upper, left)
+        some = np.all((off >= 0) & (off < side), axis=1)
+        samples, texels, skin = self.samples.some(some), self.texels[some], self.skin[some]
+        return replace(self, samples=samples, texels=texels, skin=skin)
+
+
+def make_uv_map(model: HeadModel) -> FaceUvMap:
+    """Lay a head model's template flat.
+
+    Raises:
+        HeadModelError: the outer corners of the eyes coincide.
+    """
+    vertices = model.template.double().numpy()
+    marks = landmarks(model, model.template[None].double())[0].double().numpy()
+    if np.linalg.norm(marks[45] - marks[36]) < 1e-6:
+        raise HeadModelError(
+            f"head model {model.name!r}: landmarks 36 and 45, the outer corners of the eyes,"
+            " coincide, so the face has no UV map; correct the model's landmarks or set"
+            " track.uv_rounds=0"
+        )
+    turned, radius = unrolled(vertices, marks)
+    # The smoothest warp that brings the landmarks to where they belong.
+    warp = RBFInterpolator(
+        unrolled(marks, marks)[0], MARKS, kernel="thin_plate_spline", smoothing=1e-4
+    )
+    places = to_texels(warp(turned))
+    faces = model.faces.numpy()
+    near = (np.abs(turned[:, 0]) < BACK)[faces].all(1)
+    face_id = _outermost(places, radius, faces, near)
+    texels = np.argwhere(face_id >= 0)
+    of_texel = face_id[tuple(texels.T)]
+    bary = flat_barycentrics(places[faces[of_texel]], cell_to_corner(texels[:, ::-1]))
+    samples = Samples(of_texel, faces[of_texel], bary)
+    inside = (~movable_vertices(model))[faces].any(1)
+    shown = np.zeros((HEIGHT, WIDTH))
+    shown[tuple(texels.T)] = (radius[samples.corners] * bary).sum(1)
+    column, row = np.clip(places[faces].mean(1), 0, (WIDTH - 1, HEIGHT - 1)).astype(np.int64).T
+    on_map = ((places[faces] >= 0) & (places[faces] <= (WIDTH, HEIGHT))).all((1, 2))
+    front = near & on_map & ~inside & (radius[faces].mean(1) > shown[row, column] - SHEET)
+    return FaceUvMap(samples, texels, places, front, ~inside[of_texel])
+
+
+def unrolled(points: np.ndarray, marks: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return azimuth and height (N, 2) about the head's axis, and distance (N,) from it.
+
+    The axis runs upwards between the ends of the jaw line; heights are above the tip of the nose,
+    in widths between the outer corners of the eyes.
+    """
+    axis = marks[[0, 16]].mean(0)
+    unit = float(np.linalg.norm(marks[45] - marks[36]))
+    x, z = points[:, 0] - axis[0], points[:, 2] - axis[2]
+    height = (points[:, 1] - marks[30, 1]) / unit
+    return np.stack([np.arctan2(x, z), height], axis=1), np.hypot(x, z) / unit
+
+
+def to_texels(turned: np.ndarray) -> np.ndarray:
+    """Convert azimuths and heights (N, 2) to column and row (N, 2), corner origin."""
+    step = 2.0 * RIGHT / WIDTH
+    return np.stack([WIDTH / 2 + turned[:, 0] / step, (TOP - turned[:, 1]) / step], axis=1)
+
+
+def _outermost(
+    places: np.ndarray, radius: np.ndarray, faces: np.ndarray, near: np.ndarray
+) -> np.ndarray:
+    """Find the mesh face (HEIGHT, WIDTH) furthest from the axis at every texel, -1 for none."""
+    depth = 10.0 - np.minimum(radius, 5.0)
+    flat = np.column_stack([places * depth[:, None], depth])
+    camera = Camera("map", WIDTH, HEIGHT, "PINHOLE", (1.0, 1.0, 0.0, 0.0), np.eye(4))
+    ids = np.flatnonzero(near)
+    found, _ = visible_faces(flat, faces[ids], camera)
+    return np.where(found >= 0, ids[np.maximum(found, 0)], -1)
+
+
+def window(colors: np.ndarray) -> np.ndarray:
+    """Cut the part of a map (HEIGHT, WIDTH, 3) that is read, (128, 128, 3)."""
+    part = colors[UPPER : UPPER + SIDE, LEFT : LEFT + SIDE]
+    return cv2.resize(part, (CROP, CROP), interpolation=cv2.INTER_LINEAR)
+
+
+def to_window(texels: np.ndarray) -> np.ndarray:
+    """Convert texels (..., 2) to pixels of the window, both with corner origin."""
+    return (texels - (LEFT, UPPER)) / TEXELS_PER_PIXEL
+
+
+def from_window(pixels: np.ndarray) -> np.ndarray:
+    """Convert pixels (..., 2) of the window to texels of the map."""
+    return pixels * TEXELS_PER_PIXEL + (LEFT, UPPER)
+
+
+def read_marks(net: LandmarkNet, colors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Find texels (51, 2) of landmarks 17 to 67 on a map, and their expected error (51,).
+
+    The map and its mirror image are both read; their difference counts as error.
+
+    Args:
+        net: from `load_network(config.UV_WEIGHTS)`.
+        colors: (HEIGHT, WIDTH, 3) in [0, 1].
+    """
+    image = torch.from_numpy(window(colors)).permute(2, 0, 1)[None].float()
+    with torch.inference_mode():
+        output = net(torch.cat([image, image.flip(3)]))
+    points, scale = output.points.numpy(), np.exp(output.log_scale.numpy())
+    turned = np.stack([CROP - points[1, MIRROR, 0], points[1, MIRROR, 1]], axis=1)
+    apart = 0.5 * np.linalg.norm(points[0] - turned, axis=1)
+    error = np.hypot(0.5 * (scale[0] + scale[1, MIRROR]), apart)
+    mean = 0.5 * (points[0] + turned)
+    return from_window(mean)[FIRST:], (error * TEXELS_PER_PIXEL)[FIRST:]
+
+
+def reading_map(model: HeadModel) -> FaceUvMap:
+    """Make the part of a head's UV map that is read."""
+    return make_uv_map(model).inner(LEFT, UPPER, SIDE)
+
+
+def mark_places() -> np.ndarray:
+    """Return the texels (51, 2) where landmarks 17 to 67 belong."""
+    return to_texels(MARKS)[FIRST:]

@@ -1,0 +1,308 @@
+"""Training cases of the face UV network: painted heads seen on meshes that do not quite fit them.
+
+Every case has a true head and a tracker's estimate of it that is some millimetres off. What several
+cameras see of the first is read at the places of the second, as from footage; where each place
+belongs is known. Nothing is rendered: rays are cast to the map's texels, and from the skin to the
+lights.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import open3d as o3d
+import torch
+
+from express50.geometry.cameras import Camera
+from express50.geometry.conventions import cell_to_corner
+from express50.geometry.raycast import mesh_scene
+from express50.geometry.sampling import bilinear
+from express50.head.model import HeadModel, pose, vertex_normals
+from express50.landmarks.training.poses import random_parameters
+from express50.landmarks.training.skin import Canvas, deform, paint, waves
+from pipelines.track.face_uv_map import FaceUvMap
+from pipelines.track.face_uv_training.disturb import Case, covered, photographed
+from pipelines.track.surface import Visibility, sample_normals
+
+Rng = np.random.Generator
+# At least the first, fewer than the second.
+CAMERAS = (3, 8)
+# Rays that tell how much of the even light and of each lamp a place has.
+EVEN_RAYS, LAMP_RAYS = 16, 4
+# What is further off than this leaves the even light as it is, metres.
+NEAR_M = 0.1
+# Rays start this far off the skin, metres.
+OFF_SKIN_M = 3e-4
+# Root mean square of what the drawn trackers are off along the skin, metres: from least to most.
+OFF_M = (0.0004, 0.005)
+# Share of trackers that have the face but miss what some muscles do to it.
+LATE = 0.5
+# Further than this from the true skin a place of the wrong mesh shows nothing to learn from.
+REACH_M = 0.008
+# What lies further off along the skin is another part of the face, such as the other lip.
+FAR_TEXELS = 12.0
+
+
+@dataclass(frozen=True)
+class Lamps:
+    """Light of a room.
+
+    Attributes:
+        even: (3,) from everywhere.
+        sky: (3,) unit, where the even light is brightest.
+        directions: (L, 3) unit, to the lamps.
+        colors: (L, 3) of the lamps.
+        sizes: (L,) radians, how far from the directions their light still comes.
+        shine: exponent of highlights.
+    """
+
+    even: np.ndarray
+    sky: np.ndarray
+    directions: np.ndarray
+    colors: np.ndarray
+    sizes: np.ndarray
+    shine: float
+
+    def lit(
+        self,
+        albedo: np.ndarray,
+        normals: np.ndarray,
+        reach: np.ndarray,
+        towards: np.ndarray,
+        gloss: float,
+    ) -> np.ndarray:
+        """Light (N, 3) that skin of a colour (N, 3) sends towards the camera.
+
+        `reach` (N, 1 + L) are the shares of the even light and of the lamps' that get there.
+        """
+        diffuse = self.even * ((0.6 + 0.4 * (normals @ self.sky)) * reach[:, 0])[:, None]
+        highlights = np.zeros_like(diffuse)
+        lamps = zip(self.directions, self.colors, reach[:, 1:].T, strict=True)
+        for direction, color, share in lamps:
+            cosine = (share * np.clip(normals @ direction, 0.0, None))[:, None]
+            diffuse = diffuse + cosine * color
+            half = direction + towards
+            half /= np.maximum(np.linalg.norm(half, axis=1, keepdims=True), 1e-6)
+            along = np.clip((normals * half).sum(1), 0.0, None)[:, None]
+            highlights += along**self.shine * (cosine > 0) * share[:, None] * color
+        return albedo * diffuse + gloss * highlights
+
+    def reach(
+        self,
+        scene: o3d.t.geometry.RaycastingScene,
+        places: np.ndarray,
+        normals: np.ndarray,
+        rng: Rng,
+    ) -> np.ndarray:
+        """Shares (N, 1 + L) of the even light and of the lamps' that get to places (N, 3)."""
+        starts = places + OFF_SKIN_M * normals
+        even = np.zeros(len(places))
+        for ray in _unit(rng.normal(size=(EVEN_RAYS, 3))):
+            # Unit vectors about the normal's end are weighted by the cosine.
+            even += ~_blocked(scene, starts, _unit(1.001 * normals + ray), NEAR_M)
+        shares = [even / EVEN_RAYS]
+        for direction, size in zip(self.directions, self.sizes, strict=True):
+            seen = np.zeros(len(places))
+            for ray in _unit(direction + size * rng.normal(size=(LAMP_RAYS, 3))):
+                seen += ~_blocked(scene, starts, np.broadcast_to(ray, starts.shape), np.inf)
+            shares.append(seen / LAMP_RAYS)
+        return np.stack(shares, axis=1)
+
+
+def draw_lamps(rng: Rng) -> Lamps:
+    """A room with one to four lamps."""
+    count = rng.integers(1, 5)
+    directions = rng.normal(size=(count, 3)) + [0.0, 0.3, 0.8]
+    sky = rng.normal(size=3)
+    return Lamps(
+        rng.uniform(0.1, 0.8) * rng.uniform(0.8, 1.0, 3),
+        _unit(sky),
+        _unit(directions),
+        rng.uniform(0.1, 0.8, (count, 1)) * rng.uniform(0.75, 1.0, (count, 3)),
+        rng.uniform(0.02, 0.3, count),
+        float(rng.uniform(8.0, 60.0)),
+    )
+
+
+def draw_cameras(places: np.ndarray, rng: Rng) -> list[Camera]:
+    """Cameras about the face; only where they are counts."""
+    cameras = []
+    for index in range(int(rng.integers(*CAMERAS))):
+        yaw, pitch = rng.uniform(-1.7, 1.7), rng.normal() * 0.3
+        towards = np.array(
+            [np.sin(yaw) * np.cos(pitch), np.sin(pitch), np.cos(yaw) * np.cos(pitch)]
+        )
+        pose_ = np.eye(4)
+        pose_[:3, 3] = -(places.mean(0) + np.exp(rng.uniform(-0.7, 0.7)) * towards)
+        cameras.append(Camera(str(index), 1, 1, "PINHOLE", (1.0, 1.0, 0.5, 0.5), pose_))
+    return cameras
+
+
+def _blocked(
+    scene: o3d.t.geometry.RaycastingScene, starts: np.ndarray, towards: np.ndarray, far: float
+) -> np.ndarray:
+    rays = np.concatenate([starts, towards], axis=1).astype(np.float32)
+    return scene.test_occlusions(o3d.core.Tensor(rays), tfar=far).numpy()
+
+
+def _unit(vectors: np.ndarray) -> np.ndarray:
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-6)
+
+
+@dataclass(frozen=True)
+class PaintedHead:
+    """Colours of a head: (HEIGHT, WIDTH, 3) of its uv_map, (V, 3) of what the uv_map does not show.
+
+    The background's colour (3,) and the skin's gloss come with them.
+    """
+
+    map: np.ndarray
+    vertices: np.ndarray
+    background: np.ndarray
+    gloss: float
+
+
+def draw_person(model: HeadModel, uv_map: FaceUvMap, rng: Rng) -> PaintedHead:
+    """Paint a head."""
+    whole = Canvas.of(model)
+    corners, bary = uv_map.samples.corners, uv_map.samples.bary
+    region = {name: (mask[corners] * bary).sum(1) for name, mask in whole.region.items()}
+    rest = (whole.rest[corners] * bary[..., None]).sum(1)
+    # Lips end where they end, not where a mesh's edges happen to run.
+    ragged = rng.uniform(0.0, 0.2) * waves(rest, rng, 8, 200.0, 900.0)
+    inside = {name: share > 0.5 for name, share in region.items()}
+    if "lips" in region:
+        inside["lips"] = region["lips"] > 0.5 + ragged
+    canvas = Canvas(rest, inside, whole.marks)
+    background = rng.uniform(0.0, 1.0, 3)
+    return PaintedHead(
+        uv_map.image(paint(canvas, rng)[0]),
+        paint(whole, rng)[0],
+        background.astype(np.float32),
+        float(rng.uniform(0.0, 0.3)),
+    )
+
+
+def draw_case(model: HeadModel, uv_map: FaceUvMap, person: PaintedHead, rng: Rng) -> Case:
+    """Let a person act, look from some cameras and read the uv_map of a mesh that is off."""
+    true, wrong = draw_meshes(model, uv_map, rng)
+    lamps = draw_lamps(rng)
+    head = _Scene(model, uv_map, person, true, lamps, rng)
+    places, normals = uv_map.samples.at(wrong), sample_normals(uv_map.samples, wrong)
+    visibility = Visibility(wrong, model.faces.numpy())
+    total, mass = np.zeros_like(places), np.zeros(len(places))
+    for camera in draw_cameras(places, rng):
+        weight = visibility.weights(camera, places, normals) ** 2
+        chosen = np.flatnonzero(weight)
+        color = head.seen(camera, places[chosen])
+        total[chosen] += weight[chosen, None] * color
+        mass[chosen] += weight[chosen]
+    colors = uv_map.image(total / np.maximum(mass, 1e-6)[:, None])
+    colors = photographed(covered(colors, rng), rng)
+    flow, valid = head.flow(places, normals)
+    return Case(
+        np.rint(255.0 * np.clip(colors, 0.0, 1.0)).astype(np.uint8),
+        uv_map.image(flow).astype(np.float16),
+        uv_map.image((valid & uv_map.skin & (mass > 0.02))[:, None])[..., 0],
+    )
+
+
+def draw_meshes(model: HeadModel, uv_map: FaceUvMap, rng: Rng) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices (V, 3), (V, 3) of an acting head and of a tracker's idea of it, float64."""
+    draw = random_parameters(model, rng)
+    other = {name: value.clone() for name, value in draw.items()}
+    # A tracker soon has the face (0.1 of what it is off by is left then); what it misses longest
+    # is what a few muscles do to it.
+    early = 0.1 if rng.random() < LATE else 1.0
+    other["shape"] += torch.from_numpy(
+        early * rng.uniform(0.0, 0.6) * rng.normal(size=other["shape"].shape)
+    ).float()
+    other["expression"] += torch.from_numpy(_slips(draw["expression"].numpy(), early, rng)).float()
+    other["jaw"] += torch.from_numpy(rng.uniform(0.0, 0.05) * rng.normal(size=(1, 3))).float()
+    other["eyes"] += torch.from_numpy(0.05 * rng.normal(size=(1, 6))).float()
+    with torch.inference_mode():
+        played, tracked = (pose(model, **one)[0].double().numpy() for one in (draw, other))
+    true = deform(played.astype(np.float32), rng).astype(np.float64)
+    off = tracked - played
+    for low, high, share in ((10.0, 60.0, 0.003), (60.0, 200.0, 0.001)):
+        field = np.stack([waves(true, rng, 6, low, high) for _ in range(3)], axis=1)
+        off += early * rng.uniform(0.0, share) * field
+    normals = vertex_normals(torch.from_numpy(true)[None], model.faces)[0].numpy()
+    # Along the normals the views agree better on where the skin is than along it.
+    off -= rng.uniform(0.2, 1.0) * (off * normals).sum(1, keepdims=True) * normals
+    face = np.unique(uv_map.samples.corners[uv_map.skin])
+    size = np.sqrt((off[face] ** 2).sum(1).mean())
+    wanted = np.exp(rng.uniform(*np.log(OFF_M)))
+    return true, true + off * (wanted / max(float(size), 1e-9))
+
+
+def _slips(expression: np.ndarray, early: float, rng: Rng) -> np.ndarray:
+    """What a tracker has wrong of an expression (1, X): any muscle early, then such as act."""
+    muscles = rng.random(expression.shape) < early * rng.uniform(0.0, 0.4)
+    slips = rng.uniform(0.0, 0.5) * rng.normal(size=muscles.shape) * muscles
+    missed = rng.random(expression.shape) < (1.0 - early) * rng.uniform(0.0, 0.8)
+    return slips - missed * rng.uniform(-0.2, 1.0, expression.shape) * expression
+
+
+class _Scene:
+    """Ray caster of a true, painted head, with the light that reaches its vertices."""
+
+    def __init__(
+        self,
+        model: HeadModel,
+        uv_map: FaceUvMap,
+        person: PaintedHead,
+        vertices: np.ndarray,
+        lamps: Lamps,
+        rng: Rng,
+    ) -> None:
+        self.uv_map, self.person, self.faces = uv_map, person, model.faces.numpy()
+        self.scene = mesh_scene(vertices, self.faces)
+        normals = vertex_normals(torch.from_numpy(vertices)[None], model.faces)[0]
+        self.normals = normals.numpy().astype(np.float32)
+        self.front = uv_map.front
+        self.lamps = lamps
+        self.reach = lamps.reach(self.scene, vertices, self.normals, rng)
+
+    def seen(self, camera: Camera, places: np.ndarray) -> np.ndarray:
+        """Root of light (N, 3) where a camera looks for places (N, 3)."""
+        towards = places - camera.center
+        towards /= np.linalg.norm(towards, axis=1, keepdims=True)
+        origin = np.broadcast_to(camera.center, places.shape)
+        hit, face, bary = self._cast(np.concatenate([origin, towards], axis=1))
+        color = np.tile(self.person.background, (len(places), 1))
+        face, bary = face[hit], bary[hit]
+        albedo = self._albedo(face, bary)
+        normals = (self.normals[self.faces[face]] * bary[..., None]).sum(1)
+        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-6)
+        reach = (self.reach[self.faces[face]] * bary[..., None]).sum(1)
+        light = self.lamps.lit(albedo, normals, reach, -towards[hit], self.person.gloss)
+        color[hit] = np.clip(light, 0.0, 1.0)
+        return np.sqrt(color)
+
+    def flow(self, places: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Where the true skin at places (N, 3) of the wrong mesh belongs: (N, 2), known (N,)."""
+        rays = np.concatenate([places + REACH_M * normals, -normals], axis=1)
+        hit, face, bary = self._cast(rays, 2 * REACH_M)
+        hit &= self.front[face]
+        where = (self.uv_map.places[self.faces[face]] * bary[..., None]).sum(1)
+        own = cell_to_corner(self.uv_map.texels[:, ::-1])
+        hit &= np.linalg.norm(where - own, axis=1) < FAR_TEXELS
+        return np.where(hit[:, None], where - own, 0.0), hit
+
+    def _albedo(self, face: np.ndarray, bary: np.ndarray) -> np.ndarray:
+        corners = self.faces[face]
+        plain = (self.person.vertices[corners] * bary[..., None]).sum(1)
+        mapped = bilinear(self.person.map, (self.uv_map.places[corners] * bary[..., None]).sum(1))
+        return np.where(self.front[face][:, None], mapped, plain)
+
+    def _cast(
+        self, rays: np.ndarray, far: float = np.inf
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Whether rays (N, 6) hit (N,), the faces (N,) and the shares of their corners (N, 3)."""
+        cast = self.scene.cast_rays(o3d.core.Tensor(rays.astype(np.float32)))
+        distance, u = cast["t_hit"].numpy(), cast["primitive_uvs"].numpy()
+        hit = np.isfinite(distance) & (distance < far)
+        face = np.where(hit, cast["primitive_ids"].numpy(), 0).astype(np.int64)
+        return hit, face, np.stack([1 - u.sum(1), u[:, 0], u[:, 1]], axis=1)

@@ -1,0 +1,262 @@
+"""Photo-consistency: search for the surface along the mesh's normals with small patches.
+
+A patch around every sample is moved along the normal; the surface is where the views agree best on
+its appearance. The search is exhaustive, so it works from millimetres off, where gradients of
+colour lead astray. Samples without a clear best height are left out. Scores are means of normalised
+cross-correlations over all pairs of views (as in Goesele et al. 2007).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import open3d as o3d
+from scipy.spatial import cKDTree
+
+from express50.geometry.cameras import Camera
+from express50.geometry.conventions import corner_to_cell
+from express50.geometry.pinhole import project_with_slope
+from express50.geometry.raycast import mesh_scene
+from express50.head.model import HeadModel
+from pipelines.track.crops import FrameSetCrops, root_light
+from pipelines.track.surface import (
+    COVERED,
+    Samples,
+    Visibility,
+    sample_normals,
+    spread,
+    view_weights,
+)
+from pipelines.track.terms import Anchors, NormalTerm
+
+PATCH = 7
+VIEWS = 8
+SPACING_PX = 1.0
+STEP_PX = 0.7
+# What a patch's contrast must stand out from: root of light, 0..1.
+NOISE = 0.006
+LEAST_SCORE, LEAST_SHARP = 0.3, 0.02
+NEIGHBOURS, ODD_PX, OUTLIER_PX = 24, 1.2, 2.5
+SIGMA_PX = 0.8
+# Cosine to the camera below which a patch is foreshortened too much to be compared.
+SLANT = 0.4
+# Hair and cloth may cover neck and ears: fewer samples per sample of the face, and less trust.
+COVERED_SHARE, COVERED_TRUST = 0.25, 0.3
+
+
+@dataclass(frozen=True)
+class PatchSearch:
+    """The result of a search.
+
+    Attributes:
+        height: (S,) metres along the normals.
+        score: (S,) mean correlation of the views there, 0 where nothing was found.
+        sharpness: (S,) margin of that score over any other height.
+        pixel: metres per pixel at the samples.
+    """
+
+    height: np.ndarray
+    score: np.ndarray
+    sharpness: np.ndarray
+    pixel: float
+
+
+def search(
+    images: list[tuple[np.ndarray, Camera]],
+    weights: np.ndarray,
+    places: np.ndarray,
+    normals: np.ndarray,
+    mesh: np.ndarray,
+    faces: np.ndarray,
+    reach: float,
+) -> PatchSearch:
+    """Search for every sample's surface within `reach` metres along its normal.
+
+    Args:
+        images: C grey pictures (H, W) float32, root of light, with their pinhole cameras.
+        weights: (C, S) trust in each view of each sample; 0 where it is not seen.
+        places: (S, 3) world.
+        normals: (S, 3) unit, world.
+        mesh: (V, 3) world; patches are bent to follow it.
+        faces: (F, 3).
+        reach: metres.
+    """
+    middle = places.mean(0)
+    sizes = [np.linalg.norm(middle - camera.center) / camera.K[0, 0] for _, camera in images]
+    pixel = float(np.median(sizes)) if sizes else 1e-3
+    if len(weights) > VIEWS:  # more views add little
+        weights = np.where(weights >= np.sort(weights, axis=0)[-VIEWS], weights, 0.0)
+    steps = max(3, int(np.ceil(reach / (STEP_PX * pixel))))
+    heights = np.arange(-steps, steps + 1) * (reach / steps)
+    centre = mesh.mean(0)
+    shapes = _shapes(mesh_scene(mesh - centre, faces), centre, places, normals, SPACING_PX * pixel)
+    count, size = len(places), PATCH * PATCH
+    total = np.zeros((count, len(heights), size), np.float32)
+    mass, square = np.zeros(count), np.zeros(count)
+    for (image, camera), weight in zip(images, weights, strict=True):
+        chosen = np.flatnonzero(weight > 0)
+        if not len(chosen):
+            continue
+        patches = _patches(image, camera, places[chosen], normals[chosen], heights, shapes[chosen])
+        total[chosen] += weight[chosen, None, None].astype(np.float32) * patches
+        mass[chosen] += weight[chosen]
+        square[chosen] += weight[chosen] ** 2
+    pairs = mass**2 - square
+    enough = pairs > 0.1
+    score = np.zeros((count, len(heights)))
+    together = (total[enough].astype(np.float64) ** 2).sum(2)
+    score[enough] = (together - square[enough, None]) / pairs[enough, None]
+    return _peaks(score, heights, pixel)
+
+
+def _patches(
+    image: np.ndarray,
+    camera: Camera,
+    places: np.ndarray,
+    normals: np.ndarray,
+    heights: np.ndarray,
+    shape: np.ndarray,
+) -> np.ndarray:
+    """Sample patches (S, D, PATCH^2) float32 of one picture, mean removed, of about unit length.
+
+    `shape` (S, 3, PATCH^2) are the patches' points about their samples.
+    """
+    centre = places[:, None] + heights[None, :, None] * normals[:, None]
+    pixels, slope = project_with_slope(camera, centre)
+    # Image coordinates fit single precision; world coordinates need not.
+    spread = slope.astype(np.float32) @ shape[:, None].astype(np.float32)
+    where = spread + corner_to_cell(pixels[..., None]).astype(np.float32)
+    x, y = (np.ascontiguousarray(where[:, :, k].reshape(len(places), -1)) for k in range(2))
+    values = cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    values = values.reshape(len(places), len(heights), -1)
+    values -= values.mean(2, keepdims=True)
+    length = np.einsum("sdk,sdk->sd", values, values) + np.float32((NOISE * PATCH) ** 2)
+    values /= np.sqrt(length)[..., None]
+    return values
+
+
+def _shapes(
+    scene: o3d.t.geometry.RaycastingScene,
+    origin: np.ndarray,
+    places: np.ndarray,
+    normals: np.ndarray,
+    spacing: float,
+) -> np.ndarray:
+    """Lay a square grid (S, 3, PATCH^2) on the mesh about each sample.
+
+    A nose is too round for flat patches. The scene's origin lies at `origin` (3,) in the world.
+    """
+    # The tangent is the same whichever camera looks.
+    axis = np.where(np.abs(normals[:, 1:2]) < 0.9, [[0.0, 1.0, 0.0]], [[1.0, 0.0, 0.0]])
+    across = np.cross(axis, normals)
+    across /= np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-12)
+    along = np.cross(normals, across)
+    grid = spacing * (np.arange(PATCH) - PATCH // 2)
+    v, u = np.meshgrid(grid, grid, indexing="ij")
+    flat = u.reshape(1, -1, 1) * across[:, None] + v.reshape(1, -1, 1) * along[:, None]
+    lift = 2.0 * spacing * PATCH
+    start = places[:, None] - origin + flat + lift * normals[:, None]
+    rays = np.concatenate([start, np.broadcast_to(-normals[:, None], start.shape)], axis=2)
+    hit = scene.cast_rays(o3d.core.Tensor(rays.astype(np.float32)))["t_hit"].numpy()
+    rise = np.where(np.isfinite(hit), lift - hit, 0.0)
+    # Another part of the face under the patch is no continuation of it.
+    rise = np.where(np.abs(rise) < spacing * PATCH, rise, 0.0)
+    return np.swapaxes(flat + rise[..., None] * normals[:, None], 1, 2)
+
+
+def _peaks(score: np.ndarray, heights: np.ndarray, pixel: float) -> PatchSearch:
+    """Find the highest score of every row (S, D), placed between the steps by a parabola."""
+    best = score.argmax(1)
+    inner = (best > 0) & (best < len(heights) - 1)
+    at = np.clip(best, 1, len(heights) - 2)
+    row = np.arange(len(score))
+    left, top, right = score[row, at - 1], score[row, at], score[row, at + 1]
+    bend = np.maximum(2 * top - left - right, 1e-6)
+    shift = np.clip(0.5 * (right - left) / bend, -0.5, 0.5)
+    step = heights[1] - heights[0]
+    far = np.abs(np.arange(len(heights))[None] - at[:, None]) > 2
+    # A patch that is much the same everywhere, as on a flat cheek, tells no height.
+    rival = np.where(far, score, -1.0).max(1)
+    return PatchSearch(
+        heights[at] + shift * step,
+        np.where(inner, top, 0.0),
+        np.where(inner, np.clip(top - rival, 0.0, 1.0), 0.0),
+        pixel,
+    )
+
+
+def surface_term(
+    found: PatchSearch,
+    samples: Samples,
+    places: np.ndarray,
+    normals: np.ndarray,
+    weight: float,
+) -> NormalTerm | None:
+    """Make the term of the samples whose search was conclusive; None if none was."""
+    good = np.flatnonzero((found.score > LEAST_SCORE) & (found.sharpness > LEAST_SHARP))
+    good = good[_near_neighbours(places[good], found.height[good], ODD_PX * found.pixel)]
+    if not len(good):
+        return None
+    goals = places[good] + found.height[good, None] * normals[good]
+    sure = found.score[good] * np.minimum(found.sharpness[good] / 0.2, 1.0)
+    sigma = found.pixel * SIGMA_PX / np.sqrt(weight * sure)
+    anchors = Anchors(samples.corners[good], samples.bary[good])
+    return NormalTerm(anchors, goals, normals[good], sigma, OUTLIER_PX * found.pixel)
+
+
+def _near_neighbours(places: np.ndarray, heights: np.ndarray, limit: float) -> np.ndarray:
+    """Mark heights (S,) at places (S, 3) within `limit` of the median of their neighbours.
+
+    The mesh's error changes slowly along the skin; that of a mismatched patch does not.
+    """
+    if len(places) < 2 * NEIGHBOURS:
+        return np.zeros(len(places), dtype=bool)
+    _, near = cKDTree(places).query(places, NEIGHBOURS)
+    return np.abs(heights - np.median(heights[near], axis=1)) < limit
+
+
+@dataclass(frozen=True)
+class SkinSamples:
+    """Samples of the face, and of neck and ears, which may be covered."""
+
+    face: Samples
+    covered: Samples
+
+    @classmethod
+    def of(cls, model: HeadModel, count: int) -> SkinSamples:
+        """Spread `count` samples over the face and fewer over neck and ears."""
+        return cls(spread(model, count), spread(model, round(COVERED_SHARE * count), COVERED))
+
+
+def patch_terms(
+    model: HeadModel,
+    skin: SkinSamples,
+    pictures: FrameSetCrops,
+    mesh: np.ndarray,
+    reach: float,
+    weight: float,
+) -> list[NormalTerm]:
+    """Search a frame set's surface about the current mesh (V, 3).
+
+    Args:
+        model: the head model.
+        skin: where to search.
+        pictures: of the frame set.
+        mesh: (V, 3) world.
+        reach: metres to either side.
+        weight: trust in what is found.
+    """
+    faces = model.faces.numpy()
+    images = [(root.mean(2), camera) for root, camera in map(root_light, pictures.crops)]
+    visibility, terms = Visibility(mesh, faces), []
+    for samples, trust in ((skin.face, 1.0), (skin.covered, COVERED_TRUST)):
+        places, normals = samples.at(mesh), sample_normals(samples, mesh)
+        views = view_weights(visibility, pictures, places, normals)
+        views = np.where(views > SLANT, views**2, 0.0)
+        found = search(images, views, places, normals, mesh, faces, reach)
+        term = surface_term(found, samples, places, normals, trust * weight)
+        if term is not None:
+            terms.append(term)
+    return terms

@@ -1,0 +1,279 @@
+"""Pictures and figures that show whether a track is right: overlays, a sheet, residuals."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+
+import cv2
+import numpy as np
+import open3d as o3d
+import torch
+
+from express50.capture.frames import read_cameras_of, read_peak_frame
+from express50.contract.layout import Dataset
+from express50.files.images import fit_into, write_image
+from express50.geometry.cameras import Camera
+from express50.geometry.conventions import affine_to_opencv
+from express50.geometry.pinhole import project_pinhole
+from express50.geometry.raycast import mesh_scene
+from express50.head.model import HeadModel, landmarks
+from pipelines.track.observe import facing
+from pipelines.track.outline import OutlineTerm
+from pipelines.track.state import Target
+
+TILE = 384
+SHEET_TILE, COLUMNS = 192, 8
+BAND, BAR = 20, 18  # heights of a tile's words and of a camera's row, pixels
+ODD = 1.5  # times the median: such residuals are drawn in ALARM
+PLAIN, ALARM, GROUND, DIM = (225, 225, 225), (255, 120, 90), 24, (110, 160, 210)
+ResidualTable = Mapping[str, Mapping[str, float]]
+SEEN_COLOR, FITTED_COLOR = (255, 210, 0), (0, 255, 120)
+
+
+def draw_overlays(
+    dataset: Dataset,
+    subject: str,
+    folder: Path,
+    model: HeadModel,
+    targets: list[Target],
+    vertices: np.ndarray,
+    rotations: np.ndarray,
+) -> dict[str, np.ndarray]:
+    """Write overlay_<expression>.jpg: frame above, mesh and landmarks below, in four views.
+
+    Yellow: detected; green: fitted. Vertices (E, V, 3) world, rotations (E, 3, 3) from head to it.
+
+    Returns:
+        Expression to the overlay (TILE, TILE, 3) uint8 in the view that the face looks at.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    cameras = read_cameras_of(dataset, subject)
+    frontal = {}
+    for target, mesh, rotation in zip(targets, vertices, rotations, strict=True):
+        chosen, columns = _four_views(target, cameras, rotation, mesh.mean(0)), {}
+        for camera_id in sorted(chosen):
+            frame = read_peak_frame(dataset, subject, target.observation.expression, camera_id)
+            seen = [v.points for v in target.observation.views if v.camera_id == camera_id]
+            columns[camera_id] = draw_column(frame, cameras[camera_id], model, mesh, seen)
+        path = folder / f"overlay_{target.observation.expression}.jpg"
+        write_image(path, np.concatenate(list(columns.values()), axis=1), quality=88)
+        frontal[target.observation.expression] = columns[chosen[0]][TILE:]
+    return frontal
+
+
+def _four_views(
+    target: Target, cameras: dict[str, Camera], rotation: np.ndarray, middle: np.ndarray
+) -> list[str]:
+    """Choose up to four cameras: the one the face looks at, then the furthest from those chosen."""
+    views = sorted(target.observation.views, key=lambda view: -facing(view, rotation, middle))
+    chosen = [views[0].camera_id]
+    pool = [view.camera_id for view in views[1:]]
+    while pool and len(chosen) < 4:
+        axes = np.stack([cameras[name].cam_from_world[2, :3] for name in chosen])
+        far = [float((axes @ cameras[name].cam_from_world[2, :3]).max()) for name in pool]
+        chosen.append(pool.pop(int(np.argmin(far))))
+    return chosen
+
+
+def draw_column(
+    frame: np.ndarray,
+    camera: Camera,
+    model: HeadModel,
+    mesh: np.ndarray,
+    seen: list[np.ndarray],
+    tile: int = TILE,
+) -> np.ndarray:
+    """Draw frame and overlay (2 tile, tile, 3) of the part of one view where the head is.
+
+    Args:
+        frame: (H, W, 3) uint8, undistorted.
+        camera: pinhole; its id is written on the picture.
+        model: the head model.
+        mesh: (V, 3) world.
+        seen: arrays (N, 2) of detected pixels.
+        tile: side of the picture, pixels.
+    """
+    pixels, _ = project_pinhole(camera, mesh)
+    low, high = pixels.min(0), pixels.max(0)
+    side = 1.08 * float((high - low).max())
+    corner = 0.5 * (low + high) - 0.5 * side
+    scale = tile / side
+    matrix = np.array([[scale, 0, -scale * corner[0]], [0, scale, -scale * corner[1]]])
+    flags = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
+    crop = cv2.warpAffine(frame, affine_to_opencv(matrix), (tile, tile), flags=flags)
+    shaded = _wireframe(crop, camera, matrix, model, mesh)
+    marks = landmarks(model, torch.from_numpy(mesh)[None])[0].numpy()
+    _dots(shaded, project_pinhole(camera, marks)[0] @ matrix[:, :2].T + matrix[:, 2], FITTED_COLOR)
+    for points in seen:
+        _dots(shaded, points @ matrix[:, :2].T + matrix[:, 2], SEEN_COLOR)
+    cv2.putText(shaded, camera.id, (6, 16), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (255, 255, 255), 1)
+    return np.concatenate([crop, shaded])
+
+
+def _wireframe(
+    crop: np.ndarray, camera: Camera, matrix: np.ndarray, model: HeadModel, mesh: np.ndarray
+) -> np.ndarray:
+    """Blend visible triangle edges and the mesh's outline into a crop."""
+    K = np.diag([matrix[0, 0], matrix[1, 1], 1.0]) @ camera.K
+    K[:2, 2] += matrix[:, 2]
+    scene = mesh_scene(mesh, model.faces.numpy())
+    rays = o3d.t.geometry.RaycastingScene.create_rays_pinhole(
+        intrinsic_matrix=o3d.core.Tensor(K),
+        extrinsic_matrix=o3d.core.Tensor(camera.cam_from_world),
+        width_px=crop.shape[1],
+        height_px=crop.shape[0],
+    )
+    cast = scene.cast_rays(rays)
+    hit = np.isfinite(cast["t_hit"].numpy())
+    bary = cast["primitive_uvs"].numpy()
+    smallest = np.minimum(bary.min(2), 1 - bary.sum(2))
+    edge = hit & (smallest < 0.08)
+    rim = hit ^ cv2.erode(hit.astype(np.uint8), np.ones((3, 3), np.uint8)).astype(bool)
+    image = crop.astype(np.float32)
+    image[edge] = 0.7 * image[edge] + 0.3 * np.array([90, 200, 255], np.float32)
+    image[rim] = np.array([255, 60, 60], np.float32)
+    return np.ascontiguousarray(image.astype(np.uint8))
+
+
+def _dots(image: np.ndarray, points: np.ndarray, color: tuple[int, int, int]) -> None:
+    """Draw small dots at tile pixels (N, 2), corner origin, in place."""
+    for x, y in points:
+        if 0 <= x < image.shape[1] and 0 <= y < image.shape[0]:
+            cv2.circle(image, (int(x), int(y)), 1, color, -1, cv2.LINE_AA)
+
+
+def write_sheet(folder: Path, tiles: Mapping[str, np.ndarray], table: ResidualTable) -> None:
+    """Write sheet.jpg: one overlay per expression and one bar per camera.
+
+    Args:
+        folder: target.
+        tiles: expression to its overlay (H, W, 3) uint8, as ``draw_overlays`` returns them.
+        table: expression to camera to RMS of its landmarks, pixels (``landmark_rms_px``).
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    parts = [contact_sheet(tiles, expression_residuals(table)), camera_bars(table)]
+    width = max(part.shape[1] for part in parts)
+    padded = [
+        np.pad(part, ((0, 0), (0, width - part.shape[1]), (0, 0)), constant_values=GROUND)
+        for part in parts
+    ]
+    write_image(folder / "sheet.jpg", np.concatenate(padded), quality=90)
+
+
+def expression_residuals(table: ResidualTable) -> dict[str, float]:
+    """Return RMS pixels per expression that has landmarks, its cameras weighted equally."""
+    return {name: _rms(row.values()) for name, row in table.items() if row}
+
+
+def camera_residuals(table: ResidualTable) -> dict[str, tuple[float, int]]:
+    """Return RMS pixels per camera and its number of expressions, sorted by id."""
+    found: dict[str, list[float]] = {}
+    for row in table.values():
+        for camera, value in row.items():
+            found.setdefault(camera, []).append(value)
+    return {camera: (_rms(found[camera]), len(found[camera])) for camera in sorted(found)}
+
+
+def contact_sheet(
+    tiles: Mapping[str, np.ndarray], residuals: Mapping[str, float] | None = None
+) -> np.ndarray:
+    """Draw all expressions (H, W, 3) uint8, each with its name and residual.
+
+    Args:
+        tiles: expression to its overlay (h, w, 3) uint8.
+        residuals: expression to RMS pixels; those far above the median stand out.
+    """
+    known = residuals or {}
+    limit = ODD * float(np.median(list(known.values()))) if known else math.inf
+    cells = [_cell(name, image, known.get(name), limit) for name, image in tiles.items()]
+    columns = min(COLUMNS, max(1, math.ceil(math.sqrt(1.6 * len(cells)))))
+    blank = np.full((SHEET_TILE + BAND, SHEET_TILE, 3), GROUND, np.uint8)
+    cells += [blank] * (-len(cells) % columns or (0 if cells else columns))
+    rows = [np.concatenate(cells[k : k + columns], 1) for k in range(0, len(cells), columns)]
+    return np.concatenate(rows)
+
+
+def _cell(name: str, image: np.ndarray, residual: float | None, limit: float) -> np.ndarray:
+    """Draw a tile with a band of text below."""
+    cell = np.full((SHEET_TILE + BAND, SHEET_TILE, 3), GROUND, np.uint8)
+    cell[:SHEET_TILE] = fit_into(image, SHEET_TILE, SHEET_TILE)
+    colour = ALARM if residual is not None and residual > limit else PLAIN
+    value = "no landmarks" if residual is None else f"{residual:.2f} px"
+    room = (
+        SHEET_TILE - 10 - _words(cell, value, SHEET_TILE - 4, SHEET_TILE + 14, colour, right=True)
+    )
+    while len(name) > 1 and _width(name) > room:
+        name = name[:-1]
+    _words(cell, name, 4, SHEET_TILE + 14, colour)
+    return cell
+
+
+def camera_bars(table: ResidualTable) -> np.ndarray:
+    """Draw a bar chart (H, W, 3) uint8: RMS pixels per camera, with its number of expressions."""
+    rows = camera_residuals(table)
+    values = [value for value, _ in rows.values()]
+    limit = ODD * float(np.median(values)) if values else math.inf
+    left, length = 16 + max(map(_width, rows), default=0), 2 * SHEET_TILE
+    chart = np.full((BAR * (len(rows) + 1) + 8, left + length + 190, 3), GROUND, np.uint8)
+    title = "landmark residual by camera, RMS px" if rows else "no camera has landmarks"
+    _words(chart, title, 6, 14, PLAIN)
+    scale = length / max([*values, 1e-9])
+    for k, (camera, (value, count)) in enumerate(rows.items(), 1):
+        y = BAR * k
+        odd = value > limit
+        _words(chart, camera, 6, y + 14, ALARM if odd else PLAIN)
+        end = left + max(1, round(value * scale))
+        cv2.rectangle(chart, (left, y + 4), (end, y + 14), ALARM if odd else DIM, -1)
+        words = f"{value:.2f}  ({count} expression{'s' if count > 1 else ''})"
+        _words(chart, words, end + 6, y + 14, PLAIN)
+    return chart
+
+
+def _words(
+    image: np.ndarray, text: str, x: int, y: int, colour: tuple[int, int, int], right: bool = False
+) -> int:
+    """Write words with their baseline at (x, y), or ending there; returns their width."""
+    width = _width(text)
+    place = (x - width if right else x, y)
+    cv2.putText(image, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.4, colour, 1, cv2.LINE_AA)
+    return width
+
+
+def _width(text: str) -> int:
+    return cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, 0.4, 1)[0][0]
+
+
+def _rms(values: object) -> float:
+    return float(np.sqrt(np.mean(np.square(np.fromiter(values, float)))))  # type: ignore[call-overload]
+
+
+def track_metrics(model: HeadModel, targets: list[Target], vertices: np.ndarray) -> dict:
+    """Measure the reprojection of inlier landmarks, RMS pixels per expression and camera."""
+    marks = landmarks(model, torch.from_numpy(vertices)).numpy()
+    table: dict[str, dict[str, float]] = {}
+    used, total = 0, 0
+    for target, points in zip(targets, marks, strict=True):
+        row = {}
+        for view, inliers in zip(target.observation.views, target.observation.inliers, strict=True):
+            pixels, _ = project_pinhole(view.camera, points)
+            squared = ((pixels - view.points) ** 2).sum(1)
+            chosen = inliers.copy()
+            chosen[:17] = False
+            if chosen.any():
+                row[view.camera_id] = round(float(np.sqrt(squared[chosen].mean())), 4)
+            used, total = used + int(inliers.sum()), total + inliers.size
+        table[target.observation.expression] = row
+    values = [value for row in table.values() for value in row.values()]
+    return {
+        "expressions": len(targets),
+        "landmark_rms_px": table,
+        "landmark_rms_px_mean": round(float(np.mean(values)), 4) if values else None,
+        "landmarks_used": used,
+        "landmarks_seen": total,
+        "outline_views": sum(
+            isinstance(term, OutlineTerm) for target in targets for term in target.terms
+        ),
+        "head": model.name,
+    }

@@ -1,0 +1,167 @@
+"""The rounds of tracking: read evidence from the pictures on the current mesh, fit, look again.
+
+Every round makes the terms of every expression anew, as outlines, visibility and patches depend on
+the mesh. The schedule is a table, made once from the settings and written to metrics.json.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, replace
+
+import numpy as np
+
+from express50.head.model import HeadModel
+from pipelines.track.baldness import is_bald
+from pipelines.track.basis import ALONG, OFF, Basis
+from pipelines.track.crops import FrameSetCrops, root_light
+from pipelines.track.eyes_and_jaw import EyeOffsets, with_irises_and_jaw
+from pipelines.track.face_uv import slide_term, with_slide
+from pipelines.track.face_uv_map import FaceUvMap, reading_map
+from pipelines.track.fit import fit
+from pipelines.track.outline import outline_terms
+from pipelines.track.photo_consistency import SkinSamples, patch_terms
+from pipelines.track.state import State, Target, all_vertices, rotations
+from pipelines.track.terms import NormalTerm, SlideTerm
+
+LANDMARK_STEPS = 14  # of the first fit, to landmarks alone; 6 measure the same on the twin
+ROUND_STEPS = 4
+EYE_ROUNDS = 2  # irises and visible jaw lines are found anew at least so often
+PATCH_REACH_M = 0.008  # of the first search, to either side of the mesh
+NARROWING, NARROWINGS = 0.6, 3  # factor of the reach from round to round, and how often
+# Far from the surface, whole patches of skin may match wrongly together: trust grows by this
+# factor towards the last round.
+TRUST_GROWTH = 1 / 0.3
+
+
+@dataclass(frozen=True)
+class Round:
+    """The evidence of one round; landmarks, irises and the jaw line are always in.
+
+    Attributes:
+        outlines: fit the outlines of the mattes.
+        patch_reach_m: how far along the normals the surface is searched for; 0 for no search.
+        patch_weight: trust in what the search finds.
+        read_uv: find landmarks on the face UV map anew; otherwise the last reading stays.
+    """
+
+    outlines: bool
+    patch_reach_m: float
+    patch_weight: float
+    read_uv: bool
+
+
+Schedule = tuple[Round, ...]
+
+
+def make_schedule(outline_rounds: int, patch_rounds: int, uv_rounds: int) -> Schedule:
+    """Lay out the rounds: outlines in the last ones, UV landmarks in the first.
+
+    The search narrows over the first rounds and gains trust towards the last.
+    """
+    count = max(outline_rounds, patch_rounds, EYE_ROUNDS)
+    return tuple(
+        Round(
+            outlines=count - index <= outline_rounds,
+            patch_reach_m=PATCH_REACH_M * NARROWING ** min(index, NARROWINGS) * (patch_rounds > 0),
+            patch_weight=TRUST_GROWTH ** -max(patch_rounds - 1 - index, 0),
+            read_uv=index < uv_rounds,
+        )
+        for index in range(count)
+    )
+
+
+def schedule_table(schedule: Schedule) -> list[dict[str, object]]:
+    """Write the schedule for metrics.json: one row per round."""
+    return [
+        {"round": number} | {
+            key: float(f"{value:.4g}") if isinstance(value, float) else value
+            for key, value in asdict(one).items()
+        }
+        for number, one in enumerate(schedule, 1)
+    ]  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What all rounds of a subject look at.
+
+    Attributes:
+        model: the head model.
+        pictures: of every expression's frame set.
+        skin: where the surface is searched for.
+        uv_map: of the face; None if no round reads it.
+        eyes: from `measure_eyes`.
+        bald: the skull is bare.
+    """
+
+    model: HeadModel
+    pictures: list[FrameSetCrops]
+    skin: SkinSamples
+    uv_map: FaceUvMap | None
+    eyes: EyeOffsets | None
+    bald: bool
+
+
+def gather(
+    model: HeadModel,
+    pictures: list[FrameSetCrops],
+    meshes: np.ndarray,
+    eyes: EyeOffsets | None,
+    samples: int,
+    schedule: Schedule,
+) -> Evidence:
+    """Prepare what the rounds share; `meshes` (E, V, 3) are of the fit to landmarks."""
+    shown = next((k for k, one in enumerate(pictures) if one.crops), None)
+    bald = shown is not None and is_bald(
+        model, [root_light(crop) for crop in pictures[shown].crops], meshes[shown]
+    )
+    uv_map = reading_map(model) if any(one.read_uv for one in schedule) else None
+    return Evidence(model, pictures, SkinSamples.of(model, samples), uv_map, eyes, bald)
+
+
+def refine(
+    basis: Basis, targets: list[Target], state: State, evidence: Evidence, schedule: Schedule
+) -> tuple[State, list[Target]]:
+    """Run the rounds; also returns the targets with the last round's terms."""
+    slides: list[SlideTerm | None] = [None] * len(targets)
+    found = targets
+    for one in schedule:
+        meshes, turns = all_vertices(basis.model, state), rotations(state)
+        if one.read_uv and evidence.uv_map is not None:
+            slides = [
+                slide_term(evidence.model, evidence.uv_map, *pair)
+                for pair in zip(evidence.pictures, meshes, strict=True)
+            ]
+        found = [
+            collect(one, evidence, index, target, meshes[index], turns[index], slides[index])
+            for index, target in enumerate(targets)
+        ]
+        kinds = {type(term) for target in found for term in target.terms}
+        free = tuple(
+            name for kind, name in ((NormalTerm, OFF), (SlideTerm, ALONG)) if kind in kinds
+        )
+        state, _ = fit(basis, found, state, ROUND_STEPS, free)
+    return state, found
+
+
+def collect(
+    one: Round,
+    evidence: Evidence,
+    index: int,
+    target: Target,
+    mesh: np.ndarray,
+    rotation: np.ndarray,
+    slide: SlideTerm | None,
+) -> Target:
+    """Add a round's terms to the target of one expression, on its current mesh (V, 3)."""
+    model, pictures = evidence.model, evidence.pictures[index]
+    terms = list(target.terms)
+    if one.outlines:
+        count = sum(len(each.distances) for each in evidence.pictures)
+        terms += outline_terms(model, pictures.distances, mesh, count, evidence.bald)
+    if one.patch_reach_m:
+        reach, weight = one.patch_reach_m, one.patch_weight
+        terms += patch_terms(model, evidence.skin, pictures, mesh, reach, weight)
+    target = replace(target, terms=tuple(terms))
+    target = with_irises_and_jaw(model, target, mesh, rotation, evidence.eyes)
+    return with_slide(target, slide)

@@ -1,0 +1,262 @@
+"""Residuals that tracking minimises: one form for landmarks, outlines, patches and the rest.
+
+A term speaks about *places*, weighted sums of mesh vertices. For places (n, 3) it returns residual
+vectors in standard deviations and their slope by the place; its loss turns squared lengths into
+cost and weight. The solver (`fit`) knows no more than that.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from express50.geometry.cameras import Camera
+from express50.geometry.pinhole import project_with_slope
+from express50.head.model import HeadModel
+
+HUBER = 1.5  # standard deviations beyond which a residual counts by its length, not its square
+LID_GAP_M = 0.0005  # standard deviation of the gap between the lids of a shut eye
+SLIDE_OUTLIER_M = 0.004
+
+Residuals = tuple[np.ndarray, np.ndarray, np.ndarray]
+"""Which place each residual is about (m,), the residuals (m, k), their slope by it (m, k, 3)."""
+
+
+@dataclass(frozen=True)
+class Anchors:
+    """Places on a mesh: weighted sums of its vertices.
+
+    Attributes:
+        vertices: (n, k) vertex ids.
+        weights: (n, k); barycentric for a point of a face, of both signs for a difference.
+    """
+
+    vertices: np.ndarray
+    weights: np.ndarray
+
+    @classmethod
+    def of_vertices(cls, ids: np.ndarray) -> Anchors:
+        """Vertices (n,) themselves."""
+        return cls(ids[:, None], np.ones((len(ids), 1)))
+
+    def some(self, ids: np.ndarray) -> Anchors:
+        """Choose places by index or mask."""
+        return Anchors(self.vertices[ids], self.weights[ids])
+
+    def minus(self, other: Anchors) -> Anchors:
+        """Differences between these places and as many others."""
+        return Anchors(
+            np.concatenate([self.vertices, other.vertices], axis=1),
+            np.concatenate([self.weights, -other.weights], axis=1),
+        )
+
+    def at(self, vertices: np.ndarray) -> np.ndarray:
+        """Places (n, 3) on vertices (V, 3)."""
+        return np.einsum("nk,nkc->nc", self.weights, vertices[self.vertices])
+
+
+def landmark_anchors(model: HeadModel) -> Anchors:
+    """Return the 68 landmarks' places on a head model."""
+    bary = model.landmark_bary.double().numpy()
+    # Single-precision weights miss 1 by 1e-7, which is a millimetre 10 km from the origin.
+    bary = bary / bary.sum(1, keepdims=True)
+    return Anchors(model.faces.numpy()[model.landmark_faces.numpy()], bary)
+
+
+class Term(Protocol):
+    """Residuals about some places of one expression's mesh."""
+
+    @property
+    def anchors(self) -> Anchors:
+        """The n places."""
+
+    def residuals(self, places: np.ndarray) -> Residuals:
+        """Evaluate at places (n, 3), world."""
+
+    def loss(self, square: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Cost (m,) and weight (m,) of squared residuals (m,)."""
+
+
+def squared(square: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Least squares: no residual is an outlier."""
+    return 0.5 * square, np.ones_like(square)
+
+
+def huber(square: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Huber's loss: outliers keep a constant pull."""
+    length = np.sqrt(square)
+    far = HUBER * (length - 0.5 * HUBER)
+    weight = np.minimum(1.0, HUBER / np.maximum(length, 1e-9))
+    return np.where(length <= HUBER, 0.5 * square, far), weight
+
+
+def geman_mcclure(square: np.ndarray, scale: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Geman and McClure's loss: residuals well beyond `scale` (m,) lose their pull."""
+    fade = 1.0 + square / scale**2
+    return 0.5 * square / fade, fade**-2
+
+
+def cost(term: Term, places: np.ndarray) -> float:
+    """Sum a term's cost at places (n, 3)."""
+    _, value, _ = term.residuals(places)
+    return float(term.loss((value**2).sum(1))[0].sum())
+
+
+def information(term: Term, places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Gauss-Newton matrices (n, 3, 3) and gradients (n, 3) of a term's cost by its places."""
+    rows, value, slope = term.residuals(places)
+    weight = term.loss((value**2).sum(1))[1][:, None, None]
+    matrix, gradient = np.zeros((len(places), 3, 3)), np.zeros((len(places), 3))
+    weighted = np.swapaxes(weight * slope, 1, 2)
+    np.add.at(matrix, rows, weighted @ slope)
+    np.add.at(gradient, rows, (weighted @ value[..., None])[..., 0])
+    return matrix, gradient
+
+
+@dataclass(frozen=True)
+class Sighting:
+    """Places seen by one camera.
+
+    Attributes:
+        camera: pinhole camera.
+        rows: (m,) places of the term.
+        pixels: (m, 2).
+        sigma: (m,) pixels.
+    """
+
+    camera: Camera
+    rows: np.ndarray
+    pixels: np.ndarray
+    sigma: np.ndarray
+
+
+@dataclass(frozen=True)
+class PixelTerm:
+    """Reprojection errors: places should be seen at given pixels.
+
+    Attributes:
+        anchors: n places.
+        sightings: one per camera.
+    """
+
+    anchors: Anchors
+    sightings: tuple[Sighting, ...]
+
+    def residuals(self, places: np.ndarray) -> Residuals:
+        """Pixels off, over sigma."""
+        rows, values, slopes = [np.zeros(0, int)], [np.zeros((0, 2))], [np.zeros((0, 2, 3))]
+        for seen in self.sightings:
+            pixels, slope = project_with_slope(seen.camera, places[seen.rows])
+            rows.append(seen.rows)
+            values.append((pixels - seen.pixels) / seen.sigma[:, None])
+            slopes.append(slope / seen.sigma[:, None, None])
+        return np.concatenate(rows), np.concatenate(values), np.concatenate(slopes)
+
+    def loss(self, square: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Huber's."""
+        return huber(square)
+
+
+@dataclass(frozen=True)
+class PointTerm:
+    """Places should lie at points in space, as where neighbouring frames of a clip expect them.
+
+    Attributes:
+        anchors: n places.
+        goals: (n, 3) world.
+        sigma: metres.
+    """
+
+    anchors: Anchors
+    goals: np.ndarray
+    sigma: float
+
+    def residuals(self, places: np.ndarray) -> Residuals:
+        """Metres off, over sigma."""
+        slope = np.broadcast_to(np.eye(3) / self.sigma, (len(places), 3, 3))
+        return np.arange(len(places)), (places - self.goals) / self.sigma, slope
+
+    def loss(self, square: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Huber's."""
+        return huber(square)
+
+
+@dataclass(frozen=True)
+class NormalTerm:
+    """Places should lie on the surface: only the distance along a normal counts.
+
+    Attributes:
+        anchors: n places.
+        goals: (n, 3) points of the surface, world.
+        normals: (n, 3) unit, world.
+        sigma: (n,) metres.
+        outlier: metres beyond which a point is more likely wrong than the mesh.
+    """
+
+    anchors: Anchors
+    goals: np.ndarray
+    normals: np.ndarray
+    sigma: np.ndarray
+    outlier: float
+
+    def residuals(self, places: np.ndarray) -> Residuals:
+        """Distance along the normal, over sigma."""
+        slope = (self.normals / self.sigma[:, None])[:, None]
+        value = ((places - self.goals) * slope[:, 0]).sum(1, keepdims=True)
+        return np.arange(len(places)), value, slope
+
+    def loss(self, square: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Geman and McClure's."""
+        return geman_mcclure(square, self.outlier / self.sigma)
+
+
+@dataclass(frozen=True)
+class SlideTerm:
+    """Places should slide along the skin to where it belongs; the distance off it does not count.
+
+    Attributes:
+        anchors: n landmarks.
+        marks: (n,) which of the 68 they are.
+        goals: (n, 3) world.
+        normals: (n, 3) unit, world.
+        sigma: (n,) metres.
+    """
+
+    anchors: Anchors
+    marks: np.ndarray
+    goals: np.ndarray
+    normals: np.ndarray
+    sigma: np.ndarray
+
+    def residuals(self, places: np.ndarray) -> Residuals:
+        """Metres off along the skin, over sigma."""
+        flat = np.eye(3) - self.normals[:, :, None] * self.normals[:, None, :]
+        slope = flat / self.sigma[:, None, None]
+        value = (slope @ (places - self.goals)[..., None])[..., 0]
+        return np.arange(len(places)), value, slope
+
+    def loss(self, square: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Geman and McClure's."""
+        return geman_mcclure(square, SLIDE_OUTLIER_M / self.sigma)
+
+
+@dataclass(frozen=True)
+class LidTerm:
+    """Differences between upper and lower lid of shut eyes should vanish, wherever the lids are.
+
+    Attributes:
+        anchors: n differences between landmarks.
+    """
+
+    anchors: Anchors
+
+    def residuals(self, places: np.ndarray) -> Residuals:
+        """Metres apart, over sigma."""
+        slope = np.broadcast_to(np.eye(3) / LID_GAP_M, (len(places), 3, 3))
+        return np.arange(len(places)), places / LID_GAP_M, slope
+
+    def loss(self, square: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Least squares."""
+        return squared(square)
