@@ -29,14 +29,13 @@ from express50.capture.frames import read_cameras_of, read_peaks
 from express50.capture.index import index_path, index_to_json, read_index
 from express50.contract.config import build_config
 from express50.contract.layout import Dataset
-from express50.contract.stage import Result
 from express50.files.calibration import read_cameras, write_cameras
 from express50.head.load import load_head
 from express50.runner.runner import run_stage
 from express50.twin.config import TwinConfig
 from express50.twin.record import record
 from express50.twin.truth import Truth
-from pipelines import alpha, calibrate, ingest, matte
+from pipelines import alpha, calibrate, frames, ingest, matte
 from pipelines.ingest import register
 from pipelines.track import STAGE
 
@@ -122,7 +121,7 @@ def prepare(config: TwinConfig, folder: Path) -> Reference:
         run_stage(stage, dataset, build_config(stage, {}), workers=0, progress=False)
     for subject in dataset.subjects():
         write_peaks(dataset, subject, truth.peaks(subject))
-    for stage in (alpha.STAGE, matte.STAGE):
+    for stage in (frames.STAGE, alpha.STAGE, matte.STAGE):
         run_stage(stage, dataset, build_config(stage, {}), workers=0, progress=False)
     return dataset, truth, folder / "captures"
 
@@ -210,8 +209,7 @@ def track(
     """Errors of a subject's frames, and what the stage itself says and costs."""
     with tempfile.TemporaryDirectory() as scratch:
         began = time.process_time()
-        metrics = STAGE.run(dataset, subject, config, Path(scratch))
-        metrics = metrics.to_json() if isinstance(metrics, Result) else metrics
+        metrics = STAGE.run(dataset, subject, config, Path(scratch)).metrics
         seconds = time.process_time() - began
         errors = compare(dataset, truth, subject, Path(scratch) / "track.npz", views)
     return errors, {"seconds": seconds, "detected_px": metrics["landmark_rms_px_mean"]}
@@ -252,7 +250,7 @@ def narrowed(
 ) -> Dataset:
     """One subject's dataset in links: peaks of `cues` and the last one's clip, or fewer cameras."""
     part = Dataset(out)
-    for stage in ("ingest", "calibrate", "align", "matte"):
+    for stage in ("ingest", "calibrate", "align", "frames", "matte"):
         source = dataset.item_dir(stage, subject).resolve()
         part.item_dir(stage, subject).mkdir(parents=True)
         for path in source.iterdir():

@@ -32,7 +32,7 @@ from express50.head.model import HeadModel, vertex_normals
 from express50.landmarks.iris import EYES
 from pipelines.track.observe import LandmarkView, Observation, agree
 from pipelines.track.state import Target
-from pipelines.track.terms import Anchors, LidTerm, PixelTerm, Sighting, landmark_anchors
+from pipelines.track.terms import LidTerm, MeshPlaces, PixelTerm, Sighting, landmark_anchors
 
 LOOKS_AT = 0.3  # cosine between gaze and camera below which an iris is not trusted
 # An eyeball's misplacement: standard deviation of what is left of it, and of all of it (prior).
@@ -188,7 +188,7 @@ def _iris_term(
             common = EYEBALL_M * float(np.linalg.norm(slope[0], axis=1).max()) * len(views) ** 0.5
             spread = np.array([np.hypot(sigma, common)])
             sightings.append(Sighting(view.camera, np.array([side]), pixel[None], spread))
-    return PixelTerm(Anchors.of_vertices(np.array(eyes.vertices)), tuple(sightings))
+    return PixelTerm(MeshPlaces.of_vertices(np.array(eyes.vertices)), tuple(sightings))
 
 
 def _jaw_term(
@@ -205,7 +205,7 @@ def _jaw_term(
     taken = np.flatnonzero(np.isfinite(sigma[:JAW]) & line.moved & line.usable)
     sigma[:JAW][line.moved | ~line.usable] = np.inf
     seen = Sighting(view.camera, np.arange(len(taken)), view.points[taken], spread[taken])
-    return PixelTerm(Anchors.of_vertices(line.corners[taken, 0]), (seen,))
+    return PixelTerm(MeshPlaces.of_vertices(line.corners[taken, 0]), (seen,))
 
 
 def lid_terms(model: HeadModel, observation: Observation) -> tuple[LidTerm, ...]:

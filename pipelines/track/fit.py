@@ -23,7 +23,7 @@ from pipelines.track.basis import MODE, Basis, Points
 from pipelines.track.observe import JAW_LINE_WEIGHT
 from pipelines.track.state import Pose, State, Target, prior
 from pipelines.track.terms import (
-    Anchors,
+    MeshPlaces,
     PixelTerm,
     Sighting,
     Term,
@@ -122,7 +122,7 @@ class _Expression:
     """
 
     terms: tuple[Term, ...]
-    anchors: tuple[Anchors, ...]
+    anchors: tuple[MeshPlaces, ...]
     points: Points
     neutral: bool
     single_view: bool
@@ -132,7 +132,7 @@ class _Expression:
         terms = (landmark_term(basis, target), *target.terms)
         ids = np.unique(np.concatenate([term.anchors.vertices.ravel() for term in terms]))
         anchors = tuple(
-            Anchors(np.searchsorted(ids, term.anchors.vertices), term.anchors.weights)
+            MeshPlaces(np.searchsorted(ids, term.anchors.vertices), term.anchors.weights)
             for term in terms
         )
         single = len(target.observation.views) == 1
@@ -207,7 +207,7 @@ def _normal_equations(
 
 
 def _over_vertices(
-    anchors: tuple[Anchors, ...], found: list[tuple[np.ndarray, np.ndarray]], count: int
+    anchors: tuple[MeshPlaces, ...], found: list[tuple[np.ndarray, np.ndarray]], count: int
 ) -> tuple[sparse.csr_matrix, np.ndarray]:
     """Sum the terms over M vertices: information W (3 M, 3 M) and gradient (3 M,)."""
     axes, gradient = np.arange(3), np.zeros((count, 3))

@@ -18,7 +18,7 @@ from express50.geometry.pinhole import project_with_slope
 from express50.geometry.raycast import mesh_scene
 from express50.geometry.sampling import bilinear_slope
 from express50.head.model import HeadModel
-from pipelines.track.terms import Anchors, Residuals, huber
+from pipelines.track.terms import MeshPlaces, Residuals, huber
 
 # Head outlines count as about this many independent points a view.
 EFFECTIVE_POINTS = 24
@@ -59,7 +59,7 @@ class OutlineTerm:
     """
 
     distance: SignedDistance
-    anchors: Anchors
+    anchors: MeshPlaces
     sigma: np.ndarray
     gap: np.ndarray
 
@@ -88,7 +88,7 @@ class OutlineTerm:
         cover = np.hypot(edge, COVER_SIGMA_M * scale) * max(1, pictures) ** 0.5
         sigma = np.stack([np.where(covered, cover, edge), np.full(count, edge)], axis=1)
         gap = np.full(count, (BALD_GAP_M if bald else HAIR_GAP_M) * scale)
-        return cls(distance, Anchors.of_vertices(ids), sigma * redundancy, gap)
+        return cls(distance, MeshPlaces.of_vertices(ids), sigma * redundancy, gap)
 
     def residuals(self, places: np.ndarray) -> Residuals:
         """Signed distance over sigma; inside the matte v^2 becomes v^2 / (1 + v^2 / gap^2)."""

@@ -29,7 +29,7 @@ from pipelines.track.surface import (
     spread,
     view_weights,
 )
-from pipelines.track.terms import Anchors, NormalTerm
+from pipelines.track.terms import MeshPlaces, NormalTerm
 
 PATCH = 7
 VIEWS = 8
@@ -202,7 +202,7 @@ def surface_term(
     goals = places[good] + found.height[good, None] * normals[good]
     sure = found.score[good] * np.minimum(found.sharpness[good] / 0.2, 1.0)
     sigma = found.pixel * SIGMA_PX / np.sqrt(weight * sure)
-    anchors = Anchors(samples.corners[good], samples.bary[good])
+    anchors = MeshPlaces(samples.corners[good], samples.bary[good])
     return NormalTerm(anchors, goals, normals[good], sigma, OUTLIER_PX * found.pixel)
 
 

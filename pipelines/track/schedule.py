@@ -82,7 +82,7 @@ def schedule_table(schedule: Schedule) -> list[dict[str, object]]:
 
 
 @dataclass(frozen=True)
-class Evidence:
+class SubjectEvidence:
     """What all rounds of a subject look at.
 
     Attributes:
@@ -109,18 +109,18 @@ def gather(
     eyes: EyeOffsets | None,
     samples: int,
     schedule: Schedule,
-) -> Evidence:
+) -> SubjectEvidence:
     """Prepare what the rounds share; `meshes` (E, V, 3) are of the fit to landmarks."""
     shown = next((k for k, one in enumerate(pictures) if one.crops), None)
     bald = shown is not None and is_bald(
         model, [root_light(crop) for crop in pictures[shown].crops], meshes[shown]
     )
     uv_map = reading_map(model) if any(one.read_uv for one in schedule) else None
-    return Evidence(model, pictures, SkinSamples.of(model, samples), uv_map, eyes, bald)
+    return SubjectEvidence(model, pictures, SkinSamples.of(model, samples), uv_map, eyes, bald)
 
 
 def refine(
-    basis: Basis, targets: list[Target], state: State, evidence: Evidence, schedule: Schedule
+    basis: Basis, targets: list[Target], state: State, evidence: SubjectEvidence, schedule: Schedule
 ) -> tuple[State, list[Target]]:
     """Run the rounds; also returns the targets with the last round's terms."""
     slides: list[SlideTerm | None] = [None] * len(targets)
@@ -146,7 +146,7 @@ def refine(
 
 def collect(
     one: Round,
-    evidence: Evidence,
+    evidence: SubjectEvidence,
     index: int,
     target: Target,
     mesh: np.ndarray,

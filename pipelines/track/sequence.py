@@ -32,7 +32,7 @@ from pipelines.track.state import (
     posed_sigma,
     start_state,
 )
-from pipelines.track.terms import Anchors, PointTerm, landmark_anchors
+from pipelines.track.terms import MeshPlaces, PointTerm, landmark_anchors
 
 WINDOW = 48  # frames tracked in one piece, and kept if the run is stopped
 SWEEPS = 2  # 1 leaves a third more jitter, 4 changes little
@@ -174,7 +174,7 @@ def _sweep(
     """Fit every second frame once more, towards where its neighbours are."""
     person, stride = tracker.person, tracker.stride
     marks = landmark_anchors(person.model)
-    spread = Anchors.of_vertices(_spread_vertices(person))
+    spread = MeshPlaces.of_vertices(_spread_vertices(person))
     redundancy = ((len(marks.vertices) + SPREAD_VERTICES) / EFFECTIVE_POINTS) ** 0.5
     frames = [target.observation.frame for target in targets]
     meshes = [all_vertices(person.model, State(np.zeros(0), (pose,)))[0] for pose in poses]

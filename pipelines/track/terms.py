@@ -25,7 +25,7 @@ Residuals = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 @dataclass(frozen=True)
-class Anchors:
+class MeshPlaces:
     """Places on a mesh: weighted sums of its vertices.
 
     Attributes:
@@ -37,17 +37,17 @@ class Anchors:
     weights: np.ndarray
 
     @classmethod
-    def of_vertices(cls, ids: np.ndarray) -> Anchors:
+    def of_vertices(cls, ids: np.ndarray) -> MeshPlaces:
         """Vertices (n,) themselves."""
         return cls(ids[:, None], np.ones((len(ids), 1)))
 
-    def some(self, ids: np.ndarray) -> Anchors:
+    def some(self, ids: np.ndarray) -> MeshPlaces:
         """Choose places by index or mask."""
-        return Anchors(self.vertices[ids], self.weights[ids])
+        return MeshPlaces(self.vertices[ids], self.weights[ids])
 
-    def minus(self, other: Anchors) -> Anchors:
+    def minus(self, other: MeshPlaces) -> MeshPlaces:
         """Differences between these places and as many others."""
-        return Anchors(
+        return MeshPlaces(
             np.concatenate([self.vertices, other.vertices], axis=1),
             np.concatenate([self.weights, -other.weights], axis=1),
         )
@@ -57,19 +57,19 @@ class Anchors:
         return np.einsum("nk,nkc->nc", self.weights, vertices[self.vertices])
 
 
-def landmark_anchors(model: HeadModel) -> Anchors:
+def landmark_anchors(model: HeadModel) -> MeshPlaces:
     """Return the 68 landmarks' places on a head model."""
     bary = model.landmark_bary.double().numpy()
     # Single-precision weights miss 1 by 1e-7, which is a millimetre 10 km from the origin.
     bary = bary / bary.sum(1, keepdims=True)
-    return Anchors(model.faces.numpy()[model.landmark_faces.numpy()], bary)
+    return MeshPlaces(model.faces.numpy()[model.landmark_faces.numpy()], bary)
 
 
 class Term(Protocol):
     """Residuals about some places of one expression's mesh."""
 
     @property
-    def anchors(self) -> Anchors:
+    def anchors(self) -> MeshPlaces:
         """The n places."""
 
     def residuals(self, places: np.ndarray) -> Residuals:
@@ -141,7 +141,7 @@ class PixelTerm:
         sightings: one per camera.
     """
 
-    anchors: Anchors
+    anchors: MeshPlaces
     sightings: tuple[Sighting, ...]
 
     def residuals(self, places: np.ndarray) -> Residuals:
@@ -169,7 +169,7 @@ class PointTerm:
         sigma: metres.
     """
 
-    anchors: Anchors
+    anchors: MeshPlaces
     goals: np.ndarray
     sigma: float
 
@@ -195,7 +195,7 @@ class NormalTerm:
         outlier: metres beyond which a point is more likely wrong than the mesh.
     """
 
-    anchors: Anchors
+    anchors: MeshPlaces
     goals: np.ndarray
     normals: np.ndarray
     sigma: np.ndarray
@@ -224,7 +224,7 @@ class SlideTerm:
         sigma: (n,) metres.
     """
 
-    anchors: Anchors
+    anchors: MeshPlaces
     marks: np.ndarray
     goals: np.ndarray
     normals: np.ndarray
@@ -250,7 +250,7 @@ class LidTerm:
         anchors: n differences between landmarks.
     """
 
-    anchors: Anchors
+    anchors: MeshPlaces
 
     def residuals(self, places: np.ndarray) -> Residuals:
         """Metres apart, over sigma."""

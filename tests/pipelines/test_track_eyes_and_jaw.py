@@ -25,7 +25,7 @@ from pipelines.track.fit import fit
 from pipelines.track.observe import LandmarkView, agree, landmark_sigma, point_covariance
 from pipelines.track.state import Target, initial_pose, start_state
 from pipelines.track.suspects import camera_warnings, suspect_cameras
-from pipelines.track.terms import Anchors, PixelTerm, Sighting
+from pipelines.track.terms import MeshPlaces, PixelTerm, Sighting
 from tests.pipelines.test_track import RIG, make_camera, make_scene, make_views
 
 
@@ -134,7 +134,7 @@ def test_reprojection_errors_have_the_slope_they_say() -> None:
         Sighting(camera, np.array(rows), np.full((len(rows), 2), 200.0), np.array([2.0, 3.0]))
         for camera, rows in ((RIG[0], [1, 0]), (RIG[1], [0, 1]))
     ]
-    term = PixelTerm(Anchors.of_vertices(np.array([1, 3])), tuple(seen))
+    term = PixelTerm(MeshPlaces.of_vertices(np.array([1, 3])), tuple(seen))
     rows, residual, slope = term.residuals(places)
     np.testing.assert_array_equal(rows, [1, 0, 0, 1])
     for axis in range(3):

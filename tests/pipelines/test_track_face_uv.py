@@ -19,7 +19,7 @@ from pipelines.track.crops import FrameSetCrops, HeadCrop
 from pipelines.track.face_uv import DISTRUST, slide_term, with_slide
 from pipelines.track.face_uv_map import HEIGHT, WIDTH, mark_places, reading_map
 from pipelines.track.state import Target
-from pipelines.track.terms import Anchors, SlideTerm, information, landmark_anchors
+from pipelines.track.terms import MeshPlaces, SlideTerm, information, landmark_anchors
 from tests.pipelines.term_checks import cost_at, gradient_at, slope_along
 
 
@@ -31,7 +31,7 @@ def random_slide(seed: int, scale: float = 1e-3) -> tuple[SlideTerm, np.ndarray]
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     goals = vertices[ids] + scale * rng.normal(size=(5, 3))
     sigma = rng.uniform(5e-4, 2e-3, 5)
-    return SlideTerm(Anchors.of_vertices(ids), 17 + ids, goals, normals, sigma), vertices
+    return SlideTerm(MeshPlaces.of_vertices(ids), 17 + ids, goals, normals, sigma), vertices
 
 
 @settings(max_examples=30, deadline=None)

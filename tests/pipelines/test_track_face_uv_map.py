@@ -30,7 +30,13 @@ from pipelines.track.face_uv_map import (
 )
 from pipelines.track.face_uv_training.cases import Lamps, draw_case, draw_meshes, draw_person
 from pipelines.track.face_uv_training.disturb import Case, creased, mirrored, warped, where_seen
-from pipelines.track.face_uv_training.train import TrainingPlan, main, make_batch, marks_loss, train
+from pipelines.track.face_uv_training.train import (
+    UvTrainingPlan,
+    main,
+    make_batch,
+    marks_loss,
+    train,
+)
 from tests.express50.head.tiny_head import tiny_head
 
 # Texels that the mean of all landmarks may lag behind a face that is moved by five.
@@ -228,7 +234,7 @@ def test_training_goes_on_where_it_was_stopped(tmp_path, monkeypatch, head) -> N
     monkeypatch.setattr("pipelines.track.face_uv_training.train.FILE_CASES", 2)
     monkeypatch.setattr("pipelines.track.face_uv_training.train.BATCH", 2)
     monkeypatch.setattr("pipelines.track.face_uv_training.train.KEEP_EVERY", 2)
-    plan = TrainingPlan(steps=4, files=1)
+    plan = UvTrainingPlan(steps=4, files=1)
     whole = train([head], plan, tmp_path / "one").state_dict()
     steps = iter(range(3))
 

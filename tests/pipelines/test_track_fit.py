@@ -14,7 +14,7 @@ from pipelines.track.basis import OFF, Basis, Points, make_basis
 from pipelines.track.fit import fit
 from pipelines.track.observe import LandmarkView, agree, landmark_sigma
 from pipelines.track.state import Pose, State, Target
-from pipelines.track.terms import Anchors, NormalTerm
+from pipelines.track.terms import MeshPlaces, NormalTerm
 from tests.express50.head.tiny_head import tiny_head
 from tests.pipelines.test_track import RIG, make_scene
 
@@ -60,7 +60,7 @@ def exact_surface(scene) -> NormalTerm:
     """Every vertex three times, with normals along the axes: the true surface."""
     count = len(scene.vertices)
     return NormalTerm(
-        Anchors.of_vertices(np.repeat(np.arange(count), 3)),
+        MeshPlaces.of_vertices(np.repeat(np.arange(count), 3)),
         np.repeat(scene.vertices, 3, axis=0),
         np.tile(np.eye(3), (count, 1)),
         np.full(3 * count, 2e-4),

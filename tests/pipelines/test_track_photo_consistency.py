@@ -8,7 +8,7 @@ import pytest
 from pipelines.track.photo_consistency import search as search_patches
 from pipelines.track.photo_consistency import surface_term
 from pipelines.track.surface import Samples
-from pipelines.track.terms import Anchors, NormalTerm, information
+from pipelines.track.terms import MeshPlaces, NormalTerm, information
 from tests.pipelines.term_checks import cost_at, gradient_at, slope_along
 from tests.pipelines.textured_scenes import (
     ORIGIN,
@@ -67,7 +67,7 @@ def test_derivatives_and_a_step() -> None:
     vertices = rng.normal(size=(30, 3)) * 0.01
     corners, normals = rng.integers(0, 30, (50, 3)), rng.normal(size=(50, 3))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    anchors = Anchors(corners, rng.dirichlet(np.ones(3), 50))
+    anchors = MeshPlaces(corners, rng.dirichlet(np.ones(3), 50))
     goals = anchors.at(vertices) + rng.normal(size=(50, 3)) * 0.003
     term = NormalTerm(anchors, goals, normals, rng.uniform(1e-3, 3e-3, 50), 4e-3)
     eigenvalues = np.linalg.eigvalsh(information(term, anchors.at(vertices))[0])

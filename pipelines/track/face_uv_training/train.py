@@ -54,7 +54,7 @@ HELD_OUT = 0
 
 
 @dataclass(frozen=True, kw_only=True)
-class TrainingPlan:
+class UvTrainingPlan:
     """How to train: batches of charts in all, files of cases a head model, seed."""
 
     steps: int = 4000
@@ -76,12 +76,12 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--cases", type=Path, required=True, help="folder for drawn cases")
     parser.add_argument("--ict", help="ICT-FaceKit checkout or .npz to train on as well")
     parser.add_argument(
-        "--files", type=int, default=TrainingPlan.files, help="files of cases a head"
+        "--files", type=int, default=UvTrainingPlan.files, help="files of cases a head"
     )
     parser.add_argument(
-        "--steps", type=int, default=TrainingPlan.steps, help="batches of 32 charts"
+        "--steps", type=int, default=UvTrainingPlan.steps, help="batches of 32 charts"
     )
-    parser.add_argument("--seed", type=int, default=TrainingPlan.seed)
+    parser.add_argument("--seed", type=int, default=UvTrainingPlan.seed)
     parser.add_argument("--start", type=Path, default=START, help="weights to go on from")
     parser.add_argument("--out", type=Path, default=UV_WEIGHTS)
     options = parser.parse_args(arguments)
@@ -91,7 +91,7 @@ def main(arguments: list[str] | None = None) -> int:
         parser.error(f"--start {error}")
     cv2.setNumThreads(1)
     models = [load_head(spec) for spec in ("procedural", options.ict) if spec]
-    plan = TrainingPlan(steps=options.steps, files=options.files, seed=options.seed)
+    plan = UvTrainingPlan(steps=options.steps, files=options.files, seed=options.seed)
     save_network(train(models, plan, options.cases, options.start), options.out)
     net = load_network(options.out)
     for model in models:
@@ -101,7 +101,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def train(
-    models: list[HeadModel], plan: TrainingPlan, folder: Path, start: Path = START
+    models: list[HeadModel], plan: UvTrainingPlan, folder: Path, start: Path = START
 ) -> LandmarkNet:
     """Train on cases of the head models; cases and the run's state are kept in a folder."""
     torch.manual_seed(plan.seed)
