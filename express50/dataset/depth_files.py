@@ -1,4 +1,4 @@
-"""Depth and normal maps of the depth stage on disk, whichever format they were written in.
+"""Read and write depth and normal maps in all their file formats.
 
 | format | unit | range | rounding error, at most |
 |---|---|---|---|
@@ -26,7 +26,7 @@ HALF_MAX_M = 65504.0
 
 
 def depth_file(folder: Path, camera_id: str) -> Path | None:
-    """A camera's depth map in a depth item's folder, or None where there is none."""
+    """Return a camera's depth map in a depth item's folder, or None."""
     for ending in (".png", ".exr"):
         path = folder / f"{camera_id}{ending}"
         if path.is_file():
@@ -57,10 +57,10 @@ def write_depth(
 
 
 def read_depth(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Depth (H, W) float32 metres, 0 where unknown, and its validity (H, W) bool.
+    """Read depth (H, W) float32 metres, 0 where unknown, and its validity (H, W) bool.
 
     Raises:
-        FormatError: the file is no depth map.
+        FormatError: the file is not a depth map.
     """
     if path.suffix != ".exr":
         return read_depth_png(path)
@@ -91,10 +91,10 @@ def write_normals(path: Path, normals: np.ndarray, valid: np.ndarray, kind: str)
 
 
 def read_normals(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Unit normals (H, W, 3) float32, camera axes, 0 where unknown, and their validity (H, W).
+    """Read unit normals (H, W, 3) float32, camera axes, 0 where unknown, and validity (H, W).
 
     Raises:
-        FormatError: the file is no normal map.
+        FormatError: the file is not a normal map.
     """
     code = read_image(path)
     if code.ndim != 3 or code.shape[2] != 3 or code.dtype not in (np.uint8, np.uint16):

@@ -1,7 +1,7 @@
-"""Search for subjects' ids in whatever a dataset holds: by the id, or by its digest alone.
+"""Search a dataset's files for subjects' ids: by the id, or by its digest alone.
 
 An id is found as a word: letters and digits beside it would make it another. Archives, arrays of
-texts and the ledger are looked into; pixels and points are not, as they may hold any four bytes by
+texts and the ledger are searched; pixels and points are not, as they may hold any four bytes by
 chance.
 """
 
@@ -38,13 +38,13 @@ Test = Callable[[bytes], bool]
 
 
 def names(subject: str) -> Test:
-    """Whether a text names a subject."""
+    """Make a test of whether a text names a subject."""
     word = re.compile(rb"(?<![A-Za-z0-9])" + re.escape(subject.encode()) + rb"(?![A-Za-z0-9])")
     return lambda text: word.search(text) is not None
 
 
 def names_any_of(digests: Collection[str]) -> Test:
-    """Whether a text holds an id whose SHA-256 is one of the given."""
+    """Make a test of whether a text holds an id whose SHA-256 is one of the given."""
     seen: dict[bytes, bool] = {}
 
     def hit(word: bytes) -> bool:
@@ -56,24 +56,24 @@ def names_any_of(digests: Collection[str]) -> Test:
 
 
 def files_that(test: Test, root: Path) -> Iterator[Path]:
-    """Files below a folder whose path or content passes a test."""
+    """Yield files below a folder whose path or content passes a test."""
     for path in sorted(p for p in root.rglob("*") if p.is_file()):
         if test(str(path.relative_to(root)).encode()) or says(path, test):
             yield path
 
 
 def says(path: Path, test: Test) -> bool:
-    """Whether a file's content passes a test."""
+    """True if a file's content passes a test."""
     return any(map(test, texts_of(path)))
 
 
 def files_naming(root: Path, subject: str) -> Iterator[Path]:
-    """Files below a folder whose path, content or archive members name a subject."""
+    """Yield files below a folder whose path, content or archive members name a subject."""
     return files_that(names(subject), root)
 
 
 def _ids(run: bytes) -> Iterator[bytes]:
-    """Every id that a run of letters, digits, '_' and '-' may hold: ``S001_smile`` names S001."""
+    """Yield every id that letters, digits, '_' and '-' may hold: ``S001_smile`` names S001."""
     parts = [match.span() for match in PART.finditer(run)]
     for first in range(len(parts)):
         for last in range(first, min(first + LONGEST_ID, len(parts))):
@@ -82,7 +82,7 @@ def _ids(run: bytes) -> Iterator[bytes]:
 
 
 def texts_of(path: Path) -> Iterator[bytes]:
-    """What a file says in words, piece by piece."""
+    """Yield the text in a file, piece by piece."""
     suffix = path.suffix.lower()
     if suffix in IMAGE_SUFFIXES or path.name.endswith(("sqlite-wal", "sqlite-shm")):
         return
@@ -127,7 +127,7 @@ def _tar_texts(path: Path) -> Iterator[bytes]:
 
 
 def _zip_texts(path: Path) -> Iterator[bytes]:
-    """Names and texts of an archive such as .npz or a checkpoint; its numbers are left alone."""
+    """Yield names and texts of an archive such as .npz or a checkpoint, without its numbers."""
     with zipfile.ZipFile(path) as archive:
         for member in archive.infolist():
             yield member.filename.encode()
@@ -148,7 +148,7 @@ def _npy_texts(data: bytes) -> bytes:
 
 
 def _ledger_texts(path: Path) -> Iterator[bytes]:
-    """Every text of every table: a page of the file runs them together without a gap."""
+    """Yield every text of every table: a page of the file runs them together without a gap."""
     with closing(sqlite3.connect(path)) as database:
         tables = database.execute("SELECT name FROM sqlite_master WHERE type = 'table'").fetchall()
         for (table,) in tables:

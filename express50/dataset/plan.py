@@ -1,4 +1,4 @@
-"""The cost of a capture campaign, from the receipts of a dataset that was really made.
+"""Estimate the cost of a capture campaign from the receipts of a measured dataset.
 
 Seconds and bytes per item grow with the footage as each stage declares in its `Growth`: linearly
 in the product of the sizes named there, or with the exponent that two datasets of different size
@@ -26,7 +26,7 @@ from express50.runner.ledger import Ledger
 
 @dataclass(frozen=True, kw_only=True)
 class Footage:
-    """Size of a campaign; means over subjects where it was measured."""
+    """Holds the size of a campaign; means over subjects where it was measured."""
 
     subjects: float
     expressions: float
@@ -35,12 +35,12 @@ class Footage:
     frames: float
 
     def work(self, factors: Sequence[str]) -> float:
-        """Product of some of its sizes."""
+        """Multiply some of its sizes."""
         return math.prod(getattr(self, name) for name in factors)
 
 
 # Campaigns of the papers: EXPRESS-50, and RenderMe-360 as it was used beside it (280 of its people,
-# 12 expressions, 60 cameras). How long clips are is the measured dataset's.
+# 12 expressions, 60 cameras). Clips are as long as the measured dataset's.
 TARGETS: dict[str, dict[str, float]] = {
     "express-50": {"subjects": 50, "expressions": 60, "views": 24, "pixels": 3840 * 2160},
     "renderme-360": {"subjects": 280, "expressions": 12, "views": 60, "pixels": 2448 * 2048},
@@ -49,7 +49,7 @@ TARGETS: dict[str, dict[str, float]] = {
 
 @dataclass(frozen=True, kw_only=True)
 class Measured:
-    """What one stage cost in one dataset: means an item, peak over items, and with which preset."""
+    """Holds what one stage cost in one dataset: means per item, peak over items, and the preset."""
 
     footage: Footage
     items: int
@@ -61,7 +61,7 @@ class Measured:
 
 @dataclass(frozen=True, kw_only=True)
 class Row:
-    """The estimate of one stage; ``why`` instead of figures where there are none.
+    """Holds the estimate of one stage; ``why`` instead of figures where there are none.
 
     ``memory_grows`` says that peak memory was scaled; else it is as measured, a lower bound.
     """
@@ -80,7 +80,7 @@ class Row:
 
 
 def footage_of(dataset: Dataset) -> Footage:
-    """Mean size of a dataset's footage.
+    """Average the size of a dataset's footage.
 
     Raises:
         StageError: nothing is ingested.
@@ -99,10 +99,10 @@ def footage_of(dataset: Dataset) -> Footage:
 
 
 def measure(dataset: Dataset, stages: Sequence[Stage]) -> dict[str, Measured]:
-    """What every stage cost that was run, by its receipts and the files that lie there.
+    """Measure what every stage cost that was run, from its receipts and files.
 
     Raises:
-        StageError: there is no ledger, or nothing is ingested.
+        StageError: the ledger is missing, or nothing is ingested.
     """
     if not dataset.ledger.is_file():
         raise StageError(f"{dataset.root}: no ledger.sqlite; expected a dataset that was made")
@@ -128,7 +128,7 @@ def measure(dataset: Dataset, stages: Sequence[Stage]) -> dict[str, Measured]:
 
 
 def preset_of(dataset: Dataset, stage: Stage) -> str:
-    """The preset whose values a stage last ran with, or ``own`` and a digest of these."""
+    """Return the preset whose values a stage last ran with, or ``own`` and a digest of these."""
     path = dataset.config_file(stage.name)
     text = path.read_text(encoding="utf-8") if path.is_file() else ""
     for preset in stage.presets:
@@ -138,7 +138,7 @@ def preset_of(dataset: Dataset, stage: Stage) -> str:
 
 
 def target_of(name: str | None, sizes: Mapping[str, float], measured: Footage) -> Footage:
-    """The campaign to estimate: a named one, single sizes over it, the measured for the rest.
+    """Choose the campaign to estimate: a named one, single sizes over it, the rest as measured.
 
     Args:
         name: of `TARGETS`, or None.
@@ -165,7 +165,7 @@ def estimate(
     workers: int,
     preset: str | None = None,
 ) -> list[Row]:
-    """One row a stage.
+    """Estimate one row per stage.
 
     Args:
         stages: in order.
@@ -220,7 +220,7 @@ def _row(
 def _scaled(
     values: Sequence[float], measured: Sequence[Measured], factors: tuple[str, ...], target: Footage
 ) -> tuple[float, str]:
-    """A figure an item at the target's size, and how it was got."""
+    """Scale a figure per item to the target's size; return it and how it was found."""
     works = [m.footage.work(factors) for m in measured]
     goal = target.work(factors)
     words = " x ".join(factors)
@@ -236,7 +236,7 @@ def _scaled(
 def _memory(
     measured: Sequence[Measured], factors: tuple[str, ...], target: Footage
 ) -> tuple[float, bool]:
-    """Peak bytes by the line through two measurements, else the largest of them; which it is."""
+    """Return peak bytes on the line through two measurements, else the largest, and which."""
     works = [m.footage.work(factors) for m in measured]
     largest = max(m.memory for m in measured)
     if len(works) < 2 or works[-1] <= 1.2 * works[0]:
@@ -246,7 +246,7 @@ def _memory(
 
 
 def totals(rows: Sequence[Row]) -> dict[str, Any]:
-    """Sums over the stages that were measured, and which were not."""
+    """Add up the stages that were measured, and list those that were not."""
     known = [row for row in rows if not row.why]
     return {
         "core_hours": sum(row.core_hours or 0.0 for row in known),

@@ -1,7 +1,7 @@
-"""Reading ``track.npz`` and ``sequence.npz``: a subject's head in its peak frames and its clips.
+"""Read ``track.npz`` and ``sequence.npz``: a subject's head in its peak frames and its clips.
 
-Every package reads tracks through here, so that a damaged, foreign or hostile file ends in one
-line. Nothing in a file is executed: pickled objects are refused.
+Every package reads tracks here, so that a damaged or foreign file gives one line of error.
+Nothing in a file is executed: pickled objects are refused.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _AGAIN = "run 'express50 track' again"
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Track:
-    """What was tracked of a subject. E expressions, V vertices; world = R @ head + t.
+    """Holds what was tracked of a subject: E expressions, V vertices; world = R @ head + t.
 
     Attributes:
         schema: of the file, one of SCHEMAS.
@@ -56,7 +56,7 @@ class Track:
     offsets: np.ndarray
 
     def row(self, expression: str) -> int:
-        """Row of an expression.
+        """Return the row of an expression.
 
         Raises:
             StageError: it is not tracked.
@@ -68,11 +68,11 @@ class Track:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Sequence:
-    """What was tracked of a subject's clips, F frames; arrays mean what they do in `Track`.
+    """Holds what was tracked of a subject's clips, F frames; arrays mean what they do in `Track`.
 
     Attributes:
         head: head model, as ``load_head`` takes it.
-        cues: (F,) ids of the clips, one a frame.
+        cues: (F,) ids of the clips, one per frame.
         frames: (F,) int64 decode indices.
         shape: (S,) coefficients.
         expression, neck, jaw, eyes, R, t: (F, ...).
@@ -91,10 +91,10 @@ class Sequence:
 
 
 def track_file(dataset: Dataset, subject: str) -> Path:
-    """The subject's track.
+    """Return the path of the subject's track.
 
     Raises:
-        StageError: there is none.
+        StageError: it is missing.
     """
     path = dataset.item_dir("track", subject) / "track.npz"
     if not path.is_file():
@@ -106,12 +106,12 @@ def read_track(path: Path) -> Track:
     """Read and check a track.
 
     Raises:
-        StageError: there is no such file.
-        FormatError: it is no track of a known schema, its arrays do not fit each other, or one
+        StageError: the file is missing.
+        FormatError: it is not a track of a known schema, its arrays do not fit each other, or one
             holds NaN or Inf.
     """
     if not path.is_file():
-        raise StageError(f"{path}: no such track; run 'express50 track'")
+        raise StageError(f"{path}: the track is missing; run 'express50 track'")
     arrays = read_arrays(path, FormatError, "a track", mend=_AGAIN)
     try:
         schema, head = str(arrays.pop("schema")), str(arrays.pop("head"))
@@ -132,19 +132,19 @@ def read_track(path: Path) -> Track:
     return Track(schema=schema, head=head, expressions=tuple(names.tolist()), **numbers)
 
 
-OF_FRAMES = ("frames", "expression", "neck", "jaw", "eyes", "R", "t")  # a row a frame, with cues
+OF_FRAMES = ("frames", "expression", "neck", "jaw", "eyes", "R", "t")  # a row per frame, with cues
 
 
 def read_sequence(path: Path) -> Sequence:
     """Read and check the frames of a subject's clips.
 
     Raises:
-        StageError: there is no such file.
-        FormatError: it is no sequence, its arrays do not fit, or one holds NaN or Inf.
+        StageError: the file is missing.
+        FormatError: it is not a sequence, its arrays do not fit, or one holds NaN or Inf.
     """
     if not path.is_file():
         raise StageError(
-            f"{path}: no such sequence; run 'express50 track --set track.frames=clips', or"
+            f"{path}: the sequence is missing; run 'express50 track --set track.frames=clips', or"
             " 'express50 photo' on a video"
         )
     arrays = read_arrays(path, FormatError, "a sequence", mend=_AGAIN)
@@ -167,7 +167,7 @@ def read_sequence(path: Path) -> Sequence:
 
 
 def _shapes(arrays: dict[str, np.ndarray], count: int) -> dict[str, tuple[int | None, ...]]:
-    """Expected shape of every array of a track with ``count`` expressions."""
+    """Return the expected shape of every array of a track with ``count`` expressions."""
     vertices = arrays["vertices"].shape[1] if arrays["vertices"].ndim == 3 else None
     return {
         "frames": (count,),
@@ -190,7 +190,7 @@ def _check_names(names: np.ndarray, alone: bool = True) -> None:
 
 
 def _check(name: str, array: np.ndarray, shape: tuple[int | None, ...]) -> None:
-    """Whether an array has a shape (None is any size) and holds finite numbers."""
+    """Check that an array has a shape (None is any size) and holds finite numbers."""
     kinds = "iu" if name == "frames" else "fiu"
     fits = array.ndim == len(shape) and all(
         want is None or want == got for want, got in zip(shape, array.shape, strict=False)
@@ -205,7 +205,7 @@ def _check(name: str, array: np.ndarray, shape: tuple[int | None, ...]) -> None:
 def _check_rotations(R: np.ndarray) -> None:
     error = np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)).max()
     if error > 1e-3 or (np.linalg.det(R) < 0).any():
-        raise ValueError(f"R is no rotation: R R^T differs from 1 by {error:.2g}")
+        raise ValueError(f"R is not a rotation: R R^T differs from 1 by {error:.2g}")
 
 
 def _typed(name: str, array: np.ndarray) -> np.ndarray:

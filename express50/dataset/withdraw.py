@@ -1,9 +1,9 @@
-"""Withdrawal of a subject: remove all that the dataset holds of a person, and look whether it did.
+"""Withdraw a subject: remove all that the dataset holds of a person, then search for the rest.
 
 Whatever mixes subjects (packed shards, reports, trained models' pictures) is removed whole and made
 again without the person by running its command; others' outputs that name the person go too. A
-checkpoint loses the person's codes and frames; that its other weights saw the person only a new
-training mends. The raw capture lies outside the dataset and stays its owner's task.
+checkpoint loses the person's codes and frames; only a new training removes what its other
+weights learned. The raw capture lies outside the dataset and stays its owner's task.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ Redact = Callable[[Path, str], bool]
 
 @dataclass(frozen=True)
 class Withdrawal:
-    """What was removed, which checkpoints were changed, and which files still name the subject."""
+    """Lists what was removed, which checkpoints changed, and which files still name the subject."""
 
     subject: str
     capture: Path | None
@@ -42,7 +42,7 @@ class Withdrawal:
 
 
 def plan(dataset: Dataset, subject: str) -> list[Path]:
-    """Files and folders of a dataset to remove so that nothing of a subject stays.
+    """List files and folders of a dataset to remove so that nothing of a subject stays.
 
     Raises:
         StageError: the dataset knows no such subject.
@@ -75,7 +75,7 @@ def _own_paths(dataset: Dataset, subject: str) -> Iterator[Path]:
 
 
 def _values(path: Path) -> list[str]:
-    """Values of a JSON table of texts; none where it is not one."""
+    """List the values of a JSON table of texts; empty where it is not one."""
     try:
         table = read_json(path, FormatError, "")
     except FormatError:
@@ -84,7 +84,7 @@ def _values(path: Path) -> list[str]:
 
 
 def _mixed_paths(dataset: Dataset) -> Iterator[Path]:
-    """Outputs that may hold several subjects: items that are no subject, reports, leftovers."""
+    """Yield outputs that may hold several subjects: mixed items, reports, leftovers."""
     subjects = {*dataset.captures(), *dataset.subjects()}
     yield from dataset.slurm_dir.glob("*.out")
     for base in (dataset.root, dataset.stale_dir):
@@ -99,7 +99,7 @@ def _mixed_paths(dataset: Dataset) -> Iterator[Path]:
 
 
 def _naming_items(dataset: Dataset, subject: str, gone: list[Path]) -> Iterator[Path]:
-    """Others' outputs that name the subject: their reference's, or whose plate stood in."""
+    """Yield others' outputs that name the subject: their reference's, or whose plate stood in."""
     for path in files_naming(dataset.root, subject):
         parents = [path, *path.parents]
         if not set(parents).isdisjoint(gone):
@@ -178,7 +178,7 @@ def _check_ledger(dataset: Dataset) -> None:
 
 
 def withdrawn_file(dataset: Dataset) -> Path:
-    """Records of withdrawals."""
+    """Return the file of withdrawals' records."""
     return dataset.root / "withdrawn.json"
 
 
@@ -191,7 +191,7 @@ def _record(dataset: Dataset, subject: str, files: int) -> None:
 
 
 def withdrawn(dataset: Dataset) -> set[str]:
-    """SHA-256 of the ids of withdrawn subjects; the ids themselves are not kept."""
+    """Return the SHA-256 of withdrawn subjects' ids; the ids themselves are not kept."""
     path = withdrawn_file(dataset)
     if not path.is_file():
         return set()
@@ -199,7 +199,7 @@ def withdrawn(dataset: Dataset) -> set[str]:
 
 
 def _withdrawals(path: Path) -> list:
-    """Records of withdrawals; those of before time and count were kept are digests alone."""
+    """Read the records of withdrawals; old ones are digests alone, without time and count."""
     mend = "restore it: it says who must not be taken in again"
     rows = read_json(path, FormatError, mend)
     if not isinstance(rows, list) or not all(isinstance(_digest(row), str) for row in rows):

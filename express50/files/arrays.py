@@ -1,7 +1,7 @@
-"""NumPy files from outside: ``.npz`` and ``.npy``, sizes looked at before memory is asked for.
+"""Read ``.npz`` and ``.npy`` files, checking sizes before memory is allocated.
 
-Nothing in a file is executed: pickled objects are refused. The header of an array says its shape
-and type; what it says must fit the bytes that are there, and all arrays of a file together a bound.
+Nothing in a file is executed: pickled objects are refused. The shape and type in an array's header
+must fit the bytes of the file, and all arrays of a file together a limit.
 """
 
 from __future__ import annotations
@@ -37,14 +37,14 @@ def read_arrays(
     wanted: Collection[str] = (),
     mend: str = AGAIN,
 ) -> dict[str, np.ndarray]:
-    """Arrays of an ``.npz`` file by name, none of them of objects.
+    """Read the arrays of an ``.npz`` file by name, none of them of objects.
 
     Args:
         path: the file.
-        kind: of the errors.
+        kind: class of the errors.
         what: it is expected to be, for messages, such as "a track".
-        wanted: names that must be there; others may be.
-        mend: what to do about a damaged file.
+        wanted: names of arrays that are required.
+        mend: how to fix a damaged file, for messages.
 
     Raises:
         Express50Error: of the given kind: it is missing, damaged, lacks a wanted array, or unpacks
@@ -70,7 +70,7 @@ def read_arrays(
 
 
 def read_npy(path: Path, kind: Kind, what: str, mend: str = AGAIN) -> np.ndarray:
-    """The array of an ``.npy`` file, not of objects.
+    """Read the array of an ``.npy`` file, not of objects.
 
     Raises:
         Express50Error: of the given kind: it is missing or damaged.
@@ -83,7 +83,7 @@ def read_npy(path: Path, kind: Kind, what: str, mend: str = AGAIN) -> np.ndarray
 
 
 def read_header(file: BinaryIO) -> tuple[tuple[int, ...], np.dtype]:
-    """Shape and type in an array's header; the file then stands behind it.
+    """Read shape and type from an array's header, leaving the file behind it.
 
     Raises:
         ValueError: it is damaged or of an unknown version.
@@ -102,7 +102,7 @@ def read_header(file: BinaryIO) -> tuple[tuple[int, ...], np.dtype]:
 
 
 def _array(file: BinaryIO, size: int) -> np.ndarray:
-    """An array from the start of a file of ``size`` bytes."""
+    """Read an array from the start of a file of ``size`` bytes."""
     shape, dtype = read_header(file)
     count: int = math.prod(list(shape))
     need, have = count * dtype.itemsize, size - file.tell()

@@ -1,4 +1,4 @@
-"""Crash-safe files: written aside, synced, renamed; after a kill a file is absent or whole."""
+"""Write files so that after a crash each is absent or whole: aside, synced, renamed."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pathlib import Path
 
 
 def dump_json(value: object) -> bytes:
-    """Deterministic JSON bytes: sorted keys, no NaN or infinity.
+    """Encode as deterministic JSON: sorted keys, no NaN or infinity.
 
     Raises:
         ValueError: the value holds a number that is not finite.

@@ -1,4 +1,4 @@
-"""The calibration file: cameras by id as JSON, every value checked before it is believed."""
+"""Read and write the calibration file: cameras by id as JSON, every value checked."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ def read_cameras(path: Path) -> dict[str, Camera]:
         CalibrationError: the file is missing, or a camera has a field of the wrong shape or value.
     """
     if not Path(path).exists():
-        raise CalibrationError(f"{path}: no such calibration file; run 'express50 calibrate'")
+        raise CalibrationError(f"{path}: the file is missing; run 'express50 calibrate'")
     return parse_cameras(read_json(path, CalibrationError, "write it anew"), str(path))
 
 
 def parse_cameras(table: object, where: str) -> dict[str, Camera]:
-    """Cameras of a calibration file's content.
+    """Make cameras of a calibration file's content.
 
     Raises:
-        CalibrationError: there is none, or one has a field of the wrong shape or value.
+        CalibrationError: there are none, or one has a field of the wrong shape or value.
     """
     if not isinstance(table, dict) or not table:
         got = "an empty one" if isinstance(table, dict) else type(table).__name__
@@ -79,7 +79,7 @@ def _parse_camera(path: str, camera_id: str, row: object) -> Camera:
 
 
 def _numbers(where: str, name: str, value: object, shape: tuple[int, ...]) -> np.ndarray:
-    """A finite float array of the given shape, or a CalibrationError."""
+    """Convert to a finite float array of the given shape, or raise CalibrationError."""
     try:
         array = np.array(value, dtype=np.float64)
     except (TypeError, ValueError, OverflowError):
@@ -99,7 +99,7 @@ def write_cameras(path: Path, cameras: Mapping[str, Camera]) -> None:
 
 
 def camera_rows(cameras: Mapping[str, Camera]) -> dict[str, dict]:
-    """Content of a calibration file, as :func:`parse_cameras` takes it."""
+    """Make the content of a calibration file, as :func:`parse_cameras` takes it."""
     return {
         camera_id: {
             "model": camera.model,

@@ -165,7 +165,7 @@ def _compression(suffix: str, quality: int) -> str:
 
 
 def encode_jpeg(image: np.ndarray, quality: int = 95) -> bytes:
-    """JPEG bytes of an RGB (H, W, 3) or grey (H, W) uint8 image; 4:4:4 from quality 95 upwards."""
+    """Encode an RGB (H, W, 3) or grey (H, W) uint8 image as JPEG; 4:4:4 from quality 95 upwards."""
     flags = [cv2.IMWRITE_JPEG_QUALITY, quality]
     if quality >= 95:
         flags += [cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]
@@ -173,7 +173,7 @@ def encode_jpeg(image: np.ndarray, quality: int = 95) -> bytes:
 
 
 def encode_png(image: np.ndarray) -> bytes:
-    """PNG bytes of a grey or RGB uint8 or uint16 image."""
+    """Encode a grey or RGB uint8 or uint16 image as PNG."""
     return cv2.imencode(".png", _swap(image), [cv2.IMWRITE_PNG_COMPRESSION, 3])[1].tobytes()
 
 
@@ -257,12 +257,12 @@ def _jpeg_header(data: bytes | mmap.mmap) -> tuple[tuple[int, int] | None, int |
 
 
 def _swap(image: np.ndarray) -> np.ndarray:
-    """RGB to BGR or back; a copy that OpenCV accepts."""
+    """Swap RGB and BGR into an array that OpenCV accepts."""
     return np.ascontiguousarray(image[..., ::-1]) if image.ndim == 3 else image
 
 
 def depth_to_uint16(depth: np.ndarray, valid: np.ndarray) -> np.ndarray:
-    """16-bit steps (H, W) of a depth map (H, W), metres; 0 where not valid.
+    """Quantise a depth map (H, W), metres, to 16-bit steps; 0 where not valid.
 
     Raises:
         ValueError: a valid depth is not finite, not positive or over 3.27 m.
@@ -279,7 +279,7 @@ def depth_to_uint16(depth: np.ndarray, valid: np.ndarray) -> np.ndarray:
 
 
 def depth_from_uint16(steps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Depth (H, W) float32 metres (0 where unknown) and its validity (H, W) of 16-bit steps."""
+    """Convert 16-bit steps to depth (H, W) float32 metres, 0 where unknown, and validity (H, W)."""
     return (steps * np.float32(DEPTH_UNIT_M)).astype(np.float32), steps > 0
 
 
@@ -301,7 +301,7 @@ def read_depth_png(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
 
 def srgb_to_linear(image_srgb: np.ndarray) -> np.ndarray:
-    """Linear light of sRGB values in [0, 1]; IEC 61966-2-1."""
+    """Decode sRGB values in [0, 1] to linear light; IEC 61966-2-1."""
     x = np.asarray(image_srgb)
     return np.where(x <= 0.04045, x / 12.92, ((np.maximum(x, 0.04045) + 0.055) / 1.055) ** 2.4)
 
@@ -319,7 +319,7 @@ LIGHT_OF_LEVEL = srgb_to_linear(np.arange(256) / 255.0).astype(np.float32)
 
 
 def scale_light(image: np.ndarray, gain: np.ndarray) -> np.ndarray:
-    """Image (H, W, 3) uint8 sRGB with linear light times gain (3,); what exceeds white is white."""
+    """Multiply an image's (H, W, 3) uint8 sRGB linear light by gain (3,), clipping at white."""
     if not (np.isfinite(gain).all() and (gain > 0).all()):
         raise ValueError(f"gain is {gain}, expected three finite numbers above 0")
     table = np.rint(scaled_levels(gain)).astype(np.uint8)
@@ -327,7 +327,7 @@ def scale_light(image: np.ndarray, gain: np.ndarray) -> np.ndarray:
 
 
 def scaled_levels(gain: np.ndarray) -> np.ndarray:
-    """What the 256 levels of 8-bit sRGB become (256, 3) when linear light is times gain (3,)."""
+    """Map the 256 levels of 8-bit sRGB (256, 3) when linear light is multiplied by gain (3,)."""
     return np.minimum(255.0 * linear_to_srgb(LIGHT_OF_LEVEL[:, None] * gain), 255.0)
 
 
@@ -339,18 +339,19 @@ def resize_area(image: np.ndarray, width: int, height: int) -> np.ndarray:
 
 
 def edge_distance(mask: np.ndarray) -> np.ndarray:
-    """Distance (H, W) float32 of each pixel of a mask (H, W) to the nearest outside it, in pixels.
+    """Measure the distance (H, W) float32 of each pixel of a mask (H, W) to the nearest outside it.
 
-    Zero outside; a mask without an outside has no meaning. OpenCV's roots differ in the last bit
-    with where in memory a mask lies; squared distances are whole numbers, and rounding them gives
-    the same bytes everywhere (up to 1,400 pixels from the edge, where float32 no longer tells).
+    In pixels, zero outside; a mask without an outside has no meaning. OpenCV's roots differ in the
+    last bit with where in memory a mask lies; squared distances are whole numbers, and rounding
+    them gives the same bytes everywhere (up to 1,400 pixels from the edge, where float32 no longer
+    distinguishes them).
     """
     rough = cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
     return np.sqrt(np.rint(np.square(rough)))
 
 
 def fit_into(image: np.ndarray, height: int, width: int) -> np.ndarray:
-    """The image (h, w[, 3]) uint8 scaled to fit and centred on a dark (height, width, 3) tile."""
+    """Scale an image (h, w[, 3]) uint8 to fit, centred on a dark (height, width, 3) tile."""
     if image.ndim == 2:
         image = np.repeat(image[..., None], 3, axis=2)
     scale = min(width / image.shape[1], height / image.shape[0])
@@ -369,7 +370,7 @@ def contact_sheet(
     labels: Sequence[str] | None = None,
     tile: tuple[int, int] = (160, 160),
 ) -> np.ndarray:
-    """One picture (H, W, 3) uint8 of rows of images, each row with an optional label."""
+    """Lay out rows of images as one picture (H, W, 3) uint8, each row with an optional label."""
     columns = max((len(row) for row in rows), default=1)
     blank = np.full((*tile, 3), 24, np.uint8)
     lines = []

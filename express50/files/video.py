@@ -1,6 +1,6 @@
-"""Frame-exact video: frames are counted by decoding, and found again by their time stamp.
+"""Read video frame by frame: frames are counted by decoding and found by their time stamp.
 
-A container's own frame count is never believed: edit lists and broken muxers make it wrong.
+A container's own frame count is not used: edit lists and broken muxers make it wrong.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from express50.geometry.shapes import PIXEL_LIMIT
 # Frames before the wanted one at which a seek aims. An H.264 or H.265 picture may be displayed
 # up to 16 pictures away from its place in the stream, so a nearer key frame may lie behind it.
 REORDER = 16
-# What the endings of our video files stand for. FFmpeg goes by content: a playlist named video.mp4
-# would make it read other files.
+# Containers that are read. FFmpeg goes by content: a playlist named video.mp4 would make it read
+# other files.
 CONTAINERS = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi"
 BOXES = 1_000_000  # of one file; a fragment of a second has two
 DAMAGE = (av.FFmpegError, OSError, ValueError, MemoryError, OverflowError)
@@ -69,7 +69,7 @@ def _truncated(path: Path, size: int, expected: int) -> CaptureError:
 
 
 def decoder_threads() -> int:
-    """Threads of the decoder: the runner's cap for workers, else what the decoder likes (0)."""
+    """Return the decoder's threads: the runner's cap for workers, else 0 (the decoder's choice)."""
     return int(os.environ.get("OMP_NUM_THREADS", "0") or 0)
 
 
@@ -99,7 +99,7 @@ def _reason(error: Exception) -> str:
 
 
 def _pixels(path: Path, frame: av.VideoFrame) -> np.ndarray:
-    """Pixels (H, W, 3) uint8 of a frame."""
+    """Convert a frame to (H, W, 3) uint8."""
     size = frame.width * frame.height
     if not 0 < size <= PIXEL_LIMIT:
         raise CaptureError(f"{path}: a frame is {frame.width}x{frame.height}, over {PIXEL_LIMIT}")
@@ -112,7 +112,7 @@ def _pixels(path: Path, frame: av.VideoFrame) -> np.ndarray:
 def _decode(
     path: Path, container: av.container.InputContainer, stream: av.VideoStream
 ) -> Iterator[av.VideoFrame]:
-    """Frames in display order from where the container stands; damage is an error."""
+    """Yield frames in display order from the container's position; damage is an error."""
     try:
         for packet in container.demux(stream):
             if packet.is_corrupt:
@@ -134,27 +134,27 @@ def _decode(
 
 
 def video_fps(path: Path) -> float:
-    """Frames a second that a video's container tells.
+    """Read the frames per second from a video's container.
 
     Raises:
-        CaptureError: the file is no video, or tells no rate.
+        CaptureError: the file is not a video, or has no frame rate.
     """
     container, stream = _open(path)
     with container:
         rate = float(stream.average_rate or 0)
     if not 0 < rate <= 10_000:
-        raise CaptureError(f"{path}: tells no frame rate; say fps in capture.toml")
+        raise CaptureError(f"{path}: has no frame rate; set fps in capture.toml")
     return rate
 
 
 def video_turn(path: Path) -> int:
-    """Quarter turns counter-clockwise that a video's container asks a player for, 0 to 3.
+    """Read the quarter turns counter-clockwise that a video's container asks for, 0 to 3.
 
     Telephones store what they film upright as pictures on their side. A rig's cameras are taken as
     they are stored, since a calibration belongs to stored pixels.
 
     Raises:
-        CaptureError: the file is no video, damaged or holds no frame.
+        CaptureError: the file is not a video, damaged or holds no frame.
     """
     container, stream = _open(path)
     with container:
@@ -170,7 +170,7 @@ def iterate_video(path: Path) -> Iterator[tuple[int, np.ndarray]]:
         Time stamp (in the stream's own unit) and (H, W, 3) uint8 sRGB image.
 
     Raises:
-        CaptureError: the file is no video, truncated, damaged or holds no frame.
+        CaptureError: the file is not a video, truncated, damaged or holds no frame.
     """
     check_whole(path)
     container, stream = _open(path)
@@ -184,7 +184,7 @@ def iterate_video(path: Path) -> Iterator[tuple[int, np.ndarray]]:
 
 
 class VideoReader:
-    """Reads single frames of a video whose time stamps are known, forward reads being quick."""
+    """Reads single frames of a video whose time stamps are known; forward reads are quick."""
 
     def __init__(self, path: Path, pts: tuple[int, ...]) -> None:
         self.path = path
@@ -194,7 +194,7 @@ class VideoReader:
         self._next = 0  # decode index of the frame that _frames yields next
 
     def read(self, frame: int) -> np.ndarray:
-        """Image (H, W, 3) uint8 sRGB of a decode index.
+        """Read the image (H, W, 3) uint8 sRGB at a decode index.
 
         Raises:
             CaptureError: no such frame, or the footage no longer has the indexed time stamps.
@@ -234,7 +234,7 @@ class VideoReader:
             return
         try:
             self._container.seek(self.pts[target], stream=self._stream, backward=True)
-        except DAMAGE:  # no index to seek in: from the start it goes
+        except DAMAGE:  # no index to seek in: start again
             self.restart()
             return
         self._frames = _decode(self.path, self._container, self._stream)

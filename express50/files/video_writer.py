@@ -1,4 +1,4 @@
-"""Writing footage: an H.264 video or numbered images, with the same bytes for the same pictures."""
+"""Write footage as an H.264 video or numbered images: the same pictures give the same bytes."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _BT709 = 1
 
 
 class VideoFootage:
-    """``video.mp4``: H.264, 4:4:4, BT.709.
+    """Writes ``video.mp4``: H.264, 4:4:4, BT.709.
 
     One thread and no B-frames, as the same pictures would give other bytes from run to run: libx264
     placed B-frames in six ways in 40 runs of one thread.
@@ -55,7 +55,7 @@ class VideoFootage:
 
 
 class ImageFootage:
-    """``frames/000000.png`` (or jpg) and so on."""
+    """Writes ``frames/000000.png`` (or jpg) and so on."""
 
     def __init__(self, folder: Path, suffix: str) -> None:
         self._folder = folder / "frames"

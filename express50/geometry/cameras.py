@@ -108,7 +108,7 @@ def crop_camera(camera: Camera, x0: float, y0: float, width: int, height: int) -
 
 
 def _with_K(camera: Camera, K: np.ndarray) -> Camera:
-    """The camera with other intrinsics; a one-focal model becomes its two-focal kin."""
+    """The camera with other intrinsics; a one-focal model becomes its two-focal relative."""
     p = camera._named() | {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
     model = {"SIMPLE_PINHOLE": "PINHOLE", "SIMPLE_RADIAL": "OPENCV", "RADIAL": "OPENCV"}.get(
         camera.model, camera.model

@@ -1,4 +1,4 @@
-"""The only place where half-pixel shifts and axis flips live.
+"""Convert between pixel origins and camera axes; no other file shifts by half a pixel.
 
 Inside the project a pixel's origin is the image's corner (the first pixel's centre is
 (0.5, 0.5), as COLMAP and gsplat have it) and cameras have OpenCV axes. OpenCV's own functions

@@ -1,4 +1,4 @@
-"""Embree scenes of meshes, through Open3D."""
+"""Cast rays at meshes with Embree, through Open3D."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from express50.geometry.cameras import Camera, rays
 
 
 def mesh_scene(vertices: np.ndarray, faces: np.ndarray) -> o3d.t.geometry.RaycastingScene:
-    """Embree scene of a mesh (V, 3), (F, 3), on one thread."""
+    """Make an Embree scene of a mesh (V, 3), (F, 3), on one thread."""
     scene = o3d.t.geometry.RaycastingScene(nthreads=1)
     scene.add_triangles(
         o3d.core.Tensor(np.ascontiguousarray(vertices, np.float32)),
@@ -19,7 +19,7 @@ def mesh_scene(vertices: np.ndarray, faces: np.ndarray) -> o3d.t.geometry.Raycas
 
 
 def camera_rays(camera: Camera) -> o3d.core.Tensor:
-    """A ray (H, W, 6) a pixel centre; distances along it are depth, camera z."""
+    """Make a ray (H, W, 6) per pixel centre; distances along it are depth, camera z."""
     origin, directions = rays(camera)
     row = np.concatenate([np.broadcast_to(origin, directions.shape), directions], axis=-1)
     return o3d.core.Tensor(row.astype(np.float32))

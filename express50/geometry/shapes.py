@@ -1,4 +1,4 @@
-"""Checks of array arguments, with expected and got in one line."""
+"""Check array arguments; errors say expected and got in one line."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Pictures as members of a shard: which codec a profile takes, and decoding by a member's name.
+"""Encode and decode the pictures of a shard, by profile and by a member's name.
 
 ``compact`` and ``lossless`` hold what every image library reads (JPEG, PNG). ``fast`` holds what
 decodes in the least time: alpha and parts as zstd over their bytes, depth as LERC without loss
@@ -29,7 +29,7 @@ LERC_HEADER = struct.Struct("<6siIiiiiii")
 def encode_pictures(
     rgb: np.ndarray, alpha: np.ndarray, depth: np.ndarray, parts: np.ndarray | None, profile: str
 ) -> dict[str, bytes]:
-    """Members of a sample by name.
+    """Encode the pictures of a sample as members by name.
 
     Args:
         rgb: (H, W, 3) uint8 sRGB.
@@ -53,7 +53,7 @@ def encode_pictures(
 
 
 def decode_picture(name: str, data: bytes, width: int, height: int, where: str) -> np.ndarray:
-    """The picture in a member: (H, W, 3) uint8, (H, W) uint8 or, of depth, (H, W) uint16.
+    """Decode a member: (H, W, 3) uint8, (H, W) uint8 or, of depth, (H, W) uint16.
 
     A header is checked before a pixel is decoded: no member makes more memory than its size says.
 
@@ -80,7 +80,7 @@ def decode_picture(name: str, data: bytes, width: int, height: int, where: str) 
 
 
 def crc32(data: bytes) -> int:
-    """CRC-32 as zlib's, eight times as fast."""
+    """Compute zlib's CRC-32, eight times as fast."""
     return imagecodecs.deflate_crc32(data)
 
 
@@ -100,7 +100,7 @@ def _zstd(image: np.ndarray) -> bytes:
 
 
 def _unzstd(data: bytes, width: int, height: int, where: str) -> np.ndarray:
-    image = bytearray(width * height + 1)  # one more: what is too long shows
+    image = bytearray(width * height + 1)  # one more, so that a longer content shows
     try:
         count = len(imagecodecs.zstd_decode(data, out=image))
     except (RuntimeError, ValueError) as error:
@@ -111,10 +111,10 @@ def _unzstd(data: bytes, width: int, height: int, where: str) -> np.ndarray:
 
 
 def lerc_size(data: bytes, where: str) -> tuple[int, int]:
-    """Width and height in the header of a LERC blob.
+    """Read width and height from the header of a LERC blob.
 
     Raises:
-        FormatError: the bytes are no such blob.
+        FormatError: the bytes are not such a blob.
     """
     if len(data) >= LERC_HEADER.size:
         name, version, _, rows, columns, depth, _, _, size = LERC_HEADER.unpack_from(data)
@@ -122,4 +122,4 @@ def lerc_size(data: bytes, where: str) -> tuple[int, int]:
         alone = size == len(data) and depth == 1 and min(rows, columns) > 0
         if name == b"Lerc2 " and 4 <= version <= 6 and alone:
             return columns, rows
-    raise FormatError(f"{where}: {len(data)} bytes are no LERC image of one channel")
+    raise FormatError(f"{where}: {len(data)} bytes are not a LERC image of one channel")

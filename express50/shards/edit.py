@@ -1,4 +1,4 @@
-"""Shards made of other shards: samples are copied as they are, never decoded."""
+"""Split and merge shards: samples are copied as they are, never decoded."""
 
 from __future__ import annotations
 
@@ -8,8 +8,7 @@ from pathlib import Path
 
 from express50.errors import FormatError
 from express50.files.atomic import sync_directory, sync_tree, write_json
-from express50.shards.offsets import offsets_file
-from express50.shards.reader import ShardReader
+from express50.shards.reader import ShardReader, offsets_file
 from express50.shards.writer import PackedSample, ShardWriter, write_manifest
 
 
@@ -91,7 +90,7 @@ def _refuse_doubles(readers: Sequence[ShardReader]) -> None:
 
 
 def _splits(readers: Sequence[ShardReader]) -> dict[str, str]:
-    """The split of every subject: people of one are never of another."""
+    """Return the split of every subject; a subject in two splits is refused."""
     splits: dict[str, str] = {}
     for reader in readers:
         for entry in reader.entries:
@@ -130,15 +129,15 @@ def _copy_offsets(readers: Sequence[ShardReader], out: Path) -> None:
 
 
 def _refuse_lost_offsets(reader: ShardReader, subject: str) -> None:
-    """Samples that are to be moved by offsets are of no use without them."""
+    """Refuse samples that need offsets without them."""
     first = next(n for n, entry in enumerate(reader.entries) if entry.subject == subject)
     track = reader.meta(first).get("track")
     if isinstance(track, dict) and track.get("offsets"):
-        reader.offsets(subject)  # says what is missing
+        reader.offsets(subject)  # raises
 
 
 def _write_card(readers: Sequence[ShardReader], out: Path) -> None:
-    """The sources' cards, one after the other: what they say of consent and licence stays true."""
+    """Write the sources' cards one after the other: consent and licence stay as they were."""
     parts = []
     for reader in readers:
         card = reader.root / "card.md"

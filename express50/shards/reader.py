@@ -1,4 +1,4 @@
-"""Packed samples: USTAR tar shards in WebDataset's conventions, read at random by an index.
+"""Read packed samples at random from USTAR tar shards in WebDataset's conventions.
 
 A folder of shards holds ``<split>-000000.tar`` ..., ``index.json`` (where every member lies, with
 its CRC-32), ``manifest.json`` (SHA-256 of every file). Members of a sample are adjacent; their key
@@ -26,10 +26,10 @@ import numpy as np
 
 from express50.contract.segmentation_labels import COLOURS
 from express50.errors import FormatError
+from express50.files.arrays import read_npy
 from express50.files.images import contact_sheet
 from express50.files.text import parse_json, read_json
 from express50.shards.codecs import ALPHA, DEPTH, PARTS, RGB, crc32, decode_picture
-from express50.shards.offsets import KEY, read_offsets
 
 SCHEMA = "express50.shards/1"
 _AGAIN = "rerun 'express50 pack'"
@@ -38,7 +38,7 @@ SHARD_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*-[0-9]{6}\.tar")
 
 @dataclass(frozen=True)
 class Entry:
-    """One sample's place: its ids, its shard, and (offset, size, crc32) of each member."""
+    """Locates one sample: its ids, its shard, and (offset, size, crc32) of each member."""
 
     key: str
     subject: str
@@ -50,9 +50,9 @@ class Entry:
 
 
 class ShardReader:
-    """Random access to the samples of a folder of shards; safe to fork and to pickle.
+    """Gives random access to the samples of a folder of shards; safe to fork and to pickle.
 
-    State: one open file a shard, opened when first used.
+    State: one open file per shard, opened when first used.
     """
 
     def __init__(self, root: Path, entries: tuple[Entry, ...] | None = None) -> None:
@@ -81,11 +81,11 @@ class ShardReader:
 
     @property
     def keys(self) -> list[str]:
-        """Keys of all samples, in order."""
+        """List the keys of all samples, in order."""
         return [entry.key for entry in self.entries]
 
     def groups(self) -> dict[tuple[str, str], list[int]]:
-        """Sample numbers of every (subject, expression)."""
+        """List the sample numbers of every (subject, expression)."""
         table: dict[tuple[str, str], list[int]] = {}
         for number, entry in enumerate(self.entries):
             table.setdefault((entry.subject, entry.expression), []).append(number)
@@ -98,7 +98,7 @@ class ShardReader:
         cameras: Collection[str] | None = None,
         split: str | None = None,
     ) -> ShardReader:
-        """A reader of the samples that match all the given ids; none given means all.
+        """Return a reader of the samples that match all the given ids; None matches all.
 
         Raises:
             FormatError: an id or a split is unknown (the known ones are named).
@@ -120,28 +120,28 @@ class ShardReader:
         return ShardReader(self.root, chosen)
 
     def member(self, number: int, name: str) -> bytes:
-        """Bytes of one member of a sample, checked by CRC-32.
+        """Read the bytes of one member of a sample, checked by CRC-32.
 
         Raises:
-            FormatError: there is no such member, or its bytes are damaged.
+            FormatError: the member is missing, or its bytes are damaged.
         """
         return self.members(number, [name])[name]
 
     def members(self, number: int, names: Collection[str] | None = None) -> dict[str, bytes]:
-        """Bytes of a sample's members by name, checked by CRC-32.
+        """Read the bytes of a sample's members by name, checked by CRC-32.
 
         Args:
             number: of the sample.
             names: the members wanted; all by default.
 
         Raises:
-            FormatError: there is no such member, or its bytes are damaged.
+            FormatError: the member is missing, or its bytes are damaged.
         """
         entry = self.entries[number]
         file, found = self._file(entry.shard), {}
         for name in entry.members if names is None else names:
             offset, size, crc = self._place(entry, name)
-            # A read a member copies once; one read a sample and slices of it take a third longer.
+            # One read per member copies once; one read per sample and slices take a third longer.
             data = os.pread(file, size, offset)
             if len(data) != size or crc32(data) != crc:
                 raise FormatError(
@@ -197,7 +197,7 @@ class ShardReader:
         }
 
     def offsets(self, subject: str) -> np.ndarray:
-        """Offsets (V, 3) float32, metres, of a subject's rest shape; of use where meta says so.
+        """Read the offsets (V, 3) float32, metres, of a subject's rest shape, if meta says so.
 
         Raises:
             FormatError: the file is missing, damaged, or holds something else.
@@ -205,12 +205,12 @@ class ShardReader:
         return read_offsets(self.root, subject)
 
     def iterate(self, seed: int | None = None, epoch: int = 0, start: int = 0) -> Iterator[dict]:
-        """Samples of one pass from position ``start``; shuffled by (seed, epoch) unless None."""
+        """Yield the samples of one pass from ``start``, shuffled by (seed, epoch) unless None."""
         for number in self.order(seed, epoch)[start:]:
             yield self.sample(int(number))
 
     def order(self, seed: int | None, epoch: int = 0) -> np.ndarray:
-        """Sample numbers (N,) of one pass: a pure function of (seed, epoch), for exact resume."""
+        """Return the sample numbers (N,) of one pass: a pure function of (seed, epoch)."""
         if seed is None:
             return np.arange(len(self))
         return np.random.default_rng([seed, epoch]).permutation(len(self))
@@ -231,7 +231,7 @@ class ShardReader:
     def _picture(
         self, entry: Entry, members: dict[str, bytes], names: tuple[str, ...], meta: dict
     ) -> np.ndarray:
-        """The picture that is there under one of several names."""
+        """Decode the picture that is stored under one of several names."""
         name = next((name for name in names if name in members), names[0])
         self._place(entry, name)
         where = f"{self.root / entry.shard}: {entry.key}.{name}"
@@ -250,7 +250,7 @@ def read_entries(root: Path) -> tuple[Entry, ...]:
     """
     path = root / "index.json"
     if not path.exists():
-        raise FormatError(f"{path}: no such index; name the folder that 'pack' wrote")
+        raise FormatError(f"{path}: the index is missing; name the folder that 'pack' wrote")
     table = read_json(path, FormatError, _AGAIN)
     if not isinstance(table, dict) or table.get("schema") != SCHEMA:
         got = table.get("schema") if isinstance(table, dict) else type(table).__name__
@@ -301,3 +301,38 @@ def sample_picture(sample: dict) -> np.ndarray:
     alpha = (sample["alpha"] * 255).astype(np.uint8)
     parts = [] if sample["parts"] is None else [COLOURS[sample["parts"]]]
     return contact_sheet([[sample["rgb"], alpha, shade, *parts]], tile=depth.shape)
+
+
+KEY = re.compile(r"[A-Za-z0-9_-]{1,80}")
+
+
+def offsets_file(root: Path, subject: str) -> Path:
+    """Return the path of a subject's offsets.
+
+    Raises:
+        FormatError: the subject's id has other characters than a key may have.
+    """
+    if not KEY.fullmatch(subject):
+        raise FormatError(f"subject id {subject!r}: expected letters, digits, _ and -")
+    return root / f"{subject}.offsets.npy"
+
+
+def write_offsets(root: Path, subject: str, offsets: np.ndarray) -> None:
+    """Write a subject's offsets (V, 3), metres, as float32."""
+    np.save(offsets_file(root, subject), offsets.astype(np.float32), allow_pickle=False)
+
+
+def read_offsets(root: Path, subject: str) -> np.ndarray:
+    """Read the offsets (V, 3) float32, metres, of a subject's rest shape.
+
+    Raises:
+        FormatError: the file is missing, damaged, or holds something else.
+    """
+    path = offsets_file(root, subject)
+    again = "copy the shards again or rerun 'express50 pack'"
+    array = read_npy(path, FormatError, "offsets", again)
+    if array.ndim != 2 or array.shape[1] != 3 or array.dtype != np.float32:
+        raise FormatError(f"{path}: {array.dtype} {array.shape}, expected float32 (V, 3); {again}")
+    if not np.isfinite(array).all():
+        raise FormatError(f"{path}: holds NaN or Inf; {again}")
+    return array

@@ -1,4 +1,4 @@
-"""Writing shards: the same samples give the same bytes, and a group never spans two shards."""
+"""Write shards: the same samples give the same bytes, and a group never spans two shards."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _EMPTY_HEADER = tarfile.TarInfo().tobuf(tarfile.USTAR_FORMAT, "ascii", "strict")
 
 @dataclass(frozen=True)
 class PackedSample:
-    """One encoded sample: its ids and the bytes of its members by extension (``rgb.jpg``)."""
+    """Holds one encoded sample: its ids and the bytes of its members by extension (``rgb.jpg``)."""
 
     subject: str
     expression: str
@@ -31,12 +31,12 @@ class PackedSample:
 
     @property
     def key(self) -> str:
-        """Key of the sample in the shards."""
+        """Return the key of the sample in the shards."""
         return sample_key(self.subject, self.expression, self.camera)
 
 
 def sample_key(subject: str, expression: str, camera: str) -> str:
-    """``subject_expression_camera``, of characters that every tar reader splits alike.
+    """Make ``subject_expression_camera``, of characters that every tar reader splits alike.
 
     Raises:
         FormatError: an id has other characters than letters, digits, ``_`` and ``-``, or the key
@@ -81,9 +81,9 @@ class ShardWriter:
         """
         groups = {(sample.subject, sample.expression) for sample in samples}
         if len(groups) != 1 or groups & self._groups:
-            told = ", ".join(f"{subject}/{expression}" for subject, expression in sorted(groups))
+            names = ", ".join(f"{subject}/{expression}" for subject, expression in sorted(groups))
             raise FormatError(
-                f"{self.root}: {told}: expected all samples of one expression of a subject, once"
+                f"{self.root}: {names}: expected all samples of one expression of a subject, once"
             )
         self._groups |= groups
         size = sum(
@@ -148,7 +148,7 @@ class ShardWriter:
 
 
 def _tar_members(sample: PackedSample, start: int) -> tuple[list[bytes], dict[str, list[int]]]:
-    """A sample's bytes in the tar from ``start``, and each member's data's offset, size, CRC-32."""
+    """Make a sample's bytes in the tar from ``start``, and each member's offset, size, CRC-32."""
     pieces, places, offset = [], {}, start
     for name, data in sorted(sample.members.items()):
         header, padding = tar_header(f"{sample.key}.{name}", len(data)), bytes(-len(data) % BLOCK)
@@ -159,7 +159,7 @@ def _tar_members(sample: PackedSample, start: int) -> tuple[list[bytes], dict[st
 
 
 def tar_header(name: str, size: int) -> bytes:
-    """USTAR header (512,) of a file; mode 0644, owner, group and time 0.
+    """Make the USTAR header (512,) of a file; mode 0644, owner, group and time 0.
 
     The bytes are `tarfile.TarInfo`'s, which took a fifth of all packing, four times as long.
     Name, size and checksum are filled into its header of an empty name (POSIX.1-1988, ustar).
@@ -204,7 +204,7 @@ def _sha256(path: Path) -> str:
 
 
 def verify(root: Path) -> list[str]:
-    """What is wrong with a folder of shards, one line a fault; empty when all is well.
+    """List the faults of a folder of shards, one line per fault.
 
     Checks the SHA-256 of every file in the manifest, the CRC-32 of every member, and that the tar
     headers name the members that the index places there.
@@ -229,7 +229,7 @@ def verify(root: Path) -> list[str]:
 def _manifest_faults(root: Path) -> list[str]:
     path = root / "manifest.json"
     if not path.exists():
-        return [f"{path}: no such manifest; rerun 'express50 pack'"]
+        return [f"{path}: the manifest is missing; rerun 'express50 pack'"]
     try:
         files = read_json(path, FormatError)["files"]
         expected = {name: str(row["sha256"]) for name, row in files.items()}

@@ -10,6 +10,7 @@ import numpy as np
 from express50.dataset.depth_files import write_depth, write_normals
 from express50.errors import StageError
 from express50.files.images import contact_sheet, srgb_to_linear, write_image
+from express50.geometry import meshes
 from pipelines.depth.maps import DepthMaps, PhotoErrors, Pictures
 from pipelines.depth.reconstruct import HeadSurface
 
@@ -53,22 +54,10 @@ def used_part(surface: HeadSurface) -> tuple[np.ndarray, np.ndarray]:
 def write_ply(path: Path, surface: HeadSurface) -> None:
     """Write a binary PLY: position, normal, sRGB colour, confidence; world, metres."""
     used, corners = used_part(surface)
-    fields = [(name, "<f4") for name in ("x", "y", "z", "nx", "ny", "nz")]
-    fields += [(name, "u1") for name in ("red", "green", "blue")] + [("confidence", "<f4")]
-    table = np.zeros(len(used), dtype=fields)
-    for k, name in enumerate(("x", "y", "z")):
-        table[name] = surface.vertices[used, k]
-        table[f"n{name}"] = surface.normals[used, k]
-    for k, name in enumerate(("red", "green", "blue")):
-        table[name] = surface.colors[used, k]
-    table["confidence"] = surface.confidence[used]
-    faces = np.zeros(len(corners), dtype=[("count", "u1"), ("index", "<i4", 3)])
-    faces["count"], faces["index"] = 3, corners
-    kinds = {"<f4": "float", "u1": "uchar"}
-    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(table)}"]
-    header += [f"property {kinds[kind]} {name}" for name, kind in fields]
-    header += [f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header"]
-    path.write_bytes("\n".join(header).encode() + b"\n" + table.tobytes() + faces.tobytes())
+    columns = {f"n{axis}": surface.normals[used, k] for k, axis in enumerate("xyz")}
+    columns |= {c: surface.colors[used, k] for k, c in enumerate(("red", "green", "blue"))}
+    columns["confidence"] = surface.confidence[used]
+    meshes.write_ply(path, surface.vertices[used], corners, columns)
 
 
 def write_glb(path: Path, surface: HeadSurface) -> None:

@@ -29,8 +29,7 @@ from express50.files.images import (
 from express50.files.text import read_json_table
 from express50.geometry.cameras import Camera
 from express50.shards.codecs import encode_pictures
-from express50.shards.offsets import write_offsets
-from express50.shards.reader import ShardReader
+from express50.shards.reader import ShardReader, write_offsets
 from express50.shards.writer import PackedSample, ShardWriter, sample_key, write_manifest
 from pipelines.pack.card import people_lines, split_subjects, write_card
 from pipelines.pack.colour import evened, own_picture

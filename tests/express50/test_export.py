@@ -15,7 +15,7 @@ import trimesh
 from express50.capture.frames import read_cameras_of, read_frame
 from express50.cli.main import main
 from express50.contract.layout import Dataset
-from express50.dataset.export.pictures import centred
+from express50.dataset.export.gaussian_avatars import centred
 from express50.files.calibration import read_cameras, write_cameras
 from express50.files.images import read_alpha, read_image, srgb_to_linear, write_image
 from express50.head.load import load_head
@@ -215,7 +215,7 @@ def test_a_folder_that_is_no_export_is_left_alone(dataset, tmp_path, capsys) -> 
     (tmp_path / "S001").mkdir()
     (tmp_path / "S001" / "thesis.tex").write_text("years of work")
     assert export(dataset, tmp_path, "obj", "--subject=S001") == 1
-    assert "holds no export.json, so it is no export" in capsys.readouterr().err
+    assert "holds no export.json" in capsys.readouterr().err
     assert (tmp_path / "S001" / "thesis.tex").read_text() == "years of work"
 
 
@@ -393,7 +393,7 @@ def test_every_frame_of_a_clip_is_a_mesh(dataset, tmp_path):
     [
         ({"schema": "x/1"}, "schema 'x/1'"),
         ({"frames": np.arange(4)}, "frames is"),
-        ({"R": np.ones((6, 3, 3))}, "R is no rotation"),
+        ({"R": np.ones((6, 3, 3))}, "R is not a rotation"),
         ({"t": np.full((6, 3), np.nan)}, "NaN"),
         ({"cues": np.array(["../x"] * 6)}, "expected letters"),
         ({"head": "other"}, "is not of the track beside it"),

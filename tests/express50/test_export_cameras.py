@@ -8,7 +8,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from express50.dataset.export.pictures import centred, seen_by
+from express50.dataset.export.gaussian_avatars import centred, seen_by
 from express50.geometry.cameras import Camera, pinhole_camera, project
 from express50.geometry.conventions import cam_from_world_from_opengl, opengl_from_cam_from_world
 from express50.geometry.transforms import look_at

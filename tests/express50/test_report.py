@@ -8,8 +8,7 @@ import pytest
 
 from express50.cli.main import main
 from express50.contract.layout import Dataset
-from express50.dataset.report.collect import Picture, spread
-from express50.dataset.report.page import number, render_page
+from express50.dataset.report.page import Picture, number, render_page, spread
 from express50.files.images import write_image
 from express50.runner.ledger import Ledger, Receipt
 

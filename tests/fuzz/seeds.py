@@ -36,8 +36,7 @@ from express50.rigs.read import guess_format, read_rig
 from express50.runner.ledger import Ledger, Receipt
 from express50.runner.runner import run_stage
 from express50.shards.codecs import decode_picture, encode_pictures
-from express50.shards.offsets import read_offsets, write_offsets
-from express50.shards.reader import read_entries
+from express50.shards.reader import read_entries, read_offsets, write_offsets
 from express50.shards.writer import verify, write_manifest
 from pipelines import ingest
 from tests.express50.captures.layouts import (

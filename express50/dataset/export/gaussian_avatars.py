@@ -1,6 +1,6 @@
 """Tracked heads in the layout that GaussianAvatars and VHAP read.
 
-One time step an expression: ``images/<step>_<camera>.png``, ``fg_masks/``,
+One time step per expression: ``images/<step>_<camera>.png``, ``fg_masks/``,
 ``flame_param/<step>.npz``, and ``transforms*.json`` with OpenGL camera-to-world matrices.
 """
 
@@ -10,29 +10,29 @@ import math
 from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from express50.capture.frames import read_cameras_of, read_gains, read_peak_frame
 from express50.contract.layout import Dataset
 from express50.dataset.export.parameters import export_shift, is_flame, write_parameters
-from express50.dataset.export.pictures import centred, flattened, rgba_png, seen_by
 from express50.dataset.export.select import META, SCHEMA, Head
 from express50.dataset.tracks import Track
 from express50.errors import CaptureError, ConfigError, FormatError, StageError
 from express50.files.atomic import dump_json
-from express50.files.images import encode_png, read_alpha, scale_light
-from express50.geometry.cameras import Camera, scale_camera, transform_camera
-from express50.geometry.conventions import opengl_from_cam_from_world
+from express50.files.images import encode_png, read_alpha, resize_area, scale_light
+from express50.geometry.cameras import Camera, pinhole_camera, scale_camera, transform_camera
+from express50.geometry.conventions import affine_to_opencv, opengl_from_cam_from_world
 
 BACKGROUNDS = {"alpha": None, "white": 255, "black": 0}
 
 
 @dataclass(frozen=True, kw_only=True)
 class AvatarOptions:
-    """How a data set is laid out.
+    """Says how a data set is laid out.
 
     Attributes:
-        background: ``alpha`` (pictures keep it), or what is put behind the head.
+        background: ``alpha`` (pictures keep it), or the colour behind the head.
         head_only: alpha of the head without the torso, from the regions stage.
         downscale: whole number of times that pictures are smaller than the footage.
         even_colour: divide each camera's colour gain, as calibrate measured it, out of its light.
@@ -53,7 +53,7 @@ def export_avatar(dataset: Dataset, head: Head, options: AvatarOptions, out: Pat
 
     Raises:
         StageError: no view of any expression has a matte.
-        ConfigError: an option names what is not there.
+        ConfigError: an option names a missing camera or expression.
     """
     cameras = read_cameras_of(dataset, head.subject)
     _check_options(head.track, cameras, options)
@@ -112,7 +112,7 @@ def _write_views(
     options: AvatarOptions,
     out: Path,
 ) -> tuple[list[dict], list[dict[str, str]]]:
-    """Pictures and masks of one time step: rows of the table, and what was left out and why."""
+    """Write the pictures and masks of one time step; return table rows and what was dropped."""
     rows, dropped = [], []
     frame = int(head.track.frames[head.track.row(expression)])
     for number, (name, camera) in enumerate(cameras.items()):
@@ -142,7 +142,7 @@ def _write_views(
 def _read_view(
     dataset: Dataset, item: str, camera: Camera, frame: int, options: AvatarOptions
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Undistorted frame (H, W, 3) uint8 and its alpha (H, W) uint8."""
+    """Read an undistorted frame (H, W, 3) uint8 and its alpha (H, W) uint8."""
     subject, expression = item.split("/")
     path, stage = dataset.matte_file(subject, expression, camera.id), "matte"
     if options.head_only:
@@ -162,7 +162,7 @@ def _read_view(
 
 
 def _evened(dataset: Dataset, subject: str, camera_id: str, image: np.ndarray) -> np.ndarray:
-    """The image without its camera's gain, where one was measured."""
+    """Divide the camera's gain out of an image, where one was measured."""
     gain = read_gains(dataset, subject).get(camera_id)
     return image if gain is None else scale_light(image, 1.0 / gain)
 
@@ -170,7 +170,7 @@ def _evened(dataset: Dataset, subject: str, camera_id: str, image: np.ndarray) -
 def _described(
     row: dict, cameras: dict[str, Camera], shift: np.ndarray, flame: bool
 ) -> dict[str, object]:
-    """One frame of transforms.json."""
+    """Make one frame of transforms.json."""
     move = np.eye(4)
     move[:3, 3] = -shift
     camera = transform_camera(cameras[row["camera"]], move)
@@ -196,7 +196,7 @@ def _described(
 def _write_tables(
     frames: list[dict], steps: list[str], cameras: list[str], options: AvatarOptions, out: Path
 ) -> None:
-    """transforms.json and its division into training, validation and test."""
+    """Write transforms.json and its division into training, validation and test."""
     held = options.test_expressions
     train = math.ceil(0.7 * len(steps))
     test = [k for k, name in enumerate(steps) if (k >= train if held is None else name in held)]
@@ -254,3 +254,56 @@ def _meta(
         meta["expression_names"] = list(head.model.expression_names)
         meta["meshes"] = "meshes/<step>.obj, the tracked vertices; no FLAME model gives them"
     return meta
+
+
+NEAR_PX = 0.02  # what centring would move pixels by at most: not worth an interpolation
+
+
+def centred(camera: Camera, factor: int = 1) -> Camera:
+    """A pinhole camera at the same place whose image holds the given one's whole view.
+
+    Its focal lengths are equal, its principal point is the middle, and ``factor`` divides its size.
+    The camera itself, where that is true of it already, to NEAR_PX.
+    """
+    K = camera.K
+    f = K[0, 0]
+    away = np.abs(K[:2, 2] - (camera.width / 2, camera.height / 2)).max()
+    divided = camera.width % factor == camera.height % factor == 0
+    if divided and away + abs(K[1, 1] / f - 1) * camera.height <= NEAR_PX:
+        return camera
+    width = _whole(2 * max(K[0, 2], camera.width - K[0, 2]), factor)
+    height = _whole(2 * max(K[1, 2], camera.height - K[1, 2]) * f / K[1, 1], factor)
+    square = np.array([[f, 0, width / 2], [0, f, height / 2], [0, 0, 1.0]])
+    return pinhole_camera(camera.id, square, width, height, camera.cam_from_world)
+
+
+def _whole(length: float, factor: int) -> int:
+    """Even number of pixels, a multiple of the factor, that holds a length, rounding aside."""
+    return 2 * factor * math.ceil((length - 1e-6) / (2 * factor))
+
+
+def seen_by(image: np.ndarray, camera: Camera, target: Camera, factor: int = 1) -> np.ndarray:
+    """Image (H, W[, C]) of a pinhole camera as ``target``, at the same place, has it; 0 outside.
+
+    It is made ``factor`` times smaller by averaging.
+    """
+    if target is not camera:
+        matrix = (target.K @ np.linalg.inv(camera.K))[:2]
+        image = cv2.warpAffine(
+            image, affine_to_opencv(matrix), (target.width, target.height), flags=cv2.INTER_LINEAR
+        )
+    if factor == 1:
+        return image
+    return resize_area(image, target.width // factor, target.height // factor)
+
+
+def rgba_png(image: np.ndarray, alpha: np.ndarray) -> bytes:
+    """PNG bytes of an image (H, W, 3) uint8 with opacity (H, W) uint8, colours not multiplied."""
+    pixels = np.ascontiguousarray(np.concatenate([image[..., ::-1], alpha[..., None]], -1))
+    return cv2.imencode(".png", pixels, [cv2.IMWRITE_PNG_COMPRESSION, 3])[1].tobytes()
+
+
+def flattened(image: np.ndarray, alpha: np.ndarray, level: int) -> np.ndarray:
+    """Image (H, W, 3) uint8 over a grey background of one level, by alpha (H, W) uint8."""
+    share = alpha[..., None] / np.float32(255)
+    return np.rint(image * share + level * (1 - share)).astype(np.uint8)

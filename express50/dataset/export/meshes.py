@@ -1,6 +1,6 @@
-"""Meshes of tracked heads as OBJ, PLY or GLB, in the user's world, metres.
+"""Write tracked heads as OBJ, PLY or GLB meshes, in the user's world, metres.
 
-OBJ keeps the head model's vertices and their order, with texture coordinates a corner; PLY keeps
+OBJ keeps the head model's vertices and their order, with texture coordinates per corner; PLY keeps
 them with a colour each; GLB repeats vertices along the seams of the texture, as glTF wants them.
 """
 
@@ -14,12 +14,11 @@ from express50.dataset.export.select import META, SCHEMA, Head
 from express50.files.atomic import dump_json
 from express50.files.images import encode_png
 from express50.geometry.conventions import corner_to_cell
+from express50.geometry.meshes import write_ply
 from express50.head.model import HeadModel
 
 FORMATS = ("obj", "ply", "glb")
 TEXTURE = "albedo.png"
-_PLY_VERTEX = [("x", "<f4"), ("y", "<f4"), ("z", "<f4")]
-_PLY_COLOUR = [("red", "u1"), ("green", "u1"), ("blue", "u1")]
 
 
 def export_meshes(head: Head, kind: str, out: Path) -> dict:
@@ -37,7 +36,10 @@ def export_meshes(head: Head, kind: str, out: Path) -> dict:
         if kind == "obj":
             write_obj(path, vertices, head.model, TEXTURE if head.albedo is not None else None)
         elif kind == "ply":
-            write_ply(path, vertices, head.model.faces.numpy(), vertex_colours(head))
+            colours = vertex_colours(head)
+            names = () if colours is None else ("red", "green", "blue")
+            columns = {name: colours[:, k] for k, name in enumerate(names)}  # type: ignore[index]
+            write_ply(path, vertices, head.model.faces.numpy(), columns)
         else:
             write_glb(path, vertices, head.model, head.albedo)
     meta = {
@@ -78,25 +80,6 @@ def write_obj(
     path.write_text("\n".join(lines) + "\n", encoding="ascii")
 
 
-def write_ply(
-    path: Path, vertices: np.ndarray, faces: np.ndarray, colours: np.ndarray | None = None
-) -> None:
-    """Write a binary PLY file of vertices (V, 3), faces (F, 3) and colours (V, 3) uint8 sRGB."""
-    kinds = _PLY_VERTEX + (_PLY_COLOUR if colours is not None else [])
-    table = np.zeros(len(vertices), kinds)
-    for axis, (name, _) in enumerate(_PLY_VERTEX):
-        table[name] = vertices[:, axis]
-    for channel, (name, _) in enumerate(kinds[3:]):
-        table[name] = colours[:, channel]  # type: ignore[index]
-    rows = np.zeros(len(faces), [("count", "u1"), ("corners", "<i4", 3)])
-    rows["count"], rows["corners"] = 3, faces
-    words = {"<f4": "float", "u1": "uchar"}
-    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(table)}"]
-    header += [f"property {words[kind]} {name}" for name, kind in kinds]
-    header += [f"element face {len(rows)}", "property list uchar int vertex_indices", "end_header"]
-    path.write_bytes(("\n".join(header) + "\n").encode() + table.tobytes() + rows.tobytes())
-
-
 def write_glb(
     path: Path, vertices: np.ndarray, model: HeadModel, albedo: np.ndarray | None = None
 ) -> None:
@@ -122,7 +105,7 @@ def write_glb(
 
 
 def vertex_colours(head: Head) -> np.ndarray | None:
-    """Colours (V, 3) uint8 of the texture at the vertices; None without a texture."""
+    """Sample the texture at the vertices: (V, 3) uint8, or None without a texture."""
     if head.albedo is None:
         return None
     height, width = head.albedo.shape[:2]

@@ -26,7 +26,7 @@ FAR_M = 16.0  # from there on, single precision rounds by more than a micrometre
 
 
 def is_flame(model: HeadModel) -> bool:
-    """Whether a reader of FLAME's coefficients gets this model's vertices from them."""
+    """True if FLAME's coefficients give this model's vertices."""
     return model.name.startswith("flame-")
 
 
@@ -56,7 +56,7 @@ def flame_motion(
 
 
 def write_parameters(head: Head, steps: list[str], shift: np.ndarray, out: Path) -> None:
-    """A file of parameters a time step, the canonical one, and meshes where it is not FLAME."""
+    """Write a file of parameters per time step, the canonical one, and meshes if not FLAME."""
     (out / "flame_param").mkdir()
     shared = _shared_parameters(head)
     for number, name in enumerate(steps):
@@ -99,7 +99,7 @@ def _padded(values: np.ndarray, count: int) -> np.ndarray:
 
 
 def npz_bytes(arrays: dict[str, np.ndarray]) -> bytes:
-    """Bytes of an .npz file; NumPy dates its members 1980, so that they hang on nothing else."""
+    """Bytes of an .npz file; NumPy dates its members 1980, so that they depend on nothing else."""
     buffer = io.BytesIO()
     np.savez(buffer, **arrays)  # type: ignore[arg-type]  # numpy types its options only
     return buffer.getvalue()

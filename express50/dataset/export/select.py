@@ -1,4 +1,4 @@
-"""What is exported: tracked subjects and expressions, and the folder that takes them."""
+"""Choose tracked subjects and expressions to export, and publish the folder that takes them."""
 
 from __future__ import annotations
 
@@ -180,7 +180,7 @@ def exporting(out: Path, subject: str) -> Iterator[Path]:
     target, aside = out / subject, out / f".{subject}.part"
     if target.exists() and not (target / META).is_file():
         raise StageError(
-            f"{target}: exists and holds no {META}, so it is no export; name another folder"
+            f"{target}: exists and holds no {META}, so it is not an export; name another folder"
         )
     former = aside.with_name(aside.name + ".former")
     if former.exists() and not target.exists():

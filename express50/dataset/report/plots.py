@@ -1,4 +1,4 @@
-"""Small plots as inline SVG."""
+"""Draw small plots as inline SVG."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def _svg(figure: Figure) -> Markup:
 
 
 def timing_bars(seconds: dict[str, float]) -> Markup:
-    """Horizontal bars of the seconds of each step."""
+    """Draw horizontal bars of the seconds of each step."""
     figure = Figure(figsize=(9, 0.3 * len(seconds) + 0.6))
     axes = figure.add_subplot()
     names = list(seconds)
@@ -41,7 +41,7 @@ def timing_bars(seconds: dict[str, float]) -> Markup:
 
 
 def metric_bars(figures: dict[str, dict[str, float]], columns: list[str]) -> Markup:
-    """One panel a metric: its value over the items."""
+    """Draw one panel per metric: its value over the items."""
     varying = [c for c in columns if len({row.get(c) for row in figures.values()}) > 1][:_PANELS]
     if not varying:
         return Markup("")
@@ -59,7 +59,7 @@ def metric_bars(figures: dict[str, dict[str, float]], columns: list[str]) -> Mar
 
 
 def loss_curve(log: Path) -> Markup:
-    """Training losses of a JSONL log with ``iteration`` and numbers; empty without one."""
+    """Plot the training losses of a JSONL log with ``iteration`` and numbers; empty without one."""
     if not log.is_file():
         return Markup("")
     text = read_text(log, FormatError)
@@ -77,7 +77,7 @@ def loss_curve(log: Path) -> Markup:
 
 
 def _entry(line: str, log: Path) -> dict | None:
-    """A line of the log; None of what is no entry, such as half a line before a power cut."""
+    """Parse a line of the log; None if it is not an entry, such as half a line."""
     try:
         row = parse_json(line, str(log), FormatError)
     except FormatError:
