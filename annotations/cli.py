@@ -26,10 +26,10 @@ from annotations.cli_label import (
 )
 from annotations.exchange import LAST_FRAME, export_labels, import_labels, last_frame_marks
 from annotations.labels import FLAG_REASONS, Label
-from annotations.status import coverage, effort, progress
 from annotations.store import append_label, read_labels
 from annotations.suggestions import choose_reference, reference_subject
 from annotations.validate import problems
+from annotations.worklist import coverage, effort, progress
 from express50.capture.index import read_index
 from express50.console import FAILED, OK, format_table, say, say_json
 from express50.contract.exclusions import included_subjects

@@ -12,7 +12,7 @@ from annotations.align.features import (
     looks,
     measure,
 )
-from annotations.align.match import shared_columns
+from annotations.align.stage import shared_columns
 from annotations.align.suggest import strongest_event
 from annotations.observe.observations import FaceObservations
 from annotations.observe.stage import FACE, face_side, find_points, steady

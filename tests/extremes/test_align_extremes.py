@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from annotations.align.features import expression_values, measure
-from annotations.align.match import suggest_all, watch
+from annotations.align.stage import suggest_all, watch
 from annotations.align.suggest import suggest
 from annotations.observe.observations import FaceObservations
 from annotations.observe.stage import (

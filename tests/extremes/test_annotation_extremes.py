@@ -20,7 +20,6 @@ from annotations.agreement import (
 )
 from annotations.labels import make_mark
 from annotations.sheet import make_sheet, render_sheet
-from annotations.status import coverage
 from annotations.store import append_label, read_labels
 from annotations.suggestions import read_suggestions
 from annotations.ui import view as moves
@@ -31,7 +30,7 @@ from annotations.ui.session import open_session
 from annotations.ui.timeline import GUTTER, StripContent, column_of, draw_strip, frame_at
 from annotations.ui.view import open_view
 from annotations.validate import problems
-from annotations.worklist import worklist
+from annotations.worklist import coverage, worklist
 from benchmarks.replay import cheapest_keys
 from express50.capture.index import read_index
 from express50.cli.main import main
