@@ -1,7 +1,7 @@
-"""Where Gaussians sit: the head's UV map rasterised once into (face, barycentrics) per texel.
+"""Anchor the Gaussians: rasterise the head's UV map once into face and barycentrics per texel.
 
-Texels that no triangle covers have no surface, so they get no Gaussian (the paper counts all
-N_g^2 of them; the survey's point 19 and ASH's non_empty_idx are the precedent for dropping them).
+Texels that no triangle covers have no surface, so they get no Gaussian; the paper counts all N_g^2
+of them (G19).
 """
 
 from __future__ import annotations

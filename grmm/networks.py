@@ -51,7 +51,7 @@ class Networks(nn.Module):
         self.colour = self._ladder(config.z_id, 3 + config.features, VIEW_CHANNELS, 3)
         with torch.no_grad():
             self.opacity.bias.fill_(math.log(config.opacity_init / (1 - config.opacity_init)))
-            # Features tell texels apart to the refinement: from all zeros it learns slowly.
+            # From all zeros the refinement could not distinguish texels and would learn slowly.
             self.colour.bias[3:].normal_(0, FEATURE_STD)
         self.refinement = None
         if config.refine_widths:
@@ -234,9 +234,8 @@ def zero_last(network: nn.Sequential) -> nn.Sequential:
 class Refinement(nn.Module):
     """I = I_rgb + U-Net([I_rgb, features, normalised depth (, alpha)]).
 
-    The paper names inputs and purpose only; widths, residual, the zero-initialised head and the
-    absence of norms follow the survey's point 9. ``unshuffle`` folds r x r pixels into channels
-    first: a CPU needs that. Images whose sides are no multiple of the stride are padded.
+    The paper names inputs and purpose only; G9 has the rest. ``unshuffle`` folds r x r pixels into
+    channels first, which a CPU needs. Sides that are not a multiple of the stride are padded.
     """
 
     def __init__(self, *, inputs: int, widths: Sequence[int], unshuffle: int) -> None:
