@@ -10,7 +10,8 @@ from collections.abc import Sequence
 
 from express50 import __version__
 from express50.console import run_handler
-from grmm.cli import draw, learn, measure, study
+from grmm.cli import draw, learn, measure
+from grmm.study import add_study
 
 DESCRIPTION = "Train the Gaussian Residual Morphable Model on packed shards, and use it."
 EPILOG = """example:
@@ -43,5 +44,5 @@ def build_parser() -> argparse.ArgumentParser:
     measure.add_evaluate(commands)
     measure.add_score(commands)
     measure.add_ablate(commands)
-    study.add_study(commands)
+    add_study(commands)
     return parser

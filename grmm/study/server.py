@@ -17,8 +17,8 @@ from urllib.parse import parse_qs, urlsplit
 
 from express50.errors import FormatError
 from express50.files.text import parse_json
-from grmm.study.answers import append_answer, check_answer, read_answers, read_study
 from grmm.study.design import trials
+from grmm.study.results import append_answer, check_answer, read_answers, read_study
 
 ANSWER_LIMIT = 4096  # bytes of one POST
 PAGE = "page.html"

@@ -10,10 +10,9 @@ import pytest
 from express50.errors import ConfigError, FormatError
 from express50.files.images import write_image
 from grmm.cli import main
-from grmm.study.answers import append_answer, check_answer, read_answers
 from grmm.study.design import Method, make_study, method_of, trials
+from grmm.study.results import append_answer, check_answer, markdown, read_answers, summarise
 from grmm.study.server import make_server
-from grmm.study.table import markdown, summarise
 
 
 @pytest.fixture
