@@ -48,7 +48,7 @@ from grmm.train_state import best_device, with_map_size
 
 @dataclass(frozen=True, kw_only=True)
 class Variant:
-    """One row: what it is called, what it changes, and what the paper found.
+    """One row of the ablation: its name, its changes, and the paper's figure.
 
     Attributes:
         label: as in the table.
@@ -152,7 +152,7 @@ def with_holdout(roots: Sequence[Path], config: Config) -> Config:
 
 
 def changed(config: Config, variant: Variant, used: Sequence[Path]) -> Config:
-    """The configuration of a row; what it holds out is what its own datasets have of it."""
+    """Return the configuration of a row; it holds out only what its own datasets have."""
     tables = as_tables(config)
     for table, values in variant.changes.items():
         tables[table] |= values
@@ -177,7 +177,7 @@ def _row(
     protocol: FitProtocol,
     subjects: Sequence[str],
 ) -> dict:
-    """The numbers of one row, from its file if it was measured with these very settings."""
+    """Measure one row, or read it from its file if it was measured with the same settings."""
     used = [root for root in roots if root != variant.without]
     settings = changed(config, variant, used)
     digest = _digest(roots, used, settings, protocol, subjects)
@@ -225,7 +225,7 @@ def measure(
     protocol: FitProtocol,
     subjects: Sequence[str],
 ) -> dict:
-    """Held-out views and expressions of training people, and people that training never saw."""
+    """Measure held-out views and expressions of training people, and unseen people."""
     data = loaded.config.data
     views = HeadViews(
         open_shards(roots, "*"),
@@ -243,7 +243,7 @@ def measure(
             for i, k in enumerate(kinds)
             if k == kind and views.keys[i].expression in loaded.model.expressions
         ]
-        # Without a dataset other people are trained: their views are no comparison.
+        # Without a dataset other people are trained, whose views cannot be compared.
         if not own or len(used) < len(roots):
             continue
         chosen = spread(own, protocol.images) if protocol.images else own
@@ -270,7 +270,7 @@ def measure(
 
 
 def unseen_subjects(roots: Sequence[Path], views: HeadViews, split: str) -> set[str]:
-    """People of all splits that no row trains on: those outside the training split."""
+    """Return the people of all splits that no row trains on: those outside the training split."""
     trained = {key.subject for key in open_shards(roots, split).keys}
     return {key.subject for key in views.keys} - trained
 
@@ -286,7 +286,7 @@ def _digest(
     protocol: FitProtocol,
     subjects: Sequence[str],
 ) -> str:
-    """What a row's numbers depend on, but for the code."""
+    """Digest everything that a row's numbers depend on, except the code."""
     indices = [hashlib.sha256((root / "index.json").read_bytes()).hexdigest() for root in roots]
     content = {
         "shards": indices,
@@ -299,7 +299,7 @@ def _digest(
 
 
 def variants_of(roots: Sequence[Path], names: Sequence[str] = ()) -> dict[str, Variant]:
-    """The rows asked for, all by default; with several datasets one row without each.
+    """Return the rows asked for, all by default; with several datasets one row without each.
 
     Raises:
         ConfigError: no row has such a name.
@@ -345,7 +345,7 @@ def write_tables(
 
 
 def markdown(table: Mapping[str, dict], missing: Mapping[str, str]) -> str:
-    """The table as the paper prints its own: one row a model, PSNR, SSIM and LPIPS a protocol."""
+    """Format the table as the paper does: a row per model; PSNR, SSIM and LPIPS per protocol."""
     groups = [g for g in GROUPS if any(g in row["groups"] for row in table.values())]
     head = ["Method"]
     for group in groups:

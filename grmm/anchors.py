@@ -36,7 +36,7 @@ class Anchors:
     overlaps: int
 
     def budget(self) -> str:
-        """One line that says how many Gaussians the scene gets, and how many it does not need."""
+        """Describe in one line how many Gaussians the scene gets and how many texels have none."""
         total = self.n_g * self.n_g
         count = len(self.texels)
         return (
@@ -92,7 +92,7 @@ def mouth_faces(head: HeadModel) -> Tensor:
 
 
 def _candidate_texels(grid: Tensor, n_g: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Face, column and row of every texel whose centre lies in a triangle's bounding box."""
+    """Return face, column and row of every texel whose centre lies in a triangle's bounding box."""
     low = torch.ceil(grid.amin(1) - 0.5).clamp(0, n_g).long()  # (F, 2) as (column, row)
     high = torch.floor(grid.amax(1) - 0.5).clamp(-1, n_g - 1).long()
     size = (high - low + 1).clamp_min(0)
@@ -104,7 +104,7 @@ def _candidate_texels(grid: Tensor, n_g: int) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _barycentrics(corners: Tensor, points: Tensor) -> Tensor:
-    """Barycentrics (M, 3) of points (M, 2) in triangles (M, 3, 2); -1 where one has no area."""
+    """Compute barycentrics (M, 3) of points (M, 2) in triangles (M, 3, 2); -1 without area."""
     a, b, c = corners.unbind(1)
     ab, ac, ap = b - a, c - a, points - a
     area = ab[:, 0] * ac[:, 1] - ab[:, 1] * ac[:, 0]
@@ -128,7 +128,7 @@ def uv_gradients(head: HeadModel) -> Tensor:
 
 
 def tangent_frames(vertices: Tensor, faces: Tensor, gradients: Tensor) -> tuple[Tensor, Tensor]:
-    """Right-handed frames of triangles and how far a unit of UV reaches along them.
+    """Return the right-handed frames of triangles and how far a unit of UV reaches along them.
 
     Args:
         vertices: (V, 3) metres.
@@ -161,5 +161,5 @@ def tangent_frames(vertices: Tensor, faces: Tensor, gradients: Tensor) -> tuple[
 
 
 def interpolate(values: Tensor, faces: Tensor, anchors_faces: Tensor, weights: Tensor) -> Tensor:
-    """Barycentric interpolation (N, C) of vertex values (V, C) at anchors."""
+    """Interpolate vertex values (V, C) at anchors, (N, C), by barycentrics."""
     return (values[faces[anchors_faces]] * weights[..., None]).sum(1)

@@ -81,7 +81,7 @@ class Loaded:
     loop: dict[str, Any]
 
     def state(self, subject: str, expression: str) -> HeadState:
-        """Tracked head of a training frame.
+        """Return the tracked head of a training frame.
 
         Raises:
             FormatError: the training set had no such frame.
@@ -96,7 +96,7 @@ class Loaded:
 
 
 def collect_gallery(views: HeadViews, indices: Sequence[int]) -> Gallery:
-    """Parameters of every frame, and one view of every camera, among the samples ``indices``."""
+    """Collect every frame's parameters and one view per camera of the samples ``indices``."""
     frames: dict[tuple[str, str], Tracked] = {}
     cameras: dict[str, PinholeView] = {}
     for index in indices:
@@ -170,7 +170,7 @@ def load_checkpoint(path: Path, device: torch.device | str = "cpu") -> Loaded:
 
 
 def _loaded(path: Path, content: dict[str, Any], device: torch.device | str) -> Loaded:
-    """The checkpoint of a file's content, each number of it finite."""
+    """Build the checkpoint of a file's content after checking that every number is finite."""
     try:
         config = from_tables(_current_settings(path, content["config"]))
     except ConfigError as error:
@@ -227,7 +227,7 @@ def _build(path: Path, config: ModelConfig, head: HeadModel, content: dict[str, 
 def _gallery(
     path: Path, content: dict[str, Any], head: HeadModel, device: torch.device | str
 ) -> Gallery:
-    """Frames and cameras of a file's content."""
+    """Return the frames and cameras of a file's content."""
     offsets = _arrays(content.get("offsets", {}))
     _check_finite(path, content.get("offsets", {}))
     frames = {}
@@ -242,7 +242,7 @@ def _gallery(
 
 
 def _camera(path: Path, name: str, row: dict[str, Any], device: torch.device | str) -> PinholeView:
-    """One camera, of a size that an image may have."""
+    """Read one camera and check that an image may have its size."""
     matrices = {"K": row["K"], "cam_from_head": row["cam_from_head"]}
     _check_finite(path, matrices)
     check_shape("K", row["K"], (3, 3), f"camera {name}")
@@ -262,15 +262,15 @@ def _camera(path: Path, name: str, row: dict[str, Any], device: torch.device | s
 
 
 def read_content(path: Path) -> dict[str, Any]:
-    """The tables of a checkpoint, as they were saved.
+    """Read the tables of a checkpoint as they were saved.
 
     Raises:
         FormatError: no such file, or not a checkpoint of this format.
     """
     if not Path(path).is_file():
         raise FormatError(f"{path}: no such checkpoint; 'grmm train' writes one")
-    mend = "'grmm train' writes one"
-    content = read_weights(path, FormatError, str(path), "a checkpoint that it wrote", mend)
+    remedy = "'grmm train' writes one"
+    content = read_weights(path, FormatError, str(path), "a checkpoint that it wrote", remedy)
     found = content.get("format") if isinstance(content, dict) else None
     if found != FORMAT:
         raise FormatError(f"{path}: format is {found!r}, expected {FORMAT!r}")
@@ -284,7 +284,7 @@ def _check_finite(path: Path, tensors: dict[str, Tensor]) -> None:
 
 
 def _parameters(tracked: Tracked) -> dict[str, Tensor]:
-    """All but the offsets, which the frames of a subject share."""
+    """Return all parameters except the offsets, which the frames of a subject share."""
     return {
         item.name: torch.from_numpy(np.ascontiguousarray(getattr(tracked, item.name)))
         for item in fields(tracked)

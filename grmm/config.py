@@ -82,7 +82,7 @@ class ModelConfig:
 
     @property
     def scale_bounds_mm(self) -> tuple[float, float]:
-        """Range of scales at this n_g, millimetres: texels of a smaller map lie further apart."""
+        """Return the range of scales, mm: texels of a smaller map lie further apart."""
         low, high = SCALE_RANGE_MM
         return low * 512 / self.n_g, high * 512 / self.n_g
 
@@ -115,7 +115,7 @@ class LossConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class DataConfig:
-    """What is read from the shards."""
+    """Settings of what training reads from the shards."""
 
     holdout_cameras: tuple[str, ...] = ()
     """Camera ids that training never sees; metrics.json reports on them."""

@@ -82,7 +82,7 @@ class Sample:
 
 
 class Source(Protocol):
-    """Where samples come from: the shard reader, or a list in tests."""
+    """A source of samples: the shard reader, or a list in tests."""
 
     keys: Sequence[Key]
     head: str
@@ -119,7 +119,7 @@ class Item:
     depth_valid: Tensor
 
     def comparable(self, image: Tensor) -> Tensor:
-        """``image`` (3, H, W) with the footage itself where pixels do not count."""
+        """Return ``image`` (3, H, W) with the footage where pixels do not count."""
         return torch.where(self.counts, image, self.target)
 
 
@@ -146,12 +146,12 @@ class HeadViews:
         self._states: dict[tuple[str, str], HeadState] = {}
 
     def __len__(self) -> int:
-        """Number of samples."""
+        """Return the number of samples."""
         return len(self.source.keys)
 
     @property
     def keys(self) -> Sequence[Key]:
-        """Ids of all samples."""
+        """Return the ids of all samples."""
         return self.source.keys
 
     def item(self, index: int, *, crop: bool = False) -> Item:
@@ -188,7 +188,7 @@ class HeadViews:
         )
 
     def _torso(self, index: int, sample: Sample, state: HeadState, view: PinholeView) -> np.ndarray:
-        """Torso pixels (H, W) of a sample; what takes long is found once and kept as bits."""
+        """Find the torso pixels (H, W) of a sample; masks that take long are kept as bits."""
         size = sample.alpha.shape
         if not self.ignore_torso:
             return np.zeros(size, bool)
@@ -201,7 +201,7 @@ class HeadViews:
         return bits.reshape(size).astype(bool)
 
     def sample(self, index: int) -> Sample:
-        """The decoded sample, from memory if it is there."""
+        """Return the decoded sample, from memory if it is there."""
         if index in self._cache:
             self._cache.move_to_end(index)
             return self._cache[index]
@@ -215,7 +215,7 @@ class HeadViews:
         return sample
 
     def state(self, index: int) -> HeadState:
-        """Tracked head of a sample, posed once per (subject, expression)."""
+        """Return the tracked head of a sample, posed once per (subject, expression)."""
         key = self.keys[index]
         if (key.subject, key.expression) not in self._states:
             tracked = self.sample(index).tracked
@@ -223,7 +223,7 @@ class HeadViews:
         return self._states[key.subject, key.expression]
 
     def view_of(self, sample: Sample, width: int, height: int) -> PinholeView:
-        """Camera of a sample in head space, float64: subjects may stand far from the origin."""
+        """Return a sample's camera in head space, float64: subjects may be far from the origin."""
         head_to_world = np.eye(4)
         head_to_world[:3, :3], head_to_world[:3, 3] = sample.tracked.R, sample.tracked.t
         camera = sample.cam_from_world @ head_to_world

@@ -47,12 +47,12 @@ class HeadCodes:
     tracked: Tracked
 
     def state(self, loaded: Loaded) -> HeadState:
-        """The posed mesh in head space."""
+        """Return the posed mesh in head space."""
         return pose_state(loaded.head, self.tracked)
 
 
 def trained_head(loaded: Loaded, subject: str, expression: str) -> HeadCodes:
-    """A training subject with a training expression; a frame it never showed comes by transfer.
+    """Return a training subject with a training expression, by transfer if it never showed it.
 
     Raises:
         ConfigError: the checkpoint knows no such subject or expression.
@@ -70,7 +70,7 @@ def trained_head(loaded: Loaded, subject: str, expression: str) -> HeadCodes:
 
 
 def with_expression(identity: HeadCodes, expression: HeadCodes) -> HeadCodes:
-    """Expression transfer: one head's identity with all that another's expression is made of."""
+    """Transfer an expression: combine one head's identity with another's expression."""
     return HeadCodes(
         z_id=identity.z_id,
         z_exp=expression.z_exp,
@@ -79,7 +79,7 @@ def with_expression(identity: HeadCodes, expression: HeadCodes) -> HeadCodes:
 
 
 def between(a: HeadCodes, b: HeadCodes, t: float) -> HeadCodes:
-    """The head at ``t`` from a (0) to b (1): codes and parameters are blended."""
+    """Blend codes and parameters from a (``t`` = 0) to b (1)."""
     return HeadCodes(
         z_id=torch.lerp(a.z_id, b.z_id, t),
         z_exp=torch.lerp(a.z_exp, b.z_exp, t),
@@ -88,7 +88,7 @@ def between(a: HeadCodes, b: HeadCodes, t: float) -> HeadCodes:
 
 
 def transfer(identity: Tracked, expression: Tracked) -> Tracked:
-    """One frame's head and place, another's expression, jaw, neck and eyes."""
+    """Combine one frame's head and place with another's expression, jaw, neck and eyes."""
     return replace(
         expression,
         shape=identity.shape,
@@ -161,7 +161,7 @@ def principal_directions(codes: Tensor) -> Tensor:
 
 @lru_cache(maxsize=4)
 def _directions(codes: Tensor, version: int) -> Tensor:
-    """Kept, because sliders ask again and again; a code table that training changes is another."""
+    """Cache the directions: sliders ask often. ``version`` changes when training does the codes."""
     centred = codes.detach().double() - codes.detach().double().mean(0)
     if len(codes) < 2:
         return codes.new_zeros(0, codes.shape[1])
@@ -176,7 +176,7 @@ def _directions(codes: Tensor, version: int) -> Tensor:
 def sample_identity(
     loaded: Loaded, head: HeadCodes, rng: np.random.Generator, spread: float
 ) -> HeadCodes:
-    """A new person with the given head's expression.
+    """Draw a new person with the given head's expression.
 
     Codes, shape and offsets are drawn together from the Gaussian that the training subjects
     span (``spread`` 1 has their covariance), so that a face and its skin still belong together.
@@ -200,7 +200,7 @@ def sample_identity(
 def sample_expression(
     loaded: Loaded, head: HeadCodes, rng: np.random.Generator, spread: float
 ) -> HeadCodes:
-    """The given person with a new expression, drawn as `sample_identity` draws people.
+    """Draw a new expression for the given person, as `sample_identity` draws people.
 
     Coefficients and jaw stay within what training showed: activations have bounds.
 
@@ -227,7 +227,7 @@ def sample_expression(
 
 
 def _sample_weights(count: int, rng: np.random.Generator, spread: float, what: str) -> np.ndarray:
-    """Weights (count,) that sum to 1; a weighted sum has the rows' mean and covariance."""
+    """Return weights (count,) that sum to 1; a weighted sum has the rows' mean and covariance."""
     if count < 2:
         raise ConfigError(
             f"the checkpoint has {count} of {what}, expected two or more to draw from"
@@ -242,7 +242,7 @@ def _combine(rows: Sequence[np.ndarray], weights: np.ndarray) -> np.ndarray:
 
 
 def _padded(values: np.ndarray, length: int) -> np.ndarray:
-    """Missing coefficients are zero."""
+    """Pad with zeros, which missing coefficients are."""
     return np.pad(values, [(0, length - len(values)), *[(0, 0)] * (values.ndim - 1)])
 
 
@@ -302,7 +302,7 @@ def _known(what: str, name: str, known: Sequence[str]) -> None:
 
 
 def _blend_offsets(a: np.ndarray, b: np.ndarray, t: float) -> np.ndarray:
-    """(1 - t) a + t b (V, 3); (0, 3) stands for zeros."""
+    """Blend offsets, (1 - t) a + t b (V, 3); (0, 3) stands for zeros."""
     if not len(a) and not len(b):
         return a
     a, b = (x if len(x) else np.zeros_like(max(a, b, key=len)) for x in (a, b))
@@ -310,7 +310,7 @@ def _blend_offsets(a: np.ndarray, b: np.ndarray, t: float) -> np.ndarray:
 
 
 def _lerp(a: np.ndarray, b: np.ndarray, t: float) -> np.ndarray:
-    """(1 - t) a + t b; the shorter one is padded with zeros."""
+    """Blend, (1 - t) a + t b; the shorter one is padded with zeros."""
     length = max(len(a), len(b))
     a, b = (_padded(x, length) for x in (a, b))
     return (1 - t) * a + t * b

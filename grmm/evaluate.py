@@ -1,6 +1,6 @@
 """Measure renderings against footage, over the whole image and over the head.
 
-What was held out is told apart: views of trained frames, frames of trained subjects and
+Held-out samples are of different kinds: views of trained frames, frames of trained subjects and
 expressions (a held-out expression), and subjects that training never saw (fitted first).
 """
 
@@ -42,7 +42,7 @@ SSIM_SIGMA, SSIM_WINDOW = 1.5, 11  # Wang et al. 2004
 
 
 def psnr_db(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
-    """Peak signal-to-noise ratio of (3, H, W) images in [0, 1], decibels, at most 100.
+    """Return peak signal-to-noise ratio of (3, H, W) images in [0, 1], decibels, at most 100.
 
     ``mask`` (H, W) bool limits it to some pixels; NaN if it selects none.
     """
@@ -55,7 +55,7 @@ def psnr_db(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
 
 
 def rmse(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
-    """Root mean squared error of (3, H, W) images in [0, 1]; NaN if the mask selects nothing."""
+    """Compute the RMSE of (3, H, W) images in [0, 1]; NaN if the mask selects nothing."""
     a, b = image.clamp(0, 1).double(), target.double()
     if mask is not None:
         a, b = a[:, mask], b[:, mask]
@@ -65,7 +65,7 @@ def rmse(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
 
 
 def ssim_score(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
-    """Mean SSIM of (3, H, W) images; with a mask over windows centred on its pixels.
+    """Return the mean SSIM of (3, H, W) images; with a mask over windows centred on its pixels.
 
     Windows that reach over the border are left out. NaN where no window fits or is selected.
     """
@@ -87,7 +87,7 @@ def ssim_score(image: Tensor, target: Tensor, mask: Tensor | None = None) -> flo
 
 
 def training_render(model: GRMM, views: HeadViews) -> Render:
-    """How a training subject and expression is rendered: with its rows of the code tables."""
+    """Return a function that renders training subjects with their rows of the code tables."""
 
     def render(item: Item) -> Rendering:
         subject = model.subjects.index(item.key.subject)
@@ -98,7 +98,7 @@ def training_render(model: GRMM, views: HeadViews) -> Render:
 
 
 def kind_of(key: Key, subjects: Sequence[str], gallery: Gallery) -> str:
-    """What a sample is to a checkpoint: seen in training (or fitting), or held out in which way."""
+    """Say whether a checkpoint has seen a sample, or in which way it was held out."""
     if key.subject not in subjects:
         return HELD_IDENTITY
     if (key.subject, key.expression) not in gallery.frames:
@@ -107,7 +107,7 @@ def kind_of(key: Key, subjects: Sequence[str], gallery: Gallery) -> str:
 
 
 def compare(image: Tensor, item: Item, judge: PerceptualMetrics) -> dict[str, float]:
-    """The numbers of one picture (3, H, W) in [0, 1] beside its footage.
+    """Compare one picture (3, H, W) in [0, 1] with its footage.
 
     ``psnr_db``, ``ssim``, ``rmse``, ``lpips`` count every pixel but torso (DataConfig.torso);
     ``*_head`` pixels of the footage's matte only, so that an easy background cannot flatter.
@@ -142,7 +142,7 @@ def evaluate(
     kind: Callable[[Key], str] = lambda key: "",
     keep: Callable[[int, Tensor], None] | None = None,
 ) -> list[Row]:
-    """One row of numbers per sample; see `compare`.
+    """Measure samples: one row of numbers each; see `compare`.
 
     ``depth_mm`` is the median absolute error where both depths are known (NaN: nowhere). ``keep``
     gets every index with its picture (3, H, W).
@@ -166,26 +166,26 @@ def evaluate(
 
 
 def row_of(key: Key, kind: str, numbers: dict[str, float]) -> Row:
-    """Ids and numbers of one sample."""
+    """Return the ids and numbers of one sample."""
     return Row(
         subject=key.subject, expression=key.expression, camera=key.camera, kind=kind, **numbers
     )
 
 
 def mean(rows: Sequence[Row], name: str) -> float | None:
-    """Mean of one number over the rows that have it, rounded; None if none has."""
+    """Return the mean of one number over the rows that have it, rounded; None if none has."""
     values = [float(row[name]) for row in rows if not math.isnan(float(row.get(name, math.nan)))]
     return round(sum(values) / len(values), 4) if values else None
 
 
 def means(rows: Sequence[Row]) -> dict[str, object]:
-    """Means of all numbers, and of how many images."""
+    """Return the means of all numbers, and of how many images."""
     numbers: dict[str, object] = {name: mean(rows, name) for name in NUMBERS}
     return numbers | {"images": len(rows)}
 
 
 def summarise(rows: Sequence[Row], judge: PerceptualMetrics | None = None) -> dict[str, object]:
-    """Means over all rows and per kind, subject, expression and camera; reasons for what is n/a."""
+    """Average all rows, and per kind, subject, expression and camera; say why metrics are n/a."""
     judge = PerceptualMetrics(MetricsConfig()) if judge is None else judge
     summary: dict[str, object] = means(rows) | {"fid": judge.fid()} | judge.missing()
     for group in IDS:
@@ -215,7 +215,7 @@ def write_evaluation(
 
 
 def summary_lines(summary: dict) -> list[str]:
-    """What a terminal shows of a summary: one line a kind, then what cannot be measured."""
+    """Format a summary for a terminal: one line per kind, then the metrics that are n/a."""
     names = ("psnr_db", "psnr_head_db", "ssim", "rmse", "lpips")
     lines = []
     for kind, numbers in (summary["by_kind"] or {"all": summary}).items():

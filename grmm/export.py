@@ -17,7 +17,7 @@ from grmm.checkpoint import Loaded
 from grmm.edit import HeadCodes
 from grmm.scene import PinholeView
 
-OPAQUE = 0.3  # opacity under which a Gaussian is no point of a GLB: points cannot be translucent
+OPAQUE = 0.3  # fainter Gaussians are left out of a GLB: its points cannot be translucent
 FORMATS = (".ply", ".glb", ".npz")
 SH_DC = 0.5 / math.sqrt(math.pi)  # value of the constant spherical harmonic
 
@@ -158,7 +158,7 @@ def ply_bytes(gaussians: GaussianCloud) -> bytes:
 def arrays_npz(
     loaded: Loaded, head: HeadCodes, gaussians: GaussianCloud, mesh: TexturedMesh
 ) -> bytes:
-    """Everything about one head as one .npz."""
+    """Encode everything about one head as .npz."""
     tracked = {f"flame_{name}": value for name, value in vars(head.tracked).items()}
     buffer = io.BytesIO()
     np.savez_compressed(
@@ -175,7 +175,7 @@ def arrays_npz(
 
 
 def mesh_glb(mesh: TexturedMesh) -> bytes:
-    """Binary glTF of the textured mesh; vertices are split where the texture map has seams."""
+    """Encode the textured mesh as binary glTF; vertices are split at the UV map's seams."""
     import trimesh
     from PIL import Image
 
@@ -192,7 +192,7 @@ def mesh_glb(mesh: TexturedMesh) -> bytes:
 
 
 def points_glb(gaussians: GaussianCloud) -> bytes:
-    """Binary glTF of the centres of Gaussians whose opacity is over OPAQUE."""
+    """Encode as binary glTF the centres of Gaussians whose opacity is over OPAQUE."""
     import trimesh
 
     shown = gaussians.opacities > OPAQUE

@@ -1,4 +1,4 @@
-"""FitState an unseen person by inverse rendering, in the paper's two stages.
+"""Fit an unseen person by inverse rendering, in the paper's two stages.
 
 Stage 1 inverts the codes with all networks fixed, starting from the mean code. Stage 2 fixes the
 codes and fine-tunes the decoders, held near the pretrained model by the locality loss. G22 lists
@@ -44,7 +44,7 @@ LOCALITY_T = 0.3  # weight of the fitted subject in the interpolation (paper, su
 
 @dataclass(kw_only=True)
 class FitState:
-    """What a fit works on: a copy of the model to tune, the frozen one, and the codes sought."""
+    """Everything that a fit changes or reads: tuned model, frozen model and the codes sought."""
 
     loaded: Loaded
     model: GRMM
@@ -62,7 +62,7 @@ class FitState:
 def fit(
     loaded: Loaded, views: HeadViews, given: Sequence[int], held_out: Sequence[int], out: Path
 ) -> dict[str, object]:
-    """FitState one subject from the views ``given``; report on them and on ``held_out``.
+    """Fit one subject from the views ``given``; report on them and on ``held_out``.
 
     Every expression among the views gets its own z_exp; z_id is common. Writes OUT/checkpoint.pt
     (the tuned model, whose only subject is the fitted one), OUT/metrics.json and OUT/*.jpg.
@@ -100,7 +100,7 @@ def fit(
 def run_stages(
     state: FitState, score: Callable[[], Scores]
 ) -> tuple[dict[str, Scores], dict[str, object]]:
-    """Both stages within the time budget: the scores before, between and after, and the effort.
+    """Run both stages within the time budget; returns scores before, between and after, and effort.
 
     The time that scoring takes does not count against the budget.
     """
@@ -127,7 +127,7 @@ def run_stages(
 
 
 def start(loaded: Loaded, views: HeadViews, given: list[int]) -> FitState:
-    """Mean codes and a frozen copy of the model; codes of known expressions start from theirs."""
+    """Start from the mean codes and a frozen copy of the model; known expressions keep theirs."""
     subjects = sorted({views.keys[i].subject for i in given})
     if len(subjects) != 1:
         raise TrainError(
@@ -159,7 +159,7 @@ def start(loaded: Loaded, views: HeadViews, given: list[int]) -> FitState:
 
 
 def fitted_render(state: FitState) -> Render:
-    """How an item of the fitted subject is rendered."""
+    """Return a function that renders items of the fitted subject."""
 
     def render(item: Item) -> Rendering:
         code = state.z_exp[item.key.expression]
@@ -169,13 +169,13 @@ def fitted_render(state: FitState) -> Render:
 
 
 def deadline(settings: FitConfig, began: float, share: float) -> Callable[[], bool]:
-    """A question whether this share of the time budget is used up."""
+    """Return a function that says whether this share of the time budget is used up."""
     limit = began + share * settings.seconds if settings.seconds else math.inf
     return lambda: time.perf_counter() >= limit
 
 
 def invert_codes(state: FitState, late: Callable[[], bool]) -> int:
-    """Stage 1: optimise z_id and z_exp; returns the iterations done."""
+    """Optimise z_id and z_exp (stage 1); returns the iterations done."""
     settings = state.settings
     state.model.requires_grad_(False)
     codes = [state.z_id, *state.z_exp.values()]
@@ -201,7 +201,7 @@ def invert_codes(state: FitState, late: Callable[[], bool]) -> int:
 
 
 def tune_decoders(state: FitState, late: Callable[[], bool]) -> int:
-    """Stage 2: fine-tune the decoders with the locality loss; returns the iterations done."""
+    """Fine-tune the decoders with the locality loss (stage 2); returns the iterations done."""
     settings = state.settings
     optimizer = _decoder_optimizer(state)
     rng = np.random.default_rng(state.seed)
@@ -288,7 +288,7 @@ def reconstruction(state: FitState, image: Tensor, target: Tensor) -> Tensor:
 
 
 def _both(state: FitState, rendering: Rendering, item: Item) -> Tensor:
-    """L_rec of the rasterised and, if there is one, the refined image."""
+    """Add up L_rec of the rasterised and, if there is one, the refined image."""
     loss = reconstruction(state, item.comparable(rendering.rgb), item.target)
     if rendering.image is not rendering.rgb:
         loss = loss + reconstruction(state, item.comparable(rendering.image), item.target)
@@ -296,7 +296,7 @@ def _both(state: FitState, rendering: Rendering, item: Item) -> Tensor:
 
 
 def locality_loss(state: FitState, item: Item, rng: np.random.Generator) -> Tensor:
-    """L_rec between the tuned and the frozen model between a training identity and the subject.
+    """Compare the tuned and the frozen model between a training identity and the subject.
 
     Codes and coefficients are blended at a fixed t (weight of the subject), jaw and neck by SLERP
     (paper, supplement); the mesh is posed again from the blend; the camera is a random one of the
@@ -321,7 +321,7 @@ def locality_loss(state: FitState, item: Item, rng: np.random.Generator) -> Tens
 
 
 def random_camera(state: FitState, rng: np.random.Generator) -> PinholeView:
-    """One of the training cameras."""
+    """Choose one of the training cameras."""
     cameras = state.loaded.gallery.cameras
     return cameras[sorted(cameras)[int(rng.integers(len(cameras)))]]
 
@@ -329,7 +329,7 @@ def random_camera(state: FitState, rng: np.random.Generator) -> PinholeView:
 def blend(
     state: FitState, frame: tuple[str, str], mine: Tracked, z_exp: Tensor, t: float
 ) -> tuple[HeadState, Tensor, Tensor]:
-    """Parameters and codes between a training frame (t = 0) and the fitted subject (t = 1)."""
+    """Blend parameters and codes from a training frame (t = 0) to the fitted subject (1)."""
     model, gallery = state.frozen, state.loaded.gallery
     tracked = interpolate_tracked(gallery.frames[frame], mine, t)
     subject, expression = model.subjects.index(frame[0]), model.expressions.index(frame[1])
@@ -394,7 +394,7 @@ def save_fit(state: FitState, out: Path) -> None:
 
 
 def _donors(state: FitState, expressions: Container[str]) -> dict[tuple[str, str], Tracked]:
-    """One training frame of each expression; nobody's offsets: only its expression is of use."""
+    """Return one training frame per expression, without its person's offsets."""
     found: dict[str, tuple[str, str]] = {}
     for frame in state.loaded.gallery.frames:
         if frame[1] in expressions:

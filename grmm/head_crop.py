@@ -1,4 +1,4 @@
-"""Which pixels count: the window around the head, and the torso that losses leave out.
+"""Select the pixels that count: the window around the head, without the torso.
 
 Training crops to the window, and pictures are drawn in it: what lies outside is neither rasterised
 nor refined. Shards that `express50 regions` labelled say which pixels are torso. Shards of other
@@ -40,7 +40,7 @@ def draw_window(
     *,
     refine: bool = True,
 ) -> Rendering:
-    """`GRMM.draw` in the window around the Gaussians, the rest filled with background.
+    """Draw the window around the Gaussians with `GRMM.draw`; the rest is background.
 
     Colours before refinement, depth and alpha are those of the whole image. Refined ones differ
     near the window's border as they do in training, whose crops have the same margin.
@@ -80,7 +80,7 @@ def gaussian_window(
     bounds_m: tuple[float, float],
     margin_px: int = CROP_MARGIN_PX,
 ) -> tuple[slice, slice]:
-    """Rows and columns that hold every pixel a Gaussian reaches, with a margin.
+    """Return the rows and columns that hold every pixel a Gaussian reaches, with a margin.
 
     A Gaussian is bounded by the sphere of its largest scale at the distance where its alpha falls
     under a level of 8 bits; the whole image where none is in view.
@@ -98,7 +98,7 @@ def gaussian_window(
 def head_window(
     vertices: Tensor, view: PinholeView, alpha: np.ndarray, margin_px: int = CROP_MARGIN_PX
 ) -> tuple[slice, slice]:
-    """Rows and columns that hold the projected mesh (V, 3) and the matte (H, W), with a margin.
+    """Return the window around the projected mesh (V, 3) and the matte (H, W).
 
     Sizes are rounded up to WINDOW_STEP where the image allows, so that few sizes occur: every new
     size costs convolutions their set-up.
@@ -117,7 +117,7 @@ def head_window(
 def _extents(
     points: Tensor, radii: Tensor, view: PinholeView, near_m: float, margin_px: float = 0.0
 ) -> tuple[tuple[float, float], tuple[float, float]]:
-    """From where to where spheres reach, pixels: along x, then y; (inf, -inf) where none is seen.
+    """Return the pixel range of spheres along x, then y; (inf, -inf) if none is seen.
 
     Args:
         points: (N, 3) centres, head space, metres.
@@ -145,7 +145,7 @@ def _extents(
 
 
 def _span(low: float, high: float, size: int) -> slice:
-    """Whole steps around [low, high) that lie within [0, size); the whole axis if none is left."""
+    """Round [low, high) up to whole steps in [0, size); the whole axis if it is outside."""
     low, high = max(0.0, low), min(float(size), high)
     if high <= low:
         return slice(0, size)
@@ -155,7 +155,7 @@ def _span(low: float, high: float, size: int) -> slice:
 
 
 def crop_view(view: PinholeView, rows: slice, columns: slice) -> PinholeView:
-    """The same camera, seeing only some rows and columns."""
+    """Crop a camera to some rows and columns."""
     K = view.K.clone()
     K[0, 2] -= columns.start
     K[1, 2] -= rows.start
@@ -168,7 +168,7 @@ def crop_view(view: PinholeView, rows: slice, columns: slice) -> PinholeView:
 
 
 def labelled_torso(parts: np.ndarray) -> np.ndarray:
-    """Pixels (H, W) bool that labels (H, W) of ``segmentation_labels.LABELS`` call torso, grown."""
+    """Mark the pixels (H, W) bool that part labels (H, W) call torso, dilated."""
     torso = parts == TORSO
     return _grown(torso)
 
@@ -180,7 +180,7 @@ def torso_mask(
     alpha: np.ndarray,
     depth: np.ndarray | None,
 ) -> np.ndarray:
-    """Pixels (H, W) bool that show the torso.
+    """Mark the pixels (H, W) bool that show the torso.
 
     Args:
         head: its regions ``neck`` and ``boundary`` say where the torso begins; without them
@@ -208,7 +208,7 @@ def torso_mask(
 def _filled(
     depth: np.ndarray | None, foreground: np.ndarray, vertices: Tensor, view: PinholeView
 ) -> np.ndarray:
-    """Depth (H, W) without gaps."""
+    """Fill the gaps of a depth map (H, W)."""
     known = np.zeros_like(foreground) if depth is None else depth > 0
     if depth is None or not known.any():
         camera = view.cam_from_head.to(vertices.dtype)
@@ -220,7 +220,7 @@ def _filled(
 def _points(
     view: PinholeView, rows: np.ndarray, columns: np.ndarray, depth: np.ndarray
 ) -> np.ndarray:
-    """Head-space points (N, 3) of pixels."""
+    """Return the head-space points (N, 3) of pixels."""
     K, camera = view.K.cpu().numpy(), view.cam_from_head.cpu().numpy()
     z = depth[rows, columns].astype(np.float64)
     x = (columns + 0.5 - K[0, 2]) / K[0, 0] * z

@@ -24,7 +24,7 @@ NOVEL_EXPRESSION = f"{HELD_IDENTITY}, other expression"
 
 @dataclass(frozen=True, kw_only=True)
 class FitProtocol:
-    """How unseen people are shown to a model.
+    """The views of an unseen person that a fit gets.
 
     Attributes:
         cameras: patterns of the cameras to fit from; empty: the first by id.
@@ -81,7 +81,7 @@ def evaluate_unseen(
 
 
 def given_views(views: HeadViews, subject: str, protocol: FitProtocol) -> list[int]:
-    """Indices of the views to fit from."""
+    """Return the indices of the views to fit from."""
     own = [
         i
         for i, key in enumerate(views.keys)
@@ -99,7 +99,7 @@ def given_views(views: HeadViews, subject: str, protocol: FitProtocol) -> list[i
 
 
 def _what(views: HeadViews, subject: str, cameras: Sequence[str]) -> str:
-    """What the shards have of a person, for an error."""
+    """Describe what the shards have of a person, for an error."""
     if cameras:
         return f"its cameras are {', '.join(cameras)}"
     people = sorted({key.subject for key in views.keys})
@@ -110,7 +110,7 @@ def _what(views: HeadViews, subject: str, cameras: Sequence[str]) -> str:
 
 
 def any_expression(state: FitState) -> Callable[[Item], Rendering]:
-    """How a fitted person is rendered, in fitted expressions and in those of training."""
+    """Return a function that renders a fitted person in fitted and training expressions."""
     model = state.model
 
     def render(item: Item) -> Rendering:

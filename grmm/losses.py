@@ -31,7 +31,7 @@ Perceptual = Callable[[Tensor, Tensor], Tensor]
 
 
 def ssim(a: Tensor, b: Tensor) -> Tensor:
-    """Mean structural similarity of two images (C, H, W) with values in [0, 1].
+    """Return the mean structural similarity of two images (C, H, W) with values in [0, 1].
 
     Gaussian window 11 x 11, sigma 1.5, only where it lies inside the image; it shrinks to the
     largest odd size that fits smaller images. Half precision is computed in float32.
@@ -42,7 +42,7 @@ def ssim(a: Tensor, b: Tensor) -> Tensor:
 
 
 def ssim_map(a: Tensor, b: Tensor) -> Tensor:
-    """SSIM per window (C, H - 10, W - 10); see `ssim`."""
+    """Return the SSIM per window (C, H - 10, W - 10); see `ssim`."""
     _same_shape(a, b)
     dtype = a.dtype if a.dtype in (torch.float32, torch.float64) else torch.float32
     a, b = a.to(dtype), b.to(dtype)
@@ -66,7 +66,7 @@ def _blur(stack: Tensor) -> Tensor:
 
 @lru_cache(maxsize=32)
 def _window(size: int, dtype: torch.dtype, device: torch.device) -> Tensor:
-    """The 1D Gaussian window for an axis of ``size`` pixels, sum 1."""
+    """Return the 1D Gaussian window for an axis of ``size`` pixels, sum 1."""
     length = min(SSIM_WINDOW, size - 1 + size % 2)
     offset = torch.arange(length, dtype=torch.float64) - length // 2
     weights = torch.exp(-0.5 * (offset / SSIM_SIGMA) ** 2)
@@ -76,7 +76,7 @@ def _window(size: int, dtype: torch.dtype, device: torch.device) -> Tensor:
 def reconstruction(
     image: Tensor, target: Tensor, config: LossConfig, perceptual: Perceptual | None = None
 ) -> Tensor:
-    """L_rec: weighted L1, 1 - SSIM and, with weights at hand, perceptual distance of (3, H, W)."""
+    """Compute L_rec of (3, H, W): weighted L1, 1 - SSIM and, with VGG16, perceptual distance."""
     _same_shape(image, target)
     loss = config.l1 * (image - target).abs().mean()
     if config.ssim > 0:
@@ -89,7 +89,7 @@ def reconstruction(
 def depth_dm2(
     depth: Tensor, alpha: Tensor, target: Tensor, valid: Tensor, erode_px: int = DEPTH_ERODE_PX
 ) -> Tensor:
-    """Mean squared depth error in decimetres squared over pixels where both depths mean something.
+    """Compute the mean squared depth error, dm^2, over pixels where both depths are known.
 
     Args:
         depth: (H, W) rendered camera z, metres.
@@ -128,7 +128,7 @@ def mesh_edges(faces: Tensor) -> Tensor:
 
 
 def laplacian_mm2(displacement: Tensor, edges: Tensor) -> Tensor:
-    """Mean squared uniform Laplacian of vertex displacements (V, 3), metres in, mm^2 out.
+    """Return mean squared uniform Laplacian of vertex displacements (V, 3), metres in, mm^2 out.
 
     The displacement, not the mesh, is kept smooth, so that the head's own curvature costs nothing
     (GaussianAvatars; G12). A vertex without edges costs nothing.
@@ -141,7 +141,7 @@ def laplacian_mm2(displacement: Tensor, edges: Tensor) -> Tensor:
 
 
 def codes(z_id: Tensor, z_exp: Tensor) -> Tensor:
-    """Sum of squares of both codes (DeepSDF's form; G13)."""
+    """Return the sum of squares of both codes (DeepSDF's form; G13)."""
     return z_id.square().sum() + z_exp.square().sum()
 
 
@@ -153,7 +153,7 @@ def regularisers(
     bounds_mm: tuple[float, float],
     config: LossConfig,
 ) -> dict[str, Tensor]:
-    """Weighted terms of L_reg by name."""
+    """Return the weighted terms of L_reg by name."""
     return {
         "scale": config.scale * scale_mm(rendering.gaussians.scales_mm, *bounds_mm),
         "laplacian": config.laplacian * laplacian_mm2(rendering.gaussians.displacement, edges),
@@ -204,7 +204,7 @@ class VGGDistance(nn.Module):
         self.register_buffer("std", torch.tensor(STD)[:, None, None])
 
     def forward(self, image: Tensor, target: Tensor) -> Tensor:
-        """Distance of two (3, H, W) images in [0, 1], at least 16 px a side."""
+        """Return the distance of two (3, H, W) images in [0, 1], at least 16 px per side."""
         if min(image.shape[1:]) < SMALLEST_PX:
             raise ValueError(f"image is {tuple(image.shape[1:])}, expected at least 16 x 16 pixels")
         x = (torch.stack([image, target]) - self.mean) / self.std
@@ -223,8 +223,8 @@ def load_vgg(path: Path, device: torch.device | str = "cpu") -> VGGDistance:
     Raises:
         TrainError: no such file, or not that state dict.
     """
-    mend = "leave it empty to do without"
-    weights = read_weights(path, TrainError, f"loss.vgg16 {path}", "a torch state dict", mend)
+    remedy = "leave it empty to do without"
+    weights = read_weights(path, TrainError, f"loss.vgg16 {path}", "a torch state dict", remedy)
     if not isinstance(weights, dict):
         raise TrainError(f"loss.vgg16 {path}: holds a {type(weights).__name__}, expected a dict")
     return VGGDistance(weights).to(device)

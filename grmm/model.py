@@ -39,7 +39,7 @@ class GRMM(Networks):
         self._add_anchor_buffers(head)
 
     def _add_anchor_buffers(self, head: HeadModel) -> None:
-        """Constants of the head model: rebuilt from it, so they are not in the state dict."""
+        """Add constants of the head model; they are rebuilt from it, so checkpoints lack them."""
         gradients = uv_gradients(head)
         _, reach = tangent_frames(head.template, head.faces, gradients)
         spacing_mm = 1e3 * reach[self.anchors.faces] / self.config.n_g
@@ -56,7 +56,7 @@ class GRMM(Networks):
             self.register_buffer(name, value, persistent=False)
 
     def codes(self, subject: int, expression: int) -> tuple[Tensor, Tensor]:
-        """Rows of the code tables: (z_id,) and (z_exp,)."""
+        """Return the rows of the code tables: (z_id,) and (z_exp,)."""
         return self.z_id[subject], self.z_exp[expression]
 
     def forward(
@@ -108,7 +108,7 @@ class GRMM(Networks):
     def decode(
         self, z_id: Tensor, z_exp: Tensor, state: HeadState, opacities: Tensor | None = None
     ) -> Maps:
-        """The convolutional maps of transforms and opacity, which no pose changes.
+        """Return the convolutional maps of transforms and opacity, which no pose changes.
 
         Opacity depends on the identity alone, so a caller may pass the ``opacities`` of the same
         person's last maps.
@@ -124,7 +124,7 @@ class GRMM(Networks):
         )
 
     def appearance(self, z_id: Tensor, state: HeadState, view: PinholeView) -> Tensor:
-        """Colours in [0, 1] and features (N, 3 + features) as one view sees them."""
+        """Return the colours in [0, 1] and features (N, 3 + features) as one view sees them."""
         z_id, _ = self._inputs(z_id, self.z_exp[0], state)
         maps = self._sample(self.colour(z_id, view.direction().to(z_id.dtype)))
         return torch.cat([torch.sigmoid(maps[:, :3]), maps[:, 3:]], 1)
@@ -167,17 +167,17 @@ class GRMM(Networks):
         )
 
     def _inputs(self, z_id: Tensor, z_exp: Tensor, state: HeadState) -> tuple[Tensor, Tensor]:
-        """The codes, or (ablation "no residuals") the tracked parameters in their place."""
+        """Return the codes, or for the ablation "no residuals" the tracked parameters."""
         if self.config.residual_codes:
             return z_id, z_exp
         return _to_length(state.shape, len(z_id)), _to_length(state.expression, len(z_exp))
 
     def _sample(self, maps: Tensor) -> Tensor:
-        """(C, n_g, n_g) -> (N, C) at the covered texels, in the precision of the model."""
+        """Sample (C, n_g, n_g) at the covered texels, (N, C)."""
         return maps.flatten(1).index_select(1, self.texels).T.to(self.head_centre.dtype)
 
     def _place(self, vertices: Tensor, offsets: Tensor) -> tuple[Tensor, Tensor]:
-        """Means (N, 3) and quaternions (N, 4) from the mesh and decoded offsets (N, 7).
+        """Return means (N, 3) and quaternions (N, 4) from the mesh and decoded offsets (N, 7).
 
         q = normalise(dq + identity), so that zeros mean no rotation (G1).
         """
@@ -196,7 +196,7 @@ class GRMM(Networks):
 
 
 def initial_scales(spacing_mm: Tensor, config: ModelConfig) -> Tensor:
-    """Inputs of softplus (N, 3) that give scales from texel spacings (N, 2) in millimetres.
+    """Return inputs of softplus (N, 3) that give scales of texel spacings (N, 2), mm.
 
     ``tangent``: along tangent, bitangent and, thinner, the normal; ``head``: the same on all axes.
     """
@@ -211,7 +211,7 @@ def initial_scales(spacing_mm: Tensor, config: ModelConfig) -> Tensor:
 
 
 def quat_multiply(a: Tensor, b: Tensor) -> Tensor:
-    """Hamilton product (..., 4) of quaternions, wxyz: first b, then a."""
+    """Multiply quaternions (..., 4), wxyz: first b, then a."""
     aw, ax, ay, az = a.unbind(-1)
     bw, bx, by, bz = b.unbind(-1)
     return torch.stack(

@@ -91,7 +91,7 @@ class Doubling(nn.Module):
         self.bias = nn.Parameter(torch.zeros(outputs, 2 * side, 2 * side))
 
     def forward(self, x: Tensor) -> Tensor:
-        """(1, inputs, side, side) -> (1, outputs, 2 side, 2 side)."""
+        """Map (1, inputs, side, side) to (1, outputs, 2 side, 2 side)."""
         return nn.functional.leaky_relu(self.convolution(x) + self.bias, SLOPE)
 
 
@@ -136,7 +136,7 @@ class Ladder(nn.Module):
             self.modes = nn.Parameter(torch.zeros(shape))
 
     def forward(self, code: Tensor, direction: Tensor | None = None) -> Tensor:
-        """(code,), and (3,) unit view direction if built for one -> (outputs, n_g, n_g)."""
+        """Decode (code,) and, if used, a (3,) unit view direction to (outputs, n_g, n_g)."""
         x = nn.functional.leaky_relu(self.seed(code), SLOPE).view(self.seed_shape)
         if self.view is not None:
             if direction is None:
@@ -154,7 +154,7 @@ class Ladder(nn.Module):
         return out
 
     def texel_parameters(self) -> list[nn.Parameter]:
-        """Parameters of the last layer that belong to one texel each."""
+        """Return the parameters of the last layer that belong to one texel each."""
         return [self.bias] if self.modes is None else [self.bias, self.modes]
 
 
@@ -212,13 +212,13 @@ class MeshDecoder(nn.Module):
         return identity, self.face_mask * expression
 
     def modulate(self, feature: Tensor, coefficients: Tensor) -> Tensor:
-        """FiLM: f + gamma * f + beta (Perez et al. 2018, residual form of the paper)."""
+        """Modulate by FiLM in the paper's residual form, f + gamma * f + beta (Perez et al. 2018)."""
         gamma, beta = self.film(coefficients).chunk(2)
         return feature + gamma * feature + beta
 
 
 def mlp(inputs: int, width: int, outputs: int) -> nn.Sequential:
-    """One hidden layer with a leaky ReLU."""
+    """Build a perceptron with one hidden layer and a leaky ReLU."""
     return nn.Sequential(nn.Linear(inputs, width), nn.LeakyReLU(SLOPE), nn.Linear(width, outputs))
 
 
@@ -262,7 +262,7 @@ class Refinement(nn.Module):
         self.to(memory_format=torch.channels_last)
 
     def forward(self, maps: Tensor) -> Tensor:
-        """(inputs, H, W) -> refined colours (3, H, W)."""
+        """Refine (inputs, H, W) to colours (3, H, W)."""
         height, width = maps.shape[1:]
         pad = (0, -width % self.stride, 0, -height % self.stride)
         x = nn.functional.pad(maps[None], pad)

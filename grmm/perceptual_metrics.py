@@ -45,7 +45,7 @@ class PerceptualMetrics:
 
     @torch.no_grad()
     def lpips_of(self, image: Tensor, target: Tensor) -> float:
-        """LPIPS (AlexNet) of (3, H, W) images in [0, 1]; NaN without weights or under 32 px."""
+        """Compute LPIPS of (3, H, W) images in [0, 1]; NaN without weights or under 32 px."""
         if self.lpips is None or min(image.shape[1:]) < SMALLEST_PX:
             return math.nan
         pair = (x.clamp(0, 1).float().cpu()[None] for x in (image, target))
@@ -61,7 +61,7 @@ class PerceptualMetrics:
         self.features.setdefault(group, []).append((found[0].double(), found[1].double()))
 
     def fid(self, group: str | None = None) -> float | None:
-        """FID of a group, or of all images; None where there are fewer than two."""
+        """Return the FID of a group, or of all images; None where there are fewer than two."""
         groups = self.features.values() if group is None else [self.features.get(group, [])]
         pairs = [pair for rows in groups for pair in rows]
         if len(pairs) < FID_LEAST_IMAGES:
@@ -72,7 +72,7 @@ class PerceptualMetrics:
         return round(float(metric.compute()), 4)
 
     def missing(self) -> dict[str, str]:
-        """What cannot be measured, with the reason."""
+        """Return the metrics that cannot be measured, with the reason."""
         absent = {}
         if self.lpips is None:
             absent["lpips"] = "n/a: metrics.alexnet names no weights (torchvision's alexnet)"
@@ -93,7 +93,7 @@ class _Given(nn.Module):
 
 
 def alexnet_features() -> nn.Sequential:
-    """The convolutions of AlexNet (Krizhevsky 2014) in torchvision's numbering, untrained."""
+    """Return convolutions of AlexNet (Krizhevsky 2014) in torchvision's numbering, untrained."""
     return nn.Sequential(
         nn.Conv2d(3, 64, 11, stride=4, padding=2), nn.ReLU(), nn.MaxPool2d(3, 2),
         nn.Conv2d(64, 192, 5, padding=2), nn.ReLU(), nn.MaxPool2d(3, 2),
@@ -104,7 +104,7 @@ def alexnet_features() -> nn.Sequential:
 
 
 def load_lpips(path: Path) -> nn.Module:
-    """Torchmetrics' LPIPS on the AlexNet of a torchvision state dict.
+    """Build torchmetrics' LPIPS on the AlexNet of a torchvision state dict.
 
     Raises:
         ConfigError: no such file, or not that state dict.
@@ -129,7 +129,7 @@ def load_lpips(path: Path) -> nn.Module:
 
 
 def load_inception(path: Path) -> torch.jit.ScriptModule:
-    """The Inception network of FID as TorchScript; TorchScript reaches neither files nor Python.
+    """Load FID's Inception as TorchScript, which reaches neither files nor Python.
 
     Raises:
         ConfigError: no such file, no TorchScript, or a network that is called otherwise.
@@ -152,9 +152,9 @@ def load_inception(path: Path) -> torch.jit.ScriptModule:
 
 
 def _read(path: Path, key: str) -> dict[str, Tensor]:
-    """A state dict (weights only, nothing in it is executed)."""
-    mend = "leave it empty to do without"
-    weights = read_weights(path, ConfigError, f"metrics.{key} {path}", "a torch state dict", mend)
+    """Read a state dict (weights only; nothing in it is executed)."""
+    remedy = "leave it empty to do without"
+    weights = read_weights(path, ConfigError, f"metrics.{key} {path}", "a torch state dict", remedy)
     if not isinstance(weights, dict):
         raise ConfigError(f"metrics.{key} {path}: holds a {type(weights).__name__}, not a dict")
     return weights

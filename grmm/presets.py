@@ -147,7 +147,7 @@ def from_tables(tables: Mapping[str, Mapping[str, object]]) -> Config:
 
 
 def as_tables(config: Config) -> dict[str, dict[str, Any]]:
-    """Plain nested dictionary of a configuration; tuples become lists."""
+    """Convert a configuration to a nested dictionary; tuples become lists."""
     return {
         table: {
             key: list(value) if isinstance(value, tuple) else value
@@ -193,7 +193,7 @@ class BudgetChoice:
 
 
 def choose(seconds: float, measured: Path = MEASURED) -> BudgetChoice:
-    """The best setting of the longest measured budget that fits in ``seconds``.
+    """Return the best setting of the longest measured budget that fits in ``seconds``.
 
     Less time than any that was measured gets the choice of the shortest. A machine's speed is not
     asked: one twice as fast spends the choice of half the time, which is the safe side.

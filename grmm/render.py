@@ -45,12 +45,12 @@ DEVIATIONS = 1.5  # standard deviations a step of 1 moves a code
 
 
 def to_uint8(image: Tensor) -> np.ndarray:
-    """(3, H, W) in [0, 1] -> (H, W, 3) uint8."""
+    """Convert (3, H, W) in [0, 1] to (H, W, 3) uint8."""
     return (image.detach().clamp(0, 1) * 255).round().byte().permute(1, 2, 0).cpu().numpy()
 
 
 def depth_picture(depth: Tensor, alpha: Tensor) -> np.ndarray:
-    """(H, W) depth as grey (H, W, 3) uint8, near is bright; black where alpha <= 0.5."""
+    """Show depth (H, W) as grey (H, W, 3) uint8: near is bright, alpha <= 0.5 is black."""
     mask = (alpha > 0.5) & torch.isfinite(depth)
     if not bool(mask.any()):
         return np.zeros((*depth.shape, 3), np.uint8)
@@ -77,7 +77,7 @@ def comparison_sheet(path: Path, views: HeadViews, indices: Many[int], render: R
 
 
 def orbit(view: PinholeView, degrees: float, centre: Tensor, pitch: float = 0.0) -> PinholeView:
-    """The view turned about ``centre`` (3,) in head space.
+    """Turn a view about ``centre`` (3,) in head space.
 
     ``degrees`` about the vertical axis, after ``pitch`` degrees about the camera's own horizontal
     axis (positive: seen from above).
@@ -101,7 +101,7 @@ def _rotation(angle: float, first: int, second: int, pivot: Tensor) -> Tensor:
 
 
 def resized(view: PinholeView, longest_px: int) -> PinholeView:
-    """The same camera at a size whose longer side is ``longest_px``."""
+    """Resize a camera so that its longer side is ``longest_px``."""
     scale = longest_px / max(view.width, view.height)
     width, height = (max(1, round(scale * side)) for side in (view.width, view.height))
     K = view.K.clone()
@@ -111,14 +111,14 @@ def resized(view: PinholeView, longest_px: int) -> PinholeView:
 
 
 def frontal(loaded: Loaded) -> PinholeView:
-    """The training camera that looks at the face most nearly along -z."""
+    """Return the training camera that looks at the face most nearly along -z."""
     cameras = loaded.gallery.cameras
     best = max(sorted(cameras), key=lambda name: float(cameras[name].direction()[2]))
     return cameras[best]
 
 
 def camera_of(loaded: Loaded, name: str | None, size: int = 0) -> PinholeView:
-    """A camera of the checkpoint by id, by default the frontal one; ``size`` 0: its own.
+    """Return a camera of the checkpoint by id, by default the frontal one; ``size`` 0: its own.
 
     Raises:
         ConfigError: the checkpoint has no such camera.
@@ -131,7 +131,7 @@ def camera_of(loaded: Loaded, name: str | None, size: int = 0) -> PinholeView:
 
 
 def picture(loaded: Loaded, head: HeadCodes, view: PinholeView) -> np.ndarray:
-    """One head from one view, (H, W, 3) uint8."""
+    """Draw one head from one view, (H, W, 3) uint8."""
     return next(iter(around(loaded, head, [view])))
 
 
@@ -164,7 +164,7 @@ def turntable(
 
 
 def novel_views(loaded: Loaded, head: HeadCodes, view: PinholeView) -> list[list[np.ndarray]]:
-    """Rows of PITCHES with columns of YAWS, degrees, around ``view``."""
+    """Return the rows of PITCHES with columns of YAWS, degrees, around ``view``."""
     centre = loaded.model.head_centre
     views = (orbit(view, yaw, centre, pitch) for pitch in PITCHES for yaw in YAWS)
     pictures = list(around(loaded, head, views))
@@ -174,7 +174,7 @@ def novel_views(loaded: Loaded, head: HeadCodes, view: PinholeView) -> list[list
 def expression_grid(
     loaded: Loaded, subjects: Many[str], expressions: Many[str], view: PinholeView
 ) -> list[list[np.ndarray]]:
-    """Pictures of every subject (rows) with every expression (columns).
+    """Return the pictures of every subject (rows) with every expression (columns).
 
     A subject without a tracked frame of an expression gets it by transfer.
     """
@@ -193,7 +193,7 @@ def interpolation(
 
 
 def control_sheet(loaded: Loaded, head: HeadCodes, view: PinholeView) -> Sheet:
-    """Rows that change one thing each, all else held (the paper's figure of disentangled control).
+    """Draw rows that change one thing each (the paper's figure of disentangled control).
 
     Jaw, neck and eyes; the strongest expression coefficients of training; the first principal
     directions of z_id and z_exp. A code without directions (one subject) has no row.
@@ -221,7 +221,7 @@ def control_sheet(loaded: Loaded, head: HeadCodes, view: PinholeView) -> Sheet:
 
 
 def strongest_coefficients(loaded: Loaded, count: int) -> list[int]:
-    """Numbers of the expression coefficients that vary most over the training frames."""
+    """Return the numbers of the expression coefficients that vary most over the training frames."""
     frames = loaded.gallery.frames.values()
     length = max(len(f.expression) for f in frames)
     rows = [np.pad(f.expression, (0, length - len(f.expression))) for f in frames]
@@ -232,7 +232,7 @@ def strongest_coefficients(loaded: Loaded, count: int) -> list[int]:
 def residual_sheet(
     loaded: Loaded, identity: HeadCodes, expression: HeadCodes, view: PinholeView
 ) -> Sheet:
-    """What transfer is made of: head-model parameters and residual code, alone and together.
+    """Take a transfer apart: head-model parameters and residual code, alone and together.
 
     Columns: neither, parameters alone, code alone, both, and both with z_exp = 0, which shows
     what the expression code carries (the paper's supplement, figure on the extended UV map).
@@ -254,7 +254,7 @@ def residual_sheet(
 def sample_sheet(
     loaded: Loaded, head: HeadCodes, view: PinholeView, count: int, seed: int, spread: float = 1.0
 ) -> tuple[Sheet, dict[str, list[HeadCodes]]]:
-    """Three rows of samples, and their heads: new people, new expressions, both."""
+    """Draw three rows of samples; returns their heads too: new people, new expressions, both."""
     rng = np.random.default_rng(seed)
     neutral = head
     if "neutral" in loaded.model.expressions:

@@ -1,4 +1,4 @@
-"""Which samples are taken, and when: shuffled for training, evenly spread for measuring.
+"""Choose samples: shuffled for training, evenly spread for measuring.
 
 The order of training is a pure function of (seed, epoch, position), so that a resumed run goes on
 exactly where it stopped.
@@ -20,7 +20,7 @@ class Shuffle:
     """Endless shuffled order over ``indices``; its state is (epoch, position)."""
 
     def __init__(self, indices: Sequence[int], seed: int, rank: int = 0, world: int = 1) -> None:
-        """Rank ``rank`` of ``world`` processes takes every world-th entry of the common order."""
+        """Take every world-th entry of the common order for process ``rank``."""
         if not indices:
             raise TrainError("no samples to train on; check the split and the held-out cameras")
         self.indices, self.seed, self.rank, self.world = list(indices), seed, rank, world
@@ -31,7 +31,7 @@ class Shuffle:
         return np.random.default_rng([self.seed, self.epoch]).permutation(self.indices)
 
     def next(self) -> int:
-        """Index of this rank's next sample."""
+        """Return the index of this rank's next sample."""
         taken = None
         for rank in range(self.world):
             if self.position == len(self._order):
@@ -44,17 +44,17 @@ class Shuffle:
         return taken
 
     def state(self) -> dict[str, int]:
-        """What `restore` needs."""
+        """Return the state that `restore` takes."""
         return {"epoch": self.epoch, "position": self.position}
 
     def restore(self, state: dict[str, int]) -> None:
-        """Go on after the sample that was taken last when ``state`` was saved."""
+        """Resume after the last sample taken when ``state`` was saved."""
         self.epoch, self.position = state["epoch"], state["position"]
         self._order = self._permutation()
 
 
 def spread(items: Sequence[Item], count: int) -> list[Item]:
-    """At most ``count`` of the items, evenly chosen (first and last included)."""
+    """Return at most ``count`` of the items, evenly chosen (first and last included)."""
     if len(items) <= count:
         return list(items)
     steps = np.linspace(0, len(items) - 1, count).round().astype(int)

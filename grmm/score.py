@@ -26,12 +26,12 @@ NAMED = 5  # how many wrong files an error names
 
 
 def sample_name(key: Key) -> str:
-    """What a sample is called in shards, and a picture of it in a folder."""
+    """Return the name of a sample in shards and of its picture in a folder."""
     return sample_key(key.subject, key.expression, key.camera)
 
 
 def find_picture(folder: Path, key: Key) -> Path | None:
-    """The file of a sample, None if there is none."""
+    """Return the file of a sample, None if there is none."""
     paths = (folder / f"{sample_name(key)}{suffix}" for suffix in SUFFIXES)
     return next((path for path in paths if path.is_file()), None)
 
@@ -46,7 +46,7 @@ def score(
     kind: Callable[[Key], str] = lambda key: "",
     partial: bool = False,
 ) -> list[Row]:
-    """One row of numbers per picture; ``partial`` leaves samples without a picture out.
+    """Score pictures, one row each; ``partial`` leaves samples without a picture out.
 
     Raises:
         FormatError: missing, unreadable or mis-sized pictures, which are named.
@@ -76,7 +76,7 @@ def score(
 
 
 def save_pictures(folder: Path, source: ShardSource, background: float) -> Callable:
-    """A function that writes a rendering of a sample so that `score` reads it."""
+    """Return a function that writes a rendering of a sample so that `score` reads it."""
     folder.mkdir(parents=True, exist_ok=True)
 
     def keep(index: int, image: Tensor) -> None:
@@ -90,7 +90,7 @@ def save_pictures(folder: Path, source: ShardSource, background: float) -> Calla
 
 
 def _problem(path: Path, size: tuple[int, int]) -> str | None:
-    """What is wrong with a picture; None if it can be scored."""
+    """Describe why a picture cannot be scored; None if it can."""
     try:
         pixels = read_image(path)
     except FormatError as error:
@@ -104,7 +104,7 @@ def _problem(path: Path, size: tuple[int, int]) -> str | None:
 
 
 def _pixels(path: Path, size: tuple[int, int]) -> np.ndarray:
-    """(H, W, 3) uint8; grey is spread over the channels, a fourth channel is left out."""
+    """Read (H, W, 3) uint8; grey is repeated over the channels, a fourth one is left out."""
     pixels = read_image(path)
     if pixels.ndim == 2 or pixels.shape[2] < 3:
         pixels = np.repeat(pixels.reshape(*size, -1)[..., :1], 3, axis=2)

@@ -71,7 +71,7 @@ class ShardSource:
         )
 
     def window(self, index: int) -> tuple[slice, slice, tuple[int, int]]:
-        """Rows and columns of a packed sample that its camera saw, and the packed (H, W)."""
+        """Return rows and columns of a packed sample that its camera saw, and the packed (H, W)."""
         meta = self.reader.meta(index)
         rows, columns = seen_window(meta, f"{self.reader.root}: {self.keys[index]}")
         return rows, columns, (int(meta["height"]), int(meta["width"]))  # checked just before
@@ -127,7 +127,7 @@ class MixedSource:
 
 
 def open_shards(roots: Sequence[Path], split: str) -> ShardSource | MixedSource:
-    """One folder of shards, or several mixed.
+    """Open one folder of shards, or several mixed.
 
     Raises:
         FormatError: a folder has no samples of the split, or they do not go together.
@@ -144,7 +144,7 @@ def _digest(lines: Iterable[str]) -> str:
 
 
 def seen_window(meta: dict, where: str) -> tuple[slice, slice]:
-    """Rows and columns of a packed sample that its camera saw.
+    """Return the rows and columns of a packed sample that its camera saw.
 
     Packing squares reach beyond the footage where a head stands at the border of the image. What
     lies there is black in the sample, yet not background: a model taught so would learn to cut off
@@ -191,13 +191,13 @@ def _tracked(track: Any, where: str) -> Tracked:
 
 
 def _matrix(table: dict, name: str, size: tuple[int, ...] | None, where: str) -> np.ndarray:
-    """A finite float64 array of the table; ``size`` None: any vector."""
+    """Return a finite float64 array of the table; ``size`` None: any vector."""
     try:
         array = np.array(table[name], dtype=np.float64)
     except KeyError:
         raise FormatError(f"{where}: meta has no {name}; rerun 'express50 pack'") from None
     except (TypeError, ValueError, OverflowError):
-        raise FormatError(f"{where}: {name} is no array of numbers") from None
+        raise FormatError(f"{where}: {name} is not an array of numbers") from None
     if (array.ndim != 1) if size is None else (array.shape != size):
         raise FormatError(f"{where}: {name} has shape {array.shape}, expected {size or '(any,)'}")
     if not np.isfinite(array).all():

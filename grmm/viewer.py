@@ -1,7 +1,7 @@
 """``grmm view``: a head in the browser, with sliders for FLAME's parameters and the codes.
 
 One thread draws. It always takes the newest camera and the newest sliders, so that a slow machine
-shows fewer pictures, never old ones. Listens on 127.0.0.1 unless told otherwise; pictures of people
+shows fewer pictures, never old ones. Listens on 127.0.0.1 by default; pictures of people
 leave the machine by no other way (the library's sharing service is off). The library's page asks
 Google's tag manager to count its visitors, where the browser has a way there.
 """
@@ -65,7 +65,7 @@ class Preview:
 
     @torch.no_grad()
     def draw(self, head: HeadCodes, view: PinholeView, moving: bool) -> np.ndarray:
-        """(H, W, 3) uint8; ``moving`` trades the refinement for speed."""
+        """Draw (H, W, 3) uint8; ``moving`` trades the refinement for speed."""
         model = self.loaded.model
         if head is not self._head:
             self._take(head)
@@ -279,7 +279,7 @@ class Viewer:
         return float(self._sliders[name][0].value)
 
     def _described(self) -> HeadCodes:
-        """The head that the controls describe."""
+        """Return the head that the controls describe."""
         head = trained_head(self.loaded, self._subject.value, self._expression.value)
         if self._code.value != "the same":
             donor = trained_head(self.loaded, self._subject.value, self._code.value)
@@ -290,7 +290,7 @@ class Viewer:
         return controlled(self.loaded, head, self._controls(head))
 
     def _controls(self, head: HeadCodes) -> dict[str, tuple[float, ...]]:
-        """What the sliders add to a head, as controls; sliders at rest change nothing."""
+        """Return the sliders' changes to a head as controls; sliders at rest change nothing."""
         controls: dict[str, tuple[float, ...]] = {}
         for name, (joint, entry, _) in TURNS.items():
             if self._value(name):
@@ -317,7 +317,7 @@ class Viewer:
 
 
 def view_of_camera(camera: Any, height: int, device: torch.device | str = "cpu") -> PinholeView:
-    """A browser's camera (OpenCV axes, head space) as a view of this height, at most 2 : 1 wide."""
+    """Convert a browser's camera (OpenCV axes) to a view of this height, at most 2 : 1 wide."""
     width = max(1, round(height * min(2.0, max(0.5, float(camera.aspect)))))
     focal = height / 2 / np.tan(float(camera.fov) / 2)
     K = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]]).double()

@@ -1,4 +1,4 @@
-"""A sensible head before the first step: texel colours averaged from footage.
+"""Start from a sensible head: texel colours averaged from footage.
 
 The paper trains from scratch for 250,000 iterations; on a small budget the first thousands would
 go into finding colours that projection gives at once (G17).
@@ -51,11 +51,11 @@ def warm_start(
 
 
 def _write_modes(model: GRMM, all_modes: Tensor, logits: Tensor) -> None:
-    """Principal components of the subjects' textures (S, N, 3) into modes and codes."""
+    """Write the principal components of the subjects' textures (S, N, 3) into modes and codes."""
     deviations = (logits - logits.mean(0)).flatten(1)
     u, s, v = torch.linalg.svd(deviations.double(), full_matrices=False)
     count = min(len(s) - 1, len(all_modes))
-    # Codes of unit spread: every decoder then tells the subjects apart from its first step.
+    # Codes of unit spread: every decoder then distinguishes the subjects from its first step.
     scale = u[:, :count].std(0).clamp_min(1e-8)
     model.z_id[:, :count] = (u[:, :count] / scale).to(model.z_id.dtype)
     basis = (v[:count] * (s[:count] * scale)[:, None]).to(model.z_id.dtype)
@@ -72,7 +72,7 @@ def project_texture(
     z_id: Tensor | None = None,
     z_exp: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """Mean footage colour of each texel over the views that see it.
+    """Return the mean footage colour of each texel over the views that see it.
 
     Returns:
         colours (N, 3) in [0, 1]; weight (N,), 0 where no view sees the texel.
@@ -95,7 +95,7 @@ def project_texture(
 
 
 def _seen_colours(model: GRMM, gaussians: Gaussians, item: Item) -> tuple[Tensor, Tensor]:
-    """Colours (N, 3) under the projected means, and weights (N,): squared cosine, 0 if hidden."""
+    """Sample colours (N, 3) under the means; weights (N,) are squared cosines, 0 if hidden."""
     view = item.view
     camera = view.cam_from_head.to(gaussians.means.dtype)
     points = gaussians.means @ camera[:3, :3].T + camera[:3, 3]
@@ -123,7 +123,7 @@ def _seen_colours(model: GRMM, gaussians: Gaussians, item: Item) -> tuple[Tensor
 def spread_change(
     change: Tensor, weight: Tensor, colours: Tensor, means: Tensor, samples: int = 1024
 ) -> Tensor:
-    """What changes of seen texels let one expect at every texel (N, 3).
+    """Predict the change of every texel (N, 3) from the changes of seen texels.
 
     A kernel regression on colour before the change and on place, with the head's left and right
     folded together; at most ``samples`` seen texels, evenly taken, speak for all.

@@ -20,7 +20,7 @@ def redact(path: Path, subject: str) -> bool:
     shares, stay as they are.
 
     Raises:
-        FormatError: the file is no checkpoint of 'grmm train' or 'fit'.
+        FormatError: the file is not a checkpoint of 'grmm train' or 'fit'.
     """
     content = read_content(path)
     named = {*content["subjects"], *content.get("offsets", {})}

@@ -20,13 +20,13 @@ exit codes: 0 done, 1 failed, 2 wrong usage or configuration"""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Entry point of the ``grmm`` command; returns the exit code (0 ok, 1 failed, 2 usage)."""
+    """Run the ``grmm`` command; returns the exit code (0 ok, 1 failed, 2 usage)."""
     args = build_parser().parse_args(arguments)
     return run_handler("grmm", args.handler, args)
 
 
 def build_parser() -> argparse.ArgumentParser:
-    """The argument parser with all commands."""
+    """Return the argument parser with all commands."""
     parser = argparse.ArgumentParser(
         prog="grmm",
         description=DESCRIPTION,

@@ -44,7 +44,7 @@ def add_train(commands: argparse._SubParsersAction) -> None:
 
 
 def add_training(parser: argparse.ArgumentParser) -> None:
-    """The arguments that `train_config` reads, and more folders of shards."""
+    """Add the arguments that `train_config` reads, and more folders of shards."""
     parser.add_argument(
         "--preset",
         default="paper",
@@ -96,7 +96,7 @@ def _train(args: argparse.Namespace) -> int:
 
 
 def train_config(args: argparse.Namespace) -> Config:
-    """Resolved configuration of ``grmm train``: its own flags stand above --set."""
+    """Return the resolved configuration of ``grmm train``: its own flags stand above --set."""
     name, changes = args.preset, {}
     if name == MEASURED:
         if args.seconds is None:
@@ -134,7 +134,7 @@ def _config(args: argparse.Namespace) -> int:
     config = train_config(args)
     for table in args.table or TABLES:
         if table not in TABLES:
-            raise ConfigError(f"no table is {table!r}; expected some of {', '.join(TABLES)}")
+            raise ConfigError(f"unknown table {table!r}; expected one of {', '.join(TABLES)}")
         say(config_toml(table, getattr(config, table)))
     return OK
 

@@ -107,7 +107,7 @@ def _evaluate(args: argparse.Namespace) -> int:
 def _split(
     loaded: Loaded, views: HeadViews, args: argparse.Namespace
 ) -> tuple[list[int], dict[str, list[int]]]:
-    """Samples that training's codes can draw, and those of people to be fitted first, by person."""
+    """Split samples into those that codes can draw and, by person, those to fit first."""
     chosen = select(views, args.subjects, args.expressions, args.cameras)
     people, expressions = loaded.model.subjects, loaded.model.expressions
     known = [

@@ -1,4 +1,4 @@
-"""What several commands of ``grmm`` share: checkpoints, shards, the choice of samples and heads."""
+"""The commands of ``grmm`` share these: checkpoints, shards, the choice of samples and heads."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ CHANGEABLE = ("fit", "metrics", "loss")  # tables that may differ from those of 
 
 
 def parse_seconds(text: str) -> float:
-    """Seconds of a budget: ``90``, ``60s``, ``5m`` or ``1.5h``.
+    """Parse the seconds of a budget: ``90``, ``60s``, ``5m`` or ``1.5h``.
 
     Raises:
         argparse.ArgumentTypeError: not a positive time.
@@ -31,12 +31,14 @@ def parse_seconds(text: str) -> float:
     except ValueError:
         seconds = 0.0
     if not 0 < seconds < float("inf"):
-        raise argparse.ArgumentTypeError(f"{text!r} is no time, expected for example 60s, 5m or 1h")
+        raise argparse.ArgumentTypeError(
+            f"{text!r} is not a time, expected for example 60s, 5m or 1h"
+        )
     return seconds
 
 
 def at_least(low: int, high: int = 1 << 20) -> Callable[[str], int]:
-    """A type of whole numbers from ``low`` to ``high`` for arguments."""
+    """Return an argument type that takes whole numbers from ``low`` to ``high``."""
 
     def number(text: str) -> int:
         try:
@@ -66,19 +68,19 @@ def no_file(out: Path) -> None:
 
 
 def add_checkpoint_and_shards(parser: argparse.ArgumentParser) -> None:
-    """The two positional arguments of commands that bring a model to footage."""
+    """Add the positional arguments of commands that take a model and footage."""
     parser.add_argument("checkpoint", type=Path, help="checkpoint.pt of 'grmm train' or 'fit'")
     parser.add_argument("shards", type=Path, help="folder of shards")
 
 
 def add_metrics(parser: argparse.ArgumentParser) -> None:
-    """Weights for LPIPS and FID, which nobody may distribute with this project."""
+    """Add the flags for the weights of LPIPS and FID, which cannot be distributed."""
     parser.add_argument("--alexnet", default="", help="torchvision's alexnet state dict, for LPIPS")
     parser.add_argument("--inception", default="", help="Inception as TorchScript, for FID")
 
 
 def metric_settings(args: argparse.Namespace) -> list[str]:
-    """The assignments that the flags of `add_metrics` stand for."""
+    """Return the assignments that the flags of `add_metrics` stand for."""
     given = {"alexnet": args.alexnet, "inception": args.inception}
     return [f"metrics.{name}={path}" for name, path in given.items() if path]
 
@@ -105,7 +107,7 @@ def load(path: Path, assignments: Sequence[str] = (), seconds: float | None = No
 
 
 def open_views(loaded: Loaded, shards: Path) -> HeadViews:
-    """All samples of a folder of shards, prepared as the checkpoint's training data were."""
+    """Open all samples of a folder of shards, prepared as the checkpoint's training data were."""
     from grmm.data import HeadViews
     from grmm.shard_source import ShardSource
 
@@ -121,7 +123,7 @@ def open_views(loaded: Loaded, shards: Path) -> HeadViews:
 
 
 def select(views: HeadViews, subject: str, expressions: str, cameras: str) -> list[int]:
-    """Indices of samples whose ids match; patterns as in a shell, several joined by commas.
+    """Select samples whose ids match shell patterns, several joined by commas.
 
     Raises:
         ConfigError: a pattern, or all of them together, match nothing.
@@ -158,7 +160,7 @@ def select(views: HeadViews, subject: str, expressions: str, cameras: str) -> li
 
 
 def add_edit(parser: argparse.ArgumentParser) -> None:
-    """The arguments that choose a head: one of training, edited parameter by parameter."""
+    """Add the arguments that choose a training head and edit it parameter by parameter."""
     parser.add_argument("--subject", help="default: the first of the checkpoint")
     parser.add_argument("--expression", help="default: neutral, else the first")
     parser.add_argument(
@@ -181,7 +183,7 @@ def add_edit(parser: argparse.ArgumentParser) -> None:
 
 
 def edited_head(loaded: Loaded, args: argparse.Namespace) -> HeadCodes:
-    """The head that the arguments of `add_edit` describe."""
+    """Return the head that the arguments of `add_edit` describe."""
     from grmm.edit import controlled, trained_head, with_expression
 
     head = trained_head(loaded, *frame(loaded, args.subject, args.expression))
@@ -197,7 +199,7 @@ def edited_head(loaded: Loaded, args: argparse.Namespace) -> HeadCodes:
 
 
 def frame_head(loaded: Loaded, text: str, expression: str | None = None) -> HeadCodes:
-    """The head of ``SUBJECT/EXPRESSION``; without the second part ``expression``."""
+    """Return the head of ``SUBJECT/EXPRESSION``; without the second part ``expression``."""
     from grmm.edit import trained_head
 
     subject, _, named = text.partition("/")
@@ -205,7 +207,7 @@ def frame_head(loaded: Loaded, text: str, expression: str | None = None) -> Head
 
 
 def frame(loaded: Loaded, subject: str | None, expression: str | None) -> tuple[str, str]:
-    """Subject and expression to draw, by default the first subject's neutral."""
+    """Return the subject and expression to draw, by default the first subject's neutral."""
     model = loaded.model
     subject = subject or model.subjects[0]
     if expression is None:
@@ -226,5 +228,5 @@ def _control(text: str) -> tuple[str, tuple[float, ...]]:
 
 
 def split_names(text: str) -> tuple[str, ...]:
-    """Names joined by commas."""
+    """Split names joined by commas."""
     return tuple(name.strip() for name in text.split(",") if name.strip())

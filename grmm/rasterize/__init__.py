@@ -107,7 +107,7 @@ def rasterize(
 
 
 def resolve_backend(backend: str = "auto", device: torch.device | str = "cpu") -> str:
-    """Name of the backend that ``auto`` stands for on ``device``; other names pass unchanged.
+    """Resolve ``auto`` to the backend for ``device``; other names pass unchanged.
 
     Raises:
         ValueError: the name is unknown.

@@ -174,7 +174,7 @@ def _bin(
 def _camera(
     K: Tensor, cam_from_world: Tensor, size: tuple[int, int], options: RenderOptions
 ) -> _Camera:
-    """The camera as the kernel reads it, in float64."""
+    """Return the camera as the kernel reads it, in float64."""
     (fx, _, cx), (_, fy, cy), _ = K.tolist()
     pose = cam_from_world.tolist()
     return _Camera(
@@ -192,7 +192,7 @@ def _camera(
 
 
 def _empty(shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
-    """Uninitialised tensor, in huge pages where it is large and the system has them."""
+    """Return an uninitialised tensor, in huge pages where it is large and the system has them."""
     tensor = torch.empty(shape, dtype=dtype)
     size = tensor.numel() * tensor.element_size()
     if size >= _HUGE:
@@ -204,7 +204,7 @@ class _FreshMemory(RenderBuffers):
     """Buffers that never use memory again."""
 
     def take(self, name: str, shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
-        """New memory."""
+        """Allocate new memory."""
         return _empty(shape, dtype)
 
 
@@ -212,12 +212,12 @@ _fresh = _FreshMemory()
 
 
 def _contiguous(tensor: Tensor | None) -> Tensor | None:
-    """The tensor in one block of memory, or None."""
+    """Return the tensor in one block of memory, or None."""
     return None if tensor is None else tensor.contiguous()
 
 
 def _workspace(size: int, dtype: torch.dtype) -> Tensor:
-    """Uninitialised scratch of this thread, valid until the next call."""
+    """Return an uninitialised scratch of this thread, valid until the next call."""
     buffers = _scratch.__dict__
     if dtype not in buffers or buffers[dtype].numel() < size:
         buffers[dtype] = _empty((size,), dtype)

@@ -66,7 +66,7 @@ def rasterize_gsplat(
 
 
 def plane_channels(splats: Projection, K: Tensor) -> Tensor:
-    """Channels (N, 3) that are affine in the pixel: ray length = a + b (u - cx) + c (v - cy).
+    """Return channels (N, 3) of the plane: ray length = a + b (u - cx) + c (v - cy).
 
     Blended like colours and combined by ``combine_planes`` they give the sum of weight * ray
     length; counting from the principal point keeps float32 exact enough.
@@ -78,7 +78,7 @@ def plane_channels(splats: Projection, K: Tensor) -> Tensor:
 
 
 def combine_planes(blended: Tensor, K: Tensor) -> Tensor:
-    """Sum of weight * ray length (H, W) from blended plane channels (H, W, 3)."""
+    """Return the sum of weight * ray length (H, W) from blended plane channels (H, W, 3)."""
     height, width = blended.shape[:2]
     center = K[:2, 2].to(blended.dtype)
     u = cell_to_corner(torch.arange(width, device=blended.device, dtype=blended.dtype)) - center[0]
@@ -88,7 +88,7 @@ def combine_planes(blended: Tensor, K: Tensor) -> Tensor:
 
 
 def _require_gsplat(means: Tensor) -> Any:
-    """The gsplat module; errors with the remedy where it cannot work on ``means``."""
+    """Return the gsplat module; errors with the remedy where it cannot work on ``means``."""
     if not torch.cuda.is_available():
         raise RuntimeError("backend 'gsplat' needs a CUDA device; use backend='cpu' here")
     try:
@@ -104,7 +104,7 @@ def _require_gsplat(means: Tensor) -> Any:
 
 @torch.no_grad()
 def _tiles(gsplat: Any, splats: Projection, width: int, height: int) -> tuple[Tensor, Tensor]:
-    """Tile offsets of gsplat (1, rows, columns) and sorted Gaussian indices."""
+    """Return the tile offsets of gsplat (1, rows, columns) and sorted Gaussian indices."""
     columns, rows = -(-width // TILE), -(-height // TILE)
     # One pixel more than the exact box; invisible Gaussians have radius 0 and are left out.
     radii = (splats.extents.clamp(max=1e9).ceil() + 1).int() * splats.visible[:, None]
@@ -117,9 +117,9 @@ def _tiles(gsplat: Any, splats: Projection, width: int, height: int) -> tuple[Te
 def _median_ray_length(
     gsplat: Any, splats: Projection, tiles: tuple[Tensor, Tensor], width: int, height: int
 ) -> Tensor:
-    """Ray length (H, W) of the Gaussian at which each pixel's transmittance passes one half.
+    """Return each pixel's ray length (H, W) where the transmittance passes one half.
 
-    gsplat's kernels do not tell which that is, but list all pairs of Gaussian and pixel in order.
+    gsplat's kernels do not report it, but list all pairs of Gaussian and pixel in order.
     """
     gaussians, pixels = _crossings(gsplat, splats, tiles, width, height)
     center = cell_to_corner(
@@ -135,7 +135,7 @@ def _median_ray_length(
 def _crossings(
     gsplat: Any, splats: Projection, tiles: tuple[Tensor, Tensor], width: int, height: int
 ) -> tuple[Tensor, Tensor]:
-    """Gaussian and pixel numbers (P,) where the transmittance falls through one half."""
+    """Find Gaussian and pixel numbers (P,) where the transmittance falls through one half."""
     offsets, ids = tiles
     ends = torch.cat([offsets.flatten()[1:], offsets.new_tensor([len(ids)])])
     batches = -(-int((ends - offsets.flatten()).max()) // TILE**2)
@@ -164,7 +164,7 @@ def _crossings(
 
 
 def _padded_chunks(values: Tensor) -> list[Tensor]:
-    """Channels (N, C) in parts of at most ``CHUNK``; zeros pad the last to a legal width."""
+    """Return channels (N, C) in parts of at most ``CHUNK``; zeros pad the last to a legal width."""
     chunks = list(values.split(CHUNK, dim=1))
     missing = min(w for w in WIDTHS if w >= chunks[-1].shape[1]) - chunks[-1].shape[1]
     chunks[-1] = torch.nn.functional.pad(chunks[-1], (0, missing))

@@ -46,7 +46,7 @@ class RenderOptions:
 
 @dataclass(frozen=True)
 class RenderOutput:
-    """What ``rasterize`` returns.
+    """The images that ``rasterize`` returns.
 
     Attributes:
         colors: (H, W, C) blended colours (any channels), background included.
@@ -78,7 +78,7 @@ class RenderBuffers:
         self._flat: dict[str, Tensor] = {}
 
     def take(self, name: str, shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
-        """Uninitialised tensor in the memory that ``name`` had before, grown where needed."""
+        """Return an uninitialised tensor in the memory that ``name`` had, grown if needed."""
         size = torch.Size(shape).numel()
         flat = self._flat.get(name)
         if flat is None or flat.dtype != dtype or flat.numel() < size:

@@ -99,7 +99,7 @@ def project(
 
 
 def _jacobian(points: Tensor, K: Tensor, width: int, height: int) -> Tensor:
-    """Derivatives (N, 3, 3) of (u, v, ray length) by camera coordinates (N, 3).
+    """Return the derivatives (N, 3, 3) of (u, v, ray length) by camera coordinates (N, 3).
 
     x/z and y/z of the pixel rows are clamped a little outside the image: beyond it the linear
     model of a wide Gaussian would explode.
@@ -129,7 +129,7 @@ def _clamp(value: Tensor, low: Tensor, high: Tensor) -> Tensor:
 
 
 def _regression(rows: Tensor, variances: Tensor, eps2d: float) -> tuple[Tensor, Tensor, Tensor]:
-    """Conics (N, 3), slopes (N, 2) of the ray length and antialiasing factors (N,).
+    """Return the conics (N, 3), slopes (N, 2) of the ray length and antialiasing factors (N,).
 
     ``rows`` (N, 3, 3), a square root of the covariance over (u, v, ray length), and its diagonal
     ``variances`` (N, 3). The slope is that of the regression of the ray length t on the pixel,
@@ -153,7 +153,7 @@ def _regression(rows: Tensor, variances: Tensor, eps2d: float) -> tuple[Tensor, 
 
 
 def _normals(jacobian: Tensor, slopes: Tensor) -> Tensor:
-    """Unit normals (N, 3) of the planes ray length = l + slope . (pixel - mean2d).
+    """Return the unit normals (N, 3) of the planes ray length = l + slope . (pixel - mean2d).
 
     On such a plane (ray length - slope . pixel) is constant, so minus its derivative by camera
     coordinates, which ``jacobian`` (N, 3, 3) gives, points at the camera (RaDe-GS, section 3).
@@ -166,7 +166,7 @@ def _normals(jacobian: Tensor, slopes: Tensor) -> Tensor:
 def _extents(
     means2d: Tensor, variances: Tensor, opacities: Tensor, width: int, height: int
 ) -> tuple[Tensor, Tensor]:
-    """Half sizes (N, 2) of the alpha >= 1/255 box, and whether it holds a pixel centre (N,)."""
+    """Return half sizes (N, 2) of the alpha >= 1/255 box; (N,) bool if it is in the image."""
     level = 2.0 * torch.log((opacities / ALPHA_MIN).clamp(min=1.0))
     extents = (level[:, None] * variances).sqrt()
     size = means2d.new_tensor([width, height])
@@ -175,7 +175,7 @@ def _extents(
 
 
 def ray_lengths(K: Tensor, width: int, height: int) -> Tensor:
-    """Length (H, W) of the ray through each pixel centre at camera z = 1; float64 inside."""
+    """Return length (H, W) of the ray through each pixel centre at camera z = 1; float64 inside."""
     K64 = K.double()
     u = cell_to_corner(torch.arange(width, device=K.device, dtype=torch.float64))
     v = cell_to_corner(torch.arange(height, device=K.device, dtype=torch.float64))
@@ -185,13 +185,13 @@ def ray_lengths(K: Tensor, width: int, height: int) -> Tensor:
 
 
 def depth_of_rays(ray_length: Tensor, K: Tensor) -> Tensor:
-    """Camera z (H, W) of points at ``ray_length`` (H, W) along the rays of the pixel centres."""
+    """Convert ``ray_length`` (H, W) along the rays of pixel centres to camera z (H, W)."""
     height, width = ray_length.shape
     return ray_length / ray_lengths(K, width, height).to(ray_length.dtype)
 
 
 def expected_depth(weighted_ray_length: Tensor, alpha: Tensor, K: Tensor) -> Tensor:
-    """Expected camera z (H, W), metres, from sum of weight * ray length (H, W) and alpha (H, W).
+    """Compute the expected camera z (H, W), m, from sum of weight * ray length and alpha.
 
     Zero where nothing was hit. Source: RaDe-GS, section 3 (z = t / |K^-1 (u, v, 1)|).
     """

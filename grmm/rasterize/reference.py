@@ -57,7 +57,7 @@ def rasterize_reference(
 def _blend(
     splats: Projection, colors: Tensor, order: Tensor, left: int, top: int, width: int, height: int
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Front-to-back blending of one tile.
+    """Blend one tile front to back.
 
     Returns colours (h, w, C), and (h, w) each: ray length * weight, alpha, median ray length.
 
@@ -98,7 +98,7 @@ def _blend(
 def _touches(
     splats: Projection, ids: Tensor, left: int, top: int, width: int, height: int
 ) -> Tensor:
-    """Which of the Gaussians ``ids`` can reach a pixel centre of the tile (bool)."""
+    """Mark the Gaussians ``ids`` that can reach a pixel centre of the tile (bool)."""
     low = splats.means2d[ids].detach() - splats.extents[ids]
     high = splats.means2d[ids].detach() + splats.extents[ids]
     corner = low.new_tensor([left, top])

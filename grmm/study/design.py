@@ -58,7 +58,9 @@ def make_study(
     if examples < 1 or participants < 1:
         raise ConfigError(f"got {examples} examples and {participants} participants, expected >= 1")
     if methods[0].name == methods[1].name:
-        raise ConfigError(f"both methods are called {methods[0].name!r}; --names tells them apart")
+        raise ConfigError(
+            f"both methods are called {methods[0].name!r}; give two names with --names"
+        )
     folders = [reference, *(method.folder for method in methods)]
     names = common_pictures(folders)
     if len(names) < examples:
@@ -94,7 +96,7 @@ def make_study(
 
 
 def common_pictures(folders: Sequence[Path]) -> list[str]:
-    """Stems of the pictures that all folders hold.
+    """Return the stems of the pictures that all folders hold.
 
     Raises:
         ConfigError: a folder does not exist.
@@ -111,7 +113,7 @@ def _copy(folder: Path, name: str, out: Path, seed: int) -> str:
     """Write a picture as PNG under a digest; returns that name, relative to OUT.
 
     The digest is of what the picture shows and where it came from: two methods that made the same
-    picture must not be told apart by a shared address either.
+    picture must not be recognised by a shared address either.
     """
     found = (p for p in sorted(folder.iterdir()) if p.stem == name)
     path = next(p for p in found if p.suffix.lower() in SUFFIXES)
@@ -125,7 +127,7 @@ def _copy(folder: Path, name: str, out: Path, seed: int) -> str:
 
 
 def trials(study: dict, participant: int) -> list[dict]:
-    """What one participant sees, in order: example number, and pictures of reference, A and B."""
+    """List what one participant sees, in order: example, and pictures of reference, A and B."""
     entries = study["examples"]
     order = np.random.default_rng([study["seed"], 1, participant]).permutation(len(entries))
     seen = []
@@ -145,7 +147,7 @@ def trials(study: dict, participant: int) -> list[dict]:
 
 
 def method_of(study: dict, participant: int, example: int, side: str) -> str:
-    """Which method a participant saw on a side; odd participants see the mirrored assignment."""
+    """Return the method that a participant saw on a side; odd participants see it mirrored."""
     first, second = study["methods"]
     a = study["examples"][example]["A"]
     if participant % 2:

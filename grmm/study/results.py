@@ -25,7 +25,7 @@ COLUMNS = ("first++", "first+", "second++", "second+", "tie")
 
 
 def read_study(out: Path) -> dict:
-    """The study that `make_study` wrote.
+    """Read the study that `make_study` wrote.
 
     Raises:
         FormatError: there is none.
@@ -47,7 +47,7 @@ def read_study(out: Path) -> dict:
 
 
 def check_answer(study: dict, value: object) -> dict:
-    """One answer {participant, example, question, answer}, nothing else kept.
+    """Return one answer {participant, example, question, answer}, nothing else kept.
 
     Raises:
         FormatError: a field is missing or out of range.
@@ -80,7 +80,7 @@ def append_answer(out: Path, answer: dict) -> None:
 
 
 def read_answers(out: Path, study: dict) -> list[dict]:
-    """All answers; of several to one question the last; a torn last line is left out.
+    """Return all answers; of several to one question the last; a torn last line is left out.
 
     Raises:
         FormatError: a line is not an answer to this study.
@@ -121,7 +121,7 @@ def judgments(study: dict, answers: Sequence[dict]) -> list[tuple[int, str, str]
 
 
 def summarise(study: dict, answers: Sequence[dict], seed: int = 0) -> dict:
-    """Percentages a question and overall, each with its interval, and how many answered."""
+    """Summarise answers: percentages with intervals per question and overall, and their count."""
     found = judgments(study, answers)
     rows = {
         question: _row([f for f in found if f[1] == question], seed)
@@ -142,7 +142,7 @@ def summarise(study: dict, answers: Sequence[dict], seed: int = 0) -> dict:
 
 
 def _row(found: Sequence[tuple[int, str, str]], seed: int) -> dict:
-    """Percent of every column and of each method's two together, with intervals."""
+    """Return the percent of every column and of each method's two together, with intervals."""
     people = sorted({participant for participant, _, _ in found})
     counts = np.zeros((len(people), len(COLUMNS)))
     for participant, _, column in found:
@@ -160,7 +160,7 @@ def _row(found: Sequence[tuple[int, str, str]], seed: int) -> dict:
 
 
 def _share(counts: np.ndarray | None, places: tuple[int, ...], level: float | None) -> object:
-    """Percent of some columns; of many draws the interval that holds ``level`` of them."""
+    """Return percent of some columns; of many draws the interval that holds ``level`` of them."""
     if counts is None or not counts.sum():
         return None
     shares = 100 * counts[:, places].sum(1) / counts.sum(1)
@@ -172,7 +172,7 @@ def _share(counts: np.ndarray | None, places: tuple[int, ...], level: float | No
 
 
 def markdown(summary: dict) -> str:
-    """The table as the paper prints it, shares in percent, intervals below the preferences."""
+    """Format the table as the paper does: percentages, with intervals for both methods."""
     first, second = summary["methods"]
     lines = [
         ["Type", f"{first} ++", f"{first} +", f"{second} ++", f"{second} +", "Tie", first, second],

@@ -25,13 +25,13 @@ PAGE = "page.html"
 
 
 def make_server(out: Path, host: str = "127.0.0.1", port: int = 8000) -> ThreadingHTTPServer:
-    """A server that is bound but does not serve yet; call ``serve_forever``.
+    """Bind a server that does not serve yet; call ``serve_forever``.
 
     Raises:
         FormatError: OUT holds no study, or the port is taken.
     """
     study = read_study(out)
-    read_answers(out, study)  # a damaged file is told now, not after an hour of answers
+    read_answers(out, study)  # report a damaged file now, not after an hour of answers
     page = resources.files("grmm.study").joinpath(PAGE).read_bytes()
     pictures = {p for e in study["examples"] for p in (e["reference"], *e["pictures"].values())}
     lock = Lock()
