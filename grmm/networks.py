@@ -212,7 +212,7 @@ class MeshDecoder(nn.Module):
         return identity, self.face_mask * expression
 
     def modulate(self, feature: Tensor, coefficients: Tensor) -> Tensor:
-        """Modulate by FiLM in the paper's residual form, f + gamma * f + beta (Perez et al. 2018)."""
+        """Modulate by FiLM in its residual form, f + gamma * f + beta (Perez et al. 2018)."""
         gamma, beta = self.film(coefficients).chunk(2)
         return feature + gamma * feature + beta
 
