@@ -7,7 +7,7 @@ a subject, fitted to the cameras; what is left of calibration error stays in eve
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -38,7 +38,6 @@ def measure_dataset(dataset: Dataset, truth_root: Path, out: Path | None = None)
     measures = {
         "calibrate": measure_calibrate,
         "align": measure_align,
-        "alpha": measure_alpha,
         "matte": measure_matte,
         "track": measure_track,
         "depth": measure_depth,
@@ -103,22 +102,11 @@ def sampled_views(dataset: Dataset, truth: Truth) -> Iterator[tuple[str, str, in
                 turn += 3 if len(cameras) % 3 else 1
 
 
-def measure_alpha(dataset: Dataset, truth: Truth, out: Path | None = None) -> dict:
-    """Errors of each camera's own alpha, as `measure_matte` has them."""
-    return _alpha_errors(dataset, truth, dataset.alpha_file, None)
-
-
 def measure_matte(dataset: Dataset, truth: Truth, out: Path | None = None) -> dict:
     """Mean absolute alpha error over whole images, and over the truth's uncertain rim alone."""
-    return _alpha_errors(dataset, truth, dataset.matte_file, out)
-
-
-def _alpha_errors(
-    dataset: Dataset, truth: Truth, file_of: Callable[[str, str, str], Path], out: Path | None
-) -> dict:
     whole, rim, rows, names = [], [], [], []
     for subject, expression, frame, camera in sampled_views(dataset, truth):
-        path = file_of(subject, expression, camera.id)
+        path = dataset.matte_file(subject, expression, camera.id)
         if not path.is_file():
             continue
         alpha = read_image(path).astype(np.float64) / 255.0

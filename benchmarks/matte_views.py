@@ -42,13 +42,12 @@ from express50.geometry.cameras import pinhole
 from express50.geometry.conventions import undistort_image, undistorted_mask
 from express50.twin.config import TwinConfig
 from express50.twin.truth import Truth
-from pipelines.alpha import STAGE as ALPHA
-from pipelines.alpha.keyer import Keyer
 from pipelines.matte import STAGE
-from pipelines.matte.agreement import agree
 from pipelines.matte.config import MatteConfig
-from pipelines.matte.hull import ball_of
+from pipelines.matte.consensus import agree
+from pipelines.matte.key import Keyer, KeyOptions
 from pipelines.matte.stage import corrected, make_view
+from pipelines.matte.visual_hull import ball_of
 
 PRESETS = ("draft", "standard", "reference")
 RIG = TwinConfig(
@@ -144,7 +143,7 @@ def shots_of(dataset: Dataset, truth: Truth, subject: str, frame: int) -> list[S
 
 def key(shot: Shot) -> Keyed:
     """The shot with its camera's own alpha, by the standard preset."""
-    keyer = Keyer(shot.plate, [shot.frame], shot.valid, resolve_config(ALPHA, "standard"))
+    keyer = Keyer(shot.plate, [shot.frame], shot.valid, KeyOptions())
     return Keyed(shot, np.rint(255 * keyer.alpha(shot.frame)).astype(np.uint8))
 
 
@@ -155,7 +154,7 @@ def measure(keyed: list[Keyed], config: MatteConfig, sheet: Path | None) -> Figu
     if ball is None:
         sys.exit("the rig looks at no one place; name another --dataset")
     views = [make_view(k.shot.camera, ball, k.shot.frame, k.alpha, config.side) for k in keyed]
-    found = agree(views, config)
+    found = agree(views, config.cells, config.strand)
     after = [
         corrected(k.alpha, found.removed.get(k.shot.camera.id), found.filled.get(k.shot.camera.id))
         for k in keyed

@@ -25,7 +25,6 @@ PRESETS = ("draft", "standard", "reference")
 MEASURES = {
     "calibrate": (accuracy.measure_calibrate, "translation_error_mm_max"),
     "align": (accuracy.measure_align, "peak_error_frames_mean"),
-    "alpha": (accuracy.measure_alpha, "mae"),
     "matte": (accuracy.measure_matte, "mae"),
     "track": (accuracy.measure_track, "vertex_rmse_mm"),
     "depth": (accuracy.measure_depth, "abs_error_mm_median"),

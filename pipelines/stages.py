@@ -5,7 +5,7 @@ package imports annotations.
 """
 
 from annotations import align, observe
-from pipelines import alpha, calibrate, depth, frames, ingest, matte, pack, regions, track
+from pipelines import calibrate, depth, frames, ingest, matte, pack, regions, track
 
 STAGES = (
     ingest.STAGE,
@@ -13,7 +13,6 @@ STAGES = (
     observe.STAGE,
     align.STAGE,
     frames.STAGE,
-    alpha.STAGE,
     matte.STAGE,
     track.STAGE,
     depth.STAGE,

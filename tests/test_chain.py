@@ -23,7 +23,7 @@ from express50.shards.reader import ShardReader
 pytestmark = pytest.mark.slow
 
 STAGES = (
-    "ingest", "calibrate", "observe", "align", "frames", "alpha", "matte", "track", "depth",
+    "ingest", "calibrate", "observe", "align", "frames", "matte", "track", "depth",
     "regions", "pack",
 )  # fmt: skip
 SETTINGS = {"pack": ["--set", "pack.size=96", "--set", 'pack.test_subjects=["S002"]']}

@@ -102,12 +102,8 @@ class Dataset:
         """Undistorted, colour-corrected clean plate of one camera."""
         return self.frame_file(subject, PLATES, camera)
 
-    def alpha_file(self, subject: str, expression: str, camera: str) -> Path:
-        """8-bit opacity of one peak frame as the camera alone has it."""
-        return self.item_dir("alpha", f"{subject}/{camera}") / f"{expression}.png"
-
     def matte_file(self, subject: str, expression: str, camera: str) -> Path:
-        """8-bit opacity of one peak frame after all cameras have agreed."""
+        """8-bit opacity of the subject in one peak frame."""
         return self.item_dir("matte", f"{subject}/{expression}") / f"{camera}.png"
 
     def labels_file(self, subject: str) -> Path:

@@ -1,4 +1,4 @@
-"""Mattes of a moment: what each camera keyed alone, corrected where the other cameras disagree."""
+"""The matte stage: the opacity of the subject in every camera of a peak."""
 
 from __future__ import annotations
 
@@ -6,41 +6,60 @@ from pathlib import Path
 
 from express50.contract.layout import Dataset
 from express50.contract.stage import Growth, Result, Stage
-from pipelines.matte.config import PRESETS, MatteConfig
+from pipelines.matte.config import NETWORKS, PRESETS, WITHOUT_PLATE, MatteConfig
 
 
 def items(dataset: Dataset) -> list[str]:
-    """List the items, see `pipelines.matte.stage`."""
-    from express50.capture.frames import peak_items as found
+    """List the expressions that have a peak frame."""
+    from express50.capture.frames import peak_items
 
-    return found(dataset)
+    return peak_items(dataset)
 
 
 def inputs(dataset: Dataset, item: str, config: MatteConfig) -> dict[str, Path | str]:
-    """Name what one item reads, see `pipelines.matte.stage`."""
-    from pipelines.matte.stage import inputs as found
+    """Name the cameras, the frames, the plates that the method uses, and the weights."""
+    from express50.capture.frames import frame_inputs, read_cameras_of
 
-    return found(dataset, item, config)
+    subject, expression = item.split("/")
+    found: dict[str, Path | str] = {
+        "cameras": dataset.item_dir("calibrate", subject) / "cameras.json",
+        **frame_inputs(dataset, subject, expression),
+    }
+    if config.method not in WITHOUT_PLATE:
+        plates = {c: dataset.plate_file(subject, c) for c in read_cameras_of(dataset, subject)}
+        found |= {f"plate {c}": path for c, path in plates.items() if path.is_file()}
+    if config.weights:
+        from pipelines.networks import check_file  # torch takes seconds to import
+
+        found["weights"] = Path(config.weights).expanduser()
+        check_file(Path(config.weights).expanduser(), "matte.weights")
+    return found
 
 
-def run(dataset: Dataset, item: str, config: MatteConfig, out: Path) -> Result | dict:
-    """Make one item, see `pipelines.matte.stage`."""
+def run(dataset: Dataset, item: str, config: MatteConfig, out: Path) -> Result:
+    """Matte one peak."""
     from pipelines.matte.stage import run as work
 
     return work(dataset, item, config, out)
 
 
+def needs_gpu(config: MatteConfig) -> bool:
+    """Say whether a network must run on CUDA."""
+    return config.method in NETWORKS and config.device == "cuda"
+
+
 STAGE = Stage(
     name="matte",
-    version=5,
+    version=6,
     config=MatteConfig,
     presets=PRESETS,
     items=items,
     inputs=inputs,
     run=run,
-    help="let the cameras of a moment agree on their mattes",
-    purpose="The matte that the cameras of a moment agree on: removed is red, filled is green.",
-    runs_first=("alpha",),
+    needs_gpu=needs_gpu,
+    help="separate the head from the background in every camera, and let the cameras agree",
+    purpose="The opacity of the subject in every peak frame, keyed per camera; what the other"
+    " cameras ruled out is red, what they filled is green.",
     growth=Growth(
         items=("subjects", "expressions"), time=("views", "pixels"), disk=("views", "pixels")
     ),

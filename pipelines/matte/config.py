@@ -3,47 +3,77 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 from express50.errors import ConfigError
+
+NETWORKS = ("bgmv2", "salient")
+WITHOUT_PLATE = ("grabcut", "salient")
 
 
 @dataclass(frozen=True, kw_only=True)
 class MatteConfig:
-    """How finely the cameras of a moment are compared, and what it takes to overrule one."""
+    """How each camera is matted, and what the cameras of a peak may correct in each other.
 
-    views: bool = True
-    """Let the cameras correct each other; false leaves every camera's alpha as it is."""
+    Lengths are shares of the image's longer side; differences are in deviations of noise.
+    """
+
+    method: Literal["key", "grabcut", "bgmv2", "salient"] = "key"
+    """Key against the plate, cut by colours around the face, or run a network."""
+    weights: str = ""
+    """File of the network's weights, TorchScript or ONNX; such a file is a program, so trust its
+    origin."""
+    device: Literal["auto", "cuda"] = "auto"
+    """Run the network on CUDA if available (auto), or only on CUDA."""
+    tile: int = 2048
+    """Longest side, pixels, of a tile that bgmv2 sees; larger frames are cut into tiles."""
+    scale: float = 1.0
+    """Key at this share of the resolution; the matte is enlarged afterwards."""
+    low: float = 1.2
+    """Difference that is as likely noise as subject; alpha is 0 below it."""
+    high: float = 6.0
+    """Difference that proves foreground; weaker pixels must touch such ones."""
+    light: Literal["linear", "display"] = "linear"
+    """Soft edges mix linear light, as in cameras, or sRGB values, as in composites."""
+    shadow: float = 0.25
+    """Broad darkening of the plate up to this share is a shadow; 0 turns this off."""
+    agree: bool = True
+    """Let the cameras correct each other; false keeps every camera's own matte."""
     side: int = 192
-    """Longest side, pixels, of the images that are compared."""
+    """Longest side, pixels, of the images that are compared between cameras."""
     cells: int = 96
-    """Cells along the sides of the cube in which the views are compared."""
-    votes: int = 2
-    """Other cameras that must see clear background before a place counts as empty."""
-    margin: float = 0.01
-    """Distance from a silhouette, a share of the image's longer side, that proves nothing."""
+    """Cells along each side of the cube in which the cameras are compared."""
     strand: float = 0.03
-    """What reaches no further beyond the other views' hull than this share may be hair; kept."""
-    colour: float = 0.1
-    """Largest difference of colour, of full scale, of one surface in neighbouring cameras."""
+    """What reaches no further than this beyond the other cameras' hull may be hair and is kept."""
 
     def __post_init__(self) -> None:
-        """Refuse values that compare nothing or believe anything."""
+        """Refuse values that matte nothing or everything."""
+        if not 0.1 <= self.scale <= 1.0:
+            raise ConfigError(f"matte.scale is {self.scale}, expected 0.1 to 1")
+        if not 0 < self.low < self.high:
+            raise ConfigError(
+                f"matte.low {self.low} and matte.high {self.high}: expected 0 < low < high"
+            )
+        if not 0.0 <= self.shadow < 1.0:
+            raise ConfigError(f"matte.shadow is {self.shadow}, expected 0 to below 1")
+        if (self.method in NETWORKS) != bool(self.weights):
+            raise ConfigError(
+                f"matte.method {self.method!r} with matte.weights {self.weights!r}: key and grabcut"
+                " take none, bgmv2 and salient need the file of the network's weights"
+            )
+        if self.tile < 512 or self.tile % 64:
+            raise ConfigError(f"matte.tile is {self.tile}, expected a multiple of 64, 512 or more")
         if not 16 <= self.side <= 2048 or not 16 <= self.cells <= 256:
             raise ConfigError(
                 f"matte.side {self.side} and matte.cells {self.cells}: expected 16 to 2048 pixels"
                 " and 16 to 256 cells"
             )
-        if self.votes < 2:
-            raise ConfigError(f"matte.votes is {self.votes}, expected 2 or more: one may be wrong")
-        if not 0 < self.margin <= self.strand < 1 or not 0 < self.colour < 1:
-            raise ConfigError(
-                f"matte.margin {self.margin}, matte.strand {self.strand}, matte.colour"
-                f" {self.colour}: expected 0 < margin <= strand < 1 and a colour between 0 and 1"
-            )
+        if not 0.01 <= self.strand < 1:
+            raise ConfigError(f"matte.strand is {self.strand}, expected 0.01 to below 1")
 
 
 PRESETS: dict[str, dict[str, object]] = {
-    "draft": {"side": 128, "cells": 64},
+    "draft": {"scale": 0.5, "side": 128, "cells": 64},
     "standard": {},
     "reference": {"side": 256, "cells": 128},
 }

@@ -1,112 +1,154 @@
-"""The matte stage: one moment of one subject, the final 8-bit alpha of every camera."""
+"""Matte every camera of one peak, let the cameras correct each other, and write the mattes."""
 
 from __future__ import annotations
 
-import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
 import numpy as np
 
-from express50.capture.frames import (
-    frame_inputs,
-    read_cameras_of,
-    read_peak_frame,
-)
+from express50.capture.frames import read_cameras_of, read_peak_frame, read_plate_image
 from express50.contract.layout import Dataset
-from express50.errors import FormatError, StageError
-from express50.files.images import contact_sheet, read_alpha, resize_area, write_image
+from express50.contract.stage import Note, Result
+from express50.errors import CaptureError, NoFaceError, StageError
+from express50.files.images import contact_sheet, resize_area, write_image
 from express50.geometry.cameras import Camera, pinhole, resized
 from express50.geometry.conventions import undistorted_mask
-from pipelines.matte.agreement import Agreement, agree
-from pipelines.matte.config import MatteConfig
-from pipelines.matte.hull import INSIDE, Ball, View, ball_of, center_of, projection_of
+from pipelines.matte.config import WITHOUT_PLATE, MatteConfig
+from pipelines.matte.consensus import Agreement, agree
+from pipelines.matte.key import Keyer, KeyOptions
+from pipelines.matte.plates import exposed, exposure_gain
+from pipelines.matte.visual_hull import (
+    INSIDE,
+    Ball,
+    MatteView,
+    ball_of,
+    center_of,
+    projection_of,
+)
 
 COLUMNS = 6  # of the picture
+TILE = (240, 240)
 RED, GREEN = (235, 50, 40), (50, 220, 80)
+EMPTY = 0.003  # share of the image below which a matte counts as empty
+# Share of the image's top or of a side that the subject may cover before it counts as cut off.
+MOST_CONTACT = 0.02
+
+Matter = Callable[[np.ndarray, np.ndarray | None, np.ndarray, Camera], np.ndarray]
+"""Frame (H, W, 3) uint8, plate or None, valid pixels (H, W) and pinhole camera to opacity (H, W)
+float32."""
 
 
-def inputs(dataset: Dataset, item: str, config: MatteConfig) -> dict[str, Path | str]:
-    """Cameras, and every camera's frame and alpha."""
+def run(dataset: Dataset, item: str, config: MatteConfig, out: Path) -> Result:
+    """Write `<camera>.png` per camera, and a contact sheet.
+
+    Raises:
+        StageError: no camera could be matted.
+    """
+    cv2.setNumThreads(1)  # the runner counts one core per item
     subject, expression = item.split("/")
-    found: dict[str, Path | str] = {
-        "cameras": dataset.item_dir("calibrate", subject) / "cameras.json",
-        **frame_inputs(dataset, subject, expression),
-    }
-    for camera in read_cameras_of(dataset, subject):
-        path = dataset.alpha_file(subject, expression, camera)
-        if path.is_file():
-            found[f"alpha {camera}"] = path
-    return found
-
-
-def run(dataset: Dataset, item: str, config: MatteConfig, out: Path) -> dict:
-    """Write `<camera>.png` for every camera with an alpha, and a picture of what was changed."""
-    cv2.setNumThreads(1)  # the runner counts one core an item
-    subject, expression = item.split("/")
+    matter, plated = _matter(config), config.method not in WITHOUT_PLATE
     cameras = read_cameras_of(dataset, subject, undistorted=False)
-    files = {name: dataset.alpha_file(subject, expression, name) for name in cameras}
-    there = {name: path for name, path in files.items() if path.is_file()}
-    if not there:
-        raise StageError(
-            f"{item}: no camera has an alpha; see what 'express50 status {dataset.root}' says of"
-            " the alpha stage, then run 'express50 matte' again"
-        )
-    views, found = _compared(dataset, item, {name: cameras[name] for name in there}, config)
-    changes: dict[str, dict[str, float]] = {}
-    for name, path in there.items():
-        if name in found.removed or name in found.filled:
-            before = read_alpha(path)
-            after = corrected(before, found.removed.get(name), found.filled.get(name))
-            write_image(out / f"{name}.png", after)
-            changes[name] = _shares(before, after)
-        else:
-            shutil.copyfile(path, out / f"{name}.png")
-    if views:
-        _write_picture(out, views, found)
-    return {
-        "views": len(views),
-        **({"unchanged": found.unchanged} if found.unchanged else {}),
-        "removed": {name: row["removed"] for name, row in changes.items()},
-        "filled": {name: row["filled"] for name, row in changes.items()},
-        "warnings": found.warnings,
-        "dropped": [
-            {"what": name, "why": "it has no alpha"} for name in files if name not in there
-        ],
+    ball = ball_of(cameras) if config.agree else None
+    alphas: dict[str, np.ndarray] = {}
+    views: list[MatteView] = []
+    dropped: list[Note] = []
+    for name, camera in cameras.items():  # one camera's full images at a time
+        try:
+            frame = read_peak_frame(dataset, subject, expression, name)
+            plate = _plate(dataset, subject, name) if plated else None
+            # Resampling mixes the outermost pixels with what lies beyond the image.
+            valid = cv2.erode(undistorted_mask(camera).astype(np.uint8), np.ones((3, 3))) > 0
+            alpha = np.where(valid, matter(frame, plate, valid, pinhole(camera)), np.float32(0))
+        except (CaptureError, NoFaceError, StageError) as error:
+            dropped.append(Note(name, str(error)))
+            continue
+        alphas[name] = np.rint(alpha * 255).astype(np.uint8)
+        views.append(make_view(camera, ball or Ball(np.zeros(3), 1.0), frame, alphas[name],
+                               config.side))  # fmt: skip
+    if not alphas:
+        raise StageError(f"{item}: {dropped[0].why if dropped else 'no camera is calibrated'}")
+    found = agree(views, config.cells, config.strand) if ball else Agreement(
+        unchanged="the cameras do not look at one place" if config.agree else "matte.agree is off"
+    )  # fmt: skip
+    final = {
+        name: corrected(alpha, found.removed.get(name), found.filled.get(name))
+        for name, alpha in alphas.items()
     }
+    for name, alpha in final.items():
+        write_image(out / f"{name}.png", alpha)
+    _write_picture(out, views, found)
+    figures = {
+        "method": config.method,
+        "views": len(views) if ball else 0,
+        "coverage": {name: round(float(a.mean()) / 255, 6) for name, a in final.items()},
+        "border_contact": {name: border_contact(alpha) for name, alpha in final.items()},
+        "removed": {name: _share(alphas[name], final[name]) for name in found.removed},
+        "filled": {name: _share(final[name], alphas[name]) for name in found.filled},
+        **({"unchanged": found.unchanged} if found.unchanged else {}),
+    }
+    named = {note.what for note in found.warnings}
+    odd = [note for note in matte_warnings(final) if note.what not in named]
+    return Result(figures, dropped, [*found.warnings, *odd])
 
 
-def _compared(
-    dataset: Dataset, item: str, cameras: dict[str, Camera], config: MatteConfig
-) -> tuple[list[View], Agreement]:
-    """The reduced views, and what they agree on; no views where nothing is to be compared."""
-    if not config.views:
-        return [], Agreement(unchanged="matte.views is off")
-    ball = ball_of(cameras)
-    if ball is None:
-        return [], Agreement(unchanged="the cameras do not look at one place")
-    subject, expression = item.split("/")
-    views = []
-    # One camera's full pictures at a time.
-    for name, camera in cameras.items():
-        path = dataset.alpha_file(subject, expression, name)
-        alpha = read_alpha(path)
-        if alpha.shape != (camera.height, camera.width):
-            raise FormatError(
-                f"{path}: {alpha.shape[1]}x{alpha.shape[0]}, expected the camera's"
-                f" {camera.width}x{camera.height}; run 'express50 matte {dataset.root}' again"
-            )
-        image = read_peak_frame(dataset, subject, expression, name)
-        views.append(make_view(camera, ball, image, alpha, config.side))
-    return views, agree(views, config)
+def _plate(dataset: Dataset, subject: str, camera: str) -> np.ndarray:
+    plate = read_plate_image(dataset, subject, camera)
+    if plate is None:
+        raise StageError(
+            f"no clean plate of {camera}; photograph the empty set as plates/{camera}.png and run"
+            " 'express50 ingest' and 'express50 frames' again, or set matte.method to grabcut or"
+            " salient"
+        )
+    return plate
 
 
-def make_view(camera: Camera, ball: Ball, image: np.ndarray, alpha: np.ndarray, side: int) -> View:
-    """A view of an undistorted image (H, W, 3) and alpha (H, W), uint8, of a recorded camera."""
+def _matter(config: MatteConfig) -> Matter:
+    """Make the function that mattes one frame. Networks are imported here: torch is slow to."""
+    if config.method == "key":
+        options = key_options(config)
+
+        def key(frame, plate, valid, camera):  # type: ignore[no-untyped-def]
+            return Keyer(plate, [frame], valid, options).alpha(frame)
+
+        return key
+    if config.method == "grabcut":
+        from express50.landmarks.network import load_network as load_landmarks
+        from pipelines.matte.grabcut import person_alpha
+
+        net = load_landmarks()
+        return lambda frame, plate, valid, camera: person_alpha(net, camera, frame)
+    from pipelines.matte.learned import BGMV2, SALIENT, background_alpha, salient_alpha
+    from pipelines.networks import load_network
+
+    path = Path(config.weights).expanduser()
+    if config.method == "salient":
+        salient = load_network(path, SALIENT)
+        return lambda frame, plate, valid, camera: salient_alpha(salient, frame)
+    network = load_network(path, BGMV2)
+
+    def learned(frame, plate, valid, camera):  # type: ignore[no-untyped-def]
+        shown = exposed(plate, exposure_gain(frame, plate))
+        return background_alpha(network, frame, shown, config.tile)
+
+    return learned
+
+
+def key_options(config: MatteConfig) -> KeyOptions:
+    """Take the options of keying from the stage's settings."""
+    linear = config.light == "linear"
+    return KeyOptions(config.scale, config.low, config.high, config.shadow, linear)
+
+
+def make_view(
+    camera: Camera, ball: Ball, image: np.ndarray, alpha: np.ndarray, side: int
+) -> MatteView:
+    """Reduce an undistorted image (H, W, 3) and alpha (H, W), uint8, of a recorded camera."""
     scale = min(1.0, side / max(camera.width, camera.height))
     width, height = (max(1, round(n * scale)) for n in (camera.width, camera.height))
     small = resized(camera, width, height)
-    return View(
+    return MatteView(
         name=camera.id,
         projection=projection_of(pinhole(small), ball),
         center=center_of(camera, ball),
@@ -119,10 +161,12 @@ def make_view(camera: Camera, ball: Ball, image: np.ndarray, alpha: np.ndarray, 
 def corrected(
     alpha: np.ndarray, removed: np.ndarray | None, filled: np.ndarray | None
 ) -> np.ndarray:
-    """Alpha (H, W) uint8 less what is `removed` (h, w), with what is `filled`; soft at their edges.
+    """Remove and fill pixels (h, w) bool of an alpha (H, W) uint8, softly at their edges.
 
     What neither reaches stays as it is to the bit.
     """
+    if removed is None and filled is None:
+        return alpha
     size = (alpha.shape[1], alpha.shape[0])
     out = alpha.astype(np.float32)
     if removed is not None:
@@ -133,16 +177,38 @@ def corrected(
     return np.rint(out).astype(np.uint8)
 
 
-def _shares(before: np.ndarray, after: np.ndarray) -> dict[str, float]:
-    """Share of the image, by opacity, that was removed and filled."""
-    change = after.astype(np.int64) - before
-    share = {"removed": -change[change < 0].sum(), "filled": change[change > 0].sum()}
-    return {key: round(float(value) / 255 / before.size, 6) for key, value in share.items()}
+def _share(more: np.ndarray, less: np.ndarray) -> float:
+    """Share of the image, by opacity, by which one alpha (H, W) uint8 exceeds another."""
+    excess = np.maximum(more.astype(np.int64) - less, 0).sum()
+    return round(float(excess) / 255 / more.size, 6)
 
 
-def _write_picture(out: Path, views: list[View], found: Agreement) -> None:
-    """Every camera's subject, what was removed red and what was filled green."""
-    odd = {warning["what"] for warning in found.warnings}
+def border_contact(alpha: np.ndarray) -> dict[str, float]:
+    """Share of each side of the image that an alpha (H, W) uint8 covers: where it is cut off."""
+    sides = {"top": alpha[0], "right": alpha[:, -1], "bottom": alpha[-1], "left": alpha[:, 0]}
+    return {side: round(float((line > 127).mean()), 4) for side, line in sides.items()}
+
+
+def matte_warnings(alphas: dict[str, np.ndarray]) -> list[Note]:
+    """Name the cameras whose matte is empty or whose subject is cut off at the top or a side."""
+    notes = []
+    for name, alpha in alphas.items():
+        share = float(alpha.mean()) / 255
+        if share < EMPTY:
+            notes.append(Note(name, f"its matte covers {share:.2%} of the image: empty"))
+            continue
+        contact = border_contact(alpha)
+        cut = [side for side in ("top", "right", "left") if contact[side] > MOST_CONTACT]
+        if cut:
+            most = max(contact[side] for side in cut)
+            sides = " and ".join(cut)
+            notes.append(Note(name, f"the subject leaves the image at the {sides} ({most:.0%})"))
+    return notes
+
+
+def _write_picture(out: Path, views: list[MatteView], found: Agreement) -> None:
+    """Write every camera's subject: what was removed is red, what was filled is green."""
+    odd = {note.what for note in found.warnings}
     tiles = []
     for view in views:
         tile = np.where(view.alpha[..., None] > INSIDE, view.rgb, view.rgb // 3)
@@ -155,4 +221,4 @@ def _write_picture(out: Path, views: list[View], found: Agreement) -> None:
     names = [view.name + ("?" if view.name in odd else "") for view in views]
     labels = ["  ".join(names[k : k + COLUMNS]) for k in range(0, len(tiles), COLUMNS)]
     (out / "qc").mkdir()
-    write_image(out / "qc" / "agreement.jpg", contact_sheet(rows, labels, (240, 240)), quality=88)
+    write_image(out / "qc" / "agreement.jpg", contact_sheet(rows, labels, TILE), quality=88)

@@ -9,9 +9,9 @@ import numpy as np
 from express50.capture.frames import read_plate_image
 from express50.contract.layout import Dataset
 from express50.files.images import scale_light
-from pipelines.alpha.foreground import own_colours
-from pipelines.alpha.plate import exposed, exposure_gain
+from pipelines.matte.plates import exposed, exposure_gain
 from pipelines.pack.crop import Crop, cut_image
+from pipelines.pack.foreground import own_colours
 
 
 def own_picture(

@@ -23,11 +23,11 @@ from pipelines.photo.panel import write_panel
 from pipelines.photo.picture import open_picture
 
 STAGES = ("ingest", "calibrate", "observe", "align", "frames", "track")
-MATTE_STAGES = ("alpha", "matte")
+MATTE_STAGES = ("matte",)
 SEARCH = 0.08  # people fill a rig's pictures, but not all photographs
 PHOTO_SETTINGS = (
     "observe.min_score=0.2", f"track.search={SEARCH}", f"observe.search={SEARCH}",
-    "alpha.method=grabcut",
+    "matte.method=grabcut",
 )  # fmt: skip
 WORDS = "track the face of a bare photograph or video, without calibration"
 
@@ -55,7 +55,7 @@ def add_commands(subparsers: Any) -> None:
         "--matte",
         action="store_true",
         help="matte too, and fit outlines; by colours about the face, or by a network of yours:"
-        " --set alpha.method=salient --set alpha.weights=FILE",
+        " --set matte.method=salient --set matte.weights=FILE",
     )
     add_config_options(parser)
     parser.add_argument("--json", action="store_true", help="print the account as JSON")

@@ -176,7 +176,7 @@ def test_the_command_watches_first_and_says_when_there_is_no_face(dataset, capsy
     assert code == 1
     assert "no camera sees a face" in lines
     assert "Traceback" not in lines
-    assert main(["align", str(dataset.root), "--set", "alpha.method=key"]) == 2
+    assert main(["align", str(dataset.root), "--set", "matte.method=key"]) == 2
     assert "observe and align" in capsys.readouterr().err
 
 

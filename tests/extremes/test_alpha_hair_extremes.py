@@ -7,13 +7,12 @@ import numpy as np
 import pytest
 
 from benchmarks.matte_scenes import exposed, make_scene, plain
-from pipelines.alpha.config import AlphaConfig
-from pipelines.alpha.keyer import Keyer
+from pipelines.matte.key import Keyer, KeyOptions
 
 
 def keyed(frame: np.ndarray, plate: np.ndarray) -> np.ndarray:
     """Alpha (H, W) with the default settings."""
-    return Keyer(plate, [frame], np.ones(plate.shape[:2], bool), AlphaConfig()).alpha(frame)
+    return Keyer(plate, [frame], np.ones(plate.shape[:2], bool), KeyOptions()).alpha(frame)
 
 
 @pytest.mark.parametrize("blur", [0.0, 0.9])

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipelines.alpha.learned import BGMV2, SALIENT, background_alpha, salient_alpha
-from pipelines.alpha.qc import border_contact, warnings
+from pipelines.matte.learned import BGMV2, SALIENT, background_alpha, salient_alpha
+from pipelines.matte.stage import border_contact, matte_warnings
 from pipelines.networks import load_network
 from tests.pipelines.stand_ins import Difference, onnx_bright, torchscript
 
@@ -61,24 +61,10 @@ def test_black_and_white_frames(tmp_path) -> None:
     assert background_alpha(network, white, black, 512)[1:-1, 1:-1].min() == 1
 
 
-def test_warnings_of_empty_full_and_jumping_mattes() -> None:
-    peaks = {"c": 30, "a": 10, "b": 20}
-    none = dict.fromkeys(("top", "right", "bottom", "left"), 0.0)
-    sides = dict.fromkeys(peaks, none)
-    even = dict.fromkeys(peaks, 0.3)
-    assert warnings(peaks, even, sides) == []
-    assert warnings(peaks, dict.fromkeys(peaks, 0.0), sides)[0]["why"].endswith("empty")
-    odd = warnings(peaks, even | {"b": 0.9}, sides)
-    assert [w["what"] for w in odd] == ["b"] and "median is 30.0%" in odd[0]["why"]
-    # Each is near the median of the three, but between two that follow each other lies a jump.
-    jump = warnings(peaks, {"a": 0.24, "b": 0.3, "c": 0.3} | {"b": 0.34, "a": 0.25}, sides)
-    assert [w["what"] for w in jump] == ["b"] and "at the peak before, a" in jump[0]["why"]
-    full = border_contact(np.ones((4, 6)))
-    assert full == dict.fromkeys(none, 1.0)
-    cut = warnings(peaks, even, sides | {"a": full})
-    assert cut == [
-        {"what": "a", "why": "the subject leaves the image at the top and right and left"
-         " (over 100%)"}
-    ]  # fmt: skip
-    # At the bottom every subject does.
-    assert warnings(peaks, even, sides | {"a": none | {"bottom": 0.9}}) == []
+def test_warnings_of_empty_and_cut_off_mattes() -> None:
+    alpha = np.zeros((40, 60), np.uint8)
+    alpha[10:, 20:40] = 255  # at the bottom every subject is cut off
+    full = np.full((4, 6), 255, np.uint8)
+    assert border_contact(full) == dict.fromkeys(("top", "right", "bottom", "left"), 1.0)
+    notes = matte_warnings({"a": alpha, "b": np.zeros((40, 60), np.uint8), "c": full})
+    assert [note.what for note in notes] == ["b", "c"]

@@ -11,12 +11,11 @@ from express50.errors import CalibrationError
 from express50.files.containers import read_srgb8
 from express50.files.images import linear_to_srgb, srgb_to_linear, write_image
 from express50.rigs.world_frame import canonical_from_rig, move_cameras
-from pipelines.alpha.config import AlphaConfig
-from pipelines.alpha.keyer import Keyer
-from pipelines.alpha.plate import exposure_gain
 from pipelines.calibrate.board import gather, refine_corners, square_sides
 from pipelines.calibrate.board_rig import solve_rig
 from pipelines.calibrate.stage import check_given
+from pipelines.matte.key import Keyer, KeyOptions
+from pipelines.matte.plates import exposure_gain
 from tests.pipelines.alpha_scenes import make_scene
 from tests.pipelines.board_rigs import (
     POINTS,
@@ -124,7 +123,7 @@ def test_refinement_on_a_flat_image_finds_nothing() -> None:
 
 def alpha(frame: np.ndarray, plate: np.ndarray, **changes) -> np.ndarray:
     """Alpha of a frame with the default settings, changed."""
-    keyer = Keyer(plate, [frame], np.ones(plate.shape[:2], bool), AlphaConfig(**changes))
+    keyer = Keyer(plate, [frame], np.ones(plate.shape[:2], bool), KeyOptions(**changes))
     out = keyer.alpha(frame)
     assert np.isfinite(out).all() and out.min() >= 0 and out.max() <= 1
     return out
@@ -193,7 +192,7 @@ def test_blown_highlights_on_skin_before_a_blown_lamp() -> None:
 def test_a_shadow_that_moves_from_frame_to_frame() -> None:
     scene = make_scene(33, "dark")
     y, x = np.mgrid[0:256, 0:256] / 256
-    keyer = Keyer(scene.plate, [scene.frame], np.ones((256, 256), bool), AlphaConfig())
+    keyer = Keyer(scene.plate, [scene.frame], np.ones((256, 256), bool), KeyOptions())
     for place in (0.12, 0.5, 0.9):
         dark = 1 - 0.2 * np.exp(-(((x - place) / 0.08) ** 2) - ((y - 0.2) / 0.1) ** 2)
         behind = np.where(scene.alpha < 0.5, dark, 1.0)[..., None]
@@ -213,7 +212,7 @@ def test_sixteen_bits_key_as_eight(tmp_path) -> None:
 
 def test_nothing_valid_is_empty() -> None:
     plate = np.full((40, 40, 3), 100, np.uint8)
-    keyer = Keyer(plate, [plate], np.zeros((40, 40), bool), AlphaConfig())
+    keyer = Keyer(plate, [plate], np.zeros((40, 40), bool), KeyOptions())
     assert keyer.alpha(np.full_like(plate, 250)).max() == 0
 
 

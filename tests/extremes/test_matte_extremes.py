@@ -9,17 +9,16 @@ import pytest
 
 from express50.geometry.cameras import pinhole_camera, scale_camera, transform_camera
 from express50.geometry.transforms import look_at, make_transform
-from pipelines.matte.agreement import Agreement, agree
-from pipelines.matte.config import MatteConfig
-from pipelines.matte.hull import View, ball_of
+from pipelines.matte.consensus import Agreement, agree
 from pipelines.matte.stage import corrected, make_view
+from pipelines.matte.visual_hull import MatteView, ball_of
 from tests.pipelines.bump_head import ring
 from tests.pipelines.matte_rig import SIZE, disc, make_views, shots, with_alpha
 
-CONFIG = MatteConfig(side=SIZE, cells=64)
+OPTIONS = {"cells": 64, "strand": 0.03}
 
 
-def disturbed(views: list[View]) -> list[View]:
+def disturbed(views: list[MatteView]) -> list[MatteView]:
     """A shadow in one view, a hole in another."""
     shade, hole = disc(0.12, 0.3, 0.09), disc(0.5, 0.5, 0.09)
     changes = {4: np.maximum(views[4].alpha, shade), 8: np.where(hole, 0, views[8].alpha)}
@@ -36,7 +35,7 @@ def same(one: Agreement, other: Agreement) -> bool:
 
 @pytest.mark.parametrize("count", [1, 2, 3])
 def test_so_few_cameras_overrule_nobody(count):
-    found = agree(disturbed(make_views())[3 : 3 + count], CONFIG)
+    found = agree(disturbed(make_views())[3 : 3 + count], **OPTIONS)
     assert not found.removed and not found.filled
     assert found.unchanged == f"{count} usable cameras, expected 4 or more to overrule one"
 
@@ -44,7 +43,7 @@ def test_so_few_cameras_overrule_nobody(count):
 @pytest.mark.parametrize("value", [0.0, 1.0])
 def test_mattes_that_say_nothing_are_all_named_and_left(value):
     views = make_views()
-    found = agree([replace(v, alpha=np.full_like(v.alpha, value)) for v in views], CONFIG)
+    found = agree([replace(v, alpha=np.full_like(v.alpha, value)) for v in views], **OPTIONS)
     assert not found.removed and not found.filled and "0 usable" in found.unchanged
     assert len(found.warnings) == len(views)
 
@@ -53,19 +52,19 @@ def test_mattes_without_a_common_subject_change_nothing():
     views = make_views()
     rng = np.random.default_rng(0)
     scattered = {k: disc(*rng.uniform(0.1, 0.9, 2), 0.06) for k in range(len(views))}
-    found = agree(with_alpha(views, scattered), CONFIG)
+    found = agree(with_alpha(views, scattered), **OPTIONS)
     # Where nothing is possible nothing is ruled out: nobody knows who is wrong.
     assert not found.filled and not found.removed
     assert len(found.warnings) <= len(views) // 3
 
 
 def test_a_camera_amid_the_subject_or_turned_away_is_left_out():
-    clean = agree(disturbed(make_views()), CONFIG)
+    clean = agree(disturbed(make_views()), **OPTIONS)
     for center in (np.array([0.0, 0.0, 0.05]), np.array([0.0, 0.0, 1.1])):
         rig = [camera for camera, _, _ in shots()]
         pose = look_at(center, center + [0, 0, 1.0], np.array([0.0, 1.0, 0.0]))
         rig[0] = pinhole_camera("cam00", rig[0].K, SIZE, SIZE, pose)
-        found = agree(disturbed(make_views(cameras=rig)), CONFIG)
+        found = agree(disturbed(make_views(cameras=rig)), **OPTIONS)
         assert [w["what"] for w in found.warnings] == ["cam00"]
         assert set(found.removed) == set(clean.removed) and set(found.filled) == set(clean.filled)
 
@@ -87,7 +86,7 @@ def test_a_subject_cut_by_the_frames_edge_is_not_eaten():
         alpha[SIZE // 2 :], valid[SIZE // 2 :] = 0, False
         views.append(replace(view, alpha=alpha, valid=valid))
     assert len(rig) == len(views)
-    found = agree(views, CONFIG)
+    found = agree(views, **OPTIONS)
     assert not found.removed and not found.filled and not found.warnings
 
 
@@ -100,7 +99,7 @@ def test_pictures_a_pixel_wide_are_survived(size):
         alpha = np.full((size[1], size[0]), value, np.uint8)
         alpha[: size[1] // 2] = 255
         views = [make_view(camera, ball, image, alpha, 192) for camera in rig]
-        found = agree(views, MatteConfig())
+        found = agree(views, 96, 0.03)
         for view in views:
             out = corrected(alpha, found.removed.get(view.name), found.filled.get(view.name))
             assert out.shape == alpha.shape and out.dtype == np.uint8
@@ -114,14 +113,14 @@ def test_units_and_the_worlds_origin_do_not_matter(scale, far):
         pose = transform_camera(camera, make_transform(np.eye(3), [far, -far, far])).cam_from_world
         pose[:3, 3] *= scale
         rig.append(replace(camera, cam_from_world=pose))
-    found = agree(disturbed(make_views(cameras=rig)), CONFIG)
-    clean = agree(disturbed(make_views()), CONFIG)
+    found = agree(disturbed(make_views(cameras=rig)), **OPTIONS)
+    clean = agree(disturbed(make_views()), **OPTIONS)
     assert clean.removed and clean.filled and same(found, clean)
 
 
 def test_more_cameras_than_a_byte_counts():
     views = disturbed(make_views())
     many = [replace(v, name=f"{v.name}-{k}") for k in range(23) for v in views]
-    found = agree(many, MatteConfig(side=SIZE, cells=16, votes=40))
+    found = agree(many, cells=16, strand=0.03)
     assert len(many) == 276
     assert {name[:5] for name in found.removed} == {"cam04"}

@@ -8,8 +8,8 @@ from functools import lru_cache
 import numpy as np
 
 from express50.geometry.cameras import Camera
-from pipelines.matte.hull import View, ball_of
 from pipelines.matte.stage import make_view
+from pipelines.matte.visual_hull import MatteView, ball_of
 from tests.pipelines.bump_head import render, ring
 
 SIZE = 96
@@ -21,7 +21,7 @@ def shots(count: int = 12) -> tuple[tuple[Camera, np.ndarray, np.ndarray], ...]:
     return tuple((camera, *render(camera)[:2]) for camera in ring(count, SIZE))
 
 
-def make_views(side: int = SIZE, cameras: list[Camera] | None = None) -> list[View]:
+def make_views(side: int = SIZE, cameras: list[Camera] | None = None) -> list[MatteView]:
     """Fresh undisturbed views; `cameras` replace the ring's."""
     rig = cameras or [camera for camera, _, _ in shots()]
     ball = ball_of({camera.id: camera for camera in rig})
@@ -38,7 +38,7 @@ def disc(x: float, y: float, radius: float, size: int = SIZE) -> np.ndarray:
     return (columns - x) ** 2 + (rows - y) ** 2 < radius**2
 
 
-def with_alpha(views: list[View], changes: dict[int, np.ndarray]) -> list[View]:
+def with_alpha(views: list[MatteView], changes: dict[int, np.ndarray]) -> list[MatteView]:
     """The views with other mattes (h, w) for some."""
     return [
         replace(v, alpha=changes[k].astype(np.float32)) if k in changes else v

@@ -2,35 +2,27 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 
 import cv2
 import numpy as np
 import pytest
 
-from express50.capture.frames import dhash, read_frame
-from express50.capture.index import read_index
-from express50.contract.config import resolve_config
 from express50.errors import ConfigError
-from express50.files.images import read_image
-from pipelines.alpha import STAGE
-from pipelines.alpha.config import AlphaConfig
-from pipelines.alpha.key import dilated, eroded, plate_difference
-from pipelines.alpha.keyer import Keyer
-from pipelines.alpha.opacity import local_colours, shrunk, solve_opacity
-from pipelines.alpha.plate import exposed, exposure_gain, fit_plate
-from pipelines.alpha.smooth import MattingLaplacian
+from pipelines.matte.config import MatteConfig
+from pipelines.matte.key import Keyer, KeyOptions, dilated, eroded, plate_difference
+from pipelines.matte.opacity import local_colours, shrunk, solve_opacity
+from pipelines.matte.plates import exposed, exposure_gain, fit_plate
+from pipelines.matte.refine import MattingLaplacian
 from tests.pipelines.alpha_scenes import Scene, clutter, make_scene
-from tests.synth import write_peak_frames
 
-CONFIG = AlphaConfig()
+OPTIONS = KeyOptions()
 
 
 def key(scene: Scene, **changes) -> np.ndarray:
     """Alpha (H, W) of a scene."""
     valid = np.ones(scene.alpha.shape, bool)
-    keyer = Keyer(scene.plate, [scene.frame], valid, replace(CONFIG, **changes))
+    keyer = Keyer(scene.plate, [scene.frame], valid, replace(OPTIONS, **changes))
     return keyer.alpha(scene.frame)
 
 
@@ -108,13 +100,6 @@ def test_no_gain_leaves_the_plate_as_it_is() -> None:
     assert np.abs(exposed(plate, np.full(3, 1.05)) - plate).max() < 8
 
 
-def test_smoothing_helps_thin_hair_and_keeps_what_is_sure() -> None:
-    scene = make_scene(13, "dark", noise=4.0)
-    plain, smooth = key(scene), key(scene, smooth=True)
-    assert np.mean((smooth - scene.alpha) ** 2) < np.mean((plain - scene.alpha) ** 2)
-    assert (smooth[180:, 115:140] == plain[180:, 115:140]).all()
-
-
 def test_alpha_of_a_known_mixture_is_exact_where_the_colours_are() -> None:
     alpha, none = np.linspace(0, 1, 11), np.zeros((11, 3, 3))
     front, behind = np.array([[0.1, 0.05, 0.02]] * 11), np.array([[0.4, 0.5, 0.6]] * 11)
@@ -163,7 +148,7 @@ def test_composites_in_srgb_values_are_keyed_as_such() -> None:
     front = np.array([14.0, 12.0, 12.0])
     mixed = scene.alpha[..., None] * front + (1 - scene.alpha[..., None]) * scene.plate
     scene = replace(scene, frame=np.rint(mixed).astype(np.uint8))
-    assert mae(key(scene, light="display"), scene) < 0.7 * mae(key(scene), scene)
+    assert mae(key(scene, linear=False), scene) < 0.7 * mae(key(scene), scene)
 
 
 def test_strands_before_a_shadow_are_measured_against_the_darkened_plate() -> None:
@@ -205,57 +190,14 @@ def test_pixels_without_footage_are_transparent() -> None:
     valid[:, :20] = valid[-30:] = False
     frame = np.where(valid[..., None], scene.frame, 0).astype(np.uint8)
     plate = np.where(valid[..., None], scene.plate, 0).astype(np.uint8)
-    alpha = Keyer(plate, [frame], valid, CONFIG).alpha(frame)
+    alpha = Keyer(plate, [frame], valid, OPTIONS).alpha(frame)
     assert (alpha[~valid] == 0).all() and alpha[120, 128] == 1
 
 
-def test_wrong_settings_are_refused() -> None:
-    for change in ({"low": 7.0}, {"scale": 0.0}, {"spread": 2.0}, {"shadow": 1.0},
-                   {"noise_frames": 0}, {"core": -0.1}):  # fmt: skip
-        with pytest.raises(ConfigError, match="alpha"):
-            AlphaConfig(**change)
-
-
-@pytest.fixture
-def aligned(ingested):
-    """S001 with given cameras and its peaks labelled."""
-    from express50.runner.runner import run_stage
-    from pipelines import calibrate
-
-    config = resolve_config(calibrate.STAGE, "draft")
-    assert run_stage(calibrate.STAGE, ingested, config, workers=0, progress=False).ok
-    index = read_index(ingested, "S001")
-    camera = sorted(index.cameras)[0]
-    peaks = {
-        cue.expression_id: {
-            "frame": cue.start_frame,
-            "camera": camera,
-            "pts": index.cameras[camera].pts[cue.start_frame],
-            "dhash": dhash(read_frame(ingested, "S001", camera, cue.start_frame, undistort=False)),
-            "confidence": 1.0,
-            "annotator": "test",
-        }
-        for cue in index.cues
-    }
-    folder = ingested.item_dir("align", "S001")
-    folder.mkdir(parents=True)
-    (folder / "peaks.json").write_text(json.dumps(peaks))
-    write_peak_frames(ingested)
-    return ingested
-
-
-def test_the_stage_writes_one_matte_a_peak_twice_alike(aligned, tmp_path) -> None:
-    item = STAGE.items(aligned)[0]
-    outs = [tmp_path / "a", tmp_path / "b"]
-    for out in outs:
-        out.mkdir()
-        metrics = STAGE.run(aligned, item, CONFIG, out)
-    names = sorted(path.name for path in outs[0].glob("*.png"))
-    assert names == ["neutral.png", "smile.png"] and metrics["plate"] == "given"
-    assert metrics["method"] == "key" and metrics["border_contact"]["smile"]["top"] == 0.0
-    for path in sorted(outs[0].rglob("*.*")):
-        assert path.read_bytes() == (outs[1] / path.relative_to(outs[0])).read_bytes()
-    alpha = read_image(outs[0] / "neutral.png")
-    assert alpha.shape == (64, 64) and alpha.dtype == np.uint8
-    assert metrics["coverage"]["neutral"] == pytest.approx(alpha.mean() / 255, abs=2e-3)
-    assert 0.05 < metrics["coverage"]["neutral"] < 0.6
+@pytest.mark.parametrize(
+    "change",
+    [{"low": 7.0}, {"scale": 0.0}, {"shadow": 1.0}, {"side": 4}, {"cells": 1000}, {"strand": 0.0}],
+)
+def test_wrong_settings_are_refused(change) -> None:
+    with pytest.raises(ConfigError, match="matte"):
+        MatteConfig(**change)

@@ -18,9 +18,9 @@ from express50.landmarks.network import load_network
 from express50.runner.runner import run_stage
 from express50.shards.reader import ShardReader
 from pipelines import calibrate, ingest
-from pipelines.alpha import STAGE as ALPHA
-from pipelines.alpha.config import AlphaConfig
-from pipelines.alpha.grabcut import person_alpha
+from pipelines.matte import STAGE as MATTE
+from pipelines.matte.config import MatteConfig
+from pipelines.matte.grabcut import person_alpha
 from pipelines.photo.capture import make_photo_capture
 from pipelines.photo.focal import single_camera
 from pipelines.photo.picture import open_picture
@@ -90,10 +90,10 @@ def test_small_and_large_pictures_are_cut_alike(alpha: np.ndarray, scale: float)
 
 
 def test_what_shows_no_face_is_refused() -> None:
-    with pytest.raises(StageError, match="no face found.*alpha.method to salient"):
+    with pytest.raises(StageError, match="no face found.*matte.method to salient"):
         alpha_of(np.repeat(data.brick()[..., None], 3, axis=2))
     with pytest.raises(ConfigError, match="key and grabcut take none"):
-        AlphaConfig(method="grabcut", weights="net.pt")
+        MatteConfig(method="grabcut", weights="net.pt")
 
 
 def test_a_photograph_becomes_a_sample_of_shards_without_plate_or_weights(tmp_path: Path) -> None:
@@ -136,9 +136,8 @@ def test_a_frame_without_a_face_costs_itself_alone(tmp_path: Path) -> None:
     dataset.item_dir("align", "eva").mkdir(parents=True)
     (dataset.item_dir("align", "eva") / "peaks.json").write_text(json.dumps(peaks))
     write_peak_frames(dataset)
-    run = run_stage(ALPHA, dataset, AlphaConfig(method="grabcut"), workers=0, progress=False)
-    assert run.ok
-    (dropped,) = run.outcomes[0].dropped
-    assert dropped.what == "clip_01" and "no face found" in dropped.why
-    made = dataset.item_dir("alpha", "eva/photo")
-    assert (made / "clip_00.png").is_file() and not (made / "clip_01.png").exists()
+    run = run_stage(MATTE, dataset, MatteConfig(method="grabcut"), workers=0, progress=False)
+    assert {o.item: o.status for o in run.outcomes} == {
+        "eva/clip_00": "done", "eva/clip_01": "failed",
+    }  # fmt: skip
+    assert dataset.matte_file("eva", "clip_00", "photo").is_file()

@@ -12,8 +12,8 @@ import pytest
 import torch
 
 from express50.errors import ConfigError, StageError
-from pipelines.alpha.config import AlphaConfig
-from pipelines.alpha.learned import (
+from pipelines.matte.config import MatteConfig
+from pipelines.matte.learned import (
     BGMV2,
     SALIENT,
     as_opacity,
@@ -21,7 +21,7 @@ from pipelines.alpha.learned import (
     refined,
     salient_alpha,
 )
-from pipelines.alpha.tiles import in_tiles, spans
+from pipelines.matte.refine import in_tiles, spans
 from pipelines.networks import load_network
 from tests.pipelines.alpha_scenes import make_scene
 from tests.pipelines.stand_ins import (
@@ -145,7 +145,7 @@ def test_refining_in_tiles_is_refining_the_whole(monkeypatch) -> None:
     scene = make_scene(2, "dark", size=320)
     large = cv2.GaussianBlur(scene.alpha, (0, 0), 2)
     whole = refined(scene.frame, large, 2.0)
-    monkeypatch.setattr("pipelines.alpha.learned.REFINE_TILE", 192)
+    monkeypatch.setattr("pipelines.matte.learned.REFINE_TILE", 192)
     assert np.abs(refined(scene.frame, large, 2.0) - whole).mean() < 2e-3
 
 
@@ -169,7 +169,7 @@ def test_a_file_in_half_precision_runs_on_the_cpu_too(tmp_path, rng) -> None:
 def test_a_wrong_answer_is_one_line(tmp_path, how: str, message: str) -> None:
     network = load_network(torchscript(Bad(how), tmp_path / "bad.pt"), SALIENT)
     with pytest.raises(
-        StageError, match=f"alpha.weights .*bad.pt: the network {message}"
+        StageError, match=f"matte.weights .*bad.pt: the network {message}"
     ) as caught:
         salient_alpha(network, np.zeros((8, 8, 3), np.uint8))
     assert "\n" not in str(caught.value)
@@ -199,7 +199,7 @@ def test_missing_and_damaged_files_are_one_line(tmp_path, name: str) -> None:
         load_network(path, SALIENT)
     for content in (b"", b"not a network", bytes(4096)):
         path.write_bytes(content)
-        with pytest.raises(StageError, match=r"alpha.weights .*a\.(pt|onnx): ") as caught:
+        with pytest.raises(StageError, match=r"matte.weights .*a\.(pt|onnx): ") as caught:
             load_network(path, SALIENT)
         assert "\n" not in str(caught.value)
 
@@ -256,5 +256,5 @@ def test_settings_that_do_not_go_together_are_refused() -> None:
         {"tile": 100},
         {"tile": 0},
     ):
-        with pytest.raises(ConfigError, match="alpha"):
-            AlphaConfig(**change)
+        with pytest.raises(ConfigError, match="matte"):
+            MatteConfig(**change)

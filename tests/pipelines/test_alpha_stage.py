@@ -3,33 +3,44 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from express50.capture.frames import dhash, read_frame
+from express50.capture.frames import (
+    dhash,
+    read_cameras_of,
+    read_frame,
+    read_peak_frame,
+    write_frame,
+)
 from express50.capture.index import read_index
 from express50.contract.layout import Dataset
 from express50.errors import ConfigError
 from express50.files.images import read_image, write_image
 from express50.runner.runner import Summary, run_stage
 from pipelines import calibrate, ingest
-from pipelines.alpha import STAGE
-from pipelines.alpha.config import AlphaConfig
+from pipelines.matte import STAGE
+from pipelines.matte.config import MatteConfig
 from tests.pipelines.alpha_scenes import make_scene
+from tests.pipelines.bump_dataset import make_dataset as bump_dataset
+from tests.pipelines.matte_rig import SIZE, disc
 from tests.pipelines.stand_ins import Bad, Difference, onnx_bright, torchscript
 from tests.synth import make_capture, write_peak_frames
+
+BACKDROP = np.array([77, 128, 102], np.uint8)
 
 
 def run(dataset: Dataset, **settings) -> Summary:
     """The stage over every item, in this process."""
-    return run_stage(STAGE, dataset, AlphaConfig(**settings), workers=0, progress=False)
+    return run_stage(STAGE, dataset, MatteConfig(**settings), workers=0, progress=False)
 
 
-def metrics_of(dataset: Dataset, item: str = "S001/cam00") -> dict:
+def metrics_of(dataset: Dataset, item: str = "S001/smile") -> dict:
     """Figures of one item."""
-    return json.loads((dataset.item_dir("alpha", item) / "metrics.json").read_text())
+    return json.loads((dataset.item_dir("matte", item) / "metrics.json").read_text())
 
 
 def align(dataset: Dataset, subject: str) -> None:
@@ -81,11 +92,11 @@ def unplated(root: Path) -> Path:
 def test_background_matting_sees_frame_and_plate(aligned, tmp_path) -> None:
     weights = torchscript(Difference(), tmp_path / "net.pt")
     assert run(aligned, method="bgmv2", weights=str(weights)).ok
-    learned = read_image(aligned.item_dir("alpha", "S001/cam00") / "smile.png")
+    learned = read_image(aligned.matte_file("S001", "smile", "cam00"))
     figures = metrics_of(aligned)
-    assert figures["method"] == "bgmv2" and figures["plate"] == "given"
+    assert figures["method"] == "bgmv2"
     assert run(aligned).ok
-    keyed = read_image(aligned.item_dir("alpha", "S001/cam00") / "smile.png")
+    keyed = read_image(aligned.matte_file("S001", "smile", "cam00"))
     assert ((learned > 127) == (keyed > 127)).mean() > 0.97 and learned.shape == keyed.shape
 
 
@@ -93,13 +104,13 @@ def test_other_weights_run_again_and_the_same_do_not(aligned, tmp_path) -> None:
     settings = {"method": "bgmv2", "weights": str(tmp_path / "net.pt")}
     torchscript(Difference(), tmp_path / "net.pt")
     first = run(aligned, **settings)
-    assert first.ok and run(aligned, **settings).count("skipped") == 3
-    path = aligned.item_dir("alpha", "S001/cam00") / "neutral.png"
+    assert first.ok and run(aligned, **settings).count("skipped") == 2
+    path = aligned.matte_file("S001", "neutral", "cam00")
     before = path.read_bytes()
     other = Difference()
     other.gain.data.fill_(2.0)
     torchscript(other, tmp_path / "net.pt")
-    assert run(aligned, **settings).count("done") == 3
+    assert run(aligned, **settings).count("done") == 2
     assert path.read_bytes() != before
 
 
@@ -110,14 +121,11 @@ def test_a_salient_network_needs_no_plate(tmp_path) -> None:
         "weights": str(onnx_bright(tmp_path / "net.onnx", 128)),
     }
     assert run(dataset, **settings).ok
-    folder = dataset.item_dir("alpha", "S001/cam00")
-    names = {p.name for p in folder.glob("*.png")}
-    assert names == {"neutral.png", "smile.png"}
-    alpha = read_image(folder / "smile.png")
+    folder = dataset.item_dir("matte", "S001/smile")
+    alpha = read_image(folder / "cam00.png")
     assert alpha[64, 64] == 255 and alpha[2, 2] == 0
-    assert metrics_of(dataset)["plate"] == "none"
     before = {p: p.read_bytes() for p in folder.rglob("*.*")}
-    assert run(dataset, **settings, scale=0.9).count("done") == 1  # run anew, the same bytes
+    assert run(dataset, **settings, scale=0.9).count("done") == 2  # run anew, the same bytes
     assert {p: p.read_bytes() for p in folder.rglob("*.*")} == before
 
 
@@ -129,33 +137,78 @@ def test_a_bad_network_fails_items_in_one_line_each(aligned, tmp_path, how, mess
     if how == "pair":
         torchscript(Difference(), path)
     summary = run(aligned, method="salient", weights=str(path))
-    assert summary.count("failed") == 3
+    assert summary.count("failed") == 2
     for outcome in summary.outcomes:
-        assert outcome.reason.startswith("StageError: alpha.weights") and message in outcome.reason
+        assert "matte.weights" in outcome.reason and message in outcome.reason
 
 
 def test_weights_that_are_not_there_are_said_once_and_cost_nothing(aligned, tmp_path) -> None:
-    assert run(aligned).count("done") == 3
-    with pytest.raises(ConfigError, match="alpha.weights .*no such file"):
+    assert run(aligned).count("done") == 2
+    with pytest.raises(ConfigError, match="matte.weights .*no such file"):
         run(aligned, method="salient", weights=str(tmp_path / "net.pt"))
-    assert run(aligned).count("skipped") == 3
+    assert run(aligned).count("skipped") == 2
 
 
-def test_one_camera_that_fails_leaves_the_others_done(aligned) -> None:
+def test_a_camera_without_a_plate_or_a_frame_is_dropped(aligned) -> None:
     aligned.plate_file("S001", "cam01").unlink()
-    status = {o.item: o.status for o in run(aligned).outcomes}
-    assert status == {"S001/cam00": "done", "S001/cam01": "failed", "S001/cam02": "done"}
-
-
-def test_a_frame_that_was_not_written_is_dropped(aligned) -> None:
-    aligned.frame_file("S001", "smile", "cam01").unlink()
+    aligned.frame_file("S001", "smile", "cam02").unlink()
     assert run(aligned).ok
-    assert [row["what"] for row in metrics_of(aligned, "S001/cam01")["dropped"]] == ["smile"]
-    assert "smile" in metrics_of(aligned, "S001/cam00")["coverage"]
+    dropped = {e: [row["what"] for row in metrics_of(aligned, f"S001/{e}")["dropped"]]
+               for e in ("neutral", "smile")}  # fmt: skip
+    assert dropped == {"neutral": ["cam01"], "smile": ["cam01", "cam02"]}
+    assert not aligned.matte_file("S001", "smile", "cam02").exists()
 
 
 def test_keying_without_a_plate_is_refused(tmp_path) -> None:
     dataset = make_dataset(tmp_path, [unplated(tmp_path / "raw")])
     summary = run(dataset)
-    assert [o.status for o in summary.outcomes] == ["failed"]
+    assert [o.status for o in summary.outcomes] == ["failed"] * 2
     assert "plates/cam00.png" in summary.outcomes[0].reason
+
+
+def test_keyed_mattes_are_8_bit_and_the_same_twice(aligned) -> None:
+    assert run(aligned).ok
+    folder = aligned.item_dir("matte", "S001/smile")
+    figures = metrics_of(aligned)
+    alpha = read_image(folder / "cam00.png")
+    assert alpha.shape == (64, 64) and alpha.dtype == np.uint8
+    assert figures["coverage"]["cam00"] == pytest.approx(alpha.mean() / 255, abs=1e-6)
+    assert 0.05 < figures["coverage"]["cam00"] < 0.6
+    assert figures["border_contact"]["cam00"]["top"] == 0.0
+    before = {p: p.read_bytes() for p in folder.rglob("*.*")}
+    shutil.rmtree(folder)
+    assert run(aligned).ok
+    assert {p: p.read_bytes() for p in folder.rglob("*.*")} == before
+
+
+@pytest.fixture(scope="module")
+def shaded(tmp_path_factory) -> Dataset:
+    """The bump head before plates of its backdrop, with a shadow patch in one camera."""
+    dataset = bump_dataset(tmp_path_factory.mktemp("matte"), cameras=8)
+    for expression in ("neutral", "smile"):
+        for camera in read_cameras_of(dataset, "S001"):
+            frame = read_peak_frame(dataset, "S001", expression, camera)
+            true = read_image(dataset.matte_file("S001", expression, camera))
+            plate = np.where(true[..., None] == 0, frame, BACKDROP).astype(np.uint8)
+            path = dataset.plate_file("S001", camera)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write_frame(path, plate)
+            if (expression, camera) == ("smile", "cam02"):
+                frame = np.where(disc(0.12, 0.3, 0.09)[..., None], 255 - frame, frame)
+                write_frame(dataset.frame_file("S001", expression, camera), frame.astype(np.uint8))
+    shutil.rmtree(dataset.stage_dir("matte"))
+    return dataset
+
+
+def test_what_one_camera_alone_shows_is_removed(shaded) -> None:
+    assert run(shaded, side=SIZE, cells=64).ok
+    figures = metrics_of(shaded)
+    assert figures["views"] == 8 and figures["dropped"] == []
+    assert set(figures["removed"]) == {"cam02"}
+    assert figures["removed"]["cam02"] == pytest.approx(np.pi * 0.09**2, rel=0.2)
+    corrected = read_image(shaded.matte_file("S001", "smile", "cam02"))
+    assert run(shaded, agree=False).ok
+    assert metrics_of(shaded)["unchanged"] and metrics_of(shaded)["views"] == 0
+    own = read_image(shaded.matte_file("S001", "smile", "cam02"))
+    patch = disc(0.12, 0.3, 0.07)
+    assert own[patch].mean() > 200 and corrected[patch].mean() < 20

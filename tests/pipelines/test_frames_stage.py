@@ -63,7 +63,7 @@ def test_written_frames_are_the_undistorted_footage(dataset):
 
 
 def test_each_peak_is_decoded_once_and_only_by_this_stage(dataset, monkeypatch):
-    from pipelines.alpha import STAGE as ALPHA
+    from pipelines.matte import STAGE as MATTE
 
     read: list[tuple[str, int]] = []
     original = frames_module.FrameReader.read
@@ -76,7 +76,7 @@ def test_each_peak_is_decoded_once_and_only_by_this_stage(dataset, monkeypatch):
     assert run(dataset, deep=False).ok
     peaks = frames_module.read_peaks(dataset, "S001")
     assert sorted(read) == sorted((c, f) for c in make_rig() for f in peaks.values())
-    assert run_stage(ALPHA, dataset, ALPHA.config(), workers=0, progress=False).ok
+    assert run_stage(MATTE, dataset, MATTE.config(), workers=0, progress=False).ok
     assert len(read) == 6
 
 

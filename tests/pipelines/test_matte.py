@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import shutil
 from dataclasses import replace
 
 import cv2
@@ -12,18 +10,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from express50.cli.main import main
-from express50.errors import ConfigError, FormatError, StageError
-from express50.files.images import read_image, write_image
-from express50.runner.runner import run_stage
-from pipelines.matte import STAGE
-from pipelines.matte.agreement import agree
-from pipelines.matte.config import MatteConfig
+from pipelines.matte.consensus import agree
 from pipelines.matte.stage import corrected
-from tests.pipelines.bump_dataset import make_dataset
 from tests.pipelines.matte_rig import SIZE, disc, make_views, with_alpha
 
-CONFIG = MatteConfig(side=SIZE, cells=64)
+OPTIONS = {"cells": 64, "strand": 0.03}
 BACKDROP = np.array([77, 128, 102], np.uint8)
 
 
@@ -32,7 +23,7 @@ def changed(found) -> set[str]:
 
 
 def test_views_that_agree_are_left_alone():
-    found = agree(make_views(), CONFIG)
+    found = agree(make_views(), **OPTIONS)
     assert changed(found) == set() and found.warnings == [] and found.unchanged == ""
 
 
@@ -41,7 +32,7 @@ def test_what_only_some_cameras_see_is_removed_whole(cameras):
     views = make_views()
     shade = disc(0.12, 0.3, 0.09)
     found = agree(
-        with_alpha(views, {k: np.maximum(views[k].alpha, shade) for k in cameras}), CONFIG
+        with_alpha(views, {k: np.maximum(views[k].alpha, shade) for k in cameras}), **OPTIONS
     )
     assert changed(found) == {views[k].name for k in cameras} and found.warnings == []
     for k in cameras:
@@ -55,7 +46,7 @@ def test_a_shadow_that_touches_the_head_goes_up_to_the_hull():
     head = views[5].alpha > 0
     shade = disc(0.2, 0.45, 0.15) & ~head
     assert cv2.dilate(head.astype(np.uint8), np.ones((3, 3)))[shade].any()
-    found = agree(with_alpha(views, {5: np.maximum(views[5].alpha, 0.7 * shade)}), CONFIG)
+    found = agree(with_alpha(views, {5: np.maximum(views[5].alpha, 0.7 * shade)}), **OPTIONS)
     gone = found.removed[views[5].name]
     assert gone[shade].mean() > 0.6 and not gone[head].any()
 
@@ -67,8 +58,8 @@ def test_hair_at_the_rim_stays_and_a_cable_goes():
     hair, cable = views[5].alpha.copy(), views[5].alpha.copy()
     hair[top - 3 : top, column] = 0.8
     cable[:top, column] = 0.8
-    assert changed(agree(with_alpha(views, {5: hair}), CONFIG)) == set()
-    gone = agree(with_alpha(views, {5: cable}), CONFIG).removed[views[5].name]
+    assert changed(agree(with_alpha(views, {5: hair}), **OPTIONS)) == set()
+    gone = agree(with_alpha(views, {5: cable}), **OPTIONS).removed[views[5].name]
     assert gone[: top // 2, column].all() and not gone[views[5].alpha > 0].any()
 
 
@@ -76,7 +67,7 @@ def test_a_hole_is_filled_where_the_camera_shows_the_surface_the_others_see():
     views = make_views()
     hole = disc(0.5, 0.5, 0.09)
     holed = with_alpha(views, {5: np.where(hole, 0, views[5].alpha)})
-    found = agree(holed, CONFIG)
+    found = agree(holed, **OPTIONS)
     assert changed(found) == {views[5].name} and not found.removed
     assert found.filled[views[5].name][hole].mean() > 0.95
 
@@ -86,13 +77,13 @@ def test_a_gap_that_shows_the_backdrop_stays_open():
     hole = disc(0.5, 0.5, 0.09)
     holed = with_alpha(views, {5: np.where(hole, 0, views[5].alpha)})
     holed[5] = replace(holed[5], rgb=np.where(hole[..., None], BACKDROP, holed[5].rgb))
-    assert changed(agree(holed, CONFIG)) == set()
+    assert changed(agree(holed, **OPTIONS)) == set()
 
 
 def test_a_spot_that_neighbours_lack_too_is_filled_where_the_rig_is_dense():
     views = make_views()
     holes = {k: np.where(disc(0.5, 0.5, 0.06), 0, views[k].alpha) for k in (5, 6)}
-    found = agree(with_alpha(views, holes), CONFIG)
+    found = agree(with_alpha(views, holes), **OPTIONS)
     assert set(found.filled) == {views[5].name, views[6].name}
 
 
@@ -107,8 +98,8 @@ def test_one_wrong_camera_is_named_and_changes_nobody(wrong):
         "full": np.ones_like(alpha),
         "upside down": 1 - alpha,
     }[wrong]
-    found = agree(with_alpha(views, {3: bad}), CONFIG)
-    assert [row["what"] for row in found.warnings] == [views[3].name]
+    found = agree(with_alpha(views, {3: bad}), **OPTIONS)
+    assert [note.what for note in found.warnings] == [views[3].name]
     assert changed(found) == set()
 
 
@@ -116,7 +107,7 @@ def test_a_wrong_camera_does_not_hide_what_another_must_remove():
     views = make_views()
     shade = disc(0.12, 0.3, 0.09)
     bad = {3: 1 - views[3].alpha, 8: np.maximum(views[8].alpha, shade)}
-    found = agree(with_alpha(views, bad), CONFIG)
+    found = agree(with_alpha(views, bad), **OPTIONS)
     assert set(found.removed) == {views[8].name} and len(found.warnings) == 1
 
 
@@ -126,7 +117,7 @@ def test_no_blob_in_one_camera_costs_anybody_any_of_the_head(k, x, y, radius, ho
     views = make_views()
     alpha, blob = views[k].alpha, disc(x, y, radius)
     bad = np.where(blob, 0, alpha) if hole else np.maximum(alpha, blob)
-    found = agree(with_alpha(views, {k: bad}), CONFIG)
+    found = agree(with_alpha(views, {k: bad}), **OPTIONS)
     for view in views:
         if view.name in found.removed:
             assert not found.removed[view.name][view.alpha > 0.5].any()
@@ -148,84 +139,3 @@ def test_corrections_are_soft_and_spare_the_rest_to_the_bit():
     ramp = corrected(np.full((200, 160), 255, np.uint8), removed, None)[40, 50:70]
     assert len(set(ramp.tolist())) >= 4 and (np.diff(ramp.astype(int)) >= 0).all()
     assert (corrected(alpha, None, None) == alpha).all()
-
-
-@pytest.fixture(scope="module")
-def keyed(tmp_path_factory):
-    """A dataset whose cameras have their own alphas, with a shadow in one."""
-    dataset = make_dataset(tmp_path_factory.mktemp("matte"), cameras=8)
-    for camera in range(8):
-        name = f"cam{camera:02d}"
-        for expression in ("neutral", "smile"):
-            path = dataset.alpha_file("S001", expression, name)
-            path.parent.mkdir(parents=True, exist_ok=True)
-            shutil.copyfile(dataset.matte_file("S001", expression, name), path)
-    shaded = dataset.alpha_file("S001", "smile", "cam02")
-    write_image(shaded, np.maximum(read_image(shaded), np.uint8(255) * disc(0.12, 0.3, 0.09)))
-    shutil.rmtree(dataset.stage_dir("matte"))
-    return dataset
-
-
-def test_the_stage_writes_every_camera_twice_alike(keyed):
-    run_stage(STAGE, keyed, CONFIG, workers=0, progress=False)
-    folder = keyed.item_dir("matte", "S001/smile")
-    metrics = json.loads((folder / "metrics.json").read_text())
-    assert metrics["views"] == 8 and metrics["dropped"] == [] and metrics["warnings"] == []
-    assert metrics["removed"]["cam02"] == pytest.approx(np.pi * 0.09**2, rel=0.1)
-    truth = read_image(keyed.alpha_file("S001", "neutral", "cam02"))
-    assert (read_image(keyed.matte_file("S001", "smile", "cam02")) == truth).all()
-    for camera in ("cam00", "cam05"):
-        one, other = (f("S001", "smile", camera) for f in (keyed.alpha_file, keyed.matte_file))
-        assert one.read_bytes() == other.read_bytes()
-    before = {p: p.read_bytes() for p in folder.rglob("*") if p.is_file()}
-    shutil.rmtree(folder)
-    run_stage(STAGE, keyed, CONFIG, workers=0, progress=False)
-    assert before == {p: p.read_bytes() for p in folder.rglob("*") if p.is_file()}
-
-
-def test_turned_off_the_stage_copies_and_says_so(keyed, tmp_path):
-    metrics = STAGE.run(keyed, "S001/smile", MatteConfig(views=False), tmp_path)
-    assert metrics["views"] == 0 and metrics["unchanged"] == "matte.views is off"
-    for camera in range(8):
-        name = f"cam{camera:02d}.png"
-        alpha = keyed.alpha_file("S001", "smile", name[:-4])
-        assert (tmp_path / name).read_bytes() == alpha.read_bytes()
-
-
-def test_missing_and_misfit_alphas_are_told(keyed, tmp_path):
-    path = keyed.alpha_file("S001", "smile", "cam04")
-    kept = path.read_bytes()
-    try:
-        path.unlink()
-        metrics = STAGE.run(keyed, "S001/smile", CONFIG, tmp_path)
-        write_image(path, np.zeros((4, 4), np.uint8))
-        with pytest.raises(FormatError, match="cam04.*4x4, expected the camera's 96x96"):
-            STAGE.run(keyed, "S001/smile", CONFIG, tmp_path)
-    finally:
-        path.write_bytes(kept)
-    assert metrics["dropped"] == [{"what": "cam04", "why": "it has no alpha"}]
-    assert metrics["views"] == 7 and not (tmp_path / "cam04.png").exists()
-
-
-def test_without_any_alpha_the_stage_says_what_to_run(tmp_path):
-    dataset = make_dataset(tmp_path)
-    with pytest.raises(StageError, match="no camera has an alpha; see what 'express50 status"):
-        STAGE.run(dataset, "S001/smile", CONFIG, tmp_path)
-
-
-def test_the_command_keys_first_the_subjects_whose_items_are_asked_for(keyed, capsys):
-    command = ["matte", str(keyed.root), "--workers", "0", "--items"]
-    assert main([*command, "S001/sm*"]) == 1  # there are no plates to key against
-    assert "alpha: read 8 = " in capsys.readouterr().out
-    assert main([*command, "S009/*"]) == 2
-    assert main(["matte", str(keyed.root), "--set", "track.head=x"]) == 2
-    assert "alpha and matte" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(
-    "values", [{"votes": 1}, {"side": 4}, {"cells": 1000}, {"margin": 0.0}, {"margin": 0.2},
-               {"colour": 1.0}]
-)  # fmt: skip
-def test_settings_out_of_range_are_refused(values):
-    with pytest.raises(ConfigError, match="matte"):
-        MatteConfig(**values)

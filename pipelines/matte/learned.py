@@ -12,13 +12,12 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from pipelines.alpha.smooth import smooth_alpha
-from pipelines.alpha.tiles import in_tiles
+from pipelines.matte.refine import in_tiles, smooth_alpha
 from pipelines.networks import Network, Role, resized
 
-BGMV2 = Role(setting="alpha.weights", inputs=("src", "bgr"), outputs=("pha",))
+BGMV2 = Role(setting="matte.weights", inputs=("src", "bgr"), outputs=("pha",))
 SALIENT = Role(
-    setting="alpha.weights", inputs=("pixel_values",), outputs=("alphas", "output_image"), place=-1
+    setting="matte.weights", inputs=("pixel_values",), outputs=("alphas", "output_image"), place=-1
 )
 MULTIPLE = 4  # BackgroundMattingV2 refines patches of 4 x 4 pixels
 LEAST_SIDE = 64  # below this its encoder has nothing left to see
@@ -106,5 +105,5 @@ def _padded(image: np.ndarray) -> np.ndarray:
 
 def _wrong_shape(network: Network, answer: np.ndarray, expected: tuple[int, ...]) -> Exception:
     return network.error(
-        f"gave shape {answer.shape}, expected {expected}; does alpha.method fit the file?"
+        f"gave shape {answer.shape}, expected {expected}; does matte.method fit the file?"
     )

@@ -1,28 +1,186 @@
-"""What the other cameras say of one camera's matte: what they rule out, and what they see solid."""
+"""The space that the cameras of a moment share, and what each of them sees in it.
+
+Space is a cube of cells around the point that the cameras look at, in units of the rig's own, so
+that neither metres nor the world's origin matter. A ball in it is in view of most cameras; there
+every camera's silhouette counts (visual hull, Laurentini 1994, but by votes: a place is empty
+where several cameras see clear background). Outside the ball few cameras see anything: only what
+continues the subject out of it, such as the shoulders, is possible there.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from scipy import ndimage
 
-from express50.geometry.conventions import opencv_pixels_to_corner
-from pipelines.matte.config import MatteConfig
-from pipelines.matte.hull import (
-    CLEAR,
-    FAINT,
-    INSIDE,
-    OUT,
-    SOLID,
-    Space,
-    View,
-    cell_spread,
-    cells_in,
-    splat,
-)
+from express50.geometry.cameras import Camera
+from express50.geometry.conventions import cell_centres, opencv_pixels_to_corner
+from express50.rigs.world_frame import meeting_point
 
+CUBE = 1.6  # half side of the cube, in radii of the ball
+BODY = 0.8  # radii that the subject may reach on from where it leaves the ball
+FAINT = 0.03  # alpha below this is clear background
+INSIDE = 0.5  # alpha from which a pixel shows the subject
+OUT, CLEAR, RIM, SOLID = range(4)  # what a view says of a cell
+
+
+@dataclass(frozen=True)
+class Ball:
+    """Centre (3,) and radius, world units, of the unit ball that views are compared in."""
+
+    center: np.ndarray
+    radius: float
+
+
+@dataclass(frozen=True)
+class MatteView:
+    """One camera's reduced picture and matte.
+
+    Attributes:
+        name: camera id.
+        projection: (3, 4) float32 from the unit ball's coordinates to (x, y, 1) z, pixels.
+        center: (3,) camera centre in the ball's coordinates.
+        rgb: (h, w, 3) uint8.
+        alpha: (h, w) float32 in [0, 1].
+        valid: (h, w) bool, pixels with footage.
+    """
+
+    name: str
+    projection: np.ndarray
+    center: np.ndarray
+    rgb: np.ndarray
+    alpha: np.ndarray
+    valid: np.ndarray
+
+
+@dataclass(frozen=True)
+class Space:
+    """Counts (n, n, n) uint16 of the views that see a cell, see it clear, see the subject there.
+
+    Attributes:
+        axis: (n,) float32 coordinates of the cells, the same along x, y and z.
+        seen, clear, solid: the counts.
+        labels: what each view says of each pixel, (h * w + 1,) uint8, the last for "not in view".
+    """
+
+    axis: np.ndarray
+    seen: np.ndarray
+    clear: np.ndarray
+    solid: np.ndarray
+    labels: dict[str, np.ndarray]
+
+
+def ball_of(cameras: Mapping[str, Camera]) -> Ball | None:
+    """The ball about what the cameras look at, as large as most have whole in view.
+
+    None where the optical axes are parallel or most cameras do not look at where they meet.
+    """
+    center = meeting_point(cameras)
+    if center is None:
+        return None
+    extents = []
+    for camera in cameras.values():
+        depth = camera.cam_from_world[2, :3] @ center + camera.cam_from_world[2, 3]
+        extents.append(depth * min(camera.width / camera.K[0, 0], camera.height / camera.K[1, 1]))
+    radius = float(np.median(extents)) / 2
+    return Ball(center, radius) if radius > 0 else None
+
+
+def projection_of(camera: Camera, ball: Ball) -> np.ndarray:
+    """Projection (3, 4) float32 of the ball's coordinates into a pinhole camera's image."""
+    R, t = camera.cam_from_world[:3, :3], camera.cam_from_world[:3, 3]
+    # Over the radius, so that depths are in its units too and float32 suffices.
+    offset = (R @ ball.center + t) / ball.radius
+    return np.column_stack([camera.K @ R, camera.K @ offset]).astype(np.float32)
+
+
+def center_of(camera: Camera, ball: Ball) -> np.ndarray:
+    """A camera's centre (3,) in the ball's coordinates."""
+    return (camera.center - ball.center) / ball.radius
+
+
+def label_pixels(view: MatteView, margin: float) -> np.ndarray:
+    """What a view says of its pixels (h * w + 1,) uint8; clear is further than `margin` pixels."""
+    opaque = view.alpha > FAINT
+    labels = np.full(opaque.shape, CLEAR, np.uint8)
+    if opaque.any():
+        distance = cv2.distanceTransform((~opaque).astype(np.uint8), cv2.DIST_L2, 5)
+        labels[distance <= margin] = RIM
+    labels[view.alpha > INSIDE] = SOLID
+    # What the image cuts off goes on behind its border: nothing is clear next to no footage.
+    beyond = cv2.dilate((~view.valid).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    labels[beyond & (labels == CLEAR)] = OUT
+    labels[~view.valid] = OUT
+    return np.append(labels.ravel(), np.uint8(OUT))
+
+
+def cells_in(view: MatteView, axis: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Pixel that each cell falls on, h * w where out of view, and its depth; (n, n, n) each."""
+    height, width = view.alpha.shape
+    P = view.projection
+    x, y, z = (
+        P[i, 0] * axis[:, None, None] + P[i, 1] * axis[:, None] + (P[i, 2] * axis + P[i, 3])
+        for i in range(3)
+    )
+    ahead = z > 1e-6
+    scale = 1 / np.where(ahead, z, np.float32(1))
+    x, y = x * scale, y * scale
+    inside = ahead & (x >= 0) & (y >= 0) & (x < width) & (y < height)
+    x, y = np.where(inside, x, 0).astype(np.int32), np.where(inside, y, 0).astype(np.int32)
+    return np.where(inside, y * width + x, height * width), z
+
+
+def make_space(views: Sequence[MatteView], cells: int, margin: float) -> Space:
+    """Count what every view says of every cell; `margin` is in pixels."""
+    axis = (CUBE * (cell_centres(cells) / cells * 2 - 1)).astype(np.float32)
+    seen, clear, solid = (np.zeros((cells,) * 3, np.uint16) for _ in range(3))
+    labels = {}
+    for view in views:
+        labels[view.name] = label_pixels(view, margin)
+        said = labels[view.name][cells_in(view, axis)[0]]
+        seen += said != OUT
+        clear += said == CLEAR
+        solid += said == SOLID
+    return Space(axis, seen, clear, solid, labels)
+
+
+def subject_place(space: Space, votes: int) -> np.ndarray:
+    """Cells (n, n, n) bool where the subject may be: the ball, and where it leaves the ball."""
+    a = space.axis
+    square = a[:, None, None] ** 2 + a[:, None] ** 2 + a**2
+    ball = square <= 1
+    parts, count = ndimage.label((space.clear < votes) & (space.solid >= 2) & ball)
+    if not count:
+        return ball
+    weight = np.bincount(parts.ravel(), weights=space.solid.ravel())
+    subject = parts == 1 + int(np.argmax(weight[1:]))
+    step = a[1] - a[0]
+    leaves = subject & (square > (1 - 2 * step) ** 2)
+    if not leaves.any():
+        return ball
+    return ball | (ndimage.distance_transform_edt(~leaves) * step <= BODY)
+
+
+def splat(shape: tuple[int, int], pixels: np.ndarray, spread: int) -> np.ndarray:
+    """Pixels (h, w) bool that cells fall on (N,), each `spread` pixels around."""
+    hit = np.zeros(shape[0] * shape[1] + 1, np.uint8)
+    hit[pixels] = 1
+    side = 2 * spread + 1
+    return cv2.dilate(hit[:-1].reshape(shape), np.ones((side, side), np.uint8)) > 0
+
+
+def cell_spread(view: MatteView, axis: np.ndarray) -> int:
+    """Pixels around a cell's own within which its neighbours fall: splats then leave no gap."""
+    focal = float(np.linalg.norm(view.projection[0, :3]))
+    return max(1, int(np.ceil(focal * float(axis[1] - axis[0]) / float(view.projection[2, 3]) / 2)))
+
+
+VOTES = 2  # other cameras that must see clear background before a place counts as empty
+MARGIN = 0.01  # distance from a silhouette, a share of the longer side, that proves nothing
+COLOUR = 0.1  # largest difference, of full scale, of one surface in neighbouring cameras
 MOST = 0.75  # share of the other views that must see a place to call it solid
 ERRING = 8  # one of so many views may lack the same spot
 THICK = 0.5  # share of the usual length of a ray in the hull that is no corner of it
@@ -52,7 +210,7 @@ class Evidence:
     front: np.ndarray
 
 
-def evidence_of(view: View, space: Space, place: np.ndarray, votes: int) -> Evidence:
+def evidence_of(view: MatteView, space: Space, place: np.ndarray, votes: int) -> Evidence:
     """Evidence of all views but `view`; `place` (n, n, n) is where the subject may be."""
     shape = view.alpha.shape
     pixels, depth = cells_in(view, space.axis)
@@ -80,7 +238,7 @@ def evidence_of(view: View, space: Space, place: np.ndarray, votes: int) -> Evid
     )
 
 
-def _thick(view: View, cells: np.ndarray) -> np.ndarray:
+def _thick(view: MatteView, cells: np.ndarray) -> np.ndarray:
     """Pixels (h, w) bool whose rays pass as many of the solid `cells` (h * w,) as most do.
 
     Between the tangents of few cameras the hull has corners that stand out from the subject; they
@@ -91,7 +249,7 @@ def _thick(view: View, cells: np.ndarray) -> np.ndarray:
     return chord >= THICK * np.median(chord[opaque]) if opaque.any() else opaque
 
 
-def ruled_out(view: View, evidence: Evidence, config: MatteConfig) -> np.ndarray:
+def ruled_out(view: MatteView, evidence: Evidence, strand: float) -> np.ndarray:
     """Pixels (h, w) bool of the matte that show nothing which the other views leave possible.
 
     Whole connected parts, and only those that reach too far from what is possible to be hair.
@@ -105,7 +263,7 @@ def ruled_out(view: View, evidence: Evidence, config: MatteConfig) -> np.ndarray
     np.maximum.at(reach, parts, away)
     area = np.bincount(parts.ravel(), minlength=count)
     known = np.bincount(parts.ravel(), weights=evidence.known.ravel(), minlength=count)
-    far = (reach > config.strand * max(loose.shape)) & (known > 0.5 * area)
+    far = (reach > strand * max(loose.shape)) & (known > 0.5 * area)
     far[0] = False
     wrong = far[parts]
     # What hangs together with it is wrong by a single view's word, up to the hull of them all.
@@ -117,8 +275,8 @@ def ruled_out(view: View, evidence: Evidence, config: MatteConfig) -> np.ndarray
 
 
 def shows_surface(
-    view: View, evidence: Evidence, todo: np.ndarray, others: Sequence[View],
-    subject: dict[str, np.ndarray], colour: float,
+    view: MatteView, evidence: Evidence, todo: np.ndarray, others: Sequence[MatteView],
+    subject: dict[str, np.ndarray],
 ) -> np.ndarray:  # fmt: skip
     """Pixels (h, w) bool of `todo` (h, w) whose colour is that of a surface the others see there.
 
@@ -142,14 +300,14 @@ def shows_surface(
     agree = np.zeros(depth.size, np.uint8)
     for other in near:
         x, y, inside = _pixels_of(other, points)
-        alike = np.abs(_smooth(other.rgb)[y, x] - mine).max(axis=1) < 255 * colour
+        alike = np.abs(_smooth(other.rgb)[y, x] - mine).max(axis=1) < 255 * COLOUR
         agree += alike & inside & subject[other.name][y, x]
     found = np.zeros(todo.shape, bool)
     found[rows, columns] = (agree >= 2).reshape(depth.shape).any(axis=0)
     return found
 
 
-def subject_of(view: View, evidence: Evidence) -> np.ndarray:
+def subject_of(view: MatteView, evidence: Evidence) -> np.ndarray:
     """Pixels (h, w) bool that show the subject by the matte, or by the others in a hole of it."""
     opaque = view.alpha > INSIDE
     _, parts = cv2.connectedComponents((~opaque).astype(np.uint8), connectivity=4)
@@ -162,7 +320,7 @@ def _smooth(rgb: np.ndarray) -> np.ndarray:
     return cv2.blur(rgb, (3, 3)).astype(np.float32)
 
 
-def _neighbours(view: View, others: Sequence[View]) -> list[View]:
+def _neighbours(view: MatteView, others: Sequence[MatteView]) -> list[MatteView]:
     """The cameras that look from nearest by, as seen from the ball's centre."""
     ranked = sorted(
         (o for o in others if o.name != view.name), key=lambda o: _cosine(view, o), reverse=True
@@ -170,13 +328,13 @@ def _neighbours(view: View, others: Sequence[View]) -> list[View]:
     return [other for other in ranked[:NEIGHBOURS] if _cosine(view, other) > WIDEST]
 
 
-def _cosine(a: View, b: View) -> float:
+def _cosine(a: MatteView, b: MatteView) -> float:
     """Cosine of the angle between two cameras, as seen from the ball's centre."""
     length = float(np.linalg.norm(a.center) * np.linalg.norm(b.center))
     return float(a.center @ b.center) / length if length > 0 else 0.0
 
 
-def _pixels_of(view: View, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _pixels_of(view: MatteView, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Columns, rows and whether in view (N,) of points (3, N) in the ball's coordinates."""
     height, width = view.alpha.shape
     x, y, z = view.projection[:, :3] @ points + view.projection[:, 3, None]
@@ -187,8 +345,8 @@ def _pixels_of(view: View, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, 
 
 
 def missed(
-    view: View, evidence: Evidence, others: Sequence[View],
-    subject: dict[str, np.ndarray], config: MatteConfig,
+    view: MatteView, evidence: Evidence, others: Sequence[MatteView],
+    subject: dict[str, np.ndarray],
 ) -> tuple[np.ndarray, float]:  # fmt: skip
     """Pixels (h, w) bool to fill, and the share of what the others see that then still lacks.
 
@@ -198,9 +356,9 @@ def missed(
     """
     lacking = evidence.solid & (view.alpha < INSIDE) & view.valid
     depth = _depth(evidence.solid)
-    deep = depth > config.margin * max(lacking.shape)
+    deep = depth > MARGIN * max(lacking.shape)
     todo = lacking & (subject[view.name] | (depth > _corner(view, others) * depth.max()))
-    alike = shows_surface(view, evidence, todo, others, subject, config.colour)
+    alike = shows_surface(view, evidence, todo, others, subject)
     alike = cv2.morphologyEx(alike.astype(np.uint8), cv2.MORPH_OPEN, np.ones((2, 2))) > 0
     count, spots = cv2.connectedComponents(alike.astype(np.uint8), connectivity=8)
     inside = np.bincount(spots[deep], minlength=count)
@@ -221,7 +379,7 @@ def _depth(mask: np.ndarray) -> np.ndarray:
     return cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, 5)
 
 
-def _corner(view: View, others: Sequence[View]) -> float:
+def _corner(view: MatteView, others: Sequence[MatteView]) -> float:
     """How far the hull of the others stands out from a round subject in this view, in its radii.
 
     The tangents of cameras an angle away to either side meet at 1 / cos(angle) radii.

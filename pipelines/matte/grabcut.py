@@ -19,7 +19,7 @@ from express50.geometry.cameras import Camera
 from express50.geometry.conventions import corner_to_cell
 from express50.landmarks.detector import detect
 from express50.landmarks.network import LandmarkNet
-from pipelines.alpha.learned import refined
+from pipelines.matte.learned import refined
 from pipelines.calibrate.first_guess import mean_landmarks, pose_of_face
 
 FACE_SCORE = 0.3  # heads from behind score up to 0.2, profiles from 0.33 on
@@ -48,7 +48,7 @@ def person_alpha(net: LandmarkNet, camera: Camera, frame: np.ndarray) -> np.ndar
     if face.score < FACE_SCORE or not np.isfinite(error):
         raise NoFaceError(
             f"no face found (score {face.score:.2f}, expected {FACE_SCORE} or more), and grabcut"
-            " starts from one; set alpha.method to salient and alpha.weights, or give a plate"
+            " starts from one; set matte.method to salient and alpha.weights, or give a plate"
         )
     pixels = float(camera.K[0, 0] / pose[2, 3])  # a metre at the head
     scale = min(1.0, 1 / (PIXEL_M * pixels))

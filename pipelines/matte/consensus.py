@@ -12,9 +12,20 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from pipelines.matte.config import MatteConfig
-from pipelines.matte.evidence import Evidence, evidence_of, missed, ruled_out, subject_of
-from pipelines.matte.hull import INSIDE, View, make_space, subject_place
+from express50.contract.stage import Note
+from pipelines.matte.visual_hull import (
+    INSIDE,
+    MARGIN,
+    VOTES,
+    Evidence,
+    MatteView,
+    evidence_of,
+    make_space,
+    missed,
+    ruled_out,
+    subject_of,
+    subject_place,
+)
 
 FEWEST = 4  # views; of three, two that err alike would overrule one that does not
 EMPTY, FULL = 0.003, 0.98  # shares of the image
@@ -51,17 +62,17 @@ class Agreement:
 
     Attributes:
         removed, filled: (h, w) bool of each camera that something is changed of.
-        warnings: ``{"what": camera, "why": ...}``.
+        warnings: cameras that were left as they were, and why.
         unchanged: why nothing was compared; empty where it was.
     """
 
     removed: dict[str, np.ndarray] = field(default_factory=dict)
     filled: dict[str, np.ndarray] = field(default_factory=dict)
-    warnings: list[dict[str, str]] = field(default_factory=list)
+    warnings: list[Note] = field(default_factory=list)
     unchanged: str = ""
 
 
-def agree(views: Sequence[View], config: MatteConfig) -> Agreement:
+def agree(views: Sequence[MatteView], cells: int, strand: float) -> Agreement:
     """Compare the views of one moment."""
     doubted = {view.name: why for view in views if (why := _useless(view))}
     while True:
@@ -69,7 +80,7 @@ def agree(views: Sequence[View], config: MatteConfig) -> Agreement:
         if len(used) < FEWEST:
             few = f"{len(used)} usable cameras, expected {FEWEST} or more to overrule one"
             return Agreement(warnings=_named(doubted), unchanged=few)
-        removed, filled, misfits = _compare(used, config)
+        removed, filled, misfits = _compare(used, cells, strand)
         worst = max(misfits, key=lambda name: misfits[name].size)
         # Most cameras must be right, or there is no telling who is wrong.
         if misfits[worst].size <= 1 or len(doubted) >= len(views) // 3:
@@ -77,11 +88,11 @@ def agree(views: Sequence[View], config: MatteConfig) -> Agreement:
         doubted[worst] = misfits[worst].words
 
 
-def _named(doubted: dict[str, str]) -> list[dict[str, str]]:
-    return [{"what": name, "why": why} for name, why in sorted(doubted.items())]
+def _named(doubted: dict[str, str]) -> list[Note]:
+    return [Note(name, why) for name, why in sorted(doubted.items())]
 
 
-def _useless(view: View) -> str:
+def _useless(view: MatteView) -> str:
     """Why a view says nothing of the others' mattes; empty where it does."""
     if view.projection[2, 3] <= 1:  # radii from the ball's centre, along its axis
         return "it stands amid what the others look at, or looks away; left as it was"
@@ -92,14 +103,14 @@ def _useless(view: View) -> str:
 
 
 def _compare(
-    views: Sequence[View], config: MatteConfig
+    views: Sequence[MatteView], cells: int, strand: float
 ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray], dict[str, Misfit]]:
     """What to remove and to fill of each view, and how badly it fits the others."""
     longest = max(max(view.alpha.shape) for view in views)
-    space = make_space(views, config.cells, max(1.5, config.margin * longest))
-    place = subject_place(space, config.votes)
+    space = make_space(views, cells, max(1.5, MARGIN * longest))
+    place = subject_place(space, VOTES)
     found: dict[str, Evidence] = {
-        view.name: evidence_of(view, space, place, config.votes) for view in views
+        view.name: evidence_of(view, space, place, VOTES) for view in views
     }
     subject = {view.name: subject_of(view, found[view.name]) for view in views}
     removed: dict[str, np.ndarray] = {}
@@ -107,8 +118,8 @@ def _compare(
     misfits: dict[str, Misfit] = {}
     for view in views:
         mine = found[view.name]
-        bad = ruled_out(view, mine, config)
-        spots, lacking = missed(view, mine, views, subject, config)
+        bad = ruled_out(view, mine, strand)
+        spots, lacking = missed(view, mine, views, subject)
         opaque = view.alpha > INSIDE
         stray = float((opaque & ~mine.likely).sum()) / int(opaque.sum())
         misfits[view.name] = Misfit(stray, lacking)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from express50.files.images import linear_to_srgb
-from pipelines.alpha.opacity import local_colours, to_light
+from pipelines.matte.opacity import local_colours, to_light
 
 REACH_SHARE = 0.008  # of the image's longer side: how far away colours may be taken from
 SPREAD = 0.25  # share by which a strand may be brighter or darker than its neighbours

@@ -2,28 +2,26 @@
 
 What differs from the plate by more than noise, in parts of some size, is the subject's region. The
 solid inside is found by shape and is 1; around it alpha is solved from the plate and the subject's
-colours nearby (`pipelines.alpha.opacity`), so that a strand of fair hair over a fair plate is as
+colours nearby (`pipelines.matte.opacity`), so that a strand of fair hair over a fair plate is as
 opaque as a dark one. Measured against plain keys and textbook matting in benchmarks/matte.py.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 
-from express50.files.images import edge_distance
-from pipelines.alpha.config import AlphaConfig
-from pipelines.alpha.opacity import (
+from express50.files.images import edge_distance, resize_area
+from pipelines.matte.opacity import (
     light_noise,
     local_colours,
     shrunk,
     solve_opacity,
     to_light,
 )
-from pipelines.alpha.plate import PlateModel
-from pipelines.alpha.smooth import smooth_alpha
+from pipelines.matte.plates import PlateModel, exposed, exposure_gain, fit_plate
 
 # A part of the subject smaller than this share of its largest part is clutter.
 LEAST_PART = 0.02
@@ -33,9 +31,28 @@ LARGEST_HOLE = 0.05
 REACH = 0.012
 # Deviations by which a pixel of the solid must be open to count as a gap.
 SURE = 2.0
-# Weight of alpha against smoothness, where smoothed, times the square of its deviation.
-SMOOTH = 1e-2
+# Share by which hair may be brighter or darker than what is seen of it nearby.
+SPREAD = 0.2
+# A difference of this share of the local foreground's own may belong to the solid inside.
+FIRM = 0.5
+# Radius of the disc that must fit inside a part of the subject for it to be solid.
+CORE = 0.018
+# Plate-coloured spots and gaps in the solid subject are filled this far from its edge.
+FILL = 0.012
+# Least noise assumed, in 8-bit steps.
+NOISE_FLOOR = 1.0
 _LUMA = np.array([0.299, 0.587, 0.114], dtype=np.float32)
+
+
+@dataclass(frozen=True)
+class KeyOptions:
+    """The settings of keying; see ``MatteConfig``."""
+
+    scale: float = 1.0
+    low: float = 1.2
+    high: float = 6.0
+    shadow: float = 0.25
+    linear: bool = True
 
 
 @dataclass(frozen=True)
@@ -47,7 +64,7 @@ class Support:
 
 
 def alpha_of(
-    frame: np.ndarray, model: PlateModel, valid: np.ndarray, config: AlphaConfig
+    frame: np.ndarray, model: PlateModel, valid: np.ndarray, options: KeyOptions
 ) -> np.ndarray:
     """Opacity (H, W) float32 in [0, 1] of the subject in a frame (H, W, 3) uint8.
 
@@ -56,24 +73,20 @@ def alpha_of(
     alpha = np.zeros(valid.shape, np.float32)
     length = max(valid.shape)
     image = frame.astype(np.float32)
-    difference = plate_difference(image, model, config.shadow, length)
+    difference = plate_difference(image, model, options.shadow, length)
     difference[~valid] = 0.0
-    region = subject_region(difference, config.high)
+    region = subject_region(difference, options.high)
     if not region.any():
         return alpha
     # All else happens around the subject only.
-    window = _window(region, 4 * _pixels(config.core, length))
+    window = _window(region, 4 * _pixels(CORE, length))
     part = PlateModel(model.plate[window], model.sigma[window], model.whiten)
     image, difference, region = image[window], difference[window], region[window]
-    support = find_support(difference > 2 * config.low, region, length, config)
+    support = find_support(difference > 2 * options.low, region, length)
     if support.core.any():
-        firm = firm_pixels(image, difference, support.core, part, length, config)
-        support = find_support(firm, region, length, config)
-    found, doubt = _opacity(image, difference, support, part, length, config)
-    if config.smooth:
-        light = 255.0 * to_light(image, config.light == "linear")
-        found = smooth_alpha(light, found, support.near, SMOOTH / np.maximum(doubt, 0.02) ** 2)
-    alpha[window] = found
+        firm = firm_pixels(image, difference, support.core, part, length, options)
+        support = find_support(firm, region, length)
+    alpha[window] = _opacity(image, difference, support, part, length, options)
     alpha[~valid] = 0.0
     return alpha
 
@@ -84,35 +97,34 @@ def _opacity(
     support: Support,
     model: PlateModel,
     length: int,
-    config: AlphaConfig,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Alpha (H, W) float32, 1 deep in the core and 0 off the support, and its deviation (H, W)."""
-    core, linear = support.core, config.light == "linear"
-    alpha, doubt = core.astype(np.float32), np.zeros(core.shape, np.float32)
+    options: KeyOptions,
+) -> np.ndarray:
+    """Solve alpha (H, W) float32: 1 deep in the core and 0 off the support."""
+    core, linear = support.core, options.linear
+    alpha = core.astype(np.float32)
     # Between strands the solid looks closed from a distance; near its edge it is measured.
-    todo = support.near | (core & ~eroded(core, _pixels(config.fill, length)))
+    todo = support.near | (core & ~eroded(core, _pixels(FILL, length)))
     if not todo.any():
-        return alpha, doubt
+        return alpha
     weight = _rim(core, length).astype(np.float32)
     if not core.any():
         strong = difference >= np.percentile(difference[difference > 0], 98)
         weight = (strong & support.near).astype(np.float32)
     light = to_light(image, linear)
     reach = REACH * length
-    mean, covariance = local_colours(light, weight, todo, reach, config.spread)
+    mean, covariance = local_colours(light, weight, todo, reach, SPREAD)
     plate = model.plate
-    if config.shadow > 0:
+    if options.shadow > 0:
         clear = ~(core | support.near)
-        plate = plate * shade_of_plate(image, model, clear, config.shadow, length)[..., None]
+        plate = plate * shade_of_plate(image, model, clear, options.shadow, length)[..., None]
     noise = light_noise(plate[todo], model.sigma[todo], model.whiten, linear)
     behind = to_light(plate[todo], linear)
     value, deviation, at_zero = solve_opacity(light[todo], behind, mean, covariance, noise)
     # In the core what is not surely open is solid, off it what is not surely subject is plate.
     solid = 1 - shrunk(1 - value, SURE * deviation)
-    strand = shrunk(value, config.low * at_zero)
+    strand = shrunk(value, options.low * at_zero)
     alpha[todo] = np.clip(np.where(core[todo], solid, strand), 0, 1)
-    doubt[todo] = deviation
-    return alpha, doubt
+    return alpha
 
 
 def _pixels(share: float, length: int) -> int:
@@ -209,14 +221,14 @@ def subject_region(difference: np.ndarray, high: float) -> np.ndarray:
     return (sure & (area >= least))[labels]
 
 
-def find_support(firm: np.ndarray, region: np.ndarray, length: int, config: AlphaConfig) -> Support:
+def find_support(firm: np.ndarray, region: np.ndarray, length: int) -> Support:
     """Split the region (H, W) into the solid inside and the rest, where alpha is to be measured.
 
     `firm` (H, W) marks pixels that look opaque one by one; where they leave no gap that a strand
     could make, and deep inside the outline, the subject is solid.
     """
     solid = (firm & region).astype(np.uint8)
-    radius, edge = _pixels(config.core, length), _pixels(config.fill, length)
+    radius, edge = _pixels(CORE, length), _pixels(FILL, length)
     # The image's border cuts the subject off; it goes on behind it.
     pad = 4 * radius + edge + 2
     solid = cv2.copyMakeBorder(solid, pad, pad, pad, pad, cv2.BORDER_REPLICATE)
@@ -245,7 +257,7 @@ def firm_pixels(
     core: np.ndarray,
     model: PlateModel,
     length: int,
-    config: AlphaConfig,
+    options: KeyOptions,
 ) -> np.ndarray:
     """Pixels (H, W) bool that look opaque, knowing the subject's colour about a first core.
 
@@ -255,13 +267,13 @@ def firm_pixels(
     off = image - model.plate
     own = subject_colour(image, core, length) - model.plate
     reach = _length(own, model)
-    firm = difference > np.maximum(config.firm * reach, 2 * config.low)
+    firm = difference > np.maximum(FIRM * reach, 2 * options.low)
     white = cv2.transform(own / model.sigma, model.whiten)
     along = np.einsum("...i,...i->...", cv2.transform(off / model.sigma, model.whiten), white)
     share = np.clip(along / (3 * np.maximum(reach, 1e-3) ** 2), 0, 1)
     misfit = _length(off - share[..., None] * own, model)
     # Half of the difference at least: light mixes along a curve in 8-bit steps.
-    return firm | (core & (misfit > np.maximum(2 * config.low, 0.5 * difference)))
+    return firm | (core & (misfit > np.maximum(2 * options.low, 0.5 * difference)))
 
 
 def subject_colour(image: np.ndarray, core: np.ndarray, length: int) -> np.ndarray:
@@ -295,3 +307,36 @@ def _blur(image: np.ndarray, sigma: float) -> np.ndarray:
     small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
     small = cv2.GaussianBlur(small, (0, 0), sigma / factor)
     return cv2.resize(small, (width, height), interpolation=cv2.INTER_LINEAR)
+
+
+class Keyer:
+    """A plate and its noise; gives the alpha of frames of that camera."""
+
+    def __init__(
+        self,
+        plate: np.ndarray,
+        frames: list[np.ndarray],
+        valid: np.ndarray,
+        options: KeyOptions,
+    ) -> None:
+        """Measure the noise of `frames` (H, W, 3) uint8 around `plate`, inside `valid` (H, W)."""
+        self.options = options
+        self.full_size = (plate.shape[1], plate.shape[0])
+        self.size = tuple(max(8, round(n * options.scale)) for n in self.full_size)
+        self.plate = self._shrink(plate)
+        self.valid = valid
+        self._valid_small = self._shrink(valid.astype(np.uint8) * 255) == 255
+        small = [self._shrink(f) for f in frames]
+        self.model: PlateModel = fit_plate(self.plate, small, self._valid_small, NOISE_FLOOR)
+
+    def _shrink(self, image: np.ndarray) -> np.ndarray:
+        return image if self.size == self.full_size else resize_area(image, *self.size)
+
+    def alpha(self, frame: np.ndarray) -> np.ndarray:
+        """Opacity (H, W) float32 in [0, 1] of the subject in a frame (H, W, 3) uint8."""
+        small = self._shrink(frame)
+        plate = exposed(self.plate, exposure_gain(small, self.plate))
+        alpha = alpha_of(small, replace(self.model, plate=plate), self._valid_small, self.options)
+        if self.size != self.full_size:
+            alpha = cv2.resize(alpha, self.full_size, interpolation=cv2.INTER_LINEAR)
+        return np.where(self.valid, alpha, np.float32(0))
