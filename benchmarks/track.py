@@ -35,7 +35,7 @@ from express50.runner.runner import run_stage
 from express50.twin.config import TwinConfig
 from express50.twin.record import record
 from express50.twin.truth import Truth
-from pipelines import alpha, calibrate, frames, ingest, matte
+from pipelines import calibrate, frames, ingest, matte
 from pipelines.ingest import register
 from pipelines.track import STAGE
 
@@ -121,7 +121,7 @@ def prepare(config: TwinConfig, folder: Path) -> Reference:
         run_stage(stage, dataset, build_config(stage, {}), workers=0, progress=False)
     for subject in dataset.subjects():
         write_peaks(dataset, subject, truth.peaks(subject))
-    for stage in (frames.STAGE, alpha.STAGE, matte.STAGE):
+    for stage in (frames.STAGE, matte.STAGE):
         run_stage(stage, dataset, build_config(stage, {}), workers=0, progress=False)
     return dataset, truth, folder / "captures"
 

@@ -33,7 +33,7 @@ class Role:
     """What a network must be: pictures it takes, and which of its outputs is the answer.
 
     Attributes:
-        setting: config key that names the file, such as alpha.weights, for messages.
+        setting: config key that names the file, such as matte.weights, for messages.
         inputs: names of the pictures; an ONNX file may order them otherwise.
         outputs: names that mark the answer in an ONNX file.
         place: index of the answer where no name tells it.

@@ -19,8 +19,8 @@ from express50.geometry.cameras import Camera
 from express50.geometry.conventions import corner_to_cell
 from express50.landmarks.detector import detect
 from express50.landmarks.network import LandmarkNet
-from pipelines.matte.learned import refined
 from pipelines.calibrate.first_guess import mean_landmarks, pose_of_face
+from pipelines.matte.learned import refined
 
 FACE_SCORE = 0.3  # heads from behind score up to 0.2, profiles from 0.33 on
 SEARCH = 0.08  # smallest windows searched for the face, of the longer side
@@ -48,7 +48,7 @@ def person_alpha(net: LandmarkNet, camera: Camera, frame: np.ndarray) -> np.ndar
     if face.score < FACE_SCORE or not np.isfinite(error):
         raise NoFaceError(
             f"no face found (score {face.score:.2f}, expected {FACE_SCORE} or more), and grabcut"
-            " starts from one; set matte.method to salient and alpha.weights, or give a plate"
+            " starts from one; set matte.method to salient and matte.weights, or give a plate"
         )
     pixels = float(camera.K[0, 0] / pose[2, 3])  # a metre at the head
     scale = min(1.0, 1 / (PIXEL_M * pixels))

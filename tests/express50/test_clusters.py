@@ -12,7 +12,7 @@ from express50.runner.clusters import LocalWorkers, RemoteWorkers, cuda_devices
 from express50.runner.executor import Pool
 from express50.runner.runner import run_stage
 from express50.runner.slurm import SlurmJob
-from pipelines import alpha, regions
+from pipelines import matte, regions
 from tests.faults import toy
 
 
@@ -137,7 +137,7 @@ def test_jobs_without_a_gpu_are_refused_before_the_first_is_submitted(tmp_path, 
 @pytest.mark.parametrize(
     ("stage", "without", "more"),
     [
-        (alpha.STAGE, {"method": "salient", "weights": "x.pt"}, {"device": "cuda"}),
+        (matte.STAGE, {"method": "salient", "weights": "x.pt"}, {"device": "cuda"}),
         (regions.STAGE, {"segmentation": "x.pt"}, {"device": "cuda"}),
         (regions.STAGE, {"device": "cuda"}, {"segmentation": "x.pt"}),
     ],
