@@ -1,12 +1,12 @@
-"""How far tracked heads are from the truth, what refinement adds, and what a rigid template gives.
+"""Measure tracked heads against the truth, with landmarks alone and a rigid template beside them.
 
 ``python -m benchmarks.track [--dataset DIR --truth DIR [--captures DIR]]``; without a dataset the
 digital twin records subjects that the landmark detector was not trained on, two cameras are held
 out of the capture, and the stages up to mattes are run. Peaks are the true ones, so that the
 figures speak of tracking alone. `landmark_only` is `standard` without outlines, patches and
 UV landmarks. Seconds are processor seconds of the stage, reading and overlays included.
-The last line printed is one JSON object; `benchmarks.track_truth` says what its figures mean, and
-`benchmarks.track_views` how the held-out cameras' picture is made.
+The last line printed is one JSON object; `benchmarks.track_truth` defines its figures, and
+`benchmarks.track_views` the held-out cameras' picture.
 """
 
 from __future__ import annotations
@@ -195,7 +195,7 @@ def benchmark(source: Reference, presets: tuple[str, ...], count: int, clip: boo
 
 
 def has_footage(views: dict) -> bool:
-    """Whether any held-out camera has a picture."""
+    """Say whether any held-out camera has a picture."""
     return any(v.image is not None for rows in views.values() for row in rows.values() for v in row)
 
 

@@ -1,4 +1,4 @@
-"""What each knob of tracking is worth: face error against seconds, into docs/TRADEOFFS.md.
+"""Measure what each setting of tracking is worth: error and seconds, into docs/TRADEOFFS.md.
 
 ``python -m benchmarks.track_sweep --dataset DIR --truth DIR --captures DIR`` with what
 `benchmarks.track` takes, or without: the twin then records a subject. From `standard` one thing is
@@ -109,7 +109,7 @@ def as_markdown(rows: list[dict], cameras: int) -> list[str]:
     text = (
         f"Made by `python -m benchmarks.track_sweep`: one twin subject, {len(EXPRESSIONS)}"
         f" expressions, {cameras} cameras. One thing is changed at a time from `standard`; errors"
-        " are root mean squares against the truth, seconds are processor seconds a frame. One head:"
+        " are root mean squares against the truth, seconds are processor seconds per frame. One head:"
         " differences under 0.1 mm are not to be trusted."
     )
     head = "| setting | face mm | head mm | jaw degrees | outline IoU | seconds |"

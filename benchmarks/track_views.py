@@ -1,4 +1,4 @@
-"""Held-out cameras: what they truly show, and what a tracked mesh says that they show.
+"""Held-out cameras: their true pictures, and their pictures predicted from a tracked mesh.
 
 A pixel of a held-out camera whose first surface is the tracked face is a point in space. Its colour
 is the median, over the tracking cameras that see the point on the tracked mesh (not hidden by the
@@ -36,7 +36,7 @@ LEAST_PIXELS = 200  # of the face, for a PSNR
 
 @dataclass(frozen=True)
 class HeldOut:
-    """What a held-out camera truly shows at a frame.
+    """The true view of a held-out camera at a frame.
 
     Attributes:
         camera: true pinhole camera.

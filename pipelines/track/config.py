@@ -14,7 +14,7 @@ UV_WEIGHTS = Path(__file__).with_name("face_uv_weights.npz")
 
 @dataclass(frozen=True, kw_only=True)
 class TrackConfig:
-    """Settings that trade time for accuracy or say what is tracked."""
+    """Settings that trade time for accuracy or select the frames to track."""
 
     head: str = "procedural"
     """Head model: procedural, the path of a FLAME pickle, or of ICT-FaceKit."""

@@ -35,7 +35,7 @@ from pipelines.track.state import Target
 from pipelines.track.terms import LidTerm, MeshPlaces, PixelTerm, Sighting, landmark_anchors
 
 LOOKS_AT = 0.3  # cosine between gaze and camera below which an iris is not trusted
-# An eyeball's misplacement: standard deviation of what is left of it, and of all of it (prior).
+# Standard deviations of an eyeball's misplacement: what remains of it, and the prior of it.
 EYEBALL_M, OFFSET_M = 0.0005, 0.002
 GUESSED_EXPRESSIONS = 1  # weight of the guess that eyeballs are in place, in expressions
 RIM_SHARE = 0.012  # error of a rim's place along the cheek, as a share of the face

@@ -2,7 +2,7 @@
 
 A cylinder about the head is unrolled and warped until the 68 landmarks of any head model lie where
 those of every other do, so one network reads the maps of all of them. On the map every face is
-upright, turned to the reader and of one size, and what is left to find is the mesh's error. The
+upright, turned to the reader and of one size, and only the mesh's error is left to find. The
 landmark network, trained on from its weights for whole heads, sees the middle of the map at twice
 the resolution it has of a head. The jaw line is not among its landmarks: the map does not end
 there.
@@ -54,7 +54,7 @@ MARKS = np.array(
     ]
 )  # fmt: skip
 
-# The rims of closed lips touch: a texel to either side tells which lip a landmark moves with.
+# The rims of closed lips touch: a texel to either side shows which lip a landmark moves with.
 LIPS_APART = np.zeros((68, 2))
 LIPS_APART[[61, 62, 63], 1], LIPS_APART[[65, 66, 67], 1] = -1.2, 1.2
 # First landmark that is read; first column and row of the part of the map that is read; its side.
@@ -82,7 +82,7 @@ class FaceUvMap:
     skin: np.ndarray
 
     def image(self, values: np.ndarray) -> np.ndarray:
-        """Spread values (T, C) over the map (HEIGHT, WIDTH, C), 0 where there is no head."""
+        """Spread values (T, C) over the map (HEIGHT, WIDTH, C), 0 outside the head."""
         out = np.zeros((HEIGHT, WIDTH, values.shape[1]), dtype=values.dtype)
         out[tuple(self.texels.T)] = values
         return out

@@ -33,7 +33,7 @@ from pipelines.track.terms import (
 )
 
 LANDMARK_BIAS_M = 0.003  # standard deviation of the detector's constant error on a face
-KNOWN_BIAS_M, KNOWN_MODE = 1e-6, 1e8  # what is not free is held this firmly
+KNOWN_BIAS_M, KNOWN_MODE = 1e-6, 1e8  # these hold the unknowns that are not free
 BIAS = 68 * 3
 REJECT_SIGMA, REJECT_SHARE = 4.0, 0.12
 

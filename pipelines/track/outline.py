@@ -20,7 +20,7 @@ from express50.geometry.sampling import bilinear_slope
 from express50.head.model import HeadModel
 from pipelines.track.terms import MeshPlaces, Residuals, huber
 
-# Head outlines count as about this many independent points a view.
+# Head outlines count as about this many independent points per view.
 EFFECTIVE_POINTS = 24
 POINTS_PER_VIEW = 60
 OUTLINE_SIDE = 384

@@ -161,7 +161,7 @@ def _shapes(
     rays = np.concatenate([start, np.broadcast_to(-normals[:, None], start.shape)], axis=2)
     hit = scene.cast_rays(o3d.core.Tensor(rays.astype(np.float32)))["t_hit"].numpy()
     rise = np.where(np.isfinite(hit), lift - hit, 0.0)
-    # Another part of the face under the patch is no continuation of it.
+    # Another part of the face under the patch does not continue it.
     rise = np.where(np.abs(rise) < spacing * PATCH, rise, 0.0)
     return np.swapaxes(flat + rise[..., None] * normals[:, None], 1, 2)
 
@@ -177,7 +177,7 @@ def _peaks(score: np.ndarray, heights: np.ndarray, pixel: float) -> PatchSearch:
     shift = np.clip(0.5 * (right - left) / bend, -0.5, 0.5)
     step = heights[1] - heights[0]
     far = np.abs(np.arange(len(heights))[None] - at[:, None]) > 2
-    # A patch that is much the same everywhere, as on a flat cheek, tells no height.
+    # A patch that is much the same everywhere, as on a flat cheek, has no clear height.
     rival = np.where(far, score, -1.0).max(1)
     return PatchSearch(
         heights[at] + shift * step,
@@ -246,7 +246,7 @@ def patch_terms(
         pictures: of the frame set.
         mesh: (V, 3) world.
         reach: metres to either side.
-        weight: trust in what is found.
+        weight: trust in the result.
     """
     faces = model.faces.numpy()
     images = [(root.mean(2), camera) for root, camera in map(root_light, pictures.crops)]

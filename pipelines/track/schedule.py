@@ -83,7 +83,7 @@ def schedule_table(schedule: Schedule) -> list[dict[str, object]]:
 
 @dataclass(frozen=True)
 class SubjectEvidence:
-    """What all rounds of a subject look at.
+    """Inputs that all rounds of a subject share.
 
     Attributes:
         model: the head model.

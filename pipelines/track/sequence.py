@@ -49,7 +49,7 @@ Pictures = Callable[[int, np.ndarray], FrameSetCrops]
 
 @dataclass(frozen=True)
 class ClipTracker:
-    """What tracking a window needs beside its observations.
+    """Settings and helpers for tracking windows of one person.
 
     Attributes:
         person: basis of one person, from `freeze_shape`.

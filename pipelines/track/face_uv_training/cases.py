@@ -28,9 +28,9 @@ from pipelines.track.surface import Visibility, sample_normals
 Rng = np.random.Generator
 # At least the first, fewer than the second.
 CAMERAS = (3, 8)
-# Rays that tell how much of the even light and of each lamp a place has.
+# Rays that measure a place's share of the even light and of each lamp.
 EVEN_RAYS, LAMP_RAYS = 16, 4
-# What is further off than this leaves the even light as it is, metres.
+# Occluders further away than this do not dim the even light, metres.
 NEAR_M = 0.1
 # Rays start this far off the skin, metres.
 OFF_SKIN_M = 3e-4
@@ -188,7 +188,7 @@ def draw_case(model: HeadModel, uv_map: FaceUvMap, person: PaintedHead, rng: Rng
     """Let a person act, look from some cameras and read the uv_map of a mesh that is off."""
     true, wrong = draw_meshes(model, uv_map, rng)
     lamps = draw_lamps(rng)
-    head = _Scene(model, uv_map, person, true, lamps, rng)
+    head = _PaintedScene(model, uv_map, person, true, lamps, rng)
     places, normals = uv_map.samples.at(wrong), sample_normals(uv_map.samples, wrong)
     visibility = Visibility(wrong, model.faces.numpy())
     total, mass = np.zeros_like(places), np.zeros(len(places))
@@ -238,14 +238,14 @@ def draw_meshes(model: HeadModel, uv_map: FaceUvMap, rng: Rng) -> tuple[np.ndarr
 
 
 def _slips(expression: np.ndarray, early: float, rng: Rng) -> np.ndarray:
-    """What a tracker has wrong of an expression (1, X): any muscle early, then such as act."""
+    """Draw a tracker's error of an expression (1, X): any muscle early, active ones later."""
     muscles = rng.random(expression.shape) < early * rng.uniform(0.0, 0.4)
     slips = rng.uniform(0.0, 0.5) * rng.normal(size=muscles.shape) * muscles
     missed = rng.random(expression.shape) < (1.0 - early) * rng.uniform(0.0, 0.8)
     return slips - missed * rng.uniform(-0.2, 1.0, expression.shape) * expression
 
 
-class _Scene:
+class _PaintedScene:
     """Ray caster of a true, painted head, with the light that reaches its vertices."""
 
     def __init__(
@@ -282,7 +282,7 @@ class _Scene:
         return np.sqrt(color)
 
     def flow(self, places: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Where the true skin at places (N, 3) of the wrong mesh belongs: (N, 2), known (N,)."""
+        """Find where the true skin at places (N, 3) of the wrong mesh belongs: (N, 2), known (N,)."""
         rays = np.concatenate([places + REACH_M * normals, -normals], axis=1)
         hit, face, bary = self._cast(rays, 2 * REACH_M)
         hit &= self.front[face]
@@ -300,7 +300,7 @@ class _Scene:
     def _cast(
         self, rays: np.ndarray, far: float = np.inf
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Whether rays (N, 6) hit (N,), the faces (N,) and the shares of their corners (N, 3)."""
+        """Cast rays (N, 6): hit (N,), faces (N,) and barycentric weights (N, 3)."""
         cast = self.scene.cast_rays(o3d.core.Tensor(rays.astype(np.float32)))
         distance, u = cast["t_hit"].numpy(), cast["primitive_uvs"].numpy()
         hit = np.isfinite(distance) & (distance < far)

@@ -1,4 +1,4 @@
-"""Readings of charts, and what is done to them so that the network is surprised by little."""
+"""Readings of face UV maps, and augmentations that make the network robust."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ CREASES = (
     ((36, 37, 38, 39),),
     ((42, 43, 44, 45),),
 )
-# Bits of a texel's fraction that OpenCV is told.
+# Fractional bits of OpenCV's drawing coordinates.
 FINE = 4
 # Share of the texels about a place whose displacement must be known.
 LEAST_SHARE = 0.25
@@ -93,7 +93,7 @@ def mirrored(case: Case) -> Case:
 
 
 def where_seen(case: Case, texels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Where a uv_map shows what belongs to texels (N, 2), corner origin; and whether it does (N,).
+    """Find where a map shows the content of texels (N, 2), corner origin, and whether it does (N,).
 
     Displacements are known where something is seen and asked for where it belongs.
     """
@@ -111,8 +111,8 @@ def where_seen(case: Case, texels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def creased(colors: np.ndarray, at: np.ndarray, known: np.ndarray, rng: Rng) -> np.ndarray:
     """Dark lines where lips meet and along the upper lids, in most of the maps.
 
-    Drawn shadows are no finer than the head model's vertices, and on a face these lines are what
-    tells best where its parts end.
+    Painted shadows are as coarse as the head model's vertices, and on a face these lines show best
+    where its parts end.
 
     Args:
         colors: (HEIGHT, WIDTH, 3) uint8.

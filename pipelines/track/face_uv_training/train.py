@@ -55,7 +55,7 @@ HELD_OUT = 0
 
 @dataclass(frozen=True, kw_only=True)
 class UvTrainingPlan:
-    """How to train: batches of charts in all, files of cases a head model, seed."""
+    """Settings of a training: number of batches, files of cases per head model, seed."""
 
     steps: int = 4000
     files: int = 24
@@ -71,12 +71,12 @@ class UvBatch(NamedTuple):
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Draw what is missing, train, save and report the error on held-out heads."""
+    """Draw missing cases, train, save and report the error on held-out heads."""
     parser = argparse.ArgumentParser(prog="python -m pipelines.track.face_uv_training.train")
     parser.add_argument("--cases", type=Path, required=True, help="folder for drawn cases")
     parser.add_argument("--ict", help="ICT-FaceKit checkout or .npz to train on as well")
     parser.add_argument(
-        "--files", type=int, default=UvTrainingPlan.files, help="files of cases a head"
+        "--files", type=int, default=UvTrainingPlan.files, help="files of cases per head"
     )
     parser.add_argument(
         "--steps", type=int, default=UvTrainingPlan.steps, help="batches of 32 charts"
@@ -201,7 +201,7 @@ def marks_loss(net: LandmarkNet, batch: UvBatch) -> tuple[torch.Tensor, torch.Te
 
 @torch.inference_mode()
 def validate(net: LandmarkNet, cases: list[Case]) -> str:
-    """What is left of the displacements of landmarks in cases as they were drawn."""
+    """Measure the landmarks' error left in cases as they were drawn."""
     batch = make_batch(cases)
     _, after = marks_loss(net, batch)
     home = torch.from_numpy(to_window(mark_places())).float()
