@@ -38,6 +38,7 @@ from express50.twin.truth import Truth
 from pipelines import calibrate, frames, ingest, matte
 from pipelines.ingest import register
 from pipelines.track import STAGE
+from pipelines.track.stage import run as track_subject
 
 EXPRESSIONS = ("neutral", "smile", "jaw_open", "pucker", "brow_raise", "wink_left")
 PRESETS = ("draft", "standard", "reference")
@@ -209,7 +210,7 @@ def track(
     """Errors of a subject's frames, and what the stage itself says and costs."""
     with tempfile.TemporaryDirectory() as scratch:
         began = time.process_time()
-        metrics = STAGE.run(dataset, subject, config, Path(scratch)).metrics
+        metrics = track_subject(dataset, subject, config, Path(scratch)).metrics
         seconds = time.process_time() - began
         errors = compare(dataset, truth, subject, Path(scratch) / "track.npz", views)
     return errors, {"seconds": seconds, "detected_px": metrics["landmark_rms_px_mean"]}
