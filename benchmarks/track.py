@@ -38,7 +38,7 @@ from express50.twin.truth import Truth
 from pipelines import calibrate, frames, ingest, matte
 from pipelines.ingest import register
 from pipelines.track import STAGE
-from pipelines.track.stage import run as track_subject
+from pipelines.track import run as track_subject
 
 EXPRESSIONS = ("neutral", "smile", "jaw_open", "pucker", "brow_raise", "wink_left")
 PRESETS = ("draft", "standard", "reference")
