@@ -109,8 +109,8 @@ def as_markdown(rows: list[dict], cameras: int) -> list[str]:
     text = (
         f"Made by `python -m benchmarks.track_sweep`: one twin subject, {len(EXPRESSIONS)}"
         f" expressions, {cameras} cameras. One thing is changed at a time from `standard`; errors"
-        " are root mean squares against the truth, seconds are processor seconds per frame. One head:"
-        " differences under 0.1 mm are not to be trusted."
+        " are root mean squares against the truth, seconds are processor seconds per frame. One"
+        " head: differences under 0.1 mm are not to be trusted."
     )
     head = "| setting | face mm | head mm | jaw degrees | outline IoU | seconds |"
     lines = [

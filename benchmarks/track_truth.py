@@ -215,7 +215,7 @@ def mean(values: list[float]) -> float | None:
 
 
 def r_squared(found: np.ndarray, true: np.ndarray) -> float | None:
-    """Return 1 - squared error / variance about each coefficient's mean over frames, of (E, X) arrays.
+    """Return 1 - squared error / variance about each coefficient's mean over frames, (E, X).
 
     Pooled over coefficients; None where nothing varies.
     """

@@ -282,7 +282,7 @@ class _PaintedScene:
         return np.sqrt(color)
 
     def flow(self, places: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Find where the true skin at places (N, 3) of the wrong mesh belongs: (N, 2), known (N,)."""
+        """Find where the true skin at places (N, 3) of the mesh belongs: (N, 2), known (N,)."""
         rays = np.concatenate([places + REACH_M * normals, -normals], axis=1)
         hit, face, bary = self._cast(rays, 2 * REACH_M)
         hit &= self.front[face]
