@@ -22,6 +22,7 @@ from express50.head.model import HeadModel, landmarks
 from pipelines.track.observe import facing
 from pipelines.track.outline import OutlineTerm
 from pipelines.track.state import Target
+from pipelines.track.terms import PixelTerm
 
 TILE = 384
 SHEET_TILE, COLUMNS = 192, 8
@@ -275,5 +276,13 @@ def track_metrics(model: HeadModel, targets: list[Target], vertices: np.ndarray)
         "outline_views": sum(
             isinstance(term, OutlineTerm) for target in targets for term in target.terms
         ),
+        "marked_views": sum(map(_marked_views, targets)),
         "head": model.name,
     }
+
+
+def _marked_views(target: Target) -> int:
+    """Count the views whose irises or visible jaw line were fitted."""
+    terms = [term for term in target.terms if isinstance(term, PixelTerm)]
+    seen = [sighting for term in terms for sighting in term.sightings]
+    return len({sighting.camera.id for sighting in seen if len(sighting.rows)})

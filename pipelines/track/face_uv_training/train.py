@@ -79,7 +79,7 @@ def main(arguments: list[str] | None = None) -> int:
         "--files", type=int, default=UvTrainingPlan.files, help="files of cases per head"
     )
     parser.add_argument(
-        "--steps", type=int, default=UvTrainingPlan.steps, help="batches of 32 charts"
+        "--steps", type=int, default=UvTrainingPlan.steps, help="batches of 32 maps"
     )
     parser.add_argument("--seed", type=int, default=UvTrainingPlan.seed)
     parser.add_argument("--start", type=Path, default=START, help="weights to go on from")
@@ -170,7 +170,7 @@ def read_cases(path: Path) -> list[Case]:
 
 
 def make_batch(cases: list[Case], rng: np.random.Generator | None = None) -> UvBatch:
-    """Windows of charts, with creases drawn into them if `rng` is given, and their landmarks."""
+    """Cut windows of maps, with creases drawn in if `rng` is given, and their landmarks."""
     found = [where_seen(case, to_texels(MARKS)) for case in cases]
     maps = [case.colors for case in cases]
     if rng is not None:
