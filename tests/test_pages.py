@@ -25,7 +25,7 @@ def test_links_and_mentioned_files_exist(page):
     linked = re.findall(r"\]\(([^)#:]+)\)", text)
     assert [link for link in linked if not (page.parent / link).exists()] == []
     mentioned = re.findall(
-        r"\b(?:express50|pipelines|annotations|grmm|benchmarks|tests|docs|scripts)/[\w/]+\.\w+",
+        r"\b(?:express50|pipelines|annotations|grmm|benchmarks|tests|docs|scripts)/[\w/]+\.(?:py|md|h|json|toml)\b",
         text,
     )
     assert sorted({path for path in mentioned if not (REPOSITORY / path).exists()}) == []

@@ -7,7 +7,7 @@ from pathlib import Path
 from express50.errors import HeadModelError
 from express50.head.model import HeadModel
 
-_KINDS = '"procedural", a FLAME .pkl, an ICT-FaceKit checkout or an ICT .npz'
+_KINDS = '"procedural", a FLAME .pkl, an ICT-FaceKit checkout, an .npz of its arrays, or a stored head model'
 
 
 def load_head(spec: str | Path) -> HeadModel:
@@ -16,7 +16,8 @@ def load_head(spec: str | Path) -> HeadModel:
     Args:
         spec: "procedural" for the built-in head, else a path: `*.pkl` is the user's FLAME model
             (its landmark embedding and masks are looked for beside it), a folder is a checkout of
-            ICT-FaceKit, `*.npz` holds ICT-FaceKit's arrays.
+            ICT-FaceKit, `*.npz` holds ICT-FaceKit's arrays or a head model of your own
+            (docs/RECIPES.md).
 
     Raises:
         HeadModelError: unknown name, missing file or damaged content.
@@ -28,6 +29,11 @@ def load_head(spec: str | Path) -> HeadModel:
     path = Path(spec).expanduser()
     if not path.exists():
         raise HeadModelError(f"head model {str(spec)!r}: no such file or folder; expected {_KINDS}")
+    if path.suffix == ".npz":
+        from express50.head.builtin import is_stored, load_stored
+
+        if is_stored(path):
+            return load_stored(path, path.stem)
     if path.is_dir() or path.suffix == ".npz":
         from express50.head.ict import load_ict
 
