@@ -7,7 +7,10 @@ from pathlib import Path
 from express50.errors import HeadModelError
 from express50.head.model import HeadModel
 
-_KINDS = '"procedural", a FLAME .pkl, an ICT-FaceKit checkout, an .npz of its arrays, or a stored head model'
+_KINDS = (
+    '"procedural", a FLAME .pkl, an ICT-FaceKit checkout, an .npz of its arrays, or a stored head'
+    " model"
+)
 
 
 def load_head(spec: str | Path) -> HeadModel:
