@@ -19,6 +19,8 @@ import torch
 from pipelines.track.basis import POSE_SIZE, Basis
 from pipelines.track.crops import FrameSetCrops
 from pipelines.track.eyes_and_jaw import EyeOffsets, lid_terms, with_irises_and_jaw
+from pipelines.track.face_uv import slide_term, with_slide
+from pipelines.track.face_uv_map import FaceUvMap
 from pipelines.track.fit import fit
 from pipelines.track.observe import Observation
 from pipelines.track.photo_consistency import SkinSamples, patch_terms
@@ -56,6 +58,7 @@ class ClipTracker:
         stride: frames between tracked frames.
         eyes: from `measure_eyes`.
         skin: where the surface is searched for.
+        uv_map: of the face, on which landmarks are found anew; None for none.
         pictures: reads a frame's crops; None fits landmarks alone.
         rounds: of searching for the surface per frame.
         sweeps: of smoothing.
@@ -65,6 +68,7 @@ class ClipTracker:
     stride: int = 1
     eyes: EyeOffsets | None = None
     skin: SkinSamples | None = None
+    uv_map: FaceUvMap | None = None
     pictures: Pictures | None = None
     rounds: int = 0
     sweeps: int = SWEEPS
@@ -164,6 +168,8 @@ def fit_to_pictures(tracker: ClipTracker, target: Target, pose: Pose) -> tuple[T
         trust = FIRST_TRUST ** (tracker.rounds - 1 - done)
         found = patch_terms(person.model, tracker.skin, pictures, mesh, reach, trust)
         seen = replace(target, terms=(*target.terms, *found))
+        if tracker.uv_map is not None:
+            seen = with_slide(seen, slide_term(person.model, tracker.uv_map, pictures, mesh))
         state, _ = fit(person, [seen], state, ROUND_STEPS)
     return seen, state.poses[0]
 

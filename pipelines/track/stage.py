@@ -111,7 +111,9 @@ def run(
     metrics |= {"schedule": schedule_table(schedule), "suspect_cameras": suspects}
     if config.frames == "clips":
         person = freeze_shape(basis, state.shape, state.bias)
-        tracker = ClipTracker(person, config.stride, eyes, evidence.skin, rounds=config.clip_rounds)
+        tracker = ClipTracker(
+            person, config.stride, eyes, evidence.skin, evidence.uv_map, rounds=config.clip_rounds
+        )
         shape = split_shape(basis.model, state.shape)[0]
         digests = {k: path_digest(v) if isinstance(v, Path) else v for k, v in inputs.items()}
         identity = f"{value_digest(digests)} {asdict(config)}"
