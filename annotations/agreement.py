@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
@@ -82,13 +82,14 @@ def agreement(clips: Sequence[MarkedClip], seed: int = 0) -> dict[str, object]:
         blank = dict.fromkeys((*(f"within_{k}" for k in WITHIN), "median_frames", "slip_rate"))
         return {"clips": 0, "pairs": 0} | blank | {"alpha": None, "alpha_interval": None}
     units = [clip_times(clip) for clip in clips]
+    alpha = interval_alpha(units)
     return {
         "clips": len(clips),
         "pairs": len(distances),
         **{f"within_{k}": round(float((distances <= k).mean()), 4) for k in WITHIN},
         "median_frames": float(np.median(distances)),
         "slip_rate": round(float((distances > SLIP_FRAMES).mean()), 4),
-        "alpha": _rounded(interval_alpha(units)),
+        "alpha": None if alpha is None else round(alpha, 4),
         "alpha_interval": alpha_interval(units, seed),
     }
 
@@ -130,10 +131,6 @@ def alpha_interval(units: Sequence[np.ndarray], seed: int = 0) -> list[float] | 
     return [round(float(q), 4) for q in np.quantile(kept, tails)]
 
 
-def _rounded(value: float | None) -> float | None:
-    return None if value is None else round(value, 4)
-
-
 def by_expression(clips: Sequence[MarkedClip]) -> dict[str, dict[str, object]]:
     """Compute the agreement on each expression."""
     return _grouped(clips, lambda clip: [(clip.expression, clip.frames)])
@@ -172,10 +169,6 @@ class Disagreement:
     spread: int | None
     said: dict[str, str]
     settled: str | None
-
-    def to_json(self) -> dict[str, object]:
-        """JSON form."""
-        return asdict(self)
 
 
 def disagreements(
@@ -259,10 +252,12 @@ def current_voices(dataset: Dataset, subject: str, expression: str) -> dict[str,
     """Read each person's label of one clip.
 
     Raises:
-        AnnotationError: nobody labelled it.
+        AnnotationError: it has no label.
     """
     said = labels_by_person(read_labels(dataset, subject))
     voices = {who: own[expression] for who, own in said.items() if expression in own}
     if not voices:
-        raise AnnotationError(f"{subject} {expression}: nobody has labelled it; nothing to settle")
+        raise AnnotationError(
+            f"{subject} {expression}: no person labelled it; label it before you settle it"
+        )
     return voices

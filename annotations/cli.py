@@ -148,7 +148,7 @@ def run_review(args: argparse.Namespace) -> int:
     wanted = chosen_subjects(args.dataset, args.subject)
     queue = disagreements(args.dataset, args.beyond, args.all, wanted)
     if args.json:
-        say_json([row.to_json() for row in queue])
+        say_json([asdict(row) for row in queue])
         return OK
     for row in queue:
         said = ", ".join(f"{who} {what}" for who, what in row.said.items())

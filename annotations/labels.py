@@ -165,6 +165,14 @@ def find_camera(index: Index, camera: str) -> CameraSource:
     return index.cameras[camera]
 
 
+def shows_labelled_frame(index: Index, label: Label) -> bool:
+    """Return whether the footage still holds the very frame that was labelled."""
+    source, frame = index.cameras.get(label.camera or ""), label.frame or 0
+    if source is None or not 0 <= frame < source.frames:
+        return False
+    return source.dhash[frame] == label.dhash
+
+
 def _check_frame(index: Index, cue: Cue, source: CameraSource, frame: int) -> None:
     last = min(cue.end_frame, source.frames - 1)
     if not cue.start_frame <= frame <= last:

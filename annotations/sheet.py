@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 from collections import Counter
-from collections.abc import Collection, Sequence
+from collections.abc import Collection
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -12,11 +12,11 @@ import jinja2
 import numpy as np
 
 from annotations.agreement import disagreements
-from annotations.labels import AUTOMATIC, Label
+from annotations.labels import AUTOMATIC, Label, shows_labelled_frame
 from annotations.store import current_labels, is_person, read_labels
 from annotations.suggestions import Suggested, read_suggestions, reference_subject
 from annotations.ui.frames import FaceFinder, crop_to, zoom_box
-from express50.capture.expressions import load_script
+from express50.capture.expressions import expression_words
 from express50.capture.frames import read_proxy
 from express50.capture.index import Index, read_index
 from express50.contract.exclusions import exclusion_reason, included_subjects
@@ -35,7 +35,7 @@ class Tile:
     Attributes:
         subject, expression: whose, and of what.
         state: who chose the frame (``person``, ``rule``, ``auto``: a suggestion accepted by the
-            align stage, ``suggestion``: one that nobody accepted), or ``flagged`` or ``missing``.
+            align stage, ``suggestion``: one not yet accepted), or ``flagged`` or ``missing``.
         reference: whether this is the reference's canonical frame.
         frame, camera: what to show; no frame where there is nothing to show. A flagged tile
             shows what was suggested, so that the flag can be judged.
@@ -79,11 +79,15 @@ class Sheet:
     subjects: list[str]
     notes: list[str]
 
+    @property
+    def tiles(self) -> list[Tile]:
+        """Every tile, row by row."""
+        return [tile for row in self.rows for tile in row.tiles]
+
     def counts(self) -> dict[str, int]:
-        """Tiles by state, and how many are doubtful."""
-        tiles = [tile for row in self.rows for tile in row.tiles]
-        states = Counter(tile.state for tile in tiles)
-        return {s: states[s] for s in STATES} | {"doubtful": sum(t.doubtful for t in tiles)}
+        """Count the tiles by state, and the doubtful ones."""
+        states = Counter(tile.state for tile in self.tiles)
+        return {s: states[s] for s in STATES} | {"doubtful": sum(t.doubtful for t in self.tiles)}
 
 
 def make_sheet(
@@ -93,7 +97,7 @@ def make_sheet(
     camera: str | None = None,
     sure: float = SURE,
 ) -> Sheet:
-    """The sheet of some subjects and expressions, all by default; excluded subjects are left out.
+    """Make the sheet of some subjects and expressions; excluded subjects are left out.
 
     Args:
         dataset: an ingested dataset.
@@ -121,16 +125,17 @@ def make_sheet(
     for name in (n for n in names if not expressions or n in expressions):
         first = columns[reference].get(name, Tile(subject=reference, expression=name))
         tiles = [replace(first, reference=True)]
-        tiles += [columns[s].get(name, _absent(s, name)) for s in chosen[1:]]
-        wanted = camera or first.camera
-        rows.append(SheetRow(name, *_words(name), [_seen_by(t, wanted, indexes) for t in tiles]))
-    notes += [f"{s} is excluded: {r}" for s in dataset.subjects() if (r := _excluded(dataset, s))]
+        for subject in chosen[1:]:
+            absent = Tile(subject=subject, expression=name, words="not recorded")
+            tiles.append(columns[subject].get(name, absent))
+        seen = [_seen_by(tile, camera or first.camera, indexes) for tile in tiles]
+        title, description = expression_words(name)
+        rows.append(SheetRow(name, title, description, seen))
+    for subject in dataset.subjects():
+        reason = exclusion_reason(dataset, subject)
+        if reason is not None:
+            notes.append(f"{subject} is excluded: {reason or 'no reason given'}")
     return Sheet(rows, reference, chosen, notes)
-
-
-def _excluded(dataset: Dataset, subject: str) -> str | None:
-    reason = exclusion_reason(dataset, subject)
-    return reason if reason is None else reason or "no reason given"
 
 
 def _check_known(what: str, wanted: Collection[str] | None, known: Collection[str]) -> None:
@@ -142,17 +147,8 @@ def _check_known(what: str, wanted: Collection[str] | None, known: Collection[st
         )
 
 
-def _words(expression: str) -> tuple[str, str]:
-    entry = next((e for e in load_script() if e.id == expression), None)
-    return (expression, "") if entry is None else (entry.name, entry.description)
-
-
-def _absent(subject: str, expression: str) -> Tile:
-    return Tile(subject=subject, expression=expression, words="not recorded")
-
-
 def _seen_by(tile: Tile, camera: str, indexes: dict[str, Index]) -> Tile:
-    """The tile in a camera, where the subject's has one of that name that holds the frame."""
+    """Show the tile in a camera, if the subject has it and it holds the frame."""
     source = indexes[tile.subject].cameras.get(camera)
     if tile.frame is None or source is None or tile.frame >= source.frames:
         return tile
@@ -160,7 +156,7 @@ def _seen_by(tile: Tile, camera: str, indexes: dict[str, Index]) -> Tile:
 
 
 def _column(dataset: Dataset, index: Index, sure: float, notes: list[str]) -> dict[str, Tile]:
-    """All tiles of a subject by expression."""
+    """Make the tiles of a subject by expression."""
     try:
         suggestions = read_suggestions(dataset, index.subject)
     except FormatError as error:
@@ -174,19 +170,21 @@ def _column(dataset: Dataset, index: Index, sure: float, notes: list[str]) -> di
     tiles = {}
     for cue in index.cues:
         name = cue.expression_id
-        tile = Tile(
-            subject=index.subject,
-            expression=name,
-            first=cue.start_frame,
-            last=min(cue.end_frame, index.frames - 1),
-        )
+        last = min(cue.end_frame, index.frames - 1)
+        tile = Tile(subject=index.subject, expression=name, first=cue.start_frame, last=last)
         tile = _filled(tile, index, force.get(name), suggestions.get(name))
-        tiles[name] = _doubted(tile, disputes.get(name), sure)
+        doubts = [tile.words] if tile.state not in ("flagged", "missing") and tile.words else []
+        if name in disputes:
+            doubts.append(disputes[name])
+        # Not "less than": a NaN confidence must not pass for a sure one.
+        unsure = tile.confidence is not None and not tile.confidence >= sure
+        words = "; ".join(doubts) or tile.words
+        tiles[name] = replace(tile, words=words, doubtful=bool(doubts) or unsure)
     return tiles
 
 
 def _filled(tile: Tile, index: Index, label: Label | None, hint: Suggested | None) -> Tile:
-    """The tile with the label in force, else with the suggestion."""
+    """Fill a tile with the label in force, else with the suggestion."""
     fallback = next(iter(index.cameras))
     if hint is not None and tile.first <= hint.frame <= tile.last:
         camera = hint.camera if hint.camera in index.cameras else fallback
@@ -207,32 +205,8 @@ def _filled(tile: Tile, index: Index, label: Label | None, hint: Suggested | Non
         camera=label.camera if label.camera in index.cameras else fallback,
         by=label.annotator + (", settled" if label.action == "settle" else ""),
         confidence=label.confidence if automatic else None,
-        words=_other_footage(index, label),
+        words="" if shows_labelled_frame(index, label) else "labelled on other footage",
     )
-
-
-def _other_footage(index: Index, label: Label) -> str:
-    """A warning where the label was made on other footage than what lies here now."""
-    source = index.cameras.get(label.camera or "")
-    frame = label.frame or 0
-    same = source is not None and 0 <= frame < source.frames and source.dhash[frame] == label.dhash
-    return "" if same else "labelled on other footage"
-
-
-def _doubted(tile: Tile, dispute: str | None, sure: float) -> Tile:
-    """The tile with what speaks against it."""
-    doubts = [tile.words] if tile.state not in ("flagged", "missing") and tile.words else []
-    if dispute:
-        doubts.append(dispute)
-    # Not "less than": a confidence that is no number must not pass for a sure one.
-    unsure = tile.confidence is not None and not tile.confidence >= sure
-    words = "; ".join(doubts) or tile.words
-    return replace(tile, words=words, doubtful=bool(doubts) or unsure)
-
-
-def tiles_of(rows: Sequence[SheetRow]) -> list[Tile]:
-    """Every tile, row by row."""
-    return [tile for row in rows for tile in row.tiles]
 
 
 WIDTH, HEIGHT = 176, 220  # pixels of a tile; shown smaller, so that it can be enlarged
@@ -249,7 +223,7 @@ class Pictures:
         strip: the frames around it in one picture.
         first: frame of the strip's first picture.
         count: how many pictures the strip holds.
-        problem: why there is no picture.
+        problem: the reason where the picture is missing.
     """
 
     face: str = ""
@@ -262,7 +236,7 @@ class Pictures:
 def render_sheet(
     dataset: Dataset, sheet: Sheet, *, faces: FaceFinder | None = None, around: int = 0
 ) -> str:
-    """The page as text.
+    """Render the page as text.
 
     Args:
         dataset: where the proxies are.
@@ -272,7 +246,7 @@ def render_sheet(
     """
     pictures = {
         (tile.subject, tile.expression): take_pictures(dataset, tile, faces, around)
-        for tile in tiles_of(sheet.rows)
+        for tile in sheet.tiles
     }
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("annotations", "."),
@@ -280,20 +254,19 @@ def render_sheet(
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    several = len(sheet.subjects) > 2
     return environment.get_template("sheet.html").render(
         title=f"Labels of {dataset.root.resolve().name}",
         sheet=sheet,
         counts=sheet.counts(),
         pictures=pictures,
-        several=several,
+        several=len(sheet.subjects) > 2,
         size=(WIDTH, HEIGHT),
         caption=caption,
     )
 
 
 def take_pictures(dataset: Dataset, tile: Tile, faces: FaceFinder | None, around: int) -> Pictures:
-    """The face of a tile's frame and, in the same framing, of the frames around it."""
+    """Crop the face of a tile's frame and, in the same framing, of the frames around it."""
     if tile.frame is None:
         return Pictures()
     read = partial(read_proxy, dataset, tile.subject, tile.camera)
@@ -317,9 +290,9 @@ def _data(image: np.ndarray) -> str:
 
 
 def caption(tile: Tile) -> str:
-    """Frame, who chose it and how sure that was, in one short line."""
+    """Name the frame, who chose it and how sure that was, in one short line."""
     if tile.state == "missing":
-        return ""  # the empty tile itself says why
+        return ""  # the empty tile shows the reason
     if tile.state == "flagged":
         return f"flagged: {tile.words} ({tile.by})"
     sure = "" if tile.confidence is None else f" {tile.confidence:.0%}"

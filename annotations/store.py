@@ -45,26 +45,16 @@ def append_label(dataset: Dataset, label: Label) -> None:
     handle = os.open(path, os.O_RDWR | os.O_APPEND | os.O_CREAT, 0o644)
     try:
         fcntl.flock(handle, fcntl.LOCK_EX)
-        if _ends_mid_line(handle):  # a writer died half-way: its torn line must not absorb this one
-            line = b"\n" + line
-        fresh = os.fstat(handle).st_size == 0
-        _write_all(handle, line)
+        size = os.fstat(handle).st_size
+        if size and os.pread(handle, 1, size - 1) != b"\n":
+            line = b"\n" + line  # a writer died half-way: its torn line must not absorb this one
+        while line:  # a signal or a nearly full disk may cut one write short
+            line = line[os.write(handle, line) :]
         os.fsync(handle)
     finally:
         os.close(handle)
-    if fresh:  # the file's name must outlive a power cut too
+    if size == 0:  # the file's name must outlive a power cut too
         sync_directory(path.parent)
-
-
-def _write_all(handle: int, data: bytes) -> None:
-    """Write every byte: a signal or a nearly full disk may cut one write short."""
-    while data:
-        data = data[os.write(handle, data) :]
-
-
-def _ends_mid_line(handle: int) -> bool:
-    size = os.fstat(handle).st_size
-    return size > 0 and os.pread(handle, 1, size - 1) != b"\n"
 
 
 def read_labels(dataset: Dataset, subject: str) -> list[Label]:

@@ -54,14 +54,14 @@ def read_suggestions(dataset: Dataset, subject: str) -> dict[str, Suggested]:
         return {}
     try:
         rows = read_json_table(path, FormatError, "run 'express50 align' again")
-        return {expression: _checked(expression, row) for expression, row in rows.items()}
+        return {expression: _check_suggestion(expression, row) for expression, row in rows.items()}
     except (ValueError, TypeError, AttributeError, OverflowError) as error:
         raise FormatError(
             f"{path}: not a table of suggestions ({error}); run 'express50 align' again"
         ) from None
 
 
-def _checked(expression: str, row: dict[str, Any]) -> Suggested:
+def _check_suggestion(expression: str, row: dict[str, Any]) -> Suggested:
     """Check that a row's figures can be compared: NaN would upset every order."""
     found = Suggested(**row)
     if not all(type(n) is int for n in (found.frame, found.start, *found.candidates)):

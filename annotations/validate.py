@@ -1,4 +1,7 @@
-"""Checks of every label against the footage it names, and of people against each other."""
+"""Checks of every label against the footage it names, and of people against each other.
+
+The installed hook ``label_problems`` names this module; see ``pyproject.toml``.
+"""
 
 from __future__ import annotations
 
@@ -31,9 +34,22 @@ class LabelProblem:
 
 
 def problems(dataset: Dataset, subjects: list[str] | None = None) -> list[LabelProblem]:
-    """Everything wrong with the labels of some subjects, all that are not excluded by default."""
+    """List the problems of some subjects' labels, of all that are not excluded by default."""
     chosen = included_subjects(dataset) if subjects is None else subjects
-    found = [p for subject in chosen for p in _of_subject(dataset, subject)]
+    found = []
+    for subject in chosen:
+        index, labels = read_index(dataset, subject), read_labels(dataset, subject)
+        for number in unreadable_lines(dataset, subject):
+            what = f"line {number} of {dataset.labels_file(subject)} cannot be read; label it again"
+            found.append(LabelProblem(subject, "", "unreadable", what))
+        for label in labels:
+            for kind, what in _footage_problems(index, label):
+                words = f"{label.annotator}: {what}"
+                found.append(LabelProblem(subject, label.expression, kind, words))
+        force = current_labels(labels)
+        for cue in index.cues:
+            if cue.expression_id not in force:
+                found.append(LabelProblem(subject, cue.expression_id, "coverage", "no label"))
     for row in disagreements(dataset, subjects=chosen):
         if row.spread is None:
             said = ", ".join(f"{who}: {what}" for who, what in row.said.items())
@@ -42,22 +58,8 @@ def problems(dataset: Dataset, subjects: list[str] | None = None) -> list[LabelP
     return found
 
 
-def _of_subject(dataset: Dataset, subject: str) -> Iterator[LabelProblem]:
-    index, labels = read_index(dataset, subject), read_labels(dataset, subject)
-    for number in unreadable_lines(dataset, subject):
-        what = f"line {number} of {dataset.labels_file(subject)} cannot be read; label that again"
-        yield LabelProblem(subject, "", "unreadable", what)
-    for label in labels:
-        for kind, what in _of_label(index, label):
-            yield LabelProblem(subject, label.expression, kind, f"{label.annotator}: {what}")
-    force = current_labels(labels)
-    for cue in index.cues:
-        if cue.expression_id not in force:
-            yield LabelProblem(subject, cue.expression_id, "coverage", "no label")
-
-
-def _of_label(index: Index, label: Label) -> Iterator[tuple[str, str]]:
-    """Kind and words of what is wrong with one event."""
+def _footage_problems(index: Index, label: Label) -> Iterator[tuple[str, str]]:
+    """Compare one event with the footage; give the kind and the words of each problem."""
     if not label.expression:  # about the whole subject
         return
     try:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 from statistics import median
 
 from annotations.labels import AUTOMATIC, Label
 from annotations.store import current_labels, is_person, labels_of, read_labels
-from annotations.suggestions import Suggested, read_suggestions, reference_subject
+from annotations.suggestions import read_suggestions, reference_subject
 from express50.capture.demographics import age_counts, gender_counts, shown_counts
 from express50.capture.index import read_index
 from express50.capture.readers.read import read_people
@@ -41,7 +41,7 @@ def worklist(
 
     Args:
         dataset: the dataset; excluded subjects have no tasks.
-        annotator: whose own labels count as done; nobody else's do.
+        annotator: the person whose labels count as done; the labels of others do not.
         subjects: only these; all by default.
         expressions: only these; all by default.
         order: ``doubt`` (least sure first), ``expression`` (one across all subjects, then the
@@ -83,16 +83,9 @@ def _tasks_of(
     """List one entry per cue, None where it is done."""
     done = {} if everything else labels_of(read_labels(dataset, subject), annotator)
     suggestions = read_suggestions(dataset, subject)
-    return [
-        None
-        if cue.expression_id in done
-        else LabelTask(subject, cue.expression_id, _doubt(suggestions.get(cue.expression_id)))
-        for cue in read_index(dataset, subject).cues
-    ]
-
-
-def _doubt(suggestion: Suggested | None) -> float:
-    return 1.0 if suggestion is None else 1.0 - suggestion.confidence
+    doubts = {name: 1.0 - suggestion.confidence for name, suggestion in suggestions.items()}
+    names = [cue.expression_id for cue in read_index(dataset, subject).cues]
+    return [None if n in done else LabelTask(subject, n, doubts.get(n, 1.0)) for n in names]
 
 
 def coverage(dataset: Dataset) -> dict[str, dict]:
@@ -103,7 +96,11 @@ def coverage(dataset: Dataset) -> dict[str, dict]:
         ``missing``), ``missing`` (subject -> expressions), ``excluded`` (subject -> reason),
         ``gender`` and ``age`` counts of five or more people, where captures state them.
     """
-    cells = {subject: _cells(dataset, subject) for subject in included_subjects(dataset)}
+    cells = {}
+    for subject in included_subjects(dataset):
+        force = current_labels(read_labels(dataset, subject))
+        names = [cue.expression_id for cue in read_index(dataset, subject).cues]
+        cells[subject] = {name: _state(force.get(name)) for name in names}
     missing = {
         subject: [e for e, state in row.items() if state == "missing"]
         for subject, row in cells.items()
@@ -117,12 +114,6 @@ def coverage(dataset: Dataset) -> dict[str, dict]:
         "gender": shown_counts(gender_counts(people)),
         "age": shown_counts(age_counts(people)),
     }
-
-
-def _cells(dataset: Dataset, subject: str) -> dict[str, str]:
-    force = current_labels(read_labels(dataset, subject))
-    cues = read_index(dataset, subject).cues
-    return {c.expression_id: _state(force.get(c.expression_id)) for c in cues}
 
 
 def _state(label: Label | None) -> str:
@@ -157,18 +148,17 @@ def effort(dataset: Dataset) -> dict[str, dict[str, object]]:
         for label in read_labels(dataset, subject):
             if is_person(label.annotator) and label.action in ("mark", "flag"):
                 spent[label.annotator].append(label)
-    return {who: _figures(labels) for who, labels in sorted(spent.items())}
-
-
-def _figures(labels: Sequence[Label]) -> dict[str, object]:
-    followed = [x.frame == x.suggested for x in labels if x.suggested is not None]
-    return {
-        "labels": len(labels),
-        "seconds_median": _median(x.seconds for x in labels),
-        "seconds_total": round(sum(x.seconds or 0.0 for x in labels), 1),
-        "keys_median": _median(x.keys for x in labels),
-        "accepted_share": round(sum(followed) / len(followed), 4) if followed else None,
-    }
+    figures: dict[str, dict[str, object]] = {}
+    for who, labels in sorted(spent.items()):
+        followed = [x.frame == x.suggested for x in labels if x.suggested is not None]
+        figures[who] = {
+            "labels": len(labels),
+            "seconds_median": _median(x.seconds for x in labels),
+            "seconds_total": round(sum(x.seconds or 0.0 for x in labels), 1),
+            "keys_median": _median(x.keys for x in labels),
+            "accepted_share": round(sum(followed) / len(followed), 4) if followed else None,
+        }
+    return figures
 
 
 def _median(values: Iterable[float | None]) -> float | None:

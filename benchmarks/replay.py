@@ -17,11 +17,11 @@ from textual.pilot import Pilot
 
 from annotations.labels import Label
 from annotations.store import labels_of, read_labels
-from annotations.ui import view as moves
+from annotations.ui import task as moves
 from annotations.ui.app import AnnotateApp
 from annotations.ui.frames import FaceFinder
 from annotations.ui.session import Session, open_session
-from annotations.ui.view import CueView
+from annotations.ui.task import CueView
 from express50.contract.layout import Dataset
 from express50.errors import AnnotationError
 

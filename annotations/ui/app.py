@@ -11,31 +11,20 @@ from textual.binding import Binding
 
 from annotations.labels import Label
 from annotations.ui import panels, theme
-from annotations.ui import view as moves
+from annotations.ui import task as moves
 from annotations.ui.dialogs import FlagDialog, FrameDialog, HelpDialog
 from annotations.ui.frames import ZOOMS, FaceFinder, FrameCache, FrameCrop
 from annotations.ui.images import CellSize, PaneShape, SixelPainter
-from annotations.ui.keymap import GROUPS
 from annotations.ui.layout import AnnotatorScreen
 from annotations.ui.picture import PicturePane, camera_name, shots_ahead
 from annotations.ui.session import Session
-from annotations.ui.task import TaskScene, load_scene
+from annotations.ui.task import CueView, TaskScene, load_scene
+from annotations.ui.theme import GROUPS
 from annotations.ui.timeline import CurveStrip
-from annotations.ui.view import CueView
 from annotations.worklist import LabelTask
 from express50.errors import Express50Error
 
 TASKS_AHEAD, FRAMES_AHEAD = 2, 12  # pictures that are made before their task is opened
-
-
-def _bindings() -> list[Binding]:
-    rows = []
-    for key in (key for group in GROUPS.values() for key in group):
-        if key.action == "pick":
-            rows += [Binding(k, f"pick({k})", key.words, show=False) for k in key.keys.split(",")]
-        else:
-            rows.append(Binding(key.keys, key.action, key.words, show=False))
-    return rows
 
 
 def open_view_of(scene: TaskScene, hidden: bool) -> CueView | None:
@@ -54,17 +43,25 @@ def open_view_of(scene: TaskScene, hidden: bool) -> CueView | None:
 class Desk(AnnotatorScreen):
     """Turns keys into moves (view), looks (aim) and decisions (session)."""
 
-    BINDINGS = _bindings()  # type: ignore[assignment]
+    BINDINGS = [
+        Binding(
+            keys, f"pick({keys})" if key.action == "pick" else key.action, key.words, show=False
+        )
+        for group in GROUPS.values()
+        for key in group
+        for keys in (key.keys.split(",") if key.action == "pick" else [key.keys])
+    ]
 
     def on_mount(self) -> None:
         """Open the first task; look for faces once the network is there."""
         if self.faces is not None:
             self._load_faces(self.faces)
-        self.call_after_refresh(self._begin)
 
-    def _begin(self) -> None:
-        self.open_task()
-        self.session.begin()
+        def begin() -> None:
+            self.open_task()
+            self.session.begin()
+
+        self.call_after_refresh(begin)
 
     @work(thread=True, group="faces")
     def _load_faces(self, faces: FaceFinder) -> None:
@@ -165,7 +162,7 @@ class Desk(AnnotatorScreen):
 
     def action_mark(self) -> None:
         """Mark the frame under the cursor and open the next task."""
-        if self.player.plays:  # nobody can mean a frame that moves
+        if self.player.plays:  # a moving frame cannot be meant
             self.player.stop()
             self.say("stopped; Enter again marks this frame", theme.ACCENT)
         elif self.scene is not None and self.view is not None:
@@ -175,14 +172,15 @@ class Desk(AnnotatorScreen):
             self.say(self.scene.problem or "nothing to mark", theme.RED)
 
     def action_ask_flag(self) -> None:
-        """Ask why there is no peak, then flag."""
-        self.player.stop()
-        self.app.push_screen(FlagDialog(), self._flag)
+        """Ask for the reason, then flag the expression."""
 
-    def _flag(self, reason: str | None) -> None:
-        if reason is not None and self.scene is not None:
-            scene, why = self.scene, reason
-            self._decide(lambda: self.session.flag(scene, why))
+        def flag(reason: str | None) -> None:
+            if reason is not None and self.scene is not None:
+                scene = self.scene
+                self._decide(lambda: self.session.flag(scene, reason))
+
+        self.player.stop()
+        self.app.push_screen(FlagDialog(), flag)
 
     def _decide(self, decide: Callable[[], Label]) -> None:
         """Save a decision, say so once it is on disk, and open the next task."""
@@ -223,13 +221,14 @@ class Desk(AnnotatorScreen):
 
     def action_ask_frame(self) -> None:
         """Ask for a frame's number, then go there."""
+
+        def go_to(frame: int | None) -> None:
+            if frame is not None:
+                self._move(lambda view: moves.go_to(view, frame))
+
         if self.view is not None:
             self.player.stop()
-            self.app.push_screen(FrameDialog(self.view.first, self.view.last), self._go_to_frame)
-
-    def _go_to_frame(self, frame: int | None) -> None:
-        if frame is not None:
-            self._move(lambda view: moves.go_to(view, frame))
+            self.app.push_screen(FrameDialog(self.view.first, self.view.last), go_to)
 
     def action_help(self) -> None:
         """Show every key."""

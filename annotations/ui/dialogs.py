@@ -12,13 +12,13 @@ from textual.widgets import Input, Static
 
 from annotations.labels import FLAG_REASONS
 from annotations.ui import theme
-from annotations.ui.keymap import GROUPS
+from annotations.ui.theme import GROUPS
 
 SCROLLING = ("up", "down", "pageup", "pagedown", "home", "end")
 
 
 class FlagDialog(ModalScreen[str | None]):
-    """Asks why there is no usable peak: a digit decides at once, ``5`` opens a line of text."""
+    """Asks for the reason of a flag: a digit decides at once, ``5`` opens a line of text."""
 
     AUTO_FOCUS = ""  # digits must reach the dialog, not the line of text
 
@@ -40,15 +40,12 @@ class FlagDialog(ModalScreen[str | None]):
         if event.key == "escape":
             self.dismiss(None)
         elif not words.display and event.key.isdigit():
-            self._choose(int(event.key))
-
-    def _choose(self, number: int) -> None:
-        if 1 <= number <= len(FLAG_REASONS):
-            self.dismiss(FLAG_REASONS[number - 1])
-        elif number == len(FLAG_REASONS) + 1:
-            words = self.query_one(Input)
-            words.display = True
-            words.focus()
+            number = int(event.key)
+            if 1 <= number <= len(FLAG_REASONS):
+                self.dismiss(FLAG_REASONS[number - 1])
+            elif number == len(FLAG_REASONS) + 1:
+                words.display = True
+                words.focus()
 
     def on_input_submitted(self, event: Input.Submitted) -> None:
         """A reason in words; an empty one is refused."""
@@ -102,9 +99,22 @@ class HelpDialog(ModalScreen[None]):
 
 
 def help_table(wide: bool) -> Table:
-    """All keys, in one column of groups or in two; then what the signs on the strip mean."""
-    signs = _signs()
-    groups = [_group(name) for name in GROUPS]
+    """Lay all keys out in one column or in two, and explain the signs on the strip."""
+    signs = Text.assemble(
+        ("1", theme.BEST), (" surest suggestion  ", theme.FAINT),
+        ("2", theme.CANDIDATE), (" the next ones", theme.FAINT), "\n",
+        ("●", theme.BLUE), (" your mark  ", theme.FAINT),
+        ("○", theme.TEXT), (" mark in force  ", theme.FAINT),
+        ("[━]", theme.BLUE), (" plateau", theme.FAINT),
+    )  # fmt: skip
+    groups = []
+    for keys in GROUPS.values():
+        table = Table.grid(padding=(0, 1))
+        table.add_column(width=9, style=f"bold {theme.ACCENT}")
+        table.add_column(style=theme.TEXT)
+        for key in keys:
+            table.add_row(key.shown, key.words)
+        groups.append(table)
     outer = Table.grid(padding=(0, 3))
     if wide:
         right = Table.grid()
@@ -118,25 +128,6 @@ def help_table(wide: bool) -> Table:
     for part in (*groups, signs):
         outer.add_row(part)
     return outer
-
-
-def _group(name: str) -> Table:
-    table = Table.grid(padding=(0, 1))
-    table.add_column(width=9, style=f"bold {theme.ACCENT}")
-    table.add_column(style=theme.TEXT)
-    for key in GROUPS[name]:
-        table.add_row(key.shown, key.words)
-    return table
-
-
-def _signs() -> Text:
-    return Text.assemble(
-        ("1", theme.BEST), (" surest suggestion  ", theme.FAINT),
-        ("2", theme.CANDIDATE), (" the next ones", theme.FAINT), "\n",
-        ("●", theme.BLUE), (" your mark  ", theme.FAINT),
-        ("○", theme.TEXT), (" mark in force  ", theme.FAINT),
-        ("[━]", theme.BLUE), (" plateau", theme.FAINT),
-    )  # fmt: skip
 
 
 def _choice(key: str, words: str) -> Text:

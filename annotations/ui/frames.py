@@ -72,7 +72,7 @@ class FrameCache:
     def want(self, shots: Sequence[FrameCrop], *, later: bool = False) -> None:
         """Decode these in the background, in this order; earlier requests of the kind are dropped.
 
-        What is wanted later waits until nothing else is wanted.
+        Requests for ``later`` wait until no other is left.
         """
         with self._wake:
             wanted = [s for s in reversed(shots) if s not in self._pictures]
@@ -123,7 +123,14 @@ class FrameCache:
         try:
             picture = self._decode(self._dataset, shot)
         except (Express50Error, OSError, IndexError, ValueError, cv2.error) as error:
-            raise AnnotationError(_plain(shot, error)) from error
+            where = f"{shot.subject} {shot.camera} frame {shot.frame}"
+            if isinstance(error, FileNotFoundError) or isinstance(
+                error.__cause__, FileNotFoundError
+            ):
+                words = f"{where}: its proxies are missing; run 'express50 ingest' again"
+            else:
+                words = f"{where} cannot be read: {error}"
+            raise AnnotationError(words) from error
         picture.setflags(write=False)
         with self._wake:
             if shot not in self._pictures and picture.nbytes <= self._limit:
@@ -134,18 +141,9 @@ class FrameCache:
         return picture
 
 
-def _plain(shot: FrameCrop, error: Exception) -> str:
-    where = f"{shot.subject} {shot.camera} frame {shot.frame}"
-    if isinstance(error, FileNotFoundError) or isinstance(error.__cause__, FileNotFoundError):
-        return f"{where}: its proxies are missing; run 'express50 ingest' again"
-    return f"{where} cannot be read: {error}"
-
-
 def read_shot(dataset: Dataset, shot: FrameCrop) -> np.ndarray:
     """Read a frame's proxy and bring the part that is asked for to display size."""
     image = read_proxy(dataset, shot.subject, shot.camera, shot.frame)
-    if image.ndim == 2:
-        image = np.repeat(image[..., None], 3, axis=2)
     return crop_to(image, shot.box, shot.width, shot.height)
 
 
@@ -255,7 +253,7 @@ class FaceFinder:
 
     @property
     def ready(self) -> bool:
-        """Whether the network is loaded."""
+        """True once the network is loaded."""
         return self._detect is not None
 
     def load(self) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING
 
 from rich.text import Text
 from textual.app import ComposeResult
@@ -23,9 +22,8 @@ from annotations.ui.picture import (
     subject_look,
 )
 from annotations.ui.session import Session
-from annotations.ui.task import TaskScene
+from annotations.ui.task import CueView, TaskScene, go_to, step
 from annotations.ui.timeline import CurveStrip
-from annotations.ui.view import CueView, go_to, step
 
 SAY_SECONDS = 5.0
 # Rows of the strip by the terminal's height: pictures come first.
@@ -53,7 +51,6 @@ class AnnotatorScreen(Screen[None]):
         self.aim = Aim(0, ZOOMS[0], faces)
         self.player = Player(self)
         self._said: tuple[str, str] | None = None
-        self._saying = 0
 
     def compose(self) -> ComposeResult:
         """Status, words, two pictures, strip, and a line for messages and hints."""
@@ -131,26 +128,21 @@ class AnnotatorScreen(Screen[None]):
         if line.content != text:
             line.update(text)
 
-    def say(self, words: str, colour: str = theme.GREEN, *, stay: bool = False) -> None:
-        """Show a message in place of the hints, for some seconds or until another is said."""
-        self._said = (words, colour)
-        self._saying += 1
-        if not stay:
-            said = self._saying
-            self.set_timer(SAY_SECONDS, lambda: self._hush(said))
+    def say(self, words: str, colour: str = theme.GREEN) -> None:
+        """Show a message in place of the hints, for some seconds or until the next message."""
+        self._said = said = (words, colour)
+
+        def hush() -> None:
+            if self._said is said:
+                self._said = None
+                self._draw_message()
+
+        self.set_timer(SAY_SECONDS, hush)
         self._draw_message()
 
-    def _hush(self, said: int) -> None:
-        if said == self._saying:
-            self._said = None
-            self._draw_message()
-
-
-if TYPE_CHECKING:
-    from annotations.ui.layout import AnnotatorScreen
 
 BLINK_SECONDS = 0.45
-SLOWEST, FASTEST = 2.0, 30.0  # frames a second that are played
+SLOWEST, FASTEST = 2.0, 30.0  # frames per second that are played
 
 
 class Player:
@@ -164,12 +156,12 @@ class Player:
 
     @property
     def plays(self) -> bool:
-        """Whether the window is being played."""
+        """True while the window is played."""
         return self._playing is not None
 
     @property
     def blinks(self) -> bool:
-        """Whether frame and reference take turns."""
+        """True while frame and reference take turns."""
         return self._blinking is not None
 
     def play(self) -> None:

@@ -9,11 +9,10 @@ from rich.text import Text
 
 from annotations.labels import Label
 from annotations.ui import theme
-from annotations.ui.keymap import HINTS
 from annotations.ui.picture import FrameLook
 from annotations.ui.session import Session
-from annotations.ui.task import TaskScene
-from annotations.ui.view import CueView
+from annotations.ui.task import CueView, TaskScene
+from annotations.ui.theme import HINTS
 
 LEAST_CELLS = 6  # fewer say nothing
 

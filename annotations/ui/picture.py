@@ -16,9 +16,8 @@ from annotations.suggestions import Suggested
 from annotations.ui import theme
 from annotations.ui.frames import Face, FaceFinder, FrameCache, FrameCrop, zoom_box
 from annotations.ui.images import BlockPainter, Painter, PaneShape
-from annotations.ui.task import TaskScene
+from annotations.ui.task import CueView, TaskScene
 from annotations.ui.timeline import StripContent
-from annotations.ui.view import CueView
 from express50.capture.index import CameraSource
 from express50.errors import AnnotationError
 

@@ -20,8 +20,7 @@ from annotations.labels import (
     with_plateau,
 )
 from annotations.store import append_label, is_person, labels_of, read_labels
-from annotations.ui.task import TaskScene
-from annotations.ui.view import CueView, plateau_problem
+from annotations.ui.task import CueView, TaskScene, plateau_problem
 from annotations.worklist import LabelTask, worklist
 from express50.capture.index import read_index
 from express50.contract.layout import Dataset

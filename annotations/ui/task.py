@@ -1,10 +1,14 @@
-"""The data of one task: footage, suggestion, reference and labels, read at once."""
+"""The state of one task: its data, and the position in its cue window.
+
+``load_scene`` reads footage, suggestion, reference and labels at once. The functions of a
+``CueView`` are pure: each takes a view and returns another.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
-from annotations.labels import Label
+from annotations.labels import Label, shows_labelled_frame
 from annotations.store import current_labels, labels_of, read_labels
 from annotations.suggestions import (
     CanonicalFrame,
@@ -14,7 +18,7 @@ from annotations.suggestions import (
     reference_subject,
 )
 from annotations.worklist import LabelTask
-from express50.capture.expressions import load_script
+from express50.capture.expressions import expression_words
 from express50.capture.index import Index, read_index
 from express50.contract.layout import Dataset
 from express50.errors import Express50Error
@@ -29,7 +33,7 @@ class TaskScene:
         name, description: of the expression.
         index: the subject's footage; None where it cannot be read.
         first, last: the cue window, both inside.
-        cameras: camera ids, the one that sees the face best first.
+        cameras: camera ids from the suggestion's on, which sees the face best.
         suggestion: what align suggested; None where it did not run.
         reference: the reference's canonical frame of the expression, None where there is none.
         reference_index: footage of the reference; None where it cannot be read.
@@ -70,37 +74,43 @@ class TaskScene:
 
 def load_scene(dataset: Dataset, task: LabelTask, annotator: str) -> TaskScene:
     """Read a task; faults become ``problem`` or ``notes``, not exceptions."""
-    name, description = _words(task.expression)
+    name, description = expression_words(task.expression)
+    description = description or "Not in the built-in script: match the reference."
+    scene = TaskScene(task=task, name=name, description=description)
     try:
-        return _load(dataset, task, annotator, name, description)
+        return _load(dataset, scene, annotator)
     except (Express50Error, OSError) as error:
-        return TaskScene(task=task, name=name, description=description, problem=str(error))
+        return replace(scene, problem=str(error))
 
 
-def _load(
-    dataset: Dataset, task: LabelTask, annotator: str, name: str, description: str
-) -> TaskScene:
+def _load(dataset: Dataset, scene: TaskScene, annotator: str) -> TaskScene:
+    task = scene.task
     index = read_index(dataset, task.subject)
     cue = next((c for c in index.cues if c.expression_id == task.expression), None)
     last = -1 if cue is None else min(cue.end_frame, index.frames - 1)
     if cue is None or last < cue.start_frame:
         problem = f"{task.subject} has no footage of {task.expression}: see its cues.csv"
-        return TaskScene(task=task, name=name, description=description, problem=problem)
+        return replace(scene, problem=problem)
     notes: list[str] = []
     suggestion = _suggestion(dataset, task, notes)
     reference, reference_index, is_reference = _reference(dataset, task, notes)
     labels = read_labels(dataset, task.subject)
     mine = labels_of(labels, annotator).get(task.expression)
     in_force = current_labels(labels).get(task.expression)
-    notes += [n for label in (mine, in_force) if (n := _identity_note(index, label))]
-    return TaskScene(
-        task=task,
-        name=name,
-        description=description,
+    notes += [
+        f"{label.annotator}'s frame {label.frame} of {label.camera} is another picture in today's "
+        "footage: look again and mark anew"
+        for label in (mine, in_force)
+        if label is not None and label.frame is not None and not shows_labelled_frame(index, label)
+    ]
+    names = list(index.cameras)
+    best = names.index(suggestion.camera) if suggestion and suggestion.camera in names else 0
+    return replace(
+        scene,
         index=index,
         first=cue.start_frame,
         last=last,
-        cameras=_order_cameras(index, suggestion),
+        cameras=tuple(names[best:] + names[:best]),
         suggestion=suggestion,
         reference=reference,
         reference_index=reference_index,
@@ -109,13 +119,6 @@ def _load(
         in_force=in_force,
         notes=tuple(dict.fromkeys(notes)),
     )
-
-
-def _words(expression: str) -> tuple[str, str]:
-    entry = next((e for e in load_script() if e.id == expression), None)
-    if entry is None:
-        return expression, "Not in the built-in script: match the reference."
-    return entry.name, entry.description
 
 
 def _suggestion(dataset: Dataset, task: LabelTask, notes: list[str]) -> Suggested | None:
@@ -149,23 +152,91 @@ def _reference(
     return frame, index, is_reference
 
 
-def _order_cameras(index: Index, suggestion: Suggested | None) -> tuple[str, ...]:
-    """The suggestion's camera first, then the others in their own order from there on."""
-    names = list(index.cameras)
-    best = suggestion.camera if suggestion is not None else ""
-    start = names.index(best) if best in names else 0
-    return tuple(names[start:] + names[:start])
+@dataclass(frozen=True, kw_only=True)
+class CueView:
+    """Position within one task.
+
+    Attributes:
+        first, last: the cue window, both inside.
+        cursor: the frame that is shown.
+        candidates: suggested frames, best first; empty where none is known or shown.
+        candidate: which of them was visited last.
+        plateau_first, plateau_last: ends of the plateau where they were set.
+    """
+
+    first: int
+    last: int
+    cursor: int
+    candidates: tuple[int, ...] = ()
+    candidate: int = 0
+    plateau_first: int | None = None
+    plateau_last: int | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse a cursor outside the window."""
+        if not self.first <= self.cursor <= self.last:
+            raise ValueError(f"cursor {self.cursor} lies outside {self.first} to {self.last}")
 
 
-def _identity_note(index: Index, label: Label | None) -> str | None:
-    """A warning where a label was made on other footage than what lies here now."""
-    if label is None or label.frame is None or label.camera is None:
+def open_view(
+    first: int, last: int, candidates: tuple[int, ...] = (), cursor: int | None = None
+) -> CueView:
+    """A fresh view: on the given frame, else on the best candidate, else in the window's middle."""
+    inside = tuple(dict.fromkeys(c for c in candidates if first <= c <= last))
+    if cursor is None or not first <= cursor <= last:
+        cursor = inside[0] if inside else (first + last) // 2
+    return CueView(first=first, last=last, cursor=cursor, candidates=inside)
+
+
+def go_to(view: CueView, frame: int) -> CueView:
+    """Move to a frame; the window's ends stop the cursor, it never wraps."""
+    return replace(view, cursor=min(max(frame, view.first), view.last))
+
+
+def step(view: CueView, by: int) -> CueView:
+    """Move by some frames."""
+    return go_to(view, view.cursor + by)
+
+
+def next_candidate(view: CueView, by: int) -> CueView:
+    """Move to the next (1) or previous (-1) candidate, round and round."""
+    if not view.candidates:
+        return view
+    # Away from every candidate the first press returns to the one visited last.
+    away = view.cursor not in view.candidates
+    here = view.candidate if away else view.candidates.index(view.cursor)
+    return pick_candidate(view, here if away and by > 0 else (here + by) % len(view.candidates))
+
+
+def pick_candidate(view: CueView, number: int) -> CueView:
+    """Move to a candidate by its rank, 0 the best; where there is none the view stays."""
+    if not 0 <= number < len(view.candidates):
+        return view
+    return replace(go_to(view, view.candidates[number]), candidate=number)
+
+
+def set_plateau_first(view: CueView) -> CueView:
+    """The plateau begins here; the same key on the same frame takes it back."""
+    if view.plateau_first == view.cursor:
+        return replace(view, plateau_first=None)
+    last = view.plateau_last
+    keep = last is None or last >= view.cursor
+    return replace(view, plateau_first=view.cursor, plateau_last=last if keep else None)
+
+
+def set_plateau_last(view: CueView) -> CueView:
+    """The plateau ends here; the same key on the same frame takes it back."""
+    if view.plateau_last == view.cursor:
+        return replace(view, plateau_last=None)
+    first = view.plateau_first
+    keep = first is None or first <= view.cursor
+    return replace(view, plateau_last=view.cursor, plateau_first=first if keep else None)
+
+
+def plateau_problem(view: CueView) -> str | None:
+    """Say why the cursor cannot be marked with this plateau; None when it can."""
+    low = view.first if view.plateau_first is None else view.plateau_first
+    high = view.last if view.plateau_last is None else view.plateau_last
+    if low <= view.cursor <= high:
         return None
-    source = index.cameras.get(label.camera)
-    known = source is not None and 0 <= label.frame < source.frames
-    if known and source is not None and source.dhash[label.frame] == label.dhash:
-        return None
-    return (
-        f"{label.annotator}'s frame {label.frame} of {label.camera} is another picture in today's "
-        "footage: look again and mark anew"
-    )
+    return f"frame {view.cursor} lies outside your plateau {low} to {high}: move into it"

@@ -15,7 +15,7 @@ from textual.widget import Widget
 
 from annotations.labels import Label
 from annotations.ui import theme
-from annotations.ui.view import CueView
+from annotations.ui.task import CueView
 
 GUTTER = 10  # cells left of the curves, for their names
 WIDEST = 7  # cells of a frame where the window is short

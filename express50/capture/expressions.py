@@ -43,6 +43,12 @@ class Expression:
     gaze: tuple[float, ...] = (0.0, 0.0)
 
 
+def expression_words(expression: str) -> tuple[str, str]:
+    """Return name and description of an expression; outside the script its id and no words."""
+    entry = next((e for e in load_script() if e.id == expression), None)
+    return (expression, "") if entry is None else (entry.name, entry.description)
+
+
 @cache
 def load_script() -> tuple[Expression, ...]:
     """The built-in script: 60 expressions in recording order, the first is ``neutral``."""

@@ -23,7 +23,7 @@ import json, random, sys
 sys.path[:0] = sys.argv[4:]
 from annotations.ui.task import load_scene
 from annotations.ui.session import open_session
-from annotations.ui.view import go_to, open_view
+from annotations.ui.task import go_to, open_view
 from express50.contract.layout import Dataset
 
 who = sys.argv[2]

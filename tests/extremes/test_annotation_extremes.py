@@ -22,13 +22,13 @@ from annotations.labels import make_mark
 from annotations.sheet import make_sheet, render_sheet
 from annotations.store import append_label, read_labels
 from annotations.suggestions import read_suggestions
-from annotations.ui import view as moves
+from annotations.ui import task as moves
 from annotations.ui.app import AnnotateApp
 from annotations.ui.images import CellSize
 from annotations.ui.picture import frames_ahead
 from annotations.ui.session import open_session
+from annotations.ui.task import open_view
 from annotations.ui.timeline import GUTTER, StripContent, column_of, draw_strip, frame_at
-from annotations.ui.view import open_view
 from annotations.validate import problems
 from annotations.worklist import coverage, worklist
 from benchmarks.replay import cheapest_keys

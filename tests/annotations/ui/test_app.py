@@ -10,9 +10,9 @@ from rich.text import Text
 from annotations.labels import make_mark
 from annotations.store import append_label, current_labels, read_labels
 from annotations.ui import layout
-from annotations.ui.keymap import GROUPS
 from annotations.ui.panels import fit, hint_line
 from annotations.ui.picture import PicturePane
+from annotations.ui.theme import GROUPS
 from annotations.ui.timeline import CurveStrip
 from express50.capture.index import read_index
 from tests.annotations.footage import suggest

@@ -7,7 +7,7 @@ import pytest
 from annotations.store import read_labels
 from annotations.ui.app import AnnotateApp
 from annotations.ui.session import open_session
-from annotations.ui.view import open_view
+from annotations.ui.task import open_view
 from benchmarks.replay import MOVES, cheapest_keys, measure_steps, replay
 from express50.errors import AnnotationError
 

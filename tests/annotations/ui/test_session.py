@@ -11,8 +11,7 @@ import pytest
 from annotations.labels import make_mark
 from annotations.store import append_label, labels_of, read_labels
 from annotations.ui.session import IDLE_SECONDS, open_session
-from annotations.ui.task import load_scene
-from annotations.ui.view import open_view, set_plateau_first, step
+from annotations.ui.task import load_scene, open_view, set_plateau_first, step
 from annotations.worklist import LabelTask
 from express50.capture.index import read_index
 from express50.errors import AnnotationError

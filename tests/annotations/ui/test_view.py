@@ -4,8 +4,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from annotations.ui import view as moves
-from annotations.ui.view import CueView, open_view
+from annotations.ui import task as moves
+from annotations.ui.task import CueView, open_view
 
 
 def test_a_task_opens_on_the_suggestion_else_in_the_middle():
