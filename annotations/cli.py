@@ -22,6 +22,7 @@ from annotations.cli_label import (
     add_label_verbs,
     add_selection,
     add_verb,
+    answer,
     chosen_subjects,
 )
 from annotations.exchange import LAST_FRAME, export_labels, import_labels, last_frame_marks
@@ -31,7 +32,7 @@ from annotations.suggestions import choose_reference, reference_subject
 from annotations.validate import problems
 from annotations.worklist import coverage, effort, progress
 from express50.capture.index import read_index
-from express50.console import FAILED, OK, format_table, say, say_json
+from express50.console import FAILED, OK, format_table
 from express50.contract.exclusions import included_subjects
 from express50.errors import AnnotationError
 
@@ -61,13 +62,13 @@ def _add_comparing_verbs(verbs) -> None:  # noqa: ANN001 - argparse's type is pr
     parser.add_argument(
         "--beyond", type=int, default=2, metavar="FRAMES", help="marks so close agree [2]"
     )
-    parser.add_argument("--all", action="store_true", help="also what is settled")
+    parser.add_argument("--all", action="store_true", help="also settled ones")
     parser.add_argument(
         "--settle", nargs=3, metavar=("SUBJECT", "EXPRESSION", "VERDICT"),
         help="verdict: a frame, the annotator who is right, or why there is no peak: "
         f"{', '.join(FLAG_REASONS)}, or flag:REASON",
     )  # fmt: skip
-    add_verb(verbs, "coverage", "subjects against expressions, and what is missing", run_coverage)
+    add_verb(verbs, "coverage", "subjects against expressions, with the gaps", run_coverage)
     add_verb(verbs, "status", "how far each subject is, and what labels cost", run_status)
     words = "write a contact sheet of all labels, or of a subject or expression, as one HTML file"
     parser = add_verb(verbs, "sheet", words, run_sheet)
@@ -112,15 +113,13 @@ def _add_managing_verbs(verbs) -> None:  # noqa: ANN001 - argparse's type is pri
 
 
 def run_validate(args: argparse.Namespace) -> int:
-    """Print what is wrong; gaps in coverage alone are no failure."""
+    """Print the problems; gaps in coverage alone are not a failure."""
     found = problems(args.dataset, chosen_subjects(args.dataset, args.subject))
     wrong = [p for p in found if p.kind != "coverage"]
     counts = dict(sorted(Counter(p.kind for p in found).items()))
-    if args.json:
-        say_json({"ok": not wrong, "counts": counts, "problems": [asdict(p) for p in found]})
-    else:
-        say(*(f"{p.subject} {p.expression}: {p.kind}: {p.what}" for p in wrong))
-        say(f"{len(wrong)} wrong, {counts.get('coverage', 0)} without a label")
+    data = {"ok": not wrong, "counts": counts, "problems": [asdict(p) for p in found]}
+    lines = [f"{p.subject} {p.expression}: {p.kind}: {p.what}" for p in wrong]
+    answer(args, data, *lines, f"{len(wrong)} wrong, {counts.get('coverage', 0)} without a label")
     return FAILED if wrong else OK
 
 
@@ -128,85 +127,67 @@ def run_agree(args: argparse.Namespace) -> int:
     """Print agreement."""
     clips = marked_clips(args.dataset, chosen_subjects(args.dataset, args.subject))
     overall, pairs, expressions = agreement(clips), by_pair(clips), by_expression(clips)
-    if args.json:
-        say_json({"overall": overall, "pairs": pairs, "expressions": expressions})
-    elif not clips:
-        say("no expression was marked by two people yet")
-    else:
-        rows = {"all": overall} | pairs | expressions
-        cells = [[name, *("-" if r[f] is None else str(r[f]) for f in _FIGURES)]
-                 for name, r in rows.items()]  # fmt: skip
-        say(*format_table(["", *(f.replace("_", " ") for f in _FIGURES)], cells))
-        say(f"alpha of all, 95 %: {overall['alpha_interval']}")
-    return OK
+    data = {"overall": overall, "pairs": pairs, "expressions": expressions}
+    if not clips:
+        return answer(args, data, "no expression was marked by two people yet")
+    rows = {"all": overall} | pairs | expressions
+    cells = [[name, *("-" if r[f] is None else str(r[f]) for f in _FIGURES)]
+             for name, r in rows.items()]  # fmt: skip
+    table = format_table(["", *(f.replace("_", " ") for f in _FIGURES)], cells)
+    return answer(args, data, *table, f"alpha of all, 95 %: {overall['alpha_interval']}")
 
 
 def run_review(args: argparse.Namespace) -> int:
     """Print the queue, or settle one of it."""
     if args.settle:
-        return _settle(args)
+        subject, expression, verdict = args.settle
+        index = read_index(args.dataset, subject)
+        label = settlement(args.dataset, index, expression, verdict, args.annotator)
+        append_label(args.dataset, label)
+        words = f"{subject} {expression}: settled as {describe(label)} by {args.annotator}"
+        return answer(args, asdict(label), words)
     wanted = chosen_subjects(args.dataset, args.subject)
     queue = disagreements(args.dataset, args.beyond, args.all, wanted)
-    if args.json:
-        say_json([asdict(row) for row in queue])
-        return OK
+    lines = []
     for row in queue:
         said = ", ".join(f"{who} {what}" for who, what in row.said.items())
-        say(f"{row.subject} {row.expression}: {said}" + (f" -> {row.settled}" * bool(row.settled)))
-    say(f"{len(queue)} to review")
-    return OK
-
-
-def _settle(args: argparse.Namespace) -> int:
-    subject, expression, verdict = args.settle
-    index = read_index(args.dataset, subject)
-    label = settlement(args.dataset, index, expression, verdict, args.annotator)
-    append_label(args.dataset, label)
-    if args.json:
-        say_json(asdict(label))
-    else:
-        say(f"{subject} {expression}: settled as {describe(label)} by {args.annotator}")
-    return OK
+        settled = f" -> {row.settled}" if row.settled else ""
+        lines.append(f"{row.subject} {row.expression}: {said}{settled}")
+    return answer(args, [asdict(row) for row in queue], *lines, f"{len(queue)} to review")
 
 
 def run_coverage(args: argparse.Namespace) -> int:
-    """Print what is missing and who the subjects are."""
+    """Print the missing labels and the counts of the subjects' gender and age."""
     report = coverage(args.dataset)
-    if args.json:
-        say_json(report)
-        return OK
     states = ("person", "rule", "auto", "flagged", "missing")
     rows = [
         [subject, *(str(list(cells.values()).count(state)) for state in states)]
         for subject, cells in report["cells"].items()
     ]
-    say(*format_table(["subject", *states], rows))
-    say(*(f"{s}: missing {', '.join(gaps)}" for s, gaps in report["missing"].items()))
-    say(*(f"{s}: excluded, {reason}" for s, reason in report["excluded"].items()))
+    lines = list(format_table(["subject", *states], rows))
+    lines += [f"{s}: missing {', '.join(gaps)}" for s, gaps in report["missing"].items()]
+    lines += [f"{s}: excluded, {reason}" for s, reason in report["excluded"].items()]
     for name in ("gender", "age"):
         counts = ", ".join(f"{k} {n}" for k, n in report[name].items())
-        say(f"{name}: {counts or 'too few people to count'}")
-    return OK
+        lines.append(f"{name}: {counts or 'too few people to count'}")
+    return answer(args, report, *lines)
 
 
 def run_status(args: argparse.Namespace) -> int:
     """Count the labels in force, and what people spent on theirs."""
     subjects = [progress(args.dataset, subject) for subject in args.dataset.subjects()]
     people = effort(args.dataset)
-    if args.json:
-        say_json({"subjects": subjects, "annotators": people})
-        return OK
     header = ["subject", "expressions", "by_person", "by_rule", "automatic", "flagged", "excluded"]
     cells = [["" if row[n] is None else str(row[n]) for n in header] for row in subjects]
-    say(*format_table([name.replace("_", " ") for name in header], cells))
+    lines = list(format_table([name.replace("_", " ") for name in header], cells))
     if people:
         figures = next(iter(people.values()))
         rows = [
             [who, *("-" if v is None else str(v) for v in row.values())]
             for who, row in people.items()
         ]
-        say("", *format_table(["annotator", *(n.replace("_", " ") for n in figures)], rows))
-    return OK
+        lines += ["", *format_table(["annotator", *(n.replace("_", " ") for n in figures)], rows)]
+    return answer(args, {"subjects": subjects, "annotators": people}, *lines)
 
 
 def run_sheet(args: argparse.Namespace) -> int:
@@ -225,12 +206,9 @@ def run_sheet(args: argparse.Namespace) -> int:
     args.file.parent.mkdir(parents=True, exist_ok=True)
     write_bytes(args.file, page)
     counts = sheet.counts()
-    if args.json:
-        say_json({"file": str(args.file), "bytes": len(page), "tiles": counts})
-    else:
-        said = ", ".join(f"{name} {count}" for name, count in counts.items() if count)
-        say(f"{args.file} ({len(page):,} bytes): {said}")
-    return OK
+    said = ", ".join(f"{name} {count}" for name, count in counts.items() if count)
+    data = {"file": str(args.file), "bytes": len(page), "tiles": counts}
+    return answer(args, data, f"{args.file} ({len(page):,} bytes): {said}")
 
 
 def run_reference(args: argparse.Namespace) -> int:
@@ -238,11 +216,7 @@ def run_reference(args: argparse.Namespace) -> int:
     if args.subject is not None:
         choose_reference(args.dataset, args.subject)
     subject = reference_subject(args.dataset)
-    if args.json:
-        say_json({"reference": subject})
-    else:
-        say(f"reference: {subject}")
-    return OK
+    return answer(args, {"reference": subject}, f"reference: {subject}")
 
 
 def run_rule(args: argparse.Namespace) -> int:
@@ -257,11 +231,8 @@ def run_rule(args: argparse.Namespace) -> int:
     ]
     for mark in marks:
         append_label(args.dataset, mark)
-    if args.json:
-        say_json([asdict(mark) for mark in marks])
-    else:
-        say(f"{len(marks)} marks by {LAST_FRAME} in {len(chosen)} subjects")
-    return OK
+    words = f"{len(marks)} marks by {LAST_FRAME} in {len(chosen)} subjects"
+    return answer(args, [asdict(mark) for mark in marks], words)
 
 
 def run_exclusion(args: argparse.Namespace) -> int:
@@ -275,12 +246,8 @@ def run_exclusion(args: argparse.Namespace) -> int:
         time=time.time(), reason=reason,
     )  # fmt: skip
     append_label(args.dataset, event)
-    if args.json:
-        say_json(asdict(event))
-    else:
-        reason = f": {event.reason}" if event.reason else ""
-        say(f"{args.subject}: {args.verb}d{reason}")
-    return OK
+    because = f": {event.reason}" if event.reason else ""
+    return answer(args, asdict(event), f"{args.subject}: {args.verb}d{because}")
 
 
 def run_export(args: argparse.Namespace) -> int:
@@ -288,18 +255,12 @@ def run_export(args: argparse.Namespace) -> int:
     chosen = chosen_subjects(args.dataset, args.subject) or args.dataset.subjects()
     events = [label for subject in chosen for label in read_labels(args.dataset, subject)]
     count = export_labels(events, args.file)
-    if args.json:
-        say_json({"file": str(args.file), "events": count})
-    else:
-        say(f"{args.file}: {count} events of {len(chosen)} subjects")
-    return OK
+    words = f"{args.file}: {count} events of {len(chosen)} subjects"
+    return answer(args, {"file": str(args.file), "events": count}, words)
 
 
 def run_import(args: argparse.Namespace) -> int:
-    """Append what is new."""
+    """Append the new events."""
     new, known = import_labels(args.dataset, args.file)
-    if args.json:
-        say_json({"file": str(args.file), "new": new, "known": known})
-    else:
-        say(f"{args.file}: {new} new events, {known} known already")
-    return OK
+    data = {"file": str(args.file), "new": new, "known": known}
+    return answer(args, data, f"{args.file}: {new} new events, {known} known already")

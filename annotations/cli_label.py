@@ -53,6 +53,15 @@ def add_selection(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--subject", action="append", metavar="ID", help="only this; repeatable")
 
 
+def answer(args: argparse.Namespace, data: object, *lines: str) -> int:
+    """Print data as JSON where ``--json`` asks for it, else the lines."""
+    if args.json:
+        say_json(data)
+    else:
+        say(*lines)
+    return OK
+
+
 def existing_dataset(text: str) -> Dataset:
     """Parse the folder of an existing dataset."""
     if not Path(text).is_dir():
@@ -150,11 +159,9 @@ def run_ui(args: argparse.Namespace) -> int:
             )
         os.environ.setdefault("COLORTERM", "truecolor")  # ssh does not hand it on
     AnnotateApp(session, faces=FaceFinder(dataset), sixel_cell=cell).run()
-    if args.json:
-        say_json({"done": session.done, "tasks": len(session.tasks)})
-    else:
-        say(f"{session.done} of {len(session.tasks)} done by {session.annotator}")
-    return OK
+    done, total = session.done, len(session.tasks)
+    words = f"{done} of {total} done by {session.annotator}"
+    return answer(args, {"done": done, "tasks": total}, words)
 
 
 def matching(names: Iterable[str], pattern: str | None, what: str) -> list[str]:
@@ -179,15 +186,10 @@ def run_suggest(args: argparse.Namespace) -> int:
         for expression, suggestion in read_suggestions(args.dataset, subject).items()
     ]
     rows.sort(key=lambda row: row["confidence"])
-    if args.json:
-        say_json(rows)
-    elif not rows:
-        say(f"no suggestions; run 'express50 align {args.dataset.root}'")
-    else:
-        header = ["subject", "expression", "frame", "confidence", "kind"]
-        cells = [[str(row[name]) for name in header] for row in rows]
-        say(*format_table(header, cells))
-    return OK
+    header = ["subject", "expression", "frame", "confidence", "kind"]
+    table = format_table(header, [[str(row[name]) for name in header] for row in rows])
+    none = f"no suggestions; run 'express50 align {args.dataset.root}'"
+    return answer(args, rows, *(table if rows else [none]))
 
 
 def run_next(args: argparse.Namespace) -> int:
@@ -195,12 +197,10 @@ def run_next(args: argparse.Namespace) -> int:
     wanted = chosen_subjects(args.dataset, args.subject)
     tasks = worklist(args.dataset, args.annotator, wanted, order=args.order)
     head = tasks[: max(0, args.count)]
-    if args.json:
-        say_json({"left": len(tasks), "tasks": [asdict(task) for task in head]})
-        return OK
+    data = {"left": len(tasks), "tasks": [asdict(task) for task in head]}
     rows = [[t.subject, t.expression, f"{t.doubt:.2f}"] for t in head]
-    say(*format_table(["subject", "expression", "doubt"], rows), f"{len(tasks)} left")
-    return OK
+    table = format_table(["subject", "expression", "doubt"], rows)
+    return answer(args, data, *table, f"{len(tasks)} left")
 
 
 def run_mark(args: argparse.Namespace) -> int:
@@ -236,14 +236,11 @@ def run_undo(args: argparse.Namespace) -> int:
 
 def _keep(args: argparse.Namespace, label: Label, said: str) -> int:
     append_label(args.dataset, label)
-    if args.json:
-        say_json(asdict(label))
-    else:
-        say(
-            f"{label.subject} {label.expression}: {said} as {label.annotator};"
-            f" run 'express50 align {args.dataset.root}' to use it"
-        )
-    return OK
+    words = (
+        f"{label.subject} {label.expression}: {said} as {label.annotator};"
+        f" run 'express50 align {args.dataset.root}' to use it"
+    )
+    return answer(args, asdict(label), words)
 
 
 def run_labels(args: argparse.Namespace) -> int:
@@ -253,9 +250,6 @@ def run_labels(args: argparse.Namespace) -> int:
         for subject in chosen_subjects(args.dataset, args.subject) or args.dataset.subjects()
         for label in current_labels(read_labels(args.dataset, subject)).values()
     ]
-    if args.json:
-        say_json([{k: v for k, v in asdict(x).items() if v is not None} for x in rows])
-    else:
-        cells = [[x.subject, x.expression, describe(x), x.annotator] for x in rows]
-        say(*format_table(["subject", "expression", "label", "by"], cells))
-    return OK
+    data = [{k: v for k, v in asdict(x).items() if v is not None} for x in rows]
+    cells = [[x.subject, x.expression, describe(x), x.annotator] for x in rows]
+    return answer(args, data, *format_table(["subject", "expression", "label", "by"], cells))

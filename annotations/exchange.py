@@ -139,7 +139,7 @@ def _typed(name: str, value: object) -> Any:
     for number in (int, float):
         if kind in (number, number | None):
             found = number(str(value))
-            if not abs(found) < LARGEST:  # NaN neither
+            if not abs(found) < LARGEST:  # refuses NaN too
                 raise ValueError(f"{name} is {str(value)[:40]}, expected a number under 2^63")
             return found
     return str(value)

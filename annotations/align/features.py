@@ -40,7 +40,7 @@ REST_DIRECTIONS = 20  # leading directions of unrest that are shrunk
 
 @dataclass(frozen=True)
 class Features:
-    """What C cameras saw of a subject in F frames, in units of each feature's noise.
+    """Features of a subject from C cameras in F frames, in units of each feature's noise.
 
     Attributes:
         cameras: ids of the cameras.

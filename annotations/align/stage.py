@@ -17,6 +17,7 @@ from annotations.align.suggest import (
     strongest_event,
     suggest,
     suggest_rest,
+    unrest,
 )
 from annotations.labels import AUTOMATIC, Label, make_mark, make_undo
 from annotations.observe.observations import (
@@ -26,7 +27,6 @@ from annotations.observe.observations import (
     observations_path,
     read_observations,
 )
-from annotations.observe.stage import steady
 from annotations.store import append_label, current_labels, read_labels
 from annotations.suggestions import Suggested, reference_subject
 from express50.capture.expressions import Expression, load_script
@@ -70,7 +70,7 @@ def suggest_for(
 ) -> tuple[dict[str, Suggested], list[Note]]:
     """Suggest a frame of every expression, and note what was missing for it.
 
-    Without observations there are no suggestions: only people's labels count then.
+    Without observations nothing is suggested: only people's labels count then.
     """
     if not observations_path(dataset, index.subject).is_file():
         why = f"{index.subject} is not observed: run 'express50 observe' to see why"
@@ -78,7 +78,16 @@ def suggest_for(
     other = reference_subject(dataset) if match else index.subject
     reference, dropped = None, []
     if other != index.subject and observations_path(dataset, other).is_file():
-        reference = _read_reference(dataset, other)
+        people = {
+            expression: label
+            for expression, label in current_labels(read_labels(dataset, other)).items()
+            if label.annotator != AUTOMATIC
+        }
+        reference = Reference(
+            watch(read_index(dataset, other), read_observations(dataset, other)),
+            {e: label.frame for e, label in people.items() if label.frame is not None},
+            frozenset(e for e, label in people.items() if label.frame is None),
+        )
     elif other != index.subject:
         why = f"the reference {other} is not observed; every subject's own peaks were taken"
         dropped.append(Note("matching", why))
@@ -92,20 +101,6 @@ def suggest_for(
             matched = replace(rows[expression], kind="match", reference=about | {"frame": frame})
             rows[expression] = matched
     return rows, dropped
-
-
-def _read_reference(dataset: Dataset, subject: str) -> Reference:
-    """Read the reference's observations and the frames that people chose as canonical."""
-    said = {
-        expression: label
-        for expression, label in current_labels(read_labels(dataset, subject)).items()
-        if label.annotator != AUTOMATIC
-    }
-    return Reference(
-        watch(read_index(dataset, subject), read_observations(dataset, subject)),
-        {e: label.frame for e, label in said.items() if label.frame is not None},
-        frozenset(e for e, label in said.items() if label.frame is None),
-    )
 
 
 def accept_sure(
@@ -263,7 +258,11 @@ def suggest_all(
         entry = script.get(expression)
         values = expression_values(subject.features, entry, rows)
         if expression == NEUTRAL:
-            found[expression] = suggest_rest(values, groups, _typical(subject, entry))
+            tops = [  # how far expressions usually move the face from rest, in units of noise
+                unrest(expression_values(subject.features, entry, window)).max()
+                for window in subject.windows.values()
+            ]
+            found[expression] = suggest_rest(values, groups, float(np.median(tops)))
             continue
         target = None
         if reference is not None and expression in reference.watched.windows:
@@ -309,12 +308,3 @@ def shared_columns(features: Features, other: Features) -> np.ndarray:
         ],
         axis=1,
     )
-
-
-def _typical(subject: Watched, entry: Expression | None) -> float:
-    """Measure how far expressions usually move the face from rest, in units of noise."""
-    tops = [
-        np.linalg.norm(steady(expression_values(subject.features, entry, rows)), axis=1).max()
-        for rows in subject.windows.values()
-    ]
-    return float(np.median(tops))

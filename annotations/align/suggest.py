@@ -7,7 +7,7 @@ clip itself: frames that show the expression define the direction, which in turn
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -87,11 +87,14 @@ def suggest(values: np.ndarray, groups: np.ndarray, canonical: Canonical | None)
     row = matching_row(event, canonical)
     rows = []
     for kept in _halves(groups):
-        half = None if canonical is None else _restricted(canonical, kept)
-        part = values[:, kept]
+        half, part = None, values[:, kept]
+        if canonical is not None:
+            half = replace(canonical, direction=_unit(canonical.direction[kept]))
         rows.append(matching_row(choose_event(part, strongest_event(part), half)[0], half))
     agreeing = sum(abs(other - row) <= AGREE_FRAMES for other in rows)
-    match = None if canonical is None else _likeness_in_time(event, canonical)
+    match = None
+    if canonical is not None:
+        match = np.clip(1.0 - np.abs(share_of_apex(event) - canonical.level), 0.0, 1.0)
     confidence = agreeing / (len(rows) + 1) * (1.0 if certain else DISPUTED)
     return Suggestion(
         row, confidence if own.curve.max() > STILL else 0.0, own.curve, match,
@@ -111,10 +114,10 @@ def suggest_rest(values: np.ndarray, groups: np.ndarray, typical: float) -> Sugg
         ValueError: the clip is empty or not finite.
     """
     _check(values)
-    level = _unrest(values)
+    level = unrest(values)
     row = int(np.argmin(level))
     enough = level[row] + 0.1 * typical
-    good = [level[np.argmin(_unrest(values[:, kept]))] <= enough for kept in _halves(groups)]
+    good = [level[np.argmin(unrest(values[:, kept]))] <= enough for kept in _halves(groups)]
     return Suggestion(
         row, sum(good) / (len(good) + 1), level, None, candidate_rows(row, [], -level)
     )
@@ -134,7 +137,8 @@ def _halves(groups: np.ndarray) -> Iterator[np.ndarray]:
             yield kept
 
 
-def _unrest(values: np.ndarray) -> np.ndarray:
+def unrest(values: np.ndarray) -> np.ndarray:
+    """Measure the distance (T,) of features (T, N) from rest, averaged over neighbouring frames."""
     return np.linalg.norm(steady(values), axis=1)
 
 
@@ -145,7 +149,7 @@ def strongest_event(values: np.ndarray) -> Event:
 
 
 def likest_event(values: np.ndarray, direction: np.ndarray) -> tuple[Event, np.ndarray]:
-    """The movement most like a direction (N,), and the likeness (T,) it was found by.
+    """Find the movement most like a direction (N,), and the likeness (T,) that shows it.
 
     Likeness is how far a frame goes that way, times the cosine of how much else it does.
     """
@@ -157,31 +161,26 @@ def likest_event(values: np.ndarray, direction: np.ndarray) -> tuple[Event, np.n
 
 
 def choose_event(values: np.ndarray, own: Event, canonical: Canonical | None) -> tuple[Event, bool]:
-    """The strongest event, unless another is clearly more like the reference's.
+    """Choose the strongest event, unless another is clearly more like the reference's.
 
-    Also whether the two are the same, or there is but one.
+    The second value is False where the two differ.
     """
     if canonical is None or not canonical.direction.any():
         return own, True
     other, likeness = likest_event(values, canonical.direction)
     if abs(other.apex - own.apex) <= AGREE_FRAMES:
         return own, True
-    likelier = likeness[other.apex] > OVERRULE * likeness[own.apex]
-    chosen = other if likelier and _cosine(other, canonical) > OVERRULE_COSINE else own
-    return chosen, False
-
-
-def _cosine(event: Event, canonical: Canonical) -> float:
-    """Of an event's direction and the canonical one, in the features that both have."""
-    part = event.direction[canonical.direction != 0]
-    along = float(event.direction @ canonical.direction)
-    return along / max(float(np.linalg.norm(part)), 1e-12)
+    if likeness[other.apex] <= OVERRULE * likeness[own.apex]:
+        return own, False
+    shared = np.linalg.norm(other.direction[canonical.direction != 0])
+    cosine = float(other.direction @ canonical.direction) / max(float(shared), 1e-12)
+    return (other if cosine > OVERRULE_COSINE else own), False
 
 
 def matching_row(event: Event, canonical: Canonical | None) -> int:
-    """The apex; for a canonical frame off the apex, where the movement is as far.
+    """Find the row that matches: the apex, or for a canonical frame off it an equal share of it.
 
-    On the same side of the apex if both sides offer such a frame.
+    The row lies on the canonical frame's side of the apex if both sides offer one.
     """
     if canonical is None or canonical.side == 0:
         return event.apex
@@ -206,7 +205,7 @@ def _slope(share: np.ndarray, apex: int, side: int) -> np.ndarray:
 
 
 def canonical_of(values: np.ndarray, row: int, shared: np.ndarray, count: int) -> Canonical:
-    """The canonical frame that a row of the reference's clip is.
+    """Express a row of the reference's clip as the canonical frame.
 
     Args:
         values: (T, M) features of the reference's clip.
@@ -221,20 +220,20 @@ def canonical_of(values: np.ndarray, row: int, shared: np.ndarray, count: int) -
         share = share_of_apex(event)
     direction = np.zeros(count)
     direction[shared[0]] = event.direction[shared[1]]
-    direction /= max(float(np.linalg.norm(direction)), 1e-12)
+    direction = _unit(direction)
     level = float(np.clip(share[row], 0.0, 1.0))
     return Canonical(direction, level, 0 if level >= APEX_LEVEL else int(np.sign(row - event.apex)))
 
 
 def _event_about(values: np.ndarray, weights: np.ndarray, row: int) -> Event:
-    """The event that a row belongs to, its direction learnt from frames about it."""
+    """Find the event that a row belongs to; frames about the row give its direction."""
     near = np.exp(-0.5 * ((np.arange(len(values)) - row) / NEAR_FRAMES) ** 2)
     curve, direction = _follow(values, near * weights, near, 3)
     return Event(_climb(steady(curve), row), curve, direction)
 
 
 def apex_of(curve: np.ndarray) -> int:
-    """Row of a curve's (T,) apex: the middle of the frames that are equal to it within noise."""
+    """Find the row of a curve's (T,) apex: the middle of the frames that equal it within noise."""
     even = steady(curve)
     top = int(np.argmax(even))
     low = high = top
@@ -263,17 +262,16 @@ def candidate_rows(row: int, others: list[int], curve: np.ndarray) -> list[int]:
 def _follow(
     values: np.ndarray, weights: np.ndarray, near: np.ndarray, rounds: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Curve (T,) and unit direction (N,) that frames weighted by the curve itself agree on."""
+    """Find the curve (T,) and unit direction (N,) that frames weighted by that curve agree on."""
     curve, direction = weights, np.zeros(values.shape[1])
     for _ in range(rounds):
-        mean = (near * curve) @ values
-        direction = mean / max(float(np.linalg.norm(mean)), 1e-12)
+        direction = _unit((near * curve) @ values)
         curve = np.maximum(values @ direction, 0.0)
     return curve, direction
 
 
 def _climb(curve: np.ndarray, row: int) -> int:
-    """The local maximum of a curve that a row leads up to."""
+    """Climb a curve from a row to the local maximum."""
     while True:
         around = [r for r in (row - 1, row, row + 1) if 0 <= r < len(curve)]
         best = max(around, key=lambda r: (curve[r], r == row))
@@ -282,12 +280,5 @@ def _climb(curve: np.ndarray, row: int) -> int:
         row = best
 
 
-def _likeness_in_time(event: Event, canonical: Canonical) -> np.ndarray:
-    return np.clip(1.0 - np.abs(share_of_apex(event) - canonical.level), 0.0, 1.0)
-
-
-def _restricted(canonical: Canonical, kept: np.ndarray) -> Canonical:
-    """The canonical frame in some of the features."""
-    part = canonical.direction[kept]
-    part = part / max(float(np.linalg.norm(part)), 1e-12)
-    return Canonical(part, canonical.level, canonical.side)
+def _unit(direction: np.ndarray) -> np.ndarray:
+    return direction / max(float(np.linalg.norm(direction)), 1e-12)
