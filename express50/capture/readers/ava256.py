@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from express50.capture.raw import RawCamera, RawCapture
+from express50.capture.raw import RawCapture
 from express50.capture.readers.selection import Selection, check_selection, identifier
 from express50.capture.readers.timeline import Moment, common_timeline
 from express50.errors import CalibrationError, CaptureError
@@ -36,7 +36,7 @@ def fits(path: Path) -> bool:
 
 
 def subject_of(path: Path) -> str:
-    """The subject in the folder's name, or the whole name where it has none.
+    """Return the subject in the folder's name, or the whole name where it has none.
 
     Names are ``<date>--<time>--<subject>`` or ``m--<date>--<time>--<subject>--GHS``.
     """
@@ -50,14 +50,13 @@ def read(path: Path, selection: Selection) -> RawCapture:
     """Read a capture's segments.
 
     Raises:
-        CaptureError: a list or an archive is malformed, or no picture is there.
+        CaptureError: a list or an archive is malformed, or no picture can be found.
         CalibrationError: the cameras are malformed.
     """
     calibration = read_calibration(path / CAMERAS)
     listed = read_frame_list(path / FRAMES)
     segments = list(dict.fromkeys(segment for segment, _ in listed))
     check_selection(selection, segments, sorted(calibration))
-    skipped = {f"sequence {s}": "not asked for" for s in segments if not selection.has_sequence(s)}
     wanted = [moment for moment in listed if selection.has_sequence(moment[0])]
     pictures, dropped = {}, {}
     for name in calibration:
@@ -76,24 +75,18 @@ def read(path: Path, selection: Selection) -> RawCapture:
         subject=subject_of(path),
         fps=FPS,
         meta={"licence": "research only, see the terms of AVA-256"},
-        cameras={
-            name: RawCamera(
-                id=name, kind="frames", path=path, names=names,
-                counts=line.counts, stamps=line.stamps,
-            )
-            for name, names in line.names.items()
-        },
+        cameras=line.cameras(path),
         dropped=dropped | line.dropped,
         calibration={k: c for k, c in calibration.items() if k in line.names},
         layout="ava256",
         clips=tuple(selection.expression(segment) for segment in line.sequences),
-        skipped=skipped | line.skipped,
+        skipped=selection.left_out(segments) | line.skipped,
         found={"frames_listed": len(wanted)},
-    )  # fmt: skip
+    )
 
 
 def read_calibration(path: Path) -> dict[str, Camera]:
-    """Cameras by id (``cam<number>``), metres, for pictures of 2668 x 4096.
+    """Read cameras by id (``cam<number>``), metres, for pictures of 2668 x 4096.
 
     Raises:
         CalibrationError: a camera lacks a field, or one has another shape or kind.
@@ -131,7 +124,7 @@ def _array(where: str, value: object, shape: tuple[int, ...]) -> np.ndarray:
 
 
 def read_frame_list(path: Path) -> list[Moment]:
-    """Segment and frame number of each row.
+    """Read segment and frame number of each row.
 
     Raises:
         CaptureError: a column is missing, or a frame is not a number.
@@ -148,7 +141,7 @@ def read_frame_list(path: Path) -> list[Moment]:
 
 
 def _pictures(path: Path, name: str, wanted: list[Moment]) -> Mapping[Moment, str]:
-    """Name of each wanted picture that a camera has, in its zip or in a folder.
+    """Find the name of each wanted picture that a camera has, in its zip or in a folder.
 
     Raises:
         CaptureError: there is neither, or the zip is damaged.

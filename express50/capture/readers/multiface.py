@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from express50.capture.raw import RawCamera, RawCapture
+from express50.capture.raw import RawCapture
 from express50.capture.readers.selection import Selection, check_selection, identifier
 from express50.capture.readers.timeline import Moment, common_timeline
 from express50.errors import CalibrationError, CaptureError
@@ -31,7 +31,7 @@ def fits(path: Path) -> bool:
 
 
 def subject_of(path: Path) -> str:
-    """The entity in the folder's name, or the whole name where it has none."""
+    """Return the entity in the folder's name, or the whole name where it has none."""
     parts = path.name.split("--")
     return identifier(parts[3] if len(parts) == 5 else path.name)
 
@@ -40,21 +40,18 @@ def read(path: Path, selection: Selection) -> RawCapture:
     """Read a capture's segments.
 
     Raises:
-        CaptureError: no picture is there, or the list of frames is malformed.
+        CaptureError: no picture can be found, or the list of frames is malformed.
         CalibrationError: ``KRT`` is malformed.
     """
     calibration = read_krt(path / "KRT")
     listed = read_frame_list(path / "frame_list.txt")
     segments = list(dict.fromkeys(segment for segment, _ in listed))
     check_selection(selection, segments, sorted(calibration))
-    skipped = {f"sequence {s}": "not asked for" for s in segments if not selection.has_sequence(s)}
     wanted = [moment for moment in listed if selection.has_sequence(moment[0])]
     names = [name for name in calibration if selection.has_camera(name)]
     pictures: dict[str, dict[Moment, str]] = {name: {} for name in names}
     for name in names:
-        have = {
-            segment: _stems(path / "images" / segment / name) for segment, _ in dict(wanted).items()
-        }
+        have = {segment: _stems(path / "images" / segment / name) for segment in dict(wanted)}
         for segment, number in wanted:
             file = have[segment].get(f"{number:06d}")
             if file:
@@ -70,20 +67,14 @@ def read(path: Path, selection: Selection) -> RawCapture:
         subject=subject_of(path),
         fps=FPS,
         meta={"licence": "research only, see the terms of Multiface"},
-        cameras={
-            name: RawCamera(
-                id=name, kind="frames", path=path, names=files,
-                counts=line.counts, stamps=line.stamps,
-            )
-            for name, files in line.names.items()
-        },
+        cameras=line.cameras(path),
         dropped=line.dropped,
         calibration={k: c for k, c in calibration.items() if k in line.names},
         layout="multiface",
         clips=tuple(selection.expression(segment) for segment in line.sequences),
-        skipped=skipped | line.skipped,
+        skipped=selection.left_out(segments) | line.skipped,
         found={"frames_listed": len(wanted)},
-    )  # fmt: skip
+    )
 
 
 def _stems(folder: Path) -> dict[str, str]:
@@ -94,7 +85,7 @@ def _stems(folder: Path) -> dict[str, str]:
 
 
 def read_krt(path: Path) -> dict[str, Camera]:
-    """Cameras of a KRT file, metres, for pictures of 1334 x 2048.
+    """Read the cameras of a KRT file, metres, for pictures of 1334 x 2048.
 
     Raises:
         CalibrationError: a camera's lines are not what the layout says.
@@ -123,7 +114,7 @@ def read_krt(path: Path) -> dict[str, Camera]:
 
 
 def read_frame_list(path: Path) -> list[Moment]:
-    """Segment and frame number of each line ``E001_Neutral_Eyes_Open 000123``.
+    """Read segment and frame number of each line ``E001_Neutral_Eyes_Open 000123``.
 
     Raises:
         CaptureError: a line is something else.

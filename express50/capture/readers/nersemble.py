@@ -36,7 +36,7 @@ def read(path: Path, selection: Selection) -> RawCapture:
     """Read a participant's sequences.
 
     Raises:
-        CaptureError: there is no video.
+        CaptureError: no video can be found.
         CalibrationError: cameras or colours are malformed.
     """
     calibration = read_nersemble(path / CAMERAS)
@@ -44,11 +44,6 @@ def read(path: Path, selection: Selection) -> RawCapture:
         p.name for p in (path / "sequences").iterdir() if p.is_dir() and p.name != BACKGROUND
     )
     check_selection(selection, sequences, sorted(calibration))
-    skipped = {
-        f"sequence {name}": "not asked for"
-        for name in sequences
-        if not selection.has_sequence(name)
-    }
     wanted = [name for name in sequences if selection.has_sequence(name)]
     serials = [serial for serial in sorted(calibration) if selection.has_camera(serial)]
     videos: dict[str, dict[Moment, str]] = {serial: {} for serial in serials}
@@ -65,6 +60,7 @@ def read(path: Path, selection: Selection) -> RawCapture:
         )
     colours, warnings = _colours(path, set(line.names))
     some = next(iter(line.names.values()))[0]
+    plates = {serial: f"sequences/{BACKGROUND}/image_{serial}.jpg" for serial in sorted(line.names)}
     return RawCapture(
         root=path,
         subject=subject_of(path),
@@ -78,18 +74,13 @@ def read(path: Path, selection: Selection) -> RawCapture:
         },
         dropped=line.dropped,
         calibration={k: c for k, c in calibration.items() if k in line.names},
-        plates=_plates(path, set(line.names)),
+        plates={serial: name for serial, name in plates.items() if (path / name).is_file()},
         layout="nersemble",
         clips=tuple(selection.expression(sequence) for sequence in line.sequences),
-        skipped=skipped | line.skipped,
+        skipped=selection.left_out(sequences) | line.skipped,
         found={"colour_corrected": sorted(colours)},
         warnings=warnings,
     )
-
-
-def _plates(path: Path, serials: set[str]) -> dict[str, str]:
-    names = {s: f"sequences/{BACKGROUND}/image_{s}.jpg" for s in sorted(serials)}
-    return {serial: name for serial, name in names.items() if (path / name).is_file()}
 
 
 def _colours(path: Path, serials: set[str]) -> tuple[dict, dict[str, str]]:

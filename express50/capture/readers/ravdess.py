@@ -1,4 +1,4 @@
-"""RAVDESS: a folder ``Actor_01`` of one camera's clips, whose names say what is acted.
+"""RAVDESS: a folder ``Actor_01`` of one camera's clips, whose names describe the acting.
 
 ``MM-VC-EM-IN-ST-RE-AA.mp4``: modality, vocal channel, emotion, intensity, statement, repetition,
 actor; actors of odd number are male. Source: S. Livingstone and F. Russo, "The Ryerson Audio-Visual
@@ -29,7 +29,7 @@ STATEMENTS = {"01": "kids", "02": "dogs"}
 
 @dataclass(frozen=True, order=True)
 class Clip:
-    """What a file's name says, in words."""
+    """The words that the parts of a file's name stand for."""
 
     channel: str
     emotion: str
@@ -41,7 +41,7 @@ class Clip:
 
     @property
     def sequence(self) -> str:
-        """Its name as an expression, such as ``happy_strong_kids_1``; songs are ``song_...``."""
+        """The clip's name as an expression: ``happy_strong_kids_1``, of songs ``song_...``."""
         words = [self.emotion, self.intensity, self.statement, str(self.repetition)]
         return "_".join(["song", *words] if self.channel == "song" else words)
 
@@ -78,14 +78,16 @@ def _videos(path: Path) -> list[Path]:
 
 
 def subject_of(path: Path) -> str:
-    """``Actor_01``.
+    """Return the actor's folder name, such as ``Actor_01``.
 
     Raises:
         CaptureError: the folder holds several actors.
     """
     actors = sorted({clip.actor for f in _videos(path) if (clip := parse_name(f.stem))})
     if len(actors) != 1:
-        raise CaptureError(f"{path}: holds actors {', '.join(actors[:4])}, expected one a folder")
+        raise CaptureError(
+            f"{path}: holds actors {', '.join(actors[:4])}, expected one actor per folder"
+        )
     return f"Actor_{actors[0]}"
 
 
@@ -103,7 +105,7 @@ def read(path: Path, selection: Selection) -> RawCapture:
     for file in _videos(path):
         clip = parse_name(file.stem)
         if clip is None:
-            skipped[f"file {file.name}"] = "its name is none of RAVDESS"
+            skipped[f"file {file.name}"] = "its name is not one of RAVDESS"
             continue
         known.append(clip.sequence)
         if not selection.has_sequence(clip.sequence):

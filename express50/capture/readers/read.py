@@ -21,10 +21,9 @@ from express50.capture.raw import (
 )
 from express50.capture.readers import (
     ava256,
-    bare,
+    generic,
     multiface,
     nersemble,
-    posed,
     ravdess,
     renderme,
 )
@@ -34,6 +33,7 @@ from express50.errors import CalibrationError, CaptureError, Express50Error
 from express50.rigs.rig_check import judge
 
 OURS = "express50"
+FPS = 24.0  # stands in where only the subject is asked for
 
 
 @dataclass(frozen=True)
@@ -43,9 +43,9 @@ class Layout:
     Attributes:
         name: of the layout.
         looks: its look in words, for errors.
-        fits: whether a file or folder is one.
+        fits: returns whether a file or folder is one.
         subject_of: the subject's id.
-        read: the capture; selection choose parts of it.
+        read: reads the selected parts of the capture.
     """
 
     name: str
@@ -72,14 +72,17 @@ LAYOUTS = (
     Layout("ravdess", "01-01-03-02-01-01-05.mp4", ravdess.fits, ravdess.subject_of, ravdess.read),
     Layout(
         "transforms", "transforms.json",
-        posed.fits_transforms, posed.subject_of, posed.read_transforms_folder,
+        generic.fits_transforms, generic.folder_name, generic.read_transforms_folder,
     ),
     Layout(
-        "colmap", "images/ and sparse/0/", posed.fits_colmap, posed.subject_of,
-        posed.read_colmap_folder,
+        "colmap", "images/ and sparse/0/", generic.fits_colmap, generic.folder_name,
+        generic.read_colmap_folder,
     ),
-    Layout("photos", "a folder of images", bare.fits_photos, bare.subject_of, bare.read_photos),
-    Layout("video", "a video file", bare.fits_video, bare.subject_of, bare.read_video),
+    Layout(
+        "photos", "a folder of images",
+        generic.fits_photos, generic.subject_of, generic.read_photos,
+    ),
+    Layout("video", "a video file", generic.fits_video, generic.subject_of, generic.read_video),
 )  # fmt: skip
 
 
@@ -100,27 +103,24 @@ def detect(path: Path, name: object = None) -> Layout:
             return layout
     looks = "; ".join(f"{x.name}: {x.looks}" for x in LAYOUTS if name in (None, x.name))
     ours = "" if name else f"; {OURS}: capture.toml and cameras/"
-    raise CaptureError(f"{path}: {_holds(path)}, expected one of: {looks}{ours}")
-
-
-def _holds(path: Path) -> str:
-    """Describe what the path holds instead."""
     if path.is_file():
-        return f"no known layout of a file {path.suffix or 'without an ending'}"
-    names = sorted(p.name for p in path.iterdir() if not p.name.startswith("."))
-    shown = ", ".join(names[:5]) + (", ..." if len(names) > 5 else "")
-    return f"no known layout: it holds {shown or 'nothing'}"
+        got = f"no known layout of a file {path.suffix or 'without an ending'}"
+    else:
+        names = sorted(p.name for p in path.iterdir() if not p.name.startswith("."))
+        shown = ", ".join(names[:5]) + (", ..." if len(names) > 5 else "")
+        got = f"no known layout: it holds {shown or 'nothing'}"
+    raise CaptureError(f"{path}: {got}, expected one of: {looks}{ours}")
 
 
 def is_ours(path: Path) -> bool:
     """Return whether a path is a capture in our own layout, or is meant as one."""
     meta = _meta(path)
     if meta is None:
-        return (path / "cameras").is_dir()  # the error then says what is missing
+        return (path / "cameras").is_dir()  # the error then names the missing file
     if "source" in meta:
         return False
     layout = meta.get("layout", OURS if (path / "cameras").is_dir() else None)
-    # A capture.toml alone says that it is ours; the error then says what is missing.
+    # A capture.toml alone marks it as ours; the error then names the missing file.
     return layout == OURS or (layout is None and not any(x.fits(path) for x in LAYOUTS))
 
 
@@ -145,9 +145,6 @@ def subject_of(path: Path) -> str:
     return subject
 
 
-FPS = 24.0  # stands in where only the subject is asked for
-
-
 def read_any(path: Path) -> RawCapture:
     """Read a capture of any layout.
 
@@ -168,21 +165,12 @@ def read_any(path: Path) -> RawCapture:
     given = {key: value for key, value in meta.items() if key != "source"}
     described = raw.meta | given | {"subject": subject, "fps": float(fps), "layout": raw.layout}
     raw = replace(raw, subject=subject, fps=float(fps), meta=described)
-    _check_clips(raw, path)
-    return _judged(raw, path)
-
-
-def _check_clips(raw: RawCapture, path: Path) -> None:
     doubled = sorted({clip for clip in raw.clips if raw.clips.count(clip) > 1})
     if doubled or not all(EXPRESSION.fullmatch(clip) for clip in raw.clips):
         raise CaptureError(
             f"{path}: {', '.join(doubled) or raw.clips} cannot be the expressions of its "
             "sequences; give each its own id in [expressions] of capture.toml"
         )
-
-
-def _judged(raw: RawCapture, path: Path) -> RawCapture:
-    """Check that the cameras look at one place in front of them; add what is odd as warnings."""
     if not raw.calibration:
         return raw
     verdict = judge(raw.calibration)

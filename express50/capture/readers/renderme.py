@@ -16,7 +16,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from express50.capture.raw import RawCamera, RawCapture
+from express50.capture.raw import RawCapture
 from express50.capture.readers.selection import Selection, check_selection
 from express50.capture.readers.timeline import Moment, common_timeline
 from express50.errors import CaptureError
@@ -48,7 +48,7 @@ def fits(path: Path) -> bool:
 
 
 def subject_of(path: Path) -> str:
-    """The actor's number.
+    """Return the actor's number.
 
     Raises:
         CaptureError: the folder holds several actors.
@@ -67,7 +67,7 @@ def _files(path: Path) -> list[Path]:
 
 
 def _parts(file: Path) -> tuple[str, str, str]:
-    """Actor, performance and kind (``raw``, ``anno`` or empty) of a file's name."""
+    """Split a file's name into actor, performance and kind (``raw``, ``anno`` or empty)."""
     actor, _, rest = file.stem.partition("_")
     for kind in ("raw", "anno"):
         if rest.endswith(f"_{kind}"):
@@ -80,14 +80,14 @@ def _parts(file: Path) -> tuple[str, str, str]:
 
 
 def companions(path: Path) -> list[Path]:
-    """Files beside the footage that are read too."""
+    """List the files beside the footage that are read too."""
     folder = path if path.is_dir() else path.parent
     other = folder.parent.parent / "anno" / folder.name
     return [other] if other.is_dir() else []
 
 
 def performances(path: Path) -> dict[str, Performance]:
-    """Performances of a folder in their order: e0 to e11, then the others.
+    """Find the performances of a folder in their order: e0 to e11, then the others.
 
     Raises:
         CaptureError: there are annotations only.
@@ -140,7 +140,9 @@ def read(path: Path, selection: Selection) -> RawCapture:
             prefix = f"{performance.raw.name}{WITHIN}Camera/{camera.removeprefix('cam')}/color"
             table |= {(part, key): f"{prefix}/{key}" for key in keys}
     check_selection(selection, list(known), sorted(pictures) or list(selection.cameras))
-    _require(path, taken, skipped)
+    if not taken:
+        reasons = "; ".join(f"{what}: {why}" for what, why in sorted(skipped.items()))
+        raise CaptureError(f"{path}: no performance can be used: {reasons}")
     last = {part: max(k for t in pictures.values() for p, k in t if p == part) for part in taken}
     line = common_timeline(pictures, list(taken), required=set(last.items()))
     calibration, warnings = _calibration(taken.values(), set(line.names))
@@ -152,13 +154,7 @@ def read(path: Path, selection: Selection) -> RawCapture:
         meta={"licence": "research only, see the terms of RenderMe-360"}
         | _person(next(iter(taken.values())))
         | {"renderme360": _release_facts(taken, clips, line.sequences, numbers, last)},
-        cameras={
-            name: RawCamera(
-                id=name, kind="frames", path=root, names=files,
-                counts=line.counts, stamps=line.stamps,
-            )
-            for name, files in line.names.items()
-        },
+        cameras=line.cameras(root),
         dropped=line.dropped,
         calibration=calibration,
         layout="renderme360",
@@ -166,31 +162,24 @@ def read(path: Path, selection: Selection) -> RawCapture:
         skipped=skipped | line.skipped,
         found={"releases": sorted({p.release for p in taken.values()})},
         warnings=warnings,
-    )  # fmt: skip
-
-
-def _require(path: Path, taken: dict, skipped: dict[str, str]) -> None:
-    if not taken:
-        reasons = "; ".join(f"{what}: {why}" for what, why in sorted(skipped.items()))
-        raise CaptureError(f"{path}: no performance can be used: {reasons}")
+    )
 
 
 def _frames(performance: Performance, selection: Selection) -> tuple[dict[str, list[int]], int]:
-    """Frame numbers by camera, and how many frames the file says the clip has.
+    """Read the frame numbers by camera, and the clip's number of frames as the file states it.
 
     Raises:
         CaptureError: the file is damaged, or a scripted clip lacks its end, where its peak is.
     """
-    file = open_hdf5(performance.raw)
-    group = child(file, "Camera", str(performance.raw))
+    file, where = open_hdf5(performance.raw), str(performance.raw)
+    group = child(file, "Camera", where)
     if not isinstance(group, h5py.Group):
         raise CaptureError(f"{performance.raw}: has no Camera group; copy the file again")
     found: dict[str, list[int]] = {}
-    where = str(performance.raw)
     for name in members(group, where):
         if not name.isdecimal() or not selection.has_camera(f"cam{name}"):
             continue
-        colour = child(file, f"Camera/{name}/color", str(performance.raw))
+        colour = child(file, f"Camera/{name}/color", where)
         keys = members(colour, where) if isinstance(colour, h5py.Group) else []
         if keys:  # some have sound only
             numbers = [key for key in keys if key.isdecimal() and len(key) < 9]
@@ -198,18 +187,15 @@ def _frames(performance: Performance, selection: Selection) -> tuple[dict[str, l
     have = {key for keys in found.values() for key in keys}
     if not have:
         raise CaptureError(f"{performance.raw}: holds no picture; copy the file again")
-    count = _count(group, len(have), where)
+    stated = attribute(group, "num_frame", len(have), where)
+    usable = stated.size == 1 and stated.dtype.kind in "ui"
+    count = int(stated[0]) if usable else len(have)
     if performance.part.startswith("e") and max(have) != count - 1 and len(have) != count:
         raise CaptureError(
             f"{performance.raw}: has {len(have)} frames up to number {max(have)}, num_frame is "
             f"{count}: the end of the clip, where the expression is, is missing; copy it again"
         )
     return found, count
-
-
-def _count(group: h5py.Group, default: int, where: str) -> int:
-    value = attribute(group, "num_frame", default, where)
-    return int(value[0]) if value.size == 1 and value.dtype.kind in "ui" else default
 
 
 def _release_facts(
@@ -232,7 +218,7 @@ def _release_facts(
 
 
 def _person(performance: Performance) -> dict[str, object]:
-    """Age and gender, which dataset cards count; what else the files say of a body stays there."""
+    """Read age and gender, which dataset cards count; the rest about the body stays where it is."""
     file, where = open_hdf5(performance.raw), str(performance.raw)
     age, gender = attribute(file, "age", (), where), attribute(file, "gender", "", where).tolist()
     person: dict[str, object] = {}
@@ -246,7 +232,7 @@ def _person(performance: Performance) -> dict[str, object]:
 def _calibration(
     taken: Iterable[Performance], names: set[str]
 ) -> tuple[dict[str, Camera] | None, dict[str, str]]:
-    """Cameras of the first performance that has some, and where others disagree with it."""
+    """Read the cameras of the first performance that has some; warn where others disagree."""
     first: dict[str, Camera] | None = None
     warnings = {}
     for performance in taken:
@@ -265,5 +251,5 @@ def _calibration(
                 "cameras are taken for all"
             )
     if not first:
-        warnings["calibration"] = "no anno file is there; the cameras are solved from the footage"
+        warnings["calibration"] = "no anno file was found; the cameras are solved from the footage"
     return first or None, warnings

@@ -35,6 +35,10 @@ class Selection:
         """Return whether a sequence is selected."""
         return any(fnmatch.fnmatchcase(name, p) for p in self.sequences or (usual,))
 
+    def left_out(self, sequences: Sequence[str]) -> dict[str, str]:
+        """Return the sequences that are not selected, with the reason."""
+        return {f"sequence {s}": "not asked for" for s in sequences if not self.has_sequence(s)}
+
     def has_camera(self, name: str) -> bool:
         """Return whether a camera is selected."""
         return not self.cameras or any(fnmatch.fnmatchcase(name, p) for p in self.cameras)
@@ -45,7 +49,7 @@ class Selection:
 
 
 def identifier(text: str, other: str = "_-") -> str:
-    """Make an id of any text: what is not a letter, a digit or in ``other`` becomes ``_``."""
+    """Make an id of any text: ``_`` replaces all but letters, digits and ``other``."""
     clean = re.sub(rf"[^A-Za-z0-9{re.escape(other)}]+", "_", text).strip("_-")
     return clean or "unnamed"
 

@@ -11,6 +11,9 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
+
+from express50.capture.raw import RawCamera
 
 # Share of the moments beyond which a camera is dropped rather than the moments, unless the camera
 # is a larger share of all cameras: then fewer pictures are lost with the moments.
@@ -51,6 +54,16 @@ class Timeline:
     def stamps(self) -> tuple[int, ...]:
         """The layout's own frame number of each moment."""
         return tuple(number for _, number in self.moments)
+
+    def cameras(self, root: Path) -> dict[str, RawCamera]:
+        """Return the taken cameras, whose pictures are image files named relative to the root."""
+        counts, stamps = self.counts, self.stamps
+        return {
+            name: RawCamera(
+                id=name, kind="frames", path=root, names=names, counts=counts, stamps=stamps
+            )
+            for name, names in self.names.items()
+        }
 
 
 def common_timeline(

@@ -1,6 +1,7 @@
-"""Folders that other reconstruction tools leave: pictures with COLMAP cameras or transforms.json.
+"""Footage in no dataset's layout: photographs, one video, or folders of reconstruction tools.
 
-Neither says what its unit is; ``metres_per_unit`` in capture.toml does.
+Photographs and videos come without cameras, COLMAP models and transforms.json with them. Neither
+tool states its unit; ``metres_per_unit`` in capture.toml does.
 """
 
 from __future__ import annotations
@@ -9,23 +10,100 @@ from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
-from express50.capture.raw import IMAGE_SUFFIXES, RawCamera, RawCapture
+from express50.capture.raw import IMAGE_SUFFIXES, VIDEO_SUFFIXES, RawCamera, RawCapture, image_names
 from express50.capture.readers.selection import Selection, check_selection, identifier
 from express50.capture.readers.timeline import Moment, common_timeline
-from express50.errors import CalibrationError, CaptureError
+from express50.errors import CalibrationError, CaptureError, FormatError
 from express50.files.containers import inside
+from express50.files.images import ORIENTATION, read_exif
+from express50.files.video import video_fps, video_turn
 from express50.geometry.cameras import Camera
 from express50.rigs.camera_builder import in_metres, read_table
 from express50.rigs.colmap import is_colmap, read_colmap_images
 from express50.rigs.transforms_json import camera_names, read_transforms
 
-FPS = 24.0  # of photographs it means nothing
+FPS = 24.0  # meaningless for photographs
+CAMERA = "video"
+
+
+def subject_of(path: Path) -> str:
+    """Return the folder's or the video's name."""
+    return identifier(path.stem if path.is_file() else path.resolve().name)
+
+
+def fits_photos(path: Path) -> bool:
+    """Return whether a folder holds photographs."""
+    return path.is_dir() and bool(image_names(path))
+
+
+def read_photos(path: Path, selection: Selection) -> RawCapture:
+    """Read each photograph as a camera of one moment; calibrate solves the cameras.
+
+    A photograph that lies on its side by its EXIF is read upright.
+
+    Raises:
+        CaptureError: two names become one camera id, or no photograph can be used.
+    """
+    names = image_names(path)
+    ids = {name: identifier(Path(name).stem) for name in names}
+    check_selection(selection, ["photo"], sorted(ids.values()))
+    dropped: dict[str, str] = {}
+    cameras: dict[str, RawCamera] = {}
+    for name, camera in ids.items():
+        if not selection.has_camera(camera):
+            continue
+        if camera in cameras:
+            raise CaptureError(
+                f"{path / name}: becomes camera {camera}, as {cameras[camera].names[0]} does; "
+                "rename one"
+            )
+        try:
+            orientation, _ = read_exif(path / name)
+        except FormatError as error:
+            dropped[camera] = str(error)
+            continue
+        cameras[camera] = RawCamera(
+            id=camera, kind="frames", path=path, names=(name,), counts=(1,), orientation=orientation
+        )
+    if not cameras:
+        reasons = "; ".join(f"{k}: {v}" for k, v in dropped.items())
+        raise CaptureError(f"{path}: no photograph can be used: {reasons or 'none was asked for'}")
+    return RawCapture(
+        root=path, subject=subject_of(path), fps=FPS, meta={}, cameras=cameras, dropped=dropped,
+        layout="photos", clips=(selection.expression("photo"),),
+    )  # fmt: skip
+
+
+def fits_video(path: Path) -> bool:
+    """Return whether a path is a video file."""
+    return path.is_file() and path.suffix.lower() in VIDEO_SUFFIXES
+
+
+def read_video(path: Path, selection: Selection) -> RawCapture:
+    """Read a video as one camera and one clip, named ``clip`` unless the selection names it.
+
+    A video that lies on its side, as telephones store what they film upright, is read upright.
+
+    Raises:
+        CaptureError: it is not a video.
+    """
+    check_selection(selection, ["clip"], [CAMERA])
+    orientation = ORIENTATION[video_turn(path)]
+    camera = RawCamera(
+        id=CAMERA, kind="videos", path=path.parent, names=(path.name,), orientation=orientation
+    )
+    return RawCapture(
+        root=path.parent, subject=subject_of(path), fps=video_fps(path), meta={},
+        cameras={CAMERA: camera}, layout="video", clips=(selection.expression("clip"),),
+    )  # fmt: skip
+
+
 MODELS = ("sparse/0", "sparse", ".")
 MOMENT = "photo"
 
 
-def subject_of(path: Path) -> str:
-    """The folder's name."""
+def folder_name(path: Path) -> str:
+    """Return the path's last name as an id."""
     return identifier(path.resolve().name)
 
 
@@ -39,10 +117,10 @@ def _model(path: Path) -> Path | None:
 
 
 def read_colmap_folder(path: Path, selection: Selection) -> RawCapture:
-    """Every posed picture as a camera of one moment.
+    """Read every posed picture as a camera of one moment.
 
     Raises:
-        CaptureError: no picture is there.
+        CaptureError: no picture can be found.
         CalibrationError: the model cannot be read, or has a lens that ours lack.
     """
     model = _model(path)
@@ -53,7 +131,7 @@ def read_colmap_folder(path: Path, selection: Selection) -> RawCapture:
     pictures = {
         name: {moment: f"images/{file}"}
         for name, file in files.items()
-        if _there(path, f"images/{file}")
+        if _is_picture(path, f"images/{file}")
     }
     return _assemble(path, "colmap", cameras, pictures, selection, sorted(files))
 
@@ -66,10 +144,10 @@ def fits_transforms(path: Path) -> bool:
 
 
 def read_transforms_folder(path: Path, selection: Selection) -> RawCapture:
-    """Cameras and time steps of a transforms.json.
+    """Read cameras and time steps of a transforms.json.
 
     Raises:
-        CaptureError: no picture is there.
+        CaptureError: no picture can be found.
         CalibrationError: the cameras are malformed, or move between time steps.
     """
     file = path / "transforms.json" if path.is_dir() else path
@@ -80,19 +158,15 @@ def read_transforms_folder(path: Path, selection: Selection) -> RawCapture:
         step = frame.get("timestep_index", 0)
         if not isinstance(step, int) or isinstance(step, bool) or step < 0:
             raise CaptureError(f"{file}: timestep_index {step!r}, expected 0 or more")
-        found = _picture(file.parent, str(frame.get("file_path", "")))
-        if found is not None:
-            pictures[name][(MOMENT, step)] = found
+        given = str(frame.get("file_path", "")).removeprefix("./")
+        for file_name in (given, *(given + suffix for suffix in IMAGE_SUFFIXES)):
+            if _is_picture(file.parent, file_name):  # some tools leave out the ending
+                pictures[name][(MOMENT, step)] = file_name
+                break
     return _assemble(file.parent, "transforms", cameras, pictures, selection, sorted(cameras))
 
 
-def _picture(root: Path, name: str) -> str | None:
-    """The picture's name with its ending, which some tools leave out."""
-    name = name.removeprefix("./")
-    return next((n for n in (name, *(name + s for s in IMAGE_SUFFIXES)) if _there(root, n)), None)
-
-
-def _there(root: Path, name: str) -> bool:
+def _is_picture(root: Path, name: str) -> bool:
     return bool(name) and inside(root, name).is_file()
 
 
@@ -125,21 +199,14 @@ def _assemble(
         )
     return RawCapture(
         root=root,
-        subject=subject_of(root),
+        subject=folder_name(root),
         fps=FPS,
         meta={},
-        cameras={
-            name: RawCamera(
-                id=name, kind="frames", path=root, names=names,
-                counts=line.counts, stamps=line.stamps,
-            )
-            for name, names in line.names.items()
-        },
+        cameras=line.cameras(root),
         dropped=without | line.dropped,
         calibration=in_metres(given, scale or 1.0),
         layout=layout,
         clips=tuple(selection.expression(sequence) for sequence in line.sequences),
         skipped=line.skipped,
-        found={},
         warnings=warnings,
-    )  # fmt: skip
+    )
