@@ -44,7 +44,7 @@ from pipelines.matte import STAGE
 from pipelines.matte.key import Keyer, dilated, eroded
 from pipelines.matte.plates import exposed, exposure_gain
 from pipelines.matte.stage import key_options
-from pipelines.pack.foreground import own_colours
+from pipelines.pack.colour import own_colours
 
 PRESETS = ("draft", "standard", "reference")
 HARD = (4.0, 6.0, 10.0, 16.0, 24.0, 40.0)  # 8-bit steps

@@ -1,38 +1,59 @@
-"""Packing: cropped samples of every subject, expression and camera into checksummed shards."""
+"""Pack cropped samples of every subject, expression and camera into checksummed shards."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
+from express50.contract.exclusions import exclusion_reason
 from express50.contract.layout import Dataset
 from express50.contract.stage import Growth, Result, Stage
 from pipelines.pack.config import PRESETS, PackConfig
 
 
 def items(dataset: Dataset) -> list[str]:
-    """List the items, see `pipelines.pack.stage`."""
-    from pipelines.pack.stage import items as found
-
-    return found(dataset)
+    """List the one item: the shards of all subjects."""
+    return ["shards"] if dataset.subjects() else []
 
 
 def inputs(dataset: Dataset, item: str, config: PackConfig) -> dict[str, Path | str]:
-    """Name what one item reads, see `pipelines.pack.stage`."""
-    from pipelines.pack.stage import inputs as found
+    """Name the outputs of every earlier stage for every subject, as far as they exist."""
+    from express50.capture.index import index_path
+    from express50.capture.readers.read import read_people
+    from pipelines.pack.card import people_lines
 
-    return found(dataset, item, config)
+    found: dict[str, Path | str] = {}
+    included = []
+    for subject in dataset.subjects():
+        if (reason := exclusion_reason(dataset, subject)) is not None:
+            found[f"{subject} excluded"] = reason
+            continue
+        included.append(subject)
+        found[f"{subject} index"] = index_path(dataset, subject)
+        parts = {
+            "frames": dataset.item_dir("frames", subject),
+            "calibrate": dataset.item_dir("calibrate", subject) / "cameras.json",
+            "gains": dataset.item_dir("calibrate", subject) / "gains.json",
+            "align": dataset.item_dir("align", subject) / "peaks.json",
+            "track": dataset.item_dir("track", subject) / "track.npz",
+            "matte": dataset.item_dir("matte", subject),
+            "depth": dataset.item_dir("depth", subject),
+            "regions": dataset.item_dir("regions", subject),
+        }
+        found |= {f"{subject} {name}": path for name, path in parts.items() if path.exists()}
+    # The receipt keeps no more about people than the card: nothing where they are too few.
+    return found | {"people": "\n".join(people_lines(read_people(dataset, included)))}
 
 
-def run(dataset: Dataset, item: str, config: PackConfig, out: Path) -> Result | dict:
-    """Make one item, see `pipelines.pack.stage`."""
+def run(dataset: Dataset, item: str, config: PackConfig, out: Path) -> Result:
+    """Write shards, index, manifest, splits and card."""
     from pipelines.pack.stage import run as work
 
-    return work(dataset, item, config, out)
+    return work(dataset, config, out)
 
 
 STAGE = Stage(
     name="pack",
-    version=8,
+    version=9,
     config=PackConfig,
     presets=PRESETS,
     items=items,

@@ -1,4 +1,4 @@
-"""Splits by subject and the dataset card."""
+"""Split the subjects, and write the dataset card."""
 
 from __future__ import annotations
 
@@ -13,19 +13,20 @@ from express50.capture.demographics import (
     mean_age,
     shown_counts,
 )
+from express50.contract.stage import Note
 from express50.errors import StageError
 
 
 def split_subjects(
-    subjects: Sequence[str], test_subjects: Sequence[str], fraction: float, seed: int
+    subjects: Sequence[str], test_subjects: Sequence[str], fraction: float
 ) -> dict[str, list[str]]:
-    """Subjects of ``train`` and ``test``; nobody is in both.
+    """Divide the subjects into ``train`` and ``test``; nobody is in both.
 
-    Without named test subjects each subject's seeded hash decides, so that a subject stays in its
+    Without named test subjects a hash of each subject's id decides, so that a subject stays in its
     split when others join; at least one of two or more is chosen unless the fraction is 0.
 
     Raises:
-        StageError: a named subject is not there, or none is left to train on.
+        StageError: a named subject does not exist, or none is left to train on.
     """
     unknown = sorted(set(test_subjects) - set(subjects))
     if unknown:
@@ -35,7 +36,7 @@ def split_subjects(
         )
     test = set(test_subjects)
     if not test and fraction > 0 and len(subjects) > 1:
-        draw = {name: _draw(seed, name) for name in subjects}
+        draw = {name: _draw(name) for name in subjects}
         test = {name for name in subjects if draw[name] < fraction}
         test = test or {min(subjects, key=lambda name: draw[name])}
     train = sorted(set(subjects) - test)
@@ -47,27 +48,27 @@ def split_subjects(
     return {"train": train, "test": sorted(test)}
 
 
-def _draw(seed: int, subject: str) -> float:
-    """Uniform number in [0, 1) of a subject."""
-    digest = hashlib.sha256(f"{seed}:{subject}".encode()).digest()
+def _draw(subject: str) -> float:
+    """Give a subject a number that is uniform in [0, 1)."""
+    digest = hashlib.sha256(f"0:{subject}".encode()).digest()  # earlier datasets had a seed, 0
     return int.from_bytes(digest[:8]) / 2**64
 
 
 def write_card(
     splits: Mapping[str, Sequence[str]],
     metas: Sequence[Mapping],
-    dropped: Sequence[Mapping],
+    dropped: Sequence[Note],
     statistics: Mapping[str, object],
     people: Sequence[Mapping] = (),
 ) -> str:
-    """Markdown datasheet of the packed samples.
+    """Write the datasheet of the packed samples as Markdown.
 
     Args:
         splits: subjects by split.
         metas: meta.json of every sample.
-        dropped: what was left out, with reasons.
+        dropped: samples and subjects that were left out, with reasons.
         statistics: further named numbers.
-        people: what capture.toml says of each packed subject; only counted, never quoted.
+        people: the facts in capture.toml about each packed subject; only counted, never quoted.
     """
     subjects = sorted({meta["subject"] for meta in metas})
     expressions = sorted({meta["expression"] for meta in metas})
@@ -78,7 +79,7 @@ def write_card(
         "",
         f"{len(metas)} samples of {len(subjects)} subjects x {len(expressions)} expressions x"
         f" {len(cameras)} cameras: colour, matte, depth, camera and head-model parameters of one"
-        " peak frame an expression.",
+        " peak frame per expression.",
         "",
         "| | |",
         "|---|---|",
@@ -102,7 +103,7 @@ def write_card(
         lines.append(f"| {expression} | " + " | ".join(row) + " |")
     lines += ["", "## People", "", *people_lines(people)]
     lines += ["", f"## Left out: {len(dropped)}", ""]
-    reasons = Counter(row["why"] for row in dropped)
+    reasons = Counter(note.why for note in dropped)
     lines += [f"- {count} x {why}" for why, count in sorted(reasons.items())] or ["Nothing."]
     lines += [
         "",
@@ -118,7 +119,7 @@ def write_card(
 
 
 def people_lines(people: Sequence[Mapping]) -> list[str]:
-    """Gender and age of the subjects as tables of counts, as far as enough captures say."""
+    """Count gender and age of the subjects in tables, as far as enough captures state them."""
     lines = []
     if genders := shown_counts(gender_counts(people)):
         lines += _count_table("gender", genders)
@@ -131,7 +132,7 @@ def people_lines(people: Sequence[Mapping]) -> list[str]:
 
 
 def _count_table(name: str, counts: Mapping[str, int]) -> list[str]:
-    """A table with a bar of one block a person, or a share of forty where there are more."""
+    """Draw a table with a bar of one block per person, forty at most."""
     scale = min(1.0, 40 / max(counts.values()))
     rows = [
         f"| {' '.join(value.replace('|', '/').split())} | {count} | {'█' * round(count * scale)} |"

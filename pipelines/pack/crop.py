@@ -1,4 +1,4 @@
-"""The square around a head, and images, depth and K cut out by it."""
+"""Find the square around a head, and cut images, labels, depth and K to it."""
 
 from __future__ import annotations
 
@@ -6,16 +6,19 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from express50.errors import StageError
 from express50.files.images import resize_area
 from express50.geometry.cameras import Camera, crop_camera, project, resized
 from express50.geometry.conventions import cell_centres, corner_to_cell
 
 EDGE = 0.01  # neighbours whose depths differ by more than this share lie on two surfaces
+MARGIN = 0.1  # room on each side, as a share of the head's size
+HAIR = 0.3  # how far the matte may widen the mesh's box, as a share of its size: hair, no shoulders
 
 
 @dataclass(frozen=True)
 class Crop:
-    """A square of whole source pixels: corner (x0, y0), which may lie outside, and its side."""
+    """A square of whole source pixels; its corner (x0, y0) may lie outside the image."""
 
     x0: int
     y0: int
@@ -23,9 +26,13 @@ class Crop:
 
 
 def head_crop(
-    camera: Camera, vertices: np.ndarray, alpha: np.ndarray, margin: float, hair: float
-) -> Crop | str:
-    """The crop around a tracked head, or the reason why there is none.
+    camera: Camera,
+    vertices: np.ndarray,
+    alpha: np.ndarray,
+    margin: float = MARGIN,
+    hair: float = HAIR,
+) -> Crop:
+    """Find the crop around a tracked head.
 
     Args:
         camera: pinhole camera.
@@ -33,21 +40,24 @@ def head_crop(
         alpha: (H, W) uint8.
         margin: room on each side, as a share of the head's size.
         hair: how far the matte may widen the mesh's box, as a share of its size.
+
+    Raises:
+        StageError: the head is not in the image, or the matte is empty.
     """
     pixels, _ = project(camera, vertices)
     pixels = pixels[np.isfinite(pixels).all(1)]
     if len(pixels) < 0.5 * len(vertices):
-        return "the tracked head lies behind the camera"
+        raise StageError("the tracked head lies behind the camera")
     low, high = pixels.min(0), pixels.max(0)
     y, x = np.nonzero(alpha > 127)
     if not len(x):
-        return "its matte is empty"
+        raise StageError("its matte is empty")
     reach = hair * (high - low)
     matte = np.array([[x.min(), y.min()], [x.max() + 1, y.max() + 1]], np.float64)
     low = np.minimum(low, np.maximum(low - reach, matte[0]))
     high = np.maximum(high, np.minimum(high + reach, matte[1]))
     if (high <= 0).any() or (low >= (camera.width, camera.height)).any():
-        return "the tracked head lies outside the image"
+        raise StageError("the tracked head lies outside the image")
     low, high = np.maximum(low, 0), np.minimum(high, (camera.width, camera.height))
     side = int(np.ceil((high - low).max() * (1 + 2 * margin)))
     corner = np.floor((low + high) / 2 - side / 2).astype(int)
@@ -55,17 +65,17 @@ def head_crop(
 
 
 def crop_pinhole(camera: Camera, crop: Crop, size: int) -> Camera:
-    """The camera of the cropped and resized image; exact, because pixels have a corner origin."""
+    """Give the camera of the cropped and resized image; exact, as pixels have a corner origin."""
     return resized(crop_camera(camera, crop.x0, crop.y0, crop.side, crop.side), size, size)
 
 
 def cut_image(image: np.ndarray, crop: Crop, size: int) -> np.ndarray:
-    """The crop of an image (H, W[, C]) uint8 at (size, size); 0 outside the image."""
+    """Cut an image (H, W[, C]) uint8 and resize it to (size, size); 0 outside the image."""
     return resize_area(_window(image, crop), size, size)
 
 
 def cut_labels(labels: np.ndarray, crop: Crop, size: int) -> np.ndarray:
-    """The crop of labels (H, W) uint8 at (size, size), each the nearest pixel's; 0 outside."""
+    """Cut labels (H, W) uint8 to (size, size), each that of the nearest pixel; 0 outside."""
     place = np.minimum((cell_centres(size) * (crop.side / size)).astype(int), crop.side - 1)
     return _window(labels, crop)[np.ix_(place, place)]
 
@@ -83,7 +93,7 @@ def _window(image: np.ndarray, crop: Crop) -> np.ndarray:
 def cut_depth(
     depth: np.ndarray, valid: np.ndarray, crop: Crop, size: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The crop of a depth map at (size, size), and its validity; surfaces are never blended.
+    """Cut a depth map to (size, size), and its validity; surfaces are never blended.
 
     Each new pixel's centre takes the bilinear mean of inverse depth, which is exact on planes,
     where its four neighbours are valid and lie on one surface; else its nearest pixel.

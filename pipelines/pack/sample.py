@@ -1,0 +1,297 @@
+"""Load what a sample is made of, crop it to the head, and encode it."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+
+import numpy as np
+
+from express50.capture.frames import (
+    read_cameras_of,
+    read_gains,
+    read_peak_frame,
+    read_peaks,
+    read_plate_image,
+)
+from express50.capture.index import read_index
+from express50.contract.layout import Dataset
+from express50.dataset.depth_files import depth_file, read_depth
+from express50.dataset.tracks import read_track, track_file
+from express50.errors import FormatError, StageError
+from express50.files.images import (
+    DEPTH_LIMIT_M,
+    DEPTH_UNIT_M,
+    depth_to_uint16,
+    read_alpha,
+    read_image,
+    scale_light,
+)
+from express50.files.text import read_json_table
+from express50.geometry.cameras import Camera
+from express50.shards.codecs import encode_pictures
+from express50.shards.writer import PackedSample, sample_key
+from pipelines.pack.colour import cut_own_colours
+from pipelines.pack.crop import Crop, crop_pinhole, cut_depth, cut_image, cut_labels, head_crop
+
+PARAMETERS = ("expression", "neck", "jaw", "eyes", "R", "t")
+
+
+@dataclass(frozen=True)
+class PackedSubject:
+    """The part of a subject's data that its samples share.
+
+    Attributes:
+        name: subject id.
+        cameras: pinhole cameras by id.
+        gains: linear light (3,) by camera, as far as it was measured.
+        peaks: decode index by expression.
+        labels: label without the annotator's name, by expression.
+        tracked: head-model parameters by expression.
+        vertices: (V, 3) tracked mesh in the world by expression, metres.
+        offsets: (V, 3) of the rest shape; None where all are 0.
+        meta: the fields of meta.json that all samples share.
+    """
+
+    name: str
+    cameras: dict[str, Camera]
+    gains: dict[str, np.ndarray]
+    peaks: dict[str, int]
+    labels: dict[str, dict]
+    tracked: dict[str, dict]
+    vertices: dict[str, np.ndarray]
+    offsets: np.ndarray | None
+    meta: dict
+
+
+def read_subject(dataset: Dataset, name: str) -> PackedSubject:
+    """Read everything that a subject's samples share.
+
+    Raises:
+        StageError: it is not calibrated, aligned or tracked.
+        FormatError: one of these files is malformed.
+    """
+    index = read_index(dataset, name)
+    peak_rows = read_json_table(dataset.item_dir("align", name) / "peaks.json", FormatError)
+    track = read_track(track_file(dataset, name))
+    offsets = track.offsets if track.offsets.any() else None
+    shared = {"shape": track.shape.tolist(), "offsets": offsets is not None}
+    return PackedSubject(
+        name=name,
+        cameras=read_cameras_of(dataset, name),
+        gains=read_gains(dataset, name),
+        peaks=read_peaks(dataset, name),
+        labels={expression: nameless(row) for expression, row in peak_rows.items()},
+        tracked={
+            expression: {key: getattr(track, key)[row].tolist() for key in PARAMETERS} | shared
+            for row, expression in enumerate(track.expressions)
+        },
+        vertices={
+            expression: track.vertices[row].astype(np.float64)
+            for row, expression in enumerate(track.expressions)
+        },
+        offsets=offsets,
+        meta={
+            "subject": name,
+            "head": track.head,
+            "fps": index.fps,
+            "consent": index.meta.get("consent_id", index.meta.get("consent")),
+            "licence": index.meta.get("licence", index.meta.get("license")),
+            "session": index.meta.get("session"),
+        },
+    )
+
+
+def nameless(label: dict) -> dict:
+    """Replace the annotator's name in a label by ``person``, unless a rule made the label."""
+    who = str(label.get("annotator", "unknown"))
+    kept = who in ("auto", "unknown") or who.startswith("rule:")
+    return label | {"annotator": who if kept else "person"}
+
+
+@dataclass(frozen=True)
+class LoadedSample:
+    """The full-size images (H, W) of one view.
+
+    Attributes:
+        rgb: (H, W, 3) uint8 sRGB frame.
+        plate: (H, W, 3) uint8 sRGB clean plate, or None.
+        matte: uint8 opacity of the subject, torso included.
+        alpha: uint8 opacity to pack.
+        depth: metres.
+        valid: bool, the depth is known.
+        parts: uint8 labels, or None.
+        torso: `removed` from alpha and valid, or `kept`.
+    """
+
+    rgb: np.ndarray
+    plate: np.ndarray | None
+    matte: np.ndarray
+    alpha: np.ndarray
+    depth: np.ndarray
+    valid: np.ndarray
+    parts: np.ndarray | None
+    torso: str
+
+
+def load_sample(
+    dataset: Dataset,
+    item: str,
+    camera: Camera,
+    *,
+    plate: bool,
+    remove_torso: bool,
+    min_confidence: float,
+) -> LoadedSample:
+    """Load one view of `subject/expression` from the outputs of the earlier stages.
+
+    Args:
+        dataset: the dataset.
+        item: `subject/expression`.
+        camera: pinhole camera of the view.
+        plate: load the clean plate too, if there is one.
+        remove_torso: take the torso out of alpha and depth where regions separated it.
+        min_confidence: depth with less confidence is not valid.
+
+    Raises:
+        StageError: an image is missing, or their sizes differ.
+        FormatError, CaptureError: an image cannot be read.
+    """
+    subject, expression = item.split("/")
+    matte_path = dataset.matte_file(subject, expression, camera.id)
+    folder = dataset.item_dir("depth", item)
+    if not matte_path.is_file():
+        raise StageError("it has no matte")
+    if (depth_path := depth_file(folder, camera.id)) is None:
+        raise StageError("it has no depth")
+    rgb = read_peak_frame(dataset, subject, expression, camera.id)
+    matte = alpha = read_alpha(matte_path)
+    depth, valid = read_depth(depth_path)
+    parts, head = _read_regions(dataset, item, camera.id)
+    sizes = [image.shape[:2] for image in (rgb, matte, depth, parts, head) if image is not None]
+    if set(sizes) != {(camera.height, camera.width)}:
+        raise StageError(
+            f"frame, matte, depth and regions differ in size: {', '.join(map(str, sizes))}"
+        )
+    removed = head is not None and remove_torso
+    if head is not None and removed:
+        # Depth without colour is dropped too: what is left of the torso would bend the head.
+        alpha, valid = head, valid & (head > 127)
+    if min_confidence > 0:
+        sure = read_image(folder / f"{camera.id}_confidence.png")
+        valid = valid & (sure >= round(255 * min_confidence))
+    behind = read_plate_image(dataset, subject, camera.id) if plate else None
+    torso = "removed" if removed else "kept"
+    return LoadedSample(rgb, behind, matte, alpha, depth, valid, parts, torso)
+
+
+def _read_regions(
+    dataset: Dataset, item: str, camera_id: str
+) -> tuple[np.ndarray | None, np.ndarray | None]:
+    """Read the labels (H, W) uint8 and the head's alpha (H, W) uint8; None for what is missing.
+
+    There is no alpha of the head where the regions stage could not separate the torso.
+
+    Raises:
+        FormatError: one of them is not an 8-bit grey image.
+    """
+    folder = dataset.item_dir("regions", item)
+    paths = folder / f"{camera_id}.png", folder / f"{camera_id}_head.png"
+    if not all(path.is_file() for path in paths):
+        return None, None
+    facts = read_json_table(folder / "metrics.json", FormatError)
+    torso_unknown = "torso" in facts["missing"] and facts["method"] == "mesh"
+    return read_alpha(paths[0]), None if torso_unknown else read_alpha(paths[1])
+
+
+@dataclass(frozen=True)
+class CroppedSample:
+    """The images of one view cut to (size, size); depth is 0 where `valid` is not set."""
+
+    crop: Crop
+    rgb: np.ndarray
+    alpha: np.ndarray
+    depth: np.ndarray
+    valid: np.ndarray
+    parts: np.ndarray | None
+
+
+def crop_sample(
+    loaded: LoadedSample, camera: Camera, vertices: np.ndarray, size: int, foreground: bool
+) -> CroppedSample:
+    """Cut the images of one view to the square around its tracked head.
+
+    Args:
+        loaded: the view's images.
+        camera: its pinhole camera.
+        vertices: (V, 3) tracked mesh in the world, metres.
+        size: side of the result, pixels.
+        foreground: give soft pixels the subject's own colour.
+
+    Raises:
+        StageError: there is no head to crop, or its depth is too large for shards.
+    """
+    crop = head_crop(camera, vertices, loaded.alpha)
+    depth, valid = cut_depth(loaded.depth, loaded.valid, crop, size)
+    if (farthest := depth[valid].max(initial=0)) >= DEPTH_LIMIT_M:
+        raise StageError(
+            f"its depth reaches {farthest:.2f} m; shards hold less than {DEPTH_LIMIT_M:.2f} m"
+        )
+    if foreground:
+        rgb = cut_own_colours(loaded.rgb, loaded.matte, loaded.plate, crop, size)
+    else:
+        rgb = cut_image(loaded.rgb, crop, size)
+    parts = None if loaded.parts is None else cut_labels(loaded.parts, crop, size)
+    return CroppedSample(crop, rgb, cut_image(loaded.alpha, crop, size), depth, valid, parts)
+
+
+def encode_sample(
+    cropped: CroppedSample,
+    subject: PackedSubject,
+    expression: str,
+    camera: Camera,
+    *,
+    torso: str,
+    gain: np.ndarray,
+    profile: str,
+) -> tuple[PackedSample, dict]:
+    """Encode the files of one sample; returns them and the content of its meta.json.
+
+    Args:
+        cropped: the images.
+        subject: the data that the subject's samples share.
+        expression: expression id.
+        camera: the uncropped pinhole camera.
+        torso: `removed` or `kept`.
+        gain: (3,) of linear light, to be divided out of the colours.
+        profile: codecs, see `PackConfig.profile`.
+    """
+    sample_key(subject.name, expression, camera.id)  # raises where an id cannot be a file name
+    size = len(cropped.alpha)
+    meta = subject.meta | {
+        "K": crop_pinhole(camera, cropped.crop, size).K.tolist(),
+        "cam_from_world": camera.cam_from_world.tolist(),
+        "camera": camera.id,
+        "colour_gain": gain.tolist(),
+        "crop": vars(cropped.crop),
+        "depth_scale_m": DEPTH_UNIT_M,
+        "expression": expression,
+        "frame": subject.peaks[expression],
+        "height": size,
+        "label": subject.labels[expression],
+        "parts": cropped.parts is not None,
+        "source_size": [camera.width, camera.height],
+        "torso": torso,
+        "track": subject.tracked[expression],
+        "width": size,
+    }
+    members = encode_pictures(
+        cropped.rgb if (gain == 1).all() else scale_light(cropped.rgb, 1.0 / gain),
+        cropped.alpha,
+        depth_to_uint16(cropped.depth, cropped.valid),
+        cropped.parts,
+        profile,
+    )
+    text = json.dumps(meta, sort_keys=True, separators=(",", ":"), allow_nan=False)
+    members["meta.json"] = text.encode()
+    return PackedSample(subject.name, expression, camera.id, members), meta
