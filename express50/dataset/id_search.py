@@ -128,6 +128,8 @@ def _tar_texts(path: Path) -> Iterator[bytes]:
 
 def _zip_texts(path: Path) -> Iterator[bytes]:
     """Yield names and texts of an archive such as .npz or a checkpoint, without its numbers."""
+    import numpy as np
+
     with zipfile.ZipFile(path) as archive:
         for member in archive.infolist():
             yield member.filename.encode()
@@ -137,14 +139,8 @@ def _zip_texts(path: Path) -> Iterator[bytes]:
             elif member.filename.endswith(".npy") and member.file_size < TEXT_LIMIT:
                 data = archive.read(member)
                 if b"'descr': '<U" in data[:128] or b"'descr': '|S" in data[:128]:
-                    yield _npy_texts(data)
-
-
-def _npy_texts(data: bytes) -> bytes:
-    import numpy as np
-
-    array = np.load(io.BytesIO(data), allow_pickle=False)
-    return "\n".join(map(str, array.ravel())).encode()
+                    array = np.load(io.BytesIO(data), allow_pickle=False)
+                    yield "\n".join(map(str, array.ravel())).encode()
 
 
 def _ledger_texts(path: Path) -> Iterator[bytes]:

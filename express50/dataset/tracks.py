@@ -120,15 +120,14 @@ def read_track(path: Path) -> Track:
         if schema == SCHEMAS[0]:
             arrays["offsets"] = np.zeros(arrays["vertices"].shape[1:], np.float32)
         names = arrays.pop("expressions")
-        _check_names(names)
-        expected = _shapes(arrays, len(names))
-        for name, shape in expected.items():
-            _check(name, arrays[name], shape)
-        _check_rotations(arrays["R"])
+        count = arrays["vertices"].shape[1] if arrays["vertices"].ndim == 3 else None
+        further = {"vertices": (names.size, count, 3), "offsets": (count, 3)}
+        numbers = _checked(arrays, names, further)
+        if len(set(names.tolist())) != len(names):
+            raise ValueError("an expression appears twice")
     except (KeyError, ValueError) as error:
         words = f"has no {error}" if isinstance(error, KeyError) else str(error)
         raise FormatError(f"{path}: not a track ({words}); {_AGAIN}") from None
-    numbers = {name: _typed(name, arrays[name]) for name in expected}
     return Track(schema=schema, head=head, expressions=tuple(names.tolist()), **numbers)
 
 
@@ -152,41 +151,47 @@ def read_sequence(path: Path) -> Sequence:
         schema, head, cues = str(arrays["schema"]), str(arrays["head"]), arrays["cues"]
         if schema != SEQUENCE_SCHEMA:
             raise ValueError(f"schema {schema!r}, expected {SEQUENCE_SCHEMA}")
-        _check_names(cues, alone=False)
-        count = len(cues)
-        expected = {"frames": (count,), "shape": (None,), "expression": (count, None)}
-        expected |= {name: (count, *width) for name, width in _WIDTHS.items()}
-        for name, shape in expected.items():
-            _check(name, arrays[name], shape)
-        _check_rotations(arrays["R"])
+        numbers = _checked(arrays, cues, {})
     except (KeyError, ValueError) as error:
         words = f"has no {error}" if isinstance(error, KeyError) else str(error)
         raise FormatError(f"{path}: not a sequence ({words}); {_AGAIN}") from None
-    numbers = {name: _typed(name, arrays[name]) for name in expected}
     return Sequence(head=head, cues=tuple(cues.tolist()), **numbers)
 
 
-def _shapes(arrays: dict[str, np.ndarray], count: int) -> dict[str, tuple[int | None, ...]]:
-    """Return the expected shape of every array of a track with ``count`` expressions."""
-    vertices = arrays["vertices"].shape[1] if arrays["vertices"].ndim == 3 else None
-    return {
-        "frames": (count,),
-        "shape": (None,),
-        "expression": (count, None),
-        **{name: (count, *width) for name, width in _WIDTHS.items()},
-        "vertices": (count, vertices, 3),
-        "offsets": (vertices, 3),
-    }
+def _checked(
+    arrays: dict[str, np.ndarray], names: np.ndarray, further: dict[str, tuple[int | None, ...]]
+) -> dict[str, np.ndarray]:
+    """Return the numbers of a track with their final types.
 
+    Args:
+        arrays: as they were read.
+        names: (E,) expressions or cues.
+        further: expected shapes of arrays that only one kind of file has.
 
-def _check_names(names: np.ndarray, alone: bool = True) -> None:
+    Raises:
+        ValueError: one has another shape or kind, or holds what it must not.
+        KeyError: one is missing.
+    """
     if names.ndim != 1 or names.dtype.kind != "U" or not len(names):
         raise ValueError(f"expressions are {names.dtype} {names.shape}, expected (E,) strings")
     for name in names.tolist():
         if not ID.fullmatch(name):  # they become names of files
             raise ValueError(f"expression {name!r}, expected letters, digits, _ and -")
-    if alone and len(set(names.tolist())) != len(names):
-        raise ValueError("an expression appears twice")
+    count = len(names)
+    shapes: dict[str, tuple[int | None, ...]] = {
+        "frames": (count,),
+        "shape": (None,),
+        "expression": (count, None),
+        **{name: (count, *width) for name, width in _WIDTHS.items()},
+    } | further
+    for name, shape in shapes.items():
+        _check(name, arrays[name], shape)
+    R = arrays["R"]
+    error = np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)).max()
+    if error > 1e-3 or (np.linalg.det(R) < 0).any():
+        raise ValueError(f"R is not a rotation: R R^T differs from 1 by {error:.2g}")
+    kinds = {"frames": np.int64, "vertices": np.float32, "offsets": np.float32}
+    return {name: arrays[name].astype(kinds.get(name, np.float64)) for name in shapes}
 
 
 def _check(name: str, array: np.ndarray, shape: tuple[int | None, ...]) -> None:
@@ -200,15 +205,3 @@ def _check(name: str, array: np.ndarray, shape: tuple[int | None, ...]) -> None:
         raise ValueError(f"{name} is {array.dtype} {array.shape}, expected numbers {wanted}")
     if not np.isfinite(array).all():
         raise ValueError(f"{name} holds NaN or Inf")
-
-
-def _check_rotations(R: np.ndarray) -> None:
-    error = np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)).max()
-    if error > 1e-3 or (np.linalg.det(R) < 0).any():
-        raise ValueError(f"R is not a rotation: R R^T differs from 1 by {error:.2g}")
-
-
-def _typed(name: str, array: np.ndarray) -> np.ndarray:
-    if name == "frames":
-        return array.astype(np.int64)
-    return array.astype(np.float32 if name in ("vertices", "offsets") else np.float64)

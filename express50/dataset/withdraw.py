@@ -9,9 +9,8 @@ weights learned. The raw capture lies outside the dataset and stays its owner's 
 from __future__ import annotations
 
 import shutil
-import sqlite3
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import closing, suppress
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -23,7 +22,7 @@ from express50.errors import FormatError, StageError
 from express50.files.atomic import write_json
 from express50.files.digests import text_digest
 from express50.files.text import NAME, read_json
-from express50.runner.ledger import Ledger, check_schema
+from express50.runner.ledger import Ledger
 from express50.runner.publish import hold_stages
 
 Redact = Callable[[Path, str], bool]
@@ -64,23 +63,17 @@ def _own_paths(dataset: Dataset, subject: str) -> Iterator[Path]:
     if dataset.labels_file(subject).exists():
         yield dataset.labels_file(subject)
     reference = dataset.root / "labels" / "reference.json"
-    if reference.is_file() and subject in _values(reference):
-        yield reference  # the next subject becomes the reference
+    if reference.is_file():
+        with suppress(FormatError):
+            table = read_json(reference, FormatError)
+            if isinstance(table, dict) and subject in map(str, table.values()):
+                yield reference  # the next subject becomes the reference
     test = names(subject)
     # Settings such as pack.test_subjects; the stage's next run writes its own.
     yield from (p for p in (dataset.root / "config").glob("*.toml") if says(p, test))
     for path in (dataset.root / "logs").glob("*/*.txt"):
         if path.stem.split("+")[0] == subject:
             yield path
-
-
-def _values(path: Path) -> list[str]:
-    """List the values of a JSON table of texts; empty where it is not one."""
-    try:
-        table = read_json(path, FormatError, "")
-    except FormatError:
-        return []
-    return [str(value) for value in table.values()] if isinstance(table, dict) else []
 
 
 def _mixed_paths(dataset: Dataset) -> Iterator[Path]:
@@ -136,7 +129,10 @@ def withdraw(
     """
     with hold_stages(dataset, sorted(p.stem for p in (dataset.root / "config").glob("*.toml"))):
         paths = plan(dataset, subject)
-        _check_ledger(dataset)  # before anything is removed: half a withdrawal cannot be repeated
+        if dataset.ledger.is_file():
+            # Before anything is removed: half a withdrawal cannot be repeated.
+            with Ledger(dataset.ledger) as ledger:
+                ledger.check_whole()
         captures = dataset.captures()
         capture = captures.pop(subject, None)
         files = sum(1 if p.is_file() else sum(q.is_file() for q in p.rglob("*")) for p in paths)
@@ -147,34 +143,20 @@ def withdraw(
             else:
                 path.unlink()
         write_json(dataset.captures_file, {name: str(path) for name, path in captures.items()})
-        _forget(dataset, subject, paths)
-        changed = list(_redacted(dataset, subject, checkpoints, redact))
+        if dataset.ledger.is_file():
+            with Ledger(dataset.ledger) as ledger:
+                ledger.erase(subject, dataset.root, paths, names(subject))
+        changed, own = [], sorted((dataset.root / "grmm").rglob("*.pt"))
+        for path in [*own, *(path for path in checkpoints if path.is_file())]:
+            with suppress(FormatError):  # not a GRMM checkpoint: searched for the id below
+                if redact(path, subject):
+                    changed.append(path)
+    test = names(subject)
     remaining = [
         *files_naming(dataset.root, subject),
-        *(path for path in _existing(checkpoints) if says(path, names(subject))),
+        *(path for path in checkpoints if path.is_file() and says(path, test)),
     ]
     return Withdrawal(subject, capture, tuple(paths), tuple(changed), tuple(remaining), files)
-
-
-def _existing(paths: Sequence[Path]) -> list[Path]:
-    return [path for path in paths if path.is_file()]
-
-
-def _redacted(
-    dataset: Dataset, subject: str, checkpoints: Sequence[Path], redact: Redact
-) -> Iterator[Path]:
-    for path in [*sorted((dataset.root / "grmm").rglob("*.pt")), *_existing(checkpoints)]:
-        try:
-            if redact(path, subject):
-                yield path
-        except FormatError:
-            continue  # no checkpoint of ours: found below if it names the subject
-
-
-def _check_ledger(dataset: Dataset) -> None:
-    if dataset.ledger.is_file():
-        with Ledger(dataset.ledger) as ledger:
-            ledger.check_whole()
 
 
 def withdrawn_file(dataset: Dataset) -> Path:
@@ -200,64 +182,12 @@ def withdrawn(dataset: Dataset) -> set[str]:
 
 def _withdrawals(path: Path) -> list:
     """Read the records of withdrawals; old ones are digests alone, without time and count."""
-    mend = "restore it: it says who must not be taken in again"
-    rows = read_json(path, FormatError, mend)
+    fix = "restore it: it says who must not be taken in again"
+    rows = read_json(path, FormatError, fix)
     if not isinstance(rows, list) or not all(isinstance(_digest(row), str) for row in rows):
-        raise FormatError(f"{path}: expected a list of digests; {mend}")
+        raise FormatError(f"{path}: expected a list of digests; {fix}")
     return rows
 
 
 def _digest(row: Any) -> Any:
     return row.get("id_sha256") if isinstance(row, dict) else row
-
-
-def _forget(dataset: Dataset, subject: str, paths: list[Path]) -> None:
-    """Remove receipts and digests, and overwrite the database's freed pages."""
-    if not dataset.ledger.is_file():
-        return
-    try:
-        _forget_rows(dataset, subject, paths)
-    except sqlite3.DatabaseError as error:
-        raise FormatError(f"{dataset.ledger}: not a ledger ({error}); delete it") from error
-
-
-def _forget_rows(dataset: Dataset, subject: str, paths: list[Path]) -> None:
-    pairs = {_stage_and_item(path.relative_to(dataset.root)) for path in paths}
-    root = str(dataset.root.resolve())
-    with closing(sqlite3.connect(dataset.ledger, isolation_level=None)) as database:
-        check_schema(database)
-        database.execute("PRAGMA secure_delete=ON")
-        tables = [row[0] for row in database.execute("SELECT name FROM sqlite_master")]
-        for table in (name for name in ("receipts", "made") if name in tables):
-            database.executemany(f"DELETE FROM {table} WHERE stage = ? AND item = ?", pairs)
-            database.execute(
-                f"DELETE FROM {table} WHERE item = ? OR substr(item, 1, ?) = ?",
-                (subject, len(subject) + 1, f"{subject}/"),
-            )
-        for path in paths:
-            prefix = f"{root}/{path.relative_to(dataset.root).as_posix()}"
-            database.execute(
-                "DELETE FROM digests WHERE path = ? OR substr(path, 1, ?) = ?",
-                (prefix, len(prefix) + 1, f"{prefix}/"),
-            )
-        _forget_naming(database, subject)
-        with suppress(sqlite3.OperationalError):  # ledgers of before runs were kept
-            database.execute("DELETE FROM runs")  # they count the person's items
-        database.execute("PRAGMA wal_checkpoint(TRUNCATE)")
-        database.execute("VACUUM")
-        database.execute("PRAGMA wal_checkpoint(TRUNCATE)")
-
-
-def _forget_naming(database: sqlite3.Connection, subject: str) -> None:
-    """Remove what else names the subject: its footage's digests, others' reasons and inputs."""
-    test = names(subject)
-    database.create_function("names", 1, lambda text: test((text or "").encode()))
-    database.execute("DELETE FROM digests WHERE names(path)")
-    database.execute("DELETE FROM receipts WHERE names(reason) OR names(metrics)")
-    if database.execute("SELECT 1 FROM sqlite_master WHERE name = 'made'").fetchone():
-        database.execute("DELETE FROM made WHERE names(inputs) OR names(files)")
-
-
-def _stage_and_item(path: Path) -> tuple[str, str]:
-    stage, *item = path.parts
-    return stage, "/".join(item)

@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import sqlite3
 import time
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, fields
 from pathlib import Path
@@ -123,7 +123,7 @@ COLUMNS = tuple(one.name for one in fields(Receipt) if one.name != "made")
 KINDS = {"item": str, "fingerprint": str, "status": str, "reason": str, "metrics": dict}
 
 
-def check_schema(database: sqlite3.Connection) -> None:
+def _check_schema(database: sqlite3.Connection) -> None:
     """Refuse a database that holds more than a ledger's tables.
 
     A file from elsewhere may hold views and triggers, which run as programs whenever a receipt is
@@ -147,11 +147,11 @@ class Ledger:
         with self._damage():
             if read_only:
                 self._database = _open_to_read(path)
-                check_schema(self._database)
+                _check_schema(self._database)
                 return
             path.parent.mkdir(parents=True, exist_ok=True)
             self._database = sqlite3.connect(path, timeout=60, isolation_level=None)
-            check_schema(self._database)
+            _check_schema(self._database)
             self._database.execute("PRAGMA journal_mode=WAL")
             # A receipt lost in a power failure costs making one item again; waiting for the disk
             # after each would slow every item. `forget` waits, as its removals must not be lost.
@@ -304,6 +304,43 @@ class Ledger:
                 database.executemany(f"DELETE FROM {table} WHERE stage = ? AND item = ?", keys)
         with self._damage():
             self._database.execute("PRAGMA synchronous=NORMAL")
+
+    def erase(
+        self, subject: str, root: Path, paths: Iterable[Path], names: Callable[[bytes], bool]
+    ) -> None:
+        """Remove what is of a subject or names it, and overwrite the database's freed pages.
+
+        Args:
+            subject: id; its items are the id itself or begin with it and a slash.
+            root: folder of the dataset.
+            paths: files and folders below it that were removed: their receipts and digests go.
+            names: True if a text names the subject. Others' reasons, inputs and footage may.
+        """
+        below = [path.relative_to(root) for path in paths]
+        items = {(one.parts[0], "/".join(one.parts[1:])) for one in below}
+        files = [f"{root.resolve()}/{one.as_posix()}" for one in below]
+        with self._damage():
+            database = self._database
+            database.create_function("names", 1, lambda text: names((text or "").encode()))
+            database.execute("PRAGMA synchronous=FULL")
+            database.execute("PRAGMA secure_delete=ON")
+            for table in ("receipts", "made"):
+                database.executemany(f"DELETE FROM {table} WHERE stage = ? AND item = ?", items)
+                database.execute(
+                    f"DELETE FROM {table} WHERE item = ? OR substr(item, 1, ?) = ?",
+                    (subject, len(subject) + 1, f"{subject}/"),
+                )
+            database.executemany(
+                "DELETE FROM digests WHERE path = ? OR substr(path, 1, ?) = ?",
+                [(file, len(file) + 1, f"{file}/") for file in files],
+            )
+            database.execute("DELETE FROM digests WHERE names(path)")
+            database.execute("DELETE FROM receipts WHERE names(reason) OR names(metrics)")
+            database.execute("DELETE FROM made WHERE names(inputs) OR names(files)")
+            database.execute("DELETE FROM runs")  # they count the person's items
+            database.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+            database.execute("VACUUM")
+            database.execute("PRAGMA wal_checkpoint(TRUNCATE)")
 
     def sha256(self, path: Path) -> str:
         """Return the SHA-256 of a file; it is read again only when its size or time changed."""

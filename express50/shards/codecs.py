@@ -44,7 +44,9 @@ def encode_pictures(
         members = {"rgb.jpg": encode_jpeg(rgb, 90 if profile == "compact" else 95)}
     small = {"alpha": alpha} | ({} if parts is None else {"parts": parts})
     if profile == "fast":
-        members |= {f"{name}.zst": _zstd(image) for name, image in small.items()}
+        for name, image in small.items():
+            code = imagecodecs.zstd_encode(image.tobytes(), level=ZSTD_LEVEL)
+            members[f"{name}.zst"] = bytes(code)
         members["depth.lerc"] = bytes(imagecodecs.lerc_encode(np.ascontiguousarray(depth), level=0))
     else:
         members |= {f"{name}.png": encode_png(image) for name, image in small.items()}
@@ -93,10 +95,6 @@ def _decode(name: str, data: bytes, where: str) -> np.ndarray:
         return imagecodecs.jpeg8_decode(data)
     except (RuntimeError, ValueError) as error:  # imagecodecs' errors are RuntimeErrors
         raise FormatError(f"{where}: cannot be decoded ({error})") from None
-
-
-def _zstd(image: np.ndarray) -> bytes:
-    return bytes(imagecodecs.zstd_encode(image.tobytes(), level=ZSTD_LEVEL))
 
 
 def _unzstd(data: bytes, width: int, height: int, where: str) -> np.ndarray:

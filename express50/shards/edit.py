@@ -50,8 +50,7 @@ def _write(readers: Sequence[ShardReader], out: Path, shard_mb: int) -> int:
         raise FormatError(f"--shard-mb is {shard_mb}, expected at least 1")
     if not any(len(reader) for reader in readers):
         raise FormatError(f"{readers[0].root}: no sample matches; 'express50 shards ls' lists them")
-    _refuse_doubles(readers)
-    splits = _splits(readers)
+    splits = _checked_splits(readers)
     aside = out.with_name(f".{out.name}.unfinished")
     shutil.rmtree(aside, ignore_errors=True)
     writer = ShardWriter(aside, shard_mb * 10**6)
@@ -77,20 +76,20 @@ def _write(readers: Sequence[ShardReader], out: Path, shard_mb: int) -> int:
     return sum(len(reader) for reader in readers)
 
 
-def _refuse_doubles(readers: Sequence[ShardReader]) -> None:
-    owners: dict[tuple[str, str], Path] = {}
+def _checked_splits(readers: Sequence[ShardReader]) -> dict[str, str]:
+    """Return the split of every subject.
+
+    Raises:
+        FormatError: two folders hold the same group, or a subject is in two splits.
+    """
+    owners: dict[tuple[str, str], ShardReader] = {}
     for reader in readers:
         for group in reader.groups():
-            if group in owners:
+            if owners.setdefault(group, reader) is not reader:
                 raise FormatError(
-                    f"{reader.root}: {'/'.join(group)} is in {owners[group]} too; split one of them"
-                    " so that each expression of a subject is in one folder"
+                    f"{reader.root}: {'/'.join(group)} is in {owners[group].root} too; split one of"
+                    " them so that each expression of a subject is in one folder"
                 )
-            owners[group] = reader.root
-
-
-def _splits(readers: Sequence[ShardReader]) -> dict[str, str]:
-    """Return the split of every subject; a subject in two splits is refused."""
     splits: dict[str, str] = {}
     for reader in readers:
         for entry in reader.entries:
@@ -118,7 +117,10 @@ def _copy_offsets(readers: Sequence[ShardReader], out: Path) -> None:
         for subject in sorted({entry.subject for entry in reader.entries}):
             source, target = offsets_file(reader.root, subject), offsets_file(out, subject)
             if not source.is_file():
-                _refuse_lost_offsets(reader, subject)
+                first = next(n for n, one in enumerate(reader.entries) if one.subject == subject)
+                track = reader.meta(first).get("track")
+                if isinstance(track, dict) and track.get("offsets"):
+                    reader.offsets(subject)  # raises, as its samples need them
                 continue
             if target.exists() and target.read_bytes() != source.read_bytes():
                 raise FormatError(
@@ -126,14 +128,6 @@ def _copy_offsets(readers: Sequence[ShardReader], out: Path) -> None:
                     " subject in one run"
                 )
             shutil.copyfile(source, target)
-
-
-def _refuse_lost_offsets(reader: ShardReader, subject: str) -> None:
-    """Refuse samples that need offsets without them."""
-    first = next(n for n, entry in enumerate(reader.entries) if entry.subject == subject)
-    track = reader.meta(first).get("track")
-    if isinstance(track, dict) and track.get("offsets"):
-        reader.offsets(subject)  # raises
 
 
 def _write_card(readers: Sequence[ShardReader], out: Path) -> None:

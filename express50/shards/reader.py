@@ -138,7 +138,11 @@ class ShardReader:
             FormatError: the member is missing, or its bytes are damaged.
         """
         entry = self.entries[number]
-        file, found = self._file(entry.shard), {}
+        if self._owner != os.getpid():  # a fork shares descriptors; leave the parent's alone
+            self._files, self._owner = {}, os.getpid()
+        if entry.shard not in self._files:
+            self._files[entry.shard] = os.open(self.root / entry.shard, os.O_RDONLY)
+        file, found = self._files[entry.shard], {}
         for name in entry.members if names is None else names:
             offset, size, crc = self._place(entry, name)
             # One read per member copies once; one read per sample and slices take a third longer.
@@ -220,13 +224,6 @@ class ShardReader:
         files, self._files = self._files, {}
         for file in files.values():
             os.close(file)
-
-    def _file(self, shard: str) -> int:
-        if self._owner != os.getpid():  # a fork shares descriptors; leave the parent's alone
-            self._files, self._owner = {}, os.getpid()
-        if shard not in self._files:
-            self._files[shard] = os.open(self.root / shard, os.O_RDONLY)
-        return self._files[shard]
 
     def _picture(
         self, entry: Entry, members: dict[str, bytes], names: tuple[str, ...], meta: dict
