@@ -27,7 +27,7 @@ class Label:
     """One event of the store.
 
     Attributes:
-        subject, expression: what is labelled; no expression where it is about the whole subject.
+        subject, expression: the labelled performance; no expression for a whole subject.
         action: ``mark`` a peak, ``flag`` a performance that has none, ``undo`` one's last event,
             ``settle`` a disagreement (with a frame, or with a reason in place of a flag),
             ``exclude`` or ``include`` a subject.
@@ -109,7 +109,7 @@ def make_flag(index: Index, expression: str, reason: str, annotator: str) -> Lab
     """Make a flag: the expression has no peak, for a reason such as those of ``FLAG_REASONS``.
 
     Raises:
-        AnnotationError: the expression is not in the cues, or there is no reason.
+        AnnotationError: the expression is not in the cues, or the reason is empty.
     """
     if not reason.strip():
         raise AnnotationError(
@@ -139,7 +139,7 @@ def _event(index: Index, expression: str, action: str, annotator: str) -> Label:
 
 
 def find_cue(index: Index, expression: str) -> Cue:
-    """The cue window of an expression.
+    """Find the cue window of an expression.
 
     Raises:
         AnnotationError: it is not in the cues.
@@ -154,7 +154,7 @@ def find_cue(index: Index, expression: str) -> Cue:
 
 
 def find_camera(index: Index, camera: str) -> CameraSource:
-    """The footage of a camera.
+    """Find the footage of a camera.
 
     Raises:
         AnnotationError: the capture has no such camera.
@@ -183,7 +183,7 @@ def _check_frame(index: Index, cue: Cue, source: CameraSource, frame: int) -> No
 
 
 def check_texts(label: Label) -> None:
-    """Refuse what would break tables, or colour terminals.
+    """Refuse texts that would break tables, or colour terminals.
 
     Raises:
         AnnotationError: the annotator's name or the reason is not one line of text.

@@ -79,7 +79,7 @@ def cell_size() -> CellSize | None:
 
 
 class Painter(ABC):
-    """Paints pictures that fill a pane as far as they can, and keeps the last ones as lines."""
+    """Paints pictures as large as a pane allows, and keeps the last ones as lines."""
 
     def __init__(self) -> None:
         self._kept: OrderedDict[tuple[FrameCrop, Size], list[Strip]] = OrderedDict()
@@ -208,16 +208,12 @@ def picture_strips(picture: np.ndarray, few: bool = False) -> list[Strip]:
 
 
 def _line(glyphs: np.ndarray, pairs: np.ndarray) -> Strip:
-    """One line; neighbours of the same two colours share a segment."""
-    starts = np.flatnonzero(np.diff(pairs, prepend=pairs[0] ^ 1))
+    """Write one line; neighbours of the same two colours share a segment."""
     text = "".join(glyphs)
-    ends = [*starts[1:].tolist(), len(text)]
-    colours = pairs[starts].tolist()
-    begins = starts.tolist()
-    segments = [
-        Segment(text[a:b], _style(c)) for a, b, c in zip(begins, ends, colours, strict=True)
-    ]
-    return Strip(segments, len(text))
+    starts = np.flatnonzero(np.diff(pairs, prepend=pairs[0] ^ 1))
+    colours, begins = pairs[starts].tolist(), starts.tolist()
+    runs = zip(begins, [*begins[1:], len(text)], colours, strict=True)
+    return Strip([Segment(text[a:b], _style(c)) for a, b, c in runs], len(text))
 
 
 @lru_cache(maxsize=1 << 16)

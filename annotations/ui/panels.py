@@ -18,7 +18,7 @@ LEAST_CELLS = 6  # fewer say nothing
 
 
 def fit(left: Text, right: Text, width: int) -> Text:
-    """Two texts at the ends of a line; what does not fit beside the left one is cut."""
+    """Set two texts at the ends of a line; the right one is cut where it does not fit."""
     left, right = left.copy(), right.copy()
     left.truncate(width, overflow="ellipsis")
     room = width - left.cell_len - 1
@@ -65,7 +65,7 @@ def words_line(scene: TaskScene, width: int) -> Text:
 
 
 def frame_title(scene: TaskScene, view: CueView | None, look: FrameLook | None, width: int) -> Text:
-    """Title of the left picture: position, and what is known of this very frame."""
+    """Write the title of the left picture: position, and tags of this very frame."""
     if look is None or view is None:
         return Text(f" {scene.task.subject}", style=theme.FAINT)
     left = Text.assemble(
@@ -78,7 +78,7 @@ def frame_title(scene: TaskScene, view: CueView | None, look: FrameLook | None, 
 
 
 def frame_tags(scene: TaskScene, view: CueView) -> list[tuple[str, str]]:
-    """Short words, with their colours, on what is known of the frame under the cursor."""
+    """List short words, with their colours, about the frame under the cursor."""
     tags = []
     if view.cursor in view.candidates:
         number = view.candidates.index(view.cursor) + 1
@@ -92,7 +92,7 @@ def frame_tags(scene: TaskScene, view: CueView) -> list[tuple[str, str]]:
 
 
 def reference_title(scene: TaskScene, look: FrameLook | None, width: int) -> Text:
-    """Title of the right picture."""
+    """Write the title of the right picture."""
     if scene.reference is None or look is None:
         return Text(" reference", style=theme.FAINT)
     left = Text.assemble(
@@ -107,7 +107,7 @@ def reference_title(scene: TaskScene, look: FrameLook | None, width: int) -> Tex
 
 
 def blink_title(width: int, reference: bool) -> Text:
-    """Title of the left picture while it blinks."""
+    """Write the title of the left picture while it blinks."""
     shown = "the reference" if reference else "the frame"
     text = Text(f" blink: {shown}  (any key stops)", style=f"bold {theme.ACCENT}")
     text.truncate(width)
@@ -119,7 +119,7 @@ LAST = ("?", "q")
 
 @lru_cache(maxsize=8)
 def hint_line(width: int) -> Text:
-    """As many keys as fit, the most used first; help and the way out always are the last."""
+    """List as many keys as fit, the most used first; help and quit always come last."""
     text = Text(" ")
     room = width - cell_len("? help  q quit")
     for keys, words in HINTS:
@@ -139,7 +139,7 @@ def _hint(text: Text, keys: str, words: str) -> None:
 
 
 def message_line(words: str, colour: str, width: int) -> Text:
-    """A message in place of the hints."""
+    """Write a message in place of the hints."""
     text = Text(f" {words}", style=colour)
     text.truncate(width, overflow="ellipsis")
     return text

@@ -39,7 +39,7 @@ class FrameLook:
 
 
 def shot_of(look: FrameLook, shape: PaneShape) -> FrameCrop:
-    """The picture of a look that fills a pane."""
+    """Crop the picture of a look that fills a pane."""
     columns, rows = max(1, shape.columns), max(1, shape.rows)
     box = zoom_box(look.face, look.zoom, shape.cell_aspect * rows / columns, look.aspect)
     width, height = shape.across * columns, shape.down * rows
@@ -93,12 +93,9 @@ class PicturePane(Widget):
         if self._lines is None or covered != self._covered:
             self._covered = covered
             self._lines = self._draw()
-        return [self._line(y).crop(crop.x, crop.right) for y in range(crop.y, crop.bottom)]
-
-    def _line(self, y: int) -> Strip:
-        if self._lines is not None and y < len(self._lines):
-            return self._lines[y]
-        return Strip.blank(self.size.width, theme.PLAIN)
+        blanks = [Strip.blank(self.size.width, theme.PLAIN)] * self.size.height
+        lines = (self._lines + blanks)[crop.y : crop.bottom]
+        return [line.crop(crop.x, crop.right) for line in lines]
 
     def _draw(self) -> list[Strip]:
         if self._look is None:
@@ -138,12 +135,12 @@ class Aim(NamedTuple):
 
 
 def camera_name(scene: TaskScene, number: int) -> str:
-    """A camera by its number, round and round."""
+    """Return a camera by its number, round and round."""
     return scene.cameras[number % len(scene.cameras)] if scene.cameras else ""
 
 
 def subject_look(scene: TaskScene, view: CueView, aim: Aim) -> FrameLook | None:
-    """The frame under the cursor; None where there is no footage."""
+    """Look at the frame under the cursor; None without footage."""
     if scene.index is None:
         return None
     camera = camera_name(scene, aim.camera)
@@ -155,7 +152,7 @@ def subject_look(scene: TaskScene, view: CueView, aim: Aim) -> FrameLook | None:
 
 
 def reference_look(scene: TaskScene, aim: Aim) -> FrameLook | None:
-    """The reference's canonical frame, in the same camera where the reference has it."""
+    """Look at the reference's canonical frame, in the same camera where the reference has it."""
     canonical, index = scene.reference, scene.reference_index
     if canonical is None or index is None:
         return None
@@ -211,9 +208,6 @@ def curve_in_window(
     """A curve with one value for each frame of the window; its ends are continued."""
     if found is None or not values:
         return ()
-    places = (min(max(n - found.start, 0), len(values) - 1) for n in _frames(view))
+    frames = range(view.first, view.last + 1)
+    places = (min(max(n - found.start, 0), len(values) - 1) for n in frames)
     return tuple(float(values[place]) for place in places)
-
-
-def _frames(view: CueView) -> range:
-    return range(view.first, view.last + 1)

@@ -31,7 +31,7 @@ IDLE_SECONDS = 60.0  # a longer pause between two keys is a break, and counts as
 
 @dataclass
 class Effort:
-    """What a label has cost so far: keystrokes, and seconds without breaks."""
+    """Cost of a label so far: keystrokes, and seconds without breaks."""
 
     keys: int = 0
     seconds: float = 0.0
@@ -78,7 +78,7 @@ class Session:
 
     @property
     def finished(self) -> bool:
-        """Whether nothing is left to decide."""
+        """True when nothing is left to decide."""
         return not self._open
 
     def is_open(self, task: LabelTask) -> bool:
@@ -90,7 +90,7 @@ class Session:
         return self.blind and self.is_open(task)
 
     def begin(self) -> None:
-        """The first task is on the screen: from here on time counts."""
+        """Start the clock: the first task is on the screen."""
         self._last_key = self._clock()
 
     def effort(self) -> Effort:
@@ -224,7 +224,7 @@ def open_session(
     order: str = "doubt",
     blind: bool = False,
 ) -> Session:
-    """A session over a dataset, standing on the first task that the annotator has not decided.
+    """Open a session over a dataset on the first task that the annotator has not decided.
 
     Raises:
         AnnotationError: unknown order or subject, or an annotator's name that is the toolkit's.

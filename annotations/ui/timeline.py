@@ -24,7 +24,7 @@ _BARS = " ▁▂▃▄▅▆▇█"
 
 @dataclass(frozen=True, kw_only=True)
 class StripContent:
-    """What the strip shows; the curves start at the window's first frame."""
+    """Content of the strip; the curves start at the window's first frame."""
 
     view: CueView
     activity: tuple[float, ...] = ()
@@ -93,18 +93,6 @@ def mark_line(content: StripContent, width: int) -> Line:
     """Plateau, the mark in force (○) and the annotator's own (●), the latter on top."""
     view = content.view
     line = _blank(width)
-    _draw_plateau(line, view, width)
-    for label, glyph, style in (
-        (content.in_force, "○", theme.IN_FORCE),
-        (content.mine, "●", theme.MINE),
-    ):
-        frame = None if label is None else label.frame
-        if frame is not None and view.first <= frame <= view.last:
-            line[sign_column(view, frame, width)] = (glyph, style)
-    return line
-
-
-def _draw_plateau(line: Line, view: CueView, width: int) -> None:
     first, last = view.plateau_first, view.plateau_last
     wide, _ = frame_cells(view.last - view.first + 1, width)
     if first is not None and last is not None:
@@ -114,6 +102,14 @@ def _draw_plateau(line: Line, view: CueView, width: int) -> None:
         line[column_of(view, first, width)] = ("[", theme.PLATEAU)
     if last is not None:
         line[min(column_of(view, last, width) + wide - 1, width - 1)] = ("]", theme.PLATEAU)
+    for label, glyph, style in (
+        (content.in_force, "○", theme.IN_FORCE),
+        (content.mine, "●", theme.MINE),
+    ):
+        frame = None if label is None else label.frame
+        if frame is not None and view.first <= frame <= view.last:
+            line[sign_column(view, frame, width)] = (glyph, style)
+    return line
 
 
 def _blank(width: int) -> Line:

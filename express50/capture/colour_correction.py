@@ -31,7 +31,7 @@ STRIPE = 256  # rows at a time: the terms of a whole 4K frame would take a gigab
 
 
 def check_matrix(matrix: object, where: str) -> tuple[tuple[float, ...], ...]:
-    """Rows of a correction matrix (3, T), T a number of terms that is known.
+    """Check a correction matrix (3, T), T one of the known numbers of terms; return its rows.
 
     Raises:
         CalibrationError: it has another shape, or holds NaN or infinity.
@@ -50,7 +50,7 @@ def check_matrix(matrix: object, where: str) -> tuple[tuple[float, ...], ...]:
 
 
 def expand(linear: np.ndarray, terms: int) -> np.ndarray:
-    """Terms (..., T) of linear light (..., 3)."""
+    """Compute the terms (..., T) of linear light (..., 3)."""
     channel = {"R": linear[..., 0], "G": linear[..., 1], "B": linear[..., 2]}
     columns = []
     for product in TERMS[terms]:

@@ -29,7 +29,7 @@ def public_meta(meta: Mapping) -> dict:
 
 
 def shown_counts(counts: Mapping[str, int], least: int = LEAST_PEOPLE) -> dict[str, int]:
-    """Counts of which each is of ``least`` people or more; what is fewer counts among the others.
+    """Keep counts of ``least`` people or more; smaller groups are counted among the others.
 
     The smallest groups join the others until these are enough too: a single small one could be
     inferred from the total. Empty where there are too few people at all, or only one group.
@@ -51,30 +51,24 @@ def gender_counts(metas: Sequence[Mapping]) -> dict[str, int]:
 
 def age_counts(metas: Sequence[Mapping]) -> dict[str, int]:
     """Count the subjects in each band of years."""
-    counts = Counter(_band(_age(m)) for m in metas)
-    names = [*(_name(band) for band in AGE_BANDS), "not given"]
-    return {name: counts[name] for name in names if counts[name]}
+    ages = [_age(m) for m in metas]
+    counts = {}
+    for low, high in AGE_BANDS:
+        name = f"{low}-{high}" if high < 200 else f"{low}+"
+        counts[name] = sum(age is not None and low <= age < high + 1 for age in ages)
+    counts["not given"] = ages.count(None)
+    return {name: count for name, count in counts.items() if count}
 
 
 def mean_age(metas: Sequence[Mapping], least: int = LEAST_PEOPLE) -> tuple[float, int] | None:
-    """Mean age in years and of how many people; None of fewer than ``least``."""
+    """Compute the mean age in years and the number of people; None of fewer than ``least``."""
     ages = [age for m in metas if (age := _age(m)) is not None]
     return (round(sum(ages) / len(ages), 1), len(ages)) if len(ages) >= least else None
 
 
 def _age(meta: Mapping) -> float | None:
-    """Years, or None where they are not given or no person's."""
+    """Return the age in years; None where it is not given or out of range."""
     age = meta.get("age")
     if isinstance(age, bool) or not isinstance(age, int | float):
         return None
     return age if AGE_BANDS[0][0] <= age < AGE_BANDS[-1][1] + 1 else None
-
-
-def _band(age: float | None) -> str:
-    if age is None:
-        return "not given"
-    return next(_name(b) for b in AGE_BANDS if b[0] <= age < b[1] + 1)
-
-
-def _name(band: tuple[int, int]) -> str:
-    return f"{band[0]}-{band[1]}" if band[1] < 200 else f"{band[0]}+"

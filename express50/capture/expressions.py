@@ -51,13 +51,9 @@ def expression_words(expression: str) -> tuple[str, str]:
 
 @cache
 def load_script() -> tuple[Expression, ...]:
-    """The built-in script: 60 expressions in recording order, the first is ``neutral``."""
-    text = (
-        resources.files("express50.capture")
-        .joinpath("expressions.toml")
-        .read_text(encoding="utf-8")
-    )
-    return parse_script(text, "expressions.toml")
+    """Read the built-in script: 60 expressions in recording order, ``neutral`` first."""
+    file = resources.files("express50.capture") / "expressions.toml"
+    return parse_script(file.read_text(encoding="utf-8"), "expressions.toml")
 
 
 def parse_script(text: str, where: str) -> tuple[Expression, ...]:
@@ -79,7 +75,7 @@ def parse_script(text: str, where: str) -> tuple[Expression, ...]:
 
 
 def select(ids: list[str] | tuple[str, ...] | None = None) -> tuple[Expression, ...]:
-    """The script's entries with the given ids, in the order asked for; all of them for None.
+    """Select the script's entries by id, in the order asked for; all of them for None.
 
     Raises:
         FormatError: an id is not in the script; the nearest one is named.

@@ -32,7 +32,7 @@ OPEN_READERS = 8  # open videos a process keeps; each holds a decoder's picture 
 
 
 def dhash(image: np.ndarray) -> str:
-    """64-bit difference hash of an (H, W, 3) uint8 image, 16 hexadecimal digits.
+    """Compute the 64-bit difference hash of an image (H, W, 3) uint8 as 16 hexadecimal digits.
 
     The image is averaged to 8 rows of 9 grey cells; each bit says whether a cell is darker than
     its right neighbour. Source: N. Krawetz, "Kind of like that", 2013.
@@ -61,7 +61,7 @@ class FrameReader:
             self._video = VideoReader(self.path, self.source.pts)
 
     def read(self, frame: int, deep: bool = False) -> np.ndarray:
-        """Image (H, W, 3) sRGB of a decode index, colour-corrected but not undistorted.
+        """Read an image (H, W, 3) sRGB, colour-corrected but not undistorted.
 
         Args:
             frame: decode index.
@@ -92,7 +92,7 @@ class FrameReader:
         return self._checked(image, frame)
 
     def _video_of(self, frame: int) -> tuple[VideoReader, int]:
-        """The video that holds a frame, and the frame's number in it; one stays open."""
+        """Find the video that holds a frame, and the frame's number in it; one stays open."""
         starts = np.concatenate([[0], np.cumsum(self.source.clips or (self.source.frames,))])
         clip = int(np.searchsorted(starts, frame, side="right")) - 1
         first, last = int(starts[clip]), int(starts[clip + 1])
@@ -114,7 +114,7 @@ class FrameReader:
         return image
 
     def _file(self, frame: int) -> str:
-        """Which file a frame lies in, for messages."""
+        """Name the file that holds a frame, for messages."""
         if self.source.kind == "video":
             return str(self.path)
         if self.source.kind == "frames":
@@ -145,7 +145,7 @@ _readers: OrderedDict[tuple, FrameReader] = OrderedDict()
 
 
 def _reader(index: Index, camera_id: str) -> FrameReader:
-    """Reader of a camera, kept open while it is among the last few used."""
+    """Return a camera's reader, kept open while it is among the last few used."""
     key = (index.capture, index.subject, camera_id)
     reader = _readers.pop(key, None)
     if reader is not None and reader.source != index.cameras.get(camera_id):
@@ -160,7 +160,7 @@ def _reader(index: Index, camera_id: str) -> FrameReader:
 def read_frame(
     dataset: Dataset, subject: str, camera_id: str, frame: int, undistort: bool = True
 ) -> np.ndarray:
-    """Full-resolution frame (H, W, 3) uint8 sRGB by decode index.
+    """Read a full-resolution frame (H, W, 3) uint8 sRGB by decode index.
 
     Args:
         dataset: the dataset.
@@ -174,7 +174,15 @@ def read_frame(
         StageError: ingest, or calibrate when undistorting, did not run.
     """
     image = _reader(read_index(dataset, subject), camera_id).read(frame)
-    return _undistorted(dataset, subject, camera_id, image) if undistort else image
+    if not undistort:
+        return image
+    cameras = read_cameras_of(dataset, subject, undistorted=False)
+    if camera_id not in cameras:
+        raise StageError(
+            f"{subject}: camera {camera_id!r} is not calibrated; expected one of "
+            f"{', '.join(cameras)}"
+        )
+    return undistort_image(image, cameras[camera_id])
 
 
 def read_recorded_plate(index: Index, camera_id: str, deep: bool = False) -> np.ndarray:
@@ -263,18 +271,8 @@ def frame_inputs(dataset: Dataset, subject: str, expression: str) -> dict[str, P
     return {f"frame {expression} {c}": path for c, path in files.items() if path.is_file()}
 
 
-def _undistorted(dataset: Dataset, subject: str, camera_id: str, image: np.ndarray) -> np.ndarray:
-    cameras = read_cameras_of(dataset, subject, undistorted=False)
-    if camera_id not in cameras:
-        raise StageError(
-            f"{subject}: camera {camera_id!r} is not calibrated; expected one of "
-            f"{', '.join(cameras)}"
-        )
-    return undistort_image(image, cameras[camera_id])
-
-
 def read_cameras_of(dataset: Dataset, subject: str, undistorted: bool = True) -> dict[str, Camera]:
-    """Calibrated cameras of a subject, sorted by id.
+    """Read the calibrated cameras of a subject, sorted by id.
 
     Args:
         dataset: the dataset.
@@ -303,7 +301,7 @@ def _cameras_cached(path: Path, version: tuple[int, ...]) -> dict[str, Camera]:
 
 
 def read_gains(dataset: Dataset, subject: str) -> dict[str, np.ndarray]:
-    """Linear light (3,) of each camera over that of the rig's mean; none where nothing told it.
+    """Read the linear light (3,) of each camera over that of the rig's mean; empty if not known.
 
     Raises:
         FormatError: the file is not {camera: [red, green, blue]} with numbers above 0.
@@ -362,7 +360,7 @@ def read_peak_rows(dataset: Dataset, subject: str) -> dict[str, Peak]:
     try:
         rows = read_json_table(path, FormatError, "run 'express50 align' again")
         if strange := [name for name in rows if not NAME.fullmatch(name)]:
-            raise ValueError(f"expression {strange[0]!r} is no id")  # it becomes a folder's name
+            raise ValueError(f"expression {strange[0]!r} is not an id")  # it names a folder
         return {
             name: Peak(int(row["frame"]), str(row["camera"]), row["pts"], row["dhash"])
             for name, row in rows.items()
@@ -391,7 +389,7 @@ def check_peak(index: Index, expression: str, peak: Peak) -> None:
 
 
 def peak_items(dataset: Dataset) -> list[str]:
-    """`subject/expression` for every labelled peak of the aligned subjects."""
+    """List ``subject/expression`` for every labelled peak of the aligned subjects."""
     found = []
     for subject in dataset.subjects():
         if (dataset.item_dir("align", subject) / "peaks.json").is_file():
@@ -400,7 +398,7 @@ def peak_items(dataset: Dataset) -> list[str]:
 
 
 def read_proxy(dataset: Dataset, subject: str, camera_id: str, frame: int) -> np.ndarray:
-    """Small JPEG copy (h, w, 3) uint8 sRGB of a frame; a random read costs milliseconds.
+    """Read the small JPEG copy (h, w, 3) uint8 sRGB of a frame; a read costs milliseconds.
 
     Raises:
         StageError: the subject is not ingested.
@@ -414,7 +412,7 @@ def read_proxy(dataset: Dataset, subject: str, camera_id: str, frame: int) -> np
 
 
 def decode_proxy(folder: Path, camera_id: str, frame: int) -> np.ndarray:
-    """Proxy (h, w, 3) uint8 sRGB out of a folder of indexed tars."""
+    """Read a proxy (h, w, 3) uint8 sRGB out of a folder of indexed tars."""
     tar, table = folder / f"{camera_id}.tar", folder / f"{camera_id}.json"
     try:
         version = (table.stat().st_mtime_ns, table.stat().st_size)

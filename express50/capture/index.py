@@ -31,7 +31,7 @@ class CameraSource:
     """Footage of one camera; sequences are by 0-based decode index.
 
     Attributes:
-        kind: ``video``, ``videos`` (one file a clip) or ``frames``.
+        kind: ``video``, ``videos`` (one file per clip) or ``frames``.
         source: video file, or folder of the names, relative to the capture.
         width: of the footage, pixels.
         height: of the footage, pixels.
@@ -68,7 +68,7 @@ class Index:
     Attributes:
         subject: id.
         capture: folder of the footage; from the dataset's table, not from the index file.
-        fps: frames a second.
+        fps: frames per second.
         cameras: usable cameras by id.
         plates: clean background plates by camera id, relative to the capture.
         board: ``{"config": board.toml's content, "cameras": {id: [files]}}`` or None.
@@ -94,12 +94,12 @@ class Index:
 
 
 def index_path(dataset: Dataset, subject: str) -> Path:
-    """Index file of a subject."""
+    """Return the index file of a subject."""
     return dataset.item_dir("ingest", subject) / "index.json"
 
 
 def calibration_file(dataset: Dataset, index: Index) -> Path | None:
-    """The given calibration: the capture's own, or the one that ingest translated; else None."""
+    """Find the given calibration: the capture's own, or ingest's translation; else None."""
     if index.calibration is None:
         return None
     if index.calibration == TRANSLATED:
@@ -146,7 +146,7 @@ def _read_cached(dataset: Dataset, subject: str, version: tuple[int, ...]) -> In
 
 
 def index_to_json(index: Index) -> dict[str, Any]:
-    """JSON form of an index; machine paths stay out of it."""
+    """Convert an index to JSON; machine paths stay out of it."""
     return {
         "schema": SCHEMA,
         "subject": index.subject,
@@ -162,7 +162,7 @@ def index_to_json(index: Index) -> dict[str, Any]:
 
 def _camera_to_json(camera: CameraSource) -> dict[str, Any]:
     row = dict(vars(camera))
-    # One string each keeps the file small and quick to read: a subject has 10^5 frames.
+    # Strings keep the file small and quick to read: a subject has 10^5 frames.
     row["pts"] = " ".join(map(str, camera.pts))
     row["dhash"] = " ".join(camera.dhash)
     row["names"] = list(camera.names)
@@ -172,7 +172,7 @@ def _camera_to_json(camera: CameraSource) -> dict[str, Any]:
 
 
 def index_from_json(content: Mapping[str, Any], capture: Path) -> Index:
-    """Index of its JSON form.
+    """Convert JSON to an index.
 
     Raises:
         ValueError: another schema, or sequences whose lengths differ from the frame count.

@@ -1,4 +1,4 @@
-"""Raw captures as they come off the rig: read the folder, check it, name what is wrong.
+"""Raw captures as they come off the rig: read the folder, check it, name every fault.
 
 Layout: capture.toml, cameras/<id>/video.mp4 or cameras/<id>/frames/000000.png..., and optionally
 calibration.json, plates/<id>.png, board/<id>/*.png with board/board.toml, cues.csv.
@@ -29,7 +29,7 @@ class RawCamera:
 
     Attributes:
         id: of the camera.
-        kind: ``video`` (``path`` is the file), ``videos`` (one file a clip) or ``frames`` (images).
+        kind: ``video`` (``path`` is the file), ``videos`` (a file per clip) or ``frames`` (images).
         path: the video, or the folder that ``names`` are relative to.
         names: videos or images in order; an image may lie in a container (`files.containers`).
         counts: images of each clip; one clip where it is empty.
@@ -50,7 +50,7 @@ class RawCamera:
 
 @dataclass(frozen=True, kw_only=True)
 class RawCapture:
-    """A capture of any layout, checked as far as that goes without decoding footage.
+    """A capture of any layout, checked without decoding footage.
 
     Attributes:
         root: the folder that footage and plates are relative to.
@@ -65,9 +65,9 @@ class RawCapture:
         cues: scripted expressions in file order.
         layout: which of `express50.capture.readers` it is; ours is ``express50``.
         clips: expression of each clip where the footage comes in clips; they make the cues.
-        skipped: what of a layout was left out (sequences, frames), with the reason.
+        skipped: parts of a layout that were left out (sequences, frames), with the reason.
         found: facts of the layout, for metrics.
-        warnings: what is odd but may be meant, with the reason.
+        warnings: oddities that may be meant, with the reason.
     """
 
     root: Path
@@ -112,19 +112,23 @@ def read_capture(root: Path) -> RawCapture:
         cameras=cameras,
         dropped=dropped,
         calibration=calibration,
-        plates=_read_plates(root, cameras),
+        plates={
+            Path(name).stem: f"plates/{name}"
+            for name in image_names(root / "plates")
+            if Path(name).stem in cameras
+        },
         board=_read_board(root, cameras),
         cues=read_cues(root / "cues.csv"),
     )
 
 
 def has_calibration(root: Path) -> bool:
-    """Whether the capture has calibrated cameras of its own."""
+    """Return whether the capture has calibrated cameras of its own."""
     return (root / "calibration.json").is_file()
 
 
 def read_meta(root: Path) -> dict:
-    """Content of capture.toml with checked subject and fps.
+    """Read capture.toml and check subject and fps.
 
     Raises:
         CaptureError: no such folder or file, not TOML, or a field is missing or out of range.
@@ -141,7 +145,7 @@ def read_meta(root: Path) -> dict:
 
 
 def read_capture_toml(path: Path) -> dict:
-    """Content of a capture.toml, dates as text; nothing of it is checked.
+    """Read a capture.toml, dates as text, without a check of its content.
 
     Raises:
         CaptureError: it cannot be read or is not TOML.
@@ -166,7 +170,7 @@ def check_identity(path: Path, subject: object, fps: object) -> None:
 
 
 def plain(value: object) -> object:
-    """TOML content with dates as text, so that it can go into JSON."""
+    """Convert dates in TOML content to text, so that it can go into JSON."""
     if isinstance(value, dict):
         return {key: plain(one) for key, one in value.items()}
     if isinstance(value, list):
@@ -208,7 +212,7 @@ def _read_camera(folder: Path) -> RawCamera:
 
 
 def _frame_names(folder: Path) -> tuple[str, ...]:
-    """Image names in order; they must count up from zero, or frames would be mistaken."""
+    """List image names in order; they must count up from zero, or frames would be mistaken."""
     names = image_names(folder)
     if not names:
         raise CaptureError(f"{folder}: holds no image, expected 000000.png and so on")
@@ -223,7 +227,7 @@ def _frame_names(folder: Path) -> tuple[str, ...]:
 
 
 def image_names(folder: Path) -> list[str]:
-    """List the image files in a folder, sorted; none when there is no folder."""
+    """List the image files in a folder, sorted; none when the folder is missing."""
     if not folder.is_dir():
         return []
     return sorted(
@@ -231,11 +235,6 @@ def image_names(folder: Path) -> list[str]:
         for path in folder.iterdir()
         if path.suffix.lower() in IMAGE_SUFFIXES and not path.name.startswith(".")
     )
-
-
-def _read_plates(root: Path, cameras: dict[str, RawCamera]) -> dict[str, str]:
-    names = image_names(root / "plates")
-    return {Path(n).stem: f"plates/{n}" for n in names if Path(n).stem in cameras}
 
 
 def _read_board(root: Path, cameras: dict[str, RawCamera]) -> dict | None:
@@ -313,7 +312,7 @@ def check_calibrated_sizes(raw: RawCapture, sizes: dict[str, tuple[int, int]]) -
         sizes: decoded (width, height) by camera id.
 
     Raises:
-        CalibrationError: a size differs; guessing a scale here once cost a peer days.
+        CalibrationError: a size differs; a guessed scale would give wrong depths.
     """
     for name, (width, height) in sizes.items():
         camera = (raw.calibration or {}).get(name)

@@ -105,12 +105,12 @@ def performances(path: Path) -> dict[str, Performance]:
         raise CaptureError(
             f"{path}: holds annotations only; give the folder with the pictures, such as raw/0026"
         )
-    return dict(sorted(found.items(), key=lambda item: (item[0][0] != "e", _number(item[0]))))
 
+    def rank(part: str) -> tuple[bool, int, str]:
+        digits = "".join(c for c in part[1:].split("_")[0] if c.isdigit())
+        return part[0] != "e", int(digits or 0), part
 
-def _number(part: str) -> tuple[int, str]:
-    digits = "".join(c for c in part[1:].split("_")[0] if c.isdigit())
-    return int(digits or 0), part
+    return {part: found[part] for part in sorted(found, key=rank)}
 
 
 def read(path: Path, selection: Selection) -> RawCapture:
