@@ -64,28 +64,20 @@ def worklist(
         return []
     reference = reference_subject(dataset)
     chosen = sorted(subjects or known, key=lambda s: (s != reference, s))
-    tasks = [
-        (task, position)
-        for subject in chosen
-        for position, task in enumerate(_tasks_of(dataset, subject, annotator, everything))
-        if task is not None and (expressions is None or task.expression in expressions)
-    ]
+    tasks = []
+    for subject in chosen:
+        done = {} if everything else labels_of(read_labels(dataset, subject), annotator)
+        suggestions = read_suggestions(dataset, subject)
+        doubts = {name: 1.0 - found.confidence for name, found in suggestions.items()}
+        for position, cue in enumerate(read_index(dataset, subject).cues):
+            name = cue.expression_id
+            if name not in done and (expressions is None or name in expressions):
+                tasks.append((LabelTask(subject, name, doubts.get(name, 1.0)), position))
     if order == "doubt":
         tasks.sort(key=lambda row: (row[0].subject != reference, -row[0].doubt))
     elif order == "expression":
         tasks.sort(key=lambda row: row[1])
     return [task for task, _ in tasks]
-
-
-def _tasks_of(
-    dataset: Dataset, subject: str, annotator: str, everything: bool
-) -> list[LabelTask | None]:
-    """List one entry per cue, None where it is done."""
-    done = {} if everything else labels_of(read_labels(dataset, subject), annotator)
-    suggestions = read_suggestions(dataset, subject)
-    doubts = {name: 1.0 - suggestion.confidence for name, suggestion in suggestions.items()}
-    names = [cue.expression_id for cue in read_index(dataset, subject).cues]
-    return [None if n in done else LabelTask(subject, n, doubts.get(n, 1.0)) for n in names]
 
 
 def coverage(dataset: Dataset) -> dict[str, dict]:

@@ -284,10 +284,6 @@ class AnnotateApp(App[None]):
         self._faces = faces
         self._sixel_cell = sixel_cell
 
-    def _make_picture(self, cache: FrameCache, name: str) -> PicturePane:
-        painter = None if self._sixel_cell is None else SixelPainter(self._sixel_cell)
-        return PicturePane(cache, name, painter)
-
     @property
     def desk(self) -> Desk:
         """The screen below any dialog."""
@@ -295,7 +291,12 @@ class AnnotateApp(App[None]):
 
     def on_mount(self) -> None:
         """Show the desk."""
-        self.push_screen(Desk(self.session, self.cache, self._faces, self._make_picture))
+
+        def make_picture(cache: FrameCache, name: str) -> PicturePane:
+            painter = None if self._sixel_cell is None else SixelPainter(self._sixel_cell)
+            return PicturePane(cache, name, painter)
+
+        self.push_screen(Desk(self.session, self.cache, self._faces, make_picture))
 
     def on_unmount(self) -> None:
         """Stop decoding."""

@@ -204,16 +204,14 @@ def picture_strips(picture: np.ndarray, few: bool = False) -> list[Strip]:
         front, back = to_256(front), to_256(back)
     weights = np.array([1 << 16, 1 << 8, 1])
     pairs = ((front.astype(np.int64) @ weights) << 24) | (back.astype(np.int64) @ weights)
-    return [_line(g, p) for g, p in zip(glyphs, pairs, strict=True)]
-
-
-def _line(glyphs: np.ndarray, pairs: np.ndarray) -> Strip:
-    """Write one line; neighbours of the same two colours share a segment."""
-    text = "".join(glyphs)
-    starts = np.flatnonzero(np.diff(pairs, prepend=pairs[0] ^ 1))
-    colours, begins = pairs[starts].tolist(), starts.tolist()
-    runs = zip(begins, [*begins[1:], len(text)], colours, strict=True)
-    return Strip([Segment(text[a:b], _style(c)) for a, b, c in runs], len(text))
+    lines = []
+    for text, row in zip(map("".join, glyphs), pairs, strict=True):
+        starts = np.flatnonzero(np.diff(row, prepend=row[0] ^ 1))
+        colours, begins = row[starts].tolist(), starts.tolist()
+        # Neighbours of the same two colours share a segment.
+        runs = zip(begins, [*begins[1:], len(text)], colours, strict=True)
+        lines.append(Strip([Segment(text[a:b], _style(c)) for a, b, c in runs], len(text)))
+    return lines
 
 
 @lru_cache(maxsize=1 << 16)

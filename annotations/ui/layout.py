@@ -82,7 +82,11 @@ class AnnotatorScreen(Screen[None]):
             self._draw_message()
             return
         self._draw_status()
-        self._draw_reference(self.scene)
+        picture = self.query_one("#reference", PicturePane)
+        look = reference_look(self.scene, self.aim)
+        picture.show(look, "the reference has no frame of this expression yet")
+        title = panels.reference_title(self.scene, look, picture.size.width)
+        self._write("#reference-title", title)
         self._draw_frame(self.scene)
         hidden = self.session.hidden(self.scene.task)
         content = None if self.view is None else strip_content(self.scene, self.view, hidden)
@@ -97,12 +101,6 @@ class AnnotatorScreen(Screen[None]):
             width = self.app.size.width
             self._write("#status", panels.status_line(self.session, self.scene, width))
             self._write("#words", panels.words_line(self.scene, width))
-
-    def _draw_reference(self, scene: TaskScene) -> None:
-        picture, look = self.query_one("#reference", PicturePane), reference_look(scene, self.aim)
-        picture.show(look, "the reference has no frame of this expression yet")
-        title = panels.reference_title(scene, look, picture.size.width)
-        self._write("#reference-title", title)
 
     def _draw_frame(self, scene: TaskScene) -> None:
         picture = self.query_one("#frame", PicturePane)

@@ -46,15 +46,11 @@ def status_line(session: Session, scene: TaskScene, width: int) -> Text:
     right.append(" done")
     if not session.hidden(scene.task):
         right.append("  doubt ")
-        right.append(f"{scene.task.doubt:.2f}", _doubt_colour(scene.task.doubt))
+        doubt = scene.task.doubt
+        colour = theme.RED if doubt >= 0.5 else theme.ACCENT if doubt >= 0.2 else theme.GREEN
+        right.append(f"{doubt:.2f}", colour)
     right.append(f"  {spent.seconds:.0f} s  {spent.keys} key{'' if spent.keys == 1 else 's'} ")
     return fit(left, right, width)
-
-
-def _doubt_colour(doubt: float) -> str:
-    if doubt >= 0.5:
-        return theme.RED
-    return theme.ACCENT if doubt >= 0.2 else theme.GREEN
 
 
 def words_line(scene: TaskScene, width: int) -> Text:

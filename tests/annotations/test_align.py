@@ -156,7 +156,7 @@ def test_damaged_observations_are_named(dataset):
     act(dataset, "S001")
     path = observations.observations_path(dataset, "S001")
     path.write_bytes(path.read_bytes()[:200])
-    with pytest.raises(FormatError, match="express50 align"):
+    with pytest.raises(FormatError, match="observations.npz"):
         observations.read_observations(dataset, "S001")
 
 
@@ -181,7 +181,7 @@ def test_the_command_watches_first_and_says_when_there_is_no_face(dataset, capsy
 
 
 def test_settings_out_of_range_are_refused():
-    with pytest.raises(ValueError, match="0 to 1"):
+    with pytest.raises(ValueError, match="1.5"):
         align.AlignConfig(accept=1.5)
-    with pytest.raises(ValueError, match="at least 1"):
+    with pytest.raises(ValueError, match="cameras"):
         observe.ObserveConfig(cameras=0)

@@ -107,11 +107,11 @@ def test_a_row_is_seen_by_one_camera_unless_a_subject_lacks_it(labelled):
 
 
 @pytest.mark.parametrize(
-    ("selection", "words"),
+    ("selection", "named"),
     [({"subjects": ["S9"]}, "S9"), ({"expressions": ["x"]}, "x"), ({"camera": "top"}, "top")],
 )
-def test_what_is_not_there_is_named(labelled, selection, words):
-    with pytest.raises(AnnotationError, match=words):
+def test_what_is_not_there_is_named(labelled, selection, named):
+    with pytest.raises(AnnotationError, match=named):
         make_sheet(labelled, **selection)
 
 

@@ -58,9 +58,9 @@ def test_a_face_that_does_not_move_has_an_answer_without_confidence():
 
 @pytest.mark.parametrize("values", [np.zeros((0, N)), np.full((3, N), np.nan)])
 def test_features_without_numbers_are_refused(values):
-    with pytest.raises(ValueError, match="finite"):
+    with pytest.raises(ValueError):
         suggest(values, GROUPS, None)
-    with pytest.raises(ValueError, match="finite"):
+    with pytest.raises(ValueError):
         suggest_rest(values, GROUPS, 1.0)
 
 

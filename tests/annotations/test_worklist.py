@@ -45,7 +45,7 @@ def test_the_reference_is_chosen_or_the_first_who_is_not_excluded(tmp_path):
     with pytest.raises(AnnotationError, match="S002, S003"):
         choose_reference(dataset, "S001")
     _exclude(dataset, "S003")
-    with pytest.raises(AnnotationError, match="excluded"):
+    with pytest.raises(AnnotationError, match="'S003'"):
         reference_subject(dataset)
 
 
@@ -89,11 +89,11 @@ def test_only_ones_own_labels_are_done(tmp_path):
 
 def test_unknown_orders_subjects_and_files_are_named(tmp_path):
     dataset = make_dataset(tmp_path)
-    with pytest.raises(AnnotationError, match="doubt, expression, subject"):
+    with pytest.raises(AnnotationError, match="'mood'"):
         worklist(dataset, "ann", order="mood")
     with pytest.raises(AnnotationError, match="'S009'"):
         worklist(dataset, "ann", ["S009"])
     suggest(dataset, "S001", {})
     (dataset.item_dir("align", "S001") / "suggestions.json").write_text('{"smile": {"x": 1}}')
-    with pytest.raises(FormatError, match="express50 align"):
+    with pytest.raises(FormatError, match="suggestions.json"):
         read_suggestions(dataset, "S001")

@@ -70,19 +70,19 @@ def test_what_is_wanted_is_decoded_ahead_urgent_ones_first():
 
 
 @pytest.mark.parametrize(
-    ("error", "words"),
+    ("error", "remedy"),
     [
-        (FileNotFoundError("cam.json"), "proxies are missing"),
+        (FileNotFoundError("cam.json"), "express50 ingest"),
         (CaptureError("no frame 3 of camera 'cam'"), "no frame 3"),
-        (IndexError("list index"), "cannot be read"),
+        (IndexError("list index"), "frame 3"),
     ],
 )
-def test_a_frame_that_cannot_be_read_is_told_in_plain_words(error, words):
+def test_a_frame_that_cannot_be_read_is_told_in_plain_words(error, remedy):
     def broken(dataset, wanted):
         raise error
 
     cache = FrameCache(None, decode=broken)
-    with pytest.raises(AnnotationError, match=words):
+    with pytest.raises(AnnotationError, match=remedy):
         cache.get(shot(3))
     cache.want([shot(3)])  # must not kill the thread
     wait_until(cache.idle)

@@ -135,7 +135,7 @@ def test_a_mark_outside_its_plateau_is_refused_and_nothing_is_written(suggested)
     session, _ = begin(suggested)
     scene, view = scene_and_view(session)
     view = step(set_plateau_first(step(view, 2)), -2)
-    with pytest.raises(AnnotationError, match="outside your plateau 6 to 15"):
+    with pytest.raises(AnnotationError, match="6 to 15"):
         session.mark(scene, view, scene.cameras[0])
     assert read_labels(suggested, "S001") == []
 
@@ -145,7 +145,7 @@ def test_a_label_on_other_footage_is_named(suggested):
     label = make_mark(index, "smile", 20, "cam00", "ann")
     append_label(suggested, type(label)(**{**vars(label), "dhash": "0" * 16}))
     scene = load_scene(suggested, LabelTask("S001", "smile", 0.1), "ann")
-    assert any("another picture in today's footage" in note for note in scene.notes)
+    assert any("frame 20 of cam00" in note for note in scene.notes)
 
 
 def test_what_is_missing_is_said_not_raised(dataset):
@@ -153,10 +153,8 @@ def test_what_is_missing_is_said_not_raised(dataset):
     assert scene.problem is None
     assert any("align" in note for note in scene.notes)
     assert any("reference" in note for note in scene.notes)
-    assert (
-        "no footage of shout" in load_scene(dataset, LabelTask("S001", "shout", 1.0), "ann").problem
-    )
-    assert "not ingested" in load_scene(dataset, LabelTask("S9", "smile", 1.0), "ann").problem
+    assert "shout" in load_scene(dataset, LabelTask("S001", "shout", 1.0), "ann").problem
+    assert "'S9'" in load_scene(dataset, LabelTask("S9", "smile", 1.0), "ann").problem
     suggest(dataset, {"S001": {"smile": [20]}})
     (dataset.item_dir("align", "S001") / "suggestions.json").write_text("[")
     assert "suggestions" in " ".join(
@@ -166,7 +164,7 @@ def test_what_is_missing_is_said_not_raised(dataset):
 
 @pytest.mark.parametrize("name", ["auto", "rule:last-frame"])
 def test_the_toolkits_own_names_are_refused(suggested, name):
-    with pytest.raises(AnnotationError, match="give yours"):
+    with pytest.raises(AnnotationError, match=name):
         open_session(suggested, name)
 
 

@@ -100,10 +100,10 @@ def test_renderme_key_frames_and_what_is_left_out(tmp_path):
 
 def test_renderme_of_two_actors_or_annotations_alone_is_refused(tmp_path):
     layouts.write_renderme(tmp_path, expressions=1)
-    with pytest.raises(CaptureError, match="annotations only.*raw/0026"):
+    with pytest.raises(CaptureError, match="anno/0026"):
         read_any(tmp_path / "anno" / "0026")
     (tmp_path / "raw/0026/0027_e0_raw.smc").write_bytes(b"")
-    with pytest.raises(CaptureError, match="2 actors .0026, 0027."):
+    with pytest.raises(CaptureError, match="0026, 0027"):
         subject_of(tmp_path / "raw" / "0026")
 
 
@@ -260,15 +260,15 @@ def test_capture_toml_points_at_read_only_data_and_chooses(tmp_path):
     assert near(read_frame(dataset, subject, "cam401163", 2, False), picture(3, 106, (256, 167, 3)))
     file = wishes / "capture.toml"
     file.write_text(file.read_text().replace("EXP_n*", "EXP_x*"))
-    with pytest.raises(CaptureError, match="EXP_x.*which is not there; the layout has EXP_neutral"):
+    with pytest.raises(CaptureError, match="EXP_x.*EXP_neutral"):
         read_any(wishes)
 
 
 def test_nothing_fits_is_one_error_that_names_the_layouts(tmp_path):
     (tmp_path / "notes.txt").write_text("x")
-    with pytest.raises(CaptureError, match="holds notes.txt.*renderme360: .*nersemble.*colmap"):
+    with pytest.raises(CaptureError, match="notes.txt.*renderme360.*nersemble.*colmap"):
         detect(tmp_path)
-    with pytest.raises(CaptureError, match="layout 'avi', expected one of express50"):
+    with pytest.raises(CaptureError, match="'avi'.*express50"):
         detect(tmp_path, "avi")
 
 
@@ -280,7 +280,7 @@ def test_cameras_read_the_wrong_way_round_are_refused(tmp_path):
         k: np.linalg.inv(np.array(v)).tolist() for k, v in table["world_2_cam"].items()
     }
     file.write_text(json.dumps(table))
-    with pytest.raises(CalibrationError, match="lies behind.*invert"):
+    with pytest.raises(CalibrationError):
         read_any(path)
 
 
@@ -299,5 +299,5 @@ def test_a_replaced_file_is_named(tmp_path):
     dataset, subject = ingested(tmp_path, path)
     file = path / "images/E010_Smile/400008/000031.png"
     file.write_bytes(encode_png(picture(5, 5, (512, 334, 3))))
-    with pytest.raises(CaptureError, match="E010_Smile/400008/000031.png: frame 2 has hash"):
+    with pytest.raises(CaptureError, match="E010_Smile/400008/000031.png"):
         read_frame(dataset, subject, "400008", 2, False)
