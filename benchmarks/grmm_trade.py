@@ -1,4 +1,6 @@
-"""What GRMM's knobs cost and gain: ``python -m benchmarks.grmm_trade SHARDS [--budgets 60 240]``.
+"""Measure what GRMM's settings cost and gain.
+
+Usage: ``python -m benchmarks.grmm_trade SHARDS [--budgets 60 240]``.
 
 One thing is changed at a time from the demo preset; every setting trains anew for each budget of
 processor seconds, so that other work on the machine disturbs little, and is judged on one held-out
@@ -59,7 +61,7 @@ class Smaller:
         self.digest = f"{source.digest} by {factor}"
 
     def read(self, index: int) -> Sample:
-        """One sample, reduced."""
+        """Decode one sample and reduce it."""
         sample, by = self.source.read(index), self.factor
         height, width = (side // by * by for side in sample.alpha.shape)
         size = (width // by, height // by)
@@ -82,7 +84,7 @@ class Smaller:
 
 
 def train_for(views: HeadViews, config: Config) -> tuple[torch.nn.Module, int]:
-    """Train for ``train.seconds`` of processor time; the model and its number of steps."""
+    """Train for ``train.seconds`` of processor time; return the model and its steps."""
     torch.manual_seed(config.train.seed)
     began = time.process_time()
     run = prepare(views, config)
@@ -96,7 +98,7 @@ def train_for(views: HeadViews, config: Config) -> tuple[torch.nn.Module, int]:
 
 
 def measure(source: Source, base: Config, name: str, budget: float, images: int) -> dict:
-    """One setting and budget: held-out PSNR at the shards' size, steps, seconds a picture."""
+    """Measure one setting and budget: held-out PSNR, steps, seconds per picture."""
     changes, factor = SETTINGS[name]
     tables = as_tables(base)
     budgeted = {"seconds": budget, "iterations": 10**6}

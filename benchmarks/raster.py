@@ -74,7 +74,7 @@ def rival(
 
 
 def free_bytes() -> float:
-    """Free memory of this machine; without /proc the smallest that anything is likely to have."""
+    """Return the free memory of this machine; without /proc, 8 GiB."""
     table = Path("/proc/meminfo")
     if not table.exists():
         return 8.0 * 2**30
@@ -85,7 +85,7 @@ def free_bytes() -> float:
 def case(
     n: int, size: int, channels: int, pairs: tuple[Tensor, Tensor], repeats: int
 ) -> dict[str, object]:
-    """One row of the table."""
+    """Measure one row of the table."""
     scene, buffers = head(n, size, channels), RenderBuffers()
     run = partial(native_images, size=size, buffers=buffers)
     runs = [measure(scene, run) for _ in range(repeats + 1)][1:]
@@ -98,14 +98,14 @@ def case(
 
 
 def render(scene: dict[str, Tensor], size: int, backend: str, dtype: torch.dtype) -> RenderOutput:
-    """The scene in ``dtype``, the camera in float64."""
+    """Render the scene in ``dtype`` with the camera in float64."""
     tensors = {k: v if v.shape in ((3, 3), (4, 4)) else v.to(dtype) for k, v in scene.items()}
     return rasterize(**tensors, width=size, height=size, backend=backend)
 
 
 def errors(n: int, size: int, channels: int) -> dict[str, float]:
-    """Largest absolute errors of colours in [0, 1] against the float64 reference."""
-    # Rounded first: what float32 cannot say of the scene is no error of the kernel.
+    """Measure the largest errors of colours in [0, 1] against the float64 reference."""
+    # Rounded first: rounding the scene to float32 is not an error of the kernel.
     scene = {name: tensor.float().double() for name, tensor in head(n, size, channels).items()}
     expected = render(scene, size, "reference", torch.float64).colors
     single = (render(scene, size, "cpu", torch.float32).colors - expected).abs()
@@ -119,7 +119,7 @@ def errors(n: int, size: int, channels: int) -> dict[str, float]:
 
 
 def threads_bit_identical(n: int, size: int, channels: int) -> bool:
-    """Whether images and gradients are the same bits on 1, 2 and 5 threads."""
+    """Check that images and gradients are the same bits on 1, 2 and 5 threads."""
     scene, results = head(n, size, channels), []
     for threads in (1, 2, 5):
         torch.set_num_threads(threads)
@@ -137,7 +137,7 @@ def threads_bit_identical(n: int, size: int, channels: int) -> bool:
 
 
 def main() -> int:
-    """Measure, print one line a case, then one JSON object."""
+    """Measure, print one line per case, then one JSON object."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="N 16384 at 256 px only")
     parser.add_argument("--repeats", type=int, default=7, help="runs of each case")

@@ -103,7 +103,7 @@ def ablate(
 
     Args:
         roots: folders of shards; several are mixed.
-        out: a folder a row, and the tables.
+        out: gets one folder per row, and the tables.
         config: of the full model; its budget is every row's.
         protocol: how unseen people are fitted.
         subjects: unseen people; empty: all that the training split lacks.
@@ -232,7 +232,6 @@ def measure(
         loaded.head,
         background=data.background,
         torso=data.torso,
-        cache_mb=data.cache_mb,
         device=loaded.model.z_id.device,
     )
     kinds = [kind_of(key, loaded.model.subjects, loaded.gallery) for key in views.keys]
@@ -270,7 +269,7 @@ def measure(
 
 
 def unseen_subjects(roots: Sequence[Path], views: HeadViews, split: str) -> set[str]:
-    """Return the people of all splits that no row trains on: those outside the training split."""
+    """Find the people outside the training split: no row trains on them."""
     trained = {key.subject for key in open_shards(roots, split).keys}
     return {key.subject for key in views.keys} - trained
 
@@ -299,7 +298,7 @@ def _digest(
 
 
 def variants_of(roots: Sequence[Path], names: Sequence[str] = ()) -> dict[str, Variant]:
-    """Return the rows asked for, all by default; with several datasets one row without each.
+    """Choose the rows asked for, by default all; with several datasets also one without each.
 
     Raises:
         ConfigError: no row has such a name.

@@ -86,7 +86,7 @@ def make_anchors(head: HeadModel, n_g: int, mouth: bool = True) -> Anchors:
 
 
 def mouth_faces(head: HeadModel) -> Tensor:
-    """(F,) bool: faces with a corner on teeth or tongue, or that lie inside the mouth."""
+    """Mark faces (F,) bool with a corner on teeth or tongue, or inside the mouth."""
     solid = (head.regions["teeth"] | head.regions["tongue"])[head.faces].any(1)
     return (solid | head.regions["mouth_interior"][head.faces].all(1)).cpu()
 
@@ -117,7 +117,7 @@ def _barycentrics(corners: Tensor, points: Tensor) -> Tensor:
 
 
 def uv_gradients(head: HeadModel) -> Tensor:
-    """(F, 2, 2) matrices G with [dP/du dP/dv] = [P1 - P0, P2 - P0] @ G; zero without UV area."""
+    """Compute G (F, 2, 2): [dP/du dP/dv] = [P1 - P0, P2 - P0] @ G; zero without UV area."""
     corners = head.uv.double()[head.uv_faces]
     edges = torch.stack([corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]], -1)
     determinant = torch.linalg.det(edges)
@@ -136,7 +136,7 @@ def tangent_frames(vertices: Tensor, faces: Tensor, gradients: Tensor) -> tuple[
         gradients: (F, 2, 2) from `uv_gradients`.
 
     Returns:
-        (F, 3, 3) rotations, columns = tangent (along dP/du), bitangent, normal; (F, 2) metres a
+        (F, 3, 3) rotations, columns = tangent (along dP/du), bitangent, normal; (F, 2) metres per
         unit of UV along tangent and bitangent. A triangle without area gets the identity and 0.
 
     Source: the tangent basis of TexAvatars and GaussianAvatars; the bitangent's reach is the
@@ -146,10 +146,8 @@ def tangent_frames(vertices: Tensor, faces: Tensor, gradients: Tensor) -> tuple[
     edges = torch.stack([b - a, c - a], -1)  # (F, 3, 2)
     along = edges @ gradients
     tangent, cross = along[..., 0], torch.linalg.cross(edges[..., 0], edges[..., 1])
-    reach_u, area = (
-        tangent.norm(dim=1),
-        torch.linalg.cross(along[..., 0], along[..., 1]).norm(dim=1),
-    )
+    reach_u = tangent.norm(dim=1)
+    area = torch.linalg.cross(along[..., 0], along[..., 1]).norm(dim=1)
     good = (reach_u > 1e-9) & (cross.norm(dim=1) > NEEDLE_AREA)
     normal = torch.nn.functional.normalize(cross, dim=1, eps=1e-30)
     tangent = torch.nn.functional.normalize(tangent, dim=1, eps=1e-30)

@@ -25,6 +25,7 @@ from express50.head.model import HeadModel
 from grmm.config import Config, ModelConfig
 from grmm.data import NO_OFFSETS, HeadViews, Tracked, check_tracked, pose_state
 from grmm.model import GRMM
+from grmm.networks import Networks
 from grmm.presets import as_tables, from_tables
 from grmm.scene import HeadState, PinholeView
 
@@ -35,21 +36,25 @@ RETIRED: dict[str, dict[str, object]] = {
         "displacement_scale": 1e-2, "view_channels": 8, "code_spread": 1.0,
         "opacity_from_expression": False, "thickness_init": 0.3, "scale_min_mm": 0.1,
         "scale_max_mm": 10.0, "depth_normalisation": "minmax", "precision": "float32",
+        "refine_alpha": True,
     },
-    "loss": {"depth_erode_px": 2, "perceptual_crop_px": 0, "perceptual_every": 1},
+    "loss": {
+        "l1": 0.8, "perceptual": 0.04, "depth_erode_px": 2, "perceptual_crop_px": 0,
+        "perceptual_every": 1,
+    },
     "data": {"crop_margin_px": 16},
     "train": {"ema": 0.0, "clip_norm": 0.0, "overfit": 0, "shuffle_directions": 0.0},
 }  # fmt: skip
 # Settings of older checkpoints that no result depends on.
 DROPPED = {
     "model": ("backend",),
-    "data": ("split",),
+    "data": ("split", "cache_mb"),
     "train": (
         "betas", "tensorboard", "warm_start", "warm_start_images", "save_every", "log_every",
         "threads",
     ),
     "fit": (
-        "stage1_share", "stage1_final_lr", "stage2_texel_lr_scale", "tune_refinement",
+        "stage1_share", "stage1_lr", "stage1_final_lr", "stage2_texel_lr_scale", "tune_refinement",
         "locality_t", "codes", "seed",
     ),
 }  # fmt: skip
@@ -210,10 +215,11 @@ def _current_settings(path: Path, tables: dict[str, dict[str, Any]]) -> dict[str
 
 
 def _build(path: Path, config: ModelConfig, head: HeadModel, content: dict[str, Any]) -> GRMM:
-    """Build the model of a file's content."""
-    weights = content["model"]
+    """Build the model of a file's content, in the memory that its weights take there."""
+    weights, names = content["model"], (content["subjects"], content["expressions"])
     try:
-        model = GRMM(config, head, content["subjects"], content["expressions"])
+        _check_shapes(config, head, names, weights)
+        model = GRMM(config, head, *names)
         model.load_state_dict(weights)
     except (HeadModelError, RuntimeError, ValueError, TypeError, ArithmeticError) as error:
         raise FormatError(
@@ -222,6 +228,30 @@ def _build(path: Path, config: ModelConfig, head: HeadModel, content: dict[str, 
             "with, or copy it again"
         ) from None
     return model
+
+
+def _check_shapes(
+    config: ModelConfig, head: HeadModel, names: tuple[list, list], weights: dict[str, Tensor]
+) -> None:
+    """Refuse weights of other names or shapes than the networks of a configuration have.
+
+    The networks are built on torch's meta device: a damaged size asks for no memory.
+
+    Raises:
+        ValueError: names the first weight that differs.
+    """
+    layers = sum(map(len, (config.shared_widths, config.ladder, config.refine_widths)))
+    if layers > len(weights) or config.n_g < 1:
+        raise ValueError(f"{layers} layers, n_g = {config.n_g}; stored weights: {len(weights)}")
+    with torch.device("meta"):
+        networks = Networks(config, head, len(names[0]), len(names[1])).state_dict()
+    expected = {name: tuple(tensor.shape) for name, tensor in networks.items()}
+    stored = {name: tuple(tensor.shape) for name, tensor in weights.items()}
+    for name in sorted(expected.keys() | stored.keys()):
+        if expected.get(name) != stored.get(name):
+            raise ValueError(
+                f"{name}: stored shape {stored.get(name)}, expected {expected.get(name)}"
+            )
 
 
 def _gallery(

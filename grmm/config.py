@@ -60,9 +60,6 @@ class ModelConfig:
     G9."""
     refine_unshuffle: int = 1
     """Pixel-unshuffle factor before the refinement; 2 makes it four times cheaper. G9."""
-    refine_alpha: bool = True
-    """Let the refinement read the rendered alpha too. The paper lists colours, features and depth.
-    G9."""
 
     def __post_init__(self) -> None:
         side = self.n_g / 2 ** (len(self.ladder) + 1)
@@ -89,16 +86,15 @@ class ModelConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class LossConfig:
-    """Weights of the objective; the paper's, in the units that `grmm.losses` names."""
+    """Weights of the objective; the paper's, in the units that `grmm.losses` names.
 
-    l1: float = 0.8
-    """Weight of the mean absolute error of colours."""
+    The mean absolute error of colours has the fixed weight 0.8: Adam ignores a common factor.
+    """
+
     ssim: float = 0.2
     """Weight of 1 - SSIM."""
-    perceptual: float = 0.04
-    """Weight of the distance of VGG16 features. G14."""
     vgg16: str = ""
-    """Path of torchvision's vgg16 state dict; empty switches the perceptual term off."""
+    """Path of torchvision's vgg16 state dict; empty switches the perceptual term off. G14."""
     depth: float = 0.5
     """Weight of the squared depth error, dm^2. G11."""
     scale: float = 0.1
@@ -109,8 +105,7 @@ class LossConfig:
     """Weight of the sum of squares of both codes. G13."""
 
     def __post_init__(self) -> None:
-        _not_negative("loss", self, "l1", "ssim", "perceptual", "depth", "scale", "laplacian")
-        _not_negative("loss", self, "codes")
+        _not_negative("loss", self, "ssim", "depth", "scale", "laplacian", "codes")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -127,8 +122,6 @@ class DataConfig:
     torso: str = "ignore"
     """``ignore`` pixels of shoulders and clothes in losses and metrics, or ``keep`` them as if the
     head model held them."""
-    cache_mb: int = 512
-    """Decoded samples kept in memory, megabytes."""
 
     def __post_init__(self) -> None:
         if self.torso not in ("ignore", "keep"):
@@ -143,7 +136,7 @@ class TrainConfig:
     iterations: int = 250_000
     """Optimiser steps."""
     seconds: float = 0.0
-    """Stop after this much training time too; 0 is no limit. Resumed runs add up."""
+    """Stop after this much training time too; 0 sets no limit. Resumed runs add up."""
     lr: float = 1e-4
     """Adam's rate."""
     code_lr_scale: float = 1.0
@@ -152,16 +145,16 @@ class TrainConfig:
     """Factor on the rate of parameters that belong to one texel (biases and modes of the last
     layers), in training and in the second stage of a fit."""
     refine_lr_scale: float = 1.0
-    """Factor on the refinement's rate. At the demo's 2e-3 its first steps would throw the image
-    about, and it would then learn to do nothing."""
+    """Factor on the refinement's rate. At the demo's 2e-3 its first steps would overshoot, and it
+    would then learn to do nothing."""
     final_lr: float = 1.0
     """Last rate over the first, reached along a half cosine. G16."""
     accumulate: int = 1
     """Views whose gradients are averaged per step; 4 stands for the paper's four GPUs."""
     seed: int = 0
-    """Of weights, order and a fit's random cameras."""
+    """Seed of weights, order and a fit's random cameras."""
     save_seconds: float = 120.0
-    """Training time between checkpoints: what a kill may cost. 0: only one, at the end."""
+    """Training time between checkpoints, the most that a kill may cost. 0: only one, at the end."""
     evaluate_images: int = 32
     """Images evaluated for metrics.json, evenly chosen."""
 
@@ -183,9 +176,7 @@ class FitConfig:
     stage2_iterations: int = 350
     """Steps that fine-tune the decoders."""
     seconds: float = 0.0
-    """Stop after this much time in all; 0 is no limit."""
-    stage1_lr: float = 1e-2
-    """Adam's first rate for the codes; it falls to a tenth."""
+    """Stop after this much time in all; 0 sets no limit."""
     stage2_lr: float = 1e-4
     """Adam's rate for the decoders."""
     shuffle_directions: float = 0.0
@@ -200,7 +191,6 @@ class FitConfig:
 
     def __post_init__(self) -> None:
         _not_negative("fit", self, "seconds", "locality")
-        _in_range("fit.stage1_lr", self.stage1_lr, 1e-12, 1.0)
         _in_range("fit.stage2_lr", self.stage2_lr, 1e-12, 1.0)
         _in_range("fit.shuffle_directions", self.shuffle_directions, 0.0, 1.0)
         if self.locality_every < 1:

@@ -21,6 +21,7 @@ from grmm.head_crop import crop_view, head_window, labelled_torso, torso_mask
 from grmm.scene import HeadState, PinholeView
 
 NO_OFFSETS = np.zeros((0, 3), np.float32)
+CACHE_MB = 512  # of decoded samples: some hundred of 512 px
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -133,7 +134,7 @@ class HeadViews:
         *,
         background: float = 0.0,
         torso: str = "ignore",
-        cache_mb: int = 512,
+        cache_mb: int = CACHE_MB,
         device: torch.device | str = "cpu",
     ) -> None:
         """Wrap a source whose parameters belong to ``head``; see DataConfig for the rest."""

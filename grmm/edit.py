@@ -155,7 +155,7 @@ def controlled(
 
 
 def principal_directions(codes: Tensor) -> Tensor:
-    """(K, D) directions of codes (S, D), one standard deviation long, the strongest first."""
+    """Find the principal directions (K, D) of codes (S, D), one standard deviation long."""
     return _directions(codes, codes._version)
 
 

@@ -201,7 +201,7 @@ def summarise(rows: Sequence[Row], judge: PerceptualMetrics | None = None) -> di
 def write_evaluation(
     out: Path, rows: Sequence[Row], judge: PerceptualMetrics | None = None
 ) -> dict[str, object]:
-    """Write evaluation.csv (one row an image) and evaluation.json (means); returns the means."""
+    """Write evaluation.csv (one row per image) and evaluation.json (means); returns the means."""
     buffer = io.StringIO()
     writer = csv.DictWriter(buffer, fieldnames=[*IDS, *NUMBERS], lineterminator="\n")
     writer.writeheader()

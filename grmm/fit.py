@@ -38,6 +38,7 @@ from grmm.warm_start import LOGIT_LIMIT, project_texture, spread_change
 Scores = dict[str, float | None]
 LOOKED_AT = 12  # pictures scored between the stages
 STAGE1_SHARE = 0.35  # of a time budget (G22)
+STAGE1_LR = 1e-2  # of the codes: they are few and start at a mean (G22)
 STAGE1_FINAL_LR = 0.1  # rate at the end of stage 1 over the rate at its start (G22)
 LOCALITY_T = 0.3  # weight of the fitted subject in the interpolation (paper, supplement)
 
@@ -182,10 +183,10 @@ def invert_codes(state: FitState, late: Callable[[], bool]) -> int:
     for code in codes:
         code.requires_grad_(True)
     done = 0
-    optimizer = torch.optim.Adam(codes, lr=settings.stage1_lr)
+    optimizer = torch.optim.Adam(codes, lr=STAGE1_LR)
     for number, item in _items(state, settings.stage1_iterations, late):
         share = number / settings.stage1_iterations
-        optimizer.param_groups[0]["lr"] = settings.stage1_lr * STAGE1_FINAL_LR**share
+        optimizer.param_groups[0]["lr"] = STAGE1_LR * STAGE1_FINAL_LR**share
         optimizer.zero_grad()
         z_exp = state.z_exp[item.key.expression]
         rendering = state.model.render(
@@ -342,9 +343,10 @@ def blend(
 
 def _finite(loss: Tensor, iteration: int, stage: int) -> Tensor:
     if not bool(torch.isfinite(loss)):
+        remedy = "lower fit.stage2_lr or check" if stage == 2 else "check"
         raise TrainError(
-            f"fit, stage {stage}, iteration {iteration}: the objective is {float(loss.detach())}; "
-            f"expected a finite number. Lower fit.stage{stage}_lr or check the tracked parameters"
+            f"fit, stage {stage}, iteration {iteration}: the objective is {float(loss.detach())}, "
+            f"expected a finite number; {remedy} the tracked parameters"
         )
     return loss
 

@@ -18,6 +18,7 @@ from express50.files.pickles import read_weights
 from grmm.config import LossConfig
 from grmm.scene import Rendering
 
+L1, PERCEPTUAL = 0.8, 0.04  # weights of colours and of VGG16 features, the paper's (G14)
 SSIM_WINDOW, SSIM_SIGMA = 11, 1.5
 SSIM_C1, SSIM_C2 = 0.01**2, 0.03**2
 DEPTH_ERODE_PX = 2  # expected depth bleeds across silhouettes (G11)
@@ -78,11 +79,11 @@ def reconstruction(
 ) -> Tensor:
     """Compute L_rec of (3, H, W): weighted L1, 1 - SSIM and, with VGG16, perceptual distance."""
     _same_shape(image, target)
-    loss = config.l1 * (image - target).abs().mean()
+    loss = L1 * (image - target).abs().mean()
     if config.ssim > 0:
         loss = loss + config.ssim * (1 - ssim(image, target))
-    if perceptual is not None and config.perceptual > 0:
-        loss = loss + config.perceptual * perceptual(image, target)
+    if perceptual is not None:
+        loss = loss + PERCEPTUAL * perceptual(image, target)
     return loss
 
 
@@ -122,7 +123,7 @@ def scale_mm(scales_mm: Tensor, low: float = 0.1, high: float = 10.0) -> Tensor:
 
 
 def mesh_edges(faces: Tensor) -> Tensor:
-    """(E, 2) directed edges, each once, both directions, of faces (F, 3)."""
+    """List the directed edges (E, 2) of faces (F, 3), each once, in both directions."""
     pairs = torch.cat([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     return torch.unique(torch.cat([pairs, pairs.flip(1)]), dim=0)
 

@@ -159,9 +159,8 @@ class GRMM(Networks):
         maps = out.colors.permute(2, 0, 1)
         rgb = image = maps[:3]
         if refinement is not None:
-            extra = [normalise_depth(out.depth, out.alpha)[None]]
-            extra += [out.alpha[None]] if self.config.refine_alpha else []
-            image = refinement(torch.cat([maps, *extra]))
+            depth = normalise_depth(out.depth, out.alpha)
+            image = refinement(torch.cat([maps, depth[None], out.alpha[None]]))
         return Rendering(
             image=image, rgb=rgb, depth=out.depth, alpha=out.alpha, gaussians=gaussians
         )

@@ -56,7 +56,7 @@ class Networks(nn.Module):
         self.refinement = None
         if config.refine_widths:
             self.refinement = Refinement(
-                inputs=3 + config.features + 1 + config.refine_alpha,
+                inputs=3 + config.features + 2,  # colours, features, depth and alpha
                 widths=config.refine_widths,
                 unshuffle=config.refine_unshuffle,
             )
@@ -96,7 +96,7 @@ class Doubling(nn.Module):
 
 
 class Ladder(nn.Module):
-    """Code -> (outputs, n_g, n_g), zero at the start but for what is written into ``bias``.
+    """Decode a code to (outputs, n_g, n_g), which starts as ``bias``.
 
     The last layer is a transposed convolution without weight norm (which cannot be zero) whose
     weights start at zero. ``modes`` (modes, mode_outputs, n_g, n_g) adds a linear, per-texel
@@ -232,7 +232,7 @@ def zero_last(network: nn.Sequential) -> nn.Sequential:
 
 
 class Refinement(nn.Module):
-    """I = I_rgb + U-Net([I_rgb, features, normalised depth (, alpha)]).
+    """I = I_rgb + U-Net([I_rgb, features, normalised depth, alpha]).
 
     The paper names inputs and purpose only; G9 has the rest. ``unshuffle`` folds r x r pixels into
     channels first, which a CPU needs. Sides that are not a multiple of the stride are padded.

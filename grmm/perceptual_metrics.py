@@ -82,7 +82,7 @@ class PerceptualMetrics:
 
 
 class _Given(nn.Module):
-    """Features that are there already, where torchmetrics expects a network."""
+    """Passes ready features through, where torchmetrics expects a network."""
 
     def __init__(self, count: int) -> None:
         super().__init__()

@@ -43,7 +43,7 @@ class PinholeView:
     height: int
 
     def direction(self) -> Tensor:
-        """(3,) unit vector from the head's origin to the camera (G7)."""
+        """Return the unit vector (3,) from the head's origin to the camera (G7)."""
         centre = -self.cam_from_head[:3, :3].T @ self.cam_from_head[:3, 3]
         return nn.functional.normalize(centre, dim=0)
 

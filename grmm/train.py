@@ -80,7 +80,6 @@ def train(
         head,
         background=config.data.background,
         torso=config.data.torso,
-        cache_mb=config.data.cache_mb,
         device=device,
     )
     config = with_map_size(config, views)
@@ -172,7 +171,7 @@ def objective(
     terms = {n: losses.reconstruction(image, item.target, weights) for n, image in images.items()}
     if state.perceptual is not None:
         for name, image in images.items():
-            terms[f"perceptual_{name}"] = weights.perceptual * state.perceptual(image, item.target)
+            terms[f"perceptual_{name}"] = losses.PERCEPTUAL * state.perceptual(image, item.target)
     if bool(item.depth_valid.any()):
         error = losses.depth_dm2(rendering.depth, rendering.alpha, item.depth, item.depth_valid)
         terms["depth"] = weights.depth * error

@@ -13,11 +13,11 @@ from grmm.checkpoint import read_content
 
 
 def redact(path: Path, subject: str) -> bool:
-    """Remove a subject from a checkpoint in place; True where it was in there.
+    """Remove a subject from a checkpoint in place; return True if it was there.
 
-    A checkpoint of nobody else is deleted. What is left renders the others as before, and cannot be
-    resumed: the optimizer's state had a row for the person. The decoders' weights, which everybody
-    shares, stay as they are.
+    A checkpoint of this person alone is deleted. Otherwise the rest renders the other people as
+    before, but cannot be resumed: the optimizer's state had a row for the person. The decoders'
+    weights, which all people share, stay as they are.
 
     Raises:
         FormatError: the file is not a checkpoint of 'grmm train' or 'fit'.
@@ -39,7 +39,7 @@ def redact(path: Path, subject: str) -> bool:
 def _without(content: dict[str, Any], subject: str) -> dict[str, Any]:
     rows = [row for row, name in enumerate(content["subjects"]) if name != subject]
     frames = [frame for frame in content["frames"] if frame["subject"] != subject]
-    # Nobody is left to show an expression that this person alone performed.
+    # No one else shows an expression that this person alone performed.
     lost = {f["expression_id"] for f in content["frames"]} - {f["expression_id"] for f in frames}
     kept = [row for row, name in enumerate(content["expressions"]) if name not in lost]
     # Indexing with a list copies: a view would carry the removed row to the disk.

@@ -159,7 +159,7 @@ def add_score(commands: argparse._SubParsersAction) -> None:
     _add_choice(parser)
     parser.add_argument("--background", type=float, default=0.0, help="grey, 0 to 1")
     parser.add_argument("--torso", default="ignore", choices=("ignore", "keep"), help="its pixels")
-    parser.add_argument("--partial", action="store_true", help="score those that are there")
+    parser.add_argument("--partial", action="store_true", help="score the pictures that exist")
     add_metrics(parser)
     parser.add_argument("--json", action="store_true", help="print the means as JSON")
     parser.set_defaults(handler=_score)
@@ -198,7 +198,9 @@ def add_ablate(commands: argparse._SubParsersAction) -> None:
         "--preset small --budget 2h --fit-cameras cam03 --fit-budget 60s",
     )
     parser.add_argument("shards", type=Path, help="folder of shards")
-    parser.add_argument("out", type=Path, help="a folder a row, ablation.md, ablation.json")
+    parser.add_argument(
+        "out", type=Path, help="for a folder per row, ablation.md and ablation.json"
+    )
     add_training(parser)
     parser.add_argument("--rows", default="", help="full,no_residuals,..; default: all")
     parser.add_argument("--fit-subjects", default="", help="default: all not trained")

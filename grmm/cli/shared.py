@@ -117,7 +117,6 @@ def open_views(loaded: Loaded, shards: Path) -> HeadViews:
         loaded.head,
         background=data.background,
         torso=data.torso,
-        cache_mb=data.cache_mb,
         device=loaded.model.z_id.device,
     )
 

@@ -1,4 +1,4 @@
-"""Checkpoints that are no checkpoints, or not whole."""
+"""Checkpoints that are damaged, or whose parts do not fit each other."""
 
 import pytest
 import torch
@@ -21,36 +21,39 @@ def path(tmp_path, source):
 def test_checkpoint_is_read_with_weights_only_and_damage_is_named(tmp_path):
     path = tmp_path / "checkpoint.pt"
     path.write_bytes(b"not a checkpoint")
-    with pytest.raises(FormatError, match="not a checkpoint"):
+    with pytest.raises(FormatError, match="checkpoint.pt"):
         load_checkpoint(path)
     torch.save({"format": "other/9"}, path)
-    with pytest.raises(FormatError, match="format is 'other/9'"):
+    with pytest.raises(FormatError, match="other/9"):
         load_checkpoint(path)
 
 
 @pytest.mark.parametrize(
-    ("key", "size", "message"),
+    ("key", "size", "named"),
     [
-        ("n_g", 16, "size mismatch"),
-        ("n_g", 100, "model.n_g is 100, expected a multiple of 8"),
-        ("n_g", 0, "do not fit"),
-        ("z_exp", -1, "do not fit"),
+        ("n_g", 10**6, "colour.bias"),
+        ("features", 10**6, "colour.bias"),
+        ("shared_widths", [8] * 50_000, "5000[0-9] layers"),
+        ("n_g", 16, "colour.bias"),
+        ("n_g", 100, "model.n_g"),
+        ("n_g", 0, "n_g = 0"),
+        ("z_exp", -1, "checkpoint.pt"),
     ],
 )
-def test_a_configuration_that_the_weights_do_not_have_is_refused(path, key, size, message):
+def test_a_configuration_that_the_weights_do_not_have_is_refused(path, key, size, named):
     content = torch.load(path, weights_only=True)
     content["config"]["model"][key] = size
     torch.save(content, path)
-    with pytest.raises(FormatError, match=f"checkpoint.pt: .*{message}"):
+    with pytest.raises(FormatError, match=named):
         load_checkpoint(path)
 
 
 @pytest.mark.parametrize("size", [(0, 9), (9, 2.5), (10**6, 10**6)])
-def test_a_camera_of_no_images_size_is_refused(path, size):
+def test_a_camera_whose_size_no_image_has_is_refused(path, size):
     content = torch.load(path, weights_only=True)
     content["cameras"]["cam01"] |= {"width": size[0], "height": size[1]}
     torch.save(content, path)
-    with pytest.raises(FormatError, match="camera cam01: size .*, expected two positive whole"):
+    with pytest.raises(FormatError, match="cam01"):
         load_checkpoint(path)
 
 
@@ -59,7 +62,7 @@ def test_a_frame_that_the_head_model_cannot_take_is_refused(path, name, size):
     content = torch.load(path, weights_only=True)
     content["frames"][1]["parameters"][name] = torch.zeros(size)
     torch.save(content, path)
-    with pytest.raises(FormatError, match=f"S000/e1: {size} {name} coefficients, head model"):
+    with pytest.raises(FormatError, match=f"S000/e1: {size} {name}"):
         load_checkpoint(path)
 
 

@@ -2,6 +2,7 @@ import pytest
 import torch
 
 from express50.errors import ConfigError
+from grmm import losses
 from grmm.fit import LOCALITY_T
 from grmm.networks import Refinement
 from grmm.presets import PRESETS, as_tables, from_tables, preset, resolve
@@ -12,7 +13,7 @@ def test_paper_preset_has_the_papers_numbers():
     model, loss = config.model, config.loss
     assert (model.n_g, model.z_id, model.z_exp, model.features) == (512, 512, 256, 32)
     assert model.shared_widths[-1] + model.z_exp == 512
-    assert (loss.l1, loss.ssim, loss.perceptual, loss.depth) == (0.8, 0.2, 0.04, 0.5)
+    assert (losses.L1, loss.ssim, losses.PERCEPTUAL, loss.depth) == (0.8, 0.2, 0.04, 0.5)
     assert (loss.scale, loss.laplacian, loss.codes) == (0.1, 0.01, 0.001)
     assert (config.train.iterations, config.train.lr) == (250_000, 1e-4)
     assert (config.fit.locality, LOCALITY_T) == (0.1, 0.3)

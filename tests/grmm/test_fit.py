@@ -98,9 +98,7 @@ def test_blend_weighs_the_subject_by_t(loaded, views):
 
 
 def test_fit_improves_on_the_mean_code_and_reports_both_views(loaded, views, tmp_path):
-    settings = replace(
-        loaded.config.fit, stage1_iterations=10, stage2_iterations=25, stage1_lr=5e-2
-    )
+    settings = replace(loaded.config.fit, stage1_iterations=10, stage2_iterations=25)
     loaded = replace(loaded, config=replace(loaded.config, fit=settings))
     given = unseen(views, "cam00") + unseen(views, "cam01")
     metrics = fit(loaded, views, given, unseen(views, "cam02"), tmp_path)
