@@ -16,6 +16,7 @@ import torch
 from express50.errors import HeadModelError
 from express50.files.arrays import read_arrays
 from express50.files.text import read_text
+from express50.geometry.smoothstep import smoothstep
 from express50.head.ict_regions import ict_regions
 from express50.head.model import PARENTS, HeadModel, check_head
 
@@ -249,7 +250,7 @@ def _rig(
     root_joint = np.array([0.0, 0.5 * (floor + chin[1]), centre[2]])
     # The neck's weight falls along a plane that rises to the nape, as a skull sits on a spine.
     level = (height - 0.25 * (template[:, 2] - centre[2]) - floor) / (chin[1] - floor)
-    head = _smoothstep((level - 0.25) / 0.85)
+    head = smoothstep((level - 0.25) / 0.85, 0.0, 1.0)
     head = np.where(regions["face"] | regions["mouth_interior"] | regions["teeth"], 1.0, head)
     skinning = np.zeros((template.shape[0], 5))
     skinning[:, 2] = jaw_weight * head
@@ -284,7 +285,7 @@ def _jaw_rig(
     hinge = points.mean(0) - np.linalg.solve(rotation, motion.mean(0))
     rigid = np.linalg.norm((template[:, 1:] - hinge) @ rotation.T, axis=1)
     weight = np.linalg.norm(opened[:, 1:], axis=1) / np.maximum(rigid, 1e-3)
-    below = _smoothstep((hinge[0] + 0.03 - template[:, 1]) / 0.03)
+    below = smoothstep((hinge[0] + 0.03 - template[:, 1]) / 0.03, 0.0, 1.0)
     return np.array([0.0, hinge[0], hinge[1]]), np.clip(weight, 0.0, 1.0) * below
 
 
@@ -324,9 +325,3 @@ def _at_vertices(faces: np.ndarray, vertices: np.ndarray) -> tuple[np.ndarray, n
         ids.append(face)
         bary.append(np.eye(3)[corner])
     return np.array(ids, dtype=np.int64), np.array(bary)
-
-
-def _smoothstep(x: np.ndarray) -> np.ndarray:
-    """Step smoothly from 0 at 0 to 1 at 1."""
-    x = np.clip(x, 0.0, 1.0)
-    return x * x * (3.0 - 2.0 * x)

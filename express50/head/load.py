@@ -2,11 +2,25 @@
 
 from __future__ import annotations
 
+import zipfile
+from functools import cache
 from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
 
 from express50.errors import HeadModelError
-from express50.head.model import HeadModel
+from express50.files.arrays import read_arrays
+from express50.head.model import HeadModel, check_head
 
+BUILTIN = Path(__file__).with_name("builtin.npz")
+# Arrays with the names and shapes of HeadModel's fields; the names of directions are texts.
+FIELDS = (
+    "template", "shape_dirs", "expression_dirs", "pose_dirs", "joint_regressor", "skinning",
+    "faces", "uv", "uv_faces", "landmark_faces", "landmark_bary", "shape_names",
+    "expression_names",
+)  # fmt: skip
 _KINDS = (
     '"procedural", a FLAME .pkl, an ICT-FaceKit checkout, an .npz of its arrays, or a stored head'
     " model"
@@ -26,17 +40,12 @@ def load_head(spec: str | Path) -> HeadModel:
         HeadModelError: unknown name, missing file or damaged content.
     """
     if str(spec) == "procedural":
-        from express50.head.builtin import load_builtin
-
         return load_builtin()
     path = Path(spec).expanduser()
     if not path.exists():
         raise HeadModelError(f"head model {str(spec)!r}: no such file or folder; expected {_KINDS}")
-    if path.suffix == ".npz":
-        from express50.head.builtin import is_stored, load_stored
-
-        if is_stored(path):
-            return load_stored(path, path.stem)
+    if path.suffix == ".npz" and is_stored(path):
+        return load_stored(path, path.stem)
     if path.is_dir() or path.suffix == ".npz":
         from express50.head.ict import load_ict
 
@@ -46,3 +55,54 @@ def load_head(spec: str | Path) -> HeadModel:
 
         return load_flame(path)
     raise HeadModelError(f"head model {str(spec)!r}: unknown kind of file; expected {_KINDS}")
+
+
+@cache
+def load_builtin() -> HeadModel:
+    """Load the built-in head (float32, CPU). Callers share it and must not modify it."""
+    return load_stored(BUILTIN, "procedural")
+
+
+def load_stored(path: Path, name: str) -> HeadModel:
+    """Load a head model from its arrays; docs/RECIPES.md shows how to write them.
+
+    Args:
+        path: .npz with the arrays of `FIELDS`; optionally `regions` (R, V) bool with
+            `region_names` (R,), and the 17 lists of jaw line candidates, concatenated in `contour`
+            with their lengths in `contour_counts`; `unit_expressions`, False where coefficients
+            are standard deviations.
+        name: of the model.
+
+    Raises:
+        HeadModelError: the file is damaged, lacks an array, or its arrays do not fit each other.
+    """
+    arrays = read_arrays(path, HeadModelError, "a stored head model", FIELDS)
+    try:
+        return check_head(_assembled(arrays, name))
+    except (ValueError, TypeError, RuntimeError) as error:
+        raise HeadModelError(
+            f"{path}: not a stored head model ({error}); see docs/RECIPES.md"
+        ) from error
+
+
+def is_stored(path: Path) -> bool:
+    """Return True if a file holds the arrays of a head model under our names."""
+    return zipfile.is_zipfile(path) and "skinning.npy" in zipfile.ZipFile(path).namelist()
+
+
+def _assembled(arrays: dict[str, np.ndarray], name: str) -> HeadModel:
+    fields: dict[str, Any] = {}
+    for key in FIELDS:
+        kind = np.float32 if arrays[key].dtype.kind == "f" else np.int64
+        names = key.endswith("_names")
+        value = arrays[key]
+        fields[key] = tuple(value.tolist()) if names else torch.from_numpy(value.astype(kind))
+    if "contour" in arrays and "contour_counts" in arrays:
+        ends = np.cumsum(arrays["contour_counts"])[:-1]
+        fields["contour"] = tuple(torch.from_numpy(p) for p in np.split(arrays["contour"], ends))
+    if "regions" in arrays and "region_names" in arrays:
+        masks = [torch.from_numpy(mask) for mask in arrays["regions"].astype(bool)]
+        fields["regions"] = dict(zip(arrays["region_names"].tolist(), masks, strict=True))
+    if "unit_expressions" in arrays:
+        fields["unit_expressions"] = bool(arrays["unit_expressions"])
+    return HeadModel(name=name, **fields)

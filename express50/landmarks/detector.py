@@ -148,8 +148,10 @@ def _refined(
 def _consensus(net: LandmarkNet, pyramid: list[np.ndarray], place: _Place) -> _Place:
     """The place as several crops about it see it together, its score by how well they agree."""
     window = window_about(place.points)
-    crops = [_scaled(window, scale) for scale in SCALES]
-    seen = _run(net, pyramid, [view for crop in crops for view in (crop, _mirrored(crop))])
+    centre = window @ [CROP / 2, CROP / 2, 1.0]
+    crops = [place_crop(centre, scale * window[:, :2], CROP) for scale in SCALES]
+    flip = np.array([[-1.0, 0.0, CROP], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+    seen = _run(net, pyramid, [view for crop in crops for view in (crop, crop @ flip)])
     mean = _mean_view(seen)
     spread = np.mean([np.linalg.norm(one.points - mean.points, axis=1) for one in seen], axis=0)
     differ = np.median(spread) / (DIFFER_SHARE * max(face_box(mean.points)[1], 1e-6))
@@ -160,10 +162,39 @@ def _consensus(net: LandmarkNet, pyramid: list[np.ndarray], place: _Place) -> _P
 
 
 def _window(centre: np.ndarray, side: float, angle: float) -> np.ndarray:
-    """Affine (2, 3) from crop pixels to image pixels, corner origin."""
+    """Place the network's crop: affine (2, 3) from crop pixels to image pixels, corner origin."""
     scale = side / CROP
     turn = scale * np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-    return np.concatenate([turn, (centre - turn @ [CROP / 2, CROP / 2])[:, None]], axis=1)
+    return place_crop(centre, turn, CROP)
+
+
+def place_crop(centre: np.ndarray, turn: np.ndarray, size: int) -> np.ndarray:
+    """Place a square crop about a point of an image.
+
+    Args:
+        centre: (2,) pixels of the image, corner origin.
+        turn: (2, 2) from steps in the crop to steps in the image.
+        size: side of the crop, pixels.
+
+    Returns:
+        affine (2, 3) from crop pixels to image pixels.
+    """
+    return np.concatenate([turn, (centre - turn @ [size / 2, size / 2])[:, None]], axis=1)
+
+
+def place_level_crop(centre: np.ndarray, right: np.ndarray, size: int) -> np.ndarray:
+    """Place a crop whose rows run along a direction of the image; ``right`` (2,) is one pixel."""
+    turn = np.array([[right[0], -right[1]], [right[1], right[0]]])
+    return place_crop(centre, turn, size)
+
+
+def cut_crop(image: np.ndarray, window: np.ndarray, size: int) -> np.ndarray:
+    """Cut a placed crop (size, size, 3) out of an image; its outermost pixels repeat."""
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    border = cv2.BORDER_REPLICATE
+    return cv2.warpAffine(
+        image, affine_to_opencv(window), (size, size), flags=flags, borderMode=border
+    )
 
 
 def window_about(points: np.ndarray) -> np.ndarray:
@@ -179,19 +210,6 @@ def window_about(points: np.ndarray) -> np.ndarray:
     turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
     centre, side = face_box(points @ turn.T)
     return _window(centre @ turn, max(side, 8.0), angle)
-
-
-def _scaled(window: np.ndarray, scale: float) -> np.ndarray:
-    """The window about the same centre, its side times a scale."""
-    centre = window @ [CROP / 2, CROP / 2, 1.0]
-    turn = scale * window[:, :2]
-    return np.concatenate([turn, (centre - turn @ [CROP / 2, CROP / 2])[:, None]], axis=1)
-
-
-def _mirrored(window: np.ndarray) -> np.ndarray:
-    """The same window seen in a mirror: crop x runs the other way."""
-    flip = np.array([[-1.0, 0.0, CROP], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
-    return window @ flip
 
 
 def _pyramid(image: np.ndarray) -> list[np.ndarray]:
@@ -211,42 +229,31 @@ def _sample(pyramid: list[np.ndarray], window: np.ndarray) -> np.ndarray:
     height, width = pyramid[0].shape[:2]
     shape = pyramid[level].shape
     scale = np.array([[shape[1] / width], [shape[0] / height]])
-    return cv2.warpAffine(
-        pyramid[level],
-        affine_to_opencv(window * scale),
-        (CROP, CROP),
-        flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
-        borderMode=cv2.BORDER_REPLICATE,
-    )
+    return cut_crop(pyramid[level], window * scale, CROP)
 
 
 def _run(net: LandmarkNet, pyramid: list[np.ndarray], windows: list[np.ndarray]) -> list[_Place]:
-    """Run the network on windows of an image."""
-    parts = [windows[start : start + BATCH] for start in range(0, len(windows), BATCH)]
-    return [place for part in parts for place in _run_batch(net, pyramid, part)]
-
-
-def _run_batch(
-    net: LandmarkNet, pyramid: list[np.ndarray], windows: list[np.ndarray]
-) -> list[_Place]:
-    crops = torch.from_numpy(np.stack([_sample(pyramid, window) for window in windows]))
-    # (N, H, W, 3) seen as (N, 3, H, W) lies in memory as channels-last already.
-    with torch.inference_mode():
-        output = net(crops.permute(0, 3, 1, 2).float() / 255.0)
-    scales = output.log_scale.double().exp().numpy()
-    visible = torch.sigmoid(output.seen).double().numpy()
-    scores = torch.sigmoid(output.logit).double().numpy()
+    """Run the network on windows of an image, `BATCH` at a time."""
     places = []
-    for window, found, sigma, seen, score in zip(
-        windows, output.points.double().numpy(), scales, visible, scores, strict=True
-    ):
-        points = found @ window[:, :2].T + window[:, 2]
-        determinant = np.linalg.det(window[:, :2])
-        sigma = sigma * np.sqrt(abs(determinant))
-        if determinant < 0:
-            points, sigma, seen = points[MIRROR], sigma[MIRROR], seen[MIRROR]
-        vague = np.median(sigma) / (VAGUE_SHARE * max(face_box(points)[1], 1e-6))
-        places.append(_Place(points, sigma, seen, float(score / (1.0 + vague**2))))
+    for start in range(0, len(windows), BATCH):
+        part = windows[start : start + BATCH]
+        crops = torch.from_numpy(np.stack([_sample(pyramid, window) for window in part]))
+        # (N, H, W, 3) seen as (N, 3, H, W) lies in memory as channels-last already.
+        with torch.inference_mode():
+            output = net(crops.permute(0, 3, 1, 2).float() / 255.0)
+        scales = output.log_scale.double().exp().numpy()
+        visible = torch.sigmoid(output.seen).double().numpy()
+        scores = torch.sigmoid(output.logit).double().numpy()
+        for window, found, sigma, seen, score in zip(
+            part, output.points.double().numpy(), scales, visible, scores, strict=True
+        ):
+            points = found @ window[:, :2].T + window[:, 2]
+            determinant = np.linalg.det(window[:, :2])
+            sigma = sigma * np.sqrt(abs(determinant))
+            if determinant < 0:
+                points, sigma, seen = points[MIRROR], sigma[MIRROR], seen[MIRROR]
+            vague = np.median(sigma) / (VAGUE_SHARE * max(face_box(points)[1], 1e-6))
+            places.append(_Place(points, sigma, seen, float(score / (1.0 + vague**2))))
     return places
 
 

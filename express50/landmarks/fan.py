@@ -10,14 +10,13 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 import torch
 
 from express50.errors import ConfigError
 from express50.files.arrays import DAMAGE
-from express50.geometry.conventions import affine_to_opencv, cell_to_corner
-from express50.landmarks.detector import Detection
+from express50.geometry.conventions import cell_to_corner
+from express50.landmarks.detector import Detection, cut_crop, place_crop
 
 CROP, HEAT, POINTS = 256, 64, 68
 # A crop spans 200 / 195 times the sum of the sides of the face box that FAN was trained with, whose
@@ -56,10 +55,7 @@ def find_with_fan(fan: torch.jit.ScriptModule, image: np.ndarray, face: Detectio
         face: from `detect`.
     """
     window = fan_window(face.points)
-    crop = cv2.warpAffine(
-        image, affine_to_opencv(window), (CROP, CROP),
-        flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP, borderMode=cv2.BORDER_REPLICATE,
-    )  # fmt: skip
+    crop = cut_crop(image, window, CROP)
     with torch.inference_mode():
         batch = torch.from_numpy(crop).permute(2, 0, 1)[None].float() / 255.0
         heat = _heat(fan, batch)[0].double().numpy()
@@ -81,8 +77,7 @@ def fan_window(points: np.ndarray) -> np.ndarray:
     low = low - [0.0, BROW * (high[1] - low[1])]
     centre = 0.5 * (low + high) - [0.0, RAISE * (high[1] - low[1])]
     scale = SPAN * max(float((high - low).sum()), 8.0) / CROP
-    turn = scale * np.eye(2)
-    return np.concatenate([turn, (centre - turn @ [CROP / 2, CROP / 2])[:, None]], axis=1)
+    return place_crop(centre, scale * np.eye(2), CROP)
 
 
 def _heat(fan: torch.jit.ScriptModule, batch: torch.Tensor) -> torch.Tensor:

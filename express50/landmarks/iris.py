@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from express50.geometry.conventions import affine_to_opencv, cell_to_corner
-from express50.landmarks.detector import Detection
+from express50.geometry.conventions import cell_to_corner
+from express50.landmarks.detector import Detection, cut_crop, place_level_crop
 
 # Subject's left eye first, as the model's joints have it: corners, then the points of each lid.
 EYES = ((42, 45, (43, 44), (47, 46)), (36, 39, (37, 38), (41, 40)))
@@ -57,20 +57,16 @@ def find_irises(image: np.ndarray, seen: Detection) -> Irises:
         image: (H, W, 3) uint8 RGB.
         seen: the face's landmarks in that image.
     """
-    found = [_find(image, seen, *eye) for eye in EYES]
+    found = [_find(image, seen, eye) for eye in EYES]
     centres, sigma, confidence = (np.array(part) for part in zip(*found, strict=True))
     return Irises(centres, sigma, confidence)
 
 
 def _find(
-    image: np.ndarray,
-    seen: Detection,
-    first: int,
-    last: int,
-    upper: tuple[int, int],
-    lower: tuple[int, int],
+    image: np.ndarray, seen: Detection, eye: tuple[int, int, tuple[int, int], tuple[int, int]]
 ) -> tuple[np.ndarray, float, float]:
-    """Centre (2,), sigma and confidence of one eye."""
+    """Find one iris: centre (2,), sigma and confidence."""
+    first, last, upper, lower = eye
     points = seen.points
     ring = points[[first, *upper, last, *reversed(lower)]]
     middle = ring.mean(0)
@@ -79,52 +75,26 @@ def _find(
     nothing = (middle, np.inf, 0.0)
     if not np.isfinite(ring).all() or width < LEAST_WIDTH_PX:
         return nothing
-    opening = abs(_height(points, along / width, upper, lower)) / width
+    across = np.array([-along[1], along[0]]) / width
+    lids = points[list(lower)].mean(0) - points[list(upper)].mean(0)
+    opening = abs(float(lids @ across)) / width
     surely = float(np.clip((opening - SHUT) / (OPEN - SHUT), 0.0, 1.0))
     trust = float(np.median(seen.confidence[[first, *upper, last, *lower]]))
-    window = _window(middle, along)
-    if surely * trust <= 0.0 or not _inside(middle, image.shape):
+    size = np.array([image.shape[1], image.shape[0]])
+    if surely * trust <= 0.0 or (middle < 0).any() or (middle >= size).any():
         return nothing
-    crop = _light(image, window)
+    window = place_level_crop(middle, SPAN * along / SIDE, SIDE)
+    crop = cut_crop(image, window, SIDE).astype(np.float32)
+    # Red counts most, as blue irises are dark in it; the mean light is 0.5.
+    light = 0.6 * crop[..., 0] + 0.4 * crop[..., 1]
+    light = light * (0.5 / max(float(light.mean()), 10.0))
     mask = _opening(np.linalg.inv(np.vstack([window, [0, 0, 1]])), ring)
-    place, contrast, cover = _disc(crop, mask)
+    place, contrast, cover = _disc(light, mask)
     confidence = trust * surely * cover * contrast / (contrast + CONTRAST)
     if contrast < LEAST_CONTRAST or cover < LEAST_COVER or confidence < LEAST_CONFIDENCE:
         return nothing
     centre = window[:, :2] @ place + window[:, 2]
     return centre, SIGMA * width / confidence**0.5, confidence
-
-
-def _height(
-    points: np.ndarray, along: np.ndarray, upper: tuple[int, int], lower: tuple[int, int]
-) -> float:
-    """Distance between the lids across the line of the corners, pixels."""
-    across = np.array([-along[1], along[0]])
-    return float((points[list(lower)].mean(0) - points[list(upper)].mean(0)) @ across)
-
-
-def _window(middle: np.ndarray, along: np.ndarray) -> np.ndarray:
-    """Affine (2, 3) from crop to image pixels; the line of the eye's corners lies level."""
-    step = SPAN * along / SIDE
-    turn = np.array([[step[0], -step[1]], [step[1], step[0]]])
-    return np.concatenate([turn, (middle - turn @ [SIDE / 2, SIDE / 2])[:, None]], axis=1)
-
-
-def _inside(point: np.ndarray, shape: tuple[int, ...]) -> bool:
-    return bool((point >= 0).all() and point[0] < shape[1] and point[1] < shape[0])
-
-
-def _light(image: np.ndarray, window: np.ndarray) -> np.ndarray:
-    """Crop (SIDE, SIDE) float32 of mean 0.5; red counts most, as blue irises are dark in it."""
-    crop = cv2.warpAffine(
-        image,
-        affine_to_opencv(window),
-        (SIDE, SIDE),
-        flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
-        borderMode=cv2.BORDER_REPLICATE,
-    ).astype(np.float32)
-    light = 0.6 * crop[..., 0] + 0.4 * crop[..., 1]
-    return light * (0.5 / max(float(light.mean()), 10.0))
 
 
 def _opening(crop_from_image: np.ndarray, ring: np.ndarray) -> np.ndarray:

@@ -12,8 +12,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from express50.geometry.conventions import affine_to_opencv
-from express50.landmarks.detector import Detection
+from express50.landmarks.detector import Detection, cut_crop, place_level_crop
 
 # Outer lip above, inner above, inner below, outer lip below, of each column.
 COLUMNS = ((50, 61, 67, 58), (51, 62, 66, 57), (52, 63, 65, 56))
@@ -47,8 +46,8 @@ def open_lips(image: np.ndarray, seen: Detection) -> Detection:
     gaps = seen.points[[67, 66, 65]] - seen.points[[61, 62, 63]]
     if np.linalg.norm(gaps, axis=1).mean() > SHUT * width:
         return seen
-    window = _window(seen.points[48:60].mean(0), along)
-    crop = _crop(image, window)
+    window = place_level_crop(seen.points[48:60].mean(0), SPAN * along / WIDTH, WIDTH)
+    crop = cut_crop(image, window, WIDTH).astype(np.float64) / 255.0
     inverse = np.linalg.inv(np.vstack([window, [0.0, 0.0, 1.0]]))
     inside = seen.points @ inverse[:2, :2].T + inverse[:2, 2]
     found = _openings(crop, inside)
@@ -60,21 +59,6 @@ def open_lips(image: np.ndarray, seen: Detection) -> Detection:
             points[point] = window[:, :2] @ [inside[point, 0], y] + window[:, 2]
             sigma[point] = max(SIGMA * width, 0.5 * seen.sigma[point])
     return replace(seen, points=points, sigma=sigma)
-
-
-def _window(middle: np.ndarray, along: np.ndarray) -> np.ndarray:
-    """Affine (2, 3) from crop to image pixels; the line of the mouth's corners lies level."""
-    step = SPAN * along / WIDTH
-    turn = np.array([[step[0], -step[1]], [step[1], step[0]]])
-    return np.concatenate([turn, (middle - turn @ [WIDTH / 2, WIDTH / 2])[:, None]], axis=1)
-
-
-def _crop(image: np.ndarray, window: np.ndarray) -> np.ndarray:
-    """Crop (WIDTH, WIDTH, 3) float64 in 0..1."""
-    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    size, border = (WIDTH, WIDTH), cv2.BORDER_REPLICATE
-    crop = cv2.warpAffine(image, affine_to_opencv(window), size, flags=flags, borderMode=border)
-    return crop.astype(np.float64) / 255.0
 
 
 def _openings(crop: np.ndarray, points: np.ndarray) -> list[tuple[float, float]] | None:

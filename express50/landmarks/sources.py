@@ -73,49 +73,32 @@ def open_source(
         ConfigError: the file is missing, or is not of the expected kind.
         FormatError: the file of points is malformed.
     """
-    for path in source_files(landmarks).values():
+    files = source_files(landmarks)
+    for path in files.values():
         if not path.is_file():
             raise ConfigError(
                 f"landmarks {landmarks!r}: no file {path}; expected 'embedded', 'fan:' and the "
                 "path of FAN's TorchScript weights, or the path of a file of points"
             )
-    if landmarks == EMBEDDED:
-        return _embedded(refinements, smallest)
-    if landmarks.startswith(FAN):
-        return _fan(source_files(landmarks)["fan"], refinements, smallest)
-    return _given(source_files(landmarks)["landmarks"], cameras)
+    if "landmarks" in files:
+        table = read_points(files["landmarks"], cameras)
 
+        def look_up(image: np.ndarray, camera_id: str, frame: int) -> Marked:
+            rows = table.get((camera_id, frame))
+            if rows is None:
+                return _no_face(image)
+            face = given_detection(rows[:POINTS])
+            irises = given_irises(rows, face) if len(rows) > POINTS else find_irises(image, face)
+            return Marked(face, irises, visible_contour=True)
 
-def _embedded(refinements: int, smallest: float) -> Source:
+        return look_up
     net = load_network()
+    fan = load_fan(files["fan"]) if "fan" in files else None
 
     def find(image: np.ndarray, camera_id: str, frame: int) -> Marked:
-        face = open_lips(image, detect(net, image, refinements, smallest))
-        return Marked(face, find_irises(image, face), visible_contour=False)
-
-    return find
-
-
-def _fan(path: Path, refinements: int, smallest: float) -> Source:
-    net, fan = load_network(), load_fan(path)
-
-    def find(image: np.ndarray, camera_id: str, frame: int) -> Marked:
-        face = find_with_fan(fan, image, detect(net, image, refinements, smallest))
-        return Marked(face, find_irises(image, face), visible_contour=True)
-
-    return find
-
-
-def _given(path: Path, cameras: Mapping[str, Camera]) -> Source:
-    table = read_points(path, cameras)
-
-    def find(image: np.ndarray, camera_id: str, frame: int) -> Marked:
-        rows = table.get((camera_id, frame))
-        if rows is None:
-            return _nothing(image)
-        face = given_detection(rows[:POINTS])
-        irises = given_irises(rows, face) if len(rows) > POINTS else find_irises(image, face)
-        return Marked(face, irises, visible_contour=True)
+        face = detect(net, image, refinements, smallest)
+        face = open_lips(image, face) if fan is None else find_with_fan(fan, image, face)
+        return Marked(face, find_irises(image, face), visible_contour=fan is not None)
 
     return find
 
@@ -152,7 +135,7 @@ def given_irises(rows: np.ndarray, face: Detection) -> Irises:
     return Irises(centres, np.where(sigma > 0, sigma, np.inf), confidence)
 
 
-def _nothing(image: np.ndarray) -> Marked:
+def _no_face(image: np.ndarray) -> Marked:
     """No face: the score is 0."""
     middle = np.array([image.shape[1], image.shape[0]]) / 2
     face = Detection(np.tile(middle, (POINTS, 1)), np.full(POINTS, np.inf), np.zeros(POINTS), 0.0)
@@ -197,11 +180,17 @@ def read_points(path: Path, cameras: Mapping[str, Camera]) -> Table:
             f"{path}: is of cameras {', '.join(names[:6]) or 'none'}; expected some of "
             f"{', '.join(list(cameras)[:6])}"
         )
-    return {
-        key: _undistorted(cameras[key[0]], _checked(rows, cameras[key[0]], path, key))
-        for key, rows in raw.items()
-        if key[0] in cameras
-    }
+    table = {}
+    for key, read in raw.items():
+        if key[0] in cameras:
+            camera = cameras[key[0]]
+            rows = _checked(read, camera, path, key).copy()
+            known = np.isfinite(rows[:, :2]).all(1)
+            rows[~known] = (np.nan, np.nan, 0.0)
+            focal, middle = camera.K[[0, 1], [0, 1]], camera.K[:2, 2]
+            rows[known, :2] = normalised(camera, rows[known, :2]) * focal + middle
+            table[key] = rows
+    return table
 
 
 def _read_npz(path: Path) -> Table:
@@ -257,15 +246,4 @@ def _checked(rows: np.ndarray, camera: Camera, path: Path, key: tuple[str, int])
             f"{where}: a point is at {worst[0]:.0f}, {worst[1]:.0f} of a {camera.width}x"
             f"{camera.height} image; expected pixels of the footage as recorded"
         )
-    return rows
-
-
-def _undistorted(camera: Camera, rows: np.ndarray) -> np.ndarray:
-    """The rows with pixels of the undistorted image."""
-    rows = rows.copy()
-    known = np.isfinite(rows[:, :2]).all(1)
-    rows[~known] = (np.nan, np.nan, 0.0)
-    rows[known, :2] = (
-        normalised(camera, rows[known, :2]) * camera.K[[0, 1], [0, 1]] + camera.K[:2, 2]
-    )
     return rows

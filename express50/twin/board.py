@@ -11,8 +11,9 @@ import numpy as np
 
 from express50.geometry.cameras import Camera, project
 from express50.geometry.conventions import cell_centres, corner_to_cell
+from express50.geometry.smoothstep import smoothstep
 from express50.geometry.transforms import axis_angle_to_matrix, make_transform
-from express50.twin.noise import fractal, make_lattice, noise, random_stream, smoothstep
+from express50.twin.noise import fractal, make_lattice, noise, random_stream
 from express50.twin.render import bands, ray_pattern
 from express50.twin.rig import SPAN_DEG, TARGET
 from express50.twin.surface import spherical_to_unit, unit, unit_to_spherical

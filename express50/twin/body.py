@@ -9,10 +9,11 @@ import numpy as np
 import scipy.sparse
 import torch
 
+from express50.geometry.smoothstep import smoothstep
 from express50.geometry.transforms import rigid_fit
 from express50.head.model import HeadModel, landmarks, pose
 from express50.twin.hair import HairMesh, grow_hair
-from express50.twin.noise import random_stream, smoothstep
+from express50.twin.noise import random_stream
 from express50.twin.performance import TwinPerformance
 from express50.twin.subjects import TwinSubject
 from express50.twin.surface import Caster, StarMap, face_to_vertex, smooth_over_mesh, vertex_normals

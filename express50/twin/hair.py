@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from express50.twin.noise import smoothstep
+from express50.geometry.smoothstep import smoothstep
 from express50.twin.subjects import PersonLook
 from express50.twin.surface import StarMap, unit
 

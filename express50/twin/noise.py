@@ -48,12 +48,6 @@ def fractal(
     return total
 
 
-def smoothstep(x: np.ndarray, low: float, high: float) -> np.ndarray:
-    """Step smoothly from 0 at ``low`` to 1 at ``high``."""
-    t = np.clip((x - low) / (high - low), 0.0, 1.0)
-    return t * t * (3.0 - 2.0 * t)
-
-
 def random_stream(seed: int, *path: int) -> np.random.Generator:
     """Independent generator for a seed and a path of integers such as (subject, camera, frame)."""
     return np.random.default_rng([seed, *path])

@@ -9,9 +9,10 @@ import numpy as np
 
 from express50.capture.expressions import Expression
 from express50.errors import HeadModelError
+from express50.geometry.smoothstep import smoothstep
 from express50.geometry.transforms import axis_angle_to_matrix, matrix_to_axis_angle
 from express50.head.model import HeadModel
-from express50.twin.noise import random_stream, smoothstep
+from express50.twin.noise import random_stream
 from express50.twin.rig import TARGET
 
 

@@ -10,9 +10,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from express50.geometry.smoothstep import smoothstep
 from express50.head.model import HeadModel
 from express50.twin.body import Body, Material, Posed, model_materials
-from express50.twin.noise import make_lattice, noise, random_stream, smoothstep
+from express50.twin.noise import make_lattice, noise, random_stream
 from express50.twin.skin import SkinTexture, sample_skin
 from express50.twin.surface import Caster, dot, smooth_over_mesh, unit
 

@@ -11,9 +11,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from express50.geometry.smoothstep import smoothstep
 from express50.head.model import HeadModel, landmarks
 from express50.twin.body import Body, Material, model_materials
-from express50.twin.noise import fractal, make_lattice, noise, random_stream, smoothstep
+from express50.twin.noise import fractal, make_lattice, noise, random_stream
 from express50.twin.surface import (
     MISS,
     Caster,

@@ -6,8 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from express50.geometry.smoothstep import smoothstep
 from express50.head.model import HeadModel
-from express50.twin.noise import fractal, make_lattice, random_stream, smoothstep
+from express50.twin.noise import fractal, make_lattice, random_stream
 
 OFFSET_RMS_M = 1.2e-3
 # Linear-light albedo of skin from light to deep (sRGB about 233 196 176 ... 92 62 49).

@@ -31,11 +31,10 @@ from express50.landmarks.network import (
     save_network,
 )
 from express50.landmarks.training.augment import make_backgrounds, random_crop
-from express50.landmarks.training.poses import random_parameters
-from express50.landmarks.training.render import HeadScene
-from express50.landmarks.training.skin import random_head
-from express50.landmarks.training.training_set import (
+from express50.landmarks.training.random_heads import random_head, random_parameters
+from express50.landmarks.training.views import (
     FACE_YAW,
+    HeadScene,
     ViewSet,
     draw_views,
     draw_yaws,

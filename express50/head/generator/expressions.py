@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from express50.geometry.smoothstep import smoothstep
 from express50.head.generator.eyes import blink, lid_motion
 from express50.head.generator.influence import (
     Pull,
@@ -13,7 +14,7 @@ from express50.head.generator.influence import (
     window,
 )
 from express50.head.generator.mesh import WholeMesh
-from express50.head.generator.skinning import JAW, smoothstep
+from express50.head.generator.skinning import JAW
 
 Array = np.ndarray
 Triple = tuple[float, float, float]

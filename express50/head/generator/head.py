@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 
-from express50.head.builtin import BUILTIN
 from express50.head.generator.expressions import expression_directions
 from express50.head.generator.eyes import add_eyeball
 from express50.head.generator.mesh import HalfMesh, WholeMesh, mirrored, pack_uv
@@ -29,6 +28,7 @@ from express50.head.generator.skinning import (
     pose_correctives,
     skinning_weights,
 )
+from express50.head.load import BUILTIN
 
 Array = np.ndarray
 
@@ -78,7 +78,7 @@ def procedural_arrays() -> dict[str, Any]:
 
 
 def write_builtin(path: Path) -> None:
-    """Write the head's arrays as the .npz file that `express50.head.builtin` reads."""
+    """Write the head's arrays as the .npz file that `express50.head.load` reads."""
     arrays = procedural_arrays()
     contour, regions = arrays.pop("contour"), arrays.pop("regions")
     stored: dict[str, Any] = {

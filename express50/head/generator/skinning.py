@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from express50.geometry.smoothstep import smoothstep
 from express50.head.generator.field import EYE_CENTER
 from express50.head.generator.mesh import WholeMesh
 
@@ -31,12 +32,6 @@ def joint_regressor(mesh: WholeMesh, joints: Array) -> Array:
         system = np.concatenate([mesh.vertices[near].T, np.ones((1, len(near)))])
         regressor[j, near] = np.linalg.lstsq(system, np.append(joint, 1.0), rcond=None)[0]
     return regressor
-
-
-def smoothstep(value: Array, low: float, high: float) -> Array:
-    """Step smoothly from 0 at low to 1 at high (low may exceed high), C1."""
-    t = np.clip((value - low) / (high - low), 0.0, 1.0)
-    return t * t * (3 - 2 * t)
 
 
 def vertex_average(mesh: WholeMesh, values: Array, faces: Array) -> Array:

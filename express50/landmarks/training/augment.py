@@ -9,7 +9,7 @@ import numpy as np
 
 from express50.geometry.conventions import affine_to_opencv
 from express50.landmarks.network import CROP, CROP_MARGIN, MIRROR, face_box
-from express50.landmarks.training.training_set import ViewSet
+from express50.landmarks.training.views import ViewSet
 
 Rng = np.random.Generator
 
@@ -55,11 +55,20 @@ def random_crop(
     if not empty:
         _shoulders(image, points * (size / CROP), rng)
         image = _composite(views.rgba[index], matrix * (size / CROP), image)
-    covered = _cover(image, points * (size / CROP), rng)
+    covered = np.zeros(image.shape[:2], np.uint8)
+    kind = rng.random()
+    if kind < 0.2:
+        _hair_locks(image, covered, points * (size / CROP), rng)
+    elif kind < 0.42:
+        for _ in range(rng.integers(1, 3)):
+            _occlude(image, covered, rng)
     facing = float(views.facing[index])
     score = 0.0 if empty else float(np.clip((facing + 0.15) / 0.3, 0.0, 1.0))
     weight = 0.0 if empty else float(np.clip((facing + 0.3) / 0.4, 0.0, 1.0))
-    visible = (visible & ~_is_set(covered, points * (size / CROP))).astype(np.float32)
+    column, row = np.floor(points * (size / CROP)).astype(int).T
+    shown = (column >= 0) & (row >= 0) & (column < size) & (row < size)
+    shown[shown] = covered[row[shown], column[shown]] == 0
+    visible = (visible & shown).astype(np.float32)
     return TrainingCrop(_spoil(image, rng), points.astype(np.float32), visible, score, weight)
 
 
@@ -95,18 +104,6 @@ def _shoulders(image: np.ndarray, points: np.ndarray, rng: Rng) -> None:
     angle = float(np.degrees(np.arctan2(down[1], down[0])) - 90)
     color = tuple(float(value) for value in rng.uniform(0, 255, 3))
     cv2.ellipse(image, _whole(middle), axes, angle, 0, 360, color, -1, cv2.LINE_AA)
-
-
-def _cover(image: np.ndarray, points: np.ndarray, rng: Rng) -> np.ndarray:
-    """Paint hair, bars and blobs over the crop, in place; the mask (H, W) of what they cover."""
-    mask = np.zeros(image.shape[:2], np.uint8)
-    kind = rng.random()
-    if kind < 0.2:
-        _hair_locks(image, mask, points, rng)
-    elif kind < 0.42:
-        for _ in range(rng.integers(1, 3)):
-            _occlude(image, mask, rng)
-    return mask
 
 
 def _hair_locks(image: np.ndarray, mask: np.ndarray, points: np.ndarray, rng: Rng) -> None:
@@ -147,15 +144,6 @@ def _occlude(image: np.ndarray, mask: np.ndarray, rng: Rng) -> None:
 
 def _whole(values: np.ndarray) -> tuple[int, int]:
     return int(values[0]), int(values[1])
-
-
-def _is_set(mask: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Return (P,) True where a mask is set at points (P, 2), or they lie outside it."""
-    column, row = np.floor(points).astype(int).T
-    inside = (column >= 0) & (row >= 0) & (column < mask.shape[1]) & (row < mask.shape[0])
-    out = ~inside
-    out[inside] = mask[row[inside], column[inside]] > 0
-    return out
 
 
 def _spoil(image: np.ndarray, rng: Rng) -> np.ndarray:

@@ -32,7 +32,7 @@ from express50.landmarks.network import (
     save_network,
 )
 from express50.landmarks.training.augment import TrainingCrop, make_backgrounds, random_crop
-from express50.landmarks.training.training_set import FILE_VIEWS, ViewSet, make_views, read_views
+from express50.landmarks.training.views import FILE_VIEWS, ViewSet, make_views, read_views
 
 BATCH = 32
 RATE = 2e-3

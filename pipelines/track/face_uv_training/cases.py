@@ -19,8 +19,13 @@ from express50.geometry.conventions import cell_to_corner
 from express50.geometry.raycast import mesh_scene
 from express50.geometry.sampling import bilinear
 from express50.head.model import HeadModel, pose, vertex_normals
-from express50.landmarks.training.poses import random_parameters
-from express50.landmarks.training.skin import Canvas, deform, paint, waves
+from express50.landmarks.training.random_heads import (
+    Canvas,
+    deform,
+    paint,
+    random_parameters,
+    waves,
+)
 from pipelines.track.face_uv_map import FaceUvMap
 from pipelines.track.face_uv_training.disturb import Case, covered, photographed
 from pipelines.track.surface import Visibility, sample_normals

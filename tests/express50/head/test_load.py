@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from express50.errors import HeadModelError
-from express50.head.builtin import BUILTIN
-from express50.head.load import load_head
+from express50.head.load import BUILTIN, load_head
 
 
 def test_unknown_names_say_what_is_known() -> None:

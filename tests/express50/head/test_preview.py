@@ -9,7 +9,7 @@ import torch
 from express50.cli.main import main
 from express50.errors import HeadModelError
 from express50.files.images import read_image
-from express50.head.builtin import load_builtin
+from express50.head.load import load_builtin
 from express50.head.preview import POSES, contact_sheet, expression_vector, render_preview
 
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from express50.head.builtin import BUILTIN, load_builtin
 from express50.head.generator.head import procedural_mesh, write_builtin
+from express50.head.load import BUILTIN, load_builtin
 from express50.head.model import REGIONS, landmarks
 
 

@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from express50.capture.expressions import load_script
-from express50.head.builtin import load_builtin
 from express50.head.generator.head import procedural_mesh
+from express50.head.load import load_builtin
 from express50.head.model import landmarks, pose
 from express50.head.preview import expression_vector, render_preview
 
