@@ -134,10 +134,18 @@ def save_checkpoint(
         "expressions": list(model.expressions),
         "model": model.state_dict(),
         "frames": [
-            {"subject": s, "expression_id": e, "parameters": _parameters(tracked)}
+            {
+                "subject": s,
+                "expression_id": e,
+                "parameters": {
+                    item.name: torch.from_numpy(np.ascontiguousarray(getattr(tracked, item.name)))
+                    for item in fields(tracked)
+                    if item.name != "offsets"
+                },
+            }
             for (s, e), tracked in gallery.frames.items()
         ],
-        # Once a subject: offsets are larger than all other parameters together.
+        # Once per subject: offsets are larger than all other parameters together.
         "offsets": {
             s: torch.from_numpy(np.ascontiguousarray(tracked.offsets))
             for (s, _), tracked in gallery.frames.items()
@@ -168,30 +176,23 @@ def load_checkpoint(path: Path, device: torch.device | str = "cpu") -> Loaded:
     """
     content = read_content(path)
     try:
-        return _loaded(path, content, device)
+        config = from_tables(_current_settings(path, content["config"]))
+        _check_finite(path, content["model"])
+        head = load_head(content["head"]).to(device)
+        return Loaded(
+            config=config,
+            head_spec=content["head"],
+            head=head,
+            model=_build(path, config.model, head, content).to(device),
+            gallery=_gallery(path, content, head, device),
+            optimizer=content["optimizer"],
+            loop=content["loop"],
+        )
+    except ConfigError as error:
+        raise FormatError(f"{path}: its configuration: {error}; copy it again") from None
     except (KeyError, TypeError, ValueError, IndexError, AttributeError, ArithmeticError) as error:
         words = f"{type(error).__name__}: {error}"
         raise FormatError(f"{path}: not a whole checkpoint ({words}); copy it again") from error
-
-
-def _loaded(path: Path, content: dict[str, Any], device: torch.device | str) -> Loaded:
-    """Build the checkpoint of a file's content after checking that every number is finite."""
-    try:
-        config = from_tables(_current_settings(path, content["config"]))
-    except ConfigError as error:
-        raise FormatError(f"{path}: its configuration: {error}; copy it again") from None
-    _check_finite(path, content["model"])
-    head = load_head(content["head"]).to(device)
-    model = _build(path, config.model, head, content).to(device)
-    return Loaded(
-        config=config,
-        head_spec=content["head"],
-        head=head,
-        model=model,
-        gallery=_gallery(path, content, head, device),
-        optimizer=content["optimizer"],
-        loop=content["loop"],
-    )
 
 
 def _current_settings(path: Path, tables: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
@@ -311,15 +312,6 @@ def _check_finite(path: Path, tensors: dict[str, Tensor]) -> None:
     for name, tensor in tensors.items():
         if not bool(torch.isfinite(tensor).all()):
             raise FormatError(f"{path}: {name} holds NaN or Inf; use an earlier checkpoint")
-
-
-def _parameters(tracked: Tracked) -> dict[str, Tensor]:
-    """Return all parameters except the offsets, which the frames of a subject share."""
-    return {
-        item.name: torch.from_numpy(np.ascontiguousarray(getattr(tracked, item.name)))
-        for item in fields(tracked)
-        if item.name != "offsets"
-    }
 
 
 def _arrays(tensors: dict[str, Tensor]) -> dict[str, np.ndarray]:

@@ -202,12 +202,25 @@ class HeadViews:
         return bits.reshape(size).astype(bool)
 
     def sample(self, index: int) -> Sample:
-        """Return the decoded sample, from memory if it is there."""
+        """Return the decoded sample, checked and from memory if it is there.
+
+        Raises:
+            FormatError: its images differ in size, or its parameters do not fit the head model.
+        """
         if index in self._cache:
             self._cache.move_to_end(index)
             return self._cache[index]
         sample = self.source.read(index)
-        self._check(sample, self.keys[index])
+        key = self.keys[index]
+        where = f"{key.subject}/{key.expression}/{key.camera}"
+        for name in ("alpha", "depth", "parts"):
+            array = getattr(sample, name)
+            if array is not None and array.shape != sample.image.shape[:2]:
+                raise FormatError(
+                    f"{where}: {name} is {array.shape}, expected the image's size "
+                    f"{sample.image.shape[:2]}; pack the dataset again"
+                )
+        check_tracked(where, sample.tracked, self.head)
         self._cache[index] = sample
         self._cached_bytes += _bytes(sample)
         while self._cached_bytes > self._capacity and len(self._cache) > 1:
@@ -237,18 +250,6 @@ class HeadViews:
 
     def _tensor(self, array: np.ndarray) -> Tensor:
         return torch.from_numpy(np.ascontiguousarray(array)).to(self.device, self.head.dtype)
-
-    def _check(self, sample: Sample, key: Key) -> None:
-        where = f"{key.subject}/{key.expression}/{key.camera}"
-        size = sample.image.shape[:2]
-        for name in ("alpha", "depth", "parts"):
-            array = getattr(sample, name)
-            if array is not None and array.shape != size:
-                raise FormatError(
-                    f"{where}: {name} is {array.shape}, expected the image's size {size}; "
-                    "pack the dataset again"
-                )
-        check_tracked(where, sample.tracked, self.head)
 
 
 def check_tracked(where: str, tracked: Tracked, head: HeadModel) -> None:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import copy
 import math
 import time
-from collections.abc import Callable, Container, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -381,25 +381,21 @@ def save_fit(state: FitState, out: Path) -> None:
     content["z_id"] = state.z_id[None]
     content["z_exp"] = torch.stack([*state.z_exp.values(), *known.values()])
     model.load_state_dict(content)
-    own = collect_gallery(state.views, state.given)
+    own, trained = collect_gallery(state.views, state.given), state.loaded.gallery
+    # One training frame per expression, without its person's offsets.
+    donors: dict[str, tuple[str, str]] = {}
+    for frame in trained.frames:
+        if frame[1] in known:
+            donors.setdefault(frame[1], frame)
+    frames = {f: replace(trained.frames[f], offsets=NO_OFFSETS) for f in donors.values()}
     # Training cameras stay for rendering; the subject's own come first.
     cameras: dict[str, PinholeView] = own.cameras | {
-        f"training_{name}": view for name, view in state.loaded.gallery.cameras.items()
+        f"training_{name}": view for name, view in trained.cameras.items()
     }
     save_checkpoint(
         out / "checkpoint.pt",
         model=model,
         config=state.loaded.config,
         head_spec=state.loaded.head_spec,
-        gallery=Gallery(frames=own.frames | _donors(state, known), cameras=cameras),
+        gallery=Gallery(frames=own.frames | frames, cameras=cameras),
     )
-
-
-def _donors(state: FitState, expressions: Container[str]) -> dict[tuple[str, str], Tracked]:
-    """Return one training frame per expression, without its person's offsets."""
-    found: dict[str, tuple[str, str]] = {}
-    for frame in state.loaded.gallery.frames:
-        if frame[1] in expressions:
-            found.setdefault(frame[1], frame)
-    frames = state.loaded.gallery.frames
-    return {frame: replace(frames[frame], offsets=NO_OFFSETS) for frame in found.values()}

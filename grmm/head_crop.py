@@ -196,7 +196,11 @@ def torso_mask(
     if neck is None or end is None or not bool(neck.any()) or not foreground.any():
         return np.zeros_like(foreground)
     rows, columns = np.nonzero(foreground)
-    points = _points(view, rows, columns, _filled(depth, foreground, vertices, view))
+    K, camera = view.K.cpu().numpy(), view.cam_from_head.cpu().numpy()
+    z = _filled(depth, foreground, vertices, view)[rows, columns].astype(np.float64)
+    x = (columns + 0.5 - K[0, 2]) / K[0, 0] * z
+    y = (rows + 0.5 - K[1, 2]) / K[1, 1] * z
+    points = (np.stack([x, y, z], 1) - camera[:3, 3]) @ camera[:3, :3]
     tree = cKDTree(vertices.detach().cpu().double().numpy())
     distance, nearest = tree.query(points)
     on_neck, on_end = (region.cpu().numpy()[nearest] for region in (neck, end))
@@ -215,17 +219,6 @@ def _filled(
         return np.full(foreground.shape, float((vertices @ camera[2, :3] + camera[2, 3]).mean()))
     index = distance_transform_edt(~known, return_distances=False, return_indices=True)
     return depth[tuple(index)]
-
-
-def _points(
-    view: PinholeView, rows: np.ndarray, columns: np.ndarray, depth: np.ndarray
-) -> np.ndarray:
-    """Return the head-space points (N, 3) of pixels."""
-    K, camera = view.K.cpu().numpy(), view.cam_from_head.cpu().numpy()
-    z = depth[rows, columns].astype(np.float64)
-    x = (columns + 0.5 - K[0, 2]) / K[0, 0] * z
-    y = (rows + 0.5 - K[1, 2]) / K[1, 1] * z
-    return (np.stack([x, y, z], 1) - camera[:3, 3]) @ camera[:3, :3]
 
 
 def _grown(mask: np.ndarray) -> np.ndarray:

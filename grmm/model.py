@@ -36,10 +36,7 @@ class GRMM(Networks):
         super().__init__(config, head, len(subjects), len(expressions))
         self.subjects, self.expressions = tuple(subjects), tuple(expressions)
         self.anchors = make_anchors(head, config.n_g, config.mouth)
-        self._add_anchor_buffers(head)
-
-    def _add_anchor_buffers(self, head: HeadModel) -> None:
-        """Add constants of the head model; they are rebuilt from it, so checkpoints lack them."""
+        # Constants of the head model are rebuilt from it, so checkpoints lack them.
         gradients = uv_gradients(head)
         _, reach = tangent_frames(head.template, head.faces, gradients)
         spacing_mm = 1e3 * reach[self.anchors.faces] / self.config.n_g

@@ -109,7 +109,12 @@ def load_lpips(path: Path) -> nn.Module:
     Raises:
         ConfigError: no such file, or not that state dict.
     """
-    weights = _read(path, "alexnet")
+    remedy = "leave it empty to do without"
+    weights = read_weights(
+        path, ConfigError, f"metrics.alexnet {path}", "a torch state dict", remedy
+    )
+    if not isinstance(weights, dict):
+        raise ConfigError(f"metrics.alexnet {path}: holds a {type(weights).__name__}, not a dict")
     backbone = alexnet_features()
     wanted = backbone.state_dict()
     wrong = [
@@ -149,12 +154,3 @@ def load_inception(path: Path) -> torch.jit.ScriptModule:
             f"metrics.inception {path}: gives {tuple(found.shape)} for one image, expected (1, N)"
         )
     return network
-
-
-def _read(path: Path, key: str) -> dict[str, Tensor]:
-    """Read a state dict (weights only; nothing in it is executed)."""
-    remedy = "leave it empty to do without"
-    weights = read_weights(path, ConfigError, f"metrics.{key} {path}", "a torch state dict", remedy)
-    if not isinstance(weights, dict):
-        raise ConfigError(f"metrics.{key} {path}: holds a {type(weights).__name__}, not a dict")
-    return weights

@@ -127,7 +127,9 @@ def resolve(
     tables = as_tables(preset(name))
     for table, values in (changes or {}).items():
         tables[table] |= values
-    for table, values in _read_toml(file).items():
+    if file is not None and not file.exists():
+        raise ConfigError(f"--config {file}: no such file")
+    for table, values in ({} if file is None else read_toml(file, ConfigError)).items():
         _known_table(table, f"{file}: table [{table}]")
         if not isinstance(values, dict):
             raise ConfigError(f"{file}: {table} is a value, expected a table [{table}]")
@@ -155,14 +157,6 @@ def as_tables(config: Config) -> dict[str, dict[str, Any]]:
         }
         for table in TABLES
     }
-
-
-def _read_toml(file: Path | None) -> dict[str, dict[str, object]]:
-    if file is None:
-        return {}
-    if not file.exists():
-        raise ConfigError(f"--config {file}: no such file")
-    return read_toml(file, ConfigError)
 
 
 def _known_table(table: str, where: str) -> None:

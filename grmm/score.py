@@ -99,7 +99,7 @@ def _problem(path: Path, size: tuple[int, int]) -> str | None:
         got, expected = (f"{width} x {height}" for height, width in (pixels.shape[:2], size))
         return f"{path.name} is {got}, expected {expected}"
     if pixels.dtype != np.uint8:
-        return f"{path.name} has {pixels.dtype} pixels, expected 8 bits a channel"
+        return f"{path.name} has {pixels.dtype} pixels, expected 8 bits per channel"
     return None
 
 

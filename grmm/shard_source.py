@@ -158,25 +158,19 @@ def seen_window(meta: dict, where: str) -> tuple[slice, slice]:
         crop = meta.get("crop")
         if not crop:
             return slice(0, size[0]), slice(0, size[1])
-        return _seen_window(crop, meta["source_size"], size, where)
+        spans = []
+        for start, source, length in zip(
+            (crop["y0"], crop["x0"]), reversed(meta["source_size"]), size, strict=True
+        ):
+            scale = length / crop["side"]
+            low = max(0, math.ceil((INSET_PX - start) * scale))
+            high = min(length, math.floor((source - INSET_PX - start) * scale))
+            spans.append(slice(low, high))
     except (KeyError, TypeError, ValueError, ArithmeticError, AttributeError) as error:
         words = f"{type(error).__name__}: {error}"
         raise FormatError(f"{where}: malformed crop ({words}); rerun 'express50 pack'") from None
-
-
-def _seen_window(
-    crop: dict, source_size: list, size: tuple[int, int], where: str
-) -> tuple[slice, slice]:
-    spans = []
-    for start, source, length in zip(
-        (crop["y0"], crop["x0"]), reversed(source_size), size, strict=True
-    ):
-        scale = length / crop["side"]
-        inner = (INSET_PX - start) * scale, (source - INSET_PX - start) * scale
-        low, high = max(0, math.ceil(inner[0])), min(length, math.floor(inner[1]))
-        if high <= low:
-            raise FormatError(f"{where}: its crop lies outside the footage; rerun 'express50 pack'")
-        spans.append(slice(low, high))
+    if any(span.stop <= span.start for span in spans):
+        raise FormatError(f"{where}: its crop lies outside the footage; rerun 'express50 pack'")
     return spans[0], spans[1]
 
 

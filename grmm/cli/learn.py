@@ -166,7 +166,11 @@ def _fit(args: argparse.Namespace) -> int:
     from grmm.fit import fit
 
     no_file(args.out)
-    _check_room(args.out / "checkpoint.pt", args.checkpoint, args.anew)
+    made = args.out / "checkpoint.pt"
+    if made.exists() and made.samefile(args.checkpoint):
+        raise ConfigError(f"{made} is the checkpoint to fit from; name another folder")
+    if made.exists() and not args.anew:
+        raise ConfigError(f"{made} exists; name another folder, or overwrite it with --anew")
     loaded = load(args.checkpoint, [*args.set, *metric_settings(args)], args.seconds)
     if not loaded.loop and len(loaded.model.subjects) == 1:
         log(
@@ -187,15 +191,3 @@ def _fit(args: argparse.Namespace) -> int:
             f"wrote {args.out}",
         )
     return OK
-
-
-def _check_room(made: Path, read: Path, anew: bool) -> None:
-    """Refuse to write over a checkpoint that nobody gave up.
-
-    Raises:
-        ConfigError: the folder has one, or it is the one that is read.
-    """
-    if made.exists() and made.samefile(read):
-        raise ConfigError(f"{made} is what is fitted from; fit into another folder")
-    if made.exists() and not anew:
-        raise ConfigError(f"{made} is there; fit into another folder, or write over it with --anew")

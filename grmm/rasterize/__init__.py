@@ -154,7 +154,12 @@ def _check(
         raise ValueError(f"image size is {camera.width} x {camera.height}, expected at least 1 x 1")
     if not options.near > 0 or not options.eps2d > 0:
         raise ValueError(f"near is {options.near} and eps2d {options.eps2d}, expected both above 0")
-    _check_intrinsics(camera.K.detach())
+    K = camera.K.detach().tolist()
+    (fx, skew, _), (below, fy, _), bottom = K
+    if fx <= 0 or fy <= 0 or skew != 0 or below != 0 or bottom != [0.0, 0.0, 1.0]:
+        raise ValueError(
+            f"K is {K}, expected [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with fx, fy > 0"
+        )
 
 
 def _check_finite(name: str, tensor: Tensor) -> None:
@@ -170,12 +175,3 @@ def _check_finite(name: str, tensor: Tensor) -> None:
         f"{name} has {int(bad.sum())} values that are not finite or over {LIMIT:g}, the first at"
         f" {first}; expected finite numbers"
     )
-
-
-def _check_intrinsics(K: Tensor) -> None:
-    """Refuse a K that is not a pinhole matrix with positive focal lengths and no skew."""
-    (fx, skew, _), (below, fy, _), bottom = K.tolist()
-    if fx <= 0 or fy <= 0 or skew != 0 or below != 0 or bottom != [0.0, 0.0, 1.0]:
-        raise ValueError(
-            f"K is {K.tolist()}, expected [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with fx, fy > 0"
-        )

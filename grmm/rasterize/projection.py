@@ -85,13 +85,16 @@ def project(
     means2d = focal * points[:, :2] / points[:, 2:] + K[:2, 2]
     if antialiased:
         opacities = opacities * compensation
+    # On the plane (ray length - slope . pixel) is constant, so minus its derivative by camera
+    # coordinates points at the camera (RaDe-GS, section 3).
+    steep = (slopes[:, :, None] * jacobian[:, :2]).sum(1) - jacobian[:, 2]
     extents, visible = _extents(means2d, variances[:, :2] + eps2d, opacities, width, height)
     return Projection(
         means2d=means2d.to(dtype),
         conics=conics.to(dtype),
         depths=points[:, 2].to(dtype),
         planes=planes.to(dtype),
-        normals=_normals(jacobian, slopes).to(dtype),
+        normals=torch.nn.functional.normalize(steep, dim=1).to(dtype),
         opacities=opacities.to(dtype),
         extents=extents,
         visible=visible & front,
@@ -150,16 +153,6 @@ def _regression(rows: Tensor, variances: Tensor, eps2d: float) -> tuple[Tensor, 
     slope_v = (eps2d * tv + (normal * torch.linalg.cross(u, t)).sum(1)) / det
     compensation = (det_sharp / det).clamp(min=COMPENSATION_MIN**2).sqrt()
     return conics, torch.stack([slope_u, slope_v], 1), compensation
-
-
-def _normals(jacobian: Tensor, slopes: Tensor) -> Tensor:
-    """Return the unit normals (N, 3) of the planes ray length = l + slope . (pixel - mean2d).
-
-    On such a plane (ray length - slope . pixel) is constant, so minus its derivative by camera
-    coordinates, which ``jacobian`` (N, 3, 3) gives, points at the camera (RaDe-GS, section 3).
-    """
-    steep = (slopes[:, :, None] * jacobian[:, :2]).sum(1) - jacobian[:, 2]
-    return torch.nn.functional.normalize(steep, dim=1)
 
 
 @torch.no_grad()

@@ -64,7 +64,11 @@ def _blend(
     Guards as gsplat: alpha capped at 0.99, contributions under 1/255 skipped, and a pixel stops
     before the Gaussian that would bring its transmittance to 1e-4 or less.
     """
-    ids = order[_touches(splats, order, left, top, width, height)]
+    # Only Gaussians that can reach a pixel centre of the tile.
+    low = splats.means2d[order].detach() - splats.extents[order]
+    high = splats.means2d[order].detach() + splats.extents[order]
+    corner, size = low.new_tensor([left, top]), low.new_tensor([width, height])
+    ids = order[((high >= corner) & (low <= corner + size)).all(1)]
     dtype, device = colors.dtype, colors.device
     u = cell_to_corner(torch.arange(left, left + width, dtype=dtype, device=device))
     v = cell_to_corner(torch.arange(top, top + height, dtype=dtype, device=device))
@@ -83,7 +87,7 @@ def _blend(
     length, slope_u, slope_v = splats.planes[ids][:, :, None].unbind(1)
     lengths = length + slope_u * dx + slope_v * dy
     weighted = (weights * lengths).sum(0)
-    # At most one Gaussian a pixel takes the transmittance through one half.
+    # At most one Gaussian per pixel takes the transmittance through one half.
     crosses = kept & (before > 0.5) & (after <= 0.5)
     median = torch.where(crosses, lengths, torch.zeros_like(lengths)).sum(0)
     image = weights.T @ colors[ids]
@@ -93,14 +97,3 @@ def _blend(
         weights.sum(0).reshape(height, width),
         median.reshape(height, width),
     )
-
-
-def _touches(
-    splats: Projection, ids: Tensor, left: int, top: int, width: int, height: int
-) -> Tensor:
-    """Mark the Gaussians ``ids`` that can reach a pixel centre of the tile (bool)."""
-    low = splats.means2d[ids].detach() - splats.extents[ids]
-    high = splats.means2d[ids].detach() + splats.extents[ids]
-    corner = low.new_tensor([left, top])
-    size = low.new_tensor([width, height])
-    return ((high >= corner) & (low <= corner + size)).all(1)

@@ -119,7 +119,7 @@ def _copy(folder: Path, name: str, out: Path, seed: int) -> str:
     path = next(p for p in found if p.suffix.lower() in SUFFIXES)
     pixels = read_image(path)
     if pixels.dtype != np.uint8:
-        raise FormatError(f"{path}: {pixels.dtype} pixels, expected 8 bits a channel")
+        raise FormatError(f"{path}: {pixels.dtype} pixels, expected 8 bits per channel")
     data = encode_png(pixels if pixels.ndim == 2 else pixels[..., :3])
     digest = hashlib.sha256(f"{seed} {folder} {name} ".encode() + data).hexdigest()[:24]
     write_bytes(out / "pictures" / f"{digest}.png", data)
