@@ -65,7 +65,7 @@ def _add_comparing_verbs(verbs) -> None:  # noqa: ANN001 - argparse's type is pr
     parser.add_argument("--all", action="store_true", help="also settled ones")
     parser.add_argument(
         "--settle", nargs=3, metavar=("SUBJECT", "EXPRESSION", "VERDICT"),
-        help="verdict: a frame, the annotator who is right, or why there is no peak: "
+        help="verdict: a frame, the annotator who is right, or the reason for a flag: "
         f"{', '.join(FLAG_REASONS)}, or flag:REASON",
     )  # fmt: skip
     add_verb(verbs, "coverage", "subjects against expressions, with the gaps", run_coverage)

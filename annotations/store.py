@@ -72,7 +72,7 @@ def unreadable_lines(dataset: Dataset, subject: str) -> list[int]:
 
 
 def _lines(dataset: Dataset, subject: str) -> Iterator[tuple[int, Label | None]]:
-    """Numbers and events of a subject's lines; None where a line cannot be read."""
+    """Yield numbers and events of a subject's lines; None where a line cannot be read."""
     path = dataset.labels_file(subject)
     if not path.exists():
         return
@@ -128,7 +128,7 @@ def last_event(labels: Iterable[Label], expression: str, annotator: str) -> Labe
 
 
 def _stacks(labels: Iterable[Label]) -> dict[tuple[str, str], list[Label]]:
-    """Events that were not undone, by expression and annotator."""
+    """Stack the events that were not undone, by expression and annotator."""
     stacks: dict[tuple[str, str], list[Label]] = {}
     for label in labels:
         if label.action in EXCLUSION_ACTIONS:

@@ -59,7 +59,7 @@ class Features:
 
 
 def measure(observations: FaceObservations, windows: dict[str, np.ndarray]) -> Features:
-    """Features of all observed frames.
+    """Measure the features of all observed frames.
 
     Args:
         observations: of one subject.
@@ -87,7 +87,7 @@ def measure(observations: FaceObservations, windows: dict[str, np.ndarray]) -> F
 def displacements(
     points: np.ndarray, neutral: np.ndarray, windows: dict[str, np.ndarray]
 ) -> np.ndarray:
-    """Landmark motion (F, 68, 2) against neutral (68, 2), head motion removed, in face sides."""
+    """Measure landmark motion (F, 68, 2) against neutral (68, 2), in face sides, head held still."""
     moved = np.zeros(points.shape)
     for rows in windows.values():
         motions = np.stack(
@@ -100,7 +100,7 @@ def displacements(
 
 
 def looks(faces: np.ndarray, neutral: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Local contrast (F, N) of aligned faces (F, S, S) uint8 in cells, and each cell's landmark.
+    """Measure local contrast (F, N) of aligned faces (F, S, S) uint8; name each cell's landmark.
 
     Contrast against the surroundings, not brightness, so that light and exposure do not count;
     cells that show no face are 0.
@@ -116,7 +116,7 @@ def looks(faces: np.ndarray, neutral: np.ndarray) -> tuple[np.ndarray, np.ndarra
 
 
 def _contrast(face: np.ndarray) -> np.ndarray:
-    """Cells (CELLS, CELLS) of a grey face: how much lighter than around, in local deviations."""
+    """Compare cells (CELLS, CELLS) of a grey face with their surroundings, in local deviations."""
     grey = face.astype(np.float32) / 255.0
     wide = len(face) / 8
     flat = grey - cv2.GaussianBlur(grey, (0, 0), wide)
@@ -126,7 +126,7 @@ def _contrast(face: np.ndarray) -> np.ndarray:
 
 
 def in_noise(values: np.ndarray, windows: dict[str, np.ndarray]) -> np.ndarray:
-    """Features (F, N) divided by their noise, which second differences in time show.
+    """Divide features (F, N) by their noise, which second differences in time show.
 
     Motion is smooth from frame to frame, so that what remains of a second difference is noise, with
     six times its variance. Half of every scale is the median feature's: none is divided by nothing.
@@ -142,7 +142,7 @@ def in_noise(values: np.ndarray, windows: dict[str, np.ndarray]) -> np.ndarray:
 def expression_values(
     features: Features, expression: Expression | None, rows: np.ndarray
 ) -> np.ndarray:
-    """Features (T, N) of T rows, those foremost that take part in an expression, unrest shrunk."""
+    """Weight the features (T, N) of T rows by their part in an expression, and shrink unrest."""
     weights = np.maximum(landmark_weights(expression)[features.owner], BYSTANDER)
     still = features.values[features.rest] * weights
     middle = np.median(still, axis=0)
@@ -157,7 +157,7 @@ def expression_values(
 
 
 def landmark_weights(expression: Expression | None) -> np.ndarray:
-    """Weights (68,) of the points that take part in an expression; all when it is unknown."""
+    """Weight the points (68,) that take part in an expression; all when it is unknown."""
     everywhere = np.zeros(68)
     everywhere[17:] = 1.0
     everywhere[LIDS] = 0.5

@@ -129,7 +129,7 @@ def _check(values: np.ndarray) -> None:
 
 
 def _halves(groups: np.ndarray) -> Iterator[np.ndarray]:
-    """Random halves (N,) bool of the features, always the same: a rerun gives the same bytes."""
+    """Draw random halves (N,) bool of the features, always the same, so that reruns agree."""
     rng, names = np.random.default_rng(0), np.unique(groups)
     for _ in range(_DRAWS):
         kept = np.isin(groups, names[rng.random(len(names)) < 0.5])
@@ -197,7 +197,7 @@ def share_of_apex(event: Event) -> np.ndarray:
 
 
 def _slope(share: np.ndarray, apex: int, side: int) -> np.ndarray:
-    """Rows from the apex to one side for as long as the movement falls, but for a tremble."""
+    """List rows from the apex to one side for as long as the movement falls, but for a tremble."""
     rows = [apex]
     while 0 <= rows[-1] + side < len(share) and share[rows[-1] + side] <= share[rows[-1]] + 0.05:
         rows.append(rows[-1] + side)
@@ -245,7 +245,7 @@ def apex_of(curve: np.ndarray) -> int:
 
 
 def candidate_rows(row: int, others: list[int], curve: np.ndarray) -> list[int]:
-    """Rows worth a look, best first: the suggestion, other events, the curve's local maxima.
+    """List rows worth a look, best first: the suggestion, other events, the curve's maxima.
 
     At most CANDIDATES, at least CANDIDATE_GAP frames apart.
     """

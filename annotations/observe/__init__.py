@@ -1,7 +1,7 @@
 """The observe stage: landmarks and aligned faces of every frame in a cue window.
 
 Item: a subject. This is the slow half of ``express50 align``, which runs it first. Suggesting and
-matching read only what is written here, so that a new label or another reference does not need the
+matching read only these files, so that a new label or another reference does not need the
 footage again.
 """
 

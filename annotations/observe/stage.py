@@ -225,7 +225,7 @@ def steady(values: np.ndarray, sigma: float = STEADY_FRAMES) -> np.ndarray:
 def _look(
     net: LandmarkNet, images: Sequence[np.ndarray], window: np.ndarray
 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Points and scores of batches of images through one window, mean of it and its mirror."""
+    """Detect points and scores in batches through one window, averaged with its mirror."""
     for start in range(0, len(images), BATCH):
         crops = np.stack([_cut(image, window, CROP) for image in images[start : start + BATCH]])
         both = np.concatenate([crops, crops[:, :, ::-1]])

@@ -105,44 +105,44 @@ class Desk(AnnotatorScreen):
         self.draw()
 
     def action_step(self, by: int) -> None:
-        """Some frames on or back."""
+        """Step some frames on or back."""
         self._move(lambda view: moves.step(view, by))
 
     def action_go_to(self, where: str) -> None:
-        """An end of the cue window."""
+        """Go to an end of the cue window."""
         self._move(lambda view: moves.go_to(view, getattr(view, where)))
 
     def action_candidate(self, by: int) -> None:
-        """The next or previous suggestion."""
+        """Go to the next or previous suggestion."""
         self._move(lambda view: moves.next_candidate(view, by))
         if self.view is not None and not self.view.candidates:
             hidden = self.scene is not None and self.session.hidden(self.scene.task)
             self.say("hidden until you have decided" if hidden else "no suggestion", theme.ACCENT)
 
     def action_pick(self, number: int) -> None:
-        """A suggestion by its rank."""
+        """Go to a suggestion by its rank."""
         self._move(lambda view: moves.pick_candidate(view, number - 1))
 
     def action_plateau_first(self) -> None:
-        """The plateau begins at the cursor."""
+        """Begin the plateau at the cursor."""
         self._move(moves.set_plateau_first)
 
     def action_plateau_last(self) -> None:
-        """The plateau ends at the cursor."""
+        """End the plateau at the cursor."""
         self._move(moves.set_plateau_last)
 
     def on_curve_strip_picked(self, message: CurveStrip.Picked) -> None:
-        """The strip was clicked."""
+        """Go to the frame that was clicked on the strip."""
         self._move(lambda view: moves.go_to(view, message.frame))
 
     def action_zoom(self, by: int) -> None:
-        """The next zoom."""
+        """Change to the next zoom."""
         number = (ZOOMS.index(self.aim.zoom) + by) % len(ZOOMS)
         self.aim = self.aim._replace(zoom=ZOOMS[number])
         self.draw()
 
     def action_camera(self, by: int) -> None:
-        """The next camera."""
+        """Change to the next camera."""
         if self.scene is not None and self.scene.cameras:
             number = (self.aim.camera + by) % len(self.scene.cameras)
             self.aim = self.aim._replace(camera=number)
@@ -211,7 +211,7 @@ class Desk(AnnotatorScreen):
         self.say(f"taken back: {task.subject} {task.expression}")
 
     def action_task(self, by: int) -> None:
-        """A neighbouring task."""
+        """Open a neighbouring task."""
         if self.session.move(by) or not self.session.tasks:
             self.open_task()
         else:

@@ -23,7 +23,7 @@ class FlagDialog(ModalScreen[str | None]):
     AUTO_FOCUS = ""  # digits must reach the dialog, not the line of text
 
     def compose(self) -> ComposeResult:
-        """A list of reasons, and the line for another."""
+        """List the reasons, and a line for another."""
         with Vertical(classes="dialog") as box:
             box.border_title = "flag: why is there no usable peak?"
             box.border_subtitle = "press a number; Esc: do not flag"
@@ -48,7 +48,7 @@ class FlagDialog(ModalScreen[str | None]):
                 words.focus()
 
     def on_input_submitted(self, event: Input.Submitted) -> None:
-        """A reason in words; an empty one is refused."""
+        """Take a reason in words; an empty one is refused."""
         if event.value.strip():
             self.dismiss(event.value.strip())
 
@@ -61,7 +61,7 @@ class FrameDialog(ModalScreen[int | None]):
         self._first, self._last = first, last
 
     def compose(self) -> ComposeResult:
-        """One line of digits."""
+        """Lay out one line for digits."""
         with Vertical(classes="dialog") as box:
             box.border_title = f"go to frame ({self._first} to {self._last})"
             box.border_subtitle = "Esc: stay"
@@ -73,7 +73,7 @@ class FrameDialog(ModalScreen[int | None]):
             self.dismiss(None)
 
     def on_input_submitted(self, event: Input.Submitted) -> None:
-        """A number; anything else stays, and what lies outside is not taken."""
+        """Go to the number; without one stay, and outside the window ask again."""
         number = int(event.value) if event.value.strip("-+").isdigit() else None
         if number is None or self._first <= number <= self._last:
             self.dismiss(number)

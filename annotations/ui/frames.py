@@ -56,7 +56,7 @@ class FrameCache:
         self.misses = 0
 
     def get(self, shot: FrameCrop) -> np.ndarray:
-        """The picture (height, width, 3) uint8; do not write to it.
+        """Return the picture (height, width, 3) uint8; do not write to it.
 
         Raises:
             AnnotationError: the frame cannot be read, in plain words.
@@ -148,7 +148,7 @@ def read_shot(dataset: Dataset, shot: FrameCrop) -> np.ndarray:
 
 
 def crop_to(image: np.ndarray, box: Box, width: int, height: int) -> np.ndarray:
-    """Part of an image (H, W, 3) uint8 as (height, width, 3); black beyond the image's border."""
+    """Crop an image (H, W, 3) uint8 to (height, width, 3); black beyond the image's border."""
     rows, columns = image.shape[:2]
     left, top = round(box[0] * columns), round(box[1] * rows)
     right, bottom = max(left + 1, round(box[2] * columns)), max(top + 1, round(box[3] * rows))
@@ -190,7 +190,7 @@ class Face:
 
 
 def face_of_points(points: np.ndarray, width: int, height: int) -> Face:
-    """The face of landmarks (68, 2), pixels, in a picture of that size."""
+    """Measure the face of landmarks (68, 2), pixels, in a picture of that size."""
     eyes = points[list(_EYE_CORNERS)].mean(0)
     across = float(np.linalg.norm(points[45] - points[36]))
     nose = float(np.linalg.norm(points[_NOSE_BASE] - points[_BRIDGE])) / _NOSE_SHARE
@@ -199,7 +199,7 @@ def face_of_points(points: np.ndarray, width: int, height: int) -> Face:
 
 
 def zoom_box(face: Face | None, zoom: str, pane_aspect: float, image_aspect: float) -> Box:
-    """The part of a picture that a zoom shows in a pane of that height over width.
+    """Find the part of a picture that a zoom shows in a pane of that height over width.
 
     Without a face, or for the zoom ``frame``, it is the whole picture.
     """
@@ -225,7 +225,7 @@ Detect = Callable[[np.ndarray], tuple[np.ndarray, float]]
 
 
 def load_detector() -> Detect:
-    """The landmark network as a function of a picture: points (68, 2) and score 0 to 1."""
+    """Load the landmark network as a function of a picture: points (68, 2), score 0 to 1."""
     import torch  # seconds to load, and only needed here
 
     from express50.landmarks.detector import detect
@@ -261,7 +261,7 @@ class FaceFinder:
         self._detect = self._load()
 
     def find(self, subject: str, camera: str, frame: int) -> Face | None:
-        """The face in a frame; None where there is none or the network is still loading."""
+        """Find the face in a frame; None without a face, or while the network is loading."""
         key = subject, camera, frame
         if self._detect is None or key in self._faces:
             return self._faces.get(key)

@@ -287,7 +287,7 @@ def _worth(cells: np.ndarray, counts: np.ndarray) -> float:
 
 
 def _bands(numbers: np.ndarray, colours: int) -> list[str]:
-    """The bands' text: for each colour its number and sixels, ``$`` going back to the left."""
+    """Write the bands: for each colour its number and sixels, ``$`` goes back to the left."""
     height, width = numbers.shape
     count = -(-height // _BAND)
     bits = np.zeros((count, colours, width), np.uint8)
@@ -305,7 +305,7 @@ def _bands(numbers: np.ndarray, colours: int) -> list[str]:
 
 
 def _packed(rows: np.ndarray) -> list[str]:
-    """Sixels of each row (N, W), runs of four and more as ``!count``; no blanks at the end."""
+    """Write the sixels of each row (N, W), long runs as ``!count``, without blanks at the end."""
     begins = np.ones(rows.shape, bool)
     begins[:, 1:] = rows[:, 1:] != rows[:, :-1]
     starts = np.flatnonzero(begins)
@@ -320,7 +320,7 @@ def _packed(rows: np.ndarray) -> list[str]:
 
 
 def _pieces(letters: np.ndarray, lengths: np.ndarray) -> list[str]:
-    """The text of each run; equal runs are written once and looked up."""
+    """Write the text of each run; equal runs are written once and looked up."""
     known, places = np.unique(lengths.astype(np.int64) << 8 | letters, return_inverse=True)
     runs = ((code >> 8, chr((code & 255) + 63)) for code in known.tolist())
     texts = [f"!{n}{letter}" if n > 3 else letter * n for n, letter in runs]

@@ -34,7 +34,7 @@ class FrameLook:
     aspect: float
 
     def at(self, frame: int) -> FrameLook:
-        """The same look at another frame."""
+        """Look in the same way at another frame."""
         return replace(self, frame=frame)
 
 
@@ -84,7 +84,7 @@ class PicturePane(Widget):
         self._lines = None
 
     def render_lines(self, crop: Region) -> list[Strip]:
-        """The lines of the picture, past Textual's cache of styled lines.
+        """Return the lines of the picture, past Textual's cache of styled lines.
 
         That cache rewrites the style of every segment, which costs more than all the rest: a
         picture has thousands, and no border or padding that it would be needed for.
@@ -109,7 +109,7 @@ class PicturePane(Widget):
             return self._written(str(error))
 
     def _written(self, words: str) -> list[Strip]:
-        """Words in the middle of the pane."""
+        """Write words in the middle of the pane."""
         width, height = self.size
         text = Text(words, style=theme.DIM, justify="center")
         lines = text.wrap(self.app.console, max(1, width - 4))
@@ -205,7 +205,7 @@ def strip_content(scene: TaskScene, view: CueView, hidden: bool) -> StripContent
 def curve_in_window(
     found: Suggested | None, values: Sequence[float] | None, view: CueView
 ) -> tuple[float, ...]:
-    """A curve with one value for each frame of the window; its ends are continued."""
+    """Fit a curve to the window, one value per frame; its ends are continued."""
     if found is None or not values:
         return ()
     frames = range(view.first, view.last + 1)

@@ -94,7 +94,7 @@ class Session:
         self._last_key = self._clock()
 
     def effort(self) -> Effort:
-        """Cost of the open task so far, the time since the last key included."""
+        """Sum the cost of the open task so far, with the time since the last key."""
         spent = self._efforts.get(self._here(), Effort())
         return Effort(spent.keys, spent.seconds + self._since_last_key())
 
@@ -128,7 +128,7 @@ class Session:
         return True
 
     def following(self, count: int) -> list[int]:
-        """Positions of the next undecided tasks after the open one, round the end."""
+        """List the positions of the next undecided tasks after the open one, round the end."""
         total = len(self.tasks)
         order = [(self.position + n) % total for n in range(1, total + 1)] if total else []
         return [n for n in order if _key(self.tasks[n]) in self._open][:count]

@@ -181,7 +181,7 @@ class CueView:
 def open_view(
     first: int, last: int, candidates: tuple[int, ...] = (), cursor: int | None = None
 ) -> CueView:
-    """A fresh view: on the given frame, else on the best candidate, else in the window's middle."""
+    """Open a view on the given frame, else on the best candidate, else in the window's middle."""
     inside = tuple(dict.fromkeys(c for c in candidates if first <= c <= last))
     if cursor is None or not first <= cursor <= last:
         cursor = inside[0] if inside else (first + last) // 2
@@ -216,7 +216,7 @@ def pick_candidate(view: CueView, number: int) -> CueView:
 
 
 def set_plateau_first(view: CueView) -> CueView:
-    """The plateau begins here; the same key on the same frame takes it back."""
+    """Begin the plateau at the cursor; once more on the same frame, take that back."""
     if view.plateau_first == view.cursor:
         return replace(view, plateau_first=None)
     last = view.plateau_last
@@ -225,7 +225,7 @@ def set_plateau_first(view: CueView) -> CueView:
 
 
 def set_plateau_last(view: CueView) -> CueView:
-    """The plateau ends here; the same key on the same frame takes it back."""
+    """End the plateau at the cursor; once more on the same frame, take that back."""
     if view.plateau_last == view.cursor:
         return replace(view, plateau_last=None)
     first = view.plateau_first

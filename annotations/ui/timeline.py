@@ -38,7 +38,7 @@ Line = list[Cell]
 
 
 def frame_cells(frames: int, width: int) -> tuple[int, int]:
-    """Cells of one frame, and frames of one cell, for a window in so many cells."""
+    """Return the cells per frame and the frames per cell of a window in so many cells."""
     if frames <= width:
         return min(WIDEST, width // frames), 1
     return 1, -(-frames // width)
@@ -51,13 +51,13 @@ def column_of(view: CueView, frame: int, width: int) -> int:
 
 
 def sign_column(view: CueView, frame: int, width: int) -> int:
-    """The middle cell of a frame, where signs stand."""
+    """Return the middle cell of a frame, where signs stand."""
     wide, _ = frame_cells(view.last - view.first + 1, width)
     return min(column_of(view, frame, width) + wide // 2, width - 1)
 
 
 def frame_at(view: CueView, column: int, width: int) -> int:
-    """The frame under a cell, the nearest one beyond the curve's ends."""
+    """Return the frame under a cell, the nearest one beyond the curve's ends."""
     wide, per = frame_cells(view.last - view.first + 1, width)
     return min(max(view.first + column // wide * per, view.first), view.last)
 
@@ -65,7 +65,7 @@ def frame_at(view: CueView, column: int, width: int) -> int:
 def curve_lines(
     values: tuple[float, ...], view: CueView, width: int, height: int, style: Style
 ) -> list[Line]:
-    """Bars of a curve, scaled so that its least value is the floor and its largest the ceiling."""
+    """Draw a curve as bars between its least value, the floor, and its largest, the ceiling."""
     wide, per = frame_cells(view.last - view.first + 1, width)
     low, high = min(values, default=0.0), max(values, default=0.0)
     span = max(high - low, 1e-9)
@@ -81,7 +81,7 @@ def curve_lines(
 
 
 def rank_line(view: CueView, width: int) -> Line:
-    """The suggestions by rank: a digit under each, the surest one bright."""
+    """Write the suggestions by rank: a digit under each, the surest one bright."""
     line = _blank(width)
     for number, frame in reversed(list(enumerate(view.candidates[:5], 1))):
         style = theme.BEST if number == 1 else theme.CANDIDATE
@@ -90,7 +90,7 @@ def rank_line(view: CueView, width: int) -> Line:
 
 
 def mark_line(content: StripContent, width: int) -> Line:
-    """Plateau, the mark in force (○) and the annotator's own (●), the latter on top."""
+    """Draw the plateau, the mark in force (○) and on top the annotator's own (●)."""
     view = content.view
     line = _blank(width)
     first, last = view.plateau_first, view.plateau_last
@@ -151,7 +151,7 @@ class CurveStrip(Widget):
             self.post_message(self.Picked(frame))
 
     def render_lines(self, crop: Region) -> list[Strip]:
-        """The lines of the strip, past Textual's cache of styled lines, which is slower."""
+        """Return the lines of the strip, past Textual's cache of styled lines, which is slower."""
         lines = self._drawn() + [Strip.blank(self.size.width, theme.PLAIN)] * self.size.height
         return [line.crop(crop.x, crop.right) for line in lines[crop.y : crop.bottom]]
 
@@ -164,7 +164,7 @@ class CurveStrip(Widget):
 
 
 def draw_strip(content: StripContent | None, width: int, height: int) -> list[Strip]:
-    """All lines of a strip of that size; curves take what the two lines of marks leave."""
+    """Draw a strip of that size; curves take the lines that the two lines of marks leave."""
     room = width - GUTTER
     if content is None or room < 1 or height < 1:
         return [Strip.blank(width, theme.PLAIN)] * height
@@ -181,7 +181,7 @@ def draw_strip(content: StripContent | None, width: int, height: int) -> list[St
 
 
 def _curves(content: StripContent, rows: int) -> list[tuple[str, tuple[float, ...], Style, int]]:
-    """Curves with the rows that each gets: the match is what decides, so it gets the odd one."""
+    """List the curves with their rows; the match decides, so it gets the odd row."""
     if rows < 1:
         return []
     if content.match and content.activity and rows > 1:
@@ -196,7 +196,7 @@ def _curves(content: StripContent, rows: int) -> list[tuple[str, tuple[float, ..
 
 
 def _finish(name: str, line: Line, cursor: range, width: int) -> Strip:
-    """Name, cells and the cursor's column as a strip of the full width."""
+    """Join name, cells and the cursor's column to a strip of the full width."""
     cells = (line + _blank(width))[:width]
     for column in cursor:
         glyph, style = cells[column]
