@@ -87,7 +87,7 @@ def measure(observations: FaceObservations, windows: dict[str, np.ndarray]) -> F
 def displacements(
     points: np.ndarray, neutral: np.ndarray, windows: dict[str, np.ndarray]
 ) -> np.ndarray:
-    """Measure landmark motion (F, 68, 2) against neutral (68, 2), in face sides, head held still."""
+    """Measure landmark motion (F, 68, 2) from neutral (68, 2), in face sides, less the head's."""
     moved = np.zeros(points.shape)
     for rows in windows.values():
         motions = np.stack(

@@ -100,10 +100,8 @@ class Session:
 
     def press(self) -> None:
         """Count a keystroke, and the time since the last one, for the open task."""
-        spent = self._efforts.setdefault(self._here(), Effort())
-        spent.keys += 1
-        spent.seconds += self._since_last_key()
-        self._last_key = self._clock()
+        self._book()
+        self._efforts[self._here()].keys += 1
 
     def _since_last_key(self) -> float:
         return min(max(self._clock() - self._last_key, 0.0), IDLE_SECONDS)
