@@ -56,7 +56,7 @@ def test_a_picture_that_is_no_bytes_or_lies_elsewhere_is_refused(renderme, tmp_p
         "expected at most": lambda f: f.create_dataset(
             name, (BYTES_LIMIT + 1,), np.uint8, chunks=(1 << 20,)
         ),
-        "no JPEG": lambda f: f.create_dataset(name, data=np.arange(50, dtype=np.uint8)),
+        "JPEG": lambda f: f.create_dataset(name, data=np.arange(50, dtype=np.uint8)),
         "no array": lambda f: f.create_group(name),
     }
     for number, (message, make) in enumerate(wrong.items()):
@@ -133,7 +133,7 @@ def test_a_picture_whose_header_claims_too_many_pixels(tmp_path):
     png[16:24] = side.to_bytes(4, "big") * 2
     with zipfile.ZipFile(tmp_path / "a.zip", "w") as file:
         file.writestr("a.png", bytes(png))
-    with pytest.raises(CaptureError, match="over|no JPEG"):
+    with pytest.raises(CaptureError, match="over|JPEG"):
         read_picture(tmp_path, "a.zip!/a.png")
 
 
