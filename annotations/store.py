@@ -76,7 +76,7 @@ def _lines(dataset: Dataset, subject: str) -> Iterator[tuple[int, Label | None]]
     path = dataset.labels_file(subject)
     if not path.exists():
         return
-    data = read_bytes(path, AnnotationError, mend="restore it")
+    data = read_bytes(path, AnnotationError, fix="restore it")
     for number, line in enumerate(data.decode("utf-8", errors="replace").split("\n"), 1):
         if line.strip():
             yield number, _parse(path, number, line)

@@ -4,7 +4,7 @@
 the digital twin: other subjects than the demo's, the whole script, every clip with its own timing
 and strength. Peaks are judged with everybody on their own, matches with the first subject labelled
 as the reference: at its true peaks, then at frames before or after them. A simulated annotator then
-accepts right suggestions and mends wrong ones in the app, and steps through 24 cameras of 3840 x
+accepts right suggestions and corrects wrong ones in the app, and steps through 24 cameras of 3840 x
 2160 footage are timed. The baseline takes the frame whose landmarks are furthest from neutral. The
 last line printed is one JSON object.
 """

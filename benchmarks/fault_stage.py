@@ -15,7 +15,7 @@ from pathlib import Path
 
 from express50.contract.config import build_config
 from express50.contract.layout import Dataset
-from express50.contract.stage import Stage
+from express50.contract.stage import Result, Stage
 from express50.errors import Express50Error
 from express50.runner.runner import run_stage
 
@@ -42,7 +42,7 @@ def inputs(dataset: Dataset, item: str, config: FaultConfig) -> dict[str, Path |
     return {"text": dataset.root / "in" / f"{item}.txt"}
 
 
-def run(dataset: Dataset, item: str, config: FaultConfig, out: Path) -> dict:
+def run(dataset: Dataset, item: str, config: FaultConfig, out: Path) -> Result:
     """Write a few files with pauses between them."""
     text = (dataset.root / "in" / f"{item}.txt").read_bytes()
     note = Path(config.notes) / f"{item}-{os.getpid()}-{time.time_ns()}"
@@ -52,7 +52,7 @@ def run(dataset: Dataset, item: str, config: FaultConfig, out: Path) -> dict:
         time.sleep(config.seconds / PIECES)
         os.utime(note)  # how far the work got, if it is stopped
     note.rename(note.with_suffix(".done"))
-    return {"length": len(text)}
+    return Result({"length": len(text)})
 
 
 STAGE = Stage(

@@ -19,7 +19,7 @@ from pathlib import Path
 import express50.runner.executor
 from express50.contract.config import build_config
 from express50.contract.layout import Dataset
-from express50.contract.stage import Stage
+from express50.contract.stage import Result, Stage
 from express50.runner.executor import LARGEST_BATCH, Pool
 from express50.runner.runner import run_stage
 
@@ -39,9 +39,9 @@ def inputs(dataset: Dataset, item: str, config: EmptyConfig) -> dict[str, Path |
     return {"text": dataset.root / "in" / f"{item}.txt"}
 
 
-def run(dataset: Dataset, item: str, config: EmptyConfig, out: Path) -> dict:
+def run(dataset: Dataset, item: str, config: EmptyConfig, out: Path) -> Result:
     """Write nothing."""
-    return {}
+    return Result()
 
 
 STAGE = Stage(

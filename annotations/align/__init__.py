@@ -10,7 +10,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from annotations.observe.observations import observations_path
 from annotations.store import human_digest
 from annotations.suggestions import reference_subject
 from express50.contract.layout import Dataset
@@ -34,6 +33,8 @@ class AlignConfig:
 
 def inputs(dataset: Dataset, item: str, config: AlignConfig) -> dict[str, Path | str]:
     """List index, observations and human labels of the subject and of the reference."""
+    from annotations.observe.observations import observations_path  # imports numpy
+
     other = reference_subject(dataset) if config.match else item
     read: dict[str, Path | str] = {} if other == item else {"reference": other}
     for prefix, subject in {"": item, "reference_": other}.items():

@@ -51,7 +51,7 @@ def read_observations(dataset: Dataset, subject: str) -> FaceObservations:
     if not path.is_file():
         raise StageError(f"{path}: {subject!r} is not observed; run 'express50 align' on it")
     try:
-        table = read_arrays(path, FormatError, "observations", mend="run 'express50 align'")
+        table = read_arrays(path, FormatError, "observations", fix="run 'express50 align'")
         if str(table["schema"]) != SCHEMA:
             raise ValueError(f"schema is {table['schema']}, expected {SCHEMA}")
         rest = (table[key] for key in ("frames", "points", "scores", "faces"))

@@ -92,7 +92,7 @@ class Stage:
     presets: dict[str, dict[str, object]]
     items: Callable[[Dataset], list[str]]
     inputs: Callable[[Dataset, str, Any], dict[str, Path | str]]
-    run: Callable[[Dataset, str, Any, Path], Result | dict]
+    run: Callable[[Dataset, str, Any, Path], Result]
     needs_gpu: Callable[[Any], bool] = no_gpu
     help: str = ""
     purpose: str = ""

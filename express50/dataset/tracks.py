@@ -112,7 +112,7 @@ def read_track(path: Path) -> Track:
     """
     if not path.is_file():
         raise StageError(f"{path}: the track is missing; run 'express50 track'")
-    arrays = read_arrays(path, FormatError, "a track", mend=_AGAIN)
+    arrays = read_arrays(path, FormatError, "a track", fix=_AGAIN)
     try:
         schema, head = str(arrays.pop("schema")), str(arrays.pop("head"))
         if schema not in SCHEMAS:
@@ -146,7 +146,7 @@ def read_sequence(path: Path) -> Sequence:
             f"{path}: the sequence is missing; run 'express50 track --set track.frames=clips', or"
             " 'express50 photo' on a video"
         )
-    arrays = read_arrays(path, FormatError, "a sequence", mend=_AGAIN)
+    arrays = read_arrays(path, FormatError, "a sequence", fix=_AGAIN)
     try:
         schema, head, cues = str(arrays["schema"]), str(arrays["head"]), arrays["cues"]
         if schema != SEQUENCE_SCHEMA:

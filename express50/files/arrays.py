@@ -35,7 +35,7 @@ def read_arrays(
     kind: Kind,
     what: str,
     wanted: Collection[str] = (),
-    mend: str = AGAIN,
+    fix: str = AGAIN,
 ) -> dict[str, np.ndarray]:
     """Read the arrays of an ``.npz`` file by name, none of them of objects.
 
@@ -44,7 +44,7 @@ def read_arrays(
         kind: class of the errors.
         what: it is expected to be, for messages, such as "a track".
         wanted: names of arrays that are required.
-        mend: how to fix a damaged file, for messages.
+        fix: how to fix a damaged file, for messages.
 
     Raises:
         Express50Error: of the given kind: it is missing, damaged, lacks a wanted array, or unpacks
@@ -62,14 +62,14 @@ def read_arrays(
                     data = io.BytesIO(file.read(member.file_size))
                 found[member.filename.removesuffix(".npy")] = _array(data, member.file_size)
     except DAMAGE as error:
-        raise kind(f"{path}: not {what} ({reason(error)}); {mend}") from None
+        raise kind(f"{path}: not {what} ({reason(error)}); {fix}") from None
     missing = [name for name in wanted if name not in found]
     if missing:
-        raise kind(f"{path}: not {what} (has no {', '.join(missing)}); {mend}")
+        raise kind(f"{path}: not {what} (has no {', '.join(missing)}); {fix}")
     return found
 
 
-def read_npy(path: Path, kind: Kind, what: str, mend: str = AGAIN) -> np.ndarray:
+def read_npy(path: Path, kind: Kind, what: str, fix: str = AGAIN) -> np.ndarray:
     """Read the array of an ``.npy`` file, not of objects.
 
     Raises:
@@ -79,7 +79,7 @@ def read_npy(path: Path, kind: Kind, what: str, mend: str = AGAIN) -> np.ndarray
         with path.open("rb") as file:
             return _array(file, path.stat().st_size)
     except DAMAGE as error:
-        raise kind(f"{path}: not {what} ({reason(error)}); {mend}") from None
+        raise kind(f"{path}: not {what} ({reason(error)}); {fix}") from None
 
 
 def read_header(file: BinaryIO) -> tuple[tuple[int, ...], np.dtype]:

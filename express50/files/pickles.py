@@ -280,7 +280,7 @@ def _densify(matrix: SparseMatrix) -> np.ndarray:
     return made.toarray()
 
 
-def read_weights(path: Path, kind: Kind, where: str, what: str, mend: str = AGAIN) -> Any:  # noqa: ANN401
+def read_weights(path: Path, kind: Kind, where: str, what: str, fix: str = AGAIN) -> Any:  # noqa: ANN401
     """Read a file of ``torch.save`` to the CPU.
 
     Args:
@@ -288,7 +288,7 @@ def read_weights(path: Path, kind: Kind, where: str, what: str, mend: str = AGAI
         kind: class of the errors.
         where: how messages name the file.
         what: it is expected to be, such as "a torch state dict".
-        mend: how to fix it.
+        fix: how to fix it.
 
     Raises:
         Express50Error: of the given kind: it is missing, damaged, or names what ``weights_only``
@@ -297,8 +297,8 @@ def read_weights(path: Path, kind: Kind, where: str, what: str, mend: str = AGAI
     import torch
 
     if not Path(path).is_file():
-        raise kind(f"{where}: no such file; {mend}")
+        raise kind(f"{where}: no such file; {fix}")
     try:
         return torch.load(path, map_location="cpu", weights_only=True)
     except DAMAGE as error:
-        raise kind(f"{where}: not {what} ({reason(error)}); {mend}") from None
+        raise kind(f"{where}: not {what} ({reason(error)}); {fix}") from None

@@ -27,7 +27,7 @@ AGAIN = "copy or write it again"
 Kind = type[Express50Error]
 
 
-def read_bytes(path: Path, kind: Kind, limit: int = TEXT_LIMIT, mend: str = AGAIN) -> bytes:
+def read_bytes(path: Path, kind: Kind, limit: int = TEXT_LIMIT, fix: str = AGAIN) -> bytes:
     """Read the bytes of a regular file.
 
     Raises:
@@ -38,49 +38,49 @@ def read_bytes(path: Path, kind: Kind, limit: int = TEXT_LIMIT, mend: str = AGAI
     try:
         status = path.stat()
         if not stat.S_ISREG(status.st_mode):
-            raise kind(f"{path}: is a folder, a pipe or a device, expected a file; {mend}")
+            raise kind(f"{path}: is a folder, a pipe or a device, expected a file; {fix}")
         if status.st_size > limit:
-            raise kind(f"{path}: {status.st_size} bytes, expected at most {limit}; {mend}")
+            raise kind(f"{path}: {status.st_size} bytes, expected at most {limit}; {fix}")
         return path.read_bytes()
     except (OSError, ValueError) as error:  # ValueError: a name with a zero byte
-        raise kind(f"{path}: cannot be read ({reason(error)}); {mend}") from None
+        raise kind(f"{path}: cannot be read ({reason(error)}); {fix}") from None
 
 
-def read_text(path: Path, kind: Kind, limit: int = TEXT_LIMIT, mend: str = AGAIN) -> str:
+def read_text(path: Path, kind: Kind, limit: int = TEXT_LIMIT, fix: str = AGAIN) -> str:
     """Read a file as UTF-8 without a byte order mark; line ends become newlines.
 
     Raises:
         Express50Error: as `read_bytes`, or it is not UTF-8.
     """
     try:
-        text = read_bytes(path, kind, limit, mend).decode("utf-8-sig")
+        text = read_bytes(path, kind, limit, fix).decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise kind(f"{path}: not UTF-8 text ({reason(error)}); {mend}") from None
+        raise kind(f"{path}: not UTF-8 text ({reason(error)}); {fix}") from None
     return text.replace("\r\n", "\n").replace("\r", "\n")
 
 
-def read_json(path: Path, kind: Kind, mend: str = AGAIN) -> Any:
+def read_json(path: Path, kind: Kind, fix: str = AGAIN) -> Any:
     """Read a JSON file.
 
     Raises:
         Express50Error: as `read_text` and `parse_json`.
     """
-    return parse_json(read_text(path, kind, mend=mend), str(path), kind, mend)
+    return parse_json(read_text(path, kind, fix=fix), str(path), kind, fix)
 
 
-def read_json_table(path: Path, kind: Kind, mend: str = AGAIN) -> dict[str, Any]:
+def read_json_table(path: Path, kind: Kind, fix: str = AGAIN) -> dict[str, Any]:
     """Read a JSON file that holds a table.
 
     Raises:
         Express50Error: as `read_json`, or it is something else.
     """
-    table = read_json(path, kind, mend)
+    table = read_json(path, kind, fix)
     if not isinstance(table, dict):
-        raise kind(f"{path}: expected a JSON table, got {type(table).__name__}; {mend}")
+        raise kind(f"{path}: expected a JSON table, got {type(table).__name__}; {fix}")
     return table
 
 
-def parse_json(text: str | bytes, where: str, kind: Kind, mend: str = AGAIN) -> Any:
+def parse_json(text: str | bytes, where: str, kind: Kind, fix: str = AGAIN) -> Any:
     """Parse JSON text.
 
     Raises:
@@ -92,22 +92,22 @@ def parse_json(text: str | bytes, where: str, kind: Kind, mend: str = AGAIN) -> 
             text, parse_constant=_finite, parse_float=_finite, object_pairs_hook=_once
         )
     except NotFiniteError as error:
-        raise kind(f"{where}: {error.located(text)}; {mend}") from None
+        raise kind(f"{where}: {error.located(text)}; {fix}") from None
     except (ValueError, RecursionError) as error:
-        raise kind(f"{where}: not JSON ({reason(error)}); {mend}") from None
+        raise kind(f"{where}: not JSON ({reason(error)}); {fix}") from None
 
 
-def read_toml(path: Path, kind: Kind, mend: str = "correct it") -> dict[str, Any]:
+def read_toml(path: Path, kind: Kind, fix: str = "correct it") -> dict[str, Any]:
     """Read a TOML file.
 
     Raises:
         Express50Error: as `read_text`, or it is not TOML, nested too deeply, or holds a number that
             is NaN or infinite.
     """
-    return parse_toml(read_text(path, kind, TOML_LIMIT, mend), str(path), kind, mend)
+    return parse_toml(read_text(path, kind, TOML_LIMIT, fix), str(path), kind, fix)
 
 
-def parse_toml(text: str, where: str, kind: Kind, mend: str = "correct it") -> dict[str, Any]:
+def parse_toml(text: str, where: str, kind: Kind, fix: str = "correct it") -> dict[str, Any]:
     """Parse TOML text.
 
     Raises:
@@ -116,9 +116,9 @@ def parse_toml(text: str, where: str, kind: Kind, mend: str = "correct it") -> d
     try:
         return tomllib.loads(text, parse_float=_finite)
     except NotFiniteError as error:
-        raise kind(f"{where}: {error.located(text)}; {mend}") from None
+        raise kind(f"{where}: {error.located(text)}; {fix}") from None
     except (ValueError, RecursionError) as error:
-        raise kind(f"{where}: not TOML: {reason(error)}; {mend}") from None
+        raise kind(f"{where}: not TOML: {reason(error)}; {fix}") from None
 
 
 def reason(error: BaseException) -> str:

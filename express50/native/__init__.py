@@ -10,7 +10,7 @@ import ctypes
 from functools import cache
 
 # `build` is imported where it is used: `python -m express50.native.build` must not find it loaded.
-MEND = "build it with `python -m express50.native.build` (needs g++) or reinstall the package"
+FIX = "build it with `python -m express50.native.build` (needs g++) or reinstall the package"
 
 
 class NativeLibraryError(RuntimeError):
@@ -24,7 +24,7 @@ def available() -> bool:
 
 @cache
 def why_missing() -> str:
-    """One line on why the library cannot be loaded and how to mend it; empty when it can."""
+    """One line on why the library cannot be loaded and how to fix it; empty when it can."""
     try:
         load()
     except NativeLibraryError as error:
@@ -48,7 +48,7 @@ def load(variant: str | None = None) -> ctypes.CDLL:
     for name in reversed(list(VARIANTS)[: level + 1]):
         if library_file(name).exists():
             return _open(name)
-    raise NativeLibraryError(f"no variant of the native library was built; {MEND}")
+    raise NativeLibraryError(f"no variant of the native library was built; {FIX}")
 
 
 def _open(variant: str) -> ctypes.CDLL:
@@ -57,16 +57,16 @@ def _open(variant: str) -> ctypes.CDLL:
 
     path = library_file(variant)
     if not path.exists():
-        raise NativeLibraryError(f"the native library {path.name} was not built; {MEND}")
+        raise NativeLibraryError(f"the native library {path.name} was not built; {FIX}")
     try:
         library = ctypes.CDLL(str(path))
     except OSError as error:
-        raise NativeLibraryError(f"the native library does not load: {error}; {MEND}") from error
+        raise NativeLibraryError(f"the native library does not load: {error}; {FIX}") from error
     library.native_digest.restype = ctypes.c_char_p
     try:
         expected = source_digest()
     except FileNotFoundError:  # installed without its sources: nothing to compare with
         return library
     if library.native_digest().decode() != expected:
-        raise NativeLibraryError(f"the native library {path.name} is older than its source; {MEND}")
+        raise NativeLibraryError(f"the native library {path.name} is older than its source; {FIX}")
     return library

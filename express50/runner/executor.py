@@ -217,12 +217,12 @@ def _key(task: Task, attempt: int) -> str:
 
 
 def _killed(task: Task, attempts: int, job: SlurmJob | None) -> Receipt:
-    why, mend = "out of memory or a crash in native code", "give it more memory"
+    why, fix = "out of memory or a crash in native code", "give it more memory"
     if job is not None:
-        why, mend = f"{why}, or its job's {job.time} were over", f"{mend} than {job.memory} or time"
+        why, fix = f"{why}, or its job's {job.time} were over", f"{fix} than {job.memory} or time"
     reason = (
         f"its worker process died {attempts} times ({why}); run "
-        f"this item with --workers 0 to see, or {mend}"
+        f"this item with --workers 0 to see, or {fix}"
     )
     return _failed(task, reason, attempts)
 

@@ -331,9 +331,8 @@ def why_again(
 
 
 def _outcome(receipt: Receipt, status: str = "", again: str = "") -> Outcome:
-    def notes(*keys: str) -> tuple[Note, ...]:
-        rows = (row for key in keys for row in receipt.metrics.get(key, ()))
-        return tuple(Note(str(row["what"]), str(row["why"])) for row in rows)
+    def notes(key: str) -> tuple[Note, ...]:
+        return tuple(Note(row["what"], row["why"]) for row in receipt.metrics.get(key, ()))
 
     return Outcome(
         item=receipt.item,
@@ -341,6 +340,6 @@ def _outcome(receipt: Receipt, status: str = "", again: str = "") -> Outcome:
         reason=receipt.reason,
         seconds=receipt.seconds,
         dropped=notes("dropped"),
-        warnings=notes("warnings", "weak"),
+        warnings=notes("warnings"),
         again=again,
     )

@@ -112,11 +112,11 @@ def _run_and_publish(task: Task) -> tuple[dict, dict[str, FileMark]]:
         # Standard output is for data; libraries' messages go to standard error.
         with contextlib.redirect_stdout(sys.stderr):
             result = task.stage.run(task.dataset, task.item, task.config, out)
-        metrics = result.to_json() if isinstance(result, Result) else result
-        (out / "metrics.json").write_bytes(_metrics_bytes(metrics))
+        metrics = _metrics_bytes(result)
+        (out / "metrics.json").write_bytes(metrics)
         # Their bytes are still in memory; a rename changes neither time nor inode.
         files = {p.relative_to(out).as_posix(): mark_file(p) for p in files_of(out)}
-    return json.loads(_metrics_bytes(metrics)), files
+    return json.loads(metrics), files
 
 
 def _check_gpu(task: Task) -> None:
@@ -129,9 +129,9 @@ def _check_gpu(task: Task) -> None:
         )
 
 
-def _metrics_bytes(metrics: dict) -> bytes:
+def _metrics_bytes(result: Result) -> bytes:
     try:
-        return dump_json(metrics)
+        return dump_json(result.to_json())
     except (TypeError, ValueError) as error:
         raise StageError(
             f"metrics cannot be written ({error}); expected finite numbers, texts, lists and tables"

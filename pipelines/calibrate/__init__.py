@@ -44,7 +44,7 @@ def run(dataset: Dataset, item: str, config: CalibrateConfig, out: Path) -> Resu
 
 STAGE = Stage(
     name="calibrate",
-    version=4,
+    version=5,
     config=CalibrateConfig,
     presets=PRESETS,
     items=items,

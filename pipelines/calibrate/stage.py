@@ -49,7 +49,7 @@ class CalibratedRig:
         figures: metrics that only this source has.
         gains: colour gains, if a board shows them.
         solution: the board's solution, for plots.
-        weak, dropped, warnings: notes.
+        dropped, warnings: notes.
     """
 
     source: str
@@ -59,7 +59,6 @@ class CalibratedRig:
     figures: Mapping[str, object] = field(default_factory=dict)
     gains: ColourGains | None = None
     solution: BoardSolution | None = None
-    weak: tuple[Note, ...] = ()
     dropped: tuple[Note, ...] = ()
     warnings: tuple[Note, ...] = ()
 
@@ -123,7 +122,6 @@ def _write(rig: CalibratedRig, check: FootageCheck | None, out: Path) -> Result:
         "reprojection_px": _rounded(rig.reprojection_px, 5),
         "cameras": {name: _rounded(rig.per_camera_px.get(name), 5) for name in names},
         "models": {name: rig.cameras[name].model for name in names},
-        "weak": [{"what": note.what, "why": note.why} for note in rig.weak],
         **figures,
     }
     return Result(metrics, rig.dropped, (*rig.warnings, *moved))
@@ -247,8 +245,8 @@ def _from_board(index: Index, config: CalibrateConfig) -> CalibratedRig:
         },
         gains=whites.gains(sorted(solution.cameras)),
         solution=solution,
-        weak=_notes(solution.weak),
         dropped=_notes(solution.dropped),
+        warnings=_notes(solution.weak),
     )
 
 
@@ -298,9 +296,8 @@ def _from_footage(index: Index, config: CalibrateConfig) -> CalibratedRig:
             "eye_moments": solved.eye_frames,
             "eye_spread": round(solved.eye_spread, 5),
         },
-        weak=_notes(solved.weak),
         dropped=_notes(solved.dropped),
-        warnings=(Note("scale", scale),),
+        warnings=(*_notes(solved.weak), Note("scale", scale)),
     )
 
 

@@ -29,7 +29,7 @@ def inputs(dataset: Dataset, item: str, config: IngestConfig) -> dict[str, Path 
     return found(dataset, item, config)
 
 
-def run(dataset: Dataset, item: str, config: IngestConfig, out: Path) -> Result | dict:
+def run(dataset: Dataset, item: str, config: IngestConfig, out: Path) -> Result:
     """Make one item, see `pipelines.ingest.stage`."""
     from pipelines.ingest.stage import run as work
 
@@ -45,7 +45,7 @@ def account(dataset: Dataset, subjects: Sequence[str]) -> Iterable[str]:
 
 STAGE = Stage(
     name="ingest",
-    version=3,
+    version=4,
     config=IngestConfig,
     presets=PRESETS,
     items=items,

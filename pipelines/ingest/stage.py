@@ -22,6 +22,7 @@ from express50.capture.index import TRANSLATED, CameraSource, Cue, Index, index_
 from express50.capture.raw import RawCapture, check_calibrated_sizes
 from express50.capture.readers.read import OURS, read_any, subject_of, watched
 from express50.contract.layout import Dataset
+from express50.contract.stage import Note, Result
 from express50.dataset.withdraw import withdrawn
 from express50.errors import CaptureError, FormatError, StageError
 from express50.files.atomic import dump_json, write_json
@@ -88,7 +89,7 @@ def _capture_of(dataset: Dataset, item: str) -> Path:
     return captures[item]
 
 
-def run(dataset: Dataset, item: str, config: IngestConfig, out: Path) -> dict:
+def run(dataset: Dataset, item: str, config: IngestConfig, out: Path) -> Result:
     """Index one capture; a camera that cannot be used is dropped with its reason."""
     raw = read_any(_capture_of(dataset, item))
     if raw.subject != item:
@@ -270,11 +271,11 @@ def _given(raw: RawCapture) -> str | None:
 
 def metrics(
     raw: RawCapture, index: Index, usual: int, lost: dict[str, str], warnings: dict[str, str]
-) -> dict:
+) -> Result:
     """Counts, cameras whose frame count is not the usual one, and everything left out."""
     counts = {name: camera.frames for name, camera in index.cameras.items()}
     gaps = {k: time_gaps(c.pts, c.clips) for k, c in index.cameras.items()}
-    told = {
+    figures = {
         "cameras": len(counts),
         "frames": sum(counts.values()),
         "expressions": len(index.cues),
@@ -282,13 +283,14 @@ def metrics(
         "frame_count_differs": {k: n for k, n in counts.items() if n != usual},
         "time_gaps": {k: n for k, n in gaps.items() if n},
         "plates": len(index.plates),
-        "dropped": [{"what": what, "why": why} for what, why in lost.items()],
     }
     if raw.layout != OURS:
-        told |= {"layout": raw.layout, "found": raw.found}
-    if warnings:
-        told["warnings"] = [{"what": what, "why": why} for what, why in warnings.items()]
-    return told
+        figures |= {"layout": raw.layout, "found": raw.found}
+    return Result(
+        figures,
+        [Note(what, why) for what, why in lost.items()],
+        [Note(what, why) for what, why in warnings.items()],
+    )
 
 
 def account(dataset: Dataset, subjects: list[str]) -> Iterator[str]:

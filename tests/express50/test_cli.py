@@ -158,7 +158,7 @@ def test_only_the_module_of_the_asked_command_is_imported(data):
     """Seconds of imports must not stand before a short command."""
     code = (
         "import sys; from express50.cli.main import main; main(['status', sys.argv[1]]);"
-        "heavy = {'torch', 'open3d', 'pycolmap', 'cv2', 'av', 'dask', 'distributed'};"
+        "heavy = {'torch', 'open3d', 'pycolmap', 'cv2', 'av', 'dask', 'distributed', 'numpy'};"
         "print(sorted(heavy & set(sys.modules)))"
     )
     environment = os.environ | {"PYTHONPATH": str(REPOSITORY)}

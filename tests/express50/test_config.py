@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from express50.contract.config import config_toml, field_documents, parse_assignment, resolve_config
-from express50.contract.stage import Stage
+from express50.contract.stage import Result, Stage
 from express50.errors import ConfigError
 
 
@@ -38,7 +38,7 @@ STAGE = Stage(
     presets={"draft": {"iterations": 10}, "standard": {}, "reference": {"iterations": 900}},
     items=lambda dataset: [],
     inputs=lambda dataset, item, config: {},
-    run=lambda dataset, item, config, out: {},
+    run=lambda dataset, item, config, out: Result(),
 )
 
 

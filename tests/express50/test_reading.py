@@ -25,9 +25,9 @@ from express50.files.text import parse_json, read_json, read_json_table, read_te
 def test_what_json_may_not_hold_is_named(tmp_path: Path, text: str, message: str) -> None:
     (tmp_path / "a.json").write_text(text)
     with pytest.raises(FormatError, match=message) as caught:
-        read_json(tmp_path / "a.json", FormatError, "mend it so")
+        read_json(tmp_path / "a.json", FormatError, "fix it so")
     assert str(caught.value).startswith(f"{tmp_path / 'a.json'}: ")
-    assert str(caught.value).endswith("; mend it so")
+    assert str(caught.value).endswith("; fix it so")
 
 
 def test_plain_json_is_what_json_says() -> None:
@@ -65,5 +65,5 @@ def test_size_and_kind_of_a_file_are_looked_at(tmp_path: Path) -> None:
 
 def test_an_error_is_one_line_that_steers_no_terminal_and_keeps_its_ends() -> None:
     assert str(FormatError("a\nb\r\n\x1b[2Jc\x07")) == "a b  [2Jc"
-    long = str(FormatError("where " + "x" * 100_000 + " mend it"))
-    assert len(long) < 1300 and long.startswith("where x") and long.endswith("x mend it")
+    long = str(FormatError("where " + "x" * 100_000 + " fix it"))
+    assert len(long) < 1300 and long.startswith("where x") and long.endswith("x fix it")

@@ -85,12 +85,12 @@ def test_outputs_without_a_ledger_are_shown(dataset):
     assert "no plate" in render_page(dataset)
 
 
-def test_weak_cameras_and_warnings_are_named(dataset):
+def test_warnings_are_named(dataset):
     assert "in doubt" not in render_page(dataset)
     folder = dataset.root / "calibrate" / "S1"
     folder.mkdir(parents=True)
-    weak = {"weak": [{"what": "cam7", "why": "9 corners"}], "warnings": ["no row"]}
-    (folder / "metrics.json").write_text(json.dumps(weak))
+    metrics = {"warnings": [{"what": "cam7", "why": "9 corners"}, "no row"]}
+    (folder / "metrics.json").write_text(json.dumps(metrics))
     page = render_page(dataset)
     assert "1 parts kept in doubt" in page and "cam7: 9 corners" in re.sub("<[^>]*>", "", page)
 

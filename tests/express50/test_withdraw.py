@@ -223,7 +223,7 @@ def test_what_describes_a_person_stays_in_the_capture(dataset, tmp_path):
     assert read_people(dataset, ["S001"]) == [{"gender": "feminine", "age": 47.11}]
 
 
-def test_what_an_older_ingest_kept_of_a_person_is_found_and_mended(dataset, capsys):
+def test_what_an_older_ingest_kept_of_a_person_is__and_fixed(dataset, capsys):
     path = dataset.item_dir("ingest", "S001") / "index.json"
     content = json.loads(path.read_text())
     content["meta"]["name"] = "Jane Roe"

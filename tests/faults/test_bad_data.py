@@ -45,7 +45,7 @@ def test_every_fault_is_named_and_the_rest_is_done(tmp_path, captures, capsys):
     assert list(read_index(dataset, "truncated").cameras) == ["cam00", "cam02"]
 
 
-def test_mended_captures_complete_the_dataset(tmp_path, capsys):
+def test_fixed_captures_complete_the_dataset(tmp_path, capsys):
     make_capture(tmp_path / "S001")
     cues = tmp_path / "S001/cues.csv"
     good = cues.read_text()

@@ -79,7 +79,7 @@ def test_an_undisturbed_dataset_is_sound_and_nothing_is_written(dataset):
     ],
     ids=["file", "folder", "metrics", "byte", "size"],
 )
-def test_harm_is_found_mended_and_made_again_to_the_same_bytes(dataset, kind, harm):
+def test_harm_is_found_fixed_and_made_again_to_the_same_bytes(dataset, kind, harm):
     before = toy.tree(dataset.stage_dir("toy"))
     harm(dataset)
     found, result = look(dataset)
@@ -143,7 +143,7 @@ def test_downstream_that_read_a_file_replaced_by_hand_is_found(dataset):
     flip(output(dataset))
     assert toy.run_stage_of(LATER, dataset).count("done") == 1  # it reads the wrong bytes
     found, _ = look(dataset)
-    # The second cannot be judged before the first is mended, and is then.
+    # The second cannot be judged before the first is fixed, and is then.
     assert list(found) == [("changed", "toy S001")]
     look(dataset, fix=True)
     toy.run_toy(dataset)

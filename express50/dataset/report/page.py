@@ -206,7 +206,7 @@ class StageReport:
         items: item ids that are published.
         metrics: item id to its metrics.
         dropped: (item, what, why) of parts that items left out.
-        noted: (item, what, why) of parts that were kept but are doubtful: `weak`, `warnings`.
+        noted: (item, what, why) of parts that were kept but are doubtful.
         pictures: QC pictures, evenly chosen over the items.
         picture_count: how many there are in all.
     """
@@ -227,8 +227,8 @@ def collect_stage(dataset: Dataset, stage: str) -> StageReport:
     metrics = {
         str(p.parent.relative_to(root)): read_json_table(p, FormatError, AGAIN) for p in paths
     }
-    dropped = _reasons(metrics, ("dropped",))
-    noted = _reasons(metrics, ("weak", "warnings"))
+    dropped = _reasons(metrics, "dropped")
+    noted = _reasons(metrics, "warnings")
     pictures = [
         Picture(path, f"{item}: {path.stem.replace('_', ' ')}")
         for item in metrics
@@ -239,12 +239,11 @@ def collect_stage(dataset: Dataset, stage: str) -> StageReport:
     return StageReport(stage, list(metrics), metrics, dropped, noted, shown, len(pictures))
 
 
-def _reasons(metrics: dict[str, dict], keys: tuple[str, ...]) -> list[tuple[str, str, str]]:
-    """List (item, what, why) of the rows under some keys of all items' metrics."""
+def _reasons(metrics: dict[str, dict], key: str) -> list[tuple[str, str, str]]:
+    """List (item, what, why) of the rows under a key of all items' metrics."""
     return [
         (item, str(row.get("what")), str(row.get("why")))
         for item, table in metrics.items()
-        for key in keys
         for row in table.get(key, [])
         if isinstance(row, dict)
     ]
