@@ -49,7 +49,7 @@ def read_suggestions(dataset: Dataset, subject: str) -> dict[str, Suggested]:
     Raises:
         FormatError: the file is not a table of suggestions, or a figure in it is not a number.
     """
-    path = dataset.item_dir("align", subject) / "suggestions.json"
+    path = dataset.suggestions_file(subject)
     if not path.is_file():
         return {}
     try:

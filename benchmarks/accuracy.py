@@ -130,7 +130,7 @@ def measure_track(dataset: Dataset, truth: Truth, out: Path | None = None) -> di
     """Root mean square distance between tracked and true vertices of the same topology."""
     squares, medians = [], []
     for subject in dataset.subjects():
-        path = dataset.item_dir("track", subject) / "track.npz"
+        path = dataset.track_file(subject)
         if not path.is_file():
             continue
         motion = align_worlds(read_cameras_of(dataset, subject), truth.cameras(subject))

@@ -181,7 +181,7 @@ def baseline(
         grid = build(*box, BASELINE_VOXEL_M, lambda points: hull_distance(views, points))
         vertices, _, faces = extract_mesh(grid)
         return vertices, faces
-    path = dataset.item_dir("track", subject) / "track.npz"
+    path = dataset.track_file(subject)
     found = read_track(path) if path.is_file() else None
     if found is None or expression not in found.expressions:
         return None

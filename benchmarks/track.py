@@ -26,7 +26,7 @@ import numpy as np
 from benchmarks.track_truth import Errors, clip_errors, compare, mean, pooled, summary
 from benchmarks.track_views import held_out_views
 from express50.capture.frames import read_cameras_of, read_peaks
-from express50.capture.index import index_path, index_to_json, read_index
+from express50.capture.index import index_to_json, read_index
 from express50.contract.config import build_config
 from express50.contract.layout import Dataset
 from express50.files.calibration import read_cameras, write_cameras
@@ -260,13 +260,13 @@ def narrowed(
     if cues is not None:
         index = read_index(dataset, subject)
         index = replace(index, cues=tuple(c for c in index.cues if c.expression_id == cues[-1]))
-        index_path(part, subject).unlink()
-        index_path(part, subject).write_text(json.dumps(index_to_json(index)))
-        (part.item_dir("align", subject) / "peaks.json").unlink()
+        part.index_file(subject).unlink()
+        part.index_file(subject).write_text(json.dumps(index_to_json(index)))
+        part.peaks_file(subject).unlink()
         peaks = read_peaks(dataset, subject)
         write_peaks(part, subject, {name: peaks[name] for name in cues if name in peaks})
     if views is not None:
-        file = part.item_dir("calibrate", subject) / "cameras.json"
+        file = part.cameras_file(subject)
         cameras = read_cameras(file)
         names = sorted(cameras)
         chosen = {names[round((len(names) - 1) * (k + 1) / (views + 1))] for k in range(views)}

@@ -34,7 +34,7 @@ def packed(tmp_path_factory):
     arrays["t"] -= arrays["vertices"].mean(1)
     vertices = world_vertices(load_head("procedural"), arrays, arrays["offsets"])
     arrays["vertices"] = vertices.astype(np.float32)
-    write_track(dataset.item_dir("track", "S001") / "track.npz", arrays)
+    write_track(dataset.track_file("S001"), arrays)
     published(dataset, PACK, PackConfig(size=32, test_subjects=("S002",)))
     return dataset.item_dir("pack", "shards"), arrays
 

@@ -41,7 +41,7 @@ def inputs(dataset: Dataset, item: str, config: AlignConfig) -> dict[str, Path |
         if prefix and other == item:
             continue
         observations = observations_path(dataset, subject)
-        read[f"{prefix}index"] = dataset.item_dir("ingest", subject) / "index.json"
+        read[f"{prefix}index"] = dataset.index_file(subject)
         read[f"{prefix}observe"] = observations if observations.is_file() else "absent"
         read[f"{prefix}labels"] = human_digest(dataset, subject)
     return read

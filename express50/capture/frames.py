@@ -282,7 +282,7 @@ def read_cameras_of(dataset: Dataset, subject: str, undistorted: bool = True) ->
     Raises:
         StageError: the subject is not calibrated.
     """
-    path = dataset.item_dir("calibrate", subject) / "cameras.json"
+    path = dataset.cameras_file(subject)
     try:
         stat = path.stat()
     except FileNotFoundError as error:
@@ -306,7 +306,7 @@ def read_gains(dataset: Dataset, subject: str) -> dict[str, np.ndarray]:
     Raises:
         FormatError: the file is not {camera: [red, green, blue]} with numbers above 0.
     """
-    path = dataset.item_dir("calibrate", subject) / "gains.json"
+    path = dataset.gains_file(subject)
     if not path.is_file():
         return {}
     try:
@@ -352,7 +352,7 @@ def read_peaks(dataset: Dataset, subject: str) -> dict[str, int]:
 
 def read_peak_rows(dataset: Dataset, subject: str) -> dict[str, Peak]:
     """Read the peak of each expression; raises as ``read_peaks``."""
-    path = dataset.item_dir("align", subject) / "peaks.json"
+    path = dataset.peaks_file(subject)
     if not path.is_file():
         raise StageError(
             f"{path}: subject {subject!r} is not aligned; run 'express50 align {dataset.root}'"
@@ -392,7 +392,7 @@ def peak_items(dataset: Dataset) -> list[str]:
     """List ``subject/expression`` for every labelled peak of the aligned subjects."""
     found = []
     for subject in dataset.subjects():
-        if (dataset.item_dir("align", subject) / "peaks.json").is_file():
+        if dataset.peaks_file(subject).is_file():
             found += [f"{subject}/{name}" for name in sorted(read_peaks(dataset, subject))]
     return found
 
@@ -404,7 +404,7 @@ def read_proxy(dataset: Dataset, subject: str, camera_id: str, frame: int) -> np
         StageError: the subject is not ingested.
         CaptureError: no such camera or frame.
     """
-    folder = dataset.item_dir("ingest", subject) / "proxies"
+    folder = dataset.proxies_dir(subject)
     index = read_index(dataset, subject)
     if camera_id not in index.cameras or not 0 <= frame < index.cameras[camera_id].frames:
         raise CaptureError(f"{folder}: no frame {frame} of camera {camera_id!r}")

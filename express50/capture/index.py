@@ -93,11 +93,6 @@ class Index:
         return min(camera.frames for camera in self.cameras.values())
 
 
-def index_path(dataset: Dataset, subject: str) -> Path:
-    """Return the index file of a subject."""
-    return dataset.item_dir("ingest", subject) / "index.json"
-
-
 def calibration_file(dataset: Dataset, index: Index) -> Path | None:
     """Find the given calibration: the capture's own, or ingest's translation; else None."""
     if index.calibration is None:
@@ -114,7 +109,7 @@ def read_index(dataset: Dataset, subject: str) -> Index:
         StageError: the subject is not ingested, or its capture is no longer registered.
         FormatError: the file does not follow its schema.
     """
-    path = index_path(dataset, subject)
+    path = dataset.index_file(subject)
     try:
         stat = path.stat()
     except FileNotFoundError as error:
@@ -128,7 +123,7 @@ def read_index(dataset: Dataset, subject: str) -> Index:
 
 @lru_cache(maxsize=64)
 def _read_cached(dataset: Dataset, subject: str, version: tuple[int, ...]) -> Index:
-    path = index_path(dataset, subject)
+    path = dataset.index_file(subject)
     captures = dataset.captures()
     if subject not in captures:
         raise StageError(

@@ -1,7 +1,4 @@
-"""Paths of a dataset folder that several parts of the toolkit use.
-
-A stage names the files inside its own items' folders.
-"""
+"""Paths of a dataset folder that several parts of the toolkit use."""
 
 from __future__ import annotations
 
@@ -93,6 +90,34 @@ class Dataset:
             if not NAME.fullmatch(subject):  # it becomes the name of folders
                 raise FormatError(f"{self.captures_file}: subject {subject!r} is not an id; {fix}")
         return {subject: Path(table[subject]) for subject in sorted(table)}
+
+    def index_file(self, subject: str) -> Path:
+        """Frame index of a subject's footage."""
+        return self.item_dir("ingest", subject) / "index.json"
+
+    def proxies_dir(self, subject: str) -> Path:
+        """Small copies of a subject's footage."""
+        return self.item_dir("ingest", subject) / "proxies"
+
+    def cameras_file(self, subject: str) -> Path:
+        """Calibrated cameras of a subject."""
+        return self.item_dir("calibrate", subject) / "cameras.json"
+
+    def gains_file(self, subject: str) -> Path:
+        """Colour gains of a subject's cameras, where a board showed them."""
+        return self.item_dir("calibrate", subject) / "gains.json"
+
+    def peaks_file(self, subject: str) -> Path:
+        """Peak frame of each expression of a subject."""
+        return self.item_dir("align", subject) / "peaks.json"
+
+    def suggestions_file(self, subject: str) -> Path:
+        """Peak frames that the align stage suggests."""
+        return self.item_dir("align", subject) / "suggestions.json"
+
+    def track_file(self, subject: str) -> Path:
+        """Tracked head of a subject at its peaks."""
+        return self.item_dir("track", subject) / "track.npz"
 
     def frame_file(self, subject: str, expression: str, camera: str) -> Path:
         """Undistorted, colour-corrected frame of one camera at a peak."""

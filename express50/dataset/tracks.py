@@ -90,13 +90,13 @@ class Sequence:
     t: np.ndarray
 
 
-def track_file(dataset: Dataset, subject: str) -> Path:
+def existing_track(dataset: Dataset, subject: str) -> Path:
     """Return the path of the subject's track.
 
     Raises:
         StageError: it is missing.
     """
-    path = dataset.item_dir("track", subject) / "track.npz"
+    path = dataset.track_file(subject)
     if not path.is_file():
         raise StageError(f"subject {subject!r} is not tracked; run 'express50 track'")
     return path

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from express50.capture.index import calibration_file, index_path, read_index
+from express50.capture.index import calibration_file, read_index
 from express50.contract.extensions import Command
 from express50.contract.layout import Dataset
 from express50.contract.stage import Growth, Result, Stage
@@ -25,7 +25,7 @@ def inputs(dataset: Dataset, item: str, config: CalibrateConfig) -> dict[str, Pa
     from express50.landmarks.network import WEIGHTS
 
     index = read_index(dataset, item)
-    found: dict[str, Path | str] = {"index": index_path(dataset, item), "weights": WEIGHTS}
+    found: dict[str, Path | str] = {"index": dataset.index_file(item), "weights": WEIGHTS}
     given = calibration_file(dataset, index)
     if given is not None:
         found["calibration"] = given

@@ -22,14 +22,14 @@ def inputs(dataset: Dataset, item: str, config: DepthConfig) -> dict[str, Path |
 
     subject, expression = item.split("/")
     found: dict[str, Path | str] = {
-        "cameras": dataset.item_dir("calibrate", subject) / "cameras.json",
+        "cameras": dataset.cameras_file(subject),
         **frame_inputs(dataset, subject, expression),
     }
     for camera in read_cameras_of(dataset, subject):
         path = dataset.matte_file(subject, expression, camera)
         if path.is_file():
             found[f"matte {camera}"] = path
-    track = dataset.item_dir("track", subject) / "track.npz"
+    track = dataset.track_file(subject)
     if config.use_track and track.is_file():
         found["track"] = track
     return found

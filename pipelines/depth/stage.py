@@ -100,7 +100,7 @@ def read_tracked(
     ``least`` is the share of the mesh that must lie in the mattes; None leaves the track out.
     """
     subject, expression = item.split("/")
-    path = dataset.item_dir("track", subject) / "track.npz"
+    path = dataset.track_file(subject)
     if least is None or not path.is_file():
         return None, {"used": False, "why": "use_track" if least is None else "there is none"}
     track = read_track(path)

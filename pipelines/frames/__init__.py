@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from express50.capture.index import index_path, read_index
+from express50.capture.index import read_index
 from express50.contract.layout import PLATES, Dataset
 from express50.contract.stage import Growth, Result, Stage
 
@@ -32,9 +32,7 @@ def items(dataset: Dataset) -> list[str]:
     from express50.capture.frames import peak_items  # imports OpenCV
 
     peaks = [
-        item
-        for item in peak_items(dataset)
-        if (dataset.item_dir("calibrate", item.split("/")[0]) / "cameras.json").is_file()
+        item for item in peak_items(dataset) if dataset.cameras_file(item.split("/")[0]).is_file()
     ]
     subjects = dict.fromkeys(item.split("/")[0] for item in peaks)
     return peaks + [f"{s}/{PLATES}" for s in subjects if read_index(dataset, s).plates]
@@ -46,8 +44,8 @@ def inputs(dataset: Dataset, item: str, config: FramesConfig) -> dict[str, Path 
 
     subject, expression = item.split("/")
     found: dict[str, Path | str] = {
-        "index": index_path(dataset, subject),
-        "cameras": dataset.item_dir("calibrate", subject) / "cameras.json",
+        "index": dataset.index_file(subject),
+        "cameras": dataset.cameras_file(subject),
     }
     if expression == PLATES:
         index = read_index(dataset, subject)

@@ -22,7 +22,7 @@ def inputs(dataset: Dataset, item: str, config: MatteConfig) -> dict[str, Path |
 
     subject, expression = item.split("/")
     found: dict[str, Path | str] = {
-        "cameras": dataset.item_dir("calibrate", subject) / "cameras.json",
+        "cameras": dataset.cameras_file(subject),
         **frame_inputs(dataset, subject, expression),
     }
     if config.method not in WITHOUT_PLATE:

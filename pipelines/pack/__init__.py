@@ -17,7 +17,6 @@ def items(dataset: Dataset) -> list[str]:
 
 def inputs(dataset: Dataset, item: str, config: PackConfig) -> dict[str, Path | str]:
     """Name the outputs of every earlier stage for every subject, as far as they exist."""
-    from express50.capture.index import index_path
     from express50.capture.readers.read import read_people
     from pipelines.pack.card import people_lines
 
@@ -28,13 +27,13 @@ def inputs(dataset: Dataset, item: str, config: PackConfig) -> dict[str, Path | 
             found[f"{subject} excluded"] = reason
             continue
         included.append(subject)
-        found[f"{subject} index"] = index_path(dataset, subject)
+        found[f"{subject} index"] = dataset.index_file(subject)
         parts = {
             "frames": dataset.item_dir("frames", subject),
-            "calibrate": dataset.item_dir("calibrate", subject) / "cameras.json",
-            "gains": dataset.item_dir("calibrate", subject) / "gains.json",
-            "align": dataset.item_dir("align", subject) / "peaks.json",
-            "track": dataset.item_dir("track", subject) / "track.npz",
+            "calibrate": dataset.cameras_file(subject),
+            "gains": dataset.gains_file(subject),
+            "align": dataset.peaks_file(subject),
+            "track": dataset.track_file(subject),
             "matte": dataset.item_dir("matte", subject),
             "depth": dataset.item_dir("depth", subject),
             "regions": dataset.item_dir("regions", subject),

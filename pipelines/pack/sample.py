@@ -17,7 +17,7 @@ from express50.capture.frames import (
 from express50.capture.index import read_index
 from express50.contract.layout import Dataset
 from express50.dataset.depth_files import depth_file, read_depth
-from express50.dataset.tracks import read_track, track_file
+from express50.dataset.tracks import existing_track, read_track
 from express50.errors import FormatError, StageError
 from express50.files.images import (
     DEPTH_LIMIT_M,
@@ -72,8 +72,8 @@ def read_subject(dataset: Dataset, name: str) -> PackedSubject:
         FormatError: one of these files is malformed.
     """
     index = read_index(dataset, name)
-    peak_rows = read_json_table(dataset.item_dir("align", name) / "peaks.json", FormatError)
-    track = read_track(track_file(dataset, name))
+    peak_rows = read_json_table(dataset.peaks_file(name), FormatError)
+    track = read_track(existing_track(dataset, name))
     offsets = track.offsets if track.offsets.any() else None
     shared = {"shape": track.shape.tolist(), "offsets": offsets is not None}
     return PackedSubject(

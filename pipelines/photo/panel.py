@@ -25,7 +25,7 @@ def write_panel(dataset: Dataset, subject: str, config: TrackConfig, path: Path)
 
     From the side shows what a single view cannot: whether the depth is a head's.
     """
-    with np.load(dataset.item_dir("track", subject) / "track.npz") as track:
+    with np.load(dataset.track_file(subject)) as track:
         frame, mesh = int(track["frames"][0]), track["vertices"][0].astype(np.float64)
         expression = str(track["expressions"][0])
         rotation, translation = track["R"][0], track["t"][0]

@@ -14,7 +14,7 @@ from express50.capture.frames import read_cameras_of, read_peak_frame
 from express50.contract.layout import Dataset
 from express50.contract.stage import Note, Result
 from express50.dataset.depth_files import depth_file, read_depth
-from express50.dataset.tracks import read_track, track_file
+from express50.dataset.tracks import existing_track, read_track
 from express50.errors import CaptureError, FormatError, StageError
 from express50.files.images import read_alpha, resize_area, write_image
 from express50.geometry.cameras import Camera, resized
@@ -106,7 +106,7 @@ def read_head(dataset: Dataset, subject: str, expression: str) -> TrackedHead:
         StageError: the subject or the expression is not tracked.
         FormatError: the track does not fit its head model, or is not finite.
     """
-    path = track_file(dataset, subject)
+    path = existing_track(dataset, subject)
     track = read_track(path)
     row, labels = track.row(expression), _labels_of(track.head)
     vertices = track.vertices[row].astype(np.float64)

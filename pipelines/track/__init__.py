@@ -20,13 +20,12 @@ def items(dataset: Dataset) -> list[str]:
 def inputs(dataset: Dataset, item: str, config: TrackConfig) -> dict[str, Path | str]:
     """Name index, cameras, peaks, mattes, network weights and the head model's file."""
     from express50.capture.frames import frame_inputs, read_peaks
-    from express50.capture.index import index_path
     from express50.landmarks.sources import source_files
 
     found: dict[str, Path | str] = {
-        "index": index_path(dataset, item),
-        "cameras": dataset.item_dir("calibrate", item) / "cameras.json",
-        "peaks": dataset.item_dir("align", item) / "peaks.json",
+        "index": dataset.index_file(item),
+        "cameras": dataset.cameras_file(item),
+        "peaks": dataset.peaks_file(item),
         **source_files(config.landmarks),
     }
     for expression in read_peaks(dataset, item):

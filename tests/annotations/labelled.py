@@ -2,7 +2,7 @@
 
 import json
 
-from express50.capture.index import CameraSource, Cue, Index, index_path, index_to_json
+from express50.capture.index import CameraSource, Cue, Index, index_to_json
 from express50.contract.layout import Dataset
 
 EXPRESSIONS = ("neutral", "smile", "wink_left")
@@ -32,7 +32,7 @@ def make_dataset(root, subjects=("S001", "S002"), metas=None, **kwargs):
     for subject in subjects:
         index = make_index(root, subject, meta=(metas or {}).get(subject), **kwargs)
         captures[subject] = str(index.capture)
-        path = index_path(dataset, subject)
+        path = dataset.index_file(subject)
         path.parent.mkdir(parents=True)
         path.write_text(json.dumps(index_to_json(index)))
     dataset.captures_file.write_text(json.dumps(captures))

@@ -48,7 +48,7 @@ def run(dataset, items=None, **values):
 
 
 def peaks(dataset, subject):
-    return json.loads((dataset.item_dir("align", subject) / "peaks.json").read_text())
+    return json.loads(dataset.peaks_file(subject).read_text())
 
 
 @pytest.fixture

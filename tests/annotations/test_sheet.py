@@ -143,7 +143,7 @@ def test_a_frame_that_cannot_be_read_is_said_on_its_tile(labelled):
 
 
 def test_suggestions_that_cannot_be_read_and_exclusions_are_noted(labelled, capsys):
-    (labelled.item_dir("align", "S001") / "suggestions.json").write_text("[")
+    labelled.suggestions_file("S001").write_text("[")
     assert main(["annotate", "exclude", str(labelled.root), "S002", "heavy makeup"]) == 0
     sheet = make_sheet(labelled)
     assert sheet.subjects == ["S001"]

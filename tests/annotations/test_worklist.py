@@ -94,6 +94,6 @@ def test_unknown_orders_subjects_and_files_are_named(tmp_path):
     with pytest.raises(AnnotationError, match="'S009'"):
         worklist(dataset, "ann", ["S009"])
     suggest(dataset, "S001", {})
-    (dataset.item_dir("align", "S001") / "suggestions.json").write_text('{"smile": {"x": 1}}')
+    dataset.suggestions_file("S001").write_text('{"smile": {"x": 1}}')
     with pytest.raises(FormatError, match="suggestions.json"):
         read_suggestions(dataset, "S001")

@@ -98,9 +98,9 @@ def test_an_orientation_that_is_none_is_upright(tmp_path: Path, value: int) -> N
 def test_a_forged_orientation_in_the_index_is_refused(dataset: Dataset, orientation) -> None:
     import json
 
-    from express50.capture.index import index_from_json, index_path
+    from express50.capture.index import index_from_json
 
-    content = json.loads(index_path(dataset, "shots").read_text())
+    content = json.loads(dataset.index_file("shots").read_text())
     content["cameras"]["p6"]["orientation"] = orientation
     with pytest.raises(ValueError, match="p6: orientation"):
         index_from_json(content, Path())

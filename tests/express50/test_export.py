@@ -38,16 +38,16 @@ def dataset(tmp_path_factory) -> Dataset:
     made = make_dataset(root, ("S001", "S002", "S003"), cameras=CAMERAS, size=48)
     flame = write_flame(root)
     for subject, head in (("S001", "procedural"), ("S002", flame)):
-        write_track(made.item_dir("track", subject) / "track.npz", track_arrays(head))
-    (made.item_dir("track", "S003") / "track.npz").unlink()
-    path = made.item_dir("calibrate", "S002") / "cameras.json"
+        write_track(made.track_file(subject), track_arrays(head))
+    made.track_file("S003").unlink()
+    path = made.cameras_file("S002")
     write_cameras(path, {name: replace(camera, params=(163.2, 163.2, 24.0, 24.0))
                          for name, camera in read_cameras(path).items()})  # fmt: skip
     return made
 
 
 def track_of(dataset: Dataset, subject: str) -> dict[str, np.ndarray]:
-    with np.load(dataset.item_dir("track", subject) / "track.npz") as table:
+    with np.load(dataset.track_file(subject)) as table:
         return dict(table)
 
 
@@ -316,7 +316,7 @@ def test_smaller_pictures_belong_to_smaller_cameras(dataset, tmp_path) -> None:
 
 
 def test_colour_gains_are_divided_out(dataset, tmp_path) -> None:
-    path = dataset.item_dir("calibrate", "S002") / "gains.json"
+    path = dataset.gains_file("S002")
     path.write_text(json.dumps({"cam01": [1.2, 1.0, 0.8]}))
     try:
         options = ["--subject=S002", "--expression=neutral", "--even-colour"]

@@ -113,7 +113,7 @@ def test_undistortion_goes_by_the_calibrated_camera(ingested):
 
 
 def test_proxies_are_plain_tar_members(ingested):
-    folder = ingested.item_dir("ingest", "S001") / "proxies"
+    folder = ingested.proxies_dir("S001")
     with tarfile.open(folder / "cam00.tar") as tar:
         assert tar.getnames() == [f"{n:06d}.jpg" for n in range(6)]
         assert {(m.mtime, m.uid, m.uname) for m in tar.getmembers()} == {(0, 0, "")}
@@ -127,7 +127,7 @@ def test_proxies_are_plain_tar_members(ingested):
 def test_peaks_are_checked_against_the_footage(ingested):
     index = read_index(ingested, "S001")
     row = {"frame": 1, "camera": "cam00", "pts": 1, "dhash": index.cameras["cam00"].dhash[1]}
-    path = ingested.item_dir("align", "S001") / "peaks.json"
+    path = ingested.peaks_file("S001")
     with pytest.raises(StageError, match="not aligned"):
         read_peaks(ingested, "S001")
     path.parent.mkdir(parents=True)

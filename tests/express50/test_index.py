@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from express50.capture.index import Cue, index_from_json, index_path, index_to_json, read_index
+from express50.capture.index import Cue, index_from_json, index_to_json, read_index
 from express50.contract.layout import Dataset
 from express50.errors import FormatError, StageError
 
@@ -28,11 +28,11 @@ def test_index_round_trip_and_no_machine_path(ingested, capture):
     index = read_index(ingested, "S001")
     content = json.loads(json.dumps(index_to_json(index)))
     assert index_from_json(content, capture) == index
-    assert str(capture) not in index_path(ingested, "S001").read_text()
+    assert str(capture) not in ingested.index_file("S001").read_text()
 
 
 def test_index_is_read_again_when_the_file_changes(ingested):
-    path = index_path(ingested, "S001")
+    path = ingested.index_file("S001")
     assert read_index(ingested, "S001") is read_index(ingested, "S001")
     path.write_text(path.read_text().replace('"fps": 24.0', '"fps": 25.0'))
     assert read_index(ingested, "S001").fps == 25.0
@@ -51,7 +51,7 @@ def test_index_is_read_again_when_the_file_changes(ingested):
     ],
 )
 def test_malformed_index_is_a_format_error(ingested, change, message):
-    path = index_path(ingested, "S001")
+    path = ingested.index_file("S001")
     content = json.loads(path.read_text())
     change(content)
     path.write_text(json.dumps(content))

@@ -11,7 +11,7 @@ import pytest
 
 import express50.files.arrays as array_files
 from express50.contract.layout import Dataset
-from express50.dataset.tracks import read_track, track_file
+from express50.dataset.tracks import existing_track, read_track
 from express50.errors import FormatError, StageError
 from tests.express50.tracked import track_arrays, write_track
 
@@ -126,4 +126,4 @@ def test_an_absent_track_says_what_to_run(tmp_path) -> None:
     with pytest.raises(StageError, match="run 'express50 track'"):
         read_track(tmp_path / "track.npz")
     with pytest.raises(StageError, match="subject 'S001' is not tracked; run 'express50 track'"):
-        track_file(Dataset(tmp_path), "S001")
+        existing_track(Dataset(tmp_path), "S001")

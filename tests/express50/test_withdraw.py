@@ -224,7 +224,7 @@ def test_what_describes_a_person_stays_in_the_capture(dataset, tmp_path):
 
 
 def test_what_an_older_ingest_kept_of_a_person_is__and_fixed(dataset, capsys):
-    path = dataset.item_dir("ingest", "S001") / "index.json"
+    path = dataset.index_file("S001")
     content = json.loads(path.read_text())
     content["meta"]["name"] = "Jane Roe"
     path.write_text(json.dumps(content))

@@ -125,7 +125,7 @@ def test_a_confidence_that_is_no_share_is_refused_by_name(tmp_path, wrong, capsy
 def test_a_curve_that_holds_no_number_is_refused(tmp_path):
     dataset = make_dataset(tmp_path / "data")
     suggest(dataset, "S001", {"smile": (14, 0.5)})
-    path = dataset.item_dir("align", "S001") / "suggestions.json"
+    path = dataset.suggestions_file("S001")
     path.write_text(path.read_text().replace("[1.0]", "[1.0, NaN]"))
     with pytest.raises(FormatError, match="line .* NaN, which is NaN or infinite"):
         read_suggestions(dataset, "S001")

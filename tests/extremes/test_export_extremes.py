@@ -17,7 +17,7 @@ from tests.pipelines.bump_dataset import make_dataset
 def exported(tmp_path, arrays):
     """Vertices (E, V, 3) that a reader of FLAME's convention puts into the user's world."""
     dataset = make_dataset(tmp_path, cameras=1, size=32)
-    write_track(dataset.item_dir("track", "S001") / "track.npz", arrays)
+    write_track(dataset.track_file("S001"), arrays)
     out = tmp_path / "out"
     arguments = ["export", str(dataset.root), str(out), "--format=gaussian-avatars"]
     assert main(arguments) == 0

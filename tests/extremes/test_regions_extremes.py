@@ -134,7 +134,7 @@ def test_figures_of_nothing_are_numbers_and_named() -> None:
 )
 def test_damaged_tracks_are_one_clear_line(tmp_path, key, value, message) -> None:
     dataset = make_dataset(tmp_path, cameras=2, size=32)
-    path = dataset.item_dir("track", "S001") / "track.npz"
+    path = dataset.track_file("S001")
     with np.load(path) as table:
         arrays = dict(table)
     if value == "short":

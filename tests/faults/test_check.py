@@ -259,7 +259,7 @@ def test_command_on_real_stages(tmp_path, capsys):
     dataset.labels_file("S001").parent.mkdir()
     dataset.labels_file("S001").write_text(json.dumps(label) + "\n")
     shutil.rmtree(tmp_path / "S002")
-    (dataset.item_dir("ingest", "S001") / "proxies" / "cam01.tar").unlink()
+    (dataset.proxies_dir("S001") / "cam01.tar").unlink()
     assert main(["check", root, "--fix", "--json"]) == 1
     account = json.loads(capsys.readouterr().out)
     kinds = sorted((f["kind"], f["fixed"]) for f in account["findings"])

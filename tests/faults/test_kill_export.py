@@ -29,7 +29,7 @@ def killed(arguments: list[str], out: Path, files: int) -> bool:
 def test_a_killed_export_is_absent_and_made_whole_by_the_next_run(tmp_path) -> None:
     dataset = make_dataset(tmp_path, cameras=8, size=48)
     arrays = track_arrays(write_flame(tmp_path))
-    write_track(dataset.item_dir("track", "S001") / "track.npz", arrays)
+    write_track(dataset.track_file("S001"), arrays)
     out, again = tmp_path / "out", tmp_path / "again"
     arguments = ["export", str(dataset.root), str(out), "--format=gaussian-avatars"]
     for _ in range(5):  # on a busy machine the export may be through before anyone looks

@@ -63,14 +63,14 @@ def write_given(dataset: Dataset, subject: str, rig: list[Camera], shots: dict) 
     for stage in ("calibrate", "align", "track"):
         dataset.item_dir(stage, subject).mkdir(parents=True)
     cameras = {camera.id: replace(camera) for camera in rig}
-    write_cameras(dataset.item_dir("calibrate", subject) / "cameras.json", cameras)
+    write_cameras(dataset.cameras_file(subject), cameras)
     source = read_index(dataset, subject).cameras[rig[0].id]
     peaks = {
         name: {"frame": k, "camera": rig[0].id, "pts": k, "dhash": source.dhash[k],
                "confidence": 1.0, "annotator": "tester"}
         for k, name in enumerate(EXPRESSIONS)
     }  # fmt: skip
-    (dataset.item_dir("align", subject) / "peaks.json").write_text(json.dumps(peaks))
+    dataset.peaks_file(subject).write_text(json.dumps(peaks))
     for name, (_, alpha, _) in shots.items():
         for expression in EXPRESSIONS:
             path = dataset.matte_file(subject, expression, name)
@@ -101,7 +101,7 @@ def write_track(dataset: Dataset, subject: str) -> None:
         "t": np.stack([t] * count),
         "vertices": np.stack([((template + t) * scale).astype(np.float32)] * count),
     }
-    np.savez(dataset.item_dir("track", subject) / "track.npz", **arrays)
+    np.savez(dataset.track_file(subject), **arrays)
 
 
 def published(dataset: Dataset, stage: Stage, config: object) -> dict:

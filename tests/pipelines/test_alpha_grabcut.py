@@ -134,7 +134,7 @@ def test_a_frame_without_a_face_costs_itself_alone(tmp_path: Path) -> None:
         for name, frame in (("clip_00", 1), ("clip_01", 6))
     }  # fmt: skip
     dataset.item_dir("align", "eva").mkdir(parents=True)
-    (dataset.item_dir("align", "eva") / "peaks.json").write_text(json.dumps(peaks))
+    dataset.peaks_file("eva").write_text(json.dumps(peaks))
     write_peak_frames(dataset)
     run = run_stage(MATTE, dataset, MatteConfig(method="grabcut"), workers=0, progress=False)
     assert {o.item: o.status for o in run.outcomes} == {

@@ -154,7 +154,7 @@ def test_one_camera_gets_the_tracked_heads_depth_at_low_confidence(tmp_path):
     published(dataset, STAGE, DepthConfig(voxel_mm=3.0))
     folder = dataset.item_dir("depth", ITEMS[0])
     depth, valid = read_depth(depth_file(folder, camera.id))
-    track = read_track(dataset.item_dir("track", "S001") / "track.npz")
+    track = read_track(dataset.track_file("S001"))
     scene = mesh_scene(track.vertices[0], load_head(track.head).faces.numpy())
     alpha = read_image(dataset.matte_file("S001", "neutral", camera.id)) / 255.0
     shot = compared_view(scene, camera, np.zeros((*alpha.shape, 3), np.uint8), alpha, 96)
@@ -164,7 +164,7 @@ def test_one_camera_gets_the_tracked_heads_depth_at_low_confidence(tmp_path):
     assert read_image(folder / f"{camera.id}_confidence.png").max() < 80
     assert published(dataset, PACK, PackConfig(size=64))["shards"]["kept"] == len(ITEMS)
 
-    (dataset.item_dir("track", "S001") / "track.npz").unlink()
+    dataset.track_file("S001").unlink()
     config = DepthConfig(voxel_mm=3.0)
     (outcome, _) = run_stage(STAGE, dataset, config, workers=0, progress=False).outcomes
     assert "express50 track" in outcome.reason

@@ -44,7 +44,7 @@ def dataset(tmp_path, capture):
         name: replace(camera, params=(*camera.params[:4], -0.2, 0.05, 0.01, 0.0))
         for name, camera in make_rig().items()
     }
-    write_cameras(dataset.item_dir("calibrate", "S001") / "cameras.json", rig)
+    write_cameras(dataset.cameras_file("S001"), rig)
     assert run(dataset).ok
     return dataset
 
@@ -97,7 +97,7 @@ def test_a_camera_whose_footage_changed_is_dropped(tmp_path):
 
 
 def test_a_label_on_other_footage_fails_its_expression_alone(dataset):
-    path = dataset.item_dir("align", "S001") / "peaks.json"
+    path = dataset.peaks_file("S001")
     rows = json.loads(path.read_text())
     rows["smile"]["dhash"] = "0" * 16
     path.write_text(json.dumps(rows))

@@ -65,7 +65,7 @@ def test_account_of_a_good_capture(dataset):
 
 def test_proxy_size_follows_the_config_and_never_enlarges(dataset):
     run(dataset, proxy_long_side=32)
-    folder = dataset.item_dir("ingest", "S001") / "proxies"
+    folder = dataset.proxies_dir("S001")
     assert decode_proxy(folder, "cam00", 7).shape == (32, 32, 3)
     run(dataset, proxy_long_side=640)
     assert decode_proxy(folder, "cam00", 7).shape == (64, 64, 3)
@@ -74,7 +74,7 @@ def test_proxy_size_follows_the_config_and_never_enlarges(dataset):
 def test_proxy_keeps_the_identity_of_its_frame(dataset):
     run(dataset)
     index = read_index(dataset, "S001")
-    proxy = decode_proxy(dataset.item_dir("ingest", "S001") / "proxies", "cam01", 4)
+    proxy = decode_proxy(dataset.proxies_dir("S001"), "cam01", 4)
     bits = int(dhash(proxy), 16) ^ int(index.cameras["cam01"].dhash[4], 16)
     assert bits.bit_count() <= 8
 
@@ -88,7 +88,7 @@ def test_truncated_camera_is_dropped_with_its_reason(dataset):
     assert dropped["what"] == "camera cam01"
     assert "truncated" in dropped["why"]
     assert list(read_index(dataset, "S001").cameras) == ["cam00", "cam02"]
-    names = {p.name for p in (dataset.item_dir("ingest", "S001") / "proxies").iterdir()}
+    names = {p.name for p in dataset.proxies_dir("S001").iterdir()}
     assert names == {"cam00.tar", "cam00.json", "cam02.tar", "cam02.json"}
     assert summary.outcomes[0].dropped == (Note(**dropped),)
 

@@ -270,7 +270,7 @@ def test_lossless_profile_keeps_pixels(dataset, tmp_path):
 
 def test_what_cameras_make_differently_of_light_is_divided_out(dataset, packed, tmp_path):
     name = ShardReader(packed[0]).select(subjects=["S001"]).sample(0)["meta"]["camera"]
-    gains = dataset.item_dir("calibrate", "S001") / "gains.json"
+    gains = dataset.gains_file("S001")
     write_json(gains, {name: [1.25, 1.0, 1.0]})
     try:
         for even in (True, False):

@@ -239,7 +239,7 @@ def test_a_track_beside_the_matte_and_missing_mattes_are_reported(tmp_path) -> N
     dataset = make_dataset(tmp_path)
     dataset.matte_file("S001", "smile", "cam01").unlink()
     write_image(dataset.matte_file("S001", "smile", "cam03"), np.zeros((96, 96), np.uint8))
-    path = dataset.item_dir("track", "S001") / "track.npz"
+    path = dataset.track_file("S001")
     with np.load(path) as table:
         arrays = dict(table)
     arrays["vertices"] = arrays["vertices"] + np.float32([0.1, 0, 0])
@@ -273,7 +273,7 @@ def test_items_without_track_or_mattes_fail_in_one_line(tmp_path) -> None:
         STAGE.run(dataset, "S001/smile", RegionsConfig(), tmp_path)
     with pytest.raises(ConfigError, match=r"regions\.segmentation nowhere"):
         STAGE.inputs(dataset, "S001/smile", RegionsConfig(segmentation="nowhere.pt"))
-    (dataset.item_dir("track", "S001") / "track.npz").unlink()
+    dataset.track_file("S001").unlink()
     with pytest.raises(StageError, match="S001' is not tracked; run 'express50 track'"):
         STAGE.inputs(dataset, "S001/neutral", RegionsConfig())
 

@@ -8,7 +8,6 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from express50.capture.demographics import PUBLIC_KEYS
-from express50.capture.index import index_path
 from express50.contract.config import resolve_config
 from express50.contract.layout import Dataset
 from express50.contract.stage import Stage
@@ -181,7 +180,7 @@ class StageAudit:
         """Find indices that hold keys of capture.toml which must stay outside the dataset."""
         for subject in sorted(subjects):
             try:
-                table = json.loads(index_path(self.dataset, subject).read_text(encoding="utf-8"))
+                table = json.loads(self.dataset.index_file(subject).read_text(encoding="utf-8"))
                 keys = sorted(set(table["meta"]) - PUBLIC_KEYS)
             except (OSError, ValueError, KeyError, TypeError):  # damaged: found elsewhere
                 continue

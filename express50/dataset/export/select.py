@@ -13,7 +13,7 @@ import torch
 
 from express50.contract.exclusions import exclusion_reason
 from express50.contract.layout import Dataset
-from express50.dataset.tracks import OF_FRAMES, Track, read_sequence, read_track, track_file
+from express50.dataset.tracks import OF_FRAMES, Track, existing_track, read_sequence, read_track
 from express50.errors import FormatError, StageError
 from express50.files.atomic import replace_directory, sync_tree
 from express50.files.images import read_image
@@ -55,14 +55,13 @@ def tracked_subjects(dataset: Dataset, wanted: Sequence[str]) -> list[str]:
             raise StageError(f"{dataset.root}: no subject {name!r}; expected one of {listed}")
         if (reason := exclusion_reason(dataset, name)) is not None:
             raise StageError(f"{name}: is excluded ({reason}); it is not exported")
-        track_file(dataset, name)
+        existing_track(dataset, name)
     if wanted:
         return list(dict.fromkeys(wanted))
     found = [
         name
         for name in known
-        if (dataset.item_dir("track", name) / "track.npz").is_file()
-        and exclusion_reason(dataset, name) is None
+        if dataset.track_file(name).is_file() and exclusion_reason(dataset, name) is None
     ]
     if not found:
         raise StageError(f"{dataset.root}: nothing is tracked; run 'express50 track' first")
@@ -77,7 +76,7 @@ def read_tracked(dataset: Dataset, subject: str, expressions: Sequence[str]) -> 
         FormatError: the track is damaged or does not fit its head model.
         HeadModelError: the head model cannot be loaded.
     """
-    path = track_file(dataset, subject)
+    path = existing_track(dataset, subject)
     track = read_track(path)
     unknown = sorted(set(expressions) - set(track.expressions))
     if unknown:
@@ -102,7 +101,7 @@ def with_clips(dataset: Dataset, head: Head, wanted: Sequence[str]) -> Head:
         StageError: its clips are not tracked, or none of these.
         FormatError: they are damaged, or were tracked with another head model.
     """
-    path = track_file(dataset, head.subject).with_name("sequence.npz")
+    path = existing_track(dataset, head.subject).with_name("sequence.npz")
     clips = read_sequence(path)
     if clips.head != head.track.head or len(clips.shape) != len(head.track.shape):
         raise FormatError(f"{path}: is not of the track beside it; run 'express50 track' again")

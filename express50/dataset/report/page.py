@@ -136,7 +136,7 @@ def _grmm_view(root: Path) -> list[dict]:
 
 
 def _cards(dataset: Dataset, reports: Iterable[StageReport], summary: dict) -> list[dict[str, str]]:
-    peaks = {s: read_json(dataset.item_dir("align", s) / "peaks.json") for s in dataset.subjects()}
+    peaks = {s: read_json(dataset.peaks_file(s)) for s in dataset.subjects()}
     expressions = {e for table in peaks.values() for e in table}
     cards = [
         {"label": "subjects", "value": number(len(peaks))},

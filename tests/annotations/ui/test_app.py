@@ -317,7 +317,7 @@ def test_a_click_on_the_strip_moves_the_cursor(suggested, make_app):
 
 
 def test_reference_of_another_camera_set_falls_back_to_its_own(suggested, make_app):
-    rows = json.loads((suggested.item_dir("align", "S001") / "suggestions.json").read_text())
+    rows = json.loads(suggested.suggestions_file("S001").read_text())
     assert rows["smile"]["camera"] == "cam01"
     suggest(suggested, {"S002": {"smile": [99]}})  # a suggestion outside the window
     app = make_app(suggested, subjects=["S002"], expressions=["smile"])

@@ -156,7 +156,7 @@ def test_what_is_missing_is_said_not_raised(dataset):
     assert "shout" in load_scene(dataset, LabelTask("S001", "shout", 1.0), "ann").problem
     assert "'S9'" in load_scene(dataset, LabelTask("S9", "smile", 1.0), "ann").problem
     suggest(dataset, {"S001": {"smile": [20]}})
-    (dataset.item_dir("align", "S001") / "suggestions.json").write_text("[")
+    dataset.suggestions_file("S001").write_text("[")
     assert "suggestions" in " ".join(
         load_scene(dataset, LabelTask("S001", "smile", 1), "ann").notes
     )

@@ -72,7 +72,7 @@ def test_renderme_full_release(tmp_path):
     }  # fmt: skip
     assert read_people(dataset, [subject]) == [{"age": 27, "gender": "female"}]
     assert not {"age", "gender", "weight"} & set(index.meta)
-    assert str(tmp_path) not in (dataset.item_dir("ingest", subject) / "index.json").read_text()
+    assert str(tmp_path) not in dataset.index_file(subject).read_text()
     assert_rig(dataset, subject, rig([f"cam{n:02d}" for n in range(4)]))
     config = resolve_config(calibrate.STAGE, "draft", None, ["calibrate.check_moments=0"])
     assert run_stage(calibrate.STAGE, dataset, config, workers=0, progress=False).ok
