@@ -91,7 +91,7 @@ def load_flame(
 
 
 def shape_component_count(total: int) -> int:
-    """Identity components among all: 300 of 400 in the published files, else three quarters."""
+    """Count identity components: 300 of 400 in the published files, else three quarters."""
     return 300 if total > 300 else (3 * total) // 4
 
 

@@ -219,7 +219,7 @@ def build_ict_head(arrays: IctArrays, where: str = "ICT") -> HeadModel:
 
 
 def _offsets(files: list[Path], template: np.ndarray) -> np.ndarray:
-    """Vertex offsets (V, 3, files) of OBJ files from the template."""
+    """Return vertex offsets (V, 3, files) of OBJ files from the template."""
     columns = []
     for file in files:
         lines = read_text(file, HeadModelError).splitlines()
@@ -238,7 +238,7 @@ def _offsets(files: list[Path], template: np.ndarray) -> np.ndarray:
 def _rig(
     template: np.ndarray, opened: np.ndarray, regions: dict[str, np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Joints (5, 3) and skinning (V, 5) for the template; `opened` is the jawOpen offset."""
+    """Return joints (5, 3) and skinning (V, 5) for the template; `opened` is the jawOpen offset."""
     height = template[:, 1]
     chin = template[LANDMARKS[8]]
     floor = height.min()
@@ -267,7 +267,7 @@ def _rig(
 def _jaw_rig(
     template: np.ndarray, opened: np.ndarray, lower_teeth: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Jaw hinge (3,) and weights (V,) that repeat what the jawOpen shape does.
+    """Return jaw hinge (3,) and weights (V,) that repeat what the jawOpen shape does.
 
     The lower teeth are rigid: their motion in the y-z plane is a turn by some angle about a point
     that stays in place: d = (R - I)(p - c). A vertex's weight is its own
@@ -318,7 +318,7 @@ def _pack_udim(uv: np.ndarray, uv_faces: np.ndarray) -> np.ndarray:
 
 
 def _at_vertices(faces: np.ndarray, vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Face ids (N,) and barycentrics (N, 3) that name mesh vertices (N,)."""
+    """Return face ids (N,) and barycentrics (N, 3) that name mesh vertices (N,)."""
     ids, bary = [], []
     for vertex in vertices:
         face, corner = (int(where[0]) for where in np.nonzero(faces == vertex))

@@ -78,7 +78,7 @@ def _span(count: int, first: int, end: int) -> np.ndarray:
 def _inside_hull_box(
     template: np.ndarray, ids: tuple[int, ...], margin_x: float, margin_y: float
 ) -> np.ndarray:
-    """Vertices in the front-view box of some vertices, widened by margins in metres."""
+    """Return vertices in the front-view box of some vertices, widened by margins in metres."""
     low, high = template[list(ids), :2].min(0), template[list(ids), :2].max(0)
     margin = np.array([margin_x, 0.4 * margin_y])
     return ((template[:, :2] > low - margin) & (template[:, :2] < high + margin)).all(1)
@@ -101,7 +101,7 @@ def _inside_polygon(template: np.ndarray, ids: tuple[int, ...]) -> np.ndarray:
 def _tongue(
     template: np.ndarray, faces: np.ndarray, uv_faces: np.ndarray, gums: np.ndarray
 ) -> np.ndarray:
-    """The tongue (V,) bool: the two large texture islands that lie within 2 cm of the middle.
+    """Find the tongue (V,) bool: the two large texture islands within 2 cm of the middle.
 
     Gums and tongue are one piece of mesh, but they are cut apart in the texture map.
     """
@@ -130,7 +130,7 @@ def _connected(faces: np.ndarray) -> np.ndarray:
 
 
 def _open_edge_vertices(faces: np.ndarray, count: int) -> np.ndarray:
-    """Vertices (V,) bool that lie on an edge used by one face only."""
+    """Return vertices (V,) bool that lie on an edge used by one face only."""
     edges = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
     unique, uses = np.unique(edges, axis=0, return_counts=True)
     mask = np.zeros(count, dtype=bool)

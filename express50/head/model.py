@@ -229,7 +229,7 @@ def joint_angles(
     jaw: torch.Tensor | None,
     eyes: torch.Tensor | None,
 ) -> torch.Tensor:
-    """Axis-angles (B, 5, 3) in joint order from the optional parts; B, dtype from `like`."""
+    """Return axis-angles (B, 5, 3) in joint order from the optional parts; B, dtype from `like`."""
     batch = like.shape[0]
     blocks = []
     for name, part, width in (
@@ -254,7 +254,7 @@ def skin(
     pose_dirs: torch.Tensor,
     parents: tuple[int, ...],
 ) -> torch.Tensor:
-    """Linear blend skinning with pose correctives (SMPL, Loper et al. 2015, equations 2 to 4).
+    """Apply linear blend skinning and pose correctives (SMPL, Loper et al. 2015, equations 2 to 4).
 
     Works on any subset of vertices, so that a landmark fit poses only what it needs.
 
@@ -304,7 +304,7 @@ def joint_transforms(
 
 
 def landmarks(model: HeadModel, vertices: torch.Tensor) -> torch.Tensor:
-    """The 68 landmarks (B, 68, 3) on posed vertices (B, V, 3), iBUG-68 order."""
+    """Return the 68 landmarks (B, 68, 3) on posed vertices (B, V, 3), iBUG-68 order."""
     corners = vertices[:, model.faces[model.landmark_faces]]
     return (corners * model.landmark_bary[None, :, :, None]).sum(2)
 

@@ -74,7 +74,7 @@ def is_flame_topology(model: HeadModel) -> bool:
 
 
 def add_mouth(model: HeadModel) -> HeadModel:
-    """The model with teeth and a pouch behind them; joints, landmarks and old ids stay.
+    """Add teeth and a pouch behind them to a model; joints, landmarks and old ids stay.
 
     Upper teeth follow the neck joint, lower teeth the jaw, both keep still in expressions and move
     with the identity as the lips before them do. The pouch follows the loop it hangs on.
@@ -108,7 +108,7 @@ def add_mouth(model: HeadModel) -> HeadModel:
 
 
 def _teeth(model: HeadModel, charts: tuple[np.ndarray, ...]) -> _Part:
-    """Two arches of 15 columns: a strip in front, one behind, and the edge between them."""
+    """Make two arches of 15 columns: a strip in front, one behind, and the edge between them."""
     upper, lower = (model.template[list(ring)].double() for ring in (UPPER_RING, LOWER_RING))
     unit = float((upper - lower).norm(dim=1).mean())
     if not _LIPS[0] < unit < _LIPS[1]:
@@ -151,7 +151,7 @@ def _teeth(model: HeadModel, charts: tuple[np.ndarray, ...]) -> _Part:
 
 
 def _strip(rows: tuple[int, ...] | range, flip: bool) -> np.ndarray:
-    """Triangles (84, 3) between consecutive rows of 15 vertices, seen from outside."""
+    """Return triangles (84, 3) between consecutive rows of 15 vertices, seen from outside."""
     grid = 15 * np.asarray(rows)[:, None] + np.arange(15)
     a, b, c, d = grid[:-1, :-1], grid[:-1, 1:], grid[1:, 1:], grid[1:, :-1]
     faces = np.stack([np.stack([a, b, c], -1), np.stack([a, c, d], -1)], 2).reshape(-1, 3)
@@ -167,7 +167,7 @@ def _strip_uv(chart: np.ndarray, lower: bool, from_left: bool) -> np.ndarray:
 
 
 def _pouch(model: HeadModel, chart: np.ndarray) -> _Part:
-    """Rings behind the loop at the back of the lips, ending in one vertex."""
+    """Make rings behind the loop at the back of the lips, ending in one vertex."""
     loop = torch.from_numpy(mouth_loop(model.faces.numpy(), model.name))
     size, first = len(loop), len(model.template) + TOOTH_VERTICES
     own = torch.nn.functional.one_hot(loop, len(model.template)).double()
@@ -196,7 +196,7 @@ def _pouch(model: HeadModel, chart: np.ndarray) -> _Part:
 
 
 def _funnel(size: int) -> np.ndarray:
-    """Triangles (5 size, 3) of three rings and an end vertex, numbered in that order."""
+    """Return triangles (5 size, 3) of three rings and an end vertex, numbered in that order."""
     k = np.arange(size)
     after = (k + 1) % size
     faces = []
@@ -208,7 +208,7 @@ def _funnel(size: int) -> np.ndarray:
 
 
 def _funnel_uv(size: int, chart: np.ndarray) -> np.ndarray:
-    """UV (3 size + 1, 2): concentric rings in a chart (left, bottom, right, top)."""
+    """Return UV (3 size + 1, 2): concentric rings in a chart (left, bottom, right, top)."""
     angle = 2 * np.pi * np.arange(size) / size
     circle = np.stack([np.cos(angle), np.sin(angle)], -1)
     unit = np.concatenate([circle, circle * 2 / 3, circle / 3, np.zeros((1, 2))])
@@ -242,7 +242,7 @@ def mouth_loop(faces: np.ndarray, name: str) -> np.ndarray:
 
 
 def _appended(model: HeadModel, part: _Part) -> HeadModel:
-    """The model with a part's vertices, faces and chart after its own."""
+    """Append a part's vertices, faces and chart to a model's own."""
     count, added = len(model.template), len(part.places)
     # Parts are made for the bare head; vertices that came in between lend them nothing.
     room = count - part.shape_from.shape[1]
@@ -282,7 +282,7 @@ SHRINK, LEAST = 0.9, 0.15  # of the wanted size: factor between tries, and the s
 def place_charts(
     uv: np.ndarray, uv_faces: np.ndarray, sizes: Sequence[tuple[float, float]], name: str
 ) -> tuple[np.ndarray, ...]:
-    """Free rectangles (left, bottom, right, top), one a wanted (width, height) on the unit square.
+    """Find free rectangles (left, bottom, right, top), one per wanted (width, height).
 
     Each is shrunk until it fits; the first free place from the top of the map is taken.
 
@@ -316,7 +316,7 @@ def place_charts(
 
 
 def covered_cells(uv: np.ndarray, uv_faces: np.ndarray, size: int) -> np.ndarray:
-    """Cells (size, size), bool, first row at v = 1, that triangles cover or touch."""
+    """Return cells (size, size), bool, first row at v = 1, that triangles cover or touch."""
     cells = np.zeros((size, size), np.uint8)
     places = np.stack([uv[:, 0], 1 - uv[:, 1]], -1) * size
     corners = np.floor(places).clip(0, size - 1).astype(np.int32)[uv_faces]
@@ -326,7 +326,7 @@ def covered_cells(uv: np.ndarray, uv_faces: np.ndarray, size: int) -> np.ndarray
 
 
 def _first_free(taken: np.ndarray, width: float, height: float) -> tuple[int, int, int, int] | None:
-    """Row, column, rows and columns of the largest free rectangle that is tried."""
+    """Find the largest free rectangle that is tried: row, column, rows and columns."""
     scale = 1.0
     while scale >= LEAST:
         rows, columns = max(2, round(height * scale)), max(2, round(width * scale))

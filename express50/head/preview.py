@@ -41,7 +41,7 @@ POSES: dict[str, tuple[dict[str, float], float]] = {
 
 
 def expression_vector(model: HeadModel, controls: Mapping[str, float]) -> torch.Tensor:
-    """Coefficients (1,X) of named controls; a name without _L/_R sets both sides.
+    """Return coefficients (1,X) of named controls; a name without _L/_R sets both sides.
 
     Raises:
         HeadModelError: a name that the model does not have.
@@ -58,7 +58,7 @@ def expression_vector(model: HeadModel, controls: Mapping[str, float]) -> torch.
 
 
 def vertex_colors(model: HeadModel) -> Array:
-    """Base colours (V,3), linear, by region."""
+    """Return base colours (V,3), linear, by region."""
     colors = np.tile(np.array(_SKIN), (len(model.template), 1))
     for region, color in _COLORS.items():
         if region in model.regions:
@@ -78,7 +78,7 @@ def render_preview(
     span: float = 0.34,
     center: tuple[float, float, float] = (0.0, -0.012, 0.0),
 ) -> Array:
-    """Picture (size,size,3) uint8 sRGB of posed vertices.
+    """Render posed vertices: picture (size,size,3) uint8 sRGB.
 
     Args:
         model: The head whose faces and regions are used.
@@ -86,7 +86,7 @@ def render_preview(
         yaw: Degrees the camera goes round to the subject's left.
         pitch: Degrees the camera goes up.
         size: Side of the picture, pixels.
-        supersample: Rays a pixel and axis.
+        supersample: Rays per pixel and axis.
         colors: (V,3) linear base colours; by region if None.
         span: Metres across the picture at the head's centre.
         center: Point looked at, metres.
@@ -155,7 +155,7 @@ def _shade(
 def contact_sheet(
     model: HeadModel, yaws: tuple[float, ...] = (0.0, 40.0, 90.0), size: int = 256
 ) -> Array:
-    """One row a pose of POSES, one column a yaw: picture (rows*size, columns*size, 3) uint8."""
+    """Render one row per pose of POSES and one column per yaw: picture (H, W, 3) uint8."""
     rows = []
     known = set(model.expression_names) | {name[:-2] for name in model.expression_names}
     for controls, opening in POSES.values():

@@ -123,7 +123,7 @@ def _searches(width: int, height: int, smallest: float) -> Iterator[list[np.ndar
 
 
 def _windows(width: int, height: int, side: float, turn: float) -> list[np.ndarray]:
-    """Windows of one size and turn (radians) that overlap and cover a frame."""
+    """Return windows of one size and turn (radians) that overlap and cover a frame."""
     rows = []
     for length in (height, width):
         room = max(0.0, length - side)
@@ -135,7 +135,7 @@ def _windows(width: int, height: int, side: float, turn: float) -> list[np.ndarr
 def _refined(
     net: LandmarkNet, pyramid: list[np.ndarray], place: _Place, refinements: int
 ) -> _Place:
-    """The place as nearer looks see it."""
+    """Refine a place by looking at nearer crops."""
     for _ in range(refinements - 1):
         refined = _run(net, pyramid, [window_about(place.points)])[0]
         if refined.score < KEEP_SHARE * place.score:
@@ -213,7 +213,7 @@ def window_about(points: np.ndarray) -> np.ndarray:
 
 
 def _pyramid(image: np.ndarray) -> list[np.ndarray]:
-    """The image and its halvings down to about the crop's size."""
+    """Return the image and its halvings down to about the crop's size."""
     levels = [image]
     while max(levels[-1].shape[:2]) > 2 * CROP and min(levels[-1].shape[:2]) > 1:
         height, width = levels[-1].shape[:2]
@@ -223,7 +223,7 @@ def _pyramid(image: np.ndarray) -> list[np.ndarray]:
 
 
 def _sample(pyramid: list[np.ndarray], window: np.ndarray) -> np.ndarray:
-    """Crop (128, 128, 3) uint8 of the level whose resolution fits the window."""
+    """Cut a crop (128, 128, 3) uint8 out of the level whose resolution fits the window."""
     step = np.sqrt(abs(np.linalg.det(window[:, :2])))
     level = int(np.clip(np.floor(np.log2(max(step, 1e-6)) + 0.5), 0, len(pyramid) - 1))
     height, width = pyramid[0].shape[:2]
@@ -258,7 +258,7 @@ def _run(net: LandmarkNet, pyramid: list[np.ndarray], windows: list[np.ndarray])
 
 
 def _mean_view(places: list[_Place]) -> _Place:
-    """Mean of several views of the same place; their spread adds to the expected error."""
+    """Average several views of the same place; their spread adds to the expected error."""
     points = np.stack([place.points for place in places])
     mean = points.mean(0)
     spread = np.linalg.norm(points - mean, axis=2).mean(0)

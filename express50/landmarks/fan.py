@@ -45,7 +45,7 @@ def load_fan(path: Path) -> torch.jit.ScriptModule:
 
 
 def find_with_fan(fan: torch.jit.ScriptModule, image: np.ndarray, face: Detection) -> Detection:
-    """Points by FAN in the place of a found face; its score is kept.
+    """Find a detected face's points with FAN; its score is kept.
 
     Confidence is the height of a point's heat map; sigma is its spread, a pixel of it at the least.
 
@@ -81,7 +81,7 @@ def fan_window(points: np.ndarray) -> np.ndarray:
 
 
 def _heat(fan: torch.jit.ScriptModule, batch: torch.Tensor) -> torch.Tensor:
-    """Heat maps; a stack of several hourglasses answers with a list, whose last counts."""
+    """Run FAN; a stack of several hourglasses answers with a list, whose last heat maps count."""
     output = fan(batch)
     return output[-1] if isinstance(output, list | tuple) else output
 

@@ -98,7 +98,7 @@ def _find(
 
 
 def _opening(crop_from_image: np.ndarray, ring: np.ndarray) -> np.ndarray:
-    """Mask (SIDE, SIDE) float32 of the opening between the lids, a little widened."""
+    """Return mask (SIDE, SIDE) float32 of the opening between the lids, a little widened."""
     inside = ring @ crop_from_image[:2, :2].T + crop_from_image[:2, 2]
     mask = np.zeros((SIDE, SIDE), np.uint8)
     cv2.fillPoly(mask, [np.round(inside).astype(np.int32)], 1)
@@ -129,7 +129,7 @@ def _disc(crop: np.ndarray, mask: np.ndarray) -> tuple[np.ndarray, float, float]
 
 
 def _kernels(radius: float) -> tuple[np.ndarray, np.ndarray]:
-    """Disc and ring, each summing to one."""
+    """Return disc and ring, each summing to one."""
     reach = int(np.ceil(RING * radius))
     grid = np.arange(-reach, reach + 1)
     distance = np.hypot(grid[:, None], grid)
@@ -139,7 +139,7 @@ def _kernels(radius: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _peak(score: np.ndarray, row: int, column: int) -> np.ndarray:
-    """Offset (2,) x, y of a parabola's top through the best place and its neighbours."""
+    """Return the offset (2,) x, y of a parabola's top through the best place and its neighbours."""
     offset = np.zeros(2)
     for axis, (at, size) in enumerate(((column, SIDE), (row, SIDE))):
         if not 0 < at < size - 1:

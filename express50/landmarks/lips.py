@@ -30,7 +30,7 @@ SIGMA = 0.02
 
 
 def open_lips(image: np.ndarray, seen: Detection) -> Detection:
-    """The detection with inner lips apart where the image shows an opening.
+    """Part a detection's inner lips where the image shows an opening.
 
     Args:
         image: (H, W, 3) uint8 RGB.
@@ -89,7 +89,7 @@ def _openings(crop: np.ndarray, points: np.ndarray) -> list[tuple[float, float]]
 
 
 def _longest(flags: np.ndarray) -> tuple[int, int] | None:
-    """First and past-the-last index of the longest run of True."""
+    """Return first and past-the-last index of the longest run of True."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], flags.astype(int), [0]])))
     if not len(edges):
         return None

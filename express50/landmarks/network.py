@@ -41,7 +41,7 @@ COUNTERS = "num_batches_tracked"
 
 
 def face_box(points: np.ndarray) -> tuple[np.ndarray, float]:
-    """Centre (2,) and side of the square that the detector crops about landmarks (68, 2)."""
+    """Return centre (2,) and side of the square that the detector crops about landmarks (68, 2)."""
     low, high = points.min(0), points.max(0)
     return 0.5 * (low + high), CROP_MARGIN * float((high - low).max())
 
@@ -90,7 +90,7 @@ class ShapeHead(nn.Module):
     def forward(
         self, points: torch.Tensor, variance: torch.Tensor, features: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Points (B, P, 2), log scales (B, P) and visibility logits (B, P)."""
+        """Return points (B, P, 2), log scales (B, P) and visibility logits (B, P)."""
         spread = variance.clamp_min(1e-2).log()
         place = (points - points.mean(1, keepdim=True)) / (0.25 * CROP)
         look = functional.relu(self.look(features))
@@ -150,7 +150,7 @@ def _twice(x: torch.Tensor) -> torch.Tensor:
 
 
 def _expectation(heat: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Mean position (B, P, 2) in crop pixels and variance (B, P) of softmax heat maps."""
+    """Return mean position (B, P, 2) in crop pixels and variance (B, P) of softmax heat maps."""
     batch, points, height, width = heat.shape
     share = functional.softmax(heat.reshape(batch, points, -1), -1).reshape(heat.shape)
     axis = torch.from_numpy(cell_centres(width) / width).to(heat)

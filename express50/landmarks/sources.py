@@ -44,7 +44,7 @@ Source = Callable[[np.ndarray, str, int], Marked]
 
 
 def source_files(landmarks: str) -> dict[str, Path]:
-    """Files that a source reads, by name: they belong to what a stage's output depends on.
+    """List files that a source reads, by name: they belong to what a stage's output depends on.
 
     Args:
         landmarks: `embedded`, `fan:PATH` or the path of a file of points.
@@ -104,7 +104,7 @@ def open_source(
 
 
 def given_detection(rows: np.ndarray) -> Detection:
-    """A detection of given points.
+    """Make a detection of given points.
 
     Args:
         rows: (68, 3) pixels x, y and confidence 0..1; NaN in x or y where a point is unknown.
@@ -124,7 +124,7 @@ def given_detection(rows: np.ndarray) -> Detection:
 
 
 def given_irises(rows: np.ndarray, face: Detection) -> Irises:
-    """Irises of given points (70, 3): the subject's left one, then the right."""
+    """Make irises of given points (70, 3): the subject's left one, then the right."""
     found = rows[POINTS : POINTS + IRISES]
     known = np.isfinite(found[:, :2]).all(1) & (found[:, 2] > 0)
     width = [np.linalg.norm(face.points[a] - face.points[b]) for a, b in ((45, 42), (39, 36))]
@@ -136,7 +136,7 @@ def given_irises(rows: np.ndarray, face: Detection) -> Irises:
 
 
 def _no_face(image: np.ndarray) -> Marked:
-    """No face: the score is 0."""
+    """Return a face of score 0, where there is none."""
     middle = np.array([image.shape[1], image.shape[0]]) / 2
     face = Detection(np.tile(middle, (POINTS, 1)), np.full(POINTS, np.inf), np.zeros(POINTS), 0.0)
     irises = Irises(np.tile(middle, (2, 1)), np.full(2, np.inf), np.zeros(2))
@@ -152,7 +152,7 @@ Table = dict[tuple[str, int], np.ndarray]
 
 
 def read_points(path: Path, cameras: Mapping[str, Camera]) -> Table:
-    """Points by camera and frame, undistorted.
+    """Read points by camera and frame, undistorted.
 
     Args:
         path: .npz or .json.
@@ -223,7 +223,7 @@ def _read_json(path: Path) -> Table:
 
 
 def _checked(rows: np.ndarray, camera: Camera, path: Path, key: tuple[str, int]) -> np.ndarray:
-    """The rows, if they can be used."""
+    """Return the rows, or raise FormatError if they cannot be used."""
     where = f"{path}: camera {key[0]}, frame {key[1]}"
     if rows.ndim != 2 or rows.shape[0] not in (POINTS, POINTS + IRISES) or rows.shape[1] != 3:
         raise FormatError(

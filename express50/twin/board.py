@@ -34,7 +34,7 @@ class BoardSpec:
     dictionary: str = "DICT_4X4_50"
 
     def toml(self) -> str:
-        """Content of board.toml."""
+        """Return content of board.toml."""
         return (
             f"squares_x = {self.squares_x}\nsquares_y = {self.squares_y}\n"
             f"square_length_m = {self.square_length_m}\nmarker_length_m = {self.marker_length_m}\n"
@@ -43,14 +43,14 @@ class BoardSpec:
 
 
 def corner_points(spec: BoardSpec) -> np.ndarray:
-    """Inner corners (N, 3) in board space: metres, x right, y down, z into the board."""
+    """Return inner corners (N, 3) in board space: metres, x right, y down, z into the board."""
     x, y = np.meshgrid(np.arange(1, spec.squares_x), np.arange(1, spec.squares_y))
     flat = np.stack([x.ravel(), y.ravel(), 0 * x.ravel()], axis=1)
     return flat * spec.square_length_m
 
 
 def board_poses(spec: BoardSpec, count: int, seed: int) -> list[np.ndarray]:
-    """``world_from_board`` (4, 4) of every synchronised frame.
+    """Return ``world_from_board`` (4, 4) of every synchronised frame.
 
     The board turns through the rig's arc twice in golden-section order, so that every camera sees
     it several times and neighbours see it together, whatever the count.
@@ -76,7 +76,7 @@ def _about_y(angle: float) -> np.ndarray:
 
 
 def board_pattern(spec: BoardSpec) -> np.ndarray:
-    """The printed pattern (H, W) float32, 0 to 1, white margin included."""
+    """Return the printed pattern (H, W) float32, 0 to 1, white margin included."""
     dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, spec.dictionary))
     size = (spec.squares_x, spec.squares_y)
     board = cv2.aruco.CharucoBoard(size, spec.square_length_m, spec.marker_length_m, dictionary)
@@ -119,7 +119,7 @@ def render_board(
 
 
 def _rows_of(spec: BoardSpec, world_from_board: np.ndarray, camera: Camera) -> tuple[float, float]:
-    """First and last row that the board can reach; none when the camera is behind it."""
+    """Return the first and last row that the board can reach; none when the camera is behind it."""
     if world_from_board[:3, 2] @ (camera.center - world_from_board[:3, 3]) >= 0:
         return math.inf, -math.inf
     width, height = spec.squares_x, spec.squares_y
@@ -165,7 +165,7 @@ _HIGHEST = 0.95  # elevation up to which the wall is painted, radians; cameras s
 
 
 def room_width(camera: Camera) -> int:
-    """Texels around the room that suit a camera; out of focus; 2048 or 4096."""
+    """Return texels around the room that suit a camera; out of focus; 2048 or 4096."""
     wanted = 2 * np.pi * camera.K[0, 0] * 0.35
     return int(np.clip(2 ** np.round(np.log2(wanted)), 2048, 4096))
 
@@ -173,7 +173,7 @@ def room_width(camera: Camera) -> int:
 def background(
     seed: int, origin: np.ndarray, directions: np.ndarray, width: int = 2048
 ) -> np.ndarray:
-    """Linear colours (N, 3) of rays that miss the subject.
+    """Return linear colours (N, 3) of rays that miss the subject.
 
     Args:
         seed: the studio's seed.
@@ -201,7 +201,7 @@ def background(
 
 @cache
 def _room(seed: int, width: int) -> np.ndarray:
-    """The room's wall (H, W, 3) float32, by azimuth and elevation from its middle."""
+    """Return the room's wall (H, W, 3) float32, by azimuth and elevation from its middle."""
     rng = random_stream(seed, 201)
     height = 2 * round(width * _HIGHEST / (2 * np.pi))
     az = (cell_centres(width) / width * 2 * np.pi - np.pi).astype(np.float32)
@@ -221,14 +221,14 @@ def _room(seed: int, width: int) -> np.ndarray:
 
 
 def _felt(rng: np.random.Generator, az: np.ndarray, el: np.ndarray) -> np.ndarray:
-    """Blotches (H, W) of the wall; made at half size, they are smooth."""
+    """Return blotches (H, W) of the wall; made at half size, they are smooth."""
     points = spherical_to_unit(*np.meshgrid(az[::2], el[::2])).reshape(-1, 3) * RADIUS_M
     grain = 1 + 0.16 * fractal(points, make_lattice(rng), 0.55, 4, 0.55)
     return cv2.resize(grain.reshape(len(el) // 2, len(az) // 2), (len(az), len(el)))
 
 
 def _panels(az: np.ndarray, el: np.ndarray, lattice: np.ndarray) -> np.ndarray:
-    """Brightness (H, W) of felt panels with dark seams; each panel is a little different."""
+    """Return brightness (H, W) of felt panels with dark seams; each panel is a little different."""
     columns, rows = az / (2 * np.pi) * 22, (el + 0.5 * np.pi) / np.pi * 9
     seam_x = smoothstep(np.abs(columns - np.round(columns)) / 22, 0.0004, 0.0016)
     seam_y = smoothstep(np.abs(rows - np.round(rows)) / 18, 0.0004, 0.0016)
@@ -238,12 +238,12 @@ def _panels(az: np.ndarray, el: np.ndarray, lattice: np.ndarray) -> np.ndarray:
 
 
 def _around(az: np.ndarray, centre: float | np.ndarray) -> np.ndarray:
-    """Angle from a centre, wrapped to [-pi, pi)."""
+    """Return angle from a centre, wrapped to [-pi, pi)."""
     return (az - centre + np.pi) % (2 * np.pi) - np.pi
 
 
 def _pole(rng: np.random.Generator, wall: np.ndarray, az: np.ndarray, el: np.ndarray) -> None:
-    """A steel stand with rounded shading; edits ``wall``."""
+    """Paint a steel stand with rounded shading; edits ``wall``."""
     centre, half = rng.uniform(-np.pi, np.pi), rng.uniform(0.006, 0.016)
     lean, metal, tint = rng.uniform(-0.08, 0.08), rng.uniform(0.05, 0.4), rng.uniform(0.9, 1.1, 3)
     near = np.flatnonzero(np.abs(_around(az, centre)) < 0.14 + 2 * half)
@@ -254,7 +254,7 @@ def _pole(rng: np.random.Generator, wall: np.ndarray, az: np.ndarray, el: np.nda
 
 
 def _cable(rng: np.random.Generator, wall: np.ndarray, az: np.ndarray, el: np.ndarray) -> None:
-    """A sagging cable; edits ``wall``."""
+    """Paint a sagging cable; edits ``wall``."""
     base, waves = rng.uniform(-0.6, 0.7), rng.integers(2, 6)
     line = base + 0.12 * np.abs(np.sin(0.5 * waves * az + rng.uniform(0, 6)))
     rows = np.flatnonzero((el > base - 0.01) & (el < base + 0.13))
@@ -263,7 +263,7 @@ def _cable(rng: np.random.Generator, wall: np.ndarray, az: np.ndarray, el: np.nd
 
 
 def _lamp(rng: np.random.Generator, wall: np.ndarray, az: np.ndarray, el: np.ndarray) -> None:
-    """A bright or dark box: a light, a camera housing; edits ``wall``."""
+    """Paint a bright or dark box: a light, a camera housing; edits ``wall``."""
     centre, level = rng.uniform(-np.pi, np.pi), rng.uniform(-0.5, 0.6)
     w, h = rng.uniform(0.03, 0.09, 2)
     bright = rng.uniform(0.45, 0.75) if rng.uniform() < 0.4 else rng.uniform(0.03, 0.12)

@@ -77,7 +77,7 @@ class Body:
 
 
 def build_body(model: HeadModel, subject: TwinSubject, seed: int, hair_detail: float = 1.0) -> Body:
-    """Everything of a subject that no frame changes; a hair detail of 0 makes it bald."""
+    """Build what no frame changes of a subject; a hair detail of 0 makes it bald."""
     template = model.template.double().numpy()
     faces = model.faces.numpy().astype(np.int32)
     centre = head_centre(model)
@@ -139,7 +139,7 @@ def assemble(
 
 
 def model_materials(model: HeadModel) -> np.ndarray:
-    """Material (V,) uint8 of each head vertex, from the model's regions."""
+    """Return material (V,) uint8 of each head vertex, from the model's regions."""
     labels = np.full(len(model.template), Material.SKIN, np.uint8)
     named = np.zeros(len(labels), dtype=bool)
     for mask in model.regions.values():
@@ -158,7 +158,7 @@ def model_materials(model: HeadModel) -> np.ndarray:
 
 
 def head_centre(model: HeadModel) -> np.ndarray:
-    """A point (3,) inside the skull from which face, scalp and ears are all seen."""
+    """Find a point (3,) inside the skull from which face, scalp and ears are all seen."""
     template = model.template.double().numpy()
     head = template[(model.regions["face"] | model.regions["scalp"]).numpy()]
     joints = model.joint_regressor.double().numpy() @ template
@@ -167,7 +167,7 @@ def head_centre(model: HeadModel) -> np.ndarray:
 
 
 def neutral_vertices(model: HeadModel, subject: TwinSubject) -> np.ndarray:
-    """Rest vertices (V, 3) of a subject without expression, float64 metres."""
+    """Return rest vertices (V, 3) of a subject without expression, float64 metres."""
     dirs = model.shape_dirs.double().numpy()
     return model.template.double().numpy() + dirs @ subject.shape + subject.offsets
 
@@ -175,7 +175,7 @@ def neutral_vertices(model: HeadModel, subject: TwinSubject) -> np.ndarray:
 def head_vertices(
     model: HeadModel, subject: TwinSubject, play: TwinPerformance, frame: int
 ) -> np.ndarray:
-    """Vertices (V, 3) of the posed head model in the world, metres."""
+    """Return vertices (V, 3) of the posed head model in the world, metres."""
 
     def row(array: np.ndarray) -> torch.Tensor:
         return torch.from_numpy(np.asarray(array, dtype=np.float32))[None]
@@ -235,7 +235,7 @@ def _no_hair() -> HairMesh:
 def _shoulders(
     rest: np.ndarray, skin_faces: np.ndarray, boundary: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """A shirt (N, 3) with faces (M, 3) that flares from a collar around the neck's open end."""
+    """Make a shirt (N, 3), faces (M, 3), that flares from a collar around the neck's end."""
     loop = rest[boundary]
     low, high = loop.min(0), loop.max(0)
     centre, half = 0.5 * (low + high), 0.5 * (high - low)
@@ -263,7 +263,7 @@ def _shoulders(
 def _outside(
     points: np.ndarray, centre: np.ndarray, vertices: np.ndarray, faces: np.ndarray
 ) -> np.ndarray:
-    """Points (N, 3) pushed level away from the neck's axis until they clear the skin."""
+    """Push points (N, 3) level away from the neck's axis until they clear the skin."""
     level = (points - centre) * (1.0, 0.0, 1.0)
     radius = np.linalg.norm(level, axis=1, keepdims=True)
     out = level / np.maximum(radius, 1e-6)

@@ -67,7 +67,7 @@ def record_command(args: argparse.Namespace) -> int:
 
 
 def config_from(args: argparse.Namespace) -> TwinConfig:
-    """The configuration that the command line asks for."""
+    """Return the configuration that the command line asks for."""
     ids = None
     if args.expressions:
         ids = tuple(part.strip() for part in args.expressions.split(",") if part.strip())

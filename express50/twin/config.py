@@ -29,7 +29,7 @@ class TwinConfig:
     frames_per_expression: int = 8
     "Frames of each cue window, at least 4."
     fps: float = 24.0
-    "Frames a second written to the capture."
+    "Frames per second written to the capture."
     seed: int = 0
     "Seed of everything random."
     footage: str = "video"
@@ -74,12 +74,12 @@ class TwinConfig:
             )
 
     def subject_ids(self) -> list[str]:
-        """Ids of the subjects, such as S001."""
+        """Return ids of the subjects, such as S001."""
         return [f"S{self.first_subject + n:03d}" for n in range(self.subjects)]
 
 
 def subject_number(subject: str) -> int:
-    """Number of a subject id such as S001; it seeds everything about the subject.
+    """Return the number of a subject id such as S001; it seeds everything about the subject.
 
     Raises:
         ConfigError: the id is not of that form.

@@ -92,7 +92,7 @@ def _roots(
     scalp: np.ndarray,
     count: int,
 ) -> np.ndarray:
-    """Root points (N, 3), even over the scalp's area."""
+    """Return root points (N, 3), even over the scalp's area."""
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1) * scalp[faces].mean(1) ** 2
     chosen = rng.choice(len(faces), size=count, p=area / area.sum())
@@ -105,7 +105,7 @@ def _roots(
 def _march(
     rng: np.random.Generator, roots: np.ndarray, star: StarMap, style: HairStyle, length: float
 ) -> np.ndarray:
-    """Strand points (N, steps + 1, 3) from the roots on."""
+    """Return strand points (N, steps + 1, 3) from the roots on."""
     count = len(roots)
     layer = style.lift * rng.uniform(0.08, 1.0, count) ** 1.2
     stray = rng.uniform(size=count) < 0.07
@@ -131,7 +131,7 @@ def _march(
 
 
 def _flow(at: np.ndarray, out: np.ndarray, star: StarMap, style: HairStyle) -> np.ndarray:
-    """Direction (N, 3) in which hair runs at points (N, 3), along the surface."""
+    """Return direction (N, 3) in which hair runs at points (N, 3), along the surface."""
     crown = unit(np.array([0.0, 0.9, -0.45]))
     away = unit(out * (out @ crown)[:, None] - crown)
     flow = style.away * away
@@ -149,7 +149,7 @@ def _flow(at: np.ndarray, out: np.ndarray, star: StarMap, style: HairStyle) -> n
 
 
 def _lay(at: np.ndarray, star: StarMap, height: np.ndarray) -> np.ndarray:
-    """Points (N, 3) moved to their layer above the surface; low down only pushed outwards."""
+    """Move points (N, 3) to their layer above the surface; low down only outwards."""
     relative = at - star.centre
     distance = np.linalg.norm(relative, axis=1)
     out = relative / np.maximum(distance, 1e-9)[:, None]

@@ -8,7 +8,7 @@ LATTICE = 32
 
 
 def make_lattice(rng: np.random.Generator) -> np.ndarray:
-    """Random values (32, 32, 32) in [-1, 1], float32, that :func:`noise` interpolates."""
+    """Return random values (32, 32, 32) in [-1, 1], float32, that :func:`noise` interpolates."""
     return rng.uniform(-1.0, 1.0, (LATTICE,) * 3).astype(np.float32)
 
 

@@ -93,7 +93,7 @@ def perform(
 
 
 def gaze_rotation(gaze: np.ndarray) -> np.ndarray:
-    """Eye rotations (F, 3, 3) of yaw to the subject's left (+x) and pitch upwards (F, 2)."""
+    """Return eye rotations (F, 3, 3) of yaw to the subject's left (+x) and pitch upwards (F, 2)."""
     zero = np.zeros(len(gaze))
     yaw = axis_angle_to_matrix(np.stack([zero, gaze[:, 0], zero], axis=1))
     pitch = axis_angle_to_matrix(np.stack([-gaze[:, 1], zero, zero], axis=1))
@@ -111,7 +111,7 @@ def _check_names(model: HeadModel, script: Sequence[Expression]) -> None:
 
 
 def _envelope(rng: np.random.Generator, count: int, fps: float) -> tuple[int, np.ndarray]:
-    """Peak index and strength (count,), 1 at the peak and less everywhere else."""
+    """Draw a peak's index and strength (count,), 1 at the peak and less everywhere else."""
     low, high = max(1, round(0.3 * count)), max(2, round(0.72 * count))
     peak = int(rng.integers(low, min(high, count - 2) + 1))
     # Both ends of the window are near rest; a movement rarely takes over half a second.
@@ -125,7 +125,7 @@ def _envelope(rng: np.random.Generator, count: int, fps: float) -> tuple[int, np
 
 
 def _played(rng: np.random.Generator, entry: Expression, names: dict[str, int]) -> np.ndarray:
-    """The coefficients (X,) of this subject's version of an expression at its peak."""
+    """Return the coefficients (X,) of this subject's version of an expression at its peak."""
     out = np.zeros(len(names))
     strength = rng.uniform(0.78, 1.05)
     for name, value in entry.controls.items():
@@ -158,7 +158,7 @@ def _blink(
 
 
 def _fidget(rng: np.random.Generator, count: int, fps: float, names: dict[str, int]) -> np.ndarray:
-    """Small unrest (F, X) of a face that is not performing."""
+    """Draw the small movements (F, X) of a face that is not performing."""
     out = np.zeros((count, len(names)))
     for name in ("mouthPress_L", "mouthPress_R", "browInnerUp_L", "browDown_R", "mouthSmile_L"):
         if name in names:
@@ -179,7 +179,7 @@ def _wander(rng: np.random.Generator, count: int, fps: float) -> np.ndarray:
 def _sway(
     rng: np.random.Generator, model: HeadModel, count: int, fps: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Placement of the head in the world: turned about the neck joint, near the rig's target."""
+    """Place the head in the world: turned about the neck joint, near the rig's target."""
     template = model.template.double().numpy()
     head = (model.regions["face"] | model.regions["scalp"]).numpy()
     centre = 0.5 * (template[head].min(0) + template[head].max(0))

@@ -185,7 +185,7 @@ def _check_settings(config: TwinConfig, out: Path) -> None:
 
 
 def print_progress(stream=sys.stderr, every: float = 10.0) -> Callable[[int, int], None]:  # noqa: ANN001
-    """A reporter for :func:`record`: a line that rewrites itself, or plain lines now and then."""
+    """Make a reporter for :func:`record`: one line that rewrites itself, or plain lines."""
     start = last = time.monotonic()
     live = stream.isatty()
 

@@ -1,6 +1,6 @@
 """Rendering by ray casting: colour, alpha and depth of a frame in any camera.
 
-One ray a pixel finds where there is detail; only there further rays are cast: many where the
+One ray per pixel finds where there is detail; only there further rays are cast: many where the
 silhouette or hair makes alpha fractional, a few inside. Images are made in bands of rows, so that
 memory does not grow with the image.
 """
@@ -27,7 +27,7 @@ _DEPTH_STEP = 0.004  # metres between neighbours that count as an edge inside th
 
 @dataclass(frozen=True, kw_only=True)
 class Sampling:
-    """Rays a pixel: at silhouettes and loose hair, and at detail inside the silhouette.
+    """Rays per pixel: at silhouettes and loose hair, and at detail inside the silhouette.
 
     Sparing rays, silhouette pixels where the first third agree get no more.
     """
@@ -59,7 +59,7 @@ class RowBand:
 
 
 def bands(camera: Camera) -> Iterator[RowBand]:
-    """The image in bands of at most ``BAND_PIXELS`` pixels, top to bottom."""
+    """Split the image into bands of at most ``BAND_PIXELS`` pixels, top to bottom."""
     rows = max(1, BAND_PIXELS // camera.width)
     for top in range(0, camera.height, rows):
         bottom = min(top + rows, camera.height)
@@ -85,7 +85,7 @@ def render_bands(
     sampling: Sampling,
     shade: Shade | None,
 ) -> tuple[np.ndarray, np.ndarray, tuple[int, int, int, int]] | None:
-    """Premultiplied colour and alpha of one band, where the subject may be.
+    """Render premultiplied colour and alpha of one band, where the subject may be.
 
     Args:
         caster: compiled geometry.
@@ -201,7 +201,7 @@ def _refine(
 def _cast_more(
     caster: Caster, pixels: Pixels, places: tuple[np.ndarray, np.ndarray], shade: Shade | None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Sums over places in the pixel: colour (N, 3) and hits (N,)."""
+    """Cast rays at places in the pixels; return sums of colour (N, 3) and hits (N,)."""
     centre, right, down = (part[pixels.index] for part in pixels.flat)
     u, v = (place[:, None, None] for place in places)
     directions = (centre + u * right + v * down).reshape(-1, 3)
@@ -219,7 +219,7 @@ def _cast_more(
 
 
 def ray_pattern(count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Places (count,) in a pixel, from -0.5 up, even in x, in y and over the pixel.
+    """Return places (count,) in a pixel, from -0.5 up, even in x, in y and over the pixel.
 
     Rank-1 lattice: every row and every column of a count x count grid holds one ray. Number
     ``count // 2`` is the centre.
@@ -240,7 +240,7 @@ def hull_of(vertices: np.ndarray) -> np.ndarray:
 
 
 def window_of(camera: Camera, vertices: np.ndarray) -> tuple[int, int, int, int]:
-    """Columns and rows x0, y0, x1, y1 that hold all of some vertices (N, 3), with a margin.
+    """Return columns and rows x0, y0, x1, y1 that hold all of some vertices (N, 3), with a margin.
 
     The corners of the convex hull (:func:`hull_of`) are enough.
     """
@@ -260,7 +260,7 @@ def window_of(camera: Camera, vertices: np.ndarray) -> tuple[int, int, int, int]
 def render_alpha(
     caster: Caster, material: np.ndarray, vertices: np.ndarray, camera: Camera, count: int = 33
 ) -> np.ndarray:
-    """Alpha (H, W) float32 in [0, 1] of geometry in a camera."""
+    """Render the alpha (H, W) float32 in [0, 1] of geometry in a camera."""
     alpha = np.zeros((camera.height, camera.width), np.float32)
     window = window_of(camera, hull_of(vertices))
     sampling = Sampling(edge=count, inside=1, sparing=False)

@@ -18,7 +18,7 @@ _RINGS_DEG = (4.0, 21.0, -13.0, 11.0, 28.0, -4.0)
 
 
 def make_rig(count: int, width: int, height: int, seed: int) -> dict[str, Camera]:
-    """Cameras cam00... by id, distorted (COLMAP's OPENCV model), in the true world.
+    """Draw cameras cam00... by id, distorted (COLMAP's OPENCV model), in the true world.
 
     The rig belongs to the seed alone: every subject is recorded by the same cameras. Camera 0 is
     the leftmost as the subject sees it; the world's y is up and subjects look along +z.
@@ -52,7 +52,7 @@ def make_rig(count: int, width: int, height: int, seed: int) -> dict[str, Camera
 def _intrinsics(
     rng: np.random.Generator, radius: float, width: int, height: int
 ) -> tuple[float, ...]:
-    """Focal lengths, principal point and distortion of one lens, COLMAP's OPENCV order."""
+    """Draw focal lengths, principal point and distortion of one lens, COLMAP's OPENCV order."""
     short = min(width, height)
     focal = short * radius / FRAME_M * (1.0 + rng.uniform(-0.02, 0.02))
     aspect = 1.0 + rng.uniform(-0.0015, 0.0015)

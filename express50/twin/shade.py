@@ -1,7 +1,7 @@
 """Light and materials: what colour a ray sees where it meets the subject.
 
 Everything is linear light in float32. Lights are soft boxes far away; how much of each, and of the
-ambient light, reaches a vertex is found by casting rays once a frame and shared by all cameras.
+ambient light, reaches a vertex is found by casting rays once per frame and shared by all cameras.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ class TwinEyes:
 
 
 def find_eyes(model: HeadModel) -> TwinEyes:
-    """Centres of a head model's eyeballs and radii of their irises."""
+    """Find the centres of a head model's eyeballs and the radii of their irises."""
     template = model.template.double().numpy()
     centres, axes, angles = [], [], []
     for side in ("left", "right"):
@@ -129,7 +129,7 @@ def build_scene(
 def _light_at(
     caster: Caster, points: np.ndarray, normals: np.ndarray, lighting: Lighting
 ) -> np.ndarray:
-    """Share (N, 1 + L) of the ambient light and of each soft box that reaches points."""
+    """Return share (N, 1 + L) of the ambient light and of each soft box that reaches points."""
     count, starts = len(points), points + 6e-4 * normals
     out = np.empty((count, 1 + len(lighting.directions)), np.float32)
     helper = np.where(np.abs(normals[:, 1:2]) < 0.9, [[0.0, 1.0, 0.0]], [[1.0, 0.0, 0.0]])
@@ -161,7 +161,7 @@ def _light_at(
 def _diffuse(
     lighting: Lighting, normals: np.ndarray, reach: np.ndarray, skin: np.ndarray
 ) -> np.ndarray:
-    """Diffuse light (N, 3) at vertices; over skin (N, 1) it bleeds round the terminator."""
+    """Return diffuse light (N, 3) at vertices; over skin (N, 1) it bleeds round the terminator."""
     up = 0.5 + 0.5 * normals[:, 1:2]
     total = (lighting.ground * (1 - up) + lighting.sky * up) * reach[:, :1]
     bleed = _BLEED * skin
@@ -177,7 +177,7 @@ def _diffuse(
 def shade(
     scene: LitScene, directions: np.ndarray, face: np.ndarray, bary: np.ndarray
 ) -> np.ndarray:
-    """Linear colour (N, 3) of hits.
+    """Return linear colour (N, 3) of hits.
 
     Args:
         scene: the frame.
@@ -231,7 +231,7 @@ def _surface(
 
 
 def _eye_albedo(scene: LitScene, place: np.ndarray) -> np.ndarray:
-    """Iris, pupil and sclera (N, 3) by the angle from the optical axis."""
+    """Return iris, pupil and sclera (N, 3) by the angle from the optical axis."""
     eyes = scene.eyes
     side = (place[:, 0] < 0).astype(np.int32)  # the left eye is at +x
     out = unit(place - eyes.centres[side])
@@ -261,7 +261,7 @@ def _lit(
     gloss: np.ndarray | float,
     power: float,
 ) -> np.ndarray:
-    """Diffuse light, found at the vertices, and Phong's highlight with Fresnel's rise."""
+    """Light hits by the vertices' diffuse light and Phong's highlight with Fresnel's rise."""
     cosine = dot(n, v)
     mirrored = 2.0 * cosine * n - v
     lobes = np.clip(mirrored @ lighting.directions.T, 0.0, 1.0) ** np.float32(0.25 * power)

@@ -33,13 +33,13 @@ class SkinTexture:
 
 
 def texture_width(image_short_side: int) -> int:
-    """Texels around the head so that one is about as wide as a pixel of the images."""
+    """Return texels around the head so that one is about as wide as a pixel of the images."""
     wanted = 2 * np.pi * 0.1 / 0.43 * image_short_side * 1.2
     return int(np.clip(2 ** np.ceil(np.log2(wanted)), 256, 4096))
 
 
 def sample_skin(texture: SkinTexture, points: np.ndarray) -> np.ndarray:
-    """Bilinear samples (N, 4) at places (N, 3) on the mean head."""
+    """Return bilinear samples (N, 4) at places (N, 3) on the mean head."""
     height, width = texture.pixels.shape[:2]
     az, el = unit_to_spherical(points - texture.centre.astype(np.float32))
     x = (az * np.float32(0.5 / np.pi) + np.float32(0.5)) * width - np.float32(0.5)
@@ -70,7 +70,7 @@ def paint_skin(body: Body, seed: int, width: int) -> SkinTexture:
 
 
 def _paint_band(body: Body, seed: int, width: int, height: int, y0: int, y1: int) -> np.ndarray:
-    """Texels (N, 4) of rows y0 to y1."""
+    """Return texels (N, 4) of rows y0 to y1."""
     model, look = body.model, body.subject.look
     points, masks = _surface_at(body, width, height, y0, y1)
     rng = random_stream(seed, body.subject.number, 8)
@@ -103,7 +103,7 @@ def _paint_band(body: Body, seed: int, width: int, height: int, y0: int, y1: int
 def _surface_at(
     body: Body, width: int, height: int, y0: int, y1: int
 ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """Places (N, 3) on the mean head under the texels of some rows, and masks there."""
+    """Return places (N, 3) on the mean head under the texels of some rows, and masks there."""
     model = body.model
     az = (np.arange(width) + 0.5) / width * 2 * np.pi - np.pi
     el = (np.arange(y0, y1) + 0.5) / height * np.pi - 0.5 * np.pi
@@ -133,7 +133,7 @@ def _mean_landmarks(model: HeadModel) -> np.ndarray:
 
 
 def _flush(model: HeadModel, points: np.ndarray) -> np.ndarray:
-    """Redness (N,): cheeks, tip of the nose, ears, chin."""
+    """Return redness (N,): cheeks, tip of the nose, ears, chin."""
     marks = _mean_landmarks(model)
     left = 0.35 * marks[46] + 0.35 * marks[14] + 0.3 * marks[54]
     right = 0.35 * marks[41] + 0.35 * marks[2] + 0.3 * marks[48]
@@ -150,7 +150,7 @@ def _flush(model: HeadModel, points: np.ndarray) -> np.ndarray:
 
 
 def _oily(model: HeadModel, points: np.ndarray) -> np.ndarray:
-    """Shine (N,): forehead, nose."""
+    """Return shine (N,): forehead, nose."""
     marks = _mean_landmarks(model)
     brow = 0.5 * (marks[21] + marks[22]) + np.array([0.0, 0.03, 0.0])
     nose = 0.5 * (marks[28] + marks[30])
@@ -195,7 +195,7 @@ def _hairiness(
 def _beard(
     marks: np.ndarray, points: np.ndarray, masks: dict[str, np.ndarray], lattices: list[np.ndarray]
 ) -> np.ndarray:
-    """Density of stubble (N,), in dots."""
+    """Return density of stubble (N,), in dots."""
     mouth, chin = marks[[48, 54]].mean(0), marks[8]
     nose = marks[33]
     below = smoothstep(points[:, 1], nose[1] - 0.001, nose[1] - 0.012)

@@ -35,7 +35,7 @@ _KEEP_PIXELS = 4_000_000
 
 @cache
 def _head(spec: str) -> HeadModel:
-    """Loading takes seconds; a worker films several subjects."""
+    """Load a head model once: it takes seconds, and a worker films several subjects."""
     return load_head(spec)
 
 
@@ -43,7 +43,7 @@ Film = VideoFootage | ImageFootage
 
 
 def cast_subject(config: TwinConfig, subject_id: str) -> tuple[Body, TwinPerformance]:
-    """A subject's body and what it does in every frame."""
+    """Make a subject's body and its performance."""
     model, number = _head(config.head), subject_number(subject_id)
     subject = make_subject(model, subject_id, number, config.seed)
     # Strands follow the pixels: thin enough to be finer than one, not finer than can be seen.
@@ -72,11 +72,11 @@ class StudioView:
             yield band, background(self._seed, band.origin, rays, self._room).reshape(shape)
 
     def bands(self):  # noqa: ANN201
-        """Pairs of rays and the empty studio's linear picture there."""
+        """Iterate over pairs of rays and the empty studio's linear picture there."""
         return self._make() if self._kept is None else iter(self._kept)
 
     def plate(self) -> np.ndarray:
-        """The empty studio, linear (H, W, 3)."""
+        """Return the empty studio, linear (H, W, 3)."""
         return np.concatenate([plate for _, plate in self.bands()])
 
 
@@ -130,7 +130,7 @@ def film_subject(
 
 
 def render_view(scene: LitScene, view: StudioView, hull: np.ndarray) -> np.ndarray:
-    """Linear picture (H, W, 3) of a frame in one camera, before the sensor.
+    """Render the linear picture (H, W, 3) of a frame in one camera, before the sensor.
 
     ``hull`` holds the corners of the convex hull of the scene's vertices.
     """
@@ -205,7 +205,7 @@ def make_sensor(camera_index: int, seed: int) -> Sensor:
 def expose(
     sensor: Sensor, linear: np.ndarray, rng: np.random.Generator, noise: float
 ) -> np.ndarray:
-    """The 8-bit sRGB picture (H, W, 3) of linear light (H, W, 3) float32."""
+    """Expose linear light (H, W, 3) float32: the 8-bit sRGB picture (H, W, 3)."""
     height, width = linear.shape[:2]
     y = (np.arange(height, dtype=np.float32) + 0.5) / height * 2 - 1
     x = (np.arange(width, dtype=np.float32) + 0.5) / width * 2 - 1
@@ -219,7 +219,7 @@ def expose(
 
 
 def _tone(linear: np.ndarray) -> np.ndarray:
-    """Soft shoulder above the knee, so that highlights do not clip hard."""
+    """Compress light above the knee softly, so that highlights do not clip hard."""
     over = np.maximum(linear - _KNEE, 0.0)
     return np.minimum(linear, _KNEE) + (1 - _KNEE) * (1.0 - np.exp(-over / (1 - _KNEE)))
 

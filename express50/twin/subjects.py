@@ -104,7 +104,7 @@ def soft_mask(model: HeadModel) -> np.ndarray:
 
 
 def _displacement(model: HeadModel, rng: np.random.Generator) -> np.ndarray:
-    """A smooth field (V, 3) float32, metres, that no shape coefficients can produce."""
+    """Draw a smooth field (V, 3) float32, metres, that no shape coefficients can produce."""
     template = model.template.double().numpy()
     weight = soft_mask(model)
     field = np.empty_like(template)
@@ -156,7 +156,7 @@ def _make_look(rng: np.random.Generator, number: int) -> PersonLook:
 
 
 def _blend(table: np.ndarray, place: float) -> np.ndarray:
-    """Row of a table (N, 3) at ``place`` in [0, 1], interpolated."""
+    """Interpolate the rows of a table (N, 3) at ``place`` in [0, 1]."""
     x = float(np.clip(place, 0.0, 1.0)) * (len(table) - 1)
     low = min(int(x), len(table) - 2)
     return table[low] + (table[low + 1] - table[low]) * (x - low)

@@ -24,7 +24,7 @@ class Caster:
     def cast(
         self, origin: np.ndarray, directions: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """First hits of rays.
+        """Find the first hits of rays.
 
         Args:
             origin: (3,) shared, or (N, 3).
@@ -50,7 +50,7 @@ class Caster:
 
 
 def face_to_vertex(faces: np.ndarray, count: int) -> scipy.sparse.csr_matrix:
-    """Sparse (V, F) matrix that sums a quantity of the faces (F, 3) at their vertices."""
+    """Return sparse (V, F) matrix that sums a quantity of the faces (F, 3) at their vertices."""
     rows = faces.ravel()
     columns = np.repeat(np.arange(len(faces)), 3)
     ones = np.ones(len(rows), dtype=np.float32)
@@ -67,7 +67,7 @@ def vertex_normals(
 
 
 def unit(vectors: np.ndarray) -> np.ndarray:
-    """Vectors (..., 3) at length 1; zero stays zero."""
+    """Scale vectors (..., 3) to length 1; zero stays zero."""
     return vectors / np.maximum(np.sqrt(dot(vectors, vectors)), 1e-20)
 
 
@@ -77,7 +77,7 @@ def dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def smooth_over_mesh(values: np.ndarray, faces: np.ndarray, rounds: int) -> np.ndarray:
-    """Values (V,) or (V, C) averaged with their neighbours' a number of times."""
+    """Average values (V,) or (V, C) with their neighbours' a number of times."""
     count = len(values)
     edges = faces[:, [0, 1, 1, 2, 2, 0, 1, 0, 2, 1, 0, 2]].reshape(-1, 2)
     matrix = scipy.sparse.coo_matrix(
@@ -122,12 +122,12 @@ class StarMap:
 
 
 def spherical_to_unit(azimuth: np.ndarray, elevation: np.ndarray) -> np.ndarray:
-    """Unit vectors (..., 3): azimuth from +z towards +x, elevation towards +y, radians."""
+    """Return unit vectors (..., 3): azimuth from +z towards +x, elevation towards +y, radians."""
     flat = np.cos(elevation)
     return np.stack([np.sin(azimuth) * flat, np.sin(elevation), np.cos(azimuth) * flat], axis=-1)
 
 
 def unit_to_spherical(directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Azimuth and elevation (N,) of vectors (N, 3) of any length, radians."""
+    """Return azimuth and elevation (N,) of vectors (N, 3) of any length, radians."""
     x, y, z = directions[:, 0], directions[:, 1], directions[:, 2]
     return np.arctan2(x, z), np.arctan2(y, np.sqrt(x * x + z * z))

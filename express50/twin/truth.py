@@ -77,54 +77,54 @@ class Truth:
         self._scene = lru_cache(maxsize=4)(self._compile)
 
     def subjects(self) -> list[str]:
-        """Ids of the recorded subjects."""
+        """Return ids of the recorded subjects."""
         return sorted(path.parent.name for path in self.root.glob("*/subject.json"))
 
     def cameras(self, subject: str) -> dict[str, Camera]:
-        """The rig's true cameras, distorted, by id."""
+        """Return the rig's true cameras, distorted, by id."""
         return read_cameras(self.root / subject / "cameras.json")
 
     def peaks(self, subject: str) -> dict[str, int]:
-        """Frame of each expression's peak."""
+        """Return the frame of each expression's peak."""
         return dict(self._subject(subject)[1].peaks)
 
     def head_model(self, subject: str) -> HeadModel:
-        """The head model that the subject was made with."""
+        """Return the head model that the subject was made with."""
         return self._subject(subject)[0].model
 
     def parameters(self, subject: str, frame: int) -> dict[str, np.ndarray]:
-        """Parameters of a frame: shape, offsets, expression, jaw, neck, eyes, R, t, strength."""
+        """Return a frame's shape, offsets, expression, jaw, neck, eyes, R, t, strength."""
         body, play = self._subject(subject)
         self._check_frame(subject, play, frame)
         values = {name: getattr(play, name)[frame] for name in _PLAY}
         return {"shape": body.subject.shape, "offsets": body.subject.offsets} | values
 
     def vertices(self, subject: str, frame: int) -> np.ndarray:
-        """Head-model vertices (V, 3) in the world."""
+        """Return head-model vertices (V, 3) in the world."""
         body, play = self._subject(subject)
         self._check_frame(subject, play, frame)
         return head_vertices(body.model, body.subject, play, frame)
 
     def landmarks(self, subject: str, frame: int) -> np.ndarray:
-        """The 68 landmarks (68, 3) in the world."""
+        """Return the 68 landmarks (68, 3) in the world."""
         vertices = torch.from_numpy(self.vertices(subject, frame))[None]
         model = self.head_model(subject).to(dtype=torch.float64)
         return head_landmarks(model, vertices)[0].numpy()
 
     def mesh(self, subject: str, frame: int) -> tuple[np.ndarray, np.ndarray]:
-        """All geometry, hair and shoulders included: vertices (N, 3) and faces (F, 3)."""
+        """Return all geometry, hair and shoulders included: vertices (N, 3) and faces (F, 3)."""
         _, vertices = self._scene(subject, frame)
         return vertices, self._subject(subject)[0].faces
 
     def render_depth(
         self, subject: str, frame: int, camera: Camera
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Depth (H, W) float32, camera z in metres, 0 where empty, and validity (H, W) bool."""
+        """Render depth (H, W) float32, camera z in metres, 0 where empty; validity (H, W) bool."""
         caster, _ = self._scene(subject, frame)
         return render.render_depth(caster, camera)
 
     def skin(self, subject: str, frame: int, camera: Camera) -> np.ndarray:
-        """Pixels (H, W) bool where the head's own surface is what the camera sees first."""
+        """Return pixels (H, W) bool where the head's own surface is what the camera sees first."""
         depth, valid = self.render_depth(subject, frame, camera)
         caster = Caster(self.vertices(subject, frame), self.head_model(subject).faces.numpy())
         bare, there = render.render_depth(caster, camera)
@@ -149,12 +149,12 @@ class Truth:
         return material.reshape(directions.shape[:2]), vertex.reshape(directions.shape[:2])
 
     def hairiness(self, subject: str) -> np.ndarray:
-        """Hair density per head vertex (V,), 0 to 1; 0 everywhere on bald subjects."""
+        """Return hair density per head vertex (V,), 0 to 1; 0 everywhere on bald subjects."""
         body = self._subject(subject)[0]
         return body.scalp if len(body.extras.hair.faces) else np.zeros_like(body.scalp)
 
     def render_alpha(self, subject: str, frame: int, camera: Camera) -> np.ndarray:
-        """Alpha (H, W) float32 in [0, 1] of the subject, from 32 rays a pixel at silhouettes."""
+        """Render alpha (H, W) float32 in [0, 1], from 33 rays per pixel at silhouettes."""
         caster, vertices = self._scene(subject, frame)
         return render.render_alpha(caster, self._subject(subject)[0].material, vertices, camera)
 
@@ -189,7 +189,7 @@ class Truth:
 
 
 def _read_body(about: dict, data: dict[str, np.ndarray]) -> Body:
-    """The body from its stored geometry; what only colours need is left empty."""
+    """Read the body from its stored geometry; what only colours need is left empty."""
     fields: dict[str, Any] = about["look"]
     for name, value in fields.items():
         fields[name] = np.array(value) if isinstance(value, list) else value
@@ -213,7 +213,7 @@ def _read_body(about: dict, data: dict[str, np.ndarray]) -> Body:
 def align_worlds(
     estimated: Mapping[str, Camera], true: Mapping[str, Camera], lever_m: float = 1.0
 ) -> np.ndarray:
-    """``world_true_from_estimated`` (4, 4), rigid, from cameras that both rigs have.
+    """Return ``world_true_from_estimated`` (4, 4), rigid, from cameras that both rigs have.
 
     Centres and viewing frames count together: each camera gives its centre and the ends of its
     axes at ``lever_m``, so that even two cameras, or cameras in one line, fix the rotation.

@@ -29,7 +29,7 @@ def _outline() -> Array:
 
 
 def _place(pq: Array, x: Array) -> Array:
-    """Ear-plane coordinates (backwards, up) to head space (N,3)."""
+    """Return ear-plane coordinates (backwards, up) to head space (N,3)."""
     c, s = np.cos(EAR_TILT), np.sin(EAR_TILT)
     back = c * pq[:, 0] + s * pq[:, 1]
     up = -s * pq[:, 0] + c * pq[:, 1]

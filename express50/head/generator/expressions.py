@@ -143,7 +143,7 @@ _MIDDLE: dict[str, tuple[Pull, ...]] = {
 def expression_directions(
     mesh: WholeMesh, regions: dict[str, Array], weights: Array
 ) -> tuple[tuple[str, ...], Array]:
-    """Names (X) and directions (V,3,X) in mm at full activation."""
+    """Return names (X) and directions (V,3,X) in mm at full activation."""
     jaw = weights[:, JAW]
     scopes = scope_weights(mesh, regions, jaw)
     result: dict[str, Array] = {}
@@ -177,7 +177,7 @@ def _both_sides(mesh: WholeMesh, name: str, left: Array) -> dict[str, Array]:
 
 
 def _lid_slide(mesh: WholeMesh, aside: float) -> Array:
-    """Lids carried sideways a little by the cornea, left eye."""
+    """Slide the left eye's lids a little sideways, as the cornea carries them."""
     motion = np.zeros_like(mesh.vertices)
     for k in range(8):
         motion[mesh.tag(f"lid{k}", "left"), 0] = aside * (1 - k / 7) ** 2
@@ -187,7 +187,7 @@ def _lid_slide(mesh: WholeMesh, aside: float) -> Array:
 
 
 def _jaw_directions(mesh: WholeMesh, jaw: Array) -> dict[str, Array]:
-    """Slides of the jaw, and lips that stay shut while the jaw opens by 0.3 rad."""
+    """Return slides of the jaw, and how lips stay shut while the jaw opens by 0.3 rad."""
     share = jaw[:, None]
     slide = share * np.array([[7.0, 0.0, 0.0]])
     angle = -0.3

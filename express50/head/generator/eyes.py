@@ -19,7 +19,7 @@ IRIS_RADIUS, PUPIL_RADIUS = 5.9, 1.9
 
 
 def lid_margin() -> Array:
-    """Front view (x, y) of the lid margin (40,2) mm: upper lid outwards, lower lid back."""
+    """Return the lid margin (40,2) from the front, mm: upper lid outwards, lower lid back."""
     s = 0.5 - 0.5 * np.cos(np.linspace(0, np.pi, LID_SEGMENTS + 1))
     line = INNER_CANTHUS + s[:, None] * (OUTER_CANTHUS - INNER_CANTHUS)
     upper, lower = line.copy(), line.copy()
@@ -29,13 +29,13 @@ def lid_margin() -> Array:
 
 
 def from_front(xy: Array) -> Array:
-    """Skin points (N,3) straight behind front-view positions (N,2)."""
+    """Return skin points (N,3) straight behind front-view positions (N,2)."""
     origins = np.concatenate([xy, np.zeros((len(xy), 1))], 1)
     return cast(origins, np.tile([0.0, 0.0, 1.0], (len(xy), 1)))
 
 
 def add_eye_rings(half: HalfMesh) -> tuple[Array, Array]:
-    """Lid loops out to the orbit's rim. Returns (outer ring indices, their labels (N,2))."""
+    """Add lid loops out to the orbit's rim; return the outer ring's indices and labels (N,2)."""
     margin = lid_margin()
     angle = np.pi - np.pi * np.arange(2 * LID_SEGMENTS) / LID_SEGMENTS
     outer = _ORBIT_CENTER + _ORBIT_RADII * np.stack([np.cos(angle), np.sin(angle)], 1)
@@ -52,7 +52,7 @@ def add_eye_rings(half: HalfMesh) -> tuple[Array, Array]:
 
 
 def _add_lid_edges(half: HalfMesh, margin: Array, points: Array, label: Array) -> None:
-    """The lid's thickness: an edge down to the eyeball, then a strip hidden under the lid."""
+    """Add the lid's thickness: an edge down to the eyeball, then a strip hidden under the lid."""
     away = points - EYE_CENTER
     edge = EYE_CENTER + away * (EYE_RADIUS + 0.15) / np.linalg.norm(away, axis=1, keepdims=True)
     xy = points[:, :2] - points[:, :2].mean(0)
@@ -68,7 +68,7 @@ def _add_lid_edges(half: HalfMesh, margin: Array, points: Array, label: Array) -
 
 
 def add_eyeball(half: HalfMesh, columns: int = 28) -> None:
-    """A sphere with its pole forward: rings at the pupil's and iris's rims, two UV charts."""
+    """Add a sphere with its pole forward: rings at the pupil's and iris's rims, two UV charts."""
     iris = np.degrees(np.arcsin(IRIS_RADIUS / EYE_RADIUS))
     pupil = np.degrees(np.arcsin(PUPIL_RADIUS / EYE_RADIUS))
     polar = np.radians(
@@ -117,7 +117,7 @@ _MEETING = 0.14  # share of the opening that the lower lid closes in a blink
 
 
 def lid_motion(mesh: WholeMesh, side: str, upper: float, lower: float) -> Array:
-    """Displacement (V,3) mm moving the lids' margins by shares of the opening.
+    """Return displacement (V,3) mm moving the lids' margins by shares of the opening.
 
     Loops between the margin and the still loop are spread evenly over the lengthened lid, turning
     about the eyeball's centre, and the upper lid's fold is pulled smooth onto the lid's sphere.
@@ -166,7 +166,7 @@ def lid_motion(mesh: WholeMesh, side: str, upper: float, lower: float) -> Array:
 
 
 def turned(offset: Array, angle: Array) -> Array:
-    """Displacement (N,3) of offsets turned upwards about the x axis by angles (N,)."""
+    """Return displacement (N,3) of offsets turned upwards about the x axis by angles (N,)."""
     c, s = np.cos(angle), np.sin(angle)
     y = c * offset[:, 1] + s * offset[:, 2]
     z = -s * offset[:, 1] + c * offset[:, 2]
@@ -174,5 +174,5 @@ def turned(offset: Array, angle: Array) -> Array:
 
 
 def blink(mesh: WholeMesh, side: str) -> Array:
-    """Displacement (V,3) mm that shuts the lids."""
+    """Return displacement (V,3) mm that shuts the lids."""
     return lid_motion(mesh, side, 1.0 - _MEETING, _MEETING)

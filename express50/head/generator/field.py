@@ -145,7 +145,7 @@ _SKIN = _stack(MASSES)
 
 
 def _ellipsoid_distances(stack: _Stack, p: Array) -> Array:
-    """Distances (N,E), first order near the surfaces."""
+    """Return distances (N,E), first order near the surfaces."""
     q = (p @ stack.unit - stack.shift).reshape(len(p), -1, 3)
     k0 = np.sqrt(np.einsum("nec,nec->ne", q, q)) + 1e-12
     q *= stack.inverse_radii
@@ -154,7 +154,7 @@ def _ellipsoid_distances(stack: _Stack, p: Array) -> Array:
 
 
 def _capsule_distances(stack: _Stack, p: Array) -> Array:
-    """Distances (N,C) to capsules whose radius runs linearly between the ends."""
+    """Return distances (N,C) to capsules whose radius runs linearly between the ends."""
     length2 = np.einsum("cd,cd->c", stack.axis, stack.axis)
     along = p @ stack.axis.T - np.einsum("cd,cd->c", stack.start, stack.axis)
     offset2 = (p * p).sum(1)[:, None] - 2 * p @ stack.start.T
@@ -166,13 +166,13 @@ def _capsule_distances(stack: _Stack, p: Array) -> Array:
 
 
 def _smooth_min(a: Array, b: Array, k: float) -> Array:
-    """Polynomial smooth minimum (quadratic), exact outside |a - b| < k."""
+    """Take the polynomial smooth minimum (quadratic), exact outside |a - b| < k."""
     h = np.maximum(k - np.abs(a - b), 0.0)
     return np.minimum(a, b) - (0.25 / k) * h * h
 
 
 def skin_field(points: Array) -> Array:
-    """Signed distance-like value in mm at points (N,3) in mm: negative inside the skin."""
+    """Compute a signed distance-like value, mm, at points (N,3) mm: negative inside the skin."""
     p = np.array(points, float)
     p[:, 0] = np.sqrt(p[:, 0] ** 2 + 1.0)  # folds without a crease on the mid plane
     ellipsoids = np.ascontiguousarray(_ellipsoid_distances(_SKIN, p).T)
@@ -185,7 +185,7 @@ def skin_field(points: Array) -> Array:
 
 
 def cast(origins: Array, directions: Array, far: float = 170.0, steps: int = 70) -> Array:
-    """Outermost hit (N,3) of the skin on rays from inside, marching inwards from `far` mm."""
+    """Find the outermost hit (N,3) of the skin on rays, marching inwards from `far` mm."""
     d = directions / np.linalg.norm(directions, axis=-1, keepdims=True)
     t, active = np.full(len(origins), far), np.arange(len(origins))
     for _ in range(steps):
@@ -198,7 +198,7 @@ def cast(origins: Array, directions: Array, far: float = 170.0, steps: int = 70)
 
 
 def cast_out(origins: Array, directions: Array, steps: int = 30) -> Array:
-    """First exit (N,3) from the skin on rays that start inside it."""
+    """Find the first exit (N,3) from the skin on rays that start inside it."""
     d = directions / np.linalg.norm(directions, axis=-1, keepdims=True)
     t = np.zeros(len(origins))
     for _ in range(steps):
@@ -207,7 +207,7 @@ def cast_out(origins: Array, directions: Array, steps: int = 30) -> Array:
 
 
 def gradient(points: Array, step: float = 0.25) -> Array:
-    """Unit outward normal (N,3) of the field by tetrahedral differences."""
+    """Return unit outward normal (N,3) of the field by tetrahedral differences."""
     corners = np.array([[1, -1, -1], [-1, -1, 1], [-1, 1, -1], [1, 1, 1]], float)
     stacked = (points[None] + step * corners[:, None]).reshape(-1, 3)
     values = skin_field(stacked).reshape(4, -1)
@@ -216,7 +216,7 @@ def gradient(points: Array, step: float = 0.25) -> Array:
 
 
 def project(points: Array, iterations: int = 4) -> Array:
-    """Points (N,3) moved to the skin along the field's gradient."""
+    """Move points (N,3) to the skin along the field's gradient."""
     p = np.array(points, float)
     for _ in range(iterations):
         p = p - 0.9 * skin_field(p)[:, None] * gradient(p)
@@ -257,7 +257,7 @@ def rays(azimuth: Array, latitude: Array) -> tuple[Array, Array]:
 
 
 def labels(points: Array) -> tuple[Array, Array]:
-    """Azimuth (radians) and latitude (deg) of points (N,3) in mm: the inverse of `rays`."""
+    """Return azimuth (radians) and latitude (deg) of points (N,3) in mm: the inverse of `rays`."""
     low, high = np.full(len(points), -85.0), np.full(len(points), 89.9)
     for _ in range(40):
         middle = 0.5 * (low + high)
@@ -271,6 +271,6 @@ def labels(points: Array) -> tuple[Array, Array]:
 
 
 def sphere(azimuth: Array, latitude: Array) -> Array:
-    """Unit vectors (N,3) of the labels, the domain in which the skin is triangulated."""
+    """Return unit vectors (N,3) of the labels, the domain in which the skin is triangulated."""
     b = np.radians(latitude)
     return np.stack([np.cos(b) * np.sin(azimuth), np.sin(b), np.cos(b) * np.cos(azimuth)], -1)

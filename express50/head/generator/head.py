@@ -37,7 +37,7 @@ PAIRED_CHARTS = ("ear", "eye_front", "eye_back")
 
 @cache
 def procedural_mesh() -> WholeMesh:
-    """Geometry of the head in millimetres, before directions; deterministic, built once."""
+    """Build the head's geometry in millimetres, before directions; deterministic, built once."""
     half = HalfMesh()
     add_skin(half)
     add_eyeball(half)
@@ -49,7 +49,7 @@ def procedural_mesh() -> WholeMesh:
 
 
 def procedural_arrays() -> dict[str, Any]:
-    """All arrays of the built-in head (NumPy, float64, metres), keyed as HeadModel's fields."""
+    """Make the arrays of HeadModel's fields for the built-in head (NumPy, float64, metres)."""
     mesh = procedural_mesh()
     regions = region_masks(mesh)
     joints = joint_positions(mesh)

@@ -28,7 +28,7 @@ class Pull:
 
 
 def window(points: Array, at: Array, radius: Array) -> Array:
-    """Gaussian window (N,), 1 at `at` and exp(-1) at one radius, of points (N,3)."""
+    """Return a Gaussian window (N,), 1 at `at` and exp(-1) at one radius, of points (N,3)."""
     return np.exp(-(((points - at) / radius) ** 2).sum(-1))
 
 
@@ -47,7 +47,7 @@ def displacement(mesh: WholeMesh, pulls: tuple[Pull, ...], scopes: dict[str, Arr
 
 
 def scope_weights(mesh: WholeMesh, regions: dict[str, Array], jaw: Array) -> dict[str, Array]:
-    """Vertex weights (V,) of each scope. `jaw` separates the lower lip from the upper."""
+    """Return vertex weights (V,) of each scope. `jaw` separates the lower lip from the upper."""
     hard = regions["teeth"] | regions["gums"] | regions["tongue"]
     balls = regions["left_eyeball"] | regions["right_eyeball"]
     skin = (~hard & ~balls).astype(float)
@@ -77,5 +77,5 @@ def settle_eyes(mesh: WholeMesh, motion: Array, ball_motion: str) -> Array:
 
 
 def eye_center(side: str) -> Array:
-    """Eyeball centre (3,) mm."""
+    """Return eyeball centre (3,) mm."""
     return EYE_CENTER * [1.0 if side == "left" else -1.0, 1.0, 1.0]

@@ -49,7 +49,7 @@ class HalfMesh:
         self.faces.setdefault(chart, []).append(np.asarray(faces, np.int64).reshape(-1, 3))
 
     def strip(self, chart: str, inner: Array, outer: Array, closed: bool) -> None:
-        """Quads between two rows of equal length, split along the shorter diagonal."""
+        """Add quads between two rows of equal length, split along the shorter diagonal."""
         a, b = np.asarray(inner), np.asarray(outer)
         if closed:
             a, b = np.append(a, a[0]), np.append(b, b[0])
@@ -71,12 +71,12 @@ class HalfMesh:
         self.add_faces(chart, faces[~degenerate])
 
     def fan(self, chart: str, center: int, ring: Array, closed: bool) -> None:
-        """Triangles from one vertex to a row."""
+        """Add triangles from one vertex to a row."""
         a = np.append(ring, ring[0]) if closed else np.asarray(ring)
         self.add_faces(chart, np.stack([np.full(len(a) - 1, center), a[:-1], a[1:]], 1))
 
     def array(self) -> Array:
-        """All vertices (N,3)."""
+        """Return all vertices (N,3)."""
         return np.concatenate(self.points)
 
 
@@ -150,7 +150,7 @@ RECTANGLES = {
 
 
 def pack_uv(mesh: WholeMesh) -> tuple[Array, Array]:
-    """UV coordinates (T,2) in [0,1] and their faces (F,3): each chart fills its rectangle."""
+    """Fill each chart's rectangle: UV coordinates (T,2) in [0,1] and their faces (F,3)."""
     corner_uv = np.empty_like(mesh.corner_uv)
     for chart, (left, bottom, right, top) in RECTANGLES.items():
         of_chart = mesh.face_chart == chart

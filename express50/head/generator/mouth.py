@@ -16,7 +16,7 @@ _OUTER_CENTER_Y, _OUTER_X, _OUTER_UP, _OUTER_DOWN = -49.0, 41.0, 16.0, 20.0
 
 
 def slit_y(x: Array) -> Array:
-    """Height of the closed lips' line at x (mm): a low bow that dips towards the corners."""
+    """Return height of the closed lips' line at x (mm): a low bow that dips towards the corners."""
     t = np.clip(x / CORNER_X, 0, 1)
     return -48.8 - 0.7 * np.exp(-((x / 7.0) ** 2)) - 0.5 * t**3 + 0.9 * t * (1 - t)
 
@@ -43,7 +43,7 @@ def _rows() -> tuple[Array, Array, Array, Array]:
 
 
 def add_lip_rings(half: HalfMesh) -> tuple[Array, Array]:
-    """Loops from the slit to around the mouth. Returns (outer row indices, labels (33,2))."""
+    """Add loops from the slit to around the mouth; return the outer row's indices and labels."""
     slit, border, outer, x = _rows()
     sign = np.concatenate([np.ones(LIP_SEGMENTS), [0.0], -np.ones(LIP_SEGMENTS)])
     thick = 1 - (x / CORNER_X) ** 4
@@ -70,7 +70,7 @@ def add_lip_rings(half: HalfMesh) -> tuple[Array, Array]:
 
 
 def _add_cavity(half: HalfMesh, slit: Array, contact: Array, sign: Array, thick: Array) -> None:
-    """Pocket behind the lips, wide enough for teeth and tongue, kept inside the skin."""
+    """Add the pocket behind the lips, wide enough for teeth and tongue, kept inside the skin."""
     n = len(slit)
     angle = 0.5 * np.pi * (1 - np.linspace(0, 2, n))
     up, out = np.sin(angle), np.cos(angle)
@@ -100,7 +100,7 @@ def _add_cavity(half: HalfMesh, slit: Array, contact: Array, sign: Array, thick:
 
 
 def _inside(points: Array, depth: float) -> Array:
-    """Points pushed in where they are less than `depth` mm under the skin."""
+    """Push points in where they are less than `depth` mm under the skin."""
     p = points.copy()
     for _ in range(4):
         excess = np.maximum(skin_field(p) + depth, 0.0)
@@ -142,7 +142,7 @@ def _arch(upper: bool) -> tuple[Array, Array, Array]:
 
 
 def add_teeth(half: HalfMesh, upper: bool) -> None:
-    """One dental arch, half: outer gum, crown, biting edge, inner crown, inner gum."""
+    """Add one dental arch, half: outer gum, crown, biting edge, inner crown, inner gum."""
     place, normal, phase = _arch(upper)
     groove = np.where(phase == 0.0, 1.0, 0.0)
     groove[0] = 1.0
@@ -179,7 +179,7 @@ def add_teeth(half: HalfMesh, upper: bool) -> None:
 
 
 def add_tongue(half: HalfMesh) -> None:
-    """Tongue, half: cross sections from the root forward to the tip."""
+    """Add the tongue, half: cross sections from the root forward to the tip."""
     sections = 13
     s = np.linspace(0, 1, sections)
     z = 42 + 42 * s

@@ -19,7 +19,7 @@ def _mask(mesh: WholeMesh, tags: list[str], side: str = "both") -> Array:
 
 
 def skin_mask(mesh: WholeMesh) -> Array:
-    """Vertices of the skin and ears, without the mouth's cavity."""
+    """Return vertices of the skin and ears, without the mouth's cavity."""
     used = np.isin(mesh.face_chart, ("skin", "ear", "ear_right"))
     mask = np.zeros(len(mesh.vertices), bool)
     mask[np.unique(mesh.faces[used])] = True
@@ -27,7 +27,7 @@ def skin_mask(mesh: WholeMesh) -> Array:
 
 
 def region_masks(mesh: WholeMesh) -> dict[str, Array]:
-    """Boolean masks (V,) by region name."""
+    """Return boolean masks (V,) by region name."""
     x, y, z = np.abs(mesh.vertices[:, 0]), mesh.vertices[:, 1], mesh.vertices[:, 2]
     skin = skin_mask(mesh)
     regions = {
@@ -74,7 +74,7 @@ _NOSTRILS = np.array([(0, -28.5), (6.5, -27.5), (13, -25)], float)
 
 
 def embed_landmarks(mesh: WholeMesh) -> tuple[Array, Array]:
-    """Faces (68,) and barycentric weights (68,3) of the landmarks."""
+    """Return faces (68,) and barycentric weights (68,3) of the landmarks."""
     jaw, brow = project(_JAW, 6), from_front(_BROW)
     bridge, nostrils = from_front(_BRIDGE), from_front(_NOSTRILS)
     points = np.zeros((68, 3))
@@ -100,7 +100,7 @@ def embed_landmarks(mesh: WholeMesh) -> tuple[Array, Array]:
 
 
 def _embed(mesh: WholeMesh, points: Array) -> tuple[Array, Array]:
-    """Nearest point of the skin's faces: face index and barycentric weights."""
+    """Find the nearest point of the skin's faces: face index and barycentric weights."""
     skin = np.flatnonzero(mesh.face_chart == "skin")
     corners = mesh.vertices[mesh.faces[skin]]
     faces, bary = np.zeros(len(points), np.int64), np.zeros((len(points), 3))
@@ -112,7 +112,7 @@ def _embed(mesh: WholeMesh, points: Array) -> tuple[Array, Array]:
 
 
 def _closest(corners: Array, p: Array) -> tuple[Array, Array]:
-    """Barycentric weights (F,3), clamped and renormalised, and distances (F,) to a point."""
+    """Return barycentric weights (F,3), clamped and renormalised, and distances (F,) to a point."""
     a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
     ab, ac, ap = b - a, c - a, p - a
     d00, d01, d11 = (ab * ab).sum(1), (ab * ac).sum(1), (ac * ac).sum(1)
@@ -125,7 +125,7 @@ def _closest(corners: Array, p: Array) -> tuple[Array, Array]:
 
 
 def contour_candidates(mesh: WholeMesh) -> tuple[Array, ...]:
-    """For landmarks 0..16 the skin vertices that may lie on the visible jaw line."""
+    """Find the skin vertices that may lie on the visible jaw line, for landmarks 0..16."""
     azimuth, latitude = labels(project(_JAW, 6))
     grid = mesh.tag("grid")
     result = []

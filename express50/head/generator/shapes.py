@@ -175,7 +175,7 @@ PULLS = _HEAD | _EYES | _NOSE | _MOUTH | _JAW | _EARS_AND_NECK | _ASYMMETRIC
 
 
 def _eye_scaling(mesh: WholeMesh, kind: str) -> Array:
-    """Directions of the lids and eyeballs that need the eye's own frame."""
+    """Return directions of the lids and eyeballs that need the eye's own frame."""
     motion = np.zeros_like(mesh.vertices)
     for side in ("left", "right"):
         center, ball = eye_center(side), mesh.tag("eyeball", side)
@@ -195,7 +195,7 @@ def _eye_scaling(mesh: WholeMesh, kind: str) -> Array:
 
 
 def _turn(offset: Array, angle: Array) -> Array:
-    """Displacement (N,3) of turning offsets upwards about the x axis by small angles (N,)."""
+    """Turn offsets upwards about the x axis by small angles (N,): displacements (N,3)."""
     up = np.stack([np.zeros(len(offset)), offset[:, 2], -offset[:, 1]], 1)
     return angle[:, None] * up
 
@@ -203,7 +203,7 @@ def _turn(offset: Array, angle: Array) -> Array:
 def shape_directions(
     mesh: WholeMesh, regions: dict[str, Array], jaw: Array
 ) -> tuple[tuple[str, ...], Array]:
-    """Names (S) and directions (V,3,S) in mm per unit. `jaw` (V,) separates the lips."""
+    """Return names (S) and directions (V,3,S) in mm per unit. `jaw` (V,) separates the lips."""
     scopes = scope_weights(mesh, regions, jaw)
     result = {}
     for name, pulls in PULLS.items():

@@ -26,7 +26,7 @@ from express50.head.generator.mouth import add_lip_rings
 
 Array = np.ndarray
 
-#          x, y, z, radius of the dense core, spacing there, growth a mm beyond (all mm)
+#          x, y, z, radius of the dense core, spacing there, growth per mm beyond (all mm)
 _DENSITY = np.array([
     (6, -15, 104, 14, 2.6, 0.12),
     (32, 20, 75, 22, 3.6, 0.10),
@@ -40,7 +40,7 @@ _COARSEST = 11.0
 
 
 def spacing(points: Array) -> Array:
-    """Wanted edge length (N,) mm at points (N,3)."""
+    """Return wanted edge length (N,) mm at points (N,3)."""
     d = np.linalg.norm(points[:, None] - _DENSITY[None, :, :3], axis=-1)
     h = _DENSITY[:, 4] + _DENSITY[:, 5] * np.maximum(d - _DENSITY[:, 3], 0.0)
     return np.minimum(h.min(1), _COARSEST)
@@ -97,7 +97,7 @@ def _add_midline(half: HalfMesh, lip_top: float, lip_bottom: float) -> Array:
 
 
 def _add_fill(half: HalfMesh, fixed: Array, holes: list[Array]) -> Array:
-    """Graded points (dart throwing, seeded) where no loop is; returns their indices."""
+    """Add graded points (dart throwing, seeded) where no loop is; return their indices."""
     azimuth, latitude = np.linspace(0, np.pi, 61), np.linspace(BOTTOM_LATITUDE, 90, 69)
     a, b = np.meshgrid(azimuth, latitude, indexing="ij")
     table = cast(*rays(a.ravel(), b.ravel())).reshape(61, 69, 3)
@@ -136,7 +136,7 @@ def _darts(points: Array, h: Array) -> Array:
 
 
 def inside(points: Array, polygon: Array) -> Array:
-    """Even-odd test of points (N,2) in a closed polygon (M,2)."""
+    """Return True for points (N,2) inside a closed polygon (M,2), by the even-odd rule."""
     a, b = polygon, np.roll(polygon, -1, axis=0)
     x, y = points[:, :1], points[:, 1:]
     crosses = (a[:, 1] > y) != (b[:, 1] > y)
@@ -145,7 +145,7 @@ def inside(points: Array, polygon: Array) -> Array:
 
 
 def _triangulate(label: Array, midline: int, rims: list[int]) -> Array:
-    """Hull triangles without the mid-plane cap, the neck's end and the loops' insides."""
+    """Return hull triangles without the mid-plane cap, the neck's end and the loops' insides."""
     directions = sphere(*label.T)
     flat = np.abs(np.sin(label[:, 0])) < 1e-9
     directions[flat, 0] = 0.0
@@ -222,7 +222,7 @@ def add_nostril(half: HalfMesh) -> tuple[Array, Array]:
     long = np.cross(down, side)
     turn = 2 * np.pi * np.arange(_POINTS) / _POINTS
     rings = []
-    for a, b in ((0.66, 0.5), (0.52, 0.36), (0.42, 0.27)):  # half widths a mm of distance
+    for a, b in ((0.66, 0.5), (0.52, 0.36), (0.42, 0.27)):  # half widths per mm of distance
         d = down + np.outer(np.cos(turn) * a, long) + np.outer(np.sin(turn) * b, side)
         rings.append(cast_out(np.tile(_INSIDE, (_POINTS, 1)), d))
     middle = rings[-1].mean(0)

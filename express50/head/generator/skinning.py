@@ -14,7 +14,7 @@ ROOT, NECK, JAW, LEFT_EYE, RIGHT_EYE = range(5)
 
 
 def joint_positions(mesh: WholeMesh) -> Array:
-    """Rest joints (5,3) mm: collar, upper neck, jaw hinge, eyeball centres."""
+    """Return rest joints (5,3) mm: collar, upper neck, jaw hinge, eyeball centres."""
     return np.array([(0, -165, -22), (0, -72, -16), (0, -8, 10),
                      EYE_CENTER, EYE_CENTER * [-1, 1, 1]], float)  # fmt: skip
 
@@ -35,7 +35,7 @@ def joint_regressor(mesh: WholeMesh, joints: Array) -> Array:
 
 
 def vertex_average(mesh: WholeMesh, values: Array, faces: Array) -> Array:
-    """Mean of the neighbours' values (V,...) over the edges of `faces`."""
+    """Return mean of the neighbours' values (V,...) over the edges of `faces`."""
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     edges = np.unique(np.sort(edges, 1), axis=0)
     total, degree = np.zeros_like(values), np.zeros(len(values))
@@ -47,7 +47,7 @@ def vertex_average(mesh: WholeMesh, values: Array, faces: Array) -> Array:
 
 
 def jaw_weight(mesh: WholeMesh) -> Array:
-    """Share (V,) of the jaw joint: lower lip, chin, jaw line, lower teeth, tongue."""
+    """Return share (V,) of the jaw joint: lower lip, chin, jaw line, lower teeth, tongue."""
     p = mesh.vertices
     angle = np.degrees(np.arctan2(p[:, 1] + 8, np.maximum(p[:, 2] - 10, 1.0)))
     around = smoothstep(angle, -18.5, -31.5)
@@ -90,7 +90,7 @@ def _inner_jaw_weight(mesh: WholeMesh, weight: Array) -> Array:
 
 
 def skinning_weights(mesh: WholeMesh, regions: dict[str, Array]) -> Array:
-    """Weights (V,5), rows sum to 1: collar by the root, head by the neck, jaw and eyes."""
+    """Return weights (V,5), rows sum to 1: collar by the root, head by the neck, jaw and eyes."""
     p = mesh.vertices
     jaw = jaw_weight(mesh)
     height = p[:, 1] - 0.35 * (p[:, 2] + 20)  # the neck's own axis leans forward
@@ -109,7 +109,7 @@ def skinning_weights(mesh: WholeMesh, regions: dict[str, Array]) -> Array:
 
 
 def pose_correctives(mesh: WholeMesh, regions: dict[str, Array]) -> Array:
-    """Correctives (36,V*3) in mm a unit of R - I, for the jaw's opening alone.
+    """Return correctives (36,V*3) in mm per unit of R - I, for the jaw's opening alone.
 
     Opening by a sets R[2,1] of the jaw to sin a. The lips then close in from the corners and the
     upper lip gives way a little, which skinning cannot do.

@@ -73,7 +73,7 @@ def random_crop(
 
 
 def _crop_matrix(centre: np.ndarray, side: float, angle: float, mirror: bool) -> np.ndarray:
-    """Affine (2, 3) from view pixels to crop pixels, corner origin."""
+    """Return affine (2, 3) from view pixels to crop pixels, corner origin."""
     scale = CROP / side
     turn = scale * np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
     if mirror:
@@ -93,7 +93,7 @@ def _composite(rgba: np.ndarray, matrix: np.ndarray, background: np.ndarray) -> 
 
 
 def _shoulders(image: np.ndarray, points: np.ndarray, rng: Rng) -> None:
-    """A body of one colour below the chin, in place: not all that is below a head is backdrop."""
+    """Paint a body of one colour below the chin, in place: not all below a head is backdrop."""
     if rng.random() < 0.5:
         return
     height = float(np.ptp(points, axis=0).max())
@@ -107,7 +107,7 @@ def _shoulders(image: np.ndarray, points: np.ndarray, rng: Rng) -> None:
 
 
 def _hair_locks(image: np.ndarray, mask: np.ndarray, points: np.ndarray, rng: Rng) -> None:
-    """Strands of one colour that fall from above the brows over a part of the face, in place."""
+    """Paint strands of one colour that fall over a part of the face, in place."""
     height = float(np.ptp(points, axis=0).max())
     down = points[8] - points[27]
     down = down / max(float(np.linalg.norm(down)), 1e-6)
@@ -147,7 +147,7 @@ def _whole(values: np.ndarray) -> tuple[int, int]:
 
 
 def _spoil(image: np.ndarray, rng: Rng) -> np.ndarray:
-    """Gain, white balance, gamma, haze, blur, low resolution, noise and JPEG; uint8 out."""
+    """Apply gain, white balance, gamma, haze, blur, low resolution, noise and JPEG; uint8 out."""
     ramp = np.arange(256)[:, None] / 255.0
     curve = (ramp * rng.uniform(0.8, 1.25, 3)) ** rng.uniform(0.65, 1.5) * rng.uniform(0.6, 1.3)
     table = np.clip(255 * curve + rng.uniform(-20, 30), 0, 255).astype(np.uint8)
@@ -172,7 +172,7 @@ def _spoil(image: np.ndarray, rng: Rng) -> np.ndarray:
 
 
 def _background(backgrounds: np.ndarray, size: int, rng: Rng) -> np.ndarray:
-    """A random piece (size, size, 3) of the pool (N, 2 CROP, 2 CROP, 3)."""
+    """Return a random piece (size, size, 3) of the pool (N, 2 CROP, 2 CROP, 3)."""
     pool = backgrounds[rng.integers(len(backgrounds))]
     x, y = rng.integers(0, CROP, 2)
     piece = pool[y : y + CROP, x : x + CROP]

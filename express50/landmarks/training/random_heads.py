@@ -47,7 +47,7 @@ class Canvas:
 
     @classmethod
     def of(cls, model: HeadModel) -> Canvas:
-        """A head model's vertices."""
+        """Make a canvas of a head model's vertices."""
         region = {name: mask.numpy() for name, mask in model.regions.items()}
         marks = landmarks(model, model.template[None])[0].numpy()
         return cls(model.template.numpy(), region, marks)
@@ -70,7 +70,7 @@ def random_head(model: HeadModel, rng: Rng) -> RandomHead:
 
 
 def waves(points: np.ndarray, rng: Rng, count: int, low: float, high: float) -> np.ndarray:
-    """Smooth random field (N,) of about unit variance; wave numbers low..high radians a metre."""
+    """Draw a smooth field (N,) of about unit variance; wave numbers low..high radians per metre."""
     directions = rng.normal(size=(count, 3))
     directions *= (np.exp(rng.uniform(np.log(low), np.log(high), count)))[:, None] / (
         np.linalg.norm(directions, axis=1, keepdims=True)
@@ -80,7 +80,7 @@ def waves(points: np.ndarray, rng: Rng, count: int, low: float, high: float) -> 
 
 
 def deform(vertices: np.ndarray, rng: Rng) -> np.ndarray:
-    """Anisotropic scale and a smooth random displacement of a few millimetres."""
+    """Scale each axis and add a smooth random displacement of a few millimetres."""
     centre = vertices.mean(0)
     scaled = (vertices - centre) * rng.uniform(0.9, 1.1, size=3) * rng.uniform(0.9, 1.1)
     amplitude = rng.uniform(0.0, 0.003)
@@ -89,7 +89,7 @@ def deform(vertices: np.ndarray, rng: Rng) -> np.ndarray:
 
 
 def paint(canvas: Canvas, rng: Rng) -> tuple[np.ndarray, np.ndarray | None]:
-    """Colours (N, 3) in [0, 1] and hair thickness (N,) metres or None."""
+    """Return colours (N, 3) in [0, 1] and hair thickness (N,) metres or None."""
     rest, region, marks = canvas.rest, canvas.region, canvas.marks
     colors = np.tile(_skin_color(rng), (len(rest), 1))
     # Anything in no region is a small part such as lashes: dark.
@@ -120,7 +120,7 @@ def _mix(colors: np.ndarray, color: np.ndarray, amount: np.ndarray) -> np.ndarra
 
 
 def _line_distance(points: np.ndarray, line: np.ndarray) -> np.ndarray:
-    """Distance (N,) of points (N, 3) to a polyline (L, 3)."""
+    """Return distance (N,) of points (N, 3) to a polyline (L, 3)."""
     start, along = line[:-1], np.diff(line, axis=0)
     relative = points[:, None] - start[None]
     share = (relative * along).sum(2) / np.maximum((along**2).sum(1), 1e-12)
@@ -130,7 +130,7 @@ def _line_distance(points: np.ndarray, line: np.ndarray) -> np.ndarray:
 def _tint_features(
     colors: np.ndarray, region: dict[str, np.ndarray], rest: np.ndarray, marks: np.ndarray, rng: Rng
 ) -> None:
-    """Lips, brows and eye make-up, in place."""
+    """Paint lips, brows and eye make-up, in place."""
     lips = region["lips"].astype(float) * rng.uniform(0.0, 0.9)
     colors[:] = _mix(colors, colors * rng.uniform([0.7, 0.3, 0.3], [1.2, 0.9, 0.9]), lips)
     brow_color = rng.uniform(0.0, 0.5) * np.array([1.0, rng.uniform(0.5, 1), rng.uniform(0.3, 1)])
@@ -174,7 +174,7 @@ def _grow_hair(
 def _tint_beard(
     colors: np.ndarray, region: dict[str, np.ndarray], rest: np.ndarray, marks: np.ndarray, rng: Rng
 ) -> None:
-    """Stubble, moustache or full beard, in place."""
+    """Paint stubble, moustache or full beard, in place."""
     if rng.random() < 0.6:
         return
     below = 1 / (1 + np.exp((rest[:, 1] - marks[33, 1] + rng.uniform(0, 0.02)) / 0.003))
@@ -187,7 +187,7 @@ def _tint_beard(
 def _color_eyes_and_mouth(
     colors: np.ndarray, region: dict[str, np.ndarray], rest: np.ndarray, rng: Rng
 ) -> None:
-    """Sclera, iris, pupil, teeth and mouth cavity, in place."""
+    """Paint sclera, iris, pupil, teeth and mouth cavity, in place."""
     iris = rng.uniform(0.05, 0.7) * np.array(
         [rng.uniform(0.4, 1), rng.uniform(0.5, 1), rng.uniform(0.3, 1)]
     )
@@ -247,7 +247,7 @@ def random_parameters(model: HeadModel, rng: Rng) -> dict[str, torch.Tensor]:
 
 
 def _lopsided(entry: Expression, model: HeadModel, rng: Rng) -> np.ndarray:
-    """Coefficients (X,) of a script entry; in some draws one side of the face does less."""
+    """Return coefficients (X,) of a script entry; in some draws one side of the face does less."""
     sides = {"_L": 1.0, "_R": 1.0}
     if rng.random() < 0.3:
         sides[("_L", "_R")[rng.integers(2)]] = rng.uniform(0.0, 1.0)
@@ -261,7 +261,7 @@ def _lopsided(entry: Expression, model: HeadModel, rng: Rng) -> np.ndarray:
 
 
 def _close_eyes(expression: np.ndarray, model: HeadModel, rng: Rng) -> None:
-    """A blink in some draws, a wink in others, in place."""
+    """Blink in some draws, wink in others, in place."""
     kind = rng.random()
     if kind > 0.22:
         return

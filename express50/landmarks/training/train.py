@@ -41,7 +41,7 @@ WARM_UP = 100
 HIGH_SHARE = 0.65
 KEEP_EVERY = 100
 FIRST_FILES = 6
-STEPS_A_FILE = 300
+STEPS_PER_FILE = 300
 HELD_OUT = 0
 
 
@@ -139,11 +139,11 @@ def train(models: list[HeadModel], plan: TrainingPlan, folder: Path) -> Landmark
 
 def files_in_use(step: int, files: int) -> int:
     """Files of a head model that a step draws from: a few at first, so that it can begin soon."""
-    return min(files, FIRST_FILES + step // STEPS_A_FILE)
+    return min(files, FIRST_FILES + step // STEPS_PER_FILE)
 
 
 def rate_share(step: int, steps: int) -> float:
-    """Learning rate of a step as a share of the highest one."""
+    """Return the learning rate of a step as a share of the highest one."""
     fall = (steps - step) / (steps * (1.0 - HIGH_SHARE))
     return min(1.0, (step + 1) / WARM_UP, max(fall, 0.01))
 

@@ -91,7 +91,7 @@ class HeadScene:
     def _light(
         self, points: np.ndarray, normals: np.ndarray, towards: np.ndarray, rng: Rng
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Diffuse and specular light (N, 3) each of ambient and one to three lamps."""
+        """Draw ambient light and one to three lamps: diffuse and specular light (N, 3) each."""
         sky = 0.5 + 0.5 * normals @ _unit(rng.normal(size=3))
         diffuse = rng.uniform(0.1, 0.8) * (0.6 + 0.4 * sky[:, None]) * rng.uniform(0.8, 1.0, 3)
         specular = np.zeros_like(diffuse)
@@ -117,7 +117,7 @@ def _unit(vector: np.ndarray) -> np.ndarray:
 
 
 def _facing(points: np.ndarray, eye: np.ndarray) -> float:
-    """Cosine between the face's forward direction and the direction to the camera centre."""
+    """Return the cosine between the face's forward direction and that to the camera centre."""
     across = points[45] - points[36]
     down = points[8] - points[27]
     forward = _unit(np.cross(down, across))
@@ -151,7 +151,7 @@ SIDE = 192
 FILE_VIEWS = 300
 # Each head is seen from every fifth of the range in which a face can be made out, and from behind.
 FACE_YAW = np.radians(100.0)
-VIEWS_A_HEAD = 6
+VIEWS_PER_HEAD = 6
 _ARRAYS = {"rgba": np.uint8, "points": np.float32, "visible": np.bool_, "facing": np.float32}
 
 
@@ -173,13 +173,13 @@ class ViewSet:
 
 
 def view_file(folder: Path, model_name: str, number: int, seed: int) -> Path:
-    """Path of one file of views."""
+    """Return the path of one file of views."""
     return folder / f"{model_name}-{seed}-{number:03d}.npz"
 
 
 def draw_yaws(rng: np.random.Generator) -> np.ndarray:
-    """Yaws (VIEWS_A_HEAD,) of one head's views, radians: even in front, the last from behind."""
-    strata = VIEWS_A_HEAD - 1
+    """Yaws (VIEWS_PER_HEAD,) of one head's views, radians: even in front, the last from behind."""
+    strata = VIEWS_PER_HEAD - 1
     front = ((np.arange(strata) + rng.random(strata)) * 2 / strata - 1) * FACE_YAW
     return np.append(front, rng.uniform(FACE_YAW, 2 * np.pi - FACE_YAW))
 
@@ -195,7 +195,7 @@ def draw_views(model: HeadModel, count: int, rng: np.random.Generator) -> list[T
 
 
 def stack_views(views: list[TrainingView]) -> ViewSet:
-    """One set of rendered views."""
+    """Stack rendered views into one set."""
     return ViewSet(
         **{
             name: np.array([getattr(view, name) for view in views], dtype)
