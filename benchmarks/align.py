@@ -37,6 +37,7 @@ from express50.contract.config import build_config
 from express50.contract.layout import Dataset
 from express50.contract.stage import Stage
 from express50.files.images import write_image
+from express50.files.text import markdown_table
 from express50.runner.runner import run_stage
 from express50.twin.config import TwinConfig
 from express50.twin.record import record
@@ -232,14 +233,14 @@ def as_markdown(figures: dict) -> list[str]:
         f" synthetic subjects, {figures['labels']} clips; all but the reference's are counted."
         " `align.accept` takes suggestions at least so sure without a person.",
         "",
-        "| accept | labels by hand | mean error of the others, frames | within one frame |",
-        "|---|---|---|---|",
     ]
+    head = ["accept", "labels by hand", "mean error of the others, frames", "within one frame"]
+    rows = []
     for row in figures["acceptance"]:
         error, near = row["error_frames_mean"], row["within_1_frame"]
-        shown = "n/a | n/a" if error is None else f"{error:.3f} | {100 * near:.1f} %"
-        lines.append(f"| {row['accept']:g} | {100 * row['by_hand']:.1f} % | {shown} |")
-    return lines
+        shown = ["n/a", "n/a"] if error is None else [f"{error:.3f}", f"{100 * near:.1f} %"]
+        rows.append([f"{row['accept']:g}", f"{100 * row['by_hand']:.1f} %", *shown])
+    return lines + markdown_table(head, rows)
 
 
 def record_subjects(scratch: Path, dataset: Dataset, subjects: int, frames: int) -> Truth:

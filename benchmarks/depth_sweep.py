@@ -18,6 +18,7 @@ from benchmarks.document import replace_section
 from express50.capture.frames import read_peaks
 from express50.contract.config import build_config
 from express50.contract.layout import Dataset
+from express50.files.text import markdown_table
 from express50.twin.truth import Truth
 from pipelines.depth import STAGE
 from pipelines.depth.reconstruct import reconstruct
@@ -89,9 +90,9 @@ def as_markdown(rows: list[dict], item: str) -> list[str]:
         " those that were used, where the footage has less or is too coarse for more. Seconds of"
         " one core; errors in all cameras of the rig, those left out too.",
         "",
-        "| setting | value | views | pixels | voxel mm | seconds | median mm | 95 % mm | skin mm |",
-        "|---|---|---|---|---|---|---|---|---|",
     ]
+    head = ("setting", "value", "views", "pixels", "voxel mm", "seconds", "median mm", "95 % mm",
+            "skin mm")  # fmt: skip
     keys = ("setting", "value", "views", "pixels", "voxel_mm", "seconds", "abs_error_mm_median",
             "abs_error_mm_p95", "skin_error_mm_median")  # fmt: skip
-    return lines + ["| " + " | ".join(f"{row[key]}" for key in keys) + " |" for row in rows]
+    return lines + markdown_table(head, [[row[key] for key in keys] for row in rows])

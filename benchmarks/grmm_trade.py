@@ -25,6 +25,7 @@ import torch
 from benchmarks.document import replace_section
 from benchmarks.grmm import held_out
 from express50.files.atomic import write_json
+from express50.files.text import markdown_table
 from express50.head.load import load_head
 from grmm.config import Config
 from grmm.data import HeadViews, Key, Sample, Source
@@ -141,13 +142,15 @@ def as_markdown(rows: list[dict], people: int, cameras: int, size: int) -> list[
         "torso, and over the head's alone. A picture is decoded, drawn, refined and compared. One "
         "run a row: a tenth of a dB says nothing."
     )
-    head = "| setting | budget s | steps | PSNR dB | head dB | SSIM | seconds a picture |"
+    head = ["setting", "budget s", "steps", "PSNR dB", "head dB", "SSIM", "seconds per picture"]
     lines = [
-        f"| {r['setting']} | {r['budget_s']:.0f} | {r['steps']} | {r['psnr_db']:.2f} |"
-        f" {r['psnr_head_db']:.2f} | {r['ssim']:.3f} | {r['picture_s']:.2f} |"
+        [
+            r["setting"], f"{r['budget_s']:.0f}", r["steps"], f"{r['psnr_db']:.2f}",
+            f"{r['psnr_head_db']:.2f}", f"{r['ssim']:.3f}", f"{r['picture_s']:.2f}",
+        ]
         for r in rows
-    ]
-    return [text, "", head, "|---|---|---|---|---|---|---|", *lines]
+    ]  # fmt: skip
+    return [text, "", *markdown_table(head, lines)]
 
 
 def choices(rows: list[dict]) -> list[dict]:

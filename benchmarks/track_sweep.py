@@ -21,6 +21,7 @@ from benchmarks.track_views import held_out_views
 from express50.capture.frames import read_cameras_of
 from express50.contract.config import build_config
 from express50.contract.layout import Dataset
+from express50.files.text import markdown_table
 from express50.twin.truth import Truth
 from pipelines.track import STAGE
 
@@ -112,14 +113,16 @@ def as_markdown(rows: list[dict], cameras: int) -> list[str]:
         " are root mean squares against the truth, seconds are processor seconds per frame. One"
         " head: differences under 0.1 mm are not to be trusted."
     )
-    head = "| setting | face mm | head mm | jaw degrees | outline IoU | seconds |"
+    head = ["setting", "face mm", "head mm", "jaw degrees", "outline IoU", "seconds"]
     lines = [
-        f"| {r['setting']} | {r['face_mm']:.2f} | {r['head_mm']:.2f} | {r['jaw_deg']:.2f} |"
-        f" {'n/a' if r['silhouette_iou'] is None else format(r['silhouette_iou'], '.4f')} |"
-        f" {r['seconds_per_frame']:.1f} |"
+        [
+            r["setting"], f"{r['face_mm']:.2f}", f"{r['head_mm']:.2f}", f"{r['jaw_deg']:.2f}",
+            "n/a" if r["silhouette_iou"] is None else f"{r['silhouette_iou']:.4f}",
+            f"{r['seconds_per_frame']:.1f}",
+        ]
         for r in rows
-    ]
-    return [text, "", head, "|---|---|---|---|---|---|", *lines]
+    ]  # fmt: skip
+    return [text, "", *markdown_table(head, lines)]
 
 
 if __name__ == "__main__":

@@ -17,6 +17,7 @@ from pathlib import Path
 from benchmarks import accuracy
 from benchmarks.document import replace_section
 from express50.contract.layout import Dataset
+from express50.files.text import markdown_table
 from express50.twin.truth import Truth
 from pipelines.stages import STAGES
 
@@ -164,15 +165,17 @@ def as_markdown(rows: list[dict]) -> list[str]:
         " included; an item of `matte` is a moment and counts all its cameras' `alpha`, run with"
         " the same preset. A star marks what no other preset of the stage beats in both.",
         "",
-        "| stage | preset | seconds an item | error | measure | |",
-        "|---|---|---|---|---|---|",
     ]
-    for r in rows:
-        star = "*" if (r["stage"], r["preset"]) in front else ""
-        lines.append(
-            f"| {r['stage']} | {r['preset']} | {r['seconds_per_item']:g} | {r['error']:g} |"
-            f" {r['measure']} | {star} |"
-        )
+    lines += markdown_table(
+        ["stage", "preset", "seconds per item", "error", "measure", ""],
+        [
+            [
+                r["stage"], r["preset"], f"{r['seconds_per_item']:g}", f"{r['error']:g}",
+                r["measure"], "*" if (r["stage"], r["preset"]) in front else "",
+            ]
+            for r in rows
+        ],
+    )  # fmt: skip
     return [*lines, "", "![error against seconds](tradeoffs.png)"]
 
 

@@ -18,7 +18,7 @@ from express50.console import log
 from express50.contract.config import nearest
 from express50.errors import ConfigError, FormatError
 from express50.files.atomic import dump_json, write_bytes, write_json
-from express50.files.text import read_json_table
+from express50.files.text import markdown_table, read_json_table
 from express50.head.load import load_head
 from grmm.checkpoint import Loaded, load_checkpoint
 from grmm.config import Config
@@ -349,7 +349,7 @@ def markdown(table: Mapping[str, dict], missing: Mapping[str, str]) -> str:
     head = ["Method"]
     for group in groups:
         head += [f"{GROUPS[group]}: PSNR", "SSIM", "LPIPS", "dB over full"]
-    lines = [head + ["paper, dB"], ["---"] * (len(head) + 1)]
+    lines = []
     for row in table.values():
         cells = [row["label"]]
         for group in groups:
@@ -357,7 +357,7 @@ def markdown(table: Mapping[str, dict], missing: Mapping[str, str]) -> str:
             cells += [_cell(numbers.get(name), d) for name, d in DIGITS.items()]
             cells.append(_cell(row["difference_db"].get(group), 2, sign=True))
         lines.append([*cells, _cell(row["paper_db"], 2, sign=True)])
-    text = "".join("| " + " | ".join(line) + " |\n" for line in lines)
+    text = "\n".join(markdown_table([*head, "paper, dB"], lines)) + "\n"
     return text + "".join(f"\n{name.upper()}: {reason}\n" for name, reason in missing.items())
 
 

@@ -1,9 +1,10 @@
-"""Write binary PLY files of triangle meshes."""
+"""Write triangle meshes as PLY, OBJ or GLB files, in the units they have."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -33,3 +34,67 @@ def write_ply(
     header += [f"property {_WORDS[kind]} {name}" for name, kind in kinds]
     header += [f"element face {len(rows)}", "property list uchar int vertex_indices", "end_header"]
     path.write_bytes(("\n".join(header) + "\n").encode() + table.tobytes() + rows.tobytes())
+
+
+def write_obj(
+    path: Path,
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    uv: np.ndarray,
+    uv_faces: np.ndarray,
+    texture: str | None = None,
+) -> None:
+    """Write an OBJ file with texture coordinates, and with a texture the .mtl that names it.
+
+    Args:
+        path: target; the .mtl gets its name.
+        vertices: (V, 3).
+        faces: (F, 3) indices of vertices.
+        uv: (T, 2) texture coordinates.
+        uv_faces: (F, 3) indices of texture coordinates.
+        texture: file name of the picture, beside the OBJ.
+    """
+    lines = []
+    if texture is not None:
+        material = path.with_suffix(".mtl")
+        material.write_text(f"newmtl head\nKa 0 0 0\nKd 1 1 1\nKs 0 0 0\nmap_Kd {texture}\n")
+        lines = [f"mtllib {material.name}", "usemtl head"]
+    lines += [f"v {x:.7f} {y:.7f} {z:.7f}" for x, y, z in vertices.astype(np.float64)]
+    lines += [f"vt {u:.7f} {v:.7f}" for u, v in uv.astype(np.float64)]
+    corners = np.stack([faces, uv_faces], -1).reshape(-1, 6) + 1
+    lines += [f"f {a}/{b} {c}/{d} {e}/{f}" for a, b, c, d, e, f in corners.tolist()]
+    path.write_text("\n".join(lines) + "\n", encoding="ascii")
+
+
+def write_glb(
+    path: Path,
+    name: str,
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    *,
+    normals: np.ndarray | None = None,
+    colours: np.ndarray | None = None,
+    uv: np.ndarray | None = None,
+    **material: Any,
+) -> None:
+    """Write a binary glTF file of one rough, not metallic mesh.
+
+    Args:
+        path: target.
+        name: of the mesh.
+        vertices: (V, 3).
+        faces: (F, 3) indices.
+        normals: (V, 3) of unit length.
+        colours: (V, 4) uint8, linear light, as glTF 2.0 (3.9.2) takes COLOR_0.
+        uv: (V, 2) texture coordinates.
+        material: further properties of trimesh's PBRMaterial, such as its texture.
+    """
+    import trimesh
+
+    skin = trimesh.visual.material.PBRMaterial(metallicFactor=0.0, roughnessFactor=0.8, **material)
+    visual = trimesh.visual.TextureVisuals(uv=uv, material=skin)
+    if colours is not None:
+        visual.vertex_attributes["color"] = colours
+    mesh = trimesh.Trimesh(vertices, faces, vertex_normals=normals, visual=visual, process=False)
+    scene = trimesh.Scene({name: mesh})
+    path.write_bytes(scene.export(file_type="glb", include_normals=normals is not None))

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from express50.errors import FormatError
-from express50.files.text import parse_json, read_json
+from express50.files.text import markdown_table, parse_json, read_json
 from grmm.study.design import ANSWERS, FORMAT, method_of
 
 FIELDS = ("participant", "example", "question", "answer")
@@ -174,16 +174,23 @@ def _share(counts: np.ndarray | None, places: tuple[int, ...], level: float | No
 def markdown(summary: dict) -> str:
     """Format the table as the paper does: percentages, with intervals for both methods."""
     first, second = summary["methods"]
-    lines = [
-        ["Type", f"{first} ++", f"{first} +", f"{second} ++", f"{second} +", "Tie", first, second],
-        ["---"] * 8,
+    head = [
+        "Type",
+        f"{first} ++",
+        f"{first} +",
+        f"{second} ++",
+        f"{second} +",
+        "Tie",
+        first,
+        second,
     ]
+    lines = []
     for name, row in summary["rows"].items():
         cells = [_percent(row[column]) for column in COLUMNS]
         sums = [_percent(row[m], row[f"{m}_interval"]) for m in ("first", "second")]
         lines.append([name.capitalize(), *cells, *sums])
-    table = "".join("| " + " | ".join(line) + " |\n" for line in lines)
-    return table + (
+    return "\n".join(markdown_table(head, lines)) + (
+        "\n"
         f"\n{summary['judgments']} of {summary['judgments_expected']} judgments by "
         f"{summary['participants']} participants; in brackets: {summary['interval']}.\n"
     )

@@ -63,27 +63,13 @@ def write_ply(path: Path, surface: HeadSurface) -> None:
 def write_glb(path: Path, surface: HeadSurface) -> None:
     """Write a binary glTF: position, normal, colour; world, metres.
 
-    glTF 2.0 (3.9.2) takes COLOR_0 for linear light, so colours are linear here, 8 bits: near black
-    they are up to 6 steps of sRGB off.
+    Colours are linear light in 8 bits: near black they are up to 6 steps of sRGB off.
     """
-    import trimesh
-
     used, corners = used_part(surface)
-    light = srgb_to_linear(surface.colors[used] / 255.0)
-    opaque = np.full((len(used), 1), 255)
-    skin = trimesh.visual.TextureVisuals(
-        material=trimesh.visual.material.PBRMaterial(metallicFactor=0.0, roughnessFactor=0.8)
-    )
-    skin.vertex_attributes["color"] = np.hstack([np.rint(255 * light), opaque]).astype(np.uint8)
-    mesh = trimesh.Trimesh(
-        surface.vertices[used],
-        corners,
-        vertex_normals=surface.normals[used],
-        visual=skin,
-        process=False,
-    )
-    scene = trimesh.Scene({"surface": mesh})
-    path.write_bytes(scene.export(file_type="glb", include_normals=True))
+    light = np.rint(255 * srgb_to_linear(surface.colors[used] / 255.0))
+    colours = np.hstack([light, np.full((len(used), 1), 255)]).astype(np.uint8)
+    places, normals = surface.vertices[used], surface.normals[used]
+    meshes.write_glb(path, "surface", places, corners, normals=normals, colours=colours)
 
 
 def figures_of(

@@ -193,12 +193,12 @@ def test_texels_lie_where_the_map_says() -> None:
 
 
 def test_written_files_are_found_by_the_export(tmp_path) -> None:
-    from express50.dataset.export.select import _albedo
+    from express50.dataset.export.select import read_albedo
 
     albedo = np.random.default_rng(0).integers(0, 256, (16, 16, 3), dtype=np.uint8)
     gains = {"cam1": np.array([0.5, 1.0, 2.0]), "cam0": np.ones(3)}
     write_appearance(tmp_path, albedo, Appearance(light(), gains, np.zeros((0, 3))), ["neutral"])
-    np.testing.assert_array_equal(_albedo(tmp_path), albedo)
+    np.testing.assert_array_equal(read_albedo(tmp_path), albedo)
     np.testing.assert_array_equal(read_image(tmp_path / "albedo.png"), albedo)
     with np.load(tmp_path / "appearance.npz", allow_pickle=False) as file:
         assert str(file["schema"]) == "express50.appearance/1"

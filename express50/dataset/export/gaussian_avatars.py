@@ -157,14 +157,9 @@ def _read_view(
         )
     image = read_peak_frame(dataset, subject, expression, camera.id)
     if options.even_colour:
-        image = _evened(dataset, subject, camera.id, image)
+        gain = read_gains(dataset, subject).get(camera.id)
+        image = image if gain is None else scale_light(image, 1.0 / gain)
     return image, alpha
-
-
-def _evened(dataset: Dataset, subject: str, camera_id: str, image: np.ndarray) -> np.ndarray:
-    """Divide the camera's gain out of an image, where one was measured."""
-    gain = read_gains(dataset, subject).get(camera_id)
-    return image if gain is None else scale_light(image, 1.0 / gain)
 
 
 def _described(

@@ -14,7 +14,7 @@ from express50.dataset.export.select import META, SCHEMA, Head
 from express50.files.atomic import dump_json
 from express50.files.images import encode_png
 from express50.geometry.conventions import corner_to_cell
-from express50.geometry.meshes import write_ply
+from express50.geometry.meshes import write_glb, write_obj, write_ply
 from express50.head.model import HeadModel
 
 FORMATS = ("obj", "ply", "glb")
@@ -34,14 +34,14 @@ def export_meshes(head: Head, kind: str, out: Path) -> dict:
     for name, vertices in zip(head.track.expressions, head.track.vertices, strict=True):
         path = out / f"{name}.{kind}"
         if kind == "obj":
-            write_obj(path, vertices, head.model, TEXTURE if head.albedo is not None else None)
+            write_head_obj(path, vertices, head.model, TEXTURE if head.albedo is not None else None)
         elif kind == "ply":
             colours = vertex_colours(head)
             names = () if colours is None else ("red", "green", "blue")
             columns = {name: colours[:, k] for k, name in enumerate(names)}  # type: ignore[index]
             write_ply(path, vertices, head.model.faces.numpy(), columns)
         else:
-            write_glb(path, vertices, head.model, head.albedo)
+            write_head_glb(path, vertices, head.model, head.albedo)
     meta = {
         "schema": SCHEMA,
         "format": kind,
@@ -57,51 +57,31 @@ def export_meshes(head: Head, kind: str, out: Path) -> dict:
     return meta
 
 
-def write_obj(
+def write_head_obj(
     path: Path, vertices: np.ndarray, model: HeadModel, texture: str | None = None
 ) -> None:
-    """Write an OBJ file with texture coordinates, and with a texture the .mtl that names it.
-
-    Args:
-        path: target; the .mtl gets its name.
-        vertices: (V, 3) metres.
-        model: faces and texture coordinates.
-        texture: file name of the picture, beside the OBJ.
-    """
-    lines = []
-    if texture is not None:
-        material = path.with_suffix(".mtl")
-        material.write_text(f"newmtl head\nKa 0 0 0\nKd 1 1 1\nKs 0 0 0\nmap_Kd {texture}\n")
-        lines = [f"mtllib {material.name}", "usemtl head"]
-    lines += [f"v {x:.7f} {y:.7f} {z:.7f}" for x, y, z in vertices.astype(np.float64)]
-    lines += [f"vt {u:.7f} {v:.7f}" for u, v in model.uv.double().numpy()]
-    corners = np.stack([model.faces.numpy(), model.uv_faces.numpy()], -1).reshape(-1, 6) + 1
-    lines += [f"f {a}/{b} {c}/{d} {e}/{f}" for a, b, c, d, e, f in corners.tolist()]
-    path.write_text("\n".join(lines) + "\n", encoding="ascii")
+    """Write vertices (V, 3) with the head model's faces and texture coordinates as OBJ."""
+    faces, uv_faces = model.faces.numpy(), model.uv_faces.numpy()
+    write_obj(path, vertices, faces, model.uv.double().numpy(), uv_faces, texture)
 
 
-def write_glb(
-    path: Path, vertices: np.ndarray, model: HeadModel, albedo: np.ndarray | None = None
+def write_head_glb(
+    path: Path, vertices: np.ndarray, model: HeadModel, albedo: np.ndarray | None
 ) -> None:
     """Write a binary glTF file, with the albedo (H, W, 3) uint8 sRGB as its texture."""
-    import trimesh
     from PIL import Image
 
     pairs = np.stack([model.faces.numpy(), model.uv_faces.numpy()], -1).reshape(-1, 2)
     unique, corners = np.unique(pairs, axis=0, return_inverse=True)
-    skin = trimesh.visual.material.PBRMaterial(
-        baseColorTexture=None if albedo is None else Image.fromarray(albedo),
-        baseColorFactor=[255, 255, 255, 255] if albedo is not None else [190, 190, 190, 255],
-        metallicFactor=0.0,
-        roughnessFactor=0.8,
-    )
-    mesh = trimesh.Trimesh(
+    write_glb(
+        path,
+        "head",
         vertices[unique[:, 0]],
         corners.reshape(-1, 3),
-        visual=trimesh.visual.TextureVisuals(uv=model.uv.numpy()[unique[:, 1]], material=skin),
-        process=False,
+        uv=model.uv.numpy()[unique[:, 1]],
+        baseColorTexture=None if albedo is None else Image.fromarray(albedo),
+        baseColorFactor=[255, 255, 255, 255] if albedo is not None else [190, 190, 190, 255],
     )
-    path.write_bytes(trimesh.Scene({"head": mesh}).export(file_type="glb"))
 
 
 def vertex_colours(head: Head) -> np.ndarray | None:

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from express50.dataset.export.meshes import write_obj
+from express50.dataset.export.meshes import write_head_obj
 from express50.dataset.export.select import Head
 from express50.dataset.tracks import Track
 from express50.geometry.transforms import matrix_to_axis_angle
@@ -58,24 +58,20 @@ def flame_motion(
 def write_parameters(head: Head, steps: list[str], shift: np.ndarray, out: Path) -> None:
     """Write a file of parameters per time step, the canonical one, and meshes if not FLAME."""
     (out / "flame_param").mkdir()
-    shared = _shared_parameters(head)
+    flame, shapes = is_flame(head.model), head.model.shape_dirs.shape[2]
+    offsets = head.track.offsets[: FLAME_VERTICES if flame else None]
+    shape = _padded(head.track.shape, max(shapes, FLAME_SHAPES if flame else 0))
+    shared = {"shape": shape, "static_offset": offsets[None]}
     for number, name in enumerate(steps):
         arrays = shared | _step_parameters(head, head.track.row(name), shift)
         (out / "flame_param" / f"{number:05d}.npz").write_bytes(npz_bytes(arrays))
-        if not is_flame(head.model):
+        if not flame:
             (out / "meshes").mkdir(exist_ok=True)
             vertices = head.track.vertices[head.track.row(name)] - shift
-            write_obj(out / "meshes" / f"{number:05d}.obj", vertices, head.model)
+            write_head_obj(out / "meshes" / f"{number:05d}.obj", vertices, head.model)
     still = {name: np.zeros_like(array) for name, array in arrays.items() if name not in shared}
     still["jaw_pose"][0, 0] = CANONICAL_JAW
     (out / "canonical_flame_param.npz").write_bytes(npz_bytes(shared | still))
-
-
-def _shared_parameters(head: Head) -> dict[str, np.ndarray]:
-    flame = is_flame(head.model)
-    count = max(head.model.shape_dirs.shape[2], FLAME_SHAPES if flame else 0)
-    offsets = head.track.offsets[: FLAME_VERTICES if flame else None]
-    return {"shape": _padded(head.track.shape, count), "static_offset": offsets[None]}
 
 
 def _step_parameters(head: Head, row: int, shift: np.ndarray) -> dict[str, np.ndarray]:

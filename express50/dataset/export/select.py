@@ -88,7 +88,7 @@ def read_tracked(dataset: Dataset, subject: str, expressions: Sequence[str]) -> 
     _check_fit(path, track, model)
     if expressions:
         track = chosen(track, [name for name in track.expressions if name in expressions])
-    return Head(subject=subject, track=track, model=model, albedo=_albedo(path.parent))
+    return Head(subject=subject, track=track, model=model, albedo=read_albedo(path.parent))
 
 
 def with_clips(dataset: Dataset, head: Head, wanted: Sequence[str]) -> Head:
@@ -152,7 +152,7 @@ def chosen(track: Track, expressions: Sequence[str]) -> Track:
     return replace(track, expressions=tuple(expressions), **parts)
 
 
-def _albedo(folder: Path) -> np.ndarray | None:
+def read_albedo(folder: Path) -> np.ndarray | None:
     """The texture beside a track, if there is one.
 
     Raises:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from contextlib import suppress
 from pathlib import Path
 
 import matplotlib as mpl
@@ -19,7 +20,7 @@ _PANELS = 4
 
 
 def _svg(figure: Figure) -> Markup:
-    """The figure as inline SVG with a fixed id salt, so that the same data give the same page."""
+    """Draw inline SVG with a fixed id salt, so that the same data give the same page."""
     with mpl.rc_context({"svg.hashsalt": "express50"}):
         out = io.StringIO()
         figure.savefig(out, format="svg", bbox_inches="tight", metadata={"Date": None})
@@ -63,7 +64,12 @@ def loss_curve(log: Path) -> Markup:
     if not log.is_file():
         return Markup("")
     text = read_text(log, FormatError)
-    rows = [row for line in text.split("\n") if (row := _entry(line, log)) is not None]
+    rows = []
+    for line in text.split("\n"):
+        with suppress(FormatError):  # half a line of a run that was killed
+            row = parse_json(line, str(log), FormatError)
+            if isinstance(row, dict) and {"iteration", "loss"} <= row.keys():
+                rows.append(row)
     if len(rows) < 2:
         return Markup("")
     figure = Figure(figsize=(9, 2.6))
@@ -74,12 +80,3 @@ def loss_curve(log: Path) -> Markup:
     axes.set_yscale("log")
     axes.spines[["top", "right"]].set_visible(False)
     return _svg(figure)
-
-
-def _entry(line: str, log: Path) -> dict | None:
-    """Parse a line of the log; None if it is not an entry, such as half a line."""
-    try:
-        row = parse_json(line, str(log), FormatError)
-    except FormatError:
-        return None
-    return row if isinstance(row, dict) and {"iteration", "loss"} <= row.keys() else None
