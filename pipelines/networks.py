@@ -12,7 +12,6 @@ import contextlib
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from pathlib import Path
 
 import cv2
@@ -21,6 +20,7 @@ import torch
 
 from express50.errors import ConfigError, StageError
 from express50.files.arrays import DAMAGE
+from express50.files.digests import cached_by_file
 
 TORCH_ERRORS = (*DAMAGE, torch.jit.Error)
 
@@ -85,8 +85,7 @@ def load_network(path: Path, role: Role) -> Network:
         StageError: it is no such network, or onnxruntime is not installed.
     """
     check_file(path, role.setting)
-    stat = path.stat()
-    return _load(path, role, (stat.st_mtime_ns, stat.st_size))
+    return _load(path, role)
 
 
 def check_file(path: Path, setting: str) -> None:
@@ -102,8 +101,8 @@ def resized(image: np.ndarray, height: int, width: int) -> np.ndarray:
     return cv2.resize(np.ascontiguousarray(image), (width, height), interpolation=how)
 
 
-@lru_cache(maxsize=2)
-def _load(path: Path, role: Role, version: tuple[int, int]) -> Network:
+@cached_by_file(2)
+def _load(path: Path, role: Role) -> Network:
     return _onnx(path, role) if path.suffix.lower() == ".onnx" else _torchscript(path, role)
 
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from dataclasses import dataclass
-from functools import lru_cache
 from pathlib import Path
 
 import cv2
@@ -22,6 +21,7 @@ from express50.contract.layout import Dataset
 from express50.errors import CaptureError, FormatError, StageError
 from express50.files.calibration import read_cameras
 from express50.files.containers import inside, read_samples, to_srgb8, to_srgb16
+from express50.files.digests import cached_by_file
 from express50.files.images import decode_image, read_image, upright
 from express50.files.text import NAME, read_json, read_json_table
 from express50.files.video import VideoReader
@@ -284,18 +284,17 @@ def read_cameras_of(dataset: Dataset, subject: str, undistorted: bool = True) ->
     """
     path = dataset.cameras_file(subject)
     try:
-        stat = path.stat()
+        cameras = _cameras_cached(path)
     except FileNotFoundError as error:
         raise StageError(
             f"{path}: subject {subject!r} is not calibrated; "
             f"run 'express50 calibrate {dataset.root}'"
         ) from error
-    cameras = _cameras_cached(path, (stat.st_mtime_ns, stat.st_size, stat.st_ino))
     return {name: pinhole(c) if undistorted else c for name, c in cameras.items()}
 
 
-@lru_cache(maxsize=64)
-def _cameras_cached(path: Path, version: tuple[int, ...]) -> dict[str, Camera]:
+@cached_by_file(64)
+def _cameras_cached(path: Path) -> dict[str, Camera]:
     cameras = read_cameras(path)
     return {name: cameras[name] for name in sorted(cameras)}
 
@@ -415,8 +414,7 @@ def decode_proxy(folder: Path, camera_id: str, frame: int) -> np.ndarray:
     """Read a proxy (h, w, 3) uint8 sRGB out of a folder of indexed tars."""
     tar, table = folder / f"{camera_id}.tar", folder / f"{camera_id}.json"
     try:
-        version = (table.stat().st_mtime_ns, table.stat().st_size)
-        offset, size = _proxy_table(table, version)[frame]
+        offset, size = _proxy_table(table)[frame]
         if min(offset, size) < 0 or offset + size > tar.stat().st_size:
             raise ValueError(f"frame {frame} lies outside of {tar.name}")
         with tar.open("rb") as file:
@@ -429,6 +427,6 @@ def decode_proxy(folder: Path, camera_id: str, frame: int) -> np.ndarray:
     return decode_image(data, f"{tar}: frame {frame}")
 
 
-@lru_cache(maxsize=256)
-def _proxy_table(path: Path, version: tuple[int, int]) -> list[tuple[int, int]]:
+@cached_by_file(256)
+def _proxy_table(path: Path) -> list[tuple[int, int]]:
     return [(int(a), int(b)) for a, b in read_json(path, FormatError, "ingest again")]

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from functools import lru_cache
 from pathlib import Path, PurePosixPath
 from typing import Any
 
 from express50.contract.layout import Dataset, footage_root
 from express50.errors import FormatError, StageError
+from express50.files.digests import cached_by_file
 from express50.files.text import NAME, read_json_table
 
 SCHEMA = "express50.index/1"
@@ -111,19 +111,17 @@ def read_index(dataset: Dataset, subject: str) -> Index:
     """
     path = dataset.index_file(subject)
     try:
-        stat = path.stat()
+        return _read_cached(path, dataset, subject)
     except FileNotFoundError as error:
         known = ", ".join(dataset.subjects()) or "none"
         raise StageError(
             f"{path}: subject {subject!r} is not ingested (subjects: {known}); "
             f"run 'express50 ingest {dataset.root} CAPTURE'"
         ) from error
-    return _read_cached(dataset, subject, (stat.st_mtime_ns, stat.st_size, stat.st_ino))
 
 
-@lru_cache(maxsize=64)
-def _read_cached(dataset: Dataset, subject: str, version: tuple[int, ...]) -> Index:
-    path = dataset.index_file(subject)
+@cached_by_file(64)
+def _read_cached(path: Path, dataset: Dataset, subject: str) -> Index:
     captures = dataset.captures()
     if subject not in captures:
         raise StageError(

@@ -207,16 +207,14 @@ def open_hdf5(path: Path) -> h5py.File:
         CaptureError: it is missing, truncated or not an HDF5 file.
     """
     try:
-        return _open_hdf5(path)
+        return _hdf5_of(path, "r")
     except DAMAGE as error:
         raise CaptureError(
             f"{path}: cannot be opened as HDF5 ({error}); copy the file again"
         ) from error
 
 
-@cached_by_file(OPEN_FILES)
-def _open_hdf5(path: Path) -> h5py.File:
-    return h5py.File(path, "r")
+_hdf5_of = cached_by_file(OPEN_FILES)(h5py.File)
 
 
 def child(file: h5py.File, name: str, where: str) -> Any:

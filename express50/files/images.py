@@ -146,11 +146,12 @@ def write_image(path: Path, image: np.ndarray, quality: int = 95, half: bool = F
     channels = 1 if image.ndim == 2 else image.shape[2]
     kind = "half" if half else {"uint8": "uint8", "uint16": "uint16"}.get(str(image.dtype), "float")
     spec = oiio.ImageSpec(image.shape[1], image.shape[0], channels, kind)
-    spec.attribute("Compression", _compression(Path(path).suffix.lower(), quality))
+    ending = Path(path).suffix.lower()
+    spec.attribute("Compression", f"jpeg:{quality}" if ending in (".jpg", ".jpeg") else "zip")
     if quality >= 95:
         spec.attribute("jpeg:subsampling", "4:4:4")
     spec.attribute("png:compressionLevel", 3)
-    if Path(path).suffix.lower() == ".exr":  # the time of writing would go into its header
+    if ending == ".exr":  # the time of writing would go into its header
         spec.attribute("DateTime", "1970:01:01 00:00:00")
     target = oiio.ImageOutput.create(str(path))
     if target is None or not target.open(str(path), spec):
@@ -158,10 +159,6 @@ def write_image(path: Path, image: np.ndarray, quality: int = 95, half: bool = F
     written = target.write_image(image.reshape(image.shape[0], image.shape[1], channels))
     if not target.close() or not written:
         raise FormatError(f"{path}: writing failed ({target.geterror().strip()})")
-
-
-def _compression(suffix: str, quality: int) -> str:
-    return {".jpg": f"jpeg:{quality}", ".jpeg": f"jpeg:{quality}", ".exr": "zip"}.get(suffix, "zip")
 
 
 def encode_jpeg(image: np.ndarray, quality: int = 95) -> bytes:

@@ -50,7 +50,10 @@ def check_whole(path: Path) -> None:
                 length = int.from_bytes(header[8:16], "big")
             length = length or size - offset
             if length < 8 or offset + length > size:
-                raise _truncated(path, size, offset + length)
+                raise CaptureError(
+                    f"{path}: video is truncated: {size} bytes, its boxes say {offset + length} or"
+                    " more; copy the file again"
+                )
             offset += length
     if count == BOXES:
         raise CaptureError(f"{path}: has {BOXES} boxes and more; it is damaged, copy it again")
@@ -59,13 +62,6 @@ def check_whole(path: Path) -> None:
             f"{path}: video has no index (moov box), the recording was cut off; "
             "copy the file again or record it again"
         )
-
-
-def _truncated(path: Path, size: int, expected: int) -> CaptureError:
-    return CaptureError(
-        f"{path}: video is truncated: {size} bytes, its boxes say {expected} or more; "
-        "copy the file again"
-    )
 
 
 def decoder_threads() -> int:

@@ -165,7 +165,8 @@ class Pool:
 
 
 def _submit(client: Any, batch: list[Task], attempt: int, gpu: bool) -> Any:
-    key, resources = _key(batch[0], attempt), {GPU: 1} if gpu else None
+    first, resources = batch[0], {GPU: 1} if gpu else None
+    key = f"{first.stage.name}-{first.item}-{first.fingerprint[:16]}-{attempt}"
     return client.submit(run_tasks, batch, pure=False, key=key, resources=resources)
 
 
@@ -210,10 +211,6 @@ def _outcome(future: Any) -> tuple[list[Receipt] | None, BaseException | None]:
     if isinstance(failure, CancelledError):
         raise failure
     return (None, failure) if failure is not None else (future.result(), None)
-
-
-def _key(task: Task, attempt: int) -> str:
-    return f"{task.stage.name}-{task.item}-{task.fingerprint[:16]}-{attempt}"
 
 
 def _killed(task: Task, attempts: int, job: SlurmJob | None) -> Receipt:

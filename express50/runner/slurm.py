@@ -37,7 +37,7 @@ MEMORY = re.compile(r"(\d+)([MGT])(i?B)?")
 
 @dataclass(frozen=True, kw_only=True)
 class SlurmJob:
-    """What each job of a stage asks SLURM for."""
+    """The resources that each job of a stage asks SLURM for."""
 
     time: str
     """Time limit in SLURM's forms, such as 4:00:00 or 1-12:00:00."""
@@ -162,6 +162,10 @@ def job_script(job: SlurmJob, address: str, name: str, threads: int, logs: Path)
     from dask_jobqueue.slurm import SLURMJob
 
     processes = job.processes(threads)
+    environment = thread_environment(threads)
+    if "PYTHONPATH" in os.environ:
+        environment["PYTHONPATH"] = os.environ["PYTHONPATH"]
+    exports = [f"export {name}={shlex.quote(value)}" for name, value in environment.items()]
     size, unit = MEMORY.fullmatch(job.memory).groups()[:2]  # type: ignore[union-attr]
     # Relative paths of a configuration are those of the folder that the run was started in.
     folder, output = shlex.quote(str(Path.cwd())), shlex.quote(str(logs / "%j.out"))
@@ -182,17 +186,9 @@ def job_script(job: SlurmJob, address: str, name: str, threads: int, logs: Path)
         death_timeout=ALONE_SECONDS,
         python=shlex.quote(sys.executable),
         job_extra_directives=[*directives, *["--gres=gpu:1"] * job.gpus, *job.options],
-        job_script_prologue=[*_environment(threads), *job.setup],
+        job_script_prologue=[*exports, *job.setup],
         worker_extra_args=["--no-dashboard", *(["--resources", f"{GPU}=1"] if job.gpus else [])],
     ).job_script()
-
-
-def _environment(threads: int) -> list[str]:
-    """Return lines that cap threads and pass PYTHONPATH on to workers."""
-    values = thread_environment(threads)
-    if "PYTHONPATH" in os.environ:
-        values["PYTHONPATH"] = os.environ["PYTHONPATH"]
-    return [f"export {name}={shlex.quote(value)}" for name, value in values.items()]
 
 
 class SlurmWorkers(RemoteWorkers):
@@ -209,7 +205,7 @@ class SlurmWorkers(RemoteWorkers):
         self._next_look = 0.0
 
     def slots(self, stage: str, gpu: bool) -> int:
-        """How many may work at once; 1 while there are no workers yet."""
+        """Return the number of tasks that may run at once; 1 before the first worker is there."""
         if gpu and not self.job.gpus:
             raise no_gpu(stage, f"--slurm asks for none; add gpus=1, or a table [{stage}] with it")
         return super().slots(stage, gpu)
@@ -223,9 +219,12 @@ class SlurmWorkers(RemoteWorkers):
         if time.monotonic() < self._next_look:
             return
         self._next_look = time.monotonic() + QUEUE_SECONDS
-        here = [str(worker["name"]) for worker in self.table()]
-        self._seen |= {i for i, name in self._names.items() if any(_of(name, w) for w in here)}
-        self._bury(_queue())
+        here = {str(worker["name"]) for worker in self.table()}
+        here |= {name.rpartition("-")[0] for name in here}  # dask numbers the workers of one job
+        self._seen |= {number for number, name in self._names.items() if name in here}
+        queue = _call("squeue", "--noheader", "--format=%A", f"--user={getpass.getuser()}")
+        if queue.returncode == 0:  # else it does not answer
+            self._bury(set(queue.stdout.split()))
         processes = self.job.processes(self.threads)
         while len(self._names) < min(self.job.jobs, -(-tasks // processes)):
             try:
@@ -238,8 +237,9 @@ class SlurmWorkers(RemoteWorkers):
             if self._count == 1:
                 sys.stderr.write(f"SLURM jobs are submitted; their output is in {self.logs}\n")
 
-    def _bury(self, queue: set[str] | None) -> None:
-        for number in [] if queue is None else sorted(set(self._names) - queue):
+    def _bury(self, queue: set[str]) -> None:
+        """Forget the jobs that have left the queue; stop when too many did no work."""
+        for number in sorted(set(self._names) - queue):
             del self._names[number]
             self._silent = 0 if number in self._seen else self._silent + 1
             if self._silent >= SILENT_JOBS:
@@ -272,17 +272,6 @@ class SlurmWorkers(RemoteWorkers):
         self._names.clear()
         super().close()
         self._cluster.close(timeout=10)
-
-
-def _of(name: str, worker: str) -> bool:
-    """Say whether a worker belongs to a job: dask appends a number to each of many workers."""
-    return worker == name or worker.rpartition("-")[0] == name
-
-
-def _queue() -> set[str] | None:
-    """List the user's jobs that wait or run; None when the queue does not answer."""
-    done = _call("squeue", "--noheader", "--format=%A", f"--user={getpass.getuser()}")
-    return set(done.stdout.split()) if done.returncode == 0 else None
 
 
 def _call(*command: str) -> subprocess.CompletedProcess:

@@ -19,7 +19,7 @@ RECENT = 50  # items whose rate counts for the time left
 
 @dataclass(frozen=True, kw_only=True)
 class StageStatus:
-    """How far one stage is.
+    """The progress of one stage.
 
     Attributes:
         stage: stage name.
@@ -30,7 +30,7 @@ class StageStatus:
         running: when each item that is worked at was begun, seconds since 1970.
         missing: items of the last run that wait or were left when it was stopped.
         rate: items a second of late; 0 while none has ended.
-        left_s: seconds until the run ends at that rate, None where that cannot be told.
+        left_s: seconds until the run ends at that rate, None where that is not known.
         seconds: work of all items.
         peak_memory: of the item that took most, bytes.
         receipts: all of them.
@@ -112,7 +112,7 @@ RUNNING_SHOWN = 40
 
 
 def status_page(name: str, table: Sequence[StageStatus], refresh_s: float | None) -> str:
-    """The page.
+    """Render the page.
 
     Args:
         name: of the dataset.
@@ -125,6 +125,7 @@ def status_page(name: str, table: Sequence[StageStatus], refresh_s: float | None
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("express50.runner", "."), autoescape=True, trim_blocks=True
     )
+    states = {stage.state for stage in table}
     failed = [receipt for stage in table for receipt in stage.failed]
     receipts = [receipt for stage in table for receipt in stage.receipts]
     slowest = sorted(receipts, key=lambda r: (-r.seconds, r.stage, r.item))[:SLOWEST_SHOWN]
@@ -135,7 +136,7 @@ def status_page(name: str, table: Sequence[StageStatus], refresh_s: float | None
     ]
     return environment.get_template("status_page.html").render(
         name=name,
-        state=_overall(table),
+        state=next((s for s in ("running", "stopped", "failed", "done") if s in states), "not run"),
         time=time.strftime("%Y-%m-%d %H:%M:%S %Z", time.localtime(now)),
         refresh=refresh_s,
         cards=_cards(table, receipts),
@@ -144,7 +145,15 @@ def status_page(name: str, table: Sequence[StageStatus], refresh_s: float | None
         more_working=max(0, len(working) - RUNNING_SHOWN),
         failed=failed[:FAILED_SHOWN],
         more_failed=max(0, len(failed) - FAILED_SHOWN),
-        slowest=[_slow(receipt, slowest[0].seconds) for receipt in slowest],
+        slowest=[
+            vars(receipt)
+            | {
+                "seconds": format_seconds(receipt.seconds),
+                "share": round(100 * receipt.seconds / max(slowest[0].seconds, 1e-9), 1),
+                "memory": format_memory(receipt.peak_memory),
+            }
+            for receipt in slowest
+        ],
     )
 
 
@@ -170,11 +179,6 @@ def format_seconds(seconds: float) -> str:
 def format_memory(count: float) -> str:
     """Bytes for people, in units of 1000."""
     return f"{count / 1e9:.1f} GB" if count >= 1e9 else f"{count / 1e6:.0f} MB" if count else ""
-
-
-def _overall(table: Sequence[StageStatus]) -> str:
-    states = {stage.state for stage in table}
-    return next((s for s in ("running", "stopped", "failed", "done") if s in states), "not run")
 
 
 def _cards(table: Sequence[StageStatus], receipts: Sequence[Receipt]) -> list[tuple[str, str]]:
@@ -209,15 +213,4 @@ def _row(stage: StageStatus) -> dict[str, Any]:
         "left": "" if stage.left_s is None else format_seconds(stage.left_s),
         "seconds": format_seconds(stage.seconds) if stage.receipts else "",
         "memory": format_memory(stage.peak_memory),
-    }
-
-
-def _slow(receipt: Receipt, most: float) -> dict[str, Any]:
-    return {
-        "stage": receipt.stage,
-        "item": receipt.item,
-        "seconds": format_seconds(receipt.seconds),
-        "share": round(100 * receipt.seconds / max(most, 1e-9), 1),
-        "memory": format_memory(receipt.peak_memory),
-        "attempts": receipt.attempts,
     }

@@ -107,7 +107,13 @@ def run_task(task: Task) -> Receipt:
 
 def _run_and_publish(task: Task) -> tuple[dict, dict[str, FileMark]]:
     if task.stage.needs_gpu(task.config):
-        _check_gpu(task)
+        import torch
+
+        if not torch.cuda.is_available():
+            raise StageError(
+                f"{task.stage.name} needs a GPU as it is configured; torch finds no CUDA device"
+                " here"
+            )
     with publishing(task.dataset, task.stage.name, task.item) as out:
         # Standard output is for data; libraries' messages go to standard error.
         with contextlib.redirect_stdout(sys.stderr):
@@ -117,16 +123,6 @@ def _run_and_publish(task: Task) -> tuple[dict, dict[str, FileMark]]:
         # Their bytes are still in memory; a rename changes neither time nor inode.
         files = {p.relative_to(out).as_posix(): mark_file(p) for p in files_of(out)}
     return json.loads(metrics), files
-
-
-def _check_gpu(task: Task) -> None:
-    """Refuse to run on a CPU what was asked for on a GPU."""
-    import torch
-
-    if not torch.cuda.is_available():
-        raise StageError(
-            f"{task.stage.name} needs a GPU as it is configured; torch finds no CUDA device here"
-        )
 
 
 def _metrics_bytes(result: Result) -> bytes:
