@@ -28,7 +28,7 @@ from express50.files.atomic import write_json
 from express50.files.text import markdown_table
 from express50.head.load import load_head
 from grmm.config import Config
-from grmm.data import HeadViews, Key, Sample, Source
+from grmm.data import HeadViews, Sample, SampleKey, Source
 from grmm.evaluate import evaluate, mean, training_render
 from grmm.presets import as_tables, from_tables, resolve
 from grmm.sampler import spread
@@ -57,7 +57,7 @@ class Smaller:
     def __init__(self, source: Source, factor: int) -> None:
         """Divide the sides of every image of ``source`` by ``factor``."""
         self.source, self.factor = source, factor
-        self.keys: Sequence[Key] = source.keys
+        self.keys: Sequence[SampleKey] = source.keys
         self.head = source.head
         self.digest = f"{source.digest} by {factor}"
 

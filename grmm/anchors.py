@@ -92,7 +92,7 @@ def mouth_faces(head: HeadModel) -> Tensor:
 
 
 def _candidate_texels(grid: Tensor, n_g: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Return face, column and row of every texel whose centre lies in a triangle's bounding box."""
+    """List face, column and row of every texel whose centre lies in a triangle's bounding box."""
     low = torch.ceil(grid.amin(1) - 0.5).clamp(0, n_g).long()  # (F, 2) as (column, row)
     high = torch.floor(grid.amax(1) - 0.5).clamp(-1, n_g - 1).long()
     size = (high - low + 1).clamp_min(0)
@@ -128,7 +128,7 @@ def uv_gradients(head: HeadModel) -> Tensor:
 
 
 def tangent_frames(vertices: Tensor, faces: Tensor, gradients: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the right-handed frames of triangles and how far a unit of UV reaches along them.
+    """Compute right-handed frames of triangles, and metres per unit of UV along them.
 
     Args:
         vertices: (V, 3) metres.

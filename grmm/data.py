@@ -25,7 +25,7 @@ CACHE_MB = 512  # of decoded samples: some hundred of 512 px
 
 
 @dataclass(frozen=True, kw_only=True)
-class Key:
+class SampleKey:
     """Ids of one sample."""
 
     subject: str
@@ -85,7 +85,7 @@ class Sample:
 class Source(Protocol):
     """A source of samples: the shard reader, or a list in tests."""
 
-    keys: Sequence[Key]
+    keys: Sequence[SampleKey]
     head: str
     digest: str
     """Another one if any sample is."""
@@ -110,7 +110,7 @@ class Item:
         depth_valid: (H, W) bool.
     """
 
-    key: Key
+    key: SampleKey
     state: HeadState
     view: PinholeView
     target: Tensor
@@ -151,7 +151,7 @@ class HeadViews:
         return len(self.source.keys)
 
     @property
-    def keys(self) -> Sequence[Key]:
+    def keys(self) -> Sequence[SampleKey]:
         """Return the ids of all samples."""
         return self.source.keys
 

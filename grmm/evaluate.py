@@ -21,7 +21,7 @@ from express50.errors import TrainError
 from express50.files.atomic import write_bytes, write_json
 from grmm.checkpoint import Gallery
 from grmm.config import MetricsConfig
-from grmm.data import HeadViews, Item, Key
+from grmm.data import HeadViews, Item, SampleKey
 from grmm.model import GRMM
 from grmm.perceptual_metrics import PerceptualMetrics
 from grmm.scene import Rendering
@@ -87,7 +87,7 @@ def ssim_score(image: Tensor, target: Tensor, mask: Tensor | None = None) -> flo
 
 
 def training_render(model: GRMM, views: HeadViews) -> Render:
-    """Return a function that renders training subjects with their rows of the code tables."""
+    """Make a function that renders training subjects by their rows of the code tables."""
 
     def render(item: Item) -> Rendering:
         subject = model.subjects.index(item.key.subject)
@@ -97,7 +97,7 @@ def training_render(model: GRMM, views: HeadViews) -> Render:
     return render
 
 
-def kind_of(key: Key, subjects: Sequence[str], gallery: Gallery) -> str:
+def kind_of(key: SampleKey, subjects: Sequence[str], gallery: Gallery) -> str:
     """Say whether a checkpoint has seen a sample, or in which way it was held out."""
     if key.subject not in subjects:
         return HELD_IDENTITY
@@ -139,7 +139,7 @@ def evaluate(
     indices: Sequence[int],
     render: Render,
     judge: PerceptualMetrics | None = None,
-    kind: Callable[[Key], str] = lambda key: "",
+    kind: Callable[[SampleKey], str] = lambda key: "",
     keep: Callable[[int, Tensor], None] | None = None,
 ) -> list[Row]:
     """Measure samples: one row of numbers each; see `compare`.
@@ -165,7 +165,7 @@ def evaluate(
     return rows
 
 
-def row_of(key: Key, kind: str, numbers: dict[str, float]) -> Row:
+def row_of(key: SampleKey, kind: str, numbers: dict[str, float]) -> Row:
     """Return the ids and numbers of one sample."""
     return Row(
         subject=key.subject, expression=key.expression, camera=key.camera, kind=kind, **numbers

@@ -160,7 +160,7 @@ def start(loaded: Loaded, views: HeadViews, given: list[int]) -> FitState:
 
 
 def fitted_render(state: FitState) -> Render:
-    """Return a function that renders items of the fitted subject."""
+    """Make a function that renders items of the fitted subject."""
 
     def render(item: Item) -> Rendering:
         code = state.z_exp[item.key.expression]
@@ -170,7 +170,7 @@ def fitted_render(state: FitState) -> Render:
 
 
 def deadline(settings: FitConfig, began: float, share: float) -> Callable[[], bool]:
-    """Return a function that says whether this share of the time budget is used up."""
+    """Make a function that is true once this share of the time budget is used."""
     limit = began + share * settings.seconds if settings.seconds else math.inf
     return lambda: time.perf_counter() >= limit
 

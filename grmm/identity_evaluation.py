@@ -29,7 +29,7 @@ class FitProtocol:
     Attributes:
         cameras: patterns of the cameras to fit from; empty: the first by id.
         expression: the expression to fit; others are rendered with the codes of training.
-        images: at most so many are measured a person and kind, 0 = all.
+        images: the most to measure per person and kind, 0 = all.
     """
 
     cameras: tuple[str, ...] = ()
@@ -81,7 +81,11 @@ def evaluate_unseen(
 
 
 def given_views(views: HeadViews, subject: str, protocol: FitProtocol) -> list[int]:
-    """Return the indices of the views to fit from."""
+    """Choose the views to fit from.
+
+    Raises:
+        ConfigError: the shards have none.
+    """
     own = [
         i
         for i, key in enumerate(views.keys)
@@ -110,7 +114,7 @@ def _what(views: HeadViews, subject: str, cameras: Sequence[str]) -> str:
 
 
 def any_expression(state: FitState) -> Callable[[Item], Rendering]:
-    """Return a function that renders a fitted person in fitted and training expressions."""
+    """Make a function that renders a fitted person in fitted and training expressions."""
     model = state.model
 
     def render(item: Item) -> Rendering:

@@ -32,7 +32,7 @@ Perceptual = Callable[[Tensor, Tensor], Tensor]
 
 
 def ssim(a: Tensor, b: Tensor) -> Tensor:
-    """Return the mean structural similarity of two images (C, H, W) with values in [0, 1].
+    """Compute the mean structural similarity of two images (C, H, W) with values in [0, 1].
 
     Gaussian window 11 x 11, sigma 1.5, only where it lies inside the image; it shrinks to the
     largest odd size that fits smaller images. Half precision is computed in float32.
@@ -43,7 +43,7 @@ def ssim(a: Tensor, b: Tensor) -> Tensor:
 
 
 def ssim_map(a: Tensor, b: Tensor) -> Tensor:
-    """Return the SSIM per window (C, H - 10, W - 10); see `ssim`."""
+    """Compute the SSIM per window (C, H - 10, W - 10); see `ssim`."""
     _same_shape(a, b)
     dtype = a.dtype if a.dtype in (torch.float32, torch.float64) else torch.float32
     a, b = a.to(dtype), b.to(dtype)
@@ -129,7 +129,7 @@ def mesh_edges(faces: Tensor) -> Tensor:
 
 
 def laplacian_mm2(displacement: Tensor, edges: Tensor) -> Tensor:
-    """Return mean squared uniform Laplacian of vertex displacements (V, 3), metres in, mm^2 out.
+    """Average the squared uniform Laplacian of vertex displacements (V, 3), metres in, mm^2 out.
 
     The displacement, not the mesh, is kept smooth, so that the head's own curvature costs nothing
     (GaussianAvatars; G12). A vertex without edges costs nothing.
@@ -142,7 +142,7 @@ def laplacian_mm2(displacement: Tensor, edges: Tensor) -> Tensor:
 
 
 def codes(z_id: Tensor, z_exp: Tensor) -> Tensor:
-    """Return the sum of squares of both codes (DeepSDF's form; G13)."""
+    """Add up the squares of both codes (DeepSDF's form; G13)."""
     return z_id.square().sum() + z_exp.square().sum()
 
 
@@ -154,7 +154,7 @@ def regularisers(
     bounds_mm: tuple[float, float],
     config: LossConfig,
 ) -> dict[str, Tensor]:
-    """Return the weighted terms of L_reg by name."""
+    """Compute the weighted terms of L_reg by name."""
     return {
         "scale": config.scale * scale_mm(rendering.gaussians.scales_mm, *bounds_mm),
         "laplacian": config.laplacian * laplacian_mm2(rendering.gaussians.displacement, edges),
@@ -205,7 +205,7 @@ class VGGDistance(nn.Module):
         self.register_buffer("std", torch.tensor(STD)[:, None, None])
 
     def forward(self, image: Tensor, target: Tensor) -> Tensor:
-        """Return the distance of two (3, H, W) images in [0, 1], at least 16 px per side."""
+        """Compute the distance of two (3, H, W) images in [0, 1], at least 16 px per side."""
         if min(image.shape[1:]) < SMALLEST_PX:
             raise ValueError(f"image is {tuple(image.shape[1:])}, expected at least 16 x 16 pixels")
         x = (torch.stack([image, target]) - self.mean) / self.std

@@ -105,7 +105,7 @@ class GRMM(Networks):
     def decode(
         self, z_id: Tensor, z_exp: Tensor, state: HeadState, opacities: Tensor | None = None
     ) -> Maps:
-        """Return the convolutional maps of transforms and opacity, which no pose changes.
+        """Decode the maps of transforms and opacity, which no pose changes.
 
         Opacity depends on the identity alone, so a caller may pass the ``opacities`` of the same
         person's last maps.
@@ -121,7 +121,7 @@ class GRMM(Networks):
         )
 
     def appearance(self, z_id: Tensor, state: HeadState, view: PinholeView) -> Tensor:
-        """Return the colours in [0, 1] and features (N, 3 + features) as one view sees them."""
+        """Decode colours in [0, 1] and features, (N, 3 + features), as one view sees them."""
         z_id, _ = self._inputs(z_id, self.z_exp[0], state)
         maps = self._sample(self.colour(z_id, view.direction().to(z_id.dtype)))
         return torch.cat([torch.sigmoid(maps[:, :3]), maps[:, 3:]], 1)
@@ -173,7 +173,7 @@ class GRMM(Networks):
         return maps.flatten(1).index_select(1, self.texels).T.to(self.head_centre.dtype)
 
     def _place(self, vertices: Tensor, offsets: Tensor) -> tuple[Tensor, Tensor]:
-        """Return means (N, 3) and quaternions (N, 4) from the mesh and decoded offsets (N, 7).
+        """Place means (N, 3) and quaternions (N, 4) on the mesh by decoded offsets (N, 7).
 
         q = normalise(dq + identity), so that zeros mean no rotation (G1).
         """
@@ -192,7 +192,7 @@ class GRMM(Networks):
 
 
 def initial_scales(spacing_mm: Tensor, config: ModelConfig) -> Tensor:
-    """Return inputs of softplus (N, 3) that give scales of texel spacings (N, 2), mm.
+    """Compute inputs of softplus (N, 3) whose scales match texel spacings (N, 2), mm.
 
     ``tangent``: along tangent, bitangent and, thinner, the normal; ``head``: the same on all axes.
     """

@@ -95,7 +95,7 @@ TABLES = {
 
 
 def preset(name: str) -> Config:
-    """Return the configuration of a preset.
+    """Build the configuration of a preset.
 
     Raises:
         ConfigError: no preset has this name.
@@ -187,10 +187,10 @@ class BudgetChoice:
 
 
 def choose(seconds: float, measured: Path = MEASURED) -> BudgetChoice:
-    """Return the best setting of the longest measured budget that fits in ``seconds``.
+    """Choose the best setting of the longest measured budget that fits in ``seconds``.
 
-    Less time than any that was measured gets the choice of the shortest. A machine's speed is not
-    asked: one twice as fast spends the choice of half the time, which is the safe side.
+    Less time than any that was measured gets the choice of the shortest. The
+    speed of the machine is ignored: a faster one trains the same setting for longer.
 
     Raises:
         ConfigError: the budget is not positive.

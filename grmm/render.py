@@ -111,14 +111,14 @@ def resized(view: PinholeView, longest_px: int) -> PinholeView:
 
 
 def frontal(loaded: Loaded) -> PinholeView:
-    """Return the training camera that looks at the face most nearly along -z."""
+    """Choose the training camera that looks at the face most nearly along -z."""
     cameras = loaded.gallery.cameras
     best = max(sorted(cameras), key=lambda name: float(cameras[name].direction()[2]))
     return cameras[best]
 
 
 def camera_of(loaded: Loaded, name: str | None, size: int = 0) -> PinholeView:
-    """Return a camera of the checkpoint by id, by default the frontal one; ``size`` 0: its own.
+    """Look up a camera of the checkpoint by id, by default the frontal one; ``size`` 0: its own.
 
     Raises:
         ConfigError: the checkpoint has no such camera.
@@ -164,7 +164,7 @@ def turntable(
 
 
 def novel_views(loaded: Loaded, head: HeadCodes, view: PinholeView) -> list[list[np.ndarray]]:
-    """Return the rows of PITCHES with columns of YAWS, degrees, around ``view``."""
+    """Draw rows of PITCHES and columns of YAWS, degrees, around ``view``."""
     centre = loaded.model.head_centre
     views = (orbit(view, yaw, centre, pitch) for pitch in PITCHES for yaw in YAWS)
     pictures = list(around(loaded, head, views))
@@ -174,7 +174,7 @@ def novel_views(loaded: Loaded, head: HeadCodes, view: PinholeView) -> list[list
 def expression_grid(
     loaded: Loaded, subjects: Many[str], expressions: Many[str], view: PinholeView
 ) -> list[list[np.ndarray]]:
-    """Return the pictures of every subject (rows) with every expression (columns).
+    """Draw every subject (rows) with every expression (columns).
 
     A subject without a tracked frame of an expression gets it by transfer.
     """
@@ -221,7 +221,7 @@ def control_sheet(loaded: Loaded, head: HeadCodes, view: PinholeView) -> Sheet:
 
 
 def strongest_coefficients(loaded: Loaded, count: int) -> list[int]:
-    """Return the numbers of the expression coefficients that vary most over the training frames."""
+    """Find the expression coefficients that vary most over the training frames."""
     frames = loaded.gallery.frames.values()
     length = max(len(f.expression) for f in frames)
     rows = [np.pad(f.expression, (0, length - len(f.expression))) for f in frames]

@@ -16,7 +16,7 @@ from torch import Tensor
 from express50.errors import FormatError
 from express50.files.images import read_image, write_image
 from express50.shards.writer import sample_key
-from grmm.data import HeadViews, Key
+from grmm.data import HeadViews, SampleKey
 from grmm.evaluate import Row, compare, row_of
 from grmm.perceptual_metrics import PerceptualMetrics
 from grmm.shard_source import ShardSource
@@ -25,13 +25,13 @@ SUFFIXES = (".png", ".jpg", ".jpeg")
 NAMED = 5  # how many wrong files an error names
 
 
-def sample_name(key: Key) -> str:
-    """Return the name of a sample in shards and of its picture in a folder."""
+def sample_name(key: SampleKey) -> str:
+    """Name a sample as the shards do, which is also its picture's name."""
     return sample_key(key.subject, key.expression, key.camera)
 
 
-def find_picture(folder: Path, key: Key) -> Path | None:
-    """Return the file of a sample, None if there is none."""
+def find_picture(folder: Path, key: SampleKey) -> Path | None:
+    """Find the picture of a sample; None if there is none."""
     paths = (folder / f"{sample_name(key)}{suffix}" for suffix in SUFFIXES)
     return next((path for path in paths if path.is_file()), None)
 
@@ -43,7 +43,7 @@ def score(
     views: HeadViews,
     indices: Sequence[int],
     judge: PerceptualMetrics,
-    kind: Callable[[Key], str] = lambda key: "",
+    kind: Callable[[SampleKey], str] = lambda key: "",
     partial: bool = False,
 ) -> list[Row]:
     """Score pictures, one row each; ``partial`` leaves samples without a picture out.
@@ -76,7 +76,7 @@ def score(
 
 
 def save_pictures(folder: Path, source: ShardSource, background: float) -> Callable:
-    """Return a function that writes a rendering of a sample so that `score` reads it."""
+    """Make a function that writes renderings of samples as `score` reads them."""
     folder.mkdir(parents=True, exist_ok=True)
 
     def keep(index: int, image: Tensor) -> None:

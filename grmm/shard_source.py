@@ -13,7 +13,7 @@ import numpy as np
 
 from express50.errors import FormatError
 from express50.shards.reader import ShardReader
-from grmm.data import Key, Sample, Tracked
+from grmm.data import Sample, SampleKey, Tracked
 
 INSET_PX = 2  # of the footage's border: undistortion has nothing to put there
 SIZES = {"neck": (3,), "jaw": (3,), "eyes": (6,), "R": (3, 3), "t": (3,)}
@@ -32,8 +32,8 @@ class ShardSource:
         self.reader = reader if split == "*" else reader.select(split=split)
         if not len(self.reader):
             raise FormatError(f"{root}: no samples; rerun 'express50 pack'")
-        self.keys: Sequence[Key] = [
-            Key(subject=entry.subject, expression=entry.expression, camera=entry.camera)
+        self.keys: Sequence[SampleKey] = [
+            SampleKey(subject=entry.subject, expression=entry.expression, camera=entry.camera)
             for entry in self.reader.entries
         ]
         self.head = str(self.reader.meta(0).get("head"))
@@ -113,7 +113,7 @@ class MixedSource:
                         "rename the capture and pack it again"
                     )
         self._places = [(source, i) for source in sources for i in range(len(source.keys))]
-        self.keys: Sequence[Key] = [source.keys[i] for source, i in self._places]
+        self.keys: Sequence[SampleKey] = [source.keys[i] for source, i in self._places]
         self.digest = _digest(source.digest for source in sources)
 
     def read(self, index: int) -> Sample:

@@ -23,7 +23,7 @@ from express50.files.text import parse_json, read_text
 from grmm import losses
 from grmm.checkpoint import collect_gallery, load_checkpoint, save_checkpoint
 from grmm.config import Config
-from grmm.data import HeadViews, Key
+from grmm.data import HeadViews, SampleKey
 from grmm.losses import load_vgg
 from grmm.model import GRMM
 from grmm.presets import as_tables
@@ -99,7 +99,7 @@ def best_device() -> torch.device:
     return torch.device(f"cuda:{os.environ.get('LOCAL_RANK', '0')}")
 
 
-def split_samples(keys: Sequence[Key], config: Config) -> tuple[list[int], list[int]]:
+def split_samples(keys: Sequence[SampleKey], config: Config) -> tuple[list[int], list[int]]:
     """Split samples into those to train on and those held out by camera or expression.
 
     Raises:

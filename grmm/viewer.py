@@ -194,7 +194,7 @@ class Viewer:
         watcher.drawn, watcher.still = began, not moving
         if moving:
             self.frames_per_second = 1 / (time.perf_counter() - began)
-            self._status.content = f"{self.frames_per_second:.0f} frames a second"
+            self._status.content = f"{self.frames_per_second:.0f} frames per second"
 
     def _join(self, client: viser.ClientHandle) -> None:
         with self._lock:
@@ -223,7 +223,7 @@ class Viewer:
         self._wake.set()
 
     def _add_controls(self) -> None:
-        gui, model = self.server.gui, self.loaded.model
+        gui, model, frames = self.server.gui, self.loaded.model, self.loaded.gallery.frames.values()
         self._status = gui.add_markdown("")
         self._sliders: dict[str, Any] = {}
         with gui.add_folder("who and what"):
@@ -239,7 +239,8 @@ class Viewer:
                 self._slider(name, reach, 0.0)
         with gui.add_folder("expression coefficients, added", expand_by_default=False):
             for number in strongest_coefficients(self.loaded, COEFFICIENTS):
-                size = 1.5 * max(abs(f.expression[number]) for f in self._frames_with(number))
+                shown = [f.expression for f in frames if len(f.expression) > number]
+                size = 1.5 * max(abs(expression[number]) for expression in shown)
                 name = self.loaded.head.expression_names[number]
                 self._slider(f"expression {name}", (-max(1.0, size), max(1.0, size)), 0.0)
         with gui.add_folder("residual codes"):
@@ -248,10 +249,6 @@ class Viewer:
                 for number in range(self._directions(code)):
                     self._slider(f"{code} {number}", (-3.0, 3.0), 0.0)
         gui.add_button("reset").on_click(self._reset)
-
-    def _frames_with(self, number: int) -> list:
-        frames = self.loaded.gallery.frames.values()
-        return [frame for frame in frames if len(frame.expression) > number]
 
     def _directions(self, code: str) -> int:
         return min(DIRECTIONS, len(principal_directions(getattr(self.loaded.model, code))))

@@ -26,7 +26,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def build_parser() -> argparse.ArgumentParser:
-    """Return the argument parser with all commands."""
+    """Build the argument parser with all commands."""
     parser = argparse.ArgumentParser(
         prog="grmm",
         description=DESCRIPTION,

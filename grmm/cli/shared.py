@@ -38,7 +38,7 @@ def parse_seconds(text: str) -> float:
 
 
 def at_least(low: int, high: int = 1 << 20) -> Callable[[str], int]:
-    """Return an argument type that takes whole numbers from ``low`` to ``high``."""
+    """Make an argument type of whole numbers from ``low`` to ``high``."""
 
     def number(text: str) -> int:
         try:
@@ -80,7 +80,7 @@ def add_metrics(parser: argparse.ArgumentParser) -> None:
 
 
 def metric_settings(args: argparse.Namespace) -> list[str]:
-    """Return the assignments that the flags of `add_metrics` stand for."""
+    """Translate the flags of `add_metrics` to assignments."""
     given = {"alexnet": args.alexnet, "inception": args.inception}
     return [f"metrics.{name}={path}" for name, path in given.items() if path]
 
@@ -182,7 +182,7 @@ def add_edit(parser: argparse.ArgumentParser) -> None:
 
 
 def edited_head(loaded: Loaded, args: argparse.Namespace) -> HeadCodes:
-    """Return the head that the arguments of `add_edit` describe."""
+    """Build the head that the arguments of `add_edit` describe."""
     from grmm.edit import controlled, trained_head, with_expression
 
     head = trained_head(loaded, *frame(loaded, args.subject, args.expression))
@@ -198,7 +198,7 @@ def edited_head(loaded: Loaded, args: argparse.Namespace) -> HeadCodes:
 
 
 def frame_head(loaded: Loaded, text: str, expression: str | None = None) -> HeadCodes:
-    """Return the head of ``SUBJECT/EXPRESSION``; without the second part ``expression``."""
+    """Build the head of ``SUBJECT/EXPRESSION``; ``expression`` replaces a missing second part."""
     from grmm.edit import trained_head
 
     subject, _, named = text.partition("/")
@@ -206,7 +206,7 @@ def frame_head(loaded: Loaded, text: str, expression: str | None = None) -> Head
 
 
 def frame(loaded: Loaded, subject: str | None, expression: str | None) -> tuple[str, str]:
-    """Return the subject and expression to draw, by default the first subject's neutral."""
+    """Choose the subject and expression to draw, by default the first subject's neutral."""
     model = loaded.model
     subject = subject or model.subjects[0]
     if expression is None:

@@ -96,7 +96,7 @@ def make_study(
 
 
 def common_pictures(folders: Sequence[Path]) -> list[str]:
-    """Return the stems of the pictures that all folders hold.
+    """List the stems of the pictures that all folders hold.
 
     Raises:
         ConfigError: a folder does not exist.

@@ -47,7 +47,7 @@ def read_study(out: Path) -> dict:
 
 
 def check_answer(study: dict, value: object) -> dict:
-    """Return one answer {participant, example, question, answer}, nothing else kept.
+    """Check one answer and keep only {participant, example, question, answer}.
 
     Raises:
         FormatError: a field is missing or out of range.
@@ -80,7 +80,7 @@ def append_answer(out: Path, answer: dict) -> None:
 
 
 def read_answers(out: Path, study: dict) -> list[dict]:
-    """Return all answers; of several to one question the last; a torn last line is left out.
+    """Read all answers; the last one to a question counts; a torn last line is left out.
 
     Raises:
         FormatError: a line is not an answer to this study.
@@ -142,7 +142,7 @@ def summarise(study: dict, answers: Sequence[dict], seed: int = 0) -> dict:
 
 
 def _row(found: Sequence[tuple[int, str, str]], seed: int) -> dict:
-    """Return the percent of every column and of each method's two together, with intervals."""
+    """Compute the percent of every column and of each method's two, with intervals."""
     people = sorted({participant for participant, _, _ in found})
     counts = np.zeros((len(people), len(COLUMNS)))
     for participant, _, column in found:

@@ -10,7 +10,7 @@ import torch
 from express50.geometry.transforms import look_at
 from express50.head.model import REGIONS, HeadModel
 from grmm.config import Config
-from grmm.data import Key, Sample, Tracked
+from grmm.data import Sample, SampleKey, Tracked
 from grmm.presets import resolve
 
 AXES = np.array([0.08, 0.11, 0.09])  # metres
@@ -64,7 +64,7 @@ class EllipsoidSource:
         self.size, self.offset = size, np.array(offset)
         self.cameras = {f"cam{i:02d}": self._camera(i, cameras) for i in range(cameras)}
         self.keys = [
-            Key(subject=f"S{s:03d}", expression=f"e{e}", camera=camera)
+            SampleKey(subject=f"S{s:03d}", expression=f"e{e}", camera=camera)
             for s in range(subjects)
             for e in range(expressions)
             for camera in self.cameras

@@ -140,7 +140,7 @@ def test_mixed_data_sets_share_expressions_and_refuse_common_subjects(roots):
     alone = open_shards(roots[1:], "train")
     index = next(i for i, key in enumerate(mixed.keys) if key == alone.keys[4])
     np.testing.assert_array_equal(mixed.read(index).image, alone.read(4).image)
-    with pytest.raises(FormatError, match="subject S000 is also in"):
+    with pytest.raises(FormatError, match="S000"):
         open_shards([roots[0], roots[0]], "train")
 
 

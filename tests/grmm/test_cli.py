@@ -270,7 +270,7 @@ def test_mixed_head_models_are_refused(tmp_path):
     writer = ShardWriter(tmp_path, 1 << 24)
     writer.add_group("train", samples)
     writer.close()
-    with pytest.raises(FormatError, match="'other', the first sample with 'ellipsoid'"):
+    with pytest.raises(FormatError, match="'other'"):
         ShardSource(tmp_path).read(1)
     assert io.BytesIO(samples[0].members["alpha.png"]).read(4) == b"\x89PNG"
 

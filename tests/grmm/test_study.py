@@ -129,7 +129,7 @@ def test_the_last_answer_counts_and_a_torn_line_does_not(study):
     append_answer(folder, answer | {"example": 3})
     assert [a["example"] for a in read_answers(folder, made)] == [2, 3]
     (folder / "answers.jsonl").write_text('{"a": 1}\nno\n')
-    with pytest.raises(FormatError, match="line 1: answer: participant is None"):
+    with pytest.raises(FormatError, match="line 1"):
         read_answers(folder, made)
 
 
@@ -209,7 +209,7 @@ def test_too_few_common_pictures_are_said(folders, tmp_path):
         Method(name="a", folder=folders["ours"]),
         Method(name="b", folder=folders["theirs"]),
     )
-    with pytest.raises(ConfigError, match="7 pictures of one name in all three, expected 8"):
+    with pytest.raises(ConfigError, match="7 pictures"):
         make_study(tmp_path / "x", folders["reference"], methods, examples=8)
     with pytest.raises(ConfigError, match="no such folder"):
         make_study(tmp_path / "x", tmp_path / "absent", methods)

