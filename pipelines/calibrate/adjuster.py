@@ -29,7 +29,7 @@ BEHIND = 1e4
 
 @dataclass(frozen=True, kw_only=True)
 class RigPriors:
-    """Standard deviations of the unknowns about where they start: 0 holds them, inf frees them."""
+    """Standard deviations of the unknowns about their expected values: 0 holds, inf frees them."""
 
     turn_rad: float = np.inf
     """Rotation of a camera."""
@@ -80,6 +80,7 @@ def adjust_rig(
     scales: Sequence[float],
     free: Collection[str] | None = None,
     iterations: int = ITERATIONS,
+    expected: Mapping[str, Camera] | None = None,
 ) -> AdjustedRig:
     """Fit cameras and points to tracks by the method of Levenberg and Marquardt.
 
@@ -87,16 +88,21 @@ def adjust_rig(
         cameras: start values of the cameras in `tracks.names`.
         tracks: observations.
         points: (P, 3) start values.
-        priors: how far unknowns may move from the start.
+        priors: how far unknowns may be from their expected values.
         scales: residuals, in sigmas, at which Cauchy's weight has fallen to a half. One fit after
             the other, wide scales first.
         free: cameras that may change at all; None frees all.
         iterations: limit per scale.
+        expected: cameras whose lenses the priors are about; None takes the start values. Poses
+            are expected where they start.
     """
     rig = [cameras[name] for name in tracks.names]
     information, columns = _information(rig, priors, free)
-    ties, logs = _focal_ties(rig, priors), np.log([_focal(camera) for camera in rig])
+    ties = _focal_ties(rig, priors)
     moved = np.zeros((len(rig), UNKNOWNS))
+    if expected is not None:
+        moved[:, 6:] = [_lens(camera) - _lens(expected[camera.id]) for camera in rig]
+    logs = np.array([_lens(camera)[0] for camera in rig]) - moved[:, 6]
 
     def prior_gradient(moved: np.ndarray) -> np.ndarray:
         gradient = information * moved
@@ -195,6 +201,16 @@ def _focal(camera: Camera) -> float:
     return float(np.sqrt(camera.K[0, 0] * camera.K[1, 1]))
 
 
+def _lens(camera: Camera) -> np.ndarray:
+    """Return the unknowns (4,) of a camera's lens: those from the log focal length on."""
+    bend = camera.params[_focals(camera) + 2] if _has_bend(camera) else 0.0
+    return np.array([np.log(_focal(camera)), *camera.K[:2, 2], bend])
+
+
+def _focals(camera: Camera) -> int:
+    return 2 if camera.model in ("PINHOLE", "OPENCV", "FULL_OPENCV") else 1
+
+
 def _has_bend(camera: Camera) -> bool:
     return camera.model not in ("SIMPLE_PINHOLE", "PINHOLE")
 
@@ -202,7 +218,7 @@ def _has_bend(camera: Camera) -> bool:
 def _moved(camera: Camera, step: np.ndarray) -> Camera:
     """Apply a step (10,) of its unknowns to a camera."""
     p = list(camera.params)
-    focals = 2 if camera.model in ("PINHOLE", "OPENCV", "FULL_OPENCV") else 1
+    focals = _focals(camera)
     for i in range(focals):
         p[i] *= float(np.exp(np.clip(step[6], -0.5, 0.5)))
     p[focals] += float(step[7])

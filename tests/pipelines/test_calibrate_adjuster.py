@@ -17,7 +17,7 @@ from pipelines.calibrate.adjuster import (
     move_pose,
     triangulate_tracks,
 )
-from pipelines.calibrate.tracks import PointTracks
+from pipelines.calibrate.tracks import PointTracks, _undistorted
 
 LENSES = {
     "SIMPLE_PINHOLE": (900.0, 320.0, 240.0),
@@ -126,3 +126,25 @@ def test_mismatches_do_not_pull():
 def tracks_errors(rig, tracks, points):
     cameras = list(rig.values())
     return _linearise(cameras, tracks, points).errors
+
+
+def test_priors_are_about_the_expected_lenses_wherever_the_fit_starts():
+    rig, expected = make_rig("SIMPLE_PINHOLE"), make_rig("SIMPLE_PINHOLE", focal=1.05)
+    tracks = tracks_in(rig, spots())
+    priors = RigPriors(focal=1e-6)
+    found = adjust_rig(rig, tracks, spots(), priors, (1e3,), expected=expected).cameras
+    for name in rig:
+        assert found[name].params[0] == pytest.approx(expected[name].params[0], rel=1e-3)
+    free = adjust_rig(rig, tracks, spots(), priors, (1e3,)).cameras
+    assert free["c0"].params[0] == pytest.approx(rig["c0"].params[0], rel=1e-3)
+
+
+@pytest.mark.parametrize("bend", [-50.0, -2.0, 2.0, 1e3, 5e5])
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+def test_features_where_a_lens_diverges_match_nothing_and_warn_nobody(bend):
+    camera = Camera("c0", 640, 480, "SIMPLE_RADIAL", (500.0, 320.0, 240.0, bend), np.eye(4))
+    pixels = np.array([[0.0, 0.0], [320.0, 240.0], [640.0, 480.0]])
+    ideal, described = _undistorted(camera, (pixels, np.ones((3, 128))))
+    assert np.isfinite(ideal).all()
+    assert described[1].all() and np.isfinite(described).all()
+    assert bend > 0 or not described[[0, 2]].any()
