@@ -1,4 +1,4 @@
-"""What a rig looks like, and which misreading of its matrices would explain a rig that does not.
+"""Judge a rig: where its cameras look, and which misreading of its matrices would explain it.
 
 Cameras of a head rig look at one place in front of them all. A calibration read the wrong way round
 (camera to world for world to camera, or OpenGL axes for OpenCV's) fails this, and usually only one
@@ -12,10 +12,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from express50.errors import CalibrationError
 from express50.geometry.cameras import Camera
 from express50.geometry.conventions import FLIP_YZ
-from express50.rigs.world_frame import check_meeting, meeting_point
+from express50.rigs.world_frame import depths_behind, describe_behind, meeting_point
 
 # A rig whose cameras stand closer or further from the head than this is not in metres.
 NEAR_M, FAR_M = 0.1, 10.0
@@ -30,9 +29,9 @@ class RigVerdict:
         meeting: (3,) world point nearest to all axes, None when they are parallel.
         distance_m: median distance of the cameras from it.
         miss_mm: median distance of the axes from it.
-        problem: what is wrong, empty when nothing is.
-        remedy: the reading that would put it right, empty when none would.
-        warnings: what is odd but may be meant.
+        problem: what is wrong, empty if nothing is.
+        remedy: the reading that would fix it, empty if none would.
+        warnings: what is unusual but may be intended.
     """
 
     cameras: int
@@ -46,7 +45,7 @@ class RigVerdict:
 
 def judge(cameras: Mapping[str, Camera]) -> RigVerdict:
     """Judge a rig of at least one camera."""
-    problem = _problem(cameras)
+    problem = describe_behind(depths_behind(cameras))
     point = meeting_point(cameras)
     if point is None:
         return RigVerdict(len(cameras), None, None, None, problem, "", ("the axes are parallel",))
@@ -64,14 +63,6 @@ def judge(cameras: Mapping[str, Camera]) -> RigVerdict:
     )
 
 
-def _problem(cameras: Mapping[str, Camera]) -> str:
-    try:
-        check_meeting(cameras, "rig")
-    except CalibrationError as error:
-        return str(error).removeprefix("rig: ").split("; is ")[0]
-    return ""
-
-
 def _miss(camera: Camera, point: np.ndarray) -> float:
     """Distance, metres, of a camera's optical axis from a point."""
     axis = camera.cam_from_world[2, :3]
@@ -80,7 +71,7 @@ def _miss(camera: Camera, point: np.ndarray) -> float:
 
 
 def _remedy(cameras: Mapping[str, Camera]) -> str:
-    """The first other reading of the matrices that passes, in words."""
+    """Name the first other reading of the matrices that passes."""
     readings = {
         "the matrices are camera to world: invert them": lambda T: np.linalg.inv(T),
         "the axes are OpenGL's: flip y and z": lambda T: FLIP_YZ @ T,
@@ -91,7 +82,7 @@ def _remedy(cameras: Mapping[str, Camera]) -> str:
             name: replace(camera, cam_from_world=read(camera.cam_from_world))
             for name, camera in cameras.items()
         }
-        if meeting_point(other) is not None and not _problem(other):
+        if meeting_point(other) is not None and not depths_behind(other):
             return words
     return ""
 

@@ -40,25 +40,38 @@ def meeting_point(cameras: Mapping[str, Camera]) -> np.ndarray | None:
     return middle + np.linalg.solve(total, right)
 
 
-def check_meeting(cameras: Mapping[str, Camera], where: str) -> None:
-    """Raise CalibrationError unless the point the cameras look at is in front of each of them.
+def depths_behind(cameras: Mapping[str, Camera]) -> dict[str, float]:
+    """Return the depths, metres, of the cameras that have the rig's meeting point behind them.
 
-    Inverted matrices (camera to world) and a wrong axis convention fail here.
+    Inverted matrices (camera to world) and a wrong axis convention show here. Empty where the axes
+    do not meet.
     """
     point = meeting_point(cameras)
     if point is None:
-        return
+        return {}
+    extent = float(np.median([np.linalg.norm(c.center - point) for c in cameras.values()]))
     depths = {
         name: float((c.cam_from_world[:3, :3] @ point + c.cam_from_world[:3, 3])[2])
-        for name, c in cameras.items()
+        for name, c in sorted(cameras.items())
     }
-    extent = float(np.median([np.linalg.norm(c.center - point) for c in cameras.values()]))
-    behind = [name for name, depth in sorted(depths.items()) if depth <= 0.01 * extent]
-    if behind:
-        shown = ", ".join(f"{name} (z = {depths[name]:.3g} m)" for name in behind[:4])
-        more = f" and {len(behind) - 4} more" if len(behind) > 4 else ""
+    return {name: depth for name, depth in depths.items() if depth <= 0.01 * extent}
+
+
+def describe_behind(depths: Mapping[str, float]) -> str:
+    """Put the result of `depths_behind` into words; empty where it is empty."""
+    if not depths:
+        return ""
+    shown = ", ".join(f"{name} (z = {depth:.3g} m)" for name, depth in list(depths.items())[:4])
+    more = f" and {len(depths) - 4} more" if len(depths) > 4 else ""
+    return f"the point all cameras look at lies behind {shown}{more}; expected z > 0"
+
+
+def check_meeting(cameras: Mapping[str, Camera], where: str) -> None:
+    """Raise CalibrationError unless the point the cameras look at is in front of each of them."""
+    depths = depths_behind(cameras)
+    if depths:
         raise CalibrationError(
-            f"{where}: the point all cameras look at lies behind {shown}{more}; expected z > 0; "
+            f"{where}: {describe_behind(depths)}; "
             "is world_to_camera inverted, or are its axes not OpenCV's (x right, y down, z ahead)?"
         )
 
