@@ -1,4 +1,4 @@
-"""The main job, end to end: footage, every stage, shards, GRMM, an unseen person, a report.
+"""Run the whole chain: footage, every stage, shards, GRMM, an unseen person, a report.
 
 ``python -m benchmarks.demo build/demo`` records a small synthetic capture with the digital twin and
 runs the same commands that a user would type, each as its own process. With ``--captures`` it takes
@@ -105,7 +105,7 @@ def record_twin(
 
 
 def subject_of(capture: Path) -> str:
-    """Subject named in a capture."""
+    """Read the subject named in a capture."""
     import tomllib
 
     return tomllib.loads((capture / "capture.toml").read_text())["subject"]
@@ -114,7 +114,7 @@ def subject_of(capture: Path) -> str:
 def run_stages(
     dataset: Path, captures: list[Path], unseen: str, workers: int, settings: str = "demo.toml"
 ) -> list[Step]:
-    """Every stage over the dataset; an item that fails is reported, the chain goes on."""
+    """Run every stage over the dataset; a failed item is reported, and the chain goes on."""
     common = ["--workers", str(workers), "--config", str(Path(__file__).with_name(settings))]
     steps = []
     for stage in STAGES:
@@ -128,7 +128,7 @@ def run_stages(
 
 
 def pick_views(dataset: Dataset, subject: str) -> tuple[str, list[str]]:
-    """A held-out camera and the two that the unseen person is fitted from.
+    """Choose a held-out camera and the two that the unseen person is fitted from.
 
     By the calibrated rig alone: cameras are ordered by their angle to the camera that saw the face
     best in alignment; the nearest other one is held out, the best and the next are given.
@@ -169,7 +169,7 @@ def run_grmm(dataset: Path, unseen: str, seconds: tuple[int, int]) -> list[Step]
 
 
 def summarise(dataset: Path, truth: Path | None, steps: list[Step]) -> dict:
-    """The figures of the run; what was not measured is null."""
+    """Collect the figures of the run; a figure that was not measured is null."""
 
     def metric(path: str, key: str) -> float | None:
         file = dataset / path / "metrics.json"

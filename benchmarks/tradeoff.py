@@ -55,7 +55,7 @@ def main() -> None:
 
 
 def sweep_one(base: Dataset, truth: Truth, stage: str, preset: str, out: Path) -> dict:
-    """Run one stage with one preset beside the base dataset; seconds an item and its error."""
+    """Run one stage with one preset beside the base dataset; gives seconds per item and error."""
     dataset = Dataset(out / f"{stage}-{preset}")
     dataset.root.mkdir(parents=True, exist_ok=True)
     number = [one.name for one in STAGES].index(stage)
@@ -87,7 +87,7 @@ def sweep_one(base: Dataset, truth: Truth, stage: str, preset: str, out: Path) -
 
 
 def rows_of_others(doc: Path, stages: list[str]) -> list[dict]:
-    """Rows of the document's table for stages that are not swept this time."""
+    """Read the document's rows of stages that are not swept this time."""
     text = doc.read_text(encoding="utf-8") if doc.is_file() else ""
     section = text.partition(f"## {SECTION}\n")[2].partition("\n## ")[0]
     rows = []
@@ -101,13 +101,13 @@ def rows_of_others(doc: Path, stages: list[str]) -> list[dict]:
 
 
 def children_seconds() -> float:
-    """Processor seconds of the finished child processes; other work on the machine adds none."""
+    """Measure processor seconds of the finished child processes, whatever else is running."""
     usage = resource.getrusage(resource.RUSAGE_CHILDREN)
     return usage.ru_utime + usage.ru_stime
 
 
 def pareto(rows: list[dict]) -> set[tuple[str, str]]:
-    """(stage, preset) that no other preset of the stage beats in both seconds and error."""
+    """Find (stage, preset) that no other preset of the stage beats in seconds and error."""
     return {
         (a["stage"], a["preset"])
         for a in rows
@@ -123,7 +123,7 @@ def pareto(rows: list[dict]) -> set[tuple[str, str]]:
 
 
 def write_csv(rows: list[dict], path: Path) -> None:
-    """The rows as a table for machines."""
+    """Write the rows as CSV."""
     with path.open("w", newline="") as file:
         fields = list(dict.fromkeys(key for row in rows for key in row))
         writer = csv.DictWriter(file, fields, restval="")
@@ -132,7 +132,7 @@ def write_csv(rows: list[dict], path: Path) -> None:
 
 
 def plot(rows: list[dict], path: Path) -> None:
-    """Error against seconds, one panel a stage."""
+    """Plot error against seconds, one panel per stage."""
     import matplotlib as mpl
 
     mpl.use("Agg")
@@ -150,20 +150,20 @@ def plot(rows: list[dict], path: Path) -> None:
         for r in own:
             axes.annotate(r["preset"], (r["seconds_per_item"], r["error"]), fontsize=8)
         axes.set_title(f"{stage}: {own[0]['measure'].replace('_', ' ')}", fontsize=9)
-        axes.set_xlabel("seconds an item", fontsize=8)
+        axes.set_xlabel("seconds per item", fontsize=8)
         axes.spines[["top", "right"]].set_visible(False)
     figure.tight_layout()
     figure.savefig(path, dpi=110)
 
 
 def as_markdown(rows: list[dict]) -> list[str]:
-    """The section of the document."""
+    """Format the section of the document."""
     front = pareto(rows)
     lines = [
         "Made by `make tradeoff` on the demo's synthetic captures (4 subjects, 8 cameras, 320 px),"
         " one process, against ground truth. Seconds are processor seconds, starting the command"
-        " included; an item of `matte` is a moment and counts all its cameras' `alpha`, run with"
-        " the same preset. A star marks what no other preset of the stage beats in both.",
+        " included; an item of `matte` is a peak with all its cameras. A star marks a preset that"
+        " no other preset of the stage beats in both.",
         "",
     ]
     lines += markdown_table(

@@ -1,9 +1,9 @@
-"""Networks whose weights the user brings, TorchScript or ONNX files, as functions of pictures.
+"""Load networks from the user's TorchScript or ONNX files as functions of pictures.
 
 ``torch.load``, which executes pickles, is never called. ``torch.jit.load`` reads its archive with
-an unpickler of its own: one that names ``os.system`` is refused, a test shows it. That is no proof
-of safety: TorchScript is a program, part of which runs at loading, and PyTorch's documentation
-says to load only what one trusts. So does this module.
+an unpickler of its own: a file that names ``os.system`` is refused, a test shows it. This does not
+prove safety: TorchScript is a program, part of which runs at loading, and PyTorch's documentation
+says to load only files that one trusts.
 """
 
 from __future__ import annotations
@@ -30,13 +30,13 @@ Run = Callable[[Sequence[np.ndarray]], list[np.ndarray]]
 
 @dataclass(frozen=True, kw_only=True)
 class Role:
-    """What a network must be: pictures it takes, and which of its outputs is the answer.
+    """The interface of a network: the pictures it takes, and the output that is the answer.
 
     Attributes:
         setting: config key that names the file, such as matte.weights, for messages.
         inputs: names of the pictures; an ONNX file may order them otherwise.
         outputs: names that mark the answer in an ONNX file.
-        place: index of the answer where no name tells it.
+        place: index of the answer where no name marks it.
     """
 
     setting: str
@@ -82,14 +82,14 @@ def load_network(path: Path, role: Role) -> Network:
 
     Raises:
         ConfigError: the file is missing.
-        StageError: it is no such network, or onnxruntime is not installed.
+        StageError: it is not such a network, or onnxruntime is not installed.
     """
     check_file(path, role.setting)
     return _load(path, role)
 
 
 def check_file(path: Path, setting: str) -> None:
-    """Raise ConfigError where there is no file of weights."""
+    """Raise ConfigError if the file of weights is missing."""
     if not path.is_file():
         raise ConfigError(f"{setting} {path}: no such file; expected TorchScript or .onnx")
 
@@ -236,7 +236,7 @@ def _onnx(path: Path, role: Role) -> Network:
 
 
 def _onnx_errors() -> tuple[type[Exception], ...]:
-    """What onnxruntime raises: classes without a base class of their own."""
+    """List the exceptions of onnxruntime, which share no base class of their own."""
     from onnxruntime.capi import onnxruntime_pybind11_state as state
 
     kinds = (kind for kind in vars(state).values() if isinstance(kind, type))

@@ -13,7 +13,7 @@ WITHOUT_PLATE = ("grabcut", "salient")
 
 @dataclass(frozen=True, kw_only=True)
 class MatteConfig:
-    """How each camera is matted, and what the cameras of a peak may correct in each other.
+    """Set how each camera is matted, and whether the cameras of a peak correct each other.
 
     Lengths are shares of the image's longer side; differences are in deviations of noise.
     """

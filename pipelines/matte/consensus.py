@@ -1,8 +1,8 @@
-"""The cameras of one moment agree on their mattes: what each must remove, and what it must fill.
+"""Compare the mattes of one frame set, and find what each camera must remove and fill.
 
-Removed is what the other views rule out (moving shadows, things that only some cameras see),
-filled what they see solid and this camera could not tell from its background. A camera whose matte
-fits the others neither where it is opaque nor where it is clear is named, and outvoted.
+A camera removes what the other views rule out (moving shadows, things that only some cameras see).
+It fills what they see as solid and it could not separate from its background. A camera whose matte
+fits the others neither where it is opaque nor where it is clear is reported and outvoted.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class Misfit:
 
     @property
     def words(self) -> str:
-        """What is wrong, for people."""
+        """Describe the misfit for people."""
         return (
             f"its matte lacks {self.lacking:.0%} of what the others see, and {self.stray:.0%} of it"
             " lies elsewhere; was the camera moved? left as it was"
@@ -58,7 +58,7 @@ class Misfit:
 
 @dataclass(frozen=True)
 class Agreement:
-    """What to change.
+    """The corrections that the views of one frame set make in each other.
 
     Attributes:
         removed, filled: (h, w) bool of each camera that something is changed of.
@@ -73,7 +73,7 @@ class Agreement:
 
 
 def agree(views: Sequence[MatteView], cells: int, strand: float) -> Agreement:
-    """Compare the views of one moment."""
+    """Compare the views of one frame set."""
     doubted = {view.name: why for view in views if (why := _useless(view))}
     while True:
         used = [view for view in views if view.name not in doubted]
@@ -82,7 +82,7 @@ def agree(views: Sequence[MatteView], cells: int, strand: float) -> Agreement:
             return Agreement(warnings=_named(doubted), unchanged=few)
         removed, filled, misfits = _compare(used, cells, strand)
         worst = max(misfits, key=lambda name: misfits[name].size)
-        # Most cameras must be right, or there is no telling who is wrong.
+        # Most cameras must be right; otherwise it is unknown which is wrong.
         if misfits[worst].size <= 1 or len(doubted) >= len(views) // 3:
             return Agreement(removed, filled, _named(doubted))
         doubted[worst] = misfits[worst].words
@@ -93,7 +93,7 @@ def _named(doubted: dict[str, str]) -> list[Note]:
 
 
 def _useless(view: MatteView) -> str:
-    """Why a view says nothing of the others' mattes; empty where it does."""
+    """Say why a view cannot judge the other mattes; empty where it can."""
     if view.projection[2, 3] <= 1:  # radii from the ball's centre, along its axis
         return "it stands amid what the others look at, or looks away; left as it was"
     share = float((view.alpha[view.valid] > INSIDE).mean()) if view.valid.any() else 0.0
@@ -105,7 +105,7 @@ def _useless(view: MatteView) -> str:
 def _compare(
     views: Sequence[MatteView], cells: int, strand: float
 ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray], dict[str, Misfit]]:
-    """What to remove and to fill of each view, and how badly it fits the others."""
+    """Find what to remove and to fill in each view, and how badly it fits the others."""
     longest = max(max(view.alpha.shape) for view in views)
     space = make_space(views, cells, max(1.5, MARGIN * longest))
     place = subject_place(space, VOTES)

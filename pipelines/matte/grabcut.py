@@ -1,9 +1,9 @@
-"""Alpha of a person before any background, from one picture: neither plate nor weights.
+"""Matte a person before any background from one picture, without plate or weights.
 
-The face tells the head's pose, and with it roughly where skull, hair and shoulders are; GrabCut
-(Rother, Kolmogorov and Blake 2004) finds by colours where they end, and there alpha is smooth along
-the picture's colours. Good where hair and background differ in colour; a network (`salient`) knows
-people, this does not.
+The face gives the head's pose, and with it roughly where skull, hair and shoulders are. GrabCut
+(Rother, Kolmogorov and Blake 2004) finds by colours where they end; there alpha is smooth along
+the picture's colours. It works where hair and background differ in colour; elsewhere a network
+(`salient`) is better.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ SEARCH = 0.08  # smallest windows searched for the face, of the longer side
 PIXEL_M = 1e-3  # on the head, to which larger pictures are reduced; edges are refined afterwards
 ROUNDS = 6
 EDGE_M = 0.007  # half width of the band in which alpha is soft
-HOLE_M2 = 1.5e-3  # larger gaps show what is behind
+HOLE_M2 = 1.5e-3  # larger gaps show the background
 SURE, LIKELY, HAIR = 0.7, 1.3, 1.6  # skulls: no background in the first, no hair past the last
 LEAST_DEPTH = 0.05  # metres before the camera
 
@@ -64,7 +64,7 @@ def person_alpha(net: LandmarkNet, camera: Camera, frame: np.ndarray) -> np.ndar
 
 @cache
 def _parts() -> dict[int, tuple[np.ndarray, ...]]:
-    """Convex parts (N, 3) of a person in head space, metres, by what GrabCut is told of them."""
+    """Make convex parts (N, 3) of a person in head space, metres, by GrabCut's label."""
     from express50.head.load import load_head
 
     vertices = load_head("procedural").template.double().numpy()
@@ -130,7 +130,7 @@ def _fill(mask: np.ndarray, pixels: np.ndarray, value: int) -> None:
 
 
 def _cut(image: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """What GrabCut takes for the person (H, W) bool."""
+    """Run GrabCut; returns the pixels (H, W) bool of the person."""
     if not ((mask == cv2.GC_BGD) | (mask == cv2.GC_PR_BGD)).any():
         return np.ones(mask.shape, bool)  # the face fills the picture
     cv2.setRNGSeed(0)  # its clusters start at random

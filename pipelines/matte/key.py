@@ -57,7 +57,7 @@ class KeyOptions:
 
 @dataclass(frozen=True)
 class Support:
-    """Where a frame shows the subject: `core` (H, W) surely, `near` (H, W) perhaps."""
+    """The pixels that show the subject: `core` (H, W) surely, `near` (H, W) perhaps."""
 
     core: np.ndarray
     near: np.ndarray
@@ -147,7 +147,7 @@ def dilated(mask: np.ndarray, radius: float) -> np.ndarray:
 
 
 def opened(mask: np.ndarray, radius: float) -> np.ndarray:
-    """What discs of a radius, wholly inside the mask (H, W), cover of it."""
+    """Keep of a mask (H, W) what discs of a radius cover that lie wholly inside it."""
     return dilated(eroded(mask, radius), radius)
 
 
@@ -187,7 +187,7 @@ def shade_of_plate(
     dark, broad, _ = _darkened(image, model, shadow, length)
     weight = (broad & clear).astype(np.float32)
     reach = REACH * length
-    # Where no plate is in reach there is no telling; no shadow then.
+    # Where no plate is in reach a shadow cannot be measured; assume none.
     return (_blur(dark * weight, reach) + 1e-3) / (_blur(weight, reach) + 1e-3)
 
 
@@ -216,7 +216,7 @@ def subject_region(difference: np.ndarray, high: float) -> np.ndarray:
     if not sure.any():
         return np.zeros(difference.shape, bool)
     area = stats[:, cv2.CC_STAT_AREA]
-    # A few lone pixels are no subject, however bright.
+    # A few isolated pixels are not a subject, however bright.
     least = max(LEAST_PART * area[sure].max(), 2e-4 * difference.size)
     return (sure & (area >= least))[labels]
 
@@ -262,7 +262,7 @@ def firm_pixels(
     """Pixels (H, W) bool that look opaque, knowing the subject's colour about a first core.
 
     Thin hair differs from the plate by less than hair itself does. Skin under dark hair may too,
-    but it is no mixture of hair and plate: what lies off the line between them is subject as well.
+    but it is not a mixture of hair and plate: colours off the line between them are subject too.
     """
     off = image - model.plate
     own = subject_colour(image, core, length) - model.plate

@@ -1,10 +1,10 @@
-"""Alpha from the user's matting network.
+"""Run the user's matting network.
 
 - ``bgmv2``: BackgroundMattingV2 (Lin et al. 2021) sees frame and clean plate, ``src`` and ``bgr``,
   RGB in [0, 1], sides multiples of 4; it gives ``pha`` first (its ``doc/model_usage.md``).
 - ``salient``: RMBG-2.0 and BiRefNet (Zheng et al. 2024) see the frame alone, squeezed to their own
   square, less ImageNet's mean and over its deviation; RMBG-2.0's ONNX file takes ``pixel_values``
-  and gives ``alphas``, others end before the sigmoid, which their numbers tell (their cards).
+  and gives ``alphas``; others end before the sigmoid, which the range of their values shows.
 """
 
 from __future__ import annotations

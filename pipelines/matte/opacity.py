@@ -132,9 +132,9 @@ def _precision(covariance: np.ndarray, reach: np.ndarray) -> tuple[np.ndarray, n
 
 
 def shrunk(values: np.ndarray, doubt: np.ndarray) -> np.ndarray:
-    """Values (N,) without what is within its doubt (N,): 0 there, and hardly less far above it.
+    """Shrink values (N,) by their doubt (N,): to 0 within it, and hardly far above it.
 
-    The non-negative garrote (Breiman 1995): unlike a ramp it does not lower what is sure.
+    This is the non-negative garrote (Breiman 1995): unlike a ramp it keeps large values.
     """
     kept = 1 - (doubt / np.maximum(values, 1e-9)) ** 2
     return np.where(values > 0, values * np.clip(kept, 0, 1), 0.0)

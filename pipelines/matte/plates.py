@@ -1,6 +1,6 @@
-"""What a camera shows without the subject: plate, exposure against the frame, and noise.
+"""Model the plate of a camera: its exposure relative to the frame, and its noise.
 
-The noise decides how large a difference means anything. It is measured on the frames themselves,
+The noise decides how large a difference is significant. It is measured on the frames themselves,
 where they show plate: it grows with brightness and, through compression and resampling, with the
 plate's own contrast, and its channels go together (compression keeps less colour than light).
 """

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from scipy.sparse.linalg import LinearOperator, cg
 
-# Variance of colour (of 1) that counts as flat, so that noise in flat windows is no edge.
+# Variance of colour (of 1) that counts as flat, so that noise in flat windows is not an edge.
 FLAT = 1e-5
 ITERATIONS = 30
 
@@ -117,7 +117,7 @@ def in_tiles(
     overlap: int,
     compute: Callable[[slice, slice], np.ndarray],
 ) -> np.ndarray:
-    """What ``compute(rows, columns)`` gives for tiles of an image, joined to (H, W) float32.
+    """Call ``compute(rows, columns)`` for tiles of an image, and join them to (H, W) float32.
 
     In an overlap the outer quarter of each tile, whose surroundings it did not see, is not used,
     and the half between fades from one tile to the other; where the two agree the result is
@@ -143,10 +143,10 @@ def in_tiles(
 
 
 def spans(length: int, tile: int, overlap: int) -> list[slice]:
-    """Slices that cover a length; neighbours share ``overlap``.
+    """Give slices that cover a length; neighbours share ``overlap``.
 
     Raises:
-        ValueError: ``tile`` or ``overlap`` is no multiple of STEP, or the overlap not the smaller.
+        ValueError: ``tile`` or ``overlap`` is not a multiple of STEP, or the overlap not smaller.
     """
     if tile % STEP or overlap % STEP or not 0 < overlap < tile:
         raise ValueError(f"tile {tile}, overlap {overlap}: expected multiples of {STEP}, tile more")
@@ -157,7 +157,7 @@ def spans(length: int, tile: int, overlap: int) -> list[slice]:
 
 
 def _join(whole: np.ndarray, piece: np.ndarray, start: int, end: int) -> None:
-    """Put a piece into the columns from ``start``; those before ``end`` are there and fade."""
+    """Put a piece into the columns from ``start``; those before ``end`` exist and fade."""
     shared = end - start
     if shared > 0:
         place = np.arange(shared) + 0.5

@@ -103,7 +103,7 @@ def center_of(camera: Camera, ball: Ball) -> np.ndarray:
 
 
 def label_pixels(view: MatteView, margin: float) -> np.ndarray:
-    """What a view says of its pixels (h * w + 1,) uint8; clear is further than `margin` pixels."""
+    """Label a view's pixels (h * w + 1,) uint8; clear is further than `margin` pixels."""
     opaque = view.alpha > FAINT
     labels = np.full(opaque.shape, CLEAR, np.uint8)
     if opaque.any():
@@ -183,7 +183,7 @@ MARGIN = 0.01  # distance from a silhouette, a share of the longer side, that pr
 COLOUR = 0.1  # largest difference, of full scale, of one surface in neighbouring cameras
 MOST = 0.75  # share of the other views that must see a place to call it solid
 ERRING = 8  # one of so many views may lack the same spot
-THICK = 0.5  # share of the usual length of a ray in the hull that is no corner of it
+THICK = 0.5  # share of the usual length of a ray in the hull that does not graze a corner
 NEIGHBOURS = 4  # cameras that are asked for the colour of a surface
 WIDEST = 0.2  # cosine of the largest angle to them
 SEARCH = (-0.3, 0.1, 17)  # radii before and behind the others' hull in which the surface may lie
@@ -193,7 +193,7 @@ LARGEST = 0.4  # share of the subject from which on a matte is wrong rather than
 
 @dataclass(frozen=True)
 class Evidence:
-    """What other views say of a view's pixels, each (h, w).
+    """The evidence of other views about a view's pixels, each (h, w).
 
     Attributes:
         known: whose rays cross the space that is compared.
@@ -252,7 +252,7 @@ def _thick(view: MatteView, cells: np.ndarray) -> np.ndarray:
 def ruled_out(view: MatteView, evidence: Evidence, strand: float) -> np.ndarray:
     """Pixels (h, w) bool of the matte that show nothing which the other views leave possible.
 
-    Whole connected parts, and only those that reach too far from what is possible to be hair.
+    They are whole connected parts that reach further from the possible pixels than hair does.
     """
     loose = (view.alpha > FAINT) & ~evidence.possible
     if not loose.any() or not evidence.possible.any():
@@ -281,7 +281,7 @@ def shows_surface(
     """Pixels (h, w) bool of `todo` (h, w) whose colour is that of a surface the others see there.
 
     Somewhere about the front of the others' hull two neighbours at least must see this colour on
-    the `subject` ({name: (h, w) bool}): then this camera cannot tell it from what is behind.
+    the `subject` ({name: (h, w) bool}): then this camera cannot separate it from its background.
     """
     rows, columns = np.nonzero(todo)
     near = _neighbours(view, others)
@@ -380,7 +380,7 @@ def _depth(mask: np.ndarray) -> np.ndarray:
 
 
 def _corner(view: MatteView, others: Sequence[MatteView]) -> float:
-    """How far the hull of the others stands out from a round subject in this view, in its radii.
+    """Estimate how far the hull of the others exceeds a round subject here, in its radii.
 
     The tangents of cameras an angle away to either side meet at 1 / cos(angle) radii.
     """

@@ -20,7 +20,7 @@ from express50.errors import StageError
 def split_subjects(
     subjects: Sequence[str], test_subjects: Sequence[str], fraction: float
 ) -> dict[str, list[str]]:
-    """Divide the subjects into ``train`` and ``test``; nobody is in both.
+    """Divide the subjects into ``train`` and ``test``; no subject is in both.
 
     Without named test subjects a hash of each subject's id decides, so that a subject stays in its
     split when others join; at least one of two or more is chosen unless the fraction is 0.

@@ -2,34 +2,31 @@
 
 from __future__ import annotations
 
+import math
 import re
 import shutil
 import tomllib
+from collections.abc import Iterator
+from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
 
 import numpy as np
 import torch
 
-from express50.capture.raw import IMAGE_SUFFIXES
-from express50.errors import CaptureError
+from express50.capture.raw import IMAGE_SUFFIXES, VIDEO_SUFFIXES
+from express50.errors import CaptureError, FormatError
 from express50.files.atomic import dump_json, write_bytes
 from express50.files.calibration import camera_rows
+from express50.files.containers import read_srgb8
 from express50.files.digests import file_sha256
-from express50.files.images import encode_png
-from express50.files.video import video_fps
+from express50.files.images import ORIENTATION, encode_png, read_exif, upright
+from express50.files.video import iterate_video, video_fps, video_turn
 from express50.files.video_writer import VideoFootage
 from express50.head.load import load_head
 from express50.landmarks.detector import Detection, detect
 from express50.landmarks.network import load_network
 from pipelines.photo.focal import Focal, single_camera, weigh_focal
-from pipelines.photo.picture import (
-    Picture,
-    guess_focal,
-    read_upright,
-    spread_frames,
-    upright_frames,
-)
 from pipelines.track.basis import make_basis
 from pipelines.track.config import TrackConfig
 from pipelines.track.read_inputs import DETECTOR_PASSES
@@ -37,10 +34,97 @@ from pipelines.track.read_inputs import DETECTOR_PASSES
 CAMERA = "photo"
 FACE_SCORE = 0.2
 PROBES, FOCAL_FACES = 8, 3
-PHOTO_FPS = 25.0  # a photograph has no rate, a capture must say one
-# Focal lengths, in longer sides of the picture, beyond which none is a lens before a face.
+PHOTO_FPS = 25.0  # a photograph has no rate, but a capture must state one
+# Range of possible focal lengths, in longer sides of the picture.
 FOCAL_LIMITS = (0.1, 100.0)
-TURNED_CRF = 12  # H.264 that no eye tells from the source
+TURNED_CRF = 12  # H.264 that looks like the source
+# Read as photographs; a rig's cameras write none of the last two.
+PHOTO_SUFFIXES = (*IMAGE_SUFFIXES, ".webp", ".bmp")
+FILM_DIAGONAL_MM = math.hypot(36.0, 24.0)
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A photograph or video and the facts in its name and EXIF.
+
+    Attributes:
+        path: the file.
+        video: whether it is a video.
+        orientation: EXIF's, 1 to 8, or what a video's container says in its terms; 1 where its
+            pixels lie upright.
+        film_mm: focal length on 35 mm film with the same diagonal angle of view; 0 where EXIF
+            has none.
+    """
+
+    path: Path
+    video: bool
+    orientation: int = 1
+    film_mm: float = 0.0
+
+
+def open_picture(path: Path) -> Picture:
+    """Read a file's kind from its name, and its EXIF.
+
+    Raises:
+        CaptureError: no such file, or neither an image nor a video.
+    """
+    path = Path(path)
+    if path.is_dir():
+        raise CaptureError(
+            f"{path}: is a folder, expected a photograph or a video; the pictures of several "
+            "cameras are read by 'express50 ingest'"
+        )
+    if not path.is_file():
+        raise CaptureError(f"{path}: no such file; expected a photograph or a video")
+    suffix = path.suffix.lower()
+    if suffix in VIDEO_SUFFIXES:
+        turns = video_turn(path)
+        return Picture(path, video=True, orientation=ORIENTATION[turns])
+    if suffix not in PHOTO_SUFFIXES:
+        raise CaptureError(
+            f"{path}: is not a photograph or video by its name; expected one of "
+            f"{' '.join(PHOTO_SUFFIXES + VIDEO_SUFFIXES)}"
+        )
+    try:
+        orientation, film = read_exif(path)
+    except FormatError as error:
+        raise CaptureError(str(error)) from error
+    return Picture(path, video=False, orientation=orientation, film_mm=film)
+
+
+def read_upright(picture: Picture) -> np.ndarray:
+    """Read a photograph (H, W, 3) uint8 sRGB, turned upright.
+
+    Raises:
+        CaptureError: it is damaged.
+    """
+    return upright(read_srgb8(picture.path), picture.orientation)
+
+
+def upright_frames(picture: Picture) -> Iterator[np.ndarray]:
+    """Decode a whole video (H, W, 3) uint8 sRGB, turned upright."""
+    for _, image in iterate_video(picture.path):
+        yield upright(image, picture.orientation)
+
+
+def spread_frames(picture: Picture, count: int) -> tuple[list[np.ndarray], int]:
+    """Read up to `count` frames spread over a picture; returns them and the number of all.
+
+    A video is decoded twice, so that not all of its frames are held.
+    """
+    if not picture.video:
+        return [read_upright(picture)], 1
+    frames = sum(1 for _ in upright_frames(picture))
+    wanted = set(np.unique(np.linspace(0, frames - 1, count).round().astype(int)).tolist())
+    return [image for n, image in enumerate(upright_frames(picture)) if n in wanted], frames
+
+
+def guess_focal(picture: Picture, width: int, height: int, film_mm: float) -> tuple[float, str]:
+    """Guess the focal length in pixels; the source is `exif`, else `guess` by `film_mm`."""
+    diagonal = math.hypot(width, height)
+    if picture.film_mm > 0:
+        return picture.film_mm / FILM_DIAGONAL_MM * diagonal, "exif"
+    return film_mm / FILM_DIAGONAL_MM * diagonal, "guess"
 
 
 def make_photo_capture(
@@ -53,18 +137,18 @@ def make_photo_capture(
     film_mm: float = 50.0,
     windows: int = PROBES,
 ) -> Focal:
-    """Write capture.toml, footage, cues and calibration; returns the focal length that was taken.
+    """Write capture.toml, footage, cues and calibration; returns the focal length used.
 
     A photograph is one cue of one frame; a video is cut into `windows` cues of equal length, from
     each of which `align` takes a frame for the shared shape.
 
     Args:
         picture: from `open_picture`.
-        folder: of the capture; what was made of the same file is written over.
+        folder: of the capture; an earlier capture of the same file is overwritten.
         subject: subject id.
-        config: of the fit that weighs focal lengths.
+        config: settings of the fit that compares focal lengths.
         focal_px: focal length, pixels, where it is known.
-        film_mm: focal length on 35 mm film to assume where nothing is told.
+        film_mm: focal length on 35 mm film to assume where it is unknown.
         windows: cues of a video.
 
     Raises:
@@ -92,7 +176,7 @@ def make_photo_capture(
 
 
 def _check_same(path: Path, folder: Path) -> None:
-    """Refuse to write over what was made of another picture."""
+    """Refuse to overwrite the capture of another picture."""
     try:
         known = tomllib.loads((folder / "capture.toml").read_text()).get("picture_sha256")
     except (OSError, ValueError):  # nothing is there, or nothing that could be lost
@@ -105,7 +189,7 @@ def _check_same(path: Path, folder: Path) -> None:
 
 
 def _check_focal(focal_px: float | None, side: int) -> None:
-    """Refuse a focal length that no lens has."""
+    """Refuse an impossible focal length."""
     low, high = (side * limit for limit in FOCAL_LIMITS)
     if focal_px is not None and not low <= focal_px <= high:
         raise CaptureError(
@@ -115,7 +199,7 @@ def _check_focal(focal_px: float | None, side: int) -> None:
 
 
 def find_faces(path: Path, images: list[np.ndarray], config: TrackConfig) -> list[Detection]:
-    """The faces that are surely seen in images of one person, at least one.
+    """Find the faces that are surely visible in images of one person, at least one.
 
     Raises:
         CaptureError: there is none.
@@ -134,13 +218,13 @@ def find_faces(path: Path, images: list[np.ndarray], config: TrackConfig) -> lis
 
 
 def subject_id(path: Path) -> str:
-    """A subject id out of a file's name."""
+    """Make a subject id from a file's name."""
     name = re.sub(r"[^A-Za-z0-9_-]+", "_", path.stem).strip("_-")
     return name or "photo"
 
 
 def _write_footage(picture: Picture, folder: Path) -> None:
-    """Copy the file; what lies on its side, or is of a kind no stage reads, is stored anew."""
+    """Copy the file; a turned one, or one of a kind that no stage reads, is stored upright."""
     # A former picture of another kind or suffix would make the footage ambiguous.
     shutil.rmtree(folder, ignore_errors=True)
     suffix = picture.path.suffix.lower()
@@ -170,7 +254,7 @@ def _turn_video(picture: Picture, folder: Path) -> None:
 
 
 def _cues(frames: int, windows: int) -> str:
-    """Content of cues.csv: `photo`, or `clip_00` and so on."""
+    """Format cues.csv: `photo`, or `clip_00` and so on."""
     rows = ["expression_id,start_frame,end_frame"]
     if frames == 1:
         return "\n".join([*rows, "photo,0,0"]) + "\n"
@@ -181,7 +265,7 @@ def _cues(frames: int, windows: int) -> str:
 
 
 def _meta(subject: str, fps: float, focal: Focal, sha256: str) -> str:
-    """Content of capture.toml."""
+    """Format capture.toml."""
     return (
         f'subject = "{subject}"\nfps = {fps:.6g}\n'
         f'focal_px = {focal.pixels:.3f}\nfocal_source = "{focal.source}"\n'

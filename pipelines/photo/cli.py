@@ -7,20 +7,29 @@ from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import torch
+
+from express50.capture.frames import read_cameras_of, read_peak_frame
 from express50.cli.stages import add_config_options, config_of
 from express50.console import FAILED, OK, say, say_json, stdout_to_stderr
 from express50.contract.extensions import stages
 from express50.contract.layout import Dataset
 from express50.errors import ConfigError
+from express50.files.images import write_image
 from express50.files.text import ID
+from express50.head.load import load_head
+from express50.head.preview import render_preview
+from express50.landmarks.sources import open_source
 from express50.runner.executor import Pool
 from express50.runner.runner import Summary, run_stage
 from express50.runner.threads import cap_threads
 from pipelines import ingest
-from pipelines.photo.capture import make_photo_capture, subject_id
+from pipelines.photo.capture import make_photo_capture, open_picture, subject_id
 from pipelines.photo.focal import Focal
-from pipelines.photo.panel import write_panel
-from pipelines.photo.picture import open_picture
+from pipelines.track.config import TrackConfig
+from pipelines.track.read_inputs import DETECTOR_PASSES
+from pipelines.track.report import draw_column
 
 STAGES = ("ingest", "calibrate", "observe", "align", "frames", "track")
 MATTE_STAGES = ("matte",)
@@ -29,6 +38,7 @@ PHOTO_SETTINGS = (
     "observe.min_score=0.2", f"track.search={SEARCH}", f"observe.search={SEARCH}",
     "matte.method=grabcut",
 )  # fmt: skip
+PANEL_TILE, PANEL_YAW = 512, 60.0  # pixels; degrees
 WORDS = "track the face of a bare photograph or video, without calibration"
 
 
@@ -45,7 +55,7 @@ def add_commands(subparsers: Any) -> None:
     lens.add_argument("--focal-px", type=float, metavar="F", help="focal length, pixels")
     lens.add_argument(
         "--film-mm", type=float, default=50.0, metavar="MM",
-        help="focal length on 35 mm film to assume where EXIF tells none [50]",
+        help="focal length on 35 mm film to assume where EXIF has none [50]",
     )  # fmt: skip
     parser.add_argument(
         "--windows", type=int, default=8, metavar="N",
@@ -95,7 +105,7 @@ def run_photo(args: argparse.Namespace) -> int:
 
 
 def _check(args: argparse.Namespace) -> None:
-    """Refuse options that cannot work."""
+    """Refuse impossible options."""
     if args.subject is not None and not ID.fullmatch(args.subject):
         raise ConfigError(f"--subject {args.subject!r}: expected letters, digits, '_' and '-'")
     for name, value in (("--focal-px", args.focal_px), ("--film-mm", args.film_mm)):
@@ -113,7 +123,7 @@ def _account(
     summaries: list[Summary],
     panel: Path,
 ) -> int:
-    """Say what was made and how much of it is a guess."""
+    """Print what was made and how much of it is a guess."""
     done = all(summary.ok for summary in summaries)
     if args.json:
         lens = dict(vars(focal))
@@ -130,3 +140,27 @@ def _account(
     if done:
         say(f"track: {dataset.item_dir('track', subject)}", f"picture: {panel}")
     return OK if done else FAILED
+
+
+def write_panel(dataset: Dataset, subject: str, config: TrackConfig, path: Path) -> None:
+    """Write frame, overlay and turned head side by side, of the first frame that was tracked.
+
+    The turned head shows what the photograph cannot: the depth of the fit.
+    """
+    with np.load(dataset.track_file(subject)) as track:
+        frame, mesh = int(track["frames"][0]), track["vertices"][0].astype(np.float64)
+        expression = str(track["expressions"][0])
+        rotation, translation = track["R"][0], track["t"][0]
+    model = load_head(config.head)
+    ((camera_id, camera),) = read_cameras_of(dataset, subject).items()
+    image = read_peak_frame(dataset, subject, expression, camera_id)
+    recorded = read_cameras_of(dataset, subject, undistorted=False)
+    source = open_source(config.landmarks, recorded, DETECTOR_PASSES, config.search)
+    seen = source(image, camera_id, frame)
+    dots = [seen.face.points, seen.irises.centres[seen.irises.confidence > 0]]
+    column = draw_column(image, camera, model.to(dtype=torch.float64), mesh, dots, PANEL_TILE)
+    head = (mesh - translation) @ rotation
+    turned = render_preview(model, head, yaw=PANEL_YAW, size=PANEL_TILE)
+    write_image(
+        path, np.concatenate([column[:PANEL_TILE], column[PANEL_TILE:], turned], axis=1), quality=90
+    )

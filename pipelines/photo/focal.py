@@ -1,8 +1,8 @@
-"""What a face in one camera says of its focal length: a little, and how little is said too.
+"""Estimate the focal length of one camera from a face, with the range that fits as well.
 
-Perspective alone tells a near face under a wide lens from a far one under a long lens: the nose is
-a twentieth nearer than the ears at arm's length. The head model is fitted at a ladder of focal
-lengths; the fit's cost says which explain the landmarks as well as the best one does.
+Only perspective distinguishes a near face under a wide lens from a far one under a long lens: at
+arm's length the nose is a twentieth nearer than the ears. The head model is fitted at a ladder of
+focal lengths; the fit's cost shows which explain the landmarks as well as the best one does.
 """
 
 from __future__ import annotations
@@ -23,20 +23,20 @@ from pipelines.track.schedule import LANDMARK_STEPS
 from pipelines.track.state import Target, initial_pose, start_state
 
 LADDER = 2.0 ** np.arange(-2.0, 2.5, 0.5)
-# Of a lens that nothing is told about: two thirds lie within this factor of the guess.
+# Two thirds of unknown lenses lie within this factor of the guess.
 GUESS_FACTOR = 1.5
-# The landmarks of one detection err together: they count as a quarter of as many.
+# The landmarks of one detection err together: they count as a quarter of their number.
 INDEPENDENT = 0.25
 # Focal lengths whose cost is this much above the least (two standard deviations) are as good.
 AS_GOOD = 2.0
-TOLD_FACTOR = 1.6
+CONSTRAINED_FACTOR = 1.6
 # World of a single camera: at the camera, y up, the camera looks along -z.
 CAM_FROM_WORLD = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 @dataclass(frozen=True)
 class Focal:
-    """A focal length and what speaks for it.
+    """A focal length and its evidence.
 
     Attributes:
         pixels: the focal length.
@@ -52,7 +52,7 @@ class Focal:
 
 
 def single_camera(camera_id: str, width: int, height: int, focal: float) -> Camera:
-    """A pinhole camera at the world's origin, its principal point in the middle of the image."""
+    """Make a pinhole camera at the world's origin with the principal point in the middle."""
     K = np.array([[focal, 0.0, 0.5 * width], [0.0, focal, 0.5 * height], [0.0, 0.0, 1.0]])
     return pinhole_camera(camera_id, K, width, height, CAM_FROM_WORLD)
 
@@ -63,9 +63,9 @@ def weigh_focal(
     size: tuple[int, int],
     start: tuple[float, str],
 ) -> Focal:
-    """Move a guessed focal length to where the fit is best, if the fit can tell.
+    """Move a guessed focal length to where the fit is best, if the fit constrains it.
 
-    A told focal length (`given`, `exif`) is kept; the range is measured all the same.
+    A known focal length (`given`, `exif`) is kept; the range is measured all the same.
 
     Args:
         basis: the head model.
@@ -83,8 +83,8 @@ def weigh_focal(
     evidence = INDEPENDENT * costs / len(detections)
     as_good = focals[evidence <= evidence.min() + AS_GOOD]
     low, high = float(as_good.min()), float(as_good.max())
-    told = high / low <= TOLD_FACTOR**2
-    if start[1] != "guess" or not told:
+    constrained = high / low <= CONSTRAINED_FACTOR**2
+    if start[1] != "guess" or not constrained:
         return Focal(*start, low, high)
     prior = 0.5 * (np.log(LADDER) / math.log(GUESS_FACTOR)) ** 2
     return Focal(start[0] * _lowest(np.log(LADDER), evidence + prior), "fit", low, high)
@@ -96,7 +96,7 @@ def _cost(
     size: tuple[int, int],
     focal: float,
 ) -> float:
-    """Cost of the landmark fit with a focal length; infinite where none starts."""
+    """Compute the cost of the landmark fit with a focal length; infinite where no fit starts."""
     camera = single_camera("photo", *size, focal)
     template = landmarks(basis.model, basis.model.template[None])[0].numpy()
     targets, poses = [], []

@@ -16,7 +16,6 @@ from pipelines.calibrate.board_rig import solve_rig
 from pipelines.calibrate.stage import check_given
 from pipelines.matte.key import Keyer, KeyOptions
 from pipelines.matte.plates import exposure_gain
-from tests.pipelines.alpha_scenes import make_scene
 from tests.pipelines.board_rigs import (
     POINTS,
     board_motion,
@@ -25,6 +24,7 @@ from tests.pipelines.board_rigs import (
     rig_errors,
     sizes_of,
 )
+from tests.pipelines.matte_scenes import make_scene
 
 
 def solved(rig, boards, noise: float):

@@ -9,6 +9,7 @@ import pytest
 
 from express50.geometry.cameras import pinhole_camera, scale_camera, transform_camera
 from express50.geometry.transforms import look_at, make_transform
+from pipelines.matte import consensus
 from pipelines.matte.consensus import Agreement, agree
 from pipelines.matte.stage import corrected, make_view
 from pipelines.matte.visual_hull import MatteView, ball_of
@@ -26,7 +27,7 @@ def disturbed(views: list[MatteView]) -> list[MatteView]:
 
 
 def same(one: Agreement, other: Agreement) -> bool:
-    """Whether the same pixels are removed and filled."""
+    """Check that the same pixels are removed and filled."""
     return all(
         set(a) == set(b) and all((a[name] == b[name]).all() for name in a)
         for a, b in ((one.removed, other.removed), (one.filled, other.filled))
@@ -34,14 +35,14 @@ def same(one: Agreement, other: Agreement) -> bool:
 
 
 @pytest.mark.parametrize("count", [1, 2, 3])
-def test_so_few_cameras_overrule_nobody(count):
+def test_so_few_cameras_do_not_overrule_each_other(count):
     found = agree(disturbed(make_views())[3 : 3 + count], **OPTIONS)
     assert not found.removed and not found.filled
-    assert found.unchanged == f"{count} usable cameras, expected 4 or more to overrule one"
+    assert f"{count} usable" in found.unchanged
 
 
 @pytest.mark.parametrize("value", [0.0, 1.0])
-def test_mattes_that_say_nothing_are_all_named_and_left(value):
+def test_empty_and_full_mattes_are_all_reported_and_left(value):
     views = make_views()
     found = agree([replace(v, alpha=np.full_like(v.alpha, value)) for v in views], **OPTIONS)
     assert not found.removed and not found.filled and "0 usable" in found.unchanged
@@ -65,7 +66,7 @@ def test_a_camera_amid_the_subject_or_turned_away_is_left_out():
         pose = look_at(center, center + [0, 0, 1.0], np.array([0.0, 1.0, 0.0]))
         rig[0] = pinhole_camera("cam00", rig[0].K, SIZE, SIZE, pose)
         found = agree(disturbed(make_views(cameras=rig)), **OPTIONS)
-        assert [w["what"] for w in found.warnings] == ["cam00"]
+        assert [note.what for note in found.warnings] == ["cam00"]
         assert set(found.removed) == set(clean.removed) and set(found.filled) == set(clean.filled)
 
 
@@ -118,7 +119,8 @@ def test_units_and_the_worlds_origin_do_not_matter(scale, far):
     assert clean.removed and clean.filled and same(found, clean)
 
 
-def test_more_cameras_than_a_byte_counts():
+def test_more_cameras_than_a_byte_counts(monkeypatch):
+    monkeypatch.setattr(consensus, "VOTES", 40)  # each view is there 23 times
     views = disturbed(make_views())
     many = [replace(v, name=f"{v.name}-{k}") for k in range(23) for v in views]
     found = agree(many, cells=16, strand=0.03)

@@ -24,7 +24,7 @@ from express50.files.images import read_image, write_image
 from express50.geometry.conventions import undistort_image
 from express50.runner.runner import run_stage
 from pipelines.frames import STAGE
-from tests.pipelines.test_alpha_stage import make_dataset
+from tests.pipelines.test_matte_stage import make_dataset
 from tests.synth import make_capture, make_rig
 
 

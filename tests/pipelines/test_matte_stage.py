@@ -24,9 +24,9 @@ from express50.runner.runner import Summary, run_stage
 from pipelines import calibrate, ingest
 from pipelines.matte import STAGE
 from pipelines.matte.config import MatteConfig
-from tests.pipelines.alpha_scenes import make_scene
 from tests.pipelines.bump_dataset import make_dataset as bump_dataset
 from tests.pipelines.matte_rig import SIZE, disc
+from tests.pipelines.matte_scenes import make_scene
 from tests.pipelines.stand_ins import Bad, Difference, onnx_bright, torchscript
 from tests.synth import make_capture, write_peak_frames
 

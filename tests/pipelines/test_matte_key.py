@@ -14,7 +14,7 @@ from pipelines.matte.key import Keyer, KeyOptions, dilated, eroded, plate_differ
 from pipelines.matte.opacity import local_colours, shrunk, solve_opacity
 from pipelines.matte.plates import exposed, exposure_gain, fit_plate
 from pipelines.matte.refine import MattingLaplacian
-from tests.pipelines.alpha_scenes import Scene, clutter, make_scene
+from tests.pipelines.matte_scenes import Scene, clutter, make_scene
 
 OPTIONS = KeyOptions()
 

@@ -21,9 +21,8 @@ from pipelines import calibrate, ingest
 from pipelines.matte import STAGE as MATTE
 from pipelines.matte.config import MatteConfig
 from pipelines.matte.grabcut import person_alpha
-from pipelines.photo.capture import make_photo_capture
+from pipelines.photo.capture import make_photo_capture, open_picture
 from pipelines.photo.focal import single_camera
-from pipelines.photo.picture import open_picture
 from pipelines.track.config import TrackConfig
 from tests.synth import write_peak_frames, write_video
 
@@ -101,7 +100,7 @@ def test_a_photograph_becomes_a_sample_of_shards_without_plate_or_weights(tmp_pa
     assert main(["photo", str(tmp_path / "eva.png"), str(tmp_path / "out"), "--matte",
                  "--preset", "draft"]) == 0  # fmt: skip
     dataset = Dataset(tmp_path / "out")
-    figures = json.loads((dataset.item_dir("alpha", "eva/photo") / "metrics.json").read_text())
+    figures = json.loads((dataset.item_dir("matte", "eva/photo") / "metrics.json").read_text())
     assert figures["method"] == "grabcut"
     matte = read_alpha(dataset.matte_file("eva", "photo", "photo"))
     assert all(matte[y, x] > 240 for x, y in HEAD) and all(matte[y, x] < 12 for x, y in BEHIND)

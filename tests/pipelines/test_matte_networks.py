@@ -23,7 +23,7 @@ from pipelines.matte.learned import (
 )
 from pipelines.matte.refine import in_tiles, spans
 from pipelines.networks import load_network
-from tests.pipelines.alpha_scenes import make_scene
+from tests.pipelines.matte_scenes import make_scene
 from tests.pipelines.stand_ins import (
     Bad,
     BadPair,
