@@ -157,7 +157,6 @@ def test_tiny_images(shape: tuple[int, int]) -> None:
     assert alpha(plate, plate).max() == 0
     assert alpha(np.full_like(plate, 220), plate).shape == shape
     assert alpha(plate, plate, scale=0.5).shape == shape
-    assert alpha(np.full_like(plate, 220), plate).shape == shape
 
 
 def test_a_shirt_in_the_colour_of_the_plate_does_not_harm_the_head() -> None:
@@ -221,5 +220,4 @@ def test_nothing_valid_is_empty() -> None:
 def test_random_frames_give_finite_alpha(seed: int, height: int, width: int) -> None:
     rng = np.random.default_rng(seed)
     frame, plate = rng.integers(0, 256, (2, height, width, 3)).astype(np.uint8)
-    alpha(frame, plate)
     alpha(frame, plate)
