@@ -44,7 +44,7 @@ FILM_DIAGONAL_MM = math.hypot(36.0, 24.0)
 
 
 @dataclass(frozen=True)
-class Picture:
+class PhotoSource:
     """A photograph or video and the facts in its name and EXIF.
 
     Attributes:
@@ -62,7 +62,7 @@ class Picture:
     film_mm: float = 0.0
 
 
-def open_picture(path: Path) -> Picture:
+def open_picture(path: Path) -> PhotoSource:
     """Read a file's kind from its name, and its EXIF.
 
     Raises:
@@ -79,7 +79,7 @@ def open_picture(path: Path) -> Picture:
     suffix = path.suffix.lower()
     if suffix in VIDEO_SUFFIXES:
         turns = video_turn(path)
-        return Picture(path, video=True, orientation=ORIENTATION[turns])
+        return PhotoSource(path, video=True, orientation=ORIENTATION[turns])
     if suffix not in PHOTO_SUFFIXES:
         raise CaptureError(
             f"{path}: is not a photograph or video by its name; expected one of "
@@ -89,10 +89,10 @@ def open_picture(path: Path) -> Picture:
         orientation, film = read_exif(path)
     except FormatError as error:
         raise CaptureError(str(error)) from error
-    return Picture(path, video=False, orientation=orientation, film_mm=film)
+    return PhotoSource(path, video=False, orientation=orientation, film_mm=film)
 
 
-def read_upright(picture: Picture) -> np.ndarray:
+def read_upright(picture: PhotoSource) -> np.ndarray:
     """Read a photograph (H, W, 3) uint8 sRGB, turned upright.
 
     Raises:
@@ -101,13 +101,13 @@ def read_upright(picture: Picture) -> np.ndarray:
     return upright(read_srgb8(picture.path), picture.orientation)
 
 
-def upright_frames(picture: Picture) -> Iterator[np.ndarray]:
+def upright_frames(picture: PhotoSource) -> Iterator[np.ndarray]:
     """Decode a whole video (H, W, 3) uint8 sRGB, turned upright."""
     for _, image in iterate_video(picture.path):
         yield upright(image, picture.orientation)
 
 
-def spread_frames(picture: Picture, count: int) -> tuple[list[np.ndarray], int]:
+def spread_frames(picture: PhotoSource, count: int) -> tuple[list[np.ndarray], int]:
     """Read up to `count` frames spread over a picture; returns them and the number of all.
 
     A video is decoded twice, so that not all of its frames are held.
@@ -119,7 +119,7 @@ def spread_frames(picture: Picture, count: int) -> tuple[list[np.ndarray], int]:
     return [image for n, image in enumerate(upright_frames(picture)) if n in wanted], frames
 
 
-def guess_focal(picture: Picture, width: int, height: int, film_mm: float) -> tuple[float, str]:
+def guess_focal(picture: PhotoSource, width: int, height: int, film_mm: float) -> tuple[float, str]:
     """Guess the focal length in pixels; the source is `exif`, else `guess` by `film_mm`."""
     diagonal = math.hypot(width, height)
     if picture.film_mm > 0:
@@ -128,7 +128,7 @@ def guess_focal(picture: Picture, width: int, height: int, film_mm: float) -> tu
 
 
 def make_photo_capture(
-    picture: Picture,
+    picture: PhotoSource,
     folder: Path,
     subject: str,
     config: TrackConfig,
@@ -223,7 +223,7 @@ def subject_id(path: Path) -> str:
     return name or "photo"
 
 
-def _write_footage(picture: Picture, folder: Path) -> None:
+def _write_footage(picture: PhotoSource, folder: Path) -> None:
     """Copy the file; a turned one, or one of a kind that no stage reads, is stored upright."""
     # A former picture of another kind or suffix would make the footage ambiguous.
     shutil.rmtree(folder, ignore_errors=True)
@@ -243,7 +243,7 @@ def _write_footage(picture: Picture, folder: Path) -> None:
         raise CaptureError(f"{target}: cannot be written ({error.strerror})") from error
 
 
-def _turn_video(picture: Picture, folder: Path) -> None:
+def _turn_video(picture: PhotoSource, folder: Path) -> None:
     """Encode a video again, upright."""
     frames = upright_frames(picture)
     first = next(frames)
