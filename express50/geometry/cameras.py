@@ -138,7 +138,7 @@ def distort(camera: Camera, xy: np.ndarray) -> np.ndarray:
 def undistort(camera: Camera, xy: np.ndarray, iterations: int = 30) -> np.ndarray:
     """Ideal normalised coordinates (N, 2) of distorted ones (N, 2), by damped fixed point.
 
-    Where the lens folds there is no solution: the result is then finite but does not distort back.
+    Where the lens folds no solution exists: the result is then finite but does not distort back.
     """
     if not camera.dist.any():
         return np.asarray(xy, dtype=np.float64)

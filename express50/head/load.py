@@ -87,7 +87,10 @@ def load_stored(path: Path, name: str) -> HeadModel:
 
 def is_stored(path: Path) -> bool:
     """Return True if a file holds the arrays of a head model under our names."""
-    return zipfile.is_zipfile(path) and "skinning.npy" in zipfile.ZipFile(path).namelist()
+    if not zipfile.is_zipfile(path):
+        return False
+    with zipfile.ZipFile(path) as archive:
+        return "skinning.npy" in archive.namelist()
 
 
 def _assembled(arrays: dict[str, np.ndarray], name: str) -> HeadModel:

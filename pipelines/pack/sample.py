@@ -190,7 +190,7 @@ def _read_regions(
 ) -> tuple[np.ndarray | None, np.ndarray | None]:
     """Read the labels (H, W) uint8 and the head's alpha (H, W) uint8; None for what is missing.
 
-    There is no alpha of the head where the regions stage could not separate the torso.
+    The head has no alpha of its own where the regions stage could not separate the torso.
 
     Raises:
         FormatError: one of them is not an 8-bit grey image.
@@ -229,7 +229,7 @@ def crop_sample(
         foreground: give soft pixels the subject's own colour.
 
     Raises:
-        StageError: there is no head to crop, or its depth is too large for shards.
+        StageError: the sample shows no head to crop, or its depth is too large for shards.
     """
     crop = head_crop(camera, vertices, loaded.alpha)
     depth, valid = cut_depth(loaded.depth, loaded.valid, crop, size)

@@ -32,7 +32,7 @@ def weights_file(segmentation: str) -> Path:
     """Find the file of weights that the setting names.
 
     Raises:
-        ConfigError: there is no such file.
+        ConfigError: the file does not exist.
     """
     path = Path(segmentation).expanduser()
     check_file(path, "regions.segmentation")
