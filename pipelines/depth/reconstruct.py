@@ -140,7 +140,7 @@ def finest_voxel(
 
 
 def _check_size(low: np.ndarray, high: np.ndarray, voxel: float) -> None:
-    """Refuse a box with corners (3,), (3,) of a size no head has in metres, or too large to hold."""
+    """Refuse a box with corners (3,), (3,) unlike a head in metres, or too large to hold."""
     extent = float((high - low).max())
     if extent < SMALLEST_M:
         raise StageError(
