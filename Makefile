@@ -31,7 +31,7 @@ demo: $(READY) ## the whole chain on a synthetic capture (or CAPTURES="dir ...")
 
 test: check ## lint, types and every test; ends with the share of lines that they run
 	@mkdir -p build
-	$(BIN)/python -m pytest --cov --cov-report=
+	$(BIN)/python -m pytest --cov --cov-report= -n $(WORKERS) --dist loadfile --no-loadscope-reorder
 	@echo "coverage: $$($(BIN)/coverage report --format=total) % of the product's lines"
 
 check: $(READY) ## lint and types

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from express50.contract.extensions import Command
+from express50.contract.stage import Command
 
 
 def add_commands(subparsers: Any) -> None:

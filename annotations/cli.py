@@ -1,39 +1,48 @@
-"""``express50 annotate``: all verbs, and those that check, compare and manage labels."""
+"""``express50 annotate``: verbs that give labels, compare annotators, review, export and import."""
 
 from __future__ import annotations
 
 import argparse
+import fnmatch
+import getpass
+import os
+import sys
 import time
 from collections import Counter
-from dataclasses import asdict
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Any
 
-from annotations.agreement import (
+from annotations.exchange import LAST_FRAME, export_labels, import_labels, last_frame_marks
+from annotations.labels import (
+    FLAG_REASONS,
+    Label,
+    append_label,
+    check_known,
+    current_labels,
+    is_person,
+    last_event,
+    make_event,
+    make_flag,
+    make_mark,
+    read_labels,
+)
+from annotations.suggestions import choose_reference, read_suggestions, reference_subject
+from annotations.validate import (
     agreement,
     by_expression,
     by_pair,
     describe,
     disagreements,
     marked_clips,
+    problems,
     settlement,
 )
-from annotations.cli_label import (
-    add_annotator,
-    add_label_verbs,
-    add_selection,
-    add_verb,
-    answer,
-    chosen_subjects,
-)
-from annotations.exchange import LAST_FRAME, export_labels, import_labels, last_frame_marks
-from annotations.labels import FLAG_REASONS, Label
-from annotations.store import append_label, read_labels
-from annotations.suggestions import choose_reference, reference_subject
-from annotations.validate import problems
-from annotations.worklist import coverage, effort, progress
+from annotations.worklist import ORDERS, coverage, effort, progress, worklist
 from express50.capture.index import read_index
-from express50.console import FAILED, OK, format_table
-from express50.contract.exclusions import included_subjects
+from express50.console import FAILED, OK, format_table, say, say_json
+from express50.contract.layout import Dataset, included_subjects
 from express50.errors import AnnotationError
 
 _FIGURES = ("clips", "within_1", "within_2", "within_4", "median_frames", "slip_rate", "alpha")
@@ -45,20 +54,82 @@ def add_commands(subparsers: argparse._SubParsersAction) -> None:
     words = "label peak frames, compare annotators, review and export"
     annotate = subparsers.add_parser("annotate", help=words, description=words)
     verbs = annotate.add_subparsers(dest="verb", metavar="VERB", required=True)
-    add_label_verbs(verbs)
-    _add_comparing_verbs(verbs)
-    _add_managing_verbs(verbs)
+
+    def add(name: str, handler: Callable, words: str, *shared: str) -> argparse.ArgumentParser:
+        parser = verbs.add_parser(name, help=words, description=words)
+        parser.add_argument("dataset", type=dataset_folder, metavar="DATASET")
+        parser.add_argument("--json", action="store_true", help="print JSON")
+        if "subjects" in shared:
+            parser.add_argument(
+                "--subject", action="append", metavar="ID", help="only this; repeatable"
+            )
+        if "clip" in shared:
+            parser.add_argument("subject", metavar="SUBJECT")
+            parser.add_argument("expression", metavar="EXPRESSION")
+        if "annotator" in shared:
+            parser.add_argument(
+                "--annotator", type=person, default=getpass.getuser(), metavar="NAME",
+                help="you by default",
+            )  # fmt: skip
+        parser.set_defaults(handler=handler)
+        return parser
+
+    _add_labelling_verbs(add)
+    _add_reviewing_verbs(add)
+    parser = add("reference", run_reference, "say or choose whom the others are matched to")
+    parser.add_argument("subject", nargs="?", metavar="SUBJECT", help="new reference")
+    words = "label by RenderMe-360's rule: the last frame of a clip is its peak"
+    add("rule", run_rule, words, "subjects").add_argument(
+        "--expression", action="append", metavar="ID", help="repeatable; e0 to e11 by default"
+    )
+    parser = add("exclude", run_exclusion, "leave a subject out, with the reason", "annotator")
+    parser.add_argument("subject", metavar="SUBJECT")
+    parser.add_argument("reason", metavar="REASON", help="heavy makeup, large glasses, ...")
+    parser = add("include", run_exclusion, "take an excluded subject back in", "annotator")
+    parser.add_argument("subject", metavar="SUBJECT")
+    for parser in (
+        add("export", run_export, "write every event as .csv or .json", "subjects"),
+        add("import", run_import, "take events of a .csv or .json in, once each"),
+    ):
+        parser.add_argument("file", type=Path, metavar="FILE")
 
 
-def _add_comparing_verbs(verbs) -> None:  # noqa: ANN001 - argparse's type is private
+def _add_labelling_verbs(add: Callable[..., argparse.ArgumentParser]) -> None:
+    parser = add("ui", run_ui, "label peak frames in the terminal", "annotator")
+    parser.add_argument("--subjects", metavar="GLOB", help="only these subjects")
+    parser.add_argument("--expressions", metavar="GLOB", help="only these expressions")
+    parser.add_argument("--order", choices=ORDERS, default="doubt", help="what comes first")
+    parser.add_argument(
+        "--blind", action="store_true", help="hide suggestions and others' marks until you decide"
+    )
+    parser.add_argument(
+        "--pictures", choices=("blocks", "sixel"), default="blocks",
+        help="block characters, or sixels for terminals that draw them (xterm -ti vt340, foot,"
+        " WezTerm, iTerm2) [%(default)s]",
+    )  # fmt: skip
+    add("suggest", run_suggest, "what align suggests, doubtful first", "subjects")
+    words = "what you still have to label, in the best order"
+    parser = add("next", run_next, words, "subjects", "annotator")
+    parser.add_argument("--order", choices=ORDERS, default=ORDERS[0], help="default: %(default)s")
+    parser.add_argument("--count", type=int, default=10, metavar="N", help="at most so many [10]")
+    parser = add("mark", run_mark, "mark the peak frame of an expression", "clip", "annotator")
+    parser.add_argument("frame", type=int, metavar="FRAME", help="0-based decode index")
+    parser.add_argument("--camera", help="camera it was judged in (default: the suggestion's)")
+    parser.add_argument("--first", type=int, metavar="FRAME", help="first frame of its plateau")
+    parser.add_argument("--last", type=int, metavar="FRAME", help="last frame of its plateau")
+    parser = add("flag", run_flag, "say that an expression has no peak", "clip", "annotator")
+    parser.add_argument("reason", metavar="REASON", help=", ".join(FLAG_REASONS) + ", ...")
+    words = "take your last event on an expression back"
+    add("undo", run_undo, words, "clip", "annotator")
+    add("labels", run_labels, "every label in force", "subjects")
+
+
+def _add_reviewing_verbs(add: Callable[..., argparse.ArgumentParser]) -> None:
     words = "check labels against the footage and each other; exit code 1 when one is wrong"
-    add_selection(add_verb(verbs, "validate", words, run_validate))
+    add("validate", run_validate, words, "subjects")
     words = "how well annotators agree, overall, by expression and by pair"
-    add_selection(add_verb(verbs, "agree", words, run_agree))
-    words = "list disagreements, or settle one"
-    parser = add_verb(verbs, "review", words, run_review)
-    add_selection(parser)
-    add_annotator(parser)
+    add("agree", run_agree, words, "subjects")
+    parser = add("review", run_review, "list disagreements, or settle one", "subjects", "annotator")
     parser.add_argument(
         "--beyond", type=int, default=2, metavar="FRAMES", help="marks so close agree [2]"
     )
@@ -68,12 +139,11 @@ def _add_comparing_verbs(verbs) -> None:  # noqa: ANN001 - argparse's type is pr
         help="verdict: a frame, the annotator who is right, or the reason for a flag: "
         f"{', '.join(FLAG_REASONS)}, or flag:REASON",
     )  # fmt: skip
-    add_verb(verbs, "coverage", "subjects against expressions, with the gaps", run_coverage)
-    add_verb(verbs, "status", "how far each subject is, and what labels cost", run_status)
+    add("coverage", run_coverage, "subjects against expressions, with the gaps")
+    add("status", run_status, "how far each subject is, and what labels cost")
     words = "write a contact sheet of all labels, or of a subject or expression, as one HTML file"
-    parser = add_verb(verbs, "sheet", words, run_sheet)
+    parser = add("sheet", run_sheet, words, "subjects")
     parser.add_argument("file", type=Path, metavar="OUT.html")
-    add_selection(parser)
     parser.add_argument("--expression", action="append", metavar="ID", help="only this; repeatable")
     parser.add_argument("--camera", metavar="ID", help="show this camera (default: the label's)")
     parser.add_argument(
@@ -86,30 +156,161 @@ def _add_comparing_verbs(verbs) -> None:  # noqa: ANN001 - argparse's type is pr
     )  # fmt: skip
 
 
-def _add_managing_verbs(verbs) -> None:  # noqa: ANN001 - argparse's type is private
-    words = "say or choose whose frames the others are matched to"
-    parser = add_verb(verbs, "reference", words, run_reference)
-    parser.add_argument("subject", nargs="?", metavar="SUBJECT", help="new reference")
-    words = "label by RenderMe-360's rule: the last frame of a clip is its peak"
-    parser = add_verb(verbs, "rule", words, run_rule)
-    add_selection(parser)
-    parser.add_argument(
-        "--expression", action="append", metavar="ID", help="repeatable; e0 to e11 by default"
+def table(names: Sequence[str], rows: Iterable[Mapping[str, Any]]) -> list[str]:
+    """Lay out some columns of rows; a dash stands for None."""
+    cells = [["-" if row[name] is None else str(row[name]) for name in names] for row in rows]
+    return list(format_table([name.replace("_", " ") for name in names], cells))
+
+
+def dataset_folder(text: str) -> Dataset:
+    """Parse the folder of an existing dataset."""
+    if not Path(text).is_dir():
+        raise argparse.ArgumentTypeError(
+            f"{text}: no such dataset; run 'express50 ingest {text} CAPTURE'"
+        )
+    return Dataset(Path(text))
+
+
+def person(text: str) -> str:
+    """Parse a person's name: neither the align stage's, nor a rule's, nor empty."""
+    if not text.strip() or not is_person(text):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a valid annotator name; give yours")
+    return text
+
+
+def answer(args: argparse.Namespace, data: object, *lines: str) -> int:
+    """Print data as JSON where ``--json`` asks for it, else the lines."""
+    if args.json:
+        say_json(data)
+    else:
+        say(*lines)
+    return OK
+
+
+def chosen_subjects(dataset: Dataset, wanted: list[str] | None) -> list[str] | None:
+    """Check the subjects asked for; None for all.
+
+    Raises:
+        AnnotationError: one is not ingested.
+    """
+    check_known(str(dataset.root), "subject", wanted or (), dataset.subjects())
+    return wanted
+
+
+def run_ui(args: argparse.Namespace) -> int:
+    """Open the annotator; the exit code is 0 also when work is left."""
+    from annotations.ui.app import AnnotateApp
+    from annotations.ui.frames import FaceFinder
+    from annotations.ui.images import cell_size
+    from annotations.ui.session import Session
+
+    dataset = args.dataset
+    subjects = _matching(included_subjects(dataset), args.subjects, "subject")
+    if not subjects:
+        raise AnnotationError(f"{dataset.root}: no subject; run 'express50 ingest' first")
+    names = dict.fromkeys(c.expression_id for s in subjects for c in read_index(dataset, s).cues)
+    session = Session(
+        dataset,
+        args.annotator,
+        subjects=subjects,
+        expressions=_matching(names, args.expressions, "expression"),
+        order=args.order,
+        blind=args.blind,
     )
-    for name, words in (
-        ("exclude", "leave a subject out, with the reason"),
-        ("include", "take an excluded subject back in"),
-    ):
-        parser = add_verb(verbs, name, words, run_exclusion)
-        parser.add_argument("subject", metavar="SUBJECT")
-        if name == "exclude":
-            parser.add_argument("reason", metavar="REASON", help="heavy makeup, large glasses, ...")
-        add_annotator(parser)
-    parser = add_verb(verbs, "export", "write every event as .csv or .json", run_export)
-    add_selection(parser)
-    parser.add_argument("file", type=Path, metavar="FILE")
-    parser = add_verb(verbs, "import", "take events of a .csv or .json in, once each", run_import)
-    parser.add_argument("file", type=Path, metavar="FILE")
+    if not (sys.stdin.isatty() and sys.stdout.isatty()):
+        raise AnnotationError("the annotator needs a terminal; use 'express50 annotate mark' here")
+    cell = None
+    if args.pictures == "sixel":
+        cell = cell_size()
+        os.environ.setdefault("COLORTERM", "truecolor")  # ssh does not hand it on
+    AnnotateApp(session, faces=FaceFinder(dataset), sixel_cell=cell).run()
+    done, total = session.done, len(session.tasks)
+    words = f"{done} of {total} done by {session.annotator}"
+    return answer(args, {"done": done, "tasks": total}, words)
+
+
+def _matching(names: Iterable[str], pattern: str | None, what: str) -> list[str]:
+    """Find the names that fit a pattern with ``*`` and ``?``; all for None."""
+    known = list(names)
+    found = [name for name in known if fnmatch.fnmatchcase(name, pattern or "*")]
+    if pattern is not None and not found:
+        raise AnnotationError(f"no {what} fits {pattern!r}; there are {', '.join(known)}")
+    return found
+
+
+def run_suggest(args: argparse.Namespace) -> int:
+    """Print suggestions, least sure first."""
+    rows = [
+        {"subject": subject, "expression": expression} | asdict(suggestion)
+        for subject in chosen_subjects(args.dataset, args.subject) or args.dataset.subjects()
+        for expression, suggestion in read_suggestions(args.dataset, subject).items()
+    ]
+    rows.sort(key=lambda row: row["confidence"])
+    lines = table(("subject", "expression", "frame", "confidence", "kind"), rows)
+    none = f"no suggestions; run 'express50 align {args.dataset.root}'"
+    return answer(args, rows, *(lines if rows else [none]))
+
+
+def run_next(args: argparse.Namespace) -> int:
+    """Print the worklist's head."""
+    tasks = worklist(args.dataset, args.annotator, args.subject, order=args.order)
+    head = [asdict(task) for task in tasks[: max(0, args.count)]]
+    rows = [row | {"doubt": f"{row['doubt']:.2f}"} for row in head]
+    lines = table(("subject", "expression", "doubt"), rows)
+    return answer(args, {"left": len(tasks), "tasks": head}, *lines, f"{len(tasks)} left")
+
+
+def run_mark(args: argparse.Namespace) -> int:
+    """Append a mark by a person."""
+    index = read_index(args.dataset, args.subject)
+    hint = read_suggestions(args.dataset, args.subject).get(args.expression)
+    camera = args.camera or (hint.camera if hint else "") or next(iter(index.cameras))
+    mark = make_mark(
+        index, args.expression, args.frame, camera, args.annotator, args.first, args.last
+    )
+    if hint is not None:
+        mark = replace(mark, suggested=hint.frame, confidence=hint.confidence)
+    return _keep(args, mark, f"marked frame {args.frame}")
+
+
+def run_flag(args: argparse.Namespace) -> int:
+    """Append a flag with its reason."""
+    index = read_index(args.dataset, args.subject)
+    flag = make_flag(index, args.expression, args.reason, args.annotator)
+    return _keep(args, flag, "flagged")
+
+
+def run_undo(args: argparse.Namespace) -> int:
+    """Append an undo."""
+    index = read_index(args.dataset, args.subject)
+    undo = make_event(index, args.expression, "undo", args.annotator)
+    events = read_labels(args.dataset, args.subject)
+    if last_event(events, args.expression, args.annotator) is None:
+        raise AnnotationError(
+            f"{args.subject} {args.expression}: {args.annotator} has nothing there to take back"
+        )
+    return _keep(args, undo, "took the last event back")
+
+
+def _keep(args: argparse.Namespace, label: Label, said: str) -> int:
+    append_label(args.dataset, label)
+    words = (
+        f"{label.subject} {label.expression}: {said} as {label.annotator};"
+        f" run 'express50 align {args.dataset.root}' to use it"
+    )
+    return answer(args, asdict(label), words)
+
+
+def run_labels(args: argparse.Namespace) -> int:
+    """Print every label in force."""
+    rows = [
+        label
+        for subject in chosen_subjects(args.dataset, args.subject) or args.dataset.subjects()
+        for label in current_labels(read_labels(args.dataset, subject)).values()
+    ]
+    data = [{k: v for k, v in asdict(x).items() if v is not None} for x in rows]
+    cells = [asdict(x) | {"label": describe(x), "by": x.annotator} for x in rows]
+    return answer(args, data, *table(("subject", "expression", "label", "by"), cells))
 
 
 def run_validate(args: argparse.Namespace) -> int:
@@ -130,11 +331,9 @@ def run_agree(args: argparse.Namespace) -> int:
     data = {"overall": overall, "pairs": pairs, "expressions": expressions}
     if not clips:
         return answer(args, data, "no expression was marked by two people yet")
-    rows = {"all": overall} | pairs | expressions
-    cells = [[name, *("-" if r[f] is None else str(r[f]) for f in _FIGURES)]
-             for name, r in rows.items()]  # fmt: skip
-    table = format_table(["", *(f.replace("_", " ") for f in _FIGURES)], cells)
-    return answer(args, data, *table, f"alpha of all, 95 %: {overall['alpha_interval']}")
+    groups = {"all": overall} | pairs | expressions
+    lines = table(("of", *_FIGURES), [{"of": name} | row for name, row in groups.items()])
+    return answer(args, data, *lines, f"alpha of all, 95 %: {overall['alpha_interval']}")
 
 
 def run_review(args: argparse.Namespace) -> int:
@@ -146,8 +345,9 @@ def run_review(args: argparse.Namespace) -> int:
         append_label(args.dataset, label)
         words = f"{subject} {expression}: settled as {describe(label)} by {args.annotator}"
         return answer(args, asdict(label), words)
-    wanted = chosen_subjects(args.dataset, args.subject)
-    queue = disagreements(args.dataset, args.beyond, args.all, wanted)
+    queue = disagreements(
+        args.dataset, args.beyond, args.all, chosen_subjects(args.dataset, args.subject)
+    )
     lines = []
     for row in queue:
         said = ", ".join(f"{who} {what}" for who, what in row.said.items())
@@ -161,10 +361,10 @@ def run_coverage(args: argparse.Namespace) -> int:
     report = coverage(args.dataset)
     states = ("person", "rule", "auto", "flagged", "missing")
     rows = [
-        [subject, *(str(list(cells.values()).count(state)) for state in states)]
+        {"subject": subject} | {state: list(cells.values()).count(state) for state in states}
         for subject, cells in report["cells"].items()
     ]
-    lines = list(format_table(["subject", *states], rows))
+    lines = table(("subject", *states), rows)
     lines += [f"{s}: missing {', '.join(gaps)}" for s, gaps in report["missing"].items()]
     lines += [f"{s}: excluded, {reason}" for s, reason in report["excluded"].items()]
     for name in ("gender", "age"):
@@ -177,16 +377,11 @@ def run_status(args: argparse.Namespace) -> int:
     """Count the labels in force, and what people spent on theirs."""
     subjects = [progress(args.dataset, subject) for subject in args.dataset.subjects()]
     people = effort(args.dataset)
-    header = ["subject", "expressions", "by_person", "by_rule", "automatic", "flagged", "excluded"]
-    cells = [["" if row[n] is None else str(row[n]) for n in header] for row in subjects]
-    lines = list(format_table([name.replace("_", " ") for name in header], cells))
-    if people:
-        figures = next(iter(people.values()))
-        rows = [
-            [who, *("-" if v is None else str(v) for v in row.values())]
-            for who, row in people.items()
-        ]
-        lines += ["", *format_table(["annotator", *(n.replace("_", " ") for n in figures)], rows)]
+    header = ("subject", "expressions", "by_person", "by_rule", "automatic", "flagged", "excluded")
+    lines = table(header, subjects)
+    rows = [{"annotator": who} | row for who, row in people.items()]
+    if rows:
+        lines += ["", *table(list(rows[0]), rows)]
     return answer(args, {"subjects": subjects, "annotators": people}, *lines)
 
 
@@ -196,8 +391,7 @@ def run_sheet(args: argparse.Namespace) -> int:
     from annotations.ui.frames import FaceFinder
     from express50.files.atomic import write_bytes
 
-    wanted = chosen_subjects(args.dataset, args.subject)
-    sheet = make_sheet(args.dataset, wanted, args.expression, args.camera, args.sure)
+    sheet = make_sheet(args.dataset, args.subject, args.expression, args.camera, args.sure)
     chosen = args.subject or args.expression
     around = args.around if args.around is not None else AROUND if chosen else 0
     faces = FaceFinder(args.dataset)

@@ -1,24 +1,32 @@
-"""A label is one event, checked when it is made.
+"""A label is one event, checked when it is made and kept in an append-only file per subject.
 
 A label names a camera, a decode index, its pts and a perceptual hash, so that it can never point
 at another frame unnoticed. An adjudication ranks highest, then people's labels, then a rule's, then
-a suggestion accepted without a person.
+a suggestion accepted without a person. Nothing is ever rewritten: undo is an event of its own.
 """
 
 from __future__ import annotations
 
+import fcntl
+import hashlib
+import json
+import os
 import time
-from dataclasses import dataclass, replace
+from collections.abc import Collection, Iterable, Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
 from typing import get_type_hints
 
 from express50 import __version__
-from express50.capture.index import CameraSource, Cue, Index
+from express50.capture.index import Cue, Index
+from express50.contract.layout import Dataset
 from express50.errors import AnnotationError
+from express50.files.atomic import sync_directory
+from express50.files.text import parse_json, read_bytes
 
 AUTOMATIC = "auto"
 RULE_PREFIX = "rule:"
 FLAG_REASONS = ("failed", "occluded", "not performed", "ambiguous")
-EXCLUSION_ACTIONS = ("exclude", "include")  # of a whole subject; see contract.exclusions
+EXCLUSION_ACTIONS = ("exclude", "include")  # of a whole subject; see contract.layout
 ACTIONS = ("mark", "flag", "undo", "settle", *EXCLUSION_ACTIONS)
 
 
@@ -28,16 +36,13 @@ class Label:
 
     Attributes:
         subject, expression: the labelled performance; no expression for a whole subject.
-        action: ``mark`` a peak, ``flag`` a performance that has none, ``undo`` one's last event,
-            ``settle`` a disagreement (with a frame, or with a reason in place of a flag),
-            ``exclude`` or ``include`` a subject.
+        action: one of ``ACTIONS``; a settlement has a frame, or the reason for a flag.
         annotator: who; ``auto`` for accepted suggestions, ``rule:...`` for rules.
         time: seconds since 1970.
         tool: version of this toolkit.
         frame, camera, pts, dhash: the frame's identity (absent for flag and undo).
         first, last: the plateau that the frame stands for, both inside, where it was given.
-        suggested: the frame that was suggested at that moment.
-        confidence: of the suggestion, 0 to 1.
+        suggested, confidence: the frame that was suggested at that moment, and how sure, 0 to 1.
         shown: whether the suggestion was visible before the decision.
         seconds, keys: time and keystrokes that the label took.
         reason: why it was flagged or excluded.
@@ -70,39 +75,40 @@ KINDS = {
 }
 
 
-def make_mark(index: Index, expression: str, frame: int, camera: str, annotator: str) -> Label:
-    """Make a mark with the frame's full identity; ``replace`` adds what else is known.
+def make_mark(
+    index: Index,
+    expression: str,
+    frame: int,
+    camera: str,
+    annotator: str,
+    first: int | None = None,
+    last: int | None = None,
+) -> Label:
+    """Make a mark with the frame's full identity and, where given, ends of its plateau.
 
     Raises:
-        AnnotationError: the expression is not in the cues, the camera not in the capture, or the
-            frame outside the expression's cue window.
+        AnnotationError: the expression is not in the cues, the camera not in the capture, a frame
+            outside the expression's cue window, or the frame outside its plateau.
     """
     cue = find_cue(index, expression)
-    source = find_camera(index, camera)
-    _check_frame(index, cue, source, frame)
-    label = _event(index, expression, "mark", annotator)
-    pts, dhash = source.pts[frame], source.dhash[frame]
-    return replace(label, frame=frame, camera=camera, pts=pts, dhash=dhash)
-
-
-def with_plateau(mark: Label, index: Index, first: int | None, last: int | None) -> Label:
-    """Give a mark the plateau that its frame stands for; an end may be open.
-
-    Raises:
-        AnnotationError: an end lies outside the expression's cue window, or the frame outside the
-            plateau.
-    """
-    cue, source = find_cue(index, mark.expression), find_camera(index, mark.camera or "")
-    frame = mark.frame or 0
-    low, high = frame if first is None else first, frame if last is None else last
-    for end in (low, high):
-        _check_frame(index, cue, source, end)
-    if not low <= frame <= high:
+    check_known(index.subject, "camera", [camera], index.cameras)
+    source = index.cameras[camera]
+    end = min(cue.end_frame, source.frames - 1)
+    low, high = cue.start_frame if first is None else first, end if last is None else last
+    if not cue.start_frame <= low <= frame <= high <= end:
         raise AnnotationError(
-            f"{index.subject} {mark.expression}: frame {frame} lies outside its plateau {low} to"
-            f" {high}"
+            f"{index.subject} {expression}: frame {frame} lies outside its plateau {low} to {high},"
+            f" or that outside the cue window {cue.start_frame} to {end}"
         )
-    return replace(mark, first=first, last=last)
+    return replace(
+        make_event(index, expression, "mark", annotator),
+        frame=frame,
+        camera=camera,
+        pts=source.pts[frame],
+        dhash=source.dhash[frame],
+        first=first,
+        last=last,
+    )
 
 
 def make_flag(index: Index, expression: str, reason: str, annotator: str) -> Label:
@@ -115,19 +121,15 @@ def make_flag(index: Index, expression: str, reason: str, annotator: str) -> Lab
         raise AnnotationError(
             f"{index.subject} {expression}: a flag needs a reason: {', '.join(FLAG_REASONS)}, ..."
         )
-    return replace(_event(index, expression, "flag", annotator), reason=reason.strip())
+    return replace(make_event(index, expression, "flag", annotator), reason=reason.strip())
 
 
-def make_undo(index: Index, expression: str, annotator: str) -> Label:
-    """Make an undo of the annotator's last event on an expression.
+def make_event(index: Index, expression: str, action: str, annotator: str) -> Label:
+    """Make an event that names no frame, such as an undo.
 
     Raises:
         AnnotationError: the expression is not in the cues.
     """
-    return _event(index, expression, "undo", annotator)
-
-
-def _event(index: Index, expression: str, action: str, annotator: str) -> Label:
     find_cue(index, expression)
     return Label(
         subject=index.subject,
@@ -144,42 +146,28 @@ def find_cue(index: Index, expression: str) -> Cue:
     Raises:
         AnnotationError: it is not in the cues.
     """
-    cue = next((c for c in index.cues if c.expression_id == expression), None)
-    if cue is None:
-        known = ", ".join(c.expression_id for c in index.cues)
-        raise AnnotationError(
-            f"{index.subject}: no expression {expression!r} in cues.csv ({known})"
-        )
-    return cue
+    cues = {cue.expression_id: cue for cue in index.cues}
+    check_known(index.subject, "expression", [expression], cues)
+    return cues[expression]
 
 
-def find_camera(index: Index, camera: str) -> CameraSource:
-    """Find the footage of a camera.
+def check_known(where: str, what: str, wanted: Iterable[str], known: Collection[str]) -> None:
+    """Refuse names that are not known.
 
     Raises:
-        AnnotationError: the capture has no such camera.
+        AnnotationError: one is not; it lists those that are.
     """
-    if camera not in index.cameras:
-        known = ", ".join(index.cameras)
-        raise AnnotationError(f"{index.subject}: no camera {camera!r}; expected one of {known}")
-    return index.cameras[camera]
+    for name in wanted:
+        if name not in known:
+            raise AnnotationError(
+                f"{where}: no {what} {name!r}; expected one of {', '.join(known) or 'none'}"
+            )
 
 
 def shows_labelled_frame(index: Index, label: Label) -> bool:
     """Return whether the footage still holds the very frame that was labelled."""
     source, frame = index.cameras.get(label.camera or ""), label.frame or 0
-    if source is None or not 0 <= frame < source.frames:
-        return False
-    return source.dhash[frame] == label.dhash
-
-
-def _check_frame(index: Index, cue: Cue, source: CameraSource, frame: int) -> None:
-    last = min(cue.end_frame, source.frames - 1)
-    if not cue.start_frame <= frame <= last:
-        raise AnnotationError(
-            f"{index.subject} {cue.expression_id}: frame {frame} lies outside the cue window"
-            f" {cue.start_frame} to {last}"
-        )
+    return source is not None and 0 <= frame < source.frames and source.dhash[frame] == label.dhash
 
 
 def check_texts(label: Label) -> None:
@@ -194,3 +182,150 @@ def check_texts(label: Label) -> None:
                 f"{label.subject} {label.expression}: {name} {getattr(label, name)!r} has line"
                 " breaks or control characters; expected one line of text"
             )
+
+
+def append_label(dataset: Dataset, label: Label) -> None:
+    """Append one event and sync it to disk; several annotators at once lose nothing.
+
+    Raises:
+        AnnotationError: a text is not one line.
+        OSError: it could not be written; then it is missing, or a torn line that readers pass over.
+    """
+    check_texts(label)
+    path = dataset.labels_file(label.subject)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    row = {k: v for k, v in asdict(label).items() if v is not None}
+    line = (json.dumps(row, sort_keys=True) + "\n").encode()
+    handle = os.open(path, os.O_RDWR | os.O_APPEND | os.O_CREAT, 0o644)
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX)
+        size = os.fstat(handle).st_size
+        if size and os.pread(handle, 1, size - 1) != b"\n":
+            line = b"\n" + line  # a writer died half-way: its torn line must not absorb this one
+        while line:  # a signal or a nearly full disk may cut one write short
+            line = line[os.write(handle, line) :]
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+    if size == 0:  # the file's name must outlive a power cut too
+        sync_directory(path.parent)
+
+
+def read_labels(dataset: Dataset, subject: str) -> list[Label]:
+    """Read all events of a subject in the order they were written; torn last lines are left out.
+
+    Raises:
+        AnnotationError: a whole line is not an event.
+    """
+    return [label for _, label in _lines(dataset, subject) if label is not None]
+
+
+def unreadable_lines(dataset: Dataset, subject: str) -> list[int]:
+    """List the lines, from 1, that `read_labels` passes over because a crash cut them short."""
+    return [number for number, label in _lines(dataset, subject) if label is None]
+
+
+def _lines(dataset: Dataset, subject: str) -> Iterator[tuple[int, Label | None]]:
+    """Yield numbers and events of a subject's lines; None where a line cannot be read."""
+    path = dataset.labels_file(subject)
+    if not path.exists():
+        return
+    data = read_bytes(path, AnnotationError, fix="restore it")
+    for number, line in enumerate(data.decode("utf-8", errors="replace").split("\n"), 1):
+        if not line.strip():
+            continue
+        try:
+            row = parse_json(line, str(path), AnnotationError)
+        except AnnotationError:  # the torn end of a write that a crash cut short
+            yield number, None
+            continue
+        where = f"{path}: line {number}"
+        try:
+            label = Label(**{k: v for k, v in row.items() if k in KINDS})
+        except (TypeError, AttributeError) as error:
+            raise AnnotationError(f"{where} is not a label event ({error})") from None
+        for name, kind in KINDS.items():
+            if not isinstance(found := getattr(label, name), kind):
+                raise AnnotationError(f"{where}: {name} is {found!r}, not {kind}; remove the line")
+        yield number, label
+
+
+def current_labels(labels: Iterable[Label]) -> dict[str, Label]:
+    """Return the label in force for each expression: the last of those that rank highest."""
+    current: dict[str, Label] = {}
+    for (expression, _), stack in _stacks(labels).items():
+        for label in stack:
+            old = current.get(expression)
+            if old is None or (_rank(label), label.time) >= (_rank(old), old.time):
+                current[expression] = label
+    return dict(sorted(current.items()))
+
+
+def labels_of(labels: Iterable[Label], annotator: str) -> dict[str, Label]:
+    """Return one annotator's labels by expression; their adjudications of others are left out."""
+    own = {
+        expression: said[-1]
+        for (expression, who), stack in _stacks(labels).items()
+        if who == annotator and (said := [x for x in stack if x.action != "settle"])
+    }
+    return dict(sorted(own.items()))
+
+
+def last_event(labels: Iterable[Label], expression: str, annotator: str) -> Label | None:
+    """Return the event that an undo would take back; None where nothing of theirs is left."""
+    stack = _stacks(labels).get((expression, annotator))
+    return stack[-1] if stack else None
+
+
+def _stacks(labels: Iterable[Label]) -> dict[tuple[str, str], list[Label]]:
+    """Stack the events that were not undone, by expression and annotator."""
+    stacks: dict[tuple[str, str], list[Label]] = {}
+    for label in labels:
+        if label.action in EXCLUSION_ACTIONS:
+            continue
+        stack = stacks.setdefault((label.expression, label.annotator), [])
+        if label.action != "undo":
+            stack.append(label)
+        elif stack:
+            stack.pop()
+    return stacks
+
+
+def _rank(label: Label) -> int:
+    """Adjudications stand above people, people above rules, rules above suggestions."""
+    if label.action == "settle":
+        return 3
+    return 2 if is_person(label.annotator) else int(label.annotator != AUTOMATIC)
+
+
+def is_person(annotator: str) -> bool:
+    """Return whether a name is a person's: neither the align stage's nor a rule's."""
+    return annotator != AUTOMATIC and not annotator.startswith(RULE_PREFIX)
+
+
+def origin(label: Label) -> str:
+    """Return who gave a label: ``person``, ``rule`` or ``auto``; ``flagged`` if it has no frame."""
+    if label.frame is None:
+        return "flagged"
+    if label.annotator == AUTOMATIC:
+        return "auto"
+    return "person" if is_person(label.annotator) else "rule"
+
+
+def voices(labels: Sequence[Label]) -> dict[str, dict[str, Label]]:
+    """Return the labels in force of people, by expression and then by name, sorted."""
+    found: dict[str, dict[str, Label]] = {}
+    for who in sorted({label.annotator for label in labels if is_person(label.annotator)}):
+        for expression, label in labels_of(labels, who).items():
+            found.setdefault(expression, {})[who] = label
+    return found
+
+
+def human_digest(dataset: Dataset, subject: str) -> str:
+    """Digest the decisions of people and rules; automatic labels do not change the digest."""
+    rows = [
+        (label.expression, label.action, label.frame, label.camera, label.annotator, label.reason)
+        for label in current_labels(read_labels(dataset, subject)).values()
+        if label.annotator != AUTOMATIC
+    ]
+    return hashlib.sha256(json.dumps(rows).encode()).hexdigest()

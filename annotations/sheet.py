@@ -11,21 +11,25 @@ from functools import partial
 import jinja2
 import numpy as np
 
-from annotations.agreement import disagreements
-from annotations.labels import AUTOMATIC, Label, shows_labelled_frame
-from annotations.store import current_labels, is_person, read_labels
+from annotations.labels import (
+    Label,
+    check_known,
+    current_labels,
+    origin,
+    read_labels,
+    shows_labelled_frame,
+)
 from annotations.suggestions import Suggested, read_suggestions, reference_subject
 from annotations.ui.frames import FaceFinder, crop_to, zoom_box
+from annotations.validate import disagreements
 from express50.capture.expressions import expression_words
 from express50.capture.frames import read_proxy
 from express50.capture.index import Index, read_index
-from express50.contract.exclusions import exclusion_reason, included_subjects
-from express50.contract.layout import Dataset
-from express50.errors import AnnotationError, Express50Error, FormatError
+from express50.contract.layout import Dataset, exclusion_reason, included_subjects
+from express50.errors import Express50Error, FormatError
 from express50.files.images import encode_jpeg
 
 STATES = ("person", "rule", "auto", "suggestion", "flagged", "missing")
-SURE = 0.5
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -95,12 +99,12 @@ def make_sheet(
     subjects: Collection[str] | None = None,
     expressions: Collection[str] | None = None,
     camera: str | None = None,
-    sure: float = SURE,
+    sure: float = 0.5,
 ) -> Sheet:
     """Make the sheet of some subjects and expressions; excluded subjects are left out.
 
     Args:
-        dataset: an ingested dataset.
+        dataset: to read from.
         subjects: only these; the reference is always shown with them.
         expressions: only these.
         camera: show this camera wherever a subject has it; by default the one in which the
@@ -112,13 +116,14 @@ def make_sheet(
             ingested.
     """
     reference = reference_subject(dataset)
-    chosen = [s for s in included_subjects(dataset) if not subjects or s in subjects]
-    _check_known("subject", subjects, included_subjects(dataset))
-    chosen = [reference, *(s for s in chosen if s != reference)]
+    where, included = str(dataset.root), included_subjects(dataset)
+    check_known(where, "included subject", subjects or (), included)
+    chosen = [reference, *(s for s in subjects or included if s != reference)]
     indexes = {subject: read_index(dataset, subject) for subject in chosen}
     names = list(dict.fromkeys(c.expression_id for i in indexes.values() for c in i.cues))
-    _check_known("expression", expressions, names)
-    _check_known("camera", camera and [camera], {c for i in indexes.values() for c in i.cameras})
+    cameras = dict.fromkeys(c for i in indexes.values() for c in i.cameras)
+    check_known(where, "expression", expressions or (), names)
+    check_known(where, "camera", [camera] if camera else (), cameras)
     notes: list[str] = []
     columns = {s: _column(dataset, index, sure, notes) for s, index in indexes.items()}
     rows = []
@@ -128,40 +133,25 @@ def make_sheet(
         for subject in chosen[1:]:
             absent = Tile(subject=subject, expression=name, words="not recorded")
             tiles.append(columns[subject].get(name, absent))
-        seen = [_seen_by(tile, camera or first.camera, indexes) for tile in tiles]
+        shown = camera or first.camera
+        for place, tile in enumerate(tiles):
+            source = indexes[tile.subject].cameras.get(shown)
+            if tile.frame is not None and source is not None and tile.frame < source.frames:
+                tiles[place] = replace(tile, camera=shown)
         title, description = expression_words(name)
-        rows.append(SheetRow(name, title, description, seen))
-    for subject in dataset.subjects():
-        reason = exclusion_reason(dataset, subject)
-        if reason is not None:
-            notes.append(f"{subject} is excluded: {reason or 'no reason given'}")
+        rows.append(SheetRow(name, title, description, tiles))
+    reasons = {s: exclusion_reason(dataset, s) for s in dataset.subjects()}
+    notes += [f"{s} is excluded: {why}" for s, why in reasons.items() if why is not None]
     return Sheet(rows, reference, chosen, notes)
-
-
-def _check_known(what: str, wanted: Collection[str] | None, known: Collection[str]) -> None:
-    unknown = sorted(set(wanted or ()) - set(known))
-    if unknown:
-        raise AnnotationError(
-            f"no {what} {unknown[0]!r}, or it is excluded; expected one of"
-            f" {', '.join(sorted(known))}"
-        )
-
-
-def _seen_by(tile: Tile, camera: str, indexes: dict[str, Index]) -> Tile:
-    """Show the tile in a camera, if the subject has it and it holds the frame."""
-    source = indexes[tile.subject].cameras.get(camera)
-    if tile.frame is None or source is None or tile.frame >= source.frames:
-        return tile
-    return replace(tile, camera=camera)
 
 
 def _column(dataset: Dataset, index: Index, sure: float, notes: list[str]) -> dict[str, Tile]:
     """Make the tiles of a subject by expression."""
+    suggestions = {}
     try:
         suggestions = read_suggestions(dataset, index.subject)
     except FormatError as error:
         notes.append(str(error))
-        suggestions = {}
     force = current_labels(read_labels(dataset, index.subject))
     disputes = {
         row.expression: ", ".join(f"{who} {what}" for who, what in row.said.items())
@@ -193,18 +183,17 @@ def _filled(tile: Tile, index: Index, label: Label | None, hint: Suggested | Non
         if tile.frame is None or hint is None:
             return replace(tile, frame=None, words="no label")
         return replace(tile, state="suggestion", by="suggested", confidence=hint.confidence)
-    if label.frame is None:
+    state = origin(label)
+    if state == "flagged":
         reason = label.reason or "no reason given"
-        return replace(tile, state="flagged", by=label.annotator, words=reason)
-    automatic = label.annotator == AUTOMATIC
-    state = "auto" if automatic else "person" if is_person(label.annotator) else "rule"
+        return replace(tile, state=state, by=label.annotator, words=reason)
     return replace(
         tile,
         state=state,
         frame=label.frame,
         camera=label.camera if label.camera in index.cameras else fallback,
         by=label.annotator + (", settled" if label.action == "settle" else ""),
-        confidence=label.confidence if automatic else None,
+        confidence=label.confidence if state == "auto" else None,
         words="" if shows_labelled_frame(index, label) else "labelled on other footage",
     )
 
@@ -261,7 +250,6 @@ def render_sheet(
         pictures=pictures,
         several=len(sheet.subjects) > 2,
         size=(WIDTH, HEIGHT),
-        caption=caption,
     )
 
 
@@ -287,13 +275,3 @@ def take_pictures(dataset: Dataset, tile: Tile, faces: FaceFinder | None, around
 def _data(image: np.ndarray) -> str:
     code = base64.b64encode(encode_jpeg(image, QUALITY)).decode()
     return f"data:image/jpeg;base64,{code}"
-
-
-def caption(tile: Tile) -> str:
-    """Name the frame, who chose it and how sure that was, in one short line."""
-    if tile.state == "missing":
-        return ""  # the empty tile shows the reason
-    if tile.state == "flagged":
-        return f"flagged: {tile.words} ({tile.by})"
-    sure = "" if tile.confidence is None else f" {tile.confidence:.0%}"
-    return f"frame {tile.frame} · {tile.by}{sure}"

@@ -7,9 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from annotations.store import current_labels, read_labels
-from express50.contract.exclusions import included_subjects
-from express50.contract.layout import Dataset
+from annotations.labels import check_known, current_labels, read_labels
+from express50.contract.layout import Dataset, included_subjects
 from express50.errors import AnnotationError, FormatError, StageError
 from express50.files.atomic import write_json
 from express50.files.text import read_json_table
@@ -54,22 +53,18 @@ def read_suggestions(dataset: Dataset, subject: str) -> dict[str, Suggested]:
         return {}
     try:
         rows = read_json_table(path, FormatError, "run 'express50 align' again")
-        return {expression: _check_suggestion(expression, row) for expression, row in rows.items()}
+        found = {expression: Suggested(**row) for expression, row in rows.items()}
+        for expression, row in found.items():
+            if not all(type(n) is int for n in (row.frame, row.start, *row.candidates)):
+                raise ValueError(f"{expression}: frames are not whole numbers")
+            if not 0.0 <= row.confidence <= 1.0:
+                raise ValueError(f"{expression}: confidence is {row.confidence}, expected 0 to 1")
+            if not all(map(math.isfinite, [*row.activity, *(row.match or ())])):
+                raise ValueError(f"{expression}: its curves hold NaN or infinity")
     except (ValueError, TypeError, AttributeError, OverflowError) as error:
         raise FormatError(
             f"{path}: not a table of suggestions ({error}); run 'express50 align' again"
         ) from None
-
-
-def _check_suggestion(expression: str, row: dict[str, Any]) -> Suggested:
-    """Check that a row's figures can be compared: NaN would upset every order."""
-    found = Suggested(**row)
-    if not all(type(n) is int for n in (found.frame, found.start, *found.candidates)):
-        raise ValueError(f"{expression}: frames are not whole numbers")
-    if not 0.0 <= found.confidence <= 1.0:
-        raise ValueError(f"{expression}: confidence is {found.confidence}, expected 0 to 1")
-    if not all(map(math.isfinite, [*found.activity, *(found.match or ())])):
-        raise ValueError(f"{expression}: its curves hold NaN or infinity")
     return found
 
 
@@ -117,12 +112,7 @@ def choose_reference(dataset: Dataset, subject: str) -> None:
     Raises:
         AnnotationError: it is not ingested, or excluded.
     """
-    subjects = included_subjects(dataset)
-    if subject not in subjects:
-        raise AnnotationError(
-            f"{dataset.root}: no subject {subject!r} to refer to; expected one of"
-            f" {', '.join(subjects) or 'none: run express50 ingest'}"
-        )
+    check_known(str(dataset.root), "included subject", [subject], included_subjects(dataset))
     write_json(reference_file(dataset), {"subject": subject})
 
 

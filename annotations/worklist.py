@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 from statistics import median
 
-from annotations.labels import AUTOMATIC, Label
-from annotations.store import current_labels, is_person, labels_of, read_labels
+from annotations.labels import (
+    Label,
+    check_known,
+    current_labels,
+    is_person,
+    labels_of,
+    origin,
+    read_labels,
+)
 from annotations.suggestions import read_suggestions, reference_subject
 from express50.capture.demographics import age_counts, gender_counts, shown_counts
 from express50.capture.index import read_index
 from express50.capture.readers.read import read_people
-from express50.contract.exclusions import exclusion_reason, included_subjects
-from express50.contract.layout import Dataset
-from express50.errors import AnnotationError
+from express50.contract.layout import Dataset, exclusion_reason, included_subjects
 
 ORDERS = ("doubt", "expression", "subject")
 
@@ -27,6 +32,11 @@ class LabelTask:
     subject: str
     expression: str
     doubt: float
+
+    @property
+    def key(self) -> tuple[str, str]:
+        """Subject and expression."""
+        return self.subject, self.expression
 
 
 def worklist(
@@ -49,17 +59,10 @@ def worklist(
         everything: also what the annotator has labelled.
 
     Raises:
-        AnnotationError: unknown order or subject.
+        AnnotationError: a subject is not in the dataset, or is excluded.
     """
-    if order not in ORDERS:
-        raise AnnotationError(f"order {order!r}, expected one of {', '.join(ORDERS)}")
     known = included_subjects(dataset)
-    unknown = sorted(set(subjects or ()) - set(known))
-    if unknown:
-        raise AnnotationError(
-            f"{dataset.root}: subject {unknown[0]!r} is not ingested or is excluded;"
-            f" expected one of {', '.join(known)}"
-        )
+    check_known(str(dataset.root), "included subject", subjects or (), known)
     if not known:
         return []
     reference = reference_subject(dataset)
@@ -92,7 +95,7 @@ def coverage(dataset: Dataset) -> dict[str, dict]:
     for subject in included_subjects(dataset):
         force = current_labels(read_labels(dataset, subject))
         names = [cue.expression_id for cue in read_index(dataset, subject).cues]
-        cells[subject] = {name: _state(force.get(name)) for name in names}
+        cells[subject] = {n: origin(force[n]) if n in force else "missing" for n in names}
     missing = {
         subject: [e for e, state in row.items() if state == "missing"]
         for subject, row in cells.items()
@@ -108,27 +111,16 @@ def coverage(dataset: Dataset) -> dict[str, dict]:
     }
 
 
-def _state(label: Label | None) -> str:
-    if label is None:
-        return "missing"
-    if label.frame is None:
-        return "flagged"
-    if label.annotator == AUTOMATIC:
-        return "auto"
-    return "person" if is_person(label.annotator) else "rule"
-
-
 def progress(dataset: Dataset, subject: str) -> dict[str, object]:
     """Count a subject's expressions by who labelled them."""
-    labels = current_labels(read_labels(dataset, subject)).values()
-    marks = [x for x in labels if x.frame is not None]
+    count = Counter(map(origin, current_labels(read_labels(dataset, subject)).values()))
     return {
         "subject": subject,
         "expressions": len(read_index(dataset, subject).cues),
-        "by_person": sum(is_person(x.annotator) for x in marks),
-        "by_rule": sum(not is_person(x.annotator) and x.annotator != AUTOMATIC for x in marks),
-        "automatic": sum(x.annotator == AUTOMATIC for x in marks),
-        "flagged": sum(x.frame is None for x in labels),
+        "by_person": count["person"],
+        "by_rule": count["rule"],
+        "automatic": count["auto"],
+        "flagged": count["flagged"],
         "excluded": exclusion_reason(dataset, subject),
     }
 

@@ -15,7 +15,8 @@ import numpy as np
 from benchmarks.calibrate import figures as rig_figures
 from benchmarks.depth_score import cast
 from benchmarks.regions_truth import iou_figures, true_head_alpha, true_labels, view_row
-from express50.capture.frames import read_cameras_of, read_peaks
+from express50.capture.frames import read_cameras_of
+from express50.capture.index import read_peaks
 from express50.contract.layout import Dataset
 from express50.contract.segmentation_labels import COLOURS
 from express50.dataset.depth_files import depth_file, read_depth, read_normals
@@ -156,7 +157,7 @@ def measure_track(dataset: Dataset, truth: Truth, out: Path | None = None) -> di
 def measure_depth(dataset: Dataset, truth: Truth, out: Path | None = None) -> dict:
     """Absolute depth errors over pixels where both know the surface, and how many are covered.
 
-    The errors of skin are told apart: the truth's hair is single strands, which no surface follows.
+    Errors on skin are given apart, as the truth's hair is single strands, which no surface follows.
     """
     errors, skin, degrees, covered, rows, names = [], [], [], [], [], []
     for subject, expression, frame, camera in sampled_views(dataset, truth):

@@ -24,10 +24,8 @@ import cv2
 import numpy as np
 
 from annotations import align, observe
-from annotations.labels import make_mark
-from annotations.observe import observations
-from annotations.observe.stage import STABLE, cue_frames, similarity_2d
-from annotations.store import append_label
+from annotations.labels import append_label, make_mark
+from annotations.observe.stage import NEUTRAL, STABLE, cue_frames, read_observations, similarity_2d
 from annotations.suggestions import read_suggestions, reference_subject
 from benchmarks.document import replace_section
 from benchmarks.replay import measure_steps, replay
@@ -45,7 +43,6 @@ from express50.twin.truth import Truth
 from pipelines import ingest
 from pipelines.ingest import register
 
-NEUTRAL = observations.NEUTRAL
 THRESHOLDS = (0.0, 0.3, 0.5, 0.7, 0.9, 0.95)
 OFF_APEX = (0.45, 0.85)  # strengths at which canonical frames off the apex are taken
 SAME_STRENGTH = 0.1  # of the peak: frames that differ by less match equally well to the eye
@@ -194,7 +191,7 @@ def shares_of(truth: Truth, subject: str, cue: Cue) -> np.ndarray:
 
 def farthest_frames(dataset: Dataset, subject: str) -> Iterator[tuple[str, int]]:
     """The baseline: the frame whose landmarks are furthest from neutral, head motion removed."""
-    seen, index = observations.read_observations(dataset, subject), read_index(dataset, subject)
+    seen, index = read_observations(dataset, subject), read_index(dataset, subject)
     points = seen.points[0].astype(np.float64)
     windows = {
         c.expression_id: np.searchsorted(seen.frames, cue_frames(index, c)) for c in index.cues

@@ -28,7 +28,6 @@ import cv2
 import numpy as np
 
 from benchmarks.calibrate_footage import refine_figures, see_capture, sfm_figures
-from express50.capture.frames import FrameReader
 from express50.capture.index import Index, read_index
 from express50.contract.config import resolve_config
 from express50.contract.layout import Dataset
@@ -41,13 +40,11 @@ from express50.geometry.transforms import (
     matrix_to_axis_angle,
     rigid_fit,
 )
-from express50.landmarks.network import load_network
 from express50.rigs.world_frame import meeting_point
 from express50.runner.runner import run_stage
 from express50.twin.config import TwinConfig
 from express50.twin.record import print_progress, record
-from express50.twin.rig import make_rig
-from express50.twin.studio import make_sensor
+from express50.twin.rig import make_rig, make_sensor
 from express50.twin.truth import Truth, align_worlds
 from pipelines import ingest
 from pipelines.calibrate import STAGE
@@ -57,19 +54,21 @@ from pipelines.calibrate.board import (
     board_points,
     read_corners,
 )
-from pipelines.calibrate.board_adjust import BoardRig, corner_errors
-from pipelines.calibrate.board_rig import solve_rig
-from pipelines.calibrate.camera_moves import check_footage
-from pipelines.calibrate.colour_gains import WhiteCollector
-from pipelines.calibrate.config import CalibrateConfig
-from pipelines.calibrate.intrinsics import (
+from pipelines.calibrate.board_guess import (
     BoardView,
     board_poses,
     camera_params,
     fit_intrinsics,
+    join_rig,
+    mean_transform,
+    rig_from_boards,
     with_ideal,
 )
-from pipelines.calibrate.rig_graph import join_rig, mean_transform, rig_from_board
+from pipelines.calibrate.board_rig import BoardRig, corner_errors, solve_rig
+from pipelines.calibrate.colour_gains import WhiteCollector
+from pipelines.calibrate.config import CalibrateConfig
+from pipelines.calibrate.footage import find_points, read_footage
+from pipelines.calibrate.given_rig import check_footage
 
 HEAD_RADIUS_M = 0.13
 BUMP_DEG = 0.3
@@ -172,14 +171,14 @@ def footage_figures(
     A foreign capture's given calibration is hidden from the solution and is what it is held to.
     """
     shared = Path(os.environ.get("EXPRESS50_SHARED", Path(__file__).parents[2] / "shared"))
-    seen = see_capture(index.capture, true, config.solve_moments)
+    seen = see_capture(index.capture, true, config.solve_frame_sets)
     sfm, refine = (
         {"twin": sfm_figures(seen, true, config)},
         {"twin": refine_figures(seen, true, figures, board)},
     )
     for root in sorted((shared / "captures").glob("*/calibration.json")):
         given = read_cameras(root)
-        seen = see_capture(root.parent, given, config.solve_moments)
+        seen = see_capture(root.parent, given, config.solve_frame_sets)
         sfm[root.parent.name] = sfm_figures(seen, given, config)
         refine[root.parent.name] = refine_figures(seen, given, figures)
     return {"sfm": sfm, "refine": refine}
@@ -223,26 +222,24 @@ def recorded(config: TwinConfig, folder: Path) -> tuple[Dataset, Truth]:
 
 
 def bump_figures(
-    cameras: Mapping[str, Camera], index: Index, bumps: int, moments: int = 2
+    cameras: Mapping[str, Camera], index: Index, bumps: int, frame_sets: int = 2
 ) -> dict[str, object]:
     """Whether turned cameras, and no others, are found in the footage."""
-    readers = {name: FrameReader(index, name) for name in cameras}
-    numbers = np.linspace(0, index.frames - 1, moments).round().astype(int)
-    frames = {int(k): {name: r.read(int(k)) for name, r in readers.items()} for k in numbers}
-    net = load_network()
+    seen = find_points(read_footage(index, cameras, frame_sets))
     names, rng = sorted(cameras), np.random.default_rng(0)
-    quiet = check_footage(cameras, frames, net)
-    told = {}
+    quiet = check_footage(cameras, seen)
+    accused = {}
     for place in np.linspace(0, len(names) - 1, bumps + 2).round().astype(int)[1:-1]:
         name, axis = names[place], rng.normal(size=3)
         turn = np.radians(BUMP_DEG) * axis / np.linalg.norm(axis)
         moved = make_transform(axis_angle_to_matrix(turn), np.zeros(3))
         bumped = replace(cameras[name], cam_from_world=moved @ cameras[name].cam_from_world)
-        told[name] = sorted(check_footage({**cameras, name: bumped}, frames, net).moved)
+        accused[name] = sorted(check_footage({**cameras, name: bumped}, seen).moved)
     return {
         "bump_deg": BUMP_DEG,
-        "bumped_camera_found": bool(told) and all(told[name] == [name] for name in told),
-        "bumps_found": told,
+        "bumped_camera_found": bool(accused)
+        and all(found == [name] for name, found in accused.items()),
+        "bumps_found": accused,
         "moved_in_the_rig_as_solved": sorted(quiet.moved),
         "unchecked": sorted(quiet.unchecked),
     }
@@ -320,7 +317,7 @@ def chained(
             for f, rows in sorted(frames.items())
             if rows.sum() >= 8
         ]
-        fitted = fit_intrinsics(found, sizes[name], "OPENCV", 4)
+        fitted = fit_intrinsics(found, sizes[name], "OPENCV")
         if fitted is None:
             continue
         params = camera_params(*fitted[:2], "OPENCV")
@@ -339,10 +336,9 @@ def chained(
                 weights = np.array([float(len(views[b][f].points)) for f in shared])
                 edges[a, b] = (mean_transform(np.stack(votes), weights), float(weights.sum()))
     placed = join_rig(sorted(lone), edges, sweeps=0)
-    shown = sorted({f for name in placed for f in poses[name]})
-    boards = {f: rig_from_board(f, placed, lone, views, poses) for f in shown}
+    boards = rig_from_boards(placed, lone, views, poses)
     cameras = {name: replace(lone[name], cam_from_world=pose) for name, pose in placed.items()}
-    return BoardRig(cameras, {f: pose for f, pose in boards.items() if pose is not None})
+    return BoardRig(cameras, boards)
 
 
 def rounded(row: Mapping[str, object]) -> dict[str, object]:

@@ -1,7 +1,7 @@
 """Rigs solved from footage alone, and given rigs refined, against the true cameras.
 
 Parts of ``python -m benchmarks.calibrate``. COLMAP's incremental mapping on the same features and
-landmarks (all moments of a camera as one picture, since cameras do not move) stands beside the
+landmarks (all frame sets of a camera as one picture, since cameras do not move) stands beside the
 solution.
 """
 
@@ -19,28 +19,21 @@ import pycolmap
 from express50.errors import CalibrationError
 from express50.geometry.cameras import Camera
 from express50.geometry.transforms import matrix_to_axis_angle, similarity_fit
-from express50.landmarks.network import load_network
 from pipelines.calibrate.adjuster import move_pose
 from pipelines.calibrate.board import BoardCorners
 from pipelines.calibrate.config import CalibrateConfig
-from pipelines.calibrate.footage import read_capture_frames, reduce_image, reduced_camera
+from pipelines.calibrate.footage import find_points, read_raw_footage, reduced_camera
 from pipelines.calibrate.footage_rig import solve_footage
-from pipelines.calibrate.refine import RefinedRig, refine_by_board, refine_by_footage
-from pipelines.calibrate.tracks import FrameSetPoints, find_points, match_descriptors
+from pipelines.calibrate.given_rig import RefinedRig, refine_by_board, refine_by_footage
+from pipelines.calibrate.tracks import FrameSetPoints, match_descriptors
 
 BUMP_DEG, BUMP_MM = 0.3, 5.0
 RigJudge = Callable[[Mapping[str, Camera], Mapping[str, Camera]], dict[str, float]]
 
 
-def see_capture(root: Path, true: Mapping[str, Camera], moments: int) -> dict[int, FrameSetPoints]:
+def see_capture(root: Path, true: Mapping[str, Camera], count: int) -> dict[int, FrameSetPoints]:
     """What the cameras of a raw capture see, in recorded pixels of `reduced_camera`."""
-
-    def reduce(name: str, image: np.ndarray) -> np.ndarray | None:
-        return reduce_image(true[name], image, "the footage") if name in true else None
-
-    frames = read_capture_frames(root, moments, reduce)
-    net = load_network()
-    return {frame: find_points(images, net) for frame, images in frames.items()}
+    return find_points(read_raw_footage(root, true, count))
 
 
 def small(cameras: Mapping[str, Camera]) -> dict[str, Camera]:
@@ -51,12 +44,12 @@ def small(cameras: Mapping[str, Camera]) -> dict[str, Camera]:
 def sfm_figures(
     seen: Mapping[int, FrameSetPoints], true: Mapping[str, Camera], config: CalibrateConfig
 ) -> dict[str, object]:
-    """Errors of rigs solved with unknown and with told focal lengths, and of COLMAP's mapping."""
+    """Errors of rigs solved with unknown and with known focal lengths, and of COLMAP's mapping."""
     rig = small(true)
     sizes = {name: (camera.width, camera.height) for name, camera in rig.items()}
-    told = {name: float(camera.K[0, 0]) for name, camera in rig.items()}
+    known = {name: float(camera.K[0, 0]) for name, camera in rig.items()}
     rows: dict[str, object] = {}
-    for key, focals in (("unknown_focals", {}), ("told_focals", told)):
+    for key, focals in (("unknown_focals", {}), ("known_focals", known)):
         started = time.process_time()
         try:
             solved = solve_footage(
@@ -110,15 +103,10 @@ def refine_figures(
     bumped = perturbed(true)
 
     def by_footage(rig: Mapping[str, Camera]) -> RefinedRig:
-        reduced = small(rig)
-        found = refine_by_footage(
-            reduced, reduced, seen,
+        return refine_by_footage(
+            rig, seen,
             turn_deg=config.refine_turn_deg, move_mm=config.refine_move_mm, lenses=False,
         )  # fmt: skip
-        poses = {n: c.cam_from_world for n, c in found.cameras.items()}
-        return replace(
-            found, cameras={n: replace(c, cam_from_world=poses[n]) for n, c in rig.items()}
-        )
 
     rows: dict[str, object] = {
         "before": _of(judge(bumped, true)),
@@ -146,10 +134,10 @@ def _row(
     quiet = refine(true)
     return {
         **_of(judge(found.cameras, true)),
-        "kept_given": found.kept,
+        "kept_given": bool(found.kept),
         "held_out_before_px": _five(found.before_px),
         "held_out_after_px": _five(found.after_px),
-        "true_rig_left": quiet.kept,
+        "true_rig_left": bool(quiet.kept),
         "true_rig_head_px": _five(judge(quiet.cameras, true)["head_px"]),
         "seconds": round(seconds, 2),
     }
@@ -177,7 +165,7 @@ def perturbed(rig: Mapping[str, Camera]) -> dict[str, Camera]:
 def colmap_mapping(
     seen: Mapping[int, FrameSetPoints], rig: Mapping[str, Camera]
 ) -> dict[str, Camera]:
-    """The largest model of COLMAP's incremental mapping; it is told sizes, not focal lengths."""
+    """The largest model of COLMAP's incremental mapping; it is given sizes, not focal lengths."""
     with tempfile.TemporaryDirectory() as folder:
         root = Path(folder)
         _write_database(root / "database.db", seen, rig)
@@ -226,7 +214,7 @@ def _write_database(
         frame.add_data_id(image.data_id)
         database.write_frame(frame)
         cameras[name] = made
-        points[name] = np.concatenate([_pixels(moment, name) for moment in seen.values()])
+        points[name] = np.concatenate([_pixels(frame_set, name) for frame_set in seen.values()])
         database.write_keypoints(ids[name], points[name].astype(np.float32))
     options = pycolmap.TwoViewGeometryOptions()
     options.ransac.random_seed = 0
@@ -245,20 +233,20 @@ def _write_database(
     database.close()
 
 
-def _pixels(moment: FrameSetPoints, name: str) -> np.ndarray:
-    """A camera's pixels at one moment: 68 landmarks (zeros without a face), then features."""
-    faces = {camera: points for camera, points, _ in moment.landmarks}
-    return np.concatenate([faces.get(name, np.zeros((68, 2))), moment.features[name][0]])
+def _pixels(points: FrameSetPoints, name: str) -> np.ndarray:
+    """A camera's pixels in one frame set: 68 landmarks (zeros without a face), then features."""
+    faces = {camera: pixels for camera, pixels, _ in points.landmarks}
+    return np.concatenate([faces.get(name, np.zeros((68, 2))), points.features[name][0]])
 
 
 def _pairs(seen: Mapping[int, FrameSetPoints], a: str, b: str) -> np.ndarray:
-    """Matches (M, 2) of two cameras, all moments' keypoints counted through."""
+    """Matches (M, 2) of two cameras, keypoints numbered over all frame sets."""
     found, at = [np.zeros((0, 2), int)], np.zeros(2, int)
-    for moment in seen.values():
-        if {a, b} <= {name for name, _, _ in moment.landmarks}:
+    for points in seen.values():
+        if {a, b} <= {name for name, _, _ in points.landmarks}:
             found.append(np.arange(68)[:, None] + at)
-        found.append(match_descriptors(moment.features[a][1], moment.features[b][1]) + 68 + at)
-        at += [68 + len(moment.features[name][0]) for name in (a, b)]
+        found.append(match_descriptors(points.features[a][1], points.features[b][1]) + 68 + at)
+        at += [68 + len(points.features[name][0]) for name in (a, b)]
     return np.concatenate(found).astype(np.uint32)
 
 

@@ -34,7 +34,7 @@ from benchmarks.depth_score import Mesh, score, summary
 from benchmarks.depth_sweep import sweep
 from benchmarks.depth_trace import trace
 from benchmarks.track import prepare, twin_config
-from express50.capture.frames import read_peaks
+from express50.capture.index import read_peaks
 from express50.contract.config import build_config
 from express50.contract.layout import Dataset
 from express50.dataset.tracks import read_track
@@ -46,12 +46,11 @@ from express50.twin.truth import Truth
 from pipelines import track
 from pipelines.depth import STAGE
 from pipelines.depth.blocks import build
-from pipelines.depth.hull import head_box, hull_distance
 from pipelines.depth.maps import surface_maps
-from pipelines.depth.reconstruct import HeadSurface, reconstruct
+from pipelines.depth.reconstruct import reconstruct
 from pipelines.depth.stage import read_tracked, read_views
-from pipelines.depth.surface import extract_mesh
-from pipelines.depth.views import DepthView
+from pipelines.depth.surface import HeadSurface, extract_mesh
+from pipelines.depth.views import DepthView, head_box, hull_distance
 
 PRESETS = ("draft", "standard", "reference")
 BASELINES = ("visual_hull", "tracked_mesh", "tsdf_fusion")

@@ -10,8 +10,7 @@ import open3d as o3d
 
 from express50.geometry.cameras import Camera
 from express50.geometry.conventions import K_to_opencv
-from pipelines.depth.hull import head_box
-from pipelines.depth.views import INSIDE, DepthView
+from pipelines.depth.views import INSIDE, DepthView, head_box
 
 NEIGHBOURS, PLANES, WINDOW = 4, 128, 9
 AGREE, TRUNCATION_VOXELS = 0.5, 4.0

@@ -15,7 +15,7 @@ import numpy as np
 
 from benchmarks.depth_score import score
 from benchmarks.document import replace_section
-from express50.capture.frames import read_peaks
+from express50.capture.index import read_peaks
 from express50.contract.config import build_config
 from express50.contract.layout import Dataset
 from express50.files.text import markdown_table

@@ -21,11 +21,10 @@ import torch
 
 from express50.geometry.transforms import look_at
 from express50.head.load import load_head
+from grmm.config import resolve
 from grmm.head_crop import draw_window
-from grmm.model import GRMM
-from grmm.presets import preset
+from grmm.model import GRMM, HeadState, PinholeView
 from grmm.render import orbit
-from grmm.scene import HeadState, PinholeView
 
 PAPER_FPS, TARGET_FPS = 75, 200  # the paper's, and ours on one H200
 NOISE = 0.01  # of the weights
@@ -36,7 +35,7 @@ def scene(device: torch.device, n_g: int, size: int) -> tuple[GRMM, HeadState, P
     """A model of random weights, the template's head and a camera before it."""
     torch.manual_seed(0)
     head = load_head("procedural").to(device)
-    settings = preset("paper").model
+    settings = resolve("paper").model
     if n_g != settings.n_g:  # as many doublings as fit
         steps = int(math.log2(n_g // 8))
         settings = replace(settings, n_g=n_g, ladder=settings.ladder[-(steps - 1) :])

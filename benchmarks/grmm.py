@@ -26,16 +26,14 @@ from benchmarks.demo import record_twin, run_stages, subject_of
 from express50.files.atomic import write_json
 from express50.head.load import load_head
 from express50.runner.worker import peak_memory
-from grmm.ablate import ablate
+from grmm.ablate import Ablation, ablate
 from grmm.checkpoint import Loaded, load_checkpoint
-from grmm.config import Config
-from grmm.data import HeadViews
+from grmm.config import Config, resolve
+from grmm.data import HeadViews, spread
 from grmm.edit import trained_head
 from grmm.evaluate import evaluate, mean, training_render
 from grmm.identity_evaluation import FitProtocol
-from grmm.presets import resolve
 from grmm.render import around, frontal, orbit, picture, resized
-from grmm.sampler import spread
 from grmm.shard_source import open_shards
 from grmm.train_state import prepare
 from grmm.warm_start import warm_start
@@ -136,7 +134,8 @@ def measure(shards: Path, out: Path, iterations: int, images: int, rows: list[st
     config = resolve("demo", None, [f"train.iterations={iterations}"])
     config, given = held_out(shards, config)
     protocol = FitProtocol(cameras=(given,), expression="neutral", images=images)
-    table = ablate([shards], out / "ablation", config, protocol, names=rows)["rows"]
+    run = Ablation(roots=[shards], out=out / "ablation", config=config, protocol=protocol)
+    table = ablate(run, rows)["rows"]
     full, groups = table["full"], table["full"]["groups"]
     loaded = load_checkpoint(out / "ablation" / "full" / "checkpoint.pt")
     others = {

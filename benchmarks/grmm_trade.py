@@ -27,11 +27,9 @@ from benchmarks.grmm import held_out
 from express50.files.atomic import write_json
 from express50.files.text import markdown_table
 from express50.head.load import load_head
-from grmm.config import Config
-from grmm.data import HeadViews, Sample, SampleKey, Source
+from grmm.config import Config, as_tables, from_tables, resolve
+from grmm.data import HeadViews, Sample, SampleKey, Source, spread
 from grmm.evaluate import evaluate, mean, training_render
-from grmm.presets import as_tables, from_tables, resolve
-from grmm.sampler import spread
 from grmm.shard_source import open_shards
 from grmm.train import step
 from grmm.train_state import finished, prepare, set_rates, with_map_size
@@ -154,7 +152,7 @@ def as_markdown(rows: list[dict], people: int, cameras: int, size: int) -> list[
 
 
 def choices(rows: list[dict]) -> list[dict]:
-    """For each budget the setting with the best PSNR, as `grmm.presets.choose` reads it."""
+    """For each budget the setting with the best PSNR, as `grmm.config.choose` reads it."""
     best: dict[float, dict] = {}
     for row in rows:
         if row["budget_s"] not in best or row["psnr_db"] > best[row["budget_s"]]["psnr_db"]:

@@ -41,10 +41,9 @@ from express50.geometry.cameras import pinhole
 from express50.geometry.conventions import undistort_image, undistorted_mask
 from express50.twin.truth import Truth
 from pipelines.matte import STAGE
-from pipelines.matte.key import Keyer, dilated, eroded
+from pipelines.matte.key import dilated, eroded, key_alpha
 from pipelines.matte.plates import exposed, exposure_gain
-from pipelines.matte.stage import key_options
-from pipelines.pack.colour import own_colours
+from pipelines.pack.crop import own_colours
 
 PRESETS = ("draft", "standard", "reference")
 HARD = (4.0, 6.0, 10.0, 16.0, 24.0, 40.0)  # 8-bit steps
@@ -100,10 +99,8 @@ def measured(
     configs = {name: resolve_config(STAGE, name, None, assignments) for name in presets}
     for picture in found:
         for name, config in configs.items():
-            options = key_options(config)
             start = time.process_time()
-            keyer = Keyer(picture.plate, [picture.frame], picture.valid, options)
-            alpha = keyer.alpha(picture.frame)
+            alpha = key_alpha(picture.frame, picture.plate, picture.valid, config)
             _add(rows, name, alpha, picture, time.process_time() - start)
         for name, alpha, seconds in baselines(picture, textbook):
             _add(rows, name, alpha, picture, seconds)

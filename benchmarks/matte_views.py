@@ -45,7 +45,7 @@ from express50.twin.truth import Truth
 from pipelines.matte import STAGE
 from pipelines.matte.config import MatteConfig
 from pipelines.matte.consensus import agree
-from pipelines.matte.key import Keyer, KeyOptions
+from pipelines.matte.key import key_alpha
 from pipelines.matte.stage import corrected, make_view
 from pipelines.matte.visual_hull import ball_of
 
@@ -143,8 +143,8 @@ def shots_of(dataset: Dataset, truth: Truth, subject: str, frame: int) -> list[S
 
 def key(shot: Shot) -> Keyed:
     """The shot with its camera's own alpha, by the standard preset."""
-    keyer = Keyer(shot.plate, [shot.frame], shot.valid, KeyOptions())
-    return Keyed(shot, np.rint(255 * keyer.alpha(shot.frame)).astype(np.uint8))
+    alpha = key_alpha(shot.frame, shot.plate, shot.valid, MatteConfig())
+    return Keyed(shot, np.rint(255 * alpha).astype(np.uint8))
 
 
 def measure(keyed: list[Keyed], config: MatteConfig, sheet: Path | None) -> Figures:

@@ -8,8 +8,15 @@ import torch
 from torch import Tensor
 
 from express50.geometry.conventions import cell_to_corner, corner_to_cell
-from grmm.rasterize.interface import Pinhole, Splats
-from grmm.rasterize.projection import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN, Projection, project
+from grmm.rasterize.projection import (
+    ALPHA_MAX,
+    ALPHA_MIN,
+    TRANSMITTANCE_MIN,
+    Pinhole,
+    Projection,
+    Splats,
+    project,
+)
 
 
 def head(n: int, size: int, channels: int) -> dict[str, Tensor]:

@@ -23,7 +23,8 @@ import numpy as np
 
 from benchmarks.accuracy import true_world_cameras
 from benchmarks.regions_truth import iou_figures, true_head_alpha, true_labels, view_row
-from express50.capture.frames import read_cameras_of, read_peaks
+from express50.capture.frames import read_cameras_of
+from express50.capture.index import read_peaks
 from express50.contract.config import PRESETS, resolve_config
 from express50.contract.layout import Dataset
 from express50.contract.segmentation_labels import TORSO

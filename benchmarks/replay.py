@@ -15,12 +15,11 @@ from typing import Any
 import numpy as np
 from textual.pilot import Pilot
 
-from annotations.labels import Label
-from annotations.store import labels_of, read_labels
+from annotations.labels import Label, labels_of, read_labels
 from annotations.ui import task as moves
 from annotations.ui.app import AnnotateApp
 from annotations.ui.frames import FaceFinder
-from annotations.ui.session import Session, open_session
+from annotations.ui.session import Session
 from annotations.ui.task import CueView
 from express50.contract.layout import Dataset
 from express50.errors import AnnotationError
@@ -29,8 +28,8 @@ SIZE = (120, 40)
 Move = Callable[[CueView], CueView]
 
 
-def _pick(number: int) -> Move:
-    return lambda view: moves.pick_candidate(view, number - 1)
+def _pick(rank: int) -> Move:
+    return lambda view: moves.pick_candidate(view, rank)
 
 
 MOVES: dict[str, Move] = {
@@ -41,7 +40,7 @@ MOVES: dict[str, Move] = {
     "tab": lambda view: moves.next_candidate(view, 1),
     "home": lambda view: moves.go_to(view, view.first),
     "end": lambda view: moves.go_to(view, view.last),
-    **{str(number): _pick(number) for number in range(1, 6)},
+    **{str(rank): _pick(rank) for rank in range(1, 6)},
 }
 MEASURED_KEYS = ("left", "right", "pageup", "pagedown")
 
@@ -115,7 +114,7 @@ def replay(
     Raises:
         AnnotationError: no task has a truth.
     """
-    session = open_session(
+    session = Session(
         dataset,
         annotator,
         subjects=sorted({subject for subject, _ in truth}),
@@ -220,7 +219,7 @@ def measure_steps(
     From the key to the picture encoded for the terminal, decoding included where it was not done
     ahead.
     """
-    session = open_session(dataset, "measure", subjects=subjects)
+    session = Session(dataset, "measure", subjects=subjects)
     app = MeasuredApp(session, faces=FaceFinder(dataset) if faces else None)
     return asyncio.run(_scrub(app, presses, size, np.random.default_rng(seed)))
 

@@ -25,8 +25,8 @@ import numpy as np
 
 from benchmarks.track_truth import Errors, clip_errors, compare, mean, pooled, summary
 from benchmarks.track_views import held_out_views
-from express50.capture.frames import read_cameras_of, read_peaks
-from express50.capture.index import index_to_json, read_index
+from express50.capture.frames import read_cameras_of
+from express50.capture.index import index_to_json, read_index, read_peaks
 from express50.contract.config import build_config
 from express50.contract.layout import Dataset
 from express50.files.calibration import read_cameras, write_cameras

@@ -19,15 +19,14 @@ import numpy as np
 from express50.capture.frames import read_cameras_of, read_frame
 from express50.capture.raw import read_capture
 from express50.contract.layout import Dataset
-from express50.files.containers import read_srgb8
+from express50.files.containers import read_picture
 from express50.files.images import LIGHT_OF_LEVEL, linear_to_srgb
 from express50.geometry.cameras import Camera, pinhole, unproject
 from express50.geometry.conventions import undistort_image
 from express50.geometry.raycast import visible_faces
 from express50.head.model import HeadModel
 from express50.twin.truth import Truth
-from pipelines.track.crops import look_up
-from pipelines.track.surface import Visibility
+from pipelines.track.surface import Visibility, look_up
 
 SLANT = 0.4  # cosine below which a camera's view of a point is not taken
 LEAST_VIEWS = 2
@@ -67,7 +66,7 @@ def held_out_views(
             raw = footage.get(name)
             image = None
             if raw is not None and raw.kind == "frames":
-                image = undistort_image(read_srgb8(raw.path / raw.names[frame]), camera)
+                image = undistort_image(read_picture(raw.path, raw.names[frame]), camera)
             mask, face = mask_of(model, vertices, plain), see_face(model, vertices, plain)[0]
             face = face & truth.skin(subject, frame, plain)
             found.setdefault(frame, []).append(HeldOut(plain, mask, face, image))

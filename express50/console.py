@@ -9,7 +9,8 @@ import os
 import signal
 import sys
 from collections.abc import Callable, Iterator
-from typing import IO
+from pathlib import Path
+from typing import IO, Any
 
 from express50.errors import ConfigError, Express50Error
 
@@ -35,11 +36,38 @@ def run_handler(
     except Express50Error as error:
         return _fail(program, error, FAILED)
     except OSError as error:  # the machine's, not a defect: permissions, a full disk, a folder
-        sys.stderr.write(f"{program}: {_describe(error)}\n")
+        place = f" {error.filename}:" if error.filename is not None else ""
+        words = error.strerror or str(error) or "no reason given"
+        words = f"{type(error).__name__}:{place} {words}"
+        sys.stderr.write(f"{program}: {words}; is the path right, may it be read and written?\n")
         return FAILED
     except KeyboardInterrupt:
         sys.stderr.write(f"{program}: stopped; what is finished is kept, run the same to go on\n")
         return INTERRUPTED
+
+
+def add_command(
+    subparsers: Any,
+    name: str,
+    handler: Callable[[argparse.Namespace], int],
+    help: str,  # noqa: A002  as argparse has it
+    *,
+    dataset: bool = True,
+    json: bool = True,
+    example: str | None = None,
+    **options: Any,
+) -> argparse.ArgumentParser:
+    """Add a command's parser; most commands take a DATASET, and --json to print for programs."""
+    if example is not None:
+        options |= {"epilog": f"example:\n  {example}"}
+        options |= {"formatter_class": argparse.RawDescriptionHelpFormatter}
+    parser = subparsers.add_parser(name, help=help, **options)
+    parser.set_defaults(handler=handler)
+    if dataset:
+        parser.add_argument("dataset", type=Path, metavar="DATASET", help="folder of the dataset")
+    if json:
+        parser.add_argument("--json", action="store_true", help="print as JSON")
+    return parser
 
 
 def _fail(program: str, error: Express50Error, code: int) -> int:
@@ -58,13 +86,6 @@ def readers_may_leave(stream: IO[str]) -> Iterator[None]:
         nowhere = os.open(os.devnull, os.O_WRONLY)
         os.dup2(nowhere, stream.fileno())
         os.close(nowhere)
-
-
-def _describe(error: OSError) -> str:
-    """Say what the system refused, and at which path."""
-    place = f" {error.filename}:" if error.filename is not None else ""
-    words = error.strerror or str(error) or "no reason given"
-    return f"{type(error).__name__}:{place} {words}; is the path right, may it be read and written?"
 
 
 @contextlib.contextmanager

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import fnmatch
 import hashlib
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -18,19 +17,13 @@ from express50.console import log
 from express50.contract.config import nearest
 from express50.errors import ConfigError, FormatError
 from express50.files.atomic import dump_json, write_bytes, write_json
+from express50.files.digests import file_sha256
 from express50.files.text import markdown_table, read_json_table
 from express50.head.load import load_head
 from grmm.checkpoint import Loaded, load_checkpoint
-from grmm.config import Config
-from grmm.data import HeadViews
-from grmm.evaluate import (
-    HELD_EXPRESSION,
-    HELD_VIEW,
-    evaluate,
-    kind_of,
-    mean,
-    training_render,
-)
+from grmm.config import Config, as_tables, from_tables
+from grmm.data import HeadViews, spread
+from grmm.evaluate import HELD_EXPRESSION, HELD_VIEW, evaluate, kind_of, mean, training_render
 from grmm.identity_evaluation import (
     NOVEL_EXPRESSION,
     NOVEL_VIEW,
@@ -38,9 +31,7 @@ from grmm.identity_evaluation import (
     evaluate_unseen,
     given_views,
 )
-from grmm.perceptual_metrics import PerceptualMetrics
-from grmm.presets import as_tables, from_tables
-from grmm.sampler import spread
+from grmm.metrics import PerceptualMetrics
 from grmm.shard_source import open_shards
 from grmm.train import train
 from grmm.train_state import best_device, with_map_size
@@ -48,7 +39,7 @@ from grmm.train_state import best_device, with_map_size
 
 @dataclass(frozen=True, kw_only=True)
 class Variant:
-    """One row of the ablation: its name, its changes, and the paper's figure.
+    """One row of the ablation.
 
     Attributes:
         label: as in the table.
@@ -91,52 +82,55 @@ DIGITS = {"psnr_db": 2, "ssim": 3, "lpips": 3}
 SHOWN = ("psnr_db", "psnr_head_db", "ssim", "rmse", "lpips")
 
 
-def ablate(
-    roots: Sequence[Path],
-    out: Path,
-    config: Config,
-    protocol: FitProtocol,
-    subjects: Sequence[str] = (),
-    names: Sequence[str] = (),
-) -> dict[str, Any]:
-    """Measure every row that is not measured yet; writes ablation.json and ablation.md.
+@dataclass(frozen=True, kw_only=True)
+class Ablation:
+    """What all rows share.
 
-    Args:
+    Attributes:
         roots: folders of shards; several are mixed.
         out: gets one folder per row, and the tables.
         config: of the full model; its budget is every row's.
         protocol: how unseen people are fitted.
         subjects: unseen people; empty: all that the training split lacks.
-        names: rows; empty: all.
+    """
+
+    roots: Sequence[Path]
+    out: Path
+    config: Config
+    protocol: FitProtocol
+    subjects: Sequence[str] = ()
+
+    def unseen(self, views: HeadViews) -> list[str]:
+        """List the people to fit: no row trains on them."""
+        trained = {key.subject for key in open_shards(self.roots, "train").keys}
+        return list(self.subjects) or sorted({key.subject for key in views.keys} - trained)
+
+
+def ablate(run: Ablation, names: Sequence[str] = ()) -> dict[str, Any]:
+    """Measure every row that is not measured yet; writes ablation.json and ablation.md.
+
+    ``names`` are the rows to measure; empty: all.
 
     Raises:
-        ConfigError: an unknown row, or nothing is held out.
+        ConfigError: an unknown row, nothing is held out, or a person lacks the views that it is to
+            be fitted from.
     """
-    config = with_holdout(roots, config)
+    config = with_holdout(run.roots, run.config)
+    variants = variants_of(run.roots, names)
+    source = open_shards(run.roots, "*")
+    head = load_head(source.head)
+    views = HeadViews(source, head)
+    for subject in run.unseen(views):  # before hours of training
+        given_views(views, subject, run.protocol)
     if not config.model.n_g:  # every row has as many Gaussians as the full model
-        source = open_shards(roots, "train")
-        config = with_map_size(config, HeadViews(source, load_head(source.head)))
-    variants = variants_of(roots, names)
-    check_people(roots, config, protocol, subjects)
+        config = with_map_size(config, HeadViews(open_shards(run.roots, "train"), head))
+    run = replace(run, config=config)
     rows: dict[str, dict] = {}
+    table: dict[str, Any] = {}
     for name, variant in variants.items():
-        rows[name] = _row(roots, out, name, variant, config, protocol, subjects)
-        write_tables(out, rows, variants, config)
-    return json.loads((out / "ablation.json").read_bytes())
-
-
-def check_people(
-    roots: Sequence[Path], config: Config, protocol: FitProtocol, subjects: Sequence[str]
-) -> None:
-    """Refuse, before hours of training, unseen people whom the shards do not show.
-
-    Raises:
-        ConfigError: a person lacks the views that it is to be fitted from.
-    """
-    source = open_shards(roots, "*")
-    views = HeadViews(source, load_head(source.head))
-    for subject in subjects or unseen_subjects(roots, views, "train"):
-        given_views(views, subject, protocol)
+        rows[name] = _row(run, name, variant)
+        table = write_tables(run.out, rows, config)
+    return table
 
 
 def with_holdout(roots: Sequence[Path], config: Config) -> Config:
@@ -168,32 +162,31 @@ def changed(config: Config, variant: Variant, used: Sequence[Path]) -> Config:
     return from_tables(tables)
 
 
-def _row(
-    roots: Sequence[Path],
-    out: Path,
-    name: str,
-    variant: Variant,
-    config: Config,
-    protocol: FitProtocol,
-    subjects: Sequence[str],
-) -> dict:
+def _row(run: Ablation, name: str, variant: Variant) -> dict:
     """Measure one row, or read it from its file if it was measured with the same settings."""
-    used = [root for root in roots if root != variant.without]
-    settings = changed(config, variant, used)
-    digest = _digest(roots, used, settings, protocol, subjects)
-    path = out / name / "row.json"
+    used = [root for root in run.roots if root != variant.without]
+    settings = changed(run.config, variant, used)
+    content = {  # everything that the numbers depend on, except the code
+        "shards": [file_sha256(root / "index.json") for root in run.roots],
+        "used": [run.roots.index(root) for root in used],
+        "config": as_tables(settings),
+        "protocol": asdict(run.protocol),
+        "subjects": list(run.subjects),
+    }
+    digest = hashlib.sha256(dump_json(content)).hexdigest()
+    path = run.out / name / "row.json"
     if path.exists():
         row = read_json_table(path, FormatError, "delete it to measure again")
         if row.get("digest") == digest:
             log(f"ablate: {name} is measured")
             return row
         log(f"ablate: {name} was measured with other settings: again")
-    folder = out / (variant.trains_as or name)
+    folder = run.out / (variant.trains_as or name)
     if not variant.trains_as:
         _train(used, folder, settings)
     loaded = load_checkpoint(folder / "checkpoint.pt", best_device())
     log(f"ablate: measuring {name}")
-    row = measure(replace(loaded, config=settings), roots, used, protocol, subjects)
+    row = measure(run, replace(loaded, config=settings), used)
     row |= {"digest": digest, "label": variant.label, "paper_db": variant.paper_db}
     write_json(path, row)
     return row
@@ -201,57 +194,37 @@ def _row(
 
 def _train(used: Sequence[Path], folder: Path, settings: Config) -> None:
     """Train a row, or go on where it stopped; other settings or samples start afresh."""
-    tables = as_tables(settings)
     source = open_shards(used, "train")
-    wanted = dump_json(
-        {
-            "tables": {k: v for k, v in tables.items() if k not in ("fit", "metrics")},
-            "samples": source.digest,
-        }
-    )
+    tables = {k: v for k, v in as_tables(settings).items() if k not in ("fit", "metrics")}
+    wanted = dump_json({"tables": tables, "samples": source.digest})
     mark, checkpoint = folder / "settings.json", folder / "checkpoint.pt"
-    same = mark.exists() and mark.read_bytes() == wanted
-    if not same:
+    if not mark.exists() or mark.read_bytes() != wanted:
         checkpoint.unlink(missing_ok=True)
         write_bytes(mark, wanted)
     log(f"ablate: training {folder.name}")
     train(source, load_head(source.head), folder, settings, resume=checkpoint.exists())
 
 
-def measure(
-    loaded: Loaded,
-    roots: Sequence[Path],
-    used: Sequence[Path],
-    protocol: FitProtocol,
-    subjects: Sequence[str],
-) -> dict:
+def measure(run: Ablation, loaded: Loaded, used: Sequence[Path]) -> dict:
     """Measure held-out views and expressions of training people, and unseen people."""
-    data = loaded.config.data
-    views = HeadViews(
-        open_shards(roots, "*"),
-        loaded.head,
-        background=data.background,
-        torso=data.torso,
-        device=loaded.model.z_id.device,
-    )
-    kinds = [kind_of(key, loaded.model.subjects, loaded.gallery) for key in views.keys]
+    views = loaded.views(open_shards(run.roots, "*"))
+    metrics, images = loaded.config.metrics, run.protocol.images
     groups: dict[str, dict] = {}
-    for group, kind in GROUPS.items():
+    for group in ("view", "expression"):
         own = [
             i
-            for i, k in enumerate(kinds)
-            if k == kind and views.keys[i].expression in loaded.model.expressions
+            for i, key in enumerate(views.keys)
+            if kind_of(loaded, key) == GROUPS[group] and key.expression in loaded.model.expressions
         ]
         # Without a dataset other people are trained, whose views cannot be compared.
-        if not own or len(used) < len(roots):
-            continue
-        chosen = spread(own, protocol.images) if protocol.images else own
-        judge = PerceptualMetrics(loaded.config.metrics)
-        rows = evaluate(views, chosen, training_render(loaded.model, views), judge)
-        groups[group] = _means(rows, judge)
-    judge, rows, efforts = PerceptualMetrics(loaded.config.metrics), [], []
-    for subject in subjects or sorted(unseen_subjects(roots, views, "train")):
-        found, effort = evaluate_unseen(loaded, views, subject, protocol, judge)
+        if own and len(used) == len(run.roots):
+            judge = PerceptualMetrics(metrics)
+            chosen = spread(own, images) if images else own
+            rows = evaluate(views, chosen, training_render(loaded.model, views), judge)
+            groups[group] = _means(rows, judge)
+    judge, rows, efforts = PerceptualMetrics(metrics), [], []
+    for subject in run.unseen(views):
+        found, effort = evaluate_unseen(loaded, views, subject, run.protocol, judge)
         rows += found
         efforts.append(effort)
     for group in ("unseen", "unseen_expression"):
@@ -268,33 +241,8 @@ def measure(
     }
 
 
-def unseen_subjects(roots: Sequence[Path], views: HeadViews, split: str) -> set[str]:
-    """Find the people outside the training split: no row trains on them."""
-    trained = {key.subject for key in open_shards(roots, split).keys}
-    return {key.subject for key in views.keys} - trained
-
-
 def _means(rows: list, judge: PerceptualMetrics, kind: str | None = None) -> dict:
     return {n: mean(rows, n) for n in SHOWN} | {"fid": judge.fid(kind), "images": len(rows)}
-
-
-def _digest(
-    roots: Sequence[Path],
-    used: Sequence[Path],
-    settings: Config,
-    protocol: FitProtocol,
-    subjects: Sequence[str],
-) -> str:
-    """Digest everything that a row's numbers depend on, except the code."""
-    indices = [hashlib.sha256((root / "index.json").read_bytes()).hexdigest() for root in roots]
-    content = {
-        "shards": indices,
-        "used": [roots.index(root) for root in used],
-        "config": as_tables(settings),
-        "protocol": asdict(protocol),
-        "subjects": list(subjects),
-    }
-    return hashlib.sha256(dump_json(content)).hexdigest()
 
 
 def variants_of(roots: Sequence[Path], names: Sequence[str] = ()) -> dict[str, Variant]:
@@ -317,30 +265,23 @@ def variants_of(roots: Sequence[Path], names: Sequence[str] = ()) -> dict[str, V
     return {name: row for name, row in rows.items() if not names or name in (*names, "full")}
 
 
-def write_tables(
-    out: Path, rows: Mapping[str, dict], variants: Mapping[str, Variant], config: Config
-) -> None:
-    """Write ablation.json and ablation.md of the rows measured so far."""
-    full = rows["full"]["groups"]
-    table = {
-        name: row
-        | {
-            "difference_db": {
-                group: round(numbers["psnr_db"] - full[group]["psnr_db"], 3)
-                for group, numbers in row["groups"].items()
-                if group in full and None not in (numbers["psnr_db"], full[group]["psnr_db"])
-            }
+def write_tables(out: Path, rows: Mapping[str, dict], config: Config) -> dict[str, Any]:
+    """Write ablation.json and ablation.md of the rows measured so far; returns the former."""
+    full, table = rows["full"]["groups"], {}
+    for name, row in rows.items():
+        gains = {
+            group: round(numbers["psnr_db"] - full[group]["psnr_db"], 3)
+            for group, numbers in row["groups"].items()
+            if group in full and None not in (numbers["psnr_db"], full[group]["psnr_db"])
         }
-        for name, row in rows.items()
-    }
+        table[name] = row | {"difference_db": gains}
     budget = {"seconds": config.train.seconds or None, "iterations": config.train.iterations}
     missing = PerceptualMetrics(config.metrics).missing()
-    write_json(
-        out / "ablation.json",
-        {"rows": table, "budget": budget, "holdout_cameras": list(config.data.holdout_cameras)}
-        | missing,
-    )
+    cameras = list(config.data.holdout_cameras)
+    content = {"rows": table, "budget": budget, "holdout_cameras": cameras} | missing
+    write_json(out / "ablation.json", content)
     write_bytes(out / "ablation.md", markdown(table, missing).encode())
+    return content
 
 
 def markdown(table: Mapping[str, dict], missing: Mapping[str, str]) -> str:

@@ -22,27 +22,14 @@ class Anchors:
     """N covered texels of an n_g x n_g map, in row-major order; row 0 is the top (v = 1).
 
     Attributes:
-        n_g: side of the map.
         texels: (N,) flat index row * n_g + column.
         faces: (N,) face under the texel's centre.
         barycentrics: (N, 3) of the centre, non-negative, rows sum to 1.
-        overlaps: texels claimed by more than one face (the lowest face index got them).
     """
 
-    n_g: int
     texels: Tensor
     faces: Tensor
     barycentrics: Tensor
-    overlaps: int
-
-    def budget(self) -> str:
-        """Describe in one line how many Gaussians the scene gets and how many texels have none."""
-        total = self.n_g * self.n_g
-        count = len(self.texels)
-        return (
-            f"{count} Gaussians of {total} texels ({100 * count / total:.0f} % covered, "
-            f"{self.overlaps} overlapping)"
-        )
 
 
 def make_anchors(head: HeadModel, n_g: int, mouth: bool = True) -> Anchors:
@@ -73,15 +60,10 @@ def make_anchors(head: HeadModel, n_g: int, mouth: bool = True) -> Anchors:
             f"head model {head.name!r}: no triangle of its UV map covers a texel's centre at "
             f"n_g = {n_g}; expected UV coordinates in [0, 1]. Raise model.n_g or check the UV map"
         )
-    # Texels on a shared edge belong to both neighbours; only strictly inner ones are overlaps.
-    strict = (weights > 1e-9).all(1)
-    claims = torch.bincount(texel[strict], minlength=n_g * n_g)
     return Anchors(
-        n_g=n_g,
         texels=texel[first],
         faces=face[first],
         barycentrics=weights[first].float(),
-        overlaps=int((claims > 1).sum()),
     )
 
 

@@ -1,12 +1,24 @@
-"""Settings of GRMM in frozen dataclasses; the defaults are the paper's numbers.
+"""Settings of GRMM: frozen dataclasses, presets, and how files and flags change them.
 
-Where the paper is silent, docs/GRMM.md says what was chosen and why; G1 to G23 are its sections.
+The defaults are the paper's numbers. Where the paper is silent, docs/GRMM.md says what was chosen
+and why; G1 to G23 are its sections. Precedence: ``--set table.key=value``, then TOML, then the
+preset, then the defaults.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import Any
 
+from express50.contract.config import (
+    build_dataclass,
+    config_values,
+    known_assignments,
+    read_tables,
+)
 from express50.errors import ConfigError
 
 FRAMES = ("head", "tangent")
@@ -228,3 +240,124 @@ def _not_negative(table: str, config: object, *names: str) -> None:
 def _in_range(name: str, value: float, low: float, high: float) -> None:
     if not low <= value <= high:
         raise ConfigError(f"{name} is {value}, expected {low} to {high}")
+
+
+# ``paper`` has the paper's sizes, ``small`` suits one GPU, ``demo`` two CPU cores and minutes.
+PRESETS: dict[str, dict[str, dict[str, Any]]] = {
+    "paper": {},
+    "small": {
+        "model": {
+            "n_g": 256,
+            "z_id": 128,
+            "z_exp": 64,
+            "seed_channels": 128,
+            "ladder": (128, 64, 64, 32),
+            "shared_widths": (256, 128),
+            "mesh_width": 128,
+            "film_width": 128,
+            "refine_unshuffle": 2,
+            "identity_modes": 12,
+            "frame": "tangent",
+        },
+        "train": {"iterations": 20_000, "lr": 5e-4, "code_lr_scale": 10.0, "final_lr": 0.1},
+        "fit": {"stage1_iterations": 200, "stage2_iterations": 200, "texture_warm_start": True},
+    },
+    "demo": {
+        "model": {
+            "n_g": 128,
+            "z_id": 32,
+            "z_exp": 16,
+            "features": 8,
+            "seed_channels": 32,
+            "ladder": (32, 32, 24),
+            "shared_widths": (64, 64),
+            "mesh_width": 48,
+            "film_width": 32,
+            "refine_widths": (24, 32, 48),
+            "refine_unshuffle": 4,
+            "identity_modes": 8,
+            "frame": "tangent",
+            "opacity_init": 0.8,
+            "scale_init": 0.7,
+        },
+        "train": {
+            "iterations": 4000,
+            "lr": 2e-3,
+            "code_lr_scale": 2.0,
+            "texel_lr_scale": 5.0,
+            "refine_lr_scale": 0.25,
+            "final_lr": 0.05,
+        },
+        "fit": {
+            "stage1_iterations": 120,
+            "stage2_iterations": 200,
+            "stage2_lr": 1e-3,
+            "texture_warm_start": True,
+            "shuffle_directions": 0.5,
+            "locality_every": 2,
+        },
+    },
+}
+
+MEASURED = Path(__file__).with_name("measured.json")  # written by benchmarks.grmm_trade
+TABLES: dict[str, Any] = {table.name: table.default_factory for table in fields(Config)}
+
+
+def resolve(
+    name: str = "paper",
+    file: Path | None = None,
+    assignments: Sequence[str] = (),
+    changes: Mapping[str, Mapping[str, Any]] | None = None,
+) -> Config:
+    """Build a configuration: assignments over a TOML file over ``changes`` over a preset.
+
+    Assignments read ``table.key=value``.
+
+    Raises:
+        ConfigError: unknown preset, table or key, a wrong type, or a value out of range.
+    """
+    if name not in PRESETS:
+        raise ConfigError(
+            f"preset is {name!r}, expected one of {', '.join(PRESETS)} (of 'grmm train': or"
+            " measured)"
+        )
+    tables = as_tables(Config())
+    for layer in (PRESETS[name], changes or {}, read_tables(file, list(TABLES)) if file else {}):
+        for table, values in layer.items():
+            tables[table] |= values
+    for table, key, value in known_assignments(assignments, list(TABLES)):
+        tables[table][key] = value
+    return from_tables(tables)
+
+
+def from_tables(tables: Mapping[str, Mapping[str, object]]) -> Config:
+    """Make a configuration from plain tables, as a checkpoint holds them."""
+    return Config(
+        **{table: build_dataclass(table, TABLES[table], values) for table, values in tables.items()}
+    )
+
+
+def as_tables(config: Config) -> dict[str, dict[str, Any]]:
+    """Convert a configuration to a nested dictionary."""
+    return {table: config_values(getattr(config, table)) for table in TABLES}
+
+
+@dataclass(frozen=True, kw_only=True)
+class BudgetChoice:
+    """The setting that did best in a budget of processor seconds, and its held-out PSNR."""
+
+    setting: str  # its name in docs/TRADEOFFS.md
+    changes: dict[str, dict[str, Any]]  # table -> key -> value over the demo preset
+    budget_s: float
+    psnr_db: float
+
+
+def choose(seconds: float, measured: Path = MEASURED) -> BudgetChoice:
+    """Choose the best setting of the longest measured budget that fits in ``seconds``.
+
+    Less time than any that was measured gets the choice of the shortest. The speed of the machine
+    is ignored: a faster one trains the same setting for longer.
+    """
+    rows = sorted(json.loads(measured.read_text("utf-8")), key=lambda row: row["budget_s"])
+    fitting = [row for row in rows if row["budget_s"] <= seconds]
+    return BudgetChoice(**(fitting or rows[:1])[-1])

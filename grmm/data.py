@@ -1,4 +1,4 @@
-"""Training data: packed samples -> tensors in canonical head space.
+"""Training data: packed samples -> tensors in canonical head space, and the order they come in.
 
 Geometry is not stored with the samples: the tracked mesh v_rec is posed from head-model
 parameters once per (subject, expression) and kept.
@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Protocol, TypeVar
 
 import numpy as np
 import torch
@@ -18,7 +18,7 @@ from torch import Tensor
 from express50.errors import FormatError
 from express50.head.model import HeadModel, pose
 from grmm.head_crop import crop_view, head_window, labelled_torso, torso_mask
-from grmm.scene import HeadState, PinholeView
+from grmm.model import HeadState, PinholeView
 
 NO_OFFSETS = np.zeros((0, 3), np.float32)
 CACHE_MB = 512  # of decoded samples: some hundred of 512 px
@@ -31,6 +31,11 @@ class SampleKey:
     subject: str
     expression: str
     camera: str
+
+    @property
+    def frame(self) -> tuple[str, str]:
+        """Return subject and expression."""
+        return self.subject, self.expression
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -80,6 +85,12 @@ class Sample:
     cam_from_world: np.ndarray
     tracked: Tracked
     parts: np.ndarray | None = None
+
+    @property
+    def nbytes(self) -> int:
+        """Return the memory that its images take."""
+        images = (self.image, self.alpha, self.depth, self.parts)
+        return sum(array.nbytes for array in images if array is not None)
 
 
 class Source(Protocol):
@@ -146,10 +157,6 @@ class HeadViews:
         self._cached_bytes = 0
         self._states: dict[tuple[str, str], HeadState] = {}
 
-    def __len__(self) -> int:
-        """Return the number of samples."""
-        return len(self.source.keys)
-
     @property
     def keys(self) -> Sequence[SampleKey]:
         """Return the ids of all samples."""
@@ -161,10 +168,9 @@ class HeadViews:
         With ``crop`` only the window around head and matte, as training takes it: outside it,
         footage and rendering are both the background.
         """
-        key, sample = self.keys[index], self.sample(index)
-        state = self.state(index)
+        sample, state = self.sample(index), self.state(index)
         height, width = sample.alpha.shape
-        view = self.view_of(sample, width, height)
+        view = self.view_of(sample)
         torso = self._torso(index, sample, state, view)
         rows, columns = slice(0, height), slice(0, width)
         if crop:
@@ -178,7 +184,7 @@ class HeadViews:
         target = self._tensor(image) / 255 * weight + self.background * (1 - weight)
         counts = torch.from_numpy(~torso[rows, columns]).to(self.device)
         return Item(
-            key=key,
+            key=self.keys[index],
             state=state,
             view=view,
             target=target.permute(2, 0, 1).contiguous(),
@@ -213,31 +219,32 @@ class HeadViews:
         sample = self.source.read(index)
         key = self.keys[index]
         where = f"{key.subject}/{key.expression}/{key.camera}"
+        size = sample.image.shape[:2]
         for name in ("alpha", "depth", "parts"):
             array = getattr(sample, name)
-            if array is not None and array.shape != sample.image.shape[:2]:
+            if array is not None and array.shape != size:
                 raise FormatError(
-                    f"{where}: {name} is {array.shape}, expected the image's size "
-                    f"{sample.image.shape[:2]}; pack the dataset again"
+                    f"{where}: {name} is {array.shape}, expected the image's size {size}; pack the "
+                    "dataset again"
                 )
         check_tracked(where, sample.tracked, self.head)
         self._cache[index] = sample
-        self._cached_bytes += _bytes(sample)
+        self._cached_bytes += sample.nbytes
         while self._cached_bytes > self._capacity and len(self._cache) > 1:
             _, old = self._cache.popitem(last=False)
-            self._cached_bytes -= _bytes(old)
+            self._cached_bytes -= old.nbytes
         return sample
 
     def state(self, index: int) -> HeadState:
         """Return the tracked head of a sample, posed once per (subject, expression)."""
-        key = self.keys[index]
-        if (key.subject, key.expression) not in self._states:
-            tracked = self.sample(index).tracked
-            self._states[key.subject, key.expression] = pose_state(self.head, tracked)
-        return self._states[key.subject, key.expression]
+        frame = self.keys[index].frame
+        if frame not in self._states:
+            self._states[frame] = pose_state(self.head, self.sample(index).tracked)
+        return self._states[frame]
 
-    def view_of(self, sample: Sample, width: int, height: int) -> PinholeView:
+    def view_of(self, sample: Sample) -> PinholeView:
         """Return a sample's camera in head space, float64: subjects may be far from the origin."""
+        height, width = sample.alpha.shape
         head_to_world = np.eye(4)
         head_to_world[:3, :3], head_to_world[:3, 3] = sample.tracked.R, sample.tracked.t
         camera = sample.cam_from_world @ head_to_world
@@ -254,20 +261,18 @@ class HeadViews:
 
 def check_tracked(where: str, tracked: Tracked, head: HeadModel) -> None:
     """Refuse, with a FormatError, parameters that the head model does not have."""
-    counts = {"shape": head.shape_dirs.shape[2], "expression": len(head.expression_names)}
-    for name, count in counts.items():
-        got = len(getattr(tracked, name))
-        if got > count:
+    shapes, expressions = head.shape_dirs.shape[2], len(head.expression_names)
+    for what, got, count in (
+        ("shape coefficients", len(tracked.shape), shapes),
+        ("expression coefficients", len(tracked.expression), expressions),
+        ("offsets", len(tracked.offsets), len(head.template)),
+    ):
+        # Trailing coefficients may be missing, offsets only all of them.
+        if got > count or (what == "offsets" and got not in (0, count)):
             raise FormatError(
-                f"{where}: {got} {name} coefficients, head model {head.name!r} has {count}; "
-                "name the head model that the dataset was tracked with"
+                f"{where}: {got} {what}, head model {head.name!r} has {count}; name the head model "
+                "that the dataset was tracked with"
             )
-    offsets, vertices = len(tracked.offsets), len(head.template)
-    if offsets not in (0, vertices):
-        raise FormatError(
-            f"{where}: offsets of {offsets} vertices, head model {head.name!r} has "
-            f"{vertices}; name the head model that the dataset was tracked with"
-        )
 
 
 def pose_state(head: HeadModel, tracked: Tracked) -> HeadState:
@@ -291,7 +296,43 @@ def pose_state(head: HeadModel, tracked: Tracked) -> HeadState:
     )
 
 
-def _bytes(sample: Sample) -> int:
-    depth = 0 if sample.depth is None else sample.depth.nbytes
-    parts = 0 if sample.parts is None else sample.parts.nbytes
-    return sample.image.nbytes + sample.alpha.nbytes + depth + parts
+Choice = TypeVar("Choice")
+
+
+class Shuffle:
+    """Endless shuffled order over ``indices``, a pure function of (seed, epoch, position).
+
+    A resumed run therefore goes on exactly where it stopped. State: how many samples were taken.
+    """
+
+    def __init__(self, indices: Sequence[int], seed: int, rank: int = 0, world: int = 1) -> None:
+        """Take every world-th entry of the common order for process ``rank``."""
+        self.indices, self.seed, self.rank, self.world = list(indices), seed, rank, world
+        self.taken = 0
+        self._epoch, self._order = -1, np.zeros(0, int)
+
+    def next(self) -> int:
+        """Return the index of this rank's next sample."""
+        epoch, position = divmod(self.taken + self.rank, len(self.indices))
+        if epoch != self._epoch:
+            order = np.random.default_rng([self.seed, epoch]).permutation(self.indices)
+            self._epoch, self._order = epoch, order
+        self.taken += self.world
+        return int(self._order[position])
+
+    def state(self) -> dict[str, int]:
+        """Return the state that `restore` takes."""
+        epoch, position = divmod(self.taken, len(self.indices))
+        return {"epoch": epoch, "position": position}
+
+    def restore(self, state: dict[str, int]) -> None:
+        """Resume after the last sample taken when ``state`` was saved."""
+        self.taken = state["epoch"] * len(self.indices) + state["position"]
+
+
+def spread(items: Sequence[Choice], count: int) -> list[Choice]:
+    """Return at most ``count`` of the items, evenly chosen (first and last included)."""
+    if len(items) <= count:
+        return list(items)
+    steps = np.linspace(0, len(items) - 1, count).round().astype(int)
+    return [items[i] for i in steps]

@@ -25,8 +25,8 @@ from express50.geometry.transforms import (
     slerp,
 )
 from grmm.checkpoint import Loaded
-from grmm.data import NO_OFFSETS, Tracked, pose_state
-from grmm.scene import HeadState
+from grmm.data import Tracked, pose_state
+from grmm.model import HeadState
 
 ANGLES = {"neck": 3, "jaw": 3, "eyes": 6}  # axis-angles by name, radians
 CODES = ("z_id", "z_exp")
@@ -65,8 +65,8 @@ def trained_head(loaded: Loaded, subject: str, expression: str) -> HeadCodes:
         donor = next(s for s, e in frames if e == expression)
         own = next(frame for (s, _), frame in frames.items() if s == subject)
         tracked = transfer(own, frames[donor, expression])
-    codes = model.codes(model.subjects.index(subject), model.expressions.index(expression))
-    return HeadCodes(z_id=codes[0].detach(), z_exp=codes[1].detach(), tracked=tracked)
+    z_id, z_exp = model.codes(*model.rows(subject, expression))
+    return HeadCodes(z_id=z_id.detach(), z_exp=z_exp.detach(), tracked=tracked)
 
 
 def with_expression(identity: HeadCodes, expression: HeadCodes) -> HeadCodes:
@@ -89,13 +89,8 @@ def between(a: HeadCodes, b: HeadCodes, t: float) -> HeadCodes:
 
 def transfer(identity: Tracked, expression: Tracked) -> Tracked:
     """Combine one frame's head and place with another's expression, jaw, neck and eyes."""
-    return replace(
-        expression,
-        shape=identity.shape,
-        R=identity.R,
-        t=identity.t,
-        offsets=identity.offsets,
-    )
+    own = {name: getattr(identity, name) for name in ("shape", "R", "t", "offsets")}
+    return replace(expression, **own)
 
 
 def interpolate_tracked(a: Tracked, b: Tracked, t: float) -> Tracked:
@@ -113,7 +108,7 @@ def interpolate_tracked(a: Tracked, b: Tracked, t: float) -> Tracked:
         ),
         R=a.R,
         t=a.t,
-        offsets=_blend_offsets(a.offsets, b.offsets, t),
+        offsets=_lerp(a.offsets, b.offsets, t),
     )
 
 
@@ -141,7 +136,14 @@ def controlled(
             raise ConfigError(f"control {name}: got {list(values)}, expected finite numbers")
         table, _, entry = name.partition(".")
         if table in CODES:
-            head = _with_code(loaded, head, table, entry, values, name)
+            (amount,), code = _numbers(values, 1, name), getattr(head, table)
+            moved = amount * code
+            if entry:
+                directions = principal_directions(getattr(loaded.model, table))
+                what = "principal directions of the training codes"
+                number = _entry(entry, len(directions), name, what)
+                moved = code + amount * directions[number]
+            head = replace(head, **{table: moved})
         elif table in (*ANGLES, "shape", "expression"):
             tracked = _with_parameter(loaded, head.tracked, table, entry, values, name)
             head = replace(head, tracked=tracked)
@@ -154,14 +156,9 @@ def controlled(
     return head
 
 
+@lru_cache(maxsize=4)  # sliders ask often
 def principal_directions(codes: Tensor) -> Tensor:
-    """Find the principal directions (K, D) of codes (S, D), one standard deviation long."""
-    return _directions(codes, codes._version)
-
-
-@lru_cache(maxsize=4)
-def _directions(codes: Tensor, version: int) -> Tensor:
-    """Cache the directions: sliders ask often. ``version`` changes when training does the codes."""
+    """Find the principal directions (K, D) of a checkpoint's codes (S, D), one deviation long."""
     centred = codes.detach().double() - codes.detach().double().mean(0)
     if len(codes) < 2:
         return codes.new_zeros(0, codes.shape[1])
@@ -188,12 +185,9 @@ def sample_identity(
     own = [next(t for (s, _), t in frames.items() if s == subject) for subject in model.subjects]
     weights = _sample_weights(len(own), rng, spread, "subjects")
     shape = _combine([frame.shape for frame in own], weights)
-    offsets = [frame.offsets for frame in own]
-    longest = max(offsets, key=len)
-    padded = [x if len(x) else np.zeros_like(longest) for x in offsets]
-    mixed = _combine(padded, weights).astype(np.float32) if len(longest) else NO_OFFSETS
+    offsets = _combine([frame.offsets for frame in own], weights).astype(np.float32)
     z_id = torch.as_tensor(weights).to(model.z_id) @ model.z_id.detach()
-    tracked = replace(head.tracked, shape=shape, offsets=mixed)
+    tracked = replace(head.tracked, shape=shape, offsets=offsets)
     return replace(head, z_id=z_id, tracked=tracked)
 
 
@@ -203,9 +197,6 @@ def sample_expression(
     """Draw a new expression for the given person, as `sample_identity` draws people.
 
     Coefficients and jaw stay within what training showed: activations have bounds.
-
-    Raises:
-        ConfigError: the checkpoint has fewer than two expressions.
     """
     model, frames = loaded.model, loaded.gallery.frames
     mean = {
@@ -217,9 +208,9 @@ def sample_expression(
 
     def drawn(name: str, size: int) -> np.ndarray:
         rows = [[_padded(getattr(f, name), size) for f in own] for own in mean.values()]
-        low = np.min([np.min(row, 0) for row in rows], 0)
-        high = np.max([np.max(row, 0) for row in rows], 0)
-        return np.clip(_combine([np.mean(row, 0) for row in rows], weights), low, high)
+        every = np.concatenate(rows)
+        means = _combine([np.mean(row, 0) for row in rows], weights)
+        return np.clip(means, every.min(0), every.max(0))
 
     tracked = replace(head.tracked, expression=drawn("expression", length), jaw=drawn("jaw", 3))
     z_exp = torch.as_tensor(weights).to(model.z_exp) @ model.z_exp.detach()
@@ -246,18 +237,6 @@ def _padded(values: np.ndarray, length: int) -> np.ndarray:
     return np.pad(values, [(0, length - len(values)), *[(0, 0)] * (values.ndim - 1)])
 
 
-def _with_code(
-    loaded: Loaded, head: HeadCodes, table: str, entry: str, values: Sequence[float], name: str
-) -> HeadCodes:
-    amount = _numbers(values, 1, name)[0]
-    code = getattr(head, table)
-    if not entry:
-        return replace(head, **{table: amount * code})
-    directions = principal_directions(getattr(loaded.model, table))
-    number = _entry(entry, len(directions), name, "principal directions of the training codes")
-    return replace(head, **{table: code + amount * directions[number]})
-
-
 def _with_parameter(
     loaded: Loaded, tracked: Tracked, table: str, entry: str, values: Sequence[float], name: str
 ) -> Tracked:
@@ -268,10 +247,8 @@ def _with_parameter(
     changed = _padded(np.array(getattr(tracked, table), dtype=np.float64), sizes[table])
     if entry:
         names = loaded.head.expression_names if table == "expression" else ()
-        place = names.index(entry) if entry in names else None
-        if place is None:
-            place = _entry(entry, sizes[table], name, f"{table} parameters", names)
-        changed[place] = _numbers(values, 1, name)[0]
+        place = _entry(entry, sizes[table], name, f"{table} parameters", names)
+        (changed[place],) = _numbers(values, 1, name)
     elif table in ANGLES:
         twice = table == "eyes" and len(values) == 3
         changed[:] = _numbers([*values, *values] if twice else values, sizes[table], name)
@@ -287,6 +264,8 @@ def _numbers(values: Sequence[float], count: int, name: str) -> Sequence[float]:
 
 
 def _entry(text: str, count: int, name: str, what: str, names: Sequence[str] = ()) -> int:
+    if text in names:
+        return names.index(text)
     if text.isdecimal() and int(text) < count:
         return int(text)
     named = nearest(text, names) if names else ""
@@ -301,16 +280,9 @@ def _known(what: str, name: str, known: Sequence[str]) -> None:
         )
 
 
-def _blend_offsets(a: np.ndarray, b: np.ndarray, t: float) -> np.ndarray:
-    """Blend offsets, (1 - t) a + t b (V, 3); (0, 3) stands for zeros."""
-    if not len(a) and not len(b):
-        return a
-    a, b = (x if len(x) else np.zeros_like(max(a, b, key=len)) for x in (a, b))
-    return a if a is b else ((1 - t) * a + t * b).astype(np.float32)
-
-
 def _lerp(a: np.ndarray, b: np.ndarray, t: float) -> np.ndarray:
     """Blend, (1 - t) a + t b; the shorter one is padded with zeros."""
+    if a is b:
+        return a
     length = max(len(a), len(b))
-    a, b = (_padded(x, length) for x in (a, b))
-    return (1 - t) * a + t * b
+    return ((1 - t) * _padded(a, length) + t * _padded(b, length)).astype(a.dtype)

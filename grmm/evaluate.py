@@ -1,7 +1,8 @@
 """Measure renderings against footage, over the whole image and over the head.
 
-Held-out samples are of different kinds: views of trained frames, frames of trained subjects and
-expressions (a held-out expression), and subjects that training never saw (fitted first).
+Held-out samples are views of trained frames, unseen frames of trained subjects and expressions, or
+subjects that training never saw (fitted first). Another method's pictures pass through the same
+comparison as our renderings: same crop, background and pixels counted.
 """
 
 from __future__ import annotations
@@ -9,105 +10,89 @@ from __future__ import annotations
 import csv
 import io
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
+import numpy as np
 import torch
 from torch import Tensor
-from torchmetrics.functional.image import structural_similarity_index_measure
-from torchmetrics.functional.regression import mean_squared_error
 
-from express50.errors import TrainError
+from express50.errors import FormatError, TrainError
 from express50.files.atomic import write_bytes, write_json
-from grmm.checkpoint import Gallery
+from express50.files.images import read_image, write_image
+from express50.shards.writer import sample_key
+from grmm.checkpoint import Loaded
 from grmm.config import MetricsConfig
 from grmm.data import HeadViews, Item, SampleKey
-from grmm.model import GRMM
-from grmm.perceptual_metrics import PerceptualMetrics
-from grmm.scene import Rendering
+from grmm.metrics import PerceptualMetrics, psnr_db, rmse, ssim_score
+from grmm.model import GRMM, Rendering
 
 Render = Callable[[Item], Rendering]
 Row = dict[str, str | float]
-IMAGE_NUMBERS = (
+Window = Callable[[int], tuple[slice, slice, tuple[int, int]]]
+"""Rows and columns of a sample's picture that its camera saw, and the picture's (H, W)."""
+IDS = ("subject", "expression", "camera", "kind")
+NUMBERS = (
     "psnr_db", "psnr_head_db", "psnr_with_torso_db", "ssim", "ssim_head", "rmse", "rmse_head",
-    "lpips",
+    "lpips", "psnr_unrefined_db", "depth_mm",
 )  # fmt: skip
-NUMBERS = (*IMAGE_NUMBERS, "psnr_unrefined_db", "depth_mm")
 SEEN, HELD_VIEW, HELD_EXPRESSION, HELD_IDENTITY = (
     "seen view", "held-out view", "held-out expression", "held-out identity",
 )  # fmt: skip
-IDS = ("subject", "expression", "camera", "kind")
-PSNR_LIMIT_DB = 100.0  # equal images: a number that averages, where infinity would not
-SSIM_SIGMA, SSIM_WINDOW = 1.5, 11  # Wang et al. 2004
-
-
-def psnr_db(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
-    """Return peak signal-to-noise ratio of (3, H, W) images in [0, 1], decibels, at most 100.
-
-    ``mask`` (H, W) bool limits it to some pixels; NaN if it selects none.
-    """
-    squared = (image.clamp(0, 1).double() - target.double()).square()
-    if mask is not None:
-        squared = squared[:, mask]
-        if squared.numel() == 0:
-            return math.nan
-    return float((-10 * torch.log10(squared.mean())).clamp(max=PSNR_LIMIT_DB))
-
-
-def rmse(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
-    """Compute the RMSE of (3, H, W) images in [0, 1]; NaN if the mask selects nothing."""
-    a, b = image.clamp(0, 1).double(), target.double()
-    if mask is not None:
-        a, b = a[:, mask], b[:, mask]
-    if a.numel() == 0:
-        return math.nan
-    return float(mean_squared_error(a.reshape(-1), b.reshape(-1), squared=False))
-
-
-def ssim_score(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
-    """Return the mean SSIM of (3, H, W) images; with a mask over windows centred on its pixels.
-
-    Windows that reach over the border are left out. NaN where no window fits or is selected.
-    """
-    reach = SSIM_WINDOW // 2
-    if min(image.shape[1:]) < SSIM_WINDOW:
-        return math.nan
-    _, values = structural_similarity_index_measure(
-        image.clamp(0, 1).float()[None],
-        target.float()[None],
-        sigma=SSIM_SIGMA,
-        kernel_size=SSIM_WINDOW,
-        data_range=1.0,
-        return_full_image=True,
-    )
-    inner = values[0, :, reach:-reach, reach:-reach]
-    if mask is not None:
-        inner = inner[:, mask[reach:-reach, reach:-reach]]
-    return float(inner.mean()) if inner.numel() else math.nan
+SUFFIXES = (".png", ".jpg", ".jpeg")
+NO_NETWORKS = PerceptualMetrics(MetricsConfig())
+NAMED = 5  # how many wrong files an error names
 
 
 def training_render(model: GRMM, views: HeadViews) -> Render:
     """Make a function that renders training subjects by their rows of the code tables."""
 
     def render(item: Item) -> Rendering:
-        subject = model.subjects.index(item.key.subject)
-        expression = model.expressions.index(item.key.expression)
-        return model(subject, expression, item.state, item.view, views.background)
+        return model(*model.rows(*item.key.frame), item.state, item.view, views.background)
 
     return render
 
 
-def kind_of(key: SampleKey, subjects: Sequence[str], gallery: Gallery) -> str:
+def kind_of(loaded: Loaded, key: SampleKey) -> str:
     """Say whether a checkpoint has seen a sample, or in which way it was held out."""
-    if key.subject not in subjects:
+    if key.subject not in loaded.model.subjects:
         return HELD_IDENTITY
-    if (key.subject, key.expression) not in gallery.frames:
+    if key.frame not in loaded.gallery.frames:
         return HELD_EXPRESSION
-    return SEEN if key.camera in gallery.cameras else HELD_VIEW
+    return SEEN if key.camera in loaded.gallery.cameras else HELD_VIEW
 
 
-def compare(image: Tensor, item: Item, judge: PerceptualMetrics) -> dict[str, float]:
-    """Compare one picture (3, H, W) in [0, 1] with its footage.
+@torch.no_grad()
+def evaluate(
+    views: HeadViews,
+    indices: Sequence[int],
+    render: Render,
+    judge: PerceptualMetrics = NO_NETWORKS,
+    kind: Callable[[SampleKey], str] = lambda key: "",
+    keep: Callable[[int, Tensor], None] | None = None,
+) -> list[Row]:
+    """Measure samples: one row of numbers each; see `compare`.
+
+    ``depth_mm`` is the median absolute error where both depths are known (NaN: nowhere). ``keep``
+    gets every index with its picture (3, H, W).
+    """
+    rows = []
+    for index in indices:
+        item = views.item(index)
+        out = render(item)
+        both = item.depth_valid & (out.alpha > 0.5)
+        error = (out.depth - item.depth)[both].abs()
+        row = compare(out.image, item, judge, kind(item.key))
+        row["psnr_unrefined_db"] = psnr_db(out.rgb, item.target, item.counts)
+        row["depth_mm"] = 1e3 * float(error.median()) if len(error) else math.nan
+        rows.append(row)
+        if keep is not None:
+            keep(index, out.image)
+    return rows
+
+
+def compare(image: Tensor, item: Item, judge: PerceptualMetrics, kind: str = "") -> Row:
+    """Compare one picture (3, H, W) in [0, 1] with its footage; the judge remembers it for FID.
 
     ``psnr_db``, ``ssim``, ``rmse``, ``lpips`` count every pixel but torso (DataConfig.torso);
     ``*_head`` pixels of the footage's matte only, so that an easy background cannot flatter.
@@ -121,7 +106,10 @@ def compare(image: Tensor, item: Item, judge: PerceptualMetrics) -> dict[str, fl
             "damaged or was trained at too high a rate"
         )
     shown = item.comparable(image)
+    judge.remember(kind, shown, item.target)
     return {
+        **vars(item.key),
+        "kind": kind,
         "psnr_db": psnr_db(image, item.target, item.counts),
         "psnr_head_db": psnr_db(image, item.target, item.mask),
         "psnr_with_torso_db": psnr_db(image, item.target),
@@ -134,42 +122,88 @@ def compare(image: Tensor, item: Item, judge: PerceptualMetrics) -> dict[str, fl
 
 
 @torch.no_grad()
-def evaluate(
+def score(
+    folder: Path,
+    window: Window,
     views: HeadViews,
     indices: Sequence[int],
-    render: Render,
-    judge: PerceptualMetrics | None = None,
-    kind: Callable[[SampleKey], str] = lambda key: "",
-    keep: Callable[[int, Tensor], None] | None = None,
+    judge: PerceptualMetrics,
+    partial: bool = False,
 ) -> list[Row]:
-    """Measure samples: one row of numbers each; see `compare`.
+    """Score pictures that any method made, one row each.
 
-    ``depth_mm`` is the median absolute error where both depths are known (NaN: nowhere). ``keep``
-    gets every index with its picture (3, H, W).
+    They are named ``<subject>_<expression>_<camera>.png`` (or .jpg) and have the size as packed.
+    ``partial`` leaves samples without a picture out.
+
+    Raises:
+        FormatError: missing, unreadable or mis-sized pictures, which are named.
     """
-    judge = PerceptualMetrics(MetricsConfig()) if judge is None else judge
-    rows = []
+    paths: dict[int, Path] = {}
+    missing = []
     for index in indices:
+        name = sample_name(views.keys[index])
+        files = [folder / f"{name}{suffix}" for suffix in SUFFIXES]
+        if found := next(filter(Path.is_file, files), None):
+            paths[index] = found
+        else:
+            missing.append(name)
+    if missing and not (partial and paths):
+        raise FormatError(
+            f"{folder}: {len(missing)} of {len(indices)} pictures are missing: {_list(missing)}; "
+            "expected SUBJECT_EXPRESSION_CAMERA.png. Score part of them with --partial or choose "
+            "samples with --subjects, --expressions, --cameras"
+        )
+    rows, wrong = [], []
+    for index, path in paths.items():
+        rows_seen, columns_seen, size = window(index)
+        try:
+            pixels = _read_picture(path, size)[rows_seen, columns_seen]
+        except FormatError as error:
+            wrong.append(str(error))
+            continue
         item = views.item(index)
-        out = render(item)
-        both = item.depth_valid & (out.alpha > 0.5)
-        error = (out.depth - item.depth)[both].abs()
-        numbers = compare(out.image, item, judge) | {
-            "psnr_unrefined_db": psnr_db(out.rgb, item.target, item.counts),
-            "depth_mm": 1e3 * float(error.median()) if len(error) else math.nan,
-        }
-        rows.append(row_of(item.key, kind(item.key), numbers))
-        judge.remember(kind(item.key), item.comparable(out.image), item.target)
-        if keep is not None:
-            keep(index, out.image)
+        image = torch.from_numpy(pixels.copy()).permute(2, 0, 1).to(item.target) / 255
+        rows.append(compare(image, item, judge))
+    if wrong:
+        raise FormatError(f"{folder}: {len(wrong)} pictures do not fit: {_list(wrong)}")
     return rows
 
 
-def row_of(key: SampleKey, kind: str, numbers: dict[str, float]) -> Row:
-    """Return the ids and numbers of one sample."""
-    return Row(
-        subject=key.subject, expression=key.expression, camera=key.camera, kind=kind, **numbers
-    )
+def sample_name(key: SampleKey) -> str:
+    """Name a sample as the shards do, which is also its picture's name."""
+    return sample_key(key.subject, key.expression, key.camera)
+
+
+def _read_picture(path: Path, size: tuple[int, int]) -> np.ndarray:
+    """Read (H, W, 3) uint8; grey is repeated over the channels, a fourth one is left out."""
+    pixels = read_image(path)
+    if pixels.shape[:2] != size:
+        got, expected = (f"{width} x {height}" for height, width in (pixels.shape[:2], size))
+        raise FormatError(f"{path.name} is {got}, expected {expected}")
+    if pixels.dtype != np.uint8:
+        raise FormatError(f"{path.name} has {pixels.dtype} pixels, expected 8 bits per channel")
+    if pixels.ndim == 2 or pixels.shape[2] < 3:
+        pixels = np.repeat(pixels.reshape(*size, -1)[..., :1], 3, axis=2)
+    return pixels[..., :3]
+
+
+def _list(names: Sequence[str]) -> str:
+    more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
+    return ", ".join(names[:NAMED]) + more
+
+
+def save_pictures(folder: Path, window: Window, views: HeadViews) -> Callable[[int, Tensor], None]:
+    """Make a function that writes renderings of samples as `score` reads them."""
+    folder.mkdir(parents=True, exist_ok=True)
+
+    def keep(index: int, image: Tensor) -> None:
+        rows, columns, size = window(index)
+        whole = np.full((*size, 3), round(255 * views.background), np.uint8)
+        shown = (255 * image.clamp(0, 1)).round().byte().permute(1, 2, 0).cpu().numpy()
+        whole[rows, columns] = shown
+        write_image(folder / f"{sample_name(views.keys[index])}.png", whole)
+
+    return keep
 
 
 def mean(rows: Sequence[Row], name: str) -> float | None:
@@ -178,28 +212,28 @@ def mean(rows: Sequence[Row], name: str) -> float | None:
     return round(sum(values) / len(values), 4) if values else None
 
 
-def means(rows: Sequence[Row]) -> dict[str, object]:
+def means(rows: Sequence[Row]) -> Mapping[str, object]:
     """Return the means of all numbers, and of how many images."""
-    numbers: dict[str, object] = {name: mean(rows, name) for name in NUMBERS}
-    return numbers | {"images": len(rows)}
+    return {name: mean(rows, name) for name in NUMBERS} | {"images": len(rows)}
 
 
-def summarise(rows: Sequence[Row], judge: PerceptualMetrics | None = None) -> dict[str, object]:
+def summarise(rows: Sequence[Row], judge: PerceptualMetrics = NO_NETWORKS) -> dict[str, object]:
     """Average all rows, and per kind, subject, expression and camera; say why metrics are n/a."""
-    judge = PerceptualMetrics(MetricsConfig()) if judge is None else judge
-    summary: dict[str, object] = means(rows) | {"fid": judge.fid()} | judge.missing()
+    summary = {**means(rows), "fid": judge.fid(), **judge.missing()}
     for group in IDS:
         values = sorted({str(row[group]) for row in rows if row[group]})
         summary[f"by_{group}"] = {
-            value: means([row for row in rows if row[group] == value])
-            | ({"fid": judge.fid(value)} if group == "kind" and judge.inception else {})
+            value: {
+                **means([row for row in rows if row[group] == value]),
+                **({"fid": judge.fid(value)} if group == "kind" and judge.inception else {}),
+            }
             for value in values
         }
     return summary
 
 
 def write_evaluation(
-    out: Path, rows: Sequence[Row], judge: PerceptualMetrics | None = None
+    out: Path, rows: Sequence[Row], judge: PerceptualMetrics = NO_NETWORKS
 ) -> dict[str, object]:
     """Write evaluation.csv (one row per image) and evaluation.json (means); returns the means."""
     buffer = io.StringIO()

@@ -13,9 +13,10 @@ import torch
 from express50.errors import ConfigError
 from express50.files.atomic import write_bytes
 from express50.geometry.shapes import check_finite
+from express50.head.model import HeadModel
 from grmm.checkpoint import Loaded
 from grmm.edit import HeadCodes
-from grmm.scene import PinholeView
+from grmm.model import PinholeView
 
 OPAQUE = 0.3  # fainter Gaussians are left out of a GLB: its points cannot be translucent
 FORMATS = (".ply", ".glb", ".npz")
@@ -41,60 +42,6 @@ class GaussianCloud:
     colors: np.ndarray
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class TexturedMesh:
-    """The deformed mesh M_d with the decoded colours as its texture.
-
-    Attributes:
-        vertices: (V, 3) metres, v_rec + v_id + M_face v_exp.
-        faces: (F, 3).
-        uv: (T, 2) in [0, 1], v up.
-        uv_faces: (F, 3) into uv.
-        texture: (n_g, n_g, 3) uint8 sRGB; texels that no face covers carry the mean colour.
-    """
-
-    vertices: np.ndarray
-    faces: np.ndarray
-    uv: np.ndarray
-    uv_faces: np.ndarray
-    texture: np.ndarray
-
-
-@torch.no_grad()
-def cloud(loaded: Loaded, head: HeadCodes, view: PinholeView) -> GaussianCloud:
-    """Decode a head's Gaussians; colours are those that ``view`` sees, before refinement."""
-    model, state = loaded.model, head.state(loaded)
-    gaussians = model.geometry(head.z_id, head.z_exp, state)
-    colours = model.appearance(head.z_id, state, view)[:, :3]
-    low, high = loaded.config.model.scale_bounds_mm
-    quats = torch.nn.functional.normalize(gaussians.quats, dim=1)
-    return GaussianCloud(
-        means=gaussians.means.cpu().numpy(),
-        quats=quats.cpu().numpy(),
-        scales=1e-3 * gaussians.scales_mm.clamp(low, high).cpu().numpy(),
-        opacities=gaussians.opacities.cpu().numpy(),
-        colors=colours.cpu().numpy(),
-    )
-
-
-@torch.no_grad()
-def surface(loaded: Loaded, head: HeadCodes, view: PinholeView) -> TexturedMesh:
-    """Decode a head's mesh; its texture holds the Gaussians' colours as ``view`` sees them."""
-    model, state = loaded.model, head.state(loaded)
-    vertices = state.vertices + model.geometry(head.z_id, head.z_exp, state).displacement
-    colours = model.appearance(head.z_id, state, view)[:, :3]
-    side = loaded.config.model.n_g
-    texture = colours.mean(0).expand(side * side, 3).clone()
-    texture[model.texels] = colours
-    return TexturedMesh(
-        vertices=vertices.cpu().numpy(),
-        faces=loaded.head.faces.cpu().numpy(),
-        uv=loaded.head.uv.cpu().numpy(),
-        uv_faces=loaded.head.uv_faces.cpu().numpy(),
-        texture=(255 * texture.clamp(0, 1)).round().byte().cpu().numpy().reshape(side, side, 3),
-    )
-
-
 def write_export(
     path: Path, loaded: Loaded, head: HeadCodes, view: PinholeView, points: bool = False
 ) -> str:
@@ -107,22 +54,48 @@ def write_export(
         ConfigError: another extension.
     """
     if path.suffix not in FORMATS:
-        raise ConfigError(
-            f"{path}: cannot export to {path.suffix!r}, expected .ply or .npz or .glb"
-        )
-    path.parent.mkdir(parents=True, exist_ok=True)
-    if path.suffix == ".glb" and not points:
-        mesh = surface(loaded, head, view)
-        write_bytes(path, mesh_glb(mesh))
-        return f"mesh of {len(mesh.vertices)} vertices, texture {mesh.texture.shape[0]} px"
-    gaussians = cloud(loaded, head, view)
-    if path.suffix == ".glb":
-        write_bytes(path, points_glb(gaussians))
-    elif path.suffix == ".ply":
-        write_bytes(path, ply_bytes(gaussians))
+        raise ConfigError(f"{path}: unknown kind of file, expected one of {', '.join(FORMATS)}")
+    gaussians, vertices, texture = decoded(loaded, head, view)
+    if path.suffix == ".ply":
+        content = ply_bytes(gaussians)
+    elif path.suffix == ".npz":
+        content = arrays_npz(loaded, head, gaussians, vertices)
+    elif points:
+        content = points_glb(gaussians)
     else:
-        write_bytes(path, arrays_npz(loaded, head, gaussians, surface(loaded, head, view)))
+        write_bytes(path, mesh_glb(loaded.head, vertices, texture))
+        return f"mesh of {len(vertices)} vertices, texture {len(texture)} px"
+    write_bytes(path, content)
     return f"{len(gaussians.means)} Gaussians"
+
+
+@torch.no_grad()
+def decoded(
+    loaded: Loaded, head: HeadCodes, view: PinholeView
+) -> tuple[GaussianCloud, np.ndarray, np.ndarray]:
+    """Decode a head; colours are those that ``view`` sees, before refinement.
+
+    Returns:
+        The Gaussians; the vertices (V, 3), metres, of the deformed mesh v_rec + v_id +
+        M_face v_exp; its texture (n_g, n_g, 3) uint8 sRGB, which holds the Gaussians' colours and
+        the mean colour where no face covers a texel.
+    """
+    model, state = loaded.model, head.state(loaded)
+    gaussians = model.geometry(head.z_id, head.z_exp, state)
+    colours = model.appearance(head.z_id, state, view)[:, :3]
+    low, high = loaded.config.model.scale_bounds_mm
+    cloud = GaussianCloud(
+        means=gaussians.means.cpu().numpy(),
+        quats=torch.nn.functional.normalize(gaussians.quats, dim=1).cpu().numpy(),
+        scales=1e-3 * gaussians.scales_mm.clamp(low, high).cpu().numpy(),
+        opacities=gaussians.opacities.cpu().numpy(),
+        colors=colours.cpu().numpy(),
+    )
+    side = loaded.config.model.n_g
+    texture = colours.mean(0).expand(side * side, 3).clone()
+    texture[model.texels] = colours
+    texture = (255 * texture.clamp(0, 1)).round().byte().view(side, side, 3)
+    return cloud, (state.vertices + gaussians.displacement).cpu().numpy(), texture.cpu().numpy()
 
 
 def ply_bytes(gaussians: GaussianCloud) -> bytes:
@@ -137,58 +110,55 @@ def ply_bytes(gaussians: GaussianCloud) -> bytes:
     """
     for name, array in vars(gaussians).items():
         check_finite(name, array)
-    count = len(gaussians.means)
     alpha = gaussians.opacities.astype(np.float64).clip(1e-6, 1 - 1e-6)
     columns = {
-        ("x", "y", "z"): gaussians.means,
-        ("nx", "ny", "nz"): np.zeros((count, 3)),
-        ("f_dc_0", "f_dc_1", "f_dc_2"): (gaussians.colors.astype(np.float64) - 0.5) / SH_DC,
-        ("opacity",): np.log(alpha / (1 - alpha))[:, None],
-        ("scale_0", "scale_1", "scale_2"): np.log(
-            gaussians.scales.astype(np.float64).clip(min=1e-30)
-        ),
-        ("rot_0", "rot_1", "rot_2", "rot_3"): gaussians.quats,
+        "x y z": gaussians.means,
+        "nx ny nz": np.zeros_like(gaussians.means),
+        "f_dc_0 f_dc_1 f_dc_2": (gaussians.colors.astype(np.float64) - 0.5) / SH_DC,
+        "opacity": np.log(alpha / (1 - alpha))[:, None],
+        "scale_0 scale_1 scale_2": np.log(gaussians.scales.astype(np.float64).clip(min=1e-30)),
+        "rot_0 rot_1 rot_2 rot_3": gaussians.quats,
     }
-    header = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]
-    header += [f"property float {name}" for names in columns for name in names]
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(alpha)}"]
+    header += [f"property float {name}" for names in columns for name in names.split()]
     table = np.concatenate(list(columns.values()), 1).astype("<f4")
     return "\n".join([*header, "end_header", ""]).encode("ascii") + table.tobytes()
 
 
 def arrays_npz(
-    loaded: Loaded, head: HeadCodes, gaussians: GaussianCloud, mesh: TexturedMesh
+    loaded: Loaded, head: HeadCodes, gaussians: GaussianCloud, vertices: np.ndarray
 ) -> bytes:
     """Encode everything about one head as .npz."""
-    tracked = {f"flame_{name}": value for name, value in vars(head.tracked).items()}
     buffer = io.BytesIO()
     np.savez_compressed(
         buffer,
         **vars(gaussians),
-        mesh_vertices=mesh.vertices,
-        mesh_faces=mesh.faces,
+        mesh_vertices=vertices,
+        mesh_faces=loaded.head.faces.cpu().numpy(),
         z_id=head.z_id.cpu().numpy(),
         z_exp=head.z_exp.cpu().numpy(),
         head=np.array(loaded.head_spec),
-        **tracked,
+        **{f"flame_{name}": value for name, value in vars(head.tracked).items()},
     )
     return buffer.getvalue()
 
 
-def mesh_glb(mesh: TexturedMesh) -> bytes:
+def mesh_glb(head: HeadModel, vertices: np.ndarray, texture: np.ndarray) -> bytes:
     """Encode the textured mesh as binary glTF; vertices are split at the UV map's seams."""
     import trimesh
     from PIL import Image
 
-    corners = np.stack([mesh.faces.reshape(-1), mesh.uv_faces.reshape(-1)], 1)
+    corners = np.stack([head.faces.cpu().reshape(-1), head.uv_faces.cpu().reshape(-1)], 1)
     pairs, faces = np.unique(corners, axis=0, return_inverse=True)
     material = trimesh.visual.material.PBRMaterial(
-        baseColorTexture=Image.fromarray(mesh.texture), metallicFactor=0.0, roughnessFactor=1.0
+        baseColorTexture=Image.fromarray(texture), metallicFactor=0.0, roughnessFactor=1.0
     )
-    visual = trimesh.visual.TextureVisuals(uv=mesh.uv[pairs[:, 1]], material=material)
-    whole = trimesh.Trimesh(
-        mesh.vertices[pairs[:, 0]], faces.reshape(-1, 3), visual=visual, process=False
+    uv = head.uv.cpu().numpy()[pairs[:, 1]]
+    visual = trimesh.visual.TextureVisuals(uv=uv, material=material)
+    mesh = trimesh.Trimesh(
+        vertices[pairs[:, 0]], faces.reshape(-1, 3), visual=visual, process=False
     )
-    return bytes(whole.export(file_type="glb"))
+    return bytes(mesh.export(file_type="glb"))
 
 
 def points_glb(gaussians: GaussianCloud) -> bytes:

@@ -23,16 +23,14 @@ from express50.errors import TrainError
 from express50.files.atomic import write_json
 from grmm import losses
 from grmm.checkpoint import Gallery, Loaded, collect_gallery, save_checkpoint
-from grmm.config import FitConfig, LossConfig
-from grmm.data import NO_OFFSETS, HeadViews, Item, Tracked, pose_state
+from grmm.config import Config
+from grmm.data import NO_OFFSETS, HeadViews, Item, Shuffle, Tracked, pose_state, spread
 from grmm.edit import interpolate_tracked
 from grmm.evaluate import Render, evaluate, mean
 from grmm.losses import load_vgg
-from grmm.model import GRMM
-from grmm.perceptual_metrics import PerceptualMetrics
+from grmm.metrics import PerceptualMetrics
+from grmm.model import GRMM, HeadState, PinholeView, Rendering
 from grmm.render import comparison_sheet
-from grmm.sampler import Shuffle, spread
-from grmm.scene import HeadState, PinholeView, Rendering
 from grmm.warm_start import LOGIT_LIMIT, project_texture, spread_change
 
 Scores = dict[str, float | None]
@@ -54,10 +52,12 @@ class FitState:
     given: list[int]
     z_id: Tensor
     z_exp: dict[str, Tensor]
-    weights: LossConfig
-    settings: FitConfig
-    seed: int
     perceptual: torch.nn.Module | None
+
+    @property
+    def config(self) -> Config:
+        """Return the settings of the checkpoint fitted from."""
+        return self.loaded.config
 
 
 def fit(
@@ -105,17 +105,18 @@ def run_stages(
 
     The time that scoring takes does not count against the budget.
     """
-    settings = state.settings
-    torch.manual_seed(state.seed)
+    settings = state.config.fit
+    budget = settings.seconds or math.inf
+    torch.manual_seed(state.config.train.seed)
     stages = {"mean_code": score()}
     began = time.perf_counter()
-    first = invert_codes(state, deadline(settings, began, STAGE1_SHARE))
+    first = invert_codes(state, began + STAGE1_SHARE * budget)
     spent = time.perf_counter() - began
     stages["stage1"] = score()
     began = time.perf_counter() - spent
     if settings.texture_warm_start and settings.stage2_iterations:
         start_texture(state)
-    second = tune_decoders(state, deadline(settings, began, 1.0))
+    second = tune_decoders(state, began + budget)
     spent = time.perf_counter() - began
     stages["stage2"] = score()
     return stages, {
@@ -123,7 +124,6 @@ def run_stages(
         "stage2_iterations": second,
         "iterations": first + second,
         "seconds": round(spent, 2),
-        "budget_seconds": settings.seconds or None,
     }
 
 
@@ -135,56 +135,45 @@ def start(loaded: Loaded, views: HeadViews, given: list[int]) -> FitState:
             f"got views of {len(subjects)} subjects ({', '.join(subjects) or 'none'}), "
             "expected one; check --subject, --expression and --cameras"
         )
-    model, weights = loaded.model, loaded.config.loss
-    z_id = model.z_id.detach().mean(0)
-    z_exp = {}
-    for expression in sorted({views.keys[i].expression for i in given}):
-        if expression in model.expressions:
-            z_exp[expression] = model.z_exp.detach()[model.expressions.index(expression)].clone()
-        else:
-            z_exp[expression] = model.z_exp.detach().mean(0)
-    frozen = copy.deepcopy(model).requires_grad_(False)
+    model = loaded.model
+    codes = model.z_exp.detach()
+    known = dict(zip(model.expressions, codes, strict=True))
+    expressions = sorted({views.keys[i].expression for i in given})
     return FitState(
         loaded=loaded,
         model=copy.deepcopy(model),
-        frozen=frozen,
+        frozen=copy.deepcopy(model).requires_grad_(False),
         views=views,
         given=given,
-        z_id=z_id,
-        z_exp=z_exp,
-        weights=weights,
-        settings=loaded.config.fit,
-        seed=loaded.config.train.seed,
-        perceptual=load_vgg(Path(weights.vgg16), z_id.device) if weights.vgg16 else None,
+        z_id=model.z_id.detach().mean(0),
+        z_exp={name: known.get(name, codes.mean(0)).clone() for name in expressions},
+        perceptual=load_vgg(loaded.config.loss.vgg16, codes.device),
     )
 
 
 def fitted_render(state: FitState) -> Render:
-    """Make a function that renders items of the fitted subject."""
+    """Make a function that renders the fitted person in fitted and training expressions."""
+    model = state.model
 
     def render(item: Item) -> Rendering:
-        code = state.z_exp[item.key.expression]
-        return state.model.render(state.z_id, code, item.state, item.view, state.views.background)
+        name = item.key.expression
+        fitted = name in state.z_exp
+        code = state.z_exp[name] if fitted else model.z_exp[model.expressions.index(name)]
+        return model.render(state.z_id, code, item.state, item.view, state.views.background)
 
     return render
 
 
-def deadline(settings: FitConfig, began: float, share: float) -> Callable[[], bool]:
-    """Make a function that is true once this share of the time budget is used."""
-    limit = began + share * settings.seconds if settings.seconds else math.inf
-    return lambda: time.perf_counter() >= limit
-
-
-def invert_codes(state: FitState, late: Callable[[], bool]) -> int:
-    """Optimise z_id and z_exp (stage 1); returns the iterations done."""
-    settings = state.settings
+def invert_codes(state: FitState, until: float = math.inf) -> int:
+    """Optimise z_id and z_exp (stage 1) until this time; returns the iterations done."""
+    settings = state.config.fit
     state.model.requires_grad_(False)
     codes = [state.z_id, *state.z_exp.values()]
     for code in codes:
         code.requires_grad_(True)
     done = 0
     optimizer = torch.optim.Adam(codes, lr=STAGE1_LR)
-    for number, item in _items(state, settings.stage1_iterations, late):
+    for number, item in _items(state, settings.stage1_iterations, until):
         share = number / settings.stage1_iterations
         optimizer.param_groups[0]["lr"] = STAGE1_LR * STAGE1_FINAL_LR**share
         optimizer.zero_grad()
@@ -192,8 +181,8 @@ def invert_codes(state: FitState, late: Callable[[], bool]) -> int:
         rendering = state.model.render(
             state.z_id, z_exp, item.state, item.view, state.views.background
         )
-        loss = _both(state, rendering, item)
-        _finite(loss + state.weights.codes * losses.codes(state.z_id, z_exp), number, 1).backward()
+        loss = state.config.loss.codes * losses.codes(state.z_id, z_exp)
+        _finite(_footage_loss(state, rendering, item) + loss, number, 1).backward()
         optimizer.step()
         done = number + 1
     for code in codes:
@@ -201,20 +190,20 @@ def invert_codes(state: FitState, late: Callable[[], bool]) -> int:
     return done
 
 
-def tune_decoders(state: FitState, late: Callable[[], bool]) -> int:
+def tune_decoders(state: FitState, until: float = math.inf) -> int:
     """Fine-tune the decoders with the locality loss (stage 2); returns the iterations done."""
-    settings = state.settings
+    settings = state.config.fit
     optimizer = _decoder_optimizer(state)
-    rng = np.random.default_rng(state.seed)
+    rng = np.random.default_rng(state.config.train.seed)
     done = 0
-    for number, item in _items(state, settings.stage2_iterations, late):
+    for number, item in _items(state, settings.stage2_iterations, until):
         optimizer.zero_grad()
         z_exp = state.z_exp[item.key.expression]
         shade = random_camera(state, rng) if rng.random() < settings.shuffle_directions else None
         rendering = state.model.render(
             state.z_id, z_exp, item.state, item.view, state.views.background, shade
         )
-        loss = _both(state, rendering, item)
+        loss = _footage_loss(state, rendering, item)
         if settings.locality and number % settings.locality_every == 0:
             weight = settings.locality * settings.locality_every
             loss = loss + weight * locality_loss(state, item, rng)
@@ -225,34 +214,28 @@ def tune_decoders(state: FitState, late: Callable[[], bool]) -> int:
     return done
 
 
-def _items(
-    state: FitState, iterations: int, late: Callable[[], bool]
-) -> Iterator[tuple[int, Item]]:
+def _items(state: FitState, iterations: int, until: float) -> Iterator[tuple[int, Item]]:
     """Yield given views in shuffled order until iterations or time run out; at least one."""
-    shuffle = Shuffle(state.given, state.seed)
+    shuffle = Shuffle(state.given, state.config.train.seed)
     for number in range(iterations):
-        if number > 0 and late():
+        if number > 0 and time.perf_counter() >= until:
             return
         yield number, state.views.item(shuffle.next(), crop=True)
 
 
 def _decoder_optimizer(state: FitState) -> torch.optim.Optimizer:
     """Build Adam over the decoders; codes and refinement stay fixed."""
-    model, lr = state.model, state.settings.stage2_lr
+    model, lr, texels = state.model, state.config.fit.stage2_lr, state.model.texel_parameters()
+    special = {id(parameter) for parameter in texels}
     modules = [model.transform, model.opacity, model.colour]
-    texels = {id(p): p for ladder in modules for p in ladder.texel_parameters()}
     if model.mesh is not None:
         modules.append(model.mesh)
-    rest = [p for module in modules for p in module.parameters() if id(p) not in texels]
-    for parameter in (*rest, *texels.values()):
+    rest = [p for module in modules for p in module.parameters() if id(p) not in special]
+    for parameter in (*rest, *texels):
         parameter.requires_grad_(True)
-    return torch.optim.Adam(
-        [
-            {"params": rest, "lr": lr},
-            {"params": list(texels.values()), "lr": lr * state.loaded.config.train.texel_lr_scale},
-        ],
-        fused=True,
-    )
+    texel_lr = lr * state.config.train.texel_lr_scale
+    groups = [{"params": rest, "lr": lr}, {"params": texels, "lr": texel_lr}]
+    return torch.optim.Adam(groups, fused=True)
 
 
 def start_texture(state: FitState) -> None:
@@ -283,42 +266,34 @@ def start_texture(state: FitState) -> None:
         model.colour.bias.flatten(1)[:3, model.texels] += (trust * change + (1 - trust) * guess).T
 
 
-def reconstruction(state: FitState, image: Tensor, target: Tensor) -> Tensor:
-    """Compute L_rec of (3, H, W) images: L1, SSIM and, with VGG16 weights, the perceptual term."""
-    return losses.reconstruction(image, target, state.weights, state.perceptual)
+def reconstruction(state: FitState, *pairs: tuple[Tensor, Tensor]) -> Tensor:
+    """Add up L_rec of pairs of (3, H, W) images: the rasterised and, if there is one, refined."""
+    used = pairs if state.model.refinement is not None else pairs[:1]
+    terms = [losses.reconstruction(*pair, state.config.loss, state.perceptual) for pair in used]
+    return torch.stack(terms).sum()
 
 
-def _both(state: FitState, rendering: Rendering, item: Item) -> Tensor:
-    """Add up L_rec of the rasterised and, if there is one, the refined image."""
-    loss = reconstruction(state, item.comparable(rendering.rgb), item.target)
-    if rendering.image is not rendering.rgb:
-        loss = loss + reconstruction(state, item.comparable(rendering.image), item.target)
-    return loss
+def _footage_loss(state: FitState, rendering: Rendering, item: Item) -> Tensor:
+    images = (rendering.rgb, rendering.image)
+    return reconstruction(state, *((item.comparable(image), item.target) for image in images))
 
 
 def locality_loss(state: FitState, item: Item, rng: np.random.Generator) -> Tensor:
     """Compare the tuned and the frozen model between a training identity and the subject.
 
     Codes and coefficients are blended at a fixed t (weight of the subject), jaw and neck by SLERP
-    (paper, supplement); the mesh is posed again from the blend; the camera is a random one of the
-    training set; refined and rasterised images both count, as in L_rec's other uses.
+    (paper, supplement); a random training camera sees the mesh posed anew from the blend.
     """
     frames = sorted(f for f in state.loaded.gallery.frames if f[0] in state.frozen.subjects)
-    subject, expression = frames[int(rng.integers(len(frames)))]
+    frame = frames[int(rng.integers(len(frames)))]
     view = random_camera(state, rng)
-    t = LOCALITY_T
     own = next(i for i in state.given if state.views.keys[i] == item.key)
-    mine = state.views.sample(own).tracked
-    head_state, z_id, z_exp = blend(
-        state, (subject, expression), mine, state.z_exp[item.key.expression], t
-    )
+    mine, code = state.views.sample(own).tracked, state.z_exp[item.key.expression]
+    head_state, z_id, z_exp = blend(state, frame, mine, code, LOCALITY_T)
     tuned = state.model.render(z_id, z_exp, head_state, view, state.views.background)
     with torch.no_grad():
         before = state.frozen.render(z_id, z_exp, head_state, view, state.views.background)
-    loss = reconstruction(state, tuned.rgb, before.rgb)
-    if state.model.refinement is not None:
-        loss = loss + reconstruction(state, tuned.image, before.image)
-    return loss
+    return reconstruction(state, (tuned.rgb, before.rgb), (tuned.image, before.image))
 
 
 def random_camera(state: FitState, rng: np.random.Generator) -> PinholeView:
@@ -333,11 +308,11 @@ def blend(
     """Blend parameters and codes from a training frame (t = 0) to the fitted subject (1)."""
     model, gallery = state.frozen, state.loaded.gallery
     tracked = interpolate_tracked(gallery.frames[frame], mine, t)
-    subject, expression = model.subjects.index(frame[0]), model.expressions.index(frame[1])
+    known_id, known_exp = model.codes(*model.rows(*frame))
     return (
         pose_state(state.views.head, tracked),
-        torch.lerp(model.z_id[subject], state.z_id, t),
-        torch.lerp(model.z_exp[expression], z_exp, t),
+        torch.lerp(known_id, state.z_id, t),
+        torch.lerp(known_exp, z_exp, t),
     )
 
 
@@ -352,13 +327,10 @@ def _finite(loss: Tensor, iteration: int, stage: int) -> Tensor:
 
 
 def _scores(state: FitState, held_out: Sequence[int], render: Render) -> Scores:
-    given = evaluate(state.views, spread(state.given, LOOKED_AT), render)
-    other = evaluate(state.views, spread(held_out, LOOKED_AT), render)
+    chosen = {"psnr_given_db": state.given, "psnr_held_out_db": held_out}
     scores = {
-        "psnr_given_db": mean(given, "psnr_db"),
-        "psnr_held_out_db": mean(other, "psnr_db"),
-        "psnr_held_out_head_db": mean(other, "psnr_head_db"),
-        "ssim_held_out": mean(other, "ssim"),
+        name: mean(evaluate(state.views, spread(indices, LOOKED_AT), render), "psnr_db")
+        for name, indices in chosen.items()
     }
     log("fit: " + "  ".join(f"{k} {v}" for k, v in scores.items() if v is not None))
     return scores
@@ -371,11 +343,8 @@ def save_fit(state: FitState, out: Path) -> None:
     they can be transferred to the subject.
     """
     subject = state.views.keys[state.given[0]].subject
-    known = {
-        name: code
-        for name, code in zip(state.frozen.expressions, state.frozen.z_exp.detach(), strict=True)
-        if name not in state.z_exp
-    }
+    trained_codes = zip(state.frozen.expressions, state.frozen.z_exp.detach(), strict=True)
+    known = {name: code for name, code in trained_codes if name not in state.z_exp}
     model = GRMM(state.model.config, state.views.head, [subject], [*state.z_exp, *known])
     content = state.model.state_dict()
     content["z_id"] = state.z_id[None]
@@ -395,7 +364,7 @@ def save_fit(state: FitState, out: Path) -> None:
     save_checkpoint(
         out / "checkpoint.pt",
         model=model,
-        config=state.loaded.config,
+        config=state.config,
         head_spec=state.loaded.head_spec,
         gallery=Gallery(frames=own.frames | frames, cameras=cameras),
     )

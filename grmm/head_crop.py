@@ -8,6 +8,7 @@ datasets have no labels; for them the tracked mesh and the depth map decide.
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -18,13 +19,11 @@ from torch import Tensor
 
 from express50.contract.segmentation_labels import TORSO
 from express50.head.model import HeadModel
-from grmm.model import GRMM
-from grmm.rasterize.projection import ALPHA_MIN
-from grmm.scene import Gaussians, PinholeView, Rendering
+from grmm.model import GRMM, Gaussians, PinholeView, Rendering
+from grmm.rasterize.projection import ALPHA_MIN, NEAR_M
 
 CROP_MARGIN_PX = 16  # of the window that training and drawing take
 WINDOW_STEP = 32  # pixels; windows have sides of whole steps
-NEAR_M = 1e-2  # the rasteriser's default
 NEAR_VERTEX_M = 1e-3
 STAND_OFF_M = 0.025  # a point this far off the neck belongs to a shirt, or to hair upon it
 END_M = 0.01  # a point this far off the neck's lower end lies below it
@@ -43,15 +42,8 @@ def draw_window(
     """Draw the window around the Gaussians with `GRMM.draw`; the rest is background.
 
     Colours before refinement, depth and alpha are those of the whole image. Refined ones differ
-    near the window's border as they do in training, whose crops have the same margin.
-
-    Args:
-        model: the model.
-        gaussians: from `GRMM.geometry`.
-        colours: (N, 3 + features) from `GRMM.appearance`.
-        view: the whole image's camera.
-        background: grey, sRGB in [0, 1].
-        refine: as in `GRMM.draw`.
+    near the window's border as they do in training, whose crops have the same margin. ``colours``
+    (N, 3 + features) are from `GRMM.appearance`; ``background`` is grey, sRGB in [0, 1].
     """
     low, high = model.config.scale_bounds_mm
     rows, columns = gaussian_window(gaussians, view, (1e-3 * low, 1e-3 * high))
@@ -65,31 +57,24 @@ def draw_window(
         return whole
 
     rgb = paste(out.rgb, background)
-    return Rendering(
-        image=rgb if out.image is out.rgb else paste(out.image, background),
-        rgb=rgb,
-        depth=paste(out.depth, 0.0),
-        alpha=paste(out.alpha, 0.0),
-        gaussians=out.gaussians,
-    )
+    image = rgb if out.image is out.rgb else paste(out.image, background)
+    depth, alpha = paste(out.depth, 0.0), paste(out.alpha, 0.0)
+    return replace(out, image=image, rgb=rgb, depth=depth, alpha=alpha)
 
 
 def gaussian_window(
-    gaussians: Gaussians,
-    view: PinholeView,
-    bounds_m: tuple[float, float],
-    margin_px: int = CROP_MARGIN_PX,
+    gaussians: Gaussians, view: PinholeView, bounds_m: tuple[float, float]
 ) -> tuple[slice, slice]:
     """Return the rows and columns that hold every pixel a Gaussian reaches, with a margin.
 
-    A Gaussian is bounded by the sphere of its largest scale at the distance where its alpha falls
-    under a level of 8 bits; the whole image where none is in view.
+    A sphere bounds a Gaussian: its largest scale, out to where alpha falls under a level of 8 bits.
+    The whole image where none is in view.
     """
     with torch.no_grad():
         visible = gaussians.opacities > ALPHA_MIN
         largest = gaussians.scales_mm.amax(1).mul(1e-3).clamp(*bounds_m)
         sigmas = (gaussians.opacities / ALPHA_MIN).clamp_min(1.0).log().mul(2).sqrt()
-        extra = margin_px + 2.0  # the rasteriser's blur (variance 0.3) reaches under two pixels
+        extra = CROP_MARGIN_PX + 2.0  # the rasteriser's blur reaches under two pixels
         reach = (largest * sigmas)[visible]
         columns, rows = _extents(gaussians.means[visible], reach, view, NEAR_M, extra)
     return _span(*rows, view.height), _span(*columns, view.width)
@@ -119,12 +104,8 @@ def _extents(
 ) -> tuple[tuple[float, float], tuple[float, float]]:
     """Return the pixel range of spheres along x, then y; (inf, -inf) if none is seen.
 
-    Args:
-        points: (N, 3) centres, head space, metres.
-        radii: (N,) metres.
-        view: the camera.
-        near_m: points nearer than this, or behind the camera, are not seen.
-        margin_px: added on all sides.
+    Spheres have centres (N, 3) in head space and radii (N,), metres. Those nearer than ``near_m``
+    are not seen; ``margin_px`` is added on all sides.
     """
     camera, K = view.cam_from_head.to(points.dtype), view.K.to(points.dtype)
     points = points @ camera[:3, :3].T + camera[:3, 3]
@@ -159,18 +140,12 @@ def crop_view(view: PinholeView, rows: slice, columns: slice) -> PinholeView:
     K = view.K.clone()
     K[0, 2] -= columns.start
     K[1, 2] -= rows.start
-    return PinholeView(
-        K=K,
-        cam_from_head=view.cam_from_head,
-        width=columns.stop - columns.start,
-        height=rows.stop - rows.start,
-    )
+    return replace(view, K=K, width=columns.stop - columns.start, height=rows.stop - rows.start)
 
 
 def labelled_torso(parts: np.ndarray) -> np.ndarray:
     """Mark the pixels (H, W) bool that part labels (H, W) call torso, dilated."""
-    torso = parts == TORSO
-    return _grown(torso)
+    return _grown(parts == TORSO)
 
 
 def torso_mask(

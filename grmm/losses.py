@@ -13,10 +13,9 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
-from express50.errors import TrainError
-from express50.files.pickles import read_weights
+from express50.errors import ConfigError
+from express50.files.arrays import read_weights
 from grmm.config import LossConfig
-from grmm.scene import Rendering
 
 L1, PERCEPTUAL = 0.8, 0.04  # weights of colours and of VGG16 features, the paper's (G14)
 SSIM_WINDOW, SSIM_SIGMA = 11, 1.5
@@ -26,7 +25,6 @@ DEPTH_ERODE_PX = 2  # expected depth bleeds across silhouettes (G11)
 LAYERS: tuple[int | str, ...] = (64, 64, "M", 128, 128, "M", 256, 256, 256, "M", 512, 512, 512)
 COMPARED = (3, 8, 15, 22)  # relu1_2, relu2_2, relu3_3, relu4_3 by torchvision's numbering
 MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # ImageNet, as torchvision trained it
-SMALLEST_PX = 16  # four levels, three halvings
 
 Perceptual = Callable[[Tensor, Tensor], Tensor]
 
@@ -44,7 +42,6 @@ def ssim(a: Tensor, b: Tensor) -> Tensor:
 
 def ssim_map(a: Tensor, b: Tensor) -> Tensor:
     """Compute the SSIM per window (C, H - 10, W - 10); see `ssim`."""
-    _same_shape(a, b)
     dtype = a.dtype if a.dtype in (torch.float32, torch.float64) else torch.float32
     a, b = a.to(dtype), b.to(dtype)
     stack = torch.cat([a, b, a * a, b * b, a * b])[None]  # (1, 5 C, H, W)
@@ -78,7 +75,6 @@ def reconstruction(
     image: Tensor, target: Tensor, config: LossConfig, perceptual: Perceptual | None = None
 ) -> Tensor:
     """Compute L_rec of (3, H, W): weighted L1, 1 - SSIM and, with VGG16, perceptual distance."""
-    _same_shape(image, target)
     loss = L1 * (image - target).abs().mean()
     if config.ssim > 0:
         loss = loss + config.ssim * (1 - ssim(image, target))
@@ -92,19 +88,13 @@ def depth_dm2(
 ) -> Tensor:
     """Compute the mean squared depth error, dm^2, over pixels where both depths are known.
 
-    Args:
-        depth: (H, W) rendered camera z, metres.
-        alpha: (H, W) rendered; pixels over 0.5 count.
-        target: (H, W) camera z, metres.
-        valid: (H, W) bool, where the target is known.
-        erode_px: pixels next to the border of the mask that are left out.
-
-    In metres the term would vanish (5 mm -> 2.5e-5), in millimetres it would dominate (G11).
+    Depths (H, W) are camera z, metres. Rendered ones count where ``alpha`` is over 0.5, targets
+    where ``valid``; ``erode_px`` pixels next to the border of both are left out. In metres the term
+    would vanish (5 mm -> 2.5e-5), in millimetres it would dominate (G11).
     """
     mask = valid & (alpha.detach() > 0.5)
-    if erode_px > 0:
-        outside = nn.functional.pad((~mask)[None, None].float(), [erode_px] * 4)
-        mask = mask & (nn.functional.max_pool2d(outside, 2 * erode_px + 1, 1)[0, 0] == 0)
+    outside = nn.functional.pad((~mask)[None, None].float(), [erode_px] * 4)
+    mask = mask & (nn.functional.max_pool2d(outside, 2 * erode_px + 1, 1)[0, 0] == 0)
     if not bool(mask.any()):
         return depth.sum() * 0.0
     return (10.0 * (depth - target)[mask]).square().mean()
@@ -146,29 +136,6 @@ def codes(z_id: Tensor, z_exp: Tensor) -> Tensor:
     return z_id.square().sum() + z_exp.square().sum()
 
 
-def regularisers(
-    rendering: Rendering,
-    z_id: Tensor,
-    z_exp: Tensor,
-    edges: Tensor,
-    bounds_mm: tuple[float, float],
-    config: LossConfig,
-) -> dict[str, Tensor]:
-    """Compute the weighted terms of L_reg by name."""
-    return {
-        "scale": config.scale * scale_mm(rendering.gaussians.scales_mm, *bounds_mm),
-        "laplacian": config.laplacian * laplacian_mm2(rendering.gaussians.displacement, edges),
-        "codes": config.codes * codes(z_id, z_exp),
-    }
-
-
-def _same_shape(a: Tensor, b: Tensor) -> None:
-    if a.shape != b.shape or a.ndim != 3:
-        raise ValueError(
-            f"images have shapes {tuple(a.shape)} and {tuple(b.shape)}, expected both (C, H, W)"
-        )
-
-
 class VGGDistance(nn.Module):
     """Squared distance of channel-normalised VGG16 features, averaged over four layers.
 
@@ -176,38 +143,16 @@ class VGGDistance(nn.Module):
     2018) without its learned channel weights. Weights never train.
     """
 
-    def __init__(self, weights: dict[str, Tensor]) -> None:
-        """Build from torchvision's ``vgg16`` state dict (its ``features.*`` entries are used)."""
+    def __init__(self, features: nn.Sequential) -> None:
+        """Compare the outputs of these layers, `vgg_features` with weights."""
         super().__init__()
-        layers: list[nn.Module] = []
-        channels = 3
-        for entry in LAYERS:
-            if isinstance(entry, int):
-                layers += [nn.Conv2d(channels, entry, 3, padding=1), nn.ReLU()]
-                channels = entry
-            else:
-                layers.append(nn.MaxPool2d(2))
-        self.features = nn.Sequential(*layers)
-        wanted = self.features.state_dict()
-        missing = [
-            name
-            for name, tensor in wanted.items()
-            if getattr(weights.get(f"features.{name}"), "shape", None) != tensor.shape
-        ]
-        if missing:
-            raise TrainError(
-                f"the VGG16 weights lack features.{missing[0]}; expected the state dict of "
-                "torchvision's vgg16. Leave loss.vgg16 empty to train without it"
-            )
-        self.features.load_state_dict({name: weights[f"features.{name}"] for name in wanted})
+        self.features = features
         self.requires_grad_(False)
         self.register_buffer("mean", torch.tensor(MEAN)[:, None, None])
         self.register_buffer("std", torch.tensor(STD)[:, None, None])
 
     def forward(self, image: Tensor, target: Tensor) -> Tensor:
         """Compute the distance of two (3, H, W) images in [0, 1], at least 16 px per side."""
-        if min(image.shape[1:]) < SMALLEST_PX:
-            raise ValueError(f"image is {tuple(image.shape[1:])}, expected at least 16 x 16 pixels")
         x = (torch.stack([image, target]) - self.mean) / self.std
         total = x.new_zeros(())
         for index, layer in enumerate(self.features):
@@ -218,14 +163,45 @@ class VGGDistance(nn.Module):
         return total
 
 
-def load_vgg(path: Path, device: torch.device | str = "cpu") -> VGGDistance:
-    """Read torchvision's vgg16 state dict; nothing in the file is executed.
+def vgg_features() -> nn.Sequential:
+    """Return the convolutions of VGG16 in torchvision's numbering, untrained."""
+    layers: list[nn.Module] = []
+    channels = 3
+    for entry in LAYERS:
+        if isinstance(entry, int):
+            layers += [nn.Conv2d(channels, entry, 3, padding=1), nn.ReLU()]
+            channels = entry
+        else:
+            layers.append(nn.MaxPool2d(2))
+    return nn.Sequential(*layers)
+
+
+def load_vgg(path: str, device: torch.device | str = "cpu") -> VGGDistance | None:
+    """Read the state dict of loss.vgg16 as `load_features` does; None where it is empty."""
+    if not path:
+        return None
+    features = load_features(Path(path), "loss.vgg16", "vgg16", vgg_features())
+    return VGGDistance(features).to(device)
+
+
+def load_features(path: Path, setting: str, network: str, layers: nn.Sequential) -> nn.Sequential:
+    """Fill layers with the ``features.*`` of torchvision's state dict of a network.
+
+    Nothing in the file is executed.
 
     Raises:
-        TrainError: no such file, or not that state dict.
+        ConfigError: no such file, or not that state dict; names the setting.
     """
+    where = f"{setting} {path}"
     remedy = "leave it empty to do without"
-    weights = read_weights(path, TrainError, f"loss.vgg16 {path}", "a torch state dict", remedy)
-    if not isinstance(weights, dict):
-        raise TrainError(f"loss.vgg16 {path}: holds a {type(weights).__name__}, expected a dict")
-    return VGGDistance(weights).to(device)
+    weights = read_weights(path, ConfigError, where, "a torch state dict", remedy)
+    given = weights if isinstance(weights, dict) else {}
+    wanted = layers.state_dict()
+    for name, tensor in wanted.items():
+        if getattr(given.get(f"features.{name}"), "shape", None) != tensor.shape:
+            raise ConfigError(
+                f"{where}: features.{name} is missing or of another shape; expected the state "
+                f"dict of torchvision's {network}; {remedy}"
+            )
+    layers.load_state_dict({name: given[f"features.{name}"] for name in wanted})
+    return layers

@@ -7,6 +7,7 @@ identity, expression and pose; `appearance` per view; `draw` rasterises and refi
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
@@ -17,9 +18,102 @@ from grmm.anchors import interpolate, make_anchors, tangent_frames, uv_gradients
 from grmm.config import ModelConfig
 from grmm.networks import DISPLACEMENT_M, Networks, normalise_depth
 from grmm.rasterize import rasterize
-from grmm.scene import Gaussians, HeadState, Maps, PinholeView, Rendering
 
 THICKNESS = 0.3  # of a Gaussian before training, along the normal over the tangents (G2)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class HeadState:
+    """The tracked head of one frame, in head space: (R, t) belong to the camera (`PinholeView`).
+
+    Attributes:
+        vertices: (V, 3) tracked mesh v_rec, metres, eye pose included.
+        shape: (S,) identity coefficients alpha_id.
+        expression: (X,) expression coefficients alpha_exp.
+        neck: (3,) axis-angle.
+        jaw: (3,) axis-angle.
+    """
+
+    vertices: Tensor
+    shape: Tensor
+    expression: Tensor
+    neck: Tensor
+    jaw: Tensor
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PinholeView:
+    """A pinhole camera in canonical head space: pi' = K E [R t] (paper, equation 2).
+
+    Attributes:
+        K: (3, 3) pixels, corner origin.
+        cam_from_head: (4, 4) rigid, metres, OpenCV axes.
+        width: pixels.
+        height: pixels.
+    """
+
+    K: Tensor
+    cam_from_head: Tensor
+    width: int
+    height: int
+
+    def direction(self) -> Tensor:
+        """Return the unit vector (3,) from the head's origin to the camera (G7)."""
+        centre = -self.cam_from_head[:3, :3].T @ self.cam_from_head[:3, 3]
+        return nn.functional.normalize(centre, dim=0)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Gaussians:
+    """N Gaussians in head space, without colour.
+
+    Attributes:
+        means: (N, 3) metres.
+        quats: (N, 4) wxyz.
+        scales_mm: (N, 3) unclamped standard deviations, which the regulariser sees.
+        opacities: (N,) in (0, 1).
+        displacement: (V, 3) metres, what the mesh decoder added.
+    """
+
+    means: Tensor
+    quats: Tensor
+    scales_mm: Tensor
+    opacities: Tensor
+    displacement: Tensor
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Maps:
+    """The outputs of the transform and opacity decoders for N Gaussians.
+
+    Attributes:
+        offsets: (N, 7) raw position and quaternion offsets.
+        scales_mm: (N, 3) unclamped standard deviations.
+        opacities: (N,) in (0, 1).
+    """
+
+    offsets: Tensor
+    scales_mm: Tensor
+    opacities: Tensor
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Rendering:
+    """One rendered view.
+
+    Attributes:
+        image: (3, H, W) refined colours I; the same tensor as ``rgb`` without refinement.
+        rgb: (3, H, W) rasterised colours I_rgb.
+        depth: (H, W) camera z, metres; 0 where alpha is 0.
+        alpha: (H, W).
+        gaussians: what was drawn.
+    """
+
+    image: Tensor
+    rgb: Tensor
+    depth: Tensor
+    alpha: Tensor
+    gaussians: Gaussians
 
 
 class GRMM(Networks):
@@ -52,9 +146,18 @@ class GRMM(Networks):
         for name, value in constants.items():
             self.register_buffer(name, value, persistent=False)
 
+    def rows(self, subject: str, expression: str) -> tuple[int, int]:
+        """Return the rows of a training subject and expression in the code tables."""
+        return self.subjects.index(subject), self.expressions.index(expression)
+
     def codes(self, subject: int, expression: int) -> tuple[Tensor, Tensor]:
         """Return the rows of the code tables: (z_id,) and (z_exp,)."""
         return self.z_id[subject], self.z_exp[expression]
+
+    def texel_parameters(self) -> list[nn.Parameter]:
+        """Return the parameters that belong to one texel each."""
+        ladders = (self.transform, self.opacity, self.colour)
+        return [parameter for ladder in ladders for parameter in ladder.texel_parameters()]
 
     def forward(
         self,
@@ -63,11 +166,9 @@ class GRMM(Networks):
         state: HeadState,
         view: PinholeView,
         background: float = 0.0,
-        shade_view: PinholeView | None = None,
     ) -> Rendering:
         """Render a training subject and expression (indices into the code tables)."""
-        z_id, z_exp = self.codes(subject, expression)
-        return self.render(z_id, z_exp, state, view, background, shade_view)
+        return self.render(*self.codes(subject, expression), state, view, background)
 
     def render(
         self,

@@ -36,44 +36,20 @@ class Networks(nn.Module):
         self.z_exp = nn.Parameter(CODE_STD * torch.randn(expressions, config.z_exp))
         self.mesh = None
         if config.mesh_decoder:
-            self.mesh = MeshDecoder(
-                z_id=config.z_id,
-                z_exp=config.z_exp,
-                coefficients=len(head.expression_names),
-                teeth=head.regions["teeth"],
-                shared_widths=config.shared_widths,
-                film_width=config.film_width,
-                head_width=config.mesh_width,
-            )
-        both = config.z_id + config.z_exp
-        self.transform = self._ladder(both, 10)
-        self.opacity = self._ladder(config.z_id, 1)
-        self.colour = self._ladder(config.z_id, 3 + config.features, VIEW_CHANNELS, 3)
+            self.mesh = MeshDecoder(config, len(head.expression_names), head.regions["teeth"])
+        self.transform = Ladder(config, config.z_id + config.z_exp, 10)
+        self.opacity = Ladder(config, config.z_id, 1)
+        self.colour = Ladder(
+            config, config.z_id, 3 + config.features, view_dependent=True, mode_outputs=3
+        )
         with torch.no_grad():
             self.opacity.bias.fill_(math.log(config.opacity_init / (1 - config.opacity_init)))
             # From all zeros the refinement could not distinguish texels and would learn slowly.
             self.colour.bias[3:].normal_(0, FEATURE_STD)
         self.refinement = None
         if config.refine_widths:
-            self.refinement = Refinement(
-                inputs=3 + config.features + 2,  # colours, features, depth and alpha
-                widths=config.refine_widths,
-                unshuffle=config.refine_unshuffle,
-            )
-
-    def _ladder(
-        self, code: int, outputs: int, view_channels: int = 0, mode_outputs: int | None = None
-    ) -> Ladder:
-        return Ladder(
-            code=code,
-            outputs=outputs,
-            n_g=self.config.n_g,
-            seed_channels=self.config.seed_channels,
-            widths=self.config.ladder,
-            modes=self.config.identity_modes,
-            mode_outputs=mode_outputs,
-            view_channels=view_channels,
-        )
+            inputs = 3 + config.features + 2  # colours, features, depth and alpha
+            self.refinement = Refinement(inputs, config.refine_widths, config.refine_unshuffle)
 
 
 class Doubling(nn.Module):
@@ -106,23 +82,24 @@ class Ladder(nn.Module):
 
     def __init__(
         self,
-        *,
+        config: ModelConfig,
         code: int,
         outputs: int,
-        n_g: int,
-        seed_channels: int,
-        widths: Sequence[int],
-        modes: int = 0,
+        view_dependent: bool = False,
         mode_outputs: int | None = None,
-        view_channels: int = 0,
     ) -> None:
-        """Build; with ``view_channels`` the seed also carries a lifted view direction (RGCA)."""
+        """Build for codes of this length.
+
+        The seed of a view-dependent ladder also carries a lifted view direction (RGCA). The first
+        ``mode_outputs`` outputs have modes; by default all have.
+        """
         super().__init__()
+        n_g, widths = config.n_g, config.ladder
         side = n_g // 2 ** (len(widths) + 1)
-        self.seed_shape = (1, seed_channels, side, side)
-        self.seed = nn.Linear(code, seed_channels * side * side)
-        self.view = nn.Linear(3, view_channels) if view_channels else None
-        channels = [seed_channels + view_channels, *widths]
+        self.seed_shape = (1, config.seed_channels, side, side)
+        self.seed = nn.Linear(code, config.seed_channels * side * side)
+        self.view = nn.Linear(3, VIEW_CHANNELS) if view_dependent else None
+        channels = [config.seed_channels + VIEW_CHANNELS * view_dependent, *widths]
         self.doublings = nn.ModuleList(
             Doubling(a, b, side * 2**i)
             for i, (a, b) in enumerate(zip(channels, channels[1:], strict=False))
@@ -131,16 +108,14 @@ class Ladder(nn.Module):
         nn.init.zeros_(self.last.weight)
         self.bias = nn.Parameter(torch.zeros(outputs, n_g, n_g))
         self.modes = None
-        if modes:
-            shape = (modes, outputs if mode_outputs is None else mode_outputs, n_g, n_g)
+        if config.identity_modes:
+            shape = (config.identity_modes, mode_outputs or outputs, n_g, n_g)
             self.modes = nn.Parameter(torch.zeros(shape))
 
     def forward(self, code: Tensor, direction: Tensor | None = None) -> Tensor:
         """Decode (code,) and, if used, a (3,) unit view direction to (outputs, n_g, n_g)."""
         x = nn.functional.leaky_relu(self.seed(code), SLOPE).view(self.seed_shape)
         if self.view is not None:
-            if direction is None:
-                raise ValueError("direction is missing: this decoder depends on the view")
             lifted = nn.functional.leaky_relu(self.view(direction), SLOPE)
             tiled = lifted[None, :, None, None].expand(-1, -1, *self.seed_shape[2:])
             x = torch.cat([x, tiled], 1)
@@ -166,20 +141,10 @@ class MeshDecoder(nn.Module):
     skip the teeth (M_face). The last layers start at zero: no displacement, FiLM the identity.
     """
 
-    def __init__(
-        self,
-        *,
-        z_id: int,
-        z_exp: int,
-        coefficients: int,
-        teeth: Tensor,
-        shared_widths: Sequence[int],
-        film_width: int,
-        head_width: int,
-    ) -> None:
+    def __init__(self, config: ModelConfig, coefficients: int, teeth: Tensor) -> None:
         """Build for a mesh whose teeth are marked in ``teeth`` (V,) bool; metres come out."""
         super().__init__()
-        widths = [z_id + 6, *shared_widths]
+        widths = [config.z_id + 6, *config.shared_widths]
         self.shared = nn.Sequential(
             *(
                 layer
@@ -187,10 +152,10 @@ class MeshDecoder(nn.Module):
                 for layer in (nn.Linear(a, b), nn.LeakyReLU(SLOPE))
             )
         )
-        base = widths[-1]
-        self.film = zero_last(mlp(coefficients, film_width, 2 * (base + z_exp)))
-        self.identity = zero_last(mlp(base, head_width, 3 * len(teeth)))
-        self.expression = zero_last(mlp(base + z_exp, head_width, 3 * len(teeth)))
+        base, both, outputs = widths[-1], widths[-1] + config.z_exp, 3 * len(teeth)
+        self.film = _zero_last_mlp(coefficients, config.film_width, 2 * both)
+        self.identity = _zero_last_mlp(base, config.mesh_width, outputs)
+        self.expression = _zero_last_mlp(both, config.mesh_width, outputs)
         self.register_buffer("face_mask", (~teeth).to(torch.get_default_dtype())[:, None])
 
     def forward(
@@ -198,12 +163,8 @@ class MeshDecoder(nn.Module):
     ) -> tuple[Tensor, Tensor]:
         """Return identity and masked expression displacements, each (V, 3) metres.
 
-        Args:
-            z_id: (Z,) identity code.
-            z_exp: (E,) expression code.
-            neck: (3,) axis-angle.
-            jaw: (3,) axis-angle.
-            coefficients: (X,) tracked expression coefficients.
+        Inputs are both codes, the axis-angles (3,) of neck and jaw, and the tracked expression
+        coefficients (X,).
         """
         base = self.shared(torch.cat([z_id, neck, jaw]))
         feature = self.modulate(torch.cat([base, z_exp]), coefficients)
@@ -217,18 +178,12 @@ class MeshDecoder(nn.Module):
         return feature + gamma * feature + beta
 
 
-def mlp(inputs: int, width: int, outputs: int) -> nn.Sequential:
-    """Build a perceptron with one hidden layer and a leaky ReLU."""
-    return nn.Sequential(nn.Linear(inputs, width), nn.LeakyReLU(SLOPE), nn.Linear(width, outputs))
-
-
-def zero_last(network: nn.Sequential) -> nn.Sequential:
-    """Zero the last layer, so that the network starts as the constant 0."""
-    last = network[-1]
-    assert isinstance(last, nn.Linear)
+def _zero_last_mlp(inputs: int, width: int, outputs: int) -> nn.Sequential:
+    """Build a perceptron with one hidden layer that starts as the constant 0."""
+    hidden, last = nn.Linear(inputs, width), nn.Linear(width, outputs)
     nn.init.zeros_(last.weight)
     nn.init.zeros_(last.bias)
-    return network
+    return nn.Sequential(hidden, nn.LeakyReLU(SLOPE), last)
 
 
 class Refinement(nn.Module):
@@ -238,7 +193,7 @@ class Refinement(nn.Module):
     channels first, which a CPU needs. Sides that are not a multiple of the stride are padded.
     """
 
-    def __init__(self, *, inputs: int, widths: Sequence[int], unshuffle: int) -> None:
+    def __init__(self, inputs: int, widths: Sequence[int], unshuffle: int) -> None:
         """Build for ``inputs`` channels, of which the first three are the colours refined."""
         super().__init__()
         self.unshuffle = unshuffle

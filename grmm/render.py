@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from express50.dataset.tracks import Sequence
+from express50.dataset.tracks import OF_FRAMES, Sequence, read_sequence
 from express50.errors import ConfigError
 from express50.files.images import contact_sheet, write_image
 from grmm.checkpoint import Loaded
@@ -30,16 +30,14 @@ from grmm.edit import (
 )
 from grmm.evaluate import Render
 from grmm.head_crop import draw_window
-from grmm.scene import Gaussians, PinholeView, Rendering
+from grmm.model import PinholeView
+from grmm.networks import normalise_depth
 
 VIDEO_RATE = 24  # frames a second, as the rig's
 YAWS, PITCHES = (-60, -30, 0, 30, 60), (20, 0, -20)  # degrees of the sheet of novel views
 Sheet = tuple[list[list[np.ndarray]], list[str]]
 STEPS = (-1.0, -0.5, 0.0, 0.5, 1.0)
-TURNS = {  # what a step of 1 means: entry and radians
-    "neck, yaw": ("neck.1", 0.35),
-    "eyes, yaw": ("eyes", 0.4),
-}
+TURNS = {"neck, yaw": ("neck.1", 0.35), "eyes, yaw": ("eyes", 0.4)}  # radians of a step of 1
 JAW_OPEN = 0.35  # radians
 DEVIATIONS = 1.5  # standard deviations a step of 1 moves a code
 
@@ -51,11 +49,7 @@ def to_uint8(image: Tensor) -> np.ndarray:
 
 def depth_picture(depth: Tensor, alpha: Tensor) -> np.ndarray:
     """Show depth (H, W) as grey (H, W, 3) uint8: near is bright, alpha <= 0.5 is black."""
-    mask = (alpha > 0.5) & torch.isfinite(depth)
-    if not bool(mask.any()):
-        return np.zeros((*depth.shape, 3), np.uint8)
-    low, high = depth[mask].min(), depth[mask].max()
-    grey = torch.where(mask, 1 - 0.85 * (depth - low) / (high - low).clamp_min(1e-6), 0.0)
+    grey = torch.where(alpha > 0.5, 1 - 0.85 * normalise_depth(depth, alpha), 0.0)
     return to_uint8(grey[None].expand(3, -1, -1))
 
 
@@ -71,9 +65,7 @@ def comparison_sheet(path: Path, views: HeadViews, indices: Many[int], render: R
         pictures.append(to_uint8(4 * (item.comparable(out.image) - item.target).abs()))
         rows.append(pictures)
         labels.append(f"{item.key.subject} {item.key.expression} {item.key.camera}")
-    tile = (views.item(indices[0]).view.height, views.item(indices[0]).view.width)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_image(path, contact_sheet(rows, labels, tile))
+    write_sheet(path, rows, labels)
 
 
 def orbit(view: PinholeView, degrees: float, centre: Tensor, pitch: float = 0.0) -> PinholeView:
@@ -135,14 +127,6 @@ def picture(loaded: Loaded, head: HeadCodes, view: PinholeView) -> np.ndarray:
     return next(iter(around(loaded, head, [view])))
 
 
-def drawn(
-    loaded: Loaded, gaussians: Gaussians, colours: Tensor, view: PinholeView, refine: bool = True
-) -> Rendering:
-    """Draw a decoded head in its window, as training did."""
-    background = loaded.config.data.background
-    return draw_window(loaded.model, gaussians, colours, view, background, refine=refine)
-
-
 @torch.no_grad()
 def around(loaded: Loaded, head: HeadCodes, views: Iterable[PinholeView]) -> Iterable[np.ndarray]:
     """Yield a head from each view; its geometry is decoded once for all of them."""
@@ -150,7 +134,8 @@ def around(loaded: Loaded, head: HeadCodes, views: Iterable[PinholeView]) -> Ite
     gaussians = model.geometry(head.z_id, head.z_exp, state)
     for view in views:
         colours = model.appearance(head.z_id, state, view)
-        yield to_uint8(drawn(loaded, gaussians, colours, view).image)
+        background = loaded.config.data.background
+        yield to_uint8(draw_window(model, gaussians, colours, view, background).image)
 
 
 def turntable(
@@ -158,9 +143,8 @@ def turntable(
 ) -> Iterable[np.ndarray]:
     """Yield (H, W, 3) frames of an orbit that starts at ``view``."""
     centre = loaded.model.head_centre
-    return around(
-        loaded, head, (orbit(view, degrees * number / frames, centre) for number in range(frames))
-    )
+    views = (orbit(view, degrees * number / frames, centre) for number in range(frames))
+    return around(loaded, head, views)
 
 
 def novel_views(loaded: Loaded, head: HeadCodes, view: PinholeView) -> list[list[np.ndarray]]:
@@ -195,8 +179,8 @@ def interpolation(
 def control_sheet(loaded: Loaded, head: HeadCodes, view: PinholeView) -> Sheet:
     """Draw rows that change one thing each (the paper's figure of disentangled control).
 
-    Jaw, neck and eyes; the strongest expression coefficients of training; the first principal
-    directions of z_id and z_exp. A code without directions (one subject) has no row.
+    Jaw, neck, eyes; the strongest expression coefficients of training; the first principal
+    directions of both codes, where there are any.
     """
     changes: dict[str, list[dict[str, tuple[float, ...]]]] = {
         "jaw": [{"jaw": (JAW_OPEN * (step + 1) / 2, 0.0, 0.0)} for step in STEPS]
@@ -253,8 +237,8 @@ def residual_sheet(
 
 def sample_sheet(
     loaded: Loaded, head: HeadCodes, view: PinholeView, count: int, seed: int, spread: float = 1.0
-) -> tuple[Sheet, dict[str, list[HeadCodes]]]:
-    """Draw three rows of samples; returns their heads too: new people, new expressions, both."""
+) -> Sheet:
+    """Draw three rows of samples: new people, new expressions, both."""
     rng = np.random.default_rng(seed)
     neutral = head
     if "neutral" in loaded.model.expressions:
@@ -267,7 +251,7 @@ def sample_sheet(
         "both": [sample_expression(loaded, person, rng, spread) for person in people],
     }
     pictures = [[picture(loaded, one, view) for one in row] for row in rows.values()]
-    return (pictures, list(rows)), rows
+    return pictures, list(rows)
 
 
 def driven(
@@ -291,28 +275,42 @@ def driven(
         yield picture(loaded, replace(head, tracked=replace(head.tracked, **moved)), view)
 
 
+def read_clips(path: Path, cue: str | None = None) -> Sequence:
+    """Read tracked clips, all of them or the one of a cue.
+
+    Raises:
+        ConfigError: no clip has this cue.
+    """
+    clips = read_sequence(path)
+    if cue is None:
+        return clips
+    rows = [i for i, name in enumerate(clips.cues) if name == cue]
+    if not rows:
+        known = ", ".join(dict.fromkeys(clips.cues))
+        raise ConfigError(f"--drive-cue {cue}: {path} has no such clip; expected one of {known}")
+    parts = {name: getattr(clips, name)[rows] for name in OF_FRAMES}
+    return replace(clips, cues=(cue,) * len(rows), **parts)
+
+
 def write_sheet(path: Path, rows: Many[Many[np.ndarray]], labels: Many[str] | None = None) -> None:
     """Write rows of pictures of one size as one picture."""
     path.parent.mkdir(parents=True, exist_ok=True)
     write_image(path, contact_sheet(rows, labels, rows[0][0].shape[:2]))
 
 
-def write_video(path: Path, frames: Iterable[np.ndarray], rate: int = VIDEO_RATE) -> int:
-    """Write (H, W, 3) uint8 frames as H.264, odd last row or column cut; returns the count."""
-    count = 0
+def write_video(path: Path, frames: Iterable[np.ndarray]) -> None:
+    """Write (H, W, 3) uint8 frames as H.264; an odd last row or column is cut."""
     path.parent.mkdir(parents=True, exist_ok=True)
     aside = path.with_name(f".{path.name}.part.mp4")
     with av.open(str(aside), "w") as container:
-        stream = container.add_stream("libx264", rate=rate)
+        stream = container.add_stream("libx264", rate=VIDEO_RATE)
         stream.pix_fmt = "yuv420p"
         stream.options = {"crf": "16", "preset": "veryfast"}
-        for frame in frames:
+        for number, frame in enumerate(frames):
             even = frame[: frame.shape[0] // 2 * 2, : frame.shape[1] // 2 * 2]
-            if count == 0:
+            if number == 0:
                 stream.height, stream.width = even.shape[:2]
             picture = av.VideoFrame.from_ndarray(np.ascontiguousarray(even), format="rgb24")
             container.mux(stream.encode(picture))
-            count += 1
         container.mux(stream.encode())
     aside.replace(path)
-    return count

@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
-import hashlib
+import fnmatch
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from express50.errors import FormatError
+from express50.errors import ConfigError, FormatError
+from express50.files.digests import text_digest
 from express50.shards.reader import ShardReader
 from grmm.data import Sample, SampleKey, Tracked
 
 INSET_PX = 2  # of the footage's border: undistortion has nothing to put there
-SIZES = {"neck": (3,), "jaw": (3,), "eyes": (6,), "R": (3, 3), "t": (3,)}
+SIZES: dict[str, tuple[int, ...] | None] = {  # of what is tracked; None: any vector
+    "shape": None, "expression": None, "neck": (3,), "jaw": (3,), "eyes": (6,), "R": (3, 3),
+    "t": (3,),
+}  # fmt: skip
 
 
 class ShardSource:
@@ -37,11 +40,12 @@ class ShardSource:
             for entry in self.reader.entries
         ]
         self.head = str(self.reader.meta(0).get("head"))
-        self.digest = _digest(
-            f"{entry.key} {name} {size} {crc:08x}"
+        lines = (
+            f"{entry.key} {name} {size} {crc:08x}\n"
             for entry in self.reader.entries
             for name, (_, size, crc) in sorted(entry.members.items())
         )
+        self.digest = text_digest("".join(lines))
         self._offsets: dict[str, np.ndarray] = {}
 
     def read(self, index: int) -> Sample:
@@ -77,8 +81,13 @@ class ShardSource:
         return rows, columns, (int(meta["height"]), int(meta["width"]))  # checked just before
 
     def _tracked(self, meta: dict, subject: str, where: str) -> Tracked:
-        tracked = _tracked(meta.get("track"), where)
-        if not meta["track"].get("offsets", False):
+        track = meta.get("track")
+        if not isinstance(track, dict):
+            raise FormatError(f"{where}: meta has no track; rerun 'express50 track' and 'pack'")
+        tracked = Tracked(
+            **{name: _matrix(track, name, size, where) for name, size in SIZES.items()}
+        )
+        if not track.get("offsets", False):
             return tracked
         if subject not in self._offsets:
             self._offsets[subject] = self.reader.offsets(subject)
@@ -114,33 +123,46 @@ class MixedSource:
                     )
         self._places = [(source, i) for source in sources for i in range(len(source.keys))]
         self.keys: Sequence[SampleKey] = [source.keys[i] for source, i in self._places]
-        self.digest = _digest(source.digest for source in sources)
+        self.digest = text_digest("".join(f"{source.digest}\n" for source in sources))
 
     def read(self, index: int) -> Sample:
-        """Decode one sample.
-
-        Raises:
-            FormatError: it is damaged.
-        """
+        """Decode one sample, as `ShardSource.read` does."""
         source, place = self._places[index]
         return source.read(place)
 
 
 def open_shards(roots: Sequence[Path], split: str) -> ShardSource | MixedSource:
-    """Open one folder of shards, or several mixed.
-
-    Raises:
-        FormatError: a folder has no samples of the split, or they do not go together.
-    """
+    """Open one folder of shards, or several mixed; see the two sources for errors."""
     sources = [ShardSource(root, split) for root in roots]
     return sources[0] if len(sources) == 1 else MixedSource(sources)
 
 
-def _digest(lines: Iterable[str]) -> str:
-    digest = hashlib.sha256()
-    for line in lines:
-        digest.update(line.encode() + b"\n")
-    return digest.hexdigest()
+def select(keys: Sequence[SampleKey], subjects: str, expressions: str, cameras: str) -> list[int]:
+    """Select samples whose ids match shell patterns, several joined by commas.
+
+    Raises:
+        ConfigError: a pattern, or all of them together, match nothing.
+    """
+    chosen: dict[str, set[str]] = {}
+    for kind, text in (("subject", subjects), ("expression", expressions), ("camera", cameras)):
+        known = sorted({getattr(key, kind) for key in keys})
+        chosen[kind] = set()
+        for pattern in filter(None, map(str.strip, text.split(","))):
+            matching = fnmatch.filter(known, pattern)
+            if not matching:
+                raise ConfigError(f"no {kind} is {pattern}; the shards have {', '.join(known)}")
+            chosen[kind].update(matching)
+    found = [
+        i
+        for i, key in enumerate(keys)
+        if all(getattr(key, kind) in ids for kind, ids in chosen.items())
+    ]
+    if not found:
+        raise ConfigError(
+            f"no sample has subject {subjects}, expression {expressions} and camera {cameras}; "
+            "choose ids that occur together"
+        )
+    return found
 
 
 def seen_window(meta: dict, where: str) -> tuple[slice, slice]:
@@ -172,16 +194,6 @@ def seen_window(meta: dict, where: str) -> tuple[slice, slice]:
     if any(span.stop <= span.start for span in spans):
         raise FormatError(f"{where}: its crop lies outside the footage; rerun 'express50 pack'")
     return spans[0], spans[1]
-
-
-def _tracked(track: Any, where: str) -> Tracked:
-    if not isinstance(track, dict):
-        raise FormatError(f"{where}: meta has no track; rerun 'express50 track' and 'pack'")
-    return Tracked(
-        shape=_matrix(track, "shape", None, where),
-        expression=_matrix(track, "expression", None, where),
-        **{name: _matrix(track, name, size, where) for name, size in SIZES.items()},
-    )
 
 
 def _matrix(table: dict, name: str, size: tuple[int, ...] | None, where: str) -> np.ndarray:

@@ -10,7 +10,9 @@ from __future__ import annotations
 
 import os
 import time
+from datetime import timedelta
 from pathlib import Path
+from threading import Event
 
 import torch
 import torch.distributed as distributed
@@ -23,15 +25,13 @@ from express50.files.atomic import write_json
 from express50.head.model import HeadModel
 from grmm import losses
 from grmm.config import Config
-from grmm.data import HeadViews, Item, Source
+from grmm.data import HeadViews, Item, Source, spread
 from grmm.evaluate import evaluate, mean, training_render
-from grmm.perceptual_metrics import PerceptualMetrics
+from grmm.metrics import PerceptualMetrics
+from grmm.model import Rendering
 from grmm.rasterize import NotFiniteTensorError
 from grmm.render import comparison_sheet
-from grmm.sampler import spread
-from grmm.scene import Rendering
 from grmm.train_state import (
-    Interrupt,
     TrainState,
     append_log,
     best_device,
@@ -58,15 +58,9 @@ def train(
 ) -> dict[str, object]:
     """Train on a source and write OUT/checkpoint.pt, OUT/metrics.json and OUT/preview/*.jpg.
 
-    Args:
-        source: samples; ``source.head`` is how `load_head` finds ``head`` again.
-        head: the head model that the samples were tracked with.
-        out: folder, made if absent.
-        config: resolved configuration.
-        resume: go on from OUT/checkpoint.pt, whose settings must agree except for the budget.
-
-    Returns:
-        What metrics.json holds.
+    ``source.head`` is how `load_head` finds ``head`` again. ``resume`` goes on from
+    OUT/checkpoint.pt, whose settings must agree except for the budget. Returns what metrics.json
+    holds.
 
     Raises:
         TrainError: nothing to train on, or the objective is not finite.
@@ -75,13 +69,8 @@ def train(
     # --- Processes, samples, model -------------------------------------------------------------
     rank, world, device = join_processes()
     torch.manual_seed(config.train.seed)
-    views = HeadViews(
-        source,
-        head,
-        background=config.data.background,
-        torso=config.data.torso,
-        device=device,
-    )
+    background, torso = config.data.background, config.data.torso
+    views = HeadViews(source, head, background=background, torso=torso, device=device)
     config = with_map_size(config, views)
     state = prepare(views, config, rank, world)
     checkpoint = out / "checkpoint.pt"
@@ -92,14 +81,15 @@ def train(
     parallel = DistributedDataParallel(state.model) if world > 1 else state.model
     if rank == 0:
         start_log(out / "log.jsonl", state.iteration)
-        log(f"{state.model.anchors.budget()}; {len(state.training)} views to train on")
+        count, texels = len(state.model.texels), config.model.n_g**2
+        log(
+            f"{count} Gaussians of {texels} texels ({100 * count / texels:.0f} % covered); "
+            f"{len(state.training)} views to train on"
+        )
         if state.perceptual is None:
             log("the perceptual term is off: loss.vgg16 names no weights")
         if device.type == "cpu" and not config.train.seconds and config.train.iterations > PATIENT:
-            log(
-                f"{config.train.iterations} iterations take days on a CPU; '--preset measured "
-                "--budget 1h' is the setting that does best in an hour"
-            )
+            log("this takes days on a CPU; '--preset measured --budget 1h' does best in an hour")
 
     # --- The loop ------------------------------------------------------------------------------
     started, saved = time.perf_counter() - state.seconds, state.seconds
@@ -111,7 +101,7 @@ def train(
             state.seconds = time.perf_counter() - started
             if world > 1:
                 agree(state, interrupt, device)
-            last = finished(state, config) or interrupt.requested
+            last = finished(state, config) or interrupt.is_set()
             due = 0 < config.train.save_seconds <= state.seconds - saved
             if rank == 0 and (state.iteration % LOG_EVERY == 0 or last):
                 log(progress_line(state, config))
@@ -119,9 +109,13 @@ def train(
             if rank == 0 and (due or last):
                 save(state, checkpoint, config, source.head)
                 saved = state.seconds
-            if interrupt.requested:
+            if interrupt.is_set():
                 raise KeyboardInterrupt
-    leave_processes()
+    if world > 1:
+        distributed.destroy_process_group()
+        # Gloo's threads outlive the group and take Python's lock to free the tensors of the last
+        # sum. One that does so while the interpreter ends aborts the process: they get some time.
+        time.sleep(GLOO_SECONDS)
 
     # --- The report ----------------------------------------------------------------------------
     metrics = report(state, config, out) if rank == 0 else {}
@@ -139,10 +133,9 @@ def step(state: TrainState, parallel: torch.nn.Module, config: Config) -> None:
     state.optimizer.zero_grad(set_to_none=True)
     for _ in range(config.train.accumulate):
         item = state.views.item(state.shuffle.next(), crop=True)
-        subject = state.model.subjects.index(item.key.subject)
-        expression = state.model.expressions.index(item.key.expression)
         try:
-            rendering = parallel(subject, expression, item.state, item.view, state.views.background)
+            rows = state.model.rows(*item.key.frame)
+            rendering = parallel(*rows, item.state, item.view, state.views.background)
         except NotFiniteTensorError as error:
             raise TrainError(
                 f"iteration {state.iteration}: training diverged ({error}); lower train.lr and "
@@ -175,40 +168,37 @@ def objective(
     if bool(item.depth_valid.any()):
         error = losses.depth_dm2(rendering.depth, rendering.alpha, item.depth, item.depth_valid)
         terms["depth"] = weights.depth * error
-    z_id, z_exp = model.codes(
-        model.subjects.index(item.key.subject), model.expressions.index(item.key.expression)
-    )
-    bounds = config.model.scale_bounds_mm
-    return terms | losses.regularisers(rendering, z_id, z_exp, state.edges, bounds, weights)
+    codes, gaussians = model.codes(*model.rows(*item.key.frame)), rendering.gaussians
+    return terms | {
+        "scale": weights.scale
+        * losses.scale_mm(gaussians.scales_mm, *config.model.scale_bounds_mm),
+        "laplacian": weights.laplacian * losses.laplacian_mm2(gaussians.displacement, state.edges),
+        "codes": weights.codes * losses.codes(*codes),
+    }
 
 
 def report(state: TrainState, config: Config, out: Path) -> dict[str, object]:
     """Evaluate, draw previews and write metrics.json."""
     model, views, count = state.model, state.views, config.train.evaluate_images
     render = training_render(model, views)
-    trained = {(views.keys[i].subject, views.keys[i].expression) for i in state.training}
-    frame_of = {i: (views.keys[i].subject, views.keys[i].expression) for i in state.holdout}
+    trained = {views.keys[i].frame for i in state.training}
+    held = [i for i in state.holdout if views.keys[i].frame in trained]
+    new = [i for i in state.holdout if views.keys[i].frame not in trained]
     perceptual = PerceptualMetrics(config.metrics)
     training = evaluate(views, spread(state.training, count), render)
-    held = [i for i in state.holdout if frame_of[i] in trained]
-    new = [i for i in state.holdout if frame_of[i] not in trained]
     holdout = evaluate(views, spread(held, count), render, perceptual)
     expressions = evaluate(views, spread(new, count), render)
     metrics: dict[str, object] = {
         "psnr_train_db": mean(training, "psnr_db"),
         "psnr_heldout_view_db": mean(holdout, "psnr_db"),
         "psnr_heldout_view_head_db": mean(holdout, "psnr_head_db"),
-        "psnr_heldout_view_unrefined_db": mean(holdout, "psnr_unrefined_db"),
         "psnr_heldout_expression_db": mean(expressions, "psnr_db"),
-        "ssim": mean(holdout, "ssim") if holdout else mean(training, "ssim"),
+        "ssim": mean(holdout or training, "ssim"),
         "rmse": mean(holdout or training, "rmse"),
         "lpips": mean(holdout, "lpips"),
         "fid": perceptual.fid(),
-        "psnr_heldout_view_with_torso_db": mean(holdout, "psnr_with_torso_db"),
-        "psnr_counts": f"all pixels that the camera saw; torso: {config.data.torso}",
         "depth_median_mm": mean(holdout or training, "depth_mm"),
         "heldout_images": len(holdout),
-        "heldout_expression_images": len(expressions),
         "heldout_cameras": list(config.data.holdout_cameras),
         "training_views": len(state.training),
         "subjects": list(model.subjects),
@@ -220,13 +210,11 @@ def report(state: TrainState, config: Config, out: Path) -> dict[str, object]:
         "seconds": round(state.seconds, 2),
         "iterations_per_second": round(state.iteration / max(state.seconds, 1e-9), 3),
         "terms": {name: round(value, 6) for name, value in state.terms.items()},
-        "perceptual": "on" if state.perceptual else "off: loss.vgg16 names no weights",
     }
     metrics |= perceptual.missing()
     for name, indices in (("training", state.training), ("heldout", state.holdout)):
         if indices:
-            path = out / "preview" / f"{name}.jpg"
-            comparison_sheet(path, views, spread(indices, 6), render)
+            comparison_sheet(out / "preview" / f"{name}.jpg", views, spread(indices, 6), render)
     write_json(out / "metrics.json", metrics)
     return metrics
 
@@ -239,32 +227,19 @@ def join_processes() -> tuple[int, int, torch.device]:
     return int(os.environ.get("RANK", "0")), world, device
 
 
-def leave_processes() -> None:
-    """Leave the group that `join_processes` joined, if any.
-
-    Gloo's threads outlive the group and take Python's lock to free the tensors of the last sum. A
-    thread that does so while the interpreter ends aborts the process, so they get some time.
-    """
-    if distributed.is_initialized():
-        distributed.destroy_process_group()
-        time.sleep(GLOO_SECONDS)
-
-
-def agree(state: TrainState, interrupt: Interrupt, device: torch.device) -> None:
+def agree(state: TrainState, interrupt: Event, device: torch.device) -> None:
     """Give all processes the same clock and the same request to stop, or they would deadlock."""
-    common = torch.tensor([state.seconds, float(interrupt.requested)], device=device)
+    common = torch.tensor([state.seconds, float(interrupt.is_set())], device=device)
     distributed.all_reduce(common, distributed.ReduceOp.MAX)
-    state.seconds, interrupt.requested = float(common[0]), bool(common[1] > 0)
+    state.seconds = float(common[0])
+    if common[1] > 0:
+        interrupt.set()
 
 
 def progress_line(state: TrainState, config: Config) -> str:
     """Describe the iteration, the speed, the time left and the terms in one line."""
     rate = state.iteration / max(state.seconds, 1e-9)
     used = budget_used(state, config)
-    left = state.seconds * (1 - used) / used if used > 0 else 0.0
-    words = f"{left:.0f} s"
-    for unit, length in (("min", 60), ("h", 3600), ("days", 86400)):
-        if left >= 2 * length:
-            words = f"{left / length:.1f} {unit}"
+    left = timedelta(seconds=round(state.seconds * (1 - used) / used if used > 0 else 0))
     terms = " ".join(f"{name} {value:.4f}" for name, value in state.terms.items())
-    return f"iteration {state.iteration}  {rate:.2f}/s  {words} left  {terms}"
+    return f"iteration {state.iteration}  {rate:.2f}/s  {left} left  {terms}"

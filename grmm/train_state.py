@@ -9,25 +9,23 @@ import math
 import os
 import signal
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from threading import Event, current_thread, main_thread
 
 import torch
 from torch import Tensor
 
 from express50.console import log
-from express50.errors import ConfigError, FormatError, TrainError
+from express50.errors import ConfigError, TrainError
 from express50.files.atomic import write_bytes
-from express50.files.text import parse_json, read_text
+from express50.files.text import read_text
 from grmm import losses
 from grmm.checkpoint import collect_gallery, load_checkpoint, save_checkpoint
-from grmm.config import Config
-from grmm.data import HeadViews, SampleKey
+from grmm.config import Config, as_tables
+from grmm.data import HeadViews, SampleKey, Shuffle, spread
 from grmm.losses import load_vgg
 from grmm.model import GRMM
-from grmm.presets import as_tables
-from grmm.sampler import Shuffle, spread
 
 COVERED_TEXELS = 0.75  # of a map that head models' layouts use
 LARGEST_MAP = 512  # the paper's
@@ -53,16 +51,14 @@ class TrainState:
 
 def prepare(views: HeadViews, config: Config, rank: int = 0, world: int = 1) -> TrainState:
     """Build the model, its optimiser and the order of samples."""
-    training, holdout = split_samples(views.keys, config)
-    keys = [views.keys[i] for i in training]
-    subjects = sorted({key.subject for key in keys})
-    expressions = sorted({key.expression for key in keys})
+    keys = views.keys
+    training, holdout = split_samples(keys, config)
+    subjects = sorted({keys[i].subject for i in training})
+    expressions = sorted({keys[i].expression for i in training})
     model = GRMM(config.model, views.head, subjects, expressions).to(views.device)
     # A held-out sample can only be judged where its codes were trained.
     holdout = [
-        i
-        for i in holdout
-        if views.keys[i].subject in subjects and views.keys[i].expression in expressions
+        i for i in holdout if keys[i].subject in subjects and keys[i].expression in expressions
     ]
     return TrainState(
         model=model,
@@ -71,7 +67,7 @@ def prepare(views: HeadViews, config: Config, rank: int = 0, world: int = 1) -> 
         holdout=holdout,
         optimizer=make_optimizer(model, config),
         shuffle=Shuffle(training, config.train.seed, rank, world),
-        perceptual=load_vgg(Path(config.loss.vgg16), views.device) if config.loss.vgg16 else None,
+        perceptual=load_vgg(config.loss.vgg16, views.device),
         edges=losses.mesh_edges(views.head.faces),
     )
 
@@ -79,8 +75,7 @@ def prepare(views: HeadViews, config: Config, rank: int = 0, world: int = 1) -> 
 def with_map_size(config: Config, views: HeadViews) -> Config:
     """Replace ``n_g = 0`` by a side that suits the head's size in the images.
 
-    The aim is one texel per pixel: the largest heads show half of their surface, and a map covers
-    three quarters of its texels. More Gaussians than pixels would cost time and show nothing.
+    The aim is one texel per pixel: the largest heads show half of their surface.
     """
     if config.model.n_g:
         return config
@@ -138,23 +133,18 @@ def split_samples(keys: Sequence[SampleKey], config: Config) -> tuple[list[int],
 
 def make_optimizer(model: GRMM, config: Config) -> torch.optim.Optimizer:
     """Build Adam with one group each for codes, texel parameters, refinement and the rest."""
-    settings = config.train
     codes = [model.z_id, model.z_exp]
-    texels = [
-        parameter
-        for ladder in (model.transform, model.opacity, model.colour)
-        for parameter in ladder.texel_parameters()
-    ]
+    texels = model.texel_parameters()
     refinement = [] if model.refinement is None else list(model.refinement.parameters())
     special = {id(parameter) for parameter in codes + texels + refinement}
     rest = [parameter for parameter in model.parameters() if id(parameter) not in special]
     groups = [
         {"params": rest, "scale": 1.0},
-        {"params": codes, "scale": settings.code_lr_scale},
-        {"params": texels, "scale": settings.texel_lr_scale},
-        {"params": refinement, "scale": settings.refine_lr_scale},
+        {"params": codes, "scale": config.train.code_lr_scale},
+        {"params": texels, "scale": config.train.texel_lr_scale},
+        {"params": refinement, "scale": config.train.refine_lr_scale},
     ]
-    return torch.optim.Adam(groups, lr=settings.lr, fused=True)
+    return torch.optim.Adam(groups, lr=config.train.lr, fused=True)
 
 
 def budget_used(state: TrainState, config: Config) -> float:
@@ -243,45 +233,32 @@ def start_log(path: Path, iteration: int) -> None:
     if not path.exists():
         return
     kept = []
-    for line in read_text(path, TrainError).split("\n"):
-        with contextlib.suppress(FormatError):  # a kill may have cut the last line short
-            row = parse_json(line, str(path), FormatError)
-            if isinstance(row, dict) and row.get("iteration", iteration + 1) <= iteration:
-                kept.append(json.dumps(row) + "\n")
+    for line in read_text(path, TrainError).splitlines():
+        # A kill may have cut the last line short.
+        with contextlib.suppress(ValueError, TypeError, KeyError):
+            if json.loads(line)["iteration"] <= iteration:
+                kept.append(line + "\n")
     write_bytes(path, "".join(kept).encode())
 
 
 def append_log(path: Path, state: TrainState) -> None:
     """Append where a run is to OUT/log.jsonl, one JSON object per line."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    entry = {"iteration": state.iteration, "seconds": round(state.seconds, 3)}
     numbers = {"loss": sum(state.terms.values())} | state.terms
+    entry = {"iteration": state.iteration, "seconds": round(state.seconds, 3)}
     entry |= {name: round(value, 8) for name, value in numbers.items()}
     with path.open("a", encoding="utf-8") as file:
         file.write(json.dumps(entry) + "\n")
 
 
-@dataclass
-class Interrupt:
-    """Set by Ctrl-C or SIGTERM."""
-
-    requested: bool = False
-
-
-@contextmanager
-def deferred_interrupt() -> Iterator[Interrupt]:
-    """Let the current iteration end before Ctrl-C or SIGTERM takes effect."""
-    interrupt = Interrupt()
-
-    def request(number: int, frame: object) -> None:
-        interrupt.requested = True
-
+@contextlib.contextmanager
+def deferred_interrupt() -> Iterator[Event]:
+    """Let the current iteration end before Ctrl-C or SIGTERM takes effect; they set the event."""
+    interrupt, former = Event(), {}
     try:
-        former = {s: signal.signal(s, request) for s in (signal.SIGINT, signal.SIGTERM)}
-    except ValueError:  # only the main thread gets signals
-        yield interrupt
-        return
-    try:
+        if current_thread() is main_thread():  # no other gets signals
+            for number in (signal.SIGINT, signal.SIGTERM):
+                former[number] = signal.signal(number, lambda *_: interrupt.set())
         yield interrupt
     finally:
         for number, handler in former.items():

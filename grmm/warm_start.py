@@ -12,10 +12,8 @@ import torch
 from torch import Tensor
 
 from grmm.anchors import tangent_frames
-from grmm.data import HeadViews, Item
-from grmm.model import GRMM
-from grmm.sampler import spread
-from grmm.scene import Gaussians
+from grmm.data import HeadViews, Item, spread
+from grmm.model import GRMM, Gaussians
 
 IMAGES_PER_SUBJECT = 96  # more hardly change the mean texture
 FACING = 0.25  # cosine of normal and view below which a texel is seen too obliquely
@@ -46,20 +44,15 @@ def warm_start(
     logits = torch.logit(stack.clamp(LOGIT_LIMIT, 1 - LOGIT_LIMIT))
     bias = model.colour.bias.flatten(1)
     bias[:3, model.texels] = logits.mean(0).T
-    if model.colour.modes is not None and len(model.subjects) > 1:
-        _write_modes(model, model.colour.modes, logits)
-
-
-def _write_modes(model: GRMM, all_modes: Tensor, logits: Tensor) -> None:
-    """Write the principal components of the subjects' textures (S, N, 3) into modes and codes."""
-    deviations = (logits - logits.mean(0)).flatten(1)
-    u, s, v = torch.linalg.svd(deviations.double(), full_matrices=False)
-    count = min(len(s) - 1, len(all_modes))
+    if model.colour.modes is None or len(model.subjects) == 1:
+        return
+    u, s, v = torch.linalg.svd((logits - logits.mean(0)).flatten(1).double(), full_matrices=False)
+    modes = model.colour.modes.flatten(2)
+    count = min(len(s) - 1, len(modes))
     # Codes of unit spread: every decoder then distinguishes the subjects from its first step.
     scale = u[:, :count].std(0).clamp_min(1e-8)
     model.z_id[:, :count] = (u[:, :count] / scale).to(model.z_id.dtype)
     basis = (v[:count] * (s[:count] * scale)[:, None]).to(model.z_id.dtype)
-    modes = all_modes.flatten(2)
     for k in range(count):
         modes[k][:3, model.texels] = basis[k].view(-1, 3).T
 
@@ -74,15 +67,13 @@ def project_texture(
 ) -> tuple[Tensor, Tensor]:
     """Return the mean footage colour of each texel over the views that see it.
 
-    Returns:
-        colours (N, 3) in [0, 1]; weight (N,), 0 where no view sees the texel.
+    Codes are zero by default. Returns colours (N, 3) in [0, 1] and weights (N,), which are 0 where
+    no view sees the texel.
     """
-    count = len(model.texels)
-    total = model.z_id.new_zeros(count, 3)
-    weight = model.z_id.new_zeros(count)
-    zero_id, zero_exp = torch.zeros_like(model.z_id[0]), torch.zeros_like(model.z_exp[0])
-    z_id = zero_id if z_id is None else z_id
-    z_exp = zero_exp if z_exp is None else z_exp
+    total = model.z_id.new_zeros(len(model.texels), 3)
+    weight = model.z_id.new_zeros(len(model.texels))
+    z_id = torch.zeros_like(model.z_id[0]) if z_id is None else z_id
+    z_exp = torch.zeros_like(model.z_exp[0]) if z_exp is None else z_exp
     states: dict[int, Gaussians] = {}
     for index in indices:
         item = views.item(index)
@@ -126,14 +117,9 @@ def spread_change(
     """Predict the change of every texel (N, 3) from the changes of seen texels.
 
     A kernel regression on colour before the change and on place, with the head's left and right
-    folded together; at most ``samples`` seen texels, evenly taken, speak for all.
-
-    Args:
-        change: (N, 3), meaningful where ``weight`` is positive.
-        weight: (N,) how well each texel was seen.
-        colours: (N, 3) before the change, in [0, 1].
-        means: (N, 3) head space, metres.
-        samples: bound on the work.
+    folded together; at most ``samples`` seen texels, evenly taken, speak for all. ``change`` (N, 3)
+    counts where ``weight`` (N,) is positive; ``colours`` (N, 3) in [0, 1] are those before it, and
+    ``means`` (N, 3) the places in head space, metres.
     """
     seen = torch.nonzero(weight > 0.25 * weight.max())[:, 0] if bool((weight > 0).any()) else []
     if not len(seen):

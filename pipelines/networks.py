@@ -14,7 +14,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 import torch
 
@@ -85,25 +84,13 @@ def load_network(path: Path, role: Role) -> Network:
         StageError: it is not such a network, or onnxruntime is not installed.
     """
     check_file(path, role.setting)
-    return _load(path, role)
+    return _onnx(path, role) if path.suffix.lower() == ".onnx" else _torchscript(path, role)
 
 
 def check_file(path: Path, setting: str) -> None:
     """Raise ConfigError if the file of weights is missing."""
     if not path.is_file():
         raise ConfigError(f"{setting} {path}: no such file; expected TorchScript or .onnx")
-
-
-def resized(image: np.ndarray, height: int, width: int) -> np.ndarray:
-    """An image (H, W[, C]) at another size: averaged to shrink, interpolated to grow."""
-    shrinks = height <= image.shape[0] and width <= image.shape[1]
-    how = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
-    return cv2.resize(np.ascontiguousarray(image), (width, height), interpolation=how)
-
-
-@cached_by_file(2)
-def _load(path: Path, role: Role) -> Network:
-    return _onnx(path, role) if path.suffix.lower() == ".onnx" else _torchscript(path, role)
 
 
 def _error(path: Path, role: Role, why: str) -> StageError:
@@ -126,6 +113,7 @@ def _check_inputs(path: Path, role: Role, least: int, most: int) -> None:
         )
 
 
+@cached_by_file(2)
 def _torchscript(path: Path, role: Role) -> Network:
     """A TorchScript module: on CUDA in half precision where there is one, else on the CPU."""
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
@@ -178,28 +166,31 @@ def _run_torchscript(
             answer = [answer]
         if not isinstance(answer, list | tuple) or not answer:
             raise _error(path, role, f"gave {type(answer).__name__}, expected tensors")
-        answer = [a for a in answer if isinstance(a, torch.Tensor)] or _flat(path, role, answer)
-        return [a.float().cpu().numpy() for a in answer]
+        tensors = [a for a in answer if isinstance(a, torch.Tensor)]
+        if not tensors:
+            # BiRefNet in training form wraps the list of its scales, the finest last, in another.
+            tensors = answer[role.place]
+            inside = isinstance(tensors, list | tuple)
+            if not inside or not all(isinstance(a, torch.Tensor) for a in tensors):
+                kind = type(tensors).__name__
+                raise _error(path, role, f"gave {kind} inside its output, expected tensors")
+        return [a.float().cpu().numpy() for a in tensors]
 
 
-def _flat(path: Path, role: Role, answer: Sequence) -> list[torch.Tensor]:
-    """BiRefNet in training form wraps the list of its scales, the finest last, in another."""
-    inner = answer[role.place]
-    if isinstance(inner, list | tuple) and all(isinstance(a, torch.Tensor) for a in inner):
-        return list(inner)
-    raise _error(path, role, f"gave {type(inner).__name__} inside its output, expected tensors")
-
-
+@cached_by_file(2)
 def _onnx(path: Path, role: Role) -> Network:
     """An ONNX graph, on CUDA where onnxruntime has it, else on as many threads as torch may use."""
     try:
         import onnxruntime
+        from onnxruntime.capi import onnxruntime_pybind11_state as state
     except ImportError:
         raise StageError(
             f"{role.setting} {path}: ONNX files need onnxruntime, which is not installed;"
             " run pip install 'express50[networks]'"
         ) from None
-    errors = _onnx_errors()
+    # The exceptions of onnxruntime share no base class of their own.
+    kinds = (kind for kind in vars(state).values() if isinstance(kind, type))
+    errors = tuple(kind for kind in kinds if issubclass(kind, Exception))
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads, options.inter_op_num_threads = torch.get_num_threads(), 1
     options.log_severity_level = 3
@@ -233,11 +224,3 @@ def _onnx(path: Path, role: Role) -> Network:
     height, width = [*slots[0].shape, None, None, None, None][2:4]
     fixed = isinstance(height, int) and isinstance(width, int)
     return Network(path, role, (height, width) if fixed else None, run)
-
-
-def _onnx_errors() -> tuple[type[Exception], ...]:
-    """List the exceptions of onnxruntime, which share no base class of their own."""
-    from onnxruntime.capi import onnxruntime_pybind11_state as state
-
-    kinds = (kind for kind in vars(state).values() if isinstance(kind, type))
-    return tuple(kind for kind in kinds if issubclass(kind, Exception))

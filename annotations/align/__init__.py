@@ -10,7 +10,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from annotations.store import human_digest
+from annotations.labels import human_digest
+from annotations.observe import STAGE as OBSERVE
 from annotations.suggestions import reference_subject
 from express50.contract.layout import Dataset
 from express50.contract.stage import Growth, Result, Stage
@@ -33,14 +34,12 @@ class AlignConfig:
 
 def inputs(dataset: Dataset, item: str, config: AlignConfig) -> dict[str, Path | str]:
     """List index, observations and human labels of the subject and of the reference."""
-    from annotations.observe.observations import observations_path  # imports numpy
-
-    other = reference_subject(dataset) if config.match else item
-    read: dict[str, Path | str] = {} if other == item else {"reference": other}
-    for prefix, subject in {"": item, "reference_": other}.items():
-        if prefix and other == item:
-            continue
-        observations = observations_path(dataset, subject)
+    read: dict[str, Path | str] = {}
+    subjects = {"": item}
+    if config.match and (other := reference_subject(dataset)) != item:
+        read["reference"] = subjects["reference_"] = other
+    for prefix, subject in subjects.items():
+        observations = dataset.observations_file(subject)
         read[f"{prefix}index"] = dataset.index_file(subject)
         read[f"{prefix}observe"] = observations if observations.is_file() else "absent"
         read[f"{prefix}labels"] = human_digest(dataset, subject)
@@ -64,6 +63,6 @@ STAGE = Stage(
     run=run,
     help="suggest, match to the reference and accept the peak frame of each expression",
     purpose="The labelled frame of every expression, between its cue window's first and last.",
-    runs_first=("observe",),
+    runs_first=(OBSERVE.name,),
     growth=Growth(items=("subjects",), time=("frames",), disk=("frames",)),
 )

@@ -12,9 +12,17 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from annotations.observe.observations import NEUTRAL, FaceObservations
-from annotations.observe.stage import STABLE, face_side, similarity_2d, steady
+from annotations.observe.stage import (
+    NEUTRAL,
+    SEEN_SCORE,
+    STABLE,
+    FaceObservations,
+    face_side,
+    similarity_2d,
+    steady,
+)
 from express50.capture.expressions import Expression
+from express50.capture.index import Index
 
 LIDS = np.array([37, 38, 40, 41, 43, 44, 46, 47])
 _GROUPS = {
@@ -40,10 +48,12 @@ REST_DIRECTIONS = 20  # leading directions of unrest that are shrunk
 
 @dataclass(frozen=True)
 class Features:
-    """Features of a subject from C cameras in F frames, in units of each feature's noise.
+    """Features of a subject from C cameras in F observed frames, in units of each feature's noise.
 
     Attributes:
-        cameras: ids of the cameras.
+        cameras: ids of the cameras, the one that sees the face best first.
+        frames: (F,) numbers of the frames.
+        windows: expression id -> rows of ``frames`` in its cue window, in order of time.
         values: (F, N) zero at the subject's neutral; each camera has the same N / C features.
         owner: (N,) landmark 0 to 67 that a feature belongs to or lies nearest to.
         camera: (N,) which camera a feature is of, 0 to C - 1.
@@ -52,10 +62,26 @@ class Features:
     """
 
     cameras: tuple[str, ...]
+    frames: np.ndarray
+    windows: dict[str, np.ndarray]
     values: np.ndarray
     owner: np.ndarray
     camera: np.ndarray
     rest: np.ndarray
+
+
+def watch(index: Index, observations: FaceObservations) -> Features:
+    """Measure the features of a subject by cue window.
+
+    Expressions whose window holds no observed frame that shows a face are left out.
+    """
+    windows = {}
+    shown = observations.scores.max(axis=0) >= SEEN_SCORE
+    for cue in index.cues:
+        seen = (observations.frames >= cue.start_frame) & (observations.frames <= cue.end_frame)
+        if (seen & shown).any():
+            windows[cue.expression_id] = np.flatnonzero(seen & shown)
+    return measure(observations, windows)
 
 
 def measure(observations: FaceObservations, windows: dict[str, np.ndarray]) -> Features:
@@ -63,8 +89,8 @@ def measure(observations: FaceObservations, windows: dict[str, np.ndarray]) -> F
 
     Args:
         observations: of one subject.
-        windows: expression id -> rows of ``observations`` in its cue window, in order of time.
-            Without the neutral expression the windows' first frames are taken for rest.
+        windows: rows of ``observations`` by expression, see `Features`; none is empty. Without
+            the neutral expression the windows' first frames are taken for rest.
     """
     ends = np.concatenate([rows[[0, -1]] for rows in windows.values()])
     rest = windows.get(NEUTRAL, ends[::2])
@@ -79,9 +105,28 @@ def measure(observations: FaceObservations, windows: dict[str, np.ndarray]) -> F
         owner += [np.repeat(np.arange(68), 2), nearest]
         camera.append(np.full(moved.shape[1] + cells.shape[1], number))
     return Features(
-        observations.cameras, np.concatenate(values, axis=1), np.concatenate(owner),
-        np.concatenate(camera), np.unique(np.concatenate([rest, ends])),
-    )  # fmt: skip
+        cameras=observations.cameras,
+        frames=observations.frames,
+        windows=windows,
+        values=np.concatenate(values, axis=1),
+        owner=np.concatenate(owner),
+        camera=np.concatenate(camera),
+        rest=np.unique(np.concatenate([rest, ends])),
+    )
+
+
+def shared_columns(features: Features, other: Features) -> np.ndarray:
+    """Pair the columns (2, K) that measure the same on two subjects.
+
+    Cameras of the same id are paired; where there are none, those that see each face best.
+    """
+    common = [camera for camera in features.cameras if camera in other.cameras]
+    pairs = [(features.cameras.index(c), other.cameras.index(c)) for c in common] or [(0, 0)]
+    columns = [
+        np.stack([np.flatnonzero(features.camera == a), np.flatnonzero(other.camera == b)])
+        for a, b in pairs
+    ]
+    return np.concatenate(columns, axis=1)
 
 
 def displacements(
@@ -105,7 +150,14 @@ def looks(faces: np.ndarray, neutral: np.ndarray) -> tuple[np.ndarray, np.ndarra
     Contrast against the surroundings, not brightness, so that light and exposure do not count;
     cells that show no face are 0.
     """
-    cells = np.stack([_contrast(face) for face in faces]).reshape(len(faces), -1)
+    cells = np.empty((len(faces), CELLS * CELLS), np.float32)
+    wide = faces.shape[1] / 8
+    for cell, face in zip(cells, faces, strict=True):
+        grey = face.astype(np.float32) / 255.0
+        flat = grey - cv2.GaussianBlur(grey, (0, 0), wide)
+        spread = np.sqrt(cv2.GaussianBlur(flat**2, (0, 0), wide)) + 0.02  # a local deviation
+        fine = cv2.GaussianBlur(flat / spread, (0, 0), 0.8)
+        cell[:] = cv2.resize(fine, (CELLS, CELLS), interpolation=cv2.INTER_AREA).reshape(-1)
     centre = (neutral.min(0) + neutral.max(0)) / 2
     layout = (neutral - centre) / face_side(neutral) + 0.5
     places = (np.arange(CELLS) + 0.5) / CELLS
@@ -113,16 +165,6 @@ def looks(faces: np.ndarray, neutral: np.ndarray) -> tuple[np.ndarray, np.ndarra
     away = np.linalg.norm(grid - layout, axis=-1)
     cells[:, away.min(1) > CELL_REACH] = 0.0
     return cells, away.argmin(1)
-
-
-def _contrast(face: np.ndarray) -> np.ndarray:
-    """Compare cells (CELLS, CELLS) of a grey face with their surroundings, in local deviations."""
-    grey = face.astype(np.float32) / 255.0
-    wide = len(face) / 8
-    flat = grey - cv2.GaussianBlur(grey, (0, 0), wide)
-    spread = np.sqrt(cv2.GaussianBlur(flat**2, (0, 0), wide)) + 0.02
-    fine = cv2.GaussianBlur(flat / spread, (0, 0), 0.8)
-    return cv2.resize(fine, (CELLS, CELLS), interpolation=cv2.INTER_AREA)
 
 
 def in_noise(values: np.ndarray, windows: dict[str, np.ndarray]) -> np.ndarray:

@@ -6,12 +6,14 @@ clip itself: frames that show the expression define the direction, which in turn
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from annotations.observe.stage import steady
+from annotations.align.features import Features, expression_values, shared_columns
+from annotations.observe.stage import NEUTRAL, steady
+from express50.capture.expressions import Expression
 
 CANDIDATES, CANDIDATE_GAP = 5, 3
 NEAR_FRAMES = 2.0  # an event's direction is learnt from frames about its apex (sigma)
@@ -68,6 +70,64 @@ class Suggestion:
     activity: np.ndarray
     match: np.ndarray | None
     candidates: list[int]
+
+
+@dataclass(frozen=True)
+class Reference:
+    """The reference identity, and the frames that people chose as canonical, by expression."""
+
+    features: Features
+    chosen: Mapping[str, int]
+    flagged: frozenset[str] = frozenset()
+
+
+def suggest_all(
+    features: Features, script: Mapping[str, Expression], reference: Reference | None
+) -> tuple[dict[str, Suggestion], dict[str, int]]:
+    """Suggest a frame of every expression; name the canonical frame it was matched to.
+
+    Args:
+        features: of the subject to suggest for.
+        script: the known expressions; for others all of the face counts.
+        reference: None where the subject is the reference, or it is not observed.
+    """
+    groups = features.owner + 68 * features.camera
+    found, canonical = {}, {}
+    for expression, rows in features.windows.items():
+        entry = script.get(expression)
+        values = expression_values(features, entry, rows)
+        if expression == NEUTRAL:
+            tops = [  # how far expressions usually move the face from rest, in units of noise
+                unrest(expression_values(features, entry, window)).max()
+                for window in features.windows.values()
+            ]
+            found[expression] = suggest_rest(values, groups, float(np.median(tops)))
+            continue
+        target = None
+        if (
+            reference is not None
+            and expression in reference.features.windows
+            and expression not in reference.flagged
+        ):
+            canonical[expression], target = _target(features, reference, expression, entry)
+        found[expression] = suggest(values, groups, target)
+    return found, canonical
+
+
+def _target(
+    features: Features, reference: Reference, expression: str, entry: Expression | None
+) -> tuple[int, Canonical]:
+    """Express the reference's frame, chosen or else its apex, in the subject's features."""
+    theirs = reference.features
+    rows = theirs.windows[expression]
+    values = expression_values(theirs, entry, rows)
+    if expression in reference.chosen:
+        row = int(np.argmin(np.abs(theirs.frames[rows] - reference.chosen[expression])))
+    else:
+        row = strongest_event(values).apex
+    frame = reference.chosen.get(expression, int(theirs.frames[rows[row]]))
+    shared = shared_columns(features, theirs)
+    return frame, canonical_of(values, row, shared, features.values.shape[1])
 
 
 def suggest(values: np.ndarray, groups: np.ndarray, canonical: Canonical | None) -> Suggestion:
@@ -229,7 +289,13 @@ def _event_about(values: np.ndarray, weights: np.ndarray, row: int) -> Event:
     """Find the event that a row belongs to; frames about the row give its direction."""
     near = np.exp(-0.5 * ((np.arange(len(values)) - row) / NEAR_FRAMES) ** 2)
     curve, direction = _follow(values, near * weights, near, 3)
-    return Event(_climb(steady(curve), row), curve, direction)
+    even = steady(curve)
+    while True:  # climb to the local maximum
+        low = max(0, row - 1)
+        best = low + int(np.argmax(even[low : row + 2]))
+        if even[best] <= even[row]:
+            return Event(row, curve, direction)
+        row = best
 
 
 def apex_of(curve: np.ndarray) -> int:
@@ -268,16 +334,6 @@ def _follow(
         direction = _unit((near * curve) @ values)
         curve = np.maximum(values @ direction, 0.0)
     return curve, direction
-
-
-def _climb(curve: np.ndarray, row: int) -> int:
-    """Climb a curve from a row to the local maximum."""
-    while True:
-        around = [r for r in (row - 1, row, row + 1) if 0 <= r < len(curve)]
-        best = max(around, key=lambda r: (curve[r], r == row))
-        if best == row:
-            return row
-        row = best
 
 
 def _unit(direction: np.ndarray) -> np.ndarray:

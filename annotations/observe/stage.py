@@ -1,4 +1,4 @@
-"""The observe stage's work: which cameras watch a face, and what each sees of it.
+"""The observe stage's work: which cameras watch a face, what each sees of it, and its file.
 
 The network looks through one window per clip, and head motion is averaged over time: both keep the
 jitter of single detections out of the curves in which expressions are searched for.
@@ -7,26 +7,68 @@ jitter of single detections out of the curves in which expressions are searched 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
 import torch
 
-from annotations.observe.observations import NEUTRAL, SCHEMA, SEEN_SCORE
 from express50.capture.frames import read_proxy
 from express50.capture.index import Cue, Index, read_index
 from express50.contract.layout import Dataset
 from express50.contract.stage import Note, Result
-from express50.errors import StageError
+from express50.errors import FormatError, StageError
+from express50.files.arrays import read_arrays
 from express50.files.images import contact_sheet, write_image
-from express50.geometry.conventions import affine_to_opencv
 from express50.geometry.transforms import similarity_fit
-from express50.landmarks.detector import SMALLEST, detect, window_about
+from express50.landmarks.detector import SMALLEST, cut_crop, detect, window_about
 from express50.landmarks.network import CROP, MIRROR, LandmarkNet, face_box, load_network
 
+SCHEMA = "express50.observations/1"
+NEUTRAL = "neutral"
+SEEN_SCORE = 0.15  # of a frame that shows the face at all
 TRIES = 8  # frames all over the clips in which a face is searched for, should rest show none
 RANKED_SHARE = 0.8  # of the best camera's score: one that sees less adds more noise than news
+
+
+@dataclass(frozen=True)
+class FaceObservations:
+    """The faces that C cameras saw of a subject in F frames.
+
+    Attributes:
+        cameras: ids, the one that sees the face best first.
+        frames: (F,) frame numbers, increasing.
+        points: (C, F, 68, 2) landmarks in proxy pixels.
+        scores: (C, F) face scores, 0 to 1.
+        faces: (C, F, S, S) uint8 grey, head motion removed.
+    """
+
+    cameras: tuple[str, ...]
+    frames: np.ndarray
+    points: np.ndarray
+    scores: np.ndarray
+    faces: np.ndarray
+
+
+def read_observations(dataset: Dataset, subject: str) -> FaceObservations:
+    """Read a subject's observations.
+
+    Raises:
+        StageError: the subject was not observed.
+        FormatError: the file is damaged or of another version.
+    """
+    path = dataset.observations_file(subject)
+    if not path.is_file():
+        raise StageError(f"{path}: {subject!r} is not observed; run 'express50 align' on it")
+    try:
+        table = read_arrays(path, FormatError, "observations", fix="run 'express50 align'")
+        if str(table["schema"]) != SCHEMA:
+            raise ValueError(f"schema is {table['schema']}, expected {SCHEMA}")
+        rest = (table[key] for key in ("frames", "points", "scores", "faces"))
+        return FaceObservations(tuple(map(str, table["cameras"])), *rest)
+    except (ValueError, KeyError, TypeError) as error:
+        raise FormatError(f"{path}: not observations ({error}); run 'express50 align'") from None
 
 
 def run(
@@ -246,6 +288,4 @@ def _cut(image: np.ndarray, window: np.ndarray, size: int) -> np.ndarray:
         small = (max(1, round(width / step)), max(1, round(height / step)))
         image = cv2.resize(image, small, interpolation=cv2.INTER_AREA)
     scale = np.array([[image.shape[1] / width], [image.shape[0] / height]])
-    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    matrix = affine_to_opencv(window * scale)
-    return cv2.warpAffine(image, matrix, (size, size), flags=flags, borderMode=cv2.BORDER_REPLICATE)
+    return cut_crop(image, window * scale, size)

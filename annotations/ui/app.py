@@ -1,59 +1,92 @@
-"""The annotator as a Textual app: keys become moves, looks and decisions."""
+"""The annotator as a Textual app: keys become moves (view), looks (aim) and decisions (session)."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 
+from rich.text import Text
 from textual import events, work
-from textual.app import App
+from textual.app import App, ComposeResult
 from textual.binding import Binding
+from textual.containers import Horizontal, Vertical
+from textual.screen import Screen
+from textual.timer import Timer
+from textual.widgets import Static
 
 from annotations.labels import Label
-from annotations.ui import panels, theme
 from annotations.ui import task as moves
-from annotations.ui.dialogs import FlagDialog, FrameDialog, HelpDialog
+from annotations.ui import theme, words
 from annotations.ui.frames import ZOOMS, FaceFinder, FrameCache, FrameCrop
-from annotations.ui.images import CellSize, PaneShape, SixelPainter
-from annotations.ui.layout import AnnotatorScreen
-from annotations.ui.picture import PicturePane, camera_name, shots_ahead
+from annotations.ui.images import CellSize, Painter, PaneShape, SixelPainter
+from annotations.ui.picture import (
+    Aim,
+    PicturePane,
+    camera_name,
+    reference_look,
+    shots_ahead,
+    strip_content,
+    subject_look,
+)
 from annotations.ui.session import Session
-from annotations.ui.task import CueView, TaskScene, load_scene
-from annotations.ui.theme import GROUPS
+from annotations.ui.task import CueView, TaskScene, load_scene, view_of_scene
 from annotations.ui.timeline import CurveStrip
 from annotations.worklist import LabelTask
 from express50.errors import Express50Error
 
 TASKS_AHEAD, FRAMES_AHEAD = 2, 12  # pictures that are made before their task is opened
+SAY_SECONDS = 5.0
+BLINK_SECONDS = 0.45
+SLOWEST, FASTEST = 2.0, 30.0  # frames per second that are played
+# Rows of the strip by the terminal's height: pictures come first.
+_STRIP_ROWS = ((18, 3), (30, 5), (45, 7))
+_TALLEST_STRIP = 9
 
 
-def open_view_of(scene: TaskScene, hidden: bool) -> CueView | None:
-    """Open a task on the annotator's own mark, else on the suggestion, else in the middle."""
-    if scene.index is None:
-        return None
-    mine = scene.mine
-    candidates = () if hidden else scene.candidates
-    cursor = None if mine is None else mine.frame
-    view = moves.open_view(scene.first, scene.last, candidates, cursor)
-    if mine is not None:
-        view = replace(view, plateau_first=mine.first, plateau_last=mine.last)
-    return view
-
-
-class Desk(AnnotatorScreen):
-    """Turns keys into moves (view), looks (aim) and decisions (session)."""
+class Desk(Screen[None]):
+    """Shows a scene, a view of it and what was said; whoever changes them calls ``draw``."""
 
     BINDINGS = [
-        Binding(
-            keys, f"pick({keys})" if key.action == "pick" else key.action, key.words, show=False
-        )
-        for group in GROUPS.values()
+        Binding(name, key.action.format(key=name), key.words, show=False)
+        for group in theme.GROUPS
         for key in group
-        for keys in (key.keys.split(",") if key.action == "pick" else [key.keys])
+        for name in key.keys.split(",")
     ]
+
+    def __init__(
+        self,
+        session: Session,
+        cache: FrameCache,
+        faces: FaceFinder | None,
+        sixel_cell: CellSize | None,
+    ) -> None:
+        super().__init__()
+        self.session = session
+        self.cache = cache
+        self.faces = faces
+        self.scene: TaskScene | None = None
+        self.view: CueView | None = None
+        self.aim = Aim(0, ZOOMS[0], faces)
+        self.player = Player(self)
+        self._sixel_cell = sixel_cell
+        self._said: tuple[str, str] | None = None
+
+    def compose(self) -> ComposeResult:
+        """Status, words, two pictures, strip, and a line for messages and hints."""
+        yield Static(id="status")
+        yield Static(id="words")
+        with Horizontal(id="panes"):
+            for name, side in (("frame", "left"), ("reference", "right")):
+                with Vertical(classes="pane", id=side):
+                    yield Static(id=f"{name}-title", classes="title")
+                    cell = self._sixel_cell
+                    painter = Painter() if cell is None else SixelPainter(cell)
+                    yield PicturePane(self.cache, name, painter)
+        yield CurveStrip()
+        yield Static(id="message")
 
     def on_mount(self) -> None:
         """Open the first task; look for faces once the network is there."""
+        self.set_interval(1.0, self._draw_status)
         if self.faces is not None:
             self._load_faces(self.faces)
 
@@ -68,6 +101,71 @@ class Desk(AnnotatorScreen):
         faces.load()
         self.app.call_from_thread(self.draw)
 
+    def on_resize(self) -> None:
+        """Give the strip what the height allows, then draw all anew."""
+        height = self.app.size.height
+        rows = next((rows for below, rows in _STRIP_ROWS if height < below), _TALLEST_STRIP)
+        self.query_one(CurveStrip).styles.height = rows
+        self.query_one("#words").display = height >= 14
+        self.call_after_refresh(self.draw)
+
+    def draw(self) -> None:
+        """Bring every part up to date; parts that show the same already do nothing."""
+        self._draw_message()
+        if self.scene is None:
+            return
+        self._draw_status()
+        scene, view = self.scene, self.view
+        there = reference_look(scene, self.aim)
+        picture = self.query_one("#reference", PicturePane)
+        picture.show(there, "the reference has no frame of this expression yet")
+        title = words.reference_title(scene, there, picture.size.width)
+        self._write("#reference-title", title)
+        here = None if view is None else subject_look(scene, view, self.aim)
+        swapped = there if self.player.swapped else None
+        picture = self.query_one("#frame", PicturePane)
+        picture.show(swapped or here, scene.problem or "")
+        title = words.frame_title(scene, view, here, picture.size.width)
+        if self.player.blinks:
+            shown = "the frame" if swapped is None else "the reference"
+            title = Text(f" blink: {shown}  (any key stops)", style=f"bold {theme.ACCENT}")
+        self._write("#frame-title", title)
+        content = None
+        if view is not None:
+            content = strip_content(scene, view, self.session.hidden(scene.task))
+            self.cache.want(shots_ahead(scene, view, self.aim, picture.shape))
+        self.query_one(CurveStrip).show(content)
+
+    def _draw_status(self) -> None:
+        if self.scene is not None:
+            width = self.app.size.width
+            self._write("#status", words.status_line(self.session, self.scene, width))
+            self._write("#words", Text(f" {self.scene.description}", style=theme.TEXT))
+
+    def _draw_message(self) -> None:
+        if self._said is None:
+            self._write("#message", words.hint_line(self.app.size.width))
+        else:
+            message, colour = self._said
+            self._write("#message", Text(f" {message}", style=colour))
+
+    def _write(self, where: str, text: Text) -> None:
+        line = self.query_one(where, Static)
+        if line.content != text:
+            line.update(text)
+
+    def say(self, message: str, colour: str = theme.GREEN) -> None:
+        """Show a message in place of the hints, for some seconds or until the next message."""
+        self._said = said = (message, colour)
+
+        def hush() -> None:
+            if self._said is said:
+                self._said = None
+                self._draw_message()
+
+        self.set_timer(SAY_SECONDS, hush)
+        self._draw_message()
+
     def open_task(self) -> None:
         """Show the session's open task."""
         self.player.stop()
@@ -78,7 +176,7 @@ class Desk(AnnotatorScreen):
         self.scene = scene = load_scene(self.session.dataset, task, self.session.annotator)
         if scene.suggestion is not None:  # else the camera that was chosen last stays
             self.aim = self.aim._replace(camera=0)
-        self.view = open_view_of(scene, self.session.hidden(task))
+        self.view = view_of_scene(scene, self.session.hidden(task))
         self.draw()
         if scene.problem or scene.notes:
             self.say(scene.problem or " · ".join(scene.notes), theme.ACCENT)
@@ -91,49 +189,34 @@ class Desk(AnnotatorScreen):
         shots: list[FrameCrop] = []
         for task in tasks:
             scene = load_scene(self.session.dataset, task, self.session.annotator)
-            view = open_view_of(scene, self.session.hidden(task))
+            view = view_of_scene(scene, self.session.hidden(task))
             if view is not None:
                 shots += shots_ahead(scene, view, self.aim, shape, FRAMES_AHEAD)
         self.cache.want(shots, later=True)
 
     # Moves and looks
 
-    def _move(self, how: Callable[[CueView], CueView]) -> None:
+    def move(self, how: Callable[..., CueView], *numbers: int) -> None:
+        """Stop what plays, and move by a function of the view."""
         self.player.stop()
         if self.view is not None:
-            self.view = how(self.view)
+            self.view = how(self.view, *numbers)
         self.draw()
 
-    def action_step(self, by: int) -> None:
-        """Step some frames on or back."""
-        self._move(lambda view: moves.step(view, by))
-
-    def action_go_to(self, where: str) -> None:
-        """Go to an end of the cue window."""
-        self._move(lambda view: moves.go_to(view, getattr(view, where)))
+    def action_move(self, how: str, *numbers: int) -> None:
+        """Move by a function of `annotations.ui.task`, by its name."""
+        self.move(getattr(moves, how), *numbers)
 
     def action_candidate(self, by: int) -> None:
         """Go to the next or previous suggestion."""
-        self._move(lambda view: moves.next_candidate(view, by))
+        self.move(moves.next_candidate, by)
         if self.view is not None and not self.view.candidates:
             hidden = self.scene is not None and self.session.hidden(self.scene.task)
             self.say("hidden until you have decided" if hidden else "no suggestion", theme.ACCENT)
 
-    def action_pick(self, number: int) -> None:
-        """Go to a suggestion by its rank."""
-        self._move(lambda view: moves.pick_candidate(view, number - 1))
-
-    def action_plateau_first(self) -> None:
-        """Begin the plateau at the cursor."""
-        self._move(moves.set_plateau_first)
-
-    def action_plateau_last(self) -> None:
-        """End the plateau at the cursor."""
-        self._move(moves.set_plateau_last)
-
     def on_curve_strip_picked(self, message: CurveStrip.Picked) -> None:
         """Go to the frame that was clicked on the strip."""
-        self._move(lambda view: moves.go_to(view, message.frame))
+        self.move(moves.go_to, message.frame)
 
     def action_zoom(self, by: int) -> None:
         """Change to the next zoom."""
@@ -180,7 +263,7 @@ class Desk(AnnotatorScreen):
                 self._decide(lambda: self.session.flag(scene, reason))
 
         self.player.stop()
-        self.app.push_screen(FlagDialog(), flag)
+        self.app.push_screen(words.FlagDialog(), flag)
 
     def _decide(self, decide: Callable[[], Label]) -> None:
         """Save a decision, say so once it is on disk, and open the next task."""
@@ -189,13 +272,10 @@ class Desk(AnnotatorScreen):
         except (Express50Error, OSError) as error:
             self.say(f"not saved: {error}", theme.RED)
             return
-        words = panels.saved_words(label)
-        if self.session.advance():
-            self.open_task()
-            self.say(words)
-        else:
-            self.open_task()
-            self.say(f"all {len(self.session.tasks)} done. q leaves, p looks back. {words}")
+        more = self.session.advance()
+        self.open_task()
+        done = "" if more else f"all {len(self.session.tasks)} done. q leaves, p looks back. "
+        self.say(done + words.saved(label))
 
     def action_undo(self) -> None:
         """Take the last decision back and show its task."""
@@ -224,49 +304,81 @@ class Desk(AnnotatorScreen):
 
         def go_to(frame: int | None) -> None:
             if frame is not None:
-                self._move(lambda view: moves.go_to(view, frame))
+                self.move(moves.go_to, frame)
 
         if self.view is not None:
             self.player.stop()
-            self.app.push_screen(FrameDialog(self.view.first, self.view.last), go_to)
+            self.app.push_screen(words.FrameDialog(self.view.first, self.view.last), go_to)
 
     def action_help(self) -> None:
         """Show every key."""
         self.player.stop()
-        self.app.push_screen(HelpDialog())
+        self.app.push_screen(words.HelpDialog())
 
     def action_quit(self) -> None:
         """Leave; every decision is on disk already."""
         self.app.exit()
 
 
-_STYLE = f"""
-Screen {{ background: {theme.GROUND}; color: {theme.TEXT}; layout: vertical; }}
-#status, #words, #message, .title {{ height: 1; width: 100%; }}
-#status, #message {{ background: {theme.PANEL}; }}
-.title {{ background: {theme.GROUND}; }}
-#panes {{ height: 1fr; }}
-.pane {{ width: 1fr; height: 100%; }}
-#right {{ margin-left: 1; }}
-#frame, #reference {{ width: 100%; height: 1fr; }}
-#strip {{ width: 100%; height: 5; }}
-ModalScreen {{ align: center middle; background: {theme.GROUND} 60%; }}
-.dialog {{
-    width: auto; min-width: 40; max-width: 100%; height: auto; max-height: 100%; padding: 0 2;
-    background: {theme.PANEL}; border: round {theme.ACCENT}; overflow-y: auto;
-    border-title-color: {theme.ACCENT}; border-subtitle-color: {theme.FAINT};
-}}
-.dialog Static {{ width: auto; height: auto; }}
-.help {{ width: 108; }}
-.help Static {{ width: 100%; }}
-.dialog Input {{ width: 44; height: 3; border: round {theme.FAINT}; background: {theme.PANEL}; }}
-"""
+class Player:
+    """Plays the window or blinks the pictures of a desk, one at a time.
+
+    Attributes:
+        plays: whether the window is played.
+        blinks: whether frame and reference take turns.
+        swapped: whether the reference stands in the frame's place.
+    """
+
+    def __init__(self, desk: Desk) -> None:
+        self._desk = desk
+        self._timer: Timer | None = None
+        self.plays = self.blinks = self.swapped = False
+
+    def play(self) -> None:
+        """Play from the cursor on, from the start where the cursor stands at the end; or stop."""
+        desk = self._desk
+        if self.stop() or desk.view is None or desk.scene is None or desk.scene.index is None:
+            return
+        if desk.view.cursor == desk.view.last:
+            desk.view = moves.go_to(desk.view, desk.view.first)
+        rate = min(max(desk.scene.index.fps, SLOWEST), FASTEST)
+
+        def next_frame() -> None:
+            if desk.view is None or desk.view.cursor == desk.view.last:
+                self.stop()
+            else:
+                desk.view = moves.step(desk.view, 1)
+            desk.draw()
+
+        self._timer = desk.set_interval(1.0 / rate, next_frame)
+        self.plays = True
+
+    def blink(self) -> None:
+        """Show the reference in the frame's place and back, in turns; or stop."""
+        if self.stop():
+            return
+
+        def swap() -> None:
+            self.swapped = not self.swapped
+            self._desk.draw()
+
+        self._timer = self._desk.set_interval(BLINK_SECONDS, swap)
+        self.blinks = self.swapped = True
+
+    def stop(self) -> bool:
+        """Stop whatever runs; return whether something did."""
+        ran = self._timer is not None
+        if self._timer is not None:
+            self._timer.stop()
+        self._timer = None
+        self.plays = self.blinks = self.swapped = False
+        return ran
 
 
 class AnnotateApp(App[None]):
     """One session at the desk."""
 
-    CSS = _STYLE
+    CSS = theme.SCREEN_STYLE
     TITLE = "express50 annotate"
     ENABLE_COMMAND_PALETTE = False
 
@@ -281,22 +393,11 @@ class AnnotateApp(App[None]):
         super().__init__()
         self.session = session
         self.cache = FrameCache(session.dataset)
-        self._faces = faces
-        self._sixel_cell = sixel_cell
-
-    @property
-    def desk(self) -> Desk:
-        """The screen below any dialog."""
-        return next(screen for screen in self.screen_stack if isinstance(screen, Desk))
+        self.desk = Desk(session, self.cache, faces, sixel_cell)
 
     def on_mount(self) -> None:
         """Show the desk."""
-
-        def make_picture(cache: FrameCache, name: str) -> PicturePane:
-            painter = None if self._sixel_cell is None else SixelPainter(self._sixel_cell)
-            return PicturePane(cache, name, painter)
-
-        self.push_screen(Desk(self.session, self.cache, self._faces, make_picture))
+        self.push_screen(self.desk)
 
     def on_unmount(self) -> None:
         """Stop decoding."""

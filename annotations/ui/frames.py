@@ -6,7 +6,7 @@ import threading
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import cv2
 import numpy as np
@@ -14,6 +14,9 @@ import numpy as np
 from express50.capture.frames import read_proxy
 from express50.contract.layout import Dataset
 from express50.errors import AnnotationError, Express50Error
+
+if TYPE_CHECKING:
+    from express50.landmarks.network import LandmarkNet
 
 LIMIT_BYTES = 192 << 20
 Box = tuple[float, float, float, float]  # left, top, right, bottom as shares of the image's sides
@@ -53,7 +56,6 @@ class FrameCache:
         self._open = True
         self._wake = threading.Condition()
         self._thread: threading.Thread | None = None
-        self.misses = 0
 
     def get(self, shot: FrameCrop) -> np.ndarray:
         """Return the picture (height, width, 3) uint8; do not write to it.
@@ -66,7 +68,6 @@ class FrameCache:
             if found is not None:
                 self._pictures.move_to_end(shot)
                 return found
-        self.misses += 1
         return self._read(shot)
 
     def want(self, shots: Sequence[FrameCrop], *, later: bool = False) -> None:
@@ -189,15 +190,6 @@ class Face:
     aspect: float
 
 
-def face_of_points(points: np.ndarray, width: int, height: int) -> Face:
-    """Measure the face of landmarks (68, 2), pixels, in a picture of that size."""
-    eyes = points[list(_EYE_CORNERS)].mean(0)
-    across = float(np.linalg.norm(points[45] - points[36]))
-    nose = float(np.linalg.norm(points[_NOSE_BASE] - points[_BRIDGE])) / _NOSE_SHARE
-    # From the side the eyes close up but the nose does not; seen from above, the other way round.
-    return Face(eyes[0] / width, eyes[1] / width, max(across, nose, 2.0) / width, height / width)
-
-
 def zoom_box(face: Face | None, zoom: str, pane_aspect: float, image_aspect: float) -> Box:
     """Find the part of a picture that a zoom shows in a pane of that height over width.
 
@@ -221,63 +213,53 @@ def zoom_box(face: Face | None, zoom: str, pane_aspect: float, image_aspect: flo
     return round(left, 4), round(top, 4), round(right, 4), round(bottom, 4)
 
 
-Detect = Callable[[np.ndarray], tuple[np.ndarray, float]]
-
-
-def load_detector() -> Detect:
-    """Load the landmark network as a function of a picture: points (68, 2), score 0 to 1."""
-    import torch  # seconds to load, and only needed here
-
-    from express50.landmarks.detector import detect
-    from express50.landmarks.network import load_network
-
-    torch.set_num_threads(1)
-    network = load_network()
-
-    def find(image: np.ndarray) -> tuple[np.ndarray, float]:
-        found = detect(network, image)
-        return found.points, found.score
-
-    return find
-
-
 class FaceFinder:
-    """Finds faces once for each frame that is asked for; loads its network in the background."""
+    """Finds faces once for each frame that is asked for; `load` reads the network it needs."""
 
-    def __init__(self, dataset: Dataset, load: Callable[[], Detect] = load_detector) -> None:
+    def __init__(self, dataset: Dataset) -> None:
         self._dataset = dataset
-        self._load = load
-        self._detect: Detect | None = None
+        self._network: LandmarkNet | None = None
         self._faces: dict[tuple[str, str, int], Face | None] = {}
         self._lock = threading.Lock()
 
     @property
     def ready(self) -> bool:
         """True once the network is loaded."""
-        return self._detect is not None
+        return self._network is not None
 
     def load(self) -> None:
         """Load the network; takes seconds, so call it in a thread."""
-        self._detect = self._load()
+        import torch  # seconds to load, and only needed here
+
+        from express50.landmarks.network import load_network
+
+        torch.set_num_threads(1)
+        self._network = load_network()
 
     def find(self, subject: str, camera: str, frame: int) -> Face | None:
         """Find the face in a frame; None without a face, or while the network is loading."""
         key = subject, camera, frame
-        if self._detect is None or key in self._faces:
+        if self._network is None or key in self._faces:
             return self._faces.get(key)
         with self._lock:
             if key not in self._faces:
-                self._faces[key] = self._look(*key)
+                self._faces[key] = self._look(self._network, *key)
         return self._faces[key]
 
-    def _look(self, subject: str, camera: str, frame: int) -> Face | None:
-        if self._detect is None:
-            return None
+    def _look(self, network: LandmarkNet, subject: str, camera: str, frame: int) -> Face | None:
+        from express50.landmarks.detector import detect
+
         try:
             image = read_proxy(self._dataset, subject, camera, frame)
         except (Express50Error, OSError, IndexError):
             return None  # the picture itself says why it cannot be shown
-        points, score = self._detect(image)
-        if score < MIN_SCORE or not np.isfinite(points).all():
+        found = detect(network, image)
+        if found.score < MIN_SCORE or not np.isfinite(found.points).all():
             return None
-        return face_of_points(points, image.shape[1], image.shape[0])
+        points, (height, width) = found.points, image.shape[:2]
+        eyes = points[list(_EYE_CORNERS)].mean(0)
+        across = float(np.linalg.norm(points[45] - points[36]))
+        nose = float(np.linalg.norm(points[_NOSE_BASE] - points[_BRIDGE])) / _NOSE_SHARE
+        # From the side the eyes close up but the nose does not; from above, the other way round.
+        unit = max(across, nose, 2.0)
+        return Face(eyes[0] / width, eyes[1] / width, unit / width, height / width)

@@ -10,16 +10,16 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
+import re
 import struct
 import sys
 import termios
-from abc import ABC, abstractmethod
-from collections import OrderedDict
 from collections.abc import Callable
 from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
+from PIL import Image
 from rich.color import Color
 from rich.color_triplet import ColorTriplet
 from rich.segment import ControlType, Segment
@@ -29,11 +29,11 @@ from textual.strip import Strip
 
 from annotations.ui import theme
 from annotations.ui.frames import FrameCrop
+from express50.errors import AnnotationError
 
-PICTURES = ("blocks", "sixel")
 KEPT = 32  # painted pictures that are kept for going back and forth
 SIXEL_PIXELS = 480 * 540  # sixels are shown at their own size; more would take too long to send
-COLOURS = 64  # of a sixel picture: 38 dB on a face; 128 give 41 dB in 1.5 times the time
+COLOURS = 96  # of a sixel picture: 34 dB on a textured face; 128 give 36 dB
 
 # Pixels of a cell in the order top left, top right, bottom left, bottom right; 1 is foreground.
 _SPLITS = np.array(
@@ -67,59 +67,50 @@ class PaneShape(NamedTuple):
     cell_aspect: float = 2.0  # a character cell is about twice as high as wide
 
 
-def cell_size() -> CellSize | None:
-    """Ask the terminal's driver for the pixels of a cell; None where it does not know them."""
+def cell_size() -> CellSize:
+    """Ask the terminal's driver for the pixels of a cell.
+
+    Raises:
+        AnnotationError: it does not know them.
+    """
     with contextlib.suppress(OSError, ValueError, AttributeError):
         terminal = sys.__stdout__.fileno()  # type: ignore[union-attr]
         answer = fcntl.ioctl(terminal, termios.TIOCGWINSZ, bytes(8))
         rows, columns, width, height = struct.unpack("4H", answer)
         if min(rows, columns) > 0 and width >= columns and height >= rows:
             return CellSize(width // columns, height // rows)
-    return None
+    raise AnnotationError(
+        "--pictures sixel: the terminal does not say how many pixels a cell has;"
+        " use --pictures blocks"
+    )
 
 
-class Painter(ABC):
-    """Paints pictures as large as a pane allows, and keeps the last ones as lines."""
+class Painter:
+    """Paints pictures as large as a pane allows, and keeps the last ones as lines.
+
+    Pictures are block characters in two colours, which any terminal in UTF-8 has.
+    """
 
     def __init__(self) -> None:
-        self._kept: OrderedDict[tuple[FrameCrop, Size], list[Strip]] = OrderedDict()
+        self.strips = lru_cache(maxsize=KEPT)(self._strips)
 
-    @abstractmethod
     def shape(self, pane: Size) -> PaneShape:
-        """Return the picture's shape in a pane of so many cells."""
+        """Return the picture's shape in a pane of so many cells: four pixels per cell."""
+        return PaneShape(max(1, pane.width), max(1, pane.height), 2, 2)
 
-    @abstractmethod
-    def _paint(self, pane: Size, picture: np.ndarray) -> list[Strip]:
-        """Return the lines of the pane."""
+    def paint(self, pane: Size, picture: np.ndarray) -> list[Strip]:
+        """Return the lines of the pane that show a picture of `shape`."""
+        return picture_strips(picture)
 
-    def strips(
+    def _strips(
         self, shot: FrameCrop, pane: Size, read: Callable[[FrameCrop], np.ndarray]
     ) -> list[Strip]:
         """Return the lines that show a crop; ``read`` gives its pixels (height, width, 3) uint8."""
-        key = shot, pane
-        if key not in self._kept:
-            self._kept[key] = self._paint(pane, read(shot))
-        self._kept.move_to_end(key)
-        while len(self._kept) > KEPT:
-            self._kept.popitem(last=False)
-        return self._kept[key]
-
-
-class BlockPainter(Painter):
-    """Block characters in two colours, which any terminal in UTF-8 has."""
-
-    few = False  # set where the terminal has 256 colours only
-
-    def shape(self, pane: Size) -> PaneShape:
-        """Return four pixels per cell."""
-        return PaneShape(max(1, pane.width), max(1, pane.height), 2, 2)
-
-    def _paint(self, pane: Size, picture: np.ndarray) -> list[Strip]:
-        return picture_strips(picture, self.few)
+        return self.paint(pane, read(shot))
 
 
 class SixelPainter(Painter):
-    """Sixels, drawn after the pane's last line."""
+    """Paints sixels, drawn after the pane's last line."""
 
     def __init__(self, cell: CellSize) -> None:
         super().__init__()
@@ -132,7 +123,8 @@ class SixelPainter(Painter):
         columns, rows = (max(1, int(side * share)) for side in pane)
         return PaneShape(columns, rows, *self._cell, self._cell.height / self._cell.width)
 
-    def _paint(self, pane: Size, picture: np.ndarray) -> list[Strip]:
+    def paint(self, pane: Size, picture: np.ndarray) -> list[Strip]:
+        """Return blank lines, the last of which draws the picture over all of them."""
         shape = self.shape(pane)
         left, top = (pane.width - shape.columns) // 2, (pane.height - shape.rows) // 2
         up, back = pane.height - 1 - top, pane.width - left
@@ -180,28 +172,9 @@ def _to_step(colours: np.ndarray) -> np.ndarray:
     return np.minimum(level * _STEP, 255).astype(np.uint8)
 
 
-def to_256(colours: np.ndarray) -> np.ndarray:
-    """Move colours (..., 3) uint8 to the cube and greys that a 256-colour terminal has."""
-    levels = np.array([0, 95, 135, 175, 215, 255])
-    bounds = (levels[1:] + levels[:-1]) / 2
-    cube = levels[np.searchsorted(bounds, colours)]
-    grey = colours.astype(np.float32).mean(-1, keepdims=True)
-    ramp = np.clip(np.rint((grey - 8) / 10) * 10 + 8, 8, 238).repeat(3, -1)
-    wanted = colours.astype(np.float32)
-    nearer = ((ramp - wanted) ** 2).sum(-1) < ((cube - wanted) ** 2).sum(-1)
-    return np.where(nearer[..., None], ramp, cube).astype(np.uint8)
-
-
-def picture_strips(picture: np.ndarray, few: bool = False) -> list[Strip]:
-    """Return the lines of text that show a picture.
-
-    Args:
-        picture: (2 h, 2 w, 3) uint8.
-        few: the terminal has 256 colours only.
-    """
+def picture_strips(picture: np.ndarray) -> list[Strip]:
+    """Return the lines of text that show a picture (2 h, 2 w, 3) uint8."""
     glyphs, front, back = cell_colours(picture)
-    if few:
-        front, back = to_256(front), to_256(back)
     weights = np.array([1 << 16, 1 << 8, 1])
     pairs = ((front.astype(np.int64) @ weights) << 24) | (back.astype(np.int64) @ weights)
     lines = []
@@ -216,12 +189,12 @@ def picture_strips(picture: np.ndarray, few: bool = False) -> list[Strip]:
 
 @lru_cache(maxsize=1 << 16)
 def _style(pair: int) -> Style:
-    return Style.from_color(_colour(pair >> 24), _colour(pair & 0xFFFFFF))
-
-
-@lru_cache(maxsize=1 << 15)
-def _colour(value: int) -> Color:
-    return Color.from_triplet(ColorTriplet(value >> 16, value >> 8 & 255, value & 255))
+    """Return the style of a foreground and a background, 24 bits each."""
+    front, back = (
+        Color.from_triplet(ColorTriplet(value >> 16 & 255, value >> 8 & 255, value & 255))
+        for value in (pair >> 24, pair)
+    )
+    return Style.from_color(front, back)
 
 
 def encode_sixel(picture: np.ndarray) -> str:
@@ -230,98 +203,23 @@ def encode_sixel(picture: np.ndarray) -> str:
     palette, numbers = quantise(picture)
     percent = np.rint(palette * (100 / 255)).astype(int)
     table = "".join(f"#{n};2;{r};{g};{b}" for n, (r, g, b) in enumerate(percent.tolist()))
-    bands = "-".join(_bands(numbers, len(palette)))
-    return f'\x1bP0;1;0q"1;1;{width};{height}{table}{bands}\x1b\\'
-
-
-def quantise(picture: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Reduce a picture to COLOURS colours (N, 3) float and each pixel's number (H, W) uint8.
-
-    Median cut (P. Heckbert, Color image quantization for frame buffer display, 1982) over colours
-    of five bits per channel: the box with most pixels times its longest side is halved at its
-    median.
-    """
-    channels = (picture >> 3).astype(np.int32)
-    codes = channels[..., 0] << 10 | channels[..., 1] << 5 | channels[..., 2]
-    counts = np.bincount(codes.reshape(-1), minlength=1 << 15)
-    used = np.flatnonzero(counts)
-    cells = np.stack([used >> 10, used >> 5 & 31, used & 31], axis=1)
-    means = np.stack(
-        [
-            np.bincount(codes.reshape(-1), picture[..., c].reshape(-1), 1 << 15)[used]
-            for c in range(3)
-        ],
-        axis=1,
-    )
-    boxes = _median_cut(cells, counts[used])
-    number_of = np.zeros(1 << 15, np.uint8)
-    palette = np.empty((len(boxes), 3))
-    for number, box in enumerate(boxes):
-        number_of[used[box]] = number
-        palette[number] = means[box].sum(0) / counts[used[box]].sum()
-    return palette, number_of[codes]
-
-
-def _median_cut(cells: np.ndarray, counts: np.ndarray) -> list[np.ndarray]:
-    """Split colours into boxes, each given by its rows of ``cells`` (N, 3)."""
-    boxes = [np.arange(len(cells))]
-    worth = [_worth(cells, counts)]
-    while len(boxes) < COLOURS and max(worth) > 0:
-        pick = int(np.argmax(worth))
-        box = boxes.pop(pick)
-        worth.pop(pick)
-        axis = int(np.argmax(np.ptp(cells[box], axis=0)))
-        box = box[np.argsort(cells[box, axis], kind="stable")]
-        below = np.cumsum(counts[box])
-        middle = int(np.searchsorted(below, below[-1] / 2)) + 1
-        middle = min(max(middle, 1), len(box) - 1)
-        for half in (box[:middle], box[middle:]):
-            boxes.append(half)
-            worth.append(_worth(cells[half], counts[half]))
-    return boxes
-
-
-def _worth(cells: np.ndarray, counts: np.ndarray) -> float:
-    """Rate the gain of halving a box; 0 for a single colour."""
-    return float(np.ptp(cells, axis=0).max()) * float(counts.sum()) if len(cells) > 1 else 0.0
-
-
-def _bands(numbers: np.ndarray, colours: int) -> list[str]:
-    """Write the bands: for each colour its number and sixels, ``$`` goes back to the left."""
-    height, width = numbers.shape
-    count = -(-height // _BAND)
-    bits = np.zeros((count, colours, width), np.uint8)
+    bits = np.zeros((-(-height // _BAND), len(palette), width), np.uint8)
     columns = np.arange(width)
     for row in range(height):
         # Columns differ, so that no place is written twice in one assignment.
         bits[row // _BAND, numbers[row], columns] |= np.uint8(1 << row % _BAND)
-    band, colour = np.nonzero(bits.any(2))
-    parts: list[list[str]] = [[] for _ in range(count)]
-    for place, number, text in zip(
-        band.tolist(), colour.tolist(), _packed(bits[band, colour]), strict=True
-    ):
-        parts[place].append(f"#{number}{text}")
-    return ["$".join(part) for part in parts]
+    bands = []
+    for band in bits:  # for each colour its number and sixels; "$" goes back to the left
+        used = np.flatnonzero(band.any(1))
+        texts = [row.tobytes().decode().rstrip("?") for row in band[used] + np.uint8(63)]
+        bands.append("$".join(f"#{n}{text}" for n, text in zip(used, texts, strict=True)))
+    runs = re.sub(r"([?-~])\1{3,}", lambda run: f"!{len(run[0])}{run[1]}", "-".join(bands))
+    return f'\x1bP0;1;0q"1;1;{width};{height}{table}{runs}\x1b\\'
 
 
-def _packed(rows: np.ndarray) -> list[str]:
-    """Write the sixels of each row (N, W), long runs as ``!count``, without blanks at the end."""
-    begins = np.ones(rows.shape, bool)
-    begins[:, 1:] = rows[:, 1:] != rows[:, :-1]
-    starts = np.flatnonzero(begins)
-    letters = rows.reshape(-1)[starts]
-    lengths = np.diff(starts, append=rows.size)
-    owners = starts // rows.shape[1]
-    last = np.append(owners[1:] != owners[:-1], True)
-    kept = ~(last & (letters == 0))
-    pieces = _pieces(letters[kept], lengths[kept])
-    ends = np.searchsorted(owners[kept], np.arange(len(rows)), side="right").tolist()
-    return ["".join(pieces[a:b]) for a, b in zip([0, *ends], ends, strict=False)]
-
-
-def _pieces(letters: np.ndarray, lengths: np.ndarray) -> list[str]:
-    """Write the text of each run; equal runs are written once and looked up."""
-    known, places = np.unique(lengths.astype(np.int64) << 8 | letters, return_inverse=True)
-    runs = ((code >> 8, chr((code & 255) + 63)) for code in known.tolist())
-    texts = [f"!{n}{letter}" if n > 3 else letter * n for n, letter in runs]
-    return [texts[place] for place in places.tolist()]
+def quantise(picture: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Reduce a picture to COLOURS colours (N, 3) and each pixel's number (H, W) uint8."""
+    reduced = Image.fromarray(picture).quantize(
+        COLOURS, method=Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE
+    )
+    return np.array(reduced.getpalette()).reshape(-1, 3), np.asarray(reduced)

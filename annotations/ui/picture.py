@@ -6,19 +6,19 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
+import numpy as np
 from rich.segment import Segment
 from rich.text import Text
 from textual.geometry import Region
 from textual.strip import Strip
 from textual.widget import Widget
 
-from annotations.suggestions import Suggested
 from annotations.ui import theme
 from annotations.ui.frames import Face, FaceFinder, FrameCache, FrameCrop, zoom_box
-from annotations.ui.images import BlockPainter, Painter, PaneShape
+from annotations.ui.images import Painter, PaneShape
 from annotations.ui.task import CueView, TaskScene
 from annotations.ui.timeline import StripContent
-from express50.capture.index import CameraSource
+from express50.capture.index import Index
 from express50.errors import AnnotationError
 
 
@@ -49,19 +49,15 @@ def shot_of(look: FrameLook, shape: PaneShape) -> FrameCrop:
 class PicturePane(Widget):
     """Shows a look, or words in its place; draws only when what it shows changes."""
 
-    def __init__(self, cache: FrameCache, name: str, painter: Painter | None = None) -> None:
+    def __init__(self, cache: FrameCache, name: str, painter: Painter) -> None:
         super().__init__(id=name)
         self._cache = cache
-        self._blocks = painter if isinstance(painter, BlockPainter) else BlockPainter()
-        self._painter = painter or self._blocks
+        self._blocks = Painter()
+        self._painter = painter
         self._look: FrameLook | None = None
         self._words = ""
         self._lines: list[Strip] | None = None
         self._covered = False
-
-    def on_mount(self) -> None:
-        """Ask how many colours there are."""
-        self._blocks.few = self.app.console.color_system != "truecolor"
 
     @property
     def look(self) -> FrameLook | None:
@@ -143,12 +139,10 @@ def subject_look(scene: TaskScene, view: CueView, aim: Aim) -> FrameLook | None:
     """Look at the frame under the cursor; None without footage."""
     if scene.index is None:
         return None
-    camera = camera_name(scene, aim.camera)
     # One framing for the whole window, so that only the face moves when one steps.
     anchor = view.candidates[0] if view.candidates else (view.first + view.last) // 2
-    face = None if aim.faces is None else aim.faces.find(scene.task.subject, camera, anchor)
-    aspect = _aspect(scene.index.cameras[camera])
-    return FrameLook(scene.task.subject, camera, view.cursor, face, aim.zoom, aspect)
+    look = _look(aim, scene.index, camera_name(scene, aim.camera), anchor)
+    return look.at(view.cursor)
 
 
 def reference_look(scene: TaskScene, aim: Aim) -> FrameLook | None:
@@ -159,15 +153,13 @@ def reference_look(scene: TaskScene, aim: Aim) -> FrameLook | None:
     camera = camera_name(scene, aim.camera)
     if camera not in index.cameras or canonical.frame >= index.cameras[camera].frames:
         camera = canonical.camera
-    face = None
-    if aim.faces is not None:
-        face = aim.faces.find(canonical.subject, camera, canonical.frame)
-    aspect = _aspect(index.cameras[camera])
-    return FrameLook(canonical.subject, camera, canonical.frame, face, aim.zoom, aspect)
+    return _look(aim, index, camera, canonical.frame)
 
 
-def _aspect(source: CameraSource) -> float:
-    return source.height / source.width
+def _look(aim: Aim, index: Index, camera: str, frame: int) -> FrameLook:
+    face = None if aim.faces is None else aim.faces.find(index.subject, camera, frame)
+    source = index.cameras[camera]
+    return FrameLook(index.subject, camera, frame, face, aim.zoom, source.height / source.width)
 
 
 def frames_ahead(view: CueView, count: int = AHEAD) -> list[int]:
@@ -193,21 +185,18 @@ def shots_ahead(
 def strip_content(scene: TaskScene, view: CueView, hidden: bool) -> StripContent:
     """Collect the timeline's content, without what could sway the annotator while it is hidden."""
     found = None if hidden else scene.suggestion
+
+    def curve(values: Sequence[float] | None) -> tuple[float, ...]:
+        """Fit a curve to the window, one value per frame; its ends are continued."""
+        if found is None or not values:
+            return ()
+        places = np.arange(view.first, view.last + 1) - found.start
+        return tuple(np.asarray(values, float)[places.clip(0, len(values) - 1)].tolist())
+
     return StripContent(
         view=view,
-        activity=curve_in_window(found, None if found is None else found.activity, view),
-        match=curve_in_window(found, None if found is None else found.match, view),
+        activity=curve(found.activity if found else None),
+        match=curve(found.match if found else None),
         mine=scene.mine,
         in_force=None if hidden else scene.in_force,
     )
-
-
-def curve_in_window(
-    found: Suggested | None, values: Sequence[float] | None, view: CueView
-) -> tuple[float, ...]:
-    """Fit a curve to the window, one value per frame; its ends are continued."""
-    if found is None or not values:
-        return ()
-    frames = range(view.first, view.last + 1)
-    places = (min(max(n - found.start, 0), len(values) - 1) for n in frames)
-    return tuple(float(values[place]) for place in places)

@@ -7,20 +7,19 @@ No screen is needed: the app calls this, and so do tests. A decision is on disk,
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Collection
+from collections.abc import Collection
 from dataclasses import dataclass, replace
 
 from annotations.labels import (
-    AUTOMATIC,
-    RULE_PREFIX,
     Label,
+    append_label,
+    labels_of,
+    make_event,
     make_flag,
     make_mark,
-    make_undo,
-    with_plateau,
+    read_labels,
 )
-from annotations.store import append_label, is_person, labels_of, read_labels
-from annotations.ui.task import CueView, TaskScene, plateau_problem
+from annotations.ui.task import CueView, TaskScene
 from annotations.worklist import LabelTask, worklist
 from express50.capture.index import read_index
 from express50.contract.layout import Dataset
@@ -38,33 +37,33 @@ class Effort:
 
 
 class Session:
-    """Tasks in order, the one that is open, decisions and their cost."""
+    """Tasks in order, the one that is open, decisions and their cost.
+
+    A session begins with the first task that the annotator has not decided.
+    """
 
     def __init__(
         self,
         dataset: Dataset,
         annotator: str,
-        tasks: list[LabelTask],
-        todo: Collection[LabelTask],
         *,
+        subjects: Collection[str] | None = None,
+        expressions: Collection[str] | None = None,
+        order: str = "doubt",
         blind: bool = False,
-        clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        if not is_person(annotator):
-            raise AnnotationError(
-                f"annotator {annotator!r}: {AUTOMATIC!r} and {RULE_PREFIX!r}... are the toolkit's"
-                " own names; give yours with --annotator"
-            )
+        """Open a session over a dataset; ``blind`` hides suggestions until a decision."""
         self.dataset = dataset
         self.annotator = annotator
-        self.tasks = tasks
         self.blind = blind
-        self._clock = clock
-        self._open = {_key(task) for task in todo}
+        self.tasks = worklist(dataset, annotator, subjects, expressions, order, everything=True)
+        todo = worklist(dataset, annotator, subjects, expressions, order)
+        self._open = {task.key for task in todo}
         self._efforts: dict[tuple[str, str], Effort] = {}
         self._decided: list[int] = []
-        self._last_key = clock()
-        self.position = next((n for n, t in enumerate(tasks) if _key(t) in self._open), 0)
+        self._clock = time.monotonic
+        self._last_key = self._clock()
+        self.position = next((n for n, t in enumerate(self.tasks) if t.key in self._open), 0)
 
     @property
     def task(self) -> LabelTask | None:
@@ -76,14 +75,9 @@ class Session:
         """Number of tasks this annotator has decided, in this session and before."""
         return len(self.tasks) - len(self._open)
 
-    @property
-    def finished(self) -> bool:
-        """True when nothing is left to decide."""
-        return not self._open
-
     def is_open(self, task: LabelTask) -> bool:
         """Return whether the annotator has not decided a task."""
-        return _key(task) in self._open
+        return task.key in self._open
 
     def hidden(self, task: LabelTask) -> bool:
         """Return whether suggestions and others' marks are hidden from the annotator."""
@@ -107,7 +101,7 @@ class Session:
         return min(max(self._clock() - self._last_key, 0.0), IDLE_SECONDS)
 
     def _here(self) -> tuple[str, str]:
-        return _key(self.task) if self.task is not None else ("", "")
+        return self.task.key if self.task is not None else ("", "")
 
     def move(self, by: int) -> bool:
         """Open a neighbouring task, decided or not; False at either end."""
@@ -129,7 +123,7 @@ class Session:
         """List the positions of the next undecided tasks after the open one, round the end."""
         total = len(self.tasks)
         order = [(self.position + n) % total for n in range(1, total + 1)] if total else []
-        return [n for n in order if _key(self.tasks[n]) in self._open][:count]
+        return [n for n in order if self.tasks[n].key in self._open][:count]
 
     def _go(self, position: int) -> None:
         self._book()
@@ -146,25 +140,17 @@ class Session:
         Raises:
             AnnotationError: the task has no footage, or the plateau leaves the frame out.
         """
-        problem = scene.problem or plateau_problem(view)
-        if problem is not None or scene.index is None:
-            raise AnnotationError(problem or "this task has no footage")
-        self._book()
-        spent = self._efforts[_key(scene.task)]
+        if scene.index is None:
+            raise AnnotationError(scene.problem or "this task has no footage")
+        label = make_mark(
+            scene.index, scene.task.expression, view.cursor, camera, self.annotator,
+            view.plateau_first, view.plateau_last,
+        )  # fmt: skip
         found = scene.suggestion
-        expression, index = scene.task.expression, scene.index
-        label = make_mark(index, expression, view.cursor, camera, self.annotator)
-        label = with_plateau(label, index, view.plateau_first, view.plateau_last)
         if found is not None:
             label = replace(label, suggested=found.frame, confidence=found.confidence)
-        label = replace(
-            label,
-            seconds=round(spent.seconds, 2),
-            keys=spent.keys,
-            shown=found is not None and not self.hidden(scene.task),
-        )
-        self._save(label)
-        return label
+        shown = found is not None and not self.hidden(scene.task)
+        return self._save(replace(label, shown=shown))
 
     def flag(self, scene: TaskScene, reason: str) -> Label:
         """Say that the open task has no usable peak; it is on disk when this returns.
@@ -174,18 +160,18 @@ class Session:
         """
         if scene.index is None:
             raise AnnotationError(scene.problem or "this task has no footage")
-        self._book()
-        spent = self._efforts[_key(scene.task)]
-        label = make_flag(scene.index, scene.task.expression, reason, self.annotator)
-        label = replace(label, seconds=round(spent.seconds, 2), keys=spent.keys)
-        self._save(label)
-        return label
+        return self._save(make_flag(scene.index, scene.task.expression, reason, self.annotator))
 
-    def _save(self, label: Label) -> None:
+    def _save(self, label: Label) -> Label:
+        """Append a decision on the open task with what it cost."""
+        self._book()
+        spent = self._efforts[self._here()]
+        label = replace(label, seconds=round(spent.seconds, 2), keys=spent.keys)
         append_label(self.dataset, label)
         self._decided.append(self.position)
-        self._open.discard((label.subject, label.expression))
-        self._efforts.pop((label.subject, label.expression), None)
+        self._open.discard(self._here())
+        self._efforts.pop(self._here())
+        return label
 
     def undo(self) -> LabelTask | None:
         """Take the annotator's last decision of this session back, else that on the open task.
@@ -199,34 +185,11 @@ class Session:
         if task.expression not in self._said(task.subject):
             return None
         index = read_index(self.dataset, task.subject)
-        append_label(self.dataset, make_undo(index, task.expression, self.annotator))
+        append_label(self.dataset, make_event(index, task.expression, "undo", self.annotator))
         if task.expression not in self._said(task.subject):
-            self._open.add(_key(task))
+            self._open.add(task.key)
         self._go(target)
         return task
 
     def _said(self, subject: str) -> dict[str, Label]:
         return labels_of(read_labels(self.dataset, subject), self.annotator)
-
-
-def _key(task: LabelTask) -> tuple[str, str]:
-    return task.subject, task.expression
-
-
-def open_session(
-    dataset: Dataset,
-    annotator: str,
-    *,
-    subjects: Collection[str] | None = None,
-    expressions: Collection[str] | None = None,
-    order: str = "doubt",
-    blind: bool = False,
-) -> Session:
-    """Open a session over a dataset on the first task that the annotator has not decided.
-
-    Raises:
-        AnnotationError: unknown order or subject, or an annotator's name that is the toolkit's.
-    """
-    everything = worklist(dataset, annotator, subjects, expressions, order, everything=True)
-    todo = worklist(dataset, annotator, subjects, expressions, order)
-    return Session(dataset, annotator, everything, todo, blind=blind)

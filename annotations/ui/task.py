@@ -8,8 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from annotations.labels import Label, shows_labelled_frame
-from annotations.store import current_labels, labels_of, read_labels
+from annotations.labels import Label, current_labels, labels_of, read_labels, shows_labelled_frame
 from annotations.suggestions import (
     CanonicalFrame,
     Suggested,
@@ -59,11 +58,6 @@ class TaskScene:
     in_force: Label | None = None
     problem: str | None = None
     notes: tuple[str, ...] = ()
-
-    @property
-    def key(self) -> tuple[str, str]:
-        """Subject and expression."""
-        return self.task.subject, self.task.expression
 
     @property
     def candidates(self) -> tuple[int, ...]:
@@ -172,11 +166,6 @@ class CueView:
     plateau_first: int | None = None
     plateau_last: int | None = None
 
-    def __post_init__(self) -> None:
-        """Refuse a cursor outside the window."""
-        if not self.first <= self.cursor <= self.last:
-            raise ValueError(f"cursor {self.cursor} lies outside {self.first} to {self.last}")
-
 
 def open_view(
     first: int, last: int, candidates: tuple[int, ...] = (), cursor: int | None = None
@@ -186,6 +175,16 @@ def open_view(
     if cursor is None or not first <= cursor <= last:
         cursor = inside[0] if inside else (first + last) // 2
     return CueView(first=first, last=last, cursor=cursor, candidates=inside)
+
+
+def view_of_scene(scene: TaskScene, hidden: bool) -> CueView | None:
+    """Open a task on the annotator's own mark, else on the suggestion, else in the middle."""
+    if scene.index is None:
+        return None
+    mine = scene.mine
+    candidates = () if hidden else scene.candidates
+    view = open_view(scene.first, scene.last, candidates, mine.frame if mine else None)
+    return view if mine is None else replace(view, plateau_first=mine.first, plateau_last=mine.last)
 
 
 def go_to(view: CueView, frame: int) -> CueView:
@@ -205,38 +204,22 @@ def next_candidate(view: CueView, by: int) -> CueView:
     # Away from every candidate the first press returns to the one visited last.
     away = view.cursor not in view.candidates
     here = view.candidate if away else view.candidates.index(view.cursor)
-    return pick_candidate(view, here if away and by > 0 else (here + by) % len(view.candidates))
+    place = here if away and by > 0 else (here + by) % len(view.candidates)
+    return pick_candidate(view, place + 1)
 
 
-def pick_candidate(view: CueView, number: int) -> CueView:
-    """Move to a candidate by its rank, 0 the best; where there is none the view stays."""
-    if not 0 <= number < len(view.candidates):
+def pick_candidate(view: CueView, rank: int) -> CueView:
+    """Move to a candidate by its rank, 1 the best; where there is none the view stays."""
+    if not 1 <= rank <= len(view.candidates):
         return view
-    return replace(go_to(view, view.candidates[number]), candidate=number)
+    return replace(go_to(view, view.candidates[rank - 1]), candidate=rank - 1)
 
 
-def set_plateau_first(view: CueView) -> CueView:
-    """Begin the plateau at the cursor; once more on the same frame, take that back."""
-    if view.plateau_first == view.cursor:
-        return replace(view, plateau_first=None)
-    last = view.plateau_last
-    keep = last is None or last >= view.cursor
-    return replace(view, plateau_first=view.cursor, plateau_last=last if keep else None)
-
-
-def set_plateau_last(view: CueView) -> CueView:
-    """End the plateau at the cursor; once more on the same frame, take that back."""
-    if view.plateau_last == view.cursor:
-        return replace(view, plateau_last=None)
-    first = view.plateau_first
-    keep = first is None or first <= view.cursor
-    return replace(view, plateau_last=view.cursor, plateau_first=first if keep else None)
-
-
-def plateau_problem(view: CueView) -> str | None:
-    """Say why the cursor cannot be marked with this plateau; None when it can."""
-    low = view.first if view.plateau_first is None else view.plateau_first
-    high = view.last if view.plateau_last is None else view.plateau_last
-    if low <= view.cursor <= high:
-        return None
-    return f"frame {view.cursor} lies outside your plateau {low} to {high}: move into it"
+def set_plateau(view: CueView, end: int) -> CueView:
+    """Put an end of the plateau, 0 or 1, at the cursor; once more on this frame, take that back."""
+    ends = [view.plateau_first, view.plateau_last]
+    ends[end] = None if ends[end] == view.cursor else view.cursor
+    first, last = ends
+    if first is not None and last is not None and first > last:
+        ends[1 - end] = None  # the newer end stays
+    return replace(view, plateau_first=ends[0], plateau_last=ends[1])

@@ -1,4 +1,4 @@
-"""Colours and keys of the annotator.
+"""Colours, layout and keys of the annotator.
 
 The colours hold on dark terminals with 256 colours too. Every key is listed once: the app binds the
 keys, and the help shows them.
@@ -34,8 +34,41 @@ CURSOR = Style(bgcolor="#5e4012")
 CURSOR_BAR = Style(color=ACCENT, bgcolor="#5e4012")
 
 
+SCREEN_STYLE = f"""
+Screen {{ background: {GROUND}; color: {TEXT}; layout: vertical; }}
+#status, #words, #message, .title {{
+    height: 1; width: 100%; text-wrap: nowrap; text-overflow: ellipsis;
+}}
+#status, #message {{ background: {PANEL}; }}
+.title {{ background: {GROUND}; }}
+#panes {{ height: 1fr; }}
+.pane {{ width: 1fr; height: 100%; }}
+#right {{ margin-left: 1; }}
+#frame, #reference {{ width: 100%; height: 1fr; }}
+#strip {{ width: 100%; height: 5; }}
+ModalScreen {{ align: center middle; background: {GROUND} 60%; }}
+.dialog {{
+    width: auto; min-width: 40; max-width: 100%; height: auto; max-height: 100%; padding: 0 2;
+    background: {PANEL}; border: round {ACCENT}; overflow-y: auto;
+    border-title-color: {ACCENT}; border-subtitle-color: {FAINT};
+}}
+.dialog Static {{ width: auto; height: auto; }}
+.help {{ width: 108; }}
+.help Static {{ width: 100%; }}
+.help.wide {{ layout: horizontal; }}
+.help.wide Static {{ width: 1fr; }}
+.dialog Input {{ width: 44; height: 3; border: round {FAINT}; background: {PANEL}; }}
+"""
+
+
+FAR = 10**9  # frames: beyond any window, whose ends stop the cursor
+
+
 class KeyAction(NamedTuple):
-    """Keys (Textual's names) of one action, how they are written for people, and what it does."""
+    """Keys (Textual's names) of one action, how they are written for people, and what it does.
+
+    ``{key}`` in the action stands for the key's name.
+    """
 
     keys: str
     shown: str
@@ -44,21 +77,27 @@ class KeyAction(NamedTuple):
 
 
 MOVE = (
-    KeyAction("left,comma,h", "← , h", "step(-1)", "one frame back"),
-    KeyAction("right,full_stop,l", "→ . l", "step(1)", "one frame on"),
-    KeyAction("shift+left,pageup,H,less_than_sign", "⇧← PgUp H", "step(-10)", "ten frames back"),
-    KeyAction("shift+right,pagedown,L,greater_than_sign", "⇧→ PgDn L", "step(10)", "ten frames on"),
-    KeyAction("home,0", "Home 0", "go_to('first')", "first frame of the cue window"),
-    KeyAction("end,dollar_sign", "End $", "go_to('last')", "last frame of the cue window"),
+    KeyAction("left,comma,h", "← , h", "move('step', -1)", "one frame back"),
+    KeyAction("right,full_stop,l", "→ . l", "move('step', 1)", "one frame on"),
+    KeyAction(
+        "shift+left,pageup,H,less_than_sign", "⇧← PgUp H", "move('step', -10)", "ten frames back"
+    ),
+    KeyAction(
+        "shift+right,pagedown,L,greater_than_sign", "⇧→ PgDn L", "move('step', 10)", "ten frames on"
+    ),
+    KeyAction("home,0", "Home 0", f"move('step', -{FAR})", "first frame of the cue window"),
+    KeyAction("end,dollar_sign", "End $", f"move('step', {FAR})", "last frame of the cue window"),
     KeyAction("tab", "Tab", "candidate(1)", "next suggestion"),
     KeyAction("shift+tab", "⇧Tab", "candidate(-1)", "previous suggestion"),
-    KeyAction("1,2,3,4,5", "1 … 5", "pick", "that suggestion, 1 the surest"),
+    KeyAction(
+        "1,2,3,4,5", "1 … 5", "move('pick_candidate', {key})", "that suggestion, 1 the surest"
+    ),
     KeyAction("g", "g", "ask_frame", "go to a frame by number"),
 )
 DECIDE = (
     KeyAction("enter", "Enter", "mark", "mark this frame, open the next task"),
-    KeyAction("left_square_bracket", "[", "plateau_first", "the plateau begins here"),
-    KeyAction("right_square_bracket", "]", "plateau_last", "the plateau ends here"),
+    KeyAction("left_square_bracket", "[", "move('set_plateau', 0)", "the plateau begins here"),
+    KeyAction("right_square_bracket", "]", "move('set_plateau', 1)", "the plateau ends here"),
     KeyAction("f", "f", "ask_flag", "flag: no usable peak, with a reason"),
     KeyAction("u", "u", "undo", "take the last decision back"),
     KeyAction("n", "n", "task(1)", "next task, this one stays open"),
@@ -74,7 +113,7 @@ LOOK = (
     KeyAction("question_mark,f1", "?", "help", "this help"),
     KeyAction("q", "q", "quit", "leave; every mark is already saved"),
 )
-GROUPS = {"Move": MOVE, "Decide": DECIDE, "FrameLook": LOOK}
+GROUPS = (MOVE, DECIDE, LOOK)
 HINTS = (
     ("←→", "frame"), ("⇧←→", "ten"), ("Tab", "suggestion"), ("Enter", "mark, next"),
     ("[ ]", "plateau"), ("f", "flag"), ("u", "undo"), ("n p", "task"), ("z", "zoom"),

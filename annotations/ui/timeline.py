@@ -169,8 +169,13 @@ def draw_strip(content: StripContent | None, width: int, height: int) -> list[St
     if content is None or room < 1 or height < 1:
         return [Strip.blank(width, theme.PLAIN)] * height
     named: list[tuple[str, Line]] = []
-    for name, values, style, rows in _curves(content, height - 2):
-        lines = curve_lines(values, content.view, room, rows, style)
+    rows = max(0, height - 2)
+    curves = [("activity", content.activity, theme.ACTIVITY), ("match", content.match, theme.MATCH)]
+    curves = [curve for curve in curves if curve[1]]
+    curves = curves[max(0, len(curves) - rows) :]
+    # The match decides: it gets the odd row, or the only one.
+    for n, (name, values, style) in enumerate(curves):
+        lines = curve_lines(values, content.view, room, (rows + n) // len(curves), style)
         named += [(name if n == 0 else "", line) for n, line in enumerate(lines)]
     named.append(("suggested", rank_line(content.view, room)))
     named.append(("marks", mark_line(content, room)))
@@ -178,21 +183,6 @@ def draw_strip(content: StripContent | None, width: int, height: int) -> list[St
     start = column_of(content.view, content.view.cursor, room)
     cursor = range(start, min(start + wide, room))
     return [_finish(name, line, cursor, room) for name, line in named[-height:]]
-
-
-def _curves(content: StripContent, rows: int) -> list[tuple[str, tuple[float, ...], Style, int]]:
-    """List the curves with their rows; the match decides, so it gets the odd row."""
-    if rows < 1:
-        return []
-    if content.match and content.activity and rows > 1:
-        top = rows // 2
-        return [
-            ("activity", content.activity, theme.ACTIVITY, top),
-            ("match", content.match, theme.MATCH, rows - top),
-        ]
-    if content.match:
-        return [("match", content.match, theme.MATCH, rows)]
-    return [("activity", content.activity, theme.ACTIVITY, rows)] if content.activity else []
 
 
 def _finish(name: str, line: Line, cursor: range, width: int) -> Strip:

@@ -7,7 +7,6 @@ Stages after ``frames`` read the peak frames and plates that it wrote (``read_pe
 from __future__ import annotations
 
 from collections import OrderedDict
-from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -20,10 +19,10 @@ from express50.capture.raw import RawCamera
 from express50.contract.layout import Dataset
 from express50.errors import CaptureError, FormatError, StageError
 from express50.files.calibration import read_cameras
-from express50.files.containers import inside, read_samples, to_srgb8, to_srgb16
+from express50.files.containers import inside, read_samples, to_srgb
 from express50.files.digests import cached_by_file
 from express50.files.images import decode_image, read_image, upright
-from express50.files.text import NAME, read_json, read_json_table
+from express50.files.text import read_json, read_json_table
 from express50.files.video import VideoReader
 from express50.geometry.cameras import Camera, pinhole
 from express50.geometry.conventions import undistort_image
@@ -57,15 +56,11 @@ class FrameReader:
         self.path = index.capture / self.source.source
         self._clip = 0
         self._video: VideoReader | None = None
-        if self.source.kind == "video":
-            self._video = VideoReader(self.path, self.source.pts)
 
     def read(self, frame: int, deep: bool = False) -> np.ndarray:
-        """Read an image (H, W, 3) sRGB, colour-corrected but not undistorted.
+        """Reads an image (H, W, 3) sRGB by decode index, colour-corrected but not undistorted.
 
-        Args:
-            frame: decode index.
-            deep: give uint16 where the footage has more than 8 bits; otherwise uint8.
+        It is uint8; where ``deep`` and the footage has more than 8 bits, uint16.
 
         Raises:
             CaptureError: no such frame, or the footage is not what was ingested.
@@ -131,7 +126,7 @@ class FrameReader:
 def _srgb(stored: np.ndarray, deep: bool, where: str) -> np.ndarray:
     """Convert samples as a file holds them to (H, W, 3) uint8, or uint16 if deep and not 8-bit."""
     try:
-        return to_srgb16(stored) if deep and stored.dtype != np.uint8 else to_srgb8(stored)
+        return to_srgb(stored, np.uint16 if deep and stored.dtype != np.uint8 else np.uint8)
     except ValueError as error:
         raise CaptureError(f"{where}: {error}; export it again") from error
 
@@ -160,14 +155,9 @@ def _reader(index: Index, camera_id: str) -> FrameReader:
 def read_frame(
     dataset: Dataset, subject: str, camera_id: str, frame: int, undistort: bool = True
 ) -> np.ndarray:
-    """Read a full-resolution frame (H, W, 3) uint8 sRGB by decode index.
+    """Reads a full-resolution frame (H, W, 3) uint8 sRGB by decode index.
 
-    Args:
-        dataset: the dataset.
-        subject: subject id.
-        camera_id: camera id.
-        frame: 0-based decode index.
-        undistort: as the pinhole camera of ``read_cameras_of`` sees it; needs calibrate.
+    Undistorted it is as the pinhole camera of ``read_cameras_of`` sees it.
 
     Raises:
         CaptureError: no such camera or frame, or the footage changed.
@@ -186,12 +176,9 @@ def read_frame(
 
 
 def read_recorded_plate(index: Index, camera_id: str, deep: bool = False) -> np.ndarray:
-    """Read a clean plate (H, W, 3) sRGB of the capture, colour-corrected but not undistorted.
+    """Reads a clean plate (H, W, 3) sRGB that the index lists, colour-corrected, not undistorted.
 
-    Args:
-        index: the subject's index; it must list a plate of the camera.
-        camera_id: camera id.
-        deep: give uint16 where the plate has more than 8 bits; otherwise uint8.
+    It is uint8; where ``deep`` and the plate has more than 8 bits, uint16.
 
     Raises:
         CaptureError: it cannot be read, or its size is not that of the footage.
@@ -223,14 +210,9 @@ def write_frame(path: Path, image: np.ndarray) -> None:
 def read_peak_frame(
     dataset: Dataset, subject: str, expression: str, camera_id: str, deep: bool = False
 ) -> np.ndarray:
-    """Read a peak frame (H, W, 3) sRGB, undistorted and colour-corrected.
+    """Reads a peak frame (H, W, 3) sRGB as the pinhole camera of ``read_cameras_of`` sees it.
 
-    Args:
-        dataset: the dataset.
-        subject: subject id.
-        expression: expression id.
-        camera_id: camera id; the frame is that of ``read_cameras_of``'s pinhole camera.
-        deep: give uint16 where the frame has more than 8 bits; otherwise uint8.
+    It is colour-corrected, and uint8; where ``deep`` and it has more than 8 bits, uint16.
 
     Raises:
         CaptureError: the frames stage did not write it, or it cannot be read.
@@ -261,7 +243,7 @@ def _read_written(path: Path, deep: bool) -> np.ndarray:
         image = read_image(path)
     except FormatError as error:
         raise CaptureError(f"{error}; run 'express50 frames' again") from error
-    return image if deep else to_srgb8(image)
+    return image if deep else to_srgb(image)
 
 
 def frame_inputs(dataset: Dataset, subject: str, expression: str) -> dict[str, Path]:
@@ -272,12 +254,10 @@ def frame_inputs(dataset: Dataset, subject: str, expression: str) -> dict[str, P
 
 
 def read_cameras_of(dataset: Dataset, subject: str, undistorted: bool = True) -> dict[str, Camera]:
-    """Read the calibrated cameras of a subject, sorted by id.
+    """Reads the calibrated cameras of a subject, sorted by id.
 
-    Args:
-        dataset: the dataset.
-        subject: subject id.
-        undistorted: give pinhole cameras, which undistorted frames belong to.
+    Undistorted frames belong to the pinhole cameras, which are given unless ``undistorted`` is
+    false.
 
     Raises:
         StageError: the subject is not calibrated.
@@ -320,80 +300,6 @@ def read_gains(dataset: Dataset, subject: str) -> dict[str, np.ndarray]:
                 "calibrate again"
             )
     return gains
-
-
-@dataclass(frozen=True)
-class Peak:
-    """The labelled frame of one expression, with the identity that the label gave it.
-
-    Attributes:
-        frame: decode index.
-        camera: camera on which the label was made.
-        pts: time stamp of the frame in that camera.
-        dhash: difference hash of the frame in that camera.
-    """
-
-    frame: int
-    camera: str
-    pts: int
-    dhash: str
-
-
-def read_peaks(dataset: Dataset, subject: str) -> dict[str, int]:
-    """Read the peak frame (decode index) of each expression.
-
-    Raises:
-        StageError: the subject is not aligned.
-        FormatError: the file is not a table of peaks.
-    """
-    return {name: peak.frame for name, peak in read_peak_rows(dataset, subject).items()}
-
-
-def read_peak_rows(dataset: Dataset, subject: str) -> dict[str, Peak]:
-    """Read the peak of each expression; raises as ``read_peaks``."""
-    path = dataset.peaks_file(subject)
-    if not path.is_file():
-        raise StageError(
-            f"{path}: subject {subject!r} is not aligned; run 'express50 align {dataset.root}'"
-        )
-    try:
-        rows = read_json_table(path, FormatError, "run 'express50 align' again")
-        if strange := [name for name in rows if not NAME.fullmatch(name)]:
-            raise ValueError(f"expression {strange[0]!r} is not an id")  # it names a folder
-        return {
-            name: Peak(int(row["frame"]), str(row["camera"]), row["pts"], row["dhash"])
-            for name, row in rows.items()
-        }
-    except (ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
-        raise FormatError(f"{path}: not a table of peaks ({type(error).__name__}: {error})") from (
-            error
-        )
-
-
-def check_peak(index: Index, expression: str, peak: Peak) -> None:
-    """Check that a label's frame is the one that was indexed.
-
-    Raises:
-        CaptureError: time stamp or hash differ, so that the label names another frame.
-    """
-    source = index.cameras.get(peak.camera)
-    there = source is not None and 0 <= peak.frame < source.frames
-    found = (source.pts[peak.frame], source.dhash[peak.frame]) if source and there else None
-    if found != (peak.pts, peak.dhash):
-        raise CaptureError(
-            f"{index.subject}/{expression}: frame {peak.frame} of {peak.camera} has time and hash "
-            f"{found}, the label says {(peak.pts, peak.dhash)}; the footage is not the one that "
-            "was labelled, run 'express50 align' again"
-        )
-
-
-def peak_items(dataset: Dataset) -> list[str]:
-    """List ``subject/expression`` for every labelled peak of the aligned subjects."""
-    found = []
-    for subject in dataset.subjects():
-        if dataset.peaks_file(subject).is_file():
-            found += [f"{subject}/{name}" for name in sorted(read_peaks(dataset, subject))]
-    return found
 
 
 def read_proxy(dataset: Dataset, subject: str, camera_id: str, frame: int) -> np.ndarray:

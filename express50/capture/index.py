@@ -1,4 +1,4 @@
-"""The frame index that ingest writes: every camera's frames with their identity, and the cues."""
+"""The frame index that ingest writes, and the labelled peaks among its frames."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from express50.contract.layout import Dataset, footage_root
-from express50.errors import FormatError, StageError
+from express50.errors import CaptureError, FormatError, StageError
 from express50.files.digests import cached_by_file
 from express50.files.text import NAME, read_json_table
 
@@ -213,3 +213,76 @@ def _camera_from_json(name: str, row: Mapping[str, Any]) -> CameraSource:
     if camera.clips and sum(camera.clips) != camera.frames:
         raise ValueError(f"camera {name}: clips of {sum(camera.clips)} of {camera.frames} frames")
     return camera
+
+
+@dataclass(frozen=True)
+class Peak:
+    """The labelled frame of one expression, with the identity that the label gave it.
+
+    Attributes:
+        frame: decode index.
+        camera: camera on which the label was made.
+        pts: time stamp of the frame in that camera.
+        dhash: difference hash of the frame in that camera.
+    """
+
+    frame: int
+    camera: str
+    pts: int
+    dhash: str
+
+
+def read_peaks(dataset: Dataset, subject: str) -> dict[str, int]:
+    """Read the peak frame (decode index) of each expression; raises as ``read_peak_rows``."""
+    return {name: peak.frame for name, peak in read_peak_rows(dataset, subject).items()}
+
+
+def read_peak_rows(dataset: Dataset, subject: str) -> dict[str, Peak]:
+    """Read the peak of each expression.
+
+    Raises:
+        StageError: the subject is not aligned.
+        FormatError: the file is not a table of peaks.
+    """
+    path = dataset.peaks_file(subject)
+    if not path.is_file():
+        raise StageError(
+            f"{path}: subject {subject!r} is not aligned; run 'express50 align {dataset.root}'"
+        )
+    try:
+        rows = read_json_table(path, FormatError, "run 'express50 align' again")
+        if strange := [name for name in rows if not NAME.fullmatch(name)]:
+            raise ValueError(f"expression {strange[0]!r} is not an id")  # it names a folder
+        return {
+            name: Peak(int(row["frame"]), str(row["camera"]), row["pts"], row["dhash"])
+            for name, row in rows.items()
+        }
+    except (ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
+        problem = f"{type(error).__name__}: {error}"
+        raise FormatError(f"{path}: not a table of peaks ({problem})") from error
+
+
+def check_peak(index: Index, expression: str, peak: Peak) -> None:
+    """Check that a label's frame is the one that was indexed.
+
+    Raises:
+        CaptureError: time stamp or hash differ, so that the label names another frame.
+    """
+    source = index.cameras.get(peak.camera)
+    there = source is not None and 0 <= peak.frame < source.frames
+    found = (source.pts[peak.frame], source.dhash[peak.frame]) if source and there else None
+    if found != (peak.pts, peak.dhash):
+        raise CaptureError(
+            f"{index.subject}/{expression}: frame {peak.frame} of {peak.camera} has time and hash "
+            f"{found}, the label says {(peak.pts, peak.dhash)}; the footage is not the one that "
+            "was labelled, run 'express50 align' again"
+        )
+
+
+def peak_items(dataset: Dataset) -> list[str]:
+    """List ``subject/expression`` for every labelled peak of the aligned subjects."""
+    found = []
+    for subject in dataset.subjects():
+        if dataset.peaks_file(subject).is_file():
+            found += [f"{subject}/{name}" for name in sorted(read_peaks(dataset, subject))]
+    return found

@@ -63,7 +63,7 @@ class RawCapture:
         plates: background plates by camera id, relative to the root.
         board: content of board.toml and files by camera, or None.
         cues: scripted expressions in file order.
-        layout: which of `express50.capture.readers` it is; ours is ``express50``.
+        layout: name of the layout in `express50.capture.readers.read`; ours is ``express50``.
         clips: expression of each clip where the footage comes in clips; they make the cues.
         skipped: parts of a layout that were left out (sequences, frames), with the reason.
         found: facts of the layout, for metrics.
@@ -97,7 +97,8 @@ def read_capture(root: Path) -> RawCapture:
     root = Path(root)
     meta = read_meta(root)
     cameras, dropped = _read_cameras(root)
-    calibration = read_cameras(root / "calibration.json") if has_calibration(root) else None
+    given = root / "calibration.json"
+    calibration = read_cameras(given) if given.is_file() else None
     if calibration is not None:
         for name in sorted(set(calibration) - set(cameras) - set(dropped)):
             dropped[name] = f"calibrated, but {root / 'cameras' / name} is not there"
@@ -120,11 +121,6 @@ def read_capture(root: Path) -> RawCapture:
         board=_read_board(root, cameras),
         cues=read_cues(root / "cues.csv"),
     )
-
-
-def has_calibration(root: Path) -> bool:
-    """Return whether the capture has calibrated cameras of its own."""
-    return (root / "calibration.json").is_file()
 
 
 def read_meta(root: Path) -> dict:
@@ -305,11 +301,7 @@ def _read_cue(path: Path, line: int, row: dict[str, str]) -> Cue:
 
 
 def check_calibrated_sizes(raw: RawCapture, sizes: dict[str, tuple[int, int]]) -> None:
-    """Refuse cameras calibrated for another image size than their footage has.
-
-    Args:
-        raw: the capture.
-        sizes: decoded (width, height) by camera id.
+    """Refuses cameras calibrated for another (width, height) than their footage has.
 
     Raises:
         CalibrationError: a size differs; a guessed scale would give wrong depths.

@@ -7,39 +7,51 @@ import time
 from pathlib import Path
 from typing import Any
 
-from express50.console import FAILED, OK, say, say_json, stdout_to_stderr
-from express50.contract.extensions import hook, stages
+from express50.console import FAILED, OK, add_command, say, say_json, stdout_to_stderr
 from express50.contract.layout import Dataset
+from express50.contract.stage import hook, stages
 from express50.errors import StageError
 
 
 def add_commands(subparsers: Any) -> None:
     """Add ``check`` and ``subject withdraw``."""
-    parser = subparsers.add_parser(
+    check = add_command(
+        subparsers,
         "check",
-        help="audit a dataset against its ledger, and fix it",
+        run_check,
+        "audit a dataset against its ledger, and fix it",
         description="Compares every output with what was published (present, size, and SHA-256 "
         "where the time of change is another; --deep reads every byte), with the inputs and "
         "settings that are there now, looks for unfinished and unaccounted outputs, labels of "
         "frames that do not exist, captures that are gone, and traces of withdrawn people. Exit "
         "code 0 when nothing wrong is left, 1 otherwise.",
-        epilog="example: express50 check DATASET --fix && express50 run DATASET",
+        example="express50 check DATASET --fix && express50 run DATASET",
     )
-    parser.add_argument("dataset", type=Path, metavar="DATASET")
-    parser.add_argument("--deep", action="store_true", help="read every byte of every output")
-    parser.add_argument(
+    check.add_argument("--deep", action="store_true", help="read every byte of every output")
+    check.add_argument(
         "--fix",
-        "--mend",
         action="store_true",
         help="set wrong outputs aside, so that their stage makes them again; delete leftovers",
     )
-    parser.add_argument(
-        "--checkpoint", type=Path, action="append", default=[], metavar="FILE",
-        help="a model outside the dataset that may not name withdrawn people; may be repeated",
-    )  # fmt: skip
-    parser.add_argument("--json", action="store_true", help="print as JSON")
-    parser.set_defaults(handler=run_check)
-    _add_withdraw(subparsers)
+    subject = subparsers.add_parser("subject", help="withdraw a person from a dataset")
+    withdraw = add_command(
+        subject.add_subparsers(dest="action", metavar="ACTION", required=True),
+        "withdraw",
+        run_withdraw,
+        "remove all that the dataset holds of a subject",
+        description="Removes a subject's index, derived files, labels, receipts, the packed shards "
+        "and whatever of others names the person, takes codes and frames out of checkpoints, notes "
+        "in withdrawn.json when that was, then searches all that is left for the subject's id. "
+        "Lists only, without --yes. 'express50 check' proves it at any later time.",
+        example="express50 subject withdraw DATASET S001 --yes",
+    )
+    withdraw.add_argument("subject", metavar="SUBJECT")
+    withdraw.add_argument("--yes", action="store_true", help="remove")
+    for parser in (check, withdraw):
+        parser.add_argument(
+            "--checkpoint", type=Path, action="append", default=[], metavar="FILE",
+            help="a model outside the dataset that may name withdrawn people; may be repeated",
+        )  # fmt: skip
 
 
 def run_check(args: argparse.Namespace) -> int:
@@ -61,7 +73,6 @@ def run_check(args: argparse.Namespace) -> int:
             checkpoints=args.checkpoint,
         )
     seconds = time.perf_counter() - started
-    left = sum(not finding.fixed for finding in result.findings)
     if args.json:
         say_json(
             {
@@ -78,35 +89,12 @@ def run_check(args: argparse.Namespace) -> int:
         for one in result.findings:
             say(f"{one.where}: {one.what}; {'FIXED' if one.fixed else 'fix'}: {one.fix}")
         say(*(f"note: {note}" for note in result.notes))
-        count, fixed = len(result.findings), len(result.findings) - left
-        verdict = f"{count} findings, {fixed} fixed, {left} left" if count else "sound"
+        count, fixed = len(result.findings), sum(one.fixed for one in result.findings)
+        verdict = f"{count} findings, {fixed} fixed, {count - fixed} left" if count else "sound"
         looked = f"{result.files} files, {result.bytes / 1e6:.1f} MB"
         read = f"{result.hashed / 1e6:.1f} MB read"
         say(f"{args.dataset}: {verdict} ({looked}, {read}, {seconds:.1f} s)")
     return OK if result.sound else FAILED
-
-
-def _add_withdraw(subparsers: Any) -> None:
-    parser = subparsers.add_parser("subject", help="withdraw a person from a dataset")
-    actions = parser.add_subparsers(dest="action", metavar="ACTION", required=True)
-    action = actions.add_parser(
-        "withdraw",
-        help="remove all that the dataset holds of a subject",
-        description="Removes a subject's index, derived files, labels, receipts, the packed shards "
-        "and whatever of others names the person, takes codes and frames out of checkpoints, notes "
-        "in withdrawn.json when that was, then searches all that is left for the subject's id. "
-        "Lists only, without --yes. 'express50 check' proves it at any later time.",
-        epilog="example: express50 subject withdraw DATASET S001 --yes",
-    )
-    action.add_argument("dataset", type=Path, metavar="DATASET")
-    action.add_argument("subject", metavar="SUBJECT")
-    action.add_argument(
-        "--checkpoint", type=Path, action="append", default=[], metavar="FILE",
-        help="a model outside the dataset that saw the person; may be repeated",
-    )  # fmt: skip
-    action.add_argument("--yes", action="store_true", help="remove")
-    action.add_argument("--json", action="store_true", help="print as JSON")
-    action.set_defaults(handler=run_withdraw)
 
 
 def run_withdraw(args: argparse.Namespace) -> int:
@@ -127,16 +115,17 @@ def run_withdraw(args: argparse.Namespace) -> int:
             say("add --yes to remove")
         return OK
     done = withdraw(dataset, args.subject, args.checkpoint, hook("redact_checkpoint"))
-    account = {
-        "subject": done.subject,
-        "removed": [str(path) for path in done.removed],
-        "files": done.files,
-        "checkpoints": [str(path) for path in done.checkpoints],
-        "remaining": [str(path) for path in done.remaining],
-        "raw_capture": str(done.capture) if done.capture else None,
-    }
     if args.json:
-        say_json(account)
+        say_json(
+            {
+                "subject": done.subject,
+                "removed": [str(path) for path in done.removed],
+                "files": done.files,
+                "checkpoints": [str(path) for path in done.checkpoints],
+                "remaining": [str(path) for path in done.remaining],
+                "raw_capture": str(done.capture) if done.capture else None,
+            }
+        )
     else:
         say(*(f"removed {path}" for path in done.removed))
         say(*(f"took codes and frames out of {path}" for path in done.checkpoints))

@@ -1,4 +1,4 @@
-"""``express50 export`` writes tracked heads for other tools; ``express50 report`` one HTML page."""
+"""Commands that show heads: ``export`` for other tools, ``report`` as HTML, ``head preview``."""
 
 from __future__ import annotations
 
@@ -7,90 +7,102 @@ import json
 from pathlib import Path
 from typing import Any
 
-from express50.console import OK, say, say_json
+from express50.console import OK, add_command, say, say_json
 from express50.contract.layout import Dataset
 from express50.errors import ConfigError, StageError
 
 FORMATS = ("gaussian-avatars", "obj", "ply", "glb")
-_EPILOG = """example:
-  express50 export data/mine out --format gaussian-avatars --subject S001
-writes OUT/<subject>/, replacing a former export of the subject whole"""
 
 
 def add_commands(subparsers: Any) -> None:
-    """Add ``export`` and ``report``."""
-    parser = subparsers.add_parser(
+    """Add ``export``, ``report`` and ``head preview``."""
+    parser = add_command(
+        subparsers,
         "export",
-        help="write tracked heads for other tools",
+        run_export,
+        "write tracked heads for other tools",
         description="Writes tracked heads as a GaussianAvatars data set or as meshes.",
-        epilog=_EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        example="express50 export data/mine out --format gaussian-avatars --subject S001\n"
+        "writes OUT/<subject>/, replacing a former export of the subject whole",
     )
-    parser.add_argument("dataset", type=Path, metavar="DATASET")
-    parser.add_argument("out", type=Path, metavar="OUT", help="folder that gets one per subject")
-    parser.add_argument("--format", required=True, choices=FORMATS, help="what to write")
+    add = parser.add_argument
+    add("out", type=Path, metavar="OUT", help="folder that gets one per subject")
+    add("--format", required=True, choices=FORMATS, help="what to write")
     for name in ("subject", "expression"):
-        parser.add_argument(
-            f"--{name}", action="append", default=[], metavar="ID", help=f"only this {name};"
-            " may be repeated",
-        )  # fmt: skip
-    parser.add_argument(
-        "--frames", choices=("peaks", "clips"), default="peaks",
-        help="clips: a mesh of every tracked frame (track.frames=clips, or a video's) [peaks]",
-    )  # fmt: skip
-    group = parser.add_argument_group("of gaussian-avatars")
-    group.add_argument(
-        "--background", choices=("alpha", "white", "black"), default="alpha",
-        help="what is behind the head in the pictures [alpha: they keep their opacity]",
-    )  # fmt: skip
-    group.add_argument(
-        "--head-only", action="store_true", help="masks without the torso, by the regions stage"
-    )
-    group.add_argument(
-        "--downscale", type=int, default=1, metavar="N", help="pictures N times smaller [1]"
-    )
-    group.add_argument(
-        "--even-colour", action="store_true",
-        help="divide the cameras' colour gains, measured by calibrate, out of the pictures",
-    )  # fmt: skip
-    group.add_argument(
-        "--test-expression", action="append", metavar="ID",
-        help="held back for testing; may be repeated [the last three tenths]",
-    )  # fmt: skip
-    group.add_argument("--validation-camera", metavar="ID", help="held back in training [the last]")
-    parser.add_argument("--json", action="store_true", help="print the account as JSON")
-    parser.set_defaults(handler=run_export)
-    parser = subparsers.add_parser(
-        "report", help="gather QC into one self-contained HTML page", description=run_report.__doc__
-    )
-    parser.add_argument("dataset", type=Path)
+        words = f"only this {name}; may be repeated"
+        add(f"--{name}", action="append", default=[], metavar="ID", help=words)
+    words = "clips: a mesh of every tracked frame (track.frames=clips, or a video's) [peaks]"
+    add("--frames", choices=("peaks", "clips"), default="peaks", help=words)
+    add = parser.add_argument_group("of gaussian-avatars").add_argument
+    words = "what is behind the head in the pictures [alpha: they keep their opacity]"
+    add("--background", choices=("alpha", "white", "black"), default="alpha", help=words)
+    words = "masks without the torso, by the regions stage"
+    add("--head-only", action="store_true", help=words)
+    add("--downscale", type=int, default=1, metavar="N", help="pictures N times smaller [1]")
+    words = "divide the cameras' colour gains, measured by calibrate, out of the pictures"
+    add("--even-colour", action="store_true", help=words)
+    words = "held back for testing; may be repeated [the last three tenths]"
+    add("--test-expression", action="append", metavar="ID", help=words)
+    add("--validation-camera", metavar="ID", help="held back in training [the last]")
+
+    words = "gather QC into one self-contained HTML page"
+    parser = add_command(subparsers, "report", run_report, words, description=run_report.__doc__)
     parser.add_argument("--out", type=Path, help="folder of the page (default: DATASET/report)")
     parser.add_argument("--title", help="heading of the page")
-    parser.add_argument("--json", action="store_true", help="print JSON")
-    parser.set_defaults(handler=run_report)
+
+    area = subparsers.add_parser("head", help="look at a head model")
+    parser = add_command(
+        area.add_subparsers(dest="action", metavar="ACTION", required=True),
+        "preview",
+        run_preview,
+        "draw a head model in typical poses",
+        dataset=False,
+        json=False,
+        example="express50 head preview build/head.png --yaws 0,40,90\n"
+        "one row per pose (those that the model has the controls for), one column per yaw",
+    )
+    add = parser.add_argument
+    add("out", type=Path, metavar="OUT", help="picture to write (.png or .jpg)")
+    words = "head model, as load_head takes it [procedural]"
+    add("--model", default="procedural", help=words)
+    words = "sides to look from, degrees to the subject's left [0,40,90]"
+    add("--yaws", default="0,40,90", metavar="DEG,...", help=words)
+    add("--size", type=int, default=256, help="side of a picture, pixels [256]")
 
 
 def run_export(args: argparse.Namespace) -> int:
     """Export the chosen subjects, one after the other."""
-    from express50.dataset.export.select import (
+    from express50.dataset.export import (
+        export_meshes,
         exporting,
         read_tracked,
         tracked_subjects,
         with_clips,
     )
+    from express50.dataset.export_avatar import AvatarOptions, export_avatar
 
     if args.frames == "clips" and args.format == "gaussian-avatars":
         raise ConfigError(
             "--frames clips: gaussian-avatars needs a matte of every frame, and 'matte' makes those"
             " of peaks alone; export the clips as obj, ply or glb"
         )
-
+    options = AvatarOptions(
+        background=args.background,
+        head_only=args.head_only,
+        downscale=args.downscale,
+        even_colour=args.even_colour,
+        test_expressions=None if args.test_expression is None else tuple(args.test_expression),
+        validation_camera=args.validation_camera,
+    )
     dataset, accounts = Dataset(args.dataset), []
     for subject in tracked_subjects(dataset, args.subject):
         head = read_tracked(dataset, subject, args.expression)
         head = with_clips(dataset, head, args.expression) if args.frames == "clips" else head
         with exporting(args.out, subject) as folder:
-            meta = _write(dataset, head, args, folder)
+            if args.format == "gaussian-avatars":
+                meta = export_avatar(dataset, head, options, folder)
+            else:
+                meta = export_meshes(head, args.format, folder)
         what = {"of": "frames"} if args.frames == "clips" else {}
         accounts.append({"folder": str(args.out / subject), **what, **meta})
         if not args.json:
@@ -98,25 +110,6 @@ def run_export(args: argparse.Namespace) -> int:
     if args.json:
         say_json(accounts)
     return OK
-
-
-def _write(dataset: Any, head: Any, args: argparse.Namespace, folder: Path) -> dict:
-    if args.format != "gaussian-avatars":
-        from express50.dataset.export.meshes import export_meshes
-
-        return export_meshes(head, args.format, folder)
-    from express50.dataset.export.gaussian_avatars import AvatarOptions, export_avatar
-
-    held = None if args.test_expression is None else tuple(args.test_expression)
-    options = AvatarOptions(
-        background=args.background,
-        head_only=args.head_only,
-        downscale=args.downscale,
-        even_colour=args.even_colour,
-        test_expressions=held,
-        validation_camera=args.validation_camera,
-    )
-    return export_avatar(dataset, head, options, folder)
 
 
 def _lines(account: dict) -> list[str]:
@@ -136,19 +129,34 @@ def _lines(account: dict) -> list[str]:
 
 def run_report(args: argparse.Namespace) -> int:
     """Write DATASET/report/index.html from what the stages left behind."""
-    from express50.dataset.report.page import render_page
+    from express50.dataset.report import render_page
     from express50.files.atomic import write_bytes
 
     dataset = Dataset(args.dataset)
     if not dataset.subjects():
         raise StageError(f"{args.dataset}: nothing is ingested; run 'express50 ingest' first")
     path = (args.out or dataset.report_dir) / "index.html"
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_bytes(path, render_page(dataset, args.title).encode())
-    size = path.stat().st_size
-    say(
-        json.dumps({"report": str(path), "bytes": size})
-        if args.json
-        else f"{path} ({size:,} bytes)"
-    )
+    page = render_page(dataset, args.title).encode()
+    write_bytes(path, page)
+    account = json.dumps({"report": str(path), "bytes": len(page)})
+    say(account if args.json else f"{path} ({len(page):,} bytes)")
+    return OK
+
+
+def run_preview(args: argparse.Namespace) -> int:
+    """Write a contact sheet of a head model."""
+    from express50.files.images import write_image
+    from express50.head.load import load_head
+    from express50.head.preview import contact_sheet
+
+    try:
+        yaws = tuple(float(part) for part in args.yaws.split(","))
+    except ValueError:
+        raise ConfigError(
+            f"--yaws {args.yaws!r}: expected numbers with commas, such as 0,40,90"
+        ) from None
+    model = load_head(args.model)
+    args.out.parent.mkdir(parents=True, exist_ok=True)
+    write_image(args.out, contact_sheet(model, yaws, args.size))
+    say(f"wrote {args.out}: {model.name}, {len(model.template)} vertices")
     return OK

@@ -1,132 +1,284 @@
-"""``express50 plan``: the cost of a capture campaign, estimated from measured datasets."""
+"""``express50 plan``: the cost of a capture campaign, scaled from a measured dataset's receipts.
+
+Seconds and bytes per item grow linearly in the product of the sizes that each stage names in its
+`Growth`. Memory has a part that does not grow (libraries, the head model), which one dataset cannot
+separate, so it is given as measured: a lower bound.
+"""
 
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
+import math
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
-from express50.console import OK, format_table, say, say_json, stdout_to_stderr
-from express50.contract.config import PRESETS
-from express50.contract.extensions import stages
+from rich.filesize import decimal
+
+from express50.capture.index import read_index
+from express50.console import OK, add_command, format_table, say, say_json, stdout_to_stderr
+from express50.contract.config import config_toml, resolve_config
 from express50.contract.layout import Dataset
-from express50.dataset.plan import (
-    TARGETS,
-    Footage,
-    Row,
-    estimate,
-    footage_of,
-    measure,
-    target_of,
-    totals,
-)
-from express50.errors import ConfigError
+from express50.contract.stage import Stage, stages
+from express50.errors import ConfigError, StageError
+from express50.files.digests import files_of, text_digest
+from express50.runner.ledger import Ledger
 
 SIZES = ("subjects", "expressions", "cameras", "frames_per_expression")
+# Campaigns of the papers: EXPRESS-50, and RenderMe-360 as it was used beside it (280 of its people,
+# 12 expressions, 60 cameras). Clips are as long as the measured dataset's.
+TARGETS: dict[str, dict[str, float]] = {
+    "express-50": {"subjects": 50, "expressions": 60, "views": 24, "pixels": 3840 * 2160},
+    "renderme-360": {"subjects": 280, "expressions": 12, "views": 60, "pixels": 2448 * 2048},
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Footage:
+    """Holds the size of a campaign; means over subjects where it was measured."""
+
+    subjects: float
+    expressions: float
+    views: float
+    pixels: float
+    frames: float
+
+    def work(self, factors: Sequence[str]) -> float:
+        """Multiply some of its sizes."""
+        return math.prod(getattr(self, name) for name in factors)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Measured:
+    """Holds what one stage cost in a dataset: means per item, peak over items, and the preset."""
+
+    seconds: float
+    bytes: float
+    memory: float
+    preset: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class Row:
+    """Holds the estimate of one stage; ``why`` instead of figures where there are none."""
+
+    stage: str
+    items: int
+    seconds: float | None = None
+    core_hours: float | None = None
+    days: float | None = None
+    disk: float | None = None
+    memory: float | None = None
+    preset: str = ""
+    how: str = ""
+    why: str = ""
 
 
 def add_commands(subparsers: Any) -> None:
     """Add the ``plan`` command."""
-    parser = subparsers.add_parser(
+    parser = add_command(
+        subparsers,
         "plan",
-        help="what a campaign costs, from a measured dataset's receipts",
-        description="Scales what every stage of a dataset took to the size of a campaign: linearly "
-        "in what its items grow with, or, given a second dataset of another size, with a fitted "
-        "exponent. Every figure is from receipts of this machine; what was not run is n/a.",
-        epilog="example: express50 plan DATASET --target express-50 --workers 32",
+        run_plan,
+        "what a campaign costs, from a measured dataset's receipts",
+        description="Scales what every stage of a dataset took to the size of a campaign, linearly "
+        "in what its items grow with. Every figure is from receipts of this machine; what was not "
+        "run is n/a.",
+        example="express50 plan DATASET --target express-50 --workers 32",
     )
-    parser.add_argument("dataset", type=Path, metavar="DATASET", help="a dataset that was made")
-    parser.add_argument("second", type=Path, nargs="?", metavar="SECOND", help="of another size")
     parser.add_argument("--target", choices=list(TARGETS), help="a named campaign")
     for name in SIZES:
         flag = f"--{name.replace('_', '-')}"
         parser.add_argument(flag, type=int, metavar="N", help="of the target; else as measured")
     parser.add_argument("--size", metavar="WxH", help="pixels of the target's cameras")
     parser.add_argument("--workers", type=int, default=1, metavar="N", help="cores (default 1)")
-    parser.add_argument("--preset", choices=PRESETS, help="leave out what ran with another")
-    parser.add_argument("--json", action="store_true", help="print as JSON")
-    parser.set_defaults(handler=run_plan)
 
 
 def run_plan(args: argparse.Namespace) -> int:
-    """Print a row a stage, and the sum."""
+    """Print one row per stage, and the sum."""
     if args.workers < 1:
         raise ConfigError(f"--workers {args.workers}: expected at least 1")
-    datasets = [Dataset(path) for path in (args.dataset, args.second) if path is not None]
     sizes = {name: getattr(args, name) for name in SIZES if getattr(args, name) is not None}
     if "cameras" in sizes:
         sizes["views"] = sizes.pop("cameras")
     if args.size is not None:
-        sizes["pixels"] = _pixels(args.size)
+        try:
+            width, height = (int(part) for part in args.size.lower().split("x"))
+        except ValueError:
+            raise ConfigError(
+                f"--size {args.size!r}: expected WIDTHxHEIGHT, as 3840x2160"
+            ) from None
+        sizes["pixels"] = width * height
+    dataset = Dataset(args.dataset)
     with stdout_to_stderr():
         known = list(stages().values())
-        measured = [measure(dataset, known) for dataset in datasets]
-        target = target_of(args.target, sizes, footage_of(datasets[0]))
-    rows = estimate(known, target, measured, args.workers, args.preset)
-    if args.json:
-        footage = [vars(footage_of(dataset)) for dataset in datasets]
-        say_json(
-            {"target": vars(target), "measured": footage, "workers": args.workers}
-            | {"stages": [vars(row) for row in rows], "total": totals(rows)}
-        )
-    else:
-        say(*_lines(args, datasets, target, rows))
-    return OK
-
-
-def _pixels(text: str) -> int:
-    try:
-        width, height = (int(part) for part in text.lower().split("x"))
-    except ValueError:
-        raise ConfigError(f"--size {text!r}: expected WIDTHxHEIGHT such as 3840x2160") from None
-    return width * height
-
-
-def _lines(
-    args: argparse.Namespace, datasets: list[Dataset], target: Footage, rows: list[Row]
-) -> list[str]:
-    head = [f"target   {args.target or 'as given'}: {_words(target)}"]
-    head += [f"measured {dataset.root}: {_words(footage_of(dataset))}" for dataset in datasets]
-    columns = ["stage", "items", "s an item", "core hours", f"days on {args.workers}"]
-    columns += ["disk", "peak memory", "preset", "times what was measured"]
-    cells = [_cells(row) for row in rows]
+        measured, footage = measure(dataset, known), footage_of(dataset)
+    target = target_of(args.target, sizes, footage)
+    rows = estimate(known, target, footage, measured, args.workers)
     total = totals(rows)
-    cells.append(
-        ["sum", "", "", f"{total['core_hours']:.1f}", f"{total['days']:.2f}", _size(total["disk"])]
-        + [""] * 3
-    )
-    notes = ["s an item: of one core; stages one after the other, no item split over workers"]
-    if any(row.memory is not None and not row.memory_grows for row in rows):
-        notes.append(">= memory as measured; how it grows, a second dataset of another size tells")
+    if args.json:
+        rows_json = [vars(row) for row in rows]
+        say_json(
+            {"target": vars(target), "measured": vars(footage), "workers": args.workers}
+            | {"stages": rows_json, "total": total}
+        )
+        return OK
+    columns = ["stage", "items", "s per item", "core hours", f"days on {args.workers}", "disk"]
+    columns += ["peak memory", "preset", "times what was measured"]
+    hours, days = f"{total['core_hours']:.1f}", f"{total['days']:.2f}"
+    cells = [_cells(row) for row in rows]
+    cells.append(["sum", "", "", hours, days, decimal(int(total["disk"])), "", "", ""])
+    say(f"target   {args.target or 'as given'}: {_words(target)}")
+    say(f"measured {dataset.root}: {_words(footage)}")
+    say(*format_table(columns, cells))
+    say("s per item: of one core; stages one after the other, no item split over workers")
+    say("peak memory: as measured; more footage may need more")
     if total["not_measured"]:
-        notes.append(f"the sum lacks {', '.join(total['not_measured'])}")
-    return [*head, *format_table(columns, cells), *notes]
+        say(f"the sum lacks {', '.join(total['not_measured'])}")
+    return OK
 
 
 def _cells(row: Row) -> list[str]:
     if row.why:
         return [row.stage, str(row.items), *["n/a"] * 5, "", row.why]
-    return [
-        row.stage,
-        str(row.items),
-        f"{row.seconds:.1f}",
-        f"{row.core_hours:.1f}",
-        f"{row.days:.2f}",
-        _size(row.disk or 0.0),
-        ">= " * (not row.memory_grows) + _size(row.memory or 0.0),
-        row.preset,
-        row.how,
-    ]
+    figures = [f"{row.seconds:.1f}", f"{row.core_hours:.1f}", f"{row.days:.2f}"]
+    sizes = [decimal(int(row.disk or 0)), f">= {decimal(int(row.memory or 0))}"]
+    return [row.stage, str(row.items), *figures, *sizes, row.preset, row.how]
 
 
 def _words(footage: Footage) -> str:
     sizes = {name: f"{value:.6g}" for name, value in vars(footage).items()}
     return (
         f"{sizes['subjects']} subjects x {sizes['expressions']} expressions x {sizes['views']} "
-        f"cameras of {footage.pixels / 1e6:.3g} megapixels, {sizes['frames']} frames a camera"
+        f"cameras of {footage.pixels / 1e6:.3g} megapixels, {sizes['frames']} frames per camera"
     )
 
 
-def _size(count: float) -> str:
-    """Bytes in GB, or MB where these are few."""
-    return f"{count / 1e9:,.1f} GB" if count >= 1e9 else f"{count / 1e6:,.1f} MB"
+def footage_of(dataset: Dataset) -> Footage:
+    """Average the size of a dataset's footage.
+
+    Raises:
+        StageError: nothing is ingested.
+    """
+    indices = [read_index(dataset, subject) for subject in dataset.subjects()]
+    if not indices:
+        raise StageError(f"{dataset.root}: nothing is ingested, so nothing was measured")
+    cameras = [camera for index in indices for camera in index.cameras.values()]
+    return Footage(
+        subjects=len(indices),
+        expressions=sum(len(index.cues) for index in indices) / len(indices),
+        views=len(cameras) / len(indices),
+        pixels=sum(camera.width * camera.height for camera in cameras) / len(cameras),
+        frames=sum(camera.frames for camera in cameras) / len(cameras),
+    )
+
+
+def measure(dataset: Dataset, known: Sequence[Stage]) -> dict[str, Measured]:
+    """Measure what every stage that was run cost, from its receipts and files.
+
+    Raises:
+        StageError: the ledger is missing.
+    """
+    if not dataset.ledger.is_file():
+        raise StageError(f"{dataset.root}: no ledger.sqlite; expected a dataset that was made")
+    found = {}
+    with Ledger(dataset.ledger, read_only=True) as ledger:
+        for stage in known:
+            done = [r for r in ledger.read(stage.name).values() if r.status == "done"]
+            folders = [dataset.item_dir(stage.name, receipt.item) for receipt in done]
+            if done:
+                size = sum(path.stat().st_size for one in folders for path in files_of(one))
+                found[stage.name] = Measured(
+                    seconds=sum(r.seconds for r in done) / len(done),
+                    bytes=size / len(done),
+                    memory=max(r.peak_memory for r in done),
+                    preset=preset_of(dataset, stage),
+                )
+    return found
+
+
+def preset_of(dataset: Dataset, stage: Stage) -> str:
+    """Return the preset whose values a stage last ran with, or ``own`` and a digest of these."""
+    path = dataset.config_file(stage.name)
+    text = path.read_text(encoding="utf-8") if path.is_file() else ""
+    for preset in stage.presets:
+        if config_toml(stage.name, resolve_config(stage, preset)) == text:
+            return preset
+    return f"own {text_digest(text)[:6]}"
+
+
+def target_of(name: str | None, sizes: Mapping[str, float], measured: Footage) -> Footage:
+    """Choose the campaign to estimate: a named one, single sizes over it, the rest as measured.
+
+    Args:
+        name: of `TARGETS`, or None.
+        sizes: given sizes by their names in `Footage`, and ``frames_per_expression``.
+        measured: footage of the measured dataset.
+
+    Raises:
+        ConfigError: a size is not above 0.
+    """
+    if bad := {key: value for key, value in sizes.items() if not value > 0}:
+        given = ", ".join(f"{key} is {value}" for key, value in bad.items())
+        raise ConfigError(f"target: {given}; expected more than 0")
+    values = {key: getattr(measured, key) for key in ("subjects", "expressions", "views", "pixels")}
+    values |= TARGETS.get(name or "", {}) | dict(sizes)
+    each = measured.frames / max(measured.expressions, 1)
+    each = values.pop("frames_per_expression", each)
+    return Footage(**values, frames=each * values["expressions"])
+
+
+def estimate(
+    known: Sequence[Stage],
+    target: Footage,
+    footage: Footage,
+    measured: Mapping[str, Measured],
+    workers: int,
+) -> list[Row]:
+    """Estimate one row per stage.
+
+    Args:
+        known: the stages in order.
+        target: the campaign.
+        footage: that was measured.
+        measured: what each stage cost on it.
+        workers: processes of one core each.
+    """
+    rows = []
+    for stage in known:
+        growth, cost = stage.growth, measured.get(stage.name)
+        items = round(target.work(growth.items))
+        if cost is None:
+            rows.append(Row(stage=stage.name, items=items, why="was not run"))
+            continue
+        ratio = target.work(growth.time) / footage.work(growth.time)
+        seconds = cost.seconds * ratio
+        hours = items * seconds / 3600
+        disk = cost.bytes * target.work(growth.disk) / footage.work(growth.disk)
+        rows.append(
+            Row(
+                stage=stage.name,
+                items=items,
+                seconds=seconds,
+                core_hours=hours,
+                days=hours / 24 / min(workers, items),
+                disk=items * disk,
+                memory=cost.memory,
+                preset=cost.preset,
+                how=f"{' x '.join(growth.time)} = {ratio:.4g}",
+            )
+        )
+    return rows
+
+
+def totals(rows: Sequence[Row]) -> dict[str, Any]:
+    """Add up the stages that were measured, and list those that were not."""
+    known = [row for row in rows if not row.why]
+    return {
+        "core_hours": sum(row.core_hours or 0.0 for row in known),
+        "days": sum(row.days or 0.0 for row in known),
+        "disk": sum(row.disk or 0.0 for row in known),
+        "presets": dict(Counter(row.preset for row in known)),
+        "not_measured": [row.stage for row in rows if row.why],
+    }

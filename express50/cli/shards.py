@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from express50.console import FAILED, OK, say, say_json
+from express50.console import FAILED, OK, add_command, say, say_json
 from express50.errors import FormatError
 
 
@@ -14,63 +14,53 @@ def add_commands(subparsers: Any) -> None:
     """Add the ``shards`` command."""
     parser = subparsers.add_parser("shards", help="look into packed shards and verify them")
     actions = parser.add_subparsers(dest="action", metavar="ACTION", required=True)
-    checking = actions.add_parser("verify", help="check every file and member against checksums")
-    checking.set_defaults(handler=run_verify)
-    listing = actions.add_parser("ls", help="list the samples")
-    listing.add_argument("--subject", action="append", help="only this subject; may be repeated")
-    listing.add_argument("--split", help="only this split")
-    listing.set_defaults(handler=run_ls)
-    showing = actions.add_parser(
-        "show",
-        help="print a sample's meta and write it as a picture",
-        epilog="example: express50 shards show data/pack/shards S001_smile_cam03 --out a.png",
-    )
-    showing.add_argument("--out", type=Path, help="picture of rgb, alpha and depth to write")
-    showing.set_defaults(handler=run_show)
-    _add_edits(actions)
-    for action in (checking, listing, showing):
+    words = "check every file and member against checksums"
+    verify = add_command(actions, "verify", run_verify, words, dataset=False)
+    listing = add_command(actions, "ls", run_ls, "list the samples", dataset=False)
+    show = add_command(
+        actions, "show", run_show, "print a sample's meta and write it as a picture", dataset=False,
+        example="express50 shards show data/pack/shards S001_smile_cam03 --out a.png",
+    )  # fmt: skip
+    split = add_command(
+        actions, "split", run_split, "write part of the samples as shards of their own",
+        dataset=False, json=False,
+        example="express50 shards split data/pack/shards test_only --split test",
+    )  # fmt: skip
+    words = "write the samples of several folders as one"
+    merge = add_command(actions, "merge", run_merge, words, dataset=False, json=False)
+    for action in (verify, listing, show, split):
         action.add_argument("directory", type=Path, metavar="DIR", help="folder of shards")
-        action.add_argument("--json", action="store_true", help="print as JSON")
-    showing.add_argument("key", nargs="?", metavar="KEY", help="sample; the first by default")
-
-
-def _add_edits(actions: Any) -> None:
-    """``split`` and ``merge``."""
-    splitting = actions.add_parser(
-        "split",
-        help="write part of the samples as shards of their own",
-        epilog="example: express50 shards split data/pack/shards test_only --split test",
-    )
-    splitting.add_argument("directory", type=Path, metavar="DIR", help="folder of shards")
+    show.add_argument("key", nargs="?", metavar="KEY", help="sample; the first by default")
+    show.add_argument("--out", type=Path, help="picture of rgb, alpha and depth to write")
+    merge.add_argument("directories", type=Path, nargs="+", metavar="DIR", help="shards")
+    listing.add_argument("--subject", action="append", help="only this subject; may be repeated")
     for name in ("subject", "expression", "camera"):
-        splitting.add_argument(f"--{name}", action="append", help="only this; may be repeated")
-    splitting.add_argument("--split", help="only this split")
-    splitting.set_defaults(handler=run_split)
-    merging = actions.add_parser("merge", help="write the samples of several folders as one")
-    merging.add_argument("directories", type=Path, nargs="+", metavar="DIR", help="shards")
-    merging.set_defaults(handler=run_merge)
-    for action in (splitting, merging):
+        split.add_argument(f"--{name}", action="append", help="only this; may be repeated")
+    for action in (listing, split):
+        action.add_argument("--split", help="only this split")
+    for action in (split, merge):
         action.add_argument("out", type=Path, metavar="OUT", help="empty or absent folder")
         action.add_argument("--shard-mb", type=int, default=256, help="size of a shard")
 
 
 def run_split(args: argparse.Namespace) -> int:
     """Copy the samples that match."""
-    from express50.shards.edit import split_shards
+    from express50.shards.reader import ShardReader
+    from express50.shards.writer import copy_samples
 
-    count = split_shards(
-        args.directory, args.out, args.shard_mb, args.subject, args.expression, args.camera,
-        args.split,
-    )  # fmt: skip
-    say(f"{args.out}: {count} samples")
+    wanted = (args.subject, args.expression, args.camera, args.split)
+    reader = ShardReader(args.directory).select(*wanted)
+    say(f"{args.out}: {copy_samples([reader], args.out, args.shard_mb)} samples")
     return OK
 
 
 def run_merge(args: argparse.Namespace) -> int:
     """Copy the samples of all folders."""
-    from express50.shards.edit import merge_shards
+    from express50.shards.reader import ShardReader
+    from express50.shards.writer import copy_samples
 
-    say(f"{args.out}: {merge_shards(args.directories, args.out, args.shard_mb)} samples")
+    readers = [ShardReader(directory) for directory in args.directories]
+    say(f"{args.out}: {copy_samples(readers, args.out, args.shard_mb)} samples")
     return OK
 
 

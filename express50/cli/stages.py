@@ -8,61 +8,51 @@ from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
-from express50.console import FAILED, OK, say, say_json, stdout_to_stderr
+from express50.console import FAILED, OK, add_command, say, say_json, stdout_to_stderr
 from express50.contract.config import PRESETS, config_toml, resolve_config
-from express50.contract.extensions import stages, with_required
 from express50.contract.layout import Dataset
-from express50.contract.stage import Stage
+from express50.contract.stage import Stage, stages, with_required
 from express50.errors import ConfigError, StageError
 
 
 def add_commands(subparsers: Any) -> None:
     """Add one command per stage, ``run`` and ``config``."""
     for stage in stages().values():
-        parser = subparsers.add_parser(
-            stage.name, help=stage.help, description=stage.help,
+        parser = add_command(
+            subparsers, stage.name, run_one, stage.help, description=stage.help,
             epilog=f"options of the stage: express50 config {stage.name}",
         )  # fmt: skip
         _add_run_options(parser, captures=stage.prepare is not None)
         parser.add_argument("--items", metavar="GLOB", help="only items that match, such as 'S00*'")
-        parser.set_defaults(handler=run_one, stage=stage.name)
+        parser.set_defaults(stage=stage.name)
     words, names = "run all stages in order", list(stages())
-    parser = subparsers.add_parser(
-        "run", help=words, description=words, epilog="options of a stage: express50 config STAGE"
-    )
+    parser = add_command(
+        subparsers, "run", run_all, words, description=words,
+        epilog="options of a stage: express50 config STAGE",
+    )  # fmt: skip
     _add_run_options(parser, captures=True)
     parser.add_argument("--first", metavar="STAGE", choices=names, help="start here")
     parser.add_argument("--last", metavar="STAGE", choices=names, help="end here")
-    parser.set_defaults(handler=run_all)
-    parser = subparsers.add_parser("config", help="print the configuration of stages as TOML")
+    words = "print the configuration of stages as TOML"
+    parser = add_command(subparsers, "config", show_config, words, dataset=False, json=False)
     parser.add_argument("stage", nargs="*", metavar="STAGE", help="all by default")
     add_config_options(parser)
-    parser.set_defaults(handler=show_config)
 
 
 def _add_run_options(parser: argparse.ArgumentParser, captures: bool) -> None:
-    parser.add_argument("dataset", type=Path, metavar="DATASET", help="folder of the dataset")
+    add = parser.add_argument
     if captures:
-        parser.add_argument(
-            "captures", nargs="*", type=Path, metavar="CAPTURE", help="folders of raw captures"
-        )
+        add("captures", nargs="*", type=Path, metavar="CAPTURE", help="folders of raw captures")
     add_config_options(parser)
-    parser.add_argument(
-        "--workers", type=int, default=2, metavar="N", help="local processes; 0 runs in this one"
-    )
-    parser.add_argument("--scheduler", metavar="ADDRESS", help="dask scheduler, tcp://host:port")
-    parser.add_argument(
-        "--slurm",
-        metavar="JOBS",
-        help="run in SLURM jobs: partition=P,time=4:00:00,memory=16G,cores=4,jobs=8 or jobs.toml",
-    )
-    parser.add_argument(
-        "--print-job", action="store_true", help="print the script of a SLURM job, and run nothing"
-    )
-    parser.add_argument(
-        "--threads", type=int, default=1, metavar="N", help="threads an item may use (default 1)"
-    )
-    parser.add_argument("--json", action="store_true", help="print the account as JSON")
+    words = "local processes; 0 runs in this one"
+    add("--workers", type=int, default=2, metavar="N", help=words)
+    add("--scheduler", metavar="ADDRESS", help="dask scheduler, tcp://host:port")
+    words = "run in SLURM jobs: partition=P,time=4:00:00,memory=16G,cores=4,jobs=8 or jobs.toml"
+    add("--slurm", metavar="JOBS", help=words)
+    words = "print the script of a SLURM job, and run nothing"
+    add("--print-job", action="store_true", help=words)
+    words = "threads an item may use (default 1)"
+    add("--threads", type=int, default=1, metavar="N", help=words)
 
 
 def add_config_options(parser: argparse.ArgumentParser) -> None:
@@ -114,8 +104,14 @@ def _run(args: argparse.Namespace, chosen: Sequence[Stage], pattern: str | None)
     cap_threads(args.threads)
     dataset = Dataset(args.dataset)
     slurm = _slurm_jobs(args)
-    if args.print_job:
-        return _print_jobs(dataset, args, chosen, slurm or {})
+    if slurm is not None and args.print_job:
+        from express50.runner.slurm import job_script
+
+        logs = Dataset(dataset.root.resolve()).slurm_dir
+        for job in dict.fromkeys(slurm[stage.name] for stage in chosen):
+            address = "tcp://ADDRESS-OF-THE-RUN"
+            say(job_script(job, address, "express50-N", args.threads, logs).rstrip())
+        return OK
     summaries = []
     with (
         stdout_to_stderr() if args.json else nullcontext(),
@@ -150,19 +146,6 @@ def _slurm_jobs(args: argparse.Namespace) -> Mapping[str, Any] | None:
 
     check_slurm(submit=not args.print_job)
     return read_slurm(args.slurm, stages())
-
-
-def _print_jobs(
-    dataset: Dataset, args: argparse.Namespace, chosen: Sequence[Stage], slurm: Mapping[str, Any]
-) -> int:
-    """Print each script that jobs of these stages would have, once."""
-    from express50.runner.slurm import job_script
-
-    logs = Dataset(dataset.root.resolve()).slurm_dir
-    for job in dict.fromkeys(slurm[stage.name] for stage in chosen):
-        address = "tcp://ADDRESS-OF-THE-RUN"
-        say(job_script(job, address, "express50-N", args.threads, logs).rstrip())
-    return OK
 
 
 def _items(

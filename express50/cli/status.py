@@ -1,37 +1,80 @@
-"""``express50 status``: what is done, failed, running and missing, as a table or a live page."""
+"""``express50 status``: what is done, failed, running and missing, as a table or a live page.
+
+All of it is read from the ledger.
+"""
 
 from __future__ import annotations
 
 import argparse
 import time
-from collections.abc import Iterable
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
-from express50.console import FAILED, OK, format_table, say, say_json
-from express50.contract.extensions import stages
+from rich.filesize import decimal
+
+from express50.console import FAILED, OK, add_command, format_table, say, say_json
 from express50.contract.layout import Dataset, existing_dataset
+from express50.contract.stage import stages
 from express50.errors import ConfigError
-from express50.runner.ledger import Ledger, Receipt
-from express50.runner.status import StageStatus, read_status
+from express50.files.atomic import write_bytes
+from express50.runner.ledger import Ledger, Receipt, Run
 
 PAGE_SECONDS = 3.0  # between two pages while a run goes on
+SILENT_SECONDS = 15.0  # a run that shows no sign for so long was killed
+RECENT = 50  # items whose rate counts for the time left
+FAILED_SHOWN = 200
+SLOWEST_SHOWN = 10
+RUNNING_SHOWN = 40
+
+
+@dataclass(frozen=True, kw_only=True)
+class StageStatus:
+    """The progress of one stage.
+
+    Attributes:
+        stage: stage name.
+        state: ``running``, ``stopped`` (its run was killed), ``failed`` (items did), ``done``, or
+            ``not run``.
+        done: items that are.
+        failed: receipts of items that are not.
+        running: when each item that is worked at was begun, seconds since 1970.
+        missing: items of the last run that wait or were left when it was stopped.
+        rate: items per second of late; 0 while none has ended.
+        left_s: seconds until the run ends at that rate, None where that is not known.
+        seconds: work of all items.
+        peak_memory: of the item that took most, bytes.
+        receipts: all of them.
+    """
+
+    stage: str
+    state: str
+    done: int
+    failed: tuple[Receipt, ...]
+    running: dict[str, float]
+    missing: int
+    rate: float
+    left_s: float | None
+    seconds: float
+    peak_memory: int
+    receipts: tuple[Receipt, ...]
+
+    def counts(self) -> dict[str, int]:
+        """Count the items by what became of them."""
+        failed, running = len(self.failed), len(self.running)
+        return {"done": self.done, "failed": failed, "running": running, "missing": self.missing}
 
 
 def add_commands(subparsers: Any) -> None:
-    """Add ``status`` and ``info``."""
-    parser = subparsers.add_parser("status", help="what is done, what failed, time and memory")
-    parser.add_argument("dataset", type=Path, metavar="DATASET")
+    """Add ``status``."""
+    words = "what is done, what failed, time and memory"
+    parser = add_command(subparsers, "status", show_status, words, json=False)
     how = parser.add_mutually_exclusive_group()
     how.add_argument("--json", action="store_true", help="print receipts as JSON")
     how.add_argument("--page", type=Path, metavar="FILE", help="HTML page, kept up while a run is")
     how.add_argument("--serve", type=int, metavar="PORT", help="the page on http://127.0.0.1:PORT")
-    parser.set_defaults(handler=show_status)
-    parser = subparsers.add_parser("info", help="subjects, cameras, frames and expressions")
-    parser.add_argument("dataset", type=Path, metavar="DATASET")
-    parser.add_argument("--json", action="store_true", help="print as JSON")
-    parser.set_defaults(handler=show_info)
 
 
 def show_status(args: argparse.Namespace) -> int:
@@ -43,8 +86,11 @@ def show_status(args: argparse.Namespace) -> int:
         table = _keep_page(dataset, args.page)
     else:
         table = _read(dataset)
-        if args.json:
-            say_json({row.stage: [_row(r) for r in row.receipts] for row in table})
+        if args.json:  # receipts but for their files, which `express50 check` looks at
+            rows = {row.stage: [dict(vars(receipt)) for receipt in row.receipts] for row in table}
+            for receipt in (one for receipts in rows.values() for one in receipts):
+                del receipt["made"]
+            say_json(rows)
         else:
             say(*_lines(table))
     return FAILED if any(row.failed for row in table) else OK
@@ -55,26 +101,17 @@ def _read(dataset: Dataset) -> list[StageStatus]:
         return read_status(ledger, list(stages()))
 
 
-def _page(dataset: Dataset, live: bool | None) -> tuple[str, list[StageStatus]]:
-    """The page and what is on it; it loads itself again if ``live``, None: while a run goes on."""
-    from express50.runner.status import status_page
-
-    table = _read(dataset)
-    again = any(row.state == "running" for row in table) if live is None else live
-    name = dataset.root.resolve().name
-    return status_page(name, table, PAGE_SECONDS if again else None), table
-
-
 def _keep_page(dataset: Dataset, path: Path) -> list[StageStatus]:
-    from express50.runner.status import write_page
-
+    """Write the page again and again until no stage runs."""
     said = False
     while True:
-        text, table = _page(dataset, None)
-        write_page(path, text)
+        table = _read(dataset)
+        runs = any(row.state == "running" for row in table)
+        name = dataset.root.resolve().name
+        write_bytes(path, status_page(name, table, PAGE_SECONDS if runs else None).encode())
         if not said:
             say(f"wrote {path}")
-        if not any(row.state == "running" for row in table):
+        if not runs:
             return table
         if not said:
             say("keeping it up to date until the run ends; Ctrl-C stops that, not the run")
@@ -88,7 +125,8 @@ def _serve(dataset: Dataset, port: int) -> int:
             if self.path != "/":
                 self.send_error(404)
                 return
-            body = _page(dataset, True)[0].encode()
+            name = dataset.root.resolve().name
+            body = status_page(name, _read(dataset), PAGE_SECONDS).encode()
             self.send_response(200)
             self.send_header("Content-Type", "text/html; charset=utf-8")
             self.send_header("Content-Length", str(len(body)))
@@ -109,52 +147,153 @@ def _serve(dataset: Dataset, port: int) -> int:
     return OK
 
 
-def _lines(table: list[StageStatus]) -> Iterable[str]:
+def _lines(table: list[StageStatus]) -> Iterator[str]:
     header = ["stage", "done", "failed", "running", "missing", "seconds", "peak MB", "state"]
-    rows = [
-        [
-            row.stage,
-            *(str(n) for n in (row.done, len(row.failed), len(row.running), row.missing)),
-            f"{row.seconds:.1f}",
-            f"{row.peak_memory / 1e6:.0f}",
-            row.state,
-        ]
-        for row in table
-    ]
+    rows = []
+    for row in table:
+        counts = [str(count) for count in row.counts().values()]
+        work = [f"{row.seconds:.1f}", f"{row.peak_memory / 1e6:.0f}"]
+        rows.append([row.stage, *counts, *work, row.state])
     yield from format_table(header, rows)
     for row in table:
         for receipt in row.failed:
             yield f"failed {receipt.stage} {receipt.item}: {receipt.reason}"
 
 
-def _row(receipt: Receipt) -> dict[str, Any]:
-    """A receipt but for its files, which ``express50 check`` looks at."""
-    return {name: value for name, value in vars(receipt).items() if name != "made"}
+def read_status(
+    ledger: Ledger, names: Sequence[str], now: float | None = None
+) -> list[StageStatus]:
+    """Read the StageStatus of every stage, in order; ``now`` is in seconds since 1970."""
+    moment = time.time() if now is None else now
+    runs = ledger.runs()
+    return [_stage(name, ledger.read(name), runs.get(name), moment) for name in names]
 
 
-def show_info(args: argparse.Namespace) -> int:
-    """Print what was ingested."""
-    from express50.capture.index import read_index
-
-    dataset = existing_dataset(args.dataset)
-    indices = [read_index(dataset, subject) for subject in dataset.subjects()]
-    header = ["subject", "cameras", "size", "frames", "expressions", "plates", "calibration"]
-    rows = [[str(value) for value in _info(index).values()] for index in indices]
-    if args.json:
-        say_json([_info(index) for index in indices])
+def _stage(name: str, table: dict[str, Receipt], run: Run | None, now: float) -> StageStatus:
+    receipts = tuple(table.values())
+    failed = tuple(r for r in receipts if r.status == "failed")
+    alive, open_items, former, rate = False, 0, 0, 0.0
+    running: dict[str, float] = {}
+    if run is not None:
+        alive = not run.ended and now - run.seen < SILENT_SECONDS
+        settled = [r.time for r in receipts if r.time >= run.begun]
+        # An item may be in the ledger before the run's next sign says that it is over.
+        began = run.running if alive else {}
+        running = {k: t for k, t in began.items() if k not in table or table[k].time < t}
+        open_items = max(0, run.items - run.current - len(settled))
+        rate = _rate(settled, run.begun, now if alive else run.ended or run.seen)
+        # Items that wait to be made anew have their former receipts still.
+        older = sum(r.status == "done" and r.time < run.begun for r in receipts)
+        former = min(open_items, max(0, older - run.current))
+    if alive:
+        state = "running"
+    elif open_items or (run is not None and not run.ended):
+        state = "stopped"
     else:
-        say(*format_table(header, rows))
-    return OK
+        state = "failed" if failed else "done" if receipts else "not run"
+    return StageStatus(
+        stage=name,
+        state=state,
+        done=len(receipts) - len(failed) - former,
+        failed=failed,
+        running=running,
+        missing=max(0, open_items - len(running)),
+        rate=rate,
+        left_s=open_items / rate if alive and rate > 0 else None,
+        seconds=sum(r.seconds for r in receipts),
+        peak_memory=max((r.peak_memory for r in receipts), default=0),
+        receipts=receipts,
+    )
 
 
-def _info(index: Any) -> dict[str, Any]:
-    sizes = sorted({f"{c.width}x{c.height}" for c in index.cameras.values()})
-    return {
-        "subject": index.subject,
-        "cameras": len(index.cameras),
-        "size": ",".join(sizes),
-        "frames": index.frames,
-        "expressions": len(index.cues),
-        "plates": len(index.plates),
-        "calibration": "given" if index.calibration else "board" if index.board else "none",
+def _rate(ends: list[float], begun: float, now: float) -> float:
+    """Items per second over the last ones, up to now: it sinks while nothing ends."""
+    recent = sorted(ends)[-RECENT - 1 :]
+    if len(recent) <= RECENT:  # the start of the run counts as an end
+        recent = [begun, *recent]
+    return (len(recent) - 1) / max(now - recent[0], 1e-3) if ends else 0.0
+
+
+def status_page(name: str, table: Sequence[StageStatus], refresh_s: float | None) -> str:
+    """Render the page.
+
+    Args:
+        name: of the dataset.
+        table: its stages.
+        refresh_s: seconds until a browser loads it again; None if it stays as it is.
+    """
+    import jinja2
+
+    now = time.time()
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("express50.cli", "."), autoescape=True, trim_blocks=True
+    )
+    states = {stage.state for stage in table}
+    failed = [receipt for stage in table for receipt in stage.failed]
+    receipts = [receipt for stage in table for receipt in stage.receipts]
+    slowest = sorted(receipts, key=lambda r: (-r.seconds, r.stage, r.item))[:SLOWEST_SHOWN]
+    working = [
+        {"stage": stage.stage, "item": item, "for": format_seconds(now - since)}
+        for stage in table
+        for item, since in sorted(stage.running.items(), key=lambda pair: pair[1])
+    ]
+    return environment.get_template("status_page.html").render(
+        name=name,
+        state=next((s for s in ("running", "stopped", "failed", "done") if s in states), "not run"),
+        time=time.strftime("%Y-%m-%d %H:%M:%S %Z", time.localtime(now)),
+        refresh=refresh_s,
+        cards=_cards(table),
+        stages=[_row(stage) for stage in table],
+        working=working[:RUNNING_SHOWN],
+        more_working=max(0, len(working) - RUNNING_SHOWN),
+        failed=failed[:FAILED_SHOWN],
+        more_failed=max(0, len(failed) - FAILED_SHOWN),
+        slowest=[
+            vars(receipt)
+            | {
+                "seconds": format_seconds(receipt.seconds),
+                "share": round(100 * receipt.seconds / max(slowest[0].seconds, 1e-9), 1),
+                "memory": decimal(receipt.peak_memory),
+            }
+            for receipt in slowest
+        ],
+    )
+
+
+def _cards(table: Sequence[StageStatus]) -> list[tuple[str, str]]:
+    names = ("done", "failed", "running", "missing")
+    cards = [(name, f"{sum(stage.counts()[name] for stage in table):,}") for name in names]
+    current = next((stage for stage in table if stage.state == "running"), None)
+    if current is not None:
+        left = "not known yet" if current.left_s is None else format_seconds(current.left_s)
+        cards.append((f"left of {current.stage}", left))
+    most = max((stage.peak_memory for stage in table), default=0)
+    return [*cards, ("peak memory of an item", decimal(most))]
+
+
+def _row(stage: StageStatus) -> dict[str, Any]:
+    counts = stage.counts()
+    total = sum(counts.values())
+    rate = f"{stage.rate:.1f}/s" if stage.rate >= 1 else f"{60 * stage.rate:.1f}/min"
+    return counts | {
+        "stage": stage.stage,
+        "state": stage.state,
+        "words": "some failed" if stage.state == "failed" else stage.state,
+        "shares": [(k, round(100 * n / total, 3)) for k, n in counts.items() if n],
+        "rate": rate if stage.rate > 0 else "",
+        "left": "" if stage.left_s is None else format_seconds(stage.left_s),
+        "seconds": format_seconds(stage.seconds) if stage.receipts else "",
+        "memory": decimal(stage.peak_memory) if stage.receipts else "",
     }
+
+
+def format_seconds(seconds: float) -> str:
+    """Format a duration for people: ``42 s``, ``3:05 min``, ``2:10 h``, ``3 d 4 h``."""
+    whole = round(seconds)
+    if whole < 60:
+        return f"{seconds:.1f} s" if seconds < 10 else f"{whole} s"
+    if whole < 3600:
+        return f"{whole // 60}:{whole % 60:02d} min"
+    if whole < 86400:
+        return f"{whole // 3600}:{whole % 3600 // 60:02d} h"
+    return f"{whole // 86400} d {whole % 86400 // 3600} h"

@@ -6,10 +6,10 @@ import ast
 import dataclasses
 import difflib
 import inspect
+import json
 import math
 import textwrap
 import tomllib
-import types
 import typing
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -50,16 +50,49 @@ def resolve_config(
             f"{stage.name}: unknown preset {preset!r}{nearest(preset, stage.presets)}; "
             f"expected one of {', '.join(stage.presets)}"
         )
-    tables = {stage.name, *known_stages}
+    tables = sorted({stage.name, *known_stages})
     values: dict[str, object] = dict(stage.presets[preset])
-    if given := _file_values(stage.name, file, tables):
-        try:
-            build_config(stage, values | given)
-        except ConfigError as error:
-            raise ConfigError(f"{file}: {error}") from None
-        values |= given
-    values |= _assigned_values(stage.name, assignments, tables)
+    if file is not None:
+        values |= read_tables(file, tables).get(stage.name, {})
+    for table, key, value in known_assignments(assignments, tables, "stage"):
+        if table == stage.name:
+            values[key] = value
     return build_config(stage, values)
+
+
+def read_tables(file: Path, known: Sequence[str]) -> dict[str, dict[str, object]]:
+    """Returns the tables of a TOML file.
+
+    Raises:
+        ConfigError: no such file, an unknown table, or a value outside a table.
+    """
+    if not Path(file).exists():
+        raise ConfigError(f"--config {file}: no such file")
+    content = read_toml(file, ConfigError)
+    for table, given in content.items():
+        _check_table(table, known, f"{file}: unknown table [{table}]")
+        if not isinstance(given, dict):
+            raise ConfigError(f"{file}: {table} is a value, expected a table [{table}]")
+    return content
+
+
+def known_assignments(
+    texts: Iterable[str], known: Sequence[str], kind: str = "table"
+) -> list[tuple[str, str, object]]:
+    """Splits ``table.key=value`` strings as `parse_assignment` does.
+
+    Raises:
+        ConfigError: an unknown table, or a text that has not that form.
+    """
+    found = [(text, *parse_assignment(text)) for text in texts]
+    for text, table, _, _ in found:
+        _check_table(table, known, f"--set {text!r}: no {kind} {table!r} in this command")
+    return [(table, key, value) for _, table, key, value in found]
+
+
+def _check_table(table: str, known: Sequence[str], words: str) -> None:
+    if table not in known:
+        raise ConfigError(f"{words}{nearest(table, known)}; expected {', '.join(known)}")
 
 
 def build_config(stage: Stage, values: Mapping[str, object]) -> Any:
@@ -115,37 +148,6 @@ def parse_assignment(text: str) -> tuple[str, str, object]:
         return table, key, raw.strip()
 
 
-def _assigned_values(stage: str, assignments: Sequence[str], tables: set[str]) -> dict:
-    values = {}
-    for text in assignments:
-        table, key, value = parse_assignment(text)
-        if table not in tables:
-            raise ConfigError(
-                f"--set {text!r}: no stage {table!r} in this command"
-                f"{nearest(table, sorted(tables))}; expected {', '.join(sorted(tables))}"
-            )
-        if table == stage:
-            values[key] = value
-    return values
-
-
-def _file_values(stage: str, file: Path | None, tables: set[str]) -> dict:
-    if file is None:
-        return {}
-    if not Path(file).exists():
-        raise ConfigError(f"--config {file}: no such file")
-    content = read_toml(file, ConfigError)
-    for table, value in content.items():
-        if table not in tables:
-            raise ConfigError(
-                f"{file}: unknown table [{table}]{nearest(table, sorted(tables))}; "
-                f"expected {', '.join(sorted(tables))}"
-            )
-        if not isinstance(value, dict):
-            raise ConfigError(f"{file}: {table} is a value, expected a table [{table}]")
-    return content.get(stage, {})
-
-
 def _coerce(name: str, value: object, kind: Any) -> object:
     origin, arguments = typing.get_origin(kind), typing.get_args(kind)
     if origin is Literal:
@@ -154,49 +156,18 @@ def _coerce(name: str, value: object, kind: Any) -> object:
             hint = nearest(str(value), map(str, arguments))
             raise ConfigError(f"{name}: got {value!r}{hint}; expected one of {choices}")
         return value
-    if origin in (typing.Union, types.UnionType):
-        return _coerce_union(name, value, arguments)
-    if origin is tuple:
-        return _coerce_tuple(name, value, arguments)
+    if origin is tuple:  # of any length and one type
+        if not isinstance(value, list | tuple):
+            raise ConfigError(f"{name}: got {value!r}, expected a list such as [1, 2]")
+        return tuple(_coerce(f"{name}[{i}]", one, arguments[0]) for i, one in enumerate(value))
     if kind is float and isinstance(value, int | float) and not isinstance(value, bool):
         if math.isnan(value):
             raise ConfigError(f"{name}: got NaN, expected a number")
         return float(value)
-    # bool is an int in Python, but true is no count
-    if isinstance(kind, type) and type(value) is kind:
+    # bool is an int in Python, but true is not a count
+    if type(value) is kind:
         return value
-    raise ConfigError(
-        f"{name}: got {value!r} ({type(value).__name__}), expected {_type_name(kind)}"
-    )
-
-
-def _coerce_union(name: str, value: object, arguments: tuple) -> object:
-    if value in (None, "none") and type(None) in arguments:
-        return None
-    kinds = [kind for kind in arguments if kind is not type(None)]
-    for kind in kinds[:-1]:
-        try:
-            return _coerce(name, value, kind)
-        except ConfigError:
-            continue
-    return _coerce(name, value, kinds[-1])
-
-
-def _coerce_tuple(name: str, value: object, arguments: tuple) -> tuple:
-    if not isinstance(value, list | tuple):
-        raise ConfigError(f"{name}: got {value!r}, expected a list such as [1, 2]")
-    if len(arguments) == 2 and arguments[1] is Ellipsis:
-        arguments = (arguments[0],) * len(value)
-    if len(value) != len(arguments):
-        raise ConfigError(f"{name}: got {len(value)} values, expected {len(arguments)}")
-    return tuple(
-        _coerce(f"{name}[{i}]", one, kind)
-        for i, (one, kind) in enumerate(zip(value, arguments, strict=True))
-    )
-
-
-def _type_name(kind: Any) -> str:
-    return kind.__name__ if isinstance(kind, type) else str(kind)
+    raise ConfigError(f"{name}: got {value!r} ({type(value).__name__}), expected {kind.__name__}")
 
 
 def config_values(config: Any) -> dict[str, object]:
@@ -210,19 +181,9 @@ def config_toml(name: str, config: Any) -> str:
     lines = [f"[{name}]"]
     for key, value in config_values(config).items():
         lines += [f"# {line}" for line in textwrap.wrap(documents.get(key, ""), 98)]
-        lines.append(f'{key} = "none"' if value is None else f"{key} = {_toml_value(value)}")
+        # A number, text, list or truth is written in TOML as in JSON.
+        lines.append(f"{key} = {json.dumps(value, ensure_ascii=False)}")
     return "\n".join(lines) + "\n"
-
-
-def _toml_value(value: object) -> str:
-    if isinstance(value, bool):
-        return "true" if value else "false"
-    if isinstance(value, str):
-        escaped = value.replace("\\", "\\\\").replace('"', '\\"').replace("\n", "\\n")
-        return f'"{escaped}"'
-    if isinstance(value, list | tuple):
-        return "[" + ", ".join(map(_toml_value, value)) + "]"
-    return repr(value)
 
 
 def field_documents(config: type) -> dict[str, str]:

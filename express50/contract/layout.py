@@ -1,12 +1,13 @@
-"""Paths of a dataset folder that several parts of the toolkit use."""
+"""Paths of a dataset folder that several parts of the toolkit use, and who is excluded from it."""
 
 from __future__ import annotations
 
+import contextlib
 from dataclasses import dataclass
 from pathlib import Path
 
-from express50.errors import CaptureError, FormatError, StageError
-from express50.files.text import NAME, read_json, read_toml
+from express50.errors import AnnotationError, CaptureError, FormatError, StageError
+from express50.files.text import NAME, parse_json, read_bytes, read_json_table, read_toml
 
 
 def footage_root(capture: Path) -> Path:
@@ -80,15 +81,12 @@ class Dataset:
         if not self.captures_file.is_file():
             return {}
         fix = "delete it and run 'express50 ingest' with every capture again"
-        table = read_json(self.captures_file, FormatError, fix)
-        if not isinstance(table, dict) or not all(isinstance(v, str) for v in table.values()):
-            raise FormatError(
-                f"{self.captures_file}: expected an object subject -> path, got "
-                f"{type(table).__name__}; delete it and run 'express50 ingest' again"
-            )
-        for subject in table:
-            if not NAME.fullmatch(subject):  # it becomes the name of folders
-                raise FormatError(f"{self.captures_file}: subject {subject!r} is not an id; {fix}")
+        table = read_json_table(self.captures_file, FormatError, fix)
+        for subject, path in table.items():
+            if not NAME.fullmatch(subject) or not isinstance(path, str):  # it names folders
+                raise FormatError(
+                    f"{self.captures_file}: {subject!r}: {path!r}, expected an id and a path; {fix}"
+                )
         return {subject: Path(table[subject]) for subject in sorted(table)}
 
     def index_file(self, subject: str) -> Path:
@@ -110,6 +108,10 @@ class Dataset:
     def peaks_file(self, subject: str) -> Path:
         """Peak frame of each expression of a subject."""
         return self.item_dir("align", subject) / "peaks.json"
+
+    def observations_file(self, subject: str) -> Path:
+        """File of the landmarks and faces that the observe stage saw of a subject."""
+        return self.item_dir("observe", subject) / "observations.npz"
 
     def suggestions_file(self, subject: str) -> Path:
         """Peak frames that the align stage suggests."""
@@ -185,3 +187,21 @@ def existing_dataset(path: Path) -> Dataset:
             f"{path}: not a dataset (no ledger.sqlite); run 'express50 ingest {path} CAPTURE'"
         )
     return dataset
+
+
+def exclusion_reason(dataset: Dataset, subject: str) -> str | None:
+    """Return why a subject is excluded (``express50 annotate exclude``), or None if it is not."""
+    path = dataset.labels_file(subject)
+    reason = None
+    data = read_bytes(path, AnnotationError) if path.is_file() else b""
+    for line in data.decode("utf-8", errors="replace").split("\n"):
+        with contextlib.suppress(AnnotationError, AttributeError):  # a torn line says nothing
+            row = parse_json(line, str(path), AnnotationError)
+            if row.get("action") in ("exclude", "include"):
+                reason = row.get("reason") if row["action"] == "exclude" else None
+    return reason
+
+
+def included_subjects(dataset: Dataset) -> list[str]:
+    """List ingested subjects that are not excluded, sorted."""
+    return [s for s in dataset.subjects() if exclusion_reason(dataset, s) is None]

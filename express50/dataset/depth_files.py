@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from express50.errors import FormatError
-from express50.files.images import read_depth_png, read_image, write_depth_png, write_image
+from express50.files.images import DEPTH_UNIT_M, depth_to_uint16, read_image, write_image
 
 DEPTH_ENDINGS = {"png16": ".png", "exr16": ".exr", "exr32": ".exr"}
 NORMAL_STEPS = {"png8": 127, "png16": 32767}  # of a component from 0 to 1
@@ -44,7 +44,7 @@ def write_depth(
     """
     path = folder / f"{camera_id}{DEPTH_ENDINGS[kind]}"
     if kind == "png16":
-        write_depth_png(path, depth, valid)
+        write_image(path, depth_to_uint16(depth, valid))
         return path
     inside = depth[valid]
     if inside.size and not (
@@ -62,9 +62,11 @@ def read_depth(path: Path) -> tuple[np.ndarray, np.ndarray]:
     Raises:
         FormatError: the file is not a depth map.
     """
-    if path.suffix != ".exr":
-        return read_depth_png(path)
     depth = read_image(path)
+    if path.suffix != ".exr":
+        if depth.dtype != np.uint16 or depth.ndim != 2:
+            raise FormatError(f"{path}: {depth.dtype} {depth.shape}, expected 16-bit grey depth")
+        return (depth * np.float32(DEPTH_UNIT_M)).astype(np.float32), depth > 0
     if depth.dtype != np.float32 or depth.ndim != 2:
         raise FormatError(f"{path}: {depth.dtype} {depth.shape}, expected one channel of floats")
     if not (np.isfinite(depth).all() and depth.min(initial=0) >= 0):

@@ -15,6 +15,7 @@ from express50.contract.layout import Dataset
 from express50.errors import FormatError, StageError
 from express50.files.arrays import read_arrays
 from express50.files.text import ID
+from express50.geometry.shapes import check_finite, check_shape
 
 SCHEMAS = ("express50.track/1", "express50.track/2")
 SEQUENCE_SCHEMA = "express50.sequence/1"
@@ -185,23 +186,13 @@ def _checked(
         **{name: (count, *width) for name, width in _WIDTHS.items()},
     } | further
     for name, shape in shapes.items():
-        _check(name, arrays[name], shape)
+        check_shape(name, arrays[name], shape)
+        if arrays[name].dtype.kind not in ("iu" if name == "frames" else "fiu"):
+            raise ValueError(f"{name} is {arrays[name].dtype}, expected numbers")
+        check_finite(name, arrays[name])
     R = arrays["R"]
     error = np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)).max()
     if error > 1e-3 or (np.linalg.det(R) < 0).any():
         raise ValueError(f"R is not a rotation: R R^T differs from 1 by {error:.2g}")
     kinds = {"frames": np.int64, "vertices": np.float32, "offsets": np.float32}
     return {name: arrays[name].astype(kinds.get(name, np.float64)) for name in shapes}
-
-
-def _check(name: str, array: np.ndarray, shape: tuple[int | None, ...]) -> None:
-    """Check that an array has a shape (None is any size) and holds finite numbers."""
-    kinds = "iu" if name == "frames" else "fiu"
-    fits = array.ndim == len(shape) and all(
-        want is None or want == got for want, got in zip(shape, array.shape, strict=False)
-    )
-    if not fits or array.dtype.kind not in kinds:
-        wanted = str(shape).replace("None", "any")
-        raise ValueError(f"{name} is {array.dtype} {array.shape}, expected numbers {wanted}")
-    if not np.isfinite(array).all():
-        raise ValueError(f"{name} holds NaN or Inf")

@@ -1,23 +1,32 @@
-"""Withdraw a subject: remove all that the dataset holds of a person, then search for the rest.
+"""Withdraw a subject: remove all that the dataset holds of a person, then search for the id.
 
 Whatever mixes subjects (packed shards, reports, trained models' pictures) is removed whole and made
 again without the person by running its command; others' outputs that name the person go too. A
 checkpoint loses the person's codes and frames; only a new training removes what its other
 weights learned. The raw capture lies outside the dataset and stays its owner's task.
+
+An id is found as a word: letters and digits beside it would make it another. Archives, arrays of
+texts and the ledger are searched; pixels and points are not, as they may hold any four bytes by
+chance.
 """
 
 from __future__ import annotations
 
+import io
+import re
 import shutil
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import suppress
+import sqlite3
+import tarfile
+import zipfile
+import zlib
+from collections.abc import Callable, Collection, Iterator, Sequence
+from contextlib import closing, suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 from express50.contract.layout import Dataset
-from express50.dataset.id_search import files_naming, names, says
 from express50.errors import FormatError, StageError
 from express50.files.atomic import write_json
 from express50.files.digests import text_digest
@@ -26,6 +35,20 @@ from express50.runner.ledger import Ledger
 from express50.runner.publish import hold_stages
 
 Redact = Callable[[Path, str], bool]
+Test = Callable[[bytes], bool]
+
+# What damaged archives and databases raise.
+DAMAGED = (
+    tarfile.TarError, zipfile.BadZipFile, zlib.error, sqlite3.DatabaseError, ValueError, EOFError,
+    OverflowError, NotImplementedError, RuntimeError,
+)  # fmt: skip
+IMAGE_SUFFIXES = {".jpg", ".jpeg", ".png", ".exr", ".tif", ".ply", ".glb", ".mp4"}
+CHUNK = 1 << 24
+OVERLAP = 256
+TEXT_LIMIT = 1 << 24
+RUN = re.compile(rb"[A-Za-z0-9][A-Za-z0-9_-]*")
+PART = re.compile(rb"[A-Za-z0-9]+")
+LONGEST_ID = 6  # parts joined by '_' or '-'
 
 
 @dataclass(frozen=True)
@@ -52,9 +75,17 @@ def plan(dataset: Dataset, subject: str) -> list[Path]:
     if not (subject in known or labelled or text_digest(subject) in withdrawn(dataset)):
         there = ", ".join(sorted(known)) or "none"
         raise StageError(f"{dataset.root}: no subject {subject!r}; subjects: {there}")
-    own = sorted(_own_paths(dataset, subject))
-    paths = own + sorted(_mixed_paths(dataset))
-    return paths + sorted(_naming_items(dataset, subject, paths))
+    paths = sorted(_own_paths(dataset, subject)) + sorted(_mixed_paths(dataset))
+    # Others' outputs that name the subject: their reference's, or whose plate stood in.
+    gone, naming = set(paths), []
+    for path in files_that(names(subject), dataset.root):
+        parts = path.relative_to(dataset.root).parts
+        items = [dataset.root.joinpath(*parts[:depth]) for depth in (3, 2)]
+        found = next((item for item in items if (item / "metrics.json").is_file()), None)
+        if found is not None and gone.isdisjoint([path, *path.parents]):
+            naming.append(found)
+            gone.add(found)
+    return paths + sorted(naming)
 
 
 def _own_paths(dataset: Dataset, subject: str) -> Iterator[Path]:
@@ -91,22 +122,6 @@ def _mixed_paths(dataset: Dataset) -> Iterator[Path]:
             yield path
 
 
-def _naming_items(dataset: Dataset, subject: str, gone: list[Path]) -> Iterator[Path]:
-    """Yield others' outputs that name the subject: their reference's, or whose plate stood in."""
-    for path in files_naming(dataset.root, subject):
-        parents = [path, *path.parents]
-        if not set(parents).isdisjoint(gone):
-            continue
-        for folder in parents:
-            depth = len(folder.relative_to(dataset.root).parts) if folder != dataset.root else 0
-            if depth in (2, 3) and (folder / "metrics.json").is_file():
-                yield folder
-                gone = [*gone, folder]
-                break
-            if depth == 0:
-                break
-
-
 def withdraw(
     dataset: Dataset,
     subject: str,
@@ -136,7 +151,13 @@ def withdraw(
         captures = dataset.captures()
         capture = captures.pop(subject, None)
         files = sum(1 if p.is_file() else sum(q.is_file() for q in p.rglob("*")) for p in paths)
-        _record(dataset, subject, files)
+        # Who and how many files, without the id itself: a trace must not name the person.
+        record = withdrawn_file(dataset)
+        rows = _withdrawals(record) if record.is_file() else []
+        now = datetime.now(UTC).isoformat(timespec="seconds")
+        write_json(
+            record, [*rows, {"id_sha256": text_digest(subject), "time": now, "files": files}]
+        )
         for path in paths:
             if path.is_dir():
                 shutil.rmtree(path)
@@ -153,7 +174,7 @@ def withdraw(
                     changed.append(path)
     test = names(subject)
     remaining = [
-        *files_naming(dataset.root, subject),
+        *files_that(test, dataset.root),
         *(path for path in checkpoints if path.is_file() and says(path, test)),
     ]
     return Withdrawal(subject, capture, tuple(paths), tuple(changed), tuple(remaining), files)
@@ -162,14 +183,6 @@ def withdraw(
 def withdrawn_file(dataset: Dataset) -> Path:
     """Return the file of withdrawals' records."""
     return dataset.root / "withdrawn.json"
-
-
-def _record(dataset: Dataset, subject: str, files: int) -> None:
-    """Note when somebody was withdrawn and how many files went; the id only as a digest."""
-    path = withdrawn_file(dataset)
-    rows = _withdrawals(path) if path.is_file() else []
-    time = datetime.now(UTC).isoformat(timespec="seconds")
-    write_json(path, [*rows, {"id_sha256": text_digest(subject), "time": time, "files": files}])
 
 
 def withdrawn(dataset: Dataset) -> set[str]:
@@ -191,3 +204,107 @@ def _withdrawals(path: Path) -> list:
 
 def _digest(row: Any) -> Any:
     return row.get("id_sha256") if isinstance(row, dict) else row
+
+
+def names(subject: str) -> Test:
+    """Make a test of whether a text names a subject."""
+    word = re.compile(rb"(?<![A-Za-z0-9])" + re.escape(subject.encode()) + rb"(?![A-Za-z0-9])")
+    return lambda text: word.search(text) is not None
+
+
+def names_any_of(digests: Collection[str]) -> Test:
+    """Make a test of whether a text holds an id whose SHA-256 is one of the given."""
+    seen: dict[bytes, bool] = {}
+
+    def hit(run: bytes) -> bool:
+        # Any of its parts may be an id, and any parts together: ``S001_smile`` names S001.
+        if run not in seen:
+            spans = [match.span() for match in PART.finditer(run)]
+            words = (
+                run[first:last]
+                for number, (first, _) in enumerate(spans)
+                for _, last in spans[number : number + LONGEST_ID]
+            )
+            seen[run] = any(text_digest(word.decode()) in digests for word in (run, *words))
+        return seen[run]
+
+    return lambda text: any(hit(run) for run in set(RUN.findall(text)))
+
+
+def files_that(test: Test, root: Path) -> Iterator[Path]:
+    """Yield files below a folder whose path or content passes a test."""
+    for path in sorted(p for p in root.rglob("*") if p.is_file()):
+        if test(str(path.relative_to(root)).encode()) or says(path, test):
+            yield path
+
+
+def says(path: Path, test: Test) -> bool:
+    """True if a file's content passes a test."""
+    return any(map(test, texts_of(path)))
+
+
+def texts_of(path: Path) -> Iterator[bytes]:
+    """Yield the text in a file, piece by piece."""
+    suffix = path.suffix.lower()
+    if suffix in IMAGE_SUFFIXES or path.name.endswith(("sqlite-wal", "sqlite-shm")):
+        return
+    with path.open("rb") as file:
+        head = file.read(16)
+    try:
+        if suffix == ".tar":
+            yield from _tar_texts(path)
+        elif head.startswith(b"SQLite format 3\0"):
+            with closing(sqlite3.connect(path)) as database:
+                query = "SELECT name FROM sqlite_master WHERE type = 'table'"
+                for (table,) in database.execute(query).fetchall():
+                    # Row by row: a page of the file runs texts together without a gap.
+                    for row in database.execute(f'SELECT * FROM "{table}"'):
+                        yield "\n".join(value for value in row if isinstance(value, str)).encode()
+        elif head.startswith(b"PK\x03\x04") and zipfile.is_zipfile(path):
+            yield from _zip_texts(path)
+        else:
+            yield from _blocks(path)
+    except DAMAGED:
+        yield from _blocks(path)  # a damaged archive may still name somebody
+
+
+def _blocks(path: Path) -> Iterator[bytes]:
+    with path.open("rb") as file:
+        yield from _pieces(file)
+
+
+def _pieces(file: IO[bytes]) -> Iterator[bytes]:
+    tail = b""
+    while block := file.read(CHUNK):
+        yield tail + block
+        tail = block[-OVERLAP:]
+
+
+def _tar_texts(path: Path) -> Iterator[bytes]:
+    with tarfile.open(path, "r:") as tar:
+        for member in tar:
+            yield member.name.encode(errors="surrogateescape")
+            if member.issparse():  # our shards have none; it may say to be of any size
+                raise tarfile.ReadError("a sparse member")
+            # A link would lead to another member; only what a member itself holds counts.
+            wanted = member.isreg() and member.name.endswith(".json")
+            file = tar.extractfile(member) if wanted else None
+            if file is not None:
+                yield from _pieces(file)
+
+
+def _zip_texts(path: Path) -> Iterator[bytes]:
+    """Yield names and texts of an archive such as .npz or a checkpoint, without its numbers."""
+    import numpy as np
+
+    with zipfile.ZipFile(path) as archive:
+        for member in archive.infolist():
+            yield member.filename.encode()
+            if member.filename.endswith((".pkl", ".json", ".txt")):
+                with archive.open(member) as file:
+                    yield from _pieces(file)
+            elif member.filename.endswith(".npy") and member.file_size < TEXT_LIMIT:
+                data = archive.read(member)
+                if b"'descr': '<U" in data[:128] or b"'descr': '|S" in data[:128]:
+                    array = np.load(io.BytesIO(data), allow_pickle=False)
+                    yield "\n".join(map(str, array.ravel())).encode()

@@ -1,32 +1,45 @@
-"""Read ``.npz`` and ``.npy`` files, checking sizes before memory is allocated.
+"""Read arrays from ``.npz``, ``.npy``, pickle and torch files without executing anything.
 
-Nothing in a file is executed: pickled objects are refused. The shape and type in an array's header
-must fit the bytes of the file, and all arrays of a file together a limit.
+Sizes are checked before memory is allocated: the shape and type in an array's header must fit the
+bytes of the file, and all arrays of a file together a limit. FLAME's files are Python 2 pickles
+that name chumpy and scipy classes; landmark embeddings hold torch tensors. None of those libraries
+is imported: every class comes from a short allow list, and those of chumpy, scipy and torch are
+replaced by records that only keep their state. A pickle that names anything else is refused before
+anything is called. Torch's own files are read with ``weights_only``.
 """
 
 from __future__ import annotations
 
+import codecs
 import io
 import math
+import pickle
+import struct
 import zipfile
 import zlib
+from collections import OrderedDict
 from collections.abc import Collection
 from lzma import LZMAError
 from pathlib import Path
 from tokenize import TokenError
-from typing import BinaryIO
+from types import MappingProxyType
+from typing import Any, BinaryIO
 
 import numpy as np
 
+from express50.errors import HeadModelError
 from express50.files.text import AGAIN, Kind, reason
 
-SIZE_LIMIT = 2 << 30  # unpacked bytes of a file; 60 expressions of a 26,000-vertex head take 19 MB
+SIZE_LIMIT = 2 << 30  # bytes of a file, unpacked; 60 expressions of a 26,000-vertex head take 19 MB
 HEADER_LIMIT = 4096  # characters of an array's header
-# What zipfile and NumPy raise on damaged files.
+# Of an array made from a list, a sparse matrix or a view; FLAME's largest has six million.
+VALUES_LIMIT = 1 << 25
+# What zipfile, NumPy, the standard unpickler and torch raise on damaged files.
 DAMAGE = (
     ValueError, TypeError, EOFError, OSError, KeyError, IndexError, OverflowError, MemoryError,
-    NotImplementedError, RuntimeError, SyntaxError, UnicodeError, AttributeError, LZMAError,
-    zipfile.BadZipFile, zlib.error, TokenError,
+    NotImplementedError, RuntimeError, SyntaxError, UnicodeError, AttributeError, ImportError,
+    AssertionError, LZMAError, zipfile.BadZipFile, zlib.error, TokenError, struct.error,
+    pickle.UnpicklingError,
 )  # fmt: skip
 
 
@@ -112,3 +125,272 @@ def _array(file: BinaryIO, size: int) -> np.ndarray:
         raise ValueError(f"an array {dtype} {shape} needs {need} bytes, the file has {have}")
     file.seek(0)
     return np.lib.format.read_array(file, allow_pickle=False)
+
+
+class Record:
+    """Stands for a class that is not imported; keeps what the pickle says of it."""
+
+    state: dict[str, Any]
+
+    def __new__(cls, *_: object) -> Record:
+        """Start with an empty state: pickles may build objects without calling __init__."""
+        made = super().__new__(cls)
+        made.state = {}
+        return made
+
+    def __init__(self, *_: object) -> None:
+        """Ignore constructor arguments: the state holds everything."""
+
+    def __setstate__(self, state: object) -> None:
+        """Keep the state; slots come as a pair (dict, dict)."""
+        for part in state if isinstance(state, tuple) else (state,):
+            if isinstance(part, dict):
+                self.state.update(part)
+
+
+class ChumpyArray(Record):
+    """Stands for a chumpy.Ch: the array is in state["x"]."""
+
+
+class SparseMatrix(Record):
+    """Stands for a scipy.sparse csr matrix."""
+
+    compression = "csr_array"
+
+    def dense(self) -> np.ndarray:
+        """Make a dense (rows, columns) array; SciPy checks the compressed one."""
+        import scipy.sparse
+
+        rows, columns = self.state.get("_shape", self.state.get("shape"))  # type: ignore[misc]
+        if not 0 <= rows * columns <= VALUES_LIMIT:
+            raise ValueError(f"a sparse matrix of {rows} x {columns}")
+        parts = tuple(np.asarray(self.state[key]) for key in ("data", "indices", "indptr"))
+        made = getattr(scipy.sparse, self.compression)(parts, shape=(rows, columns))
+        made.check_format(full_check=True)
+        return made.toarray()
+
+
+class ColumnMatrix(SparseMatrix):
+    """Stands for a scipy.sparse csc matrix."""
+
+    compression = "csc_array"
+
+
+class StorageType(Record):
+    """Stands for a torch storage type."""
+
+
+class ArrayType(Record):
+    """Stands for numpy.ndarray, which, called by a pickle, would make arrays of any size."""
+
+
+def _new_record(kind: object = Record, *_: object) -> Record:
+    """Do what copy_reg._reconstructor does, for records alone."""
+    if isinstance(kind, type) and issubclass(kind, Record):
+        return kind()
+    raise pickle.UnpicklingError("copy_reg._reconstructor of a class that is not allowed")
+
+
+def _encode(text: object, encoding: object = "latin1") -> bytes:
+    """Do what _codecs.encode does for the byte strings of protocol 2."""
+    if not isinstance(text, str) or encoding not in ("latin1", "latin-1"):
+        raise pickle.UnpicklingError("_codecs.encode of something other than latin-1 text")
+    return codecs.latin_1_encode(text)[0]
+
+
+def _reconstruct_array(kind: object, shape: object, code: object) -> np.ndarray:
+    """Do what numpy's _reconstruct does, for plain arrays alone."""
+    if kind is not ArrayType:
+        raise pickle.UnpicklingError("numpy array subclass")
+    return np.ndarray((0,), np.dtype("b"))
+
+
+def _dtype(code: object, *flags: object) -> np.dtype:
+    """Make a numpy.dtype from a type code string."""
+    if not isinstance(code, (str, bytes)):
+        raise pickle.UnpicklingError("numpy.dtype from something other than a code")
+    return np.dtype(code.decode("ascii") if isinstance(code, bytes) else code)
+
+
+def _scalar(dtype: np.dtype, data: object) -> np.generic:
+    """Rebuild a NumPy scalar from its bytes."""
+    raw = data.encode("latin1") if isinstance(data, str) else data
+    if not isinstance(raw, bytes) or dtype.hasobject:
+        raise pickle.UnpicklingError("numpy scalar without bytes")
+    return np.frombuffer(raw, dtype=dtype, count=1)[0]
+
+
+def _tensor(
+    storage: object, offset: int, size: tuple[int, ...], stride: tuple[int, ...], *_: object
+) -> np.ndarray:
+    """Do what torch._utils._rebuild_tensor_v2 does on a NumPy storage, bounds checked."""
+    if not isinstance(storage, np.ndarray) or storage.ndim != 1 or offset < 0:
+        raise pickle.UnpicklingError("tensor without a storage")
+    if min((*size, *stride, 0)) < 0:
+        raise pickle.UnpicklingError("tensor with negative size or stride")
+    last = offset + sum((n - 1) * step for n, step in zip(size, stride, strict=True))
+    if 0 not in size and last >= storage.size:
+        raise pickle.UnpicklingError("tensor reaches beyond its storage")
+    if math.prod(size) > VALUES_LIMIT:  # a stride of 0 repeats one number for ever
+        raise pickle.UnpicklingError(f"tensor of {math.prod(size)} numbers, over {VALUES_LIMIT}")
+    steps = [step * storage.itemsize for step in stride]
+    return np.lib.stride_tricks.as_strided(storage[offset:], size, steps).copy()
+
+
+def _read_torch_storage(data: object) -> np.ndarray:
+    """Read a storage pickled into an array file, as torch.storage._load_from_bytes does.
+
+    Layout: pickles of magic, protocol, system information, the storage, its keys; then for each key
+    an int64 count and the raw little-endian numbers.
+    """
+    if not isinstance(data, bytes):
+        raise pickle.UnpicklingError("torch storage without bytes")
+    stream = io.BytesIO(data)
+    for _ in range(3):
+        SafeUnpickler(stream, encoding="latin1").load()
+    reader = SafeUnpickler(stream, encoding="latin1")
+    reader.storages, reader.longest = {}, len(data)  # type: ignore[attr-defined]
+    storage = reader.load()
+    keys = SafeUnpickler(stream, encoding="latin1").load()
+    if not isinstance(keys, list) or not isinstance(storage, np.ndarray) or len(keys) != 1:
+        raise pickle.UnpicklingError("a torch storage with an unknown layout")
+    count = int(np.frombuffer(stream.read(8), "<i8", count=1)[0])
+    raw = stream.read(storage.nbytes)
+    if count != storage.size or len(raw) != storage.nbytes:
+        raise pickle.UnpicklingError("a torch storage that is cut short")
+    return np.frombuffer(raw, storage.dtype).copy()
+
+
+_NUMPY = ("numpy.core.multiarray", "numpy._core.multiarray")
+_ALLOWED = MappingProxyType(
+    {
+        **{(module, "_reconstruct"): _reconstruct_array for module in _NUMPY},
+        **{(module, "scalar"): _scalar for module in _NUMPY},
+        ("numpy", "ndarray"): ArrayType,
+        ("numpy", "dtype"): _dtype,
+        ("_codecs", "encode"): _encode,
+        ("copy_reg", "_reconstructor"): _new_record,
+        ("copyreg", "_reconstructor"): _new_record,
+        ("__builtin__", "object"): Record,
+        ("builtins", "object"): Record,
+        ("__builtin__", "set"): set,
+        ("builtins", "set"): set,
+        ("collections", "OrderedDict"): OrderedDict,
+        ("torch._utils", "_rebuild_tensor_v2"): _tensor,
+        ("torch.storage", "_load_from_bytes"): _read_torch_storage,
+    }
+)
+_STORAGE_DTYPES = MappingProxyType(
+    {
+        "FloatStorage": np.float32, "DoubleStorage": np.float64, "HalfStorage": np.float16,
+        "LongStorage": np.int64, "IntStorage": np.int32, "ShortStorage": np.int16,
+        "ByteStorage": np.uint8, "CharStorage": np.int8, "BoolStorage": np.bool_,
+    }
+)  # fmt: skip
+
+
+class SafeUnpickler(pickle.Unpickler):
+    """Resolves names from the allow list only."""
+
+    def find_class(self, module: str, name: str) -> Any:  # noqa: ANN401 (pickle's own signature)
+        """Return the stand-in for a name, or refuse."""
+        if (module, name) in _ALLOWED:
+            return _ALLOWED[(module, name)]
+        if module.split(".")[0] == "chumpy":
+            return ChumpyArray
+        if module.startswith("scipy.sparse") and name in ("csc_matrix", "csc_array"):
+            return ColumnMatrix
+        if module.startswith("scipy.sparse") and name in ("csr_matrix", "csr_array"):
+            return SparseMatrix
+        if module == "torch" and name in _STORAGE_DTYPES:
+            return type(name, (StorageType,), {})
+        raise pickle.UnpicklingError(f"it names {module}.{name}, which is not on the allow list")
+
+    def persistent_load(self, pid: object) -> np.ndarray:
+        """Make a storage of torch's old format: ("storage", type, key, location, count, view)."""
+        storages = getattr(self, "storages", None)
+        if storages is None or not isinstance(pid, tuple) or len(pid) < 5 or pid[0] != "storage":
+            raise pickle.UnpicklingError("a persistent id outside a torch storage")
+        dtype, count = _STORAGE_DTYPES[pid[1].__name__], int(pid[4])
+        if not 0 <= count <= self.longest:  # type: ignore[attr-defined]
+            raise pickle.UnpicklingError(f"a torch storage of {count} numbers that are not there")
+        return storages.setdefault(str(pid[2]), np.zeros(count, dtype))
+
+
+def read_pickle(path: Path) -> Any:  # noqa: ANN401 (whatever the file holds)
+    """Read a pickle without executing anything.
+
+    Raises:
+        HeadModelError: unreadable, damaged, or naming something that is not on the allow list.
+    """
+    try:
+        size = path.stat().st_size
+        if size > SIZE_LIMIT:
+            raise HeadModelError(f"{path}: {size} bytes, expected at most {SIZE_LIMIT}")
+        with path.open("rb") as file:
+            return SafeUnpickler(file, encoding="latin1").load()
+    except DAMAGE as error:
+        raise HeadModelError(f"{path}: refused or damaged pickle ({reason(error)})") from error
+
+
+def read_object_array(path: Path) -> Any:  # noqa: ANN401 (whatever the file holds)
+    """Read an `.npy` file, also one that holds a pickled object, without executing anything.
+
+    Raises:
+        HeadModelError: as `read_pickle`.
+    """
+    try:
+        with path.open("rb") as file:
+            shape, dtype = read_header(file)
+            if not dtype.hasobject:
+                return read_npy(path, HeadModelError, "an array")
+            content = SafeUnpickler(file, encoding="latin1").load()
+    except DAMAGE as error:
+        raise HeadModelError(f"{path}: refused or damaged array ({reason(error)})") from error
+    return content.item() if isinstance(content, np.ndarray) and shape == () else content
+
+
+def to_array(value: object, name: str, where: str) -> np.ndarray:
+    """Convert what a pickle held (array, chumpy, sparse matrix or list) to a dense array.
+
+    Raises:
+        HeadModelError: it is not numbers, is too large, or holds NaN or Inf.
+    """
+    for _ in range(8):  # one may hold another; a loop of them holds nothing
+        if isinstance(value, ChumpyArray):
+            value = next((value.state[key] for key in ("x", "a", "v") if key in value.state), None)
+    try:
+        array = value.dense() if isinstance(value, SparseMatrix) else np.asarray(value)
+    except (ValueError, TypeError, OverflowError, KeyError, IndexError, MemoryError) as error:
+        raise HeadModelError(f"{where}: {name} is not an array ({reason(error)})") from error
+    if array.dtype.kind not in "fiub":
+        raise HeadModelError(f"{where}: {name} holds {array.dtype}, expected numbers")
+    if array.size > VALUES_LIMIT:
+        raise HeadModelError(f"{where}: {name} holds {array.size} numbers, over {VALUES_LIMIT}")
+    if array.dtype.kind == "f" and not np.isfinite(array).all():
+        raise HeadModelError(f"{where}: {name} holds NaN or Inf, expected finite numbers")
+    return array
+
+
+def read_weights(path: Path, kind: Kind, where: str, what: str, fix: str = AGAIN) -> Any:  # noqa: ANN401
+    """Read a file of ``torch.save`` to the CPU.
+
+    Args:
+        path: the file.
+        kind: class of the errors.
+        where: how messages name the file.
+        what: it is expected to be, such as "a torch state dict".
+        fix: how to fix it.
+
+    Raises:
+        Express50Error: of the given kind: it is missing, damaged, or names what ``weights_only``
+            does not allow.
+    """
+    import torch
+
+    if not Path(path).is_file():
+        raise kind(f"{where}: no such file; {fix}")
+    try:
+        return torch.load(path, map_location="cpu", weights_only=True)
+    except DAMAGE as error:
+        raise kind(f"{where}: not {what} ({reason(error)}); {fix}") from None

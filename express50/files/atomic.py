@@ -6,6 +6,8 @@ import json
 import os
 import shutil
 import uuid
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 
@@ -39,26 +41,30 @@ def write_json(path: Path, value: object) -> None:
     write_bytes(path, dump_json(value))
 
 
-def replace_directory(source: Path, target: Path) -> None:
-    """Rename ``source`` to ``target``; a former target is moved out of the way and deleted.
+@contextmanager
+def folder_in_one_step(aside: Path, target: Path) -> Iterator[Path]:
+    """Yield an empty folder aside; on a clean exit it is synced and replaces ``target``.
 
-    A kill between the two renames leaves the target absent, never mixed.
+    When the body raises, a former target stays as it was. A kill between the two renames leaves
+    the target absent, never mixed. What a killed run left aside is deleted.
     """
-    target.parent.mkdir(parents=True, exist_ok=True)
-    former = source.with_name(source.name + ".former")
-    if target.exists():
-        target.rename(former)
-    source.rename(target)
-    sync_directory(target.parent)
-    shutil.rmtree(former, ignore_errors=True)
-
-
-def sync_tree(root: Path) -> None:
-    """Flush every file and folder below ``root`` to the disk."""
-    for folder, _, names in os.walk(root, topdown=False):
-        for name in names:
-            _sync(Path(folder) / name, os.O_RDONLY)
-        sync_directory(Path(folder))
+    shutil.rmtree(aside, ignore_errors=True)
+    aside.mkdir(parents=True)
+    try:
+        yield aside
+        for folder, _, names in os.walk(aside, topdown=False):
+            for name in names:
+                _sync(Path(folder) / name, os.O_RDONLY)
+            sync_directory(Path(folder))
+        target.parent.mkdir(parents=True, exist_ok=True)
+        former = aside.with_name(aside.name + ".former")
+        if target.exists():
+            target.rename(former)
+        aside.rename(target)
+        sync_directory(target.parent)
+        shutil.rmtree(former, ignore_errors=True)
+    finally:
+        shutil.rmtree(aside, ignore_errors=True)
 
 
 def sync_directory(path: Path) -> None:

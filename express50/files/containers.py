@@ -8,8 +8,9 @@ unpacked to the disk, no name leads out of the footage's folder, and sizes are c
 from __future__ import annotations
 
 import io
-import struct
 import zipfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -19,7 +20,7 @@ import numpy as np
 from PIL import Image
 
 from express50.errors import CaptureError, FormatError
-from express50.files.arrays import DAMAGE as ZIP_DAMAGE
+from express50.files.arrays import DAMAGE as ARRAY_DAMAGE
 from express50.files.digests import cached_by_file
 from express50.files.images import decode_cv, linear_to_srgb, read_image, upright
 from express50.files.text import read_bytes
@@ -33,33 +34,21 @@ OPEN_FILES = 4  # containers a process keeps open
 DAMAGE = (OSError, RuntimeError, KeyError, ValueError, TypeError, OverflowError, AttributeError)
 
 
-def to_srgb8(image: np.ndarray) -> np.ndarray:
-    """Convert an image (H, W[, C]) to (H, W, 3) uint8 sRGB; floats are linear, 16 bits are sRGB.
+def to_srgb(image: np.ndarray, kind: type = np.uint8) -> np.ndarray:
+    """Convert an image (H, W[, C]) to (H, W, 3) sRGB levels of uint8 or uint16.
+
+    Floats are linear, whole numbers are sRGB of eight bits, or of sixteen for both kinds.
 
     Raises:
         ValueError: the image holds NaN or infinity.
     """
-    if image.dtype == np.uint16:
-        return np.rint(_three_channels(image) / 257.0).astype(np.uint8)
-    return _srgb_levels(image, np.uint8)
-
-
-def to_srgb16(image: np.ndarray) -> np.ndarray:
-    """Convert an image (H, W[, C]) uint16 sRGB or float linear to (H, W, 3) uint16 sRGB.
-
-    Raises:
-        ValueError: the image holds NaN or infinity.
-    """
-    return _srgb_levels(image, np.uint16)
-
-
-def _srgb_levels(image: np.ndarray, kind: type) -> np.ndarray:
-    """Levels (H, W, 3) of an unsigned type; integers must be of that type already."""
     image = _three_channels(image)
     if image.dtype.kind == "f":
         if not np.isfinite(image).all():
             raise ValueError("image holds NaN or infinity")
         image = np.rint(linear_to_srgb(np.clip(image, 0.0, 1.0)) * np.iinfo(kind).max)
+    elif image.dtype == np.uint16 and kind is np.uint8:
+        image = np.rint(image / 257.0)
     return np.ascontiguousarray(image.astype(kind))
 
 
@@ -70,21 +59,7 @@ def _three_channels(image: np.ndarray) -> np.ndarray:
     return np.repeat(image[..., :1], 3, axis=2) if image.shape[2] < 3 else image[..., :3]
 
 
-def read_srgb8(path: Path) -> np.ndarray:
-    """Read an image file as (H, W, 3) uint8 sRGB.
-
-    Raises:
-        CaptureError: the file is missing, damaged or holds NaN or infinity.
-    """
-    try:
-        return to_srgb8(read_image(path))
-    except FormatError as error:
-        raise CaptureError(str(error)) from error
-    except ValueError as error:
-        raise CaptureError(f"{path}: {error}; export it again") from error
-
-
-def inside(root: Path, name: str, where: str = "") -> Path:
+def inside(root: Path, name: str) -> Path:
     """Return the path of a name relative to a folder.
 
     Raises:
@@ -94,11 +69,9 @@ def inside(root: Path, name: str, where: str = "") -> Path:
     path = root / name
     out = pure.is_absolute() or ".." in pure.parts or not name.isprintable()
     if any(len(part.encode(errors="replace")) > NAME_LIMIT for part in pure.parts):
-        raise CaptureError(f"{where or root}: {name[:40]!r}... is longer than a name may be")
+        raise CaptureError(f"{root}: {name[:40]!r}... is longer than a name may be")
     if out or not path.resolve().is_relative_to(root.resolve()):
-        raise CaptureError(
-            f"{where or root}: {name!r} leads out of {root}; expected a name inside it"
-        )
+        raise CaptureError(f"{root}: {name!r} leads out of it; expected a name inside it")
     return path
 
 
@@ -109,7 +82,7 @@ def read_picture(root: Path, name: str, orientation: int = 1) -> np.ndarray:
         CaptureError: it is missing, damaged, too large, or its name leads out of the folder.
     """
     try:
-        return to_srgb8(read_samples(root, name, orientation))
+        return to_srgb(read_samples(root, name, orientation))
     except ValueError as error:
         raise CaptureError(f"{root / name}: {error}; export it again") from error
 
@@ -143,7 +116,7 @@ def decode_picture(data: bytes, where: str) -> np.ndarray:
     try:
         with Image.open(io.BytesIO(data), formats=("JPEG", "PNG", "AVIF")) as header:
             width, height = header.size
-    except (*ZIP_DAMAGE, struct.error, Image.DecompressionBombError) as error:
+    except (*ARRAY_DAMAGE, Image.DecompressionBombError) as error:
         raise CaptureError(
             f"{where}: {len(data)} bytes are not a JPEG, PNG or AVIF image; copy the file again"
         ) from error
@@ -173,16 +146,23 @@ def member_bytes(path: Path, member: str) -> bytes:
     archive = open_zip(path)
     if member not in archive.NameToInfo:
         raise CaptureError(f"{path}: has no member {member}; copy it again")
-    try:
+    with _damage_is_one_error(ARRAY_DAMAGE, f"{where}: damaged"):
         _check_size(archive.getinfo(member).file_size, where)
         return archive.read(member)
-    except (*ZIP_DAMAGE, struct.error) as error:
-        raise CaptureError(f"{where}: damaged ({error}); copy the archive again") from error
 
 
 def _check_size(size: int, where: str) -> None:
     if size > BYTES_LIMIT:
         raise CaptureError(f"{where}: {size} bytes, expected at most {BYTES_LIMIT}; it is damaged")
+
+
+@contextmanager
+def _damage_is_one_error(kinds: tuple[type[BaseException], ...], words: str) -> Iterator[None]:
+    """Turn what libraries raise on damaged files into one CaptureError."""
+    try:
+        yield
+    except kinds as error:
+        raise CaptureError(f"{words} ({error}); copy the file again") from error
 
 
 def open_zip(path: Path) -> zipfile.ZipFile:
@@ -191,10 +171,8 @@ def open_zip(path: Path) -> zipfile.ZipFile:
     Raises:
         CaptureError: it is missing or not a zip.
     """
-    try:
+    with _damage_is_one_error(ARRAY_DAMAGE, f"{path}: not a zip archive"):
         return _open_zip(path)
-    except ZIP_DAMAGE as error:
-        raise CaptureError(f"{path}: not a zip archive ({error}); copy it again") from error
 
 
 _open_zip = cached_by_file(OPEN_FILES)(zipfile.ZipFile)
@@ -206,12 +184,8 @@ def open_hdf5(path: Path) -> h5py.File:
     Raises:
         CaptureError: it is missing, truncated or not an HDF5 file.
     """
-    try:
+    with _damage_is_one_error(DAMAGE, f"{path}: cannot be opened as HDF5"):
         return _hdf5_of(path, "r")
-    except DAMAGE as error:
-        raise CaptureError(
-            f"{path}: cannot be opened as HDF5 ({error}); copy the file again"
-        ) from error
 
 
 _hdf5_of = cached_by_file(OPEN_FILES)(h5py.File)
@@ -226,7 +200,7 @@ def child(file: h5py.File, name: str, where: str) -> Any:
         CaptureError: a part of the path is a link, or the file is damaged.
     """
     node: Any = file
-    try:
+    with _damage_is_one_error(DAMAGE, f"{where}: {name} is damaged"):
         for part in name.split("/"):
             link = node.get(part, getlink=True) if isinstance(node, h5py.Group) else None
             if link is None:
@@ -234,8 +208,6 @@ def child(file: h5py.File, name: str, where: str) -> Any:
             if not isinstance(link, h5py.HardLink):
                 raise CaptureError(f"{where}: {name} is a link, expected data in the file itself")
             node = node[part]
-    except DAMAGE as error:
-        raise CaptureError(f"{where}: {name} is damaged ({error}); copy it again") from error
     return node
 
 
@@ -245,10 +217,8 @@ def members(group: h5py.Group, where: str) -> list[str]:
     Raises:
         CaptureError: the file is damaged.
     """
-    try:
+    with _damage_is_one_error(DAMAGE, f"{where}: a group is damaged"):
         return [str(name) for name in group]
-    except DAMAGE as error:
-        raise CaptureError(f"{where}: a group is damaged ({error}); copy it again") from error
 
 
 def attribute(group: h5py.Group, name: str, default: object, where: str) -> np.ndarray:
@@ -257,10 +227,8 @@ def attribute(group: h5py.Group, name: str, default: object, where: str) -> np.n
     Raises:
         CaptureError: the file is damaged.
     """
-    try:
+    with _damage_is_one_error(DAMAGE, f"{where}: attribute {name} is damaged"):
         return np.ravel(np.asarray(group.attrs.get(name, default)))
-    except DAMAGE as error:
-        raise CaptureError(f"{where}: attribute {name} is damaged ({error})") from error
 
 
 def read_array(file: h5py.File, name: str, where: str) -> np.ndarray:
@@ -272,12 +240,9 @@ def read_array(file: h5py.File, name: str, where: str) -> np.ndarray:
     node = child(file, name, where)
     if not isinstance(node, h5py.Dataset):
         raise CaptureError(f"{where}: has no array {name}; copy the file again")
-    try:
+    with _damage_is_one_error(DAMAGE, f"{where}: {name} is damaged"):
         if node.dtype.kind not in "uif" or node.is_virtual or node.external:
             raise CaptureError(f"{where}: {name} is {node.dtype}, expected numbers in the file")
-        _check_size(
-            int(np.prod(node.shape, dtype=object)) * node.dtype.itemsize, f"{where}: {name}"
-        )
+        size = int(np.prod(node.shape, dtype=object)) * node.dtype.itemsize
+        _check_size(size, f"{where}: {name}")
         return np.asarray(node[()])
-    except DAMAGE as error:
-        raise CaptureError(f"{where}: {name} is damaged ({error}); copy it again") from error

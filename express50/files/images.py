@@ -275,28 +275,6 @@ def depth_to_uint16(depth: np.ndarray, valid: np.ndarray) -> np.ndarray:
     return np.nan_to_num(steps).astype(np.uint16)
 
 
-def depth_from_uint16(steps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Convert 16-bit steps to depth (H, W) float32 metres, 0 where unknown, and validity (H, W)."""
-    return (steps * np.float32(DEPTH_UNIT_M)).astype(np.float32), steps > 0
-
-
-def write_depth_png(path: Path, depth: np.ndarray, valid: np.ndarray) -> None:
-    """Write a depth map (H, W), metres, as 16-bit PNG in steps of 0.05 mm; 0 means unknown."""
-    write_image(path, depth_to_uint16(depth, valid))
-
-
-def read_depth_png(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Read depth (H, W) float32 metres and validity (H, W) bool.
-
-    Raises:
-        FormatError: the file is not a 16-bit grey image.
-    """
-    steps = read_image(path)
-    if steps.dtype != np.uint16 or steps.ndim != 2:
-        raise FormatError(f"{path}: {steps.dtype} {steps.shape}, expected a 16-bit grey depth map")
-    return depth_from_uint16(steps)
-
-
 def srgb_to_linear(image_srgb: np.ndarray) -> np.ndarray:
     """Decode sRGB values in [0, 1] to linear light; IEC 61966-2-1."""
     x = np.asarray(image_srgb)
@@ -332,7 +310,7 @@ def resize_area(image: np.ndarray, width: int, height: int) -> np.ndarray:
     """Resize (H, W[, C]); averages areas when shrinking, interpolates when growing."""
     shrinking = width <= image.shape[1] and height <= image.shape[0]
     mode = cv2.INTER_AREA if shrinking else cv2.INTER_LINEAR
-    return cv2.resize(image, (width, height), interpolation=mode)
+    return cv2.resize(np.ascontiguousarray(image), (width, height), interpolation=mode)
 
 
 def edge_distance(mask: np.ndarray) -> np.ndarray:

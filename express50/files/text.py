@@ -98,17 +98,17 @@ def parse_json(text: str | bytes, where: str, kind: Kind, fix: str = AGAIN) -> A
         raise kind(f"{where}: not JSON ({reason(error)}); {fix}") from None
 
 
-def read_toml(path: Path, kind: Kind, fix: str = "correct it") -> dict[str, Any]:
+def read_toml(path: Path, kind: Kind) -> dict[str, Any]:
     """Read a TOML file.
 
     Raises:
         Express50Error: as `read_text`, or it is not TOML, nested too deeply, or holds a number that
             is NaN or infinite.
     """
-    return parse_toml(read_text(path, kind, TOML_LIMIT, fix), str(path), kind, fix)
+    return parse_toml(read_text(path, kind, TOML_LIMIT, "correct it"), str(path), kind)
 
 
-def parse_toml(text: str, where: str, kind: Kind, fix: str = "correct it") -> dict[str, Any]:
+def parse_toml(text: str, where: str, kind: Kind) -> dict[str, Any]:
     """Parse TOML text.
 
     Raises:
@@ -117,9 +117,9 @@ def parse_toml(text: str, where: str, kind: Kind, fix: str = "correct it") -> di
     try:
         return tomllib.loads(text, parse_float=_finite)
     except NotFiniteError as error:
-        raise kind(f"{where}: {error.located(text)}; {fix}") from None
+        raise kind(f"{where}: {error.located(text)}; correct it") from None
     except (ValueError, RecursionError) as error:
-        raise kind(f"{where}: not TOML: {reason(error)}; {fix}") from None
+        raise kind(f"{where}: not TOML: {reason(error)}; correct it") from None
 
 
 def reason(error: BaseException) -> str:

@@ -22,6 +22,7 @@ MODELS: dict[str, tuple[str, ...]] = {
     "OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"),
     "FULL_OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
 }
+NEAREST_M = 1e-9  # depth by which undistorted cameras divide at least
 _DISTORTION = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 
 
@@ -135,7 +136,7 @@ def distort(camera: Camera, xy: np.ndarray) -> np.ndarray:
     return np.stack([x * radial + dx, y * radial + dy], axis=1)
 
 
-def undistort(camera: Camera, xy: np.ndarray, iterations: int = 30) -> np.ndarray:
+def undistort(camera: Camera, xy: np.ndarray) -> np.ndarray:
     """Ideal normalised coordinates (N, 2) of distorted ones (N, 2), by damped fixed point.
 
     Where the lens folds no solution exists: the result is then finite but does not distort back.
@@ -143,7 +144,7 @@ def undistort(camera: Camera, xy: np.ndarray, iterations: int = 30) -> np.ndarra
     if not camera.dist.any():
         return np.asarray(xy, dtype=np.float64)
     ideal = np.array(xy, dtype=np.float64)
-    for _ in range(iterations):
+    for _ in range(30):
         error = xy - distort(camera, ideal)
         # Without the bound a diverging point overflows; 20 is 87 degrees off the axis.
         ideal = np.clip(ideal + error, -20.0, 20.0)
@@ -257,3 +258,33 @@ def _triangulate_one(P: np.ndarray, xy: np.ndarray, w: np.ndarray, focal: np.nda
         if np.linalg.norm(step) < 1e-10:
             break
     return point
+
+
+def project_pinhole(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Pixels (..., 2) and depth (...) of world points (..., 3) in an undistorted camera."""
+    ray, depth, _ = _rays(camera, points)
+    return ray * camera.K[[0, 1], [0, 1]] + camera.K[:2, 2], depth
+
+
+def inside_frame(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Pixels (S, 2) of world points (S, 3), and whether (S,) they lie in the image, a pixel in."""
+    pixels, depth = project_pinhole(camera, points)
+    size = np.array([camera.width, camera.height])
+    return pixels, (depth > 1e-3) & (pixels >= 1.0).all(1) & (pixels <= size - 1.0).all(1)
+
+
+def project_with_slope(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Pixels (..., 2) of world points (..., 3) and d pixel / d point (..., 2, 3)."""
+    ray, _, safe = _rays(camera, points)
+    rotation, K = camera.cam_from_world[:3, :3], camera.K
+    focal = K[[0, 1], [0, 1]]
+    slope = (rotation[:2] - ray[..., None] * rotation[2:]) / safe[..., None, None]
+    return ray * focal + K[:2, 2], slope * focal[:, None]
+
+
+def _rays(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Image-plane coordinates (..., 2) at unit depth, depth (...), depth that is never zero."""
+    local = points @ camera.cam_from_world[:3, :3].T + camera.cam_from_world[:3, 3]
+    depth = local[..., 2]
+    safe = np.where(np.abs(depth) > NEAREST_M, depth, NEAREST_M)
+    return local[..., :2] / safe[..., None], depth, safe

@@ -1,29 +1,25 @@
-"""Bilinear values of an image at corner-origin points, with a named policy for the border."""
+"""Functions that interpolate: bilinear values of an image, a smooth step, spherical harmonics."""
 
 from __future__ import annotations
-
-from typing import Literal
 
 import cv2
 import numpy as np
 
 from express50.geometry.conventions import corner_to_cell
 
-Border = Literal["edge", "zero"]
-_BORDERS = {"edge": cv2.BORDER_REPLICATE, "zero": cv2.BORDER_CONSTANT}
 # cv2.remap takes at most 32767 rows and columns; this many points per call fit the cache.
 _COLUMNS, _ROWS = 4096, 2048
 
 
-def bilinear(image: np.ndarray, points: np.ndarray, border: Border = "edge") -> np.ndarray:
+def bilinear(image: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Interpolate an image (H, W[, C]) at points (N, 2) quickly: (N[, C]) of the image's type.
 
-    OpenCV rounds places to 1/32 pixel; use `bilinear_slope` where that matters.
+    Outside the image the outermost pixels repeat. OpenCV rounds places to 1/32 pixel; use
+    `bilinear_slope` where that matters.
 
     Args:
         image: uint8, uint16, float32 or float64; at most 4 channels.
         points: x, y with the corner of the first pixel as origin.
-        border: "edge" repeats the outermost pixels, "zero" fades to 0 within one pixel.
     """
     count = len(points)
     columns = min(_COLUMNS, max(count, 1))
@@ -33,7 +29,7 @@ def bilinear(image: np.ndarray, points: np.ndarray, border: Border = "edge") -> 
     for start in range(0, len(padded), _ROWS):
         part = padded[start : start + _ROWS]
         x, y = np.ascontiguousarray(part[..., 0]), np.ascontiguousarray(part[..., 1])
-        found = cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=_BORDERS[border])
+        found = cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         out[start : start + _ROWS] = found.reshape(*x.shape, *image.shape[2:])
     return out.reshape(-1, *image.shape[2:])[:count]
 
@@ -57,3 +53,22 @@ def bilinear_slope(image: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, n
     top, low = a + (b - a) * fx, c + (d - c) * fx
     slope = np.stack([(b - a) * (1 - fy) + (d - c) * fy, low - top], axis=2)
     return top + (low - top) * fy, slope
+
+
+def smoothstep(x: np.ndarray, low: float, high: float) -> np.ndarray:
+    """Step smoothly from 0 at ``low`` to 1 at ``high``; ``low`` may exceed ``high``."""
+    t = np.clip((x - low) / (high - low), 0.0, 1.0)
+    return t * t * (3.0 - 2.0 * t)
+
+
+def sh_polynomials(directions: np.ndarray) -> np.ndarray:
+    """Evaluate the real spherical harmonics (N, 9) at unit directions (N, 3), without constants.
+
+    The order is (0,0), (1,-1), (1,0), (1,1), (2,-2) ... (2,2), without the Condon-Shortley sign:
+    1, y, z, x, xy, yz, 3z^2 - 1, xz, x^2 - y^2. Nine coefficients reproduce the irradiance of any
+    distant light to about one per cent (Ramamoorthi and Hanrahan 2001, "An efficient representation
+    for irradiance environment maps").
+    """
+    x, y, z = directions.T
+    columns = [np.ones_like(x), y, z, x, x * y, y * z, 3 * z * z - 1, x * z, x * x - y * y]
+    return np.stack(columns, axis=1)

@@ -27,7 +27,7 @@ def check_shape(
         raise ValueError(f"{prefix}{name} has shape {shape}, expected {wanted}")
 
 
-def check_finite(name: str, array: np.ndarray, where: str = "") -> None:
+def check_finite(name: str, array: np.ndarray) -> None:
     """Raise if ``array`` holds NaN or Inf.
 
     Raises:
@@ -36,8 +36,7 @@ def check_finite(name: str, array: np.ndarray, where: str = "") -> None:
     bad = ~np.isfinite(array)
     if bad.any():
         first = tuple(int(i) for i in np.argwhere(bad)[0])
-        prefix = f"{where}: " if where else ""
         raise ValueError(
-            f"{prefix}{name} has {int(bad.sum())} values that are not finite, the first at {first};"
+            f"{name} has {int(bad.sum())} values that are not finite, the first at {first};"
             " expected finite numbers"
         )

@@ -23,19 +23,10 @@ def axis_angle_to_matrix(axis_angle: np.ndarray) -> np.ndarray:
     safe = np.where(small, 1.0, theta)
     s = np.where(small, 1.0 - theta2 / 6.0, np.sin(safe) / safe)
     c = np.where(small, 0.5 - theta2 / 24.0, (1.0 - np.cos(safe)) / (safe * safe))
-    k = _cross_matrix(a)
+    x, y, z = np.moveaxis(a, -1, 0)
+    zero = np.zeros_like(x)
+    k = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).reshape(*a.shape[:-1], 3, 3)
     return np.eye(3) + s * k + c * (k @ k)
-
-
-def _cross_matrix(a: np.ndarray) -> np.ndarray:
-    """Matrices K (..., 3, 3) with K v = a x v."""
-    zero = np.zeros_like(a[..., 0])
-    rows = [
-        np.stack([zero, -a[..., 2], a[..., 1]], axis=-1),
-        np.stack([a[..., 2], zero, -a[..., 0]], axis=-1),
-        np.stack([-a[..., 1], a[..., 0], zero], axis=-1),
-    ]
-    return np.stack(rows, axis=-2)
 
 
 def quat_to_matrix(quats: np.ndarray) -> np.ndarray:

@@ -19,16 +19,12 @@ def axis_angle_to_matrix(axis_angle: Tensor) -> Tensor:
     safe = torch.where(small, torch.ones_like(theta2), theta2).sqrt()
     s = torch.where(small, 1.0 - theta2 / 6.0, torch.sin(safe) / safe)
     c = torch.where(small, 0.5 - theta2 / 24.0, (1.0 - torch.cos(safe)) / (safe * safe))
-    k = _cross_matrix(axis_angle)
+    x, y, z = axis_angle.unbind(-1)
+    zero = torch.zeros_like(x)
+    entries = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1)
+    k = entries.reshape(*axis_angle.shape[:-1], 3, 3)
     eye = torch.eye(3, dtype=axis_angle.dtype, device=axis_angle.device)
     return eye + s * k + c * (k @ k)
-
-
-def _cross_matrix(a: Tensor) -> Tensor:
-    """Matrices K (..., 3, 3) with K v = a x v."""
-    x, y, z = a.unbind(-1)
-    zero = torch.zeros_like(x)
-    return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).reshape(*a.shape[:-1], 3, 3)
 
 
 def quat_to_matrix(quats: Tensor) -> Tensor:
@@ -63,11 +59,9 @@ def matrix_to_quat(R: Tensor) -> Tensor:
     x = m[..., 2, 1] - m[..., 1, 2]
     y = m[..., 0, 2] - m[..., 2, 0]
     z = m[..., 1, 0] - m[..., 0, 1]
-    xy, xz, yz = (
-        m[..., 1, 0] + m[..., 0, 1],
-        m[..., 0, 2] + m[..., 2, 0],
-        m[..., 2, 1] + m[..., 1, 2],
-    )
+    xy = m[..., 1, 0] + m[..., 0, 1]
+    xz = m[..., 0, 2] + m[..., 2, 0]
+    yz = m[..., 2, 1] + m[..., 1, 2]
     branches = torch.stack(
         [
             torch.stack([squares[..., 0], x, y, z], -1),

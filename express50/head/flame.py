@@ -10,66 +10,62 @@ from __future__ import annotations
 
 import hashlib
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 
 from express50.errors import HeadModelError
-from express50.files.pickles import read_object_array, read_pickle, to_array
+from express50.files.arrays import read_object_array, read_pickle, to_array
 from express50.head.ict import read_obj
 from express50.head.model import PARENTS, REGIONS, HeadModel, check_head
-from express50.head.mouth import add_mouth, is_flame_topology
+from express50.head.mouth import FLAME_VERTICES, add_mouth
 
-EMBEDDINGS = (
-    "landmark_embedding.npy",
-    "landmark_embedding_with_eyes.npy",
-    "flame_static_embedding_68.pkl",
-)
-MASKS = ("FLAME_masks.pkl",)
-TEMPLATES = ("head_template_mesh.obj", "head_template.obj")
+COMPANIONS = {
+    "embedding": ("landmark_embedding.npy", "landmark_embedding_with_eyes.npy",
+                  "flame_static_embedding_68.pkl"),
+    "masks": ("FLAME_masks.pkl",),
+    "template": ("head_template_mesh.obj", "head_template.obj"),
+}  # fmt: skip
 _REQUIRED = ("v_template", "f", "shapedirs", "posedirs", "J_regressor", "weights", "kintree_table")
 
 
-def load_flame(
-    path: str | Path,
-    embedding: str | Path | None = None,
-    masks: str | Path | None = None,
-    template: str | Path | None = None,
-    mouth: bool = True,
-) -> HeadModel:
-    """Load FLAME.
+def load_flame(path: str | Path) -> HeadModel:
+    """Load FLAME, with teeth and the inside of the mouth where the file has FLAME's vertices.
 
     Args:
-        path: The model pickle (generic_model.pkl, flame2023.pkl, ...).
-        embedding: Landmark embedding, `.npy` or `.pkl`; by default looked for beside the model.
-        masks: FLAME_masks.pkl, likewise.
-        template: head_template_mesh.obj, likewise.
-        mouth: Add teeth and the inside of the mouth, where the file has FLAME's vertices.
+        path: The model pickle (generic_model.pkl, flame2023.pkl, ...); landmark embedding, masks
+            and template are looked for beside it.
 
     Raises:
         HeadModelError: a file is missing, damaged, unsafe or of another layout.
     """
-    path = Path(path)
-    files = _companions(path, embedding, masks, template)
+    model = read_flame(Path(path))
+    return check_head(add_mouth(model)) if len(model.template) == FLAME_VERTICES else model
+
+
+def read_flame(path: Path) -> HeadModel:
+    """Read FLAME as it is stored, with neither teeth nor the inside of a mouth."""
+    files = _companions(path)
     arrays = read_flame_arrays(path)
     faces = arrays["f"].astype(np.int64)
     _, uv, uv_corners, uv_faces, _ = read_obj(files["template"])
     if not np.array_equal(uv_corners, faces):
         raise HeadModelError(f"{files['template']}: its faces are not those of {path.name}")
     landmark_faces, landmark_bary, contour = read_embedding(files["embedding"], faces)
-    shape_count = shape_component_count(arrays["shapedirs"].shape[2])
-    directions = arrays["shapedirs"].astype(np.float32)
-    vertices = arrays["v_template"].shape[0]
+    vertices, _, directions = arrays["shapedirs"].shape
+    # Identity has 300 of 400 components in the published files, else three quarters.
+    shapes = 300 if directions > 300 else (3 * directions) // 4
 
     def tensor(array: np.ndarray) -> torch.Tensor:
         return torch.from_numpy(np.ascontiguousarray(array, dtype=np.float32))
 
-    model = check_head(
+    return check_head(
         HeadModel(
             name=f"flame-{hashlib.sha256(path.read_bytes()).hexdigest()[:12]}",
             template=tensor(arrays["v_template"]),
-            shape_dirs=tensor(directions[:, :, :shape_count]),
-            expression_dirs=tensor(directions[:, :, shape_count:]),
+            shape_dirs=tensor(arrays["shapedirs"][:, :, :shapes]),
+            expression_dirs=tensor(arrays["shapedirs"][:, :, shapes:]),
             pose_dirs=tensor(arrays["posedirs"].reshape(vertices * 3, -1).T),
             joint_regressor=tensor(arrays["J_regressor"]),
             skinning=tensor(arrays["weights"]),
@@ -79,27 +75,17 @@ def load_flame(
             landmark_faces=torch.from_numpy(landmark_faces),
             landmark_bary=tensor(landmark_bary),
             contour=contour,
-            shape_names=tuple(f"shape{i:03d}" for i in range(shape_count)),
-            expression_names=tuple(
-                f"expression{i:03d}" for i in range(directions.shape[2] - shape_count)
-            ),
+            shape_names=tuple(f"shape{i:03d}" for i in range(shapes)),
+            expression_names=tuple(f"expression{i:03d}" for i in range(directions - shapes)),
             regions=read_masks(files["masks"], arrays["v_template"]),
             unit_expressions=False,
         )
     )
-    return check_head(add_mouth(model)) if mouth and is_flame_topology(model) else model
-
-
-def shape_component_count(total: int) -> int:
-    """Count identity components: 300 of 400 in the published files, else three quarters."""
-    return 300 if total > 300 else (3 * total) // 4
 
 
 def read_flame_arrays(path: Path) -> dict[str, np.ndarray]:
     """Read and check the arrays of a FLAME model pickle; sparse and chumpy arrays made dense."""
-    content = read_pickle(path)
-    if not isinstance(content, dict):
-        raise HeadModelError(f"{path}: holds a {type(content).__name__}, expected FLAME's dict")
+    content = _read_dict(path)
     missing = [key for key in _REQUIRED if key not in content]
     if missing:
         raise HeadModelError(f"{path}: lacks {', '.join(missing)}; expected a FLAME model pickle")
@@ -135,9 +121,7 @@ def read_embedding(
     Understands the dict of DECA-style `.npy` files (full 68 or 70 points with a table of contour
     points by yaw, or 51 static points plus that table) and the 68-point pickle of TF_FLAME.
     """
-    content = read_object_array(path) if path.suffix == ".npy" else read_pickle(path)
-    if not isinstance(content, dict):
-        raise HeadModelError(f"{path}: holds a {type(content).__name__}, expected a dict of points")
+    content = _read_dict(path)
 
     def get(*names: str) -> np.ndarray | None:
         found = next((name for name in names if name in content), None)
@@ -174,10 +158,8 @@ def read_embedding(
 
 
 def read_masks(path: Path, template: np.ndarray) -> dict[str, torch.Tensor]:
-    """Region masks of FLAME_masks.pkl; irises are the eyeballs' fronts, absent parts are empty."""
-    content = read_pickle(path)
-    if not isinstance(content, dict):
-        raise HeadModelError(f"{path}: holds a {type(content).__name__}, expected a dict of ids")
+    """Read masks from FLAME_masks.pkl; irises are the eyeballs' fronts, absent parts are empty."""
+    content = _read_dict(path)
     regions = {name: np.zeros(len(template), dtype=bool) for name in REGIONS}
     for name in sorted(set(REGIONS) & set(content)):
         ids = to_array(content[name], name, str(path)).reshape(-1).astype(np.int64)
@@ -197,23 +179,20 @@ def read_masks(path: Path, template: np.ndarray) -> dict[str, torch.Tensor]:
     return {name: torch.from_numpy(mask) for name, mask in regions.items()}
 
 
-def _companions(
-    path: Path,
-    embedding: str | Path | None,
-    masks: str | Path | None,
-    template: str | Path | None,
-) -> dict[str, Path]:
+def _read_dict(path: Path) -> dict[str, Any]:
+    content = read_object_array(path) if path.suffix == ".npy" else read_pickle(path)
+    if not isinstance(content, dict):
+        raise HeadModelError(f"{path}: holds a {type(content).__name__}, expected a dict")
+    return content
+
+
+def _companions(path: Path) -> dict[str, Path]:
     """Find the files that go with the model, or say in one message which are missing."""
     found, missing = {}, []
-    for kind, given, names in (
-        ("embedding", embedding, EMBEDDINGS),
-        ("masks", masks, MASKS),
-        ("template", template, TEMPLATES),
-    ):
-        choices = [Path(given)] if given is not None else [path.parent / name for name in names]
-        file = next((choice for choice in choices if choice.is_file()), None)
+    for kind, names in COMPANIONS.items():
+        file = next((path.parent / name for name in names if (path.parent / name).is_file()), None)
         if file is None:
-            missing.append(" or ".join(str(choice.name) for choice in choices))
+            missing.append(" or ".join(names))
         else:
             found[kind] = file
     if missing:

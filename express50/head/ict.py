@@ -1,8 +1,8 @@
-"""Import of ICT-FaceKit's light face model (USC Institute for Creative Technologies, MIT licence).
+"""Load ICT-FaceKit's light face model (USC Institute for Creative Technologies, MIT licence).
 
 Reads a checkout of the public repository (`FaceXModel/*.obj`) or the same arrays in one `.npz`.
-The model has blend shapes but no skeleton: joints and skinning are synthesised here, the jaw's from
-the model's own `jawOpen` shape. Vertex ranges and landmark indices are those of its README.
+The model has blend shapes but no skeleton: joints and skinning are made here, the jaw's from the
+model's own `jawOpen` shape. Regions come from the vertex ranges and landmarks of its README.
 """
 
 from __future__ import annotations
@@ -12,12 +12,14 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from skimage.measure import points_in_poly
 
 from express50.errors import HeadModelError
 from express50.files.arrays import read_arrays
 from express50.files.text import read_text
-from express50.geometry.smoothstep import smoothstep
-from express50.head.ict_regions import ict_regions
+from express50.geometry.sampling import smoothstep
 from express50.head.model import PARENTS, HeadModel, check_head
 
 VERTEX_COUNT = 26719
@@ -29,6 +31,20 @@ LANDMARKS = (
     5708, 5695, 2081, 0, 4275, 6200, 6213, 6346, 6461, 5518, 5957, 5841, 5702, 5711, 5533, 6216,
     6207, 6470, 5517, 5966,
 )  # fmt: skip
+# First and one past the last vertex of each part (README, "Face Model Topology" and below it).
+RANGES = {
+    "face_area": (0, 9409),
+    "narrow_face": (0, 6706),
+    "head_and_neck": (9409, 11248),
+    "mouth_socket": (11248, 13294),
+    "eye_socket_left": (13294, 13678),
+    "eye_socket_right": (13678, 14062),
+    "gums_tongue": (14062, 17039),
+    "upper_teeth": (17039, 19247),
+    "lower_teeth": (19247, 21451),
+    "left_eyeball": (21451, 23021),
+    "right_eyeball": (23021, 24591),
+}
 # Shells that only a game engine's transparent shaders can show: as opaque faces they hide the eyes.
 _HIDDEN_MATERIALS = ("M_EyeBlend", "M_EyeOcclusion", "M_LacrimalFluid")
 _NPZ_KEYS = (
@@ -59,7 +75,19 @@ def load_ict(path: str | Path) -> HeadModel:
     """
     path = Path(path)
     arrays = read_ict_npz(path) if path.suffix == ".npz" else read_ict_checkout(path)
-    return build_ict_head(arrays, where=str(path))
+    if arrays.template.shape != (VERTEX_COUNT, 3):
+        raise HeadModelError(
+            f"{path}: template has shape {arrays.template.shape}, expected ({VERTEX_COUNT}, 3), "
+            "the topology of ICT-FaceKit's light model"
+        )
+    if "jawOpen" not in arrays.expression_names:
+        raise HeadModelError(f"{path}: no jawOpen expression; the jaw joint is derived from it")
+    try:
+        _check_mesh(arrays.template, arrays.faces)
+        _check_mesh(arrays.uv, arrays.uv_faces)
+        return check_head(build_ict_head(arrays))
+    except (ValueError, IndexError) as error:
+        raise HeadModelError(f"{path}: arrays do not fit ({error}); copy it again") from None
 
 
 def read_ict_npz(path: Path) -> IctArrays:
@@ -112,7 +140,7 @@ def read_ict_checkout(path: Path) -> IctArrays:
 def read_obj(
     path: Path,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Vertices (V,3), texture coordinates (T,2), triangles (F,3), their uv (F,3) and material (F,).
+    """Read vertices (V,3), texture coordinates (T,2), faces (F,3), their uv (F,3), material (F,).
 
     Polygons are cut into fans. Faces without texture coordinates get coordinate 0.
     """
@@ -160,61 +188,37 @@ def _check_mesh(points: np.ndarray, faces: np.ndarray) -> None:
         raise ValueError(f"faces name points {faces.min()} to {faces.max()} of {len(points)}")
 
 
-def _check_arrays(arrays: IctArrays) -> None:
-    """Raise ValueError where arrays do not fit each other."""
-    _check_mesh(arrays.template, arrays.faces)
-    _check_mesh(arrays.uv, arrays.uv_faces)
-    for name, dirs in (("shapes", arrays.shape_dirs), ("expressions", arrays.expression_dirs)):
-        if dirs.ndim != 3 or dirs.shape[:2] != (VERTEX_COUNT, 3) or not np.isfinite(dirs).all():
-            raise ValueError(f"{name}: {dirs.shape}, expected finite ({VERTEX_COUNT}, 3, N)")
-    counts = (len(arrays.expression_names), len(arrays.uv_faces), len(arrays.face_material))
-    faces = len(arrays.faces)
-    if counts != (arrays.expression_dirs.shape[2], faces, faces) or arrays.uv.shape[1] != 2:
-        raise ValueError("expression names, texture faces or materials are of other counts")
-
-
-def build_ict_head(arrays: IctArrays, where: str = "ICT") -> HeadModel:
+def build_ict_head(arrays: IctArrays) -> HeadModel:
     """Turn the arrays into a HeadModel in metres with joints, skinning, landmarks and regions."""
-    if arrays.template.shape != (VERTEX_COUNT, 3):
-        raise HeadModelError(
-            f"{where}: template has shape {arrays.template.shape}, expected ({VERTEX_COUNT}, 3), "
-            "the topology of ICT-FaceKit's light model"
-        )
-    try:
-        _check_arrays(arrays)
-    except ValueError as error:
-        raise HeadModelError(f"{where}: {error}; copy it again") from None
-    if "jawOpen" not in arrays.expression_names:
-        raise HeadModelError(f"{where}: no jawOpen expression; the jaw joint is derived from it")
     template = arrays.template * METRES_PER_UNIT
     regions = ict_regions(template, arrays.faces, arrays.uv_faces)
     jaw_open = arrays.expression_names.index("jawOpen")
     opened = arrays.expression_dirs[:, :, jaw_open].astype(np.float64) * METRES_PER_UNIT
     joints, skinning = _rig(template, opened, regions)
     shown = ~np.isin(arrays.face_material, _HIDDEN_MATERIALS)
-    landmark_faces, landmark_bary = _at_vertices(arrays.faces[shown], np.array(LANDMARKS))
+    faces = arrays.faces[shown]
+    # A landmark is a corner of the first face that has its vertex.
+    face, corner = np.array([np.argwhere(faces == vertex)[0] for vertex in LANDMARKS]).T
 
     def tensor(array: np.ndarray) -> torch.Tensor:
         return torch.from_numpy(np.ascontiguousarray(array, dtype=np.float32))
 
-    return check_head(
-        HeadModel(
-            name="ict",
-            template=tensor(template),
-            shape_dirs=tensor(arrays.shape_dirs * METRES_PER_UNIT),
-            expression_dirs=tensor(arrays.expression_dirs * METRES_PER_UNIT),
-            pose_dirs=torch.zeros(9 * (len(PARENTS) - 1), VERTEX_COUNT * 3),
-            joint_regressor=tensor(_regressor(template, joints, regions)),
-            skinning=tensor(skinning),
-            faces=torch.from_numpy(arrays.faces[shown]),
-            uv=tensor(_pack_udim(arrays.uv, arrays.uv_faces)),
-            uv_faces=torch.from_numpy(arrays.uv_faces[shown]),
-            landmark_faces=torch.from_numpy(landmark_faces),
-            landmark_bary=tensor(landmark_bary),
-            shape_names=tuple(f"identity{i:03d}" for i in range(arrays.shape_dirs.shape[2])),
-            expression_names=arrays.expression_names,
-            regions={name: torch.from_numpy(mask) for name, mask in regions.items()},
-        )
+    return HeadModel(
+        name="ict",
+        template=tensor(template),
+        shape_dirs=tensor(arrays.shape_dirs * METRES_PER_UNIT),
+        expression_dirs=tensor(arrays.expression_dirs * METRES_PER_UNIT),
+        pose_dirs=torch.zeros(9 * (len(PARENTS) - 1), VERTEX_COUNT * 3),
+        joint_regressor=tensor(_regressor(template, joints, regions)),
+        skinning=tensor(skinning),
+        faces=torch.from_numpy(faces),
+        uv=tensor(_pack_udim(arrays.uv)),
+        uv_faces=torch.from_numpy(arrays.uv_faces[shown]),
+        landmark_faces=torch.from_numpy(face),
+        landmark_bary=tensor(np.eye(3)[corner]),
+        shape_names=tuple(f"identity{i:03d}" for i in range(arrays.shape_dirs.shape[2])),
+        expression_names=arrays.expression_names,
+        regions={name: torch.from_numpy(mask) for name, mask in regions.items()},
     )
 
 
@@ -292,7 +296,7 @@ def _jaw_rig(
 def _regressor(
     template: np.ndarray, joints: np.ndarray, regions: dict[str, np.ndarray]
 ) -> np.ndarray:
-    """Joint regressor (5, V): smallest-norm weights over nearby vertices that hit each joint."""
+    """Return the joint regressor (5, V): smallest-norm weights over vertices near each joint."""
     rows = np.zeros((5, template.shape[0]))
     skin = ~(regions["teeth"] | regions["mouth_interior"] | regions["tongue"])
     for row, joint in enumerate(joints):
@@ -306,7 +310,7 @@ def _regressor(
     return rows
 
 
-def _pack_udim(uv: np.ndarray, uv_faces: np.ndarray) -> np.ndarray:
+def _pack_udim(uv: np.ndarray) -> np.ndarray:
     """Fold UDIM tiles into [0, 1]: tile 0 (the face) takes 3/4 of the side, others 1/4 each."""
     packed = np.clip(uv, 0.0, None)
     tile = np.minimum(np.floor(packed[:, 0]).astype(int), 7)
@@ -317,11 +321,69 @@ def _pack_udim(uv: np.ndarray, uv_faces: np.ndarray) -> np.ndarray:
     return np.clip(corner + packed * np.where(tile == 0, 0.75, 0.25)[:, None], 0.0, 1.0)
 
 
-def _at_vertices(faces: np.ndarray, vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return face ids (N,) and barycentrics (N, 3) that name mesh vertices (N,)."""
-    ids, bary = [], []
-    for vertex in vertices:
-        face, corner = (int(where[0]) for where in np.nonzero(faces == vertex))
-        ids.append(face)
-        bary.append(np.eye(3)[corner])
-    return np.array(ids, dtype=np.int64), np.array(bary)
+def ict_regions(
+    template: np.ndarray, faces: np.ndarray, uv_faces: np.ndarray
+) -> dict[str, np.ndarray]:
+    """Return masks (V,) by region of the template (V, 3) in metres with all triangles (F, 3)."""
+    number = np.arange(len(template))
+    part = {name: (number >= first) & (number < end) for name, (first, end) in RANGES.items()}
+    marks, (x, y, z) = template[list(LANDMARKS)], template.T
+    skin = part["face_area"] | part["head_and_neck"]
+    ears = part["face_area"] & (np.abs(x) > 0.069) & (z < 0.031) & (y > -0.024) & (y < 0.044)
+    brow_top = marks[17:27, 1].max() + 0.005
+    face = part["narrow_face"] & ~ears & (y > marks[8, 1] - 0.03)
+    # The hair line of the nape: behind the ears the scalp reaches down to the mouth's height.
+    scalp = skin & ~face & ~ears & (y > np.where(z < 0.0, -0.035, 0.01))
+    nose, margin = marks[27:36, :2], np.array([0.006, 0.004])
+    near_nose = (template[:, :2] > nose.min(0) - margin) & (template[:, :2] < nose.max(0) + margin)
+    lips = marks[48:60, :2]
+    lips = lips.mean(0) + 1.04 * (lips - lips.mean(0))
+    # The neck is open below: its last edges are used by one face only.
+    edges = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    edges, uses = np.unique(edges, axis=0, return_counts=True)
+    regions = {
+        "face": face,
+        "neck": skin & ~face & ~ears & ~scalp,
+        "scalp": scalp,
+        "forehead": face & (y > brow_top),
+        "nose": face & near_nose.all(1),
+        "lips": face & points_in_poly(template[:, :2], lips),
+        "left_ear": ears & (x > 0),
+        "right_ear": ears & (x < 0),
+        "teeth": part["upper_teeth"] | part["lower_teeth"],
+        "upper_teeth": part["upper_teeth"],
+        "lower_teeth": part["lower_teeth"],
+        "tongue": _tongue(template, faces, uv_faces, part["gums_tongue"]),
+        "mouth_interior": part["mouth_socket"] | part["gums_tongue"],
+        "boundary": skin & np.isin(number, edges[uses == 1]) & (y < np.quantile(y, 0.05)),
+    }
+    for side in ("left", "right"):
+        ball = part[f"{side}_eyeball"]
+        centre = template[ball].mean(0)
+        radius = np.linalg.norm(template - centre, axis=1)
+        regions[f"{side}_eyeball"] = ball
+        # An iris of 6 mm radius on a ball of 12 mm spans half a radian from the axis.
+        regions[f"{side}_iris"] = ball & (z - centre[2] > np.cos(0.5) * radius)
+        near = np.linalg.norm((template - centre) * np.array([1.0, 1.3, 0.7]), axis=1)
+        regions[f"{side}_eye_region"] = face & (near < 0.026)
+    return regions
+
+
+def _tongue(
+    template: np.ndarray, faces: np.ndarray, uv_faces: np.ndarray, gums: np.ndarray
+) -> np.ndarray:
+    """Find the tongue (V,) bool: the two large texture islands within 2 cm of the middle.
+
+    Gums and tongue are one piece of mesh, but they are cut apart in the texture map.
+    """
+    inside = gums[faces].all(1)
+    corners = uv_faces[inside]
+    pairs = corners.ravel(), np.repeat(corners[:, 0], 3)
+    links = coo_matrix((np.ones(corners.size), pairs), shape=(uv_faces.max() + 1,) * 2)
+    islands = connected_components(links, directed=False)[1][corners[:, 0]]
+    mask = np.zeros(template.shape[0], dtype=bool)
+    for island in np.unique(islands):
+        ids = np.unique(faces[inside][islands == island])
+        if ids.size > 200 and np.abs(template[ids, 0]).max() < 0.0205:
+            mask[ids] = True
+    return mask

@@ -77,8 +77,23 @@ def load_stored(path: Path, name: str) -> HeadModel:
         HeadModelError: the file is damaged, lacks an array, or its arrays do not fit each other.
     """
     arrays = read_arrays(path, HeadModelError, "a stored head model", FIELDS)
+    fields: dict[str, Any] = {}
     try:
-        return check_head(_assembled(arrays, name))
+        for key in FIELDS:
+            kind = np.float32 if arrays[key].dtype.kind == "f" else np.int64
+            if key.endswith("_names"):
+                fields[key] = tuple(arrays[key].tolist())
+            else:
+                fields[key] = torch.from_numpy(arrays[key].astype(kind))
+        if "contour" in arrays and "contour_counts" in arrays:
+            lines = np.split(arrays["contour"], np.cumsum(arrays["contour_counts"])[:-1])
+            fields["contour"] = tuple(torch.from_numpy(line) for line in lines)
+        if "regions" in arrays and "region_names" in arrays:
+            masks = [torch.from_numpy(mask) for mask in arrays["regions"].astype(bool)]
+            fields["regions"] = dict(zip(arrays["region_names"].tolist(), masks, strict=True))
+        if "unit_expressions" in arrays:
+            fields["unit_expressions"] = bool(arrays["unit_expressions"])
+        return check_head(HeadModel(name=name, **fields))
     except (ValueError, TypeError, RuntimeError) as error:
         raise HeadModelError(
             f"{path}: not a stored head model ({error}); see docs/RECIPES.md"
@@ -91,21 +106,3 @@ def is_stored(path: Path) -> bool:
         return False
     with zipfile.ZipFile(path) as archive:
         return "skinning.npy" in archive.namelist()
-
-
-def _assembled(arrays: dict[str, np.ndarray], name: str) -> HeadModel:
-    fields: dict[str, Any] = {}
-    for key in FIELDS:
-        kind = np.float32 if arrays[key].dtype.kind == "f" else np.int64
-        names = key.endswith("_names")
-        value = arrays[key]
-        fields[key] = tuple(value.tolist()) if names else torch.from_numpy(value.astype(kind))
-    if "contour" in arrays and "contour_counts" in arrays:
-        ends = np.cumsum(arrays["contour_counts"])[:-1]
-        fields["contour"] = tuple(torch.from_numpy(p) for p in np.split(arrays["contour"], ends))
-    if "regions" in arrays and "region_names" in arrays:
-        masks = [torch.from_numpy(mask) for mask in arrays["regions"].astype(bool)]
-        fields["regions"] = dict(zip(arrays["region_names"].tolist(), masks, strict=True))
-    if "unit_expressions" in arrays:
-        fields["unit_expressions"] = bool(arrays["unit_expressions"])
-    return HeadModel(name=name, **fields)

@@ -16,7 +16,7 @@ from express50.errors import HeadModelError
 from express50.geometry.transforms_torch import axis_angle_to_matrix
 
 JOINTS = ("root", "neck", "jaw", "left_eye", "right_eye")
-PARENTS = (-1, 0, 1, 1, 1)
+PARENTS = (-1, 0, 1, 1, 1)  # of each joint; -1 for the root
 REGIONS = (
     "face", "neck", "scalp", "forehead", "nose", "lips", "left_ear", "right_ear",
     "left_eye_region", "right_eye_region", "left_eyeball", "right_eyeball", "left_iris",
@@ -38,7 +38,6 @@ class HeadModel:
         expression_dirs: (V, 3, X) metres per unit coefficient.
         pose_dirs: (9 * (J - 1), V * 3) metres per unit of R - I, row-major.
         joint_regressor: (J, V) rows sum to 1.
-        parents: parent of each joint, -1 for the root.
         skinning: (V, J) rows sum to 1.
         faces: (F, 3) int64.
         uv: (T, 2) in [0, 1], v up.
@@ -67,13 +66,12 @@ class HeadModel:
     landmark_bary: torch.Tensor
     shape_names: tuple[str, ...]
     expression_names: tuple[str, ...]
-    parents: tuple[int, ...] = PARENTS
     contour: tuple[torch.Tensor, ...] | None = None
     regions: dict[str, torch.Tensor] = field(default_factory=dict)
     unit_expressions: bool = True
 
     def __post_init__(self) -> None:
-        vertices, joints = self.template.shape[0], len(self.parents)
+        vertices, joints = self.template.shape[0], len(PARENTS)
         shapes, expressions = len(self.shape_names), len(self.expression_names)
         expected = {
             "template": (vertices, 3),
@@ -129,8 +127,7 @@ class HeadModel:
 def check_head(model: HeadModel) -> HeadModel:
     """Return the model if its values are usable, else raise HeadModelError.
 
-    Checks finite arrays, index ranges, skinning and regressor rows summing to one and parents that
-    come before their children.
+    Checks finite arrays, index ranges, skinning and regressor rows summing to one.
     """
     where = f"head model {model.name!r}"
     for item in fields(model):
@@ -154,10 +151,6 @@ def check_head(model: HeadModel) -> HeadModel:
         error = float((rows.sum(1) - 1).abs().max())
         if error > 1e-2:
             raise HeadModelError(f"{where}: rows of {key} sum to 1 only within {error:.3g}")
-    if any(parent >= joint for joint, parent in enumerate(model.parents)) or model.parents[0] != -1:
-        raise HeadModelError(
-            f"{where}: parents {model.parents}, expected -1 first and then earlier joints only"
-        )
     return model
 
 
@@ -195,7 +188,7 @@ def pose(
     joints = torch.einsum("jv,bvc->bjc", model.joint_regressor, rest)
     angles = joint_angles(rest, root, neck, jaw, eyes)
     rotations = axis_angle_to_matrix(angles)
-    posed = skin(rest, joints, rotations, model.skinning, model.pose_dirs, model.parents)
+    posed = skin(rest, joints, rotations, model.skinning, model.pose_dirs)
     return posed if translation is None else posed + translation[:, None]
 
 
@@ -205,7 +198,7 @@ def rest_vertices(
     expression: torch.Tensor,
     offsets: torch.Tensor | None = None,
 ) -> torch.Tensor:
-    """Shaped, unposed vertices (B, V, 3): template + shape + expression directions + offsets."""
+    """Return unposed vertices (B, V, 3): template + shape + expression directions + offsets."""
     for name, value, count in (
         ("shape", shape, model.shape_dirs.shape[2]),
         ("expression", expression, model.expression_dirs.shape[2]),
@@ -252,7 +245,6 @@ def skin(
     rotations: torch.Tensor,
     skinning: torch.Tensor,
     pose_dirs: torch.Tensor,
-    parents: tuple[int, ...],
 ) -> torch.Tensor:
     """Apply linear blend skinning and pose correctives (SMPL, Loper et al. 2015, equations 2 to 4).
 
@@ -264,7 +256,6 @@ def skin(
         rotations: (B, J, 3, 3), each relative to its parent.
         skinning: (N, J).
         pose_dirs: (9 * (J - 1), N * 3).
-        parents: parent of each joint, -1 first.
 
     Returns:
         (B, N, 3).
@@ -272,29 +263,21 @@ def skin(
     identity = torch.eye(3, dtype=rest.dtype, device=rest.device)
     feature = (rotations[:, 1:] - identity).flatten(1)
     corrected = rest + (feature @ pose_dirs).reshape(rest.shape)
-    turn, shift = joint_transforms(joints, rotations, parents)
+    turn, shift = joint_transforms(joints, rotations)
     blended_turn = torch.einsum("nj,bjrc->bnrc", skinning, turn)
     blended_shift = torch.einsum("nj,bjc->bnc", skinning, shift)
     return (blended_turn @ corrected[..., None])[..., 0] + blended_shift
 
 
 def joint_transforms(
-    joints: torch.Tensor, rotations: torch.Tensor, parents: tuple[int, ...]
+    joints: torch.Tensor, rotations: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Transform of each joint, which takes a point at rest to turn @ x + shift.
+    """Return each joint's turn (B, J, 3, 3) and shift (B, J, 3): rest x goes to turn @ x + shift.
 
-    The shift is linear in the joints (there is no constant part).
-
-    Args:
-        joints: (B, J, 3) rest joints.
-        rotations: (B, J, 3, 3), each relative to its parent.
-        parents: parent of each joint, -1 first.
-
-    Returns:
-        turn (B, J, 3, 3), shift (B, J, 3).
+    The shift is linear in the rest joints (B, J, 3); rotations (B, J, 3, 3) are to the parents.
     """
     world_rotations, world_joints = [rotations[:, 0]], [joints[:, 0]]
-    for joint, parent in enumerate(parents[1:], start=1):
+    for joint, parent in enumerate(PARENTS[1:], start=1):
         bone = (joints[:, joint] - joints[:, parent])[..., None]
         world_joints.append(world_joints[parent] + (world_rotations[parent] @ bone)[..., 0])
         world_rotations.append(world_rotations[parent] @ rotations[:, joint])
@@ -310,7 +293,7 @@ def landmarks(model: HeadModel, vertices: torch.Tensor) -> torch.Tensor:
 
 
 def vertex_normals(vertices: torch.Tensor, faces: torch.Tensor) -> torch.Tensor:
-    """Unit normals (B, V, 3) of vertices (B, V, 3), area weighted; zero where no face has area."""
+    """Return unit normals of vertices (B, V, 3), area weighted; 0 where no face has area."""
     a, b, c = (vertices[:, faces[:, corner]] for corner in range(3))
     face_normals = torch.linalg.cross(b - a, c - a)
     normals = torch.zeros_like(vertices)

@@ -46,48 +46,26 @@ _CHARTS = ((0.18, 0.18), (0.2, 0.12), (0.2, 0.12))
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Part:
-    """Vertices to append: ``weights`` (N, V) take linear bases from the model's own vertices.
+    """Vertices to append to a model, which take their directions from the model's own."""
 
-    Attributes:
-        places: (N, 3) metres, in the template.
-        shape_from: (N, V) rows sum to 1.
-        motion_from: the same for expression, pose correctives and skinning; rows of 0 for rigid
-            parts.
-        skinning: (N, J) of rigid parts, else 0.
-        faces: (F, 3) into the whole model.
-        uv: (T, 2); uv_faces (F, 3) from 0.
-        uv_faces: (F, 3).
-    """
-
-    places: torch.Tensor
-    shape_from: torch.Tensor
-    motion_from: torch.Tensor
-    skinning: torch.Tensor
-    faces: torch.Tensor
-    uv: torch.Tensor
-    uv_faces: torch.Tensor
-
-
-def is_flame_topology(model: HeadModel) -> bool:
-    """Return True if vertex ids have the same meaning as in FLAME."""
-    return len(model.template) == FLAME_VERTICES
+    places: torch.Tensor  # (N, 3) metres, in the template
+    shape_from: torch.Tensor  # (N, V) weights of the model's vertices, rows sum to 1
+    motion_from: torch.Tensor  # the same for expression, pose and skinning; 0 for rigid parts
+    skinning: torch.Tensor  # (N, J) of rigid parts, else 0
+    faces: torch.Tensor  # (F, 3) into the whole model
+    uv: torch.Tensor  # (T, 2)
+    uv_faces: torch.Tensor  # (F, 3), from 0
 
 
 def add_mouth(model: HeadModel) -> HeadModel:
-    """Add teeth and a pouch behind them to a model; joints, landmarks and old ids stay.
+    """Add teeth and a pouch behind them to a model of FLAME's vertices; old ids and joints stay.
 
     Upper teeth follow the neck joint, lower teeth the jaw, both keep still in expressions and move
     with the identity as the lips before them do. The pouch follows the loop it hangs on.
 
     Raises:
-        HeadModelError: the model's topology or lips are not FLAME's, or its texture map has no
-            room.
+        HeadModelError: the model's lips are not FLAME's, or its texture map has no room.
     """
-    if not is_flame_topology(model):
-        raise HeadModelError(
-            f"head model {model.name!r}: {len(model.template)} vertices, expected FLAME's"
-            f" {FLAME_VERTICES}; load it without a mouth"
-        )
     charts = place_charts(model.uv.numpy(), model.uv_faces.numpy(), _CHARTS, model.name)
     teeth = _teeth(model, charts[1:])
     pouch = _pouch(model, charts[0])
@@ -138,7 +116,11 @@ def _teeth(model: HeadModel, charts: tuple[np.ndarray, ...]) -> _Part:
         flip = from_left == bool(jaw)
         strips.append(_strip(rows, flip))
         uv_strips.append(_strip(range(4 * jaw, 4 * jaw + 4), flip))
-        uv.append(_strip_uv(charts[jaw], bool(jaw), from_left))
+        left, bottom, right, top = charts[jaw]
+        u = np.linspace(left, right, 15)[:: -1 if from_left else 1]
+        share = np.array(_STRIP_V) if jaw else 1 - np.array(_STRIP_V)
+        v = bottom + share * (top - bottom)
+        uv.append(np.stack(np.broadcast_arrays(u, v[:, None]), -1).reshape(-1, 2))
     return _Part(
         places=torch.cat(places),
         shape_from=shape_from.repeat(8, 1),
@@ -156,14 +138,6 @@ def _strip(rows: tuple[int, ...] | range, flip: bool) -> np.ndarray:
     a, b, c, d = grid[:-1, :-1], grid[:-1, 1:], grid[1:, 1:], grid[1:, :-1]
     faces = np.stack([np.stack([a, b, c], -1), np.stack([a, c, d], -1)], 2).reshape(-1, 3)
     return faces[:, ::-1].copy() if flip else faces
-
-
-def _strip_uv(chart: np.ndarray, lower: bool, from_left: bool) -> np.ndarray:
-    """UV (60, 2) of a jaw's four rows in a chart (left, bottom, right, top); u rises with x."""
-    u = np.linspace(chart[0], chart[2], 15)[:: -1 if from_left else 1]
-    share = np.asarray(_STRIP_V) if lower else 1 - np.asarray(_STRIP_V)
-    v = chart[1] + share * (chart[3] - chart[1])
-    return np.stack(np.broadcast_arrays(u, v[:, None]), -1).reshape(-1, 2)
 
 
 def _pouch(model: HeadModel, chart: np.ndarray) -> _Part:
@@ -184,13 +158,18 @@ def _pouch(model: HeadModel, chart: np.ndarray) -> _Part:
     steps = np.concatenate([np.arange(size), np.arange(2 * size + 1) + size])
     ids = np.concatenate([loop.numpy(), first + np.arange(2 * size + 1)])
     faces = _funnel(size)
+    # The texture has concentric rings in the chart.
+    angle = 2 * np.pi * np.arange(size) / size
+    circle = np.stack([np.cos(angle), np.sin(angle)], -1)
+    rings = np.concatenate([circle, circle * 2 / 3, circle / 3, np.zeros((1, 2))])
+    middle, half = 0.5 * (chart[:2] + chart[2:]), 0.5 * (chart[2:] - chart[:2])
     return _Part(
         places=torch.cat(places),
         shape_from=combined,
         motion_from=combined,
         skinning=torch.zeros(len(combined), len(JOINTS)),
         faces=torch.from_numpy(ids[faces]),
-        uv=torch.from_numpy(_funnel_uv(size, chart)),
+        uv=torch.from_numpy(middle + half * rings),
         uv_faces=torch.from_numpy(steps[faces]),
     )
 
@@ -207,17 +186,8 @@ def _funnel(size: int) -> np.ndarray:
     return np.concatenate(faces)
 
 
-def _funnel_uv(size: int, chart: np.ndarray) -> np.ndarray:
-    """Return UV (3 size + 1, 2): concentric rings in a chart (left, bottom, right, top)."""
-    angle = 2 * np.pi * np.arange(size) / size
-    circle = np.stack([np.cos(angle), np.sin(angle)], -1)
-    unit = np.concatenate([circle, circle * 2 / 3, circle / 3, np.zeros((1, 2))])
-    middle, half = 0.5 * (chart[:2] + chart[2:]), 0.5 * (chart[2:] - chart[:2])
-    return middle + half * unit
-
-
 def mouth_loop(faces: np.ndarray, name: str) -> np.ndarray:
-    """Ids (32,) of the open loop at the back of the lips, in the order new faces run along it.
+    """Return ids (32,) of the open loop behind the lips, in the order new faces run along it.
 
     It starts at the first of CORNERS.
 
@@ -236,7 +206,7 @@ def mouth_loop(faces: np.ndarray, name: str) -> np.ndarray:
     if len(loop) != LOOP_SIZE or CORNERS[1] not in loop:
         raise HeadModelError(
             f"head model {name!r}: no open loop of {LOOP_SIZE} vertices through {CORNERS[0]} and"
-            f" {CORNERS[1]} behind the lips, expected FLAME's topology; load it without a mouth"
+            f" {CORNERS[1]} behind the lips, expected FLAME's topology"
         )
     return np.array(loop)
 
@@ -270,7 +240,7 @@ def _appended(model: HeadModel, part: _Part) -> HeadModel:
 
 
 def _extended(directions: torch.Tensor, weights: torch.Tensor) -> torch.Tensor:
-    """Directions (V, 3, K) with those of appended vertices, weighted means of the old ones."""
+    """Return directions (V, 3, K) and those of appended vertices, weighted means of the old."""
     return torch.cat([directions, torch.einsum("nv,vck->nck", weights, directions)])
 
 
@@ -303,8 +273,8 @@ def place_charts(
         box = _first_free(taken, width * GRID, height * GRID)
         if box is None:
             raise HeadModelError(
-                f"head model {name!r}: its texture map has no room for a mouth; load it without a"
-                " mouth, or leave a free corner in the template's map"
+                f"head model {name!r}: its texture map has no room for a mouth; leave a free"
+                " corner in the template's map"
             )
         row, column, rows, columns = box
         around = slice(max(0, row - GUTTER), row + rows + GUTTER)

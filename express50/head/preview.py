@@ -9,6 +9,7 @@ import open3d as o3d
 import torch
 
 from express50.errors import HeadModelError
+from express50.geometry.raycast import mesh_scene
 from express50.head.model import HeadModel, pose, vertex_normals
 
 Array = np.ndarray
@@ -23,6 +24,8 @@ _COLORS = {
     "left_pupil": (0.01, 0.01, 0.01), "right_pupil": (0.01, 0.01, 0.01),
 }  # fmt: skip
 _BACKGROUND = (0.11, 0.12, 0.14)
+# Metres: the point looked at, what is seen across it, and the camera's distance from it.
+_CENTER, _SPAN, _AWAY = (0.0, -0.012, 0.0), 0.34, 1.2
 
 # Name -> (expression controls, jaw opening rad), for the contact sheet.
 POSES: dict[str, tuple[dict[str, float], float]] = {
@@ -57,83 +60,61 @@ def expression_vector(model: HeadModel, controls: Mapping[str, float]) -> torch.
     return vector
 
 
-def vertex_colors(model: HeadModel) -> Array:
-    """Return base colours (V,3), linear, by region."""
-    colors = np.tile(np.array(_SKIN), (len(model.template), 1))
-    for region, color in _COLORS.items():
-        if region in model.regions:
-            colors[model.regions[region].cpu().numpy()] = color
-    return colors
-
-
 def render_preview(
-    model: HeadModel,
-    vertices: Array | torch.Tensor,
-    *,
-    yaw: float = 0.0,
-    pitch: float = 0.0,
-    size: int = 384,
-    supersample: int = 2,
-    colors: Array | None = None,
-    span: float = 0.34,
-    center: tuple[float, float, float] = (0.0, -0.012, 0.0),
+    model: HeadModel, vertices: Array | torch.Tensor, *, yaw: float = 0.0, size: int = 384
 ) -> Array:
-    """Render posed vertices: picture (size,size,3) uint8 sRGB.
+    """Render posed vertices: picture (size,size,3) uint8 sRGB, four rays per pixel.
 
     Args:
         model: The head whose faces and regions are used.
         vertices: (V,3) metres.
         yaw: Degrees the camera goes round to the subject's left.
-        pitch: Degrees the camera goes up.
         size: Side of the picture, pixels.
-        supersample: Rays per pixel and axis.
-        colors: (V,3) linear base colours; by region if None.
-        span: Metres across the picture at the head's centre.
-        center: Point looked at, metres.
     """
     points = np.asarray(vertices, np.float32)
     faces = model.faces.cpu().numpy()
-    scene = o3d.t.geometry.RaycastingScene(nthreads=1)
-    scene.add_triangles(points, faces.astype(np.uint32))
-    origin, directions, right, up, back = _camera(yaw, pitch, size * supersample, span, center)
+    scene = mesh_scene(points, faces)
+    origin, directions, axes = _camera(yaw, 2 * size)
     rays = np.concatenate([np.broadcast_to(origin, directions.shape), directions], -1)
     hits = scene.cast_rays(o3d.core.Tensor(rays.astype(np.float32)))
     distance = hits["t_hit"].numpy()
     seen = np.isfinite(distance)
-    triangle = hits["primitive_ids"].numpy()[seen]
+    corner = faces[hits["primitive_ids"].numpy()[seen]]
     u, v = hits["primitive_uvs"].numpy()[seen].T
     weights = np.stack([1 - u - v, u, v], 1)[:, :, None]
     normals = vertex_normals(torch.from_numpy(points)[None], model.faces.cpu())[0].numpy()
-    corner = faces[triangle]
     n = (normals[corner] * weights).sum(1)
     n /= np.linalg.norm(n, axis=1, keepdims=True) + 1e-9
-    base = ((vertex_colors(model) if colors is None else colors)[corner] * weights).sum(1)
+    colors = np.tile(np.array(_SKIN), (len(points), 1))
+    for region, color in _COLORS.items():
+        if region in model.regions:
+            colors[model.regions[region].cpu().numpy()] = color
+    base = (colors[corner] * weights).sum(1)
     place = origin + distance[seen, None] * directions[seen]
-    shade = _shade(scene, place, n, (right, up, back), -directions[seen])
+    shade = _shade(scene, place, n, axes, -directions[seen])
     image = np.tile(np.array(_BACKGROUND), (*distance.shape, 1))
     image[seen] = base * shade[:, :1] + shade[:, 1:]
-    image = image.reshape(size, supersample, size, supersample, 3).mean((1, 3))
+    image = image.reshape(size, 2, size, 2, 3).mean((1, 3))
     return (np.clip(image, 0, 1) ** (1 / 2.2) * 255 + 0.5).astype(np.uint8)
 
 
-def _camera(yaw: float, pitch: float, side: int, span: float, center: tuple) -> tuple:
-    a, b = np.radians(yaw), np.radians(pitch)
-    back = np.array([np.sin(a) * np.cos(b), np.sin(b), np.cos(a) * np.cos(b)])
-    right = np.array([np.cos(a), 0.0, -np.sin(a)])
+def _camera(yaw: float, side: int) -> tuple[Array, Array, tuple[Array, Array, Array]]:
+    """Return the rays' origin and unit directions (side,side,3), and the axes right, up, back."""
+    a = np.radians(yaw)
+    back, right = np.array([np.sin(a), 0.0, np.cos(a)]), np.array([np.cos(a), 0.0, -np.sin(a)])
     up = np.cross(back, right)
-    away = 1.2
-    origin = np.array(center) + away * back
-    step = (np.arange(side) + 0.5) / side * span - span / 2
+    origin = np.array(_CENTER) + _AWAY * back
+    step = (np.arange(side) + 0.5) / side * _SPAN - _SPAN / 2
     x, y = np.meshgrid(step, -step)
-    directions = x[..., None] * right + y[..., None] * up - away * back
+    directions = x[..., None] * right + y[..., None] * up - _AWAY * back
     directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
-    return origin, directions, right, up, back
+    return origin, directions, (right, up, back)
 
 
 def _shade(
     scene: o3d.t.geometry.RaycastingScene, place: Array, n: Array, axes: tuple, view: Array
 ) -> Array:
-    """Diffuse factor and specular addition (N,2): shadowed key light, fill, sky; a dull gloss."""
+    """Return diffuse factor and gloss (N,2) of a shadowed key light, a fill light and a sky."""
     right, up, back = axes
     total = 0.18 + 0.10 * (n @ up)
     gloss = np.zeros(len(n))

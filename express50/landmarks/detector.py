@@ -89,7 +89,7 @@ def detect(
     """
     if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8 or 0 in image.shape:
         raise ValueError(f"image is {image.dtype} {image.shape}, expected uint8 (H, W, 3)")
-    pyramid = _pyramid(image)
+    pyramid = make_pyramid(image)
     place: _Place | None = None
     for windows in _searches(image.shape[1], image.shape[0], smallest):
         coarse = max(_run(net, pyramid, windows), key=lambda one: one.score)
@@ -104,7 +104,7 @@ def detect(
 
 
 def _searches(width: int, height: int, smallest: float) -> Iterator[list[np.ndarray]]:
-    """Windows to look in, in turn: the whole frame, it turned and smaller ones, smaller ones yet.
+    """Yield windows to look in: the whole frame, it turned and smaller ones, smaller ones yet.
 
     At last, where smaller windows than usual are asked for, those of the first size turned: a
     photograph may lie on its side, the footage of a rig is known to do so or not.
@@ -129,39 +129,42 @@ def _windows(width: int, height: int, side: float, turn: float) -> list[np.ndarr
         room = max(0.0, length - side)
         count = 1 + int(np.ceil(room / (STEP * side)))
         rows.append(length / 2 + room * (np.linspace(-0.5, 0.5, count) if room else np.zeros(1)))
-    return [_window(np.array([x, y]), side, turn) for y in rows[0] for x in rows[1]]
+    return [place_window(np.array([x, y]), side, turn) for y in rows[0] for x in rows[1]]
 
 
 def _refined(
     net: LandmarkNet, pyramid: list[np.ndarray], place: _Place, refinements: int
 ) -> _Place:
-    """Refine a place by looking at nearer crops."""
+    """Refine a place by nearer crops; the last look's score falls where its crops do not agree."""
     for _ in range(refinements - 1):
         refined = _run(net, pyramid, [window_about(place.points)])[0]
         if refined.score < KEEP_SHARE * place.score:
             # The crop went astray, as it may on a profile: the wider view knew better.
             break
         place = refined
-    return _consensus(net, pyramid, place)
-
-
-def _consensus(net: LandmarkNet, pyramid: list[np.ndarray], place: _Place) -> _Place:
-    """The place as several crops about it see it together, its score by how well they agree."""
     window = window_about(place.points)
     centre = window @ [CROP / 2, CROP / 2, 1.0]
     crops = [place_crop(centre, scale * window[:, :2], CROP) for scale in SCALES]
     flip = np.array([[-1.0, 0.0, CROP], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
-    seen = _run(net, pyramid, [view for crop in crops for view in (crop, crop @ flip)])
-    mean = _mean_view(seen)
-    spread = np.mean([np.linalg.norm(one.points - mean.points, axis=1) for one in seen], axis=0)
-    differ = np.median(spread) / (DIFFER_SHARE * max(face_box(mean.points)[1], 1e-6))
+    looks = _run(net, pyramid, [view for crop in crops for view in (crop, crop @ flip)])
+    points = np.stack([look.points for look in looks])
+    mean = points.mean(0)
+    spread = np.linalg.norm(points - mean, axis=2).mean(0)
+    together = _Place(
+        mean,
+        np.hypot(np.mean([look.sigma for look in looks], axis=0), spread),
+        np.mean([look.seen for look in looks], axis=0),
+        float(np.mean([look.score for look in looks])),
+    )
+    differ = np.median(spread) / (DIFFER_SHARE * max(face_box(mean)[1], 1e-6))
+    sure = together.score >= KEEP_SHARE * place.score
     # Where they agree their mean is the better place, even if a profile's score is less so near.
-    kept = mean if differ < 1.0 or mean.score >= KEEP_SHARE * place.score else place
-    score = mean.score if mean.score >= KEEP_SHARE * place.score else place.score
+    kept = together if differ < 1.0 or sure else place
+    score = together.score if sure else place.score
     return replace(kept, score=float(score / (1.0 + differ**4)))
 
 
-def _window(centre: np.ndarray, side: float, angle: float) -> np.ndarray:
+def place_window(centre: np.ndarray, side: float, angle: float) -> np.ndarray:
     """Place the network's crop: affine (2, 3) from crop pixels to image pixels, corner origin."""
     scale = side / CROP
     turn = scale * np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
@@ -197,11 +200,14 @@ def cut_crop(image: np.ndarray, window: np.ndarray, size: int) -> np.ndarray:
     )
 
 
-def window_about(points: np.ndarray) -> np.ndarray:
-    """The window the network was trained on, about landmarks (68, 2), the eyes level.
+def points_in_crop(window: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Return crop pixels of image pixels (N, 2), for a placed crop (2, 3)."""
+    inverse = np.linalg.inv(np.vstack([window, [0.0, 0.0, 1.0]]))
+    return points @ inverse[:2, :2].T + inverse[:2, 2]
 
-    Affine (2, 3) from crop pixels to image pixels, corner origin.
-    """
+
+def window_about(points: np.ndarray) -> np.ndarray:
+    """Place the crop that the network was trained on about landmarks (68, 2), the eyes level."""
     eyes = points[42:48].mean(0) - points[36:42].mean(0)
     down = points[8] - points[27]
     # The face's own down direction also holds in profile, where the eyes coincide.
@@ -209,10 +215,10 @@ def window_about(points: np.ndarray) -> np.ndarray:
     angle = float(np.arctan2(axis[1], axis[0]))
     turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
     centre, side = face_box(points @ turn.T)
-    return _window(centre @ turn, max(side, 8.0), angle)
+    return place_window(centre @ turn, max(side, 8.0), angle)
 
 
-def _pyramid(image: np.ndarray) -> list[np.ndarray]:
+def make_pyramid(image: np.ndarray) -> list[np.ndarray]:
     """Return the image and its halvings down to about the crop's size."""
     levels = [image]
     while max(levels[-1].shape[:2]) > 2 * CROP and min(levels[-1].shape[:2]) > 1:
@@ -222,7 +228,7 @@ def _pyramid(image: np.ndarray) -> list[np.ndarray]:
     return levels
 
 
-def _sample(pyramid: list[np.ndarray], window: np.ndarray) -> np.ndarray:
+def sample_window(pyramid: list[np.ndarray], window: np.ndarray) -> np.ndarray:
     """Cut a crop (128, 128, 3) uint8 out of the level whose resolution fits the window."""
     step = np.sqrt(abs(np.linalg.det(window[:, :2])))
     level = int(np.clip(np.floor(np.log2(max(step, 1e-6)) + 0.5), 0, len(pyramid) - 1))
@@ -237,7 +243,7 @@ def _run(net: LandmarkNet, pyramid: list[np.ndarray], windows: list[np.ndarray])
     places = []
     for start in range(0, len(windows), BATCH):
         part = windows[start : start + BATCH]
-        crops = torch.from_numpy(np.stack([_sample(pyramid, window) for window in part]))
+        crops = torch.from_numpy(np.stack([sample_window(pyramid, window) for window in part]))
         # (N, H, W, 3) seen as (N, 3, H, W) lies in memory as channels-last already.
         with torch.inference_mode():
             output = net(crops.permute(0, 3, 1, 2).float() / 255.0)
@@ -255,16 +261,3 @@ def _run(net: LandmarkNet, pyramid: list[np.ndarray], windows: list[np.ndarray])
             vague = np.median(sigma) / (VAGUE_SHARE * max(face_box(points)[1], 1e-6))
             places.append(_Place(points, sigma, seen, float(score / (1.0 + vague**2))))
     return places
-
-
-def _mean_view(places: list[_Place]) -> _Place:
-    """Average several views of the same place; their spread adds to the expected error."""
-    points = np.stack([place.points for place in places])
-    mean = points.mean(0)
-    spread = np.linalg.norm(points - mean, axis=2).mean(0)
-    return _Place(
-        mean,
-        np.hypot(np.mean([place.sigma for place in places], axis=0), spread),
-        np.mean([place.seen for place in places], axis=0),
-        float(np.mean([place.score for place in places])),
-    )

@@ -135,7 +135,7 @@ class LandmarkNet(nn.Module):
         y = functional.relu(self.mix16(functional.relu(x16 + _twice(self.side8(y)))))
         y = functional.relu(self.mix32(functional.relu(x32 + _twice(self.side16(y)))))
         heat = self.heat(y)
-        points, log_scale, seen = self.shape(*_expectation(heat), features)
+        points, log_scale, seen = self.shape(*expectation(heat), features)
         return Output(points, log_scale, seen, self.face(features)[:, 0], heat)
 
 
@@ -149,7 +149,7 @@ def _twice(x: torch.Tensor) -> torch.Tensor:
     return functional.interpolate(x, scale_factor=2.0, mode="bilinear", align_corners=False)
 
 
-def _expectation(heat: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+def expectation(heat: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """Return mean position (B, P, 2) in crop pixels and variance (B, P) of softmax heat maps."""
     batch, points, height, width = heat.shape
     share = functional.softmax(heat.reshape(batch, points, -1), -1).reshape(heat.shape)
@@ -162,7 +162,7 @@ def _expectation(heat: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
 
 
 def heat_loss(heat: torch.Tensor, points: torch.Tensor) -> torch.Tensor:
-    """Cross entropy (B, P) of heat maps against points (B, P, 2) spread over their four cells.
+    """Return the cross entropy (B, P) of heat maps and points (B, P, 2) spread over four cells.
 
     Its gradient is strong from the first step, where that of the expectation is still faint.
     """

@@ -1,5 +1,9 @@
 """Sources of landmarks: the embedded network, the user's own FAN weights, or a file of points.
 
+FAN is the face alignment network (Bulat and Tzimiropoulos 2017). Its published weights are
+TorchScript files (2DFAN4, 3DFAN4) that map crops (B, 3, 256, 256) in [0, 1] to heat maps (B, 68,
+64, 64). The embedded network finds the face, FAN its points; nothing is downloaded.
+
 A source is called with an image, its camera's id and its frame, and answers with a `Marked` face:
 the frozen `Detection` that all share, the irises, and which convention its jaw line follows.
 """
@@ -7,53 +11,47 @@ the frozen `Detection` that all share, the irises, and which convention its jaw 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+import torch
 
 from express50.errors import ConfigError, FormatError
-from express50.files.arrays import read_arrays
+from express50.files.arrays import DAMAGE, read_arrays
 from express50.files.text import read_json
 from express50.geometry.cameras import Camera, normalised
-from express50.landmarks.detector import SMALLEST, Detection, detect
-from express50.landmarks.fan import find_with_fan, load_fan
-from express50.landmarks.iris import Irises, find_irises
-from express50.landmarks.lips import open_lips
+from express50.geometry.conventions import cell_to_corner
+from express50.landmarks.detector import SMALLEST, Detection, cut_crop, detect, place_crop
+from express50.landmarks.eyes_and_lips import Irises, find_irises, open_lips
 from express50.landmarks.network import WEIGHTS, load_network
 
 EMBEDDED, FAN = "embedded", "fan:"
+SCHEMA = "express50.landmarks/1"
+NAMES = ("schema", "cameras", "frames", "points")
+POINTS, IRISES = 68, 2
+# Points may lie this share of the image outside of it: a chin below the frame is still a chin.
+OUTSIDE = 0.5
 
 
 @dataclass(frozen=True)
 class Marked:
-    """A face in an image.
-
-    Attributes:
-        face: the 68 landmarks.
-        irises: iris centres, the subject's left eye first.
-        visible_contour: points 0..16 follow the visible edge of the jaw; see `pipelines.track`.
-    """
+    """A face in an image."""
 
     face: Detection
     irises: Irises
-    visible_contour: bool
+    visible_contour: bool  # points 0..16 follow the visible edge of the jaw
 
 
 Source = Callable[[np.ndarray, str, int], Marked]
 
 
 def source_files(landmarks: str) -> dict[str, Path]:
-    """List files that a source reads, by name: they belong to what a stage's output depends on.
-
-    Args:
-        landmarks: `embedded`, `fan:PATH` or the path of a file of points.
-    """
+    """Return the files that a source reads, by name: a stage's output depends on them."""
     if landmarks == EMBEDDED:
         return {"weights": WEIGHTS}
     if landmarks.startswith(FAN):
-        path = Path(landmarks.removeprefix(FAN)).expanduser()
-        return {"weights": WEIGHTS, "fan": path}
+        return {"weights": WEIGHTS, "fan": Path(landmarks.removeprefix(FAN)).expanduser()}
     return {"landmarks": Path(landmarks).expanduser()}
 
 
@@ -85,8 +83,12 @@ def open_source(
 
         def look_up(image: np.ndarray, camera_id: str, frame: int) -> Marked:
             rows = table.get((camera_id, frame))
-            if rows is None:
-                return _no_face(image)
+            if rows is None:  # a face of score 0
+                middle = np.array([image.shape[1], image.shape[0]]) / 2
+                unsure = np.full(POINTS, np.inf), np.zeros(POINTS)
+                face = Detection(np.tile(middle, (POINTS, 1)), *unsure, 0.0)
+                irises = Irises(np.tile(middle, (2, 1)), np.full(2, np.inf), np.zeros(2))
+                return Marked(face, irises, visible_contour=True)
             face = given_detection(rows[:POINTS])
             irises = given_irises(rows, face) if len(rows) > POINTS else find_irises(image, face)
             return Marked(face, irises, visible_contour=True)
@@ -104,10 +106,7 @@ def open_source(
 
 
 def given_detection(rows: np.ndarray) -> Detection:
-    """Make a detection of given points.
-
-    Args:
-        rows: (68, 3) pixels x, y and confidence 0..1; NaN in x or y where a point is unknown.
+    """Make a detection of given rows (68, 3): pixels x, y, NaN where unknown, confidence 0..1.
 
     Unknown points stand at the middle of the known ones, with an infinite sigma. A sure point is
     taken to be right within 0.6 % of the face's size, one of confidence c within that over c.
@@ -135,19 +134,6 @@ def given_irises(rows: np.ndarray, face: Detection) -> Irises:
     return Irises(centres, np.where(sigma > 0, sigma, np.inf), confidence)
 
 
-def _no_face(image: np.ndarray) -> Marked:
-    """Return a face of score 0, where there is none."""
-    middle = np.array([image.shape[1], image.shape[0]]) / 2
-    face = Detection(np.tile(middle, (POINTS, 1)), np.full(POINTS, np.inf), np.zeros(POINTS), 0.0)
-    irises = Irises(np.tile(middle, (2, 1)), np.full(2, np.inf), np.zeros(2))
-    return Marked(face, irises, visible_contour=True)
-
-
-SCHEMA = "express50.landmarks/1"
-NAMES = ("schema", "cameras", "frames", "points")
-POINTS, IRISES = 68, 2
-# Points may lie this share of the image outside of it: a chin below the frame is still a chin.
-OUTSIDE = 0.5
 Table = dict[tuple[str, int], np.ndarray]
 
 
@@ -247,3 +233,80 @@ def _checked(rows: np.ndarray, camera: Camera, path: Path, key: tuple[str, int])
             f"{camera.height} image; expected pixels of the footage as recorded"
         )
     return rows
+
+
+FAN_CROP, HEAT = 256, 64
+# A crop spans 200 / 195 times the sum of the sides of the face box that FAN was trained with, whose
+# middle lies an eighth of its height above; that box goes from above the brows to the chin.
+SPAN, RAISE, BROW = 200.0 / 195.0, 0.12, 0.12
+REACH = 3
+
+
+def load_fan(path: Path) -> torch.jit.ScriptModule:
+    """Read TorchScript weights.
+
+    Raises:
+        ConfigError: not a TorchScript file, or one that maps crops to something else.
+    """
+    wanted = f"expected FAN's TorchScript weights, (1, 3, {FAN_CROP}, {FAN_CROP}) to 68 heat maps"
+    try:
+        fan = torch.jit.load(str(path), map_location="cpu").eval()
+        with torch.inference_mode():
+            output = _heat(fan, torch.zeros(1, 3, FAN_CROP, FAN_CROP))
+    except (*DAMAGE, torch.jit.Error) as error:
+        first = str(error).strip().splitlines()[0] if str(error).strip() else "no reason given"
+        raise ConfigError(f"landmarks: {path} cannot be used ({first}); {wanted}") from error
+    if tuple(output.shape) != (1, POINTS, HEAT, HEAT):
+        raise ConfigError(f"landmarks: {path} gives {tuple(output.shape)}; {wanted}")
+    return fan
+
+
+def find_with_fan(fan: torch.jit.ScriptModule, image: np.ndarray, face: Detection) -> Detection:
+    """Find a detected face's points with FAN; its score is kept.
+
+    Confidence is the height of a point's heat map; sigma is its spread, a pixel of it at the least.
+    The image is (H, W, 3) uint8 RGB.
+    """
+    window = fan_window(face.points)
+    crop = cut_crop(image, window, FAN_CROP)
+    with torch.inference_mode():
+        batch = torch.from_numpy(crop).permute(2, 0, 1)[None].float() / 255.0
+        heat = _heat(fan, batch)[0].double().numpy()
+    if not np.isfinite(heat).all():
+        raise ConfigError("landmarks: FAN's weights give NaN or infinite heat; use others")
+    found = [_peak(one) for one in heat]
+    cells, spread, height = (np.array(part) for part in zip(*found, strict=True))
+    step = FAN_CROP / HEAT
+    points = (cells * step) @ window[:, :2].T + window[:, 2]
+    scale = float(np.sqrt(abs(np.linalg.det(window[:, :2]))))
+    confidence = np.clip(height, 0.0, 1.0)
+    sigma = np.maximum(spread, 0.5) * step * scale / np.maximum(confidence, 0.05)
+    return replace(face, points=points, sigma=sigma, confidence=face.score * confidence)
+
+
+def fan_window(points: np.ndarray) -> np.ndarray:
+    """Place an upright crop about landmarks (68, 2): affine (2, 3) from crop to image pixels."""
+    low, high = points.min(0), points.max(0)
+    low = low - [0.0, BROW * (high[1] - low[1])]
+    centre = 0.5 * (low + high) - [0.0, RAISE * (high[1] - low[1])]
+    scale = SPAN * max(float((high - low).sum()), 8.0) / FAN_CROP
+    return place_crop(centre, scale * np.eye(2), FAN_CROP)
+
+
+def _heat(fan: torch.jit.ScriptModule, batch: torch.Tensor) -> torch.Tensor:
+    """Run FAN; a stack of several hourglasses answers with a list, whose last heat maps count."""
+    output = fan(batch)
+    return output[-1] if isinstance(output, list | tuple) else output
+
+
+def _peak(heat: np.ndarray) -> tuple[np.ndarray, float, float]:
+    """Find the place (2,) in cells, corner origin, spread in cells and height of a map's peak."""
+    row, column = np.unravel_index(int(np.argmax(heat)), heat.shape)
+    rows = slice(max(row - REACH, 0), row + REACH + 1)
+    columns = slice(max(column - REACH, 0), column + REACH + 1)
+    share = np.clip(heat[rows, columns], 0.0, None)
+    total = max(float(share.sum()), 1e-12)
+    y, x = cell_to_corner(np.mgrid[rows, columns][:, : share.shape[0], : share.shape[1]])
+    place = np.array([(share * x).sum(), (share * y).sum()]) / total
+    variance = float((share * ((x - place[0]) ** 2 + (y - place[1]) ** 2)).sum()) / total
+    return place, (0.5 * variance) ** 0.5, float(heat[row, column])

@@ -45,9 +45,9 @@ def variants() -> tuple[str, ...]:
     return tuple(VARIANTS) if x86 else ("baseline",)
 
 
-def library_file(variant: str, folder: Path = HERE) -> Path:
+def library_file(variant: str) -> Path:
     """Where the shared object of a variant lies."""
-    return folder / f"gaussians_{variant}.so"
+    return HERE / f"gaussians_{variant}.so"
 
 
 def source_digest() -> str:
@@ -92,18 +92,13 @@ def compile_variant(variant: str, target: Path) -> None:
     raise BuildError(f"{command[0]} failed on {SOURCE.name} ({variant}): {run.stderr.strip()}")
 
 
-def _build_in_place(variant: str) -> str:
-    """Compile one variant next to this file; returns its name."""
-    compile_variant(variant, library_file(variant))
-    return variant
-
-
 def main() -> int:
     """Build every variant next to this file; 1 if that failed."""
     try:
         with ThreadPoolExecutor(max_workers=2) as pool:
-            for variant in pool.map(_build_in_place, variants()):
-                sys.stdout.write(f"built {library_file(variant)}\n")
+            files = [library_file(variant) for variant in variants()]
+            for file, _ in zip(files, pool.map(compile_variant, variants(), files), strict=True):
+                sys.stdout.write(f"built {file}\n")
     except BuildError as error:
         sys.stderr.write(f"{error}\n")
         return 1

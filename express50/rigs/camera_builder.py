@@ -1,4 +1,4 @@
-"""Parts that every importer needs: cameras from K and distortion, names, sizes, scale."""
+"""What every importer needs: cameras from K and distortion, names, sizes, scale."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 
 from express50.errors import CalibrationError
 from express50.files.calibration import camera_rows, parse_cameras
-from express50.files.text import read_bytes, read_json_table
+from express50.files.text import read_bytes
 from express50.geometry.cameras import Camera, resized
 
 
@@ -22,7 +22,7 @@ def camera_from_K(
     size: tuple[int, int],
     cam_from_world: np.ndarray,
 ) -> Camera:
-    """A camera of the smallest COLMAP model that holds the distortion.
+    """Returns a camera of the smallest COLMAP model that holds the distortion.
 
     Args:
         camera_id: its name.
@@ -37,7 +37,9 @@ def camera_from_K(
     K, d = np.asarray(K, dtype=np.float64), np.zeros(14)
     given = np.asarray(dist, dtype=np.float64).ravel()
     if given.size > d.size:
-        raise CalibrationError(f"camera {camera_id}: {given.size} numbers of distortion, over 14")
+        raise CalibrationError(
+            f"camera {camera_id}: has {given.size} distortion terms, expected at most 14"
+        )
     d[: given.size] = given
     if K.shape != (3, 3) or abs(K[0, 1]) > 1e-3 * abs(K[0, 0]) or d[8:].any():
         raise CalibrationError(
@@ -55,7 +57,7 @@ def camera_from_K(
 
 
 def names_from_files(files: Sequence[str]) -> list[str]:
-    """Camera names of image files: the folder where each folder holds one, else the file's stem.
+    """Names cameras after image files: the folder where each folder holds one, else the stem.
 
     ``cam00/000000.jpg, cam01/000000.jpg`` gives ``cam00, cam01``; ``x/a.jpg, x/b.jpg`` ``a, b``.
     """
@@ -71,7 +73,7 @@ def names_from_files(files: Sequence[str]) -> list[str]:
 
 
 def at_size(cameras: dict[str, Camera], size: tuple[int, int] | None) -> dict[str, Camera]:
-    """The cameras with K scaled to the footage's size (width, height); None leaves them.
+    """Returns the cameras with K scaled to the footage's size (width, height); None leaves them.
 
     Raises:
         CalibrationError: the aspect ratio is another, so that a crop and not a scale is missing.
@@ -92,7 +94,7 @@ def at_size(cameras: dict[str, Camera], size: tuple[int, int] | None) -> dict[st
 
 
 def in_metres(cameras: dict[str, Camera], metres_per_unit: float) -> dict[str, Camera]:
-    """The cameras with positions scaled to metres.
+    """Returns the cameras with positions scaled to metres.
 
     Raises:
         CalibrationError: the factor is not a positive finite number.
@@ -108,7 +110,7 @@ def in_metres(cameras: dict[str, Camera], metres_per_unit: float) -> dict[str, C
 
 
 def checked(cameras: dict[str, Camera], path: Path) -> dict[str, Camera]:
-    """The cameras after the checks that our own calibration file must pass.
+    """Returns the cameras after the checks that our own calibration file must pass.
 
     Raises:
         CalibrationError: there are none, or one has a wrong rotation, focal length or number.
@@ -117,18 +119,9 @@ def checked(cameras: dict[str, Camera], path: Path) -> dict[str, Camera]:
 
 
 def holds(path: Path, word: str) -> bool:
-    """Whether a file is text with a word in it.
+    """Returns whether a file contains a word.
 
     Raises:
         CalibrationError: it cannot be read, or is too large to be a calibration.
     """
     return word.encode() in read_bytes(path, CalibrationError)
-
-
-def read_table(path: Path) -> dict:
-    """A JSON table.
-
-    Raises:
-        CalibrationError: the file is missing or is not a JSON table.
-    """
-    return read_json_table(path, CalibrationError)

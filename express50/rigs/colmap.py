@@ -1,7 +1,7 @@
 """Cameras of a COLMAP model: ``cameras`` and ``images``, as .bin or .txt; nothing else is read.
 
-COLMAP's own reader believes the counts in a binary file and asks for as much memory. Source of the
-layout: COLMAP's documentation of its output format.
+COLMAP's own reader trusts the counts in a binary file and allocates as much memory. The layout is
+that of COLMAP's documentation of its output format.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ SIZE_LIMIT = 1 << 30  # bytes of a file; images hold every observed point
 
 
 class Lens(NamedTuple):
-    """A camera of a model, without pose."""
+    """A camera without pose."""
 
     model: str
     width: int
@@ -43,51 +43,44 @@ class Shot(NamedTuple):
 
 
 def is_colmap(path: Path) -> bool:
-    """Whether a folder holds a COLMAP model."""
+    """Returns whether a folder holds a COLMAP model."""
     return any((path / f"images.{end}").is_file() for end in ("bin", "txt"))
 
 
-def read_colmap(path: Path) -> dict[str, Camera]:
-    """Every posed image as a camera; its world and unit are the model's own.
+def read_colmap_images(path: Path) -> tuple[dict[str, Camera], dict[str, str]]:
+    """Returns every posed image as a camera, and its image file, by camera.
+
+    World and unit are the model's own.
 
     Raises:
         CalibrationError: the model cannot be read, or has a camera model that ours lack.
-    """
-    return read_colmap_images(path)[0]
-
-
-def read_colmap_images(path: Path) -> tuple[dict[str, Camera], dict[str, str]]:
-    """The cameras as `read_colmap` gives them, and the image file of each.
-
-    Raises:
-        CalibrationError: as there.
     """
     binary = (path / "images.bin").is_file()
     try:
         lenses, shots = _read_binary(path) if binary else _read_text(path)
     except (ValueError, IndexError, struct.error, UnicodeDecodeError) as error:
         raise CalibrationError(
-            f"{path}: no COLMAP model ({reason(error)}); expected cameras and images as .bin or"
+            f"{path}: not a COLMAP model ({reason(error)}); expected cameras and images as .bin or"
             " .txt: export it again"
         ) from None
     shots = sorted(shots)
     names = names_from_files([shot.name for shot in shots])
     if len(set(names)) < len(names):
         raise CalibrationError(
-            f"{path}: several images share one camera name ({names[0]}, ...); expected one image a"
-            " camera: export the model of a single time step"
+            f"{path}: several images share one camera name ({names[0]}, ...); expected one image"
+            " per camera: export the model of a single time step"
         )
-    cameras = {n: _camera(path, n, shot, lenses) for n, shot in zip(names, shots, strict=True)}
+    cameras = {}
+    for name, shot in zip(names, shots, strict=True):
+        lens, turn = lenses.get(shot.camera), np.array(shot.pose[:4])
+        length = float(np.linalg.norm(turn))
+        if lens is None or not (np.isfinite(shot.pose).all() and 0 < length < 1e6):
+            raise CalibrationError(
+                f"{path}: image {shot.name} has no pose or no camera; export again"
+            )
+        pose = make_transform(quat_to_matrix(turn / length), np.array(shot.pose[4:]))
+        cameras[name] = Camera(name, lens.width, lens.height, lens.model, lens.params, pose)
     return checked(cameras, path), {n: s.name for n, s in zip(names, shots, strict=True)}
-
-
-def _camera(path: Path, name: str, shot: Shot, lenses: dict[int, Lens]) -> Camera:
-    lens, turn = lenses.get(shot.camera), np.array(shot.pose[:4])
-    length = float(np.linalg.norm(turn))
-    if lens is None or not (np.isfinite(shot.pose).all() and 0 < length < 1e6):
-        raise CalibrationError(f"{path}: image {shot.name} has no pose or no camera; export again")
-    pose = make_transform(quat_to_matrix(turn / length), np.array(shot.pose[4:]))
-    return Camera(name, lens.width, lens.height, lens.model, lens.params, pose)
 
 
 def _refuse(path: Path, model: str) -> CalibrationError:
@@ -123,7 +116,7 @@ def _read_text(path: Path) -> tuple[dict[int, Lens], list[Shot]]:
 def _read_binary(path: Path) -> tuple[dict[int, Lens], list[Shot]]:
     data = read_bytes(path / "cameras.bin", CalibrationError, SIZE_LIMIT)
     lenses, shots, place = {}, [], 8
-    # A count may say what it likes: what is missing ends the loop.
+    # A wrong count does no harm: unpacking beyond the end raises.
     for _ in range(struct.unpack_from("<Q", data)[0]):
         number, kind, width, height = struct.unpack_from("<IiQQ", data, place)
         if kind not in HELD:

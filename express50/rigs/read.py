@@ -1,23 +1,50 @@
-"""Read a rig in any known format, at the footage's size, in metres."""
+"""Read a rig in any known format, at the footage's size, in metres.
+
+COLMAP's models and transforms.json have modules of their own. The other layouts are read here:
+
+- OpenCV's YAML, one file per camera. OpenCV puts the pixel origin at the first pixel's centre, so K
+  is shifted.
+- NeRSemble's camera_params.json, as nersemble-data 0.0.6 reads it: ``world_2_cam`` is world to
+  camera with OpenCV axes, metres; K belongs to 2200 x 3208 images.
+- RenderMe-360's .smc: ``RT`` is camera to world with OpenCV axes, metres; K belongs to the stored
+  resolution.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
-from express50.errors import CalibrationError
+import cv2
+import h5py
+import numpy as np
+
+from express50.errors import CalibrationError, CaptureError
 from express50.files.calibration import read_cameras
+from express50.files.containers import attribute, child, members, open_hdf5, read_array
+from express50.files.text import TOML_LIMIT, read_json_table, read_text, reason
 from express50.geometry.cameras import Camera
-from express50.rigs.camera_builder import at_size, holds, in_metres
-from express50.rigs.colmap import is_colmap, read_colmap
-from express50.rigs.dataset_formats import is_nersemble, is_renderme, read_nersemble, read_renderme
-from express50.rigs.opencv_yaml import is_opencv_yaml, read_opencv_yaml
+from express50.geometry.conventions import K_from_opencv
+from express50.geometry.transforms import axis_angle_to_matrix, make_transform
+from express50.rigs.camera_builder import at_size, camera_from_K, checked, holds, in_metres
+from express50.rigs.colmap import is_colmap, read_colmap_images
 from express50.rigs.transforms_json import is_transforms, read_transforms
 
 FORMATS = ("express50", "colmap", "opencv", "transforms", "nersemble", "renderme360")
+NERSEMBLE_SIZE = (2200, 3208)
+# Names in use: OpenCV's calibration sample, its stereo sample, ROS, and hand-written files.
+_K = ("camera_matrix", "cameraMatrix", "K", "M", "intrinsics")
+_DIST = ("distortion_coefficients", "dist_coeffs", "distCoeffs", "dist", "D")
+_ROTATION = ("R", "rotation", "rvec", "Rot")
+_TRANSLATION = ("T", "t", "tvec", "translation")
+_SIZES = (("image_width", "image_height"), ("width", "height"), ("W", "H"))
+YAML = (".yml", ".yaml")
+LEVELS, ENTRIES = 16, 64  # of nesting, and in a matrix
 
 
 def guess_format(path: Path) -> str:
-    """The format of a file or folder.
+    """Returns the format of a file or folder.
 
     Raises:
         CalibrationError: it does not exist or fits none.
@@ -25,11 +52,11 @@ def guess_format(path: Path) -> str:
     if not path.exists():
         raise CalibrationError(f"{path}: does not exist")
     tests = {
-        "renderme360": is_renderme,
-        "nersemble": is_nersemble,
+        "renderme360": lambda p: p.is_file() and p.suffix == ".smc",
+        "nersemble": lambda p: p.is_file() and p.suffix == ".json" and holds(p, '"world_2_cam"'),
         "colmap": is_colmap,
         "transforms": is_transforms,
-        "opencv": is_opencv_yaml,
+        "opencv": lambda p: any(f.suffix in YAML for f in (p.iterdir() if p.is_dir() else [p])),
         "express50": lambda p: p.is_file() and holds(p, '"world_to_camera"'),
     }
     found = next((name for name, fits in tests.items() if fits(path)), None)
@@ -47,7 +74,7 @@ def read_rig(
     size: tuple[int, int] | None = None,
     metres_per_unit: float = 1.0,
 ) -> dict[str, Camera]:
-    """Cameras of a calibration that another tool wrote.
+    """Reads the cameras of a calibration that another tool wrote.
 
     Args:
         path: file or folder.
@@ -56,21 +83,207 @@ def read_rig(
         metres_per_unit: what one unit of the file's world is, metres.
 
     Raises:
-        CalibrationError: the format is unknown or the content does not fit it.
+        CalibrationError: no format fits, or the content does not fit the format.
     """
-    kind = kind or guess_format(path)
-    if kind == "opencv":
-        found = read_opencv_yaml(path, size)
-    elif kind == "transforms":
-        found = read_transforms(path, size)
-    else:
-        readers = {
-            "express50": read_cameras,
-            "colmap": read_colmap,
-            "nersemble": read_nersemble,
-            "renderme360": read_renderme,
-        }
-        if kind not in readers:
-            raise CalibrationError(f"format {kind!r}, expected one of {', '.join(FORMATS)}")
-        found = readers[kind](path)
+    readers: dict[str, Callable[[Path], dict[str, Camera]]] = {
+        "express50": read_cameras,
+        "colmap": lambda path: read_colmap_images(path)[0],
+        "opencv": lambda path: read_opencv_yaml(path, size),
+        "transforms": lambda path: read_transforms(path, size),
+        "nersemble": read_nersemble,
+        "renderme360": read_renderme,
+    }
+    found = readers[kind or guess_format(path)](path)
     return in_metres(at_size(found, size), metres_per_unit)
+
+
+def read_opencv_yaml(path: Path, size: tuple[int, int] | None) -> dict[str, Camera]:
+    """Reads the cameras of a folder of ``<camera>.yml`` files, or one such file.
+
+    ``size`` is the width and height of the images where the files do not say.
+
+    Raises:
+        CalibrationError: a matrix is missing or has the wrong shape, or no size is known.
+    """
+    files = sorted(p for p in path.iterdir() if p.suffix in YAML) if path.is_dir() else [path]
+    found = {}
+    for file in files:
+        storage = _open(file)
+        with _damage(file):
+            K = _matrix(storage, _K, file)
+            dist = _matrix(storage, _DIST, file, optional=True)
+            pose = _pose(storage, file)
+            shape = _image_size(storage, size, file)
+            found[file.stem] = camera_from_K(file.stem, K_from_opencv(K), dist.ravel(), shape, pose)
+    return checked(found, path)
+
+
+def _open(path: Path) -> cv2.FileStorage:
+    """Opens a file after refusing nesting that would overflow OpenCV's recursive parser."""
+    text = read_text(path, CalibrationError, TOML_LIMIT)
+    if not text.startswith("%YAML"):
+        raise CalibrationError(f"{path}: does not begin with %YAML; expected OpenCV's YAML 1.0")
+    level = 0
+    for line in text.split("\n"):
+        lead = len(line) - len(line.lstrip(" -\t"))
+        level = max(0, level + line.count("[") + line.count("{"))
+        if level > LEVELS or lead > 4 * LEVELS:
+            raise CalibrationError(f"{path}: is nested over {LEVELS} deep, expected matrices")
+        level = max(0, level - line.count("]") - line.count("}"))
+    with _damage(path):
+        storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
+    if not storage.isOpened():
+        raise CalibrationError(f"{path}: OpenCV cannot read it; expected its YAML 1.0 format")
+    return storage
+
+
+@contextmanager
+def _damage(path: Path) -> Iterator[None]:
+    """Names the file in errors of OpenCV, which checks a value only when it is asked for it."""
+    try:
+        yield
+    except (cv2.error, SystemError, ValueError, OverflowError, TypeError) as error:
+        raise CalibrationError(
+            f"{path}: OpenCV cannot read a value ({getattr(error, 'err', '') or reason(error)});"
+            " write the file again"
+        ) from None
+
+
+def _matrix(
+    storage: cv2.FileStorage, keys: tuple[str, ...], path: Path, optional: bool = False
+) -> np.ndarray:
+    """Reads the first of the named matrices that exists; a 3 x 3 one unless it is optional."""
+    for key in keys:
+        node = storage.getNode(key)
+        if node.empty():
+            continue
+        if node.isMap():  # OpenCV would allocate a matrix of any size before it reads the numbers
+            rows, columns = (int(node.getNode(side).real()) for side in ("rows", "cols"))
+            count = node.getNode("data").size()
+            if not 0 < rows * columns <= ENTRIES or rows * columns != count:
+                raise CalibrationError(f"{path}: {key} is {rows} x {columns} with {count} numbers")
+            value = node.mat()
+        else:
+            value = _list_of_numbers(path, key, node)
+        if optional or value.shape == (3, 3):
+            return np.asarray(value, dtype=np.float64)
+        raise CalibrationError(f"{path}: {key} has shape {value.shape}, expected (3, 3)")
+    if optional:
+        return np.zeros(0)
+    raise CalibrationError(f"{path}: has none of {', '.join(keys)}; expected a 3 x 3 matrix")
+
+
+def _list_of_numbers(path: Path, key: str, node: cv2.FileNode) -> np.ndarray:
+    """Reads a list of numbers, or a list of rows of them."""
+    entries = [node.at(i) for i in range(min(node.size(), ENTRIES))]
+    if not any(entry.isSeq() for entry in entries):
+        return np.array([entry.real() for entry in entries])
+    if len({entry.size() if entry.isSeq() else -1 for entry in entries}) != 1:
+        raise CalibrationError(f"{path}: {key} has rows of several lengths, expected a matrix")
+    width = min(entries[0].size(), ENTRIES)
+    return np.array([[entry.at(i).real() for i in range(width)] for entry in entries])
+
+
+def _pose(storage: cv2.FileStorage, path: Path) -> np.ndarray:
+    """Reads a pose world to camera (4, 4); a rotation is a matrix or Rodrigues' vector."""
+    R = _matrix(storage, _ROTATION, path, optional=True)
+    t = _matrix(storage, _TRANSLATION, path, optional=True)
+    if R.size == 3:
+        R = axis_angle_to_matrix(R.ravel())
+    if R.shape != (3, 3) or t.size != 3:
+        raise CalibrationError(
+            f"{path}: no pose; expected {' or '.join(_ROTATION)} (3 x 3 or a Rodrigues vector) and"
+            f" {' or '.join(_TRANSLATION)} (3), world to camera"
+        )
+    return make_transform(R, t.ravel())
+
+
+def _image_size(
+    storage: cv2.FileStorage, size: tuple[int, int] | None, path: Path
+) -> tuple[int, int]:
+    for pair in _SIZES:
+        nodes = [storage.getNode(key) for key in pair]
+        if not any(node.empty() for node in nodes):
+            return int(nodes[0].real()), int(nodes[1].real())
+    if size is None:
+        raise CalibrationError(f"{path}: does not say the images' size; give --size WIDTHxHEIGHT")
+    return size
+
+
+def read_nersemble(path: Path) -> dict[str, Camera]:
+    """Reads cameras by serial number, at the release's full size.
+
+    Raises:
+        CalibrationError: world_2_cam or intrinsics are missing or have another shape.
+    """
+    table = read_json_table(path, CalibrationError)
+    poses, intrinsics = table.get("world_2_cam"), table.get("intrinsics")
+    if not isinstance(poses, dict) or intrinsics is None:
+        raise CalibrationError(
+            f"{path}: expected world_2_cam {{serial: 4 x 4}} and intrinsics (3 x 3, or a table by"
+            " serial)"
+        )
+    found = {}
+    for serial, pose in poses.items():
+        own = intrinsics.get(serial) if isinstance(intrinsics, dict) else intrinsics
+        K, matrix = _array(path, serial, own, (3, 3)), _array(path, serial, pose, (4, 4))
+        found[serial] = camera_from_K(serial, K_from_opencv(K), [], NERSEMBLE_SIZE, matrix)
+    return checked(found, path)
+
+
+def read_renderme(path: Path) -> dict[str, Camera]:
+    """Reads the cameras of an SMC with a Calibration group (in full releases the ``_anno`` one).
+
+    Raises:
+        CalibrationError: the file has no calibration or no resolution, or an array's shape is off.
+    """
+    try:
+        file = open_hdf5(path)
+        group = child(file, "Calibration", str(path))
+        if not isinstance(group, h5py.Group):
+            raise CalibrationError(
+                f"{path}: has no Calibration; expected it in the anno file of the same performance"
+                f" ({path.name.replace('_raw', '_anno')})"
+            )
+        size = _smc_size(path, file)
+        found = {}
+        for name in members(group, str(path)):
+            if not name.isdecimal() or len(name) > 4:
+                raise CalibrationError(f"{path}: camera {name!r}, expected a number such as 07")
+            rows = {key: f"Calibration/{name}/{key}" for key in ("K", "RT", "D")}
+            K = _array(path, name, read_array(file, rows["K"], str(path)), (3, 3))
+            pose = _array(path, name, read_array(file, rows["RT"], str(path)), (4, 4))
+            has_dist = child(file, rows["D"], str(path)) is not None
+            dist = np.ravel(read_array(file, rows["D"], str(path))) if has_dist else np.zeros(0)
+            if np.linalg.matrix_rank(pose) < 4:
+                raise CalibrationError(f"{path}: RT of camera {name} cannot be inverted")
+            camera_id = f"cam{int(name):02d}"
+            found[camera_id] = camera_from_K(
+                camera_id, K_from_opencv(K), dist[:14], size, np.linalg.inv(pose)
+            )
+    except CaptureError as error:
+        raise CalibrationError(str(error)) from None
+    return checked(found, path)
+
+
+def _smc_size(path: Path, file: h5py.File) -> tuple[int, int]:
+    """Reads width and height, which are stored the other way round; else the release's own."""
+    group = child(file, "Camera", str(path))
+    size = np.array((2048, 2448))
+    if isinstance(group, h5py.Group):
+        size = attribute(group, "resolution", size, str(path))
+    if size.shape != (2,) or size.dtype.kind not in "ui":
+        raise CalibrationError(f"{path}: resolution {size.tolist()}, expected height and width")
+    return int(size[1]), int(size[0])
+
+
+def _array(path: Path, name: str, value: object, shape: tuple[int, int]) -> np.ndarray:
+    try:
+        array = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError):
+        array = np.zeros(0)
+    if array.shape != shape or not np.isfinite(array).all():
+        raise CalibrationError(
+            f"{path}: camera {name} has an array of shape {array.shape}, expected {shape}, finite"
+        )
+    return array

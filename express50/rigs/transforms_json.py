@@ -11,21 +11,16 @@ from pathlib import Path
 import numpy as np
 
 from express50.errors import CalibrationError
+from express50.files.text import read_json_table
 from express50.geometry.cameras import Camera
 from express50.geometry.conventions import cam_from_world_from_opengl
-from express50.rigs.camera_builder import (
-    camera_from_K,
-    checked,
-    holds,
-    names_from_files,
-    read_table,
-)
+from express50.rigs.camera_builder import camera_from_K, checked, holds, names_from_files
 
 _HELD = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE")
 
 
 def is_transforms(path: Path) -> bool:
-    """Whether a file, or a folder's transforms.json, has frames with matrices."""
+    """Returns whether a file, or a folder's transforms.json, has frames with matrices."""
     path = _file(path)
     return path.suffix == ".json" and path.is_file() and holds(path, "transform_matrix")
 
@@ -35,7 +30,7 @@ def _file(path: Path) -> Path:
 
 
 def read_transforms(path: Path, size: tuple[int, int] | None) -> dict[str, Camera]:
-    """One camera a frame, or a camera index where frames of several time steps share cameras.
+    """Reads one camera per frame, or per camera index where time steps share cameras.
 
     Args:
         path: the file, or the folder that holds transforms.json.
@@ -45,20 +40,28 @@ def read_transforms(path: Path, size: tuple[int, int] | None) -> dict[str, Camer
         CalibrationError: a frame lacks what a camera needs, or a camera moves between frames.
     """
     path = _file(path)
-    table = read_table(path)
+    table = read_json_table(path, CalibrationError)
     frames = table.get("frames")
-    if not isinstance(frames, list) or not frames:
+    tables = isinstance(frames, list) and all(isinstance(frame, dict) for frame in frames)
+    if not frames or not tables:
         raise CalibrationError(f"{path}: has no frames; expected [{{transform_matrix, ...}}, ...]")
-    if not all(isinstance(frame, dict) for frame in frames):
-        raise CalibrationError(f"{path}: frames holds something else than tables")
     try:
         names = camera_names(frames)
     except (TypeError, ValueError, OverflowError) as error:
-        raise CalibrationError(f"{path}: camera_index is no number ({error})") from None
-    _check_unique(path, names, frames)
+        raise CalibrationError(f"{path}: camera_index is not a number ({error})") from None
     found: dict[str, Camera] = {}
+    files: dict[str, str] = {}
     for number, (name, frame) in enumerate(zip(names, frames, strict=True)):
-        camera = _camera(f"{path}: frame {number} ({name})", name, table | frame, size)
+        file = str(frame.get("file_path", name))
+        if "camera_index" not in frame and files.setdefault(name, file) != file:
+            raise CalibrationError(
+                f"{path}: {files[name]} and {file} are both camera {name}; rename one"
+            )
+        where = f"{path}: frame {number} ({name})"
+        try:
+            camera = _camera(where, name, table | frame, size)
+        except (TypeError, ValueError, OverflowError, ZeroDivisionError) as error:
+            raise CalibrationError(f"{where}: a value has the wrong kind ({error})") from None
         earlier = found.setdefault(name, camera)
         if np.abs(earlier.cam_from_world - camera.cam_from_world).max() > 1e-6:
             raise CalibrationError(
@@ -69,7 +72,7 @@ def read_transforms(path: Path, size: tuple[int, int] | None) -> dict[str, Camer
 
 
 def camera_names(frames: list[dict]) -> list[str]:
-    """The camera of each frame: its index where all have one, else by its file's name."""
+    """Names the camera of each frame: by its index where all have one, else by its file."""
     if all("camera_index" in frame for frame in frames):
         return [f"cam{int(frame['camera_index']):02d}" for frame in frames]
     return names_from_files(
@@ -77,25 +80,7 @@ def camera_names(frames: list[dict]) -> list[str]:
     )
 
 
-def _check_unique(path: Path, names: list[str], frames: list[dict]) -> None:
-    """Refuse two pictures whose names come out as one camera's."""
-    files: dict[str, str] = {}
-    for name, frame in zip(names, frames, strict=True):
-        file = str(frame.get("file_path", name))
-        if "camera_index" not in frame and files.setdefault(name, file) != file:
-            raise CalibrationError(
-                f"{path}: {files[name]} and {file} are both camera {name}; rename one"
-            )
-
-
 def _camera(where: str, name: str, row: dict, size: tuple[int, int] | None) -> Camera:
-    try:
-        return _camera_of(where, name, row, size)
-    except (TypeError, ValueError, OverflowError, ZeroDivisionError) as error:
-        raise CalibrationError(f"{where}: a value is no number of its kind ({error})") from None
-
-
-def _camera_of(where: str, name: str, row: dict, size: tuple[int, int] | None) -> Camera:
     model = str(row.get("camera_model", "OPENCV"))
     if model not in _HELD:
         raise CalibrationError(
@@ -108,38 +93,27 @@ def _camera_of(where: str, name: str, row: dict, size: tuple[int, int] | None) -
         )
     world_from_cam = np.eye(4)
     world_from_cam[: len(matrix)] = matrix.astype(np.float64)
-    width, height = _size(where, row, size)
-    K = _K(where, row, width, height)
+    if "w" in row and "h" in row:
+        size = int(row["w"]), int(row["h"])
+    if size is None:
+        raise CalibrationError(f"{where}: has no w and h; give --size WIDTHxHEIGHT")
+    fx, fy = _focal(row, "x", size[0]), _focal(row, "y", size[1])
+    if fx is None:
+        raise CalibrationError(f"{where}: has neither fl_x nor camera_angle_x; add one")
+    fy = fx if fy is None else fy
+    cx, cy = float(row.get("cx", size[0] / 2)), float(row.get("cy", size[1] / 2))
+    K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
     if row.get("is_fisheye"):
         raise CalibrationError(f"{where}: is_fisheye, expected a perspective lens; undistort first")
     if float(row.get("k4", 0.0)):  # Nerfstudio's fourth power of r^2, which OpenCV's model lacks
         raise CalibrationError(f"{where}: k4 is {row['k4']}, expected 0 or none; undistort first")
-    dist = [float(row.get(key, 0.0)) for key in ("k1", "k2", "p1", "p2", "k3")]
-    if model != "OPENCV":
-        dist = []
-    return camera_from_K(name, K, dist, (width, height), cam_from_world_from_opengl(world_from_cam))
-
-
-def _size(where: str, row: dict, size: tuple[int, int] | None) -> tuple[int, int]:
-    if "w" in row and "h" in row:
-        return int(row["w"]), int(row["h"])
-    if size is None:
-        raise CalibrationError(f"{where}: has no w and h; give --size WIDTHxHEIGHT")
-    return size
-
-
-def _K(where: str, row: dict, width: int, height: int) -> np.ndarray:
-    """K (3, 3) of focal lengths or of angles of view; pixels are square where one is told."""
-    fx, fy = _focal(row, "x", width), _focal(row, "y", height)
-    if fx is None:
-        raise CalibrationError(f"{where}: has neither fl_x nor camera_angle_x; add one")
-    fy = fx if fy is None else fy
-    cx, cy = float(row.get("cx", width / 2)), float(row.get("cy", height / 2))
-    return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
+    terms = ("k1", "k2", "p1", "p2", "k3") if model == "OPENCV" else ()
+    dist = [float(row.get(key, 0.0)) for key in terms]
+    return camera_from_K(name, K, dist, size, cam_from_world_from_opengl(world_from_cam))
 
 
 def _focal(row: dict, axis: str, side: int) -> float | None:
-    """Focal length along an axis, pixels, or None where nothing is told."""
+    """Returns the focal length along an axis, pixels, or None where it is not given."""
     if f"fl_{axis}" in row:
         return float(row[f"fl_{axis}"])
     if f"camera_angle_{axis}" in row:

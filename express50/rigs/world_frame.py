@@ -1,6 +1,11 @@
-"""The world a board calibration is delivered in, and the checks any calibration must pass.
+"""Where a rig looks: the checks that any calibration must pass, and the world of a solved rig.
 
-The world is made from the cameras alone, so that the same footage always gives the same one:
+Cameras of a head rig look at one place in front of them all. A calibration read the wrong way round
+(camera to world for world to camera, or OpenGL axes for OpenCV's) fails this, and usually only one
+reading passes.
+
+The world of a solved rig is made from the cameras alone, so that the same footage always gives the
+same one:
 - origin: the point nearest to all optical axes (where the rig looks);
 - y: up, against the mean of the cameras' downward image axes, or the head's own up where that is
   known and says that the cameras lie on their sides;
@@ -11,11 +16,13 @@ The world is made from the cameras alone, so that the same footage always gives 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from express50.errors import CalibrationError
 from express50.geometry.cameras import Camera, transform_camera
+from express50.geometry.conventions import FLIP_YZ
 from express50.geometry.transforms import make_transform
 
 # Below this the mean viewing side of a rig is noise: the cameras stand all round.
@@ -24,10 +31,12 @@ CLEAR_SIDE = 0.15
 ON_ITS_SIDE = 0.7
 # Axes within about 1 degree of parallel meet nowhere in particular.
 PARALLEL = 3e-4
+# A rig whose cameras stand closer to the head or further from it than this is not in metres.
+NEAR_M, FAR_M = 0.1, 10.0
 
 
 def meeting_point(cameras: Mapping[str, Camera]) -> np.ndarray | None:
-    """Point (3,) nearest to all optical axes in least squares; None for (nearly) parallel axes."""
+    """Returns the point (3,) nearest to all optical axes; None for (nearly) parallel axes."""
     total, right = np.zeros((3, 3)), np.zeros(3)
     middle = np.mean([c.center for c in cameras.values()], axis=0)
     for camera in cameras.values():
@@ -41,7 +50,7 @@ def meeting_point(cameras: Mapping[str, Camera]) -> np.ndarray | None:
 
 
 def depths_behind(cameras: Mapping[str, Camera]) -> dict[str, float]:
-    """Return the depths, metres, of the cameras that have the rig's meeting point behind them.
+    """Returns the depths, metres, of the cameras that have the rig's meeting point behind them.
 
     Inverted matrices (camera to world) and a wrong axis convention show here. Empty where the axes
     do not meet.
@@ -57,8 +66,18 @@ def depths_behind(cameras: Mapping[str, Camera]) -> dict[str, float]:
     return {name: depth for name, depth in depths.items() if depth <= 0.01 * extent}
 
 
-def describe_behind(depths: Mapping[str, float]) -> str:
-    """Put the result of `depths_behind` into words; empty where it is empty."""
+def check_meeting(cameras: Mapping[str, Camera], where: str) -> None:
+    """Raises CalibrationError unless the point the cameras look at is in front of each of them."""
+    problem = _describe_behind(depths_behind(cameras))
+    if problem:
+        raise CalibrationError(
+            f"{where}: {problem}; "
+            "is world_to_camera inverted, or are its axes not OpenCV's (x right, y down, z ahead)?"
+        )
+
+
+def _describe_behind(depths: Mapping[str, float]) -> str:
+    """Puts the result of `depths_behind` into words; empty where it is empty."""
     if not depths:
         return ""
     shown = ", ".join(f"{name} (z = {depth:.3g} m)" for name, depth in list(depths.items())[:4])
@@ -66,20 +85,83 @@ def describe_behind(depths: Mapping[str, float]) -> str:
     return f"the point all cameras look at lies behind {shown}{more}; expected z > 0"
 
 
-def check_meeting(cameras: Mapping[str, Camera], where: str) -> None:
-    """Raise CalibrationError unless the point the cameras look at is in front of each of them."""
-    depths = depths_behind(cameras)
-    if depths:
-        raise CalibrationError(
-            f"{where}: {describe_behind(depths)}; "
-            "is world_to_camera inverted, or are its axes not OpenCV's (x right, y down, z ahead)?"
+@dataclass(frozen=True)
+class RigVerdict:
+    """Figures and warnings of a rig.
+
+    Attributes:
+        cameras: how many.
+        meeting: (3,) world point nearest to all axes, None when they are parallel.
+        distance_m: median distance of the cameras from it.
+        miss_mm: median distance of the axes from it.
+        problem: what is wrong, empty if nothing is.
+        remedy: the reading that would fix it, empty if none would.
+        warnings: what is unusual but may be intended.
+    """
+
+    cameras: int
+    meeting: tuple[float, float, float] | None
+    distance_m: float | None
+    miss_mm: float | None
+    problem: str
+    remedy: str
+    warnings: tuple[str, ...]
+
+
+def judge(cameras: Mapping[str, Camera]) -> RigVerdict:
+    """Judges a rig of at least one camera."""
+    problem = _describe_behind(depths_behind(cameras))
+    point = meeting_point(cameras)
+    if point is None:
+        return RigVerdict(len(cameras), None, None, None, problem, "", ("the axes are parallel",))
+    gaps = {name: point - camera.center for name, camera in cameras.items()}
+    distance = float(np.median([np.linalg.norm(gap) for gap in gaps.values()]))
+    axes = {name: camera.cam_from_world[2, :3] for name, camera in cameras.items()}
+    misses = {n: np.linalg.norm(gap - axes[n] * (axes[n] @ gap)) for n, gap in gaps.items()}
+    warnings = []
+    if not NEAR_M < distance < FAR_M:
+        warnings.append(
+            f"cameras stand {distance:.3g} m from where they look: are the units metres?"
         )
+    stray = [name for name, miss in misses.items() if miss > 0.35 * distance]
+    if stray:
+        warnings.append(f"{', '.join(stray)} look elsewhere than the others")
+    for name, camera in cameras.items():
+        offset = np.abs(camera.K[:2, 2] / (camera.width, camera.height) - 0.5).max()
+        if offset > 0.2:
+            warnings.append(f"{name}: principal point {offset:.0%} of the image from its middle")
+    return RigVerdict(
+        cameras=len(cameras),
+        meeting=(float(point[0]), float(point[1]), float(point[2])),
+        distance_m=distance,
+        miss_mm=1e3 * float(np.median(list(misses.values()))),
+        problem=problem,
+        remedy=_remedy(cameras) if problem else "",
+        warnings=tuple(warnings),
+    )
+
+
+def _remedy(cameras: Mapping[str, Camera]) -> str:
+    """Names the first other reading of the matrices that passes."""
+    readings = {
+        "the matrices are camera to world: invert them": lambda T: np.linalg.inv(T),
+        "the axes are OpenGL's: flip y and z": lambda T: FLIP_YZ @ T,
+        "the matrices are camera to world with OpenGL axes": lambda T: np.linalg.inv(T @ FLIP_YZ),
+    }
+    for words, read in readings.items():
+        other = {
+            name: replace(camera, cam_from_world=read(camera.cam_from_world))
+            for name, camera in cameras.items()
+        }
+        if meeting_point(other) is not None and not depths_behind(other):
+            return words
+    return ""
 
 
 def canonical_from_rig(
     cameras: Mapping[str, Camera], fallback: np.ndarray, head_up: np.ndarray | None = None
 ) -> np.ndarray:
-    """Transform (4, 4) from the rig's space to the canonical world of this module.
+    """Returns the transform (4, 4) from the rig's space to the canonical world of this module.
 
     `fallback` (3,), rig space, is the origin when the axes do not meet (one camera, or parallel);
     `head_up` (3,) is the direction from chin to crown, where a head is known.
@@ -112,5 +194,5 @@ def _level(vector: np.ndarray, up: np.ndarray) -> np.ndarray:
 
 
 def move_cameras(cameras: Mapping[str, Camera], new_from_old: np.ndarray) -> dict[str, Camera]:
-    """All cameras after the world moved by a rigid transform (4, 4)."""
+    """Returns all cameras after the world moved by a rigid transform (4, 4)."""
     return {name: transform_camera(camera, new_from_old) for name, camera in cameras.items()}

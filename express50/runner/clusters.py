@@ -22,10 +22,25 @@ class LocalWorkers:
     """Processes on this machine; the first ones get one GPU each."""
 
     def __init__(self, count: int, threads: int) -> None:
+        from distributed import Nanny
+
         devices = cuda_devices()
         self.count, self.gpus = count, min(count, len(devices))
-        cluster = start_cluster(local_workers(count, devices), threads, host="127.0.0.1")
-        self.client, self._cluster = cluster
+        shared = {
+            "nthreads": 1,
+            "host": "127.0.0.1",
+            "protocol": "tcp://",
+            "dashboard": False,
+            "memory_limit": 0.9 / count,
+            "silence_logs": logging.CRITICAL,
+        }
+        workers: dict[int, dict] = {
+            number: {"cls": Nanny, "options": dict(shared)} for number in range(count)
+        }
+        for number, device in enumerate(devices[:count]):
+            gpu = {"env": {"CUDA_VISIBLE_DEVICES": device}, "resources": {GPU: 1}}
+            workers[number]["options"] |= gpu
+        self.client, self._cluster = start_cluster(workers, threads, host="127.0.0.1")
         self.client.register_plugin(_ignore_interrupts())
 
     def keep(self, tasks: int) -> None:
@@ -110,9 +125,12 @@ def no_gpu(stage: str, words: str) -> StageError:
     return StageError(f"{stage} needs a GPU as it is configured, and {words}")
 
 
-def cluster_settings(threads: int) -> dict[str, object]:
-    """Return dask's settings for a scheduler in this process."""
-    return {
+def start_cluster(workers: dict[int, dict], threads: int, **scheduler: object) -> tuple[Any, Any]:
+    """Start a scheduler with local workers, if any; returns its client and the cluster."""
+    import dask
+    from distributed import Client, Scheduler, SpecCluster
+
+    settings = {
         "distributed.scheduler.allowed-failures": 0,
         # A stage may hold the interpreter for minutes in native code; that is not death.
         "distributed.scheduler.worker-ttl": None,
@@ -120,42 +138,14 @@ def cluster_settings(threads: int) -> dict[str, object]:
         "distributed.worker.multiprocessing-method": "spawn",
         "distributed.nanny.pre-spawn-environ": thread_environment(threads),
     }
-
-
-def start_cluster(workers: dict[int, dict], threads: int, **scheduler: object) -> tuple[Any, Any]:
-    """Start a scheduler with local workers, if any; returns its client and the cluster."""
-    import dask
-    from distributed import Client, Scheduler, SpecCluster
-
     options = {"dashboard": False, "dashboard_address": ":0", "port": 0, "protocol": "tcp://"}
-    with dask.config.set(cluster_settings(threads)):
+    with dask.config.set(settings):
         cluster = SpecCluster(
             workers=workers,
             scheduler={"cls": Scheduler, "options": options | scheduler},
             silence_logs=logging.CRITICAL,
         )
         return Client(cluster, set_as_default=False), cluster
-
-
-def local_workers(count: int, devices: list[str]) -> dict[int, dict]:
-    """Specify local workers; the first ones get one GPU each."""
-    from distributed import Nanny
-
-    shared = {
-        "nthreads": 1,
-        "host": "127.0.0.1",
-        "protocol": "tcp://",
-        "dashboard": False,
-        "memory_limit": 0.9 / count,
-        "silence_logs": logging.CRITICAL,
-    }
-    specifications: dict[int, dict] = {}
-    for number in range(count):
-        mine = {}
-        if number < len(devices):
-            mine = {"env": {"CUDA_VISIBLE_DEVICES": devices[number]}, "resources": {GPU: 1}}
-        specifications[number] = {"cls": Nanny, "options": shared | mine}
-    return specifications
 
 
 def cuda_devices() -> list[str]:

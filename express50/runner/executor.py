@@ -13,7 +13,7 @@ from express50.errors import StageError
 from express50.runner.clusters import GPU, LocalWorkers, RemoteWorkers
 from express50.runner.ledger import Receipt
 from express50.runner.slurm import SlurmJob, SlurmWorkers
-from express50.runner.worker import BATCH_SECONDS, Task, run_task, run_tasks
+from express50.runner.worker import BATCH_SECONDS, Task, failed_receipt, run_task, run_tasks
 
 ATTEMPTS = 2  # an item that killed its worker this often is set aside
 SLURM_ATTEMPTS = 3  # the same where a worker may also have come to its job's time limit
@@ -60,7 +60,6 @@ class Pool:
         self,
         tasks: Iterable[Task],
         settle: Callable[[Receipt], None],
-        tick: Callable[[], None],
         begin: Callable[[Task], None] = lambda task: None,
     ) -> None:
         """Run every task of one stage and hand each receipt to ``settle`` as it comes.
@@ -72,7 +71,6 @@ class Pool:
         Args:
             tasks: of one stage and configuration.
             settle: takes each receipt.
-            tick: called at least every ``POLL_SECONDS`` while workers run.
             begin: called as a task is handed to a worker.
 
         Raises:
@@ -90,14 +88,10 @@ class Pool:
         workers = self._workers = self._workers_for(tasks[0])
         job = workers.job if isinstance(workers, SlurmWorkers) else None
         last = SLURM_ATTEMPTS if job else ATTEMPTS
-        left = self._run_window(workers, tasks, settle, tick, begin, 1)
+        left = self._run_window(workers, tasks, settle, begin, 1)
         for attempt in range(2, last + 1):
             groups = [left] if job and left else [[task] for task in left]
-            left = [
-                t
-                for g in groups
-                for t in self._run_window(workers, g, settle, tick, begin, attempt)
-            ]
+            left = [t for g in groups for t in self._run_window(workers, g, settle, begin, attempt)]
         for killer in left:
             settle(_killed(killer, last, job))
 
@@ -106,7 +100,6 @@ class Pool:
         workers: LocalWorkers | RemoteWorkers,
         tasks: list[Task],
         settle: Callable[[Receipt], None],
-        tick: Callable[[], None],
         begin: Callable[[Task], None],
         attempt: int,
     ) -> list[Task]:
@@ -115,6 +108,7 @@ class Pool:
 
         waiting, killed, size = deque(tasks), [], 1
         name, gpu = tasks[0].stage.name, tasks[0].stage.needs_gpu(tasks[0].config)
+        resources = {GPU: 1} if gpu else None
         running: dict[Any, list[Task]] = {}
         while waiting or running:
             with _loss_is_one_error():
@@ -125,23 +119,25 @@ class Pool:
                     batch = [waiting.popleft() for _ in range(min(size, fair))]
                     for task in batch:
                         begin(task)
-                    running[_submit(workers.client, batch, attempt, gpu)] = batch
-                done = _finished(workers.client, running)
-                ended = [(future, *_outcome(future)) for future in done]
+                    key = f"{name}-{batch[0].item}-{batch[0].fingerprint[:16]}-{attempt}"
+                    future = workers.client.submit(
+                        run_tasks, batch, pure=False, key=key, resources=resources
+                    )
+                    running[future] = batch
+                ended = _ended(workers.client, running)
             for future, receipts, failure in ended:
                 batch = running.pop(future)
-                if receipts is not None:
+                if isinstance(failure, KilledWorker):
+                    killed += batch
+                elif failure is not None:  # the tasks did not even start
+                    words = f"worker: {type(failure).__name__}: {failure}"
+                    for task in batch:
+                        settle(_failed(task, words, attempt))
+                else:
                     size = _next_size(size, batch, receipts)
                     waiting.extendleft(reversed(batch[len(receipts) :]))
                     for receipt in receipts:
                         settle(replace(receipt, attempts=attempt))
-                elif isinstance(failure, KilledWorker):
-                    killed += batch
-                else:  # the tasks did not even start
-                    for task in batch:
-                        words = f"worker: {type(failure).__name__}: {failure}"
-                        settle(_failed(task, words, attempt))
-            tick()
         return killed
 
     def _workers_for(self, task: Task) -> LocalWorkers | RemoteWorkers:
@@ -162,12 +158,6 @@ class Pool:
         if self._workers is not None:
             self._workers.close()
         self._workers = None
-
-
-def _submit(client: Any, batch: list[Task], attempt: int, gpu: bool) -> Any:
-    first, resources = batch[0], {GPU: 1} if gpu else None
-    key = f"{first.stage.name}-{first.item}-{first.fingerprint[:16]}-{attempt}"
-    return client.submit(run_tasks, batch, pure=False, key=key, resources=resources)
 
 
 def _next_size(size: int, batch: list[Task], receipts: list[Receipt]) -> int:
@@ -194,23 +184,26 @@ def _loss_is_one_error() -> Iterator[None]:
         ) from error
 
 
-def _finished(client: Any, running: Iterable[Any]) -> set[Any]:
-    """Return the futures that ended, after a wait of at most ``POLL_SECONDS``."""
+def _ended(
+    client: Any, running: Iterable[Any]
+) -> list[tuple[Any, list[Receipt], BaseException | None]]:
+    """Wait a moment for batches to end; returns their futures, receipts, and why one did not run.
+
+    Raises:
+        CancelledError: the scheduler is gone.
+    """
     from distributed import wait
 
     try:
         with client.as_current():
-            return wait(list(running), POLL_SECONDS, "FIRST_COMPLETED").done
+            done = wait(list(running), POLL_SECONDS, "FIRST_COMPLETED").done
     except TimeoutError:
-        return set()
-
-
-def _outcome(future: Any) -> tuple[list[Receipt] | None, BaseException | None]:
-    """Return the receipts of a finished batch, or why it did not run."""
-    failure = future.exception()
-    if isinstance(failure, CancelledError):
-        raise failure
-    return (None, failure) if failure is not None else (future.result(), None)
+        return []
+    failures = [(future, future.exception()) for future in done]
+    for _, failure in failures:
+        if isinstance(failure, CancelledError):
+            raise failure
+    return [(future, [] if failure else future.result(), failure) for future, failure in failures]
 
 
 def _killed(task: Task, attempts: int, job: SlurmJob | None) -> Receipt:
@@ -225,11 +218,4 @@ def _killed(task: Task, attempts: int, job: SlurmJob | None) -> Receipt:
 
 
 def _failed(task: Task, reason: str, attempts: int) -> Receipt:
-    return Receipt(
-        stage=task.stage.name,
-        item=task.item,
-        fingerprint=task.fingerprint,
-        status="failed",
-        reason=" ".join(reason.split()),
-        attempts=attempts,
-    )
+    return failed_receipt(task.stage.name, task.item, task.fingerprint, reason, attempts)

@@ -210,12 +210,9 @@ class Ledger:
         """Store a receipt; it replaces the item's former one."""
         row = {name: getattr(receipt, name) for name in COLUMNS}
         row["metrics"] = json.dumps(receipt.metrics, sort_keys=True)
-        marks = ", ".join(f":{name}" for name in row)
         key = (receipt.stage, receipt.item)
         with self._change() as database:
-            database.execute(
-                f"INSERT OR REPLACE INTO receipts ({', '.join(row)}) VALUES ({marks})", row
-            )
+            self._replace("receipts", row)
             if receipt.made is None:
                 database.execute("DELETE FROM made WHERE stage = ? AND item = ?", key)
             else:
@@ -241,7 +238,7 @@ class Ledger:
         return found
 
     def made(self, stage: str) -> dict[str, Made]:
-        """Read inputs and files of a stage's items, sorted; old ledgers lack them.
+        """Read inputs and files of a stage's items, sorted.
 
         Raises:
             FormatError: a row is damaged.
@@ -257,12 +254,8 @@ class Ledger:
 
     def write_run(self, run: Run) -> None:
         """Store a run; it replaces the stage's former one."""
-        row = dict(vars(run)) | {"running": json.dumps(run.running)}
-        marks = ", ".join(f":{name}" for name in row)
         with self._damage():
-            self._database.execute(
-                f"INSERT OR REPLACE INTO runs ({', '.join(row)}) VALUES ({marks})", row
-            )
+            self._replace("runs", dict(vars(run)) | {"running": json.dumps(run.running)})
 
     def runs(self) -> dict[str, Run]:
         """Read the last run of each stage.
@@ -275,6 +268,11 @@ class Ledger:
             row["stage"]: Run(**row | {"running": self._parsed(row["running"], "runs")})
             for row in rows
         }
+
+    def _replace(self, table: str, row: dict[str, Any]) -> None:
+        marks = ", ".join(f":{name}" for name in row)
+        query = f"INSERT OR REPLACE INTO {table} ({', '.join(row)}) VALUES ({marks})"
+        self._database.execute(query, row)
 
     def _parsed(self, text: Any, where: str) -> dict:
         table = parse_json(text, f"{self._path}: {where}", FormatError, DELETE)

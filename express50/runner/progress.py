@@ -9,10 +9,15 @@ import threading
 import time
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
-from express50.console import readers_may_leave
+from rich.console import Console
+from rich.progress import MofNCompleteColumn
+from rich.progress import Progress as Bar
+
+from express50.console import log
 from express50.runner.ledger import Ledger, Receipt, Run
+
+BEAT_SECONDS = 2.0
 
 
 class Progress:
@@ -23,13 +28,13 @@ class Progress:
         self.total = total
         self.settled = 0
         self.enabled = enabled
-        self._bar: Any = None
-        self._row: Any = None
+        self._bar: Bar | None = None
 
     def __enter__(self) -> Progress:
         if self.enabled and self.total and sys.stderr.isatty():
-            self._bar = make_bar()
-            self._row = self._bar.add_task(self.stage, total=self.total, rate="")
+            columns = (*Bar.get_default_columns(), MofNCompleteColumn())
+            self._bar = Bar(*columns, console=Console(stderr=True))
+            self._bar.add_task(self.stage, total=self.total)
             self._bar.start()
         return self
 
@@ -40,67 +45,14 @@ class Progress:
     def settle(self, receipt: Receipt) -> None:
         """Show that an item ended."""
         self.settled += 1
+        line = f"{receipt.stage} {self.settled}/{self.total} {receipt.item} {receipt.status}"
+        line += f" {receipt.seconds:.1f} s" + (f": {receipt.reason}" if receipt.reason else "")
         if self._bar is not None:
-            self._bar.advance(self._row)
-            self.tick()
-        if not self.enabled:
-            return
-        if self._bar is None or receipt.status == "failed":
-            line = describe(receipt, self.settled, self.total)
-            if self._bar is not None:
+            self._bar.advance(self._bar.task_ids[0])
+            if receipt.status == "failed":
                 self._bar.console.print(line, markup=False, highlight=False, soft_wrap=True)
-            else:
-                with readers_may_leave(sys.stderr):
-                    sys.stderr.write(line + "\n")
-                    sys.stderr.flush()
-
-    def tick(self) -> None:
-        """Redraw rate and time left while nothing ends."""
-        if self._bar is not None:
-            task = self._bar.tasks[0]
-            self._bar.update(self._row, rate=format_rate(self.settled, task.elapsed or 0.0))
-
-
-def make_bar() -> Any:
-    """Bar of rich on standard error."""
-    from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
-    from rich.progress import Progress as Bar
-
-    return Bar(
-        TextColumn("{task.description:<10}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn("{task.fields[rate]}"),
-        TimeElapsedColumn(),
-        TextColumn("left"),
-        TimeRemainingColumn(),
-        console=Console(stderr=True),
-    )
-
-
-def format_rate(count: int, seconds: float) -> str:
-    """Items a second, or a minute where that is below one."""
-    if count == 0 or seconds <= 0:
-        return "-"
-    rate = count / seconds
-    return f"{rate:.1f}/s" if rate >= 1 else f"{rate * 60:.1f}/min"
-
-
-def describe(receipt: Receipt, settled: int, total: int) -> str:
-    """One line on a settled item."""
-    line = f"{receipt.stage} {settled}/{total} {receipt.item} {receipt.status}"
-    line += f" {receipt.seconds:.1f} s"
-    return f"{line}: {receipt.reason}" if receipt.reason else line
-
-
-BEAT_SECONDS = 2.0
+        elif self.enabled:
+            log(line)
 
 
 class RunLog:

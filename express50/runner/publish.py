@@ -13,7 +13,7 @@ from typing import IO
 
 from express50.contract.layout import Dataset
 from express50.errors import StageError
-from express50.files.atomic import replace_directory, sync_directory, sync_tree
+from express50.files.atomic import folder_in_one_step, sync_directory
 
 
 @contextmanager
@@ -23,13 +23,8 @@ def publishing(dataset: Dataset, stage: str, item: str) -> Iterator[Path]:
     When the body raises, the item's former folder stays as it was.
     """
     aside = dataset.staging_dir / f"{stage}-{item.replace('/', '+')}-{uuid.uuid4().hex}"
-    aside.mkdir(parents=True)
-    try:
+    with folder_in_one_step(aside, dataset.item_dir(stage, item)):
         yield aside
-        sync_tree(aside)
-        replace_directory(aside, dataset.item_dir(stage, item))
-    finally:
-        shutil.rmtree(aside, ignore_errors=True)
 
 
 def set_aside(dataset: Dataset, stage: str, item: str) -> bool:

@@ -19,10 +19,10 @@ from express50.errors import ConfigError, Express50Error, StageError
 from express50.files.atomic import write_bytes
 from express50.files.digests import path_digest
 from express50.runner.executor import Pool
-from express50.runner.ledger import Ledger, Made, Receipt
+from express50.runner.ledger import Ledger, Receipt
 from express50.runner.progress import Progress, RunLog
 from express50.runner.publish import clean_leftovers, discard_stale, set_aside, stage_lock
-from express50.runner.worker import Task, fingerprint, input_digests
+from express50.runner.worker import Task, failed_receipt, fingerprint, input_digests
 
 WARNINGS = 12  # lines; more of them would hide the account
 ALIKE = 3  # so many first items that fail for one reason show a wrong setting
@@ -150,13 +150,16 @@ def run_stage(
     shared = nullcontext(pool) if pool else Pool(workers, scheduler)
     with shared as workers_pool, stage_lock(dataset, stage.name), Ledger(dataset.ledger) as ledger:
         clean_leftovers(dataset, stage.name)
-        changed = save_config(dataset, stage, config)
+        changed = _save_config(dataset, stage, config)
         if items is None:
-            retire_items(dataset, ledger, stage.name, chosen)
+            gone = sorted(set(ledger.read(stage.name)) - set(chosen))
+            for item in gone:
+                set_aside(dataset, stage.name, item)
+            ledger.forget(stage.name, gone)
         with RunLog(dataset.ledger, stage.name, len(chosen)) as log:
-            outcomes = _run_items(
-                stage, dataset, config, chosen, ledger, workers_pool, progress, log, changed
-            )
+            threads = workers_pool.threads
+            work = _sort_items(stage, dataset, config, chosen, ledger, threads, changed)
+            outcomes = _run_items(stage, dataset, work, ledger, workers_pool, progress, log)
     missing = set(chosen) - set(outcomes)
     if missing:  # read = done + skipped + failed
         raise StageError(f"{stage.name}: no account of {', '.join(sorted(missing))}; run it again")
@@ -164,24 +167,37 @@ def run_stage(
     return Summary(stage.name, tuple(outcomes[item] for item in chosen), seconds)
 
 
-def _run_items(
+@dataclass(frozen=True)
+class _Work:
+    """The items of a stage by what is to do with them.
+
+    Attributes:
+        former: receipts of former runs.
+        current: outcomes of items that are up to date.
+        unreadable: receipts of items whose inputs cannot be read.
+        tasks: items to run.
+        again: why items are run that a former run had made.
+    """
+
+    former: Mapping[str, Receipt]
+    current: dict[str, Outcome]
+    unreadable: list[Receipt]
+    tasks: list[Task]
+    again: dict[str, str]
+
+
+def _sort_items(
     stage: Stage,
     dataset: Dataset,
     config: Any,
     chosen: list[str],
     ledger: Ledger,
-    pool: Pool,
-    progress: bool,
-    log: RunLog,
+    threads: int,
     changed: list[str],
-) -> dict[str, Outcome]:
-    """Sort items into current, unreadable and to do; run the last; settle each as it ends.
-
-    ``changed`` has the settings that differ from those of the former run.
-    """
-    outcomes: dict[str, Outcome] = {}
+) -> _Work:
+    """Sort items into those that are up to date, that cannot be read, and that are to do."""
     receipts, made = ledger.read(stage.name), ledger.made(stage.name)
-    tasks, unreadable, again = [], [], {}
+    work = _Work(receipts, {}, [], [], {})
     # Items share inputs; what a stage reads does not change while it runs.
     digest_of = functools.cache(lambda path: path_digest(path, ledger.sha256))
     for item in chosen:
@@ -191,52 +207,78 @@ def _run_items(
             raise
         except Express50Error as error:
             reason = f"{type(error).__name__}: {error}"
-            unreadable.append(
-                Receipt(
-                    stage=stage.name, item=item, fingerprint="", status="failed", reason=reason,
-                    attempts=0,
-                )
-            )  # fmt: skip
+            work.unreadable.append(failed_receipt(stage.name, item, "", reason, 0))
             continue
-        digest = fingerprint(stage, config, inputs)
-        if is_current(dataset, receipts.get(item), digest):
-            outcomes[item] = _outcome(receipts[item], status="skipped")
-        else:
-            tasks.append(Task(stage, dataset, item, config, digest, inputs, pool.threads))
-            again[item] = why_again(
-                stage, receipts.get(item), digest, made.get(item), inputs, changed
+        digest, receipt = fingerprint(stage, config, inputs), receipts.get(item)
+        done = receipt is not None and receipt.status == "done"
+        output = dataset.item_dir(stage.name, item) / "metrics.json"
+        if receipt is not None and done and receipt.fingerprint == digest and output.is_file():
+            work.current[item] = _outcome(receipt, status="skipped")
+            continue
+        work.tasks.append(Task(stage, dataset, item, config, digest, inputs, threads))
+        if receipt is not None and done:
+            same = receipt.fingerprint == digest
+            before = made[item].inputs if item in made else inputs
+            work.again[item] = (
+                "output missing" if same else _why_again(stage, before, inputs, changed)
             )
     ledger.keep_digests()
-    reasons = {receipt.reason for receipt in unreadable}
-    if len(unreadable) == len(chosen) > 1 and len(reasons) == 1:
+    reasons = {receipt.reason for receipt in work.unreadable}
+    if len(work.unreadable) == len(chosen) > 1 and len(reasons) == 1:
         # A setting is wrong rather than all items: former outputs stay.
         raise StageError(f"{stage.name}: no item can be made: {reasons.pop()}")
+    return work
+
+
+def _why_again(
+    stage: Stage, before: Mapping[str, str], inputs: Mapping[str, str], changed: Sequence[str]
+) -> str:
+    """Say which inputs (digests by name), settings or version differ from the former run's."""
+    names = [n for n in sorted({*before, *inputs}) if before.get(n) != inputs.get(n)]
+    if names:
+        return f"inputs changed: {', '.join(names[:NAMED])}{', ...' if names[NAMED:] else ''}"
+    if changed:
+        return f"settings changed: {', '.join(changed)}"
+    return f"stage version changed, it is {stage.version} now"
+
+
+def _run_items(
+    stage: Stage,
+    dataset: Dataset,
+    work: _Work,
+    ledger: Ledger,
+    pool: Pool,
+    progress: bool,
+    log: RunLog,
+) -> dict[str, Outcome]:
+    """Run what is to do and settle each item as it ends; returns the outcomes of all."""
+    outcomes, ended = dict(work.current), []
     log.current(len(outcomes))
 
     def begin(task: Task) -> None:
         # A receipt must not outlive its output, should this run be killed half-way.
-        if task.item in receipts:
+        if task.item in work.former:
             ledger.forget(stage.name, [task.item])
         log.begin(task.item)
 
-    ended: list[Receipt] = []
-    with Progress(stage.name, len(tasks) + len(unreadable), progress) as display:
+    total = len(work.tasks) + len(work.unreadable)
+    with Progress(stage.name, total, progress) as display:
 
         def settle(receipt: Receipt) -> None:
-            record(dataset, ledger, receipt)
-            outcomes[receipt.item] = _outcome(receipt, again=again.get(receipt.item, ""))
+            _record(dataset, ledger, receipt)
+            outcomes[receipt.item] = _outcome(receipt, again=work.again.get(receipt.item, ""))
             display.settle(receipt)
             log.settle(receipt.item)
 
         def settle_task(receipt: Receipt) -> None:
             settle(receipt)
             ended.append(receipt)
-            if len(ended) == ALIKE < len(tasks):
-                _refuse_alike(stage, ended, receipts)
+            if len(ended) == ALIKE < len(work.tasks):
+                _refuse_alike(stage, ended, work.former)
 
-        for receipt in unreadable:
+        for receipt in work.unreadable:
             settle(receipt)
-        pool.run(tasks, settle_task, display.tick, begin)
+        pool.run(work.tasks, settle_task, begin)
     ledger.keep_digests()
     return outcomes
 
@@ -255,17 +297,7 @@ def _refuse_alike(stage: Stage, ended: list[Receipt], former: Mapping[str, Recei
         )
 
 
-def is_current(dataset: Dataset, receipt: Receipt | None, digest: str) -> bool:
-    """Say whether an item was made from exactly these inputs and its output is there."""
-    return (
-        receipt is not None
-        and receipt.status == "done"
-        and receipt.fingerprint == digest
-        and (dataset.item_dir(receipt.stage, receipt.item) / "metrics.json").is_file()
-    )
-
-
-def record(dataset: Dataset, ledger: Ledger, receipt: Receipt) -> None:
+def _record(dataset: Dataset, ledger: Ledger, receipt: Receipt) -> None:
     """Store a receipt; the former output of a failed item is set aside, unread."""
     if receipt.status == "failed":
         set_aside(dataset, receipt.stage, receipt.item)
@@ -277,15 +309,7 @@ def record(dataset: Dataset, ledger: Ledger, receipt: Receipt) -> None:
         ledger.know(dataset.item_dir(receipt.stage, receipt.item), receipt.made.files)
 
 
-def retire_items(dataset: Dataset, ledger: Ledger, stage: str, chosen: list[str]) -> None:
-    """Set aside outputs of items that the stage no longer has."""
-    gone = sorted(set(ledger.read(stage)) - set(chosen))
-    for item in gone:
-        set_aside(dataset, stage, item)
-    ledger.forget(stage, gone)
-
-
-def save_config(dataset: Dataset, stage: Stage, config: Any) -> list[str]:
+def _save_config(dataset: Dataset, stage: Stage, config: Any) -> list[str]:
     """Save the resolved config of a stage; returns the settings that changed."""
     path, text = dataset.config_file(stage.name), config_toml(stage.name, config)
     former = path.read_text(encoding="utf-8", errors="replace") if path.is_file() else ""
@@ -297,37 +321,6 @@ def save_config(dataset: Dataset, stage: Stage, config: Any) -> list[str]:
     except (tomllib.TOMLDecodeError, AttributeError):
         return []
     return sorted(k for k in before.keys() | now.keys() if before.get(k) != now.get(k))
-
-
-def why_again(
-    stage: Stage,
-    receipt: Receipt | None,
-    digest: str,
-    made: Made | None,
-    inputs: Mapping[str, str],
-    changed: Sequence[str],
-) -> str:
-    """Say why an item is made that a former run had made; empty where none had.
-
-    Args:
-        stage: the stage.
-        receipt: of the former run.
-        digest: fingerprint of the item now.
-        made: inputs and files of the former run, where the ledger has them.
-        inputs: digests of the inputs now.
-        changed: settings that differ from those of the former run.
-    """
-    if receipt is None or receipt.status != "done":
-        return ""
-    if receipt.fingerprint == digest:
-        return "output missing"
-    before = made.inputs if made is not None else inputs
-    names = [n for n in sorted({*before, *inputs}) if before.get(n) != inputs.get(n)]
-    if names:
-        return f"inputs changed: {', '.join(names[:NAMED])}{', ...' if names[NAMED:] else ''}"
-    if changed:
-        return f"settings changed: {', '.join(changed)}"
-    return f"stage version changed, it is {stage.version} now"
 
 
 def _outcome(receipt: Receipt, status: str = "", again: str = "") -> Outcome:

@@ -15,8 +15,7 @@ import subprocess
 import sys
 import tempfile
 import time
-import tomllib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass, fields
 from importlib.util import find_spec
 from pathlib import Path
@@ -24,6 +23,7 @@ from typing import Any
 
 from express50.contract.config import build_dataclass, nearest
 from express50.errors import ConfigError, StageError
+from express50.files.text import read_toml
 from express50.runner.clusters import GPU, RemoteWorkers, no_gpu, start_cluster
 from express50.runner.threads import thread_environment
 
@@ -91,44 +91,33 @@ def read_slurm(text: str, stages: Iterable[str]) -> dict[str, SlurmJob]:
         ConfigError: no such file, unknown keys, wrong values, or time or memory are missing.
     """
     names = list(stages)
-    values = _file_values(Path(text)) if text.endswith(".toml") else _inline_values(text)
+    if text.endswith(".toml"):
+        values = read_toml(Path(text), ConfigError)
+    else:
+        values = dict[str, Any]()
+        for part in text.split(","):
+            key, equals, value = (word.strip() for word in part.partition("="))
+            if not equals or not key:
+                raise ConfigError(f"--slurm: {part!r} is not key=value; use a file for lists")
+            count = key in ("cores", "jobs", "gpus") and value.isdigit()
+            values[key] = int(value) if count else value
     tables = {key: value for key, value in values.items() if isinstance(value, dict)}
     common = {key: value for key, value in values.items() if key not in tables}
     for name in tables:
         if name not in names:
             raise ConfigError(f"--slurm {text}: unknown table [{name}]{nearest(name, names)}")
-    return {name: _job(text, common | tables.get(name, {})) for name in names}
-
-
-def _job(text: str, values: Mapping[str, object]) -> SlurmJob:
-    missing = [key for key in ("time", "memory") if key not in values]
-    if missing:
-        raise ConfigError(
-            f"--slurm {text}: no {' and no '.join(missing)}; expected such as "
-            "partition=cpu,time=4:00:00,memory=16G,cores=4,jobs=8, or a file jobs.toml of these"
-        )
-    known = ", ".join(field.name for field in fields(SlurmJob))
-    return build_dataclass("slurm", SlurmJob, values, hint=f"; expected one of {known}")
-
-
-def _file_values(path: Path) -> dict[str, Any]:
-    try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
-        raise ConfigError(f"--slurm {path}: no such file") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ConfigError(f"--slurm {path}: not TOML: {error}") from error
-
-
-def _inline_values(text: str) -> dict[str, Any]:
-    values: dict[str, Any] = {}
-    for part in text.split(","):
-        key, equals, value = (word.strip() for word in part.partition("="))
-        if not equals or not key:
-            raise ConfigError(f"--slurm: {part!r} is not key=value; lists need a file jobs.toml")
-        count = key in ("cores", "jobs", "gpus") and value.isdigit()
-        values[key] = int(value) if count else value
-    return values
+    hint = f"; expected one of {', '.join(field.name for field in fields(SlurmJob))}"
+    jobs = {}
+    for name in names:
+        merged = common | tables.get(name, {})
+        missing = [key for key in ("time", "memory") if key not in merged]
+        if missing:
+            raise ConfigError(
+                f"--slurm {text}: no {' and no '.join(missing)}; expected such as "
+                "partition=cpu,time=4:00:00,memory=16G,cores=4,jobs=8, or a file jobs.toml of these"
+            )
+        jobs[name] = build_dataclass("slurm", SlurmJob, merged, hint=hint)
+    return jobs
 
 
 def check_slurm(submit: bool = True) -> None:

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from express50.contract.layout import Dataset
-from express50.contract.stage import Result, Stage
+from express50.contract.stage import Stage
 from express50.errors import Express50Error, StageError
 from express50.files.atomic import dump_json, write_bytes
 from express50.files.digests import files_of, value_digest
@@ -64,6 +64,18 @@ def fingerprint(stage: Stage, config: Any, inputs: dict[str, str]) -> str:
     return value_digest([stage.name, stage.version, vars(config), inputs])
 
 
+def failed_receipt(stage: str, item: str, fingerprint: str, reason: str, attempts: int) -> Receipt:
+    """Make the receipt of an item that no worker could run."""
+    return Receipt(
+        stage=stage,
+        item=item,
+        fingerprint=fingerprint,
+        status="failed",
+        reason=" ".join(reason.split()),
+        attempts=attempts,
+    )
+
+
 def run_tasks(tasks: list[Task]) -> list[Receipt]:
     """Run items in turn for a while; returns the receipts of those begun, at least one."""
     began, receipts = time.perf_counter(), []
@@ -91,7 +103,13 @@ def run_task(task: Task) -> Receipt:
         reason = f"{type(error).__name__}: {error}"
     except Exception as error:  # noqa: BLE001
         # A defect that one item triggers must not stop the others; the traceback goes to a file.
-        reason = _record_defect(task, error)
+        reason = f"{type(error).__name__}: {error} (unexpected; "
+        log = task.dataset.log_file(task.stage.name, task.item)
+        try:
+            write_bytes(log, "".join(traceback.format_exception(error)).encode())
+            reason += f"traceback in {log})"
+        except OSError as trouble:  # a full disk is a usual reason for the error itself
+            reason += f"its traceback could not be written to {log}: {trouble})"
     return Receipt(
         stage=task.stage.name,
         item=task.item,
@@ -118,30 +136,17 @@ def _run_and_publish(task: Task) -> tuple[dict, dict[str, FileMark]]:
         # Standard output is for data; libraries' messages go to standard error.
         with contextlib.redirect_stdout(sys.stderr):
             result = task.stage.run(task.dataset, task.item, task.config, out)
-        metrics = _metrics_bytes(result)
+        try:
+            metrics = dump_json(result.to_json())
+        except (TypeError, ValueError) as error:
+            raise StageError(
+                f"metrics cannot be written ({error}); expected finite numbers, texts, lists and"
+                " tables"
+            ) from error
         (out / "metrics.json").write_bytes(metrics)
         # Their bytes are still in memory; a rename changes neither time nor inode.
         files = {p.relative_to(out).as_posix(): mark_file(p) for p in files_of(out)}
     return json.loads(metrics), files
-
-
-def _metrics_bytes(result: Result) -> bytes:
-    try:
-        return dump_json(result.to_json())
-    except (TypeError, ValueError) as error:
-        raise StageError(
-            f"metrics cannot be written ({error}); expected finite numbers, texts, lists and tables"
-        ) from error
-
-
-def _record_defect(task: Task, error: Exception) -> str:
-    log = task.dataset.log_file(task.stage.name, task.item)
-    words = f"{type(error).__name__}: {error}"
-    try:
-        write_bytes(log, "".join(traceback.format_exception(error)).encode())
-    except OSError as trouble:  # a full disk is a usual reason for the error itself
-        return f"{words} (unexpected; its traceback could not be written to {log}: {trouble})"
-    return f"{words} (unexpected; traceback in {log})"
 
 
 def reset_peak_memory() -> None:
@@ -156,5 +161,4 @@ def peak_memory() -> int:
         for line in Path("/proc/self/status").read_text().splitlines():
             if line.startswith("VmHWM:"):
                 return int(line.split()[1]) * 1024
-    unit = 1 if sys.platform == "darwin" else 1024
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024

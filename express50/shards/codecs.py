@@ -74,7 +74,14 @@ def decode_picture(name: str, data: bytes, width: int, height: int, where: str) 
         )
     if name.endswith(".zst"):
         return _unzstd(data, width, height, where)
-    image = _decode(name, data, where)
+    try:
+        if name.endswith(".png"):
+            image = decode_image(data, where)
+        else:
+            lerc = name.endswith(".lerc")
+            image = (imagecodecs.lerc_decode if lerc else imagecodecs.jpeg8_decode)(data)
+    except (RuntimeError, ValueError) as error:  # imagecodecs' errors are RuntimeErrors
+        raise FormatError(f"{where}: cannot be decoded ({error})") from None
     kind = np.uint16 if name in DEPTH else np.uint8
     if image.dtype != kind or image.shape != (height, width, 3)[: 3 if name in RGB else 2]:
         raise FormatError(f"{where}: {image.dtype} {image.shape}, expected {np.dtype(kind)}")
@@ -84,17 +91,6 @@ def decode_picture(name: str, data: bytes, width: int, height: int, where: str) 
 def crc32(data: bytes) -> int:
     """Compute zlib's CRC-32, eight times as fast."""
     return imagecodecs.deflate_crc32(data)
-
-
-def _decode(name: str, data: bytes, where: str) -> np.ndarray:
-    if name.endswith(".png"):
-        return decode_image(data, where)
-    try:
-        if name.endswith(".lerc"):
-            return imagecodecs.lerc_decode(data)
-        return imagecodecs.jpeg8_decode(data)
-    except (RuntimeError, ValueError) as error:  # imagecodecs' errors are RuntimeErrors
-        raise FormatError(f"{where}: cannot be decoded ({error})") from None
 
 
 def _unzstd(data: bytes, width: int, height: int, where: str) -> np.ndarray:

@@ -33,6 +33,7 @@ from express50.shards.codecs import ALPHA, DEPTH, PARTS, RGB, crc32, decode_pict
 
 SCHEMA = "express50.shards/1"
 _AGAIN = "rerun 'express50 pack'"
+KEY = re.compile(r"[A-Za-z0-9_-]{1,80}")
 SHARD_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*-[0-9]{6}\.tar")
 
 
@@ -206,18 +207,16 @@ class ShardReader:
         Raises:
             FormatError: the file is missing, damaged, or holds something else.
         """
-        return read_offsets(self.root, subject)
-
-    def iterate(self, seed: int | None = None, epoch: int = 0, start: int = 0) -> Iterator[dict]:
-        """Yield the samples of one pass from ``start``, shuffled by (seed, epoch) unless None."""
-        for number in self.order(seed, epoch)[start:]:
-            yield self.sample(int(number))
-
-    def order(self, seed: int | None, epoch: int = 0) -> np.ndarray:
-        """Return the sample numbers (N,) of one pass: a pure function of (seed, epoch)."""
-        if seed is None:
-            return np.arange(len(self))
-        return np.random.default_rng([seed, epoch]).permutation(len(self))
+        path = offsets_file(self.root, subject)
+        again = f"copy the shards again or {_AGAIN}"
+        array = read_npy(path, FormatError, "offsets", again)
+        if array.ndim != 2 or array.shape[1] != 3 or array.dtype != np.float32:
+            raise FormatError(
+                f"{path}: {array.dtype} {array.shape}, expected float32 (V, 3); {again}"
+            )
+        if not np.isfinite(array).all():
+            raise FormatError(f"{path}: holds NaN or Inf; {again}")
+        return array
 
     def close(self) -> None:
         """Close the open shards."""
@@ -300,9 +299,6 @@ def sample_picture(sample: dict) -> np.ndarray:
     return contact_sheet([[sample["rgb"], alpha, shade, *parts]], tile=depth.shape)
 
 
-KEY = re.compile(r"[A-Za-z0-9_-]{1,80}")
-
-
 def offsets_file(root: Path, subject: str) -> Path:
     """Return the path of a subject's offsets.
 
@@ -317,19 +313,3 @@ def offsets_file(root: Path, subject: str) -> Path:
 def write_offsets(root: Path, subject: str, offsets: np.ndarray) -> None:
     """Write a subject's offsets (V, 3), metres, as float32."""
     np.save(offsets_file(root, subject), offsets.astype(np.float32), allow_pickle=False)
-
-
-def read_offsets(root: Path, subject: str) -> np.ndarray:
-    """Read the offsets (V, 3) float32, metres, of a subject's rest shape.
-
-    Raises:
-        FormatError: the file is missing, damaged, or holds something else.
-    """
-    path = offsets_file(root, subject)
-    again = "copy the shards again or rerun 'express50 pack'"
-    array = read_npy(path, FormatError, "offsets", again)
-    if array.ndim != 2 or array.shape[1] != 3 or array.dtype != np.float32:
-        raise FormatError(f"{path}: {array.dtype} {array.shape}, expected float32 (V, 3); {again}")
-    if not np.isfinite(array).all():
-        raise FormatError(f"{path}: holds NaN or Inf; {again}")
-    return array

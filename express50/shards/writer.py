@@ -1,9 +1,13 @@
-"""Write shards: the same samples give the same bytes, and a group never spans two shards."""
+"""Write, check, split and merge shards.
+
+The same samples give the same bytes, and a group never spans two shards.
+"""
 
 from __future__ import annotations
 
 import hashlib
 import json
+import shutil
 import tarfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -11,9 +15,11 @@ from pathlib import Path
 from typing import BinaryIO, cast
 
 from express50.errors import FormatError
+from express50.files.atomic import folder_in_one_step, write_json
+from express50.files.digests import file_sha256
 from express50.files.text import NAME, read_json
 from express50.shards.codecs import crc32
-from express50.shards.reader import KEY, SCHEMA, SHARD_NAME, ShardReader, read_entries
+from express50.shards.reader import KEY, SCHEMA, SHARD_NAME, ShardReader, offsets_file, read_entries
 
 BLOCK = tarfile.BLOCKSIZE
 RECORD = tarfile.RECORDSIZE
@@ -192,15 +198,10 @@ def write_manifest(root: Path, digests: Mapping[str, str] | None = None) -> None
     files = {}
     for path in sorted(root.iterdir()):
         if path.is_file() and path.name != "manifest.json" and not path.name.startswith("."):
-            digest = (digests or {}).get(path.name) or _sha256(path)
+            digest = (digests or {}).get(path.name) or file_sha256(path)
             files[path.name] = {"bytes": path.stat().st_size, "sha256": digest}
     text = json.dumps({"schema": SCHEMA, "files": files}, indent=1, sort_keys=True)
     (root / "manifest.json").write_text(text + "\n", encoding="utf-8")
-
-
-def _sha256(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def verify(root: Path) -> list[str]:
@@ -217,11 +218,20 @@ def verify(root: Path) -> list[str]:
         return [*faults, str(error)]
     for number, entry in enumerate(reader.entries):
         for name, (offset, size, _) in entry.members.items():
+            path, title = root / entry.shard, f"{entry.key}.{name}"
             try:
                 reader.member(number, name)
-                _check_header(root / entry.shard, f"{entry.key}.{name}", offset, size)
+                with path.open("rb") as file:
+                    file.seek(max(offset - BLOCK, 0))
+                    info = tarfile.TarInfo.frombuf(file.read(BLOCK), "ascii", "strict")
             except FormatError as error:
                 faults.append(str(error))
+            except tarfile.HeaderError as error:
+                faults.append(f"{path}: {title}: no tar header in front of it ({error})")
+            else:
+                if (info.name, info.size) != (title, size):
+                    words = f"{info.name} with {info.size} bytes, the index {title} with {size}"
+                    faults.append(f"{path}: tar says {words}")
     reader.close()
     return faults
 
@@ -241,20 +251,107 @@ def _manifest_faults(root: Path) -> list[str]:
     for name, digest in sorted(expected.items()):
         if not NAME.fullmatch(name) or not (root / name).is_file():
             faults.append(f"{root / name}: is missing or outside the folder")
-        elif _sha256(root / name) != digest:
+        elif file_sha256(root / name) != digest:
             faults.append(f"{root / name}: SHA-256 differs from the manifest's {digest[:12]}...")
     return faults
 
 
-def _check_header(path: Path, name: str, offset: int, size: int) -> None:
-    with path.open("rb") as file:
-        file.seek(max(offset - BLOCK, 0))
-        block = file.read(BLOCK)
+def copy_samples(readers: Sequence[ShardReader], out: Path, shard_mb: int) -> int:
+    """Write all samples of several readers into the folder `out`; returns how many.
+
+    Raises:
+        FormatError: there is none, a member is damaged, `out` is not empty, or two readers hold the
+            same (subject, expression), or a subject in different splits or with different offsets.
+    """
+    out = out.resolve()
+    if out.exists() and not out.is_dir():
+        raise FormatError(f"{out}: is a file; expected an empty or absent folder")
+    if out.exists() and any(out.iterdir()):
+        raise FormatError(f"{out}: is not empty; expected an empty or absent folder")
+    if shard_mb < 1:
+        raise FormatError(f"--shard-mb is {shard_mb}, expected at least 1")
+    if not any(len(reader) for reader in readers):
+        raise FormatError(f"{readers[0].root}: no sample matches; 'express50 shards ls' lists them")
+    splits = _checked_splits(readers)
+    groups = [(reader, *row) for reader in readers for row in reader.groups().items()]
+    names = {s: sorted(k for k, v in splits.items() if v == s) for s in set(splits.values())}
+    aside = out.with_name(f".{out.name}.unfinished")
     try:
-        info = tarfile.TarInfo.frombuf(block, "ascii", "strict")
-    except tarfile.HeaderError as error:
-        raise FormatError(f"{path}: {name}: no tar header in front of it ({error})") from None
-    if (info.name, info.size) != (name, size):
-        raise FormatError(
-            f"{path}: tar says {info.name} with {info.size} bytes, the index {name} with {size}"
-        )
+        with folder_in_one_step(aside, out):
+            writer = ShardWriter(aside, shard_mb * 10**6)
+            for split in sorted(names):
+                for reader, (subject, expression), numbers in groups:
+                    if splits[subject] == split:
+                        samples = [
+                            PackedSample(
+                                subject, expression, reader.entries[n].camera, reader.members(n)
+                            )
+                            for n in numbers
+                        ]
+                        writer.add_group(split, samples)
+            writer.close()
+            _copy_offsets(readers, aside)
+            write_json(aside / "splits.json", names | {"chosen_by": "the shards these are made of"})
+            _write_card(readers, aside)
+            write_manifest(aside, writer.digests)
+            if out.exists():
+                out.rmdir()  # refuses a folder that was filled meanwhile
+    finally:
+        for reader in readers:
+            reader.close()
+    return sum(len(reader) for reader in readers)
+
+
+def _checked_splits(readers: Sequence[ShardReader]) -> dict[str, str]:
+    """Return the split of every subject.
+
+    Raises:
+        FormatError: two folders hold the same group, or a subject is in two splits.
+    """
+    owners: dict[tuple[str, str], ShardReader] = {}
+    for reader in readers:
+        for group in reader.groups():
+            if owners.setdefault(group, reader) is not reader:
+                raise FormatError(
+                    f"{reader.root}: {'/'.join(group)} is in {owners[group].root} too; split one of"
+                    " them so that each expression of a subject is in one folder"
+                )
+    splits: dict[str, str] = {}
+    for reader in readers:
+        for entry in reader.entries:
+            if splits.setdefault(entry.subject, entry.split) != entry.split:
+                raise FormatError(
+                    f"{reader.root}: {entry.subject} is in split {entry.split!r} here and in"
+                    f" {splits[entry.subject]!r} elsewhere; pack again with pack.test_subjects set"
+                )
+    return splits
+
+
+def _copy_offsets(readers: Sequence[ShardReader], out: Path) -> None:
+    for reader in readers:
+        for subject in sorted({entry.subject for entry in reader.entries}):
+            source, target = offsets_file(reader.root, subject), offsets_file(out, subject)
+            if not source.is_file():
+                first = next(n for n, one in enumerate(reader.entries) if one.subject == subject)
+                track = reader.meta(first).get("track")
+                if isinstance(track, dict) and track.get("offsets"):
+                    reader.offsets(subject)  # raises, as its samples need them
+                continue
+            if target.exists() and target.read_bytes() != source.read_bytes():
+                raise FormatError(
+                    f"{source}: differs from the other folder's offsets of {subject}; pack this"
+                    " subject in one run"
+                )
+            shutil.copyfile(source, target)
+
+
+def _write_card(readers: Sequence[ShardReader], out: Path) -> None:
+    """Write the sources' cards one after the other: consent and licence stay as they were."""
+    parts = []
+    for reader in readers:
+        card = reader.root / "card.md"
+        parts.append(card.read_text(encoding="utf-8") if card.is_file() else "(no card)\n")
+    count = len({entry.key for reader in readers for entry in reader.entries})
+    folders = f"{len(readers)} folder{'s' if len(readers) > 1 else ''}"
+    text = f"# {count} samples of {folders} of shards\n\nTheir cards, as they were:\n\n"
+    (out / "card.md").write_text(text + "\n".join(parts), encoding="utf-8")

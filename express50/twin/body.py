@@ -9,14 +9,19 @@ import numpy as np
 import scipy.sparse
 import torch
 
-from express50.geometry.smoothstep import smoothstep
+from express50.geometry.sampling import smoothstep
 from express50.geometry.transforms import rigid_fit
 from express50.head.model import HeadModel, landmarks, pose
 from express50.twin.hair import HairMesh, grow_hair
-from express50.twin.noise import random_stream
-from express50.twin.performance import TwinPerformance
-from express50.twin.subjects import TwinSubject
-from express50.twin.surface import Caster, StarMap, face_to_vertex, smooth_over_mesh, vertex_normals
+from express50.twin.subjects import TwinPerformance, TwinSubject
+from express50.twin.surface import (
+    Caster,
+    StarMap,
+    face_to_vertex,
+    random_stream,
+    smooth_over_mesh,
+    vertex_normals,
+)
 
 
 class Material(IntEnum):
@@ -34,46 +39,28 @@ class Material(IntEnum):
 
 @dataclass(frozen=True, kw_only=True)
 class Extras:
-    """Geometry besides the head model (hair, clothes), in rest head space.
+    """Geometry besides the head model, in rest head space."""
 
-    Attributes:
-        hair: strands, rigid with the skull; may be empty.
-        cloth_vertices, cloth_faces: shoulders, rigid with the root.
-        skull: (K,) head vertices that hair follows; skull_rest (K, 3) where they rest.
-    """
-
-    hair: HairMesh
-    cloth_vertices: np.ndarray
+    hair: HairMesh  # rigid with the skull; may be empty
+    cloth_vertices: np.ndarray  # shoulders, rigid with the root
     cloth_faces: np.ndarray
-    skull: np.ndarray
-    skull_rest: np.ndarray
+    skull: np.ndarray  # (K,) head vertices that hair follows
+    skull_rest: np.ndarray  # (K, 3) where they rest
 
 
 @dataclass(frozen=True, kw_only=True)
 class Body:
-    """One subject's static geometry.
-
-    Attributes:
-        model: the head model.
-        subject: identity.
-        faces: (F, 3) of the head, then hair, then shoulders, as one mesh.
-        material: (F,) uint8.
-        template: (V, 3) float32 rest positions of the mean head, where textures live.
-        scalp: (V,) float32 hairiness, soft at the hairline.
-        centre: (3,) centre of the head, template space.
-        extras: hair and shoulders.
-        incidence: sums face normals of head and shoulders at their vertices.
-    """
+    """One subject's static geometry."""
 
     model: HeadModel
     subject: TwinSubject
-    faces: np.ndarray
-    material: np.ndarray
-    template: np.ndarray
-    scalp: np.ndarray
-    centre: np.ndarray
+    faces: np.ndarray  # (F, 3) of the head, then hair, then shoulders, as one mesh
+    material: np.ndarray  # (F,) uint8
+    template: np.ndarray  # (V, 3) float32, the mean head, where textures live
+    scalp: np.ndarray  # (V,) float32 hairiness, soft at the hairline
+    centre: np.ndarray  # (3,) of the head, template space
     extras: Extras
-    incidence: scipy.sparse.csr_matrix
+    incidence: scipy.sparse.csr_matrix  # sums normals of head's and shoulders' faces at vertices
 
 
 def build_body(model: HeadModel, subject: TwinSubject, seed: int, hair_detail: float = 1.0) -> Body:
@@ -86,7 +73,7 @@ def build_body(model: HeadModel, subject: TwinSubject, seed: int, hair_detail: f
     # Hair ends at the nape, wherever a model's scalp mask ends.
     chin = landmarks(model, model.template[None])[0, 8, 1].item()
     scalp = scalp * smoothstep(template[:, 1], chin - 0.005, chin + 0.025)
-    rest = neutral_vertices(model, subject)
+    rest = template + model.shape_dirs.double().numpy() @ subject.shape + subject.offsets
     skin_faces = faces[model_materials(model)[faces].min(1) == Material.SKIN]
     cloth_vertices, cloth_faces = _shoulders(rest, skin_faces, model.regions["boundary"].numpy())
     # Hair lies on skin and shirt alike.
@@ -96,9 +83,7 @@ def build_body(model: HeadModel, subject: TwinSubject, seed: int, hair_detail: f
         centre,
     )
     rng = random_stream(seed, subject.number, 7)
-    hair = _no_hair()
-    if hair_detail > 0:
-        hair = grow_hair(rng, rest, faces, scalp, star, subject.look, hair_detail)
+    hair = grow_hair(rng, rest, faces, scalp, star, subject.look, hair_detail)
     skull = np.flatnonzero(scalp > 0.8)[::7]
     extras = Extras(
         hair=hair, cloth_vertices=cloth_vertices, cloth_faces=cloth_faces,
@@ -166,12 +151,6 @@ def head_centre(model: HeadModel) -> np.ndarray:
     return np.array([0.0, joints[3:5, 1].mean() - 0.01, middle[2] - 0.01])
 
 
-def neutral_vertices(model: HeadModel, subject: TwinSubject) -> np.ndarray:
-    """Return rest vertices (V, 3) of a subject without expression, float64 metres."""
-    dirs = model.shape_dirs.double().numpy()
-    return model.template.double().numpy() + dirs @ subject.shape + subject.offsets
-
-
 def head_vertices(
     model: HeadModel, subject: TwinSubject, play: TwinPerformance, frame: int
 ) -> np.ndarray:
@@ -195,41 +174,28 @@ def head_vertices(
 
 @dataclass(frozen=True, kw_only=True)
 class Posed:
-    """All geometry of one frame in the world: (N, 3) vertices and normals, hair's turn (3, 3)."""
+    """All geometry of one frame in the world: vertices and normals (N, 3), hair's tangents."""
 
     vertices: np.ndarray
     normals: np.ndarray
     tangents: np.ndarray
-    head_from_world: np.ndarray
 
 
-def pose_body(body: Body, play: TwinPerformance, frame: int, with_normals: bool = True) -> Posed:
+def pose_body(body: Body, play: TwinPerformance, frame: int) -> Posed:
     """Pose head, hair and shoulders for a frame."""
     extras, hair = body.extras, body.extras.hair
     head = head_vertices(body.model, body.subject, play, frame)
     turn, shift = rigid_fit(extras.skull_rest, head[extras.skull])
     cloth = extras.cloth_vertices @ play.R[frame].T + play.t[frame]
-    vertices = np.concatenate([head, hair.vertices @ turn.T + shift, cloth]).astype(np.float32)
-    normals = np.zeros_like(vertices)
-    tangents = (hair.tangents @ turn.T).astype(np.float32)
-    if with_normals:
-        solid = np.concatenate([head, cloth]).astype(np.float32)
-        solid_faces = np.concatenate([body.model.faces.numpy(), extras.cloth_faces + len(head)])
-        solid_normals = vertex_normals(solid, solid_faces, body.incidence)
-        normals[: len(head)] = solid_normals[: len(head)]
-        normals[len(head) : len(head) + len(hair.vertices)] = hair.normals @ turn.T
-        normals[len(head) + len(hair.vertices) :] = solid_normals[len(head) :]
+    solid = np.concatenate([head, cloth]).astype(np.float32)
+    solid_faces = np.concatenate([body.model.faces.numpy(), extras.cloth_faces + len(head)])
+    normals = vertex_normals(solid, solid_faces, body.incidence)
+    around_hair = [normals[: len(head)], hair.normals @ turn.T, normals[len(head) :]]
     return Posed(
-        vertices=vertices, normals=normals, tangents=tangents, head_from_world=play.R[frame].T
+        vertices=np.concatenate([head, hair.vertices @ turn.T + shift, cloth]).astype(np.float32),
+        normals=np.concatenate(around_hair).astype(np.float32),
+        tangents=(hair.tangents @ turn.T).astype(np.float32),
     )
-
-
-def _no_hair() -> HairMesh:
-    empty = np.zeros((0, 3), np.float32)
-    return HairMesh(
-        vertices=empty, faces=np.zeros((0, 3), np.int32), tangents=empty, normals=empty,
-        colours=empty,
-    )  # fmt: skip
 
 
 def _shoulders(
@@ -252,22 +218,16 @@ def _shoulders(
     edge = np.interp(around, bearing % (2 * np.pi), loop[:, 1] - centre[1], period=2 * np.pi)
     drop = 0.012 + edge * (1 - flare) - 0.10 * flare**2.2 - 0.24 * s**3
     shirt = np.stack([width * scale * c, drop, -0.02 * flare + depth * scale * z], axis=-1)
-    shirt = _outside(shirt.reshape(-1, 3) + centre, centre, rest, skin_faces)
+    shirt = shirt.reshape(-1, 3) + centre
+    # It is pushed level away from the neck's axis until it clears the skin.
+    level = (shirt - centre) * (1.0, 0.0, 1.0)
+    radius = np.linalg.norm(level, axis=1, keepdims=True)
+    out = level / np.maximum(radius, 1e-6)
+    distance, _, _ = Caster(rest, skin_faces).cast(shirt - level + 0.5 * out, -out)
+    skin = np.where(distance < 0.5, 0.5 - distance, 0.0)[:, None]
+    shirt = shirt + out * np.maximum(skin + 0.0035 - radius, 0.0)
     index = np.arange(shirt.shape[0]).reshape(around.shape)
     a, b = index[:-1], index[1:]
     c, d = np.roll(a, -1, axis=1), np.roll(b, -1, axis=1)
     faces = np.concatenate([np.stack([a, c, b], -1), np.stack([c, d, b], -1)]).reshape(-1, 3)
     return shirt.astype(np.float32), faces.astype(np.int32)
-
-
-def _outside(
-    points: np.ndarray, centre: np.ndarray, vertices: np.ndarray, faces: np.ndarray
-) -> np.ndarray:
-    """Push points (N, 3) level away from the neck's axis until they clear the skin."""
-    level = (points - centre) * (1.0, 0.0, 1.0)
-    radius = np.linalg.norm(level, axis=1, keepdims=True)
-    out = level / np.maximum(radius, 1e-6)
-    start = points - level + 0.5 * out
-    distance, _, _ = Caster(vertices, faces).cast(start, -out)
-    skin = np.where(np.isfinite(distance) & (distance < 0.5), 0.5 - distance, 0.0)[:, None]
-    return points + out * np.maximum(skin + 0.0035 - radius, 0.0)

@@ -49,18 +49,11 @@ class TwinConfig:
 
     def __post_init__(self) -> None:
         limits = {
-            "subjects": (1, 10_000),
-            "first_subject": (0, 99_999),
-            "cameras": (1, 200),
-            "width": (32, 16_384),
-            "height": (32, 16_384),
-            "frames_per_expression": (4, 10_000),
-            "fps": (1, 1000),
-            "crf": (0, 51),
-            "board_frames": (0, 1000),
-            "noise": (0, 100),
+            "subjects": (1, 10_000), "first_subject": (0, 99_999), "cameras": (1, 200),
+            "width": (32, 16_384), "height": (32, 16_384), "frames_per_expression": (4, 10_000),
+            "fps": (1, 1000), "crf": (0, 51), "board_frames": (0, 1000), "noise": (0, 100),
             "seed": (0, 2**63 - 1),
-        }
+        }  # fmt: skip
         for name, (low, high) in limits.items():
             value = getattr(self, name)
             if not low <= value <= high:

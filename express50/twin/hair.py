@@ -10,16 +10,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from express50.geometry.smoothstep import smoothstep
+from express50.geometry.sampling import smoothstep
 from express50.twin.subjects import PersonLook
 from express50.twin.surface import StarMap, unit
 
 _CLEARANCE = 2.2e-3  # metres
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class HairStyle:
-    """Shape of the strands; lengths in metres."""
+    """Number and shape of the strands; lengths in metres."""
 
     strands: int
     steps: int
@@ -29,23 +29,18 @@ class HairStyle:
     fall: float
     side: float
     away: float
-    width: float = 5.5e-4
+    width: float
 
 
+#              strands, steps, lift, curl, back, fall, side, away, width
 _STYLES = {
-    "short": HairStyle(strands=4500, steps=5, lift=0.012, curl=0.0015, back=0.0, fall=0.3,
-                       side=0.25, away=1.0),
-    "side": HairStyle(strands=4500, steps=7, lift=0.018, curl=0.001, back=0.5, fall=0.35,
-                      side=0.9, away=0.6),
-    "curly": HairStyle(strands=5200, steps=8, lift=0.034, curl=0.006, back=0.1, fall=0.2,
-                       side=0.0, away=1.0, width=6e-4),
-    "bob": HairStyle(strands=5200, steps=14, lift=0.016, curl=0.002, back=0.25, fall=1.0,
-                     side=0.0, away=0.5, width=6e-4),
-    "buzz": HairStyle(strands=5800, steps=3, lift=0.006, curl=0.0, back=0.0, fall=0.2,
-                      side=0.0, away=0.7, width=5e-4),
-    "swept": HairStyle(strands=4800, steps=8, lift=0.022, curl=0.0015, back=1.3, fall=0.3,
-                       side=0.2, away=0.3),
-}  # fmt: skip
+    "short": HairStyle(4500, 5, 0.012, 0.0015, 0.0, 0.3, 0.25, 1.0, 5.5e-4),
+    "side": HairStyle(4500, 7, 0.018, 0.001, 0.5, 0.35, 0.9, 0.6, 5.5e-4),
+    "curly": HairStyle(5200, 8, 0.034, 0.006, 0.1, 0.2, 0.0, 1.0, 6e-4),
+    "bob": HairStyle(5200, 14, 0.016, 0.002, 0.25, 1.0, 0.0, 0.5, 6e-4),
+    "buzz": HairStyle(5800, 3, 0.006, 0.0, 0.0, 0.2, 0.0, 0.7, 5e-4),
+    "swept": HairStyle(4800, 8, 0.022, 0.0015, 1.3, 0.3, 0.2, 0.3, 5.5e-4),
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,7 +61,7 @@ def grow_hair(
     scalp: np.ndarray,
     star: StarMap,
     look: PersonLook,
-    detail: float = 1.0,
+    detail: float,
 ) -> HairMesh:
     """Grow a subject's hair.
 
@@ -77,29 +72,20 @@ def grow_hair(
         scalp: (V,) density of roots, 0 to 1.
         star: outer surface of the head.
         look: colour, style and length.
-        detail: more and thinner strands where above 1, fewer and thicker ones below.
+        detail: more and thinner strands where above 1, fewer and thicker ones below, none at 0.
     """
     style = _STYLES[look.hair_style]
-    roots = _roots(rng, vertices, faces, scalp, round(style.strands * detail))
-    points = _march(rng, roots, star, style, look.hair_length_m)
-    return _ribbons(rng, points, star.centre, style.width / detail, look.hair)
-
-
-def _roots(
-    rng: np.random.Generator,
-    vertices: np.ndarray,
-    faces: np.ndarray,
-    scalp: np.ndarray,
-    count: int,
-) -> np.ndarray:
-    """Return root points (N, 3), even over the scalp's area."""
+    # Roots are even over the scalp's area.
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1) * scalp[faces].mean(1) ** 2
+    count = round(style.strands * detail)
     chosen = rng.choice(len(faces), size=count, p=area / area.sum())
     u, v = rng.uniform(size=(2, count, 1))
     flip = u + v > 1
     u, v = np.where(flip, 1 - u, u), np.where(flip, 1 - v, v)
-    return a[chosen] + u * (b - a)[chosen] + v * (c - a)[chosen]
+    roots = a[chosen] + u * (b - a)[chosen] + v * (c - a)[chosen]
+    points = _march(rng, roots, star, style, look.hair_length_m)
+    return _ribbons(rng, points, star.centre, style.width / max(detail, 0.1), look.hair)
 
 
 def _march(
@@ -120,7 +106,14 @@ def _march(
         at = at + step[:, None] * unit(flow)
         # Never nearer than the clearance, or chords of the ribbons dip into the skin.
         rise = layer * (1.0 - np.exp(-6.6 * k / style.steps))
-        at = _lay(at, star, np.maximum(rise, min(_CLEARANCE, 0.4 * style.lift)))
+        height = np.maximum(rise, min(_CLEARANCE, 0.4 * style.lift))
+        distance = np.linalg.norm(at - star.centre, axis=1)
+        ray = (at - star.centre) / np.maximum(distance, 1e-9)[:, None]
+        wanted = star.radius(ray) + height
+        # Where the shoulders begin, the surface is suddenly far out: hair that hangs yields to it
+        # in small steps, and only outwards.
+        pushed = np.minimum(np.maximum(distance, wanted), distance + 0.004)
+        at = star.centre + ray * np.where(ray[:, 1] < -0.25, pushed, wanted)[:, None]
         turn = phase + wobble + 2.4 * k
         side = np.cross(out, unit(flow))
         curl = style.curl * (k / style.steps) ** 0.5
@@ -148,19 +141,6 @@ def _flow(at: np.ndarray, out: np.ndarray, star: StarMap, style: HairStyle) -> n
     return (1 - low) * along + low * np.array([0.0, -1.0, 0.0])
 
 
-def _lay(at: np.ndarray, star: StarMap, height: np.ndarray) -> np.ndarray:
-    """Move points (N, 3) to their layer above the surface; low down only outwards."""
-    relative = at - star.centre
-    distance = np.linalg.norm(relative, axis=1)
-    out = relative / np.maximum(distance, 1e-9)[:, None]
-    wanted = star.radius(out) + height
-    hanging = out[:, 1] < -0.25
-    # Where the shoulders begin, the surface is suddenly far out: yield to it in small steps.
-    pushed = np.minimum(np.maximum(distance, wanted), distance + 0.004)
-    placed = np.where(hanging, pushed, wanted)
-    return star.centre + out * placed[:, None]
-
-
 def _ribbons(
     rng: np.random.Generator,
     points: np.ndarray,
@@ -168,7 +148,7 @@ def _ribbons(
     width: float,
     colour: np.ndarray,
 ) -> HairMesh:
-    """Two-sided ribbons along strand points (N, P, 3), each rolled at random, thin at the tip."""
+    """Make ribbons along strand points (N, P, 3), each rolled at random, thin at the tip."""
     count, length = points.shape[:2]
     tangents = unit(np.gradient(points, axis=1))
     out = unit(points - centre)

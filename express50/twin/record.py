@@ -1,7 +1,11 @@
-"""Recording: plan the work, film it in processes, publish captures and their truth."""
+"""``express50 twin record``: make synthetic captures with known truth.
+
+The work is planned, filmed in processes, and published: a subject appears complete or not at all.
+"""
 
 from __future__ import annotations
 
+import argparse
 import json
 import multiprocessing
 import os
@@ -10,17 +14,80 @@ import sys
 import time
 from collections.abc import Callable
 from concurrent.futures import Future, ProcessPoolExecutor, wait
-from dataclasses import asdict
+from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
 
 from express50.capture.expressions import select
+from express50.contract.config import field_documents
 from express50.errors import CaptureError
 from express50.files.atomic import write_bytes
 from express50.runner.threads import cap_threads
 from express50.twin.config import TwinConfig
 
+_EPILOG = """example:
+  express50 twin record build/twin --subjects 4 --cameras 8 --width 320 --height 320 \\
+      --expressions neutral,smile,jaw_open --frames-per-expression 8 --seed 0
+writes build/twin/captures/S001... (for 'express50 ingest') and build/twin/truth/S001..."""
+_NUMBERS = [setting.name for setting in fields(TwinConfig) if setting.type in ("int", "float")]
+
+Task = tuple[str, list[int]]
 _counter: Any = None  # shared count of pictures, set in every worker
+
+
+def add_commands(subparsers: argparse._SubParsersAction) -> None:
+    """Add ``twin`` with its sub-command ``record``."""
+    area = subparsers.add_parser("twin", help="record a synthetic capture with known truth")
+    actions = area.add_subparsers(dest="action", metavar="ACTION", required=True)
+    parser = actions.add_parser(
+        "record",
+        help="record subjects of the digital twin",
+        epilog=_EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    words, default = field_documents(TwinConfig), TwinConfig()
+    parser.add_argument("out", type=Path, metavar="OUT", help="folder for captures/ and truth/")
+    for name in _NUMBERS:
+        value = getattr(default, name)
+        parser.add_argument(
+            f"--{name.replace('_', '-')}", type=type(value), default=value, metavar="N",
+            help=f"{words[name]} [{value}]",
+        )  # fmt: skip
+    parser.add_argument("--head", default=default.head, help=words["head"] + f" [{default.head}]")
+    parser.add_argument("--expressions", metavar="ID,ID...", help=words["expressions"])
+    kind = parser.add_mutually_exclusive_group()
+    kind.add_argument("--video", action="store_true", help="write H.264 videos [default]")
+    kind.add_argument("--frames", choices=("png", "jpg"), nargs="?", const="png",
+                      help="write single images instead of videos")  # fmt: skip
+    parser.add_argument("--give-calibration", action="store_true", help=words["give_calibration"])
+    parser.add_argument("--no-plates", action="store_true", help="leave clean plates out")
+    parser.add_argument("--no-hair", action="store_true", help="bald subjects")
+    parser.add_argument("--workers", type=int, default=min(8, os.cpu_count() or 1), metavar="N",
+                        help="processes; they do not change the bytes")  # fmt: skip
+    parser.add_argument("--json", action="store_true", help="print the result as JSON")
+    parser.set_defaults(handler=record_command)
+
+
+def record_command(args: argparse.Namespace) -> int:
+    """Record and say what was recorded."""
+    ids = None
+    if args.expressions:
+        ids = tuple(part.strip() for part in args.expressions.split(",") if part.strip())
+    config = TwinConfig(
+        **{name: getattr(args, name) for name in _NUMBERS},
+        head=args.head,
+        expressions=ids,
+        footage=args.frames or "video",
+        give_calibration=args.give_calibration,
+        plates=not args.no_plates,
+        hair=not args.no_hair,
+    )
+    recorded = record(config, args.out, max(1, args.workers), print_progress())
+    if args.json:
+        print(json.dumps({"captures": str(args.out / "captures"), "recorded": recorded}))
+    else:
+        print(f"{len(recorded)} subjects recorded in {args.out / 'captures'}; the rest was there")
+    return 0
 
 
 def record(
@@ -31,8 +98,7 @@ def record(
 ) -> list[str]:
     """Record subjects that are not there yet; the rest is kept.
 
-    Writes ``out/captures/<subject>`` (raw capture layout) and ``out/truth/<subject>``. A subject
-    appears whole or not at all.
+    Writes ``out/captures/<subject>`` (raw capture layout) and ``out/truth/<subject>``.
 
     Args:
         config: what to record.
@@ -54,7 +120,14 @@ def record(
     staging = out / ".recording"
     shutil.rmtree(staging, ignore_errors=True)
     staging.mkdir(parents=True)
-    tasks = _plan(config, missing, workers)
+    # A task is a subject, or "" for the board, and some cameras. They share each frame's geometry,
+    # so subjects are split only where there are more workers.
+    parts = min(config.cameras, max(1, -(-workers // len(missing))))
+    groups = [list(range(k, config.cameras, parts)) for k in range(parts)]
+    tasks = [(subject, group) for subject in missing for group in groups]
+    if config.board_frames:
+        shares = [list(range(k, config.cameras, workers)) for k in range(workers)]
+        tasks += [("", share) for share in shares if share]
     frames = len(select(config.expressions)) * config.frames_per_expression
     total = config.cameras * (len(missing) * frames + config.board_frames)
     _run(config, staging, tasks, workers, lambda done: report(done, total) if report else None)
@@ -62,22 +135,6 @@ def record(
         _publish(config, subject, staging, out)
     shutil.rmtree(staging)
     return missing
-
-
-Task = tuple[str, list[int]]  # subject id, or "" for the board, and indices of cameras
-
-
-def _plan(config: TwinConfig, subjects: list[str], workers: int) -> list[Task]:
-    """Split by subject, and by camera where there are more workers than subjects.
-
-    Cameras of one task share each frame's geometry, so tasks are kept as large as they can be.
-    """
-    parts = min(config.cameras, max(1, -(-workers // len(subjects))))
-    groups = [list(range(k, config.cameras, parts)) for k in range(parts)]
-    tasks = [(subject, group) for subject in subjects for group in groups]
-    if config.board_frames:
-        tasks += [("", list(range(k, config.cameras, workers))) for k in range(workers)]
-    return [task for task in tasks if task[1]]
 
 
 def _run(
@@ -139,7 +196,7 @@ def _film(config: TwinConfig, task: Task, staging: Path) -> None:
 
 def _publish(config: TwinConfig, subject: str, staging: Path, out: Path) -> None:
     """Add the files besides footage, then move a subject's truth and capture into place."""
-    from express50.twin.board import BoardSpec
+    from express50.twin.board import BOARD_TOML
 
     capture, truth = staging / "captures" / subject, staging / "truth" / subject
     about = json.loads((truth / "subject.json").read_text())
@@ -156,7 +213,7 @@ def _publish(config: TwinConfig, subject: str, staging: Path, out: Path) -> None
     if config.board_frames:
         # One rig, one board sequence: hard links spare the disk copies for every subject.
         shutil.copytree(staging / "board", capture / "board", copy_function=os.link)
-        (capture / "board" / "board.toml").write_text(BoardSpec().toml())
+        (capture / "board" / "board.toml").write_text(BOARD_TOML)
     if config.give_calibration:
         shutil.copyfile(truth / "cameras.json", capture / "calibration.json")
     for source, target in ((truth, out / "truth"), (capture, out / "captures")):
@@ -184,21 +241,21 @@ def _check_settings(config: TwinConfig, out: Path) -> None:
     write_bytes(path, text.encode())
 
 
-def print_progress(stream=sys.stderr, every: float = 10.0) -> Callable[[int, int], None]:  # noqa: ANN001
-    """Make a reporter for :func:`record`: one line that rewrites itself, or plain lines."""
+def print_progress() -> Callable[[int, int], None]:
+    """Make a reporter for `record` on standard error: one line that rewrites itself, or lines."""
     start = last = time.monotonic()
-    live = stream.isatty()
+    live = sys.stderr.isatty()
 
     def report(done: int, total: int) -> None:
         nonlocal last
         now = time.monotonic()
-        if not live and now - last < every and done < total:
+        if not live and now - last < 10.0 and done < total:
             return
         last = now
         rate = done / max(now - start, 1e-3)
         left = f"{(total - done) / rate:.0f} s left" if done else "starting"
-        stream.write(f"{chr(13) if live else ''}twin {done}/{total} pictures {rate:.1f}/s {left}"
-                     + ("   " if live and done < total else "\n"))  # fmt: skip
-        stream.flush()
+        line = f"twin {done}/{total} pictures {rate:.1f}/s {left}"
+        end = "   \r" if live and done < total else "\n"
+        print(line, end=end, file=sys.stderr, flush=True)
 
     return report

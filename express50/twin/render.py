@@ -39,22 +39,14 @@ class Sampling:
 
 @dataclass(frozen=True, kw_only=True)
 class RowBand:
-    """Rays of some rows of a camera, halo included, in the world.
+    """Rays of some rows of a camera, halo included, in the world."""
 
-    Attributes:
-        top, bottom: rows of the image, halo left out.
-        pad: rows of halo above and below.
-        origin: (3,) float32.
-        centre: (h, w, 3) directions through pixel centres, camera z 1.
-        right, down: (h, w, 3) change of direction from pixel to pixel.
-    """
-
-    top: int
+    top: int  # rows of the image, halo left out
     bottom: int
-    pad: tuple[int, int]
-    origin: np.ndarray
-    centre: np.ndarray
-    right: np.ndarray
+    rows: slice  # the same rows of the arrays
+    origin: np.ndarray  # (3,) float32
+    centre: np.ndarray  # (h, w, 3) directions through pixel centres, camera z 1
+    right: np.ndarray  # (h, w, 3) change of direction from pixel to pixel
     down: np.ndarray
 
 
@@ -70,76 +62,69 @@ def bands(camera: Camera) -> Iterator[RowBand]:
         right = 0.5 * (grid[1:-1, 2:] - grid[1:-1, :-2])
         down = 0.5 * (grid[2:, 1:-1] - grid[:-2, 1:-1])
         yield RowBand(
-            top=top, bottom=bottom, pad=(top - start, end - bottom),
+            top=top, bottom=bottom, rows=slice(top - start, bottom - start),
             origin=origin.astype(np.float32),
             centre=grid[1:-1, 1:-1].astype(np.float32),
             right=right.astype(np.float32), down=down.astype(np.float32),
         )  # fmt: skip
 
 
-def render_bands(
+def render_band(
     caster: Caster,
     material: np.ndarray,
     window: tuple[int, int, int, int],
     band: RowBand,
     sampling: Sampling,
     shade: Shade | None,
-) -> tuple[np.ndarray, np.ndarray, tuple[int, int, int, int]] | None:
+) -> tuple[np.ndarray, np.ndarray, tuple[slice, slice]] | None:
     """Render premultiplied colour and alpha of one band, where the subject may be.
 
-    Args:
-        caster: compiled geometry.
-        material: (F,) of each triangle.
-        window: columns and rows x0, y0, x1, y1 of the image outside of which nothing is hit.
-        band: rays.
-        sampling: how many rays.
-        shade: colours (N, 3) for directions (N, 3), faces (N,), barycentrics (N, 2); None for
-            alpha alone.
+    Outside ``window``, columns and rows x0, y0, x1, y1 of the image, nothing is hit; ``shade`` is
+    None for alpha alone.
 
     Returns:
-        colour (h, w, 3) and alpha (h, w) float32 of the part x0, y0, x1, y1 of the image; None
+        colour (h, w, 3) and alpha (h, w) float32 of the named rows and columns of the image; None
         where the band does not meet the window.
     """
     x0, x1 = window[0], window[2]
     y0, y1 = max(band.top, window[1]), min(band.bottom, window[3])
     if x0 >= x1 or y0 >= y1:
         return None
-    first = band.top - band.pad[0]
-    a, b = max(y0 - HALO, first) - first, min(y1 + HALO, band.bottom + band.pad[1]) - first
-    c, d = max(x0 - HALO, 0), min(x1 + HALO, band.centre.shape[1])
-    centre, right, down = (part[a:b, c:d] for part in (band.centre, band.right, band.down))
-    height, width = centre.shape[:2]
-    distance, face, bary = caster.cast(band.origin, centre.reshape(-1, 3))
+    first = band.top - band.rows.start
+    above, left = max(y0 - HALO - first, 0), max(x0 - HALO, 0)
+    around = slice(above, y1 + HALO - first), slice(left, x1 + HALO)
+    inner = slice(y0 - first - above, y1 - first - above), slice(x0 - left, x1 - left)
+    # (3, h * w, 3): pixels' centres, and the steps to the right and down.
+    grid = np.stack([part[around] for part in (band.centre, band.right, band.down)])
+    height, width = grid.shape[1:3]
+    grid = grid.reshape(3, -1, 3)
+    distance, face, bary = caster.cast(band.origin, grid[0])
     edge, inside = _detail(distance.reshape(height, width), face.reshape(height, width), material)
     keep = np.zeros((height, width), dtype=bool)
-    keep[y0 - first - a : y1 - first - a, x0 - c : x1 - c] = True
+    keep[inner] = True
     colour = np.zeros((height * width, 3), np.float32)
     alpha = np.zeros(height * width, np.float32)
-    flat = [part.reshape(-1, 3) for part in (centre, right, down)]
     # The centre's ray is one of the samples of every pixel.
     seen = np.flatnonzero(keep.ravel() & (face != MISS))
     alpha[seen] = 1.0
     if shade is not None and seen.size:
-        colour[seen] = shade(flat[0][seen], face[seen], bary[seen])
+        colour[seen] = shade(grid[0, seen], face[seen], bary[seen])
     for chosen, count in ((edge, sampling.edge), (inside & ~edge, sampling.inside)):
         index = np.flatnonzero((chosen & keep).ravel())
         for part in np.array_split(index, max(1, len(index) * count >> 18)):
             if part.size and count > 1:
-                rays_at = Pixels(index=part, flat=flat, origin=band.origin)
-                _refine(caster, rays_at, count, sampling.sparing, shade, colour, alpha)
-    rows = slice(y0 - first - a, y1 - first - a)
-    columns = slice(x0 - c, x1 - c)
-    return (
-        colour.reshape(height, width, 3)[rows, columns],
-        alpha.reshape(height, width)[rows, columns],
-        (x0, y0, x1, y1),
-    )
+                samples = colour[part], alpha[part]
+                colour[part], alpha[part] = _refined(
+                    caster, band.origin, grid[:, part], samples, count, sampling.sparing, shade
+                )
+    place = slice(y0, y1), slice(x0, x1)
+    return colour.reshape(height, width, 3)[inner], alpha.reshape(height, width)[inner], place
 
 
 def _detail(
     distance: np.ndarray, face: np.ndarray, material: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Masks (h, w) of pixels whose alpha may be fractional, and of other pixels with detail."""
+    """Find pixels (h, w) whose alpha may be fractional, and other pixels with detail."""
     hit = face != MISS
     kind = np.where(hit, material[np.where(hit, face, 0)], 255).astype(np.uint8)
     box = np.ones((3, 3), np.uint8)
@@ -156,65 +141,51 @@ def _detail(
     return edge, inside
 
 
-@dataclass(frozen=True)
-class Pixels:
-    """Some pixels of a band: ``index`` (N,) into ``flat``, the band's (h * w, 3) ray arrays."""
-
-    index: np.ndarray
-    flat: list[np.ndarray]
-    origin: np.ndarray
-
-
-def _refine(
+def _refined(
     caster: Caster,
-    pixels: Pixels,
+    origin: np.ndarray,
+    grid: np.ndarray,
+    samples: tuple[np.ndarray, np.ndarray],
     count: int,
     sparing: bool,
     shade: Shade | None,
-    colour: np.ndarray,
-    alpha: np.ndarray,
-) -> None:
-    """Replace the one sample in ``colour`` and ``alpha`` of some pixels by ``count`` of them.
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return colour (N, 3) and alpha (N,) of pixels (3, N, 3) as means of ``count`` samples.
 
-    Sparing with rays, a third comes first; pixels where those all hit, or all miss, end there.
+    ``samples`` are those of their centres. Sparing with rays, a third comes first; pixels where
+    those all hit, or all miss, end there.
     """
-    u, v = ray_pattern(count)
+    places = np.stack(ray_pattern(count), axis=1)
     others = np.delete(np.arange(count), count // 2)
-    index = pixels.index
     first = others[:: len(others) // 2] if sparing and len(others) > 4 else others
-    sums = _cast_more(caster, pixels, (u[first], v[first]), shade)
-    colour[index] += sums[0]
-    alpha[index] += sums[1]
-    weight = np.full(len(index), 1.0 + len(first), np.float32)
+    more = _cast_more(caster, origin, grid, places[first], shade)
+    colour, alpha = samples[0] + more[0], samples[1] + more[1]
+    weight = np.full(len(alpha), 1.0 + len(first), np.float32)
     if len(first) < len(others):
-        mixed = np.flatnonzero((alpha[index] > 0) & (alpha[index] < weight))
+        mixed = np.flatnonzero((alpha > 0) & (alpha < weight))
         rest = np.setdiff1d(others, first)
-        part = Pixels(index=index[mixed], flat=pixels.flat, origin=pixels.origin)
-        sums = _cast_more(caster, part, (u[rest], v[rest]), shade)
-        colour[part.index] += sums[0]
-        alpha[part.index] += sums[1]
+        more = _cast_more(caster, origin, grid[:, mixed], places[rest], shade)
+        colour[mixed] += more[0]
+        alpha[mixed] += more[1]
         weight[mixed] += len(rest)
-    colour[index] /= weight[:, None]
-    alpha[index] /= weight
+    return colour / weight[:, None], alpha / weight
 
 
 def _cast_more(
-    caster: Caster, pixels: Pixels, places: tuple[np.ndarray, np.ndarray], shade: Shade | None
+    caster: Caster, origin: np.ndarray, grid: np.ndarray, places: np.ndarray, shade: Shade | None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Cast rays at places in the pixels; return sums of colour (N, 3) and hits (N,)."""
-    centre, right, down = (part[pixels.index] for part in pixels.flat)
-    u, v = (place[:, None, None] for place in places)
+    """Cast rays at places (K, 2) in pixels; return sums of colour (N, 3) and hits (N,)."""
+    centre, right, down = grid
+    u, v = places.T[:, :, None, None]
     directions = (centre + u * right + v * down).reshape(-1, 3)
-    _, face, bary = caster.cast(pixels.origin, directions)
+    _, face, bary = caster.cast(origin, directions)
     hit = np.flatnonzero(face != MISS)
     seen = np.zeros(len(directions), np.float32)
     seen[hit] = 1.0
-    count = len(places[0])
-    if shade is None:
-        return np.zeros((len(centre), 3), np.float32), seen.reshape(count, -1).sum(0)
     colours = np.zeros((len(directions), 3), np.float32)
-    if hit.size:
+    if shade is not None and hit.size:
         colours[hit] = shade(directions[hit], face[hit], bary[hit])
+    count = len(places)
     return colours.reshape(count, -1, 3).sum(0), seen.reshape(count, -1).sum(0)
 
 
@@ -235,7 +206,7 @@ def ray_pattern(count: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def hull_of(vertices: np.ndarray) -> np.ndarray:
-    """Corners (K, 3) of the convex hull of vertices (N, 3), which are not all in one plane."""
+    """Return corners (K, 3) of the convex hull of vertices (N, 3), not all in one plane."""
     return vertices[scipy.spatial.ConvexHull(vertices).vertices]
 
 
@@ -251,36 +222,33 @@ def window_of(camera: Camera, vertices: np.ndarray) -> tuple[int, int, int, int]
     margin = 3 + 0.005 * max(camera.width, camera.height)
     x0, y0 = np.floor(pixels.min(0) - margin).astype(int)
     x1, y1 = np.ceil(pixels.max(0) + margin).astype(int)
-    size = (camera.width, camera.height)
-    x0, x1 = np.clip((x0, x1), 0, size[0])
-    y0, y1 = np.clip((y0, y1), 0, size[1])
+    x0, x1 = np.clip((x0, x1), 0, camera.width)
+    y0, y1 = np.clip((y0, y1), 0, camera.height)
     return int(x0), int(y0), int(x1), int(y1)
 
 
 def render_alpha(
-    caster: Caster, material: np.ndarray, vertices: np.ndarray, camera: Camera, count: int = 33
+    caster: Caster, material: np.ndarray, vertices: np.ndarray, camera: Camera
 ) -> np.ndarray:
-    """Render the alpha (H, W) float32 in [0, 1] of geometry in a camera."""
+    """Render the alpha (H, W) float32 in [0, 1] of geometry in a camera, with 33 rays at edges."""
     alpha = np.zeros((camera.height, camera.width), np.float32)
     window = window_of(camera, hull_of(vertices))
-    sampling = Sampling(edge=count, inside=1, sparing=False)
+    sampling = Sampling(edge=33, inside=1, sparing=False)
     for band in bands(camera):
-        done = render_bands(caster, material, window, band, sampling, None)
+        done = render_band(caster, material, window, band, sampling, None)
         if done is not None:
-            x0, y0, x1, y1 = done[2]
-            alpha[y0:y1, x0:x1] = done[1]
+            _, part, place = done
+            alpha[place] = part
     return alpha
 
 
 def render_depth(caster: Caster, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """Camera z (H, W) float32 metres through pixel centres, 0 where nothing is hit; and valid."""
+    """Render camera z (H, W) float32, metres, 0 where nothing is hit; and where it is valid."""
     depth = np.zeros((camera.height, camera.width), np.float32)
     for band in bands(camera):
-        rows = slice(band.pad[0], band.pad[0] + band.bottom - band.top)
-        part = band.centre[rows]
+        part = band.centre[band.rows]
         # Directions have camera z 1, so the distance along them is camera z.
         distance, _, _ = caster.cast(band.origin, part.reshape(-1, 3))
-        depth[band.top : band.bottom] = np.where(np.isfinite(distance), distance, 0.0).reshape(
-            part.shape[:2]
-        )
+        distance = np.where(np.isfinite(distance), distance, 0.0)
+        depth[band.top : band.bottom] = distance.reshape(part.shape[:2])
     return depth, depth > 0

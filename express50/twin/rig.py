@@ -1,14 +1,19 @@
-"""The camera rig: N cameras on a sphere segment around the subject, denser at the front."""
+"""The rig's cameras: where they stand, and how their sensors make pictures of light.
+
+N cameras stand on a sphere segment around the subject, denser at the front.
+"""
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 
+from express50.files.images import linear_to_srgb
 from express50.geometry.cameras import Camera
 from express50.geometry.transforms import look_at
-from express50.twin.noise import random_stream
+from express50.twin.surface import random_stream
 
 TARGET = np.array([0.0, 1.25, 0.0])  # where heads are: a seated person, y up, metres
 SPAN_DEG = 300.0
@@ -24,7 +29,7 @@ def make_rig(count: int, width: int, height: int, seed: int) -> dict[str, Camera
     the leftmost as the subject sees it; the world's y is up and subjects look along +z.
     """
     rng = random_stream(seed, 101)
-    cameras = {}
+    cameras, short = {}, min(width, height)
     for index in range(count):
         camera_id = f"cam{index:02d}"
         place = 2.0 * (index + 0.5) / count - 1.0
@@ -43,20 +48,56 @@ def make_rig(count: int, width: int, height: int, seed: int) -> dict[str, Camera
         aim = TARGET + rng.uniform(-0.012, 0.012, 3)
         tilt = np.array([math.tan(math.radians(rng.uniform(-1.5, 1.5))), 1.0, 0.0])
         pose = look_at(TARGET + radius * out, aim, tilt)
-        cameras[camera_id] = Camera(
-            camera_id, width, height, "OPENCV", _intrinsics(rng, radius, width, height), pose
-        )
+        focal = short * radius / FRAME_M * (1.0 + rng.uniform(-0.02, 0.02))
+        aspect = 1.0 + rng.uniform(-0.0015, 0.0015)
+        cx, cy = np.array([width, height]) / 2 + short * rng.uniform(-0.012, 0.012, 2)
+        k1, k2 = rng.uniform(-0.22, -0.08), rng.uniform(0.05, 0.3)
+        p1, p2 = rng.uniform(-0.0012, 0.0012, 2)
+        lens = tuple(float(x) for x in (focal, focal * aspect, cx, cy, k1, k2, p1, p2))
+        cameras[camera_id] = Camera(camera_id, width, height, "OPENCV", lens, pose)
     return cameras
 
 
-def _intrinsics(
-    rng: np.random.Generator, radius: float, width: int, height: int
-) -> tuple[float, ...]:
-    """Draw focal lengths, principal point and distortion of one lens, COLMAP's OPENCV order."""
-    short = min(width, height)
-    focal = short * radius / FRAME_M * (1.0 + rng.uniform(-0.02, 0.02))
-    aspect = 1.0 + rng.uniform(-0.0015, 0.0015)
-    cx, cy = np.array([width, height]) / 2 + short * rng.uniform(-0.012, 0.012, 2)
-    k1, k2 = rng.uniform(-0.22, -0.08), rng.uniform(0.05, 0.3)
-    p1, p2 = rng.uniform(-0.0012, 0.0012, 2)
-    return tuple(float(x) for x in (focal, focal * aspect, cx, cy, k1, k2, p1, p2))
+_SHOT, _READ = 0.0055, 0.0016  # noise of a clean studio exposure, linear light
+_KNEE = 0.75
+_CURVE_STEPS = 16384
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sensor:
+    """One camera's colour gain (3,) and how much its corners darken."""
+
+    gain: np.ndarray
+    vignette: float
+
+
+def make_sensor(camera_index: int, seed: int) -> Sensor:
+    """Draw a camera's sensor."""
+    rng = random_stream(seed, 301, camera_index)
+    gain = 0.85 * rng.uniform(0.94, 1.06) * (1.0 + rng.normal(0.0, 0.025, 3))
+    return Sensor(gain=gain.astype(np.float32), vignette=float(rng.uniform(0.02, 0.08)))
+
+
+def expose(
+    sensor: Sensor, linear: np.ndarray, rng: np.random.Generator, noise: float
+) -> np.ndarray:
+    """Expose linear light (H, W, 3) float32 to the 8-bit sRGB picture (H, W, 3)."""
+    height, width = linear.shape[:2]
+    y = (np.arange(height, dtype=np.float32) + 0.5) / height * 2 - 1
+    x = (np.arange(width, dtype=np.float32) + 0.5) / width * 2 - 1
+    falloff = 1.0 - sensor.vignette * 0.5 * (x[None] ** 2 + y[:, None] ** 2)
+    signal = linear * sensor.gain * falloff[..., None]
+    if noise > 0:
+        grain = rng.standard_normal(signal.shape, dtype=np.float32)
+        signal = signal + noise * grain * np.sqrt(_READ**2 + _SHOT**2 * np.maximum(signal, 0.0))
+    steps = np.clip(signal * (_CURVE_STEPS / 2.0), 0, _CURVE_STEPS - 1).astype(np.int32)
+    return _CURVE[steps]
+
+
+# Linear light 0 to 2 in fine steps, one of which is at most half of one level. Above the knee it is
+# compressed softly, so that highlights do not clip hard.
+_LIGHT = (np.arange(_CURVE_STEPS) + 0.5) * 2.0 / _CURVE_STEPS
+_OVER = 1.0 - np.exp(-np.maximum(_LIGHT - _KNEE, 0.0) / (1 - _KNEE))
+_CURVE = np.rint(255.0 * linear_to_srgb(np.minimum(_LIGHT, _KNEE) + (1 - _KNEE) * _OVER)).astype(
+    np.uint8
+)

@@ -10,12 +10,19 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from express50.geometry.smoothstep import smoothstep
+from express50.geometry.sampling import smoothstep
 from express50.head.model import HeadModel
 from express50.twin.body import Body, Material, Posed, model_materials
-from express50.twin.noise import make_lattice, noise, random_stream
 from express50.twin.skin import SkinTexture, sample_skin
-from express50.twin.surface import Caster, dot, smooth_over_mesh, unit
+from express50.twin.surface import (
+    Caster,
+    dot,
+    make_lattice,
+    noise,
+    random_stream,
+    smooth_over_mesh,
+    unit,
+)
 
 # How far light bleeds round the terminator in skin, per channel: red most (d'Eon et al. 2007).
 _BLEED = np.array([0.32, 0.12, 0.06], np.float32)
@@ -96,7 +103,6 @@ class LitScene:
     lighting: Lighting
     attributes: np.ndarray
     hair_tangents: np.ndarray
-    vertices: np.ndarray
     iris_lattice: np.ndarray
 
 
@@ -121,7 +127,7 @@ def build_scene(
     attributes[solid, 9:] = reach[:, 1:]
     return LitScene(
         caster=caster, body=body, texture=texture, eyes=eyes, lighting=lighting,
-        attributes=attributes, hair_tangents=posed.tangents, vertices=posed.vertices,
+        attributes=attributes, hair_tangents=posed.tangents,
         iris_lattice=make_lattice(random_stream(seed, body.subject.number, 10)),
     )  # fmt: skip
 
@@ -177,14 +183,7 @@ def _diffuse(
 def shade(
     scene: LitScene, directions: np.ndarray, face: np.ndarray, bary: np.ndarray
 ) -> np.ndarray:
-    """Return linear colour (N, 3) of hits.
-
-    Args:
-        scene: the frame.
-        directions: (N, 3) ray directions, any length.
-        face: (N,) index of the triangle hit; none may be a miss.
-        bary: (N, 2) weights of its second and third vertex.
-    """
+    """Return linear colour (N, 3) of rays' hits, as `Caster.cast` gives them, without misses."""
     body = scene.body
     corners = body.faces[face]
     w1, w2 = bary[:, :1], bary[:, 1:]
@@ -206,14 +205,20 @@ def shade(
             out[chosen] = _hair(scene.lighting, n, v, m[:, 3:6], scene.hair_tangents[first])
             continue
         albedo, gloss, power = _surface(scene, kind, m[:, 3:6])
-        out[chosen] = _lit(scene.lighting, n, v, m[:, 6:], albedo, gloss, power)
+        # The vertices' diffuse light, and Phong's highlight with Fresnel's rise.
+        cosine = dot(n, v)
+        lobes = np.clip((2.0 * cosine * n - v) @ scene.lighting.directions.T, 0.0, 1.0)
+        highlight = (lobes ** np.float32(0.25 * power) * m[:, 9:]) @ scene.lighting.colours
+        rim = 0.55 + 2.0 * (1.0 - np.clip(cosine, 0.0, 1.0)) ** 4
+        shine = gloss * np.float32((power + 2.0) / 8.0) * rim
+        out[chosen] = albedo * m[:, 6:9] + highlight * shine
     return out
 
 
 def _surface(
     scene: LitScene, kind: int, place: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray | float, float]:
-    """Albedo (N, 3), strength and sharpness of the highlight at places (N, 3) on the mean head."""
+    """Return albedo (N, 3), strength and sharpness of the highlight at places on the mean head."""
     if kind == Material.SKIN:
         texel = sample_skin(scene.texture, place)
         return texel[:, :3], 0.045 * texel[:, 3:], 22.0
@@ -250,24 +255,6 @@ def _eye_albedo(scene: LitScene, place: np.ndarray) -> np.ndarray:
     white = white - (veins * far)[:, None] * np.array([0.05, 0.16, 0.15])
     mix = smoothstep(angle, 0.95, 1.08)[:, None]
     return (iris * (1 - mix) + white * mix).astype(np.float32)
-
-
-def _lit(
-    lighting: Lighting,
-    n: np.ndarray,
-    v: np.ndarray,
-    light: np.ndarray,
-    albedo: np.ndarray,
-    gloss: np.ndarray | float,
-    power: float,
-) -> np.ndarray:
-    """Light hits by the vertices' diffuse light and Phong's highlight with Fresnel's rise."""
-    cosine = dot(n, v)
-    mirrored = 2.0 * cosine * n - v
-    lobes = np.clip(mirrored @ lighting.directions.T, 0.0, 1.0) ** np.float32(0.25 * power)
-    highlight = (lobes * light[:, 3:]) @ lighting.colours
-    rim = 0.55 + 2.0 * (1.0 - np.clip(cosine, 0.0, 1.0)) ** 4
-    return albedo * light[:, :3] + highlight * (gloss * np.float32((power + 2.0) / 8.0) * rim)
 
 
 def _hair(

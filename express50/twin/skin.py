@@ -11,13 +11,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from express50.geometry.smoothstep import smoothstep
+from express50.geometry.sampling import smoothstep
 from express50.head.model import HeadModel, landmarks
 from express50.twin.body import Body, Material, model_materials
-from express50.twin.noise import fractal, make_lattice, noise, random_stream
 from express50.twin.surface import (
     MISS,
     Caster,
+    fractal,
+    make_lattice,
+    noise,
+    random_stream,
+    sample_panorama,
     smooth_over_mesh,
     spherical_to_unit,
     unit_to_spherical,
@@ -45,68 +49,63 @@ def sample_skin(texture: SkinTexture, points: np.ndarray) -> np.ndarray:
     x = (az * np.float32(0.5 / np.pi) + np.float32(0.5)) * width - np.float32(0.5)
     y = (el * np.float32(1.0 / np.pi) + np.float32(0.5)) * height - np.float32(0.5)
     y = np.clip(y, 0, np.float32(height - 1.01))
-    left, top = np.floor(x), np.floor(y)
-    fx, fy = (x - left)[:, None], (y - top)[:, None]
-    x0, y0 = left.astype(np.int32), top.astype(np.int32)
-    xa, xb = x0 % width, (x0 + 1) % width
-    flat = texture.pixels.reshape(-1, 4)
-    row = y0 * width
-    low = flat[row + xa] * (1 - fx) + flat[row + xb] * fx
-    row = row + width
-    high = flat[row + xa] * (1 - fx) + flat[row + xb] * fx
-    return low * (1 - fy) + high * fy
+    return sample_panorama(texture.pixels, x, y)
 
 
 def paint_skin(body: Body, seed: int, width: int) -> SkinTexture:
     """Paint the texture of one subject, ``width`` texels around."""
     height = width // 2
-    rows = max(1, 262_144 // width)
+    step = max(1, 262_144 // width)
     bands = [
-        _paint_band(body, seed, width, height, y, min(y + rows, height))
-        for y in range(0, height, rows)
+        _paint_rows(body, seed, width, range(y, min(y + step, height)))
+        for y in range(0, height, step)
     ]
     pixels = np.concatenate(bands).reshape(height, width, 4)
     return SkinTexture(pixels=pixels, centre=body.centre)
 
 
-def _paint_band(body: Body, seed: int, width: int, height: int, y0: int, y1: int) -> np.ndarray:
-    """Return texels (N, 4) of rows y0 to y1."""
+def _paint_rows(body: Body, seed: int, width: int, rows: range) -> np.ndarray:
+    """Return texels (N, 4) of some rows."""
     model, look = body.model, body.subject.look
-    points, masks = _surface_at(body, width, height, y0, y1)
+    points, masks = _surface_at(body, width, rows)
+    marks = landmarks(model, model.template[None])[0].double().numpy()
     rng = random_stream(seed, body.subject.number, 8)
     lattices = [make_lattice(rng) for _ in range(6)]
-    face = masks["face"]
     albedo = np.broadcast_to(look.skin.astype(np.float32), points.shape).copy()
     tone = fractal(points, lattices[0], 0.030, 4, 0.55)
     albedo *= 1.0 + 0.085 * tone[:, None] * np.array([0.6, 1.0, 1.1], np.float32)
-    flush = look.flush * _flush(model, points) * (0.7 + 0.5 * noise(points / 0.012, lattices[1]))
+    flush = look.flush * _flush(model, marks, points)
+    flush = flush * (0.7 + 0.5 * noise(points / 0.012, lattices[1]))
     albedo *= 1.0 + flush[:, None] * np.array([0.02, -0.25, -0.22], np.float32)
     pores = fractal(points, lattices[2], 0.0022, 2, 0.7)
     albedo *= 1.0 + 0.05 * pores[:, None]
     spots = smoothstep(fractal(points, lattices[3], 0.0032, 2, 0.35), 0.48, 0.85)
-    where = face * smoothstep(noise(points / 0.02, lattices[4]), -0.4, 0.3)
+    where = masks["face"] * smoothstep(noise(points / 0.02, lattices[4]), -0.4, 0.3)
     albedo *= 1.0 - look.freckles * (spots * where)[:, None] * np.array([0.22, 0.34, 0.40])
-    albedo = _moles(rng, albedo, points, model, look.moles)
-    gloss = look.gloss * (1.0 + 0.25 * pores) * (0.8 + 0.5 * _oily(model, points))
+    places = model.template.numpy()[(model.regions["face"] | model.regions["neck"]).numpy()]
+    for mole in places[rng.integers(0, len(places), look.moles)]:
+        radius = rng.uniform(0.0007, 0.0018)
+        inside = smoothstep(np.linalg.norm(points - mole, axis=1), 1.25 * radius, 0.75 * radius)
+        albedo = albedo * (1.0 - inside[:, None] * np.array([0.55, 0.65, 0.7]))
+    brow = 0.5 * (marks[21] + marks[22]) + np.array([0.0, 0.03, 0.0])
+    oily = _bump(points, brow, 0.03) + _bump(points, 0.5 * (marks[28] + marks[30]), 0.014)
+    gloss = look.gloss * (1.0 + 0.25 * pores) * (0.8 + 0.5 * oily)
     lips = smoothstep(masks["lips"] + 0.10 * noise(points / 0.004, lattices[5]), 0.35, 0.65)
     creases = fractal(points * (1.0, 0.25, 1.0), lattices[1], 0.0025, 2)
     lip_colour = look.lips * (1.0 + 0.12 * creases)[:, None]
     albedo += lips[:, None] * (lip_colour - albedo)
     gloss += lips * 1.3
-    hairs = _hairiness(body, points, masks, lattices)
+    hairs = _hairiness(body, marks, points, masks, lattices)
     albedo += hairs[:, None] * (look.hair * 0.8 + 0.01 - albedo)
-    return np.concatenate([albedo, gloss[:, None] * (1 - 0.8 * hairs[:, None])], axis=1).astype(
-        np.float32
-    )
+    gloss = gloss * (1 - 0.8 * hairs)
+    return np.concatenate([albedo, gloss[:, None]], axis=1).astype(np.float32)
 
 
-def _surface_at(
-    body: Body, width: int, height: int, y0: int, y1: int
-) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+def _surface_at(body: Body, width: int, rows: range) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """Return places (N, 3) on the mean head under the texels of some rows, and masks there."""
     model = body.model
     az = (np.arange(width) + 0.5) / width * 2 * np.pi - np.pi
-    el = (np.arange(y0, y1) + 0.5) / height * np.pi - 0.5 * np.pi
+    el = (np.array(rows) + 0.5) / (width // 2) * np.pi - 0.5 * np.pi
     out = spherical_to_unit(*np.meshgrid(az, el)).reshape(-1, 3)
     faces = model.faces.numpy()
     faces = faces[model_materials(model)[faces].min(1) == Material.SKIN]
@@ -128,58 +127,47 @@ def _surface_at(
     return points.astype(np.float32), masks
 
 
-def _mean_landmarks(model: HeadModel) -> np.ndarray:
-    return landmarks(model, model.template[None])[0].double().numpy()
+def _bump(points: np.ndarray, centre: np.ndarray, radius: float) -> np.ndarray:
+    return np.exp(-((points - centre) ** 2).sum(1) / (2 * radius**2))
 
 
-def _flush(model: HeadModel, points: np.ndarray) -> np.ndarray:
-    """Return redness (N,): cheeks, tip of the nose, ears, chin."""
-    marks = _mean_landmarks(model)
+def _flush(model: HeadModel, marks: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Return redness (N,): cheeks, tip of the nose, chin, ears."""
     left = 0.35 * marks[46] + 0.35 * marks[14] + 0.3 * marks[54]
     right = 0.35 * marks[41] + 0.35 * marks[2] + 0.3 * marks[48]
-    total = np.zeros(len(points), np.float32)
-    for centre, radius, weight in (
-        (left, 0.026, 1.0), (right, 0.026, 1.0), (marks[30], 0.014, 0.9), (marks[8], 0.018, 0.4),
-    ):  # fmt: skip
-        total += weight * np.exp(-((points - centre) ** 2).sum(1) / (2 * radius**2))
+    spots = [(left, 0.026, 1.0), (right, 0.026, 1.0), (marks[30], 0.014, 0.9),
+             (marks[8], 0.018, 0.4)]  # fmt: skip
+    template = model.template.numpy()
     ears = (model.regions["left_ear"] | model.regions["right_ear"]).numpy()
     for side in (1.0, -1.0):
-        ear = model.template.numpy()[ears & (model.template[:, 0].numpy() * side > 0)].mean(0)
-        total += 0.8 * np.exp(-((points - ear) ** 2).sum(1) / (2 * 0.02**2))
+        spots.append((template[ears & (template[:, 0] * side > 0)].mean(0), 0.02, 0.8))
+    total = np.zeros(len(points), np.float32)
+    for centre, radius, weight in spots:
+        total += weight * _bump(points, centre, radius)
     return total
 
 
-def _oily(model: HeadModel, points: np.ndarray) -> np.ndarray:
-    """Return shine (N,): forehead, nose."""
-    marks = _mean_landmarks(model)
-    brow = 0.5 * (marks[21] + marks[22]) + np.array([0.0, 0.03, 0.0])
-    nose = 0.5 * (marks[28] + marks[30])
-    forehead = np.exp(-((points - brow) ** 2).sum(1) / (2 * 0.03**2))
-    return forehead + np.exp(-((points - nose) ** 2).sum(1) / (2 * 0.014**2))
-
-
-def _moles(
-    rng: np.random.Generator, albedo: np.ndarray, points: np.ndarray, model: HeadModel, count: int
-) -> np.ndarray:
-    """Darken a few round spots on face and neck."""
-    places = model.template.numpy()[(model.regions["face"] | model.regions["neck"]).numpy()]
-    for place in places[rng.integers(0, len(places), count)]:
-        radius = rng.uniform(0.0007, 0.0018)
-        inside = smoothstep(np.linalg.norm(points - place, axis=1), 1.25 * radius, 0.75 * radius)
-        albedo = albedo * (1.0 - inside[:, None] * np.array([0.55, 0.65, 0.7]))
-    return albedo
-
-
 def _hairiness(
-    body: Body, points: np.ndarray, masks: dict[str, np.ndarray], lattices: list[np.ndarray]
+    body: Body,
+    marks: np.ndarray,
+    points: np.ndarray,
+    masks: dict[str, np.ndarray],
+    lattices: list[np.ndarray],
 ) -> np.ndarray:
-    """Coverage (N,) by short hair that has no geometry: brows, stubble, the roots on the scalp."""
-    look, marks = body.subject.look, _mean_landmarks(body.model)
+    """Return cover (N,) by short hair that has no geometry: brows, stubble, roots on the scalp."""
+    look = body.subject.look
     cover = np.zeros(len(points), np.float32)
     for ids in (range(17, 22), range(22, 27)):
-        along, off = _along_polyline(points, marks[list(ids)])
+        # Place along the brow, 0 to 1 and beyond its ends, and height off it, in the front view.
+        line = marks[list(ids)]
+        x, first, last = points[:, 0], line[0, 0], line[-1, 0]
+        beyond = (np.minimum(x - first, 0) + np.maximum(x - last, 0)) / (last - first)
+        along = (np.interp(x, line[:, 0], np.linspace(0, 1, 5)) + beyond).astype(np.float32)
         if ids[0] == 17:
             along = 1.0 - along  # from the inner end outwards, on both sides
+        away = np.abs(points[:, 2] - np.interp(x, line[:, 0], line[:, 2])) > 0.03
+        height = points[:, 1] - np.interp(x, line[:, 0], line[:, 1])
+        off = np.where(away, 1.0, height).astype(np.float32)
         thick = 0.0046 * (1.0 - 0.55 * along) * smoothstep(along, -0.06, 0.12) + 0.0006
         fibres = noise(np.stack([along * 60 + off * 900, off * 500, along * 10], 1), lattices[3])
         body_of_brow = smoothstep(np.abs(off) / thick + 0.28 * fibres, 1.25, 0.55)
@@ -196,30 +184,13 @@ def _beard(
     marks: np.ndarray, points: np.ndarray, masks: dict[str, np.ndarray], lattices: list[np.ndarray]
 ) -> np.ndarray:
     """Return density of stubble (N,), in dots."""
-    mouth, chin = marks[[48, 54]].mean(0), marks[8]
-    nose = marks[33]
+    mouth, chin, nose = marks[[48, 54]].mean(0), marks[8], marks[33]
     below = smoothstep(points[:, 1], nose[1] - 0.001, nose[1] - 0.012)
     jaw = smoothstep(points[:, 1], chin[1] - 0.035, chin[1] - 0.005)
     cheek = np.abs(points[:, 0] - mouth[0]) / 0.06
     line = smoothstep(points[:, 1] - (mouth[1] + 0.05 * (cheek - 0.75)), 0.02, -0.004)
     front = smoothstep(points[:, 2], mouth[2] - 0.10, mouth[2] - 0.06)
-    upper = np.exp(-(((points - (marks[33] + marks[51]) / 2) / (0.022, 0.009, 0.03)) ** 2).sum(1))
+    upper = np.exp(-(((points - (nose + marks[51]) / 2) / (0.022, 0.009, 0.03)) ** 2).sum(1))
     dots = smoothstep(noise(points / 0.0011, lattices[2]), -0.1, 0.5)
     area = below * jaw * front * np.maximum(line, 1.3 * upper) * (1 - masks["lips"])
     return np.clip(area, 0, 1) * (0.30 + 0.35 * dots)
-
-
-def _along_polyline(points: np.ndarray, line: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Place along a polyline (N,), 0 to 1 and beyond the ends, and signed height off it, metres.
-
-    Works in the front view, where brows run sideways.
-    """
-    order = line[np.argsort(line[:, 0])]
-    place = np.interp(points[:, 0], order[:, 0], np.arange(len(order)) / (len(order) - 1))
-    span = order[-1, 0] - order[0, 0]
-    beyond = np.minimum(points[:, 0] - order[0, 0], 0) + np.maximum(points[:, 0] - order[-1, 0], 0)
-    height = np.interp(points[:, 0], order[:, 0], order[:, 1])
-    depth = np.interp(points[:, 0], order[:, 0], order[:, 2])
-    off = points[:, 1] - height
-    away = np.abs(points[:, 2] - depth) > 0.03
-    return (place + beyond / span).astype(np.float32), np.where(away, 1.0, off).astype(np.float32)

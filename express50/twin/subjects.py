@@ -1,41 +1,41 @@
-"""Made-up people: shape, a displacement the head model cannot express, and how they look."""
+"""Made-up people: how they are shaped and look, and how they perform the script.
+
+A subject has coefficients of the head model, a displacement that the model cannot express, and an
+appearance. Its performance has a timing, strength, blinks and sway of its own.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from express50.geometry.smoothstep import smoothstep
+from express50.capture.expressions import Expression
+from express50.errors import HeadModelError
+from express50.geometry.sampling import smoothstep
+from express50.geometry.transforms import axis_angle_to_matrix, matrix_to_axis_angle
 from express50.head.model import HeadModel
-from express50.twin.noise import fractal, make_lattice, random_stream
+from express50.twin.rig import TARGET
+from express50.twin.surface import fractal, make_lattice, random_stream
 
 OFFSET_RMS_M = 1.2e-3
 # Linear-light albedo of skin from light to deep (sRGB about 233 196 176 ... 92 62 49).
-_SKIN_TONES = np.array(
-    [
-        [0.74, 0.50, 0.39],
-        [0.64, 0.40, 0.28],
-        [0.52, 0.30, 0.20],
-        [0.38, 0.20, 0.12],
-        [0.24, 0.12, 0.072],
-        [0.13, 0.066, 0.042],
-    ]
-)
-_HAIR_COLOURS = np.array(
-    [
-        [0.014, 0.011, 0.010],
-        [0.035, 0.020, 0.012],
-        [0.085, 0.045, 0.022],
-        [0.24, 0.14, 0.065],
-        [0.22, 0.065, 0.022],
-        [0.30, 0.29, 0.28],
-    ]
-)
-_EYE_COLOURS = np.array(
-    [[0.09, 0.035, 0.012], [0.14, 0.07, 0.02], [0.13, 0.15, 0.06], [0.10, 0.19, 0.29]]
-)
-HAIR_STYLES = ("short", "side", "curly", "bob", "buzz", "swept")
+_SKIN_TONES = np.array([
+    [0.74, 0.50, 0.39], [0.64, 0.40, 0.28], [0.52, 0.30, 0.20], [0.38, 0.20, 0.12],
+    [0.24, 0.12, 0.072], [0.13, 0.066, 0.042],
+])  # fmt: skip
+_HAIR_COLOURS = np.array([
+    [0.014, 0.011, 0.010], [0.035, 0.020, 0.012], [0.085, 0.045, 0.022], [0.24, 0.14, 0.065],
+    [0.22, 0.065, 0.022], [0.30, 0.29, 0.28],
+])  # fmt: skip
+_EYE_COLOURS = np.array([
+    [0.09, 0.035, 0.012], [0.14, 0.07, 0.02], [0.13, 0.15, 0.06], [0.10, 0.19, 0.29],
+])  # fmt: skip
+# Style and length in metres.
+_HAIR_LENGTHS = {
+    "short": 0.035, "side": 0.06, "curly": 0.05, "bob": 0.2, "buzz": 0.008, "swept": 0.09,
+}  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,20 +61,12 @@ class PersonLook:
 
 @dataclass(frozen=True, kw_only=True)
 class TwinSubject:
-    """One made-up person on a head model.
-
-    Attributes:
-        id: subject id.
-        number: number in the id; seeds the subject's random traits.
-        shape: (S,) shape coefficients.
-        offsets: (V, 3) metres, added to the rest shape, orthogonal to the model's shape space.
-        look: appearance.
-    """
+    """One made-up person on a head model."""
 
     id: str
-    number: int
-    shape: np.ndarray
-    offsets: np.ndarray
+    number: int  # in the id; seeds the subject's random traits
+    shape: np.ndarray  # (S,) coefficients
+    offsets: np.ndarray  # (V, 3) metres, added at rest, orthogonal to the model's shape space
     look: PersonLook
 
 
@@ -82,13 +74,27 @@ def make_subject(model: HeadModel, subject_id: str, number: int, seed: int) -> T
     """Draw one subject; it depends on the seed and the subject's number only."""
     rng = random_stream(seed, number, 1)
     shape = np.clip(0.8 * rng.standard_normal(len(model.shape_names)), -2.0, 2.0)
-    offsets = _displacement(model, random_stream(seed, number, 2))
+    rng = random_stream(seed, number, 2)
+    template = model.template.double().numpy()
+    weight = soft_mask(model)
+    field = np.empty_like(template)
+    for axis in range(3):
+        broad = fractal(template, make_lattice(rng), 0.05, 1)
+        fine = fractal(template, make_lattice(rng), 0.02, 1)
+        field[:, axis] = weight * (broad + 0.35 * fine)
+    # What lies in the span of the shape directions is taken out, so that no tracker can find it.
+    basis = model.shape_dirs.double().numpy().reshape(-1, len(model.shape_names))
+    gram = basis.T @ basis
+    gram += 1e-9 * np.trace(gram) * np.eye(len(gram))
+    field = field - (basis @ np.linalg.solve(gram, basis.T @ field.ravel())).reshape(field.shape)
+    rms = np.sqrt((np.linalg.norm(field, axis=1)[weight > 0.5] ** 2).mean())
+    offsets = (field * (OFFSET_RMS_M / rms)).astype(np.float32)
     look = _make_look(random_stream(seed, number, 3), number)
     return TwinSubject(id=subject_id, number=number, shape=shape, offsets=offsets, look=look)
 
 
 def soft_mask(model: HeadModel) -> np.ndarray:
-    """Weights (V,): 1 on skin, 0 on eyes, teeth, tongue and inside the mouth, soft at the lids."""
+    """Return weights (V,): 1 on skin, 0 on eyes and inside the mouth, soft at the lids."""
     template = model.template.double().numpy()
     inner = np.zeros(len(template), dtype=bool)
     for region in ("left_eyeball", "right_eyeball", "teeth", "tongue", "mouth_interior"):
@@ -103,24 +109,6 @@ def soft_mask(model: HeadModel) -> np.ndarray:
     return weight
 
 
-def _displacement(model: HeadModel, rng: np.random.Generator) -> np.ndarray:
-    """Draw a smooth field (V, 3) float32, metres, that no shape coefficients can produce."""
-    template = model.template.double().numpy()
-    weight = soft_mask(model)
-    field = np.empty_like(template)
-    for axis in range(3):
-        broad = fractal(template, make_lattice(rng), 0.05, 1)
-        fine = fractal(template, make_lattice(rng), 0.02, 1)
-        field[:, axis] = weight * (broad + 0.35 * fine)
-    # What lies in the span of the shape directions is taken out, so that no tracker can find it.
-    basis = model.shape_dirs.double().numpy().reshape(-1, len(model.shape_names))
-    gram = basis.T @ basis
-    gram += 1e-9 * np.trace(gram) * np.eye(len(gram))
-    field = field - (basis @ np.linalg.solve(gram, basis.T @ field.ravel())).reshape(field.shape)
-    rms = np.sqrt((np.linalg.norm(field, axis=1)[weight > 0.5] ** 2).mean())
-    return (field * (OFFSET_RMS_M / rms)).astype(np.float32)
-
-
 def _make_look(rng: np.random.Generator, number: int) -> PersonLook:
     """Draw an appearance; neighbouring numbers get unlike skin and hair."""
     # A step of 0.38 through [0, 1) visits it evenly, so that even four subjects are varied.
@@ -133,8 +121,7 @@ def _make_look(rng: np.random.Generator, number: int) -> PersonLook:
     hair = _blend(_HAIR_COLOURS[:5], hair_place)
     if age > 56:
         hair = 0.4 * hair + 0.6 * _HAIR_COLOURS[5]
-    style = HAIR_STYLES[(number + int(rng.integers(0, 2)) * 3) % len(HAIR_STYLES)]
-    length = {"short": 0.035, "side": 0.06, "curly": 0.05, "bob": 0.2, "buzz": 0.008, "swept": 0.09}
+    style = list(_HAIR_LENGTHS)[(number + int(rng.integers(0, 2)) * 3) % len(_HAIR_LENGTHS)]
     eyes = _blend(_EYE_COLOURS, rng.uniform(0.0, 1.0) * (1.0 - 0.8 * float(dark)))
     return PersonLook(
         skin=skin,
@@ -148,7 +135,7 @@ def _make_look(rng: np.random.Generator, number: int) -> PersonLook:
         eyes=eyes,
         hair=hair * rng.uniform(0.85, 1.15),
         hair_style=style,
-        hair_length_m=length[style] * float(rng.uniform(0.8, 1.25)),
+        hair_length_m=_HAIR_LENGTHS[style] * float(rng.uniform(0.8, 1.25)),
         cloth=rng.uniform(0.03, 0.3) * rng.uniform(0.7, 1.3, 3),
         age=age,
         gender=gender,
@@ -160,3 +147,163 @@ def _blend(table: np.ndarray, place: float) -> np.ndarray:
     x = float(np.clip(place, 0.0, 1.0)) * (len(table) - 1)
     low = min(int(x), len(table) - 2)
     return table[low] + (table[low + 1] - table[low]) * (x - low)
+
+
+@dataclass(frozen=True, kw_only=True)
+class TwinPerformance:
+    """Parameters of every frame, in head-model terms; world = R @ head + t, metres."""
+
+    cues: tuple[tuple[str, int, int], ...]  # expression id, first and last frame of each window
+    peaks: dict[str, int]  # expression id -> frame at which the expression is strongest
+    strength: np.ndarray  # (F,) how far the frame's expression is played, 0 to 1
+    expression: np.ndarray  # (F, X) coefficients
+    jaw: np.ndarray  # (F, 3) axis-angle, radians; so are neck (F, 3) and eyes (F, 6)
+    neck: np.ndarray
+    eyes: np.ndarray
+    R: np.ndarray  # (F, 3, 3)
+    t: np.ndarray  # (F, 3)
+
+    @property
+    def frames(self) -> int:
+        """Number of frames."""
+        return len(self.strength)
+
+
+# What a face does that is not performing.
+_FIDGETS = ("mouthPress_L", "mouthPress_R", "browInnerUp_L", "browDown_R", "mouthSmile_L")
+
+
+def perform(
+    model: HeadModel,
+    script: Sequence[Expression],
+    frames_per_expression: int,
+    fps: float,
+    number: int,
+    seed: int,
+) -> TwinPerformance:
+    """Play a script once: rest, onset, an apex anywhere in the window's middle, offset, rest.
+
+    Raises:
+        HeadModelError: the head model does not name the script's expression directions.
+    """
+    names = {name: column for column, name in enumerate(model.expression_names)}
+    wanted = {name for entry in script for name in entry.controls}
+    if len(wanted & set(names)) < 0.6 * len(wanted):
+        raise HeadModelError(
+            f"head model {model.name!r}: names {len(wanted & set(names))} of the script's"
+            f" {len(wanted)} controls; the twin needs a head with named expressions, such as"
+            " 'procedural' or ICT-FaceKit"
+        )
+    count = frames_per_expression * len(script)
+    expression = np.zeros((count, len(names)))
+    jaw, neck = np.zeros((count, 3)), np.zeros((count, 3))
+    gaze, strength = np.zeros((count, 2)), np.zeros(count)
+    cues, peaks = [], {}
+    for order, entry in enumerate(script):
+        # Seeded by the id, so that leaving expressions out does not change the others.
+        rng = random_stream(seed, number, 4, *entry.id.encode())
+        first = order * frames_per_expression
+        peak, curve = _envelope(rng, frames_per_expression, fps)
+        span = slice(first, first + frames_per_expression)
+        expression[span] += curve[:, None] * _played(rng, entry, names)
+        jaw[span] += curve[:, None] * np.array(entry.jaw) * rng.uniform(0.85, 1.1)
+        neck[span] += curve[:, None] * (np.array(entry.neck) + rng.normal(0.0, 0.015, 3))
+        gaze[span] += curve[:, None] * np.array(entry.gaze) * rng.uniform(0.85, 1.05)
+        gaze[span] += rng.normal(0.0, 0.02, 2)
+        strength[span] = curve
+        _blink(rng, expression[span], peak, names)
+        cues.append((entry.id, first, first + frames_per_expression - 1))
+        peaks[entry.id] = first + peak
+    rng = random_stream(seed, number, 5)
+    for name in (name for name in _FIDGETS if name in names):
+        small = 0.08 * np.maximum(_wander(rng, count, fps), 0.0)
+        expression[:, names[name]] += (1.0 - strength) * small
+    R, t = _sway(random_stream(seed, number, 6), model, count, fps)
+    eyes = np.tile(matrix_to_axis_angle(gaze_rotation(gaze)), (1, 2))
+    return TwinPerformance(
+        cues=tuple(cues), peaks=peaks, strength=strength, expression=expression,
+        jaw=jaw, neck=neck, eyes=eyes, R=R, t=t,
+    )  # fmt: skip
+
+
+def gaze_rotation(gaze: np.ndarray) -> np.ndarray:
+    """Return eye rotations (F, 3, 3) of yaw to the subject's left (+x) and pitch upwards (F, 2)."""
+    zero = np.zeros(len(gaze))
+    yaw = axis_angle_to_matrix(np.stack([zero, gaze[:, 0], zero], axis=1))
+    pitch = axis_angle_to_matrix(np.stack([-gaze[:, 1], zero, zero], axis=1))
+    return yaw @ pitch
+
+
+def _envelope(rng: np.random.Generator, count: int, fps: float) -> tuple[int, np.ndarray]:
+    """Draw a peak's index and strength (count,), 1 at the peak and less everywhere else."""
+    low, high = max(1, round(0.3 * count)), max(2, round(0.72 * count))
+    peak = int(rng.integers(low, min(high, count - 2) + 1))
+    # Both ends of the window are near rest; a movement rarely takes over half a second.
+    onset = min(rng.uniform(0.2, 0.36) * count, peak + 0.9, 0.7 * fps)
+    offset = min(rng.uniform(0.24, 0.42) * count, count - peak - 0.1, 0.7 * fps)
+    hold = rng.uniform(0.1, 0.9) * min(0.06 * count, 0.5 * fps)
+    d = np.arange(count) - peak
+    away = np.maximum(np.abs(d) - hold, 0.0) / np.where(d < 0, max(onset, 1.3), max(offset, 1.3))
+    sag = 1.0 - 0.06 * np.minimum(np.abs(d) / max(1.0, 0.15 * count), 1.0)
+    return peak, sag * (1.0 - smoothstep(away, 0.0, 1.0))
+
+
+def _played(rng: np.random.Generator, entry: Expression, names: dict[str, int]) -> np.ndarray:
+    """Return the coefficients (X,) of this subject's version of an expression at its peak."""
+    out = np.zeros(len(names))
+    strength = rng.uniform(0.78, 1.05)
+    for name, value in entry.controls.items():
+        gain = rng.normal(1.0, 0.1)
+        if name in names:
+            out[names[name]] = np.clip(strength * gain * value, -1.0, 1.1)
+    if entry.controls:
+        # People rarely move one muscle alone: a few others join in a little.
+        for column in rng.choice(len(names), size=min(3, len(names)), replace=False):
+            if list(names)[column].startswith(("mouth", "brow", "cheek", "nose")):
+                out[column] += rng.uniform(0.0, 0.08)
+    return out
+
+
+def _blink(
+    rng: np.random.Generator, expression: np.ndarray, peak: int, names: dict[str, int]
+) -> None:
+    """Blink in some windows, at least two frames away from the peak; edits ``expression``."""
+    count = len(expression)
+    allowed = [f for f in range(count) if abs(f - peak) >= 2 + count // 24]
+    if rng.uniform() > 0.35 or not allowed:
+        return
+    centre, length = allowed[int(rng.integers(len(allowed)))], 1.0 + count / 40.0
+    closing = np.clip(1.2 - np.abs(np.arange(count) - centre) / length, 0.0, 1.0)
+    closing[abs(np.arange(count) - peak) < 2] = 0.0
+    for side in ("eyeBlink_L", "eyeBlink_R"):
+        if side in names:
+            column = names[side]
+            expression[:, column] = np.maximum(expression[:, column], closing)
+
+
+def _wander(rng: np.random.Generator, count: int, fps: float) -> np.ndarray:
+    """Smooth motion (F,) of about unit size: a few slow sines."""
+    time = np.arange(count) / fps
+    waves = [
+        np.sin(2 * np.pi * (time / period + rng.uniform()))
+        for period in rng.uniform([1.3, 2.5, 5.0], [2.5, 5.0, 9.0])
+    ]
+    return np.sum(waves, axis=0) / 1.5
+
+
+def _sway(
+    rng: np.random.Generator, model: HeadModel, count: int, fps: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Place the head in the world: turned about the neck joint, near the rig's target."""
+    template = model.template.double().numpy()
+    head = (model.regions["face"] | model.regions["scalp"]).numpy()
+    centre = 0.5 * (template[head].min(0) + template[head].max(0))
+    pivot = (model.joint_regressor.double().numpy() @ template)[1]
+    lean = rng.normal(0.0, 1.0, 3) * np.radians([2.5, 4.0, 1.5])
+    turn = np.stack([_wander(rng, count, fps) for _ in range(3)], axis=1) * np.radians(
+        [1.2, 1.6, 0.8]
+    )
+    drift = np.stack([_wander(rng, count, fps) for _ in range(3)], axis=1) * 0.003
+    R = axis_angle_to_matrix(lean + turn)
+    place = TARGET - centre + rng.uniform(-0.008, 0.008, 3) + drift
+    return R, pivot + place - R @ pivot

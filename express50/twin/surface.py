@@ -1,4 +1,4 @@
-"""Ray casting against triangle meshes (Embree through Open3D), and helpers on meshes."""
+"""What the twin is made with: ray casting (Embree), vectors, meshes, and smooth random fields."""
 
 from __future__ import annotations
 
@@ -7,19 +7,17 @@ import open3d as o3d
 import scipy.sparse
 
 from express50.geometry.conventions import cell_centres, corner_to_cell
+from express50.geometry.raycast import mesh_scene
 
 MISS = np.uint32(0xFFFFFFFF)
+LATTICE = 32
 
 
 class Caster:
     """A compiled triangle scene; one thread, so that processes do not fight over cores."""
 
     def __init__(self, vertices: np.ndarray, faces: np.ndarray) -> None:
-        self._scene = o3d.t.geometry.RaycastingScene(nthreads=1)
-        self._scene.add_triangles(
-            o3d.core.Tensor(np.ascontiguousarray(vertices, dtype=np.float32)),
-            o3d.core.Tensor(np.ascontiguousarray(faces, dtype=np.uint32)),
-        )
+        self._scene = mesh_scene(vertices, faces)
 
     def cast(
         self, origin: np.ndarray, directions: np.ndarray
@@ -49,6 +47,16 @@ class Caster:
         return answer.numpy()
 
 
+def unit(vectors: np.ndarray) -> np.ndarray:
+    """Scale vectors (..., 3) to length 1; zero stays zero."""
+    return vectors / np.maximum(np.sqrt(dot(vectors, vectors)), 1e-20)
+
+
+def dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Return products (..., 1) of vectors (..., 3); much quicker than a sum over the axis."""
+    return np.einsum("...i,...i->...", a, b)[..., None]
+
+
 def face_to_vertex(faces: np.ndarray, count: int) -> scipy.sparse.csr_matrix:
     """Return sparse (V, F) matrix that sums a quantity of the faces (F, 3) at their vertices."""
     rows = faces.ravel()
@@ -60,20 +68,9 @@ def face_to_vertex(faces: np.ndarray, count: int) -> scipy.sparse.csr_matrix:
 def vertex_normals(
     vertices: np.ndarray, faces: np.ndarray, incidence: scipy.sparse.csr_matrix
 ) -> np.ndarray:
-    """Unit normals (V, 3), area weighted; ``incidence`` comes from :func:`face_to_vertex`."""
+    """Return unit normals (V, 3), area weighted; ``incidence`` is `face_to_vertex`'s."""
     a, b, c = (vertices[faces[:, k]] for k in range(3))
-    total = incidence @ np.cross(b - a, c - a)
-    return unit(total)
-
-
-def unit(vectors: np.ndarray) -> np.ndarray:
-    """Scale vectors (..., 3) to length 1; zero stays zero."""
-    return vectors / np.maximum(np.sqrt(dot(vectors, vectors)), 1e-20)
-
-
-def dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Products (..., 1) of vectors (..., 3); several times quicker than a sum over the axis."""
-    return np.einsum("...i,...i->...", a, b)[..., None]
+    return unit(incidence @ np.cross(b - a, c - a))
 
 
 def smooth_over_mesh(values: np.ndarray, faces: np.ndarray, rounds: int) -> np.ndarray:
@@ -91,36 +88,6 @@ def smooth_over_mesh(values: np.ndarray, faces: np.ndarray, rounds: int) -> np.n
     return values
 
 
-class StarMap:
-    """Distance of a head's outer surface from its centre, in every direction."""
-
-    def __init__(self, vertices: np.ndarray, faces: np.ndarray, centre: np.ndarray) -> None:
-        self.centre = np.asarray(centre, dtype=np.float64)
-        self._rows, self._columns = 192, 384
-        az = cell_centres(self._columns) / self._columns * 2 * np.pi - np.pi
-        el = cell_centres(self._rows) / self._rows * np.pi - 0.5 * np.pi
-        grid_az, grid_el = np.meshgrid(az, el)
-        out = spherical_to_unit(grid_az, grid_el).reshape(-1, 3)
-        # From outside inwards: the outermost surface counts, not what lies below it.
-        distance, _, _ = Caster(vertices, faces).cast(self.centre + 1.0 * out, -out)
-        radius = np.where(np.isfinite(distance), 1.0 - distance, np.nan)
-        radius = radius.reshape(self._rows, self._columns)
-        self._radius = np.where(np.isfinite(radius) & (radius > 0), radius, 0.0)
-
-    def radius(self, directions: np.ndarray) -> np.ndarray:
-        """Radius (N,) in unit directions (N, 3), metres, bilinear; 0 where nothing is hit."""
-        az, el = unit_to_spherical(directions)
-        x = corner_to_cell((az + np.pi) / (2 * np.pi) * self._columns)
-        y = corner_to_cell((el + 0.5 * np.pi) / np.pi * self._rows)
-        y = np.clip(y, 0, self._rows - 1.001)
-        x0, y0 = np.floor(x).astype(int), np.floor(y).astype(int)
-        fx, fy = x - x0, y - y0
-        xa, xb = x0 % self._columns, (x0 + 1) % self._columns
-        low = self._radius[y0, xa] * (1 - fx) + self._radius[y0, xb] * fx
-        high = self._radius[y0 + 1, xa] * (1 - fx) + self._radius[y0 + 1, xb] * fx
-        return low * (1 - fy) + high * fy
-
-
 def spherical_to_unit(azimuth: np.ndarray, elevation: np.ndarray) -> np.ndarray:
     """Return unit vectors (..., 3): azimuth from +z towards +x, elevation towards +y, radians."""
     flat = np.cos(elevation)
@@ -131,3 +98,87 @@ def unit_to_spherical(directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return azimuth and elevation (N,) of vectors (N, 3) of any length, radians."""
     x, y, z = directions[:, 0], directions[:, 1], directions[:, 2]
     return np.arctan2(x, z), np.arctan2(y, np.sqrt(x * x + z * z))
+
+
+def sample_panorama(panorama: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Interpolate a panorama (H, W, C), closed in x, at cells x and y < H - 1 (N,)."""
+    height, width = panorama.shape[:2]
+    left, top = np.floor(x), np.floor(y)
+    fx, fy = (x - left)[:, None], (y - top)[:, None]
+    column, row = left.astype(np.int32), top.astype(np.int32) * width
+    a, b = column % width, (column + 1) % width
+    flat = panorama.reshape(height * width, -1)
+    low = flat[row + a] * (1 - fx) + flat[row + b] * fx
+    row = row + width
+    high = flat[row + a] * (1 - fx) + flat[row + b] * fx
+    return low * (1 - fy) + high * fy
+
+
+class StarMap:
+    """Distance of a head's outer surface from its centre, in every direction."""
+
+    def __init__(self, vertices: np.ndarray, faces: np.ndarray, centre: np.ndarray) -> None:
+        self.centre = np.asarray(centre, dtype=np.float64)
+        rows, columns = 192, 384
+        az = cell_centres(columns) / columns * 2 * np.pi - np.pi
+        el = cell_centres(rows) / rows * np.pi - 0.5 * np.pi
+        out = spherical_to_unit(*np.meshgrid(az, el)).reshape(-1, 3)
+        # From outside inwards: the outermost surface counts, not what lies below it.
+        distance, _, _ = Caster(vertices, faces).cast(self.centre + 1.0 * out, -out)
+        radius = np.where(distance < 1.0, 1.0 - distance, 0.0)
+        self._radius = radius.reshape(rows, columns, 1)
+
+    def radius(self, directions: np.ndarray) -> np.ndarray:
+        """Return the radius (N,) in unit directions (N, 3), metres; 0 where nothing is hit."""
+        az, el = unit_to_spherical(directions)
+        rows, columns, _ = self._radius.shape
+        x = corner_to_cell((az + np.pi) / (2 * np.pi) * columns)
+        y = np.clip(corner_to_cell((el + 0.5 * np.pi) / np.pi * rows), 0, rows - 1.001)
+        return sample_panorama(self._radius, x, y)[:, 0]
+
+
+def random_stream(seed: int, *path: int) -> np.random.Generator:
+    """Make a generator of its own for a seed and a path such as (subject, camera, frame)."""
+    return np.random.default_rng([seed, *path])
+
+
+def make_lattice(rng: np.random.Generator) -> np.ndarray:
+    """Return random values (32, 32, 32) in [-1, 1], float32, that `noise` interpolates."""
+    return rng.uniform(-1.0, 1.0, (LATTICE,) * 3).astype(np.float32)
+
+
+def noise(points: np.ndarray, lattice: np.ndarray) -> np.ndarray:
+    """Return value noise (N,), about -1 to 1, at points (N, 3) in lattice cells; periodic."""
+    p = np.asarray(points, dtype=np.float32)
+    cell = np.floor(p)
+    f = p - cell
+    f = f * f * (3.0 - 2.0 * f)
+    i0 = cell.astype(np.int32) & (LATTICE - 1)
+    i1 = (i0 + 1) & (LATTICE - 1)
+    flat = lattice.ravel()
+    x0, x1 = i0[:, 0] * LATTICE * LATTICE, i1[:, 0] * LATTICE * LATTICE
+    y0, y1 = i0[:, 1] * LATTICE, i1[:, 1] * LATTICE
+    z0, z1 = i0[:, 2], i1[:, 2]
+    fx, fy, fz = f.T
+    near, far = (
+        _mix(_mix(flat[x0 + y0 + z], flat[x1 + y0 + z], fx),
+             _mix(flat[x0 + y1 + z], flat[x1 + y1 + z], fx), fy)
+        for z in (z0, z1)
+    )  # fmt: skip
+    return _mix(near, far, fz)
+
+
+def _mix(a: np.ndarray, b: np.ndarray, t: np.ndarray) -> np.ndarray:
+    return a + (b - a) * t
+
+
+def fractal(
+    points: np.ndarray, lattice: np.ndarray, wavelength: float, octaves: int, gain: float = 0.5
+) -> np.ndarray:
+    """Sum (N,) octaves of `noise` at points (N, 3); ``wavelength`` in their unit."""
+    total = np.zeros(len(points), dtype=np.float32)
+    for octave in range(octaves):
+        # The shift keeps lattice points of the octaves, where each is extremal, apart.
+        scaled = np.asarray(points) * (2.0**octave / wavelength) + 7.31 * octave
+        total += gain**octave * noise(scaled, lattice)
+    return total

@@ -18,15 +18,14 @@ import torch
 from express50.errors import CaptureError
 from express50.files.calibration import read_cameras, write_cameras
 from express50.geometry.cameras import Camera, rays
-from express50.geometry.transforms import make_transform
+from express50.geometry.transforms import make_transform, rigid_fit
 from express50.head.load import load_head
 from express50.head.model import HeadModel
 from express50.head.model import landmarks as head_landmarks
 from express50.twin import render
 from express50.twin.body import Body, Extras, assemble, head_vertices, pose_body
 from express50.twin.hair import HairMesh
-from express50.twin.performance import TwinPerformance
-from express50.twin.subjects import PersonLook, TwinSubject
+from express50.twin.subjects import PersonLook, TwinPerformance, TwinSubject
 from express50.twin.surface import MISS, Caster
 
 SKIN_M = 0.5e-3  # hair roots stand on the skin; what lies this near to it is skin
@@ -161,7 +160,7 @@ class Truth:
     def _compile(self, subject: str, frame: int) -> tuple[Caster, np.ndarray]:
         body, play = self._subject(subject)
         self._check_frame(subject, play, frame)
-        vertices = pose_body(body, play, frame, with_normals=False).vertices
+        vertices = pose_body(body, play, frame).vertices
         return Caster(vertices, body.faces), vertices
 
     def _check_frame(self, subject: str, play: TwinPerformance, frame: int) -> None:
@@ -183,40 +182,33 @@ class Truth:
         play = TwinPerformance(
             cues=tuple((str(e), int(a), int(b)) for e, a, b in about["cues"]), peaks=peaks, **arrays
         )
-        with np.load(folder / "body.npz", allow_pickle=False) as data:
-            body = _read_body(about, {name: data[name] for name in data.files})
+        with np.load(folder / "body.npz", allow_pickle=False) as stored:
+            data = dict(stored)
+        look: dict[str, Any] = about["look"]
+        look |= {name: np.array(value) for name, value in look.items() if isinstance(value, list)}
+        person = TwinSubject(
+            id=about["id"], number=about["number"], shape=data["shape"], offsets=data["offsets"],
+            look=PersonLook(**look),
+        )  # fmt: skip
+        # What only colours need is left empty.
+        blank = np.zeros_like(data["hair_vertices"])
+        hair = HairMesh(
+            vertices=data["hair_vertices"], faces=data["hair_faces"], tangents=blank, normals=blank,
+            colours=blank,
+        )  # fmt: skip
+        extras = Extras(
+            hair=hair, cloth_vertices=data["cloth_vertices"], cloth_faces=data["cloth_faces"],
+            skull=data["skull"], skull_rest=data["skull_rest"],
+        )  # fmt: skip
+        body = assemble(load_head(about["head"]), person, extras, data["scalp"], data["centre"])
         return body, play
 
 
-def _read_body(about: dict, data: dict[str, np.ndarray]) -> Body:
-    """Read the body from its stored geometry; what only colours need is left empty."""
-    fields: dict[str, Any] = about["look"]
-    for name, value in fields.items():
-        fields[name] = np.array(value) if isinstance(value, list) else value
-    look = PersonLook(**fields)
-    subject = TwinSubject(
-        id=about["id"], number=about["number"], shape=data["shape"], offsets=data["offsets"],
-        look=look,
-    )  # fmt: skip
-    blank = np.zeros_like(data["hair_vertices"])
-    hair = HairMesh(
-        vertices=data["hair_vertices"], faces=data["hair_faces"], tangents=blank, normals=blank,
-        colours=blank,
-    )  # fmt: skip
-    extras = Extras(
-        hair=hair, cloth_vertices=data["cloth_vertices"], cloth_faces=data["cloth_faces"],
-        skull=data["skull"], skull_rest=data["skull_rest"],
-    )  # fmt: skip
-    return assemble(load_head(about["head"]), subject, extras, data["scalp"], data["centre"])
-
-
-def align_worlds(
-    estimated: Mapping[str, Camera], true: Mapping[str, Camera], lever_m: float = 1.0
-) -> np.ndarray:
+def align_worlds(estimated: Mapping[str, Camera], true: Mapping[str, Camera]) -> np.ndarray:
     """Return ``world_true_from_estimated`` (4, 4), rigid, from cameras that both rigs have.
 
     Centres and viewing frames count together: each camera gives its centre and the ends of its
-    axes at ``lever_m``, so that even two cameras, or cameras in one line, fix the rotation.
+    axes, a metre long, so that even two cameras, or cameras in one line, fix the rotation.
 
     Raises:
         ValueError: no camera is in both.
@@ -226,16 +218,13 @@ def align_worlds(
         raise ValueError(
             f"rigs share no camera: estimated {sorted(estimated)}, true {sorted(true)}"
         )
-    source = np.concatenate([_frame_points(estimated[name], lever_m) for name in shared])
-    target = np.concatenate([_frame_points(true[name], lever_m) for name in shared])
-    mean_s, mean_t = source.mean(0), target.mean(0)
-    U, _, Vt = np.linalg.svd((target - mean_t).T @ (source - mean_s))
-    R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
-    return make_transform(R, mean_t - R @ mean_s)
+    source = np.concatenate([_frame_points(estimated[name]) for name in shared])
+    target = np.concatenate([_frame_points(true[name]) for name in shared])
+    return make_transform(*rigid_fit(source, target))
 
 
-def _frame_points(camera: Camera, lever: float) -> np.ndarray:
+def _frame_points(camera: Camera) -> np.ndarray:
     pose = camera.world_from_cam
-    ends = pose[:3, 3] + lever * pose[:3, :3].T
+    ends = pose[:3, 3] + pose[:3, :3].T
     # Both ends of every axis, so that the points' mean is the centre.
     return np.concatenate([pose[None, :3, 3], ends, 2 * pose[:3, 3] - ends])

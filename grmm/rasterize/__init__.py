@@ -13,15 +13,15 @@ import torch
 from torch import Tensor
 
 from express50 import native
-from grmm.rasterize.interface import (
+from grmm.rasterize.projection import (
     NotFiniteTensorError,
     Pinhole,
     RenderBuffers,
     RenderOptions,
     RenderOutput,
     Splats,
+    rasterize_reference,
 )
-from grmm.rasterize.reference import rasterize_reference
 
 __all__ = [
     "BACKENDS",
@@ -48,8 +48,6 @@ def rasterize(
     height: int,
     *,
     background: Tensor | None = None,
-    near: float = 0.01,
-    eps2d: float = 0.3,
     antialiased: bool = False,
     median_depth: bool = False,
     normals: bool = False,
@@ -59,7 +57,7 @@ def rasterize(
     """Render Gaussians into one pinhole image; differentiable in every tensor argument.
 
     Args:
-        means: (N, 3) metres, world. N may be 0.
+        means: (N, 3) metres, world. N may be 0; those nearer than NEAR_M are dropped.
         quats: (N, 4) wxyz, any length; a quaternion of zero length stands for no rotation.
         scales: (N, 3) standard deviations, metres, along the rotated axes; 0 is allowed.
         opacities: (N,) in [0, 1]; under 1/255 a Gaussian is invisible.
@@ -67,11 +65,9 @@ def rasterize(
         K: (3, 3) pixels, corner origin, no skew; the principal point may lie anywhere.
         cam_from_world: (4, 4) rigid. Points are taken to the camera in float64, so a float64
             camera keeps float32 Gaussians precise far from the origin.
-        width: image width, pixels.
-        height: image height, pixels.
+        width: pixels.
+        height: pixels.
         background: (C,) colour behind the Gaussians; black without. Depth never gets one.
-        near: metres; Gaussians whose mean is not beyond it are dropped.
-        eps2d: px^2, added to the diagonal of every 2D covariance (> 0).
         antialiased: scale opacity by sqrt(det before / det after dilation) (Mip-Splatting, 2024).
         median_depth: also give the median depth.
         normals: also give blended normals.
@@ -86,14 +82,8 @@ def rasterize(
     """
     splats = Splats(means=means, quats=quats, scales=scales, opacities=opacities, colors=colors)
     camera = Pinhole(K=K, cam_from_world=cam_from_world, width=width, height=height)
-    options = RenderOptions(
-        near=near,
-        eps2d=eps2d,
-        antialiased=antialiased,
-        median_depth=median_depth,
-        normals=normals,
-    )
-    _check(splats, camera, background, options)
+    options = RenderOptions(antialiased=antialiased, median_depth=median_depth, normals=normals)
+    _check(splats, camera, background)
     name = resolve_backend(backend, means.device)
     if name == "cpu":  # a backend is imported when it is used: gsplat may start a long build
         from grmm.rasterize.cpu import rasterize_cpu
@@ -107,11 +97,7 @@ def rasterize(
 
 
 def resolve_backend(backend: str = "auto", device: torch.device | str = "cpu") -> str:
-    """Resolve ``auto`` to the backend for ``device``; other names pass unchanged.
-
-    Raises:
-        ValueError: the name is unknown.
-    """
+    """Resolve ``auto`` to the backend for ``device``; a ValueError refuses unknown names."""
     if backend not in BACKENDS:
         raise ValueError(f"backend is {backend!r}, expected one of {', '.join(BACKENDS)}")
     if backend != "auto":
@@ -124,9 +110,7 @@ def resolve_backend(backend: str = "auto", device: torch.device | str = "cpu") -
     return "reference"
 
 
-def _check(
-    splats: Splats, camera: Pinhole, background: Tensor | None, options: RenderOptions
-) -> None:
+def _check(splats: Splats, camera: Pinhole, background: Tensor | None) -> None:
     """Check shapes, dtypes, devices and values; the ValueError names the argument."""
     n, channels = splats.means.shape[0], splats.colors.shape[-1]
     tensors = vars(splats) | {"K": camera.K, "cam_from_world": camera.cam_from_world}
@@ -152,8 +136,6 @@ def _check(
         _check_finite(name, tensor)
     if camera.width < 1 or camera.height < 1:
         raise ValueError(f"image size is {camera.width} x {camera.height}, expected at least 1 x 1")
-    if not options.near > 0 or not options.eps2d > 0:
-        raise ValueError(f"near is {options.near} and eps2d {options.eps2d}, expected both above 0")
     K = camera.K.detach().tolist()
     (fx, skew, _), (below, fy, _), bottom = K
     if fx <= 0 or fy <= 0 or skew != 0 or below != 0 or bottom != [0.0, 0.0, 1.0]:

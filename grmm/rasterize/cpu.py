@@ -16,8 +16,17 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from express50 import native
-from grmm.rasterize.interface import Pinhole, RenderBuffers, RenderOptions, RenderOutput, Splats
-from grmm.rasterize.projection import depth_of_rays, expected_depth
+from grmm.rasterize.projection import (
+    DILATION_PX2,
+    NEAR_M,
+    Pinhole,
+    RenderBuffers,
+    RenderOptions,
+    RenderOutput,
+    Splats,
+    depth_of_rays,
+    expected_depth,
+)
 
 _TILE = 16  # kTile of tiles.h
 _SPLAT = 10  # numbers in Splat of blend.h
@@ -51,12 +60,7 @@ def rasterize_cpu(
     options: RenderOptions,
     buffers: RenderBuffers | None = None,
 ) -> RenderOutput:
-    """Render; see ``grmm.rasterize``.
-
-    Raises:
-        ValueError: the tensors are not on the CPU, or the Gaussians are too large to be binned.
-        express50.native.NativeLibraryError: the library was not built; says how to fix it.
-    """
+    """Render; see ``grmm.rasterize``."""
     device = scene.means.device
     if device.type != "cpu":
         raise ValueError(f"backend 'cpu' got tensors on {device}; use 'auto' or 'gsplat'")
@@ -108,7 +112,8 @@ class _Rasterize(torch.autograd.Function):
         splats, boxes, starts, ids = _bin(camera, geometry, colors)
         used = torch.empty(starts.numel() - 1, dtype=torch.int32)
         blended = (splats, boxes, colors, background, starts, ids, used)
-        shape, dtype, take = (camera.height, camera.width), means.dtype, (buffers or _fresh).take
+        shape, dtype = (camera.height, camera.width), means.dtype
+        take = buffers.take if buffers else lambda _, *new: _empty(*new)
         image = take("image", (*shape, colors.shape[1]), dtype)
         weighted, alpha = take("weighted", shape, dtype), take("alpha", shape, dtype)
         median = take("median", shape, dtype) if options.median_depth else None
@@ -181,8 +186,8 @@ def _camera(
         intrinsics=(fx, fy, cx, cy),
         R=tuple(x for row in pose[:3] for x in row[:3]),
         t=tuple(row[3] for row in pose[:3]),
-        near=options.near,
-        eps2d=options.eps2d,
+        near=NEAR_M,
+        eps2d=DILATION_PX2,
         width=size[0],
         height=size[1],
         antialiased=options.antialiased,
@@ -192,7 +197,7 @@ def _camera(
 
 
 def _empty(shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
-    """Return an uninitialised tensor, in huge pages where it is large and the system has them."""
+    """Return an uninitialised tensor; a large one asks for huge pages."""
     tensor = torch.empty(shape, dtype=dtype)
     size = tensor.numel() * tensor.element_size()
     if size >= _HUGE:
@@ -200,19 +205,7 @@ def _empty(shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
     return tensor
 
 
-class _FreshMemory(RenderBuffers):
-    """Buffers that never use memory again."""
-
-    def take(self, name: str, shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
-        """Allocate new memory."""
-        return _empty(shape, dtype)
-
-
-_fresh = _FreshMemory()
-
-
 def _contiguous(tensor: Tensor | None) -> Tensor | None:
-    """Return the tensor in one block of memory, or None."""
     return None if tensor is None else tensor.contiguous()
 
 

@@ -13,10 +13,13 @@ import torch
 from torch import Tensor
 
 from express50.geometry.conventions import cell_to_corner
-from grmm.rasterize.interface import Pinhole, RenderOptions, RenderOutput, Splats
 from grmm.rasterize.projection import (
     ALPHA_MAX,
+    Pinhole,
     Projection,
+    RenderOptions,
+    RenderOutput,
+    Splats,
     depth_of_rays,
     expected_depth,
     project,
@@ -30,15 +33,10 @@ WIDTHS = (1, 2, 3, 4, 5, 8, 9, 16, 17, 32)  # channel counts that every gsplat r
 def rasterize_gsplat(
     scene: Splats, camera: Pinhole, background: Tensor | None, options: RenderOptions
 ) -> RenderOutput:
-    """Render; see ``grmm.rasterize``.
-
-    Raises:
-        ValueError: the tensors are not float32 on a CUDA device.
-        RuntimeError: there is no CUDA device, or gsplat is not installed.
-    """
+    """Render; see ``grmm.rasterize``. The tensors must be float32 on a CUDA device."""
     gsplat = _require_gsplat(scene.means)
     width, height, K = camera.width, camera.height, camera.K
-    splats = project(scene, camera, options.near, options.eps2d, options.antialiased)
+    splats = project(scene, camera, options.antialiased)
     tiles = _tiles(gsplat, splats, width, height)
     channels = [plane_channels(splats, K), splats.normals[:, : 3 * options.normals], scene.colors]
     passes = []

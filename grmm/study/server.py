@@ -17,11 +17,12 @@ from urllib.parse import parse_qs, urlsplit
 
 from express50.errors import FormatError
 from express50.files.text import parse_json
-from grmm.study.design import trials
-from grmm.study.results import append_answer, check_answer, read_answers, read_study
+from grmm.study import append_answer, check_answer, read_answers, read_study, trials
 
 ANSWER_LIMIT = 4096  # bytes of one POST
 PAGE = "page.html"
+Reply = tuple[HTTPStatus, str, bytes]
+NOT_FOUND: Reply = (HTTPStatus.NOT_FOUND, "text/plain", b"no such page\n")
 
 
 def make_server(out: Path, host: str = "127.0.0.1", port: int = 8000) -> ThreadingHTTPServer:
@@ -30,61 +31,23 @@ def make_server(out: Path, host: str = "127.0.0.1", port: int = 8000) -> Threadi
     Raises:
         FormatError: OUT holds no study, or the port is taken.
     """
-    study = read_study(out)
-    read_answers(out, study)  # report a damaged file now, not after an hour of answers
-    page = resources.files("grmm.study").joinpath(PAGE).read_bytes()
-    pictures = {p for e in study["examples"] for p in (e["reference"], *e["pictures"].values())}
-    lock = Lock()
+    study = StudyPages(out)
 
     class Handler(BaseHTTPRequestHandler):
         def do_GET(self) -> None:
-            url = urlsplit(self.path)
-            name = url.path.removeprefix("/")
-            if not name:
-                self._reply(HTTPStatus.OK, "text/html; charset=utf-8", page)
-            elif name == "trials":
-                self._trials(parse_qs(url.query).get("participant", [""])[0])
-            elif name in pictures:
-                self._reply(HTTPStatus.OK, "image/png", (out / name).read_bytes())
-            else:
-                self._reply(HTTPStatus.NOT_FOUND, "text/plain", b"no such page\n")
+            self._reply(*study.get(self.path))
 
         def do_POST(self) -> None:
             length = self.headers.get("Content-Length", "")
             if urlsplit(self.path).path != "/answers":
-                self._reply(HTTPStatus.NOT_FOUND, "text/plain", b"no such page\n")
+                self._reply(*NOT_FOUND)
             elif self.headers.get("Content-Type") != "application/json":
                 # Other sites' pages can post forms without asking, but not this type.
                 self._reply(HTTPStatus.UNSUPPORTED_MEDIA_TYPE, "text/plain", b"expected JSON\n")
             elif not length.isdecimal() or int(length) > ANSWER_LIMIT:
                 self._reply(HTTPStatus.BAD_REQUEST, "text/plain", b"too long\n")
             else:
-                self._answer(self.rfile.read(int(length)))
-
-        def _answer(self, body: bytes) -> None:
-            try:
-                answer = check_answer(study, parse_json(body, "answer", FormatError))
-            except (ValueError, FormatError) as error:
-                self._reply(HTTPStatus.BAD_REQUEST, "text/plain", f"{error}\n".encode())
-                return
-            with lock:
-                append_answer(out, answer)
-            self._reply(HTTPStatus.OK, "application/json", b"{}")
-
-        def _trials(self, text: str) -> None:
-            if not text.isdecimal() or int(text) >= study["participants"]:
-                message = f"participant is {text!r}, expected 0 to {study['participants'] - 1}\n"
-                self._reply(HTTPStatus.BAD_REQUEST, "text/plain", message.encode())
-                return
-            number = int(text)
-            with lock:
-                done = [a for a in read_answers(out, study) if a["participant"] == number]
-            content = {
-                "trials": trials(study, number),
-                "questions": study["questions"],
-                "done": done,
-            }
-            self._reply(HTTPStatus.OK, "application/json", json.dumps(content).encode())
+                self._reply(*study.answer(self.rfile.read(int(length))))
 
         def _reply(self, status: HTTPStatus, kind: str, body: bytes) -> None:
             self.send_response(status)
@@ -101,3 +64,49 @@ def make_server(out: Path, host: str = "127.0.0.1", port: int = 8000) -> Threadi
         return ThreadingHTTPServer((host, port), Handler)
     except OSError as error:
         raise FormatError(f"{host}:{port} cannot be listened on: {error}; try --port") from error
+
+
+class StudyPages:
+    """What the server shows and takes; answers are read and written by one thread at a time."""
+
+    def __init__(self, out: Path) -> None:
+        """Read the study; a damaged file is reported now, not after an hour of answers."""
+        self.out, self.study, self.lock = out, read_study(out), Lock()
+        read_answers(out, self.study)
+        examples = self.study["examples"]
+        self.pictures = {p for e in examples for p in (e["reference"], *e["pictures"].values())}
+
+    def get(self, address: str) -> Reply:
+        """Return the page, a picture, or what one participant sees."""
+        url = urlsplit(address)
+        name = url.path.removeprefix("/")
+        if not name:
+            page = resources.files("grmm.study").joinpath(PAGE).read_bytes()
+            return HTTPStatus.OK, "text/html; charset=utf-8", page
+        if name in self.pictures:
+            return HTTPStatus.OK, "image/png", (self.out / name).read_bytes()
+        if name != "trials":
+            return NOT_FOUND
+        text, count = parse_qs(url.query).get("participant", [""])[0], self.study["participants"]
+        if not text.isdecimal() or int(text) >= count:
+            message = f"participant is {text!r}, expected 0 to {count - 1}\n"
+            return HTTPStatus.BAD_REQUEST, "text/plain", message.encode()
+        number = int(text)
+        with self.lock:
+            answers = read_answers(self.out, self.study)
+        content = {
+            "trials": trials(self.study, number),
+            "questions": self.study["questions"],
+            "done": [answer for answer in answers if answer["participant"] == number],
+        }
+        return HTTPStatus.OK, "application/json", json.dumps(content).encode()
+
+    def answer(self, body: bytes) -> Reply:
+        """Check one answer and append it."""
+        try:
+            answer = check_answer(self.study, parse_json(body, "answer", FormatError))
+        except FormatError as error:
+            return HTTPStatus.BAD_REQUEST, "text/plain", f"{error}\n".encode()
+        with self.lock:
+            append_answer(self.out, answer)
+        return HTTPStatus.OK, "application/json", b"{}"

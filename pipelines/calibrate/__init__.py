@@ -6,21 +6,20 @@ from pathlib import Path
 from typing import Any
 
 from express50.capture.index import calibration_file, read_index
-from express50.contract.extensions import Command
 from express50.contract.layout import Dataset
-from express50.contract.stage import Growth, Result, Stage
+from express50.contract.stage import Command, Growth, Result, Stage
 from pipelines.calibrate.config import PRESETS, CalibrateConfig
 
 __all__ = ["COMMAND", "STAGE", "CalibrateConfig"]
 
 
 def items(dataset: Dataset) -> list[str]:
-    """List the subjects: a rig may be bumped between two, so each has its own cameras."""
+    """Lists the subjects: a rig may be bumped between two, so each has its own cameras."""
     return dataset.subjects()
 
 
 def inputs(dataset: Dataset, item: str, config: CalibrateConfig) -> dict[str, Path | str]:
-    """List the frame index, the landmark weights, and calibration and board images if given."""
+    """Lists the frame index, the landmark weights, and calibration and board images if given."""
     # Imported here, as everything heavy: listing the stages must stay quick.
     from express50.landmarks.network import WEIGHTS
 
@@ -36,7 +35,7 @@ def inputs(dataset: Dataset, item: str, config: CalibrateConfig) -> dict[str, Pa
 
 
 def run(dataset: Dataset, item: str, config: CalibrateConfig, out: Path) -> Result:
-    """Write the cameras of one subject, plots, and from a board the cameras' colour gains."""
+    """Writes the cameras of one subject, plots, and from a board the cameras' colour gains."""
     from pipelines.calibrate.stage import run as work
 
     return work(dataset, item, config, out)
@@ -57,7 +56,7 @@ STAGE = Stage(
 
 
 def add_commands(subparsers: Any) -> None:
-    """Add ``express50 cameras``, see `pipelines.calibrate.cli`."""
+    """Adds ``express50 cameras``, see `pipelines.calibrate.cli`."""
     from pipelines.calibrate.cli import add_commands as add
 
     add(subparsers)

@@ -1,17 +1,17 @@
 """Bundle adjustment of a rig over footage: poses, lenses and points at once, with priors.
 
-COLMAP's adjuster, which the board uses, takes all observations for equally good and has no priors
-on lenses. Footage is seen through landmarks that are off by many pixels beside features that are
-off by a fraction of one, and says little about a lens. So every observation has its own sigma here,
-and every unknown a prior. SciPy's sparse least squares applies its loss to priors too and cannot
-eliminate the points; here they are eliminated as by Triggs et al., Bundle Adjustment, a Modern
-Synthesis, 2000, section 6.1.
+COLMAP's adjuster, which the board uses, weights all observations alike and has no priors on
+lenses. Footage has landmarks that are off by many pixels, features that are off by a fraction of
+one, and says little about a lens. So every observation has its own sigma here, and every unknown a
+prior. Points are eliminated as by Triggs et al., Bundle Adjustment, a Modern Synthesis, 2000,
+section 6.1, which SciPy's sparse least squares cannot do.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -21,28 +21,25 @@ from pipelines.calibrate.tracks import PointTracks
 
 UNKNOWNS = 10
 """Per camera: rotation (3), translation (3), log focal length, centre (2), first radial term."""
-ITERATIONS = 60
-"""Enough for rigs of tens of cameras; longer runs move poses by less than they are off."""
-BEHIND = 1e4
-"""Residual of a point behind its camera, in sigmas."""
+ITERATIONS = 60  # longer runs move poses by less than they are off
+BEHIND = 1e4  # residual of a point behind its camera, in sigmas
 
 
 @dataclass(frozen=True, kw_only=True)
 class RigPriors:
-    """Standard deviations of the unknowns about their expected values: 0 holds, inf frees them."""
+    """Standard deviations of the unknowns about their expected values: 0 holds, inf frees them.
+
+    `focal` and `focal_spread` (against the mean of all cameras) are shares of the focal length,
+    `centre` is a share of the image's diagonal. `bend` is the first radial term's effect at the
+    image's corner, as a share of half the diagonal.
+    """
 
     turn_rad: float = np.inf
-    """Rotation of a camera."""
     move_m: float = np.inf
-    """Translation of a camera, in the units of the points."""
     focal: float = 0.0
-    """Focal length, as a share of it."""
     focal_spread: float = np.inf
-    """Focal length against the mean of all cameras, as a share of it."""
     centre: float = 0.0
-    """Principal point, as a share of the image's diagonal."""
     bend: float = 0.0
-    """First radial term, by its effect at the image's corner, as a share of half the diagonal."""
 
 
 @dataclass(frozen=True)
@@ -57,10 +54,7 @@ class AdjustedRig:
 
 @dataclass(frozen=True)
 class _Linear:
-    """Errors (N, 2), their derivatives by cameras (N, 2, 10) and points (N, 2, 3), and sizes (N,).
-
-    `sizes` are the lengths of the errors in sigmas.
-    """
+    """Errors (N, 2), derivatives by camera (N, 2, 10) and point (N, 2, 3), sizes (N,) in sigmas."""
 
     errors: np.ndarray
     by_camera: np.ndarray
@@ -68,7 +62,7 @@ class _Linear:
     sizes: np.ndarray
 
     def cost(self, scale: float) -> float:
-        """Half the squared sizes, flattened by Cauchy's loss."""
+        """Returns half the squared sizes, flattened by Cauchy's loss."""
         return 0.5 * scale**2 * float(np.log1p((self.sizes / scale) ** 2).sum())
 
 
@@ -82,40 +76,32 @@ def adjust_rig(
     iterations: int = ITERATIONS,
     expected: Mapping[str, Camera] | None = None,
 ) -> AdjustedRig:
-    """Fit cameras and points to tracks by the method of Levenberg and Marquardt.
+    """Fits cameras and points (P, 3) to tracks by the method of Levenberg and Marquardt.
 
-    Args:
-        cameras: start values of the cameras in `tracks.names`.
-        tracks: observations.
-        points: (P, 3) start values.
-        priors: how far unknowns may be from their expected values.
-        scales: residuals, in sigmas, at which Cauchy's weight has fallen to a half. One fit after
-            the other, wide scales first.
-        free: cameras that may change at all; None frees all.
-        iterations: limit per scale.
-        expected: cameras whose lenses the priors are about; None takes the start values. Poses
-            are expected where they start.
+    There is one fit of at most `iterations` per scale, wide ones first: the residual, in sigmas, at
+    which Cauchy's weight has fallen to a half. Only `free` cameras change, None frees all. Priors
+    are about the poses at the start and the lenses of `expected`, None takes those at the start.
     """
     rig = [cameras[name] for name in tracks.names]
     information, columns = _information(rig, priors, free)
-    ties = _focal_ties(rig, priors)
+    ties = np.zeros((len(rig), len(rig)))  # of log focal lengths to their common mean
+    if priors.focal > 0 and np.isfinite(priors.focal_spread):
+        ties = (np.eye(len(rig)) - 1 / len(rig)) / priors.focal_spread**2
     moved = np.zeros((len(rig), UNKNOWNS))
     if expected is not None:
         moved[:, 6:] = [_lens(camera) - _lens(expected[camera.id]) for camera in rig]
     logs = np.array([_lens(camera)[0] for camera in rig]) - moved[:, 6]
 
-    def prior_gradient(moved: np.ndarray) -> np.ndarray:
-        gradient = information * moved
-        gradient[:, 6] += ties @ (logs + moved[:, 6])
-        return gradient.reshape(-1)
-
-    def prior_cost(moved: np.ndarray) -> float:
-        focals = logs + moved[:, 6]
-        return 0.5 * float((information * moved**2).sum() + focals @ ties @ focals)
+    def prior(moved: np.ndarray) -> tuple[float, np.ndarray]:
+        """Returns the priors' cost and its gradient (10C,)."""
+        gradient, tied = information * moved, ties @ (logs + moved[:, 6])
+        cost = 0.5 * float((gradient * moved).sum() + (logs + moved[:, 6]) @ tied)
+        gradient[:, 6] += tied
+        return cost, gradient.reshape(-1)
 
     at = _linearise(rig, tracks, points)
     for scale in scales:
-        lowest, damping = at.cost(scale) + prior_cost(moved), 1e-3
+        lowest, damping = at.cost(scale) + prior(moved)[0], 1e-3
         for _ in range(iterations):
             normal = _eliminate_points(at, tracks, scale, len(rig), damping)
             H = normal.cameras + np.diag(information.reshape(-1))
@@ -124,12 +110,12 @@ def adjust_rig(
             block = H[np.ix_(columns, columns)]
             block += 1e-12 * np.trace(block) * np.eye(len(columns))
             step = np.zeros(moved.size)
-            step[columns] = np.linalg.solve(block, (normal.right - prior_gradient(moved))[columns])
-            shifts = normal.point_steps(step)
+            step[columns] = np.linalg.solve(block, (normal.right - prior(moved)[1])[columns])
+            shifts = normal.follow(step)
             step = step.reshape(moved.shape)
             tried = [_moved(camera, step[i]) for i, camera in enumerate(rig)]
             then = _linearise(tried, tracks, points + shifts)
-            cost = then.cost(scale) + prior_cost(moved + step)
+            cost = then.cost(scale) + prior(moved + step)[0]
             if not cost < lowest:
                 damping *= 8
                 if damping > 1e8:
@@ -147,9 +133,9 @@ def adjust_rig(
 def single_camera_gains(
     fit: AdjustedRig, tracks: PointTracks, priors: RigPriors, scale: float, free: Collection[str]
 ) -> np.ndarray:
-    """Estimate (C,) how much the cost would fall if each camera alone joined the `free` ones.
+    """Estimates (C,) how much the cost would fall if each camera alone joined the `free` ones.
 
-    To first order, with all points following; 0 for cameras that are free already.
+    The estimate is to first order, with all points following; 0 for cameras that are free already.
     """
     rig = [fit.cameras[name] for name in tracks.names]
     normal = _eliminate_points(_linearise(rig, tracks, fit.points), tracks, scale, len(rig), 0.0)
@@ -165,7 +151,7 @@ def single_camera_gains(
 
 
 def triangulate_tracks(cameras: Mapping[str, Camera], tracks: PointTracks) -> np.ndarray:
-    """Triangulate (P, 3) the points nearest to their rays, reweighted robustly in three rounds."""
+    """Triangulates (P, 3) the points nearest to their rays, reweighted robustly in three rounds."""
     rig = [cameras[name] for name in tracks.names]
     xy = np.zeros_like(tracks.pixels)
     for index, camera in enumerate(rig):
@@ -193,7 +179,7 @@ def triangulate_tracks(cameras: Mapping[str, Camera], tracks: PointTracks) -> np
 
 
 def move_pose(cam_from_world: np.ndarray, step: np.ndarray) -> np.ndarray:
-    """Apply a small rotation and translation (6,), in the camera's axes, to a pose (4, 4)."""
+    """Applies a small rotation and translation (6,), in the camera's axes, to a pose (4, 4)."""
     return make_transform(axis_angle_to_matrix(step[:3]), step[3:]) @ cam_from_world
 
 
@@ -202,7 +188,7 @@ def _focal(camera: Camera) -> float:
 
 
 def _lens(camera: Camera) -> np.ndarray:
-    """Return the unknowns (4,) of a camera's lens: those from the log focal length on."""
+    """Returns the unknowns (4,) of a camera's lens: those from the log focal length on."""
     bend = camera.params[_focals(camera) + 2] if _has_bend(camera) else 0.0
     return np.array([np.log(_focal(camera)), *camera.K[:2, 2], bend])
 
@@ -216,7 +202,7 @@ def _has_bend(camera: Camera) -> bool:
 
 
 def _moved(camera: Camera, step: np.ndarray) -> Camera:
-    """Apply a step (10,) of its unknowns to a camera."""
+    """Applies a step (10,) of its unknowns to a camera."""
     p = list(camera.params)
     focals = _focals(camera)
     for i in range(focals):
@@ -233,7 +219,7 @@ def _moved(camera: Camera, step: np.ndarray) -> Camera:
 def _information(
     rig: list[Camera], priors: RigPriors, free: Collection[str] | None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the inverse variances (C, 10) of the unknowns, and the flat indices of free ones."""
+    """Returns the inverse variances (C, 10) of the unknowns, and the flat indices of free ones."""
     sigma = np.zeros((len(rig), UNKNOWNS))
     for row, camera in zip(sigma, rig, strict=True):
         if free is None or camera.id in free:
@@ -244,13 +230,6 @@ def _information(
     information = np.zeros_like(sigma)
     information[sigma > 0] = sigma[sigma > 0] ** -2.0
     return information, np.flatnonzero(sigma)
-
-
-def _focal_ties(rig: list[Camera], priors: RigPriors) -> np.ndarray:
-    """Information matrix (C, C) of log focal lengths about their common mean."""
-    if priors.focal == 0 or not (np.isfinite(priors.focal_spread) and priors.focal_spread > 0):
-        return np.zeros((len(rig), len(rig)))
-    return (np.eye(len(rig)) - 1 / len(rig)) / priors.focal_spread**2
 
 
 def _linearise(rig: list[Camera], tracks: PointTracks, points: np.ndarray) -> _Linear:
@@ -284,25 +263,17 @@ def _linearise(rig: list[Camera], tracks: PointTracks, points: np.ndarray) -> _L
     return _Linear(errors, by_camera, by_point, sizes)
 
 
-@dataclass(frozen=True)
-class _Normal:
-    """Normal equations with the points eliminated.
+class _Normal(NamedTuple):
+    """Normal equations with the points eliminated (Triggs et al., section 6.1).
 
-    `cameras` (10C, 10C) and `right` (10C,) are the reduced system, `diagonal` (10C,) that of the
-    full one. `inverse` (P, 3, 3), `coupling` (P, 10C, 3) and `pull` (P, 3) give the points' steps.
+    `diagonal` (10C,) is the full system's, the rest the reduced one's. `follow` gives the points'
+    steps (P, 3) after a step (10C,) of the cameras.
     """
 
     cameras: np.ndarray
     right: np.ndarray
     diagonal: np.ndarray
-    inverse: np.ndarray
-    coupling: np.ndarray
-    pull: np.ndarray
-
-    def point_steps(self, step: np.ndarray) -> np.ndarray:
-        """Steps (P, 3) of the points that follow a step (10C,) of the cameras."""
-        moved = self.pull + np.tensordot(step, self.coupling, (0, 1))
-        return -(self.inverse @ moved[..., None])[..., 0]
+    follow: Callable[[np.ndarray], np.ndarray]
 
 
 def _eliminate_points(
@@ -325,13 +296,16 @@ def _eliminate_points(
     squares = np.zeros((cameras, UNKNOWNS, cameras, UNKNOWNS))
     squares[own, :, own] = _sum_by(Jc.transpose(0, 2, 1) @ Jc, tracks.camera, cameras)
     full = squares.reshape(size, size)
+
+    def follow(step: np.ndarray) -> np.ndarray:
+        moved = pull + np.tensordot(step, coupling, (0, 1))
+        return -(inverse @ moved[..., None])[..., 0]
+
     return _Normal(
         cameras=full - np.tensordot(scaled, coupling, ((0, 2), (0, 2))),
         right=np.tensordot(scaled, pull, ((0, 2), (0, 1))) - push,
         diagonal=np.diag(full).copy(),
-        inverse=inverse,
-        coupling=coupling,
-        pull=pull,
+        follow=follow,
     )
 
 

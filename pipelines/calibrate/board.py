@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 
 from express50.errors import CalibrationError
-from express50.files.containers import read_srgb8
+from express50.files.containers import read_picture
 from express50.geometry.conventions import opencv_pixels_to_corner
 
 REQUIRED = ("squares_x", "squares_y", "square_length_m", "marker_length_m", "dictionary")
@@ -39,8 +39,7 @@ class Board:
 class BoardCorners:
     """Board corners found in images, one row each.
 
-    `camera` and `frame` (N,) index into `cameras` and `frames`; `corner` (N,) is the corner's id
-    on the board and `pixels` (N, 2) its position.
+    `camera` and `frame` (N,) index `cameras` and `frames`; `corner` (N,) is the id on the board.
     """
 
     cameras: tuple[str, ...]
@@ -51,13 +50,13 @@ class BoardCorners:
     pixels: np.ndarray
 
     def select(self, keep: np.ndarray) -> BoardCorners:
-        """Keep the rows where `keep` (N,) is true, with the same camera and frame numbers."""
+        """Keeps the rows where `keep` (N,) is true, with the same camera and frame numbers."""
         columns = (self.camera, self.frame, self.corner, self.pixels)
         return BoardCorners(self.cameras, self.frames, *(column[keep] for column in columns))
 
 
 def board_from_table(table: Mapping[str, object], where: str) -> Board:
-    """Build the board that a parsed `board.toml` describes; `where` names the file in errors."""
+    """Builds the board that a parsed `board.toml` describes; `where` names the file in errors."""
     missing = [key for key in REQUIRED if key not in table]
     if missing:
         raise CalibrationError(
@@ -76,46 +75,51 @@ def board_from_table(table: Mapping[str, object], where: str) -> Board:
         raise CalibrationError(
             f"{where}: a value has the wrong kind ({error}); counts are integers, lengths metres"
         ) from error
-    _check_board(board, where)
+    problem = _problem(board)
+    if problem:
+        raise CalibrationError(f"{where}: {problem}")
     return board
 
 
-def _check_board(board: Board, where: str) -> None:
-    if min(board.squares_x, board.squares_y) < 3:
-        raise CalibrationError(
-            f"{where}: squares are {board.squares_x} x {board.squares_y}, expected at least 3 x 3"
-        )
-    lengths = (board.marker_length_m, board.square_length_m)
-    if not all(math.isfinite(length) for length in lengths) or not 0 < lengths[0] < lengths[1]:
-        raise CalibrationError(
-            f"{where}: marker_length_m {lengths[0]} and square_length_m {lengths[1]}: expected "
-            "0 < marker < square; measure the print and write both in metres"
+def _problem(board: Board) -> str:
+    """Says why no such board can be printed; empty if one can."""
+    x, y, marker, square = (
+        board.squares_x, board.squares_y, board.marker_length_m, board.square_length_m
+    )  # fmt: skip
+    if min(x, y) < 3:
+        return f"squares are {x} x {y}, expected at least 3 x 3"
+    if not 0 < marker < square < math.inf:
+        return (
+            f"marker_length_m {marker} and square_length_m {square}: expected 0 < marker < square;"
+            " measure the print and write both in metres"
         )
     if not isinstance(getattr(cv2.aruco, board.dictionary, None), int):
-        raise CalibrationError(
-            f"{where}: dictionary is {board.dictionary!r}; expected a name of OpenCV's, such as "
-            "DICT_4X4_50"
+        return f"dictionary is {board.dictionary!r}; expected a name of OpenCV's: DICT_4X4_50, ..."
+    count = len(_dictionary(board).bytesList)
+    if count < x * y // 2:
+        return (
+            f"a {x} x {y} board needs {x * y // 2} markers, but {board.dictionary} has {count};"
+            " name the dictionary it was printed with"
         )
-    codes = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, board.dictionary)).bytesList
-    needed = board.squares_x * board.squares_y // 2
-    if len(codes) < needed:
-        raise CalibrationError(
-            f"{where}: a {board.squares_x} x {board.squares_y} board needs {needed} markers, but "
-            f"{board.dictionary} has {len(codes)}; name the dictionary it was printed with"
-        )
+    return ""
+
+
+def _dictionary(board: Board) -> cv2.aruco.Dictionary:
+    return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, board.dictionary))
 
 
 def opencv_board(board: Board) -> cv2.aruco.CharucoBoard:
-    """Return OpenCV's object for this board (it draws, detects and lists corners)."""
-    dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, board.dictionary))
-    size = (board.squares_x, board.squares_y)
-    made = cv2.aruco.CharucoBoard(size, board.square_length_m, board.marker_length_m, dictionary)
+    """Returns OpenCV's object for this board (it draws, detects and lists corners)."""
+    made = cv2.aruco.CharucoBoard(
+        (board.squares_x, board.squares_y), board.square_length_m, board.marker_length_m,
+        _dictionary(board),
+    )  # fmt: skip
     made.setLegacyPattern(board.legacy_pattern)
     return made
 
 
 def board_points(board: Board) -> np.ndarray:
-    """Return the inner corners (N, 3) in the board's space: metres, x right, y down, z into it.
+    """Returns the inner corners (N, 3) in the board's space: metres, x right, y down, z into it.
 
     Row `i` is corner `i` of OpenCV's detector, row by row from the print's top left.
     """
@@ -128,7 +132,7 @@ def board_points(board: Board) -> np.ndarray:
 def detect_corners(
     image: np.ndarray, detector: cv2.aruco.CharucoDetector, board: Board
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Find the board's corners in an image (H, W, 3) uint8: ids (N,), pixels (N, 2)."""
+    """Finds the board's corners in an image (H, W, 3) uint8: ids (N,), pixels (N, 2)."""
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     corners, ids, _, _ = detector.detectBoard(grey)
     if ids is None or len(ids) == 0:
@@ -142,15 +146,10 @@ def detect_corners(
 def refine_corners(
     grey: np.ndarray, pixels: np.ndarray, sides: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Refine corners in a grey image (H, W) uint8.
+    """Refines corners (N, 2), OpenCV's pixels, in a grey image (H, W) uint8.
 
-    Args:
-        grey: the image.
-        pixels: (N, 2) first positions, OpenCV's pixels (origin at the first pixel's centre).
-        sides: (N,) length in the image of the shorter side of the squares at each corner.
-
-    Returns:
-        refined positions (N, 2), and a mask (N,) of those that found a saddle close by.
+    `sides` (N,) are the shorter sides, pixels, of the squares at each corner. Returns the refined
+    positions, and a mask (N,) of those that found a saddle close by.
     """
     refined, found = pixels.astype(np.float64).copy(), np.zeros(len(pixels), bool)
     blurred: dict[float, np.ndarray] = {}
@@ -167,7 +166,7 @@ def refine_corners(
 
 
 def _saddle(image: np.ndarray, start: np.ndarray, radius: int) -> np.ndarray | None:
-    """Walk to the saddle (2,) near a start; None if there is none or the walk diverges."""
+    """Walks to the saddle (2,) near a start; None if there is none or the walk diverges."""
     inverse, inside = _quadratic_fit(radius)
     side = 2 * radius + 1
     at = start.astype(np.float64)
@@ -187,7 +186,7 @@ def _saddle(image: np.ndarray, start: np.ndarray, radius: int) -> np.ndarray | N
 
 
 def _quadratic_fit(radius: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the least-squares inverse (6, M) for a x^2 + b x y + c y^2 + d x + e y + f on a disc.
+    """Returns the least-squares inverse (6, M) for a x^2 + b x y + c y^2 + d x + e y + f on a disc.
 
     The second value marks the M pixels of the square patch that lie in the disc.
     """
@@ -201,12 +200,10 @@ def _quadratic_fit(radius: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def square_sides(board_xy: np.ndarray, pixels: np.ndarray, square: float) -> np.ndarray:
-    """Measure the shorter side (N,), pixels, of the squares at corners (N, 2) seen at (N, 2)."""
-    if len(board_xy) < 4:
-        return np.full(len(board_xy), 0.0)
-    homography, _ = cv2.findHomography(board_xy, pixels, 0)
+    """Measures the shorter side (N,), pixels, of the squares at corners (N, 2) seen at (N, 2)."""
+    homography = cv2.findHomography(board_xy, pixels, 0)[0] if len(board_xy) >= 4 else None
     if homography is None:
-        return np.full(len(board_xy), 0.0)
+        return np.zeros(len(board_xy))
 
     def mapped(xy: np.ndarray) -> np.ndarray:
         return cv2.perspectiveTransform(xy[None].astype(np.float64), homography)[0]
@@ -218,7 +215,7 @@ def square_sides(board_xy: np.ndarray, pixels: np.ndarray, square: float) -> np.
 
 
 def make_detector(board: Board) -> cv2.aruco.CharucoDetector:
-    """Return a detector for the board with sub-pixel marker corners."""
+    """Returns a detector for the board with sub-pixel marker corners."""
     parameters = cv2.aruco.DetectorParameters()
     # The chessboard corners between the markers carry the measurement; a marker's own corners are
     # only refined enough to predict those.
@@ -229,7 +226,7 @@ def make_detector(board: Board) -> cv2.aruco.CharucoDetector:
 def gather(
     found: Iterable[tuple[str, str, np.ndarray, np.ndarray]], cameras: Iterable[str]
 ) -> BoardCorners:
-    """Stack (camera, frame, ids (N,), pixels (N, 2)) detections into one table."""
+    """Stacks (camera, frame, ids (N,), pixels (N, 2)) detections into one table."""
     names = tuple(sorted(cameras))
     rows = list(found)
     frames = tuple(sorted({frame for _, frame, _, _ in rows}))
@@ -254,12 +251,10 @@ def read_corners(
     limit: int,
     look: Callable[[str, str, np.ndarray, np.ndarray, np.ndarray], None] | None = None,
 ) -> BoardCorners:
-    """Detect the board in each camera's `files`; files of one name were taken at one time.
+    """Detects the board in each camera's `files`; files of one name were taken at one time.
 
-    At most `limit` images are read per camera, evenly spaced over all names (0 = all). An image
-    whose (width, height) is not `sizes[camera]` is an error: its pixels are not the footage's.
-    Images are read only once, so `look` is called with camera, frame, image, ids and pixels of
-    each.
+    At most `limit` images are read per camera, evenly spaced over all names (0 = all); `sizes` are
+    the footage's (width, height). `look` gets camera, frame, image, ids and pixels of each.
     """
     by_name = {camera: {path.stem: path for path in paths} for camera, paths in files.items()}
     names = sorted(set().union(*by_name.values()))
@@ -268,7 +263,8 @@ def read_corners(
     found = []
     for camera, paths in sorted(by_name.items()):
         for name in (n for n in names if n in paths):
-            image = read_srgb8(paths[name])
+            path = paths[name].resolve()  # it may be a link to elsewhere
+            image = read_picture(path.parent, path.name)
             if (image.shape[1], image.shape[0]) != tuple(sizes[camera]):
                 raise CalibrationError(
                     f"{paths[name]}: image is {image.shape[1]}x{image.shape[0]}, the footage "
@@ -283,7 +279,7 @@ def read_corners(
 
 
 def even(count: int, limit: int) -> list[int]:
-    """Choose at most `limit` indices below `count`, evenly spaced."""
+    """Chooses at most `limit` indices below `count`, evenly spaced."""
     if count <= limit:
         return list(range(count))
     return [int(i) for i in np.linspace(0, count - 1, limit).round()]

@@ -1,49 +1,63 @@
-"""Solve a rig from board corners: single cameras, pose graph, joint adjustment, rejection."""
+"""Solve a rig from board corners: single cameras, their rig, joint adjustment, rejection.
+
+The joint adjustment is COLMAP's. Its world is the board: its points are the board's corners, held
+constant, so the scale is the print's and the board stays flat and rigid. COLMAP's rig is the camera
+rig, and each board frame is one pose of the rig. There are no 3D points to estimate.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from itertools import combinations
 
 import numpy as np
+import pycolmap
 
 from express50.errors import CalibrationError
-from express50.geometry.cameras import Camera
+from express50.geometry.cameras import Camera, project
 from express50.rigs.world_frame import canonical_from_rig, move_cameras
 from pipelines.calibrate.board import BoardCorners, even
-from pipelines.calibrate.board_adjust import BoardRig, adjust_board_rig, corner_errors
-from pipelines.calibrate.config import AUTO
-from pipelines.calibrate.intrinsics import (
+from pipelines.calibrate.board_guess import (
     MIN_CORNERS,
+    MIN_FRAMES,
+    NEAR,
     BoardView,
+    all_board_poses,
     as_model,
-    board_poses,
     board_views,
     camera_params,
     fit_intrinsics,
+    join_rig,
+    relative_pose,
+    rig_from_boards,
     seen_from_front,
     with_ideal,
 )
-from pipelines.calibrate.rig_graph import NEAR, join_rig, pair_edges, rig_from_board
+from pipelines.calibrate.config import AUTO
 
-LADDER = ("SIMPLE_RADIAL", "RADIAL", "OPENCV")
-"""From few to many parameters: a focal length and one radial term, two terms, two focal lengths
-and tangential terms."""
-MIN_FRAMES = 4
-"""Board images a camera needs; one with fewer is dropped."""
-WEAK_CORNERS, WEAK_FRAMES = 200, 8
-"""Cameras with fewer accepted corners, or that share fewer board images, are reported as weak."""
+LADDER = ("SIMPLE_RADIAL", "RADIAL", "OPENCV")  # from few to many parameters
+WEAK_CORNERS, WEAK_FRAMES = 200, 8  # cameras with less are reported
 REJECT_SIGMA = 4.0
 """Corners further off than this many robust standard deviations are rejected; 3 to 6 gave the same
 rig within 0.005 degrees."""
+ITERATIONS = 60  # of Levenberg-Marquardt; rigs before boards settle in fewer than 15
+
+
+@dataclass(frozen=True)
+class BoardRig:
+    """Cameras in the rig's space (their `cam_from_world`), and rig_from_board (4, 4) a frame."""
+
+    cameras: dict[str, Camera]
+    boards: dict[int, np.ndarray]
 
 
 @dataclass(frozen=True)
 class BoardSolution:
-    """A calibrated rig: cameras in the canonical world, and the observations behind it.
+    """Cameras and world_from_board (4, 4) by frame in the canonical world, and what they rest on.
 
-    `boards[frame]` is world_from_board (4, 4). `corners` and their `errors` (N, 2), pixels, are
-    those that were kept, of `corners_found`. `dropped` and `weak` give a reason per camera.
+    `corners` and their `errors` (N, 2), pixels, were kept of `corners_found`. `dropped` and `weak`
+    give a reason per camera.
     """
 
     cameras: dict[str, Camera]
@@ -62,23 +76,20 @@ def solve_rig(
     model: str = AUTO,
     rounds: int = 3,
 ) -> BoardSolution:
-    """Calibrate every camera that the corners of one board tie together.
+    """Calibrates every camera that the corners of one board tie together.
 
-    Args:
-        corners: corners of a rigid board, moved about in front of the rig.
-        points: (P, 3) the board's corners, metres.
-        sizes: (width, height) of each camera, pixels.
-        model: COLMAP lens model; auto takes the simplest that fits, camera by camera.
-        rounds: joint adjustments, each followed by rejection of corners.
+    `points` (P, 3) are the board's corners, metres; `sizes` are (width, height). `model` is a lens
+    model of COLMAP's; auto takes the simplest that fits, camera by camera. Each of `rounds` adjusts
+    everything and then rejects corners.
 
     Raises:
         CalibrationError: no camera can be calibrated; the message lists the reasons.
     """
     dropped: dict[str, str] = {}
-    views = _views(corners, points, sizes, dropped)
-    lone, views = _single_cameras(views, sizes, "RADIAL" if model == AUTO else model, dropped)
+    lens = "RADIAL" if model == AUTO else model
+    lone, views = _single_cameras(corners, points, sizes, lens, dropped)
+    _require(lone, dropped)
     rig = _first_rig(lone, views, dropped)
-    _require(rig.cameras, dropped)
     rig, kept, errors = _refine(rig, corners, points, model, rounds, dropped)
     middles = [pose[:3, :3] @ points.mean(0) + pose[:3, 3] for pose in rig.boards.values()]
     world_from_rig = canonical_from_rig(rig.cameras, np.median(middles, axis=0))
@@ -102,14 +113,15 @@ def _require(cameras: Mapping[str, object], dropped: Mapping[str, str]) -> None:
         )
 
 
-def _views(
+def _single_cameras(
     corners: BoardCorners,
     points: np.ndarray,
     sizes: Mapping[str, tuple[int, int]],
+    model: str,
     dropped: dict[str, str],
-) -> dict[str, dict[int, BoardView]]:
-    """Split the corners into usable views per camera; name cameras that have too few."""
-    views: dict[str, dict[int, BoardView]] = {}
+) -> tuple[dict[str, Camera], dict[str, dict[int, BoardView]]]:
+    """Fits each camera's intrinsics on its own; returns the cameras and the views each one kept."""
+    cameras, kept = {}, {}
     for name in corners.cameras:
         large = board_views(corners, name, points, sizes[name])
         good = {view.frame: view for view in large if seen_from_front(view)}
@@ -118,28 +130,16 @@ def _views(
                 f"its corners run the wrong way round in {len(large) - len(good)} of {len(large)} "
                 "board images: the images are mirrored or the board is not this one"
             )
-        elif len(good) < MIN_FRAMES:
+            continue
+        if len(good) < MIN_FRAMES:
             dropped[name] = (
                 f"the board is seen well (at least {MIN_CORNERS} corners) in {len(good)} "
                 f"images, expected at least {MIN_FRAMES}"
             )
-        else:
-            views[name] = good
-    return views
-
-
-def _single_cameras(
-    views: Mapping[str, dict[int, BoardView]],
-    sizes: Mapping[str, tuple[int, int]],
-    model: str,
-    dropped: dict[str, str],
-) -> tuple[dict[str, Camera], dict[str, dict[int, BoardView]]]:
-    """Fit each camera's intrinsics on its own; return the cameras and the views each one kept."""
-    cameras, kept = {}, {}
-    for name, mine in views.items():
+            continue
         # Fifteen images are enough to start a lens: 8 to 60 led to the same rig.
-        frames = [sorted(mine)[i] for i in even(len(mine), 15)]
-        fitted = fit_intrinsics([mine[f] for f in frames], sizes[name], model, MIN_FRAMES)
+        frames = [sorted(good)[i] for i in even(len(good), 15)]
+        fitted = fit_intrinsics([good[f] for f in frames], sizes[name], model)
         if fitted is None:
             dropped[name] = (
                 f"no lens explains its {len(frames)} board images: wrong corners, or the board "
@@ -148,9 +148,9 @@ def _single_cameras(
             continue
         K, dist, used = fitted
         camera = Camera(name, *sizes[name], model, camera_params(K, dist, model), np.eye(4))
-        bad = {frames[i] for i in range(len(frames))} - {frames[i] for i in used}
+        bad = set(frames) - {frames[i] for i in used}
         cameras[name] = camera
-        kept[name] = {f: with_ideal(camera, v) for f, v in mine.items() if f not in bad}
+        kept[name] = {f: with_ideal(camera, v) for f, v in good.items() if f not in bad}
     return cameras, kept
 
 
@@ -159,14 +159,13 @@ def _first_rig(
     views: Mapping[str, dict[int, BoardView]],
     dropped: dict[str, str],
 ) -> BoardRig:
-    """Join single cameras over shared frames; name those that agree with no other."""
-    if not cameras:
-        return BoardRig({}, {})
-    poses = {
-        name: {f: found for f, view in views[name].items() if (found := board_poses(view))}
-        for name in cameras
+    """Joins single cameras over shared frames; names those that agree with no other."""
+    poses = all_board_poses(views)
+    edges = {
+        (a, b): found
+        for a, b in combinations(sorted(cameras), 2)
+        if (found := relative_pose(cameras[b], views[b], poses[a], poses[b])) is not None
     }
-    edges = pair_edges(cameras, views, poses)
     placed = join_rig(sorted(cameras), edges)
     for name in sorted(set(cameras) - set(placed)):
         shared = {o for o in placed if set(poses[name]) & set(poses[o])}
@@ -176,11 +175,7 @@ def _first_rig(
             if shared
             else "it shares no board image with the other cameras"
         )
-    boards = {}
-    for frame in sorted({f for name in placed for f in poses[name]}):
-        pose = rig_from_board(frame, placed, cameras, views, poses)
-        if pose is not None:
-            boards[frame] = pose
+    boards = rig_from_boards(placed, cameras, views, poses)
     return BoardRig({n: replace(cameras[n], cam_from_world=T) for n, T in placed.items()}, boards)
 
 
@@ -192,7 +187,7 @@ def _refine(
     rounds: int,
     dropped: dict[str, str],
 ) -> tuple[BoardRig, BoardCorners, np.ndarray]:
-    """Adjust, drop bad corners, images and cameras, and adjust again."""
+    """Adjusts, drops bad corners, images and cameras, and adjusts again."""
     errors = corner_errors(rig, corners, points)
     keep = np.ones(len(errors), bool)
     limit = max(NEAR * float(np.hypot(c.width, c.height)) for c in rig.cameras.values())
@@ -204,10 +199,7 @@ def _refine(
         keep &= np.bincount(image[keep], minlength=image.max(initial=0) + 1)[image] >= 6
         rig = _drop_cameras(rig, corners, keep, number, dropped)
         _require(rig.cameras, dropped)
-        keep &= np.isin(
-            corners.camera,
-            [i for i, name in enumerate(corners.cameras) if name in rig.cameras],
-        )
+        keep &= np.array([name in rig.cameras for name in corners.cameras])[corners.camera]
         kept = corners.select(keep)
         if model == AUTO and number == min(1, rounds - 1):
             rig = _simplest_models(rig, kept, points, loss_scale)
@@ -224,11 +216,11 @@ def _refine(
 def _simplest_models(
     rig: BoardRig, kept: BoardCorners, points: np.ndarray, loss_scale: float
 ) -> BoardRig:
-    """Give each camera the simplest lens model that its corners do not contradict.
+    """Gives each camera the simplest lens model that its corners do not contradict.
 
     Superfluous distortion terms trade with the principal point and the rotation: tangential terms
-    alone triple the rotation's error. The model with the lowest Bayesian information criterion
-    wins, camera by camera (Schwarz 1978), with a robust sum of squares.
+    alone triple the rotation's error. The lowest Bayesian information criterion wins (Schwarz
+    1978), with a robust sum of squares.
     """
     rigs: list[BoardRig] = []
     costs: list[np.ndarray] = []
@@ -255,7 +247,7 @@ def _simplest_models(
 def _drop_cameras(
     rig: BoardRig, corners: BoardCorners, keep: np.ndarray, number: int, dropped: dict[str, str]
 ) -> BoardRig:
-    """Drop cameras that lost most of their corners to rejection."""
+    """Drops cameras that lost most of their corners to rejection."""
     cameras = {}
     for index, name in enumerate(corners.cameras):
         if name not in rig.cameras:
@@ -274,7 +266,7 @@ def _drop_cameras(
 
 
 def _weak(rig: BoardRig, kept: BoardCorners) -> dict[str, str]:
-    """Name cameras whose corners are few, cover little of the image or tie to few others."""
+    """Names cameras whose corners are few, cover little of the image or tie to few others."""
     weak = {}
     seen = {name: set(kept.frame[kept.camera == kept.cameras.index(name)]) for name in rig.cameras}
     for name, camera in sorted(rig.cameras.items()):
@@ -290,3 +282,124 @@ def _weak(rig: BoardRig, kept: BoardCorners) -> dict[str, str]:
         elif covered < 0.25:
             weak[name] = f"corners cover {covered:.0%} of its image, expected 25 % or more"
     return weak
+
+
+def corner_errors(rig: BoardRig, corners: BoardCorners, points: np.ndarray) -> np.ndarray:
+    """Computes the reprojection errors (N, 2), pixels; `points` (P, 3) are corners on the board.
+
+    Infinite where the rig has no such camera or frame, or the corner lies behind the camera.
+    """
+    errors = np.full((len(corners.corner), 2), np.inf)
+    for index, name in enumerate(corners.cameras):
+        for frame in rig.boards if name in rig.cameras else ():
+            rows = np.flatnonzero((corners.camera == index) & (corners.frame == frame))
+            pose = rig.cameras[name].cam_from_world @ rig.boards[frame]
+            placed = replace(rig.cameras[name], cam_from_world=pose)
+            pixels, _ = project(placed, points[corners.corner[rows]])
+            errors[rows] = pixels - corners.pixels[rows]
+    return np.where(np.isfinite(errors), errors, np.inf)
+
+
+def adjust_board_rig(
+    rig: BoardRig,
+    corners: BoardCorners,
+    points: np.ndarray,
+    loss_scale_px: float,
+    lenses: bool = True,
+    cameras: bool = True,
+) -> BoardRig:
+    """Refines board poses, and if asked `lenses` and the poses of `cameras`, over the corners.
+
+    Every observed camera and frame must be in `rig`; `points` (P, 3) are corners on the board,
+    metres. The Cauchy loss begins to flatten at `loss_scale_px`.
+    """
+    reconstruction, names, frames = _build(rig, corners, points)
+    options = pycolmap.BundleAdjustmentOptions()
+    options.print_summary = False
+    options.refine_points3D = False
+    options.refine_focal_length = lenses
+    options.refine_sensor_from_rig = cameras
+    options.refine_principal_point = lenses
+    options.refine_extra_params = lenses
+    options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
+    options.ceres.loss_function_scale = loss_scale_px
+    # There are no free points to eliminate, so COLMAP's choice by image count (an iterative
+    # solver beyond a thousand) loses to the default, factorising the normal equations.
+    options.ceres.auto_select_solver_type = False
+    options.ceres.solver_options.max_num_iterations = ITERATIONS
+    options.ceres.solver_options.function_tolerance = 1e-9
+    options.ceres.solver_options.num_threads = 1  # sums in one order: the same bytes every run
+    config = pycolmap.BundleAdjustmentConfig()
+    for image_id in reconstruction.reg_image_ids():
+        config.add_image(image_id)
+    pycolmap.create_default_bundle_adjuster(options, config, reconstruction).solve()
+    solved = reconstruction.rig(1)
+    root = rig.cameras[names[0]].cam_from_world  # the first camera stays where it was
+    found = {}
+    for i, name in enumerate(names):
+        made = reconstruction.camera(i + 1)
+        pose = _matrix(solved.sensor_from_rig(made.sensor_id)) @ root if i else root
+        params = tuple(float(p) for p in made.params)
+        found[name] = replace(rig.cameras[name], params=params, cam_from_world=pose)
+    boards = {
+        frame: np.linalg.inv(root) @ _matrix(reconstruction.frame(i + 1).rig_from_world)
+        for i, frame in enumerate(frames)
+    }
+    return BoardRig(found, boards)
+
+
+def _build(
+    rig: BoardRig, corners: BoardCorners, points: np.ndarray
+) -> tuple[pycolmap.Reconstruction, list[str], list[int]]:
+    """Writes the rig as a COLMAP reconstruction; camera i and frame i get the id i + 1."""
+    reconstruction = pycolmap.Reconstruction()
+    names = [n for i, n in enumerate(corners.cameras) if (corners.camera == i).any()]
+    frames = sorted({int(f) for f in corners.frame})
+    root = rig.cameras[names[0]].cam_from_world
+    made_rig = pycolmap.Rig(rig_id=1)  # its own space is that of the first camera
+    for i, name in enumerate(names):
+        given = rig.cameras[name]
+        camera = pycolmap.Camera(
+            camera_id=i + 1, model=given.model, width=given.width, height=given.height,
+            params=list(given.params),
+        )  # fmt: skip
+        reconstruction.add_camera(camera)
+        if i == 0:
+            made_rig.add_ref_sensor(camera.sensor_id)
+        else:
+            pose = given.cam_from_world @ np.linalg.inv(root)
+            made_rig.add_sensor(camera.sensor_id, _rigid(pose))
+    reconstruction.add_rig(made_rig)
+    for corner, point in enumerate(points):
+        reconstruction.add_point3D_with_id(corner + 1, pycolmap.Point3D(xyz=point))
+    for i, frame in enumerate(frames):
+        made = pycolmap.Frame(frame_id=i + 1, rig_id=1)
+        made.rig_from_world = _rigid(root @ rig.boards[frame])
+        images = []
+        for j, name in enumerate(names):
+            index = corners.cameras.index(name)
+            rows = np.flatnonzero((corners.camera == index) & (corners.frame == frame))
+            if len(rows):
+                image = pycolmap.Image(
+                    name=f"{name}/{frame}", keypoints=corners.pixels[rows], camera_id=j + 1,
+                    image_id=i * len(names) + j + 1,
+                )  # fmt: skip
+                image.frame_id = i + 1
+                made.add_data_id(image.data_id)
+                images.append((image, corners.corner[rows]))
+        reconstruction.add_frame(made)
+        for image, seen in images:
+            reconstruction.add_image(image)
+            for k, corner in enumerate(seen):
+                element = pycolmap.TrackElement(image.image_id, k)
+                reconstruction.add_observation(int(corner) + 1, element)
+        reconstruction.register_frame(i + 1)
+    return reconstruction, names, frames
+
+
+def _rigid(T: np.ndarray) -> pycolmap.Rigid3d:
+    return pycolmap.Rigid3d(np.ascontiguousarray(T[:3]))
+
+
+def _matrix(pose: pycolmap.Rigid3d) -> np.ndarray:
+    return np.vstack([pose.matrix(), [0.0, 0.0, 0.0, 1.0]])

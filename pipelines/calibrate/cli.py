@@ -15,14 +15,14 @@ from express50.errors import CalibrationError, ConfigError
 from express50.files.calibration import camera_rows, read_cameras, write_cameras
 from express50.geometry.cameras import Camera
 from express50.rigs.read import FORMATS, guess_format, read_rig
-from express50.rigs.rig_check import RigVerdict, judge
+from express50.rigs.world_frame import RigVerdict, judge
 
 if TYPE_CHECKING:
-    from pipelines.calibrate.camera_moves import FootageCheck
+    from pipelines.calibrate.given_rig import FootageCheck
 
 
 def add_commands(subparsers: Any) -> None:
-    """Add ``cameras import`` and ``cameras check``."""
+    """Adds ``cameras import`` and ``cameras check``."""
     parser = subparsers.add_parser("cameras", help="import and check calibrations")
     actions = parser.add_subparsers(dest="action", metavar="ACTION", required=True)
     importing = actions.add_parser(
@@ -42,7 +42,7 @@ def add_commands(subparsers: Any) -> None:
     checking.add_argument(
         "--footage", type=Path, metavar="CAPTURE", help="also look for cameras that have moved"
     )
-    checking.add_argument("--frames", type=int, default=4, help="moments looked at (default: 4)")
+    checking.add_argument("--frames", type=int, default=4, help="frame sets compared (default: 4)")
     for action in (importing, checking):
         action.add_argument("--format", choices=FORMATS, help="what it is (default: guessed)")
         action.add_argument("--size", help="WIDTHxHEIGHT of the footage; K is scaled to it")
@@ -53,29 +53,26 @@ def add_commands(subparsers: Any) -> None:
 
 
 def run_import(args: argparse.Namespace) -> int:
-    """Write the cameras and say what was found; exit code 1 when they do not fit together."""
+    """Writes the cameras and says what was found; exit code 1 when they do not fit together."""
     cameras = _read(args)
     verdict = judge(cameras)
-    if args.out.exists() and not args.overwrite and _differs(args.out, cameras):
-        raise ConfigError(
-            f"{args.out} holds something else; write elsewhere, or over it with --overwrite"
-        )
+    if args.out.exists() and not args.overwrite:
+        try:
+            same = camera_rows(read_cameras(args.out)) == camera_rows(cameras)
+        except CalibrationError:
+            same = False
+        if not same:
+            raise ConfigError(
+                f"{args.out} holds something else; write elsewhere, or over it with --overwrite"
+            )
     if not verdict.problem:
         write_cameras(args.out, cameras)
     _report(args, cameras, verdict, None if verdict.problem else args.out)
     return FAILED if verdict.problem else OK
 
 
-def _differs(path: Path, cameras: Mapping[str, Camera]) -> bool:
-    """Whether a file is not what these cameras would be written as."""
-    try:
-        return camera_rows(read_cameras(path)) != camera_rows(cameras)
-    except CalibrationError:
-        return True
-
-
 def run_check(args: argparse.Namespace) -> int:
-    """Say what was found; exit code 1 when the cameras fit neither together nor their footage."""
+    """Says what was found; exit code 1 if the cameras fit neither together nor their footage."""
     cameras = _read(args)
     verdict = judge(cameras)
     footage = None
@@ -87,32 +84,24 @@ def run_check(args: argparse.Namespace) -> int:
 
 def _look_at_footage(args: argparse.Namespace, cameras: Mapping[str, Camera]) -> FootageCheck:
     # Imported here: the other commands need neither torch nor OpenCV's features.
-    from express50.landmarks.network import load_network
-    from pipelines.calibrate.camera_moves import check_footage
-    from pipelines.calibrate.footage import read_capture_frames, reduce_image
-
-    def reduce(name: str, image: np.ndarray) -> np.ndarray | None:
-        return reduce_image(cameras[name], image, "the footage") if name in cameras else None
+    from pipelines.calibrate.footage import find_points, read_raw_footage
+    from pipelines.calibrate.given_rig import check_footage
 
     if args.frames < 1:
         raise ConfigError(f"--frames is {args.frames}, expected 1 or more")
-    frames = read_capture_frames(args.footage, args.frames, reduce)
-    shown = {name for images in frames.values() for name in images}
-    known = {name: camera for name, camera in cameras.items() if name in shown}
-    return check_footage(known, frames, load_network())
+    seen = find_points(read_raw_footage(args.footage, cameras, args.frames))
+    shown = {name for points in seen.values() for name in points.features}
+    return check_footage({n: c for n, c in cameras.items() if n in shown}, seen)
 
 
 def _read(args: argparse.Namespace) -> dict[str, Camera]:
-    return read_rig(args.source, args.format, _size(args.size), args.scale)
-
-
-def _size(text: str | None) -> tuple[int, int] | None:
-    if text is None:
-        return None
-    parts = text.lower().split("x")
-    if len(parts) != 2 or not all(p.isdigit() and int(p) > 0 for p in parts):
-        raise ConfigError(f"--size is {text!r}, expected WIDTHxHEIGHT such as 3840x2160")
-    return int(parts[0]), int(parts[1])
+    size = None
+    if args.size is not None:
+        parts = args.size.lower().split("x")
+        if len(parts) != 2 or not all(p.isdigit() and int(p) > 0 for p in parts):
+            raise ConfigError(f"--size is {args.size!r}, expected WIDTHxHEIGHT such as 3840x2160")
+        size = int(parts[0]), int(parts[1])
+    return read_rig(args.source, args.format, size, args.scale)
 
 
 def _report(
@@ -124,7 +113,11 @@ def _report(
 ) -> None:
     kind = args.format or guess_format(args.source)
     if args.json:
-        seen = {"footage": _footage_row(footage)} if footage else {}
+        seen = {}
+        if footage:
+            row = asdict(footage)
+            del row["cameras"]
+            seen = {"footage": row}
         say_json({"format": kind, "out": out and str(out), **asdict(verdict), **seen})
         return
     say(f"{args.source}: {verdict.cameras} cameras ({kind})")
@@ -144,17 +137,8 @@ def _report(
         say(f"remedy: {verdict.remedy or 'none of the usual misreadings explains it'}")
     elif out is not None:
         say(f"wrote {out}")
-    if footage is not None:
-        _report_footage(footage)
-
-
-def _footage_row(footage: FootageCheck) -> dict[str, object]:
-    moved = {name: asdict(move) for name, move in footage.moved.items()}
-    figures = {"points": footage.points, "error_px": footage.error_px}
-    return figures | {"moved": moved, "unchecked": footage.unchecked}
-
-
-def _report_footage(footage: FootageCheck) -> None:
+    if footage is None:
+        return
     error = "" if footage.error_px is None else f", off by {footage.error_px:.2f} px (median)"
     say(f"footage: {footage.points} points{error}")
     for name, why in footage.unchecked.items():

@@ -22,7 +22,7 @@ class CalibrateConfig:
     """Board images read per camera, evenly spaced; 0 reads all."""
     rounds: int = 3
     """Joint adjustments to the board, each followed by rejection of corners."""
-    solve_moments: int = 8
+    solve_frame_sets: int = 8
     """Frame sets from which cameras are solved if there is neither a calibration nor a board."""
     distance_m: float = 1.0
     """Rough distance of cameras from the head: where the solution from footage starts if neither
@@ -37,11 +37,11 @@ class CalibrateConfig:
     """How far given cameras may be turned, without a board (a standard deviation)."""
     refine_move_mm: float = 3.0
     """How far given cameras may have moved, without a board (a standard deviation)."""
-    check_moments: int = 2
+    check_frame_sets: int = 2
     """Frame sets in which cameras that have moved are searched; 0 does not search."""
 
     def __post_init__(self) -> None:
-        """Check names and ranges."""
+        """Checks names and ranges."""
         if self.camera_model not in (AUTO, *MODELS):
             raise ConfigError(
                 f"calibrate.camera_model is {self.camera_model!r}; expected {AUTO} or "
@@ -49,7 +49,7 @@ class CalibrateConfig:
             )
         if self.refine not in REFINE:
             raise ConfigError(f"calibrate.refine is {self.refine!r}; expected {', '.join(REFINE)}")
-        least = {"board_frames": 0, "rounds": 1, "solve_moments": 1, "check_moments": 0}
+        least = {"board_frames": 0, "rounds": 1, "solve_frame_sets": 1, "check_frame_sets": 0}
         for name, value in least.items():
             if getattr(self, name) < value:
                 raise ConfigError(
@@ -62,7 +62,7 @@ class CalibrateConfig:
 
 
 PRESETS: dict[str, dict[str, object]] = {
-    "draft": {"board_frames": 36, "rounds": 1, "solve_moments": 4, "check_moments": 0},
+    "draft": {"board_frames": 36, "rounds": 1, "solve_frame_sets": 4, "check_frame_sets": 0},
     "standard": {},
     # More board images and frame sets take longer and gain nothing (docs/TRADEOFFS.md).
     "reference": {},

@@ -1,13 +1,19 @@
-"""Footage for calibration: frames at a few instants, reduced, and hints about focal lengths."""
+"""Footage for calibration: frames at a few instants, and the points that cameras see in them.
+
+Landmarks tie any two cameras that see the face, to a few pixels. Features (SIFT, on skin, hair,
+cloth and room) tie neighbouring cameras, to a fraction of a pixel. Images are reduced as they are
+read, one at a time, which keeps a rig's full-size images out of memory.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 
 import cv2
 import numpy as np
+from scipy.spatial import cKDTree
 
 from express50.capture.frames import FrameReader
 from express50.capture.index import Cue, Index
@@ -17,111 +23,81 @@ from express50.files.containers import read_picture
 from express50.files.images import read_exif
 from express50.files.video import iterate_video
 from express50.geometry.cameras import Camera, resized
+from express50.geometry.conventions import opencv_pixels_to_corner
+from express50.landmarks.detector import detect
 from express50.landmarks.network import load_network
-from pipelines.calibrate.tracks import (
-    Features,
-    FrameSetPoints,
-    find_face,
-    find_features,
-    without_fixed,
-)
+from pipelines.calibrate.board import even
+from pipelines.calibrate.tracks import FEATURE_SIGMA_PX, Features, FrameSetPoints
 
-LONG_SIDE = 1280
-"""Images are reduced to this long side, pixels, before points are searched in them."""
-FILM_DIAGONAL_MM = math.hypot(36.0, 24.0)
+LONG_SIDE = 1280  # pixels of reduced images
+FEATURES = 1500  # kept per image, strongest first
+FACE_SCORE = 0.9  # below are profiles and backs of heads, whose landmarks are guessed
+LANDMARK_INFLATION = 3.0  # of sigma, as errors within a view are correlated
+
+Images = Iterable[tuple[int, str, np.ndarray]]
+"""Frame number, camera and reduced image (H, W, 3) uint8, one by one."""
 
 
 def reduced_camera(camera: Camera) -> Camera:
-    """Return the camera of an image with a long side of `LONG_SIDE` at most."""
+    """Returns the camera of an image with a long side of `LONG_SIDE` at most."""
     share = min(1.0, LONG_SIDE / max(camera.width, camera.height))
     size = round(camera.width * share), round(camera.height * share)
     return camera if share == 1.0 else resized(camera, *size)
 
 
-def reduce_image(camera: Camera, image: np.ndarray, what: str) -> np.ndarray:
-    """Reduce a camera's image (H, W, 3) to the size of `reduced_camera`; a reduced one passes.
+def at_footage_size(small: Camera, camera: Camera) -> Camera:
+    """Returns a reduced camera at the size of the footage, that of `camera`."""
+    size = (camera.width, camera.height)
+    return small if size == (small.width, small.height) else resized(small, *size)
 
-    Reducing each image as it is read keeps a rig's full-size images out of memory.
-    """
-    small = reduced_camera(camera)
-    shape = image.shape[:2]
-    if shape == (small.height, small.width):
-        return image
+
+def _reduced(camera: Camera, image: np.ndarray, frame: int) -> np.ndarray:
+    small, shape = reduced_camera(camera), image.shape[:2]
     if shape != (camera.height, camera.width):
         raise CalibrationError(
-            f"camera {camera.id}: {what} is {shape[1]}x{shape[0]}, the "
+            f"camera {camera.id}: frame {frame} is {shape[1]}x{shape[0]}, the "
             f"camera is {camera.width}x{camera.height}; scale the intrinsics"
         )
     return cv2.resize(image, (small.width, small.height), interpolation=cv2.INTER_AREA)
 
 
-def read_footage(
-    index: Index, cameras: Mapping[str, Camera], frames: int
-) -> Iterator[tuple[int, str, np.ndarray]]:
-    """Yield frame number, camera and reduced image (H, W, 3) at so many instants, one by one."""
+def read_footage(index: Index, cameras: Mapping[str, Camera], count: int) -> Images:
+    """Yields reduced images of ingested footage at up to `count` instants.
+
+    The instants are the middles of cues, or spread over all frames where there are no cues.
+    """
     cues = [cue for cue in index.cues if cue.end_frame < index.frames]
-    wanted = sorted(set(_middles(cues, frames))) or _spread(range(index.frames), frames)
+    wanted = sorted(set(_middles(cues, count))) or even(index.frames, count)
     for name in sorted(cameras):
         reader = FrameReader(index, name)
         for frame in wanted:
-            yield frame, name, reduce_image(cameras[name], reader.read(frame), f"frame {frame}")
+            yield frame, name, _reduced(cameras[name], reader.read(frame), frame)
         reader.close()
 
 
-def find_footage_points(
-    index: Index, cameras: Mapping[str, Camera], frames: int
-) -> dict[int, FrameSetPoints]:
-    """Find landmarks and features at so many instants, in pixels of `reduced_camera`."""
-    net = load_network()
-    faces: dict[int, list[tuple[str, np.ndarray, np.ndarray]]] = {}
-    features: dict[int, dict[str, Features]] = {}
-    for frame, name, image in read_footage(index, cameras, frames):
-        face = find_face(image, net)
-        faces.setdefault(frame, []).extend([(name, *face)] if face else [])
-        features.setdefault(frame, {})[name] = find_features(image)
-    return {
-        frame: FrameSetPoints(faces[frame], without_fixed(features[frame]))
-        for frame in sorted(faces)
-    }
+def read_raw_footage(root: Path, cameras: Mapping[str, Camera], count: int) -> Images:
+    """Yields reduced images of a raw capture at up to `count` instants, as `read_footage` does.
 
-
-def read_capture_frames(
-    root: Path, count: int, reduce: Callable[[str, np.ndarray], np.ndarray | None]
-) -> dict[int, dict[str, np.ndarray]]:
-    """Read images (H, W, 3) uint8 of a raw capture at up to `count` instants, by frame number.
-
-    The instants are the middles of cues, or spread over the images where there are no cues; of a
-    video without cues only the first frame is read, as its length is unknown. Each image is kept
-    as `reduce(camera, image)` returns it, and left out where that is None.
+    Of a video without cues only the first frame is read, as its length is unknown.
 
     Raises:
         CaptureError: the capture is unusable, or a camera has no such frame.
     """
     capture = read_capture(root)
     lengths = [len(camera.names) for camera in capture.cameras.values() if camera.names]
-    wanted = _middles(capture.cues, count) or _spread(range(min(lengths, default=1)), count)
-    found: dict[int, dict[str, np.ndarray]] = {frame: {} for frame in wanted}
-    for name, camera in sorted(capture.cameras.items()):
-        for frame, image in _read_raw(camera, wanted):
-            kept = reduce(name, image)
-            if kept is not None:
-                found[frame][name] = kept
-    return found
+    wanted = _middles(capture.cues, count) or even(min(lengths, default=1), count)
+    for name in sorted(set(capture.cameras) & set(cameras)):
+        for frame, image in _read_raw(capture.cameras[name], wanted):
+            yield frame, name, _reduced(cameras[name], image, frame)
 
 
 def _middles(cues: Iterable[Cue], count: int) -> list[int]:
-    """Middle frames of up to `count` cues, evenly chosen."""
-    return _spread(sorted((cue.start_frame + cue.end_frame) // 2 for cue in cues), count)
-
-
-def _spread(frames: Sequence[int], count: int) -> list[int]:
-    """Choose up to `count` frames, evenly."""
-    picks = np.linspace(0, len(frames) - 1, min(count, len(frames))).round().astype(int)
-    return [frames[i] for i in picks]
+    """Returns the middle frames of up to `count` cues, evenly chosen."""
+    middles = sorted((cue.start_frame + cue.end_frame) // 2 for cue in cues)
+    return [middles[i] for i in even(len(middles), count)]
 
 
 def _read_raw(camera: RawCamera, wanted: list[int]) -> Iterator[tuple[int, np.ndarray]]:
-    """Yield wanted frames one by one, so that only one full-size image is held."""
     if camera.kind == "frames":
         length = len(camera.names)
         if max(wanted) < length:
@@ -138,11 +114,52 @@ def _read_raw(camera: RawCamera, wanted: list[int]) -> Iterator[tuple[int, np.nd
     raise CaptureError(f"{camera.path}: has {length} frames, frame {missing} was expected")
 
 
-def known_focals(index: Index) -> dict[str, float]:
-    """Return the focal lengths, pixels of the footage, from capture.toml or the images' EXIF.
+def find_points(images: Images) -> dict[int, FrameSetPoints]:
+    """Finds landmarks and features, in pixels of the images, by frame number."""
+    net = load_network()
+    landmarks: dict[int, list[tuple[str, np.ndarray, np.ndarray]]] = {}
+    features: dict[int, dict[str, Features]] = {}
+    for frame, name, image in images:
+        face = detect(net, image)
+        sigma = LANDMARK_INFLATION * np.maximum(face.sigma, FEATURE_SIGMA_PX)
+        clear = face.score >= FACE_SCORE
+        landmarks.setdefault(frame, []).extend([(name, face.points, sigma)] if clear else [])
+        features.setdefault(frame, {})[name] = find_features(image)
+    return {f: FrameSetPoints(landmarks[f], without_fixed(features[f])) for f in sorted(features)}
 
-    `focal_px` in capture.toml is a number, or a table by camera. EXIF gives the focal length on
-    35 mm film (36 x 24 mm) that has the same diagonal angle of view.
+
+def find_features(image: np.ndarray) -> Features:
+    """Finds SIFT features in an image (H, W, 3) uint8; descriptors are roots (RootSIFT, 2012)."""
+    sift = cv2.SIFT_create(nfeatures=FEATURES, contrastThreshold=0.01)
+    keys, described = sift.detectAndCompute(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), None)
+    if not keys:
+        return np.zeros((0, 2)), np.zeros((0, 128), np.float32)
+    pixels = opencv_pixels_to_corner(np.array([key.pt for key in keys]))
+    return pixels, np.sqrt(described / np.maximum(described.sum(1, keepdims=True), 1e-9))
+
+
+def without_fixed(features: Mapping[str, Features]) -> dict[str, Features]:
+    """Removes features that three or more cameras of a frame set have at the same pixel.
+
+    They belong to the sensors, not to the scene: dust, a watermark, fixed-pattern noise.
+    """
+    names = sorted(features)
+    owner = np.concatenate([np.full(len(features[n][0]), i) for i, n in enumerate(names)])
+    pixels = np.concatenate([features[n][0] for n in names])
+    described = np.concatenate([features[n][1] for n in names])
+    pairs = cKDTree(pixels).query_pairs(0.75, output_type="ndarray")
+    alike = np.einsum("ij,ij->i", described[pairs[:, 0]], described[pairs[:, 1]]) > 0.9
+    first, second = pairs[alike & (owner[pairs[:, 0]] != owner[pairs[:, 1]])].T
+    seen = np.zeros((len(owner), len(names)), bool)
+    seen[first, owner[second]] = seen[second, owner[first]] = True
+    keep = seen.sum(1) < 2
+    return {n: tuple(c[keep[owner == i]] for c in features[n]) for i, n in enumerate(names)}
+
+
+def known_focals(index: Index) -> dict[str, float]:
+    """Returns the focal lengths, pixels of the footage, from capture.toml or the images' EXIF.
+
+    `focal_px` in capture.toml is a number, or a table by camera.
 
     Raises:
         CalibrationError: `focal_px` is not a positive number.
@@ -161,16 +178,15 @@ def known_focals(index: Index) -> dict[str, float]:
                 )
             found[name] = float(value)
         elif source.kind == "frames":
-            film = film_focal_mm(index.capture / source.source / source.names[0])
-            if film > 0:
-                diagonal = math.hypot(source.width, source.height)
-                found[name] = film / FILM_DIAGONAL_MM * diagonal
+            try:
+                film_mm = read_exif(index.capture / source.source / source.names[0])[1]
+            except FormatError:  # a member of a container
+                continue
+            if film_mm > 0:
+                found[name] = focal_of_film(film_mm, source.width, source.height)
     return found
 
 
-def film_focal_mm(path: Path) -> float:
-    """Read the 35 mm equivalent focal length from an image's EXIF, 0 where there is none."""
-    try:
-        return read_exif(path)[1]
-    except FormatError:  # a member of a container
-        return 0.0
+def focal_of_film(film_mm: float, width: int, height: int) -> float:
+    """Returns the focal length, pixels, with the diagonal angle of view of one on 35 mm film."""
+    return film_mm / math.hypot(36.0, 24.0) * math.hypot(width, height)

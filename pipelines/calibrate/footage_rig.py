@@ -1,65 +1,65 @@
 """Solve a rig without calibration or board from its footage: structure from motion.
 
-The face starts the solution, features make it precise, and everything is adjusted together over
-several frame sets. Cameras do not move between them, so all points tie the same poses. The metre
-comes from the distance between the eyes.
+A mean head's 68 landmarks give each camera a first pose towards the head, however far apart the
+cameras stand. Cameras that see no face are placed by features of points that the rig knows. Then
+everything is adjusted together over several frame sets, between which cameras do not move. The
+metre comes from the distance between the eyes.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import combinations
 
+import cv2
 import numpy as np
 
 from express50.errors import CalibrationError
 from express50.geometry.cameras import Camera, triangulate
-from express50.geometry.transforms import rigid_fit
+from express50.geometry.transforms import invert_transform, make_transform, rigid_fit
 from express50.rigs.camera_builder import in_metres
 from express50.rigs.world_frame import canonical_from_rig, move_cameras
 from pipelines.calibrate.adjuster import AdjustedRig, RigPriors, adjust_rig, triangulate_tracks
+from pipelines.calibrate.board_guess import as_model, join_rig, mean_transform
 from pipelines.calibrate.config import AUTO
-from pipelines.calibrate.first_guess import (
-    LEAST_INLIERS,
-    face_rig,
-    focal_at,
-    mean_landmarks,
-    place_by_features,
-    start_camera,
+from pipelines.calibrate.tracks import (
+    LEAST_POINTS,
+    FrameSetPoints,
+    PointTracks,
+    join_tracks,
+    match_descriptors,
 )
-from pipelines.calibrate.intrinsics import as_model
-from pipelines.calibrate.tracks import LEAST_POINTS, FrameSetPoints, PointTracks, join_tracks
 
-FACE_SCALES, FEATURE_SCALES = (6.0, 2.0), (3.0, 1.5)
-"""Cauchy scales of the adjustments, in sigmas."""
+FACE_SCALES, FEATURE_SCALES = (6.0, 2.0), (3.0, 1.5)  # of Cauchy's loss, in sigmas
 BANDS = (0.04, 0.015)
 """How far features may be from their epipolar lines while the rig is still rough, as a share of
 the diagonal."""
 KNOWN_FOCAL, GUESSED_FOCAL, FOCAL_SPREAD = 0.02, 0.6, 0.03
-"""Standard deviations of focal lengths that are known, that are guessed, and of one rig's focal
-lengths about their mean, as shares. A guess of 0.3 pulled the focal lengths of synthetic rigs 1 to
-2 % further from the truth."""
+"""Standard deviations of log focal lengths. Known ones come from EXIF in whole millimetres. Guessed
+ones assume that faces are `calibrate.distance_m` away: a factor of 1.8 either way. The spread is
+that of one rig's focal lengths about their mean."""
 CENTRE, BEND = 0.005, 0.02
 """Standard deviations of principal points, as a share of the diagonal, and of how far lenses bend
 the image's corner, as a share of half of it: footage alone says little about either."""
-OUTLIER = 4.0
-"""Features with larger errors, in sigmas, are mismatches and left out of reported figures."""
+OUTLIER = 4.0  # sigmas; features with larger errors are mismatches and not reported
 EYES = (slice(36, 42), slice(42, 48))
+NOMINAL = 2.5  # focal length, in longer sides, at which distances are first estimated
+INNER = slice(17, 68)  # the jaw's outline is not the same skin from every side
+NEAR_DEG = 25.0  # frame sets whose relative pose is further from the mean are wrong
+LEAST_INLIERS, LEAST_SHARE = 12, 0.4
+"""A camera without a face is placed if so many known points, and such a share of those it seems
+to see, agree on a pose within 4 pixels. Twelve alone were wrong by up to 16 degrees."""
 
 
 @dataclass(frozen=True)
 class FootageSolution:
     """A rig solved from footage, in metres and in the canonical world.
 
-    Attributes:
-        cameras: those that could be placed.
-        tracks: the observations they were solved from.
-        errors: (N, 2) pixels, one row per observation.
-        inliers: (N,) bool, the features that are not mismatches.
-        dropped: the other cameras, with the reason.
-        weak: cameras that only the face holds, with the reason.
-        eye_frames: frame sets in which the distance between the eyes was measured.
-        eye_spread: robust standard deviation of that distance over them, as a share of it.
+    `errors` (N, 2), pixels, are those of `tracks`; `inliers` (N,) marks the features that are not
+    mismatches. `dropped` and `weak` (held by the face alone) give a reason per camera. The distance
+    between the eyes was measured in `eye_frames` frame sets; `eye_spread` is its robust standard
+    deviation, as a share.
     """
 
     cameras: dict[str, Camera]
@@ -82,16 +82,11 @@ def solve_footage(
     distance_m: float,
     eye_distance_mm: float,
 ) -> FootageSolution:
-    """Solve a rig from points that its cameras saw at the same instants.
+    """Solves a rig from points that its cameras saw at the same instants.
 
-    Args:
-        seen: points by frame number.
-        sizes: (width, height) of each camera, pixels.
-        focals: known focal lengths, pixels, by camera.
-        where: the capture, for messages.
-        model: COLMAP lens model; auto is SIMPLE_RADIAL.
-        distance_m: assumed distance of faces, where focal lengths start that are not known.
-        eye_distance_mm: assumed distance between the pupils, which gives the metre.
+    `seen` holds points by frame number; `sizes` are (width, height), `focals` the known focal
+    lengths, pixels. The other settings are those of `CalibrateConfig`; `where` names the capture
+    in errors.
 
     Raises:
         CalibrationError: fewer than two cameras see one face at one time, so that nothing starts
@@ -113,32 +108,17 @@ def solve_footage(
             f" {', '.join(sorted(faces)) or 'none'}: add calibration.json or board/<camera>/*.png"
             " with board.toml, then run 'express50 ingest' again"
         )
-    without = {name: camera for name, camera in start.items() if name not in rig}
-    priors = RigPriors(
-        focal=KNOWN_FOCAL if all(name in focals for name in sizes) else GUESSED_FOCAL,
-        focal_spread=FOCAL_SPREAD,
-        centre=CENTRE,
-        bend=BEND,
-    )
-    bare = {frame: FrameSetPoints(points.landmarks, {}) for frame, points in seen.items()}
-    tracks = join_tracks(rig, bare, BANDS[0])
-    rig = adjust_rig(rig, tracks, triangulate_tracks(rig, tracks), RigPriors(), FACE_SCALES).cameras
-    tracks, adjusted = _adjust_with_features(rig, seen, priors, start)
-    more = place_by_features(adjusted.cameras, without, seen)
-    if more:
-        tracks, adjusted = _adjust_with_features(adjusted.cameras | more, seen, priors, start)
-        loose = set(_weak(tracks)) & set(more)  # held by neither a face nor features
-        if loose:
-            rig = {name: c for name, c in adjusted.cameras.items() if name not in loose}
-            tracks, adjusted = _adjust_with_features(rig, seen, priors, start)
+    known = all(name in focals for name in sizes)
+    tracks, adjusted = _adjust(rig, start, seen, KNOWN_FOCAL if known else GUESSED_FOCAL)
     shapes = _landmark_points(adjusted.cameras, seen)
     gaps = np.array([np.linalg.norm(p[EYES[0]].mean(0) - p[EYES[1]].mean(0)) for p in shapes])
-    if not (gaps > 0).any():
+    gaps = gaps[gaps > 0]
+    if len(gaps) == 0:
         raise CalibrationError(
             f"{where}: the eyes cannot be located in space, so nothing gives the metre; add"
             " calibration.json or board images, then run 'express50 ingest' again"
         )
-    eyes = float(np.median(gaps[gaps > 0]))
+    eyes = float(np.median(gaps))
     scale = eye_distance_mm * 1e-3 / eyes
     metric = in_metres(adjusted.cameras, scale)
     middle = scale * np.median([p.mean(0) for p in shapes], axis=0)
@@ -148,39 +128,55 @@ def solve_footage(
         f"it sees no face well, and fewer than {LEAST_INLIERS} of its features fit points that two"
         " other cameras know: add board images or calibration.json"
     )
-    sizes_in_sigmas = np.linalg.norm(adjusted.errors, axis=1) / tracks.sigma
     return FootageSolution(
         cameras=move_cameras(metric, canonical_from_rig(metric, middle, up)),
         tracks=tracks,
         errors=adjusted.errors,
-        inliers=tracks.features() & (sizes_in_sigmas < OUTLIER),
-        dropped={n: lone if n in faces else blind for n in sorted(without) if n not in metric},
+        inliers=tracks.features()
+        & (np.linalg.norm(adjusted.errors, axis=1) / tracks.sigma < OUTLIER),
+        dropped={n: lone if n in faces else blind for n in sorted(sizes) if n not in metric},
         weak=_weak(tracks),
-        eye_frames=int((gaps > 0).sum()),
-        eye_spread=1.4826 * float(np.median(np.abs(gaps[gaps > 0] - eyes))) / eyes,
+        eye_frames=len(gaps),
+        eye_spread=1.4826 * float(np.median(np.abs(gaps - eyes))) / eyes,
     )
 
 
-def _adjust_with_features(
-    rig: Mapping[str, Camera],
+def _adjust(
+    rig: dict[str, Camera],
+    start: Mapping[str, Camera],
     seen: Mapping[int, FrameSetPoints],
-    priors: RigPriors,
-    expected: Mapping[str, Camera],
+    focal: float,
 ) -> tuple[PointTracks, AdjustedRig]:
-    """Fit poses and lenses to landmarks and features, matched anew as the rig gets better."""
-    for band in BANDS:
-        for scale in FEATURE_SCALES:
-            tracks = join_tracks(rig, seen, band)
-            points = triangulate_tracks(rig, tracks)
-            adjusted = adjust_rig(rig, tracks, points, priors, (scale,), expected=expected)
-            rig = adjusted.cameras
-    return tracks, adjusted
+    """Adjusts a rig first to landmarks, then to features, and places cameras without a face."""
+    priors = RigPriors(focal=focal, focal_spread=FOCAL_SPREAD, centre=CENTRE, bend=BEND)
+
+    def with_features(rig: dict[str, Camera]) -> tuple[PointTracks, AdjustedRig]:
+        for band in BANDS:
+            for scale in FEATURE_SCALES:
+                tracks = join_tracks(rig, seen, band)  # anew, as the rig gets better
+                points = triangulate_tracks(rig, tracks)
+                fit = adjust_rig(rig, tracks, points, priors, (scale,), expected=start)
+                rig = fit.cameras
+        return tracks, fit
+
+    bare = {frame: FrameSetPoints(points.landmarks, {}) for frame, points in seen.items()}
+    tracks = join_tracks(rig, bare, BANDS[0])
+    fit = adjust_rig(rig, tracks, triangulate_tracks(rig, tracks), RigPriors(), FACE_SCALES)
+    tracks, fit = with_features(fit.cameras)
+    others = {name: camera for name, camera in start.items() if name not in rig}
+    more = place_by_features(fit.cameras, others, seen) if others else {}
+    if more:
+        tracks, fit = with_features(fit.cameras | more)
+        loose = set(_weak(tracks)) & set(more)  # held by neither a face nor features
+        if loose:
+            tracks, fit = with_features({n: c for n, c in fit.cameras.items() if n not in loose})
+    return tracks, fit
 
 
 def _landmark_points(
     cameras: Mapping[str, Camera], seen: Mapping[int, FrameSetPoints]
 ) -> list[np.ndarray]:
-    """Triangulate landmarks (68, 3) of the frame sets in which two cameras see them."""
+    """Triangulates landmarks (68, 3) of the frame sets in which two cameras see them."""
     found = []
     for points in seen.values():
         views = [(cameras[n], p, 1 / s**2) for n, p, s in points.landmarks if n in cameras]
@@ -193,7 +189,6 @@ def _landmark_points(
 
 
 def _weak(tracks: PointTracks) -> dict[str, str]:
-    """Name the cameras that share too few features with two others."""
     features = tracks.select(tracks.features())
     return {
         name: f"shares {count} features with two others, expected {LEAST_POINTS} or more: little"
@@ -201,3 +196,144 @@ def _weak(tracks: PointTracks) -> dict[str, str]:
         for name, count in zip(tracks.names, features.shared_points(), strict=True)
         if count < LEAST_POINTS
     }
+
+
+def mean_landmarks() -> np.ndarray:
+    """Returns the landmarks (68, 3) of the built-in mean head, metres, head space."""
+    # Imported here: only rigs that come without any calibration need a head.
+    from express50.head.load import load_head
+    from express50.head.model import landmarks
+
+    head = load_head("procedural")
+    return landmarks(head, head.template[None])[0].double().numpy()
+
+
+def start_camera(name: str, size: tuple[int, int], focal: float) -> Camera:
+    """Makes a camera at the origin from nothing but a focal length, pixels."""
+    params = (focal, size[0] / 2, size[1] / 2, 0.0)
+    return Camera(name, size[0], size[1], "SIMPLE_RADIAL", params, np.eye(4))
+
+
+def focal_at(
+    distance_m: float,
+    seen: Mapping[int, FrameSetPoints],
+    sizes: Mapping[str, tuple[int, int]],
+    head: np.ndarray,
+) -> float:
+    """Returns the focal length, in longer sides, with which faces stand at a distance (median)."""
+    distances = []
+    for points in seen.values():
+        for name, pixels, sigma in points.landmarks:
+            camera = start_camera(name, sizes[name], NOMINAL * max(sizes[name]))
+            pose, error = pose_of_face(pixels, sigma, camera, head)
+            if np.isfinite(error):
+                distances.append(pose[2, 3])
+    return NOMINAL * distance_m / float(np.median(distances)) if distances else NOMINAL
+
+
+def pose_of_face(
+    points: np.ndarray, sigma: np.ndarray, camera: Camera, head: np.ndarray
+) -> tuple[np.ndarray, float]:
+    """Estimates the pose cam_from_head (4, 4) of landmarks (68, 2), and its rms error in sigmas.
+
+    The error is infinite if no pose puts the head in front of the camera.
+    """
+    ideal = (points - camera.K[:2, 2]) / camera.K[[0, 1], [0, 1]]
+    shape, xy, eye = head[INNER], ideal[INNER], np.eye(3)
+    try:
+        _, turn, shift = cv2.solvePnP(shape, xy, eye, None, flags=cv2.SOLVEPNP_SQPNP)
+        turn, shift = cv2.solvePnPRefineLM(shape, xy, eye, None, turn, shift)
+    except cv2.error:  # landmarks on one spot
+        return np.eye(4), float("inf")
+    pose = make_transform(cv2.Rodrigues(turn)[0], shift.ravel())
+    placed = shape @ pose[:3, :3].T + pose[:3, 3]
+    if not (np.isfinite(pose).all() and placed[:, 2].min() > 0):
+        return np.eye(4), float("inf")
+    off = np.linalg.norm(placed[:, :2] / placed[:, 2:] - xy, axis=1) * camera.K[0, 0]
+    return pose, float(np.sqrt(np.mean((off / sigma[INNER]) ** 2)))
+
+
+def face_rig(
+    cameras: Mapping[str, Camera], seen: Mapping[int, FrameSetPoints], head: np.ndarray
+) -> dict[str, Camera]:
+    """Poses the largest group of cameras that see faces in common frame sets."""
+    poses: dict[str, dict[int, tuple[np.ndarray, float]]] = {}
+    for frame, points in seen.items():
+        for name, pixels, sigma in points.landmarks:
+            pose, error = pose_of_face(pixels, sigma, cameras[name], head)
+            if np.isfinite(error):
+                poses.setdefault(name, {})[frame] = (pose, 1 / (1 + error**2))
+    edges = {}
+    for a, b in combinations(sorted(poses), 2):
+        shared = sorted(set(poses[a]) & set(poses[b]))
+        if not shared:
+            continue
+        votes = np.stack([poses[b][f][0] @ invert_transform(poses[a][f][0]) for f in shared])
+        weights = np.array([poses[a][f][1] * poses[b][f][1] for f in shared])
+        mean = mean_transform(votes, weights)
+        traces = np.trace(votes[:, :3, :3] @ mean[:3, :3].T, axis1=1, axis2=2)
+        near = np.degrees(np.arccos(np.clip((traces - 1) / 2, -1, 1))) < NEAR_DEG
+        if near.any():
+            mean = mean_transform(votes[near], weights[near])
+        edges[a, b] = mean, float(max(weights[near].sum(), 1e-9))
+    placed = join_rig(sorted(poses), edges) if edges else {}
+    return {name: replace(cameras[name], cam_from_world=T) for name, T in placed.items()}
+
+
+def place_by_features(
+    rig: Mapping[str, Camera],
+    others: Mapping[str, Camera],
+    seen: Mapping[int, FrameSetPoints],
+) -> dict[str, Camera]:
+    """Places `others`, which see no face, by features that look like points the rig knows.
+
+    Their focal length becomes the rig's median.
+    """
+    tracks = join_tracks(rig, seen, 0.015)
+    points = triangulate_tracks(rig, tracks)
+    known: list[tuple[int, np.ndarray, np.ndarray]] = []  # frame, points (M, 3), descriptors
+    for index, name in enumerate(tracks.names):
+        mine = np.flatnonzero((tracks.camera == index) & tracks.features())
+        place = {tracks.pixels[row].tobytes(): points[tracks.point[row]] for row in mine}
+        for frame, found in seen.items():
+            if name in found.features:
+                pixels, described = found.features[name]
+                rows = [i for i, p in enumerate(pixels) if p.tobytes() in place]
+                at = np.array([place[pixels[i].tobytes()] for i in rows]).reshape(-1, 3)
+                known.append((frame, at, described[rows]))
+    shares = [c.K[0, 0] / max(c.width, c.height) for c in rig.values()]
+    placed = {}
+    for name, camera in sorted(others.items()):
+        pairs = [np.zeros((0, 5))]
+        for frame, at, described in known:
+            if name in seen[frame].features:
+                pixels, mine = seen[frame].features[name]
+                matches = match_descriptors(mine, described)
+                pairs.append(np.column_stack([pixels[matches[:, 0]], at[matches[:, 1]]]))
+        focal = float(np.median(shares)) * max(camera.width, camera.height)
+        lens = as_model(start_camera(name, (camera.width, camera.height), focal), camera.model)
+        pose = resect(np.concatenate(pairs), lens.K)
+        if pose is not None:
+            placed[name] = replace(lens, cam_from_world=pose)
+    return placed
+
+
+def resect(pairs: np.ndarray, K: np.ndarray) -> np.ndarray | None:
+    """Estimates a pose (4, 4) from rows (M, 5) of a pixel and a point; None if too few agree."""
+    # A point comes once for every camera that knows it: samples must not repeat it.
+    rows = np.unique(pairs, axis=0)
+    if len(np.unique(rows[:, :2], axis=0)) < LEAST_INLIERS:
+        return None
+    pixels, points = np.ascontiguousarray(rows[:, :2]), np.ascontiguousarray(rows[:, 2:])
+    try:
+        ok, turn, shift, inliers = cv2.solvePnPRansac(
+            points, pixels, K, None, iterationsCount=2000, reprojectionError=4.0,
+            confidence=0.999, flags=cv2.SOLVEPNP_EPNP,
+        )  # fmt: skip
+    except cv2.error:  # points on a line or on one spot
+        return None
+    good = inliers[:, 0] if ok and inliers is not None else np.zeros(0, int)
+    distinct = min(len(np.unique(column[good], axis=0)) for column in (pixels, points))
+    if distinct < LEAST_INLIERS or len(good) < LEAST_SHARE * len(rows):
+        return None
+    return make_transform(cv2.Rodrigues(turn)[0], shift.ravel())

@@ -1,12 +1,18 @@
-"""Calibrate one subject's cameras: given ones are checked, others solved from board or footage."""
+"""Calibrate one subject's cameras, and draw the result.
+
+Given cameras are checked and refined; others are solved from a board or from the footage.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
 
 from express50.capture.index import Index, calibration_file, read_index
 from express50.contract.layout import Dataset
@@ -14,42 +20,38 @@ from express50.contract.stage import Note, Result
 from express50.errors import CalibrationError, CaptureError
 from express50.files.atomic import write_json
 from express50.files.calibration import read_cameras, write_cameras
-from express50.geometry.cameras import Camera, resized
-from express50.landmarks.network import load_network
-from express50.rigs.world_frame import check_meeting
+from express50.files.images import write_image
+from express50.geometry.cameras import Camera, pinhole, unproject
+from express50.rigs.world_frame import check_meeting, meeting_point
 from pipelines.calibrate.board import BoardCorners, board_from_table, board_points, read_corners
 from pipelines.calibrate.board_rig import BoardSolution, solve_rig
-from pipelines.calibrate.camera_moves import FootageCheck, check_footage
 from pipelines.calibrate.colour_gains import ColourGains, WhiteCollector
 from pipelines.calibrate.config import CalibrateConfig
-from pipelines.calibrate.first_guess import start_camera
 from pipelines.calibrate.footage import (
-    find_footage_points,
+    at_footage_size,
+    find_points,
     known_focals,
     read_footage,
     reduced_camera,
 )
-from pipelines.calibrate.footage_rig import solve_footage
-from pipelines.calibrate.plots import draw_residuals, draw_rig
-from pipelines.calibrate.refine import RefinedRig, refine_by_board, refine_by_footage
+from pipelines.calibrate.footage_rig import solve_footage, start_camera
+from pipelines.calibrate.given_rig import (
+    FootageCheck,
+    RefinedRig,
+    check_footage,
+    refine_by_board,
+    refine_by_footage,
+)
 
-COLOUR_FRAMES = 12
-"""Board images read per camera if only its colours are needed."""
+COLOUR_FRAMES = 12  # board images read per camera if only its colours are needed
 
 
 @dataclass(frozen=True)
 class CalibratedRig:
-    """The cameras of one subject, and what is reported about them.
+    """The cameras of one subject in the canonical world, and what is reported about them.
 
-    Attributes:
-        source: given, board or footage.
-        cameras: in the canonical world, metres.
-        reprojection_px: rms over all observations; None for given cameras.
-        per_camera_px: the same by camera.
-        figures: metrics that only this source has.
-        gains: colour gains, if a board shows them.
-        solution: the board's solution, for plots.
-        dropped, warnings: notes.
+    `source` is given, board or footage, `figures` are metrics that only this source has. Errors
+    are rms over all observations; None for given cameras.
     """
 
     source: str
@@ -64,10 +66,7 @@ class CalibratedRig:
 
 
 def run(dataset: Dataset, item: str, config: CalibrateConfig, out: Path) -> Result:
-    """Write cameras.json and plots of one subject, and from a board the gains of its cameras.
-
-    CONVENTIONS.md describes the world.
-    """
+    """Writes cameras.json and plots of one subject, and from a board the gains of its cameras."""
     index = read_index(dataset, item)
     given = calibration_file(dataset, index)
     has_board = index.board is not None and bool(index.board["cameras"])
@@ -79,12 +78,11 @@ def run(dataset: Dataset, item: str, config: CalibrateConfig, out: Path) -> Resu
         rig = _from_footage(index, config)
     check = None
     if rig.source != "footage":  # there the same footage would judge itself
-        check = _check_footage(index, rig.cameras, config.check_moments)
+        check = _check_footage(index, rig.cameras, config.check_frame_sets)
     return _write(rig, check, out)
 
 
 def _write(rig: CalibratedRig, check: FootageCheck | None, out: Path) -> Result:
-    """Write the files of a calibrated rig and gather its metrics."""
     names = sorted(rig.cameras)
     figures = dict(rig.figures)
     write_cameras(out / "cameras.json", rig.cameras)
@@ -93,15 +91,16 @@ def _write(rig: CalibratedRig, check: FootageCheck | None, out: Path) -> Result:
     origins = np.array([pose[:3, 3] for pose in boards]).reshape(-1, 3)
     draw_rig(out / "qc" / "rig.jpg", rig.cameras, origins)
     if rig.solution is not None:
-        draw_residuals(out / "qc" / "residuals.jpg", rig.solution)
+        draw_residuals(out / "qc" / "residuals.jpg", rig.solution, rig.per_camera_px)
     if rig.gains is not None:
-        write_json(out / "gains.json", {n: [round(g, 5) for g in rig.gains.gain[n]] for n in names
-                                        if n in rig.gains.gain})  # fmt: skip
+        gains = rig.gains.gain
+        rows = {n: [round(g, 5) for g in gains[n]] for n in names if n in gains}
+        write_json(out / "gains.json", rows)
         figures["colour"] = {
             "spread_percent": _rounded(rig.gains.before, 3),
             "spread_evened_percent": _rounded(rig.gains.after, 3),
             "squares": rig.gains.squares,
-            "untold": [name for name in names if name not in rig.gains.gain],
+            "untold": [name for name in names if name not in gains],
         }
     moved = [
         Note(
@@ -142,14 +141,20 @@ def _given(index: Index, path: Path, has_board: bool, config: CalibrateConfig) -
     refined: RefinedRig | None = None
     gains: ColourGains | None = None
     warnings: tuple[Note, ...] = ()
+    lenses = config.refine == "all"
     if config.refine != "none" and has_board:
         corners, points, whites = _read_board(index, config.board_frames)
         gains = whites.gains(sorted(cameras))
-        refined = refine_by_board(
-            cameras, corners, points, rounds=config.rounds, lenses=config.refine == "all"
-        )
+        refined = refine_by_board(cameras, corners, points, rounds=config.rounds, lenses=lenses)
     elif config.refine != "none":
-        refined = _refine_by_footage(index, cameras, config)
+        # One bumped camera is corrected first. Where several seem to have moved, the whole rig is
+        # off, and the check cannot say which camera is at fault.
+        check = _check_footage(index, cameras, max(1, config.check_frame_sets))
+        refined = refine_by_footage(
+            cameras, find_points(read_footage(index, cameras, config.solve_frame_sets)),
+            turn_deg=config.refine_turn_deg, move_mm=config.refine_move_mm, lenses=lenses,
+            start=check.cameras if check is not None and len(check.moved) == 1 else None,
+        )  # fmt: skip
     elif has_board:
         try:
             gains = _read_board(index, COLOUR_FRAMES)[2].gains(sorted(cameras))
@@ -167,51 +172,16 @@ def _given(index: Index, path: Path, has_board: bool, config: CalibrateConfig) -
     )
 
 
-def _refine_by_footage(
-    index: Index, cameras: dict[str, Camera], config: CalibrateConfig
-) -> RefinedRig:
-    checked = _check_footage(index, cameras, max(1, config.check_moments))
-    # One bumped camera is corrected first. Where several seem to have moved, the whole rig is off,
-    # and the check cannot say which camera is at fault.
-    start = checked.cameras if checked is not None and len(checked.moved) == 1 else cameras
-    seen = find_footage_points(index, cameras, config.solve_moments)
-    small = {name: reduced_camera(camera) for name, camera in cameras.items()}
-    placed = {n: replace(c, cam_from_world=start[n].cam_from_world) for n, c in small.items()}
-    lenses = config.refine == "all"
-    refined = refine_by_footage(
-        small, placed, seen,
-        turn_deg=config.refine_turn_deg, move_mm=config.refine_move_mm, lenses=lenses,
-    )  # fmt: skip
-    if refined.kept:
-        return replace(refined, cameras=cameras)
-    return replace(
-        refined,
-        cameras={
-            name: _at_footage_size(camera, cameras[name])
-            if lenses
-            else replace(cameras[name], cam_from_world=camera.cam_from_world)
-            for name, camera in refined.cameras.items()
-        },
-    )
-
-
-def _at_footage_size(small: Camera, camera: Camera) -> Camera:
-    """Resize a reduced camera to the footage's size, that of `camera`."""
-    size = (camera.width, camera.height)
-    return small if size == (small.width, small.height) else resized(small, *size)
-
-
 def sizes_of(index: Index) -> dict[str, tuple[int, int]]:
-    """Return the (width, height) of each camera's footage."""
+    """Returns the (width, height) of each camera's footage."""
     return {name: (source.width, source.height) for name, source in index.cameras.items()}
 
 
 def check_given(cameras: dict[str, Camera], sizes: dict[str, tuple[int, int]], where: str) -> None:
-    """Check cameras that came with a capture against its footage.
+    """Checks that given cameras have the footage's sizes and look at one place.
 
     Raises:
-        CalibrationError: no camera is left, an image size differs from the footage's, or the
-            cameras do not look at one place in front of them all.
+        CalibrationError: they do not, or there is none.
     """
     if not cameras:
         raise CalibrationError(
@@ -251,7 +221,7 @@ def _from_board(index: Index, config: CalibrateConfig) -> CalibratedRig:
 
 
 def _read_board(index: Index, limit: int) -> tuple[BoardCorners, np.ndarray, WhiteCollector]:
-    """Read the board's corners in its images, their places on it (P, 3), and its white squares."""
+    """Reads the board's corners, their places on it (P, 3), and its white squares."""
     table = index.board or {}
     board = board_from_table(table["config"], f"{index.capture}: board.toml")
     files = {n: [index.capture / file for file in table["cameras"].get(n, [])]
@@ -266,7 +236,7 @@ def _from_footage(index: Index, config: CalibrateConfig) -> CalibratedRig:
     small = {name: reduced_camera(camera) for name, camera in blank.items()}
     focals = {n: f * small[n].width / blank[n].width for n, f in known_focals(index).items()}
     solved = solve_footage(
-        find_footage_points(index, blank, config.solve_moments),
+        find_points(read_footage(index, blank, config.solve_frame_sets)),
         {name: (camera.width, camera.height) for name, camera in small.items()},
         focals,
         str(index.capture),
@@ -274,7 +244,7 @@ def _from_footage(index: Index, config: CalibrateConfig) -> CalibratedRig:
         distance_m=config.distance_m,
         eye_distance_mm=config.eye_distance_mm,
     )
-    cameras = {n: _at_footage_size(camera, blank[n]) for n, camera in solved.cameras.items()}
+    cameras = {n: at_footage_size(camera, blank[n]) for n, camera in solved.cameras.items()}
     check_meeting(cameras, str(index.capture))
     squared, good = np.sum(solved.errors**2, axis=1), solved.inliers
     scale = (
@@ -292,8 +262,8 @@ def _from_footage(index: Index, config: CalibrateConfig) -> CalibratedRig:
         },
         figures={
             "features": int(good.sum()),
-            "focals_told": sorted(set(focals) & set(solved.cameras)),
-            "eye_moments": solved.eye_frames,
+            "known_focals": sorted(set(focals) & set(solved.cameras)),
+            "eye_frame_sets": solved.eye_frames,
             "eye_spread": round(solved.eye_spread, 5),
         },
         dropped=_notes(solved.dropped),
@@ -305,11 +275,90 @@ def _rms(squared: np.ndarray) -> float | None:
     return float(np.sqrt(squared.mean())) if squared.size else None
 
 
-def _check_footage(index: Index, cameras: Mapping[str, Camera], count: int) -> FootageCheck | None:
-    """Search for moved cameras in so many frame sets; None with fewer than three cameras."""
+def _check_footage(index: Index, cameras: dict[str, Camera], count: int) -> FootageCheck | None:
+    """Searches for moved cameras in so many frame sets; None with fewer than three cameras."""
     if count < 1 or len(cameras) < 3:
         return None
-    frames: dict[int, dict[str, np.ndarray]] = {}
-    for frame, name, image in read_footage(index, cameras, count):
-        frames.setdefault(frame, {})[name] = image
-    return check_footage(cameras, frames, load_network())
+    return check_footage(cameras, find_points(read_footage(index, cameras, count)))
+
+
+def draw_rig(path: Path, cameras: Mapping[str, Camera], boards: np.ndarray) -> None:
+    """Draws frusta and axes from above and from the front; `boards` (B, 3) are board origins."""
+    figure = Figure(figsize=(11, 5.2), dpi=100, layout="tight")
+    met = meeting_point(cameras)
+    centers = np.stack([camera.center for camera in cameras.values()])
+    target = centers.mean(0) if met is None else met
+    reach = float(np.median(np.linalg.norm(centers - target, axis=1))) or 1.0
+    titles = ("from above (front of the rig below)", "from the front")
+    for column, (title, plane) in enumerate(zip(titles, ([0, 2], [0, 1]), strict=True), 1):
+        axes = figure.add_subplot(1, 2, column)
+        for name, camera in sorted(cameras.items()):
+            size = np.array([camera.width, camera.height])
+            corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) * size
+            outline = unproject(pinhole(camera), corners, np.full(4, 0.12 * reach))[:, plane]
+            start = camera.center[plane]
+            for i in range(4):
+                side = np.stack([start, outline[i], outline[(i + 1) % 4]])
+                axes.plot(*side.T, color="tab:blue", lw=0.8)
+            end = start if met is None else start + reach * camera.cam_from_world[2, plane]
+            axes.plot([start[0], end[0]], [start[1], end[1]], color="0.8", lw=0.5, zorder=0)
+            axes.annotate(name, start, fontsize=6, textcoords="offset points", xytext=(3, 3))
+        if len(boards):
+            axes.plot(*boards[:, plane].T, ".", color="tab:orange", ms=3, label="board")
+            axes.legend(loc="upper right", fontsize=7)
+        axes.plot(*target[plane], "k+", ms=10)
+        axes.set_aspect("equal", "datalim")
+        axes.set_xlabel("xyz"[plane[0]] + " [m]")
+        axes.set_ylabel("xyz"[plane[1]] + " [m]")
+        axes.set_title(title, fontsize=10)
+        axes.grid(alpha=0.3)
+        if column == 1:
+            axes.invert_yaxis()
+    _save(figure, path)
+
+
+def draw_residuals(
+    path: Path, solution: BoardSolution, per_camera_px: Mapping[str, float | None]
+) -> None:
+    """Draws the scatter of corner errors, their mean over the image, and the rms per camera.
+
+    A round scatter and arrows without a pattern mean that the lens model is sufficient.
+    """
+    figure = Figure(figsize=(13, 4.2), dpi=100, layout="tight")
+    errors = solution.errors
+    scatter, field, bars = (figure.add_subplot(1, 3, i + 1) for i in range(3))
+    limit = max(float(np.percentile(np.abs(errors), 99.5)) * 1.2, 1e-6)
+    scatter.hexbin(errors[:, 0], errors[:, 1], gridsize=40, extent=(-limit, limit) * 2, mincnt=1)
+    scatter.set_aspect("equal")
+    scatter.set_title(f"errors of {len(errors)} corners [px]", fontsize=10)
+    _draw_field(field, solution)
+    names = sorted(solution.cameras)
+    colours = ["tab:red" if n in solution.weak else "tab:blue" for n in names]
+    bars.bar(range(len(names)), [per_camera_px[name] for name in names], color=colours)
+    bars.set_xticks(range(len(names)), names, rotation=90, fontsize=7)
+    bars.set_title("rms per camera [px]; red: weakly tied in", fontsize=10)
+    _save(figure, path)
+
+
+def _draw_field(axes: Axes, solution: BoardSolution, cells: int = 12) -> None:
+    """Draws the mean error in each cell of the image, over all cameras, as arrows."""
+    kept, cameras = solution.corners, solution.cameras
+    known = [(c.width, c.height) if (c := cameras.get(n)) else (1, 1) for n in kept.cameras]
+    where = kept.pixels / np.array(known)[kept.camera]
+    cell = np.clip((where * cells).astype(int), 0, cells - 1) @ np.array([1, cells])
+    count = np.bincount(cell, minlength=cells**2)
+    full = np.flatnonzero(count >= 5)
+    sums = [np.bincount(cell, solution.errors[:, i], minlength=cells**2) for i in range(2)]
+    mean = np.stack(sums, axis=1)[full] / count[full, None]
+    at = (np.column_stack([full % cells, full // cells]) + 0.5) / cells
+    longest = float(np.linalg.norm(mean, axis=1).max(initial=1e-9))
+    axes.quiver(at[:, 0], at[:, 1], mean[:, 0], mean[:, 1], angles="xy", scale=longest * 12)
+    axes.set_xlim(0, 1)
+    axes.set_ylim(1, 0)
+    axes.set_title(f"mean error over the image (longest {longest:.3f} px)", fontsize=10)
+
+
+def _save(figure: Figure, path: Path) -> None:
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    write_image(path, np.ascontiguousarray(np.asarray(canvas.buffer_rgba())[..., :3]), quality=90)

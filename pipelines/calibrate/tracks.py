@@ -1,8 +1,4 @@
-"""Points that several cameras see at one instant: facial landmarks and image features.
-
-Landmarks tie any two cameras that see the face, to a few pixels. Features (SIFT, on skin, hair,
-cloth and room) tie neighbouring cameras, to a fraction of a pixel.
-"""
+"""Tracks: points that several cameras saw at one instant, matched between the cameras."""
 
 from __future__ import annotations
 
@@ -14,41 +10,26 @@ import cv2
 import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
 
 from express50.geometry.cameras import Camera, distort, normalised
-from express50.geometry.conventions import opencv_pixels_to_corner
-from express50.landmarks.detector import detect
-from express50.landmarks.network import LandmarkNet
 
 Features: TypeAlias = tuple[np.ndarray, np.ndarray]
 """Recorded pixels (N, 2) and descriptors (N, 128) of length one."""
-FEATURES = 1500
-"""Features kept per image, strongest first."""
 RATIO = 0.8
 """A match counts if its distance is below this share of the second-best one's (Lowe 2004)."""
 FEATURE_SIGMA_PX = 0.7
-FACE_SCORE = 0.9
-"""Faces with a lower score are profiles and backs of heads, whose landmarks are guessed."""
-LANDMARK_INFLATION = 3.0
-"""Landmark errors within a view are correlated; their sigma is inflated by this factor."""
 NEIGHBOURS, WIDEST_DEG = 6, 45.0
 """Features are compared between each camera and so many neighbours, if their axes differ by less
 than the angle: beyond it features no longer look alike."""
-LEAST_POINTS = 20
-"""Points that a camera must share with two others to be judged by them."""
+LEAST_POINTS = 20  # that a camera must share with two others to be judged by them
 
 
 @dataclass(frozen=True)
 class PointTracks:
     """Observations of points, one row per camera and point; no camera sees a point twice.
 
-    Attributes:
-        names: cameras that `camera` indexes.
-        camera: (N,) index into `names`.
-        point: (N,) number of the point; rows with one number show the same point.
-        pixels: (N, 2) as recorded.
-        sigma: (N,) expected error, pixels.
+    `camera` (N,) indexes `names`; rows with one number in `point` (N,) show the same point.
+    `pixels` (N, 2) are as recorded, `sigma` (N,) are their expected errors.
     """
 
     names: tuple[str, ...]
@@ -58,7 +39,7 @@ class PointTracks:
     sigma: np.ndarray
 
     def select(self, keep: np.ndarray) -> PointTracks:
-        """Keep the rows where `keep` (N,) is true, of points that two cameras still see."""
+        """Keeps the rows where `keep` (N,) is true, of points that two cameras still see."""
         twice = np.bincount(self.point[keep], minlength=1 + self.point.max(initial=-1)) >= 2
         keep = keep & twice[self.point]
         columns = (self.camera, self.point, self.pixels, self.sigma)
@@ -67,17 +48,17 @@ class PointTracks:
         return PointTracks(self.names, camera, number, pixels, sigma)
 
     def of_cameras(self, names: tuple[str, ...]) -> PointTracks:
-        """Keep the observations of some cameras and index these anew."""
+        """Keeps the observations of some cameras and indexes these anew."""
         number = np.array([names.index(n) if n in names else -1 for n in self.names], int)
         kept = self.select(number[self.camera] >= 0)
         return replace(kept, names=names, camera=number[kept.camera])
 
     def features(self) -> np.ndarray:
-        """Mark the rows (N,) that are features, not landmarks."""
+        """Marks the rows (N,) that are features, not landmarks."""
         return self.sigma == FEATURE_SIGMA_PX
 
     def shared_points(self) -> np.ndarray:
-        """Count the points (C,) that each camera sees together with two others."""
+        """Counts the points (C,) that each camera sees together with two others."""
         views = np.bincount(self.point, minlength=1)
         rows = views[self.point] >= 3
         return np.bincount(self.camera[rows], minlength=len(self.names))
@@ -85,62 +66,13 @@ class PointTracks:
 
 @dataclass(frozen=True)
 class FrameSetPoints:
-    """Landmarks and features that the cameras of one frame set saw, in recorded pixels.
+    """What the cameras of one frame set saw, in recorded pixels.
 
-    Attributes:
-        landmarks: camera, points (68, 2) and sigma (68,) of each view of the face.
-        features: features by camera.
+    `landmarks` are camera, points (68, 2) and sigma (68,) of each view of the face.
     """
 
     landmarks: list[tuple[str, np.ndarray, np.ndarray]]
     features: dict[str, Features]
-
-
-def find_points(images: Mapping[str, np.ndarray], net: LandmarkNet | None) -> FrameSetPoints:
-    """Find landmarks (none without a network) and features in images (H, W, 3) uint8."""
-    faces = {name: find_face(images[name], net) for name in sorted(images)} if net else {}
-    features = {name: find_features(image) for name, image in images.items()}
-    landmarks = [(name, *face) for name, face in faces.items() if face]
-    return FrameSetPoints(landmarks, without_fixed(features))
-
-
-def find_face(image: np.ndarray, net: LandmarkNet) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return landmarks (68, 2) and their sigmas (68,), or None unless a face is seen clearly."""
-    seen = detect(net, image)
-    if seen.score < FACE_SCORE:
-        return None
-    return seen.points, LANDMARK_INFLATION * np.maximum(seen.sigma, FEATURE_SIGMA_PX)
-
-
-def find_features(image: np.ndarray) -> Features:
-    """Find SIFT features in an image (H, W, 3) uint8.
-
-    Descriptors are compared as square roots (Arandjelovic and Zisserman, CVPR 2012).
-    """
-    sift = cv2.SIFT_create(nfeatures=FEATURES, contrastThreshold=0.01)
-    keys, described = sift.detectAndCompute(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), None)
-    if not keys:
-        return np.zeros((0, 2)), np.zeros((0, 128), np.float32)
-    pixels = opencv_pixels_to_corner(np.array([key.pt for key in keys]))
-    return pixels, np.sqrt(described / np.maximum(described.sum(1, keepdims=True), 1e-9))
-
-
-def without_fixed(features: Mapping[str, Features]) -> dict[str, Features]:
-    """Remove features that three or more cameras of a frame set have at the same pixel.
-
-    They belong to the sensors, not to the scene: dust, a watermark, fixed-pattern noise.
-    """
-    names = sorted(features)
-    owner = np.concatenate([np.full(len(features[n][0]), i) for i, n in enumerate(names)])
-    pixels = np.concatenate([features[n][0] for n in names])
-    described = np.concatenate([features[n][1] for n in names])
-    pairs = cKDTree(pixels).query_pairs(0.75, output_type="ndarray")
-    alike = np.einsum("ij,ij->i", described[pairs[:, 0]], described[pairs[:, 1]]) > 0.9
-    first, second = pairs[alike & (owner[pairs[:, 0]] != owner[pairs[:, 1]])].T
-    seen = np.zeros((len(owner), len(names)), bool)
-    seen[first, owner[second]] = seen[second, owner[first]] = True
-    keep = seen.sum(1) < 2
-    return {n: tuple(c[keep[owner == i]] for c in features[n]) for i, n in enumerate(names)}
 
 
 def join_tracks(
@@ -149,17 +81,13 @@ def join_tracks(
     band: float,
     verified: bool = True,
 ) -> PointTracks:
-    """Join landmarks and matched features into tracks.
+    """Joins landmarks and matched features of frames into tracks.
 
-    Args:
-        cameras: the rig as it is believed to be.
-        seen: points by frame number.
-        band: largest distance of a match from its epipolar line, as a share of the image's
-            diagonal: how far off a camera may be.
-        verified: match features by their descriptors and the pair's own fundamental matrix over
-            all frames, and use `cameras` only for the band. Such matches can show that a whole
-            rig is a little off; matches searched along wrong epipolar lines would confirm it.
-            False searches along the lines, which finds more where most cameras are right.
+    A match is at most `band` off its epipolar line, as a share of the image's diagonal. `verified`
+    matches by descriptors and the pair's own fundamental matrix over all frames; `cameras` only
+    give the band. Such matches can show that a whole rig is a little off, which matches searched
+    along wrong lines would confirm. False searches along the lines: more matches if most cameras
+    are right.
     """
     names = tuple(sorted(cameras))
     ideal = {f: {n: _undistorted(cameras[n], p.features[n]) for n in names if n in p.features}
@@ -201,8 +129,7 @@ def join_tracks(
 def _undistorted(camera: Camera, features: Features) -> Features:
     """Features in the pixels of the undistorted image.
 
-    Where the lens folds (a trial lens may, in the corners) there is no such pixel. These features
-    get descriptors of zeros, which match nothing.
+    Where a trial lens folds there is no such pixel: descriptors of zeros match nothing.
     """
     K, (pixels, described) = camera.K, features
     xy = normalised(camera, pixels)
@@ -212,7 +139,7 @@ def _undistorted(camera: Camera, features: Features) -> Features:
 
 
 def _neighbours(cameras: Mapping[str, Camera]) -> list[tuple[str, str]]:
-    """List the pairs of cameras, in order of name, of which one is among the other's nearest."""
+    """Lists the pairs of cameras, in order of name, of which one is among the other's nearest."""
     names = sorted(cameras)
     axes = np.stack([cameras[name].cam_from_world[2, :3] for name in names])
     angle = np.degrees(np.arccos(np.clip(axes @ axes.T, -1, 1)))
@@ -226,7 +153,7 @@ def _neighbours(cameras: Mapping[str, Camera]) -> list[tuple[str, str]]:
 def _chain(
     names: tuple[str, ...], matches: list[tuple[str, str, np.ndarray]]
 ) -> list[list[tuple[int, int]]]:
-    """Chain pairwise matches into groups of (camera, feature).
+    """Chains pairwise matches into groups of (camera, feature).
 
     A group that holds two features of one camera contradicts itself and is left out.
     """
@@ -250,10 +177,7 @@ def _chain(
 def match_descriptors(
     a: np.ndarray, b: np.ndarray, allowed: np.ndarray | None = None
 ) -> np.ndarray:
-    """Match descriptors (A, 128) and (B, 128): pairs (M, 2) that are each other's clear best.
-
-    Only pairs that are `allowed` (A, B) are compared; None allows all.
-    """
+    """Matches descriptors (A, 128), (B, 128): `allowed` pairs (M, 2), each other's clear best."""
     if min(len(a), len(b)) < 2:
         return np.zeros((0, 2), int)
     likeness = a @ b.T
@@ -271,7 +195,7 @@ def match_descriptors(
 def epipolar_distance(
     a: Camera, b: Camera, pixels_a: np.ndarray, pixels_b: np.ndarray
 ) -> np.ndarray:
-    """Measure (A, B), pixels in b, how far each pixel in b is from the epipolar line of each in a.
+    """Measures (A, B), pixels in b, how far each pixel in b is from the epipolar line of each in a.
 
     Pixels are undistorted. Source: Hartley and Zisserman, Multiple View Geometry, 2nd ed., 9.2.
     """
@@ -285,7 +209,7 @@ def epipolar_distance(
 
 
 def verified_pairs(features: Mapping[int, tuple[Features, Features]]) -> dict[int, np.ndarray]:
-    """Return the matches (M, 2) by frame that one fundamental matrix of two cameras explains.
+    """Returns the matches (M, 2) by frame that one fundamental matrix of two cameras explains.
 
     Empty where it explains fewer than 12 matches, or fewer than two fifths of them.
     """

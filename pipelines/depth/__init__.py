@@ -4,16 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from express50.capture.index import peak_items
 from express50.contract.layout import Dataset
 from express50.contract.stage import Growth, Result, Stage
 from pipelines.depth.config import PRESETS, DepthConfig
-
-
-def items(dataset: Dataset) -> list[str]:
-    """List the expressions that have a peak frame."""
-    from express50.capture.frames import peak_items
-
-    return peak_items(dataset)
 
 
 def inputs(dataset: Dataset, item: str, config: DepthConfig) -> dict[str, Path | str]:
@@ -47,7 +41,7 @@ STAGE = Stage(
     version=8,
     config=DepthConfig,
     presets=PRESETS,
-    items=items,
+    items=peak_items,
     inputs=inputs,
     run=run,
     help="reconstruct the head's surface and depth maps of each expression",

@@ -57,7 +57,7 @@ class LevelSet:
 
     @property
     def allocated(self) -> int:
-        """Count the voxels held; a dense array would hold the product of ``shape``."""
+        """Count the voxels held."""
         return self.blocks[HELD:].size
 
     @property
@@ -133,13 +133,9 @@ def assemble(
 ) -> LevelSet:  # fmt: skip
     """Make a grid of ``values`` at ``places``; blocks that are constant there are not held.
 
-    Args:
-        origin: (3,) world, metres.
-        voxel: metres.
-        shape: voxels (X, Y, Z) of the box.
-        inside: (A, B, C) whether a block that is not among the places is inside.
-        places: (M, 3) in the table's order.
-        values: distances (m, BLOCK, BLOCK, BLOCK), metres, of places (m, 3).
+    ``values`` gives distances (m, BLOCK, BLOCK, BLOCK), metres, of places (m, 3). The places (M, 3)
+    are in the table's order; other blocks are as ``inside`` (A, B, C) says. Border voxels and
+    those beyond the box become outside.
 
     Raises:
         StageError: more than VOXEL_LIMIT voxels would be held.
@@ -152,7 +148,13 @@ def assemble(
     for start in range(0, len(places), CHUNK):
         part = places[start : start + CHUNK]
         found = np.clip(values(part), -far, far).astype(np.float32, copy=False)
-        _close_border(found, part, shape, far)
+        for axis in range(3):
+            index = BLOCK * part[:, axis, None] + np.arange(BLOCK)
+            last = shape[axis] - 1
+            side = np.moveaxis(found, axis + 1, 1)
+            for outside, least in (((index == 0) | (index == last), BORDER), (index > last, far)):
+                hit = np.nonzero(outside)
+                side[hit] = np.maximum(side[hit], np.float32(least))
         near = (found.min((1, 2, 3)) < far) & (found.max((1, 2, 3)) > -far)
         rows = np.where(found[:, 0, 0, 0] < 0, INSIDE, OUTSIDE)
         rows[near] = count + np.arange(near.sum())
@@ -166,19 +168,6 @@ def assemble(
                 " If it is, raise depth.voxel_mm or depth.voxel_px"
             )
     return LevelSet(origin, voxel, shape, table, np.concatenate(blocks))
-
-
-def _close_border(
-    values: np.ndarray, places: np.ndarray, shape: tuple[int, int, int], far: float
-) -> None:
-    """Make the box's border and the voxels of its last blocks beyond it outside; in place."""
-    for axis in range(3):
-        index = BLOCK * places[:, axis, None] + np.arange(BLOCK)
-        last = shape[axis] - 1
-        side = np.moveaxis(values, axis + 1, 1)
-        for outside, least in (((index == 0) | (index == last), BORDER), (index > last, far)):
-            hit = np.nonzero(outside)
-            side[hit] = np.maximum(side[hit], np.float32(least))
 
 
 def box_shape(extent: np.ndarray, voxel: float) -> tuple[int, int, int]:
@@ -267,7 +256,7 @@ def dilated(grid: LevelSet) -> LevelSet:
     blocks = np.concatenate([grid.blocks[:HELD], grid.blocks[grid.table[wanted]]])
     table = grid.table.copy()
     table[wanted] = HELD + np.arange(len(blocks) - HELD)
-    return LevelSet(grid.origin, grid.voxel, grid.shape, table, blocks)
+    return replace(grid, table=table, blocks=blocks)
 
 
 def largest_body(grid: LevelSet) -> LevelSet:
@@ -300,7 +289,14 @@ def _inside_parts(grid: LevelSet) -> tuple[LevelSet, np.ndarray]:
     table = np.where(deep > 0, len(grid.blocks) - 1 + deep, grid.table)
     parts = LevelSet(grid.origin, grid.voxel, grid.shape, table, blocks.astype(np.int32))
     total = 1 + count + deeps
-    first, second = _touching(parts, held(grid)[own.any((1, 2, 3))], total)
+    around = windows(parts, held(grid)[own.any((1, 2, 3))], 1, 1).astype(np.int64)
+    middle, pairs = around[:, 1:-1, 1:-1, 1:-1], []
+    for x, y, z in product((0, 1, 2), repeat=3):
+        other = around[:, x : x + BLOCK, y : y + BLOCK, z : z + BLOCK]
+        key = (middle * total + other)[(middle != other) & (middle > 0) & (other > 0)]
+        # runs of the same pair first: sorting all of them would take most of the time
+        pairs.append(np.unique(key[np.diff(key, prepend=-1) != 0]))
+    first, second = np.divmod(np.concatenate(pairs), total)
     graph = sparse.coo_matrix((np.ones(len(first)), (first, second)), (total, total))
     joined = sparse.csgraph.connected_components(graph, directed=False)[1]
     size = np.bincount(joined[own.ravel()], minlength=joined.max() + 1)  # outside is part 0
@@ -309,24 +305,8 @@ def _inside_parts(grid: LevelSet) -> tuple[LevelSet, np.ndarray]:
     return replace(parts, blocks=joined[blocks]), size
 
 
-def _touching(parts: LevelSet, places: np.ndarray, count: int) -> np.ndarray:
-    """List the pairs (2, N) of different parts, below ``count``, that touch in these blocks."""
-    around = windows(parts, places, 1, 1).astype(np.int64)
-    middle = around[:, 1:-1, 1:-1, 1:-1]
-    found = []
-    for x, y, z in product((0, 1, 2), repeat=3):
-        other = around[:, x : x + BLOCK, y : y + BLOCK, z : z + BLOCK]
-        key = (middle * count + other)[(middle != other) & (middle > 0) & (other > 0)]
-        # runs of the same pair first: sorting all of them would take most of the time
-        found.append(np.unique(key[np.diff(key, prepend=-1) != 0]))
-    return np.stack(np.divmod(np.concatenate(found), count))
-
-
 def smoothed(grid: LevelSet, sigma: float, truncate: float = 4.0) -> LevelSet:
-    """Convolve with a Gaussian of ``sigma`` voxels, exact in the blocks of ``grid``.
-
-    Passes along the axes need the blocks around, where the result is only a guess.
-    """
+    """Convolve with a Gaussian of ``sigma`` voxels, exact in the blocks of ``grid``."""
     radius = int(truncate * sigma + 0.5)
     kernel = np.exp(-0.5 * (np.arange(-radius, radius + 1) / sigma) ** 2)
     return separably(grid, kernel / kernel.sum())
@@ -335,8 +315,7 @@ def smoothed(grid: LevelSet, sigma: float, truncate: float = 4.0) -> LevelSet:
 def separably(grid: LevelSet, kernel: np.ndarray) -> LevelSet:
     """Correlate with a kernel (K,) along each axis in turn, exact in ``grid``'s blocks.
 
-    K is odd and at most 2 BLOCK + 1. A block and its two neighbours make lines of 3 BLOCK voxels,
-    which are multiplied by one matrix.
+    K is odd and at most 2 BLOCK + 1. The result holds the blocks around too, where it is a guess.
     """
     wide = dilated(grid)
     radius = len(kernel) // 2
@@ -362,22 +341,17 @@ def refined(grid: LevelSet, voxel: float) -> LevelSet:
     """
     ratio = voxel / grid.voxel
     shape = box_shape((np.array(grid.shape) - 1) * grid.voxel, voxel)
-    axes = [_coarse_span(-(-n // BLOCK), ratio, m)
-            for n, m in zip(shape, grid.table.shape, strict=True)]  # fmt: skip
+    axes = []  # of each, the first and the last coarse block that each finer block meets
+    for fine, coarse in zip(shape, grid.table.shape, strict=True):
+        first = BLOCK * np.arange(-(-fine // BLOCK)) * ratio
+        ends = np.floor(first), np.ceil(first + (BLOCK - 1) * ratio)
+        axes.append([np.minimum(end.astype(int) >> SHIFT, coarse - 1) for end in ends])
     below = [grid.table[np.ix_(*ends)] for ends in product(*axes)]
     near = np.any([rows >= HELD for rows in below], axis=0) | (np.ptp(below, axis=0) > 0)
     pole = 3**0.5 - 2
     kernel = pole ** np.abs(np.arange(-BLOCK, BLOCK + 1))  # samples to coefficients, cut at BLOCK
     values = _spline_values(separably(grid, kernel / kernel.sum()), ratio)
     return assemble(grid.origin, voxel, shape, below[0] == INSIDE, np.argwhere(near), values)
-
-
-def _coarse_span(count: int, ratio: float, coarse: int) -> tuple[np.ndarray, np.ndarray]:
-    """Find the first and last coarse block (count,) that each finer block along an axis meets."""
-    first = BLOCK * np.arange(count) * ratio
-    ends = [np.floor(first).astype(int), np.ceil(first + (BLOCK - 1) * ratio).astype(int)]
-    low, high = (np.minimum(end >> SHIFT, coarse - 1) for end in ends)
-    return low, high
 
 
 def _spline_values(spline: LevelSet, ratio: float) -> Values:
@@ -392,7 +366,10 @@ def _spline_values(spline: LevelSet, ratio: float) -> Values:
             position = (BLOCK * places[:, axis, None] + np.arange(BLOCK)) * ratio
             first = np.floor(position[:, 0]).astype(int) - 1
             taps = first[:, None] + np.arange(side)
-            weights.append(_cubic(position[..., None] - taps[:, None]).astype(np.float32))
+            away = np.abs(position[..., None] - taps[:, None])
+            middle = 2 / 3 - away**2 * (1 - away / 2)
+            cubic = np.where(away < 1, middle, np.maximum(2 - away, 0) ** 3 / 6)
+            weights.append(cubic.astype(np.float32))
             taps = np.clip(taps, 0, last[axis])
             rows.append(taps >> SHIFT)
             inner.append(taps & (BLOCK - 1))
@@ -407,10 +384,3 @@ def _spline_values(spline: LevelSet, ratio: float) -> Values:
         return window
 
     return values
-
-
-def _cubic(offset: np.ndarray) -> np.ndarray:
-    """Evaluate the cubic B-spline at offsets from its middle."""
-    away = np.abs(offset)
-    inner = 2 / 3 - away**2 * (1 - away / 2)
-    return np.where(away < 1, inner, np.maximum(2 - away, 0) ** 3 / 6)

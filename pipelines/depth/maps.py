@@ -1,10 +1,8 @@
 """Cast rays at the surface: depth, normals and confidence per camera, checked by its neighbours.
 
-No ground truth exists in real footage, so confidence comes from photometric reprojection: each view
-is warped into its neighbours' pictures through its own depth map. Where the surface is right the
-colours are those that the neighbour saw, up to its gain, highlights and noise; where it is off,
-colours come from beside. Bare skin looks alike a millimetre further: a small error proves little
-there, a large one always shows (Seitz et al. 2006 compare surfaces this way).
+Confidence comes from photometric reprojection: each view is warped into its neighbours' pictures
+through its own depth map. Where the surface is right the colours agree up to gain, highlights and
+noise. On bare skin a small error proves little, a large one always shows (Seitz et al. 2006).
 """
 
 from __future__ import annotations
@@ -16,12 +14,11 @@ import cv2
 import numpy as np
 import open3d as o3d
 
-from express50.files.images import resize_area
-from express50.geometry.cameras import Camera, rays, resized
+from express50.geometry.cameras import Camera, rays
 from express50.geometry.raycast import camera_rays, mesh_scene
 from express50.geometry.sampling import bilinear
-from pipelines.depth.reconstruct import HeadSurface
-from pipelines.depth.views import INSIDE, project_fast
+from pipelines.depth.surface import HeadSurface
+from pipelines.depth.views import INSIDE, project_fast, reduced
 
 STEEP = 0.25  # cosine between surface and ray below which confidence fades to 0
 BROKEN = 4.0  # pixels' widths between neighbours' depths at which confidence is halved
@@ -41,15 +38,10 @@ Pictures = list[tuple[Camera, np.ndarray, np.ndarray]]
 
 @dataclass(frozen=True)
 class DepthMaps:
-    """What one camera sees of the surface.
+    """What one camera sees of the surface: maps (H, W), `valid` where it lies inside the matte.
 
-    Attributes:
-        depth: (H, W) metres, 0 where not valid.
-        valid: (H, W), inside the matte and on the surface.
-        confidence: (H, W) in [0, 1].
-        normals: (H, W, 3) in camera axes, 0 where not valid.
-        covered: share of the matte that the surface fills.
-        spill: share of the surface outside the matte.
+    Depth is in metres, normals (H, W, 3) in camera axes, both 0 where not valid; confidence is in
+    [0, 1]. `covered` is the share of the matte with depth, `spill` that of the surface outside.
     """
 
     depth: np.ndarray
@@ -62,13 +54,10 @@ class DepthMaps:
 
 @dataclass(frozen=True)
 class ComparedView:
-    """One camera's picture at the size of the comparison.
+    """One camera's colours (H, W, 3) float32, 8-bit steps, at the size of the comparison.
 
-    Attributes:
-        camera: undistorted pinhole camera.
-        colour: (H, W, 3) float32, 8-bit steps.
-        depth: (H, W) float32 metres, 0 where there is none.
-        plain: (H, W), off every edge, and the surface not seen at too flat an angle.
+    `depth` (H, W) is in metres, 0 where there is none; `plain` (H, W) pixels lie off every edge and
+    see the surface at no flat angle.
     """
 
     camera: Camera
@@ -81,14 +70,14 @@ class ComparedView:
 class PhotoErrors:
     """Photometric errors (H, W), 8-bit steps, of one view; NaN where no neighbour sees the point.
 
-    ``compared`` is the share of the view's depth that neighbours see.
+    ``compared`` is the share that they see.
     """
 
     errors: np.ndarray
     compared: float
 
     def figures(self) -> dict[str, float]:
-        """Summarise: median and 95th percentile of the errors, shares compared and consistent."""
+        """Summarise the errors and the shares compared and consistent for the metrics."""
         known = self.errors[np.isfinite(self.errors)]
         if not len(known):
             return {"photo_compared": 0.0}
@@ -139,11 +128,9 @@ def make_maps(
     normals: np.ndarray,
     confidence: np.ndarray,
 ) -> DepthMaps:
-    """Keep what is hit inside the matte (H, W), and weaken doubtful confidence.
+    """Keep what is hit inside the matte (H, W); weaken confidence at slants and where depth jumps.
 
-    `depth` (H, W) is not finite where nothing is hit; `normals` (H, W, 3) are of the world and of
-    any length; `confidence` (H, W) fades where the surface is seen at a slant, and where depth
-    jumps: a pixel there belongs to neither side.
+    `depth` (H, W) is not finite where nothing is hit; `normals` (H, W, 3) are the world's.
     """
     hit = np.isfinite(depth) & (depth > 0)
     inside = alpha > INSIDE
@@ -168,8 +155,7 @@ def make_maps(
 def jumps(camera: Camera, depth: np.ndarray) -> np.ndarray:
     """Measure the range (H, W) of depth (H, W; 0: none) over a pixel and its eight neighbours.
 
-    The unit is a pixel's width at that depth, whatever the metres and the focal length; outlines
-    are infinite.
+    The unit is a pixel's width at that depth; outlines are infinite.
     """
     square = np.ones((3, 3), np.uint8)
     low, high = (way(depth.astype(np.float32), square) for way in (cv2.erode, cv2.dilate))
@@ -184,11 +170,7 @@ def compared_view(
     side: int = COMPARED_SIDE,
 ) -> ComparedView:
     """Reduce a picture (H, W, 3) uint8 to at most ``side`` pixels, with depth inside its matte."""
-    scale = side / max(camera.width, camera.height)
-    if scale < 1:
-        camera = resized(camera, round(camera.width * scale), round(camera.height * scale))
-        rgb = resize_area(rgb, camera.width, camera.height)
-        alpha = resize_area(alpha, camera.width, camera.height)
+    camera, rgb, alpha = reduced(camera, rgb, alpha, side)
     depth = scene.cast_rays(camera_rays(camera), nthreads=1)["t_hit"].numpy()
     seen = np.isfinite(depth) & (alpha > INSIDE)
     depth = np.where(seen, depth, 0).astype(np.float32)
@@ -198,10 +180,7 @@ def compared_view(
 
 
 def photo_errors(views: Sequence[ComparedView]) -> list[PhotoErrors]:
-    """Compare every view with its neighbours through its depth.
-
-    An error is the median over the neighbours of the colours' difference.
-    """
+    """Compare each view with its neighbours through its depth: their median colour difference."""
     forward = np.stack([view.camera.cam_from_world[2, :3] for view in views])
     closeness = forward @ forward.T
     np.fill_diagonal(closeness, -2.0)
@@ -235,8 +214,6 @@ def _difference(colour: np.ndarray, points: np.ndarray, other: ComparedView) -> 
     hidden = depth[there] - other.depth[row, column] > HIDDEN_M
     there[there] = other.plain[row, column] & ~hidden
     found = np.full(len(points), np.nan, np.float32)
-    if not there.any():
-        return found
     theirs = bilinear(other.colour, pixels[there])
     mine = colour[there]
     bright = (mine > DARK) & (theirs > DARK)
@@ -251,8 +228,7 @@ def _difference(colour: np.ndarray, points: np.ndarray, other: ComparedView) -> 
 def doubted(maps: DepthMaps, photo: PhotoErrors) -> DepthMaps:
     """Lower the confidence where neighbours' colours contradict the depth.
 
-    The result is the root of the product of what the surface and what the colours say: small
-    values, which tell bad depth from worse, keep their differences in 8 bits.
+    The root of the product keeps the differences of small values in 8 bits.
     """
     known = np.isfinite(photo.errors)
     total, count = (

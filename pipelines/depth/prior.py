@@ -26,13 +26,7 @@ DIRECTIONS = _CELL / np.linalg.norm(_CELL, axis=1, keepdims=True)
 
 @dataclass(frozen=True)
 class TrackedSolid:
-    """A tracked mesh, closed.
-
-    Attributes:
-        scene: the mesh and the caps over its holes.
-        border: scene of the caps over large holes (the neck), or None.
-        low, high: (3,) corners of its box, metres.
-    """
+    """A tracked mesh with caps over its holes, and those over large ones (the neck) as `border`."""
 
     scene: o3d.t.geometry.RaycastingScene
     border: o3d.t.geometry.RaycastingScene | None
@@ -40,10 +34,7 @@ class TrackedSolid:
     high: np.ndarray
 
     def merge(self, points: np.ndarray, hull: np.ndarray, reach: float) -> np.ndarray:
-        """Blend the solid's distances into those (N,) to the hull at points (N, 3).
-
-        Distances of more than ``reach`` metres outside the hull stay.
-        """
+        """Blend the solid's distances into those (N,) to the hull, where under ``reach`` metres."""
         within = hull < reach
         points, own = points[within], hull[within]
         distance = self.distance(points)
@@ -56,9 +47,8 @@ class TrackedSolid:
     def distance(self, points: np.ndarray) -> np.ndarray:
         """Measure signed distances (N,) float32, metres, negative inside the closed mesh.
 
-        A point is inside if no straight way out exists in any of 26 directions. Parity and winding
-        tests fail on a head model, whose eyeballs, teeth and mouth cavity are open sheets inside
-        the skin; all of these count as inside here.
+        A point is inside if all of 26 directions hit the mesh: parity and winding tests fail on the
+        open sheets of eyes, teeth and mouth inside the skin.
         """
         query = o3d.core.Tensor(np.ascontiguousarray(points, np.float32))
         gap = self.scene.compute_distance(query, nthreads=1).numpy()
@@ -71,10 +61,7 @@ class TrackedSolid:
         return np.where(inside, -gap, gap)
 
     def belief(self, points: np.ndarray, height: np.ndarray) -> np.ndarray:
-        """Weigh the tracked surface, (N,) in [0, 1], at points (N, 3).
-
-        ``height`` (N,) is the visual hull's height over the mesh there, metres.
-        """
+        """Weigh the mesh, (N,) in [0, 1], at points (N, 3); the hull is ``height`` (N,) above."""
         near = np.clip(2.0 - height / REACH, 0, 1)
         if self.border is None:
             return near
@@ -85,9 +72,7 @@ class TrackedSolid:
 
 def close_mesh(vertices: np.ndarray, faces: np.ndarray) -> TrackedSolid:
     """Close the tracked mesh (V, 3), (F, 3): holes get fans to their middles."""
-    vertices = np.asarray(vertices, np.float64)
-    points, caps = [vertices], []
-    borders = []
+    points, caps, borders = [vertices], [], []
     for loop in boundary_loops(faces):
         ring = vertices[loop]
         middle = len(vertices) + len(points) - 1
@@ -122,10 +107,7 @@ def boundary_loops(faces: np.ndarray) -> list[np.ndarray]:
 
 
 def matte_agreement(views: Sequence[DepthView], vertices: np.ndarray, faces: np.ndarray) -> float:
-    """Measure which share of the pixels that a mesh (V, 3), (F, 3) covers lies in the mattes.
-
-    It is the median over views of the mean matte there; a view that the mesh misses counts as 0.
-    """
+    """Return the median over views of the mean matte where a mesh (V, 3), (F, 3) is seen."""
     scene = mesh_scene(vertices, faces)
     shares = []
     for view in views:

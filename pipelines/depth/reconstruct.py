@@ -1,15 +1,24 @@
-"""Reconstruct a surface from views: visual hull, tracked mesh, photo-consistency."""
+"""Reconstruct a surface from views: visual hull, tracked mesh, photo-consistency.
+
+Patches of the surface slide along its normals and are compared across views. A patch is curved as
+the surface is, so that views far apart see it alike: a fronto-parallel sweep fails at the 35 to 45
+degrees between neighbours of a sparse ring, a flat patch at a nose. The score is zero-mean
+normalised cross-correlation, which ignores each camera's gain and offset. Tracking searches along
+normals too, with other supports and scores (docs/LOG.md, Depth).
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 
+import cv2
 import numpy as np
+import open3d as o3d
 from scipy.spatial import cKDTree
 
 from express50.errors import StageError
+from express50.geometry.raycast import mesh_scene
 from express50.geometry.sampling import bilinear
 from pipelines.depth.blocks import (
     BLOCK,
@@ -24,10 +33,10 @@ from pipelines.depth.blocks import (
     refined,
     voxel_index,
 )
-from pipelines.depth.hull import UNSEEN, head_box, hull_distance
 from pipelines.depth.prior import TrackedSolid
 from pipelines.depth.surface import (
     HeadMesh,
+    HeadSurface,
     advance,
     averaged,
     extract_mesh,
@@ -37,8 +46,14 @@ from pipelines.depth.surface import (
     rim_targets,
     smooth_displacement,
 )
-from pipelines.depth.sweep import patch_scores, view_weights
-from pipelines.depth.views import DepthView, pixel_size, project_fast
+from pipelines.depth.views import (
+    UNSEEN,
+    DepthView,
+    head_box,
+    hull_distance,
+    pixel_size,
+    project_fast,
+)
 
 COARSE_M = 0.006  # voxel of the first level: it spans the gap between hull and face
 LEVEL_RATIO = 1.47  # each level is so many times finer than the one before
@@ -47,28 +62,9 @@ FAIR_VOXELS = 1.4  # smoothing before each level; less gains 0.012 mm but fails 
 SMALLEST_M, LARGEST_M = 0.03, 3.0  # a head is 0.25 m high, with shoulders under 1 m
 HULL_CONFIDENCE = 0.3  # where only silhouettes speak
 LEAST_CONFIDENCE = 0.1  # where nothing does; that of a tracked head in a single view
-
-
-@dataclass(frozen=True)
-class HeadSurface:
-    """The reconstructed head.
-
-    Attributes:
-        vertices (V, 3), normals (V, 3): world, metres, outward.
-        faces: (F, 3).
-        confidence: (V,) in [0, 1]; agreement of the views, 0.3 where only silhouettes speak.
-        colors: (V, 3) uint8 sRGB.
-        grid: signed distances from which the mesh was taken.
-        figures: voxels and agreement, for the metrics.
-    """
-
-    vertices: np.ndarray
-    normals: np.ndarray
-    faces: np.ndarray
-    confidence: np.ndarray
-    colors: np.ndarray
-    grid: LevelSet
-    figures: dict = field(default_factory=dict)
+GRAZING = 0.25  # cosine; flatter than this, a patch is squeezed to under a quarter of its width
+SAMPLES = 5  # along a patch's side: 7 are worse (0.353 for 0.333 mm)
+SPACING_VOXELS = 0.66  # between a patch's samples
 
 
 def reconstruct(
@@ -78,14 +74,9 @@ def reconstruct(
     voxel_px: float = 1.4,
     noise: float = 0.8,
 ) -> HeadSurface:
-    """Reconstruct the surface that the views share.
+    """Reconstruct the surface that two or more views share, from the tracked mesh if there is one.
 
-    Args:
-        views: usable views, at least two.
-        solid: the tracked mesh, or None.
-        voxel_mm: voxel of the last level, millimetres.
-        voxel_px: it spans at least this many pixels.
-        noise: standard deviation, 8-bit steps, under which texture does not count.
+    The numbers are the settings of those names (`DepthConfig`).
 
     Raises:
         StageError: the mattes share no volume, or the box or surface is too large for the voxel.
@@ -120,11 +111,7 @@ def reconstruct(
 def tracked_surface(
     view: DepthView, solid: TrackedSolid, voxel_mm: float, voxel_px: float, noise: float
 ) -> HeadSurface:
-    """Take the tracked head as it is: a single view says nothing else about depth.
-
-    Raises:
-        StageError: the head is too small or too large for the voxel.
-    """
+    """Take the tracked head as it is: a single view says nothing else about depth."""
     voxel = finest_voxel([view], (solid.low + solid.high) / 2, voxel_mm, voxel_px)
     low, high = solid.low - 4 * voxel, solid.high + 4 * voxel
     _check_size(low, high, voxel)
@@ -142,18 +129,13 @@ def finest_voxel(
 def _check_size(low: np.ndarray, high: np.ndarray, voxel: float) -> None:
     """Refuse a box with corners (3,), (3,) unlike a head in metres, or too large to hold."""
     extent = float((high - low).max())
-    if extent < SMALLEST_M:
-        raise StageError(
-            f"the head's box is {extent * 1e3:.3g} mm large, expected at least"
-            f" {SMALLEST_M * 1e3:g} mm: is the calibration in metres?"
-        )
     blocks = float(np.prod((high - low) / (BLOCK * voxel)))
-    if blocks > VOXEL_LIMIT or extent > LARGEST_M:
-        size = " x ".join(f"{side:.2f}" for side in high - low)
+    if blocks > VOXEL_LIMIT or not SMALLEST_M <= extent <= LARGEST_M:
+        size = " x ".join(f"{side:.3g}" for side in high - low)
         raise StageError(
             f"the head's box is {size} m, {blocks:.2g} blocks of voxels of {voxel * 1e3:g} mm;"
-            f" expected at most {LARGEST_M:g} m and {VOXEL_LIMIT:.2g}: is the calibration in"
-            " metres? If it is, raise depth.voxel_mm"
+            f" expected {SMALLEST_M:g} to {LARGEST_M:g} m and at most {VOXEL_LIMIT:.2g} blocks: is"
+            " the calibration in metres? If it is, raise depth.voxel_mm"
         )
 
 
@@ -175,8 +157,7 @@ def _moved(
 ) -> LevelSet:
     """Move the surface once: slide patches by offsets (D,), metres, solve for a displacement.
 
-    Silhouettes pull as hard as a perfect photographic match: the surface is brought out to them
-    (``extent`` is the box's diagonal, metres).
+    Silhouettes pull as hard as a perfect match; ``extent`` is the box's diagonal, metres.
     """
     mesh = extract_mesh(grid)
     if not len(mesh.faces):
@@ -192,7 +173,7 @@ def _moved(
         np.add.at(count, near, 1.0)
     laplacian = graph_laplacian(mesh.faces, len(mesh.vertices))
     pinned, weight = pinned / np.maximum(count, 1), np.minimum(count, 1)
-    displacement, _ = smooth_displacement(scores, offsets, laplacian, pinned, weight)
+    displacement = smooth_displacement(scores, offsets, laplacian, pinned, weight)
     return advance(grid, mesh.vertices, displacement)
 
 
@@ -206,28 +187,24 @@ def _finished(views: Sequence[DepthView], grid: LevelSet, noise: float) -> HeadS
             " larger than a few voxels: check the mattes, or lower depth.voxel_mm"
         )
     mesh = mesh._replace(faces=largest_part(mesh.vertices, mesh.faces))
-    vertices, normals, faces = mesh
-    agreement = patch_scores(views, grid, mesh, np.array([-1.0, 0.0, 1.0]) * grid.voxel, noise)
-    agreement = agreement[:, 1]
+    offsets = np.array([-1.0, 0.0, 1.0]) * grid.voxel
+    agreement = patch_scores(views, grid, mesh, offsets, noise)[:, 1]
+    confidence = averaged(np.clip(agreement, 0, 1), mesh.faces, rounds=6)
+    used, faces = np.unique(mesh.faces, return_inverse=True)
+    vertices, agreement, confidence = mesh.vertices[used], agreement[used], confidence[used]
     on_hull = np.abs(hull_distance(views, vertices)) < 0.5 * grid.voxel
-    confidence = averaged(np.clip(agreement, 0, 1), faces, rounds=6)
-    used = np.zeros(len(vertices), bool)
-    used[faces] = True
     figures = {
         "voxel_mm": grid.voxel * 1e3,
         "voxels_allocated": grid.allocated,
         "voxels_dense": math.prod(grid.shape),
         "voxel_limit": VOXEL_LIMIT,
         "grid_bytes": grid.nbytes,
-        "vertices": int(used.sum()),
-        "photo_agreement_median": float(np.median(agreement[used])),
-        "photo_supported": float((confidence[used] > 0.3).mean()),
-        "silhouette_supported": float(on_hull[used].mean()),
+        "photo_agreement_median": float(np.median(agreement)),
     }
     floor = np.where(on_hull, HULL_CONFIDENCE, LEAST_CONFIDENCE)
     confidence = np.maximum(confidence, floor).astype(np.float32)
-    colors = vertex_colors(views, mesh, grid.voxel)
-    return HeadSurface(vertices, normals, faces, confidence, colors, grid, figures)
+    colors, normals = vertex_colors(views, mesh, grid.voxel)[used], mesh.normals[used]
+    return HeadSurface(vertices, normals, faces.reshape(-1, 3), confidence, colors, grid, figures)
 
 
 def vertex_colors(views: Sequence[DepthView], mesh: HeadMesh, lift: float) -> np.ndarray:
@@ -243,3 +220,116 @@ def vertex_colors(views: Sequence[DepthView], mesh: HeadMesh, lift: float) -> np
     seen = weights.sum(0)
     mean = np.where(seen[:, None] > 0, total / np.maximum(seen, 1e-9)[:, None], 128.0)
     return np.rint(mean).clip(0, 255).astype(np.uint8)
+
+
+def patch_scores(
+    views: Sequence[DepthView], grid: LevelSet, mesh: HeadMesh, offsets: np.ndarray, noise: float
+) -> np.ndarray:
+    """Score how well the views agree (V, D) on patches moved along normals by offsets (D,) metres.
+
+    Scores are correlations in [-1, 1], averaged over neighbours; 0 where under two views see the
+    vertex.
+    """
+    vertices, normals, faces = mesh
+    spacing = SPACING_VOXELS * grid.voxel
+    pixel = np.median([pixel_size(view, vertices.mean(0)) for view in views])
+    greys = grey_images(views, 0.4 * spacing / pixel)
+    weights = view_weights(views, mesh, grid.voxel)
+    # Samples of a patch lie no closer than the pixels: finer ones would repeat them.
+    ticks = (np.arange(SAMPLES) - (SAMPLES - 1) / 2) * max(spacing, float(pixel))
+    flat = np.stack(np.meshgrid(ticks, ticks), -1).reshape(-1, 2)
+    axis = np.where(np.abs(normals[:, 1:2]) < 0.8, [[0.0, 1.0, 0.0]], [[1.0, 0.0, 0.0]])
+    first = np.cross(normals, axis)
+    first /= np.maximum(np.linalg.norm(first, axis=1, keepdims=True), 1e-9)
+    tangents = np.stack([first, np.cross(normals, first)], axis=1)  # (V, 2, 3), orthonormal
+    scores = np.zeros((len(vertices), len(offsets)), np.float32)
+    usable = np.flatnonzero((weights > 0).sum(0) >= 2)
+    for chunk in np.array_split(usable, max(1, len(usable) // 1000)):
+        line = vertices[chunk, None] + normals[chunk, None] * offsets[:, None]  # (n, D, 3)
+        # Patches (n, P, 3) follow the surface, unless it is further off than they are wide.
+        about = flat @ tangents[chunk]
+        around = (vertices[chunk, None] + about).reshape(-1, 3)
+        height = grid.sample(around).reshape(about.shape[:2])
+        rise = np.where(np.abs(height) < np.abs(flat).max(), -height, 0.0)
+        patch = (about + rise[..., None] * normals[chunk, None]).astype(np.float32)
+        scores[chunk] = _correlate(views, greys, line, patch, weights[:, chunk] ** 2, noise)
+    # Neighbours see the same: chance matches of one patch, frequent in hair, average out.
+    return averaged(scores, faces, rounds=1)
+
+
+def grey_images(views: Sequence[DepthView], blur_px: float) -> list[np.ndarray]:
+    """Convert views to luma (H, W) float32, in 8-bit steps, blurred against aliasing."""
+    greys = []
+    for view in views:
+        grey = cv2.cvtColor(view.rgb, cv2.COLOR_RGB2GRAY).astype(np.float32)
+        greys.append(cv2.GaussianBlur(grey, (0, 0), blur_px) if blur_px > 0.3 else grey)
+    return greys
+
+
+def view_weights(views: Sequence[DepthView], mesh: HeadMesh, lift: float) -> np.ndarray:
+    """Weigh each vertex in each view, (C, V) in [0, 1]: the cosine to the normal, 0 if hidden.
+
+    A vertex counts as seen if the point ``lift`` metres above it is.
+    """
+    vertices, normals, _ = mesh
+    scene = mesh_scene(vertices, mesh.faces)
+    weights = np.zeros((len(views), len(vertices)), np.float32)
+    for row, view in zip(weights, views, strict=True):
+        towards = view.camera.center - vertices
+        distance = np.linalg.norm(towards, axis=1, keepdims=True)
+        towards = towards / distance
+        cosine = (normals * towards).sum(1)
+        pixels, depth = project_fast(view.camera, vertices)
+        size = np.array([view.camera.width, view.camera.height])
+        seen = (cosine > GRAZING) & (depth > 0) & ((pixels > 2) & (pixels < size - 2)).all(1)
+        seen[seen] = bilinear(view.alpha, pixels[seen]) > 0.9
+        rays = np.concatenate([vertices + lift * (normals + towards), towards], axis=1)[seen]
+        hidden = scene.test_occlusions(o3d.core.Tensor(rays.astype(np.float32)), nthreads=1)
+        seen[seen] = ~hidden.numpy()
+        row[seen] = cosine[seen]
+    return weights
+
+
+def _correlate(
+    views: Sequence[DepthView],
+    greys: Sequence[np.ndarray],
+    line: np.ndarray,
+    patch: np.ndarray,
+    weights: np.ndarray,
+    noise: float,
+) -> np.ndarray:
+    """Average the correlation (n, D) of patches (n, P, 3) along lines over all pairs of views.
+
+    Lines (n, D, 3) hold the patches' centres. With z_c the normalised patch of view c, the mean is
+    (|sum w_c z_c|^2 - sum w_c^2 |z_c|^2) / ((sum w_c)^2 - sum w_c^2).
+    """
+    count = patch.shape[1]
+    total = np.zeros((*line.shape[:2], count), np.float32)
+    own = np.zeros(line.shape[:2], np.float32)
+    for view, grey, weight in zip(views, greys, weights, strict=True):
+        seen = weight > 0
+        if not seen.any():
+            continue
+        pixels = _patch_pixels(view, line[seen], patch[seen])
+        z = bilinear(grey, pixels.reshape(-1, 2)).reshape(pixels.shape[:3])
+        z -= z.mean(-1, keepdims=True)
+        power = np.einsum("ndp,ndp->nd", z, z)
+        share = weight[seen, None] / np.sqrt(power + count * noise * noise)
+        total[seen] += z * share[..., None]
+        own[seen] += power * share * share
+    pairs = weights.sum(0) ** 2 - (weights**2).sum(0)
+    return (np.einsum("ndp,ndp->nd", total, total) - own) / np.maximum(pairs, 1e-9)[:, None]
+
+
+def _patch_pixels(view: DepthView, line: np.ndarray, patch: np.ndarray) -> np.ndarray:
+    """Project patches to pixels (n, D, P, 2) float32: affine within one, 1 % of its depth wide."""
+    M = (view.camera.K @ view.camera.cam_from_world[:3, :3]).astype(np.float32)
+    p = (line - view.camera.center).astype(np.float32) @ M.T  # (n, D, 3)
+    depth = np.maximum(p[..., 2], 1e-6)
+    along = patch @ M.T  # (n, P, 3)
+    pixels = np.empty((*line.shape[:2], patch.shape[1], 2), np.float32)
+    for axis in range(2):
+        center = p[..., axis] / depth
+        moved = along[:, None, :, axis] - center[..., None] * along[:, None, :, 2]
+        pixels[..., axis] = center[..., None] + moved / depth[..., None]
+    return pixels

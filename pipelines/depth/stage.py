@@ -1,4 +1,4 @@
-"""Reconstruct one expression of one subject: a surface, and depth maps of every camera."""
+"""Reconstruct one expression of one subject and write maps, the mesh, metrics and a sheet."""
 
 from __future__ import annotations
 
@@ -10,19 +10,22 @@ import numpy as np
 from express50.capture.frames import read_cameras_of, read_peak_frame
 from express50.contract.layout import Dataset
 from express50.contract.stage import Note, Result
+from express50.dataset.depth_files import write_depth, write_normals
 from express50.dataset.tracks import read_track
 from express50.errors import CaptureError, FormatError, StageError
-from express50.files.images import read_alpha
+from express50.files.images import contact_sheet, read_alpha, srgb_to_linear, write_image
+from express50.geometry import meshes
 from express50.head.load import load_head
 from pipelines.depth.config import DepthConfig
-from pipelines.depth.hull import without_contradiction
-from pipelines.depth.maps import Pictures, surface_maps
-from pipelines.depth.outputs import figures_of, write_glb, write_maps, write_picture, write_ply
+from pipelines.depth.maps import DepthMaps, PhotoErrors, Pictures, surface_maps
 from pipelines.depth.prior import TrackedSolid, close_mesh, matte_agreement
 from pipelines.depth.reconstruct import reconstruct, tracked_surface
-from pipelines.depth.views import DepthView, make_view
+from pipelines.depth.surface import HeadSurface
+from pipelines.depth.views import DepthView, make_view, without_contradiction
 
-UNITS = (0.05, 3.0)  # metres; a surface of another size is in other units
+ERROR_STEPS = 30.0  # 8-bit steps at the bright end of the error maps
+BLANK = 24  # grey of unknown pixels
+SHOWN = 4  # cameras in the contact sheet
 
 
 def run(dataset: Dataset, item: str, config: DepthConfig, out: Path) -> Result:
@@ -30,7 +33,6 @@ def run(dataset: Dataset, item: str, config: DepthConfig, out: Path) -> Result:
     cv2.setNumThreads(1)  # the runner counts one core per item
     fineness = config.voxel_mm, config.voxel_px, config.noise
     agreement = config.track_agreement if config.use_track else None
-    subject, expression = item.split("/")
     views, pictures, dropped = read_views(dataset, item, config.image_side)
     one_camera = len(views) == 1 and not dropped  # a photograph, or a video of one camera
     if len(views) < config.min_views and not one_camera:
@@ -49,12 +51,6 @@ def run(dataset: Dataset, item: str, config: DepthConfig, out: Path) -> Result:
         surface = tracked_surface(views[0], solid, *fineness)
     else:
         surface = reconstruct(views, solid, *fineness)
-    extent = float(np.ptp(surface.vertices[np.unique(surface.faces)], axis=0).max())
-    if not UNITS[0] < extent < UNITS[1]:
-        raise StageError(
-            f"{item}: the surface is {extent:.3g} m large, expected {UNITS[0]} to {UNITS[1]} m;"
-            " is the calibration in metres?"
-        )
     maps, photo = surface_maps(surface, pictures)
     write_ply(out / "surface.ply", surface)
     if config.glb:
@@ -118,3 +114,98 @@ def read_tracked(
         why = f"only {agreement:.0%} of it lies in the mattes, under {least:.0%}"
         return None, {"used": False, "why": why, "agreement": agreement}
     return close_mesh(vertices, faces), {"used": True, "agreement": agreement}
+
+
+def write_maps(
+    out: Path, camera_id: str, maps: DepthMaps, depth_format: str, normal_maps: str
+) -> None:
+    """Write ``<camera>.png`` or ``.exr``, ``<camera>_confidence.png``, ``<camera>_normals.png``."""
+    try:
+        write_depth(out, camera_id, maps.depth, maps.valid, depth_format)
+    except ValueError as error:
+        raise StageError(
+            f"{camera_id}: depth up to {maps.depth.max():.4g} m does not fit"
+            f" {depth_format} ({error}); if it is right, set depth.depth_format=exr32"
+        ) from None
+    write_image(
+        out / f"{camera_id}_confidence.png", np.rint(maps.confidence * 255).astype(np.uint8)
+    )
+    if normal_maps != "none":
+        path = out / f"{camera_id}_normals.png"
+        known = maps.valid & (np.linalg.norm(maps.normals, axis=-1) > 0.5)
+        write_normals(path, maps.normals, known, normal_maps)
+
+
+def write_ply(path: Path, surface: HeadSurface) -> None:
+    """Write a binary PLY: position, normal, sRGB colour, confidence; world, metres."""
+    columns = {f"n{axis}": surface.normals[:, k] for k, axis in enumerate("xyz")}
+    columns |= {c: surface.colors[:, k] for k, c in enumerate(("red", "green", "blue"))}
+    columns["confidence"] = surface.confidence
+    meshes.write_ply(path, surface.vertices, surface.faces, columns)
+
+
+def write_glb(path: Path, surface: HeadSurface) -> None:
+    """Write a binary glTF: position, normal, colour; world, metres.
+
+    Colours are linear light in 8 bits: near black they are up to 6 steps of sRGB off.
+    """
+    light = np.rint(255 * srgb_to_linear(surface.colors / 255.0))
+    colours = np.hstack([light, np.full((len(light), 1), 255)]).astype(np.uint8)
+    vertices, normals = surface.vertices, surface.normals
+    meshes.write_glb(path, "surface", vertices, surface.faces, normals=normals, colours=colours)
+
+
+def figures_of(
+    surface: HeadSurface, maps: dict[str, DepthMaps], photo: dict[str, PhotoErrors]
+) -> dict:
+    """Collect the item's metrics, rounded so that they do not depend on the last bit."""
+    errors = np.concatenate([one.errors[np.isfinite(one.errors)] for one in photo.values()])
+    compared = float(np.mean([one.compared for one in photo.values()]))
+    table = surface.figures | PhotoErrors(errors, compared).figures() | {
+        "coverage": float(np.mean([view.covered for view in maps.values()])),
+        "coverage_worst": min(view.covered for view in maps.values()),
+        "spill": float(np.mean([view.spill for view in maps.values()])),
+        "voxel_share": surface.figures["voxels_allocated"] / surface.figures["voxels_dense"],
+        "views": len(maps),
+    }  # fmt: skip
+    cameras = {}
+    for name, view in maps.items():
+        sure = float(view.confidence[view.valid].mean()) if view.valid.any() else 0.0
+        row = {"coverage": view.covered, "spill": view.spill, "confidence": sure}
+        row |= photo[name].figures()
+        cameras[name] = {key: round(value, 4) for key, value in row.items()}
+    rounded = {k: round(v, 5) if isinstance(v, float) else v for k, v in table.items()}
+    return rounded | {"cameras": cameras}
+
+
+def write_picture(
+    out: Path, pictures: Pictures, maps: dict[str, DepthMaps], photo: dict[str, PhotoErrors]
+) -> None:
+    """Write a contact sheet of evenly chosen cameras: frame, depth, normals, confidence, errors."""
+    chosen = np.unique(np.linspace(0, len(pictures) - 1, SHOWN).round().astype(int))
+    rows: list[list[np.ndarray]] = [[], [], [], [], []]
+    for camera, rgb, _ in (pictures[k] for k in chosen):
+        view, errors = maps[camera.id], photo[camera.id].errors
+        near = np.zeros_like(view.depth)
+        if view.valid.any():
+            low, high = np.percentile(view.depth[view.valid], [1, 99])
+            near = (high - view.depth) / max(high - low, 1e-6)
+        known = np.isfinite(errors)
+        share = np.where(known, errors, 0) / ERROR_STEPS
+        normal = (view.normals * [1, -1, -1] + 1) * 127.5
+        rows[0].append(rgb)
+        rows[1].append(_coloured(near, view.valid, cv2.COLORMAP_VIRIDIS))
+        rows[2].append(np.where(view.valid[..., None], normal, BLANK).astype(np.uint8))
+        rows[3].append((view.confidence * 255).astype(np.uint8))
+        rows[4].append(_coloured(share, known, cv2.COLORMAP_INFERNO))
+    labels = ["frame", "depth", "normals", "confidence", f"photo error, 0 to {ERROR_STEPS:g}/255"]
+    (out / "qc").mkdir(exist_ok=True)
+    sheet = contact_sheet(rows, labels, tile=(240, 240))
+    write_image(out / "qc" / "surface.jpg", sheet, quality=90)
+
+
+def _coloured(values: np.ndarray, known: np.ndarray, colours: int) -> np.ndarray:
+    """Colour values (H, W) in [0, 1], 1 is bright; unknown pixels are grey."""
+    level = (np.clip(values, 0, 1) * 255).astype(np.uint8)
+    color = cv2.applyColorMap(level, colours)[..., ::-1]
+    return np.where(known[..., None], color, BLANK).astype(np.uint8)

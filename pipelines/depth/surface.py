@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
@@ -39,6 +40,23 @@ class HeadMesh(NamedTuple):
     vertices: np.ndarray
     normals: np.ndarray
     faces: np.ndarray
+
+
+@dataclass(frozen=True)
+class HeadSurface:
+    """The reconstructed head: a mesh as HeadMesh, and the signed distances it was taken from.
+
+    Confidence (V,) is in [0, 1], 0.3 where only silhouettes speak; colors (V, 3) are uint8 sRGB;
+    `figures` are for the metrics.
+    """
+
+    vertices: np.ndarray
+    normals: np.ndarray
+    faces: np.ndarray
+    confidence: np.ndarray
+    colors: np.ndarray
+    grid: LevelSet
+    figures: dict = field(default_factory=dict)
 
 
 def extract_mesh(grid: LevelSet) -> HeadMesh:
@@ -118,8 +136,7 @@ def averaged(values: np.ndarray, faces: np.ndarray, rounds: int) -> np.ndarray:
 def rim_targets(views: Sequence[DepthView], grid: LevelSet, depth_range: float) -> np.ndarray:
     """Find the points (N, 3) where rays along the silhouettes pass closest to the surface.
 
-    Such a point should lie on the surface: the grid's distance there is the displacement that the
-    surface lacks (positive where it has shrunk away from the silhouette).
+    The grid's distance there is the displacement that the surface lacks.
     """
     steps = np.arange(-0.5, 0.5, 1.5 * grid.voxel / depth_range) * depth_range
     middle = grid.points((np.array(grid.shape) - 1) / 2)
@@ -130,25 +147,18 @@ def rim_targets(views: Sequence[DepthView], grid: LevelSet, depth_range: float) 
         y, x = np.nonzero(edge)
         if not len(x):
             continue
-        pixels = _onto_contour(view.silhouette_px, x, y)
-        center_depth = (view.camera.cam_from_world[:3, :3] @ middle)[2]
-        center_depth += view.camera.cam_from_world[2, 3]
-        near = unproject(view.camera, pixels, np.ones(len(x)))
-        ray = near - view.camera.center
-        depths = center_depth + steps
-        points = view.camera.center + ray[:, None] * depths[None, :, None]
-        values = grid.sample(points.reshape(-1, 3)).reshape(len(x), -1)
-        best = values.argmin(1)
+        # Pixel centres are moved along the gradient to distance 0.
+        signed = view.silhouette_px
+        dx = (signed[y, x + 1] - signed[y, x - 1]) / 2
+        dy = (signed[y + 1, x] - signed[y - 1, x]) / 2
+        scale = signed[y, x] / np.maximum(dx * dx + dy * dy, 0.25)
+        pixels = cell_to_corner(np.stack([x - dx * scale, y - dy * scale], axis=1))
+        depths = (view.camera.cam_from_world[:3, :3] @ middle)[2] + view.camera.cam_from_world[2, 3]
+        ray = unproject(view.camera, pixels, np.ones(len(x))) - view.camera.center
+        points = view.camera.center + ray[:, None] * (depths + steps)[None, :, None]
+        best = grid.sample(points.reshape(-1, 3)).reshape(len(x), -1).argmin(1)
         found.append(points[np.arange(len(x)), best])
     return np.concatenate(found) if found else np.zeros((0, 3))
-
-
-def _onto_contour(signed: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Move pixel centres along the gradient to distance 0: corner-origin pixels (N, 2)."""
-    dx = (signed[y, x + 1] - signed[y, x - 1]) / 2
-    dy = (signed[y + 1, x] - signed[y - 1, x]) / 2
-    scale = signed[y, x] / np.maximum(dx * dx + dy * dy, 0.25)
-    return cell_to_corner(np.stack([x - dx * scale, y - dy * scale], axis=1))
 
 
 def smooth_displacement(
@@ -157,40 +167,36 @@ def smooth_displacement(
     laplacian: sparse.csc_matrix,
     pinned: np.ndarray,
     pinned_weight: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Find displacements (V,) that score well and bend little, and the trust (V,) in the scores.
+) -> np.ndarray:
+    """Find displacements (V,), metres, that score well at offsets (D,) and bend little.
 
-    Alternates between the best offset near the current displacement (score minus a coupling times
-    the squared gap, exhaustive) and a linear solve of a thin plate through these offsets and the
-    pinned ones (Steinbruecker et al. 2009; Newcombe et al. 2011).
-
-    Args:
-        scores: (V, D) photo-consistency at the offsets.
-        offsets: (D,) metres, evenly spaced.
-        laplacian: (V, V) of the mesh.
-        pinned: (V,) displacements known from elsewhere, metres.
-        pinned_weight: (V,) their weights.
+    Alternates between the best offset near the current displacement (scores (V, D) minus a coupling
+    times the squared gap) and a linear solve of a thin plate through these offsets and the
+    ``pinned`` ones (V,) (Steinbruecker et al. 2009; Newcombe et al. 2011).
     """
-    count = len(scores)
     peak, typical = scores.max(1), np.median(scores, axis=1)
     # a peak counts by its height and by how far it stands out; 0.33 is what good texture gives
     trust = np.clip(3.0 * np.clip(peak, 0, 1) * (peak - typical), 0, 1)
     plate = STIFFNESS_VOXELS**4 * (laplacian.T @ laplacian)  # against a data weight of one
     ridge = 0.01  # a patch that nothing pins stays where it is
-    rows = np.arange(count)
-    step = offsets[1] - offsets[0]
+    rows, step = np.arange(len(scores)), offsets[1] - offsets[0]
     displacement = _plate(plate, ridge + trust + pinned_weight, pinned_weight * pinned, step)
     believed = trust
     for coupling in COUPLINGS:
         gap = offsets[None] - displacement[:, None]
         energy = scores - coupling * gap * gap
         best = energy.argmax(1)
-        target = offsets[best] + _parabola(energy, rows, best) * step
+        # The peak of the parabola through the best sample and its two neighbours.
+        inner = np.clip(best, 1, energy.shape[1] - 2)
+        left, mid, right = (energy[rows, inner + k] for k in (-1, 0, 1))
+        bend = left - 2 * mid + right
+        peak = np.where(bend < -1e-9, 0.5 * (left - right) / np.minimum(bend, -1e-9), 0.0)
+        target = offsets[best] + np.where(best == inner, np.clip(peak, -0.5, 0.5), 0.0) * step
         pull = believed * target + pinned_weight * pinned
         displacement = _plate(plate, ridge + believed + pinned_weight, pull, step, displacement)
         # A match that its neighbours contradict is due to chance (Geman and McClure 1985).
         believed = trust / (1.0 + ((target - displacement) / (OUTLIER_STEPS * step)) ** 2) ** 2
-    return displacement, trust
+    return displacement
 
 
 def _plate(
@@ -208,20 +214,10 @@ def _plate(
     return found
 
 
-def _parabola(energy: np.ndarray, rows: np.ndarray, best: np.ndarray) -> np.ndarray:
-    """Find the peak, in [-0.5, 0.5] steps, of the parabola through the best sample and its two."""
-    inner = np.clip(best, 1, energy.shape[1] - 2)
-    left, mid, right = (energy[rows, inner + k] for k in (-1, 0, 1))
-    bend = left - 2 * mid + right
-    peak = np.where(bend < -1e-9, 0.5 * (left - right) / np.minimum(bend, -1e-9), 0.0)
-    return np.where(best == inner, np.clip(peak, -0.5, 0.5), 0.0)
-
-
 def advance(grid: LevelSet, vertices: np.ndarray, displacement: np.ndarray) -> LevelSet:
-    """Move the grid's surface by ``displacement`` (V,) along the normals.
+    """Move the grid's surface by ``displacement`` (V,) of its vertices (V, 3) along the normals.
 
-    The displacement spreads from the surface into the grid as a normalised Gaussian average; a
-    voxel out of its reach lies far from the old and the new surface and stays.
+    The displacement spreads into the grid as a normalised Gaussian average.
     """
     index = np.rint((vertices - grid.origin) / grid.voxel).astype(int)
     index = np.clip(index, 0, np.array(grid.shape) - 1)

@@ -1,32 +1,40 @@
-"""Prepare the cameras of an item: check and repair mattes, measure distances to silhouettes."""
+"""Prepare an item's cameras: mattes, distances to silhouettes, and the visual hull they share."""
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 
+from express50.contract.stage import Note
 from express50.errors import StageError
 from express50.files.images import resize_area
-from express50.geometry.cameras import Camera, resized
+from express50.geometry.cameras import Camera, project, resized
+from express50.geometry.conventions import cell_to_corner
+from express50.geometry.sampling import bilinear
 
 INSIDE = 0.5  # alpha at a silhouette
 EMPTY = 0.002  # share of the image below which a matte holds no head
 FULL = 0.98  # share above which a matte cuts nothing out
 SPECK = 0.01  # share of a matte's largest part below which other parts are dropped
 HOLE = 0.05  # share of the matte up to which a hole in it is filled
+UNSEEN = 1.0  # metres; the distance given to space that too few cameras see
+BOX_CELLS = 40  # along the sides of the box in which the hull is looked for
+VOTERS = 5  # fewest views of which one can be outvoted
+MISSED = 0.001  # share of the mattes that the hull may miss before any view is suspected
+OUTVOTED = 2.0  # leaving the view out must help this many times more than leaving out any other
+CELLS = 64  # along the sides of the box in which views are compared
 
 
 @dataclass(frozen=True)
 class DepthView:
-    """One usable camera of an item.
+    """One usable pinhole camera with its frame (H, W, 3) uint8 sRGB and matte (H, W) in [0, 1].
 
-    Attributes:
-        camera: undistorted pinhole camera.
-        rgb: (H, W, 3) uint8 sRGB.
-        alpha: (H, W) float32 in [0, 1].
-        silhouette_px: (H, W) float32 signed distance to the silhouette, pixels, positive inside.
+    `silhouette_px` (H, W) is the signed distance to the matte's outline, positive inside.
     """
 
     camera: Camera
@@ -36,13 +44,7 @@ class DepthView:
 
 
 def make_view(camera: Camera, rgb: np.ndarray, alpha: np.ndarray, side: int) -> DepthView:
-    """Make a view from images reduced to at most ``side`` pixels.
-
-    Args:
-        camera: undistorted pinhole camera.
-        rgb: (H, W, 3) uint8 sRGB.
-        alpha: (H, W) float32 in [0, 1]; the view's is without specks and small holes.
-        side: longest side, pixels; larger images are averaged down.
+    """Make a view of a pinhole camera's images, averaged down to at most ``side`` pixels.
 
     Raises:
         StageError: the camera cannot be used: sizes differ, or the matte is empty or full.
@@ -57,11 +59,7 @@ def make_view(camera: Camera, rgb: np.ndarray, alpha: np.ndarray, side: int) -> 
         raise StageError(f"its matte is empty ({share:.2%} of the image)")
     if share > FULL:
         raise StageError(f"its matte covers {share:.1%} of the image and cuts nothing out")
-    scale = side / max(camera.width, camera.height)
-    if scale < 1:
-        width, height = round(camera.width * scale), round(camera.height * scale)
-        camera = resized(camera, width, height)
-        rgb, alpha = resize_area(rgb, width, height), resize_area(alpha, width, height)
+    camera, rgb, alpha = reduced(camera, rgb, alpha, side)
     if not (alpha > INSIDE).any():
         raise StageError(
             f"its matte is empty at {camera.width}x{camera.height}: it holds nothing but specks"
@@ -70,12 +68,20 @@ def make_view(camera: Camera, rgb: np.ndarray, alpha: np.ndarray, side: int) -> 
     return DepthView(camera, rgb, alpha, silhouette_distance(alpha))
 
 
-def repaired_matte(alpha: np.ndarray) -> np.ndarray:
-    """Remove specks from a matte (H, W) and fill small holes.
+def reduced(
+    camera: Camera, rgb: np.ndarray, alpha: np.ndarray, side: int
+) -> tuple[Camera, np.ndarray, np.ndarray]:
+    """Average a camera's images down to at most ``side`` pixels; the camera follows."""
+    scale = side / max(camera.width, camera.height)
+    if scale >= 1:
+        return camera, rgb, alpha
+    width, height = round(camera.width * scale), round(camera.height * scale)
+    rgb, alpha = resize_area(rgb, width, height), resize_area(alpha, width, height)
+    return resized(camera, width, height), rgb, alpha
 
-    A hole drills a tunnel through the whole hull. Filling a real one, between strands, costs
-    nothing: its pixels stay outside the matte in which depth is valid.
-    """
+
+def repaired_matte(alpha: np.ndarray) -> np.ndarray:
+    """Remove specks from a matte (H, W) and fill small holes, which would pierce the whole hull."""
 
     def parts(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         _, labels, stats, _ = cv2.connectedComponentsWithStats(mask, connectivity=8)
@@ -123,3 +129,149 @@ def pixel_size(view: DepthView, point: np.ndarray) -> float:
     """Measure the metres that a pixel spans at a world point (3,)."""
     M = view.camera.cam_from_world
     return float(abs(M[2, :3] @ point + M[2, 3]) / view.camera.K[0, 0])
+
+
+def hull_distance(views: Sequence[DepthView], points: np.ndarray) -> np.ndarray:
+    """Measure signed distances (N,) of points (N, 3) to the visual hull, metres, negative inside.
+
+    It is the maximum over the views (Laurentini 1994). Points seen by fewer than two views, or by
+    less than a third of them, are outside: otherwise phantoms would float before the head.
+    """
+    distance = np.full(len(points), -UNSEEN, np.float32)
+    seen = np.zeros(len(points), np.int16)
+    for view in views:
+        camera = view.camera
+        pixels, depth = project_fast(camera, points)
+        size = np.array([camera.width, camera.height])
+        inside = (depth > 0) & ((pixels >= 0) & (pixels <= size)).all(1)
+        focal = float(np.sqrt(camera.K[0, 0] * camera.K[1, 1]))
+        metres = -bilinear(view.silhouette_px, pixels[inside]) * depth[inside] / focal
+        distance[inside] = np.maximum(distance[inside], metres)
+        seen += inside
+    return np.where(seen >= max(2, len(views) / 3), distance, UNSEEN).astype(np.float32)
+
+
+def head_box(views: Sequence[DepthView]) -> tuple[np.ndarray, np.ndarray]:
+    """Find the corners (3,), (3,) of the box around the visual hull, metres.
+
+    Raises:
+        StageError: the silhouettes have no common volume.
+    """
+    center, reach = _meeting_point(views), []
+    for view in views:
+        pixel, depth = project(view.camera, center[None])
+        y, x = np.nonzero(view.alpha > INSIDE)
+        offset = cell_to_corner(np.stack([x, y], axis=1)) - pixel[0]
+        if depth[0] <= 0 or not np.isfinite(offset).all():
+            raise StageError(
+                f"camera {view.camera.id}: the head lies behind it; expected every camera to face"
+                " the head: check the calibration"
+            )
+        furthest = np.linalg.norm(offset, axis=1).max()
+        reach.append(float(1.1 * furthest * depth[0] / view.camera.K[0, 0]))
+    radius = np.full(3, max(reach))
+    for _ in range(2):
+        axis = np.linspace(-1.0, 1.0, BOX_CELLS)
+        cube = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
+        points = center + radius * cube
+        step = 2.0 * radius / (BOX_CELLS - 1)
+        inside = points[hull_distance(views, points) < 0.5 * step.max()]
+        if not len(inside):
+            raise StageError(
+                f"the silhouettes of {len(views)} cameras share no volume around {center.round(3)};"
+                " expected mattes of one head in one world: check mattes and calibration"
+            )
+        low, high = inside.min(0) - step, inside.max(0) + step
+        radius = (high - low) / 2.0
+        center = low + radius
+    return center - radius, center + radius
+
+
+def _meeting_point(views: Sequence[DepthView]) -> np.ndarray:
+    """Find the point (3,) nearest to the rays through the mattes' centres."""
+    A, b, origins = np.zeros((3, 3)), np.zeros(3), []
+    for view in views:
+        y, x = np.nonzero(view.alpha > INSIDE)
+        K, R = view.camera.K, view.camera.cam_from_world[:3, :3]
+        middle = cell_to_corner(np.array([x.mean(), y.mean()]))
+        ray = np.r_[(middle - K[:2, 2]) / K[[0, 1], [0, 1]], 1.0]
+        ray = R.T @ ray / np.linalg.norm(ray)
+        plane = np.eye(3) - np.outer(ray, ray)
+        A, b = A + plane, b + plane @ view.camera.center
+        origins.append(view.camera.center)
+    scale = np.linalg.norm(np.std(origins, axis=0))
+    if scale < 1e-6 or np.linalg.eigvalsh(A)[0] < 1e-4:
+        raise StageError(
+            f"{len(views)} cameras look along one line; expected two directions at least a degree"
+            " apart: check the calibration"
+        )
+    return np.linalg.solve(A, b)
+
+
+def without_contradiction(views: Sequence[DepthView]) -> tuple[list[DepthView], list[Note]]:
+    """Leave out the one view, if any, without which the common hull fills the mattes again."""
+    if len(views) < VOTERS:
+        return list(views), []
+    boxes = []  # of every second view each: one bad view spoils only one of them
+    for half in (views[0::2], views[1::2]):
+        with contextlib.suppress(StageError):
+            boxes.append(head_box(half))
+    boxes = boxes or [head_box(views)]
+    low, high = max(boxes, key=lambda box: float(np.prod(box[1] - box[0])))
+    axes = [np.linspace(a, b, CELLS) for a, b in zip(low, high, strict=True)]
+    points = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
+    cell = float((high - low).max() / (CELLS - 1))
+    votes = [_vote(view, points, cell) for view in views]
+    missed = _unfilled(votes)
+    if missed < MISSED:
+        return list(views), []
+    without = [_unfilled([*votes[:k], *votes[k + 1 :]]) for k in range(len(views))]
+    worst = int(np.argmin(without))
+    second = float(np.sort(without)[1])
+    if without[worst] > second / OUTVOTED or second < MISSED / 2:
+        return list(views), []
+    why = (
+        f"it contradicts the others (the common hull misses {missed:.1%} of the mattes with it,"
+        f" {without[worst]:.1%} without it): check its matte and its calibration"
+    )
+    return [v for k, v in enumerate(views) if k != worst], [Note(views[worst].camera.id, why)]
+
+
+class _Vote(NamedTuple):
+    """What a view says about P cells of space: whether its matte allows them, and their pixels.
+
+    ``pixel`` (P,) is a flat index of ``matte`` (h, w), about one pixel per cell, -1 where unseen.
+    """
+
+    allows: np.ndarray
+    pixel: np.ndarray
+    matte: np.ndarray
+
+
+def _vote(view: DepthView, points: np.ndarray, cell: float) -> _Vote:
+    """Let a view judge cells of ``cell`` metres around points (P, 3)."""
+    pixels, depth = project_fast(view.camera, points)
+    size = np.array([view.camera.width, view.camera.height])
+    seen = (depth > 0) & (pixels >= 0).all(1) & (pixels < size).all(1)
+    near = float(np.median(depth[seen])) if seen.any() else 1.0
+    step = max(1.0, cell * view.camera.K[0, 0] / near)
+    shape = np.maximum(1, np.ceil(size / step)).astype(int)
+    allows = np.ones(len(points), bool)
+    allows[seen] = bilinear(view.silhouette_px, pixels[seen]) > -step / 2
+    column, row = np.minimum((pixels[seen] / step).astype(int), shape - 1).T
+    pixel = np.full(len(points), -1)
+    pixel[seen] = row * shape[0] + column
+    small = resize_area(view.silhouette_px, int(shape[0]), int(shape[1]))
+    return _Vote(allows, pixel, small > 0)
+
+
+def _unfilled(votes: Sequence[_Vote]) -> float:
+    """Measure the share of the mattes, mean over the views, that their hull does not fill."""
+    hull = np.stack([vote.allows for vote in votes]).all(0)
+    shares = []
+    for vote in votes:
+        filled = np.zeros(vote.matte.size, np.uint8)
+        filled[vote.pixel[hull & (vote.pixel >= 0)]] = 1
+        filled = cv2.dilate(filled.reshape(vote.matte.shape), np.ones((3, 3), np.uint8))
+        shares.append(float((filled[vote.matte] == 0).mean()) if vote.matte.any() else 0.0)
+    return float(np.mean(shares))

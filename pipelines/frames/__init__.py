@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from express50.capture.index import read_index
+from express50.capture.index import peak_items, read_index, read_peak_rows
 from express50.contract.layout import PLATES, Dataset
 from express50.contract.stage import Growth, Result, Stage
 
@@ -29,8 +29,6 @@ def items(dataset: Dataset) -> list[str]:
 
     Only aligned and calibrated subjects have items.
     """
-    from express50.capture.frames import peak_items  # imports OpenCV
-
     peaks = [
         item for item in peak_items(dataset) if dataset.cameras_file(item.split("/")[0]).is_file()
     ]
@@ -40,8 +38,6 @@ def items(dataset: Dataset) -> list[str]:
 
 def inputs(dataset: Dataset, item: str, config: FramesConfig) -> dict[str, Path | str]:
     """Name the index, the cameras, and the peak or the plates; the index holds footage hashes."""
-    from express50.capture.frames import read_peak_rows
-
     subject, expression = item.split("/")
     found: dict[str, Path | str] = {
         "index": dataset.index_file(subject),

@@ -8,19 +8,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from express50.capture.frames import (
-    FrameReader,
-    check_peak,
-    read_cameras_of,
-    read_peak_rows,
-    read_recorded_plate,
-    write_frame,
-)
-from express50.capture.index import read_index
+from express50.capture.frames import FrameReader, read_cameras_of, read_recorded_plate, write_frame
+from express50.capture.index import check_peak, read_index, read_peak_rows
 from express50.contract.layout import PLATES, Dataset
 from express50.contract.stage import Note, Result
 from express50.errors import CaptureError, StageError
-from express50.files.containers import to_srgb8
+from express50.files.containers import to_srgb
 from express50.files.images import contact_sheet, resize_area, write_image
 from express50.geometry.conventions import undistort_image
 
@@ -64,7 +57,7 @@ def run(dataset: Dataset, item: str, deep: bool, out: Path) -> Result:
         bits[name] = 8 * image.itemsize
         scale = min(1.0, TILE / max(image.shape[:2]))
         height, width = (max(1, round(n * scale)) for n in image.shape[:2])
-        tiles[name] = resize_area(to_srgb8(image), width, height)
+        tiles[name] = resize_area(to_srgb(image), width, height)
     if not tiles:
         why = "; ".join(f"{note.what}: {note.why}" for note in dropped[:3])
         raise StageError(f"{item}: no camera could be read ({why or 'none is calibrated'})")

@@ -1,12 +1,14 @@
-"""Ingest: the frame index, proxies and a first look at sync, light and focus of a capture."""
+"""The ingest stage: frame index and proxies of a capture, and checks of sync, light and focus."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from express50.contract.layout import Dataset
 from express50.contract.stage import Growth, Result, Stage
+from express50.errors import FormatError
+from express50.files.text import read_json_table
 from pipelines.ingest.config import PRESETS, IngestConfig
 
 
@@ -36,11 +38,19 @@ def run(dataset: Dataset, item: str, config: IngestConfig, out: Path) -> Result:
     return work(dataset, item, config, out)
 
 
-def account(dataset: Dataset, subjects: Sequence[str]) -> Iterable[str]:
-    """Say what was found in captures, see `pipelines.ingest.stage`."""
-    from pipelines.ingest.stage import account as lines
-
-    return lines(dataset, list(subjects))
+def account(dataset: Dataset, subjects: Sequence[str]) -> Iterator[str]:
+    """Yield a line per ingested capture for people."""
+    for subject in subjects:
+        path = dataset.item_dir("ingest", subject) / "metrics.json"
+        if not path.is_file():
+            continue
+        found = read_json_table(path, FormatError, "ingest again")
+        counts = sorted({found["frame_count"], *found["frame_count_differs"].values()})
+        frames = " to ".join(map(str, dict.fromkeys((counts[0], counts[-1]))))
+        yield (
+            f"  {subject} ({found.get('layout', 'express50')}): {found['cameras']} cameras, "
+            f"{frames} frames each, {found['expressions']} expressions"
+        )
 
 
 STAGE = Stage(
@@ -55,6 +65,6 @@ STAGE = Stage(
     purpose="Footage indexed frame by frame, with proxies for scrubbing.",
     prepare=register,
     account=account,
-    # Proxies, and what is seen in them, have one size whatever the footage has.
+    # Proxies have one size, whatever that of the footage.
     growth=Growth(("subjects",), ("frames", "views", "pixels"), ("frames", "views")),
 )

@@ -1,4 +1,4 @@
-"""Decode one camera once: frames' identity, proxies, and what the checks need of each frame."""
+"""Decode one camera once: identity of its frames, proxies, and measurements for the checks."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import io
 import json
 import tarfile
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -21,30 +21,13 @@ from express50.files.digests import file_sha256, text_digest
 from express50.files.images import encode_jpeg, resize_area, upright
 from express50.files.video import iterate_video
 from pipelines.ingest.config import IngestConfig
-from pipelines.ingest.focus import edge_width
-from pipelines.ingest.light import cells_of
-from pipelines.ingest.sync import movement, small_grey
-
-
-@dataclass(frozen=True)
-class Seen:
-    """What a scan saw of a camera beside its frames' identity.
-
-    Attributes:
-        moves: (F,) movement since the frame before, grey levels.
-        cells: (F, 16, 16, 3) linear light.
-        widths: frame and width of its sharpest edges, pixels, of some frames.
-    """
-
-    moves: np.ndarray
-    cells: np.ndarray
-    widths: tuple[tuple[int, float], ...]
+from pipelines.ingest.quality import Seen, edge_width, light_cells, movement, small_grey
 
 
 def scan_camera(
     raw: RawCapture, camera: RawCamera, folder: Path, config: IngestConfig
 ) -> tuple[CameraSource, Seen]:
-    """Decode one camera, write its proxies, and return its frames' identity and what was seen.
+    """Decode one camera and write its proxies; return its frames' identity and measurements.
 
     Raises:
         CaptureError: the footage is truncated, damaged or changes its size.
@@ -52,7 +35,10 @@ def scan_camera(
     pts: list[int] = []
     hashes: list[str] = []
     clips: list[int] = []
-    watch = _Watch(config)
+    moves: list[float] = []
+    cells: list[np.ndarray] = []
+    widths: list[tuple[int, float]] = []
+    before: np.ndarray | None = None
     size: tuple[int, ...] | None = None
     with ProxyWriter(folder / f"{camera.id}.tar") as proxies:
         for clip, stamp, image in iterate_camera(camera):
@@ -60,7 +46,7 @@ def scan_camera(
             if image.shape[:2] != size:
                 raise CaptureError(
                     f"{camera.path}: frame {len(pts)} is {image.shape[1]}x{image.shape[0]}, "
-                    f"the first is {size[1]}x{size[0]}; all must be of one size"
+                    f"the first is {size[1]}x{size[0]}; all frames must have the same size"
                 )
             clips += [0] * (clip + 1 - len(clips))
             clips[clip] += 1
@@ -68,9 +54,15 @@ def scan_camera(
             hashes.append(dhash(image))
             small = shrink(image, config.proxy_long_side)
             proxies.add(encode_jpeg(corrected(small, camera), config.proxy_quality))
-            watch.look(image, small)
+            grey = small_grey(small)
+            moves.append(movement(before, grey))
+            before = grey
+            cells.append(light_cells(small).astype(np.float16))
+            every = config.focus_every
+            if every and (len(pts) - 1) % every == 0 and (width := edge_width(image)) is not None:
+                widths.append((len(pts) - 1, width))
     if size is None:
-        raise CaptureError(f"{camera.path}: holds no frame; record or copy it again")
+        raise CaptureError(f"{camera.path}: has no frames; record or copy it again")
     (folder / f"{camera.id}.json").write_bytes(dump_json(proxies.table))
     source = CameraSource(
         kind=camera.kind,
@@ -86,46 +78,15 @@ def scan_camera(
         correction=camera.correction,
         orientation=camera.orientation,
     )
-    return source, watch.seen()
-
-
-class _Watch:
-    """Gathers figures of frame after frame."""
-
-    def __init__(self, config: IngestConfig) -> None:
-        self._config = config
-        self._moves: list[float] = []
-        self._cells: list[np.ndarray] = []
-        self._widths: list[tuple[int, float]] = []
-        self._before: np.ndarray | None = None
-
-    def look(self, image: np.ndarray, small: np.ndarray) -> None:
-        """Take a frame (H, W, 3) uint8 and its proxy's pixels."""
-        frame, every = len(self._moves), self._config.focus_every
-        grey = small_grey(small)
-        self._moves.append(movement(self._before, grey))
-        self._before = grey
-        self._cells.append(cells_of(small).astype(np.float16))
-        if every and frame % every == 0:
-            width = edge_width(image)
-            if width is not None:
-                self._widths.append((frame, width))
-
-    def seen(self) -> Seen:
-        """All that was gathered."""
-        return Seen(np.array(self._moves), np.stack(self._cells), tuple(self._widths))
+    return source, Seen(np.array(moves), np.stack(cells), tuple(widths))
 
 
 def trimmed(
     source: CameraSource, seen: Seen, counts: tuple[int, ...], table: Path
 ) -> tuple[CameraSource, Seen]:
-    """A camera without the frames that its clips have beyond the given counts.
+    """Returns a camera and its measurements with the first ``counts`` frames of each clip.
 
-    Args:
-        source: the camera.
-        seen: what was seen of it.
-        counts: frames to keep of each clip.
-        table: its proxies' table, which is written anew.
+    The ``table`` of its proxies is rewritten.
     """
     ends = np.cumsum(source.clips)
     rows = zip(ends, source.clips, counts, strict=True)
@@ -150,7 +111,7 @@ def trimmed(
 
 
 def iterate_camera(camera: RawCamera) -> Iterator[tuple[int, int, np.ndarray]]:
-    """Clip, time stamp and recorded image (H, W, 3) uint8 sRGB of every frame."""
+    """Yield clip, time stamp and recorded image (H, W, 3) uint8 sRGB of every frame."""
     if camera.kind == "video":
         yield from ((0, stamp, image) for stamp, image in iterate_video(camera.path))
     elif camera.kind == "videos":
@@ -166,7 +127,7 @@ def iterate_camera(camera: RawCamera) -> Iterator[tuple[int, int, np.ndarray]]:
 
 
 def time_gaps(pts: tuple[int, ...], clips: tuple[int, ...] = ()) -> int:
-    """Steps between frames longer than 1.5 usual ones: each tells of a frame the recorder lost.
+    """Count the steps longer than 1.5 times the median, where the recorder lost a frame.
 
     Steps from one clip to the next do not count.
     """
@@ -178,7 +139,7 @@ def time_gaps(pts: tuple[int, ...], clips: tuple[int, ...] = ()) -> int:
 
 
 def source_sha256(camera: RawCamera) -> str:
-    """Digest of the video file, or of the names and digests of all files that hold the frames."""
+    """Return the digest of the video, or of the names and digests of all files with frames."""
     if camera.kind == "video":
         return file_sha256(camera.path)
     files = dict.fromkeys(name.partition(WITHIN)[0] for name in camera.names)
@@ -189,7 +150,7 @@ def source_sha256(camera: RawCamera) -> str:
 
 
 def shrink(image: np.ndarray, long_side: int) -> np.ndarray:
-    """Image (H, W, 3) with its longer side at most ``long_side``."""
+    """Reduce an image (H, W, 3) to at most ``long_side`` pixels on its longer side."""
     height, width = image.shape[:2]
     scale = long_side / max(height, width)
     if scale >= 1:
@@ -211,7 +172,7 @@ class ProxyWriter:
         self._tar.close()
 
     def add(self, data: bytes) -> None:
-        """Append one JPEG; time and owner are 0, so that the same frames give the same bytes."""
+        """Append one JPEG; time and owner are 0, so that equal frames give equal bytes."""
         info = tarfile.TarInfo(f"{len(self.table):06d}.jpg")
         info.size = len(data)
         # The header is one block; the data follow it.

@@ -19,7 +19,7 @@ from express50.geometry.cameras import Camera
 from express50.geometry.conventions import corner_to_cell
 from express50.landmarks.detector import detect
 from express50.landmarks.network import LandmarkNet
-from pipelines.calibrate.first_guess import mean_landmarks, pose_of_face
+from pipelines.calibrate.footage_rig import mean_landmarks, pose_of_face
 from pipelines.matte.learned import refined
 
 FACE_SCORE = 0.3  # heads from behind score up to 0.2, profiles from 0.33 on

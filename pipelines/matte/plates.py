@@ -1,8 +1,14 @@
-"""Model the plate of a camera: its exposure relative to the frame, and its noise.
+"""Model the plate of a camera, and solve alpha where plate and subject mix.
 
-The noise decides how large a difference is significant. It is measured on the frames themselves,
-where they show plate: it grows with brightness and, through compression and resampling, with the
-plate's own contrast, and its channels go together (compression keeps less colour than light).
+The noise around the plate decides how large a difference is significant. It is measured on the
+frame itself, where that shows plate: it grows with brightness and, through compression and
+resampling, with the plate's own contrast, and its channels are correlated.
+
+A pixel is ``alpha * F + (1 - alpha) * B`` in linear light, which is what a lens averages. B, the
+plate, is known but for noise; F has the mean and the covariance of the subject's colours nearby.
+The likeliest alpha under both is the Bayesian matting of Chuang et al. 2001 with B given: the
+covariance lets a strand be lighter or darker than its neighbours without being called more or
+less opaque. The deviation of alpha is large where F and B are alike.
 """
 
 from __future__ import annotations
@@ -12,22 +18,28 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from express50.files.images import LIGHT_OF_LEVEL, scaled_levels
+from express50.files.images import LIGHT_OF_LEVEL, scaled_levels, srgb_to_linear
 
 LEVELS = np.linspace(16.0, 240.0, 8)  # 8-bit intensities at which noise is tabulated
-# Differences above this, in 8-bit steps, are not noise whatever the camera.
-MOST_NOISE = 14.0
+MOST_NOISE = 14.0  # 8-bit steps; larger differences are not noise, whatever the camera
+NOISE_FLOOR = 1.0  # least noise assumed, in 8-bit steps
 # Below this share of plate in view there is nothing to measure noise or exposure on.
 LEAST_PLATE = 0.05
 # Largest changes of exposure, natural logarithms: a few tenths of a stop as a rule, else two stops.
 GAINS = (0.51, 1.41)
+ROUNDS = 3  # the covariance a pixel sees depends on its alpha; settled to 0.01 after two
+OCTAVES = 4  # of reach, in which colours are looked for
+TINT = 0.1  # share of the spread in brightness by which colour spreads too
+CHUNK = 1 << 18  # pixels solved at once, so that memory is bounded
+_PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+_MATRIX = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
 
 
 @dataclass(frozen=True)
 class PlateModel:
-    """Plate (H, W, 3) float32 in 8-bit steps and the noise of frames around it.
+    """Plate (H, W, 3) float32 in 8-bit steps, in the frame's exposure, and the noise around it.
 
-    `sigma` (H, W, 3) is the deviation a channel; `whiten` (3, 3) makes the squared length of
+    `sigma` (H, W, 3) is the deviation per channel; `whiten` (3, 3) makes the squared length of
     `whiten @ ((frame - plate) / sigma)` three on average where a frame shows plate.
     """
 
@@ -37,7 +49,7 @@ class PlateModel:
 
 
 def exposure_gain(frame: np.ndarray, plate: np.ndarray) -> np.ndarray:
-    """Gain (3,) of linear light from plate to frame, (H, W, 3) uint8 sRGB each.
+    """Estimate the gain (3,) of linear light from plate to frame, (H, W, 3) uint8 sRGB each.
 
     The plate's pixels form the sharpest peak of the ratios' histogram, whatever the subject
     does; 1 where no peak stands out (the subject fills the frame). Another stop is believed only
@@ -63,53 +75,45 @@ def exposure_gain(frame: np.ndarray, plate: np.ndarray) -> np.ndarray:
 
 
 def exposed(plate: np.ndarray, gain: np.ndarray) -> np.ndarray:
-    """Plate (H, W, 3) uint8 as the frame's exposure would show it: float32, 8-bit steps."""
+    """Return a plate (H, W, 3) uint8 in the frame's exposure: float32, 8-bit steps."""
     if np.abs(gain - 1.0).max() < 0.004:  # within half a step everywhere
         return plate.astype(np.float32)
     table = scaled_levels(gain).astype(np.float32)
     return np.stack([table[plate[..., c], c] for c in range(3)], axis=-1)
 
 
-def fit_plate(
-    plate: np.ndarray, frames: list[np.ndarray], valid: np.ndarray, floor: float
-) -> PlateModel:
-    """Measure the noise of frames (H, W, 3) uint8 against their plate where `valid` (H, W).
+def fit_plate(plate: np.ndarray, frame: np.ndarray, valid: np.ndarray) -> PlateModel:
+    """Model a plate (H, W, 3) uint8 in a frame's exposure, and the frame's noise around it.
 
-    With too little plate in view the noise is `floor`, in 8-bit steps, everywhere.
+    The noise is measured on the frame (H, W, 3) uint8 where `valid` (H, W); with too little plate
+    in view it is NOISE_FLOOR everywhere.
     """
-    base = plate.astype(np.float32)
-    slope = _contrast(base)
+    base, shown = plate.astype(np.float32), exposed(plate, exposure_gain(frame, plate))
+    # Length of the gradient, 8-bit steps per pixel.
+    slope = np.hypot(*(cv2.Sobel(base, cv2.CV_32F, x, 1 - x) / 8.0 for x in (1, 0)))
     step = max(1, round(np.sqrt(valid.size / 4e5)))
     window = np.s_[step // 2 :: step, step // 2 :: step]
-    errors, levels, slopes, total = [], [], [], 0
-    for frame in frames:
-        shown = exposed(plate, exposure_gain(frame, plate))
-        error = (frame.astype(np.float32) - shown)[window][valid[window]]
-        total += len(error)
-        quiet = np.abs(error).max(axis=1) < MOST_NOISE
-        errors.append(error[quiet])
-        levels.append(base[window][valid[window]][quiet])
-        slopes.append(slope[window][valid[window]][quiet])
-    error, level = np.concatenate(errors), np.concatenate(levels)
-    contrast = np.concatenate(slopes)
-    if len(error) < max(LEAST_PLATE * total, 100):
-        return PlateModel(base, np.full_like(base, floor), np.eye(3, dtype=np.float32))
-    table = _noise_table(error, level, floor)
+    error = (frame.astype(np.float32) - shown)[window][valid[window]]
+    quiet = np.abs(error).max(axis=1) < MOST_NOISE
+    if quiet.sum() < max(LEAST_PLATE * len(error), 100):
+        return PlateModel(shown, np.full_like(base, NOISE_FLOOR), np.eye(3, dtype=np.float32))
+    error, level, contrast = (
+        error[quiet], base[window][valid[window]][quiet], slope[window][valid[window]][quiet]
+    )  # fmt: skip
+    table = _noise_table(error, level)
     by_level = _look_up(table, level)
     share = _contrast_share(error, by_level, contrast)
     sigma = np.sqrt(_look_up(table, base) ** 2 + (share * slope) ** 2).astype(np.float32)
     scaled = error / np.sqrt(by_level**2 + (share * contrast) ** 2)
-    return PlateModel(base, sigma, _whitening(scaled))
+    inside = scaled[np.abs(scaled).max(axis=1) < 4.0]
+    covariance = inside.T @ inside / max(len(inside), 1)
+    # A tenth of independent noise keeps a direction that only looked quiet from ruling the key.
+    values, vectors = np.linalg.eigh(covariance + 0.1 * np.eye(3))
+    whiten = (vectors / np.sqrt(np.maximum(values, 0.1))) @ vectors.T
+    return PlateModel(shown, sigma, whiten.astype(np.float32))
 
 
-def _contrast(image: np.ndarray) -> np.ndarray:
-    """Length (H, W, 3) of the gradient, 8-bit steps a pixel."""
-    dx = cv2.Sobel(image, cv2.CV_32F, 1, 0) / 8.0
-    dy = cv2.Sobel(image, cv2.CV_32F, 0, 1) / 8.0
-    return np.hypot(dx, dy)
-
-
-def _noise_table(error: np.ndarray, level: np.ndarray, floor: float) -> np.ndarray:
+def _noise_table(error: np.ndarray, level: np.ndarray) -> np.ndarray:
     """Robust deviation (8, 3) at each of LEVELS from errors and plate values (N, 3)."""
     half = (LEVELS[1] - LEVELS[0]) / 2
     table = np.full((len(LEVELS), 3), np.nan)
@@ -123,7 +127,7 @@ def _noise_table(error: np.ndarray, level: np.ndarray, floor: float) -> np.ndarr
         table[:, channel] = (
             np.interp(LEVELS, LEVELS[known], table[known, channel]) if known.any() else overall
         )
-    return np.maximum(table, floor)
+    return np.maximum(table, NOISE_FLOOR)
 
 
 def _robust_deviation(size: np.ndarray) -> float:
@@ -157,10 +161,109 @@ def _contrast_share(error: np.ndarray, by_level: np.ndarray, contrast: np.ndarra
     return float(np.clip(np.sqrt(max(more, 0.0)) / np.median(contrast[steep]), 0.0, 0.3))
 
 
-def _whitening(scaled: np.ndarray) -> np.ndarray:
-    """Matrix (3, 3) that gives errors (N, 3), unit variance each, unit covariance."""
-    inside = scaled[np.abs(scaled).max(axis=1) < 4.0]
-    covariance = inside.T @ inside / max(len(inside), 1)
-    # A tenth of independent noise keeps a direction that only looked quiet from ruling the key.
-    values, vectors = np.linalg.eigh(covariance + 0.1 * np.eye(3))
-    return ((vectors / np.sqrt(np.maximum(values, 0.1))) @ vectors.T).astype(np.float32)
+def to_light(values: np.ndarray, linear: bool) -> np.ndarray:
+    """Return light in [0, 1] of sRGB values in 8-bit steps, or the scaled values if not linear."""
+    shares = np.clip(values, 0, 255) / 255.0
+    return srgb_to_linear(shares).astype(np.float32) if linear else shares.astype(np.float32)
+
+
+def light_noise(
+    plate: np.ndarray, sigma: np.ndarray, whiten: np.ndarray, linear: bool
+) -> np.ndarray:
+    """Return the covariance (N, 3, 3) of light from that of 8-bit steps at plate values (N, 3)."""
+    level = np.clip(plate, 1, 254)
+    slope = (to_light(level + 1, linear) - to_light(level - 1, linear)) / 2
+    deviation = (slope * sigma).astype(np.float64)
+    mixing = np.linalg.inv(whiten.astype(np.float64))
+    return deviation[:, :, None] * (mixing @ mixing.T) * deviation[:, None, :]
+
+
+def local_colours(
+    light: np.ndarray, weight: np.ndarray, where: np.ndarray, reach: float, spread: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return mean (N, 3) and covariance (N, 3, 3) of colours near the pixels of `where` (H, W).
+
+    Args:
+        light: (H, W, 3) colours.
+        weight: (H, W), which of them count.
+        where: (H, W) bool, N of them true.
+        reach: pixels; the nearest of OCTAVES reaches that holds any colour decides.
+        spread: share by which brightness may differ from what is seen nearby.
+    """
+    # A blur this wide has no detail, so sums are kept small; one channel at a time, for memory.
+    factor = max(1, int(reach / 3))
+    height, width = weight.shape
+    size = (max(1, width // factor), max(1, height // factor))
+
+    def nearby(values: np.ndarray) -> np.ndarray:
+        small = cv2.resize(values * weight, size, interpolation=cv2.INTER_AREA)
+        total = np.full_like(small, 1e-3 * 1e-2**OCTAVES * small.mean())  # where none is in reach
+        for octave in range(OCTAVES):
+            total += 1e-2**octave * blurred(small, reach / factor * 2**octave)
+        return cv2.resize(total, (width, height), interpolation=cv2.INTER_LINEAR)[where]
+
+    share = np.maximum(nearby(np.ones_like(weight)), 1e-20)
+    channels = [np.ascontiguousarray(light[..., c]) for c in range(3)]
+    mean = np.stack([nearby(c) / share for c in channels], axis=1).astype(np.float64)
+    squares = [nearby(channels[i] * channels[j]) / share for i, j in _PAIRS]
+    outer = mean[:, :, None] * mean[:, None, :]
+    covariance = np.stack(squares, axis=1)[:, _MATRIX] - outer
+    tint = (TINT * spread) ** 2 * (mean**2).mean(axis=1)
+    return mean, covariance + spread**2 * outer + tint[:, None, None] * np.eye(3)
+
+
+def blurred(image: np.ndarray, sigma: float) -> np.ndarray:
+    """Blur an image (H, W[, C]) by a Gaussian, at reduced size where that is wide."""
+    factor = max(1, int(sigma / 3))
+    height, width = image.shape[:2]
+    size = (max(1, width // factor), max(1, height // factor))
+    small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+    small = cv2.GaussianBlur(small, (0, 0), sigma / factor)
+    return cv2.resize(small, (width, height), interpolation=cv2.INTER_LINEAR)
+
+
+def solve_opacity(
+    seen: np.ndarray,
+    behind: np.ndarray,
+    mean: np.ndarray,
+    covariance: np.ndarray,
+    noise: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Solve the likeliest alpha (N,), not clipped, its deviation (N,), and that near alpha 0.
+
+    Args:
+        seen: (N, 3) light of the pixels.
+        behind: (N, 3) light of the plate.
+        mean: (N, 3) of the subject's colours.
+        covariance: (N, 3, 3) of the subject's colours.
+        noise: (N, 3, 3) covariance of seen light that shows plate.
+    """
+    out = np.zeros((3, len(seen)))
+    for start in range(0, len(seen), CHUNK):
+        part = slice(start, start + CHUNK)
+        difference, reach = seen[part] - behind[part], mean[part] - behind[part]
+        own = noise[part] + 1e-10 * np.eye(3)
+        precision = _precision(own, reach)[1]
+        out[2, part] = 1 / np.sqrt(np.maximum(precision, 1e-12))
+        alpha = np.full(len(reach), 0.5)
+        for _ in range(ROUNDS):
+            share = np.clip(alpha, 0, 1)[:, None, None] ** 2
+            direction, precision = _precision(own + share * covariance[part], reach)
+            alpha = np.einsum("ni,ni->n", difference, direction) / np.maximum(precision, 1e-12)
+        out[:2, part] = alpha, 1 / np.sqrt(np.maximum(precision, 1e-12))
+    return out[0], out[1], out[2]
+
+
+def _precision(covariance: np.ndarray, reach: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return ``C^-1 r`` (N, 3) and ``r' C^-1 r`` (N,), the weights and precision on r."""
+    direction = np.linalg.solve(covariance, reach[..., None].astype(np.float64))[..., 0]
+    return direction, np.einsum("ni,ni->n", reach, direction)
+
+
+def shrunk(values: np.ndarray, doubt: np.ndarray) -> np.ndarray:
+    """Shrink values (N,) by their doubt (N,): to 0 within it, and little far above it.
+
+    This is the non-negative garrote (Breiman 1995): unlike a ramp it keeps large values.
+    """
+    kept = 1 - (doubt / np.maximum(values, 1e-9)) ** 2
+    return np.where(values > 0, values * np.clip(kept, 0, 1), 0.0)

@@ -17,7 +17,7 @@ from express50.geometry.cameras import Camera, pinhole, resized
 from express50.geometry.conventions import undistorted_mask
 from pipelines.matte.config import WITHOUT_PLATE, MatteConfig
 from pipelines.matte.consensus import Agreement, agree
-from pipelines.matte.key import Keyer, KeyOptions
+from pipelines.matte.key import key_alpha
 from pipelines.matte.plates import exposed, exposure_gain
 from pipelines.matte.visual_hull import (
     INSIDE,
@@ -107,10 +107,9 @@ def _plate(dataset: Dataset, subject: str, camera: str) -> np.ndarray:
 def _matter(config: MatteConfig) -> Matter:
     """Make the function that mattes one frame. Networks are imported here: torch is slow to."""
     if config.method == "key":
-        options = key_options(config)
 
         def key(frame, plate, valid, camera):  # type: ignore[no-untyped-def]
-            return Keyer(plate, [frame], valid, options).alpha(frame)
+            return key_alpha(frame, plate, valid, config)
 
         return key
     if config.method == "grabcut":
@@ -133,12 +132,6 @@ def _matter(config: MatteConfig) -> Matter:
         return background_alpha(network, frame, shown, config.tile)
 
     return learned
-
-
-def key_options(config: MatteConfig) -> KeyOptions:
-    """Take the options of keying from the stage's settings."""
-    linear = config.light == "linear"
-    return KeyOptions(config.scale, config.low, config.high, config.shadow, linear)
 
 
 def make_view(

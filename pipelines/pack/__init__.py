@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from express50.contract.exclusions import exclusion_reason
-from express50.contract.layout import Dataset
+from express50.contract.layout import Dataset, exclusion_reason
 from express50.contract.stage import Growth, Result, Stage
 from pipelines.pack.config import PRESETS, PackConfig
 

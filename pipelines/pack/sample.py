@@ -7,14 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from express50.capture.frames import (
-    read_cameras_of,
-    read_gains,
-    read_peak_frame,
-    read_peaks,
-    read_plate_image,
-)
-from express50.capture.index import read_index
+from express50.capture.frames import read_cameras_of, read_gains, read_peak_frame, read_plate_image
+from express50.capture.index import read_index, read_peaks
 from express50.contract.layout import Dataset
 from express50.dataset.depth_files import depth_file, read_depth
 from express50.dataset.tracks import existing_track, read_track
@@ -31,8 +25,15 @@ from express50.files.text import read_json_table
 from express50.geometry.cameras import Camera
 from express50.shards.codecs import encode_pictures
 from express50.shards.writer import PackedSample, sample_key
-from pipelines.pack.colour import cut_own_colours
-from pipelines.pack.crop import Crop, crop_pinhole, cut_depth, cut_image, cut_labels, head_crop
+from pipelines.pack.crop import (
+    Crop,
+    crop_pinhole,
+    cut_depth,
+    cut_image,
+    cut_labels,
+    cut_own_colours,
+    head_crop,
+)
 
 PARAMETERS = ("expression", "neck", "jaw", "eyes", "R", "t")
 

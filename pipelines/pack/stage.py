@@ -8,8 +8,7 @@ import cv2
 import numpy as np
 
 from express50.capture.readers.read import read_people
-from express50.contract.exclusions import exclusion_reason
-from express50.contract.layout import Dataset
+from express50.contract.layout import Dataset, exclusion_reason
 from express50.contract.segmentation_labels import COLOURS
 from express50.contract.stage import Note, Result
 from express50.errors import CaptureError, FormatError, StageError

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from typing import Any
 
-from express50.contract.extensions import Command
+from express50.contract.stage import Command
 
 
 def add_commands(subparsers: Any) -> None:
-    """Add the command, see `pipelines.photo.cli`."""
+    """Adds the command, see `pipelines.photo.cli`."""
     from pipelines.photo.cli import add_commands as add
 
     add(subparsers)

@@ -1,4 +1,9 @@
-"""Make a raw capture of one camera out of a photograph or a video."""
+"""Make a raw capture of one camera out of a photograph or a video, its focal length included.
+
+Only perspective distinguishes a near face under a wide lens from a far one under a long lens: at
+arm's length the nose is a twentieth nearer than the ears. The head model is fitted at a ladder of
+focal lengths; the fit's cost shows which explain the landmarks as well as the best one does.
+"""
 
 from __future__ import annotations
 
@@ -15,21 +20,26 @@ import numpy as np
 import torch
 
 from express50.capture.raw import IMAGE_SUFFIXES, VIDEO_SUFFIXES
-from express50.errors import CaptureError, FormatError
+from express50.errors import CaptureError, FormatError, StageError
 from express50.files.atomic import dump_json, write_bytes
 from express50.files.calibration import camera_rows
-from express50.files.containers import read_srgb8
+from express50.files.containers import read_picture
 from express50.files.digests import file_sha256
 from express50.files.images import ORIENTATION, encode_png, read_exif, upright
-from express50.files.video import iterate_video, video_fps, video_turn
-from express50.files.video_writer import VideoFootage
+from express50.files.video import VideoFootage, iterate_video, video_fps, video_turn
+from express50.geometry.cameras import Camera, pinhole_camera
 from express50.head.load import load_head
+from express50.head.model import landmarks
 from express50.landmarks.detector import Detection, detect
 from express50.landmarks.network import load_network
-from pipelines.photo.focal import Focal, single_camera, weigh_focal
-from pipelines.track.basis import make_basis
+from pipelines.calibrate.footage import focal_of_film
+from pipelines.track.basis import Basis, make_basis
 from pipelines.track.config import TrackConfig
+from pipelines.track.fit import fit
+from pipelines.track.observe import LandmarkView, agree, landmark_sigma
 from pipelines.track.read_inputs import DETECTOR_PASSES
+from pipelines.track.schedule import LANDMARK_STEPS
+from pipelines.track.state import Target, initial_pose, start_state
 
 CAMERA = "photo"
 FACE_SCORE = 0.2
@@ -40,20 +50,23 @@ FOCAL_LIMITS = (0.1, 100.0)
 TURNED_CRF = 12  # H.264 that looks like the source
 # Read as photographs; a rig's cameras write none of the last two.
 PHOTO_SUFFIXES = (*IMAGE_SUFFIXES, ".webp", ".bmp")
-FILM_DIAGONAL_MM = math.hypot(36.0, 24.0)
+LADDER = 2.0 ** np.arange(-2.0, 2.5, 0.5)
+# Two thirds of unknown lenses lie within this factor of the guess.
+GUESS_FACTOR = 1.5
+# The landmarks of one detection err together: they count as a quarter of their number.
+INDEPENDENT = 0.25
+# Focal lengths whose cost is this much above the least (two standard deviations) are as good.
+AS_GOOD = 2.0
+CONSTRAINED_FACTOR = 1.6
+# World of a single camera: at the camera, y up, the camera looks along -z.
+CAM_FROM_WORLD = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 @dataclass(frozen=True)
 class PhotoSource:
-    """A photograph or video and the facts in its name and EXIF.
+    """A photograph or video, with EXIF's orientation (1 is upright) and focal length.
 
-    Attributes:
-        path: the file.
-        video: whether it is a video.
-        orientation: EXIF's, 1 to 8, or what a video's container says in its terms; 1 where its
-            pixels lie upright.
-        film_mm: focal length on 35 mm film with the same diagonal angle of view; 0 where EXIF
-            has none.
+    `film_mm` is that on 35 mm film with the same diagonal angle of view; 0 if unknown.
     """
 
     path: Path
@@ -63,7 +76,7 @@ class PhotoSource:
 
 
 def open_picture(path: Path) -> PhotoSource:
-    """Read a file's kind from its name, and its EXIF.
+    """Reads a file's kind from its name, and its EXIF.
 
     Raises:
         CaptureError: no such file, or neither an image nor a video.
@@ -92,39 +105,34 @@ def open_picture(path: Path) -> PhotoSource:
     return PhotoSource(path, video=False, orientation=orientation, film_mm=film)
 
 
-def read_upright(picture: PhotoSource) -> np.ndarray:
-    """Read a photograph (H, W, 3) uint8 sRGB, turned upright.
-
-    Raises:
-        CaptureError: it is damaged.
-    """
-    return upright(read_srgb8(picture.path), picture.orientation)
-
-
 def upright_frames(picture: PhotoSource) -> Iterator[np.ndarray]:
-    """Decode a whole video (H, W, 3) uint8 sRGB, turned upright."""
+    """Decodes a photograph or a whole video: frames (H, W, 3) uint8 sRGB, turned upright."""
+    if not picture.video:
+        path = picture.path.resolve()  # it may be a link to elsewhere
+        yield read_picture(path.parent, path.name, picture.orientation)
+        return
     for _, image in iterate_video(picture.path):
         yield upright(image, picture.orientation)
 
 
-def spread_frames(picture: PhotoSource, count: int) -> tuple[list[np.ndarray], int]:
-    """Read up to `count` frames spread over a picture; returns them and the number of all.
-
-    A video is decoded twice, so that not all of its frames are held.
-    """
-    if not picture.video:
-        return [read_upright(picture)], 1
-    frames = sum(1 for _ in upright_frames(picture))
-    wanted = set(np.unique(np.linspace(0, frames - 1, count).round().astype(int)).tolist())
-    return [image for n, image in enumerate(upright_frames(picture)) if n in wanted], frames
-
-
 def guess_focal(picture: PhotoSource, width: int, height: int, film_mm: float) -> tuple[float, str]:
-    """Guess the focal length in pixels; the source is `exif`, else `guess` by `film_mm`."""
-    diagonal = math.hypot(width, height)
-    if picture.film_mm > 0:
-        return picture.film_mm / FILM_DIAGONAL_MM * diagonal, "exif"
-    return film_mm / FILM_DIAGONAL_MM * diagonal, "guess"
+    """Guesses the focal length in pixels; the source is `exif`, else `guess` by `film_mm`."""
+    mm, source = (picture.film_mm, "exif") if picture.film_mm > 0 else (film_mm, "guess")
+    return focal_of_film(mm, width, height), source
+
+
+@dataclass(frozen=True)
+class Focal:
+    """A focal length, pixels, and its evidence.
+
+    `source` is `given`, `exif`, `guess`, or `fit` where the face moved the guess. The face is
+    explained as well by any focal length from `low` to `high`, within the ladder.
+    """
+
+    pixels: float
+    source: str
+    low: float
+    high: float
 
 
 def make_photo_capture(
@@ -135,32 +143,40 @@ def make_photo_capture(
     *,
     focal_px: float | None = None,
     film_mm: float = 50.0,
-    windows: int = PROBES,
+    windows: int = 8,
 ) -> Focal:
-    """Write capture.toml, footage, cues and calibration; returns the focal length used.
+    """Writes capture.toml, footage, cues and calibration; returns the focal length used.
 
     A photograph is one cue of one frame; a video is cut into `windows` cues of equal length, from
-    each of which `align` takes a frame for the shared shape.
-
-    Args:
-        picture: from `open_picture`.
-        folder: of the capture; an earlier capture of the same file is overwritten.
-        subject: subject id.
-        config: settings of the fit that compares focal lengths.
-        focal_px: focal length, pixels, where it is known.
-        film_mm: focal length on 35 mm film to assume where it is unknown.
-        windows: cues of a video.
+    each of which `align` takes a frame for the shared shape. An earlier capture of the same file
+    in `folder` is overwritten. `film_mm` is assumed where neither `focal_px` nor EXIF is known.
 
     Raises:
         CaptureError: the picture cannot be read or shows no face, the folder has another picture,
             or the focal length is that of no lens.
     """
     torch.set_num_threads(1)
-    _check_same(picture.path, folder)
-    images, frames = spread_frames(picture, PROBES)
+    digest = file_sha256(picture.path)
+    try:
+        known = tomllib.loads((folder / "capture.toml").read_text()).get("picture_sha256", digest)
+    except (OSError, ValueError):  # nothing is there, or nothing that could be lost
+        known = digest
+    if known != digest:
+        raise CaptureError(
+            f"{picture.path}: {folder} was made of another picture; name this one with --subject,"
+            " or remove that folder"
+        )
+    # A video is decoded twice, so that not all of its frames are held.
+    frames = sum(1 for _ in upright_frames(picture)) if picture.video else 1
+    probes = set(np.linspace(0, frames - 1, PROBES).round().astype(int).tolist())
+    images = [image for n, image in enumerate(upright_frames(picture)) if n in probes]
     height, width = images[0].shape[:2]
-    _check_focal(focal_px, max(width, height))
-    fps = video_fps(picture.path) if picture.video else PHOTO_FPS
+    low, high = (max(width, height) * limit for limit in FOCAL_LIMITS)
+    if focal_px is not None and not low <= focal_px <= high:
+        raise CaptureError(
+            f"--focal-px {focal_px:g}: expected {low:g} to {high:g} for a picture"
+            f" {max(width, height)} px long; millimetres on 35 mm film go to --film-mm"
+        )
     faces = find_faces(picture.path, images, config)
     start = (focal_px, "given") if focal_px else guess_focal(picture, width, height, film_mm)
     basis = make_basis(load_head(config.head))
@@ -169,41 +185,27 @@ def make_photo_capture(
     _write_footage(picture, folder / "cameras" / CAMERA)
     camera = single_camera(CAMERA, width, height, focal.pixels)
     write_bytes(folder / "calibration.json", dump_json(camera_rows({CAMERA: camera})))
-    write_bytes(folder / "cues.csv", _cues(frames, windows).encode())
-    meta = _meta(subject, fps, focal, file_sha256(picture.path))
+    rows = ["expression_id,start_frame,end_frame"]
+    if frames == 1:
+        rows.append("photo,0,0")
+    else:
+        edges = np.unique(np.linspace(0, frames, min(windows, frames) + 1).round().astype(int))
+        pairs = zip(edges[:-1], edges[1:], strict=True)
+        rows += [f"clip_{n:02d},{a},{b - 1}" for n, (a, b) in enumerate(pairs)]
+    write_bytes(folder / "cues.csv", ("\n".join(rows) + "\n").encode())
+    fps = video_fps(picture.path) if picture.video else PHOTO_FPS
+    meta = (
+        f'subject = "{subject}"\nfps = {fps:.6g}\n'
+        f'focal_px = {focal.pixels:.3f}\nfocal_source = "{focal.source}"\n'
+        f"focal_range_px = [{focal.low:.1f}, {focal.high:.1f}]\n"
+        f'picture_sha256 = "{digest}"\n'
+    )
     write_bytes(folder / "capture.toml", meta.encode())
     return focal
 
 
-def _check_same(path: Path, folder: Path) -> None:
-    """Refuse to overwrite the capture of another picture."""
-    try:
-        known = tomllib.loads((folder / "capture.toml").read_text()).get("picture_sha256")
-    except (OSError, ValueError):  # nothing is there, or nothing that could be lost
-        return
-    if known is not None and known != file_sha256(path):
-        raise CaptureError(
-            f"{path}: {folder} was made of another picture; name this one with --subject, or "
-            "remove that folder"
-        )
-
-
-def _check_focal(focal_px: float | None, side: int) -> None:
-    """Refuse an impossible focal length."""
-    low, high = (side * limit for limit in FOCAL_LIMITS)
-    if focal_px is not None and not low <= focal_px <= high:
-        raise CaptureError(
-            f"--focal-px {focal_px:g}: expected {low:g} to {high:g} for a picture {side} px long; "
-            "millimetres on 35 mm film go to --film-mm"
-        )
-
-
 def find_faces(path: Path, images: list[np.ndarray], config: TrackConfig) -> list[Detection]:
-    """Find the faces that are surely visible in images of one person, at least one.
-
-    Raises:
-        CaptureError: there is none.
-    """
+    """Finds the faces, at least one, that are surely visible in images of one person."""
     net = load_network()
     seen = [detect(net, image, DETECTOR_PASSES, config.search) for image in images]
     faces = [face for face in seen if face.score >= FACE_SCORE]
@@ -218,57 +220,82 @@ def find_faces(path: Path, images: list[np.ndarray], config: TrackConfig) -> lis
 
 
 def subject_id(path: Path) -> str:
-    """Make a subject id from a file's name."""
-    name = re.sub(r"[^A-Za-z0-9_-]+", "_", path.stem).strip("_-")
-    return name or "photo"
+    """Makes a subject id from a file's name."""
+    return re.sub(r"[^A-Za-z0-9_-]+", "_", path.stem).strip("_-") or "photo"
 
 
 def _write_footage(picture: PhotoSource, folder: Path) -> None:
-    """Copy the file; a turned one, or one of a kind that no stage reads, is stored upright."""
+    """Copies the file; a turned one, or one of a kind that no stage reads, is stored upright."""
     # A former picture of another kind or suffix would make the footage ambiguous.
     shutil.rmtree(folder, ignore_errors=True)
     suffix = picture.path.suffix.lower()
     name = f"video{suffix}" if picture.video else f"frames/000000{suffix}"
     target = folder / name
     target.parent.mkdir(parents=True)
-    if not picture.video and (picture.orientation != 1 or suffix not in IMAGE_SUFFIXES):
-        write_bytes(target.with_suffix(".png"), encode_png(read_upright(picture)))
+    if picture.orientation == 1 and (picture.video or suffix in IMAGE_SUFFIXES):
+        try:
+            shutil.copyfile(picture.path, target)
+        except OSError as error:
+            raise CaptureError(f"{target}: cannot be written ({error.strerror})") from error
         return
-    if picture.orientation != 1:
-        _turn_video(picture, folder)
-        return
-    try:
-        shutil.copyfile(picture.path, target)
-    except OSError as error:
-        raise CaptureError(f"{target}: cannot be written ({error.strerror})") from error
-
-
-def _turn_video(picture: PhotoSource, folder: Path) -> None:
-    """Encode a video again, upright."""
     frames = upright_frames(picture)
     first = next(frames)
+    if not picture.video:
+        write_bytes(target.with_suffix(".png"), encode_png(first))
+        return
     height, width = first.shape[:2]
     with VideoFootage(folder, width, height, video_fps(picture.path), TURNED_CRF) as video:
         for image in chain([first], frames):
             video.write(image)
 
 
-def _cues(frames: int, windows: int) -> str:
-    """Format cues.csv: `photo`, or `clip_00` and so on."""
-    rows = ["expression_id,start_frame,end_frame"]
-    if frames == 1:
-        return "\n".join([*rows, "photo,0,0"]) + "\n"
-    edges = np.unique(np.linspace(0, frames, min(windows, frames) + 1).round().astype(int))
-    pairs = zip(edges[:-1], edges[1:], strict=True)
-    rows += [f"clip_{n:02d},{a},{b - 1}" for n, (a, b) in enumerate(pairs)]
-    return "\n".join(rows) + "\n"
+def single_camera(camera_id: str, width: int, height: int, focal: float) -> Camera:
+    """Returns a pinhole camera at the world's origin with the principal point in the middle."""
+    K = np.array([[focal, 0.0, 0.5 * width], [0.0, focal, 0.5 * height], [0.0, 0.0, 1.0]])
+    return pinhole_camera(camera_id, K, width, height, CAM_FROM_WORLD)
 
 
-def _meta(subject: str, fps: float, focal: Focal, sha256: str) -> str:
-    """Format capture.toml."""
-    return (
-        f'subject = "{subject}"\nfps = {fps:.6g}\n'
-        f'focal_px = {focal.pixels:.3f}\nfocal_source = "{focal.source}"\n'
-        f"focal_range_px = [{focal.low:.1f}, {focal.high:.1f}]\n"
-        f'picture_sha256 = "{sha256}"\n'
-    )
+def weigh_focal(
+    basis: Basis, detections: list[Detection], size: tuple[int, int], start: tuple[float, str]
+) -> Focal:
+    """Moves a guessed focal length to where the fit is best, if the fit constrains it.
+
+    A known focal length (`given`, `exif`) is kept; the range is measured all the same. The
+    detections are of one person in one camera; `start` is a focal length, pixels, and its source.
+
+    Raises:
+        StageError: no focal length of the ladder explains the landmarks.
+    """
+    focals = start[0] * LADDER
+    costs = np.array([_cost(basis, detections, size, focal) for focal in focals])
+    if not np.isfinite(costs).any():
+        raise StageError("no pose of a head explains the landmarks; the face may be hidden")
+    evidence = INDEPENDENT * costs / len(detections)
+    as_good = focals[evidence <= evidence.min() + AS_GOOD]
+    low, high = float(as_good.min()), float(as_good.max())
+    if start[1] != "guess" or high / low > CONSTRAINED_FACTOR**2:
+        return Focal(*start, low, high)
+    x = np.log(LADDER)
+    y = evidence + 0.5 * (x / math.log(GUESS_FACTOR)) ** 2
+    best, shift = int(np.argmin(y)), 0.0
+    if 0 < best < len(x) - 1 and np.isfinite(y[best - 1 : best + 2]).all():
+        # The parabola through the lowest sample and its neighbours.
+        bend = float(y[best - 1] - 2 * y[best] + y[best + 1])
+        shift = 0.5 * (y[best - 1] - y[best + 1]) / max(bend, 1e-12) * (x[1] - x[0])
+    return Focal(start[0] * math.exp(x[best] + shift), "fit", low, high)
+
+
+def _cost(basis: Basis, detections: list[Detection], size: tuple[int, int], focal: float) -> float:
+    """Computes the cost of the landmark fit with a focal length; infinite where no fit starts."""
+    camera = single_camera("photo", *size, focal)
+    template = landmarks(basis.model, basis.model.template[None])[0].numpy()
+    targets, poses = [], []
+    for number, seen in enumerate(detections):
+        view = LandmarkView(camera.id, camera, seen.points, seen.sigma, seen.score)
+        observation, _ = agree(f"frame {number}", number, [view])
+        try:
+            poses.append(initial_pose(observation, template))
+        except StageError:
+            return math.inf
+        targets.append(Target(observation, landmark_sigma(observation), False))
+    return fit(basis, targets, start_state(basis, poses), LANDMARK_STEPS)[1]

@@ -13,8 +13,8 @@ import torch
 from express50.capture.frames import read_cameras_of, read_peak_frame
 from express50.cli.stages import add_config_options, config_of
 from express50.console import FAILED, OK, say, say_json, stdout_to_stderr
-from express50.contract.extensions import stages
 from express50.contract.layout import Dataset
+from express50.contract.stage import stages
 from express50.errors import ConfigError
 from express50.files.images import write_image
 from express50.files.text import ID
@@ -25,14 +25,12 @@ from express50.runner.executor import Pool
 from express50.runner.runner import Summary, run_stage
 from express50.runner.threads import cap_threads
 from pipelines import ingest
-from pipelines.photo.capture import make_photo_capture, open_picture, subject_id
-from pipelines.photo.focal import Focal
+from pipelines.photo.capture import Focal, make_photo_capture, open_picture, subject_id
 from pipelines.track.config import TrackConfig
 from pipelines.track.read_inputs import DETECTOR_PASSES
 from pipelines.track.report import draw_column
 
-STAGES = ("ingest", "calibrate", "observe", "align", "frames", "track")
-MATTE_STAGES = ("matte",)
+STAGES = ("ingest", "calibrate", "observe", "align", "frames", "matte", "track")
 SEARCH = 0.08  # people fill a rig's pictures, but not all photographs
 PHOTO_SETTINGS = (
     "observe.min_score=0.2", f"track.search={SEARCH}", f"observe.search={SEARCH}",
@@ -43,7 +41,7 @@ WORDS = "track the face of a bare photograph or video, without calibration"
 
 
 def add_commands(subparsers: Any) -> None:
-    """Add the ``photo`` command."""
+    """Adds the ``photo`` command."""
     parser = subparsers.add_parser(
         "photo", help=WORDS, description=WORDS,
         epilog="example: express50 photo portrait.jpg out; see out/track/portrait/qc",
@@ -73,15 +71,21 @@ def add_commands(subparsers: Any) -> None:
 
 
 def run_photo(args: argparse.Namespace) -> int:
-    """Make the capture and run the stages on it."""
-    _check(args)
+    """Makes the capture and runs the stages on it."""
+    if args.subject is not None and not ID.fullmatch(args.subject):
+        raise ConfigError(f"--subject {args.subject!r}: expected letters, digits, '_' and '-'")
+    for name, value in (("--focal-px", args.focal_px), ("--film-mm", args.film_mm)):
+        if value is not None and not 0 < value < float("inf"):
+            raise ConfigError(f"{name} {value}: expected a number above 0")
+    if args.windows < 1:
+        raise ConfigError(f"--windows {args.windows}: expected at least 1")
     picture = open_picture(args.picture)
     clips = ("track.frames=clips",) if picture.video else ()
     args.set = [*PHOTO_SETTINGS, *clips, *args.set]
     cap_threads(1)
     subject = args.subject or subject_id(args.picture)
     dataset = Dataset(args.out)
-    names = [*STAGES[:-1], *(MATTE_STAGES if args.matte else ()), STAGES[-1]]
+    names = [name for name in STAGES if args.matte or name != "matte"]
     with stdout_to_stderr() if args.json else nullcontext():
         loaded = [stages()[name] for name in names]
         configs = [config_of(stage, args) for stage in loaded]
@@ -101,34 +105,18 @@ def run_photo(args: argparse.Namespace) -> int:
         panel = folder / "panel.jpg"
         if summaries[-1].ok:
             write_panel(dataset, subject, configs[-1], panel)
-    return _account(args, dataset, subject, focal, summaries, panel)
-
-
-def _check(args: argparse.Namespace) -> None:
-    """Refuse impossible options."""
-    if args.subject is not None and not ID.fullmatch(args.subject):
-        raise ConfigError(f"--subject {args.subject!r}: expected letters, digits, '_' and '-'")
-    for name, value in (("--focal-px", args.focal_px), ("--film-mm", args.film_mm)):
-        if value is not None and not 0 < value < float("inf"):
-            raise ConfigError(f"{name} {value}: expected a number above 0")
-    if args.windows < 1:
-        raise ConfigError(f"--windows {args.windows}: expected at least 1")
-
-
-def _account(
-    args: argparse.Namespace,
-    dataset: Dataset,
-    subject: str,
-    focal: Focal,
-    summaries: list[Summary],
-    panel: Path,
-) -> int:
-    """Print what was made and how much of it is a guess."""
-    done = all(summary.ok for summary in summaries)
+    done = summaries[-1].ok
     if args.json:
-        lens = dict(vars(focal))
-        say_json({"focal": lens, "stages": [summary.to_json() for summary in summaries]})
-        return OK if done else FAILED
+        say_json({"focal": vars(focal), "stages": [summary.to_json() for summary in summaries]})
+    else:
+        _account(focal, summaries)
+        if done:
+            say(f"track: {dataset.item_dir('track', subject)}", f"picture: {panel}")
+    return OK if done else FAILED
+
+
+def _account(focal: Focal, summaries: list[Summary]) -> None:
+    """Prints what was made and how much of it is a guess."""
     for summary in summaries:
         say(*summary.lines())
     say(
@@ -137,16 +125,10 @@ def _account(
     )
     if not focal.low <= focal.pixels <= focal.high:
         say("warning: the focal length is not among these; check it, or name --focal-px")
-    if done:
-        say(f"track: {dataset.item_dir('track', subject)}", f"picture: {panel}")
-    return OK if done else FAILED
 
 
 def write_panel(dataset: Dataset, subject: str, config: TrackConfig, path: Path) -> None:
-    """Write frame, overlay and turned head side by side, of the first frame that was tracked.
-
-    The turned head shows what the photograph cannot: the depth of the fit.
-    """
+    """Writes the first tracked frame, its overlay and the turned head side by side."""
     with np.load(dataset.track_file(subject)) as track:
         frame, mesh = int(track["frames"][0]), track["vertices"][0].astype(np.float64)
         expression = str(track["expressions"][0])

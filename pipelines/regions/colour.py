@@ -1,10 +1,10 @@
-"""Tell hair, skin and torso apart by colour where geometry alone is not sure.
+"""Separate hair, skin and torso by colour where geometry alone is not sure.
 
-Each view teaches itself: the pixels that geometry is sure of give a histogram of the colours of
-hair, of skin and of the torso; every other pixel takes the class that its colour and its place make
-most likely (log-likelihood plus log-prior). Views from behind, where hair may cover all skin, learn
-half of the skin's colours from views of the face. So a collar in front of the neck is torso, and
-hair over a shoulder or over the forehead is hair, as far as their colours differ.
+The pixels of a view that geometry is sure of give histograms of the colours of hair, skin and
+torso; every other pixel takes the class that its colour and its place make most likely. Views from
+behind, where hair may cover all skin, take half of the skin's colours from views of the face. So a
+collar in front of the neck is torso, and hair over a shoulder or the forehead is hair, as far as
+their colours differ.
 
 The constants were set on the digital twin's four people (docs/LOG.md, Parts).
 """
@@ -105,7 +105,12 @@ def by_colour(
         # As much of each: the back of a neck may be in a shadow that no face is in.
         own, others = (c / np.float32(max(c.sum(), 1.0)) for c in (counts[1], skin_colours))
         counts[1] = SHARED * (own + others)
-    best = (_likelihoods(cells, counts) + _priors(labels, geometry, beyond)).argmax(0)
+    likelihoods = np.full((3, *labels.shape), np.log(UNTAUGHT), np.float32)
+    for row, taught in zip(likelihoods, counts, strict=True):
+        if taught.sum() >= LEAST:
+            shares = gaussian_filter(taught, SMOOTH) / taught.sum()
+            row[:] = np.log(np.maximum(shares, 0) + RARE)[cells]
+    best = (likelihoods + _priors(labels, geometry, beyond)).argmax(0)
     around = (geometry.mesh > 0) | geometry.rim | bare
     kept = np.isin(geometry.near, (SKIN, NECK, EARS)) & around
     skin_label = np.where(kept, geometry.near, SKIN)
@@ -127,16 +132,6 @@ def _counts(cells: Cells, mask: np.ndarray) -> np.ndarray:
     counts = np.zeros(CELLS, np.float32)
     np.add.at(counts, tuple(axis[mask] for axis in cells), 1)
     return counts
-
-
-def _likelihoods(cells: Cells, taught: Sequence[np.ndarray]) -> np.ndarray:
-    """Look up the log-likelihood (3, H, W) of each pixel's colour; untaught classes are flat."""
-    says = np.full((3, *cells[0].shape), np.log(UNTAUGHT), np.float32)
-    for row, counts in zip(says, taught, strict=True):
-        if counts.sum() >= LEAST:
-            shares = gaussian_filter(counts, SMOOTH) / counts.sum()
-            row[:] = np.log(np.maximum(shares, 0) + RARE)[cells]
-    return says
 
 
 def _priors(labels: np.ndarray, geometry: HeadGeometry, beyond: float) -> np.ndarray:

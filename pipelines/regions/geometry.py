@@ -1,4 +1,4 @@
-"""Label the pixels of a view by the tracked head's geometry, and cut the torso from its matte."""
+"""Label the pixels of a view by the tracked head's geometry, and cut the torso off its matte."""
 
 from __future__ import annotations
 
@@ -70,18 +70,12 @@ def head_labels(model: HeadModel) -> HeadLabels:
     end = np.flatnonzero(masks.get("boundary", none))
     missing = [*by_mesh, *(["torso"] if len(end) < 3 else [])]
     named = np.any(list(masks.values()), axis=0) if masks else ~none
-    return HeadLabels(faces[_named_sheets(faces, named)], labels, end, tuple(missing))
-
-
-def _named_sheets(faces: np.ndarray, named: np.ndarray) -> np.ndarray:
-    """Mark the faces (F,) of connected sheets that hold a vertex of a region."""
-    count = len(named)
+    # Connected sheets without a vertex of any region are lash cards.
     edges = np.concatenate([faces[:, :2], faces[:, 1:]])
-    graph = coo_matrix((np.ones(len(edges), np.int8), edges.T), shape=(count, count))
+    graph = coo_matrix((np.ones(len(edges), np.int8), edges.T), shape=(len(none), len(none)))
     _, sheet = connected_components(graph, directed=False)
-    kept = np.zeros(sheet.max() + 1, bool)
-    kept[sheet[named]] = True
-    return kept[sheet[faces[:, 0]]]
+    kept = np.isin(sheet, sheet[named])
+    return HeadLabels(faces[kept[faces[:, 0]]], labels, end, tuple(missing))
 
 
 @dataclass(frozen=True)
@@ -147,10 +141,17 @@ def see(head: TrackedHead, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
     """
     labels = np.zeros((camera.height, camera.width), np.uint8)
     depth = np.zeros(labels.shape, np.float32)
-    x0, y0, x1, y1 = _window(head.vertices, camera)
-    if x1 <= x0 or y1 <= y0:
+    pixels, ahead = project(camera, head.vertices)
+    if not (ahead > 0).any():
         return labels, depth
-    origin, directions = rays(crop_camera(camera, x0, y0, x1 - x0, y1 - y0))
+    size = np.array([camera.width, camera.height])
+    low, high = np.zeros(2, int), size  # of the window outside of which no ray meets the head
+    if (ahead > 0).all():
+        ends = np.clip([np.floor(pixels.min(0)), np.ceil(pixels.max(0))], 0, size)
+        low, high = ends.astype(int)
+        if (high <= low).any():
+            return labels, depth
+    origin, directions = rays(crop_camera(camera, *low.tolist(), *(high - low).tolist()))
     row = np.concatenate(
         [np.broadcast_to(origin - head.center, directions.shape), directions], axis=-1
     )
@@ -163,22 +164,10 @@ def see(head: TrackedHead, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
     found = head.labels.vertices[vertex]
     away = (hits["primitive_normals"].numpy()[hit] * directions[hit]).sum(1) > 0
     found = np.where(away & np.isin(found, _OUTER), np.uint8(0), found)
-    window = np.s_[y0:y1, x0:x1]
+    window = np.s_[low[1] : high[1], low[0] : high[0]]
     labels[window][hit] = found
     depth[window][hit] = np.where(found > 0, distance[hit], 0)
     return labels, depth
-
-
-def _window(vertices: np.ndarray, camera: Camera) -> tuple[int, int, int, int]:
-    """Find the window x0, y0, x1, y1 of the image outside of which no ray meets the vertices."""
-    pixels, depth = project(camera, vertices)
-    size = np.array([camera.width, camera.height])
-    if not (depth > 0).any():
-        return 0, 0, 0, 0
-    if not (depth > 0).all():
-        return 0, 0, camera.width, camera.height
-    low, high = np.clip([np.floor(pixels.min(0)), np.ceil(pixels.max(0))], 0, size).astype(int)
-    return int(low[0]), int(low[1]), int(high[0]), int(high[1])
 
 
 @dataclass(frozen=True)

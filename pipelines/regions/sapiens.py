@@ -13,7 +13,8 @@ import cv2
 import numpy as np
 
 from express50.contract.segmentation_labels import LABELS, label_mask
-from pipelines.networks import Network, Role, check_file, load_network, resized
+from express50.files.images import resize_area
+from pipelines.networks import Network, Role, check_file, load_network
 
 SAPIENS = Role(setting="regions.segmentation", inputs=("image",))
 HEIGHT, WIDTH = 1024, 768
@@ -61,7 +62,7 @@ def segment(network: Network, frame: np.ndarray) -> np.ndarray:
     labels = np.zeros(frame.shape[:2], np.uint8)
     # Class by class: 28 scores per pixel of a 4K frame would take a gigabyte.
     for part, score in zip(LABEL_OF_CLASS, scores, strict=True):
-        large = resized(score, *frame.shape[:2])
+        large = resize_area(score, frame.shape[1], frame.shape[0])
         wins = large > best
         best[wins] = large[wins]
         labels[wins] = part

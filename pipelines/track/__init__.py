@@ -19,7 +19,8 @@ def items(dataset: Dataset) -> list[str]:
 
 def inputs(dataset: Dataset, item: str, config: TrackConfig) -> dict[str, Path | str]:
     """Name index, cameras, peaks, mattes, network weights and the head model's file."""
-    from express50.capture.frames import frame_inputs, read_peaks
+    from express50.capture.frames import frame_inputs
+    from express50.capture.index import read_peaks
     from express50.landmarks.sources import source_files
 
     found: dict[str, Path | str] = {

@@ -19,18 +19,20 @@ from express50.files.images import linear_to_srgb, write_image
 from express50.geometry.cameras import Camera
 from express50.geometry.conventions import cell_to_corner
 from express50.geometry.raycast import visible_faces
-from express50.geometry.spherical_harmonics import sh_polynomials
+from express50.geometry.sampling import sh_polynomials
 from express50.head.model import HeadModel, vertex_normals
-from pipelines.track.crops import FrameSetCrops, look_up, root_light
 from pipelines.track.state import Target
 from pipelines.track.surface import (
-    Samples,
+    FrameSetCrops,
     Visibility,
     flat_barycentrics,
+    root_light,
     sample_normals,
     spread,
+    view_colours,
     view_weights,
 )
+from pipelines.track.terms import MeshPlaces
 
 LIGHT_FLOOR = 0.05
 RIDGE = 0.02
@@ -53,13 +55,9 @@ EVEN_LIGHT = np.repeat(np.eye(9)[:, :1], 3, axis=1)
 
 @dataclass(frozen=True)
 class SampleColours:
-    """The colours that C cameras show at S samples of one frame set.
+    """The colours (C, S, 3), root of linear light, that C cameras show at S samples of a frame set.
 
-    Attributes:
-        cameras: C camera ids.
-        values: (C, S, 3) root of linear light.
-        weights: (C, S) trust, 0 where a sample is not seen.
-        normals: (S, 3) world.
+    Weights (C, S) are 0 where a sample is not seen; normals (S, 3) are of the world.
     """
 
     cameras: tuple[str, ...]
@@ -153,14 +151,14 @@ def _with_albedo(appearance: Appearance, frame_sets: list[SampleColours]) -> App
             mass = mass + weight[:, None] * shade**2
             total = total + weight[:, None] * shade * value
     albedo = np.where(mass > 1e-6, total / np.maximum(mass, 1e-6), np.nan)
-    return Appearance(appearance.light, appearance.gains, albedo)
+    return replace(appearance, albedo=albedo)
 
 
 def _with_gains(appearance: Appearance, frame_sets: list[SampleColours]) -> Appearance:
     """Solve root gains by least squares with a geometric mean of one: the rest is albedo."""
     over: dict[str, np.ndarray] = {name: np.zeros(3) for name in appearance.gains}
     under: dict[str, np.ndarray] = {name: np.zeros(3) for name in appearance.gains}
-    plain = Appearance(appearance.light, {}, appearance.albedo)
+    plain = replace(appearance, gains={})
     for seen in frame_sets:
         expected = np.nan_to_num(plain.shade("", seen.normals) * appearance.albedo)
         for camera_id, value, weight in zip(seen.cameras, seen.values, seen.weights, strict=True):
@@ -170,9 +168,7 @@ def _with_gains(appearance: Appearance, frame_sets: list[SampleColours]) -> Appe
     if not gains:
         return appearance
     mean = np.exp(np.mean([np.log(gain) for gain in gains.values()], axis=0))
-    return Appearance(
-        appearance.light, {n: gain / mean for n, gain in gains.items()}, appearance.albedo
-    )
+    return replace(appearance, gains={n: gain / mean for n, gain in gains.items()})
 
 
 def _with_light(appearance: Appearance, frame_sets: list[SampleColours]) -> Appearance:
@@ -191,7 +187,7 @@ def _with_light(appearance: Appearance, frame_sets: list[SampleColours]) -> Appe
     light = _ridge_fit(
         np.concatenate(basis), np.concatenate(target), np.concatenate(weights), appearance.light
     )
-    return Appearance(light, appearance.gains, appearance.albedo)
+    return replace(appearance, light=light)
 
 
 def robust_mean(
@@ -219,18 +215,11 @@ def write_texture(
     samples: int,
     side: int,
 ) -> bool:
-    """Estimate light and gains, bake albedo.png and write it with appearance.npz.
+    """Estimate light and gains, bake albedo.png and write it with appearance.npz into `out`.
 
-    Nothing is written if no picture shows any of the head; the result says whether one did.
-
-    Args:
-        out: folder.
-        model: the head.
-        targets: E expressions.
-        meshes: (E, V, 3) world.
-        pictures: of the E frame sets.
-        samples: places on the skin at which light and gains are estimated.
-        side: texels per side.
+    Nothing is written if no picture shows any of the head; the result says whether one did. Meshes
+    (E, V, 3) are of the E targets; light and gains are estimated at so many `samples` of the skin;
+    the texture has `side` texels per side.
     """
     skin = spread(model, samples)
     some = range(0, len(pictures), -(-len(pictures) // LIGHT_FRAME_SETS))
@@ -261,14 +250,9 @@ def bake_albedo(
     appearance: Appearance,
     side: int,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Bake the head's colours freed of light and gains.
+    """Bake the head's colours freed of light and gains, from frame sets with meshes (E, V, 3).
 
-    Args:
-        model: the head.
-        meshes: (E, V, 3) world.
-        pictures: of the E frame sets; the first (best the neutral one) counts most.
-        appearance: light and gains.
-        side: texels per side.
+    The first frame set, best the neutral one, counts most.
 
     Returns:
         (side, side, 3) uint8 sRGB, first row at v = 1, continued over what was not seen; and
@@ -278,15 +262,21 @@ def bake_albedo(
     scenes = [_scene(model, *pair) for pair in zip(pictures, meshes, strict=True)]
     known = np.zeros((side, side), dtype=bool)
     root = np.zeros((side, side, 3))
-    for start in range(0, len(texels.faces), CHUNK):
+    for start in range(0, len(texels.weights), CHUNK):
         some = slice(start, start + CHUNK)
         part = texels.some(some)
         seen = [_colours(scene, part) for scene in scenes]
-        colour, mass = _agreed(seen, appearance)
+        values = [value for one in seen for value in one.values]
+        if not values:
+            continue
+        shade = [appearance.shade(name, one.normals) for one in seen for name in one.cameras]
+        weight = np.concatenate([one.weights**2 for one in seen])
         row, column = texture[some].T
-        root[row, column], known[row, column] = colour, mass > LEAST_WEIGHT
-    light = np.where(known[..., None], root**2, 0.0)
-    srgb = linear_to_srgb(np.clip(_filled(light, known), 0.0, 1.0))
+        known[row, column] = weight.sum(0) > LEAST_WEIGHT
+        weight[: len(seen[0].cameras)] *= FIRST_WEIGHT
+        root[row, column] = robust_mean(np.stack(values), np.stack(shade), weight, SPREAD)
+    mass = known.astype(np.float64)[..., None]
+    srgb = linear_to_srgb(np.clip(_filled(root**2 * mass, mass), 0.0, 1.0))
     return np.rint(255.0 * srgb).astype(np.uint8), known
 
 
@@ -313,7 +303,7 @@ def write_appearance(
     )
 
 
-def texel_samples(model: HeadModel, side: int) -> tuple[Samples, np.ndarray]:
+def texel_samples(model: HeadModel, side: int) -> tuple[MeshPlaces, np.ndarray]:
     """Find the places on the mesh of the texture's texels, and their rows and columns (S, 2)."""
     uv, uv_faces = model.uv.double().numpy(), model.uv_faces.numpy()
     # The map a metre before a camera whose focal length is its side: a metre is the map's width.
@@ -324,7 +314,7 @@ def texel_samples(model: HeadModel, side: int) -> tuple[Samples, np.ndarray]:
     faces = face_id[tuple(texture.T)]
     at = cell_to_corner(texture[:, ::-1]) / side
     bary = flat_barycentrics(flat[uv_faces[faces], :2], at)
-    return Samples(faces, model.faces.numpy()[faces], bary), texture
+    return MeshPlaces(model.faces.numpy()[faces], bary), texture
 
 
 @dataclass(frozen=True)
@@ -344,48 +334,23 @@ def _scene(model: HeadModel, pictures: FrameSetCrops, mesh: np.ndarray) -> _Scen
     return _Scene(mesh, normals, pictures, images, Visibility(mesh, model.faces.numpy()))
 
 
-def _colours(scene: _Scene, samples: Samples) -> SampleColours:
+def _colours(scene: _Scene, samples: MeshPlaces) -> SampleColours:
     """Look samples up in every picture: facets decide visibility, light falls on smooth normals."""
     places, facets = samples.at(scene.mesh), sample_normals(samples, scene.mesh)
     weights = view_weights(scene.visibility, scene.pictures, places, facets)
-    values = np.zeros((*weights.shape, 3))
-    for row, (image, camera) in enumerate(scene.images):
-        chosen = np.flatnonzero(weights[row])
-        values[row, chosen] = look_up(camera, image, places[chosen])
+    values = view_colours(scene.images, weights, places)
     normals = samples.at(scene.normals)
     length = np.linalg.norm(normals, axis=1, keepdims=True)
     normals = np.where(length > 1e-9, normals / np.maximum(length, 1e-9), facets)
-    names = tuple(crop.camera_id for crop in scene.pictures.crops)
+    names = tuple(crop.camera.id for crop in scene.pictures.crops)
     return SampleColours(names, values, weights, normals)
 
 
-def _agreed(
-    frame_sets: list[SampleColours], appearance: Appearance
-) -> tuple[np.ndarray, np.ndarray]:
-    """Find root albedo (S, 3) that most views agree on, and how well it was seen (S,)."""
-    count = len(frame_sets[0].normals)
-    shade = [appearance.shade(name, one.normals) for one in frame_sets for name in one.cameras]
-    values = [value for one in frame_sets for value in one.values]
-    if not values:
-        return np.zeros((count, 3)), np.zeros(count)
-    mass = np.concatenate([one.weights**2 for one in frame_sets])
-    weight = mass.copy()
-    weight[: len(frame_sets[0].cameras)] *= FIRST_WEIGHT
-    return robust_mean(np.stack(values), np.stack(shade), weight, SPREAD), mass.sum(0)
+def _filled(total: np.ndarray, mass: np.ndarray) -> np.ndarray:
+    """Fill pixels of no mass (H, W, 1) from their surroundings by a pyramid of means (H, W, 3).
 
-
-def _filled(image: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """Fill unknown pixels of an image (H, W, 3) from their surroundings by a pyramid of means.
-
-    Known pixels stay. Gortler et al. 1996 ("The Lumigraph") fill holes like this.
+    Pixels of mass 1 stay. Gortler et al. 1996 ("The Lumigraph") fill holes like this.
     """
-    mass = known.astype(np.float64)[..., None]
-    if not mass.any():
-        return np.full_like(image, 0.5)
-    return _pulled(image * mass, mass)
-
-
-def _pulled(total: np.ndarray, mass: np.ndarray) -> np.ndarray:
     height, width = mass.shape[:2]
     if mass.all() or min(height, width) == 1:
         return total / np.maximum(mass, 1e-12)
@@ -394,6 +359,6 @@ def _pulled(total: np.ndarray, mass: np.ndarray) -> np.ndarray:
     few = few.reshape(*few.shape[:2], 1)
     share = np.minimum(4.0 * few, 1.0) / np.maximum(few, 1e-12)
     coarse = cv2.resize(
-        _pulled(less * share, few * share), (width, height), interpolation=cv2.INTER_LINEAR
+        _filled(less * share, few * share), (width, height), interpolation=cv2.INTER_LINEAR
     )
     return total + (1.0 - mass) * coarse

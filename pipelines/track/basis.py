@@ -111,7 +111,6 @@ class Points:
             _joint_rotations(pose)[None],
             self.skinning,
             self.pose_dirs,
-            self.basis.model.parents,
         )[0]
         return posed @ (axis_angle_to_matrix(pose[12:15]) @ rotation).T + pose[15:]
 
@@ -137,23 +136,15 @@ class Points:
             return points, points
 
         by_pose, points = torch.func.jacfwd(both, has_aux=True)(pose)
-        by_coefficient = self._linear_columns(pose, rotation_t)
-        return points.numpy(), torch.cat([by_coefficient, by_pose], dim=2).numpy()
-
-    def _transforms(
-        self, pose: torch.Tensor, joints: torch.Tensor
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        rotations = _joint_rotations(pose)[None].expand(len(joints), -1, -1, -1)
-        return joint_transforms(joints, rotations, self.basis.model.parents)
-
-    def _linear_columns(self, pose: torch.Tensor, rotation: torch.Tensor) -> torch.Tensor:
-        """Return the Jacobian (M, 3, S + X) by the coefficients."""
-        turn, shift = self._transforms(pose, self.basis.joint_directions.permute(2, 0, 1))
-        world = axis_angle_to_matrix(pose[12:15]) @ rotation
+        moving = self.basis.joint_directions.permute(2, 0, 1)
+        turns = _joint_rotations(pose)[None].expand(len(moving), -1, -1, -1)
+        turn, shift = joint_transforms(moving, turns)
+        world = axis_angle_to_matrix(pose[12:15]) @ rotation_t
         blended = torch.einsum("nj,jrc->nrc", self.skinning, world @ turn[0])
         moved = (shift @ world.T).permute(1, 2, 0).flatten(1)
         columns = torch.addmm((blended @ self.directions).flatten(1), self.skinning, moved)
-        return columns.view(self.directions.shape)
+        by_coefficient = columns.view(self.directions.shape)
+        return points.numpy(), torch.cat([by_coefficient, by_pose], dim=2).numpy()
 
 
 def _joint_rotations(pose: torch.Tensor) -> torch.Tensor:
@@ -162,20 +153,22 @@ def _joint_rotations(pose: torch.Tensor) -> torch.Tensor:
     return axis_angle_to_matrix(angles)
 
 
+def in_regions(model: HeadModel, names: tuple[str, ...]) -> np.ndarray:
+    """Mark the vertices (V,) in any of the named regions that a model has."""
+    masks = [model.regions[name].numpy() for name in names if name in model.regions]
+    return np.any([np.zeros(len(model.template), dtype=bool), *masks], axis=0)
+
+
 def movable_vertices(model: HeadModel) -> np.ndarray:
     """Mark the vertices (V,) that may leave the model's shapes: skin, not eyes, teeth and mouth."""
-    rigid = [model.regions[name].numpy() for name in RIGID if name in model.regions]
-    return ~np.any([np.zeros(len(model.template), dtype=bool), *rigid], axis=0)
+    return ~in_regions(model, RIGID)
 
 
 def with_modes(model: HeadModel, count: int, along: int = 0) -> HeadModel:
     """Add the field's modes to the head's shape directions, weighted by standard deviations.
 
-    Args:
-        model: any head.
-        count: number of modes along the normals.
-        along: number of modes by which the skin slides along itself, each for three axes. Skin is
-            located less finely along itself than in depth, so these are the broadest modes.
+    There are `count` modes along the normals, and `along` by which the skin slides along itself,
+    each for three axes. Skin is located less finely along itself: these are the broadest modes.
     """
     if count == 0 and along == 0:
         return model
@@ -238,21 +231,15 @@ def cotangent_laplacian(
     harm and the matrix is positive semi-definite.
     """
     count = len(vertices)
-    rows: list[np.ndarray] = []
-    columns: list[np.ndarray] = []
     values: list[np.ndarray] = []
     mass = np.full(count, 1e-12)
     for k in range(3):
         i, j, o = faces[:, k], faces[:, (k + 1) % 3], faces[:, (k + 2) % 3]
         u, v = vertices[i] - vertices[o], vertices[j] - vertices[o]
         area = np.linalg.norm(np.cross(u, v), axis=1)
-        rows.append(i)
-        columns.append(j)
         values.append(0.5 * (u * v).sum(1) / np.maximum(area, 1e-14))
         np.add.at(mass, i, area / 6.0)
-    shape = (count, count)
-    half = sparse.csr_matrix(
-        (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))), shape=shape
-    )
+    edges = (faces.T.ravel(), faces[:, [1, 2, 0]].T.ravel())
+    half = sparse.csr_matrix((np.concatenate(values), edges), shape=(count, count))
     weights = (half + half.T).maximum(0.0).minimum(20.0)
     return sparse.diags(np.asarray(weights.sum(1)).ravel()) - weights, mass

@@ -25,11 +25,10 @@ import numpy as np
 import open3d as o3d
 import torch
 
-from express50.geometry.cameras import Camera
-from express50.geometry.pinhole import project_with_slope
+from express50.geometry.cameras import Camera, project_with_slope
 from express50.geometry.raycast import mesh_scene
 from express50.head.model import HeadModel, vertex_normals
-from express50.landmarks.iris import EYES
+from express50.landmarks.eyes_and_lips import EYES
 from pipelines.track.observe import LandmarkView, Observation, agree
 from pipelines.track.state import Target
 from pipelines.track.terms import LidTerm, MeshPlaces, PixelTerm, Sighting, landmark_anchors
@@ -59,11 +58,9 @@ CLEAR_M = 0.004  # visibility is tested this far off the skin: the rim hides its
 
 @dataclass(frozen=True)
 class EyeOffsets:
-    """Offsets between a subject's irises and the model's.
+    """Offsets (2, 3) of a subject's irises from two vertices in their middle, left and right.
 
-    Attributes:
-        vertices: in the middle of the left and right iris.
-        offsets: (2, 3) head space, metres, the median over the expressions.
+    They are in head space, metres, the median over the expressions.
     """
 
     vertices: tuple[int, int]
@@ -73,46 +70,31 @@ class EyeOffsets:
 def measure_eyes(
     model: HeadModel, targets: list[Target], meshes: np.ndarray, rotations: np.ndarray
 ) -> EyeOffsets | None:
-    """Measure where irises are seen against a fit without them; shrunk with few expressions.
+    """Measure where irises are seen against a fit without them; None if the model has no irises.
 
-    Args:
-        model: the head model.
-        targets: E expressions.
-        meshes: (E, V, 3) of the fit, world.
-        rotations: (E, 3, 3) world from head.
-
-    Returns:
-        None where the model names no irises.
+    Meshes (E, V, 3) and rotations (E, 3, 3), world from head, are those of the E targets' fit.
+    Offsets are shrunk where few expressions show an iris.
     """
     vertices = iris_vertices(model)
     if vertices is None:
         return None
     offsets = np.zeros((2, 3))
     for side, vertex in enumerate(vertices):
-        found = [
-            rotation.T @ offset
-            for target, mesh, rotation in zip(targets, meshes, rotations, strict=True)
-            if (offset := _offset(model, target, mesh, side, vertex)) is not None
-        ]
+        found = []
+        for target, mesh, rotation in zip(targets, meshes, rotations, strict=True):
+            normal, right = np.eye(3) / OFFSET_M**2, np.zeros(3)
+            views = _seeing(model, target, mesh, side, vertex)
+            for view, centre, sigma in views:
+                pixel, slope = project_with_slope(view.camera, mesh[vertex][None])
+                weighted = slope[0] / sigma**2
+                normal += weighted.T @ slope[0]
+                right += weighted.T @ (centre - pixel[0])
+            if views:
+                found.append(rotation.T @ np.linalg.solve(normal, right))
         if found:
             share = len(found) / (len(found) + GUESSED_EXPRESSIONS)
             offsets[side] = share * np.median(found, axis=0)
     return EyeOffsets(vertices, offsets)
-
-
-def _offset(
-    model: HeadModel, target: Target, mesh: np.ndarray, side: int, vertex: int
-) -> np.ndarray | None:
-    """Return the world offset (3,) that brings one iris vertex to where the views see it."""
-    normal, count = np.eye(3) / OFFSET_M**2, 0
-    right = np.zeros(3)
-    for view, centre, sigma in _seeing(model, target, mesh, side, vertex):
-        pixel, slope = project_with_slope(view.camera, mesh[vertex][None])
-        weighted = slope[0] / sigma**2
-        normal += weighted.T @ slope[0]
-        right += weighted.T @ (centre - pixel[0])
-        count += 1
-    return np.linalg.solve(normal, right) if count else None
 
 
 def _seeing(
@@ -153,14 +135,9 @@ def with_irises_and_jaw(
     rotation: np.ndarray,
     eyes: EyeOffsets | None,
 ) -> Target:
-    """Add irises to a target and move the jaw line to where the current mesh shows it.
+    """Add irises to a target and move its jaw line to where the current mesh (V, 3) shows it.
 
-    Args:
-        model: the head model.
-        target: evidence of one expression, without irises.
-        mesh: (V, 3) of the current fit, world.
-        rotation: (3, 3) world from head.
-        eyes: from `measure_eyes`.
+    `rotation` (3, 3) is world from head; `eyes` are from `measure_eyes`.
     """
     sigma, terms = target.sigma.copy(), list(target.terms)
     if eyes is not None:
@@ -205,7 +182,7 @@ def _jaw_term(
     taken = np.flatnonzero(np.isfinite(sigma[:JAW]) & line.moved & line.usable)
     sigma[:JAW][line.moved | ~line.usable] = np.inf
     seen = Sighting(view.camera, np.arange(len(taken)), view.points[taken], spread[taken])
-    return PixelTerm(MeshPlaces.of_vertices(line.corners[taken, 0]), (seen,))
+    return PixelTerm(MeshPlaces.of_vertices(line.places.vertices[taken, 0]), (seen,))
 
 
 def lid_terms(model: HeadModel, observation: Observation) -> tuple[LidTerm, ...]:
@@ -224,10 +201,7 @@ def shut_lids(
 ) -> list[Observation]:
     """Find shut eyes in one person's observations and move their upper lids to the lower ones.
 
-    Args:
-        observations: frame sets to examine.
-        others: frame sets to compare each with, in most of which eyes are open; by default the
-            other observations.
+    Each is compared with `others`, in most of which eyes are open; by default with the rest.
     """
     shut = np.zeros((len(observations), 2), dtype=bool)
     for side in range(2):
@@ -289,29 +263,20 @@ class JawLine:
     """The jaw line in one view.
 
     Attributes:
-        corners: (17, 3) vertex ids.
-        bary: (17, 3) their weights.
+        places: 17 points.
         moved: (17,) bool, points that left the embedding for the rim.
         usable: (17,) bool, points that the camera sees.
     """
 
-    corners: np.ndarray
-    bary: np.ndarray
+    places: MeshPlaces
     moved: np.ndarray
     usable: np.ndarray
 
-    def positions(self, vertices: np.ndarray) -> np.ndarray:
-        """Place the points (17, 3) on a mesh (V, 3)."""
-        return (vertices[self.corners] * self.bary[..., None]).sum(1)
-
 
 def contour_points(model: HeadModel, vertices: np.ndarray, camera: Camera) -> JawLine:
-    """Choose the 17 points of the jaw line that a camera sees.
+    """Choose the 17 points of the jaw line that a pinhole camera sees on a mesh (V, 3), world.
 
-    Args:
-        model: the head model; without `contour` candidates every point keeps its place.
-        vertices: (V, 3) of the current mesh, world.
-        camera: pinhole.
+    Without `contour` candidates in the model every point keeps its place.
     """
     faces = model.faces.numpy()
     corners = faces[model.landmark_faces[:JAW].numpy()].copy()
@@ -337,4 +302,4 @@ def contour_points(model: HeadModel, vertices: np.ndarray, camera: Camera) -> Ja
     hits = mesh_scene(vertices, faces).cast_rays(o3d.core.Tensor(rays.astype(np.float32)))
     # Directions are not unit vectors: the ray's parameter is 1 at the point.
     seen = hits["t_hit"].numpy() > 0.999
-    return JawLine(corners, bary, moved, seen)
+    return JawLine(MeshPlaces(corners, bary), moved, seen)

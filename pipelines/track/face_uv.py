@@ -4,35 +4,46 @@ Patches say how far the skin lies before or behind the mesh, not that a corner o
 millimetre too far out. So the pictures are projected onto the current mesh, unwrapped to the face
 UV map, and landmarks are found there again: if a corner of the mouth appears beside its texel, the
 mesh moves by that much.
+
+The map is a cylinder about the head, unrolled and warped until the 68 landmarks of any head model
+lie where those of every other do, so one network reads the maps of all of them. On it every face is
+upright, turned to the reader and of one size, and only the mesh's error is left to find. The
+landmark network, trained on from its weights for whole heads, sees the middle of the map at twice
+the resolution it has of a head. The jaw line is not among its landmarks: the map does not end
+there.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
+import cv2
 import numpy as np
 import torch
+from scipy.interpolate import RBFInterpolator
 
-from express50.geometry.conventions import corner_to_cell
+from express50.errors import HeadModelError
+from express50.geometry.cameras import Camera
+from express50.geometry.conventions import cell_to_corner, corner_to_cell
+from express50.geometry.raycast import visible_faces
 from express50.geometry.sampling import bilinear
-from express50.head.model import HeadModel, vertex_normals
-from express50.landmarks.network import LandmarkNet, load_network
+from express50.head.model import HeadModel, landmarks, vertex_normals
+from express50.landmarks.network import CROP, MIRROR, LandmarkNet, load_network
 from pipelines.track.appearance import robust_mean
+from pipelines.track.basis import movable_vertices
 from pipelines.track.config import UV_WEIGHTS
-from pipelines.track.crops import FrameSetCrops, look_up, root_light
-from pipelines.track.face_uv_map import (
-    FIRST,
-    HEIGHT,
-    LIPS_APART,
-    WIDTH,
-    FaceUvMap,
-    mark_places,
-    read_marks,
-)
 from pipelines.track.state import Target
-from pipelines.track.surface import Visibility, sample_normals, view_weights
-from pipelines.track.terms import SlideTerm, landmark_anchors
+from pipelines.track.surface import (
+    FrameSetCrops,
+    Visibility,
+    flat_barycentrics,
+    root_light,
+    sample_normals,
+    view_colours,
+    view_weights,
+)
+from pipelines.track.terms import MeshPlaces, SlideTerm, landmark_anchors
 
 REDUNDANCY = 2.0  # neighbouring landmarks err together: so many count as one
 FLOOR_M = 0.0004
@@ -42,6 +53,42 @@ LEAST_SEEN, LEAST_VIEWS = 0.1, 2
 # shows get so many times their standard deviation. The others, as corners of open mouths, stay.
 DISTRUST = 6.0
 TORN_M = 0.004  # texels further apart than this lie on two sides of a gap, as between open lips
+
+# Texels, and how much of the head they cover: about 1.3 mm each on the cheeks.
+WIDTH, HEIGHT = 192, 160
+RIGHT, TOP = 1.35, 1.2
+# Beyond this azimuth a face may straddle the seam at the back.
+BACK = 2.6
+# What lies further behind what a texel shows is another sheet of skin; outer eye corners' widths.
+SHEET = 0.04
+# Where the landmarks' azimuths (radians) and heights (in widths between the outer eye corners) are
+# put: those of the procedural head, so that it needs no warp.
+MARKS = np.array(
+    [
+        (-1.571, 0.290), (-1.561, 0.079), (-1.552, -0.125), (-1.455, -0.356), (-1.215, -0.547),
+        (-0.874, -0.691), (-0.515, -0.800), (-0.214, -0.872), (0.000, -0.880), (0.214, -0.872),
+        (0.515, -0.800), (0.874, -0.691), (1.215, -0.547), (1.455, -0.356), (1.552, -0.125),
+        (1.561, 0.079), (1.571, 0.290), (-0.657, 0.519), (-0.497, 0.590), (-0.351, 0.611),
+        (-0.219, 0.595), (-0.100, 0.536), (0.100, 0.536), (0.219, 0.595), (0.351, 0.611),
+        (0.497, 0.590), (0.657, 0.519), (0.000, 0.404), (0.000, 0.284), (0.000, 0.153),
+        (0.000, 0.000), (-0.137, -0.128), (-0.076, -0.160), (0.000, -0.169), (0.076, -0.160),
+        (0.137, -0.128), (-0.605, 0.367), (-0.483, 0.401), (-0.328, 0.396), (-0.234, 0.341),
+        (-0.335, 0.309), (-0.484, 0.314), (0.234, 0.341), (0.328, 0.396), (0.483, 0.401),
+        (0.605, 0.367), (0.484, 0.314), (0.335, 0.309), (-0.323, -0.396), (-0.175, -0.340),
+        (-0.053, -0.301), (0.000, -0.313), (0.053, -0.301), (0.175, -0.340), (0.323, -0.396),
+        (0.177, -0.466), (0.056, -0.501), (0.000, -0.508), (-0.056, -0.501), (-0.177, -0.466),
+        (-0.312, -0.396), (-0.156, -0.389), (0.000, -0.398), (0.156, -0.389), (0.312, -0.396),
+        (0.156, -0.390), (0.000, -0.399), (-0.156, -0.390),
+    ]
+)  # fmt: skip
+
+# The rims of closed lips touch: a texel to either side shows which lip a landmark moves with.
+LIPS_APART = np.zeros((68, 2))
+LIPS_APART[[61, 62, 63], 1], LIPS_APART[[65, 66, 67], 1] = -1.2, 1.2
+# First landmark that is read; first column and row of the part of the map that is read; its side.
+FIRST = 17
+LEFT, UPPER, SIDE = 36, 34, 120
+TEXELS_PER_PIXEL = SIDE / CROP
 
 
 def with_slide(target: Target, slide: SlideTerm | None) -> Target:
@@ -56,14 +103,7 @@ def with_slide(target: Target, slide: SlideTerm | None) -> Target:
 def slide_term(
     model: HeadModel, uv_map: FaceUvMap, pictures: FrameSetCrops, mesh: np.ndarray
 ) -> SlideTerm | None:
-    """Find where one frame set's skin belongs; None if too little is seen.
-
-    Args:
-        model: the head.
-        uv_map: of its face.
-        pictures: of the frame set.
-        mesh: (V, 3) of the fit so far, world.
-    """
+    """Find where a frame set's skin belongs, about its mesh (V, 3); None if too little is seen."""
     colors, mass = unwrap(model, uv_map, pictures, mesh)
     if not (mass > LEAST_SEEN).any():
         return None
@@ -96,11 +136,7 @@ def unwrap(
     """
     places, normals = uv_map.samples.at(mesh), sample_normals(uv_map.samples, mesh)
     weights = view_weights(Visibility(mesh, model.faces.numpy()), pictures, places, normals)
-    values = np.zeros((*weights.shape, 3))
-    for row, crop in enumerate(pictures.crops):
-        chosen = np.flatnonzero(weights[row])
-        image, camera = root_light(crop)
-        values[row, chosen] = look_up(camera, image, places[chosen])
+    values = view_colours([root_light(crop) for crop in pictures.crops], weights, places)
     trust = weights**2 * ((weights > 0).sum(0) >= LEAST_VIEWS)
     colors = robust_mean(values, np.ones_like(values), trust, VIEW_NOISE)
     mass = trust.sum(0)[:, None].astype(np.float32)
@@ -120,3 +156,131 @@ def _between(places: np.ndarray, at: np.ndarray) -> tuple[np.ndarray, np.ndarray
 def uv_network() -> LandmarkNet:
     """Read the shipped network once."""
     return load_network(UV_WEIGHTS)
+
+
+@dataclass(frozen=True)
+class FaceUvMap:
+    """The UV map of a head model's face.
+
+    Attributes:
+        samples: T places on the mesh, one per texel that shows the head.
+        texels: (T, 2) their rows and columns.
+        places: (V, 2) column and row of every vertex, corner origin; far off where it has none.
+        front: (F,) bool, faces of skin that the map shows, however small.
+        skin: (T,) bool, texels of skin: not of eyes, teeth or tongue.
+    """
+
+    samples: MeshPlaces
+    texels: np.ndarray
+    places: np.ndarray
+    front: np.ndarray
+    skin: np.ndarray
+
+    def image(self, values: np.ndarray) -> np.ndarray:
+        """Spread values (T, C) over the map (HEIGHT, WIDTH, C), 0 outside the head."""
+        out = np.zeros((HEIGHT, WIDTH, values.shape[1]), dtype=values.dtype)
+        out[tuple(self.texels.T)] = values
+        return out
+
+
+def make_uv_map(model: HeadModel) -> FaceUvMap:
+    """Lay a head model's template flat.
+
+    Raises:
+        HeadModelError: the outer corners of the eyes coincide.
+    """
+    vertices = model.template.double().numpy()
+    marks = landmarks(model, model.template[None].double())[0].double().numpy()
+    if np.linalg.norm(marks[45] - marks[36]) < 1e-6:
+        raise HeadModelError(
+            f"head model {model.name!r}: landmarks 36 and 45, the outer corners of the eyes,"
+            " coincide, so the face has no UV map; correct the model's landmarks or set"
+            " track.uv_rounds=0"
+        )
+    turned, radius = unrolled(vertices, marks)
+    # The smoothest warp that brings the landmarks to where they belong.
+    warp = RBFInterpolator(
+        unrolled(marks, marks)[0], MARKS, kernel="thin_plate_spline", smoothing=1e-4
+    )
+    places = to_texels(warp(turned))
+    faces = model.faces.numpy()
+    near = (np.abs(turned[:, 0]) < BACK)[faces].all(1)
+    ids = np.flatnonzero(near)
+    # Seen from outside, what is further from the axis is nearer.
+    depth = 10.0 - np.minimum(radius, 5.0)
+    flat = np.column_stack([places * depth[:, None], depth])
+    camera = Camera("map", WIDTH, HEIGHT, "PINHOLE", (1.0, 1.0, 0.0, 0.0), np.eye(4))
+    found = visible_faces(flat, faces[ids], camera)[0]
+    face_id = np.where(found >= 0, ids[np.maximum(found, 0)], -1)
+    texels = np.argwhere(face_id >= 0)
+    of_texel = face_id[tuple(texels.T)]
+    bary = flat_barycentrics(places[faces[of_texel]], cell_to_corner(texels[:, ::-1]))
+    samples = MeshPlaces(faces[of_texel], bary)
+    inside = (~movable_vertices(model))[faces].any(1)
+    shown = np.zeros((HEIGHT, WIDTH))
+    shown[tuple(texels.T)] = (radius[samples.vertices] * bary).sum(1)
+    column, row = np.clip(places[faces].mean(1), 0, (WIDTH - 1, HEIGHT - 1)).astype(np.int64).T
+    on_map = ((places[faces] >= 0) & (places[faces] <= (WIDTH, HEIGHT))).all((1, 2))
+    front = near & on_map & ~inside & (radius[faces].mean(1) > shown[row, column] - SHEET)
+    return FaceUvMap(samples, texels, places, front, ~inside[of_texel])
+
+
+def unrolled(points: np.ndarray, marks: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return azimuth and height (N, 2) about the head's axis, and distance (N,) from it.
+
+    The axis runs upwards between the ends of the jaw line; heights are above the tip of the nose,
+    in widths between the outer corners of the eyes.
+    """
+    axis = marks[[0, 16]].mean(0)
+    unit = float(np.linalg.norm(marks[45] - marks[36]))
+    x, z = points[:, 0] - axis[0], points[:, 2] - axis[2]
+    height = (points[:, 1] - marks[30, 1]) / unit
+    return np.stack([np.arctan2(x, z), height], axis=1), np.hypot(x, z) / unit
+
+
+def to_texels(turned: np.ndarray) -> np.ndarray:
+    """Convert azimuths and heights (N, 2) to column and row (N, 2), corner origin."""
+    step = 2.0 * RIGHT / WIDTH
+    return np.stack([WIDTH / 2 + turned[:, 0] / step, (TOP - turned[:, 1]) / step], axis=1)
+
+
+def window(colors: np.ndarray) -> np.ndarray:
+    """Cut the part of a map (HEIGHT, WIDTH, 3) that is read, (128, 128, 3)."""
+    part = colors[UPPER : UPPER + SIDE, LEFT : LEFT + SIDE]
+    return cv2.resize(part, (CROP, CROP), interpolation=cv2.INTER_LINEAR)
+
+
+def to_window(texels: np.ndarray) -> np.ndarray:
+    """Convert texels (..., 2) to pixels of the window, both with corner origin."""
+    return (texels - (LEFT, UPPER)) / TEXELS_PER_PIXEL
+
+
+def read_marks(net: LandmarkNet, colors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Find texels (51, 2) of landmarks 17 to 67 on a map, and their expected error (51,).
+
+    The map (HEIGHT, WIDTH, 3), in [0, 1], and its mirror image are both read; their difference
+    counts as error.
+    """
+    image = torch.from_numpy(window(colors)).permute(2, 0, 1)[None].float()
+    with torch.inference_mode():
+        output = net(torch.cat([image, image.flip(3)]))
+    points, scale = output.points.numpy(), np.exp(output.log_scale.numpy())
+    turned = np.stack([CROP - points[1, MIRROR, 0], points[1, MIRROR, 1]], axis=1)
+    apart = 0.5 * np.linalg.norm(points[0] - turned, axis=1)
+    error = np.hypot(0.5 * (scale[0] + scale[1, MIRROR]), apart)
+    texels = 0.5 * (points[0] + turned) * TEXELS_PER_PIXEL + (LEFT, UPPER)
+    return texels[FIRST:], (error * TEXELS_PER_PIXEL)[FIRST:]
+
+
+def mark_places() -> np.ndarray:
+    """Return the texels (51, 2) where landmarks 17 to 67 belong."""
+    return to_texels(MARKS)[FIRST:]
+
+
+def reading_map(model: HeadModel) -> FaceUvMap:
+    """Make a head's UV map with the texels that are read alone."""
+    whole = make_uv_map(model)
+    off = whole.texels - (UPPER, LEFT)
+    some = np.all((off >= 0) & (off < SIDE), axis=1)
+    samples, texels, skin = whole.samples.some(some), whole.texels[some], whole.skin[some]
+    return replace(whole, samples=samples, texels=texels, skin=skin)

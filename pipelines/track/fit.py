@@ -17,7 +17,7 @@ import numpy as np
 import scipy.sparse as sparse
 
 from express50.errors import StageError
-from express50.geometry.pinhole import project_pinhole
+from express50.geometry.cameras import project_pinhole
 from express50.geometry.transforms import axis_angle_to_matrix
 from pipelines.track.basis import MODE, Basis, Points
 from pipelines.track.observe import JAW_LINE_WEIGHT
@@ -41,15 +41,10 @@ REJECT_SIGMA, REJECT_SHARE = 4.0, 0.12
 def fit(
     basis: Basis, targets: list[Target], state: State, steps: int, free: tuple[str, ...] = ()
 ) -> tuple[State, float]:
-    """Minimise the targets' cost plus priors from a start.
+    """Minimise the targets' cost plus priors from a start, in at most so many steps.
 
-    Args:
-        basis: the head model.
-        targets: one per expression.
-        state: the start.
-        steps: most Levenberg-Marquardt steps.
-        free: offset modes that the terms can determine (`basis.OFF`, `basis.ALONG`). With any of
-            them the detector's bias is free too: the surface then shows how landmarks err.
+    `free` are the offset modes that the terms can determine (`basis.OFF`, `basis.ALONG`). With any
+    of them the detector's bias is free too: the surface then shows how landmarks err.
 
     Returns:
         The fitted state and its cost.
@@ -83,15 +78,6 @@ def fit(
     if not np.isfinite(least):
         raise StageError("the fit diverged; check the calibration and the landmark overlays")
     return state, least
-
-
-def landmark_term(basis: Basis, target: Target) -> PixelTerm:
-    """Make the term of a target's landmarks in all its views."""
-    sightings = []
-    for view, sigma in zip(target.observation.views, target.sigma, strict=True):
-        rows = np.flatnonzero(np.isfinite(sigma))
-        sightings.append(Sighting(view.camera, rows, view.points[rows], sigma[rows]))
-    return PixelTerm(landmark_anchors(basis.model), tuple(sightings))
 
 
 def consistent_sigma(target: Target, marks: np.ndarray) -> np.ndarray:
@@ -129,7 +115,11 @@ class _Expression:
 
     @classmethod
     def of(cls, basis: Basis, target: Target) -> _Expression:
-        terms = (landmark_term(basis, target), *target.terms)
+        sightings = []
+        for view, sigma in zip(target.observation.views, target.sigma, strict=True):
+            rows = np.flatnonzero(np.isfinite(sigma))
+            sightings.append(Sighting(view.camera, rows, view.points[rows], sigma[rows]))
+        terms = (PixelTerm(landmark_anchors(basis.model), tuple(sightings)), *target.terms)
         ids = np.unique(np.concatenate([term.anchors.vertices.ravel() for term in terms]))
         anchors = tuple(
             MeshPlaces(np.searchsorted(ids, term.anchors.vertices), term.anchors.weights)

@@ -7,10 +7,8 @@ from itertools import combinations
 
 import numpy as np
 
-from express50.geometry.cameras import Camera, triangulate
-from express50.geometry.pinhole import project_pinhole, project_with_slope
-from express50.landmarks.iris import Irises
-from express50.landmarks.sources import Marked
+from express50.geometry.cameras import Camera, project_pinhole, project_with_slope, triangulate
+from express50.landmarks.eyes_and_lips import Irises
 
 PAIR_LIMIT = 120
 LANDMARK_FLOOR_PX = 1.0  # least error assumed of a landmark, for a face 128 px tall
@@ -25,11 +23,9 @@ SAME_DIRECTION = np.radians(2.0)
 
 @dataclass(frozen=True)
 class LandmarkView:
-    """Landmarks seen by one camera.
+    """Landmarks seen by one pinhole camera.
 
     Attributes:
-        camera_id: the camera's id.
-        camera: pinhole.
         points: (68, 2) pixels.
         sigma: (68,) pixels; infinite where a point is not known.
         score: of the face, 0 to 1.
@@ -73,15 +69,6 @@ class Observation:
     covariance: np.ndarray
     refused: tuple[LandmarkView, ...] = ()
     shut: tuple[int, ...] = ()
-
-
-def make_view(camera: Camera, seen: Marked) -> LandmarkView:
-    """Make a view of what a source of landmarks found in an undistorted image of a camera."""
-    face = seen.face
-    return LandmarkView(
-        camera.id, camera, face.points, face.sigma, face.score, seen.irises,
-        visible_contour=seen.visible_contour,
-    )  # fmt: skip
 
 
 def agree(
@@ -134,7 +121,12 @@ def robust_triangulate(views: list[LandmarkView]) -> tuple[np.ndarray, np.ndarra
     if count < 2:
         return np.full((68, 3), np.nan), np.ones((count, 68), dtype=bool)
     candidates = _pair_points(views)
-    squared = _squared_errors(views, candidates)
+    squared = np.empty((len(candidates), count, 68))  # over sigma; infinite behind a camera
+    for index, view in enumerate(views):
+        pixels, depth = project_pinhole(view.camera, candidates)
+        limit = SIGMA_SHARE_LIMIT * float(np.ptp(view.points, axis=0).max())
+        error = ((pixels - view.points) ** 2).sum(-1) / np.minimum(view.sigma, limit) ** 2
+        squared[:, index] = np.where(depth > 0, error, np.inf)
     redundancy = np.array([view.redundancy for view in views])
     cost = (np.minimum(squared, INLIER_SIGMA**2) / redundancy[:, None]).sum(1)
     best = np.argmin(cost, axis=0)
@@ -149,15 +141,10 @@ def robust_triangulate(views: list[LandmarkView]) -> tuple[np.ndarray, np.ndarra
 def point_covariance(
     views: list[LandmarkView], points: np.ndarray, inliers: np.ndarray
 ) -> np.ndarray:
-    """Return the covariance (68, 3, 3) of triangulated points, square metres.
+    """Return the covariance (68, 3, 3) of points (68, 3) triangulated from inliers (C, 68), m^2.
 
     The inverse of the normal equations at the points: each view adds J' J / (redundancy sigma^2), J
     (2, 3) being the slope of its pixel and sigma the standard deviation of a coordinate.
-
-    Args:
-        views: C views.
-        points: (68, 3); NaN where there is none.
-        inliers: (C, 68) bool, what the points were triangulated from.
     """
     normal = np.zeros((68, 3, 3))
     known = np.isfinite(points).all(1)
@@ -222,14 +209,3 @@ def _rays(view: LandmarkView, pixels: np.ndarray) -> np.ndarray:
     x = (pixels - K[:2, 2]) / K[[0, 1], [0, 1]]
     directions = np.concatenate([x, np.ones((len(x), 1))], axis=1) @ pose[:3, :3]
     return directions / np.linalg.norm(directions, axis=1, keepdims=True)
-
-
-def _squared_errors(views: list[LandmarkView], candidates: np.ndarray) -> np.ndarray:
-    """Return squared errors over sigma (pairs, views, 68); infinite behind a camera."""
-    errors = np.empty((len(candidates), len(views), 68))
-    for index, view in enumerate(views):
-        pixels, depth = project_pinhole(view.camera, candidates)
-        limit = SIGMA_SHARE_LIMIT * float(np.ptp(view.points, axis=0).max())
-        squared = ((pixels - view.points) ** 2).sum(-1) / np.minimum(view.sigma, limit) ** 2
-        errors[:, index] = np.where(depth > 0, squared, np.inf)
-    return errors

@@ -11,13 +11,21 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 import open3d as o3d
+import torch
 
 from express50.files.images import edge_distance
-from express50.geometry.cameras import Camera, resized
-from express50.geometry.pinhole import project_with_slope
+from express50.geometry.cameras import (
+    Camera,
+    inside_frame,
+    project_pinhole,
+    project_with_slope,
+    resized,
+)
 from express50.geometry.raycast import mesh_scene
 from express50.geometry.sampling import bilinear_slope
-from express50.head.model import HeadModel
+from express50.head.model import HeadModel, vertex_normals
+from pipelines.track.basis import in_regions
+from pipelines.track.surface import SignedDistance, Visibility, look_up
 from pipelines.track.terms import MeshPlaces, Residuals, huber
 
 # Head outlines count as about this many independent points per view.
@@ -28,34 +36,23 @@ EDGE_SIGMA_M = 0.0015
 # Where hair, cloth or shoulders may stand before the skin: standard deviation of their thickness,
 # and the gap (metres) at which what lies inside the matte stops to pull.
 COVER_SIGMA_M, HAIR_GAP_M, BALD_GAP_M = 0.008, 0.004, 0.03
+FEATURES = (
+    "lips", "left_eye_region", "right_eye_region", "left_eyeball", "right_eyeball",
+    "mouth_interior", "teeth", "tongue",
+)  # fmt: skip
+# Of the natural logarithm of the face's brightness and of its two ratios of colours.
+LEAST_SPREAD = np.array([0.2, 0.03, 0.03])
+WITHIN, BALD_SHARE = 3.0, 0.6
 COVERED = ("neck", "scalp", "forehead", "left_ear", "right_ear")
 BARE = ("face", "nose", "lips")
-
-
-@dataclass(frozen=True)
-class SignedDistance:
-    """Signed distance to a matte's edge in pixels, positive outside, with its camera.
-
-    Attributes:
-        values: (H, W) float32 at pixel centres.
-        camera: pinhole camera of full size.
-        step: (2,) full-size pixels per cell, x and y.
-    """
-
-    values: np.ndarray
-    camera: Camera
-    step: np.ndarray
 
 
 @dataclass(frozen=True)
 class OutlineTerm:
     """Vertices on the mesh's outline should lie on the outline of one view's matte.
 
-    Attributes:
-        distance: the view's signed distance.
-        anchors: n vertices.
-        sigma: (n, 2) standard deviations in full-size pixels, inside and outside the matte.
-        gap: (n,) pixels inside the matte at which the pull fades.
+    `sigma` (n, 2) are standard deviations in pixels, inside and outside the matte; inside it the
+    pull fades at `gap` (n,) pixels.
     """
 
     distance: SignedDistance
@@ -100,9 +97,7 @@ class OutlineTerm:
         along = (fade**-1.5 / sigma)[:, None, None]
         return np.arange(len(places)), residual[:, None], (gradient[:, None] @ slope) * along
 
-    def loss(self, square: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Huber's."""
-        return huber(square)
+    loss = staticmethod(huber)
 
 
 def signed_distance(alpha: np.ndarray, camera: Camera, side: int = 640) -> SignedDistance | None:
@@ -134,16 +129,11 @@ def sample_distance(distance: SignedDistance, pixels: np.ndarray) -> tuple[np.nd
 def outline_vertices(
     vertices: np.ndarray, faces: np.ndarray, camera: Camera, allowed: np.ndarray
 ) -> np.ndarray:
-    """Find the vertices (n,) on the outer outline of a mesh in a view, at most POINTS_PER_VIEW.
+    """Find vertices (n,) on the outer outline of a mesh in a view, at most POINTS_PER_VIEW.
 
-    A vertex counts if it lies between faces turned to and from the camera and projects to within a
-    pixel and a half of the edge of the mesh's own mask, so that inner folds do not.
-
-    Args:
-        vertices: (V, 3) world.
-        faces: (F, 3).
-        camera: pinhole.
-        allowed: (V,) bool.
+    A vertex counts if it is `allowed` (V,), lies between faces turned to and from the camera and
+    projects to within a pixel and a half of the edge of the mesh's own mask, so that inner folds do
+    not.
     """
     depth = vertices @ camera.cam_from_world[2, :3] + camera.cam_from_world[2, 3]
     if (depth <= 1e-3).any():
@@ -152,7 +142,11 @@ def outline_vertices(
     window = resized(
         camera, max(1, round(camera.width * shrink)), max(1, round(camera.height * shrink))
     )
-    edge = _mask_distance(vertices, faces, window)
+    rays = o3d.t.geometry.RaycastingScene.create_rays_pinhole(
+        o3d.core.Tensor(window.K), o3d.core.Tensor(window.cam_from_world),
+        window.width, window.height,
+    )  # fmt: skip
+    edge = edge_distance(mesh_scene(vertices, faces).test_occlusions(rays).numpy())
     corners = vertices[faces]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     front = ((camera.center - corners[:, 0]) * normals).sum(1) > 0
@@ -160,37 +154,13 @@ def outline_vertices(
     turned_to[faces[front].ravel()] = True
     turned_from[faces[~front].ravel()] = True
     chosen = np.flatnonzero(turned_to & turned_from & allowed)
-    local = vertices[chosen] @ window.cam_from_world[:3, :3].T + window.cam_from_world[:3, 3]
-    pixels = local[:, :2] / local[:, 2:] * window.K[[0, 1], [0, 1]] + window.K[:2, 2]
-    column, row = np.floor(pixels).astype(int).T
-    inside = (column >= 0) & (row >= 0) & (column < window.width) & (row < window.height)
-    column, row = np.clip(column, 0, window.width - 1), np.clip(row, 0, window.height - 1)
-    chosen = chosen[inside & (edge[row, column] <= 1.5)]
+    cell = np.floor(project_pinhole(window, vertices[chosen])[0]).astype(int)
+    size = np.array([window.width, window.height])
+    column, row = np.clip(cell, 0, size - 1).T
+    chosen = chosen[((cell >= 0) & (cell < size)).all(1) & (edge[row, column] <= 1.5)]
     if len(chosen) > POINTS_PER_VIEW:
         chosen = chosen[np.linspace(0, len(chosen) - 1, POINTS_PER_VIEW).astype(int)]
     return chosen
-
-
-def outline_regions(model: HeadModel, bald: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Return masks (V,) of vertices that may form an outline and of those that may be covered."""
-
-    def union(names: tuple[str, ...]) -> np.ndarray:
-        return np.any([model.regions[name].numpy() for name in names], axis=0)
-
-    allowed = union(BARE + COVERED) & ~model.regions["boundary"].numpy()
-    return allowed, union(("neck",) if bald else COVERED)
-
-
-def _mask_distance(vertices: np.ndarray, faces: np.ndarray, camera: Camera) -> np.ndarray:
-    """Return the distance (H, W) of pixels in the mesh's mask to the mask's edge; 0 outside."""
-    scene = mesh_scene(vertices, faces)
-    rays = o3d.t.geometry.RaycastingScene.create_rays_pinhole(
-        intrinsic_matrix=o3d.core.Tensor(camera.K),
-        extrinsic_matrix=o3d.core.Tensor(camera.cam_from_world),
-        width_px=camera.width,
-        height_px=camera.height,
-    )
-    return edge_distance(scene.test_occlusions(rays).numpy())
 
 
 def outline_terms(
@@ -201,10 +171,43 @@ def outline_terms(
     bald: bool,
 ) -> list[OutlineTerm]:
     """Make the outline terms of one frame set on the current mesh (V, 3)."""
-    allowed, covered = outline_regions(model, bald)
+    allowed = in_regions(model, BARE + COVERED) & ~in_regions(model, ("boundary",))
+    covered = in_regions(model, ("neck",) if bald else COVERED)
     faces, terms = model.faces.numpy(), []
     for distance in distances:
         ids = outline_vertices(mesh, faces, distance.camera, allowed)
         if len(ids) >= 8:
             terms.append(OutlineTerm.of(distance, ids, mesh[ids], covered[ids], pictures, bald))
     return terms
+
+
+def bare_share(
+    model: HeadModel, images: list[tuple[np.ndarray, Camera]], mesh: np.ndarray
+) -> float:
+    """Return the share of the visible scalp that has the face's colour; 0 if too little is seen.
+
+    `images` are of `root_light`, the mesh (V, 3) is fitted roughly. A head with more than
+    BALD_SHARE is bald; under hair the skull can be anywhere within centimetres of the outline.
+    """
+    scalp, face = in_regions(model, ("scalp",)), in_regions(model, ("face",))
+    face &= ~in_regions(model, FEATURES)
+    normals = vertex_normals(torch.from_numpy(mesh)[None], model.faces)[0].numpy()
+    visibility = Visibility(mesh, model.faces.numpy())
+    values = np.full((len(images), *mesh.shape), np.nan)
+    for value, (image, camera) in zip(values, images, strict=True):
+        seen = visibility.weights(camera, mesh, normals) > 0
+        seen &= inside_frame(camera, mesh)[1]
+        value[seen] = np.log(np.maximum(look_up(camera, image, mesh[seen]), 0.01))
+    known = np.isfinite(values).any((0, 2))
+    scalp, face = scalp & known, face & known
+    if face.sum() < 20 or scalp.sum() < 20:
+        return 0.0
+    middle = np.full(mesh.shape, np.nan)
+    middle[known] = np.nanmedian(values[:, known], axis=0)
+    r, g, b = middle.T
+    # Shading changes brightness much, ratios of colours little.
+    colour = np.stack([(r + g + b) / 3.0, r - g, g - b], axis=1)
+    usual = np.median(colour[face], axis=0)
+    spread = 1.4826 * np.median(np.abs(colour[face] - usual), axis=0)
+    off = np.abs(colour[scalp] - usual) / np.maximum(spread, LEAST_SPREAD)
+    return float((off < WITHIN).all(1).mean())

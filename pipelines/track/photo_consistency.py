@@ -15,16 +15,15 @@ import numpy as np
 import open3d as o3d
 from scipy.spatial import cKDTree
 
-from express50.geometry.cameras import Camera
+from express50.geometry.cameras import Camera, project_with_slope
 from express50.geometry.conventions import corner_to_cell
-from express50.geometry.pinhole import project_with_slope
 from express50.geometry.raycast import mesh_scene
 from express50.head.model import HeadModel
-from pipelines.track.crops import FrameSetCrops, root_light
 from pipelines.track.surface import (
     COVERED,
-    Samples,
+    FrameSetCrops,
     Visibility,
+    root_light,
     sample_normals,
     spread,
     view_weights,
@@ -45,16 +44,16 @@ SLANT = 0.4
 # Hair and cloth may cover neck and ears: fewer samples per sample of the face, and less trust.
 COVERED_SHARE, COVERED_TRUST = 0.25, 0.3
 
+SkinSamples = list[tuple[MeshPlaces, float]]
+"""Where the surface is searched for, and the trust in what is found there."""
+
 
 @dataclass(frozen=True)
 class PatchSearch:
-    """The result of a search.
+    """The result of a search: heights (S,), metres along the normals.
 
-    Attributes:
-        height: (S,) metres along the normals.
-        score: (S,) mean correlation of the views there, 0 where nothing was found.
-        sharpness: (S,) margin of that score over any other height.
-        pixel: metres per pixel at the samples.
+    `score` (S,) is the views' mean correlation there, 0 where nothing was found, `sharpness` (S,)
+    its margin over any other height; a pixel is `pixel` metres wide at the samples.
     """
 
     height: np.ndarray
@@ -72,16 +71,10 @@ def search(
     faces: np.ndarray,
     reach: float,
 ) -> PatchSearch:
-    """Search for every sample's surface within `reach` metres along its normal.
+    """Search for the surface within `reach` metres of places (S, 3) along unit normals (S, 3).
 
-    Args:
-        images: C grey pictures (H, W) float32, root of light, with their pinhole cameras.
-        weights: (C, S) trust in each view of each sample; 0 where it is not seen.
-        places: (S, 3) world.
-        normals: (S, 3) unit, world.
-        mesh: (V, 3) world; patches are bent to follow it.
-        faces: (F, 3).
-        reach: metres.
+    Images are C grey pictures (H, W) float32, root of light, with their pinhole cameras; `weights`
+    (C, S) are 0 where a place is not seen. Patches are bent to follow the mesh (V, 3), (F, 3).
     """
     middle = places.mean(0)
     sizes = [np.linalg.norm(middle - camera.center) / camera.K[0, 0] for _, camera in images]
@@ -189,45 +182,31 @@ def _peaks(score: np.ndarray, heights: np.ndarray, pixel: float) -> PatchSearch:
 
 def surface_term(
     found: PatchSearch,
-    samples: Samples,
+    samples: MeshPlaces,
     places: np.ndarray,
     normals: np.ndarray,
     weight: float,
 ) -> NormalTerm | None:
     """Make the term of the samples whose search was conclusive; None if none was."""
     good = np.flatnonzero((found.score > LEAST_SCORE) & (found.sharpness > LEAST_SHARP))
-    good = good[_near_neighbours(places[good], found.height[good], ODD_PX * found.pixel)]
+    if len(good) < 2 * NEIGHBOURS:
+        return None
+    # The mesh's error changes slowly along the skin; that of a mismatched patch does not.
+    _, near = cKDTree(places[good]).query(places[good], NEIGHBOURS)
+    odd = np.abs(found.height[good] - np.median(found.height[good][near], axis=1))
+    good = good[odd < ODD_PX * found.pixel]
     if not len(good):
         return None
     goals = places[good] + found.height[good, None] * normals[good]
     sure = found.score[good] * np.minimum(found.sharpness[good] / 0.2, 1.0)
     sigma = found.pixel * SIGMA_PX / np.sqrt(weight * sure)
-    anchors = MeshPlaces(samples.corners[good], samples.bary[good])
-    return NormalTerm(anchors, goals, normals[good], sigma, OUTLIER_PX * found.pixel)
+    return NormalTerm(samples.some(good), goals, normals[good], sigma, OUTLIER_PX * found.pixel)
 
 
-def _near_neighbours(places: np.ndarray, heights: np.ndarray, limit: float) -> np.ndarray:
-    """Mark heights (S,) at places (S, 3) within `limit` of the median of their neighbours.
-
-    The mesh's error changes slowly along the skin; that of a mismatched patch does not.
-    """
-    if len(places) < 2 * NEIGHBOURS:
-        return np.zeros(len(places), dtype=bool)
-    _, near = cKDTree(places).query(places, NEIGHBOURS)
-    return np.abs(heights - np.median(heights[near], axis=1)) < limit
-
-
-@dataclass(frozen=True)
-class SkinSamples:
-    """Samples of the face, and of neck and ears, which may be covered."""
-
-    face: Samples
-    covered: Samples
-
-    @classmethod
-    def of(cls, model: HeadModel, count: int) -> SkinSamples:
-        """Spread `count` samples over the face and fewer over neck and ears."""
-        return cls(spread(model, count), spread(model, round(COVERED_SHARE * count), COVERED))
+def skin_samples(model: HeadModel, count: int) -> SkinSamples:
+    """Spread `count` samples over the face and fewer over neck and ears, which may be covered."""
+    covered = spread(model, round(COVERED_SHARE * count), COVERED)
+    return [(spread(model, count), 1.0), (covered, COVERED_TRUST)]
 
 
 def patch_terms(
@@ -240,18 +219,12 @@ def patch_terms(
 ) -> list[NormalTerm]:
     """Search a frame set's surface about the current mesh (V, 3).
 
-    Args:
-        model: the head model.
-        skin: where to search.
-        pictures: of the frame set.
-        mesh: (V, 3) world.
-        reach: metres to either side.
-        weight: trust in the result.
+    `reach` is in metres to either side, `weight` the trust in the result.
     """
     faces = model.faces.numpy()
     images = [(root.mean(2), camera) for root, camera in map(root_light, pictures.crops)]
     visibility, terms = Visibility(mesh, faces), []
-    for samples, trust in ((skin.face, 1.0), (skin.covered, COVERED_TRUST)):
+    for samples, trust in skin:
         places, normals = samples.at(mesh), sample_normals(samples, mesh)
         views = view_weights(visibility, pictures, places, normals)
         views = np.where(views > SLANT, views**2, 0.0)

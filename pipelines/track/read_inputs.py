@@ -2,26 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from functools import partial
 
 import numpy as np
 
-from express50.capture.frames import (
-    read_cameras_of,
-    read_frame,
-    read_peak_frame,
-    read_peaks,
-)
+from express50.capture.frames import read_cameras_of, read_frame, read_peak_frame
+from express50.capture.index import read_peaks
 from express50.contract.layout import Dataset
 from express50.contract.stage import Note
 from express50.errors import CaptureError
 from express50.files.images import read_alpha
 from express50.geometry.cameras import Camera
 from express50.landmarks.sources import Source, open_source
-from pipelines.track.crops import FrameSetCrops, HeadCrop, cut_crop
 from pipelines.track.eyes_and_jaw import shut_lids
-from pipelines.track.observe import LandmarkView, Observation, agree, make_view
+from pipelines.track.observe import LandmarkView, Observation, agree
 from pipelines.track.outline import signed_distance
+from pipelines.track.surface import FrameSetCrops, HeadCrop, cut_crop
 
 MIN_SCORE = 0.2  # views with a lower face score are left out
 MIN_LANDMARKS = 20  # that must agree between the cameras of an expression
@@ -38,34 +35,26 @@ def open_landmarks(dataset: Dataset, subject: str, landmarks: str, search: float
 
 
 def observe_peaks(
-    dataset: Dataset,
-    subject: str,
-    cameras: dict[str, Camera],
-    source: Source,
-    neutral: str,
-    most: int,
+    dataset: Dataset, subject: str, source: Source, neutral: str, most: int
 ) -> tuple[list[Observation], list[Note]]:
     """Detect landmarks at every peak, reject outlying views and find shut eyes.
 
     With `most` above 0 only so many cameras are used: those that see the neutral frame best.
     """
     dropped: list[Note] = []
-    peaks = read_peaks(dataset, subject)
-    order = sorted(peaks, key=lambda name: (name != neutral, list(peaks).index(name)))
-    chosen = list(cameras)
+    peaks, cameras = read_peaks(dataset, subject), read_cameras_of(dataset, subject)
     found = {}
-    for expression in order:
-        now = {name: cameras[name] for name in chosen}
+    for expression in sorted(peaks, key=lambda name: name != neutral):
+        read = partial(read_peak_frame, dataset, subject, expression)
         try:
-            read = _peak_reader(dataset, subject, expression)
-            views = _views(read, now, peaks[expression], source)
+            views = _views(read, cameras, peaks[expression], source)
         except CaptureError as error:
             dropped.append(Note(expression, str(error)))
             continue
-        if most and len(chosen) > most and len(views) >= most:
+        if most and len(cameras) > most and len(views) >= most:
             views = sorted(views, key=lambda view: float(np.median(view.sigma)) / view.score)
             views = views[:most]
-            chosen = sorted(view.camera_id for view in views)
+            cameras = {name: cameras[name] for name in sorted(view.camera_id for view in views)}
         if not views:
             dropped.append(Note(expression, "no camera sees a face"))
             continue
@@ -80,31 +69,30 @@ def observe_peaks(
     return shut_lids([found[name] for name in peaks if name in found]), dropped
 
 
-def observe_frame(
+def observe_clip(
     dataset: Dataset,
     subject: str,
-    cameras: dict[str, Camera],
-    cue: str,
-    frame: int,
     source: Source,
-) -> Observation | None:
-    """Observe a frame of a clip; None where the cameras agree on no face."""
-    try:
-        read = _frame_reader(dataset, subject, frame)
-        views = _views(read, cameras, frame, source)
-    except CaptureError:
-        return None
-    observation = agree(cue, frame, views)[0] if views else None
-    enough = observation and observation.inliers.sum(1).max() >= MIN_LANDMARKS
-    return observation if enough else None
+    peaks: list[Observation],
+    cue: str,
+    frames: Sequence[int],
+) -> list[Observation]:
+    """Observe frames of a clip in one pass through each camera's footage.
 
-
-def _peak_reader(dataset: Dataset, subject: str, expression: str) -> Read:
-    return lambda camera: read_peak_frame(dataset, subject, expression, camera)
-
-
-def _frame_reader(dataset: Dataset, subject: str, frame: int) -> Read:
-    return lambda camera: read_frame(dataset, subject, camera, frame)
+    Frames where the cameras agree on no face are left out.
+    """
+    views: dict[int, list[LandmarkView]] = {frame: [] for frame in frames}
+    for camera_id, camera in read_cameras_of(dataset, subject).items():
+        for frame in frames:
+            try:
+                read = partial(read_frame, dataset, subject, frame=frame)
+                views[frame] += _views(read, {camera_id: camera}, frame, source)
+            except CaptureError:
+                continue  # this camera's footage lacks the frame
+    seen = [agree(cue, frame, found)[0] for frame, found in views.items() if found]
+    seen = [one for one in seen if one.inliers.sum(1).max() >= MIN_LANDMARKS]
+    # A clip may be one long blink: the peaks show what open eyes look like.
+    return shut_lids(seen, peaks)
 
 
 def _views(
@@ -123,24 +111,29 @@ def _views(
             missing.append(error)
             continue
         seen = source(image, camera_id, frame)
-        if seen.face.score >= MIN_SCORE and np.isfinite(seen.face.sigma).any():
-            views.append(make_view(camera, seen))
+        face = seen.face
+        if face.score >= MIN_SCORE and np.isfinite(face.sigma).any():
+            view = LandmarkView(
+                camera.id, camera, face.points, face.sigma, face.score, seen.irises,
+                visible_contour=seen.visible_contour,
+            )  # fmt: skip
+            views.append(view)
     if missing and len(missing) == len(cameras):
         raise missing[0]
     return views
 
 
 def peak_pictures(
-    dataset: Dataset, subject: str, observation: Observation, mesh: np.ndarray, side: int
+    dataset: Dataset, subject: str, side: int, expression: str, mesh: np.ndarray
 ) -> FrameSetCrops:
     """Read a peak's outlines and crops about its mesh (V, 3) from all cameras.
 
     Cameras behind the head have no landmarks but see the skull.
     """
     distances, crops = [], []
-    read = _peak_reader(dataset, subject, observation.expression)
+    read = partial(read_peak_frame, dataset, subject, expression)
     for camera_id, camera in read_cameras_of(dataset, subject).items():
-        path = dataset.matte_file(subject, observation.expression, camera_id)
+        path = dataset.matte_file(subject, expression, camera_id)
         alpha = read_alpha(path) if path.is_file() else None
         if alpha is not None:
             distances.append(signed_distance(alpha, camera))
@@ -151,25 +144,20 @@ def peak_pictures(
 
 
 def frame_pictures(
-    dataset: Dataset, subject: str, frame: int, mesh: np.ndarray, side: int
+    dataset: Dataset, subject: str, side: int, frame: int, mesh: np.ndarray
 ) -> FrameSetCrops:
     """Read the crops of a frame of a clip about its mesh (V, 3); such frames have no mattes."""
+    read = partial(read_frame, dataset, subject, frame=frame)
     cameras = read_cameras_of(dataset, subject).values()
-    read = _frame_reader(dataset, subject, frame)
     crops = [_crop(read, camera, None, mesh, side) for camera in cameras]
     return FrameSetCrops((), tuple(crop for crop in crops if crop))
 
 
 def _crop(
-    read: Read,
-    camera: Camera,
-    alpha: np.ndarray | None,
-    mesh: np.ndarray,
-    side: int,
+    read: Read, camera: Camera, alpha: np.ndarray | None, mesh: np.ndarray, side: int
 ) -> HeadCrop | None:
     """Cut a camera's crop about the head; None where its footage lacks the frame or the head."""
     try:
-        image = read(camera.id)
+        return cut_crop(camera, read(camera.id), alpha, mesh, side)
     except CaptureError:
         return None
-    return cut_crop(camera, image, alpha, mesh, side)

@@ -1,4 +1,4 @@
-"""Pictures and figures that show whether a track is right: overlays, a sheet, residuals."""
+"""Show whether a track is right: overlays, a sheet, residuals, and cameras that seem wrong."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ import torch
 
 from express50.capture.frames import read_cameras_of, read_peak_frame
 from express50.contract.layout import Dataset
+from express50.contract.stage import Note
 from express50.files.images import fit_into, write_image
-from express50.geometry.cameras import Camera
+from express50.geometry.cameras import Camera, project_pinhole
 from express50.geometry.conventions import affine_to_opencv
-from express50.geometry.pinhole import project_pinhole
 from express50.geometry.raycast import mesh_scene
 from express50.head.model import HeadModel, landmarks
-from pipelines.track.observe import facing
+from pipelines.track.observe import LandmarkView, facing
 from pipelines.track.outline import OutlineTerm
 from pipelines.track.state import Target
 from pipelines.track.terms import PixelTerm
@@ -31,6 +31,15 @@ ODD = 1.5  # times the median: such residuals are drawn in ALARM
 PLAIN, ALARM, GROUND, DIM = (225, 225, 225), (255, 120, 90), 24, (110, 160, 210)
 ResidualTable = Mapping[str, Mapping[str, float]]
 SEEN_COLOR, FITTED_COLOR = (255, 210, 0), (0, 255, 120)
+
+# Cameras that are off in the same way in every expression.
+LEAST_EXPRESSIONS, LEAST_CAMERAS = 3, 3
+# They are off by a multiple of the other cameras' deviation, and of its own standard error; and by
+# at least 0.03 of the face's size, 0.06 of its scale or 0.06 radians.
+OVER_OTHERS, OVER_ERROR = 3.0, 3.0
+FACING = 0.2  # landmarks of nearer profiles are too poor to accuse a camera
+# Columns of a deviation: offset in pixels and as a share of the face, ln scale, roll.
+PIXELS, SHARE, SCALE, ROLL = slice(0, 2), slice(2, 4), slice(4, 5), slice(5, 6)
 
 
 def draw_overlays(
@@ -53,7 +62,15 @@ def draw_overlays(
     cameras = read_cameras_of(dataset, subject)
     frontal = {}
     for target, mesh, rotation in zip(targets, vertices, rotations, strict=True):
-        chosen, columns = _four_views(target, cameras, rotation, mesh.mean(0)), {}
+        views = sorted(
+            target.observation.views, key=lambda view: -facing(view, rotation, mesh.mean(0))
+        )
+        pool, columns = [view.camera_id for view in views], {}
+        chosen = [pool.pop(0)]
+        while pool and len(chosen) < 4:  # then the furthest from those chosen
+            axes = np.stack([cameras[name].cam_from_world[2, :3] for name in chosen])
+            far = [float((axes @ cameras[name].cam_from_world[2, :3]).max()) for name in pool]
+            chosen.append(pool.pop(int(np.argmin(far))))
         for camera_id in sorted(chosen):
             frame = read_peak_frame(dataset, subject, target.observation.expression, camera_id)
             seen = [v.points for v in target.observation.views if v.camera_id == camera_id]
@@ -62,20 +79,6 @@ def draw_overlays(
         write_image(path, np.concatenate(list(columns.values()), axis=1), quality=88)
         frontal[target.observation.expression] = columns[chosen[0]][TILE:]
     return frontal
-
-
-def _four_views(
-    target: Target, cameras: dict[str, Camera], rotation: np.ndarray, middle: np.ndarray
-) -> list[str]:
-    """Choose up to four cameras: the one the face looks at, then the furthest from those chosen."""
-    views = sorted(target.observation.views, key=lambda view: -facing(view, rotation, middle))
-    chosen = [views[0].camera_id]
-    pool = [view.camera_id for view in views[1:]]
-    while pool and len(chosen) < 4:
-        axes = np.stack([cameras[name].cam_from_world[2, :3] for name in chosen])
-        far = [float((axes @ cameras[name].cam_from_world[2, :3]).max()) for name in pool]
-        chosen.append(pool.pop(int(np.argmin(far))))
-    return chosen
 
 
 def draw_column(
@@ -88,13 +91,8 @@ def draw_column(
 ) -> np.ndarray:
     """Draw frame and overlay (2 tile, tile, 3) of the part of one view where the head is.
 
-    Args:
-        frame: (H, W, 3) uint8, undistorted.
-        camera: pinhole; its id is written on the picture.
-        model: the head model.
-        mesh: (V, 3) world.
-        seen: arrays (N, 2) of detected pixels.
-        tile: side of the picture, pixels.
+    The frame (H, W, 3) uint8 is undistorted; the pinhole camera's id is written on the picture.
+    `mesh` (V, 3) is of the world; `seen` are arrays (N, 2) of detected pixels.
     """
     pixels, _ = project_pinhole(camera, mesh)
     low, high = pixels.min(0), pixels.max(0)
@@ -148,10 +146,8 @@ def _dots(image: np.ndarray, points: np.ndarray, color: tuple[int, int, int]) ->
 def write_sheet(folder: Path, tiles: Mapping[str, np.ndarray], table: ResidualTable) -> None:
     """Write sheet.jpg: one overlay per expression and one bar per camera.
 
-    Args:
-        folder: target.
-        tiles: expression to its overlay (H, W, 3) uint8, as ``draw_overlays`` returns them.
-        table: expression to camera to RMS of its landmarks, pixels (``landmark_rms_px``).
+    The tiles are those of `draw_overlays`; the table maps expressions to cameras to the RMS of
+    their landmarks, pixels (`landmark_rms_px`).
     """
     folder.mkdir(parents=True, exist_ok=True)
     parts = [contact_sheet(tiles, expression_residuals(table)), camera_bars(table)]
@@ -180,35 +176,28 @@ def camera_residuals(table: ResidualTable) -> dict[str, tuple[float, int]]:
 def contact_sheet(
     tiles: Mapping[str, np.ndarray], residuals: Mapping[str, float] | None = None
 ) -> np.ndarray:
-    """Draw all expressions (H, W, 3) uint8, each with its name and residual.
+    """Draw all expressions (H, W, 3) uint8 as tiles, each with its name and residual in pixels.
 
-    Args:
-        tiles: expression to its overlay (h, w, 3) uint8.
-        residuals: expression to RMS pixels; those far above the median stand out.
+    Residuals far above the median stand out.
     """
     known = residuals or {}
     limit = ODD * float(np.median(list(known.values()))) if known else math.inf
-    cells = [_cell(name, image, known.get(name), limit) for name, image in tiles.items()]
-    columns = min(COLUMNS, max(1, math.ceil(math.sqrt(1.6 * len(cells)))))
-    blank = np.full((SHEET_TILE + BAND, SHEET_TILE, 3), GROUND, np.uint8)
-    cells += [blank] * (-len(cells) % columns or (0 if cells else columns))
-    rows = [np.concatenate(cells[k : k + columns], 1) for k in range(0, len(cells), columns)]
-    return np.concatenate(rows)
-
-
-def _cell(name: str, image: np.ndarray, residual: float | None, limit: float) -> np.ndarray:
-    """Draw a tile with a band of text below."""
-    cell = np.full((SHEET_TILE + BAND, SHEET_TILE, 3), GROUND, np.uint8)
-    cell[:SHEET_TILE] = fit_into(image, SHEET_TILE, SHEET_TILE)
-    colour = ALARM if residual is not None and residual > limit else PLAIN
-    value = "no landmarks" if residual is None else f"{residual:.2f} px"
-    room = (
-        SHEET_TILE - 10 - _words(cell, value, SHEET_TILE - 4, SHEET_TILE + 14, colour, right=True)
-    )
-    while len(name) > 1 and _width(name) > room:
-        name = name[:-1]
-    _words(cell, name, 4, SHEET_TILE + 14, colour)
-    return cell
+    columns = min(COLUMNS, max(1, math.ceil(math.sqrt(1.6 * len(tiles)))))
+    rows, height = -(-max(len(tiles), 1) // columns), SHEET_TILE + BAND
+    sheet = np.full((rows * height, columns * SHEET_TILE, 3), GROUND, np.uint8)
+    for number, (name, image) in enumerate(tiles.items()):
+        y, x = height * (number // columns), SHEET_TILE * (number % columns)
+        cell = sheet[y : y + height, x : x + SHEET_TILE]
+        cell[:SHEET_TILE] = fit_into(image, SHEET_TILE, SHEET_TILE)
+        residual = known.get(name)
+        colour = ALARM if residual is not None and residual > limit else PLAIN
+        value = "no landmarks" if residual is None else f"{residual:.2f} px"
+        room = SHEET_TILE - 10 - _width(value)
+        while len(name) > 1 and _width(name) > room:
+            name = name[:-1]
+        _words(cell, value, SHEET_TILE - 4 - _width(value), SHEET_TILE + 14, colour)
+        _words(cell, name, 4, SHEET_TILE + 14, colour)
+    return sheet
 
 
 def camera_bars(table: ResidualTable) -> np.ndarray:
@@ -232,14 +221,9 @@ def camera_bars(table: ResidualTable) -> np.ndarray:
     return chart
 
 
-def _words(
-    image: np.ndarray, text: str, x: int, y: int, colour: tuple[int, int, int], right: bool = False
-) -> int:
-    """Write words with their baseline at (x, y), or ending there; returns their width."""
-    width = _width(text)
-    place = (x - width if right else x, y)
-    cv2.putText(image, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.4, colour, 1, cv2.LINE_AA)
-    return width
+def _words(image: np.ndarray, text: str, x: int, y: int, colour: tuple[int, int, int]) -> None:
+    """Write words with their baseline at (x, y)."""
+    cv2.putText(image, text, (x, y), cv2.FONT_HERSHEY_SIMPLEX, 0.4, colour, 1, cv2.LINE_AA)
 
 
 def _width(text: str) -> int:
@@ -267,22 +251,99 @@ def track_metrics(model: HeadModel, targets: list[Target], vertices: np.ndarray)
             used, total = used + int(inliers.sum()), total + inliers.size
         table[target.observation.expression] = row
     values = [value for row in table.values() for value in row.values()]
+    terms = [target.terms for target in targets]
+    marked = 0  # views whose irises or visible jaw line were fitted
+    for own in terms:
+        seen = [one for term in own if isinstance(term, PixelTerm) for one in term.sightings]
+        marked += len({sighting.camera.id for sighting in seen if len(sighting.rows)})
     return {
         "expressions": len(targets),
         "landmark_rms_px": table,
         "landmark_rms_px_mean": round(float(np.mean(values)), 4) if values else None,
         "landmarks_used": used,
         "landmarks_seen": total,
-        "outline_views": sum(
-            isinstance(term, OutlineTerm) for target in targets for term in target.terms
-        ),
-        "marked_views": sum(map(_marked_views, targets)),
+        "outline_views": sum(isinstance(term, OutlineTerm) for own in terms for term in own),
+        "marked_views": marked,
         "head": model.name,
     }
 
 
-def _marked_views(target: Target) -> int:
-    """Count the views whose irises or visible jaw line were fitted."""
-    terms = [term for term in target.terms if isinstance(term, PixelTerm)]
-    seen = [sighting for term in terms for sighting in term.sightings]
-    return len({sighting.camera.id for sighting in seen if len(sighting.rows)})
+def suspect_cameras(
+    targets: list[Target], marks: np.ndarray, rotations: np.ndarray, middles: np.ndarray
+) -> dict[str, dict[str, object]]:
+    """Find cameras whose landmarks are displaced in the same way in every expression.
+
+    A detector errs differently from face to face; a camera that was moved or calibrated wrongly is
+    off by the same pixels, scale or turn every time. `calibrate` checks cameras too, on features of
+    its own frames; this check sees the frames that are tracked, and so a camera that was moved
+    between calibration and take.
+
+    Args:
+        targets: E expressions; views that were refused count here too.
+        marks: (E, 68, 3) fitted landmarks, world.
+        rotations: (E, 3, 3) world from head.
+        middles: (E, 3) middle of each head, world.
+
+    Returns:
+        Camera to `offset_px` (mean offset x, y from the expected place), `of_face` (that as a
+        share of the face's size), `scale` (seen over expected), `roll_deg` (clockwise in the
+        picture) and `expressions` (their number).
+    """
+    seen: dict[str, list[np.ndarray]] = {}
+    for target, points, rotation, middle in zip(targets, marks, rotations, middles, strict=True):
+        for view in (*target.observation.views, *target.observation.refused):
+            known = np.isfinite(view.sigma)
+            known[:17] = False
+            if facing(view, rotation, middle) > FACING and known.any():
+                seen.setdefault(view.camera_id, []).append(_deviation(view, points, known))
+    enough = {name: np.stack(rows) for name, rows in seen.items() if len(rows) >= LEAST_EXPRESSIONS}
+    if len(enough) < LEAST_CAMERAS:
+        return {}
+    # What all cameras have in common in scale and roll is the fit's error.
+    common = np.median([rows.mean(0) for rows in enough.values()], axis=0) * [0, 0, 0, 0, 1, 1]
+    off = set()
+    for kind, least in (SHARE, 0.03), (SCALE, 0.06), (ROLL, 0.06):
+        table = {name: (rows - common)[:, kind] for name, rows in enough.items()}
+        lengths = {name: float(np.linalg.norm(rows.mean(0))) for name, rows in table.items()}
+        for name, rows in table.items():
+            others = float(np.median([lengths[other] for other in table if other != name]))
+            error = float(np.linalg.norm(rows.std(0, ddof=1))) / len(rows) ** 0.5
+            if lengths[name] > max(least, OVER_OTHERS * others, OVER_ERROR * error):
+                off.add(name)
+    return {
+        name: {
+            "offset_px": [round(float(value), 2) for value in rows[:, PIXELS].mean(0)],
+            "of_face": round(float(np.linalg.norm(rows[:, SHARE].mean(0))), 4),
+            "scale": round(math.exp(rows[:, SCALE].mean()), 3),
+            "roll_deg": round(math.degrees(rows[:, ROLL].mean()), 2),
+            "expressions": len(rows),
+        }
+        for name, rows in sorted(enough.items()) if name in off
+    }  # fmt: skip
+
+
+def _deviation(view: LandmarkView, points: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """Compare a view's known landmarks with the fitted ones (68, 3): PIXELS, SHARE, SCALE, ROLL."""
+    pixels, _ = project_pinhole(view.camera, points)
+    size = max(float(np.ptp(pixels, axis=0).max()), 1.0)
+    offset = np.median((view.points - pixels)[known], axis=0)
+    seen, expected = (
+        (p[known] - np.median(p[known], axis=0)) @ [1, 1j] for p in (view.points, pixels)
+    )
+    ratio = complex((seen * expected.conj()).sum() / max(float((abs(expected) ** 2).sum()), 1e-12))
+    if abs(ratio) < 1e-6:  # all seen points coincide
+        ratio = 1.0 + 0j
+    return np.r_[offset, offset / size, math.log(abs(ratio)), math.atan2(ratio.imag, ratio.real)]
+
+
+def camera_warnings(suspects: dict[str, dict[str, object]]) -> list[Note]:
+    """Write the result of `suspect_cameras` as warnings."""
+    return [
+        Note(
+            f"camera {name}",
+            f"its landmarks are off by {row['offset_px']} px ({row['of_face']:.0%} of the face),"
+            f" {row['scale']} times the expected size and turned by {row['roll_deg']} degrees, in"
+            " every expression; check its calibration",
+        )
+        for name, row in suspects.items()
+    ]

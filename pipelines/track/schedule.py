@@ -11,16 +11,14 @@ from dataclasses import asdict, dataclass, replace
 import numpy as np
 
 from express50.head.model import HeadModel
-from pipelines.track.baldness import is_bald
 from pipelines.track.basis import ALONG, OFF, Basis
-from pipelines.track.crops import FrameSetCrops, root_light
 from pipelines.track.eyes_and_jaw import EyeOffsets, with_irises_and_jaw
-from pipelines.track.face_uv import slide_term, with_slide
-from pipelines.track.face_uv_map import FaceUvMap, reading_map
+from pipelines.track.face_uv import FaceUvMap, reading_map, slide_term, with_slide
 from pipelines.track.fit import fit
-from pipelines.track.outline import outline_terms
-from pipelines.track.photo_consistency import SkinSamples, patch_terms
+from pipelines.track.outline import BALD_SHARE, bare_share, outline_terms
+from pipelines.track.photo_consistency import SkinSamples, patch_terms, skin_samples
 from pipelines.track.state import State, Target, all_vertices, rotations
+from pipelines.track.surface import FrameSetCrops, root_light
 from pipelines.track.terms import NormalTerm, SlideTerm
 
 LANDMARK_STEPS = 14  # of the first fit, to landmarks alone; 6 measure the same on the twin
@@ -86,7 +84,6 @@ class SubjectEvidence:
     """Inputs that all rounds of a subject share.
 
     Attributes:
-        model: the head model.
         pictures: of every expression's frame set.
         skin: where the surface is searched for.
         uv_map: of the face; None if no round reads it.
@@ -94,7 +91,6 @@ class SubjectEvidence:
         bald: the skull is bare.
     """
 
-    model: HeadModel
     pictures: list[FrameSetCrops]
     skin: SkinSamples
     uv_map: FaceUvMap | None
@@ -112,56 +108,38 @@ def gather(
 ) -> SubjectEvidence:
     """Prepare what the rounds share; `meshes` (E, V, 3) are of the fit to landmarks."""
     shown = next((k for k, one in enumerate(pictures) if one.crops), None)
-    bald = shown is not None and is_bald(
-        model, [root_light(crop) for crop in pictures[shown].crops], meshes[shown]
-    )
+    bald = False
+    if shown is not None:
+        images = [root_light(crop) for crop in pictures[shown].crops]
+        bald = bare_share(model, images, meshes[shown]) > BALD_SHARE
     uv_map = reading_map(model) if any(one.read_uv for one in schedule) else None
-    return SubjectEvidence(model, pictures, SkinSamples.of(model, samples), uv_map, eyes, bald)
+    return SubjectEvidence(pictures, skin_samples(model, samples), uv_map, eyes, bald)
 
 
 def refine(
     basis: Basis, targets: list[Target], state: State, evidence: SubjectEvidence, schedule: Schedule
 ) -> tuple[State, list[Target]]:
     """Run the rounds; also returns the targets with the last round's terms."""
+    model, found = basis.model, targets
     slides: list[SlideTerm | None] = [None] * len(targets)
-    found = targets
+    outlines = sum(len(one.distances) for one in evidence.pictures)
     for one in schedule:
-        meshes, turns = all_vertices(basis.model, state), rotations(state)
-        if one.read_uv and evidence.uv_map is not None:
-            slides = [
-                slide_term(evidence.model, evidence.uv_map, *pair)
-                for pair in zip(evidence.pictures, meshes, strict=True)
-            ]
-        found = [
-            collect(one, evidence, index, target, meshes[index], turns[index], slides[index])
-            for index, target in enumerate(targets)
-        ]
+        meshes, turns, found = all_vertices(model, state), rotations(state), []
+        for index, (target, pictures) in enumerate(zip(targets, evidence.pictures, strict=True)):
+            mesh, terms = meshes[index], [*target.terms]
+            if one.outlines:
+                terms += outline_terms(model, pictures.distances, mesh, outlines, evidence.bald)
+            if one.patch_reach_m:
+                reach, weight = one.patch_reach_m, one.patch_weight
+                terms += patch_terms(model, evidence.skin, pictures, mesh, reach, weight)
+            if one.read_uv and evidence.uv_map is not None:
+                slides[index] = slide_term(model, evidence.uv_map, pictures, mesh)
+            seen = replace(target, terms=tuple(terms))
+            seen = with_irises_and_jaw(model, seen, mesh, turns[index], evidence.eyes)
+            found.append(with_slide(seen, slides[index]))
         kinds = {type(term) for target in found for term in target.terms}
         free = tuple(
             name for kind, name in ((NormalTerm, OFF), (SlideTerm, ALONG)) if kind in kinds
         )
         state, _ = fit(basis, found, state, ROUND_STEPS, free)
     return state, found
-
-
-def collect(
-    one: Round,
-    evidence: SubjectEvidence,
-    index: int,
-    target: Target,
-    mesh: np.ndarray,
-    rotation: np.ndarray,
-    slide: SlideTerm | None,
-) -> Target:
-    """Add a round's terms to the target of one expression, on its current mesh (V, 3)."""
-    model, pictures = evidence.model, evidence.pictures[index]
-    terms = list(target.terms)
-    if one.outlines:
-        count = sum(len(each.distances) for each in evidence.pictures)
-        terms += outline_terms(model, pictures.distances, mesh, count, evidence.bald)
-    if one.patch_reach_m:
-        reach, weight = one.patch_reach_m, one.patch_weight
-        terms += patch_terms(model, evidence.skin, pictures, mesh, reach, weight)
-    target = replace(target, terms=tuple(terms))
-    target = with_irises_and_jaw(model, target, mesh, rotation, evidence.eyes)
-    return with_slide(target, slide)

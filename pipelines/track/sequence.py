@@ -1,4 +1,4 @@
-"""Track one window of a clip with the peaks' shape: frame by frame, then smoothed both ways.
+"""Track clips with the peaks' shape: frame by frame, then smoothed both ways, window by window.
 
 The shape is folded into the head model's rest, so the fit of the peaks serves here too. Each frame
 starts from its neighbour and is fitted to its landmarks, then to the surface that its pictures
@@ -10,17 +10,26 @@ sweeps reach, and the overlap is dropped, so window ends do not show.
 
 from __future__ import annotations
 
+import io
+import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 import torch
 
-from pipelines.track.basis import POSE_SIZE, Basis
-from pipelines.track.crops import FrameSetCrops
+from express50.capture.index import Cue
+from express50.contract.stage import Note
+from express50.dataset.tracks import SEQUENCE_SCHEMA
+from express50.errors import FormatError, StageError
+from express50.files.arrays import read_arrays
+from express50.files.atomic import write_bytes
+from express50.files.digests import text_digest
+from pipelines.track.basis import POSE_SIZE, Basis, Points
+from pipelines.track.config import VERSION
 from pipelines.track.eyes_and_jaw import EyeOffsets, lid_terms, with_irises_and_jaw
-from pipelines.track.face_uv import slide_term, with_slide
-from pipelines.track.face_uv_map import FaceUvMap
+from pipelines.track.face_uv import FaceUvMap, slide_term, with_slide
 from pipelines.track.fit import fit
 from pipelines.track.observe import Observation
 from pipelines.track.photo_consistency import SkinSamples, patch_terms
@@ -34,6 +43,7 @@ from pipelines.track.state import (
     posed_sigma,
     start_state,
 )
+from pipelines.track.surface import FrameSetCrops
 from pipelines.track.terms import MeshPlaces, PointTerm, landmark_anchors
 
 WINDOW = 48  # frames tracked in one piece, and kept if the run is stopped
@@ -47,21 +57,17 @@ REACH_SHARE, FIRST_TRUST = 0.5, 0.3
 
 Pictures = Callable[[int, np.ndarray], FrameSetCrops]
 """Crops of a frame about its mesh (V, 3)."""
+Observe = Callable[[str, Sequence[int]], list[Observation]]
+"""Observations of frames of a cue."""
 
 
 @dataclass(frozen=True)
 class ClipTracker:
-    """Settings and helpers for tracking windows of one person.
+    """Settings and helpers for tracking windows of one person, whose basis is of `freeze_shape`.
 
-    Attributes:
-        person: basis of one person, from `freeze_shape`.
-        stride: frames between tracked frames.
-        eyes: from `measure_eyes`.
-        skin: where the surface is searched for.
-        uv_map: of the face, on which landmarks are found anew; None for none.
-        pictures: reads a frame's crops; None fits landmarks alone.
-        rounds: of searching for the surface per frame.
-        sweeps: of smoothing.
+    Every `stride`-th frame is tracked. `eyes`, `skin` and `uv_map` are those of the peaks' rounds;
+    the surface is searched for in so many `rounds` per frame, if `pictures` reads its crops; then
+    come the `sweeps` of smoothing.
     """
 
     person: Basis
@@ -72,14 +78,6 @@ class ClipTracker:
     pictures: Pictures | None = None
     rounds: int = 0
     sweeps: int = SWEEPS
-
-
-@dataclass(frozen=True)
-class ClipWindow:
-    """A run of frames to fit, and the slice of them to keep."""
-
-    frames: tuple[int, ...]
-    kept: slice
 
 
 def freeze_shape(basis: Basis, shape: np.ndarray, bias: np.ndarray) -> Basis:
@@ -103,23 +101,17 @@ def freeze_shape(basis: Basis, shape: np.ndarray, bias: np.ndarray) -> Basis:
 
 def make_windows(
     frames: Sequence[int], size: int = WINDOW, sweeps: int = SWEEPS
-) -> list[ClipWindow]:
-    """Cut frames into overlapping windows; every frame is kept by exactly one."""
+) -> list[tuple[Sequence[int], Sequence[int]]]:
+    """Cut frames into overlapping windows to fit, each with the frames that it alone keeps."""
     overlap = 2 * sweeps + 2
-    windows = []
-    for first in range(0, len(frames), size):
-        last = min(first + size, len(frames))
-        low, high = max(0, first - overlap), min(len(frames), last + overlap)
-        windows.append(ClipWindow(tuple(frames[low:high]), slice(first - low, last - low)))
-    return windows
+    return [
+        (frames[max(0, first - overlap) : first + size + overlap], frames[first : first + size])
+        for first in range(0, len(frames), size)
+    ]
 
 
 def track_window(tracker: ClipTracker, observations: list[Observation]) -> list[Pose]:
-    """Find the poses of the frames of one window.
-
-    Args:
-        tracker: person and settings.
-        observations: F of them, in order of their frames.
+    """Find the poses of the frames of one window, observed in their order.
 
     Raises:
         StageError: a frame cannot be fitted.
@@ -180,7 +172,7 @@ def _sweep(
     """Fit every second frame once more, towards where its neighbours are."""
     person, stride = tracker.person, tracker.stride
     marks = landmark_anchors(person.model)
-    spread = MeshPlaces.of_vertices(_spread_vertices(person))
+    spread = MeshPlaces.of_vertices(_spread_vertices(person.model.template.numpy()))
     redundancy = ((len(marks.vertices) + SPREAD_VERTICES) / EFFECTIVE_POINTS) ** 0.5
     frames = [target.observation.frame for target in targets]
     meshes = [all_vertices(person.model, State(np.zeros(0), (pose,)))[0] for pose in poses]
@@ -221,9 +213,8 @@ def _expected(
     return None, 0.0
 
 
-def _spread_vertices(basis: Basis) -> np.ndarray:
-    """Choose vertices all over the head, each the furthest from those before it."""
-    places = basis.model.template.numpy()
+def _spread_vertices(places: np.ndarray) -> np.ndarray:
+    """Choose vertices all over a head (V, 3), each the furthest from those before it."""
     chosen = [0]
     nearest = np.linalg.norm(places - places[0], axis=1)
     for _ in range(SPREAD_VERTICES - 1):
@@ -232,25 +223,126 @@ def _spread_vertices(basis: Basis) -> np.ndarray:
     return np.array(chosen)
 
 
-def sequence_arrays(
-    basis: Basis, frames: list[int], cues: list[str], poses: list[Pose]
-) -> dict[str, np.ndarray]:
-    """Make the arrays of sequence.npz, with the meaning they have in track.npz."""
-    own, count = np.stack([pose.own for pose in poses]), basis.expression_size
+def write_npz(path: Path, arrays: dict[str, np.ndarray]) -> None:
+    """Write arrays without pickled objects.
+
+    Raises:
+        StageError: one of them is not finite.
+    """
+    for name, array in arrays.items():
+        if array.dtype.kind == "f" and not np.isfinite(array).all():
+            raise StageError(f"{path.name}: {name} holds NaN or infinity; the fit diverged")
+    np.savez(path, **arrays)  # type: ignore[arg-type]  # numpy types its options
+
+
+def pose_arrays(poses: Sequence[Pose], expressions: int) -> dict[str, np.ndarray]:
+    """Make the arrays of F poses that track.npz and sequence.npz share; X `expressions`."""
+    own = np.stack([pose.own for pose in poses])
     return {
-        "frames": np.array(frames, dtype=np.int64),
-        "cues": np.array(cues),
-        "expression": own[:, :count],
-        "neck": own[:, count : count + 3],
-        "jaw": own[:, count + 3 : count + 6],
-        "eyes": own[:, count + 6 : count + POSE_SIZE - 6],
+        "expression": own[:, :expressions],
+        "neck": own[:, expressions : expressions + 3],
+        "jaw": own[:, expressions + 3 : expressions + 6],
+        "eyes": own[:, expressions + 6 : expressions + 12],
         "R": np.stack([pose.rotation for pose in poses]),
         "t": own[:, -3:],
     }
 
 
+def write_clips(
+    out: Path,
+    tracker: ClipTracker,
+    head: str,
+    shape: np.ndarray,
+    cues: tuple[Cue, ...],
+    observe: Observe,
+    keep: Path,
+    identity: str,
+) -> tuple[dict, list[Note]]:
+    """Track every frame of every cue window and write out/sequence.npz (docs/FORMAT.md).
+
+    Finished windows lie in `keep` under a digest of everything they depend on, so a run after a
+    crash continues where the last one stopped; they go once the sequence is written.
+
+    `head` names the head model, `shape` (S,) are its own coefficients; `identity` says which
+    inputs, settings and fit of the peaks the windows are of.
+
+    Returns:
+        Metrics (`frames`, `jitter_mm` per cue), and dropped frames.
+
+    Raises:
+        StageError: no frame of any cue shows a face.
+    """
+    folder = keep / text_digest(f"{VERSION} {identity}")[:16]
+    rows: list[tuple[str, int, Pose]] = []
+    dropped: list[Note] = []
+    for cue in cues:
+        frames = list(range(cue.start_frame, cue.end_frame + 1, tracker.stride))
+        found: dict[int, Pose] = {}
+        windows = make_windows(frames, sweeps=tracker.sweeps)
+        for number, (fitted, kept) in enumerate(windows):
+            file = folder / f"{cue.expression_id}_{number:04d}.npz"
+            done = _read_window(file)
+            if done is None:
+                seen = observe(cue.expression_id, fitted)
+                pairs = zip(seen, track_window(tracker, seen), strict=True)
+                done = {one.frame: pose for one, pose in pairs if one.frame in kept}
+                _write_window(file, done, tracker.person.expression_size)
+            found |= done
+        rows += [(cue.expression_id, frame, found[frame]) for frame in sorted(found)]
+        lost = len(frames) - len(found)
+        if lost:
+            why = f"{lost} of {len(frames)} frames show no face that cameras agree on"
+            dropped.append(Note(f"{cue.expression_id} (clip)", why))
+    if not rows:
+        raise StageError("no frame of any clip shows a face; check the peaks' overlays")
+    names, numbers, poses = zip(*rows, strict=True)
+    arrays = {"frames": np.array(numbers, dtype=np.int64), "cues": np.array(names)}
+    arrays |= pose_arrays(poses, tracker.person.expression_size)
+    arrays |= {"schema": np.array(SEQUENCE_SCHEMA), "head": np.array(head), "shape": shape}
+    write_npz(out / "sequence.npz", arrays)
+    # Only publishing is left; a run that ends before that tracks the clips again.
+    shutil.rmtree(keep, ignore_errors=True)
+    return {"frames": len(rows), "jitter_mm": _jitter(tracker, rows)}, dropped
+
+
+def _write_window(file: Path, poses: dict[int, Pose], expressions: int) -> None:
+    buffer = io.BytesIO()
+    rows = [poses[frame] for frame in sorted(poses)]
+    np.savez(
+        buffer,
+        frames=np.array(sorted(poses), dtype=np.int64),
+        own=np.array([pose.own for pose in rows]).reshape(-1, expressions + POSE_SIZE),
+        rotation=np.array([pose.rotation for pose in rows]).reshape(-1, 3, 3),
+    )
+    write_bytes(file, buffer.getvalue())
+
+
+def _read_window(file: Path) -> dict[int, Pose] | None:
+    """Read a window that a former run finished; None if it did not."""
+    if not file.is_file():
+        return None
+    try:
+        data = read_arrays(file, FormatError, "a window", ("frames", "own", "rotation"))
+        rows = zip(data["frames"].tolist(), data["own"], data["rotation"], strict=True)
+        return {frame: Pose(own, rotation) for frame, own, rotation in rows}
+    except (FormatError, ValueError, TypeError):
+        return None  # damaged: tracked anew
+
+
+def _jitter(tracker: ClipTracker, rows: list[tuple[str, int, Pose]]) -> dict[str, float]:
+    """Return the mean second difference of vertices, mm, per cue; runs with gaps are skipped."""
+    person = tracker.person
+    points = Points(person, np.arange(0, len(person.model.template), 7))
+    found = {}
+    for cue in sorted({row[0] for row in rows}):
+        frames, poses = zip(*(row[1:] for row in rows if row[0] == cue), strict=True)
+        if len(frames) < 3 or (np.diff(frames) != tracker.stride).any():
+            continue
+        meshes = np.stack([points.evaluate(pose.own, pose.rotation) for pose in poses])
+        found[cue] = round(jitter_mm(meshes), 4)
+    return found
+
+
 def jitter_mm(vertices: np.ndarray) -> float:
     """Return the mean second difference in time of vertices (F, V, 3), millimetres."""
-    if len(vertices) < 3:
-        return 0.0
     return 1e3 * float(np.linalg.norm(np.diff(vertices, n=2, axis=0), axis=2).mean())

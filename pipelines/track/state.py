@@ -130,12 +130,8 @@ def posed_sigma(
 def initial_pose(observation: Observation, template: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Find rotation (3, 3) and translation (3,) with world = R @ head + t.
 
-    Uses triangulated landmarks where enough exist (and checks that their size is a head's), else
-    perspective-n-point in the surest view.
-
-    Args:
-        observation: Views of one expression.
-        template: (68, 3) landmarks of the head model, metres.
+    Uses triangulated landmarks where enough exist (and checks that their size is that of the head
+    model's, `template` (68, 3)), else perspective-n-point in the surest view.
 
     Raises:
         RigScaleError: the rig's unit is not the metre.
@@ -209,22 +205,21 @@ def prior(
         np.array(JAW_SIGMA) * [share, 1.0, 1.0],
         np.full(6, EYE_SIGMA),
     ]
-    residuals = [np.r_[residual, own[count : count + 12] / sigmas]]
-    rows = [np.eye(count + 12, size) * np.r_[slope, 1.0 / sigmas][:, None]]
+    single = np.r_[residual, own[count : count + 12] / sigmas]
     eyes = count + 6
     difference = np.zeros((3, size))
     difference[:, eyes : eyes + 3] = np.eye(3) / EYE_DIFFERENCE_SIGMA
     difference[:, eyes + 3 : eyes + 6] = -np.eye(3) / EYE_DIFFERENCE_SIGMA
-    rows.append(difference)
-    residuals.append(difference @ own)
-    walls = [_wall(own, size, np.array([count + 3]), 0.0, -JAW_CLOSED_SIGMA)]
+    parts = [
+        (single, np.eye(count + 12, size) * np.r_[slope, 1.0 / sigmas][:, None]),
+        (difference @ own, difference),
+        _wall(own, np.array([count + 3]), 0.0, -JAW_CLOSED_SIGMA),
+    ]
     if model.unit_expressions:
         ids = np.arange(count)
-        walls += [_wall(own, size, ids, 0.0, -BELOW_SIGMA), _wall(own, size, ids, 1.0, ABOVE_SIGMA)]
-    for residual, slope in walls:
-        residuals.append(residual)
-        rows.append(slope)
-    return np.concatenate(residuals), np.concatenate(rows)
+        parts += [_wall(own, ids, 0.0, -BELOW_SIGMA), _wall(own, ids, 1.0, ABOVE_SIGMA)]
+    residuals, slopes = zip(*parts, strict=True)
+    return np.concatenate(residuals), np.concatenate(slopes)
 
 
 def _few(activations: np.ndarray, active: float, mean: float) -> tuple[np.ndarray, np.ndarray]:
@@ -242,11 +237,11 @@ def _few(activations: np.ndarray, active: float, mean: float) -> tuple[np.ndarra
 
 
 def _wall(
-    own: np.ndarray, size: int, ids: np.ndarray, limit: float, sigma: float
+    own: np.ndarray, ids: np.ndarray, limit: float, sigma: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Penalise unknowns beyond a limit; a negative sigma is a wall from below."""
     beyond = np.maximum((own[ids] - limit) / sigma, 0.0)
     active = np.flatnonzero(beyond > 0)
-    slope = np.zeros((len(active), size))
+    slope = np.zeros((len(active), len(own)))
     slope[np.arange(len(active)), ids[active]] = 1.0 / sigma
     return beyond[active], slope

@@ -1,16 +1,20 @@
-"""Samples of the skin, and how well each camera sees them."""
+"""What cameras show of the skin: head crops, samples of the skin, and how well each sees them."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 import open3d as o3d
 
-from express50.geometry.cameras import Camera
+from express50.files.images import LIGHT_OF_LEVEL, resize_area
+from express50.geometry.cameras import Camera, crop_camera, inside_frame, project_pinhole, resized
 from express50.geometry.raycast import mesh_scene
+from express50.geometry.sampling import bilinear_slope
 from express50.head.model import HeadModel
-from pipelines.track.crops import FrameSetCrops, matte_weights
+from pipelines.track.basis import in_regions
+from pipelines.track.terms import MeshPlaces
 
 SEEN = (
     "face", "nose", "lips",
@@ -24,43 +28,100 @@ TOUCH_M = 3e-4
 # What hides a sample is part of the head: rays begin so far before it, none behind its camera.
 HEAD_M = 0.5
 GRAZING = 0.25
+MARGIN = 0.15  # about the head in its crop, as a share of the head's size
 
 
 @dataclass(frozen=True)
-class Samples:
-    """Fixed places on a mesh.
+class HeadCrop:
+    """One camera's picture (H, W, 3) uint8 sRGB of a frame set, cropped to the head.
 
-    Attributes:
-        faces: (S,) face ids.
-        corners: (S, 3) vertex ids.
-        bary: (S, 3) barycentric weights.
+    `camera` is the crop's; `alpha` (H, W) uint8 is 255 where the subject is, None without a matte.
     """
 
-    faces: np.ndarray
-    corners: np.ndarray
-    bary: np.ndarray
-
-    def some(self, ids: np.ndarray | slice) -> Samples:
-        """Choose samples by index, mask or slice."""
-        return Samples(self.faces[ids], self.corners[ids], self.bary[ids])
-
-    def at(self, vertices: np.ndarray) -> np.ndarray:
-        """Place the samples (S, 3) on vertices (V, 3)."""
-        return np.einsum("sk,skc->sc", self.bary, vertices[self.corners])
+    camera: Camera
+    image: np.ndarray
+    alpha: np.ndarray | None
 
 
-def spread(model: HeadModel, count: int, regions: tuple[str, ...] = SEEN) -> Samples:
+@dataclass(frozen=True)
+class SignedDistance:
+    """Signed distance (H, W) to a matte's edge in pixels of its camera, positive outside.
+
+    A cell is `step` (2,) pixels of the camera wide and high.
+    """
+
+    values: np.ndarray
+    camera: Camera
+    step: np.ndarray
+
+
+@dataclass(frozen=True)
+class FrameSetCrops:
+    """The pictures of one frame set: distances to its mattes' outlines, and head crops."""
+
+    distances: tuple[SignedDistance, ...]
+    crops: tuple[HeadCrop, ...]
+
+
+def cut_crop(
+    camera: Camera, image: np.ndarray, alpha: np.ndarray | None, mesh: np.ndarray, side: int
+) -> HeadCrop | None:
+    """Crop an undistorted frame (H, W, 3) to a mesh (V, 3) and shrink it to at most `side` pixels.
+
+    Returns None where the head is behind the camera or (almost) outside the frame.
+    """
+    pixels, depth = project_pinhole(camera, mesh)
+    if (depth <= 1e-3).any():
+        return None
+    low, high = pixels.min(0), pixels.max(0)
+    grow = MARGIN * (high - low).max()
+    x0, y0 = np.maximum(np.floor(low - grow), 0).astype(int).tolist()
+    x1, y1 = np.minimum(np.ceil(high + grow), (camera.width, camera.height)).astype(int).tolist()
+    if min(x1 - x0, y1 - y0) < 8:
+        return None
+    seen = crop_camera(camera, x0, y0, x1 - x0, y1 - y0)
+    image = np.ascontiguousarray(image[y0:y1, x0:x1])
+    alpha = None if alpha is None else np.ascontiguousarray(alpha[y0:y1, x0:x1])
+    step = max(seen.width, seen.height) / side
+    if step > 1.0:
+        width, height = max(8, round(seen.width / step)), max(8, round(seen.height / step))
+        seen = resized(seen, width, height)
+        image = resize_area(image, width, height)
+        alpha = None if alpha is None else resize_area(alpha, width, height)
+    return HeadCrop(seen, image, alpha)
+
+
+def root_light(crop: HeadCrop) -> tuple[np.ndarray, Camera]:
+    """Return a crop's root of linear light (h, w, 3) float32, and its camera.
+
+    In the root of light a surface's colour, the light on it and a camera's gain still multiply,
+    and shot noise is the same everywhere (Anscombe 1948).
+    """
+    return np.sqrt(cv2.GaussianBlur(LIGHT_OF_LEVEL[crop.image], (0, 0), 0.7)), crop.camera
+
+
+def matte_weights(crop: HeadCrop, places: np.ndarray) -> np.ndarray:
+    """Weigh places (S, 3) by the matte (S,): 0 outside the picture or the subject, at most 1."""
+    pixels, inside = inside_frame(crop.camera, places)
+    if crop.alpha is None:
+        return inside.astype(np.float64)
+    size = np.array([crop.camera.width, crop.camera.height])
+    column, row = np.clip(pixels.astype(np.int64), 0, size - 1).T
+    return inside * (crop.alpha[row, column] / 255.0)
+
+
+def look_up(camera: Camera, image: np.ndarray, places: np.ndarray) -> np.ndarray:
+    """Interpolate a picture (H, W, C) at world points (S, 3): values (S, C)."""
+    return bilinear_slope(image, project_pinhole(camera, places)[0])[0]
+
+
+def spread(model: HeadModel, count: int, regions: tuple[str, ...] = SEEN) -> MeshPlaces:
     """Spread about `count` samples evenly by area over the skin of the template's regions.
 
     The same model, count and regions give the same samples.
     """
     faces = model.faces.numpy()
-    none = np.zeros(len(model.template), dtype=bool)
-
-    def union(names: tuple[str, ...]) -> np.ndarray:
-        return np.any([none, *(model.regions[n].numpy() for n in names if n in model.regions)], 0)
-
-    allowed = (union(regions) & ~union(HIDDEN))[faces].all(1)
+    allowed = (in_regions(model, regions) & ~in_regions(model, HIDDEN))[faces].all(1)
     # A head that names no such region is taken to be skin all over.
     ids = np.flatnonzero(allowed) if allowed.any() else np.arange(len(faces))
     corners = model.template.double().numpy()[faces[ids]]
@@ -74,7 +135,7 @@ def spread(model: HeadModel, count: int, regions: tuple[str, ...] = SEEN) -> Sam
     u, v = (0.5 + 0.7548776662466927 * step) % 1.0, (0.5 + 0.5698402909980532 * step) % 1.0
     root = np.sqrt(u)
     bary = np.stack([1 - root, root * (1 - v), root * v], axis=1)
-    return Samples(chosen, faces[chosen], bary)
+    return MeshPlaces(faces[chosen], bary)
 
 
 def flat_barycentrics(corners: np.ndarray, points: np.ndarray) -> np.ndarray:
@@ -89,9 +150,9 @@ def flat_barycentrics(corners: np.ndarray, points: np.ndarray) -> np.ndarray:
     return bary / bary.sum(1, keepdims=True)
 
 
-def sample_normals(samples: Samples, vertices: np.ndarray) -> np.ndarray:
+def sample_normals(samples: MeshPlaces, vertices: np.ndarray) -> np.ndarray:
     """Return unit normals (S, 3) of the samples' faces on vertices (V, 3)."""
-    a, b, c = (vertices[samples.corners[:, k]] for k in range(3))
+    a, b, c = (vertices[samples.vertices[:, k]] for k in range(3))
     normal = np.cross(b - a, c - a)
     return normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
 
@@ -134,3 +195,14 @@ def view_weights(
         for crop in pictures.crops
     ]
     return np.array(rows).reshape(-1, len(places))
+
+
+def view_colours(
+    images: list[tuple[np.ndarray, Camera]], weights: np.ndarray, places: np.ndarray
+) -> np.ndarray:
+    """Look places (S, 3) up in C pictures of `root_light`: (C, S, 3), 0 where they weigh 0."""
+    values = np.zeros((*weights.shape, 3))
+    for value, weight, (image, camera) in zip(values, weights, images, strict=True):
+        seen = np.flatnonzero(weight)
+        value[seen] = look_up(camera, image, places[seen])
+    return values

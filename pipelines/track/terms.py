@@ -12,8 +12,7 @@ from typing import Protocol
 
 import numpy as np
 
-from express50.geometry.cameras import Camera
-from express50.geometry.pinhole import project_with_slope
+from express50.geometry.cameras import Camera, project_with_slope
 from express50.head.model import HeadModel
 
 HUBER = 1.5  # standard deviations beyond which a residual counts by its length, not its square
@@ -26,11 +25,9 @@ Residuals = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 @dataclass(frozen=True)
 class MeshPlaces:
-    """Places on a mesh: weighted sums of its vertices.
+    """Places on a mesh: sums of its `vertices` (n, k), ids, with weights (n, k).
 
-    Attributes:
-        vertices: (n, k) vertex ids.
-        weights: (n, k); barycentric for a point of a face, of both signs for a difference.
+    Weights are barycentric for a point of a face, and of both signs for a difference.
     """
 
     vertices: np.ndarray
@@ -41,8 +38,8 @@ class MeshPlaces:
         """Vertices (n,) themselves."""
         return cls(ids[:, None], np.ones((len(ids), 1)))
 
-    def some(self, ids: np.ndarray) -> MeshPlaces:
-        """Choose places by index or mask."""
+    def some(self, ids: np.ndarray | slice) -> MeshPlaces:
+        """Choose places by index, mask or slice."""
         return MeshPlaces(self.vertices[ids], self.weights[ids])
 
     def minus(self, other: MeshPlaces) -> MeshPlaces:
@@ -79,11 +76,6 @@ class Term(Protocol):
         """Cost (m,) and weight (m,) of squared residuals (m,)."""
 
 
-def squared(square: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Least squares: no residual is an outlier."""
-    return 0.5 * square, np.ones_like(square)
-
-
 def huber(square: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Huber's loss: outliers keep a constant pull."""
     length = np.sqrt(square)
@@ -117,14 +109,7 @@ def information(term: Term, places: np.ndarray) -> tuple[np.ndarray, np.ndarray]
 
 @dataclass(frozen=True)
 class Sighting:
-    """Places seen by one camera.
-
-    Attributes:
-        camera: pinhole camera.
-        rows: (m,) places of the term.
-        pixels: (m, 2).
-        sigma: (m,) pixels.
-    """
+    """Pixels (m, 2) and sigmas (m,) at which a pinhole camera sees places `rows` (m,) of a term."""
 
     camera: Camera
     rows: np.ndarray
@@ -134,12 +119,7 @@ class Sighting:
 
 @dataclass(frozen=True)
 class PixelTerm:
-    """Reprojection errors: places should be seen at given pixels.
-
-    Attributes:
-        anchors: n places.
-        sightings: one per camera.
-    """
+    """Reprojection errors: places should be seen at given pixels."""
 
     anchors: MeshPlaces
     sightings: tuple[Sighting, ...]
@@ -154,20 +134,12 @@ class PixelTerm:
             slopes.append(slope / seen.sigma[:, None, None])
         return np.concatenate(rows), np.concatenate(values), np.concatenate(slopes)
 
-    def loss(self, square: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Huber's."""
-        return huber(square)
+    loss = staticmethod(huber)
 
 
 @dataclass(frozen=True)
 class PointTerm:
-    """Places should lie at points in space, as where neighbouring frames of a clip expect them.
-
-    Attributes:
-        anchors: n places.
-        goals: (n, 3) world.
-        sigma: metres.
-    """
+    """Places should lie at goals (n, 3), world, as neighbouring frames expect; sigma in metres."""
 
     anchors: MeshPlaces
     goals: np.ndarray
@@ -178,21 +150,15 @@ class PointTerm:
         slope = np.broadcast_to(np.eye(3) / self.sigma, (len(places), 3, 3))
         return np.arange(len(places)), (places - self.goals) / self.sigma, slope
 
-    def loss(self, square: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Huber's."""
-        return huber(square)
+    loss = staticmethod(huber)
 
 
 @dataclass(frozen=True)
 class NormalTerm:
     """Places should lie on the surface: only the distance along a normal counts.
 
-    Attributes:
-        anchors: n places.
-        goals: (n, 3) points of the surface, world.
-        normals: (n, 3) unit, world.
-        sigma: (n,) metres.
-        outlier: metres beyond which a point is more likely wrong than the mesh.
+    Goals (n, 3) and unit normals (n, 3) are of the world, sigma (n,) is in metres; a point further
+    off than `outlier` metres is more likely wrong than the mesh.
     """
 
     anchors: MeshPlaces
@@ -216,12 +182,7 @@ class NormalTerm:
 class SlideTerm:
     """Places should slide along the skin to where it belongs; the distance off it does not count.
 
-    Attributes:
-        anchors: n landmarks.
-        marks: (n,) which of the 68 they are.
-        goals: (n, 3) world.
-        normals: (n, 3) unit, world.
-        sigma: (n,) metres.
+    The places are the landmarks `marks` (n,) of the 68; the rest is as in NormalTerm.
     """
 
     anchors: MeshPlaces
@@ -244,11 +205,7 @@ class SlideTerm:
 
 @dataclass(frozen=True)
 class LidTerm:
-    """Differences between upper and lower lid of shut eyes should vanish, wherever the lids are.
-
-    Attributes:
-        anchors: n differences between landmarks.
-    """
+    """Differences between upper and lower lid of shut eyes should vanish, wherever the lids are."""
 
     anchors: MeshPlaces
 
@@ -259,4 +216,4 @@ class LidTerm:
 
     def loss(self, square: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Least squares."""
-        return squared(square)
+        return 0.5 * square, np.ones_like(square)

@@ -7,10 +7,15 @@ import numpy as np
 import pytest
 
 from annotations import align, observe
-from annotations.labels import AUTOMATIC, make_flag, make_mark
-from annotations.observe import observations
-from annotations.observe.stage import FACE
-from annotations.store import append_label, current_labels, read_labels
+from annotations.labels import (
+    AUTOMATIC,
+    append_label,
+    current_labels,
+    make_flag,
+    make_mark,
+    read_labels,
+)
+from annotations.observe.stage import FACE, SCHEMA, read_observations
 from annotations.suggestions import choose_reference, read_suggestions
 from express50.capture.index import read_index
 from express50.cli.main import main
@@ -35,7 +40,7 @@ def act(dataset, subject, strength=2.0, stride=1):
     folder = dataset.item_dir("observe", subject)
     folder.mkdir(parents=True, exist_ok=True)
     np.savez(
-        folder / "observations.npz", schema=observations.SCHEMA, cameras=np.array(["cam01"]),
+        folder / "observations.npz", schema=SCHEMA, cameras=np.array(["cam01"]),
         frames=frames, points=points[None].astype(np.float32),
         scores=np.ones((1, len(frames)), np.float32),
         faces=np.full((1, len(frames), FACE, FACE), 99, np.uint8),
@@ -59,7 +64,7 @@ def watched(dataset):
     return dataset
 
 
-def test_peaks_are_found_and_the_others_matched_to_the_reference(watched):
+def test_peaks_are_found_and_other_subjects_match_the_reference(watched):
     assert run(watched).ok
     for subject in ("S001", "S002"):
         rows = read_suggestions(watched, subject)
@@ -75,7 +80,7 @@ def test_peaks_are_found_and_the_others_matched_to_the_reference(watched):
     assert peaks(watched, "S002")["smile"]["frame"] == matched.frame
 
 
-def test_a_rerun_appends_nothing_and_the_references_label_moves_the_others(watched):
+def test_rerun_appends_nothing_and_a_label_of_the_reference_moves_other_suggestions(watched):
     assert run(watched).ok
     before = read_labels(watched, "S002")
     assert run(watched).count("skipped") == 2
@@ -89,7 +94,7 @@ def test_a_rerun_appends_nothing_and_the_references_label_moves_the_others(watch
     assert read_suggestions(watched, "S002")["jaw_open"].frame == pytest.approx(38, abs=1)
 
 
-def test_a_flag_of_the_reference_leaves_the_others_their_own_peaks(watched):
+def test_flagged_reference_leaves_other_subjects_their_own_peaks(watched):
     append_label(watched, make_flag(read_index(watched, "S001"), "smile", "failed", "ann"))
     assert run(watched).ok
     assert "smile" not in peaks(watched, "S001")
@@ -97,7 +102,7 @@ def test_a_flag_of_the_reference_leaves_the_others_their_own_peaks(watched):
     assert read_suggestions(watched, "S002")["jaw_open"].kind == "match"
 
 
-def test_another_reference_is_matched_to(watched):
+def test_choosing_another_reference_matches_to_it(watched):
     assert run(watched).ok
     choose_reference(watched, "S002")
     assert run(watched).count("done") == 2
@@ -122,7 +127,7 @@ def test_unsure_suggestions_wait_for_a_person(dataset):
     assert set(peaks(dataset, "S001")) == set(EXPRESSIONS)
 
 
-def test_people_can_label_whom_no_camera_saw(dataset):
+def test_people_can_label_a_subject_without_observations(dataset):
     refused = run(dataset, ["S001"])
     assert not refused.ok
     assert "not observed" in refused.outcomes[0].reason
@@ -135,7 +140,7 @@ def test_people_can_label_whom_no_camera_saw(dataset):
     }  # fmt: skip
 
 
-def test_without_the_references_observations_everybody_keeps_their_own_peak(dataset):
+def test_unobserved_reference_leaves_every_subject_its_own_peak(dataset):
     act(dataset, "S002")
     assert run(dataset, ["S002"]).ok
     assert read_suggestions(dataset, "S002")["smile"].kind == "peak"
@@ -143,7 +148,7 @@ def test_without_the_references_observations_everybody_keeps_their_own_peak(data
     assert "S001 is not observed" in metrics["dropped"][0]["why"]
 
 
-def test_frames_between_those_observed_get_a_curve_too(dataset):
+def test_curves_cover_frames_between_observed_ones(dataset):
     act(dataset, "S001", stride=2)
     assert run(dataset, ["S001"]).ok
     row = read_suggestions(dataset, "S001")["smile"]
@@ -152,15 +157,15 @@ def test_frames_between_those_observed_get_a_curve_too(dataset):
     assert row.frame % 2 == 0
 
 
-def test_damaged_observations_are_named(dataset):
+def test_damaged_observations_raise_an_error_naming_the_file(dataset):
     act(dataset, "S001")
-    path = observations.observations_path(dataset, "S001")
+    path = dataset.observations_file("S001")
     path.write_bytes(path.read_bytes()[:200])
     with pytest.raises(FormatError, match="observations.npz"):
-        observations.read_observations(dataset, "S001")
+        read_observations(dataset, "S001")
 
 
-def test_a_suggestion_that_changed_takes_the_place_of_the_old_one(watched):
+def test_changed_suggestion_replaces_the_old_automatic_mark(watched):
     assert run(watched).ok
     index = read_index(watched, "S001")
     mark = make_mark(index, "smile", 30, "cam01", AUTOMATIC)
@@ -169,7 +174,7 @@ def test_a_suggestion_that_changed_takes_the_place_of_the_old_one(watched):
     assert peaks(watched, "S001")["smile"]["frame"] == pytest.approx(22, abs=1)
 
 
-def test_the_command_watches_first_and_says_when_there_is_no_face(dataset, capsys):
+def test_align_command_observes_first_and_reports_a_missing_face(dataset, capsys):
     surer = ["--workers", "0", "--set", "observe.min_score=1.0"]
     code = main(["align", str(dataset.root), *surer])
     lines = capsys.readouterr().out

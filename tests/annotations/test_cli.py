@@ -5,9 +5,9 @@ import json
 import numpy as np
 import pytest
 
-from annotations.agreement import MarkedClip, agreement, interval_alpha
+from annotations.validate import MarkedClip, agreement, interval_alpha
 from express50.cli.main import main
-from express50.contract.exclusions import included_subjects
+from express50.contract.layout import included_subjects
 
 from .labelled import EXPRESSIONS, make_dataset, suggest
 
@@ -32,7 +32,7 @@ def mark(annotate, who, expression, frame, subject="S001"):
     return annotate("mark", subject, expression, str(frame), "--annotator", who)
 
 
-def test_suggestions_come_doubtful_first_and_next_follows_them(annotate):
+def test_suggest_lists_least_sure_first_and_next_follows(annotate):
     assert [row["expression"] for row in annotate("suggest")] == ["smile", "neutral"]
     first = annotate("next", "--annotator", "ann", "--subject", "S001")
     assert [t["expression"] for t in first["tasks"]] == ["wink_left", "smile", "neutral"]
@@ -41,7 +41,7 @@ def test_suggestions_come_doubtful_first_and_next_follows_them(annotate):
     assert left["left"] == 2
 
 
-def test_mark_keeps_what_was_suggested_and_undo_takes_it_back(annotate):
+def test_mark_stores_the_suggestion_and_undo_removes_the_mark(annotate):
     label = mark(annotate, "ann", "smile", 15)
     assert (label["suggested"], label["confidence"], label["dhash"]) == (14, 0.2, f"{15:016x}")
     assert [row["frame"] for row in annotate("labels")] == [15]
@@ -58,7 +58,7 @@ def test_status_counts_people_rules_and_flags(annotate):
     assert status["annotators"]["ann"]["labels"] == 2
 
 
-def test_agreement_is_measured_and_a_disagreement_settled_keeps_both(annotate):
+def test_agree_measures_and_review_settles_without_losing_labels(annotate):
     for who, smile, wink in (("ann", 12, 24), ("bob", 18, 25)):
         mark(annotate, who, "smile", smile)
         mark(annotate, who, "wink_left", wink)
@@ -97,7 +97,9 @@ def test_alpha_is_krippendorffs_on_time_within_the_clip():
 
 
 @pytest.mark.parametrize("ending", ["csv", "json"])
-def test_export_and_import_lose_and_double_nothing(annotate, dataset, tmp_path, ending):
+def test_export_and_import_round_trip_without_loss_or_duplicates(
+    annotate, dataset, tmp_path, ending
+):
     mark(annotate, "ann", "smile", 14)
     annotate("flag", "S002", "smile", "failed: blinked, twice", "--annotator", "bob")
     annotate("exclude", "S002", "heavy makeup", "--annotator", "bob")
@@ -124,7 +126,7 @@ def test_import_of_another_datasets_frame_writes_nothing(annotate, dataset, tmp_
     assert not dataset.labels_file("S001").exists()
 
 
-def test_rule_marks_last_frames_once_and_people_stand_above(annotate):
+def test_rule_marks_last_frames_once_and_ranks_below_people(annotate):
     assert annotate("rule") == []  # no RenderMe-360 expression here
     marks = annotate("rule", "--expression", "smile", "--subject", "S001")
     assert [m["frame"] for m in marks] == [19]
@@ -133,7 +135,7 @@ def test_rule_marks_last_frames_once_and_people_stand_above(annotate):
     assert [row["frame"] for row in annotate("labels")] == [14]
 
 
-def test_exclusion_has_a_reason_and_an_end(annotate, dataset):
+def test_exclude_and_include_a_subject(annotate, dataset):
     annotate("exclude", "S002", "large glasses", "--annotator", "ann")
     report = annotate("coverage")
     assert report["excluded"] == {"S002": "large glasses"}
@@ -151,7 +153,7 @@ def test_validate_finds_a_frame_that_is_not_the_one_labelled(annotate, dataset):
     assert found["counts"]["identity"] == 1
 
 
-def test_a_line_that_cannot_be_read_is_named(annotate, dataset):
+def test_validate_counts_unreadable_lines(annotate, dataset):
     mark(annotate, "ann", "smile", 14)
     path = dataset.labels_file("S001")
     path.write_text("garbage\n" + path.read_text() + '{"a')
@@ -170,7 +172,7 @@ def test_a_line_that_cannot_be_read_is_named(annotate, dataset):
         (["exclude", "S001", " "], "S001"),
     ],
 )
-def test_mistakes_are_refused_in_one_line_that_names_them(annotate, dataset, capsys, words, named):
+def test_invalid_input_prints_one_line_naming_it(annotate, dataset, capsys, words, named):
     mark(annotate, "ann", "smile", 14)
     before = dataset.labels_file("S001").read_bytes()
     verb, *rest = words
@@ -188,14 +190,17 @@ def test_a_disagreement_is_settled_by_a_reason_in_words(annotate):
 
 
 @pytest.mark.parametrize(
-    ("change", "told"),
+    ("change", "named"),
     [
-        ({"frame": None}, "a mark without frame"),
-        ({"expression": "nope"}, "no expression 'nope'"),
-        ({"reason": "a\nb"}, "control characters"),
+        ({"frame": None}, "frame"),
+        ({"expression": "nope"}, "'nope'"),
+        ({"reason": "a\nb"}, repr("a\nb")),
+        ({"camera": "z"}, "'z'"),
+        ({"dhash": "f" * 16}, "f" * 16),
+        ({"pts": 3}, "pts 140"),
     ],
 )
-def test_import_refuses_what_no_verb_would_write(annotate, dataset, tmp_path, capsys, change, told):
+def test_import_refuses_invalid_events(annotate, dataset, tmp_path, capsys, change, named):
     mark(annotate, "ann", "smile", 14)
     file = tmp_path / "labels.json"
     annotate("export", str(file))
@@ -203,7 +208,7 @@ def test_import_refuses_what_no_verb_would_write(annotate, dataset, tmp_path, ca
     file.write_text(json.dumps([{k: v for k, v in row.items() if v is not None}]))
     before = dataset.labels_file("S001").read_bytes()
     assert main(["annotate", "import", str(dataset.root), str(file)]) == 1
-    assert told in capsys.readouterr().err
+    assert named in capsys.readouterr().err
     assert dataset.labels_file("S001").read_bytes() == before
 
 
@@ -212,9 +217,29 @@ def test_reference_is_the_first_unless_chosen(annotate):
     assert annotate("reference", "S002") == {"reference": "S002"}
 
 
-@pytest.mark.parametrize("verb", ["status", "labels", "coverage", "agree", "suggest", "next"])
-def test_verbs_print_tables_too(annotate, dataset, capsys, verb):
+@pytest.mark.parametrize(
+    ("verb", "rows"),
+    [
+        ("status", [["S001", "3", "1", "0", "0", "0", "-"], ["ann", "1", "-", "0.0", "-", "1.0"]]),
+        ("labels", [["S001", "smile", "frame", "14", "ann"]]),
+        ("coverage", [["S001", "1", "0", "0", "0", "2"], ["S002", "0", "0", "0", "0", "3"]]),
+        ("agree", [["all", "1", "0.0", "0.0", "1.0", "4.0", "0.0", "0.0"]]),
+        ("suggest", [["S001", "smile", "14", "0.2", "peak"]]),
+        ("next", [["S001", "neutral", "0.10"], ["S002", "smile", "1.00"]]),
+    ],
+)
+def test_verbs_print_tables(annotate, dataset, capsys, verb, rows):
     mark(annotate, "ann", "smile", 14)
+    if verb == "agree":
+        mark(annotate, "bob", "smile", 18)
     words = ["--annotator", "ann"] if verb == "next" else []
     assert main(["annotate", verb, str(dataset.root), *words]) == 0
-    assert capsys.readouterr().out.strip()
+    printed = [line.split() for line in capsys.readouterr().out.splitlines()]
+    assert [row for row in rows if row not in printed] == []
+
+
+@pytest.mark.parametrize("name", ["auto", "rule:last-frame", " "])
+def test_the_toolkits_own_names_are_refused(dataset, name):
+    words = ["S001", "smile", "failed", "--annotator", name]
+    assert main(["annotate", "flag", str(dataset.root), *words]) != 0
+    assert not dataset.labels_file("S001").exists()

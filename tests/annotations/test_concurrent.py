@@ -10,8 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from annotations.labels import make_mark
-from annotations.store import append_label, current_labels, labels_of, read_labels
+from annotations.labels import append_label, current_labels, labels_of, make_mark, read_labels
 from express50.capture.index import read_index
 
 REPOSITORY = Path(__file__).resolve().parents[2]
@@ -22,13 +21,13 @@ _ANNOTATOR = """
 import json, random, sys
 sys.path[:0] = sys.argv[4:]
 from annotations.ui.task import load_scene
-from annotations.ui.session import open_session
+from annotations.ui.session import Session
 from annotations.ui.task import go_to, open_view
 from express50.contract.layout import Dataset
 
 who = sys.argv[2]
 dice = random.Random(who)
-session = open_session(Dataset(sys.argv[1]), who, subjects=["S001"], order="subject")
+session = Session(Dataset(sys.argv[1]), who, subjects=["S001"], order="subject")
 print("ready", flush=True)
 sys.stdin.readline()
 for _ in range(int(sys.argv[3])):
@@ -113,7 +112,7 @@ def test_no_acknowledged_event_is_lost_or_torn_and_the_order_is_kept(finished):
     assert sum(a["annotator"] != b["annotator"] for a, b in zip(rows, rows[1:], strict=False)) > 40
 
 
-def test_a_disk_that_fills_up_is_told_and_costs_no_other_mark(suggested, monkeypatch):
+def test_full_disk_raises_and_loses_no_other_mark(suggested, monkeypatch):
     index = read_index(suggested, "S001")
     append_label(suggested, make_mark(index, "smile", 20, "cam00", "ann"))
     write, rest = os.write, [30]
@@ -125,16 +124,16 @@ def test_a_disk_that_fills_up_is_told_and_costs_no_other_mark(suggested, monkeyp
         rest[0] -= count
         return count
 
-    monkeypatch.setattr("annotations.store.os.write", full)
+    monkeypatch.setattr("annotations.labels.os.write", full)
     with pytest.raises(OSError, match="No space"):
         append_label(suggested, make_mark(index, "smile", 21, "cam00", "ann"))
-    monkeypatch.setattr("annotations.store.os.write", lambda h, data: write(h, data[:7]))
+    monkeypatch.setattr("annotations.labels.os.write", lambda h, data: write(h, data[:7]))
     append_label(suggested, make_mark(index, "smile", 22, "cam00", "ann"))
     assert [label.frame for label in read_labels(suggested, "S001")] == [20, 22]
 
 
 @pytest.mark.parametrize("tail", [b"\0" * 4096, b'{"action": "ma\xff\xfe', b"\xe2\x82", b"[1, 2]x"])
-def test_a_tail_that_a_power_cut_spoilt_is_passed_over(suggested, tail):
+def test_corrupt_last_line_is_skipped(suggested, tail):
     index = read_index(suggested, "S001")
     append_label(suggested, make_mark(index, "smile", 20, "cam00", "ann"))
     with suggested.labels_file("S001").open("ab") as file:

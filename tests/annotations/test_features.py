@@ -11,11 +11,10 @@ from annotations.align.features import (
     landmark_weights,
     looks,
     measure,
+    shared_columns,
 )
-from annotations.align.stage import shared_columns
 from annotations.align.suggest import strongest_event
-from annotations.observe.observations import FaceObservations
-from annotations.observe.stage import FACE, face_side, find_points, steady
+from annotations.observe.stage import FACE, FaceObservations, face_side, find_points, steady
 from express50.capture.expressions import load_script
 from express50.landmarks.network import load_network
 
@@ -44,7 +43,7 @@ def windows_of(*names):
     return {name: np.arange(n * WINDOW, (n + 1) * WINDOW) for n, name in enumerate(names)}
 
 
-def test_head_motion_is_no_expression():
+def test_head_motion_causes_no_displacement():
     angle = 0.3
     R = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
     moved = np.stack([1.4 * FACE_POINTS @ R.T + [30, -20]] * 3)
@@ -52,7 +51,7 @@ def test_head_motion_is_no_expression():
     np.testing.assert_allclose(found, 0.0, atol=1e-9)
 
 
-def test_a_blink_does_not_pass_for_a_smile():
+def test_blink_is_not_taken_for_a_smile():
     points = still(2)
     smile = np.exp(-0.5 * ((np.arange(WINDOW) - 11.0) / 1.5) ** 2)
     points[WINDOW:, 48:68] += 3.0 * smile[:, None, None]
@@ -62,7 +61,7 @@ def test_a_blink_does_not_pass_for_a_smile():
     assert strongest_event(values).apex == pytest.approx(11, abs=1)
 
 
-def test_looks_alone_can_tell_a_peak():
+def test_appearance_alone_reveals_a_peak():
     points, rng = still(2), np.random.default_rng(4)
     skin = np.kron(rng.integers(60, 200, (FACE // 4, FACE // 4)), np.ones((4, 4)))
     faces = (skin + rng.normal(0, 2, (2 * WINDOW, FACE, FACE))).astype(np.uint8)
@@ -75,7 +74,7 @@ def test_looks_alone_can_tell_a_peak():
     assert strongest_event(values).apex == pytest.approx(9, abs=1)
 
 
-def test_light_does_not_change_the_look():
+def test_appearance_features_ignore_brightness():
     rng = np.random.default_rng(2)
     face = rng.integers(0, 100, (1, FACE, FACE)).astype(np.uint8)
     bright, _ = looks(2 * face + 20, FACE_POINTS)
@@ -84,7 +83,7 @@ def test_light_does_not_change_the_look():
     assert np.abs(dark).max() > 0.5
 
 
-def test_what_a_face_does_at_rest_is_shrunk():
+def test_motion_seen_at_rest_is_shrunk():
     rng = np.random.default_rng(5)
     points = still(3)
     way = rng.normal(size=(68, 2))
@@ -102,7 +101,7 @@ def test_what_a_face_does_at_rest_is_shrunk():
     assert kept[sway].mean() / kept[jaw].mean() < 0.5 * raw[sway].mean() / raw[jaw].mean()
 
 
-def test_noise_is_measured_and_motion_is_not_taken_for_it():
+def test_noise_scale_ignores_slow_motion():
     rng = np.random.default_rng(0)
     slow = 50 * np.sin(np.linspace(0, 3, 200))[:, None] * np.ones(2)
     values = slow + rng.normal(0, [1.0, 5.0], (200, 2))
@@ -121,13 +120,13 @@ def test_constant_and_short_clips_stay_finite():
 
 
 @pytest.mark.parametrize("entry", SCRIPT.values(), ids=lambda e: e.id)
-def test_every_scripted_expression_has_points_that_take_part(entry):
+def test_every_scripted_expression_weights_some_points(entry):
     weights = landmark_weights(entry)
     assert weights.shape == (68,)
     assert weights.sum() > 0
 
 
-def test_cameras_are_paired_by_name_else_the_best_of_both():
+def test_cameras_pair_by_name_or_else_best_with_best():
     rest, windows = still(1), windows_of("neutral")
     one = measure(observations(rest, cameras=("a", "b")), windows)
     two = measure(observations(rest, cameras=("c", "b")), windows)
@@ -145,7 +144,7 @@ def test_watching_an_empty_picture_gives_finite_points_with_a_low_score():
     assert (scores < 0.5).all()
 
 
-def test_steadying_keeps_constants_and_single_frames():
+def test_steady_keeps_constants_and_single_frames():
     np.testing.assert_allclose(steady(np.full((5, 2), 3.0)), 3.0)
     np.testing.assert_allclose(steady(np.array([[2.0]])), 2.0)
     assert face_side(np.array([[0.0, 0], [10, 4]])) == pytest.approx(11)

@@ -1,4 +1,4 @@
-"""The contact sheet: every label in its place, told apart, on a page that fetches nothing."""
+"""The contact sheet shows every label in its place, on a page that fetches nothing."""
 
 import base64
 import json
@@ -9,9 +9,8 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
-from annotations.labels import AUTOMATIC, make_flag, make_mark
+from annotations.labels import AUTOMATIC, append_label, make_flag, make_mark
 from annotations.sheet import STRIP_WIDTH, make_sheet, render_sheet, take_pictures
-from annotations.store import append_label
 from annotations.ui.frames import crop_to
 from express50.capture.frames import read_proxy
 from express50.capture.index import read_index
@@ -71,7 +70,7 @@ def cells(sheet):
     return {(t.subject, t.expression): t for row in sheet.rows for t in row.tiles}
 
 
-def test_every_cell_says_what_is_in_force_and_who_said_it(labelled):
+def test_tiles_show_the_label_in_force_and_its_origin(labelled):
     found = cells(make_sheet(labelled))
     said = {key: (t.state, t.frame, t.doubtful) for key, t in found.items()}
     assert said == {
@@ -87,7 +86,7 @@ def test_every_cell_says_what_is_in_force_and_who_said_it(labelled):
     assert cells(make_sheet(labelled, sure=0.2))["S002", "neutral"].doubtful is False
 
 
-def test_people_who_differ_and_changed_footage_are_doubtful(labelled):
+def test_disagreements_and_changed_footage_are_doubtful(labelled):
     index = read_index(labelled, "S001")
     append_label(labelled, make_mark(index, "smile", 28, "cam00", "bob"))
     mark = make_mark(index, "neutral", 4, "cam00", "ann")
@@ -98,7 +97,7 @@ def test_people_who_differ_and_changed_footage_are_doubtful(labelled):
     assert found["S001", "smile"].doubtful and found["S001", "neutral"].doubtful
 
 
-def test_a_row_is_seen_by_one_camera_unless_a_subject_lacks_it(labelled):
+def test_row_uses_one_camera_where_subjects_have_it(labelled):
     found = cells(make_sheet(labelled))
     assert {t.camera for t in found.values() if t.expression == "neutral"} == {"cam01"}
     assert found["S002", "smile"].camera == "cam00"  # the reference's
@@ -110,12 +109,12 @@ def test_a_row_is_seen_by_one_camera_unless_a_subject_lacks_it(labelled):
     ("selection", "named"),
     [({"subjects": ["S9"]}, "S9"), ({"expressions": ["x"]}, "x"), ({"camera": "top"}, "top")],
 )
-def test_what_is_not_there_is_named(labelled, selection, named):
+def test_unknown_selection_raises_with_its_name(labelled, selection, named):
     with pytest.raises(AnnotationError, match=named):
         make_sheet(labelled, **selection)
 
 
-def test_the_page_shows_the_frames_and_fetches_nothing(labelled):
+def test_page_shows_the_frames_without_external_resources(labelled):
     text = render_sheet(labelled, make_sheet(labelled), around=4)
     assert not re.search(r"https?://|<link|@import|src=\"(?!data:)", text)
     tiles = Page(text).tiles
@@ -136,13 +135,13 @@ def test_the_page_shows_the_frames_and_fetches_nothing(labelled):
     assert "30%" in tiles["S002", "neutral"]["words"]
 
 
-def test_a_frame_that_cannot_be_read_is_said_on_its_tile(labelled):
+def test_unreadable_frame_is_reported_on_its_tile(labelled):
     tile = cells(make_sheet(labelled))["S001", "smile"]
     broken = type(tile)(**vars(tile) | {"frame": 999})
     assert "no frame 999" in take_pictures(labelled, broken, None, 0).problem
 
 
-def test_suggestions_that_cannot_be_read_and_exclusions_are_noted(labelled, capsys):
+def test_unreadable_suggestions_and_exclusions_are_noted(labelled, capsys):
     labelled.suggestions_file("S001").write_text("[")
     assert main(["annotate", "exclude", str(labelled.root), "S002", "heavy makeup"]) == 0
     sheet = make_sheet(labelled)

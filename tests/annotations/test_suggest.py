@@ -36,12 +36,12 @@ def clip(*movements, noise=0.3, seed=0):
     return values + noise * np.random.default_rng(seed).normal(size=values.shape)
 
 
-def test_the_middle_of_a_plateau_is_suggested_not_its_first_frame():
+def test_middle_of_a_plateau_is_suggested():
     course = np.array([0, 0, 1, 4, 4, 4, 4, 4, 1, 0, 0], float)
     assert suggest(np.outer(course, direction(1)), GROUPS, None).row == 5
 
 
-def test_a_clear_movement_is_found_with_confidence_and_noise_with_little():
+def test_clear_movement_has_high_confidence_and_noise_low():
     sure = suggest(clip((bump(30, 17), 1, 20.0)), GROUPS, None)
     vague = suggest(clip((bump(30, 17), 1, 0.0)), GROUPS, None)
     assert abs(sure.row - 17) <= 1
@@ -49,7 +49,7 @@ def test_a_clear_movement_is_found_with_confidence_and_noise_with_little():
     assert vague.confidence < 0.5
 
 
-def test_a_face_that_does_not_move_has_an_answer_without_confidence():
+def test_still_face_gets_a_suggestion_with_zero_confidence():
     still = suggest(np.zeros((5, N)), GROUPS, None)
     assert 0 <= still.row < 5
     assert still.confidence == 0.0
@@ -57,14 +57,14 @@ def test_a_face_that_does_not_move_has_an_answer_without_confidence():
 
 
 @pytest.mark.parametrize("values", [np.zeros((0, N)), np.full((3, N), np.nan)])
-def test_features_without_numbers_are_refused(values):
+def test_empty_or_nan_features_are_refused(values):
     with pytest.raises(ValueError):
         suggest(values, GROUPS, None)
     with pytest.raises(ValueError):
         suggest_rest(values, GROUPS, 1.0)
 
 
-def test_of_two_movements_the_one_like_the_references_is_taken():
+def test_movement_most_like_the_reference_is_chosen():
     reference = canonical_of(clip((bump(30, 12), 1, 20.0)), 12, SAME, N)
     values = clip((bump(40, 8), 1, 12.0), (bump(40, 28), 2, 25.0))
     assert strongest_event(values).apex == pytest.approx(28, abs=1)
@@ -74,13 +74,13 @@ def test_of_two_movements_the_one_like_the_references_is_taken():
     assert any(abs(row - 28) <= 1 for row in matched.candidates)
 
 
-def test_a_reference_that_did_something_else_does_not_overrule_the_clip():
+def test_reference_with_another_movement_does_not_overrule_the_clip():
     reference = canonical_of(clip((bump(30, 12), 7, 20.0)), 12, SAME, N)
     assert suggest(clip((bump(40, 28), 2, 25.0)), GROUPS, reference).row == pytest.approx(28, abs=1)
 
 
 @pytest.mark.parametrize("side", [-1, 1])
-def test_a_canonical_frame_off_the_apex_is_matched_by_how_far_the_face_goes(side):
+def test_canonical_frame_off_the_apex_matches_an_equal_share_of_the_movement(side):
     course = bump(40, 15, 5.0)
     row = 15 + side * 6
     reference = canonical_of(clip((course, 1, 30.0)), row, SAME, N)
@@ -94,7 +94,7 @@ def test_a_canonical_frame_off_the_apex_is_matched_by_how_far_the_face_goes(side
     assert found.match.max() == pytest.approx(found.match[found.row], abs=0.05)
 
 
-def test_only_features_that_both_have_are_compared():
+def test_only_shared_features_are_compared():
     theirs = clip((bump(30, 12), 1, 20.0))
     shared = np.stack([np.arange(N // 2), np.arange(N // 2)])
     reference = canonical_of(theirs, 12, shared, N)
@@ -102,20 +102,20 @@ def test_only_features_that_both_have_are_compared():
     assert suggest(clip((bump(30, 20), 1, 15.0)), GROUPS, reference).row == pytest.approx(20, abs=1)
 
 
-def test_a_reference_without_movement_matches_like_none():
+def test_still_reference_has_no_effect():
     empty = Canonical(np.zeros(N), 1.0, 0)
     values = clip((bump(30, 20), 1, 15.0))
     assert suggest(values, GROUPS, empty).row == suggest(values, GROUPS, None).row
 
 
-def test_rest_is_the_calmest_frame_and_any_as_calm_is_as_good():
+def test_rest_is_the_calmest_frame():
     course = np.concatenate([bump(8, 0), np.zeros(12)])
     found = suggest_rest(clip((course, 1, 20.0)), GROUPS, typical=20.0)
     assert found.row > 6
     assert found.confidence > 0.9
 
 
-def test_candidates_are_apart_with_the_suggestion_first():
+def test_candidates_keep_their_distance_and_start_with_the_suggestion():
     curve = np.array([0, 5, 0, 0, 9, 0, 0, 7, 6.9, 0, 0, 1, 0.0])
     assert candidate_rows(4, [7], curve) == [4, 7, 1, 11]
 

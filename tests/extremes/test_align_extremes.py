@@ -7,12 +7,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from annotations.align.features import expression_values, measure
-from annotations.align.stage import suggest_all, watch
-from annotations.align.suggest import suggest
-from annotations.observe.observations import FaceObservations
+from annotations.align.features import expression_values, measure, watch
+from annotations.align.suggest import suggest, suggest_all
 from annotations.observe.stage import (
     FACE,
+    FaceObservations,
     align_faces,
     choose_cameras,
     frames_to_try,
@@ -42,7 +41,7 @@ def suggested(points, windows, expression="smile"):
 
 @pytest.mark.parametrize("scale", [1e-3, 1.0, 1e5])
 @pytest.mark.parametrize("origin", [0.0, 1e5])
-def test_the_answer_does_not_depend_on_the_faces_size_or_place(scale, origin):
+def test_suggestion_is_invariant_to_scale_and_position(scale, origin):
     rng = np.random.default_rng(1)
     course = np.exp(-0.5 * ((np.arange(40) - 28.0) / 2) ** 2)
     points = SHAPE + rng.normal(0, 0.002, (40, 68, 2))
@@ -57,12 +56,12 @@ def test_the_answer_does_not_depend_on_the_faces_size_or_place(scale, origin):
 @pytest.mark.parametrize(
     "points", [np.zeros((6, 68, 2)), np.repeat(SHAPE[None], 6, axis=0) * 100], ids=["dot", "still"]
 )
-def test_a_face_without_size_or_motion_has_a_finite_answer_without_confidence(points):
+def test_face_without_size_or_motion_has_zero_confidence(points):
     windows = {"neutral": np.arange(3), "smile": np.arange(3, 6)}
     assert suggested(points, windows).confidence == 0.0
 
 
-def test_frames_without_a_face_are_nobodys_peak():
+def test_frames_without_a_face_are_never_a_peak():
     """A grey frame's points lie anywhere, and so far from rest as no expression does."""
     points = SHAPE * 100 + np.random.default_rng(2).normal(0, 0.2, (30, 68, 2))
     points[12:20, 48:68] += np.array([0, 1, 2, 3, 3, 2, 1, 0])[:, None, None]
@@ -76,7 +75,7 @@ def test_frames_without_a_face_are_nobodys_peak():
     assert 14 <= watched.frames[watched.windows["smile"][found["smile"].row]] <= 17
 
 
-def test_the_face_is_searched_for_until_a_frame_shows_it():
+def test_frames_are_tried_until_one_shows_a_face():
     scores = {3: 0.0, 0: 0.1, 6: 0.05, 40: 0.9}
     index = SimpleNamespace(subject="S001", cameras={"a": None, "b": None})
     tries = frames_to_try(np.array([0, 3, 6]), np.arange(0, 71, 10))
@@ -94,7 +93,7 @@ def test_windows_of_one_frame_and_windows_that_overlap():
     assert 0 <= suggested(points, both).row < 4
 
 
-def test_one_frame_far_astray_does_not_win_over_a_movement():
+def test_outlier_frame_does_not_beat_a_movement():
     rng = np.random.default_rng(3)
     points = SHAPE * 100 + rng.normal(0, 0.2, (40, 68, 2))
     course = np.exp(-0.5 * ((np.arange(40) - 28.0) / 3) ** 2)
@@ -104,7 +103,7 @@ def test_one_frame_far_astray_does_not_win_over_a_movement():
     assert abs(15 + suggested(points, windows).row - 28) <= 2
 
 
-def test_a_face_that_fills_no_pixel_is_cut_out_finite():
+def test_face_smaller_than_a_pixel_is_cut_out():
     image = np.full((4, 5, 3), 200, np.uint8)
     faces = align_faces([image], np.zeros((1, 68, 2)), np.zeros((68, 2)))
     assert faces.shape == (1, FACE, FACE)

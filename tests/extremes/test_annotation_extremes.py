@@ -9,7 +9,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from annotations.agreement import (
+from annotations.labels import append_label, make_mark, read_labels
+from annotations.sheet import make_sheet, render_sheet
+from annotations.suggestions import read_suggestions
+from annotations.ui import task as moves
+from annotations.ui.app import AnnotateApp
+from annotations.ui.images import CellSize
+from annotations.ui.picture import frames_ahead
+from annotations.ui.session import Session
+from annotations.ui.task import open_view
+from annotations.ui.timeline import GUTTER, StripContent, column_of, draw_strip, frame_at
+from annotations.validate import (
     MarkedClip,
     agreement,
     by_expression,
@@ -17,19 +27,8 @@ from annotations.agreement import (
     clip_times,
     disagreements,
     marked_clips,
+    problems,
 )
-from annotations.labels import make_mark
-from annotations.sheet import make_sheet, render_sheet
-from annotations.store import append_label, read_labels
-from annotations.suggestions import read_suggestions
-from annotations.ui import task as moves
-from annotations.ui.app import AnnotateApp
-from annotations.ui.images import CellSize
-from annotations.ui.picture import frames_ahead
-from annotations.ui.session import open_session
-from annotations.ui.task import open_view
-from annotations.ui.timeline import GUTTER, StripContent, column_of, draw_strip, frame_at
-from annotations.validate import problems
 from annotations.worklist import coverage, worklist
 from benchmarks.replay import cheapest_keys
 from express50.capture.index import read_index
@@ -53,20 +52,20 @@ def clips_of(*frames, start=0, length=24):
 
 
 @pytest.mark.parametrize("clips", [[], clips_of((3,)), clips_of((), (5,))])
-def test_one_voice_agrees_with_nobody(clips):
+def test_agreement_needs_two_annotators(clips):
     found = agreement(clips)
     assert (found["clips"], found["pairs"], found["alpha"], found["within_1"]) == (0, 0, None, None)
     assert by_pair(clips) == {}
     assert all(row["alpha"] is None for row in by_expression(clips).values())
 
 
-def test_all_equal_has_no_alpha_but_all_within():
+def test_equal_marks_have_no_alpha_but_agree():
     found = agreement(clips_of((4, 4), (4, 4, 4), (4, 4)))
     assert (found["alpha"], found["alpha_interval"]) == (None, None)
     assert (found["within_1"], found["median_frames"], found["slip_rate"]) == (1.0, 0.0, 0.0)
 
 
-def test_a_lone_voice_among_pairs_does_not_count():
+def test_clips_marked_once_do_not_count():
     with_lone = agreement(clips_of((4, 5), (9,), (14, 14)))
     assert with_lone == agreement(
         [c for c in clips_of((4, 5), (9,), (14, 14)) if len(c.frames) > 1]
@@ -74,7 +73,7 @@ def test_a_lone_voice_among_pairs_does_not_count():
     assert with_lone["clips"] == 2
 
 
-def test_a_frames_difference_in_a_day_long_clip_is_no_agreement():
+def test_difference_of_a_frame_in_a_day_long_clip_gives_negative_alpha():
     start = 10**15
     marks = [(start + 5, start + 6), (start + 5, start + 6), (start + 6, start + 5)]
     found = agreement(clips_of(*marks, start=start, length=DAY))
@@ -109,7 +108,7 @@ def test_agreement_depends_neither_on_where_the_clip_starts_nor_on_who_is_named_
 
 
 @pytest.mark.parametrize("wrong", [math.nan, math.inf, -math.inf, -0.1, 1.5])
-def test_a_confidence_that_is_no_share_is_refused_by_name(tmp_path, wrong, capsys):
+def test_confidence_outside_zero_to_one_is_refused(tmp_path, wrong, capsys):
     dataset = make_dataset(tmp_path / "data")
     suggest(dataset, "S001", {"smile": (14, wrong)})
     with pytest.raises(FormatError, match="smile: confidence|NaN or infinite"):
@@ -122,7 +121,7 @@ def test_a_confidence_that_is_no_share_is_refused_by_name(tmp_path, wrong, capsy
     )  # and the sheet is made all the same
 
 
-def test_a_curve_that_holds_no_number_is_refused(tmp_path):
+def test_curve_with_nan_is_refused(tmp_path):
     dataset = make_dataset(tmp_path / "data")
     suggest(dataset, "S001", {"smile": (14, 0.5)})
     path = dataset.suggestions_file("S001")
@@ -131,7 +130,7 @@ def test_a_curve_that_holds_no_number_is_refused(tmp_path):
         read_suggestions(dataset, "S001")
 
 
-def test_a_capture_without_cues_has_no_work_and_no_fault(tmp_path):
+def test_capture_without_cues_has_no_tasks_or_problems(tmp_path):
     dataset = make_dataset(tmp_path / "data", expressions=())
     assert worklist(dataset, "ann") == []
     assert problems(dataset) == [] and disagreements(dataset) == [] and marked_clips(dataset) == []
@@ -139,7 +138,7 @@ def test_a_capture_without_cues_has_no_work_and_no_fault(tmp_path):
     sheet = make_sheet(dataset)
     assert sheet.rows == [] and sum(sheet.counts().values()) == 0
     assert "0 expressions" in render_sheet(dataset, sheet)
-    assert open_session(dataset, "ann").task is None
+    assert Session(dataset, "ann").task is None
 
 
 windows = st.tuples(st.integers(0, 10**9), st.integers(1, 3000))
@@ -147,7 +146,7 @@ windows = st.tuples(st.integers(0, 10**9), st.integers(1, 3000))
 
 @settings(deadline=None, max_examples=40)
 @given(window=windows, width=st.integers(1, 250), height=st.integers(1, 12), data=st.data())
-def test_any_window_fits_any_strip(window, width, height, data):
+def test_strip_fits_any_window_and_size(window, width, height, data):
     first, count = window
     cursor = first + data.draw(st.integers(0, count - 1))
     view = open_view(first, first + count - 1, (cursor,))
@@ -163,7 +162,7 @@ def test_any_window_fits_any_strip(window, width, height, data):
         assert under <= cursor <= under + math.ceil(count / room)
 
 
-def test_a_window_of_a_thousand_frames_is_crossed_and_decoded_ahead_in_bounds():
+def test_long_window_decodes_ahead_within_bounds():
     view = open_view(500, 1499, (700, 1300))
     ahead = frames_ahead(view)
     assert len(ahead) == len(set(ahead)) == 64 and {700, 1300} <= set(ahead)
@@ -190,11 +189,11 @@ def speck(tmp_path_factory):
 
 @pytest.mark.parametrize("cell", [None, CellSize(7, 15)])
 @pytest.mark.parametrize("size", [(1, 1), (2, 3), (30, 10)])
-def test_five_pixels_in_a_terminal_of_one_cell(speck, tmp_path, cell, size):
+def test_app_with_tiny_frames_and_terminals(speck, tmp_path, cell, size):
     dataset = Dataset(tmp_path)
     for name in ("ingest", "captures.json"):
         (tmp_path / name).symlink_to(speck.root / name)
-    session = open_session(dataset, "ann", order="subject")
+    session = Session(dataset, "ann", order="subject")
     app = AnnotateApp(session, sixel_cell=cell)
 
     async def run():
@@ -207,7 +206,7 @@ def test_five_pixels_in_a_terminal_of_one_cell(speck, tmp_path, cell, size):
     assert (label.frame, label.expression) == (2, "neutral")
 
 
-def test_a_sheet_of_five_pixels(speck, tmp_path):
+def test_sheet_of_tiny_frames(speck, tmp_path):
     dataset = Dataset(tmp_path)
     for name in ("ingest", "captures.json"):
         (tmp_path / name).symlink_to(speck.root / name)
@@ -217,7 +216,7 @@ def test_a_sheet_of_five_pixels(speck, tmp_path):
     assert 'data-count="3"' in file.read_text()  # the window's, not a million
 
 
-def test_huge_frame_numbers_survive_the_store_and_the_exchange(tmp_path):
+def test_huge_frame_numbers_survive_the_store(tmp_path):
     dataset = make_dataset(tmp_path / "data", subjects=("S001",))
     mark = make_mark(read_index(dataset, "S001"), "smile", 14, "a", "ann")
     huge = type(mark)(**vars(mark) | {"frame": 2**62, "pts": -(2**63), "time": 1e300})

@@ -8,13 +8,14 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from express50.errors import CalibrationError
-from express50.files.containers import read_srgb8
+from express50.files.containers import read_picture
 from express50.files.images import linear_to_srgb, srgb_to_linear, write_image
 from express50.rigs.world_frame import canonical_from_rig, move_cameras
 from pipelines.calibrate.board import gather, refine_corners, square_sides
 from pipelines.calibrate.board_rig import solve_rig
 from pipelines.calibrate.stage import check_given
-from pipelines.matte.key import Keyer, KeyOptions
+from pipelines.matte.config import MatteConfig
+from pipelines.matte.key import key_alpha
 from pipelines.matte.plates import exposure_gain
 from tests.pipelines.board_rigs import (
     POINTS,
@@ -123,8 +124,7 @@ def test_refinement_on_a_flat_image_finds_nothing() -> None:
 
 def alpha(frame: np.ndarray, plate: np.ndarray, **changes) -> np.ndarray:
     """Alpha of a frame with the default settings, changed."""
-    keyer = Keyer(plate, [frame], np.ones(plate.shape[:2], bool), KeyOptions(**changes))
-    out = keyer.alpha(frame)
+    out = key_alpha(frame, plate, np.ones(plate.shape[:2], bool), MatteConfig(**changes))
     assert np.isfinite(out).all() and out.min() >= 0 and out.max() <= 1
     return out
 
@@ -191,11 +191,10 @@ def test_blown_highlights_on_skin_before_a_blown_lamp() -> None:
 def test_a_shadow_that_moves_from_frame_to_frame() -> None:
     scene = make_scene(33, "dark")
     y, x = np.mgrid[0:256, 0:256] / 256
-    keyer = Keyer(scene.plate, [scene.frame], np.ones((256, 256), bool), KeyOptions())
     for place in (0.12, 0.5, 0.9):
         dark = 1 - 0.2 * np.exp(-(((x - place) / 0.08) ** 2) - ((y - 0.2) / 0.1) ** 2)
         behind = np.where(scene.alpha < 0.5, dark, 1.0)[..., None]
-        found = keyer.alpha(np.rint(scene.frame * behind).astype(np.uint8))
+        found = alpha(np.rint(scene.frame * behind).astype(np.uint8), scene.plate)
         assert found[:30].mean() < 0.01
         assert np.abs(found - scene.alpha).mean() < 0.012
 
@@ -205,14 +204,14 @@ def test_sixteen_bits_key_as_eight(tmp_path) -> None:
     read = []
     for name, image in (("frame", scene.frame), ("plate", scene.plate)):
         write_image(tmp_path / f"{name}.png", image.astype(np.uint16) * 257)
-        read.append(read_srgb8(tmp_path / f"{name}.png"))
+        read.append(read_picture(tmp_path, f"{name}.png"))
     assert np.array_equal(alpha(*read), alpha(scene.frame, scene.plate))
 
 
 def test_nothing_valid_is_empty() -> None:
     plate = np.full((40, 40, 3), 100, np.uint8)
-    keyer = Keyer(plate, [plate], np.zeros((40, 40), bool), KeyOptions())
-    assert keyer.alpha(np.full_like(plate, 250)).max() == 0
+    nothing = np.zeros((40, 40), bool)
+    assert key_alpha(np.full_like(plate, 250), plate, nothing, MatteConfig()).max() == 0
 
 
 @settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.too_slow])

@@ -13,7 +13,7 @@ from express50.capture.readers.read import detect, read_any
 from express50.errors import CalibrationError, CaptureError, Express50Error
 from express50.files.containers import BYTES_LIMIT, inside, read_picture
 from express50.files.images import PIXEL_LIMIT, encode_png
-from tests.express50.captures import layouts
+from tests.express50.capture import layouts
 from tests.synth import write_video
 
 

@@ -14,10 +14,9 @@ from express50.geometry.raycast import mesh_scene
 from express50.geometry.transforms import axis_angle_to_matrix
 from pipelines.depth import STAGE
 from pipelines.depth.config import DepthConfig
-from pipelines.depth.hull import without_contradiction
 from pipelines.depth.maps import cast_maps, compared_view, photo_errors
 from pipelines.depth.reconstruct import reconstruct
-from pipelines.depth.views import make_view
+from pipelines.depth.views import make_view, without_contradiction
 from tests.pipelines.bump_dataset import make_dataset
 from tests.pipelines.bump_head import RADII, render, ring
 

@@ -9,8 +9,8 @@ import pytest
 
 from express50.cli.main import main
 from express50.head.load import load_head
-from tests.express50.flame_reader import flame_vertices
-from tests.express50.tracked import track_arrays, world_vertices, write_track
+from tests.express50.dataset.tracked import track_arrays, world_vertices, write_track
+from tests.express50.head.flame_reader import flame_vertices
 from tests.pipelines.bump_dataset import make_dataset
 
 

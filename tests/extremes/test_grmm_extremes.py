@@ -10,7 +10,7 @@ from torch.autograd import gradcheck
 from grmm import losses
 from grmm.config import LossConfig
 from grmm.edit import interpolate_tracked, slerp_axis_angle
-from grmm.evaluate import psnr_db, ssim_score
+from grmm.metrics import psnr_db, ssim_score
 from grmm.model import initial_scales
 from grmm.networks import normalise_depth
 from tests.grmm.synthetic import EllipsoidSource, tiny_config

@@ -7,12 +7,13 @@ import numpy as np
 import pytest
 
 from benchmarks.matte_scenes import exposed, make_scene, plain
-from pipelines.matte.key import Keyer, KeyOptions
+from pipelines.matte.config import MatteConfig
+from pipelines.matte.key import key_alpha
 
 
 def keyed(frame: np.ndarray, plate: np.ndarray) -> np.ndarray:
     """Alpha (H, W) with the default settings."""
-    return Keyer(plate, [frame], np.ones(plate.shape[:2], bool), KeyOptions()).alpha(frame)
+    return key_alpha(frame, plate, np.ones(plate.shape[:2], bool), MatteConfig())
 
 
 @pytest.mark.parametrize("blur", [0.0, 0.9])

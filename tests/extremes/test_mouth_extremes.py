@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from express50.errors import HeadModelError
-from express50.head.flame import load_flame
+from express50.head.flame import load_flame, read_flame
 from express50.head.model import HeadModel, pose, vertex_normals
 from express50.head.mouth import LOWER_RING, UPPER_RING, add_mouth
 from tests.express50.head.flame_head import write_flame_size
@@ -23,7 +23,7 @@ def path(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def bare(path) -> HeadModel:
-    return load_flame(path, mouth=False)
+    return read_flame(path)
 
 
 @pytest.mark.parametrize("scale", [1e3, 1e-3, 0.0])

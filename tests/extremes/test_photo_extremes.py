@@ -11,16 +11,14 @@ import pytest
 import torch
 
 from express50.errors import CaptureError
-from express50.geometry.cameras import Camera
-from express50.geometry.pinhole import project_pinhole
+from express50.geometry.cameras import Camera, project_pinhole
 from express50.head.load import load_head
 from express50.head.model import landmarks, pose
 from express50.head.preview import render_preview
 from express50.landmarks.detector import Detection, detect
-from express50.landmarks.iris import find_irises
+from express50.landmarks.eyes_and_lips import find_irises
 from express50.landmarks.network import load_network
-from pipelines.photo.capture import find_faces
-from pipelines.photo.focal import single_camera, weigh_focal
+from pipelines.photo.capture import find_faces, single_camera, weigh_focal
 from pipelines.track.basis import Basis, Points, make_basis
 from pipelines.track.config import TrackConfig
 from pipelines.track.eyes_and_jaw import contour_points
@@ -125,7 +123,7 @@ def test_sliver_pictures_have_no_face_and_no_irises(size: tuple[int, int]) -> No
 
 
 def test_a_face_hardly_tells_its_lens(basis, seen) -> None:
-    """The range of focal lengths is wide, holds the guess, and a told one is kept."""
+    """The range of focal lengths is wide, holds the guess, and a given one is kept."""
     found = weigh_focal(basis, [seen], (512, 512), (836.0, "guess"))
     assert found.source == "guess" and found.pixels == 836.0
     assert found.low < 600 < 1300 < found.high
@@ -135,8 +133,8 @@ def test_jaw_lines_of_degenerate_meshes_stay_finite(basis: Basis) -> None:
     camera = single_camera("photo", 64, 64, 100.0)
     for mesh in (np.zeros((len(basis.model.template), 3)), 1e6 * basis.model.template.numpy()):
         line = contour_points(basis.model, mesh, camera)
-        assert np.isfinite(line.positions(mesh)).all()
-        assert line.corners.shape == (17, 3) and line.usable.dtype == bool
+        assert np.isfinite(line.places.at(mesh)).all()
+        assert line.places.vertices.shape == (17, 3) and line.usable.dtype == bool
 
 
 @pytest.mark.parametrize(

@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 
 from express50.contract.segmentation_labels import LABELS, label_mask
+from express50.dataset.depth_files import write_depth
 from express50.errors import FormatError, StageError
-from express50.files.images import write_depth_png, write_image
+from express50.files.images import write_image
 from express50.geometry.cameras import pinhole_camera, resized, transform_camera
 from express50.geometry.transforms import look_at, make_transform
 from pipelines.regions import STAGE
 from pipelines.regions.config import RegionsConfig
 from pipelines.regions.geometry import SCALP, head_alpha, make_head, place, see
-from pipelines.regions.outputs import label_shares, mesh_fit, subject_box, view_warning
-from pipelines.regions.stage import label_view
+from pipelines.regions.stage import label_shares, label_view, mesh_fit, subject_box, view_warning
 from tests.pipelines.bump_dataset import make_dataset
 from tests.pipelines.region_scenes import camera_at, make_scene, tracked
 
@@ -124,9 +124,9 @@ def test_figures_of_nothing_are_numbers_and_named() -> None:
 @pytest.mark.parametrize(
     ("key", "value", "message"),
     [
-        ("vertices", np.nan, "holds NaN or Inf.*; run 'express50 track' again"),
-        ("vertices", np.inf, "holds NaN or Inf"),
-        ("R", np.nan, "holds NaN or Inf"),
+        ("vertices", np.nan, "vertices .*not finite.*; run 'express50 track' again"),
+        ("vertices", np.inf, "vertices .*not finite"),
+        ("R", np.nan, "R .*not finite"),
         ("vertices", "short", "expected .* of its head model"),
         ("head", "missing", "not a track"),
         ("expressions", "other", "it is not tracked"),
@@ -156,7 +156,7 @@ def test_mattes_and_depth_maps_of_another_size_are_named(tmp_path) -> None:
     write_image(dataset.matte_file("S001", "smile", "cam00"), np.zeros((8, 8), np.uint8))
     folder = dataset.item_dir("depth", "S001/smile")
     folder.mkdir(parents=True)
-    write_depth_png(folder / "cam01.png", np.ones((8, 8)), np.ones((8, 8), bool))
+    write_depth(folder, "cam01", np.ones((8, 8)), np.ones((8, 8), bool), "png16")
     result = STAGE.run(dataset, "S001/smile", CONFIG, tmp_path)
     why = {note.what: note.why for note in result.dropped}
     assert "express50 matte" in why["cam00"] and "express50 depth" in why["cam01"]

@@ -9,12 +9,11 @@ import pytest
 
 from express50.files.images import linear_to_srgb, read_image
 from pipelines.track.appearance import EVEN_LIGHT, Appearance, bake_albedo, write_texture
-from pipelines.track.crops import FrameSetCrops, HeadCrop, cut_crop
 from pipelines.track.observe import Observation
 from pipelines.track.outline import outline_terms, outline_vertices, signed_distance
-from pipelines.track.photo_consistency import SkinSamples, patch_terms
+from pipelines.track.photo_consistency import patch_terms, skin_samples
 from pipelines.track.state import Target
-from pipelines.track.surface import Visibility
+from pipelines.track.surface import FrameSetCrops, HeadCrop, Visibility, cut_crop
 from pipelines.track.terms import NormalTerm, cost, information
 from tests.pipelines.textured_scenes import (
     ORIGIN,
@@ -45,7 +44,7 @@ def search(crops, mesh) -> NormalTerm | None:
     """The stage's search on one frame set; its surface, if it found any."""
     model = ball_head()
     pictures = FrameSetCrops((), tuple(crops))
-    found = patch_terms(model, SkinSamples.of(model, SAMPLES), pictures, mesh, 0.006, 1.0)
+    found = patch_terms(model, skin_samples(model, SAMPLES), pictures, mesh, 0.006, 1.0)
     return found[0] if found else None
 
 
@@ -172,7 +171,9 @@ def test_cameras_given_twice_add_nothing_new() -> None:
     mesh = head_mesh()
     shots = [take(camera, mesh=mesh) for camera in rig()]
     assert search(shots[:1] * 3, mesh) is None
-    twice = search(shots + [replace(s, camera_id=s.camera_id + "b") for s in shots], mesh)
+    twice = search(
+        shots + [replace(s, camera=replace(s.camera, id=s.camera.id + "b")) for s in shots], mesh
+    )
     assert abs(np.median(np.linalg.norm(twice.goals, axis=1)) - RADIUS) < 4e-4
 
 

@@ -197,15 +197,13 @@ def test_an_unreadable_ledger_is_set_aside_and_outputs_are_made_again(dataset, h
     assert look(dataset)[0] == {}
 
 
-def test_a_ledger_of_before_digests_is_told_apart_and_taken_up(dataset):
+def test_an_output_whose_digests_are_lost_is_made_again(dataset):
+    before = toy.tree(dataset.stage_dir("toy"))
     with sqlite3.connect(dataset.ledger) as database:
-        database.execute("DROP TABLE made")
-    flip(output(dataset))
-    found, result = look(dataset)
-    assert found == {} and sum("have no digests" in note for note in result.notes) == 2
-    look(dataset, fix=True)
-    flip(output(dataset, "S002"))
-    assert ("changed", "toy S002") in look(dataset)[0]
+        database.execute("DELETE FROM made WHERE item = 'S001'")
+    assert set(look(dataset)[0]) == {("unknown", "toy S001"), ("unknown", "after S001")}
+    assert look(dataset, fix=True)[1].sound
+    assert run(dataset).ok and toy.tree(dataset.stage_dir("toy")) == before
 
 
 def test_traces_of_the_withdrawn_are_found_by_digest_alone(dataset):

@@ -10,8 +10,8 @@ import time
 from pathlib import Path
 
 from express50.cli.main import main
+from tests.express50.dataset.tracked import track_arrays, write_track
 from tests.express50.head.flame_files import write_flame
-from tests.express50.tracked import track_arrays, write_track
 from tests.pipelines.bump_dataset import make_dataset
 
 

@@ -14,21 +14,20 @@ import pycolmap
 import torch
 
 from annotations.exchange import export_labels, read_table
-from annotations.labels import make_mark
-from annotations.store import append_label, read_labels
+from annotations.labels import append_label, make_mark, read_labels
 from annotations.suggestions import read_suggestions
-from express50.capture.frames import decode_proxy, read_gains, read_peaks
-from express50.capture.index import read_index
+from express50.capture.frames import decode_proxy, read_gains
+from express50.capture.index import read_index, read_peaks
 from express50.capture.raw import read_cues
 from express50.capture.readers.read import read_any
 from express50.contract.config import resolve_config
 from express50.contract.layout import Dataset
-from express50.dataset.id_search import files_naming
 from express50.dataset.tracks import read_track
+from express50.dataset.withdraw import files_that, names
 from express50.errors import FormatError, TrainError
+from express50.files.arrays import read_weights
 from express50.files.containers import read_picture
 from express50.files.images import read_image, write_image
-from express50.files.pickles import read_weights
 from express50.files.video import VideoReader, iterate_video
 from express50.head.flame import load_flame
 from express50.landmarks.sources import read_points
@@ -36,10 +35,10 @@ from express50.rigs.read import guess_format, read_rig
 from express50.runner.ledger import Ledger, Receipt
 from express50.runner.runner import run_stage
 from express50.shards.codecs import decode_picture, encode_pictures
-from express50.shards.reader import read_entries, read_offsets, write_offsets
+from express50.shards.reader import ShardReader, read_entries, write_offsets
 from express50.shards.writer import verify, write_manifest
 from pipelines import ingest
-from tests.express50.captures.layouts import (
+from tests.express50.capture.layouts import (
     write_ava,
     write_colmap,
     write_multiface,
@@ -175,7 +174,7 @@ def _points(root: Path, name: str) -> None:
 
 
 def _verified(shards: Path) -> None:
-    list(files_naming(shards, "S001"))
+    list(files_that(names("S001"), shards))
     if faults := verify(shards):
         raise FormatError("; ".join(faults))
 
@@ -234,7 +233,7 @@ READERS: dict[str, Callable[[Path], object]] = {
     "track.npz": lambda root: read_track(root / "track.npz"),
     "points.npz": lambda root: _points(root, "points.npz"),
     "points.json": lambda root: _points(root, "points.json"),
-    "S001.offsets.npy": lambda root: read_offsets(root, "S001"),
+    "S001.offsets.npy": lambda root: ShardReader(root, ()).offsets("S001"),
     "flame/flame.pkl": _flame,
     "flame/landmark_embedding.npy": _flame,
     "flame/FLAME_masks.pkl": _flame,

@@ -9,9 +9,8 @@ import torch
 
 from express50.geometry.transforms import look_at
 from express50.head.model import REGIONS, HeadModel
-from grmm.config import Config
+from grmm.config import Config, resolve
 from grmm.data import Sample, SampleKey, Tracked
-from grmm.presets import resolve
 
 AXES = np.array([0.08, 0.11, 0.09])  # metres
 STRETCH = 0.015  # metres the first expression coefficient adds to the y axis

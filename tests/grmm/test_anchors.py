@@ -28,20 +28,17 @@ def test_only_covered_texels_get_a_gaussian(head):
     anchors = make_anchors(type(head)(**{**vars(head), **squeezed}), 32)
     assert len(anchors.texels) == 32 * 16
     assert (anchors.texels % 32 < 16).all()
-    assert "50 % covered" in anchors.budget()
 
 
 def test_full_map_is_covered_once(head):
     anchors = make_anchors(head, 48)
     assert torch.equal(anchors.texels, torch.arange(48 * 48))
-    assert anchors.overlaps == 0
 
 
-def test_overlapping_charts_are_counted_and_the_lowest_face_wins(head):
+def test_the_lowest_face_wins_where_charts_overlap(head):
     folded = head.uv.clone()
     folded[:, 0] = (2 * folded[:, 0]).where(folded[:, 0] <= 0.5, 2 - 2 * folded[:, 0])
     anchors = make_anchors(type(head)(**{**vars(head), "uv": folded}), 16)
-    assert anchors.overlaps > 200
     columns = (anchors.faces % (2 * 32 * 24)) % (32 * 24) % 32
     assert (columns < 16).all()
 

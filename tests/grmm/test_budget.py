@@ -1,11 +1,10 @@
-import argparse
-
 import pytest
 
 from express50.errors import ConfigError
 from express50.files.atomic import write_json
-from grmm.cli.learn import add_training, train_config
-from grmm.presets import choose
+from grmm.cli import build_parser
+from grmm.cli.commands import train_config
+from grmm.config import choose
 
 
 @pytest.fixture
@@ -31,16 +30,8 @@ def test_the_longest_measured_budget_that_fits(measured, seconds, setting):
     assert choose(seconds, measured).setting == setting
 
 
-@pytest.mark.parametrize("seconds", [0, -1, float("nan")])
-def test_no_time_is_refused(measured, seconds):
-    with pytest.raises(ConfigError, match="expected more than 0"):
-        choose(seconds, measured)
-
-
 def arguments(*words):
-    parser = argparse.ArgumentParser()
-    add_training(parser)
-    return parser.parse_args(words)
+    return build_parser().parse_args(["config", *words])
 
 
 def test_command_line_takes_the_measured_setting(capsys):

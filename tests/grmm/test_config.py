@@ -3,13 +3,13 @@ import torch
 
 from express50.errors import ConfigError
 from grmm import losses
+from grmm.config import PRESETS, as_tables, from_tables, resolve
 from grmm.fit import LOCALITY_T
 from grmm.networks import Refinement
-from grmm.presets import PRESETS, as_tables, from_tables, preset, resolve
 
 
 def test_paper_preset_has_the_papers_numbers():
-    config = preset("paper")
+    config = resolve("paper")
     model, loss = config.model, config.loss
     assert (model.n_g, model.z_id, model.z_exp, model.features) == (512, 512, 256, 32)
     assert model.shared_widths[-1] + model.z_exp == 512
@@ -22,7 +22,7 @@ def test_paper_preset_has_the_papers_numbers():
 
 
 def test_the_demos_refinement_sees_a_quarter_of_the_size():
-    model = preset("demo").model
+    model = resolve("demo").model
     net = Refinement(inputs=4, widths=model.refine_widths, unshuffle=model.refine_unshuffle)
     sizes = []
     net.enter.register_forward_hook(lambda _, given, out: sizes.append(given[0].shape[2:]))
@@ -32,7 +32,7 @@ def test_the_demos_refinement_sees_a_quarter_of_the_size():
 
 @pytest.mark.parametrize("name", PRESETS)
 def test_presets_survive_a_checkpoint(name):
-    config = preset(name)
+    config = resolve(name)
     assert from_tables(as_tables(config)) == config
 
 
@@ -42,7 +42,7 @@ def test_assignments_stand_over_toml_over_preset(tmp_path):
     config = resolve("demo", file, ["train.lr=0.25", "model.refine_widths=[8]"])
     assert (config.train.lr, config.train.iterations) == (0.25, 7)
     assert config.model.refine_widths == (8,)
-    assert config.train.final_lr == preset("demo").train.final_lr
+    assert config.train.final_lr == resolve("demo").train.final_lr
 
 
 @pytest.mark.parametrize(

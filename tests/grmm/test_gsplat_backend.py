@@ -6,8 +6,7 @@ import pytest
 import torch
 
 from grmm.rasterize import gsplat_backend, rasterize
-from grmm.rasterize.interface import Pinhole, Splats
-from grmm.rasterize.projection import project
+from grmm.rasterize.projection import Pinhole, Splats, project
 from tests.grmm import gsplat_kernels
 from tests.grmm.gaussian_scenes import random_scene, relative_error, render
 

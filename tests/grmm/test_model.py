@@ -4,9 +4,8 @@ import torch
 
 from grmm import losses
 from grmm.data import HeadViews
-from grmm.model import GRMM, initial_scales, quat_multiply
+from grmm.model import GRMM, PinholeView, initial_scales, quat_multiply
 from grmm.render import orbit
-from grmm.scene import PinholeView
 from grmm.train import objective, step
 from grmm.train_state import make_optimizer, prepare, set_rates
 from tests.grmm.synthetic import EllipsoidSource, ellipsoid_head, tiny_config

@@ -1,24 +1,18 @@
 import pytest
 import torch
 
+from grmm.config import ModelConfig
 from grmm.networks import Ladder, MeshDecoder, Refinement, normalise_depth
 
 
-def ladder(**changes):
-    settings = {"code": 6, "outputs": 5, "n_g": 32, "seed_channels": 8, "widths": (8, 8)}
-    return Ladder(**(settings | changes))
+def ladder(view_dependent=False, mode_outputs=None, **changes):
+    config = ModelConfig(**({"n_g": 32, "seed_channels": 8, "ladder": (8, 8)} | changes))
+    return Ladder(config, 6, 5, view_dependent, mode_outputs)
 
 
 def mesh_decoder(teeth=None):
-    return MeshDecoder(
-        z_id=6,
-        z_exp=4,
-        coefficients=7,
-        teeth=torch.zeros(9, dtype=torch.bool) if teeth is None else teeth,
-        shared_widths=(16, 8),
-        film_width=8,
-        head_width=8,
-    )
+    config = ModelConfig(z_id=6, z_exp=4, shared_widths=(16, 8), film_width=8, mesh_width=8)
+    return MeshDecoder(config, 7, torch.zeros(9, dtype=torch.bool) if teeth is None else teeth)
 
 
 def test_ladder_starts_at_its_bias():
@@ -30,32 +24,25 @@ def test_ladder_starts_at_its_bias():
 
 @pytest.mark.parametrize(("n_g", "widths"), [(16, ()), (32, (8,)), (128, (16, 8, 8))])
 def test_ladder_doubles_up_to_n_g(n_g, widths):
-    assert ladder(n_g=n_g, widths=widths)(torch.zeros(6)).shape == (5, n_g, n_g)
+    assert ladder(n_g=n_g, ladder=widths)(torch.zeros(6)).shape == (5, n_g, n_g)
 
 
 def test_paper_ladder_reaches_512_from_8():
-    net = Ladder(
-        code=4, outputs=1, n_g=512, seed_channels=4, widths=(4, 4, 4, 4, 4), view_channels=0
-    )
+    net = ladder(n_g=512, seed_channels=4, ladder=(4, 4, 4, 4, 4))
     assert net.seed_shape == (1, 4, 8, 8)
     assert len(net.doublings) + 1 == 6
 
 
 def test_every_parameter_of_a_ladder_learns():
-    net = ladder(modes=2, view_channels=3)
+    net = ladder(identity_modes=2, view_dependent=True)
     torch.nn.init.normal_(net.last.weight)
     torch.nn.init.normal_(net.modes)
     net(torch.randn(6), torch.tensor([0.0, 0.6, 0.8])).square().sum().backward()
     assert all(p.grad is not None and p.grad.abs().sum() > 0 for p in net.parameters())
 
 
-def test_view_dependent_ladder_asks_for_a_direction():
-    with pytest.raises(ValueError, match="direction"):
-        ladder(view_channels=3)(torch.zeros(6))
-
-
 def test_modes_are_linear_in_the_code():
-    net = ladder(modes=3)
+    net = ladder(identity_modes=3)
     torch.nn.init.normal_(net.modes)
     code = torch.tensor([1.0, -2.0, 0.5, 9.0, 9.0, 9.0])
     expected = net.bias + net.modes[0] - 2 * net.modes[1] + 0.5 * net.modes[2]
@@ -63,7 +50,7 @@ def test_modes_are_linear_in_the_code():
 
 
 def test_modes_may_reach_the_first_outputs_only():
-    net = ladder(modes=2, mode_outputs=3)
+    net = ladder(identity_modes=2, mode_outputs=3)
     torch.nn.init.ones_(net.modes)
     out = net(torch.ones(6))
     assert torch.equal(out[:3], net.bias[:3] + 2) and torch.equal(out[3:], net.bias[3:])
@@ -71,7 +58,7 @@ def test_modes_may_reach_the_first_outputs_only():
 
 def test_activations_keep_their_size_through_the_ladder():
     torch.manual_seed(0)
-    net = ladder(n_g=128, widths=(32, 32, 32), seed_channels=32)
+    net = ladder(n_g=128, ladder=(32, 32, 32), seed_channels=32)
     x = torch.randn(1, 32, 8, 8)
     for doubling in net.doublings:
         x = doubling(x)

@@ -51,7 +51,7 @@ def test_single_gaussian_worked_by_hand(backend):
     out = rasterize(
         **scene, width=17, height=17, background=torch.tensor([3.0], dtype=F64), backend=backend
     )
-    variance = (100.0 * 0.1 / 2.0) ** 2 + 0.3  # (f s / z)^2 + eps2d
+    variance = (100.0 * 0.1 / 2.0) ** 2 + 0.3  # (f s / z)^2 + dilation
     alpha = 0.5 * math.exp(-0.5 * 3.0**2 / variance)  # 3 px right of the mean
     assert out.alpha[8, 8].item() == pytest.approx(0.5, abs=1e-14)
     assert out.alpha[8, 11].item() == pytest.approx(alpha, abs=1e-14)
@@ -364,7 +364,6 @@ def test_values_that_are_not_finite_are_refused_by_name(name, value):
         ({"K": torch.eye(3, dtype=F64) * -1}, "expected .*fx, fy > 0"),
         ({"K": pinhole(1, 0, 0).triu(1) + torch.eye(3) + 1e-3}, "K is"),
         ({"width": 0}, "image size is 0 x 8"),
-        ({"eps2d": 0.0}, "eps2d 0.0, expected both above 0"),
         ({"backend": "cuda"}, "expected one of auto, reference, cpu, gsplat"),
     ],
 )

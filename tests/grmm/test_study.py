@@ -10,8 +10,16 @@ import pytest
 from express50.errors import ConfigError, FormatError
 from express50.files.images import write_image
 from grmm.cli import main
-from grmm.study.design import Method, make_study, method_of, trials
-from grmm.study.results import append_answer, check_answer, markdown, read_answers, summarise
+from grmm.study import (
+    append_answer,
+    check_answer,
+    make_study,
+    markdown,
+    method_of,
+    read_answers,
+    summarise,
+    trials,
+)
 from grmm.study.server import make_server
 
 
@@ -31,8 +39,8 @@ def folders(tmp_path):
 @pytest.fixture
 def study(folders, tmp_path):
     methods = (
-        Method(name="Ours", folder=folders["ours"]),
-        Method(name="MD", folder=folders["theirs"]),
+        ("Ours", folders["ours"]),
+        ("MD", folders["theirs"]),
     )
     made = make_study(tmp_path / "s", folders["reference"], methods, examples=6, participants=4)
     return tmp_path / "s", made
@@ -63,8 +71,8 @@ def test_what_a_participant_sees_names_no_method(study):
 def test_the_same_seed_makes_the_same_study(study, folders, tmp_path):
     _, made = study
     methods = (
-        Method(name="Ours", folder=folders["ours"]),
-        Method(name="MD", folder=folders["theirs"]),
+        ("Ours", folders["ours"]),
+        ("MD", folders["theirs"]),
     )
     again = make_study(tmp_path / "t", folders["reference"], methods, examples=6, participants=4)
     assert again == made
@@ -206,8 +214,8 @@ def test_commands_make_and_table(folders, tmp_path, capsys):
 
 def test_too_few_common_pictures_are_said(folders, tmp_path):
     methods = (
-        Method(name="a", folder=folders["ours"]),
-        Method(name="b", folder=folders["theirs"]),
+        ("a", folders["ours"]),
+        ("b", folders["theirs"]),
     )
     with pytest.raises(ConfigError, match="7 pictures"):
         make_study(tmp_path / "x", folders["reference"], methods, examples=8)

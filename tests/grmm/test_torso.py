@@ -8,7 +8,7 @@ from express50.contract.segmentation_labels import TORSO
 from grmm.data import HeadViews
 from grmm.evaluate import evaluate
 from grmm.head_crop import torso_mask
-from grmm.scene import PinholeView
+from grmm.model import PinholeView
 from grmm.train import objective
 from grmm.train_state import prepare
 from tests.grmm.synthetic import EllipsoidSource, ellipsoid_head, tiny_config

@@ -118,10 +118,10 @@ def test_a_browser_shows_the_controls(loaded, tmp_path):
     ]  # fmt: skip
     try:
         for _ in range(3):  # a busy machine may not answer in the browser's time
-            told = subprocess.run(command, capture_output=True, text=True, timeout=90, check=False)
-            if "jaw open" in told.stdout:
+            page = subprocess.run(command, capture_output=True, text=True, timeout=90, check=False)
+            if "jaw open" in page.stdout:
                 break
     finally:
         viewer.stop()
         thread.join()
-    assert "jaw open" in told.stdout
+    assert "jaw open" in page.stdout

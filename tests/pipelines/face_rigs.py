@@ -1,4 +1,4 @@
-"""What a rig would see of a spotted head at some moments: landmarks and features, as numbers."""
+"""What a rig would see of a spotted head at some instants: landmarks and features, as numbers."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def face_cameras(count: int = 6, span_deg: float = 90.0, focal: float = 1100.0) 
 
 def see(
     rig: dict[str, Camera],
-    moments: int = 2,
+    sets: int = 2,
     features: int = 130,
     noise_px: float = 0.3,
     landmark_px: float = 2.0,
@@ -54,7 +54,7 @@ def see(
     """
     rng = np.random.default_rng(7)
     seen = {}
-    for moment in range(moments):
+    for number in range(sets):
         turn = axis_angle_to_matrix(rng.normal(size=3) * 0.1)
         shift = rng.normal(size=3) * 0.01
         shape = face() + rng.normal(size=(68, 3)) * 0.002
@@ -79,7 +79,7 @@ def see(
             own[mixed] = own[np.roll(mixed, 1)]
             own /= np.linalg.norm(own, axis=1, keepdims=True)
             found[name] = (pixels, own.astype(np.float32))
-        seen[moment] = FrameSetPoints(landmarks, found)
+        seen[number] = FrameSetPoints(landmarks, found)
     return seen
 
 

@@ -19,8 +19,7 @@ from pipelines.calibrate.board import (
     make_detector,
     opencv_board,
 )
-from pipelines.calibrate.board_adjust import BoardRig, corner_errors
-from pipelines.calibrate.board_rig import solve_rig
+from pipelines.calibrate.board_rig import BoardRig, corner_errors, solve_rig
 from pipelines.calibrate.stage import check_given
 from tests.pipelines.board_rigs import (
     BOARD,

@@ -1,7 +1,6 @@
 """A camera that moved after calibration is found in the footage, named and measured."""
 
 import json
-import weakref
 from dataclasses import replace
 
 import cv2
@@ -13,19 +12,20 @@ from express50.cli.main import main
 from express50.contract.layout import Dataset
 from express50.errors import CalibrationError, CaptureError
 from express50.files.calibration import write_cameras
+from express50.files.containers import read_picture
 from express50.files.images import write_image
 from express50.geometry.cameras import Camera, project, rays
 from express50.geometry.transforms import look_at
 from pipelines.calibrate.adjuster import RigPriors, adjust_rig, move_pose, triangulate_tracks
-from pipelines.calibrate.camera_moves import check_footage
-from pipelines.calibrate.footage import read_capture_frames, reduce_image, reduced_camera
-from pipelines.calibrate.tracks import (
-    PointTracks,
-    epipolar_distance,
+from pipelines.calibrate.footage import (
     find_features,
     find_points,
+    read_raw_footage,
+    reduced_camera,
     without_fixed,
 )
+from pipelines.calibrate.given_rig import check_footage
+from pipelines.calibrate.tracks import FrameSetPoints, PointTracks, epipolar_distance
 
 TURN, SHIFT = np.radians(0.3), 5e-3
 
@@ -61,7 +61,17 @@ def picture(camera):
 @pytest.fixture(scope="module")
 def footage():
     rig = make_rig()
-    return rig, {0: {name: picture(camera) for name, camera in rig.items()}}
+    return rig, {name: picture(camera) for name, camera in rig.items()}
+
+
+def features_of(images):
+    features = {name: find_features(image) for name, image in images.items()}
+    return {0: FrameSetPoints([], without_fixed(features))}
+
+
+@pytest.fixture(scope="module")
+def seen(footage):
+    return features_of(footage[1])
 
 
 def bumped(rig, name, turn=(0, 0, 0), shift=(0, 0, 0)):
@@ -72,9 +82,9 @@ def bumped(rig, name, turn=(0, 0, 0), shift=(0, 0, 0)):
     }
 
 
-def test_a_rig_that_fits_is_quiet(footage):
-    rig, frames = footage
-    verdict = check_footage(rig, frames, None)
+def test_a_rig_that_fits_is_quiet(footage, seen):
+    rig, _ = footage
+    verdict = check_footage(rig, seen)
     assert verdict.moved == {} and verdict.unchecked == {}
     assert verdict.points > 150 and verdict.error_px < 0.5
     for name, camera in rig.items():
@@ -90,10 +100,10 @@ def test_a_rig_that_fits_is_quiet(footage):
         ("cam04", (0, np.radians(2.0), 0), (0, 0, 0)),
     ],
 )
-def test_a_bump_is_named_and_put_right(footage, name, turn, shift):
-    rig, frames = footage
+def test_a_bump_is_named_and_put_right(footage, seen, name, turn, shift):
+    rig, _ = footage
     wrong = bumped(rig, name, turn, shift)
-    verdict = check_footage(wrong, frames, None)
+    verdict = check_footage(wrong, seen)
     assert list(verdict.moved) == [name]
     towards = rig[name].center / np.linalg.norm(rig[name].center)
     points = towards + np.random.default_rng(1).normal(size=(200, 3)) * 0.3
@@ -104,63 +114,59 @@ def test_a_bump_is_named_and_put_right(footage, name, turn, shift):
     assert np.median(np.linalg.norm(after - true, axis=1)) < 0.5 * off
 
 
-def test_two_bumped_cameras_are_both_named(footage):
-    rig, frames = footage
+def test_two_bumped_cameras_are_both_named(footage, seen):
+    rig, _ = footage
     wrong = bumped(bumped(rig, "cam01", (TURN, 0, 0)), "cam05", (0, -2 * TURN, 0))
-    assert set(check_footage(wrong, frames, None).moved) == {"cam01", "cam05"}
+    assert set(check_footage(wrong, seen).moved) == {"cam01", "cam05"}
 
 
 def test_a_camera_without_common_points_is_said_to_be_unchecked(footage):
-    rig, frames = footage
-    blind = {0: {**frames[0], "cam02": np.full_like(frames[0]["cam02"], 128)}}
-    verdict = check_footage(rig, blind, None)
+    rig, images = footage
+    blind = images | {"cam02": np.full_like(images["cam02"], 128)}
+    verdict = check_footage(rig, features_of(blind))
     assert list(verdict.unchecked) == ["cam02"] and "shares 0 points" in verdict.unchecked["cam02"]
     assert verdict.moved == {}
 
 
-def test_two_cameras_and_wrong_sizes_are_refused(footage):
-    rig, frames = footage
+def test_two_cameras_and_wrong_sizes_are_refused(footage, seen, tmp_path):
+    rig, images = footage
     two = {name: rig[name] for name in ("cam00", "cam01")}
     with pytest.raises(CalibrationError, match="three or more"):
-        check_footage(two, frames, None)
+        check_footage(two, seen)
+    small = images | {"cam00": np.zeros((10, 10, 3), np.uint8)}
+    write_capture(tmp_path / "capture", rig, small)
     with pytest.raises(CalibrationError, match="cam00: frame 0 is 10x10, the camera is 320x320"):
-        check_footage(rig, {0: {**frames[0], "cam00": np.zeros((10, 10, 3), np.uint8)}}, None)
+        list(read_raw_footage(tmp_path / "capture", rig, 1))
 
 
-def test_large_images_are_reduced_with_their_camera():
+def test_large_images_are_reduced_with_their_camera_one_by_one(footage, tmp_path, monkeypatch):
     camera = replace(make_rig(1)["cam00"], width=2560, height=1920)
-    image = reduce_image(camera, np.zeros((1920, 2560, 3), np.uint8), "frame 3")
-    assert image.shape == (960, 1280, 3)
     np.testing.assert_allclose(reduced_camera(camera).K[:2], 0.5 * camera.K[:2])
-
-
-def test_reduced_images_pass_again_and_the_full_ones_are_let_go(footage, tmp_path, monkeypatch):
-    rig, frames = footage
+    rig, images = footage
     monkeypatch.setattr("pipelines.calibrate.footage.LONG_SIDE", 160)
-    write_capture(tmp_path / "capture", rig, frames[0])
-    alive = []
+    write_capture(tmp_path / "capture", rig, images)
+    read = []
 
-    def reduce(name, image):
-        alive[:] = [ref for ref in alive if ref() is not None]
-        assert len(alive) <= 1  # the image read before this one at most
-        alive.append(weakref.ref(image))
-        return reduce_image(rig[name], image, "frame 0")
+    def reading(*args):
+        read.append(args)
+        return read_picture(*args)
 
-    found = read_capture_frames(tmp_path / "capture", 1, reduce)
-    assert {image.shape for image in found[0].values()} == {(160, 160, 3)}
-    assert all(reduce_image(rig[n], found[0][n], "frame 0") is found[0][n] for n in rig)
+    monkeypatch.setattr("pipelines.calibrate.footage.read_picture", reading)
+    for number, (frame, _, image) in enumerate(read_raw_footage(tmp_path / "capture", rig, 1), 1):
+        assert frame == 0 and image.shape == (160, 160, 3)
+        assert len(read) == number  # the next image is not read before this one is used
 
 
 def test_noise_fixed_to_the_pixels_of_all_sensors_does_not_accuse(footage):
-    rig, frames = footage
+    rig, images = footage
     noise = cv2.GaussianBlur(np.random.default_rng(5).normal(size=(320, 320, 1)) * 90, (0, 0), 1.5)
-    same = {n: np.clip(i + noise[..., None], 0, 255).astype(np.uint8) for n, i in frames[0].items()}
-    verdict = check_footage(rig, {0: same}, None)
+    same = {n: np.clip(i + noise[..., None], 0, 255).astype(np.uint8) for n, i in images.items()}
+    verdict = check_footage(rig, features_of(same))
     assert verdict.moved == {}
     blank = {n: np.clip(128 + noise[..., None], 0, 255).repeat(3, 2).astype(np.uint8) for n in rig}
     left = without_fixed({name: find_features(image) for name, image in blank.items()})
     assert sum(len(pixels) for pixels, _ in left.values()) == 0
-    scene = {name: find_features(image) for name, image in frames[0].items()}
+    scene = {name: find_features(image) for name, image in images.items()}
     kept = without_fixed(scene)
     for name in rig:
         assert len(kept[name][0]) > 0.95 * len(scene[name][0])
@@ -193,10 +199,9 @@ def test_freed_poses_return_to_the_truth():
     assert np.abs(fit.points - points).max() < 1e-4
 
 
-def test_no_network_means_no_landmarks_and_blank_images_no_features(footage):
-    rig, frames = footage
-    seen = find_points({"cam00": np.zeros((320, 320, 3), np.uint8)}, None)
-    assert seen.landmarks == [] and seen.features["cam00"][0].shape == (0, 2)
+def test_blank_images_have_no_landmarks_and_no_features():
+    found = find_points([(3, "cam00", np.zeros((320, 320, 3), np.uint8))])
+    assert found[3].landmarks == [] and found[3].features["cam00"][0].shape == (0, 2)
 
 
 def write_capture(root, rig, images):
@@ -208,39 +213,39 @@ def write_capture(root, rig, images):
 
 
 def test_the_command_names_the_camera(footage, tmp_path, capsys):
-    rig, frames = footage
-    write_capture(tmp_path / "capture", rig, frames[0])
+    rig, images = footage
+    write_capture(tmp_path / "capture", rig, images)
     write_cameras(tmp_path / "c.json", rig)
     command = ["cameras", "check", str(tmp_path / "c.json"), "--footage", str(tmp_path / "capture")]
     assert main(command) == 0
     assert "moved" not in capsys.readouterr().out
     write_cameras(tmp_path / "c.json", bumped(rig, "cam03", (0, TURN, 0)))
     assert main([*command, "--json"]) == 1
-    told = json.loads(capsys.readouterr().out)["footage"]
-    assert list(told["moved"]) == ["cam03"] and told["moved"]["cam03"]["shift_px"] > 2
+    checked = json.loads(capsys.readouterr().out)["footage"]
+    assert list(checked["moved"]) == ["cam03"] and checked["moved"]["cam03"]["shift_px"] > 2
 
 
-def test_moments_follow_the_cues_and_a_short_camera_is_named(footage, tmp_path):
-    rig, frames = footage
-    write_capture(tmp_path / "capture", rig, frames[0])
-    assert list(read_capture_frames(tmp_path / "capture", 3, lambda name, image: image)) == [0]
+def test_frame_sets_follow_the_cues_and_a_short_camera_is_named(footage, tmp_path):
+    rig, images = footage
+    write_capture(tmp_path / "capture", rig, images)
+    assert {frame for frame, _, _ in read_raw_footage(tmp_path / "capture", rig, 3)} == {0}
     cues = "expression_id,start_frame,end_frame\nneutral,0,0\nsmile,2,4\n"
     (tmp_path / "capture" / "cues.csv").write_text(cues)
     with pytest.raises(CaptureError, match="has 1 frames, frame 3 was expected"):
-        read_capture_frames(tmp_path / "capture", 2, lambda name, image: image)
+        list(read_raw_footage(tmp_path / "capture", rig, 2))
 
 
 def test_calibrate_warns_of_the_camera_and_goes_on(footage, tmp_path, capsys):
-    rig, frames = footage
-    write_capture(tmp_path / "capture", rig, frames[0])
+    rig, images = footage
+    write_capture(tmp_path / "capture", rig, images)
     write_cameras(tmp_path / "capture" / "calibration.json", bumped(rig, "cam03", (0, TURN, 0)))
     dataset = Dataset(tmp_path / "dataset")
     assert main(["ingest", str(dataset.root), str(tmp_path / "capture"), "--workers", "0"]) == 0
     assert main(["calibrate", str(dataset.root), "--workers", "0"]) == 0
     path = dataset.item_dir("calibrate", "S001") / "metrics.json"
-    told = json.loads(path.read_text())
-    assert [row["what"] for row in told["warnings"]] == ["cam03"]
-    assert "px" in told["warnings"][0]["why"] and told["footage"]["points"] > 20
-    quiet = ["--workers", "0", "--set", "calibrate.check_moments=0"]
+    metrics = json.loads(path.read_text())
+    assert [row["what"] for row in metrics["warnings"]] == ["cam03"]
+    assert "px" in metrics["warnings"][0]["why"] and metrics["footage"]["points"] > 20
+    quiet = ["--workers", "0", "--set", "calibrate.check_frame_sets=0"]
     assert main(["calibrate", str(dataset.root), *quiet]) == 0
     assert json.loads(path.read_text())["footage"] is None

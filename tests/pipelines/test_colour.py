@@ -50,46 +50,38 @@ def centred(gain: np.ndarray) -> np.ndarray:
 )
 def test_any_gains_are_found_whatever_the_patches(gain, seed):
     true = np.array(gain)
-    found = fit_gains(patches(true, seed=seed))
-    assert found.tied.all()
-    np.testing.assert_allclose(found.gain, centred(true), rtol=1e-6)
-    assert found.after < 1e-6
+    found, _, after = fit_gains(patches(true, seed=seed))
+    np.testing.assert_allclose(found, centred(true), rtol=1e-6)
+    assert after < 1e-6
 
 
 def test_glare_in_one_camera_does_not_spoil_the_others():
     true = np.random.default_rng(1).uniform(0.9, 1.1, (6, 3))
     light = patches(true, noise=0.01)
     light[:50, 2] *= 3.0
-    found = fit_gains(light)
-    assert np.abs(np.log(found.gain / centred(true))).max() < 0.01
-    assert found.after < found.before
+    found, before, after = fit_gains(light)
+    assert np.abs(np.log(found / centred(true))).max() < 0.01
+    assert after < before
 
 
 def test_cameras_that_share_too_little_keep_their_colours():
     light = patches(np.array([[1.0] * 3, [1.2] * 3, [0.7] * 3]))
     light[5:, 2] = np.nan
-    found = fit_gains(light)
-    assert found.tied.tolist() == [True, True, False]
-    assert (found.gain[2] == 1).all()
-    np.testing.assert_allclose(found.gain[1] / found.gain[0], 1.2, rtol=1e-6)
+    found = fit_gains(light)[0]
+    assert np.isnan(found[2]).all()
+    np.testing.assert_allclose(found[1] / found[0], 1.2, rtol=1e-6)
 
 
 @pytest.mark.parametrize("shape", [(0, 4, 3), (10, 1, 3), (0, 0, 3)])
 def test_nothing_in_common_tells_nothing(shape):
-    found = fit_gains(np.ones(shape))
-    assert not found.tied.any() and (found.gain == 1).all() and np.isnan(found.after)
-
-
-@pytest.mark.parametrize("bad", [0.0, -1.0, np.inf])
-def test_light_that_cannot_be_is_refused(bad):
-    with pytest.raises(ValueError, match="above 0"):
-        fit_gains(np.full((20, 3, 3), bad))
+    found, before, after = fit_gains(np.ones(shape))
+    assert np.isnan(found).all() and before is None and after is None
 
 
 def test_gains_over_six_decades_stay_finite():
     true = np.array([[1e-3] * 3, [1.0] * 3, [1e3] * 3])
-    found = fit_gains(patches(true))
-    np.testing.assert_allclose(found.gain, centred(true), rtol=1e-6)
+    found = fit_gains(patches(true))[0]
+    np.testing.assert_allclose(found, centred(true), rtol=1e-6)
 
 
 def seen_squares(image: np.ndarray) -> dict:
@@ -123,11 +115,11 @@ def test_clipped_or_dark_paper_is_not_asked(board_image):
 def test_gains_of_two_cameras_come_back_from_their_pictures(board_image):
     true = np.array([1.1, 0.97, 0.9])
     whites = WhiteCollector(BOARD)
-    for moment in range(4):
+    for number in range(4):
         for name, gain in (("a", true**0.5), ("b", true**-0.5)):
             image = scale_light(board_image, gain)
             ids, pixels = detect_corners(image, make_detector(BOARD), BOARD)
-            whites.look(name, str(moment), image, ids, pixels)
+            whites.look(name, str(number), image, ids, pixels)
     found = whites.gains(["a", "b", "c"])
     np.testing.assert_allclose(found.gain["a"] / found.gain["b"], true, rtol=0.01)
     assert set(found.gain) == {"a", "b"}

@@ -11,13 +11,18 @@ from express50.errors import StageError
 from express50.geometry.cameras import rays
 from express50.geometry.raycast import mesh_scene
 from pipelines.depth.blocks import build
-from pipelines.depth.hull import head_box, hull_distance, without_contradiction
 from pipelines.depth.maps import cast_maps
-from pipelines.depth.outputs import write_ply
 from pipelines.depth.prior import boundary_loops, close_mesh, matte_agreement
 from pipelines.depth.reconstruct import reconstruct
+from pipelines.depth.stage import write_ply
 from pipelines.depth.surface import advance, extract_mesh
-from pipelines.depth.views import make_view, silhouette_distance
+from pipelines.depth.views import (
+    head_box,
+    hull_distance,
+    make_view,
+    silhouette_distance,
+    without_contradiction,
+)
 from tests.pipelines.bump_head import mesh, render, ring
 
 QUICK = 4.0  # millimetres per voxel

@@ -12,8 +12,7 @@ from express50.geometry.cameras import Camera, rays
 from express50.geometry.raycast import mesh_scene
 from pipelines.depth.blocks import LevelSet, build, combined, largest_body
 from pipelines.depth.maps import cast_maps
-from pipelines.depth.reconstruct import HeadSurface
-from pipelines.depth.surface import extract_mesh, grid_normals
+from pipelines.depth.surface import HeadSurface, extract_mesh, grid_normals
 from tests.pipelines.bump_head import ring
 from tests.pipelines.dense_grid import to_dense
 

@@ -16,7 +16,7 @@ from express50.capture.frames import (
     read_recorded_plate,
     write_frame,
 )
-from express50.capture.index import read_index
+from express50.capture.index import read_index, read_peaks
 from express50.contract.layout import PLATES
 from express50.errors import CaptureError
 from express50.files.calibration import write_cameras
@@ -50,7 +50,7 @@ def dataset(tmp_path, capture):
 
 
 def test_written_frames_are_the_undistorted_footage(dataset):
-    peaks = frames_module.read_peaks(dataset, "S001")
+    peaks = read_peaks(dataset, "S001")
     rig = frames_module.read_cameras_of(dataset, "S001", undistorted=False)
     index = read_index(dataset, "S001")
     assert set(STAGE.items(dataset)) == {"S001/neutral", "S001/smile", f"S001/{PLATES}"}
@@ -74,7 +74,7 @@ def test_each_peak_is_decoded_once_and_only_by_this_stage(dataset, monkeypatch):
 
     monkeypatch.setattr(frames_module.FrameReader, "read", counted)
     assert run(dataset, deep=False).ok
-    peaks = frames_module.read_peaks(dataset, "S001")
+    peaks = read_peaks(dataset, "S001")
     assert sorted(read) == sorted((c, f) for c in make_rig() for f in peaks.values())
     assert run_stage(MATTE, dataset, MATTE.config(), workers=0, progress=False).ok
     assert len(read) == 6
@@ -83,7 +83,7 @@ def test_each_peak_is_decoded_once_and_only_by_this_stage(dataset, monkeypatch):
 def test_a_camera_whose_footage_changed_is_dropped(tmp_path):
     make_capture(tmp_path / "raw")
     dataset = make_dataset(tmp_path, [tmp_path / "raw"])
-    peak = frames_module.read_peaks(dataset, "S001")["smile"]
+    peak = read_peaks(dataset, "S001")["smile"]
     noise = np.random.default_rng(0).integers(0, 255, (8, 8, 3), dtype=np.uint8)
     path = tmp_path / f"raw/cameras/cam01/frames/{peak:06d}.png"
     write_image(path, np.kron(noise, np.ones((8, 8, 1), np.uint8)))
@@ -114,7 +114,7 @@ def test_16_bits_are_kept_where_the_footage_has_them(tmp_path):
         write_image(path, image * 257 + (image % 7))
     dataset = make_dataset(tmp_path, [tmp_path / "raw"])
     assert metrics_of(dataset, "S001/smile")["bits"] == {"cam00": 16}
-    peak = frames_module.read_peaks(dataset, "S001")["smile"]
+    peak = read_peaks(dataset, "S001")["smile"]
     truth = read_image(tmp_path / f"raw/cameras/cam00/frames/{peak:06d}.png")
     deep = read_peak_frame(dataset, "S001", "smile", "cam00", deep=True)
     assert deep.dtype == np.uint16 and np.array_equal(deep, truth)

@@ -1,4 +1,4 @@
-"""Ingest: the index is true to the footage; bad cameras are dropped, bad captures fail alone."""
+"""Ingest indexes the footage, drops bad cameras and fails bad captures one by one."""
 
 import json
 import shutil
@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from express50.capture.frames import decode_proxy, dhash
-from express50.capture.index import CameraSource, Cue, read_index
+from express50.capture.index import Cue, read_index
 from express50.contract.config import resolve_config
 from express50.contract.layout import Dataset
 from express50.contract.stage import Note
@@ -42,7 +42,7 @@ def camera_folder(dataset, name):
     return dataset.captures()["S001"] / "cameras" / name
 
 
-def test_account_of_a_good_capture(dataset):
+def test_a_good_capture_gives_full_counts(dataset):
     assert run(dataset).ok
     assert metrics(dataset) == {
         "cameras": 3,
@@ -93,7 +93,7 @@ def test_truncated_camera_is_dropped_with_its_reason(dataset):
     assert summary.outcomes[0].dropped == (Note(**dropped),)
 
 
-def test_a_copied_camera_is_named(dataset):
+def test_a_copied_camera_is_reported(dataset):
     assert run(dataset).ok and not metrics(dataset)["warnings"]
     shutil.copyfile(
         camera_folder(dataset, "cam00") / "video.mp4", camera_folder(dataset, "cam02") / "video.mp4"
@@ -101,16 +101,13 @@ def test_a_copied_camera_is_named(dataset):
     assert run(dataset).ok
     (warning,) = metrics(dataset)["warnings"]
     assert warning["what"] == "camera cam02"
-    assert "the very files of camera cam00" in warning["why"]
+    assert "camera cam00" in warning["why"]
 
 
-def test_names_that_would_meet_in_later_stages_are_refused(dataset):
+def test_camera_names_that_clash_in_later_stages_are_refused(dataset):
     camera_folder(dataset, "cam02").rename(camera_folder(dataset, "cam00_head"))
     (dataset.captures()["S001"] / "calibration.json").unlink(missing_ok=True)
-    summary = run(dataset)
-    assert (
-        "cameras cam00 and cam00_head would write files of one name" in summary.outcomes[0].reason
-    )
+    assert "cameras cam00 and cam00_head" in run(dataset).outcomes[0].reason
 
 
 def test_missing_camera_is_dropped(dataset):
@@ -129,7 +126,7 @@ def test_capture_without_a_usable_camera_fails(dataset):
     assert not dataset.item_dir("ingest", "S001").exists()
 
 
-def test_wrong_calibration_stops_that_item_and_not_the_other(dataset, tmp_path):
+def test_wrong_calibration_fails_its_item_only(dataset, tmp_path):
     make_capture(tmp_path / "S002", subject="S002", cameras=2, frames=4)
     ingest.register(dataset, [tmp_path / "S002"])
     path = dataset.captures()["S001"] / "calibration.json"
@@ -142,7 +139,7 @@ def test_wrong_calibration_stops_that_item_and_not_the_other(dataset, tmp_path):
     assert "cam00: params has shape (5,), expected (8,)" in summary.outcomes[0].reason
 
 
-def test_calibration_for_another_size_stops_the_item(dataset):
+def test_calibration_for_another_size_fails_the_item(dataset):
     path = dataset.captures()["S001"] / "calibration.json"
     table = json.loads(path.read_text())
     table["cam00"]["width"] = 128
@@ -206,7 +203,7 @@ def test_register_checks_before_it_writes(dataset, tmp_path):
     assert dataset.captures()["S001"] == (tmp_path / "other").resolve()
 
 
-def test_capture_that_went_away_or_changed_its_subject_fails_alone(dataset, tmp_path):
+def test_a_moved_capture_or_a_changed_subject_fails_its_item_only(dataset, tmp_path):
     (tmp_path / "S001" / "capture.toml").write_text('subject = "S009"\nfps = 24\n')
     assert "registered as 'S001'" in run(dataset).outcomes[0].reason
     (tmp_path / "S001").rename(tmp_path / "elsewhere")
@@ -222,18 +219,10 @@ def test_config_ranges():
 
 
 def test_usual_count_prefers_the_common_then_the_larger():
-    def camera(frames):
-        return CameraSource(
-            kind="video", source="", width=1, height=1, frames=frames, pts=(), dhash=(), sha256=""
-        )
-
-    def usual(*counts):
-        return usual_count({str(i): camera(n) for i, n in enumerate(counts)})
-
-    assert (usual(), usual(5), usual(5, 9, 5), usual(4, 6)) == (0, 5, 5, 6)
+    assert [usual_count(c) for c in ((), (5,), (5, 9, 5), (4, 6))] == [0, 5, 5, 6]
 
 
-def test_lost_frames_show_as_time_gaps():
+def test_lost_frames_count_as_time_gaps():
     assert time_gaps((0, 10, 20, 30)) == 0
     assert time_gaps((0, 10, 30, 40, 70, 80)) == 2
     assert time_gaps((5,)) == time_gaps(()) == 0

@@ -21,8 +21,7 @@ from pipelines import calibrate, ingest
 from pipelines.matte import STAGE as MATTE
 from pipelines.matte.config import MatteConfig
 from pipelines.matte.grabcut import person_alpha
-from pipelines.photo.capture import make_photo_capture, open_picture
-from pipelines.photo.focal import single_camera
+from pipelines.photo.capture import make_photo_capture, open_picture, single_camera
 from pipelines.track.config import TrackConfig
 from tests.synth import write_peak_frames, write_video
 

@@ -10,20 +10,23 @@ import pytest
 
 from express50.errors import ConfigError
 from pipelines.matte.config import MatteConfig
-from pipelines.matte.key import Keyer, KeyOptions, dilated, eroded, plate_difference
-from pipelines.matte.opacity import local_colours, shrunk, solve_opacity
-from pipelines.matte.plates import exposed, exposure_gain, fit_plate
-from pipelines.matte.refine import MattingLaplacian
+from pipelines.matte.key import dilated, eroded, key_alpha, plate_difference
+from pipelines.matte.learned import MattingLaplacian
+from pipelines.matte.plates import (
+    exposed,
+    exposure_gain,
+    fit_plate,
+    local_colours,
+    shrunk,
+    solve_opacity,
+)
 from tests.pipelines.matte_scenes import Scene, clutter, make_scene
-
-OPTIONS = KeyOptions()
 
 
 def key(scene: Scene, **changes) -> np.ndarray:
     """Alpha (H, W) of a scene."""
     valid = np.ones(scene.alpha.shape, bool)
-    keyer = Keyer(scene.plate, [scene.frame], valid, replace(OPTIONS, **changes))
-    return keyer.alpha(scene.frame)
+    return key_alpha(scene.frame, scene.plate, valid, MatteConfig(**changes))
 
 
 def mae(alpha: np.ndarray, scene: Scene) -> float:
@@ -88,7 +91,7 @@ def test_the_difference_of_mere_noise_is_one() -> None:
         np.clip(np.rint(true + rng.normal(size=true.shape) * 3), 0, 255).astype(np.uint8)
         for _ in range(2)
     )
-    model = fit_plate(plate, [frame], np.ones(plate.shape[:2], bool), 1.0)
+    model = fit_plate(plate, frame, np.ones(plate.shape[:2], bool))
     assert np.median(model.sigma) == pytest.approx(3 * np.sqrt(2), rel=0.1)
     difference = plate_difference(frame.astype(np.float32), model, 0.0, 200)
     assert np.sqrt(np.mean(difference**2)) == pytest.approx(1.0, abs=0.1)
@@ -148,7 +151,7 @@ def test_composites_in_srgb_values_are_keyed_as_such() -> None:
     front = np.array([14.0, 12.0, 12.0])
     mixed = scene.alpha[..., None] * front + (1 - scene.alpha[..., None]) * scene.plate
     scene = replace(scene, frame=np.rint(mixed).astype(np.uint8))
-    assert mae(key(scene, linear=False), scene) < 0.7 * mae(key(scene), scene)
+    assert mae(key(scene, light="display"), scene) < 0.7 * mae(key(scene), scene)
 
 
 def test_strands_before_a_shadow_are_measured_against_the_darkened_plate() -> None:
@@ -190,7 +193,7 @@ def test_pixels_without_footage_are_transparent() -> None:
     valid[:, :20] = valid[-30:] = False
     frame = np.where(valid[..., None], scene.frame, 0).astype(np.uint8)
     plate = np.where(valid[..., None], scene.plate, 0).astype(np.uint8)
-    alpha = Keyer(plate, [frame], valid, OPTIONS).alpha(frame)
+    alpha = key_alpha(frame, plate, valid, MatteConfig())
     assert (alpha[~valid] == 0).all() and alpha[120, 128] == 1
 
 

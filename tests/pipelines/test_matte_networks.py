@@ -18,10 +18,11 @@ from pipelines.matte.learned import (
     SALIENT,
     as_opacity,
     background_alpha,
+    in_tiles,
     refined,
     salient_alpha,
+    spans,
 )
-from pipelines.matte.refine import in_tiles, spans
 from pipelines.networks import load_network
 from tests.pipelines.matte_scenes import make_scene
 from tests.pipelines.stand_ins import (

@@ -14,9 +14,10 @@ from scipy.ndimage import minimum_filter
 
 from express50.contract.layout import Dataset
 from express50.contract.segmentation_labels import LABELS
+from express50.dataset.depth_files import read_depth
 from express50.errors import StageError
 from express50.files.atomic import write_json
-from express50.files.images import read_depth_png, read_image, srgb_to_linear, write_image
+from express50.files.images import read_image, srgb_to_linear, write_image
 from express50.geometry.cameras import pinhole_camera, project, unproject
 from express50.geometry.transforms import look_at
 from express50.shards.reader import ShardReader
@@ -304,7 +305,7 @@ def test_depth_stage_drops_a_bad_camera_and_reports_it(tmp_path):
     assert "empty" in row["dropped"][0]["why"]
     assert metrics["S001/neutral"]["views"] == 6
     folder = dataset.item_dir("depth", "S001/smile")
-    depth, valid = read_depth_png(folder / "cam00.png")
+    depth, valid = read_depth(folder / "cam00.png")
     assert 1.0 < depth[valid].mean() < 1.2 and valid.sum() > 500
     assert not (folder / "cam01.png").exists() and (folder / "qc" / "surface.jpg").exists()
     assert 0 < row["voxels_allocated"] < row["voxel_limit"] and row["grid_bytes"] < 2e6

@@ -15,15 +15,15 @@ import pytest
 from express50.cli.main import main
 from express50.errors import CaptureError
 from express50.files.calibration import read_cameras
-from express50.files.containers import read_srgb8
+from express50.files.containers import read_picture
 from express50.files.images import write_image
 from express50.files.video import iterate_video
 from pipelines.photo.capture import (
     guess_focal,
     make_photo_capture,
     open_picture,
-    read_upright,
     subject_id,
+    upright_frames,
 )
 from pipelines.track.config import TrackConfig
 from tests.synth import turn_video
@@ -140,7 +140,7 @@ def test_photographs_of_kinds_that_no_rig_writes_are_read(
     path = tmp_path / f"eva.{suffix}"
     cv2.imwrite(str(path), astronaut[..., ::-1])
     make_photo_capture(open_picture(path), tmp_path / "out", "eva", TrackConfig())
-    stored = read_srgb8(tmp_path / "out/cameras/photo/frames/000000.png")
+    stored = read_picture(tmp_path / "out/cameras/photo/frames", "000000.png")
     assert np.abs(stored.astype(int) - astronaut).mean() < 4
 
 
@@ -173,7 +173,7 @@ def test_exif_turns_pictures_upright(tmp_path: Path, orientation: int, stored) -
     upright = np.stack([4 * x, 5 * y, 0 * x + 90], -1).astype(np.uint8)
     write_exif(tmp_path / "a.tif", stored(upright), orientation, 28)
     picture = open_picture(tmp_path / "a.tif")
-    np.testing.assert_array_equal(read_upright(picture), upright)
+    np.testing.assert_array_equal(next(upright_frames(picture)), upright)
     focal, source = guess_focal(picture, 64, 48, 50.0)
     assert source == "exif" and focal == pytest.approx(28 / np.hypot(36, 24) * 80)
 
@@ -192,7 +192,7 @@ def test_a_photograph_on_its_side_is_tracked_as_an_upright_one(
     np.testing.assert_allclose(camera.K[:2, 2], [140, 180])
     assert focal.source == "exif"
     assert focal.pixels == pytest.approx(50 / np.hypot(36, 24) * np.hypot(280, 360))
-    stored = read_srgb8(tmp_path / "out/cameras/photo/frames/000000.png")
+    stored = read_picture(tmp_path / "out/cameras/photo/frames", "000000.png")
     np.testing.assert_array_equal(stored, upright)
 
 

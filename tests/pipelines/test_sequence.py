@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -13,9 +14,8 @@ from express50.dataset.tracks import SEQUENCE_SCHEMA
 from express50.errors import StageError
 from express50.geometry.cameras import project
 from express50.geometry.transforms import axis_angle_to_matrix
-from pipelines.track import clips
+from pipelines.track import sequence
 from pipelines.track.basis import Points
-from pipelines.track.clips import track_clips, write_clips
 from pipelines.track.observe import LandmarkView, Observation, agree
 from pipelines.track.sequence import (
     ClipTracker,
@@ -24,6 +24,7 @@ from pipelines.track.sequence import (
     jitter_mm,
     make_windows,
     track_window,
+    write_clips,
 )
 from pipelines.track.state import Pose
 from pipelines.track.terms import landmark_anchors
@@ -77,10 +78,10 @@ def test_a_frozen_shape_is_the_same_head() -> None:
 @pytest.mark.parametrize(("count", "window", "sweeps"), [(1, 48, 2), (13, 4, 0), (50, 7, 3)])
 def test_every_frame_is_kept_by_one_window(count: int, window: int, sweeps: int) -> None:
     windows = make_windows(range(100, 100 + count), window, sweeps)
-    kept = [frame for one in windows for frame in one.frames[one.kept]]
-    assert kept == list(range(100, 100 + count))
-    for before, after in zip(windows, windows[1:], strict=False):
-        shared = set(before.frames) & set(after.frames)
+    assert [frame for _, kept in windows for frame in kept] == list(range(100, 100 + count))
+    assert all(set(kept) <= set(fitted) for fitted, kept in windows)
+    for (before, _), (after, _) in zip(windows, windows[1:], strict=False):
+        shared = set(before) & set(after)
         assert len(shared) > 2 * sweeps
 
 
@@ -124,15 +125,22 @@ CUES = (Cue("smile", 0, 4), Cue("frown", 5, 9))
 
 
 def run(scene, keep: Path, watched: list[int], fail_at: int | None = None, hide: int | None = None):
+    """Track the cues: arrays, metrics and notes."""
     seen = observations(scene, 0.5)
 
-    def observe(cue: str, frame: int) -> Observation | None:
-        if frame == fail_at:
+    def observe(cue: str, frames: Sequence[int]) -> list[Observation]:
+        if fail_at in frames:
             raise KeyboardInterrupt
-        watched.append(frame)
-        return None if frame == hide else seen[frame]
+        watched.extend(frames)
+        return [seen[frame] for frame in frames if frame != hide]
 
-    return track_clips(quick(scene), CUES, observe, keep, "inputs")
+    out = keep.with_name(keep.name + "-out")
+    out.mkdir(exist_ok=True)
+    metrics, dropped = write_clips(
+        out, quick(scene), "tiny", scene.shape, CUES, observe, keep, "inputs"
+    )
+    with np.load(out / "sequence.npz", allow_pickle=False) as data:
+        return dict(data), metrics, dropped
 
 
 def quick(scene) -> ClipTracker:
@@ -159,11 +167,14 @@ def test_a_stopped_run_goes_on_to_the_same_result(tmp_path: Path) -> None:
 
 
 def test_frames_without_a_face_are_left_out_and_said(tmp_path: Path) -> None:
-    arrays, _, dropped = run(make_scene(), tmp_path, [], hide=3)
+    arrays, _, dropped = run(make_scene(), tmp_path / "windows", [], hide=3)
     assert 3 not in arrays["frames"] and len(arrays["frames"]) == FRAMES - 1
     assert "1 of 5 frames" in dropped[0].why
     with pytest.raises(StageError, match="no frame of any clip"):
-        track_clips(quick(make_scene()), CUES, lambda c, f: None, tmp_path / "n", "")
+        write_clips(
+            tmp_path, quick(make_scene()), "tiny", np.zeros(5), CUES, lambda c, f: [],
+            tmp_path / "n", "",
+        )  # fmt: skip
 
 
 def test_kept_windows_go_when_the_sequence_is_written(
@@ -172,13 +183,14 @@ def test_kept_windows_go_when_the_sequence_is_written(
     scene, keep = make_scene(), tmp_path / ".windows" / "S001"
     seen = observations(scene, 0.5)
     kept = []
-    savez = clips.np.savez
+    savez = sequence.np.savez
     monkeypatch.setattr(
-        clips.np, "savez", lambda *a, **k: (kept.append(keep.is_dir()), savez(*a, **k))
+        sequence.np, "savez", lambda *a, **k: (kept.append(keep.is_dir()), savez(*a, **k))
     )
     write_clips(
-        tmp_path, quick(scene), "tiny", scene.shape, CUES, lambda c, f: seen[f], keep, "inputs"
-    )
+        tmp_path, quick(scene), "tiny", scene.shape, CUES, lambda c, f: [seen[k] for k in f],
+        keep, "inputs",
+    )  # fmt: skip
     assert kept[-1] and not keep.exists()
     with np.load(tmp_path / "sequence.npz", allow_pickle=False) as data:
         assert data["R"].shape == (FRAMES, 3, 3) and data["shape"].shape == (5,)

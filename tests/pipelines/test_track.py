@@ -13,12 +13,11 @@ from hypothesis import strategies as st
 
 from express50.contract.config import build_config
 from express50.errors import CaptureError, ConfigError, StageError
-from express50.geometry.cameras import Camera, project
-from express50.geometry.pinhole import project_with_slope
+from express50.geometry.cameras import Camera, project, project_with_slope
 from express50.geometry.transforms import axis_angle_to_matrix, look_at
 from express50.head.model import landmarks, pose
 from express50.landmarks.detector import Detection
-from express50.landmarks.iris import Irises
+from express50.landmarks.eyes_and_lips import Irises
 from express50.landmarks.sources import Marked
 from pipelines.track.basis import Basis, Points, make_basis
 from pipelines.track.config import TrackConfig
@@ -272,7 +271,7 @@ def no_irises() -> Irises:
 
 @pytest.fixture
 def tracked_dataset(tmp_path: Path, ingested, monkeypatch: pytest.MonkeyPatch):
-    """A calibrated, labelled dataset whose detector is told the landmarks of a tiny head."""
+    """A calibrated, labelled dataset whose detector finds the landmarks of a tiny head."""
     import json
 
     from express50.capture.frames import read_cameras_of
@@ -300,12 +299,12 @@ def tracked_dataset(tmp_path: Path, ingested, monkeypatch: pytest.MonkeyPatch):
     write_peak_frames(ingested)
     scene = make_scene()
 
-    def told(image: np.ndarray, camera_id: str, frame: int) -> Marked:
+    def marked(image: np.ndarray, camera_id: str, frame: int) -> Marked:
         points = project(read_cameras_of(ingested, "S001")[camera_id], scene.marks)[0]
         face = Detection(points, np.ones(68), np.full(68, 0.9), 0.95)
         return Marked(face, no_irises(), visible_contour=False)
 
-    monkeypatch.setattr(read_inputs, "open_source", lambda *unused: told)
+    monkeypatch.setattr(read_inputs, "open_source", lambda *unused: marked)
     monkeypatch.setattr(stage, "_basis", lambda *unused: scene.basis)
     return ingested, scene
 

@@ -9,7 +9,7 @@ import pytest
 
 from express50.errors import StageError
 from express50.files.images import linear_to_srgb, read_image
-from express50.geometry.spherical_harmonics import sh_polynomials
+from express50.geometry.sampling import sh_polynomials
 from pipelines.track.appearance import (
     EVEN_LIGHT,
     Appearance,
@@ -22,7 +22,7 @@ from pipelines.track.appearance import (
     trust,
     write_appearance,
 )
-from pipelines.track.crops import FrameSetCrops, HeadCrop
+from pipelines.track.surface import FrameSetCrops, HeadCrop
 from tests.pipelines.textured_scenes import RADIUS, ball_head, paint, picture, rig
 
 NAMES = ("a", "b", "c", "d", "e")
@@ -115,7 +115,7 @@ def test_spread_is_that_of_the_noise_and_outliers_lose_trust() -> None:
 
 def crop_of(camera, colour=paint, alpha=None) -> HeadCrop:
     level = np.rint(255 * linear_to_srgb(picture(camera, colour=colour).astype(float) ** 2))
-    return HeadCrop(camera.id, camera, level.astype(np.uint8), alpha)
+    return HeadCrop(camera, level.astype(np.uint8), alpha)
 
 
 def plain(cameras) -> Appearance:
@@ -185,15 +185,17 @@ def test_texels_lie_where_the_map_says() -> None:
     model, side = ball_head(), 50
     texels, texture = texel_samples(model, side)
     assert len(texture) > 0.9 * side * side
-    np.testing.assert_allclose(texels.bary.sum(1), 1.0)
-    corners = model.uv.numpy()[model.uv_faces.numpy()[texels.faces]]
-    uv = (texels.bary[..., None] * corners).sum(1)
+    np.testing.assert_allclose(texels.weights.sum(1), 1.0)
+    number = {tuple(face): k for k, face in enumerate(model.faces.tolist())}
+    ids = [number[tuple(face)] for face in texels.vertices.tolist()]
+    corners = model.uv.numpy()[model.uv_faces.numpy()[ids]]
+    uv = (texels.weights[..., None] * corners).sum(1)
     expected = np.stack([(texture[:, 1] + 0.5) / side, 1 - (texture[:, 0] + 0.5) / side], 1)
     np.testing.assert_allclose(uv, expected, atol=1e-6)
 
 
 def test_written_files_are_found_by_the_export(tmp_path) -> None:
-    from express50.dataset.export.select import read_albedo
+    from express50.dataset.export import read_albedo
 
     albedo = np.random.default_rng(0).integers(0, 256, (16, 16, 3), dtype=np.uint8)
     gains = {"cam1": np.array([0.5, 1.0, 2.0]), "cam0": np.ones(3)}

@@ -1,4 +1,4 @@
-"""Whether a skull is bare is told by what the pictures show of it, not by their rims."""
+"""A bare skull is recognised by what the pictures show of it, not by their rims."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from express50.geometry.cameras import Camera, pinhole, project
 from express50.geometry.transforms import look_at
 from express50.head.load import load_head
 from express50.head.model import pose
-from pipelines.track.baldness import bare_share, is_bald
+from pipelines.track.outline import BALD_SHARE, bare_share
 
 SIZE, FOCAL = 400, 900.0
 SKIN, HAIR = (0.8, 0.6, 0.5), (0.2, 0.15, 0.1)
@@ -41,8 +41,8 @@ def painted(row: int) -> np.ndarray:
 
 def test_hair_above_the_face_is_no_bald_head(scene):
     head, mesh, camera, row = scene
-    assert not is_bald(head, [(painted(row), camera)], mesh)
-    assert is_bald(head, [(painted(0), camera)], mesh)
+    assert bare_share(head, [(painted(row), camera)], mesh) < BALD_SHARE
+    assert bare_share(head, [(painted(0), camera)], mesh) > BALD_SHARE
 
 
 def test_a_skull_outside_the_picture_is_not_seen(scene):
@@ -52,5 +52,5 @@ def test_a_skull_outside_the_picture_is_not_seen(scene):
     fx, fy, cx, cy = cut.params
     cut = replace(cut, height=SIZE - row, params=(fx, fy, cx, cy - row))
     share = bare_share(head, [(painted(row)[row:], cut)], mesh)
-    assert whole is not None and whole < 0.3
-    assert share is None or share < 0.5, "its rim is skin"
+    assert 0 < whole < 0.3
+    assert share < 0.5, "its rim is skin"

@@ -13,8 +13,8 @@ import benchmarks
 from benchmarks.track import HELD_OUT, benchmark, narrowed, parse, prepare, twin_config
 from benchmarks.track_truth import clip_errors, compare, r_squared, summary
 from benchmarks.track_views import held_out_views
-from express50.capture.frames import read_cameras_of, read_peaks
-from express50.capture.index import read_index
+from express50.capture.frames import read_cameras_of
+from express50.capture.index import read_index, read_peaks
 from express50.dataset.tracks import SCHEMAS
 
 CAMERAS, SUBJECT = 7, "S041"

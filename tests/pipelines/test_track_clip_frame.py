@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from pipelines.track.basis import make_basis
-from pipelines.track.crops import FrameSetCrops
 from pipelines.track.observe import Observation
-from pipelines.track.photo_consistency import SkinSamples
+from pipelines.track.photo_consistency import skin_samples
 from pipelines.track.sequence import ClipTracker, fit_to_pictures, freeze_shape
 from pipelines.track.state import Target, start_state
+from pipelines.track.surface import FrameSetCrops
 from pipelines.track.terms import NormalTerm
 from tests.pipelines.test_track_appearance import crop_of
 from tests.pipelines.textured_scenes import ball_head, rig
@@ -24,7 +24,7 @@ def scene(rounds: int = 3, seen: bool = True) -> tuple[ClipTracker, Target]:
     person = freeze_shape(basis, np.zeros(basis.shape_size), np.zeros((68, 3)))
     unknown = np.full((68, 3), np.nan)
     nothing = Observation("smile", 0, (), np.zeros((0, 68), bool), unknown, np.zeros((68, 3, 3)))
-    skin = SkinSamples.of(model, 500)
+    skin = skin_samples(model, 500)
     tracker = ClipTracker(person, skin=skin, pictures=lambda *_: pictures, rounds=rounds)
     return tracker, Target(nothing, np.zeros((0, 68)), neutral=False)
 

@@ -12,7 +12,7 @@ from express50.geometry.cameras import project, triangulate
 from express50.geometry.transforms import axis_angle_to_matrix
 from express50.head.load import load_head
 from express50.head.model import HeadModel, landmarks, vertex_normals
-from express50.landmarks.iris import Irises
+from express50.landmarks.eyes_and_lips import Irises
 from pipelines.track.basis import make_basis
 from pipelines.track.eyes_and_jaw import (
     JAW,
@@ -23,8 +23,8 @@ from pipelines.track.eyes_and_jaw import (
 )
 from pipelines.track.fit import fit
 from pipelines.track.observe import LandmarkView, agree, landmark_sigma, point_covariance
+from pipelines.track.report import camera_warnings, suspect_cameras
 from pipelines.track.state import Target, initial_pose, start_state
-from pipelines.track.suspects import camera_warnings, suspect_cameras
 from pipelines.track.terms import MeshPlaces, PixelTerm, Sighting
 from tests.pipelines.test_track import RIG, make_camera, make_scene, make_views
 
@@ -38,11 +38,11 @@ def head() -> HeadModel:
 def test_moved_jaw_points_lie_on_the_rim(head: HeadModel, angle: float) -> None:
     mesh, camera = head.template.numpy(), make_camera(angle)
     line = contour_points(head, mesh, camera)
-    points = line.positions(mesh)
+    points = line.places.at(mesh)
     normals = vertex_normals(head.template[None], head.faces)[0].numpy()
     towards = camera.center - points
     towards /= np.linalg.norm(towards, axis=1, keepdims=True)
-    rim = (normals[line.corners[:, 0]] * towards).sum(1)
+    rim = (normals[line.places.vertices[:, 0]] * towards).sum(1)
     assert np.abs(rim[line.moved & line.usable]).max(initial=0.0) <= 0.21
     fixed = landmarks(head, head.template[None])[0, :JAW].numpy()
     np.testing.assert_allclose(points[~line.moved], fixed[~line.moved], atol=1e-9)
@@ -73,7 +73,7 @@ def test_the_visible_jaw_explains_visible_marks_better(head: HeadModel) -> None:
         return abs(x - outline[np.abs(outline[:, 1] - y) < 4, 0].min())
 
     chosen = np.flatnonzero(line.moved & line.usable)
-    moved = [inside(line.positions(mesh)[point]) for point in chosen]
+    moved = [inside(line.places.at(mesh)[point]) for point in chosen]
     assert len(chosen) >= 3
     assert np.mean(moved) < 0.6 * np.mean([inside(fixed[point]) for point in chosen])
 

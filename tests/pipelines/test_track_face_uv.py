@@ -15,10 +15,17 @@ from express50.geometry.transforms import look_at
 from express50.head.load import load_head
 from express50.head.model import landmarks, pose, vertex_normals
 from pipelines.track.basis import split_shape, with_modes
-from pipelines.track.crops import FrameSetCrops, HeadCrop
-from pipelines.track.face_uv import DISTRUST, slide_term, with_slide
-from pipelines.track.face_uv_map import HEIGHT, WIDTH, mark_places, reading_map
+from pipelines.track.face_uv import (
+    DISTRUST,
+    HEIGHT,
+    WIDTH,
+    mark_places,
+    reading_map,
+    slide_term,
+    with_slide,
+)
 from pipelines.track.state import Target
+from pipelines.track.surface import FrameSetCrops, HeadCrop
 from pipelines.track.terms import MeshPlaces, SlideTerm, information, landmark_anchors
 from tests.pipelines.term_checks import cost_at, gradient_at, slope_along
 
@@ -154,7 +161,7 @@ def shot_of(mesh: np.ndarray, angle: float) -> HeadCrop:
     eye = centre + np.array([np.sin(angle), 0.0, np.cos(angle)])
     view = look_at(eye, centre, np.array([0.0, 1.0, 0.0]))
     camera = Camera(f"{angle}", 128, 128, "PINHOLE", (250.0, 250.0, 64.0, 64.0), view)
-    return HeadCrop(camera.id, camera, np.full((128, 128, 3), 128, np.uint8), None)
+    return HeadCrop(camera, np.full((128, 128, 3), 128, np.uint8), None)
 
 
 def test_modes_along_the_skin_stay_in_it(head) -> None:

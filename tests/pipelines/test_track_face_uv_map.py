@@ -12,30 +12,35 @@ from express50.errors import HeadModelError
 from express50.geometry.raycast import mesh_scene
 from express50.head.load import load_head
 from express50.landmarks.network import MIRROR, trainable_network
-from pipelines.track.face_uv import uv_network
-from pipelines.track.face_uv_map import (
+from pipelines.track.face_uv import (
     FIRST,
     HEIGHT,
+    LEFT,
     MARKS,
     SIDE,
+    TEXELS_PER_PIXEL,
+    UPPER,
     WIDTH,
-    from_window,
     make_uv_map,
     mark_places,
     read_marks,
     reading_map,
     to_texels,
     to_window,
+    uv_network,
     window,
 )
-from pipelines.track.face_uv_training.cases import Lamps, draw_case, draw_meshes, draw_person
-from pipelines.track.face_uv_training.disturb import Case, creased, mirrored, warped, where_seen
+from pipelines.track.face_uv_training.cases import Case, Lamps, draw_case, draw_meshes, draw_person
 from pipelines.track.face_uv_training.train import (
     UvTrainingPlan,
+    creased,
     main,
     make_batch,
     marks_loss,
+    mirrored,
     train,
+    warped,
+    where_seen,
 )
 from tests.express50.head.tiny_head import tiny_head
 
@@ -61,7 +66,7 @@ def cases(head, chart):
 
 def test_a_texel_shows_the_place_it_lies_at(chart) -> None:
     assert len(chart.texels) == WIDTH * HEIGHT
-    places = (chart.places[chart.samples.corners] * chart.samples.bary[..., None]).sum(1)
+    places = (chart.places[chart.samples.vertices] * chart.samples.weights[..., None]).sum(1)
     np.testing.assert_allclose(places, chart.texels[:, ::-1] + 0.5, atol=1e-6)
     image = chart.image(np.arange(len(chart.texels), dtype=float)[:, None])
     assert len(np.unique(image)) == WIDTH * HEIGHT
@@ -100,7 +105,7 @@ def test_where_nothing_is_off_nothing_is_to_be_moved(head, chart, monkeypatch) -
 
 def test_displacements_are_as_large_as_the_mesh_is_off(head, chart) -> None:
     rng = np.random.default_rng(4)
-    face = np.unique(chart.samples.corners[chart.skin])
+    face = np.unique(chart.samples.vertices[chart.skin])
     sizes = []
     for _ in range(12):
         true, wrong = draw_meshes(head, chart, rng)
@@ -221,6 +226,7 @@ def test_a_chart_of_one_colour_gives_finite_landmarks(level: float) -> None:
 def test_the_window_holds_every_landmark(chart) -> None:
     part = reading_map(load_head("procedural"))
     assert len(part.texels) == SIDE * SIDE < len(chart.texels)
+    from_window = lambda pixels: pixels * TEXELS_PER_PIXEL + (LEFT, UPPER)  # noqa: E731
     pixels = to_window(mark_places())
     assert pixels.min() > 8 and pixels.max() < 120
     np.testing.assert_allclose(from_window(pixels), mark_places(), atol=1e-9)
@@ -233,7 +239,7 @@ def test_the_window_holds_every_landmark(chart) -> None:
 def test_training_goes_on_where_it_was_stopped(tmp_path, monkeypatch, head) -> None:
     monkeypatch.setattr("pipelines.track.face_uv_training.train.FILE_CASES", 2)
     monkeypatch.setattr("pipelines.track.face_uv_training.train.BATCH", 2)
-    monkeypatch.setattr("pipelines.track.face_uv_training.train.KEEP_EVERY", 2)
+    monkeypatch.setattr("express50.landmarks.training.train.KEEP_EVERY", 2)
     plan = UvTrainingPlan(steps=4, files=1)
     whole = train([head], plan, tmp_path / "one").state_dict()
     steps = iter(range(3))
@@ -290,7 +296,7 @@ def test_a_head_whose_eyes_coincide_is_named(head) -> None:
 
 def test_a_tiny_head_has_a_chart_too() -> None:
     chart = make_uv_map(tiny_head(vertices=60))
-    assert len(chart.texels) > 100 and np.isfinite(chart.samples.bary).all()
+    assert len(chart.texels) > 100 and np.isfinite(chart.samples.weights).all()
 
 
 def test_what_stands_in_the_way_takes_the_light() -> None:

@@ -1,4 +1,4 @@
-"""Shut eyes are told by irises that cameras find at other times."""
+"""Shut eyes are recognised by irises that cameras find at other times."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from express50.geometry.cameras import project
 from express50.geometry.transforms import axis_angle_to_matrix
 from express50.head.load import load_head
 from express50.head.model import landmarks, pose
-from express50.landmarks.iris import EYES, Irises
+from express50.landmarks.eyes_and_lips import EYES, Irises
 from pipelines.track.basis import make_basis
 from pipelines.track.eyes_and_jaw import lid_terms, shut_lids
 from pipelines.track.fit import fit

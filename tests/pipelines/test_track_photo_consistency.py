@@ -7,7 +7,6 @@ import pytest
 
 from pipelines.track.photo_consistency import search as search_patches
 from pipelines.track.photo_consistency import surface_term
-from pipelines.track.surface import Samples
 from pipelines.track.terms import MeshPlaces, NormalTerm, information
 from tests.pipelines.term_checks import cost_at, gradient_at, slope_along
 from tests.pipelines.textured_scenes import (
@@ -53,7 +52,9 @@ def test_heights_are_found_to_a_fraction_of_a_pixel(pictures, millimetres: float
     relief = relief_of(found, samples, places, normals)
     assert abs(np.median(truth) + 1e-3 * millimetres) < 2e-4
     assert found.pixel == pytest.approx(1 / (2.2 * 256), rel=0.15)
-    kept = np.flatnonzero((samples.corners[:, None] == relief.anchors.vertices[None]).all(2).any(1))
+    kept = np.flatnonzero(
+        (samples.vertices[:, None] == relief.anchors.vertices[None]).all(2).any(1)
+    )
     assert len(relief.goals) > 0.7 * len(truth)
     error = np.abs(found.height - truth)[kept] / found.pixel
     assert np.median(error) < 0.15 and np.quantile(error, 0.9) < 0.5
@@ -133,7 +134,7 @@ def test_few_samples_are_refused_rather_than_believed(pictures) -> None:
     found, samples, places, normals = search(*pictures)
     some = slice(0, 30)
     few = type(found)(found.height[some], found.score[some], found.sharpness[some], found.pixel)
-    part = Samples(samples.faces[some], samples.corners[some], samples.bary[some])
+    part = samples.some(some)
     assert surface_term(few, part, places[some], normals[some], 1.0) is None
 
 

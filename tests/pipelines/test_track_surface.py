@@ -12,8 +12,7 @@ from express50.geometry.cameras import Camera
 from express50.geometry.transforms import look_at
 from express50.head.load import load_head
 from pipelines.track.appearance import robust_mean
-from pipelines.track.crops import cut_crop, look_up
-from pipelines.track.surface import COVERED, Visibility, spread
+from pipelines.track.surface import COVERED, Visibility, cut_crop, look_up, spread
 from tests.pipelines.textured_scenes import (
     RADIUS,
     ball,
@@ -63,9 +62,9 @@ def test_samples_are_deterministic_even_and_on_the_allowed_skin_only() -> None:
     for one, other in zip(vars(samples).values(), vars(again).values(), strict=True):
         np.testing.assert_array_equal(one, other)
     allowed = face & (vertices[:, 1] <= 0.08)
-    assert allowed[samples.corners].all()
-    np.testing.assert_allclose(samples.bary.sum(1), 1.0)
-    assert (samples.bary >= 0).all()
+    assert allowed[samples.vertices].all()
+    np.testing.assert_allclose(samples.weights.sum(1), 1.0)
+    assert (samples.weights >= 0).all()
     places = samples.at(vertices)
     # Archimedes: equal slices of a sphere have equal area.
     counts, _ = np.histogram(places[:, 1], np.linspace(-0.02, 0.07, 10))
@@ -78,15 +77,15 @@ def test_samples_of_neck_and_ears_lie_there() -> None:
     model = load_head("procedural")
     samples = spread(model, 900, COVERED)
     inside = np.any([model.regions[name].numpy() for name in COVERED], axis=0)
-    assert inside[samples.corners].all()
+    assert inside[samples.vertices].all()
     for name in COVERED:
-        assert model.regions[name].numpy()[samples.corners].all(1).sum() > 50
+        assert model.regions[name].numpy()[samples.vertices].all(1).sum() > 50
 
 
 def test_a_head_without_regions_is_skin_all_over() -> None:
     model = ball_head()
     bare = replace(model, regions={})
-    assert len(np.unique(spread(bare, 2000).faces)) > 1000
+    assert len(np.unique(spread(bare, 2000).vertices, axis=0)) > 1000
 
 
 @pytest.mark.parametrize("distance", [0.05, 0.3, 0.46, 0.6, 3.0])

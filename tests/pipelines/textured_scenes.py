@@ -10,9 +10,10 @@ import torch
 from express50.geometry.cameras import Camera
 from express50.geometry.transforms import look_at
 from express50.head.model import HeadModel
-from pipelines.track.surface import Samples, Visibility, sample_normals
+from pipelines.track.surface import Visibility, sample_normals
+from pipelines.track.terms import MeshPlaces
+from tests.express50.geometry.mesh_scenes import sphere
 from tests.express50.head.tiny_head import tiny_head
-from tests.express50.mesh_scenes import sphere
 
 RADIUS = 0.1
 ORIGIN = np.zeros(3)
@@ -67,16 +68,20 @@ def ball(radius: float = RADIUS, rings: int = 40, centre: np.ndarray = ORIGIN):
     return vertices + centre, faces
 
 
-def places_on(faces: np.ndarray, vertices: np.ndarray, count: int = 400, seed: int = 0) -> Samples:
+def places_on(
+    faces: np.ndarray, vertices: np.ndarray, count: int = 400, seed: int = 0
+) -> MeshPlaces:
     """Samples on faces that look along +z."""
     rng = np.random.default_rng(seed)
     way = np.cross(*(vertices[faces[:, k]] - vertices[faces[:, 0]] for k in (1, 2)))
     front = np.flatnonzero(way[:, 2] > 0.6 * np.linalg.norm(way, axis=1).clip(1e-12))
     chosen = rng.choice(front, count)
-    return Samples(chosen, faces[chosen], rng.dirichlet(np.ones(3), count))
+    return MeshPlaces(faces[chosen], rng.dirichlet(np.ones(3), count))
 
 
-def seen_weights(cameras: list[Camera], samples: Samples, vertices: np.ndarray, faces: np.ndarray):
+def seen_weights(
+    cameras: list[Camera], samples: MeshPlaces, vertices: np.ndarray, faces: np.ndarray
+):
     """Places, normals and weights (C, S)."""
     places, normals = samples.at(vertices), sample_normals(samples, vertices)
     visibility = Visibility(vertices, faces)

@@ -20,17 +20,16 @@ from express50.capture.raw import (
     read_meta,
 )
 from express50.capture.readers import (
-    ava256,
-    generic,
-    multiface,
-    nersemble,
-    ravdess,
+    codec_avatars,
+    pictures,
     renderme,
+    videos,
 )
-from express50.capture.readers.selection import EXPRESSION, Selection, parse_selection
+from express50.capture.readers.selection import Selection, folder_id, parse_selection
 from express50.contract.layout import Dataset, footage_source
 from express50.errors import CalibrationError, CaptureError, Express50Error
-from express50.rigs.rig_check import judge
+from express50.geometry.cameras import Camera
+from express50.rigs.world_frame import judge
 
 OURS = "express50"
 FPS = 24.0  # stands in where only the subject is asked for
@@ -63,31 +62,37 @@ LAYOUTS = (
     ),
     Layout(
         "nersemble", "calibration/camera_params.json and sequences/",
-        nersemble.fits, nersemble.subject_of, nersemble.read,
+        videos.fits_nersemble, folder_id, videos.read_participant,
     ),
     Layout(
-        "ava256", "decoder/camera_calibration.json", ava256.fits, ava256.subject_of, ava256.read
+        "ava256", "decoder/camera_calibration.json",
+        codec_avatars.fits_ava256, codec_avatars.subject_of, codec_avatars.read_ava256,
     ),
-    Layout("multiface", "KRT and images/", multiface.fits, multiface.subject_of, multiface.read),
-    Layout("ravdess", "01-01-03-02-01-01-05.mp4", ravdess.fits, ravdess.subject_of, ravdess.read),
+    Layout(
+        "multiface", "KRT and images/",
+        codec_avatars.fits_multiface, codec_avatars.subject_of, codec_avatars.read_multiface,
+    ),
+    Layout(
+        "ravdess", "01-01-03-02-01-01-05.mp4",
+        videos.fits_ravdess, videos.actor_of, videos.read_actor,
+    ),
     Layout(
         "transforms", "transforms.json",
-        generic.fits_transforms, generic.folder_name, generic.read_transforms_folder,
+        pictures.fits_transforms, folder_id, pictures.read_transforms_folder,
     ),
     Layout(
-        "colmap", "images/ and sparse/0/", generic.fits_colmap, generic.folder_name,
-        generic.read_colmap_folder,
+        "colmap", "images/ and sparse/0/",
+        pictures.fits_colmap, folder_id, pictures.read_colmap_folder,
     ),
     Layout(
-        "photos", "a folder of images",
-        generic.fits_photos, generic.subject_of, generic.read_photos,
+        "photos", "a folder of images", pictures.fits_photos, folder_id, pictures.read_photos
     ),
-    Layout("video", "a video file", generic.fits_video, generic.subject_of, generic.read_video),
+    Layout("video", "a video file", videos.fits_video, videos.video_id, videos.read_video),
 )  # fmt: skip
 
 
 def detect(path: Path, name: object = None) -> Layout:
-    """Find the layout of a file or folder: the named one, else the first that fits.
+    """Finds the layout of a file or folder: the named one, else the first that fits.
 
     Raises:
         CaptureError: it does not exist, no layout has the name, or none fits.
@@ -102,43 +107,39 @@ def detect(path: Path, name: object = None) -> Layout:
         if name in (None, layout.name) and layout.fits(path):
             return layout
     looks = "; ".join(f"{x.name}: {x.looks}" for x in LAYOUTS if name in (None, x.name))
-    ours = "" if name else f"; {OURS}: capture.toml and cameras/"
-    if path.is_file():
-        got = f"no known layout of a file {path.suffix or 'without an ending'}"
-    else:
-        names = sorted(p.name for p in path.iterdir() if not p.name.startswith("."))
-        shown = ", ".join(names[:5]) + (", ..." if len(names) > 5 else "")
-        got = f"no known layout: it holds {shown or 'nothing'}"
-    raise CaptureError(f"{path}: {got}, expected one of: {looks}{ours}")
+    held = sorted(p.name for p in path.iterdir()) if path.is_dir() else ["a file"]
+    raise CaptureError(
+        f"{path}: no known layout; got {', '.join(held[:5]) or 'an empty folder'}, expected one "
+        f"of: {looks}; {OURS}: capture.toml and cameras/"
+    )
 
 
 def is_ours(path: Path) -> bool:
-    """Return whether a path is a capture in our own layout, or is meant as one."""
+    """Returns whether a path is a capture in our own layout, or is meant as one."""
     meta = _meta(path)
-    if meta is None:
-        return (path / "cameras").is_dir()  # the error then names the missing file
     if "source" in meta:
         return False
-    layout = meta.get("layout", OURS if (path / "cameras").is_dir() else None)
+    if "layout" in meta or (path / "cameras").is_dir():
+        return meta.get("layout", OURS) == OURS
     # A capture.toml alone marks it as ours; the error then names the missing file.
-    return layout == OURS or (layout is None and not any(x.fits(path) for x in LAYOUTS))
+    return bool(meta) and not any(layout.fits(path) for layout in LAYOUTS)
 
 
-def _meta(path: Path) -> dict | None:
-    """Read a capture.toml; None where there is none."""
+def _meta(path: Path) -> dict:
+    """Read a capture.toml; empty where there is none."""
     file = path / "capture.toml"
-    return read_capture_toml(file) if file.is_file() else None
+    return read_capture_toml(file) if file.is_file() else {}
 
 
 def subject_of(path: Path) -> str:
-    """Find the subject of a capture of any layout without reading its footage.
+    """Finds the subject of a capture of any layout without reading its footage.
 
     Raises:
         CaptureError: it is not a capture, or its subject cannot be an id.
     """
     if is_ours(path):
         return read_meta(path)["subject"]
-    meta, source = _meta(path) or {}, footage_source(path)
+    meta, source = _meta(path), footage_source(path)
     layout = detect(source, meta.get("layout"))
     subject = meta.get("subject") or layout.subject_of(source)
     check_identity(path / "capture.toml" if path.is_dir() else path, subject, meta.get("fps", FPS))
@@ -146,7 +147,7 @@ def subject_of(path: Path) -> str:
 
 
 def read_any(path: Path) -> RawCapture:
-    """Read a capture of any layout.
+    """Reads a capture of any layout.
 
     Raises:
         CaptureError: it is not a capture, or nothing of it can be used.
@@ -155,42 +156,53 @@ def read_any(path: Path) -> RawCapture:
     path = Path(path)
     if is_ours(path):
         return read_capture(path)
-    meta, source = _meta(path) or {}, footage_source(path)
+    meta, source = _meta(path), footage_source(path)
     layout = detect(source, meta.get("layout"))
-    selection = parse_selection(meta, path / "capture.toml")
-    raw = layout.read(source, selection)
+    raw = layout.read(source, parse_selection(meta, path / "capture.toml"))
     subject, fps = meta.get("subject") or raw.subject, meta.get("fps", raw.fps)
     check_identity(path / "capture.toml", subject, fps)
     # Where the footage lies is this machine's matter, not the dataset's.
     given = {key: value for key, value in meta.items() if key != "source"}
-    described = raw.meta | given | {"subject": subject, "fps": float(fps), "layout": raw.layout}
-    raw = replace(raw, subject=subject, fps=float(fps), meta=described)
+    described = {"subject": subject, "fps": float(fps), "layout": layout.name}
     doubled = sorted({clip for clip in raw.clips if raw.clips.count(clip) > 1})
-    if doubled or not all(EXPRESSION.fullmatch(clip) for clip in raw.clips):
+    if doubled:
         raise CaptureError(
-            f"{path}: {', '.join(doubled) or raw.clips} cannot be the expressions of its "
-            "sequences; give each its own id in [expressions] of capture.toml"
+            f"{path}: several sequences are the expression {', '.join(doubled)}; give each its own "
+            "id in [expressions] of capture.toml"
         )
-    if not raw.calibration:
-        return raw
-    verdict = judge(raw.calibration)
+    calibration = {k: c for k, c in (raw.calibration or {}).items() if k in raw.cameras}
+    return replace(
+        raw,
+        subject=subject,
+        fps=float(fps),
+        meta=raw.meta | given | described,
+        layout=layout.name,
+        calibration=calibration or None,
+        warnings=raw.warnings | _check_rig(path, calibration),
+    )
+
+
+def _check_rig(path: Path, calibration: dict[str, Camera]) -> dict[str, str]:
+    """Return what is odd about the cameras; refuse those that do not look at one place."""
+    if not calibration:
+        return {}
+    verdict = judge(calibration)
     if verdict.problem:
         raise CalibrationError(
             f"{path}: {verdict.problem}; {verdict.remedy or 'check the calibration'}"
         )
-    odd = {"cameras": "; ".join(verdict.warnings)} if verdict.warnings else {}
-    return replace(raw, warnings=raw.warnings | odd)
+    return {"cameras": "; ".join(verdict.warnings)} if verdict.warnings else {}
 
 
 def watched(path: Path) -> list[Path]:
-    """List files and folders whose change makes an ingest stale."""
+    """Lists files and folders whose change makes an ingest stale."""
     source = footage_source(path)
     found = [path] if source == path else [path, source]
     return found + (renderme.companions(source) if renderme.fits(source) else [])
 
 
 def read_people(dataset: Dataset, subjects: Iterable[str]) -> list[dict]:
-    """Read gender and age of subjects, in order, from their captures.
+    """Reads gender and age of subjects, in order, from their captures.
 
     They are read for counts and kept nowhere; an entry is empty where the capture is gone or says
     nothing.

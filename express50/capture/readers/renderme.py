@@ -9,7 +9,8 @@ but that is frame 119 of one and 12 of the other: the release and the frame's ow
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+import re
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,17 +18,17 @@ import h5py
 import numpy as np
 
 from express50.capture.raw import RawCapture
-from express50.capture.readers.selection import Selection, check_selection
-from express50.capture.readers.timeline import Moment, common_timeline
+from express50.capture.readers.selection import Moment, Selection, check_selection, common_timeline
 from express50.errors import CaptureError
 from express50.files.containers import WITHIN, attribute, child, members, open_hdf5
 from express50.geometry.cameras import Camera
-from express50.rigs.dataset_formats import read_renderme
+from express50.rigs.read import read_renderme
 
 FPS = 30.0
 FULL, KEY_FRAMES = "full", "key frames"
 USUAL = "e*"  # the twelve expressions; speech (s*) and hair (h*) are taken when asked for
 MOVED_MM = 1.0
+NAME = re.compile(r"([0-9]+)_([ehs].*?)(?:_(raw|anno))?")  # actor, performance, kind
 
 
 @dataclass(frozen=True)
@@ -41,14 +42,14 @@ class Performance:
 
 
 def fits(path: Path) -> bool:
-    """Return whether a path is an SMC, or a folder that holds some."""
+    """Returns whether a path is an SMC, or a folder that holds some."""
     if path.is_file():
         return path.suffix.lower() == ".smc"
     return any(path.glob("*.smc"))
 
 
 def subject_of(path: Path) -> str:
-    """Return the actor's number.
+    """Returns the actor's number.
 
     Raises:
         CaptureError: the folder holds several actors.
@@ -68,26 +69,23 @@ def _files(path: Path) -> list[Path]:
 
 def _parts(file: Path) -> tuple[str, str, str]:
     """Split a file's name into actor, performance and kind (``raw``, ``anno`` or empty)."""
-    actor, _, rest = file.stem.partition("_")
-    for kind in ("raw", "anno"):
-        if rest.endswith(f"_{kind}"):
-            return actor, rest.removesuffix(f"_{kind}"), kind
-    if not actor.isdigit() or rest[:1] not in ("e", "h", "s"):
+    match = NAME.fullmatch(file.stem)
+    if match is None:
         raise CaptureError(
             f"{file}: name is not a performance of RenderMe-360; expected such as 0026_e0_raw.smc"
         )
-    return actor, rest, ""
+    return match[1], match[2], match[3] or ""
 
 
 def companions(path: Path) -> list[Path]:
-    """List the files beside the footage that are read too."""
+    """Lists the files beside the footage that are read too."""
     folder = path if path.is_dir() else path.parent
     other = folder.parent.parent / "anno" / folder.name
     return [other] if other.is_dir() else []
 
 
 def performances(path: Path) -> dict[str, Performance]:
-    """Find the performances of a folder in their order: e0 to e11, then the others.
+    """Finds the performances of a folder in their order: e0 to e11, then the others.
 
     Raises:
         CaptureError: there are annotations only.
@@ -114,7 +112,7 @@ def performances(path: Path) -> dict[str, Performance]:
 
 
 def read(path: Path, selection: Selection) -> RawCapture:
-    """Read an actor's performances.
+    """Reads an actor's performances.
 
     Raises:
         CaptureError: a file is damaged, or none can be used.
@@ -122,43 +120,51 @@ def read(path: Path, selection: Selection) -> RawCapture:
     """
     known = performances(path)
     root = path if path.is_dir() else path.parent
-    names = {"e0": "neutral"} | dict(selection.expressions)
-    skipped, taken, numbers = {}, {}, {}
+    skipped, taken, lengths = {}, {}, {}
     pictures: dict[str, dict[Moment, str]] = {}
     for part, performance in known.items():
         if not selection.has_sequence(part, "*" if path.is_file() else USUAL):
             skipped[f"sequence {part}"] = "no scripted expression; name it in sequences to take it"
             continue
         try:
-            frames, count = _frames(performance, selection)
+            frames, lengths[part] = _frames(performance, selection)
         except CaptureError as error:
             skipped[f"sequence {part}"] = str(error)
             continue
-        taken[part], numbers[part] = performance, count
+        taken[part] = performance
         for camera, keys in frames.items():
-            table = pictures.setdefault(camera, {})
             prefix = f"{performance.raw.name}{WITHIN}Camera/{camera.removeprefix('cam')}/color"
+            table = pictures.setdefault(camera, {})
             table |= {(part, key): f"{prefix}/{key}" for key in keys}
     check_selection(selection, list(known), sorted(pictures) or list(selection.cameras))
     if not taken:
         reasons = "; ".join(f"{what}: {why}" for what, why in sorted(skipped.items()))
         raise CaptureError(f"{path}: no performance can be used: {reasons}")
     last = {part: max(k for t in pictures.values() for p, k in t if p == part) for part in taken}
-    line = common_timeline(pictures, list(taken), required=set(last.items()))
-    calibration, warnings = _calibration(taken.values(), set(line.names))
-    clips = tuple(names.get(part) or selection.expression(part) for part in line.sequences)
+    line = common_timeline(root, pictures, list(taken), required=last.items())
+    calibration, warnings = _calibration(taken.values(), line.cameras.keys())
+    expressions = {"e0": "neutral"} | dict(selection.expressions)
+    clips = {part: expressions.get(part) or selection.expression(part) for part in line.sequences}
+    facts = {
+        clip: {
+            "performance": part,
+            "release": taken[part].release,
+            "num_frame": lengths[part],
+            "last_frame": last[part],
+        }
+        for part, clip in clips.items()
+    }
     return RawCapture(
         root=root,
         subject=subject_of(path),
         fps=FPS,
         meta={"licence": "research only, see the terms of RenderMe-360"}
         | _person(next(iter(taken.values())))
-        | {"renderme360": _release_facts(taken, clips, line.sequences, numbers, last)},
-        cameras=line.cameras(root),
+        | {"renderme360": facts},
+        cameras=line.cameras,
         dropped=line.dropped,
         calibration=calibration,
-        layout="renderme360",
-        clips=clips,
+        clips=tuple(clips.values()),
         skipped=skipped | line.skipped,
         found={"releases": sorted({p.release for p in taken.values()})},
         warnings=warnings,
@@ -198,25 +204,6 @@ def _frames(performance: Performance, selection: Selection) -> tuple[dict[str, l
     return found, count
 
 
-def _release_facts(
-    taken: dict[str, Performance],
-    clips: Sequence[str],
-    sequences: Sequence[str],
-    numbers: dict[str, int],
-    last: dict[str, int],
-) -> dict[str, dict]:
-    """Collect the facts that the last-frame rule needs of each expression."""
-    return {
-        clip: {
-            "performance": part,
-            "release": taken[part].release,
-            "num_frame": numbers[part],
-            "last_frame": last[part],
-        }
-        for clip, part in zip(clips, sequences, strict=True)
-    }
-
-
 def _person(performance: Performance) -> dict[str, object]:
     """Read age and gender, which dataset cards count; the rest about the body stays where it is."""
     file, where = open_hdf5(performance.raw), str(performance.raw)
@@ -230,7 +217,7 @@ def _person(performance: Performance) -> dict[str, object]:
 
 
 def _calibration(
-    taken: Iterable[Performance], names: set[str]
+    taken: Iterable[Performance], names: Collection[str]
 ) -> tuple[dict[str, Camera] | None, dict[str, str]]:
     """Read the cameras of the first performance that has some; warn where others disagree."""
     first: dict[str, Camera] | None = None

@@ -1,18 +1,32 @@
-"""Selection of parts of a foreign layout, under which names, as a capture.toml states it."""
+"""Select parts of another dataset's layout, and align its cameras to one timeline.
+
+A capture.toml states which sequences and cameras to take, under which names. A layout lists the
+moments of which each camera has a picture. Datasets lack some by design (AVA-256 lists frames that
+were never published), so that the n-th files of two cameras may show different moments. Moments
+that a camera lacks are left out for all cameras; a camera that lacks many is left out itself.
+"""
 
 from __future__ import annotations
 
 import fnmatch
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from express50.capture.raw import RawCamera
 from express50.errors import CaptureError
 
 EXPRESSION = re.compile(r"[A-Za-z0-9][A-Za-z0-9_]*")
+# Share of the moments beyond which a camera is dropped rather than the moments, unless the camera
+# is a larger share of all cameras: then fewer pictures are lost with the moments.
+LACKING = 0.02
+SHOWN = 4  # moments that a reason names
+
+Moment = tuple[str, int]  # sequence, the layout's own frame number
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,30 +46,35 @@ class Selection:
     metres_per_unit: float | None = None
 
     def has_sequence(self, name: str, usual: str = "*") -> bool:
-        """Return whether a sequence is selected."""
+        """Returns whether a sequence is selected."""
         return any(fnmatch.fnmatchcase(name, p) for p in self.sequences or (usual,))
 
     def left_out(self, sequences: Sequence[str]) -> dict[str, str]:
-        """Return the sequences that are not selected, with the reason."""
+        """Returns the sequences that are not selected, with the reason."""
         return {f"sequence {s}": "not asked for" for s in sequences if not self.has_sequence(s)}
 
     def has_camera(self, name: str) -> bool:
-        """Return whether a camera is selected."""
+        """Returns whether a camera is selected."""
         return not self.cameras or any(fnmatch.fnmatchcase(name, p) for p in self.cameras)
 
     def expression(self, sequence: str) -> str:
-        """Return the expression id of a sequence: the given one, else one made of its name."""
+        """Returns the expression id of a sequence: the given one, else one made of its name."""
         return self.expressions.get(sequence) or identifier(sequence, "_")
 
 
 def identifier(text: str, other: str = "_-") -> str:
-    """Make an id of any text: ``_`` replaces all but letters, digits and ``other``."""
+    """Makes an id of any text: ``_`` replaces all but letters, digits and ``other``."""
     clean = re.sub(rf"[^A-Za-z0-9{re.escape(other)}]+", "_", text).strip("_-")
     return clean or "unnamed"
 
 
+def folder_id(path: Path) -> str:
+    """Returns the folder's name as an id, of a file the name of its folder."""
+    return identifier((path if path.is_dir() else path.parent).resolve().name)
+
+
 def parse_selection(meta: Mapping[str, Any], where: Path) -> Selection:
-    """Selection of a capture.toml's content.
+    """Returns the selection that a capture.toml makes.
 
     Raises:
         CaptureError: a value is of another type, or an expression id cannot be one.
@@ -88,10 +107,10 @@ def _patterns(meta: Mapping[str, Any], key: str, where: Path) -> tuple[str, ...]
 
 
 def check_selection(selection: Selection, sequences: Sequence[str], cameras: Sequence[str]) -> None:
-    """Refuse patterns that match nothing: a typing error would look like missing data.
+    """Refuses patterns that match nothing: a typing error would look like missing data.
 
     Raises:
-        CaptureError: a wish fits nothing of the layout.
+        CaptureError: a pattern matches nothing of the layout.
     """
     for what, patterns, known in (
         ("sequences", (*selection.sequences, *selection.expressions), sequences),
@@ -104,3 +123,113 @@ def check_selection(selection: Selection, sequences: Sequence[str], cameras: Seq
                     f"capture.toml: {what} name {pattern!r}, which is not there; the layout has "
                     f"{some or 'none'}"
                 )
+
+
+@dataclass(frozen=True)
+class Timeline:
+    """Footage of the moments that all taken cameras share.
+
+    Attributes:
+        cameras: the taken cameras by id.
+        sequences: in order.
+        dropped: cameras that were left out, with the reason.
+        skipped: sequences and frames that were left out, with the reason.
+    """
+
+    cameras: dict[str, RawCamera]
+    sequences: tuple[str, ...]
+    dropped: dict[str, str]
+    skipped: dict[str, str]
+
+
+def common_timeline(
+    root: Path,
+    pictures: Mapping[str, Mapping[Moment, str]],
+    order: Sequence[str],
+    kind: str = "frames",
+    listed: Collection[Moment] = (),
+    required: Collection[Moment] = (),
+    dropped: Mapping[str, str] | None = None,
+) -> Timeline:
+    """Finds the moments that all cameras share.
+
+    Args:
+        root: the folder that the names are relative to.
+        pictures: name of each picture or video by moment, by camera.
+        order: sequences in the order they are to have.
+        kind: ``frames``, or ``videos`` of one moment each.
+        listed: moments that the layout's own list names, though no camera may have them.
+        required: moments that must not be lost, so that a camera without them is dropped.
+        dropped: cameras that are left out already, with the reason.
+
+    Raises:
+        CaptureError: the cameras share no moment.
+    """
+    counts = Counter(moment for table in pictures.values() for moment in table)
+    present = sum(map(bool, pictures.values()))
+    common = {moment for moment, count in counts.items() if 2 * count >= present}
+    lost = dict(dropped or {}) | _lacking_cameras(pictures, common, required, kind)
+    taken = {camera: table for camera, table in pictures.items() if camera not in lost}
+    skipped = _reasons(set(listed) - counts.keys(), "no camera", "has a", kind)
+    skipped |= _reasons(counts.keys() - common, "most cameras", "have no", kind)
+    shared = common if taken else set()
+    for camera, table in taken.items():
+        skipped |= _reasons(shared - table.keys(), camera, "has no", kind)
+        shared = shared & table.keys()
+    if not shared:
+        reasons = "; ".join(f"{what}: {why}" for what, why in (lost | skipped).items())
+        raise CaptureError(
+            f"{root}: its cameras share no {kind} ({reasons or 'it has no cameras'}); "
+            "copy or download them again"
+        )
+    rank = {sequence: number for number, sequence in enumerate(order)}
+    moments = sorted(shared, key=lambda m: (rank[m[0]], m[1]))
+    lengths = Counter(sequence for sequence, _ in moments)
+    images = kind == "frames"
+    cameras = {
+        camera: RawCamera(
+            id=camera,
+            kind=kind,
+            path=root,
+            names=tuple(table[moment] for moment in moments),
+            counts=tuple(lengths.values()) if images else (),
+            stamps=tuple(number for _, number in moments) if images else (),
+        )
+        for camera, table in taken.items()
+    }
+    return Timeline(cameras, tuple(lengths), lost, skipped)
+
+
+def _lacking_cameras(
+    pictures: Mapping[str, Mapping[Moment, str]],
+    common: Collection[Moment],
+    required: Collection[Moment],
+    kind: str,
+) -> dict[str, str]:
+    """Find the cameras that lack so many common moments that they are dropped, with the reason."""
+    worth = max(LACKING, 1 / max(1, sum(map(bool, pictures.values()))))
+    dropped = {}
+    for camera, table in pictures.items():
+        lacking = set(common) - table.keys()
+        lost = sorted(lacking & set(required))
+        if lost:
+            dropped[camera] = f"lacks {_words(lost)}, which is labelled"
+        elif len(lacking) == len(common) or len(lacking) > worth * len(common):
+            dropped[camera] = f"has {len(common) - len(lacking)} of {len(common)} {kind}"
+    return dropped
+
+
+def _reasons(moments: Collection[Moment], who: str, has: str, kind: str) -> dict[str, str]:
+    """Write one line per sequence that lost moments."""
+    found: dict[str, list[Moment]] = {}
+    for moment in sorted(moments):
+        found.setdefault(moment[0], []).append(moment)
+    return {
+        f"{len(lost)} of the {kind} of {sequence} ({who})": f"{who} {has} picture of {_words(lost)}"
+        for sequence, lost in found.items()
+    }
+
+
+def _words(moments: Sequence[Moment]) -> str:
+    shown = ", ".join(f"{sequence} {number}" for sequence, number in moments[:SHOWN])
+    return shown + (f" and {len(moments) - SHOWN} more" if len(moments) > SHOWN else "")

@@ -2,160 +2,155 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 
-from express50.geometry.smoothstep import smoothstep
-from express50.head.generator.eyes import blink, lid_motion
-from express50.head.generator.influence import (
+from express50.geometry.sampling import smoothstep
+from express50.head.generator.eyes import lid_motion, turned
+from express50.head.generator.field import window
+from express50.head.generator.mesh import WholeMesh
+from express50.head.generator.shapes import (
     Pull,
+    Triple,
     displacement,
+    middle,
     scope_weights,
     settle_eyes,
-    window,
 )
-from express50.head.generator.mesh import WholeMesh
-from express50.head.generator.skinning import JAW
 
 Array = np.ndarray
-Triple = tuple[float, float, float]
 
 _CORNER: Triple = (25.5, -49.5, 87)
 
 
-def _p(
-    at: Triple,
-    radius: Triple,
-    move: Triple = (0, 0, 0),
-    stretch: Triple = (0, 0, 0),
-    scope: str = "skin",
-    sides: str = "left",
-) -> Pull:
-    return Pull(at=at, radius=radius, move=move, stretch=stretch, scope=scope, sides=sides)
-
+left = partial(Pull, sides="left")
 
 # One-sided directions, written for the left; "_L" and "_R" are made of them.
 PAIRED: dict[str, tuple[Pull, ...]] = {
     "browDown": (
-        _p((26, 40, 84), (20, 12, 20), (-2.0, -5.0, 1.0)),
-        _p((10, 38, 92), (9, 11, 14), (-1.5, -3.0, 1.2)),
+        left((26, 40, 84), (20, 12, 20), (-2.0, -5.0, 1.0)),
+        left((10, 38, 92), (9, 11, 14), (-1.5, -3.0, 1.2)),
     ),
     "browInnerUp": (
-        _p((13, 41, 90), (13, 14, 18), (1.0, 7.0, 0.3)),
-        _p((12, 60, 92), (18, 16, 20), (0.0, 3.0, 0.0)),
+        left((13, 41, 90), (13, 14, 18), (1.0, 7.0, 0.3)),
+        left((12, 60, 92), (18, 16, 20), (0.0, 3.0, 0.0)),
     ),
     "browOuterUp": (
-        _p((42, 41, 76), (17, 14, 22), (0.5, 6.5, 0.0)),
-        _p((40, 60, 80), (20, 16, 24), (0.0, 2.5, 0.0)),
+        left((42, 41, 76), (17, 14, 22), (0.5, 6.5, 0.0)),
+        left((40, 60, 80), (20, 16, 24), (0.0, 2.5, 0.0)),
     ),
     "cheekPuff": (
-        _p((42, -46, 70), (21, 20, 26), (8.0, 0.0, 7.0)),
-        _p((16, -38, 96), (13, 9, 16), (0.5, 0.5, 2.5), scope="upper"),
+        left((42, -46, 70), (21, 20, 26), (8.0, 0.0, 7.0)),
+        left((16, -38, 96), (13, 9, 16), (0.5, 0.5, 2.5), scope="upper"),
     ),
     "cheekRaiser": (
-        _p((38, -6, 74), (20, 15, 22), (0.5, 5.0, 2.5)),
-        _p((36, 7, 78), (16, 7, 16), (0.0, 2.0, 0.8)),
+        left((38, -6, 74), (20, 15, 22), (0.5, 5.0, 2.5)),
+        left((36, 7, 78), (16, 7, 16), (0.0, 2.0, 0.8)),
     ),
     "cheekSquint": (
-        _p((36, -2, 76), (18, 13, 20), (0.0, 4.0, 2.8)),
-        _p((22, -22, 92), (9, 12, 14), (0.5, 1.5, -0.6)),
+        left((36, -2, 76), (18, 13, 20), (0.0, 4.0, 2.8)),
+        left((22, -22, 92), (9, 12, 14), (0.5, 1.5, -0.6)),
     ),
-    "cheekSuck": (_p((42, -46, 68), (17, 18, 22), (-6.0, 0.0, -3.0)),),
+    "cheekSuck": (left((42, -46, 68), (17, 18, 22), (-6.0, 0.0, -3.0)),),
     "mouthSmile": (
-        _p(_CORNER, (15, 12, 22), (8.0, 8.5, -5.0)),
-        _p((38, -22, 74), (19, 15, 22), (2.0, 5.0, 3.5)),
-        _p((12, -43, 102), (10, 9, 16), (2.0, 1.2, -1.2), scope="upper"),
-        _p((12, -55, 100), (11, 9, 16), (2.2, 1.6, -1.2), scope="lower"),
-        _p((27, -31, 90), (8, 11, 14), (0.5, 0.5, -1.0)),
+        left(_CORNER, (15, 12, 22), (8.0, 8.5, -5.0)),
+        left((38, -22, 74), (19, 15, 22), (2.0, 5.0, 3.5)),
+        left((12, -43, 102), (10, 9, 16), (2.0, 1.2, -1.2), scope="upper"),
+        left((12, -55, 100), (11, 9, 16), (2.2, 1.6, -1.2), scope="lower"),
+        left((27, -31, 90), (8, 11, 14), (0.5, 0.5, -1.0)),
     ),
     "mouthFrown": (
-        _p(_CORNER, (14, 12, 22), (1.5, -7.5, -1.0)),
-        _p((30, -64, 80), (13, 13, 20), (0.5, -2.5, 0.6)),
+        left(_CORNER, (14, 12, 22), (1.5, -7.5, -1.0)),
+        left((30, -64, 80), (13, 13, 20), (0.5, -2.5, 0.6)),
     ),
     "mouthDimple": (
-        _p(_CORNER, (13, 11, 20), (4.5, 0.5, -3.5)),
-        _p((34, -48, 80), (7, 8, 13), (0.0, 0.0, -2.0)),
+        left(_CORNER, (13, 11, 20), (4.5, 0.5, -3.5)),
+        left((34, -48, 80), (7, 8, 13), (0.0, 0.0, -2.0)),
     ),
     "mouthStretch": (
-        _p(_CORNER, (17, 15, 26), (9.0, -2.5, -5.0)),
-        _p((12, -54, 100), (12, 10, 16), (2.5, -0.6, -1.2), scope="lower"),
-        _p((12, -43, 102), (12, 10, 16), (2.5, 0.0, -1.0), scope="upper"),
+        left(_CORNER, (17, 15, 26), (9.0, -2.5, -5.0)),
+        left((12, -54, 100), (12, 10, 16), (2.5, -0.6, -1.2), scope="lower"),
+        left((12, -43, 102), (12, 10, 16), (2.5, 0.0, -1.0), scope="upper"),
     ),
     "mouthUpperUp": (
-        _p((11, -44, 101), (12, 10, 20), (0.8, 6.5, 0.8), scope="upper"),
-        _p((20, -30, 92), (11, 10, 16), (0.5, 2.5, 0.8), scope="upper"),
+        left((11, -44, 101), (12, 10, 20), (0.8, 6.5, 0.8), scope="upper"),
+        left((20, -30, 92), (11, 10, 16), (0.5, 2.5, 0.8), scope="upper"),
     ),
     "mouthLowerDown": (
-        _p((11, -55, 100), (12, 11, 20), (1.0, -6.5, 0.3), scope="lower"),
-        _p((14, -68, 95), (13, 9, 16), (0.5, -1.5, 0.6), scope="lower"),
+        left((11, -55, 100), (12, 11, 20), (1.0, -6.5, 0.3), scope="lower"),
+        left((14, -68, 95), (13, 9, 16), (0.5, -1.5, 0.6), scope="lower"),
     ),
     "mouthPress": (
-        _p((11, -44, 102), (14, 6, 16), (0.3, -1.6, -1.2), scope="upper"),
-        _p((11, -55, 101), (14, 7, 16), (0.3, 1.8, -1.2), scope="lower"),
-        _p(_CORNER, (10, 8, 16), (1.6, 0.0, -1.0)),
+        left((11, -44, 102), (14, 6, 16), (0.3, -1.6, -1.2), scope="upper"),
+        left((11, -55, 101), (14, 7, 16), (0.3, 1.8, -1.2), scope="lower"),
+        left(_CORNER, (10, 8, 16), (1.6, 0.0, -1.0)),
     ),
     "noseSneer": (
-        _p((14, -16, 98), (10, 11, 14), (1.2, 5.5, -0.4)),
-        _p((15, -33, 97), (12, 9, 16), (0.6, 4.2, 0.8), scope="upper"),
-        _p((9, 12, 92), (8, 13, 14), (-1.0, 2.2, 1.4)),
+        left((14, -16, 98), (10, 11, 14), (1.2, 5.5, -0.4)),
+        left((15, -33, 97), (12, 9, 16), (0.6, 4.2, 0.8), scope="upper"),
+        left((9, 12, 92), (8, 13, 14), (-1.0, 2.2, 1.4)),
     ),
-    "nostrilFlare": (_p((15, -20, 99), (7, 8, 10), (3.0, 0.8, 0.0)),),
+    "nostrilFlare": (left((15, -20, 99), (7, 8, 10), (3.0, 0.8, 0.0)),),
     "neckTense": (
-        _p((30, -140, 22), (16, 36, 26), (2.5, 0.0, 2.5)),
-        _p((30, -72, 74), (16, 14, 22), (1.5, -2.0, 0.0), scope="lower"),
+        left((30, -140, 22), (16, 36, 26), (2.5, 0.0, 2.5)),
+        left((30, -72, 74), (16, 14, 22), (1.5, -2.0, 0.0), scope="lower"),
     ),
 }
 _MIDDLE: dict[str, tuple[Pull, ...]] = {
     "mouthFunnel": (
-        _p((0, -44, 102), (22, 10, 22), (0, 4.2, 5.5), scope="upper", sides="middle"),
-        _p((0, -56, 100), (22, 11, 22), (0, -4.6, 5.5), scope="lower", sides="middle"),
-        _p(_CORNER, (13, 12, 22), (-8.0, 0.0, 4.0), sides="both"),
+        middle((0, -44, 102), (22, 10, 22), (0, 4.2, 5.5), scope="upper"),
+        middle((0, -56, 100), (22, 11, 22), (0, -4.6, 5.5), scope="lower"),
+        Pull(_CORNER, (13, 12, 22), (-8.0, 0.0, 4.0)),
     ),
     "mouthPucker": (
-        _p((0, -49, 100), (24, 16, 26), (0, 0, 7.0), sides="middle"),
-        _p((0, -49, 96), (26, 15, 30), stretch=(-0.34, 0, 0), sides="middle"),
-        _p(_CORNER, (15, 13, 22), (-4.5, 0.0, 4.0), sides="both"),
+        middle((0, -49, 100), (24, 16, 26), (0, 0, 7.0)),
+        middle((0, -49, 96), (26, 15, 30), stretch=(-0.34, 0, 0)),
+        Pull(_CORNER, (15, 13, 22), (-4.5, 0.0, 4.0)),
     ),
-    "mouthLeft": (_p((0, -50, 96), (34, 20, 34), (11.0, 0.8, 0), sides="middle"),),
-    "mouthRight": (_p((0, -50, 96), (34, 20, 34), (-11.0, 0.8, 0), sides="middle"),),
+    "mouthLeft": (middle((0, -50, 96), (34, 20, 34), (11.0, 0.8, 0)),),
+    "mouthRight": (middle((0, -50, 96), (34, 20, 34), (-11.0, 0.8, 0)),),
     "mouthRollLower": (
-        _p((0, -54, 101), (24, 7, 16), (0, 2.6, -5.5), scope="lower", sides="middle"),
-        _p((0, -61, 99), (22, 7, 16), (0, 2.2, -1.0), scope="lower", sides="middle"),
+        middle((0, -54, 101), (24, 7, 16), (0, 2.6, -5.5), scope="lower"),
+        middle((0, -61, 99), (22, 7, 16), (0, 2.2, -1.0), scope="lower"),
     ),
     "mouthRollUpper": (
-        _p((0, -45, 102), (24, 6.5, 16), (0, -2.2, -5.5), scope="upper", sides="middle"),
-        _p((0, -38, 102), (22, 7, 16), (0, -1.8, -0.8), scope="upper", sides="middle"),
+        middle((0, -45, 102), (24, 6.5, 16), (0, -2.2, -5.5), scope="upper"),
+        middle((0, -38, 102), (22, 7, 16), (0, -1.8, -0.8), scope="upper"),
     ),
     "mouthShrugLower": (
-        _p((0, -54, 101), (22, 9, 20), (0, 3.6, 2.6), scope="lower", sides="middle"),
-        _p((0, -72, 96), (24, 14, 20), (0, 5.0, 0.8), scope="lower", sides="middle"),
-        _p((0, -45, 102), (20, 7, 18), (0, 2.6, 1.6), scope="upper", sides="middle"),
+        middle((0, -54, 101), (22, 9, 20), (0, 3.6, 2.6), scope="lower"),
+        middle((0, -72, 96), (24, 14, 20), (0, 5.0, 0.8), scope="lower"),
+        middle((0, -45, 102), (20, 7, 18), (0, 2.6, 1.6), scope="upper"),
     ),
     "mouthShrugUpper": (
-        _p((0, -42, 103), (22, 11, 20), (0, 3.4, 2.0), scope="upper", sides="middle"),
-        _p((0, -54, 101), (18, 6, 18), (0, 2.4, 1.2), scope="lower", sides="middle"),
+        middle((0, -42, 103), (22, 11, 20), (0, 3.4, 2.0), scope="upper"),
+        middle((0, -54, 101), (18, 6, 18), (0, 2.4, 1.2), scope="lower"),
     ),
-    "chinWrinkle": (_p((0, -80, 96), (16, 11, 16), (0, 3.0, 1.4), sides="middle"),),
-    "browSqueeze": (_p((13, 38, 90), (10, 12, 16), (-3.4, -0.8, 1.0), sides="both"),),
-    "throatSwallow": (_p((0, -132, 36), (13, 16, 22), (0, 8.0, 1.0), sides="middle"),),
+    "chinWrinkle": (middle((0, -80, 96), (16, 11, 16), (0, 3.0, 1.4)),),
+    "browSqueeze": (Pull((13, 38, 90), (10, 12, 16), (-3.4, -0.8, 1.0)),),
+    "throatSwallow": (middle((0, -132, 36), (13, 16, 22), (0, 8.0, 1.0)),),
 }
 
 
 def expression_directions(
-    mesh: WholeMesh, regions: dict[str, Array], weights: Array
+    mesh: WholeMesh, regions: dict[str, Array], jaw: Array
 ) -> tuple[tuple[str, ...], Array]:
-    """Return names (X) and directions (V,3,X) in mm at full activation."""
-    jaw = weights[:, JAW]
+    """Return names (X) and directions (V,3,X) in mm at full activation; `jaw` as for shapes."""
     scopes = scope_weights(mesh, regions, jaw)
     result: dict[str, Array] = {}
     for name, pulls in PAIRED.items():
-        left = settle_eyes(mesh, displacement(mesh, pulls, scopes), "none")
-        result |= _both_sides(mesh, name, left)
+        motion = settle_eyes(mesh, displacement(mesh, pulls, scopes), False)
+        result |= _both_sides(mesh, name, motion)
     for name, (upper, lower, aside) in _LIDS.items():
-        left = lid_motion(mesh, "left", upper, lower) + _lid_slide(mesh, aside)
-        result |= _both_sides(mesh, name, left)
-    result |= _both_sides(mesh, "eyeBlink", blink(mesh, "left"))
+        motion = lid_motion(mesh, "left", upper, lower)
+        # The cornea carries the lids a little sideways.
+        shares = {f"lid{k}": (1 - k / 7) ** 2 for k in range(8)} | {"lid_edge": 1, "lid_hidden": 1}
+        for tag, share in shares.items():
+            motion[mesh.tag(tag, "left"), 0] += aside * share
+        result |= _both_sides(mesh, name, motion)
     for name, pulls in _MIDDLE.items():
-        result[name] = settle_eyes(mesh, displacement(mesh, pulls, scopes), "none")
+        result[name] = settle_eyes(mesh, displacement(mesh, pulls, scopes), False)
     result |= _jaw_directions(mesh, jaw) | _tongue_directions(mesh)
     names = tuple(sorted(result, key=str.lower))
     return names, np.stack([result[name] for name in names], -1)
@@ -163,6 +158,7 @@ def expression_directions(
 
 #  name: share of the opening the upper lid comes down, the lower comes up, slide in x (mm)
 _LIDS: dict[str, tuple[float, float, float]] = {
+    "eyeBlink": (0.86, 0.14, 0.0),
     "eyeLookDown": (0.36, -0.1, 0.0),
     "eyeLookUp": (-0.2, 0.1, 0.0),
     "eyeLookIn": (0.0, 0.0, -0.7),
@@ -176,46 +172,28 @@ def _both_sides(mesh: WholeMesh, name: str, left: Array) -> dict[str, Array]:
     return {f"{name}_L": left, f"{name}_R": left[mesh.mirror] * [-1.0, 1.0, 1.0]}
 
 
-def _lid_slide(mesh: WholeMesh, aside: float) -> Array:
-    """Slide the left eye's lids a little sideways, as the cornea carries them."""
-    motion = np.zeros_like(mesh.vertices)
-    for k in range(8):
-        motion[mesh.tag(f"lid{k}", "left"), 0] = aside * (1 - k / 7) ** 2
-    for tag in ("lid_edge", "lid_hidden"):
-        motion[mesh.tag(tag, "left"), 0] = aside
-    return motion
-
-
 def _jaw_directions(mesh: WholeMesh, jaw: Array) -> dict[str, Array]:
     """Return slides of the jaw, and how lips stay shut while the jaw opens by 0.3 rad."""
     share = jaw[:, None]
     slide = share * np.array([[7.0, 0.0, 0.0]])
-    angle = -0.3
-    offset = mesh.vertices - np.array([0.0, -8.0, 10.0])
-    y = np.cos(angle) * offset[:, 1] - np.sin(angle) * offset[:, 2]
-    z = np.sin(angle) * offset[:, 1] + np.cos(angle) * offset[:, 2]
-    back = np.stack([offset[:, 0], y, z], 1) - offset
-    near = window(mesh.vertices, np.array([0.0, -52.0, 95.0]), np.array([36.0, 15.0, 30.0]))
-    soft = 1.0 - np.isin(
-        np.arange(len(jaw)),
-        np.concatenate([mesh.tag(t) for t in ("lower_teeth", "lower_gums", "tongue")]),
-    )
-    lips = near.copy()
+    back = turned(mesh.vertices - np.array([0.0, -8.0, 10.0]), np.array(0.3))
+    lips = window(mesh.vertices, (0.0, -52.0, 95.0), (36.0, 15.0, 30.0))
     for k in range(4):
         lips[mesh.tag(f"lip{k}")] = np.maximum(lips[mesh.tag(f"lip{k}")], 1.0 - 0.06 * k)
+    for tag in ("lower_teeth", "lower_gums", "tongue"):
+        lips[mesh.tag(tag)] = 0.0
     return {
         "jawForward": share * np.array([[0.0, -0.5, 6.0]]),
         "jawLeft": slide,
         "jawRight": -slide,
-        "mouthClose": 0.9 * (share * (lips * soft)[:, None]) * back,
+        "mouthClose": 0.9 * (share * lips[:, None]) * back,
     }
 
 
 def _tongue_directions(mesh: WholeMesh) -> dict[str, Array]:
     tongue = mesh.tag("tongue")
     p = mesh.vertices[tongue]
-    tip = smoothstep(p[:, 2], 44.0, 84.0)[:, None]
-    up = (p[:, 1:2] + 58.0) / 8.0
+    tip, up = smoothstep(p[:, 2], 44.0, 84.0)[:, None], (p[:, 1] + 58.0) / 8.0
     moves = {
         "tongueOut": tip * [0.0, 3.0, 38.0],
         "tongueUp": tip**2 * [0.0, 15.0, -4.0],
@@ -223,7 +201,7 @@ def _tongue_directions(mesh: WholeMesh) -> dict[str, Array]:
         "tongueLeft": tip**2 * [14.0, 0.0, -2.0],
         "tongueRight": tip**2 * [-14.0, 0.0, -2.0],
         "tongueCurl": tip**3 * np.array([0.0, 12.0, -14.0]),
-        "tongueWide": tip * np.stack([0.25 * p[:, 0], -0.8 * up[:, 0], 0 * p[:, 0]], 1),
+        "tongueWide": tip * np.stack([0.25 * p[:, 0], -0.8 * up, 0 * p[:, 0]], 1),
         "tongueBack": tip * [0.0, 2.0, -9.0],
     }
     result = {}

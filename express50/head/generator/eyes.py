@@ -4,8 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from express50.head.generator.field import EYE_CENTER, EYE_RADIUS, LID_RADIUS, cast, labels
-from express50.head.generator.influence import eye_center
+from express50.head.generator.field import (
+    EYE_CENTER,
+    EYE_RADIUS,
+    LID_RADIUS,
+    cast,
+    eye_center,
+    labels,
+)
 from express50.head.generator.mesh import HalfMesh, WholeMesh
 
 Array = np.ndarray
@@ -71,24 +77,8 @@ def add_eyeball(half: HalfMesh, columns: int = 28) -> None:
     """Add a sphere with its pole forward: rings at the pupil's and iris's rims, two UV charts."""
     iris = np.degrees(np.arcsin(IRIS_RADIUS / EYE_RADIUS))
     pupil = np.degrees(np.arcsin(PUPIL_RADIUS / EYE_RADIUS))
-    polar = np.radians(
-        [
-            pupil,
-            pupil + 2,
-            0.5 * (pupil + iris),
-            iris,
-            iris + 2,
-            42,
-            54,
-            66,
-            78,
-            90,
-            110,
-            130,
-            150,
-            167,
-        ]
-    )
+    polar = np.radians([pupil, pupil + 2, 0.5 * (pupil + iris), iris, iris + 2,
+                        42, 54, 66, 78, 90, 110, 130, 150, 167])  # fmt: skip
     turn = 2 * np.pi * np.arange(columns) / columns
     circle = np.stack([np.cos(turn), np.sin(turn)], 1)
     front = int(half.add(EYE_CENTER + [[0, 0, EYE_RADIUS]], "eyeball")[0])
@@ -113,7 +103,6 @@ def add_eyeball(half: HalfMesh, columns: int = 28) -> None:
 
 
 _STILL = 5  # lid loop that does not move; loops inside it share the margin's motion
-_MEETING = 0.14  # share of the opening that the lower lid closes in a blink
 
 
 def lid_motion(mesh: WholeMesh, side: str, upper: float, lower: float) -> Array:
@@ -121,12 +110,8 @@ def lid_motion(mesh: WholeMesh, side: str, upper: float, lower: float) -> Array:
 
     Loops between the margin and the still loop are spread evenly over the lengthened lid, turning
     about the eyeball's centre, and the upper lid's fold is pulled smooth onto the lid's sphere.
-
-    Args:
-        mesh: The head.
-        side: "left" or "right".
-        upper: Share of the opening by which the upper margin comes down (negative: up).
-        lower: Share by which the lower margin comes up (negative: down).
+    `upper` is the share of the opening by which the upper margin comes down, `lower` that by which
+    the lower one comes up.
     """
     center = eye_center(side)
     loops = np.stack([mesh.vertices[mesh.tag(f"lid{k}", side)] for k in range(_STILL + 1)]) - center
@@ -150,14 +135,8 @@ def lid_motion(mesh: WholeMesh, side: str, upper: float, lower: float) -> Array:
     new_angle = angle + (angle - angle[_STILL]) / span * (new_margin - angle[0])
     motion = np.zeros_like(mesh.vertices)
     for k in range(_STILL):
-        new = np.stack(
-            [
-                loops[k, :, 0],
-                new_radius[k] * np.sin(new_angle[k]),
-                new_radius[k] * np.cos(new_angle[k]),
-            ],
-            1,
-        )
+        y, z = new_radius[k] * np.sin(new_angle[k]), new_radius[k] * np.cos(new_angle[k])
+        new = np.stack([loops[k, :, 0], y, z], 1)
         motion[mesh.tag(f"lid{k}", side)] = new - loops[k]
     for tag in ("lid_edge", "lid_hidden"):
         ring = mesh.tag(tag, side)
@@ -171,8 +150,3 @@ def turned(offset: Array, angle: Array) -> Array:
     y = c * offset[:, 1] + s * offset[:, 2]
     z = -s * offset[:, 1] + c * offset[:, 2]
     return np.stack([offset[:, 0], y, z], 1) - offset
-
-
-def blink(mesh: WholeMesh, side: str) -> Array:
-    """Return displacement (V,3) mm that shuts the lids."""
-    return lid_motion(mesh, side, 1.0 - _MEETING, _MEETING)

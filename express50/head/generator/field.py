@@ -13,6 +13,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.interpolate import PchipInterpolator
 
 Array = np.ndarray
@@ -23,164 +24,134 @@ LID_RADIUS = 13.3
 
 
 @dataclass(frozen=True)
-class Mass:
-    """One mass: kind "ellipsoid" (a centre, b radii) or "capsule" (a, b ends)."""
+class Ellipsoid:
+    """A mass by centre and radii, turned by degrees; ``carve`` takes it away."""
 
-    kind: str
-    a: tuple[float, float, float]
-    b: tuple[float, float, float]
+    centre: tuple[float, float, float]
+    radii: tuple[float, float, float]
     blend: float
-    radii: tuple[float, float] = (0.0, 0.0)
-    tilt: float = 0.0  # degrees about x (ellipsoids): positive tips the top forward
-    yaw: float = 0.0  # degrees about y (ellipsoids): positive turns the front to the left
+    tilt: float = 0.0  # about x: positive tips the top forward
+    yaw: float = 0.0  # about y: positive turns the front to the left
     carve: bool = False
 
 
-def _ellipsoid(
-    c: tuple, r: tuple, blend: float, *, tilt: float = 0.0, yaw: float = 0.0, carve: bool = False
-) -> Mass:
-    return Mass("ellipsoid", c, r, blend, tilt=tilt, yaw=yaw, carve=carve)
+@dataclass(frozen=True)
+class Capsule:
+    """A mass by its ends and the radii there; ``carve`` takes it away."""
+
+    start: tuple[float, float, float]
+    end: tuple[float, float, float]
+    start_radius: float
+    end_radius: float
+    blend: float
+    carve: bool = False
 
 
-def _capsule(
-    a: tuple, b: tuple, ra: float, rb: float, blend: float, *, carve: bool = False
-) -> Mass:
-    return Mass("capsule", a, b, blend, radii=(ra, rb), carve=carve)
-
-
-SKULL = (
-    _ellipsoid((0, 54, -20), (75, 79, 74), 1),
-    _ellipsoid((0, 52, 24), (66, 78, 70), 28),
-    _ellipsoid((0, 5, 38), (62, 60, 46), 25),
-    _ellipsoid((0, -35, 46), (44, 42, 48), 22),  # maxilla and muscles around the mouth
-    _capsule((44, 2, 62), (66, 4, 12), 11, 6, 14),  # cheekbone and zygomatic arch
-    _capsule((10, -83, 78), (43, -60, 12), 10, 8.5, 18),  # body of the mandible
-    _capsule((44, -58, 12), (57, -8, 6), 9, 9, 14),  # ramus
-    _ellipsoid((0, -50, 32), (47, 39, 46), 16),
-    _ellipsoid((0, -80, 82), (15, 13, 14), 12),  # chin
-    _ellipsoid((0, -79, 38), (37, 23, 38), 14),  # floor of the mouth
-    _ellipsoid((34, -24, 60), (21, 26, 24), 16),  # cheek fat
-    _ellipsoid((28, -4, 76), (12, 9, 9), 14),  # front of the cheek, under the eye
+MASSES: tuple[Ellipsoid | Capsule, ...] = (
+    # skull
+    Ellipsoid((0, 54, -20), (75, 79, 74), 1),
+    Ellipsoid((0, 52, 24), (66, 78, 70), 28),
+    Ellipsoid((0, 5, 38), (62, 60, 46), 25),
+    Ellipsoid((0, -35, 46), (44, 42, 48), 22),  # maxilla and muscles around the mouth
+    Capsule((44, 2, 62), (66, 4, 12), 11, 6, 14),  # cheekbone and zygomatic arch
+    Capsule((10, -83, 78), (43, -60, 12), 10, 8.5, 18),  # body of the mandible
+    Capsule((44, -58, 12), (57, -8, 6), 9, 9, 14),  # ramus
+    Ellipsoid((0, -50, 32), (47, 39, 46), 16),
+    Ellipsoid((0, -80, 82), (15, 13, 14), 12),  # chin
+    Ellipsoid((0, -79, 38), (37, 23, 38), 14),  # floor of the mouth
+    Ellipsoid((34, -24, 60), (21, 26, 24), 16),  # cheek fat
+    Ellipsoid((28, -4, 76), (12, 9, 9), 14),  # front of the cheek, under the eye
+    # neck
+    Capsule((0, -70, -16), (0, -230, -34), 50, 52, 18),
+    Ellipsoid((0, -18, -46), (46, 44, 33), 22),  # nuchal muscles
+    Ellipsoid((56, -18, -22), (10, 18, 12), 12),  # mastoid
+    Capsule((54, -36, -22), (15, -215, 16), 7, 8, 16),  # sternocleidomastoid
+    Capsule((14, -60, -58), (82, -206, -42), 12, 27, 34),  # trapezius
+    Ellipsoid((0, -102, 24), (24, 15, 16), 16),  # hyoid
+    Ellipsoid((0, -131, 28), (8, 13, 8), 14),  # thyroid cartilage
+    # brow and orbit
+    Capsule((10, 37, 86), (30, 42, 78), 7, 6.5, 12),
+    Capsule((30, 42, 78), (53, 35, 60), 6.5, 5.5, 12),
+    Ellipsoid((0, 37, 84), (14, 11, 10.5), 12),  # glabella
+    Ellipsoid((32, 15.0, 90), (16.5, 10.5, 14), 11, carve=True, yaw=18),
+    Ellipsoid((33, 32.5, 71), (18, 6.0, 11.5), 6, yaw=22),  # fullness between lid and brow
+    Ellipsoid((16.5, 22, 93.5), (5, 8, 8.5), 11, carve=True),
+    Ellipsoid(tuple(EYE_CENTER), (LID_RADIUS,) * 3, 3.0),
+    Capsule((20, 25.0, 85.0), (31, 28.8, 83.5), 1.4, 1.8, 2.5, carve=True),  # fold of the lid
+    Capsule((31, 28.8, 83.5), (45, 24.5, 77), 1.8, 1.4, 2.5, carve=True),
+    # nose
+    Capsule((0, 26, 83), (0, -6, 99), 6.5, 8.5, 11),
+    Ellipsoid((0, -8, 88), (14, 22, 16), 9),
+    Ellipsoid((0, -14, 106.5), (9.5, 9, 10), 8),
+    Ellipsoid((12.5, -19, 97.5), (6.5, 7, 10), 4, yaw=-15),
+    Capsule((0, -26, 97), (0, -20, 109), 4.0, 5, 5),
+    # lips
+    Ellipsoid((0, -48, 80), (28, 22, 19), 10),  # dental arch behind the lips
+    Capsule((3.5, -43.2, 98), (15, -45.0, 95), 5.4, 4.6, 4),
+    Capsule((15, -45.0, 95), (27, -49, 84.5), 4.6, 2.0, 4),
+    Capsule((0, -55, 97.0), (11, -54.6, 95.5), 6.0, 5.6, 5),
+    Capsule((11, -54.6, 95.5), (26, -50, 84.5), 5.6, 2.0, 5),
+    Capsule((0, -31, 105.5), (0, -40, 108), 3.5, 4, 3, carve=True),  # philtrum
+    Capsule((0, -66.5, 103.5), (20, -67, 96), 6, 4.5, 10, carve=True),  # labiomental fold
+    Ellipsoid((32, -50, 92), (5, 6, 7), 9, carve=True),  # hollow beside the mouth's corner
 )
-NECK = (
-    _capsule((0, -70, -16), (0, -230, -34), 50, 52, 18),
-    _ellipsoid((0, -18, -46), (46, 44, 33), 22),  # nuchal muscles
-    _ellipsoid((56, -18, -22), (10, 18, 12), 12),  # mastoid
-    _capsule((54, -36, -22), (15, -215, 16), 7, 8, 16),  # sternocleidomastoid
-    _capsule((14, -60, -58), (82, -206, -42), 12, 27, 34),  # trapezius
-    _ellipsoid((0, -102, 24), (24, 15, 16), 16),  # hyoid
-    _ellipsoid((0, -131, 28), (8, 13, 8), 14),  # thyroid cartilage
-)
-BROW_AND_ORBIT = (
-    _capsule((10, 37, 86), (30, 42, 78), 7, 6.5, 12),
-    _capsule((30, 42, 78), (53, 35, 60), 6.5, 5.5, 12),
-    _ellipsoid((0, 37, 84), (14, 11, 10.5), 12),  # glabella
-    _ellipsoid((32, 15.0, 90), (16.5, 10.5, 14), 11, carve=True, yaw=18),
-    _ellipsoid((33, 32.5, 71), (18, 6.0, 11.5), 6, yaw=22),  # fullness between lid and brow
-    _ellipsoid((16.5, 22, 93.5), (5, 8, 8.5), 11, carve=True),
-    _ellipsoid(tuple(EYE_CENTER), (LID_RADIUS,) * 3, 3.0),
-    _capsule((20, 25.0, 85.0), (31, 28.8, 83.5), 1.4, 1.8, 2.5, carve=True),  # fold of the lid
-    _capsule((31, 28.8, 83.5), (45, 24.5, 77), 1.8, 1.4, 2.5, carve=True),
-)
-NOSE = (
-    _capsule((0, 26, 83), (0, -6, 99), 6.5, 8.5, 11),
-    _ellipsoid((0, -8, 88), (14, 22, 16), 9),
-    _ellipsoid((0, -14, 106.5), (9.5, 9, 10), 8),
-    _ellipsoid((12.5, -19, 97.5), (6.5, 7, 10), 4, yaw=-15),
-    _capsule((0, -26, 97), (0, -20, 109), 4.0, 5, 5),
-)
-LIPS = (
-    _ellipsoid((0, -48, 80), (28, 22, 19), 10),  # dental arch behind the lips
-    _capsule((3.5, -43.2, 98), (15, -45.0, 95), 5.4, 4.6, 4),
-    _capsule((15, -45.0, 95), (27, -49, 84.5), 4.6, 2.0, 4),
-    _capsule((0, -55, 97.0), (11, -54.6, 95.5), 6.0, 5.6, 5),
-    _capsule((11, -54.6, 95.5), (26, -50, 84.5), 5.6, 2.0, 5),
-    _capsule((0, -31, 105.5), (0, -40, 108), 3.5, 4, 3, carve=True),  # philtrum
-    _capsule((0, -66.5, 103.5), (20, -67, 96), 6, 4.5, 10, carve=True),  # labiomental fold
-    _ellipsoid((32, -50, 92), (5, 6, 7), 9, carve=True),  # hollow beside the mouth's corner
-)
-MASSES = SKULL + NECK + BROW_AND_ORBIT + NOSE + LIPS
 
 
-def _rotation(tilt: float, yaw: float) -> Array:
-    a, b = np.radians(tilt), np.radians(yaw)
+# All masses as arrays, so that one matrix product serves each kind.
+_ROUND = [mass for mass in MASSES if isinstance(mass, Ellipsoid)]
+_LONG = [mass for mass in MASSES if isinstance(mass, Capsule)]
+
+
+def _to_unit_sphere(mass: Ellipsoid) -> Array:
+    """Return the matrix (3,3) that takes directions, as rows, to the ellipsoid's unit sphere."""
+    a, b = np.radians(mass.tilt), np.radians(mass.yaw)
     rx = np.array([[1, 0, 0], [0, np.cos(a), -np.sin(a)], [0, np.sin(a), np.cos(a)]])
     ry = np.array([[np.cos(b), 0, np.sin(b)], [0, 1, 0], [-np.sin(b), 0, np.cos(b)]])
-    return ry @ rx
+    return ry @ rx / np.array(mass.radii, float)
 
 
-@dataclass(frozen=True)
-class _Stack:
-    """Masses as arrays, so that one matrix product serves all of them."""
-
-    unit: Array  # (3,3E) head space to the ellipsoids' unit spheres
-    shift: Array  # (3E,)
-    inverse_radii: Array  # (E,3)
-    start: Array  # (C,3) capsules: first end, axis, radii
-    axis: Array
-    radii: Array
-    order: tuple[tuple[bool, int, float, bool], ...]  # is ellipsoid, index, blend, carve
+_TO_SPHERES = np.concatenate([_to_unit_sphere(mass) for mass in _ROUND], 1)
+_SHIFT = np.concatenate([np.array(mass.centre) @ _to_unit_sphere(mass) for mass in _ROUND])
+_INVERSE_RADII = np.array([1 / np.array(mass.radii, float) for mass in _ROUND])
+_START = np.array([mass.start for mass in _LONG], float)
+_AXIS = np.array([np.subtract(mass.end, mass.start) for mass in _LONG], float)
+_END_RADII = np.array([(mass.start_radius, mass.end_radius) for mass in _LONG], float)
 
 
-def _stack(masses: tuple[Mass, ...]) -> _Stack:
-    round_ones = [m for m in masses if m.kind == "ellipsoid"]
-    long_ones = [m for m in masses if m.kind == "capsule"]
-    units = [_rotation(m.tilt, m.yaw) / np.array(m.b, float) for m in round_ones]
-    order, counts = [], {"ellipsoid": 0, "capsule": 0}
-    for m in masses:
-        order.append((m.kind == "ellipsoid", counts[m.kind], m.blend, m.carve))
-        counts[m.kind] += 1
-    return _Stack(
-        unit=np.concatenate(units, 1),
-        shift=np.concatenate([np.array(m.a) @ u for m, u in zip(round_ones, units, strict=True)]),
-        inverse_radii=np.array([1 / np.array(m.b, float) for m in round_ones]),
-        start=np.array([m.a for m in long_ones], float),
-        axis=np.array([np.subtract(m.b, m.a) for m in long_ones], float),
-        radii=np.array([m.radii for m in long_ones], float),
-        order=tuple(order),
-    )
-
-
-_SKIN = _stack(MASSES)
-
-
-def _ellipsoid_distances(stack: _Stack, p: Array) -> Array:
+def _ellipsoid_distances(p: Array) -> Array:
     """Return distances (N,E), first order near the surfaces."""
-    q = (p @ stack.unit - stack.shift).reshape(len(p), -1, 3)
+    q = (p @ _TO_SPHERES - _SHIFT).reshape(len(p), -1, 3)
     k0 = np.sqrt(np.einsum("nec,nec->ne", q, q)) + 1e-12
-    q *= stack.inverse_radii
+    q *= _INVERSE_RADII
     k1 = np.sqrt(np.einsum("nec,nec->ne", q, q)) + 1e-12
     return k0 * (k0 - 1.0) / k1
 
 
-def _capsule_distances(stack: _Stack, p: Array) -> Array:
+def _capsule_distances(p: Array) -> Array:
     """Return distances (N,C) to capsules whose radius runs linearly between the ends."""
-    length2 = np.einsum("cd,cd->c", stack.axis, stack.axis)
-    along = p @ stack.axis.T - np.einsum("cd,cd->c", stack.start, stack.axis)
-    offset2 = (p * p).sum(1)[:, None] - 2 * p @ stack.start.T
-    offset2 = offset2 + np.einsum("cd,cd->c", stack.start, stack.start)
+    length2 = np.einsum("cd,cd->c", _AXIS, _AXIS)
+    along = p @ _AXIS.T - np.einsum("cd,cd->c", _START, _AXIS)
+    offset2 = (p * p).sum(1)[:, None] - 2 * p @ _START.T
+    offset2 = offset2 + np.einsum("cd,cd->c", _START, _START)
     t = np.clip(along / length2, 0.0, 1.0)
     distance2 = offset2 - 2 * t * along + t * t * length2
-    radius = stack.radii[:, 0] + (stack.radii[:, 1] - stack.radii[:, 0]) * t
+    radius = _END_RADII[:, 0] + (_END_RADII[:, 1] - _END_RADII[:, 0]) * t
     return np.sqrt(np.maximum(distance2, 0.0)) - radius
-
-
-def _smooth_min(a: Array, b: Array, k: float) -> Array:
-    """Take the polynomial smooth minimum (quadratic), exact outside |a - b| < k."""
-    h = np.maximum(k - np.abs(a - b), 0.0)
-    return np.minimum(a, b) - (0.25 / k) * h * h
 
 
 def skin_field(points: Array) -> Array:
     """Compute a signed distance-like value, mm, at points (N,3) mm: negative inside the skin."""
     p = np.array(points, float)
     p[:, 0] = np.sqrt(p[:, 0] ** 2 + 1.0)  # folds without a crease on the mid plane
-    ellipsoids = np.ascontiguousarray(_ellipsoid_distances(_SKIN, p).T)
-    capsules = np.ascontiguousarray(_capsule_distances(_SKIN, p).T)
-    value = ellipsoids[0]
-    for is_ellipsoid, index, blend, carve in _SKIN.order[1:]:
-        d = ellipsoids[index] if is_ellipsoid else capsules[index]
-        value = -_smooth_min(-value, d, blend) if carve else _smooth_min(value, d, blend)
+    ellipsoids = iter(np.ascontiguousarray(_ellipsoid_distances(p).T))
+    capsules = iter(np.ascontiguousarray(_capsule_distances(p).T))
+    value = next(ellipsoids)
+    for mass in MASSES[1:]:
+        d = next(ellipsoids if isinstance(mass, Ellipsoid) else capsules)
+        sign = -1.0 if mass.carve else 1.0
+        # The polynomial smooth minimum (quadratic), exact where they differ by more than the blend.
+        h = np.maximum(mass.blend - np.abs(sign * value - d), 0.0)
+        value = sign * (np.minimum(sign * value, d) - (0.25 / mass.blend) * h * h)
     return value
 
 
@@ -225,35 +196,19 @@ def project(points: Array, iterations: int = 4) -> Array:
 
 BOTTOM_LATITUDE = -80.0
 #         latitude, origin y, origin z, elevation
-_TABLE = np.array(
-    [
-        (-85.0, -180, -22, -20),
-        (-80.0, -165, -20, -22),
-        (-66.0, -110, -10, -30),
-        (-58.0, -72, -4, -45),
-        (-51.0, -35, 0, -50),
-        (-45.0, -29, 0, -38),
-        (-40.0, -27, 0, -30),
-        (-30.0, -13, 0, -20),
-        (-20.0, -2, 0, -15),
-        (-14.0, 2, 0, -10),
-        (0.0, 20, 0, 0),
-        (10.0, 30, 0, 8),
-        (30.0, 38, 0, 30),
-        (60.0, 40, 0, 61),
-        (90.0, 40, 0, 90),
-    ]
-)
+_TABLE = np.array([
+    (-85.0, -180, -22, -20), (-80.0, -165, -20, -22), (-66.0, -110, -10, -30),
+    (-58.0, -72, -4, -45), (-51.0, -35, 0, -50), (-45.0, -29, 0, -38), (-40.0, -27, 0, -30),
+    (-30.0, -13, 0, -20), (-20.0, -2, 0, -15), (-14.0, 2, 0, -10), (0.0, 20, 0, 0),
+    (10.0, 30, 0, 8), (30.0, 38, 0, 30), (60.0, 40, 0, 61), (90.0, 40, 0, 90),
+])  # fmt: skip
 _CURVES = PchipInterpolator(_TABLE[:, 0], _TABLE[:, 1:])
 
 
 def rays(azimuth: Array, latitude: Array) -> tuple[Array, Array]:
-    """Origins and unit directions (N,3) in mm for azimuth (radians, 0 front) and latitude (deg)."""
+    """Return origins (N,3) mm and unit directions by azimuth (radians, 0 front), latitude (deg)."""
     y, z, elevation = _CURVES(np.asarray(latitude, float)).T
-    e = np.radians(elevation)
-    origins = np.stack([np.zeros_like(y), y, z], -1)
-    directions = np.stack([np.cos(e) * np.sin(azimuth), np.sin(e), np.cos(e) * np.cos(azimuth)], -1)
-    return origins, directions
+    return np.stack([np.zeros_like(y), y, z], -1), sphere(azimuth, elevation)
 
 
 def labels(points: Array) -> tuple[Array, Array]:
@@ -274,3 +229,13 @@ def sphere(azimuth: Array, latitude: Array) -> Array:
     """Return unit vectors (N,3) of the labels, the domain in which the skin is triangulated."""
     b = np.radians(latitude)
     return np.stack([np.cos(b) * np.sin(azimuth), np.sin(b), np.cos(b) * np.cos(azimuth)], -1)
+
+
+def window(points: Array, at: ArrayLike, radius: ArrayLike) -> Array:
+    """Return a Gaussian window (N,), 1 at `at` and exp(-1) at one radius, of points (N,D)."""
+    return np.exp(-(((points - np.array(at)) / np.array(radius)) ** 2).sum(-1))
+
+
+def eye_center(side: str) -> Array:
+    """Return eyeball centre (3,) mm."""
+    return EYE_CENTER * [1.0 if side == "left" else -1.0, 1.0, 1.0]

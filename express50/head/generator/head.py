@@ -14,24 +14,29 @@ from typing import Any
 
 import numpy as np
 
+from express50.geometry.sampling import smoothstep
 from express50.head.generator.expressions import expression_directions
 from express50.head.generator.eyes import add_eyeball
-from express50.head.generator.mesh import HalfMesh, WholeMesh, mirrored, pack_uv
+from express50.head.generator.field import eye_center, window
+from express50.head.generator.mesh import (
+    HalfMesh,
+    WholeMesh,
+    mirrored,
+    neighbour_mean,
+    pack_uv,
+)
 from express50.head.generator.mouth import add_teeth, add_tongue
 from express50.head.generator.regions import contour_candidates, embed_landmarks, region_masks
 from express50.head.generator.shapes import shape_directions
 from express50.head.generator.skin import add_skin, set_skin_uv
-from express50.head.generator.skinning import (
-    JAW,
-    joint_positions,
-    joint_regressor,
-    pose_correctives,
-    skinning_weights,
-)
 from express50.head.load import BUILTIN
 
 Array = np.ndarray
 
+ROOT, NECK, JAW, LEFT_EYE, RIGHT_EYE = range(5)
+# Rest joints, mm: collar, upper neck, jaw hinge, eyeball centres.
+JOINTS = np.array([(0, -165, -22), (0, -72, -16), (0, -8, 10),
+                   eye_center("left"), eye_center("right")], float)  # fmt: skip
 PAIRED_CHARTS = ("ear", "eye_front", "eye_back")
 
 
@@ -48,50 +53,133 @@ def procedural_mesh() -> WholeMesh:
     return mirrored(half, PAIRED_CHARTS)
 
 
-def procedural_arrays() -> dict[str, Any]:
-    """Make the arrays of HeadModel's fields for the built-in head (NumPy, float64, metres)."""
+def write_builtin(path: Path) -> None:
+    """Write the head's arrays, in metres, as the .npz file that `express50.head.load` reads."""
     mesh = procedural_mesh()
-    regions = region_masks(mesh)
-    joints = joint_positions(mesh)
+    regions, contour = region_masks(mesh), contour_candidates(mesh)
     uv, uv_faces = pack_uv(mesh)
     landmark_faces, landmark_bary = embed_landmarks(mesh)
     weights = skinning_weights(mesh, regions)
     shape_names, shapes = shape_directions(mesh, regions, weights[:, JAW])
-    expression_names, expressions = expression_directions(mesh, regions, weights)
-    return {
+    expression_names, expressions = expression_directions(mesh, regions, weights[:, JAW])
+    arrays = {
         "template": mesh.vertices / 1000,
         "shape_dirs": shapes / 1000,
-        "shape_names": shape_names,
         "expression_dirs": expressions / 1000,
-        "expression_names": expression_names,
         "pose_dirs": pose_correctives(mesh, regions) / 1000,
-        "joint_regressor": joint_regressor(mesh, joints),
+        "joint_regressor": joint_regressor(mesh),
         "skinning": weights,
-        "faces": mesh.faces,
         "uv": uv,
+        "landmark_bary": landmark_bary,
+    }
+    stored: dict[str, Any] = {name: array.astype(np.float32) for name, array in arrays.items()}
+    stored |= {
+        "faces": mesh.faces,
         "uv_faces": uv_faces,
         "landmark_faces": landmark_faces,
-        "landmark_bary": landmark_bary,
-        "contour": contour_candidates(mesh),
-        "regions": regions,
-    }
-
-
-def write_builtin(path: Path) -> None:
-    """Write the head's arrays as the .npz file that `express50.head.load` reads."""
-    arrays = procedural_arrays()
-    contour, regions = arrays.pop("contour"), arrays.pop("regions")
-    stored: dict[str, Any] = {
-        name: np.asarray(value, np.float32) if np.asarray(value).dtype.kind == "f" else value
-        for name, value in arrays.items()
-    }
-    stored |= {
+        "shape_names": shape_names,
+        "expression_names": expression_names,
         "contour": np.concatenate(contour),
-        "contour_counts": np.array([len(line) for line in contour]),
-        "region_names": np.array(list(regions)),
+        "contour_counts": [len(line) for line in contour],
+        "region_names": list(regions),
         "regions": np.stack(list(regions.values())),
     }
     np.savez_compressed(path, **stored)
+
+
+def joint_regressor(mesh: WholeMesh) -> Array:
+    """Return weights (5,V), rows sum to 1: least-norm affine ones over vertices near the joints."""
+    regressor = np.zeros((5, len(mesh.vertices)))
+    skin = np.isin(np.arange(len(mesh.vertices)), mesh.tag("grid"))
+    for j, joint in enumerate(JOINTS):
+        if j >= LEFT_EYE:
+            near = mesh.tag("eyeball", "left" if j == LEFT_EYE else "right")
+        else:
+            distance = np.linalg.norm(mesh.vertices - joint, axis=1) + np.where(skin, 0, 1e6)
+            near = np.argsort(distance, kind="stable")[:160]
+        system = np.concatenate([mesh.vertices[near].T, np.ones((1, len(near)))])
+        regressor[j, near] = np.linalg.lstsq(system, np.append(joint, 1.0), rcond=None)[0]
+    return regressor
+
+
+# Along a lip loop from the middle of the upper lip to that of the lower: corners share evenly.
+_CLOSURE = smoothstep(np.arange(33.0), 7.0, 25.0)
+
+
+def jaw_weight(mesh: WholeMesh) -> Array:
+    """Return share (V,) of the jaw joint: lower lip, chin, jaw line, lower teeth, tongue."""
+    p = mesh.vertices
+    angle = np.degrees(np.arctan2(p[:, 1] + 8, np.maximum(p[:, 2] - 10, 1.0)))
+    around = smoothstep(angle, -18.5, -31.5)
+    around *= smoothstep(p[:, 2], -14.0, 42.0) * smoothstep(p[:, 1], -138.0, -92.0)
+    around[mesh.tag("ear")] = 0.0
+    weight, fixed = around.copy(), np.zeros(len(p), bool)
+    skin = mesh.faces[mesh.face_chart == "skin"]
+    for k, f in enumerate((0.0, 0.1, 0.22, 0.38, 0.58, 0.8)):
+        for which in ("left", "right"):
+            ring = mesh.tag(f"lip{k}", which)
+            weight[ring] = (1 - f) * _CLOSURE + f * around[ring]
+            fixed[ring] = k <= 2
+    for tag in ("ear_foot", "lid5"):
+        weight[mesh.tag(tag)], fixed[mesh.tag(tag)] = 0.0, True
+    for _ in range(10):
+        weight = np.where(fixed, weight, 0.5 * (weight + neighbour_mean(weight, skin)))
+    for k in range(7):
+        deep = smoothstep(np.array(float(k)), 3.0, 8.0)
+        for which in ("left", "right"):
+            weight[mesh.tag(f"cavity{k}", which)] = _CLOSURE * (1 - 0.6 * deep)
+    for tag, value in (("upper_teeth", 0.0), ("upper_gums", 0.0), ("lower_teeth", 1.0),
+                       ("lower_gums", 1.0), ("throat", 0.2)):  # fmt: skip
+        weight[mesh.tag(tag)] = value
+    tongue = mesh.tag("tongue")
+    weight[tongue] = 0.55 + 0.45 * smoothstep(mesh.vertices[tongue, 2], 42.0, 62.0)
+    return weight
+
+
+def skinning_weights(mesh: WholeMesh, regions: dict[str, Array]) -> Array:
+    """Return weights (V,5), rows sum to 1: collar by the root, head by the neck, jaw and eyes."""
+    p = mesh.vertices
+    jaw = jaw_weight(mesh)
+    height = p[:, 1] - 0.35 * (p[:, 2] + 20)  # the neck's own axis leans forward
+    head = np.maximum(smoothstep(height, -150.0, -62.0), jaw)
+    inside = regions["mouth_interior"] | regions["teeth"] | regions["tongue"]
+    head[inside] = 1.0
+    weights = np.zeros((len(p), 5))
+    weights[:, JAW] = jaw
+    weights[:, NECK] = head - jaw
+    weights[:, ROOT] = 1.0 - head
+    for joint, side in ((LEFT_EYE, "left"), (RIGHT_EYE, "right")):
+        ball = regions[f"{side}_eyeball"]
+        weights[ball] = 0.0
+        weights[ball, joint] = 1.0
+    return weights
+
+
+def pose_correctives(mesh: WholeMesh, regions: dict[str, Array]) -> Array:
+    """Return correctives (36,V*3) in mm per unit of R - I, for the jaw's opening alone.
+
+    Opening by a sets R[2,1] of the jaw to sin a. The lips then close in from the corners and the
+    upper lip gives way a little, which skinning cannot do.
+    """
+    hard = regions["teeth"] | regions["gums"] | regions["tongue"]
+    p, sign = mesh.vertices, np.sign(mesh.vertices[:, 0])
+
+    folded = np.stack([np.abs(p[:, 0]), p[:, 1], p[:, 2]], 1)
+    corner, upper, cheek = (
+        np.where(hard, 0.0, window(folded, at, radius))
+        for at, radius in (
+            ((26, -49, 86), (15, 13, 24)),
+            ((0, -42, 101), (22, 12, 20)),
+            ((42, -42, 62), (18, 24, 26)),
+        )
+    )
+    motion = np.zeros_like(p)
+    motion[:, 0] = -sign * (12.0 * corner + 6.0 * cheek)
+    motion[:, 1] = 5.0 * upper * (1 - jaw_weight(mesh))
+    motion[:, 2] = 4.0 * corner
+    result = np.zeros((36, p.size))
+    result[9 * (JAW - 1) + 7] = motion.ravel()
+    return result
 
 
 if __name__ == "__main__":

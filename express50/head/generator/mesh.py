@@ -22,7 +22,7 @@ class HalfMesh:
     tags: dict[str, Array] = field(default_factory=dict)
     faces: dict[str, list[Array]] = field(default_factory=dict)
     uv: dict[str, dict[int, tuple[float, float]]] = field(default_factory=dict)
-    labels: dict[int, tuple[float, float]] = field(default_factory=dict)  # see procedural_rays
+    labels: dict[int, tuple[float, float]] = field(default_factory=dict)  # see `field.rays`
 
     def add(self, points: Array, tag: str = "") -> Array:
         """Add vertices (N,3), return their indices; `tag` names them (appending to the tag)."""
@@ -63,11 +63,7 @@ class HalfMesh:
             quads[:, [[0, 1, 3], [1, 2, 3]]],
         )
         faces = split.reshape(-1, 3)
-        degenerate = (
-            (faces[:, 0] == faces[:, 1])
-            | (faces[:, 1] == faces[:, 2])
-            | (faces[:, 0] == faces[:, 2])
-        )
+        degenerate = (faces == faces[:, [1, 2, 0]]).any(1)
         self.add_faces(chart, faces[~degenerate])
 
     def fan(self, chart: str, center: int, ring: Array, closed: bool) -> None:
@@ -164,3 +160,15 @@ def pack_uv(mesh: WholeMesh) -> tuple[Array, Array]:
     key = (mesh.faces * len(RECTANGLES) + chart_id[:, None]) * 2 + side
     _, first, inverse = np.unique(key, return_index=True, return_inverse=True)
     return corner_uv.reshape(-1, 2)[first], inverse.reshape(-1, 3).astype(np.int64)
+
+
+def neighbour_mean(values: Array, faces: Array) -> Array:
+    """Return means of the neighbours' values (V,...) over the edges of faces (F,3)."""
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    edges = np.unique(np.sort(edges, 1), axis=0)
+    total = np.zeros_like(values)
+    np.add.at(total, edges[:, 0], values[edges[:, 1]])
+    np.add.at(total, edges[:, 1], values[edges[:, 0]])
+    degree = np.bincount(edges.ravel(), minlength=len(values))
+    degree = degree.reshape((-1,) + (1,) * (values.ndim - 1))
+    return np.where(degree > 0, total / degree.clip(1), values)

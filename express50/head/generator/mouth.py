@@ -128,13 +128,8 @@ def _arch(upper: bool) -> tuple[Array, Array, Array]:
     z = front - 31.0 * (x / reach) ** 2.3
     length = np.concatenate([[0], np.cumsum(np.hypot(np.diff(x), np.diff(z)))])
     xs, zs = np.interp(along, length, x), np.interp(along, length, z)
-    tangent = np.stack(
-        [
-            np.interp(np.array(along) + 1, length, x) - xs,
-            np.interp(np.array(along) + 1, length, z) - zs,
-        ],
-        1,
-    )
+    ahead = np.array(along) + 1
+    tangent = np.stack([np.interp(ahead, length, x) - xs, np.interp(ahead, length, z) - zs], 1)
     tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
     normal = np.stack([-tangent[:, 1], tangent[:, 0]], 1)
     normal[0] = (0.0, 1.0)

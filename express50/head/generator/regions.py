@@ -96,14 +96,9 @@ def embed_landmarks(mesh: WholeMesh) -> tuple[Array, Array]:
         row = mesh.vertices[mesh.tag(tag, "left")]
         sign = np.where(np.array(loop) < 0, -1.0, 1.0)[:, None]
         points[first : first + len(loop)] = row[np.abs(loop)] * np.where([1, 0, 0], sign, 1.0)
-    return _embed(mesh, points)
-
-
-def _embed(mesh: WholeMesh, points: Array) -> tuple[Array, Array]:
-    """Find the nearest point of the skin's faces: face index and barycentric weights."""
     skin = np.flatnonzero(mesh.face_chart == "skin")
     corners = mesh.vertices[mesh.faces[skin]]
-    faces, bary = np.zeros(len(points), np.int64), np.zeros((len(points), 3))
+    faces, bary = np.zeros(68, np.int64), np.zeros((68, 3))
     for k, point in enumerate(points):
         weights, distance = _closest(corners, point)
         best = int(np.argmin(distance))

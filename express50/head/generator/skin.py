@@ -1,4 +1,4 @@
-"""The skin: feature loops placed on the field, the rest filled by graded points and triangulated.
+"""The skin: loops of features, nostrils and ears, the rest filled by graded points, triangulated.
 
 The half head is triangulated as a convex hull of its label directions on a sphere (a spherical
 Delaunay triangulation); the closing cap on the mid plane and the holes inside loops are dropped.
@@ -7,10 +7,11 @@ Delaunay triangulation); the closing cap on the mid plane and the holes inside l
 from __future__ import annotations
 
 import numpy as np
+from scipy.interpolate import CubicSpline
 from scipy.ndimage import map_coordinates
 from scipy.spatial import ConvexHull, cKDTree
+from skimage.measure import points_in_poly
 
-from express50.head.generator.ears import add_ear
 from express50.head.generator.eyes import add_eye_rings
 from express50.head.generator.field import (
     BOTTOM_LATITUDE,
@@ -20,20 +21,17 @@ from express50.head.generator.field import (
     project,
     rays,
     sphere,
+    window,
 )
-from express50.head.generator.mesh import HalfMesh
+from express50.head.generator.mesh import HalfMesh, neighbour_mean
 from express50.head.generator.mouth import add_lip_rings
 
 Array = np.ndarray
 
 #          x, y, z, radius of the dense core, spacing there, growth per mm beyond (all mm)
 _DENSITY = np.array([
-    (6, -15, 104, 14, 2.6, 0.12),
-    (32, 20, 75, 22, 3.6, 0.10),
-    (10, -48, 98, 30, 3.8, 0.10),
-    (15, 40, 88, 22, 4.2, 0.10),
-    (0, -85, 85, 20, 4.6, 0.10),
-    (45, -62, 20, 20, 5.5, 0.10),
+    (6, -15, 104, 14, 2.6, 0.12), (32, 20, 75, 22, 3.6, 0.10), (10, -48, 98, 30, 3.8, 0.10),
+    (15, 40, 88, 22, 4.2, 0.10), (0, -85, 85, 20, 4.6, 0.10), (45, -62, 20, 20, 5.5, 0.10),
     (70, 5, -15, 30, 5.0, 0.12),
 ])  # fmt: skip
 _COARSEST = 11.0
@@ -60,9 +58,22 @@ def add_skin(half: HalfMesh) -> None:
     index = np.concatenate([fixed_index, filled])
     label = np.concatenate([fixed_label, [half.labels[int(i)] for i in filled]])
     faces = _triangulate(label, len(fixed), [len(r) for r in rim])
-    half.add_faces("skin", index[faces])
+    faces = index[faces]
+    half.add_faces("skin", faces)
     half.tags["filled"], half.tags["grid"] = filled, index
-    _relax(half, index[faces], filled, fixed)
+    # The filled vertices are evened out: average of neighbours, put back on the skin; labels too.
+    points = half.array()
+    label = np.array([half.labels.get(i, (0.0, 0.0)) for i in range(half.count)])
+    direction = sphere(*label.T)
+    for _ in range(6):
+        points[filled] += 0.6 * (neighbour_mean(points, faces) - points)[filled]
+        points[filled] = project(points[filled], 1)
+        direction[filled] += 0.6 * (neighbour_mean(direction, faces) - direction)[filled]
+    points[filled] = project(points[filled], 3)
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    half.points = [points]
+    x, y, z = direction[filled].T
+    half.label(filled, np.stack([np.arctan2(x, z), np.degrees(np.arcsin(y))], 1))
 
 
 def _add_midline(half: HalfMesh, lip_top: float, lip_bottom: float) -> Array:
@@ -114,34 +125,18 @@ def _add_fill(half: HalfMesh, fixed: Array, holes: list[Array]) -> Array:
     h = spacing(points)
     keep = points[:, 0] > 0.6 * h
     for hole in holes:
-        keep &= ~inside(label, hole)
+        keep &= ~points_in_poly(label, hole)
     keep[keep] = cKDTree(fixed).query(points[keep])[0] > 0.72 * h[keep]
     points, label, h = points[keep], label[keep], h[keep]
-    chosen = _darts(points, h)
-    placed = cast(*rays(*label[chosen].T))
-    index = half.add(placed, "fill")
-    half.label(index, label[chosen])
-    return index
-
-
-def _darts(points: Array, h: Array) -> Array:
-    tree = cKDTree(points)
-    alive = np.ones(len(points), bool)
-    chosen = []
+    tree, alive, chosen = cKDTree(points), np.ones(len(points), bool), []
     for i in range(len(points)):
         if alive[i]:
             chosen.append(i)
             alive[tree.query_ball_point(points[i], 0.86 * h[i])] = False
-    return np.array(chosen)
-
-
-def inside(points: Array, polygon: Array) -> Array:
-    """Return True for points (N,2) inside a closed polygon (M,2), by the even-odd rule."""
-    a, b = polygon, np.roll(polygon, -1, axis=0)
-    x, y = points[:, :1], points[:, 1:]
-    crosses = (a[:, 1] > y) != (b[:, 1] > y)
-    slope = (b[:, 0] - a[:, 0]) / np.where(b[:, 1] == a[:, 1], 1e-12, b[:, 1] - a[:, 1])
-    return (crosses & (x < a[:, 0] + (y - a[:, 1]) * slope)).sum(1) % 2 == 1
+    placed = cast(*rays(*label[chosen].T))
+    index = half.add(placed, "fill")
+    half.label(index, label[chosen])
+    return index
 
 
 def _triangulate(label: Array, midline: int, rims: list[int]) -> Array:
@@ -158,40 +153,6 @@ def _triangulate(label: Array, midline: int, rims: list[int]) -> Array:
         drop |= member[faces].all(1)
         start += count
     return faces[~drop]
-
-
-def _relax(half: HalfMesh, faces: Array, free: Array, fixed: Array) -> None:
-    """Even out the filled vertices: average of neighbours, put back on the skin; labels too."""
-    points = half.array()
-    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    edges = np.unique(np.sort(edges, 1), axis=0)
-    label = np.array([half.labels.get(i, (0.0, 0.0)) for i in range(half.count)])
-    direction = sphere(*label.T)
-    degree = np.bincount(edges.ravel(), minlength=half.count)[:, None].clip(1)
-
-    def average(x: Array) -> Array:
-        total = np.zeros_like(x)
-        np.add.at(total, edges[:, 0], x[edges[:, 1]])
-        np.add.at(total, edges[:, 1], x[edges[:, 0]])
-        return total / degree
-
-    for _ in range(6):
-        points[free] += 0.6 * (average(points) - points)[free]
-        points[free] = project(points[free], 1)
-        direction[free] += 0.6 * (average(direction) - direction)[free]
-    points[free] = project(points[free], 3)
-    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-    half.points = [points]
-    half.label(
-        free,
-        np.stack(
-            [
-                np.arctan2(direction[free, 0], direction[free, 2]),
-                np.degrees(np.arcsin(direction[free, 1])),
-            ],
-            1,
-        ),
-    )
 
 
 def set_skin_uv(half: HalfMesh) -> None:
@@ -211,7 +172,7 @@ def set_skin_uv(half: HalfMesh) -> None:
 _INSIDE = np.array([7.0, -16.0, 105.0])  # a point above the nostril from which loops are cast
 _DOWN = np.array([0.05, -0.97, 0.2])
 _LONG = np.array([-0.24, 0.2, 0.95])  # from the ala's base towards the tip
-_POINTS = 14
+_NOSTRIL_POINTS = 14
 
 
 def add_nostril(half: HalfMesh) -> tuple[Array, Array]:
@@ -220,11 +181,11 @@ def add_nostril(half: HalfMesh) -> tuple[Array, Array]:
     side = np.cross(_LONG, down)
     side /= np.linalg.norm(side)
     long = np.cross(down, side)
-    turn = 2 * np.pi * np.arange(_POINTS) / _POINTS
+    turn = 2 * np.pi * np.arange(_NOSTRIL_POINTS) / _NOSTRIL_POINTS
     rings = []
     for a, b in ((0.66, 0.5), (0.52, 0.36), (0.42, 0.27)):  # half widths per mm of distance
         d = down + np.outer(np.cos(turn) * a, long) + np.outer(np.sin(turn) * b, side)
-        rings.append(cast_out(np.tile(_INSIDE, (_POINTS, 1)), d))
+        rings.append(cast_out(np.tile(_INSIDE, (_NOSTRIL_POINTS, 1)), d))
     middle = rings[-1].mean(0)
     for shrink, lift in ((0.88, 1.6), (0.7, 4.5), (0.45, 7.5)):
         rings.append(middle + shrink * (rings[2] - middle) - lift * down)
@@ -239,4 +200,91 @@ def add_nostril(half: HalfMesh) -> tuple[Array, Array]:
     top = half.add((middle - 9.0 * down)[None], "nostril_top")
     half.label(top, center[None])
     half.fan("skin", int(top[0]), rows[-1], closed=True)
+    return rows[0], label
+
+
+EAR_CENTER = np.array([7.0, -15.0])  # (y, z) of the ear's own origin, mm
+EAR_TILT = np.radians(12.0)  # the ear's long axis leans back
+_EAR_POINTS = 40
+# Outline (backwards, up) in mm from the helix's root over the top to lobe and tragus.
+_OUTLINE = np.array([
+    (-7.5, 8), (-6.5, 20), (0, 29), (9, 32), (18, 28.5), (23.5, 18), (23, 5), (18, -8),
+    (11.5, -18), (5.5, -26.5), (-1, -30.5), (-6.5, -27), (-8.5, -18), (-9.5, -9), (-9.5, 0),
+])  # fmt: skip
+_CONCHA = np.array([-1.5, -4.0])
+
+
+def _place(pq: Array, x: Array) -> Array:
+    """Return ear-plane coordinates (backwards, up) to head space (N,3)."""
+    c, s = np.cos(EAR_TILT), np.sin(EAR_TILT)
+    back = c * pq[:, 0] + s * pq[:, 1]
+    up = -s * pq[:, 0] + c * pq[:, 1]
+    return np.stack([x, EAR_CENTER[0] + up, EAR_CENTER[1] - back], 1)
+
+
+def _flare(pq: Array) -> Array:
+    """Return the distance (mm) of the ear's plane from the head's side."""
+    back = np.logaddexp(0.0, 0.35 * (pq[:, 0] + 5.0)) / 0.35  # a smooth max(0, p + 5)
+    return 0.5 + 0.5 * back - 0.0016 * pq[:, 1] ** 2
+
+
+def _relief(pq: Array, inset: Array, rim: Array) -> Array:
+    """Height (mm) of the front sheet: helix fold, scapha, antihelix, concha, tragus, lobe."""
+    back_top = 1 / (1 + np.exp(-(rim[:, 0] * 0.35 + rim[:, 1] * 0.12 - 0.2)))
+    inset = inset[:, None]
+    helix = back_top * (2.6 * window(inset, 0.06, 0.07) - 2.0 * window(inset, 0.24, 0.09))
+    ridge = 2.6 * back_top * window(inset, 0.44, 0.1)
+    bowl = np.exp(-((((pq[:, 0] + 1.0) / 8.5) ** 2 + ((pq[:, 1] + 3.0) / 10.5) ** 2) ** 1.5))
+    fossa, tragus = window(pq, (4, 17), (6, 5)), window(pq, (-7, -4), (3.2, 5.5))
+    anti, crus = window(pq, (2, -15), (5, 3)), window(pq, (-3, 4), (5, 2.2))
+    return helix + ridge - 7.0 * bowl - 1.6 * fossa + 3.0 * tragus + 2.0 * anti + 1.2 * crus
+
+
+def add_ear(half: HalfMesh) -> tuple[Array, Array]:
+    """Add the left ear. Returns (attachment loop indices, their labels (N,2))."""
+    closed = np.concatenate([_OUTLINE, _OUTLINE[:1]])
+    length = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(closed, axis=0), axis=1))])
+    curve = CubicSpline(length, closed, bc_type="periodic")
+    rim = curve(np.linspace(0, length[-1], _EAR_POINTS, endpoint=False))
+    foot = np.stack(
+        [np.where(rim[:, 0] > -2, -2 + 0.32 * (rim[:, 0] + 2), rim[:, 0]), rim[:, 1] * 0.8 - 0.5], 1
+    )
+    on_skin = _place(foot, np.zeros(_EAR_POINTS))
+    attach = cast(on_skin, np.tile([1.0, 0.0, 0.0], (_EAR_POINTS, 1)))
+    base = attach[:, 0]
+    plane = np.linalg.lstsq(np.pad(foot, ((0, 0), (0, 1)), constant_values=1), base, rcond=None)[0]
+
+    def side(pq: Array) -> Array:
+        return pq @ plane[:2] + plane[2] + 0.6
+
+    rim_x = side(rim) + _flare(rim)
+    rows = [half.add(attach, "ear_foot")]
+    label = np.stack(labels(attach), 1)
+    half.label(rows[0], label)
+    steps = []
+    for f in (0.3, 0.62, 0.9):
+        pq = foot + (f**1.35) * (rim - foot)
+        steps.append(_place(pq, base + np.maximum(rim_x - 2.6 - base, 0.3) * f))
+    for inset in (0.0, 0.06, 0.14, 0.22, 0.31, 0.42, 0.53, 0.65, 0.8, 0.92):
+        pq = rim + inset * (_CONCHA - rim)
+        level = np.full(_EAR_POINTS, inset)
+        edge = 0.8 if inset == 0.0 else 0.0
+        points = _place(pq, side(pq) + _flare(pq) + _relief(pq, level, rim) - edge)
+        if inset < 0.3:  # outside the foot the ear must stay over the skin
+            under = cast(points * [0, 1, 1], np.tile([1.0, 0.0, 0.0], (_EAR_POINTS, 1)))
+            points[:, 0] = np.maximum(points[:, 0], under[:, 0] + 0.5 + 3 * inset)
+        steps.append(points)
+    for points in steps:
+        rows.append(half.add(points, "ear"))
+        half.strip("ear", rows[-2], rows[-1], closed=True)
+    canal = _CONCHA[None]
+    x = side(canal) + _flare(canal) + _relief(canal, np.ones(1), rim[:1]) - 1.0
+    center = half.add(_place(canal, x), "ear")
+    half.fan("ear", int(center[0]), rows[-1], closed=True)
+    turn = rim - _CONCHA
+    turn /= np.linalg.norm(turn, axis=1, keepdims=True)
+    for k, row in enumerate(rows):
+        half.set_uv("ear", row, turn * (1 - k / len(rows)))
+    half.set_uv("ear", center, np.zeros((1, 2)))
+    half.tags["ear_rim"] = rows[4]
     return rows[0], label

@@ -33,17 +33,11 @@ class RandomHead:
 
 @dataclass(frozen=True)
 class Canvas:
-    """Places to paint.
+    """Places to paint."""
 
-    Attributes:
-        rest: (N, 3) metres, on the head at rest.
-        region: names and which of the places are in it, (N,) bool.
-        marks: (68, 3) landmarks of the head at rest.
-    """
-
-    rest: np.ndarray
-    region: dict[str, np.ndarray]
-    marks: np.ndarray
+    rest: np.ndarray  # (N, 3) metres, on the head at rest
+    region: dict[str, np.ndarray]  # names and which of the places are in it, (N,) bool
+    marks: np.ndarray  # (68, 3) landmarks of the head at rest
 
     @classmethod
     def of(cls, model: HeadModel) -> Canvas:
@@ -91,7 +85,13 @@ def deform(vertices: np.ndarray, rng: Rng) -> np.ndarray:
 def paint(canvas: Canvas, rng: Rng) -> tuple[np.ndarray, np.ndarray | None]:
     """Return colours (N, 3) in [0, 1] and hair thickness (N,) metres or None."""
     rest, region, marks = canvas.rest, canvas.region, canvas.marks
-    colors = np.tile(_skin_color(rng), (len(rest), 1))
+    if rng.random() < 0.15:
+        skin = rng.uniform(0.15, 0.95, 3)
+    else:
+        light = rng.uniform(0.0, 1.0)
+        skin = (1 - light) * np.array([0.25, 0.15, 0.10]) + light * np.array([0.95, 0.78, 0.68])
+        skin = np.clip(skin * rng.uniform(0.85, 1.15, 3), 0.05, 1.0)
+    colors = np.tile(skin, (len(rest), 1))
     # Anything in no region is a small part such as lashes: dark.
     nothing = ~np.any(list(region.values()), axis=0)
     colors *= 1 + rng.uniform(0, 0.15) * waves(rest, rng, 12, 20.0, 150.0)[:, None]
@@ -107,24 +107,8 @@ def paint(canvas: Canvas, rng: Rng) -> tuple[np.ndarray, np.ndarray | None]:
     return np.clip(colors, 0.0, 1.0).astype(np.float32), hair
 
 
-def _skin_color(rng: Rng) -> np.ndarray:
-    if rng.random() < 0.15:
-        return rng.uniform(0.15, 0.95, 3)
-    light = rng.uniform(0.0, 1.0)
-    skin = (1 - light) * np.array([0.25, 0.15, 0.10]) + light * np.array([0.95, 0.78, 0.68])
-    return np.clip(skin * rng.uniform(0.85, 1.15, 3), 0.05, 1.0)
-
-
 def _mix(colors: np.ndarray, color: np.ndarray, amount: np.ndarray) -> np.ndarray:
     return colors + (color - colors) * amount[:, None]
-
-
-def _line_distance(points: np.ndarray, line: np.ndarray) -> np.ndarray:
-    """Return distance (N,) of points (N, 3) to a polyline (L, 3)."""
-    start, along = line[:-1], np.diff(line, axis=0)
-    relative = points[:, None] - start[None]
-    share = (relative * along).sum(2) / np.maximum((along**2).sum(1), 1e-12)
-    return np.linalg.norm(relative - np.clip(share, 0, 1)[..., None] * along, axis=2).min(1)
 
 
 def _tint_features(
@@ -135,12 +119,15 @@ def _tint_features(
     colors[:] = _mix(colors, colors * rng.uniform([0.7, 0.3, 0.3], [1.2, 0.9, 0.9]), lips)
     brow_color = rng.uniform(0.0, 0.5) * np.array([1.0, rng.uniform(0.5, 1), rng.uniform(0.3, 1)])
     skin = np.flatnonzero(region["face"])
-    width, strength = (
-        rng.uniform(0.002, 0.006),
-        rng.choice([0.0, rng.uniform(0.2, 1.0)], p=[0.2, 0.8]),
-    )
+    width = rng.uniform(0.002, 0.006)
+    strength = rng.choice([0.0, rng.uniform(0.2, 1.0)], p=[0.2, 0.8])
     for line in (marks[17:22], marks[22:27]):
-        near = _line_distance(rest[skin], line)
+        # Distance of each place to the polyline.
+        start, along = line[:-1], np.diff(line, axis=0)
+        relative = rest[skin][:, None] - start[None]
+        share = (relative * along).sum(2) / np.maximum((along**2).sum(1), 1e-12)
+        off = relative - np.clip(share, 0, 1)[..., None] * along
+        near = np.linalg.norm(off, axis=2).min(1)
         ragged = 1 + 0.4 * waves(rest[skin], rng, 8, 300.0, 1500.0)
         amount = strength / (1 + np.exp((near - width * ragged) / 0.001))
         colors[skin] = _mix(colors[skin], brow_color, amount)
@@ -188,9 +175,7 @@ def _color_eyes_and_mouth(
     colors: np.ndarray, region: dict[str, np.ndarray], rest: np.ndarray, rng: Rng
 ) -> None:
     """Paint sclera, iris, pupil, teeth and mouth cavity, in place."""
-    iris = rng.uniform(0.05, 0.7) * np.array(
-        [rng.uniform(0.4, 1), rng.uniform(0.5, 1), rng.uniform(0.3, 1)]
-    )
+    iris = rng.uniform(0.05, 0.7) * rng.uniform([0.4, 0.5, 0.3], 1)
     sclera = rng.uniform(0.6, 1.0) * np.array([1.0, rng.uniform(0.9, 1), rng.uniform(0.85, 1)])
     for side in ("left", "right"):
         ball = region[f"{side}_eyeball"]
@@ -201,9 +186,7 @@ def _color_eyes_and_mouth(
         colors[np.flatnonzero(ball)[angle < rng.uniform(0.42, 0.55)]] = iris
         colors[np.flatnonzero(ball)[angle < rng.uniform(0.15, 0.28)]] = 0.02
     inside = region["mouth_interior"] | region["tongue"]
-    colors[inside] = rng.uniform(0.05, 0.6) * np.array(
-        [1.0, rng.uniform(0.3, 0.8), rng.uniform(0.3, 0.8)]
-    )
+    colors[inside] = rng.uniform(0.05, 0.6) * np.array([1.0, *rng.uniform(0.3, 0.8, 2)])
     colors[region["teeth"]] = rng.uniform(0.5, 1.0) * np.array([1.0, 0.97, rng.uniform(0.8, 1.0)])
 
 
@@ -234,16 +217,9 @@ def random_parameters(model: HeadModel, rng: Rng) -> dict[str, torch.Tensor]:
         expression = np.clip(expression, -1.0, 1.2)
     if rng.random() < 0.25:
         jaw[0] = rng.uniform(0.0, 0.5)
-    arguments = {
-        "shape": shape,
-        "expression": expression,
-        "neck": neck,
-        "jaw": jaw,
-        "eyes": np.array([*gaze, 0.0, *gaze, 0.0]),
-    }
-    return {
-        name: torch.from_numpy(value.astype(np.float32))[None] for name, value in arguments.items()
-    }
+    eyes = np.array([*gaze, 0.0, *gaze, 0.0])
+    drawn = {"shape": shape, "expression": expression, "neck": neck, "jaw": jaw, "eyes": eyes}
+    return {name: torch.from_numpy(v.astype(np.float32))[None] for name, v in drawn.items()}
 
 
 def _lopsided(entry: Expression, model: HeadModel, rng: Rng) -> np.ndarray:

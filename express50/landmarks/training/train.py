@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import time
+from collections.abc import Callable
 from dataclasses import astuple, dataclass
 from pathlib import Path
 
@@ -19,8 +20,9 @@ import numpy as np
 import torch
 from torch.nn import functional
 
+from express50.contract.config import field_documents
 from express50.errors import TrainError
-from express50.files.pickles import read_weights
+from express50.files.arrays import read_weights
 from express50.head.load import load_head
 from express50.head.model import HeadModel
 from express50.landmarks.network import (
@@ -31,8 +33,14 @@ from express50.landmarks.network import (
     load_network,
     save_network,
 )
-from express50.landmarks.training.augment import TrainingCrop, make_backgrounds, random_crop
-from express50.landmarks.training.views import FILE_VIEWS, ViewSet, make_views, read_views
+from express50.landmarks.training.views import (
+    FILE_VIEWS,
+    TrainingCrop,
+    ViewSet,
+    make_backgrounds,
+    open_views,
+    random_crop,
+)
 
 BATCH = 32
 RATE = 2e-3
@@ -47,19 +55,16 @@ HELD_OUT = 0
 
 @dataclass(frozen=True, kw_only=True)
 class TrainingPlan:
-    """Settings of a training run.
-
-    Attributes:
-        steps: batches of crops in all.
-        small_steps: of these, the first that are at half resolution.
-        files: files of views per head model.
-        seed: of everything random.
-    """
+    """Settings of a training run."""
 
     steps: int = 6000
+    "Batches of 32 crops in all."
     small_steps: int = 3000
+    "Of these, the first that are at half resolution."
     files: int = 30
+    "Files of views per head model."
     seed: int = 0
+    "Of everything random."
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -69,31 +74,19 @@ def main(arguments: list[str] | None = None) -> int:
     )
     parser.add_argument("--views", type=Path, required=True, help="folder for rendered views")
     parser.add_argument("--ict", help="ICT-FaceKit checkout or .npz to train on as well")
-    parser.add_argument(
-        "--files", type=int, default=TrainingPlan.files, help="files of views per head"
-    )
-    parser.add_argument("--steps", type=int, default=TrainingPlan.steps, help="batches of 32 crops")
-    parser.add_argument(
-        "--small-steps",
-        type=int,
-        default=TrainingPlan.small_steps,
-        help="of these, at half resolution",
-    )
-    parser.add_argument("--seed", type=int, default=TrainingPlan.seed)
+    words = field_documents(TrainingPlan)
+    for name, value in vars(TrainingPlan()).items():
+        flag = f"--{name.replace('_', '-')}"
+        parser.add_argument(flag, type=int, default=value, help=words[name])
     parser.add_argument("--out", type=Path, default=WEIGHTS)
     options = parser.parse_args(arguments)
     torch.set_num_threads(1)
     models = [load_head(spec) for spec in ("procedural", options.ict) if spec]
-    plan = TrainingPlan(
-        steps=options.steps,
-        small_steps=options.small_steps,
-        files=options.files,
-        seed=options.seed,
-    )
+    plan = TrainingPlan(**{name: getattr(options, name) for name in words})
     save_network(train(models, plan, options.views), options.out)
     net = load_network(options.out)
     for model in models:
-        views = read_views(make_views(options.views, model, HELD_OUT, plan.seed))
+        views = open_views(options.views, model, HELD_OUT, plan.seed)
         print(f"{model.name}: held-out heads {validate(net, views, plan.seed)}")
     return 0
 
@@ -103,18 +96,14 @@ def train(models: list[HeadModel], plan: TrainingPlan, folder: Path) -> Landmark
     torch.manual_seed(plan.seed)
     backgrounds = make_backgrounds(400, np.random.default_rng([plan.seed, 1]))
     net = LandmarkNet().train().to(memory_format=torch.channels_last)
-    optimiser = torch.optim.AdamW(net.parameters(), lr=RATE, weight_decay=1e-3)
     name = "-".join([*(m.name for m in models), *(str(value) for value in astuple(plan))])
-    state = folder / f"training-{name}.pt"
-    first = take_up(state, net, optimiser)
-    began, losses = time.monotonic(), []
     sets: list[ViewSet] = []
-    for step in range(first, plan.steps):
+
+    def loss_at(step: int) -> torch.Tensor:
         while len(sets) < len(models) * files_in_use(step, plan.files):
             number = HELD_OUT + 1 + len(sets) // len(models)
             model = models[len(sets) % len(models)]
-            sets.append(read_views(make_views(folder, model, number, plan.seed)))
-        optimiser.param_groups[0]["lr"] = RATE * rate_share(step, plan.steps)
+            sets.append(open_views(folder, model, number, plan.seed))
         # Seeded by the step, so that a run taken up again draws what it would have drawn.
         rng = np.random.default_rng([plan.seed, 2, step])
         size = CROP // 2 if step < plan.small_steps else CROP
@@ -123,7 +112,21 @@ def train(models: list[HeadModel], plan: TrainingPlan, folder: Path) -> Landmark
             random_crop(sets[file], view, backgrounds, rng, size)
             for file, view in zip(*picks, strict=True)
         ]
-        loss = crop_loss(net, crops)
+        return crop_loss(net, crops)
+
+    return descend(net, plan.steps, RATE, folder / f"training-{name}.pt", loss_at)
+
+
+def descend(
+    net: LandmarkNet, steps: int, rate: float, state: Path, loss_at: Callable[[int], torch.Tensor]
+) -> LandmarkNet:
+    """Minimise the loss of every step; an interrupted run goes on from its `state`, a file."""
+    optimiser = torch.optim.AdamW(net.parameters(), lr=rate, weight_decay=1e-3)
+    first = take_up(state, net, optimiser)
+    began, losses = time.monotonic(), []
+    for step in range(first, steps):
+        optimiser.param_groups[0]["lr"] = rate * rate_share(step, steps)
+        loss = loss_at(step)
         optimiser.zero_grad(set_to_none=True)
         loss.backward()
         torch.nn.utils.clip_grad_norm_(net.parameters(), 5.0)

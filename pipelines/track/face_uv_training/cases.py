@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 import open3d as o3d
 import torch
@@ -26,8 +27,7 @@ from express50.landmarks.training.random_heads import (
     random_parameters,
     waves,
 )
-from pipelines.track.face_uv_map import FaceUvMap
-from pipelines.track.face_uv_training.disturb import Case, covered, photographed
+from pipelines.track.face_uv import HEIGHT, WIDTH, FaceUvMap
 from pipelines.track.surface import Visibility, sample_normals
 
 Rng = np.random.Generator
@@ -50,14 +50,26 @@ FAR_TEXELS = 12.0
 
 
 @dataclass(frozen=True)
+class Case:
+    """One reading of a map: `colors` (HEIGHT, WIDTH, 3) uint8, root of light.
+
+    A texel shows what belongs `flow` (HEIGHT, WIDTH, 2) float16 texels to its right and below it,
+    where `valid` (HEIGHT, WIDTH) says that this is known.
+    """
+
+    colors: np.ndarray
+    flow: np.ndarray
+    valid: np.ndarray
+
+
+@dataclass(frozen=True)
 class Lamps:
     """Light of a room.
 
     Attributes:
         even: (3,) from everywhere.
         sky: (3,) unit, where the even light is brightest.
-        directions: (L, 3) unit, to the lamps.
-        colors: (L, 3) of the lamps.
+        directions, colors: (L, 3) unit, to the lamps, and their light.
         sizes: (L,) radians, how far from the directions their light still comes.
         shine: exponent of highlights.
     """
@@ -77,7 +89,7 @@ class Lamps:
         towards: np.ndarray,
         gloss: float,
     ) -> np.ndarray:
-        """Light (N, 3) that skin of a colour (N, 3) sends towards the camera.
+        """Return the light (N, 3) that skin of a colour (N, 3) sends towards the camera.
 
         `reach` (N, 1 + L) are the shares of the even light and of the lamps' that get there.
         """
@@ -100,7 +112,7 @@ class Lamps:
         normals: np.ndarray,
         rng: Rng,
     ) -> np.ndarray:
-        """Shares (N, 1 + L) of the even light and of the lamps' that get to places (N, 3)."""
+        """Return the shares (N, 1 + L) of even light and lamps' light that get to places (N, 3)."""
         starts = places + OFF_SKIN_M * normals
         even = np.zeros(len(places))
         for ray in _unit(rng.normal(size=(EVEN_RAYS, 3))):
@@ -116,7 +128,7 @@ class Lamps:
 
 
 def draw_lamps(rng: Rng) -> Lamps:
-    """A room with one to four lamps."""
+    """Draw a room with one to four lamps."""
     count = rng.integers(1, 5)
     directions = rng.normal(size=(count, 3)) + [0.0, 0.3, 0.8]
     sky = rng.normal(size=3)
@@ -131,7 +143,7 @@ def draw_lamps(rng: Rng) -> Lamps:
 
 
 def draw_cameras(places: np.ndarray, rng: Rng) -> list[Camera]:
-    """Cameras about the face; only where they are counts."""
+    """Draw cameras about the face; only where they are counts."""
     cameras = []
     for index in range(int(rng.integers(*CAMERAS))):
         yaw, pitch = rng.uniform(-1.7, 1.7), rng.normal() * 0.3
@@ -157,10 +169,7 @@ def _unit(vectors: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class PaintedHead:
-    """Colours of a head: (HEIGHT, WIDTH, 3) of its uv_map, (V, 3) of what the uv_map does not show.
-
-    The background's colour (3,) and the skin's gloss come with them.
-    """
+    """Colours of a head: (HEIGHT, WIDTH, 3) of its map, (V, 3) elsewhere, (3,) behind it; gloss."""
 
     map: np.ndarray
     vertices: np.ndarray
@@ -171,7 +180,7 @@ class PaintedHead:
 def draw_person(model: HeadModel, uv_map: FaceUvMap, rng: Rng) -> PaintedHead:
     """Paint a head."""
     whole = Canvas.of(model)
-    corners, bary = uv_map.samples.corners, uv_map.samples.bary
+    corners, bary = uv_map.samples.vertices, uv_map.samples.weights
     region = {name: (mask[corners] * bary).sum(1) for name, mask in whole.region.items()}
     rest = (whole.rest[corners] * bary[..., None]).sum(1)
     # Lips end where they end, not where a mesh's edges happen to run.
@@ -213,8 +222,31 @@ def draw_case(model: HeadModel, uv_map: FaceUvMap, person: PaintedHead, rng: Rng
     )
 
 
+def covered(colors: np.ndarray, rng: Rng) -> np.ndarray:
+    """Draw strands of hair and other things before the face, in some of the maps."""
+    if rng.random() < 0.5:
+        return colors
+    out = np.ascontiguousarray(colors, dtype=np.float32)
+    for _ in range(rng.integers(1, 5)):
+        layer = out.copy()
+        start = rng.uniform([0.0, -10.0], [WIDTH, 0.6 * HEIGHT])
+        end = start + rng.normal(size=2) * [25.0, 40.0]
+        ink = tuple(float(v) for v in rng.uniform(0.0, 0.8) * rng.uniform(0.6, 1.0, 3))
+        points = np.rint([start, (start + end) / 2 + rng.normal(size=2) * 8, end]).astype(np.int32)
+        cv2.polylines(layer, [points], False, ink, int(rng.integers(1, 9)))
+        out += rng.uniform(0.3, 1.0) * (layer - out)
+    return out
+
+
+def photographed(colors: np.ndarray, rng: Rng) -> np.ndarray:
+    """Add blur and noise of cameras, exposure and contrast of a room."""
+    colors = cv2.GaussianBlur(np.float32(colors), (0, 0), rng.uniform(0.25, 1.4))
+    colors = colors * rng.uniform(0.6, 1.3) + rng.normal(size=3) * 0.02
+    return colors + rng.normal(size=colors.shape) * rng.uniform(0.0, 0.02)
+
+
 def draw_meshes(model: HeadModel, uv_map: FaceUvMap, rng: Rng) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (V, 3), (V, 3) of an acting head and of a tracker's idea of it, float64."""
+    """Draw vertices (V, 3), (V, 3) of an acting head and of a tracker's idea of it, float64."""
     draw = random_parameters(model, rng)
     other = {name: value.clone() for name, value in draw.items()}
     # A tracker soon has the face (0.1 of what it is off by is left then); what it misses longest
@@ -223,7 +255,13 @@ def draw_meshes(model: HeadModel, uv_map: FaceUvMap, rng: Rng) -> tuple[np.ndarr
     other["shape"] += torch.from_numpy(
         early * rng.uniform(0.0, 0.6) * rng.normal(size=other["shape"].shape)
     ).float()
-    other["expression"] += torch.from_numpy(_slips(draw["expression"].numpy(), early, rng)).float()
+    # Any muscle slips early, active ones later.
+    expression = draw["expression"].numpy()
+    muscles = rng.random(expression.shape) < early * rng.uniform(0.0, 0.4)
+    slips = rng.uniform(0.0, 0.5) * rng.normal(size=muscles.shape) * muscles
+    missed = rng.random(expression.shape) < (1.0 - early) * rng.uniform(0.0, 0.8)
+    slips -= missed * rng.uniform(-0.2, 1.0, expression.shape) * expression
+    other["expression"] += torch.from_numpy(slips).float()
     other["jaw"] += torch.from_numpy(rng.uniform(0.0, 0.05) * rng.normal(size=(1, 3))).float()
     other["eyes"] += torch.from_numpy(0.05 * rng.normal(size=(1, 6))).float()
     with torch.inference_mode():
@@ -236,18 +274,10 @@ def draw_meshes(model: HeadModel, uv_map: FaceUvMap, rng: Rng) -> tuple[np.ndarr
     normals = vertex_normals(torch.from_numpy(true)[None], model.faces)[0].numpy()
     # Along the normals the views agree better on where the skin is than along it.
     off -= rng.uniform(0.2, 1.0) * (off * normals).sum(1, keepdims=True) * normals
-    face = np.unique(uv_map.samples.corners[uv_map.skin])
+    face = np.unique(uv_map.samples.vertices[uv_map.skin])
     size = np.sqrt((off[face] ** 2).sum(1).mean())
     wanted = np.exp(rng.uniform(*np.log(OFF_M)))
     return true, true + off * (wanted / max(float(size), 1e-9))
-
-
-def _slips(expression: np.ndarray, early: float, rng: Rng) -> np.ndarray:
-    """Draw a tracker's error of an expression (1, X): any muscle early, active ones later."""
-    muscles = rng.random(expression.shape) < early * rng.uniform(0.0, 0.4)
-    slips = rng.uniform(0.0, 0.5) * rng.normal(size=muscles.shape) * muscles
-    missed = rng.random(expression.shape) < (1.0 - early) * rng.uniform(0.0, 0.8)
-    return slips - missed * rng.uniform(-0.2, 1.0, expression.shape) * expression
 
 
 class _PaintedScene:
@@ -265,23 +295,25 @@ class _PaintedScene:
         self.uv_map, self.person, self.faces = uv_map, person, model.faces.numpy()
         self.scene = mesh_scene(vertices, self.faces)
         normals = vertex_normals(torch.from_numpy(vertices)[None], model.faces)[0]
-        self.normals = normals.numpy().astype(np.float32)
-        self.front = uv_map.front
-        self.lamps = lamps
+        self.normals, self.lamps = normals.numpy().astype(np.float32), lamps
         self.reach = lamps.reach(self.scene, vertices, self.normals, rng)
 
     def seen(self, camera: Camera, places: np.ndarray) -> np.ndarray:
-        """Root of light (N, 3) where a camera looks for places (N, 3)."""
+        """Return the root of light (N, 3) where a camera looks for places (N, 3)."""
         towards = places - camera.center
         towards /= np.linalg.norm(towards, axis=1, keepdims=True)
         origin = np.broadcast_to(camera.center, places.shape)
         hit, face, bary = self._cast(np.concatenate([origin, towards], axis=1))
         color = np.tile(self.person.background, (len(places), 1))
         face, bary = face[hit], bary[hit]
-        albedo = self._albedo(face, bary)
-        normals = (self.normals[self.faces[face]] * bary[..., None]).sum(1)
+        corners = self.faces[face]
+        plain = (self.person.vertices[corners] * bary[..., None]).sum(1)
+        at = (self.uv_map.places[corners] * bary[..., None]).sum(1)
+        mapped = bilinear(self.person.map, at)
+        albedo = np.where(self.uv_map.front[face][:, None], mapped, plain)
+        normals = (self.normals[corners] * bary[..., None]).sum(1)
         normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-6)
-        reach = (self.reach[self.faces[face]] * bary[..., None]).sum(1)
+        reach = (self.reach[corners] * bary[..., None]).sum(1)
         light = self.lamps.lit(albedo, normals, reach, -towards[hit], self.person.gloss)
         color[hit] = np.clip(light, 0.0, 1.0)
         return np.sqrt(color)
@@ -290,17 +322,11 @@ class _PaintedScene:
         """Find where the true skin at places (N, 3) of the mesh belongs: (N, 2), known (N,)."""
         rays = np.concatenate([places + REACH_M * normals, -normals], axis=1)
         hit, face, bary = self._cast(rays, 2 * REACH_M)
-        hit &= self.front[face]
+        hit &= self.uv_map.front[face]
         where = (self.uv_map.places[self.faces[face]] * bary[..., None]).sum(1)
         own = cell_to_corner(self.uv_map.texels[:, ::-1])
         hit &= np.linalg.norm(where - own, axis=1) < FAR_TEXELS
         return np.where(hit[:, None], where - own, 0.0), hit
-
-    def _albedo(self, face: np.ndarray, bary: np.ndarray) -> np.ndarray:
-        corners = self.faces[face]
-        plain = (self.person.vertices[corners] * bary[..., None]).sum(1)
-        mapped = bilinear(self.person.map, (self.uv_map.places[corners] * bary[..., None]).sum(1))
-        return np.where(self.front[face][:, None], mapped, plain)
 
     def _cast(
         self, rays: np.ndarray, far: float = np.inf

@@ -11,7 +11,6 @@ from __future__ import annotations
 import argparse
 import hashlib
 import os
-import time
 from dataclasses import astuple, dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -21,6 +20,8 @@ import numpy as np
 import torch
 
 from express50.errors import FormatError
+from express50.geometry.conventions import corner_to_cell
+from express50.geometry.sampling import bilinear
 from express50.head.load import load_head
 from express50.head.model import HeadModel
 from express50.landmarks.network import WEIGHTS as START
@@ -31,26 +32,39 @@ from express50.landmarks.network import (
     save_network,
     trainable_network,
 )
-from express50.landmarks.training.train import keep_state, rate_share, take_up
+from express50.landmarks.training.train import descend
 from pipelines.track.config import UV_WEIGHTS
-from pipelines.track.face_uv_map import (
+from pipelines.track.face_uv import (
     FIRST,
+    HEIGHT,
+    LIPS_APART,
     MARKS,
     TEXELS_PER_PIXEL,
+    WIDTH,
     make_uv_map,
     mark_places,
     to_texels,
     to_window,
     window,
 )
-from pipelines.track.face_uv_training.cases import draw_case, draw_person
-from pipelines.track.face_uv_training.disturb import Case, creased, warped, where_seen
+from pipelines.track.face_uv_training.cases import Case, draw_case, draw_person
 
 FILE_CASES, CASES_PER_PERSON = 60, 2
 BATCH = 32
 RATE = 1e-3
-KEEP_EVERY = 100
 HELD_OUT = 0
+# Steps in which the inverse of a displacement is found.
+TURNS = 6
+# Landmarks that deep creases run along: where lips meet, twice; the upper lids with their lashes.
+CREASES = (
+    ((60, 61, 62, 63, 64), (60, 67, 66, 65, 64)),
+    ((36, 37, 38, 39),),
+    ((42, 43, 44, 45),),
+)
+# Fractional bits of OpenCV's drawing coordinates.
+FINE = 4
+# Share of the texels about a place whose displacement must be known.
+LEAST_SHARE = 0.25
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,13 +89,10 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m pipelines.track.face_uv_training.train")
     parser.add_argument("--cases", type=Path, required=True, help="folder for drawn cases")
     parser.add_argument("--ict", help="ICT-FaceKit checkout or .npz to train on as well")
-    parser.add_argument(
-        "--files", type=int, default=UvTrainingPlan.files, help="files of cases per head"
-    )
-    parser.add_argument(
-        "--steps", type=int, default=UvTrainingPlan.steps, help="batches of 32 maps"
-    )
-    parser.add_argument("--seed", type=int, default=UvTrainingPlan.seed)
+    plan = UvTrainingPlan()
+    parser.add_argument("--files", type=int, default=plan.files, help="files of cases per head")
+    parser.add_argument("--steps", type=int, default=plan.steps, help="batches of 32 maps")
+    parser.add_argument("--seed", type=int, default=plan.seed)
     parser.add_argument("--start", type=Path, default=START, help="weights to go on from")
     parser.add_argument("--out", type=Path, default=UV_WEIGHTS)
     options = parser.parse_args(arguments)
@@ -95,7 +106,7 @@ def main(arguments: list[str] | None = None) -> int:
     save_network(train(models, plan, options.cases, options.start), options.out)
     net = load_network(options.out)
     for model in models:
-        cases = read_cases(make_cases(options.cases, model, HELD_OUT, plan.seed))
+        cases = open_cases(options.cases, model, HELD_OUT, plan.seed)
         print(f"{model.name}: held-out heads {validate(net, cases)}")
     return 0
 
@@ -106,67 +117,44 @@ def train(
     """Train on cases of the head models; cases and the run's state are kept in a folder."""
     torch.manual_seed(plan.seed)
     net = trainable_network(start)
-    optimiser = torch.optim.AdamW(net.parameters(), lr=RATE, weight_decay=1e-3)
     begun = hashlib.sha256(start.read_bytes()).hexdigest()[:8]
     name = "-".join([*(m.name for m in models), *(str(value) for value in astuple(plan)), begun])
     cases = [
         case
         for number in range(HELD_OUT + 1, HELD_OUT + 1 + plan.files)
         for model in models
-        for case in read_cases(make_cases(folder, model, number, plan.seed))
+        for case in open_cases(folder, model, number, plan.seed)
     ]
-    state = folder / f"uv_map-training-{name}.pt"
-    first = take_up(state, net, optimiser)
-    began, losses = time.monotonic(), []
-    for step in range(first, plan.steps):
-        optimiser.param_groups[0]["lr"] = RATE * rate_share(step, plan.steps)
+
+    def loss_at(step: int) -> torch.Tensor:
         # Seeded by the step, so that a run taken up again draws what it would have drawn.
         rng = np.random.default_rng([plan.seed, 2, step])
         picks = rng.integers(len(cases), size=BATCH)
         batch = make_batch([warped(cases[pick], rng) for pick in picks], rng)
-        loss, _ = marks_loss(net, batch)
-        optimiser.zero_grad(set_to_none=True)
-        loss.backward()
-        torch.nn.utils.clip_grad_norm_(net.parameters(), 5.0)
-        optimiser.step()
-        losses.append(loss.item())
-        if (step + 1) % KEEP_EVERY == 0:
-            seconds = (time.monotonic() - began) / (step + 1 - first)
-            recent = np.mean(losses[-KEEP_EVERY:])
-            print(f"step {step + 1}: loss {recent:.3f}, {seconds:.2f} s", flush=True)
-            keep_state(state, net, optimiser, step + 1)
-    return net.eval()
+        return marks_loss(net, batch)[0]
+
+    return descend(net, plan.steps, RATE, folder / f"uv_map-training-{name}.pt", loss_at)
 
 
-def make_cases(folder: Path, model: HeadModel, number: int, seed: int) -> Path:
-    """Draw one file of `FILE_CASES` cases, unless it is there already."""
+def open_cases(folder: Path, model: HeadModel, number: int, seed: int) -> list[Case]:
+    """Read a file of `FILE_CASES` cases; they are drawn first if it is not there."""
     path = folder / f"uv_map-{model.name}-{seed}-{number:03d}.npz"
-    if path.exists():
-        return path
-    rng = np.random.default_rng([seed, number, *model.name.encode()])
-    uv_map, cases = make_uv_map(model), list[Case]()
-    while len(cases) < FILE_CASES:
-        person = draw_person(model, uv_map, rng)
-        cases += [draw_case(model, uv_map, person, rng) for _ in range(CASES_PER_PERSON)]
-    folder.mkdir(parents=True, exist_ok=True)
-    # Two processes that happen to draw the same file write the same bytes.
-    part = path.with_suffix(f".{os.getpid()}.part")
-    with part.open("wb") as file:
-        names = Case.__annotations__
-        stacks: dict[str, Any] = {n: np.stack([getattr(case, n) for case in cases]) for n in names}
-        np.savez(file, **stacks)
-    part.rename(path)
-    return path
-
-
-def read_cases(path: Path) -> list[Case]:
-    """Read a file of cases."""
+    names = Case.__annotations__
+    if not path.exists():
+        rng = np.random.default_rng([seed, number, *model.name.encode()])
+        uv_map, cases = make_uv_map(model), list[Case]()
+        while len(cases) < FILE_CASES:
+            person = draw_person(model, uv_map, rng)
+            cases += [draw_case(model, uv_map, person, rng) for _ in range(CASES_PER_PERSON)]
+        folder.mkdir(parents=True, exist_ok=True)
+        # Two processes that happen to draw the same file write the same bytes.
+        part = path.with_suffix(f".{os.getpid()}.part")
+        with part.open("wb") as file:
+            stacks: Any = {n: np.stack([getattr(case, n) for case in cases]) for n in names}
+            np.savez(file, **stacks)
+        part.rename(path)
     with np.load(path, allow_pickle=False) as data:
-        stacks = {name: data[name] for name in Case.__annotations__}
-    return [
-        Case(**{name: stack[index] for name, stack in stacks.items()})
-        for index in range(len(stacks["valid"]))
-    ]
+        return [Case(*row) for row in zip(*(data[name] for name in names), strict=True)]
 
 
 def make_batch(cases: list[Case], rng: np.random.Generator | None = None) -> UvBatch:
@@ -187,7 +175,7 @@ def make_batch(cases: list[Case], rng: np.random.Generator | None = None) -> UvB
 
 
 def marks_loss(net: LandmarkNet, batch: UvBatch) -> tuple[torch.Tensor, torch.Tensor]:
-    """Distance, Laplace likelihood and cross entropy of the known landmarks; distances (B, 51)."""
+    """Return distance, likelihood and entropy of the known landmarks, and distances (B, 51)."""
     output = net(batch.images)
     # The square root's slope at zero distance is bounded by the added 0.01 px^2.
     off = (output.points[:, FIRST:] - batch.points).square().sum(-1)
@@ -211,6 +199,71 @@ def validate(net: LandmarkNet, cases: list[Case]) -> str:
         f"{TEXELS_PER_PIXEL * float(before[shown].mean()):.2f} texels before, "
         f"{TEXELS_PER_PIXEL * float(after[shown].mean()):.2f} after"
     )
+
+
+def warped(case: Case, rng: np.random.Generator) -> Case:
+    """Return the reading of a mesh that is off by some more, smooth in the map; maybe mirrored.
+
+    A texel that shows what its neighbour showed belongs where the neighbour's did. Displacements
+    are larger than a tracker's: a network that may expect small ones reports too small ones.
+    """
+    y, x = np.mgrid[:HEIGHT, :WIDTH].astype(np.float32)
+    coarse = rng.normal(size=(2, *rng.integers(2, 9, 2))) * rng.uniform(0.0, 3.5)
+    fields = [cv2.resize(one, (WIDTH, HEIGHT), interpolation=cv2.INTER_CUBIC) for one in coarse]
+    turn = rng.normal(size=(2, 2)) * 0.04
+    broad = np.stack([x - WIDTH / 2, y - HEIGHT / 2], axis=2) @ turn + rng.normal(size=2) * 2.5
+    shift = (rng.random() ** 0.5 * (np.stack(fields, axis=2) + broad)).astype(np.float32)
+    at = x + shift[..., 0], y + shift[..., 1]
+    colors = cv2.remap(case.colors, *at, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    flow = cv2.remap(case.flow.astype(np.float32), *at, cv2.INTER_LINEAR) + shift
+    valid = cv2.remap(case.valid.astype(np.float32), *at, cv2.INTER_LINEAR) > 0.99
+    out = Case(colors, flow, valid)
+    return mirrored(out) if rng.random() < 0.5 else out
+
+
+def mirrored(case: Case) -> Case:
+    """Return the same reading with the sides of the face exchanged."""
+    flow = np.ascontiguousarray(case.flow[:, ::-1]) * np.array([-1.0, 1.0], np.float32)
+    colors, valid = (np.ascontiguousarray(image[:, ::-1]) for image in (case.colors, case.valid))
+    return Case(colors, flow, valid)
+
+
+def where_seen(case: Case, texels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Find where a map shows the content of texels (N, 2), corner origin, and whether it does (N,).
+
+    Displacements are known where something is seen and asked for where it belongs.
+    """
+    valid = case.valid.astype(np.float32)
+    share = cv2.GaussianBlur(valid, (0, 0), 1.5)
+    flow = cv2.GaussianBlur(case.flow.astype(np.float32) * valid[..., None], (0, 0), 1.5)
+    flow = flow / np.maximum(share, 1e-3)[..., None]
+    own = (texels + LIPS_APART).astype(np.float32)
+    at = own
+    for _ in range(TURNS):
+        at = own - bilinear(flow, at)
+    return at - LIPS_APART, bilinear(share, at) > LEAST_SHARE
+
+
+def creased(
+    colors: np.ndarray, at: np.ndarray, known: np.ndarray, rng: np.random.Generator
+) -> np.ndarray:
+    """Darken lines where lips meet and along the upper lids of most maps (HEIGHT, WIDTH, 3) uint8.
+
+    Painted shadows are as coarse as the head model's vertices, and on a face these lines show best
+    where its parts end. The landmarks are at texels (68, 2), corner origin, where `known` (68,).
+    """
+    dark = np.zeros((HEIGHT, WIDTH), np.float32)
+    for lines in CREASES:
+        if rng.random() < 0.25 or not known[np.concatenate(lines)].all():
+            continue
+        one = np.zeros((HEIGHT, WIDTH), np.uint8)
+        for line in lines:
+            points = np.rint(corner_to_cell(at[list(line)]) * 2**FINE).astype(np.int32)
+            width = int(rng.integers(1, 3))
+            cv2.polylines(one, [points], False, 255, width, cv2.LINE_AA, FINE)
+        soft = cv2.GaussianBlur(one.astype(np.float32) / 255.0, (0, 0), rng.uniform(0.3, 1.2))
+        dark = np.maximum(dark, rng.uniform(0.1, 0.9) * soft)
+    return np.rint(colors * (1.0 - dark[..., None])).astype(np.uint8)
 
 
 if __name__ == "__main__":

@@ -4,7 +4,7 @@ import pytest
 import textual._wait
 
 from annotations.ui.app import AnnotateApp
-from annotations.ui.session import open_session
+from annotations.ui.session import Session
 
 
 @pytest.fixture(autouse=True)
@@ -23,6 +23,6 @@ def make_app():
 
     def make(dataset, annotator="ann", **options):
         options.setdefault("order", "subject")
-        return AnnotateApp(open_session(dataset, annotator, **options))
+        return AnnotateApp(Session(dataset, annotator, **options))
 
     return make

@@ -7,13 +7,12 @@ import shutil
 import pytest
 from rich.text import Text
 
-from annotations.labels import make_mark
-from annotations.store import append_label, current_labels, read_labels
-from annotations.ui import layout
-from annotations.ui.panels import fit, hint_line
+from annotations.labels import append_label, current_labels, make_mark, read_labels
+from annotations.ui import app as app_module
 from annotations.ui.picture import PicturePane
 from annotations.ui.theme import GROUPS
 from annotations.ui.timeline import CurveStrip
+from annotations.ui.words import fit, hint_line
 from express50.capture.index import read_index
 from tests.annotations.footage import suggest
 
@@ -40,7 +39,7 @@ def labels(dataset, subject="S001"):
     return read_labels(dataset, subject)
 
 
-def test_one_key_accepts_a_right_suggestion_and_opens_the_next(suggested, make_app):
+def test_enter_accepts_the_suggestion_and_opens_the_next_task(suggested, make_app):
     app = make_app(suggested)
     task = drive(app, "enter", check=lambda app: app.session.task)
     (label,) = labels(suggested)
@@ -49,7 +48,7 @@ def test_one_key_accepts_a_right_suggestion_and_opens_the_next(suggested, make_a
     assert task.expression == "smile"
 
 
-def test_every_way_of_moving_is_on_its_key(suggested, make_app):
+def test_every_movement_key_moves_the_cursor(suggested, make_app):
     table = [
         ("right", 21), ("left", 19), (".", 21), (",", 19), ("l", 21), ("h", 19),
         ("shift+right", 30), ("pagedown", 30), ("L", 30), ("pageup", 16), ("shift+left", 16),
@@ -75,22 +74,22 @@ def test_every_way_of_moving_is_on_its_key(suggested, make_app):
     asyncio.run(run())
 
 
-def test_a_plateau_goes_into_the_label(suggested, make_app):
+def test_plateau_is_stored_in_the_label(suggested, make_app):
     keys = ("left", "left", "[", "right", "right", "right", "]", "left", "enter")
     drive(make_app(suggested), *keys)
     (label,) = labels(suggested)
     assert (label.first, label.frame, label.last, label.keys) == (2, 4, 5, 9)
 
 
-def test_a_frame_outside_its_plateau_is_not_saved_and_the_screen_says_why(suggested, make_app):
+def test_frame_outside_its_plateau_is_refused_with_a_message(suggested, make_app):
     keys = ("]", "right", "enter")
     said = drive(make_app(suggested), *keys, check=lambda app: line(app, "message"))
     assert "not saved" in said
-    assert "outside your plateau" in said
+    assert "outside its plateau" in said
     assert labels(suggested) == []
 
 
-def test_flags_by_one_digit_or_in_words(suggested, make_app):
+def test_flag_by_digit_or_in_words(suggested, make_app):
     app = make_app(suggested)
     drive(app, "f", "2", "f", "escape", "f", "5", *"tongueless", "enter")
     first, second = labels(suggested)
@@ -98,7 +97,7 @@ def test_flags_by_one_digit_or_in_words(suggested, make_app):
     assert (second.expression, second.reason) == ("smile", "tongueless")
 
 
-def test_undo_brings_the_task_back_and_says_so(suggested, make_app):
+def test_undo_reopens_the_task_with_a_message(suggested, make_app):
     app = make_app(suggested)
     said = drive(app, "enter", "u", check=lambda app: line(app, "message"))
     assert "taken back: S001 neutral" in said
@@ -115,7 +114,7 @@ def test_next_and_previous_leave_tasks_open(suggested, make_app):
     assert "first task" in drive(make_app(suggested), "p", check=lambda app: line(app, "message"))
 
 
-def test_what_is_marked_stands_on_the_screen_when_one_returns(suggested, make_app):
+def test_earlier_mark_is_shown_on_return(suggested, make_app):
     app = make_app(suggested)
     title, strip = drive(
         app, "right", "enter", "p", size=(100, 32),
@@ -126,7 +125,7 @@ def test_what_is_marked_stands_on_the_screen_when_one_returns(suggested, make_ap
     assert "●" in strip[-1]
 
 
-def test_blind_hides_suggestion_curves_and_others_marks_until_one_has_decided(suggested, make_app):
+def test_blind_hides_suggestions_curves_and_marks_until_the_decision(suggested, make_app):
     append_label(suggested, make_mark(read_index(suggested, "S001"), "smile", 22, "cam00", "bob"))
     app = make_app(suggested, blind=True, expressions=["smile"], subjects=["S001"])
 
@@ -143,7 +142,7 @@ def test_blind_hides_suggestion_curves_and_others_marks_until_one_has_decided(su
     assert {"1", "2", "●", "█"} <= set(strip)
 
 
-def test_narrow_lines_keep_what_one_needs():
+def test_narrow_lines_keep_the_essential_parts():
     line = fit(Text(" Jaw open  S001"), Text("2/24 done  doubt 0.04  25 s  0 keys "), 40)
     assert line.plain.startswith(" Jaw open  S001") and line.cell_len == 40
     assert fit(Text("x" * 50), Text("cam05"), 40).plain == "x" * 39 + "…"
@@ -170,8 +169,10 @@ def test_help_scrolls_in_a_low_terminal(suggested, make_app):
     asyncio.run(run())
 
 
-def test_zoom_camera_blink_play_and_help_leave_the_label_alone(suggested, make_app, monkeypatch):
-    monkeypatch.setattr(layout, "FASTEST", 2.0)  # a busy machine must not reach the window's end
+def test_looking_keys_do_not_label(suggested, make_app, monkeypatch):
+    monkeypatch.setattr(
+        app_module, "FASTEST", 2.0
+    )  # a busy machine must not reach the window's end
     app = make_app(suggested)
 
     async def run():
@@ -206,8 +207,8 @@ def test_zoom_camera_blink_play_and_help_leave_the_label_alone(suggested, make_a
     asyncio.run(run())
 
 
-def test_play_ends_with_the_window_and_starts_again(suggested, make_app, monkeypatch):
-    monkeypatch.setattr(layout, "FASTEST", 4.0)
+def test_play_stops_at_the_end_of_the_window_and_restarts(suggested, make_app, monkeypatch):
+    monkeypatch.setattr(app_module, "FASTEST", 4.0)
     app = make_app(suggested)
 
     async def run():
@@ -227,7 +228,7 @@ def test_play_ends_with_the_window_and_starts_again(suggested, make_app, monkeyp
     asyncio.run(run())
 
 
-def test_without_suggestions_and_reference_the_middle_is_opened_and_said(dataset, make_app):
+def test_task_without_suggestion_opens_in_the_middle_with_a_message(dataset, make_app):
     app = make_app(dataset)
     cursor, message, right = drive(
         app,
@@ -243,7 +244,7 @@ def test_without_suggestions_and_reference_the_middle_is_opened_and_said(dataset
     assert (label.frame, label.suggested, label.shown) == (7, None, False)
 
 
-def test_missing_proxies_and_footage_are_said_in_plain_words(suggested, make_app, footage):
+def test_missing_proxies_and_footage_are_reported(suggested, make_app, footage):
     ingest = suggested.root / "ingest"
     ingest.unlink()
     shutil.copytree(footage.root / "ingest", ingest)
@@ -265,13 +266,13 @@ def test_missing_proxies_and_footage_are_said_in_plain_words(suggested, make_app
     assert labels(suggested) == []
 
 
-def test_nothing_to_label_is_said(suggested, make_app):
+def test_empty_worklist_is_reported(suggested, make_app):
     app = make_app(suggested, expressions=["shout"])
     assert "nothing to label" in drive(app, "enter", "u", "n", "f", "1",
                                        check=lambda app: line(app, "message"))  # fmt: skip
 
 
-def test_the_end_of_the_work_is_said_and_everything_can_be_flagged(suggested, make_app):
+def test_end_of_the_worklist_is_reported(suggested, make_app):
     app = make_app(suggested, subjects=["S002"])
     said = drive(app, *(["f", "3"] * 3), check=lambda app: line(app, "message"))
     assert "all 3 done" in said
@@ -279,14 +280,14 @@ def test_the_end_of_the_work_is_said_and_everything_can_be_flagged(suggested, ma
 
 
 @pytest.mark.parametrize("size", [(40, 12), (80, 24), (200, 60), (20, 6)])
-def test_terminals_of_any_size(suggested, make_app, size):
+def test_app_runs_in_terminals_of_any_size(suggested, make_app, size):
     app = make_app(suggested)
     keys = ("right", "z", "[", "f", "escape", "question_mark", "escape", "n")
     drive(app, *keys, size=size)
     assert app.session.task.expression == "smile"
 
 
-def test_a_resize_keeps_the_position(suggested, make_app):
+def test_resize_keeps_the_position(suggested, make_app):
     app = make_app(suggested)
 
     async def run():
@@ -304,7 +305,7 @@ def test_a_resize_keeps_the_position(suggested, make_app):
     asyncio.run(run())
 
 
-def test_a_click_on_the_strip_moves_the_cursor(suggested, make_app):
+def test_click_on_the_strip_moves_the_cursor(suggested, make_app):
     app = make_app(suggested)
 
     async def run():
@@ -325,5 +326,5 @@ def test_reference_of_another_camera_set_falls_back_to_its_own(suggested, make_a
 
 
 def test_no_key_is_bound_twice():
-    keys = [k for group in GROUPS.values() for key in group for k in key.keys.split(",")]
+    keys = [k for group in GROUPS for key in group for k in key.keys.split(",")]
     assert len(keys) == len(set(keys))

@@ -19,7 +19,7 @@ from annotations.ui.images import (
     quantise,
 )
 from annotations.ui.picture import PicturePane, shot_of
-from annotations.ui.session import open_session
+from annotations.ui.session import Session
 
 SHOT = FrameCrop("S1", "cam", 3, (0.0, 0.0, 1.0, 1.0), 8, 8)
 
@@ -60,7 +60,7 @@ def decode_sixel(text):
 
 @settings(deadline=None, max_examples=40)
 @given(height=st.integers(1, 40), width=st.integers(1, 40), colours=st.integers(1, COLOURS))
-def test_sixels_of_few_colours_are_the_picture(height, width, colours):
+def test_sixels_of_few_colours_decode_to_the_picture(height, width, colours):
     rng = np.random.default_rng(height * width + colours)
     few = (np.arange(colours)[:, None] * [97, 59, 31] % 32 * 8).astype(np.uint8)
     picture = few[rng.integers(0, colours, (height, width))]
@@ -69,7 +69,7 @@ def test_sixels_of_few_colours_are_the_picture(height, width, colours):
     assert (beyond == -1).all()
 
 
-def test_sixels_of_many_colours_are_near_the_picture_and_paint_every_pixel():
+def test_sixels_of_many_colours_approximate_the_picture():
     picture = smooth(125, 90)
     palette, numbers = quantise(picture)
     image, _ = decode_sixel(encode_sixel(picture))
@@ -121,8 +121,8 @@ def shown(app, name="frame"):
     return pane, app.cache.get(shot_of(pane.look, pane.shape))
 
 
-def test_the_app_draws_sixels_and_none_over_a_dialog(suggested):
-    app = Recorder(open_session(suggested, "ann", order="subject"), sixel_cell=CellSize(7, 15))
+def test_app_draws_sixels_except_over_dialogs(suggested):
+    app = Recorder(Session(suggested, "ann", order="subject"), sixel_cell=CellSize(7, 15))
 
     async def run():
         async with app.run_test(size=(80, 22)) as pilot:

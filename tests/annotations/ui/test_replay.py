@@ -4,9 +4,9 @@ import asyncio
 
 import pytest
 
-from annotations.store import read_labels
+from annotations.labels import read_labels
 from annotations.ui.app import AnnotateApp
-from annotations.ui.session import open_session
+from annotations.ui.session import Session
 from annotations.ui.task import open_view
 from benchmarks.replay import MOVES, cheapest_keys, measure_steps, replay
 from express50.errors import AnnotationError
@@ -16,7 +16,7 @@ from express50.errors import AnnotationError
     ("frame", "keys"),
     [(20, 0), (21, 0), (22, 1), (24, 3), (27, 1), (30, 1), (31, 1), (45, 5), (99, 1), (0, 1)],
 )
-def test_the_cheapest_keys_lead_within_the_tolerance(frame, keys):
+def test_cheapest_keys_reach_the_frame_within_the_tolerance(frame, keys):
     view = open_view(5, 80, (20, 28))
     found = cheapest_keys(view, frame, tolerance=1)
     assert len(found) == keys
@@ -25,7 +25,7 @@ def test_the_cheapest_keys_lead_within_the_tolerance(frame, keys):
     assert abs(view.cursor - min(max(frame, 5), 80)) <= 1
 
 
-def test_right_suggestions_cost_one_key_and_wrong_ones_their_way(suggested):
+def test_replay_counts_keys_of_right_and_wrong_suggestions(suggested):
     truth = {
         ("S001", "neutral"): 5, ("S001", "smile"): 27, ("S002", "neutral"): 7,
         ("S002", "jaw_open"): 40,
@@ -50,7 +50,7 @@ def test_steps_are_measured_over_tasks_cameras_and_zooms(suggested):
     assert read_labels(suggested, "S001") == []
 
 
-def test_faces_found_late_are_drawn_when_they_are_there(suggested):
+def test_faces_found_late_are_drawn(suggested):
     class Finder:
         ready = False
 
@@ -62,7 +62,7 @@ def test_faces_found_late_are_drawn_when_they_are_there(suggested):
 
             return Face(0.5, 0.5, 0.2, 1.0) if self.ready else None
 
-    app = AnnotateApp(open_session(suggested, "ann"), faces=Finder())
+    app = AnnotateApp(Session(suggested, "ann"), faces=Finder())
 
     async def run():
         async with app.run_test(size=(80, 22)) as pilot:

@@ -39,7 +39,6 @@ def test_arrays_survive_the_stand_ins(flame: Path) -> None:
     np.testing.assert_allclose(directions, arrays["shapedirs"], atol=1e-7)
     np.testing.assert_allclose(model.joint_regressor.numpy(), arrays["J_regressor"], atol=1e-7)
     assert (len(model.shape_names), len(model.expression_names)) == (SHAPES, EXPRESSIONS)
-    assert model.parents == (-1, 0, 1, 1, 1)
     assert not model.unit_expressions
     feature = np.random.default_rng(3).normal(size=36)
     by_hand = arrays["posedirs"] @ feature

@@ -9,8 +9,7 @@ import pytest
 import torch
 
 from express50.errors import HeadModelError
-from express50.head.ict import LANDMARKS, VERTEX_COUNT, load_ict, read_obj
-from express50.head.ict_regions import RANGES
+from express50.head.ict import LANDMARKS, RANGES, VERTEX_COUNT, load_ict, read_obj
 from express50.head.load import load_head
 from express50.head.model import REGIONS, landmarks, pose
 

@@ -15,7 +15,7 @@ from express50.head.preview import POSES, contact_sheet, expression_vector, rend
 
 def test_a_head_fills_the_middle_of_the_picture():
     head = load_builtin()
-    image = render_preview(head, head.template, size=64, supersample=1)
+    image = render_preview(head, head.template, size=64)
     background = image[0, 0].astype(int)
     differs = np.abs(image.astype(int) - background).max(-1) > 20
     assert image.shape == (64, 64, 3) and image.dtype == np.uint8

@@ -199,26 +199,6 @@ def test_opencv_yaml_round_trip(tmp_path, rodrigues):
     assert_same(read_rig(tmp_path / "yaml"), rig)
 
 
-def test_easymocap_pair_round_trip(tmp_path):
-    rig = make_rig()
-    intrinsics = cv2.FileStorage(str(tmp_path / "intri.yml"), cv2.FILE_STORAGE_WRITE)
-    extrinsics = cv2.FileStorage(str(tmp_path / "extri.yml"), cv2.FILE_STORAGE_WRITE)
-    intrinsics.startWriteStruct("names", cv2.FILE_NODE_SEQ)
-    for name in rig:
-        intrinsics.write("", name)
-    intrinsics.endWriteStruct()
-    for name, camera in rig.items():
-        intrinsics.write(f"K_{name}", K_to_opencv(camera.K))
-        intrinsics.write(f"dist_{name}", camera.dist[None, :5])
-        extrinsics.write(f"Rot_{name}", camera.cam_from_world[:3, :3])
-        extrinsics.write(f"T_{name}", camera.cam_from_world[:3, 3:])
-    intrinsics.release()
-    extrinsics.release()
-    with pytest.raises(CalibrationError, match="--size"):
-        read_rig(tmp_path)
-    assert_same(read_rig(tmp_path, size=(640, 480)), rig)
-
-
 def test_yaml_without_pose_names_file_and_keys(tmp_path):
     write_yaml(tmp_path / "yaml", make_rig())
     file = tmp_path / "yaml" / "cam02.yml"

@@ -9,7 +9,7 @@ import pytest
 from express50.cli.main import main
 from express50.files.calibration import read_cameras, write_cameras
 from express50.geometry.conventions import FLIP_YZ
-from express50.rigs.rig_check import judge
+from express50.rigs.world_frame import judge
 from tests.express50.rigs.test_read import make_rig, write_transforms
 
 

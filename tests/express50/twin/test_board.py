@@ -4,18 +4,8 @@ import pytest
 
 from express50.geometry.cameras import project
 from express50.geometry.conventions import opencv_pixels_to_corner
-from express50.twin.board import BoardSpec, board_poses, corner_points, render_board
-from express50.twin.rig import make_rig
-from express50.twin.studio import expose, make_sensor
-
-SPEC = BoardSpec()
-
-
-def detector():
-    dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, SPEC.dictionary))
-    size = (SPEC.squares_x, SPEC.squares_y)
-    board = cv2.aruco.CharucoBoard(size, SPEC.square_length_m, SPEC.marker_length_m, dictionary)
-    return cv2.aruco.CharucoDetector(board)
+from express50.twin.board import board_poses, charuco_board, render_board
+from express50.twin.rig import expose, make_rig, make_sensor
 
 
 def facing(cameras, pose):
@@ -27,28 +17,21 @@ def facing(cameras, pose):
 
 def test_detected_corners_are_where_the_truth_has_them():
     cameras = make_rig(8, 400, 400, 0)
-    errors, found = [], detector()
-    for pose in board_poses(SPEC, 4, 0):
+    board = charuco_board()
+    errors, found = [], cv2.aruco.CharucoDetector(board)
+    for pose in board_poses(4, 0):
         camera = cameras[facing(cameras, pose)[0]]
-        picture = render_board(SPEC, pose, camera, 0)
+        picture = render_board(pose, camera, 0)
         image = expose(make_sensor(0, 0), picture, np.random.default_rng(0), 1.0)
         corners, ids, _, _ = found.detectBoard(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))
         assert ids is not None and len(ids) >= 12
-        points = corner_points(SPEC)[ids.ravel()] @ pose[:3, :3].T + pose[:3, 3]
+        points = board.getChessboardCorners()[ids.ravel()] @ pose[:3, :3].T + pose[:3, 3]
         true, _ = project(camera, points)
         errors.append(opencv_pixels_to_corner(corners.reshape(-1, 2)) - true)
     errors = np.concatenate(errors)
     assert np.quantile(np.linalg.norm(errors, axis=1), 0.95) < 0.3
     # A half-pixel slip would show as a common shift.
     assert np.abs(np.median(errors, axis=0)).max() < 0.06
-
-
-def test_corner_points_agree_with_opencv():
-    dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, SPEC.dictionary))
-    board = cv2.aruco.CharucoBoard(
-        (SPEC.squares_x, SPEC.squares_y), SPEC.square_length_m, SPEC.marker_length_m, dictionary
-    )
-    assert np.allclose(board.getChessboardCorners(), corner_points(SPEC), atol=1e-7)
 
 
 @pytest.mark.parametrize("count", [4, 8, 24])
@@ -61,7 +44,7 @@ def test_every_camera_sees_the_board_and_neighbours_share_it(count):
                 > 0.5 * np.linalg.norm(c.center - pose[:3, 3])
                 for c in cameras
             ]
-            for pose in board_poses(SPEC, 24, 0)
+            for pose in board_poses(24, 0)
         ]
     )
     assert seen.sum(0).min() >= 4

@@ -13,8 +13,7 @@ from express50.cli.main import main
 from express50.console import USAGE
 from express50.errors import CaptureError, ConfigError
 from express50.files.images import read_image
-from express50.files.video import iterate_video
-from express50.files.video_writer import VideoFootage
+from express50.files.video import VideoFootage, iterate_video
 from express50.twin.config import TwinConfig
 from express50.twin.record import record
 from express50.twin.studio import film_board, film_subject
@@ -107,7 +106,7 @@ def test_settings_of_which_nothing_was_recorded_do_not_bind(tiny_config, tmp_pat
 
 
 def test_the_same_pictures_make_the_same_video(tmp_path):
-    """Whatever lay in the memory before: encoders' lookahead has told B-frames by it."""
+    """The bytes do not depend on what was in memory: an encoder's lookahead once did."""
     rng = np.random.default_rng(0)
     ground = gaussian_filter(rng.uniform(0, 255, (120, 200, 3)), (3, 3, 0)) * 2
     pictures = [

@@ -7,10 +7,15 @@ from express50.capture.expressions import load_script, select
 from express50.errors import HeadModelError
 from express50.head.load import load_head
 from express50.twin.body import build_body, head_vertices, model_materials, pose_body
-from express50.twin.noise import fractal, make_lattice, noise
-from express50.twin.performance import gaze_rotation, perform
 from express50.twin.rig import TARGET, make_rig
-from express50.twin.subjects import OFFSET_RMS_M, make_subject, soft_mask
+from express50.twin.subjects import (
+    OFFSET_RMS_M,
+    gaze_rotation,
+    make_subject,
+    perform,
+    soft_mask,
+)
+from express50.twin.surface import fractal, make_lattice, noise
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,176 @@
+"""Pictures of one moment: photographs, and the folders of reconstruction tools.
+
+Photographs come without cameras, COLMAP models and transforms.json with them. Neither tool states
+its unit; ``metres_per_unit`` in capture.toml does.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
+from pathlib import Path
+
+from express50.capture.raw import IMAGE_SUFFIXES, RawCamera, RawCapture, image_names
+from express50.capture.readers.selection import (
+    Moment,
+    Selection,
+    check_selection,
+    common_timeline,
+    folder_id,
+    identifier,
+)
+from express50.errors import CalibrationError, CaptureError, FormatError
+from express50.files.containers import inside
+from express50.files.images import read_exif
+from express50.files.text import read_json_table
+from express50.geometry.cameras import Camera
+from express50.rigs.camera_builder import in_metres
+from express50.rigs.colmap import is_colmap, read_colmap_images
+from express50.rigs.transforms_json import camera_names, read_transforms
+
+FPS = 24.0  # meaningless for photographs
+MODELS = ("sparse/0", "sparse", ".")
+MOMENT = "photo"
+
+
+def fits_photos(path: Path) -> bool:
+    """Returns whether a folder holds photographs."""
+    return bool(image_names(path))
+
+
+def read_photos(path: Path, selection: Selection) -> RawCapture:
+    """Reads each photograph as a camera of one moment; calibrate solves the cameras.
+
+    A photograph that lies on its side by its EXIF is read upright.
+
+    Raises:
+        CaptureError: two names become one camera id, or no photograph can be used.
+    """
+    ids = _camera_ids(path, image_names(path), lambda name: Path(name).stem)
+    check_selection(selection, [MOMENT], sorted(ids.values()))
+    dropped: dict[str, str] = {}
+    cameras: dict[str, RawCamera] = {}
+    for name, camera in ids.items():
+        if not selection.has_camera(camera):
+            continue
+        try:
+            turn, _ = read_exif(path / name)
+        except FormatError as error:
+            dropped[camera] = str(error)
+            continue
+        cameras[camera] = RawCamera(
+            id=camera, kind="frames", path=path, names=(name,), counts=(1,), orientation=turn
+        )
+    if not cameras:
+        reasons = "; ".join(f"{k}: {v}" for k, v in dropped.items())
+        raise CaptureError(f"{path}: no photograph can be used: {reasons}")
+    return RawCapture(
+        root=path, subject=folder_id(path), fps=FPS, meta={}, cameras=cameras, dropped=dropped,
+        clips=(selection.expression(MOMENT),),
+    )  # fmt: skip
+
+
+def fits_colmap(path: Path) -> bool:
+    """Returns whether a folder holds a COLMAP model and its pictures."""
+    return _model(path) is not None and (path / "images").is_dir()
+
+
+def _model(path: Path) -> Path | None:
+    return next((path / name for name in MODELS if is_colmap(path / name)), None)
+
+
+def read_colmap_folder(path: Path, selection: Selection) -> RawCapture:
+    """Reads every posed picture as a camera of one moment.
+
+    Raises:
+        CaptureError: no picture can be found.
+        CalibrationError: the model cannot be read, or has a lens that ours lack.
+    """
+    cameras, files = read_colmap_images(_model(path) or path)
+    pictures = {name: {(MOMENT, 0): f"images/{file}"} for name, file in files.items()}
+    return _read_posed(path, "colmap", cameras, pictures, selection)
+
+
+def fits_transforms(path: Path) -> bool:
+    """Returns whether a folder, or the file itself, is a transforms.json with frames."""
+    if path.is_dir():
+        return (path / "transforms.json").is_file()
+    return path.name.startswith("transforms") and path.suffix == ".json"
+
+
+def read_transforms_folder(path: Path, selection: Selection) -> RawCapture:
+    """Reads cameras and time steps of a transforms.json.
+
+    Raises:
+        CaptureError: no picture can be found.
+        CalibrationError: the cameras are malformed, or move between time steps.
+    """
+    file = path / "transforms.json" if path.is_dir() else path
+    cameras = read_transforms(file, None)
+    frames = read_json_table(file, CalibrationError)["frames"]
+    pictures: dict[str, dict[Moment, str]] = {name: {} for name in cameras}
+    for name, frame in zip(camera_names(frames), frames, strict=True):
+        step = frame.get("timestep_index", 0)
+        if not isinstance(step, int) or isinstance(step, bool) or step < 0:
+            raise CaptureError(f"{file}: timestep_index {step!r}, expected 0 or more")
+        given = str(frame.get("file_path", "")).removeprefix("./")
+        endings = ("", *IMAGE_SUFFIXES)  # some tools leave out the ending
+        found = (given + end for end in endings if _is_picture(file.parent, given + end))
+        pictures[name][(MOMENT, step)] = next(found, given)
+    return _read_posed(file.parent, "transforms", cameras, pictures, selection)
+
+
+def _read_posed(
+    root: Path,
+    layout: str,
+    calibration: Mapping[str, Camera],
+    pictures: Mapping[str, Mapping[Moment, str]],
+    selection: Selection,
+) -> RawCapture:
+    """Read the pictures that are there, by moment, by camera."""
+    ids = _camera_ids(root, calibration, str)
+    check_selection(selection, [MOMENT], sorted(calibration))
+    there = {
+        ids[name]: {moment: file for moment, file in table.items() if _is_picture(root, file)}
+        for name, table in pictures.items()
+    }
+    without = {name: "its picture is not there" for name, table in there.items() if not table}
+    wanted = {ids[n]: there[ids[n]] for n in ids if there[ids[n]] and selection.has_camera(n)}
+    line = common_timeline(root, wanted, [MOMENT], dropped=without)
+    scale, warnings = selection.metres_per_unit, {}
+    if scale is None:
+        warnings["scale"] = (
+            f"{layout} does not say what its unit is, metres are assumed; say metres_per_unit in "
+            "capture.toml"
+        )
+    return RawCapture(
+        root=root,
+        subject=folder_id(root),
+        fps=FPS,
+        meta={},
+        cameras=line.cameras,
+        dropped=line.dropped,
+        calibration=in_metres(
+            {ids[n]: replace(camera, id=ids[n]) for n, camera in calibration.items()}, scale or 1.0
+        ),
+        clips=tuple(selection.expression(sequence) for sequence in line.sequences),
+        skipped=line.skipped,
+        warnings=warnings,
+    )
+
+
+def _is_picture(root: Path, name: str) -> bool:
+    return bool(name) and inside(root, name).is_file()
+
+
+def _camera_ids(root: Path, names: Iterable[str], stem: Callable[[str], str]) -> dict[str, str]:
+    """Return each name's camera id; two names that become one id are an error."""
+    owners: dict[str, str] = {}
+    for name in names:
+        camera = identifier(stem(name))
+        if camera in owners:
+            raise CaptureError(
+                f"{root}: {owners[camera]} and {name} both become camera {camera}; rename one"
+            )
+        owners[camera] = name
+    return {name: camera for camera, name in owners.items()}

@@ -1,0 +1,227 @@
+"""Footage stored as videos: NeRSemble v2, RAVDESS, and a single video without cameras.
+
+NeRSemble v2: a participant's folder, ``018/``, one video per sequence and camera. Footage is
+colour-corrected when it is read (``color_calibration.json``: a polynomial per camera, in linear
+light); its files stay as they are. Source: the layout that nersemble-data 0.0.6 reads.
+
+RAVDESS: a folder ``Actor_01`` of one camera's clips, whose names describe the acting,
+``MM-VC-EM-IN-ST-RE-AA.mp4``: modality, vocal channel, emotion, intensity, statement, repetition,
+actor; actors of odd number are male. Source: S. Livingstone and F. Russo, "The Ryerson Audio-Visual
+Database of Emotional Speech and Song", PLoS ONE 13(5), 2018.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from express50.capture.colour_correction import check_matrix
+from express50.capture.raw import VIDEO_SUFFIXES, RawCamera, RawCapture
+from express50.capture.readers.selection import (
+    Moment,
+    Selection,
+    check_selection,
+    common_timeline,
+    folder_id,
+    identifier,
+)
+from express50.errors import CalibrationError, CaptureError
+from express50.files.images import ORIENTATION
+from express50.files.text import read_json_table
+from express50.files.video import video_fps, video_turn
+from express50.rigs.read import read_nersemble
+
+CAMERAS = Path("calibration/camera_params.json")
+COLOURS = Path("calibration/color_calibration.json")
+BACKGROUND = "BACKGROUND"
+
+NAME = re.compile(r"0[123]-(0[12])-(0[1-8])-(0[12])-(0[12])-(\d\d)-(\d\d)")
+CHANNELS = {"01": "speech", "02": "song"}
+EMOTIONS = {
+    "01": "neutral", "02": "calm", "03": "happy", "04": "sad",
+    "05": "angry", "06": "fearful", "07": "disgust", "08": "surprised",
+}  # fmt: skip
+INTENSITIES = {"01": "normal", "02": "strong"}
+STATEMENTS = {"01": "kids", "02": "dogs"}
+
+
+def fits_nersemble(path: Path) -> bool:
+    """Returns whether a folder is a participant's."""
+    return (path / CAMERAS).is_file() and (path / "sequences").is_dir()
+
+
+def read_participant(path: Path, selection: Selection) -> RawCapture:
+    """Reads the sequences of a participant of NeRSemble.
+
+    Raises:
+        CaptureError: no video can be found.
+        CalibrationError: cameras or colours are malformed.
+    """
+    calibration = read_nersemble(path / CAMERAS)
+    sequences = sorted(
+        p.name for p in (path / "sequences").iterdir() if p.is_dir() and p.name != BACKGROUND
+    )
+    check_selection(selection, sequences, sorted(calibration))
+    wanted = [name for name in sequences if selection.has_sequence(name)]
+    videos: dict[str, dict[Moment, str]] = {}
+    for serial in filter(selection.has_camera, sorted(calibration)):
+        names = {s: f"sequences/{s}/images/cam_{serial}.mp4" for s in wanted}
+        videos[serial] = {(s, 0): name for s, name in names.items() if (path / name).is_file()}
+    line = common_timeline(path, videos, wanted, "videos")
+    colours, warnings = _colours(path, set(line.cameras))
+    plates = {serial: f"sequences/{BACKGROUND}/image_{serial}.jpg" for serial in line.cameras}
+    return RawCapture(
+        root=path,
+        subject=folder_id(path),
+        fps=video_fps(path / next(iter(line.cameras.values())).names[0]),
+        meta={"licence": "research only, see the terms of NeRSemble"},
+        cameras={
+            serial: replace(camera, correction=colours.get(serial, ()))
+            for serial, camera in line.cameras.items()
+        },
+        dropped=line.dropped,
+        calibration=calibration,
+        plates={serial: name for serial, name in plates.items() if (path / name).is_file()},
+        clips=tuple(selection.expression(sequence) for sequence in line.sequences),
+        skipped=selection.left_out(sequences) | line.skipped,
+        found={"colour_corrected": sorted(colours)},
+        warnings=warnings,
+    )
+
+
+def _colours(path: Path, serials: set[str]) -> tuple[dict, dict[str, str]]:
+    """Read the corrections by camera, and warnings about cameras without one."""
+    if not (path / COLOURS).is_file():
+        return {}, {"colours": f"{COLOURS} is missing; colours stay as each camera recorded them"}
+    table = read_json_table(path / COLOURS, CalibrationError)
+    found = {
+        serial: check_matrix(table[serial], f"{path / COLOURS}: {serial}")
+        for serial in sorted(serials & set(table))
+    }
+    without = sorted(serials - set(found))
+    return found, {f"camera {s}": f"{COLOURS} has no correction of it" for s in without}
+
+
+@dataclass(frozen=True, order=True)
+class Clip:
+    """The words that the parts of a RAVDESS file's name stand for."""
+
+    channel: str
+    emotion: str
+    intensity: str
+    statement: str
+    repetition: int
+    actor: str
+
+    @property
+    def sequence(self) -> str:
+        """The clip's name as an expression: ``happy_strong_kids_1``, of songs ``song_...``."""
+        words = [self.emotion, self.intensity, self.statement, str(self.repetition)]
+        return "_".join(["song", *words] if self.channel == "song" else words)
+
+
+def parse_name(stem: str) -> Clip | None:
+    """Parses a file's name without its ending; None where it is not one of RAVDESS."""
+    match = NAME.fullmatch(stem)
+    if match is None:
+        return None
+    channel, emotion, intensity, statement, repetition, actor = match.groups()
+    return Clip(
+        CHANNELS[channel], EMOTIONS[emotion], INTENSITIES[intensity], STATEMENTS[statement],
+        int(repetition), actor,
+    )  # fmt: skip
+
+
+def _clips(path: Path) -> dict[Path, Clip | None]:
+    files = [path] if path.is_file() else sorted(path.iterdir())
+    return {file: parse_name(file.stem) for file in files if fits_video(file)}
+
+
+def fits_ravdess(path: Path) -> bool:
+    """Returns whether a path is a clip of RAVDESS or a folder of such clips."""
+    return any(_clips(path).values())
+
+
+def actor_of(path: Path) -> str:
+    """Returns the actor's folder name in RAVDESS, such as ``Actor_01``.
+
+    Raises:
+        CaptureError: the folder holds several actors.
+    """
+    actors = sorted({clip.actor for clip in _clips(path).values() if clip})
+    if len(actors) != 1:
+        raise CaptureError(
+            f"{path}: holds actors {', '.join(actors[:4])}, expected one actor per folder"
+        )
+    return f"Actor_{actors[0]}"
+
+
+def read_actor(path: Path, selection: Selection) -> RawCapture:
+    """Reads an actor's clips; of a clip with and without sound the one with sound is taken.
+
+    Raises:
+        CaptureError: no clip can be used.
+    """
+    clips = _clips(path)
+    check_selection(selection, [clip.sequence for clip in clips.values() if clip], ["front"])
+    skipped: dict[str, str] = {}
+    taken: dict[str, tuple[Clip, str]] = {}
+    for file, clip in clips.items():
+        if clip is None:
+            skipped[f"file {file.name}"] = "its name is not one of RAVDESS"
+        elif not selection.has_sequence(clip.sequence):
+            skipped[f"file {file.name}"] = "not asked for"
+        elif clip.sequence in taken:  # sorted by name: the one with sound came first
+            skipped[f"file {file.name}"] = f"the same clip as {taken[clip.sequence][1]}"
+        else:
+            taken[clip.sequence] = clip, file.name
+    if not taken:
+        raise CaptureError(
+            f"{path}: no clip can be used; expected such as 01-01-03-02-01-01-05.mp4"
+        )
+    rows = sorted(taken.values())
+    root = path if path.is_dir() else path.parent
+    names = tuple(name for _, name in rows)
+    return RawCapture(
+        root=root,
+        subject=actor_of(path),
+        fps=video_fps(root / names[0]),
+        meta={
+            "licence": "CC BY-NC-SA 4.0",
+            "gender": "male" if int(rows[0][0].actor) % 2 else "female",
+        },
+        cameras={"front": RawCamera(id="front", kind="videos", path=root, names=names)},
+        clips=tuple(selection.expression(clip.sequence) for clip, _ in rows),
+        skipped=skipped,
+        found={"emotions": sorted({clip.emotion for clip, _ in rows})},
+    )
+
+
+def fits_video(path: Path) -> bool:
+    """Returns whether a path is a video file."""
+    return path.is_file() and path.suffix.lower() in VIDEO_SUFFIXES
+
+
+def video_id(path: Path) -> str:
+    """Returns the video's name as an id."""
+    return identifier(path.stem)
+
+
+def read_video(path: Path, selection: Selection) -> RawCapture:
+    """Reads a video as one camera and one clip, named ``clip`` unless the selection names it.
+
+    A video that lies on its side, as telephones store what they film upright, is read upright.
+
+    Raises:
+        CaptureError: it is not a video.
+    """
+    check_selection(selection, ["clip"], ["video"])
+    orientation = ORIENTATION[video_turn(path)]
+    camera = RawCamera(
+        id="video", kind="videos", path=path.parent, names=(path.name,), orientation=orientation
+    )
+    return RawCapture(
+        root=path.parent, subject=video_id(path), fps=video_fps(path), meta={},
+        cameras={"video": camera}, clips=(selection.expression("clip"),),
+    )  # fmt: skip

@@ -1,0 +1,433 @@
+"""Audit a dataset against its ledger: report what is wrong, and set aside what can be remade.
+
+Checked are captures, labels, the ledger, every stage's outputs (present, as published, made from
+the present inputs) and traces of withdrawn people.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import nullcontext
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from express50.capture.demographics import PUBLIC_KEYS
+from express50.contract.config import resolve_config
+from express50.contract.layout import Dataset, footage_root
+from express50.contract.stage import Stage
+from express50.dataset.withdraw import files_that, names_any_of, says, withdrawn
+from express50.errors import AnnotationError, ConfigError, Express50Error, FormatError
+from express50.files.digests import file_sha256, files_of, path_digest, text_digest
+from express50.runner.ledger import FileMark, Ledger, Made, Receipt
+from express50.runner.publish import clean_leftovers, hold_stages, is_running, set_aside
+from express50.runner.worker import fingerprint, input_digests
+from express50.shards.reader import read_entries
+from express50.shards.writer import verify
+
+WRONG_LABELS = ("identity", "window", "unknown", "unreadable")
+LabelProblems = Callable[[Dataset, list[str]], Iterable[Any]]
+# Damaged inputs may fail in any of these ways before a stage has checked them.
+BAD_INPUT = (Express50Error, OSError, ValueError, KeyError, TypeError)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Finding:
+    """Says what is wrong, where, and how to fix it.
+
+    Attributes:
+        kind: one word for programs, such as ``missing`` or ``changed``.
+        where: ``stage item``, or a file of the dataset.
+        what: is wrong, in words.
+        fix: how it was fixed, or how to fix it.
+        fixed: True once nothing is left to do but to run the stage.
+    """
+
+    kind: str
+    where: str
+    what: str
+    fix: str
+    fixed: bool = False
+
+
+@dataclass
+class Audit:
+    """Collects findings, notes on what is not a fault, files and bytes compared, bytes read."""
+
+    findings: list[Finding] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+    files: int = 0
+    bytes: int = 0
+    hashed: int = 0
+
+    @property
+    def sound(self) -> bool:
+        """True when nothing wrong is left."""
+        return all(finding.fixed for finding in self.findings)
+
+
+@dataclass(frozen=True)
+class Fault:
+    """Says what is wrong with one item; files that no run wrote (`foreign`) must not be moved."""
+
+    item: str
+    kind: str
+    what: str
+    foreign: bool = False
+
+
+def audit(
+    dataset: Dataset,
+    stages: Sequence[Stage],
+    *,
+    deep: bool = False,
+    fix: bool = False,
+    label_problems: LabelProblems = lambda dataset, subjects: (),
+    checkpoints: Sequence[Path] = (),
+) -> Audit:
+    """Check everything that the ledger knows, and set aside what can be made again.
+
+    Args:
+        dataset: the dataset.
+        stages: its stages in order.
+        deep: read every output's bytes; else only of files whose time of change is another.
+        fix: set wrong outputs aside and forget their receipts; nothing is deleted that no stage
+            can make again.
+        label_problems: checks the labels of subjects against their footage; records with ``kind``,
+            ``expression`` and ``what``.
+        checkpoints: files outside the dataset in which no withdrawn person may be named.
+
+    Raises:
+        StageError: a stage that is to be fixed is running.
+    """
+    dataset, result = Dataset(dataset.root.resolve()), Audit()
+    with hold_stages(dataset, [stage.name for stage in stages]) if fix else nullcontext():
+        # First, as a fix takes away what labels are compared with.
+        result.findings += _capture_findings(dataset)
+        result.findings += _label_findings(dataset, label_problems)
+        # Read-only where its folder is: such a connection leaves journals behind.
+        read_only = not os.access(dataset.root, os.W_OK)
+        if finding := _ledger_finding(dataset, fix, read_only):
+            result.findings.append(finding)
+        else:
+            with Ledger(dataset.ledger, read_only) as ledger:
+                _StageAudit(dataset, stages, ledger, result, deep, fix).run()
+        result.findings += _person_findings(dataset, checkpoints)
+    stale = [path for path in dataset.stale_dir.rglob("*") if path.is_file()]
+    if stale:
+        size = sum(path.stat().st_size for path in stale) / 1e6
+        result.notes.append(
+            f".stale: {len(stale)} files, {size:.1f} MB, of outputs set aside earlier, which"
+            " nothing reads; making an item again removes its own"
+        )
+    return result
+
+
+def _capture_findings(dataset: Dataset) -> Iterator[Finding]:
+    """Find captures that are gone, and subjects whose capture is not registered."""
+    try:
+        captures = dataset.captures()
+    except FormatError as error:
+        yield Finding(kind="capture", where="captures.json", what=str(error), fix="restore it")
+        return
+    fix = f"express50 ingest {dataset.root} CAPTURE, with its present place"
+    for subject, path in captures.items():
+        try:
+            what = "" if path.exists() and footage_root(path) else f"its capture {path} is gone"
+        except Express50Error as error:
+            what = str(error)
+        if what:
+            yield Finding(kind="capture", where=f"captures.json {subject}", what=what, fix=fix)
+    for subject in sorted(set(dataset.subjects()) - set(captures)):
+        what = "captures.json does not name its capture"
+        yield Finding(kind="capture", where=f"ingest {subject}", what=what, fix=fix)
+
+
+def _label_findings(dataset: Dataset, problems: LabelProblems) -> Iterator[Finding]:
+    """Find labels that point at frames, cameras or expressions that do not exist."""
+    known = set(dataset.subjects())
+    for path in sorted((dataset.root / "labels").glob("*.jsonl")):
+        where, subject = f"labels/{path.name}", path.stem
+        if subject not in known:
+            what, fix = f"{subject} is not ingested", "ingest the subject, or move the file away"
+            yield Finding(kind="label", where=where, what=what, fix=fix)
+            continue
+        try:
+            found = [p for p in problems(dataset, [subject]) if p.kind in WRONG_LABELS]
+        except AnnotationError as error:
+            yield Finding(kind="label", where=where, what=str(error), fix="restore the file")
+            continue
+        except Express50Error:  # the index is damaged, which is a finding of its own
+            continue
+        fix = (
+            f"express50 annotate ui {dataset.root}: undo it and mark the frame again (labels are"
+            " people's work and are never rewritten)"
+        )
+        for one in found:
+            yield Finding(kind="label", where=f"{where} {one.expression}", what=one.what, fix=fix)
+
+
+def _ledger_finding(dataset: Dataset, fix: bool, read_only: bool) -> Finding | None:
+    """Find a ledger that is missing or damaged; rename it, so that stages start a new one."""
+    again = f"express50 run {dataset.root}: every item is made again, to the same bytes"
+    what = "is missing; without it every output counts as made by nobody"
+    if dataset.ledger.is_file():
+        try:
+            with Ledger(dataset.ledger, read_only) as ledger:
+                ledger.check_whole()
+            return None
+        except FormatError as error:
+            what = str(error)
+        aside = f"ledger.sqlite.unreadable-{int(time.time())}"
+        for ending in ("", "-wal", "-shm") if fix else ():
+            path = dataset.root / f"ledger.sqlite{ending}"
+            if path.exists():
+                path.rename(dataset.root / f"{aside}{ending}")
+        again = f"set aside as {aside}; {again}" if fix else f"--fix, then {again}"
+    return Finding(kind="ledger", where="ledger.sqlite", what=what, fix=again, fixed=fix)
+
+
+def _person_findings(dataset: Dataset, checkpoints: Sequence[Path]) -> Iterator[Finding]:
+    if not (digests := withdrawn(dataset)):
+        return
+    test = names_any_of(digests)
+    for path in [*files_that(test, dataset.root), *(p for p in checkpoints if says(p, test))]:
+        inside = path.is_relative_to(dataset.root)
+        yield Finding(
+            kind="person",
+            where=str(path.relative_to(dataset.root) if inside else path),
+            what="names a person who was withdrawn",
+            fix=f"express50 subject withdraw {dataset.root} ID --yes again (--checkpoint for one "
+            "outside the dataset), or delete it",
+        )
+
+
+class _StageAudit:
+    """Passes over the stages once; state: which subjects were found broken on the way."""
+
+    def __init__(
+        self,
+        dataset: Dataset,
+        stages: Sequence[Stage],
+        ledger: Ledger,
+        result: Audit,
+        deep: bool,
+        fix: bool,
+    ) -> None:
+        self.dataset, self.stages, self.ledger = dataset, stages, ledger
+        self.result, self.deep, self.fix = result, deep, fix
+        captures = [f.where for f in result.findings if f.kind == "capture"]
+        # Subjects of damaged items, "" is all; a capture that is gone has its own finding.
+        self.broken = {where.removeprefix("captures.json").split(" ")[-1] for where in captures}
+        self.receipts = {stage.name: ledger.read(stage.name) for stage in stages}
+        self.made = {stage.name: ledger.made(stage.name) for stage in stages}
+        sha256 = file_sha256 if deep else ledger.sha256
+        self.digest = _published_digest(dataset, self.made, sha256)
+
+    def run(self) -> None:
+        """Audit each stage; what an earlier one lacks is not held against a later one."""
+        for stage in self.stages:
+            if not self.fix and is_running(self.dataset, stage.name):
+                self._note(stage, "runs now; its items were not looked at")
+                self.broken.add("")
+                continue
+            if found := list(self.dataset.staging_dir.glob(f"{stage.name}-*")):
+                if self.fix:
+                    clean_leftovers(self.dataset, stage.name)
+                what = f"{len(found)} unfinished outputs of a run that was killed"
+                how = "deleted" if self.fix else "--fix deletes them, as the next run would"
+                self._find("leftover", f".staging {stage.name}", what, how, self.fix)
+            self._stage(stage)
+        if self.fix:
+            self.ledger.keep_digests()
+
+    def _stage(self, stage: Stage) -> None:
+        try:
+            known = set(stage.items(self.dataset))
+        except BAD_INPUT:  # what names the items is damaged
+            known = None
+        receipts = self.receipts[stage.name]
+        faults = list(self._output_faults(stage.name))
+        if stage.name == "ingest":
+            faults += self._personal_faults(receipts.keys() - {fault.item for fault in faults})
+        wrong = {fault.item for fault in faults}
+        for fault in faults:
+            self._settle(stage.name, fault, known is None or fault.item in known)
+        sound = {k: r for k, r in receipts.items() if k not in wrong and r.status == "done"}
+        if sound:
+            self._judge(stage, sound)
+        failed = {item for item, receipt in receipts.items() if receipt.status == "failed"}
+        to_do = (known or set()) - receipts.keys() - wrong
+        # None of these has an output: what was made of a former one is right once it is back.
+        self.broken |= {item.split("/")[0] for item in wrong | failed | to_do}
+        if to_do and receipts:
+            count = f"{len(to_do)} of {len(known or ())} items are to do"
+            self._note(stage, f"{count}; run 'express50 {stage.name}'")
+        if failed:
+            self._note(stage, f"{len(failed)} items failed; see status")
+
+    def _output_faults(self, stage: str) -> Iterator[Fault]:
+        """Find outputs that are missing, changed or unaccounted for, at most one fault per item."""
+        top = self.dataset.stage_dir(stage)
+        there = {p.parent.relative_to(top).as_posix() for p in top.glob("*/metrics.json")}
+        nested = (p.parent.relative_to(top) for p in top.glob("*/*/metrics.json"))
+        there |= {path.as_posix() for path in nested if path.parts[0] not in there}
+        done = {i for i, r in self.receipts[stage].items() if r.status == "done"}
+        made = self.made[stage]
+        for item in sorted(done):
+            if item not in there:
+                yield Fault(item, "missing", "the ledger has a receipt, its output is gone")
+            elif item in made and (fault := self._changed(stage, item, made[item].files)):
+                yield fault
+        for item in sorted(there - (done & made.keys())):
+            what = "an output without a receipt: its run did not end, or no run made it"
+            yield Fault(item, "unknown", what)
+
+    def _changed(self, stage: str, item: str, marks: Mapping[str, FileMark]) -> Fault | None:
+        folder = self.dataset.item_dir(stage, item)
+        there = {path.relative_to(folder).as_posix(): path for path in files_of(folder)}
+        gone = sorted(marks.keys() - there.keys())
+        shared = sorted(marks.keys() & there.keys())
+        other = [name for name in shared if self._differs(there[name], marks[name])]
+        foreign = sorted(there.keys() - marks.keys())
+        states = {"gone": gone, "not as published": other, "written by no run": foreign}
+        words = [f"{_few(names)} {state}" for state, names in states.items() if names]
+        if words:
+            kind = "missing" if gone else "changed" if other else "foreign"
+            return Fault(item, kind, ", ".join(words), bool(foreign))
+        if not {"index.json", "manifest.json"} <= there.keys():
+            return None
+        try:  # the shards' own checksums: all of them, or only whether index and sizes fit
+            read_entries(folder)
+            faults = verify(folder) if self.deep else []
+        except FormatError as error:
+            faults = [str(error)]
+        return Fault(item, "shards", _few(faults)) if faults else None
+
+    def _differs(self, path: Path, mark: FileMark) -> bool:
+        """Compare a file's bytes; a copy has another time, so time alone is not evidence."""
+        stat = path.stat()
+        self.result.files += 1
+        self.result.bytes += stat.st_size
+        if stat.st_size != mark.size:
+            return True
+        if not self.deep and stat.st_mtime_ns == mark.mtime_ns:
+            return False
+        self.result.hashed += stat.st_size
+        return file_sha256(path) != mark.sha256
+
+    def _personal_faults(self, subjects: set[str]) -> Iterator[Fault]:
+        """Find indices that hold keys of capture.toml which must stay outside the dataset."""
+        for subject in sorted(subjects):
+            try:
+                table = json.loads(self.dataset.index_file(subject).read_text(encoding="utf-8"))
+                keys = sorted(set(table["meta"]) - PUBLIC_KEYS)
+            except (OSError, ValueError, KeyError, TypeError):  # damaged: found elsewhere
+                continue
+            if keys:
+                what = f"index.json holds {', '.join(keys)} of capture.toml, which stay outside"
+                yield Fault(subject, "personal", what)
+
+    def _settle(self, stage: str, fault: Fault, known: bool) -> None:
+        """Set a faulty item aside where its stage can make it again."""
+        again, fixed = f"express50 {stage} {self.dataset.root}", False
+        if fault.foreign:
+            how = "move what no run wrote out of the folder, then check again"
+        elif not known and fault.kind == "unknown":
+            how = f"{stage} has no such item now; move it away if nobody needs it"
+        elif self.fix:
+            fixed, how = True, f"set aside; make it again: {again}"
+            set_aside(self.dataset, stage, fault.item)
+            self.ledger.forget(stage, [fault.item])
+        else:
+            how = f"--fix, then {again}" if known else "--fix; the stage has no such item now"
+        self._find(fault.kind, f"{stage} {fault.item}", fault.what, how, fixed)
+
+    def _judge(self, stage: Stage, receipts: dict[str, Receipt]) -> None:
+        """Report items that were made from other inputs, with other settings or another version."""
+        path, name = self.dataset.config_file(stage.name), stage.name
+        again = f"express50 {name} {self.dataset.root}"
+        try:
+            config = resolve_config(stage, "standard", path, (), [s.name for s in self.stages])
+        except ConfigError as error:
+            how = f"{again}, with the settings that you want"
+            self._find("config", f"config/{path.name}", str(error), how)
+            return
+        unreadable: dict[str, list[str]] = {}
+        other_settings = 0
+        for item, receipt in receipts.items():
+            try:
+                now = input_digests(stage, self.dataset, item, config, self.digest)
+            except BAD_INPUT as error:
+                unreadable.setdefault(f"{type(error).__name__}: {error}", []).append(item)
+                continue
+            if fingerprint(stage, config, now) == receipt.fingerprint:
+                continue
+            before = self.made[name][item].inputs
+            changed = [k for k in sorted(before.keys() | now.keys()) if before.get(k) != now.get(k)]
+            if not changed:
+                other_settings += 1
+            elif self._waits(item):
+                self._note(stage, f"{item} cannot be judged before what it reads is made again")
+            else:
+                what = f"made from another {_few(changed)} than is there now"
+                self._settle(name, Fault(item, "outdated", what), True)
+        for reason, items in unreadable.items():
+            if not all(self._waits(item) for item in items):
+                what = f"its inputs cannot be read: {reason}"
+                self._find("unreadable", f"{name} {_few(items, 1)}", what, again)
+        if other_settings:
+            words = "items were made with other settings or by another version"
+            self._note(stage, f"{other_settings} {words}; the next run makes them again")
+
+    def _waits(self, item: str) -> bool:
+        """True if something that the item may read is broken."""
+        subject = item.split("/")[0]
+        known = subject in self.receipts[self.stages[0].name]
+        return bool(self.broken & {"", subject}) or (bool(self.broken) and not known)
+
+    def _note(self, stage: Stage, words: str) -> None:
+        self.result.notes.append(f"{stage.name}: {words}")
+
+    def _find(self, kind: str, where: str, what: str, how: str, fixed: bool = False) -> None:
+        finding = Finding(kind=kind, where=where, what=what, fix=how, fixed=fixed)
+        self.result.findings.append(finding)
+
+
+def _published_digest(
+    dataset: Dataset, made: Mapping[str, Mapping[str, Made]], sha256: Callable[[Path], str]
+) -> Callable[[Path], str]:
+    """Return a function that digests paths as `path_digest` does, with files as published.
+
+    A damaged file is made again to the same bytes, and does not make wrong what was made of the
+    good one. Paths that no stage published count as they are.
+    """
+    known: dict[Path, str] = {}
+    below: dict[Path, list[Path]] = {}
+    for stage, items in made.items():
+        for item, row in items.items():
+            for name, mark in row.files.items():
+                path = dataset.item_dir(stage, item) / name
+                known[path] = mark.sha256
+                for parent in path.parents[: len(path.relative_to(dataset.root).parts) - 1]:
+                    below.setdefault(parent, []).append(path)
+
+    def digest(path: Path) -> str:
+        if path not in known and path not in below:
+            known[path] = path_digest(path, sha256)
+        elif path not in known:
+            files = sorted(below[path])
+            rows = (f"{file.relative_to(path).as_posix()} {known[file]}" for file in files)
+            known[path] = text_digest("\n".join(rows))
+        return known[path]
+
+    return digest
+
+
+def _few(names: Sequence[str], count: int = 3) -> str:
+    """List the first names, then how many more there are."""
+    more = f" and {len(names) - count} more" if len(names) > count else ""
+    return ", ".join(names[:count]) + more

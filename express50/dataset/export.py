@@ -1,0 +1,249 @@
+"""Choose tracked heads to export, write them as OBJ, PLY or GLB, and publish each subject's folder.
+
+Meshes are in the user's world, metres. OBJ keeps the head model's vertices and their order, with
+texture coordinates per corner; PLY keeps them with a colour each; GLB repeats vertices along the
+seams of the texture, as glTF wants them.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image
+
+from express50.contract.layout import Dataset, exclusion_reason, included_subjects
+from express50.dataset.tracks import OF_FRAMES, Track, existing_track, read_sequence, read_track
+from express50.errors import FormatError, StageError
+from express50.files.atomic import dump_json, folder_in_one_step
+from express50.files.images import encode_png, read_image
+from express50.geometry.conventions import corner_to_cell
+from express50.geometry.meshes import write_glb, write_obj, write_ply
+from express50.head.load import load_head
+from express50.head.model import HeadModel, pose
+
+META = "export.json"
+TEXTURE = "albedo.png"
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Head:
+    """Holds a subject's tracked head.
+
+    Attributes:
+        subject: its id.
+        track: the chosen rows of its track.
+        model: the head model it was tracked with.
+        albedo: (H, W, 3) uint8 sRGB texture, its first row at v = 1; None where there is none.
+    """
+
+    subject: str
+    track: Track
+    model: HeadModel
+    albedo: np.ndarray | None
+
+    def meta(self, kind: str) -> dict:
+        """Make the part of ``export.json`` that all formats share."""
+        return {
+            "schema": "express50.export/1",
+            "format": kind,
+            "subject": self.subject,
+            "head": self.model.name,
+            "units": "metres",
+        }
+
+
+def tracked_subjects(dataset: Dataset, wanted: Sequence[str]) -> list[str]:
+    """List the wanted subjects, or all that are tracked and not excluded.
+
+    Raises:
+        StageError: a wanted one is unknown, excluded or not tracked, or none is tracked.
+    """
+    known = dataset.subjects()
+    for name in wanted:
+        if name not in known:
+            listed = ", ".join(known) or "none"
+            raise StageError(f"{dataset.root}: no subject {name!r}; expected one of {listed}")
+        if (reason := exclusion_reason(dataset, name)) is not None:
+            raise StageError(f"{name}: is excluded ({reason}); it is not exported")
+        existing_track(dataset, name)
+    if wanted:
+        return list(dict.fromkeys(wanted))
+    found = [s for s in included_subjects(dataset) if dataset.track_file(s).is_file()]
+    if not found:
+        raise StageError(f"{dataset.root}: nothing is tracked; run 'express50 track' first")
+    return found
+
+
+def read_tracked(dataset: Dataset, subject: str, expressions: Sequence[str]) -> Head:
+    """Read a subject's head with the wanted expressions, or all, in the track's order.
+
+    Raises:
+        StageError: the subject or a wanted expression is not tracked.
+        FormatError: the track is damaged or does not fit its head model.
+        HeadModelError: the head model cannot be loaded.
+    """
+    path = existing_track(dataset, subject)
+    track = read_track(path)
+    unknown = sorted(set(expressions) - set(track.expressions))
+    if unknown:
+        raise StageError(
+            f"{subject}: {', '.join(unknown)} not tracked; expected some of"
+            f" {', '.join(track.expressions)}"
+        )
+    model = load_head(track.head)
+    counts = {
+        "vertices": (track.vertices.shape[1], len(model.template)),
+        "shape": (len(track.shape), model.shape_dirs.shape[2]),
+        "expression": (track.expression.shape[1], model.expression_dirs.shape[2]),
+    }
+    for name, (got, there) in counts.items():
+        if got > there or (name == "vertices" and got != there):
+            raise FormatError(
+                f"{path}: {got} {name}, its head model {model.name!r} has {there};"
+                " run 'express50 track' again"
+            )
+    if expressions:
+        names = tuple(name for name in track.expressions if name in expressions)
+        rows = [track.row(name) for name in names]
+        parts = {name: getattr(track, name)[rows] for name in (*OF_FRAMES, "vertices")}
+        track = replace(track, expressions=names, **parts)
+    return Head(subject=subject, track=track, model=model, albedo=read_albedo(path.parent))
+
+
+def with_clips(dataset: Dataset, head: Head, wanted: Sequence[str]) -> Head:
+    """Put every tracked frame of a head's clips in the place of its peaks.
+
+    The frames' names are the clip's and the frame's, such as ``smile_000123``; where clips are
+    wanted by id, others are left out.
+
+    Raises:
+        StageError: its clips are not tracked, or none of these.
+        FormatError: they are damaged, or were tracked with another head model.
+    """
+    path = existing_track(dataset, head.subject).with_name("sequence.npz")
+    clips, track = read_sequence(path), head.track
+    if clips.head != track.head or len(clips.shape) != len(track.shape):
+        raise FormatError(f"{path}: is not of the track beside it; run 'express50 track' again")
+    rows = [i for i, cue in enumerate(clips.cues) if not wanted or cue in wanted]
+    if not rows:
+        raise StageError(f"{path}: holds no frame of {', '.join(wanted) or 'any clip'}")
+    own = {name: getattr(clips, name)[rows] for name in OF_FRAMES}
+    names = tuple(f"{clips.cues[i]}_{clips.frames[i]:06d}" for i in rows)
+    model = head.model.to(dtype=torch.float64)
+    vertices = []
+    for i in range(len(rows)):  # one after the other: all frames at once may not fit the memory
+        shape, expression, neck, jaw, eyes, offsets = (
+            torch.from_numpy(np.asarray(array, np.float64))[None]
+            for array in (
+                track.shape, own["expression"][i], own["neck"][i], own["jaw"][i], own["eyes"][i],
+                track.offsets,
+            )
+        )  # fmt: skip
+        posed = pose(model, shape, expression, neck=neck, jaw=jaw, eyes=eyes, offsets=offsets)[0]
+        vertices.append((posed.numpy() @ own["R"][i].T + own["t"][i]).astype(np.float32))
+    track = replace(track, expressions=names, vertices=np.stack(vertices), **own)
+    return replace(head, track=track)
+
+
+def read_albedo(folder: Path) -> np.ndarray | None:
+    """Read the texture beside a track, if there is one.
+
+    Raises:
+        FormatError: it is not an 8-bit colour image.
+    """
+    path = folder / TEXTURE
+    if not path.is_file():
+        return None
+    image = read_image(path)
+    if image.ndim != 3 or image.dtype != np.uint8:
+        raise FormatError(f"{path}: {image.dtype} {image.shape}, expected 8-bit RGB; track again")
+    return np.ascontiguousarray(image[..., :3])
+
+
+@contextmanager
+def exporting(out: Path, subject: str) -> Iterator[Path]:
+    """Yield an empty folder aside; on a clean exit it becomes ``out/subject`` in one rename.
+
+    A former export of the subject is replaced; what a killed run left aside is deleted.
+
+    Raises:
+        StageError: ``out/subject`` holds something else than an export.
+    """
+    target, aside = out / subject, out / f".{subject}.part"
+    if target.exists() and not (target / META).is_file():
+        raise StageError(
+            f"{target}: exists and holds no {META}, so it is not an export; name another folder"
+        )
+    former = aside.with_name(aside.name + ".former")
+    if former.exists() and not target.exists():
+        former.rename(target)
+    shutil.rmtree(former, ignore_errors=True)
+    with folder_in_one_step(aside, target):
+        yield aside
+
+
+def export_meshes(head: Head, kind: str, out: Path) -> dict:
+    """Write ``<expression>.<kind>`` of every expression into an empty folder; returns the meta."""
+    model, faces = head.model, head.model.faces.numpy()
+    texture = None if head.albedo is None else TEXTURE
+    if head.albedo is not None and kind == "obj":
+        (out / TEXTURE).write_bytes(encode_png(head.albedo))
+    for name, vertices in zip(head.track.expressions, head.track.vertices, strict=True):
+        path = out / f"{name}.{kind}"
+        if kind == "obj":
+            write_head_obj(path, vertices, model, texture)
+        elif kind == "ply":
+            columns = {} if head.albedo is None else _vertex_colours(model, head.albedo)
+            write_ply(path, vertices, faces, columns)
+        else:
+            _write_head_glb(path, vertices, model, head.albedo)
+    meta = head.meta(kind) | {
+        "expressions": list(head.track.expressions),
+        "frames": head.track.frames.tolist(),
+        "textured": head.albedo is not None,
+        "world_from_export": np.eye(4).tolist(),
+    }
+    (out / META).write_bytes(dump_json(meta))
+    return meta
+
+
+def write_head_obj(
+    path: Path, vertices: np.ndarray, model: HeadModel, texture: str | None = None
+) -> None:
+    """Write vertices (V, 3) with the head model's faces and texture coordinates as OBJ."""
+    faces, uv_faces = model.faces.numpy(), model.uv_faces.numpy()
+    write_obj(path, vertices, faces, model.uv.double().numpy(), uv_faces, texture)
+
+
+def _write_head_glb(
+    path: Path, vertices: np.ndarray, model: HeadModel, albedo: np.ndarray | None
+) -> None:
+    """Write a binary glTF file, with the albedo (H, W, 3) uint8 sRGB as its texture."""
+    pairs = np.stack([model.faces.numpy(), model.uv_faces.numpy()], -1).reshape(-1, 2)
+    unique, corners = np.unique(pairs, axis=0, return_inverse=True)
+    write_glb(
+        path,
+        "head",
+        vertices[unique[:, 0]],
+        corners.reshape(-1, 3),
+        uv=model.uv.numpy()[unique[:, 1]],
+        baseColorTexture=None if albedo is None else Image.fromarray(albedo),
+        baseColorFactor=[255, 255, 255, 255] if albedo is not None else [190, 190, 190, 255],
+    )
+
+
+def _vertex_colours(model: HeadModel, albedo: np.ndarray) -> dict[str, np.ndarray]:
+    """Sample the texture (H, W, 3) uint8 at the vertices: (V,) uint8 by name of the channel."""
+    height, width = albedo.shape[:2]
+    uv = np.zeros((len(model.template), 2))
+    uv[model.faces.numpy().ravel()] = model.uv.numpy()[model.uv_faces.numpy().ravel()]
+    places = corner_to_cell(np.stack([uv[:, 0] * width, (1 - uv[:, 1]) * height], -1))
+    column, row = np.rint(places).astype(int).T
+    colours = albedo[row.clip(0, height - 1), column.clip(0, width - 1)]
+    return {name: colours[:, k] for k, name in enumerate(("red", "green", "blue"))}

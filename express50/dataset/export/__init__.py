@@ -1,1 +1,0 @@
-"""Tracked heads in the layouts of other tools: GaussianAvatars, OBJ, PLY, GLB."""

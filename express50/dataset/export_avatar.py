@@ -1,0 +1,346 @@
+"""Write tracked heads in the layout that GaussianAvatars and VHAP read.
+
+One time step per expression: ``images/<step>_<camera>.png``, ``fg_masks/``,
+``flame_param/<step>.npz``, and ``transforms*.json`` with OpenGL camera-to-world matrices.
+
+FLAME turns a head about its root joint J, we about the origin: R (x - J) + J + T = R x + t gives
+T = t + R J - J, where J is regressed from the shaped vertices, expression and static offset
+included.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+
+from express50.capture.frames import read_cameras_of, read_gains, read_peak_frame
+from express50.contract.layout import Dataset
+from express50.dataset.export import META, Head, write_head_obj
+from express50.dataset.tracks import Track
+from express50.errors import CaptureError, ConfigError, FormatError, StageError
+from express50.files.atomic import dump_json
+from express50.files.images import encode_png, read_alpha, resize_area, scale_light
+from express50.geometry.cameras import Camera, pinhole_camera, scale_camera, transform_camera
+from express50.geometry.conventions import affine_to_opencv, opengl_from_cam_from_world
+from express50.geometry.transforms import make_transform, matrix_to_axis_angle
+from express50.head.model import HeadModel, rest_vertices
+from express50.head.mouth import FLAME_VERTICES as BARE_VERTICES
+from express50.head.mouth import TOOTH_VERTICES
+
+BACKGROUNDS = {"alpha": None, "white": 255, "black": 0}
+FLAME_VERTICES = BARE_VERTICES + TOOTH_VERTICES  # of the layout's FLAME
+FLAME_SHAPES, FLAME_EXPRESSIONS = 300, 100  # its readers expect that many, or zeros
+CANONICAL_JAW = 0.3  # radians
+# From there on, single precision rounds by more than a micrometre: the world is moved by whole
+# metres.
+FAR_M = 16.0
+NEAR_PX = 0.02  # what centring would move pixels by at most: not worth an interpolation
+
+
+@dataclass(frozen=True, kw_only=True)
+class AvatarOptions:
+    """Says how a data set is laid out.
+
+    Attributes:
+        background: ``alpha`` (pictures keep it), or the colour behind the head.
+        head_only: alpha of the head without the torso, from the regions stage.
+        downscale: whole number of times that pictures are smaller than the footage.
+        even_colour: divide each camera's colour gain, as calibrate measured it, out of its light.
+        test_expressions: those held back for testing; None: the last three tenths.
+        validation_camera: held back in training; None: the last.
+    """
+
+    background: str = "alpha"
+    head_only: bool = False
+    downscale: int = 1
+    even_colour: bool = False
+    test_expressions: tuple[str, ...] | None = None
+    validation_camera: str | None = None
+
+
+def export_avatar(dataset: Dataset, head: Head, options: AvatarOptions, out: Path) -> dict:
+    """Write one subject's data set into the empty folder ``out``; returns its meta.
+
+    Raises:
+        StageError: no view of any expression has a matte.
+        ConfigError: an option names a missing camera or expression.
+    """
+    cameras = read_cameras_of(dataset, head.subject)
+    _check_options(head.track, cameras, options)
+    centre = head.track.vertices.mean((0, 1), dtype=np.float64)
+    far = np.abs(centre).max() > FAR_M
+    shift, factor = np.rint(centre) if far else np.zeros(3), options.downscale
+    targets = {name: centred(camera, factor) for name, camera in cameras.items()}
+    move = make_transform(np.eye(3), -shift)
+    shown = {
+        name: transform_camera(scale_camera(one, 1 / factor, 1 / factor), move)
+        for name, one in targets.items()
+    }
+    for folder in ("images", "fg_masks"):
+        (out / folder).mkdir()
+    frames: list[dict] = []
+    steps: list[str] = []
+    dropped: list[dict[str, str]] = []
+    for name, frame in zip(head.track.expressions, head.track.frames.tolist(), strict=True):
+        before = len(frames)
+        for number, (camera_id, camera) in enumerate(cameras.items()):
+            file = f"{len(steps):05d}_{number:02d}.png"
+            item = f"{head.subject}/{name}"
+            try:
+                _write_view(dataset, item, camera, targets[camera_id], options, out, file)
+            except (CaptureError, FormatError, StageError) as error:
+                dropped.append({"what": f"{name}/{camera_id}", "why": str(error)})
+                continue
+            ids = {"timestep_index": len(steps), "timestep_index_original": frame,
+                   "timestep_id": name, "camera_index": number}  # fmt: skip
+            frames.append(ids | _described(shown[camera_id], file))
+        if len(frames) > before:
+            steps.append(name)
+    if not frames:
+        reasons = "; ".join(sorted({row["why"] for row in dropped})[:3])
+        raise StageError(f"{head.subject}: no view can be exported ({reasons})")
+    write_parameters(head, steps, shift, out)
+    for row in frames:
+        step = f"{row['timestep_index']:05d}"
+        row["flame_param_path"] = f"flame_param/{step}.npz"
+        if not _is_flame(head.model):
+            row["mesh_path"] = f"meshes/{step}.obj"
+    _write_tables(frames, steps, sorted(cameras), options, out)
+    meta = _meta(head, steps, sorted(cameras), shift, options)
+    meta["cameras_centred"] = [name for name in targets if targets[name] is not cameras[name]]
+    meta |= {"read": len(frames) + len(dropped), "views": len(frames), "dropped": dropped}
+    (out / META).write_bytes(dump_json(meta))
+    return meta
+
+
+def _check_options(track: Track, cameras: dict[str, Camera], options: AvatarOptions) -> None:
+    if not 1 <= options.downscale <= min(min(c.width, c.height) for c in cameras.values()):
+        raise ConfigError(
+            f"downscale {options.downscale}: expected 1 (full size) up to the images' height"
+        )
+    unknown = sorted(set(options.test_expressions or ()) - set(track.expressions))
+    if unknown:
+        raise ConfigError(
+            f"test expressions {', '.join(unknown)}: expected some of"
+            f" {', '.join(track.expressions)}"
+        )
+    if set(options.test_expressions or ()) >= set(track.expressions):
+        raise ConfigError("test expressions: all of them are, which leaves none to train on")
+    if options.validation_camera not in (None, *cameras):
+        raise ConfigError(
+            f"validation camera {options.validation_camera!r}: expected one of {', '.join(cameras)}"
+        )
+
+
+def _write_view(
+    dataset: Dataset,
+    item: str,
+    camera: Camera,
+    target: Camera,
+    options: AvatarOptions,
+    out: Path,
+    file: str,
+) -> None:
+    """Write an undistorted frame and its matte as the target camera sees them.
+
+    Raises:
+        CaptureError, FormatError, StageError: one of them is missing or damaged.
+    """
+    subject, expression = item.split("/")
+    path, stage = dataset.matte_file(subject, expression, camera.id), "matte"
+    if options.head_only:
+        path, stage = dataset.item_dir("regions", item) / f"{camera.id}_head.png", "regions"
+    if not path.is_file():
+        raise StageError(f"it has no {path.name} of stage {stage}; run 'express50 {stage}'")
+    alpha = read_alpha(path)
+    if alpha.shape != (camera.height, camera.width):
+        raise FormatError(
+            f"{path}: {alpha.shape[1]}x{alpha.shape[0]}, expected the camera's"
+            f" {camera.width}x{camera.height}; run 'express50 {stage}' again"
+        )
+    image = read_peak_frame(dataset, subject, expression, camera.id)
+    gain = read_gains(dataset, subject).get(camera.id) if options.even_colour else None
+    image = image if gain is None else scale_light(image, 1.0 / gain)
+    image, alpha = (seen_by(one, camera, target, options.downscale) for one in (image, alpha))
+    level = BACKGROUNDS[options.background]
+    if level is None:  # colours are not multiplied by the opacity
+        pixels = np.ascontiguousarray(np.concatenate([image[..., ::-1], alpha[..., None]], -1))
+        data = cv2.imencode(".png", pixels, [cv2.IMWRITE_PNG_COMPRESSION, 3])[1].tobytes()
+    else:
+        share = alpha[..., None] / np.float32(255)
+        data = encode_png(np.rint(image * share + level * (1 - share)).astype(np.uint8))
+    (out / "images" / file).write_bytes(data)
+    (out / "fg_masks" / file).write_bytes(encode_png(alpha))
+
+
+def _described(camera: Camera, file: str) -> dict[str, object]:
+    """Make the part of a frame of transforms.json that depends on its camera."""
+    K = camera.K
+    return {
+        "camera_id": camera.id,
+        "cx": K[0, 2], "cy": K[1, 2], "fl_x": K[0, 0], "fl_y": K[1, 1],
+        "w": camera.width, "h": camera.height,
+        "camera_angle_x": 2 * math.atan(camera.width / (2 * K[0, 0])),
+        "camera_angle_y": 2 * math.atan(camera.height / (2 * K[1, 1])),
+        "transform_matrix": opengl_from_cam_from_world(camera.cam_from_world).tolist(),
+        "file_path": f"images/{file}",
+        "fg_mask_path": f"fg_masks/{file}",
+    }  # fmt: skip
+
+
+def _write_tables(
+    frames: list[dict], steps: list[str], cameras: list[str], options: AvatarOptions, out: Path
+) -> None:
+    """Write transforms.json and its division into training, validation and test."""
+    held = options.test_expressions
+    train = math.ceil(0.7 * len(steps))
+    test = [k for k, name in enumerate(steps) if (k >= train if held is None else name in held)]
+    rest = [k for k in range(len(steps)) if k not in test]
+    numbers = list(range(len(cameras)))
+    chosen = cameras.index(options.validation_camera) if options.validation_camera else -1
+    validation = [numbers[chosen]] if len(cameras) > 1 else []
+    training = [k for k in numbers if k not in validation]
+    for suffix, steps_of, cameras_of in (
+        ("", list(range(len(steps))), numbers),
+        ("_train", rest, training),
+        ("_val", rest, validation),
+        ("_test", test, numbers),
+    ):
+        rows = [
+            row
+            for row in frames
+            if row["timestep_index"] in steps_of and row["camera_index"] in cameras_of
+        ]
+        table = {"frames": rows, "timestep_indices": steps_of, "camera_indices": cameras_of}
+        (out / f"transforms{suffix}.json").write_bytes(dump_json(table))
+
+
+def _meta(
+    head: Head, steps: list[str], cameras: list[str], shift: np.ndarray, options: AvatarOptions
+) -> dict:
+    flame = _is_flame(head.model)
+    meta = head.meta("gaussian-avatars") | {
+        "expressions": steps,
+        "cameras": cameras,
+        "background": options.background,
+        "downscale": options.downscale,
+        "even_colour": options.even_colour,
+        "masks": "head" if options.head_only else "matte",
+        "world_from_export": make_transform(np.eye(3), shift).tolist(),
+        "vertices": "rotation about the root joint, then translation, as FLAME has it",
+        "coefficients": "FLAME" if flame else "the head model's own",
+    }
+    if not flame:
+        meta["shape_names"] = list(head.model.shape_names)
+        meta["expression_names"] = list(head.model.expression_names)
+        meta["meshes"] = "meshes/<step>.obj, the tracked vertices; no FLAME model gives them"
+    return meta
+
+
+def centred(camera: Camera, factor: int = 1) -> Camera:
+    """Make a pinhole camera at the same place whose image holds the given one's whole view.
+
+    Its focal lengths are equal, its principal point is the middle, and ``factor`` divides its size.
+    The camera itself, where that is true of it already, to NEAR_PX.
+    """
+    K = camera.K
+    f = K[0, 0]
+    away = np.abs(K[:2, 2] - (camera.width / 2, camera.height / 2)).max()
+    divided = camera.width % factor == camera.height % factor == 0
+    if divided and away + abs(K[1, 1] / f - 1) * camera.height <= NEAR_PX:
+        return camera
+    width = _whole(2 * max(K[0, 2], camera.width - K[0, 2]), factor)
+    height = _whole(2 * max(K[1, 2], camera.height - K[1, 2]) * f / K[1, 1], factor)
+    square = np.array([[f, 0, width / 2], [0, f, height / 2], [0, 0, 1.0]])
+    return pinhole_camera(camera.id, square, width, height, camera.cam_from_world)
+
+
+def _whole(length: float, factor: int) -> int:
+    """Even number of pixels, a multiple of the factor, that holds a length, rounding aside."""
+    return 2 * factor * math.ceil((length - 1e-6) / (2 * factor))
+
+
+def seen_by(image: np.ndarray, camera: Camera, target: Camera, factor: int = 1) -> np.ndarray:
+    """Turn an image (H, W[, C]) of a pinhole camera into that of ``target``, at the same place.
+
+    It is 0 outside the image, and made ``factor`` times smaller by averaging.
+    """
+    if target is not camera:
+        matrix = (target.K @ np.linalg.inv(camera.K))[:2]
+        image = cv2.warpAffine(
+            image, affine_to_opencv(matrix), (target.width, target.height), flags=cv2.INTER_LINEAR
+        )
+    if factor == 1:
+        return image
+    return resize_area(image, target.width // factor, target.height // factor)
+
+
+def _is_flame(model: HeadModel) -> bool:
+    """True if FLAME's coefficients give this model's vertices."""
+    return model.name.startswith("flame-")
+
+
+def write_parameters(head: Head, steps: list[str], shift: np.ndarray, out: Path) -> None:
+    """Write a file of parameters per time step, the canonical one, and meshes if not FLAME.
+
+    Args:
+        head: the head.
+        steps: its expressions, in the order of the time steps.
+        shift: (3,) metres taken off the world.
+        out: folder of the data set.
+    """
+    flame, shapes = _is_flame(head.model), head.model.shape_dirs.shape[2]
+    for folder in ("flame_param",) if flame else ("flame_param", "meshes"):
+        (out / folder).mkdir()
+    offsets = head.track.offsets[: FLAME_VERTICES if flame else None]
+    shape = _padded(head.track.shape, max(shapes, FLAME_SHAPES if flame else 0))
+    shared = {"shape": shape, "static_offset": offsets[None]}
+    for number, name in enumerate(steps):
+        row = head.track.row(name)
+        arrays = shared | _step_parameters(head, row, shift)
+        (out / "flame_param" / f"{number:05d}.npz").write_bytes(_npz_bytes(arrays))
+        if not flame:
+            path = out / "meshes" / f"{number:05d}.obj"
+            write_head_obj(path, head.track.vertices[row] - shift, head.model)
+    still = {name: np.zeros_like(array) for name, array in arrays.items() if name not in shared}
+    still["jaw_pose"][0, 0] = CANONICAL_JAW
+    (out / "canonical_flame_param.npz").write_bytes(_npz_bytes(shared | still))
+
+
+def _step_parameters(head: Head, row: int, shift: np.ndarray) -> dict[str, np.ndarray]:
+    """Make the parameters of one row of the track, by FLAME's convention about the root joint."""
+    track, model = head.track, head.model
+    exact = model.to(dtype=torch.float64)
+    shape, expression, offsets = (
+        torch.from_numpy(array.astype(np.float64))[None]
+        for array in (track.shape, track.expression[row], track.offsets)
+    )
+    rest = rest_vertices(exact, shape, expression, offsets)[0]
+    joint, R = (exact.joint_regressor[0] @ rest).numpy(), track.R[row]
+    count = max(model.expression_dirs.shape[2], FLAME_EXPRESSIONS if _is_flame(model) else 0)
+    arrays = {
+        "translation": track.t[row] - shift + R @ joint - joint,
+        "rotation": matrix_to_axis_angle(R),
+        "neck_pose": track.neck[row],
+        "jaw_pose": track.jaw[row],
+        "eyes_pose": track.eyes[row],
+        "expr": _padded(track.expression[row], count),
+    }
+    return {name: array[None].astype(np.float32) for name, array in arrays.items()}
+
+
+def _padded(values: np.ndarray, count: int) -> np.ndarray:
+    return np.pad(values, (0, count - len(values))).astype(np.float32)
+
+
+def _npz_bytes(arrays: dict[str, np.ndarray]) -> bytes:
+    """Bytes of an .npz file; NumPy dates its members 1980, so that they depend on nothing else."""
+    buffer = io.BytesIO()
+    np.savez(buffer, **arrays)  # type: ignore[arg-type]  # numpy types its options only
+    return buffer.getvalue()

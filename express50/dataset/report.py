@@ -1,0 +1,272 @@
+"""One self-contained HTML page of a dataset: QC of every stage, errors where truth exists."""
+
+from __future__ import annotations
+
+import base64
+import io
+from contextlib import suppress
+from pathlib import Path
+from typing import TypeVar
+
+import jinja2
+import matplotlib as mpl
+from markupsafe import Markup
+
+from express50.contract.layout import Dataset
+from express50.contract.stage import stages
+from express50.errors import FormatError
+from express50.files.images import encode_jpeg, read_image, resize_area
+from express50.files.text import parse_json, read_json_table, read_text
+from express50.runner.ledger import Ledger, Receipt
+
+mpl.use("Agg")
+from matplotlib.figure import Figure  # noqa: E402  the backend is chosen first
+
+T = TypeVar("T")
+Picture = tuple[Path, str]  # a file and the words under it
+
+AGAIN = "run its stage again"
+PICTURE_WIDTH = 900  # pixels of an embedded picture: a page of forty stays below ten megabytes
+PICTURES = 12  # of a stage
+ROWS = 12
+COLUMNS = 8
+PANELS = 4
+VIDEO_LIMIT = 8_000_000  # bytes
+INK = "#2457a6"
+
+
+def render_page(dataset: Dataset, title: str | None = None) -> str:
+    """Returns the whole page as text.
+
+    Beside the stages' folders it reads, where they exist: ``summary.json`` (figures of the run),
+    ``accuracy/`` (errors against truth, made by the benchmarks) and ``grmm/``.
+    """
+    receipts: dict[str, list[Receipt]] = {}
+    if dataset.ledger.is_file():
+        with Ledger(dataset.ledger, read_only=True) as ledger:
+            receipts = {name: list(ledger.read(name).values()) for name in stages()}
+    views = [_stage_view(dataset, name, receipts.get(name, [])) for name in stages()]
+    # A stage all of whose items failed has published nothing, and is what people look for.
+    views = [view for view in views if view["item_count"] or view["failed"]]
+    summary = _table(dataset.root / "summary.json")
+    accuracy_dir = dataset.root / "accuracy"
+    measured = _table(accuracy_dir / "accuracy.json")
+    accuracy = None
+    if measured:
+        pictures = spread(_pictures_below(accuracy_dir, 24), PICTURES)
+        accuracy = {"rows": _rows(measured), "pictures": [_embed(p) for p in pictures]}
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("express50.dataset", "."), autoescape=True
+    )
+    return environment.get_template("report_page.html").render(
+        title=title or f"Dataset {dataset.root.resolve().name}",
+        subtitle=", ".join(dataset.subjects()),
+        cards=_cards(dataset, views, summary),
+        stages=views,
+        accuracy=accuracy,
+        grmm=_grmm_view(dataset.root / "grmm"),
+    )
+
+
+def _stage_view(dataset: Dataset, stage: str, receipts: list[Receipt]) -> dict:
+    """Collect what the template needs of one stage, from its published items and receipts."""
+    root = dataset.stage_dir(stage)
+    paths = sorted(root.rglob("metrics.json")) if root.is_dir() else []
+    metrics = {str(p.parent.relative_to(root)): _table(p) for p in paths}
+    pictures = [
+        (path, f"{item}: {path.stem.replace('_', ' ')}")
+        for item in metrics
+        for ending in ("jpg", "png")
+        for path in sorted((root / item / "qc").glob(f"*.{ending}"))
+    ]
+    figures = {
+        item: {
+            key: float(value)
+            for key, value in table.items()
+            if isinstance(value, int | float) and not isinstance(value, bool)
+        }
+        for item, table in metrics.items()
+    }
+    columns = list(dict.fromkeys(key for row in figures.values() for key in row))[:COLUMNS]
+    shown = list(figures.items())[:ROWS]
+    return {
+        "name": stage,
+        "purpose": stages()[stage].purpose,
+        "item_count": len(metrics),
+        "failed": [(r.item, r.reason) for r in receipts if r.status == "failed"],
+        "dropped": _reasons(metrics, "dropped"),
+        "noted": _reasons(metrics, "warnings"),
+        "seconds": number(round(sum(r.seconds for r in receipts), 1)),
+        "columns": columns,
+        "rows": [
+            {"item": item, "cells": [number(row.get(c)) for c in columns]} for item, row in shown
+        ],
+        "more_rows": len(figures) - len(shown),
+        "plot": _metric_bars(figures, columns) if len(figures) > 1 else "",
+        "pictures": [_embed(p) for p in spread(pictures, PICTURES)],
+        "picture_count": len(pictures),
+    }
+
+
+def _reasons(metrics: dict[str, dict], key: str) -> list[tuple[str, str, str]]:
+    """List (item, what, why) of the rows under a key of all items' metrics."""
+    return [
+        (item, str(row.get("what")), str(row.get("why")))
+        for item, table in metrics.items()
+        for row in table.get(key, [])
+        if isinstance(row, dict)
+    ]
+
+
+def _cards(dataset: Dataset, views: list[dict], summary: dict) -> list[dict[str, str]]:
+    peaks = {s: _table(dataset.peaks_file(s)) for s in dataset.subjects()}
+    cards: dict[str, object] = {
+        "subjects": len(peaks),
+        "expressions": len({e for table in peaks.values() for e in table}),
+        "peak labels": sum(map(len, peaks.values())),
+        "parts dropped": sum(len(view["dropped"]) for view in views),
+    }
+    seconds = summary.get("seconds")
+    if isinstance(seconds, dict):
+        cards["minutes in all"] = f"{sum(seconds.values()) / 60:.1f}"
+    for key in ("train.psnr_heldout_view_db", "fit.psnr_db", "peak_memory_gib"):
+        if summary.get(key) is not None:
+            cards[key.replace("_", " ")] = summary[key]
+    return [{"label": label, "value": number(value)} for label, value in cards.items()]
+
+
+def _grmm_view(root: Path) -> list[dict]:
+    """Collect one part per folder below ``grmm``: train, fit, render."""
+    folders = [root, *(p for p in sorted(root.iterdir()) if p.is_dir())] if root.is_dir() else []
+    parts = []
+    for folder in folders:
+        deep = folder != root
+        metrics = _table(folder / "metrics.json")
+        pictures = _pictures_below(folder, 8) if deep else []
+        videos = [
+            {"uri": _address("video/mp4", path.read_bytes()), "caption": _words(path.stem)}
+            for path in (sorted(folder.rglob("*.mp4")) if deep else ())
+            if path.stat().st_size <= VIDEO_LIMIT
+        ]
+        if metrics or pictures or videos:
+            parts.append(
+                {
+                    "name": folder.name if deep else "training",
+                    "rows": _rows(metrics),
+                    "plot": _loss_curve(folder / "log.jsonl"),
+                    "pictures": [_embed(p) for p in pictures],
+                    "videos": videos,
+                }
+            )
+    return parts
+
+
+def _rows(table: dict, prefix: str = "") -> list[dict[str, str]]:
+    """Flatten a nested table of figures to rows of label and value; long lists are left out."""
+    rows: list[dict[str, str]] = []
+    for key, value in table.items():
+        label = f"{prefix}{key}"
+        if isinstance(value, dict):
+            rows += _rows(value, f"{label}.")
+        elif not isinstance(value, list):
+            rows.append({"label": _words(label), "value": number(value)})
+    return rows
+
+
+def _table(path: Path) -> dict:
+    """Read a JSON table, empty where the file is absent."""
+    return read_json_table(path, FormatError, AGAIN) if path.is_file() else {}
+
+
+def _pictures_below(root: Path, limit: int) -> list[Picture]:
+    """List pictures anywhere below a folder, captioned by their relative path."""
+    paths = sorted(p for p in root.rglob("*") if p.suffix in (".jpg", ".png"))
+    names = [_words(str(p.relative_to(root).with_suffix(""))).replace("/", ": ") for p in paths]
+    return spread(list(zip(paths, names, strict=True)), limit)
+
+
+def _embed(picture: Picture) -> dict[str, object]:
+    """Make a picture a JPEG data address, at most PICTURE_WIDTH wide; words alone if damaged."""
+    path, caption = picture
+    try:
+        image = read_image(path)
+    except FormatError as error:
+        return {"uri": "", "caption": f"{caption}: cannot be shown, {error}", "wide": False}
+    height, width = image.shape[:2]
+    if width > PICTURE_WIDTH:
+        image = resize_area(image, PICTURE_WIDTH, max(1, round(height * PICTURE_WIDTH / width)))
+    data = encode_jpeg(image[..., :3] if image.ndim == 3 else image, 85)
+    return {"uri": _address("image/jpeg", data), "caption": caption, "wide": width > 1.8 * height}
+
+
+def _address(kind: str, data: bytes) -> str:
+    return f"data:{kind};base64,{base64.b64encode(data).decode()}"
+
+
+def _words(name: str) -> str:
+    return name.replace("_", " ")
+
+
+def number(value: object) -> str:
+    """Formats a figure for people; n/a if it was not measured."""
+    if value is None:
+        return "n/a"
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return str(value)
+    if isinstance(value, int) or float(value).is_integer() and abs(value) < 1e6:
+        return f"{int(value):,}"
+    return f"{value:.3g}" if abs(value) < 100 else f"{value:,.0f}"
+
+
+def spread(values: list[T], count: int) -> list[T]:
+    """Returns at most ``count`` of the values, evenly chosen."""
+    if len(values) <= count:
+        return values
+    return [values[round(i * (len(values) - 1) / (count - 1))] for i in range(count)]
+
+
+def _svg(figure: Figure) -> Markup:
+    """Draw inline SVG with a fixed id salt, so that the same data give the same page."""
+    with mpl.rc_context({"svg.hashsalt": "express50"}):
+        out = io.StringIO()
+        figure.savefig(out, format="svg", bbox_inches="tight", metadata={"Date": None})
+    text = out.getvalue()
+    return Markup(text[text.index("<svg") :])  # our own drawing, no user text
+
+
+def _metric_bars(figures: dict[str, dict[str, float]], columns: list[str]) -> Markup:
+    """Draw one panel per metric: its value over the items."""
+    varying = [c for c in columns if len({row.get(c) for row in figures.values()}) > 1][:PANELS]
+    if not varying:
+        return Markup("")
+    figure = Figure(figsize=(2.9 * len(varying), 1.8))
+    figure.subplots(1, len(varying))
+    for axes, column in zip(figure.axes, varying, strict=True):
+        values = [row[column] for row in figures.values() if column in row]
+        axes.bar(range(len(values)), values, color=INK)
+        axes.set_title(_words(column), fontsize=9)
+        axes.tick_params(labelsize=7)
+        axes.set_xticks([])
+        axes.spines[["top", "right"]].set_visible(False)
+    figure.tight_layout()
+    return _svg(figure)
+
+
+def _loss_curve(log: Path) -> Markup:
+    """Plot the training losses of a JSONL log with ``iteration`` and numbers; empty without one."""
+    rows = []
+    for line in read_text(log, FormatError).split("\n") if log.is_file() else ():
+        with suppress(FormatError):  # half a line of a run that was killed
+            row = parse_json(line, str(log), FormatError)
+            if isinstance(row, dict) and {"iteration", "loss"} <= row.keys():
+                rows.append(row)
+    if len(rows) < 2:
+        return Markup("")
+    figure = Figure(figsize=(9, 2.6))
+    axes = figure.add_subplot()
+    axes.plot([r["iteration"] for r in rows], [r["loss"] for r in rows], color=INK, lw=1.2)
+    axes.set_xlabel("iteration")
+    axes.set_ylabel("loss")
+    axes.set_yscale("log")
+    axes.spines[["top", "right"]].set_visible(False)
+    return _svg(figure)

@@ -1,1 +1,0 @@
-"""One self-contained HTML page of a dataset: QC of every stage, errors where truth exists."""

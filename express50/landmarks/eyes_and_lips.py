@@ -1,0 +1,207 @@
+"""Irises and inner lips, found in the pixels where the network's points are too coarse.
+
+Irises: every eye is brought to one size by its corners. A disc and the ring around it, both cut by
+the opening, are compared at every place and a few radii: iris and pupil are darker than the white
+around them (Daugman 1993 has the difference across a circle). Shut eyes say nothing.
+
+Lips: the network sees a mouth in some thirty pixels and often takes a row of teeth for closed lips.
+Lips are redder than teeth, and much lighter than an open mouth's dark. Down each of three columns
+between the outer lips the longest run of pixels that do not look like lips is taken as the opening.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+
+from express50.geometry.conventions import cell_to_corner
+from express50.landmarks.detector import Detection, cut_crop, place_level_crop, points_in_crop
+
+# Subject's left eye first, as the model's joints have it: corners, then the points of each lid.
+EYES = ((42, 45, (43, 44), (47, 46)), (36, 39, (37, 38), (41, 40)))
+SIDE = 64
+# The crop spans this many eye widths; an iris is a fifth of an eye's width in radius, more where
+# the head is turned and the width foreshortened.
+SPAN = 1.5
+RADII = (0.17, 0.2, 0.235, 0.275)
+RING = 1.55
+# Landmarks may cut an opening by this share of its width.
+SLACK = 0.1
+LEAST_WIDTH_PX = 6.0
+SHUT, OPEN = 0.1, 0.2
+# Contrast between disc and ring, of a crop whose mean light is a half: least, and that which gives
+# half of the confidence. Shut lids stay under the first.
+LEAST_CONTRAST, CONTRAST = 0.12, 0.08
+LEAST_COVER, LEAST_CONFIDENCE = 0.35, 0.2
+# Standard deviation of a sure centre, in eye widths.
+SIGMA = 0.04
+
+
+@dataclass(frozen=True)
+class Irises:
+    """Iris centres of one image, the subject's left eye first."""
+
+    centres: np.ndarray  # (2, 2) pixels, corner origin; where the confidence is 0 the eye's middle
+    sigma: np.ndarray  # (2,) expected error in pixels; infinite where the confidence is 0
+    confidence: np.ndarray  # (2,) in 0..1; 0 for shut, hidden and tiny eyes
+
+
+def find_irises(image: np.ndarray, seen: Detection) -> Irises:
+    """Find both irises of a face whose landmarks were seen in an image (H, W, 3) uint8 RGB."""
+    found = [_find(image, seen, eye) for eye in EYES]
+    centres, sigma, confidence = (np.array(part) for part in zip(*found, strict=True))
+    return Irises(centres, sigma, confidence)
+
+
+def _find(
+    image: np.ndarray, seen: Detection, eye: tuple[int, int, tuple[int, int], tuple[int, int]]
+) -> tuple[np.ndarray, float, float]:
+    """Find one iris: centre (2,), sigma and confidence."""
+    first, last, upper, lower = eye
+    points = seen.points
+    ring = points[[first, *upper, last, *reversed(lower)]]
+    middle = ring.mean(0)
+    along = points[last] - points[first]
+    width = float(np.linalg.norm(along))
+    nothing = (middle, np.inf, 0.0)
+    if not np.isfinite(ring).all() or width < LEAST_WIDTH_PX:
+        return nothing
+    across = np.array([-along[1], along[0]]) / width
+    lids = points[list(lower)].mean(0) - points[list(upper)].mean(0)
+    opening = abs(float(lids @ across)) / width
+    surely = float(np.clip((opening - SHUT) / (OPEN - SHUT), 0.0, 1.0))
+    trust = float(np.median(seen.confidence[[first, *upper, last, *lower]]))
+    size = np.array([image.shape[1], image.shape[0]])
+    if surely * trust <= 0.0 or (middle < 0).any() or (middle >= size).any():
+        return nothing
+    window = place_level_crop(middle, SPAN * along / SIDE, SIDE)
+    crop = cut_crop(image, window, SIDE).astype(np.float32)
+    # Red counts most, as blue irises are dark in it; the mean light is 0.5.
+    light = 0.6 * crop[..., 0] + 0.4 * crop[..., 1]
+    light = light * (0.5 / max(float(light.mean()), 10.0))
+    # The opening between the lids, a little widened.
+    inside = np.round(points_in_crop(window, ring)).astype(np.int32)
+    mask = cv2.fillPoly(np.zeros((SIDE, SIDE), np.uint8), [inside], 1)
+    grow = 2 * round(SLACK * SIDE / SPAN) + 1
+    mask = cv2.dilate(mask, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (grow, grow)))
+    place, contrast, cover = _disc(light, mask.astype(np.float32))
+    confidence = trust * surely * cover * contrast / (contrast + CONTRAST)
+    if contrast < LEAST_CONTRAST or cover < LEAST_COVER or confidence < LEAST_CONFIDENCE:
+        return nothing
+    centre = window[:, :2] @ place + window[:, 2]
+    return centre, SIGMA * width / confidence**0.5, confidence
+
+
+def _disc(crop: np.ndarray, mask: np.ndarray) -> tuple[np.ndarray, float, float]:
+    """Find the best place (2,) in crop pixels, its contrast and the disc's share in the opening."""
+    best = (-np.inf, np.full(2, SIDE / 2), 0.0, 0.0)
+    for radius in RADII:
+        pixels = radius * SIDE / SPAN
+        grid = np.arange(-np.ceil(RING * pixels), np.ceil(RING * pixels) + 1)
+        distance = np.hypot(grid[:, None], grid)
+        disc = np.clip(pixels + 0.5 - distance, 0.0, 1.0)
+        ring = np.clip(RING * pixels + 0.5 - distance, 0.0, 1.0) - disc
+        disc, ring = (disc / disc.sum()).astype(np.float32), (ring / ring.sum()).astype(np.float32)
+        within, around, light, other = (
+            cv2.filter2D(image, -1, kernel, borderType=cv2.BORDER_CONSTANT)
+            for image in (mask, crop * mask)
+            for kernel in (disc, ring)
+        )
+        contrast = other / np.maximum(around, 1e-3) - light / np.maximum(within, 1e-3)
+        score = contrast * np.sqrt(np.clip(within * around, 0.0, None)) * (mask > 0)
+        row, column = np.unravel_index(int(np.argmax(score)), score.shape)
+        if score[row, column] > best[0]:
+            place = cell_to_corner(np.array([column, row])) + _peak(score, int(row), int(column))
+            best = (
+                float(score[row, column]), place,
+                float(contrast[row, column]), float(min(within[row, column], 1.0)),
+            )  # fmt: skip
+    return best[1], best[2], best[3]
+
+
+def _peak(score: np.ndarray, row: int, column: int) -> np.ndarray:
+    """Return the offset (2,) x, y of a parabola's top through the best place and its neighbours."""
+    offset = np.zeros(2)
+    for axis, (line, at) in enumerate(((score[row], column), (score[:, column], row))):
+        if not 0 < at < SIDE - 1:
+            continue
+        line = line[at - 1 : at + 2]
+        bend = float(line[0] - 2 * line[1] + line[2])
+        if bend < -1e-9:
+            offset[axis] = np.clip(0.5 * float(line[0] - line[2]) / bend, -0.5, 0.5)
+    return offset
+
+
+# Outer lip above, inner above, inner below, outer lip below, of each column.
+LIP_COLUMNS = ((50, 61, 67, 58), (51, 62, 66, 57), (52, 63, 65, 56))
+LIP_SIDE, LIP_SPAN = 72, 1.2
+LEAST_MOUTH_PX = 12.0
+# Inner lips further apart than this share of the mouth's width are open already: they are kept.
+LIP_SHUT = 0.08
+# Half the columns' width that is averaged, rows kept clear of the outer lips (shares of the
+# mouth's width), and the least height of an opening.
+HALF, CLEAR, LEAST_GAP = 0.03, 0.03, 0.045
+# A pixel is not lip if it is this much less red than the lips, next to the skin's difference from
+# grey, or has less than this share of their light.
+PALE, DARK = 0.5, 0.55
+LIP_SIGMA = 0.02
+
+
+def open_lips(image: np.ndarray, seen: Detection) -> Detection:
+    """Part a detection's inner lips where the image (H, W, 3) uint8 RGB shows an opening.
+
+    The detection stays where the network saw the mouth open, or where it is shut or small.
+    """
+    along = seen.points[54] - seen.points[48]
+    width = float(np.linalg.norm(along))
+    if not np.isfinite(seen.points[48:]).all() or width < LEAST_MOUTH_PX:
+        return seen
+    gaps = seen.points[[67, 66, 65]] - seen.points[[61, 62, 63]]
+    if np.linalg.norm(gaps, axis=1).mean() > LIP_SHUT * width:
+        return seen
+    window = place_level_crop(seen.points[48:60].mean(0), LIP_SPAN * along / LIP_SIDE, LIP_SIDE)
+    crop = cut_crop(image, window, LIP_SIDE).astype(np.float64) / 255.0
+    inside = points_in_crop(window, seen.points)
+    found = _openings(crop, inside)
+    if found is None:
+        return seen
+    points, sigma = seen.points.copy(), seen.sigma.copy()
+    for (_, upper, lower, _), (top, bottom) in zip(LIP_COLUMNS, found, strict=True):
+        for point, y in ((upper, top), (lower, bottom)):
+            points[point] = window[:, :2] @ [inside[point, 0], y] + window[:, 2]
+            sigma[point] = max(LIP_SIGMA * width, 0.5 * seen.sigma[point])
+    return replace(seen, points=points, sigma=sigma)
+
+
+def _openings(crop: np.ndarray, points: np.ndarray) -> list[tuple[float, float]] | None:
+    """Find the opening's upper and lower edge (crop rows) in each column; None where shut."""
+    light = crop.mean(2) + 1e-3
+    redness = (crop[..., 0] - crop[..., 1]) / light
+    polygon = np.zeros((LIP_SIDE, LIP_SIDE), np.uint8)
+    cv2.fillPoly(polygon, [np.round(points[48:60]).astype(np.int32)], 1)
+    mouth = polygon > 0
+    if mouth.sum() < 40:
+        return None
+    # Whatever is open, the reddest of the mouth is lip, and the lightest of that is lit lip.
+    red = float(np.percentile(redness[mouth], 75))
+    lit = float(np.median(light[mouth & (redness >= np.median(redness[mouth]))]))
+    no_lip = (redness < PALE * red) | (light < DARK * lit)
+    found = []
+    for above, _, _, below in LIP_COLUMNS:
+        x = 0.5 * (points[above, 0] + points[below, 0])
+        reach = max(1, round(HALF * LIP_SIDE / LIP_SPAN))
+        columns = slice(max(0, round(x) - reach), round(x) + reach + 1)
+        clear = CLEAR * LIP_SIDE / LIP_SPAN
+        low, high = round(points[above, 1] + clear), round(points[below, 1] + 2 * clear)
+        flags = no_lip[max(low, 0) : high, columns].mean(1) > 0.5
+        # First and past-the-last row of each run.
+        edges = np.flatnonzero(np.diff(np.concatenate([[0], flags.astype(int), [0]])))
+        runs = edges.reshape(-1, 2)
+        lengths = runs[:, 1] - runs[:, 0]
+        if not len(runs) or lengths.max() < LEAST_GAP * LIP_SIDE / LIP_SPAN:
+            return None
+        first, last = max(low, 0) + runs[int(np.argmax(lengths))]
+        found.append((float(first), float(last)))
+    return found

@@ -1,0 +1,409 @@
+"""What the commands of ``grmm`` do: read the arguments, call the library, print.
+
+Torch takes a second to import and --help must not wait for it, so that handlers import late.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from express50.console import OK, log, say, say_json
+from express50.errors import ConfigError
+from grmm.config import TABLES, Config, as_tables, choose, from_tables, resolve
+
+if TYPE_CHECKING:
+    from grmm.checkpoint import Loaded
+    from grmm.data import HeadViews
+    from grmm.edit import HeadCodes
+    from grmm.identity_evaluation import FitProtocol
+
+MEASURED = "measured"  # in place of a preset
+HOLDOUTS = ("holdout_cameras", "holdout_expressions")
+CHANGEABLE = ("fit", "metrics", "loss")  # tables that may differ from those of training
+
+
+def train(args: argparse.Namespace) -> int:
+    """Train, or go on from the checkpoint in OUT."""
+    from express50.head.load import load_head
+    from grmm.shard_source import open_shards
+    from grmm.train import train
+
+    _no_file(args.out)
+    config = train_config(args)
+    source = open_shards([args.shards, *args.also], "train")
+    resume = not args.anew and (args.out / "checkpoint.pt").exists()
+    metrics = train(source, load_head(source.head), args.out, config, resume=resume)
+    names = ("psnr_heldout_view_db", "psnr_train_db", "ssim", "iterations", "gaussians")
+    lines = [f"{name}: {metrics.get(name)}" for name in names]
+    return _print(args, metrics, *lines, f"wrote {args.out / 'checkpoint.pt'}")
+
+
+def train_config(args: argparse.Namespace) -> Config:
+    """Return the resolved configuration of ``grmm train``: its own flags stand above --set."""
+    name, changes = args.preset, {}
+    if name == MEASURED:
+        if args.seconds is None:
+            raise ConfigError(f"--preset {MEASURED} needs a time, such as --budget 4m")
+        choice = choose(args.seconds)
+        log(
+            f"measured: {choice.setting} ({choice.psnr_db:.1f} dB in {choice.budget_s:.0f} s "
+            "where measured)"
+        )
+        name, changes = "demo", choice.changes
+    config = resolve(name, args.config, [*args.set, *_metric_settings(args)], changes)
+    if args.seconds is not None:
+        config = replace(config, train=replace(config.train, seconds=args.seconds))
+    given = {name: _split_names(getattr(args, name)) for name in HOLDOUTS}
+    held: dict[str, Any] = {name: ids for name, ids in given.items() if ids}
+    return replace(config, data=replace(config.data, **held))
+
+
+def config(args: argparse.Namespace) -> int:
+    """Print the settings that `train` would take, as TOML."""
+    from express50.contract.config import config_toml
+
+    resolved = train_config(args)
+    for table in args.table or TABLES:
+        if table not in TABLES:
+            raise ConfigError(f"unknown table {table!r}; expected one of {', '.join(TABLES)}")
+        say(config_toml(table, getattr(resolved, table)))
+    return OK
+
+
+def fit(args: argparse.Namespace) -> int:
+    """Fit an unseen person and report on the views that the fit did not get."""
+    from grmm.fit import fit
+    from grmm.shard_source import ShardSource, select
+
+    _no_file(args.out)
+    made = args.out / "checkpoint.pt"
+    if made.exists() and made.samefile(args.checkpoint):
+        raise ConfigError(f"{made} is the checkpoint to fit from; name another folder")
+    if made.exists() and not args.anew:
+        raise ConfigError(f"{made} exists; name another folder, or overwrite it with --anew")
+    loaded = _load(args.checkpoint, [*args.set, *_metric_settings(args)], args.seconds)
+    if not loaded.loop and len(loaded.model.subjects) == 1:
+        log(
+            f"{args.checkpoint} is a fit of {loaded.model.subjects[0]}: it knows how one person "
+            "looks; people are fitted from what 'grmm train' wrote"
+        )
+    views = loaded.views(ShardSource(args.shards, "*"))
+    given = select(views.keys, args.subject, args.expression, args.cameras)
+    chosen = set(given)
+    rest = [i for i in select(views.keys, args.subject, args.expression, "*") if i not in chosen]
+    metrics = fit(loaded, views, given, rest, args.out)
+    reached = f"{metrics['seconds']} s, {metrics['iterations']} iterations"
+    line = f"psnr_db: {metrics['psnr_db']} ({metrics['psnr_is_of']}), after {reached}"
+    return _print(args, metrics, line, f"wrote {args.out}")
+
+
+def render(args: argparse.Namespace) -> int:
+    """Write pictures, sheets and videos of one head."""
+    from express50.files.images import write_image
+    from grmm import render
+
+    _no_file(args.out)
+    loaded = _load(args.checkpoint)
+    model, head = loaded.model, _edited_head(loaded, args)
+    view = render.camera_of(loaded, args.camera, args.size)
+    view = render.orbit(view, args.yaw, model.head_centre, args.pitch)
+    args.out.mkdir(parents=True, exist_ok=True)
+    write_image(args.out / "picture.png", render.picture(loaded, head, view))
+    say(f"wrote {args.out / 'picture.png'}")
+    videos: dict[str, Any] = {}
+    if args.turntable:
+        videos["turntable"] = render.turntable(loaded, head, view, args.frames, args.degrees)
+    if args.to:
+        end = _frame_head(loaded, args.to, args.expression)
+        videos["interpolation"] = render.interpolation(loaded, head, end, view, args.frames)
+    if args.drive:
+        clips = render.read_clips(args.drive, args.drive_cue)
+        videos["driven"] = render.driven(loaded, head, clips, view)
+    for name, frames in videos.items():
+        render.write_video(args.out / f"{name}.mp4", frames)
+        say(f"wrote {args.out / name}.mp4")
+    sheets: dict[str, Any] = {}
+    if args.views:
+        sheets["views"] = (render.novel_views(loaded, head, view),)
+    if args.controls:
+        sheets["controls"] = render.control_sheet(loaded, head, view)
+    if args.expression_of:
+        plain = _frame_head(loaded, args.subject or model.subjects[0])
+        donor = _frame_head(loaded, args.expression_of)
+        sheets["transfer"] = render.residual_sheet(loaded, plain, donor, view)
+    if args.samples:
+        sheets["samples"] = render.sample_sheet(
+            loaded, head, view, args.samples, args.seed, args.spread
+        )
+    expressions = model.expressions[: args.columns]
+    sheets["grid"] = (render.expression_grid(loaded, model.subjects[:8], expressions, view),)
+    for name, sheet in sheets.items():
+        render.write_sheet(args.out / f"{name}.jpg", *sheet)
+        say(f"wrote {args.out / name}.jpg")
+    return OK
+
+
+def export(args: argparse.Namespace) -> int:
+    """Write one head to a file."""
+    from grmm.export import write_export
+    from grmm.render import camera_of
+
+    loaded = _load(args.checkpoint)
+    head, view = _edited_head(loaded, args), camera_of(loaded, args.camera, args.size)
+    say(f"wrote {args.out}: {write_export(args.out, loaded, head, view, args.points)}")
+    return OK
+
+
+def view(args: argparse.Namespace) -> int:
+    """Serve the viewer until Ctrl-C."""
+    from grmm.viewer import Viewer
+
+    viewer = Viewer(_load(args.checkpoint), args.host, args.port, args.size, args.still)
+    if viewer.port != args.port:
+        say(f"port {args.port} is taken; this is another")
+    say(f"http://{args.host}:{viewer.port}  (Ctrl-C stops)")
+    viewer.run()
+    return OK
+
+
+def evaluate(args: argparse.Namespace) -> int:
+    """Measure a checkpoint on people it has codes for, and on people fitted first."""
+    from grmm.data import spread
+    from grmm.evaluate import SEEN, evaluate, kind_of, save_pictures, training_render
+    from grmm.identity_evaluation import evaluate_unseen
+    from grmm.metrics import PerceptualMetrics
+    from grmm.shard_source import ShardSource
+
+    _no_file(args.out)
+    loaded = _load(args.checkpoint, _metric_settings(args), args.fit_budget)
+    source = ShardSource(args.shards, "*")
+    views = loaded.views(source)
+    keep = save_pictures(args.save, source.window, views) if args.save else None
+    judge = PerceptualMetrics(loaded.config.metrics)
+    kind = partial(kind_of, loaded)
+    known, unseen = _split(loaded, views, args)
+    if args.heldout:
+        known = [i for i in known if kind(views.keys[i]) != SEEN]
+    if args.images:
+        known = spread(known, args.images)
+    if not known and not unseen:
+        raise ConfigError(
+            f"{args.shards}: training saw all that was chosen; leave --heldout out, or train with "
+            "--holdout-cameras"
+        )
+    render = training_render(loaded.model, views)
+    rows = evaluate(views, known, render, judge, kind, keep)
+    protocol = _protocol(args)
+    for subject, chosen in unseen.items():
+        found, effort = evaluate_unseen(loaded, views, subject, protocol, judge, keep, chosen)
+        log(f"{subject}: fitted from {', '.join(effort['cameras'])} in {effort['seconds']} s")
+        rows += found
+    _report(args, rows, judge)
+    return OK
+
+
+def _split(
+    loaded: Loaded, views: HeadViews, args: argparse.Namespace
+) -> tuple[list[int], dict[str, list[int]]]:
+    """Split samples into those that codes can draw and, by person, those to fit first."""
+    from grmm.shard_source import select
+
+    chosen = select(views.keys, args.subjects, args.expressions, args.cameras)
+    people, expressions = loaded.model.subjects, loaded.model.expressions
+    known: list[int] = []
+    unseen: dict[str, list[int]] = {}
+    for i in chosen:
+        key = views.keys[i]
+        if key.subject not in people:
+            unseen.setdefault(key.subject, []).append(i)
+        elif key.expression in expressions:
+            known.append(i)
+    if args.fit_cameras:
+        return known, dict(sorted(unseen.items()))
+    if not known:
+        raise ConfigError(
+            f"{args.shards}: training saw none of {', '.join(sorted(unseen)) or args.expressions}; "
+            "people whom it never saw are fitted first: name --fit-cameras"
+        )
+    return known, {}
+
+
+def score(args: argparse.Namespace) -> int:
+    """Measure pictures that another method made."""
+    from express50.head.load import load_head
+    from grmm.config import DataConfig, MetricsConfig
+    from grmm.data import HeadViews, spread
+    from grmm.evaluate import score
+    from grmm.metrics import PerceptualMetrics
+    from grmm.shard_source import ShardSource, select
+
+    data = DataConfig(background=args.background, torso=args.torso)
+    source = ShardSource(args.shards, "*")
+    views = HeadViews(source, load_head(source.head), background=data.background, torso=data.torso)
+    chosen = select(views.keys, args.subjects, args.expressions, args.cameras)
+    chosen = spread(chosen, args.images) if args.images else chosen
+    judge = PerceptualMetrics(MetricsConfig(alexnet=args.alexnet, inception=args.inception))
+    rows = score(args.renders, source.window, views, chosen, judge, args.partial)
+    _report(args, rows, judge)
+    if len(rows) < len(chosen):
+        log(f"scored {len(rows)} of {len(chosen)} samples: the others have no picture")
+    return OK
+
+
+def _report(args: argparse.Namespace, rows: list, judge: Any) -> None:
+    from grmm.evaluate import summary_lines, write_evaluation
+
+    summary = write_evaluation(args.out, rows, judge)
+    _print(args, summary, *summary_lines(summary))
+
+
+def ablate(args: argparse.Namespace) -> int:
+    """Train and measure every row of the ablation that is not measured yet."""
+    from grmm.ablate import Ablation, ablate
+
+    config = train_config(args)
+    if args.fit_budget is not None:
+        config = replace(config, fit=replace(config.fit, seconds=args.fit_budget))
+    run = Ablation(
+        roots=[args.shards, *args.also],
+        out=args.out,
+        config=config,
+        protocol=_protocol(args),
+        subjects=_split_names(args.fit_subjects),
+    )
+    table = ablate(run, _split_names(args.rows))
+    return _print(args, table, (args.out / "ablation.md").read_text(encoding="utf-8"))
+
+
+def _protocol(args: argparse.Namespace) -> FitProtocol:
+    from grmm.identity_evaluation import FitProtocol
+
+    return FitProtocol(
+        cameras=_split_names(args.fit_cameras), expression=args.fit_expression, images=args.images
+    )
+
+
+def study_make(args: argparse.Namespace) -> int:
+    """Write a study of two methods' pictures."""
+    from grmm.study import make_study
+
+    methods = list(zip(args.names, (args.ours, args.theirs), strict=True))
+    study = make_study(
+        args.out, args.reference, methods, args.examples, args.participants, args.seed
+    )
+    say(f"wrote {args.out / 'study.json'}: {len(study['examples'])} examples")
+    return OK
+
+
+def study_serve(args: argparse.Namespace) -> int:
+    """Serve a study until Ctrl-C."""
+    from grmm.study.server import make_server
+
+    with make_server(args.out, args.host, args.port) as server:
+        say(f"http://{args.host}:{server.server_address[1]}  (Ctrl-C stops; answers are kept)")
+        server.serve_forever()
+    return OK
+
+
+def study_table(args: argparse.Namespace) -> int:
+    """Write and print the table of a study's answers."""
+    from express50.files.atomic import write_bytes, write_json
+    from grmm.study import markdown, read_answers, read_study, summarise
+
+    study = read_study(args.out)
+    summary = summarise(study, read_answers(args.out, study))
+    write_json(args.out / "table.json", summary)
+    write_bytes(args.out / "table.md", markdown(summary).encode())
+    return _print(args, summary, markdown(summary))
+
+
+def _print(args: argparse.Namespace, result: object, *lines: str) -> int:
+    """Print lines, or with --json the result; returns the exit code."""
+    if args.json:
+        say_json(result)
+    else:
+        say(*lines)
+    return OK
+
+
+def _no_file(out: Path) -> None:
+    """Refuse, before any work, a folder to write to that is a file or lies below one."""
+    for path in (out, *out.parents):
+        if path.is_dir():
+            return
+        if path.exists():
+            raise ConfigError(f"{path} is a file, expected a folder to write to; name another")
+
+
+def _metric_settings(args: argparse.Namespace) -> list[str]:
+    """Translate --alexnet and --inception to assignments."""
+    given = {"alexnet": args.alexnet, "inception": args.inception}
+    return [f"metrics.{name}={path}" for name, path in given.items() if path]
+
+
+def _load(path: Path, assignments: Sequence[str] = (), seconds: float | None = None) -> Loaded:
+    """Read a checkpoint; ``fit.*``, ``metrics.*`` and ``loss.*`` replace its own settings."""
+    from express50.contract.config import known_assignments
+    from grmm.checkpoint import load_checkpoint
+    from grmm.train_state import best_device
+
+    loaded = load_checkpoint(path, best_device())
+    tables = as_tables(loaded.config)
+    for table, key, value in known_assignments(assignments, CHANGEABLE):
+        tables[table][key] = value
+    if seconds is not None:
+        tables["fit"]["seconds"] = seconds
+    return replace(loaded, config=from_tables(tables))
+
+
+def _edited_head(loaded: Loaded, args: argparse.Namespace) -> HeadCodes:
+    """Build the head that the arguments describe: a training head, then its edits."""
+    from grmm.edit import controlled, trained_head, with_expression
+
+    head = trained_head(loaded, *_frame(loaded, args.subject, args.expression))
+    if args.expression_of:
+        head = with_expression(head, _frame_head(loaded, args.expression_of))
+    if args.z_id_of:
+        head = replace(head, z_id=_frame_head(loaded, args.z_id_of).z_id)
+    if args.z_exp_of:
+        donor = trained_head(loaded, loaded.model.subjects[0], args.z_exp_of)
+        head = replace(head, z_exp=donor.z_exp)
+    return controlled(loaded, head, dict(_control(text) for text in args.control))
+
+
+def _frame_head(loaded: Loaded, text: str, expression: str | None = None) -> HeadCodes:
+    """Build the head of ``SUBJECT/EXPRESSION``; ``expression`` replaces a missing second part."""
+    from grmm.edit import trained_head
+
+    subject, _, named = text.partition("/")
+    return trained_head(loaded, *_frame(loaded, subject, named or expression))
+
+
+def _frame(loaded: Loaded, subject: str | None, expression: str | None) -> tuple[str, str]:
+    """Choose the subject and expression to draw, by default the first subject's neutral."""
+    subject = subject or loaded.model.subjects[0]
+    if expression is None:
+        own = [e for s, e in loaded.gallery.frames if s == subject]
+        expression = "neutral" if "neutral" in own else (own or list(loaded.model.expressions))[0]
+    return subject, expression
+
+
+def _control(text: str) -> tuple[str, tuple[float, ...]]:
+    name, equals, numbers = text.partition("=")
+    try:
+        values = tuple(float(number) for number in numbers.split(","))
+    except ValueError:
+        values = ()
+    if not equals or not values:
+        raise ConfigError(f"--control {text!r}: expected NAME=NUMBER or NAME=NUMBER,NUMBER,NUMBER")
+    return name.strip(), values
+
+
+def _split_names(text: str) -> tuple[str, ...]:
+    """Split names joined by commas."""
+    return tuple(name.strip() for name in text.split(",") if name.strip())

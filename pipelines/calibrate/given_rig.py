@@ -1,0 +1,350 @@
+"""Given cameras against what was recorded: which have moved, and are all a little off?
+
+To find cameras that have moved, points are fitted with one camera free after the other; the one
+that explains most has moved, and the rest are tried again. So a bump is not blamed on neighbours.
+
+Refinement by footage or by a board changes all cameras, but only if held-out points then fit
+clearly better.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from express50.errors import CalibrationError
+from express50.geometry.cameras import Camera, pinhole, project
+from express50.geometry.transforms import make_transform, matrix_to_axis_angle, rigid_fit
+from express50.rigs.world_frame import move_cameras
+from pipelines.calibrate.adjuster import (
+    AdjustedRig,
+    RigPriors,
+    adjust_rig,
+    single_camera_gains,
+    triangulate_tracks,
+)
+from pipelines.calibrate.board import BoardCorners
+from pipelines.calibrate.board_guess import (
+    NEAR,
+    all_board_poses,
+    board_views,
+    rig_from_boards,
+    with_ideal,
+)
+from pipelines.calibrate.board_rig import BoardRig, adjust_board_rig, corner_errors
+from pipelines.calibrate.footage import at_footage_size, reduced_camera
+from pipelines.calibrate.tracks import LEAST_POINTS, FrameSetPoints, PointTracks, join_tracks
+
+MOVE_BANDS = ((0.1, 0.015), (0.02, 0.003))
+"""Two passes, bumps of degrees first: largest distance of matches from epipolar lines, and least
+shift of a moved camera's picture, as shares of the diagonal."""
+LEAST_GAIN, GAIN_RATIO = 30.0, 4.0
+"""Freeing a moved camera must lower the robust cost by this much (noise alone: half a chi-square
+of six, under 15), and by so many times what the median other camera would."""
+MOVE_PRIORS = RigPriors(turn_rad=np.radians(1.0), move_m=0.01)
+MOVE_SCALES, ITERATIONS = (6.0, 3.0, 1.5), 4
+"""Residuals flatten at so many sigmas: a camera that is off by a few pixels must not be rejected
+together with the mismatches. Four iterations per scale name the cameras that convergence names."""
+HELD = 5  # every fifth point, or board image, judges and is not adjusted to
+CLEARLY = 0.8
+"""Held-out errors must fall to this share of what they were; even true rigs gain up to 6 %."""
+REFINE_BAND = 0.03  # of features about the given rig's epipolar lines, as a share of the diagonal
+REFINE_SCALES = (3.0, 1.5)
+LENS = RigPriors(focal=0.005, focal_spread=0.005, centre=0.002, bend=0.005)  # of given lenses
+
+
+@dataclass(frozen=True)
+class CameraMove:
+    """The estimated motion of a camera since it was calibrated.
+
+    Only the picture's shift is measured: turns and moves trade places at a head's distance.
+    """
+
+    shift_px: float
+    turn_deg: float
+    move_mm: float
+
+
+@dataclass(frozen=True)
+class FootageCheck:
+    """The result of checking cameras against `points` that two or more of them see.
+
+    `error_px` is the median reprojection error, None without points. `moved` lists the surest
+    first; `cameras` have the corrected poses. `unchecked` gives a reason per camera.
+    """
+
+    points: int
+    error_px: float | None
+    moved: dict[str, CameraMove]
+    unchecked: dict[str, str]
+    cameras: dict[str, Camera]
+
+
+def check_footage(
+    cameras: Mapping[str, Camera], seen: Mapping[int, FrameSetPoints]
+) -> FootageCheck:
+    """Searches three or more cameras for those that have moved since they were calibrated.
+
+    `seen` are points by frame number, in pixels of `reduced_camera`.
+
+    Raises:
+        CalibrationError: fewer than three cameras.
+    """
+    if len(cameras) < 3:
+        raise CalibrationError(
+            f"{len(cameras)} cameras; three or more are needed to say which one has moved"
+        )
+    now = {name: reduced_camera(camera) for name, camera in cameras.items()}
+    moved: list[str] = []
+    for band, least_shift in MOVE_BANDS:
+        tracks = join_tracks(now, seen, band, verified=False)
+        now, found = _free_moved_cameras(now, tracks, least_shift)
+        moved += [name for name in found if name not in moved]
+    fit = _fit(now, tracks, triangulate_tracks(now, tracks), ())
+    errors = np.linalg.norm(fit.errors, axis=1)
+    corrected = {n: replace(c, cam_from_world=now[n].cam_from_world) for n, c in cameras.items()}
+    moves = {
+        name: CameraMove(
+            _picture_shift(cameras[name], corrected[name], fit, tracks),
+            *_turn_and_move(cameras[name], corrected[name]),
+        )
+        for name in moved
+    }
+    return FootageCheck(
+        points=len(fit.points),
+        error_px=float(np.median(errors)) if len(errors) else None,
+        moved=moves,
+        unchecked={
+            name: f"shares {count} points with two others, expected {LEAST_POINTS} or more"
+            for name, count in zip(tracks.names, tracks.shared_points(), strict=True)
+            if count < LEAST_POINTS
+        },
+        cameras=corrected,
+    )
+
+
+def _free_moved_cameras(
+    cameras: Mapping[str, Camera], tracks: PointTracks, least_shift: float
+) -> tuple[dict[str, Camera], list[str]]:
+    """Frees one camera after the other while that explains enough; at most a third of the rig.
+
+    The first-order gain does not tell a moved camera from its neighbours where few cameras see
+    each other. So the three with the largest gain are each freed in a fit of their own.
+    """
+    points = triangulate_tracks(cameras, tracks)
+    free: tuple[str, ...] = ()
+    fit = _fit(cameras, tracks, points, free)
+    while len(free) < max(1, len(cameras) // 3):
+        gain = single_camera_gains(fit, tracks, MOVE_PRIORS, MOVE_SCALES[-1], free)
+        enough = (tracks.shared_points() >= LEAST_POINTS) & (gain >= 0.5 * LEAST_GAIN)
+        likely = [tracks.names[i] for i in np.argsort(-gain, kind="stable") if enough[i]]
+        tried = {
+            name: _fit(cameras, tracks, points, (*free, name))
+            for name in [n for n in likely if n not in free][:3]
+        }
+        if not tried:
+            break
+        name = min(tried, key=lambda name: (tried[name].cost, name))
+        found, camera = tried[name], cameras[name]
+        shift = _picture_shift(camera, found.cameras[name], found, tracks)
+        others = single_camera_gains(found, tracks, MOVE_PRIORS, MOVE_SCALES[-1], (*free, name))
+        needed = max(LEAST_GAIN, GAIN_RATIO * float(np.median(others)))
+        if shift < least_shift * np.hypot(camera.width, camera.height):
+            break
+        if fit.cost - found.cost < needed:
+            break
+        free, fit = (*free, name), found
+    return fit.cameras, list(free)
+
+
+def _fit(
+    cameras: Mapping[str, Camera], tracks: PointTracks, points: np.ndarray, free: tuple[str, ...]
+) -> AdjustedRig:
+    return adjust_rig(cameras, tracks, points, MOVE_PRIORS, MOVE_SCALES, free, ITERATIONS)
+
+
+def _picture_shift(before: Camera, after: Camera, fit: AdjustedRig, tracks: PointTracks) -> float:
+    """Median length, pixels, by which a camera's picture shifts between two of its poses."""
+    seen = fit.points[tracks.point[tracks.camera == tracks.names.index(before.id)]]
+    old, new = (project(pinhole(camera), seen)[0] for camera in (before, after))
+    length = np.linalg.norm(new - old, axis=1)
+    length = length[np.isfinite(length)]
+    return float(np.median(length)) if len(length) else 0.0
+
+
+def _turn_and_move(before: Camera, after: Camera) -> tuple[float, float]:
+    """Returns degrees and millimetres by which a camera was turned and moved."""
+    turn = after.cam_from_world[:3, :3] @ before.cam_from_world[:3, :3].T
+    degrees = float(np.degrees(np.linalg.norm(matrix_to_axis_angle(turn))))
+    return degrees, 1e3 * float(np.linalg.norm(after.center - before.center))
+
+
+@dataclass(frozen=True)
+class RefinedRig:
+    """Cameras after refinement, and median errors of held-out points before and after.
+
+    `kept` is the reason why the given cameras stayed, empty if they were replaced.
+    """
+
+    cameras: dict[str, Camera]
+    by: str
+    before_px: float
+    after_px: float
+    kept: str
+
+    def figures(self, given: Mapping[str, Camera]) -> dict[str, object]:
+        """Returns metrics, including how far each camera was turned and moved."""
+        moves = {}
+        for name, after in {} if self.kept else self.cameras.items():
+            turn_deg, move_mm = _turn_and_move(given[name], after)
+            moves[name] = {"turn_deg": round(turn_deg, 4), "move_mm": round(move_mm, 3)}
+        before, later = (
+            round(error, 4) if np.isfinite(error) else None
+            for error in (self.before_px, self.after_px)
+        )
+        return {
+            "by": self.by,
+            "held_out_before_px": before,
+            "held_out_after_px": later,
+            "kept_given": bool(self.kept),
+            "why": self.kept,
+            "moves": moves,
+        }
+
+
+def refine_by_footage(
+    given: Mapping[str, Camera],
+    seen: Mapping[int, FrameSetPoints],
+    *,
+    turn_deg: float,
+    move_mm: float,
+    lenses: bool,
+    start: Mapping[str, Camera] | None = None,
+) -> RefinedRig:
+    """Refines cameras, and if asked `lenses`, by points they saw at the same instants.
+
+    `seen` are points by frame number, in pixels of `reduced_camera`. `turn_deg` and `move_mm` are
+    standard deviations of how far cameras may be off. `start` are the given cameras with corrected
+    poses of those that have clearly moved.
+    """
+    small = {name: reduced_camera(camera) for name, camera in given.items()}
+    poses = {name: camera.cam_from_world for name, camera in (start or given).items()}
+    placed = {name: replace(camera, cam_from_world=poses[name]) for name, camera in small.items()}
+    tracks = join_tracks(placed, seen, REFINE_BAND)
+    enough = tracks.shared_points() >= LEAST_POINTS
+    names = tuple(n for n, ok in zip(tracks.names, enough, strict=True) if ok)
+    tracks = tracks.of_cameras(names)
+    held, fit = (tracks.select((tracks.point % HELD == 0) == side) for side in (True, False))
+    if len(names) < 3 or len(held.camera) < LEAST_POINTS:
+        why = "cameras share too few points"
+        return RefinedRig(dict(given), "footage", np.nan, np.nan, why)
+    priors = replace(
+        LENS if lenses else RigPriors(), turn_rad=np.radians(turn_deg), move_m=move_mm * 1e-3
+    )
+    points = triangulate_tracks(placed, fit)
+    found = adjust_rig(placed, fit, points, priors, REFINE_SCALES).cameras
+    before, before_px = _judge(small, held)
+    after, after_px = _judge(found, held)
+    if not after < CLEARLY * before:
+        why = "held-out points fit no better"
+        return RefinedRig(dict(given), "footage", before_px, after_px, why)
+    refined = dict(given)
+    for name, camera in found.items():
+        full = at_footage_size(camera, given[name]) if lenses else given[name]
+        refined[name] = replace(full, cam_from_world=camera.cam_from_world)
+    return RefinedRig(refined, "footage", before_px, after_px, "")
+
+
+def _judge(cameras: Mapping[str, Camera], held: PointTracks) -> tuple[float, float]:
+    """Returns mean robust cost and median feature error, pixels, of held-out tracks."""
+    points = triangulate_tracks(cameras, held)
+    fit = adjust_rig(cameras, held, points, RigPriors(), REFINE_SCALES[-1:], free=(), iterations=15)
+    errors = np.linalg.norm(fit.errors, axis=1)
+    features = errors[held.features()]
+    median = float(np.median(features if len(features) else errors))
+    return fit.cost / len(errors), median
+
+
+def refine_by_board(
+    given: Mapping[str, Camera],
+    corners: BoardCorners,
+    points: np.ndarray,
+    *,
+    rounds: int,
+    lenses: bool,
+) -> RefinedRig:
+    """Refines cameras, and if asked `lenses`, by a ChArUco board that several see at once.
+
+    The scale becomes the print's; where the rig stands is kept, by a rigid motion. `points` (P, 3)
+    are corners on the board, metres. Each of `rounds` takes its loss scale from the errors before.
+    """
+    held = corners.frame % HELD == 0
+    fit, judge = corners.select(~held), corners.select(held)
+    start = _with_boards(given, fit, points)
+    fit = fit.select(_near(start, fit, points))
+    if len(set(fit.camera)) < 2 or len(start.boards) < 4:
+        why = "cameras share too few corners"
+        return RefinedRig(dict(given), "board", np.nan, np.nan, why)
+    loss = max(2 * _median_error(start, fit, points), 0.1)
+    solved = start
+    for _ in range(max(rounds, 2)):
+        solved = adjust_board_rig(solved, fit, points, loss, lenses=lenses)
+        loss = max(2 * _median_error(solved, fit, points), 0.02)
+    found = _over(solved.cameras, given)
+    before = _median_error(_with_boards(given, judge, points), judge, points)
+    after = _median_error(_with_boards({**given, **found}, judge, points), judge, points)
+    if not after < CLEARLY * before:
+        why = "held-out corners fit no better"
+        return RefinedRig(dict(given), "board", before, after, why)
+    return RefinedRig({**given, **found}, "board", before, after, "")
+
+
+def _with_boards(
+    cameras: Mapping[str, Camera], corners: BoardCorners, points: np.ndarray
+) -> BoardRig:
+    """Adds the board poses that fit the cameras best, with the cameras held."""
+    views = {}
+    for name in sorted(set(corners.cameras) & set(cameras)):
+        size = (cameras[name].width, cameras[name].height)
+        mine = board_views(corners, name, points, size)
+        if mine:
+            views[name] = {v.frame: with_ideal(cameras[name], v) for v in mine}
+    placed = {name: cameras[name].cam_from_world for name in views}
+    boards = rig_from_boards(placed, cameras, views, all_board_poses(views))
+    rig = BoardRig({name: cameras[name] for name in views}, boards)
+    kept = corners.select(_near(rig, corners, points))
+    if len(kept.camera) == 0:
+        return rig
+    loss = max(2 * _median_error(rig, kept, points), 0.1)
+    held = adjust_board_rig(rig, kept, points, loss, lenses=False, cameras=False)
+    return BoardRig(rig.cameras, {**rig.boards, **held.boards})
+
+
+def _near(rig: BoardRig, corners: BoardCorners, points: np.ndarray) -> np.ndarray:
+    """Marks the rows (N,) that the rig explains roughly."""
+    errors = np.linalg.norm(corner_errors(rig, corners, points), axis=1)
+    widths = [np.hypot(c.width, c.height) for c in rig.cameras.values()]
+    return errors < 2 * NEAR * max(widths, default=0.0)
+
+
+def _median_error(rig: BoardRig, corners: BoardCorners, points: np.ndarray) -> float:
+    errors = np.linalg.norm(corner_errors(rig, corners, points), axis=1)
+    errors = errors[np.isfinite(errors)]
+    return float(np.median(errors)) if len(errors) else float("nan")
+
+
+def _over(solved: Mapping[str, Camera], given: Mapping[str, Camera]) -> dict[str, Camera]:
+    """Lays solved cameras over the given ones by the rigid motion that most of them agree on."""
+    names = sorted(solved)
+    new, old = (np.stack([rig[n].center for n in names]) for rig in (solved, given))
+    if len(names) < 3:
+        motion = given[names[0]].world_from_cam @ solved[names[0]].cam_from_world
+        return move_cameras(solved, motion)
+    weights = np.ones(len(names))
+    for _ in range(10):  # a camera that was bumped must not drag the others along
+        R, t = rigid_fit(new, old, weights)
+        off = np.linalg.norm(new @ R.T + t - old, axis=1)
+        weights = 1 / (1 + (off / max(float(np.median(off)), 1e-6)) ** 2)
+    return move_cameras(solved, make_transform(R, t))

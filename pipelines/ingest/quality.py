@@ -1,0 +1,385 @@
+"""Check sync, light and focus of the cameras: figures for ``checks.json`` and warnings for people.
+
+- Sync: every camera sees the same face move, so the curve of how much changes from frame to frame
+  is compared with the median curve of the others. The likeliest path of lags (Viterbi) shows where
+  a camera lost or repeated frames.
+- Light: the subject moves, but the background and most of the face do not. Each cell of a frame is
+  compared with its own median over time, and the median over the cells counts.
+- Focus: the width of the sharpest edges is compared with the other cameras and over time.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+
+import cv2
+import numpy as np
+from scipy.ndimage import median_filter
+
+from express50.files.images import srgb_to_linear
+from pipelines.ingest.config import IngestConfig
+
+SIDE = 96  # longer side, pixels, of the images in which movement is measured
+FEWEST_CAMERAS, FEWEST_FRAMES = 3, 24
+SPAN = 15  # frames of the running mean that is subtracted: views differ in how much they see
+STEP_COST = 10.0  # cost of a change of lag, in units of log likelihood
+FRAME_COST = 1.0  # cost of each frame of a lag: few frames are lost more often than many
+START_COST = 7.0  # cost of being out of step from the start
+ALIKE = 0.35  # least correlation with the other cameras for a camera to be judged
+EARLY = 8  # a change of lag before this frame looks like one before the start
+LEAST_SPREAD = 0.15  # of curves of unit variance; views are never more alike than that
+STILL = 0.05  # share of a camera's usual movement below which a frame repeats the one before
+
+CELLS = 16
+DARK, BRIGHT = 0.004, 0.85  # linear light between which a cell shows the camera's gain
+DRIFT_SPAN = 9  # frames of the running median: a passing hand is not a drift
+FEWEST_CELLS = 12
+FEWEST_DRIFT_FRAMES = 12  # with fewer, a movement looks like a drift
+EXPOSURE_DRIFT, COLOUR_DRIFT = 0.15, 0.06  # stops over the capture from which on it is a warning
+_CURVE = srgb_to_linear(np.arange(256, dtype=np.float32) / 255.0).astype(np.float32)
+
+REACH = 8  # pixels on either side of an edge within which its two levels are looked for
+SMOOTH = 0.8  # deviation, pixels, of the filter against noise; subtracted from the width again
+LEAST_HEIGHT = 30.0  # grey levels between the sides of an edge, so that noise is not an edge
+FEWEST_EDGES = 12
+SHARPEST = 20  # percentile of the widths: a face is soft, its lashes and hair are not
+
+
+@dataclass(frozen=True)
+class Seen:
+    """Measurements of one camera's frames.
+
+    Attributes:
+        moves: (F,) movement since the frame before, grey levels.
+        cells: (F, 16, 16, 3) linear light.
+        widths: frame and width of its sharpest edges, pixels, of some frames.
+    """
+
+    moves: np.ndarray
+    cells: np.ndarray
+    widths: tuple[tuple[int, float], ...]
+
+
+def check_quality(
+    seen: Mapping[str, Seen],
+    digests: Mapping[str, str],
+    clips: Sequence[int],
+    config: IngestConfig,
+) -> tuple[dict, dict[str, str]]:
+    """Returns the figures for ``checks.json`` and the warnings by camera.
+
+    ``digests`` are of each camera's files, ``clips`` the frames of each recording.
+    """
+    count = min(sum(clips), *(len(s.moves) for s in seen.values()))
+    moves = {name: s.moves[:count] for name, s in seen.items()}
+    steps, unjudged = (
+        find_steps(moves, clips, config.sync_frames) if config.sync_frames else ({}, {})
+    )
+    stuck = find_repeats(moves)
+    drifts = {name: measure_drift(s.cells.astype("float32")) for name, s in seen.items()}
+    widths, blurred = judge_focus({n: s.widths for n, s in seen.items()}, config.blur_ratio)
+    first: dict[str, str] = {}
+    warnings = {}
+    for name in sorted(seen):
+        words = []
+        if (twin := first.setdefault(digests[name], name)) != name:
+            words.append(f"has the same files as camera {twin}; remove the copy")
+        if name in steps:
+            words.append(describe_steps(steps[name]))
+        if frames := stuck.get(name):
+            shown = ", ".join(map(str, frames[:6])) + (", ..." if len(frames) > 6 else "")
+            words.append(
+                f"repeats the frame before in {len(frames)} frames ({shown}) while others move"
+            )
+        words += describe_drift(drifts[name])
+        words += [blurred[name]] if name in blurred else []
+        if words:
+            warnings[f"camera {name}"] = "; ".join(words)
+    figures = {
+        "sync": {
+            "out_of_step": {k: [asdict(s) for s in v] for k, v in steps.items()},
+            "repeats": stuck,
+            "untold": unjudged,
+        },
+        "light": {k: asdict(d) if d else None for k, d in drifts.items()},
+        "focus_px": widths,
+    }
+    return figures, warnings
+
+
+@dataclass(frozen=True)
+class Step:
+    """From ``frame`` on, a camera's frame n shows what the others show in n + ``lag``."""
+
+    frame: int
+    lag: int
+
+
+def small_grey(image: np.ndarray) -> np.ndarray:
+    """Return a grey image float32, longer side at most 96 pixels, of an image (H, W, 3) uint8."""
+    grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32)
+    scale = SIDE / max(grey.shape)
+    if scale >= 1:
+        return grey
+    size = (max(1, round(grey.shape[1] * scale)), max(1, round(grey.shape[0] * scale)))
+    return cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
+
+
+def movement(before: np.ndarray | None, after: np.ndarray) -> float:
+    """Return the mean change between two small grey images, grey levels; 0 for the first."""
+    return 0.0 if before is None else float(np.abs(after - before).mean())
+
+
+def find_steps(
+    moves: Mapping[str, np.ndarray], clips: Sequence[int], reach: int
+) -> tuple[dict[str, list[Step]], dict[str, str]]:
+    """Finds the steps of cameras that are out of step, and why other cameras cannot be judged.
+
+    ``moves`` (F,) are all of one length; ``clips`` are the frames of each recording and ``reach``
+    is the largest lag, frames.
+    """
+    names = sorted(moves)
+    if len(names) < FEWEST_CAMERAS:
+        return {}, dict.fromkeys(names, f"fewer than {FEWEST_CAMERAS} cameras")
+    steps: dict[str, list[Step]] = {}
+    judged: set[str] = set()
+    start = 0
+    for count in clips:
+        if count >= FEWEST_FRAMES:
+            curves = {n: _curve(moves[n][start : start + count].astype(float)) for n in names}
+            found, alike = _steps_of_clip(curves, reach)
+            judged |= alike
+            for name, path in found.items():
+                steps.setdefault(name, []).extend(Step(start + s.frame, s.lag) for s in path)
+        start += count
+    why = "too few frames or too little movement that others see too"
+    return steps, {name: why for name in names if name not in judged}
+
+
+def _curve(moves: np.ndarray) -> np.ndarray:
+    """Return the logarithm of movement (F,) less its running mean, scaled to unit deviation."""
+    floor = max(float(np.median(moves)) * 0.2, 1e-3)
+    values = np.log(moves + floor)
+    values[0] = values[1]  # nothing comes before the first frame
+    span = min(SPAN, len(values) // 2 * 2 - 1)
+    padded = np.pad(values, span // 2, mode="reflect")
+    values = values - np.convolve(padded, np.ones(span) / span, mode="valid")
+    return values / max(float(values.std()), 1e-6)
+
+
+def _steps_of_clip(
+    curves: Mapping[str, np.ndarray], reach: int
+) -> tuple[dict[str, list[Step]], set[str]]:
+    """Return the steps by camera, and the cameras whose movement is like that of the others.
+
+    The camera with the strongest evidence is taken out first: left in, it would distort what the
+    others are compared with.
+    """
+    steps: dict[str, list[Step]] = {}
+    alike: set[str] = set()
+    while len(curves) - len(steps) >= FEWEST_CAMERAS:
+        left = {name: curve for name, curve in curves.items() if name not in steps}
+        rest = {n: np.median([c for m, c in left.items() if m != n], axis=0) for n in left}
+        # The fit of the usual camera: a camera out of step would excuse itself by its own.
+        misses = [np.mean((left[n] - rest[n])[1:] ** 2) for n in left]
+        spread = max(float(np.median(misses)), LEAST_SPREAD)
+        gains = {}
+        for name in left:
+            path, gain = _likeliest_lags(left[name], rest[name], reach, spread)
+            if _correlation(left[name], rest[name], path) >= ALIKE:
+                alike.add(name)
+                if path.any():
+                    gains[name] = gain, path
+        if not gains:
+            break
+        worst = max(gains, key=lambda name: gains[name][0])
+        path = gains[worst][1]
+        edges = np.flatnonzero(np.diff(path, prepend=0))
+        steps[worst] = [Step(int(t), int(path[t])) for t in edges]
+    return steps, alike
+
+
+def _likeliest_lags(
+    curve: np.ndarray, rest: np.ndarray, reach: int, spread: float
+) -> tuple[np.ndarray, float]:
+    """Return the likeliest lag (F,) of each frame, and its log likelihood over no lag at all."""
+    count = len(curve)
+    lags = np.arange(-reach, reach + 1)
+    at = np.arange(count)[:, None] + lags
+    beyond = (at < 0) | (at >= count)
+    miss = (curve[:, None] - rest[np.clip(at, 0, count - 1)]) ** 2 / (2 * spread)
+    # Beyond the clip there is nothing to compare, so no lag fits better there than being in step.
+    miss = np.minimum(np.where(beyond, miss[:, reach : reach + 1], miss), 6.0)
+    total = miss[0] + (START_COST + FRAME_COST * np.abs(lags)) * (lags != 0)
+    far = np.abs(lags[:, None] - lags)
+    change = (STEP_COST + FRAME_COST * far) * (far > 0)
+    never = np.where(far > 0, np.inf, 0.0)
+    came = np.zeros((count, len(lags)), dtype=np.int64)
+    for t in range(1, count):
+        # This near the end, mostly frames without a counterpart would decide about a change.
+        late = t >= count - 2 * reach
+        ways = total[:, None] + (never if late else change)
+        came[t] = ways.argmin(axis=0)
+        total = ways.min(axis=0) + miss[t]
+    path = np.zeros(count, dtype=np.int64)
+    state = int(total.argmin())
+    gain = float(miss[:, reach].sum() - total[state])
+    for t in range(count - 1, -1, -1):
+        path[t] = lags[state]
+        state = int(came[t, state])
+    return path, gain
+
+
+def _correlation(curve: np.ndarray, rest: np.ndarray, path: np.ndarray) -> float:
+    """Return the correlation of a curve with that of the others along a path of lags."""
+    at = np.arange(len(curve)) + path
+    inside = (at >= 1) & (at < len(curve))
+    a, b = curve[inside], rest[at[inside]]
+    if len(a) < FEWEST_FRAMES // 2 or a.std() < 1e-9 or b.std() < 1e-9:
+        return 0.0
+    return float(np.corrcoef(a, b)[0, 1])
+
+
+def describe_steps(steps: Sequence[Step]) -> str:
+    """Describe the steps of a camera for people."""
+    words = []
+    before = 0
+    for step in steps:
+        change = step.lag - before
+        frames = f"{abs(change)} frame{'s' if abs(change) > 1 else ''}"
+        if step.frame < EARLY and before == 0:
+            side = "ahead of" if step.lag > 0 else "behind"
+            words.append(f"is {frames} {side} the others from its start")
+        else:
+            what = "loses" if change > 0 else "repeats or gains"
+            words.append(f"{what} {frames} at about frame {step.frame}")
+        before = step.lag
+    return "; ".join(words) + "; cut its footage so that the cameras show the same moment"
+
+
+def find_repeats(moves: Mapping[str, np.ndarray]) -> dict[str, list[int]]:
+    """Find the frames of each camera that repeat the one before while most others move."""
+    names = sorted(moves)
+    if len(names) < FEWEST_CAMERAS:
+        return {}
+    table = np.stack([moves[name] for name in names])
+    usual = np.median(table, axis=1, keepdims=True)
+    moving = (table > 0.5 * usual).sum(axis=0) > len(names) // 2
+    stuck = (table < STILL * usual) & moving
+    stuck[:, 0] = False
+    return {
+        n: np.flatnonzero(row).tolist() for n, row in zip(names, stuck, strict=True) if row.any()
+    }
+
+
+@dataclass(frozen=True)
+class Drift:
+    """Range of a camera's light over the capture, in stops.
+
+    Attributes:
+        exposure: mean over red, green and blue.
+        red, blue: against green.
+        brightest, darkest: frames of the largest and the smallest exposure.
+    """
+
+    exposure: float
+    red: float
+    blue: float
+    brightest: int
+    darkest: int
+
+
+def light_cells(image: np.ndarray) -> np.ndarray:
+    """Return the mean linear light (16, 16, 3) float32 of an image (H, W, 3) uint8."""
+    return cv2.resize(_CURVE[image], (CELLS, CELLS), interpolation=cv2.INTER_AREA)
+
+
+def measure_drift(cells: np.ndarray) -> Drift | None:
+    """Measure the drift of a camera's cells (F, 16, 16, 3); None with too few frames or cells."""
+    if len(cells) < FEWEST_DRIFT_FRAMES:
+        return None
+    usual = np.median(cells, axis=0)
+    usable = ((usual > DARK) & (usual < BRIGHT)).all(axis=-1)
+    if usable.sum() < FEWEST_CELLS:
+        return None
+    stops = np.log2(np.maximum(cells[:, usable], 1e-4) / usual[usable])  # (F, N, 3)
+    curve = median_filter(np.median(stops, axis=1), (DRIFT_SPAN, 1), mode="nearest")
+    exposure = curve.mean(axis=1)
+    return Drift(
+        exposure=float(np.ptp(exposure)),
+        red=float(np.ptp(curve[:, 0] - curve[:, 1])),
+        blue=float(np.ptp(curve[:, 2] - curve[:, 1])),
+        brightest=int(exposure.argmax()),
+        darkest=int(exposure.argmin()),
+    )
+
+
+def describe_drift(drift: Drift | None) -> list[str]:
+    """Describe what is wrong with a camera's light; empty where nothing is."""
+    if drift is None:
+        return []
+    wrong = []
+    if drift.exposure > EXPOSURE_DRIFT:
+        wrong.append(
+            f"exposure changes by {drift.exposure:.2f} stops between frame {drift.darkest} (dark) "
+            f"and {drift.brightest} (bright)"
+        )
+    colours = [(n, v) for n, v in (("red", drift.red), ("blue", drift.blue)) if v > COLOUR_DRIFT]
+    if colours:
+        words = " and ".join(f"{name} by {value:.2f} stops" for name, value in colours)
+        wrong.append(f"white balance changes, {words} against green")
+    return wrong
+
+
+def edge_width(image: np.ndarray) -> float | None:
+    """Measure the width of the sharpest edges of an image (H, W, 3) uint8; None with too few.
+
+    The width is the standard deviation, pixels, of the Gaussian that would blur a step as much: a
+    step of height h, blurred by s, rises by at most h / (s sqrt(2 pi)) per pixel.
+    """
+    grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32)
+    grey = cv2.GaussianBlur(grey, (0, 0), SMOOTH)
+    slope = np.hypot(
+        cv2.Sobel(grey, cv2.CV_32F, 1, 0, ksize=1) / 2,
+        cv2.Sobel(grey, cv2.CV_32F, 0, 1, ksize=1) / 2,
+    )
+    window = np.ones((2 * REACH + 1, 2 * REACH + 1), np.uint8)
+    height = cv2.dilate(grey, window) - cv2.erode(grey, window)
+    steepest = slope == cv2.dilate(slope, np.ones((REACH + 1, REACH + 1), np.uint8))
+    edges = steepest & (height > LEAST_HEIGHT) & (slope > 0)
+    if edges.sum() < FEWEST_EDGES:
+        return None
+    widths = height[edges] / (slope[edges] * math.sqrt(2 * math.pi))
+    width = float(np.percentile(widths, SHARPEST))
+    return math.sqrt(max(width**2 - SMOOTH**2, 0.0))
+
+
+def judge_focus(
+    widths: Mapping[str, Sequence[tuple[int, float]]], ratio: float
+) -> tuple[dict[str, float], dict[str, str]]:
+    """Returns each camera's median width, pixels, and the cameras out of focus with the reason.
+
+    ``widths`` are (frame, width) samples; edges ``ratio`` times as wide as usual are out of focus.
+    """
+    middle = {name: float(np.median([w for _, w in rows])) for name, rows in widths.items() if rows}
+    wrong = {}
+    for name, width in middle.items():
+        others = [w for other, w in middle.items() if other != name]
+        usual = float(np.median(others)) if len(others) > 1 else width
+        if width > ratio * max(usual, 0.5):
+            wrong[name] = (
+                f"out of focus: its sharpest edges are {width:.1f} px wide, the other cameras' "
+                f"{usual:.1f}"
+            )
+            continue
+        third = max(1, len(widths[name]) // 3)
+        first, last = widths[name][:third], widths[name][-third:]
+        before, after = (float(np.median([w for _, w in rows])) for rows in (first, last))
+        if len(widths[name]) >= 6 and max(before, after) > ratio * max(min(before, after), 0.5):
+            wrong[name] = (
+                f"its focus changes: the sharpest edges are {before:.1f} px wide about frame "
+                f"{first[0][0]}, {after:.1f} about frame {last[-1][0]}"
+            )
+    return middle, wrong

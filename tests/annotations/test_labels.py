@@ -1,0 +1,154 @@
+"""The label store: nothing is lost, people stand above suggestions, undo is a record."""
+
+import json
+import multiprocessing
+import time
+from dataclasses import replace
+
+import pytest
+
+from annotations.labels import (
+    AUTOMATIC,
+    Label,
+    append_label,
+    current_labels,
+    human_digest,
+    labels_of,
+    make_event,
+    make_flag,
+    make_mark,
+    read_labels,
+)
+from express50.capture.index import CameraSource, Cue, Index
+from express50.contract.layout import Dataset
+from express50.errors import AnnotationError
+
+
+def _index(tmp_path):
+    source = CameraSource(
+        kind="frames", source="cameras/a/frames", width=8, height=8, frames=10,
+        pts=tuple(range(0, 100, 10)), dhash=tuple(f"{i:016x}" for i in range(10)), sha256="0",
+    )  # fmt: skip
+    return Index(
+        subject="S1", capture=tmp_path, fps=24.0, cameras={"a": source}, plates={}, board=None,
+        calibration=None, cues=(Cue("smile", 2, 6),),
+    )  # fmt: skip
+
+
+def _mark(frame, annotator, when):
+    return Label(
+        subject="S1", expression="smile", action="mark", annotator=annotator, time=when, frame=frame
+    )
+
+
+def test_mark_stores_the_frame_identity(tmp_path):
+    mark = make_mark(_index(tmp_path), "smile", 4, "a", "ann")
+    assert (mark.pts, mark.dhash) == (40, f"{4:016x}")
+    dataset = Dataset(tmp_path)
+    append_label(dataset, mark)
+    assert read_labels(dataset, "S1") == [mark]
+
+
+@pytest.mark.parametrize(
+    ("expression", "frame", "camera", "named"),
+    [("frown", 4, "a", "frown"), ("smile", 7, "a", "2 to 6"), ("smile", 4, "z", "'z'")],
+)
+def test_mark_outside_footage_or_cue_is_refused(tmp_path, expression, frame, camera, named):
+    with pytest.raises(AnnotationError, match=named):
+        make_mark(_index(tmp_path), expression, frame, camera, "ann")
+
+
+def test_person_outranks_a_later_suggestion():
+    labels = [_mark(3, "ann", 1.0), _mark(5, AUTOMATIC, 2.0)]
+    assert current_labels(labels)["smile"].frame == 3
+    assert current_labels(reversed(labels))["smile"].frame == 3
+
+
+def test_later_person_wins_and_undo_restores_the_earlier_label():
+    labels = [_mark(3, "ann", 1.0), _mark(5, "bob", 2.0), _mark(6, "bob", 3.0)]
+    assert current_labels(labels)["smile"].frame == 6
+    undo = Label(subject="S1", expression="smile", action="undo", annotator="bob", time=4.0)
+    assert current_labels([*labels, undo])["smile"].frame == 5
+    assert current_labels([*labels, undo, undo])["smile"].frame == 3
+    assert current_labels([*labels, undo, undo, undo])["smile"].frame == 3
+
+
+def test_automatic_labels_do_not_change_the_human_digest(tmp_path):
+    dataset = Dataset(tmp_path)
+    before = human_digest(dataset, "S1")
+    append_label(dataset, _mark(3, AUTOMATIC, time.time()))
+    assert human_digest(dataset, "S1") == before
+    append_label(dataset, _mark(3, "ann", time.time()))
+    assert human_digest(dataset, "S1") != before
+
+
+def test_torn_line_is_skipped_and_later_lines_are_read(tmp_path):
+    dataset = Dataset(tmp_path)
+    append_label(dataset, _mark(3, "ann", 1.0))
+    with dataset.labels_file("S1").open("a") as file:
+        file.write('{"subject": "S1", "expre')
+    append_label(dataset, _mark(4, "ann", 2.0))
+    assert [label.frame for label in read_labels(dataset, "S1")] == [3, 4]
+
+
+def test_line_that_is_not_an_event_raises_with_its_number(tmp_path):
+    dataset = Dataset(tmp_path)
+    append_label(dataset, _mark(3, "ann", 1.0))
+    with dataset.labels_file("S1").open("a") as file:
+        file.write(json.dumps({"subject": "S1"}) + "\n")
+    with pytest.raises(AnnotationError, match="line 2"):
+        read_labels(dataset, "S1")
+
+
+def _append_many(root, annotator):
+    for number in range(50):
+        append_label(Dataset(root), _mark(number, annotator, float(number)))
+
+
+def test_concurrent_annotators_lose_no_labels(tmp_path):
+    context = multiprocessing.get_context("fork")
+    workers = [context.Process(target=_append_many, args=(tmp_path, f"a{i}")) for i in range(3)]
+    for worker in workers:
+        worker.start()
+    for worker in workers:
+        worker.join()
+    labels = read_labels(Dataset(tmp_path), "S1")
+    for i in range(3):
+        assert [x.frame for x in labels if x.annotator == f"a{i}"] == list(range(50))
+
+
+def test_adjudication_outranks_later_marks_and_keeps_the_originals(tmp_path):
+    index = _index(tmp_path)
+    settle = replace(make_mark(index, "smile", 4, "a", "eve"), action="settle")
+    labels = [_mark(3, "ann", 1.0), _mark(5, "eve", 2.0), settle, _mark(6, "bob", 9e9)]
+    assert current_labels(labels)["smile"] == settle
+    assert {who: labels_of(labels, who)["smile"].frame for who in ("ann", "bob", "eve")} == {
+        "ann": 3, "bob": 6, "eve": 5,
+    }  # fmt: skip
+    assert current_labels([*labels, make_event(index, "smile", "undo", "eve")])["smile"].frame == 6
+
+
+def test_rule_ranks_between_people_and_suggestions():
+    labels = [_mark(5, "rule:last-frame", 3.0), _mark(3, AUTOMATIC, 4.0)]
+    assert current_labels(labels)["smile"].frame == 5
+    assert current_labels([*labels, _mark(4, "ann", 1.0)])["smile"].frame == 4
+
+
+def test_plateau_and_effort_are_kept(tmp_path):
+    index = _index(tmp_path)
+    mark = make_mark(index, "smile", 4, "a", "ann", 3, 5)
+    mark = replace(mark, seconds=2.5, keys=2, shown=True)
+    append_label(Dataset(tmp_path), mark)
+    assert read_labels(Dataset(tmp_path), "S1") == [mark]
+    for first, last in ((5, 5), (1, None)):  # without the frame; beyond the cue window
+        with pytest.raises(AnnotationError):
+            make_mark(index, "smile", 4, "a", "ann", first, last)
+
+
+def test_a_flag_needs_a_reason_and_an_expression(tmp_path):
+    index = _index(tmp_path)
+    assert make_flag(index, "smile", " failed: blinked ", "ann").reason == "failed: blinked"
+    with pytest.raises(AnnotationError, match="smile"):
+        make_flag(index, "smile", " ", "ann")
+    with pytest.raises(AnnotationError, match="frown"):
+        make_flag(index, "frown", "failed", "ann")

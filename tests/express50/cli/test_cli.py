@@ -1,0 +1,165 @@
+"""The command line: output, exit codes, one line for an error, only one area imported."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from express50.cli.main import main
+from tests.synth import make_capture
+
+COMMANDS = [
+    "annotate",
+    "cameras",
+    "photo",
+    "shards",
+    "check",
+    "plan",
+    "subject",
+    "export",
+    "report",
+]
+REPOSITORY = Path(__file__).resolve().parents[3]
+
+
+@pytest.fixture
+def run(capsys):
+    def call(*arguments):
+        code = main([str(argument) for argument in arguments])
+        captured = capsys.readouterr()
+        return code, captured.out, captured.err
+
+    return call
+
+
+@pytest.fixture
+def data(tmp_path):
+    return tmp_path / "data"
+
+
+def test_ingest_then_skip_then_status(run, data, capture):
+    code, out, err = run("ingest", data, capture)
+    assert code == 0
+    assert out.startswith("ingest: read 1 = 1 done + 0 skipped + 0 failed in ")
+    assert err.startswith("ingest 1/1 S001 done ")
+    code, out, err = run("ingest", data)
+    assert (code, err) == (0, "")
+    assert "0 done + 1 skipped" in out
+    code, out, _ = run("status", data)
+    assert code == 0
+    assert out.splitlines()[1].split()[:3] == ["ingest", "1", "0"]
+
+
+def test_json_is_alone_on_standard_output(data, capture):
+    command = [sys.executable, "-m", "express50", "ingest", str(data), str(capture), "--json"]
+    done = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, check=True)
+    account = json.loads(done.stdout)
+    counts = [account[k] for k in ("stage", "read", "done", "skipped", "failed")]
+    assert counts == ["ingest", 1, 1, 0, 0]
+    assert account["items"][0]["item"] == "S001"
+
+
+def test_bad_item_gives_exit_code_1_and_is_named(run, data, capture, tmp_path):
+    make_capture(tmp_path / "S002", subject="S002", cameras=1)
+    (tmp_path / "S002/cues.csv").write_text("nonsense\n")
+    code, out, _ = run("ingest", data, capture, tmp_path / "S002", "--workers", 0)
+    assert code == 1
+    assert "read 2 = 1 done + 0 skipped + 1 failed" in out
+    assert "failed S002: CaptureError: " in out
+    assert run("status", data)[0] == 1
+    code, out, _ = run("ingest", data, "--items", "S001")
+    assert (code, "read 1 = 0 done + 1 skipped + 0 failed" in out) == (0, True)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "message"),
+    [
+        (["ingest", "DATA", "absent"], 1, "CaptureError: "),
+        (["ingest", "DATA"], 1, "no such dataset"),
+        (["status", "DATA"], 1, "not a dataset"),
+        (["ingest", "DATA", "CAP", "--set", "ingest.proxy_long=3"], 2, "mean 'proxy_long_side'"),
+        (["ingest", "DATA", "CAP", "--set", "track.x=3"], 2, "runs ingest only"),
+        (["ingest", "DATA", "CAP", "--preset", "fast"], 2, "unknown preset"),
+        (["ingest", "DATA", "CAP", "--workers", "-1"], 2, "--workers -1"),
+        (["ingest", "DATA", "CAP", "--items", "Z*"], 2, "no item of ingest matches"),
+        (["run", "DATA", "CAP", "--first", "track", "--last", "ingest"], 2, "comes after"),
+        (["config", "trak"], 2, "unknown stage 'trak'"),
+        (["ingest"], 2, "required: DATASET"),
+        (["nonsense"], 2, "invalid choice"),
+        ([], 2, "required: COMMAND"),
+    ],
+)
+def test_errors_are_one_line_with_their_exit_code(run, data, capture, arguments, code, message):
+    places = {"DATA": data, "CAP": capture}
+    found, out, err = run(*[places.get(a, a) for a in arguments])
+    assert (found, out) == (code, "")
+    last = err.strip().splitlines()[-1]
+    assert message in last
+    assert last.startswith("express50")
+    assert "Traceback" not in err
+
+
+def test_config_prints_toml_that_config_accepts(run, data, capture, tmp_path):
+    code, out, _ = run("config", "ingest", "--preset", "draft", "--set", "ingest.proxy_quality=70")
+    assert code == 0
+    assert "# JPEG quality of proxies, 1 to 100.\nproxy_quality = 70" in out
+    (tmp_path / "c.toml").write_text(out)
+    assert run("ingest", data, capture, "--config", tmp_path / "c.toml")[0] == 0
+    assert "proxy_long_side = 320" in (data / "config/ingest.toml").read_text()
+
+
+def test_run_goes_through_the_stages_in_order(run, data, capture):
+    code, out, _ = run("run", data, capture, "--last", "ingest", "--json")
+    assert code == 0
+    assert [account["stage"] for account in json.loads(out)] == ["ingest"]
+
+
+def test_what_the_system_refuses_is_one_line(run, data, capture):
+    assert run("ingest", data, capture)[0] == 0
+    code, _, err = run("report", data, "--out", "/proc/none/report.html")
+    assert code == 1 and err.count("\n") == 1
+    assert "/proc/none" in err and "Traceback" not in err
+
+
+def test_a_reader_that_leaves_stops_nothing(data, capture):
+    command = [sys.executable, "-m", "express50", "ingest", str(data), str(capture)]
+    read, write = os.pipe()
+    os.close(read)
+    environment = {**os.environ, "PYTHONPATH": str(REPOSITORY)}
+    ended = subprocess.run(command, stdout=write, stderr=write, env=environment, check=False)
+    os.close(write)
+    assert ended.returncode == 0 and (data / "ingest" / "S001" / "metrics.json").is_file()
+
+
+def test_version_and_help(run):
+    assert run("--version")[:2] == (0, "express50 0.1.0\n")
+    code, out, _ = run("--help")
+    assert code == 0
+    for name in ["ingest", "calibrate", "run", "status", "config", *COMMANDS]:
+        assert f"\n    {name}" in out
+
+
+def test_only_the_module_of_the_asked_command_is_imported(data):
+    """Seconds of imports must not stand before a short command."""
+    code = (
+        "import sys; from express50.cli.main import main; main(['status', sys.argv[1]]);"
+        "heavy = {'torch', 'open3d', 'pycolmap', 'cv2', 'av', 'dask', 'distributed', 'numpy'};"
+        "print(sorted(heavy & set(sys.modules)))"
+    )
+    environment = os.environ | {"PYTHONPATH": str(REPOSITORY)}
+    command = [sys.executable, "-c", code, str(data)]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+def test_interrupt_keeps_what_is_finished_and_says_so(run, data, capture, monkeypatch):
+    def stop(*arguments, **options):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("express50.runner.runner.run_stage", stop)
+    code, out, err = run("ingest", data, capture)
+    assert (code, out) == (130, "")
+    assert "what is finished is kept" in err

@@ -1,0 +1,86 @@
+"""Plans: figures come from receipts, grow by the stated law, or are absent."""
+
+import json
+
+import pytest
+
+from express50.cli.main import main
+from express50.cli.plan import (
+    TARGETS,
+    Footage,
+    Measured,
+    estimate,
+    footage_of,
+    measure,
+    target_of,
+)
+from express50.contract.layout import Dataset
+from express50.contract.stage import stages
+from express50.errors import ConfigError
+from express50.runner.ledger import Ledger
+from pipelines import ingest
+from tests.synth import make_capture
+
+SMALL = Footage(subjects=2, expressions=6, views=8, pixels=1e5, frames=36)
+
+
+def cost(seconds, size=1e6, memory=1e9, preset="draft"):
+    return Measured(seconds=seconds, bytes=size, memory=memory, preset=preset)
+
+
+def test_express_50_is_scaled_linearly_from_one_dataset():
+    target = target_of("express-50", {}, SMALL)
+    assert target == Footage(subjects=50, expressions=60, views=24, pixels=8294400, frames=360)
+    (row,) = estimate([stages()["depth"]], target, SMALL, {"depth": cost(2.0)}, workers=10)
+    ratio = 24 * 8294400 / (8 * 1e5)
+    assert row.items == 3000 and row.seconds == pytest.approx(2 * ratio)
+    assert row.core_hours == pytest.approx(3000 * 2 * ratio / 3600)
+    assert row.days == pytest.approx(row.core_hours / 240)
+    assert row.disk == pytest.approx(3000 * 1e6 * ratio)
+    assert row.memory == 1e9  # the part that does not grow is unknown: no guess is printed
+
+
+def test_one_item_is_not_split_over_workers():
+    (row,) = estimate([stages()["pack"]], SMALL, SMALL, {"pack": cost(86400.0)}, workers=32)
+    assert row.items == 1 and row.days == pytest.approx(1.0)
+
+
+def test_what_was_not_measured_says_so():
+    chosen, measured = [stages()["depth"], stages()["track"]], {"depth": cost(2.0)}
+    rows = estimate(chosen, SMALL, SMALL, measured, 1)
+    assert [row.why for row in rows] == ["", "was not run"]
+    assert rows[1].seconds is rows[1].core_hours is rows[1].disk is rows[1].memory is None
+
+
+def test_every_stage_has_a_law_and_every_target_a_size():
+    rows = estimate(list(stages().values()), SMALL, SMALL, {}, 1)
+    assert [row.stage for row in rows] == list(stages())
+    for name in TARGETS:
+        assert target_of(name, {"frames_per_expression": 90}, SMALL).frames in (5400, 1080)
+    with pytest.raises(ConfigError, match="views is 0; expected more than 0"):
+        target_of(None, {"views": 0}, SMALL)
+
+
+def test_figures_are_those_of_the_receipts(tmp_path, capsys):
+    for name in ("S001", "S002"):
+        make_capture(tmp_path / name, subject=name, cameras=2, frames=4, size=64)
+    root = tmp_path / "data"
+    captures = [str(tmp_path / name) for name in ("S001", "S002")]
+    assert main(["ingest", str(root), *captures, "--workers", "0", "--preset", "draft"]) == 0
+    dataset = Dataset(root)
+    with Ledger(dataset.ledger) as ledger:
+        receipts = ledger.read("ingest").values()
+    found = measure(dataset, [ingest.STAGE])["ingest"]
+    assert found.seconds == pytest.approx(sum(r.seconds for r in receipts) / 2)
+    assert found.memory == max(r.peak_memory for r in receipts) and found.preset == "draft"
+    files = [p for p in dataset.stage_dir("ingest").rglob("*") if p.is_file()]
+    assert found.bytes == sum(p.stat().st_size for p in files) / 2
+    assert footage_of(dataset) == Footage(subjects=2, expressions=2, views=2, pixels=4096, frames=4)
+    capsys.readouterr()
+    assert main(["plan", str(root), "--size", "128x64", "--subjects", "10", "--json"]) == 0
+    first = json.loads(capsys.readouterr().out)["stages"][0]
+    assert first["items"] == 10 and first["seconds"] == pytest.approx(2 * found.seconds)
+    assert main(["plan", str(root), "--target", "renderme-360"]) == 0
+    said = capsys.readouterr().out
+    assert "was not run" in said and "the sum lacks calibrate" in said
+    assert main(["plan", str(root), "--size", "big"]) == 2

@@ -1,0 +1,239 @@
+"""`status` reads a dataset's progress from its ledger while others write it."""
+
+import html.parser
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+import urllib.error
+import urllib.request
+from pathlib import Path
+
+import pytest
+
+from express50.cli import status as status_cli
+from express50.cli.main import main
+from express50.cli.status import SILENT_SECONDS, format_seconds, read_status, status_page
+from express50.runner.ledger import Ledger, Receipt, Run
+from tests.faults import toy
+
+REPOSITORY = Path(__file__).resolve().parents[3]
+
+
+def receipt(item, at, status="done", **values):
+    values = {"stage": "toy", "fingerprint": "f", "seconds": 2.0} | values
+    reason = "StageError: dark" if status == "failed" else ""
+    return Receipt(item=item, time=at, status=status, reason=reason, **values)
+
+
+def of(tmp_path, run, receipts, now):
+    with Ledger(tmp_path / "ledger.sqlite") as ledger:
+        if run is not None:
+            ledger.write_run(run)
+        for one in receipts:
+            ledger.write(one)
+    with Ledger(tmp_path / "ledger.sqlite", read_only=True) as ledger:
+        (row,) = read_status(ledger, ["toy"], now)
+    return row
+
+
+def test_a_run_tells_what_is_done_running_and_missing_and_when_it_ends(tmp_path):
+    run = Run(
+        stage="toy",
+        items=14,
+        current=2,
+        begun=100.0,
+        seen=119.0,
+        running={"a6": 115.0, "a5": 112.0},
+    )
+    receipts = [receipt(f"a{n}", 104.0 + 2 * n) for n in range(5)]
+    receipts += [receipt("bad", 120.0, "failed", peak_memory=7), receipt("old", 50.0)]
+    row = of(tmp_path, run, receipts, 120.0)
+    assert (row.state, row.done, len(row.failed)) == ("running", 6, 1)
+    assert sorted(row.running) == ["a5", "a6"]
+    assert row.missing == 14 - 2 - 6 - 2
+    assert row.rate == pytest.approx(6 / 20)
+    assert row.left_s == pytest.approx((14 - 2 - 6) / (6 / 20))
+    assert (row.seconds, row.peak_memory) == (14.0, 7)
+
+
+def test_an_item_that_has_ended_since_the_last_sign_is_not_running(tmp_path):
+    run = Run(stage="toy", items=2, begun=100.0, seen=110.0, running={"a": 105.0, "b": 105.0})
+    row = of(tmp_path, run, [receipt("a", 111.0)], 112.0)
+    assert (list(row.running), row.done, row.missing) == (["b"], 1, 0)
+
+
+def test_the_rate_is_that_of_late_and_sinks_while_nothing_ends(tmp_path):
+    slow = [receipt(f"slow{n}", 100.0 + 10 * n) for n in range(60)]
+    quick = [receipt(f"quick{n}", 700.0 + n) for n in range(60)]
+    run = Run(stage="toy", items=200, begun=90.0, seen=759.0)
+    assert of(tmp_path, run, slow + quick, 759.0).rate == pytest.approx(1.0)
+    assert of(tmp_path, run, [], 759.0 + 10).rate == pytest.approx(50 / 60)
+
+
+@pytest.mark.parametrize(
+    ("run", "receipts", "state", "missing"),
+    [
+        (None, [], "not run", 0),
+        (Run(stage="toy", items=1, begun=1.0, seen=3.0, ended=3.0), ["done"], "done", 0),
+        (Run(stage="toy", items=1, begun=1.0, seen=3.0, ended=3.0), ["failed"], "failed", 0),
+        (Run(stage="toy", items=3, begun=1.0, seen=3.0, ended=3.0), ["done"], "stopped", 2),
+        (
+            Run(stage="toy", items=3, begun=1.0, seen=3.0, running={"b": 2.0}),
+            ["done"],
+            "stopped",
+            2,
+        ),
+    ],
+)
+def test_states(tmp_path, run, receipts, state, missing):
+    rows = [receipt(f"a{n}", 2.0, one) for n, one in enumerate(receipts)]
+    row = of(tmp_path, run, rows, 4.0 + SILENT_SECONDS)
+    assert (row.state, row.missing, row.running) == (state, missing, {})
+
+
+class Tags(html.parser.HTMLParser):
+    """Open elements balance, and nothing is loaded from elsewhere."""
+
+    VOID = {"meta", "br"}
+
+    def __init__(self):
+        super().__init__()
+        self.open, self.seen, self.attributes, self.text = [], [], [], ""
+
+    def handle_starttag(self, tag, attrs):
+        self.seen.append(tag)
+        self.attributes += attrs
+        if tag not in self.VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        self.text += data
+
+
+def parsed(text):
+    tags = Tags()
+    tags.feed(text)
+    assert tags.open == []
+    assert not [value for name, value in tags.attributes if name in ("src", "href", "srcset")]
+    assert not re.search(r"https?:|url\(|@import", text)
+    return tags
+
+
+def test_page_escapes_all_text_and_loads_nothing(tmp_path):
+    evil = "<script>alert(1)</script>&\"'"
+    failed = receipt(evil, 105.0, "failed", metrics={}, attempts=3)
+    run = Run(stage="toy", items=9, begun=100.0, seen=119.0, running={evil + "2": 101.0})
+    row = of(tmp_path, run, [failed, receipt("slow", 110.0, seconds=4020.0)], 120.0)
+    tags = parsed(status_page(evil, [row], 3.0))
+    assert tags.seen.count("script") == 1  # its own, by which it loads itself again
+    for words in (evil + "2", "StageError: dark", "1:07 h", "running", "missing"):
+        assert words in tags.text
+    assert "script" not in parsed(status_page(evil, [row], None)).seen
+
+
+def test_durations():
+    words = [format_seconds(s) for s in (1.26, 42.4, 59.7, 185, 7800, 273_600)]
+    assert words == ["1.3 s", "42 s", "1:00 min", "3:05 min", "2:10 h", "3 d 4 h"]
+
+
+def start(dataset, workers, slower=10):
+    command = [sys.executable, "-m", "tests.faults.toy", str(dataset.root), str(workers)]
+    environment = os.environ | {"PYTHONPATH": str(REPOSITORY), toy.SLOWER: str(slower)}
+    return subprocess.Popen(command, cwd=REPOSITORY, env=environment, stderr=subprocess.DEVNULL)
+
+
+def status_of_toy(dataset, now=None):
+    with Ledger(dataset.ledger, read_only=True) as ledger:
+        (row,) = read_status(ledger, ["toy"], now)
+    return row
+
+
+def first_with(dataset, seen, patience=60.0):
+    """The first status of which something is true."""
+    give_up = time.monotonic() + patience
+    while time.monotonic() < give_up:
+        if dataset.ledger.is_file():
+            row = status_of_toy(dataset)
+            if seen(row):
+                return row
+        time.sleep(0.05)
+    raise AssertionError("not seen")
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+def test_page_follows_a_run_of_another_process_to_its_end(tmp_path, monkeypatch, workers):
+    monkeypatch.setattr(status_cli, "PAGE_SECONDS", 0.2)
+    names = [*(f"item{n}" for n in range(8)), "bad1"]
+    dataset = toy.make_dataset(tmp_path / "data", names)
+    # Slow enough that a busy machine does not miss a run's middle between two looks.
+    process = start(dataset, workers, slower=25)
+    row = first_with(dataset, lambda row: row.state == "running" and row.running and row.done)
+    assert row.done + len(row.failed) + len(row.running) + row.missing == len(names)
+    page = tmp_path / "page.html"
+    monkeypatch.setattr(status_cli, "stages", lambda: {"toy": toy.STAGE})
+    assert main(["status", str(dataset.root), "--page", str(page)]) == 1
+    assert process.wait(timeout=60) == 1
+    end = status_of_toy(dataset)
+    assert (end.state, end.done, len(end.failed), end.missing) == ("failed", 8, 1, 0)
+    text = page.read_text()
+    assert "bad1" in text and "expected &#39;repaired&#39;" in text
+    assert "script" not in parsed(text).seen
+
+
+def test_a_killed_run_is_told_from_one_that_works(tmp_path):
+    dataset = toy.make_dataset(tmp_path / "data", [f"item{n}" for n in range(40)])
+    process = start(dataset, 0)
+    first_with(dataset, lambda row: row.running)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    row = status_of_toy(dataset, time.time() + SILENT_SECONDS)
+    assert row.state == "stopped"
+    assert row.missing + row.done == 40 and row.missing > 0
+
+
+def test_serve_answers_on_this_machine_alone(tmp_path):
+    of(tmp_path, None, [receipt("a", 1.0, stage="ingest")], 2.0)
+    command = [sys.executable, "-u", "-m", "express50", "status", str(tmp_path), "--serve", "0"]
+    with subprocess.Popen(command, cwd=REPOSITORY, stdout=subprocess.PIPE, text=True) as process:
+        address = process.stdout.readline().split()[0]
+        assert address.startswith("http://127.0.0.1:")
+        with urllib.request.urlopen(address, timeout=10) as answer:
+            assert "ingest" in parsed(answer.read().decode()).text
+        with pytest.raises(urllib.error.HTTPError, match="404"):
+            urllib.request.urlopen(address + "/ledger.sqlite", timeout=10)
+        process.terminate()
+    assert process.returncode == 130
+
+
+def test_what_is_no_ledger_is_one_error_that_tells_nobody_to_delete(tmp_path, capsys):
+    (tmp_path / "ledger.sqlite").write_bytes(b"no database" * 100)
+    assert main(["status", str(tmp_path)]) == 1
+    error = capsys.readouterr().err
+    assert "cannot be read as a ledger" in error and "delete" not in error
+
+
+def test_a_port_in_use_is_one_error(tmp_path, capsys):
+    of(tmp_path, None, [], 2.0)
+    assert main(["status", str(tmp_path), "--serve", "70000"]) == 2
+    assert "choose another port" in capsys.readouterr().err
+
+
+def test_status_reads_ledgers_of_before_runs_were_kept_and_writes_nothing(tmp_path, capsys):
+    of(tmp_path, None, [receipt("a", 1.0, "failed", stage="ingest")], 2.0)
+    with Ledger(tmp_path / "ledger.sqlite") as ledger:
+        ledger._database.execute("DROP TABLE runs")
+        ledger._database.execute("PRAGMA journal_mode=DELETE")
+    before = (tmp_path / "ledger.sqlite").read_bytes()
+    assert main(["status", str(tmp_path), "--page", str(tmp_path / "p.html")]) == 1
+    assert main(["status", str(tmp_path), "--json"]) == 1
+    out = capsys.readouterr().out
+    assert json.loads(out[out.index("{") :])["ingest"][0]["reason"] == "StageError: dark"
+    assert "StageError: dark" in (tmp_path / "p.html").read_text()
+    assert (tmp_path / "ledger.sqlite").read_bytes() == before

@@ -1,0 +1,252 @@
+"""Withdrawal: nothing of the person stays, nothing of the others goes."""
+
+import json
+import shutil
+from dataclasses import replace
+from datetime import datetime
+
+import numpy as np
+import pytest
+
+from express50.capture.index import read_index
+from express50.capture.readers.read import read_people
+from express50.cli.main import main
+from express50.cli.status import read_status
+from express50.contract.layout import Dataset
+from express50.dataset.withdraw import (
+    files_that,
+    names,
+    names_any_of,
+    withdraw,
+    withdrawn,
+    withdrawn_file,
+)
+from express50.errors import CaptureError, FormatError, StageError
+from express50.files.digests import text_digest
+from express50.runner.ledger import Ledger, Made, Receipt, Run, mark_file
+from express50.runner.publish import publishing, stage_lock
+from pipelines import ingest
+from tests.faults.toy import tree
+from tests.synth import make_capture
+
+
+@pytest.fixture
+def dataset(tmp_path):
+    for name in ("S001", "S002"):
+        make_capture(tmp_path / "raw" / name, subject=name, cameras=2, frames=4)
+    captures = [str(tmp_path / "raw" / name) for name in ("S001", "S002")]
+    assert main(["ingest", str(tmp_path / "data"), *captures, "--workers", "0"]) == 0
+    dataset = Dataset(tmp_path / "data")
+    for name in ("S001", "S002"):
+        dataset.labels_file(name).parent.mkdir(exist_ok=True)
+        dataset.labels_file(name).write_text("{}\n")
+        with publishing(dataset, "matte", f"{name}/cam00") as out:
+            (out / "metrics.json").write_text("{}")
+    with publishing(dataset, "pack", "shards") as out:
+        (out / "metrics.json").write_text("{}")
+        (out / "splits.json").write_text('{"train": ["S001", "S002"]}')
+    return dataset
+
+
+def test_a_damaged_ledger_stops_a_withdrawal_before_it_removes_anything(dataset):
+    data = bytearray(dataset.ledger.read_bytes())
+    for side in ("-wal", "-shm"):
+        dataset.ledger.with_name(dataset.ledger.name + side).unlink(missing_ok=True)
+    data[200:] = b"\xff" * len(data[200:])
+    dataset.ledger.write_bytes(data)
+    before = {k: v for k, v in tree(dataset.root).items() if "ledger" not in k}
+    with pytest.raises(FormatError, match="not a ledger"):
+        withdraw(dataset, "S001")
+    assert {k: v for k, v in tree(dataset.root).items() if "ledger" not in k} == before
+
+
+def test_nothing_of_the_subject_stays_and_the_others_are_untouched(dataset):
+    with Ledger(dataset.ledger) as ledger:  # of a run that was killed, in SLURM jobs
+        ledger.write_run(Run(stage="track", items=2, running={"S001": 1.0}))
+    dataset.slurm_dir.mkdir(parents=True)
+    (dataset.slurm_dir / "1000.out").write_text("S001: chatter of a library")
+    others = {k: v for k, v in tree(dataset.root).items() if "S002" in k}
+    assert len(list(files_that(names("S001"), dataset.root))) > 5
+    done = withdraw(dataset, "S001")
+    assert done.remaining == ()
+    assert list(files_that(names("S001"), dataset.root)) == []
+    assert b"S001" not in dataset.ledger.read_bytes()
+    assert {k: v for k, v in tree(dataset.root).items() if "S002" in k} == others
+    assert not dataset.item_dir("pack", "shards").exists()
+    assert dataset.subjects() == ["S002"]
+    with Ledger(dataset.ledger) as ledger:
+        assert list(ledger.read("ingest")) == ["S002"]
+
+
+@pytest.mark.parametrize("name", ["", ".", "..", "../..", "S001/", "S001/cam00", "shards", "S009"])
+def test_what_is_no_subject_removes_nothing(dataset, name):
+    before = tree(dataset.root.parent)
+    with pytest.raises(StageError, match="no subject .*; subjects: S001, S002"):
+        withdraw(dataset, name)
+    assert main(["subject", "withdraw", str(dataset.root), name, "--yes"]) == 1
+    after = tree(dataset.root.parent)
+    assert {k: v for k, v in after.items() if "ledger" not in k and "staging" not in k} == {
+        k: v for k, v in before.items() if "ledger" not in k and "staging" not in k
+    }
+
+
+def test_a_file_that_is_no_checkpoint_is_said_before_anything_goes(dataset, capsys):
+    other = dataset.root.parent / "notes.txt"
+    other.write_text("S001")
+    for path in (other, dataset.root / "nope.pt"):
+        command = ["subject", "withdraw", str(dataset.root), "S001", f"--checkpoint={path}"]
+        assert main([*command, "--yes"]) == 1
+        assert str(path) in capsys.readouterr().err
+    assert dataset.subjects() == ["S001", "S002"]
+
+
+def test_stages_are_done_without_the_person(dataset):
+    withdraw(dataset, "S001")
+    with Ledger(dataset.ledger) as ledger:
+        (status,) = read_status(ledger, ["ingest"])
+    assert (status.state, status.done, status.missing) == ("done", 1, 0)
+
+
+def test_points_and_pixels_that_spell_an_id_by_chance_name_nobody(dataset):
+    with publishing(dataset, "depth", "S002/smile") as out:
+        for name in ("surface.glb", "surface.ply", "cam00.exr", "cam00_normals.png"):
+            (out / name).write_bytes(b"\x00S001\x00")
+        (out / "metrics.json").write_text("{}")
+    assert withdraw(dataset, "S001").remaining == ()
+    assert len(list(dataset.item_dir("depth", "S002/smile").iterdir())) == 5
+
+
+def test_what_is_left_is_found_and_makes_exit_code_1(dataset, capsys):
+    model = dataset.root / "grmm" / "model.pt"
+    model.parent.mkdir()
+    model.write_bytes(b"\x00codes of S001\x00")
+    command = ["subject", "withdraw", str(dataset.root), "S001", "--yes", "--json"]
+    assert main(command) == 1
+    account = json.loads(capsys.readouterr().out)
+    assert account["remaining"] == [str(model)]
+    assert account["raw_capture"].endswith("raw/S001")
+
+
+def test_nothing_is_removed_without_yes(dataset, capsys):
+    before = tree(dataset.root)
+    assert main(["subject", "withdraw", str(dataset.root), "S001"]) == 0
+    assert tree(dataset.root) == before
+    assert "would remove" in capsys.readouterr().out
+
+
+def test_withdrawn_subject_is_not_taken_in_again(dataset):
+    capture = dataset.captures()["S001"]
+    withdraw(dataset, "S001")
+    with pytest.raises(CaptureError, match="subject S001 was withdrawn"):
+        ingest.register(dataset, [capture])
+
+
+def test_unknown_subject_is_an_error(dataset):
+    with pytest.raises(StageError, match="no subject 'S00'; subjects: S001, S002"):
+        withdraw(dataset, "S00")
+
+
+def test_what_others_outputs_and_tables_say_of_the_person_goes_too(dataset):
+    with publishing(dataset, "align", "S002") as out:
+        (out / "metrics.json").write_text("{}")
+        (out / "suggestions.json").write_text('{"smile": {"reference": {"subject": "S001"}}}')
+    (dataset.root / "labels" / "reference.json").write_text('{"subject": "S001"}')
+    dataset.config_file("pack").write_text('[pack]\ntest_subjects = ["S001"]\n')
+    footage = dataset.captures()["S001"] / "capture.toml"
+    with Ledger(dataset.ledger) as ledger:
+        done = {"stage": "align", "fingerprint": "f", "status": "done"}
+        ledger.write(Receipt(item="S002", metrics={"reference": "S001"}, **done))
+        ledger.write(Receipt(item="S003", made=Made({"S001 plate": "d"}, {}), **done))
+        ledger.write(Receipt(item="S004", made=Made({"plate": "d"}, {}), **done))
+        ledger.sha256(footage)
+        ledger.keep_digests()
+    done = withdraw(dataset, "S001")
+    assert done.remaining == ()
+    assert not dataset.item_dir("align", "S002").exists()
+    assert not (dataset.root / "labels" / "reference.json").exists()
+    with Ledger(dataset.ledger) as ledger:
+        assert "S002" not in ledger.read("align")
+        assert list(ledger.made("align")) == ["S004"]
+    assert b"S001" not in dataset.ledger.read_bytes()
+
+
+def test_the_record_says_when_and_how_much_but_not_who(dataset):
+    count = len([k for k in tree(dataset.root) if "S001" in k or k.startswith("pack/")])
+    done = withdraw(dataset, "S001")
+    text = withdrawn_file(dataset).read_text()
+    (row,) = json.loads(text)
+    assert row["files"] == done.files == count and "S001" not in text
+    assert datetime.fromisoformat(row["time"]).tzinfo is not None
+    assert withdrawn(dataset) == {row["id_sha256"]} == {text_digest("S001")}
+    withdrawn_file(dataset).write_text(json.dumps([text_digest("S001")]))  # as it once was
+    assert withdrawn(dataset) == {text_digest("S001")}
+
+
+def test_nobody_is_withdrawn_under_a_running_stage(dataset):
+    before = tree(dataset.root)
+    with stage_lock(dataset, "ingest"), pytest.raises(StageError, match="another 'ingest' runs"):
+        withdraw(dataset, "S001")
+    after, before = (
+        {k: v for k, v in files.items() if not k.endswith(".lock")}
+        for files in (tree(dataset.root), before)
+    )
+    assert after == before
+
+
+def test_texts_in_arrays_and_archives_are_read_and_numbers_are_not(tmp_path):
+    np.savez_compressed(tmp_path / "who.npz", subjects=np.array(["S002", "S001"]))
+    np.savez(tmp_path / "chance.npz", values=np.frombuffer(b"\0S001\0\0\0", np.uint8))
+    (tmp_path / "S001_smile.txt").write_text("")
+    (tmp_path / "S0011.txt").write_text("S0011 xS001 S001x")
+    found = {path.name for path in files_that(names("S001"), tmp_path)}
+    assert found == {"who.npz", "S001_smile.txt"}
+    by_digest = files_that(names_any_of({text_digest("S001")}), tmp_path)
+    assert {path.name for path in by_digest} == found
+
+
+def test_check_proves_a_withdrawal_and_finds_what_comes_back(dataset, capsys):
+    withdraw(dataset, "S001")
+    shutil.rmtree(dataset.stage_dir("matte"))  # outputs without receipts, made by this test
+    dataset.labels_file("S002").write_text("")
+    assert main(["check", str(dataset.root)]) == 0
+    (dataset.root / "export").mkdir()
+    (dataset.root / "export" / "a.json").write_text('{"key": "S001_smile_cam00"}')
+    capsys.readouterr()
+    assert main(["check", str(dataset.root)]) == 1
+    assert "export/a.json: names a person who was withdrawn" in capsys.readouterr().out
+
+
+PERSON = 'name = "Jane Roe"\nage = 4711e-2\ngender = "feminine"\nconsent_id = "C-77"\n'
+
+
+def test_what_describes_a_person_stays_in_the_capture(dataset, tmp_path):
+    capture = tmp_path / "raw" / "S001" / "capture.toml"
+    capture.write_text(capture.read_text() + PERSON)
+    assert main(["ingest", str(dataset.root), "--workers", "0"]) == 0
+    assert read_index(dataset, "S001").meta["consent_id"] == "C-77"
+    for name, data in tree(dataset.root).items():
+        assert not {w for w in (b"Jane", b"47.11", b"feminine") if w in data}, name
+    assert read_people(dataset, ["S001"]) == [{"gender": "feminine", "age": 47.11}]
+
+
+def test_what_an_older_ingest_kept_of_a_person_is_found_and_fixed(dataset, capsys):
+    path = dataset.index_file("S001")
+    content = json.loads(path.read_text())
+    content["meta"]["name"] = "Jane Roe"
+    path.write_text(json.dumps(content))
+    with Ledger(dataset.ledger) as ledger:
+        receipt, made = ledger.read("ingest")["S001"], ledger.made("ingest")["S001"]
+        files = made.files | {"index.json": mark_file(path)}
+        ledger.write(replace(receipt, made=replace(made, files=files)))
+    shutil.rmtree(dataset.stage_dir("matte"))
+    shutil.rmtree(dataset.stage_dir("pack"))
+    (dataset.root / "labels" / "S001.jsonl").write_text("")
+    (dataset.root / "labels" / "S002.jsonl").write_text("")
+    assert main(["check", str(dataset.root), "--json"]) == 1
+    said = capsys.readouterr().out
+    (finding,) = json.loads(said)["findings"]
+    assert finding["kind"] == "personal" and "holds name" in finding["what"]
+    assert "Jane" not in said
+    assert main(["check", str(dataset.root), "--fix"]) == 0
+    assert main(["ingest", str(dataset.root), "--workers", "0"]) == 0
+    assert "name" not in read_index(dataset, "S001").meta

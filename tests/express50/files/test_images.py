@@ -1,0 +1,88 @@
+"""Image files: types kept, damage named, depth quantised as stated."""
+
+import numpy as np
+import pytest
+from scipy.ndimage import distance_transform_edt
+
+from express50.errors import FormatError
+from express50.files import images
+
+RNG = np.random.default_rng(0)
+
+
+@pytest.mark.parametrize(
+    ("name", "dtype"),
+    [("a.png", np.uint8), ("a.png", np.uint16), ("a.tif", np.uint16), ("a.exr", np.float32)],
+)
+@pytest.mark.parametrize("shape", [(7, 9), (7, 9, 3), (1, 1, 3)])
+def test_lossless_round_trip_keeps_type_and_values(tmp_path, name, dtype, shape):
+    top = 1.0 if dtype == np.float32 else np.iinfo(dtype).max
+    image = (RNG.random(shape) * top).astype(dtype)
+    images.write_image(tmp_path / name, image)
+    back = images.read_image(tmp_path / name)
+    assert back.dtype == dtype
+    np.testing.assert_array_equal(back, image)
+
+
+def test_half_floats_are_within_half_an_ulp(tmp_path):
+    image = RNG.random((5, 6)).astype(np.float32)
+    images.write_image(tmp_path / "h.exr", image, half=True)
+    np.testing.assert_allclose(images.read_image(tmp_path / "h.exr"), image, rtol=2**-11)
+
+
+def test_same_image_gives_same_bytes(tmp_path):
+    image = (RNG.random((9, 9, 3)) * 255).astype(np.uint8)
+    for name in ("a.png", "a.jpg", "a.exr"):
+        images.write_image(tmp_path / name, image)
+        first = (tmp_path / name).read_bytes()
+        images.write_image(tmp_path / name, image)
+        assert (tmp_path / name).read_bytes() == first
+
+
+def test_jpeg_keeps_colour_order():
+    image = np.zeros((16, 16, 3), np.uint8)
+    image[..., 0] = 200
+    back = images.decode_image(images.encode_jpeg(image))
+    assert abs(int(back[8, 8, 0]) - 200) < 4
+    assert back[8, 8, 2] < 6
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -1.0, 1000.0])
+def test_a_depth_that_cannot_be_stored_is_refused(value):
+    depth = np.full((2, 2), value)
+    with pytest.raises(ValueError, match="in metres"):
+        images.depth_to_uint16(depth, np.ones((2, 2), bool))
+
+
+def test_damaged_and_missing_files_are_named(tmp_path):
+    with pytest.raises(FormatError, match="missing.png"):
+        images.read_image(tmp_path / "missing.png")
+    path = tmp_path / "cut.png"
+    images.write_image(path, (RNG.random((64, 64, 3)) * 255).astype(np.uint8))
+    path.write_bytes(path.read_bytes()[:2000])
+    with pytest.raises(FormatError, match="cut.png"):
+        images.read_image(path)
+    with pytest.raises(FormatError, match="12 bytes"):
+        images.decode_image(b"not an image")
+
+
+def test_srgb_curves_are_inverse():
+    x = np.linspace(0, 1, 257)
+    np.testing.assert_allclose(images.linear_to_srgb(images.srgb_to_linear(x)), x, atol=1e-7)
+
+
+def test_contact_sheet_pads_short_rows():
+    row = [np.zeros((10, 20, 3), np.uint8)] * 3
+    sheet = images.contact_sheet([row, row[:1]], labels=["a", "b"], tile=(40, 50))
+    assert sheet.shape == (80, 150, 3)
+
+
+def test_distances_to_an_edge_are_the_same_wherever_a_mask_lies():
+    """OpenCV's own differ in the last bit with the addresses of its arrays."""
+    mask = np.hypot(*(np.mgrid[:97, :83] - 45.0)) < 31.0
+    expected = distance_transform_edt(mask).astype(np.float32)
+    for offset in range(0, 64, 8):
+        room = np.zeros(mask.size + 64, bool)
+        placed = room[offset : offset + mask.size].reshape(mask.shape)
+        placed[:] = mask
+        assert images.edge_distance(placed).tobytes() == expected.tobytes()

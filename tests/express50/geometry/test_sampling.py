@@ -1,0 +1,57 @@
+"""Bilinear sampling against the formula, the border, and spherical harmonics."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from express50.geometry.sampling import bilinear, bilinear_slope, sh_polynomials
+
+PLANE = np.fromfunction(lambda y, x: 3 * (x + 0.5) - 2 * (y + 0.5) + 7, (20, 30))
+POINTS = np.random.default_rng(0).uniform([0.5, 0.5], [29.4, 19.4], (9000, 2))
+
+
+def test_a_plane_is_reproduced_with_its_slope() -> None:
+    values, slope = bilinear_slope(PLANE[..., None], POINTS)
+    assert np.allclose(values[:, 0], POINTS @ [3, -2] + 7, atol=1e-10)
+    assert np.allclose(slope[:, 0], [3, -2], atol=1e-10)
+
+
+@pytest.mark.parametrize("shape", [(), (3,)])
+def test_quick_sampling_differs_by_the_rounding_of_places_alone(shape: tuple[int, ...]) -> None:
+    image = np.broadcast_to(PLANE.reshape(20, 30, *([1] * len(shape))), (20, 30, *shape))
+    image = np.ascontiguousarray(image, np.float32)
+    exact = (POINTS @ [3, -2] + 7).reshape(-1, *([1] * len(shape)))
+    found = bilinear(image, POINTS)
+    assert found.shape == (9000, *shape)
+    assert found.dtype == np.float32
+    assert np.abs(found - exact).max() < 5 / 64 + 1e-3
+
+
+def test_the_border_repeats() -> None:
+    image = np.full((4, 5), 8, np.float32)
+    outside = np.array([[-3.0, 2.0], [0.0, 2.0], [2.5, 40.0]])
+    assert bilinear(image, outside).tolist() == [8, 8, 8]
+    assert np.isfinite(bilinear_slope(image[..., None], outside * 1e9)[0]).all()
+
+
+def test_no_points() -> None:
+    assert bilinear(np.zeros((4, 5), np.float32), np.zeros((0, 2))).shape == (0,)
+
+
+def test_many_points() -> None:
+    points = np.tile(POINTS, (1000, 1))
+    image = PLANE.astype(np.float32)
+    assert np.array_equal(bilinear(image, points)[-9000:], bilinear(image, POINTS))
+
+
+def test_harmonics_are_orthonormal() -> None:
+    heights, weights = np.polynomial.legendre.leggauss(8)
+    angles = np.arange(16) * 2 * np.pi / 16
+    z, angle = (grid.ravel() for grid in np.meshgrid(heights, angles, indexing="ij"))
+    across = np.sqrt(1 - z**2)
+    directions = np.stack([across * np.cos(angle), across * np.sin(angle), z], axis=1)
+    norms = np.sqrt(np.array([1, 3, 3, 3, 15, 15, 1.25, 15, 3.75]) / (4 * np.pi))
+    Y = sh_polynomials(directions) * norms
+    area = np.repeat(weights, 16) * 2 * np.pi / 16
+    assert np.allclose(Y.T @ (area[:, None] * Y), np.eye(9), atol=1e-12)

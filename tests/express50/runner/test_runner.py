@@ -1,0 +1,328 @@
+"""The runner: skips, isolates, accounts, and sets aside what is stale or deadly."""
+
+import contextlib
+import dataclasses
+import json
+import os
+import shutil
+import subprocess
+import sys
+import threading
+from pathlib import Path
+from unittest.mock import Mock
+
+import pytest
+
+from express50.cli.status import read_status
+from express50.contract.stage import Note
+from express50.errors import ConfigError, StageError
+from express50.runner.clusters import RemoteWorkers
+from express50.runner.executor import Pool
+from express50.runner.ledger import Ledger
+from express50.runner.runner import run_stage, select_items
+from express50.runner.worker import Task
+from tests.faults import toy
+from tests.faults.toy import make_dataset, run_toy, tree
+
+
+def statuses(summary):
+    return {outcome.item: outcome.status for outcome in summary.outcomes}
+
+
+def receipts(dataset):
+    with Ledger(dataset.ledger) as ledger:
+        return ledger.read("toy")
+
+
+def test_one_bad_item_never_stops_the_others(tmp_path):
+    names = ["bad1", "bug1", "drop1", "nan1", "noinput1", "ok1", "S001/cam03"]
+    dataset = make_dataset(tmp_path / "data", names)
+    summary = run_toy(dataset)
+    failed = {"bad1", "bug1", "nan1", "noinput1"}
+    assert {k for k, v in statuses(summary).items() if v == "failed"} == failed
+    assert {k for k, v in statuses(summary).items() if v == "done"} == set(names) - failed
+    assert not summary.ok
+    assert {k: r.status for k, r in receipts(dataset).items()} == statuses(summary)
+    assert [summary.count(s) for s in ("done", "skipped", "failed")] == [3, 0, 4]
+    (dropped,) = (o.dropped for o in summary.outcomes if o.item == "drop1")
+    assert dropped == (Note("cam03", "dark"),)
+    lines = "\n".join(summary.lines())
+    assert all(name in lines for name in (*failed, "cam03"))
+    assert all(not (dataset.item_dir("toy", name)).exists() for name in failed)
+
+
+def test_unexpected_error_leaves_its_traceback_in_a_log_that_success_removes(tmp_path):
+    dataset = make_dataset(tmp_path / "data", ["bug1", "ok1"])
+    (outcome,) = [o for o in run_toy(dataset).outcomes if o.status == "failed"]
+    log = dataset.log_file("toy", "bug1")
+    assert outcome.reason.startswith("KeyError: 'absent'")
+    assert str(log) in outcome.reason
+    assert "misbehave" in log.read_text()
+
+
+def test_second_run_skips_and_a_changed_input_or_config_redoes(tmp_path):
+    dataset = make_dataset(tmp_path / "data", ["a", "b"])
+    assert set(statuses(run_toy(dataset)).values()) == {"done"}
+    assert set(statuses(run_toy(dataset)).values()) == {"skipped"}
+    (dataset.root / "in" / "a.txt").write_text("other")
+    assert statuses(run_toy(dataset)) == {"a": "done", "b": "skipped"}
+    assert set(statuses(run_toy(dataset, word="b")).values()) == {"done"}
+    newer = dataclasses.replace(toy.STAGE, version=2)
+    summary = run_stage(newer, dataset, toy.ToyConfig(word="b"), workers=0, progress=False)
+    assert set(statuses(summary).values()) == {"done"}
+
+
+def test_what_is_made_again_is_said_with_its_reason(tmp_path):
+    dataset = make_dataset(tmp_path / "data", ["a", "b"])
+
+    def again(stage=toy.STAGE, **values):
+        summary = run_stage(stage, dataset, toy.ToyConfig(**values), workers=0, progress=False)
+        reasons = {o.item: o.again for o in summary.outcomes}
+        assert all(why in "\n".join(summary.lines()) for why in reasons.values())
+        return [reasons["a"], reasons["b"]]
+
+    assert again() == ["", ""]
+    (dataset.root / "in" / "a.txt").write_text("other")
+    assert again() == ["inputs changed: text", ""]
+    assert again(word="c") == ["settings changed: word"] * 2
+    newer = dataclasses.replace(toy.STAGE, version=2)
+    assert again(newer, word="c") == ["stage version changed, it is 2 now"] * 2
+    shutil.rmtree(dataset.item_dir("toy", "b"))
+    assert again(newer, word="c") == ["", "output missing"]
+
+
+def test_touched_input_with_the_same_content_is_skipped(tmp_path):
+    dataset = make_dataset(tmp_path / "data", ["a"])
+    run_toy(dataset)
+    (dataset.root / "in" / "a.txt").write_text("a")
+    assert statuses(run_toy(dataset)) == {"a": "skipped"}
+
+
+def test_lost_output_is_made_again(tmp_path):
+    dataset = make_dataset(tmp_path / "data", ["a"])
+    run_toy(dataset)
+    before = tree(dataset.stage_dir("toy"))
+    (dataset.item_dir("toy", "a") / "metrics.json").unlink()
+    assert statuses(run_toy(dataset)) == {"a": "done"}
+    assert tree(dataset.stage_dir("toy")) == before
+
+
+def test_stale_output_of_a_failed_item_is_set_aside_and_success_clears_it(tmp_path):
+    dataset = make_dataset(tmp_path / "data", ["bad1"])
+    source = dataset.root / "in" / "bad1.txt"
+    source.write_text("repaired")
+    assert run_toy(dataset).ok
+    source.write_text("broken")
+    assert not run_toy(dataset).ok
+    assert not dataset.item_dir("toy", "bad1").exists()
+    assert (dataset.stale_dir / "toy" / "bad1" / "metrics.json").is_file()
+    source.write_text("repaired")
+    assert run_toy(dataset).ok
+    assert not (dataset.stale_dir / "toy" / "bad1").exists()
+
+
+def test_a_run_that_is_stopped_costs_only_the_items_it_had_begun(tmp_path, monkeypatch):
+    dataset = make_dataset(tmp_path / "data", ["a", "b", "c", "d"])
+    run_toy(dataset)
+    real = toy.STAGE.run
+
+    def stopped(dataset, item, config, out):
+        if item == "b":
+            raise KeyboardInterrupt
+        return real(dataset, item, config, out)
+
+    mistyped = dataclasses.replace(toy.STAGE, run=stopped)
+    with pytest.raises(KeyboardInterrupt):
+        run_stage(mistyped, dataset, toy.ToyConfig(word="b"), workers=0, progress=False)
+    with Ledger(dataset.ledger) as ledger:
+        (status,) = read_status(ledger, ["toy"])
+    assert (status.state, status.done, status.missing) == ("stopped", 1, 3)
+    assert statuses(run_toy(dataset)) == {"a": "done", "b": "done", "c": "skipped", "d": "skipped"}
+
+
+def test_a_setting_that_fits_no_item_leaves_what_is_made(tmp_path):
+    dataset = make_dataset(tmp_path / "data", ["a", "b"])
+    run_toy(dataset)
+
+    def without(dataset, item, config):
+        raise StageError("toy.weights /nope.pth: no such file")
+
+    broken = dataclasses.replace(toy.STAGE, inputs=without)
+    with pytest.raises(StageError, match="no item can be made: StageError: toy.weights /nope.pth"):
+        run_stage(broken, dataset, toy.ToyConfig(word="b"), workers=0, progress=False)
+    assert statuses(run_toy(dataset)) == {"a": "skipped", "b": "skipped"}
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+def test_a_setting_that_every_item_fails_by_costs_a_few(tmp_path, workers):
+    names = [f"a{n}" for n in range(8)]
+    dataset = make_dataset(tmp_path / "data", names)
+    run_toy(dataset)
+    with pytest.raises(StageError, match="first 3 items fail alike, though they were made before"):
+        run_toy(dataset, workers=workers, files=-1)
+    again = statuses(run_toy(dataset))
+    assert list(again.values()).count("skipped") >= 3
+    assert set(again.values()) == {"done", "skipped"}
+
+
+def test_items_that_never_were_made_may_all_fail(tmp_path):
+    dataset = make_dataset(tmp_path / "data", [f"a{n}" for n in range(8)])
+    assert set(statuses(run_toy(dataset, files=-1)).values()) == {"failed"}
+
+
+def test_an_unreachable_scheduler_leaves_what_is_made(tmp_path):
+    dataset = make_dataset(tmp_path / "data", ["a", "b"])
+    run_toy(dataset)
+    with pytest.raises(StageError):
+        run_stage(
+            toy.STAGE, dataset, toy.ToyConfig(word="b"), scheduler="tcp://127.0.0.1:1",
+            progress=False,
+        )  # fmt: skip
+    assert statuses(run_toy(dataset)) == {"a": "skipped", "b": "skipped"}
+
+
+def test_outputs_of_vanished_items_are_set_aside_only_by_a_full_run(tmp_path):
+    dataset = make_dataset(tmp_path / "data", ["a", "b"])
+    run_toy(dataset)
+    (dataset.root / "in" / "b.txt").unlink()
+    run_stage(toy.STAGE, dataset, toy.ToyConfig(), items=["a"], workers=0, progress=False)
+    assert dataset.item_dir("toy", "b").exists()
+    run_toy(dataset)
+    assert not dataset.item_dir("toy", "b").exists()
+    assert list(receipts(dataset)) == ["a"]
+
+
+def test_workers_give_the_same_bytes_as_inline(tmp_path):
+    names = [f"item{n}" for n in range(5)] + ["bad1", "bug1"]
+    inline, spread = (make_dataset(tmp_path / n, names) for n in ("inline", "spread"))
+    first, second = run_toy(inline, workers=0), run_toy(spread, workers=2)
+    assert statuses(first) == statuses(second)
+    assert tree(inline.stage_dir("toy")) == tree(spread.stage_dir("toy"))
+
+
+def test_item_that_kills_its_worker_is_set_aside_after_two_attempts(tmp_path):
+    names = ["poison1", "once1", *[f"item{n}" for n in range(6)]]
+    dataset = make_dataset(tmp_path / "data", names)
+    summary = run_toy(dataset, workers=2)
+    assert {k for k, v in statuses(summary).items() if v == "failed"} == {"poison1"}
+    table = receipts(dataset)
+    assert (table["poison1"].attempts, table["once1"].attempts) == (2, 2)
+    assert "died 2 times" in table["poison1"].reason
+
+
+def test_receipt_counts_time_and_memory(tmp_path):
+    dataset = make_dataset(tmp_path / "data", ["a"])
+    run_toy(dataset, seconds=0.05)
+    receipt = receipts(dataset)["a"]
+    assert receipt.seconds >= 0.15
+    assert 1e6 < receipt.peak_memory < 1e11
+    assert receipt.metrics == {"length": 1, "dropped": [], "warnings": []}
+    assert json.loads((dataset.item_dir("toy", "a") / "metrics.json").read_text()) == (
+        receipt.metrics
+    )
+
+
+def test_resolved_config_is_saved_and_can_be_given_back(tmp_path):
+    from express50.contract.config import resolve_config
+
+    dataset = make_dataset(tmp_path / "data", ["a"])
+    run_toy(dataset, word="x", files=4)
+    again = resolve_config(toy.STAGE, "draft", dataset.config_file("toy"))
+    assert again == toy.ToyConfig(word="x", files=4)
+
+
+def test_stage_without_items_and_unmatched_pattern_are_errors(tmp_path):
+    dataset = make_dataset(tmp_path / "data", [])
+    with pytest.raises(StageError, match="nothing to do"):
+        run_toy(dataset)
+    dataset = make_dataset(tmp_path / "other", ["S001", "S002"])
+    assert select_items(toy.STAGE, dataset, "*2") == ["S002"]
+    with pytest.raises(ConfigError, match="no item of toy matches, did you mean 'S001'"):
+        select_items(toy.STAGE, dataset, "S01")
+
+
+def test_unreachable_scheduler_is_one_error(tmp_path, monkeypatch):
+    from express50.runner import clusters
+
+    dataset = make_dataset(tmp_path / "data", ["a", "b"])
+    monkeypatch.setattr(clusters, "CONNECT_SECONDS", 0.5)
+    with pytest.raises(StageError, match="scheduler tcp://127.0.0.1:9: cannot connect"):
+        run_stage(
+            toy.STAGE, dataset, toy.ToyConfig(), scheduler="tcp://127.0.0.1:9", progress=False
+        )
+
+
+def test_given_scheduler_is_used_and_left_running(tmp_path):
+    from distributed import Client, LocalCluster
+
+    dataset = make_dataset(tmp_path / "data", ["a", "b", "c"])
+    with LocalCluster(
+        n_workers=1, threads_per_worker=1, processes=True, dashboard_address=None
+    ) as cluster:
+        summary = run_stage(
+            toy.STAGE,
+            dataset,
+            toy.ToyConfig(),
+            scheduler=cluster.scheduler_address,
+            progress=False,
+        )
+        with Client(cluster) as client:
+            assert len(client.nthreads()) == 1
+    assert summary.count("done") == 3
+
+
+def test_lost_scheduler_is_one_error_and_what_is_done_is_kept(tmp_path):
+    from distributed import LocalCluster
+
+    dataset = make_dataset(tmp_path / "data", [f"item{n}" for n in range(40)])
+    cluster = LocalCluster(n_workers=1, processes=True, dashboard_address=None, silence_logs=50)
+    timer = threading.Timer(1.0, cluster.close)
+    timer.start()
+    with pytest.raises(StageError, match="lost the dask scheduler"):
+        run_stage(
+            toy.STAGE,
+            dataset,
+            toy.ToyConfig(seconds=0.1),
+            scheduler=cluster.scheduler_address,
+            progress=False,
+        )
+    timer.join()
+    assert run_toy(dataset, seconds=0.001).ok
+
+
+@pytest.mark.parametrize("call", ["nthreads", "submit"])
+def test_whichever_call_finds_the_scheduler_gone_the_error_is_the_same(call):
+    from distributed.comm import CommClosedError
+
+    client = Mock()
+    client.nthreads.return_value = {"worker": 1}
+    getattr(client, call).side_effect = CommClosedError("in <TCP (closed)>: reset by peer")
+    pool = Pool(scheduler="tcp://gone:8786")
+    pool._workers = RemoteWorkers(client)
+    task = Task(toy.STAGE, toy.Dataset(Path("data")), "item", toy.ToyConfig(), "f" * 64, {})
+    with pytest.raises(StageError, match="lost the dask scheduler .*reset by peer"):
+        pool.run([task, task], settle=Mock())
+
+
+def test_bar_on_a_terminal_shows_counts_and_failures(tmp_path):
+    """The driver's standard error is a pseudo-terminal; plain lines go everywhere else."""
+    dataset = make_dataset(tmp_path / "data", ["a", "b", "bad1"])
+    code = (
+        "import sys; from pathlib import Path; from tests.faults import toy;"
+        "from express50.runner.runner import run_stage;"
+        "run_stage(toy.STAGE, toy.Dataset(Path(sys.argv[1])), toy.ToyConfig(seconds=.1), workers=0)"
+    )
+    driver, terminal = os.openpty()
+    repository = Path(__file__).resolve().parents[3]
+    environment = os.environ | {"TERM": "xterm", "COLUMNS": "120"}
+    command = [sys.executable, "-c", code, str(dataset.root)]
+    with subprocess.Popen(command, cwd=repository, env=environment, stderr=terminal) as process:
+        os.close(terminal)
+        shown = b""
+        with contextlib.suppress(OSError):  # Linux ends a terminal's output with EIO
+            while block := os.read(driver, 4096):
+                shown += block
+    assert process.returncode == 0
+    text = shown.decode()
+    assert "3/3" in text
+    assert "failed" in text
