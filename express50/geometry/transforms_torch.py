@@ -14,17 +14,21 @@ def axis_angle_to_matrix(axis_angle: Tensor) -> Tensor:
 
     Source: Rodrigues' formula; series below 1e-3 rad keep value and gradient smooth through zero.
     """
-    theta2 = (axis_angle * axis_angle).sum(-1)[..., None, None]
+    # rsub(x, a, alpha=b) is a - b x; forward differentiation of x * b loads torch's compiler, 1 s.
+    theta2 = (axis_angle * axis_angle).sum(-1)
     small = theta2 < 1e-6
     safe = torch.where(small, torch.ones_like(theta2), theta2).sqrt()
-    s = torch.where(small, 1.0 - theta2 / 6.0, torch.sin(safe) / safe)
-    c = torch.where(small, 0.5 - theta2 / 24.0, (1.0 - torch.cos(safe)) / (safe * safe))
+    series_s = torch.rsub(theta2, 1.0, alpha=1 / 6)
+    series_c = torch.rsub(theta2, 0.5, alpha=1 / 24)
+    s = torch.where(small, series_s, torch.sin(safe) / safe)
+    c = torch.where(small, series_c, (1.0 - torch.cos(safe)) / (safe * safe))
     x, y, z = axis_angle.unbind(-1)
-    zero = torch.zeros_like(x)
-    entries = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1)
-    k = entries.reshape(*axis_angle.shape[:-1], 3, 3)
-    eye = torch.eye(3, dtype=axis_angle.dtype, device=axis_angle.device)
-    return eye + s * k + c * (k @ k)
+    entries = [
+        1 - c * (y * y + z * z), c * x * y - s * z, c * x * z + s * y,
+        c * x * y + s * z, 1 - c * (x * x + z * z), c * y * z - s * x,
+        c * x * z - s * y, c * y * z + s * x, 1 - c * (x * x + y * y),
+    ]  # fmt: skip
+    return torch.stack(entries, -1).reshape(*axis_angle.shape[:-1], 3, 3)
 
 
 def quat_to_matrix(quats: Tensor) -> Tensor:

@@ -124,27 +124,40 @@ class Points:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Evaluate positions (M, 3) and their Jacobian (M, 3, D).
 
-        Posed vertices are linear in the coefficients, so only the 18 columns of the pose need
-        forward-mode differentiation.
+        Vertices are linear in the joints' transforms and in the coefficients, so only these
+        transforms, not the vertices, are differentiated by torch.
         """
-        values, rotation_t = torch.from_numpy(parameters), torch.from_numpy(rotation)
+        values, about = torch.from_numpy(parameters), torch.from_numpy(rotation)
         linear, pose = values[:-POSE_SIZE], values[-POSE_SIZE:]
         rest, joints = self._rest(linear), self._joints(linear)
 
-        def both(pose: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-            points = self._posed(rest, joints, pose, rotation_t)
-            return points, points
+        def transforms(pose: torch.Tensor, joints: torch.Tensor) -> tuple[torch.Tensor, ...]:
+            turns = _joint_rotations(pose)
+            turn, shift = joint_transforms(joints[None], turns[None])
+            world = axis_angle_to_matrix(pose[12:15]) @ about
+            return world @ turn[0], shift[0] @ world.T, turns[1:]
 
-        by_pose, points = torch.func.jacfwd(both, has_aux=True)(pose)
+        turn, shift, turns = transforms(pose, joints)  # (5, 3, 3), (5, 3), (4, 3, 3)
+        # By the joints too, although unused: torch loads its compiler, 1 s, for mixed sums.
+        by_pose = [both[0] for both in torch.func.jacfwd(transforms, argnums=(0, 1))(pose, joints)]
+        correctives = self.pose_dirs.T @ by_pose[2].flatten(0, 2)  # (3 M, 18)
+        corrected = rest + (self.pose_dirs.T @ (turns - torch.eye(3)).flatten()).view(rest.shape)
+        blended = torch.einsum("nj,jrc->nrc", self.skinning, turn)
+        points = (blended @ corrected[..., None])[..., 0] + self.skinning @ shift + pose[15:]
+        shared = (self.skinning[:, :, None] * corrected[:, None]).flatten(1)  # (M, 5 * 3)
+        columns = shared @ by_pose[0].transpose(1, 2).flatten(0, 1).flatten(1)
+        columns = columns + self.skinning @ by_pose[1].flatten(1)
+        columns = columns.view(len(rest), 3, -1) + blended @ correctives.view(len(rest), 3, -1)
+        columns[:, :, 15:] += torch.eye(3)
+
         moving = self.basis.joint_directions.permute(2, 0, 1)
-        turns = _joint_rotations(pose)[None].expand(len(moving), -1, -1, -1)
-        turn, shift = joint_transforms(moving, turns)
-        world = axis_angle_to_matrix(pose[12:15]) @ rotation_t
-        blended = torch.einsum("nj,jrc->nrc", self.skinning, world @ turn[0])
-        moved = (shift @ world.T).permute(1, 2, 0).flatten(1)
-        columns = torch.addmm((blended @ self.directions).flatten(1), self.skinning, moved)
-        by_coefficient = columns.view(self.directions.shape)
-        return points.numpy(), torch.cat([by_coefficient, by_pose], dim=2).numpy()
+        every = _joint_rotations(pose)[None].expand(len(moving), -1, -1, -1)
+        world = axis_angle_to_matrix(pose[12:15]) @ about
+        moved = (joint_transforms(moving, every)[1] @ world.T).permute(1, 2, 0).flatten(1)
+        by_coefficient = torch.addmm((blended @ self.directions).flatten(1), self.skinning, moved)
+        return points.numpy(), torch.cat(
+            [by_coefficient.view(self.directions.shape), columns], dim=2
+        ).numpy()
 
 
 def _joint_rotations(pose: torch.Tensor) -> torch.Tensor:

@@ -69,7 +69,7 @@ def test_textureless_images_leave_the_hull(views, value):
     assert finite(surface)
     off = hull_distance(views, surface.vertices)
     assert np.abs(np.median(off)) < 1e-3 and np.percentile(np.abs(off), 95) < 6e-3
-    assert surface.figures["photo_agreement_median"] == 0
+    assert surface.figures["photo_agreement_median"] < 1e-6  # rounding alone
     assert surface.confidence.max() <= 0.3 + 1e-6
 
 
