@@ -1,12 +1,11 @@
 """Read the pixels of a dataset: peak frames, clean plates, proxies and recorded footage.
 
 Stages after ``frames`` read the peak frames and plates that it wrote (``read_peak_frame``,
-``read_plate_image``). ``FrameReader`` and ``read_frame`` decode the footage itself.
+``read_plate_image``). ``FrameReader`` and ``FootageReader`` decode the footage itself.
 """
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from pathlib import Path
 
 import cv2
@@ -26,8 +25,6 @@ from express50.files.text import read_json, read_json_table
 from express50.files.video import VideoReader
 from express50.geometry.cameras import Camera, pinhole
 from express50.geometry.conventions import undistort_image
-
-OPEN_READERS = 8  # open videos a process keeps; each holds a decoder's picture buffers
 
 
 def dhash(image: np.ndarray) -> str:
@@ -136,43 +133,52 @@ def corrected(image: np.ndarray, source: CameraSource | RawCamera) -> np.ndarray
     return correct_srgb(image, source.correction) if source.correction else image
 
 
-_readers: OrderedDict[tuple, FrameReader] = OrderedDict()
+class FootageReader:
+    """Frames of all cameras of a subject; videos stay open, so that reading forward is quick."""
 
+    def __init__(self, dataset: Dataset, subject: str, undistort: bool = True) -> None:
+        """Open nothing yet; undistorted frames are as the cameras of ``read_cameras_of`` see them.
 
-def _reader(index: Index, camera_id: str) -> FrameReader:
-    """Return a camera's reader, kept open while it is among the last few used."""
-    key = (index.capture, index.subject, camera_id)
-    reader = _readers.pop(key, None)
-    if reader is not None and reader.source != index.cameras.get(camera_id):
-        reader.close()
-        reader = None
-    _readers[key] = reader or FrameReader(index, camera_id)
-    while len(_readers) > OPEN_READERS:
-        _readers.popitem(last=False)[1].close()
-    return _readers[key]
+        Raises:
+            StageError: ingest, or calibrate when undistorting, did not run.
+        """
+        self._index = read_index(dataset, subject)
+        self._cameras = read_cameras_of(dataset, subject, undistorted=False) if undistort else None
+        self._readers: dict[str, FrameReader] = {}
+
+    def read(self, camera_id: str, frame: int) -> np.ndarray:
+        """Reads a full-resolution frame (H, W, 3) uint8 sRGB by decode index.
+
+        Raises:
+            CaptureError: no such camera or frame, or the footage changed.
+            StageError: undistorting, and the camera is not calibrated.
+        """
+        if camera_id not in self._readers:
+            self._readers[camera_id] = FrameReader(self._index, camera_id)
+        image = self._readers[camera_id].read(frame)
+        if self._cameras is None:
+            return image
+        if camera_id not in self._cameras:
+            raise StageError(
+                f"{self._index.subject}: camera {camera_id!r} is not calibrated; expected one of "
+                f"{', '.join(self._cameras)}"
+            )
+        return undistort_image(image, self._cameras[camera_id])
+
+    def __enter__(self) -> FootageReader:
+        return self
+
+    def __exit__(self, *unused: object) -> None:
+        for reader in self._readers.values():
+            reader.close()
 
 
 def read_frame(
     dataset: Dataset, subject: str, camera_id: str, frame: int, undistort: bool = True
 ) -> np.ndarray:
-    """Reads a full-resolution frame (H, W, 3) uint8 sRGB by decode index.
-
-    Undistorted it is as the pinhole camera of ``read_cameras_of`` sees it.
-
-    Raises:
-        CaptureError: no such camera or frame, or the footage changed.
-        StageError: ingest, or calibrate when undistorting, did not run.
-    """
-    image = _reader(read_index(dataset, subject), camera_id).read(frame)
-    if not undistort:
-        return image
-    cameras = read_cameras_of(dataset, subject, undistorted=False)
-    if camera_id not in cameras:
-        raise StageError(
-            f"{subject}: camera {camera_id!r} is not calibrated; expected one of "
-            f"{', '.join(cameras)}"
-        )
-    return undistort_image(image, cameras[camera_id])
+    """Reads one frame (H, W, 3) uint8 sRGB by decode index, as ``FootageReader`` does."""
+    with FootageReader(dataset, subject, undistort) as footage:
+        return footage.read(camera_id, frame)
 
 
 def read_recorded_plate(index: Index, camera_id: str, deep: bool = False) -> np.ndarray:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from functools import partial
 
 import numpy as np
 
-from express50.capture.frames import read_cameras_of, read_frame, read_peak_frame
+from express50.capture.frames import FootageReader, read_cameras_of, read_peak_frame
 from express50.capture.index import read_peaks
 from express50.contract.layout import Dataset
 from express50.contract.stage import Note
@@ -18,7 +19,7 @@ from express50.landmarks.sources import Source, open_source
 from pipelines.track.eyes_and_jaw import shut_lids
 from pipelines.track.observe import LandmarkView, Observation, agree
 from pipelines.track.outline import signed_distance
-from pipelines.track.surface import FrameSetCrops, HeadCrop, cut_crop
+from pipelines.track.surface import CutCrops, FrameSetCrops, cut_crop
 
 MIN_SCORE = 0.2  # views with a lower face score are left out
 MIN_LANDMARKS = 20  # that must agree between the cameras of an expression
@@ -69,30 +70,42 @@ def observe_peaks(
     return shut_lids([found[name] for name in peaks if name in found]), dropped
 
 
-def observe_clip(
+def read_clip(
     dataset: Dataset,
     subject: str,
     source: Source,
     peaks: list[Observation],
+    side: int,
     cue: str,
     frames: Sequence[int],
-) -> list[Observation]:
-    """Observe frames of a clip in one pass through each camera's footage.
+) -> Iterator[tuple[Observation, CutCrops]]:
+    """Yield what the cameras see of a clip, frame set by frame set; each frame is decoded once.
 
-    Frames where the cameras agree on no face are left out.
+    Frames where the cameras agree on no face are left out. Crops, of at most `side` pixels, have no
+    mattes; they can be cut until the next frame set is asked for.
     """
-    views: dict[int, list[LandmarkView]] = {frame: [] for frame in frames}
-    for camera_id, camera in read_cameras_of(dataset, subject).items():
+    cameras = read_cameras_of(dataset, subject)
+    with FootageReader(dataset, subject) as footage:
         for frame in frames:
-            try:
-                read = partial(read_frame, dataset, subject, frame=frame)
-                views[frame] += _views(read, {camera_id: camera}, frame, source)
-            except CaptureError:
-                continue  # this camera's footage lacks the frame
-    seen = [agree(cue, frame, found)[0] for frame, found in views.items() if found]
-    seen = [one for one in seen if one.inliers.sum(1).max() >= MIN_LANDMARKS]
-    # A clip may be one long blink: the peaks show what open eyes look like.
-    return shut_lids(seen, peaks)
+            images = {}
+            for camera_id in cameras:
+                with suppress(CaptureError):  # this camera's footage lacks the frame
+                    images[camera_id] = footage.read(camera_id, frame)
+            seen = {camera_id: cameras[camera_id] for camera_id in images}
+            views = _views(images.__getitem__, seen, frame, source)
+            observation = agree(cue, frame, views)[0] if views else None
+            if observation is None or observation.inliers.sum(1).max() < MIN_LANDMARKS:
+                continue
+            # A clip may be one long blink: the peaks show what open eyes look like.
+            yield shut_lids([observation], peaks)[0], partial(_frame_crops, seen, images, side)
+
+
+def _frame_crops(
+    cameras: dict[str, Camera], images: dict[str, np.ndarray], side: int, mesh: np.ndarray
+) -> FrameSetCrops:
+    """Cut the crops of a frame of a clip about its mesh (V, 3)."""
+    crops = [cut_crop(cameras[name], image, None, mesh, side) for name, image in images.items()]
+    return FrameSetCrops((), tuple(crop for crop in crops if crop))
 
 
 def _views(
@@ -137,27 +150,8 @@ def peak_pictures(
         alpha = read_alpha(path) if path.is_file() else None
         if alpha is not None:
             distances.append(signed_distance(alpha, camera))
-        crops.append(_crop(read, camera, alpha, mesh, side))
+        with suppress(CaptureError):  # the frames stage left this camera out
+            crops.append(cut_crop(camera, read(camera_id), alpha, mesh, side))
     return FrameSetCrops(
         tuple(one for one in distances if one), tuple(crop for crop in crops if crop)
     )
-
-
-def frame_pictures(
-    dataset: Dataset, subject: str, side: int, frame: int, mesh: np.ndarray
-) -> FrameSetCrops:
-    """Read the crops of a frame of a clip about its mesh (V, 3); such frames have no mattes."""
-    read = partial(read_frame, dataset, subject, frame=frame)
-    cameras = read_cameras_of(dataset, subject).values()
-    crops = [_crop(read, camera, None, mesh, side) for camera in cameras]
-    return FrameSetCrops((), tuple(crop for crop in crops if crop))
-
-
-def _crop(
-    read: Read, camera: Camera, alpha: np.ndarray | None, mesh: np.ndarray, side: int
-) -> HeadCrop | None:
-    """Cut a camera's crop about the head; None where its footage lacks the frame or the head."""
-    try:
-        return cut_crop(camera, read(camera.id), alpha, mesh, side)
-    except CaptureError:
-        return None

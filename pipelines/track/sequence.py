@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import io
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -43,7 +43,7 @@ from pipelines.track.state import (
     posed_sigma,
     start_state,
 )
-from pipelines.track.surface import FrameSetCrops
+from pipelines.track.surface import CutCrops
 from pipelines.track.terms import MeshPlaces, PointTerm, landmark_anchors
 
 WINDOW = 48  # frames tracked in one piece, and kept if the run is stopped
@@ -55,10 +55,10 @@ MAX_GAP = 3  # strides beyond which frames do not constrain each other
 # Landmarks and the frame before leave a millimetre or two: half of what the peaks' search spans.
 REACH_SHARE, FIRST_TRUST = 0.5, 0.3
 
-Pictures = Callable[[int, np.ndarray], FrameSetCrops]
-"""Crops of a frame about its mesh (V, 3)."""
-Observe = Callable[[str, Sequence[int]], list[Observation]]
-"""Observations of frames of a cue."""
+Observed = tuple[Observation, CutCrops]
+"""What the cameras see of a frame, and its crops until the next frame is asked for."""
+ReadClip = Callable[[str, Sequence[int]], Iterable[Observed]]
+"""Read frames of a cue, one after the other."""
 
 
 @dataclass(frozen=True)
@@ -66,8 +66,7 @@ class ClipTracker:
     """Settings and helpers for tracking windows of one person, whose basis is of `freeze_shape`.
 
     Every `stride`-th frame is tracked. `eyes`, `skin` and `uv_map` are those of the peaks' rounds;
-    the surface is searched for in so many `rounds` per frame, if `pictures` reads its crops; then
-    come the `sweeps` of smoothing.
+    the surface is searched for in so many `rounds` per frame; then come the `sweeps` of smoothing.
     """
 
     person: Basis
@@ -75,7 +74,6 @@ class ClipTracker:
     eyes: EyeOffsets | None = None
     skin: SkinSamples | None = None
     uv_map: FaceUvMap | None = None
-    pictures: Pictures | None = None
     rounds: int = 0
     sweeps: int = SWEEPS
 
@@ -110,8 +108,8 @@ def make_windows(
     ]
 
 
-def track_window(tracker: ClipTracker, observations: list[Observation]) -> list[Pose]:
-    """Find the poses of the frames of one window, observed in their order.
+def track_window(tracker: ClipTracker, clip: Iterable[Observed]) -> dict[int, Pose]:
+    """Find the pose of every frame of one window, read in their order.
 
     Raises:
         StageError: a frame cannot be fitted.
@@ -121,7 +119,7 @@ def track_window(tracker: ClipTracker, observations: list[Observation]) -> list[
     template = anchors.at(person.model.template.numpy())
     targets: list[Target] = []
     poses: list[Pose] = []
-    for observation in observations:
+    for observation, cut_crops in clip:
         start = start_state(person, [initial_pose(observation, template)])
         pose = start.poses[0]
         # Views from behind are left out as at the peaks.
@@ -137,21 +135,23 @@ def track_window(tracker: ClipTracker, observations: list[Observation]) -> list[
         rotation = state.poses[0].rotation
         target = with_irises_and_jaw(person.model, target, mesh, rotation, tracker.eyes)
         state, _ = fit(person, [target], state, ROUND_STEPS)
-        target, found = fit_to_pictures(tracker, target, state.poses[0])
+        target, found = fit_to_pictures(tracker, target, state.poses[0], cut_crops)
         targets.append(target)
         poses.append(found)
     for half in range(2 * tracker.sweeps):
         poses = _sweep(tracker, targets, poses, half % 2)
-    return poses
+    return {target.observation.frame: pose for target, pose in zip(targets, poses, strict=True)}
 
 
-def fit_to_pictures(tracker: ClipTracker, target: Target, pose: Pose) -> tuple[Target, Pose]:
+def fit_to_pictures(
+    tracker: ClipTracker, target: Target, pose: Pose, cut_crops: CutCrops
+) -> tuple[Target, Pose]:
     """Fit a frame to the surface its pictures agree on; returns the target with that surface."""
     person, seen = tracker.person, target
-    if tracker.pictures is None or tracker.skin is None or not tracker.rounds:
+    if tracker.skin is None or not tracker.rounds:
         return target, pose
     state = State(np.zeros(0), (pose,))
-    pictures = tracker.pictures(target.observation.frame, all_vertices(person.model, state)[0])
+    pictures = cut_crops(all_vertices(person.model, state)[0])
     if not pictures.crops:
         return target, pose
     for done in range(tracker.rounds):
@@ -254,7 +254,7 @@ def write_clips(
     head: str,
     shape: np.ndarray,
     cues: tuple[Cue, ...],
-    observe: Observe,
+    read: ReadClip,
     keep: Path,
     identity: str,
 ) -> tuple[dict, list[Note]]:
@@ -283,9 +283,8 @@ def write_clips(
             file = folder / f"{cue.expression_id}_{number:04d}.npz"
             done = _read_window(file)
             if done is None:
-                seen = observe(cue.expression_id, fitted)
-                pairs = zip(seen, track_window(tracker, seen), strict=True)
-                done = {one.frame: pose for one, pose in pairs if one.frame in kept}
+                all_fitted = track_window(tracker, read(cue.expression_id, fitted))
+                done = {frame: pose for frame, pose in all_fitted.items() if frame in kept}
                 _write_window(file, done, tracker.person.expression_size)
             found |= done
         rows += [(cue.expression_id, frame, found[frame]) for frame in sorted(found)]

@@ -26,13 +26,7 @@ from pipelines.track.config import TrackConfig
 from pipelines.track.eyes_and_jaw import lid_terms, measure_eyes
 from pipelines.track.fit import consistent_sigma, fit
 from pipelines.track.observe import Observation
-from pipelines.track.read_inputs import (
-    frame_pictures,
-    observe_clip,
-    observe_peaks,
-    open_landmarks,
-    peak_pictures,
-)
+from pipelines.track.read_inputs import observe_peaks, open_landmarks, peak_pictures, read_clip
 from pipelines.track.report import (
     camera_warnings,
     draw_overlays,
@@ -110,8 +104,7 @@ def run(
     if config.frames == "clips":
         tracker = ClipTracker(
             freeze_shape(basis, state.shape, state.bias), config.stride, eyes, evidence.skin,
-            evidence.uv_map, partial(frame_pictures, dataset, item, config.photo_side),
-            config.clip_rounds,
+            evidence.uv_map, config.clip_rounds,
         )  # fmt: skip
         shape = split_shape(basis.model, state.shape)[0]
         # The peaks' fit follows from the inputs and settings, up to how the machine rounds.
@@ -119,7 +112,8 @@ def run(
         digests = {k: path_digest(v) if isinstance(v, Path) else v for k, v in inputs.items()}
         metrics["clips"], lost = write_clips(
             out, tracker, config.head, shape, read_index(dataset, item).cues,
-            partial(observe_clip, dataset, item, source, peaks), dataset.windows_dir(item),
+            partial(read_clip, dataset, item, source, peaks, config.photo_side),
+            dataset.windows_dir(item),
             repr((value_digest(digests), asdict(config), fitted)),
         )  # fmt: skip
         dropped += lost

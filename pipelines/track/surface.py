@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import cv2
@@ -61,6 +62,10 @@ class FrameSetCrops:
 
     distances: tuple[SignedDistance, ...]
     crops: tuple[HeadCrop, ...]
+
+
+CutCrops = Callable[[np.ndarray], FrameSetCrops]
+"""Cut the crops of a frame set about its mesh (V, 3)."""
 
 
 def cut_crop(

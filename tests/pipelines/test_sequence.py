@@ -3,22 +3,29 @@
 from __future__ import annotations
 
 import dataclasses
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from express50.capture.frames import FrameReader
 from express50.capture.index import Cue
 from express50.dataset.tracks import SEQUENCE_SCHEMA
 from express50.errors import StageError
 from express50.geometry.cameras import project
 from express50.geometry.transforms import axis_angle_to_matrix
+from express50.landmarks.detector import Detection
+from express50.landmarks.eyes_and_lips import Irises
+from express50.landmarks.sources import Marked
 from pipelines.track import sequence
 from pipelines.track.basis import Points
 from pipelines.track.observe import LandmarkView, Observation, agree
+from pipelines.track.read_inputs import read_clip
 from pipelines.track.sequence import (
     ClipTracker,
+    Observed,
     _expected,
     freeze_shape,
     jitter_mm,
@@ -27,8 +34,11 @@ from pipelines.track.sequence import (
     write_clips,
 )
 from pipelines.track.state import Pose
+from pipelines.track.surface import FrameSetCrops
 from pipelines.track.terms import landmark_anchors
+from tests.express50.capture.test_frames import write_calibration
 from tests.pipelines.test_track import RIG, make_scene
+from tests.synth import make_rig, render_ball
 
 FRAMES = 10
 
@@ -65,6 +75,14 @@ def meshes(person, poses: list[Pose]) -> np.ndarray:
     return np.stack([points.evaluate(pose.own, pose.rotation) for pose in poses])
 
 
+def unseen(mesh: np.ndarray) -> FrameSetCrops:
+    return FrameSetCrops((), ())
+
+
+def tracked(tracker: ClipTracker, seen: list[Observation]) -> list[Pose]:
+    return list(track_window(tracker, ((one, unseen) for one in seen)).values())
+
+
 def test_a_frozen_shape_is_the_same_head() -> None:
     scene = make_scene()
     person = freeze_shape(scene.basis, scene.shape, np.zeros((68, 3)))
@@ -92,7 +110,7 @@ def test_smoothing_takes_noise_and_leaves_motion() -> None:
     truth = meshes(person, true_poses(scene))
     results = {}
     for sweeps in (0, 2):
-        results[sweeps] = meshes(person, track_window(ClipTracker(person, sweeps=sweeps), seen))
+        results[sweeps] = meshes(person, tracked(ClipTracker(person, sweeps=sweeps), seen))
     assert jitter_mm(results[2]) < 0.4 * jitter_mm(results[0])
     error = {n: np.linalg.norm(mesh - truth, axis=2).mean() for n, mesh in results.items()}
     assert error[2] < error[0]
@@ -107,9 +125,9 @@ def test_sweeps_know_no_direction_of_time() -> None:
     person = freeze_shape(scene.basis, scene.shape, np.zeros((68, 3)))
     seen = observations(scene, 1.0)[:7]
     tracker = ClipTracker(person)
-    ahead = track_window(tracker, seen)
+    ahead = tracked(tracker, seen)
     mirrored = [dataclasses.replace(one, frame=100 - one.frame) for one in reversed(seen)]
-    back = track_window(tracker, mirrored)[::-1]
+    back = tracked(tracker, mirrored)[::-1]
     np.testing.assert_allclose(meshes(person, ahead), meshes(person, back), atol=3e-4)
 
 
@@ -128,16 +146,16 @@ def run(scene, keep: Path, watched: list[int], fail_at: int | None = None, hide:
     """Track the cues: arrays, metrics and notes."""
     seen = observations(scene, 0.5)
 
-    def observe(cue: str, frames: Sequence[int]) -> list[Observation]:
+    def read(cue: str, frames: Sequence[int]) -> list[Observed]:
         if fail_at in frames:
             raise KeyboardInterrupt
         watched.extend(frames)
-        return [seen[frame] for frame in frames if frame != hide]
+        return [(seen[frame], unseen) for frame in frames if frame != hide]
 
     out = keep.with_name(keep.name + "-out")
     out.mkdir(exist_ok=True)
     metrics, dropped = write_clips(
-        out, quick(scene), "tiny", scene.shape, CUES, observe, keep, "inputs"
+        out, quick(scene), "tiny", scene.shape, CUES, read, keep, "inputs"
     )
     with np.load(out / "sequence.npz", allow_pickle=False) as data:
         return dict(data), metrics, dropped
@@ -177,6 +195,34 @@ def test_frames_without_a_face_are_left_out_and_said(tmp_path: Path) -> None:
         )  # fmt: skip
 
 
+def test_a_clip_is_decoded_once_and_its_crops_are_of_its_frames(ingested, monkeypatch) -> None:
+    rig = make_rig()
+    write_calibration(ingested, rig)
+    places = 0.05 * np.random.default_rng(0).normal(size=(68, 3))
+    decoded: Counter[tuple[str, int]] = Counter()
+    original = FrameReader.read
+
+    def counted(self, frame, deep=False):
+        decoded[self.camera_id, frame] += 1
+        return original(self, frame, deep)
+
+    def find(image, camera_id: str, frame: int) -> Marked:
+        points = project(rig[camera_id], places)[0]
+        face = Detection(points, np.ones(68), np.ones(68), 0.9 if frame != 2 else 0.0)
+        return Marked(face, Irises(np.zeros((2, 2)), np.full(2, np.inf), np.zeros(2)), True)
+
+    monkeypatch.setattr(FrameReader, "read", counted)
+    clip = read_clip(ingested, "S001", find, [], 64, "smile", [1, 2, 4])
+    for frame, (seen, cut_crops) in zip((1, 4), clip, strict=True):
+        assert seen.frame == frame
+        for crop in cut_crops(places).crops:
+            row, column = np.array(crop.camera.K[:2, 2] - rig[crop.camera.id].K[:2, 2]).astype(int)
+            whole = render_ball(rig[crop.camera.id], frame)
+            height, width = crop.image.shape[:2]
+            assert np.array_equal(crop.image, whole[-column:, -row:][:height, :width])
+    assert decoded == {(camera, frame): 1 for camera in rig for frame in (1, 2, 4)}
+
+
 def test_kept_windows_go_when_the_sequence_is_written(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -188,8 +234,8 @@ def test_kept_windows_go_when_the_sequence_is_written(
         sequence.np, "savez", lambda *a, **k: (kept.append(keep.is_dir()), savez(*a, **k))
     )
     write_clips(
-        tmp_path, quick(scene), "tiny", scene.shape, CUES, lambda c, f: [seen[k] for k in f],
-        keep, "inputs",
+        tmp_path, quick(scene), "tiny", scene.shape, CUES,
+        lambda c, f: [(seen[k], unseen) for k in f], keep, "inputs",
     )  # fmt: skip
     assert kept[-1] and not keep.exists()
     with np.load(tmp_path / "sequence.npz", allow_pickle=False) as data:

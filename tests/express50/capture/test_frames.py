@@ -6,8 +6,8 @@ import tarfile
 import numpy as np
 import pytest
 
-from express50.capture import frames
 from express50.capture.frames import (
+    FootageReader,
     FrameReader,
     dhash,
     read_cameras_of,
@@ -22,6 +22,7 @@ from express50.errors import CaptureError, FormatError, StageError
 from express50.files.calibration import write_cameras
 from express50.files.containers import to_srgb
 from express50.files.images import write_image
+from express50.files.video import VideoReader
 from express50.geometry.conventions import undistort_image
 from express50.runner.runner import run_stage
 from pipelines import ingest
@@ -62,14 +63,20 @@ def test_video_frames_are_exact_in_any_order(tmp_path):
     assert np.abs(sequential[17] - truth).mean() < 6  # 4:2:0 chroma at 64 px
 
 
-def test_few_videos_stay_open(tmp_path, monkeypatch):
-    monkeypatch.setattr(frames, "OPEN_READERS", 2)
+def test_each_video_is_opened_once_and_closed_at_the_end(tmp_path, monkeypatch):
+    opened, closed = [], []
+    monkeypatch.setattr(VideoReader, "restart", lambda self: pytest.fail("read back"))
+    start, stop = VideoReader.__init__, VideoReader.close
+    monkeypatch.setattr(VideoReader, "__init__", lambda *a: (opened.append(1), start(*a))[1])
+    monkeypatch.setattr(VideoReader, "close", lambda self: (closed.append(1), stop(self))[1])
     make_capture(tmp_path / "S001", cameras=4, video=True)
     dataset = ingest_capture(tmp_path / "data", tmp_path / "S001")
-    for _ in range(2):
-        for name in read_index(dataset, "S001").cameras:
-            read_frame(dataset, "S001", name, 1, undistort=False)
-            assert len(frames._readers) <= 2
+    with FootageReader(dataset, "S001", undistort=False) as footage:
+        for frame in range(3):
+            for name in read_index(dataset, "S001").cameras:
+                footage.read(name, frame)
+        assert len(opened) == 4 and not closed
+    assert len(closed) == 4
 
 
 def test_changed_footage_is_noticed(tmp_path):
