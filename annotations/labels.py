@@ -292,7 +292,10 @@ def _stacks(labels: Iterable[Label]) -> dict[tuple[str, str], list[Label]]:
 
 
 def _rank(label: Label) -> int:
-    """Adjudications stand above people, people above rules, rules above suggestions."""
+    """Rank an annotator.
+
+    Adjudications above people, people above rules, rules above suggestions.
+    """
     if label.action == "settle":
         return 3
     return 2 if is_person(label.annotator) else int(label.annotator != AUTOMATIC)

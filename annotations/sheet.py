@@ -85,7 +85,7 @@ class Sheet:
 
     @property
     def tiles(self) -> list[Tile]:
-        """Every tile, row by row."""
+        """Return every tile, row by row."""
         return [tile for row in self.rows for tile in row.tiles]
 
     def counts(self) -> dict[str, int]:

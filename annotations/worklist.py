@@ -35,7 +35,7 @@ class LabelTask:
 
     @property
     def key(self) -> tuple[str, str]:
-        """Subject and expression."""
+        """Return the subject and expression."""
         return self.subject, self.expression
 
 

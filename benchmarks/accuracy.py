@@ -34,7 +34,7 @@ NEUTRAL = "neutral"
 
 
 def measure_dataset(dataset: Dataset, truth_root: Path, out: Path | None = None) -> dict:
-    """Every figure that the published stages allow, and error pictures below ``out``."""
+    """Return every figure that the published stages allow, and error pictures below ``out``."""
     truth = Truth(truth_root)
     measures = {
         "calibrate": measure_calibrate,
@@ -55,7 +55,7 @@ def measure_dataset(dataset: Dataset, truth_root: Path, out: Path | None = None)
 
 
 def measure_calibrate(dataset: Dataset, truth: Truth, out: Path | None = None) -> dict:
-    """Worst rotation, position and head-place error of the cameras over all subjects."""
+    """Return the worst rotation, position and head-place error of the cameras over all subjects."""
     rows = [
         rig_figures(read_cameras_of(dataset, subject, undistorted=False), truth.cameras(subject))
         for subject in calibrated_subjects(dataset)
@@ -65,12 +65,12 @@ def measure_calibrate(dataset: Dataset, truth: Truth, out: Path | None = None) -
 
 
 def calibrated_subjects(dataset: Dataset) -> list[str]:
-    """Subjects whose cameras were published."""
+    """Return the subjects whose cameras were published."""
     return [s for s in dataset.subjects() if dataset.item_dir("calibrate", s).is_dir()]
 
 
 def measure_align(dataset: Dataset, truth: Truth, out: Path | None = None) -> dict:
-    """Frames between each label and the true peak; the neutral expression has none."""
+    """Return frames between each label and the true peak; the neutral expression has none."""
     errors = [
         abs(frame - truth.peaks(subject)[expression])
         for subject in dataset.subjects()
@@ -86,14 +86,14 @@ def measure_align(dataset: Dataset, truth: Truth, out: Path | None = None) -> di
 
 
 def true_world_cameras(dataset: Dataset, truth: Truth, subject: str) -> dict[str, Camera]:
-    """The estimated pinhole cameras, moved into the true world."""
+    """Return the estimated pinhole cameras, moved into the true world."""
     estimated = read_cameras_of(dataset, subject)
     motion = align_worlds(estimated, truth.cameras(subject))
     return {c: transform_camera(camera, motion) for c, camera in estimated.items()}
 
 
 def sampled_views(dataset: Dataset, truth: Truth) -> Iterator[tuple[str, str, int, Camera]]:
-    """(subject, expression, frame, camera in the true world), a few of every peak."""
+    """Yield (subject, expression, frame, camera in the true world), a few of every peak."""
     turn = 0
     for subject in dataset.subjects():
         cameras = list(true_world_cameras(dataset, truth, subject).values())
@@ -104,7 +104,7 @@ def sampled_views(dataset: Dataset, truth: Truth) -> Iterator[tuple[str, str, in
 
 
 def measure_matte(dataset: Dataset, truth: Truth, out: Path | None = None) -> dict:
-    """Mean absolute alpha error over whole images, and over the truth's uncertain rim alone."""
+    """Return mean absolute alpha errors over whole images, and over the truth's soft rim."""
     whole, rim, rows, names = [], [], [], []
     for subject, expression, frame, camera in sampled_views(dataset, truth):
         path = dataset.matte_file(subject, expression, camera.id)
@@ -128,7 +128,7 @@ def measure_matte(dataset: Dataset, truth: Truth, out: Path | None = None) -> di
 
 
 def measure_track(dataset: Dataset, truth: Truth, out: Path | None = None) -> dict:
-    """Root mean square distance between tracked and true vertices of the same topology."""
+    """Return root mean square distance between tracked and true vertices of the same topology."""
     squares, medians = [], []
     for subject in dataset.subjects():
         path = dataset.track_file(subject)
@@ -155,7 +155,7 @@ def measure_track(dataset: Dataset, truth: Truth, out: Path | None = None) -> di
 
 
 def measure_depth(dataset: Dataset, truth: Truth, out: Path | None = None) -> dict:
-    """Absolute depth errors over pixels where both know the surface, and how many are covered.
+    """Return absolute depth errors where both know the surface, and the share that is covered.
 
     Errors on skin are given apart, as the truth's hair is single strands, which no surface follows.
     """
@@ -199,7 +199,7 @@ def measure_depth(dataset: Dataset, truth: Truth, out: Path | None = None) -> di
 
 
 def _normal_error(path: Path, truth: Truth, subject: str, frame: int, camera: Camera) -> np.ndarray:
-    """Angles (H, W), degrees, of a normal map to the true head's; NaN where either is unknown."""
+    """Return angles (H, W), degrees, of a normal map to the true head's; NaN where unknown."""
     if not path.is_file():
         return np.full((camera.height, camera.width), np.nan)
     found, known = read_normals(path)
@@ -210,7 +210,7 @@ def _normal_error(path: Path, truth: Truth, subject: str, frame: int, camera: Ca
 
 
 def measure_regions(dataset: Dataset, truth: Truth, out: Path | None = None) -> dict:
-    """Mean absolute error of the head's alpha, and the parts' mean intersection over union."""
+    """Return mean absolute error of head's alpha and the parts' mean intersection over union."""
     found, rows, names = [], [], []
     for subject, expression, frame, camera in sampled_views(dataset, truth):
         folder = dataset.item_dir("regions", f"{subject}/{expression}")
@@ -236,7 +236,7 @@ def _grey(image: np.ndarray) -> np.ndarray:
 
 
 def _depth_grey(depth: np.ndarray, valid: np.ndarray) -> np.ndarray:
-    """Depth as grey, near is bright."""
+    """Return the depth as grey, near is bright."""
     if not valid.any():
         return np.zeros(depth.shape, np.uint8)
     low, high = np.percentile(depth[valid], [1, 99])
@@ -244,7 +244,7 @@ def _depth_grey(depth: np.ndarray, valid: np.ndarray) -> np.ndarray:
 
 
 def _heat(error_m: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """Signed error as colour: red in front of the truth, blue behind it."""
+    """Return the signed error as colour: red in front of the truth, blue behind it."""
     e = np.where(known, error_m * 1e3 / ERROR_RANGE_MM, 0.0)
     colour = np.stack(
         [1 - np.clip(e, 0, 1), 1 - np.abs(np.clip(e, -1, 1)), 1 + np.clip(e, -1, 0)], -1

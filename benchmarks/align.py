@@ -79,7 +79,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def measure(dataset: Dataset, truth: Truth, preset: str) -> dict:
-    """All figures but the steps' time."""
+    """Return all figures but the steps' time."""
     subjects = dataset.subjects()
     began = time.perf_counter()
     run(observe.STAGE, dataset, preset)
@@ -113,7 +113,7 @@ def measure(dataset: Dataset, truth: Truth, preset: str) -> dict:
 
 
 def within(errors: list[int], frames: int) -> float:
-    """Share of errors of at most so many frames."""
+    """Return the share of errors of at most so many frames."""
     return round(float(np.mean(np.array(errors) <= frames)), 4)
 
 
@@ -126,7 +126,7 @@ def run(stage: Stage, dataset: Dataset, preset: str, **values: object) -> None:
 
 
 def peak_errors(dataset: Dataset, truth: Truth) -> list[int]:
-    """Frames off the true peak of every suggestion but the neutral one's."""
+    """Count the frames off the true peak of every suggestion but the neutral one's."""
     return [
         abs(found.frame - truth.peaks(subject)[expression])
         for subject in dataset.subjects()
@@ -138,7 +138,7 @@ def peak_errors(dataset: Dataset, truth: Truth) -> list[int]:
 def match_errors(
     dataset: Dataset, truth: Truth, preset: str, off_apex: bool
 ) -> tuple[list[int], list[float]]:
-    """Frames off the best match, and confidences, of all but the reference.
+    """Count the frames off the best match, and list confidences, of all but the reference.
 
     The reference is labelled first, at its true peaks or at random frames off them.
     """
@@ -175,7 +175,7 @@ def label_reference(
 def match_error(
     dataset: Dataset, truth: Truth, subject: str, expression: str, level: float, frame: int
 ) -> int:
-    """Frames to the nearest of those at which the subject goes as far as the reference did."""
+    """Count frames to the nearest at which the subject goes as far as the reference did."""
     cue = next(c for c in read_index(dataset, subject).cues if c.expression_id == expression)
     away = np.abs(shares_of(truth, subject, cue) - level)
     same = cue.start_frame + np.flatnonzero(away <= away.min() + SAME_STRENGTH)
@@ -183,14 +183,17 @@ def match_error(
 
 
 def shares_of(truth: Truth, subject: str, cue: Cue) -> np.ndarray:
-    """How far the expression is played in each frame of its window, as a share of its peak."""
+    """Return the expression's strength in each frame of its window, as a share of its peak."""
     frames = range(cue.start_frame, cue.end_frame + 1)
     strengths = np.array([float(truth.parameters(subject, f)["strength"]) for f in frames])
     return strengths / strengths.max()
 
 
 def farthest_frames(dataset: Dataset, subject: str) -> Iterator[tuple[str, int]]:
-    """The baseline: the frame whose landmarks are furthest from neutral, head motion removed."""
+    """Find the baseline.
+
+    The frame whose landmarks are furthest from neutral, head motion removed.
+    """
     seen, index = read_observations(dataset, subject), read_index(dataset, subject)
     points = seen.points[0].astype(np.float64)
     windows = {
@@ -207,7 +210,7 @@ def farthest_frames(dataset: Dataset, subject: str) -> Iterator[tuple[str, int]]
 
 
 def acceptance(errors: list[int], confidences: list[float]) -> list[dict[str, float | None]]:
-    """What accepting suggestions at least so sure leaves to people, and how far off those are."""
+    """Measure what accepting sure suggestions leaves to people, and how far off these are."""
     off, sure = np.array(errors), np.array(confidences)
     out: list[dict[str, float | None]] = []
     for threshold in THRESHOLDS:
@@ -224,7 +227,7 @@ def acceptance(errors: list[int], confidences: list[float]) -> list[dict[str, fl
 
 
 def as_markdown(figures: dict) -> list[str]:
-    """The acceptance table as a section of docs/TRADEOFFS.md."""
+    """Return the acceptance table as a section of docs/TRADEOFFS.md."""
     lines = [
         f"Made by `python -m benchmarks.align --doc docs/TRADEOFFS.md` on {figures['subjects']}"
         f" synthetic subjects, {figures['labels']} clips; all but the reference's are counted."
@@ -254,7 +257,7 @@ def record_subjects(scratch: Path, dataset: Dataset, subjects: int, frames: int)
 
 
 def record_4k(scratch: Path, dataset: Dataset, cameras: int = 24, frames: int = 12) -> Dataset:
-    """An ingested capture of 24 cameras at 3840 x 2160: frames of the dataset, blown up."""
+    """Ingest a capture of 24 cameras at 3840 x 2160: frames of the dataset, blown up."""
     capture, subject = scratch / "big", dataset.subjects()[0]
     camera = next(iter(read_index(dataset, subject).cameras))
     for number in range(cameras):

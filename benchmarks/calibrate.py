@@ -144,7 +144,7 @@ def main() -> int:
 
 
 def gain_figures(palette: WhiteCollector, names: list[str]) -> dict[str, float]:
-    """Root mean square error of the colour gains, percent, and the same of leaving colours be."""
+    """Return root mean square error of the colour gains, percent, and one of leaving colours be."""
     found = palette.gains(names)
     measured = np.array([found.gain.get(name, np.ones(3)) for name in names])
     every = sorted(make_rig(RIG.cameras, RIG.width, RIG.height, RIG.seed))
@@ -166,7 +166,7 @@ def footage_figures(
     board: tuple[BoardCorners, np.ndarray],
     config: CalibrateConfig,
 ) -> dict[str, object]:
-    """Rigs solved from the footage alone, and perturbed ones refined: the twin's and foreign ones.
+    """Measure rigs solved from footage alone and perturbed ones refined, the twin's and foreign.
 
     A foreign capture's given calibration is hidden from the solution and is what it is held to.
     """
@@ -185,14 +185,14 @@ def footage_figures(
 
 
 def add_data_arguments(parser: argparse.ArgumentParser) -> None:
-    """Options that name a twin dataset and its truth."""
+    """Add the options that name a twin dataset and its truth."""
     parser.add_argument("--dataset", type=Path, default=Path("build/demo/data/demo"))
     parser.add_argument("--truth", type=Path, default=Path("build/demo/twin/truth"))
     parser.add_argument("--small", type=Path, default=Path("build/bench-twin"))
 
 
 def dataset_and_truth(args: argparse.Namespace) -> tuple[Dataset, Truth]:
-    """The named dataset, or a small one recorded for the purpose."""
+    """Return the named dataset, or a small one recorded for the purpose."""
     dataset = Dataset(args.dataset)
     if dataset.captures_file.is_file():
         return dataset, Truth(args.truth)
@@ -209,7 +209,7 @@ def dataset_and_truth(args: argparse.Namespace) -> tuple[Dataset, Truth]:
 
 
 def recorded(config: TwinConfig, folder: Path) -> tuple[Dataset, Truth]:
-    """A twin recording, made where it is not there, and ingested."""
+    """Return a twin recording, made where it is not there, and ingested."""
     record(config, folder, report=print_progress())
     dataset = Dataset(folder / "data")
     ingest.register(dataset, sorted((folder / "captures").iterdir()))
@@ -224,7 +224,7 @@ def recorded(config: TwinConfig, folder: Path) -> tuple[Dataset, Truth]:
 def bump_figures(
     cameras: Mapping[str, Camera], index: Index, bumps: int, frame_sets: int = 2
 ) -> dict[str, object]:
-    """Whether turned cameras, and no others, are found in the footage."""
+    """Return whether turned cameras, and no others, are found in the footage."""
     seen = find_points(read_footage(index, cameras, frame_sets))
     names, rng = sorted(cameras), np.random.default_rng(0)
     quiet = check_footage(cameras, seen)
@@ -246,7 +246,7 @@ def bump_figures(
 
 
 def board_files(index: Index) -> dict[str, list[Path]]:
-    """Board images of every camera."""
+    """Return board images of every camera."""
     table = index.board or {"cameras": {}}
     return {
         name: [index.capture / file for file in table["cameras"].get(name, [])]
@@ -255,7 +255,7 @@ def board_files(index: Index) -> dict[str, list[Path]]:
 
 
 def figures(estimated: Mapping[str, Camera], true: Mapping[str, Camera]) -> dict[str, float]:
-    """Errors of a rig after a rigid motion onto the true one."""
+    """Return errors of a rig after a rigid motion onto the true one."""
     motion = align_worlds(estimated, true)
     moved = {name: transform_camera(camera, motion) for name, camera in estimated.items()}
     turns = [
@@ -283,7 +283,7 @@ def figures(estimated: Mapping[str, Camera], true: Mapping[str, Camera]) -> dict
 
 
 def head_error(estimated: Mapping[str, Camera], true: Mapping[str, Camera]) -> float:
-    """Rms distance, pixels, of points in the head's place between both rigs' pictures.
+    """Return the rms distance, pixels, of points in the head's place between both rigs' pictures.
 
     The worlds are laid on each other by those points, triangulated by either rig: a camera's
     rotation and principal point trade places without harm there, and would tilt a fit to the
@@ -306,7 +306,7 @@ def head_error(estimated: Mapping[str, Camera], true: Mapping[str, Camera]) -> f
 def chained(
     observations: BoardCorners, points: np.ndarray, sizes: Mapping[str, tuple[int, int]]
 ) -> BoardRig:
-    """OpenCV a camera, the mean relative pose a pair, and the best tree of pairs: no adjustment."""
+    """Chain OpenCV's cameras by mean relative poses along the best tree of pairs, not adjusted."""
     lone: dict[str, Camera] = {}
     views: dict[str, dict[int, BoardView]] = {}
     for i, name in enumerate(observations.cameras):
@@ -342,7 +342,7 @@ def chained(
 
 
 def rounded(row: Mapping[str, object]) -> dict[str, object]:
-    """The row with floats to five significant digits."""
+    """Return the row with floats to five significant digits."""
     return {k: float(f"{v:.5g}") if isinstance(v, float) else v for k, v in row.items()}
 
 

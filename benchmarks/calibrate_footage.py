@@ -32,19 +32,19 @@ RigJudge = Callable[[Mapping[str, Camera], Mapping[str, Camera]], dict[str, floa
 
 
 def see_capture(root: Path, true: Mapping[str, Camera], count: int) -> dict[int, FrameSetPoints]:
-    """What the cameras of a raw capture see, in recorded pixels of `reduced_camera`."""
+    """Return what the cameras of a raw capture see, in recorded pixels of `reduced_camera`."""
     return find_points(read_raw_footage(root, true, count))
 
 
 def small(cameras: Mapping[str, Camera]) -> dict[str, Camera]:
-    """The cameras of reduced images."""
+    """Return the cameras of reduced images."""
     return {name: reduced_camera(camera) for name, camera in cameras.items()}
 
 
 def sfm_figures(
     seen: Mapping[int, FrameSetPoints], true: Mapping[str, Camera], config: CalibrateConfig
 ) -> dict[str, object]:
-    """Errors of rigs solved with unknown and with known focal lengths, and of COLMAP's mapping."""
+    """Return errors of rigs with unknown and with known focal lengths, and of COLMAP's mapping."""
     rig = small(true)
     sizes = {name: (camera.width, camera.height) for name, camera in rig.items()}
     known = {name: float(camera.K[0, 0]) for name, camera in rig.items()}
@@ -66,7 +66,7 @@ def sfm_figures(
 
 
 def similar(estimated: Mapping[str, Camera], true: Mapping[str, Camera]) -> dict[str, object]:
-    """Errors of a rig after a similarity onto the true one, and that similarity's scale."""
+    """Return errors of a rig after a similarity onto the true one, and that similarity's scale."""
     names = sorted(estimated)
     count: dict[str, object] = {"cameras_registered": len(names), "cameras": len(true)}
     if len(names) < 3:
@@ -95,7 +95,7 @@ def refine_figures(
     judge: RigJudge,
     board: tuple[BoardCorners, np.ndarray] | None = None,
 ) -> dict[str, object]:
-    """Errors of a perturbed rig before and after, and whether the true one is left as it is.
+    """Return errors of a perturbed rig before and after, and whether the true one is left as it is.
 
     `judge` compares a rig with the true one.
     """
@@ -150,7 +150,7 @@ def _of(row: Mapping[str, float]) -> dict[str, object]:
 
 
 def perturbed(rig: Mapping[str, Camera]) -> dict[str, Camera]:
-    """Every camera turned by `BUMP_DEG` and moved by `BUMP_MM`, each its own way."""
+    """Return every camera turned by `BUMP_DEG` and moved by `BUMP_MM`, each its own way."""
     rng = np.random.default_rng(0)
     found = {}
     for name, camera in sorted(rig.items()):
@@ -165,7 +165,7 @@ def perturbed(rig: Mapping[str, Camera]) -> dict[str, Camera]:
 def colmap_mapping(
     seen: Mapping[int, FrameSetPoints], rig: Mapping[str, Camera]
 ) -> dict[str, Camera]:
-    """The largest model of COLMAP's incremental mapping; it is given sizes, not focal lengths."""
+    """Return the largest model of COLMAP's mapping, which is given sizes, not focal lengths."""
     with tempfile.TemporaryDirectory() as folder:
         root = Path(folder)
         _write_database(root / "database.db", seen, rig)
@@ -234,13 +234,13 @@ def _write_database(
 
 
 def _pixels(points: FrameSetPoints, name: str) -> np.ndarray:
-    """A camera's pixels in one frame set: 68 landmarks (zeros without a face), then features."""
+    """Return a camera's pixels in a frame set: 68 landmarks (zeros without a face), features."""
     faces = {camera: pixels for camera, pixels, _ in points.landmarks}
     return np.concatenate([faces.get(name, np.zeros((68, 2))), points.features[name][0]])
 
 
 def _pairs(seen: Mapping[int, FrameSetPoints], a: str, b: str) -> np.ndarray:
-    """Matches (M, 2) of two cameras, keypoints numbered over all frame sets."""
+    """Match (M, 2) of two cameras, keypoints numbered over all frame sets."""
     found, at = [np.zeros((0, 2), int)], np.zeros(2, int)
     for points in seen.values():
         if {a, b} <= {name for name, _, _ in points.landmarks}:

@@ -76,7 +76,7 @@ def _grey(view: DepthView) -> np.ndarray:
 
 
 def _rays_to(one: Camera, other: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """A (3, 3), b (3,): depth * A @ (x, y, 1) + b is the other's pixel times z, as in OpenCV."""
+    """Return A (3, 3) and b (3,): depth * A @ (x, y, 1) + b is the other's z * (x, y, 1)."""
     motion = other.cam_from_world @ np.linalg.inv(one.cam_from_world)
     here, there = K_to_opencv(one.K), K_to_opencv(other.K)
     return there @ motion[:3, :3] @ np.linalg.inv(here), there @ motion[:3, 3]
@@ -89,7 +89,7 @@ def _warped(
     corner: tuple[int, int],
     shape: tuple[int, ...],
 ) -> np.ndarray:
-    """The other view's picture as seen through a plane at a depth, of a window of this view."""
+    """Return other view's picture as seen through a plane at a depth, of a window of this view."""
     matrix = plane * moved[0]
     matrix[:, 2] += moved[1]
     window = np.array([[1, 0, corner[0]], [0, 1, corner[1]], [0, 0, 1.0]])
@@ -104,7 +104,7 @@ def _moments(grey: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _correlation(here: tuple[np.ndarray, np.ndarray, np.ndarray], there: np.ndarray) -> np.ndarray:
-    """Zero-mean normalised cross-correlation (H, W) in windows; no texture gives about 0."""
+    """Return zero-mean normalised cross-correlation (H, W) in windows; no texture gives about 0."""
     grey, mean, variance = here
     _, other, spread = _moments(there)
     joint = cv2.blur(grey * there, (WINDOW, WINDOW)) - mean * other

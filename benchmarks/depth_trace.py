@@ -49,7 +49,7 @@ def trace(grid: LevelSet, camera: Camera) -> np.ndarray:
 def bracketed_root(
     grid: LevelSet, origin: np.ndarray, directions: np.ndarray, low: np.ndarray, high: np.ndarray
 ) -> np.ndarray:
-    """Depths (N,) of the zeros between depths outside (N,) and inside (N,)."""
+    """Return depths (N,) of the zeros between depths outside (N,) and inside (N,)."""
 
     def value(t: np.ndarray) -> np.ndarray:
         return grid.sample(origin + t[:, None] * directions)

@@ -33,12 +33,12 @@ class FaultConfig:
 
 
 def items(dataset: Dataset) -> list[str]:
-    """Names of the input files."""
+    """Name of the input files."""
     return sorted(path.stem for path in (dataset.root / "in").glob("*.txt"))
 
 
 def inputs(dataset: Dataset, item: str, config: FaultConfig) -> dict[str, Path | str]:
-    """The item's file."""
+    """Return the item's file."""
     return {"text": dataset.root / "in" / f"{item}.txt"}
 
 

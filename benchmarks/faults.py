@@ -57,7 +57,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def measure(scratch: Path, kills: int, rng: random.Random) -> dict:
-    """The figures; see the module."""
+    """Return the figures; see the module."""
     count = max(8, 4 * kills)
     calm, hurt = (make_dataset(scratch / name, count) for name in ("calm", "hurt"))
     if start(calm, scratch / "calm-notes", "--workers", "4").wait() != 0:
@@ -93,7 +93,7 @@ def measure(scratch: Path, kills: int, rng: random.Random) -> dict:
 
 
 def make_dataset(root: Path, count: int) -> Dataset:
-    """A dataset of `count` small inputs."""
+    """Return a dataset of `count` small inputs."""
     (root / "in").mkdir(parents=True)
     for number in range(count):
         (root / "in" / f"item{number:04d}.txt").write_text(f"{number}")
@@ -101,7 +101,7 @@ def make_dataset(root: Path, count: int) -> Dataset:
 
 
 def start(dataset: Dataset, notes: Path, *options: str) -> subprocess.Popen:
-    """A driver, in a group of its own."""
+    """Return a driver, in a group of its own."""
     notes.mkdir(exist_ok=True)
     command = [sys.executable, "-m", "benchmarks.fault_stage", str(dataset.root), str(notes)]
     return launch([*command, *options])
@@ -144,7 +144,7 @@ def hurt_once(
 
 
 def with_scheduler(dataset: Dataset, notes: Path, rng: random.Random, account: Account) -> None:
-    """The same with a scheduler and a worker of their own, of which the scheduler is killed."""
+    """Do the same with a scheduler and a worker of their own, and kill the scheduler."""
     port = str(rng.randrange(20_000, 60_000))
     python = [sys.executable, "-m", "distributed.cli.dask_scheduler", "--no-dashboard"]
     scheduler = launch([*python, "--host", "127.0.0.1", "--port", port])
@@ -173,7 +173,7 @@ def at_work(driver: subprocess.Popen, notes: Path) -> bool:
 
 
 def workers_of(driver: subprocess.Popen) -> list[psutil.Process]:
-    """Processes that do a driver's work: the children of its nannies."""
+    """Return processes that do a driver's work: the children of its nannies."""
     children = psutil.Process(driver.pid).children(recursive=True)
     return [one for one in children if "spawn_main" in " ".join(one.cmdline())]
 
@@ -186,7 +186,7 @@ def finish(process: subprocess.Popen) -> None:
 
 
 def check_work_is_left(dataset: Dataset) -> None:
-    """The next kill must find something to do."""
+    """Make sure that the next kill finds something to do."""
     names = items(dataset)
     done = sum((dataset.item_dir(STAGE.name, name) / "metrics.json").is_file() for name in names)
     if done > len(names) - 8:
@@ -194,7 +194,7 @@ def check_work_is_left(dataset: Dataset) -> None:
 
 
 def published(dataset: Dataset) -> dict[str, dict[str, bytes]]:
-    """Every published item's files."""
+    """Return every published item's files."""
     found = {}
     for name in items(dataset):
         folder = dataset.item_dir(STAGE.name, name)
@@ -204,7 +204,7 @@ def published(dataset: Dataset) -> dict[str, dict[str, bytes]]:
 
 
 def wrong_bytes(dataset: Dataset, expected: dict[str, dict[str, bytes]]) -> int:
-    """Files that differ from those of an undisturbed run, are too many or too few."""
+    """Return files that differ from those of an undisturbed run, are too many or too few."""
     count = 0
     for name, files in published(dataset).items():
         count += len(set(files.items()) ^ set(expected[name].items()))
@@ -212,7 +212,7 @@ def wrong_bytes(dataset: Dataset, expected: dict[str, dict[str, bytes]]) -> int:
 
 
 def work_seconds(notes: Path) -> tuple[float, float]:
-    """Seconds that every item took once, and seconds of all other tries, from the notes."""
+    """Return seconds that every item took once, and seconds of all other tries, from the notes."""
     tries: dict[str, list[tuple[bool, float]]] = {}
     for path in notes.iterdir():
         item, _, began = path.stem.split("-")

@@ -32,7 +32,7 @@ DISTANCE_M, FILL = 1.0, 0.7  # camera to head; the head's height over the pictur
 
 
 def scene(device: torch.device, n_g: int, size: int) -> tuple[GRMM, HeadState, PinholeView]:
-    """A model of random weights, the template's head and a camera before it."""
+    """Return a model of random weights, the template's head and a camera before it."""
     torch.manual_seed(0)
     head = load_head("procedural").to(device)
     settings = resolve("paper").model
@@ -66,7 +66,7 @@ def scene(device: torch.device, n_g: int, size: int) -> tuple[GRMM, HeadState, P
 
 @torch.no_grad()
 def frames_per_second(draw: Callable[[int], object], device: torch.device, seconds: float) -> float:
-    """Pictures a second by the clock, after five that are not counted."""
+    """Measure pictures per second by the clock, after five that are not counted."""
     for number in range(5):
         draw(number)
     _wait(device)

@@ -59,7 +59,7 @@ def make_shards(out: Path, workers: int) -> Path:
 
 
 def held_out(shards: Path, config: Config) -> tuple[Config, str]:
-    """The configuration with its held-out views and frames, and the camera to fit from.
+    """Return the configuration with its held-out views and frames, and the camera to fit from.
 
     Cameras in the order in which they face the first person: the first is fitted from, the second
     and the fifth are held out, one beside the middle and one from the side.
@@ -84,7 +84,7 @@ def held_out(shards: Path, config: Config) -> tuple[Config, str]:
 
 
 def baseline(shards: Path, config: Config, images: int) -> dict[str, float | None]:
-    """The textured tracked mesh on the held-out cameras."""
+    """Return the textured tracked mesh on the held-out cameras."""
     source = open_shards([shards], "train")
     views = HeadViews(source, load_head(source.head))
     torch.manual_seed(config.train.seed)
@@ -96,7 +96,7 @@ def baseline(shards: Path, config: Config, images: int) -> dict[str, float | Non
 
 
 def frames_per_second(draw: Callable[[], object], seconds: float = 4.0) -> float:
-    """Pictures a second by the clock, after two that are not counted."""
+    """Measure pictures per second by the clock, after two that are not counted."""
     draw(), draw()
     count, began = 0, time.perf_counter()
     while time.perf_counter() - began < seconds:
@@ -106,7 +106,10 @@ def frames_per_second(draw: Callable[[], object], seconds: float = 4.0) -> float
 
 
 def speeds(loaded: Loaded) -> dict[str, float]:
-    """Frame rates: everything anew at 256 px; at 512 px a head at rest before a moving camera."""
+    """Measure frame rates: everything anew at 256 px.
+
+    At 512 px a head at rest before a moving camera.
+    """
     model = loaded.model
     view, centre = frontal(loaded), model.head_centre
     heads = [
@@ -130,7 +133,7 @@ def speeds(loaded: Loaded) -> dict[str, float]:
 
 
 def measure(shards: Path, out: Path, iterations: int, images: int, rows: list[str]) -> dict:
-    """Baseline, full model and ablations on one folder of shards."""
+    """Return the baseline, full model and ablations on one folder of shards."""
     config = resolve("demo", None, [f"train.iterations={iterations}"])
     config, given = held_out(shards, config)
     protocol = FitProtocol(cameras=(given,), expression="neutral", images=images)

@@ -132,7 +132,7 @@ def measure(source: Source, base: Config, name: str, budget: float, images: int)
 
 
 def as_markdown(rows: list[dict], people: int, cameras: int, size: int) -> list[str]:
-    """The section's lines."""
+    """Return the section's lines."""
     text = (
         f"Made by `python -m benchmarks.grmm_trade`: {people} people, {cameras} cameras of {size} "
         "px, two more held out. One thing is changed at a time from `--preset demo`. A budget is "
@@ -152,7 +152,7 @@ def as_markdown(rows: list[dict], people: int, cameras: int, size: int) -> list[
 
 
 def choices(rows: list[dict]) -> list[dict]:
-    """For each budget the setting with the best PSNR, as `grmm.config.choose` reads it."""
+    """Find, for each budget, the setting with the best PSNR, as `grmm.config.choose` reads it."""
     best: dict[float, dict] = {}
     for row in rows:
         if row["budget_s"] not in best or row["psnr_db"] > best[row["budget_s"]]["psnr_db"]:

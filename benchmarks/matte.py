@@ -94,7 +94,7 @@ def measured(
     assignments: list[str],
     textbook: bool = True,
 ) -> dict[str, object]:
-    """Means over pictures of every preset and baseline, and ratios to the soft key."""
+    """Return means over pictures of every preset and baseline, and ratios to the soft key."""
     rows: Rows = {}
     configs = {name: resolve_config(STAGE, name, None, assignments) for name in presets}
     for picture in found:
@@ -127,7 +127,7 @@ def _add(rows: Rows, name: str, alpha: np.ndarray, picture: Picture, seconds: fl
 
 
 def composite_errors(alpha: np.ndarray, picture: Picture) -> dict[str, float]:
-    """Error of the subject before black, mean absolute light in soft pixels, times 1000.
+    """Return the error of the subject before black, mean absolute light in soft pixels, times 1000.
 
     `composite_error` with the subject's own colours as estimated, `composite_error_footage` with
     the frame's colours.
@@ -144,7 +144,7 @@ def composite_errors(alpha: np.ndarray, picture: Picture) -> dict[str, float]:
 
 
 def scenes(size: int) -> Iterator[Picture]:
-    """The drawn scenes."""
+    """Yield the drawn scenes."""
     for scene in make_scenes(size):
         whole = np.ones(scene.alpha.shape, bool)
         yield Picture(
@@ -158,7 +158,7 @@ def scenes(size: int) -> Iterator[Picture]:
 
 
 def pictures(dataset: Dataset, truth: Truth, limit: int) -> Iterator[Picture]:
-    """Peaks of the twin, an even choice of at most `limit`."""
+    """Yield peaks of the twin, an even choice of at most `limit`."""
     every = [
         (subject, camera, frame)
         for subject in dataset.subjects()
@@ -216,7 +216,7 @@ def _best(alphas: list[np.ndarray], picture: Picture) -> np.ndarray:
 
 
 def guided_filter(frame: np.ndarray, alpha: np.ndarray, radius: int, epsilon: float) -> np.ndarray:
-    """Alpha (H, W) filtered by a frame's (H, W, 3) colours (He, Sun and Tang 2010)."""
+    """Return the alpha (H, W) filtered by a frame's (H, W, 3) colours (He, Sun and Tang 2010)."""
     guide = frame / 255.0
     side = (2 * radius + 1, 2 * radius + 1)
 
@@ -234,7 +234,7 @@ def guided_filter(frame: np.ndarray, alpha: np.ndarray, radius: int, epsilon: fl
 
 
 def closed_form(frame: np.ndarray, soft: np.ndarray) -> tuple[np.ndarray, float]:
-    """Levin's closed form on a trimap of the soft key, and its seconds."""
+    """Solve Levin's closed form on a trimap of the soft key, and its seconds."""
     from pymatting import estimate_alpha_cf
 
     radius = max(2.0, max(soft.shape) / 160)
@@ -247,7 +247,7 @@ def closed_form(frame: np.ndarray, soft: np.ndarray) -> tuple[np.ndarray, float]
 
 
 def errors(alpha: np.ndarray, true: np.ndarray) -> dict[str, float]:
-    """Mean and summed absolute, squared and gradient errors of an alpha (H, W)."""
+    """Return the mean and summed absolute, squared and gradient errors of an alpha (H, W)."""
     off = np.abs(alpha.astype(np.float64) - true)
     gradients = (_gradient(alpha) - _gradient(true)) ** 2
     soft = (true > 0.02) & (true < 0.98)
@@ -264,7 +264,7 @@ def errors(alpha: np.ndarray, true: np.ndarray) -> dict[str, float]:
 
 
 def _gradient(alpha: np.ndarray) -> np.ndarray:
-    """Length (H, W) of the gradient of alpha smoothed by a Gaussian of 1.4 pixels."""
+    """Return the length (H, W) of the gradient of alpha smoothed by a Gaussian of 1.4 pixels."""
     smooth = cv2.GaussianBlur(alpha.astype(np.float32), (0, 0), 1.4)
     return np.hypot(cv2.Sobel(smooth, -1, 1, 0) / 8, cv2.Sobel(smooth, -1, 0, 1) / 8)
 

@@ -38,12 +38,12 @@ class Shot:
 
 
 def undisturbed(shots: list[Shot]) -> list[Shot]:
-    """Nothing."""
+    """Leave the shot as it is."""
     return shots
 
 
 def shadow(shots: list[Shot]) -> list[Shot]:
-    """A deep, soft-edged shadow on the backdrop of three cameras in eight, elsewhere in each."""
+    """Lay a deep soft shadow on the backdrop of three cameras in eight, elsewhere in each."""
     rng = np.random.default_rng(1)
     return [
         _behind(shot, np.zeros(3), SHADE * _blob(shot, rng)) if k % 8 in (0, 3, 5) else shot
@@ -52,7 +52,7 @@ def shadow(shots: list[Shot]) -> list[Shot]:
 
 
 def stand(shots: list[Shot]) -> list[Shot]:
-    """A stand and a cable behind the subject, in every fourth camera."""
+    """Return a stand and a cable behind the subject, in every fourth camera."""
     rng = np.random.default_rng(2)
     return [
         _behind(shot, np.array(STAND), _stand(shot, rng)) if k % 4 == 0 else shot
@@ -61,7 +61,7 @@ def stand(shots: list[Shot]) -> list[Shot]:
 
 
 def patch(shots: list[Shot]) -> list[Shot]:
-    """A patch of one colour on the skin; two cameras have the same colour behind it."""
+    """Return a patch of one colour on the skin; two cameras have the same colour behind it."""
     front = shots[len(shots) // 2]
     rows, columns = np.nonzero((front.depth > 0) & (front.true > 0.99))
     height, width = front.true.shape
@@ -74,7 +74,7 @@ def patch(shots: list[Shot]) -> list[Shot]:
 
 
 def bumped(shots: list[Shot]) -> list[Shot]:
-    """One camera turned and rolled: frame, plate and truth move together."""
+    """Return one camera turned and rolled: frame, plate and truth move together."""
     k = len(shots) // 2 - 3
     return [*shots[:k], _moved(shots[k]), *shots[k + 1 :]]
 
@@ -89,7 +89,7 @@ DISTURBANCES: dict[str, Callable[[list[Shot]], list[Shot]]] = {
 
 
 def _behind(shot: Shot, light: np.ndarray, cover: np.ndarray) -> Shot:
-    """The frame with `light` (3,) over the backdrop by `cover` (H, W), behind the subject."""
+    """Return frame with `light` (3,) over the backdrop by `cover` (H, W), behind the subject."""
     plate = srgb_to_linear(shot.plate / 255)
     change = ((1 - shot.true) * cover * shot.valid)[..., None] * (light - plate)
     return replace(shot, frame=_srgb8(srgb_to_linear(shot.frame / 255) + change))
@@ -100,7 +100,7 @@ def _srgb8(linear: np.ndarray) -> np.ndarray:
 
 
 def _blob(shot: Shot, rng: np.random.Generator) -> np.ndarray:
-    """A round soft shape (H, W) in [0, 1] in the upper half, at the left or right."""
+    """Return a round soft shape (H, W) in [0, 1] in the upper half, at the left or right."""
     height, width = shot.true.shape
     y, x = np.mgrid[0:height, 0:width] / max(height, width)
     middle = rng.choice([0.15, 0.85]) + rng.uniform(-0.05, 0.05), rng.uniform(0.2, 0.6)
@@ -110,7 +110,7 @@ def _blob(shot: Shot, rng: np.random.Generator) -> np.ndarray:
 
 
 def _stand(shot: Shot, rng: np.random.Generator) -> np.ndarray:
-    """An upright pole with a box on it and a cable across (H, W) in [0, 1]."""
+    """Return an upright pole with a box on it and a cable across (H, W) in [0, 1]."""
     height, width = shot.true.shape
     image = np.zeros((height, width), np.uint8)
     x = int(width * (rng.choice([0.1, 0.9]) + rng.uniform(-0.03, 0.03)))
@@ -123,13 +123,13 @@ def _stand(shot: Shot, rng: np.random.Generator) -> np.ndarray:
 
 
 def _points(shot: Shot) -> np.ndarray:
-    """World points (H, W, 3) of the true surface."""
+    """Return world points (H, W, 3) of the true surface."""
     origin, directions = rays(pinhole(shot.camera))
     return origin + shot.depth[..., None] * directions
 
 
 def _painted(shot: Shot, at: np.ndarray, colour: np.ndarray, behind: bool) -> Shot:
-    """The surface around a point (3,) in a colour (3,), 8-bit steps, and the plate behind too."""
+    """Return surface around a point (3,) in a colour (3,), 8-bit steps and the plate behind too."""
     near = (np.linalg.norm(_points(shot) - at, axis=-1) < PATCH_M) & (shot.depth > 0)
     if not near.any():
         return shot

@@ -46,14 +46,14 @@ class Scene:
 
 
 def make_scenes(size: int) -> Iterator[Scene]:
-    """Every kind of hair before every kind of plate, (size, size) pixels."""
+    """Yield every kind of hair before every kind of plate, (size, size) pixels."""
     for i, hair in enumerate(HAIR):
         for j, backdrop in enumerate(PLATES):
             yield make_scene(hair, backdrop, size, np.random.default_rng([i, j]))
 
 
 def make_scene(hair: str, backdrop: str, size: int, rng: np.random.Generator) -> Scene:
-    """One scene."""
+    """Return one scene."""
     labels = _draw(hair, size, rng)
     colours = _linear(_palette(HAIR[hair][0], rng))
     opaque = (labels > 0).astype(np.float32)
@@ -81,14 +81,14 @@ def make_scene(hair: str, backdrop: str, size: int, rng: np.random.Generator) ->
 
 
 def plain(rng: np.random.Generator, size: int) -> np.ndarray:
-    """A grey studio backdrop (size, size, 3), linear light, a little brighter in the middle."""
+    """Draw a grey studio backdrop (size, size, 3), linear light, brighter in the middle."""
     y, x = np.mgrid[0:size, 0:size] / size - 0.5
     bright = 0.45 - 0.25 * (x**2 + y**2)
     return bright[..., None] * (1 + 0.03 * rng.uniform(-1, 1, 3))
 
 
 def cluttered(rng: np.random.Generator, size: int) -> np.ndarray:
-    """Blotches, boxes, cables and fine texture (size, size, 3), linear light."""
+    """Return blotches, boxes, cables and fine texture (size, size, 3), linear light."""
     coarse = rng.uniform(0.08, 0.7, (9, 9, 3)).astype(np.float32)
     image = cv2.resize(coarse, (size, size), interpolation=cv2.INTER_CUBIC)
     for _ in range(14):
@@ -104,7 +104,7 @@ def cluttered(rng: np.random.Generator, size: int) -> np.ndarray:
 
 
 def exposed(linear: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """The 8-bit sRGB picture of linear light (H, W, 3), with a sensor's noise."""
+    """Return the 8-bit sRGB picture of linear light (H, W, 3), with a sensor's noise."""
     deviation = np.hypot(READ, SHOT * np.sqrt(np.clip(linear, 0, None)))
     seen = linear_to_srgb(np.clip(linear + rng.normal(size=linear.shape) * deviation, 0, 1))
     return np.rint(seen * 255).astype(np.uint8)
@@ -119,19 +119,19 @@ def _lens(image: np.ndarray) -> np.ndarray:
 
 
 def _shadow(size: int) -> np.ndarray:
-    """Share of light (size, size) that a broad soft shadow beside the head takes."""
+    """Return the share of light (size, size) that a broad soft shadow beside the head takes."""
     y, x = np.mgrid[0:size, 0:size] / size
     return SHADOW * np.exp(-(((x - 0.85) / 0.12) ** 2) - ((y - 0.6) / 0.25) ** 2)
 
 
 def _palette(hair: tuple[int, int, int], rng: np.random.Generator) -> np.ndarray:
-    """Colours (3 + SHADES, 3), sRGB, by label: none, skin, shirt, hair."""
+    """Return colours (3 + SHADES, 3), sRGB, by label: none, skin, shirt, hair."""
     shades = np.array(hair) * rng.uniform(0.75, 1.25, (SHADES, 1))
     return np.concatenate([[(0, 0, 0), SKIN, SHIRT], np.clip(shades, 0, 255)])
 
 
 def _draw(hair: str, size: int, rng: np.random.Generator) -> np.ndarray:
-    """Labels (size * FINE,) * 2 uint8 of shirt, skin and hair."""
+    """Label (size * FINE,) * 2 uint8 of shirt, skin and hair."""
     s = size * FINE
     labels = np.zeros((s, s), np.uint8)
     cv2.ellipse(labels, (s // 2, int(1.08 * s)), (int(0.4 * s), int(0.26 * s)), 0, 0, 360, 2, -1)

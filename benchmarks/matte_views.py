@@ -111,14 +111,14 @@ def main() -> int:
 
 
 def moments(dataset: Dataset, truth: Truth, limit: int) -> list[tuple[str, int]]:
-    """(subject, frame) of an even choice of the peaks."""
+    """Return (subject, frame) of an even choice of the peaks."""
     every = [(s, frame) for s in dataset.subjects() for frame in truth.peaks(s).values()]
     picks = np.linspace(0, len(every) - 1, min(limit, len(every))).round().astype(int)
     return [every[i] for i in np.unique(picks)]
 
 
 def shots_of(dataset: Dataset, truth: Truth, subject: str, frame: int) -> list[Shot]:
-    """Undistorted frames and plates of a moment with their true alpha and depth."""
+    """Return undistorted frames and plates of a moment with their true alpha and depth."""
     shots = []
     for camera in truth.cameras(subject).values():
         index = read_index(dataset, subject)
@@ -142,13 +142,13 @@ def shots_of(dataset: Dataset, truth: Truth, subject: str, frame: int) -> list[S
 
 
 def key(shot: Shot) -> Keyed:
-    """The shot with its camera's own alpha, by the standard preset."""
+    """Return the shot with its camera's own alpha, by the standard preset."""
     alpha = key_alpha(shot.frame, shot.plate, shot.valid, MatteConfig())
     return Keyed(shot, np.rint(255 * alpha).astype(np.uint8))
 
 
 def measure(keyed: list[Keyed], config: MatteConfig, sheet: Path | None) -> Figures:
-    """Errors before and after of one moment, and the seconds between."""
+    """Return errors before and after of one moment, and the seconds between."""
     started = time.process_time()
     ball = ball_of({k.shot.camera.id: k.shot.camera for k in keyed})
     if ball is None:
@@ -174,14 +174,14 @@ def measure(keyed: list[Keyed], config: MatteConfig, sheet: Path | None) -> Figu
 def sheet_of(
     args: argparse.Namespace, preset: str, scene: str, step: int, frame: int
 ) -> Path | None:
-    """Where the picture of a measurement goes, if anywhere."""
+    """Return where the picture of a measurement goes, if anywhere."""
     if args.pictures is None or preset != "standard" or step == 1:
         return None
     return args.pictures / f"{scene}-{frame}.png"
 
 
 def summary(rows: dict[tuple[int, str, str], list[Figures]]) -> dict[str, object]:
-    """Means over the peaks by number of cameras, preset and scene, with their ratios."""
+    """Return means over the peaks by number of cameras, preset and scene, with their ratios."""
     table: dict[str, Any] = {}
     for (count, preset, scene), mine in rows.items():
         means = {name: float(np.mean([row[name] for row in mine])) for name in mine[0]}

@@ -36,7 +36,7 @@ Run = Callable[[dict[str, Tensor]], tuple[Tensor, ...]]
 
 
 def measure(scene: dict[str, Tensor], run: Run) -> tuple[float, float]:
-    """CPU seconds of forward, and of forward and backward, of one run on a float32 scene."""
+    """Return CPU seconds of forward, and of forward and backward, of one run on a float32 scene."""
     leaves = {name: tensor.float().requires_grad_() for name, tensor in scene.items()}
     start = time.process_time()
     images = run(leaves)
@@ -50,7 +50,7 @@ def measure(scene: dict[str, Tensor], run: Run) -> tuple[float, float]:
 def native_images(
     leaves: dict[str, Tensor], size: int, buffers: RenderBuffers
 ) -> tuple[Tensor, ...]:
-    """Colours, depth and alpha of the native kernel."""
+    """Return colours, depth and alpha of the native kernel."""
     out = rasterize(**leaves, width=size, height=size, backend="cpu", buffers=buffers)
     return out.colors, out.depth, out.alpha
 
@@ -58,7 +58,7 @@ def native_images(
 def rival(
     scene: dict[str, Tensor], pairs: tuple[Tensor, Tensor], size: int, ours: float
 ) -> dict[str, object]:
-    """Seconds of autograd over explicit pairs and how often ours fit in, or why there are none."""
+    """Return autograd's seconds over explicit pairs and how often ours fit in, or why not."""
     channels = scene["colors"].shape[1]
     # Gathered colours, their products and both gradients; then some 40 numbers for each pair.
     needed, free = len(pairs[0]) * (4 * 4 * channels + 300), free_bytes()

@@ -20,7 +20,7 @@ from grmm.rasterize.projection import (
 
 
 def head(n: int, size: int, channels: int) -> dict[str, Tensor]:
-    """N flat splats on an ellipsoid as large as a head, 1 m in front of the camera, float64.
+    """Return N flat splats on an ellipsoid as large as a head, 1 m in front of the camera, float64.
 
     They lie row by row on an equal-area map, as GRMM's lie on its UV map, and cover a third of
     the picture with 14 to 16 blended splats a pixel of it on average.
@@ -56,7 +56,7 @@ def head(n: int, size: int, channels: int) -> dict[str, Tensor]:
 
 
 def records(scene: dict[str, Tensor], size: int) -> tuple[Splats, Pinhole]:
-    """The scene as the rasteriser's records."""
+    """Return the scene as the rasteriser's records."""
     camera = {name: scene[name] for name in ("K", "cam_from_world")}
     splats = {name: tensor for name, tensor in scene.items() if name not in camera}
     return Splats(**splats), Pinhole(**camera, width=size, height=size)
@@ -64,7 +64,7 @@ def records(scene: dict[str, Tensor], size: int) -> tuple[Splats, Pinhole]:
 
 @torch.no_grad()
 def blended_pairs(scene: dict[str, Tensor], size: int) -> tuple[Tensor, Tensor]:
-    """Gaussian and pixel numbers (M,) of every blend, by pixel and nearest first within it."""
+    """Return Gaussian and pixel numbers (M,) of every blend, by pixel, nearest first."""
     splats = project(*records(scene, size))
     visible = splats.visible.nonzero()[:, 0]
     order = visible[torch.sort(splats.depths[visible], stable=True).indices]
@@ -86,7 +86,7 @@ def blended_pairs(scene: dict[str, Tensor], size: int) -> tuple[Tensor, Tensor]:
 
 
 def pair_alphas(splats: Projection, gaussians: Tensor, pixels: Tensor, size: int) -> Tensor:
-    """Opacity (M,) of each Gaussian at its pixel."""
+    """Return the opacity (M,) of each Gaussian at its pixel."""
     center = cell_to_corner(
         torch.stack([pixels % size, pixels // size], 1).to(splats.means2d.dtype)
     )
@@ -97,7 +97,7 @@ def pair_alphas(splats: Projection, gaussians: Tensor, pixels: Tensor, size: int
 
 
 def before(alphas: Tensor, pixels: Tensor) -> Tensor:
-    """Transmittance (M,) in front of each pair, its pixel's earlier pairs multiplied up."""
+    """Return transmittance (M,) in front of each pair, its pixel's earlier pairs multiplied up."""
     # One running sum of logarithms over all pixels; float64 keeps its end as exact as its start.
     logs = torch.log1p(-alphas.double())
     running = torch.cumsum(logs, 0) - logs
@@ -108,7 +108,7 @@ def before(alphas: Tensor, pixels: Tensor) -> Tensor:
 def render_pairs(
     scene: dict[str, Tensor], pairs: tuple[Tensor, Tensor], size: int
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Colours (P, C), sum of weight * ray length (P,) and alpha (P,), all by torch's autograd."""
+    """Return colours (P, C), sums of weight * ray length (P,) and alpha (P,), by autograd."""
     gaussians, pixels = pairs
     splats = project(*records(scene, size))
     alphas = pair_alphas(splats, gaussians, pixels, size)

@@ -64,7 +64,7 @@ class ReplayResult:
     errors: list[int] = field(default_factory=list)
 
     def summary(self) -> dict[str, float]:
-        """Medians and 95th percentiles; empty lists give no entry."""
+        """Return medians and 95th percentiles; empty lists give no entry."""
         rows: dict[str, float] = {"labels": len(self.labels)}
         if self.keystrokes:
             rows["keystrokes_per_label_median"] = float(np.median(self.keystrokes))
@@ -163,7 +163,7 @@ async def _label_one(
 
 
 def cheapest_keys(view: CueView, frame: int, tolerance: int) -> list[str]:
-    """The fewest keys from the cursor to a frame within the tolerance, by breadth-first search."""
+    """Find the fewest keys from the cursor to a frame within the tolerance, breadth first."""
     goal = min(max(frame, view.first), view.last)
     seen: dict[CueView, list[str]] = {view: []}
     edge = [view]
@@ -183,7 +183,7 @@ def cheapest_keys(view: CueView, frame: int, tolerance: int) -> list[str]:
 
 
 async def timed_press(app: MeasuredApp, pilot: Pilot, key: str) -> float:
-    """Press a key and wait for what it draws; seconds until that is encoded for the terminal."""
+    """Press a key and wait for what it draws; return seconds until the terminal could have it."""
     before = app.painted
     start = time.perf_counter()
     app.simulate_key(key)
@@ -214,7 +214,7 @@ def measure_steps(
     size: tuple[int, int] = (160, 48),
     seed: int = 0,
 ) -> list[float]:
-    """Seconds of each of so many steps through a dataset, tasks, cameras and zooms mixed in.
+    """Return seconds of each of so many steps through a dataset, tasks, cameras and zooms mixed in.
 
     From the key to the picture encoded for the terminal, decoding included where it was not done
     ahead.

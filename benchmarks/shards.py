@@ -75,7 +75,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def summary(formats: dict[str, dict]) -> dict:
-    """Our figures, and their ratios to the best rival's."""
+    """Return our figures, and their ratios to the best rival's."""
     ours, figures = formats["express50"], {}
     rivals = [row for name, row in formats.items() if name != "express50" and "why" not in row]
     for name in ("pack", "read_sequential", "read_shuffled", "read_random"):
@@ -89,7 +89,7 @@ def summary(formats: dict[str, dict]) -> dict:
 
 
 def members(number: int, side: int, profile: str) -> Members:
-    """A sample: a photograph's crop, a soft round matte with strands, a ball's depth with noise."""
+    """Make a sample: a photograph's crop, a soft matte with strands, a ball's depth with noise."""
     rng = np.random.default_rng(number)
     y, x = rng.integers(0, 128, 2)
     rgb = resize_area(np.ascontiguousarray(astronaut()[y : y + 384, x : x + 384]), side, side)
@@ -108,7 +108,7 @@ def members(number: int, side: int, profile: str) -> Members:
 
 
 def png_of_fast(side: int) -> list[Members]:
-    """The same samples, of the same JPEG quality, with PNG beside it."""
+    """Return the same samples, of the same JPEG quality, with PNG beside it."""
     found = []
     for number in range(DISTINCT):
         rest = members(number, side, "compact")
@@ -118,7 +118,7 @@ def png_of_fast(side: int) -> list[Members]:
 
 
 def decode_rate(some: list[Members], side: int) -> float:
-    """Samples a second that one core decodes."""
+    """Measure the samples per second that one core decodes."""
 
     def decode() -> None:
         for one in some:
@@ -131,7 +131,7 @@ def decode_rate(some: list[Members], side: int) -> float:
 
 
 def opencv_rate(some: list[Members]) -> float:
-    """The same by OpenCV's decoder alone."""
+    """Measure the same by OpenCV's decoder alone."""
 
     def decode() -> None:
         for one in some:
@@ -146,7 +146,7 @@ def opencv_rate(some: list[Members]) -> float:
 
 
 def least(work: Callable[[], object]) -> float:
-    """Fewest processor seconds of a few passes."""
+    """Return the fewest processor seconds of a few passes."""
     spent = []
     for _ in range(PASSES):
         began = processor_seconds()
@@ -156,7 +156,7 @@ def least(work: Callable[[], object]) -> float:
 
 
 def processor_seconds() -> float:
-    """Of this process and of its children that ended."""
+    """Return the processor seconds of this process and of its children that ended."""
     children = resource.getrusage(resource.RUSAGE_CHILDREN)
     return time.process_time() + children.ru_utime + children.ru_stime
 
@@ -164,7 +164,7 @@ def processor_seconds() -> float:
 def measured(
     run: Callable[[list[Members], Path], Callable[[], Passes]], given: list[Members], folder: Path
 ) -> dict:
-    """Rates of one format; `why` where it cannot run here."""
+    """Return rates of one format; `why` where it cannot run here."""
     try:
         spent = []
         for _ in range(PASSES):
@@ -199,12 +199,12 @@ def exhaust(samples: Iterator[Members]) -> None:
 
 
 def order(count: int) -> list[int]:
-    """Random sample numbers."""
+    """Return random sample numbers."""
     return random.Random(0).choices(range(count), k=count)
 
 
 def ours(given: list[Members], folder: Path) -> Callable[[], Passes]:
-    """Tar with an index."""
+    """Measure our tar with its index."""
     writer = ShardWriter(folder, SHARD)
     for first in range(0, len(given), CAMERAS):
         group = given[first : first + CAMERAS]
@@ -229,7 +229,7 @@ def ours(given: list[Members], folder: Path) -> Callable[[], Passes]:
 
 
 def webdataset(given: list[Members], folder: Path) -> Callable[[], Passes]:
-    """Tar read in a stream; shuffled in a buffer, as its users do."""
+    """Measure WebDataset: a tar read in a stream, shuffled in a buffer, as its users do."""
     wds = importlib.import_module("webdataset")
     folder.mkdir()
     pattern = str(folder / "train-%06d.tar")
@@ -247,7 +247,7 @@ def webdataset(given: list[Members], folder: Path) -> Callable[[], Passes]:
 
 
 def litdata(given: list[Members], folder: Path) -> Callable[[], Passes]:
-    """Litdata's chunks."""
+    """Measure litdata's chunks."""
     lit = importlib.import_module("litdata")
     inputs = list(range(len(given)))
     _Given.samples = given
@@ -277,7 +277,7 @@ def _given(number: int) -> Members:
 
 
 def mosaic(given: list[Members], folder: Path) -> Callable[[], Passes]:
-    """MosaicML's MDS."""
+    """Measure MosaicML's MDS."""
     streaming = importlib.import_module("streaming")
     columns = dict.fromkeys(given[0], "bytes")
     with streaming.MDSWriter(out=str(folder), columns=columns) as writer:

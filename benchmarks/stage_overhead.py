@@ -30,12 +30,12 @@ class EmptyConfig:
 
 
 def items(dataset: Dataset) -> list[str]:
-    """Names of the input files."""
+    """Name of the input files."""
     return sorted(path.stem for path in (dataset.root / "in").glob("*.txt"))
 
 
 def inputs(dataset: Dataset, item: str, config: EmptyConfig) -> dict[str, Path | str]:
-    """The item's file."""
+    """Return the item's file."""
     return {"text": dataset.root / "in" / f"{item}.txt"}
 
 
@@ -78,7 +78,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def make_dataset(root: Path, count: int) -> Dataset:
-    """A dataset of `count` small inputs."""
+    """Return a dataset of `count` small inputs."""
     (root / "in").mkdir(parents=True)
     for number in range(count):
         (root / "in" / f"item{number:05d}.txt").write_text(f"{number}")
@@ -86,7 +86,7 @@ def make_dataset(root: Path, count: int) -> Dataset:
 
 
 def with_workers(dataset: Dataset, count: int, batch: int) -> float:
-    """Milliseconds an item in two workers that have started, in batches of at most so many."""
+    """Return milliseconds per item in two running workers, in batches of at most so many."""
     express50.runner.executor.LARGEST_BATCH = batch
     first = make_dataset(dataset.root / "first", 4)
     with Pool(2) as pool:
@@ -95,7 +95,7 @@ def with_workers(dataset: Dataset, count: int, batch: int) -> float:
 
 
 def timed(dataset: Dataset, pool: Pool, count: int) -> float:
-    """Milliseconds an item, by the clock: waiting for the disk counts."""
+    """Return milliseconds per item, by the clock: waiting for the disk counts."""
     began = time.perf_counter()
     summary = run_stage(STAGE, dataset, build_config(STAGE, {}), progress=False, pool=pool)
     seconds = time.perf_counter() - began
@@ -104,7 +104,7 @@ def timed(dataset: Dataset, pool: Pool, count: int) -> float:
 
 
 def syncs(folder: Path, count: int) -> float:
-    """Milliseconds that one small file takes to the disk here: an item cannot cost less."""
+    """Return milliseconds that one small file takes to the disk here: an item cannot cost less."""
     folder.mkdir()
     began = time.perf_counter()
     for number in range(count):

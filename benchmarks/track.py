@@ -71,7 +71,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def parse(arguments: list[str] | None) -> argparse.Namespace:
-    """The command line."""
+    """Return the command line."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.track", description=__doc__)
     parser.add_argument("--dataset", type=Path, help="dataset with ingest, calibrate and mattes")
     parser.add_argument("--truth", type=Path, help="truth folder of the recording")
@@ -94,7 +94,7 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
 
 
 def preset_names(text: str) -> tuple[str, ...]:
-    """Names of presets, from one with commas; empty for landmark_only alone."""
+    """Name of presets, from one with commas; empty for landmark_only alone."""
     names = tuple(name for name in text.split(",") if name and name != "landmark_only")
     if not set(names) <= set(PRESETS):
         raise argparse.ArgumentTypeError(f"{text!r}, expected some of {','.join(PRESETS)}")
@@ -102,7 +102,7 @@ def preset_names(text: str) -> tuple[str, ...]:
 
 
 def twin_config(subjects: int, cameras: int, side: int) -> TwinConfig:
-    """Subjects other than the demo's and the detector's, with given cameras."""
+    """Return subjects other than the demo's and the detector's, with given cameras."""
     return TwinConfig(
         subjects=subjects, first_subject=41, cameras=cameras, width=side, height=side,
         expressions=EXPRESSIONS, frames_per_expression=4, board_frames=0, give_calibration=True,
@@ -128,7 +128,7 @@ def prepare(config: TwinConfig, folder: Path) -> Reference:
 
 
 def hold_out(capture: Path, out: Path) -> None:
-    """The capture without HELD_OUT cameras, spread over the rig's inside."""
+    """Copy the capture without HELD_OUT cameras, spread over the rig's inside."""
     names = sorted(path.name for path in (capture / "cameras").iterdir())
     held = [names[len(names) * (k + 1) // (HELD_OUT + 1) - k] for k in range(HELD_OUT)]
     shutil.copytree(capture, out, copy_function=os.link)
@@ -162,7 +162,7 @@ def write_peaks(dataset: Dataset, subject: str, peaks: dict[str, int]) -> None:
 
 
 def benchmark(source: Reference, presets: tuple[str, ...], count: int, clip: bool) -> dict:
-    """Figures of `landmark_only` and of the presets on the first `count` subjects."""
+    """Return figures of `landmark_only` and of the presets on the first `count` subjects."""
     dataset, truth, captures = source
     subjects = dataset.subjects()[:count]
     views = {s: held_out_views(dataset, truth, s, captures) for s in subjects}
@@ -207,7 +207,7 @@ def track(
     config,
     views: dict,  # noqa: ANN001
 ) -> tuple[list[Errors], dict]:
-    """Errors of a subject's frames, and what the stage itself says and costs."""
+    """Return errors of a subject's frames, and what the stage itself says and costs."""
     with tempfile.TemporaryDirectory() as scratch:
         began = time.process_time()
         metrics = track_subject(dataset, subject, config, Path(scratch)).metrics
@@ -217,7 +217,7 @@ def track(
 
 
 def report(rows: list[Errors], figures: list[dict], footage: bool) -> dict:
-    """One preset's figures over all subjects."""
+    """Return one preset's figures over all subjects."""
     result = summary(rows)
     detected = float(np.mean([row["detected_px"] for row in figures]))
     result["landmark_px"] = {"true": result.pop("landmark_px_true"), "detected": round(detected, 3)}
@@ -231,7 +231,7 @@ def report(rows: list[Errors], figures: list[dict], footage: bool) -> dict:
 
 
 def jitter(dataset: Dataset, truth: Truth, subject: str, config) -> dict:  # noqa: ANN001
-    """Errors over one expression's clip, with the shape of that and the neutral peak."""
+    """Return the errors over one expression's clip, with the shape of that and the neutral peak."""
     peaks = read_peaks(dataset, subject)
     cue = next(name for name in peaks if name != config.neutral)
     with tempfile.TemporaryDirectory() as scratch:
@@ -249,7 +249,7 @@ def narrowed(
     cues: tuple[str, ...] | None = None,
     views: int | None = None,
 ) -> Dataset:
-    """One subject's dataset in links: peaks of `cues` and the last one's clip, or fewer cameras."""
+    """Link one subject's dataset: peaks of `cues` and the last one's clip, or fewer cameras."""
     part = Dataset(out)
     for stage in ("ingest", "calibrate", "align", "frames", "matte"):
         source = dataset.item_dir(stage, subject).resolve()
@@ -278,7 +278,7 @@ def narrowed(
 
 
 def scaling(scratch: Path) -> list[dict]:
-    """Seconds and face error of `standard` over views and pixels, one subject recorded anew."""
+    """Return seconds and face error of `standard` over views and pixels of a new subject."""
     config, rows = build_config(STAGE, STAGE.presets["standard"]), []
     for side in SCALING_SIDES:
         cameras = max(SCALING_VIEWS) + HELD_OUT

@@ -73,7 +73,7 @@ def main(arguments: list[str] | None = None) -> int:
 def sweep(
     dataset: Dataset, truth: Truth, captures: Path | None, knobs: list[str] | None, scratch: Path
 ) -> list[dict]:
-    """A row for each knob, and for fewer cameras in the rig."""
+    """Return a row for each knob, and for fewer cameras in the rig."""
     subject = dataset.subjects()[0]
     part = narrowed(dataset, subject, scratch / "part", cues=EXPRESSIONS)
     views = held_out_views(part, truth, subject, captures)
@@ -90,7 +90,7 @@ def sweep(
 def row_of(
     name: str, dataset: Dataset, truth: Truth, subject: str, values: dict, views: dict
 ) -> dict:
-    """Errors and seconds of `standard` with some values changed."""
+    """Return errors and seconds of `standard` with some values changed."""
     errors, found = track(dataset, truth, subject, build_config(STAGE, values), views)
     figures = summary(errors)
     row = {
@@ -106,7 +106,7 @@ def row_of(
 
 
 def as_markdown(rows: list[dict], cameras: int) -> list[str]:
-    """The section's lines."""
+    """Return the section's lines."""
     text = (
         f"Made by `python -m benchmarks.track_sweep`: one twin subject, {len(EXPRESSIONS)}"
         f" expressions, {cameras} cameras. One thing is changed at a time from `standard`; errors"

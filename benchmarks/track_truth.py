@@ -58,7 +58,7 @@ class Errors:
 def compare(
     dataset: Dataset, truth: Truth, subject: str, path: Path, held_out: Mapping[int, list[HeldOut]]
 ) -> list[Errors]:
-    """Errors of every frame of a track.
+    """Return errors of every frame of a track.
 
     Args:
         dataset: what was tracked.
@@ -105,7 +105,7 @@ def frame_errors(
     cameras: Mapping[str, Camera],
     held_out: Mapping[int, list[HeldOut]],
 ) -> Errors:
-    """Errors of one row of a track; `cameras` are the estimated ones in the true world."""
+    """Return errors of one row of a track; `cameras` are the estimated ones in the true world."""
     frame = int(track.frames[row])
     moved = track.vertices[row].astype(np.float64) @ motion[:3, :3].T + motion[:3, 3]
     true = truth.vertices(subject, frame)
@@ -133,20 +133,20 @@ def frame_errors(
 
 
 def region_errors(model: HeadModel, vertices: np.ndarray, true: np.ndarray) -> dict[str, float]:
-    """Root mean square distance of face, head (no mouth, neck or cut edge) and neck, metres."""
+    """Return rms distances of face, head (no mouth, neck or cut edge) and neck, metres."""
     distance = np.linalg.norm(vertices - true, axis=1)
     return {name: rms(distance[chosen]) for name, chosen in regions_of(model).items()}
 
 
 def regions_of(model: HeadModel) -> dict[str, np.ndarray]:
-    """Vertices (V,) bool of face, head and neck."""
+    """Return vertices (V,) bool of face, head and neck."""
     away = np.any([model.regions[name].numpy() for name in NO_SKIN], axis=0)
     face, neck = face_of(model), model.regions["neck"].numpy()
     return {"face": face, "head": ~away, "neck": neck}
 
 
 def face_motion(model: HeadModel, expression: np.ndarray) -> np.ndarray:
-    """Displacement (3 F,) of the face's vertices by coefficients (X,), metres."""
+    """Return the displacement (3 F,) of the face's vertices by coefficients (X,), metres."""
     directions = model.expression_dirs.double().numpy()[face_of(model)]
     return (directions @ expression).ravel()
 
@@ -158,7 +158,7 @@ def landmark_px(
     vertices: np.ndarray,
     true: np.ndarray,
 ) -> float:
-    """Root mean square distance of 68 landmarks' projections in all tracking cameras, pixels."""
+    """Return the rms distance of 68 landmarks' projections in all tracking cameras, pixels."""
     errors = []
     for name, camera in cameras.items():
         found, _ = project(camera, marks_of(model, vertices))
@@ -168,24 +168,24 @@ def landmark_px(
 
 
 def marks_of(model: HeadModel, vertices: np.ndarray) -> np.ndarray:
-    """The 68 landmarks (68, 3) of vertices (V, 3)."""
+    """Return the 68 landmarks (68, 3) of vertices (V, 3)."""
     return landmarks(model.to(dtype=torch.float64), torch.from_numpy(vertices)[None])[0].numpy()
 
 
 def angle_deg(a: np.ndarray, b: np.ndarray) -> float:
-    """Angle between two axis-angle rotations (3,), degrees."""
+    """Return the angle between two axis-angle rotations (3,), degrees."""
     R = axis_angle_to_matrix(a).T @ axis_angle_to_matrix(b)
     return float(np.degrees(np.arccos(np.clip((np.trace(R) - 1) / 2, -1.0, 1.0))))
 
 
 def iou(a: np.ndarray, b: np.ndarray) -> float:
-    """Intersection over union of two masks; 1 where both are empty."""
+    """Return the intersection over union of two masks; 1 where both are empty."""
     union = (a | b).sum()
     return float((a & b).sum() / union) if union else 1.0
 
 
 def summary(rows: list[Errors]) -> dict:
-    """Figures over frames: mm and pixels as root mean squares, shares and decibels as means."""
+    """Average figures over frames: mm and pixels as root mean squares, others as means."""
     tracked, true = (
         np.stack([getattr(row, name) for row in rows]) for name in ("motion", "true_motion")
     )
@@ -205,12 +205,12 @@ def summary(rows: list[Errors]) -> dict:
 
 
 def pooled(rows: list[dict[str, float]]) -> dict[str, float]:
-    """Root mean square over frames, millimetres."""
+    """Return the root mean square over frames, millimetres."""
     return {name: round(1e3 * rms(np.array([row[name] for row in rows])), 3) for name in rows[0]}
 
 
 def mean(values: list[float]) -> float | None:
-    """Mean; None of nothing."""
+    """Return the mean; None of nothing."""
     return round(float(np.mean(values)), 4) if values else None
 
 
@@ -224,7 +224,7 @@ def r_squared(found: np.ndarray, true: np.ndarray) -> float | None:
 
 
 def clip_errors(dataset: Dataset, truth: Truth, subject: str, cue: str, folder: Path) -> dict:
-    """`jitter_mm` and `clip_face_rmse_mm` over a clip, or None with `jitter_reason`.
+    """Return `jitter_mm` and `clip_face_rmse_mm` over a clip, or None with `jitter_reason`.
 
     Jitter is the mean second difference of the face's error, tracked minus true, so that true
     motion does not count. `folder` holds sequence.npz and the track.npz of the same run.
@@ -250,7 +250,7 @@ def clip_errors(dataset: Dataset, truth: Truth, subject: str, cue: str, folder: 
 
 
 def clip_meshes(model: HeadModel, track: Track, rows: Mapping[str, np.ndarray]) -> np.ndarray:
-    """World vertices (F, V, 3) of a clip's parameters with a track's shape and offsets."""
+    """Return world vertices (F, V, 3) of a clip's parameters with a track's shape and offsets."""
     model = model.to(dtype=torch.float64)
     own = {name: torch.from_numpy(rows[name]).double() for name in ("neck", "jaw", "eyes")}
     expression = torch.from_numpy(rows["expression"]).double()
@@ -262,5 +262,5 @@ def clip_meshes(model: HeadModel, track: Track, rows: Mapping[str, np.ndarray]) 
 
 
 def rms(values: np.ndarray) -> float:
-    """Root mean square."""
+    """Return the root mean square."""
     return float(np.sqrt(np.mean(np.asarray(values) ** 2)))

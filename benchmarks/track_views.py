@@ -53,7 +53,7 @@ class HeldOut:
 def held_out_views(
     dataset: Dataset, truth: Truth, subject: str, captures: Path | None
 ) -> dict[int, list[HeldOut]]:
-    """Views of all true cameras that the dataset lacks, by frame of a true peak."""
+    """Return views of all true cameras that the dataset lacks, by frame of a true peak."""
     known = read_cameras_of(dataset, subject)
     hidden = {k: v for k, v in truth.cameras(subject).items() if k not in known}
     footage = read_capture(captures / subject).cameras if captures else {}
@@ -74,19 +74,19 @@ def held_out_views(
 
 
 def face_of(model: HeadModel) -> np.ndarray:
-    """Vertices (V,) bool of the face."""
+    """Return vertices (V,) bool of the face."""
     return model.regions["face"].numpy()
 
 
 def mask_of(model: HeadModel, vertices: np.ndarray, camera: Camera) -> np.ndarray:
-    """Pixels (H, W) bool that the mesh covers, by ray casting."""
+    """Return pixels (H, W) bool that the mesh covers, by ray casting."""
     return visible_faces(vertices, model.faces.numpy(), camera)[0] >= 0
 
 
 def see_face(
     model: HeadModel, vertices: np.ndarray, camera: Camera
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Pixels (H, W) bool whose first surface is the face region, face ids and depth."""
+    """Return pixels (H, W) bool whose first surface is the face region, face ids and depth."""
     faces = model.faces.numpy()
     face_id, depth = visible_faces(vertices, faces, camera)
     inside = face_of(model)[faces].all(1)
@@ -102,7 +102,7 @@ def psnr_db(
     cameras: Mapping[str, Camera],
     view: HeldOut,
 ) -> float | None:
-    """Peak signal to noise ratio of the module docstring's picture, dB; None without enough face.
+    """Return the PSNR, dB, of the module docstring's picture; None without enough face.
 
     Args:
         dataset: whose frames colour the mesh.
@@ -132,7 +132,7 @@ def psnr_db(
 
 
 def face_normals(vertices: np.ndarray, corners: np.ndarray) -> np.ndarray:
-    """Unit normals (N, 3) of triangles (N, 3) of vertices."""
+    """Return unit normals (N, 3) of triangles (N, 3) of vertices."""
     a, b, c = (vertices[corners[:, k]] for k in range(3))
     normal = np.cross(b - a, c - a)
     return normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
@@ -148,7 +148,7 @@ def median_colours(
     places: np.ndarray,
     normals: np.ndarray,
 ) -> np.ndarray:
-    """Median root of light (N, 3) of places on a mesh in the cameras that see them; else NaN."""
+    """Return the median root of light (N, 3) of places on a mesh; NaN where few cameras see it."""
     visibility = Visibility(vertices, model.faces.numpy())
     seen = np.full((len(cameras), len(places), 3), np.nan)
     for row, (name, camera) in enumerate(cameras.items()):

@@ -84,7 +84,7 @@ def orbit(view: PinholeView, degrees: float, centre: Tensor, pitch: float = 0.0)
 
 
 def _rotation(angle: float, first: int, second: int, pivot: Tensor) -> Tensor:
-    """(4, 4) rotation by radians from axis ``second`` to ``first``, about a point (3,)."""
+    """Return (4, 4) rotation by radians from axis ``second`` to ``first``, about a point (3,)."""
     turn = torch.eye(4, dtype=torch.float64, device=pivot.device)
     turn[first, first] = turn[second, second] = math.cos(angle)
     turn[first, second], turn[second, first] = math.sin(angle), -math.sin(angle)

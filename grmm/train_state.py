@@ -148,13 +148,13 @@ def make_optimizer(model: GRMM, config: Config) -> torch.optim.Optimizer:
 
 
 def budget_used(state: TrainState, config: Config) -> float:
-    """Share of the budget used, by iterations or by seconds, whichever is further."""
+    """Return the share of the budget used, by iterations or by seconds, whichever is further."""
     by_time = state.seconds / config.train.seconds if config.train.seconds else 0.0
     return max(state.iteration / config.train.iterations, by_time)
 
 
 def finished(state: TrainState, config: Config) -> bool:
-    """True when iterations or seconds are used up."""
+    """Return True when iterations or seconds are used up."""
     return budget_used(state, config) >= 1
 
 

@@ -72,7 +72,7 @@ class Network:
         return answer[0]
 
     def error(self, why: str) -> StageError:
-        """An error about this network, in one line."""
+        """Make an error about this network, in one line."""
         return _error(self.path, self.role, why)
 
 
@@ -98,7 +98,7 @@ def _error(path: Path, role: Role, why: str) -> StageError:
 
 
 def _reason(error: BaseException) -> str:
-    """The last telling line of a library's message, which may run over pages."""
+    """Return the last telling line of a library's message, which may run over pages."""
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
     return lines[-1][:200] if lines else type(error).__name__
 
@@ -115,7 +115,7 @@ def _check_inputs(path: Path, role: Role, least: int, most: int) -> None:
 
 @cached_by_file(2)
 def _torchscript(path: Path, role: Role) -> Network:
-    """A TorchScript module: on CUDA in half precision where there is one, else on the CPU."""
+    """Return TorchScript module: on CUDA in half precision where there is one, else on the CPU."""
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     try:
         with warnings.catch_warnings():
@@ -143,7 +143,7 @@ def _torchscript(path: Path, role: Role) -> Network:
 def _run_torchscript(
     path: Path, role: Role, module: torch.jit.ScriptModule, device: torch.device, batches: Sequence
 ) -> list[np.ndarray]:
-    """Outputs of a module; the same pictures give the same numbers whatever ran before."""
+    """Return outputs of a module; the same pictures give the same numbers whatever ran before."""
     floats = (p.dtype for p in module.parameters() if p.is_floating_point())
     dtype = next(floats, torch.float32)
     cuda = device.type == "cuda"
@@ -179,7 +179,7 @@ def _run_torchscript(
 
 @cached_by_file(2)
 def _onnx(path: Path, role: Role) -> Network:
-    """An ONNX graph, on CUDA where onnxruntime has it, else on as many threads as torch may use."""
+    """Load an ONNX graph, on CUDA where onnxruntime has it, else on torch's threads."""
     try:
         import onnxruntime
         from onnxruntime.capi import onnxruntime_pybind11_state as state

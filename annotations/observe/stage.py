@@ -241,7 +241,7 @@ def align_faces(
 
 
 def face_side(neutral: np.ndarray) -> float:
-    """Side of the square, pixels, about landmarks (68, 2) that the aligned face shows."""
+    """Return side of the square, pixels, about landmarks (68, 2) that the aligned face shows."""
     return 1.1 * max(float((neutral.max(0) - neutral.min(0)).max()), LEAST_SIDE)
 
 

@@ -71,7 +71,7 @@ class Desk(Screen[None]):
         self._said: tuple[str, str] | None = None
 
     def compose(self) -> ComposeResult:
-        """Status, words, two pictures, strip, and a line for messages and hints."""
+        """Yield status, words, two pictures, strip, and a line for messages and hints."""
         yield Static(id="status")
         yield Static(id="words")
         with Horizontal(id="panes"):

@@ -88,7 +88,7 @@ class FrameCache:
 
     @property
     def used_bytes(self) -> int:
-        """Bytes of the pictures in memory."""
+        """Return bytes of the pictures in memory."""
         return self._bytes
 
     def idle(self) -> bool:
@@ -224,7 +224,7 @@ class FaceFinder:
 
     @property
     def ready(self) -> bool:
-        """True once the network is loaded."""
+        """Return True once the network is loaded."""
         return self._network is not None
 
     def load(self) -> None:

@@ -61,7 +61,7 @@ class PicturePane(Widget):
 
     @property
     def look(self) -> FrameLook | None:
-        """The look that is shown; None where words replace it."""
+        """Return the look that is shown; None where words replace it."""
         return self._look
 
     def show(self, look: FrameLook | None, words: str = "") -> None:
@@ -72,7 +72,7 @@ class PicturePane(Widget):
 
     @property
     def shape(self) -> PaneShape:
-        """The size of the picture, in cells and pixels."""
+        """Return the size of the picture, in cells and pixels."""
         return self._painter.shape(self.size)
 
     def on_resize(self) -> None:
@@ -163,7 +163,7 @@ def _look(aim: Aim, index: Index, camera: str, frame: int) -> FrameLook:
 
 
 def frames_ahead(view: CueView, count: int = AHEAD) -> list[int]:
-    """Frames that the next keys may ask for: the nearest, ten on either side, the suggestions."""
+    """List frames that the next keys may ask for: ten on either side, and suggestions."""
     near = [view.cursor, *view.candidates, view.cursor + 10, view.cursor - 10]
     for away in range(1, count):
         near += [view.cursor + away, view.cursor - away]
@@ -174,7 +174,7 @@ def frames_ahead(view: CueView, count: int = AHEAD) -> list[int]:
 def shots_ahead(
     scene: TaskScene, view: CueView, aim: Aim, shape: PaneShape, count: int = AHEAD
 ) -> list[FrameCrop]:
-    """Pictures to decode for a task, most urgent first; finds the faces on the way."""
+    """Return pictures to decode for a task, most urgent first; finds the faces on the way."""
     here, there = subject_look(scene, view, aim), reference_look(scene, aim)
     shots = [shot_of(here.at(n), shape) for n in frames_ahead(view, count)] if here else []
     if there is not None:

@@ -67,7 +67,7 @@ class Session:
 
     @property
     def task(self) -> LabelTask | None:
-        """The open task; None when there are none at all."""
+        """Return the open task; None when there are none at all."""
         return self.tasks[self.position] if self.tasks else None
 
     @property

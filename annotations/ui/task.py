@@ -61,7 +61,7 @@ class TaskScene:
 
     @property
     def candidates(self) -> tuple[int, ...]:
-        """Suggested frames, best first."""
+        """Return suggested frames, best first."""
         found = self.suggestion
         return () if found is None else (found.frame, *found.candidates)
 
@@ -129,7 +129,7 @@ def _suggestion(dataset: Dataset, task: LabelTask, notes: list[str]) -> Suggeste
 def _reference(
     dataset: Dataset, task: LabelTask, notes: list[str]
 ) -> tuple[CanonicalFrame | None, Index | None, bool]:
-    """Canonical frame, its footage, and whether this task is the reference's own."""
+    """Return the canonical frame, its footage, and whether this task is the reference's own."""
     try:
         is_reference = reference_subject(dataset) == task.subject
         frame = canonical(dataset, task.expression)

@@ -45,7 +45,7 @@ def frame_cells(frames: int, width: int) -> tuple[int, int]:
 
 
 def column_of(view: CueView, frame: int, width: int) -> int:
-    """First cell of a frame."""
+    """Return the first cell of a frame."""
     wide, per = frame_cells(view.last - view.first + 1, width)
     return (frame - view.first) // per * wide
 
@@ -141,7 +141,7 @@ class CurveStrip(Widget):
 
     @property
     def text(self) -> list[str]:
-        """The lines as plain text."""
+        """Return the lines as plain text."""
         return [line.text for line in self._drawn()]
 
     def on_click(self, event: events.Click) -> None:

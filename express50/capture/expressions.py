@@ -42,14 +42,14 @@ class Expression:
 
 
 def expression_words(expression: str) -> tuple[str, str]:
-    """Returns the name and description of an expression; outside the script its id and ""."""
+    """Return the name and description of an expression; outside the script its id and ""."""
     entry = next((e for e in load_script() if e.id == expression), None)
     return (expression, "") if entry is None else (entry.name, entry.description)
 
 
 @cache
 def load_script() -> tuple[Expression, ...]:
-    """Returns the built-in script: 60 expressions in recording order, ``neutral`` first."""
+    """Return the built-in script: 60 expressions in recording order, ``neutral`` first."""
     file = resources.files("express50.capture") / "expressions.toml"
     script = []
     for row in tomllib.loads(file.read_text(encoding="utf-8"))["expression"]:
@@ -59,7 +59,7 @@ def load_script() -> tuple[Expression, ...]:
 
 
 def select(ids: list[str] | tuple[str, ...] | None = None) -> tuple[Expression, ...]:
-    """Returns the script's entries with these ids, in their order; all of them for None.
+    """Return the script's entries with these ids, in their order; all of them for None.
 
     Raises:
         FormatError: an id is not in the script; the nearest one is named.

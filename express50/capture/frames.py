@@ -55,7 +55,7 @@ class FrameReader:
         self._video: VideoReader | None = None
 
     def read(self, frame: int, deep: bool = False) -> np.ndarray:
-        """Reads an image (H, W, 3) sRGB by decode index, colour-corrected but not undistorted.
+        """Read an image (H, W, 3) sRGB by decode index, colour-corrected but not undistorted.
 
         It is uint8; where ``deep`` and the footage has more than 8 bits, uint16.
 
@@ -147,7 +147,7 @@ class FootageReader:
         self._readers: dict[str, FrameReader] = {}
 
     def read(self, camera_id: str, frame: int) -> np.ndarray:
-        """Reads a full-resolution frame (H, W, 3) uint8 sRGB by decode index.
+        """Read a full-resolution frame (H, W, 3) uint8 sRGB by decode index.
 
         Raises:
             CaptureError: no such camera or frame, or the footage changed.
@@ -176,13 +176,13 @@ class FootageReader:
 def read_frame(
     dataset: Dataset, subject: str, camera_id: str, frame: int, undistort: bool = True
 ) -> np.ndarray:
-    """Reads one frame (H, W, 3) uint8 sRGB by decode index, as ``FootageReader`` does."""
+    """Read one frame (H, W, 3) uint8 sRGB by decode index, as ``FootageReader`` does."""
     with FootageReader(dataset, subject, undistort) as footage:
         return footage.read(camera_id, frame)
 
 
 def read_recorded_plate(index: Index, camera_id: str, deep: bool = False) -> np.ndarray:
-    """Reads a clean plate (H, W, 3) sRGB that the index lists, colour-corrected, not undistorted.
+    """Read a clean plate (H, W, 3) sRGB that the index lists, colour-corrected, not undistorted.
 
     It is uint8; where ``deep`` and the plate has more than 8 bits, uint16.
 
@@ -216,7 +216,7 @@ def write_frame(path: Path, image: np.ndarray) -> None:
 def read_peak_frame(
     dataset: Dataset, subject: str, expression: str, camera_id: str, deep: bool = False
 ) -> np.ndarray:
-    """Reads a peak frame (H, W, 3) sRGB as the pinhole camera of ``read_cameras_of`` sees it.
+    """Read a peak frame (H, W, 3) sRGB as the pinhole camera of ``read_cameras_of`` sees it.
 
     It is colour-corrected, and uint8; where ``deep`` and it has more than 8 bits, uint16.
 
@@ -260,7 +260,7 @@ def frame_inputs(dataset: Dataset, subject: str, expression: str) -> dict[str, P
 
 
 def read_cameras_of(dataset: Dataset, subject: str, undistorted: bool = True) -> dict[str, Camera]:
-    """Reads the calibrated cameras of a subject, sorted by id.
+    """Read the calibrated cameras of a subject, sorted by id.
 
     Undistorted frames belong to the pinhole cameras, which are given unless ``undistorted`` is
     false.

@@ -89,7 +89,7 @@ class Index:
 
     @property
     def frames(self) -> int:
-        """Frames that every camera has."""
+        """Return frames that every camera has."""
         return min(camera.frames for camera in self.cameras.values())
 
 

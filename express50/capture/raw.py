@@ -301,7 +301,7 @@ def _read_cue(path: Path, line: int, row: dict[str, str]) -> Cue:
 
 
 def check_calibrated_sizes(raw: RawCapture, sizes: dict[str, tuple[int, int]]) -> None:
-    """Refuses cameras calibrated for another (width, height) than their footage has.
+    """Refuse cameras calibrated for another (width, height) than their footage has.
 
     Raises:
         CalibrationError: a size differs; a guessed scale would give wrong depths.

@@ -135,7 +135,7 @@ def _serve(dataset: Dataset, port: int) -> int:
             self.wfile.write(body)
 
         def log_message(self, *unused: object) -> None:
-            """Nothing: the page asks every few seconds."""
+            """Stay silent: the page asks every few seconds."""
 
     try:
         server = ThreadingHTTPServer(("127.0.0.1", port), Handler)
@@ -207,7 +207,7 @@ def _stage(name: str, table: dict[str, Receipt], run: Run | None, now: float) ->
 
 
 def _rate(ends: list[float], begun: float, now: float) -> float:
-    """Items per second over the last ones, up to now: it sinks while nothing ends."""
+    """Return items per second over the last ones, up to now: it sinks while nothing ends."""
     recent = sorted(ends)[-RECENT - 1 :]
     if len(recent) <= RECENT:  # the start of the run counts as an end
         recent = [begun, *recent]

@@ -61,7 +61,7 @@ def resolve_config(
 
 
 def read_tables(file: Path, known: Sequence[str]) -> dict[str, dict[str, object]]:
-    """Returns the tables of a TOML file.
+    """Return the tables of a TOML file.
 
     Raises:
         ConfigError: no such file, an unknown table, or a value outside a table.
@@ -79,7 +79,7 @@ def read_tables(file: Path, known: Sequence[str]) -> dict[str, dict[str, object]
 def known_assignments(
     texts: Iterable[str], known: Sequence[str], kind: str = "table"
 ) -> list[tuple[str, str, object]]:
-    """Splits ``table.key=value`` strings as `parse_assignment` does.
+    """Split ``table.key=value`` strings as `parse_assignment` does.
 
     Raises:
         ConfigError: an unknown table, or a text that has not that form.
@@ -123,7 +123,7 @@ def build_dataclass(table: str, kind: type, values: Mapping[str, object], hint: 
 
 
 def nearest(word: str, known: Iterable[str]) -> str:
-    """Words ``, did you mean 'x'?`` when a known name is near, else nothing."""
+    """Return the words ``, did you mean 'x'?`` when a known name is near, else nothing."""
     names = list(known)
     close = difflib.get_close_matches(word, names, n=1, cutoff=0.5)
     return f", did you mean {close[0]!r}?" if close else ""
@@ -171,12 +171,12 @@ def _coerce(name: str, value: object, kind: Any) -> object:
 
 
 def config_values(config: Any) -> dict[str, object]:
-    """Field values of a config dataclass, in order."""
+    """Return field values of a config dataclass, in order."""
     return {field.name: getattr(config, field.name) for field in dataclasses.fields(config)}
 
 
 def config_toml(name: str, config: Any) -> str:
-    """TOML table of a config, each field under the words that document it."""
+    """Return the TOML table of a config, each field under the words that document it."""
     documents = field_documents(type(config))
     lines = [f"[{name}]"]
     for key, value in config_values(config).items():
@@ -187,7 +187,7 @@ def config_toml(name: str, config: Any) -> str:
 
 
 def field_documents(config: type) -> dict[str, str]:
-    """Documentation strings that stand under the fields of a config dataclass."""
+    """Return documentation strings that stand under the fields of a config dataclass."""
     try:
         tree = ast.parse(textwrap.dedent(inspect.getsource(config)))
     except OSError:  # classes made at run time have no source

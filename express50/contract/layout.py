@@ -56,24 +56,24 @@ class Dataset:
         object.__setattr__(self, "root", Path(self.root))
 
     def stage_dir(self, stage: str) -> Path:
-        """Folder that holds the items of a stage."""
+        """Return the folder that holds the items of a stage."""
         return self.root / stage
 
     def item_dir(self, stage: str, item: str) -> Path:
-        """Published folder of one item; ``item`` may be nested (``S001/cam03``)."""
+        """Return the published folder of one item; ``item`` may be nested (``S001/cam03``)."""
         return self.root / stage / item
 
     def subjects(self) -> list[str]:
-        """Ingested subjects, sorted."""
+        """Return the ingested subjects, sorted."""
         return sorted(path.parent.name for path in self.stage_dir("ingest").glob("*/index.json"))
 
     @property
     def captures_file(self) -> Path:
-        """JSON table subject -> folder of its raw capture."""
+        """Return the path of the JSON table subject -> folder of its raw capture."""
         return self.root / "captures.json"
 
     def captures(self) -> dict[str, Path]:
-        """Registered raw captures by subject, sorted; empty before the first ingest.
+        """Return the registered raw captures by subject, sorted; empty before the first ingest.
 
         Raises:
             FormatError: the table is not a JSON object of strings.
@@ -90,15 +90,15 @@ class Dataset:
         return {subject: Path(table[subject]) for subject in sorted(table)}
 
     def index_file(self, subject: str) -> Path:
-        """Frame index of a subject's footage."""
+        """Return the path of the frame index of a subject's footage."""
         return self.item_dir("ingest", subject) / "index.json"
 
     def proxies_dir(self, subject: str) -> Path:
-        """Small copies of a subject's footage."""
+        """Return the folder of the small copies of a subject's footage."""
         return self.item_dir("ingest", subject) / "proxies"
 
     def cameras_file(self, subject: str) -> Path:
-        """Calibrated cameras of a subject."""
+        """Return the path of a subject's calibrated cameras."""
         return self.item_dir("calibrate", subject) / "cameras.json"
 
     def gains_file(self, subject: str) -> Path:
@@ -106,44 +106,44 @@ class Dataset:
         return self.item_dir("calibrate", subject) / "gains.json"
 
     def peaks_file(self, subject: str) -> Path:
-        """Peak frame of each expression of a subject."""
+        """Return the path of a subject's table of peak frames."""
         return self.item_dir("align", subject) / "peaks.json"
 
     def observations_file(self, subject: str) -> Path:
-        """File of the landmarks and faces that the observe stage saw of a subject."""
+        """Return the path of the landmarks and faces that the observe stage saw of a subject."""
         return self.item_dir("observe", subject) / "observations.npz"
 
     def suggestions_file(self, subject: str) -> Path:
-        """Peak frames that the align stage suggests."""
+        """Return the path of the peak frames that the align stage suggests."""
         return self.item_dir("align", subject) / "suggestions.json"
 
     def track_file(self, subject: str) -> Path:
-        """Tracked head of a subject at its peaks."""
+        """Return the path of a subject's tracked head at its peaks."""
         return self.item_dir("track", subject) / "track.npz"
 
     def frame_file(self, subject: str, expression: str, camera: str) -> Path:
-        """Undistorted, colour-corrected frame of one camera at a peak."""
+        """Return the path of a camera's undistorted, colour-corrected frame at a peak."""
         return self.item_dir("frames", f"{subject}/{expression}") / f"{camera}.jxl"
 
     def plate_file(self, subject: str, camera: str) -> Path:
-        """Undistorted, colour-corrected clean plate of one camera."""
+        """Return the path of a camera's undistorted, colour-corrected clean plate."""
         return self.frame_file(subject, PLATES, camera)
 
     def matte_file(self, subject: str, expression: str, camera: str) -> Path:
-        """8-bit opacity of the subject in one peak frame."""
+        """Return the path of the subject's 8-bit opacity in one peak frame."""
         return self.item_dir("matte", f"{subject}/{expression}") / f"{camera}.png"
 
     def labels_file(self, subject: str) -> Path:
-        """Append-only label events of one subject."""
+        """Return the path of a subject's label events, which are only appended to."""
         return self.root / "labels" / f"{subject}.jsonl"
 
     @property
     def ledger(self) -> Path:
-        """SQLite receipts of every stage."""
+        """Return the path of the receipts of every stage (SQLite)."""
         return self.root / "ledger.sqlite"
 
     def config_file(self, stage: str) -> Path:
-        """Resolved configuration that a stage last ran with."""
+        """Return the path of the resolved configuration that a stage last ran with."""
         return self.root / "config" / f"{stage}.toml"
 
     @property
@@ -153,25 +153,25 @@ class Dataset:
 
     @property
     def staging_dir(self) -> Path:
-        """Unfinished outputs; nothing below it is ever read."""
+        """Return the folder of unfinished outputs; nothing below it is ever read."""
         return self.root / ".staging"
 
     def windows_dir(self, subject: str) -> Path:
-        """Finished parts of a subject's unfinished clips; removed when the clips are written."""
+        """Return folder of finished parts of a subject's clips; it goes when these are written."""
         return self.root / ".windows" / subject
 
     @property
     def stale_dir(self) -> Path:
-        """Outputs set aside because a newer run of their item failed or no longer lists it."""
+        """Return the folder of outputs whose item failed in a newer run, or is no longer listed."""
         return self.root / ".stale"
 
     @property
     def slurm_dir(self) -> Path:
-        """Output of SLURM jobs, one file per job."""
+        """Return the folder of the output of SLURM jobs, one file per job."""
         return self.root / "logs" / "slurm"
 
     def log_file(self, stage: str, item: str) -> Path:
-        """Traceback of an unexpected failure of one item."""
+        """Return the path of the traceback of an unexpected failure of one item."""
         return self.root / "logs" / stage / f"{item.replace('/', '+')}.txt"
 
 

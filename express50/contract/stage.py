@@ -47,7 +47,7 @@ class Result:
     warnings: Sequence[Note] = ()
 
     def to_json(self) -> dict[str, Any]:
-        """The content of ``metrics.json``."""
+        """Return the content of ``metrics.json``."""
         notes = {"dropped": self.dropped, "warnings": self.warnings}
         return {**self.metrics, **{key: [asdict(n) for n in rows] for key, rows in notes.items()}}
 

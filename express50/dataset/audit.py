@@ -65,7 +65,7 @@ class Audit:
 
     @property
     def sound(self) -> bool:
-        """True when nothing wrong is left."""
+        """Return True when nothing wrong is left."""
         return all(finding.fixed for finding in self.findings)
 
 
@@ -384,7 +384,7 @@ class _StageAudit:
             self._note(stage, f"{other_settings} {words}; the next run makes them again")
 
     def _waits(self, item: str) -> bool:
-        """True if something that the item may read is broken."""
+        """Return True if something that the item may read is broken."""
         subject = item.split("/")[0]
         known = subject in self.receipts[self.stages[0].name]
         return bool(self.broken & {"", subject}) or (bool(self.broken) and not known)

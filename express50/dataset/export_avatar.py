@@ -262,7 +262,7 @@ def centred(camera: Camera, factor: int = 1) -> Camera:
 
 
 def _whole(length: float, factor: int) -> int:
-    """Even number of pixels, a multiple of the factor, that holds a length, rounding aside."""
+    """Return even number of pixels, a multiple of factor, that holds a length, rounding aside."""
     return 2 * factor * math.ceil((length - 1e-6) / (2 * factor))
 
 
@@ -282,7 +282,7 @@ def seen_by(image: np.ndarray, camera: Camera, target: Camera, factor: int = 1) 
 
 
 def _is_flame(model: HeadModel) -> bool:
-    """True if FLAME's coefficients give this model's vertices."""
+    """Return True if FLAME's coefficients give this model's vertices."""
     return model.name.startswith("flame-")
 
 
@@ -340,7 +340,10 @@ def _padded(values: np.ndarray, count: int) -> np.ndarray:
 
 
 def _npz_bytes(arrays: dict[str, np.ndarray]) -> bytes:
-    """Bytes of an .npz file; NumPy dates its members 1980, so that they depend on nothing else."""
+    """Return bytes of an .npz file.
+
+    NumPy dates its members 1980, so that they depend on nothing else.
+    """
     buffer = io.BytesIO()
     np.savez(buffer, **arrays)  # type: ignore[arg-type]  # numpy types its options only
     return buffer.getvalue()

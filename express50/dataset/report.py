@@ -36,7 +36,7 @@ INK = "#2457a6"
 
 
 def render_page(dataset: Dataset, title: str | None = None) -> str:
-    """Returns the whole page as text.
+    """Return the whole page as text.
 
     Beside the stages' folders it reads, where they exist: ``summary.json`` (figures of the run),
     ``accuracy/`` (errors against truth, made by the benchmarks) and ``grmm/``.
@@ -208,7 +208,7 @@ def _words(name: str) -> str:
 
 
 def number(value: object) -> str:
-    """Formats a figure for people; n/a if it was not measured."""
+    """Format a figure for people; n/a if it was not measured."""
     if value is None:
         return "n/a"
     if isinstance(value, bool) or not isinstance(value, int | float):
@@ -219,7 +219,7 @@ def number(value: object) -> str:
 
 
 def spread(values: list[T], count: int) -> list[T]:
-    """Returns at most ``count`` of the values, evenly chosen."""
+    """Return at most ``count`` of the values, evenly chosen."""
     if len(values) <= count:
         return values
     return [values[round(i * (len(values) - 1) / (count - 1))] for i in range(count)]

@@ -239,7 +239,7 @@ def files_that(test: Test, root: Path) -> Iterator[Path]:
 
 
 def says(path: Path, test: Test) -> bool:
-    """True if a file's content passes a test."""
+    """Return True if a file's content passes a test."""
     return any(map(test, texts_of(path)))
 
 

@@ -307,4 +307,4 @@ class ImageFootage:
         self._count += 1
 
     def __exit__(self, *unused: object) -> None:
-        """Nothing is open between pictures."""
+        """Do nothing: no file is open between pictures."""

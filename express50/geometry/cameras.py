@@ -50,20 +50,20 @@ class Camera:
 
     @property
     def K(self) -> np.ndarray:
-        """Intrinsics (3, 3), pixels, corner origin."""
+        """Return intrinsics (3, 3), pixels, corner origin."""
         p = self._named()
         fx, fy = p.get("fx", p.get("f", 0.0)), p.get("fy", p.get("f", 0.0))
         return np.array([[fx, 0.0, p["cx"]], [0.0, fy, p["cy"]], [0.0, 0.0, 1.0]])
 
     @property
     def dist(self) -> np.ndarray:
-        """Distortion (8,), OpenCV's order k1 k2 p1 p2 k3 k4 k5 k6."""
+        """Return the distortion (8,), OpenCV's order k1 k2 p1 p2 k3 k4 k5 k6."""
         p = self._named()
         return np.array([p.get(name, 0.0) for name in _DISTORTION])
 
     @property
     def world_from_cam(self) -> np.ndarray:
-        """Inverse (4, 4) of ``cam_from_world``."""
+        """Return the inverse (4, 4) of ``cam_from_world``."""
         R, t = self.cam_from_world[:3, :3], self.cam_from_world[:3, 3]
         out = np.eye(4)
         out[:3, :3], out[:3, 3] = R.T, -R.T @ t
@@ -71,45 +71,45 @@ class Camera:
 
     @property
     def center(self) -> np.ndarray:
-        """Position (3,) in the world, metres."""
+        """Return the position (3,) in the world, metres."""
         return self.world_from_cam[:3, 3]
 
 
 def pinhole_camera(
     camera_id: str, K: np.ndarray, width: int, height: int, cam_from_world: np.ndarray
 ) -> Camera:
-    """A camera without distortion from K (3, 3) and a pose (4, 4)."""
+    """Return a camera without distortion from K (3, 3) and a pose (4, 4)."""
     check_shape("K", K, (3, 3), camera_id)
     params = (float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]))
     return Camera(camera_id, int(width), int(height), "PINHOLE", params, np.asarray(cam_from_world))
 
 
 def pinhole(camera: Camera) -> Camera:
-    """The same camera without distortion: what undistorted images are seen with."""
+    """Return the same camera without distortion: what undistorted images are seen with."""
     return pinhole_camera(camera.id, camera.K, camera.width, camera.height, camera.cam_from_world)
 
 
 def resized(camera: Camera, width: int, height: int) -> Camera:
-    """The camera of the image resized to (width, height)."""
+    """Return the camera of the image resized to (width, height)."""
     return scale_camera(camera, width / camera.width, height / camera.height)
 
 
 def scale_camera(camera: Camera, sx: float, sy: float) -> Camera:
-    """The camera of the image scaled by (sx, sy); with a corner origin K scales as it is."""
+    """Return the camera of the image scaled by (sx, sy); with a corner origin K scales as it is."""
     width, height = round(camera.width * sx), round(camera.height * sy)
     K = np.diag([sx, sy, 1.0]) @ camera.K
     return replace(_with_K(camera, K), width=width, height=height)
 
 
 def crop_camera(camera: Camera, x0: float, y0: float, width: int, height: int) -> Camera:
-    """The camera of the crop whose corner is at pixel (x0, y0) of the image."""
+    """Return the camera of the crop whose corner is at pixel (x0, y0) of the image."""
     K = camera.K.copy()
     K[:2, 2] -= (x0, y0)
     return replace(_with_K(camera, K), width=int(width), height=int(height))
 
 
 def _with_K(camera: Camera, K: np.ndarray) -> Camera:
-    """The camera with other intrinsics; a one-focal model becomes its two-focal relative."""
+    """Return the camera with other intrinsics; a one-focal model becomes its two-focal relative."""
     p = camera._named() | {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
     model = {"SIMPLE_PINHOLE": "PINHOLE", "SIMPLE_RADIAL": "OPENCV", "RADIAL": "OPENCV"}.get(
         camera.model, camera.model
@@ -118,12 +118,12 @@ def _with_K(camera: Camera, K: np.ndarray) -> Camera:
 
 
 def transform_camera(camera: Camera, new_from_old: np.ndarray) -> Camera:
-    """The camera after the world moved by the rigid transform ``new_from_old`` (4, 4)."""
+    """Return the camera after the world moved by the rigid transform ``new_from_old`` (4, 4)."""
     return replace(camera, cam_from_world=camera.cam_from_world @ np.linalg.inv(new_from_old))
 
 
 def distort(camera: Camera, xy: np.ndarray) -> np.ndarray:
-    """Distorted normalised coordinates (N, 2) of ideal ones (N, 2).
+    """Return distorted normalised coordinates (N, 2) of ideal ones (N, 2).
 
     Source: OpenCV's rational model, of which COLMAP's OPENCV and RADIAL are special cases.
     """
@@ -137,7 +137,7 @@ def distort(camera: Camera, xy: np.ndarray) -> np.ndarray:
 
 
 def undistort(camera: Camera, xy: np.ndarray) -> np.ndarray:
-    """Ideal normalised coordinates (N, 2) of distorted ones (N, 2), by damped fixed point.
+    """Return ideal normalised coordinates (N, 2) of distorted ones (N, 2), by damped fixed point.
 
     Where the lens folds no solution exists: the result is then finite but does not distort back.
     """
@@ -179,7 +179,7 @@ def project(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]
 
 
 def unproject(camera: Camera, pixels: np.ndarray, depth: np.ndarray) -> np.ndarray:
-    """World points (N, 3) at pixels (N, 2) and camera depths (N,), metres."""
+    """Return world points (N, 3) at pixels (N, 2) and camera depths (N,), metres."""
     pixels = np.asarray(pixels, dtype=np.float64)
     check_shape("pixels", pixels, (None, 2))
     K = camera.K
@@ -189,7 +189,7 @@ def unproject(camera: Camera, pixels: np.ndarray, depth: np.ndarray) -> np.ndarr
 
 
 def rays(camera: Camera, stride: int = 1) -> tuple[np.ndarray, np.ndarray]:
-    """Origin (3,) and directions (H', W', 3) through the centres of every stride-th pixel.
+    """Return origin (3,) and directions (H', W', 3) through the centres of every stride-th pixel.
 
     Directions have camera z 1, so that ``origin + depth * direction`` is the point at a depth.
     """
@@ -231,13 +231,13 @@ def triangulate(
 
 
 def normalised(camera: Camera, pixels: np.ndarray) -> np.ndarray:
-    """Undistorted coordinates (N, 2) on the plane z = 1 of recorded pixels (N, 2)."""
+    """Return undistorted coordinates (N, 2) on the plane z = 1 of recorded pixels (N, 2)."""
     K = camera.K
     return undistort(camera, (pixels - K[:2, 2]) / (K[0, 0], K[1, 1]))
 
 
 def _triangulate_one(P: np.ndarray, xy: np.ndarray, w: np.ndarray, focal: np.ndarray) -> np.ndarray:
-    """One world point (3,) from normalised observations (C, 2) with weights (C,)."""
+    """Return one world point (3,) from normalised observations (C, 2) with weights (C,)."""
     use = w > 0
     P, xy, w = P[use], xy[use], w[use] * focal[use] ** 2
     rows = xy[:, :, None] * P[:, 2:3] - P[:, :2]  # (C, 2, 4)
@@ -261,20 +261,20 @@ def _triangulate_one(P: np.ndarray, xy: np.ndarray, w: np.ndarray, focal: np.nda
 
 
 def project_pinhole(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels (..., 2) and depth (...) of world points (..., 3) in an undistorted camera."""
+    """Return pixels (..., 2) and depth (...) of world points (..., 3) in an undistorted camera."""
     ray, depth, _ = _rays(camera, points)
     return ray * camera.K[[0, 1], [0, 1]] + camera.K[:2, 2], depth
 
 
 def inside_frame(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels (S, 2) of world points (S, 3), and whether (S,) they lie in the image, a pixel in."""
+    """Return pixels (S, 2) of world points (S, 3), and whether (S,) they lie a pixel inside."""
     pixels, depth = project_pinhole(camera, points)
     size = np.array([camera.width, camera.height])
     return pixels, (depth > 1e-3) & (pixels >= 1.0).all(1) & (pixels <= size - 1.0).all(1)
 
 
 def project_with_slope(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels (..., 2) of world points (..., 3) and d pixel / d point (..., 2, 3)."""
+    """Return pixels (..., 2) of world points (..., 3) and d pixel / d point (..., 2, 3)."""
     ray, _, safe = _rays(camera, points)
     rotation, K = camera.cam_from_world[:3, :3], camera.K
     focal = K[[0, 1], [0, 1]]
@@ -283,7 +283,7 @@ def project_with_slope(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, 
 
 
 def _rays(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Image-plane coordinates (..., 2) at unit depth, depth (...), depth that is never zero."""
+    """Return coordinates (..., 2) at unit depth, depth (...), and depth that is never zero."""
     local = points @ camera.cam_from_world[:3, :3].T + camera.cam_from_world[:3, 3]
     depth = local[..., 2]
     safe = np.where(np.abs(depth) > NEAREST_M, depth, NEAREST_M)

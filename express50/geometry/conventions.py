@@ -19,31 +19,31 @@ FLIP_YZ = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 def opencv_pixels_to_corner(pixels: np.ndarray) -> np.ndarray:
-    """Corner-origin pixels (..., 2) of OpenCV's centre-origin pixels (..., 2)."""
+    """Return corner-origin pixels (..., 2) of OpenCV's centre-origin pixels (..., 2)."""
     return np.asarray(pixels, dtype=np.float64) + 0.5
 
 
 def corner_to_opencv_pixels(pixels: np.ndarray) -> np.ndarray:
-    """OpenCV's centre-origin pixels (..., 2) of corner-origin pixels (..., 2)."""
+    """Return OpenCV's centre-origin pixels (..., 2) of corner-origin pixels (..., 2)."""
     return np.asarray(pixels, dtype=np.float64) - 0.5
 
 
 def K_to_opencv(K: np.ndarray) -> np.ndarray:
-    """K (3, 3) as OpenCV's functions expect it (principal point less half a pixel)."""
+    """Return K (3, 3) as OpenCV's functions expect it (principal point less half a pixel)."""
     shifted = np.array(K, dtype=np.float64)
     shifted[:2, 2] -= 0.5
     return shifted
 
 
 def K_from_opencv(K: np.ndarray) -> np.ndarray:
-    """Corner-origin K (3, 3) of one that an OpenCV function returned."""
+    """Return the corner-origin K (3, 3) of one that an OpenCV function returned."""
     shifted = np.array(K, dtype=np.float64)
     shifted[:2, 2] += 0.5
     return shifted
 
 
 def affine_to_opencv(matrix: np.ndarray) -> np.ndarray:
-    """Affine (2, 3) between centre-origin pixels, as ``cv2.warpAffine`` has it.
+    """Return the affine (2, 3) between centre-origin pixels, as ``cv2.warpAffine`` has it.
 
     ``matrix`` (2, 3) does the same between corner-origin pixels.
     """
@@ -53,7 +53,7 @@ def affine_to_opencv(matrix: np.ndarray) -> np.ndarray:
 
 
 def corner_to_cell(places: Places) -> Places:
-    """Fractional indices, for interpolation, of corner-origin places; cell 0 spans 0 to 1.
+    """Return fractional indices, for interpolation, of corner-origin places; cell 0 spans 0 to 1.
 
     Takes and returns an array or a tensor of any shape.
     """
@@ -61,27 +61,27 @@ def corner_to_cell(places: Places) -> Places:
 
 
 def cell_to_corner(indices: Places) -> Places:
-    """Corner-origin places of fractional indices: the inverse of ``corner_to_cell``."""
+    """Return corner-origin places of fractional indices: the inverse of ``corner_to_cell``."""
     return indices + 0.5  # type: ignore[operator,return-value]
 
 
 def cell_centres(count: int) -> np.ndarray:
-    """Corner-origin places (count,) of the centres of a row of cells."""
+    """Return corner-origin places (count,) of the centres of a row of cells."""
     return np.arange(count) + 0.5
 
 
 def cam_from_world_from_opengl(world_from_cam_gl: np.ndarray) -> np.ndarray:
-    """``cam_from_world`` (4, 4), OpenCV axes, of an OpenGL camera-to-world matrix (4, 4)."""
+    """Return ``cam_from_world`` (4, 4), OpenCV axes, of an OpenGL camera-to-world matrix (4, 4)."""
     return np.linalg.inv(np.asarray(world_from_cam_gl, dtype=np.float64) @ FLIP_YZ)
 
 
 def opengl_from_cam_from_world(cam_from_world: np.ndarray) -> np.ndarray:
-    """OpenGL camera-to-world matrix (4, 4) of ``cam_from_world`` (4, 4), OpenCV axes."""
+    """Return the OpenGL camera-to-world matrix (4, 4) of ``cam_from_world`` (4, 4), OpenCV axes."""
     return np.linalg.inv(np.asarray(cam_from_world, dtype=np.float64)) @ FLIP_YZ
 
 
 def undistort_maps(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """Maps (H, W) x and y, float32, for ``cv2.remap`` from ``camera`` to its pinhole camera."""
+    """Map (H, W) x and y, float32, for ``cv2.remap`` from ``camera`` to its pinhole camera."""
     K = K_to_opencv(camera.K)
     return cv2.initUndistortRectifyMap(
         K, camera.dist, None, K, (camera.width, camera.height), cv2.CV_32FC1
@@ -89,7 +89,7 @@ def undistort_maps(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
 
 
 def undistort_image(image: np.ndarray, camera: Camera) -> np.ndarray:
-    """Image (H, W[, C]) as the pinhole camera ``pinhole(camera)`` would see it; 0 outside.
+    """Return image (H, W[, C]) as the pinhole camera ``pinhole(camera)`` would see it; 0 outside.
 
     Raises:
         ValueError: the image's size is not the camera's.
@@ -106,6 +106,6 @@ def undistort_image(image: np.ndarray, camera: Camera) -> np.ndarray:
 
 
 def undistorted_mask(camera: Camera) -> np.ndarray:
-    """Pixels (H, W), bool, of the pinhole camera that the distorted image really covers."""
+    """Return pixels (H, W), bool, of the pinhole camera that the distorted image really covers."""
     x, y = undistort_maps(camera)
     return (x >= 0) & (y >= 0) & (x <= camera.width - 1) & (y <= camera.height - 1)

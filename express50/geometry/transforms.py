@@ -12,7 +12,7 @@ from express50.geometry.shapes import check_shape
 
 
 def axis_angle_to_matrix(axis_angle: np.ndarray) -> np.ndarray:
-    """Rotation matrices (..., 3, 3) of axis-angle vectors (..., 3), radians.
+    """Return rotation matrices (..., 3, 3) of axis-angle vectors (..., 3), radians.
 
     Source: Rodrigues' formula, with the series of sin(x)/x and (1-cos x)/x^2 near zero.
     """
@@ -30,7 +30,7 @@ def axis_angle_to_matrix(axis_angle: np.ndarray) -> np.ndarray:
 
 
 def quat_to_matrix(quats: np.ndarray) -> np.ndarray:
-    """Rotation matrices (..., 3, 3) of quaternions (..., 4), wxyz, normalised here.
+    """Return rotation matrices (..., 3, 3) of quaternions (..., 4), wxyz, normalised here.
 
     Raises:
         ValueError: a quaternion has zero length.
@@ -49,7 +49,7 @@ def quat_to_matrix(quats: np.ndarray) -> np.ndarray:
 
 
 def matrix_to_quat(R: np.ndarray) -> np.ndarray:
-    """Unit quaternions (..., 4), wxyz with w >= 0, of rotation matrices (..., 3, 3).
+    """Return unit quaternions (..., 4), wxyz with w >= 0, of rotation matrices (..., 3, 3).
 
     Takes the best conditioned of the four branches (Shepperd 1978), so that half turns are exact.
     """
@@ -82,7 +82,7 @@ def matrix_to_quat(R: np.ndarray) -> np.ndarray:
 
 
 def matrix_to_axis_angle(R: np.ndarray) -> np.ndarray:
-    """Axis-angle vectors (..., 3), radians in [0, pi], of rotation matrices (..., 3, 3)."""
+    """Return axis-angle vectors (..., 3), radians in [0, pi], of rotation matrices (..., 3, 3)."""
     q = matrix_to_quat(R)
     sine = np.linalg.norm(q[..., 1:], axis=-1, keepdims=True)
     angle = 2.0 * np.arctan2(sine, q[..., :1])
@@ -91,7 +91,7 @@ def matrix_to_axis_angle(R: np.ndarray) -> np.ndarray:
 
 
 def slerp(q0: np.ndarray, q1: np.ndarray, t: float | np.ndarray) -> np.ndarray:
-    """Spherical interpolation (..., 4) between unit quaternions (..., 4), along the shorter arc.
+    """Interpolate spherically between unit quaternions (..., 4), along the shorter arc.
 
     Source: Shoemake 1985; falls back to normalised linear interpolation for nearly equal ends.
     """
@@ -111,7 +111,7 @@ def slerp(q0: np.ndarray, q1: np.ndarray, t: float | np.ndarray) -> np.ndarray:
 
 
 def make_transform(R: np.ndarray, t: np.ndarray) -> np.ndarray:
-    """Rigid transform (4, 4) of a rotation (3, 3) and a translation (3,)."""
+    """Return the rigid transform (4, 4) of a rotation (3, 3) and a translation (3,)."""
     T = np.eye(4)
     T[:3, :3] = R
     T[:3, 3] = t
@@ -119,13 +119,13 @@ def make_transform(R: np.ndarray, t: np.ndarray) -> np.ndarray:
 
 
 def invert_transform(T: np.ndarray) -> np.ndarray:
-    """Inverse (4, 4) of a rigid transform (4, 4)."""
+    """Return the inverse (4, 4) of a rigid transform (4, 4)."""
     R, t = T[:3, :3], T[:3, 3]
     return make_transform(R.T, -R.T @ t)
 
 
 def look_at(eye: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:
-    """``cam_from_world`` (4, 4) of a camera at ``eye`` (3,) looking at ``target``, OpenCV axes.
+    """Return ``cam_from_world`` (4, 4), OpenCV axes, at ``eye`` (3,) looking at ``target``.
 
     Raises:
         ValueError: the eye is at the target, or ``up`` is parallel to the viewing direction.
@@ -143,7 +143,7 @@ def look_at(eye: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:
 def rigid_fit(
     source: np.ndarray, target: np.ndarray, weights: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """R (3, 3) and t (3,) that best take ``source`` (N, 3) to ``target`` (N, 3), least squares."""
+    """Fit R (3, 3) and t (3,) that take ``source`` (N, 3) to ``target`` (N, 3), least squares."""
     _, R, t = _procrustes(source, target, weights, with_scale=False)
     return R, t
 
@@ -158,7 +158,7 @@ def similarity_fit(
 def _procrustes(
     source: np.ndarray, target: np.ndarray, weights: np.ndarray | None, with_scale: bool
 ) -> tuple[float, np.ndarray, np.ndarray]:
-    """Weighted least-squares similarity; Umeyama 1991."""
+    """Fit the similarity of least weighted squares (Umeyama 1991)."""
     source = np.asarray(source, dtype=np.float64)
     target = np.asarray(target, dtype=np.float64)
     check_shape("source", source, (None, 3))

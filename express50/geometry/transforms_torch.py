@@ -10,7 +10,7 @@ from torch import Tensor
 
 
 def axis_angle_to_matrix(axis_angle: Tensor) -> Tensor:
-    """Rotation matrices (..., 3, 3) of axis-angle vectors (..., 3), radians.
+    """Return rotation matrices (..., 3, 3) of axis-angle vectors (..., 3), radians.
 
     Source: Rodrigues' formula; series below 1e-3 rad keep value and gradient smooth through zero.
     """
@@ -32,7 +32,7 @@ def axis_angle_to_matrix(axis_angle: Tensor) -> Tensor:
 
 
 def quat_to_matrix(quats: Tensor) -> Tensor:
-    """Rotation matrices (..., 3, 3) of quaternions (..., 4), wxyz, normalised here.
+    """Return rotation matrices (..., 3, 3) of quaternions (..., 4), wxyz, normalised here.
 
     A quaternion of zero length becomes the identity, with zero gradient.
     """
@@ -51,7 +51,7 @@ def quat_to_matrix(quats: Tensor) -> Tensor:
 
 
 def matrix_to_quat(R: Tensor) -> Tensor:
-    """Unit quaternions (..., 4), wxyz with w >= 0, of rotation matrices (..., 3, 3).
+    """Return unit quaternions (..., 4), wxyz with w >= 0, of rotation matrices (..., 3, 3).
 
     Takes the best conditioned of four branches (Shepperd 1978).
     """

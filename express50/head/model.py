@@ -101,12 +101,12 @@ class HeadModel:
 
     @property
     def dtype(self) -> torch.dtype:
-        """Dtype of the float tensors."""
+        """Return the dtype of the float tensors."""
         return self.template.dtype
 
     @property
     def device(self) -> torch.device:
-        """Device of all tensors."""
+        """Return the device of all tensors."""
         return self.template.device
 
     def to(

@@ -18,13 +18,13 @@ class NativeLibraryError(RuntimeError):
 
 
 def available() -> bool:
-    """Whether the native library can be loaded on this machine."""
+    """Return whether the native library can be loaded on this machine."""
     return not why_missing()
 
 
 @cache
 def why_missing() -> str:
-    """One line on why the library cannot be loaded and how to fix it; empty when it can."""
+    """Return one line on why the library cannot be loaded and how to fix it; empty when it can."""
     try:
         load()
     except NativeLibraryError as error:
@@ -34,7 +34,7 @@ def why_missing() -> str:
 
 @cache
 def load(variant: str | None = None) -> ctypes.CDLL:
-    """The shared library of ``variant``, or the best that was built and this processor can run.
+    """Return shared library of ``variant``, or the best that was built and this processor can run.
 
     Raises:
         NativeLibraryError: it was not built, is older than its source or does not load.

@@ -40,13 +40,13 @@ class BuildError(Exception):
 
 
 def variants() -> tuple[str, ...]:
-    """Names of the variants that can run on this kind of processor."""
+    """Name of the variants that can run on this kind of processor."""
     x86 = platform.machine().lower() in ("x86_64", "amd64")
     return tuple(VARIANTS) if x86 else ("baseline",)
 
 
 def library_file(variant: str) -> Path:
-    """Where the shared object of a variant lies."""
+    """Return the path of a variant's shared object."""
     return HERE / f"gaussians_{variant}.so"
 
 
@@ -59,7 +59,7 @@ def source_digest() -> str:
 
 
 def compiler() -> str:
-    """Path of the C++ compiler: $CXX, g++, c++ or clang++.
+    """Return the path of the C++ compiler: $CXX, g++, c++ or clang++.
 
     Raises:
         BuildError: there is none.

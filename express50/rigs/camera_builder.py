@@ -22,7 +22,7 @@ def camera_from_K(
     size: tuple[int, int],
     cam_from_world: np.ndarray,
 ) -> Camera:
-    """Returns a camera of the smallest COLMAP model that holds the distortion.
+    """Return a camera of the smallest COLMAP model that holds the distortion.
 
     Args:
         camera_id: its name.
@@ -57,7 +57,7 @@ def camera_from_K(
 
 
 def names_from_files(files: Sequence[str]) -> list[str]:
-    """Names cameras after image files: the folder where each folder holds one, else the stem.
+    """Name cameras after image files: the folder where each folder holds one, else the stem.
 
     ``cam00/000000.jpg, cam01/000000.jpg`` gives ``cam00, cam01``; ``x/a.jpg, x/b.jpg`` ``a, b``.
     """
@@ -73,7 +73,7 @@ def names_from_files(files: Sequence[str]) -> list[str]:
 
 
 def at_size(cameras: dict[str, Camera], size: tuple[int, int] | None) -> dict[str, Camera]:
-    """Returns the cameras with K scaled to the footage's size (width, height); None leaves them.
+    """Return the cameras with K scaled to the footage's size (width, height); None leaves them.
 
     Raises:
         CalibrationError: the aspect ratio is another, so that a crop and not a scale is missing.
@@ -94,7 +94,7 @@ def at_size(cameras: dict[str, Camera], size: tuple[int, int] | None) -> dict[st
 
 
 def in_metres(cameras: dict[str, Camera], metres_per_unit: float) -> dict[str, Camera]:
-    """Returns the cameras with positions scaled to metres.
+    """Return the cameras with positions scaled to metres.
 
     Raises:
         CalibrationError: the factor is not a positive finite number.
@@ -110,7 +110,7 @@ def in_metres(cameras: dict[str, Camera], metres_per_unit: float) -> dict[str, C
 
 
 def checked(cameras: dict[str, Camera], path: Path) -> dict[str, Camera]:
-    """Returns the cameras after the checks that our own calibration file must pass.
+    """Return the cameras after the checks that our own calibration file must pass.
 
     Raises:
         CalibrationError: there are none, or one has a wrong rotation, focal length or number.
@@ -119,7 +119,7 @@ def checked(cameras: dict[str, Camera], path: Path) -> dict[str, Camera]:
 
 
 def holds(path: Path, word: str) -> bool:
-    """Returns whether a file contains a word.
+    """Return whether a file contains a word.
 
     Raises:
         CalibrationError: it cannot be read, or is too large to be a calibration.

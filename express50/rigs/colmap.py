@@ -43,12 +43,12 @@ class Shot(NamedTuple):
 
 
 def is_colmap(path: Path) -> bool:
-    """Returns whether a folder holds a COLMAP model."""
+    """Return whether a folder holds a COLMAP model."""
     return any((path / f"images.{end}").is_file() for end in ("bin", "txt"))
 
 
 def read_colmap_images(path: Path) -> tuple[dict[str, Camera], dict[str, str]]:
-    """Returns every posed image as a camera, and its image file, by camera.
+    """Return every posed image as a camera, and its image file, by camera.
 
     World and unit are the model's own.
 

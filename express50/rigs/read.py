@@ -44,7 +44,7 @@ LEVELS, ENTRIES = 16, 64  # of nesting, and in a matrix
 
 
 def guess_format(path: Path) -> str:
-    """Returns the format of a file or folder.
+    """Return the format of a file or folder.
 
     Raises:
         CalibrationError: it does not exist or fits none.
@@ -74,7 +74,7 @@ def read_rig(
     size: tuple[int, int] | None = None,
     metres_per_unit: float = 1.0,
 ) -> dict[str, Camera]:
-    """Reads the cameras of a calibration that another tool wrote.
+    """Read the cameras of a calibration that another tool wrote.
 
     Args:
         path: file or folder.
@@ -98,7 +98,7 @@ def read_rig(
 
 
 def read_opencv_yaml(path: Path, size: tuple[int, int] | None) -> dict[str, Camera]:
-    """Reads the cameras of a folder of ``<camera>.yml`` files, or one such file.
+    """Read the cameras of a folder of ``<camera>.yml`` files, or one such file.
 
     ``size`` is the width and height of the images where the files do not say.
 
@@ -119,7 +119,7 @@ def read_opencv_yaml(path: Path, size: tuple[int, int] | None) -> dict[str, Came
 
 
 def _open(path: Path) -> cv2.FileStorage:
-    """Opens a file after refusing nesting that would overflow OpenCV's recursive parser."""
+    """Open a file after refusing nesting that would overflow OpenCV's recursive parser."""
     text = read_text(path, CalibrationError, TOML_LIMIT)
     if not text.startswith("%YAML"):
         raise CalibrationError(f"{path}: does not begin with %YAML; expected OpenCV's YAML 1.0")
@@ -139,7 +139,7 @@ def _open(path: Path) -> cv2.FileStorage:
 
 @contextmanager
 def _damage(path: Path) -> Iterator[None]:
-    """Names the file in errors of OpenCV, which checks a value only when it is asked for it."""
+    """Name the file in errors of OpenCV, which checks a value only when it is asked for it."""
     try:
         yield
     except (cv2.error, SystemError, ValueError, OverflowError, TypeError) as error:
@@ -152,7 +152,7 @@ def _damage(path: Path) -> Iterator[None]:
 def _matrix(
     storage: cv2.FileStorage, keys: tuple[str, ...], path: Path, optional: bool = False
 ) -> np.ndarray:
-    """Reads the first of the named matrices that exists; a 3 x 3 one unless it is optional."""
+    """Read the first of the named matrices that exists; a 3 x 3 one unless it is optional."""
     for key in keys:
         node = storage.getNode(key)
         if node.empty():
@@ -174,7 +174,7 @@ def _matrix(
 
 
 def _list_of_numbers(path: Path, key: str, node: cv2.FileNode) -> np.ndarray:
-    """Reads a list of numbers, or a list of rows of them."""
+    """Read a list of numbers, or a list of rows of them."""
     entries = [node.at(i) for i in range(min(node.size(), ENTRIES))]
     if not any(entry.isSeq() for entry in entries):
         return np.array([entry.real() for entry in entries])
@@ -185,7 +185,7 @@ def _list_of_numbers(path: Path, key: str, node: cv2.FileNode) -> np.ndarray:
 
 
 def _pose(storage: cv2.FileStorage, path: Path) -> np.ndarray:
-    """Reads a pose world to camera (4, 4); a rotation is a matrix or Rodrigues' vector."""
+    """Read a pose world to camera (4, 4); a rotation is a matrix or Rodrigues' vector."""
     R = _matrix(storage, _ROTATION, path, optional=True)
     t = _matrix(storage, _TRANSLATION, path, optional=True)
     if R.size == 3:
@@ -211,7 +211,7 @@ def _image_size(
 
 
 def read_nersemble(path: Path) -> dict[str, Camera]:
-    """Reads cameras by serial number, at the release's full size.
+    """Read cameras by serial number, at the release's full size.
 
     Raises:
         CalibrationError: world_2_cam or intrinsics are missing or have another shape.
@@ -232,7 +232,7 @@ def read_nersemble(path: Path) -> dict[str, Camera]:
 
 
 def read_renderme(path: Path) -> dict[str, Camera]:
-    """Reads the cameras of an SMC with a Calibration group (in full releases the ``_anno`` one).
+    """Read the cameras of an SMC with a Calibration group (in full releases the ``_anno`` one).
 
     Raises:
         CalibrationError: the file has no calibration or no resolution, or an array's shape is off.
@@ -267,7 +267,7 @@ def read_renderme(path: Path) -> dict[str, Camera]:
 
 
 def _smc_size(path: Path, file: h5py.File) -> tuple[int, int]:
-    """Reads width and height, which are stored the other way round; else the release's own."""
+    """Read width and height, which are stored the other way round; else the release's own."""
     group = child(file, "Camera", str(path))
     size = np.array((2048, 2448))
     if isinstance(group, h5py.Group):

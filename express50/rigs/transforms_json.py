@@ -20,7 +20,7 @@ _HELD = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE")
 
 
 def is_transforms(path: Path) -> bool:
-    """Returns whether a file, or a folder's transforms.json, has frames with matrices."""
+    """Return whether a file, or a folder's transforms.json, has frames with matrices."""
     path = _file(path)
     return path.suffix == ".json" and path.is_file() and holds(path, "transform_matrix")
 
@@ -30,7 +30,7 @@ def _file(path: Path) -> Path:
 
 
 def read_transforms(path: Path, size: tuple[int, int] | None) -> dict[str, Camera]:
-    """Reads one camera per frame, or per camera index where time steps share cameras.
+    """Read one camera per frame, or per camera index where time steps share cameras.
 
     Args:
         path: the file, or the folder that holds transforms.json.
@@ -72,7 +72,7 @@ def read_transforms(path: Path, size: tuple[int, int] | None) -> dict[str, Camer
 
 
 def camera_names(frames: list[dict]) -> list[str]:
-    """Names the camera of each frame: by its index where all have one, else by its file."""
+    """Name the camera of each frame: by its index where all have one, else by its file."""
     if all("camera_index" in frame for frame in frames):
         return [f"cam{int(frame['camera_index']):02d}" for frame in frames]
     return names_from_files(
@@ -113,7 +113,7 @@ def _camera(where: str, name: str, row: dict, size: tuple[int, int] | None) -> C
 
 
 def _focal(row: dict, axis: str, side: int) -> float | None:
-    """Returns the focal length along an axis, pixels, or None where it is not given."""
+    """Return the focal length along an axis, pixels, or None where it is not given."""
     if f"fl_{axis}" in row:
         return float(row[f"fl_{axis}"])
     if f"camera_angle_{axis}" in row:

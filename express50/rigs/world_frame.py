@@ -36,7 +36,7 @@ NEAR_M, FAR_M = 0.1, 10.0
 
 
 def meeting_point(cameras: Mapping[str, Camera]) -> np.ndarray | None:
-    """Returns the point (3,) nearest to all optical axes; None for (nearly) parallel axes."""
+    """Return the point (3,) nearest to all optical axes; None for (nearly) parallel axes."""
     total, right = np.zeros((3, 3)), np.zeros(3)
     middle = np.mean([c.center for c in cameras.values()], axis=0)
     for camera in cameras.values():
@@ -50,7 +50,7 @@ def meeting_point(cameras: Mapping[str, Camera]) -> np.ndarray | None:
 
 
 def depths_behind(cameras: Mapping[str, Camera]) -> dict[str, float]:
-    """Returns the depths, metres, of the cameras that have the rig's meeting point behind them.
+    """Return the depths, metres, of the cameras that have the rig's meeting point behind them.
 
     Inverted matrices (camera to world) and a wrong axis convention show here. Empty where the axes
     do not meet.
@@ -67,7 +67,7 @@ def depths_behind(cameras: Mapping[str, Camera]) -> dict[str, float]:
 
 
 def check_meeting(cameras: Mapping[str, Camera], where: str) -> None:
-    """Raises CalibrationError unless the point the cameras look at is in front of each of them."""
+    """Raise CalibrationError unless the point the cameras look at is in front of each of them."""
     problem = _describe_behind(depths_behind(cameras))
     if problem:
         raise CalibrationError(
@@ -77,7 +77,7 @@ def check_meeting(cameras: Mapping[str, Camera], where: str) -> None:
 
 
 def _describe_behind(depths: Mapping[str, float]) -> str:
-    """Puts the result of `depths_behind` into words; empty where it is empty."""
+    """Put the result of `depths_behind` into words; empty where it is empty."""
     if not depths:
         return ""
     shown = ", ".join(f"{name} (z = {depth:.3g} m)" for name, depth in list(depths.items())[:4])
@@ -109,7 +109,7 @@ class RigVerdict:
 
 
 def judge(cameras: Mapping[str, Camera]) -> RigVerdict:
-    """Judges a rig of at least one camera."""
+    """Judge a rig of at least one camera."""
     problem = _describe_behind(depths_behind(cameras))
     point = meeting_point(cameras)
     if point is None:
@@ -142,7 +142,7 @@ def judge(cameras: Mapping[str, Camera]) -> RigVerdict:
 
 
 def _remedy(cameras: Mapping[str, Camera]) -> str:
-    """Names the first other reading of the matrices that passes."""
+    """Name the first other reading of the matrices that passes."""
     readings = {
         "the matrices are camera to world: invert them": lambda T: np.linalg.inv(T),
         "the axes are OpenGL's: flip y and z": lambda T: FLIP_YZ @ T,
@@ -161,7 +161,7 @@ def _remedy(cameras: Mapping[str, Camera]) -> str:
 def canonical_from_rig(
     cameras: Mapping[str, Camera], fallback: np.ndarray, head_up: np.ndarray | None = None
 ) -> np.ndarray:
-    """Returns the transform (4, 4) from the rig's space to the canonical world of this module.
+    """Return the transform (4, 4) from the rig's space to the canonical world of this module.
 
     `fallback` (3,), rig space, is the origin when the axes do not meet (one camera, or parallel);
     `head_up` (3,) is the direction from chin to crown, where a head is known.
@@ -187,12 +187,12 @@ def canonical_from_rig(
 
 
 def _level(vector: np.ndarray, up: np.ndarray) -> np.ndarray:
-    """Unit direction of a vector's part across `up`; zero if there is hardly any."""
+    """Return the unit direction of a vector's part across `up`; zero if there is hardly any."""
     level = vector - up * (up @ vector)
     length = np.linalg.norm(level)
     return level / length if length > 1e-3 * np.linalg.norm(vector) else np.zeros(3)
 
 
 def move_cameras(cameras: Mapping[str, Camera], new_from_old: np.ndarray) -> dict[str, Camera]:
-    """Returns all cameras after the world moved by a rigid transform (4, 4)."""
+    """Return all cameras after the world moved by a rigid transform (4, 4)."""
     return {name: transform_camera(camera, new_from_old) for name, camera in cameras.items()}

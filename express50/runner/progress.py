@@ -77,17 +77,17 @@ class RunLog:
         self._thread.join()
 
     def current(self, count: int) -> None:
-        """So many items are up to date already."""
+        """Count the items that are up to date already."""
         with self._lock:
             self._run = replace(self._run, current=self._run.current + count)
 
     def begin(self, item: str) -> None:
-        """An item is worked at."""
+        """Note that an item is being worked on."""
         with self._lock:
             self._run.running[item] = time.time()
 
     def settle(self, item: str) -> None:
-        """An item is done, or failed."""
+        """Note that an item is done, or failed."""
         with self._lock:
             self._run.running.pop(item, None)
 

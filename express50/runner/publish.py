@@ -101,7 +101,7 @@ def hold_stages(dataset: Dataset, names: Iterable[str]) -> Iterator[None]:
 
 
 def is_running(dataset: Dataset, stage: str) -> bool:
-    """Whether some process runs a stage at this moment."""
+    """Return whether some process runs a stage at this moment."""
     path = dataset.staging_dir / f".{stage}.lock"
     if not path.is_file():
         return False

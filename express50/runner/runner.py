@@ -59,7 +59,7 @@ class Summary:
 
     @property
     def ok(self) -> bool:
-        """Whether no item failed."""
+        """Return whether no item failed."""
         return self.count("failed") == 0
 
     def to_json(self) -> dict[str, Any]:

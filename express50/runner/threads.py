@@ -24,7 +24,10 @@ VARIABLES = (
 
 
 def thread_environment(threads: int) -> dict[str, str]:
-    """Environment variables that cap every known pool; they work before a library is imported."""
+    """Return environment variables that cap every known pool.
+
+    They work before a library is imported.
+    """
     return dict.fromkeys(VARIABLES, str(threads))
 
 
@@ -44,5 +47,8 @@ def cap_threads(threads: int) -> None:
 
 @functools.lru_cache(maxsize=1)
 def _libraries(modules: int) -> ThreadpoolController:
-    """Libraries with a pool; looking for them takes 1.5 ms, and only an import brings new ones."""
+    """Find the libraries with a pool.
+
+    Looking for them takes 1.5 ms, and only an import brings new ones.
+    """
     return ThreadpoolController()

@@ -164,7 +164,7 @@ class ShardReader:
         return entry.members[name]
 
     def meta(self, number: int) -> dict:
-        """The sample's meta.json."""
+        """Return the sample's meta.json."""
         return self._meta(number, self.member(number, "meta.json"))
 
     def _meta(self, number: int, data: bytes) -> dict:
@@ -287,7 +287,7 @@ def _shard_entries(root: Path, shard: dict) -> Iterator[Entry]:
 
 
 def sample_picture(sample: dict) -> np.ndarray:
-    """Picture (H, 3 W or 4 W, 3) uint8: rgb, alpha, depth (near is bright), parts if labelled."""
+    """Lay RGB, alpha, depth (near is bright) and any labels side by side, (H, 3 or 4 W, 3)."""
     depth, valid = sample["depth"], sample["valid"]
     shade = np.zeros(depth.shape, np.uint8)
     if valid.any():

@@ -41,7 +41,7 @@ class Lighting:
 
 
 def make_lighting(number: int, seed: int) -> Lighting:
-    """The studio's lights on the day a subject was recorded; each day differs a little."""
+    """Return the studio's lights on the day a subject was recorded; each day differs a little."""
     rng = random_stream(seed, number, 9)
     towards = np.array(
         [[0.75, 0.65, 0.9], [-0.85, 0.35, 0.75], [-0.55, 0.55, -0.9], [0.8, 0.3, -0.7]]
@@ -260,7 +260,7 @@ def _eye_albedo(scene: LitScene, place: np.ndarray) -> np.ndarray:
 def _hair(
     lighting: Lighting, n: np.ndarray, v: np.ndarray, albedo: np.ndarray, tangent: np.ndarray
 ) -> np.ndarray:
-    """A pale and a coloured highlight along the strand, and a diffuse term (Kajiya, Kay 1989)."""
+    """Add a pale and a coloured highlight along the strand, and diffuse light (Kajiya 1989)."""
     along, seen_along = tangent @ lighting.directions.T, dot(tangent, v)
     across = np.sqrt(np.clip(1.0 - along * along, 0.0, 1.0))
     shown = np.clip(0.35 + 0.75 * (n @ lighting.directions.T), 0.0, 1.0)

@@ -195,7 +195,7 @@ def _jacobian(points: Tensor, K: Tensor, width: int, height: int) -> Tensor:
 
 
 def _clamp(value: Tensor, low: Tensor, high: Tensor) -> Tensor:
-    """``torch.clamp`` whose gradient reaches the bounds (they depend on K) where they are used."""
+    """Clamp as torch does, but let the gradient reach the bounds (they depend on K)."""
     return torch.where(value < low, low, torch.where(value > high, high, value))
 
 

@@ -14,12 +14,12 @@ __all__ = ["COMMAND", "STAGE", "CalibrateConfig"]
 
 
 def items(dataset: Dataset) -> list[str]:
-    """Lists the subjects: a rig may be bumped between two, so each has its own cameras."""
+    """List the subjects: a rig may be bumped between two, so each has its own cameras."""
     return dataset.subjects()
 
 
 def inputs(dataset: Dataset, item: str, config: CalibrateConfig) -> dict[str, Path | str]:
-    """Lists the frame index, the landmark weights, and calibration and board images if given."""
+    """List the frame index, the landmark weights, and calibration and board images if given."""
     # Imported here, as everything heavy: listing the stages must stay quick.
     from express50.landmarks.network import WEIGHTS
 
@@ -35,7 +35,7 @@ def inputs(dataset: Dataset, item: str, config: CalibrateConfig) -> dict[str, Pa
 
 
 def run(dataset: Dataset, item: str, config: CalibrateConfig, out: Path) -> Result:
-    """Writes the cameras of one subject, plots, and from a board the cameras' colour gains."""
+    """Write the cameras of one subject, plots, and from a board the cameras' colour gains."""
     from pipelines.calibrate.stage import run as work
 
     return work(dataset, item, config, out)
@@ -56,7 +56,7 @@ STAGE = Stage(
 
 
 def add_commands(subparsers: Any) -> None:
-    """Adds ``express50 cameras``, see `pipelines.calibrate.cli`."""
+    """Add ``express50 cameras``, see `pipelines.calibrate.cli`."""
     from pipelines.calibrate.cli import add_commands as add
 
     add(subparsers)

@@ -62,7 +62,7 @@ class _Linear:
     sizes: np.ndarray
 
     def cost(self, scale: float) -> float:
-        """Returns half the squared sizes, flattened by Cauchy's loss."""
+        """Return half the squared sizes, flattened by Cauchy's loss."""
         return 0.5 * scale**2 * float(np.log1p((self.sizes / scale) ** 2).sum())
 
 
@@ -76,7 +76,7 @@ def adjust_rig(
     iterations: int = ITERATIONS,
     expected: Mapping[str, Camera] | None = None,
 ) -> AdjustedRig:
-    """Fits cameras and points (P, 3) to tracks by the method of Levenberg and Marquardt.
+    """Fit cameras and points (P, 3) to tracks by the method of Levenberg and Marquardt.
 
     There is one fit of at most `iterations` per scale, wide ones first: the residual, in sigmas, at
     which Cauchy's weight has fallen to a half. Only `free` cameras change, None frees all. Priors
@@ -93,7 +93,7 @@ def adjust_rig(
     logs = np.array([_lens(camera)[0] for camera in rig]) - moved[:, 6]
 
     def prior(moved: np.ndarray) -> tuple[float, np.ndarray]:
-        """Returns the priors' cost and its gradient (10C,)."""
+        """Return the priors' cost and its gradient (10C,)."""
         gradient, tied = information * moved, ties @ (logs + moved[:, 6])
         cost = 0.5 * float((gradient * moved).sum() + (logs + moved[:, 6]) @ tied)
         gradient[:, 6] += tied
@@ -133,7 +133,7 @@ def adjust_rig(
 def single_camera_gains(
     fit: AdjustedRig, tracks: PointTracks, priors: RigPriors, scale: float, free: Collection[str]
 ) -> np.ndarray:
-    """Estimates (C,) how much the cost would fall if each camera alone joined the `free` ones.
+    """Estimate (C,) how much the cost would fall if each camera alone joined the `free` ones.
 
     The estimate is to first order, with all points following; 0 for cameras that are free already.
     """
@@ -151,7 +151,7 @@ def single_camera_gains(
 
 
 def triangulate_tracks(cameras: Mapping[str, Camera], tracks: PointTracks) -> np.ndarray:
-    """Triangulates (P, 3) the points nearest to their rays, reweighted robustly in three rounds."""
+    """Triangulate (P, 3) the points nearest to their rays, reweighted robustly in three rounds."""
     rig = [cameras[name] for name in tracks.names]
     xy = np.zeros_like(tracks.pixels)
     for index, camera in enumerate(rig):
@@ -179,7 +179,7 @@ def triangulate_tracks(cameras: Mapping[str, Camera], tracks: PointTracks) -> np
 
 
 def move_pose(cam_from_world: np.ndarray, step: np.ndarray) -> np.ndarray:
-    """Applies a small rotation and translation (6,), in the camera's axes, to a pose (4, 4)."""
+    """Apply a small rotation and translation (6,), in the camera's axes, to a pose (4, 4)."""
     return make_transform(axis_angle_to_matrix(step[:3]), step[3:]) @ cam_from_world
 
 
@@ -188,7 +188,7 @@ def _focal(camera: Camera) -> float:
 
 
 def _lens(camera: Camera) -> np.ndarray:
-    """Returns the unknowns (4,) of a camera's lens: those from the log focal length on."""
+    """Return the unknowns (4,) of a camera's lens: those from the log focal length on."""
     bend = camera.params[_focals(camera) + 2] if _has_bend(camera) else 0.0
     return np.array([np.log(_focal(camera)), *camera.K[:2, 2], bend])
 
@@ -202,7 +202,7 @@ def _has_bend(camera: Camera) -> bool:
 
 
 def _moved(camera: Camera, step: np.ndarray) -> Camera:
-    """Applies a step (10,) of its unknowns to a camera."""
+    """Apply a step (10,) of its unknowns to a camera."""
     p = list(camera.params)
     focals = _focals(camera)
     for i in range(focals):
@@ -219,7 +219,7 @@ def _moved(camera: Camera, step: np.ndarray) -> Camera:
 def _information(
     rig: list[Camera], priors: RigPriors, free: Collection[str] | None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the inverse variances (C, 10) of the unknowns, and the flat indices of free ones."""
+    """Return the inverse variances (C, 10) of the unknowns, and the flat indices of free ones."""
     sigma = np.zeros((len(rig), UNKNOWNS))
     for row, camera in zip(sigma, rig, strict=True):
         if free is None or camera.id in free:
@@ -310,7 +310,7 @@ def _eliminate_points(
 
 
 def _sum_by(rows: np.ndarray, group: np.ndarray, count: int) -> np.ndarray:
-    """Sums (count, ...) of rows (N, ...) by their group (N,)."""
+    """Sum (count, ...) of rows (N, ...) by their group (N,)."""
     out = np.zeros((count, *rows.shape[1:]))
     np.add.at(out, group, rows)
     return out

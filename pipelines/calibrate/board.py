@@ -50,13 +50,13 @@ class BoardCorners:
     pixels: np.ndarray
 
     def select(self, keep: np.ndarray) -> BoardCorners:
-        """Keeps the rows where `keep` (N,) is true, with the same camera and frame numbers."""
+        """Keep the rows where `keep` (N,) is true, with the same camera and frame numbers."""
         columns = (self.camera, self.frame, self.corner, self.pixels)
         return BoardCorners(self.cameras, self.frames, *(column[keep] for column in columns))
 
 
 def board_from_table(table: Mapping[str, object], where: str) -> Board:
-    """Builds the board that a parsed `board.toml` describes; `where` names the file in errors."""
+    """Build the board that a parsed `board.toml` describes; `where` names the file in errors."""
     missing = [key for key in REQUIRED if key not in table]
     if missing:
         raise CalibrationError(
@@ -82,7 +82,7 @@ def board_from_table(table: Mapping[str, object], where: str) -> Board:
 
 
 def _problem(board: Board) -> str:
-    """Says why no such board can be printed; empty if one can."""
+    """Say why no such board can be printed; empty if one can."""
     x, y, marker, square = (
         board.squares_x, board.squares_y, board.marker_length_m, board.square_length_m
     )  # fmt: skip
@@ -109,7 +109,7 @@ def _dictionary(board: Board) -> cv2.aruco.Dictionary:
 
 
 def opencv_board(board: Board) -> cv2.aruco.CharucoBoard:
-    """Returns OpenCV's object for this board (it draws, detects and lists corners)."""
+    """Return OpenCV's object for this board (it draws, detects and lists corners)."""
     made = cv2.aruco.CharucoBoard(
         (board.squares_x, board.squares_y), board.square_length_m, board.marker_length_m,
         _dictionary(board),
@@ -119,7 +119,7 @@ def opencv_board(board: Board) -> cv2.aruco.CharucoBoard:
 
 
 def board_points(board: Board) -> np.ndarray:
-    """Returns the inner corners (N, 3) in the board's space: metres, x right, y down, z into it.
+    """Return the inner corners (N, 3) in the board's space: metres, x right, y down, z into it.
 
     Row `i` is corner `i` of OpenCV's detector, row by row from the print's top left.
     """
@@ -132,7 +132,7 @@ def board_points(board: Board) -> np.ndarray:
 def detect_corners(
     image: np.ndarray, detector: cv2.aruco.CharucoDetector, board: Board
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Finds the board's corners in an image (H, W, 3) uint8: ids (N,), pixels (N, 2)."""
+    """Find the board's corners in an image (H, W, 3) uint8: ids (N,), pixels (N, 2)."""
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     corners, ids, _, _ = detector.detectBoard(grey)
     if ids is None or len(ids) == 0:
@@ -146,7 +146,7 @@ def detect_corners(
 def refine_corners(
     grey: np.ndarray, pixels: np.ndarray, sides: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Refines corners (N, 2), OpenCV's pixels, in a grey image (H, W) uint8.
+    """Refine corners (N, 2), OpenCV's pixels, in a grey image (H, W) uint8.
 
     `sides` (N,) are the shorter sides, pixels, of the squares at each corner. Returns the refined
     positions, and a mask (N,) of those that found a saddle close by.
@@ -166,7 +166,7 @@ def refine_corners(
 
 
 def _saddle(image: np.ndarray, start: np.ndarray, radius: int) -> np.ndarray | None:
-    """Walks to the saddle (2,) near a start; None if there is none or the walk diverges."""
+    """Walk to the saddle (2,) near a start; None if there is none or the walk diverges."""
     inverse, inside = _quadratic_fit(radius)
     side = 2 * radius + 1
     at = start.astype(np.float64)
@@ -186,7 +186,7 @@ def _saddle(image: np.ndarray, start: np.ndarray, radius: int) -> np.ndarray | N
 
 
 def _quadratic_fit(radius: int) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the least-squares inverse (6, M) for a x^2 + b x y + c y^2 + d x + e y + f on a disc.
+    """Return the least-squares inverse (6, M) for a x^2 + b x y + c y^2 + d x + e y + f on a disc.
 
     The second value marks the M pixels of the square patch that lie in the disc.
     """
@@ -200,7 +200,7 @@ def _quadratic_fit(radius: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def square_sides(board_xy: np.ndarray, pixels: np.ndarray, square: float) -> np.ndarray:
-    """Measures the shorter side (N,), pixels, of the squares at corners (N, 2) seen at (N, 2)."""
+    """Measure the shorter side (N,), pixels, of the squares at corners (N, 2) seen at (N, 2)."""
     homography = cv2.findHomography(board_xy, pixels, 0)[0] if len(board_xy) >= 4 else None
     if homography is None:
         return np.zeros(len(board_xy))
@@ -215,7 +215,7 @@ def square_sides(board_xy: np.ndarray, pixels: np.ndarray, square: float) -> np.
 
 
 def make_detector(board: Board) -> cv2.aruco.CharucoDetector:
-    """Returns a detector for the board with sub-pixel marker corners."""
+    """Return a detector for the board with sub-pixel marker corners."""
     parameters = cv2.aruco.DetectorParameters()
     # The chessboard corners between the markers carry the measurement; a marker's own corners are
     # only refined enough to predict those.
@@ -226,7 +226,7 @@ def make_detector(board: Board) -> cv2.aruco.CharucoDetector:
 def gather(
     found: Iterable[tuple[str, str, np.ndarray, np.ndarray]], cameras: Iterable[str]
 ) -> BoardCorners:
-    """Stacks (camera, frame, ids (N,), pixels (N, 2)) detections into one table."""
+    """Stack (camera, frame, ids (N,), pixels (N, 2)) detections into one table."""
     names = tuple(sorted(cameras))
     rows = list(found)
     frames = tuple(sorted({frame for _, frame, _, _ in rows}))
@@ -251,7 +251,7 @@ def read_corners(
     limit: int,
     look: Callable[[str, str, np.ndarray, np.ndarray, np.ndarray], None] | None = None,
 ) -> BoardCorners:
-    """Detects the board in each camera's `files`; files of one name were taken at one time.
+    """Detect the board in each camera's `files`; files of one name were taken at one time.
 
     At most `limit` images are read per camera, evenly spaced over all names (0 = all); `sizes` are
     the footage's (width, height). `look` gets camera, frame, image, ids and pixels of each.
@@ -279,7 +279,7 @@ def read_corners(
 
 
 def even(count: int, limit: int) -> list[int]:
-    """Chooses at most `limit` indices below `count`, evenly spaced."""
+    """Choose at most `limit` indices below `count`, evenly spaced."""
     if count <= limit:
         return list(range(count))
     return [int(i) for i in np.linspace(0, count - 1, limit).round()]

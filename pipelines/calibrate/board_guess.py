@@ -44,7 +44,7 @@ Views = Mapping[str, Mapping[int, BoardView]]
 
 
 def seen_from_front(view: BoardView) -> bool:
-    """Checks the sense in which corners run round the board: mirrors and wrong ids reverse it."""
+    """Check the sense in which corners run round the board: mirrors and wrong ids reverse it."""
     flat = np.column_stack([view.points[:, :2], np.ones(len(view.points))])
     affine, _, rank, _ = np.linalg.lstsq(flat, view.pixels, rcond=None)
     return bool(rank == 3 and np.linalg.det(affine[:2]) > 0)
@@ -53,7 +53,7 @@ def seen_from_front(view: BoardView) -> bool:
 def board_views(
     corners: BoardCorners, camera: str, points: np.ndarray, size: tuple[int, int]
 ) -> list[BoardView]:
-    """Lists a camera's board images that hold a pose, in order of frame.
+    """List a camera's board images that hold a pose, in order of frame.
 
     Their corners spread over two directions and over more than 3 % of the diagonal of an image of
     `size` (width, height). `points` (P, 3) are the corners on the board.
@@ -76,7 +76,7 @@ def board_views(
 def fit_intrinsics(
     views: list[BoardView], size: tuple[int, int], model: str
 ) -> tuple[np.ndarray, np.ndarray, list[int]] | None:
-    """Fits focal lengths, principal point and distortion to views of a flat board.
+    """Fit focal lengths, principal point and distortion to views of a flat board.
 
     Views that fit three times worse than the median view are set aside and the rest fitted
     again, at most three times. Returns K (3, 3), distortion (5,) in OpenCV's order and the
@@ -100,7 +100,7 @@ def fit_intrinsics(
 def _calibrate(
     views: list[BoardView], size: tuple[int, int], model: str
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
-    """Runs OpenCV's calibration (Zhang 2000); K, distortion (5,), rms (V,) pixels."""
+    """Run OpenCV's calibration (Zhang 2000); K, distortion (5,), rms (V,) pixels."""
     points = [view.points.astype(np.float32) for view in views]
     pixels = [view.pixels.astype(np.float32) for view in views]
     flags = cv2.CALIB_FIX_K3
@@ -125,7 +125,7 @@ def _calibrate(
 
 
 def camera_params(K: np.ndarray, dist: np.ndarray, model: str) -> tuple[float, ...]:
-    """Writes K (3, 3) and OpenCV's distortion (4 or more,) in COLMAP's parameter order of `model`.
+    """Write K (3, 3) and OpenCV's distortion (4 or more,) in COLMAP's parameter order of `model`.
 
     Distortion that the model lacks is left out.
     """
@@ -135,18 +135,18 @@ def camera_params(K: np.ndarray, dist: np.ndarray, model: str) -> tuple[float, .
 
 
 def as_model(camera: Camera, model: str) -> Camera:
-    """Converts a camera to another model; distortion that the model lacks is left out."""
+    """Convert a camera to another model; distortion that the model lacks is left out."""
     return replace(camera, model=model, params=camera_params(camera.K, camera.dist, model))
 
 
 def with_ideal(camera: Camera, view: BoardView) -> BoardView:
-    """Adds the normalised, undistorted coordinates of this camera to a view."""
+    """Add the normalised, undistorted coordinates of this camera to a view."""
     ideal = cv2.undistortPoints(view.pixels[:, None], camera.K, camera.dist[None])[:, 0]
     return replace(view, ideal=ideal)
 
 
 def board_poses(view: BoardView) -> list[np.ndarray]:
-    """Lists the poses cam_from_board (4, 4) that explain a view (with `ideal` set), best first.
+    """List the poses cam_from_board (4, 4) that explain a view (with `ideal` set), best first.
 
     A small flat target has two that may reproject alike (IPPE, Collins and Bartoli 2014); only the
     other cameras can decide. The second is left out where it fits 2.5 times worse.
@@ -172,7 +172,7 @@ def board_poses(view: BoardView) -> list[np.ndarray]:
 
 
 def all_board_poses(views: Views) -> dict[str, dict[int, list[np.ndarray]]]:
-    """Lists the poses of all views that have one."""
+    """List the poses of all views that have one."""
     return {
         name: {frame: found for frame, view in mine.items() if (found := board_poses(view))}
         for name, mine in views.items()
@@ -180,7 +180,7 @@ def all_board_poses(views: Views) -> dict[str, dict[int, list[np.ndarray]]]:
 
 
 def mean_transform(transforms: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Averages transforms (N, 4, 4): chordal mean of the rotations, mean of the translations."""
+    """Average transforms (N, 4, 4): chordal mean of the rotations, mean of the translations."""
     U, _, Vt = np.linalg.svd(np.tensordot(weights, transforms[:, :3, :3], 1))
     R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
     return make_transform(R, weights @ transforms[:, :3, 3] / weights.sum())
@@ -192,7 +192,7 @@ def relative_pose(
     from_poses: Mapping[int, list[np.ndarray]],
     to_poses: Mapping[int, list[np.ndarray]],
 ) -> tuple[np.ndarray, float] | None:
-    """Finds the pose to_from_from (4, 4) on which shared frames agree, and its weight in corners.
+    """Find the pose to_from_from (4, 4) on which shared frames agree, and its weight in corners.
 
     `camera` and `views` are those of the camera the pose leads to. The candidate that predicts
     most corners in other frames is averaged with those near it. None if it explains less than half
@@ -225,7 +225,7 @@ def relative_pose(
 def _predictor(
     views: list[BoardView], poses: list[list[np.ndarray]], camera: Camera
 ) -> Callable[[np.ndarray], np.ndarray]:
-    """Returns a function from a relative pose to its prediction's error (F,), pixels, per view."""
+    """Return a function from a relative pose to its prediction's error (F,), pixels, per view."""
     counts = np.array([len(view.points) for view in views])
     starts = np.concatenate([[0], np.cumsum(counts)[:-1]])
     ideal = np.concatenate([view.ideal for view in views])
@@ -254,7 +254,7 @@ def _predictor(
 
 
 def _nearness(pose: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """Robust weights (N,) of other poses; a quarter at 2 degrees or 5 % of the pose's distance."""
+    """Weigh other poses (N,) robustly: a quarter at 2 degrees or 5 % of the pose's distance."""
     angles = np.linalg.norm(matrix_to_axis_angle(pose[:3, :3].T @ others[:, :3, :3]), axis=1)
     shifts = np.linalg.norm(others[:, :3, 3] - pose[:3, 3], axis=1)
     scale = max(float(np.linalg.norm(pose[:3, 3])), 1e-3)
@@ -265,7 +265,7 @@ def _nearness(pose: np.ndarray, others: np.ndarray) -> np.ndarray:
 def join_rig(
     names: list[str], edges: Mapping[tuple[str, str], tuple[np.ndarray, float]], sweeps: int = 20
 ) -> dict[str, np.ndarray]:
-    """Places the largest connected group of cameras: poses cam_from_rig (4, 4).
+    """Place the largest connected group of cameras: poses cam_from_rig (4, 4).
 
     `edges` are the pose b_from_a and weight of each pair (a, b). The maximum spanning tree gives
     the poses, then sweeps of averaging over all edges spread the error of closing loops.
@@ -298,7 +298,7 @@ def rig_from_boards(
     views: Views,
     poses: Poses,
 ) -> dict[int, np.ndarray]:
-    """Chooses the board's pose (4, 4) in each frame: the candidate that fits its cameras best."""
+    """Choose the board's pose (4, 4) in each frame: the candidate that fits its cameras best."""
     boards = {}
     for frame in sorted({f for name in cam_from_rig for f in poses[name]}):
         seen = [name for name in sorted(cam_from_rig) if frame in poses[name]]
@@ -316,7 +316,7 @@ def rig_from_boards(
 
 
 def _view_error(cam_from_board: np.ndarray, view: BoardView) -> float:
-    """Returns a view's rms error under a pose, normalised; infinite behind the camera."""
+    """Return a view's rms error under a pose, normalised; infinite behind the camera."""
     placed = view.points @ cam_from_board[:3, :3].T + cam_from_board[:3, 3]
     if placed[:, 2].min() <= 0:
         return float("inf")

@@ -76,7 +76,7 @@ def solve_rig(
     model: str = AUTO,
     rounds: int = 3,
 ) -> BoardSolution:
-    """Calibrates every camera that the corners of one board tie together.
+    """Calibrate every camera that the corners of one board tie together.
 
     `points` (P, 3) are the board's corners, metres; `sizes` are (width, height). `model` is a lens
     model of COLMAP's; auto takes the simplest that fits, camera by camera. Each of `rounds` adjusts
@@ -120,7 +120,7 @@ def _single_cameras(
     model: str,
     dropped: dict[str, str],
 ) -> tuple[dict[str, Camera], dict[str, dict[int, BoardView]]]:
-    """Fits each camera's intrinsics on its own; returns the cameras and the views each one kept."""
+    """Fit each camera's intrinsics on its own; returns the cameras and the views each one kept."""
     cameras, kept = {}, {}
     for name in corners.cameras:
         large = board_views(corners, name, points, sizes[name])
@@ -159,7 +159,7 @@ def _first_rig(
     views: Mapping[str, dict[int, BoardView]],
     dropped: dict[str, str],
 ) -> BoardRig:
-    """Joins single cameras over shared frames; names those that agree with no other."""
+    """Join single cameras over shared frames; names those that agree with no other."""
     poses = all_board_poses(views)
     edges = {
         (a, b): found
@@ -187,7 +187,7 @@ def _refine(
     rounds: int,
     dropped: dict[str, str],
 ) -> tuple[BoardRig, BoardCorners, np.ndarray]:
-    """Adjusts, drops bad corners, images and cameras, and adjusts again."""
+    """Adjust, drop bad corners, images and cameras, and adjust again."""
     errors = corner_errors(rig, corners, points)
     keep = np.ones(len(errors), bool)
     limit = max(NEAR * float(np.hypot(c.width, c.height)) for c in rig.cameras.values())
@@ -216,7 +216,7 @@ def _refine(
 def _simplest_models(
     rig: BoardRig, kept: BoardCorners, points: np.ndarray, loss_scale: float
 ) -> BoardRig:
-    """Gives each camera the simplest lens model that its corners do not contradict.
+    """Give each camera the simplest lens model that its corners do not contradict.
 
     Superfluous distortion terms trade with the principal point and the rotation: tangential terms
     alone triple the rotation's error. The lowest Bayesian information criterion wins (Schwarz
@@ -247,7 +247,7 @@ def _simplest_models(
 def _drop_cameras(
     rig: BoardRig, corners: BoardCorners, keep: np.ndarray, number: int, dropped: dict[str, str]
 ) -> BoardRig:
-    """Drops cameras that lost most of their corners to rejection."""
+    """Drop cameras that lost most of their corners to rejection."""
     cameras = {}
     for index, name in enumerate(corners.cameras):
         if name not in rig.cameras:
@@ -266,7 +266,7 @@ def _drop_cameras(
 
 
 def _weak(rig: BoardRig, kept: BoardCorners) -> dict[str, str]:
-    """Names cameras whose corners are few, cover little of the image or tie to few others."""
+    """Name cameras whose corners are few, cover little of the image or tie to few others."""
     weak = {}
     seen = {name: set(kept.frame[kept.camera == kept.cameras.index(name)]) for name in rig.cameras}
     for name, camera in sorted(rig.cameras.items()):
@@ -285,7 +285,7 @@ def _weak(rig: BoardRig, kept: BoardCorners) -> dict[str, str]:
 
 
 def corner_errors(rig: BoardRig, corners: BoardCorners, points: np.ndarray) -> np.ndarray:
-    """Computes the reprojection errors (N, 2), pixels; `points` (P, 3) are corners on the board.
+    """Compute the reprojection errors (N, 2), pixels; `points` (P, 3) are corners on the board.
 
     Infinite where the rig has no such camera or frame, or the corner lies behind the camera.
     """
@@ -308,7 +308,7 @@ def adjust_board_rig(
     lenses: bool = True,
     cameras: bool = True,
 ) -> BoardRig:
-    """Refines board poses, and if asked `lenses` and the poses of `cameras`, over the corners.
+    """Refine board poses, and if asked `lenses` and the poses of `cameras`, over the corners.
 
     Every observed camera and frame must be in `rig`; `points` (P, 3) are corners on the board,
     metres. The Cauchy loss begins to flatten at `loss_scale_px`.
@@ -351,7 +351,7 @@ def adjust_board_rig(
 def _build(
     rig: BoardRig, corners: BoardCorners, points: np.ndarray
 ) -> tuple[pycolmap.Reconstruction, list[str], list[int]]:
-    """Writes the rig as a COLMAP reconstruction; camera i and frame i get the id i + 1."""
+    """Write the rig as a COLMAP reconstruction; camera i and frame i get the id i + 1."""
     reconstruction = pycolmap.Reconstruction()
     names = [n for i, n in enumerate(corners.cameras) if (corners.camera == i).any()]
     frames = sorted({int(f) for f in corners.frame})

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 def add_commands(subparsers: Any) -> None:
-    """Adds ``cameras import`` and ``cameras check``."""
+    """Add ``cameras import`` and ``cameras check``."""
     parser = subparsers.add_parser("cameras", help="import and check calibrations")
     actions = parser.add_subparsers(dest="action", metavar="ACTION", required=True)
     importing = actions.add_parser(
@@ -53,7 +53,7 @@ def add_commands(subparsers: Any) -> None:
 
 
 def run_import(args: argparse.Namespace) -> int:
-    """Writes the cameras and says what was found; exit code 1 when they do not fit together."""
+    """Write the cameras and say what was found; exit code 1 when they do not fit together."""
     cameras = _read(args)
     verdict = judge(cameras)
     if args.out.exists() and not args.overwrite:
@@ -72,7 +72,7 @@ def run_import(args: argparse.Namespace) -> int:
 
 
 def run_check(args: argparse.Namespace) -> int:
-    """Says what was found; exit code 1 if the cameras fit neither together nor their footage."""
+    """Say what was found; exit code 1 if the cameras fit neither together nor their footage."""
     cameras = _read(args)
     verdict = judge(cameras)
     footage = None

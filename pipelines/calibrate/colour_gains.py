@@ -47,12 +47,12 @@ class WhiteCollector:
     def look(
         self, camera: str, frame: str, image: np.ndarray, ids: np.ndarray, pixels: np.ndarray
     ) -> None:
-        """Adds one image (H, W, 3) uint8 with its corners: ids (N,), pixels (N, 2)."""
+        """Add one image (H, W, 3) uint8 with its corners: ids (N,), pixels (N, 2)."""
         light = white_light(image, ids, pixels, self.squares)
         self.light |= {(camera, frame, square): value for square, value in light.items()}
 
     def gains(self, cameras: Sequence[str]) -> ColourGains:
-        """Measures the gains of some cameras."""
+        """Measure the gains of some cameras."""
         number = {name: i for i, name in enumerate(cameras)}
         seen = {key: value for key, value in self.light.items() if key[0] in number}
         patches = {key: i for i, key in enumerate(sorted({key[1:] for key in seen}))}
@@ -65,7 +65,7 @@ class WhiteCollector:
 
 
 def white_squares(board: Board) -> dict[int, np.ndarray]:
-    """Returns the ids (4,) of the corners around each white square, by its marker's number."""
+    """Return the ids (4,) of the corners around each white square, by its marker's number."""
     side, across, down = board.square_length_m, board.squares_x - 1, board.squares_y - 1
     made = opencv_board(board)
     found = {}
@@ -80,7 +80,7 @@ def white_squares(board: Board) -> dict[int, np.ndarray]:
 def white_light(
     image: np.ndarray, ids: np.ndarray, pixels: np.ndarray, squares: Mapping[int, np.ndarray]
 ) -> dict[int, np.ndarray]:
-    """Measures the linear light (3,) of the squares' paper in an image (H, W, 3) uint8, by square.
+    """Measure the linear light (3,) of the squares' paper in an image (H, W, 3) uint8, by square.
 
     `ids` (N,) are the inner corners seen at `pixels` (N, 2), `squares` are from `white_squares`.
     Those that are too small, cut off, clipped or too dark are left out.
@@ -114,7 +114,7 @@ def white_light(
 
 
 def fit_gains(light: np.ndarray) -> tuple[np.ndarray, float | None, float | None]:
-    """Fits gains of cameras to linear light (N, C, 3) of the same N patches; NaN where not seen.
+    """Fit gains of cameras to linear light (N, C, 3) of the same N patches; NaN where not seen.
 
     Least squares of log light on a level per patch, eliminated, and a gain per camera, with
     Cauchy's loss as reflections move with the camera.
@@ -155,6 +155,6 @@ def fit_gains(light: np.ndarray) -> tuple[np.ndarray, float | None, float | None
 
 
 def _departures(value: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Returns log light (N, C, 3) less the weighted mean of each patch."""
+    """Return log light (N, C, 3) less the weighted mean of each patch."""
     total = np.maximum(weights.sum(1), 1e-12)[:, None]
     return value - ((weights[..., None] * value).sum(1) / total)[:, None]

@@ -41,7 +41,7 @@ class CalibrateConfig:
     """Frame sets in which cameras that have moved are searched; 0 does not search."""
 
     def __post_init__(self) -> None:
-        """Checks names and ranges."""
+        """Check names and ranges."""
         if self.camera_model not in (AUTO, *MODELS):
             raise ConfigError(
                 f"calibrate.camera_model is {self.camera_model!r}; expected {AUTO} or "

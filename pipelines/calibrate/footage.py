@@ -39,14 +39,14 @@ Images = Iterable[tuple[int, str, np.ndarray]]
 
 
 def reduced_camera(camera: Camera) -> Camera:
-    """Returns the camera of an image with a long side of `LONG_SIDE` at most."""
+    """Return the camera of an image with a long side of `LONG_SIDE` at most."""
     share = min(1.0, LONG_SIDE / max(camera.width, camera.height))
     size = round(camera.width * share), round(camera.height * share)
     return camera if share == 1.0 else resized(camera, *size)
 
 
 def at_footage_size(small: Camera, camera: Camera) -> Camera:
-    """Returns a reduced camera at the size of the footage, that of `camera`."""
+    """Return a reduced camera at the size of the footage, that of `camera`."""
     size = (camera.width, camera.height)
     return small if size == (small.width, small.height) else resized(small, *size)
 
@@ -62,7 +62,7 @@ def _reduced(camera: Camera, image: np.ndarray, frame: int) -> np.ndarray:
 
 
 def read_footage(index: Index, cameras: Mapping[str, Camera], count: int) -> Images:
-    """Yields reduced images of ingested footage at up to `count` instants.
+    """Yield reduced images of ingested footage at up to `count` instants.
 
     The instants are the middles of cues, or spread over all frames where there are no cues.
     """
@@ -76,7 +76,7 @@ def read_footage(index: Index, cameras: Mapping[str, Camera], count: int) -> Ima
 
 
 def read_raw_footage(root: Path, cameras: Mapping[str, Camera], count: int) -> Images:
-    """Yields reduced images of a raw capture at up to `count` instants, as `read_footage` does.
+    """Yield reduced images of a raw capture at up to `count` instants, as `read_footage` does.
 
     Of a video without cues only the first frame is read, as its length is unknown.
 
@@ -92,7 +92,7 @@ def read_raw_footage(root: Path, cameras: Mapping[str, Camera], count: int) -> I
 
 
 def _middles(cues: Iterable[Cue], count: int) -> list[int]:
-    """Returns the middle frames of up to `count` cues, evenly chosen."""
+    """Return the middle frames of up to `count` cues, evenly chosen."""
     middles = sorted((cue.start_frame + cue.end_frame) // 2 for cue in cues)
     return [middles[i] for i in even(len(middles), count)]
 
@@ -115,7 +115,7 @@ def _read_raw(camera: RawCamera, wanted: list[int]) -> Iterator[tuple[int, np.nd
 
 
 def find_points(images: Images) -> dict[int, FrameSetPoints]:
-    """Finds landmarks and features, in pixels of the images, by frame number."""
+    """Find landmarks and features, in pixels of the images, by frame number."""
     net = load_network()
     landmarks: dict[int, list[tuple[str, np.ndarray, np.ndarray]]] = {}
     features: dict[int, dict[str, Features]] = {}
@@ -129,7 +129,7 @@ def find_points(images: Images) -> dict[int, FrameSetPoints]:
 
 
 def find_features(image: np.ndarray) -> Features:
-    """Finds SIFT features in an image (H, W, 3) uint8; descriptors are roots (RootSIFT, 2012)."""
+    """Find SIFT features in an image (H, W, 3) uint8; descriptors are roots (RootSIFT, 2012)."""
     sift = cv2.SIFT_create(nfeatures=FEATURES, contrastThreshold=0.01)
     keys, described = sift.detectAndCompute(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), None)
     if not keys:
@@ -139,7 +139,7 @@ def find_features(image: np.ndarray) -> Features:
 
 
 def without_fixed(features: Mapping[str, Features]) -> dict[str, Features]:
-    """Removes features that three or more cameras of a frame set have at the same pixel.
+    """Remove features that three or more cameras of a frame set have at the same pixel.
 
     They belong to the sensors, not to the scene: dust, a watermark, fixed-pattern noise.
     """
@@ -157,7 +157,7 @@ def without_fixed(features: Mapping[str, Features]) -> dict[str, Features]:
 
 
 def known_focals(index: Index) -> dict[str, float]:
-    """Returns the focal lengths, pixels of the footage, from capture.toml or the images' EXIF.
+    """Return the focal lengths, pixels of the footage, from capture.toml or the images' EXIF.
 
     `focal_px` in capture.toml is a number, or a table by camera.
 
@@ -188,5 +188,5 @@ def known_focals(index: Index) -> dict[str, float]:
 
 
 def focal_of_film(film_mm: float, width: int, height: int) -> float:
-    """Returns the focal length, pixels, with the diagonal angle of view of one on 35 mm film."""
+    """Return the focal length, pixels, with the diagonal angle of view of one on 35 mm film."""
     return film_mm / math.hypot(36.0, 24.0) * math.hypot(width, height)

@@ -82,7 +82,7 @@ def solve_footage(
     distance_m: float,
     eye_distance_mm: float,
 ) -> FootageSolution:
-    """Solves a rig from points that its cameras saw at the same instants.
+    """Solve a rig from points that its cameras saw at the same instants.
 
     `seen` holds points by frame number; `sizes` are (width, height), `focals` the known focal
     lengths, pixels. The other settings are those of `CalibrateConfig`; `where` names the capture
@@ -147,7 +147,7 @@ def _adjust(
     seen: Mapping[int, FrameSetPoints],
     focal: float,
 ) -> tuple[PointTracks, AdjustedRig]:
-    """Adjusts a rig first to landmarks, then to features, and places cameras without a face."""
+    """Adjust a rig first to landmarks, then to features, and place cameras without a face."""
     priors = RigPriors(focal=focal, focal_spread=FOCAL_SPREAD, centre=CENTRE, bend=BEND)
 
     def with_features(rig: dict[str, Camera]) -> tuple[PointTracks, AdjustedRig]:
@@ -176,7 +176,7 @@ def _adjust(
 def _landmark_points(
     cameras: Mapping[str, Camera], seen: Mapping[int, FrameSetPoints]
 ) -> list[np.ndarray]:
-    """Triangulates landmarks (68, 3) of the frame sets in which two cameras see them."""
+    """Triangulate landmarks (68, 3) of the frame sets in which two cameras see them."""
     found = []
     for points in seen.values():
         views = [(cameras[n], p, 1 / s**2) for n, p, s in points.landmarks if n in cameras]
@@ -199,7 +199,7 @@ def _weak(tracks: PointTracks) -> dict[str, str]:
 
 
 def mean_landmarks() -> np.ndarray:
-    """Returns the landmarks (68, 3) of the built-in mean head, metres, head space."""
+    """Return the landmarks (68, 3) of the built-in mean head, metres, head space."""
     # Imported here: only rigs that come without any calibration need a head.
     from express50.head.load import load_head
     from express50.head.model import landmarks
@@ -209,7 +209,7 @@ def mean_landmarks() -> np.ndarray:
 
 
 def start_camera(name: str, size: tuple[int, int], focal: float) -> Camera:
-    """Makes a camera at the origin from nothing but a focal length, pixels."""
+    """Make a camera at the origin from nothing but a focal length, pixels."""
     params = (focal, size[0] / 2, size[1] / 2, 0.0)
     return Camera(name, size[0], size[1], "SIMPLE_RADIAL", params, np.eye(4))
 
@@ -220,7 +220,7 @@ def focal_at(
     sizes: Mapping[str, tuple[int, int]],
     head: np.ndarray,
 ) -> float:
-    """Returns the focal length, in longer sides, with which faces stand at a distance (median)."""
+    """Return the focal length, in longer sides, with which faces stand at a distance (median)."""
     distances = []
     for points in seen.values():
         for name, pixels, sigma in points.landmarks:
@@ -234,7 +234,7 @@ def focal_at(
 def pose_of_face(
     points: np.ndarray, sigma: np.ndarray, camera: Camera, head: np.ndarray
 ) -> tuple[np.ndarray, float]:
-    """Estimates the pose cam_from_head (4, 4) of landmarks (68, 2), and its rms error in sigmas.
+    """Estimate the pose cam_from_head (4, 4) of landmarks (68, 2), and its rms error in sigmas.
 
     The error is infinite if no pose puts the head in front of the camera.
     """
@@ -256,7 +256,7 @@ def pose_of_face(
 def face_rig(
     cameras: Mapping[str, Camera], seen: Mapping[int, FrameSetPoints], head: np.ndarray
 ) -> dict[str, Camera]:
-    """Poses the largest group of cameras that see faces in common frame sets."""
+    """Pose the largest group of cameras that see faces in common frame sets."""
     poses: dict[str, dict[int, tuple[np.ndarray, float]]] = {}
     for frame, points in seen.items():
         for name, pixels, sigma in points.landmarks:
@@ -285,7 +285,7 @@ def place_by_features(
     others: Mapping[str, Camera],
     seen: Mapping[int, FrameSetPoints],
 ) -> dict[str, Camera]:
-    """Places `others`, which see no face, by features that look like points the rig knows.
+    """Place `others`, which see no face, by features that look like points the rig knows.
 
     Their focal length becomes the rig's median.
     """
@@ -319,7 +319,7 @@ def place_by_features(
 
 
 def resect(pairs: np.ndarray, K: np.ndarray) -> np.ndarray | None:
-    """Estimates a pose (4, 4) from rows (M, 5) of a pixel and a point; None if too few agree."""
+    """Estimate a pose (4, 4) from rows (M, 5) of a pixel and a point; None if too few agree."""
     # A point comes once for every camera that knows it: samples must not repeat it.
     rows = np.unique(pairs, axis=0)
     if len(np.unique(rows[:, :2], axis=0)) < LEAST_INLIERS:

@@ -85,7 +85,7 @@ class FootageCheck:
 def check_footage(
     cameras: Mapping[str, Camera], seen: Mapping[int, FrameSetPoints]
 ) -> FootageCheck:
-    """Searches three or more cameras for those that have moved since they were calibrated.
+    """Search three or more cameras for those that have moved since they were calibrated.
 
     `seen` are points by frame number, in pixels of `reduced_camera`.
 
@@ -128,7 +128,7 @@ def check_footage(
 def _free_moved_cameras(
     cameras: Mapping[str, Camera], tracks: PointTracks, least_shift: float
 ) -> tuple[dict[str, Camera], list[str]]:
-    """Frees one camera after the other while that explains enough; at most a third of the rig.
+    """Free one camera after the other while that explains enough; at most a third of the rig.
 
     The first-order gain does not tell a moved camera from its neighbours where few cameras see
     each other. So the three with the largest gain are each freed in a fit of their own.
@@ -166,7 +166,7 @@ def _fit(
 
 
 def _picture_shift(before: Camera, after: Camera, fit: AdjustedRig, tracks: PointTracks) -> float:
-    """Median length, pixels, by which a camera's picture shifts between two of its poses."""
+    """Return median length, pixels, by which a camera's picture shifts between two of its poses."""
     seen = fit.points[tracks.point[tracks.camera == tracks.names.index(before.id)]]
     old, new = (project(pinhole(camera), seen)[0] for camera in (before, after))
     length = np.linalg.norm(new - old, axis=1)
@@ -175,7 +175,7 @@ def _picture_shift(before: Camera, after: Camera, fit: AdjustedRig, tracks: Poin
 
 
 def _turn_and_move(before: Camera, after: Camera) -> tuple[float, float]:
-    """Returns degrees and millimetres by which a camera was turned and moved."""
+    """Return degrees and millimetres by which a camera was turned and moved."""
     turn = after.cam_from_world[:3, :3] @ before.cam_from_world[:3, :3].T
     degrees = float(np.degrees(np.linalg.norm(matrix_to_axis_angle(turn))))
     return degrees, 1e3 * float(np.linalg.norm(after.center - before.center))
@@ -195,7 +195,7 @@ class RefinedRig:
     kept: str
 
     def figures(self, given: Mapping[str, Camera]) -> dict[str, object]:
-        """Returns metrics, including how far each camera was turned and moved."""
+        """Return metrics, including how far each camera was turned and moved."""
         moves = {}
         for name, after in {} if self.kept else self.cameras.items():
             turn_deg, move_mm = _turn_and_move(given[name], after)
@@ -223,7 +223,7 @@ def refine_by_footage(
     lenses: bool,
     start: Mapping[str, Camera] | None = None,
 ) -> RefinedRig:
-    """Refines cameras, and if asked `lenses`, by points they saw at the same instants.
+    """Refine cameras, and if asked `lenses`, by points they saw at the same instants.
 
     `seen` are points by frame number, in pixels of `reduced_camera`. `turn_deg` and `move_mm` are
     standard deviations of how far cameras may be off. `start` are the given cameras with corrected
@@ -258,7 +258,7 @@ def refine_by_footage(
 
 
 def _judge(cameras: Mapping[str, Camera], held: PointTracks) -> tuple[float, float]:
-    """Returns mean robust cost and median feature error, pixels, of held-out tracks."""
+    """Return mean robust cost and median feature error, pixels, of held-out tracks."""
     points = triangulate_tracks(cameras, held)
     fit = adjust_rig(cameras, held, points, RigPriors(), REFINE_SCALES[-1:], free=(), iterations=15)
     errors = np.linalg.norm(fit.errors, axis=1)
@@ -275,7 +275,7 @@ def refine_by_board(
     rounds: int,
     lenses: bool,
 ) -> RefinedRig:
-    """Refines cameras, and if asked `lenses`, by a ChArUco board that several see at once.
+    """Refine cameras, and if asked `lenses`, by a ChArUco board that several see at once.
 
     The scale becomes the print's; where the rig stands is kept, by a rigid motion. `points` (P, 3)
     are corners on the board, metres. Each of `rounds` takes its loss scale from the errors before.
@@ -304,7 +304,7 @@ def refine_by_board(
 def _with_boards(
     cameras: Mapping[str, Camera], corners: BoardCorners, points: np.ndarray
 ) -> BoardRig:
-    """Adds the board poses that fit the cameras best, with the cameras held."""
+    """Add the board poses that fit the cameras best, with the cameras held."""
     views = {}
     for name in sorted(set(corners.cameras) & set(cameras)):
         size = (cameras[name].width, cameras[name].height)
@@ -323,7 +323,7 @@ def _with_boards(
 
 
 def _near(rig: BoardRig, corners: BoardCorners, points: np.ndarray) -> np.ndarray:
-    """Marks the rows (N,) that the rig explains roughly."""
+    """Mark the rows (N,) that the rig explains roughly."""
     errors = np.linalg.norm(corner_errors(rig, corners, points), axis=1)
     widths = [np.hypot(c.width, c.height) for c in rig.cameras.values()]
     return errors < 2 * NEAR * max(widths, default=0.0)
@@ -336,7 +336,7 @@ def _median_error(rig: BoardRig, corners: BoardCorners, points: np.ndarray) -> f
 
 
 def _over(solved: Mapping[str, Camera], given: Mapping[str, Camera]) -> dict[str, Camera]:
-    """Lays solved cameras over the given ones by the rigid motion that most of them agree on."""
+    """Lay solved cameras over the given ones by the rigid motion that most of them agree on."""
     names = sorted(solved)
     new, old = (np.stack([rig[n].center for n in names]) for rig in (solved, given))
     if len(names) < 3:

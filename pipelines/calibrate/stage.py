@@ -66,7 +66,7 @@ class CalibratedRig:
 
 
 def run(dataset: Dataset, item: str, config: CalibrateConfig, out: Path) -> Result:
-    """Writes cameras.json and plots of one subject, and from a board the gains of its cameras."""
+    """Write cameras.json and plots of one subject, and from a board the gains of its cameras."""
     index = read_index(dataset, item)
     given = calibration_file(dataset, index)
     has_board = index.board is not None and bool(index.board["cameras"])
@@ -173,12 +173,12 @@ def _given(index: Index, path: Path, has_board: bool, config: CalibrateConfig) -
 
 
 def sizes_of(index: Index) -> dict[str, tuple[int, int]]:
-    """Returns the (width, height) of each camera's footage."""
+    """Return the (width, height) of each camera's footage."""
     return {name: (source.width, source.height) for name, source in index.cameras.items()}
 
 
 def check_given(cameras: dict[str, Camera], sizes: dict[str, tuple[int, int]], where: str) -> None:
-    """Checks that given cameras have the footage's sizes and look at one place.
+    """Check that given cameras have the footage's sizes and look at one place.
 
     Raises:
         CalibrationError: they do not, or there is none.
@@ -221,7 +221,7 @@ def _from_board(index: Index, config: CalibrateConfig) -> CalibratedRig:
 
 
 def _read_board(index: Index, limit: int) -> tuple[BoardCorners, np.ndarray, WhiteCollector]:
-    """Reads the board's corners, their places on it (P, 3), and its white squares."""
+    """Read the board's corners, their places on it (P, 3), and its white squares."""
     table = index.board or {}
     board = board_from_table(table["config"], f"{index.capture}: board.toml")
     files = {n: [index.capture / file for file in table["cameras"].get(n, [])]
@@ -276,14 +276,14 @@ def _rms(squared: np.ndarray) -> float | None:
 
 
 def _check_footage(index: Index, cameras: dict[str, Camera], count: int) -> FootageCheck | None:
-    """Searches for moved cameras in so many frame sets; None with fewer than three cameras."""
+    """Search for moved cameras in so many frame sets; None with fewer than three cameras."""
     if count < 1 or len(cameras) < 3:
         return None
     return check_footage(cameras, find_points(read_footage(index, cameras, count)))
 
 
 def draw_rig(path: Path, cameras: Mapping[str, Camera], boards: np.ndarray) -> None:
-    """Draws frusta and axes from above and from the front; `boards` (B, 3) are board origins."""
+    """Draw frusta and axes from above and from the front; `boards` (B, 3) are board origins."""
     figure = Figure(figsize=(11, 5.2), dpi=100, layout="tight")
     met = meeting_point(cameras)
     centers = np.stack([camera.center for camera in cameras.values()])
@@ -320,7 +320,7 @@ def draw_rig(path: Path, cameras: Mapping[str, Camera], boards: np.ndarray) -> N
 def draw_residuals(
     path: Path, solution: BoardSolution, per_camera_px: Mapping[str, float | None]
 ) -> None:
-    """Draws the scatter of corner errors, their mean over the image, and the rms per camera.
+    """Draw the scatter of corner errors, their mean over the image, and the rms per camera.
 
     A round scatter and arrows without a pattern mean that the lens model is sufficient.
     """
@@ -341,7 +341,7 @@ def draw_residuals(
 
 
 def _draw_field(axes: Axes, solution: BoardSolution, cells: int = 12) -> None:
-    """Draws the mean error in each cell of the image, over all cameras, as arrows."""
+    """Draw the mean error in each cell of the image, over all cameras, as arrows."""
     kept, cameras = solution.corners, solution.cameras
     known = [(c.width, c.height) if (c := cameras.get(n)) else (1, 1) for n in kept.cameras]
     where = kept.pixels / np.array(known)[kept.camera]

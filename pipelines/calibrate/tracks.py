@@ -39,7 +39,7 @@ class PointTracks:
     sigma: np.ndarray
 
     def select(self, keep: np.ndarray) -> PointTracks:
-        """Keeps the rows where `keep` (N,) is true, of points that two cameras still see."""
+        """Keep the rows where `keep` (N,) is true, of points that two cameras still see."""
         twice = np.bincount(self.point[keep], minlength=1 + self.point.max(initial=-1)) >= 2
         keep = keep & twice[self.point]
         columns = (self.camera, self.point, self.pixels, self.sigma)
@@ -48,17 +48,17 @@ class PointTracks:
         return PointTracks(self.names, camera, number, pixels, sigma)
 
     def of_cameras(self, names: tuple[str, ...]) -> PointTracks:
-        """Keeps the observations of some cameras and indexes these anew."""
+        """Keep the observations of some cameras and index these anew."""
         number = np.array([names.index(n) if n in names else -1 for n in self.names], int)
         kept = self.select(number[self.camera] >= 0)
         return replace(kept, names=names, camera=number[kept.camera])
 
     def features(self) -> np.ndarray:
-        """Marks the rows (N,) that are features, not landmarks."""
+        """Mark the rows (N,) that are features, not landmarks."""
         return self.sigma == FEATURE_SIGMA_PX
 
     def shared_points(self) -> np.ndarray:
-        """Counts the points (C,) that each camera sees together with two others."""
+        """Count the points (C,) that each camera sees together with two others."""
         views = np.bincount(self.point, minlength=1)
         rows = views[self.point] >= 3
         return np.bincount(self.camera[rows], minlength=len(self.names))
@@ -81,7 +81,7 @@ def join_tracks(
     band: float,
     verified: bool = True,
 ) -> PointTracks:
-    """Joins landmarks and matched features of frames into tracks.
+    """Join landmarks and matched features of frames into tracks.
 
     A match is at most `band` off its epipolar line, as a share of the image's diagonal. `verified`
     matches by descriptors and the pair's own fundamental matrix over all frames; `cameras` only
@@ -127,7 +127,7 @@ def join_tracks(
 
 
 def _undistorted(camera: Camera, features: Features) -> Features:
-    """Features in the pixels of the undistorted image.
+    """Return features in the pixels of the undistorted image.
 
     Where a trial lens folds there is no such pixel: descriptors of zeros match nothing.
     """
@@ -139,7 +139,7 @@ def _undistorted(camera: Camera, features: Features) -> Features:
 
 
 def _neighbours(cameras: Mapping[str, Camera]) -> list[tuple[str, str]]:
-    """Lists the pairs of cameras, in order of name, of which one is among the other's nearest."""
+    """List the pairs of cameras, in order of name, of which one is among the other's nearest."""
     names = sorted(cameras)
     axes = np.stack([cameras[name].cam_from_world[2, :3] for name in names])
     angle = np.degrees(np.arccos(np.clip(axes @ axes.T, -1, 1)))
@@ -153,7 +153,7 @@ def _neighbours(cameras: Mapping[str, Camera]) -> list[tuple[str, str]]:
 def _chain(
     names: tuple[str, ...], matches: list[tuple[str, str, np.ndarray]]
 ) -> list[list[tuple[int, int]]]:
-    """Chains pairwise matches into groups of (camera, feature).
+    """Chain pairwise matches into groups of (camera, feature).
 
     A group that holds two features of one camera contradicts itself and is left out.
     """
@@ -177,7 +177,7 @@ def _chain(
 def match_descriptors(
     a: np.ndarray, b: np.ndarray, allowed: np.ndarray | None = None
 ) -> np.ndarray:
-    """Matches descriptors (A, 128), (B, 128): `allowed` pairs (M, 2), each other's clear best."""
+    """Match descriptors (A, 128), (B, 128): `allowed` pairs (M, 2), each other's clear best."""
     if min(len(a), len(b)) < 2:
         return np.zeros((0, 2), int)
     likeness = a @ b.T
@@ -195,7 +195,7 @@ def match_descriptors(
 def epipolar_distance(
     a: Camera, b: Camera, pixels_a: np.ndarray, pixels_b: np.ndarray
 ) -> np.ndarray:
-    """Measures (A, B), pixels in b, how far each pixel in b is from the epipolar line of each in a.
+    """Measure (A, B), pixels in b, how far each pixel in b is from the epipolar line of each in a.
 
     Pixels are undistorted. Source: Hartley and Zisserman, Multiple View Geometry, 2nd ed., 9.2.
     """
@@ -209,7 +209,7 @@ def epipolar_distance(
 
 
 def verified_pairs(features: Mapping[int, tuple[Features, Features]]) -> dict[int, np.ndarray]:
-    """Returns the matches (M, 2) by frame that one fundamental matrix of two cameras explains.
+    """Return the matches (M, 2) by frame that one fundamental matrix of two cameras explains.
 
     Empty where it explains fewer than 12 matches, or fewer than two fifths of them.
     """

@@ -105,7 +105,7 @@ class LevelSet:
 
     @cached_property
     def _constant_row(self) -> np.ndarray:
-        """Row (A * B * C,) of blocks that are constant like all blocks after them, else -1."""
+        """Return rows (A * B * C,) of blocks that are constant, as all after them are, else -1."""
         least = minimum_filter(self.table, 2, mode="nearest", origin=-1)
         most = maximum_filter(self.table, 2, mode="nearest", origin=-1)
         return np.where((least == most) & (most < HELD), most, -1).astype(np.int8).ravel()

@@ -68,7 +68,7 @@ def check_quality(
     clips: Sequence[int],
     config: IngestConfig,
 ) -> tuple[dict, dict[str, str]]:
-    """Returns the figures for ``checks.json`` and the warnings by camera.
+    """Return the figures for ``checks.json`` and the warnings by camera.
 
     ``digests`` are of each camera's files, ``clips`` the frames of each recording.
     """
@@ -135,7 +135,7 @@ def movement(before: np.ndarray | None, after: np.ndarray) -> float:
 def find_steps(
     moves: Mapping[str, np.ndarray], clips: Sequence[int], reach: int
 ) -> tuple[dict[str, list[Step]], dict[str, str]]:
-    """Finds the steps of cameras that are out of step, and why other cameras cannot be judged.
+    """Find the steps of cameras that are out of step, and why other cameras cannot be judged.
 
     ``moves`` (F,) are all of one length; ``clips`` are the frames of each recording and ``reach``
     is the largest lag, frames.
@@ -359,7 +359,7 @@ def edge_width(image: np.ndarray) -> float | None:
 def judge_focus(
     widths: Mapping[str, Sequence[tuple[int, float]]], ratio: float
 ) -> tuple[dict[str, float], dict[str, str]]:
-    """Returns each camera's median width, pixels, and the cameras out of focus with the reason.
+    """Return each camera's median width, pixels, and the cameras out of focus with the reason.
 
     ``widths`` are (frame, width) samples; edges ``ratio`` times as wide as usual are out of focus.
     """

@@ -84,7 +84,7 @@ def scan_camera(
 def trimmed(
     source: CameraSource, seen: Seen, counts: tuple[int, ...], table: Path
 ) -> tuple[CameraSource, Seen]:
-    """Returns a camera and its measurements with the first ``counts`` frames of each clip.
+    """Return a camera and its measurements with the first ``counts`` frames of each clip.
 
     The ``table`` of its proxies is rewritten.
     """

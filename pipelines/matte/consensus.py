@@ -43,7 +43,7 @@ class Misfit:
 
     @property
     def size(self) -> float:
-        """Over 1 where the matte is wrong as a whole."""
+        """Return the size of the error: over 1, the matte is wrong as a whole."""
         elsewhere = min(self.stray / STRAY, self.lacking / LACKING)
         return max(elsewhere, self.lacking / MOST_LACKING)
 

@@ -33,7 +33,7 @@ LEAST_DEPTH = 0.05  # metres before the camera
 
 
 def person_alpha(net: LandmarkNet, camera: Camera, frame: np.ndarray) -> np.ndarray:
-    """Opacity (H, W) float32 of the person whose face is found in a frame (H, W, 3) uint8.
+    """Return opacity (H, W) float32 of the person whose face is found in a frame (H, W, 3) uint8.
 
     Args:
         net: finds the face.
@@ -90,7 +90,7 @@ def _parts() -> dict[int, tuple[np.ndarray, ...]]:
 def _slab(
     half_widths: tuple[float, ...], heights: tuple[float, ...], back: float, thick: float
 ) -> np.ndarray:
-    """Corners (N, 3) of a body with these half widths at these heights, about a depth."""
+    """Return corners (N, 3) of a body with these half widths at these heights, about a depth."""
     return np.array([
         (side * width, height, back + face * thick)
         for width, height in zip(half_widths, heights, strict=True)
@@ -100,7 +100,7 @@ def _slab(
 
 
 def _guess(shape: tuple[int, int], face: np.ndarray, pose: np.ndarray, K: np.ndarray) -> np.ndarray:
-    """GrabCut's mask (H, W) uint8 by where a person may be.
+    """Return GrabCut's mask (H, W) uint8 by where a person may be.
 
     Args:
         shape: height and width.
@@ -142,7 +142,7 @@ def _cut(image: np.ndarray, mask: np.ndarray) -> np.ndarray:
 
 
 def _whole(inside: np.ndarray, face: np.ndarray, hole: float) -> np.ndarray:
-    """The parts (H, W) bool that touch the face (H, W), holes up to an area in pixels filled."""
+    """Return parts (H, W) bool that touch the face (H, W), holes up to an area in pixels filled."""
     _, labels = cv2.connectedComponents(inside.astype(np.uint8), connectivity=4)
     person = np.isin(labels, np.unique(labels[face & inside]))
     holes = binary_fill_holes(person) & ~person

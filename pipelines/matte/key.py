@@ -156,7 +156,7 @@ def opened(mask: np.ndarray, radius: float) -> np.ndarray:
 
 
 def _length(error: np.ndarray, model: PlateModel) -> np.ndarray:
-    """Root mean square (H, W) of whitened errors (H, W, 3), 1 on average for mere noise."""
+    """Return root mean square (H, W) of whitened errors (H, W, 3), 1 on average for mere noise."""
     white = cv2.transform(error / model.sigma, model.whiten)
     return np.sqrt(np.einsum("...i,...i->...", white, white) / 3.0)
 
@@ -190,7 +190,7 @@ def shade_of_plate(
 def _darkened(
     image: np.ndarray, model: PlateModel, shadow: float, length: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Darkening (H, W), where neighbourhoods are plate but for it, and the difference left."""
+    """Return the darkening (H, W) where only it changes the plate, and the difference left."""
     # Darkening linear light by s darkens sRGB values by about s^(1/2.2).
     dark = np.clip(
         (image @ _LUMA) / np.maximum(model.plate @ _LUMA, 1.0), (1 - shadow) ** (1 / 2.2), 1.0
@@ -283,7 +283,7 @@ def subject_colour(image: np.ndarray, core: np.ndarray, length: int) -> np.ndarr
 
 
 def _rim(core: np.ndarray, length: int) -> np.ndarray:
-    """Pixels (H, W) of the core near its edge, but for those that may be mixed with plate."""
+    """Return pixels (H, W) of core near its edge, but for those that may be mixed with plate."""
     inner = eroded(core, 2)
     inner = inner if inner.any() else core
     return inner & ~eroded(inner, 2 * _pixels(REACH, length))

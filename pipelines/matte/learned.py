@@ -39,7 +39,7 @@ STEP = 64  # tiles start on multiples of this: networks that halve the picture s
 def background_alpha(
     network: Network, frame: np.ndarray, plate: np.ndarray, tile: int, overlap: int = OVERLAP
 ) -> np.ndarray:
-    """Opacity (H, W) float32 of a frame (H, W, 3), its plate (H, W, 3) known, 8-bit steps both.
+    """Return opacity (H, W) float32 of a frame and its plate (H, W, 3), both in 8-bit steps.
 
     Frames beyond `tile` pixels are cut up. The network pools over all it sees, so tiles differ a
     little from a whole; where memory allows, let `tile` hold the frame.
@@ -60,7 +60,7 @@ def background_alpha(
 
 
 def salient_alpha(network: Network, frame: np.ndarray) -> np.ndarray:
-    """Opacity (H, W) float32 of what stands out in a frame (H, W, 3) uint8.
+    """Return the opacity (H, W) float32 of what stands out in a frame (H, W, 3) uint8.
 
     The network sees the frame at its own size; where that is smaller, the enlarged alpha follows
     the frame's colours in the uncertain band.
@@ -81,14 +81,17 @@ def salient_alpha(network: Network, frame: np.ndarray) -> np.ndarray:
 
 
 def as_opacity(values: np.ndarray) -> np.ndarray:
-    """Opacities of values that may be logits: those leave [0, 1], what a sigmoid gave does not."""
+    """Return opacities of values that may be logits.
+
+    Those leave [0, 1], what a sigmoid gave does not.
+    """
     if values.min() >= -1e-3 and values.max() <= 1 + 1e-3:
         return np.clip(values, 0, 1)
     return (1 / (1 + np.exp(-np.clip(values, -60, 60)))).astype(np.float32)
 
 
 def refined(frame: np.ndarray, alpha: np.ndarray, factor: float) -> np.ndarray:
-    """Alpha (H, W) that was enlarged by a factor, along the colours of a frame (H, W, 3) uint8."""
+    """Refine an enlarged alpha (H, W) along the colours of a frame (H, W, 3) uint8."""
     if factor <= 1:
         return alpha
     unsure = ((alpha > 0.01) & (alpha < 0.99)).astype(np.uint8)
@@ -103,7 +106,7 @@ def refined(frame: np.ndarray, alpha: np.ndarray, factor: float) -> np.ndarray:
 
 
 def _padded(image: np.ndarray) -> np.ndarray:
-    """The image (H, W, 3) with its last row and column repeated up to a size the network takes."""
+    """Repeat an image's (H, W, 3) last row and column up to a size that the network takes."""
     height, width = (max(LEAST_SIDE, n + -n % MULTIPLE) for n in image.shape[:2])
     down, right = height - image.shape[0], width - image.shape[1]
     return cv2.copyMakeBorder(image, 0, down, 0, right, cv2.BORDER_REPLICATE)
@@ -173,7 +176,7 @@ class MattingLaplacian:
         self.mean = mean
 
     def product(self, values: np.ndarray) -> np.ndarray:
-        """L @ values, both (H, W); right where the band is."""
+        """Return L @ values, both (H, W); right where the band is."""
         average = _mean(values)[self.windows]
         together = _mean(self.image * values[..., None])[self.windows]
         slope = np.einsum("mij,mj->mi", self.inverse, together - self.mean * average[:, None])
@@ -184,7 +187,7 @@ class MattingLaplacian:
         return rest[..., 1] * values - fitted
 
     def diagonal(self) -> np.ndarray:
-        """Diagonal (H, W) of L; right where the band is."""
+        """Return the diagonal (H, W) of L; right where the band is."""
         pulled = np.einsum("mij,mj->mi", self.inverse, self.mean)
         constant = np.einsum("mi,mi->m", pulled, self.mean)
         inverse = self._summed(self.inverse.reshape(-1, 9)).reshape(*self.windows.shape, 3, 3)

@@ -114,7 +114,7 @@ def fit_plate(plate: np.ndarray, frame: np.ndarray, valid: np.ndarray) -> PlateM
 
 
 def _noise_table(error: np.ndarray, level: np.ndarray) -> np.ndarray:
-    """Robust deviation (8, 3) at each of LEVELS from errors and plate values (N, 3)."""
+    """Return the robust deviation (8, 3) at each of LEVELS from errors and plate values (N, 3)."""
     half = (LEVELS[1] - LEVELS[0]) / 2
     table = np.full((len(LEVELS), 3), np.nan)
     for channel in range(3):
@@ -131,7 +131,7 @@ def _noise_table(error: np.ndarray, level: np.ndarray) -> np.ndarray:
 
 
 def _robust_deviation(size: np.ndarray) -> float:
-    """Deviation from absolute errors, trimmed of subject pixels that slipped in.
+    """Return the deviation from absolute errors, trimmed of subject pixels that slipped in.
 
     The median finds the scale; the mean square inside three of it does not step as the median of
     whole numbers does. A normal variable cut at three deviations keeps 0.9866 of its own.
@@ -144,7 +144,7 @@ def _robust_deviation(size: np.ndarray) -> float:
 
 
 def _look_up(table: np.ndarray, level: np.ndarray) -> np.ndarray:
-    """Deviation of each channel at plate values (..., 3)."""
+    """Return the deviation of each channel at plate values (..., 3)."""
     steps = np.arange(256)
     fine = np.stack([np.interp(steps, LEVELS, table[:, c]) for c in range(3)], axis=1)
     index = np.clip(level + 0.5, 0, 255).astype(np.uint8)
@@ -152,7 +152,7 @@ def _look_up(table: np.ndarray, level: np.ndarray) -> np.ndarray:
 
 
 def _contrast_share(error: np.ndarray, by_level: np.ndarray, contrast: np.ndarray) -> float:
-    """Share of the plate's gradient that shows up as error (misregistration, compression)."""
+    """Return share of plate's gradient that shows up as error (misregistration, compression)."""
     steep = contrast > max(float(np.percentile(contrast, 90)), 2.0)
     if steep.sum() < 100:
         return 0.0

@@ -171,13 +171,13 @@ def corrected(
 
 
 def _share(more: np.ndarray, less: np.ndarray) -> float:
-    """Share of the image, by opacity, by which one alpha (H, W) uint8 exceeds another."""
+    """Return share of the image, by opacity, by which one alpha (H, W) uint8 exceeds another."""
     excess = np.maximum(more.astype(np.int64) - less, 0).sum()
     return round(float(excess) / 255 / more.size, 6)
 
 
 def border_contact(alpha: np.ndarray) -> dict[str, float]:
-    """Share of each side of the image that an alpha (H, W) uint8 covers: where it is cut off."""
+    """Return share of each side of image that an alpha (H, W) uint8 covers: where it is cut off."""
     sides = {"top": alpha[0], "right": alpha[:, -1], "bottom": alpha[-1], "left": alpha[:, 0]}
     return {side: round(float((line > 127).mean()), 4) for side, line in sides.items()}
 

@@ -74,7 +74,7 @@ class Space:
 
 
 def ball_of(cameras: Mapping[str, Camera]) -> Ball | None:
-    """The ball about what the cameras look at, as large as most have whole in view.
+    """Return the ball about what the cameras look at, as large as most have whole in view.
 
     None where the optical axes are parallel or most cameras do not look at where they meet.
     """
@@ -90,7 +90,7 @@ def ball_of(cameras: Mapping[str, Camera]) -> Ball | None:
 
 
 def projection_of(camera: Camera, ball: Ball) -> np.ndarray:
-    """Projection (3, 4) float32 of the ball's coordinates into a pinhole camera's image."""
+    """Return projection (3, 4) float32 of the ball's coordinates into a pinhole camera's image."""
     R, t = camera.cam_from_world[:3, :3], camera.cam_from_world[:3, 3]
     # Over the radius, so that depths are in its units too and float32 suffices.
     offset = (R @ ball.center + t) / ball.radius
@@ -98,7 +98,7 @@ def projection_of(camera: Camera, ball: Ball) -> np.ndarray:
 
 
 def center_of(camera: Camera, ball: Ball) -> np.ndarray:
-    """A camera's centre (3,) in the ball's coordinates."""
+    """Return a camera's centre (3,) in the ball's coordinates."""
     return (camera.center - ball.center) / ball.radius
 
 
@@ -118,7 +118,7 @@ def label_pixels(view: MatteView, margin: float) -> np.ndarray:
 
 
 def cells_in(view: MatteView, axis: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Pixel that each cell falls on, h * w where out of view, and its depth; (n, n, n) each."""
+    """Return each cell's pixel, h * w where out of view, and its depth; (n, n, n) each."""
     height, width = view.alpha.shape
     P = view.projection
     x, y, z = (
@@ -148,7 +148,7 @@ def make_space(views: Sequence[MatteView], cells: int, margin: float) -> Space:
 
 
 def subject_place(space: Space, votes: int) -> np.ndarray:
-    """Cells (n, n, n) bool where the subject may be: the ball, and where it leaves the ball."""
+    """Mark cells (n, n, n) where the subject may be: the ball, and where it leaves the ball."""
     a = space.axis
     square = a[:, None, None] ** 2 + a[:, None] ** 2 + a**2
     ball = square <= 1
@@ -165,7 +165,7 @@ def subject_place(space: Space, votes: int) -> np.ndarray:
 
 
 def splat(shape: tuple[int, int], pixels: np.ndarray, spread: int) -> np.ndarray:
-    """Pixels (h, w) bool that cells fall on (N,), each `spread` pixels around."""
+    """Return pixels (h, w) bool that cells fall on (N,), each `spread` pixels around."""
     hit = np.zeros(shape[0] * shape[1] + 1, np.uint8)
     hit[pixels] = 1
     side = 2 * spread + 1
@@ -173,7 +173,10 @@ def splat(shape: tuple[int, int], pixels: np.ndarray, spread: int) -> np.ndarray
 
 
 def cell_spread(view: MatteView, axis: np.ndarray) -> int:
-    """Pixels around a cell's own within which its neighbours fall: splats then leave no gap."""
+    """Return the pixels around a cell's own within which its neighbours fall.
+
+    Splats then leave no gap.
+    """
     focal = float(np.linalg.norm(view.projection[0, :3]))
     return max(1, int(np.ceil(focal * float(axis[1] - axis[0]) / float(view.projection[2, 3]) / 2)))
 
@@ -211,7 +214,7 @@ class Evidence:
 
 
 def evidence_of(view: MatteView, space: Space, place: np.ndarray, votes: int) -> Evidence:
-    """Evidence of all views but `view`; `place` (n, n, n) is where the subject may be."""
+    """Return evidence of all views but `view`; `place` (n, n, n) is where the subject may be."""
     shape = view.alpha.shape
     pixels, depth = cells_in(view, space.axis)
     own = space.labels[view.name][pixels]
@@ -239,7 +242,7 @@ def evidence_of(view: MatteView, space: Space, place: np.ndarray, votes: int) ->
 
 
 def _thick(view: MatteView, cells: np.ndarray) -> np.ndarray:
-    """Pixels (h, w) bool whose rays pass as many of the solid `cells` (h * w,) as most do.
+    """Return pixels (h, w) bool whose rays pass as many of the solid `cells` (h * w,) as most do.
 
     Between the tangents of few cameras the hull has corners that stand out from the subject; they
     are thin along the rays that pass the subject.
@@ -250,7 +253,7 @@ def _thick(view: MatteView, cells: np.ndarray) -> np.ndarray:
 
 
 def ruled_out(view: MatteView, evidence: Evidence, strand: float) -> np.ndarray:
-    """Pixels (h, w) bool of the matte that show nothing which the other views leave possible.
+    """Return pixels (h, w) bool of matte that show nothing which the other views leave possible.
 
     They are whole connected parts that reach further from the possible pixels than hair does.
     """
@@ -278,7 +281,7 @@ def shows_surface(
     view: MatteView, evidence: Evidence, todo: np.ndarray, others: Sequence[MatteView],
     subject: dict[str, np.ndarray],
 ) -> np.ndarray:  # fmt: skip
-    """Pixels (h, w) bool of `todo` (h, w) whose colour is that of a surface the others see there.
+    """Return pixels (h, w) bool of `todo` (h, w) coloured like a surface that others see there.
 
     Somewhere about the front of the others' hull two neighbours at least must see this colour on
     the `subject` ({name: (h, w) bool}): then this camera cannot separate it from its background.
@@ -308,7 +311,7 @@ def shows_surface(
 
 
 def subject_of(view: MatteView, evidence: Evidence) -> np.ndarray:
-    """Pixels (h, w) bool that show the subject by the matte, or by the others in a hole of it."""
+    """Return pixels (h, w) bool of the subject: by the matte, or by the others in its holes."""
     opaque = view.alpha > INSIDE
     _, parts = cv2.connectedComponents((~opaque).astype(np.uint8), connectivity=4)
     # The bottom counts as closed: there the body goes on.
@@ -321,7 +324,7 @@ def _smooth(rgb: np.ndarray) -> np.ndarray:
 
 
 def _neighbours(view: MatteView, others: Sequence[MatteView]) -> list[MatteView]:
-    """The cameras that look from nearest by, as seen from the ball's centre."""
+    """Return the cameras that look from nearest by, as seen from the ball's centre."""
     ranked = sorted(
         (o for o in others if o.name != view.name), key=lambda o: _cosine(view, o), reverse=True
     )
@@ -329,13 +332,13 @@ def _neighbours(view: MatteView, others: Sequence[MatteView]) -> list[MatteView]
 
 
 def _cosine(a: MatteView, b: MatteView) -> float:
-    """Cosine of the angle between two cameras, as seen from the ball's centre."""
+    """Return the cosine of the angle between two cameras, as seen from the ball's centre."""
     length = float(np.linalg.norm(a.center) * np.linalg.norm(b.center))
     return float(a.center @ b.center) / length if length > 0 else 0.0
 
 
 def _pixels_of(view: MatteView, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Columns, rows and whether in view (N,) of points (3, N) in the ball's coordinates."""
+    """Return columns, rows and whether in view (N,) of points (3, N) in the ball's coordinates."""
     height, width = view.alpha.shape
     x, y, z = view.projection[:, :3] @ points + view.projection[:, 3, None]
     ahead = z > 1e-6
@@ -348,7 +351,7 @@ def missed(
     view: MatteView, evidence: Evidence, others: Sequence[MatteView],
     subject: dict[str, np.ndarray],
 ) -> tuple[np.ndarray, float]:  # fmt: skip
-    """Pixels (h, w) bool to fill, and the share of what the others see that then still lacks.
+    """Return pixels (h, w) bool to fill and the share of what the others see that then still lacks.
 
     Filled are connected spots that lack alpha where the others see something solid, some of it
     well inside, and whose colour is that of the surface. Spots that the matte does not enclose
@@ -373,7 +376,7 @@ def missed(
 
 
 def _depth(mask: np.ndarray) -> np.ndarray:
-    """Distance (h, w) of a mask's pixels to its edge; the image's border is none."""
+    """Return the distance (h, w) of a mask's pixels to its edge; the image's border is none."""
     if mask.all():
         return np.full(mask.shape, float(max(mask.shape)), np.float32)
     return cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, 5)

@@ -8,7 +8,7 @@ from express50.contract.stage import Command
 
 
 def add_commands(subparsers: Any) -> None:
-    """Adds the command, see `pipelines.photo.cli`."""
+    """Add the command, see `pipelines.photo.cli`."""
     from pipelines.photo.cli import add_commands as add
 
     add(subparsers)

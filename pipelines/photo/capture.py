@@ -76,7 +76,7 @@ class PhotoSource:
 
 
 def open_picture(path: Path) -> PhotoSource:
-    """Reads a file's kind from its name, and its EXIF.
+    """Read a file's kind from its name, and its EXIF.
 
     Raises:
         CaptureError: no such file, or neither an image nor a video.
@@ -106,7 +106,7 @@ def open_picture(path: Path) -> PhotoSource:
 
 
 def upright_frames(picture: PhotoSource) -> Iterator[np.ndarray]:
-    """Decodes a photograph or a whole video: frames (H, W, 3) uint8 sRGB, turned upright."""
+    """Decode a photograph or a whole video: frames (H, W, 3) uint8 sRGB, turned upright."""
     if not picture.video:
         path = picture.path.resolve()  # it may be a link to elsewhere
         yield read_picture(path.parent, path.name, picture.orientation)
@@ -116,7 +116,7 @@ def upright_frames(picture: PhotoSource) -> Iterator[np.ndarray]:
 
 
 def guess_focal(picture: PhotoSource, width: int, height: int, film_mm: float) -> tuple[float, str]:
-    """Guesses the focal length in pixels; the source is `exif`, else `guess` by `film_mm`."""
+    """Guess the focal length in pixels; the source is `exif`, else `guess` by `film_mm`."""
     mm, source = (picture.film_mm, "exif") if picture.film_mm > 0 else (film_mm, "guess")
     return focal_of_film(mm, width, height), source
 
@@ -145,7 +145,7 @@ def make_photo_capture(
     film_mm: float = 50.0,
     windows: int = 8,
 ) -> Focal:
-    """Writes capture.toml, footage, cues and calibration; returns the focal length used.
+    """Write capture.toml, footage, cues and calibration; returns the focal length used.
 
     A photograph is one cue of one frame; a video is cut into `windows` cues of equal length, from
     each of which `align` takes a frame for the shared shape. An earlier capture of the same file
@@ -205,7 +205,7 @@ def make_photo_capture(
 
 
 def find_faces(path: Path, images: list[np.ndarray], config: TrackConfig) -> list[Detection]:
-    """Finds the faces, at least one, that are surely visible in images of one person."""
+    """Find the faces, at least one, that are surely visible in images of one person."""
     net = load_network()
     seen = [detect(net, image, DETECTOR_PASSES, config.search) for image in images]
     faces = [face for face in seen if face.score >= FACE_SCORE]
@@ -220,12 +220,12 @@ def find_faces(path: Path, images: list[np.ndarray], config: TrackConfig) -> lis
 
 
 def subject_id(path: Path) -> str:
-    """Makes a subject id from a file's name."""
+    """Make a subject id from a file's name."""
     return re.sub(r"[^A-Za-z0-9_-]+", "_", path.stem).strip("_-") or "photo"
 
 
 def _write_footage(picture: PhotoSource, folder: Path) -> None:
-    """Copies the file; a turned one, or one of a kind that no stage reads, is stored upright."""
+    """Copy the file; a turned one, or one of a kind that no stage reads, is stored upright."""
     # A former picture of another kind or suffix would make the footage ambiguous.
     shutil.rmtree(folder, ignore_errors=True)
     suffix = picture.path.suffix.lower()
@@ -250,7 +250,7 @@ def _write_footage(picture: PhotoSource, folder: Path) -> None:
 
 
 def single_camera(camera_id: str, width: int, height: int, focal: float) -> Camera:
-    """Returns a pinhole camera at the world's origin with the principal point in the middle."""
+    """Return a pinhole camera at the world's origin with the principal point in the middle."""
     K = np.array([[focal, 0.0, 0.5 * width], [0.0, focal, 0.5 * height], [0.0, 0.0, 1.0]])
     return pinhole_camera(camera_id, K, width, height, CAM_FROM_WORLD)
 
@@ -258,7 +258,7 @@ def single_camera(camera_id: str, width: int, height: int, focal: float) -> Came
 def weigh_focal(
     basis: Basis, detections: list[Detection], size: tuple[int, int], start: tuple[float, str]
 ) -> Focal:
-    """Moves a guessed focal length to where the fit is best, if the fit constrains it.
+    """Move a guessed focal length to where the fit is best, if the fit constrains it.
 
     A known focal length (`given`, `exif`) is kept; the range is measured all the same. The
     detections are of one person in one camera; `start` is a focal length, pixels, and its source.
@@ -286,7 +286,7 @@ def weigh_focal(
 
 
 def _cost(basis: Basis, detections: list[Detection], size: tuple[int, int], focal: float) -> float:
-    """Computes the cost of the landmark fit with a focal length; infinite where no fit starts."""
+    """Compute the cost of the landmark fit with a focal length; infinite where no fit starts."""
     camera = single_camera("photo", *size, focal)
     template = landmarks(basis.model, basis.model.template[None])[0].numpy()
     targets, poses = [], []

@@ -41,7 +41,7 @@ WORDS = "track the face of a bare photograph or video, without calibration"
 
 
 def add_commands(subparsers: Any) -> None:
-    """Adds the ``photo`` command."""
+    """Add the ``photo`` command."""
     parser = subparsers.add_parser(
         "photo", help=WORDS, description=WORDS,
         epilog="example: express50 photo portrait.jpg out; see out/track/portrait/qc",
@@ -71,7 +71,7 @@ def add_commands(subparsers: Any) -> None:
 
 
 def run_photo(args: argparse.Namespace) -> int:
-    """Makes the capture and runs the stages on it."""
+    """Make the capture and run the stages on it."""
     if args.subject is not None and not ID.fullmatch(args.subject):
         raise ConfigError(f"--subject {args.subject!r}: expected letters, digits, '_' and '-'")
     for name, value in (("--focal-px", args.focal_px), ("--film-mm", args.film_mm)):
@@ -116,7 +116,7 @@ def run_photo(args: argparse.Namespace) -> int:
 
 
 def _account(focal: Focal, summaries: list[Summary]) -> None:
-    """Prints what was made and how much of it is a guess."""
+    """Print what was made and how much of it is a guess."""
     for summary in summaries:
         say(*summary.lines())
     say(
@@ -128,7 +128,7 @@ def _account(focal: Focal, summaries: list[Summary]) -> None:
 
 
 def write_panel(dataset: Dataset, subject: str, config: TrackConfig, path: Path) -> None:
-    """Writes the first tracked frame, its overlay and the turned head side by side."""
+    """Write the first tracked frame, its overlay and the turned head side by side."""
     with np.load(dataset.track_file(subject)) as track:
         frame, mesh = int(track["frames"][0]), track["vertices"][0].astype(np.float64)
         expression = str(track["expressions"][0])

@@ -135,7 +135,10 @@ def _counts(cells: Cells, mask: np.ndarray) -> np.ndarray:
 
 
 def _priors(labels: np.ndarray, geometry: HeadGeometry, beyond: float) -> np.ndarray:
-    """Log-prior (3, H, W) of hair, skin and torso by place; `beyond` is skin's off the rim."""
+    """Return the log-prior (3, H, W) of hair, skin and torso by place.
+
+    `beyond` is that of skin beyond the rim.
+    """
     fade = np.clip(geometry.height / FADE, IMPOSSIBLE, -IMPOSSIBLE)
     above, below = np.maximum(fade, 0), np.minimum(fade, 0)
     on_mesh = geometry.mesh > 0

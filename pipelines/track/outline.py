@@ -88,7 +88,10 @@ class OutlineTerm:
         return cls(distance, MeshPlaces.of_vertices(ids), sigma * redundancy, gap)
 
     def residuals(self, places: np.ndarray) -> Residuals:
-        """Signed distance over sigma; inside the matte v^2 becomes v^2 / (1 + v^2 / gap^2)."""
+        """Return the signed distance over sigma.
+
+        Inside the matte, v^2 becomes v^2 / (1 + v^2 / gap^2).
+        """
         pixels, slope = project_with_slope(self.distance.camera, places)
         value, gradient = sample_distance(self.distance, pixels)
         fade = 1.0 + np.where(value < 0, value / self.gap, 0.0) ** 2

@@ -35,7 +35,7 @@ class MeshPlaces:
 
     @classmethod
     def of_vertices(cls, ids: np.ndarray) -> MeshPlaces:
-        """Vertices (n,) themselves."""
+        """Return vertices (n,) themselves."""
         return cls(ids[:, None], np.ones((len(ids), 1)))
 
     def some(self, ids: np.ndarray | slice) -> MeshPlaces:
@@ -43,14 +43,14 @@ class MeshPlaces:
         return MeshPlaces(self.vertices[ids], self.weights[ids])
 
     def minus(self, other: MeshPlaces) -> MeshPlaces:
-        """Differences between these places and as many others."""
+        """Return differences between these places and as many others."""
         return MeshPlaces(
             np.concatenate([self.vertices, other.vertices], axis=1),
             np.concatenate([self.weights, -other.weights], axis=1),
         )
 
     def at(self, vertices: np.ndarray) -> np.ndarray:
-        """Places (n, 3) on vertices (V, 3)."""
+        """Place (n, 3) on vertices (V, 3)."""
         return np.einsum("nk,nkc->nc", self.weights, vertices[self.vertices])
 
 
@@ -67,17 +67,17 @@ class Term(Protocol):
 
     @property
     def anchors(self) -> MeshPlaces:
-        """The n places."""
+        """Return the number of places."""
 
     def residuals(self, places: np.ndarray) -> Residuals:
         """Evaluate at places (n, 3), world."""
 
     def loss(self, square: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Cost (m,) and weight (m,) of squared residuals (m,)."""
+        """Return cost (m,) and weight (m,) of squared residuals (m,)."""
 
 
 def huber(square: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Huber's loss: outliers keep a constant pull."""
+    """Evaluate Huber's loss: outliers keep a constant pull."""
     length = np.sqrt(square)
     far = HUBER * (length - 0.5 * HUBER)
     weight = np.minimum(1.0, HUBER / np.maximum(length, 1e-9))
@@ -85,7 +85,10 @@ def huber(square: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def geman_mcclure(square: np.ndarray, scale: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Geman and McClure's loss: residuals well beyond `scale` (m,) lose their pull."""
+    """Evaluate the loss of Geman and McClure.
+
+    Residuals well beyond `scale` (m,) lose their pull.
+    """
     fade = 1.0 + square / scale**2
     return 0.5 * square / fade, fade**-2
 
@@ -97,7 +100,7 @@ def cost(term: Term, places: np.ndarray) -> float:
 
 
 def information(term: Term, places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Gauss-Newton matrices (n, 3, 3) and gradients (n, 3) of a term's cost by its places."""
+    """Return Gauss-Newton matrices (n, 3, 3) and gradients (n, 3) of a term by its places."""
     rows, value, slope = term.residuals(places)
     weight = term.loss((value**2).sum(1))[1][:, None, None]
     matrix, gradient = np.zeros((len(places), 3, 3)), np.zeros((len(places), 3))
@@ -125,7 +128,7 @@ class PixelTerm:
     sightings: tuple[Sighting, ...]
 
     def residuals(self, places: np.ndarray) -> Residuals:
-        """Pixels off, over sigma."""
+        """Return the pixels off, over sigma."""
         rows, values, slopes = [np.zeros(0, int)], [np.zeros((0, 2))], [np.zeros((0, 2, 3))]
         for seen in self.sightings:
             pixels, slope = project_with_slope(seen.camera, places[seen.rows])
@@ -146,7 +149,7 @@ class PointTerm:
     sigma: float
 
     def residuals(self, places: np.ndarray) -> Residuals:
-        """Metres off, over sigma."""
+        """Return the metres off, over sigma."""
         slope = np.broadcast_to(np.eye(3) / self.sigma, (len(places), 3, 3))
         return np.arange(len(places)), (places - self.goals) / self.sigma, slope
 
@@ -168,13 +171,13 @@ class NormalTerm:
     outlier: float
 
     def residuals(self, places: np.ndarray) -> Residuals:
-        """Distance along the normal, over sigma."""
+        """Return the distance along the normal, over sigma."""
         slope = (self.normals / self.sigma[:, None])[:, None]
         value = ((places - self.goals) * slope[:, 0]).sum(1, keepdims=True)
         return np.arange(len(places)), value, slope
 
     def loss(self, square: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Geman and McClure's."""
+        """Evaluate the loss of Geman and McClure."""
         return geman_mcclure(square, self.outlier / self.sigma)
 
 
@@ -192,14 +195,14 @@ class SlideTerm:
     sigma: np.ndarray
 
     def residuals(self, places: np.ndarray) -> Residuals:
-        """Metres off along the skin, over sigma."""
+        """Return the metres off along the skin, over sigma."""
         flat = np.eye(3) - self.normals[:, :, None] * self.normals[:, None, :]
         slope = flat / self.sigma[:, None, None]
         value = (slope @ (places - self.goals)[..., None])[..., 0]
         return np.arange(len(places)), value, slope
 
     def loss(self, square: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Geman and McClure's."""
+        """Evaluate the loss of Geman and McClure."""
         return geman_mcclure(square, SLIDE_OUTLIER_M / self.sigma)
 
 
@@ -210,10 +213,10 @@ class LidTerm:
     anchors: MeshPlaces
 
     def residuals(self, places: np.ndarray) -> Residuals:
-        """Metres apart, over sigma."""
+        """Return the metres apart, over sigma."""
         slope = np.broadcast_to(np.eye(3) / LID_GAP_M, (len(places), 3, 3))
         return np.arange(len(places)), places / LID_GAP_M, slope
 
     def loss(self, square: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Least squares."""
+        """Evaluate least squares."""
         return 0.5 * square, np.ones_like(square)

@@ -42,17 +42,17 @@ FPS = 30.0
 
 
 def fits_ava256(path: Path) -> bool:
-    """Returns whether a folder is a capture of AVA-256."""
+    """Return whether a folder is a capture of AVA-256."""
     return (path / AVA256_CAMERAS).is_file()
 
 
 def fits_multiface(path: Path) -> bool:
-    """Returns whether a folder is a capture of Multiface."""
+    """Return whether a folder is a capture of Multiface."""
     return (path / "KRT").is_file() and (path / "images").is_dir()
 
 
 def subject_of(path: Path) -> str:
-    """Returns the subject in the folder's name, or the whole name where it has none.
+    """Return the subject in the folder's name, or the whole name where it has none.
 
     Names are ``<date>--<time>--<subject>`` or ``m--<date>--<time>--<subject>--GHS``.
     """
@@ -63,7 +63,7 @@ def subject_of(path: Path) -> str:
 
 
 def read_ava256(path: Path, selection: Selection) -> RawCapture:
-    """Reads a capture's segments.
+    """Read a capture's segments.
 
     Raises:
         CaptureError: a list or an archive is malformed, or no picture can be found.
@@ -83,7 +83,7 @@ def read_ava256(path: Path, selection: Selection) -> RawCapture:
 
 
 def read_multiface(path: Path, selection: Selection) -> RawCapture:
-    """Reads a capture's segments.
+    """Read a capture's segments.
 
     Raises:
         CaptureError: no picture can be found, or the list of frames is malformed.

@@ -34,12 +34,12 @@ MOMENT = "photo"
 
 
 def fits_photos(path: Path) -> bool:
-    """Returns whether a folder holds photographs."""
+    """Return whether a folder holds photographs."""
     return bool(image_names(path))
 
 
 def read_photos(path: Path, selection: Selection) -> RawCapture:
-    """Reads each photograph as a camera of one moment; calibrate solves the cameras.
+    """Read each photograph as a camera of one moment; calibrate solves the cameras.
 
     A photograph that lies on its side by its EXIF is read upright.
 
@@ -71,7 +71,7 @@ def read_photos(path: Path, selection: Selection) -> RawCapture:
 
 
 def fits_colmap(path: Path) -> bool:
-    """Returns whether a folder holds a COLMAP model and its pictures."""
+    """Return whether a folder holds a COLMAP model and its pictures."""
     return _model(path) is not None and (path / "images").is_dir()
 
 
@@ -80,7 +80,7 @@ def _model(path: Path) -> Path | None:
 
 
 def read_colmap_folder(path: Path, selection: Selection) -> RawCapture:
-    """Reads every posed picture as a camera of one moment.
+    """Read every posed picture as a camera of one moment.
 
     Raises:
         CaptureError: no picture can be found.
@@ -92,14 +92,14 @@ def read_colmap_folder(path: Path, selection: Selection) -> RawCapture:
 
 
 def fits_transforms(path: Path) -> bool:
-    """Returns whether a folder, or the file itself, is a transforms.json with frames."""
+    """Return whether a folder, or the file itself, is a transforms.json with frames."""
     if path.is_dir():
         return (path / "transforms.json").is_file()
     return path.name.startswith("transforms") and path.suffix == ".json"
 
 
 def read_transforms_folder(path: Path, selection: Selection) -> RawCapture:
-    """Reads cameras and time steps of a transforms.json.
+    """Read cameras and time steps of a transforms.json.
 
     Raises:
         CaptureError: no picture can be found.

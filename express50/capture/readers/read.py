@@ -92,7 +92,7 @@ LAYOUTS = (
 
 
 def detect(path: Path, name: object = None) -> Layout:
-    """Finds the layout of a file or folder: the named one, else the first that fits.
+    """Find the layout of a file or folder: the named one, else the first that fits.
 
     Raises:
         CaptureError: it does not exist, no layout has the name, or none fits.
@@ -115,7 +115,7 @@ def detect(path: Path, name: object = None) -> Layout:
 
 
 def is_ours(path: Path) -> bool:
-    """Returns whether a path is a capture in our own layout, or is meant as one."""
+    """Return whether a path is a capture in our own layout, or is meant as one."""
     meta = _meta(path)
     if "source" in meta:
         return False
@@ -132,7 +132,7 @@ def _meta(path: Path) -> dict:
 
 
 def subject_of(path: Path) -> str:
-    """Finds the subject of a capture of any layout without reading its footage.
+    """Find the subject of a capture of any layout without reading its footage.
 
     Raises:
         CaptureError: it is not a capture, or its subject cannot be an id.
@@ -147,7 +147,7 @@ def subject_of(path: Path) -> str:
 
 
 def read_any(path: Path) -> RawCapture:
-    """Reads a capture of any layout.
+    """Read a capture of any layout.
 
     Raises:
         CaptureError: it is not a capture, or nothing of it can be used.
@@ -195,14 +195,14 @@ def _check_rig(path: Path, calibration: dict[str, Camera]) -> dict[str, str]:
 
 
 def watched(path: Path) -> list[Path]:
-    """Lists files and folders whose change makes an ingest stale."""
+    """List files and folders whose change makes an ingest stale."""
     source = footage_source(path)
     found = [path] if source == path else [path, source]
     return found + (renderme.companions(source) if renderme.fits(source) else [])
 
 
 def read_people(dataset: Dataset, subjects: Iterable[str]) -> list[dict]:
-    """Reads gender and age of subjects, in order, from their captures.
+    """Read gender and age of subjects, in order, from their captures.
 
     They are read for counts and kept nowhere; an entry is empty where the capture is gone or says
     nothing.

@@ -42,14 +42,14 @@ class Performance:
 
 
 def fits(path: Path) -> bool:
-    """Returns whether a path is an SMC, or a folder that holds some."""
+    """Return whether a path is an SMC, or a folder that holds some."""
     if path.is_file():
         return path.suffix.lower() == ".smc"
     return any(path.glob("*.smc"))
 
 
 def subject_of(path: Path) -> str:
-    """Returns the actor's number.
+    """Return the actor's number.
 
     Raises:
         CaptureError: the folder holds several actors.
@@ -78,14 +78,14 @@ def _parts(file: Path) -> tuple[str, str, str]:
 
 
 def companions(path: Path) -> list[Path]:
-    """Lists the files beside the footage that are read too."""
+    """List the files beside the footage that are read too."""
     folder = path if path.is_dir() else path.parent
     other = folder.parent.parent / "anno" / folder.name
     return [other] if other.is_dir() else []
 
 
 def performances(path: Path) -> dict[str, Performance]:
-    """Finds the performances of a folder in their order: e0 to e11, then the others.
+    """Find the performances of a folder in their order: e0 to e11, then the others.
 
     Raises:
         CaptureError: there are annotations only.
@@ -112,7 +112,7 @@ def performances(path: Path) -> dict[str, Performance]:
 
 
 def read(path: Path, selection: Selection) -> RawCapture:
-    """Reads an actor's performances.
+    """Read an actor's performances.
 
     Raises:
         CaptureError: a file is damaged, or none can be used.

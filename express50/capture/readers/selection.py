@@ -46,35 +46,35 @@ class Selection:
     metres_per_unit: float | None = None
 
     def has_sequence(self, name: str, usual: str = "*") -> bool:
-        """Returns whether a sequence is selected."""
+        """Return whether a sequence is selected."""
         return any(fnmatch.fnmatchcase(name, p) for p in self.sequences or (usual,))
 
     def left_out(self, sequences: Sequence[str]) -> dict[str, str]:
-        """Returns the sequences that are not selected, with the reason."""
+        """Return the sequences that are not selected, with the reason."""
         return {f"sequence {s}": "not asked for" for s in sequences if not self.has_sequence(s)}
 
     def has_camera(self, name: str) -> bool:
-        """Returns whether a camera is selected."""
+        """Return whether a camera is selected."""
         return not self.cameras or any(fnmatch.fnmatchcase(name, p) for p in self.cameras)
 
     def expression(self, sequence: str) -> str:
-        """Returns the expression id of a sequence: the given one, else one made of its name."""
+        """Return the expression id of a sequence: the given one, else one made of its name."""
         return self.expressions.get(sequence) or identifier(sequence, "_")
 
 
 def identifier(text: str, other: str = "_-") -> str:
-    """Makes an id of any text: ``_`` replaces all but letters, digits and ``other``."""
+    """Make an id of any text: ``_`` replaces all but letters, digits and ``other``."""
     clean = re.sub(rf"[^A-Za-z0-9{re.escape(other)}]+", "_", text).strip("_-")
     return clean or "unnamed"
 
 
 def folder_id(path: Path) -> str:
-    """Returns the folder's name as an id, of a file the name of its folder."""
+    """Return the folder's name as an id, of a file the name of its folder."""
     return identifier((path if path.is_dir() else path.parent).resolve().name)
 
 
 def parse_selection(meta: Mapping[str, Any], where: Path) -> Selection:
-    """Returns the selection that a capture.toml makes.
+    """Return the selection that a capture.toml makes.
 
     Raises:
         CaptureError: a value is of another type, or an expression id cannot be one.
@@ -107,7 +107,7 @@ def _patterns(meta: Mapping[str, Any], key: str, where: Path) -> tuple[str, ...]
 
 
 def check_selection(selection: Selection, sequences: Sequence[str], cameras: Sequence[str]) -> None:
-    """Refuses patterns that match nothing: a typing error would look like missing data.
+    """Refuse patterns that match nothing: a typing error would look like missing data.
 
     Raises:
         CaptureError: a pattern matches nothing of the layout.
@@ -151,7 +151,7 @@ def common_timeline(
     required: Collection[Moment] = (),
     dropped: Mapping[str, str] | None = None,
 ) -> Timeline:
-    """Finds the moments that all cameras share.
+    """Find the moments that all cameras share.
 
     Args:
         root: the folder that the names are relative to.

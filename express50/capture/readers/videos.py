@@ -47,12 +47,12 @@ STATEMENTS = {"01": "kids", "02": "dogs"}
 
 
 def fits_nersemble(path: Path) -> bool:
-    """Returns whether a folder is a participant's."""
+    """Return whether a folder is a participant's."""
     return (path / CAMERAS).is_file() and (path / "sequences").is_dir()
 
 
 def read_participant(path: Path, selection: Selection) -> RawCapture:
-    """Reads the sequences of a participant of NeRSemble.
+    """Read the sequences of a participant of NeRSemble.
 
     Raises:
         CaptureError: no video can be found.
@@ -116,13 +116,13 @@ class Clip:
 
     @property
     def sequence(self) -> str:
-        """The clip's name as an expression: ``happy_strong_kids_1``, of songs ``song_...``."""
+        """Return clip's name as an expression: ``happy_strong_kids_1``, of songs ``song_...``."""
         words = [self.emotion, self.intensity, self.statement, str(self.repetition)]
         return "_".join(["song", *words] if self.channel == "song" else words)
 
 
 def parse_name(stem: str) -> Clip | None:
-    """Parses a file's name without its ending; None where it is not one of RAVDESS."""
+    """Parse a file's name without its ending; None where it is not one of RAVDESS."""
     match = NAME.fullmatch(stem)
     if match is None:
         return None
@@ -139,12 +139,12 @@ def _clips(path: Path) -> dict[Path, Clip | None]:
 
 
 def fits_ravdess(path: Path) -> bool:
-    """Returns whether a path is a clip of RAVDESS or a folder of such clips."""
+    """Return whether a path is a clip of RAVDESS or a folder of such clips."""
     return any(_clips(path).values())
 
 
 def actor_of(path: Path) -> str:
-    """Returns the actor's folder name in RAVDESS, such as ``Actor_01``.
+    """Return the actor's folder name in RAVDESS, such as ``Actor_01``.
 
     Raises:
         CaptureError: the folder holds several actors.
@@ -158,7 +158,7 @@ def actor_of(path: Path) -> str:
 
 
 def read_actor(path: Path, selection: Selection) -> RawCapture:
-    """Reads an actor's clips; of a clip with and without sound the one with sound is taken.
+    """Read an actor's clips; of a clip with and without sound the one with sound is taken.
 
     Raises:
         CaptureError: no clip can be used.
@@ -199,17 +199,17 @@ def read_actor(path: Path, selection: Selection) -> RawCapture:
 
 
 def fits_video(path: Path) -> bool:
-    """Returns whether a path is a video file."""
+    """Return whether a path is a video file."""
     return path.is_file() and path.suffix.lower() in VIDEO_SUFFIXES
 
 
 def video_id(path: Path) -> str:
-    """Returns the video's name as an id."""
+    """Return the video's name as an id."""
     return identifier(path.stem)
 
 
 def read_video(path: Path, selection: Selection) -> RawCapture:
-    """Reads a video as one camera and one clip, named ``clip`` unless the selection names it.
+    """Read a video as one camera and one clip, named ``clip`` unless the selection names it.
 
     A video that lies on its side, as telephones store what they film upright, is read upright.
 

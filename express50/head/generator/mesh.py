@@ -88,7 +88,10 @@ class WholeMesh:
     left_tags: dict[str, Array]
 
     def tag(self, name: str, side: str = "both") -> Array:
-        """Indices of a tag: side "left" (x >= 0), "right" (mirrored, same order) or "both"."""
+        """Return indices of a tag.
+
+        The side is "left" (x >= 0), "right" (mirrored, same order) or "both".
+        """
         left = self.left_tags[name]
         if side == "left":
             return left

@@ -22,7 +22,7 @@ def slit_y(x: Array) -> Array:
 
 
 def _rows() -> tuple[Array, Array, Array, Array]:
-    """Front views (33,2) of slit, vermilion border and outer loop; and slit x a row point."""
+    """Return front views (33,2) of slit, vermilion and outer loop, and slit x per row point."""
     s = np.linspace(0, 1, LIP_SEGMENTS + 1)
     x = CORNER_X * np.sin(0.5 * np.pi * s)
     t = x / CORNER_X
@@ -114,7 +114,7 @@ _LOWER_CROWNS = (5.4, 5.9, 6.8, 6.9, 7.0, 10.4)
 
 
 def _arch(upper: bool) -> tuple[Array, Array, Array]:
-    """Columns along half an arch: position (N,2) as (x, z), outward normal (N,2), tooth phase."""
+    """Return (x, z) (N,2), outward normals (N,2) and tooth phase of columns along half an arch."""
     widths = _UPPER_CROWNS if upper else _LOWER_CROWNS
     edges = np.concatenate([[0], np.cumsum(widths)])
     along, phase = [0.0], [0.0]

@@ -77,7 +77,7 @@ def add_skin(half: HalfMesh) -> None:
 
 
 def _add_midline(half: HalfMesh, lip_top: float, lip_bottom: float) -> Array:
-    """Mid-plane vertices from lip to crown to nape to collar and lip to collar, and the collar."""
+    """Add mid-plane vertices from lip over crown and nape to the collar, and from lip to collar."""
     groups = []
     for azimuth, low, high in (
         (0.0, lip_top, 90.0),
@@ -229,7 +229,7 @@ def _flare(pq: Array) -> Array:
 
 
 def _relief(pq: Array, inset: Array, rim: Array) -> Array:
-    """Height (mm) of the front sheet: helix fold, scapha, antihelix, concha, tragus, lobe."""
+    """Return height (mm) of front sheet: helix fold, scapha, antihelix, concha, tragus, lobe."""
     back_top = 1 / (1 + np.exp(-(rim[:, 0] * 0.35 + rim[:, 1] * 0.12 - 0.2)))
     inset = inset[:, None]
     helix = back_top * (2.6 * window(inset, 0.06, 0.07) - 2.0 * window(inset, 0.24, 0.09))

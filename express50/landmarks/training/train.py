@@ -141,7 +141,7 @@ def descend(
 
 
 def files_in_use(step: int, files: int) -> int:
-    """Files of a head model that a step draws from: a few at first, so that it can begin soon."""
+    """Count the files that a step draws from: few at first, so that training can begin soon."""
     return min(files, FIRST_FILES + step // STEPS_PER_FILE)
 
 
@@ -195,7 +195,7 @@ def crop_batch(crops: list[TrainingCrop]) -> LandmarkBatch:
 
 
 def crop_loss(net: LandmarkNet, crops: list[TrainingCrop]) -> torch.Tensor:
-    """Distance and Laplace likelihood of the points, cross entropies of heat maps and answers."""
+    """Return the points' distance and likelihood, and entropies of heat maps and answers."""
     batch = crop_batch(crops)
     output = net(batch.images)
     # The square root's slope at zero distance is bounded by the added 0.01 px^2.
@@ -210,7 +210,7 @@ def crop_loss(net: LandmarkNet, crops: list[TrainingCrop]) -> torch.Tensor:
 
 @torch.inference_mode()
 def validate(net: LandmarkNet, views: ViewSet, seed: int) -> str:
-    """Errors in crop pixels by how far the head is turned, and how often the answers are right."""
+    """Return errors in crop pixels by the head's turn, and how often the answers are right."""
     rng = np.random.default_rng([seed, 3])
     backgrounds = make_backgrounds(50, rng)
     errors, seen, right = [], [], []
