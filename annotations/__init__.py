@@ -1,4 +1,4 @@
-"""Peak-expression labels: the store, suggestions, and the align stage that joins them."""
+"""This package labels peak expressions: labels, suggestions, and the terminal annotator."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``express50 annotate``: verbs that give labels, compare annotators, review, export and import."""
+"""``express50 annotate`` gives labels, compares annotators, reviews, exports and imports."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Labels from elsewhere: CSV or JSON files, and RenderMe-360's rule.
+"""Import labels from elsewhere: CSV or JSON files, and RenderMe-360's rule.
 
 A file holds every event, and importing it neither loses nor doubles one. The 12 expressions of
 RenderMe-360 are recorded so that the performer holds the target at the end of the clip; the

@@ -1,4 +1,4 @@
-"""A label is one event, checked when it is made and kept in an append-only file per subject.
+"""Make labels, each an event that is checked, and append them to a subject's file.
 
 A label names a camera, a decode index, its pts and a perceptual hash, so that it can never point
 at another frame unnoticed. An adjudication ranks highest, then people's labels, then a rule's, then

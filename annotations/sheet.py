@@ -1,4 +1,4 @@
-"""The contact sheet: every label as a face on one static HTML page, styled by its origin."""
+"""Draw the contact sheet: every label as a face on one static HTML page."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Suggestions of the align stage, and the reference identity that they were matched to."""
+"""Read and write the align stage's suggestions, and choose the reference identity."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Checks of labels against the footage that they name, and of people against each other.
+"""Check labels against the footage that they name, and people against each other.
 
 The installed hook ``label_problems`` names this module; see ``pyproject.toml``.
 

@@ -1,4 +1,4 @@
-"""The worklist of an annotator, the coverage of a dataset, and what labels have cost so far."""
+"""List an annotator's work, the coverage of a dataset, and what labels have cost so far."""
 
 from __future__ import annotations
 

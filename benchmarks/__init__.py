@@ -1,1 +1,1 @@
-"""Benchmarks: accuracy against truth and seconds side by side; each ends in one JSON object."""
+"""Benchmarks measure accuracy against truth beside seconds; each ends in one JSON object."""

@@ -1,4 +1,4 @@
-"""Errors of a dataset against the twin's ground truth. Opened after the stages have run, only here.
+"""Measure a dataset against the twin's truth, which is opened here, after the stages have run.
 
 A rig solved from a board lies in a world of its own: it is laid on the true one by one rigid motion
 a subject, fitted to the cameras; what is left of calibration error stays in every figure.

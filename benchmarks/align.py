@@ -1,4 +1,4 @@
-"""How well peaks and matches are suggested, and what labelling them through the real UI costs.
+"""Measure how well peaks and matches are suggested, and what labelling them in the UI costs.
 
 ``python -m benchmarks.align [--dataset DIR --truth DIR]``; without a dataset one is recorded with
 the digital twin: other subjects than the demo's, the whole script, every clip with its own timing

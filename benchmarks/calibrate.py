@@ -1,4 +1,4 @@
-"""Calibration against the twin's true rig: ``python -m benchmarks.calibrate --help``.
+"""Measure calibration against the twin's true rig.
 
 The stage's solution stands beside a baseline from the same corners: OpenCV's calibration of every
 camera alone, then relative poses averaged and chained, without a joint adjustment. Rigs are laid

@@ -1,4 +1,4 @@
-"""Rigs solved from footage alone, and given rigs refined, against the true cameras.
+"""Measure rigs solved from footage alone, and given rigs refined, against true cameras.
 
 Parts of ``python -m benchmarks.calibrate``. COLMAP's incremental mapping on the same features and
 landmarks (all frame sets of a camera as one picture, since cameras do not move) stands beside the

@@ -1,4 +1,4 @@
-"""Depth straight from the signed distances, as a second opinion on rays cast at the mesh.
+"""Trace depth in the signed distances, as a second opinion on rays cast at the mesh.
 
 Sphere tracing, then a bracketed root: no mesh comes between the grid and the depth. The stage casts
 rays at the mesh, which is seven times faster and differs by 0.005 mm.

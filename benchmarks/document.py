@@ -1,4 +1,4 @@
-"""docs/TRADEOFFS.md is written by several benchmarks: each owns one section."""
+"""Write one benchmark's section of docs/TRADEOFFS.md; several benchmarks share the page."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A stage whose items take a while and note when they were worked at; its driver can be killed.
+"""Run a stage whose items take a while and note when they were worked on, to be killed.
 
 ``python -m benchmarks.fault_stage ROOT NOTES --workers N [--scheduler ADDRESS]``
 """

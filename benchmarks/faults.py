@@ -1,4 +1,4 @@
-"""What is lost when things are killed: drivers, workers and schedulers, at random moments.
+"""Kill drivers, workers and schedulers at random moments, and measure what is lost.
 
 ``python -m benchmarks.faults`` runs a stage of slow items over and over, sends SIGKILL to one of
 its processes at random moments and starts it again, until so many kills are done; then lets one run

@@ -1,4 +1,4 @@
-"""Frame rate of GRMM end to end: ``python -m benchmarks.fps [--device cpu --n-g 128 --size 256]``.
+"""Measure GRMM's frame rate: ``python -m benchmarks.fps [--device cpu --n-g 128 --size 256]``.
 
 Decode, rasterise and refine, features and depth on, at the paper's size (N_g 512, 1024 x 1024) with
 random weights, which cost what trained ones do. Three ways: everything anew for every picture, as

@@ -1,4 +1,4 @@
-"""GRMM on shards of twin captures: ``python -m benchmarks.grmm OUT [--shards DIR]``.
+"""Measure GRMM on shards of twin captures: ``python -m benchmarks.grmm OUT [--shards DIR]``.
 
 Eight people, the last never trained on; twelve expressions; twelve cameras of 256 px, two held out;
 three frames of training people held out. Footage goes through every stage, so that the shards have

@@ -1,4 +1,4 @@
-"""Mattes against known alpha, beside plain keys and textbook matting.
+"""Measure mattes against known alpha, beside plain keys and textbook matting.
 
 ``python -m benchmarks.matte`` draws scenes (`benchmarks.matte_scenes`: dark, blond and frizzy
 strands, each before a plain and a cluttered plate) and keys them with every preset; with

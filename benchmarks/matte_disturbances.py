@@ -1,4 +1,4 @@
-"""What goes wrong on a set, laid on recorded frames: the scenes of ``benchmarks.matte_views``."""
+"""Lay what goes wrong on a set on recorded frames, for ``benchmarks.matte_views``."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Several views against the key: scenes in which no camera alone can be right.
+"""Measure several views against the key, in scenes in which no camera alone can be right.
 
 ``python -m benchmarks.matte_views`` records a rig of 24 cameras with the digital twin (a minute),
 or takes ``--dataset`` and ``--truth``, disturbs the peaks and measures the mattes before and after

@@ -1,4 +1,4 @@
-"""The scene of ``benchmarks.raster`` and its rival, autograd over explicit Gaussian-pixel pairs."""
+"""Make the scene of ``benchmarks.raster``, and its rival: autograd over explicit pairs."""
 
 from __future__ import annotations
 

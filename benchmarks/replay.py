@@ -1,4 +1,4 @@
-"""A simulated annotator at the real app: what labels cost in keys and seconds, and how fast it is.
+"""Simulate an annotator at the real app: what labels cost in keys and seconds.
 
 The annotator knows the true frames. A frame within the tolerance is accepted; any other is left for
 the nearest good one along the path that needs the fewest keys: steps, tens, and suggestions.

@@ -1,4 +1,4 @@
-"""Writing and reading packed samples, beside WebDataset, litdata and MosaicML's MDS.
+"""Write and read packed samples, beside WebDataset, litdata and MosaicML's MDS.
 
 ``python -m benchmarks.shards`` packs 2,000 samples of 512 px whose members are the same bytes for
 all four, reads them in order, shuffled and at random as bytes, and decodes ours by profile. All

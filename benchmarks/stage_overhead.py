@@ -1,4 +1,4 @@
-"""What the runner adds to an item: fingerprints, folders, receipts and their way to the disk.
+"""Measure what the runner adds to an item: fingerprints, folders, receipts.
 
 ``python -m benchmarks.stage_overhead`` runs a stage that does nothing over many items: in this
 process, in two worker processes (their start not counted) with every item alone and in batches, as

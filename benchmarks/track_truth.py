@@ -1,4 +1,4 @@
-"""Tracked meshes against the twin's truth: millimetres, pixels, coefficients and new views.
+"""Measure tracked meshes against the twin's truth: millimetres, pixels, coefficients, views.
 
 All is compared in the true world, where the estimated one is laid by one rigid motion a subject.
 """

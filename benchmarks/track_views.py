@@ -1,4 +1,4 @@
-"""Held-out cameras: their true pictures, and their pictures predicted from a tracked mesh.
+"""Predict the pictures of held-out cameras from a tracked mesh, beside the true ones.
 
 A pixel of a held-out camera whose first surface is the tracked face is a point in space. Its colour
 is the median, over the tracking cameras that see the point on the tracked mesh (not hidden by the

@@ -1,3 +1,3 @@
-"""EXPRESS-50: the core of the multi-view head capture toolkit (files, stages, cameras, heads)."""
+"""EXPRESS-50 is the core of the head capture toolkit: files, stages, cameras, heads."""
 
 __version__ = "0.1.0"

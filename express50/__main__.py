@@ -1,4 +1,4 @@
-"""``python -m express50``: the ``express50`` command."""
+"""``python -m express50`` runs the ``express50`` command."""
 
 import sys
 

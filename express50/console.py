@@ -1,4 +1,4 @@
-"""Shared frame of the command lines: one-line errors, exit codes 0, 1 and 2, clean stops."""
+"""Frame every command line: one-line errors, exit codes 0, 1 and 2, clean stops."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The errors a user sees: one line each, saying where, what, got, expected and how to fix it."""
+"""Define the errors a user sees: one line with where, what, got, expected and how to fix it."""
 
 from __future__ import annotations
 

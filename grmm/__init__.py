@@ -1,1 +1,1 @@
-"""GRMM: a Gaussian residual morphable head model, trained on packed shards."""
+"""GRMM is a Gaussian residual morphable head model, trained on packed shards."""

@@ -1,4 +1,4 @@
-"""``python -m grmm``: the ``grmm`` command."""
+"""``python -m grmm`` runs the ``grmm`` command."""
 
 import sys
 

@@ -1,4 +1,4 @@
-"""The paper's ablations as one command: rows trained and fitted under one budget, one table.
+"""Run the paper's ablations: rows trained and fitted under one budget, and one table.
 
 Finished rows are kept: a row is measured again only when its settings, the shards or the protocol
 differ from those it was measured with; a half-trained row goes on from its checkpoint.

@@ -1,4 +1,4 @@
-"""Checkpoints: one file that holds the model, its configuration and the whole state of the loop.
+"""Read and write checkpoints: the model, its configuration and the whole state of the loop.
 
 Written whole or not at all, read with ``weights_only``: nothing in a checkpoint is executed.
 """

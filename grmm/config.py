@@ -1,4 +1,4 @@
-"""Settings of GRMM: frozen dataclasses, presets, and how files and flags change them.
+"""Define GRMM's settings and presets, and change them by files and flags.
 
 The defaults are the paper's numbers. Where the paper is silent, docs/GRMM.md says what was chosen
 and why; G1 to G23 are its sections. Precedence: ``--set table.key=value``, then TOML, then the

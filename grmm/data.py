@@ -1,4 +1,4 @@
-"""Training data: packed samples -> tensors in canonical head space, and the order they come in.
+"""Turn packed samples into tensors in canonical head space, and choose their order.
 
 Geometry is not stored with the samples: the tracked mesh v_rec is posed from head-model
 parameters once per (subject, expression) and kept.

@@ -1,4 +1,4 @@
-"""Points of the model's space and moves between them: everything a picture needs but a camera.
+"""Make points of the model's space and move between them: a picture's input but the camera.
 
 FLAME's parameters (the tracked mesh) and the residual codes are separate inputs of the model, so
 each can be changed alone: one subject's codes with another's expression, a wider jaw under the

@@ -1,4 +1,4 @@
-"""The terms of the objective (paper: Training and Losses), each in the unit its name states.
+"""Define the objective's terms (paper: Training and Losses), each in the unit its name states.
 
 All return 0-d tensors, are finite for equal and for constant images, and are 0 where there is
 nothing to compare.

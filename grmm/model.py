@@ -1,4 +1,4 @@
-"""GRMM: codes and tracked parameters -> Gaussians on the head's UV map -> an image.
+"""Turn codes and tracked parameters into Gaussians on the head's UV map, and into an image.
 
 The steps are separate, so that a caller pays only for what changes: `geometry` once per
 identity, expression and pose; `appearance` per view; `draw` rasterises and refines.

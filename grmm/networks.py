@@ -1,4 +1,4 @@
-"""The networks of GRMM and its tables of codes: everything that a checkpoint holds weights of.
+"""Define GRMM's networks and tables of codes: all that a checkpoint holds weights of.
 
 Widths and starting values that the paper leaves open are explained in docs/GRMM.md.
 """

@@ -1,4 +1,4 @@
-"""Pictures and videos from a model: novel views, turntables, grids, controls, interpolation."""
+"""Render pictures and videos from a model: novel views, turntables, grids, interpolation."""
 
 from __future__ import annotations
 

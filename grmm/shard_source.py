@@ -1,4 +1,4 @@
-"""Packed shards as a source of training samples."""
+"""Serve packed shards as training samples."""
 
 from __future__ import annotations
 

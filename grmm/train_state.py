@@ -1,4 +1,4 @@
-"""The state of a training run: what it starts from, what a checkpoint keeps, when it ends."""
+"""Hold the state of a training run: its start, what a checkpoint keeps, when it ends."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``grmm view``: a head in the browser, with sliders for FLAME's parameters and the codes.
+"""``grmm view`` shows a head in the browser, with sliders for its parameters and codes.
 
 One thread draws the newest camera and sliders, so that a slow machine shows fewer pictures, never
 old ones. Pictures of people leave the machine through this port alone: the library's sharing

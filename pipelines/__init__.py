@@ -1,1 +1,1 @@
-"""One module or small package a stage; they meet the other packages only in files."""
+"""Each stage is a small package here; stages meet the other packages only in files."""

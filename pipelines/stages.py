@@ -1,4 +1,4 @@
-"""The stages in the order in which they run.
+"""List the stages in the order in which they run.
 
 This is the only list of them; the entry point ``express50.stages`` leads here. It alone in this
 package imports annotations.

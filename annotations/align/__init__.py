@@ -1,4 +1,4 @@
-"""The align stage: for every expression the frame that matches the reference's canonical frame.
+"""The align stage finds, for every expression, the frame that matches the reference's.
 
 Item: a subject. Its observations are compared with the reference identity's labels or peaks. A
 suggestion that is sure enough is accepted without a person, through the label store that annotators

@@ -1,4 +1,4 @@
-"""A face's expression as numbers that can be compared in time: motion and look, against rest.
+"""Describe a face's expression by numbers that compare in time: motion and look.
 
 Every feature is counted in its own noise, which is measured from the footage itself. What a face
 does at rest (fidgets, sway, the detector's drift) is shrunk, so that the curve of an expression

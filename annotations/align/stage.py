@@ -1,4 +1,4 @@
-"""The align stage's work: suggestions, those that are accepted, and the peak frames in force."""
+"""Write suggestions, those that are accepted, and the peak frames in force."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The observe stage: landmarks and aligned faces of every frame in a cue window.
+"""The observe stage finds landmarks and aligned faces in every frame of a cue window.
 
 Item: a subject. This is the slow half of ``express50 align``, which runs it first. Suggesting and
 matching read only these files, so that a new label or another reference does not need the

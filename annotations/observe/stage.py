@@ -1,4 +1,4 @@
-"""The observe stage's work: which cameras watch a face, what each sees of it, and its file.
+"""Choose the cameras that watch a face, find what each sees of it, and write it.
 
 The network looks through one window per clip, and head motion is averaged over time: both keep the
 jitter of single detections out of the curves in which expressions are searched for.

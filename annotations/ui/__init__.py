@@ -1,1 +1,1 @@
-"""The terminal annotator: state, frames, pictures and the Textual app that joins them."""
+"""This room holds the terminal annotator: state, frames, pictures and the Textual app."""

@@ -1,4 +1,4 @@
-"""The annotator as a Textual app: keys become moves (view), looks (aim) and decisions (session)."""
+"""Run the annotator as a Textual app: keys move, look and decide."""
 
 from __future__ import annotations
 

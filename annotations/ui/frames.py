@@ -1,4 +1,4 @@
-"""Frames at display size, decoded ahead in a thread; the crop that each zoom shows."""
+"""Decode frames at display size ahead of time, in a thread, and crop them for each zoom."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Pictures as lines of the terminal: block characters in any terminal, or sixels.
+"""Draw pictures as lines of the terminal: block characters in any terminal, or sixels.
 
 A half block gives a cell 1 x 2 pixels; the quadrants give it 2 x 2, of which each takes one of the
 cell's two colours, whichever split loses least. Sixels are the DEC graphics that xterm, WezTerm,

@@ -1,4 +1,4 @@
-"""The picture panes: which crop of which frame is shown, and the widget that shows it."""
+"""Show the pictures: which crop of which frame, and the widget that draws it."""
 
 from __future__ import annotations
 

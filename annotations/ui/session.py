@@ -1,4 +1,4 @@
-"""An annotator's session: which task is open, what was decided, and what it cost.
+"""Hold an annotator's session: the open task, the decisions, and what they cost.
 
 No screen is needed: the app calls this, and so do tests. A decision is on disk, synced, when
 ``mark`` or ``flag`` returns.

@@ -1,4 +1,4 @@
-"""The state of one task: its data, and the position in its cue window.
+"""Hold the state of one task: its data, and the position in its cue window.
 
 ``load_scene`` reads footage, suggestion, reference and labels at once. The functions of a
 ``CueView`` are pure: each takes a view and returns another.

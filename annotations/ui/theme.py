@@ -1,4 +1,4 @@
-"""Colours, layout and keys of the annotator.
+"""Define the colours, layout and keys of the annotator.
 
 The colours hold on dark terminals with 256 colours too. Every key is listed once: the app binds the
 keys, and the help shows them.

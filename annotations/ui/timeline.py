@@ -1,4 +1,4 @@
-"""The cue window on a line: activity and match curves, suggestions, marks and the cursor."""
+"""Draw the cue window on a line: curves, suggestions, marks and the cursor."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The words of the screen: lines around the pictures, and small questions over them."""
+"""Write the words of the screen: lines around the pictures, and small questions over them."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""Raw captures: index, frames, calibration, expressions."""
+"""This room reads raw captures: their frames, index and expressions."""

@@ -1,4 +1,4 @@
-"""Polynomial colour correction, as colour charts are fitted: linear light in, linear light out.
+"""Correct colours by polynomials fitted to colour charts: linear light in, linear light out.
 
 Terms of V. Cheung, S. Westland, D. Connah and C. Ripamonti, "A comparative study of the
 characterisation of colour cameras by means of neural networks and polynomial transforms",

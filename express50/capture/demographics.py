@@ -1,4 +1,4 @@
-"""Counts of the subjects' gender and age, where captures state them.
+"""Count the subjects by gender and age, where captures state them.
 
 What a capture says of a person stays in the capture. A dataset takes over `PUBLIC_KEYS` of its
 capture.toml and nothing else; gender and age are read from the capture when they are counted.

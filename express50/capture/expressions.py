@@ -1,4 +1,4 @@
-"""The 60-expression script: what subjects are asked to do, as data in ``expressions.toml``."""
+"""Read the 60-expression script: what subjects are asked to do (``expressions.toml``)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The frame index that ingest writes, and the labelled peaks among its frames."""
+"""Read and write the frame index that ingest makes, and the labelled peaks among its frames."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Raw captures as they come off the rig: read the folder, check it, name every fault.
+"""Read a raw capture as it comes off the rig: check the folder and name every fault.
 
 Layout: capture.toml, cameras/<id>/video.mp4 or cameras/<id>/frames/000000.png..., and optionally
 calibration.json, plates/<id>.png, board/<id>/*.png with board/board.toml, cues.csv.

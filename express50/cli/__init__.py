@@ -1,1 +1,1 @@
-"""The express50 command line."""
+"""This room holds the express50 command line."""

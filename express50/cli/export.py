@@ -1,4 +1,4 @@
-"""Commands that show heads: ``export`` for other tools, ``report`` as HTML, ``head preview``."""
+"""Run the commands that show heads: ``export`` for other tools, ``report``, ``head preview``."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The ``express50`` command: one sub-command per stage, and those on datasets, shards and heads."""
+"""Run ``express50``: one sub-command per stage, and those on datasets, shards and heads."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``express50 plan``: the cost of a capture campaign, scaled from a measured dataset's receipts.
+"""``express50 plan`` scales a measured dataset's receipts to the cost of a capture campaign.
 
 Seconds and bytes per item grow linearly in the product of the sizes that each stage names in its
 `Growth`. Memory has a part that does not grow (libraries, the head model), which one dataset cannot

@@ -1,4 +1,4 @@
-"""``express50 shards``: verify packed shards, list their samples, look at one, split, merge."""
+"""``express50 shards`` verifies packed shards, lists and shows samples, splits and merges."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Commands that run stages (one each, ``run`` for all), and ``config``, which prints settings."""
+"""Run the stages (one command each, ``run`` for all), and ``config``, which prints settings."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``express50 status``: what is done, failed, running and missing, as a table or a live page.
+"""``express50 status`` shows what is done, failed, running and missing: a table or a live page.
 
 All of it is read from the ledger.
 """

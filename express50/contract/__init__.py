@@ -1,1 +1,1 @@
-"""The contract every stage may rely on: layout, configuration, stage, labels of parts."""
+"""Every stage may rely on this room: layout, configuration, stage, labels of parts."""

@@ -1,4 +1,4 @@
-"""Stage configuration: ``--set`` over TOML over preset, typed and checked, saved beside outputs."""
+"""Resolve a stage's configuration: ``--set`` over TOML over preset, typed, checked, saved."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Paths of a dataset folder that several parts of the toolkit use, and who is excluded from it."""
+"""Name the paths of a dataset folder that several parts use, and the subjects it excludes."""
 
 from __future__ import annotations
 

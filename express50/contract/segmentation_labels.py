@@ -1,4 +1,4 @@
-"""Segmentation labels: their names, their colours and those that belong to the head."""
+"""Define the segmentation labels: names, colours, and those that belong to the head."""
 
 from __future__ import annotations
 

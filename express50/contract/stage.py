@@ -1,4 +1,4 @@
-"""What a stage is, and how the stages, commands and hooks of other packages are found.
+"""Define a stage, and find the stages, commands and hooks of other packages.
 
 A stage is a pure function over one work item plus a frozen config. The core imports no package
 above it: a package names what it offers in its ``pyproject.toml``::

@@ -1,1 +1,1 @@
-"""Operations over a finished dataset: tracks, audit, report, export, withdrawal."""
+"""This room works on finished datasets: tracks, audit, report, export, withdrawal."""

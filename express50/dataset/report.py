@@ -1,4 +1,4 @@
-"""One self-contained HTML page of a dataset: QC of every stage, errors where truth exists."""
+"""Write one self-contained HTML page of a dataset: QC of stages, errors where truth exists."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""Reading and writing of files: text, arrays, pictures, video, checkpoints."""
+"""This room reads and writes files: text, arrays, pictures, video, checkpoints."""

@@ -1,1 +1,1 @@
-"""Cameras, rigid transforms, and conversions between conventions."""
+"""This room holds cameras, rigid transforms and conversions between conventions."""

@@ -1,4 +1,4 @@
-"""Cameras: projection, rays, distortion, crops and triangulation.
+"""Project, unproject, distort, crop and triangulate with cameras.
 
 World and camera units are metres, axes are OpenCV's, a pixel's origin is the image's corner.
 Models and the order of their parameters are COLMAP's.

@@ -1,4 +1,4 @@
-"""Functions that interpolate: bilinear values of an image, a smooth step, spherical harmonics."""
+"""Interpolate: bilinear values of an image, a smooth step, spherical harmonics."""
 
 from __future__ import annotations
 

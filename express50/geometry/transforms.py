@@ -1,4 +1,4 @@
-"""Rotations, rigid and similarity transforms in NumPy float64.
+"""Compute rotations, rigid and similarity transforms in NumPy float64.
 
 Quaternions are wxyz; axis-angle vectors are radians, right-handed. The torch twin of the
 rotation part is ``express50.geometry.transforms_torch``; a test holds the two against each other.

@@ -1,4 +1,4 @@
-"""Rotations in torch: batched, any float type, with gradients that stay finite at 0 and pi.
+"""Compute rotations in torch: any float type, with gradients that stay finite at 0 and pi.
 
 Quaternions are wxyz; axis-angle vectors are radians. The NumPy twin is ``transforms``.
 """

@@ -1,1 +1,1 @@
-"""Head models: one type for FLAME, ICT-FaceKit and the built-in procedural head."""
+"""This room loads head models: one type for FLAME, ICT-FaceKit and the built-in head."""

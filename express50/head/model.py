@@ -1,4 +1,4 @@
-"""The head model all parts share: a linear shape space posed by linear blend skinning.
+"""Define the head model that all share: a linear shape space posed by linear blend skinning.
 
 The layout is FLAME's (Li et al. 2017, "Learning a model of facial shape and expression from 4D
 scans"): five joints (root, neck, jaw, left eye, right eye), joints regressed from the shaped

@@ -1,4 +1,4 @@
-"""Teeth and the inside of the mouth for heads of FLAME's topology, which have neither.
+"""Add teeth and the inside of the mouth to heads of FLAME's topology, which have neither.
 
 Facts of the topology: 5023 vertices; two rings of 15 vertices each round the lips, paired by
 index; an open loop of 32 vertices at the back of the lips. The order of the 120 tooth vertices, and

@@ -1,4 +1,4 @@
-"""Shaded pictures of a head model, by ray casting: base colours by region, key and fill light."""
+"""Draw shaded pictures of a head model by ray casting, coloured by region."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""The embedded 68-landmark detector: network, detection in frames, synthetic training."""
+"""This room finds 68 landmarks: network, detection in frames, synthetic training."""

@@ -1,4 +1,4 @@
-"""Irises and inner lips, found in the pixels where the network's points are too coarse.
+"""Find irises and inner lips in the pixels, where the network's points are too coarse.
 
 Irises: every eye is brought to one size by its corners. A disc and the ring around it, both cut by
 the opening, are compared at every place and a few radii: iris and pupil are darker than the white

@@ -1,4 +1,4 @@
-"""The landmark network: a small convolutional encoder-decoder with one heat map per point.
+"""Define the landmark network: a small encoder-decoder with one heat map per point.
 
 Points come from the expectation over softmax heat maps (integral regression, Sun et al. 2018), so
 they are continuous and have gradients everywhere. A small perceptron that sees all of them at once

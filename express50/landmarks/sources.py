@@ -1,4 +1,4 @@
-"""Sources of landmarks: the embedded network, the user's own FAN weights, or a file of points.
+"""Open a source of landmarks: the embedded network, the user's FAN weights, or a file.
 
 FAN is the face alignment network (Bulat and Tzimiropoulos 2017). Its published weights are
 TorchScript files (2DFAN4, 3DFAN4) that map crops (B, 3, 256, 256) in [0, 1] to heat maps (B, 68,

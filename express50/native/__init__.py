@@ -1,4 +1,4 @@
-"""The native library: C++ behind a plain C ABI, loaded through ctypes. This file is light.
+"""Load the native library, C++ behind a plain C ABI, through ctypes. This file is light.
 
 ``setup.py`` compiles one source into a shared object for each instruction set of ``build.py``; at
 run time the best one that this processor understands is opened.

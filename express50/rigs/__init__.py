@@ -1,1 +1,1 @@
-"""Rigs: cameras that other tools calibrated, read into ours, and checks that any rig must pass."""
+"""This room reads cameras that other tools calibrated, and checks any rig."""

@@ -1,4 +1,4 @@
-"""What every importer needs: cameras from K and distortion, names, sizes, scale."""
+"""Build cameras for every importer from K and distortion, names, sizes and scale."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Cameras of a COLMAP model: ``cameras`` and ``images``, as .bin or .txt; nothing else is read.
+"""Read cameras of a COLMAP model (``cameras`` and ``images``, .bin or .txt) and nothing else.
 
 COLMAP's own reader trusts the counts in a binary file and allocates as much memory. The layout is
 that of COLMAP's documentation of its output format.

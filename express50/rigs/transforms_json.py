@@ -1,4 +1,4 @@
-"""Cameras of a ``transforms.json`` (instant-ngp, Nerfstudio, VHAP, GaussianAvatars).
+"""Read cameras of ``transforms.json`` (instant-ngp, Nerfstudio, VHAP, GaussianAvatars).
 
 Poses are camera to world with OpenGL axes; intrinsics stand beside each frame or at the top.
 """

@@ -1,4 +1,4 @@
-"""Where a rig looks: the checks that any calibration must pass, and the world of a solved rig.
+"""Check where a rig looks, as any calibration must pass, and choose a solved rig's world.
 
 Cameras of a head rig look at one place in front of them all. A calibration read the wrong way round
 (camera to world for world to camera, or OpenGL axes for OpenCV's) fails this, and usually only one

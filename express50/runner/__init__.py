@@ -1,1 +1,1 @@
-"""The runner: schedules items, publishes outputs, keeps the ledger."""
+"""The runner schedules items, publishes outputs and keeps the ledger."""

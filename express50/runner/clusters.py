@@ -1,4 +1,4 @@
-"""Workers of dask: local processes that share the GPUs, or those of a given scheduler."""
+"""Start workers of dask: local processes that share the GPUs, or those of a given scheduler."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The ledger: SQLite receipts of what was made from what, last runs, and digests of files.
+"""Keep the ledger: SQLite receipts of what was made from what, last runs, digests of files.
 
 Only the driver writes it; workers return receipts, and others may read meanwhile.
 """

@@ -1,4 +1,4 @@
-"""Progress of a stage: a bar or lines for people, and signs of life in the ledger for onlookers."""
+"""Show a stage's progress: a bar or lines for people, signs of life in the ledger for others."""
 
 from __future__ import annotations
 

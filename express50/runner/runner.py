@@ -1,4 +1,4 @@
-"""Runs a stage over its items: skips current ones, isolates bad ones, accounts for all."""
+"""Run a stage over its items: skip current ones, isolate bad ones, account for all."""
 
 from __future__ import annotations
 

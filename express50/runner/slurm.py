@@ -1,4 +1,4 @@
-"""Workers as SLURM jobs: what a job asks for, its script, and the jobs of a run.
+"""Start workers as SLURM jobs: their requests, their script, and the jobs of a run.
 
 dask-jobqueue writes the script. Jobs are submitted and watched here, because its own cluster takes
 no notice of an ``sbatch`` that refuses, nor of jobs of several workers that have ended.

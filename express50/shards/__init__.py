@@ -1,1 +1,1 @@
-"""Packed shards: reading, writing, editing."""
+"""This room reads, writes and edits packed shards."""

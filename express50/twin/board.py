@@ -1,4 +1,4 @@
-"""The calibration board, and the room behind the subject."""
+"""Draw the calibration board, and the room behind the subject."""
 
 from __future__ import annotations
 

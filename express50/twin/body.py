@@ -1,4 +1,4 @@
-"""A subject's geometry: the head model, hair and shoulders, posed for one frame."""
+"""Assemble a subject's geometry, head model, hair and shoulders, posed for one frame."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Settings of a recording: one frozen dataclass, checked once."""
+"""Define the settings of a recording: one frozen dataclass, checked once."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Hair: thin ribbons that grow from the scalp, flow over the head and break its silhouette.
+"""Grow hair: thin ribbons that flow over the head and break its silhouette.
 
 Strands march over the head in a flow field (away from the crown, combed, falling), in layers
 above the skin. They hang on the skull rigidly; the whole mesh is made once a subject.

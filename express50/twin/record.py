@@ -1,4 +1,4 @@
-"""``express50 twin record``: make synthetic captures with known truth.
+"""``express50 twin record`` makes synthetic captures with known truth.
 
 The work is planned, filmed in processes, and published: a subject appears complete or not at all.
 """

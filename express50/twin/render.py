@@ -1,4 +1,4 @@
-"""Rendering by ray casting: colour, alpha and depth of a frame in any camera.
+"""Render by ray casting: colour, alpha and depth of a frame in any camera.
 
 One ray per pixel finds where there is detail; only there further rays are cast: many where the
 silhouette or hair makes alpha fractional, a few inside. Images are made in bands of rows, so that

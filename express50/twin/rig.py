@@ -1,4 +1,4 @@
-"""The rig's cameras: where they stand, and how their sensors make pictures of light.
+"""Place the rig's cameras, and make pictures of light as their sensors do.
 
 N cameras stand on a sphere segment around the subject, denser at the front.
 """

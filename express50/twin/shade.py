@@ -1,4 +1,4 @@
-"""Light and materials: what colour a ray sees where it meets the subject.
+"""Shade light and materials: the colour that a ray sees where it meets the subject.
 
 Everything is linear light in float32. Lights are soft boxes far away; how much of each, and of the
 ambient light, reaches a vertex is found by casting rays once per frame and shared by all cameras.

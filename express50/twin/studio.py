@@ -1,4 +1,4 @@
-"""Filming: a subject's frames through every camera, plates and board pictures, written to files."""
+"""Film a subject through every camera, with plates and board pictures, and write the files."""
 
 from __future__ import annotations
 

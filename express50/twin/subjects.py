@@ -1,4 +1,4 @@
-"""Made-up people: how they are shaped and look, and how they perform the script.
+"""Make up people: how they are shaped and look, and how they perform the script.
 
 A subject has coefficients of the head model, a displacement that the model cannot express, and an
 appearance. Its performance has a timing, strength, blinks and sway of its own.

@@ -1,4 +1,4 @@
-"""What the twin is made with: ray casting (Embree), vectors, meshes, and smooth random fields."""
+"""Serve the twin with ray casting (Embree), vectors, meshes and smooth random fields."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Ground truth of the twin, kept apart from the capture: opened by benchmarks, tests and reports.
+"""Keep the twin's truth apart from the capture, for benchmarks, tests and reports.
 
 Only parameters are stored; meshes, depth and alpha are made from them when they are asked for.
 """

@@ -1,4 +1,4 @@
-"""``grmm``: train, fit, config, render, export, view, evaluate, score, ablate, study.
+"""``grmm`` trains, fits, renders, exports, views, evaluates, scores, ablates and studies.
 
 This file says what a user may type: each option once in OPTIONS, and each command as its options
 in order. `grmm.cli.commands` says what the commands do.

@@ -1,4 +1,4 @@
-"""What the commands of ``grmm`` do: read the arguments, call the library, print.
+"""Run the commands of ``grmm``: read the arguments, call the library, print.
 
 Torch takes a second to import and --help must not wait for it, so that handlers import late.
 """

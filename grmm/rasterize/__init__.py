@@ -1,4 +1,4 @@
-"""Differentiable rasterisation of 3D Gaussians: one interface, three backends.
+"""Rasterise 3D Gaussians differentiably: one interface, three backends.
 
 ``reference`` is plain torch (the oracle), ``cpu`` the native C++ kernel (deterministic for any
 number of threads), ``gsplat`` CUDA. All follow ``grmm.rasterize.projection`` and gsplat's guards,

@@ -1,4 +1,4 @@
-"""The native CPU backend: ``torch.autograd.Function`` over the C ABI of express50/native.
+"""Rasterise on the CPU: a ``torch.autograd.Function`` over the native library.
 
 Deterministic: images and gradients are the same bits for any number of threads, which is taken
 from ``torch.get_num_threads()``. Large outputs ask for huge pages, since a third of the time of a

@@ -1,4 +1,4 @@
-"""The CUDA backend: our projection in torch, gsplat's kernels for sorting and blending.
+"""Rasterise on CUDA: our projection in torch, gsplat's kernels for sorting and blending.
 
 Projecting here rather than in gsplat gives gradients to K and the pose, which gsplat's projection
 lacks, and the three channels from which RaDe depth is built. gsplat is imported on first use only:

@@ -1,4 +1,4 @@
-"""Projection and blending of 3D Gaussians: the readable torch form that every backend follows.
+"""Project and blend 3D Gaussians in the readable torch form that every backend follows.
 
 The projection is computed in float64 and only its results are rounded to the dtype of ``means``:
 needle-shaped and huge Gaussians cancel badly in float32, and N small matrices cost little.

@@ -1,4 +1,4 @@
-"""Calibration of a rig: given cameras are checked, others are solved from board or footage."""
+"""The calibrate stage checks given cameras, or solves them from a board or from footage."""
 
 from __future__ import annotations
 

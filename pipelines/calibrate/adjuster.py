@@ -1,4 +1,4 @@
-"""Bundle adjustment of a rig over footage: poses, lenses and points at once, with priors.
+"""Adjust a rig over footage: poses, lenses and points at once, with priors.
 
 COLMAP's adjuster, which the board uses, weights all observations alike and has no priors on
 lenses. Footage has landmarks that are off by many pixels, features that are off by a fraction of

@@ -1,4 +1,4 @@
-"""The ChArUco board: its description in `board.toml`, and its corners in images.
+"""Read the ChArUco board: its description in `board.toml`, and its corners in images.
 
 Corner positions leave this file in the project's pixels (origin at the corner of the first pixel);
 OpenCV counts from that pixel's centre. Corners are refined to the saddle point of a fitted surface

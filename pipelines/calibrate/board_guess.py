@@ -1,4 +1,4 @@
-"""First guess of a rig from board images: lenses, poses of single views, and their rig.
+"""Guess a rig from board images: lenses, poses of single views, and how views join.
 
 Each camera gets a lens from its own views, and for each frame the board poses that its view allows
 (two, since a flat target is ambiguous). The relative pose on which two cameras agree over their

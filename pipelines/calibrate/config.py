@@ -1,4 +1,4 @@
-"""Settings of the calibrate stage and its presets."""
+"""Define the settings of the calibrate stage and its presets."""
 
 from __future__ import annotations
 

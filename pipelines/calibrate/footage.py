@@ -1,4 +1,4 @@
-"""Footage for calibration: frames at a few instants, and the points that cameras see in them.
+"""Read footage for calibration: frames at a few instants, and the points seen in them.
 
 Landmarks tie any two cameras that see the face, to a few pixels. Features (SIFT, on skin, hair,
 cloth and room) tie neighbouring cameras, to a fraction of a pixel. Images are reduced as they are

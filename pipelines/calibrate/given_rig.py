@@ -1,4 +1,4 @@
-"""Given cameras against what was recorded: which have moved, and are all a little off?
+"""Hold given cameras against what was recorded: find those that moved, refine those a little off.
 
 To find cameras that have moved, points are fitted with one camera free after the other; the one
 that explains most has moved, and the rest are tried again. So a bump is not blamed on neighbours.

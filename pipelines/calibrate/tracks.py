@@ -1,4 +1,4 @@
-"""Tracks: points that several cameras saw at one instant, matched between the cameras."""
+"""Join points that several cameras saw at one instant into tracks."""
 
 from __future__ import annotations
 

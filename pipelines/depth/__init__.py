@@ -1,4 +1,4 @@
-"""The depth stage: a surface and depth maps per expression, from mattes, frames and tracks."""
+"""The depth stage makes a surface and depth maps per expression."""
 
 from __future__ import annotations
 

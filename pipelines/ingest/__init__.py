@@ -1,4 +1,4 @@
-"""The ingest stage: frame index and proxies of a capture, and checks of sync, light and focus."""
+"""The ingest stage writes a capture's frame index and proxies, and checks its quality."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Ingest: decode every camera once, and write the frame index, the proxies and a contact sheet.
+"""Decode every camera once, and write the frame index, the proxies and a contact sheet.
 
 Every later stage names frames by decode index; the index holds each frame's time stamp and hash,
 so that a label can be checked against the footage it was made on. Proxies are small JPEGs in an

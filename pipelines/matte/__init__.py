@@ -1,4 +1,4 @@
-"""The matte stage: the opacity of the subject in every camera of a peak."""
+"""The matte stage finds the opacity of the subject in every camera of a peak."""
 
 from __future__ import annotations
 

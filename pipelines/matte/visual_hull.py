@@ -1,4 +1,4 @@
-"""The space that the cameras of a moment share, and what each of them sees in it.
+"""Carve the space that the cameras of a frame set share, and say what each sees in it.
 
 Space is a cube of cells around the point that the cameras look at, in units of the rig's own, so
 that neither metres nor the world's origin matter. A ball in it is in view of most cameras; there

@@ -1,4 +1,4 @@
-"""Configuration of the pack stage and its presets."""
+"""Define the settings of the pack stage and its presets."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""One photograph or video of one camera without calibration, made ready for the stages."""
+"""Photo makes one photograph or video without calibration ready for the stages."""
 
 from __future__ import annotations
 

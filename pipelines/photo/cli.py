@@ -1,4 +1,4 @@
-"""``express50 photo``: track the face of a bare photograph or of a video of one camera."""
+"""``express50 photo`` tracks the face of a bare photograph or of a video of one camera."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The regions stage: labels of each pixel of a peak frame, and a matte of the head alone."""
+"""The regions stage labels each pixel of a peak frame, and mattes the head alone."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Settings of the regions stage and its presets."""
+"""Define the settings of the regions stage and its presets."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tracking: fit a head model to every peak frame of a subject, seen by all its cameras."""
+"""The track stage fits a head model to every peak frame of a subject."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The subject's albedo texture, and the light and camera gains that it is freed of.
+"""Bake the subject's albedo texture, freed of the light and of the cameras' gains.
 
 Everything is in root light: picture = root gain x root light x root albedo. The three are found in
 closed form, one after the other, at samples of the skin; the texture is then baked with the light

@@ -1,4 +1,4 @@
-"""The head model as tracking needs it: a few posed vertices with derivatives, and smooth offsets.
+"""Pose a few vertices of the head model with derivatives, and add smooth offsets to it.
 
 The joints are linear in the coefficients, so their regressor is folded into a basis once. Posing a
 few hundred vertices then costs milliseconds and their Jacobian some tens of milliseconds.

@@ -1,4 +1,4 @@
-"""Eyes and the jaw line: irises turn the eyes, shut lids meet, the jaw line is seen on the rim.
+"""Use eyes and jaw line: irises turn the eyes, shut lids meet, the jaw line lies on the rim.
 
 **Irises** are pixels that the iris vertices should project to. An eyeball misplaced by a millimetre
 turns the gaze by five degrees in every expression alike, so the median offset over a subject's

@@ -1,4 +1,4 @@
-"""Landmarks on the face UV map: they slide the mesh along the skin to where it belongs.
+"""Find landmarks on the face UV map; they slide the mesh along the skin to its place.
 
 Patches say how far the skin lies before or behind the mesh, not that a corner of the mouth sits a
 millimetre too far out. So the pictures are projected onto the current mesh, unwrapped to the face

@@ -1,4 +1,4 @@
-"""Levenberg-Marquardt fit of one shape and many expressions to the residuals of `terms`.
+"""Fit one shape and many expressions to the residuals of `terms` (Levenberg-Marquardt).
 
 The unknowns are x = (shape, bias, own_1, ..., own_E) and the cost is the sum, over expressions and
 their terms, of the loss of the squared residuals, plus half the squared residuals of the priors. An

@@ -1,4 +1,4 @@
-"""Landmarks of one frame set in all cameras, and consensus among the views."""
+"""Find the landmarks of a frame set on which its cameras agree."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Photo-consistency: search for the surface along the mesh's normals with small patches.
+"""Search for the surface along the mesh's normals with small patches.
 
 A patch around every sample is moved along the normal; the surface is where the views agree best on
 its appearance. The search is exhaustive, so it works from millimetres off, where gradients of

@@ -1,4 +1,4 @@
-"""The rounds of tracking: read evidence from the pictures on the current mesh, fit, look again.
+"""Run the rounds of tracking: read evidence from pictures on the current mesh, fit, again.
 
 Every round makes the terms of every expression anew, as outlines, visibility and patches depend on
 the mesh. The schedule is a table, made once from the settings and written to metrics.json.

@@ -1,4 +1,4 @@
-"""The track stage: detect, triangulate, fit to landmarks, refine in rounds, write, check.
+"""Track a subject: detect, triangulate, fit to landmarks, refine in rounds, write, check.
 
 docs/TRACKING.md describes the method.
 """

@@ -1,4 +1,4 @@
-"""The unknowns of tracking, their start from geometry alone, and their prior."""
+"""Define the unknowns of tracking, their start from geometry alone, and their prior."""
 
 from __future__ import annotations
 

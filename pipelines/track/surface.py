@@ -1,4 +1,4 @@
-"""What cameras show of the skin: head crops, samples of the skin, and how well each sees them."""
+"""Crop heads, sample their skin, and weigh how well each camera sees the samples."""
 
 from __future__ import annotations
 

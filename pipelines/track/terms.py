@@ -1,4 +1,4 @@
-"""Residuals that tracking minimises: one form for landmarks, outlines, patches and the rest.
+"""Define the residuals that tracking minimises, in one form for all evidence.
 
 A term speaks about *places*, weighted sums of mesh vertices. For places (n, 3) it returns residual
 vectors in standard deviations and their slope by the place; its loss turns squared lengths into

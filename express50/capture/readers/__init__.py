@@ -1,1 +1,1 @@
-"""Captures in other datasets' layouts, read where they lie: one module a layout."""
+"""Readers of other datasets' layouts, one module per layout, read captures where they lie."""

@@ -1,4 +1,4 @@
-"""Meta's captures of heads: AVA-256 (Goliath heads have the same tree) and Multiface.
+"""Read Meta's captures of heads: AVA-256 (Goliath's heads have the same tree) and Multiface.
 
 AVA-256: ``m--..--GHS`` with a ``decoder`` folder. ``K`` and ``T`` are stored column by column
 (transposed), and belong to pictures of 2668 x 4096 whatever size was downloaded. Pictures stay in

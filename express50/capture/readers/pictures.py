@@ -1,4 +1,4 @@
-"""Pictures of one moment: photographs, and the folders of reconstruction tools.
+"""Read pictures of one instant: photographs, and the folders of reconstruction tools.
 
 Photographs come without cameras, COLMAP models and transforms.json with them. Neither tool states
 its unit; ``metres_per_unit`` in capture.toml does.

@@ -1,4 +1,4 @@
-"""RenderMe-360: a folder of ``.smc`` files (HDF5) of one actor, or one such file.
+"""Read RenderMe-360: a folder of one actor's ``.smc`` files (HDF5), or one such file.
 
 There are two releases. The full one (21 actors) has pictures in ``raw/<id>/<id>_e0_raw.smc``
 and cameras in ``anno/<id>/<id>_e0_anno.smc``; the one of 500 actors has both in ``<id>_e0.smc``,

@@ -1,4 +1,4 @@
-"""Footage stored as videos: NeRSemble v2, RAVDESS, and a single video without cameras.
+"""Read footage stored as videos: NeRSemble v2, RAVDESS, and a single video without cameras.
 
 NeRSemble v2: a participant's folder, ``018/``, one video per sequence and camera. Footage is
 colour-corrected when it is read (``color_calibration.json``: a polynomial per camera, in linear

@@ -1,1 +1,1 @@
-"""The generator of the built-in head model; only its stored arrays are read at run time."""
+"""This room makes the built-in head; only its stored arrays are read at run time."""

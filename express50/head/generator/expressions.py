@@ -1,4 +1,4 @@
-"""Named expression directions, ARKit's names and some more: full activation is coefficient 1."""
+"""Define expression directions by ARKit's names and some more; 1 is full activation."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Eyelid loops of the skin, the lids' hidden edges and motions, and the eyeballs."""
+"""Build eyelid loops of the skin, the lids' hidden edges and motions, and the eyeballs."""
 
 from __future__ import annotations
 

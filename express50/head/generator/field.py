@@ -1,4 +1,4 @@
-"""Signed field of the head's skin, and the rays that sample it.
+"""Define the signed field of the head's skin, and cast the rays that sample it.
 
 The field joins anatomical masses by smooth minima. The rays leave a bent central axis; their
 labels are azimuth and latitude.

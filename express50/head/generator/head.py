@@ -1,4 +1,4 @@
-"""Code that makes the built-in head: a full head in FLAME's layout with named directions.
+"""Make the built-in head: a full head in FLAME's layout with named directions.
 
 Run `python -m express50.head.generator.head` after a change here: it rewrites `builtin.npz`.
 

@@ -1,4 +1,4 @@
-"""Half-head mesh builder: vertices with tags, faces in UV charts; mirrored into the whole head.
+"""Build half a head's mesh, vertices with tags and faces in UV charts, and mirror it.
 
 Parts are built on the subject's left (x >= 0, millimetres). A face's winding follows its chart:
 faces are turned so that their UV area is positive, and charts are laid out as seen from outside.

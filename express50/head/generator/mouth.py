@@ -1,4 +1,4 @@
-"""Lip loops of the skin, the mouth cavity behind them, teeth with gums, and the tongue."""
+"""Build lip loops, the mouth cavity behind them, teeth with gums, and the tongue."""
 
 from __future__ import annotations
 

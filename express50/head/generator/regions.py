@@ -1,4 +1,4 @@
-"""Region masks, the 68 iBUG landmarks, and candidates for the visible jaw line."""
+"""Choose region masks, the 68 iBUG landmarks, and candidates for the visible jaw line."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Named shape directions of one unit (about a standard deviation) each, and what makes them.
+"""Define named shape directions of one unit (about a standard deviation) each.
 
 Shape and expression directions are put together from smooth, windowed pulls.
 """

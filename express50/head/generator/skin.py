@@ -1,4 +1,4 @@
-"""The skin: loops of features, nostrils and ears, the rest filled by graded points, triangulated.
+"""Build the skin: loops of features, nostrils and ears; graded points fill the rest.
 
 The half head is triangulated as a convex hull of its label directions on a sphere (a spherical
 Delaunay triangulation); the closing cap on the mid plane and the holes inside loops are dropped.

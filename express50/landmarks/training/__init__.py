@@ -1,1 +1,1 @@
-"""Training of the landmark network on rendered heads."""
+"""This room trains the landmark network on rendered heads."""

@@ -1,4 +1,4 @@
-"""Random heads for the training of the landmark detector: shape, expression, pose, skin and hair.
+"""Make random heads to train the landmark detector on: shape, expression, pose, skin, hair.
 
 Shapes, skins, hair and light are drawn far beyond what is usual on purpose, so that the detector
 learns where things are on a face and not how one renderer or one head model paints them. Most heads

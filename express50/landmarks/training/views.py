@@ -1,4 +1,4 @@
-"""Training crops: rendered views of random heads on random backgrounds, spoiled as cameras do.
+"""Render training crops of random heads on random backgrounds, spoiled as cameras do.
 
 A view has a picture, landmarks, and which of them the head hides. A file of views is made once; it
 depends on the seed, the head model and its number alone.

@@ -1,1 +1,1 @@
-"""Training of the network that reads face UV maps; nothing outside this folder imports it."""
+"""This room trains the network that reads face UV maps; nothing outside imports it."""

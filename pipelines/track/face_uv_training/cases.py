@@ -1,4 +1,4 @@
-"""Training cases of the face UV network: painted heads seen on meshes that do not quite fit them.
+"""Make training cases: painted heads seen on meshes that do not quite fit them.
 
 Every case has a true head and a tracker's estimate of it that is some millimetres off. What several
 cameras see of the first is read at the places of the second, as from footage; where each place
