@@ -20,7 +20,7 @@ BEGIN, END = "<!-- main path: begin -->\n", "<!-- main path: end -->\n"
 
 
 def import_graph() -> dict[str, set[str]]:
-    """Imports among the product's modules, those inside functions included."""
+    """Map each of the product's modules to those it imports, inside functions too."""
     paths = {
         ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): path
         for package in PACKAGES
@@ -39,7 +39,7 @@ def import_graph() -> dict[str, set[str]]:
 
 
 def main_path() -> str:
-    """Files that a frame passes: the core's rooms, then the new files of each step in order."""
+    """List the files that a frame passes: the core, then the new files of each step."""
     from pipelines.stages import STAGES
 
     graph = import_graph()
@@ -72,7 +72,7 @@ def main_path() -> str:
 
 
 def architecture() -> str:
-    """docs/ARCHITECTURE.md with the list of files as the code has it."""
+    """Return docs/ARCHITECTURE.md with the list of files as the code has it."""
     text = (ROOT / "docs" / "ARCHITECTURE.md").read_text(encoding="utf-8")
     before, rest = text.split(BEGIN)
     _, after = rest.split(END)
@@ -80,7 +80,7 @@ def architecture() -> str:
 
 
 def field_notes(config: type) -> dict[str, str]:
-    """The string under each field of a config class."""
+    """Return the string under each field of a config class."""
     import inspect
     import textwrap
 
@@ -95,7 +95,7 @@ def field_notes(config: type) -> dict[str, str]:
 
 
 def settings_table(config: type, presets: dict[str, dict[str, object]]) -> list[str]:
-    """A table of a config's fields: default, other presets' values, meaning."""
+    """Return a table of a config's fields: default, other presets' values, meaning."""
     notes = field_notes(config)
     rows = ["| setting | default | presets | meaning |", "|---|---|---|---|"]
     for field in dataclasses.fields(config):
@@ -114,7 +114,7 @@ def settings_table(config: type, presets: dict[str, dict[str, object]]) -> list[
 
 
 def settings() -> str:
-    """docs/CONFIG.md."""
+    """Return docs/CONFIG.md."""
     import grmm.config
     from pipelines.stages import STAGES
 
@@ -131,11 +131,12 @@ def settings() -> str:
         lines += ["", f"## {stage.name}", "", stage.purpose, ""]
         presets = {name: values for name, values in stage.presets.items() if values}
         lines += settings_table(stage.config, presets)
-    lines += ["", "# Settings of GRMM", "", "`grmm config train` prints the values of a preset."]
-    for name, config in vars(grmm.config).items():
-        if name.endswith("Config") and config.__module__ == "grmm.config":
-            title = name.removesuffix("Config").lower()
-            lines += ["", f"## {title}", "", *settings_table(config, {})]
+    note = "The defaults are the preset `paper`; `grmm config --preset NAME` prints another one."
+    lines += ["", "# Settings of GRMM", "", note]
+    for table in dataclasses.fields(grmm.config.Config):
+        config = type(getattr(grmm.config.Config(), table.name))
+        presets = {name: values.get(table.name, {}) for name, values in grmm.config.PRESETS.items()}
+        lines += ["", f"## {table.name}", "", *settings_table(config, presets)]
     return "\n".join([*lines, ""])
 
 
