@@ -41,7 +41,7 @@ from annotations.validate import (
 )
 from annotations.worklist import ORDERS, coverage, effort, progress, worklist
 from express50.capture.index import read_index
-from express50.console import FAILED, OK, format_table, say, say_json
+from express50.console import FAILED, OK, answer, format_table
 from express50.contract.layout import Dataset, included_subjects
 from express50.errors import AnnotationError
 
@@ -176,15 +176,6 @@ def person(text: str) -> str:
     if not text.strip() or not is_person(text):
         raise argparse.ArgumentTypeError(f"{text!r} is not a valid annotator name; give yours")
     return text
-
-
-def answer(args: argparse.Namespace, data: object, *lines: str) -> int:
-    """Print data as JSON where ``--json`` asks for it, else the lines."""
-    if args.json:
-        say_json(data)
-    else:
-        say(*lines)
-    return OK
 
 
 def chosen_subjects(dataset: Dataset, wanted: list[str] | None) -> list[str] | None:
@@ -416,13 +407,8 @@ def run_reference(args: argparse.Namespace) -> int:
 def run_rule(args: argparse.Namespace) -> int:
     """Append the rule's marks; people's labels stand above them."""
     chosen = chosen_subjects(args.dataset, args.subject) or included_subjects(args.dataset)
-    marks = [
-        mark
-        for subject in chosen
-        for mark in last_frame_marks(
-            args.dataset, read_index(args.dataset, subject), args.expression
-        )
-    ]
+    indexes = (read_index(args.dataset, subject) for subject in chosen)
+    marks = [m for i in indexes for m in last_frame_marks(args.dataset, i, args.expression)]
     for mark in marks:
         append_label(args.dataset, mark)
     words = f"{len(marks)} marks by {LAST_FRAME} in {len(chosen)} subjects"
@@ -448,9 +434,9 @@ def run_export(args: argparse.Namespace) -> int:
     """Write the events."""
     chosen = chosen_subjects(args.dataset, args.subject) or args.dataset.subjects()
     events = [label for subject in chosen for label in read_labels(args.dataset, subject)]
-    count = export_labels(events, args.file)
-    words = f"{args.file}: {count} events of {len(chosen)} subjects"
-    return answer(args, {"file": str(args.file), "events": count}, words)
+    export_labels(events, args.file)
+    words = f"{args.file}: {len(events)} events of {len(chosen)} subjects"
+    return answer(args, {"file": str(args.file), "events": len(events)}, words)
 
 
 def run_import(args: argparse.Namespace) -> int:

@@ -35,14 +35,13 @@ from express50.contract.layout import Dataset
 from express50.errors import AnnotationError
 from express50.files.text import NAME, parse_json, read_text
 
-FORMATS = (".csv", ".json")
 LARGEST = 2**63
 _FIELDS = tuple(field.name for field in fields(Label))
 _REQUIRED = tuple(field.name for field in fields(Label) if field.default is MISSING)
 
 
-def export_labels(labels: Iterable[Label], path: Path) -> int:
-    """Write events as CSV or JSON, by the file's ending; returns how many.
+def export_labels(labels: Iterable[Label], path: Path) -> None:
+    """Write events as CSV or JSON, by the file's ending.
 
     Raises:
         AnnotationError: another ending.
@@ -53,12 +52,11 @@ def export_labels(labels: Iterable[Label], path: Path) -> int:
     if path.suffix == ".json":
         rows = [{k: v for k, v in row.items() if v is not None} for row in rows]
         path.write_text(json.dumps(rows, indent=1, sort_keys=True) + "\n", encoding="utf-8")
-        return len(rows)
+        return
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, _FIELDS)
         writer.writeheader()
         writer.writerows(rows)
-    return len(rows)
 
 
 def import_labels(dataset: Dataset, path: Path) -> tuple[int, int]:
@@ -106,7 +104,7 @@ def read_table(path: Path) -> list[Label]:
 
 
 def _check_format(path: Path) -> None:
-    if path.suffix not in FORMATS:
+    if path.suffix not in (".csv", ".json"):
         raise AnnotationError(f"{path}: ends in {path.suffix!r}, expected .csv or .json")
 
 

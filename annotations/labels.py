@@ -252,13 +252,9 @@ def _lines(dataset: Dataset, subject: str) -> Iterator[tuple[int, Label | None]]
 
 def current_labels(labels: Iterable[Label]) -> dict[str, Label]:
     """Return the label in force for each expression: the last of those that rank highest."""
-    current: dict[str, Label] = {}
-    for (expression, _), stack in _stacks(labels).items():
-        for label in stack:
-            old = current.get(expression)
-            if old is None or (_rank(label), label.time) >= (_rank(old), old.time):
-                current[expression] = label
-    return dict(sorted(current.items()))
+    events = [label for stack in _stacks(labels).values() for label in stack]
+    events.sort(key=lambda label: (label.expression, _rank(label), label.time))
+    return {label.expression: label for label in events}  # the last one wins
 
 
 def labels_of(labels: Iterable[Label], annotator: str) -> dict[str, Label]:
@@ -292,10 +288,7 @@ def _stacks(labels: Iterable[Label]) -> dict[tuple[str, str], list[Label]]:
 
 
 def _rank(label: Label) -> int:
-    """Rank an annotator.
-
-    Adjudications above people, people above rules, rules above suggestions.
-    """
+    """Rank an annotator: adjudications, then people, then rules, then suggestions."""
     if label.action == "settle":
         return 3
     return 2 if is_person(label.annotator) else int(label.annotator != AUTOMATIC)

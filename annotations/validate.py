@@ -98,18 +98,15 @@ def footage_problems(index: Index, label: Label) -> Iterator[tuple[str, str]]:
     for name in ("first", "frame", "last"):
         frame = getattr(label, name)
         if frame is not None and not cue.start_frame <= frame <= cue.end_frame:
-            yield (
-                "window",
-                f"{name} {frame} lies outside the cue window {cue.start_frame} to {cue.end_frame}",
-            )
+            window = f"{cue.start_frame} to {cue.end_frame}"
+            yield "window", f"{name} {frame} lies outside the cue window {window}"
     if not 0 <= label.frame < source.frames:
         yield "identity", f"frame {label.frame} does not exist in {label.camera}"
-    elif (source.pts[label.frame], source.dhash[label.frame]) != (label.pts, label.dhash):
-        yield (
-            "identity",
-            f"frame {label.frame} of {label.camera} has pts {source.pts[label.frame]} and hash"
-            f" {source.dhash[label.frame]}, the label says {label.pts} and {label.dhash}",
-        )
+        return
+    pts, dhash = source.pts[label.frame], source.dhash[label.frame]
+    if (pts, dhash) != (label.pts, label.dhash):
+        found = f"frame {label.frame} of {label.camera} has pts {pts} and hash {dhash}"
+        yield "identity", f"{found}, the label says {label.pts} and {label.dhash}"
 
 
 @dataclass(frozen=True)

@@ -31,10 +31,10 @@ def run_handler(
         with readers_may_leave(sys.stdout):
             sys.stdout.flush()
         return code
-    except ConfigError as error:
-        return _fail(program, error, USAGE)
     except Express50Error as error:
-        return _fail(program, error, FAILED)
+        line = " ".join(str(error).split())
+        sys.stderr.write(f"{program}: {type(error).__name__}: {line}\n")
+        return USAGE if isinstance(error, ConfigError) else FAILED
     except OSError as error:  # the machine's, not a defect: permissions, a full disk, a folder
         place = f" {error.filename}:" if error.filename is not None else ""
         words = error.strerror or str(error) or "no reason given"
@@ -68,13 +68,6 @@ def add_command(
     if json:
         parser.add_argument("--json", action="store_true", help="print as JSON")
     return parser
-
-
-def _fail(program: str, error: Express50Error, code: int) -> int:
-    notes = getattr(error, "__notes__", [])
-    line = " ".join(" ".join([str(error), *notes]).split())
-    sys.stderr.write(f"{program}: {type(error).__name__}: {line}\n")
-    return code
 
 
 @contextlib.contextmanager
@@ -123,6 +116,15 @@ def log(line: str) -> None:
 def say_json(value: object) -> None:
     """Write JSON to standard output."""
     say(json.dumps(value, indent=1, sort_keys=True, ensure_ascii=False))
+
+
+def answer(args: argparse.Namespace, data: object, *lines: str) -> int:
+    """Print data as JSON where ``--json`` asks for it, else the lines; return the exit code OK."""
+    if args.json:
+        say_json(data)
+    else:
+        say(*lines)
+    return OK
 
 
 @contextlib.contextmanager

@@ -135,10 +135,8 @@ def displacements(
     """Measure landmark motion (F, 68, 2) from neutral (68, 2), in face sides, less the head's."""
     moved = np.zeros(points.shape)
     for rows in windows.values():
-        motions = np.stack(
-            [similarity_2d(frame[STABLE], neutral[STABLE]) for frame in points[rows]]
-        )
-        motions = steady(motions)
+        fits = [similarity_2d(frame[STABLE], neutral[STABLE]) for frame in points[rows]]
+        motions = steady(np.stack(fits))
         moved[rows] = points[rows] @ motions[:, :, :2].transpose(0, 2, 1) + motions[:, None, :, 2]
         moved[rows] -= neutral
     return moved / face_side(neutral)

@@ -19,7 +19,7 @@ from annotations.labels import (
     make_mark,
     read_labels,
 )
-from annotations.observe.stage import read_observations
+from annotations.observe.stage import cue_frames, read_observations
 from annotations.suggestions import Suggested, reference_subject
 from express50.capture.expressions import load_script
 from express50.capture.frames import read_proxy
@@ -76,11 +76,11 @@ def suggest_for(
             for expression, label in current_labels(read_labels(dataset, other)).items()
             if label.annotator != AUTOMATIC
         }
-        reference = Reference(
-            watch(read_index(dataset, other), read_observations(dataset, other)),
-            {e: label.frame for e, label in people.items() if label.frame is not None},
-            frozenset(e for e, label in people.items() if label.frame is None),
-        )
+        chosen = {e: label.frame for e, label in people.items() if label.frame is not None}
+        theirs = watch(read_index(dataset, other), read_observations(dataset, other))
+        flagged = people.keys() - chosen.keys()
+        windows = {e: rows for e, rows in theirs.windows.items() if e not in flagged}
+        reference = Reference(replace(theirs, windows=windows), chosen)
     elif other != index.subject:
         why = f"the reference {other} is not observed; every subject's own peaks were taken"
         dropped.append(Note("matching", why))
@@ -156,7 +156,7 @@ def _in_footage(found: Suggestion, features: Features, expression: str, index: I
     """Express a suggestion in the footage's frames, its curves per frame of the cue window."""
     frames = features.frames[features.windows[expression]]
     cue = next(c for c in index.cues if c.expression_id == expression)
-    every = np.arange(cue.start_frame, min(cue.end_frame, index.frames - 1) + 1)
+    every = cue_frames(index, cue)
 
     def curve(values: np.ndarray) -> list[float]:
         return [round(float(v), 3) for v in np.interp(every, frames, values)]

@@ -74,11 +74,10 @@ class Suggestion:
 
 @dataclass(frozen=True)
 class Reference:
-    """The reference identity, and the frames that people chose as canonical, by expression."""
+    """The reference's expressions that nobody flagged, and the frames that people chose of them."""
 
     features: Features
     chosen: Mapping[str, int]
-    flagged: frozenset[str] = frozenset()
 
 
 def suggest_all(
@@ -104,11 +103,7 @@ def suggest_all(
             found[expression] = suggest_rest(values, groups, float(np.median(tops)))
             continue
         target = None
-        if (
-            reference is not None
-            and expression in reference.features.windows
-            and expression not in reference.flagged
-        ):
+        if reference is not None and expression in reference.features.windows:
             canonical[expression], target = _target(features, reference, expression, entry)
         found[expression] = suggest(values, groups, target)
     return found, canonical
@@ -302,12 +297,10 @@ def apex_of(curve: np.ndarray) -> int:
     """Find the row of a curve's (T,) apex: the middle of the frames that equal it within noise."""
     even = steady(curve)
     top = int(np.argmax(even))
-    low = high = top
-    while low > 0 and even[low - 1] >= PLATEAU_SHARE * even[top]:
-        low -= 1
-    while high < len(even) - 1 and even[high + 1] >= PLATEAU_SHARE * even[top]:
-        high += 1
-    return round((low + high) / 2)
+    lower = np.flatnonzero(even < PLATEAU_SHARE * even[top])
+    low = lower[lower < top].max(initial=-1) + 1
+    high = lower[lower > top].min(initial=len(even)) - 1
+    return round(float(low + high) / 2)
 
 
 def candidate_rows(row: int, others: list[int], curve: np.ndarray) -> list[int]:

@@ -83,14 +83,14 @@ def run(
 ) -> Result:
     """Write ``observations.npz`` and a picture of the watching cameras at rest."""
     index = read_index(dataset, item)
-    windows = {c.expression_id: cue_frames(index, c, stride) for c in index.cues}
-    if not any(len(frames) for frames in windows.values()):
+    cues = {c.expression_id: cue_frames(index, c, stride) for c in index.cues}
+    windows = {expression: frames for expression, frames in cues.items() if len(frames)}
+    if not windows:
         raise StageError(f"{item}: cues.csv names no expression in the footage; add its timing")
     net = load_network()
-    rest = windows.get(NEUTRAL)
-    if rest is None or not len(rest):
-        rest = np.array([frames[0] for frames in windows.values() if len(frames)])
-    frames = np.unique(np.concatenate(list(windows.values())))
+    rest = windows.get(NEUTRAL, np.array([frames[0] for frames in windows.values()]))
+    seen = list(windows.values())
+    frames = np.unique(np.concatenate(seen))
 
     def score(camera: str, frame: int) -> float:
         return detect(net, read_proxy(dataset, item, camera, frame), smallest=search).score
@@ -99,7 +99,6 @@ def run(
     middle, ranked = choose_cameras(index, score, tries, min_score)
     watching = ranked[:cameras]
     rest = np.union1d(rest, [middle])
-    seen = [c for c in windows.values() if len(c)]
     views = [_watch(dataset, item, net, camera, seen, rest, search) for camera in watching]
     points, scores, faces = (np.stack(part) for part in zip(*views, strict=True))
     np.savez_compressed(
@@ -114,7 +113,7 @@ def run(
         "watching_cameras": watching,
         "score_median": round(float(np.median(scores)), 4),
     }
-    beyond = [e for e, window in windows.items() if not len(window)]
+    beyond = (e for e in cues if e not in windows)
     return Result(metrics, [Note(e, "its cue lies beyond the footage") for e in beyond])
 
 
@@ -125,16 +124,13 @@ def cue_frames(index: Index, cue: Cue, stride: int = 1) -> np.ndarray:
 
 def frames_to_try(rest: np.ndarray, frames: np.ndarray) -> list[int]:
     """List the frames in which to search for the face: at rest, then all over the clips."""
-    spread = [*np.linspace(0, len(rest) - 1, 3)[[1, 0, 2]].astype(int)]
+    spread = np.linspace(0, len(rest) - 1, 3)[[1, 0, 2]].astype(int)
     others = np.linspace(0, len(frames) - 1, TRIES).astype(int)
-    return list(dict.fromkeys([*(int(rest[i]) for i in spread), *(int(frames[i]) for i in others)]))
+    return list(dict.fromkeys([*rest[spread].tolist(), *frames[others].tolist()]))
 
 
 def choose_cameras(
-    index: Index,
-    score: Callable[[str, int], float],
-    frames: list[int],
-    min_score: float,
+    index: Index, score: Callable[[str, int], float], frames: list[int], min_score: float
 ) -> tuple[int, list[str]]:
     """Find the first of the frames that shows a face, and rank the cameras that see it best.
 
@@ -231,13 +227,11 @@ def align_faces(
     side = face_side(neutral)
     layout = (neutral[STABLE] - ((low + high) / 2 - side / 2)) * (FACE / side)
     motions = steady(np.stack([similarity_2d(frame[STABLE], layout) for frame in points]))
-    grey = (cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in images)
-    return np.stack(
-        [
-            _cut(image, cv2.invertAffineTransform(motion), FACE)
-            for image, motion in zip(grey, motions, strict=True)
-        ]
-    )
+    faces = [
+        _cut(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), cv2.invertAffineTransform(motion), FACE)
+        for image, motion in zip(images, motions, strict=True)
+    ]
+    return np.stack(faces)
 
 
 def face_side(neutral: np.ndarray) -> float:
@@ -257,10 +251,10 @@ def similarity_2d(source: np.ndarray, target: np.ndarray) -> np.ndarray:
     return np.concatenate([s * R[:2, :2], t[:2, None]], axis=1)
 
 
-def steady(values: np.ndarray, sigma: float = STEADY_FRAMES) -> np.ndarray:
+def steady(values: np.ndarray) -> np.ndarray:
     """Average values (T, ...) over neighbouring frames with Gaussian weights."""
     numbers = np.arange(len(values))
-    weights = np.exp(-0.5 * ((numbers[:, None] - numbers) / sigma) ** 2)
+    weights = np.exp(-0.5 * ((numbers[:, None] - numbers) / STEADY_FRAMES) ** 2)
     return np.tensordot(weights / weights.sum(1, keepdims=True), values, axes=1)
 
 

@@ -9,6 +9,7 @@ from textual import events, work
 from textual.app import App, ComposeResult
 from textual.binding import Binding
 from textual.containers import Horizontal, Vertical
+from textual.geometry import Size
 from textual.screen import Screen
 from textual.timer import Timer
 from textual.widgets import Static
@@ -17,7 +18,7 @@ from annotations.labels import Label
 from annotations.ui import task as moves
 from annotations.ui import theme, words
 from annotations.ui.frames import ZOOMS, FaceFinder, FrameCache, FrameCrop
-from annotations.ui.images import CellSize, Painter, PaneShape, SixelPainter
+from annotations.ui.images import Painter, PaneShape, SixelPainter
 from annotations.ui.picture import (
     Aim,
     PicturePane,
@@ -57,7 +58,7 @@ class Desk(Screen[None]):
         session: Session,
         cache: FrameCache,
         faces: FaceFinder | None,
-        sixel_cell: CellSize | None,
+        sixel_cell: Size | None,
     ) -> None:
         super().__init__()
         self.session = session
@@ -68,7 +69,7 @@ class Desk(Screen[None]):
         self.aim = Aim(0, ZOOMS[0], faces)
         self.player = Player(self)
         self._sixel_cell = sixel_cell
-        self._said: tuple[str, str] | None = None
+        self._said: Text | None = None
 
     def compose(self) -> ComposeResult:
         """Yield status, words, two pictures, strip, and a line for messages and hints."""
@@ -143,11 +144,7 @@ class Desk(Screen[None]):
             self._write("#words", Text(f" {self.scene.description}", style=theme.TEXT))
 
     def _draw_message(self) -> None:
-        if self._said is None:
-            self._write("#message", words.hint_line(self.app.size.width))
-        else:
-            message, colour = self._said
-            self._write("#message", Text(f" {message}", style=colour))
+        self._write("#message", self._said or words.hint_line(self.app.size.width))
 
     def _write(self, where: str, text: Text) -> None:
         line = self.query_one(where, Static)
@@ -156,7 +153,7 @@ class Desk(Screen[None]):
 
     def say(self, message: str, colour: str = theme.GREEN) -> None:
         """Show a message in place of the hints, for some seconds or until the next message."""
-        self._said = said = (message, colour)
+        self._said = said = Text(f" {message}", style=colour)
 
         def hush() -> None:
             if self._said is said:
@@ -315,10 +312,6 @@ class Desk(Screen[None]):
         self.player.stop()
         self.app.push_screen(words.HelpDialog())
 
-    def action_quit(self) -> None:
-        """Leave; every decision is on disk already."""
-        self.app.exit()
-
 
 class Player:
     """Plays the window or blinks the pictures of a desk, one at a time.
@@ -387,7 +380,7 @@ class AnnotateApp(App[None]):
         session: Session,
         *,
         faces: FaceFinder | None = None,
-        sixel_cell: CellSize | None = None,
+        sixel_cell: Size | None = None,
     ) -> None:
         """Show pictures as sixels where the pixels of a terminal's cell are given."""
         super().__init__()

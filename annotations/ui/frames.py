@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections import OrderedDict
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -40,15 +40,8 @@ class FrameCache:
     what a background thread should decode next.
     """
 
-    def __init__(
-        self,
-        dataset: Dataset,
-        limit_bytes: int = LIMIT_BYTES,
-        decode: Callable[[Dataset, FrameCrop], np.ndarray] | None = None,
-    ) -> None:
+    def __init__(self, dataset: Dataset) -> None:
         self._dataset = dataset
-        self._limit = limit_bytes
-        self._decode = decode or read_shot
         self._pictures: OrderedDict[FrameCrop, np.ndarray] = OrderedDict()
         self._bytes = 0
         self._wanted: list[FrameCrop] = []
@@ -86,11 +79,6 @@ class FrameCache:
                 self._thread.start()
             self._wake.notify()
 
-    @property
-    def used_bytes(self) -> int:
-        """Return bytes of the pictures in memory."""
-        return self._bytes
-
     def idle(self) -> bool:
         """Return whether nothing is left to decode ahead."""
         with self._wake:
@@ -122,7 +110,7 @@ class FrameCache:
 
     def _read(self, shot: FrameCrop) -> np.ndarray:
         try:
-            picture = self._decode(self._dataset, shot)
+            picture = read_shot(self._dataset, shot)
         except (Express50Error, OSError, IndexError, ValueError, cv2.error) as error:
             where = f"{shot.subject} {shot.camera} frame {shot.frame}"
             if isinstance(error, FileNotFoundError) or isinstance(
@@ -134,10 +122,10 @@ class FrameCache:
             raise AnnotationError(words) from error
         picture.setflags(write=False)
         with self._wake:
-            if shot not in self._pictures and picture.nbytes <= self._limit:
+            if shot not in self._pictures and picture.nbytes <= LIMIT_BYTES:
                 self._pictures[shot] = picture
                 self._bytes += picture.nbytes
-            while self._bytes > self._limit:
+            while self._bytes > LIMIT_BYTES:
                 self._bytes -= self._pictures.popitem(last=False)[1].nbytes
         return picture
 

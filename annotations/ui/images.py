@@ -14,7 +14,6 @@ import re
 import struct
 import sys
 import termios
-from collections.abc import Callable
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -28,7 +27,6 @@ from textual.geometry import Size
 from textual.strip import Strip
 
 from annotations.ui import theme
-from annotations.ui.frames import FrameCrop
 from express50.errors import AnnotationError
 
 KEPT = 32  # painted pictures that are kept for going back and forth
@@ -50,13 +48,6 @@ _STEP = 8  # colours are kept in steps of 8: fewer styles, fewer bytes over ssh
 _BAND = 6
 
 
-class CellSize(NamedTuple):
-    """Pixels of a character cell."""
-
-    width: int
-    height: int
-
-
 class PaneShape(NamedTuple):
     """A picture's size in cells, the pixels of each cell, and a cell's height over width."""
 
@@ -67,8 +58,8 @@ class PaneShape(NamedTuple):
     cell_aspect: float = 2.0  # a character cell is about twice as high as wide
 
 
-def cell_size() -> CellSize:
-    """Ask the terminal's driver for the pixels of a cell.
+def cell_size() -> Size:
+    """Ask the terminal's driver for the pixels of a character cell.
 
     Raises:
         AnnotationError: it does not know them.
@@ -78,7 +69,7 @@ def cell_size() -> CellSize:
         answer = fcntl.ioctl(terminal, termios.TIOCGWINSZ, bytes(8))
         rows, columns, width, height = struct.unpack("4H", answer)
         if min(rows, columns) > 0 and width >= columns and height >= rows:
-            return CellSize(width // columns, height // rows)
+            return Size(width // columns, height // rows)
     raise AnnotationError(
         "--pictures sixel: the terminal does not say how many pixels a cell has;"
         " use --pictures blocks"
@@ -92,27 +83,32 @@ class Painter:
     """
 
     def __init__(self) -> None:
-        self.strips = lru_cache(maxsize=KEPT)(self._strips)
+        # The lines that show a crop in a pane of that size; ``read`` gives the crop's pixels.
+        self.strips = lru_cache(maxsize=KEPT)(lambda crop, pane, read: self.paint(pane, read(crop)))
 
     def shape(self, pane: Size) -> PaneShape:
         """Return the picture's shape in a pane of so many cells: four pixels per cell."""
         return PaneShape(max(1, pane.width), max(1, pane.height), 2, 2)
 
     def paint(self, pane: Size, picture: np.ndarray) -> list[Strip]:
-        """Return the lines of the pane that show a picture of `shape`."""
-        return picture_strips(picture)
-
-    def _strips(
-        self, shot: FrameCrop, pane: Size, read: Callable[[FrameCrop], np.ndarray]
-    ) -> list[Strip]:
-        """Return the lines that show a crop; ``read`` gives its pixels (height, width, 3) uint8."""
-        return self.paint(pane, read(shot))
+        """Return the lines of the pane that show a picture (2 h, 2 w, 3) uint8 of `shape`."""
+        glyphs, front, back = cell_colours(picture)
+        weights = np.array([1 << 16, 1 << 8, 1])
+        pairs = ((front.astype(np.int64) @ weights) << 24) | (back.astype(np.int64) @ weights)
+        lines = []
+        for text, row in zip(map("".join, glyphs), pairs, strict=True):
+            starts = np.flatnonzero(np.diff(row, prepend=row[0] ^ 1))
+            colours, begins = row[starts].tolist(), starts.tolist()
+            # Neighbours of the same two colours share a segment.
+            runs = zip(begins, [*begins[1:], len(text)], colours, strict=True)
+            lines.append(Strip([Segment(text[a:b], _style(c)) for a, b, c in runs], len(text)))
+        return lines
 
 
 class SixelPainter(Painter):
     """Paints sixels, drawn after the pane's last line."""
 
-    def __init__(self, cell: CellSize) -> None:
+    def __init__(self, cell: Size) -> None:
         super().__init__()
         self._cell = cell
 
@@ -158,33 +154,16 @@ def cell_colours(picture: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarra
     kept = (front**2).sum(-1) / inside + (back**2).sum(-1) / (4 - inside)
     spread = kept - (total**2).sum(-1) / 4
     spread[0] *= _QUADRANT_GAIN
-    best = spread.argmax(0)[None]
-    take = best[..., None]
-    inside = np.take_along_axis(np.broadcast_to(inside, spread.shape), best, 0)[0][..., None]
-    front = np.take_along_axis(front, take, 0)[0]
-    back = total - front
-    return _GLYPHS[best[0]], _to_step(front / inside), _to_step(back / (4 - inside))
+    best = spread.argmax(0)
+    inside = _SPLITS.sum(1)[best][..., None]
+    front = np.take_along_axis(front, best[None, ..., None], 0)[0]
+    return _GLYPHS[best], _to_step(front / inside), _to_step((total - front) / (4 - inside))
 
 
 def _to_step(colours: np.ndarray) -> np.ndarray:
     """Round colours to the steps that are kept, the brightest to white."""
     level = np.rint(np.asarray(colours, np.float32) / _STEP)
     return np.minimum(level * _STEP, 255).astype(np.uint8)
-
-
-def picture_strips(picture: np.ndarray) -> list[Strip]:
-    """Return the lines of text that show a picture (2 h, 2 w, 3) uint8."""
-    glyphs, front, back = cell_colours(picture)
-    weights = np.array([1 << 16, 1 << 8, 1])
-    pairs = ((front.astype(np.int64) @ weights) << 24) | (back.astype(np.int64) @ weights)
-    lines = []
-    for text, row in zip(map("".join, glyphs), pairs, strict=True):
-        starts = np.flatnonzero(np.diff(row, prepend=row[0] ^ 1))
-        colours, begins = row[starts].tolist(), starts.tolist()
-        # Neighbours of the same two colours share a segment.
-        runs = zip(begins, [*begins[1:], len(text)], colours, strict=True)
-        lines.append(Strip([Segment(text[a:b], _style(c)) for a, b, c in runs], len(text)))
-    return lines
 
 
 @lru_cache(maxsize=1 << 16)

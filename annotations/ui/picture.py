@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from rich.segment import Segment
+from rich.align import Align
 from rich.text import Text
 from textual.geometry import Region
 from textual.strip import Strip
@@ -33,41 +32,30 @@ class FrameLook:
     zoom: str
     aspect: float
 
-    def at(self, frame: int) -> FrameLook:
-        """Look in the same way at another frame."""
-        return replace(self, frame=frame)
-
 
 def shot_of(look: FrameLook, shape: PaneShape) -> FrameCrop:
     """Crop the picture of a look that fills a pane."""
-    columns, rows = max(1, shape.columns), max(1, shape.rows)
-    box = zoom_box(look.face, look.zoom, shape.cell_aspect * rows / columns, look.aspect)
-    width, height = shape.across * columns, shape.down * rows
+    aspect = shape.cell_aspect * shape.rows / shape.columns
+    box = zoom_box(look.face, look.zoom, aspect, look.aspect)
+    width, height = shape.across * shape.columns, shape.down * shape.rows
     return FrameCrop(look.subject, look.camera, look.frame, box, width, height)
 
 
 class PicturePane(Widget):
-    """Shows a look, or words in its place; draws only when what it shows changes."""
+    """Shows a look, or words in its place."""
 
     def __init__(self, cache: FrameCache, name: str, painter: Painter) -> None:
         super().__init__(id=name)
         self._cache = cache
         self._blocks = Painter()
         self._painter = painter
-        self._look: FrameLook | None = None
+        self.look: FrameLook | None = None  # None where words replace it
         self._words = ""
-        self._lines: list[Strip] | None = None
-        self._covered = False
 
-    @property
-    def look(self) -> FrameLook | None:
-        """Return the look that is shown; None where words replace it."""
-        return self._look
-
-    def show(self, look: FrameLook | None, words: str = "") -> None:
-        """Show a look, or words where there is none."""
-        if (look, words) != (self._look, self._words):
-            self._look, self._words, self._lines = look, words, None
+    def show(self, look: FrameLook | None, words: str) -> None:
+        """Show a look, or words where there is none; nothing is drawn when they are the same."""
+        if (look, words) != (self.look, self._words):
+            self.look, self._words = look, words
             self.refresh()
 
     @property
@@ -75,30 +63,20 @@ class PicturePane(Widget):
         """Return the size of the picture, in cells and pixels."""
         return self._painter.shape(self.size)
 
-    def on_resize(self) -> None:
-        """Draw anew."""
-        self._lines = None
-
     def render_lines(self, crop: Region) -> list[Strip]:
         """Return the lines of the picture, past Textual's cache of styled lines.
 
         That cache rewrites the style of every segment, which costs more than all the rest: a
         picture has thousands, and no border or padding that it would be needed for.
         """
-        covered = not self.screen.is_active
-        if self._lines is None or covered != self._covered:
-            self._covered = covered
-            self._lines = self._draw()
-        blanks = [Strip.blank(self.size.width, theme.PLAIN)] * self.size.height
-        lines = (self._lines + blanks)[crop.y : crop.bottom]
-        return [line.crop(crop.x, crop.right) for line in lines]
+        return [line.crop(crop.x, crop.right) for line in self._draw()[crop.y : crop.bottom]]
 
     def _draw(self) -> list[Strip]:
-        if self._look is None:
+        if self.look is None:
             return self._written(self._words)
         # Below a dialog characters stand in: Textual tints them, and pixels would lie on top.
-        painter = self._blocks if self._covered else self._painter
-        shot = shot_of(self._look, painter.shape(self.size))
+        painter = self._painter if self.screen.is_active else self._blocks
+        shot = shot_of(self.look, painter.shape(self.size))
         try:
             return painter.strips(shot, self.size, self._cache.get)
         except AnnotationError as error:
@@ -108,15 +86,9 @@ class PicturePane(Widget):
         """Write words in the middle of the pane."""
         width, height = self.size
         text = Text(words, style=theme.DIM, justify="center")
-        lines = text.wrap(self.app.console, max(1, width - 4))
-        blank = Strip.blank(width, theme.PLAIN)
-        above = max(0, (height - len(lines)) // 2)
-        written = []
-        for line in lines:
-            line.align("center", width)
-            strip = Strip([Segment(line.plain, theme.DIM)])
-            written.append(strip.adjust_cell_length(width, theme.PLAIN))
-        return [blank] * above + written
+        middle = Align.center(text, theme.PLAIN, vertical="middle", width=max(1, width - 4))
+        options = self.app.console.options.update(width=width, height=height)
+        return [Strip(line, width) for line in self.app.console.render_lines(middle, options)]
 
 
 AHEAD = 64  # frames about the cursor that are decoded before they are asked for
@@ -142,7 +114,7 @@ def subject_look(scene: TaskScene, view: CueView, aim: Aim) -> FrameLook | None:
     # One framing for the whole window, so that only the face moves when one steps.
     anchor = view.candidates[0] if view.candidates else (view.first + view.last) // 2
     look = _look(aim, scene.index, camera_name(scene, aim.camera), anchor)
-    return look.at(view.cursor)
+    return replace(look, frame=view.cursor)
 
 
 def reference_look(scene: TaskScene, aim: Aim) -> FrameLook | None:
@@ -176,7 +148,9 @@ def shots_ahead(
 ) -> list[FrameCrop]:
     """Return pictures to decode for a task, most urgent first; finds the faces on the way."""
     here, there = subject_look(scene, view, aim), reference_look(scene, aim)
-    shots = [shot_of(here.at(n), shape) for n in frames_ahead(view, count)] if here else []
+    shots = []
+    if here is not None:
+        shots = [shot_of(replace(here, frame=n), shape) for n in frames_ahead(view, count)]
     if there is not None:
         shots.insert(1, shot_of(there, shape))
     return shots
@@ -184,19 +158,14 @@ def shots_ahead(
 
 def strip_content(scene: TaskScene, view: CueView, hidden: bool) -> StripContent:
     """Collect the timeline's content, without what could sway the annotator while it is hidden."""
-    found = None if hidden else scene.suggestion
-
-    def curve(values: Sequence[float] | None) -> tuple[float, ...]:
-        """Fit a curve to the window, one value per frame; its ends are continued."""
-        if found is None or not values:
-            return ()
-        places = np.arange(view.first, view.last + 1) - found.start
-        return tuple(np.asarray(values, float)[places.clip(0, len(values) - 1)].tolist())
-
-    return StripContent(
-        view=view,
-        activity=curve(found.activity if found else None),
-        match=curve(found.match if found else None),
-        mine=scene.mine,
-        in_force=None if hidden else scene.in_force,
-    )
+    if hidden or scene.suggestion is None:
+        return StripContent(view=view, mine=scene.mine, in_force=None if hidden else scene.in_force)
+    found = scene.suggestion
+    places = np.arange(view.first, view.last + 1) - found.start
+    # One value per frame of the window: the curves' ends are continued.
+    curves = {
+        name: tuple(np.take(np.asarray(values, float), places, mode="clip").tolist())
+        for name, values in (("activity", found.activity), ("match", found.match))
+        if values
+    }
+    return StripContent(view=view, mine=scene.mine, in_force=scene.in_force, **curves)

@@ -7,6 +7,7 @@ No screen is needed: the app calls this, and so do tests. A decision is on disk,
 from __future__ import annotations
 
 import time
+from collections import defaultdict
 from collections.abc import Collection
 from dataclasses import dataclass, replace
 
@@ -59,7 +60,7 @@ class Session:
         self.tasks = worklist(dataset, annotator, subjects, expressions, order, everything=True)
         todo = worklist(dataset, annotator, subjects, expressions, order)
         self._open = {task.key for task in todo}
-        self._efforts: dict[tuple[str, str], Effort] = {}
+        self._efforts: defaultdict[int, Effort] = defaultdict(Effort)  # by position
         self._decided: list[int] = []
         self._clock = time.monotonic
         self._last_key = self._clock()
@@ -89,19 +90,16 @@ class Session:
 
     def effort(self) -> Effort:
         """Sum the cost of the open task so far, with the time since the last key."""
-        spent = self._efforts.get(self._here(), Effort())
+        spent = self._efforts[self.position]
         return Effort(spent.keys, spent.seconds + self._since_last_key())
 
     def press(self) -> None:
         """Count a keystroke, and the time since the last one, for the open task."""
         self._book()
-        self._efforts[self._here()].keys += 1
+        self._efforts[self.position].keys += 1
 
     def _since_last_key(self) -> float:
         return min(max(self._clock() - self._last_key, 0.0), IDLE_SECONDS)
-
-    def _here(self) -> tuple[str, str]:
-        return self.task.key if self.task is not None else ("", "")
 
     def move(self, by: int) -> bool:
         """Open a neighbouring task, decided or not; False at either end."""
@@ -131,7 +129,7 @@ class Session:
 
     def _book(self) -> None:
         """Put the time since the last key to the open task's account."""
-        self._efforts.setdefault(self._here(), Effort()).seconds += self._since_last_key()
+        self._efforts[self.position].seconds += self._since_last_key()
         self._last_key = self._clock()
 
     def mark(self, scene: TaskScene, view: CueView, camera: str) -> Label:
@@ -165,12 +163,12 @@ class Session:
     def _save(self, label: Label) -> Label:
         """Append a decision on the open task with what it cost."""
         self._book()
-        spent = self._efforts[self._here()]
+        spent = self._efforts[self.position]
         label = replace(label, seconds=round(spent.seconds, 2), keys=spent.keys)
         append_label(self.dataset, label)
         self._decided.append(self.position)
-        self._open.discard(self._here())
-        self._efforts.pop(self._here())
+        self._open.discard(self.tasks[self.position].key)
+        del self._efforts[self.position]
         return label
 
     def undo(self) -> LabelTask | None:

@@ -59,12 +59,6 @@ class TaskScene:
     problem: str | None = None
     notes: tuple[str, ...] = ()
 
-    @property
-    def candidates(self) -> tuple[int, ...]:
-        """Return suggested frames, best first."""
-        found = self.suggestion
-        return () if found is None else (found.frame, *found.candidates)
-
 
 def load_scene(dataset: Dataset, task: LabelTask, annotator: str) -> TaskScene:
     """Read a task; faults become ``problem`` or ``notes``, not exceptions."""
@@ -181,8 +175,8 @@ def view_of_scene(scene: TaskScene, hidden: bool) -> CueView | None:
     """Open a task on the annotator's own mark, else on the suggestion, else in the middle."""
     if scene.index is None:
         return None
-    mine = scene.mine
-    candidates = () if hidden else scene.candidates
+    mine, found = scene.mine, None if hidden else scene.suggestion
+    candidates = (found.frame, *found.candidates) if found else ()
     view = open_view(scene.first, scene.last, candidates, mine.frame if mine else None)
     return view if mine is None else replace(view, plateau_first=mine.first, plateau_last=mine.last)
 

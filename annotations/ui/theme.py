@@ -28,7 +28,6 @@ MATCH = Style(color=VIOLET, bgcolor=GROUND)
 BEST = Style(color=GREEN, bgcolor=GROUND, bold=True, reverse=True)
 CANDIDATE = Style(color=GREEN, bgcolor=GROUND)
 MINE = Style(color=BLUE, bgcolor=GROUND, bold=True)
-IN_FORCE = Style(color=TEXT, bgcolor=GROUND)
 PLATEAU = Style(color=BLUE, bgcolor=GROUND)
 CURSOR = Style(bgcolor="#5e4012")
 CURSOR_BAR = Style(color=ACCENT, bgcolor="#5e4012")
@@ -111,7 +110,7 @@ LOOK = (
     KeyAction("b", "b", "blink", "blink: reference and frame in one place"),
     KeyAction("space", "Space", "play", "play the window, or stop"),
     KeyAction("question_mark,f1", "?", "help", "this help"),
-    KeyAction("q", "q", "quit", "leave; every mark is already saved"),
+    KeyAction("q", "q", "app.quit", "leave; every mark is already saved"),
 )
 GROUPS = (MOVE, DECIDE, LOOK)
 HINTS = (

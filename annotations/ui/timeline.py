@@ -8,7 +8,7 @@ from itertools import groupby
 from rich.segment import Segment
 from rich.style import Style
 from textual import events
-from textual.geometry import Region, Size
+from textual.geometry import Region
 from textual.message import Message
 from textual.strip import Strip
 from textual.widget import Widget
@@ -102,10 +102,8 @@ def mark_line(content: StripContent, width: int) -> Line:
         line[column_of(view, first, width)] = ("[", theme.PLATEAU)
     if last is not None:
         line[min(column_of(view, last, width) + wide - 1, width - 1)] = ("]", theme.PLATEAU)
-    for label, glyph, style in (
-        (content.in_force, "○", theme.IN_FORCE),
-        (content.mine, "●", theme.MINE),
-    ):
+    marks = ((content.in_force, "○", theme.PLAIN), (content.mine, "●", theme.MINE))
+    for label, glyph, style in marks:
         frame = None if label is None else label.frame
         if frame is not None and view.first <= frame <= view.last:
             line[sign_column(view, frame, width)] = (glyph, style)
@@ -129,20 +127,12 @@ class CurveStrip(Widget):
     def __init__(self) -> None:
         super().__init__(id="strip")
         self._content: StripContent | None = None
-        self._lines: list[Strip] = []
-        self._drawn_size: Size | None = None
 
     def show(self, content: StripContent | None) -> None:
         """Show other content; nothing is drawn when it is the same."""
         if content != self._content:
             self._content = content
-            self._lines = []
             self.refresh()
-
-    @property
-    def text(self) -> list[str]:
-        """Return the lines as plain text."""
-        return [line.text for line in self._drawn()]
 
     def on_click(self, event: events.Click) -> None:
         """Post the frame that was clicked."""
@@ -152,15 +142,9 @@ class CurveStrip(Widget):
 
     def render_lines(self, crop: Region) -> list[Strip]:
         """Return the lines of the strip, past Textual's cache of styled lines, which is slower."""
-        lines = self._drawn() + [Strip.blank(self.size.width, theme.PLAIN)] * self.size.height
+        lines = draw_strip(self._content, *self.size)
+        lines += [Strip.blank(self.size.width, theme.PLAIN)] * self.size.height
         return [line.crop(crop.x, crop.right) for line in lines[crop.y : crop.bottom]]
-
-    def _drawn(self) -> list[Strip]:
-        # Held against the size itself: the message of a resize may come after the next drawing.
-        if not self._lines or self._drawn_size != self.size:
-            self._lines = draw_strip(self._content, self.size.width, self.size.height)
-            self._drawn_size = self.size
-        return self._lines
 
 
 def draw_strip(content: StripContent | None, width: int, height: int) -> list[Strip]:

@@ -26,8 +26,7 @@ LEAST_CELLS = 6  # fewer say nothing
 
 
 def fit(left: Text, right: Text, width: int) -> Text:
-    """Set two texts at the ends of a line; the right one is cut where it does not fit."""
-    left, right = left.copy(), right.copy()
+    """Set two texts at the ends of a line, in the left one; what does not fit is cut."""
     left.truncate(width, overflow="ellipsis")
     room = width - left.cell_len - 1
     right = Text() if room < LEAST_CELLS else right
@@ -94,28 +93,18 @@ def reference_title(scene: TaskScene, look: FrameLook | None, width: int) -> Tex
     return fit(left, Text(f"{look.camera} ", style=theme.FAINT), width)
 
 
-LAST = ("?", "q")
-
-
 @lru_cache(maxsize=8)
 def hint_line(width: int) -> Text:
-    """List as many keys as fit, the most used first; help and quit always come last."""
+    """List as many keys as fit, the most used first; help and quit, the last, always do."""
     text = Text(" ")
     room = width - cell_len("? help  q quit")
     for keys, words in HINTS:
         piece = cell_len(keys) + cell_len(words) + 3
-        if keys not in LAST and text.cell_len + piece <= room:
-            _hint(text, keys, words)
-    for keys, words in HINTS:
-        if keys in LAST:
-            _hint(text, keys, words)
+        if keys in ("?", "q") or text.cell_len + piece <= room:
+            text.append(keys, f"bold {theme.ACCENT}")
+            text.append(f" {words}  ", theme.FAINT)
     text.truncate(width)
     return text
-
-
-def _hint(text: Text, keys: str, words: str) -> None:
-    text.append(keys, f"bold {theme.ACCENT}")
-    text.append(f" {words}  ", theme.FAINT)
 
 
 def saved(label: Label) -> str:

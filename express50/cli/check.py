@@ -7,7 +7,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from express50.console import FAILED, OK, add_command, say, say_json, stdout_to_stderr
+from express50.console import FAILED, OK, add_command, answer, stdout_to_stderr
 from express50.contract.layout import Dataset
 from express50.contract.stage import hook, stages
 from express50.errors import StageError
@@ -73,27 +73,25 @@ def run_check(args: argparse.Namespace) -> int:
             checkpoints=args.checkpoint,
         )
     seconds = time.perf_counter() - started
-    if args.json:
-        say_json(
-            {
-                "sound": result.sound,
-                "findings": [vars(finding) for finding in result.findings],
-                "notes": result.notes,
-                "files": result.files,
-                "bytes": result.bytes,
-                "bytes_read": result.hashed,
-                "seconds": round(seconds, 3),
-            }
-        )
-    else:
-        for one in result.findings:
-            say(f"{one.where}: {one.what}; {'FIXED' if one.fixed else 'fix'}: {one.fix}")
-        say(*(f"note: {note}" for note in result.notes))
-        count, fixed = len(result.findings), sum(one.fixed for one in result.findings)
-        verdict = f"{count} findings, {fixed} fixed, {count - fixed} left" if count else "sound"
-        looked = f"{result.files} files, {result.bytes / 1e6:.1f} MB"
-        read = f"{result.hashed / 1e6:.1f} MB read"
-        say(f"{args.dataset}: {verdict} ({looked}, {read}, {seconds:.1f} s)")
+    data = {
+        "sound": result.sound,
+        "findings": [vars(finding) for finding in result.findings],
+        "notes": result.notes,
+        "files": result.files,
+        "bytes": result.bytes,
+        "bytes_read": result.hashed,
+        "seconds": round(seconds, 3),
+    }
+    lines = [
+        f"{one.where}: {one.what}; {'FIXED' if one.fixed else 'fix'}: {one.fix}"
+        for one in result.findings
+    ]
+    lines += [f"note: {note}" for note in result.notes]
+    count, fixed = len(result.findings), sum(one.fixed for one in result.findings)
+    verdict = f"{count} findings, {fixed} fixed, {count - fixed} left" if count else "sound"
+    looked = f"{result.files} files, {result.bytes / 1e6:.1f} MB"
+    read = f"{result.hashed / 1e6:.1f} MB read"
+    answer(args, data, *lines, f"{args.dataset}: {verdict} ({looked}, {read}, {seconds:.1f} s)")
     return OK if result.sound else FAILED
 
 
@@ -106,35 +104,29 @@ def run_withdraw(args: argparse.Namespace) -> int:
         hook("read_checkpoint")(path)
     if not args.yes:
         paths = [str(path) for path in plan(dataset, args.subject)]
-        if args.json:
-            say_json({"subject": args.subject, "would_remove": paths})
-        else:
-            say(*(f"would remove {path}" for path in paths))
-            models = [*sorted((dataset.root / "grmm").rglob("*.pt")), *args.checkpoint]
-            say(*(f"would take codes and frames out of {path}" for path in models))
-            say("add --yes to remove")
-        return OK
+        models = [*sorted((dataset.root / "grmm").rglob("*.pt")), *args.checkpoint]
+        lines = [f"would remove {path}" for path in paths]
+        lines += [f"would take codes and frames out of {path}" for path in models]
+        data = {"subject": args.subject, "would_remove": paths}
+        return answer(args, data, *lines, "add --yes to remove")
     done = withdraw(dataset, args.subject, args.checkpoint, hook("redact_checkpoint"))
-    if args.json:
-        say_json(
-            {
-                "subject": done.subject,
-                "removed": [str(path) for path in done.removed],
-                "files": done.files,
-                "checkpoints": [str(path) for path in done.checkpoints],
-                "remaining": [str(path) for path in done.remaining],
-                "raw_capture": str(done.capture) if done.capture else None,
-            }
-        )
-    else:
-        say(*(f"removed {path}" for path in done.removed))
-        say(*(f"took codes and frames out of {path}" for path in done.checkpoints))
-        say(*(f"STILL NAMES {done.subject}: {path}" for path in done.remaining))
-        if done.capture:
-            say(f"the raw capture {done.capture} is outside the dataset: delete it yourself")
-        say(
-            "run 'express50 matte' again, as others' plates may have come from the person, then "
-            "the stages after it and 'express50 report'; train models that saw the person again "
-            "(their other weights keep an influence), and delete exports outside the dataset"
-        )
+    data = {
+        "subject": done.subject,
+        "removed": [str(path) for path in done.removed],
+        "files": done.files,
+        "checkpoints": [str(path) for path in done.checkpoints],
+        "remaining": [str(path) for path in done.remaining],
+        "raw_capture": str(done.capture) if done.capture else None,
+    }
+    lines = [f"removed {path}" for path in done.removed]
+    lines += [f"took codes and frames out of {path}" for path in done.checkpoints]
+    lines += [f"STILL NAMES {done.subject}: {path}" for path in done.remaining]
+    if done.capture:
+        lines.append(f"the raw capture {done.capture} is outside the dataset: delete it yourself")
+    lines.append(
+        "run 'express50 matte' again, as others' plates may have come from the person, then "
+        "the stages after it and 'express50 report'; train models that saw the person again "
+        "(their other weights keep an influence), and delete exports outside the dataset"
+    )
+    answer(args, data, *lines)
     return FAILED if done.remaining else OK

@@ -17,7 +17,7 @@ from typing import Any
 from rich.filesize import decimal
 
 from express50.capture.index import read_index
-from express50.console import OK, add_command, format_table, say, say_json, stdout_to_stderr
+from express50.console import add_command, answer, format_table, stdout_to_stderr
 from express50.contract.config import config_toml, resolve_config
 from express50.contract.layout import Dataset
 from express50.contract.stage import Stage, stages
@@ -117,26 +117,23 @@ def run_plan(args: argparse.Namespace) -> int:
     target = target_of(args.target, sizes, footage)
     rows = estimate(known, target, footage, measured, args.workers)
     total = totals(rows)
-    if args.json:
-        rows_json = [vars(row) for row in rows]
-        say_json(
-            {"target": vars(target), "measured": vars(footage), "workers": args.workers}
-            | {"stages": rows_json, "total": total}
-        )
-        return OK
+    data = {"target": vars(target), "measured": vars(footage), "workers": args.workers}
+    data |= {"stages": [vars(row) for row in rows], "total": total}
     columns = ["stage", "items", "s per item", "core hours", f"days on {args.workers}", "disk"]
     columns += ["peak memory", "preset", "times what was measured"]
     hours, days = f"{total['core_hours']:.1f}", f"{total['days']:.2f}"
     cells = [_cells(row) for row in rows]
     cells.append(["sum", "", "", hours, days, decimal(int(total["disk"])), "", "", ""])
-    say(f"target   {args.target or 'as given'}: {_words(target)}")
-    say(f"measured {dataset.root}: {_words(footage)}")
-    say(*format_table(columns, cells))
-    say("s per item: of one core; stages one after the other, no item split over workers")
-    say("peak memory: as measured; more footage may need more")
+    lines = [
+        f"target   {args.target or 'as given'}: {_words(target)}",
+        f"measured {dataset.root}: {_words(footage)}",
+        *format_table(columns, cells),
+        "s per item: of one core; stages one after the other, no item split over workers",
+        "peak memory: as measured; more footage may need more",
+    ]
     if total["not_measured"]:
-        say(f"the sum lacks {', '.join(total['not_measured'])}")
-    return OK
+        lines.append(f"the sum lacks {', '.join(total['not_measured'])}")
+    return answer(args, data, *lines)
 
 
 def _cells(row: Row) -> list[str]:

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from express50.console import FAILED, OK, add_command, say, say_json
+from express50.console import FAILED, OK, add_command, answer, say, say_json
 from express50.errors import FormatError
 
 
@@ -69,10 +69,8 @@ def run_verify(args: argparse.Namespace) -> int:
     from express50.shards.writer import verify
 
     faults = verify(args.directory)
-    if args.json:
-        say_json({"directory": str(args.directory), "faults": faults})
-    else:
-        say(*faults, f"{args.directory}: {len(faults)} faults" if faults else "all is well")
+    verdict = f"{args.directory}: {len(faults)} faults" if faults else "all is well"
+    answer(args, {"directory": str(args.directory), "faults": faults}, *faults, verdict)
     return FAILED if faults else OK
 
 
@@ -81,12 +79,9 @@ def run_ls(args: argparse.Namespace) -> int:
     from express50.shards.reader import ShardReader
 
     reader = ShardReader(args.directory).select(subjects=args.subject, split=args.split)
-    if args.json:
-        say_json([{"key": e.key, "split": e.split, "shard": e.shard} for e in reader.entries])
-    else:
-        say(*(f"{e.key}  {e.split}  {e.shard}" for e in reader.entries))
-        say(f"{len(reader)} samples")
-    return OK
+    data = [{"key": e.key, "split": e.split, "shard": e.shard} for e in reader.entries]
+    lines = ("  ".join(row.values()) for row in data)
+    return answer(args, data, *lines, f"{len(reader)} samples")
 
 
 def run_show(args: argparse.Namespace) -> int:

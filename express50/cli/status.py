@@ -15,12 +15,12 @@ from typing import Any
 
 from rich.filesize import decimal
 
-from express50.console import FAILED, OK, add_command, format_table, say, say_json
+from express50.console import FAILED, OK, add_command, answer, format_table, say
 from express50.contract.layout import Dataset, existing_dataset
 from express50.contract.stage import stages
 from express50.errors import ConfigError
 from express50.files.atomic import write_bytes
-from express50.runner.ledger import Ledger, Receipt, Run
+from express50.runner.ledger import COLUMNS, Ledger, Receipt, Run
 
 PAGE_SECONDS = 3.0  # between two pages while a run goes on
 SILENT_SECONDS = 15.0  # a run that shows no sign for so long was killed
@@ -86,13 +86,9 @@ def show_status(args: argparse.Namespace) -> int:
         table = _keep_page(dataset, args.page)
     else:
         table = _read(dataset)
-        if args.json:  # receipts but for their files, which `express50 check` looks at
-            rows = {row.stage: [dict(vars(receipt)) for receipt in row.receipts] for row in table}
-            for receipt in (one for receipts in rows.values() for one in receipts):
-                del receipt["made"]
-            say_json(rows)
-        else:
-            say(*_lines(table))
+        # Receipts but for their files, which `express50 check` looks at.
+        rows = {s.stage: [{k: getattr(r, k) for k in COLUMNS} for r in s.receipts] for s in table}
+        answer(args, rows, *_lines(table))
     return FAILED if any(row.failed for row in table) else OK
 
 

@@ -27,11 +27,8 @@ HALF_MAX_M = 65504.0
 
 def depth_file(folder: Path, camera_id: str) -> Path | None:
     """Return a camera's depth map in a depth item's folder, or None."""
-    for ending in (".png", ".exr"):
-        path = folder / f"{camera_id}{ending}"
-        if path.is_file():
-            return path
-    return None
+    paths = (folder / f"{camera_id}{ending}" for ending in (".png", ".exr"))
+    return next((path for path in paths if path.is_file()), None)
 
 
 def write_depth(

@@ -10,10 +10,10 @@ included.
 
 from __future__ import annotations
 
-import io
 import math
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -88,10 +88,12 @@ def export_avatar(dataset: Dataset, head: Head, options: AvatarOptions, out: Pat
     steps: list[str] = []
     dropped: list[dict[str, str]] = []
     for name, frame in zip(head.track.expressions, head.track.frames.tolist(), strict=True):
-        before = len(frames)
+        before, step = len(frames), f"{len(steps):05d}"
+        paths = {"flame_param_path": f"flame_param/{step}.npz"}
+        if not _is_flame(head.model):
+            paths["mesh_path"] = f"meshes/{step}.obj"
         for number, (camera_id, camera) in enumerate(cameras.items()):
-            file = f"{len(steps):05d}_{number:02d}.png"
-            item = f"{head.subject}/{name}"
+            file, item = f"{step}_{number:02d}.png", f"{head.subject}/{name}"
             try:
                 _write_view(dataset, item, camera, targets[camera_id], options, out, file)
             except (CaptureError, FormatError, StageError) as error:
@@ -99,18 +101,13 @@ def export_avatar(dataset: Dataset, head: Head, options: AvatarOptions, out: Pat
                 continue
             ids = {"timestep_index": len(steps), "timestep_index_original": frame,
                    "timestep_id": name, "camera_index": number}  # fmt: skip
-            frames.append(ids | _described(shown[camera_id], file))
+            frames.append(ids | paths | _described(shown[camera_id], file))
         if len(frames) > before:
             steps.append(name)
     if not frames:
         reasons = "; ".join(sorted({row["why"] for row in dropped})[:3])
         raise StageError(f"{head.subject}: no view can be exported ({reasons})")
     write_parameters(head, steps, shift, out)
-    for row in frames:
-        step = f"{row['timestep_index']:05d}"
-        row["flame_param_path"] = f"flame_param/{step}.npz"
-        if not _is_flame(head.model):
-            row["mesh_path"] = f"meshes/{step}.obj"
     _write_tables(frames, steps, sorted(cameras), options, out)
     meta = _meta(head, steps, sorted(cameras), shift, options)
     meta["cameras_centred"] = [name for name in targets if targets[name] is not cameras[name]]
@@ -300,17 +297,18 @@ def write_parameters(head: Head, steps: list[str], shift: np.ndarray, out: Path)
         (out / folder).mkdir()
     offsets = head.track.offsets[: FLAME_VERTICES if flame else None]
     shape = _padded(head.track.shape, max(shapes, FLAME_SHAPES if flame else 0))
-    shared = {"shape": shape, "static_offset": offsets[None]}
+    shared: dict[str, Any] = {"shape": shape, "static_offset": offsets[None]}
     for number, name in enumerate(steps):
         row = head.track.row(name)
-        arrays = shared | _step_parameters(head, row, shift)
-        (out / "flame_param" / f"{number:05d}.npz").write_bytes(_npz_bytes(arrays))
+        arrays: dict[str, Any] = _step_parameters(head, row, shift)
+        # NumPy dates the members of its archives 1980: their bytes depend on nothing else.
+        np.savez(out / "flame_param" / f"{number:05d}.npz", **shared, **arrays)
         if not flame:
             path = out / "meshes" / f"{number:05d}.obj"
             write_head_obj(path, head.track.vertices[row] - shift, head.model)
-    still = {name: np.zeros_like(array) for name, array in arrays.items() if name not in shared}
+    still = {name: np.zeros_like(array) for name, array in arrays.items()}
     still["jaw_pose"][0, 0] = CANONICAL_JAW
-    (out / "canonical_flame_param.npz").write_bytes(_npz_bytes(shared | still))
+    np.savez(out / "canonical_flame_param.npz", **shared, **still)
 
 
 def _step_parameters(head: Head, row: int, shift: np.ndarray) -> dict[str, np.ndarray]:
@@ -337,13 +335,3 @@ def _step_parameters(head: Head, row: int, shift: np.ndarray) -> dict[str, np.nd
 
 def _padded(values: np.ndarray, count: int) -> np.ndarray:
     return np.pad(values, (0, count - len(values))).astype(np.float32)
-
-
-def _npz_bytes(arrays: dict[str, np.ndarray]) -> bytes:
-    """Return bytes of an .npz file.
-
-    NumPy dates its members 1980, so that they depend on nothing else.
-    """
-    buffer = io.BytesIO()
-    np.savez(buffer, **arrays)  # type: ignore[arg-type]  # numpy types its options only
-    return buffer.getvalue()

@@ -30,7 +30,7 @@ from express50.contract.layout import Dataset
 from express50.errors import FormatError, StageError
 from express50.files.atomic import write_json
 from express50.files.digests import text_digest
-from express50.files.text import NAME, read_json
+from express50.files.text import NAME, read_json, read_json_table
 from express50.runner.ledger import Ledger
 from express50.runner.publish import hold_stages
 
@@ -96,8 +96,7 @@ def _own_paths(dataset: Dataset, subject: str) -> Iterator[Path]:
     reference = dataset.root / "labels" / "reference.json"
     if reference.is_file():
         with suppress(FormatError):
-            table = read_json(reference, FormatError)
-            if isinstance(table, dict) and subject in map(str, table.values()):
+            if subject in map(str, read_json_table(reference, FormatError).values()):
                 yield reference  # the next subject becomes the reference
     test = names(subject)
     # Settings such as pack.test_subjects; the stage's next run writes its own.
@@ -152,12 +151,9 @@ def withdraw(
         capture = captures.pop(subject, None)
         files = sum(1 if p.is_file() else sum(q.is_file() for q in p.rglob("*")) for p in paths)
         # Who and how many files, without the id itself: a trace must not name the person.
-        record = withdrawn_file(dataset)
-        rows = _withdrawals(record) if record.is_file() else []
         now = datetime.now(UTC).isoformat(timespec="seconds")
-        write_json(
-            record, [*rows, {"id_sha256": text_digest(subject), "time": now, "files": files}]
-        )
+        record = {"id_sha256": text_digest(subject), "time": now, "files": files}
+        write_json(withdrawn_file(dataset), [*_withdrawals(dataset), record])
         for path in paths:
             if path.is_dir():
                 shutil.rmtree(path)
@@ -187,14 +183,14 @@ def withdrawn_file(dataset: Dataset) -> Path:
 
 def withdrawn(dataset: Dataset) -> set[str]:
     """Return the SHA-256 of withdrawn subjects' ids; the ids themselves are not kept."""
+    return {_digest(row) for row in _withdrawals(dataset)}
+
+
+def _withdrawals(dataset: Dataset) -> list:
+    """Read the records of withdrawals; old ones are digests alone, without time and count."""
     path = withdrawn_file(dataset)
     if not path.is_file():
-        return set()
-    return {_digest(row) for row in _withdrawals(path)}
-
-
-def _withdrawals(path: Path) -> list:
-    """Read the records of withdrawals; old ones are digests alone, without time and count."""
+        return []
     fix = "restore it: it says who must not be taken in again"
     rows = read_json(path, FormatError, fix)
     if not isinstance(rows, list) or not all(isinstance(_digest(row), str) for row in rows):

@@ -51,11 +51,6 @@ class Pool:
     def __exit__(self, *unused: object) -> None:
         self.close()
 
-    def runs_inline(self, count: int) -> bool:
-        """Say whether starting processes would cost more than it gains."""
-        here = self.scheduler is None and self.slurm is None
-        return here and (self.workers == 0 or count <= 1)
-
     def run(
         self,
         tasks: Iterable[Task],
@@ -78,7 +73,8 @@ class Pool:
                 stage needs.
         """
         tasks = list(tasks)
-        if self.runs_inline(len(tasks)):
+        here = self.scheduler is None and self.slurm is None
+        if here and (self.workers == 0 or len(tasks) <= 1):  # processes would cost more than gain
             for task in tasks:
                 begin(task)
                 settle(run_task(task))
@@ -132,7 +128,7 @@ class Pool:
                 elif failure is not None:  # the tasks did not even start
                     words = f"worker: {type(failure).__name__}: {failure}"
                     for task in batch:
-                        settle(_failed(task, words, attempt))
+                        settle(failed_receipt(task, words, attempt))
                 else:
                     size = _next_size(size, batch, receipts)
                     waiting.extendleft(reversed(batch[len(receipts) :]))
@@ -214,8 +210,4 @@ def _killed(task: Task, attempts: int, job: SlurmJob | None) -> Receipt:
         f"its worker process died {attempts} times ({why}); run "
         f"this item with --workers 0 to see, or {fix}"
     )
-    return _failed(task, reason, attempts)
-
-
-def _failed(task: Task, reason: str, attempts: int) -> Receipt:
-    return failed_receipt(task.stage.name, task.item, task.fingerprint, reason, attempts)
+    return failed_receipt(task, reason, attempts)

@@ -162,10 +162,6 @@ class Ledger:
         return self
 
     def __exit__(self, *unused: object) -> None:
-        self.close()
-
-    def close(self) -> None:
-        """Close the database."""
         self._database.close()
 
     @contextmanager
@@ -297,10 +293,9 @@ class Ledger:
         keys = [(stage, item) for item in items]
         with self._damage():
             self._database.execute("PRAGMA synchronous=FULL")
-        with self._change() as database:
-            for table in ("receipts", "made"):
-                database.executemany(f"DELETE FROM {table} WHERE stage = ? AND item = ?", keys)
-        with self._damage():
+            with self._change() as database:
+                for table in ("receipts", "made"):
+                    database.executemany(f"DELETE FROM {table} WHERE stage = ? AND item = ?", keys)
             self._database.execute("PRAGMA synchronous=NORMAL")
 
     def erase(

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import sqlite3
 import sys
 import threading
 import time
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
 from rich.console import Console
-from rich.progress import MofNCompleteColumn
-from rich.progress import Progress as Bar
+from rich.progress import MofNCompleteColumn, Progress
 
 from express50.console import log
 from express50.runner.ledger import Ledger, Receipt, Run
@@ -20,39 +21,28 @@ from express50.runner.ledger import Ledger, Receipt, Run
 BEAT_SECONDS = 2.0
 
 
-class Progress:
-    """Counts settled items on standard error."""
+@contextlib.contextmanager
+def showing(stage: str, total: int, enabled: bool) -> Iterator[Callable[[Receipt], None]]:
+    """Show on standard error that items end: a bar in a terminal, else lines.
 
-    def __init__(self, stage: str, total: int, enabled: bool = True) -> None:
-        self.stage = stage
-        self.total = total
-        self.settled = 0
-        self.enabled = enabled
-        self._bar: Bar | None = None
+    Yields the function that takes the receipt of each.
+    """
+    in_terminal = enabled and total > 0 and sys.stderr.isatty()
+    columns = (*Progress.get_default_columns(), MofNCompleteColumn())
+    bar = Progress(*columns, console=Console(stderr=True))  # shows nothing until it is entered
+    task, settled = bar.add_task(stage, total=total), itertools.count(1)
 
-    def __enter__(self) -> Progress:
-        if self.enabled and self.total and sys.stderr.isatty():
-            columns = (*Bar.get_default_columns(), MofNCompleteColumn())
-            self._bar = Bar(*columns, console=Console(stderr=True))
-            self._bar.add_task(self.stage, total=self.total)
-            self._bar.start()
-        return self
-
-    def __exit__(self, *unused: object) -> None:
-        if self._bar is not None:
-            self._bar.stop()
-
-    def settle(self, receipt: Receipt) -> None:
-        """Show that an item ended."""
-        self.settled += 1
-        line = f"{receipt.stage} {self.settled}/{self.total} {receipt.item} {receipt.status}"
+    def show(receipt: Receipt) -> None:
+        line = f"{receipt.stage} {next(settled)}/{total} {receipt.item} {receipt.status}"
         line += f" {receipt.seconds:.1f} s" + (f": {receipt.reason}" if receipt.reason else "")
-        if self._bar is not None:
-            self._bar.advance(self._bar.task_ids[0])
-            if receipt.status == "failed":
-                self._bar.console.print(line, markup=False, highlight=False, soft_wrap=True)
-        elif self.enabled:
+        bar.advance(task)
+        if enabled and not in_terminal:
             log(line)
+        elif in_terminal and receipt.status == "failed":
+            bar.console.print(line, markup=False, highlight=False, soft_wrap=True)
+
+    with bar if in_terminal else contextlib.nullcontext():
+        yield show
 
 
 class RunLog:

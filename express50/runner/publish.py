@@ -27,11 +27,11 @@ def publishing(dataset: Dataset, stage: str, item: str) -> Iterator[Path]:
         yield aside
 
 
-def set_aside(dataset: Dataset, stage: str, item: str) -> bool:
+def set_aside(dataset: Dataset, stage: str, item: str) -> None:
     """Move a published item to the stale folder, so that no later stage reads it."""
     target = dataset.item_dir(stage, item)
     if not target.exists():
-        return False
+        return
     discard_stale(dataset, stage, item)
     stale = dataset.stale_dir / stage / item
     stale.parent.mkdir(parents=True, exist_ok=True)
@@ -41,7 +41,6 @@ def set_aside(dataset: Dataset, stage: str, item: str) -> bool:
     while folder != dataset.stage_dir(stage) and not any(folder.iterdir()):
         folder.rmdir()
         folder = folder.parent
-    return True
 
 
 def discard_stale(dataset: Dataset, stage: str, item: str) -> None:
@@ -49,12 +48,10 @@ def discard_stale(dataset: Dataset, stage: str, item: str) -> None:
     shutil.rmtree(dataset.stale_dir / stage / item, ignore_errors=True)
 
 
-def clean_leftovers(dataset: Dataset, stage: str) -> int:
-    """Delete unfinished outputs of killed runs of one stage; returns how many there were."""
-    leftovers = sorted(dataset.staging_dir.glob(f"{stage}-*"))
-    for path in leftovers:
+def clean_leftovers(dataset: Dataset, stage: str) -> None:
+    """Delete unfinished outputs of killed runs of one stage."""
+    for path in dataset.staging_dir.glob(f"{stage}-*"):
         shutil.rmtree(path, ignore_errors=True)
-    return len(leftovers)
 
 
 GLANCE_SECONDS = 0.05
@@ -79,9 +76,9 @@ def stage_lock(dataset: Dataset, stage: str) -> Iterator[None]:
         yield
 
 
-def _locked(file: IO[str]) -> bool:
+def _locked(file: IO[str], kind: int = fcntl.LOCK_EX) -> bool:
     try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        fcntl.flock(file, kind | fcntl.LOCK_NB)
     except BlockingIOError:
         return False
     return True
@@ -106,9 +103,5 @@ def is_running(dataset: Dataset, stage: str) -> bool:
     if not path.is_file():
         return False
     with path.open("r") as file:
-        try:
-            # Shared, and let go at once; a stage that starts meanwhile tries again.
-            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
-        except BlockingIOError:
-            return True
-    return False
+        # Shared, and let go at once; a stage that starts meanwhile tries again.
+        return not _locked(file, fcntl.LOCK_SH)

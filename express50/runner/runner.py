@@ -20,7 +20,7 @@ from express50.files.atomic import write_bytes
 from express50.files.digests import path_digest
 from express50.runner.executor import Pool
 from express50.runner.ledger import Ledger, Receipt
-from express50.runner.progress import Progress, RunLog
+from express50.runner.progress import RunLog, showing
 from express50.runner.publish import clean_leftovers, discard_stale, set_aside, stage_lock
 from express50.runner.worker import Task, failed_receipt, fingerprint, input_digests
 
@@ -197,6 +197,7 @@ def _sort_items(
 ) -> _Work:
     """Sort items into those that are up to date, that cannot be read, and that are to do."""
     receipts, made = ledger.read(stage.name), ledger.made(stage.name)
+    done = {item: receipt for item, receipt in receipts.items() if receipt.status == "done"}
     work = _Work(receipts, {}, [], [], {})
     # Items share inputs; what a stage reads does not change while it runs.
     digest_of = functools.cache(lambda path: path_digest(path, ledger.sha256))
@@ -207,21 +208,20 @@ def _sort_items(
             raise
         except Express50Error as error:
             reason = f"{type(error).__name__}: {error}"
-            work.unreadable.append(failed_receipt(stage.name, item, "", reason, 0))
+            task = Task(stage, dataset, item, config, "", {}, threads)
+            work.unreadable.append(failed_receipt(task, reason, 0))
             continue
-        digest, receipt = fingerprint(stage, config, inputs), receipts.get(item)
-        done = receipt is not None and receipt.status == "done"
+        digest, receipt = fingerprint(stage, config, inputs), done.get(item)
         output = dataset.item_dir(stage.name, item) / "metrics.json"
-        if receipt is not None and done and receipt.fingerprint == digest and output.is_file():
+        if receipt is not None and receipt.fingerprint == digest and output.is_file():
             work.current[item] = _outcome(receipt, status="skipped")
             continue
         work.tasks.append(Task(stage, dataset, item, config, digest, inputs, threads))
-        if receipt is not None and done:
-            same = receipt.fingerprint == digest
+        if receipt is not None and receipt.fingerprint == digest:
+            work.again[item] = "output missing"
+        elif receipt is not None:
             before = made[item].inputs if item in made else inputs
-            work.again[item] = (
-                "output missing" if same else _why_again(stage, before, inputs, changed)
-            )
+            work.again[item] = _why_again(stage, before, inputs, changed)
     ledger.keep_digests()
     reasons = {receipt.reason for receipt in work.unreadable}
     if len(work.unreadable) == len(chosen) > 1 and len(reasons) == 1:
@@ -262,12 +262,12 @@ def _run_items(
         log.begin(task.item)
 
     total = len(work.tasks) + len(work.unreadable)
-    with Progress(stage.name, total, progress) as display:
+    with showing(stage.name, total, progress) as show:
 
         def settle(receipt: Receipt) -> None:
             _record(dataset, ledger, receipt)
             outcomes[receipt.item] = _outcome(receipt, again=work.again.get(receipt.item, ""))
-            display.settle(receipt)
+            show(receipt)
             log.settle(receipt.item)
 
         def settle_task(receipt: Receipt) -> None:

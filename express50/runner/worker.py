@@ -64,12 +64,12 @@ def fingerprint(stage: Stage, config: Any, inputs: dict[str, str]) -> str:
     return value_digest([stage.name, stage.version, vars(config), inputs])
 
 
-def failed_receipt(stage: str, item: str, fingerprint: str, reason: str, attempts: int) -> Receipt:
+def failed_receipt(task: Task, reason: str, attempts: int) -> Receipt:
     """Make the receipt of an item that no worker could run."""
     return Receipt(
-        stage=stage,
-        item=item,
-        fingerprint=fingerprint,
+        stage=task.stage.name,
+        item=task.item,
+        fingerprint=task.fingerprint,
         status="failed",
         reason=" ".join(reason.split()),
         attempts=attempts,

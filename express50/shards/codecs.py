@@ -22,6 +22,7 @@ ALPHA = ("alpha.png", "alpha.zst")
 PARTS = ("parts.png", "parts.zst")
 DEPTH = ("depth.png", "depth.lerc")
 ZSTD_LEVEL = 3
+crc32 = imagecodecs.deflate_crc32  # zlib's CRC-32, eight times as fast
 # Name, version, checksum, rows, columns, depth, valid pixels, block, bytes of the blob.
 LERC_HEADER = struct.Struct("<6siIiiiiii")
 
@@ -86,11 +87,6 @@ def decode_picture(name: str, data: bytes, width: int, height: int, where: str) 
     if image.dtype != kind or image.shape != (height, width, 3)[: 3 if name in RGB else 2]:
         raise FormatError(f"{where}: {image.dtype} {image.shape}, expected {np.dtype(kind)}")
     return image
-
-
-def crc32(data: bytes) -> int:
-    """Compute zlib's CRC-32, eight times as fast."""
-    return imagecodecs.deflate_crc32(data)
 
 
 def _unzstd(data: bytes, width: int, height: int, where: str) -> np.ndarray:

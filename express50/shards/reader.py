@@ -120,14 +120,6 @@ class ShardReader:
             chosen = tuple(entry for entry in chosen if getattr(entry, name) in values)
         return ShardReader(self.root, chosen)
 
-    def member(self, number: int, name: str) -> bytes:
-        """Read the bytes of one member of a sample, checked by CRC-32.
-
-        Raises:
-            FormatError: the member is missing, or its bytes are damaged.
-        """
-        return self.members(number, [name])[name]
-
     def members(self, number: int, names: Collection[str] | None = None) -> dict[str, bytes]:
         """Read the bytes of a sample's members by name, checked by CRC-32.
 
@@ -164,8 +156,12 @@ class ShardReader:
         return entry.members[name]
 
     def meta(self, number: int) -> dict:
-        """Return the sample's meta.json."""
-        return self._meta(number, self.member(number, "meta.json"))
+        """Return the sample's meta.json.
+
+        Raises:
+            FormatError: it is missing, damaged, or does not say what a step of depth is.
+        """
+        return self._meta(number, self.members(number, ["meta.json"])["meta.json"])
 
     def _meta(self, number: int, data: bytes) -> dict:
         entry = self.entries[number]

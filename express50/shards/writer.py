@@ -12,14 +12,14 @@ import tarfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO, cast
+from typing import BinaryIO
 
 from express50.errors import FormatError
 from express50.files.atomic import folder_in_one_step, write_json
 from express50.files.digests import file_sha256
 from express50.files.text import NAME, read_json
 from express50.shards.codecs import crc32
-from express50.shards.reader import KEY, SCHEMA, SHARD_NAME, ShardReader, offsets_file, read_entries
+from express50.shards.reader import KEY, SCHEMA, SHARD_NAME, ShardReader, offsets_file
 
 BLOCK = tarfile.BLOCKSIZE
 RECORD = tarfile.RECORDSIZE
@@ -101,16 +101,10 @@ class ShardWriter:
                 raise FormatError(f"key {sample.key} appears twice; rename a subject or expression")
             self._keys.add(sample.key)
             pieces, members = _tar_members(sample, file.tell())
-            self._write(b"".join(pieces))
-            self._shards[-1]["samples"].append(
-                {
-                    "key": sample.key,
-                    "subject": sample.subject,
-                    "expression": sample.expression,
-                    "camera": sample.camera,
-                    "members": members,
-                }
-            )
+            self._write(file, b"".join(pieces))
+            ids = ("key", "subject", "expression", "camera")
+            row = {name: getattr(sample, name) for name in ids} | {"members": members}
+            self._shards[-1]["samples"].append(row)
 
     def close(self) -> None:
         """Finish the last shard and write ``index.json``."""
@@ -120,12 +114,9 @@ class ShardWriter:
         (self.root / "index.json").write_text(text + "\n", encoding="utf-8")
 
     def _open_for(self, split: str, size: int) -> BinaryIO:
-        fits = (
-            self._file is not None
-            and self._shards[-1]["split"] == split
-            and self._file.tell() + size <= self.shard_bytes
-        )
-        if not fits:
+        file = self._file
+        full = file is not None and file.tell() + size > self.shard_bytes
+        if file is None or full or self._shards[-1]["split"] != split:
             self._finish_shard()
             number = self._counts.get(split, 0)
             name = f"{split}-{number:06d}.tar"
@@ -133,19 +124,19 @@ class ShardWriter:
                 raise FormatError(f"split {split!r}: expected letters, digits, _ and -")
             self._counts[split] = number + 1
             self._shards.append({"file": name, "split": split, "samples": []})
-            self._file = (self.root / name).open("xb")  # never over an old shard
-        return cast(BinaryIO, self._file)
+            file = self._file = (self.root / name).open("xb")  # never over an old shard
+        return file
 
-    def _write(self, data: bytes) -> None:
+    def _write(self, file: BinaryIO, data: bytes) -> None:
         """Append to the open shard, hashed at once: its bytes are in the processor's cache."""
-        cast(BinaryIO, self._file).write(data)
+        file.write(data)
         self._hash.update(data)
 
     def _finish_shard(self) -> None:
         if self._file is None:
             return
         end = self._file.tell() + 2 * BLOCK
-        self._write(bytes(2 * BLOCK + -end % RECORD))
+        self._write(self._file, bytes(2 * BLOCK + -end % RECORD))
         shard = self._shards[-1]
         shard["bytes"] = self._file.tell()
         self.digests[shard["file"]], self._hash = self._hash.hexdigest(), hashlib.sha256()
@@ -213,14 +204,14 @@ def verify(root: Path) -> list[str]:
     root = Path(root)
     faults = _manifest_faults(root)
     try:
-        reader = ShardReader(root, read_entries(root))
+        reader = ShardReader(root)
     except FormatError as error:
         return [*faults, str(error)]
     for number, entry in enumerate(reader.entries):
         for name, (offset, size, _) in entry.members.items():
             path, title = root / entry.shard, f"{entry.key}.{name}"
             try:
-                reader.member(number, name)
+                reader.members(number, [name])
                 with path.open("rb") as file:
                     file.seek(max(offset - BLOCK, 0))
                     info = tarfile.TarInfo.frombuf(file.read(BLOCK), "ascii", "strict")
@@ -232,7 +223,6 @@ def verify(root: Path) -> list[str]:
                 if (info.name, info.size) != (title, size):
                     words = f"{info.name} with {info.size} bytes, the index {title} with {size}"
                     faults.append(f"{path}: tar says {words}")
-    reader.close()
     return faults
 
 
@@ -274,31 +264,24 @@ def copy_samples(readers: Sequence[ShardReader], out: Path, shard_mb: int) -> in
         raise FormatError(f"{readers[0].root}: no sample matches; 'express50 shards ls' lists them")
     splits = _checked_splits(readers)
     groups = [(reader, *row) for reader in readers for row in reader.groups().items()]
+    groups.sort(key=lambda group: splits[group[1][0]])
     names = {s: sorted(k for k, v in splits.items() if v == s) for s in set(splits.values())}
     aside = out.with_name(f".{out.name}.unfinished")
-    try:
-        with folder_in_one_step(aside, out):
-            writer = ShardWriter(aside, shard_mb * 10**6)
-            for split in sorted(names):
-                for reader, (subject, expression), numbers in groups:
-                    if splits[subject] == split:
-                        samples = [
-                            PackedSample(
-                                subject, expression, reader.entries[n].camera, reader.members(n)
-                            )
-                            for n in numbers
-                        ]
-                        writer.add_group(split, samples)
-            writer.close()
-            _copy_offsets(readers, aside)
-            write_json(aside / "splits.json", names | {"chosen_by": "the shards these are made of"})
-            _write_card(readers, aside)
-            write_manifest(aside, writer.digests)
-            if out.exists():
-                out.rmdir()  # refuses a folder that was filled meanwhile
-    finally:
-        for reader in readers:
-            reader.close()
+    with folder_in_one_step(aside, out):
+        writer = ShardWriter(aside, shard_mb * 10**6)
+        for reader, (subject, expression), numbers in groups:
+            samples = [
+                PackedSample(subject, expression, reader.entries[n].camera, reader.members(n))
+                for n in numbers
+            ]
+            writer.add_group(splits[subject], samples)
+        writer.close()
+        _copy_offsets(readers, aside)
+        write_json(aside / "splits.json", names | {"chosen_by": "the shards these are made of"})
+        _write_card(readers, aside)
+        write_manifest(aside, writer.digests)
+        if out.exists():
+            out.rmdir()  # refuses a folder that was filled meanwhile
     return sum(len(reader) for reader in readers)
 
 

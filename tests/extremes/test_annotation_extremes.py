@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from textual.geometry import Size
 
 from annotations.labels import append_label, make_mark, read_labels
 from annotations.sheet import make_sheet, render_sheet
 from annotations.suggestions import read_suggestions
 from annotations.ui import task as moves
 from annotations.ui.app import AnnotateApp
-from annotations.ui.images import CellSize
 from annotations.ui.picture import frames_ahead
 from annotations.ui.session import Session
 from annotations.ui.task import open_view
@@ -187,7 +187,7 @@ def speck(tmp_path_factory):
     return dataset
 
 
-@pytest.mark.parametrize("cell", [None, CellSize(7, 15)])
+@pytest.mark.parametrize("cell", [None, Size(7, 15)])
 @pytest.mark.parametrize("size", [(1, 1), (2, 3), (30, 10)])
 def test_app_with_tiny_frames_and_terminals(speck, tmp_path, cell, size):
     dataset = Dataset(tmp_path)

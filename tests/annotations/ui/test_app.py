@@ -35,6 +35,11 @@ def line(app, name):
     return app.desk.query_one(f"#{name}").content.plain
 
 
+def strip_text(app):
+    strip = app.desk.query_one(CurveStrip)
+    return [line.text for line in strip.render_lines(strip.size.region)]
+
+
 def labels(dataset, subject="S001"):
     return read_labels(dataset, subject)
 
@@ -118,7 +123,7 @@ def test_earlier_mark_is_shown_on_return(suggested, make_app):
     app = make_app(suggested)
     title, strip = drive(
         app, "right", "enter", "p", size=(100, 32),
-        check=lambda app: (line(app, "frame-title"), app.desk.query_one(CurveStrip).text),
+        check=lambda app: (line(app, "frame-title"), strip_text(app)),
     )  # fmt: skip
     assert "frame 5" in title
     assert "● your mark" in title
@@ -130,7 +135,7 @@ def test_blind_hides_suggestions_curves_and_marks_until_the_decision(suggested, 
     app = make_app(suggested, blind=True, expressions=["smile"], subjects=["S001"])
 
     def look(app):
-        return app.desk.view.cursor, "".join(app.desk.query_one(CurveStrip).text)
+        return app.desk.view.cursor, "".join(strip_text(app))
 
     cursor, strip = drive(app, "tab", check=look)
     assert cursor == (16 + 31) // 2
@@ -252,7 +257,8 @@ def test_missing_proxies_and_footage_are_reported(suggested, make_app, footage):
         path.unlink()
 
     def picture_words(app):
-        strips = app.desk.query_one("#frame", PicturePane)._lines
+        pane = app.desk.query_one("#frame", PicturePane)
+        strips = pane.render_lines(pane.size.region)
         return " ".join(" ".join(strip.text for strip in strips).split())
 
     assert "proxies are missing" in drive(make_app(suggested), check=picture_words)
@@ -300,7 +306,7 @@ def test_resize_keeps_the_position(suggested, make_app):
                 while strip.size.width != 60:
                     await pilot.pause(0.01)
             assert app.desk.view.cursor == 5
-            assert all(len(text) == 60 for text in strip.text)
+            assert all(len(text) == 60 for text in strip_text(app))
 
     asyncio.run(run())
 

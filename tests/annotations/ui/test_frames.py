@@ -6,6 +6,7 @@ import time
 import numpy as np
 import pytest
 
+from annotations.ui import frames
 from annotations.ui.frames import Face, FrameCache, FrameCrop, crop_to, zoom_box
 from express50.errors import AnnotationError, CaptureError
 
@@ -37,13 +38,23 @@ def wait_until(true, seconds=5.0):
     assert true()
 
 
-def test_cache_is_bounded_and_drops_the_least_recently_used():
+@pytest.fixture
+def cache(monkeypatch):
+    """A cache that paints its pictures."""
+    monkeypatch.setattr(frames, "read_shot", painter)
+    cache = FrameCache(None)
+    yield cache
+    cache.close()
+
+
+def test_cache_is_bounded_and_drops_the_least_recently_used(cache, monkeypatch):
     each = 8 * 8 * 3
     decode = Counter()
-    cache = FrameCache(None, limit_bytes=3 * each, decode=decode)
+    monkeypatch.setattr(frames, "read_shot", decode)
+    monkeypatch.setattr(frames, "LIMIT_BYTES", 3 * each)
     for frame in (1, 2, 3, 1, 4):
         assert cache.get(shot(frame))[0, 0, 0] == frame
-        assert cache.used_bytes <= 3 * each
+        assert cache._bytes <= 3 * each
     assert decode.count == 4
     cache.get(shot(1))
     assert decode.count == 4
@@ -51,13 +62,13 @@ def test_cache_is_bounded_and_drops_the_least_recently_used():
     assert decode.count == 5
 
 
-def test_picture_larger_than_the_cache_is_returned():
-    cache = FrameCache(None, limit_bytes=10, decode=painter)
+def test_picture_larger_than_the_cache_is_returned(cache, monkeypatch):
+    monkeypatch.setattr(frames, "LIMIT_BYTES", 10)
     assert cache.get(shot(5)).shape == (8, 8, 3)
-    assert cache.used_bytes == 0
+    assert cache._bytes == 0
 
 
-def test_wanted_pictures_are_decoded_ahead_by_urgency():
+def test_wanted_pictures_are_decoded_ahead_by_urgency(cache, monkeypatch):
     order, gate = [], threading.Event()
 
     def slow(dataset, wanted):
@@ -65,7 +76,7 @@ def test_wanted_pictures_are_decoded_ahead_by_urgency():
         order.append(wanted.frame)
         return painter(dataset, wanted)
 
-    cache = FrameCache(None, decode=slow)
+    monkeypatch.setattr(frames, "read_shot", slow)
     cache.want([shot(9)])
     wait_until(cache.idle)  # the thread has taken 9 and waits at the gate
     cache.want([shot(7), shot(8)], later=True)
@@ -73,10 +84,9 @@ def test_wanted_pictures_are_decoded_ahead_by_urgency():
     gate.set()
     wait_until(lambda: len(order) == 5)
     assert order == [9, 1, 2, 7, 8]
-    wait_until(lambda: cache.used_bytes == 5 * 8 * 8 * 3)
+    wait_until(lambda: cache._bytes == 5 * 8 * 8 * 3)
     cache.get(shot(2))
     assert len(order) == 5
-    cache.close()
 
 
 @pytest.mark.parametrize(
@@ -87,19 +97,18 @@ def test_wanted_pictures_are_decoded_ahead_by_urgency():
         (IndexError("list index"), "frame 3"),
     ],
 )
-def test_unreadable_frame_raises_and_keeps_the_thread_alive(error, remedy):
+def test_unreadable_frame_raises_and_keeps_the_thread_alive(cache, monkeypatch, error, remedy):
     def broken(dataset, wanted):
         raise error
 
-    cache = FrameCache(None, decode=broken)
+    monkeypatch.setattr(frames, "read_shot", broken)
     with pytest.raises(AnnotationError, match=remedy):
         cache.get(shot(3))
     cache.want([shot(3)])  # must not kill the thread
     wait_until(cache.idle)
-    cache._decode = painter
+    monkeypatch.setattr(frames, "read_shot", painter)
     cache.want([shot(4)])
-    wait_until(lambda: cache.used_bytes > 0)
-    cache.close()
+    wait_until(lambda: cache._bytes > 0)
 
 
 def test_crop_beyond_the_border_is_black():

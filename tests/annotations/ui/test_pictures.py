@@ -13,7 +13,6 @@ from annotations.ui.frames import FrameCrop
 from annotations.ui.images import (
     COLOURS,
     SIXEL_PIXELS,
-    CellSize,
     SixelPainter,
     encode_sixel,
     quantise,
@@ -79,7 +78,7 @@ def test_sixels_of_many_colours_approximate_the_picture():
 
 
 def test_sixels_follow_the_panes_last_cell_and_return_the_cursor():
-    cell = CellSize(10, 21)
+    cell = Size(10, 21)
     painter = SixelPainter(cell)
     pane = Size(12, 5)
     shape = painter.shape(pane)
@@ -99,7 +98,7 @@ def test_sixels_follow_the_panes_last_cell_and_return_the_cursor():
 
 def test_large_panes_send_no_more_pixels_than_the_limit():
     for pane in (Size(400, 150), Size(297, 120), Size(1000, 2)):
-        shape = SixelPainter(CellSize(11, 24)).shape(pane)
+        shape = SixelPainter(Size(11, 24)).shape(pane)
         pixels = shape.columns * shape.across * shape.rows * shape.down
         assert 0.2 * SIXEL_PIXELS < pixels <= SIXEL_PIXELS
 
@@ -122,7 +121,7 @@ def shown(app, name="frame"):
 
 
 def test_app_draws_sixels_except_over_dialogs(suggested):
-    app = Recorder(Session(suggested, "ann", order="subject"), sixel_cell=CellSize(7, 15))
+    app = Recorder(Session(suggested, "ann", order="subject"), sixel_cell=Size(7, 15))
 
     async def run():
         async with app.run_test(size=(80, 22)) as pilot:

@@ -10,7 +10,7 @@ import pytest
 
 from annotations.labels import append_label, labels_of, make_mark, read_labels
 from annotations.ui.session import IDLE_SECONDS, Session
-from annotations.ui.task import load_scene, open_view, set_plateau, step
+from annotations.ui.task import load_scene, set_plateau, step, view_of_scene
 from annotations.worklist import LabelTask
 from express50.capture.index import read_index
 from express50.errors import AnnotationError
@@ -36,8 +36,7 @@ def begin(dataset, **options):
 
 def scene_and_view(session):
     scene = load_scene(session.dataset, session.task, session.annotator)
-    hidden = session.hidden(session.task)
-    return scene, open_view(scene.first, scene.last, () if hidden else scene.candidates)
+    return scene, view_of_scene(scene, session.hidden(session.task))
 
 
 def mark(session):

@@ -55,16 +55,17 @@ def test_everything_is_synced_before_the_rename(dataset, monkeypatch):
 def test_leftovers_of_killed_runs_are_removed_for_that_stage_only(dataset):
     for name in ("matte-S001+cam00-123", "track-S001-456"):
         (dataset.staging_dir / name).mkdir(parents=True)
-    assert clean_leftovers(dataset, "matte") == 1
+    clean_leftovers(dataset, "matte")
     assert [p.name for p in staged(dataset)] == ["track-S001-456"]
 
 
 def test_set_aside_hides_an_item_from_later_stages(dataset):
     publish(dataset, "1")
-    assert set_aside(dataset, "matte", "S001/cam00")
+    set_aside(dataset, "matte", "S001/cam00")
     assert not dataset.item_dir("matte", "S001").exists()  # no empty folder stays
     assert (dataset.stale_dir / "matte/S001/cam00/a.txt").read_text() == "1"
-    assert not set_aside(dataset, "matte", "S001/cam00")
+    set_aside(dataset, "matte", "S001/cam00")  # there is nothing left to do
+    assert (dataset.stale_dir / "matte/S001/cam00").exists()
 
 
 def test_write_bytes_replaces_in_one_step_and_leaves_nothing_beside(tmp_path):

@@ -135,7 +135,7 @@ def test_webdataset_reads_every_sample_unchanged(shards):
     assert sorted(read) == sorted(reader.keys)
     for number, entry in enumerate(reader.entries):
         for name in entry.members:
-            assert read[entry.key][name] == reader.member(number, name)
+            assert read[entry.key][name] == reader.members(number)[name]
 
 
 def test_select_by_ids_and_split(shards):
@@ -164,13 +164,13 @@ def test_readers_that_are_gone_leave_no_open_files(shards):
 
 def test_reader_survives_pickling_and_forking(shards):
     reader = ShardReader(shards)
-    first = reader.member(0, "rgb.jpg")
-    assert pickle.loads(pickle.dumps(reader)).member(0, "rgb.jpg") == first
+    first = reader.members(0)
+    assert pickle.loads(pickle.dumps(reader)).members(0) == first
     child = os.fork()
     if child == 0:
-        os._exit(0 if reader.member(0, "rgb.jpg") == first else 1)
+        os._exit(0 if reader.members(0) == first else 1)
     assert os.waitpid(child, 0)[1] == 0
-    assert reader.member(0, "rgb.jpg") == first
+    assert reader.members(0) == first
 
 
 def copy(shards: Path, target: Path) -> Path:
