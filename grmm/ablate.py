@@ -10,6 +10,7 @@ import fnmatch
 import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -75,7 +76,6 @@ VARIANTS = {
         trains_as="full",
     ),
 }
-DATASET_PREFIX = "without_"
 GROUPS = {"view": HELD_VIEW, "expression": HELD_EXPRESSION, "unseen": NOVEL_VIEW,
           "unseen_expression": NOVEL_EXPRESSION}  # fmt: skip
 DIGITS = {"psnr_db": 2, "ssim": 3, "lpips": 3}
@@ -122,8 +122,8 @@ def ablate(run: Ablation, names: Sequence[str] = ()) -> dict[str, Any]:
     views = HeadViews(source, head)
     for subject in run.unseen(views):  # before hours of training
         given_views(views, subject, run.protocol)
-    if not config.model.n_g:  # every row has as many Gaussians as the full model
-        config = with_map_size(config, HeadViews(open_shards(run.roots, "train"), head))
+    # Every row has as many Gaussians as the full model.
+    config = with_map_size(config, HeadViews(open_shards(run.roots, "train"), head))
     run = replace(run, config=config)
     rows: dict[str, dict] = {}
     table: dict[str, Any] = {}
@@ -207,30 +207,25 @@ def _train(used: Sequence[Path], folder: Path, settings: Config) -> None:
 
 def measure(run: Ablation, loaded: Loaded, used: Sequence[Path]) -> dict:
     """Measure held-out views and expressions of training people, and unseen people."""
-    views = loaded.views(open_shards(run.roots, "*"))
-    metrics, images = loaded.config.metrics, run.protocol.images
-    groups: dict[str, dict] = {}
-    for group in ("view", "expression"):
-        own = [
-            i
-            for i, key in enumerate(views.keys)
-            if kind_of(loaded, key) == GROUPS[group] and key.expression in loaded.model.expressions
-        ]
-        # Without a dataset other people are trained, whose views cannot be compared.
-        if own and len(used) == len(run.roots):
-            judge = PerceptualMetrics(metrics)
-            chosen = spread(own, images) if images else own
-            rows = evaluate(views, chosen, training_render(loaded.model, views), judge)
-            groups[group] = _means(rows, judge)
-    judge, rows, efforts = PerceptualMetrics(metrics), [], []
+    views, kind = loaded.views(open_shards(run.roots, "*")), partial(kind_of, loaded)
+    judge, rows, efforts = PerceptualMetrics(loaded.config.metrics), [], []
+    # Without a dataset other people are trained, whose views cannot be compared.
+    if len(used) == len(run.roots):
+        render, expressions = training_render(loaded.model, views), loaded.model.expressions
+        drawn = [i for i, key in enumerate(views.keys) if key.expression in expressions]
+        for held in (HELD_VIEW, HELD_EXPRESSION):
+            own = [i for i in drawn if kind(views.keys[i]) == held]
+            chosen = spread(own, run.protocol.images or len(own))
+            rows += evaluate(views, chosen, render, judge, kind)
     for subject in run.unseen(views):
         found, effort = evaluate_unseen(loaded, views, subject, run.protocol, judge)
         rows += found
         efforts.append(effort)
-    for group in ("unseen", "unseen_expression"):
-        own_rows = [row for row in rows if row["kind"] == GROUPS[group]]
-        if own_rows:
-            groups[group] = _means(own_rows, judge, GROUPS[group])
+    groups = {}
+    for group, name in GROUPS.items():
+        if own_rows := [row for row in rows if row["kind"] == name]:
+            numbers = {n: mean(own_rows, n) for n in SHOWN}
+            groups[group] = numbers | {"fid": judge.fid(name), "images": len(own_rows)}
     return {
         "groups": groups,
         "fits": efforts,
@@ -239,10 +234,6 @@ def measure(run: Ablation, loaded: Loaded, used: Sequence[Path]) -> dict:
         "iterations": loaded.loop.get("iteration"),
         "seconds": round(float(loaded.loop.get("seconds", 0.0)), 1),
     }
-
-
-def _means(rows: list, judge: PerceptualMetrics, kind: str | None = None) -> dict:
-    return {n: mean(rows, n) for n in SHOWN} | {"fid": judge.fid(kind), "images": len(rows)}
 
 
 def variants_of(roots: Sequence[Path], names: Sequence[str] = ()) -> dict[str, Variant]:
@@ -255,7 +246,7 @@ def variants_of(roots: Sequence[Path], names: Sequence[str] = ()) -> dict[str, V
     if len(roots) > 1:
         for root in roots:
             name = root.parent.parent.name if root.name == "shards" else root.name
-            rows[DATASET_PREFIX + name] = Variant(label=f"W/o {name}", changes={}, without=root)
+            rows[f"without_{name}"] = Variant(label=f"W/o {name}", changes={}, without=root)
     for name in names:
         if name not in rows:
             raise ConfigError(

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -48,22 +49,17 @@ def make_anchors(head: HeadModel, n_g: int, mouth: bool = True) -> Anchors:
     inside = (weights >= 0).all(1)
     if not mouth:
         inside &= ~mouth_faces(head)[face]
-    face, weights = face[inside], weights[inside]
-    texel = (row * n_g + column)[inside]
-    # A stable sort keeps faces in ascending order within a texel: the lowest index wins.
-    order = torch.argsort(texel, stable=True)
-    texel, face, weights = texel[order], face[order], weights[order]
-    first = torch.ones_like(texel, dtype=torch.bool)
-    first[1:] = texel[1:] != texel[:-1]
-    if not bool(first.any()):
+    # Candidates come in ascending order of faces: where charts overlap, the lowest index wins.
+    texels, first = np.unique((row * n_g + column)[inside].numpy(), return_index=True)
+    if not len(texels):
         raise HeadModelError(
             f"head model {head.name!r}: no triangle of its UV map covers a texel's centre at "
             f"n_g = {n_g}; expected UV coordinates in [0, 1]. Raise model.n_g or check the UV map"
         )
     return Anchors(
-        texels=texel[first],
-        faces=face[first],
-        barycentrics=weights[first].float(),
+        texels=torch.from_numpy(texels),
+        faces=face[inside][first],
+        barycentrics=weights[inside][first].float(),
     )
 
 
@@ -140,6 +136,6 @@ def tangent_frames(vertices: Tensor, faces: Tensor, gradients: Tensor) -> tuple[
     return frame, torch.where(good[:, None], reach, 0.0)
 
 
-def interpolate(values: Tensor, faces: Tensor, anchors_faces: Tensor, weights: Tensor) -> Tensor:
-    """Interpolate vertex values (V, C) at anchors, (N, C), by barycentrics."""
-    return (values[faces[anchors_faces]] * weights[..., None]).sum(1)
+def interpolate(values: Tensor, corners: Tensor, weights: Tensor) -> Tensor:
+    """Interpolate vertex values (V, C) in triangles (N, 3) by barycentrics (N, 3) to (N, C)."""
+    return (values[corners] * weights[..., None]).sum(1)

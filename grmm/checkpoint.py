@@ -83,14 +83,7 @@ class Loaded:
 
     def views(self, source: Source) -> HeadViews:
         """Prepare the samples of a source as the training data were."""
-        data = self.config.data
-        return HeadViews(
-            source,
-            self.head,
-            background=data.background,
-            torso=data.torso,
-            device=self.model.z_id.device,
-        )
+        return HeadViews(source, self.head, self.config.data)
 
 
 def collect_gallery(views: HeadViews, indices: Sequence[int]) -> Gallery:
@@ -142,9 +135,7 @@ def save_checkpoint(
         "optimizer": optimizer or {},
         "loop": loop or {},
     }
-    buffer = io.BytesIO()
-    torch.save(content, buffer)
-    write_bytes(path, buffer.getvalue())
+    write_content(path, content)
 
 
 def load_checkpoint(path: Path, device: torch.device | str = "cpu") -> Loaded:
@@ -188,6 +179,13 @@ def read_content(path: Path) -> dict[str, Any]:
     if found != FORMAT:
         raise FormatError(f"{path}: format is {found!r}, expected {FORMAT!r}")
     return content
+
+
+def write_content(path: Path, content: dict[str, Any]) -> None:
+    """Write the tables of a checkpoint in one step."""
+    buffer = io.BytesIO()
+    torch.save(content, buffer)
+    write_bytes(path, buffer.getvalue())
 
 
 def _check_finite(path: Path, name: str, value: object) -> None:

@@ -9,16 +9,11 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
-from express50.contract.config import (
-    build_dataclass,
-    config_values,
-    known_assignments,
-    read_tables,
-)
+from express50.contract.config import build_dataclass, known_assignments, read_tables
 from express50.errors import ConfigError
 
 FRAMES = ("head", "tangent")
@@ -339,7 +334,7 @@ def from_tables(tables: Mapping[str, Mapping[str, object]]) -> Config:
 
 def as_tables(config: Config) -> dict[str, dict[str, Any]]:
     """Convert a configuration to a nested dictionary."""
-    return {table: config_values(getattr(config, table)) for table in TABLES}
+    return asdict(config)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -16,12 +16,15 @@ import torch
 from torch import Tensor
 
 from express50.errors import FormatError
+from express50.geometry.transforms import make_transform
 from express50.head.model import HeadModel, pose
+from grmm.config import DataConfig
 from grmm.head_crop import crop_view, head_window, labelled_torso, torso_mask
 from grmm.model import HeadState, PinholeView
 
 NO_OFFSETS = np.zeros((0, 3), np.float32)
-CACHE_MB = 512  # of decoded samples: some hundred of 512 px
+CACHE_BYTES = 512 << 20  # of decoded samples: some hundred of 512 px
+DEFAULTS = DataConfig()  # black behind the head, torso ignored
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -138,23 +141,12 @@ class Item:
 class HeadViews:
     """Samples of a source as items, with a bounded cache of decoded samples."""
 
-    def __init__(
-        self,
-        source: Source,
-        head: HeadModel,
-        *,
-        background: float = 0.0,
-        torso: str = "ignore",
-        cache_mb: int = CACHE_MB,
-        device: torch.device | str = "cpu",
-    ) -> None:
-        """Wrap a source whose parameters belong to ``head``; see DataConfig for the rest."""
-        self.source, self.head, self.device = source, head.to(device), torch.device(device)
-        self.background, self.ignore_torso = background, torso == "ignore"
+    def __init__(self, source: Source, head: HeadModel, data: DataConfig = DEFAULTS) -> None:
+        """Wrap a source whose parameters belong to ``head``, on whose device items will be."""
+        self.source, self.head = source, head
+        self.background, self.ignore_torso = data.background, data.torso == "ignore"
         self._torsos: dict[int, np.ndarray] = {}
-        self._capacity = cache_mb * 2**20
         self._cache: OrderedDict[int, Sample] = OrderedDict()
-        self._cached_bytes = 0
         self._states: dict[tuple[str, str], HeadState] = {}
 
     @property
@@ -178,11 +170,11 @@ class HeadViews:
             rows, columns = head_window(state.vertices, view, matte)
             view = crop_view(view, rows, columns)
         image, alpha = sample.image[rows, columns], sample.alpha[rows, columns]
-        depth = np.zeros(alpha.shape, np.float32) if sample.depth is None else sample.depth
-        known = self._tensor(depth if sample.depth is None else depth[rows, columns])
+        depth = np.zeros_like(alpha) if sample.depth is None else sample.depth[rows, columns]
+        known = self._tensor(depth)
         weight = (self._tensor(alpha) / 255)[..., None]
         target = self._tensor(image) / 255 * weight + self.background * (1 - weight)
-        counts = torch.from_numpy(~torso[rows, columns]).to(self.device)
+        counts = torch.from_numpy(~torso[rows, columns]).to(self.head.device)
         return Item(
             key=self.keys[index],
             state=state,
@@ -229,10 +221,8 @@ class HeadViews:
                 )
         check_tracked(where, sample.tracked, self.head)
         self._cache[index] = sample
-        self._cached_bytes += sample.nbytes
-        while self._cached_bytes > self._capacity and len(self._cache) > 1:
-            _, old = self._cache.popitem(last=False)
-            self._cached_bytes -= old.nbytes
+        while len(self._cache) > 1 and sum(s.nbytes for s in self._cache.values()) > CACHE_BYTES:
+            self._cache.popitem(last=False)
         return sample
 
     def state(self, index: int) -> HeadState:
@@ -245,18 +235,16 @@ class HeadViews:
     def view_of(self, sample: Sample) -> PinholeView:
         """Return a sample's camera in head space, float64: subjects may be far from the origin."""
         height, width = sample.alpha.shape
-        head_to_world = np.eye(4)
-        head_to_world[:3, :3], head_to_world[:3, 3] = sample.tracked.R, sample.tracked.t
-        camera = sample.cam_from_world @ head_to_world
+        camera = sample.cam_from_world @ make_transform(sample.tracked.R, sample.tracked.t)
         return PinholeView(
-            K=torch.as_tensor(sample.K, dtype=torch.float64, device=self.device),
-            cam_from_head=torch.as_tensor(camera, dtype=torch.float64, device=self.device),
+            K=torch.as_tensor(sample.K, dtype=torch.float64, device=self.head.device),
+            cam_from_head=torch.as_tensor(camera, dtype=torch.float64, device=self.head.device),
             width=width,
             height=height,
         )
 
     def _tensor(self, array: np.ndarray) -> Tensor:
-        return torch.from_numpy(np.ascontiguousarray(array)).to(self.device, self.head.dtype)
+        return torch.from_numpy(np.ascontiguousarray(array)).to(self.head.device, self.head.dtype)
 
 
 def check_tracked(where: str, tracked: Tracked, head: HeadModel) -> None:

@@ -160,8 +160,6 @@ def controlled(
 def principal_directions(codes: Tensor) -> Tensor:
     """Find the principal directions (K, D) of a checkpoint's codes (S, D), one deviation long."""
     centred = codes.detach().double() - codes.detach().double().mean(0)
-    if len(codes) < 2:
-        return codes.new_zeros(0, codes.shape[1])
     _, spread, directions = torch.linalg.svd(centred, full_matrices=False)
     kept = spread > 1e-9 * spread.max().clamp_min(1e-12)
     scaled = spread[kept, None] / (len(codes) - 1) ** 0.5 * directions[kept]
@@ -199,15 +197,14 @@ def sample_expression(
     Coefficients and jaw stay within what training showed: activations have bounds.
     """
     model, frames = loaded.model, loaded.gallery.frames
-    mean = {
-        expression: [frame for (_, e), frame in frames.items() if e == expression]
-        for expression in model.expressions
-    }
-    weights = _sample_weights(len(mean), rng, spread, "expressions")
+    weights = _sample_weights(len(model.expressions), rng, spread, "expressions")
     length = max(len(frame.expression) for frame in frames.values())
 
     def drawn(name: str, size: int) -> np.ndarray:
-        rows = [[_padded(getattr(f, name), size) for f in own] for own in mean.values()]
+        rows = [
+            [padded(getattr(f, name), size) for (_, e), f in frames.items() if e == expression]
+            for expression in model.expressions
+        ]
         every = np.concatenate(rows)
         means = _combine([np.mean(row, 0) for row in rows], weights)
         return np.clip(means, every.min(0), every.max(0))
@@ -229,10 +226,10 @@ def _sample_weights(count: int, rng: np.random.Generator, spread: float, what: s
 
 def _combine(rows: Sequence[np.ndarray], weights: np.ndarray) -> np.ndarray:
     length = max(len(row) for row in rows)
-    return np.tensordot(weights, np.stack([_padded(row, length) for row in rows]), 1)
+    return np.tensordot(weights, np.stack([padded(row, length) for row in rows]), 1)
 
 
-def _padded(values: np.ndarray, length: int) -> np.ndarray:
+def padded(values: np.ndarray, length: int) -> np.ndarray:
     """Pad with zeros, which missing coefficients are."""
     return np.pad(values, [(0, length - len(values)), *[(0, 0)] * (values.ndim - 1)])
 
@@ -244,7 +241,7 @@ def _with_parameter(
         "shape": loaded.head.shape_dirs.shape[2],
         "expression": len(loaded.head.expression_names),
     }
-    changed = _padded(np.array(getattr(tracked, table), dtype=np.float64), sizes[table])
+    changed = padded(np.array(getattr(tracked, table), dtype=np.float64), sizes[table])
     if entry:
         names = loaded.head.expression_names if table == "expression" else ()
         place = _entry(entry, sizes[table], name, f"{table} parameters", names)
@@ -285,4 +282,4 @@ def _lerp(a: np.ndarray, b: np.ndarray, t: float) -> np.ndarray:
     if a is b:
         return a
     length = max(len(a), len(b))
-    return ((1 - t) * _padded(a, length) + t * _padded(b, length)).astype(a.dtype)
+    return ((1 - t) * padded(a, length) + t * padded(b, length)).astype(a.dtype)

@@ -141,7 +141,7 @@ def score(
     paths: dict[int, Path] = {}
     missing = []
     for index in indices:
-        name = sample_name(views.keys[index])
+        name = sample_key(**vars(views.keys[index]))
         files = [folder / f"{name}{suffix}" for suffix in SUFFIXES]
         if found := next(filter(Path.is_file, files), None):
             paths[index] = found
@@ -167,11 +167,6 @@ def score(
     if wrong:
         raise FormatError(f"{folder}: {len(wrong)} pictures do not fit: {_list(wrong)}")
     return rows
-
-
-def sample_name(key: SampleKey) -> str:
-    """Name a sample as the shards do, which is also its picture's name."""
-    return sample_key(key.subject, key.expression, key.camera)
 
 
 def _read_picture(path: Path, size: tuple[int, int]) -> np.ndarray:
@@ -201,7 +196,7 @@ def save_pictures(folder: Path, window: Window, views: HeadViews) -> Callable[[i
         whole = np.full((*size, 3), round(255 * views.background), np.uint8)
         shown = (255 * image.clamp(0, 1)).round().byte().permute(1, 2, 0).cpu().numpy()
         whole[rows, columns] = shown
-        write_image(folder / f"{sample_name(views.keys[index])}.png", whole)
+        write_image(folder / f"{sample_key(**vars(views.keys[index]))}.png", whole)
 
     return keep
 

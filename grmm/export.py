@@ -9,6 +9,8 @@ from pathlib import Path
 
 import numpy as np
 import torch
+import trimesh
+from PIL import Image
 
 from express50.errors import ConfigError
 from express50.files.atomic import write_bytes
@@ -145,9 +147,6 @@ def arrays_npz(
 
 def mesh_glb(head: HeadModel, vertices: np.ndarray, texture: np.ndarray) -> bytes:
     """Encode the textured mesh as binary glTF; vertices are split at the UV map's seams."""
-    import trimesh
-    from PIL import Image
-
     corners = np.stack([head.faces.cpu().reshape(-1), head.uv_faces.cpu().reshape(-1)], 1)
     pairs, faces = np.unique(corners, axis=0, return_inverse=True)
     material = trimesh.visual.material.PBRMaterial(
@@ -163,8 +162,6 @@ def mesh_glb(head: HeadModel, vertices: np.ndarray, texture: np.ndarray) -> byte
 
 def points_glb(gaussians: GaussianCloud) -> bytes:
     """Encode as binary glTF the centres of Gaussians whose opacity is over OPAQUE."""
-    import trimesh
-
     shown = gaussians.opacities > OPAQUE
     colours = np.round(255 * gaussians.colors[shown].clip(0, 1)).astype(np.uint8)
     points = trimesh.PointCloud(gaussians.means[shown], colors=colours)

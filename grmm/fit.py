@@ -24,12 +24,11 @@ from express50.files.atomic import write_json
 from grmm import losses
 from grmm.checkpoint import Gallery, Loaded, collect_gallery, save_checkpoint
 from grmm.config import Config
-from grmm.data import NO_OFFSETS, HeadViews, Item, Shuffle, Tracked, pose_state, spread
-from grmm.edit import interpolate_tracked
+from grmm.data import NO_OFFSETS, HeadViews, Item, Shuffle, spread
+from grmm.edit import HeadCodes, between, trained_head
 from grmm.evaluate import Render, evaluate, mean
-from grmm.losses import load_vgg
 from grmm.metrics import PerceptualMetrics
-from grmm.model import GRMM, HeadState, PinholeView, Rendering
+from grmm.model import GRMM, PinholeView, Rendering
 from grmm.render import comparison_sheet
 from grmm.warm_start import LOGIT_LIMIT, project_texture, spread_change
 
@@ -43,11 +42,10 @@ LOCALITY_T = 0.3  # weight of the fitted subject in the interpolation (paper, su
 
 @dataclass(kw_only=True)
 class FitState:
-    """Everything that a fit changes or reads: tuned model, frozen model and the codes sought."""
+    """Everything that a fit changes or reads: the tuned model and the codes sought."""
 
     loaded: Loaded
     model: GRMM
-    frozen: GRMM
     views: HeadViews
     given: list[int]
     z_id: Tensor
@@ -93,7 +91,7 @@ def fit(
     save_fit(state, out)
     comparison_sheet(out / "given.jpg", views, state.given[:6], render)
     if held_out:
-        comparison_sheet(out / "held_out.jpg", views, list(held_out)[:6], render)
+        comparison_sheet(out / "held_out.jpg", views, held_out[:6], render)
     write_json(out / "metrics.json", metrics)
     return metrics
 
@@ -128,7 +126,7 @@ def run_stages(
 
 
 def start(loaded: Loaded, views: HeadViews, given: list[int]) -> FitState:
-    """Start from the mean codes and a frozen copy of the model; known expressions keep theirs."""
+    """Start from the mean codes and a copy of the model; known expressions keep their codes."""
     subjects = sorted({views.keys[i].subject for i in given})
     if len(subjects) != 1:
         raise TrainError(
@@ -142,12 +140,11 @@ def start(loaded: Loaded, views: HeadViews, given: list[int]) -> FitState:
     return FitState(
         loaded=loaded,
         model=copy.deepcopy(model),
-        frozen=copy.deepcopy(model).requires_grad_(False),
         views=views,
         given=given,
         z_id=model.z_id.detach().mean(0),
         z_exp={name: known.get(name, codes.mean(0)).clone() for name in expressions},
-        perceptual=load_vgg(loaded.config.loss.vgg16, codes.device),
+        perceptual=losses.load_vgg(loaded.config.loss.vgg16, codes.device),
     )
 
 
@@ -279,20 +276,25 @@ def _footage_loss(state: FitState, rendering: Rendering, item: Item) -> Tensor:
 
 
 def locality_loss(state: FitState, item: Item, rng: np.random.Generator) -> Tensor:
-    """Compare the tuned and the frozen model between a training identity and the subject.
+    """Compare the tuned model and the loaded one between a training identity and the subject.
 
     Codes and coefficients are blended at a fixed t (weight of the subject), jaw and neck by SLERP
     (paper, supplement); a random training camera sees the mesh posed anew from the blend.
     """
-    frames = sorted(f for f in state.loaded.gallery.frames if f[0] in state.frozen.subjects)
+    frames = sorted(f for f in state.loaded.gallery.frames if f[0] in state.loaded.model.subjects)
     frame = frames[int(rng.integers(len(frames)))]
     view = random_camera(state, rng)
     own = next(i for i in state.given if state.views.keys[i] == item.key)
-    mine, code = state.views.sample(own).tracked, state.z_exp[item.key.expression]
-    head_state, z_id, z_exp = blend(state, frame, mine, code, LOCALITY_T)
-    tuned = state.model.render(z_id, z_exp, head_state, view, state.views.background)
+    mine = HeadCodes(
+        z_id=state.z_id,
+        z_exp=state.z_exp[item.key.expression],
+        tracked=state.views.sample(own).tracked,
+    )
+    head = between(trained_head(state.loaded, *frame), mine, LOCALITY_T)
+    scene = (head.z_id, head.z_exp, head.state(state.loaded), view, state.views.background)
+    tuned = state.model.render(*scene)
     with torch.no_grad():
-        before = state.frozen.render(z_id, z_exp, head_state, view, state.views.background)
+        before = state.loaded.model.render(*scene)
     return reconstruction(state, (tuned.rgb, before.rgb), (tuned.image, before.image))
 
 
@@ -300,20 +302,6 @@ def random_camera(state: FitState, rng: np.random.Generator) -> PinholeView:
     """Choose one of the training cameras."""
     cameras = state.loaded.gallery.cameras
     return cameras[sorted(cameras)[int(rng.integers(len(cameras)))]]
-
-
-def blend(
-    state: FitState, frame: tuple[str, str], mine: Tracked, z_exp: Tensor, t: float
-) -> tuple[HeadState, Tensor, Tensor]:
-    """Blend parameters and codes from a training frame (t = 0) to the fitted subject (1)."""
-    model, gallery = state.frozen, state.loaded.gallery
-    tracked = interpolate_tracked(gallery.frames[frame], mine, t)
-    known_id, known_exp = model.codes(*model.rows(*frame))
-    return (
-        pose_state(state.views.head, tracked),
-        torch.lerp(known_id, state.z_id, t),
-        torch.lerp(known_exp, z_exp, t),
-    )
 
 
 def _finite(loss: Tensor, iteration: int, stage: int) -> Tensor:
@@ -343,7 +331,8 @@ def save_fit(state: FitState, out: Path) -> None:
     they can be transferred to the subject.
     """
     subject = state.views.keys[state.given[0]].subject
-    trained_codes = zip(state.frozen.expressions, state.frozen.z_exp.detach(), strict=True)
+    former = state.loaded.model
+    trained_codes = zip(former.expressions, former.z_exp.detach(), strict=True)
     known = {name: code for name, code in trained_codes if name not in state.z_exp}
     model = GRMM(state.model.config, state.views.head, [subject], [*state.z_exp, *known])
     content = state.model.state_dict()

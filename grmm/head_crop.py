@@ -188,11 +188,10 @@ def _filled(
     depth: np.ndarray | None, foreground: np.ndarray, vertices: Tensor, view: PinholeView
 ) -> np.ndarray:
     """Fill the gaps of a depth map (H, W)."""
-    known = np.zeros_like(foreground) if depth is None else depth > 0
-    if depth is None or not known.any():
+    if depth is None or not (depth > 0).any():
         camera = view.cam_from_head.to(vertices.dtype)
         return np.full(foreground.shape, float((vertices @ camera[2, :3] + camera[2, 3]).mean()))
-    index = distance_transform_edt(~known, return_distances=False, return_indices=True)
+    index = distance_transform_edt(~(depth > 0), return_distances=False, return_indices=True)
     return depth[tuple(index)]
 
 

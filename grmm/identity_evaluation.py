@@ -71,7 +71,7 @@ def evaluate_unseen(
     rows = []
     for kind, fitted in ((NOVEL_VIEW, True), (NOVEL_EXPRESSION, False)):
         chosen = [i for i in own if (views.keys[i].expression in state.z_exp) == fitted]
-        chosen = spread(chosen, protocol.images) if protocol.images else chosen
+        chosen = spread(chosen, protocol.images or len(chosen))
         rows += evaluate(
             views, chosen, fitted_render(state), judge, lambda key, kind=kind: kind, keep
         )

@@ -91,7 +91,9 @@ class PerceptualMetrics:
         pairs = [pair for rows in groups for pair in rows]
         if len(pairs) < FID_LEAST_IMAGES:
             return None
-        metric = FrechetInceptionDistance(feature=_Given(len(pairs[0][0])))
+        features = nn.Identity()  # ready ones pass through, where torchmetrics expects a network
+        features.num_features = len(pairs[0][0])
+        metric = FrechetInceptionDistance(feature=features)
         metric.update(torch.stack([real for real, _ in pairs]), real=True)
         metric.update(torch.stack([fake for _, fake in pairs]), real=False)
         return round(float(metric.compute()), 4)
@@ -104,17 +106,6 @@ class PerceptualMetrics:
         if self.inception is None:
             absent["fid"] = "n/a: metrics.inception names no network (inception-2015-12-05.pt)"
         return absent
-
-
-class _Given(nn.Module):
-    """Passes ready features through, where torchmetrics expects a network."""
-
-    def __init__(self, count: int) -> None:
-        super().__init__()
-        self.num_features = count
-
-    def forward(self, features: Tensor) -> Tensor:
-        return features
 
 
 def alexnet_features() -> nn.Sequential:

@@ -129,18 +129,16 @@ class GRMM(Networks):
         """Build for a head model; subjects and expressions name the rows of the code tables."""
         super().__init__(config, head, len(subjects), len(expressions))
         self.subjects, self.expressions = tuple(subjects), tuple(expressions)
-        self.anchors = make_anchors(head, config.n_g, config.mouth)
-        # Constants of the head model are rebuilt from it, so checkpoints lack them.
-        gradients = uv_gradients(head)
+        anchors, gradients = make_anchors(head, config.n_g, config.mouth), uv_gradients(head)
         _, reach = tangent_frames(head.template, head.faces, gradients)
-        spacing_mm = 1e3 * reach[self.anchors.faces] / self.config.n_g
+        spacing_mm = 1e3 * reach[anchors.faces] / config.n_g
+        # Constants of the head model are rebuilt from it, so checkpoints lack them.
         constants = {
-            "faces": head.faces,
-            "gradients": gradients,
-            "texels": self.anchors.texels,
-            "anchor_faces": self.anchors.faces,
-            "barycentrics": self.anchors.barycentrics.to(head.dtype),
-            "scale_bias": initial_scales(spacing_mm, self.config),
+            "texels": anchors.texels,
+            "corners": head.faces[anchors.faces],  # (N, 3) vertices of each anchor's face
+            "gradients": gradients[anchors.faces],
+            "barycentrics": anchors.barycentrics.to(head.dtype),
+            "scale_bias": initial_scales(spacing_mm, config),
             "head_centre": head.template.mean(0),
         }
         for name, value in constants.items():
@@ -278,7 +276,7 @@ class GRMM(Networks):
 
         q = normalise(dq + identity), so that zeros mean no rotation (G1).
         """
-        base = interpolate(vertices, self.faces, self.anchor_faces, self.barycentrics)
+        base = interpolate(vertices, self.corners, self.barycentrics)
         shift = DISPLACEMENT_M * offsets[:, :3]
         unit = offsets.new_tensor([1.0, 0.0, 0.0, 0.0])
         quats = nn.functional.normalize(offsets[:, 3:7] + unit, dim=1, eps=1e-8)
@@ -286,8 +284,7 @@ class GRMM(Networks):
             return base + shift, quats
         # Frames steer, they are not learned through: their gradient is ill-conditioned on slivers.
         with torch.no_grad():
-            used = self.anchor_faces
-            frames, _ = tangent_frames(vertices, self.faces[used], self.gradients[used])
+            frames, _ = tangent_frames(vertices, self.corners, self.gradients)
             turn = matrix_to_quat(frames)
         return base + (frames * shift[:, None, :]).sum(2), quat_multiply(turn, quats)
 

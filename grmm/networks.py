@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from itertools import chain, pairwise
 
 import torch
 from torch import Tensor, nn
@@ -101,8 +102,7 @@ class Ladder(nn.Module):
         self.view = nn.Linear(3, VIEW_CHANNELS) if view_dependent else None
         channels = [config.seed_channels + VIEW_CHANNELS * view_dependent, *widths]
         self.doublings = nn.ModuleList(
-            Doubling(a, b, side * 2**i)
-            for i, (a, b) in enumerate(zip(channels, channels[1:], strict=False))
+            Doubling(a, b, side * 2**i) for i, (a, b) in enumerate(pairwise(channels))
         )
         self.last = nn.ConvTranspose2d(channels[-1], outputs, 4, 2, 1, bias=False)
         nn.init.zeros_(self.last.weight)
@@ -145,13 +145,8 @@ class MeshDecoder(nn.Module):
         """Build for a mesh whose teeth are marked in ``teeth`` (V,) bool; metres come out."""
         super().__init__()
         widths = [config.z_id + 6, *config.shared_widths]
-        self.shared = nn.Sequential(
-            *(
-                layer
-                for a, b in zip(widths, widths[1:], strict=False)
-                for layer in (nn.Linear(a, b), nn.LeakyReLU(SLOPE))
-            )
-        )
+        layers = ((nn.Linear(a, b), nn.LeakyReLU(SLOPE)) for a, b in pairwise(widths))
+        self.shared = nn.Sequential(*chain.from_iterable(layers))
         base, both, outputs = widths[-1], widths[-1] + config.z_exp, 3 * len(teeth)
         self.film = _zero_last_mlp(coefficients, config.film_width, 2 * both)
         self.identity = _zero_last_mlp(base, config.mesh_width, outputs)
@@ -200,12 +195,8 @@ class Refinement(nn.Module):
         self.stride = unshuffle * 2 ** (len(widths) - 1)
         folded = inputs * unshuffle**2
         self.enter = _block(folded, widths[0])
-        self.down = nn.ModuleList(
-            _block(a, b, stride=2) for a, b in zip(widths, widths[1:], strict=False)
-        )
-        self.up = nn.ModuleList(
-            _block(a + b, a) for a, b in reversed(list(zip(widths, widths[1:], strict=False)))
-        )
+        self.down = nn.ModuleList(_block(a, b, stride=2) for a, b in pairwise(widths))
+        self.up = nn.ModuleList(_block(a + b, a) for a, b in reversed(list(pairwise(widths))))
         self.head = nn.Conv2d(widths[0], 3 * unshuffle**2, 3, padding=1)
         for layer in self.modules():
             if isinstance(layer, nn.Conv2d):

@@ -22,11 +22,12 @@ from grmm.edit import (
     HeadCodes,
     between,
     controlled,
+    padded,
     principal_directions,
     sample_expression,
     sample_identity,
     trained_head,
-    transfer,
+    with_expression,
 )
 from grmm.evaluate import Render
 from grmm.head_crop import draw_window
@@ -188,10 +189,8 @@ def control_sheet(loaded: Loaded, head: HeadCodes, view: PinholeView) -> Sheet:
     for label, (name, reach) in TURNS.items():
         values = [reach * step for step in STEPS]
         changes[label] = [{name: (0.0, v, 0.0) if name == "eyes" else (v,)} for v in values]
-    for number in strongest_coefficients(loaded, 2):
-        size = max(abs(f.expression[number]) for f in loaded.gallery.frames.values())
-        name = f"expression.{number}"
-        label = loaded.head.expression_names[number]
+    for number, size in strongest_coefficients(loaded, 2).items():
+        label, name = loaded.head.expression_names[number], f"expression.{number}"
         changes[label] = [{name: (size * (step + 1) / 2,)} for step in STEPS]
     for code in ("z_id", "z_exp"):
         for number in range(min(2, len(principal_directions(getattr(loaded.model, code))))):
@@ -204,13 +203,13 @@ def control_sheet(loaded: Loaded, head: HeadCodes, view: PinholeView) -> Sheet:
     return rows, list(changes)
 
 
-def strongest_coefficients(loaded: Loaded, count: int) -> list[int]:
-    """Find the expression coefficients that vary most over the training frames."""
-    frames = loaded.gallery.frames.values()
-    length = max(len(f.expression) for f in frames)
-    rows = [np.pad(f.expression, (0, length - len(f.expression))) for f in frames]
-    order = np.argsort(-np.std(rows, axis=0), kind="stable")
-    return [int(number) for number in order[:count]]
+def strongest_coefficients(loaded: Loaded, count: int) -> dict[int, float]:
+    """Find the expression coefficients that vary most in training, and how large each gets."""
+    shown = [frame.expression for frame in loaded.gallery.frames.values()]
+    length = max(map(len, shown))
+    rows = np.stack([padded(expression, length) for expression in shown])
+    order = np.argsort(-np.std(rows, axis=0), kind="stable")[:count]
+    return {int(number): float(np.abs(rows[:, number]).max()) for number in order}
 
 
 def residual_sheet(
@@ -221,11 +220,10 @@ def residual_sheet(
     Columns: neither, parameters alone, code alone, both, and both with z_exp = 0, which shows
     what the expression code carries (the paper's supplement, figure on the extended UV map).
     """
-    moved = transfer(identity.tracked, expression.tracked)
-    both = replace(identity, tracked=moved, z_exp=expression.z_exp)
+    both = with_expression(identity, expression)
     heads = [
         identity,
-        replace(identity, tracked=moved),
+        replace(identity, tracked=both.tracked),
         replace(identity, z_exp=expression.z_exp),
         both,
         controlled(loaded, both, {"z_exp": (0.0,)}),

@@ -61,7 +61,7 @@ class ShardSource:
                 f"{where}: tracked with head model {meta.get('head')!r}, the first sample with "
                 f"{self.head!r}; train on one of them: pack them into different folders"
             )
-        rows, columns = seen_window(meta, where)
+        rows, columns, _ = seen_window(meta, where)
         K = _matrix(meta, "K", (3, 3), where)
         K[:2, 2] -= columns.start, rows.start
         return Sample(
@@ -75,10 +75,8 @@ class ShardSource:
         )
 
     def window(self, index: int) -> tuple[slice, slice, tuple[int, int]]:
-        """Return rows and columns of a packed sample that its camera saw, and the packed (H, W)."""
-        meta = self.reader.meta(index)
-        rows, columns = seen_window(meta, f"{self.reader.root}: {self.keys[index]}")
-        return rows, columns, (int(meta["height"]), int(meta["width"]))  # checked just before
+        """Return what `seen_window` does of a sample."""
+        return seen_window(self.reader.meta(index), f"{self.reader.root}: {self.keys[index]}")
 
     def _tracked(self, meta: dict, subject: str, where: str) -> Tracked:
         track = meta.get("track")
@@ -143,20 +141,16 @@ def select(keys: Sequence[SampleKey], subjects: str, expressions: str, cameras: 
     Raises:
         ConfigError: a pattern, or all of them together, match nothing.
     """
-    chosen: dict[str, set[str]] = {}
+    found = list(range(len(keys)))
     for kind, text in (("subject", subjects), ("expression", expressions), ("camera", cameras)):
         known = sorted({getattr(key, kind) for key in keys})
-        chosen[kind] = set()
+        chosen: set[str] = set()
         for pattern in filter(None, map(str.strip, text.split(","))):
             matching = fnmatch.filter(known, pattern)
             if not matching:
                 raise ConfigError(f"no {kind} is {pattern}; the shards have {', '.join(known)}")
-            chosen[kind].update(matching)
-    found = [
-        i
-        for i, key in enumerate(keys)
-        if all(getattr(key, kind) in ids for kind, ids in chosen.items())
-    ]
+            chosen.update(matching)
+        found = [i for i in found if getattr(keys[i], kind) in chosen]
     if not found:
         raise ConfigError(
             f"no sample has subject {subjects}, expression {expressions} and camera {cameras}; "
@@ -165,8 +159,8 @@ def select(keys: Sequence[SampleKey], subjects: str, expressions: str, cameras: 
     return found
 
 
-def seen_window(meta: dict, where: str) -> tuple[slice, slice]:
-    """Return the rows and columns of a packed sample that its camera saw.
+def seen_window(meta: dict, where: str) -> tuple[slice, slice, tuple[int, int]]:
+    """Return the rows and columns of a packed sample that its camera saw, and the packed (H, W).
 
     Packing squares reach beyond the footage where a head stands at the border of the image. What
     lies there is black in the sample, yet not background: a model taught so would learn to cut off
@@ -179,7 +173,7 @@ def seen_window(meta: dict, where: str) -> tuple[slice, slice]:
         size = (int(meta["height"]), int(meta["width"]))
         crop = meta.get("crop")
         if not crop:
-            return slice(0, size[0]), slice(0, size[1])
+            return slice(0, size[0]), slice(0, size[1]), size
         spans = []
         for start, source, length in zip(
             (crop["y0"], crop["x0"]), reversed(meta["source_size"]), size, strict=True
@@ -193,7 +187,7 @@ def seen_window(meta: dict, where: str) -> tuple[slice, slice]:
         raise FormatError(f"{where}: malformed crop ({words}); rerun 'express50 pack'") from None
     if any(span.stop <= span.start for span in spans):
         raise FormatError(f"{where}: its crop lies outside the footage; rerun 'express50 pack'")
-    return spans[0], spans[1]
+    return spans[0], spans[1], size
 
 
 def _matrix(table: dict, name: str, size: tuple[int, ...] | None, where: str) -> np.ndarray:

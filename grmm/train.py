@@ -69,8 +69,7 @@ def train(
     # --- Processes, samples, model -------------------------------------------------------------
     rank, world, device = join_processes()
     torch.manual_seed(config.train.seed)
-    background, torso = config.data.background, config.data.torso
-    views = HeadViews(source, head, background=background, torso=torso, device=device)
+    views = HeadViews(source, head.to(device), config.data)
     config = with_map_size(config, views)
     state = prepare(views, config, rank, world)
     checkpoint = out / "checkpoint.pt"

@@ -24,7 +24,6 @@ from grmm import losses
 from grmm.checkpoint import collect_gallery, load_checkpoint, save_checkpoint
 from grmm.config import Config, as_tables
 from grmm.data import HeadViews, SampleKey, Shuffle, spread
-from grmm.losses import load_vgg
 from grmm.model import GRMM
 
 COVERED_TEXELS = 0.75  # of a map that head models' layouts use
@@ -55,7 +54,7 @@ def prepare(views: HeadViews, config: Config, rank: int = 0, world: int = 1) -> 
     training, holdout = split_samples(keys, config)
     subjects = sorted({keys[i].subject for i in training})
     expressions = sorted({keys[i].expression for i in training})
-    model = GRMM(config.model, views.head, subjects, expressions).to(views.device)
+    model = GRMM(config.model, views.head, subjects, expressions).to(views.head.device)
     # A held-out sample can only be judged where its codes were trained.
     holdout = [
         i for i in holdout if keys[i].subject in subjects and keys[i].expression in expressions
@@ -67,7 +66,7 @@ def prepare(views: HeadViews, config: Config, rank: int = 0, world: int = 1) -> 
         holdout=holdout,
         optimizer=make_optimizer(model, config),
         shuffle=Shuffle(training, config.train.seed, rank, world),
-        perceptual=load_vgg(config.loss.vgg16, views.device),
+        perceptual=losses.load_vgg(config.loss.vgg16, views.head.device),
         edges=losses.mesh_edges(views.head.faces),
     )
 

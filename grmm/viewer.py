@@ -20,7 +20,7 @@ import viser
 from torch import Tensor
 
 from express50.console import stdout_to_stderr
-from express50.geometry.transforms import quat_to_matrix
+from express50.geometry.transforms import invert_transform, make_transform, quat_to_matrix
 from grmm.checkpoint import Loaded
 from grmm.edit import HeadCodes, between, controlled, principal_directions, trained_head
 from grmm.head_crop import draw_window
@@ -96,8 +96,8 @@ class Preview:
         cosine = float((self._direction * view.direction()).sum())
         if not moving:
             return cosine < 1 - 1e-9
-        turned = math.degrees(math.acos(max(-1.0, min(1.0, cosine))))
-        return turned > TURN_DEGREES and self._colour_seconds < SLOW_SECONDS
+        turned = cosine < math.cos(math.radians(TURN_DEGREES))
+        return turned and self._colour_seconds < SLOW_SECONDS
 
 
 @dataclass(kw_only=True)
@@ -120,10 +120,7 @@ class _Server(viser.ViserServer):
 class Viewer:
     """The server, the browsers that watch, and the head that the controls describe."""
 
-    def __init__(
-        self, loaded: Loaded, host: str = "127.0.0.1", port: int = 8080, moving: int = 320,
-        still: int = 512,
-    ) -> None:  # fmt: skip
+    def __init__(self, loaded: Loaded, host: str, port: int, moving: int, still: int) -> None:
         """Start to listen; heights in pixels while things move and once they rest."""
         self.loaded, self.heights = loaded, {True: moving, False: still}
         self.preview = Preview(loaded)
@@ -187,9 +184,9 @@ class Viewer:
         watcher = Watcher(client=client, changed=time.perf_counter())
         self._watchers[client.client_id] = watcher
         view = frontal(self.loaded)
-        matrix = view.cam_from_head.cpu().numpy()
+        head_from_cam = invert_transform(view.cam_from_head.cpu().numpy())
         client.camera.up_direction = (0.0, 1.0, 0.0)
-        client.camera.position = tuple(-matrix[:3, :3].T @ matrix[:3, 3])
+        client.camera.position = tuple(head_from_cam[:3, 3])
         client.camera.look_at = tuple(self.loaded.model.head_centre.cpu().numpy())
         client.camera.fov = 2 * np.arctan(view.height / 2 / float(view.K[1, 1]))
 
@@ -208,7 +205,7 @@ class Viewer:
         self._wake.set()
 
     def _add_controls(self) -> None:
-        gui, model, frames = self.server.gui, self.loaded.model, self.loaded.gallery.frames.values()
+        gui, model = self.server.gui, self.loaded.model
         self._status = gui.add_markdown("")
         self._sliders: list[tuple[Any, float, tuple[str, ...]]] = []
         with gui.add_folder("who and what"):
@@ -221,10 +218,8 @@ class Viewer:
             for name, (controls, reach) in POSES.items():
                 self._slider(name, reach, 0.0, *controls)
         with gui.add_folder("expression coefficients, added", expand_by_default=False):
-            for number in strongest_coefficients(self.loaded, COEFFICIENTS):
-                shown = [f.expression for f in frames if len(f.expression) > number]
-                size = max(1.0, 1.5 * max(abs(expression[number]) for expression in shown))
-                name = self.loaded.head.expression_names[number]
+            for number, largest in strongest_coefficients(self.loaded, COEFFICIENTS).items():
+                name, size = self.loaded.head.expression_names[number], max(1.0, 1.5 * largest)
                 self._slider(f"expression {name}", (-size, size), 0.0, f"expression.{number}")
         with gui.add_folder("residual codes"):
             for code in ("z_id", "z_exp"):
@@ -278,13 +273,11 @@ def own_value(head: HeadCodes, control: str) -> float:
     return float(values[int(entry)]) if entry and int(entry) < len(values) else 0.0
 
 
-def view_of_camera(camera: Any, height: int, device: torch.device | str = "cpu") -> PinholeView:
+def view_of_camera(camera: Any, height: int, device: torch.device) -> PinholeView:
     """Convert a browser's camera (OpenCV axes) to a view of this height, at most 2 : 1 wide."""
     width = max(1, round(height * min(2.0, max(0.5, float(camera.aspect)))))
     focal = height / 2 / np.tan(float(camera.fov) / 2)
     K = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]]).double()
-    cam_from_head = np.eye(4)
-    cam_from_head[:3, :3] = quat_to_matrix(np.asarray(camera.wxyz, dtype=np.float64)).T
-    cam_from_head[:3, 3] = -cam_from_head[:3, :3] @ np.asarray(camera.position)
-    pose = torch.from_numpy(cam_from_head).to(device)
+    head_from_cam = make_transform(quat_to_matrix(camera.wxyz), camera.position)
+    pose = torch.from_numpy(invert_transform(head_from_cam)).to(device)
     return PinholeView(K=K.to(device), cam_from_head=pose, width=width, height=height)

@@ -39,7 +39,7 @@ def warm_start(
         known.append(weight > 0)
     stack, seen = torch.stack(textures), torch.stack(known)[..., None]  # (S, N, 3), (S, N, 1)
     mean = (stack * seen).sum(0) / seen.sum(0).clamp_min(1)
-    mean = fill_texels(mean, seen.any(0)[:, 0], model.anchors.texels, model.config.n_g)
+    mean = fill_texels(mean, seen.any(0)[:, 0], model.texels, model.config.n_g)
     stack = torch.where(seen, stack, mean)
     logits = torch.logit(stack.clamp(LOGIT_LIMIT, 1 - LOGIT_LIMIT))
     bias = model.colour.bias.flatten(1)
@@ -101,10 +101,7 @@ def _seen_colours(model: GRMM, gaussians: Gaussians, item: Item) -> tuple[Tensor
     grid = torch.stack([2 * x / view.width - 1, 2 * y / view.height - 1], -1)
     sampled = torch.nn.functional.grid_sample(maps[None], grid[None, None], align_corners=False)
     sampled = sampled[0, :, 0].T  # (N, 6)
-    vertices = item.state.vertices
-    frames, _ = tangent_frames(
-        vertices, model.faces[model.anchor_faces], model.gradients[model.anchor_faces]
-    )
+    frames, _ = tangent_frames(item.state.vertices, model.corners, model.gradients)
     facing = -((frames[..., 2] @ camera[:3, :3].T) * points).sum(1) / points.norm(dim=1)
     hit = (points[:, 2] > 0) & (points[:, 2] < sampled[:, 3] + OCCLUSION_M)
     seen = hit & (sampled[:, 4:] > 0.99).all(1) & (facing > FACING)

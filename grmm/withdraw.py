@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-import io
 from pathlib import Path
 from typing import Any
 
-import torch
-
-from express50.files.atomic import write_bytes
-from grmm.checkpoint import read_content
+from grmm.checkpoint import read_content, write_content
 
 
 def redact(path: Path, subject: str) -> bool:
@@ -29,10 +25,8 @@ def redact(path: Path, subject: str) -> bool:
         return False
     if content["subjects"] == [subject]:
         path.unlink()
-        return True
-    buffer = io.BytesIO()
-    torch.save(_without(content, subject), buffer)
-    write_bytes(path, buffer.getvalue())
+    else:
+        write_content(path, _without(content, subject))
     return True
 
 

@@ -13,7 +13,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from express50.console import OK, log, say, say_json
+from express50.contract.config import config_toml, known_assignments
 from express50.errors import ConfigError
+from express50.files.atomic import write_bytes, write_json
 from grmm.config import TABLES, Config, as_tables, choose, from_tables, resolve
 
 if TYPE_CHECKING:
@@ -21,6 +23,7 @@ if TYPE_CHECKING:
     from grmm.data import HeadViews
     from grmm.edit import HeadCodes
     from grmm.identity_evaluation import FitProtocol
+    from grmm.metrics import PerceptualMetrics
 
 MEASURED = "measured"  # in place of a preset
 HOLDOUTS = ("holdout_cameras", "holdout_expressions")
@@ -65,8 +68,6 @@ def train_config(args: argparse.Namespace) -> Config:
 
 def config(args: argparse.Namespace) -> int:
     """Print the settings that `train` would take, as TOML."""
-    from express50.contract.config import config_toml
-
     resolved = train_config(args)
     for table in args.table or TABLES:
         if table not in TABLES:
@@ -94,8 +95,7 @@ def fit(args: argparse.Namespace) -> int:
         )
     views = loaded.views(ShardSource(args.shards, "*"))
     given = select(views.keys, args.subject, args.expression, args.cameras)
-    chosen = set(given)
-    rest = [i for i in select(views.keys, args.subject, args.expression, "*") if i not in chosen]
+    rest = sorted({*select(views.keys, args.subject, args.expression, "*")} - {*given})
     metrics = fit(loaded, views, given, rest, args.out)
     reached = f"{metrics['seconds']} s, {metrics['iterations']} iterations"
     line = f"psnr_db: {metrics['psnr_db']} ({metrics['psnr_is_of']}), after {reached}"
@@ -189,8 +189,7 @@ def evaluate(args: argparse.Namespace) -> int:
     known, unseen = _split(loaded, views, args)
     if args.heldout:
         known = [i for i in known if kind(views.keys[i]) != SEEN]
-    if args.images:
-        known = spread(known, args.images)
+    known = spread(known, args.images or len(known))
     if not known and not unseen:
         raise ConfigError(
             f"{args.shards}: training saw all that was chosen; leave --heldout out, or train with "
@@ -203,8 +202,7 @@ def evaluate(args: argparse.Namespace) -> int:
         found, effort = evaluate_unseen(loaded, views, subject, protocol, judge, keep, chosen)
         log(f"{subject}: fitted from {', '.join(effort['cameras'])} in {effort['seconds']} s")
         rows += found
-    _report(args, rows, judge)
-    return OK
+    return _report(args, rows, judge)
 
 
 def _split(
@@ -214,20 +212,16 @@ def _split(
     from grmm.shard_source import select
 
     chosen = select(views.keys, args.subjects, args.expressions, args.cameras)
-    people, expressions = loaded.model.subjects, loaded.model.expressions
-    known: list[int] = []
-    unseen: dict[str, list[int]] = {}
-    for i in chosen:
-        key = views.keys[i]
-        if key.subject not in people:
-            unseen.setdefault(key.subject, []).append(i)
-        elif key.expression in expressions:
-            known.append(i)
+    keys, model = views.keys, loaded.model
+    strangers = sorted({keys[i].subject for i in chosen} - {*model.subjects})
+    unseen = {name: [i for i in chosen if keys[i].subject == name] for name in strangers}
+    known = [i for i in chosen if keys[i].subject not in unseen]
+    known = [i for i in known if keys[i].expression in model.expressions]
     if args.fit_cameras:
-        return known, dict(sorted(unseen.items()))
+        return known, unseen
     if not known:
         raise ConfigError(
-            f"{args.shards}: training saw none of {', '.join(sorted(unseen)) or args.expressions}; "
+            f"{args.shards}: training saw none of {', '.join(unseen) or args.expressions}; "
             "people whom it never saw are fitted first: name --fit-cameras"
         )
     return known, {}
@@ -244,9 +238,9 @@ def score(args: argparse.Namespace) -> int:
 
     data = DataConfig(background=args.background, torso=args.torso)
     source = ShardSource(args.shards, "*")
-    views = HeadViews(source, load_head(source.head), background=data.background, torso=data.torso)
+    views = HeadViews(source, load_head(source.head), data)
     chosen = select(views.keys, args.subjects, args.expressions, args.cameras)
-    chosen = spread(chosen, args.images) if args.images else chosen
+    chosen = spread(chosen, args.images or len(chosen))
     judge = PerceptualMetrics(MetricsConfig(alexnet=args.alexnet, inception=args.inception))
     rows = score(args.renders, source.window, views, chosen, judge, args.partial)
     _report(args, rows, judge)
@@ -255,11 +249,11 @@ def score(args: argparse.Namespace) -> int:
     return OK
 
 
-def _report(args: argparse.Namespace, rows: list, judge: Any) -> None:
+def _report(args: argparse.Namespace, rows: list, judge: PerceptualMetrics) -> int:
     from grmm.evaluate import summary_lines, write_evaluation
 
     summary = write_evaluation(args.out, rows, judge)
-    _print(args, summary, *summary_lines(summary))
+    return _print(args, summary, *summary_lines(summary))
 
 
 def ablate(args: argparse.Namespace) -> int:
@@ -312,7 +306,6 @@ def study_serve(args: argparse.Namespace) -> int:
 
 def study_table(args: argparse.Namespace) -> int:
     """Write and print the table of a study's answers."""
-    from express50.files.atomic import write_bytes, write_json
     from grmm.study import markdown, read_answers, read_study, summarise
 
     study = read_study(args.out)
@@ -348,7 +341,6 @@ def _metric_settings(args: argparse.Namespace) -> list[str]:
 
 def _load(path: Path, assignments: Sequence[str] = (), seconds: float | None = None) -> Loaded:
     """Read a checkpoint; ``fit.*``, ``metrics.*`` and ``loss.*`` replace its own settings."""
-    from express50.contract.config import known_assignments
     from grmm.checkpoint import load_checkpoint
     from grmm.train_state import best_device
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 import json
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from importlib import resources
 from pathlib import Path
 from threading import Lock
 from urllib.parse import parse_qs, urlsplit
@@ -20,7 +19,7 @@ from express50.files.text import parse_json
 from grmm.study import append_answer, check_answer, read_answers, read_study, trials
 
 ANSWER_LIMIT = 4096  # bytes of one POST
-PAGE = "page.html"
+PAGE = Path(__file__).with_name("page.html")
 Reply = tuple[HTTPStatus, str, bytes]
 NOT_FOUND: Reply = (HTTPStatus.NOT_FOUND, "text/plain", b"no such page\n")
 
@@ -81,8 +80,7 @@ class StudyPages:
         url = urlsplit(address)
         name = url.path.removeprefix("/")
         if not name:
-            page = resources.files("grmm.study").joinpath(PAGE).read_bytes()
-            return HTTPStatus.OK, "text/html; charset=utf-8", page
+            return HTTPStatus.OK, "text/html; charset=utf-8", PAGE.read_bytes()
         if name in self.pictures:
             return HTTPStatus.OK, "image/png", (self.out / name).read_bytes()
         if name != "trials":

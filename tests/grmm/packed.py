@@ -7,6 +7,13 @@ import numpy as np
 from express50.files.images import encode_jpeg, encode_png
 from express50.shards.writer import PackedSample, ShardWriter
 
+TINY = [
+    "--set=model.n_g=32", "--set=model.ladder=[8, 8]", "--set=model.refine_widths=[8]",
+    "--set=model.seed_channels=8", "--set=train.iterations=3", "--set=train.evaluate_images=2",
+    "--set=fit.stage1_iterations=2", "--set=fit.stage2_iterations=2", "--preset=demo",
+]  # fmt: skip
+"""Flags of a run that takes a second."""
+
 
 def packed(source, index):
     """One sample as the pack stage encodes it."""

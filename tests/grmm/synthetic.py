@@ -17,7 +17,10 @@ STRETCH = 0.015  # metres the first expression coefficient adds to the y axis
 
 
 def ellipsoid_head(rows: int = 10, columns: int = 16) -> HeadModel:
-    """A lat-long ellipsoid in the head model's layout; the lowest ring plays the teeth."""
+    """A lat-long ellipsoid in the head model's layout.
+
+    The lowest ring plays the teeth, two above it the inside of the mouth.
+    """
     v, u = np.meshgrid(np.linspace(0, 1, rows + 1), np.linspace(0, 1, columns + 1), indexing="ij")
     polar, azimuth = np.pi * (1 - v), 2 * np.pi * (u - 0.5)
     unit = np.stack(
@@ -32,8 +35,9 @@ def ellipsoid_head(rows: int = 10, columns: int = 16) -> HeadModel:
     expression[:, 1, 0] = STRETCH * unit[:, 1]
     skinning = np.zeros((count, 5))
     skinning[:, 0] = 1
-    teeth = torch.from_numpy(v.reshape(-1) < 0.15)
-    regions = {name: torch.zeros(count, dtype=torch.bool) for name in REGIONS} | {"teeth": teeth}
+    height = torch.from_numpy(v.reshape(-1))
+    regions = {name: torch.zeros(count, dtype=torch.bool) for name in REGIONS}
+    regions |= {"teeth": height < 0.15, "mouth_interior": (height > 0.35) & (height < 0.55)}
     return HeadModel(
         name="ellipsoid",
         template=torch.from_numpy(AXES * unit).float(),

@@ -7,37 +7,12 @@ import pytest
 from express50.errors import FormatError
 from express50.files.images import read_image, write_image
 from grmm import ablate as ablate_module
-from grmm import checkpoint as checkpoint_module
 from grmm.ablate import VARIANTS
 from grmm.anchors import make_anchors
 from grmm.cli import main
 from grmm.shard_source import open_shards
-from tests.grmm.packed import write_shards
+from tests.grmm.packed import TINY, write_shards
 from tests.grmm.synthetic import EllipsoidSource, ellipsoid_head, tiny_config
-
-TINY = [
-    "--set=model.n_g=32", "--set=model.ladder=[8, 8]", "--set=model.refine_widths=[8]",
-    "--set=model.seed_channels=8", "--set=train.iterations=2", "--set=train.evaluate_images=1",
-    "--set=fit.stage1_iterations=1", "--set=fit.stage2_iterations=1", "--preset=demo",
-]  # fmt: skip
-
-
-def mouth_head():
-    """The ellipsoid with two rings that play the inside of the mouth."""
-    head = ellipsoid_head()
-    v = head.uv[:, 1]
-    head.regions["mouth_interior"][(v > 0.3) & (v < 0.55)] = True
-    return head
-
-
-@pytest.fixture(autouse=True, scope="module")
-def toy_head():
-    from express50.head import load
-
-    with pytest.MonkeyPatch.context() as patch:
-        for module in (load, checkpoint_module, ablate_module):
-            patch.setattr(module, "load_head", lambda spec: mouth_head())
-        yield
 
 
 @pytest.fixture(scope="module")
@@ -104,7 +79,6 @@ def test_finished_rows_are_kept_and_changed_ones_measured_again(table, roots, mo
 
 
 def test_rows_of_other_samples_are_trained_afresh(tmp_path, monkeypatch):
-    monkeypatch.setattr(ablate_module, "load_head", lambda spec: ellipsoid_head())
     gone_on = []
     monkeypatch.setattr(ablate_module, "train", lambda *a, resume, **k: gone_on.append(resume))
     config = tiny_config()
@@ -124,7 +98,7 @@ def test_unknown_rows_are_named(roots, tmp_path, capsys):
 
 
 def test_faces_of_the_mouth_lose_their_gaussians_only():
-    head = mouth_head()
+    head = ellipsoid_head()
     whole, without = make_anchors(head, 32), make_anchors(head, 32, mouth=False)
     gone = sorted(set(whole.texels.tolist()) - set(without.texels.tolist()))
     faces = {int(f) for t, f in zip(whole.texels, whole.faces, strict=True) if int(t) in set(gone)}

@@ -8,8 +8,6 @@ from grmm.checkpoint import load_checkpoint
 from grmm.train import train
 from tests.grmm.synthetic import ellipsoid_head, tiny_config
 
-pytestmark = pytest.mark.usefixtures("toy_head")
-
 
 @pytest.fixture
 def path(tmp_path, source):

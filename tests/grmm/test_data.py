@@ -5,6 +5,8 @@ import pytest
 import torch
 
 from express50.errors import FormatError
+from grmm import data
+from grmm.config import DataConfig
 from grmm.data import HeadViews, Shuffle, pose_state, spread
 from tests.grmm.synthetic import STRETCH, EllipsoidSource, ellipsoid_head
 
@@ -14,13 +16,8 @@ def source():
     return EllipsoidSource(size=64)
 
 
-@pytest.fixture
-def views(source):
-    return HeadViews(source, ellipsoid_head())
-
-
 def test_footage_is_composited_on_the_background(source):
-    views = HeadViews(source, ellipsoid_head(), background=0.25)
+    views = HeadViews(source, ellipsoid_head(), DataConfig(background=0.25))
     item = views.item(0)
     assert torch.equal(
         item.target[:, ~item.mask], torch.full_like(item.target[:, ~item.mask], 0.25)
@@ -37,35 +34,39 @@ def test_geometry_is_posed_once_per_frame(views):
     assert float(taller) == pytest.approx(STRETCH, rel=1e-5)
 
 
-def test_cache_is_bounded_and_answers_from_memory(source):
-    views = HeadViews(source, ellipsoid_head(), cache_mb=0)
-    assert views.sample(0) is views.sample(0)
+def test_cache_is_bounded_and_answers_from_memory(source, monkeypatch):
+    views = HeadViews(source, ellipsoid_head())
     first = views.sample(0)
-    views.sample(1)
-    assert views.sample(0) is not first
-    roomy = HeadViews(source, ellipsoid_head())
-    first = roomy.sample(0)
-    roomy.sample(1)
-    assert roomy.sample(0) is first
+    second = views.sample(1)
+    assert views.sample(0) is first
+    monkeypatch.setattr(data, "CACHE_BYTES", 2 * first.nbytes)
+    views.sample(2)
+    assert views.sample(0) is first and views.sample(1) is not second
+    monkeypatch.setattr(data, "CACHE_BYTES", 0)
+    assert views.sample(2) is views.sample(2)
 
 
-def test_sizes_that_differ_are_named(source):
-    class Broken(EllipsoidSource):
-        def read(self, index):
-            return replace(super().read(index), alpha=np.zeros((3, 3), np.uint8))
+class Changed(EllipsoidSource):
+    """The toy data set, where every sample has these changes."""
 
+    def __init__(self, **changes):
+        super().__init__(size=32)
+        self.changes = changes
+
+    def read(self, index):
+        return replace(super().read(index), **self.changes)
+
+
+def test_sizes_that_differ_are_named():
+    broken = Changed(alpha=np.zeros((3, 3), np.uint8))
     with pytest.raises(FormatError, match=r"S000/e0/cam00: alpha is \(3, 3\)"):
-        HeadViews(Broken(size=32), ellipsoid_head()).item(0)
+        HeadViews(broken, ellipsoid_head()).item(0)
 
 
 def test_parameters_of_another_head_model_are_named(source):
-    class Other(EllipsoidSource):
-        def read(self, index):
-            sample = super().read(index)
-            return replace(sample, tracked=replace(sample.tracked, expression=np.zeros(9)))
-
+    other = Changed(tracked=replace(source.read(0).tracked, expression=np.zeros(9)))
     with pytest.raises(FormatError, match="9 expression"):
-        HeadViews(Other(size=32), ellipsoid_head()).item(0)
+        HeadViews(other, ellipsoid_head()).item(0)
 
 
 def test_fewer_coefficients_are_padded(source):
@@ -74,12 +75,8 @@ def test_fewer_coefficients_are_padded(source):
     assert state.expression.tolist() == [1, 0, 0, 0]
 
 
-def test_missing_depth_is_no_depth(source):
-    class Flat(EllipsoidSource):
-        def read(self, index):
-            return replace(super().read(index), depth=None)
-
-    item = HeadViews(Flat(size=32), ellipsoid_head()).item(0, crop=True)
+def test_missing_depth_is_no_depth():
+    item = HeadViews(Changed(depth=None), ellipsoid_head()).item(0, crop=True)
     assert not item.depth_valid.any()
     assert item.depth.shape == item.mask.shape
 

@@ -3,7 +3,6 @@ import pytest
 import torch
 
 from express50.errors import ConfigError
-from grmm import checkpoint as checkpoint_module
 from grmm.checkpoint import load_checkpoint
 from grmm.edit import (
     between,
@@ -32,11 +31,9 @@ from tests.grmm.synthetic import EllipsoidSource, ellipsoid_head, tiny_config
 @pytest.fixture(scope="module")
 def loaded(tmp_path_factory):
     out = tmp_path_factory.mktemp("run")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(checkpoint_module, "load_head", lambda spec: ellipsoid_head())
-        source = EllipsoidSource(subjects=3, expressions=3, size=32)
-        train(source, ellipsoid_head(), out, tiny_config())
-        return load_checkpoint(out / "checkpoint.pt")
+    source = EllipsoidSource(subjects=3, expressions=3, size=32)
+    train(source, ellipsoid_head(), out, tiny_config())
+    return load_checkpoint(out / "checkpoint.pt")
 
 
 def test_transfer_takes_all_of_the_expression_and_none_of_the_identity(loaded):
@@ -49,11 +46,16 @@ def test_transfer_takes_all_of_the_expression_and_none_of_the_identity(loaded):
 
 def test_blending_meets_both_ends(loaded):
     a, b = trained_head(loaded, "S000", "e0"), trained_head(loaded, "S001", "e2")
+    b = controlled(loaded, b, {"jaw.0": (0.4,), "shape.1": (2.0,)})
     for t, end in ((0.0, a), (1.0, b)):
         got = between(a, b, t)
-        torch.testing.assert_close(got.z_id, end.z_id)
-        torch.testing.assert_close(got.z_exp, end.z_exp)
-        np.testing.assert_allclose(got.tracked.expression, end.tracked.expression)
+        torch.testing.assert_close((got.z_id, got.z_exp), (end.z_id, end.z_exp))
+        for name in ("shape", "expression", "neck", "jaw", "eyes"):
+            expected = getattr(end.tracked, name)
+            np.testing.assert_allclose(getattr(got.tracked, name), expected, atol=1e-7)
+    third = between(a, b, 0.3)
+    assert third.tracked.jaw[0] == pytest.approx(0.12)
+    torch.testing.assert_close(third.z_id, 0.7 * a.z_id + 0.3 * b.z_id)
 
 
 @pytest.mark.parametrize(
@@ -133,15 +135,17 @@ def test_sampled_expressions_stay_within_training_and_keep_the_person(loaded):
     assert all(one.z_id is head.z_id for one in drawn)
 
 
-def test_orbit_upwards_keeps_distance_and_sees_from_above(loaded):
+def test_orbit_keeps_its_distance_and_sees_from_above(loaded):
     view, centre = frontal(loaded), loaded.model.head_centre.double()
-    up = orbit(view, 0, centre, pitch=30)
+    up, turned = orbit(view, 0, centre, pitch=30), orbit(view, 90, centre)
+    torch.testing.assert_close(orbit(turned, -90, centre).cam_from_head, view.cam_from_head)
 
     def eye(v):
         return -v.cam_from_head[:3, :3].T @ v.cam_from_head[:3, 3] - centre
 
     assert float(eye(up)[1]) > float(eye(view)[1]) + 0.1
     torch.testing.assert_close(eye(up).norm(), eye(view).norm())
+    torch.testing.assert_close(eye(turned).norm(), eye(view).norm())
     seen = up.cam_from_head[:3, :3] @ centre + up.cam_from_head[:3, 3]
     before = view.cam_from_head[:3, :3] @ centre + view.cam_from_head[:3, 3]
     torch.testing.assert_close(seen, before)

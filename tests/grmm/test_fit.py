@@ -8,20 +8,12 @@ import torch
 from express50.errors import TrainError
 from grmm.checkpoint import load_checkpoint
 from grmm.data import HeadViews
-from grmm.edit import interpolate_tracked, trained_head, transfer
-from grmm.fit import blend, fit, invert_codes, locality_loss, reconstruction, start, tune_decoders
-from grmm.render import (
-    expression_grid,
-    frontal,
-    interpolation,
-    turntable,
-    write_video,
-)
+from grmm.edit import trained_head
+from grmm.fit import fit, invert_codes, locality_loss, reconstruction, start, tune_decoders
+from grmm.render import expression_grid, frontal, interpolation, turntable
 from grmm.train import train
 from grmm.warm_start import spread_change
 from tests.grmm.synthetic import EllipsoidSource, ellipsoid_head, tiny_config
-
-pytestmark = pytest.mark.usefixtures("toy_head")
 
 
 @pytest.fixture(scope="module")
@@ -66,8 +58,7 @@ def test_stage_two_changes_decoders_only(loaded, views):
     changed = {k for k, v in state.model.state_dict().items() if not torch.equal(v, before[k])}
     assert {name.split(".")[0] for name in changed} == {"mesh", "transform", "opacity", "colour"}
     assert torch.equal(state.z_id, z_id)
-    frozen = state.frozen.state_dict()
-    assert all(torch.equal(frozen[k], before[k]) for k in frozen)
+    assert all(torch.equal(v, before[k]) for k, v in loaded.model.state_dict().items())
 
 
 def test_locality_loss_is_zero_until_the_model_is_tuned(loaded, views):
@@ -86,15 +77,6 @@ def test_reconstruction_has_the_perceptual_term_where_weights_are_given(loaded, 
     state.perceptual = lambda image, other: (image - other).abs().sum()
     expected = plain + 0.04 * (0.5 * target).sum()
     torch.testing.assert_close(reconstruction(state, (0.5 * target, target)), expected)
-
-
-def test_blend_weighs_the_subject_by_t(loaded, views):
-    state = start(loaded, views, unseen(views))
-    mine = views.sample(state.given[0]).tracked
-    _, z_id, z_exp = blend(state, ("S001", "e1"), mine, state.z_exp["e0"], 0.3)
-    expected = 0.7 * loaded.model.z_id[1] + 0.3 * state.z_id
-    torch.testing.assert_close(z_id, expected)
-    torch.testing.assert_close(z_exp, 0.7 * loaded.model.z_exp[1] + 0.3 * state.z_exp["e0"])
 
 
 def test_fit_improves_on_the_mean_code_and_reports_both_views(loaded, views, tmp_path):
@@ -147,24 +129,7 @@ def test_views_of_two_subjects_are_refused(loaded, views, tmp_path):
         fit(loaded, views, [0, len(views.keys) - 1], [], tmp_path)
 
 
-def test_interpolated_parameters_meet_both_ends(views):
-    a, b = views.sample(0).tracked, views.sample(3).tracked
-    b = replace(b, jaw=np.array([0.4, 0, 0]), shape=np.array([1.0, 2, 3]))
-    for t, end in ((0.0, a), (1.0, b)):
-        got = interpolate_tracked(a, b, t)
-        for name in ("shape", "expression", "neck", "jaw", "eyes"):
-            np.testing.assert_allclose(getattr(got, name), getattr(end, name), atol=1e-7)
-    assert interpolate_tracked(a, b, 0.3).jaw[0] == pytest.approx(0.12)
-
-
-def test_transfer_keeps_the_identity_and_takes_the_expression(views):
-    a, b = views.sample(0).tracked, views.sample(3).tracked
-    a = replace(a, shape=np.array([1.0, 2, 3]))
-    got = transfer(a, b)
-    assert got.shape is a.shape and got.expression is b.expression
-
-
-def test_turntable_grid_and_interpolation(loaded, tmp_path):
+def test_turntable_grid_and_interpolation(loaded):
     start, end = (trained_head(loaded, *frame) for frame in (("S000", "e0"), ("S001", "e1")))
     view = frontal(loaded)
     frames = list(turntable(loaded, start, view, frames=3))
@@ -175,11 +140,6 @@ def test_turntable_grid_and_interpolation(loaded, tmp_path):
     blend_frames = list(interpolation(loaded, start, end, view, frames=3))
     np.testing.assert_array_equal(blend_frames[0], rows[0][0])
     np.testing.assert_array_equal(blend_frames[2], rows[1][1])
-    write_video(tmp_path / "t.mp4", frames)
-    import av
-
-    with av.open(str(tmp_path / "t.mp4")) as container:
-        assert sum(1 for _ in container.decode(video=0)) == 3
 
 
 def test_unseen_texels_change_like_their_mirror_images():

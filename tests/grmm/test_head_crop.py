@@ -14,8 +14,8 @@ from tests.grmm.synthetic import EllipsoidSource, ellipsoid_head, tiny_config
 
 
 @pytest.fixture(scope="module")
-def views():
-    return HeadViews(EllipsoidSource(size=64), ellipsoid_head())
+def source():
+    return EllipsoidSource(size=64)
 
 
 @pytest.fixture(scope="module")

@@ -9,8 +9,6 @@ from grmm.train import train
 from grmm.train_state import with_map_size
 from tests.grmm.synthetic import EllipsoidSource, ellipsoid_head, tiny_config
 
-pytestmark = pytest.mark.usefixtures("toy_head")
-
 
 @pytest.mark.parametrize(("size", "ladder"), [(32, (8, 8)), (160, (8, 8)), (160, (8,))])
 def test_map_follows_the_pixels_of_the_head(size, ladder):
@@ -29,6 +27,6 @@ def test_a_chosen_map_is_kept_in_the_checkpoint(tmp_path, source):
     train(source, ellipsoid_head(), tmp_path, config, resume=True)
 
 
-def test_a_given_map_is_left_alone(source):
+def test_a_given_map_is_left_alone(views):
     config = tiny_config()
-    assert with_map_size(config, HeadViews(source, ellipsoid_head())) is config
+    assert with_map_size(config, views) is config

@@ -3,6 +3,7 @@ import threading
 import urllib.error
 import urllib.request
 from collections import Counter
+from itertools import product
 
 import numpy as np
 import pytest
@@ -36,14 +37,14 @@ def folders(tmp_path):
     return made
 
 
+def made_in(out, folders):
+    methods = (("Ours", folders["ours"]), ("MD", folders["theirs"]))
+    return make_study(out, folders["reference"], methods, examples=6, participants=4)
+
+
 @pytest.fixture
 def study(folders, tmp_path):
-    methods = (
-        ("Ours", folders["ours"]),
-        ("MD", folders["theirs"]),
-    )
-    made = make_study(tmp_path / "s", folders["reference"], methods, examples=6, participants=4)
-    return tmp_path / "s", made
+    return tmp_path / "s", made_in(tmp_path / "s", folders)
 
 
 def test_sides_are_counterbalanced_over_examples_and_participants(study):
@@ -69,29 +70,16 @@ def test_what_a_participant_sees_names_no_method(study):
 
 
 def test_the_same_seed_makes_the_same_study(study, folders, tmp_path):
-    _, made = study
-    methods = (
-        ("Ours", folders["ours"]),
-        ("MD", folders["theirs"]),
-    )
-    again = make_study(tmp_path / "t", folders["reference"], methods, examples=6, participants=4)
-    assert again == made
+    assert made_in(tmp_path / "t", folders) == study[1]
 
 
 def answer_all(folder, made, choose):
-    for participant in range(made["participants"]):
-        for example in range(len(made["examples"])):
-            for question in made["questions"]:
-                ours = "A" if method_of(made, participant, example, "A") == "Ours" else "B"
-                append_answer(
-                    folder,
-                    {
-                        "participant": participant,
-                        "example": example,
-                        "question": question,
-                        "answer": choose(participant, example, question, ours),
-                    },
-                )
+    people, examples = range(made["participants"]), range(len(made["examples"]))
+    for participant, example, question in product(people, examples, made["questions"]):
+        ours = "A" if method_of(made, participant, example, "A") == "Ours" else "B"
+        answer = choose(participant, example, question, ours)
+        ids = {"participant": participant, "example": example, "question": question}
+        append_answer(folder, ids | {"answer": answer})
 
 
 def test_table_turns_sides_back_into_methods(study):
@@ -213,10 +201,7 @@ def test_commands_make_and_table(folders, tmp_path, capsys):
 
 
 def test_too_few_common_pictures_are_said(folders, tmp_path):
-    methods = (
-        ("a", folders["ours"]),
-        ("b", folders["theirs"]),
-    )
+    methods = (("a", folders["ours"]), ("b", folders["theirs"]))
     with pytest.raises(ConfigError, match="7 pictures"):
         make_study(tmp_path / "x", folders["reference"], methods, examples=8)
     with pytest.raises(ConfigError, match="no such folder"):

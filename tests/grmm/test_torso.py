@@ -5,6 +5,7 @@ import pytest
 import torch
 
 from express50.contract.segmentation_labels import TORSO
+from grmm.config import DataConfig
 from grmm.data import HeadViews
 from grmm.evaluate import evaluate
 from grmm.head_crop import torso_mask
@@ -12,6 +13,8 @@ from grmm.model import PinholeView
 from grmm.train import objective
 from grmm.train_state import prepare
 from tests.grmm.synthetic import EllipsoidSource, ellipsoid_head, tiny_config
+
+KEEP = DataConfig(torso="keep")
 
 
 def collared_head():
@@ -87,7 +90,7 @@ def test_torso_neither_teaches_nor_counts():
     terms, again = (objective(run, rendering, i, config) for i in (item, spoiled))
     assert float(terms["rgb"]) == pytest.approx(float(again["rgb"]), abs=2e-3)  # SSIM's window
     assert float(terms["depth"]) == float(again["depth"])
-    kept = HeadViews(Dressed(size=64), collared_head(), torso="keep")
+    kept = HeadViews(Dressed(size=64), collared_head(), KEEP)
     assert kept.item(0).counts.all()
 
     def render(item):
@@ -113,4 +116,4 @@ def test_labels_of_parts_go_before_distances():
     item = HeadViews(Labelled(size=64), collared_head()).item(0)
     assert not item.counts[:34].any() and item.counts[36:].all()
     assert not item.depth_valid[:34].any() and not item.mask[:34].any()
-    assert HeadViews(Labelled(size=64), collared_head(), torso="keep").item(0).counts.all()
+    assert HeadViews(Labelled(size=64), collared_head(), KEEP).item(0).counts.all()

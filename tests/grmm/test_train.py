@@ -14,8 +14,6 @@ from grmm.train_state import budget_used, prepare, set_rates, split_samples
 from grmm.warm_start import fill_texels, project_texture, warm_start
 from tests.grmm.synthetic import EllipsoidSource, ellipsoid_head, tiny_config
 
-pytestmark = pytest.mark.usefixtures("toy_head")
-
 
 def state_of(path):
     return torch.load(path / "checkpoint.pt", weights_only=True)
@@ -115,9 +113,9 @@ def test_interrupt_leaves_a_checkpoint_to_resume(tmp_path, source, monkeypatch):
     assert train(source, ellipsoid_head(), tmp_path, config, resume=True)["iterations"] == 5
 
 
-def test_rates_fall_along_a_cosine(source):
+def test_rates_fall_along_a_cosine(views):
     config = tiny_config(train={"iterations": 10, "lr": 1.0, "final_lr": 0.1, "code_lr_scale": 3.0})
-    run = prepare(HeadViews(source, ellipsoid_head()), config)
+    run = prepare(views, config)
     rates = []
     for run.iteration in (0, 5, 10):
         set_rates(run, config)
@@ -127,8 +125,7 @@ def test_rates_fall_along_a_cosine(source):
     assert budget_used(run, config) == 1
 
 
-def test_warm_start_shows_the_subjects_before_the_first_step(source):
-    views = HeadViews(source, ellipsoid_head())
+def test_warm_start_shows_the_subjects_before_the_first_step(views):
     config = tiny_config()
     run = prepare(views, config)
     cold = summarise(evaluate(views, run.training, training_render(run.model, views)))
@@ -179,8 +176,7 @@ def test_objective_that_is_not_finite_stops_with_the_sample_named(source, tmp_pa
         train(Poisoned(size=32), ellipsoid_head(), tmp_path, tiny_config())
 
 
-def test_evaluation_is_written_as_table_and_means(tmp_path, source):
-    views = HeadViews(source, ellipsoid_head())
+def test_evaluation_is_written_as_table_and_means(tmp_path, views):
     run = prepare(views, tiny_config())
     rows = evaluate(views, [0, 4], training_render(run.model, views))
     summary = write_evaluation(tmp_path, rows)
@@ -238,8 +234,7 @@ def test_held_out_expressions_are_not_trained_on():
         split_samples(keys, wrong)
 
 
-def test_a_rendering_with_nan_is_refused_not_passed_over(source):
-    views = HeadViews(source, ellipsoid_head())
+def test_a_rendering_with_nan_is_refused_not_passed_over(views):
     render = training_render(prepare(views, tiny_config()).model, views)
 
     def damaged(item):

@@ -1,12 +1,12 @@
 import shutil
 import subprocess
 import threading
+from contextlib import contextmanager
 
 import numpy as np
 import pytest
 import torch
 
-from grmm import checkpoint as checkpoint_module
 from grmm.checkpoint import load_checkpoint
 from grmm.edit import controlled, trained_head
 from grmm.render import frontal, orbit, picture
@@ -19,10 +19,8 @@ from tests.grmm.synthetic import EllipsoidSource, ellipsoid_head, tiny_config
 @pytest.fixture(scope="module")
 def loaded(tmp_path_factory):
     out = tmp_path_factory.mktemp("run")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(checkpoint_module, "load_head", lambda spec: ellipsoid_head())
-        train(EllipsoidSource(size=32), ellipsoid_head(), out, tiny_config())
-        result = load_checkpoint(out / "checkpoint.pt")
+    train(EllipsoidSource(size=32), ellipsoid_head(), out, tiny_config())
+    result = load_checkpoint(out / "checkpoint.pt")
     generator = torch.Generator().manual_seed(0)
     with torch.no_grad():  # codes that show in pictures
         result.model.z_id += torch.randn(result.model.z_id.shape, generator=generator)
@@ -77,11 +75,21 @@ def test_opacity_is_decoded_once_a_person(loaded, monkeypatch):
     assert len(calls) == 3
 
 
-def test_a_slider_moved_in_a_browser_changes_the_picture(loaded):
-    viewer = Viewer(loaded, port=18200, moving=48, still=64)
+@contextmanager
+def served(viewer):
+    """A viewer that draws in a thread, and stops when it is told to."""
     thread = threading.Thread(target=viewer.run)
     thread.start()
     try:
+        yield viewer
+    finally:
+        viewer.stop()
+        thread.join(timeout=10)
+    assert not thread.is_alive()
+
+
+def test_a_slider_moved_in_a_browser_changes_the_picture(loaded):
+    with served(Viewer(loaded, "127.0.0.1", 18200, moving=48, still=64)) as viewer:
         browser = Browser(viewer.port)
         eye = np.array([0.0, 0.05, 0.7])
         browser.look(eye)
@@ -97,10 +105,6 @@ def test_a_slider_moved_in_a_browser_changes_the_picture(loaded):
         browser.move("subject", "S001")
         assert np.abs(browser.settle(64) - side).max() > 20
         browser.close()
-    finally:
-        viewer.stop()
-        thread.join(timeout=10)
-    assert not thread.is_alive()
 
 
 def test_a_browser_shows_the_controls(loaded, tmp_path):
@@ -108,20 +112,14 @@ def test_a_browser_shows_the_controls(loaded, tmp_path):
     browser = shutil.which("chromium") or shutil.which("chromium-browser")
     if browser is None:
         pytest.skip("chromium is not installed")
-    viewer = Viewer(loaded, port=8330, moving=32, still=32)
-    thread = threading.Thread(target=viewer.run)
-    thread.start()
     command = [
         browser, "--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={tmp_path}",
         "--timeout=8000", "--virtual-time-budget=8000", "--dump-dom",
-        f"http://127.0.0.1:{viewer.port}",
     ]  # fmt: skip
-    try:
+    with served(Viewer(loaded, "127.0.0.1", 8330, moving=32, still=32)) as viewer:
+        command.append(f"http://127.0.0.1:{viewer.port}")
         for _ in range(3):  # a busy machine may not answer in the browser's time
             page = subprocess.run(command, capture_output=True, text=True, timeout=90, check=False)
             if "jaw open" in page.stdout:
                 break
-    finally:
-        viewer.stop()
-        thread.join()
     assert "jaw open" in page.stdout

@@ -4,7 +4,6 @@ import pytest
 import torch
 
 from express50.errors import ConfigError, FormatError
-from grmm import checkpoint as checkpoint_module
 from grmm.checkpoint import load_checkpoint, read_content
 from grmm.edit import trained_head
 from grmm.train import train
@@ -13,8 +12,7 @@ from tests.grmm.synthetic import EllipsoidSource, ellipsoid_head, tiny_config
 
 
 @pytest.fixture
-def trained(tmp_path, monkeypatch):
-    monkeypatch.setattr(checkpoint_module, "load_head", lambda spec: ellipsoid_head())
+def trained(tmp_path):
     source, config = EllipsoidSource(size=32), tiny_config(train={"iterations": 1})
     train(source, ellipsoid_head(), tmp_path, config)
     return tmp_path / "checkpoint.pt", source, config
