@@ -76,21 +76,27 @@ class Network:
         return _error(self.path, self.role, why)
 
 
-def load_network(path: Path, role: Role) -> Network:
+def load_network(path: str | Path, role: Role) -> Network:
     """Load a network, or take it from those that this process loaded before.
 
     Raises:
         ConfigError: the file is missing.
         StageError: it is not such a network, or onnxruntime is not installed.
     """
-    check_file(path, role.setting)
+    path = weights_file(path, role.setting)
     return _onnx(path, role) if path.suffix.lower() == ".onnx" else _torchscript(path, role)
 
 
-def check_file(path: Path, setting: str) -> None:
-    """Raise ConfigError if the file of weights is missing."""
+def weights_file(path: str | Path, setting: str) -> Path:
+    """Return the path of the file of weights that a setting names.
+
+    Raises:
+        ConfigError: the file is missing.
+    """
+    path = Path(path).expanduser()
     if not path.is_file():
         raise ConfigError(f"{setting} {path}: no such file; expected TorchScript or .onnx")
+    return path
 
 
 def _error(path: Path, role: Role, why: str) -> StageError:

@@ -28,15 +28,15 @@ def public_meta(meta: Mapping) -> dict:
     return {key: value for key, value in meta.items() if key in PUBLIC_KEYS}
 
 
-def shown_counts(counts: Mapping[str, int], least: int = LEAST_PEOPLE) -> dict[str, int]:
-    """Keep counts of ``least`` people or more; smaller groups are counted among the others.
+def shown_counts(counts: Mapping[str, int]) -> dict[str, int]:
+    """Keep counts of LEAST_PEOPLE or more; smaller groups are counted among the others.
 
     The smallest groups join the others until these are enough too: a single small one could be
     inferred from the total. Empty where there are too few people at all, or only one group.
     """
     left = sorted((n, name) for name, n in counts.items() if name != "not given")
     others = counts.get("not given", 0)
-    while left and (left[0][0] < least or 0 < others < least):
+    while left and (left[0][0] < LEAST_PEOPLE or 0 < others < LEAST_PEOPLE):
         others += left.pop(0)[0]
     if not left:
         return {}

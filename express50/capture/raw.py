@@ -94,7 +94,6 @@ def read_capture(root: Path) -> RawCapture:
         CaptureError: a file is missing or malformed so that the whole capture is unusable.
         CalibrationError: calibration.json is there but malformed.
     """
-    root = Path(root)
     meta = read_meta(root)
     cameras, dropped = _read_cameras(root)
     given = root / "calibration.json"
@@ -129,24 +128,26 @@ def read_meta(root: Path) -> dict:
     Raises:
         CaptureError: no such folder or file, not TOML, or a field is missing or out of range.
     """
-    path = Path(root) / "capture.toml"
+    path = root / "capture.toml"
     if not path.is_file():
-        what = "no such folder" if not Path(root).is_dir() else "has no capture.toml"
+        what = "no such folder" if not root.is_dir() else "has no capture.toml"
         raise CaptureError(
             f"{root}: {what}; expected a capture folder whose capture.toml says subject and fps"
         )
-    meta = read_capture_toml(path)
+    meta = read_capture_toml(root)
     check_identity(path, meta.get("subject"), meta.get("fps"))
     return meta
 
 
-def read_capture_toml(path: Path) -> dict:
-    """Read a capture.toml, dates as text, without a check of its content.
+def read_capture_toml(root: Path) -> dict:
+    """Read a capture.toml, dates as text, without a check of its content; empty without one.
 
     Raises:
         CaptureError: it cannot be read or is not TOML.
     """
-    return {key: plain(value) for key, value in read_toml(path, CaptureError).items()}
+    path = root / "capture.toml"
+    table = read_toml(path, CaptureError) if path.is_file() else {}
+    return {key: plain(value) for key, value in table.items()}
 
 
 def check_identity(path: Path, subject: object, fps: object) -> None:

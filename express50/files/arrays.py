@@ -10,7 +10,6 @@ anything is called. Torch's own files are read with ``weights_only``.
 
 from __future__ import annotations
 
-import codecs
 import io
 import math
 import pickle
@@ -176,10 +175,6 @@ class ColumnMatrix(SparseMatrix):
     compression = "csc_array"
 
 
-class StorageType(Record):
-    """Stands for a torch storage type."""
-
-
 class ArrayType(Record):
     """Stands for numpy.ndarray, which, called by a pickle, would make arrays of any size."""
 
@@ -195,7 +190,7 @@ def _encode(text: object, encoding: object = "latin1") -> bytes:
     """Do what _codecs.encode does for the byte strings of protocol 2."""
     if not isinstance(text, str) or encoding not in ("latin1", "latin-1"):
         raise pickle.UnpicklingError("_codecs.encode of something other than latin-1 text")
-    return codecs.latin_1_encode(text)[0]
+    return text.encode("latin-1")
 
 
 def _reconstruct_array(kind: object, shape: object, code: object) -> np.ndarray:
@@ -303,7 +298,7 @@ class SafeUnpickler(pickle.Unpickler):
         if module.startswith("scipy.sparse") and name in ("csr_matrix", "csr_array"):
             return SparseMatrix
         if module == "torch" and name in _STORAGE_DTYPES:
-            return type(name, (StorageType,), {})
+            return type(name, (Record,), {})
         raise pickle.UnpicklingError(f"it names {module}.{name}, which is not on the allow list")
 
     def persistent_load(self, pid: object) -> np.ndarray:

@@ -42,7 +42,9 @@ def to_srgb(image: np.ndarray, kind: type = np.uint8) -> np.ndarray:
     Raises:
         ValueError: the image holds NaN or infinity.
     """
-    image = _three_channels(image)
+    image = image[..., None] if image.ndim == 2 else image
+    # Grey is repeated, alpha is dropped.
+    image = np.repeat(image[..., :1], 3, axis=2) if image.shape[2] < 3 else image[..., :3]
     if image.dtype.kind == "f":
         if not np.isfinite(image).all():
             raise ValueError("image holds NaN or infinity")
@@ -50,13 +52,6 @@ def to_srgb(image: np.ndarray, kind: type = np.uint8) -> np.ndarray:
     elif image.dtype == np.uint16 and kind is np.uint8:
         image = np.rint(image / 257.0)
     return np.ascontiguousarray(image.astype(kind))
-
-
-def _three_channels(image: np.ndarray) -> np.ndarray:
-    """Repeat grey, and drop alpha."""
-    if image.ndim == 2:
-        image = image[..., None]
-    return np.repeat(image[..., :1], 3, axis=2) if image.shape[2] < 3 else image[..., :3]
 
 
 def inside(root: Path, name: str) -> Path:
@@ -87,7 +82,7 @@ def read_picture(root: Path, name: str, orientation: int = 1) -> np.ndarray:
         raise CaptureError(f"{root / name}: {error}; export it again") from error
 
 
-def read_samples(root: Path, name: str, orientation: int = 1) -> np.ndarray:
+def read_samples(root: Path, name: str, orientation: int) -> np.ndarray:
     """Read an image (H, W[, C]) by its name, turned upright, in the file's own sample type.
 
     Raises:
@@ -136,7 +131,7 @@ def member_bytes(path: Path, member: str) -> bytes:
     """
     where = f"{path}{WITHIN}{member}"
     if path.suffix.lower() != ".zip":
-        array = read_array(open_hdf5(path), member, f"{path}")
+        array = read_array(open_hdf5(path), member)
         if array.dtype != np.uint8 or array.ndim != 1:
             raise CaptureError(
                 f"{where}: {array.dtype} of shape {array.shape}, expected encoded bytes (uint8, one"
@@ -191,7 +186,7 @@ def open_hdf5(path: Path) -> h5py.File:
 _hdf5_of = cached_by_file(OPEN_FILES)(h5py.File)
 
 
-def child(file: h5py.File, name: str, where: str) -> Any:
+def child(file: h5py.File, name: str) -> Any:
     """Return the group or dataset at a path in an HDF5 file, or None.
 
     Links are refused: an external one reads any file of the machine.
@@ -200,44 +195,46 @@ def child(file: h5py.File, name: str, where: str) -> Any:
         CaptureError: a part of the path is a link, or the file is damaged.
     """
     node: Any = file
-    with _damage_is_one_error(DAMAGE, f"{where}: {name} is damaged"):
+    with _damage_is_one_error(DAMAGE, f"{file.filename}: {name} is damaged"):
         for part in name.split("/"):
             link = node.get(part, getlink=True) if isinstance(node, h5py.Group) else None
             if link is None:
                 return None
             if not isinstance(link, h5py.HardLink):
-                raise CaptureError(f"{where}: {name} is a link, expected data in the file itself")
+                raise CaptureError(
+                    f"{file.filename}: {name} is a link, expected data in the file itself"
+                )
             node = node[part]
     return node
 
 
-def members(group: h5py.Group, where: str) -> list[str]:
+def members(group: h5py.Group) -> list[str]:
     """List the names in a group of an HDF5 file.
 
     Raises:
         CaptureError: the file is damaged.
     """
-    with _damage_is_one_error(DAMAGE, f"{where}: a group is damaged"):
+    with _damage_is_one_error(DAMAGE, f"{group.file.filename}: a group is damaged"):
         return [str(name) for name in group]
 
 
-def attribute(group: h5py.Group, name: str, default: object, where: str) -> np.ndarray:
+def attribute(group: h5py.Group, name: str, default: object) -> np.ndarray:
     """Read an attribute of a group, or its default, as a flat array.
 
     Raises:
         CaptureError: the file is damaged.
     """
-    with _damage_is_one_error(DAMAGE, f"{where}: attribute {name} is damaged"):
+    with _damage_is_one_error(DAMAGE, f"{group.file.filename}: attribute {name} is damaged"):
         return np.ravel(np.asarray(group.attrs.get(name, default)))
 
 
-def read_array(file: h5py.File, name: str, where: str) -> np.ndarray:
+def read_array(file: h5py.File, name: str) -> np.ndarray:
     """Read a dataset's array after checking its type and size.
 
     Raises:
         CaptureError: it is missing, not plain numbers, too large, or lies in another file.
     """
-    node = child(file, name, where)
+    node, where = child(file, name), file.filename
     if not isinstance(node, h5py.Dataset):
         raise CaptureError(f"{where}: has no array {name}; copy the file again")
     with _damage_is_one_error(DAMAGE, f"{where}: {name} is damaged"):

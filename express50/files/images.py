@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import mmap
 import struct
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import cv2
@@ -313,6 +313,15 @@ def resize_area(image: np.ndarray, width: int, height: int) -> np.ndarray:
     return cv2.resize(np.ascontiguousarray(image), (width, height), interpolation=mode)
 
 
+def shrink(image: np.ndarray, side: int) -> np.ndarray:
+    """Average an image (H, W[, C]) down to at most ``side`` pixels on its longer side."""
+    scale = side / max(image.shape[:2])
+    if scale >= 1:
+        return image
+    height, width = (max(1, round(n * scale)) for n in image.shape[:2])
+    return resize_area(image, width, height)
+
+
 def edge_distance(mask: np.ndarray) -> np.ndarray:
     """Measure the distance (H, W) float32 of each pixel of a mask (H, W) to the nearest outside it.
 
@@ -357,3 +366,11 @@ def contact_sheet(
             cv2.putText(line, labels[number], (5, 14), *_LABEL)
         lines.append(line)
     return np.concatenate(lines, axis=0) if lines else blank
+
+
+def tile_sheet(pictures: Mapping[str, np.ndarray], columns: int, side: int) -> np.ndarray:
+    """Lay out named pictures in rows of square tiles, each row with its names as the label."""
+    names = list(pictures)
+    rows = [names[k : k + columns] for k in range(0, len(names), columns)]
+    tiles = [[pictures[name] for name in row] for row in rows]
+    return contact_sheet(tiles, ["  ".join(row) for row in rows], (side, side))

@@ -105,21 +105,13 @@ def read_toml(path: Path, kind: Kind) -> dict[str, Any]:
         Express50Error: as `read_text`, or it is not TOML, nested too deeply, or holds a number that
             is NaN or infinite.
     """
-    return parse_toml(read_text(path, kind, TOML_LIMIT, "correct it"), str(path), kind)
-
-
-def parse_toml(text: str, where: str, kind: Kind) -> dict[str, Any]:
-    """Parse TOML text.
-
-    Raises:
-        Express50Error: as `read_toml`.
-    """
+    text = read_text(path, kind, TOML_LIMIT, "correct it")
     try:
         return tomllib.loads(text, parse_float=_finite)
     except NotFiniteError as error:
-        raise kind(f"{where}: {error.located(text)}; correct it") from None
+        raise kind(f"{path}: {error.located(text)}; correct it") from None
     except (ValueError, RecursionError) as error:
-        raise kind(f"{where}: not TOML: {reason(error)}; correct it") from None
+        raise kind(f"{path}: not TOML: {reason(error)}; correct it") from None
 
 
 def reason(error: BaseException) -> str:

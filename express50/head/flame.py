@@ -2,7 +2,7 @@
 
 Four files in one folder: the model pickle, a landmark embedding, FLAME_masks.pkl and the template
 OBJ that carries the texture map. File layouts are as published loaders describe them; nothing in
-the files is executed (`safe_pickle.py`). Vertex and face counts are taken from the file. Teeth and
+the files is executed (`files/arrays.py`). Vertex and face counts are taken from the file. Teeth and
 the inside of the mouth, which FLAME lacks, are added (`mouth.py`).
 """
 
@@ -17,7 +17,7 @@ import torch
 
 from express50.errors import HeadModelError
 from express50.files.arrays import read_object_array, read_pickle, to_array
-from express50.head.ict import read_obj
+from express50.head.ict import read_obj, tensor
 from express50.head.model import PARENTS, REGIONS, HeadModel, check_head
 from express50.head.mouth import FLAME_VERTICES, add_mouth
 
@@ -56,10 +56,6 @@ def read_flame(path: Path) -> HeadModel:
     vertices, _, directions = arrays["shapedirs"].shape
     # Identity has 300 of 400 components in the published files, else three quarters.
     shapes = 300 if directions > 300 else (3 * directions) // 4
-
-    def tensor(array: np.ndarray) -> torch.Tensor:
-        return torch.from_numpy(np.ascontiguousarray(array, dtype=np.float32))
-
     return check_head(
         HeadModel(
             name=f"flame-{hashlib.sha256(path.read_bytes()).hexdigest()[:12]}",

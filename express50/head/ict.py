@@ -199,10 +199,6 @@ def build_ict_head(arrays: IctArrays) -> HeadModel:
     faces = arrays.faces[shown]
     # A landmark is a corner of the first face that has its vertex.
     face, corner = np.array([np.argwhere(faces == vertex)[0] for vertex in LANDMARKS]).T
-
-    def tensor(array: np.ndarray) -> torch.Tensor:
-        return torch.from_numpy(np.ascontiguousarray(array, dtype=np.float32))
-
     return HeadModel(
         name="ict",
         template=tensor(template),
@@ -220,6 +216,11 @@ def build_ict_head(arrays: IctArrays) -> HeadModel:
         expression_names=arrays.expression_names,
         regions={name: torch.from_numpy(mask) for name, mask in regions.items()},
     )
+
+
+def tensor(array: np.ndarray) -> torch.Tensor:
+    """Return an array as a float32 tensor."""
+    return torch.from_numpy(np.ascontiguousarray(array, dtype=np.float32))
 
 
 def _offsets(files: list[Path], template: np.ndarray) -> np.ndarray:

@@ -265,8 +265,12 @@ def place_charts(
     Raises:
         HeadModelError: a chart does not fit even at LEAST of its size.
     """
-    taken = covered_cells(uv, uv_faces, GRID)
-    taken = cv2.dilate(taken.astype(np.uint8), np.ones((2 * GUTTER + 1,) * 2, np.uint8)) > 0
+    # Cells that triangles cover or touch; the first row is at v = 1.
+    cells = np.zeros((GRID, GRID), np.uint8)
+    places = np.stack([uv[:, 0], 1 - uv[:, 1]], -1) * GRID
+    for triangle in np.floor(places).clip(0, GRID - 1).astype(np.int32)[uv_faces]:
+        cv2.fillConvexPoly(cells, triangle, 1)
+    taken = cv2.dilate(cells, np.ones((2 * GUTTER + 1,) * 2, np.uint8)) > 0
     taken[:GUTTER] = taken[-GUTTER:] = taken[:, :GUTTER] = taken[:, -GUTTER:] = True
     found = []
     for width, height in sizes:
@@ -283,16 +287,6 @@ def place_charts(
         bottom, top = GRID - row - rows, GRID - row
         found.append(np.array([column, bottom, column + columns, top]) / GRID)
     return tuple(found)
-
-
-def covered_cells(uv: np.ndarray, uv_faces: np.ndarray, size: int) -> np.ndarray:
-    """Return cells (size, size), bool, first row at v = 1, that triangles cover or touch."""
-    cells = np.zeros((size, size), np.uint8)
-    places = np.stack([uv[:, 0], 1 - uv[:, 1]], -1) * size
-    corners = np.floor(places).clip(0, size - 1).astype(np.int32)[uv_faces]
-    for triangle in corners:
-        cv2.fillConvexPoly(cells, triangle, 1)
-    return cells > 0
 
 
 def _first_free(taken: np.ndarray, width: float, height: float) -> tuple[int, int, int, int] | None:

@@ -72,25 +72,20 @@ def names_from_files(files: Sequence[str]) -> list[str]:
     return [re.sub(r"[^\w.+-]+", "_", name).strip("_.+-") for name in names]
 
 
-def at_size(cameras: dict[str, Camera], size: tuple[int, int] | None) -> dict[str, Camera]:
-    """Return the cameras with K scaled to the footage's size (width, height); None leaves them.
+def at_size(camera: Camera, size: tuple[int, int]) -> Camera:
+    """Return the camera with K scaled to the footage's size (width, height).
 
     Raises:
         CalibrationError: the aspect ratio is another, so that a crop and not a scale is missing.
     """
-    if size is None:
-        return cameras
-    found = {}
-    for name, camera in cameras.items():
-        sx, sy = size[0] / camera.width, size[1] / camera.height
-        if abs(sx / sy - 1) > 0.01:
-            raise CalibrationError(
-                f"camera {name}: calibrated at {camera.width}x{camera.height}, footage of"
-                f" {size[0]}x{size[1]} has another shape; expected the same aspect ratio: was the"
-                " footage cropped or turned?"
-            )
-        found[name] = resized(camera, *size)
-    return found
+    sx, sy = size[0] / camera.width, size[1] / camera.height
+    if abs(sx / sy - 1) > 0.01:
+        raise CalibrationError(
+            f"camera {camera.id}: calibrated at {camera.width}x{camera.height}, footage of"
+            f" {size[0]}x{size[1]} has another shape; expected the same aspect ratio: was the"
+            " footage cropped or turned?"
+        )
+    return resized(camera, *size)
 
 
 def in_metres(cameras: dict[str, Camera], metres_per_unit: float) -> dict[str, Camera]:
@@ -107,6 +102,21 @@ def in_metres(cameras: dict[str, Camera], metres_per_unit: float) -> dict[str, C
         pose[:3, 3] *= metres_per_unit
         found[name] = replace(camera, cam_from_world=pose)
     return found
+
+
+def finite_array(value: object, shape: tuple[int, ...], what: str) -> np.ndarray:
+    """Return a value as a float array of a shape.
+
+    Raises:
+        CalibrationError: it is not that; the message begins with ``what``.
+    """
+    try:
+        array = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError):
+        array = np.zeros(0)
+    if array.shape != shape or not np.isfinite(array).all():
+        raise CalibrationError(f"{what} of shape {array.shape}, expected {shape}, finite")
+    return array
 
 
 def checked(cameras: dict[str, Camera], path: Path) -> dict[str, Camera]:

@@ -27,7 +27,14 @@ from express50.files.text import TOML_LIMIT, read_json_table, read_text, reason
 from express50.geometry.cameras import Camera
 from express50.geometry.conventions import K_from_opencv
 from express50.geometry.transforms import axis_angle_to_matrix, make_transform
-from express50.rigs.camera_builder import at_size, camera_from_K, checked, holds, in_metres
+from express50.rigs.camera_builder import (
+    at_size,
+    camera_from_K,
+    checked,
+    finite_array,
+    holds,
+    in_metres,
+)
 from express50.rigs.colmap import is_colmap, read_colmap_images
 from express50.rigs.transforms_json import is_transforms, read_transforms
 
@@ -94,7 +101,9 @@ def read_rig(
         "renderme360": read_renderme,
     }
     found = readers[kind or guess_format(path)](path)
-    return in_metres(at_size(found, size), metres_per_unit)
+    if size is not None:
+        found = {name: at_size(camera, size) for name, camera in found.items()}
+    return in_metres(found, metres_per_unit)
 
 
 def read_opencv_yaml(path: Path, size: tuple[int, int] | None) -> dict[str, Camera]:
@@ -226,7 +235,8 @@ def read_nersemble(path: Path) -> dict[str, Camera]:
     found = {}
     for serial, pose in poses.items():
         own = intrinsics.get(serial) if isinstance(intrinsics, dict) else intrinsics
-        K, matrix = _array(path, serial, own, (3, 3)), _array(path, serial, pose, (4, 4))
+        what = f"{path}: camera {serial} has an array"
+        K, matrix = finite_array(own, (3, 3), what), finite_array(pose, (4, 4), what)
         found[serial] = camera_from_K(serial, K_from_opencv(K), [], NERSEMBLE_SIZE, matrix)
     return checked(found, path)
 
@@ -239,7 +249,7 @@ def read_renderme(path: Path) -> dict[str, Camera]:
     """
     try:
         file = open_hdf5(path)
-        group = child(file, "Calibration", str(path))
+        group = child(file, "Calibration")
         if not isinstance(group, h5py.Group):
             raise CalibrationError(
                 f"{path}: has no Calibration; expected it in the anno file of the same performance"
@@ -247,14 +257,15 @@ def read_renderme(path: Path) -> dict[str, Camera]:
             )
         size = _smc_size(path, file)
         found = {}
-        for name in members(group, str(path)):
+        for name in members(group):
             if not name.isdecimal() or len(name) > 4:
                 raise CalibrationError(f"{path}: camera {name!r}, expected a number such as 07")
             rows = {key: f"Calibration/{name}/{key}" for key in ("K", "RT", "D")}
-            K = _array(path, name, read_array(file, rows["K"], str(path)), (3, 3))
-            pose = _array(path, name, read_array(file, rows["RT"], str(path)), (4, 4))
-            has_dist = child(file, rows["D"], str(path)) is not None
-            dist = np.ravel(read_array(file, rows["D"], str(path))) if has_dist else np.zeros(0)
+            what = f"{path}: camera {name} has an array"
+            K = finite_array(read_array(file, rows["K"]), (3, 3), what)
+            pose = finite_array(read_array(file, rows["RT"]), (4, 4), what)
+            has_dist = child(file, rows["D"]) is not None
+            dist = np.ravel(read_array(file, rows["D"])) if has_dist else np.zeros(0)
             if np.linalg.matrix_rank(pose) < 4:
                 raise CalibrationError(f"{path}: RT of camera {name} cannot be inverted")
             camera_id = f"cam{int(name):02d}"
@@ -268,22 +279,10 @@ def read_renderme(path: Path) -> dict[str, Camera]:
 
 def _smc_size(path: Path, file: h5py.File) -> tuple[int, int]:
     """Read width and height, which are stored the other way round; else the release's own."""
-    group = child(file, "Camera", str(path))
+    group = child(file, "Camera")
     size = np.array((2048, 2448))
     if isinstance(group, h5py.Group):
-        size = attribute(group, "resolution", size, str(path))
+        size = attribute(group, "resolution", size)
     if size.shape != (2,) or size.dtype.kind not in "ui":
         raise CalibrationError(f"{path}: resolution {size.tolist()}, expected height and width")
     return int(size[1]), int(size[0])
-
-
-def _array(path: Path, name: str, value: object, shape: tuple[int, int]) -> np.ndarray:
-    try:
-        array = np.asarray(value, dtype=np.float64)
-    except (TypeError, ValueError, OverflowError):
-        array = np.zeros(0)
-    if array.shape != shape or not np.isfinite(array).all():
-        raise CalibrationError(
-            f"{path}: camera {name} has an array of shape {array.shape}, expected {shape}, finite"
-        )
-    return array

@@ -13,11 +13,6 @@ from pipelines.calibrate.config import PRESETS, CalibrateConfig
 __all__ = ["COMMAND", "STAGE", "CalibrateConfig"]
 
 
-def items(dataset: Dataset) -> list[str]:
-    """List the subjects: a rig may be bumped between two, so each has its own cameras."""
-    return dataset.subjects()
-
-
 def inputs(dataset: Dataset, item: str, config: CalibrateConfig) -> dict[str, Path | str]:
     """List the frame index, the landmark weights, and calibration and board images if given."""
     # Imported here, as everything heavy: listing the stages must stay quick.
@@ -46,7 +41,7 @@ STAGE = Stage(
     version=5,
     config=CalibrateConfig,
     presets=PRESETS,
-    items=items,
+    items=Dataset.subjects,  # a rig may be bumped between two: each has its own cameras
     inputs=inputs,
     run=run,
     help="take or solve the cameras",

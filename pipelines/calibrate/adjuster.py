@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from express50.geometry.cameras import Camera, distort, normalised
+from express50.geometry.cameras import MODELS, Camera, distort, normalised
 from express50.geometry.transforms import axis_angle_to_matrix, make_transform
 from pipelines.calibrate.tracks import PointTracks
 
@@ -189,31 +189,23 @@ def _focal(camera: Camera) -> float:
 
 def _lens(camera: Camera) -> np.ndarray:
     """Return the unknowns (4,) of a camera's lens: those from the log focal length on."""
-    bend = camera.params[_focals(camera) + 2] if _has_bend(camera) else 0.0
-    return np.array([np.log(_focal(camera)), *camera.K[:2, 2], bend])
-
-
-def _focals(camera: Camera) -> int:
-    return 2 if camera.model in ("PINHOLE", "OPENCV", "FULL_OPENCV") else 1
+    return np.array([np.log(_focal(camera)), *camera.K[:2, 2], camera.dist[0]])
 
 
 def _has_bend(camera: Camera) -> bool:
-    return camera.model not in ("SIMPLE_PINHOLE", "PINHOLE")
+    return "k1" in MODELS[camera.model]
 
 
 def _moved(camera: Camera, step: np.ndarray) -> Camera:
     """Apply a step (10,) of its unknowns to a camera."""
-    p = list(camera.params)
-    focals = _focals(camera)
-    for i in range(focals):
-        p[i] *= float(np.exp(np.clip(step[6], -0.5, 0.5)))
-    p[focals] += float(step[7])
-    p[focals + 1] += float(step[8])
-    if _has_bend(camera):
-        p[focals + 2] += float(step[9])
-    return replace(
-        camera, params=tuple(p), cam_from_world=move_pose(camera.cam_from_world, step[:6])
-    )
+    p = dict(zip(MODELS[camera.model], camera.params, strict=True))
+    for name in p.keys() & {"f", "fx", "fy"}:
+        p[name] *= float(np.exp(np.clip(step[6], -0.5, 0.5)))
+    for name, change in zip(("cx", "cy", "k1"), step[7:], strict=True):
+        if name in p:
+            p[name] += float(change)
+    pose = move_pose(camera.cam_from_world, step[:6])
+    return replace(camera, params=tuple(p.values()), cam_from_world=pose)
 
 
 def _information(

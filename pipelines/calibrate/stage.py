@@ -340,9 +340,9 @@ def draw_residuals(
     _save(figure, path)
 
 
-def _draw_field(axes: Axes, solution: BoardSolution, cells: int = 12) -> None:
+def _draw_field(axes: Axes, solution: BoardSolution) -> None:
     """Draw the mean error in each cell of the image, over all cameras, as arrows."""
-    kept, cameras = solution.corners, solution.cameras
+    kept, cameras, cells = solution.corners, solution.cameras, 12
     known = [(c.width, c.height) if (c := cameras.get(n)) else (1, 1) for n in kept.cameras]
     where = kept.pixels / np.array(known)[kept.camera]
     cell = np.clip((where * cells).astype(int), 0, cells - 1) @ np.array([1, cells])

@@ -55,16 +55,6 @@ class LevelSet:
     table: np.ndarray
     blocks: np.ndarray
 
-    @property
-    def allocated(self) -> int:
-        """Count the voxels held."""
-        return self.blocks[HELD:].size
-
-    @property
-    def nbytes(self) -> int:
-        """Count the bytes of the blocks and the table."""
-        return self.blocks.nbytes + self.table.nbytes
-
     def points(self, index: np.ndarray) -> np.ndarray:
         """Convert fractional voxel indices (N, 3) to world points (N, 3)."""
         return self.origin + self.voxel * index

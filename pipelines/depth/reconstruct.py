@@ -22,6 +22,7 @@ from express50.geometry.raycast import mesh_scene
 from express50.geometry.sampling import bilinear
 from pipelines.depth.blocks import (
     BLOCK,
+    HELD,
     VOXEL_LIMIT,
     LevelSet,
     assemble,
@@ -195,10 +196,10 @@ def _finished(views: Sequence[DepthView], grid: LevelSet, noise: float) -> HeadS
     on_hull = np.abs(hull_distance(views, vertices)) < 0.5 * grid.voxel
     figures = {
         "voxel_mm": grid.voxel * 1e3,
-        "voxels_allocated": grid.allocated,
+        "voxels_allocated": grid.blocks[HELD:].size,
         "voxels_dense": math.prod(grid.shape),
         "voxel_limit": VOXEL_LIMIT,
-        "grid_bytes": grid.nbytes,
+        "grid_bytes": grid.blocks.nbytes + grid.table.nbytes,
         "photo_agreement_median": float(np.median(agreement)),
     }
     floor = np.where(on_hull, HULL_CONFIDENCE, LEAST_CONFIDENCE)

@@ -71,17 +71,15 @@ def read_views(
     dropped = []
     for camera_id, camera in read_cameras_of(dataset, subject).items():
         path = dataset.matte_file(subject, expression, camera_id)
-        if not path.is_file():
-            dropped.append(Note(camera_id, "it has no matte"))
-            continue
         try:
+            if not path.is_file():
+                raise StageError("it has no matte")
             alpha = read_alpha(path).astype(np.float32) / 255
             rgb = read_peak_frame(dataset, subject, expression, camera_id)
             views.append(make_view(camera, rgb, alpha, image_side))
+            pictures.append((camera, rgb, alpha))
         except (CaptureError, FormatError, StageError) as error:
             dropped.append(Note(camera_id, str(error)))
-            continue
-        pictures.append((camera, rgb, alpha))
     views, contradicting = without_contradiction(views)
     gone = {note.what for note in contradicting}
     pictures = [row for row in pictures if row[0].id not in gone]

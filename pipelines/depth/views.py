@@ -12,7 +12,7 @@ import numpy as np
 
 from express50.contract.stage import Note
 from express50.errors import StageError
-from express50.files.images import resize_area
+from express50.files.images import resize_area, shrink
 from express50.geometry.cameras import Camera, project, resized
 from express50.geometry.conventions import cell_to_corner
 from express50.geometry.sampling import bilinear
@@ -22,6 +22,7 @@ EMPTY = 0.002  # share of the image below which a matte holds no head
 FULL = 0.98  # share above which a matte cuts nothing out
 SPECK = 0.01  # share of a matte's largest part below which other parts are dropped
 HOLE = 0.05  # share of the matte up to which a hole in it is filled
+UPSAMPLE = 3  # times that a matte is enlarged before distances to its outline are measured
 UNSEEN = 1.0  # metres; the distance given to space that too few cameras see
 BOX_CELLS = 40  # along the sides of the box in which the hull is looked for
 VOTERS = 5  # fewest views of which one can be outvoted
@@ -72,12 +73,10 @@ def reduced(
     camera: Camera, rgb: np.ndarray, alpha: np.ndarray, side: int
 ) -> tuple[Camera, np.ndarray, np.ndarray]:
     """Average a camera's images down to at most ``side`` pixels; the camera follows."""
-    scale = side / max(camera.width, camera.height)
-    if scale >= 1:
+    small = shrink(rgb, side)
+    if small is rgb:
         return camera, rgb, alpha
-    width, height = round(camera.width * scale), round(camera.height * scale)
-    rgb, alpha = resize_area(rgb, width, height), resize_area(alpha, width, height)
-    return resized(camera, width, height), rgb, alpha
+    return resized(camera, small.shape[1], small.shape[0]), small, shrink(alpha, side)
 
 
 def repaired_matte(alpha: np.ndarray) -> np.ndarray:
@@ -97,20 +96,20 @@ def repaired_matte(alpha: np.ndarray) -> np.ndarray:
     return np.where(np.isin(labels, holes), np.float32(1), kept)
 
 
-def silhouette_distance(alpha: np.ndarray, upsample: int = 3) -> np.ndarray:
+def silhouette_distance(alpha: np.ndarray) -> np.ndarray:
     """Measure the signed distance (H, W) float32, pixels, positive inside, to alpha's 0.5 contour.
 
     The matte is enlarged first, so that the contour keeps the matte's subpixel position.
     Pixels beyond the image are unknown, not empty: a head cut by the border stays inside there.
     """
     height, width = alpha.shape
-    size = (width * upsample, height * upsample)
+    size = (width * UPSAMPLE, height * UPSAMPLE)
     large = cv2.resize(alpha.astype(np.float32), size, interpolation=cv2.INTER_LINEAR)
     mask = (large > INSIDE).astype(np.uint8)
     inside = cv2.distanceTransform(mask, cv2.DIST_L2, cv2.DIST_MASK_5)
     outside = cv2.distanceTransform(1 - mask, cv2.DIST_L2, cv2.DIST_MASK_5)
     # Distances are to pixel centres across the contour: half a pixel too long on either side.
-    signed = np.where(mask > 0, inside - 0.5, 0.5 - outside) / upsample
+    signed = np.where(mask > 0, inside - 0.5, 0.5 - outside) / UPSAMPLE
     limit = float(width + height)  # a matte without a contour is infinitely far from one
     signed = np.clip(signed, -limit, limit).astype(np.float32)
     return cv2.resize(signed, (width, height), interpolation=cv2.INTER_AREA)

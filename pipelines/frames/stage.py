@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 
 import cv2
@@ -14,7 +15,7 @@ from express50.contract.layout import PLATES, Dataset
 from express50.contract.stage import Note, Result
 from express50.errors import CaptureError, StageError
 from express50.files.containers import to_srgb
-from express50.files.images import contact_sheet, resize_area, write_image
+from express50.files.images import shrink, tile_sheet, write_image
 from express50.geometry.conventions import undistort_image
 
 COLUMNS = 6  # of the contact sheet
@@ -55,13 +56,12 @@ def run(dataset: Dataset, item: str, deep: bool, out: Path) -> Result:
             continue
         write_frame(out / f"{name}.jxl", image)
         bits[name] = 8 * image.itemsize
-        scale = min(1.0, TILE / max(image.shape[:2]))
-        height, width = (max(1, round(n * scale)) for n in image.shape[:2])
-        tiles[name] = resize_area(to_srgb(image), width, height)
+        tiles[name] = shrink(to_srgb(image), TILE)
     if not tiles:
         why = "; ".join(f"{note.what}: {note.why}" for note in dropped[:3])
         raise StageError(f"{item}: no camera could be read ({why or 'none is calibrated'})")
-    _write_picture(out, tiles)
+    (out / "qc").mkdir()
+    write_image(out / "qc" / "frames.jpg", tile_sheet(tiles, COLUMNS, TILE), quality=88)
     return Result({"frames": len(tiles), "bits": bits}, dropped)
 
 
@@ -74,23 +74,7 @@ def _reader(dataset: Dataset, subject: str, expression: str, deep: bool) -> Read
     check_peak(index, expression, peak)
 
     def read(camera: str) -> np.ndarray:
-        reader = FrameReader(index, camera)
-        try:
+        with closing(FrameReader(index, camera)) as reader:
             return reader.read(peak.frame, deep)
-        finally:
-            reader.close()
 
     return read
-
-
-def _write_picture(out: Path, tiles: dict[str, np.ndarray]) -> None:
-    """Write a contact sheet of the cameras."""
-    names = list(tiles)
-    rows = [names[k : k + COLUMNS] for k in range(0, len(names), COLUMNS)]
-    sheet = contact_sheet(
-        [[tiles[name] for name in row] for row in rows],
-        ["  ".join(row) for row in rows],
-        (TILE, TILE),
-    )
-    (out / "qc").mkdir()
-    write_image(out / "qc" / "frames.jpg", sheet, quality=88)

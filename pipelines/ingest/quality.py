@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 from scipy.ndimage import median_filter
 
-from express50.files.images import srgb_to_linear
+from express50.files.images import shrink, srgb_to_linear
 from pipelines.ingest.config import IngestConfig
 
 SIDE = 96  # longer side, pixels, of the images in which movement is measured
@@ -119,12 +119,7 @@ class Step:
 
 def small_grey(image: np.ndarray) -> np.ndarray:
     """Return a grey image float32, longer side at most 96 pixels, of an image (H, W, 3) uint8."""
-    grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32)
-    scale = SIDE / max(grey.shape)
-    if scale >= 1:
-        return grey
-    size = (max(1, round(grey.shape[1] * scale)), max(1, round(grey.shape[0] * scale)))
-    return cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
+    return shrink(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32), SIDE)
 
 
 def movement(before: np.ndarray | None, after: np.ndarray) -> float:

@@ -18,7 +18,7 @@ from express50.errors import CaptureError
 from express50.files.atomic import dump_json
 from express50.files.containers import WITHIN, inside, read_picture
 from express50.files.digests import file_sha256, text_digest
-from express50.files.images import encode_jpeg, resize_area, upright
+from express50.files.images import encode_jpeg, shrink, upright
 from express50.files.video import iterate_video
 from pipelines.ingest.config import IngestConfig
 from pipelines.ingest.quality import Seen, edge_width, light_cells, movement, small_grey
@@ -147,15 +147,6 @@ def source_sha256(camera: RawCamera) -> str:
         rows = [f"{n} {file_sha256(inside(camera.path, n))}" for n in files]
         return text_digest("\n".join([*rows, *camera.names]))
     return text_digest("\n".join(f"{n} {file_sha256(camera.path / n)}" for n in camera.names))
-
-
-def shrink(image: np.ndarray, long_side: int) -> np.ndarray:
-    """Reduce an image (H, W, 3) to at most ``long_side`` pixels on its longer side."""
-    height, width = image.shape[:2]
-    scale = long_side / max(height, width)
-    if scale >= 1:
-        return image
-    return resize_area(image, max(1, round(width * scale)), max(1, round(height * scale)))
 
 
 class ProxyWriter:

@@ -156,10 +156,8 @@ def _calibration(raw: RawCapture, cameras: Mapping[str, CameraSource]) -> dict[s
         return None
     if raw.calibration is None:
         return None
-    found: dict[str, Camera] = {}
-    for name in sorted(raw.calibration.keys() & sizes.keys()):
-        found |= at_size({name: raw.calibration[name]}, sizes[name])
-    return found
+    names = sorted(raw.calibration.keys() & sizes.keys())
+    return {name: at_size(raw.calibration[name], sizes[name]) for name in names}
 
 
 def _with_cues(

@@ -23,10 +23,9 @@ def inputs(dataset: Dataset, item: str, config: MatteConfig) -> dict[str, Path |
         plates = {c: dataset.plate_file(subject, c) for c in read_cameras_of(dataset, subject)}
         found |= {f"plate {c}": path for c, path in plates.items() if path.is_file()}
     if config.weights:
-        from pipelines.networks import check_file  # torch takes seconds to import
+        from pipelines.networks import weights_file  # torch takes seconds to import
 
-        found["weights"] = Path(config.weights).expanduser()
-        check_file(Path(config.weights).expanduser(), "matte.weights")
+        found["weights"] = weights_file(config.weights, "matte.weights")
     return found
 
 

@@ -16,8 +16,6 @@ from express50.contract.stage import Note
 from pipelines.matte.visual_hull import (
     INSIDE,
     MARGIN,
-    VOTES,
-    Evidence,
     MatteView,
     evidence_of,
     make_space,
@@ -108,10 +106,8 @@ def _compare(
     """Find what to remove and to fill in each view, and how badly it fits the others."""
     longest = max(max(view.alpha.shape) for view in views)
     space = make_space(views, cells, max(1.5, MARGIN * longest))
-    place = subject_place(space, VOTES)
-    found: dict[str, Evidence] = {
-        view.name: evidence_of(view, space, place, VOTES) for view in views
-    }
+    place = subject_place(space)
+    found = {view.name: evidence_of(view, space, place) for view in views}
     subject = {view.name: subject_of(view, found[view.name]) for view in views}
     removed: dict[str, np.ndarray] = {}
     filled: dict[str, np.ndarray] = {}

@@ -33,7 +33,6 @@ ENLARGED_WEIGHT = 0.01
 REFINE_TILE, REFINE_OVERLAP = 1024, 64
 FLAT = 1e-5  # variance of colour (of 1) that counts as flat, so that noise is not an edge
 ITERATIONS = 30
-STEP = 64  # tiles start on multiples of this: networks that halve the picture stay in phase
 
 
 def background_alpha(
@@ -51,8 +50,7 @@ def background_alpha(
     def compute(rows: slice, columns: slice) -> np.ndarray:
         pair = [_padded(x[rows, columns].astype(np.float32) / 255) for x in (frame, plate)]
         answer = network(*pair)
-        if answer.shape != (1, *pair[0].shape[:2]):
-            raise _wrong_shape(network, answer, (1, *pair[0].shape[:2]))
+        _check_shape(network, answer, pair[0].shape[:2])
         return answer[0, : rows.stop - rows.start, : columns.stop - columns.start]
 
     alpha = in_tiles(frame.shape[:2], tile, overlap, compute)
@@ -71,8 +69,7 @@ def salient_alpha(network: Network, frame: np.ndarray) -> np.ndarray:
     height, width = network.size or (SIDE, SIDE)
     small = resize_area(frame, width, height).astype(np.float32)
     answer = network((small / 255 - MEAN) / DEVIATION)
-    if answer.shape != (1, height, width):
-        raise _wrong_shape(network, answer, (1, height, width))
+    _check_shape(network, answer, (height, width))
     alpha = as_opacity(answer[0])
     if (height, width) == frame.shape[:2]:
         return alpha
@@ -100,7 +97,7 @@ def refined(frame: np.ndarray, alpha: np.ndarray, factor: float) -> np.ndarray:
 
     def compute(rows: slice, columns: slice) -> np.ndarray:
         part = np.s_[rows, columns]
-        return smooth_alpha(frame[part], alpha[part], band[part], ENLARGED_WEIGHT)
+        return smooth_alpha(frame[part], alpha[part], band[part])
 
     return in_tiles(alpha.shape, REFINE_TILE, REFINE_OVERLAP, compute)
 
@@ -112,39 +109,34 @@ def _padded(image: np.ndarray) -> np.ndarray:
     return cv2.copyMakeBorder(image, 0, down, 0, right, cv2.BORDER_REPLICATE)
 
 
-def _wrong_shape(network: Network, answer: np.ndarray, expected: tuple[int, ...]) -> Exception:
-    return network.error(
-        f"gave shape {answer.shape}, expected {expected}; does matte.method fit the file?"
-    )
+def _check_shape(network: Network, answer: np.ndarray, size: tuple[int, ...]) -> None:
+    """Raise StageError unless an answer is one channel of a size (height, width)."""
+    if answer.shape != (1, *size):
+        raise network.error(
+            f"gave shape {answer.shape}, expected {(1, *size)}; does matte.method fit the file?"
+        )
 
 
-def smooth_alpha(
-    image: np.ndarray,
-    alpha: np.ndarray,
-    band: np.ndarray,
-    weight: float | np.ndarray,
-) -> np.ndarray:
+def smooth_alpha(image: np.ndarray, alpha: np.ndarray, band: np.ndarray) -> np.ndarray:
     """Smooth alpha (H, W) in `band` (H, W) by an image (H, W, 3) in 8-bit steps; the rest stays.
 
-    Minimises a' L a + weight |a - alpha|^2 over the band by conjugate gradients; the weight, one or
-    (H, W), says what alpha is worth.
+    Minimises a' L a + ENLARGED_WEIGHT |a - alpha|^2 over the band by conjugate gradients.
     """
     if not band.any() or min(band.shape) < 3:
         return alpha
     laplacian = MattingLaplacian(image / 255.0, band)
     count = int(band.sum())
-    worth = np.broadcast_to(np.asarray(weight, np.float64), band.shape)[band]
 
     def product(values: np.ndarray) -> np.ndarray:
         spread = np.zeros(band.shape)
         spread[band] = values
-        return laplacian.product(spread)[band] + worth * values
+        return laplacian.product(spread)[band] + ENLARGED_WEIGHT * values
 
     key = alpha[band].astype(np.float64)
     fixed = np.where(band, 0.0, alpha)
-    right = worth * key - laplacian.product(fixed)[band]
+    right = ENLARGED_WEIGHT * key - laplacian.product(fixed)[band]
     # Preconditioned by its diagonal: windows at image borders and flat ones differ in scale.
-    inverse = 1.0 / (laplacian.diagonal()[band] + worth)
+    inverse = 1.0 / (laplacian.diagonal()[band] + ENLARGED_WEIGHT)
     solved, _ = cg(
         LinearOperator((count, count), product, dtype=np.float64),
         right,
@@ -227,8 +219,9 @@ def in_tiles(
 
     Args:
         shape: (H, W) of the image.
-        tile: longest side of a tile, pixels; a multiple of STEP.
-        overlap: pixels that neighbours share; a multiple of STEP, less than ``tile``.
+        tile: longest side of a tile, pixels; a multiple of 64, so that networks that halve the
+            picture stay in phase.
+        overlap: pixels that neighbours share; a multiple of 64, less than ``tile``.
         compute: gives (rows, columns) values of one tile.
     """
     whole = np.zeros(shape, np.float32)
@@ -245,13 +238,7 @@ def in_tiles(
 
 
 def spans(length: int, tile: int, overlap: int) -> list[slice]:
-    """Give slices that cover a length; neighbours share ``overlap``.
-
-    Raises:
-        ValueError: ``tile`` or ``overlap`` is not a multiple of STEP, or the overlap not smaller.
-    """
-    if tile % STEP or overlap % STEP or not 0 < overlap < tile:
-        raise ValueError(f"tile {tile}, overlap {overlap}: expected multiples of {STEP}, tile more")
+    """Give slices that cover a length; neighbours share ``overlap``."""
     starts = [0]
     while starts[-1] + tile < length:
         starts.append(starts[-1] + tile - overlap)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -12,7 +13,7 @@ from express50.capture.frames import read_cameras_of, read_peak_frame, read_plat
 from express50.contract.layout import Dataset
 from express50.contract.stage import Note, Result
 from express50.errors import CaptureError, NoFaceError, StageError
-from express50.files.images import contact_sheet, resize_area, write_image
+from express50.files.images import shrink, tile_sheet, write_image
 from express50.geometry.cameras import Camera, pinhole, resized
 from express50.geometry.conventions import undistorted_mask
 from pipelines.matte.config import WITHOUT_PLATE, MatteConfig
@@ -24,18 +25,17 @@ from pipelines.matte.visual_hull import (
     Ball,
     MatteView,
     ball_of,
-    center_of,
     projection_of,
 )
 
 COLUMNS = 6  # of the picture
-TILE = (240, 240)
+TILE = 240
 RED, GREEN = (235, 50, 40), (50, 220, 80)
 EMPTY = 0.003  # share of the image below which a matte counts as empty
 # Share of the image's top or of a side that the subject may cover before it counts as cut off.
 MOST_CONTACT = 0.02
 
-Matter = Callable[[np.ndarray, np.ndarray | None, np.ndarray, Camera], np.ndarray]
+Matter = Callable[[np.ndarray, Any, np.ndarray, Camera], np.ndarray]
 """Frame (H, W, 3) uint8, plate or None, valid pixels (H, W) and pinhole camera to opacity (H, W)
 float32."""
 
@@ -107,11 +107,7 @@ def _plate(dataset: Dataset, subject: str, camera: str) -> np.ndarray:
 def _matter(config: MatteConfig) -> Matter:
     """Make the function that mattes one frame. Networks are imported here: torch is slow to."""
     if config.method == "key":
-
-        def key(frame, plate, valid, camera):  # type: ignore[no-untyped-def]
-            return key_alpha(frame, plate, valid, config)
-
-        return key
+        return lambda frame, plate, valid, camera: key_alpha(frame, plate, valid, config)
     if config.method == "grabcut":
         from express50.landmarks.network import load_network as load_landmarks
         from pipelines.matte.grabcut import person_alpha
@@ -121,32 +117,26 @@ def _matter(config: MatteConfig) -> Matter:
     from pipelines.matte.learned import BGMV2, SALIENT, background_alpha, salient_alpha
     from pipelines.networks import load_network
 
-    path = Path(config.weights).expanduser()
+    network = load_network(config.weights, SALIENT if config.method == "salient" else BGMV2)
     if config.method == "salient":
-        salient = load_network(path, SALIENT)
-        return lambda frame, plate, valid, camera: salient_alpha(salient, frame)
-    network = load_network(path, BGMV2)
-
-    def learned(frame, plate, valid, camera):  # type: ignore[no-untyped-def]
-        shown = exposed(plate, exposure_gain(frame, plate))
-        return background_alpha(network, frame, shown, config.tile)
-
-    return learned
+        return lambda frame, plate, valid, camera: salient_alpha(network, frame)
+    return lambda frame, plate, valid, camera: background_alpha(
+        network, frame, exposed(plate, exposure_gain(frame, plate)), config.tile
+    )
 
 
 def make_view(
     camera: Camera, ball: Ball, image: np.ndarray, alpha: np.ndarray, side: int
 ) -> MatteView:
     """Reduce an undistorted image (H, W, 3) and alpha (H, W), uint8, of a recorded camera."""
-    scale = min(1.0, side / max(camera.width, camera.height))
-    width, height = (max(1, round(n * scale)) for n in (camera.width, camera.height))
-    small = resized(camera, width, height)
+    rgb = shrink(image, side)
+    small = resized(camera, rgb.shape[1], rgb.shape[0])
     return MatteView(
         name=camera.id,
         projection=projection_of(pinhole(small), ball),
-        center=center_of(camera, ball),
-        rgb=resize_area(image, width, height),
-        alpha=resize_area(alpha, width, height).astype(np.float32) / 255,
+        center=(camera.center - ball.center) / ball.radius,
+        rgb=rgb,
+        alpha=shrink(alpha, side).astype(np.float32) / 255,
         valid=undistorted_mask(small),
     )
 
@@ -202,16 +192,13 @@ def matte_warnings(alphas: dict[str, np.ndarray]) -> list[Note]:
 def _write_picture(out: Path, views: list[MatteView], found: Agreement) -> None:
     """Write every camera's subject: what was removed is red, what was filled is green."""
     odd = {note.what for note in found.warnings}
-    tiles = []
+    tiles = {}
     for view in views:
         tile = np.where(view.alpha[..., None] > INSIDE, view.rgb, view.rgb // 3)
         for masks, colour in ((found.removed, RED), (found.filled, GREEN)):
             if view.name in masks:
                 mask = masks[view.name]
                 tile[mask] = (0.3 * tile[mask] + 0.7 * np.array(colour)).astype(np.uint8)
-        tiles.append(tile)
-    rows = [tiles[k : k + COLUMNS] for k in range(0, len(tiles), COLUMNS)]
-    names = [view.name + ("?" if view.name in odd else "") for view in views]
-    labels = ["  ".join(names[k : k + COLUMNS]) for k in range(0, len(tiles), COLUMNS)]
+        tiles[view.name + ("?" if view.name in odd else "")] = tile
     (out / "qc").mkdir()
-    write_image(out / "qc" / "agreement.jpg", contact_sheet(rows, labels, TILE), quality=88)
+    write_image(out / "qc" / "agreement.jpg", tile_sheet(tiles, COLUMNS, TILE), quality=88)

@@ -97,11 +97,6 @@ def projection_of(camera: Camera, ball: Ball) -> np.ndarray:
     return np.column_stack([camera.K @ R, camera.K @ offset]).astype(np.float32)
 
 
-def center_of(camera: Camera, ball: Ball) -> np.ndarray:
-    """Return a camera's centre (3,) in the ball's coordinates."""
-    return (camera.center - ball.center) / ball.radius
-
-
 def label_pixels(view: MatteView, margin: float) -> np.ndarray:
     """Label a view's pixels (h * w + 1,) uint8; clear is further than `margin` pixels."""
     opaque = view.alpha > FAINT
@@ -147,12 +142,12 @@ def make_space(views: Sequence[MatteView], cells: int, margin: float) -> Space:
     return Space(axis, seen, clear, solid, labels)
 
 
-def subject_place(space: Space, votes: int) -> np.ndarray:
+def subject_place(space: Space) -> np.ndarray:
     """Mark cells (n, n, n) where the subject may be: the ball, and where it leaves the ball."""
     a = space.axis
     square = a[:, None, None] ** 2 + a[:, None] ** 2 + a**2
     ball = square <= 1
-    parts, count = ndimage.label((space.clear < votes) & (space.solid >= 2) & ball)
+    parts, count = ndimage.label((space.clear < VOTES) & (space.solid >= 2) & ball)
     if not count:
         return ball
     weight = np.bincount(parts.ravel(), weights=space.solid.ravel())
@@ -170,15 +165,6 @@ def splat(shape: tuple[int, int], pixels: np.ndarray, spread: int) -> np.ndarray
     hit[pixels] = 1
     side = 2 * spread + 1
     return cv2.dilate(hit[:-1].reshape(shape), np.ones((side, side), np.uint8)) > 0
-
-
-def cell_spread(view: MatteView, axis: np.ndarray) -> int:
-    """Return the pixels around a cell's own within which its neighbours fall.
-
-    Splats then leave no gap.
-    """
-    focal = float(np.linalg.norm(view.projection[0, :3]))
-    return max(1, int(np.ceil(focal * float(axis[1] - axis[0]) / float(view.projection[2, 3]) / 2)))
 
 
 VOTES = 2  # other cameras that must see clear background before a place counts as empty
@@ -213,18 +199,20 @@ class Evidence:
     front: np.ndarray
 
 
-def evidence_of(view: MatteView, space: Space, place: np.ndarray, votes: int) -> Evidence:
+def evidence_of(view: MatteView, space: Space, place: np.ndarray) -> Evidence:
     """Return evidence of all views but `view`; `place` (n, n, n) is where the subject may be."""
     shape = view.alpha.shape
     pixels, depth = cells_in(view, space.axis)
     own = space.labels[view.name][pixels]
     against = space.clear - (own == CLEAR)
-    possible = place & (against < votes)
+    possible = place & (against < VOTES)
     seen = space.seen - (own != OUT)
     sure = (space.solid - (own == SOLID) >= seen - seen // ERRING) & (
         seen >= max(3.0, MOST * (len(space.labels) - 1))
     )
-    spread = cell_spread(view, space.axis)
+    # Pixels around a cell's own within which its neighbours fall: splats then leave no gap.
+    step = float(np.linalg.norm(view.projection[0, :3])) * float(space.axis[1] - space.axis[0])
+    spread = max(1, int(np.ceil(step / float(view.projection[2, 3]) / 2)))
     front = np.full(shape[0] * shape[1] + 1, np.inf, np.float32)
     np.minimum.at(front, pixels[sure], depth[sure])
     disc = np.ones((2 * spread + 1,) * 2, np.uint8)

@@ -59,7 +59,7 @@ def write_card(
     metas: Sequence[Mapping],
     dropped: Sequence[Note],
     statistics: Mapping[str, object],
-    people: Sequence[Mapping] = (),
+    people: Sequence[Mapping],
 ) -> str:
     """Write the datasheet of the packed samples as Markdown.
 
@@ -74,6 +74,8 @@ def write_card(
     expressions = sorted({meta["expression"] for meta in metas})
     cameras = sorted({meta["camera"] for meta in metas})
     counts = Counter((meta["subject"], meta["expression"]) for meta in metas)
+    by_annotator = Counter(str(meta["label"].get("annotator", "unknown")) for meta in metas)
+    labellers = [f"{name} ({count} samples)" for name, count in sorted(by_annotator.items())]
     lines = [
         "# Dataset card",
         "",
@@ -91,7 +93,7 @@ def write_card(
         f"| licence | {_values(metas, 'licence')} |",
         f"| consent | {_values(metas, 'consent')} |",
         f"| head model | {_values(metas, 'head')} |",
-        f"| labels by | {_annotators(metas)} |",
+        f"| labels by | {', '.join(labellers)} |",
         "",
         "## Cameras packed, by subject and expression",
         "",
@@ -144,8 +146,3 @@ def _count_table(name: str, counts: Mapping[str, int]) -> list[str]:
 def _values(metas: Sequence[Mapping], key: str) -> str:
     found = sorted({str(meta[key]) if meta[key] is not None else "not stated" for meta in metas})
     return ", ".join(found[:5]) + (f" and {len(found) - 5} more" if len(found) > 5 else "")
-
-
-def _annotators(metas: Sequence[Mapping]) -> str:
-    found = Counter(str(meta["label"].get("annotator", "unknown")) for meta in metas)
-    return ", ".join(f"{name} ({count} samples)" for name, count in sorted(found.items()))

@@ -35,21 +35,13 @@ class Crop:
     side: int
 
 
-def head_crop(
-    camera: Camera,
-    vertices: np.ndarray,
-    alpha: np.ndarray,
-    margin: float = MARGIN,
-    hair: float = HAIR,
-) -> Crop:
+def head_crop(camera: Camera, vertices: np.ndarray, alpha: np.ndarray) -> Crop:
     """Find the crop around a tracked head.
 
     Args:
         camera: pinhole camera.
         vertices: (V, 3) tracked mesh in the world, metres.
         alpha: (H, W) uint8.
-        margin: room on each side, as a share of the head's size.
-        hair: how far the matte may widen the mesh's box, as a share of its size.
 
     Raises:
         StageError: the head is not in the image, or the matte is empty.
@@ -62,14 +54,14 @@ def head_crop(
     y, x = np.nonzero(alpha > 127)
     if not len(x):
         raise StageError("its matte is empty")
-    reach = hair * (high - low)
+    reach = HAIR * (high - low)
     matte = np.array([[x.min(), y.min()], [x.max() + 1, y.max() + 1]], np.float64)
     low = np.minimum(low, np.maximum(low - reach, matte[0]))
     high = np.maximum(high, np.minimum(high + reach, matte[1]))
     if (high <= 0).any() or (low >= (camera.width, camera.height)).any():
         raise StageError("the tracked head lies outside the image")
     low, high = np.maximum(low, 0), np.minimum(high, (camera.width, camera.height))
-    side = int(np.ceil((high - low).max() * (1 + 2 * margin)))
+    side = int(np.ceil((high - low).max() * (1 + 2 * MARGIN)))
     corner = np.floor((low + high) / 2 - side / 2).astype(int)
     return Crop(int(corner[0]), int(corner[1]), side)
 

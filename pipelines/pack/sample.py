@@ -25,8 +25,8 @@ from express50.files.text import read_json_table
 from express50.geometry.cameras import Camera
 from express50.shards.codecs import encode_pictures
 from express50.shards.writer import PackedSample, sample_key
+from pipelines.pack.config import PackConfig
 from pipelines.pack.crop import (
-    Crop,
     crop_pinhole,
     cut_depth,
     cut_image,
@@ -136,36 +136,24 @@ class LoadedSample:
 
 
 def load_sample(
-    dataset: Dataset,
-    item: str,
-    camera: Camera,
-    *,
-    plate: bool,
-    remove_torso: bool,
-    min_confidence: float,
+    dataset: Dataset, subject: PackedSubject, expression: str, camera: Camera, config: PackConfig
 ) -> LoadedSample:
-    """Load one view of `subject/expression` from the outputs of the earlier stages.
-
-    Args:
-        dataset: the dataset.
-        item: `subject/expression`.
-        camera: pinhole camera of the view.
-        plate: load the clean plate too, if there is one.
-        remove_torso: take the torso out of alpha and depth where regions separated it.
-        min_confidence: depth with less confidence is not valid.
+    """Load one view from the outputs of the earlier stages.
 
     Raises:
-        StageError: an image is missing, or their sizes differ.
+        StageError: it is not tracked, an image is missing, or their sizes differ.
         FormatError, CaptureError: an image cannot be read.
     """
-    subject, expression = item.split("/")
-    matte_path = dataset.matte_file(subject, expression, camera.id)
+    if expression not in subject.tracked:
+        raise StageError("it is not tracked")
+    item = f"{subject.name}/{expression}"
+    matte_path = dataset.matte_file(subject.name, expression, camera.id)
     folder = dataset.item_dir("depth", item)
     if not matte_path.is_file():
         raise StageError("it has no matte")
     if (depth_path := depth_file(folder, camera.id)) is None:
         raise StageError("it has no depth")
-    rgb = read_peak_frame(dataset, subject, expression, camera.id)
+    rgb = read_peak_frame(dataset, subject.name, expression, camera.id)
     matte = alpha = read_alpha(matte_path)
     depth, valid = read_depth(depth_path)
     parts, head = _read_regions(dataset, item, camera.id)
@@ -174,16 +162,15 @@ def load_sample(
         raise StageError(
             f"frame, matte, depth and regions differ in size: {', '.join(map(str, sizes))}"
         )
-    removed = head is not None and remove_torso
-    if head is not None and removed:
+    torso = "kept"
+    if head is not None and config.torso == "remove":
         # Depth without colour is dropped too: what is left of the torso would bend the head.
-        alpha, valid = head, valid & (head > 127)
-    if min_confidence > 0:
+        alpha, valid, torso = head, valid & (head > 127), "removed"
+    if config.min_confidence > 0:
         sure = read_image(folder / f"{camera.id}_confidence.png")
-        valid = valid & (sure >= round(255 * min_confidence))
-    behind = read_plate_image(dataset, subject, camera.id) if plate else None
-    torso = "removed" if removed else "kept"
-    return LoadedSample(rgb, behind, matte, alpha, depth, valid, parts, torso)
+        valid = valid & (sure >= round(255 * config.min_confidence))
+    plate = read_plate_image(dataset, subject.name, camera.id) if config.foreground else None
+    return LoadedSample(rgb, plate, matte, alpha, depth, valid, parts, torso)
 
 
 def _read_regions(
@@ -205,94 +192,57 @@ def _read_regions(
     return read_alpha(paths[0]), None if torso_unknown else read_alpha(paths[1])
 
 
-@dataclass(frozen=True)
-class CroppedSample:
-    """The images of one view cut to (size, size); depth is 0 where `valid` is not set."""
+def encode_sample(
+    loaded: LoadedSample,
+    subject: PackedSubject,
+    expression: str,
+    camera: Camera,
+    config: PackConfig,
+) -> tuple[PackedSample, dict]:
+    """Cut one view to the square around its tracked head, and encode its files.
 
-    crop: Crop
-    rgb: np.ndarray
-    alpha: np.ndarray
-    depth: np.ndarray
-    valid: np.ndarray
-    parts: np.ndarray | None
-
-
-def crop_sample(
-    loaded: LoadedSample, camera: Camera, vertices: np.ndarray, size: int, foreground: bool
-) -> CroppedSample:
-    """Cut the images of one view to the square around its tracked head.
-
-    Args:
-        loaded: the view's images.
-        camera: its pinhole camera.
-        vertices: (V, 3) tracked mesh in the world, metres.
-        size: side of the result, pixels.
-        foreground: give soft pixels the subject's own colour.
+    Returns the files, and the content of meta.json.
 
     Raises:
         StageError: the sample shows no head to crop, or its depth is too large for shards.
     """
-    crop = head_crop(camera, vertices, loaded.alpha)
-    depth, valid = cut_depth(loaded.depth, loaded.valid, crop, size)
+    crop = head_crop(camera, subject.vertices[expression], loaded.alpha)
+    depth, valid = cut_depth(loaded.depth, loaded.valid, crop, config.size)
     if (farthest := depth[valid].max(initial=0)) >= DEPTH_LIMIT_M:
         raise StageError(
             f"its depth reaches {farthest:.2f} m; shards hold less than {DEPTH_LIMIT_M:.2f} m"
         )
-    if foreground:
-        rgb = cut_own_colours(loaded.rgb, loaded.matte, loaded.plate, crop, size)
+    if config.foreground:
+        rgb = cut_own_colours(loaded.rgb, loaded.matte, loaded.plate, crop, config.size)
     else:
-        rgb = cut_image(loaded.rgb, crop, size)
-    parts = None if loaded.parts is None else cut_labels(loaded.parts, crop, size)
-    return CroppedSample(crop, rgb, cut_image(loaded.alpha, crop, size), depth, valid, parts)
-
-
-def encode_sample(
-    cropped: CroppedSample,
-    subject: PackedSubject,
-    expression: str,
-    camera: Camera,
-    *,
-    torso: str,
-    gain: np.ndarray,
-    profile: str,
-) -> tuple[PackedSample, dict]:
-    """Encode the files of one sample; returns them and the content of its meta.json.
-
-    Args:
-        cropped: the images.
-        subject: the data that the subject's samples share.
-        expression: expression id.
-        camera: the uncropped pinhole camera.
-        torso: `removed` or `kept`.
-        gain: (3,) of linear light, to be divided out of the colours.
-        profile: codecs, see `PackConfig.profile`.
-    """
+        rgb = cut_image(loaded.rgb, crop, config.size)
+    parts = None if loaded.parts is None else cut_labels(loaded.parts, crop, config.size)
     sample_key(subject.name, expression, camera.id)  # raises where an id cannot be a file name
-    size = len(cropped.alpha)
+    gain = subject.gains.get(camera.id, np.ones(3)) if config.even_colour else np.ones(3)
+    members = encode_pictures(
+        rgb if (gain == 1).all() else scale_light(rgb, 1.0 / gain),
+        cut_image(loaded.alpha, crop, config.size),
+        depth_to_uint16(depth, valid),
+        parts,
+        config.profile,
+    )
     meta = subject.meta | {
-        "K": crop_pinhole(camera, cropped.crop, size).K.tolist(),
+        "K": crop_pinhole(camera, crop, config.size).K.tolist(),
         "cam_from_world": camera.cam_from_world.tolist(),
         "camera": camera.id,
         "colour_gain": gain.tolist(),
-        "crop": vars(cropped.crop),
+        "crop": vars(crop),
         "depth_scale_m": DEPTH_UNIT_M,
         "expression": expression,
         "frame": subject.peaks[expression],
-        "height": size,
+        "height": config.size,
         "label": subject.labels[expression],
-        "parts": cropped.parts is not None,
+        "parts": parts is not None,
         "source_size": [camera.width, camera.height],
-        "torso": torso,
+        "torso": loaded.torso,
         "track": subject.tracked[expression],
-        "width": size,
+        "width": config.size,
     }
-    members = encode_pictures(
-        cropped.rgb if (gain == 1).all() else scale_light(cropped.rgb, 1.0 / gain),
-        cropped.alpha,
-        depth_to_uint16(cropped.depth, cropped.valid),
-        cropped.parts,
-        profile,
-    )
     text = json.dumps(meta, sort_keys=True, separators=(",", ":"), allow_nan=False)
     members["meta.json"] = text.encode()
     return PackedSample(subject.name, expression, camera.id, members), meta

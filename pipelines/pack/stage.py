@@ -18,13 +18,7 @@ from express50.shards.reader import ShardReader, write_offsets
 from express50.shards.writer import PackedSample, ShardWriter, write_manifest
 from pipelines.pack.card import split_subjects, write_card
 from pipelines.pack.config import PackConfig
-from pipelines.pack.sample import (
-    PackedSubject,
-    crop_sample,
-    encode_sample,
-    load_sample,
-    read_subject,
-)
+from pipelines.pack.sample import PackedSubject, encode_sample, load_sample, read_subject
 
 SHARD_BYTES = 256_000_000  # a shard is closed at this size; an expression is never split
 QC_SAMPLES = 12
@@ -117,39 +111,13 @@ def _pack_group(
 ) -> tuple[list[Pair], list[Note]]:
     """Pack all cameras of one expression; a note says why a camera is left out."""
     group, dropped = [], []
-    for camera_id in sorted(subject.cameras):
+    for camera_id, camera in sorted(subject.cameras.items()):
         try:
-            group.append(_pack_sample(dataset, subject, expression, camera_id, config))
+            loaded = load_sample(dataset, subject, expression, camera, config)
+            group.append(encode_sample(loaded, subject, expression, camera, config))
         except (CaptureError, FormatError, StageError) as error:
             dropped.append(Note(f"{subject.name}/{expression}/{camera_id}", str(error)))
     return group, dropped
-
-
-def _pack_sample(
-    dataset: Dataset, subject: PackedSubject, expression: str, camera_id: str, config: PackConfig
-) -> Pair:
-    """Pack one view.
-
-    Raises:
-        CaptureError, FormatError, StageError: it cannot be packed.
-    """
-    if expression not in subject.tracked:
-        raise StageError("it is not tracked")
-    camera, vertices = subject.cameras[camera_id], subject.vertices[expression]
-    loaded = load_sample(
-        dataset,
-        f"{subject.name}/{expression}",
-        camera,
-        plate=config.foreground,
-        remove_torso=config.torso == "remove",
-        min_confidence=config.min_confidence,
-    )
-    cropped = crop_sample(loaded, camera, vertices, config.size, config.foreground)
-    gain = subject.gains.get(camera_id, np.ones(3)) if config.even_colour else np.ones(3)
-    return encode_sample(
-        cropped, subject, expression, camera,
-        torso=loaded.torso, gain=gain, profile=config.profile,
-    )  # fmt: skip
 
 
 def warn_of_gaps(metas: list[dict]) -> list[Note]:

@@ -15,19 +15,19 @@ from express50.cli.stages import add_config_options, config_of
 from express50.console import FAILED, OK, say, say_json, stdout_to_stderr
 from express50.contract.layout import Dataset
 from express50.contract.stage import stages
+from express50.dataset.tracks import read_track
 from express50.errors import ConfigError
 from express50.files.images import write_image
 from express50.files.text import ID
 from express50.head.load import load_head
 from express50.head.preview import render_preview
-from express50.landmarks.sources import open_source
 from express50.runner.executor import Pool
 from express50.runner.runner import Summary, run_stage
 from express50.runner.threads import cap_threads
 from pipelines import ingest
 from pipelines.photo.capture import Focal, make_photo_capture, open_picture, subject_id
 from pipelines.track.config import TrackConfig
-from pipelines.track.read_inputs import DETECTOR_PASSES
+from pipelines.track.read_inputs import open_landmarks
 from pipelines.track.report import draw_column
 
 STAGES = ("ingest", "calibrate", "observe", "align", "frames", "matte", "track")
@@ -129,19 +129,16 @@ def _account(focal: Focal, summaries: list[Summary]) -> None:
 
 def write_panel(dataset: Dataset, subject: str, config: TrackConfig, path: Path) -> None:
     """Write the first tracked frame, its overlay and the turned head side by side."""
-    with np.load(dataset.track_file(subject)) as track:
-        frame, mesh = int(track["frames"][0]), track["vertices"][0].astype(np.float64)
-        expression = str(track["expressions"][0])
-        rotation, translation = track["R"][0], track["t"][0]
+    track = read_track(dataset.track_file(subject))
+    mesh = track.vertices[0].astype(np.float64)
     model = load_head(config.head)
     ((camera_id, camera),) = read_cameras_of(dataset, subject).items()
-    image = read_peak_frame(dataset, subject, expression, camera_id)
-    recorded = read_cameras_of(dataset, subject, undistorted=False)
-    source = open_source(config.landmarks, recorded, DETECTOR_PASSES, config.search)
-    seen = source(image, camera_id, frame)
+    image = read_peak_frame(dataset, subject, track.expressions[0], camera_id)
+    source = open_landmarks(dataset, subject, config.landmarks, config.search)
+    seen = source(image, camera_id, int(track.frames[0]))
     dots = [seen.face.points, seen.irises.centres[seen.irises.confidence > 0]]
     column = draw_column(image, camera, model.to(dtype=torch.float64), mesh, dots, PANEL_TILE)
-    head = (mesh - translation) @ rotation
+    head = (mesh - track.t[0]) @ track.R[0]
     turned = render_preview(model, head, yaw=PANEL_YAW, size=PANEL_TILE)
     write_image(
         path, np.concatenate([column[:PANEL_TILE], column[PANEL_TILE:], turned], axis=1), quality=90

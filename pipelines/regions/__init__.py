@@ -28,9 +28,9 @@ def inputs(dataset: Dataset, item: str, config: RegionsConfig) -> dict[str, Path
         found |= {f"matte {camera}": matte} if matte.is_file() else {}
         found |= {f"depth {camera}": depth} if config.depth and depth else {}
     if config.segmentation:
-        from pipelines.regions.sapiens import weights_file
+        from pipelines.networks import weights_file  # torch takes seconds to import
 
-        found["segmentation"] = weights_file(config.segmentation)
+        found["segmentation"] = weights_file(config.segmentation, "regions.segmentation")
     return found
 
 

@@ -7,14 +7,12 @@ mean and divided by a deviation in 8-bit steps in, scores of 28 classes out (its
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import cv2
 import numpy as np
 
 from express50.contract.segmentation_labels import LABELS, label_mask
 from express50.files.images import resize_area
-from pipelines.networks import Network, Role, check_file, load_network
+from pipelines.networks import Network, Role, load_network
 
 SAPIENS = Role(setting="regions.segmentation", inputs=("image",))
 HEIGHT, WIDTH = 1024, 768
@@ -29,20 +27,9 @@ LABEL_OF_CLASS = np.array(
 )
 
 
-def weights_file(segmentation: str) -> Path:
-    """Find the file of weights that the setting names.
-
-    Raises:
-        ConfigError: the file does not exist.
-    """
-    path = Path(segmentation).expanduser()
-    check_file(path, "regions.segmentation")
-    return path
-
-
 def network_labels(segmentation: str, frame: np.ndarray, mesh: np.ndarray) -> np.ndarray:
     """Label a frame (H, W, 3) by the network in a file, refined by the mesh's labels (H, W)."""
-    return refined(segment(load_network(weights_file(segmentation), SAPIENS), frame), mesh)
+    return refined(segment(load_network(segmentation, SAPIENS), frame), mesh)
 
 
 def segment(network: Network, frame: np.ndarray) -> np.ndarray:

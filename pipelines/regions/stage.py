@@ -16,7 +16,7 @@ from express50.contract.stage import Note, Result
 from express50.dataset.depth_files import depth_file, read_depth
 from express50.dataset.tracks import existing_track, read_track
 from express50.errors import CaptureError, FormatError, StageError
-from express50.files.images import contact_sheet, fit_into, read_alpha, resize_area, write_image
+from express50.files.images import contact_sheet, fit_into, read_alpha, shrink, write_image
 from express50.geometry.cameras import Camera, resized
 from express50.head.load import load_head
 from pipelines.regions.colour import SKIN, Scalp, by_colour, decide, face_colours, scalp_votes
@@ -63,7 +63,7 @@ def run(dataset: Dataset, item: str, config: RegionsConfig, out: Path) -> Result
     dropped = []
     for name, camera in read_cameras_of(dataset, subject).items():
         try:
-            known = frames.pop(name) if name in frames else None
+            known = frames.pop(name, None)
             rgb, alpha = known or read_pair(dataset, item, camera)
             depth = read_depth_of(dataset, item, camera) if use_depth else None
         except UNREADABLE as error:
@@ -202,14 +202,13 @@ def _shrunk(
     camera: Camera, rgb: np.ndarray, alpha: np.ndarray, depth: np.ndarray | None, side: int
 ) -> tuple[Camera, np.ndarray, np.ndarray, np.ndarray | None]:
     """Reduce camera, frame, matte and depth map to at most `side` pixels on the longer side."""
-    scale = side / max(camera.width, camera.height)
-    if scale >= 1:
+    small = shrink(rgb, side)
+    if small is rgb:
         return camera, rgb, alpha, depth
-    width, height = (max(1, round(n * scale)) for n in (camera.width, camera.height))
+    height, width = small.shape[:2]
     if depth is not None:
         depth = cv2.resize(depth, (width, height), interpolation=cv2.INTER_NEAREST_EXACT)
-    rgb, alpha = resize_area(rgb, width, height), resize_area(alpha, width, height)
-    return resized(camera, width, height), rgb, alpha, depth
+    return resized(camera, width, height), small, shrink(alpha, side), depth
 
 
 def _write_view(

@@ -12,11 +12,6 @@ from pipelines.track.config import PRESETS, UV_WEIGHTS, VERSION, TrackConfig
 __all__ = ["STAGE"]
 
 
-def items(dataset: Dataset) -> list[str]:
-    """List subjects: all expressions of one share the shape."""
-    return dataset.subjects()
-
-
 def inputs(dataset: Dataset, item: str, config: TrackConfig) -> dict[str, Path | str]:
     """Name index, cameras, peaks, mattes, network weights and the head model's file."""
     from express50.capture.frames import frame_inputs
@@ -59,7 +54,7 @@ STAGE = Stage(
     version=VERSION,
     config=TrackConfig,
     presets=PRESETS,
-    items=items,
+    items=Dataset.subjects,  # all expressions of one share the shape
     inputs=inputs,
     run=run,
     help="fit a head model to every peak frame",

@@ -15,6 +15,7 @@ LANDMARK_FLOOR_PX = 1.0  # least error assumed of a landmark, for a face 128 px 
 # Landmarks 0..16 slide along the jaw; in a single view the jaw's width depends on them alone.
 JAW_LINE_WEIGHT, SINGLE_VIEW_JAW_WEIGHT = 0.25, 0.7
 INLIER_SIGMA = 3.5
+MIN_SHARE = 0.4  # of its known landmarks that must agree for a view to stay
 # However vague a landmark, one that is further off than this many shares of the face disagrees.
 SIGMA_SHARE_LIMIT = 0.04
 # Cameras whose lines of sight to the face meet under less than about this angle see it alike.
@@ -71,9 +72,7 @@ class Observation:
     shut: tuple[int, ...] = ()
 
 
-def agree(
-    expression: str, frame: int, views: list[LandmarkView], min_share: float = 0.4
-) -> tuple[Observation, list[str]]:
+def agree(expression: str, frame: int, views: list[LandmarkView]) -> tuple[Observation, list[str]]:
     """Triangulate robustly and leave out whole views that disagree with the rest.
 
     Returns:
@@ -85,7 +84,7 @@ def agree(
         points, inliers = robust_triangulate(views)
         known = np.stack([np.isfinite(view.sigma) for view in views])
         share = (inliers & known).sum(1) / np.maximum(known.sum(1), 1)
-        if len(views) <= 2 or share.min() >= min_share:
+        if len(views) <= 2 or share.min() >= MIN_SHARE:
             covariance = point_covariance(views, points, inliers & known)
             found = Observation(
                 expression, frame, tuple(views), inliers & known, points, covariance, tuple(refused)

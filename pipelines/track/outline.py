@@ -31,7 +31,7 @@ from pipelines.track.terms import MeshPlaces, Residuals, huber
 # Head outlines count as about this many independent points per view.
 EFFECTIVE_POINTS = 24
 POINTS_PER_VIEW = 60
-OUTLINE_SIDE = 384
+OUTLINE_SIDE, MATTE_SIDE = 384, 640
 EDGE_SIGMA_M = 0.0015
 # Where hair, cloth or shoulders may stand before the skin: standard deviation of their thickness,
 # and the gap (metres) at which what lies inside the matte stops to pull.
@@ -103,12 +103,12 @@ class OutlineTerm:
     loss = staticmethod(huber)
 
 
-def signed_distance(alpha: np.ndarray, camera: Camera, side: int = 640) -> SignedDistance | None:
+def signed_distance(alpha: np.ndarray, camera: Camera) -> SignedDistance | None:
     """Compute the signed distance of a matte (H, W) uint8; None where it is empty or full.
 
-    Large mattes are averaged down to about `side` pixels first.
+    Large mattes are averaged down to about MATTE_SIDE pixels first.
     """
-    full, shrink = np.array(alpha.shape[::-1]), max(alpha.shape) / side
+    full, shrink = np.array(alpha.shape[::-1]), max(alpha.shape) / MATTE_SIDE
     if shrink > 1.0:
         size = np.maximum(np.rint(full / shrink), 1).astype(int)
         alpha = cv2.resize(alpha, size.tolist(), interpolation=cv2.INTER_AREA)

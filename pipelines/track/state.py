@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from express50.errors import StageError
-from express50.geometry.transforms import rigid_fit, similarity_fit
+from express50.geometry.transforms import make_transform, rigid_fit, similarity_fit
 from express50.head.model import HeadModel, pose
 from pipelines.track.basis import POSE_SIZE, Basis
 from pipelines.track.observe import Observation, facing, landmark_sigma
@@ -178,8 +178,7 @@ def _from_one_view(observation: Observation, template: np.ndarray) -> tuple[np.n
             "look at its overlay, the face may be hidden"
         )
     turn, shift = cv2.solvePnPRefineLM(*arguments, turn, shift)
-    cam_from_head = np.eye(4)
-    cam_from_head[:3, :3], cam_from_head[:3, 3] = cv2.Rodrigues(turn)[0], shift[:, 0]
+    cam_from_head = make_transform(cv2.Rodrigues(turn)[0], shift[:, 0])
     world = np.linalg.inv(view.camera.cam_from_world) @ cam_from_head
     return world[:3, :3], world[:3, 3]
 

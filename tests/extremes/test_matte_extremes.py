@@ -9,7 +9,7 @@ import pytest
 
 from express50.geometry.cameras import pinhole_camera, scale_camera, transform_camera
 from express50.geometry.transforms import look_at, make_transform
-from pipelines.matte import consensus
+from pipelines.matte import visual_hull
 from pipelines.matte.consensus import Agreement, agree
 from pipelines.matte.stage import corrected, make_view
 from pipelines.matte.visual_hull import MatteView, ball_of
@@ -120,7 +120,7 @@ def test_units_and_the_worlds_origin_do_not_matter(scale, far):
 
 
 def test_more_cameras_than_a_byte_counts(monkeypatch):
-    monkeypatch.setattr(consensus, "VOTES", 40)  # each view is there 23 times
+    monkeypatch.setattr(visual_hull, "VOTES", 40)  # each view is there 23 times
     views = disturbed(make_views())
     many = [replace(v, name=f"{v.name}-{k}") for k in range(23) for v in views]
     found = agree(many, cells=16, strand=0.03)

@@ -107,7 +107,7 @@ def test_a_photograph_becomes_a_sample_of_shards_without_plate_or_weights(tmp_pa
     for stage in ("depth", "regions", "pack"):
         assert main([stage, str(dataset.root), "--preset", "draft"]) == 0
     reader = ShardReader(dataset.stage_dir("pack") / "shards")
-    assert reader.keys == ["eva_photo_photo"]
+    assert [entry.key for entry in reader.entries] == ["eva_photo_photo"]
     sample = reader.sample(0)
     known, head = sample["valid"], sample["alpha"] > 0.5
     assert 0.3 < (known & head).sum() / head.sum() < 1

@@ -129,8 +129,8 @@ def test_crop_follows_head_and_hair_but_not_shoulders():
     alpha = np.zeros((320, 320), np.uint8)
     alpha[100:320, 20:300] = 255  # shoulders
     alpha[80:120, 120:200] = 255  # hair
-    crop = head_crop(camera, vertices, alpha, margin=0.0, hair=0.3)
-    assert crop.x0 > 60 and crop.y0 <= 85 and 100 < crop.side < 180
+    crop = head_crop(camera, vertices, alpha)
+    assert crop.x0 > 60 and crop.y0 <= 85 and 100 < crop.side < 200
     for moved, matte in (([0, 0, 0], alpha * 0), ([5, 0, 0], alpha), ([0, 0, 3], alpha)):
         with pytest.raises(StageError):
             head_crop(camera, vertices + moved, matte)

@@ -33,7 +33,7 @@ from express50.files.containers import WITHIN, open_zip
 from express50.files.text import NAME, read_json_table, read_text
 from express50.geometry.cameras import Camera
 from express50.geometry.conventions import K_from_opencv
-from express50.rigs.camera_builder import camera_from_K, checked, in_metres
+from express50.rigs.camera_builder import camera_from_K, checked, finite_array, in_metres
 
 AVA256_CAMERAS = Path("decoder/camera_calibration.json")
 AVA256_SIZE, MULTIFACE_SIZE = (2668, 4096), (1334, 2048)
@@ -149,22 +149,12 @@ def _ava256_cameras(path: Path) -> dict[str, Camera]:
             raise CalibrationError(
                 f"{where}: distortionModel {model}, expected RadialAndTangential"
             )
-        K, T = _array(where, row["K"], (3, 3)).T, _array(where, row["T"], (4, 4)).T
-        given = row["distortion"]
-        dist = _array(where, given, (len(given) if isinstance(given, list) else 0,))
+        what, given = f"{where}: array", row["distortion"]
+        K, T = finite_array(row["K"], (3, 3), what).T, finite_array(row["T"], (4, 4), what).T
+        dist = finite_array(given, (len(given) if isinstance(given, list) else 0,), what)
         pose = np.vstack([T[:3], [0, 0, 0, 1]])
         found[name] = camera_from_K(name, K_from_opencv(K), dist, AVA256_SIZE, pose)
     return checked(in_metres(found, 1e-3), path)
-
-
-def _array(where: str, value: object, shape: tuple[int, ...]) -> np.ndarray:
-    try:
-        array = np.asarray(value, dtype=np.float64)
-    except (TypeError, ValueError, OverflowError):
-        array = np.zeros(0)
-    if array.shape != shape or not np.isfinite(array).all() or array.size > 16:
-        raise CalibrationError(f"{where}: array of shape {array.shape}, expected {shape}, finite")
-    return array
 
 
 def _ava256_pictures(path: Path, name: str, wanted: list[Moment]) -> dict[Moment, str]:

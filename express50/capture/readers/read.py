@@ -97,7 +97,6 @@ def detect(path: Path, name: object = None) -> Layout:
     Raises:
         CaptureError: it does not exist, no layout has the name, or none fits.
     """
-    path = Path(path)
     if not path.exists():
         raise CaptureError(f"{path}: no such folder or file; expected a capture")
     names = [layout.name for layout in LAYOUTS]
@@ -116,19 +115,13 @@ def detect(path: Path, name: object = None) -> Layout:
 
 def is_ours(path: Path) -> bool:
     """Return whether a path is a capture in our own layout, or is meant as one."""
-    meta = _meta(path)
+    meta = read_capture_toml(path)
     if "source" in meta:
         return False
     if "layout" in meta or (path / "cameras").is_dir():
         return meta.get("layout", OURS) == OURS
     # A capture.toml alone marks it as ours; the error then names the missing file.
     return bool(meta) and not any(layout.fits(path) for layout in LAYOUTS)
-
-
-def _meta(path: Path) -> dict:
-    """Read a capture.toml; empty where there is none."""
-    file = path / "capture.toml"
-    return read_capture_toml(file) if file.is_file() else {}
 
 
 def subject_of(path: Path) -> str:
@@ -139,7 +132,7 @@ def subject_of(path: Path) -> str:
     """
     if is_ours(path):
         return read_meta(path)["subject"]
-    meta, source = _meta(path), footage_source(path)
+    meta, source = read_capture_toml(path), footage_source(path)
     layout = detect(source, meta.get("layout"))
     subject = meta.get("subject") or layout.subject_of(source)
     check_identity(path / "capture.toml" if path.is_dir() else path, subject, meta.get("fps", FPS))
@@ -153,10 +146,9 @@ def read_any(path: Path) -> RawCapture:
         CaptureError: it is not a capture, or nothing of it can be used.
         CalibrationError: its cameras are malformed or do not fit together.
     """
-    path = Path(path)
     if is_ours(path):
         return read_capture(path)
-    meta, source = _meta(path), footage_source(path)
+    meta, source = read_capture_toml(path), footage_source(path)
     layout = detect(source, meta.get("layout"))
     raw = layout.read(source, parse_selection(meta, path / "capture.toml"))
     subject, fps = meta.get("subject") or raw.subject, meta.get("fps", raw.fps)

@@ -177,23 +177,23 @@ def _frames(performance: Performance, selection: Selection) -> tuple[dict[str, l
     Raises:
         CaptureError: the file is damaged, or a scripted clip lacks its end, where its peak is.
     """
-    file, where = open_hdf5(performance.raw), str(performance.raw)
-    group = child(file, "Camera", where)
+    file = open_hdf5(performance.raw)
+    group = child(file, "Camera")
     if not isinstance(group, h5py.Group):
         raise CaptureError(f"{performance.raw}: has no Camera group; copy the file again")
     found: dict[str, list[int]] = {}
-    for name in members(group, where):
+    for name in members(group):
         if not name.isdecimal() or not selection.has_camera(f"cam{name}"):
             continue
-        colour = child(file, f"Camera/{name}/color", where)
-        keys = members(colour, where) if isinstance(colour, h5py.Group) else []
+        colour = child(file, f"Camera/{name}/color")
+        keys = members(colour) if isinstance(colour, h5py.Group) else []
         if keys:  # some have sound only
             numbers = [key for key in keys if key.isdecimal() and len(key) < 9]
             found[f"cam{name}"] = sorted(map(int, numbers))
     have = {key for keys in found.values() for key in keys}
     if not have:
         raise CaptureError(f"{performance.raw}: holds no picture; copy the file again")
-    stated = attribute(group, "num_frame", len(have), where)
+    stated = attribute(group, "num_frame", len(have))
     usable = stated.size == 1 and stated.dtype.kind in "ui"
     count = int(stated[0]) if usable else len(have)
     if performance.part.startswith("e") and max(have) != count - 1 and len(have) != count:
@@ -206,8 +206,8 @@ def _frames(performance: Performance, selection: Selection) -> tuple[dict[str, l
 
 def _person(performance: Performance) -> dict[str, object]:
     """Read age and gender, which dataset cards count; the rest about the body stays where it is."""
-    file, where = open_hdf5(performance.raw), str(performance.raw)
-    age, gender = attribute(file, "age", (), where), attribute(file, "gender", "", where).tolist()
+    file = open_hdf5(performance.raw)
+    age, gender = attribute(file, "age", ()), attribute(file, "gender", "").tolist()
     person: dict[str, object] = {}
     if age.size == 1 and age.dtype.kind in "ui" and 0 < age[0] < 130:
         person["age"] = int(age[0])
