@@ -278,7 +278,7 @@ def run_undo(args: argparse.Namespace) -> int:
     events = read_labels(args.dataset, args.subject)
     if last_event(events, args.expression, args.annotator) is None:
         raise AnnotationError(
-            f"{args.subject} {args.expression}: {args.annotator} has nothing there to take back"
+            f"{args.subject} {args.expression}: {args.annotator} has no label on it to undo"
         )
     return _keep(args, undo, "took the last event back")
 

@@ -97,8 +97,8 @@ def make_mark(
     low, high = cue.start_frame if first is None else first, end if last is None else last
     if not cue.start_frame <= low <= frame <= high <= end:
         raise AnnotationError(
-            f"{index.subject} {expression}: frame {frame} lies outside its plateau {low} to {high},"
-            f" or that outside the cue window {cue.start_frame} to {end}"
+            f"{index.subject} {expression}: plateau {low} to {high} with peak frame {frame};"
+            f" expected first <= peak <= last, inside the cue window {cue.start_frame} to {end}"
         )
     return replace(
         make_event(index, expression, "mark", annotator),

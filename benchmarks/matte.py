@@ -38,7 +38,7 @@ from express50.contract.config import resolve_config
 from express50.contract.layout import Dataset
 from express50.files.images import srgb_to_linear
 from express50.geometry.cameras import pinhole
-from express50.geometry.conventions import undistort_image, undistorted_mask
+from express50.geometry.sampling import undistort_image, undistorted_mask
 from express50.twin.truth import Truth
 from pipelines.matte import STAGE
 from pipelines.matte.key import dilated, eroded, key_alpha

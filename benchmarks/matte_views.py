@@ -39,7 +39,7 @@ from express50.contract.config import resolve_config
 from express50.contract.layout import Dataset
 from express50.files.images import contact_sheet, write_image
 from express50.geometry.cameras import pinhole
-from express50.geometry.conventions import undistort_image, undistorted_mask
+from express50.geometry.sampling import undistort_image, undistorted_mask
 from express50.twin.config import TwinConfig
 from express50.twin.truth import Truth
 from pipelines.matte import STAGE

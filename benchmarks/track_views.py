@@ -22,8 +22,8 @@ from express50.contract.layout import Dataset
 from express50.files.containers import read_picture
 from express50.files.images import LIGHT_OF_LEVEL, linear_to_srgb
 from express50.geometry.cameras import Camera, pinhole, unproject
-from express50.geometry.conventions import undistort_image
 from express50.geometry.raycast import visible_faces
+from express50.geometry.sampling import undistort_image
 from express50.head.model import HeadModel
 from express50.twin.truth import Truth
 from pipelines.track.surface import Visibility, look_up

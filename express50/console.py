@@ -39,10 +39,14 @@ def run_handler(
         place = f" {error.filename}:" if error.filename is not None else ""
         words = error.strerror or str(error) or "no reason given"
         words = f"{type(error).__name__}:{place} {words}"
-        sys.stderr.write(f"{program}: {words}; is the path right, may it be read and written?\n")
+        sys.stderr.write(
+            f"{program}: {words}; check the path, its permissions and the free disk space\n"
+        )
         return FAILED
     except KeyboardInterrupt:
-        sys.stderr.write(f"{program}: stopped; what is finished is kept, run the same to go on\n")
+        sys.stderr.write(
+            f"{program}: interrupted; finished work is kept, run the same command to continue\n"
+        )
         return INTERRUPTED
 
 

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from express50.errors import HeadModelError
+from express50.geometry.conventions import cell_to_corner, corner_to_cell
 from express50.head.model import HeadModel
 
 NEEDLE_AREA = 1e-14  # of a UV or 3D triangle; below it no direction on it is trustworthy
@@ -44,7 +45,7 @@ def make_anchors(head: HeadModel, n_g: int, mouth: bool = True) -> Anchors:
     corners = head.uv.double()[head.uv_faces].cpu()  # (F, 3, 2)
     grid = torch.stack([corners[..., 0] * n_g, (1 - corners[..., 1]) * n_g], -1)
     face, column, row = _candidate_texels(grid, n_g)
-    centre = torch.stack([column, row], -1).double() + 0.5
+    centre = cell_to_corner(torch.stack([column, row], -1).double())
     weights = _barycentrics(grid[face], centre)
     inside = (weights >= 0).all(1)
     if not mouth:
@@ -71,8 +72,8 @@ def mouth_faces(head: HeadModel) -> Tensor:
 
 def _candidate_texels(grid: Tensor, n_g: int) -> tuple[Tensor, Tensor, Tensor]:
     """List face, column and row of every texel whose centre lies in a triangle's bounding box."""
-    low = torch.ceil(grid.amin(1) - 0.5).clamp(0, n_g).long()  # (F, 2) as (column, row)
-    high = torch.floor(grid.amax(1) - 0.5).clamp(-1, n_g - 1).long()
+    low = torch.ceil(corner_to_cell(grid.amin(1))).clamp(0, n_g).long()  # (F, 2) as (column, row)
+    high = torch.floor(corner_to_cell(grid.amax(1))).clamp(-1, n_g - 1).long()
     size = (high - low + 1).clamp_min(0)
     count = size[:, 0] * size[:, 1]
     face = torch.repeat_interleave(torch.arange(len(grid)), count)

@@ -18,6 +18,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from express50.contract.segmentation_labels import TORSO
+from express50.geometry.conventions import cell_to_corner
 from express50.head.model import HeadModel
 from grmm.model import GRMM, Gaussians, PinholeView, Rendering
 from grmm.rasterize.projection import ALPHA_MIN, NEAR_M
@@ -173,8 +174,8 @@ def torso_mask(
     rows, columns = np.nonzero(foreground)
     K, camera = view.K.cpu().numpy(), view.cam_from_head.cpu().numpy()
     z = _filled(depth, foreground, vertices, view)[rows, columns].astype(np.float64)
-    x = (columns + 0.5 - K[0, 2]) / K[0, 0] * z
-    y = (rows + 0.5 - K[1, 2]) / K[1, 1] * z
+    x = (cell_to_corner(columns) - K[0, 2]) / K[0, 0] * z
+    y = (cell_to_corner(rows) - K[1, 2]) / K[1, 1] * z
     points = (np.stack([x, y, z], 1) - camera[:3, 3]) @ camera[:3, :3]
     tree = cKDTree(vertices.detach().cpu().double().numpy())
     distance, nearest = tree.query(points)

@@ -63,8 +63,8 @@ def evaluate_unseen(
     ]
     if not own:
         raise ConfigError(
-            f"{subject}: no view is left to measure: it is fitted from cameras "
-            f"{', '.join(sorted(cameras))}, and expressions must be {', '.join(sorted(known))}"
+            f"{subject}: no view is left to measure: cameras {', '.join(sorted(cameras))} are "
+            f"used for the fit, and only expressions {', '.join(sorted(known))} can be drawn"
         )
     state = start(loaded, views, given)
     _, effort = run_stages(state, lambda: {})

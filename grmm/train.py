@@ -108,7 +108,7 @@ def train(
             if rank == 0 and (due or last):
                 save(state, checkpoint, config, source.head)
                 saved = state.seconds
-            if interrupt.is_set():
+            if interrupt.is_set():  # only now, after the save
                 raise KeyboardInterrupt
     if world > 1:
         distributed.destroy_process_group()
@@ -119,7 +119,7 @@ def train(
     # --- The report ----------------------------------------------------------------------------
     metrics = report(state, config, out) if rank == 0 else {}
     if rank == 0 and float(str(metrics["psnr_train_db"])) < GREY_DB:
-        log("training pictures are worse than grey ones: it diverged; lower train.lr")
+        log("training images score worse than plain grey: training diverged; lower train.lr")
     return metrics
 
 

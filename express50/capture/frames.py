@@ -24,7 +24,7 @@ from express50.files.images import decode_image, read_image, upright
 from express50.files.text import read_json, read_json_table
 from express50.files.video import VideoReader
 from express50.geometry.cameras import Camera, pinhole
-from express50.geometry.conventions import undistort_image
+from express50.geometry.sampling import undistort_image
 
 
 def dhash(image: np.ndarray) -> str:

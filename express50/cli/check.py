@@ -124,9 +124,9 @@ def run_withdraw(args: argparse.Namespace) -> int:
     if done.capture:
         lines.append(f"the raw capture {done.capture} is outside the dataset: delete it yourself")
     lines.append(
-        "run 'express50 matte' again, as others' plates may have come from the person, then "
-        "the stages after it and 'express50 report'; train models that saw the person again "
-        "(their other weights keep an influence), and delete exports outside the dataset"
+        "run 'express50 run' to make again what was removed, then 'express50 report'; train "
+        "models that saw the person again (their other weights keep an influence), and delete "
+        "exports outside the dataset"
     )
     answer(args, data, *lines)
     return FAILED if done.remaining else OK

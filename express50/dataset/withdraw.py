@@ -76,7 +76,7 @@ def plan(dataset: Dataset, subject: str) -> list[Path]:
         there = ", ".join(sorted(known)) or "none"
         raise StageError(f"{dataset.root}: no subject {subject!r}; subjects: {there}")
     paths = sorted(_own_paths(dataset, subject)) + sorted(_mixed_paths(dataset))
-    # Others' outputs that name the subject: their reference's, or whose plate stood in.
+    # Others' outputs that name the subject, such as peaks matched to the reference person's.
     gone, naming = set(paths), []
     for path in files_that(names(subject), dataset.root):
         parts = path.relative_to(dataset.root).parts

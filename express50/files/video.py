@@ -95,7 +95,10 @@ def _pixels(path: Path, frame: av.VideoFrame) -> np.ndarray:
     """Convert a frame to (H, W, 3) uint8."""
     size = frame.width * frame.height
     if not 0 < size <= PIXEL_LIMIT:
-        raise CaptureError(f"{path}: a frame is {frame.width}x{frame.height}, over {PIXEL_LIMIT}")
+        raise CaptureError(
+            f"{path}: a frame is {frame.width}x{frame.height} pixels, expected at most"
+            f" {PIXEL_LIMIT} in all; encode it smaller"
+        )
     try:
         return frame.to_ndarray(format="rgb24")
     except DAMAGE as error:

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from express50.geometry.conventions import cell_centres
 from express50.geometry.shapes import check_shape
 
 # Where each COLMAP parameter goes: focal x, focal y, then OpenCV's k1 k2 p1 p2 k3 k4 k5 k6.
@@ -193,9 +194,7 @@ def rays(camera: Camera, stride: int = 1) -> tuple[np.ndarray, np.ndarray]:
 
     Directions have camera z 1, so that ``origin + depth * direction`` is the point at a depth.
     """
-    x, y = np.meshgrid(
-        np.arange(0, camera.width, stride) + 0.5, np.arange(0, camera.height, stride) + 0.5
-    )
+    x, y = np.meshgrid(cell_centres(camera.width)[::stride], cell_centres(camera.height)[::stride])
     pixels = np.stack([x.ravel(), y.ravel()], axis=1)
     ahead = unproject(camera, pixels, np.ones(len(pixels)))
     return camera.center, (ahead - camera.center).reshape(*x.shape, 3)

@@ -1,4 +1,4 @@
-"""Convert between pixel origins and camera axes; no other file shifts by half a pixel.
+"""Convert between pixel origins and camera axes; no other Python file shifts by half a pixel.
 
 Inside the project a pixel's origin is the image's corner (the first pixel's centre is
 (0.5, 0.5), as COLMAP and gsplat have it) and cameras have OpenCV axes. OpenCV's own functions
@@ -9,10 +9,7 @@ from __future__ import annotations
 
 from typing import TypeVar
 
-import cv2
 import numpy as np
-
-from express50.geometry.cameras import Camera
 
 Places = TypeVar("Places")
 FLIP_YZ = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -78,34 +75,3 @@ def cam_from_world_from_opengl(world_from_cam_gl: np.ndarray) -> np.ndarray:
 def opengl_from_cam_from_world(cam_from_world: np.ndarray) -> np.ndarray:
     """Return the OpenGL camera-to-world matrix (4, 4) of ``cam_from_world`` (4, 4), OpenCV axes."""
     return np.linalg.inv(np.asarray(cam_from_world, dtype=np.float64)) @ FLIP_YZ
-
-
-def undistort_maps(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """Map (H, W) x and y, float32, for ``cv2.remap`` from ``camera`` to its pinhole camera."""
-    K = K_to_opencv(camera.K)
-    return cv2.initUndistortRectifyMap(
-        K, camera.dist, None, K, (camera.width, camera.height), cv2.CV_32FC1
-    )
-
-
-def undistort_image(image: np.ndarray, camera: Camera) -> np.ndarray:
-    """Return image (H, W[, C]) as the pinhole camera ``pinhole(camera)`` would see it; 0 outside.
-
-    Raises:
-        ValueError: the image's size is not the camera's.
-    """
-    if image.shape[:2] != (camera.height, camera.width):
-        raise ValueError(
-            f"camera {camera.id}: image is {image.shape[1]}x{image.shape[0]},"
-            f" expected {camera.width}x{camera.height}"
-        )
-    if not camera.dist.any():
-        return image
-    x, y = undistort_maps(camera)
-    return cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
-
-
-def undistorted_mask(camera: Camera) -> np.ndarray:
-    """Return pixels (H, W), bool, of the pinhole camera that the distorted image really covers."""
-    x, y = undistort_maps(camera)
-    return (x >= 0) & (y >= 0) & (x <= camera.width - 1) & (y <= camera.height - 1)

@@ -1,14 +1,46 @@
-"""Interpolate: bilinear values of an image, a smooth step, spherical harmonics."""
+"""Resample: undistorted images, bilinear values, a smooth step, spherical harmonics."""
 
 from __future__ import annotations
 
 import cv2
 import numpy as np
 
-from express50.geometry.conventions import corner_to_cell
+from express50.geometry.cameras import Camera
+from express50.geometry.conventions import K_to_opencv, corner_to_cell
 
 # cv2.remap takes at most 32767 rows and columns; this many points per call fit the cache.
 _COLUMNS, _ROWS = 4096, 2048
+
+
+def undistort_maps(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """Map (H, W) x and y, float32, for ``cv2.remap`` from ``camera`` to its pinhole camera."""
+    K = K_to_opencv(camera.K)
+    return cv2.initUndistortRectifyMap(
+        K, camera.dist, None, K, (camera.width, camera.height), cv2.CV_32FC1
+    )
+
+
+def undistort_image(image: np.ndarray, camera: Camera) -> np.ndarray:
+    """Return image (H, W[, C]) as the pinhole camera ``pinhole(camera)`` would see it; 0 outside.
+
+    Raises:
+        ValueError: the image's size is not the camera's.
+    """
+    if image.shape[:2] != (camera.height, camera.width):
+        raise ValueError(
+            f"camera {camera.id}: image is {image.shape[1]}x{image.shape[0]},"
+            f" expected {camera.width}x{camera.height}"
+        )
+    if not camera.dist.any():
+        return image
+    x, y = undistort_maps(camera)
+    return cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
+
+
+def undistorted_mask(camera: Camera) -> np.ndarray:
+    """Return pixels (H, W), bool, of the pinhole camera that the distorted image really covers."""
+    x, y = undistort_maps(camera)
+    return (x >= 0) & (y >= 0) & (x <= camera.width - 1) & (y <= camera.height - 1)
 
 
 def bilinear(image: np.ndarray, points: np.ndarray) -> np.ndarray:

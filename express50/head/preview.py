@@ -9,6 +9,7 @@ import open3d as o3d
 import torch
 
 from express50.errors import HeadModelError
+from express50.geometry.conventions import cell_centres
 from express50.geometry.raycast import mesh_scene
 from express50.head.model import HeadModel, pose, vertex_normals
 
@@ -104,7 +105,7 @@ def _camera(yaw: float, side: int) -> tuple[Array, Array, tuple[Array, Array, Ar
     back, right = np.array([np.sin(a), 0.0, np.cos(a)]), np.array([np.cos(a), 0.0, -np.sin(a)])
     up = np.cross(back, right)
     origin = np.array(_CENTER) + _AWAY * back
-    step = (np.arange(side) + 0.5) / side * _SPAN - _SPAN / 2
+    step = cell_centres(side) / side * _SPAN - _SPAN / 2
     x, y = np.meshgrid(step, -step)
     directions = x[..., None] * right + y[..., None] * up - _AWAY * back
     directions /= np.linalg.norm(directions, axis=-1, keepdims=True)

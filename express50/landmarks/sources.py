@@ -163,8 +163,8 @@ def read_points(path: Path, cameras: Mapping[str, Camera]) -> Table:
     if not any(camera_id in cameras for camera_id, _ in raw):
         names = sorted({camera_id for camera_id, _ in raw})
         raise FormatError(
-            f"{path}: is of cameras {', '.join(names[:6]) or 'none'}; expected some of "
-            f"{', '.join(list(cameras)[:6])}"
+            f"{path}: holds landmarks of cameras {', '.join(names[:6]) or 'none'}; expected some"
+            f" of {', '.join(list(cameras)[:6])}"
         )
     table = {}
     for key, read in raw.items():
@@ -219,8 +219,8 @@ def _checked(rows: np.ndarray, camera: Camera, path: Path, key: tuple[str, int])
     known = np.isfinite(rows[:, :2]).all(1)
     if np.isinf(rows).any() or not np.isfinite(rows[known, 2]).all():
         raise FormatError(
-            f"{where}: holds infinite numbers or a confidence that is none; say NaN (null in JSON) "
-            "for an unknown point"
+            f"{where}: a value is infinite, or a known point has no confidence; write NaN (null in "
+            "JSON) for an unknown point"
         )
     if ((rows[known, 2] < 0) | (rows[known, 2] > 1)).any():
         raise FormatError(f"{where}: confidence is out of range, expected 0 to 1")

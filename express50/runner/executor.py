@@ -205,7 +205,7 @@ def _ended(
 def _killed(task: Task, attempts: int, job: SlurmJob | None) -> Receipt:
     why, fix = "out of memory or a crash in native code", "give it more memory"
     if job is not None:
-        why, fix = f"{why}, or its job's {job.time} were over", f"{fix} than {job.memory} or time"
+        why, fix = f"{why}, or its job reached {job.time}", f"{fix} than {job.memory}, or more time"
     reason = (
         f"its worker process died {attempts} times ({why}); run "
         f"this item with --workers 0 to see, or {fix}"

@@ -63,9 +63,9 @@ class SlurmJob:
     def __post_init__(self) -> None:
         """Check forms and ranges."""
         if not TIME.fullmatch(self.time):
-            raise ValueError(f"time is {self.time!r}, expected such as 4:00:00 or 1-12:00:00")
+            raise ValueError(f"time is {self.time!r}, expected a time like 4:00:00 or 1-12:00:00")
         if not MEMORY.fullmatch(self.memory):
-            raise ValueError(f"memory is {self.memory!r}, expected such as 16G")
+            raise ValueError(f"memory is {self.memory!r}, expected a size like 16G")
         if self.cores < 1 or self.jobs < 1:
             raise ValueError(f"cores {self.cores}, jobs {self.jobs}: expected at least 1")
         if self.gpus not in (0, 1):
@@ -113,7 +113,7 @@ def read_slurm(text: str, stages: Iterable[str]) -> dict[str, SlurmJob]:
         missing = [key for key in ("time", "memory") if key not in merged]
         if missing:
             raise ConfigError(
-                f"--slurm {text}: no {' and no '.join(missing)}; expected such as "
+                f"--slurm {text}: no {' and no '.join(missing)}; expected something like "
                 "partition=cpu,time=4:00:00,memory=16G,cores=4,jobs=8, or a file jobs.toml of these"
             )
         jobs[name] = build_dataclass("slurm", SlurmJob, merged, hint=hint)

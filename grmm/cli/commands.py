@@ -221,8 +221,8 @@ def _split(
         return known, unseen
     if not known:
         raise ConfigError(
-            f"{args.shards}: training saw none of {', '.join(unseen) or args.expressions}; "
-            "people whom it never saw are fitted first: name --fit-cameras"
+            f"{args.shards}: the model was not trained on {', '.join(unseen) or args.expressions}; "
+            "give --fit-cameras to fit such people first"
         )
     return known, {}
 

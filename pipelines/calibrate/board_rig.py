@@ -108,8 +108,9 @@ def _require(cameras: Mapping[str, object], dropped: Mapping[str, str]) -> None:
     if not cameras:
         reasons = "; ".join(f"{name}: {why}" for name, why in sorted(dropped.items()))
         raise CalibrationError(
-            f"no camera can be calibrated from the board ({reasons}); record the board again, "
-            "large in view, tilted in turn to all sides, before neighbouring cameras at once"
+            f"no camera can be calibrated from the board ({reasons}); record the board again: "
+            "fill much of the picture, tilt it to every side, and show it to neighbouring cameras"
+            " at the same time"
         )
 
 

@@ -38,7 +38,7 @@ class CalibrateConfig:
     refine_move_mm: float = 3.0
     """How far given cameras may have moved, without a board (a standard deviation)."""
     check_frame_sets: int = 2
-    """Frame sets in which cameras that have moved are searched; 0 does not search."""
+    """Number of frame sets in which to look for cameras that have moved; 0: no check."""
 
     def __post_init__(self) -> None:
         """Check names and ranges."""

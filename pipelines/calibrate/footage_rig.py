@@ -103,8 +103,8 @@ def solve_footage(
     faces = {name for points in seen.values() for name, _, _ in points.landmarks}
     if len(rig) < 2:
         raise CalibrationError(
-            f"{where}: has neither calibration.json nor board images, and to solve its cameras from"
-            f" footage two or more must see a face at the same time; a face is seen by"
+            f"{where}: has neither calibration.json nor board images, and solving from footage"
+            f" needs two cameras that see a face at the same time; a face is seen by"
             f" {', '.join(sorted(faces)) or 'none'}: add calibration.json or board/<camera>/*.png"
             " with board.toml, then run 'express50 ingest' again"
         )

@@ -100,7 +100,7 @@ def _write(rig: CalibratedRig, check: FootageCheck | None, out: Path) -> Result:
             "spread_percent": _rounded(rig.gains.before, 3),
             "spread_evened_percent": _rounded(rig.gains.after, 3),
             "squares": rig.gains.squares,
-            "untold": [name for name in names if name not in gains],
+            "unjudged": [name for name in names if name not in gains],
         }
     moved = [
         Note(
@@ -248,9 +248,9 @@ def _from_footage(index: Index, config: CalibrateConfig) -> CalibratedRig:
     check_meeting(cameras, str(index.capture))
     squared, good = np.sum(solved.errors**2, axis=1), solved.inliers
     scale = (
-        f"taken from the distance between the eyes, assumed to be {config.eye_distance_mm:g} mm:"
-        " adults' differ by 12 % (two standard deviations); measure it and set"
-        " calibrate.eye_distance_mm, or bring a board"
+        "the scale comes from an assumed distance between the eyes of"
+        f" {config.eye_distance_mm:g} mm; adults' differ by 12 % (two standard deviations). Measure"
+        " it and set calibrate.eye_distance_mm, or record a board"
     )
     return CalibratedRig(
         source="footage",

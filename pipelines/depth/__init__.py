@@ -38,7 +38,7 @@ def run(dataset: Dataset, item: str, config: DepthConfig, out: Path) -> Result:
 
 STAGE = Stage(
     name="depth",
-    version=8,
+    version=9,
     config=DepthConfig,
     presets=PRESETS,
     items=peak_items,

@@ -153,9 +153,9 @@ def assemble(
         count += len(blocks[-1])
         if (count - HELD) * BLOCK**3 > VOXEL_LIMIT:
             raise StageError(
-                f"the surface takes more than {VOXEL_LIMIT:.2g} voxels of {voxel * 1e3:.3g} mm,"
-                " expected a head, which takes 3 million of 1.6 mm; is the calibration in metres?"
-                " If it is, raise depth.voxel_mm or depth.voxel_px"
+                f"the surface needs more than {VOXEL_LIMIT:.2g} voxels of {voxel * 1e3:.3g} mm;"
+                " a head needs about 3 million of 1.6 mm. Check that the calibration is in metres;"
+                " if it is, raise depth.voxel_mm or depth.voxel_px"
             )
     return LevelSet(origin, voxel, shape, table, np.concatenate(blocks))
 

@@ -96,7 +96,8 @@ def read_tracked(
     subject, expression = item.split("/")
     path = dataset.track_file(subject)
     if least is None or not path.is_file():
-        return None, {"used": False, "why": "use_track" if least is None else "there is none"}
+        why = "depth.use_track is off" if least is None else "it is not tracked"
+        return None, {"used": False, "why": why}
     track = read_track(path)
     if expression not in track.expressions:
         return None, {"used": False, "why": f"{expression} is not tracked"}

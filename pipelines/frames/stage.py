@@ -16,7 +16,7 @@ from express50.contract.stage import Note, Result
 from express50.errors import CaptureError, StageError
 from express50.files.containers import to_srgb
 from express50.files.images import shrink, tile_sheet, write_image
-from express50.geometry.conventions import undistort_image
+from express50.geometry.sampling import undistort_image
 
 COLUMNS = 6  # of the contact sheet
 TILE = 240  # pixels

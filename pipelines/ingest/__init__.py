@@ -55,7 +55,7 @@ def account(dataset: Dataset, subjects: Sequence[str]) -> Iterator[str]:
 
 STAGE = Stage(
     name="ingest",
-    version=4,
+    version=5,
     config=IngestConfig,
     presets=PRESETS,
     items=items,

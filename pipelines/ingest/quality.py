@@ -101,7 +101,7 @@ def check_quality(
         "sync": {
             "out_of_step": {k: [asdict(s) for s in v] for k, v in steps.items()},
             "repeats": stuck,
-            "untold": unjudged,
+            "unjudged": unjudged,
         },
         "light": {k: asdict(d) if d else None for k, d in drifts.items()},
         "focus_px": widths,

@@ -52,7 +52,7 @@ STAGE = Stage(
     needs_gpu=needs_gpu,
     help="separate the head from the background in every camera, and let the cameras agree",
     purpose="The opacity of the subject in every peak frame, keyed per camera; what the other"
-    " cameras ruled out is red, what they filled is green.",
+    " cameras ruled out is red in the pictures, what they filled green.",
     growth=Growth(
         items=("subjects", "expressions"), time=("views", "pixels"), disk=("views", "pixels")
     ),

@@ -49,8 +49,9 @@ class Misfit:
     def words(self) -> str:
         """Describe the misfit for people."""
         return (
-            f"its matte lacks {self.lacking:.0%} of what the others see, and {self.stray:.0%} of it"
-            " lies elsewhere; was the camera moved? left as it was"
+            f"its matte misses {self.lacking:.0%} of the subject that the other cameras see, and"
+            f" {self.stray:.0%} of it lies outside; check whether the camera moved. The matte was"
+            " not changed"
         )
 
 
@@ -93,7 +94,7 @@ def _named(doubted: dict[str, str]) -> list[Note]:
 def _useless(view: MatteView) -> str:
     """Say why a view cannot judge the other mattes; empty where it can."""
     if view.projection[2, 3] <= 1:  # radii from the ball's centre, along its axis
-        return "it stands amid what the others look at, or looks away; left as it was"
+        return "it stands inside what the others look at, or faces away; its matte was not changed"
     share = float((view.alpha[view.valid] > INSIDE).mean()) if view.valid.any() else 0.0
     if share < EMPTY:
         return f"its matte is empty ({share:.2%} of the image)"

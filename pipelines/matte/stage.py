@@ -15,7 +15,7 @@ from express50.contract.stage import Note, Result
 from express50.errors import CaptureError, NoFaceError, StageError
 from express50.files.images import shrink, tile_sheet, write_image
 from express50.geometry.cameras import Camera, pinhole, resized
-from express50.geometry.conventions import undistorted_mask
+from express50.geometry.sampling import undistorted_mask
 from pipelines.matte.config import WITHOUT_PLATE, MatteConfig
 from pipelines.matte.consensus import Agreement, agree
 from pipelines.matte.key import key_alpha
@@ -50,7 +50,8 @@ def run(dataset: Dataset, item: str, config: MatteConfig, out: Path) -> Result:
     subject, expression = item.split("/")
     matter, plated = _matter(config), config.method not in WITHOUT_PLATE
     cameras = read_cameras_of(dataset, subject, undistorted=False)
-    ball = ball_of(cameras) if config.agree else None
+    ball = ball_of(cameras)
+    compares = config.agree and ball is not None
     alphas: dict[str, np.ndarray] = {}
     views: list[MatteView] = []
     dropped: list[Note] = []
@@ -65,13 +66,17 @@ def run(dataset: Dataset, item: str, config: MatteConfig, out: Path) -> Result:
             dropped.append(Note(name, str(error)))
             continue
         alphas[name] = np.rint(alpha * 255).astype(np.uint8)
-        views.append(make_view(camera, ball or Ball(np.zeros(3), 1.0), frame, alphas[name],
-                               config.side))  # fmt: skip
+        # Without a common place to look at, a view is only for the picture.
+        place = ball or Ball(np.zeros(3), 1.0)
+        views.append(make_view(camera, place, frame, alphas[name], config.side))
     if not alphas:
         raise StageError(f"{item}: {dropped[0].why if dropped else 'no camera is calibrated'}")
-    found = agree(views, config.cells, config.strand) if ball else Agreement(
-        unchanged="the cameras do not look at one place" if config.agree else "matte.agree is off"
-    )  # fmt: skip
+    if compares:
+        found = agree(views, config.cells, config.strand)
+    elif config.agree:
+        found = Agreement(unchanged="the cameras do not look at one place")
+    else:
+        found = Agreement(unchanged="matte.agree is off")
     final = {
         name: corrected(alpha, found.removed.get(name), found.filled.get(name))
         for name, alpha in alphas.items()
@@ -81,7 +86,7 @@ def run(dataset: Dataset, item: str, config: MatteConfig, out: Path) -> Result:
     _write_picture(out, views, found)
     figures = {
         "method": config.method,
-        "views": len(views) if ball else 0,
+        "views": len(views) if compares else 0,
         "coverage": {name: round(float(a.mean()) / 255, 6) for name, a in final.items()},
         "border_contact": {name: border_contact(alpha) for name, alpha in final.items()},
         "removed": {name: _share(alphas[name], final[name]) for name in found.removed},

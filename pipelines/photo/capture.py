@@ -28,6 +28,7 @@ from express50.files.digests import file_sha256
 from express50.files.images import ORIENTATION, encode_png, read_exif, upright
 from express50.files.video import VideoFootage, iterate_video, video_fps, video_turn
 from express50.geometry.cameras import Camera, pinhole_camera
+from express50.geometry.conventions import FLIP_YZ
 from express50.head.load import load_head
 from express50.head.model import landmarks
 from express50.landmarks.detector import Detection, detect
@@ -59,7 +60,7 @@ INDEPENDENT = 0.25
 AS_GOOD = 2.0
 CONSTRAINED_FACTOR = 1.6
 # World of a single camera: at the camera, y up, the camera looks along -z.
-CAM_FROM_WORLD = np.diag([1.0, -1.0, -1.0, 1.0])
+CAM_FROM_WORLD = FLIP_YZ
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from typing import Literal
 
 from express50.errors import ConfigError
 
-VERSION = 12
+VERSION = 13
 UV_WEIGHTS = Path(__file__).with_name("face_uv_weights.npz")
 
 
@@ -26,7 +26,7 @@ class TrackConfig:
     stride: int = 1
     """Track every n-th frame of a clip."""
     neutral: str = "neutral"
-    """Expression id of the resting face; none need exist."""
+    """Expression id of the resting face; it need not exist."""
     cameras: int = 0
     """Cameras whose landmarks are used at the peaks, those that see the face best; 0 uses all.
     Clips use all."""

@@ -102,19 +102,20 @@ def run(
     suspects = suspect_cameras(targets, marks, turns, meshes.mean(1))
     metrics |= {"schedule": schedule_table(schedule), "suspect_cameras": suspects}
     if config.frames == "clips":
+        shape = split_shape(basis.model, state.shape)[0]
         tracker = ClipTracker(
             freeze_shape(basis, state.shape, state.bias), config.stride, eyes, evidence.skin,
             evidence.uv_map, config.clip_rounds,
         )  # fmt: skip
-        shape = split_shape(basis.model, state.shape)[0]
-        # The peaks' fit follows from the inputs and settings, up to how the machine rounds.
+        read = partial(read_clip, dataset, item, source, peaks, config.photo_side)
+        # Windows that a stopped run finished are taken over if this digest is the same. The peaks'
+        # fit follows from inputs and settings, up to how the machine rounds.
         fitted = (shape.tobytes(), state.bias.tobytes(), eyes and vars(eyes))
         digests = {k: path_digest(v) if isinstance(v, Path) else v for k, v in inputs.items()}
+        identity = repr((value_digest(digests), asdict(config), fitted))
         metrics["clips"], lost = write_clips(
-            out, tracker, config.head, shape, read_index(dataset, item).cues,
-            partial(read_clip, dataset, item, source, peaks, config.photo_side),
-            dataset.windows_dir(item),
-            repr((value_digest(digests), asdict(config), fitted)),
+            out, tracker, config.head, shape, read_index(dataset, item).cues, read,
+            dataset.windows_dir(item), identity,
         )  # fmt: skip
         dropped += lost
     return Result(metrics, dropped, camera_warnings(suspects))

@@ -67,7 +67,7 @@ class Term(Protocol):
 
     @property
     def anchors(self) -> MeshPlaces:
-        """Return the number of places."""
+        """Return the places that the residuals are about."""
 
     def residuals(self, places: np.ndarray) -> Residuals:
         """Evaluate at places (n, 3), world."""

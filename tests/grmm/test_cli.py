@@ -146,7 +146,7 @@ def test_export_writes_the_same_gaussians_as_ply_and_npz(checkpoint, tmp_path):
         (["train", "{shards}", "{out}", *TINY, "--set=loss.ssim=-1"], 2, "loss.ssim is -1"),
         (["train", "{shards}", "{out}", *TINY, "--set=train.lr=-1"], 2, "train.lr is -1"),
         (["evaluate", "{checkpoint}", "{shards}", "{out}", "--subjects=S002"], 2,
-         "name --fit-cameras"),
+         "--fit-cameras"),
         (["evaluate", "{checkpoint}", "{shards}", "{out}", "--heldout", "--cameras=cam00"], 2,
          "training saw all"),
         (["evaluate", "{checkpoint}", "{shards}", "{out}", "--subjects=S002", "--cameras=cam00",

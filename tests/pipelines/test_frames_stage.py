@@ -21,7 +21,7 @@ from express50.contract.layout import PLATES
 from express50.errors import CaptureError
 from express50.files.calibration import write_cameras
 from express50.files.images import read_image, write_image
-from express50.geometry.conventions import undistort_image
+from express50.geometry.sampling import undistort_image
 from express50.runner.runner import run_stage
 from pipelines.frames import STAGE
 from tests.pipelines.test_matte_stage import make_dataset

@@ -174,7 +174,7 @@ def _multiface_cameras(path: Path) -> dict[str, Camera]:
     for block in re.split(r"\n\s*\n", text.strip()):
         name, *rows = [line.strip() for line in block.splitlines()] or [""]
         if not NAME.fullmatch(name):
-            raise CalibrationError(f"{path}: camera {name[:40]!r}, expected such as 400002")
+            raise CalibrationError(f"{path}: camera {name[:40]!r}, expected an id like 400002")
         try:
             table = [np.array(row.split(), dtype=np.float64) for row in rows]
         except ValueError:

@@ -72,7 +72,7 @@ def _parts(file: Path) -> tuple[str, str, str]:
     match = NAME.fullmatch(file.stem)
     if match is None:
         raise CaptureError(
-            f"{file}: name is not a performance of RenderMe-360; expected such as 0026_e0_raw.smc"
+            f"{file}: name is not a performance of RenderMe-360; expected one like 0026_e0_raw.smc"
         )
     return match[1], match[2], match[3] or ""
 

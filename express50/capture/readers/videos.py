@@ -178,7 +178,7 @@ def read_actor(path: Path, selection: Selection) -> RawCapture:
             taken[clip.sequence] = clip, file.name
     if not taken:
         raise CaptureError(
-            f"{path}: no clip can be used; expected such as 01-01-03-02-01-01-05.mp4"
+            f"{path}: no clip can be used; expected names like 01-01-03-02-01-01-05.mp4"
         )
     rows = sorted(taken.values())
     root = path if path.is_dir() else path.parent

@@ -23,7 +23,7 @@ from express50.files.calibration import write_cameras
 from express50.files.containers import to_srgb
 from express50.files.images import write_image
 from express50.files.video import VideoReader
-from express50.geometry.conventions import undistort_image
+from express50.geometry.sampling import undistort_image
 from express50.runner.runner import run_stage
 from pipelines import ingest
 from tests.synth import make_capture, make_rig, render_ball

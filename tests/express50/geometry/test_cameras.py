@@ -8,8 +8,7 @@ from hypothesis import strategies as st
 
 from express50.errors import CalibrationError
 from express50.files import calibration as calibration_file
-from express50.geometry import cameras, transforms
-from express50.geometry import conventions as adapters
+from express50.geometry import cameras, conventions, sampling, transforms
 from express50.geometry.cameras import Camera
 
 POSE = transforms.look_at(np.array([0.1, 0.2, 1.0]), np.zeros(3), np.array([0.0, 1.0, 0.0]))
@@ -20,10 +19,10 @@ POINTS = np.random.default_rng(0).normal(size=(20, 3)) * 0.1
 def test_project_agrees_with_opencv():
     R, t = POSE[:3, :3], POSE[:3, 3]
     theirs = cv2.projectPoints(
-        POINTS, cv2.Rodrigues(R)[0], t, adapters.K_to_opencv(OPENCV.K), OPENCV.dist
+        POINTS, cv2.Rodrigues(R)[0], t, conventions.K_to_opencv(OPENCV.K), OPENCV.dist
     )[0][:, 0]
     ours, depth = cameras.project(OPENCV, POINTS)
-    np.testing.assert_allclose(ours, adapters.opencv_pixels_to_corner(theirs), atol=1e-9)
+    np.testing.assert_allclose(ours, conventions.opencv_pixels_to_corner(theirs), atol=1e-9)
     assert (depth > 0).all()
 
 
@@ -113,7 +112,7 @@ def test_undistort_image_moves_features_to_the_pinhole_projection():
     y, x = np.mgrid[:160, :200] + 0.5
     spot = cameras.project(camera, point)[0][0]
     image[:] = np.exp(-((x - spot[0]) ** 2 + (y - spot[1]) ** 2) / 8)
-    flat = adapters.undistort_image(image, camera)
+    flat = sampling.undistort_image(image, camera)
     centroid = np.array([(flat * x).sum(), (flat * y).sum()]) / flat.sum()
     np.testing.assert_allclose(
         centroid, cameras.project(cameras.pinhole(camera), point)[0][0], atol=0.15

@@ -33,12 +33,11 @@ from express50.landmarks.training.random_heads import random_head, random_parame
 from express50.landmarks.training.views import (
     FACE_YAW,
     HeadScene,
-    ViewSet,
+    TrainingView,
     draw_views,
     draw_yaws,
     make_backgrounds,
     random_crop,
-    stack_views,
 )
 
 
@@ -135,11 +134,11 @@ def test_crops_move_points_with_the_picture() -> None:
     x, y = points[30].astype(int)
     rgba[y - 3 : y + 4, x - 3 : x + 4, :3] = 255
     points[30] = [x + 0.5, y + 0.5]
-    views = ViewSet(rgba[None], points[None], np.ones((1, 68), bool), np.ones(1, np.float32))
+    view = TrainingView(rgba, points, np.ones(68, bool), np.float32(1))
     backgrounds = make_backgrounds(2, rng) // 16
     errors = []
     for _ in range(40):
-        crop = random_crop(views, 0, backgrounds, rng)
+        crop = random_crop(view, backgrounds, rng)
         image = crop.image.astype(float).mean(2)
         bright = image > 0.5 * (image.max() + np.median(image))
         if crop.weight == 0 or bright.sum() < 6 or bright.sum() > 2500:
@@ -177,32 +176,33 @@ def test_pictures_without_a_head_score_low(
 
 
 @pytest.fixture(scope="module")
-def unseen_views() -> ViewSet:
+def unseen_views() -> list[TrainingView]:
     """Renders of procedural heads with a seed that training never uses: front to profile."""
     model = load_head("procedural")
     rng = np.random.default_rng(987_654)
-    views = []
-    for yaw in np.radians([0, 12, -15, 25, -30, 45, -50, 60, 85, -88]):
-        views.append(HeadScene(model, random_head(model, rng)).render(rng, 208, float(yaw)))
-    return stack_views(views)
+    return [
+        HeadScene(model, random_head(model, rng)).render(rng, 208, float(yaw))
+        for yaw in np.radians([0, 12, -15, 25, -30, 45, -50, 60, 85, -88])
+    ]
 
 
 def test_views_are_drawn_the_same_again_and_from_all_around() -> None:
     model = load_head("procedural")
-    first, again = (stack_views(draw_views(model, 2, np.random.default_rng(5))) for _ in range(2))
-    for name, value in vars(first).items():
-        np.testing.assert_array_equal(value, getattr(again, name))
+    first, again = (draw_views(model, 2, np.random.default_rng(5)) for _ in range(2))
+    for view, same in zip(first, again, strict=True):
+        for name, value in vars(view).items():
+            np.testing.assert_array_equal(value, getattr(same, name))
     yaws = np.stack([draw_yaws(np.random.default_rng(seed)) for seed in range(200)])
     front = np.histogram(yaws[:, :-1], bins=5, range=(-FACE_YAW, FACE_YAW))[0]
     assert (front == 200).all()
     assert (np.cos(yaws[:, -1]) < np.cos(FACE_YAW) + 1e-9).all()
 
 
-def test_crops_are_drawn_the_same_again(unseen_views: ViewSet) -> None:
+def test_crops_are_drawn_the_same_again(unseen_views: list[TrainingView]) -> None:
     backgrounds = make_backgrounds(2, np.random.default_rng(0))
     for size in (CROP, CROP // 2):
         first, again = (
-            random_crop(unseen_views, 3, backgrounds, np.random.default_rng(1), size)
+            random_crop(unseen_views[3], backgrounds, np.random.default_rng(1), size)
             for _ in range(2)
         )
         np.testing.assert_array_equal(first.image, again.image)
@@ -210,13 +210,13 @@ def test_crops_are_drawn_the_same_again(unseen_views: ViewSet) -> None:
         assert first.image.shape == (size, size, 3)
 
 
-def test_half_a_profile_is_hidden(unseen_views: ViewSet) -> None:
+def test_half_a_profile_is_hidden(unseen_views: list[TrainingView]) -> None:
     """From the subject's left, the right eye and the right of the jaw cannot be seen."""
-    left, right = unseen_views.visible[8], unseen_views.visible[9]
+    left, right = unseen_views[8].visible, unseen_views[9].visible
     for near in (left, right[MIRROR]):
         assert not near[[0, 1, 2, 36, 37, 41]].any()
         assert near[[12, 13, 14]].any()
-    assert unseen_views.visible[0, 27:36].mean() > 0.7
+    assert unseen_views[0].visible[27:36].mean() > 0.7
 
 
 def test_heads_play_the_script_and_wink() -> None:
@@ -246,40 +246,45 @@ def on_canvas(rgba: np.ndarray, seed: int, at: tuple[int, int], size: int = 400)
 
 
 def test_finds_heads_it_never_saw_anywhere_in_a_frame(
-    network: LandmarkNet, unseen_views: ViewSet
+    network: LandmarkNet, unseen_views: list[TrainingView]
 ) -> None:
     errors = []
-    for index in np.flatnonzero(unseen_views.facing > 0.6):
+    for index, view in enumerate(unseen_views):
+        if view.facing <= 0.6:
+            continue
         at = (13 * (index % 10), 190 - 17 * (index % 10))
-        found = detect(network, on_canvas(unseen_views.rgba[index], index, at))
-        truth = unseen_views.points[index] + at
+        found = detect(network, on_canvas(view.rgba, index, at))
+        truth = view.points + at
         _, side = face_box(truth)
         errors.append(np.linalg.norm(found.points - truth, axis=1)[17:].mean() / side)
     # Shares of the face box: 0.03 is two pixels of a face 70 pixels tall.
     assert np.median(errors) < 0.03
 
 
-def test_hidden_points_have_a_low_confidence(network: LandmarkNet, unseen_views: ViewSet) -> None:
+def test_hidden_points_have_a_low_confidence(
+    network: LandmarkNet, unseen_views: list[TrainingView]
+) -> None:
     seen, hidden = [], []
-    for index in np.flatnonzero(unseen_views.facing > 0.0):
-        found = detect(network, on_canvas(unseen_views.rgba[index], index, (90, 90)))
+    for index, view in enumerate(unseen_views):
+        if view.facing <= 0.0:
+            continue
+        found = detect(network, on_canvas(view.rgba, index, (90, 90)))
         share = found.confidence / max(found.score, 1e-6)
         assert ((share >= 0) & (share <= 1)).all()
-        seen += list(share[unseen_views.visible[index]])
-        hidden += list(share[~unseen_views.visible[index]])
+        seen += list(share[view.visible])
+        hidden += list(share[~view.visible])
     assert np.median(hidden) < 0.5 * np.median(seen)
 
 
 def test_profiles_are_found_and_backs_of_heads_are_not(
-    network: LandmarkNet, unseen_views: ViewSet
+    network: LandmarkNet, unseen_views: list[TrainingView]
 ) -> None:
     errors = []
     for index in (7, 8, 9):
-        found = detect(network, on_canvas(unseen_views.rgba[index], index, (90, 90)))
-        _, side = face_box(unseen_views.points[index])
-        errors.append(
-            np.median(np.linalg.norm(found.points - unseen_views.points[index] - 90, axis=1)) / side
-        )
+        view = unseen_views[index]
+        found = detect(network, on_canvas(view.rgba, index, (90, 90)))
+        _, side = face_box(view.points)
+        errors.append(np.median(np.linalg.norm(found.points - view.points - 90, axis=1)) / side)
     assert np.median(errors) < 0.045
     model, rng = load_head("procedural"), np.random.default_rng(31)
     for _ in range(4):
@@ -287,10 +292,10 @@ def test_profiles_are_found_and_backs_of_heads_are_not(
         assert detect(network, on_canvas(back.rgba, 1, (90, 90))).score < 0.3
 
 
-def test_points_follow_the_frame(network: LandmarkNet, unseen_views: ViewSet) -> None:
+def test_points_follow_the_frame(network: LandmarkNet, unseen_views: list[TrainingView]) -> None:
     """Shifting the frame shifts the points; doubling its size doubles them."""
-    index = int(np.argmax(unseen_views.facing))
-    frame = on_canvas(unseen_views.rgba[index], 3, (100, 90))
+    view = max(unseen_views, key=lambda one: one.facing)
+    frame = on_canvas(view.rgba, 3, (100, 90))
     found = detect(network, frame)
     moved = detect(network, np.roll(frame, (6, 9), axis=(0, 1)))
     assert np.median(np.linalg.norm(moved.points - found.points - [9, 6], axis=1)) < 1.0

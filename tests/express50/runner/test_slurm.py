@@ -111,9 +111,9 @@ def test_options_of_a_file_and_of_one_line(tmp_path):
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("memory=16G", "no time; expected such as partition=cpu,time=4:00:00"),
-        ("time=4h,memory=16G", "time is '4h', expected such as 4:00:00"),
-        ("time=4,memory=16", "memory is '16', expected such as 16G"),
+        ("memory=16G", "no time; .*partition=cpu,time=4:00:00"),
+        ("time=4h,memory=16G", "time is '4h', .*4:00:00"),
+        ("time=4,memory=16", "memory is '16', .*16G"),
         ("time=4,memory=16G,core=2", "unknown key slurm.core, did you mean 'cores'"),
         ("time=4,memory=16G,cores=two", r"slurm.cores: got 'two' \(str\), expected int"),
         ("time=4,memory=16G,gpus=2", "gpus is 2, expected 0 or 1; ask for more jobs"),
@@ -166,7 +166,7 @@ def test_items_of_a_job_at_its_time_limit_are_tried_again(cluster, tmp_path, mon
     assert max(receipts[name].attempts for name in names[:5]) == 2
     assert receipts["bad1"].attempts in (1, 2)
     reason = receipts["poison1"].reason
-    assert "died 2 times" in reason and "job's 10 were over" in reason
+    assert "died 2 times" in reason and "its job reached 10" in reason
     assert len(slurm_stand_in.pids(cluster)) >= 2
     (calm.root / "in" / "poison1.txt").unlink()
     run_stage(toy.STAGE, calm, toy.ToyConfig(seconds=0.4), workers=0, progress=False)
