@@ -18,11 +18,15 @@ def mesh_scene(vertices: np.ndarray, faces: np.ndarray) -> o3d.t.geometry.Raycas
     return scene
 
 
+def join_rays(origins: np.ndarray, directions: np.ndarray) -> o3d.core.Tensor:
+    """Make rays (..., 6) for Open3D of origins and directions (..., 3); one may be shared."""
+    both = np.broadcast_arrays(origins, directions)
+    return o3d.core.Tensor(np.concatenate(both, axis=-1, dtype=np.float32))
+
+
 def camera_rays(camera: Camera) -> o3d.core.Tensor:
     """Make a ray (H, W, 6) per pixel centre; distances along it are depth, camera z."""
-    origin, directions = rays(camera)
-    row = np.concatenate([np.broadcast_to(origin, directions.shape), directions], axis=-1)
-    return o3d.core.Tensor(row.astype(np.float32))
+    return join_rays(*rays(camera))
 
 
 def visible_faces(
@@ -42,9 +46,7 @@ def visible_faces(
     # Far from the origin float32 rays are too coarse: everything is cast about the mesh's centre.
     centre = vertices.mean(0)
     origin, directions = rays(camera)
-    start = np.broadcast_to(origin - centre, directions.shape)
-    cast = np.concatenate([start, directions], axis=-1).astype(np.float32)
-    hit = mesh_scene(vertices - centre, faces).cast_rays(o3d.core.Tensor(cast))
+    hit = mesh_scene(vertices - centre, faces).cast_rays(join_rays(origin - centre, directions))
     depth = hit["t_hit"].numpy().astype(np.float64)
     face = hit["primitive_ids"].numpy().astype(np.int64)
     return np.where(np.isfinite(depth), face, -1), depth

@@ -40,12 +40,12 @@ def quat_to_matrix(quats: np.ndarray) -> np.ndarray:
     if np.any(norm == 0.0):
         raise ValueError("quats holds a quaternion of zero length, expected non-zero")
     w, x, y, z = np.moveaxis(q / norm, -1, 0)
-    rows = [
-        np.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], axis=-1),
-        np.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], axis=-1),
-        np.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], axis=-1),
-    ]
-    return np.stack(rows, axis=-2)
+    entries = [
+        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
+    ]  # fmt: skip
+    return np.stack(entries, -1).reshape(*q.shape[:-1], 3, 3)
 
 
 def matrix_to_quat(R: np.ndarray) -> np.ndarray:
@@ -55,28 +55,22 @@ def matrix_to_quat(R: np.ndarray) -> np.ndarray:
     """
     m = np.asarray(R, dtype=np.float64)
     d0, d1, d2 = m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]
-    four_squares = np.stack(
-        [1 + d0 + d1 + d2, 1 + d0 - d1 - d2, 1 - d0 + d1 - d2, 1 - d0 - d1 + d2], -1
-    )
+    squares = [1 + d0 + d1 + d2, 1 + d0 - d1 - d2, 1 - d0 + d1 - d2, 1 - d0 - d1 + d2]
     x = m[..., 2, 1] - m[..., 1, 2]
     y = m[..., 0, 2] - m[..., 2, 0]
     z = m[..., 1, 0] - m[..., 0, 1]
     xy = m[..., 1, 0] + m[..., 0, 1]
     xz = m[..., 0, 2] + m[..., 2, 0]
     yz = m[..., 2, 1] + m[..., 1, 2]
-    branches = np.stack(
-        [
-            np.stack([four_squares[..., 0], x, y, z], -1),
-            np.stack([x, four_squares[..., 1], xy, xz], -1),
-            np.stack([y, xy, four_squares[..., 2], yz], -1),
-            np.stack([z, xz, yz, four_squares[..., 3]], -1),
-        ],
-        axis=-2,
-    )
-    best = np.argmax(four_squares, axis=-1)[..., None, None]
-    q = np.take_along_axis(branches, np.broadcast_to(best, (*best.shape[:-1], 4)), axis=-2)[
-        ..., 0, :
-    ]
+    entries = [
+        squares[0], x, y, z,
+        x, squares[1], xy, xz,
+        y, xy, squares[2], yz,
+        z, xz, yz, squares[3],
+    ]  # fmt: skip
+    branches = np.stack(entries, -1).reshape(*m.shape[:-2], 4, 4)
+    best = np.argmax(squares, axis=0)[..., None, None]
+    q = np.take_along_axis(branches, best, axis=-2)[..., 0, :]
     q = q / np.linalg.norm(q, axis=-1, keepdims=True)
     return np.where(q[..., :1] < 0, -q, q)
 
@@ -144,15 +138,12 @@ def rigid_fit(
     source: np.ndarray, target: np.ndarray, weights: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Fit R (3, 3) and t (3,) that take ``source`` (N, 3) to ``target`` (N, 3), least squares."""
-    _, R, t = _procrustes(source, target, weights, with_scale=False)
-    return R, t
+    return _procrustes(source, target, weights, with_scale=False)[1:]
 
 
-def similarity_fit(
-    source: np.ndarray, target: np.ndarray, weights: np.ndarray | None = None
-) -> tuple[float, np.ndarray, np.ndarray]:
-    """Scale, rotation and translation with ``target = scale * R @ source + t`` in least squares."""
-    return _procrustes(source, target, weights, with_scale=True)
+def similarity_fit(source: np.ndarray, target: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
+    """Fit scale, R and t with ``target = scale * R @ source + t`` in least squares."""
+    return _procrustes(source, target, None, with_scale=True)
 
 
 def _procrustes(

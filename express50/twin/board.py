@@ -19,7 +19,6 @@ from express50.twin.surface import (
     fractal,
     make_lattice,
     noise,
-    random_stream,
     sample_panorama,
     spherical_to_unit,
     unit,
@@ -52,7 +51,7 @@ def board_poses(count: int, seed: int) -> list[np.ndarray]:
     The board turns through the rig's arc twice in golden-section order, so that every camera sees
     it several times and neighbours see it together, whatever the count.
     """
-    rng = random_stream(seed, 401)
+    rng = np.random.default_rng([seed, 401])
     middle = np.array([*SQUARES, 0.0]) * 0.5 * SQUARE_M
     poses = []
     for k in range(count):
@@ -144,7 +143,7 @@ def studio_bands(camera: Camera, seed: int) -> Iterator[tuple[RowBand, np.ndarra
 @cache
 def _room(seed: int, width: int) -> np.ndarray:
     """Return the room's wall (H, W, 3) float32, by azimuth and elevation from its middle."""
-    rng = random_stream(seed, 201)
+    rng = np.random.default_rng([seed, 201])
     height = 2 * round(width * _HIGHEST / (2 * np.pi))
     az = (cell_centres(width) / width * 2 * np.pi - np.pi).astype(np.float32)
     el = ((cell_centres(height) / height * 2 - 1) * _HIGHEST).astype(np.float32)

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from enum import IntEnum
 
 import numpy as np
-import scipy.sparse
 import torch
 
 from express50.geometry.sampling import smoothstep
@@ -14,14 +13,7 @@ from express50.geometry.transforms import rigid_fit
 from express50.head.model import HeadModel, landmarks, pose
 from express50.twin.hair import HairMesh, grow_hair
 from express50.twin.subjects import TwinPerformance, TwinSubject
-from express50.twin.surface import (
-    Caster,
-    StarMap,
-    face_to_vertex,
-    random_stream,
-    smooth_over_mesh,
-    vertex_normals,
-)
+from express50.twin.surface import Caster, StarMap, smooth_over_mesh, vertex_normals
 
 
 class Material(IntEnum):
@@ -60,7 +52,6 @@ class Body:
     scalp: np.ndarray  # (V,) float32 hairiness, soft at the hairline
     centre: np.ndarray  # (3,) of the head, template space
     extras: Extras
-    incidence: scipy.sparse.csr_matrix  # sums normals of head's and shoulders' faces at vertices
 
 
 def build_body(model: HeadModel, subject: TwinSubject, seed: int, hair_detail: float = 1.0) -> Body:
@@ -82,7 +73,7 @@ def build_body(model: HeadModel, subject: TwinSubject, seed: int, hair_detail: f
         np.concatenate([skin_faces, cloth_faces + len(rest)]),
         centre,
     )
-    rng = random_stream(seed, subject.number, 7)
+    rng = np.random.default_rng([seed, subject.number, 7])
     hair = grow_hair(rng, rest, faces, scalp, star, subject.look, hair_detail)
     skull = np.flatnonzero(scalp > 0.8)[::7]
     extras = Extras(
@@ -107,30 +98,20 @@ def assemble(
     joined = np.concatenate(
         [faces[shown], extras.hair.faces + heads, extras.cloth_faces + heads + hairs]
     ).astype(np.int32)
-    material = np.concatenate(
-        [
-            head_material[shown],
-            np.full(len(extras.hair.faces), Material.HAIR, np.uint8),
-            np.full(len(extras.cloth_faces), Material.CLOTH, np.uint8),
-        ]
-    ).astype(np.uint8)
-    solid = np.concatenate([faces, extras.cloth_faces + heads])
-    incidence = face_to_vertex(solid, heads + len(extras.cloth_vertices))
+    counts = len(extras.hair.faces), len(extras.cloth_faces)
+    others = np.repeat(np.array([Material.HAIR, Material.CLOTH], np.uint8), counts)
+    material = np.concatenate([head_material[shown], others])
     return Body(
         model=model, subject=subject, faces=joined, material=material,
         template=model.template.numpy(), scalp=scalp, centre=centre, extras=extras,
-        incidence=incidence,
     )  # fmt: skip
 
 
 def model_materials(model: HeadModel) -> np.ndarray:
     """Return material (V,) uint8 of each head vertex, from the model's regions."""
-    labels = np.full(len(model.template), Material.SKIN, np.uint8)
-    named = np.zeros(len(labels), dtype=bool)
-    for mask in model.regions.values():
-        named |= mask.numpy()
     # In no region: ICT-FaceKit's opaque lash cards and the sockets behind its eyes.
-    labels[~named] = Material.HIDDEN
+    named = np.any([mask.numpy() for mask in model.regions.values()], axis=0)
+    labels = np.where(named, Material.SKIN, Material.HIDDEN).astype(np.uint8)
     for region, material in (
         ("mouth_interior", Material.MOUTH),
         ("tongue", Material.TONGUE),
@@ -189,7 +170,7 @@ def pose_body(body: Body, play: TwinPerformance, frame: int) -> Posed:
     cloth = extras.cloth_vertices @ play.R[frame].T + play.t[frame]
     solid = np.concatenate([head, cloth]).astype(np.float32)
     solid_faces = np.concatenate([body.model.faces.numpy(), extras.cloth_faces + len(head)])
-    normals = vertex_normals(solid, solid_faces, body.incidence)
+    normals = vertex_normals(solid, solid_faces)
     around_hair = [normals[: len(head)], hair.normals @ turn.T, normals[len(head) :]]
     return Posed(
         vertices=np.concatenate([head, hair.vertices @ turn.T + shift, cloth]).astype(np.float32),

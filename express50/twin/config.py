@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass
 
 from express50.errors import ConfigError
@@ -65,19 +64,3 @@ class TwinConfig:
                 f"twin: video frames are {self.width}x{self.height}, H.264 wants even sizes;"
                 " change the size or record frames"
             )
-
-    def subject_ids(self) -> list[str]:
-        """Return ids of the subjects, such as S001."""
-        return [f"S{self.first_subject + n:03d}" for n in range(self.subjects)]
-
-
-def subject_number(subject: str) -> int:
-    """Return the number of a subject id such as S001; it seeds everything about the subject.
-
-    Raises:
-        ConfigError: the id is not of that form.
-    """
-    match = re.fullmatch(r"S(\d+)", subject)
-    if match is None:
-        raise ConfigError(f"subject {subject!r} is not a twin's id, expected S001 and so on")
-    return int(match.group(1))

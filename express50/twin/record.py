@@ -21,7 +21,7 @@ from typing import Any
 from express50.capture.expressions import select
 from express50.contract.config import field_documents
 from express50.errors import CaptureError
-from express50.files.atomic import write_bytes
+from express50.files.atomic import dump_json, write_json
 from express50.runner.threads import cap_threads
 from express50.twin.config import TwinConfig
 
@@ -114,7 +114,8 @@ def record(
     """
     select(config.expressions)
     _check_settings(config, out)
-    missing = [s for s in config.subject_ids() if not (out / "captures" / s).is_dir()]
+    ids = [f"S{config.first_subject + n:03d}" for n in range(config.subjects)]
+    missing = [s for s in ids if not (out / "captures" / s).is_dir()]
     if not missing:
         return []
     staging = out / ".recording"
@@ -226,19 +227,16 @@ def _check_settings(config: TwinConfig, out: Path) -> None:
     """Remember the settings of a recording, so that it is never continued with others."""
     path = out / "twin.json"
     settings = {k: v for k, v in asdict(config).items() if k not in ("subjects", "first_subject")}
-    text = json.dumps(settings, indent=1, sort_keys=True) + "\n"
+    now = json.loads(dump_json(settings))
     begun = any((out / "captures").glob("*"))  # otherwise nothing was recorded with these settings
-    if begun and path.is_file() and path.read_text() != text:
-        former = json.loads(path.read_text())
-        changed = sorted(
-            k for k in settings if json.dumps(former.get(k)) != json.dumps(settings[k])
-        )
+    former = json.loads(path.read_bytes()) if begun and path.is_file() else now
+    changed = sorted(k for k in now | former if former.get(k) != now.get(k))
+    if changed:
         raise CaptureError(
             f"{out}: holds a recording with other settings ({', '.join(changed)} differ);"
             " record into another folder or delete this one"
         )
-    out.mkdir(parents=True, exist_ok=True)
-    write_bytes(path, text.encode())
+    write_json(path, now)
 
 
 def print_progress() -> Callable[[int, int], None]:

@@ -12,8 +12,8 @@ import numpy as np
 
 from express50.files.images import linear_to_srgb
 from express50.geometry.cameras import Camera
+from express50.geometry.conventions import cell_centres
 from express50.geometry.transforms import look_at
-from express50.twin.surface import random_stream
 
 TARGET = np.array([0.0, 1.25, 0.0])  # where heads are: a seated person, y up, metres
 SPAN_DEG = 300.0
@@ -28,7 +28,7 @@ def make_rig(count: int, width: int, height: int, seed: int) -> dict[str, Camera
     The rig belongs to the seed alone: every subject is recorded by the same cameras. Camera 0 is
     the leftmost as the subject sees it; the world's y is up and subjects look along +z.
     """
-    rng = random_stream(seed, 101)
+    rng = np.random.default_rng([seed, 101])
     cameras, short = {}, min(width, height)
     for index in range(count):
         camera_id = f"cam{index:02d}"
@@ -73,7 +73,7 @@ class Sensor:
 
 def make_sensor(camera_index: int, seed: int) -> Sensor:
     """Draw a camera's sensor."""
-    rng = random_stream(seed, 301, camera_index)
+    rng = np.random.default_rng([seed, 301, camera_index])
     gain = 0.85 * rng.uniform(0.94, 1.06) * (1.0 + rng.normal(0.0, 0.025, 3))
     return Sensor(gain=gain.astype(np.float32), vignette=float(rng.uniform(0.02, 0.08)))
 
@@ -83,8 +83,8 @@ def expose(
 ) -> np.ndarray:
     """Expose linear light (H, W, 3) float32 to the 8-bit sRGB picture (H, W, 3)."""
     height, width = linear.shape[:2]
-    y = (np.arange(height, dtype=np.float32) + 0.5) / height * 2 - 1
-    x = (np.arange(width, dtype=np.float32) + 0.5) / width * 2 - 1
+    y = cell_centres(height).astype(np.float32) / height * 2 - 1
+    x = cell_centres(width).astype(np.float32) / width * 2 - 1
     falloff = 1.0 - sensor.vignette * 0.5 * (x[None] ** 2 + y[:, None] ** 2)
     signal = linear * sensor.gain * falloff[..., None]
     if noise > 0:

@@ -14,15 +14,7 @@ from express50.geometry.sampling import smoothstep
 from express50.head.model import HeadModel
 from express50.twin.body import Body, Material, Posed, model_materials
 from express50.twin.skin import SkinTexture, sample_skin
-from express50.twin.surface import (
-    Caster,
-    dot,
-    make_lattice,
-    noise,
-    random_stream,
-    smooth_over_mesh,
-    unit,
-)
+from express50.twin.surface import Caster, dot, make_lattice, noise, smooth_over_mesh, unit
 
 # How far light bleeds round the terminator in skin, per channel: red most (d'Eon et al. 2007).
 _BLEED = np.array([0.32, 0.12, 0.06], np.float32)
@@ -42,7 +34,7 @@ class Lighting:
 
 def make_lighting(number: int, seed: int) -> Lighting:
     """Return the studio's lights on the day a subject was recorded; each day differs a little."""
-    rng = random_stream(seed, number, 9)
+    rng = np.random.default_rng([seed, number, 9])
     towards = np.array(
         [[0.75, 0.65, 0.9], [-0.85, 0.35, 0.75], [-0.55, 0.55, -0.9], [0.8, 0.3, -0.7]]
     ) + rng.normal(0.0, 0.1, (4, 3))
@@ -128,7 +120,7 @@ def build_scene(
     return LitScene(
         caster=caster, body=body, texture=texture, eyes=eyes, lighting=lighting,
         attributes=attributes, hair_tangents=posed.tangents,
-        iris_lattice=make_lattice(random_stream(seed, body.subject.number, 10)),
+        iris_lattice=make_lattice(np.random.default_rng([seed, body.subject.number, 10])),
     )  # fmt: skip
 
 
@@ -137,7 +129,7 @@ def _light_at(
 ) -> np.ndarray:
     """Return share (N, 1 + L) of the ambient light and of each soft box that reaches points."""
     count, starts = len(points), points + 6e-4 * normals
-    out = np.empty((count, 1 + len(lighting.directions)), np.float32)
+    out = np.zeros((count, 1 + len(lighting.directions)), np.float32)
     helper = np.where(np.abs(normals[:, 1:2]) < 0.9, [[0.0, 1.0, 0.0]], [[1.0, 0.0, 0.0]])
     across = unit(np.cross(helper, normals))
     other = np.cross(normals, across)
@@ -159,7 +151,6 @@ def _light_at(
             angle = 2 * np.pi / _SOFT_RAYS * k + spin[lit]
             ray = unit(direction + lighting.size * (np.cos(angle) * side + np.sin(angle) * lift))
             seen += ~caster.blocked(starts[lit], ray, 2.0)
-        out[:, 1 + light] = 0.0
         out[lit, 1 + light] = seen / _SOFT_RAYS
     return out
 

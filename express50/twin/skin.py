@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from express50.geometry.conventions import cell_centres, cell_to_corner
 from express50.geometry.sampling import smoothstep
 from express50.head.model import HeadModel, landmarks
 from express50.twin.body import Body, Material, model_materials
@@ -20,7 +21,6 @@ from express50.twin.surface import (
     fractal,
     make_lattice,
     noise,
-    random_stream,
     sample_panorama,
     smooth_over_mesh,
     spherical_to_unit,
@@ -69,7 +69,7 @@ def _paint_rows(body: Body, seed: int, width: int, rows: range) -> np.ndarray:
     model, look = body.model, body.subject.look
     points, masks = _surface_at(body, width, rows)
     marks = landmarks(model, model.template[None])[0].double().numpy()
-    rng = random_stream(seed, body.subject.number, 8)
+    rng = np.random.default_rng([seed, body.subject.number, 8])
     lattices = [make_lattice(rng) for _ in range(6)]
     albedo = np.broadcast_to(look.skin.astype(np.float32), points.shape).copy()
     tone = fractal(points, lattices[0], 0.030, 4, 0.55)
@@ -104,8 +104,8 @@ def _paint_rows(body: Body, seed: int, width: int, rows: range) -> np.ndarray:
 def _surface_at(body: Body, width: int, rows: range) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """Return places (N, 3) on the mean head under the texels of some rows, and masks there."""
     model = body.model
-    az = (np.arange(width) + 0.5) / width * 2 * np.pi - np.pi
-    el = (np.array(rows) + 0.5) / (width // 2) * np.pi - 0.5 * np.pi
+    az = cell_centres(width) / width * 2 * np.pi - np.pi
+    el = cell_to_corner(np.array(rows)) / (width // 2) * np.pi - 0.5 * np.pi
     out = spherical_to_unit(*np.meshgrid(az, el)).reshape(-1, 3)
     faces = model.faces.numpy()
     faces = faces[model_materials(model)[faces].min(1) == Material.SKIN]
@@ -113,7 +113,7 @@ def _surface_at(body: Body, width: int, rows: range) -> tuple[np.ndarray, dict[s
     # Beyond the centre it has come in through the open neck and struck the skull from inside.
     hit = (face != MISS) & (distance < 1.0)
     corners = faces[np.where(hit, face, 0)]
-    weights = np.stack([1 - bary.sum(1), bary[:, 0], bary[:, 1]], axis=1)
+    weights = np.column_stack([1 - bary.sum(1), bary])
 
     def at(values: np.ndarray) -> np.ndarray:
         return np.where(hit, (values[corners] * weights).sum(1), 0.0).astype(np.float32)

@@ -17,13 +17,12 @@ from express50.geometry.cameras import Camera
 from express50.head.load import load_head
 from express50.twin.board import board_poses, render_board, studio_bands
 from express50.twin.body import Body, build_body, pose_body
-from express50.twin.config import TwinConfig, subject_number
+from express50.twin.config import TwinConfig
 from express50.twin.render import RowBand, Sampling, hull_of, render_band, window_of
 from express50.twin.rig import Sensor, expose, make_rig, make_sensor
 from express50.twin.shade import LitScene, build_scene, find_eyes, make_lighting, shade
 from express50.twin.skin import paint_skin, texture_width
 from express50.twin.subjects import TwinPerformance, make_subject, perform
-from express50.twin.surface import random_stream
 from express50.twin.truth import write_truth
 
 # Rays and plates of so many pixels are kept between frames (about 50 bytes each); beyond, every
@@ -36,7 +35,8 @@ _head = cache(load_head)
 
 def cast_subject(config: TwinConfig, subject_id: str) -> tuple[Body, TwinPerformance]:
     """Make a subject's body and its performance."""
-    model, number = _head(config.head), subject_number(subject_id)
+    # The number in the id, such as S001, seeds everything about the subject.
+    model, number = _head(config.head), int(subject_id.removeprefix("S"))
     subject = make_subject(model, subject_id, number, config.seed)
     # Strands follow the pixels: thin enough to be finer than one, not finer than can be seen.
     detail = float(np.clip(min(config.width, config.height) / 512, 0.6, 3.0))
@@ -99,14 +99,14 @@ def film_subject(
             hull = hull_of(posed.vertices)
             for view, film in zip(views, films, strict=True):
                 picture = render_view(scene, view, hull)
-                chance = random_stream(seed, number, 11, view.index, frame)
+                chance = np.random.default_rng([seed, number, 11, view.index, frame])
                 film.write(expose(view.sensor, picture, chance, config.noise))
                 tick()
     if 0 in camera_indices:
         write_truth(truth, config.head, body, play, {camera.id: camera for camera in rig})
     if config.plates:
         for view in views:
-            chance = random_stream(seed, number, 12, view.index)
+            chance = np.random.default_rng([seed, number, 12, view.index])
             plate = np.concatenate([plate for _, plate in view.bands()])
             image = expose(view.sensor, plate, chance, config.noise)
             write_png(capture / "plates" / f"{view.camera.id}.png", image)
@@ -141,7 +141,7 @@ def film_board(
         camera, sensor = rig[index], make_sensor(index, config.seed)
         for number, pose in enumerate(poses):
             picture = render_board(pose, camera, config.seed)
-            chance = random_stream(config.seed, 402, index, number)
+            chance = np.random.default_rng([config.seed, 402, index, number])
             image = expose(sensor, picture, chance, config.noise)
             write_png(folder / camera.id / f"{number:06d}.png", image)
             tick()

@@ -17,7 +17,7 @@ from express50.geometry.sampling import smoothstep
 from express50.geometry.transforms import axis_angle_to_matrix, matrix_to_axis_angle
 from express50.head.model import HeadModel
 from express50.twin.rig import TARGET
-from express50.twin.surface import fractal, make_lattice, random_stream
+from express50.twin.surface import fractal, make_lattice
 
 OFFSET_RMS_M = 1.2e-3
 # Linear-light albedo of skin from light to deep (sRGB about 233 196 176 ... 92 62 49).
@@ -72,9 +72,9 @@ class TwinSubject:
 
 def make_subject(model: HeadModel, subject_id: str, number: int, seed: int) -> TwinSubject:
     """Draw one subject; it depends on the seed and the subject's number only."""
-    rng = random_stream(seed, number, 1)
+    rng = np.random.default_rng([seed, number, 1])
     shape = np.clip(0.8 * rng.standard_normal(len(model.shape_names)), -2.0, 2.0)
-    rng = random_stream(seed, number, 2)
+    rng = np.random.default_rng([seed, number, 2])
     template = model.template.double().numpy()
     weight = soft_mask(model)
     field = np.empty_like(template)
@@ -89,17 +89,15 @@ def make_subject(model: HeadModel, subject_id: str, number: int, seed: int) -> T
     field = field - (basis @ np.linalg.solve(gram, basis.T @ field.ravel())).reshape(field.shape)
     rms = np.sqrt((np.linalg.norm(field, axis=1)[weight > 0.5] ** 2).mean())
     offsets = (field * (OFFSET_RMS_M / rms)).astype(np.float32)
-    look = _make_look(random_stream(seed, number, 3), number)
+    look = _make_look(np.random.default_rng([seed, number, 3]), number)
     return TwinSubject(id=subject_id, number=number, shape=shape, offsets=offsets, look=look)
 
 
 def soft_mask(model: HeadModel) -> np.ndarray:
     """Return weights (V,): 1 on skin, 0 on eyes and inside the mouth, soft at the lids."""
     template = model.template.double().numpy()
-    inner = np.zeros(len(template), dtype=bool)
-    for region in ("left_eyeball", "right_eyeball", "teeth", "tongue", "mouth_interior"):
-        inner |= model.regions[region].numpy()
-    weight = np.where(inner, 0.0, 1.0)
+    inner = ("left_eyeball", "right_eyeball", "teeth", "tongue", "mouth_interior")
+    weight = np.where(np.any([model.regions[name].numpy() for name in inner], axis=0), 0.0, 1.0)
     for region in ("left_eyeball", "right_eyeball"):
         ball = template[model.regions[region].numpy()]
         centre = 0.5 * (ball.min(0) + ball.max(0))
@@ -144,9 +142,8 @@ def _make_look(rng: np.random.Generator, number: int) -> PersonLook:
 
 def _blend(table: np.ndarray, place: float) -> np.ndarray:
     """Interpolate the rows of a table (N, 3) at ``place`` in [0, 1]."""
-    x = float(np.clip(place, 0.0, 1.0)) * (len(table) - 1)
-    low = min(int(x), len(table) - 2)
-    return table[low] + (table[low + 1] - table[low]) * (x - low)
+    rows = np.arange(len(table))
+    return np.array([np.interp(place * rows[-1], rows, column) for column in table.T])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -201,7 +198,7 @@ def perform(
     cues, peaks = [], {}
     for order, entry in enumerate(script):
         # Seeded by the id, so that leaving expressions out does not change the others.
-        rng = random_stream(seed, number, 4, *entry.id.encode())
+        rng = np.random.default_rng([seed, number, 4, *entry.id.encode()])
         first = order * frames_per_expression
         peak, curve = _envelope(rng, frames_per_expression, fps)
         span = slice(first, first + frames_per_expression)
@@ -214,11 +211,11 @@ def perform(
         _blink(rng, expression[span], peak, names)
         cues.append((entry.id, first, first + frames_per_expression - 1))
         peaks[entry.id] = first + peak
-    rng = random_stream(seed, number, 5)
+    rng = np.random.default_rng([seed, number, 5])
     for name in (name for name in _FIDGETS if name in names):
         small = 0.08 * np.maximum(_wander(rng, count, fps), 0.0)
         expression[:, names[name]] += (1.0 - strength) * small
-    R, t = _sway(random_stream(seed, number, 6), model, count, fps)
+    R, t = _sway(np.random.default_rng([seed, number, 6]), model, count, fps)
     eyes = np.tile(matrix_to_axis_angle(gaze_rotation(gaze)), (1, 2))
     return TwinPerformance(
         cues=tuple(cues), peaks=peaks, strength=strength, expression=expression,

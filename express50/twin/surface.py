@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-import open3d as o3d
 import scipy.sparse
 
 from express50.geometry.conventions import cell_centres, corner_to_cell
-from express50.geometry.raycast import mesh_scene
+from express50.geometry.raycast import join_rays, mesh_scene
 
 MISS = np.uint32(0xFFFFFFFF)
 LATTICE = 32
@@ -32,19 +31,15 @@ class Caster:
             distance (N,) float32, inf where nothing is hit; face (N,) uint32, ``MISS`` likewise;
             barycentric weights (N, 2) of the face's second and third vertex.
         """
-        rays = np.empty((len(directions), 6), dtype=np.float32)
-        rays[:, :3] = origin
-        rays[:, 3:] = directions
-        hits = self._scene.cast_rays(o3d.core.Tensor(rays), nthreads=1)
+        hits = self._scene.cast_rays(join_rays(origin, directions), nthreads=1)
         return (
             hits["t_hit"].numpy(), hits["primitive_ids"].numpy(), hits["primitive_uvs"].numpy(),
         )  # fmt: skip
 
     def blocked(self, origins: np.ndarray, directions: np.ndarray, far: float) -> np.ndarray:
         """Return (N,) True for rays of unit directions (N, 3) that hit within ``far`` metres."""
-        rays = np.concatenate([origins, directions], axis=1).astype(np.float32)
-        answer = self._scene.test_occlusions(o3d.core.Tensor(rays), tnear=0.0, tfar=far, nthreads=1)
-        return answer.numpy()
+        rays = join_rays(origins, directions)
+        return self._scene.test_occlusions(rays, tnear=0.0, tfar=far, nthreads=1).numpy()
 
 
 def unit(vectors: np.ndarray) -> np.ndarray:
@@ -57,19 +52,13 @@ def dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.einsum("...i,...i->...", a, b)[..., None]
 
 
-def face_to_vertex(faces: np.ndarray, count: int) -> scipy.sparse.csr_matrix:
-    """Return sparse (V, F) matrix that sums a quantity of the faces (F, 3) at their vertices."""
-    rows = faces.ravel()
-    columns = np.repeat(np.arange(len(faces)), 3)
-    ones = np.ones(len(rows), dtype=np.float32)
-    return scipy.sparse.csr_matrix((ones, (rows, columns)), shape=(count, len(faces)))
-
-
-def vertex_normals(
-    vertices: np.ndarray, faces: np.ndarray, incidence: scipy.sparse.csr_matrix
-) -> np.ndarray:
-    """Return unit normals (V, 3), area weighted; ``incidence`` is `face_to_vertex`'s."""
+def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Return unit normals (V, 3), area weighted."""
     a, b, c = (vertices[faces[:, k]] for k in range(3))
+    where = faces.ravel(), np.repeat(np.arange(len(faces)), 3)
+    ones = np.ones(faces.size, dtype=np.float32)
+    # Sums what the faces have at their vertices.
+    incidence = scipy.sparse.csr_matrix((ones, where), shape=(len(vertices), len(faces)))
     return unit(incidence @ np.cross(b - a, c - a))
 
 
@@ -135,11 +124,6 @@ class StarMap:
         x = corner_to_cell((az + np.pi) / (2 * np.pi) * columns)
         y = np.clip(corner_to_cell((el + 0.5 * np.pi) / np.pi * rows), 0, rows - 1.001)
         return sample_panorama(self._radius, x, y)[:, 0]
-
-
-def random_stream(seed: int, *path: int) -> np.random.Generator:
-    """Make a generator of its own for a seed and a path such as (subject, camera, frame)."""
-    return np.random.default_rng([seed, *path])
 
 
 def make_lattice(rng: np.random.Generator) -> np.ndarray:

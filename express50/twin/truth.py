@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 from express50.errors import CaptureError
 from express50.files.calibration import read_cameras, write_cameras
@@ -21,7 +20,6 @@ from express50.geometry.cameras import Camera, rays
 from express50.geometry.transforms import make_transform, rigid_fit
 from express50.head.load import load_head
 from express50.head.model import HeadModel
-from express50.head.model import landmarks as head_landmarks
 from express50.twin import render
 from express50.twin.body import Body, Extras, assemble, head_vertices, pose_body
 from express50.twin.hair import HairMesh
@@ -39,12 +37,10 @@ def write_truth(
     folder.mkdir(parents=True, exist_ok=True)
     write_cameras(folder / "cameras.json", cameras)
     subject = body.subject
-    look = {
-        k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in asdict(subject.look).items()
-    }
-    about = {"id": subject.id, "number": subject.number, "head": head, "look": look,
-             "cues": play.cues}  # fmt: skip
-    (folder / "subject.json").write_text(json.dumps(about, indent=1) + "\n")
+    about = {"id": subject.id, "number": subject.number, "head": head,
+             "look": asdict(subject.look), "cues": play.cues}  # fmt: skip
+    words = json.dumps(about, indent=1, default=np.ndarray.tolist)
+    (folder / "subject.json").write_text(words + "\n")
     (folder / "peaks.json").write_text(json.dumps(play.peaks, indent=1) + "\n")
     np.savez_compressed(folder / "frames.npz", **{name: getattr(play, name) for name in _PLAY})
     extras = body.extras
@@ -93,22 +89,14 @@ class Truth:
 
     def parameters(self, subject: str, frame: int) -> dict[str, np.ndarray]:
         """Return a frame's shape, offsets, expression, jaw, neck, eyes, R, t, strength."""
-        body, play = self._subject(subject)
-        self._check_frame(subject, play, frame)
+        body, play = self._play(subject, frame)
         values = {name: getattr(play, name)[frame] for name in _PLAY}
         return {"shape": body.subject.shape, "offsets": body.subject.offsets} | values
 
     def vertices(self, subject: str, frame: int) -> np.ndarray:
         """Return head-model vertices (V, 3) in the world."""
-        body, play = self._subject(subject)
-        self._check_frame(subject, play, frame)
+        body, play = self._play(subject, frame)
         return head_vertices(body.model, body.subject, play, frame)
-
-    def landmarks(self, subject: str, frame: int) -> np.ndarray:
-        """Return the 68 landmarks (68, 3) in the world."""
-        vertices = torch.from_numpy(self.vertices(subject, frame))[None]
-        model = self.head_model(subject).to(dtype=torch.float64)
-        return head_landmarks(model, vertices)[0].numpy()
 
     def mesh(self, subject: str, frame: int) -> tuple[np.ndarray, np.ndarray]:
         """Return all geometry, hair and shoulders included: vertices (N, 3) and faces (F, 3)."""
@@ -141,7 +129,7 @@ class Truth:
         origin, directions = rays(camera)
         _, face, uv = caster.cast(origin, directions.reshape(-1, 3))
         hit = face != MISS
-        corner = np.stack([1 - uv.sum(1), *uv.T], axis=1).argmax(1)
+        corner = np.column_stack([1 - uv.sum(1), uv]).argmax(1)
         face = np.where(hit, face, 0)
         material = np.where(hit, body.material[face].astype(np.int16), np.int16(-1))
         vertex = body.faces[face, corner].astype(np.int64)
@@ -158,16 +146,18 @@ class Truth:
         return render.render_alpha(caster, self._subject(subject)[0].material, vertices, camera)
 
     def _compile(self, subject: str, frame: int) -> tuple[Caster, np.ndarray]:
-        body, play = self._subject(subject)
-        self._check_frame(subject, play, frame)
+        body, play = self._play(subject, frame)
         vertices = pose_body(body, play, frame).vertices
         return Caster(vertices, body.faces), vertices
 
-    def _check_frame(self, subject: str, play: TwinPerformance, frame: int) -> None:
+    def _play(self, subject: str, frame: int) -> tuple[Body, TwinPerformance]:
+        """Return a subject and its performance, which must have the frame."""
+        body, play = self._subject(subject)
         if not 0 <= frame < play.frames:
             raise ValueError(
                 f"{subject}: frame {frame} not in truth, expected 0..{play.frames - 1}"
             )
+        return body, play
 
     def _read_subject(self, subject: str) -> tuple[Body, TwinPerformance]:
         folder = self.root / subject

@@ -40,8 +40,8 @@ def from_front(xy: Array) -> Array:
     return cast(origins, np.tile([0.0, 0.0, 1.0], (len(xy), 1)))
 
 
-def add_eye_rings(half: HalfMesh) -> tuple[Array, Array]:
-    """Add lid loops out to the orbit's rim; return the outer ring's indices and labels (N,2)."""
+def add_eye_rings(half: HalfMesh) -> Array:
+    """Add lid loops out to the orbit's rim; return the outer ring's indices."""
     margin = lid_margin()
     angle = np.pi - np.pi * np.arange(2 * LID_SEGMENTS) / LID_SEGMENTS
     outer = _ORBIT_CENTER + _ORBIT_RADII * np.stack([np.cos(angle), np.sin(angle)], 1)
@@ -50,11 +50,11 @@ def add_eye_rings(half: HalfMesh) -> tuple[Array, Array]:
     margin_label = np.stack(labels(rings[0]), 1)
     indices = [half.add(ring, f"lid{k}") for k, ring in enumerate(rings)]
     for index, f in zip(indices, _FRACTIONS, strict=True):
-        half.label(index, margin_label + f * (outer_label - margin_label))
+        half.labels[index] = margin_label + f * (outer_label - margin_label)
     for inner, out in zip(indices[:-1], indices[1:], strict=True):
         half.strip("skin", inner, out, closed=True)
     _add_lid_edges(half, indices[0], rings[0], margin_label)
-    return indices[-1], outer_label
+    return indices[-1]
 
 
 def _add_lid_edges(half: HalfMesh, margin: Array, points: Array, label: Array) -> None:
@@ -69,37 +69,37 @@ def _add_lid_edges(half: HalfMesh, margin: Array, points: Array, label: Array) -
     rows = [margin]
     for tag, ring, f in (("lid_edge", edge, 0.86), ("lid_hidden", hidden, 0.6)):
         rows.append(half.add(ring, tag))
-        half.label(rows[-1], middle + f * (label - middle))
+        half.labels[rows[-1]] = middle + f * (label - middle)
         half.strip("skin", rows[-2], rows[-1], closed=True)
 
 
-def add_eyeball(half: HalfMesh, columns: int = 28) -> None:
+def add_eyeball(half: HalfMesh) -> None:
     """Add a sphere with its pole forward: rings at the pupil's and iris's rims, two UV charts."""
     iris = np.degrees(np.arcsin(IRIS_RADIUS / EYE_RADIUS))
     pupil = np.degrees(np.arcsin(PUPIL_RADIUS / EYE_RADIUS))
     polar = np.radians([pupil, pupil + 2, 0.5 * (pupil + iris), iris, iris + 2,
                         42, 54, 66, 78, 90, 110, 130, 150, 167])  # fmt: skip
-    turn = 2 * np.pi * np.arange(columns) / columns
+    turn = 2 * np.pi * np.arange(28) / 28
     circle = np.stack([np.cos(turn), np.sin(turn)], 1)
-    front = int(half.add(EYE_CENTER + [[0, 0, EYE_RADIUS]], "eyeball")[0])
+    front = half.add(EYE_CENTER + [[0, 0, EYE_RADIUS]], "eyeball")
     rings = []
     for k, a in enumerate(polar):
-        ring = np.concatenate([np.sin(a) * circle, np.full((columns, 1), np.cos(a))], 1)
+        ring = np.concatenate([np.sin(a) * circle, np.full((28, 1), np.cos(a))], 1)
         rings.append(half.add(EYE_CENTER + EYE_RADIUS * ring, "eyeball"))
         if k <= 9:
             half.set_uv("eye_front", rings[-1], circle * a / np.pi)
         if k >= 9:
             half.set_uv("eye_back", rings[-1], circle * [-1, 1] * (np.pi - a) / np.pi)
-    back = int(half.add(EYE_CENTER - [[0, 0, EYE_RADIUS]], "eyeball")[0])
+    back = half.add(EYE_CENTER - [[0, 0, EYE_RADIUS]], "eyeball")
     pole = np.zeros((1, 2))
-    half.set_uv("eye_front", np.array([front]), pole)
-    half.set_uv("eye_back", np.array([back]), pole)
+    half.set_uv("eye_front", front, pole)
+    half.set_uv("eye_back", back, pole)
     half.fan("eye_front", front, rings[0], closed=True)
     half.fan("eye_back", back, rings[-1], closed=True)
     for k in range(len(rings) - 1):
         half.strip("eye_front" if k < 9 else "eye_back", rings[k], rings[k + 1], closed=True)
-    half.tags["pupil"] = np.concatenate([[front], rings[0]])
-    half.tags["iris"] = np.concatenate([[front], *rings[:4]])
+    half.tags["pupil"] = np.concatenate([front, rings[0]])
+    half.tags["iris"] = np.concatenate([front, *rings[:4]])
 
 
 _STILL = 5  # lid loop that does not move; loops inside it share the margin's motion

@@ -155,11 +155,11 @@ def skin_field(points: Array) -> Array:
     return value
 
 
-def cast(origins: Array, directions: Array, far: float = 170.0, steps: int = 70) -> Array:
-    """Find the outermost hit (N,3) of the skin on rays, marching inwards from `far` mm."""
+def cast(origins: Array, directions: Array) -> Array:
+    """Find the outermost hit (N,3) of the skin on rays, marching inwards from 170 mm."""
     d = directions / np.linalg.norm(directions, axis=-1, keepdims=True)
-    t, active = np.full(len(origins), far), np.arange(len(origins))
-    for _ in range(steps):
+    t, active = np.full(len(origins), 170.0), np.arange(len(origins))
+    for _ in range(70):
         value = skin_field(origins[active] + t[active, None] * d[active])
         t[active] = np.maximum(t[active] - 0.85 * value, 0.0)
         active = active[np.abs(value) > 5e-3]
@@ -168,19 +168,19 @@ def cast(origins: Array, directions: Array, far: float = 170.0, steps: int = 70)
     return origins + t[:, None] * d
 
 
-def cast_out(origins: Array, directions: Array, steps: int = 30) -> Array:
+def cast_out(origins: Array, directions: Array) -> Array:
     """Find the first exit (N,3) from the skin on rays that start inside it."""
     d = directions / np.linalg.norm(directions, axis=-1, keepdims=True)
     t = np.zeros(len(origins))
-    for _ in range(steps):
+    for _ in range(30):
         t = t - 0.8 * skin_field(origins + t[:, None] * d)
     return origins + t[:, None] * d
 
 
-def gradient(points: Array, step: float = 0.25) -> Array:
-    """Return unit outward normal (N,3) of the field by tetrahedral differences."""
+def gradient(points: Array) -> Array:
+    """Return unit outward normal (N,3) of the field by tetrahedral differences over 0.25 mm."""
     corners = np.array([[1, -1, -1], [-1, -1, 1], [-1, 1, -1], [1, 1, 1]], float)
-    stacked = (points[None] + step * corners[:, None]).reshape(-1, 3)
+    stacked = (points[None] + 0.25 * corners[:, None]).reshape(-1, 3)
     values = skin_field(stacked).reshape(4, -1)
     g = (corners[:, None] * values[..., None]).sum(0)
     return g / (np.linalg.norm(g, axis=-1, keepdims=True) + 1e-12)

@@ -18,13 +18,7 @@ from express50.geometry.sampling import smoothstep
 from express50.head.generator.expressions import expression_directions
 from express50.head.generator.eyes import add_eyeball
 from express50.head.generator.field import eye_center, window
-from express50.head.generator.mesh import (
-    HalfMesh,
-    WholeMesh,
-    mirrored,
-    neighbour_mean,
-    pack_uv,
-)
+from express50.head.generator.mesh import HalfMesh, WholeMesh, mirrored, neighbour_mean, pack_uv
 from express50.head.generator.mouth import add_teeth, add_tongue
 from express50.head.generator.regions import contour_candidates, embed_landmarks, region_masks
 from express50.head.generator.shapes import shape_directions
@@ -37,7 +31,6 @@ ROOT, NECK, JAW, LEFT_EYE, RIGHT_EYE = range(5)
 # Rest joints, mm: collar, upper neck, jaw hinge, eyeball centres.
 JOINTS = np.array([(0, -165, -22), (0, -72, -16), (0, -8, 10),
                    eye_center("left"), eye_center("right")], float)  # fmt: skip
-PAIRED_CHARTS = ("ear", "eye_front", "eye_back")
 
 
 @cache
@@ -50,7 +43,7 @@ def procedural_mesh() -> WholeMesh:
     add_teeth(half, upper=False)
     add_tongue(half)
     set_skin_uv(half)
-    return mirrored(half, PAIRED_CHARTS)
+    return mirrored(half)
 
 
 def write_builtin(path: Path) -> None:
@@ -89,14 +82,13 @@ def write_builtin(path: Path) -> None:
 
 def joint_regressor(mesh: WholeMesh) -> Array:
     """Return weights (5,V), rows sum to 1: least-norm affine ones over vertices near the joints."""
-    regressor = np.zeros((5, len(mesh.vertices)))
-    skin = np.isin(np.arange(len(mesh.vertices)), mesh.tag("grid"))
+    regressor, skin = np.zeros((5, len(mesh.vertices))), mesh.tag("grid")
     for j, joint in enumerate(JOINTS):
         if j >= LEFT_EYE:
             near = mesh.tag("eyeball", "left" if j == LEFT_EYE else "right")
         else:
-            distance = np.linalg.norm(mesh.vertices - joint, axis=1) + np.where(skin, 0, 1e6)
-            near = np.argsort(distance, kind="stable")[:160]
+            distance = np.linalg.norm(mesh.vertices[skin] - joint, axis=1)
+            near = skin[np.argsort(distance, kind="stable")[:160]]
         system = np.concatenate([mesh.vertices[near].T, np.ones((1, len(near)))])
         regressor[j, near] = np.linalg.lstsq(system, np.append(joint, 1.0), rcond=None)[0]
     return regressor

@@ -17,32 +17,24 @@ Array = np.ndarray
 class HalfMesh:
     """Growing left half. tags name vertex indices, uv holds one (u, v) a vertex and chart."""
 
-    points: list[Array] = field(default_factory=list)
-    count: int = 0
+    points: Array = field(default_factory=lambda: np.empty((0, 3)))
+    # Azimuth (radians) and latitude (deg) of skin vertices, NaN elsewhere: see `field.rays`.
+    labels: Array = field(default_factory=lambda: np.empty((0, 2)))
     tags: dict[str, Array] = field(default_factory=dict)
     faces: dict[str, list[Array]] = field(default_factory=dict)
-    uv: dict[str, dict[int, tuple[float, float]]] = field(default_factory=dict)
-    labels: dict[int, tuple[float, float]] = field(default_factory=dict)  # see `field.rays`
+    uv: dict[str, dict[int, Array]] = field(default_factory=dict)
 
-    def add(self, points: Array, tag: str = "") -> Array:
+    def add(self, points: Array, tag: str) -> Array:
         """Add vertices (N,3), return their indices; `tag` names them (appending to the tag)."""
-        index = np.arange(self.count, self.count + len(points))
-        self.points.append(np.asarray(points, float))
-        self.count += len(points)
-        if tag:
-            self.tags[tag] = np.concatenate([self.tags.get(tag, index[:0]), index])
+        index = len(self.points) + np.arange(len(points))
+        self.points = np.concatenate([self.points, points])
+        self.labels = np.concatenate([self.labels, np.full((len(points), 2), np.nan)])
+        self.tags[tag] = np.concatenate([self.tags.get(tag, index[:0]), index])
         return index
 
     def set_uv(self, chart: str, index: Array, uv: Array) -> None:
         """Set the chart's coordinates (N,2) of vertices `index`."""
-        store = self.uv.setdefault(chart, {})
-        for i, (u, v) in zip(index, uv, strict=True):
-            store[int(i)] = (float(u), float(v))
-
-    def label(self, index: Array, label: Array) -> None:
-        """Set azimuth (radians) and latitude (deg) (N,2) of skin vertices."""
-        for i, (azimuth, latitude) in zip(index, label, strict=True):
-            self.labels[int(i)] = (float(azimuth), float(latitude))
+        self.uv.setdefault(chart, {}).update(zip(index.tolist(), uv, strict=True))
 
     def add_faces(self, chart: str, faces: Array) -> None:
         """Add triangles (N,3) to a chart; `set_uv` must cover their vertices before assembly."""
@@ -50,10 +42,10 @@ class HalfMesh:
 
     def strip(self, chart: str, inner: Array, outer: Array, closed: bool) -> None:
         """Add quads between two rows of equal length, split along the shorter diagonal."""
-        a, b = np.asarray(inner), np.asarray(outer)
+        a, b = inner, outer
         if closed:
             a, b = np.append(a, a[0]), np.append(b, b[0])
-        p = self.array()
+        p = self.points
         first = np.linalg.norm(p[a[:-1]] - p[b[1:]], axis=1)
         second = np.linalg.norm(p[a[1:]] - p[b[:-1]], axis=1)
         quads = np.stack([a[:-1], a[1:], b[1:], b[:-1]], 1)
@@ -66,14 +58,10 @@ class HalfMesh:
         degenerate = (faces == faces[:, [1, 2, 0]]).any(1)
         self.add_faces(chart, faces[~degenerate])
 
-    def fan(self, chart: str, center: int, ring: Array, closed: bool) -> None:
-        """Add triangles from one vertex to a row."""
-        a = np.append(ring, ring[0]) if closed else np.asarray(ring)
+    def fan(self, chart: str, center: Array, ring: Array, closed: bool) -> None:
+        """Add triangles from one vertex (1,) to a row."""
+        a = np.append(ring, ring[0]) if closed else ring
         self.add_faces(chart, np.stack([np.full(len(a) - 1, center), a[:-1], a[1:]], 1))
-
-    def array(self) -> Array:
-        """Return all vertices (N,3)."""
-        return np.concatenate(self.points)
 
 
 @dataclass(frozen=True)
@@ -99,9 +87,9 @@ class WholeMesh:
         return right if side == "right" else np.unique(np.concatenate([left, right]))
 
 
-def mirrored(half: HalfMesh, paired: tuple[str, ...]) -> WholeMesh:
-    """Mirror the half and weld it at x = 0. `paired` charts get a second island on the right."""
-    points = half.array()
+def mirrored(half: HalfMesh) -> WholeMesh:
+    """Mirror the half and weld it at x = 0."""
+    points = half.points
     on_plane = np.abs(points[:, 0]) < 1e-9
     right = np.where(on_plane, np.arange(len(points)), 0)
     right[~on_plane] = len(points) + np.arange((~on_plane).sum())
@@ -113,7 +101,7 @@ def mirrored(half: HalfMesh, paired: tuple[str, ...]) -> WholeMesh:
     faces, charts, corners = [], [], []
     for chart, blocks in half.faces.items():
         block = np.concatenate(blocks)
-        uv = np.array([[half.uv[chart][int(i)] for i in face] for face in block])
+        uv = np.array([[half.uv[chart][i] for i in face] for face in block.tolist()])
         e1, e2 = uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]
         turned = e1[:, 0] * e2[:, 1] - e1[:, 1] * e2[:, 0] < 0
         block[turned] = block[turned][:, ::-1]
@@ -121,17 +109,18 @@ def mirrored(half: HalfMesh, paired: tuple[str, ...]) -> WholeMesh:
         faces += [block, right[block][:, ::-1]]
         corners += [uv, uv[:, ::-1] * [-1, 1]]
         charts += [chart] * len(block)
-        charts += [chart + ("_right" if chart in paired else "")] * len(block)
+        charts += [chart + ("_right" if chart in PAIRED_CHARTS else "")] * len(block)
     return WholeMesh(
         vertices=vertices,
         faces=np.concatenate(faces),
         face_chart=np.array(charts),
         corner_uv=np.concatenate(corners),
         mirror=mirror,
-        left_tags=dict(half.tags),
+        left_tags=half.tags,
     )
 
 
+PAIRED_CHARTS = ("ear", "eye_front", "eye_back")  # they get a second island on the right
 # Chart -> left, bottom, right, top in the unit square.
 RECTANGLES = {
     "skin": (0.005, 0.250, 0.995, 0.995),

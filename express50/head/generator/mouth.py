@@ -15,18 +15,14 @@ CORNER_X = 25.5
 _OUTER_CENTER_Y, _OUTER_X, _OUTER_UP, _OUTER_DOWN = -49.0, 41.0, 16.0, 20.0
 
 
-def slit_y(x: Array) -> Array:
-    """Return height of the closed lips' line at x (mm): a low bow that dips towards the corners."""
-    t = np.clip(x / CORNER_X, 0, 1)
-    return -48.8 - 0.7 * np.exp(-((x / 7.0) ** 2)) - 0.5 * t**3 + 0.9 * t * (1 - t)
-
-
 def _rows() -> tuple[Array, Array, Array, Array]:
     """Return front views (33,2) of slit, vermilion and outer loop, and slit x per row point."""
     s = np.linspace(0, 1, LIP_SEGMENTS + 1)
     x = CORNER_X * np.sin(0.5 * np.pi * s)
     t = x / CORNER_X
-    slit = np.stack([x, slit_y(x)], 1)
+    # The closed lips' line is a low bow that dips towards the corners.
+    y = -48.8 - 0.7 * np.exp(-((x / 7.0) ** 2)) - 0.5 * t**3 + 0.9 * t * (1 - t)
+    slit = np.stack([x, y], 1)
     up = 7.6 * (1 - t**1.7) ** 0.9 + 1.2 * np.exp(-(((x - 5.5) / 3.2) ** 2)) + 0.2
     down = 10.0 * (1 - t**2.2) ** 0.8
     wide = x * (1 + 0.03 * t**4)
@@ -42,8 +38,8 @@ def _rows() -> tuple[Array, Array, Array, Array]:
     return slit, border, outer, np.concatenate([x, x[-2::-1]])
 
 
-def add_lip_rings(half: HalfMesh) -> tuple[Array, Array]:
-    """Add loops from the slit to around the mouth; return the outer row's indices and labels."""
+def add_lip_rings(half: HalfMesh) -> Array:
+    """Add loops from the slit to around the mouth; return the outer row's indices."""
     slit, border, outer, x = _rows()
     sign = np.concatenate([np.ones(LIP_SEGMENTS), [0.0], -np.ones(LIP_SEGMENTS)])
     thick = 1 - (x / CORNER_X) ** 4
@@ -62,11 +58,11 @@ def add_lip_rings(half: HalfMesh) -> tuple[Array, Array]:
     for k, (row, f) in enumerate(zip(rows, (0, 0.12, 0.26, 0.4, 0.55, 0.78, 1.0), strict=True)):
         row[np.abs(row[:, 0]) < 1e-9, 0] = 0.0
         indices.append(half.add(row, f"lip{k}"))
-        half.label(indices[-1], slit_label + f * (outer_label - slit_label))
+        half.labels[indices[-1]] = slit_label + f * (outer_label - slit_label)
         if k:
             half.strip("skin", indices[k - 1], indices[k], closed=False)
     _add_cavity(half, indices[0], contact, sign, thick)
-    return indices[-1], outer_label
+    return indices[-1]
 
 
 def _add_cavity(half: HalfMesh, slit: Array, contact: Array, sign: Array, thick: Array) -> None:
@@ -96,7 +92,7 @@ def _add_cavity(half: HalfMesh, slit: Array, contact: Array, sign: Array, thick:
         half.strip("mouth", rows[-2], rows[-1], closed=False)
     throat = half.tags["throat"] = half.add(np.array([[0.0, -51.0, 37.0]]), "cavity")
     half.set_uv("mouth", throat, np.array([[0.0, 0.0]]))
-    half.fan("mouth", int(throat[0]), rows[-1], closed=False)
+    half.fan("mouth", throat, rows[-1], closed=False)
 
 
 def _inside(points: Array, depth: float) -> Array:
@@ -115,32 +111,28 @@ _LOWER_CROWNS = (5.4, 5.9, 6.8, 6.9, 7.0, 10.4)
 
 def _arch(upper: bool) -> tuple[Array, Array, Array]:
     """Return (x, z) (N,2), outward normals (N,2) and tooth phase of columns along half an arch."""
-    widths = _UPPER_CROWNS if upper else _LOWER_CROWNS
+    widths, shares = np.array(_UPPER_CROWNS if upper else _LOWER_CROWNS), (0.16, 0.5, 0.84, 1.0)
     edges = np.concatenate([[0], np.cumsum(widths)])
-    along, phase = [0.0], [0.0]
-    for k in range(len(widths)):
-        for f in (0.16, 0.5, 0.84, 1.0):
-            along.append(edges[k] + f * widths[k])
-            phase.append(f % 1.0)
+    along = np.append(0.0, edges[:-1, None] + shares * widths[:, None])
+    phase = np.append(0.0, np.tile(shares, len(widths)) % 1.0)
     x = np.linspace(0, 30, 400)
     front = 91.0 if upper else 86.8
     reach = 25.0 if upper else 23.5
     z = front - 31.0 * (x / reach) ** 2.3
     length = np.concatenate([[0], np.cumsum(np.hypot(np.diff(x), np.diff(z)))])
     xs, zs = np.interp(along, length, x), np.interp(along, length, z)
-    ahead = np.array(along) + 1
+    ahead = along + 1
     tangent = np.stack([np.interp(ahead, length, x) - xs, np.interp(ahead, length, z) - zs], 1)
     tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
     normal = np.stack([-tangent[:, 1], tangent[:, 0]], 1)
     normal[0] = (0.0, 1.0)
-    return np.stack([xs, zs], 1), normal, np.array(phase)
+    return np.stack([xs, zs], 1), normal, phase
 
 
 def add_teeth(half: HalfMesh, upper: bool) -> None:
     """Add one dental arch, half: outer gum, crown, biting edge, inner crown, inner gum."""
     place, normal, phase = _arch(upper)
     groove = np.where(phase == 0.0, 1.0, 0.0)
-    groove[0] = 1.0
     bulge = np.where(phase == 0.5, 0.35, 0.0)
     t = np.linspace(0, 1, len(phase))
     y0, sign = (-42.0, 1.0) if upper else (-61.5, -1.0)  # gum line; sign points to the roots
@@ -170,7 +162,6 @@ def add_teeth(half: HalfMesh, upper: bool) -> None:
         half.set_uv(f"{name}_teeth", rows[-1], np.stack([t, np.full(len(t), -0.1 * v)], 1))
         if k:
             half.strip(f"{name}_teeth", rows[-2], rows[-1], closed=False)
-    half.tags[f"{name}_incisor"] = rows[4][:2]
 
 
 def add_tongue(half: HalfMesh) -> None:
@@ -190,12 +181,10 @@ def add_tongue(half: HalfMesh) -> None:
         y = 0.5 * (top[k] + bottom[k]) + 0.5 * (top[k] - bottom[k]) * sn * r
         y = y - 1.1 * np.exp(-((turn - 0.5 * np.pi) ** 2) / 0.05)  # the groove along the middle
         rows.append(half.add(np.stack([width[k] * r * c, y, np.full(9, z[k])], 1), "tongue"))
-        half.tags[f"tongue_row{k}"] = rows[-1]
         # Seen from above with the tip down; the underside unrolls outwards.
         half.set_uv("tongue", rows[-1], np.stack([np.linspace(0, 1, 9), np.full(9, -s[k])], 1))
         if k:
             half.strip("tongue", rows[-2], rows[-1], closed=False)
     tip = half.add(np.array([[0.0, -57.8, 85.0]]), "tongue")
     half.set_uv("tongue", tip, np.array([[0.0, -1.12]]))
-    half.fan("tongue", int(tip[0]), rows[-1], closed=False)
-    half.tags["tongue_tip"] = tip
+    half.fan("tongue", tip, rows[-1], closed=False)

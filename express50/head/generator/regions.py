@@ -18,18 +18,11 @@ def _mask(mesh: WholeMesh, tags: list[str], side: str = "both") -> Array:
     return mask
 
 
-def skin_mask(mesh: WholeMesh) -> Array:
-    """Return vertices of the skin and ears, without the mouth's cavity."""
-    used = np.isin(mesh.face_chart, ("skin", "ear", "ear_right"))
-    mask = np.zeros(len(mesh.vertices), bool)
-    mask[np.unique(mesh.faces[used])] = True
-    return mask
-
-
 def region_masks(mesh: WholeMesh) -> dict[str, Array]:
     """Return boolean masks (V,) by region name."""
     x, y, z = np.abs(mesh.vertices[:, 0]), mesh.vertices[:, 1], mesh.vertices[:, 2]
-    skin = skin_mask(mesh)
+    skin = np.zeros(len(x), bool)  # ears included, without the mouth's cavity
+    skin[mesh.faces[np.isin(mesh.face_chart, ("skin", "ear", "ear_right"))]] = True
     regions = {
         "lips": _mask(mesh, [f"lip{k}" for k in range(4)]),
         "upper_teeth": _mask(mesh, ["upper_teeth"]),

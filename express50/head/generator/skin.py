@@ -46,34 +46,26 @@ def spacing(points: Array) -> Array:
 
 def add_skin(half: HalfMesh) -> None:
     """Add the whole skin of the left half, with eye, lip, nostril and ear loops."""
-    loops = [add_eye_rings(half), add_nostril(half), add_ear(half)]
-    lips = add_lip_rings(half)
-    mouth_hole = np.concatenate([lips[1], [[0.0, lips[1][-1, 1]]]])
-    holes = [label for _, label in loops] + [mouth_hole]
-    rim = [index for index, _ in loops] + [lips[0]]
-    fixed = _add_midline(half, lips[1][0, 1], lips[1][-1, 1])
-    fixed_label = np.array([half.labels[int(i)] for i in np.concatenate([fixed, *rim])])
-    fixed_index = np.concatenate([fixed, *rim])
-    filled = _add_fill(half, half.array()[fixed_index], holes)
-    index = np.concatenate([fixed_index, filled])
-    label = np.concatenate([fixed_label, [half.labels[int(i)] for i in filled]])
-    faces = _triangulate(label, len(fixed), [len(r) for r in rim])
-    faces = index[faces]
+    rims = [add_eye_rings(half), add_nostril(half), add_ear(half), add_lip_rings(half)]
+    *holes, lips = (half.labels[rim] for rim in rims)
+    holes.append(np.concatenate([lips, [[0.0, lips[-1, 1]]]]))
+    fixed = _add_midline(half, lips[0, 1], lips[-1, 1])
+    index = np.concatenate([fixed, *rims])
+    filled = _add_fill(half, half.points[index], holes)
+    index = np.concatenate([index, filled])
+    faces = index[_triangulate(half.labels[index], len(fixed), [len(rim) for rim in rims])]
     half.add_faces("skin", faces)
-    half.tags["filled"], half.tags["grid"] = filled, index
+    half.tags["grid"] = index
     # The filled vertices are evened out: average of neighbours, put back on the skin; labels too.
-    points = half.array()
-    label = np.array([half.labels.get(i, (0.0, 0.0)) for i in range(half.count)])
-    direction = sphere(*label.T)
+    points, direction = half.points, sphere(*np.nan_to_num(half.labels).T)
     for _ in range(6):
         points[filled] += 0.6 * (neighbour_mean(points, faces) - points)[filled]
         points[filled] = project(points[filled], 1)
         direction[filled] += 0.6 * (neighbour_mean(direction, faces) - direction)[filled]
     points[filled] = project(points[filled], 3)
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-    half.points = [points]
     x, y, z = direction[filled].T
-    half.label(filled, np.stack([np.arctan2(x, z), np.degrees(np.arcsin(y))], 1))
+    half.labels[filled] = np.stack([np.arctan2(x, z), np.degrees(np.arcsin(y))], 1)
 
 
 def _add_midline(half: HalfMesh, lip_top: float, lip_bottom: float) -> Array:
@@ -90,19 +82,16 @@ def _add_midline(half: HalfMesh, lip_top: float, lip_bottom: float) -> Array:
         count = np.concatenate([[0], np.cumsum(step / spacing(points[1:]))])
         n = int(np.ceil(count[-1]))
         pick = np.interp(np.arange(n + 1) * count[-1] / n, count, latitude)
-        if azimuth == 0.0:
-            pick = pick[1:] if low == lip_top else pick[:-1]  # the lips' loop has that end
-        else:
-            pick = pick[:-1]  # the crown belongs to the front
+        # The lips' loop has the ends at the lips, and the crown belongs to the front.
+        pick = pick[1:] if low == lip_top else pick[:-1]
         points = cast(*rays(np.full(len(pick), azimuth), pick))
         points[:, 0] = 0.0
-        tag = {90.0: "midline_front", lip_bottom: "midline_low"}[high]
-        groups.append(half.add(points, "midline_back" if azimuth else tag))
-        half.label(groups[-1], np.stack([np.full(len(pick), azimuth), pick], 1))
+        groups.append(half.add(points, "midline"))
+        half.labels[groups[-1]] = np.stack([np.full(len(pick), azimuth), pick], 1)
     around = np.linspace(0, np.pi, 26)[1:-1]
     collar = np.stack([around, np.full(len(around), BOTTOM_LATITUDE)], 1)
     groups.append(half.add(cast(*rays(*collar.T)), "collar"))
-    half.label(groups[-1], collar)
+    half.labels[groups[-1]] = collar
     half.tags["collar"] = np.concatenate([groups[-1], groups[1][:1], groups[2][:1]])
     return np.concatenate(groups)
 
@@ -114,9 +103,8 @@ def _add_fill(half: HalfMesh, fixed: Array, holes: list[Array]) -> Array:
     table = cast(*rays(a.ravel(), b.ravel())).reshape(61, 69, 3)
     rng = np.random.default_rng(50)
     label = rng.random((24000, 2))
-    label = np.stack(
-        [np.pi * label[:, 0], np.degrees(np.arcsin(2 * label[:, 1] - 1))], 1
-    )  # even on the sphere
+    # Even on the sphere.
+    label = np.stack([np.pi * label[:, 0], np.degrees(np.arcsin(2 * label[:, 1] - 1))], 1)
     more = rng.random((16000, 2)) * [1.2, 90.0] + [0.0, -60.0]
     label = np.concatenate([label, more])
     label = label[label[:, 1] > BOTTOM_LATITUDE + 1]
@@ -133,9 +121,8 @@ def _add_fill(half: HalfMesh, fixed: Array, holes: list[Array]) -> Array:
         if alive[i]:
             chosen.append(i)
             alive[tree.query_ball_point(points[i], 0.86 * h[i])] = False
-    placed = cast(*rays(*label[chosen].T))
-    index = half.add(placed, "fill")
-    half.label(index, label[chosen])
+    index = half.add(cast(*rays(*label[chosen].T)), "fill")
+    half.labels[index] = label[chosen]
     return index
 
 
@@ -157,8 +144,8 @@ def _triangulate(label: Array, midline: int, rims: list[int]) -> Array:
 
 def set_skin_uv(half: HalfMesh) -> None:
     """Skin chart: pseudo-cylindrical, cut along the back, pole at the crown, roomier in front."""
-    index = np.array(sorted(half.labels))
-    azimuth, latitude = np.array([half.labels[int(i)] for i in index]).T
+    index = np.flatnonzero(np.isfinite(half.labels[:, 0]))
+    azimuth, latitude = half.labels[index].T
     width = np.interp(
         latitude,
         [-85, -80, -60, -42, -15, 15, 40, 60, 75, 84, 90],
@@ -175,8 +162,8 @@ _LONG = np.array([-0.24, 0.2, 0.95])  # from the ala's base towards the tip
 _NOSTRIL_POINTS = 14
 
 
-def add_nostril(half: HalfMesh) -> tuple[Array, Array]:
-    """Add the left nostril. Returns (outer loop indices, their labels (N,2))."""
+def add_nostril(half: HalfMesh) -> Array:
+    """Add the left nostril; return its outer loop's indices (N,)."""
     down = _DOWN / np.linalg.norm(_DOWN)
     side = np.cross(_LONG, down)
     side /= np.linalg.norm(side)
@@ -194,13 +181,13 @@ def add_nostril(half: HalfMesh) -> tuple[Array, Array]:
     rows = []
     for k, (ring, f) in enumerate(zip(rings, (1, 0.85, 0.7, 0.55, 0.4, 0.2), strict=True)):
         rows.append(half.add(ring, f"nostril{k}"))
-        half.label(rows[-1], center + f * (label - center))
+        half.labels[rows[-1]] = center + f * (label - center)
         if k:
             half.strip("skin", rows[-1], rows[-2], closed=True)
     top = half.add((middle - 9.0 * down)[None], "nostril_top")
-    half.label(top, center[None])
-    half.fan("skin", int(top[0]), rows[-1], closed=True)
-    return rows[0], label
+    half.labels[top] = center
+    half.fan("skin", top, rows[-1], closed=True)
+    return rows[0]
 
 
 EAR_CENTER = np.array([7.0, -15.0])  # (y, z) of the ear's own origin, mm
@@ -240,8 +227,8 @@ def _relief(pq: Array, inset: Array, rim: Array) -> Array:
     return helix + ridge - 7.0 * bowl - 1.6 * fossa + 3.0 * tragus + 2.0 * anti + 1.2 * crus
 
 
-def add_ear(half: HalfMesh) -> tuple[Array, Array]:
-    """Add the left ear. Returns (attachment loop indices, their labels (N,2))."""
+def add_ear(half: HalfMesh) -> Array:
+    """Add the left ear; return the indices (N,) of the loop by which it is attached."""
     closed = np.concatenate([_OUTLINE, _OUTLINE[:1]])
     length = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(closed, axis=0), axis=1))])
     curve = CubicSpline(length, closed, bc_type="periodic")
@@ -259,8 +246,7 @@ def add_ear(half: HalfMesh) -> tuple[Array, Array]:
 
     rim_x = side(rim) + _flare(rim)
     rows = [half.add(attach, "ear_foot")]
-    label = np.stack(labels(attach), 1)
-    half.label(rows[0], label)
+    half.labels[rows[0]] = np.stack(labels(attach), 1)
     steps = []
     for f in (0.3, 0.62, 0.9):
         pq = foot + (f**1.35) * (rim - foot)
@@ -280,11 +266,10 @@ def add_ear(half: HalfMesh) -> tuple[Array, Array]:
     canal = _CONCHA[None]
     x = side(canal) + _flare(canal) + _relief(canal, np.ones(1), rim[:1]) - 1.0
     center = half.add(_place(canal, x), "ear")
-    half.fan("ear", int(center[0]), rows[-1], closed=True)
+    half.fan("ear", center, rows[-1], closed=True)
     turn = rim - _CONCHA
     turn /= np.linalg.norm(turn, axis=1, keepdims=True)
     for k, row in enumerate(rows):
         half.set_uv("ear", row, turn * (1 - k / len(rows)))
     half.set_uv("ear", center, np.zeros((1, 2)))
-    half.tags["ear_rim"] = rows[4]
-    return rows[0], label
+    return rows[0]

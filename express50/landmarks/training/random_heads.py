@@ -99,11 +99,11 @@ def paint(canvas: Canvas, rng: Rng) -> tuple[np.ndarray, np.ndarray | None]:
     middle, radius = marks[[2, 14, 30, 8]][rng.integers(4)], rng.uniform(0.02, 0.05)
     blush = np.exp(-((rest - middle) ** 2).sum(1) / radius**2)
     colors = _mix(colors, rng.uniform(0.2, 1.0, 3), blush * rng.uniform(0, 0.3))
-    _tint_features(colors, region, rest, marks, rng)
+    _tint_features(colors, canvas, rng)
     colors[nothing] = rng.uniform(0.02, 0.25)
-    hair = _grow_hair(colors, region, rest, marks, rng)
-    _tint_beard(colors, region, rest, marks, rng)
-    _color_eyes_and_mouth(colors, region, rest, rng)
+    hair = _grow_hair(colors, canvas, rng)
+    _tint_beard(colors, canvas, rng)
+    _color_eyes_and_mouth(colors, canvas, rng)
     return np.clip(colors, 0.0, 1.0).astype(np.float32), hair
 
 
@@ -111,10 +111,9 @@ def _mix(colors: np.ndarray, color: np.ndarray, amount: np.ndarray) -> np.ndarra
     return colors + (color - colors) * amount[:, None]
 
 
-def _tint_features(
-    colors: np.ndarray, region: dict[str, np.ndarray], rest: np.ndarray, marks: np.ndarray, rng: Rng
-) -> None:
+def _tint_features(colors: np.ndarray, canvas: Canvas, rng: Rng) -> None:
     """Paint lips, brows and eye make-up, in place."""
+    rest, region, marks = canvas.rest, canvas.region, canvas.marks
     lips = region["lips"].astype(float) * rng.uniform(0.0, 0.9)
     colors[:] = _mix(colors, colors * rng.uniform([0.7, 0.3, 0.3], [1.2, 0.9, 0.9]), lips)
     brow_color = rng.uniform(0.0, 0.5) * np.array([1.0, rng.uniform(0.5, 1), rng.uniform(0.3, 1)])
@@ -136,12 +135,11 @@ def _tint_features(
         colors[:] = _mix(colors, rng.uniform(0.0, 0.8, 3), shade)
 
 
-def _grow_hair(
-    colors: np.ndarray, region: dict[str, np.ndarray], rest: np.ndarray, marks: np.ndarray, rng: Rng
-) -> np.ndarray | None:
+def _grow_hair(colors: np.ndarray, canvas: Canvas, rng: Rng) -> np.ndarray | None:
     """Paint a hair cap above a tilted plane, in place; returns its thickness or None for bald."""
     if rng.random() < 0.3:
         return None
+    rest, region, marks = canvas.rest, canvas.region, canvas.marks
     brows, crown = marks[17:27, 1].max(), rest[:, 1].max()
     front = np.array([0.0, brows + rng.uniform(0.15, 0.8) * (crown - brows), marks[27, 2]])
     tilt = rng.uniform(0.2, 1.25)
@@ -158,12 +156,11 @@ def _grow_hair(
     return (amount * np.maximum(thickness, 0.0)).astype(np.float32)
 
 
-def _tint_beard(
-    colors: np.ndarray, region: dict[str, np.ndarray], rest: np.ndarray, marks: np.ndarray, rng: Rng
-) -> None:
+def _tint_beard(colors: np.ndarray, canvas: Canvas, rng: Rng) -> None:
     """Paint stubble, moustache or full beard, in place."""
     if rng.random() < 0.6:
         return
+    rest, region, marks = canvas.rest, canvas.region, canvas.marks
     below = 1 / (1 + np.exp((rest[:, 1] - marks[33, 1] + rng.uniform(0, 0.02)) / 0.003))
     cheek = 1 / (1 + np.exp((marks[33, 2] - rng.uniform(0.02, 0.09) - rest[:, 2]) / 0.004))
     amount = below * cheek * (region["face"] & ~region["lips"]) * rng.uniform(0.2, 0.9)
@@ -171,10 +168,9 @@ def _tint_beard(
     colors[:] = _mix(colors, rng.uniform(0.0, 0.4) * np.ones(3), np.clip(amount * grain, 0, 1))
 
 
-def _color_eyes_and_mouth(
-    colors: np.ndarray, region: dict[str, np.ndarray], rest: np.ndarray, rng: Rng
-) -> None:
+def _color_eyes_and_mouth(colors: np.ndarray, canvas: Canvas, rng: Rng) -> None:
     """Paint sclera, iris, pupil, teeth and mouth cavity, in place."""
+    rest, region = canvas.rest, canvas.region
     iris = rng.uniform(0.05, 0.7) * rng.uniform([0.4, 0.5, 0.3], 1)
     sclera = rng.uniform(0.6, 1.0) * np.array([1.0, rng.uniform(0.9, 1), rng.uniform(0.85, 1)])
     for side in ("left", "right"):
@@ -196,10 +192,10 @@ def random_parameters(model: HeadModel, rng: Rng) -> dict[str, torch.Tensor]:
     jaw = rng.normal(size=3) * np.array([0.03, 0.03, 0.02])
     neck = rng.normal(size=3) * 0.15
     gaze = rng.normal(size=2) * np.array([0.2, 0.3])
+    expression = np.zeros(len(model.expression_names))
     if not model.unit_expressions:
-        expression = rng.normal(size=len(model.expression_names))
+        expression = rng.normal(size=len(expression))
     elif rng.random() < SCRIPTED_SHARE:
-        expression = np.zeros(len(model.expression_names))
         script = load_script()
         for number in rng.integers(len(script), size=1 + int(rng.random() < 0.25)):
             strength = rng.uniform(0.3, 1.15)
@@ -208,8 +204,7 @@ def random_parameters(model: HeadModel, rng: Rng) -> dict[str, torch.Tensor]:
             gaze += strength * np.array([-script[number].gaze[1], script[number].gaze[0]])
     else:
         # Up to eight random directions, weak ones likelier than strong ones.
-        count = len(model.expression_names)
-        expression = np.zeros(count)
+        count = len(expression)
         active = rng.choice(count, size=rng.integers(0, min(9, count + 1)), replace=False)
         expression[active] = rng.beta(1.0, 1.2, size=active.size)
     if model.unit_expressions:

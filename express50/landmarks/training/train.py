@@ -29,6 +29,7 @@ from express50.landmarks.network import (
     CROP,
     WEIGHTS,
     LandmarkNet,
+    Output,
     heat_loss,
     load_network,
     save_network,
@@ -36,7 +37,7 @@ from express50.landmarks.network import (
 from express50.landmarks.training.views import (
     FILE_VIEWS,
     TrainingCrop,
-    ViewSet,
+    TrainingView,
     make_backgrounds,
     open_views,
     random_crop,
@@ -97,10 +98,12 @@ def train(models: list[HeadModel], plan: TrainingPlan, folder: Path) -> Landmark
     backgrounds = make_backgrounds(400, np.random.default_rng([plan.seed, 1]))
     net = LandmarkNet().train().to(memory_format=torch.channels_last)
     name = "-".join([*(m.name for m in models), *(str(value) for value in astuple(plan))])
-    sets: list[ViewSet] = []
+    sets: list[list[TrainingView]] = []
 
     def loss_at(step: int) -> torch.Tensor:
-        while len(sets) < len(models) * files_in_use(step, plan.files):
+        # Few files at first, so that training can begin soon.
+        files = min(plan.files, FIRST_FILES + step // STEPS_PER_FILE)
+        while len(sets) < len(models) * files:
             number = HELD_OUT + 1 + len(sets) // len(models)
             model = models[len(sets) % len(models)]
             sets.append(open_views(folder, model, number, plan.seed))
@@ -109,7 +112,7 @@ def train(models: list[HeadModel], plan: TrainingPlan, folder: Path) -> Landmark
         size = CROP // 2 if step < plan.small_steps else CROP
         picks = np.divmod(rng.integers(len(sets) * FILE_VIEWS, size=BATCH), FILE_VIEWS)
         crops = [
-            random_crop(sets[file], view, backgrounds, rng, size)
+            random_crop(sets[file][view], backgrounds, rng, size)
             for file, view in zip(*picks, strict=True)
         ]
         return crop_loss(net, crops)
@@ -125,7 +128,8 @@ def descend(
     first = take_up(state, net, optimiser)
     began, losses = time.monotonic(), []
     for step in range(first, steps):
-        optimiser.param_groups[0]["lr"] = rate * rate_share(step, steps)
+        fall = (steps - step) / (steps * (1.0 - HIGH_SHARE))
+        optimiser.param_groups[0]["lr"] = rate * min(1.0, (step + 1) / WARM_UP, max(fall, 0.01))
         loss = loss_at(step)
         optimiser.zero_grad(set_to_none=True)
         loss.backward()
@@ -138,17 +142,6 @@ def descend(
             print(f"step {step + 1}: loss {recent:.3f}, {seconds:.2f} s", flush=True)
             keep_state(state, net, optimiser, step + 1)
     return net.eval()
-
-
-def files_in_use(step: int, files: int) -> int:
-    """Count the files that a step draws from: few at first, so that training can begin soon."""
-    return min(files, FIRST_FILES + step // STEPS_PER_FILE)
-
-
-def rate_share(step: int, steps: int) -> float:
-    """Return the learning rate of a step as a share of the highest one."""
-    fall = (steps - step) / (steps * (1.0 - HIGH_SHARE))
-    return min(1.0, (step + 1) / WARM_UP, max(fall, 0.01))
 
 
 def keep_state(
@@ -194,29 +187,39 @@ def crop_batch(crops: list[TrainingCrop]) -> LandmarkBatch:
     )
 
 
+def point_loss(
+    output: Output, points: torch.Tensor, first: int = 0
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return losses and distances (B, N) of the landmarks from `first` on, at points (B, N, 2).
+
+    The loss sums distance, likelihood and entropy; distances are crop pixels.
+    """
+    # The square root's slope at zero distance is bounded by the added 0.01 px^2.
+    distance = ((output.points[:, first:] - points).square().sum(-1) + 0.01).sqrt()
+    log_scale = output.log_scale[:, first:]
+    likelihood = 2 * log_scale + distance * torch.exp(-log_scale)
+    return 0.2 * distance + likelihood + heat_loss(output.heat[:, first:], points), distance
+
+
 def crop_loss(net: LandmarkNet, crops: list[TrainingCrop]) -> torch.Tensor:
     """Return the points' distance and likelihood, and entropies of heat maps and answers."""
     batch = crop_batch(crops)
     output = net(batch.images)
-    # The square root's slope at zero distance is bounded by the added 0.01 px^2.
-    distance = ((output.points - batch.points).square().sum(-1) + 0.01).sqrt()
-    likelihood = 2 * output.log_scale + distance * torch.exp(-output.log_scale)
-    heat = heat_loss(output.heat, batch.points)
     seen = functional.binary_cross_entropy_with_logits(output.seen, batch.visible, reduction="none")
     share = batch.weight / batch.weight.sum().clamp_min(1.0)
-    point_loss = ((0.2 * distance + likelihood + heat + 0.5 * seen).mean(1) * share).sum()
-    return point_loss + functional.binary_cross_entropy_with_logits(output.logit, batch.score)
+    points = (point_loss(output, batch.points)[0] + 0.5 * seen).mean(1) * share
+    return points.sum() + functional.binary_cross_entropy_with_logits(output.logit, batch.score)
 
 
 @torch.inference_mode()
-def validate(net: LandmarkNet, views: ViewSet, seed: int) -> str:
+def validate(net: LandmarkNet, views: list[TrainingView], seed: int) -> str:
     """Return errors in crop pixels by the head's turn, and how often the answers are right."""
     rng = np.random.default_rng([seed, 3])
     backgrounds = make_backgrounds(50, rng)
     errors, seen, right = [], [], []
-    for start in range(0, len(views.facing), BATCH):
-        picks = range(start, min(start + BATCH, len(views.facing)))
-        batch = crop_batch([random_crop(views, i, backgrounds, rng) for i in picks])
+    for start in range(0, len(views), BATCH):
+        some = views[start : start + BATCH]
+        batch = crop_batch([random_crop(view, backgrounds, rng) for view in some])
         output = net(batch.images)
         error = (output.points - batch.points).norm(dim=-1).mean(1)
         errors.append(torch.where(batch.weight > 0, error, torch.nan))
@@ -224,7 +227,7 @@ def validate(net: LandmarkNet, views: ViewSet, seed: int) -> str:
         seen.append(((output.seen > 0) == (batch.visible > 0.5))[full].float().mean(1))
         clear = (batch.score <= 0) | (batch.score >= 1)
         right.append(((output.logit > 0) == (batch.score > 0.5))[clear].float())
-    error, facing = torch.cat(errors), torch.from_numpy(views.facing)
+    error, facing = torch.cat(errors), torch.from_numpy(np.stack([view.facing for view in views]))
     parts = [
         f"{name} {float(error[(facing > low) & (facing <= high)].nanmedian()):.2f}"
         for name, low, high in (("front", 0.7, 1.0), ("turned", 0.3, 0.7), ("profile", -0.1, 0.3))

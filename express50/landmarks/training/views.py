@@ -7,15 +7,18 @@ depends on the seed, the head model and its number alone.
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, TypeVar
 
 import cv2
 import numpy as np
 import open3d as o3d
 
 from express50.geometry.conventions import affine_to_opencv
-from express50.geometry.raycast import mesh_scene
+from express50.geometry.raycast import join_rays, mesh_scene
+from express50.geometry.transforms import make_transform
 from express50.head.model import HeadModel
 from express50.landmarks.network import CROP, CROP_MARGIN, MIRROR, face_box
 from express50.landmarks.training.random_heads import RandomHead, random_head
@@ -24,6 +27,7 @@ FRAME_SIDE_M = 0.38
 # A landmark counts as seen if nothing lies further than this in front of it.
 HIDING_M = 0.005
 Rng = np.random.Generator
+Record = TypeVar("Record")
 
 
 @dataclass(frozen=True)
@@ -31,9 +35,9 @@ class TrainingView:
     """A rendered view."""
 
     rgba: np.ndarray  # (S, S, 4) uint8, black where empty
-    points: np.ndarray  # (68, 2) pixels, corner origin
+    points: np.ndarray  # (68, 2) float32 pixels, corner origin
     visible: np.ndarray  # (68,) bool, nothing of the head is before the landmark
-    facing: float  # cosine between the face's forward direction and the direction to the camera
+    facing: np.float32  # cosine between the ways that the face looks and to the camera
 
 
 class HeadScene:
@@ -58,13 +62,13 @@ class HeadScene:
         rgba = self._shade(rays, rng, side)
         eye = -cam_from_world[:3, :3].T @ cam_from_world[:3, 3]
         towards = points - eye
-        sight = np.concatenate([np.broadcast_to(eye, towards.shape), towards], axis=1)
-        share = self.scene.cast_rays(o3d.core.Tensor(sight.astype(np.float32)))["t_hit"].numpy()
+        share = self.scene.cast_rays(join_rays(eye, towards))["t_hit"].numpy()
         visible = (1.0 - share) * np.linalg.norm(towards, axis=1) < HIDING_M
         # Right eye to left eye is +x, brow to chin is -y: (-y) x (+x) = +z.
-        forward = _unit(np.cross(points[8] - points[27], points[45] - points[36]))
-        facing = float(forward @ _unit(eye - points[30]))
-        return TrainingView(rgba, pixels[:, :2] / pixels[:, 2:], visible, facing)
+        forward = unit(np.cross(points[8] - points[27], points[45] - points[36]))
+        facing = np.float32(forward @ unit(eye - points[30]))
+        pixels = (pixels[:, :2] / pixels[:, 2:]).astype(np.float32)
+        return TrainingView(rgba, pixels, visible, facing)
 
     def _shade(self, rays: o3d.core.Tensor, rng: Rng, side: int) -> np.ndarray:
         """Cast rays and light the hits: rgba (side, side, 4) uint8."""
@@ -73,14 +77,12 @@ class HeadScene:
         hit = np.isfinite(distance)
         face = self.faces[cast["primitive_ids"].numpy()[hit]]
         bary = cast["primitive_uvs"].numpy()[hit]
-        weights = np.stack([1 - bary.sum(1), bary[:, 0], bary[:, 1]], axis=1)[..., None]
+        weights = np.column_stack([1 - bary.sum(1), bary])[..., None]
         albedo = (self.head.colors[face] * weights).sum(1)
-        normals = (self.head.normals[face] * weights).sum(1)
-        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-6)
-        rays_hit = rays.numpy()[hit]
-        towards = -rays_hit[:, 3:] / np.linalg.norm(rays_hit[:, 3:], axis=1, keepdims=True)
-        points = rays_hit[:, :3] + rays_hit[:, 3:] * distance[hit][:, None]
-        light = self._light(points, normals, towards, rng)
+        normals = unit((self.head.normals[face] * weights).sum(1))
+        start, ahead = np.split(rays.numpy()[hit], 2, axis=1)
+        points = start + ahead * distance[hit][:, None]
+        light = self._light(points, normals, -unit(ahead), rng)
         image = np.zeros((side, side, 4), np.uint8)
         shaded = np.clip(albedo * light[0] + light[1], 0, 1) ** rng.uniform(0.7, 1.4)
         image[hit, :3] = (255 * shaded).astype(np.uint8)
@@ -91,28 +93,27 @@ class HeadScene:
         self, points: np.ndarray, normals: np.ndarray, towards: np.ndarray, rng: Rng
     ) -> tuple[np.ndarray, np.ndarray]:
         """Draw ambient light and one to three lamps: diffuse and specular light (N, 3) each."""
-        sky = 0.5 + 0.5 * normals @ _unit(rng.normal(size=3))
+        sky = 0.5 + 0.5 * normals @ unit(rng.normal(size=3))
         diffuse = rng.uniform(0.1, 0.8) * (0.6 + 0.4 * sky[:, None]) * rng.uniform(0.8, 1.0, 3)
         specular = np.zeros_like(diffuse)
         for lamp in range(rng.integers(1, 4)):
-            direction = _unit(rng.normal(size=3) + towards.mean(0) * rng.uniform(0.0, 2.0))
+            direction = unit(rng.normal(size=3) + towards.mean(0) * rng.uniform(0.0, 2.0))
             color = rng.uniform(0.2, 1.0) * rng.uniform(0.75, 1.0, 3)
             cosine = np.clip(normals @ direction, 0, None)
             if lamp == 0 and rng.random() < 0.35:
-                shadow = np.concatenate(
-                    [points + 1e-3 * normals, np.broadcast_to(direction, points.shape)], axis=1
-                )
-                blocked = self.scene.test_occlusions(o3d.core.Tensor(shadow.astype(np.float32)))
+                shadow = join_rays(points + 1e-3 * normals, direction)
+                blocked = self.scene.test_occlusions(shadow)
                 cosine = cosine * np.where(blocked.numpy(), rng.uniform(0, 0.6), 1.0)
-            half = _unit(direction + towards)
+            half = unit(direction + towards)
             shine = np.clip((normals * half).sum(1), 0, None) ** rng.uniform(8, 60)
             diffuse = diffuse + cosine[:, None] * color
             specular = specular + self.head.gloss * (shine * (cosine > 0))[:, None] * color
         return diffuse, specular
 
 
-def _unit(vector: np.ndarray) -> np.ndarray:
-    return vector / np.maximum(np.linalg.norm(vector, axis=-1, keepdims=True), 1e-9)
+def unit(vectors: np.ndarray) -> np.ndarray:
+    """Scale vectors (..., 3) to length 1; zero stays zero."""
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-9)
 
 
 def _random_camera(
@@ -123,14 +124,12 @@ def _random_camera(
     forward = np.array([np.sin(yaw) * np.cos(pitch), np.sin(pitch), np.cos(yaw) * np.cos(pitch)])
     target = points.mean(0) + np.array([0.0, 0.02, -0.06]) + rng.normal(size=3) * 0.008
     distance = np.exp(rng.uniform(np.log(0.45), np.log(2.0)))
-    right = _unit(np.cross(np.array([0.0, 1.0, 0.0]), forward))
+    right = unit(np.cross(np.array([0.0, 1.0, 0.0]), forward))
     rotation = np.stack([right, -np.cross(forward, right), -forward])
     roll = rng.normal() * 0.12
     c, s = np.cos(roll), np.sin(roll)
     rotation = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1.0]]) @ rotation
-    cam_from_world = np.eye(4)
-    cam_from_world[:3, :3] = rotation
-    cam_from_world[:3, 3] = -rotation @ (target + distance * forward)
+    cam_from_world = make_transform(rotation, -rotation @ (target + distance * forward))
     focal = side * distance / FRAME_SIDE_M * rng.uniform(0.85, 1.15)
     return np.array([[focal, 0, side / 2], [0, focal, side / 2], [0, 0, 1.0]]), cam_from_world
 
@@ -140,17 +139,6 @@ FILE_VIEWS = 300
 # Each head is seen from every fifth of the range in which a face can be made out, and from behind.
 FACE_YAW = np.radians(100.0)
 VIEWS_PER_HEAD = 6
-_ARRAYS = {"rgba": np.uint8, "points": np.float32, "visible": np.bool_, "facing": np.float32}
-
-
-@dataclass(frozen=True)
-class ViewSet:
-    """N rendered views: each array of `TrainingView` with a first axis."""
-
-    rgba: np.ndarray
-    points: np.ndarray
-    visible: np.ndarray
-    facing: np.ndarray
 
 
 def draw_yaws(rng: np.random.Generator) -> np.ndarray:
@@ -170,26 +158,27 @@ def draw_views(model: HeadModel, count: int, rng: np.random.Generator) -> list[T
     return views
 
 
-def stack_views(views: list[TrainingView]) -> ViewSet:
-    """Stack rendered views into one set."""
-    rows = {name: [getattr(view, name) for view in views] for name in _ARRAYS}
-    return ViewSet(**{name: np.array(rows[name], dtype) for name, dtype in _ARRAYS.items()})
-
-
-def open_views(folder: Path, model: HeadModel, number: int, seed: int) -> ViewSet:
+def open_views(folder: Path, model: HeadModel, number: int, seed: int) -> list[TrainingView]:
     """Read one file of `FILE_VIEWS` views, which is rendered if it is not there yet."""
+    rng = np.random.default_rng([seed, number, *model.name.encode()])
     path = folder / f"{model.name}-{seed}-{number:03d}.npz"
+    return made_once(path, TrainingView, lambda: draw_views(model, FILE_VIEWS, rng))
+
+
+def made_once(path: Path, kind: type[Record], make: Callable[[], list[Record]]) -> list[Record]:
+    """Read a file of records, dataclasses of arrays, which are made if it is not there yet."""
+    names = kind.__annotations__
     if not path.exists():
-        rng = np.random.default_rng([seed, number, *model.name.encode()])
-        views = stack_views(draw_views(model, FILE_VIEWS, rng))
-        folder.mkdir(parents=True, exist_ok=True)
-        # Two processes that happen to render the same file write the same bytes.
+        records = make()
+        arrays: Any = {name: np.stack([getattr(one, name) for one in records]) for name in names}
+        path.parent.mkdir(parents=True, exist_ok=True)
+        # Two processes that happen to make the same file write the same bytes.
         part = path.with_suffix(f".{os.getpid()}.part")
         with part.open("wb") as file:
-            np.savez(file, **vars(views))
+            np.savez(file, **arrays)
         part.rename(path)
     with np.load(path, allow_pickle=False) as data:
-        return ViewSet(**{name: data[name] for name in _ARRAYS})
+        return [kind(*row) for row in zip(*(data[name] for name in names), strict=True)]
 
 
 @dataclass(frozen=True)
@@ -204,10 +193,10 @@ class TrainingCrop:
 
 
 def random_crop(
-    views: ViewSet, index: int, backgrounds: np.ndarray, rng: Rng, size: int = CROP
+    view: TrainingView, backgrounds: np.ndarray, rng: Rng, size: int = CROP
 ) -> TrainingCrop:
     """Draw one training crop of a view, (size, size) pixels."""
-    points = views.points[index].astype(np.float64)
+    points = view.points.astype(np.float64)
     centre, side = face_box(points)
     empty = rng.random() < 0.06
     if rng.random() < 0.8:
@@ -224,7 +213,7 @@ def random_crop(
         turn = np.diag([-1.0, 1.0]) @ turn
     matrix = np.concatenate([turn, (CROP / 2 - turn @ centre)[:, None]], axis=1)
     points = points @ matrix[:, :2].T + matrix[:, 2]
-    visible = views.visible[index]
+    visible = view.visible
     if np.linalg.det(matrix[:, :2]) < 0:
         points, visible = points[MIRROR], visible[MIRROR]
     pool = backgrounds[rng.integers(len(backgrounds))]
@@ -234,7 +223,7 @@ def random_crop(
         image = cv2.resize(image, (size, size), interpolation=cv2.INTER_AREA)
     if not empty:
         _shoulders(image, points * (size / CROP), rng)
-        image = _composite(views.rgba[index], matrix * (size / CROP), image)
+        image = _composite(view.rgba, matrix * (size / CROP), image)
     covered = np.zeros(image.shape[:2], np.uint8)
     kind = rng.random()
     if kind < 0.2:
@@ -242,7 +231,7 @@ def random_crop(
     elif kind < 0.42:
         for _ in range(rng.integers(1, 3)):
             _occlude(image, covered, rng)
-    facing = float(views.facing[index])
+    facing = float(view.facing)
     score = 0.0 if empty else float(np.clip((facing + 0.15) / 0.3, 0.0, 1.0))
     weight = 0.0 if empty else float(np.clip((facing + 0.3) / 0.4, 0.0, 1.0))
     column, row = np.floor(points * (size / CROP)).astype(int).T

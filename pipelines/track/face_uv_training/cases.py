@@ -17,8 +17,9 @@ import torch
 
 from express50.geometry.cameras import Camera
 from express50.geometry.conventions import cell_to_corner
-from express50.geometry.raycast import mesh_scene
+from express50.geometry.raycast import join_rays, mesh_scene
 from express50.geometry.sampling import bilinear
+from express50.geometry.transforms import make_transform
 from express50.head.model import HeadModel, pose, vertex_normals
 from express50.landmarks.training.random_heads import (
     Canvas,
@@ -27,8 +28,10 @@ from express50.landmarks.training.random_heads import (
     random_parameters,
     waves,
 )
+from express50.landmarks.training.views import unit
 from pipelines.track.face_uv import HEIGHT, WIDTH, FaceUvMap
 from pipelines.track.surface import Visibility, sample_normals
+from pipelines.track.terms import MeshPlaces
 
 Rng = np.random.Generator
 # At least the first, fewer than the second.
@@ -99,9 +102,7 @@ class Lamps:
         for direction, color, share in lamps:
             cosine = (share * np.clip(normals @ direction, 0.0, None))[:, None]
             diffuse = diffuse + cosine * color
-            half = direction + towards
-            half /= np.maximum(np.linalg.norm(half, axis=1, keepdims=True), 1e-6)
-            along = np.clip((normals * half).sum(1), 0.0, None)[:, None]
+            along = np.clip((normals * unit(direction + towards)).sum(1), 0.0, None)[:, None]
             highlights += along**self.shine * (cosine > 0) * share[:, None] * color
         return albedo * diffuse + gloss * highlights
 
@@ -115,14 +116,15 @@ class Lamps:
         """Return the shares (N, 1 + L) of even light and lamps' light that get to places (N, 3)."""
         starts = places + OFF_SKIN_M * normals
         even = np.zeros(len(places))
-        for ray in _unit(rng.normal(size=(EVEN_RAYS, 3))):
+        for ray in unit(rng.normal(size=(EVEN_RAYS, 3))):
             # Unit vectors about the normal's end are weighted by the cosine.
-            even += ~_blocked(scene, starts, _unit(1.001 * normals + ray), NEAR_M)
+            rays = join_rays(starts, unit(1.001 * normals + ray))
+            even += ~scene.test_occlusions(rays, tfar=NEAR_M).numpy()
         shares = [even / EVEN_RAYS]
         for direction, size in zip(self.directions, self.sizes, strict=True):
             seen = np.zeros(len(places))
-            for ray in _unit(direction + size * rng.normal(size=(LAMP_RAYS, 3))):
-                seen += ~_blocked(scene, starts, np.broadcast_to(ray, starts.shape), np.inf)
+            for ray in unit(direction + size * rng.normal(size=(LAMP_RAYS, 3))):
+                seen += ~scene.test_occlusions(join_rays(starts, ray)).numpy()
             shares.append(seen / LAMP_RAYS)
         return np.stack(shares, axis=1)
 
@@ -134,8 +136,8 @@ def draw_lamps(rng: Rng) -> Lamps:
     sky = rng.normal(size=3)
     return Lamps(
         rng.uniform(0.1, 0.8) * rng.uniform(0.8, 1.0, 3),
-        _unit(sky),
-        _unit(directions),
+        unit(sky),
+        unit(directions),
         rng.uniform(0.1, 0.8, (count, 1)) * rng.uniform(0.75, 1.0, (count, 3)),
         rng.uniform(0.02, 0.3, count),
         float(rng.uniform(8.0, 60.0)),
@@ -150,21 +152,10 @@ def draw_cameras(places: np.ndarray, rng: Rng) -> list[Camera]:
         towards = np.array(
             [np.sin(yaw) * np.cos(pitch), np.sin(pitch), np.cos(yaw) * np.cos(pitch)]
         )
-        pose_ = np.eye(4)
-        pose_[:3, 3] = -(places.mean(0) + np.exp(rng.uniform(-0.7, 0.7)) * towards)
-        cameras.append(Camera(str(index), 1, 1, "PINHOLE", (1.0, 1.0, 0.5, 0.5), pose_))
+        eye = places.mean(0) + np.exp(rng.uniform(-0.7, 0.7)) * towards
+        at_eye = make_transform(np.eye(3), -eye)
+        cameras.append(Camera(str(index), 1, 1, "PINHOLE", (1.0, 1.0, 0.5, 0.5), at_eye))
     return cameras
-
-
-def _blocked(
-    scene: o3d.t.geometry.RaycastingScene, starts: np.ndarray, towards: np.ndarray, far: float
-) -> np.ndarray:
-    rays = np.concatenate([starts, towards], axis=1).astype(np.float32)
-    return scene.test_occlusions(o3d.core.Tensor(rays), tfar=far).numpy()
-
-
-def _unit(vectors: np.ndarray) -> np.ndarray:
-    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-6)
 
 
 @dataclass(frozen=True)
@@ -182,7 +173,7 @@ def draw_person(model: HeadModel, uv_map: FaceUvMap, rng: Rng) -> PaintedHead:
     whole = Canvas.of(model)
     corners, bary = uv_map.samples.vertices, uv_map.samples.weights
     region = {name: (mask[corners] * bary).sum(1) for name, mask in whole.region.items()}
-    rest = (whole.rest[corners] * bary[..., None]).sum(1)
+    rest = uv_map.samples.at(whole.rest)
     # Lips end where they end, not where a mesh's edges happen to run.
     ragged = rng.uniform(0.0, 0.2) * waves(rest, rng, 8, 200.0, 900.0)
     inside = {name: share > 0.5 for name, share in region.items()}
@@ -300,40 +291,33 @@ class _PaintedScene:
 
     def seen(self, camera: Camera, places: np.ndarray) -> np.ndarray:
         """Return the root of light (N, 3) where a camera looks for places (N, 3)."""
-        towards = places - camera.center
-        towards /= np.linalg.norm(towards, axis=1, keepdims=True)
-        origin = np.broadcast_to(camera.center, places.shape)
-        hit, face, bary = self._cast(np.concatenate([origin, towards], axis=1))
+        towards = unit(places - camera.center)
+        hit, face, spots = self._cast(join_rays(camera.center, towards))
         color = np.tile(self.person.background, (len(places), 1))
-        face, bary = face[hit], bary[hit]
-        corners = self.faces[face]
-        plain = (self.person.vertices[corners] * bary[..., None]).sum(1)
-        at = (self.uv_map.places[corners] * bary[..., None]).sum(1)
-        mapped = bilinear(self.person.map, at)
+        face, spots = face[hit], spots.some(hit)
+        mapped = bilinear(self.person.map, spots.at(self.uv_map.places))
+        plain = spots.at(self.person.vertices)
         albedo = np.where(self.uv_map.front[face][:, None], mapped, plain)
-        normals = (self.normals[corners] * bary[..., None]).sum(1)
-        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-6)
-        reach = (self.reach[corners] * bary[..., None]).sum(1)
+        normals, reach = unit(spots.at(self.normals)), spots.at(self.reach)
         light = self.lamps.lit(albedo, normals, reach, -towards[hit], self.person.gloss)
         color[hit] = np.clip(light, 0.0, 1.0)
         return np.sqrt(color)
 
     def flow(self, places: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Find where the true skin at places (N, 3) of the mesh belongs: (N, 2), known (N,)."""
-        rays = np.concatenate([places + REACH_M * normals, -normals], axis=1)
-        hit, face, bary = self._cast(rays, 2 * REACH_M)
+        hit, face, spots = self._cast(join_rays(places + REACH_M * normals, -normals), 2 * REACH_M)
         hit &= self.uv_map.front[face]
-        where = (self.uv_map.places[self.faces[face]] * bary[..., None]).sum(1)
+        where = spots.at(self.uv_map.places)
         own = cell_to_corner(self.uv_map.texels[:, ::-1])
         hit &= np.linalg.norm(where - own, axis=1) < FAR_TEXELS
         return np.where(hit[:, None], where - own, 0.0), hit
 
     def _cast(
-        self, rays: np.ndarray, far: float = np.inf
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Cast rays (N, 6): hit (N,), faces (N,) and barycentric weights (N, 3)."""
-        cast = self.scene.cast_rays(o3d.core.Tensor(rays.astype(np.float32)))
+        self, rays: o3d.core.Tensor, far: float = np.inf
+    ) -> tuple[np.ndarray, np.ndarray, MeshPlaces]:
+        """Cast rays (N, 6): hit (N,), faces (N,) and places on them."""
+        cast = self.scene.cast_rays(rays)
         distance, u = cast["t_hit"].numpy(), cast["primitive_uvs"].numpy()
         hit = np.isfinite(distance) & (distance < far)
         face = np.where(hit, cast["primitive_ids"].numpy(), 0).astype(np.int64)
-        return hit, face, np.stack([1 - u.sum(1), u[:, 0], u[:, 1]], axis=1)
+        return hit, face, MeshPlaces(self.faces[face], np.column_stack([1 - u.sum(1), u]))

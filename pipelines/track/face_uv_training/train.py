@@ -10,10 +10,9 @@ from __future__ import annotations
 
 import argparse
 import hashlib
-import os
 from dataclasses import astuple, dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -25,14 +24,9 @@ from express50.geometry.sampling import bilinear
 from express50.head.load import load_head
 from express50.head.model import HeadModel
 from express50.landmarks.network import WEIGHTS as START
-from express50.landmarks.network import (
-    LandmarkNet,
-    heat_loss,
-    load_network,
-    save_network,
-    trainable_network,
-)
-from express50.landmarks.training.train import descend
+from express50.landmarks.network import LandmarkNet, load_network, save_network, trainable_network
+from express50.landmarks.training.train import descend, point_loss
+from express50.landmarks.training.views import made_once
 from pipelines.track.config import UV_WEIGHTS
 from pipelines.track.face_uv import (
     FIRST,
@@ -138,23 +132,16 @@ def train(
 
 def open_cases(folder: Path, model: HeadModel, number: int, seed: int) -> list[Case]:
     """Read a file of `FILE_CASES` cases; they are drawn first if it is not there."""
-    path = folder / f"uv_map-{model.name}-{seed}-{number:03d}.npz"
-    names = Case.__annotations__
-    if not path.exists():
+
+    def draw() -> list[Case]:
         rng = np.random.default_rng([seed, number, *model.name.encode()])
         uv_map, cases = make_uv_map(model), list[Case]()
         while len(cases) < FILE_CASES:
             person = draw_person(model, uv_map, rng)
             cases += [draw_case(model, uv_map, person, rng) for _ in range(CASES_PER_PERSON)]
-        folder.mkdir(parents=True, exist_ok=True)
-        # Two processes that happen to draw the same file write the same bytes.
-        part = path.with_suffix(f".{os.getpid()}.part")
-        with part.open("wb") as file:
-            stacks: Any = {n: np.stack([getattr(case, n) for case in cases]) for n in names}
-            np.savez(file, **stacks)
-        part.rename(path)
-    with np.load(path, allow_pickle=False) as data:
-        return [Case(*row) for row in zip(*(data[name] for name in names), strict=True)]
+        return cases
+
+    return made_once(folder / f"uv_map-{model.name}-{seed}-{number:03d}.npz", Case, draw)
 
 
 def make_batch(cases: list[Case], rng: np.random.Generator | None = None) -> UvBatch:
@@ -177,14 +164,8 @@ def make_batch(cases: list[Case], rng: np.random.Generator | None = None) -> UvB
 def marks_loss(net: LandmarkNet, batch: UvBatch) -> tuple[torch.Tensor, torch.Tensor]:
     """Return distance, likelihood and entropy of the known landmarks, and distances (B, 51)."""
     output = net(batch.images)
-    # The square root's slope at zero distance is bounded by the added 0.01 px^2.
-    off = (output.points[:, FIRST:] - batch.points).square().sum(-1)
-    distance = (off + 0.01).sqrt()
-    log_scale = output.log_scale[:, FIRST:]
-    likelihood = 2 * log_scale + distance * torch.exp(-log_scale)
-    heat = heat_loss(output.heat[:, FIRST:], batch.points)
-    total = ((0.2 * distance + likelihood + heat) * batch.known).sum()
-    return total / batch.known.sum().clamp_min(1.0), distance.detach()
+    loss, distance = point_loss(output, batch.points, FIRST)
+    return (loss * batch.known).sum() / batch.known.sum().clamp_min(1.0), distance.detach()
 
 
 @torch.inference_mode()

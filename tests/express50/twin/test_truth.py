@@ -2,11 +2,13 @@ import dataclasses
 
 import numpy as np
 import pytest
+import torch
 
 from express50.errors import CaptureError
 from express50.files.images import read_image
 from express50.geometry.cameras import project, resized, transform_camera
 from express50.geometry.transforms import axis_angle_to_matrix, make_transform
+from express50.head.model import landmarks
 from express50.twin.body import Material
 from express50.twin.rig import make_rig
 from express50.twin.truth import Truth, align_worlds
@@ -21,7 +23,9 @@ def test_landmarks_project_into_the_alpha(truth):
     frame = truth.peaks("S001")["jaw_open"]
     camera = truth.cameras("S001")["cam01"]
     alpha = truth.render_alpha("S001", frame, camera)
-    pixels, _ = project(camera, truth.landmarks("S001", frame))
+    vertices = torch.from_numpy(truth.vertices("S001", frame)).float()
+    marks = landmarks(truth.head_model("S001"), vertices[None])[0].numpy()
+    pixels, _ = project(camera, marks)
     x, y = np.floor(pixels[17:]).astype(int).T  # the jaw line itself may lie on the silhouette
     assert (alpha[y, x] > 0.99).all()
     assert alpha.min() == 0.0 and alpha.max() == 1.0
