@@ -59,7 +59,7 @@ def test_reciprocal_scale_is_finite_down_to_zero():
     scales = torch.tensor([[0.0, 1e-12, 1e-7]], requires_grad=True)
     loss = losses.scale_mm(scales)
     loss.backward()
-    assert float(loss) == pytest.approx(1e7)
+    assert loss.item() == pytest.approx(1e7)
     assert torch.isfinite(scales.grad).all()
 
 

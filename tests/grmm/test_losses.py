@@ -34,7 +34,7 @@ def test_terms_vanish_at_equal_images_with_finite_gradient():
     x = a.clone().requires_grad_(True)
     loss = losses.reconstruction(x, a, LossConfig())
     loss.backward()
-    assert float(loss) == 0
+    assert loss.item() == 0
     assert torch.isfinite(x.grad).all() and x.grad.abs().max() < 1e-9
 
 

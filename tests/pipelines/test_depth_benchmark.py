@@ -1,4 +1,4 @@
-"""Check the benchmark of depth: its figures, the swept settings and the table."""
+"""Check the benchmark of depth: its figures and the swept settings."""
 
 from __future__ import annotations
 
@@ -6,9 +6,8 @@ from dataclasses import fields
 
 import numpy as np
 
-from benchmarks.depth import parse
 from benchmarks.depth_score import of_surest, summary
-from benchmarks.depth_sweep import AXES, as_markdown
+from benchmarks.depth_sweep import AXES
 from pipelines.depth.config import DepthConfig
 
 
@@ -18,15 +17,6 @@ def test_every_setting_of_the_sweep_exists():
         assert axis == "views" or knob in known
         for value in values if axis != "views" else ():
             DepthConfig(**{knob: value})
-
-
-def test_the_table_has_a_column_for_every_cell():
-    row = {"setting": "voxel_mm", "value": 2.4, "views": 24, "pixels": 512, "voxel_mm": 2.4,
-           "seconds": 20.0, "abs_error_mm_median": 0.5, "abs_error_mm_p95": 7.0,
-           "skin_error_mm_median": 0.4, "coverage": 0.98}  # fmt: skip
-    lines = as_markdown([row], "S001/neutral")
-    assert len({line.count("|") for line in lines[2:]}) == 1
-    assert lines[-1].startswith("| voxel_mm | 2.4 | 24 | 512 |")
 
 
 def test_figures_are_those_of_all_pixels_and_none_where_nothing_was_measured():
@@ -48,8 +38,3 @@ def test_the_tail_of_the_surest_pixels_leaves_out_those_of_least_confidence():
     found = of_surest(errors, sure)["abs_error_mm_p95_of_surest"]
     assert found["0.98"] == 20 and found["0.9"] == 1
     assert of_surest(errors, -sure)["abs_error_mm_p95_of_surest"]["0.7"] == 20
-
-
-def test_a_sweep_is_asked_for_by_name():
-    options = parse(["--sweep", "--axes", "views,voxel"])
-    assert options.sweep and options.axes == "views,voxel"
