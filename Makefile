@@ -12,7 +12,7 @@ TRAIN ?= --preset measured --budget 1h
 STAGE_FLAGS = --preset $(PRESET) --workers $(WORKERS) $(foreach kv,$(SET),--set $(kv)) $(if $(SLURM),--slurm $(SLURM))
 
 .PHONY: help setup demo test check bench tradeoff report clean \
-        ingest calibrate align frames matte track depth regions pack train
+        ingest calibrate align frames matte track depth register regions pack train
 
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 14
@@ -48,7 +48,7 @@ tradeoff: $(READY) ## sweep the speed-accuracy knobs into docs/TRADEOFFS.md
 ingest: $(READY) ## index CAPTURES="dir ..." into DATASET
 	$(BIN)/express50 ingest $(DATASET) $(CAPTURES) $(STAGE_FLAGS)
 
-calibrate align frames matte track depth regions pack: $(READY) ## one stage over DATASET
+calibrate align frames matte track depth register regions pack: $(READY) ## one stage over DATASET
 	$(BIN)/express50 $@ $(DATASET) $(STAGE_FLAGS)
 
 train: $(READY) ## train GRMM on DATASET's shards, or go on with it; TRAIN="--preset paper" on a GPU

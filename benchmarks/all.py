@@ -10,7 +10,7 @@ import sys
 # dataset of the demo; `demo` and the sweeps are jobs of their own.
 NAMES = (
     "align", "calibrate", "depth", "faults", "fps", "grmm", "matte", "matte_views",
-    "raster", "shards", "stage_overhead", "track",
+    "raster", "register", "shards", "stage_overhead", "track",
 )  # fmt: skip
 
 

@@ -24,7 +24,10 @@ import psutil
 
 from express50.contract.layout import Dataset
 
-STAGES = ("ingest", "calibrate", "align", "frames", "matte", "track", "depth", "regions", "pack")
+STAGES = (
+    "ingest", "calibrate", "align", "frames", "matte", "track", "depth", "register", "regions",
+    "pack",
+)  # fmt: skip
 # Six expressions that between them open the jaw, move brows, lids, lips and cheeks, and are
 # one-sided; the fourth subject is never trained on.
 EXPRESSIONS = ("neutral", "smile", "jaw_open", "pucker", "brow_raise", "wink_left")

@@ -5,7 +5,7 @@ package imports annotations.
 """
 
 from annotations import align, observe
-from pipelines import calibrate, depth, frames, ingest, matte, pack, regions, track
+from pipelines import calibrate, depth, frames, ingest, matte, pack, regions, register, track
 
 STAGES = (
     ingest.STAGE,
@@ -16,6 +16,7 @@ STAGES = (
     matte.STAGE,
     track.STAGE,
     depth.STAGE,
+    register.STAGE,
     regions.STAGE,
     pack.STAGE,
 )

@@ -26,7 +26,7 @@ pytestmark = pytest.mark.slow
 
 STAGES = (
     "ingest", "calibrate", "observe", "align", "frames", "matte", "track", "depth",
-    "regions", "pack",
+    "register", "regions", "pack",
 )  # fmt: skip
 SETTINGS = {"pack": ["--set", "pack.size=96", "--set", 'pack.test_subjects=["S002"]']}
 RECORDING = [

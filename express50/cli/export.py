@@ -78,6 +78,7 @@ def run_export(args: argparse.Namespace) -> int:
         read_tracked,
         tracked_subjects,
         with_clips,
+        with_registered,
     )
     from express50.dataset.export_avatar import AvatarOptions, export_avatar
 
@@ -97,7 +98,10 @@ def run_export(args: argparse.Namespace) -> int:
     dataset, accounts = Dataset(args.dataset), []
     for subject in tracked_subjects(dataset, args.subject):
         head = read_tracked(dataset, subject, args.expression)
-        head = with_clips(dataset, head, args.expression) if args.frames == "clips" else head
+        if args.frames == "clips":
+            head = with_clips(dataset, head, args.expression)
+        elif args.format != "gaussian-avatars":  # that one is parameters and what they pose
+            head = with_registered(dataset, head)
         with exporting(args.out, subject) as folder:
             if args.format == "gaussian-avatars":
                 meta = export_avatar(dataset, head, options, folder)

@@ -121,6 +121,14 @@ class Dataset:
         """Return the path of a subject's tracked head at its peaks."""
         return self.item_dir("track", subject) / "track.npz"
 
+    def surface_file(self, subject: str, expression: str) -> Path:
+        """Return the path of an expression's reconstructed surface."""
+        return self.item_dir("depth", f"{subject}/{expression}") / "surface.ply"
+
+    def registration_file(self, subject: str, expression: str) -> Path:
+        """Return the path of an expression's mesh on the reconstructed surface."""
+        return self.item_dir("register", f"{subject}/{expression}") / "registration.npz"
+
     def frame_file(self, subject: str, expression: str, camera: str) -> Path:
         """Return the path of a camera's undistorted, colour-corrected frame at a peak."""
         return self.item_dir("frames", f"{subject}/{expression}") / f"{camera}.jxl"

@@ -18,7 +18,14 @@ import torch
 from PIL import Image
 
 from express50.contract.layout import Dataset, exclusion_reason, included_subjects
-from express50.dataset.tracks import OF_FRAMES, Track, existing_track, read_sequence, read_track
+from express50.dataset.tracks import (
+    OF_FRAMES,
+    Track,
+    best_vertices,
+    existing_track,
+    read_sequence,
+    read_track,
+)
 from express50.errors import FormatError, StageError
 from express50.files.atomic import dump_json, folder_in_one_step
 from express50.files.images import encode_png, read_image
@@ -114,6 +121,18 @@ def read_tracked(dataset: Dataset, subject: str, expressions: Sequence[str]) -> 
         parts = {name: getattr(track, name)[rows] for name in (*OF_FRAMES, "vertices")}
         track = replace(track, expressions=names, **parts)
     return Head(subject=subject, track=track, model=model, albedo=read_albedo(path.parent))
+
+
+def with_registered(dataset: Dataset, head: Head) -> Head:
+    """Put the meshes on the reconstructed surface, where they are, in the place of tracked ones.
+
+    Raises:
+        FormatError: one is damaged, or of another track.
+    """
+    vertices = [
+        best_vertices(dataset, head.subject, head.track, name) for name in head.track.expressions
+    ]
+    return replace(head, track=replace(head.track, vertices=np.stack(vertices)))
 
 
 def with_clips(dataset: Dataset, head: Head, wanted: Sequence[str]) -> Head:

@@ -1,4 +1,4 @@
-"""Read ``track.npz`` and ``sequence.npz``: a subject's head in its peak frames and its clips.
+"""Read what was tracked and registered: a subject's head in its peak frames and its clips.
 
 Every package reads tracks here, so that a damaged or foreign file gives one line of error.
 Nothing in a file is executed: pickled objects are refused.
@@ -14,11 +14,13 @@ import numpy as np
 from express50.contract.layout import Dataset
 from express50.errors import FormatError, StageError
 from express50.files.arrays import read_arrays
+from express50.files.digests import file_sha256
 from express50.files.text import ID
 from express50.geometry.shapes import check_finite, check_shape
 
 SCHEMAS = ("express50.track/1", "express50.track/2")
 SEQUENCE_SCHEMA = "express50.sequence/1"
+REGISTRATION_SCHEMA = "express50.registration/1"
 _WIDTHS = {"neck": (3,), "jaw": (3,), "eyes": (6,), "R": (3, 3), "t": (3,)}
 _AGAIN = "run 'express50 track' again"
 
@@ -91,6 +93,27 @@ class Sequence:
     t: np.ndarray
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Registration:
+    """Holds an expression's mesh on the reconstructed surface, V vertices.
+
+    Attributes:
+        track: SHA-256 of the track.npz that was registered.
+        vertices: (V, 3) float32 metres, world.
+        offsets: (V, 3) float32 metres, added to the rest shape of the tracked parameters.
+        seen: (V,) bool, where the surface was found and trusted.
+        residual: (V,) float32 metres, height of the surface over the mesh there, 0 elsewhere.
+        sigma: (V,) float32 metres, standard deviation of the vertices along their normals.
+    """
+
+    track: str
+    vertices: np.ndarray
+    offsets: np.ndarray
+    seen: np.ndarray
+    residual: np.ndarray
+    sigma: np.ndarray
+
+
 def existing_track(dataset: Dataset, subject: str) -> Path:
     """Return the path of the subject's track.
 
@@ -130,6 +153,51 @@ def read_track(path: Path) -> Track:
         words = f"has no {error}" if isinstance(error, KeyError) else str(error)
         raise FormatError(f"{path}: not a track ({words}); {_AGAIN}") from None
     return Track(schema=schema, head=head, expressions=tuple(names.tolist()), **numbers)
+
+
+def read_registration(path: Path) -> Registration:
+    """Read and check a registration.
+
+    Raises:
+        StageError: the file is missing.
+        FormatError: it is not a registration, or its arrays do not fit or hold NaN or Inf.
+    """
+    again = "run 'express50 register' again"
+    if not path.is_file():
+        raise StageError(f"{path}: the registration is missing; run 'express50 register'")
+    arrays = read_arrays(path, FormatError, "a registration", fix=again)
+    try:
+        schema, track = str(arrays.pop("schema")), str(arrays.pop("track"))
+        if schema != REGISTRATION_SCHEMA:
+            raise ValueError(f"schema {schema!r}, expected {REGISTRATION_SCHEMA}")
+        count = len(arrays["vertices"])
+        for name, width in {"vertices": (3,), "offsets": (3,), "residual": (), "sigma": ()}.items():
+            check_shape(name, arrays[name], (count, *width))
+            check_finite(name, arrays[name])
+        check_shape("seen", arrays["seen"], (count,))
+        names = ("vertices", "offsets", "seen", "residual", "sigma")
+        return Registration(track=track, **{name: arrays[name] for name in names})
+    except (KeyError, ValueError) as error:
+        words = f"has no {error}" if isinstance(error, KeyError) else str(error)
+        raise FormatError(f"{path}: not a registration ({words}); {again}") from None
+
+
+def best_vertices(dataset: Dataset, subject: str, track: Track, expression: str) -> np.ndarray:
+    """Return an expression's vertices (V, 3) float32: registered where they are, else tracked.
+
+    Raises:
+        StageError: the expression is not tracked.
+        FormatError: the registration is damaged, or of another track.
+    """
+    tracked = track.vertices[track.row(expression)]
+    path = dataset.registration_file(subject, expression)
+    if not path.is_file():
+        return tracked
+    found = read_registration(path)
+    if found.track != file_sha256(dataset.track_file(subject)):
+        raise FormatError(f"{path}: is of another track; run 'express50 register' again")
+    check_shape("vertices", found.vertices, tracked.shape)
+    return found.vertices
 
 
 OF_FRAMES = ("frames", "expression", "neck", "jaw", "eyes", "R", "t")  # a row per frame, with cues

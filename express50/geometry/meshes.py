@@ -1,14 +1,18 @@
-"""Write triangle meshes as PLY, OBJ or GLB files, in the units they have."""
+"""Write triangle meshes as PLY, OBJ or GLB files, in the units they have; read surfaces."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from express50.errors import FormatError
+
 _WORDS = {"<f4": "float", "|u1": "uchar"}
+_AGAIN = "run 'express50 depth' again"
 
 
 def write_ply(
@@ -34,6 +38,41 @@ def write_ply(
     header += [f"property {_WORDS[kind]} {name}" for name, kind in kinds]
     header += [f"element face {len(rows)}", "property list uchar int vertex_indices", "end_header"]
     path.write_bytes(("\n".join(header) + "\n").encode() + table.tobytes() + rows.tobytes())
+
+
+@dataclass(frozen=True)
+class Surface:
+    """A reconstructed surface, as ``surface.ply`` holds it.
+
+    Vertices (N, 3) are in metres, faces (F, 3) are indices, colors (N, 3) are uint8 sRGB and
+    confidence (N,) is from 0 to 1.
+    """
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    colors: np.ndarray
+    confidence: np.ndarray
+
+
+def read_surface(path: Path) -> Surface:
+    """Read a surface that the depth stage wrote.
+
+    Raises:
+        FormatError: it is not such a file, holds no face, or NaN.
+    """
+    import trimesh
+
+    try:
+        mesh = trimesh.load(path, file_type="ply", process=False, force="mesh")
+        columns = mesh.metadata["_ply_raw"]["vertex"]["data"]
+        vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
+        colors = np.stack([np.ravel(columns[k]) for k in ("red", "green", "blue")], axis=1)
+        confidence = np.ravel(columns["confidence"]).astype(np.float64)
+    except Exception as error:  # noqa: BLE001  # trimesh raises what the damage leads to
+        raise FormatError(f"{path}: not a surface of depth ({error}); {_AGAIN}") from None
+    if not len(faces) or not (np.isfinite(vertices).all() and np.isfinite(confidence).all()):
+        raise FormatError(f"{path}: {len(faces)} faces, or NaN in the vertices; {_AGAIN}")
+    return Surface(vertices, faces, colors, confidence)
 
 
 def write_obj(

@@ -1,0 +1,117 @@
+"""Register one expression: read track and surface, lay the mesh, write it with its uncertainty."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from express50.contract.layout import Dataset
+from express50.contract.stage import Note, Result
+from express50.dataset.tracks import REGISTRATION_SCHEMA, Track, existing_track, read_track
+from express50.errors import FormatError, StageError
+from express50.files.digests import file_sha256
+from express50.files.images import contact_sheet, write_image
+from express50.geometry.meshes import read_surface
+from express50.geometry.transforms_torch import axis_angle_to_matrix
+from express50.head.load import load_head
+from express50.head.model import HeadModel, joint_angles, joint_transforms
+from express50.head.preview import render_preview
+from pipelines.register.lay import GivenSurface, LaidMesh, crossings, lay
+from pipelines.register.skin import skin_trust
+
+LEAST_SEEN = 0.1  # share of the face under which the surface is not this head's
+YAWS = (0.0, 45.0, 90.0)  # of the pictures, degrees
+
+
+def run(dataset: Dataset, item: str, detail: float, out: Path) -> Result:
+    """Write registration.npz and a picture; details from `detail` metres up are followed.
+
+    Raises:
+        StageError: the expression has no surface, or is not tracked.
+        FormatError: the track does not fit its head model, or the surface is damaged.
+    """
+    torch.set_num_threads(1)
+    subject, expression = item.split("/")
+    path, file = existing_track(dataset, subject), dataset.surface_file(subject, expression)
+    if not file.is_file():
+        raise StageError(f"{item}: it has no surface; run 'express50 depth'")
+    track, surface = read_track(path), read_surface(file)
+    row, model = track.row(expression), load_head(track.head)
+    start = track.vertices[row].astype(np.float64)
+    if len(start) != len(model.template):
+        raise FormatError(
+            f"{path}: {len(start)} vertices, its head model has {len(model.template)};"
+            " run 'express50 track' again"
+        )
+    trust = skin_trust(model, start, surface.vertices, surface.colors, surface.confidence)
+    laid = lay(model, start, GivenSurface(surface.vertices, surface.faces, trust), detail)
+    moved = laid.vertices - start
+    offsets = rest_offsets(model, track, row, moved)
+    np.savez(
+        out / "registration.npz",
+        schema=np.array(REGISTRATION_SCHEMA),
+        track=np.array(file_sha256(path)),
+        vertices=laid.vertices.astype(np.float32),
+        offsets=offsets.astype(np.float32),
+        seen=laid.seen,
+        residual=laid.residual.astype(np.float32),
+        sigma=laid.sigma.astype(np.float32),
+    )
+    write_picture(out, model, track, row, laid)
+    metrics = figures_of(model, start, laid)
+    warnings = []
+    if metrics["seen_share"] < LEAST_SEEN:
+        why = f"the surface was found at only {metrics['seen_share']:.0%} of the face's vertices"
+        warnings.append(Note(expression, why))
+    return Result(metrics, (), warnings)
+
+
+def rest_offsets(model: HeadModel, track: Track, row: int, moved: np.ndarray) -> np.ndarray:
+    """Turn moves (V, 3) of posed vertices, world, into offsets (V, 3) of the head at rest.
+
+    Added to the rest shape of the tracked parameters, they give the moved vertices: joints stay
+    those of the tracked shape.
+    """
+    neck, jaw, eyes = (
+        torch.from_numpy(part[row])[None] for part in (track.neck, track.jaw, track.eyes)
+    )
+    like = torch.zeros(1, 1, 3, dtype=torch.float64)
+    turns = axis_angle_to_matrix(joint_angles(like, None, neck, jaw, eyes))
+    turn, _ = joint_transforms(torch.zeros(1, turns.shape[1], 3, dtype=torch.float64), turns)
+    blended = torch.einsum("nj,jrc->nrc", model.skinning.double(), turn[0]).numpy()
+    return np.linalg.solve(blended, (moved @ track.R[row])[..., None])[..., 0]
+
+
+def figures_of(model: HeadModel, start: np.ndarray, laid: LaidMesh) -> dict:
+    """Collect the item's metrics: of the face, rounded so that the last bit does not matter."""
+    face = model.regions["face"].numpy() if "face" in model.regions else np.ones(len(start), bool)
+    seen = face & laid.seen
+    residual = np.abs(laid.residual[seen])
+    moved = np.linalg.norm(laid.vertices - start, axis=1)[face]
+    figures = {
+        "residual_mm_median": 1e3 * float(np.median(residual)) if seen.any() else None,
+        "residual_mm_p95": 1e3 * float(np.percentile(residual, 95)) if seen.any() else None,
+        "moved_mm_median": 1e3 * float(np.median(moved)),
+        "moved_mm_p95": 1e3 * float(np.percentile(moved, 95)),
+        "sigma_mm_median": 1e3 * float(np.median(laid.sigma[face])),
+        "seen_share": float(seen.sum() / max(1, face.sum())),
+    }
+    rounded = {k: None if value is None else round(value, 4) for k, value in figures.items()}
+    before, after = (len(crossings(model, mesh)) for mesh in (start, laid.vertices))
+    return rounded | {"crossing_triangles": after, "crossing_triangles_tracked": before}
+
+
+def write_picture(out: Path, model: HeadModel, track: Track, row: int, laid: LaidMesh) -> None:
+    """Write a sheet: the tracked mesh above, the registered one below, from three sides."""
+    (out / "qc").mkdir(exist_ok=True)
+    rows = [
+        [
+            render_preview(model, (mesh - track.t[row]) @ track.R[row], yaw=yaw, size=240)
+            for yaw in YAWS
+        ]
+        for mesh in (track.vertices[row].astype(np.float64), laid.vertices)
+    ]
+    sheet = contact_sheet(rows, ["tracked", "registered"], tile=(240, 240))
+    write_image(out / "qc" / "registration.jpg", sheet, quality=90)

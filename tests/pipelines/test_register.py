@@ -1,0 +1,245 @@
+"""Register: a mesh on a known surface, hair left out, lips apart, and the stage's files."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from express50.contract.layout import Dataset
+from express50.dataset.export import Head, with_registered
+from express50.dataset.tracks import best_vertices, read_registration, read_track
+from express50.errors import ConfigError, FormatError, StageError
+from express50.geometry.meshes import read_surface, write_ply
+from express50.geometry.transforms_torch import axis_angle_to_matrix
+from express50.head.load import load_head
+from express50.head.model import joint_angles, pose, rest_vertices, skin
+from pipelines.register import STAGE, RegisterConfig
+from pipelines.register.lay import (
+    GivenSurface,
+    Plate,
+    SurfaceSearch,
+    crossings,
+    lay,
+    mesh_normals,
+    without_new_crossings,
+)
+from pipelines.register.skin import skin_trust
+from pipelines.register.stage import rest_offsets
+from tests.express50.dataset.tracked import track_arrays, write_track
+
+DETAIL = 0.010
+
+
+@pytest.fixture(scope="module")
+def model():
+    return load_head("procedural")
+
+
+def posed(model, seed: int, jaw: float = 0.0) -> np.ndarray:
+    """A person's mesh (V, 3): the template with random shape coefficients."""
+    shape = 0.8 * np.random.default_rng(seed).normal(size=(1, model.shape_dirs.shape[2]))
+    angles = torch.tensor([[jaw, 0.0, 0.0]])
+    return (
+        pose(model, torch.from_numpy(shape).float(), torch.zeros(1, 0), jaw=angles)[0]
+        .double()
+        .numpy()
+    )
+
+
+def bumped(model, mesh: np.ndarray, height: float) -> tuple[np.ndarray, np.ndarray]:
+    """A mesh with a smooth rise on its left cheek; also where (V,) it rises by over a half."""
+    cheek = mesh[((mesh - [0.045, -0.03, 0.06]) ** 2).sum(1).argmin()]
+    share = np.exp(-((mesh - cheek) ** 2).sum(1) / 0.025**2)
+    return mesh + height * share[:, None] * mesh_normals(mesh, model.faces), share > 0.5
+
+
+def surface_of(model, mesh: np.ndarray) -> GivenSurface:
+    """A mesh as a surface that is trusted everywhere."""
+    return GivenSurface(mesh, model.faces.numpy(), np.ones(len(mesh)))
+
+
+def test_a_bump_is_followed_and_the_rest_stays(model):
+    start = posed(model, 1)
+    true, raised = bumped(model, start, 0.004)
+    laid = lay(model, start, surface_of(model, true), DETAIL)
+    face = model.regions["face"].numpy()
+    left = np.linalg.norm(laid.vertices - true, axis=1)
+    assert np.median(np.linalg.norm(start - true, axis=1)[face & raised]) > 0.0025
+    assert np.percentile(left[face & raised], 95) < 0.0004
+    assert np.percentile(left[face], 95) < 0.0002
+    fixed = np.any([model.regions[k].numpy() for k in ("left_eyeball", "teeth", "tongue")], axis=0)
+    assert np.abs(laid.vertices - start)[fixed].max() < 1e-5
+    cheek = face & raised & laid.seen
+    assert cheek.sum() > 20
+    assert laid.sigma[cheek].max() < 0.5 * np.median(laid.sigma[model.regions["scalp"].numpy()])
+
+
+def test_a_surface_out_of_reach_or_without_trust_moves_nothing(model):
+    start = posed(model, 2)
+    true, raised = bumped(model, start, 0.004)
+    far = lay(model, start, surface_of(model, true + [0.0, 0.0, 0.5]), DETAIL)
+    doubtful = replace(surface_of(model, true), trust=np.zeros(len(true)))
+    for laid in (far, lay(model, start, doubtful, DETAIL)):
+        assert np.abs(laid.vertices - start).max() < 1e-9
+        assert not laid.seen.any() and not laid.residual.any()
+        assert laid.sigma[raised].min() > 0.003
+
+
+def test_heights_point_to_the_nearer_sheet_that_faces_the_same_way():
+    square = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]) * 0.1
+    sheets = [square + [0, 0, z] for z in (0.004, -0.006, 0.001)]
+    faces = np.array([[0, 1, 2], [0, 2, 3]])
+    turned = faces[:, ::-1]  # the nearest sheet faces away
+    vertices = np.concatenate(sheets)
+    surface = GivenSurface(
+        vertices, np.concatenate([faces, faces + 4, turned + 8]), np.repeat([0.5, 1.0, 1.0], 4)
+    )
+    up = np.array([[0.0, 0.0, 1.0]])
+    search = SurfaceSearch(replace(surface, faces=surface.faces[:4]))
+    height, trust = search.heights(np.array([[0.01, 0.02, 0.0]]), up, 0.01)
+    assert height == pytest.approx([0.004], abs=1e-6) and trust == pytest.approx([0.5])
+    assert search.heights(np.array([[0.01, 0.02, 0.0]]), up, 0.003)[1] == [0.0]
+    assert SurfaceSearch(surface).heights(np.array([[0.01, 0.02, 0.0]]), -up, 0.01)[0] == (
+        pytest.approx([-0.001], abs=1e-6)
+    )
+
+
+def test_the_uncertainty_is_the_spread_of_what_fits_the_data(model):
+    """The plate's standard deviations are those of fits to data with the stated noise."""
+    mesh, rng = posed(model, 3), np.random.default_rng(0)
+    plate = Plate(mesh, model.faces.numpy(), np.ones(len(mesh), bool), DETAIL)
+    weight = np.where(rng.uniform(size=len(mesh)) < 0.3, 0.0003**-2.0, 0.0)
+    solver = plate.factor(weight)
+    sigma = plate.sigma(solver, weight)
+    some = rng.choice(len(mesh), 12, replace=False)
+    unit = np.zeros((len(mesh), len(some)))
+    unit[some, np.arange(len(some))] = 1.0
+    exact = np.sqrt(solver.solve(unit)[some, np.arange(len(some))])
+    assert sigma[some] == pytest.approx(exact, rel=0.4)
+    assert np.mean(sigma[some] / exact) == pytest.approx(1.0, abs=0.12)
+
+
+def test_hair_and_doubtful_places_get_no_trust(model):
+    mesh = posed(model, 4)
+    rng, count = np.random.default_rng(1), len(mesh)
+    colors = np.clip(rng.normal((200, 150, 125), 6, (count, 3)), 0, 255).astype(np.uint8)
+    hair = mesh[:, 1] > np.percentile(mesh[model.regions["forehead"].numpy(), 1], 40)
+    colors[hair] = np.clip(rng.normal((70, 50, 40), 6, (hair.sum(), 3)), 0, 255)
+    confidence = np.full(count, 0.8)
+    side = mesh[:, 0] < -0.055
+    confidence[side] = 0.3
+    trust = skin_trust(model, mesh, mesh, colors, confidence)
+    nose = model.regions["nose"].numpy()
+    assert trust[hair].max() < 0.05 and trust[side].max() < 0.05
+    assert np.median(trust[nose]) > 0.75
+    lips = model.regions["lips"].numpy() & ~side
+    colors[lips] = (190, 80, 90)
+    assert np.median(skin_trust(model, mesh, mesh, colors, confidence)[lips]) > 0.5
+    nowhere = skin_trust(model, mesh, mesh + 1.0, colors, confidence)
+    assert nowhere == pytest.approx(confidence)
+
+
+def test_lips_do_not_newly_pass_through_each_other(model):
+    start = posed(model, 5, jaw=0.02)
+    lips = model.regions["lips"].numpy()
+    middle = start[lips].mean(0)
+    squeezed = start.copy()
+    squeezed[lips, 1] = middle[1] + (start[lips, 1] - middle[1]) * -0.5
+    known = crossings(model, start)
+    assert len(np.setdiff1d(crossings(model, squeezed), known)) > 20
+    freed = without_new_crossings(model, start, squeezed)
+    assert len(np.setdiff1d(crossings(model, freed), known)) < 5
+    assert np.array_equal(without_new_crossings(model, start, start), start)
+
+
+def test_offsets_at_rest_give_the_moved_vertices(model, tmp_path):
+    arrays = track_arrays("procedural", offsets_mm=0.0)
+    track = read_track(write_track(tmp_path / "track.npz", arrays))
+    moved = 0.002 * np.random.default_rng(2).normal(size=track.vertices.shape[1:])
+    offsets = torch.from_numpy(rest_offsets(model, track, 1, moved))
+    exact = model.to(dtype=torch.float64)
+    rest = rest_vertices(
+        exact, torch.from_numpy(track.shape)[None], torch.from_numpy(track.expression[1:2])
+    )
+    joints = torch.einsum("jv,bvc->bjc", exact.joint_regressor, rest)
+    parts = (torch.from_numpy(x[1:2]) for x in (track.neck, track.jaw, track.eyes))
+    turns = axis_angle_to_matrix(joint_angles(rest, None, *parts))
+    head = skin(rest + offsets, joints, turns, exact.skinning, exact.pose_dirs)[0].numpy()
+    world = head @ track.R[1].T + track.t[1]
+    assert np.abs(world - (track.vertices[1] + moved)).max() < 1e-6
+
+
+@pytest.fixture
+def dataset(tmp_path, model) -> Dataset:
+    """A tracked subject whose smile has a surface with a bump; its neutral has none."""
+    dataset = Dataset(tmp_path)
+    dataset.item_dir("track", "S001").mkdir(parents=True)
+    arrays = track_arrays("procedural", offsets_mm=0.0)
+    write_track(dataset.track_file("S001"), arrays)
+    path = dataset.surface_file("S001", "smile")
+    path.parent.mkdir(parents=True)
+    head = (arrays["vertices"][1] - arrays["t"][1]) @ arrays["R"][1]
+    true = bumped(model, head.astype(np.float64), 0.004)[0] @ arrays["R"][1].T + arrays["t"][1]
+    write_surface(path, true, model.faces.numpy())
+    return dataset
+
+
+def write_surface(path: Path, vertices: np.ndarray, faces: np.ndarray) -> None:
+    """Write a skin-coloured surface as depth does."""
+    colour = dict(zip(("red", "green", "blue"), (200, 150, 125), strict=True))
+    columns = {k: np.full(len(vertices), v, np.uint8) for k, v in colour.items()}
+    columns["confidence"] = np.full(len(vertices), 0.8, np.float32)
+    write_ply(path, vertices, faces, columns)
+
+
+def test_the_stage_writes_a_mesh_that_later_stages_take(dataset, tmp_path):
+    out = tmp_path / "out"
+    out.mkdir()
+    track = read_track(dataset.track_file("S001"))
+    assert np.array_equal(best_vertices(dataset, "S001", track, "smile"), track.vertices[1])
+    result = STAGE.run(dataset, "S001/smile", RegisterConfig(), out)
+    assert result.metrics["seen_share"] > 0.5 and not result.warnings
+    assert result.metrics["residual_mm_median"] < 0.05
+    assert result.metrics["moved_mm_p95"] > 0.1
+    assert (out / "qc" / "registration.jpg").is_file()
+    path = dataset.registration_file("S001", "smile")
+    path.parent.mkdir(parents=True)
+    (out / "registration.npz").rename(path)
+    found = read_registration(path)
+    best = best_vertices(dataset, "S001", track, "smile")
+    assert np.array_equal(best, found.vertices)
+    assert np.abs(best - track.vertices[1]).max() > 0.002
+    assert found.seen.any() and np.isfinite(found.sigma).all()
+    head = Head(subject="S001", track=track, model=load_head("procedural"), albedo=None)
+    exported = with_registered(dataset, head).track.vertices
+    assert np.array_equal(exported, [track.vertices[0], found.vertices])
+    write_track(dataset.track_file("S001"), track_arrays("procedural", seed=7))
+    with pytest.raises(FormatError):  # of another track
+        best_vertices(dataset, "S001", read_track(dataset.track_file("S001")), "smile")
+
+
+def test_what_is_missing_or_damaged_is_one_clear_error(dataset, tmp_path):
+    with pytest.raises(StageError):  # no surface
+        STAGE.run(dataset, "S001/neutral", RegisterConfig(), tmp_path)
+    path = dataset.surface_file("S001", "smile")
+    whole = path.read_bytes()
+    for damaged in (
+        b"",
+        b"ply\n",
+        whole[: len(whole) // 2],
+        whole.replace(b"confidence", b"x" * 10),
+    ):
+        path.write_bytes(damaged)
+        with pytest.raises(FormatError):
+            read_surface(path)
+    with pytest.raises(StageError):
+        read_registration(tmp_path / "none.npz")
+    np.savez(tmp_path / "bad.npz", schema=np.array("express50.registration/1"))
+    with pytest.raises(FormatError):
+        read_registration(tmp_path / "bad.npz")
+    with pytest.raises(ConfigError):
+        RegisterConfig(detail_mm=0.0)
