@@ -36,8 +36,11 @@ def build_parser(command: str | None = None) -> argparse.ArgumentParser:
     for module in OWN:
         module.add_commands(subparsers)
     for name, other in commands().items():
+        known = subparsers.choices.get(name)
         if name == command:
-            other.add(subparsers)
+            other.add(known or subparsers)
+        elif known:
+            continue
         else:
             subparsers.add_parser(name, help=other.help)
     return parser

@@ -127,6 +127,7 @@ class Command:
     Attributes:
         help: one line for the list of commands.
         add: ``add(subparsers)`` adds the command's parser; called when the command is asked for.
+            A command with a stage's name gets that stage's parser, to add options to it.
     """
 
     help: str

@@ -35,10 +35,10 @@ STAY_M = 0.003  # standard deviation of the tracked mesh where no surface is fou
 FOLD_M = 0.03  # a vertex that faces the mesh itself nearer than this lies in a fold
 SAMPLES = 64  # of the posterior; their standard deviation is known to 9 %
 RETREATS = 8
-# Surfaces there are not the skin's, or coarser than what tracking sees.
+# Surfaces there are not the skin's, or coarser than what tracking sees; an ear is all folds.
 TRUST = {
-    "scalp": 0.0, "mouth_interior": 0.0, "boundary": 0.0, "neck": 0.3, "left_ear": 0.3,
-    "right_ear": 0.3, "lips": 0.5, "left_eye_region": 0.1, "right_eye_region": 0.1,
+    "scalp": 0.0, "mouth_interior": 0.0, "boundary": 0.0, "neck": 0.3, "left_ear": 0.0,
+    "right_ear": 0.0, "lips": 0.5, "left_eye_region": 0.1, "right_eye_region": 0.1,
 }  # fmt: skip
 RIMS = ("lips", "left_eye_region", "right_eye_region")
 

@@ -47,25 +47,32 @@ def run(dataset: Dataset, item: str, detail: float, out: Path) -> Result:
         )
     trust = skin_trust(model, start, surface.vertices, surface.colors, surface.confidence)
     laid = lay(model, start, GivenSurface(surface.vertices, surface.faces, trust), detail)
-    moved = laid.vertices - start
-    offsets = rest_offsets(model, track, row, moved)
-    np.savez(
-        out / "registration.npz",
-        schema=np.array(REGISTRATION_SCHEMA),
-        track=np.array(file_sha256(path)),
-        vertices=laid.vertices.astype(np.float32),
-        offsets=offsets.astype(np.float32),
-        seen=laid.seen,
-        residual=laid.residual.astype(np.float32),
-        sigma=laid.sigma.astype(np.float32),
-    )
-    write_picture(out, model, track, row, laid)
-    metrics = figures_of(model, start, laid)
+    metrics = write_registration(out, path, track, row, laid)
     warnings = []
     if metrics["seen_share"] < LEAST_SEEN:
         why = f"the surface was found at only {metrics['seen_share']:.0%} of the face's vertices"
         warnings.append(Note(expression, why))
     return Result(metrics, (), warnings)
+
+
+def write_registration(out: Path, path: Path, track: Track, row: int, laid: LaidMesh) -> dict:
+    """Write registration.npz and a picture of a track's row; returns the metrics.
+
+    `path` is the track's file.
+    """
+    model, start = load_head(track.head), track.vertices[row].astype(np.float64)
+    np.savez(
+        out / "registration.npz",
+        schema=np.array(REGISTRATION_SCHEMA),
+        track=np.array(file_sha256(path)),
+        vertices=laid.vertices.astype(np.float32),
+        offsets=rest_offsets(model, track, row, laid.vertices - start).astype(np.float32),
+        seen=laid.seen,
+        residual=laid.residual.astype(np.float32),
+        sigma=laid.sigma.astype(np.float32),
+    )
+    write_picture(out, model, track, row, laid)
+    return figures_of(model, start, laid)
 
 
 def rest_offsets(model: HeadModel, track: Track, row: int, moved: np.ndarray) -> np.ndarray:
