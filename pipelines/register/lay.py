@@ -26,7 +26,7 @@ from pipelines.track.basis import cotangent_laplacian, in_regions, movable_verti
 ROUNDS = ((0.010, 2.0), (0.008, 1.25), (0.006, 1.0), (0.004, 1.0), (0.003, 1.0), (0.002, 1.0))
 AGREE = 0.6  # least cosine between the normals of mesh and surface
 OUTLIER = 0.3  # of the reach: a height so far from the plate is believed by a quarter
-BELIEF_STEPS = 3
+BELIEF_STEPS = 2
 NOISE_M = 0.0003  # standard deviation of a height that is fully trusted
 # What a surface's heights have in common as errors, as far as no view tells them apart: found on
 # three synthetic people, where 90 % intervals then hold for 88 to 93 % of the vertices.

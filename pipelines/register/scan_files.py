@@ -4,14 +4,11 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import open3d as o3d
 
-from express50.cli.stages import run_one
 from express50.console import FAILED, OK, say, say_json
-from express50.contract.stage import Command
 from express50.dataset.export import write_head_obj
 from express50.dataset.tracks import read_track
 from express50.errors import ConfigError, Express50Error, FormatError
@@ -25,19 +22,6 @@ from pipelines.register.stage import write_registration
 from pipelines.track.stage import write_track
 
 VERSION = 1  # raise it when the same scan gives other files
-
-
-def add_options(parser: Any) -> None:
-    """Let the stage's command register given scans as well."""
-    words = "register this scan (.obj, .ply, .glb, .stl), or all of a folder, instead of a dataset;"
-    words += " DATASET is the folder to write to; may be repeated"
-    parser.add_argument("--scan", type=Path, action="append", metavar="FILE", help=words)
-    words = "with --scan: the head model to fit, as track.head takes it [procedural]"
-    parser.add_argument("--head", default="procedural", metavar="MODEL", help=words)
-    parser.set_defaults(handler=lambda args: run_scans(args) if args.scan else run_one(args))
-
-
-COMMAND = Command("register given scans", add_options)
 
 
 def run_scans(args: argparse.Namespace) -> int:

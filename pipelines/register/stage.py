@@ -22,7 +22,7 @@ from pipelines.register.lay import GivenSurface, LaidMesh, crossings, lay
 from pipelines.register.skin import skin_trust
 
 LEAST_SEEN = 0.1  # share of the face under which the surface is not this head's
-YAWS = (0.0, 45.0, 90.0)  # of the pictures, degrees
+YAWS = (0.0, 60.0)  # of the pictures, degrees
 
 
 def run(dataset: Dataset, item: str, detail: float, out: Path) -> Result:
@@ -111,7 +111,7 @@ def figures_of(model: HeadModel, start: np.ndarray, laid: LaidMesh) -> dict:
 
 
 def write_picture(out: Path, model: HeadModel, track: Track, row: int, laid: LaidMesh) -> None:
-    """Write a sheet: the tracked mesh above, the registered one below, from three sides."""
+    """Write a sheet: the tracked mesh above, the registered one below, from two sides."""
     (out / "qc").mkdir(exist_ok=True)
     rows = [
         [

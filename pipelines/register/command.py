@@ -1,0 +1,32 @@
+"""The options of ``express50 register`` that make it register given scans."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from express50.contract.stage import Command
+
+
+def add_options(parser: Any) -> None:
+    """Add the options to the parser of the stage's command."""
+    words = "register this scan (.obj, .ply, .glb, .stl), or all of a folder, instead of a dataset;"
+    words += " DATASET is the folder to write to; may be repeated"
+    parser.add_argument("--scan", type=Path, action="append", metavar="FILE", help=words)
+    words = "with --scan: the head model to fit, as track.head takes it [procedural]"
+    parser.add_argument("--head", default="procedural", metavar="MODEL", help=words)
+    parser.set_defaults(handler=run)
+
+
+def run(args: Any) -> int:
+    """Register scans if any are given, else a dataset's expressions."""
+    if args.scan:
+        from pipelines.register.scan_files import run_scans
+
+        return run_scans(args)
+    from express50.cli.stages import run_one
+
+    return run_one(args)
+
+
+COMMAND = Command("register given scans", add_options)
