@@ -78,7 +78,7 @@ class FittedScan:
 
 
 def read_scan(path: Path) -> Scan:
-    """Read a scan; its unit is told by its size.
+    """Read a scan; its unit is recognised by its size.
 
     Raises:
         FormatError: it is not a mesh, is damaged, too coarse, or of no size that a head has.
