@@ -105,8 +105,8 @@ def cases(dataset: Dataset, truth: Truth) -> Iterator[tuple[Case, np.ndarray, np
     for subject in dataset.subjects():
         found = read_track(dataset.track_file(subject))
         model = load_head(found.head)
-        motion = align_worlds(read_cameras_of(dataset, subject), truth.cameras(subject))
         used = read_cameras_of(dataset, subject)
+        motion = align_worlds(used, truth.cameras(subject))
         centres = [
             pinhole(camera).center
             for name, camera in truth.cameras(subject).items()

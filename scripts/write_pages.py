@@ -96,6 +96,8 @@ def field_notes(config: type) -> dict[str, str]:
 
 def settings_table(config: type, presets: dict[str, dict[str, object]]) -> list[str]:
     """Return a table of a config's fields: default, other presets' values, meaning."""
+    if not dataclasses.fields(config):
+        return ["It has no settings."]
     notes = field_notes(config)
     rows = ["| setting | default | presets | meaning |", "|---|---|---|---|"]
     for field in dataclasses.fields(config):

@@ -39,9 +39,7 @@ def build_parser(command: str | None = None) -> argparse.ArgumentParser:
         known = subparsers.choices.get(name)
         if name == command:
             other.add(known or subparsers)
-        elif known:
-            continue
-        else:
+        elif known is None:
             subparsers.add_parser(name, help=other.help)
     return parser
 

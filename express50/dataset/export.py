@@ -129,10 +129,8 @@ def with_registered(dataset: Dataset, head: Head) -> Head:
     Raises:
         FormatError: one is damaged, or of another track.
     """
-    vertices = [
-        best_vertices(dataset, head.subject, head.track, name) for name in head.track.expressions
-    ]
-    return replace(head, track=replace(head.track, vertices=np.stack(vertices)))
+    vertices = best_vertices(dataset, head.subject, head.track)
+    return replace(head, track=replace(head.track, vertices=vertices))
 
 
 def with_clips(dataset: Dataset, head: Head, wanted: Sequence[str]) -> Head:

@@ -182,22 +182,22 @@ def read_registration(path: Path) -> Registration:
         raise FormatError(f"{path}: not a registration ({words}); {again}") from None
 
 
-def best_vertices(dataset: Dataset, subject: str, track: Track, expression: str) -> np.ndarray:
-    """Return an expression's vertices (V, 3) float32: registered where they are, else tracked.
+def best_vertices(dataset: Dataset, subject: str, track: Track) -> np.ndarray:
+    """Return the vertices (E, V, 3) float32 of a subject's track, registered ones where they are.
 
     Raises:
-        StageError: the expression is not tracked.
-        FormatError: the registration is damaged, or of another track.
+        FormatError: a registration is damaged, or of another track.
     """
-    tracked = track.vertices[track.row(expression)]
-    path = dataset.registration_file(subject, expression)
-    if not path.is_file():
-        return tracked
-    found = read_registration(path)
-    if found.track != file_sha256(dataset.track_file(subject)):
-        raise FormatError(f"{path}: is of another track; run 'express50 register' again")
-    check_shape("vertices", found.vertices, tracked.shape)
-    return found.vertices
+    vertices, digest = track.vertices.copy(), file_sha256(dataset.track_file(subject))
+    for row, expression in enumerate(track.expressions):
+        path = dataset.registration_file(subject, expression)
+        if not path.is_file():
+            continue
+        found = read_registration(path)
+        if found.track != digest or found.vertices.shape != vertices[row].shape:
+            raise FormatError(f"{path}: is of another track; run 'express50 register' again")
+        vertices[row] = found.vertices
+    return vertices
 
 
 OF_FRAMES = ("frames", "expression", "neck", "jaw", "eyes", "R", "t")  # a row per frame, with cues

@@ -29,6 +29,12 @@ def camera_rays(camera: Camera) -> o3d.core.Tensor:
     return join_rays(*rays(camera))
 
 
+def barycentrics(hits: dict[str, o3d.core.Tensor], hit: np.ndarray) -> np.ndarray:
+    """Return the barycentric weights (N, 3), in the faces that they hit, of the marked rays."""
+    u, v = hits["primitive_uvs"].numpy()[hit].T
+    return np.stack([1 - u - v, u, v], axis=1)
+
+
 def visible_faces(
     vertices: np.ndarray, faces: np.ndarray, camera: Camera
 ) -> tuple[np.ndarray, np.ndarray]:

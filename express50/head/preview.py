@@ -10,7 +10,7 @@ import torch
 
 from express50.errors import HeadModelError
 from express50.geometry.conventions import cell_centres
-from express50.geometry.raycast import mesh_scene
+from express50.geometry.raycast import barycentrics, mesh_scene
 from express50.head.model import HeadModel, pose, vertex_normals
 
 Array = np.ndarray
@@ -81,8 +81,7 @@ def render_preview(
     distance = hits["t_hit"].numpy()
     seen = np.isfinite(distance)
     corner = faces[hits["primitive_ids"].numpy()[seen]]
-    u, v = hits["primitive_uvs"].numpy()[seen].T
-    weights = np.stack([1 - u - v, u, v], 1)[:, :, None]
+    weights = barycentrics(hits, seen)[:, :, None]
     normals = vertex_normals(torch.from_numpy(points)[None], model.faces.cpu())[0].numpy()
     n = (normals[corner] * weights).sum(1)
     n /= np.linalg.norm(n, axis=1, keepdims=True) + 1e-9

@@ -15,7 +15,7 @@ import numpy as np
 import open3d as o3d
 
 from express50.geometry.cameras import Camera, rays
-from express50.geometry.raycast import camera_rays, mesh_scene
+from express50.geometry.raycast import barycentrics, camera_rays, mesh_scene
 from express50.geometry.sampling import bilinear
 from pipelines.depth.surface import HeadSurface
 from pipelines.depth.views import INSIDE, project_fast, reduced
@@ -113,8 +113,7 @@ def cast_maps(
     depth = hits["t_hit"].numpy()
     hit = np.isfinite(depth)
     faces = surface.faces[hits["primitive_ids"].numpy()[hit]]
-    u, v = hits["primitive_uvs"].numpy()[hit].T
-    corners = np.stack([1 - u - v, u, v], axis=1)  # (n, 3) barycentric
+    corners = barycentrics(hits, hit)
     normals, confidence = np.zeros((*depth.shape, 3)), np.zeros(depth.shape)
     normals[hit] = (surface.normals[faces] * corners[..., None]).sum(1)
     confidence[hit] = (surface.confidence[faces] * corners).sum(1)

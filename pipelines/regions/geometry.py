@@ -14,7 +14,7 @@ from express50.contract.segmentation_labels import HEAD, LABELS, label_mask
 from express50.files.images import edge_distance
 from express50.geometry.cameras import Camera, crop_camera, project, rays, unproject
 from express50.geometry.conventions import opencv_pixels_to_corner
-from express50.geometry.raycast import mesh_scene
+from express50.geometry.raycast import barycentrics, mesh_scene
 from express50.head.model import HeadModel
 
 SCALP = len(LABELS)
@@ -158,8 +158,7 @@ def see(head: TrackedHead, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
     hits = head.scene.cast_rays(o3d.core.Tensor(row.astype(np.float32)), nthreads=1)
     distance = hits["t_hit"].numpy()
     hit = np.isfinite(distance) & (distance > 0)
-    u, v = hits["primitive_uvs"].numpy()[hit].T
-    corner = np.stack([1 - u - v, u, v], axis=1).argmax(1)
+    corner = barycentrics(hits, hit).argmax(1)
     vertex = head.labels.faces[hits["primitive_ids"].numpy()[hit], corner]
     found = head.labels.vertices[vertex]
     away = (hits["primitive_normals"].numpy()[hit] * directions[hit]).sum(1) > 0

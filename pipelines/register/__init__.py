@@ -8,21 +8,11 @@ from pathlib import Path
 from express50.capture.index import peak_items
 from express50.contract.layout import Dataset
 from express50.contract.stage import Growth, Result, Stage
-from express50.errors import ConfigError
 
 
 @dataclass(frozen=True, kw_only=True)
 class RegisterConfig:
-    """How finely the mesh follows the surface."""
-
-    detail_mm: float = 16.0
-    """Wavelength of the finest detail that the mesh follows, millimetres: depth's own errors are
-    finer. Less for given scans and for footage much finer than 512 pixels per head."""
-
-    def __post_init__(self) -> None:
-        """Check ranges."""
-        if not 1 <= self.detail_mm <= 100:
-            raise ConfigError(f"register.detail_mm is {self.detail_mm}, expected 1 to 100")
+    """Nothing to set."""
 
 
 def inputs(dataset: Dataset, item: str, config: RegisterConfig) -> dict[str, Path | str]:
@@ -40,7 +30,7 @@ def run(dataset: Dataset, item: str, config: RegisterConfig, out: Path) -> Resul
     """Register one expression."""
     from pipelines.register.stage import run as work
 
-    return work(dataset, item, config.detail_mm / 1e3, out)
+    return work(dataset, item, out)
 
 
 STAGE = Stage(

@@ -28,8 +28,8 @@ AGREE = 0.6  # least cosine between the normals of mesh and surface
 OUTLIER = 0.3  # of the reach: a height so far from the plate is believed by a quarter
 BELIEF_STEPS = 2
 NOISE_M = 0.0003  # standard deviation of a height that is fully trusted
-# What a surface's heights have in common as errors, as far as no view tells them apart: found on
-# three synthetic people, where 90 % intervals then hold for 88 to 93 % of the vertices.
+# Heights err together, as neighbouring patches of a surface do: set on three synthetic people so
+# that 90 % intervals hold there (docs/LOG.md, Registration).
 SURFACE_M = 0.0004
 STAY_M = 0.003  # standard deviation of the tracked mesh where no surface is found
 FOLD_M = 0.03  # a vertex that faces the mesh itself nearer than this lies in a fold
@@ -37,7 +37,7 @@ SAMPLES = 64  # of the posterior; their standard deviation is known to 9 %
 RETREATS = 8
 # Surfaces there are not the skin's, or coarser than what tracking sees; an ear is all folds.
 TRUST = {
-    "scalp": 0.0, "mouth_interior": 0.0, "boundary": 0.0, "neck": 0.3, "left_ear": 0.0,
+    "scalp": 0.0, "mouth_interior": 0.0, "boundary": 0.0, "neck": 0.0, "left_ear": 0.0,
     "right_ear": 0.0, "lips": 0.5, "left_eye_region": 0.1, "right_eye_region": 0.1,
 }  # fmt: skip
 RIMS = ("lips", "left_eye_region", "right_eye_region")
@@ -89,8 +89,7 @@ def lay(model: HeadModel, start: np.ndarray, surface: GivenSurface, detail: floa
         moved = ((mesh - start) * normals).sum(1)
         weight = trust / NOISE_M**2
         for _ in range(BELIEF_STEPS):
-            solver = plate.factor(weight)
-            rise = solver.solve(weight * height - moved * plate.stay)
+            rise = plate.factor(weight).solve(weight * height - moved * plate.stay)
             off = (height - rise) / (OUTLIER * reach)
             weight = trust / NOISE_M**2 / (1.0 + off**2) ** 2  # Geman and McClure 1985
         mesh = mesh + rise[:, None] * normals
@@ -99,7 +98,7 @@ def lay(model: HeadModel, start: np.ndarray, surface: GivenSurface, detail: floa
     residual, trust = search.heights(mesh, normals, ROUNDS[-1][0])
     seen = trust * trusted * ~folded(mesh, normals, faces) > 0.05
     # Tracked vertices err together, so that springs between them know less than they seem to.
-    sigma = np.hypot(plate.sigma(solver, weight), np.where(seen, SURFACE_M, STAY_M))
+    sigma = np.hypot(plate.sigma(weight), np.where(seen, SURFACE_M, STAY_M))
     return LaidMesh(mesh, seen, np.where(seen, residual, 0.0), sigma)
 
 
@@ -155,12 +154,15 @@ class Plate:
         matrix = self.bend.T @ self.bend + sparse.diags(weight + self.stay)
         return splu(matrix.tocsc(), permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
 
-    def sigma(self, solver: SuperLU, weight: np.ndarray) -> np.ndarray:
-        """Estimate standard deviations (V,) of heights by samples of their posterior."""
+    def sigma(self, weight: np.ndarray) -> np.ndarray:
+        """Estimate standard deviations (V,) of heights under data of weights (V,).
+
+        They are the spread of samples of the heights' posterior.
+        """
         random = np.random.default_rng(0)
         pull = self.bend.T @ random.normal(size=(len(weight), SAMPLES))
         pull += np.sqrt(weight + self.stay)[:, None] * random.normal(size=pull.shape)
-        return np.sqrt((solver.solve(pull) ** 2).mean(1))
+        return np.sqrt((self.factor(weight).solve(pull) ** 2).mean(1))
 
 
 def trusted_vertices(model: HeadModel) -> np.ndarray:

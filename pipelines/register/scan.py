@@ -16,7 +16,7 @@ import torch
 from express50.errors import FormatError, StageError
 from express50.files.images import linear_to_srgb, srgb_to_linear
 from express50.geometry.cameras import Camera, pinhole_camera, rays
-from express50.geometry.raycast import join_rays, mesh_scene
+from express50.geometry.raycast import barycentrics, join_rays, mesh_scene
 from express50.geometry.transforms import look_at
 from express50.head.load import load_head
 from express50.head.model import HeadModel
@@ -47,6 +47,7 @@ SIDE, AWAY_M, SPAN_M = 400, 1.2, 0.34  # of the pictures: pixels, distance, what
 YAWS, PITCHES = (-50.0, -25.0, 0.0, 25.0, 50.0), (-15.0, 15.0)
 LEAST_SCORE = 0.2
 CHIN, NOSE_BRIDGE = 8, 27
+HALF_HEAD_M = 0.06
 REACHES = (0.015, 0.010, 0.006, 0.004)  # of the search, per round of the fit of parameters; metres
 ROUND_STEPS, SIGMA_M = 4, 0.0012
 DETAIL_M = 0.008  # wavelength of the finest detail that is followed: scans have few errors
@@ -85,7 +86,7 @@ def read_scan(path: Path) -> Scan:
     """
     import trimesh
 
-    if path.suffix.lower() not in KINDS or not path.is_file():
+    if path.suffix.lower() not in KINDS:
         raise FormatError(f"{path}: expected a mesh file, one of {', '.join(KINDS)}")
     try:
         mesh = trimesh.load(path, force="mesh", process=False)
@@ -141,7 +142,7 @@ def fit_scan(scan: Scan, head: str) -> FittedScan:
     torch.set_num_threads(1)
     basis = make_basis(load_head(head))
     observation = look(scan)
-    targets, state, lost = fit_landmarks(basis, [observation], observation.expression)
+    targets, state, lost = fit_landmarks(basis, [observation], neutral="")  # it may be any face
     if lost:
         raise StageError(f"the scan's landmarks fit no head: {lost[0].why}")
     model, trust = basis.model, np.ones(len(scan.vertices))
@@ -205,8 +206,7 @@ def look(scan: Scan) -> Observation:
             flat = towards * np.cos(yaw) + right * np.sin(yaw)
             way = flat * np.cos(pitch) + up * np.sin(pitch)
             camera = place_camera(middle, way, up, SPAN_M, f"view{len(views):02d}")
-            seen = source(painter.picture(camera), camera.id, 0)
-            face = seen.face
+            face = source(painter.picture(camera), camera.id, 0).face
             if face.score >= LEAST_SCORE:
                 views.append(LandmarkView(camera.id, camera, face.points, face.sigma, face.score))
     if len(views) < 2:
@@ -239,8 +239,7 @@ class ScanPainter:
         hit = self.scene.cast_rays(join_rays(origin - self.centre, directions))
         seen = np.isfinite(hit["t_hit"].numpy())
         corners = self.scan.faces[hit["primitive_ids"].numpy()[seen].astype(np.int64)]
-        u, v = hit["primitive_uvs"].numpy()[seen].T
-        weights = np.stack([1 - u - v, u, v], axis=1)[..., None]
+        weights = barycentrics(hit, seen)[..., None]
         normals = (self.normals[corners] * weights).sum(1)
         right, down, ahead = camera.cam_from_world[:3, :3]
         light = 0.3 * right - 0.5 * down - ahead
@@ -250,12 +249,11 @@ class ScanPainter:
         return np.rint(255 * linear_to_srgb(np.clip(image, 0, 1))).astype(np.uint8)
 
     def middle_of(self, camera: Camera, points: np.ndarray) -> np.ndarray:
-        """Return the middle (3,) of the scan's places at pixels (N, 2), a head's depth behind."""
+        """Return the middle (3,) of the scan's places at pixels (N, 2), half a head behind."""
         origin, directions = rays(camera)
         column, row = np.clip(points, 0, SIDE - 1).astype(np.int64).T
         hit = self.scene.cast_rays(join_rays(origin - self.centre, directions[row, column]))
         depth = hit["t_hit"].numpy()
         near = np.median(depth[np.isfinite(depth)]) if np.isfinite(depth).any() else AWAY_M
-        return (origin + near * directions[row, column]).mean(0) + 0.06 * camera.cam_from_world[
-            2, :3
-        ]
+        ahead = camera.cam_from_world[2, :3]
+        return (origin + near * directions[row, column]).mean(0) + HALF_HEAD_M * ahead

@@ -21,11 +21,15 @@ from pipelines.register.scan import KINDS, UNITS, FittedScan, Scan, fit_scan, re
 from pipelines.register.stage import write_registration
 from pipelines.track.stage import write_track
 
-VERSION = 1  # raise it when the same scan gives other files
+VERSION = 2  # raise it when the same scan gives other files
+OF_DATASETS = ("set", "config", "items", "scheduler", "slurm", "print_job")
 
 
 def run_scans(args: argparse.Namespace) -> int:
     """Register the scans of a command line; one that fails does not stop the others."""
+    ignored = [name for name in OF_DATASETS if getattr(args, name)]
+    if ignored:
+        raise ConfigError(f"--{ignored[0].replace('_', '-')} goes with a dataset, not with --scan")
     load_head(args.head)  # a wrong name is an error before the work
     out, accounts = args.dataset, []
     for name, path in scans_of(args.scan).items():
@@ -47,7 +51,7 @@ def scans_of(paths: list[Path]) -> dict[str, Path]:
     """List scans by the names of their folders; of a folder all scans in it.
 
     Raises:
-        ConfigError: there is none, or two have one name, or one cannot be a folder's name.
+        ConfigError: one is missing, two have one name, or one cannot be a folder's name.
     """
     files = [
         file
@@ -58,8 +62,12 @@ def scans_of(paths: list[Path]) -> dict[str, Path]:
             else [path]
         )
     ]
-    if not files:
-        raise ConfigError(f"--scan {paths[0]}: holds no scan, one of {', '.join(KINDS)}")
+    missing = next((file for file in files if not file.is_file()), None)
+    if missing is not None or not files:
+        raise ConfigError(
+            f"--scan {missing or paths[0]}: no scan there; expected a file, one of"
+            f" {', '.join(KINDS)}, or a folder of them"
+        )
     found: dict[str, Path] = {}
     for file in files:
         if not ID.fullmatch(file.stem) or file.stem in found:
@@ -77,9 +85,10 @@ def register_scan(path: Path, head: str, folder: Path) -> dict:
     Raises:
         Express50Error: the scan cannot be read, or shows no face.
     """
-    if not path.is_file():
-        raise FormatError(f"{path}: there is no such file")
-    identity = value_digest([VERSION, file_sha256(path), head])
+    model = Path(head).expanduser()
+    identity = value_digest(
+        [VERSION, file_sha256(path), file_sha256(model) if model.is_file() else head]
+    )
     if folder.exists():
         if not (folder / "metrics.json").is_file():
             raise FormatError(f"{folder}: is not a registration of a scan; name another folder")

@@ -97,6 +97,8 @@ def test_wrong_options_are_refused_before_the_work(person, tmp_path):
     assert run(tmp_path / "out", "--scan", scan, "--scan", scan) == 2
     (tmp_path / "empty").mkdir()
     assert run(tmp_path / "out", "--scan", tmp_path / "empty") == 2
+    assert run(tmp_path / "out", "--scan", tmp_path / "none.obj") == 2
+    assert run(tmp_path / "out", "--scan", scan, "--items", "S*") == 2
     (tmp_path / "out" / "a").mkdir(parents=True)
     (tmp_path / "out" / "a" / "letter.txt").write_text("mine")
     assert run(tmp_path / "out", "--scan", scan) == 1
