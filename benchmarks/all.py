@@ -9,7 +9,7 @@ import sys
 # Hours on two cores, most of them in `align`, `track`, `depth` and `grmm`. `regions` wants the
 # dataset of the demo; `demo` and the sweeps are jobs of their own.
 NAMES = (
-    "align", "calibrate", "depth", "faults", "fps", "grmm", "matte", "matte_views",
+    "align", "calibrate", "depth", "faults", "fps", "grmm", "head", "matte", "matte_views",
     "raster", "register", "shards", "stage_overhead", "track",
 )  # fmt: skip
 

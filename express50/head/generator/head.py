@@ -4,8 +4,8 @@ Run `python -m express50.head.generator.head` after a change here: it rewrites `
 the mean and the shape directions that the file has. With `--people ict.npz` these are fitted anew
 to the people of ICT-FaceKit (`people`), which takes some minutes.
 
-The generator draws a head by rule, features placed by anthropometry (Farkas 1994): its mesh, UV
-map, regions, landmarks and motions, which the mean of people takes over vertex by vertex. Measures are
+The generator draws a head by rule, features placed by anthropometry (Farkas 1994). The mean of
+people takes over its mesh, UV map, regions, landmarks and motions, vertex by vertex. Measures are
 millimetres while building and metres in the result.
 """
 
