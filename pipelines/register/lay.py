@@ -17,8 +17,8 @@ import scipy.sparse as sparse
 import torch
 from scipy.sparse.linalg import SuperLU, splu
 
-from express50.geometry.raycast import join_rays, mesh_scene
 from express50.geometry.meshes import cotangent_laplacian
+from express50.geometry.raycast import join_rays, mesh_scene
 from express50.head.model import HeadModel, vertex_normals
 from pipelines.track.basis import in_regions, movable_vertices
 
