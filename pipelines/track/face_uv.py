@@ -62,7 +62,7 @@ BACK = 2.6
 # What lies further behind what a texel shows is another sheet of skin; outer eye corners' widths.
 SHEET = 0.04
 # Where the landmarks' azimuths (radians) and heights (in widths between the outer eye corners) are
-# put: those of the procedural head, so that it needs no warp.
+# put on the map, whatever the head.
 MARKS = np.array(
     [
         (-1.571, 0.290), (-1.561, 0.079), (-1.552, -0.125), (-1.455, -0.356), (-1.215, -0.547),
