@@ -38,7 +38,6 @@ from pipelines.track.surface import (
     FrameSetCrops,
     Visibility,
     flat_barycentrics,
-    root_light,
     sample_normals,
     view_colours,
     view_weights,
@@ -136,7 +135,7 @@ def unwrap(
     """
     places, normals = uv_map.samples.at(mesh), sample_normals(uv_map.samples, mesh)
     weights = view_weights(Visibility(mesh, model.faces.numpy()), pictures, places, normals)
-    values = view_colours([root_light(crop) for crop in pictures.crops], weights, places)
+    values = view_colours(pictures.images(), weights, places)
     trust = weights**2 * ((weights > 0).sum(0) >= LEAST_VIEWS)
     colors = robust_mean(values, np.ones_like(values), trust, VIEW_NOISE)
     mass = trust.sum(0)[:, None].astype(np.float32)

@@ -23,7 +23,6 @@ from pipelines.track.surface import (
     COVERED,
     FrameSetCrops,
     Visibility,
-    root_light,
     sample_normals,
     spread,
     view_weights,
@@ -222,7 +221,7 @@ def patch_terms(
     `reach` is in metres to either side, `weight` the trust in the result.
     """
     faces = model.faces.numpy()
-    images = [(root.mean(2), camera) for root, camera in map(root_light, pictures.crops)]
+    images = [(root.mean(2), camera) for root, camera in pictures.images()]
     visibility, terms = Visibility(mesh, faces), []
     for samples, trust in skin:
         places, normals = samples.at(mesh), sample_normals(samples, mesh)
