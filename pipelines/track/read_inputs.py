@@ -140,10 +140,13 @@ def _look(
     frame: int,
     expected: np.ndarray | None,
 ) -> Observation | None:
-    """Follow a frame set's face near expected landmarks (68, 3); search for it where that fails."""
+    """Find a frame set's face near expected landmarks (68, 3), where it was at the peak, anywhere."""
+    places = [] if expected is None else [expected]
+    places += [peak.points for peak in peaks if peak.expression == cue]
     found = None
-    if follow is not None and expected is not None:
-        found = _agreed(cue, frame, _followed(read, cameras, follow, expected))
+    for place in places:
+        if follow is not None and found is None and np.isfinite(place).all():
+            found = _agreed(cue, frame, _followed(read, cameras, follow, place))
     if found is None:
         found = _agreed(cue, frame, _views(read, cameras, frame, source))
     # A clip may be one long blink: the peaks show what open eyes look like.

@@ -67,6 +67,11 @@ class FrameSetCrops:
     crops: tuple[HeadCrop, ...]
     lit: tuple[tuple[np.ndarray, Camera], ...] | None = None
 
+    def some(self, ids: list[int]) -> FrameSetCrops:
+        """Choose crops by index."""
+        lit = None if self.lit is None else tuple(self.lit[k] for k in ids)
+        return FrameSetCrops(self.distances, tuple(self.crops[k] for k in ids), lit)
+
     def images(self) -> list[tuple[np.ndarray, Camera]]:
         """Return the crops' `root_light`."""
         return [root_light(crop) for crop in self.crops] if self.lit is None else list(self.lit)
