@@ -155,7 +155,10 @@ class Points:
 def _transforms(
     pose: torch.Tensor, joints: torch.Tensor, about: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Return the joints' turns (5, 3, 3) and shifts (5, 3) to the world, and their own (4, 3, 3)."""
+    """Return the joints' turns (5, 3, 3) and shifts (5, 3) to the world, and rotations (4, 3, 3).
+
+    The latter are to the parents, without the root's.
+    """
     turns = _joint_rotations(pose)
     turn, shift = joint_transforms(joints[None], turns[None])
     world = axis_angle_to_matrix(pose[12:15]) @ about
@@ -196,9 +199,9 @@ def rotation_slopes(angles: torch.Tensor) -> torch.Tensor:
     axes = (angles[:, :, None] * angles[:, None] + turned) / square.clamp_min(1e-24)
     # Next to no rotation its slopes are turns about the axes.
     axes = torch.where(square > 1e-12, axes, unit)
-    generators = torch.linalg.cross(axes[..., None, :].expand(-1, -1, 3, -1), unit.expand_as(
-        rotation)[:, None].expand(-1, 3, -1, -1)).mT
-    return generators @ rotation[:, None]
+    # The cross products of an axis with the unit vectors are the columns of its generator.
+    columns = torch.linalg.cross(axes[:, :, None].expand(-1, -1, 3, -1), unit.expand(1, 1, 3, 3))
+    return columns.mT @ rotation[:, None]
 
 
 def _joint_rotations(pose: torch.Tensor) -> torch.Tensor:

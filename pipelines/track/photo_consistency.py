@@ -124,9 +124,7 @@ def _patches(
     _, slope = project_with_slope(camera, places)
     spread = slope.astype(np.float32) @ shape.astype(np.float32)
     middle = corner_to_cell(pixels).astype(np.float32)
-    x, y = (
-        (middle[:, :, k, None] + spread[:, None, k]).reshape(len(places), -1) for k in range(2)
-    )
+    x, y = ((middle[:, :, k, None] + spread[:, None, k]).reshape(len(places), -1) for k in range(2))
     values = cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     values = values.reshape(len(places), len(heights), -1)
     values -= (values @ EVEN)[..., None]

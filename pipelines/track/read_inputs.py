@@ -33,7 +33,9 @@ DETECTOR_PASSES = 3  # crops after the coarse pass; 1 measures the same on the t
 # A followed face is looked for in so many views, those that it looks at most: more add nothing.
 FOLLOWED_VIEWS = 10
 LEAST_AHEAD = 0.1  # cosine between the face's direction and a camera's, below which none looks
-MOVED_SHARE = 0.12  # of its crop, from which on a face that was found off the middle is looked at again
+MOVED_SHARE = (
+    0.12  # of its crop, from which on a face that was found off the middle is looked at again
+)
 # A face is lost unless this share of its views, or the only one, scores as much.
 KEPT_SHARE, KEPT_SCORE = 0.5, 0.5
 
@@ -140,7 +142,7 @@ def _look(
     frame: int,
     expected: np.ndarray | None,
 ) -> Observation | None:
-    """Find a frame set's face near expected landmarks (68, 3), where it was at the peak, anywhere."""
+    """Find a face near expected landmarks (68, 3), else where it was at the peak, else anywhere."""
     places = [] if expected is None else [expected]
     places += [peak.points for peak in peaks if peak.expression == cue]
     found = None

@@ -1,11 +1,13 @@
 """Track clips with the peaks' shape: frame by frame, then smoothed both ways, window by window.
 
-The shape is folded into the head model's rest, so the fit of the peaks serves here too. Each frame
-starts from its neighbour and is fitted to its landmarks, then to the surface that its pictures
-agree on. Sweeps then fit every frame again, pulled towards the mean of its two neighbours: every
-second frame first, then the others, so that neither direction of time comes first. The first and
-the last frame, which have one neighbour, are treated alike. Windows overlap by more frames than the
-sweeps reach, and the overlap is dropped, so window ends do not show.
+The shape is folded into the head model's rest, so the fit of the peaks serves here too. A frame's
+landmarks are looked for where the mesh of the frame before has them; it starts from that frame's
+expression and is fitted to its landmarks, then to the surface that its pictures agree on. What that
+says is condensed to a quadratic of the frame's unknowns. Sweeps then fit every frame again, pulled
+towards the mean of its two neighbours: every second frame first, then the others, so that neither
+direction of time comes first. The first and the last frame, which have one neighbour, are treated
+alike. Windows overlap by more frames than the sweeps reach, and the overlap is dropped, so window
+ends do not show.
 """
 
 from __future__ import annotations
@@ -48,7 +50,7 @@ from pipelines.track.surface import CutCrops
 from pipelines.track.terms import MeshPlaces, PointTerm, landmark_anchors
 
 WINDOW = 48  # frames tracked in one piece, and kept if the run is stopped
-SWEEP_STEPS = 2
+SWEEP_STEPS = 2  # of a quadratic
 SWEEPS = 2  # 1 leaves a third more jitter, 4 changes little
 SMOOTH_M = 0.001  # standard deviation of a point about the middle of the neighbouring frames'
 # Vertices beside the landmarks that neighbours are compared by, and the effective number of all.
