@@ -4,7 +4,8 @@
 digital twin records subjects that the landmark detector was not trained on, two cameras are held
 out of the capture, and the stages up to mattes are run. Peaks are the true ones, so that the
 figures speak of tracking alone. `landmark_only` is `standard` without outlines, patches and
-UV landmarks. Seconds are processor seconds of the stage, reading and overlays included.
+UV landmarks. Seconds are processor seconds of the stage, reading and overlays included; those of
+`clip` are all that the clip takes beyond the peaks, per camera's view of a frame.
 The last line printed is one JSON object; `benchmarks.track_truth` defines its figures, and
 `benchmarks.track_views` the held-out cameras' picture.
 """
@@ -18,8 +19,10 @@ import shutil
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import patch
 
 import numpy as np
 
@@ -39,6 +42,7 @@ from pipelines import calibrate, frames, ingest, matte
 from pipelines.ingest import register
 from pipelines.track import STAGE
 from pipelines.track import run as track_subject
+from pipelines.track import stage as track_stage
 
 EXPRESSIONS = ("neutral", "smile", "jaw_open", "pucker", "brow_raise", "wink_left")
 PRESETS = ("draft", "standard", "reference")
@@ -49,6 +53,7 @@ NO_CLIP = {
     "jitter_mm": None,
     "clip_face_rmse_mm": None,
     "jitter_reason": "--no-clip was given",
+    "clip": None,
 }
 HELD_OUT = 2
 SCALING_VIEWS, SCALING_SIDES = (4, 8, 16), (256, 512)
@@ -62,7 +67,7 @@ def main(arguments: list[str] | None = None) -> int:
         if options.dataset is not None:
             source = Dataset(options.dataset), Truth(options.truth), options.captures
         else:
-            config = twin_config(options.subjects, options.cameras, options.side)
+            config = twin_config(options.subjects, options.cameras, options.side, options.frames)
             source = prepare(config, Path(scratch) / "twin")
         result = benchmark(source, options.presets, options.subjects, options.clip)
         result["scaling"] = scaling(Path(scratch)) if options.scaling else None
@@ -81,15 +86,18 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
     parser.add_argument("--cameras", type=int, default=18, help=f"of these {HELD_OUT} are held out")
     parser.add_argument("--side", type=int, default=512, help="pixels of the recorded footage")
     parser.add_argument("--clip", action=argparse.BooleanOptionalAction, default=True,
-                        help="track one clip for the jitter")  # fmt: skip
+                        help="track one clip for its cost and errors")  # fmt: skip
+    parser.add_argument("--frames", type=int, default=4, help="of a recorded clip")
     parser.add_argument("--scaling", action="store_true", help="also over views and pixels")
     options = parser.parse_args(arguments)
     if (options.dataset is None) != (options.truth is None):
         parser.error("give both --dataset and --truth, or neither")
     if options.captures is not None and options.dataset is None:
         parser.error("--captures goes with --dataset and --truth")
-    if options.subjects < 1 or options.cameras < HELD_OUT + 2 or options.side < 64:
-        parser.error(f"expected 1 subject, {HELD_OUT + 2} cameras and 64 pixels or more")
+    least = {"subjects": 1, "cameras": HELD_OUT + 2, "side": 64, "frames": 4}
+    for name, count in least.items():
+        if getattr(options, name) < count:
+            parser.error(f"--{name} is {getattr(options, name)}, expected {count} or more")
     return options
 
 
@@ -101,12 +109,12 @@ def preset_names(text: str) -> tuple[str, ...]:
     return names
 
 
-def twin_config(subjects: int, cameras: int, side: int) -> TwinConfig:
-    """Return subjects other than the demo's and the detector's, with given cameras."""
+def twin_config(subjects: int, cameras: int, side: int, frames: int = 4) -> TwinConfig:
+    """Return subjects other than the demo's and the detector's; `frames` of every expression."""
     return TwinConfig(
         subjects=subjects, first_subject=41, cameras=cameras, width=side, height=side,
-        expressions=EXPRESSIONS, frames_per_expression=4, board_frames=0, give_calibration=True,
-        footage="jpg", seed=5,
+        expressions=EXPRESSIONS, frames_per_expression=frames, board_frames=0,
+        give_calibration=True, footage="jpg", seed=5,
     )  # fmt: skip
 
 
@@ -183,7 +191,7 @@ def benchmark(source: Reference, presets: tuple[str, ...], count: int, clip: boo
             errors, found = track(dataset, truth, subject, config, views[subject])
             rows, figures = rows + errors, [*figures, found]
         result[name] = report(rows, figures, has_footage(views))
-        result[name] |= jitter(dataset, truth, subjects[0], config) if clip else NO_CLIP
+        result[name] |= track_clip(dataset, truth, subjects[0], config) if clip else NO_CLIP
         print(name, json.dumps(result[name]), file=sys.stderr, flush=True)
         result["baseline"] = {"vertex_rmse_mm": pooled([row.baseline for row in rows])}
         best = mean([value for row in rows for value in row.true_psnrs])
@@ -230,16 +238,45 @@ def report(rows: list[Errors], figures: list[dict], footage: bool) -> dict:
     return result
 
 
-def jitter(dataset: Dataset, truth: Truth, subject: str, config) -> dict:  # noqa: ANN001
-    """Return the errors over one expression's clip, with the shape of that and the neutral peak."""
+def track_clip(dataset: Dataset, truth: Truth, subject: str, config) -> dict:  # noqa: ANN001
+    """Return cost and errors of one expression's clip, with the shape of that and the neutral peak.
+
+    A picture is one camera's view of one frame; the peaks' part of the run is not counted.
+    """
     peaks = read_peaks(dataset, subject)
     cue = next(name for name in peaks if name != config.neutral)
     with tempfile.TemporaryDirectory() as scratch:
         part = narrowed(dataset, subject, Path(scratch) / "part", cues=(config.neutral, cue))
         out = Path(scratch) / "out"
         out.mkdir()
-        STAGE.run(part, subject, replace(config, frames="clips"), out)
-        return clip_errors(part, truth, subject, cue, out)
+        seconds: list[float] = []
+        with patch.object(track_stage, "write_clips", timed(track_stage.write_clips, seconds)):
+            STAGE.run(part, subject, replace(config, frames="clips"), out)
+        found = clip_errors(part, truth, subject, cue, out)
+        (span,) = read_index(part, subject).cues
+        frames = span.end_frame - span.start_frame + 1
+        pictures = frames * len(read_cameras_of(part, subject))
+        return found | {
+            "clip": {
+                "core_seconds_per_picture": round(seconds[0] / pictures, 4),
+                "pictures": pictures,
+                "face_rmse_mm": found["clip_face_rmse_mm"],
+                "jitter_mm": found["jitter_mm"],
+            }
+        }
+
+
+def timed(function: Callable, seconds: list[float]) -> Callable:
+    """Return the function such that it appends the processor seconds of its calls."""
+
+    def call(*values: object) -> object:
+        began = time.process_time()
+        try:
+            return function(*values)
+        finally:
+            seconds.append(time.process_time() - began)
+
+    return call
 
 
 def narrowed(

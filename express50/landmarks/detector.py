@@ -261,3 +261,28 @@ def _run(net: LandmarkNet, pyramid: list[np.ndarray], windows: list[np.ndarray])
             vague = np.median(sigma) / (VAGUE_SHARE * max(face_box(points)[1], 1e-6))
             places.append(_Place(points, sigma, seen, float(score / (1.0 + vague**2))))
     return places
+
+
+def follow(net: LandmarkNet, image: np.ndarray, window: np.ndarray) -> Detection:
+    """Look once where a face is expected, as in a video's next frame.
+
+    Args:
+        net: From `load_network`.
+        image: (H, W, 3) uint8 RGB; only what lies about the window is read.
+        window: Affine (2, 3) from crop pixels to image pixels, as of `window_about`; the face may
+            lie a quarter of its side off the middle.
+
+    Returns:
+        The face, of a low score where there is none. `detect` is surer: it takes several looks.
+    """
+    corners = window @ np.array([[0, CROP, 0, CROP], [0, 0, CROP, CROP], [1, 1, 1, 1]])
+    size = np.array([image.shape[1], image.shape[0]])
+    # A window beside the image still shows its outermost pixels.
+    low = np.clip(np.floor(corners.min(1)) - 1, 0, size - 1).astype(int)
+    high = np.clip(np.ceil(corners.max(1)) + 1, low + 1, size).astype(int)
+    part = np.ascontiguousarray(image[low[1] : high[1], low[0] : high[0]])
+    moved = window - np.column_stack([np.zeros((2, 2)), low])
+    place = _run(net, make_pyramid(part), [moved])[0]
+    relative = place.sigma / (HALF_CONFIDENCE_SHARE * max(face_box(place.points)[1], 1e-6))
+    confidence = place.score * place.seen / (1.0 + relative**2)
+    return Detection(place.points + low, place.sigma, confidence, place.score)

@@ -26,7 +26,6 @@ from pipelines.track.surface import (
     FrameSetCrops,
     Visibility,
     flat_barycentrics,
-    root_light,
     sample_normals,
     spread,
     view_colours,
@@ -330,7 +329,7 @@ class _Scene:
 
 def _scene(model: HeadModel, pictures: FrameSetCrops, mesh: np.ndarray) -> _Scene:
     normals = vertex_normals(torch.from_numpy(mesh)[None], model.faces)[0].numpy()
-    images = [root_light(crop) for crop in pictures.crops]
+    images = pictures.images()
     return _Scene(mesh, normals, pictures, images, Visibility(mesh, model.faces.numpy()))
 
 

@@ -125,29 +125,21 @@ class Points:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Evaluate positions (M, 3) and their Jacobian (M, 3, D).
 
-        Vertices are linear in the joints' transforms and in the coefficients, so only these
-        transforms, not the vertices, are differentiated by torch.
+        Vertices are linear in the joints' transforms and in the coefficients.
         """
         values, about = torch.from_numpy(parameters), torch.from_numpy(rotation)
         linear, pose = values[:-POSE_SIZE], values[-POSE_SIZE:]
         rest, joints = self._rest(linear), self._joints(linear)
 
-        def transforms(pose: torch.Tensor, joints: torch.Tensor) -> tuple[torch.Tensor, ...]:
-            turns = _joint_rotations(pose)
-            turn, shift = joint_transforms(joints[None], turns[None])
-            world = axis_angle_to_matrix(pose[12:15]) @ about
-            return world @ turn[0], shift[0] @ world.T, turns[1:]
-
-        turn, shift, turns = transforms(pose, joints)  # (5, 3, 3), (5, 3), (4, 3, 3)
-        # By the joints too, although unused: torch loads its compiler, 1 s, for mixed sums.
-        by_pose = [both[0] for both in torch.func.jacfwd(transforms, argnums=(0, 1))(pose, joints)]
-        correctives = self.pose_dirs.T @ by_pose[2].flatten(0, 2)  # (3 M, 18)
+        turn, shift, turns = _transforms(pose, joints, about)
+        by_turn, by_shift, by_turns = _transform_slopes(pose, joints, about)
+        correctives = self.pose_dirs.T @ by_turns.flatten(1).T  # (3 M, 18)
         corrected = rest + (self.pose_dirs.T @ (turns - torch.eye(3)).flatten()).view(rest.shape)
         blended = torch.einsum("nj,jrc->nrc", self.skinning, turn)
         points = (blended @ corrected[..., None])[..., 0] + self.skinning @ shift + pose[15:]
         shared = (self.skinning[:, :, None] * corrected[:, None]).flatten(1)  # (M, 5 * 3)
-        columns = shared @ by_pose[0].transpose(1, 2).flatten(0, 1).flatten(1)
-        columns = columns + self.skinning @ by_pose[1].flatten(1)
+        columns = shared @ by_turn.permute(1, 3, 2, 0).flatten(0, 1).flatten(1)
+        columns = columns + self.skinning @ by_shift.permute(1, 2, 0).flatten(1)
         columns = columns.view(len(rest), 3, -1) + blended @ correctives.view(len(rest), 3, -1)
         columns[:, :, 15:] += torch.eye(3)
 
@@ -159,6 +151,58 @@ class Points:
         return points.numpy(), torch.cat(
             [by_coefficient.view(self.directions.shape), columns], dim=2
         ).numpy()
+
+
+def _transforms(
+    pose: torch.Tensor, joints: torch.Tensor, about: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Return the joints' turns (5, 3, 3) and shifts (5, 3) to the world, and rotations (4, 3, 3).
+
+    The latter are to the parents, without the root's.
+    """
+    turns = _joint_rotations(pose)
+    turn, shift = joint_transforms(joints[None], turns[None])
+    world = axis_angle_to_matrix(pose[12:15]) @ about
+    return world @ turn[0], shift[0] @ world.T, turns[1:]
+
+
+def _transform_slopes(
+    pose: torch.Tensor, joints: torch.Tensor, about: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Return the slopes of `_transforms` by the pose: (18, 5, 3, 3), (18, 5, 3), (18, 4, 3, 3).
+
+    Transforms are affine in any one joint's rotation: along its slope their difference is exact.
+    """
+    turns, slopes = _joint_rotations(pose), rotation_slopes(pose[:15].view(5, 3))
+    own = torch.zeros(4, 3, 4, 3, 3, dtype=pose.dtype)
+    own[range(4), :, range(4)] = slopes[:4]
+    own = own.flatten(0, 1)
+    moved = turns.expand(13, -1, -1, -1).clone()
+    moved[1:, 1:] += own
+    turn, shift = joint_transforms(joints.expand(13, -1, -1), moved)
+    world = axis_angle_to_matrix(pose[12:15]) @ about
+    spin = slopes[4] @ about
+    zero = torch.zeros(3, *turn.shape[1:], dtype=pose.dtype)
+    by_turn = torch.cat([world @ (turn[1:] - turn[0]), spin[:, None] @ turn[0], zero])
+    along = torch.cat([(shift[1:] - shift[0]) @ world.T, shift[0] @ spin.mT, zero[..., 0]])
+    return by_turn, along, torch.cat([own, torch.zeros(6, 4, 3, 3, dtype=pose.dtype)])
+
+
+def rotation_slopes(angles: torch.Tensor) -> torch.Tensor:
+    """Return the slopes (N, 3, 3, 3) of rotations by their axis-angles (N, 3).
+
+    Source: Gallego and Yezzi 2015, "A compact formula for the derivative of a 3-D rotation in
+    exponential coordinates".
+    """
+    rotation, unit = axis_angle_to_matrix(angles), torch.eye(3, dtype=angles.dtype)
+    square = angles.square().sum(1)[:, None, None]
+    turned = torch.linalg.cross(angles[:, None].expand(-1, 3, -1), (unit - rotation).mT)
+    axes = (angles[:, :, None] * angles[:, None] + turned) / square.clamp_min(1e-24)
+    # Next to no rotation its slopes are turns about the axes.
+    axes = torch.where(square > 1e-12, axes, unit)
+    # The cross products of an axis with the unit vectors are the columns of its generator.
+    columns = torch.linalg.cross(axes[:, :, None].expand(-1, -1, 3, -1), unit.expand(1, 1, 3, 3))
+    return columns.mT @ rotation[:, None]
 
 
 def _joint_rotations(pose: torch.Tensor) -> torch.Tensor:

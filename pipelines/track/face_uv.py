@@ -38,7 +38,6 @@ from pipelines.track.surface import (
     FrameSetCrops,
     Visibility,
     flat_barycentrics,
-    root_light,
     sample_normals,
     view_colours,
     view_weights,
@@ -49,6 +48,7 @@ REDUNDANCY = 2.0  # neighbouring landmarks err together: so many count as one
 FLOOR_M = 0.0004
 VIEW_NOISE = 0.05  # standard deviation of root light between views of one place
 LEAST_SEEN, LEAST_VIEWS = 0.1, 2
+MOST_VIEWS = 6  # those from the side blur the map
 # Landmarks of whole heads are coarser and err differently in every expression: those that the map
 # shows get so many times their standard deviation. The others, as corners of open mouths, stay.
 DISTRUST = 6.0
@@ -135,12 +135,22 @@ def unwrap(
     the skin from one off it.
     """
     places, normals = uv_map.samples.at(mesh), sample_normals(uv_map.samples, mesh)
+    pictures = _facing(pictures, places.mean(0), normals.mean(0))
     weights = view_weights(Visibility(mesh, model.faces.numpy()), pictures, places, normals)
-    values = view_colours([root_light(crop) for crop in pictures.crops], weights, places)
-    trust = weights**2 * ((weights > 0).sum(0) >= LEAST_VIEWS)
-    colors = robust_mean(values, np.ones_like(values), trust, VIEW_NOISE)
+    # The network reads it in single precision.
+    values = view_colours(pictures.images(), weights, places).astype(np.float32)
+    trust = (weights**2 * ((weights > 0).sum(0) >= LEAST_VIEWS)).astype(np.float32)
+    colors = robust_mean(values, np.ones((1, 1, 1), np.float32), trust, VIEW_NOISE)
     mass = trust.sum(0)[:, None].astype(np.float32)
     return uv_map.image(colors.astype(np.float32)), uv_map.image(mass)[..., 0]
+
+
+def _facing(pictures: FrameSetCrops, middle: np.ndarray, forward: np.ndarray) -> FrameSetCrops:
+    """Keep the pictures that the face at `middle` (3,) looks at most."""
+    away = [crop.camera.center - middle for crop in pictures.crops]
+    facing = [float(forward @ way) / max(float(np.linalg.norm(way)), 1e-12) for way in away]
+    chosen = sorted(np.argsort(facing, kind="stable")[::-1][:MOST_VIEWS].tolist())
+    return pictures.some(chosen)
 
 
 def _between(places: np.ndarray, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

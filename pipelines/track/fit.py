@@ -21,7 +21,7 @@ from express50.geometry.cameras import project_pinhole
 from express50.geometry.transforms import axis_angle_to_matrix
 from pipelines.track.basis import MODE, Basis, Points
 from pipelines.track.observe import JAW_LINE_WEIGHT
-from pipelines.track.state import Pose, State, Target, prior
+from pipelines.track.state import Pose, Quadratic, State, Target, prior
 from pipelines.track.terms import (
     MeshPlaces,
     PixelTerm,
@@ -80,6 +80,21 @@ def fit(
     return state, least
 
 
+def condensed(basis: Basis, target: Target, pose: Pose) -> Target:
+    """Return a target whose evidence is a quadratic about a pose that was fitted to it.
+
+    Whatever else it is then fitted to costs a small part of what the evidence did. The shape is
+    known: the basis is of `freeze_shape`.
+    """
+    one = _Expression.of(basis, target)
+    hessian, gradient = _normal_equations(basis, one, pose, State(np.zeros(0), (pose,)))
+    residual, moved = prior(basis.model, pose.own, one.neutral, one.single_view)
+    inner = hessian[BIAS:, BIAS:] - moved.T @ moved
+    known = Quadratic(pose, inner, gradient[BIAS:] - moved.T @ residual)
+    unused = np.full_like(target.sigma, np.inf)
+    return replace(target, sigma=unused, terms=(), known=known)
+
+
 def consistent_sigma(target: Target, marks: np.ndarray) -> np.ndarray:
     """Return the target's standard deviations with landmarks that contradict the fit left out.
 
@@ -112,13 +127,15 @@ class _Expression:
     points: Points
     neutral: bool
     single_view: bool
+    known: Quadratic | None
 
     @classmethod
     def of(cls, basis: Basis, target: Target) -> _Expression:
         sightings = []
         for view, sigma in zip(target.observation.views, target.sigma, strict=True):
             rows = np.flatnonzero(np.isfinite(sigma))
-            sightings.append(Sighting(view.camera, rows, view.points[rows], sigma[rows]))
+            if len(rows):
+                sightings.append(Sighting(view.camera, rows, view.points[rows], sigma[rows]))
         terms = (PixelTerm(landmark_anchors(basis.model), tuple(sightings)), *target.terms)
         ids = np.unique(np.concatenate([term.anchors.vertices.ravel() for term in terms]))
         anchors = tuple(
@@ -126,7 +143,7 @@ class _Expression:
             for term in terms
         )
         single = len(target.observation.views) == 1
-        return cls(terms, anchors, Points(basis, ids), target.neutral, single)
+        return cls(terms, anchors, Points(basis, ids), target.neutral, single, target.known)
 
     def places(self, basis: Basis, positions: np.ndarray, state: State, pose: Pose) -> list:
         """Return the terms' places (n, 3); the landmarks' are where the detector would put them."""
@@ -163,6 +180,7 @@ def _cost(basis: Basis, expressions: list[_Expression], state: State, weights: n
         total += sum(cost(*pair) for pair in zip(one.terms, places, strict=True))
         residual, _ = prior(basis.model, pose.own, one.neutral, one.single_view)
         total += 0.5 * float(residual @ residual)
+        total += one.known.at(pose)[0] if one.known else 0.0
     return total if np.isfinite(total) else np.inf
 
 
@@ -182,6 +200,9 @@ def _normal_equations(
     residual, moved = prior(basis.model, pose.own, one.neutral, one.single_view)
     base[shapes:, shapes:] += moved.T @ moved
     slope[shapes:] += moved.T @ residual
+    if one.known:
+        base[shapes:, shapes:] += one.known.hessian
+        slope[shapes:] += one.known.at(pose)[1]
     hessian[np.ix_(columns, columns)] = base
     gradient[columns] = slope
     # A landmark's bias b moves its place by R b.

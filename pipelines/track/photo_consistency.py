@@ -15,7 +15,7 @@ import numpy as np
 import open3d as o3d
 from scipy.spatial import cKDTree
 
-from express50.geometry.cameras import Camera, project_with_slope
+from express50.geometry.cameras import Camera, project_pinhole, project_with_slope
 from express50.geometry.conventions import corner_to_cell
 from express50.geometry.raycast import mesh_scene
 from express50.head.model import HeadModel
@@ -23,7 +23,6 @@ from pipelines.track.surface import (
     COVERED,
     FrameSetCrops,
     Visibility,
-    root_light,
     sample_normals,
     spread,
     view_weights,
@@ -34,6 +33,8 @@ PATCH = 7
 VIEWS = 8
 SPACING_PX = 1.0
 STEP_PX = 0.7
+EVEN = np.full(PATCH * PATCH, 1.0 / (PATCH * PATCH), np.float32)
+GREY = np.full(3, 1.0 / 3.0, np.float32)
 # What a patch's contrast must stand out from: root of light, 0..1.
 NOISE = 0.006
 LEAST_SCORE, LEAST_SHARP = 0.3, 0.02
@@ -99,7 +100,7 @@ def search(
     pairs = mass**2 - square
     enough = pairs > 0.1
     score = np.zeros((count, len(heights)))
-    together = (total[enough].astype(np.float64) ** 2).sum(2)
+    together = np.einsum("sdk,sdk->sd", total[enough], total[enough]).astype(np.float64)
     score[enough] = (together - square[enough, None]) / pairs[enough, None]
     return _peaks(score, heights, pixel)
 
@@ -117,14 +118,16 @@ def _patches(
     `shape` (S, 3, PATCH^2) are the patches' points about their samples.
     """
     centre = places[:, None] + heights[None, :, None] * normals[:, None]
-    pixels, slope = project_with_slope(camera, centre)
-    # Image coordinates fit single precision; world coordinates need not.
-    spread = slope.astype(np.float32) @ shape[:, None].astype(np.float32)
-    where = spread + corner_to_cell(pixels[..., None]).astype(np.float32)
-    x, y = (np.ascontiguousarray(where[:, :, k].reshape(len(places), -1)) for k in range(2))
+    pixels, _ = project_pinhole(camera, centre)
+    # Heights change how large a patch is seen by less than a hundredth: its slope is that of the
+    # mesh. Image coordinates fit single precision; world coordinates need not.
+    _, slope = project_with_slope(camera, places)
+    spread = slope.astype(np.float32) @ shape.astype(np.float32)
+    middle = corner_to_cell(pixels).astype(np.float32)
+    x, y = ((middle[:, :, k, None] + spread[:, None, k]).reshape(len(places), -1) for k in range(2))
     values = cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     values = values.reshape(len(places), len(heights), -1)
-    values -= values.mean(2, keepdims=True)
+    values -= (values @ EVEN)[..., None]
     length = np.einsum("sdk,sdk->sd", values, values) + np.float32((NOISE * PATCH) ** 2)
     values /= np.sqrt(length)[..., None]
     return values
@@ -222,7 +225,7 @@ def patch_terms(
     `reach` is in metres to either side, `weight` the trust in the result.
     """
     faces = model.faces.numpy()
-    images = [(root.mean(2), camera) for root, camera in map(root_light, pictures.crops)]
+    images = [(root @ GREY, camera) for root, camera in pictures.images()]
     visibility, terms = Visibility(mesh, faces), []
     for samples, trust in skin:
         places, normals = samples.at(mesh), sample_normals(samples, mesh)

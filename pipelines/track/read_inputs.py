@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
 
@@ -14,12 +14,15 @@ from express50.contract.layout import Dataset
 from express50.contract.stage import Note
 from express50.errors import CaptureError
 from express50.files.images import read_alpha
-from express50.geometry.cameras import Camera
-from express50.landmarks.sources import Source, open_source
+from express50.geometry.cameras import Camera, project_pinhole
+from express50.landmarks.detector import follow, window_about
+from express50.landmarks.eyes_and_lips import find_irises, open_lips
+from express50.landmarks.network import face_box, load_network
+from express50.landmarks.sources import EMBEDDED, Marked, Source, open_source
 from pipelines.track.eyes_and_jaw import shut_lids
 from pipelines.track.observe import LandmarkView, Observation, agree
 from pipelines.track.outline import signed_distance
-from pipelines.track.surface import CutCrops, FrameSetCrops, cut_crop
+from pipelines.track.surface import CutCrops, FrameSetCrops, cut_crop, root_light
 
 MIN_SCORE = 0.2  # views with a lower face score are left out
 MIN_LANDMARKS = 20  # that must agree between the cameras of an expression
@@ -27,12 +30,43 @@ Read = Callable[[str], np.ndarray]
 """Read a camera's undistorted image (H, W, 3) uint8 by its id; raises CaptureError."""
 
 DETECTOR_PASSES = 3  # crops after the coarse pass; 1 measures the same on the twin
+# A followed face is looked for in so many views, those that it looks at most: more add nothing.
+FOLLOWED_VIEWS = 10
+LEAST_AHEAD = 0.1  # cosine between the face's direction and a camera's, below which none looks
+MOVED_SHARE = (
+    0.12  # of its crop, from which on a face that was found off the middle is looked at again
+)
+# A face is lost unless this share of its views, or the only one, scores as much.
+KEPT_SHARE, KEPT_SCORE = 0.5, 0.5
+
+Follow = Callable[[np.ndarray, np.ndarray], Marked]
+"""Look at an image (H, W, 3) where landmarks (68, 2), pixels, are expected."""
+Look = Callable[[np.ndarray | None], Observation | None]
+"""Find a frame set's face near expected landmarks (68, 3), or anywhere; None if there is none."""
 
 
 def open_landmarks(dataset: Dataset, subject: str, landmarks: str, search: float) -> Source:
     """Open the source of landmarks; files of points refer to the footage as recorded."""
     recorded = read_cameras_of(dataset, subject, undistorted=False)
     return open_source(landmarks, recorded, DETECTOR_PASSES, search)
+
+
+def open_follower(landmarks: str) -> Follow | None:
+    """Return how a face is followed through a clip; None for sources that need or know no place."""
+    if landmarks != EMBEDDED:
+        return None
+    net = load_network()
+
+    def look(image: np.ndarray, expected: np.ndarray) -> Marked:
+        window = window_about(expected)
+        face = follow(net, image, window)
+        middle, side = face_box(face.points)
+        if np.linalg.norm(middle - face_box(expected)[0]) > MOVED_SHARE * side:
+            face = follow(net, image, window_about(face.points))
+        face = open_lips(image, face)
+        return Marked(face, find_irises(image, face), visible_contour=False)
+
+    return look
 
 
 def observe_peaks(
@@ -74,15 +108,16 @@ def read_clip(
     dataset: Dataset,
     subject: str,
     source: Source,
+    follow: Follow | None,
     peaks: list[Observation],
     side: int,
     cue: str,
     frames: Sequence[int],
-) -> Iterator[tuple[Observation, CutCrops]]:
-    """Yield what the cameras see of a clip, frame set by frame set; each frame is decoded once.
+) -> Iterator[tuple[Look, CutCrops]]:
+    """Yield how to look at a clip, frame set by frame set; each frame is decoded once.
 
-    Frames where the cameras agree on no face are left out. Crops, of at most `side` pixels, have no
-    mattes; they can be cut until the next frame set is asked for.
+    Faces are searched for by the source, or followed where they are expected. Crops, of at most
+    `side` pixels, have no mattes. Both can be asked for until the next frame set is.
     """
     cameras = read_cameras_of(dataset, subject)
     with FootageReader(dataset, subject) as footage:
@@ -92,20 +127,88 @@ def read_clip(
                 with suppress(CaptureError):  # this camera's footage lacks the frame
                     images[camera_id] = footage.read(camera_id, frame)
             seen = {camera_id: cameras[camera_id] for camera_id in images}
-            views = _views(images.__getitem__, seen, frame, source)
-            observation = agree(cue, frame, views)[0] if views else None
-            if observation is None or observation.inliers.sum(1).max() < MIN_LANDMARKS:
-                continue
-            # A clip may be one long blink: the peaks show what open eyes look like.
-            yield shut_lids([observation], peaks)[0], partial(_frame_crops, seen, images, side)
+            read = images.__getitem__
+            look = partial(_look, read, seen, source, follow, peaks, cue, frame)
+            yield look, partial(_frame_crops, seen, images, side)
+
+
+def _look(
+    read: Read,
+    cameras: dict[str, Camera],
+    source: Source,
+    follow: Follow | None,
+    peaks: list[Observation],
+    cue: str,
+    frame: int,
+    expected: np.ndarray | None,
+) -> Observation | None:
+    """Find a face near expected landmarks (68, 3), else where it was at the peak, else anywhere."""
+    places = [] if expected is None else [expected]
+    places += [peak.points for peak in peaks if peak.expression == cue]
+    found = None
+    for place in places:
+        if follow is not None and found is None and np.isfinite(place).all():
+            found = _agreed(cue, frame, _followed(read, cameras, follow, place))
+    if found is None:
+        found = _agreed(cue, frame, _views(read, cameras, frame, source))
+    # A clip may be one long blink: the peaks show what open eyes look like.
+    return None if found is None else shut_lids([found], peaks)[0]
+
+
+def _agreed(cue: str, frame: int, views: list[LandmarkView]) -> Observation | None:
+    """Return what the views agree on; None if that is no face."""
+    observation = agree(cue, frame, views)[0] if views else None
+    if observation is None or observation.inliers.sum(1).max() < MIN_LANDMARKS:
+        return None
+    return observation
+
+
+def _followed(
+    read: Read, cameras: Mapping[str, Camera], follow: Follow, expected: np.ndarray
+) -> list[LandmarkView]:
+    """Return the views with a face near expected landmarks (68, 3); none if it is lost."""
+    views = []
+    chosen = _ahead(cameras, expected)
+    for name in chosen:
+        camera = cameras[name]
+        seen = follow(read(name), project_pinhole(camera, expected)[0])
+        if seen.face.score >= MIN_SCORE:
+            views.append(_landmark_view(camera, seen))
+    sure = sum(view.score >= KEPT_SCORE for view in views)
+    return views if sure > KEPT_SHARE * len(chosen) else []
+
+
+def _ahead(cameras: Mapping[str, Camera], marks: np.ndarray) -> list[str]:
+    """Choose the cameras that a face with landmarks (68, 3) looks at and lies in the picture of."""
+    across, up = marks[45] - marks[36], marks[27] - marks[8]
+    forward, middle = np.cross(across, up), marks.mean(0)
+    facing = {}
+    for name, camera in cameras.items():
+        towards = camera.center - middle
+        pixels, depth = project_pinhole(camera, middle)
+        inside = (pixels > 0).all() and (pixels < (camera.width, camera.height)).all()
+        if depth > 0 and inside:
+            length = np.linalg.norm(forward) * np.linalg.norm(towards)
+            facing[name] = float(forward @ towards) / max(float(length), 1e-12)
+    best = sorted(facing, key=lambda name: (-facing[name], name))[:FOLLOWED_VIEWS]
+    return sorted(name for name in best if facing[name] > LEAST_AHEAD)
+
+
+def _landmark_view(camera: Camera, seen: Marked) -> LandmarkView:
+    face = seen.face
+    return LandmarkView(
+        camera.id, camera, face.points, face.sigma, face.score, seen.irises,
+        visible_contour=seen.visible_contour,
+    )  # fmt: skip
 
 
 def _frame_crops(
     cameras: dict[str, Camera], images: dict[str, np.ndarray], side: int, mesh: np.ndarray
 ) -> FrameSetCrops:
     """Cut the crops of a frame of a clip about its mesh (V, 3)."""
-    crops = [cut_crop(cameras[name], image, None, mesh, side) for name, image in images.items()]
-    return FrameSetCrops((), tuple(crop for crop in crops if crop))
+    found = [cut_crop(cameras[name], image, None, mesh, side) for name, image in images.items()]
+    crops = tuple(crop for crop in found if crop)
+    return FrameSetCrops((), crops, tuple(root_light(crop) for crop in crops))
 
 
 def _views(
@@ -124,13 +227,8 @@ def _views(
             missing.append(error)
             continue
         seen = source(image, camera_id, frame)
-        face = seen.face
-        if face.score >= MIN_SCORE and np.isfinite(face.sigma).any():
-            view = LandmarkView(
-                camera.id, camera, face.points, face.sigma, face.score, seen.irises,
-                visible_contour=seen.visible_contour,
-            )  # fmt: skip
-            views.append(view)
+        if seen.face.score >= MIN_SCORE and np.isfinite(seen.face.sigma).any():
+            views.append(_landmark_view(camera, seen))
     if missing and len(missing) == len(cameras):
         raise missing[0]
     return views

@@ -18,7 +18,7 @@ from pipelines.track.fit import fit
 from pipelines.track.outline import BALD_SHARE, bare_share, outline_terms
 from pipelines.track.photo_consistency import SkinSamples, patch_terms, skin_samples
 from pipelines.track.state import State, Target, all_vertices, rotations
-from pipelines.track.surface import FrameSetCrops, root_light
+from pipelines.track.surface import FrameSetCrops
 from pipelines.track.terms import NormalTerm, SlideTerm
 
 LANDMARK_STEPS = 14  # of the first fit, to landmarks alone; 6 measure the same on the twin
@@ -110,7 +110,7 @@ def gather(
     shown = next((k for k, one in enumerate(pictures) if one.crops), None)
     bald = False
     if shown is not None:
-        images = [root_light(crop) for crop in pictures[shown].crops]
+        images = pictures[shown].images()
         bald = bare_share(model, images, meshes[shown]) > BALD_SHARE
     uv_map = reading_map(model) if any(one.read_uv for one in schedule) else None
     return SubjectEvidence(pictures, skin_samples(model, samples), uv_map, eyes, bald)

@@ -1,11 +1,13 @@
 """Track clips with the peaks' shape: frame by frame, then smoothed both ways, window by window.
 
-The shape is folded into the head model's rest, so the fit of the peaks serves here too. Each frame
-starts from its neighbour and is fitted to its landmarks, then to the surface that its pictures
-agree on. Sweeps then fit every frame again, pulled towards the mean of its two neighbours: every
-second frame first, then the others, so that neither direction of time comes first. The first and
-the last frame, which have one neighbour, are treated alike. Windows overlap by more frames than the
-sweeps reach, and the overlap is dropped, so window ends do not show.
+The shape is folded into the head model's rest, so the fit of the peaks serves here too. A frame's
+landmarks are looked for where the mesh of the frame before has them; it starts from that frame's
+expression and is fitted to its landmarks, then to the surface that its pictures agree on. What that
+says is condensed to a quadratic of the frame's unknowns. Sweeps then fit every frame again, pulled
+towards the mean of its two neighbours: every second frame first, then the others, so that neither
+direction of time comes first. The first and the last frame, which have one neighbour, are treated
+alike. Windows overlap by more frames than the sweeps reach, and the overlap is dropped, so window
+ends do not show.
 """
 
 from __future__ import annotations
@@ -30,9 +32,10 @@ from pipelines.track.basis import POSE_SIZE, Basis, Points
 from pipelines.track.config import VERSION
 from pipelines.track.eyes_and_jaw import EyeOffsets, lid_terms, with_irises_and_jaw
 from pipelines.track.face_uv import FaceUvMap, slide_term, with_slide
-from pipelines.track.fit import fit
+from pipelines.track.fit import condensed, fit
 from pipelines.track.observe import Observation
 from pipelines.track.photo_consistency import SkinSamples, patch_terms
+from pipelines.track.read_inputs import Look
 from pipelines.track.schedule import LANDMARK_STEPS, PATCH_REACH_M, ROUND_STEPS
 from pipelines.track.state import (
     Pose,
@@ -47,6 +50,7 @@ from pipelines.track.surface import CutCrops
 from pipelines.track.terms import MeshPlaces, PointTerm, landmark_anchors
 
 WINDOW = 48  # frames tracked in one piece, and kept if the run is stopped
+SWEEP_STEPS = 2  # of a quadratic
 SWEEPS = 2  # 1 leaves a third more jitter, 4 changes little
 SMOOTH_M = 0.001  # standard deviation of a point about the middle of the neighbouring frames'
 # Vertices beside the landmarks that neighbours are compared by, and the effective number of all.
@@ -55,8 +59,8 @@ MAX_GAP = 3  # strides beyond which frames do not constrain each other
 # Landmarks and the frame before leave a millimetre or two: half of what the peaks' search spans.
 REACH_SHARE, FIRST_TRUST = 0.5, 0.3
 
-Observed = tuple[Observation, CutCrops]
-"""What the cameras see of a frame, and its crops until the next frame is asked for."""
+Observed = tuple[Look, CutCrops]
+"""How to find a frame's face and to cut its crops, until the next frame is asked for."""
 ReadClip = Callable[[str, Sequence[int]], Iterable[Observed]]
 """Read frames of a cue, one after the other."""
 
@@ -114,33 +118,59 @@ def track_window(tracker: ClipTracker, clip: Iterable[Observed]) -> dict[int, Po
     Raises:
         StageError: a frame cannot be fitted.
     """
-    person = tracker.person
-    anchors = landmark_anchors(person.model)
-    template = anchors.at(person.model.template.numpy())
     targets: list[Target] = []
     poses: list[Pose] = []
-    for observation, cut_crops in clip:
-        start = start_state(person, [initial_pose(observation, template)])
-        pose = start.poses[0]
-        # Views from behind are left out as at the peaks.
-        sigma = posed_sigma(observation, pose.rotation, pose.own[-3:])
-        terms = lid_terms(person.model, observation)
-        target = Target(observation, sigma, False, terms)
-        if poses:
-            own = poses[-1].own.copy()
-            own[-3:] = pose.own[-3:]
-            start = State(start.shape, (Pose(own, pose.rotation),))
-        state, _ = fit(person, [target], start, LANDMARK_STEPS)
-        mesh = all_vertices(person.model, state)[0]
-        rotation = state.poses[0].rotation
-        target = with_irises_and_jaw(person.model, target, mesh, rotation, tracker.eyes)
-        state, _ = fit(person, [target], state, ROUND_STEPS)
-        target, found = fit_to_pictures(tracker, target, state.poses[0], cut_crops)
-        targets.append(target)
-        poses.append(found)
+    marks, lost = None, True
+    anchors = landmark_anchors(tracker.person.model)
+    for look, cut_crops in clip:
+        observation = look(None if lost else marks)
+        lost = observation is None
+        if observation is None:
+            continue
+        target, pose = _track_frame(tracker, observation, cut_crops, poses[-1] if poses else None)
+        targets.append(condensed(tracker.person, target, pose))
+        poses.append(pose)
+        marks = anchors.at(_mesh(tracker.person, pose))
     for half in range(2 * tracker.sweeps):
         poses = _sweep(tracker, targets, poses, half % 2)
     return {target.observation.frame: pose for target, pose in zip(targets, poses, strict=True)}
+
+
+def _track_frame(
+    tracker: ClipTracker, observation: Observation, cut_crops: CutCrops, before: Pose | None
+) -> tuple[Target, Pose]:
+    """Fit one frame, from the pose of the one before where there is one."""
+    person, model = tracker.person, tracker.person.model
+    pose = _start(person, observation, before)
+    # Views from behind are left out as at the peaks.
+    sigma = posed_sigma(observation, pose.rotation, pose.own[-3:])
+    target = Target(observation, sigma, False, lid_terms(model, observation))
+    if before is None:
+        pose = _fitted(person, target, pose, LANDMARK_STEPS)
+    mesh = _mesh(person, pose)
+    target = with_irises_and_jaw(model, target, mesh, pose.rotation, tracker.eyes)
+    pose = _fitted(person, target, pose, ROUND_STEPS)
+    return fit_to_pictures(tracker, target, pose, cut_crops)
+
+
+def _start(person: Basis, observation: Observation, before: Pose | None) -> Pose:
+    """Move the face of the frame before, or a face at rest, to where the landmarks are."""
+    anchors = landmark_anchors(person.model)
+    if before is None:
+        template = anchors.at(person.model.template.numpy())
+        return start_state(person, [initial_pose(observation, template)]).poses[0]
+    own = before.own.copy()
+    marks = anchors.at(_mesh(person, before))
+    rotation, own[-3:] = initial_pose(observation, (marks - own[-3:]) @ before.rotation)
+    return Pose(own, rotation)
+
+
+def _mesh(person: Basis, pose: Pose) -> np.ndarray:
+    return all_vertices(person.model, State(np.zeros(0), (pose,)))[0]
+
+
+def _fitted(person: Basis, target: Target, pose: Pose, steps: int) -> Pose:
+    return fit(person, [target], State(np.zeros(0), (pose,)), steps)[0].poses[0]
 
 
 def fit_to_pictures(
@@ -150,20 +180,20 @@ def fit_to_pictures(
     person, seen = tracker.person, target
     if tracker.skin is None or not tracker.rounds:
         return target, pose
-    state = State(np.zeros(0), (pose,))
-    pictures = cut_crops(all_vertices(person.model, state)[0])
+    mesh = _mesh(person, pose)
+    pictures = cut_crops(mesh)
     if not pictures.crops:
         return target, pose
     for done in range(tracker.rounds):
-        mesh = all_vertices(person.model, state)[0]
         reach = REACH_SHARE * PATCH_REACH_M * 0.6**done
         trust = FIRST_TRUST ** (tracker.rounds - 1 - done)
         found = patch_terms(person.model, tracker.skin, pictures, mesh, reach, trust)
         seen = replace(target, terms=(*target.terms, *found))
         if tracker.uv_map is not None:
             seen = with_slide(seen, slide_term(person.model, tracker.uv_map, pictures, mesh))
-        state, _ = fit(person, [seen], state, ROUND_STEPS)
-    return seen, state.poses[0]
+        pose = _fitted(person, seen, pose, ROUND_STEPS)
+        mesh = _mesh(person, pose)
+    return seen, pose
 
 
 def _sweep(
@@ -175,7 +205,7 @@ def _sweep(
     spread = MeshPlaces.of_vertices(_spread_vertices(person.model.template.numpy()))
     redundancy = ((len(marks.vertices) + SPREAD_VERTICES) / EFFECTIVE_POINTS) ** 0.5
     frames = [target.observation.frame for target in targets]
-    meshes = [all_vertices(person.model, State(np.zeros(0), (pose,)))[0] for pose in poses]
+    meshes = [_mesh(person, pose) for pose in poses]
     swept = list(poses)
     for number, frame in enumerate(frames):
         # By the frame, not by its place: it is the same in every window that it is in.
@@ -187,8 +217,7 @@ def _sweep(
         sigma = SMOOTH_M * redundancy * vagueness
         pull = tuple(PointTerm(one, one.at(expected), sigma) for one in (marks, spread))
         target = replace(targets[number], terms=(*targets[number].terms, *pull))
-        state, _ = fit(person, [target], State(np.zeros(0), (poses[number],)), ROUND_STEPS)
-        swept[number] = state.poses[0]
+        swept[number] = _fitted(person, target, poses[number], SWEEP_STEPS)
     return swept
 
 

@@ -26,7 +26,13 @@ from pipelines.track.config import TrackConfig
 from pipelines.track.eyes_and_jaw import lid_terms, measure_eyes
 from pipelines.track.fit import consistent_sigma, fit
 from pipelines.track.observe import Observation
-from pipelines.track.read_inputs import observe_peaks, open_landmarks, peak_pictures, read_clip
+from pipelines.track.read_inputs import (
+    observe_peaks,
+    open_follower,
+    open_landmarks,
+    peak_pictures,
+    read_clip,
+)
 from pipelines.track.report import (
     camera_warnings,
     draw_overlays,
@@ -107,7 +113,8 @@ def run(
             freeze_shape(basis, state.shape, state.bias), config.stride, eyes, evidence.skin,
             evidence.uv_map, config.clip_rounds,
         )  # fmt: skip
-        read = partial(read_clip, dataset, item, source, peaks, config.photo_side)
+        follow = open_follower(config.landmarks)
+        read = partial(read_clip, dataset, item, source, follow, peaks, config.photo_side)
         # Windows that a stopped run finished are taken over if this digest is the same. The peaks'
         # fit follows from inputs and settings, up to how the machine rounds.
         fitted = (shape.tobytes(), state.bias.tobytes(), eyes and vars(eyes))

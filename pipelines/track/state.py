@@ -9,7 +9,12 @@ import numpy as np
 import torch
 
 from express50.errors import StageError
-from express50.geometry.transforms import make_transform, rigid_fit, similarity_fit
+from express50.geometry.transforms import (
+    make_transform,
+    matrix_to_axis_angle,
+    rigid_fit,
+    similarity_fit,
+)
 from express50.head.model import HeadModel, pose
 from pipelines.track.basis import POSE_SIZE, Basis
 from pipelines.track.observe import Observation, facing, landmark_sigma
@@ -61,6 +66,25 @@ class State:
 
 
 @dataclass(frozen=True)
+class Quadratic:
+    """Evidence as a quadratic of one expression's own unknowns (X + 18) about a pose.
+
+    `hessian` (X + 18, X + 18) and `gradient` (X + 18,) are those of its cost there.
+    """
+
+    pose: Pose
+    hessian: np.ndarray
+    gradient: np.ndarray
+
+    def at(self, pose: Pose) -> tuple[float, np.ndarray]:
+        """Return the cost above that at its own pose, and the gradient (X + 18,)."""
+        change = pose.own - self.pose.own
+        change[-6:-3] = matrix_to_axis_angle(pose.rotation @ self.pose.rotation.T)
+        slope = self.hessian @ change
+        return float(change @ (self.gradient + 0.5 * slope)), self.gradient + slope
+
+
+@dataclass(frozen=True)
 class Target:
     """The evidence that one expression is fitted to.
 
@@ -69,12 +93,14 @@ class Target:
         sigma: (views, 68) pixels, infinite where a landmark is not used.
         neutral: the expression is the resting face.
         terms: residuals beside the landmarks'.
+        known: evidence that was condensed to a quadratic.
     """
 
     observation: Observation
     sigma: np.ndarray
     neutral: bool
     terms: tuple[Term, ...] = ()
+    known: Quadratic | None = None
 
 
 def rounded(state: State, decimals: int) -> State:

@@ -58,10 +58,23 @@ class SignedDistance:
 
 @dataclass(frozen=True)
 class FrameSetCrops:
-    """The pictures of one frame set: distances to its mattes' outlines, and head crops."""
+    """The pictures of one frame set: distances to its mattes' outlines, and head crops.
+
+    `lit` are the crops' `root_light`, where they are kept: they take twelve times the memory.
+    """
 
     distances: tuple[SignedDistance, ...]
     crops: tuple[HeadCrop, ...]
+    lit: tuple[tuple[np.ndarray, Camera], ...] | None = None
+
+    def some(self, ids: list[int]) -> FrameSetCrops:
+        """Choose crops by index."""
+        lit = None if self.lit is None else tuple(self.lit[k] for k in ids)
+        return FrameSetCrops(self.distances, tuple(self.crops[k] for k in ids), lit)
+
+    def images(self) -> list[tuple[np.ndarray, Camera]]:
+        """Return the crops' `root_light`."""
+        return [root_light(crop) for crop in self.crops] if self.lit is None else list(self.lit)
 
 
 CutCrops = Callable[[np.ndarray], FrameSetCrops]
