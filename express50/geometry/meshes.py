@@ -1,4 +1,7 @@
-"""Write triangle meshes as PLY, OBJ or GLB files, in the units they have; read surfaces."""
+"""Write triangle meshes as PLY, OBJ or GLB files, in the units they have; read surfaces.
+
+Also their Laplacian.
+"""
 
 from __future__ import annotations
 
@@ -8,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import scipy.sparse as sparse
 
 from express50.errors import FormatError
 
@@ -137,3 +141,26 @@ def write_glb(
     mesh = trimesh.Trimesh(vertices, faces, vertex_normals=normals, visual=visual, process=False)
     scene = trimesh.Scene({name: mesh})
     path.write_bytes(scene.export(file_type="glb", include_normals=normals is not None))
+
+
+def cotangent_laplacian(
+    vertices: np.ndarray, faces: np.ndarray
+) -> tuple[sparse.csr_matrix, np.ndarray]:
+    """Return cotangent stiffness (V, V) and lumped mass (V,) of a mesh (V, 3), (F, 3).
+
+    Source: Pinkall and Polthier 1993. Only edges' positive weights are kept, so that slivers do no
+    harm and the matrix is positive semi-definite.
+    """
+    count = len(vertices)
+    values: list[np.ndarray] = []
+    mass = np.full(count, 1e-12)
+    for k in range(3):
+        i, j, o = faces[:, k], faces[:, (k + 1) % 3], faces[:, (k + 2) % 3]
+        u, v = vertices[i] - vertices[o], vertices[j] - vertices[o]
+        area = np.linalg.norm(np.cross(u, v), axis=1)
+        values.append(0.5 * (u * v).sum(1) / np.maximum(area, 1e-14))
+        np.add.at(mass, i, area / 6.0)
+    edges = (faces.T.ravel(), faces[:, [1, 2, 0]].T.ravel())
+    half = sparse.csr_matrix((np.concatenate(values), edges), shape=(count, count))
+    weights = (half + half.T).maximum(0.0).minimum(20.0)
+    return sparse.diags(np.asarray(weights.sum(1)).ravel()) - weights, mass

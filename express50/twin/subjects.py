@@ -73,7 +73,7 @@ class TwinSubject:
 def make_subject(model: HeadModel, subject_id: str, number: int, seed: int) -> TwinSubject:
     """Draw one subject; it depends on the seed and the subject's number only."""
     rng = np.random.default_rng([seed, number, 1])
-    shape = np.clip(0.8 * rng.standard_normal(len(model.shape_names)), -2.0, 2.0)
+    shape = np.clip(rng.standard_normal(len(model.shape_names)), -2.5, 2.5)
     rng = np.random.default_rng([seed, number, 2])
     template = model.template.double().numpy()
     weight = soft_mask(model)

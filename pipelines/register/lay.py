@@ -16,10 +16,11 @@ import scipy.sparse as sparse
 import torch
 from scipy.sparse.linalg import SuperLU, splu
 
+from express50.geometry.meshes import cotangent_laplacian
 from express50.geometry.raycast import join_rays, mesh_scene
 from express50.head.model import HeadModel, vertex_normals
 from pipelines.register.untangle import untangled
-from pipelines.track.basis import cotangent_laplacian, in_regions, movable_vertices
+from pipelines.track.basis import in_regions, movable_vertices
 
 # Per round: how far to either side the surface is searched for, metres, and the finest wavelength
 # that the mesh follows, in multiples of the last. Broad differences are taken first.

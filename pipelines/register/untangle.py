@@ -16,9 +16,10 @@ import scipy.sparse as sparse
 from scipy.sparse.linalg import spsolve
 from scipy.spatial import cKDTree
 
+from express50.geometry.meshes import cotangent_laplacian
 from express50.geometry.transforms import rigid_fit
 from express50.head.model import HeadModel
-from pipelines.track.basis import cotangent_laplacian, in_regions
+from pipelines.track.basis import in_regions
 
 RIMS = ("lips", "left_eye_region", "right_eye_region")
 FIXED = ("left_eyeball", "right_eyeball", "teeth", "gums", "tongue", "boundary")

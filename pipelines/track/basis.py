@@ -20,6 +20,7 @@ import scipy.sparse as sparse
 import torch
 from scipy.sparse.linalg import eigsh
 
+from express50.geometry.meshes import cotangent_laplacian
 from express50.geometry.transforms_torch import axis_angle_to_matrix
 from express50.head.model import HeadModel, joint_transforms, skin, vertex_normals
 
@@ -233,26 +234,3 @@ def offset_modes(
     heights = np.zeros((len(vertices), count))
     heights[free] = modes / (root_tau * (kappa**2 + np.maximum(values, 0.0)))
     return heights
-
-
-def cotangent_laplacian(
-    vertices: np.ndarray, faces: np.ndarray
-) -> tuple[sparse.csr_matrix, np.ndarray]:
-    """Return cotangent stiffness (V, V) and lumped mass (V,) of a mesh (V, 3), (F, 3).
-
-    Source: Pinkall and Polthier 1993. Only edges' positive weights are kept, so that slivers do no
-    harm and the matrix is positive semi-definite.
-    """
-    count = len(vertices)
-    values: list[np.ndarray] = []
-    mass = np.full(count, 1e-12)
-    for k in range(3):
-        i, j, o = faces[:, k], faces[:, (k + 1) % 3], faces[:, (k + 2) % 3]
-        u, v = vertices[i] - vertices[o], vertices[j] - vertices[o]
-        area = np.linalg.norm(np.cross(u, v), axis=1)
-        values.append(0.5 * (u * v).sum(1) / np.maximum(area, 1e-14))
-        np.add.at(mass, i, area / 6.0)
-    edges = (faces.T.ravel(), faces[:, [1, 2, 0]].T.ravel())
-    half = sparse.csr_matrix((np.concatenate(values), edges), shape=(count, count))
-    weights = (half + half.T).maximum(0.0).minimum(20.0)
-    return sparse.diags(np.asarray(weights.sum(1)).ravel()) - weights, mass

@@ -10,7 +10,7 @@ from express50.geometry.sampling import smoothstep
 from express50.head.generator.eyes import lid_motion, turned
 from express50.head.generator.field import window
 from express50.head.generator.mesh import WholeMesh
-from express50.head.generator.shapes import (
+from express50.head.generator.pulls import (
     Pull,
     Triple,
     displacement,
@@ -134,24 +134,29 @@ _MIDDLE: dict[str, tuple[Pull, ...]] = {
 
 
 def expression_directions(
-    mesh: WholeMesh, regions: dict[str, Array], jaw: Array
+    mesh: WholeMesh, mean: WholeMesh, regions: dict[str, Array], jaw: Array, hinge: Array
 ) -> tuple[tuple[str, ...], Array]:
-    """Return names (X) and directions (V,3,X) in mm at full activation; `jaw` as for shapes."""
+    """Return names (X) and directions (V,3,X) in mm at full activation, for the mean of people.
+
+    Pulls are placed on the head drawn by rule, `mesh`, and move the same vertices of `mean`; lids
+    and jaw move by the mean's own shape. `jaw` (V,) separates the lips; `hinge` (3,) is the jaw's
+    joint in the mean.
+    """
     scopes = scope_weights(mesh, regions, jaw)
     result: dict[str, Array] = {}
     for name, pulls in PAIRED.items():
-        motion = settle_eyes(mesh, displacement(mesh, pulls, scopes), False)
+        motion = settle_eyes(mesh, displacement(mesh, pulls, scopes))
         result |= _both_sides(mesh, name, motion)
     for name, (upper, lower, aside) in _LIDS.items():
-        motion = lid_motion(mesh, "left", upper, lower)
+        motion = lid_motion(mean, "left", upper, lower)
         # The cornea carries the lids a little sideways.
         shares = {f"lid{k}": (1 - k / 7) ** 2 for k in range(8)} | {"lid_edge": 1, "lid_hidden": 1}
         for tag, share in shares.items():
             motion[mesh.tag(tag, "left"), 0] += aside * share
         result |= _both_sides(mesh, name, motion)
     for name, pulls in _MIDDLE.items():
-        result[name] = settle_eyes(mesh, displacement(mesh, pulls, scopes), False)
-    result |= _jaw_directions(mesh, jaw) | _tongue_directions(mesh)
+        result[name] = settle_eyes(mesh, displacement(mesh, pulls, scopes))
+    result |= _jaw_directions(mesh, mean, jaw, hinge) | _tongue_directions(mesh)
     names = tuple(sorted(result, key=str.lower))
     return names, np.stack([result[name] for name in names], -1)
 
@@ -172,11 +177,11 @@ def _both_sides(mesh: WholeMesh, name: str, left: Array) -> dict[str, Array]:
     return {f"{name}_L": left, f"{name}_R": left[mesh.mirror] * [-1.0, 1.0, 1.0]}
 
 
-def _jaw_directions(mesh: WholeMesh, jaw: Array) -> dict[str, Array]:
+def _jaw_directions(mesh: WholeMesh, mean: WholeMesh, jaw: Array, hinge: Array) -> dict[str, Array]:
     """Return slides of the jaw, and how lips stay shut while the jaw opens by 0.3 rad."""
     share = jaw[:, None]
     slide = share * np.array([[7.0, 0.0, 0.0]])
-    back = turned(mesh.vertices - np.array([0.0, -8.0, 10.0]), np.array(0.3))
+    back = turned(mean.vertices - hinge, np.array(0.3))
     lips = window(mesh.vertices, (0.0, -52.0, 95.0), (36.0, 15.0, 30.0))
     for k in range(4):
         lips[mesh.tag(f"lip{k}")] = np.maximum(lips[mesh.tag(f"lip{k}")], 1.0 - 0.06 * k)

@@ -9,7 +9,6 @@ from express50.head.generator.field import (
     EYE_RADIUS,
     LID_RADIUS,
     cast,
-    eye_center,
     labels,
 )
 from express50.head.generator.mesh import HalfMesh, WholeMesh
@@ -102,6 +101,12 @@ def add_eyeball(half: HalfMesh) -> None:
     half.tags["iris"] = np.concatenate([front, *rings[:4]])
 
 
+def ball_centre(mesh: WholeMesh, side: str) -> Array:
+    """Return the centre (3,) of an eyeball, mm: the middle between its poles."""
+    ball = mesh.vertices[mesh.tag("eyeball", side)]
+    return 0.5 * (ball[0] + ball[-1])
+
+
 _STILL = 5  # lid loop that does not move; loops inside it share the margin's motion
 
 
@@ -113,7 +118,7 @@ def lid_motion(mesh: WholeMesh, side: str, upper: float, lower: float) -> Array:
     `upper` is the share of the opening by which the upper margin comes down, `lower` that by which
     the lower one comes up.
     """
-    center = eye_center(side)
+    center = ball_centre(mesh, side)
     loops = np.stack([mesh.vertices[mesh.tag(f"lid{k}", side)] for k in range(_STILL + 1)]) - center
     margin = loops[0]
     count = len(margin)

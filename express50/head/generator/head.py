@@ -1,13 +1,18 @@
-"""Make the built-in head: a full head in FLAME's layout with named directions.
+"""Make the built-in head: a full head in FLAME's layout with the variety of people.
 
-Run `python -m express50.head.generator.head` after a change here: it rewrites `builtin.npz`.
+Run `python -m express50.head.generator.head` after a change here: it rewrites `builtin.npz` with
+the mean and the shape directions that the file has. With `--people ict.npz` these are fitted anew
+to the people of ICT-FaceKit (`people`), which takes some minutes.
 
-Measures are millimetres while building and metres in the result. No vertex, weight or direction is
-taken from another model; the placement of features follows anthropometry (Farkas 1994).
+The generator draws a head by rule, features placed by anthropometry (Farkas 1994): its mesh, UV
+map, regions, landmarks and motions, which the mean of people takes over vertex by vertex. Measures are
+millimetres while building and metres in the result.
 """
 
 from __future__ import annotations
 
+import argparse
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -16,21 +21,20 @@ import numpy as np
 
 from express50.geometry.sampling import smoothstep
 from express50.head.generator.expressions import expression_directions
-from express50.head.generator.eyes import add_eyeball
-from express50.head.generator.field import eye_center, window
+from express50.head.generator.eyes import add_eyeball, ball_centre
+from express50.head.generator.field import window
 from express50.head.generator.mesh import HalfMesh, WholeMesh, mirrored, neighbour_mean, pack_uv
 from express50.head.generator.mouth import add_teeth, add_tongue
+from express50.head.generator.people import People, fit_people
 from express50.head.generator.regions import contour_candidates, embed_landmarks, region_masks
-from express50.head.generator.shapes import shape_directions
 from express50.head.generator.skin import add_skin, set_skin_uv
-from express50.head.load import BUILTIN
+from express50.head.load import BUILTIN, load_builtin
 
 Array = np.ndarray
 
 ROOT, NECK, JAW, LEFT_EYE, RIGHT_EYE = range(5)
-# Rest joints, mm: collar, upper neck, jaw hinge, eyeball centres.
-JOINTS = np.array([(0, -165, -22), (0, -72, -16), (0, -8, 10),
-                   eye_center("left"), eye_center("right")], float)  # fmt: skip
+# Rest joints of the head drawn by rule, mm: collar, upper neck, jaw hinge.
+JOINTS = np.array([(0, -165, -22), (0, -72, -16), (0, -8, 10)], float)
 
 
 @cache
@@ -46,21 +50,25 @@ def procedural_mesh() -> WholeMesh:
     return mirrored(half)
 
 
-def write_builtin(path: Path) -> None:
+def write_builtin(path: Path, people: People) -> None:
     """Write the head's arrays, in metres, as the .npz file that `express50.head.load` reads."""
     mesh = procedural_mesh()
+    mean = replace(mesh, vertices=people.mean)
+    eyes = [ball_centre(mean, side) for side in ("left", "right")]
+    joints = np.concatenate([people.joints, eyes])
     regions, contour = region_masks(mesh), contour_candidates(mesh)
     uv, uv_faces = pack_uv(mesh)
     landmark_faces, landmark_bary = embed_landmarks(mesh)
     weights = skinning_weights(mesh, regions)
-    shape_names, shapes = shape_directions(mesh, regions, weights[:, JAW])
-    expression_names, expressions = expression_directions(mesh, regions, weights[:, JAW])
+    expression_names, expressions = expression_directions(
+        mesh, mean, regions, weights[:, JAW], joints[JAW]
+    )
     arrays = {
-        "template": mesh.vertices / 1000,
-        "shape_dirs": shapes / 1000,
+        "template": people.mean / 1000,
+        "shape_dirs": np.round(people.directions / 1000, 6),
         "expression_dirs": expressions / 1000,
         "pose_dirs": pose_correctives(mesh, regions) / 1000,
-        "joint_regressor": joint_regressor(mesh),
+        "joint_regressor": joint_regressor(mean, joints),
         "skinning": weights,
         "uv": uv,
         "landmark_bary": landmark_bary,
@@ -70,7 +78,7 @@ def write_builtin(path: Path) -> None:
         "faces": mesh.faces,
         "uv_faces": uv_faces,
         "landmark_faces": landmark_faces,
-        "shape_names": shape_names,
+        "shape_names": [f"people_{k:02d}" for k in range(people.directions.shape[2])],
         "expression_names": expression_names,
         "contour": np.concatenate(contour),
         "contour_counts": [len(line) for line in contour],
@@ -80,10 +88,18 @@ def write_builtin(path: Path) -> None:
     np.savez_compressed(path, **stored)
 
 
-def joint_regressor(mesh: WholeMesh) -> Array:
+def stored_people() -> People:
+    """Return the mean and the directions that the stored head has."""
+    head = load_builtin()
+    template = 1000 * head.template.double().numpy()
+    joints = head.joint_regressor.double().numpy()[:LEFT_EYE] @ template
+    return People(template, 1000 * head.shape_dirs.double().numpy(), joints)
+
+
+def joint_regressor(mesh: WholeMesh, joints: Array) -> Array:
     """Return weights (5,V), rows sum to 1: least-norm affine ones over vertices near the joints."""
     regressor, skin = np.zeros((5, len(mesh.vertices))), mesh.tag("grid")
-    for j, joint in enumerate(JOINTS):
+    for j, joint in enumerate(joints):
         if j >= LEFT_EYE:
             near = mesh.tag("eyeball", "left" if j == LEFT_EYE else "right")
         else:
@@ -174,5 +190,20 @@ def pose_correctives(mesh: WholeMesh, regions: dict[str, Array]) -> Array:
     return result
 
 
+def main(arguments: list[str] | None = None) -> int:
+    """Rewrite the stored head."""
+    parser = argparse.ArgumentParser(
+        prog="python -m express50.head.generator.head", description=__doc__
+    )
+    parser.add_argument("--people", type=Path, help="ICT-FaceKit's arrays (.npz) to fit people to")
+    parser.add_argument("--out", type=Path, default=BUILTIN)
+    options = parser.parse_args(arguments)
+    mesh = procedural_mesh()
+    write_builtin(
+        options.out, fit_people(mesh, JOINTS, options.people) if options.people else stored_people()
+    )
+    return 0
+
+
 if __name__ == "__main__":
-    write_builtin(BUILTIN)
+    raise SystemExit(main())

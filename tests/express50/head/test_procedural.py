@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from express50.head.generator.head import procedural_mesh, write_builtin
+from express50.head.generator.head import procedural_mesh, stored_people, write_builtin
 from express50.head.load import BUILTIN, load_builtin
 from express50.head.model import REGIONS, landmarks
 
@@ -29,11 +29,11 @@ def test_has_the_size_of_an_adult_head(head):
     vertices = head.template.numpy()
     skin = ~(head.regions["neck"] | head.regions["left_ear"] | head.regions["right_ear"]).numpy()
     size = np.ptp(vertices[skin], axis=0)
-    assert 0.145 < size[0] < 0.165
+    assert 0.145 < size[0] < 0.172
     assert 0.222 < size[1] < 0.240
     assert 0.195 < size[2] < 0.220, size  # with the nose
     eyes = [vertices[head.regions[f"{s}_eyeball"].numpy()].mean(0) for s in ("left", "right")]
-    assert np.linalg.norm(eyes[0] - eyes[1]) == pytest.approx(0.063, abs=1e-4)
+    assert np.linalg.norm(eyes[0] - eyes[1]) == pytest.approx(0.064, abs=5e-4)
 
 
 def test_has_the_promised_number_of_parts(head):
@@ -79,7 +79,7 @@ def test_is_mirror_symmetric(head):
 
 
 def test_the_stored_arrays_are_those_that_the_generator_makes(head, tmp_path):
-    write_builtin(tmp_path / "made.npz")
+    write_builtin(tmp_path / "made.npz", stored_people())
     with np.load(tmp_path / "made.npz") as made, np.load(BUILTIN) as stored:
         assert set(made) == set(stored)
         for name in made:
