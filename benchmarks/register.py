@@ -7,7 +7,8 @@ same of a head of another model (``--foreign`` names one that the twin can play,
 ICT-FaceKit file) that the built-in head is tracked and registered on; ``n/a`` without one.
 
 Point to surface is the distance of the face's vertices that two cameras see on the true head, to
-the true head. Vertex errors need the same head model. `interval_90` is the share of these vertices
+the true head. Vertex errors need the same head model. `truth` counts the crossing triangles of the
+twin's own mesh. `interval_90` is the share of these vertices
 that lie within 1.645 of their stated standard deviations. Seconds are processor seconds of the
 stage per expression. The last line printed is one JSON object.
 """
@@ -41,7 +42,8 @@ from express50.runner.runner import run_stage
 from express50.twin.truth import Truth, align_worlds
 from pipelines import depth, track
 from pipelines.register import STAGE
-from pipelines.register.lay import GivenSurface, crossings, lay, mesh_normals
+from pipelines.register.lay import GivenSurface, lay, mesh_normals
+from pipelines.register.untangle import crossings
 
 SEEN_BY, SLANT, LIFT_M = 2, 0.3, 5e-4
 SCAN_DETAIL_M = 0.003  # a true surface has no errors to smooth away
@@ -87,14 +89,17 @@ def benchmark(dataset: Dataset, truth: Truth) -> dict[str, Figures]:
         run_stage(stage, dataset, build_config(stage, {}), workers=0, progress=False)
         seconds = time.process_time() - began
     rows: dict[str, list[Figures]] = {"tracked": [], "standard": [], "scan": []}
+    true: list[float] = []
     for case, registered, sigma in cases(dataset, truth):
         scan = GivenSurface(*case.true, np.ones(len(case.true[0])))
         laid = lay(case.model, case.mesh, scan, SCAN_DETAIL_M)
         rows["tracked"].append(errors(case, case.mesh))
         rows["standard"].append(errors(case, registered, sigma))
         rows["scan"].append(errors(case, laid.vertices))
+        true += [float(len(crossings(case.model, case.true[0])))] if case.same else []
     result = {name: pooled(found) for name, found in rows.items()}
     result["standard"]["seconds_per_frame"] = round(seconds / len(rows["standard"]), 2)
+    result["truth"] = {"crossing_triangles": round(float(np.mean(true)), 3) if true else None}
     for name, figures in result.items():
         print(name, json.dumps(figures), file=sys.stderr, flush=True)
     return result

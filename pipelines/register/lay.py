@@ -12,7 +12,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import open3d as o3d
 import scipy.sparse as sparse
 import torch
 from scipy.sparse.linalg import SuperLU, splu
@@ -20,6 +19,7 @@ from scipy.sparse.linalg import SuperLU, splu
 from express50.geometry.meshes import cotangent_laplacian
 from express50.geometry.raycast import join_rays, mesh_scene
 from express50.head.model import HeadModel, vertex_normals
+from pipelines.register.untangle import untangled
 from pipelines.track.basis import in_regions, movable_vertices
 
 # Per round: how far to either side the surface is searched for, metres, and the finest wavelength
@@ -35,13 +35,11 @@ SURFACE_M = 0.0004
 STAY_M = 0.003  # standard deviation of the tracked mesh where no surface is found
 FOLD_M = 0.03  # a vertex that faces the mesh itself nearer than this lies in a fold
 SAMPLES = 64  # of the posterior; their standard deviation is known to 9 %
-RETREATS = 8
 # Surfaces there are not the skin's, or coarser than what tracking sees; an ear is all folds.
 TRUST = {
     "scalp": 0.0, "mouth_interior": 0.0, "boundary": 0.0, "neck": 0.0, "left_ear": 0.0,
     "right_ear": 0.0, "lips": 0.5, "left_eye_region": 0.1, "right_eye_region": 0.1,
 }  # fmt: skip
-RIMS = ("lips", "left_eye_region", "right_eye_region")
 
 
 @dataclass(frozen=True)
@@ -94,7 +92,7 @@ def lay(model: HeadModel, start: np.ndarray, surface: GivenSurface, detail: floa
             off = (height - rise) / (OUTLIER * reach)
             weight = trust / NOISE_M**2 / (1.0 + off**2) ** 2  # Geman and McClure 1985
         mesh = mesh + rise[:, None] * normals
-    mesh = without_new_crossings(model, start, mesh)
+    mesh = untangled(model, mesh)
     normals = mesh_normals(mesh, model.faces)
     residual, trust = search.heights(mesh, normals, ROUNDS[-1][0])
     seen = trust * trusted * ~folded(mesh, normals, faces) > 0.05
@@ -192,40 +190,6 @@ def smooth_normals(vertices: np.ndarray, faces: torch.Tensor, wavelength: float)
     stiffness, mass = cotangent_laplacian(vertices, faces.numpy())
     spread = sparse.diags(mass) + (wavelength / (2 * np.pi)) ** 2 * stiffness
     return _unit(splu(spread.tocsc()).solve(mass[:, None] * mesh_normals(vertices, faces)))
-
-
-def crossings(model: HeadModel, mesh: np.ndarray) -> np.ndarray:
-    """List the faces of lips and lids that pass through each other on a mesh (V, 3)."""
-    faces = model.faces.numpy()
-    rims = np.flatnonzero(in_regions(model, RIMS)[faces].any(1))
-    if not len(rims):
-        return rims
-    used, corners = np.unique(faces[rims], return_inverse=True)
-    part = o3d.geometry.TriangleMesh(
-        o3d.utility.Vector3dVector((mesh - mesh.mean(0))[used]),
-        o3d.utility.Vector3iVector(corners.reshape(-1, 3)),
-    )
-    pairs = np.asarray(part.get_self_intersecting_triangles()).reshape(-1, 2)
-    return rims[np.unique(pairs)]
-
-
-def without_new_crossings(model: HeadModel, start: np.ndarray, mesh: np.ndarray) -> np.ndarray:
-    """Move vertices back towards a start (V, 3) where lips or lids newly pass through each other.
-
-    What passed through itself at the start still does.
-    """
-    faces, known = model.faces.numpy(), crossings(model, start)
-    moves, share = np.ones(len(mesh)), np.ones(len(mesh))
-    for _ in range(RETREATS):
-        new = np.setdiff1d(crossings(model, start + share[:, None] * (mesh - start)), known)
-        if not len(new):
-            break
-        moves[np.unique(faces[new])] *= 0.5
-        share = moves.copy()
-        for _ in range(2):  # two rings of neighbours follow, or a step would be left
-            least = share[faces].min(1)
-            np.minimum.at(share, faces, 0.5 * (share[faces] + least[:, None]))
-    return start + share[:, None] * (mesh - start)
 
 
 def _unit(vectors: np.ndarray) -> np.ndarray:
