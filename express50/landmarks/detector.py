@@ -11,15 +11,25 @@ confidence.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import islice
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 import torch
 
 from express50.geometry.conventions import affine_to_opencv
-from express50.landmarks.network import CROP, MIRROR, LandmarkNet, face_box
+from express50.landmarks.network import (
+    CROP,
+    MIRROR,
+    POINTS,
+    LandmarkNet,
+    Output,
+    face_box,
+    mirrored,
+)
 
 # A point whose error scale is this share of the face box has half the confidence.
 HALF_CONFIDENCE_SHARE = 0.025
@@ -32,12 +42,13 @@ FOUND_SCORE = 0.5
 SHRINK, STEP = 0.55, 0.5
 SMALLEST = 0.25
 BATCH = 32  # windows at a time
+COARSE, MIDDLE = CROP, CROP  # pixels of the first looks
 KEEP_SHARE = 0.8
-# The last look is taken in several crops, in shares of the trained one. On a face, profiles too,
-# they differ by less than 0.02 of the face box (median point), on walls, coins and backs of heads
-# by more: there the score falls.
-SCALES = (0.8, 1.0, 1.2)
-DIFFER_SHARE = 0.02
+# The last look is taken in several crops, in shares of the trained one, some mirrored. On a face,
+# profiles too, they differ by less than DIFFER_SHARE of the face box (median point), on walls,
+# coins and backs of heads by more: there the score falls.
+LAST = ((0.9, False), (1.1, True))
+DIFFER_SHARE = 0.015
 
 
 @dataclass(frozen=True)
@@ -60,6 +71,13 @@ class Detection:
     score: float
 
 
+class Look(NamedTuple):
+    """A crop to be seen: the pyramid of an image and a placed crop (2, 3)."""
+
+    pyramid: list[np.ndarray]
+    window: np.ndarray
+
+
 @dataclass(frozen=True)
 class _Place:
     """A face in an image: points (68, 2), sigma and seen (68,), score; see `Detection`."""
@@ -71,7 +89,10 @@ class _Place:
 
 
 def detect(
-    net: LandmarkNet, image: np.ndarray, refinements: int = 3, smallest: float = SMALLEST
+    net: LandmarkNet,
+    image: np.ndarray,
+    refinements: int = 2,
+    smallest: float = SMALLEST,
 ) -> Detection:
     """Detect the landmarks of the most face-like place in an image.
 
@@ -79,7 +100,7 @@ def detect(
         net: From `load_network`.
         image: (H, W, 3) uint8 RGB; any size.
         refinements: Looks in sequence after the coarse pass; the last is taken in several crops,
-            each also mirrored.
+            one of them mirrored.
         smallest: Side of the smallest windows searched, of the image's longer side. A face is
             found in windows of up to three times its width; each further size, SHRINK of the one
             before, costs about three times as much where no face is.
@@ -87,20 +108,83 @@ def detect(
     Raises:
         ValueError: another shape or type.
     """
-    if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8 or 0 in image.shape:
-        raise ValueError(f"image is {image.dtype} {image.shape}, expected uint8 (H, W, 3)")
-    pyramid = make_pyramid(image)
-    place: _Place | None = None
-    for windows in _searches(image.shape[1], image.shape[0], smallest):
-        coarse = max(_run(net, pyramid, windows), key=lambda one: one.score)
-        found = _refined(net, pyramid, coarse, refinements)
-        place = found if place is None or found.score > place.score else place
-        if place.score >= FOUND_SCORE:
-            break
-    assert place is not None  # the whole frame is always looked at
+    return detect_many(net, [image], refinements, smallest)[0]
+
+
+def detect_many(
+    net: LandmarkNet,
+    images: Sequence[np.ndarray],
+    refinements: int = 2,
+    smallest: float = SMALLEST,
+) -> list[Detection]:
+    """Detect as `detect` does in each of several images, of a frame set or clip, for less time.
+
+    Raises:
+        ValueError: an image of another shape or type.
+    """
+    for image in images:
+        if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8 or 0 in image.shape:
+            raise ValueError(f"image is {image.dtype} {image.shape}, expected uint8 (H, W, 3)")
+    pyramids = [make_pyramid(image) for image in images]
+    best: list[_Place | None] = [None] * len(images)
+    searches = [_searches(image.shape[1], image.shape[0], smallest) for image in images]
+    left = dict(enumerate(searches))
+    while left:
+        windows = {one: next(search, None) for one, search in left.items()}
+        left = {one: search for one, search in left.items() if windows[one] is not None}
+        looks = [Look(pyramids[one], window) for one in left for window in windows[one] or ()]
+        places = iter(_run(net, looks, COARSE))
+        coarse = [
+            max(islice(places, len(windows[one] or ())), key=lambda place: place.score)
+            for one in left
+        ]
+        found = _refined(net, [pyramids[one] for one in left], coarse, refinements)
+        for one, place in zip(list(left), found, strict=True):
+            held = best[one]
+            if held is None or place.score > held.score:
+                best[one] = held = place
+            if held.score >= FOUND_SCORE:
+                del left[one]
+    return [_detection(place) for place in best if place is not None]
+
+
+def _detection(place: _Place) -> Detection:
     relative = place.sigma / (HALF_CONFIDENCE_SHARE * max(face_box(place.points)[1], 1e-6))
     confidence = place.score * place.seen / (1.0 + relative**2)
     return Detection(place.points, place.sigma, confidence, place.score)
+
+
+@dataclass(frozen=True)
+class DensePoints:
+    """Dense points of a face, those of `LandmarkNet.places`.
+
+    Attributes:
+        points: (D, 2) pixels, corner origin.
+        sigma: (D,) expected error in pixels (the scale of a Laplace distribution), large where
+            the head or something before it hides a point.
+    """
+
+    points: np.ndarray
+    sigma: np.ndarray
+
+
+def find_dense(net: LandmarkNet, image: np.ndarray, face: Detection) -> DensePoints:
+    """Find the dense points of a detected face, in the same crops as the last look at it."""
+    pyramid = make_pyramid(image)
+    windows = _last_windows(window_about(face.points))
+    output = _answer(net, [Look(pyramid, window) for window in windows], CROP, dense=True)
+    found = output.dense.double().numpy()
+    scales = output.dense_log_scale.double().exp().numpy()
+    partner = mirrored(found.shape[1])[POINTS:] - POINTS
+    points, sigmas = [], []
+    for window, places, scale in zip(windows, found, scales, strict=True):
+        determinant = np.linalg.det(window[:, :2])
+        order = partner if determinant < 0 else slice(None)
+        points.append((places @ window[:, :2].T + window[:, 2])[order])
+        sigmas.append((scale * np.sqrt(abs(determinant)))[order])
+    mean = np.mean(points, axis=0)
+    spread = np.linalg.norm(np.stack(points) - mean, axis=2).mean(0)
+    return DensePoints(mean, np.hypot(np.mean(sigmas, axis=0), spread))
 
 
 def _searches(width: int, height: int, smallest: float) -> Iterator[list[np.ndarray]]:
@@ -133,20 +217,43 @@ def _windows(width: int, height: int, side: float, turn: float) -> list[np.ndarr
 
 
 def _refined(
-    net: LandmarkNet, pyramid: list[np.ndarray], place: _Place, refinements: int
-) -> _Place:
-    """Refine a place by nearer crops; the last look's score falls where its crops do not agree."""
+    net: LandmarkNet, pyramids: list[list[np.ndarray]], places: list[_Place], refinements: int
+) -> list[_Place]:
+    """Refine a place per image by nearer crops, and judge it by whether the last ones agree."""
+    places = list(places)
+    straying = set[int]()
     for _ in range(refinements - 1):
-        refined = _run(net, pyramid, [window_about(place.points)])[0]
-        if refined.score < KEEP_SHARE * place.score:
-            # The crop went astray, as it may on a profile: the wider view knew better.
-            break
-        place = refined
-    window = window_about(place.points)
+        going = [one for one in range(len(places)) if one not in straying]
+        looks = [Look(pyramids[one], window_about(places[one].points)) for one in going]
+        for one, refined in zip(going, _run(net, looks, MIDDLE), strict=True):
+            if refined.score < KEEP_SHARE * places[one].score:
+                # The crop went astray, as it may on a profile: the wider view knew better.
+                straying.add(one)
+            else:
+                places[one] = refined
+    looks = [
+        Look(pyramid, window)
+        for pyramid, place in zip(pyramids, places, strict=True)
+        for window in _last_windows(window_about(place.points))
+    ]
+    found, count = _run(net, looks, CROP), len(LAST)
+    return [
+        _agreed(place, found[count * one : count * (one + 1)]) for one, place in enumerate(places)
+    ]
+
+
+def _last_windows(window: np.ndarray) -> list[np.ndarray]:
+    """Return the crops of the last look, about a window (2, 3)."""
     centre = window @ [CROP / 2, CROP / 2, 1.0]
-    crops = [place_crop(centre, scale * window[:, :2], CROP) for scale in SCALES]
-    flip = np.array([[-1.0, 0.0, CROP], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
-    looks = _run(net, pyramid, [view for crop in crops for view in (crop, crop @ flip)])
+    flip = np.diag([-1.0, 1.0])
+    return [
+        place_crop(centre, scale * window[:, :2] @ (flip if mirrored else np.eye(2)), CROP)
+        for scale, mirrored in LAST
+    ]
+
+
+def _agreed(place: _Place, looks: list[_Place]) -> _Place:
+    """Join the last looks at a place; the score falls where these do not agree."""
     points = np.stack([look.points for look in looks])
     mean = points.mean(0)
     spread = np.linalg.norm(points - mean, axis=2).mean(0)
@@ -228,39 +335,53 @@ def make_pyramid(image: np.ndarray) -> list[np.ndarray]:
     return levels
 
 
-def sample_window(pyramid: list[np.ndarray], window: np.ndarray) -> np.ndarray:
-    """Cut a crop (128, 128, 3) uint8 out of the level whose resolution fits the window."""
-    step = np.sqrt(abs(np.linalg.det(window[:, :2])))
+def sample_window(pyramid: list[np.ndarray], window: np.ndarray, size: int = CROP) -> np.ndarray:
+    """Cut a crop (size, size, 3) uint8 out of the level whose resolution fits the window."""
+    pixels = np.diag([CROP / size, CROP / size, 1.0])
+    step = np.sqrt(abs(np.linalg.det(window[:, :2]))) * CROP / size
     level = int(np.clip(np.floor(np.log2(max(step, 1e-6)) + 0.5), 0, len(pyramid) - 1))
     height, width = pyramid[0].shape[:2]
     shape = pyramid[level].shape
     scale = np.array([[shape[1] / width], [shape[0] / height]])
-    return cut_crop(pyramid[level], window * scale, CROP)
+    return cut_crop(pyramid[level], window @ pixels * scale, size)
 
 
-def _run(net: LandmarkNet, pyramid: list[np.ndarray], windows: list[np.ndarray]) -> list[_Place]:
-    """Run the network on windows of an image, `BATCH` at a time."""
+def _run(net: LandmarkNet, looks: Sequence[Look], size: int) -> list[_Place]:
+    """Run the network on looks of (size, size) pixels, `BATCH` at a time."""
     places = []
-    for start in range(0, len(windows), BATCH):
-        part = windows[start : start + BATCH]
-        crops = torch.from_numpy(np.stack([sample_window(pyramid, window) for window in part]))
-        # (N, H, W, 3) seen as (N, 3, H, W) lies in memory as channels-last already.
-        with torch.inference_mode():
-            output = net(crops.permute(0, 3, 1, 2).float() / 255.0)
+    for start in range(0, len(looks), BATCH):
+        part = looks[start : start + BATCH]
+        output = _answer(net, part, size, dense=False)
         scales = output.log_scale.double().exp().numpy()
         visible = torch.sigmoid(output.seen).double().numpy()
         scores = torch.sigmoid(output.logit).double().numpy()
-        for window, found, sigma, seen, score in zip(
-            part, output.points.double().numpy(), scales, visible, scores, strict=True
-        ):
-            points = found @ window[:, :2].T + window[:, 2]
-            determinant = np.linalg.det(window[:, :2])
-            sigma = sigma * np.sqrt(abs(determinant))
-            if determinant < 0:
-                points, sigma, seen = points[MIRROR], sigma[MIRROR], seen[MIRROR]
-            vague = np.median(sigma) / (VAGUE_SHARE * max(face_box(points)[1], 1e-6))
-            places.append(_Place(points, sigma, seen, float(score / (1.0 + vague**2))))
+        found = output.points.double().numpy()
+        places += [
+            _placed(look.window, *row)
+            for look, *row in zip(part, found, scales, visible, scores, strict=True)
+        ]
     return places
+
+
+def _answer(net: LandmarkNet, looks: Sequence[Look], size: int, dense: bool) -> Output:
+    crops = np.stack([sample_window(look.pyramid, look.window, size) for look in looks])
+    # (N, H, W, 3) seen as (N, 3, H, W) lies in memory as channels-last already.
+    with torch.inference_mode():
+        images = torch.from_numpy(crops).permute(0, 3, 1, 2)
+        return net(images.float() / 255.0, dense=dense)
+
+
+def _placed(
+    window: np.ndarray, found: np.ndarray, sigma: np.ndarray, seen: np.ndarray, score: float
+) -> _Place:
+    """Return what a crop showed in pixels of its image."""
+    points = found @ window[:, :2].T + window[:, 2]
+    determinant = np.linalg.det(window[:, :2])
+    sigma = sigma * np.sqrt(abs(determinant))
+    if determinant < 0:
+        points, sigma, seen = points[MIRROR], sigma[MIRROR], seen[MIRROR]
+    vague = np.median(sigma) / (VAGUE_SHARE * max(face_box(points)[1], 1e-6))
+    return _Place(points, sigma, seen, float(score / (1.0 + vague**2)))
 
 
 def follow(net: LandmarkNet, image: np.ndarray, window: np.ndarray) -> Detection:
@@ -282,7 +403,5 @@ def follow(net: LandmarkNet, image: np.ndarray, window: np.ndarray) -> Detection
     high = np.clip(np.ceil(corners.max(1)) + 1, low + 1, size).astype(int)
     part = np.ascontiguousarray(image[low[1] : high[1], low[0] : high[0]])
     moved = window - np.column_stack([np.zeros((2, 2)), low])
-    place = _run(net, make_pyramid(part), [moved])[0]
-    relative = place.sigma / (HALF_CONFIDENCE_SHARE * max(face_box(place.points)[1], 1e-6))
-    confidence = place.score * place.seen / (1.0 + relative**2)
-    return Detection(place.points + low, place.sigma, confidence, place.score)
+    place = _run(net, [Look(make_pyramid(part), moved)], CROP)[0]
+    return _detection(replace(place, points=place.points + low))

@@ -4,7 +4,8 @@ Points come from the expectation over softmax heat maps (integral regression, Su
 they are continuous and have gradients everywhere. A small perceptron that sees all of them at once
 then corrects what does not look like a face, as where a heat map was fooled by an occluder, and
 says of each point how far off it may be (the scale of a two-dimensional Laplace distribution) and
-whether it can be seen.
+whether it can be seen. Dense points, over face, ears and neck, are found in the same way on coarser
+heat maps, and corrected by a perceptron that sees them and the landmarks.
 """
 
 from __future__ import annotations
@@ -40,6 +41,14 @@ WEIGHTS = Path(__file__).with_name("weights.npz")
 COUNTERS = "num_batches_tracked"
 
 
+def mirrored(dense: int = 0) -> np.ndarray:
+    """Return the partner of each landmark and dense point in the mirror image (68 + dense,).
+
+    The first half of the dense points is on the subject's left, the other its mirror image.
+    """
+    return np.concatenate([MIRROR, POINTS + np.roll(np.arange(dense), dense // 2)])
+
+
 def face_box(points: np.ndarray) -> tuple[np.ndarray, float]:
     """Return centre (2,) and side of the square that the detector crops about landmarks (68, 2)."""
     low, high = points.min(0), points.max(0)
@@ -55,6 +64,9 @@ class Output(NamedTuple):
         seen: (B, 68) logit of whether nothing hides the point.
         logit: (B,) logit of whether a face looks towards the camera.
         heat: (B, 68, H / 4, W / 4) heat maps before the softmax.
+        dense: (B, D, 2) dense points, crop pixels.
+        dense_log_scale: (B, D) as of the landmarks.
+        dense_heat: (B, D, H / 8, W / 8) heat maps before the softmax.
     """
 
     points: torch.Tensor
@@ -62,6 +74,9 @@ class Output(NamedTuple):
     seen: torch.Tensor
     logit: torch.Tensor
     heat: torch.Tensor
+    dense: torch.Tensor
+    dense_log_scale: torch.Tensor
+    dense_heat: torch.Tensor
 
 
 class Residual(nn.Module):
@@ -100,15 +115,53 @@ class ShapeHead(nn.Module):
         return points + 8.0 * out[:, :2].transpose(1, 2), log_scale.clamp(-2.0, 4.0), out[:, 3]
 
 
+class DenseHead(nn.Module):
+    """Finds dense points on the maps of a stage before the last; see `Output`.
+
+    Attributes:
+        faces: (D,) int32, of the built-in head; weights: (D, 3) barycentric: where the points are.
+    """
+
+    def __init__(self, dense: int, maps: int, features: int, width: int = 160) -> None:
+        super().__init__()
+        self.register_buffer("faces", torch.zeros(dense, dtype=torch.int32))
+        self.register_buffer("weights", torch.zeros(dense, 3))
+        self.heat = nn.Conv2d(maps, dense, 1)
+        self.look = nn.Linear(features, 64)
+        self.first = nn.Linear(3 * dense + 2 * POINTS + 64, width)
+        self.second = nn.Linear(width, 3 * dense)
+        self.spread = nn.Parameter(torch.zeros(dense))
+        nn.init.zeros_(self.second.weight)
+        nn.init.zeros_(self.second.bias)
+
+    def forward(
+        self, maps: torch.Tensor, marks: torch.Tensor, features: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Return points (B, D, 2), log scales (B, D) and heat maps (B, D, H, W)."""
+        heat = self.heat(maps)
+        points, variance = expectation(heat)
+        spread = variance.clamp_min(1e-2).log()
+        centre = marks.mean(1, keepdim=True)
+        places = [((one - centre) / (0.25 * CROP)).flatten(1) for one in (points, marks)]
+        look = functional.relu(self.look(features))
+        hidden = functional.relu(self.first(torch.cat([*places, 0.3 * spread, look], 1)))
+        out = self.second(hidden).view(-1, 3, heat.shape[1])
+        log_scale = (1.0 + out[:, 2] + self.spread * spread).clamp(-2.0, 4.0)
+        return points + 8.0 * out[:, :2].transpose(1, 2), log_scale, heat
+
+
 class LandmarkNet(nn.Module):
     """Maps crops (B, 3, 128, 128) in [0, 1] to landmarks; see `Output`.
 
     Crops of half the size (64, 64) are understood as well; points are in pixels of 128 all the
     same. Training begins with them, for a quarter of the time.
+
+    A network for other pictures than of whole heads has no dense points.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, dense: int = 0) -> None:
         super().__init__()
+        self.dense = DenseHead(dense, 64, 128) if dense else None
         self.stem1, self.stem2 = _conv(3, 16, 5, 2), _conv(16, 32, 3, 2)
         self.block32 = Residual(32)
         self.down16, self.block16 = _conv(32, 64, 3, 2), Residual(64)
@@ -121,8 +174,31 @@ class LandmarkNet(nn.Module):
         self.shape = ShapeHead(128)
         self.face = nn.Linear(128, 1)
 
-    def forward(self, crops: torch.Tensor) -> Output:
-        """Run the network; exposure and contrast are normalised per crop."""
+    def forward(self, crops: torch.Tensor, dense: bool = True) -> Output:
+        """Run the network, without dense points if these are not wanted.
+
+        Exposure and contrast are normalised per crop.
+        """
+        # Places need single precision, whatever training has the convolutions done in.
+        maps, finest, features = (part.float() for part in self.trunk(crops))
+        with torch.autocast("cpu", enabled=False):
+            heat = self.heat(finest)
+            points, log_scale, seen = self.shape(*expectation(heat), features)
+            none = points[:, :0]
+            over = none, none[..., 0], none[..., None]
+            if self.dense is not None and dense:
+                over = self.dense(maps, points, features)
+            return Output(points, log_scale, seen, self.face(features)[:, 0], heat, *over)
+
+    def places(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return where the dense points are: faces (D,) of the built-in head, weights (D, 3)."""
+        if self.dense is None:
+            return np.zeros(0, np.int64), np.zeros((0, 3))
+        faces, weights = self.dense.faces, self.dense.weights
+        return faces.numpy().astype(np.int64), weights.double().numpy()
+
+    def trunk(self, crops: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Return maps (B, 64, H / 8, W / 8) and (B, 48, H / 4, W / 4), and features (B, 128)."""
         mean = crops.mean((1, 2, 3), keepdim=True)
         deviation = crops.std((1, 2, 3), keepdim=True) + 0.02
         x = functional.relu(self.stem1((crops - mean) / deviation))
@@ -130,13 +206,10 @@ class LandmarkNet(nn.Module):
         x16 = self.block16(functional.relu(self.down16(x32)))
         x8 = self.block8(functional.relu(self.down8(x16)))
         x4 = self.block4(functional.relu(self.down4(x8)))
-        features = x4.mean((2, 3))
         y = self.mix8(functional.relu(x8 + _twice(self.side4(x4))))
-        y = functional.relu(self.mix16(functional.relu(x16 + _twice(self.side8(y)))))
-        y = functional.relu(self.mix32(functional.relu(x32 + _twice(self.side16(y)))))
-        heat = self.heat(y)
-        points, log_scale, seen = self.shape(*expectation(heat), features)
-        return Output(points, log_scale, seen, self.face(features)[:, 0], heat)
+        y16 = functional.relu(self.mix16(functional.relu(x16 + _twice(self.side8(y)))))
+        y = functional.relu(self.mix32(functional.relu(x32 + _twice(self.side16(y16)))))
+        return y16, y, x4.mean((2, 3))
 
 
 def _conv(inputs: int, outputs: int, size: int, stride: int = 1) -> nn.Sequential:
@@ -187,7 +260,7 @@ def heat_loss(heat: torch.Tensor, points: torch.Tensor) -> torch.Tensor:
 def save_network(net: LandmarkNet, path: Path) -> None:
     """Write the weights as float16 (counters of batch normalisation are left out)."""
     state = {
-        key: value.detach().cpu().numpy().astype(np.float16)
+        key: (value.half() if value.is_floating_point() else value).detach().cpu().numpy()
         for key, value in net.state_dict().items()
         if not key.endswith(COUNTERS)
     }
@@ -211,13 +284,14 @@ def trainable_network(path: Path = WEIGHTS) -> LandmarkNet:
     Raises:
         FormatError: the file is missing, damaged or holds something else.
     """
-    net = LandmarkNet()
-    names = [key for key in net.state_dict() if not key.endswith(COUNTERS)]
+    names = [key for key in LandmarkNet().state_dict() if not key.endswith(COUNTERS)]
     arrays = read_arrays(path, FormatError, "landmark weights", names)
+    net = LandmarkNet(len(arrays.get("dense.faces", ())))
+    names = [key for key in net.state_dict() if not key.endswith(COUNTERS)]
     try:
         state = {key: torch.from_numpy(arrays[key].astype(np.float32)) for key in names}
         net.load_state_dict(state, strict=False)
-    except (RuntimeError, TypeError, ValueError) as error:
+    except (KeyError, RuntimeError, TypeError, ValueError) as error:
         raise FormatError(f"{path}: not landmark weights ({reason(error)}); {AGAIN}") from None
     return net.to(memory_format=torch.channels_last)
 

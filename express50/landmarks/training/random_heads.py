@@ -1,33 +1,41 @@
 """Make random heads to train the landmark detector on: shape, expression, pose, skin, hair.
 
 Shapes, skins, hair and light are drawn far beyond what is usual on purpose, so that the detector
-learns where things are on a face and not how one renderer or one head model paints them. Most heads
+learns where things are on a face and not how one renderer or one head model paints them. Most
+skins are people's all the same: what photographs show is in the middle of what is drawn. Most heads
 play entries of the 60-expression script, weaker, stronger, lopsided or two at once; the others move
 random muscles, so that unscripted expressions occur as well.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 
 from express50.capture.expressions import Expression, load_script
 from express50.head.model import HeadModel, landmarks, pose, vertex_normals
+from express50.landmarks.training.dense import Places, closest_places, place_points
 
+BROWS = slice(17, 27)
 SCRIPTED_SHARE = 0.6  # of the heads play entries of the script
 Rng = np.random.Generator
 
 
 @dataclass(frozen=True)
 class RandomHead:
-    """One random head: vertices and normals (V, 3), colours (V, 3) in [0, 1], landmarks (68, 3)."""
+    """One random head: vertices, normals (V, 3), the same without hair `skin` (V, 3), landmarks.
+
+    `look` is the seed of the paint on its canvas: places are painted where a view sees them.
+    """
 
     vertices: np.ndarray
     normals: np.ndarray
-    colors: np.ndarray
+    skin: np.ndarray
     landmarks: np.ndarray
+    canvas: Canvas
+    look: int
     gloss: float
 
 
@@ -38,13 +46,28 @@ class Canvas:
     rest: np.ndarray  # (N, 3) metres, on the head at rest
     region: dict[str, np.ndarray]  # names and which of the places are in it, (N,) bool
     marks: np.ndarray  # (68, 3) landmarks of the head at rest
+    top: float | None = None  # height of the crown; None: of the highest of the places
+    eyes: dict[str, np.ndarray] | None = None  # centres of the eyeballs; None: of their places
 
     @classmethod
     def of(cls, model: HeadModel) -> Canvas:
         """Make a canvas of a head model's vertices."""
         region = {name: mask.numpy() for name, mask in model.regions.items()}
         marks = landmarks(model, model.template[None])[0].numpy()
-        return cls(model.template.numpy(), region, marks)
+        rest = model.template.numpy()
+        eyes = {side: rest[region[f"{side}_eyeball"]].mean(0) for side in ("left", "right")}
+        return cls(rest, region, marks, float(rest[:, 1].max()), eyes)
+
+    def at(self, faces: np.ndarray, weights: np.ndarray) -> Canvas:
+        """Return places on faces (N, 3) at barycentric weights (N, 3) of a canvas of vertices."""
+        nearest = np.take_along_axis(faces, weights.argmax(1)[:, None], 1)[:, 0]
+        region = {name: mask[nearest] for name, mask in self.region.items()}
+        # The rim of the lips is smooth, not as the mesh has it.
+        lips = (self.region["lips"][faces] * weights).sum(1) > 0.5
+        region["face"] = (region["face"] | region["lips"]) & ~lips
+        region["lips"] = lips
+        rest = (self.rest[faces] * weights[..., None]).sum(1)
+        return replace(self, rest=rest.astype(np.float32), region=region)
 
 
 def random_head(model: HeadModel, rng: Rng) -> RandomHead:
@@ -53,14 +76,35 @@ def random_head(model: HeadModel, rng: Rng) -> RandomHead:
     with torch.no_grad():
         vertices = pose(model, **draw)
     vertices = torch.from_numpy(deform(vertices[0].numpy(), rng))[None]
+    canvas, brows = _move_brows(model, Canvas.of(model), rng)
     points = landmarks(model, vertices)[0].numpy()
-    colors, hair = paint(Canvas.of(model), rng)
+    points[BROWS] = place_points(model, brows, vertices[0].numpy())
+    look = int(rng.integers(2**31))
+    hair = paint(canvas, np.random.default_rng(look))[1]
+    skin = vertices[0].numpy()
     normals = vertex_normals(vertices, model.faces)
     if hair is not None:
         vertices = vertices + normals * torch.from_numpy(hair)[None, :, None]
         normals = vertex_normals(vertices, model.faces)
     gloss = float(rng.uniform(0.0, 0.5))
-    return RandomHead(vertices[0].numpy(), normals[0].numpy(), colors, points, gloss)
+    return RandomHead(vertices[0].numpy(), normals[0].numpy(), skin, points, canvas, look, gloss)
+
+
+def _move_brows(model: HeadModel, canvas: Canvas, rng: Rng) -> tuple[Canvas, Places]:
+    """Move the brows of a canvas, and return where their landmarks are: on the hairs.
+
+    Else the bone would say enough, and the brows of people differ in where they are on it.
+    """
+    brows = canvas.marks[BROWS].copy()
+    outwards = np.sign(brows[:, 0])
+    along = (np.abs(brows[:, 0]) - np.abs(brows[:, 0]).min()) / np.ptp(np.abs(brows[:, 0]))
+    brows[:, 0] += outwards * (rng.normal() * 0.002 + along * rng.normal() * 0.003)
+    brows[:, 1] += rng.normal() * 0.003 + (along - 0.5) * rng.normal() * 0.003
+    brows[:, 1] += outwards * rng.normal() * 0.0007
+    places = closest_places(model, brows)
+    marks = canvas.marks.copy()
+    marks[BROWS] = place_points(model, places)
+    return replace(canvas, marks=marks), places
 
 
 def waves(points: np.ndarray, rng: Rng, count: int, low: float, high: float) -> np.ndarray:
@@ -69,8 +113,10 @@ def waves(points: np.ndarray, rng: Rng, count: int, low: float, high: float) -> 
     directions *= (np.exp(rng.uniform(np.log(low), np.log(high), count)))[:, None] / (
         np.linalg.norm(directions, axis=1, keepdims=True)
     )
-    phases = rng.uniform(0, 2 * np.pi, count)
-    return np.sin(points @ directions.T + phases).sum(1) * np.sqrt(2.0 / count)
+    phases = rng.uniform(0, 2 * np.pi, count).astype(np.float32)
+    # Single precision: sines of doubles cost eighty times as much.
+    angles = points.astype(np.float32) @ directions.T.astype(np.float32) + phases
+    return np.sin(angles).sum(1) * np.float32(np.sqrt(2.0 / count))
 
 
 def deform(vertices: np.ndarray, rng: Rng) -> np.ndarray:
@@ -85,21 +131,17 @@ def deform(vertices: np.ndarray, rng: Rng) -> np.ndarray:
 def paint(canvas: Canvas, rng: Rng) -> tuple[np.ndarray, np.ndarray | None]:
     """Return colours (N, 3) in [0, 1] and hair thickness (N,) metres or None."""
     rest, region, marks = canvas.rest, canvas.region, canvas.marks
-    if rng.random() < 0.15:
-        skin = rng.uniform(0.15, 0.95, 3)
-    else:
-        light = rng.uniform(0.0, 1.0)
-        skin = (1 - light) * np.array([0.25, 0.15, 0.10]) + light * np.array([0.95, 0.78, 0.68])
-        skin = np.clip(skin * rng.uniform(0.85, 1.15, 3), 0.05, 1.0)
+    skin = _skin_color(rng)
     colors = np.tile(skin, (len(rest), 1))
     # Anything in no region is a small part such as lashes: dark.
     nothing = ~np.any(list(region.values()), axis=0)
-    colors *= 1 + rng.uniform(0, 0.15) * waves(rest, rng, 12, 20.0, 150.0)[:, None]
-    colors *= 1 + rng.uniform(0, 0.12) * waves(rest, rng, 24, 150.0, 900.0)[:, None]
+    for most, count, low, high in ((0.15, 12, 20.0, 150.0), (0.12, 24, 150.0, 900.0)):
+        spots = most * rng.beta(1.0, 3.0) * waves(rest, rng, count, low, high)
+        colors *= 1 + spots[:, None]
     middle, radius = marks[[2, 14, 30, 8]][rng.integers(4)], rng.uniform(0.02, 0.05)
     blush = np.exp(-((rest - middle) ** 2).sum(1) / radius**2)
     colors = _mix(colors, rng.uniform(0.2, 1.0, 3), blush * rng.uniform(0, 0.3))
-    _tint_features(colors, canvas, rng)
+    _tint_features(colors, canvas, skin, rng)
     colors[nothing] = rng.uniform(0.02, 0.25)
     hair = _grow_hair(colors, canvas, rng)
     _tint_beard(colors, canvas, rng)
@@ -107,19 +149,32 @@ def paint(canvas: Canvas, rng: Rng) -> tuple[np.ndarray, np.ndarray | None]:
     return np.clip(colors, 0.0, 1.0).astype(np.float32), hair
 
 
+def _skin_color(rng: Rng) -> np.ndarray:
+    """Draw a person's skin from dark over tan to pale; any colour in some draws."""
+    if rng.random() < 0.1:
+        return rng.uniform(0.15, 0.95, 3)
+    tones = np.array(
+        [[0.26, 0.17, 0.13], [0.62, 0.43, 0.32], [0.85, 0.66, 0.55], [0.95, 0.80, 0.73]]
+    )
+    place = rng.uniform(0.0, 3.0)
+    skin = [np.interp(place, range(4), channel) for channel in tones.T]
+    return np.clip(skin * rng.uniform(0.9, 1.1, 3), 0.05, 1.0)
+
+
 def _mix(colors: np.ndarray, color: np.ndarray, amount: np.ndarray) -> np.ndarray:
     return colors + (color - colors) * amount[:, None]
 
 
-def _tint_features(colors: np.ndarray, canvas: Canvas, rng: Rng) -> None:
+def _tint_features(colors: np.ndarray, canvas: Canvas, tone: np.ndarray, rng: Rng) -> None:
     """Paint lips, brows and eye make-up, in place."""
     rest, region, marks = canvas.rest, canvas.region, canvas.marks
     lips = region["lips"].astype(float) * rng.uniform(0.0, 0.9)
     colors[:] = _mix(colors, colors * rng.uniform([0.7, 0.3, 0.3], [1.2, 0.9, 0.9]), lips)
     brow_color = rng.uniform(0.0, 0.5) * np.array([1.0, rng.uniform(0.5, 1), rng.uniform(0.3, 1)])
+    brow_color = np.minimum(brow_color, rng.uniform(0.1, 0.8) * tone)
     skin = np.flatnonzero(region["face"])
-    width = rng.uniform(0.002, 0.006)
-    strength = rng.choice([0.0, rng.uniform(0.2, 1.0)], p=[0.2, 0.8])
+    width = rng.uniform(0.0035, 0.0075)  # the line runs a little below the skin
+    strength = rng.choice([0.0, rng.uniform(0.3, 1.0)], p=[0.05, 0.95])
     for line in (marks[17:22], marks[22:27]):
         # Distance of each place to the polyline.
         start, along = line[:-1], np.diff(line, axis=0)
@@ -128,7 +183,9 @@ def _tint_features(colors: np.ndarray, canvas: Canvas, rng: Rng) -> None:
         off = relative - np.clip(share, 0, 1)[..., None] * along
         near = np.linalg.norm(off, axis=2).min(1)
         ragged = 1 + 0.4 * waves(rest[skin], rng, 8, 300.0, 1500.0)
-        amount = strength / (1 + np.exp((near - width * ragged) / 0.001))
+        hairs = np.clip(1 + rng.uniform(0, 0.7) * waves(rest[skin], rng, 12, 1e3, 4e3), 0.0, 1.0)
+        inside = np.clip((near - width * ragged) / 0.001, -30.0, 30.0)
+        amount = strength * hairs / (1 + np.exp(inside))
         colors[skin] = _mix(colors[skin], brow_color, amount)
     for side in ("left", "right"):
         shade = region[f"{side}_eye_region"] * rng.uniform(0.0, 0.4)
@@ -140,7 +197,7 @@ def _grow_hair(colors: np.ndarray, canvas: Canvas, rng: Rng) -> np.ndarray | Non
     if rng.random() < 0.3:
         return None
     rest, region, marks = canvas.rest, canvas.region, canvas.marks
-    brows, crown = marks[17:27, 1].max(), rest[:, 1].max()
+    brows, crown = marks[17:27, 1].max(), rest[:, 1].max() if canvas.top is None else canvas.top
     front = np.array([0.0, brows + rng.uniform(0.15, 0.8) * (crown - brows), marks[27, 2]])
     tilt = rng.uniform(0.2, 1.25)
     height = (rest - front) @ np.array([0.0, np.cos(tilt), -np.sin(tilt)])
@@ -157,15 +214,22 @@ def _grow_hair(colors: np.ndarray, canvas: Canvas, rng: Rng) -> np.ndarray | Non
 
 
 def _tint_beard(colors: np.ndarray, canvas: Canvas, rng: Rng) -> None:
-    """Paint stubble, moustache or full beard, in place."""
-    if rng.random() < 0.6:
+    """Paint stubble, moustache, chin or full beard, in place."""
+    kind = rng.choice(["none", "full", "chin", "moustache"], p=[0.55, 0.25, 0.1, 0.1])
+    if kind == "none":
         return
     rest, region, marks = canvas.rest, canvas.region, canvas.marks
     below = 1 / (1 + np.exp((rest[:, 1] - marks[33, 1] + rng.uniform(0, 0.02)) / 0.003))
     cheek = 1 / (1 + np.exp((marks[33, 2] - rng.uniform(0.02, 0.09) - rest[:, 2]) / 0.004))
-    amount = below * cheek * (region["face"] & ~region["lips"]) * rng.uniform(0.2, 0.9)
-    grain = 1 + 0.5 * waves(rest, rng, 20, 400.0, 2000.0)
-    colors[:] = _mix(colors, rng.uniform(0.0, 0.4) * np.ones(3), np.clip(amount * grain, 0, 1))
+    if kind == "chin":
+        below = 1 / (1 + np.exp((rest[:, 1] - marks[57, 1] + rng.uniform(0, 0.01)) / 0.003))
+    if kind == "moustache":
+        middle, size = (marks[33] + marks[51]) / 2, rng.uniform([0.018, 0.006], [0.032, 0.011])
+        below = np.exp(-((((rest - middle)[:, :2] / size) ** 2).sum(1) ** 2))
+    amount = below * cheek * (region["face"] & ~region["lips"]) * rng.uniform(0.2, 0.95)
+    grain = 1 + 0.5 * waves(rest * (1.0, 0.4, 1.0), rng, 20, 400.0, 3000.0)
+    shade = rng.uniform(0.0, 0.4 if rng.random() < 0.8 else 0.9) * np.ones(3)
+    colors[:] = _mix(colors, shade * rng.uniform([1, 0.8, 0.6], 1), np.clip(amount * grain, 0, 1))
 
 
 def _color_eyes_and_mouth(colors: np.ndarray, canvas: Canvas, rng: Rng) -> None:
@@ -176,13 +240,14 @@ def _color_eyes_and_mouth(colors: np.ndarray, canvas: Canvas, rng: Rng) -> None:
     for side in ("left", "right"):
         ball = region[f"{side}_eyeball"]
         colors[ball] = sclera
-        centre = rest[ball].mean(0)
-        arm = rest[ball] - centre
+        arm = rest[ball] - (rest[ball].mean(0) if canvas.eyes is None else canvas.eyes[side])
         angle = np.arccos(np.clip(arm[:, 2] / np.linalg.norm(arm, axis=1), -1, 1))
-        colors[np.flatnonzero(ball)[angle < rng.uniform(0.42, 0.55)]] = iris
+        edge = rng.uniform(0.42, 0.55)
+        colors[np.flatnonzero(ball)[angle < edge]] = iris * rng.uniform(0.4, 1.0)
+        colors[np.flatnonzero(ball)[angle < 0.85 * edge]] = iris
         colors[np.flatnonzero(ball)[angle < rng.uniform(0.15, 0.28)]] = 0.02
     inside = region["mouth_interior"] | region["tongue"]
-    colors[inside] = rng.uniform(0.05, 0.6) * np.array([1.0, *rng.uniform(0.3, 0.8, 2)])
+    colors[inside] = rng.uniform(0.05, 0.5) * np.array([1.0, *rng.uniform(0.3, 0.8, 2)])
     colors[region["teeth"]] = rng.uniform(0.5, 1.0) * np.array([1.0, 0.97, rng.uniform(0.8, 1.0)])
 
 
@@ -211,7 +276,7 @@ def random_parameters(model: HeadModel, rng: Rng) -> dict[str, torch.Tensor]:
         _close_eyes(expression, model, rng)
         expression = np.clip(expression, -1.0, 1.2)
     if rng.random() < 0.25:
-        jaw[0] = rng.uniform(0.0, 0.5)
+        jaw[0] = rng.uniform(0.0, 0.65)  # up to a scream
     eyes = np.array([*gaze, 0.0, *gaze, 0.0])
     drawn = {"shape": shape, "expression": expression, "neck": neck, "jaw": jaw, "eyes": eyes}
     return {name: torch.from_numpy(v.astype(np.float32))[None] for name, v in drawn.items()}

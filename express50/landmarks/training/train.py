@@ -1,6 +1,6 @@
 """Make `weights.npz` in one run.
 
-    python -m express50.landmarks.training.train --views DIR [--ict PATH]
+    python -m express50.landmarks.training.train --views DIR [--ict PATH] [--start WEIGHTS]
 
 Trains on renders of random heads only: the procedural head and, where a path is given,
 ICT-FaceKit; the shipped file used both, with the defaults of the other arguments. No photograph of
@@ -11,11 +11,13 @@ that was interrupted goes on from its last state, which is kept in DIR, to the s
 from __future__ import annotations
 
 import argparse
+import hashlib
 import time
 from collections.abc import Callable
 from dataclasses import astuple, dataclass
 from pathlib import Path
 
+import cv2
 import numpy as np
 import torch
 from torch.nn import functional
@@ -27,24 +29,27 @@ from express50.head.load import load_head
 from express50.head.model import HeadModel
 from express50.landmarks.network import (
     CROP,
+    POINTS,
     WEIGHTS,
     LandmarkNet,
     Output,
     heat_loss,
     load_network,
     save_network,
+    trainable_network,
 )
+from express50.landmarks.training.dense import Places, carry_places, choose_places
+from express50.landmarks.training.scene import TrainingView
 from express50.landmarks.training.views import (
     FILE_VIEWS,
     TrainingCrop,
-    TrainingView,
     make_backgrounds,
     open_views,
     random_crop,
 )
 
 BATCH = 32
-RATE = 2e-3
+RATE, RATE_ON = 2e-3, 1e-3  # from nothing, from given weights
 WARM_UP = 100
 # The rate stays high until this share of the run, then falls in a straight line.
 HIGH_SHARE = 0.65
@@ -52,6 +57,7 @@ KEEP_EVERY = 100
 FIRST_FILES = 6
 STEPS_PER_FILE = 300
 HELD_OUT = 0
+SMALL_EVERY = 4  # after the small steps these remain small: the detector's first look is
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,6 +70,8 @@ class TrainingPlan:
     "Of these, the first that are at half resolution."
     files: int = 30
     "Files of views per head model."
+    dense: int = 256
+    "Dense points, an even number, with those low on the neck, which are left out."
     seed: int = 0
     "Of everything random."
 
@@ -79,25 +87,49 @@ def main(arguments: list[str] | None = None) -> int:
     for name, value in vars(TrainingPlan()).items():
         flag = f"--{name.replace('_', '-')}"
         parser.add_argument(flag, type=int, default=value, help=words[name])
+    parser.add_argument("--start", type=Path, help="weights whose landmarks to go on from")
     parser.add_argument("--out", type=Path, default=WEIGHTS)
     options = parser.parse_args(arguments)
     torch.set_num_threads(1)
+    cv2.setNumThreads(1)
     models = [load_head(spec) for spec in ("procedural", options.ict) if spec]
     plan = TrainingPlan(**{name: getattr(options, name) for name in words})
-    save_network(train(models, plan, options.views), options.out)
+    save_network(train(models, plan, options.views, options.start), options.out)
     net = load_network(options.out)
-    for model in models:
-        views = open_views(options.views, model, HELD_OUT, plan.seed)
+    for model, places in zip(models, places_of(models, plan.dense), strict=True):
+        views = open_views(options.views, model, HELD_OUT, plan.seed, places)
         print(f"{model.name}: held-out heads {validate(net, views, plan.seed)}")
     return 0
 
 
-def train(models: list[HeadModel], plan: TrainingPlan, folder: Path) -> LandmarkNet:
+def places_of(models: list[HeadModel], dense: int) -> list[Places]:
+    """Return the places of the dense points on each model: chosen on the last, the most human."""
+    chosen = choose_places(models[-1], dense)
+    return [carry_places(models[-1], chosen, model) for model in models]
+
+
+def start_network(start: Path | None, places: Places) -> LandmarkNet:
+    """Return a network to train, with what given weights hold of it."""
+    net = LandmarkNet(len(places[0]))
+    state = net.state_dict()
+    given = {} if start is None else trainable_network(start).state_dict()
+    # Weights of another number of dense points lack all that depends on it.
+    state |= {key: value for key, value in given.items() if value.shape == state[key].shape}
+    state["dense.faces"], state["dense.weights"] = (torch.from_numpy(part) for part in places)
+    net.load_state_dict(state)
+    return net.train().to(memory_format=torch.channels_last)
+
+
+def train(
+    models: list[HeadModel], plan: TrainingPlan, folder: Path, start: Path | None = None
+) -> LandmarkNet:
     """Train on views of the head models; views and the run's state are kept in a folder."""
     torch.manual_seed(plan.seed)
     backgrounds = make_backgrounds(400, np.random.default_rng([plan.seed, 1]))
-    net = LandmarkNet().train().to(memory_format=torch.channels_last)
-    name = "-".join([*(m.name for m in models), *(str(value) for value in astuple(plan))])
+    places = places_of(models, plan.dense)
+    net = start_network(start, places[0])
+    begun = hashlib.sha256(start.read_bytes()).hexdigest()[:8] if start else "anew"
+    name = "-".join([*(m.name for m in models), *(str(value) for value in astuple(plan)), begun])
     sets: list[list[TrainingView]] = []
 
     def loss_at(step: int) -> torch.Tensor:
@@ -105,11 +137,12 @@ def train(models: list[HeadModel], plan: TrainingPlan, folder: Path) -> Landmark
         files = min(plan.files, FIRST_FILES + step // STEPS_PER_FILE)
         while len(sets) < len(models) * files:
             number = HELD_OUT + 1 + len(sets) // len(models)
-            model = models[len(sets) % len(models)]
-            sets.append(open_views(folder, model, number, plan.seed))
+            which = len(sets) % len(models)
+            sets.append(open_views(folder, models[which], number, plan.seed, places[which]))
         # Seeded by the step, so that a run taken up again draws what it would have drawn.
         rng = np.random.default_rng([plan.seed, 2, step])
-        size = CROP // 2 if step < plan.small_steps else CROP
+        small = step < plan.small_steps or step % SMALL_EVERY == 0
+        size = CROP // 2 if small else CROP
         picks = np.divmod(rng.integers(len(sets) * FILE_VIEWS, size=BATCH), FILE_VIEWS)
         crops = [
             random_crop(sets[file][view], backgrounds, rng, size)
@@ -117,7 +150,8 @@ def train(models: list[HeadModel], plan: TrainingPlan, folder: Path) -> Landmark
         ]
         return crop_loss(net, crops)
 
-    return descend(net, plan.steps, RATE, folder / f"training-{name}.pt", loss_at)
+    rate = RATE_ON if start else RATE
+    return descend(net, plan.steps, rate, folder / f"training-{name}.pt", loss_at)
 
 
 def descend(
@@ -166,7 +200,7 @@ def take_up(path: Path, net: torch.nn.Module, optimiser: torch.optim.Optimizer) 
 
 @dataclass(frozen=True)
 class LandmarkBatch:
-    """Stacked crops: images (B, 3, H, W) in [0, 1], points (B, 68, 2), the rest (B[, 68])."""
+    """Stacked crops: images (B, 3, H, W) in [0, 1], points (B, 68 + D, 2), the rest (B[, 68])."""
 
     images: torch.Tensor
     points: torch.Tensor
@@ -194,20 +228,32 @@ def point_loss(
 
     The loss sums distance, likelihood and entropy; distances are crop pixels.
     """
+    found = output.points[:, first:], output.log_scale[:, first:], output.heat[:, first:]
+    return place_loss(*found, points)
+
+
+def place_loss(
+    found: torch.Tensor, log_scale: torch.Tensor, heat: torch.Tensor, points: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return losses and distances (B, N) of found points (B, N, 2), see `point_loss`."""
     # The square root's slope at zero distance is bounded by the added 0.01 px^2.
-    distance = ((output.points[:, first:] - points).square().sum(-1) + 0.01).sqrt()
-    log_scale = output.log_scale[:, first:]
+    distance = ((found - points).square().sum(-1) + 0.01).sqrt()
     likelihood = 2 * log_scale + distance * torch.exp(-log_scale)
-    return 0.2 * distance + likelihood + heat_loss(output.heat[:, first:], points), distance
+    return 0.2 * distance + likelihood + heat_loss(heat, points), distance
 
 
 def crop_loss(net: LandmarkNet, crops: list[TrainingCrop]) -> torch.Tensor:
     """Return the points' distance and likelihood, and entropies of heat maps and answers."""
     batch = crop_batch(crops)
-    output = net(batch.images)
-    seen = functional.binary_cross_entropy_with_logits(output.seen, batch.visible, reduction="none")
+    with torch.autocast("cpu", torch.bfloat16):
+        output = net(batch.images)
+    visible, marks = batch.visible[:, :POINTS], batch.points[:, :POINTS]
+    dense = batch.points[:, POINTS:]
+    seen = functional.binary_cross_entropy_with_logits(output.seen, visible, reduction="none")
     share = batch.weight / batch.weight.sum().clamp_min(1.0)
-    points = (point_loss(output, batch.points)[0] + 0.5 * seen).mean(1) * share
+    points = (point_loss(output, marks)[0] + 0.5 * seen).mean(1) * share
+    over = output.dense, output.dense_log_scale, output.dense_heat
+    points = points + 0.5 * place_loss(*over, dense)[0].mean(1) * share
     return points.sum() + functional.binary_cross_entropy_with_logits(output.logit, batch.score)
 
 
@@ -221,10 +267,10 @@ def validate(net: LandmarkNet, views: list[TrainingView], seed: int) -> str:
         some = views[start : start + BATCH]
         batch = crop_batch([random_crop(view, backgrounds, rng) for view in some])
         output = net(batch.images)
-        error = (output.points - batch.points).norm(dim=-1).mean(1)
+        error = (output.points - batch.points[:, :POINTS]).norm(dim=-1).mean(1)
         errors.append(torch.where(batch.weight > 0, error, torch.nan))
         full = batch.weight >= 1.0
-        seen.append(((output.seen > 0) == (batch.visible > 0.5))[full].float().mean(1))
+        seen.append(((output.seen > 0) == (batch.visible[:, :POINTS] > 0.5))[full].float().mean(1))
         clear = (batch.score <= 0) | (batch.score >= 1)
         right.append(((output.logit > 0) == (batch.score > 0.5))[clear].float())
     error, facing = torch.cat(errors), torch.from_numpy(np.stack([view.facing for view in views]))

@@ -1,11 +1,12 @@
-"""Render training crops of random heads on random backgrounds, spoiled as cameras do.
+"""Cut training crops of rendered heads on random backgrounds, spoiled as cameras do.
 
-A view has a picture, landmarks, and which of them the head hides. A file of views is made once; it
-depends on the seed, the head model and its number alone.
+A file of views is made once; it depends on the seed, the head model, its number and the dense
+points alone.
 """
 
 from __future__ import annotations
 
+import hashlib
 import os
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -14,126 +15,16 @@ from typing import Any, TypeVar
 
 import cv2
 import numpy as np
-import open3d as o3d
 
 from express50.geometry.conventions import affine_to_opencv
-from express50.geometry.raycast import join_rays, mesh_scene
-from express50.geometry.transforms import make_transform
 from express50.head.model import HeadModel
-from express50.landmarks.network import CROP, CROP_MARGIN, MIRROR, face_box
-from express50.landmarks.training.random_heads import RandomHead, random_head
+from express50.landmarks.network import CROP, CROP_MARGIN, POINTS, face_box, mirrored
+from express50.landmarks.training.dense import Places
+from express50.landmarks.training.random_heads import random_head
+from express50.landmarks.training.scene import HeadScene, TrainingView
 
-FRAME_SIDE_M = 0.38
-# A landmark counts as seen if nothing lies further than this in front of it.
-HIDING_M = 0.005
 Rng = np.random.Generator
 Record = TypeVar("Record")
-
-
-@dataclass(frozen=True)
-class TrainingView:
-    """A rendered view."""
-
-    rgba: np.ndarray  # (S, S, 4) uint8, black where empty
-    points: np.ndarray  # (68, 2) float32 pixels, corner origin
-    visible: np.ndarray  # (68,) bool, nothing of the head is before the landmark
-    facing: np.float32  # cosine between the ways that the face looks and to the camera
-
-
-class HeadScene:
-    """A random head in a ray caster, to be seen from many sides."""
-
-    def __init__(self, model: HeadModel, head: RandomHead) -> None:
-        self.faces = model.faces.numpy()
-        self.head = head
-        self.scene = mesh_scene(head.vertices, self.faces)
-
-    def render(self, rng: Rng, side: int, yaw: float) -> TrainingView:
-        """Render (side, side) pixels from a yaw in radians, 0 in front; the rest is random."""
-        points = self.head.landmarks
-        K, cam_from_world = _random_camera(points, rng, side, yaw)
-        pixels = (points @ cam_from_world[:3, :3].T + cam_from_world[:3, 3]) @ K.T
-        rays = o3d.t.geometry.RaycastingScene.create_rays_pinhole(
-            intrinsic_matrix=o3d.core.Tensor(K),
-            extrinsic_matrix=o3d.core.Tensor(cam_from_world),
-            width_px=side,
-            height_px=side,
-        )
-        rgba = self._shade(rays, rng, side)
-        eye = -cam_from_world[:3, :3].T @ cam_from_world[:3, 3]
-        towards = points - eye
-        share = self.scene.cast_rays(join_rays(eye, towards))["t_hit"].numpy()
-        visible = (1.0 - share) * np.linalg.norm(towards, axis=1) < HIDING_M
-        # Right eye to left eye is +x, brow to chin is -y: (-y) x (+x) = +z.
-        forward = unit(np.cross(points[8] - points[27], points[45] - points[36]))
-        facing = np.float32(forward @ unit(eye - points[30]))
-        pixels = (pixels[:, :2] / pixels[:, 2:]).astype(np.float32)
-        return TrainingView(rgba, pixels, visible, facing)
-
-    def _shade(self, rays: o3d.core.Tensor, rng: Rng, side: int) -> np.ndarray:
-        """Cast rays and light the hits: rgba (side, side, 4) uint8."""
-        cast = self.scene.cast_rays(rays)
-        distance = cast["t_hit"].numpy()
-        hit = np.isfinite(distance)
-        face = self.faces[cast["primitive_ids"].numpy()[hit]]
-        bary = cast["primitive_uvs"].numpy()[hit]
-        weights = np.column_stack([1 - bary.sum(1), bary])[..., None]
-        albedo = (self.head.colors[face] * weights).sum(1)
-        normals = unit((self.head.normals[face] * weights).sum(1))
-        start, ahead = np.split(rays.numpy()[hit], 2, axis=1)
-        points = start + ahead * distance[hit][:, None]
-        light = self._light(points, normals, -unit(ahead), rng)
-        image = np.zeros((side, side, 4), np.uint8)
-        shaded = np.clip(albedo * light[0] + light[1], 0, 1) ** rng.uniform(0.7, 1.4)
-        image[hit, :3] = (255 * shaded).astype(np.uint8)
-        image[hit, 3] = 255
-        return image
-
-    def _light(
-        self, points: np.ndarray, normals: np.ndarray, towards: np.ndarray, rng: Rng
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Draw ambient light and one to three lamps: diffuse and specular light (N, 3) each."""
-        sky = 0.5 + 0.5 * normals @ unit(rng.normal(size=3))
-        diffuse = rng.uniform(0.1, 0.8) * (0.6 + 0.4 * sky[:, None]) * rng.uniform(0.8, 1.0, 3)
-        specular = np.zeros_like(diffuse)
-        for lamp in range(rng.integers(1, 4)):
-            direction = unit(rng.normal(size=3) + towards.mean(0) * rng.uniform(0.0, 2.0))
-            color = rng.uniform(0.2, 1.0) * rng.uniform(0.75, 1.0, 3)
-            cosine = np.clip(normals @ direction, 0, None)
-            if lamp == 0 and rng.random() < 0.35:
-                shadow = join_rays(points + 1e-3 * normals, direction)
-                blocked = self.scene.test_occlusions(shadow)
-                cosine = cosine * np.where(blocked.numpy(), rng.uniform(0, 0.6), 1.0)
-            half = unit(direction + towards)
-            shine = np.clip((normals * half).sum(1), 0, None) ** rng.uniform(8, 60)
-            diffuse = diffuse + cosine[:, None] * color
-            specular = specular + self.head.gloss * (shine * (cosine > 0))[:, None] * color
-        return diffuse, specular
-
-
-def unit(vectors: np.ndarray) -> np.ndarray:
-    """Scale vectors (..., 3) to length 1; zero stays zero."""
-    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-9)
-
-
-def _random_camera(
-    points: np.ndarray, rng: Rng, side: int, yaw: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Draw K (3,3) and cam_from_world (4,4) that frame the whole head, landmarks (68, 3) given."""
-    pitch = np.clip(rng.normal() * 0.28, -0.8, 0.8)
-    forward = np.array([np.sin(yaw) * np.cos(pitch), np.sin(pitch), np.cos(yaw) * np.cos(pitch)])
-    target = points.mean(0) + np.array([0.0, 0.02, -0.06]) + rng.normal(size=3) * 0.008
-    distance = np.exp(rng.uniform(np.log(0.45), np.log(2.0)))
-    right = unit(np.cross(np.array([0.0, 1.0, 0.0]), forward))
-    rotation = np.stack([right, -np.cross(forward, right), -forward])
-    roll = rng.normal() * 0.12
-    c, s = np.cos(roll), np.sin(roll)
-    rotation = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1.0]]) @ rotation
-    cam_from_world = make_transform(rotation, -rotation @ (target + distance * forward))
-    focal = side * distance / FRAME_SIDE_M * rng.uniform(0.85, 1.15)
-    return np.array([[focal, 0, side / 2], [0, focal, side / 2], [0, 0, 1.0]]), cam_from_world
-
-
 SIDE = 192
 FILE_VIEWS = 300
 # Each head is seen from every fifth of the range in which a face can be made out, and from behind.
@@ -148,21 +39,28 @@ def draw_yaws(rng: np.random.Generator) -> np.ndarray:
     return np.append(front, rng.uniform(FACE_YAW, 2 * np.pi - FACE_YAW))
 
 
-def draw_views(model: HeadModel, count: int, rng: np.random.Generator) -> list[TrainingView]:
-    """Render `count` views of random heads."""
+def draw_views(
+    model: HeadModel, count: int, rng: np.random.Generator, places: Places | None = None
+) -> list[TrainingView]:
+    """Render `count` views of random heads, with dense points at places of the model."""
     views: list[TrainingView] = []
     while len(views) < count:
-        scene = HeadScene(model, random_head(model, rng))
+        scene = HeadScene(model, random_head(model, rng), places)
         yaws = draw_yaws(rng)[: count - len(views)]
         views += [scene.render(rng, SIDE, float(yaw)) for yaw in yaws]
     return views
 
 
-def open_views(folder: Path, model: HeadModel, number: int, seed: int) -> list[TrainingView]:
+def open_views(
+    folder: Path, model: HeadModel, number: int, seed: int, places: Places
+) -> list[TrainingView]:
     """Read one file of `FILE_VIEWS` views, which is rendered if it is not there yet."""
     rng = np.random.default_rng([seed, number, *model.name.encode()])
-    path = folder / f"{model.name}-{seed}-{number:03d}.npz"
-    return made_once(path, TrainingView, lambda: draw_views(model, FILE_VIEWS, rng))
+    # Other heads or other dense points make other files.
+    made_of = b"".join(np.ascontiguousarray(part).tobytes() for part in (model.template, *places))
+    digest = hashlib.sha256(made_of).hexdigest()[:8]
+    path = folder / f"{model.name}-{digest}-{seed}-{number:03d}.npz"
+    return made_once(path, TrainingView, lambda: draw_views(model, FILE_VIEWS, rng, places))
 
 
 def made_once(path: Path, kind: type[Record], make: Callable[[], list[Record]]) -> list[Record]:
@@ -186,8 +84,10 @@ class TrainingCrop:
     """A training crop."""
 
     image: np.ndarray  # (size, size, 3) uint8
-    points: np.ndarray  # (68, 2) in pixels of a crop of `CROP` pixels, whatever the image's size
-    visible: np.ndarray  # (68,) float32, 1 where neither the head nor anything else hides the point
+    points: np.ndarray  # (68 + D, 2) pixels of a crop of `CROP` pixels, whatever the image's size
+    visible: (
+        np.ndarray
+    )  # (68 + D,) float32, 1 where neither the head nor anything else hides the point
     score: float  # target of the face score
     weight: float  # how much the points count; 0 for backs of heads
 
@@ -197,8 +97,8 @@ def random_crop(
 ) -> TrainingCrop:
     """Draw one training crop of a view, (size, size) pixels."""
     points = view.points.astype(np.float64)
-    centre, side = face_box(points)
-    empty = rng.random() < 0.06
+    centre, side = face_box(points[:POINTS])
+    empty = rng.random() < 0.08
     if rng.random() < 0.8:
         side *= np.exp(rng.uniform(-0.18, 0.25))
         centre = centre + rng.normal(size=2) * 0.05 * side
@@ -215,7 +115,8 @@ def random_crop(
     points = points @ matrix[:, :2].T + matrix[:, 2]
     visible = view.visible
     if np.linalg.det(matrix[:, :2]) < 0:
-        points, visible = points[MIRROR], visible[MIRROR]
+        partner = mirrored(len(points) - POINTS)
+        points, visible = points[partner], visible[partner]
     pool = backgrounds[rng.integers(len(backgrounds))]
     x, y = rng.integers(0, CROP, 2)
     image = pool[y : y + CROP, x : x + CROP].copy()
@@ -225,10 +126,12 @@ def random_crop(
         _shoulders(image, points * (size / CROP), rng)
         image = _composite(view.rgba, matrix * (size / CROP), image)
     covered = np.zeros(image.shape[:2], np.uint8)
-    kind = rng.random()
-    if kind < 0.2:
-        _hair_locks(image, covered, points * (size / CROP), rng)
-    elif kind < 0.42:
+    scaled = points[:POINTS] * (size / CROP)
+    if rng.random() < 0.25:
+        _hair_locks(image, covered, scaled, rng)
+    if rng.random() < 0.1:
+        _fingers(image, covered, scaled, rng)
+    elif rng.random() < 0.2:
         for _ in range(rng.integers(1, 3)):
             _occlude(image, covered, rng)
     facing = float(view.facing)
@@ -277,7 +180,9 @@ def _hair_locks(image: np.ndarray, mask: np.ndarray, points: np.ndarray, rng: Rn
     """Paint strands of one colour that fall over a part of the face, in place."""
     height, down = _size_and_down(points)
     across = np.array([down[1], -down[0]])
-    count, side = int(rng.integers(8, 50)), rng.uniform(-0.6, 0.6)
+    count = int(rng.integers(8, 120))
+    # A fringe, or hair that hangs beside the face.
+    side = rng.uniform(-0.6, 0.6) if rng.random() < 0.5 else rng.choice([-0.6, 0.6])
     begin = points[27] - height * down * rng.uniform(0.3, 0.7)
     start = begin + height * (side + rng.normal(size=(count, 1)) * 0.12) * across
     length = height * rng.uniform(0.2, 0.9) * rng.uniform(0.7, 1.2, (count, 1))
@@ -290,6 +195,24 @@ def _hair_locks(image: np.ndarray, mask: np.ndarray, points: np.ndarray, rng: Rn
         shade = tuple(float(value) for value in color * rng.uniform(0.6, 1.2))
         cv2.polylines(image, [strand], False, shade, 1, cv2.LINE_AA, 3)
         cv2.polylines(mask, [strand], False, 1, 1, cv2.LINE_8, 3)
+
+
+def _fingers(image: np.ndarray, mask: np.ndarray, points: np.ndarray, rng: Rng) -> None:
+    """Paint two to five fingers of about the face's colour over a part of it, in place."""
+    height, _ = _size_and_down(points)
+    column, row = np.clip(points[rng.choice([2, 14, 30, 33, 27])], 0, len(image) - 1).astype(int)
+    skin = image[row, column] * rng.uniform(0.7, 1.2)
+    angle, width = rng.uniform(0, 2 * np.pi), max(2, int(height * rng.uniform(0.06, 0.11)))
+    along = np.array([np.cos(angle), np.sin(angle)])
+    tip = points[rng.integers(len(points))] + rng.normal(size=2) * 0.1 * height
+    for finger in range(rng.integers(2, 6)):
+        shift = np.array([-along[1], along[0]]) * 1.05 * width * finger
+        start = tip + shift + along * height * rng.uniform(-0.08, 0.08)
+        end = start + along * height * rng.uniform(0.5, 1.0)
+        for color, thick in ((0.55 * skin, width), (skin, int(0.8 * width))):
+            shade = tuple(float(value) for value in color)
+            cv2.line(image, _whole(start), _whole(end), shade, max(1, thick), cv2.LINE_AA)
+        cv2.line(mask, _whole(start), _whole(end), 1, width)
 
 
 def _occlude(image: np.ndarray, mask: np.ndarray, rng: Rng) -> None:
@@ -319,21 +242,35 @@ def _spoil(image: np.ndarray, rng: Rng) -> np.ndarray:
     image = cv2.LUT(image, table[None])
     if rng.random() < 0.15:
         image = cv2.merge([cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)] * 3)
-    size = len(image)
-    if rng.random() < 0.4:
+    size = full = len(image)
+    if rng.random() < 0.45:
+        # A small or distant face: what follows happened to its few pixels.
+        size = int(full * rng.uniform(0.22, 0.9))
+        image = cv2.resize(image, (size, size), interpolation=cv2.INTER_AREA)
+    if rng.random() < 0.35:
         image = cv2.GaussianBlur(image, (0, 0), size / CROP * rng.uniform(0.4, 1.8))
-    if rng.random() < 0.2:
-        small = int(rng.uniform(0.35, 0.8) * size)
-        image = cv2.resize(image, (small, small), interpolation=cv2.INTER_AREA)
-        image = cv2.resize(image, (size, size), interpolation=cv2.INTER_LINEAR)
+    if rng.random() < 0.1:
+        image = cv2.filter2D(image, -1, _motion(size / CROP * rng.uniform(2, 8), rng))
     if rng.random() < 0.5:
         noise = rng.standard_normal(image.shape, np.float32) * np.float32(rng.uniform(1, 14))
         image = np.clip(image + noise, 0, 255).astype(np.uint8)
-    if rng.random() < 0.35:
+    if rng.random() < 0.4:
         quality = int(rng.integers(25, 95))
         coded = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
         image = cv2.imdecode(coded, cv2.IMREAD_COLOR)
+    if size != full:
+        image = cv2.resize(image, (full, full), interpolation=cv2.INTER_LINEAR)
     return image
+
+
+def _motion(length: float, rng: Rng) -> np.ndarray:
+    """Return the kernel of a straight motion of some pixels."""
+    side = 2 * int(np.ceil(length / 2)) + 1
+    kernel, angle = np.zeros((side, side), np.float32), rng.uniform(0, np.pi)
+    step = 0.5 * length * np.array([np.cos(angle), np.sin(angle)])
+    ends = (_whole(np.round(side // 2 + sign * step)) for sign in (-1, 1))
+    cv2.line(kernel, *ends, 1.0, 1, cv2.LINE_AA)
+    return kernel / kernel.sum()
 
 
 def make_backgrounds(count: int, rng: Rng) -> np.ndarray:

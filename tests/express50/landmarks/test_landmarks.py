@@ -12,6 +12,7 @@ from express50.capture.expressions import load_script
 from express50.head.load import load_head
 from express50.landmarks.detector import (
     detect,
+    detect_many,
     make_pyramid,
     place_window,
     sample_window,
@@ -30,10 +31,9 @@ from express50.landmarks.network import (
     save_network,
 )
 from express50.landmarks.training.random_heads import random_head, random_parameters
+from express50.landmarks.training.scene import HeadScene, TrainingView
 from express50.landmarks.training.views import (
     FACE_YAW,
-    HeadScene,
-    TrainingView,
     draw_views,
     draw_yaws,
     make_backgrounds,
@@ -56,7 +56,8 @@ def test_weights_are_small_and_complete() -> None:
     assert WEIGHTS.stat().st_size < 4_000_000
     with np.load(WEIGHTS, allow_pickle=False) as data:
         assert all(np.isfinite(data[name]).all() for name in data.files)
-        names = {name for name in LandmarkNet().state_dict() if "num_batches" not in name}
+        dense = len(data.get("dense.faces", ()))
+        names = {name for name in LandmarkNet(dense).state_dict() if "num_batches" not in name}
         assert names == set(data.files)
 
 
@@ -301,6 +302,20 @@ def test_points_follow_the_frame(network: LandmarkNet, unseen_views: list[Traini
     assert np.median(np.linalg.norm(moved.points - found.points - [9, 6], axis=1)) < 1.0
     large = detect(network, np.kron(frame, np.ones((2, 2, 1), np.uint8)))
     assert np.median(np.linalg.norm(large.points / 2 - found.points, axis=1)) < 1.0
+
+
+def test_views_together_give_what_each_gives_alone(
+    network: LandmarkNet, unseen_views: list[TrainingView]
+) -> None:
+    """Also where some need a longer search than others: the second shows no face."""
+    frames = [on_canvas(view.rgba, index, (90, 90)) for index, view in enumerate(unseen_views[:3])]
+    frames.insert(1, np.full((60, 90, 3), 128, np.uint8))
+    for found, frame in zip(detect_many(network, frames), frames, strict=True):
+        alone = detect(network, frame)
+        assert found.score == pytest.approx(alone.score, abs=1e-3)
+        if found.score > 0.5:  # else the windows that were looked at may score alike
+            np.testing.assert_allclose(found.points, alone.points, atol=0.02)
+    assert detect_many(network, []) == []
 
 
 def test_a_real_photograph(network: LandmarkNet) -> None:

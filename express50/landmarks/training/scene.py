@@ -1,0 +1,297 @@
+"""Render random heads: painted pixel by pixel, lit as in rooms, streets and by flashes, in glasses.
+
+Most light is what photographs show: from above or the camera, soft, with shadows; the rest comes
+from anywhere in any colour.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import open3d as o3d
+
+from express50.geometry.raycast import barycentrics, join_rays, mesh_scene
+from express50.geometry.transforms import make_transform
+from express50.head.model import HeadModel
+from express50.landmarks.training.random_heads import Canvas, RandomHead, paint, waves
+
+FRAME_SIDE_M = 0.38
+# A landmark counts as seen if nothing lies further than this in front of it.
+HIDING_M = 0.005
+# Rays per vertex that measure how open it lies to the light of the surroundings, and their length.
+OPEN_RAYS, OPEN_M = 4, 0.08
+GLASSES_SHARE, NATURAL_SHARE = 0.25, 0.75
+RING = 24  # corners of a lens
+Rng = np.random.Generator
+
+
+@dataclass(frozen=True)
+class TrainingView:
+    """A rendered view."""
+
+    rgba: np.ndarray  # (S, S, 4) uint8, black where empty
+    points: np.ndarray  # (68 + D, 2) float32 pixels, corner origin: landmarks, then dense points
+    visible: np.ndarray  # (68 + D,) bool, nothing of the head or its glasses is before the point
+    facing: np.float32  # cosine between the ways that the face looks and to the camera
+
+
+@dataclass(frozen=True)
+class _Hits:
+    """Places that rays see first: points, normals, directions (N, 3); which pixels, (S, S) bool."""
+
+    points: np.ndarray
+    normals: np.ndarray
+    towards: np.ndarray
+    openness: np.ndarray
+    pixels: np.ndarray
+
+
+class HeadScene:
+    """A random head in a ray caster, to be seen from many sides."""
+
+    def __init__(
+        self,
+        model: HeadModel,
+        head: RandomHead,
+        places: tuple[np.ndarray, np.ndarray] | None = None,
+    ) -> None:
+        """Compile a head; `places` are faces (D,) and weights (D, 3) of dense points on it."""
+        self.faces = model.faces.numpy()
+        self.head = head
+        self.canvas = head.canvas
+        self.scene = mesh_scene(head.vertices, self.faces)
+        self.points = head.landmarks
+        if places is not None:
+            dense = (head.skin[self.faces[places[0]]] * places[1][..., None]).sum(1)
+            self.points = np.concatenate([head.landmarks, dense])
+        self.openness = self._measure_openness(np.random.default_rng(head.look))
+
+    def _measure_openness(self, rng: Rng) -> np.ndarray:
+        """Return the share (V,) of the surroundings that light each vertex."""
+        starts = self.head.vertices + 6e-4 * self.head.normals
+        free = np.zeros(len(starts), np.float32)
+        for _ in range(OPEN_RAYS):
+            way = unit(self.head.normals + unit(rng.normal(size=starts.shape).astype(np.float32)))
+            rays = join_rays(starts, way)
+            free += ~self.scene.test_occlusions(rays, 0.0, OPEN_M).numpy()
+        return free / OPEN_RAYS
+
+    def render(self, rng: Rng, side: int, yaw: float) -> TrainingView:
+        """Render (side, side) pixels from a yaw in radians, 0 in front; the rest is random."""
+        marks = self.head.landmarks
+        K, cam_from_world = _random_camera(marks, rng, side, yaw)
+        rays = o3d.t.geometry.RaycastingScene.create_rays_pinhole(
+            intrinsic_matrix=o3d.core.Tensor(K),
+            extrinsic_matrix=o3d.core.Tensor(cam_from_world),
+            width_px=side,
+            height_px=side,
+        )
+        rgba = self._shade(rays, rng)
+        eye = -cam_from_world[:3, :3].T @ cam_from_world[:3, 3]
+        visible = self._seen(eye, self.points)
+        # Right eye to left eye is +x, brow to chin is -y: (-y) x (+x) = +z.
+        forward = unit(np.cross(marks[8] - marks[27], marks[45] - marks[36]))
+        facing = np.float32(forward @ unit(eye - marks[30]))
+        pixels = project(K, cam_from_world, self.points)
+        if rng.random() < GLASSES_SHARE and facing > -0.1:
+            worn = self._wear_glasses(rgba, eye, K @ cam_from_world[:3], rng)
+            visible &= ~_inside(worn, pixels)
+        return TrainingView(rgba, pixels.astype(np.float32), visible, facing)
+
+    def _seen(self, eye: np.ndarray, points: np.ndarray) -> np.ndarray:
+        """Return which points (N, 3) the head does not hide from an eye (3,)."""
+        towards = points - eye
+        share = self.scene.cast_rays(join_rays(eye, towards))["t_hit"].numpy()
+        return (1.0 - share) * np.linalg.norm(towards, axis=1) < HIDING_M
+
+    def _shade(self, rays: o3d.core.Tensor, rng: Rng) -> np.ndarray:
+        """Cast rays, paint and light the hits: rgba (side, side, 4) uint8."""
+        cast = self.scene.cast_rays(rays)
+        distance = cast["t_hit"].numpy()
+        hit = np.isfinite(distance)
+        face = self.faces[cast["primitive_ids"].numpy()[hit]]
+        bary = barycentrics(cast, hit)
+        canvas = self.canvas.at(face, bary)
+        albedo = paint(canvas, np.random.default_rng(self.head.look))[0]
+        normals = unit((self.head.normals[face] * bary[..., None]).sum(1))
+        normals = _roughen(normals, canvas, np.random.default_rng(self.head.look + 1))
+        start, ahead = np.split(rays.numpy()[hit], 2, axis=1)
+        points = start + ahead * distance[hit][:, None]
+        openness = (self.openness[face] * bary).sum(1)
+        diffuse, shine = self._light(_Hits(points, normals, -unit(ahead), openness, hit), rng)
+        color = albedo * diffuse + shine
+        # A camera exposes for what it sees, more or less.
+        bright = np.percentile(color.mean(1), 90) if len(color) else 1.0
+        color *= rng.uniform(0.5, 1.05) / max(bright, 0.02)
+        image = np.zeros((*hit.shape, 4), np.uint8)
+        image[hit, :3] = (255 * np.clip(color, 0, 1) ** rng.uniform(0.7, 1.3)).astype(np.uint8)
+        image[hit, 3] = 255
+        return image
+
+    def _light(self, hits: _Hits, rng: Rng) -> tuple[np.ndarray, np.ndarray]:
+        """Draw ambient light and one to three lamps: diffuse and specular light (N, 3) each."""
+        natural = rng.random() < NATURAL_SHARE
+        above = unit(np.array([0.0, 1.0, 0.0]) + rng.normal(size=3) * (0.3 if natural else 2.0))
+        sky = 0.5 + 0.5 * hits.normals @ above
+        tint = rng.uniform(0.85 if natural else 0.7, 1.0, 3)
+        diffuse = rng.uniform(0.1, 0.8) * (0.5 + 0.5 * sky[:, None]) * tint
+        diffuse = diffuse * hits.openness[:, None]
+        specular = np.zeros_like(diffuse)
+        camera, wrap = unit(hits.towards.mean(0)), rng.uniform(0.0, 0.3)
+        for _ in range(rng.integers(1, 4)):
+            direction = _lamp(camera, natural, rng)
+            color = rng.uniform(0.2, 1.0) * rng.uniform(0.8 if natural else 0.6, 1.0, 3)
+            cosine = np.clip((hits.normals @ direction + wrap) / (1 + wrap), 0, None)
+            if rng.random() < 0.5:
+                cosine = cosine * self._shadow(hits, direction, rng)
+            half = unit(direction + hits.towards)
+            shine = np.clip((hits.normals * half).sum(1), 0, None) ** rng.uniform(8, 60)
+            diffuse = diffuse + cosine[:, None] * color
+            specular = specular + self.head.gloss * (shine * (cosine > 0))[:, None] * color
+        return diffuse, specular
+
+    def _shadow(self, hits: _Hits, direction: np.ndarray, rng: Rng) -> np.ndarray:
+        """Return the share (N,) of a lamp that the head does not block: hard or soft edges."""
+        size, softness = rng.uniform(0.0, 0.25), rng.uniform(0.0, 0.6)
+        jitter = size * rng.normal(size=hits.points.shape)
+        rays = join_rays(hits.points + 1e-3 * hits.normals, unit(direction + jitter))
+        free = np.where(self.scene.test_occlusions(rays).numpy(), softness, 1.0)
+        mask = hits.pixels.astype(np.float32)
+        image = np.zeros_like(mask)
+        image[hits.pixels] = free
+        # Rays of neighbouring pixels, jittered, together sample a lamp of some size.
+        sigma = 0.5 + 8.0 * size
+        image, mask = (cv2.GaussianBlur(one, (0, 0), sigma) for one in (image, mask))
+        return (image / np.maximum(mask, 1e-6))[hits.pixels]
+
+    def _wear_glasses(
+        self, rgba: np.ndarray, eye: np.ndarray, projection: np.ndarray, rng: Rng
+    ) -> list[np.ndarray]:
+        """Draw glasses, in place; returns outlines (RING, 2) of lenses that hide the eyes."""
+        marks = self.head.landmarks
+        across = unit(marks[45] - marks[36])
+        up = unit(marks[27] - marks[8] - across * (across @ (marks[27] - marks[8])))
+        forward = np.cross(across, up)
+        size = rng.uniform([0.021, 0.015], [0.029, 0.025])
+        square, lift = rng.uniform(0.5, 1.0), forward * rng.uniform(0.012, 0.02)
+        angle = np.linspace(0, 2 * np.pi, RING, endpoint=False)
+        x, y = (np.sign(f) * np.abs(f) ** square for f in (np.cos(angle), np.sin(angle)))
+        oval = size[0] * x[:, None] * across + size[1] * (y[:, None] - 0.1) * up
+        rings = [marks[ids].mean(0) + lift + oval for ids in (range(36, 42), range(42, 48))]
+        color = (*(float(c) for c in rng.uniform(0, 255 if rng.random() < 0.4 else 70, 3)), 255.0)
+        dark, opaque = rng.random() < 0.25, []
+        rings_2d = [_flat(projection, ring) for ring in rings]
+        for ring in rings_2d:
+            strength = rng.uniform(0.5, 1.0) if dark else rng.uniform(0.0, 0.2)
+            _blend(rgba, ring, rng.uniform(0, 90 if dark else 255, 3), strength)
+            if rng.random() < 0.3:
+                _blend(rgba, _glare(ring, rng), rng.uniform(180, 255, 3), rng.uniform(0.2, 0.9))
+            if strength > 0.6:
+                opaque.append(ring)
+        width = float(np.ptp(np.concatenate(rings_2d), axis=0).max())
+        thick = max(1, int(round(width * rng.uniform(0.0, 0.045))))
+        bridge = np.stack([rings[0][0], marks[27] + lift, rings[1][RING // 2]])
+        sides = ((rings[0][RING // 2], marks[0]), (rings[1][0], marks[16]))
+        temples = [np.linspace(ring, ear + 0.02 * up - 0.01 * forward, 12) for ring, ear in sides]
+        for line, closed in [(rings[0], 1), (rings[1], 1), (bridge, 0), *((t, 0) for t in temples)]:
+            self._draw_line(rgba, eye, projection, line, closed, color, thick)
+        return opaque
+
+    def _draw_line(
+        self,
+        rgba: np.ndarray,
+        eye: np.ndarray,
+        projection: np.ndarray,
+        line: np.ndarray,
+        closed: int,
+        color: tuple[float, ...],
+        thick: int,
+    ) -> None:
+        """Draw the parts of a line (N, 3) that the head does not hide, in place."""
+        seen, flat = self._seen(eye, line), _flat(projection, line)
+        for k in range(len(line) - 1 + closed):
+            j = (k + 1) % len(line)
+            if seen[k] and seen[j]:
+                ends = [tuple(int(v) for v in np.round(flat[i] * 8)) for i in (k, j)]
+                cv2.line(rgba, *ends, color, thick, cv2.LINE_AA, 3)
+
+
+def unit(vectors: np.ndarray) -> np.ndarray:
+    """Scale vectors (..., 3) to length 1; zero stays zero."""
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-9)
+
+
+def project(K: np.ndarray, cam_from_world: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Return pixels (N, 2) of points (N, 3)."""
+    return _flat(K @ cam_from_world[:3], points)
+
+
+def _flat(projection: np.ndarray, points: np.ndarray) -> np.ndarray:
+    pixels = points @ projection[:, :3].T + projection[:, 3]
+    return pixels[:, :2] / pixels[:, 2:]
+
+
+def _lamp(camera: np.ndarray, natural: bool, rng: Rng) -> np.ndarray:
+    """Draw a direction towards a lamp."""
+    if not natural:
+        return unit(rng.normal(size=3) + camera * rng.uniform(0.0, 2.0))
+    if rng.random() < 0.3:
+        return unit(camera + 0.12 * rng.normal(size=3))  # a flash
+    return unit(np.array([0.0, rng.uniform(0.1, 1.2), 0.0]) + unit(rng.normal(size=3)))
+
+
+def _roughen(normals: np.ndarray, canvas: Canvas, rng: Rng) -> np.ndarray:
+    """Bend normals (N, 3) as pores and, on old faces, wrinkles do."""
+    skin = canvas.region["face"] | canvas.region["neck"]
+    bend = np.zeros_like(normals)
+    for low, high, most, flat in ((400.0, 2500.0, 0.12, 1.0), (150.0, 700.0, 0.35, 0.25)):
+        amount = most * rng.beta(1.0, 2.5)
+        places = canvas.rest * np.array([flat, 1.0, flat])
+        field = np.stack([waves(places, rng, 8, low, high) for _ in range(3)], axis=1)
+        bend += amount * field * skin[:, None]
+    return unit(normals + 0.5 * bend)
+
+
+def _blend(rgba: np.ndarray, outline: np.ndarray, color: np.ndarray, strength: float) -> None:
+    """Lay a colour over what is inside an outline (N, 2) of an image, in place."""
+    mask = np.zeros(rgba.shape[:2], np.uint8)
+    cv2.fillPoly(mask, [np.round(outline * 8).astype(np.int32)], 255, cv2.LINE_AA, 3)
+    share = (strength / 255) * mask[..., None].astype(np.float32)
+    over = np.array([*color, 255.0], np.float32)
+    rgba[:] = (rgba * (1 - share) + over * share).astype(np.uint8)
+
+
+def _glare(ring: np.ndarray, rng: Rng) -> np.ndarray:
+    """Return the outline (RING, 2) of a reflection in a lens."""
+    middle = ring.mean(0)
+    shift = (ring[rng.integers(RING)] - middle) * rng.uniform(0, 0.6)
+    return middle + shift + (ring - middle) * rng.uniform(0.1, 0.5, 2)
+
+
+def _inside(outlines: list[np.ndarray], points: np.ndarray) -> np.ndarray:
+    """Return which points (N, 2) lie within any of some outlines."""
+    inside = np.zeros(len(points), bool)
+    for outline in outlines:
+        ring = np.round(outline).astype(np.float32)
+        inside |= [cv2.pointPolygonTest(ring, (float(x), float(y)), False) > 0 for x, y in points]
+    return inside
+
+
+def _random_camera(
+    points: np.ndarray, rng: Rng, side: int, yaw: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Draw K (3,3) and cam_from_world (4,4) that frame the whole head, landmarks (68, 3) given."""
+    pitch = np.clip(rng.normal() * 0.28, -0.8, 0.8)
+    forward = np.array([np.sin(yaw) * np.cos(pitch), np.sin(pitch), np.cos(yaw) * np.cos(pitch)])
+    target = points.mean(0) + np.array([0.0, 0.02, -0.06]) + rng.normal(size=3) * 0.008
+    distance = np.exp(rng.uniform(np.log(0.45), np.log(2.0)))
+    right = unit(np.cross(np.array([0.0, 1.0, 0.0]), forward))
+    rotation = np.stack([right, -np.cross(forward, right), -forward])
+    roll = rng.normal() * 0.12
+    c, s = np.cos(roll), np.sin(roll)
+    rotation = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1.0]]) @ rotation
+    cam_from_world = make_transform(rotation, -rotation @ (target + distance * forward))
+    focal = side * distance / FRAME_SIDE_M * rng.uniform(0.85, 1.15)
+    return np.array([[focal, 0, side / 2], [0, focal, side / 2], [0, 0, 1.0]]), cam_from_world
