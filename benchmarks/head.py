@@ -50,7 +50,8 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--sheet", type=Path, help="write a sheet of sampled heads here")
     options = parser.parse_args(arguments)
     torch.set_num_threads(1)
-    own, result = load_builtin(), {"benchmark": "head"}
+    own = load_builtin()
+    result: dict = {"benchmark": "head"}
     result["measures_mm"] = measure(own, options.seed)
     if options.ict is None:
         result |= dict.fromkeys(("face", "head", "mean_only"), "n/a: --ict names no file")

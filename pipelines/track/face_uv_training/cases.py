@@ -28,7 +28,7 @@ from express50.landmarks.training.random_heads import (
     random_parameters,
     waves,
 )
-from express50.landmarks.training.views import unit
+from express50.landmarks.training.scene import unit
 from pipelines.track.face_uv import HEIGHT, WIDTH, FaceUvMap
 from pipelines.track.surface import Visibility, sample_normals
 from pipelines.track.terms import MeshPlaces
