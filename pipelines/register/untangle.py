@@ -32,7 +32,8 @@ STEPS = 40
 # would leave lips that were closed apart.
 SHARE, FURTHER = 0.4, 0.05
 OPPOSED, AGREE = -0.3, 0.3  # cosines: of normals that face each other; with the way at rest
-BACK_STEPS = 8
+BACK_STEPS = 8  # in these, faces that face each other go back into their own flesh
+FLAT = 16  # from this step on, crumpled skin is made flat
 PUSHED_ONLY, EVERY = 3, 4  # crumpled faces are pushed in these first steps, and then in each 4th
 
 
@@ -70,7 +71,7 @@ def untangled(model: HeadModel, mesh: np.ndarray) -> np.ndarray:
     for step in range(STEPS):
         crumpled = skin.joined(pairs) & (step >= PUSHED_ONLY) & (step % EVERY != EVERY - 1)
         if crumpled.any():
-            mesh = skin.evened(mesh, pairs[crumpled])
+            mesh = skin.evened(mesh, pairs[crumpled], step)
         if not crumpled.all():
             mesh = mesh + skin.parting(mesh, pairs[~crumpled], step)
         pairs = crossing_pairs(model, mesh)
@@ -115,14 +116,16 @@ class Skin:
         ]
         return np.any(found, axis=0)
 
-    def evened(self, mesh: np.ndarray, pairs: np.ndarray) -> np.ndarray:
-        """Return the mesh with the pairs' corners half way to the mean move of their neighbours."""
+    def evened(self, mesh: np.ndarray, pairs: np.ndarray, step: int) -> np.ndarray:
+        """Return the mesh with the pairs' corners half way to where their neighbours have them."""
         some = np.unique(self.faces[pairs])
         some = some[self.free[some]]
-        moved, around = mesh - self.rest, self.edges[some]
+        # The model itself may be crumpled there: then the skin is made flat.
+        rest = self.rest * (step < FLAT)
+        moved, around = mesh - rest, self.edges[some]
         mean = (around @ moved) / np.asarray(around.sum(1)).reshape(-1, 1)
         result = mesh.copy()
-        result[some] = self.rest[some] + (moved[some] + mean) / 2
+        result[some] = rest[some] + (moved[some] + mean) / 2
         return result
 
     def parting(self, mesh: np.ndarray, pairs: np.ndarray, step: int) -> np.ndarray:
