@@ -1,10 +1,10 @@
-"""Make `weights.npz` in one run.
+"""Make `weights.npz`.
 
     python -m express50.landmarks.training.train --views DIR [--ict PATH] [--start WEIGHTS]
 
 Trains on renders of random heads only: the procedural head and, where a path is given,
-ICT-FaceKit; the shipped file used both, with the defaults of the other arguments. No photograph of
-a person is used. The result depends on the arguments alone, up to how the machine rounds. A run
+ICT-FaceKit; the shipped file used both, in several runs that each went on from the one before
+(`--start`; docs/LOG.md). No photograph of a person is used. The result depends on the arguments alone, up to how the machine rounds. A run
 that was interrupted goes on from its last state, which is kept in DIR, to the same result.
 """
 
