@@ -4,8 +4,9 @@
 
 Trains on renders of random heads only: the procedural head and, where a path is given,
 ICT-FaceKit; the shipped file used both, in several runs that each went on from the one before
-(`--start`; docs/LOG.md). No photograph of a person is used. The result depends on the arguments alone, up to how the machine rounds. A run
-that was interrupted goes on from its last state, which is kept in DIR, to the same result.
+(`--start`; docs/LOG.md). No photograph of a person is used. The result depends on the arguments
+alone, up to how the machine rounds. A run that was interrupted goes on from its last state, which
+is kept in DIR, to the same result.
 """
 
 from __future__ import annotations
