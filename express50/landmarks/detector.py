@@ -47,8 +47,8 @@ KEEP_SHARE = 0.8
 # The last look is taken in several crops, in shares of the trained one, some mirrored. On a face,
 # profiles too, they differ by less than DIFFER_SHARE of the face box (median point), on walls,
 # coins and backs of heads by more: there the score falls.
-LAST = ((0.9, False), (1.1, True))
-DIFFER_SHARE = 0.015
+LAST = ((0.75, False), (1.0, True), (1.0, False), (1.25, True))
+DIFFER_SHARE = 0.013
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ from express50.head.generator.pulls import (
     Triple,
     displacement,
     middle,
+    part_lips,
     scope_weights,
     settle_eyes,
 )
@@ -145,7 +146,7 @@ def expression_directions(
     scopes = scope_weights(mesh, regions, jaw)
     result: dict[str, Array] = {}
     for name, pulls in PAIRED.items():
-        motion = settle_eyes(mesh, displacement(mesh, pulls, scopes))
+        motion = part_lips(mesh, settle_eyes(mesh, displacement(mesh, pulls, scopes)))
         result |= _both_sides(mesh, name, motion)
     for name, (upper, lower, aside) in _LIDS.items():
         motion = lid_motion(mean, "left", upper, lower)
@@ -155,7 +156,7 @@ def expression_directions(
             motion[mesh.tag(tag, "left"), 0] += aside * share
         result |= _both_sides(mesh, name, motion)
     for name, pulls in _MIDDLE.items():
-        result[name] = settle_eyes(mesh, displacement(mesh, pulls, scopes))
+        result[name] = part_lips(mesh, settle_eyes(mesh, displacement(mesh, pulls, scopes)))
     result |= _jaw_directions(mesh, mean, jaw, hinge) | _tongue_directions(mesh)
     names = tuple(sorted(result, key=str.lower))
     return names, np.stack([result[name] for name in names], -1)
@@ -163,7 +164,7 @@ def expression_directions(
 
 #  name: share of the opening the upper lid comes down, the lower comes up, slide in x (mm)
 _LIDS: dict[str, tuple[float, float, float]] = {
-    "eyeBlink": (0.86, 0.14, 0.0),
+    "eyeBlink": (0.85, 0.135, 0.0),  # lids that touch would pass through each other
     "eyeLookDown": (0.36, -0.1, 0.0),
     "eyeLookUp": (-0.2, 0.1, 0.0),
     "eyeLookIn": (0.0, 0.0, -0.7),
@@ -180,7 +181,7 @@ def _both_sides(mesh: WholeMesh, name: str, left: Array) -> dict[str, Array]:
 def _jaw_directions(mesh: WholeMesh, mean: WholeMesh, jaw: Array, hinge: Array) -> dict[str, Array]:
     """Return slides of the jaw, and how lips stay shut while the jaw opens by 0.3 rad."""
     share = jaw[:, None]
-    slide = share * np.array([[7.0, 0.0, 0.0]])
+    slide = _level_corners(mesh, jaw)[:, None] * np.array([[7.0, 0.0, 0.0]])
     back = turned(mean.vertices - hinge, np.array(0.3))
     lips = window(mesh.vertices, (0.0, -52.0, 95.0), (36.0, 15.0, 30.0))
     for k in range(4):
@@ -193,6 +194,18 @@ def _jaw_directions(mesh: WholeMesh, mean: WholeMesh, jaw: Array, hinge: Array) 
         "jawRight": -slide,
         "mouthClose": 0.9 * (share * lips[:, None]) * back,
     }
+
+
+def _level_corners(mesh: WholeMesh, jaw: Array) -> Array:
+    """Return the jaw's share (V,) with lips that move as one towards their corners."""
+    result = jaw.copy()
+    for tag in ("lip0", "lip1", "lip2", "lip3", "cavity0", "cavity1"):
+        for side in ("left", "right"):
+            ring = mesh.tag(tag, side)
+            own = smoothstep(np.abs(np.arange(len(ring)) - len(ring) // 2), 0.0, 16.0)
+            both = 0.5 * (jaw[ring] + jaw[ring[::-1]])
+            result[ring] = both + own * (jaw[ring] - both)
+    return result
 
 
 def _tongue_directions(mesh: WholeMesh) -> dict[str, Array]:

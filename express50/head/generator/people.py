@@ -435,13 +435,17 @@ def _fill_inside(
             ring, share = mesh.tag(f"cavity{depth}", side), max(0.0, 1.0 - depth / 4.0)
             points[ring] = warp(mesh.vertices[ring]) + share * bent
             moves[ring] += share * (moves[lip] - moves[ring])
-    return _sink(mesh, points), moves
+    points = _sink(mesh, points)
+    for side in ("left", "right"):  # the lips' own backs lie behind them as drawn, corners too
+        lip, back = mesh.tag("lip0", side), mesh.tag("cavity0", side)
+        points[back] = points[lip] + mesh.vertices[back] - mesh.vertices[lip]
+    return points, moves
 
 
 def _sink(mesh: WholeMesh, points: Array) -> Array:
     """Return points (V, 3) with gums and the mouth's walls well under the skin."""
     scene = mesh_scene(points, mesh.faces[_is_skin(mesh)])
-    parts = [(mesh.tag(f"cavity{k}"), 1.5 if k == 0 else 5.0) for k in range(7)]
+    parts = [(mesh.tag(f"cavity{k}"), 5.0) for k in range(1, 7)]
     parts += [(mesh.tag(f"{row}_gums"), 6.0) for row in ("upper", "lower")]
     for ids, depth in parts:
         for _ in range(5):

@@ -66,4 +66,24 @@ def settle_eyes(mesh: WholeMesh, motion: Array) -> Array:
     return result
 
 
+# How much of a motion that would push shut lips through each other is held back, from the slit on.
+SHUT_SHARE = (1.0, 0.7, 0.3)
+
+
+def part_lips(mesh: WholeMesh, motion: Array) -> Array:
+    """Return the motion (V, 3) with shut lips moving up and down as one where they would close.
+
+    No sum of such motions then pushes shut lips through each other.
+    """
+    result = motion.copy()
+    for k, share in enumerate(SHUT_SHARE):
+        for side in ("left", "right"):
+            ring = mesh.tag(f"lip{k}", side)  # from the middle of the upper lip to the lower's
+            upper, lower = ring[: len(ring) // 2], ring[: len(ring) // 2 : -1]
+            held = 0.5 * share * np.maximum(motion[lower, 1] - motion[upper, 1], 0.0)
+            result[upper, 1] = motion[upper, 1] + held
+            result[lower, 1] = motion[lower, 1] - held
+    return result
+
+
 middle = partial(Pull, sides="middle")
