@@ -43,6 +43,7 @@ FEATURES = (
 # Of the natural logarithm of the face's brightness and of its two ratios of colours.
 LEAST_SPREAD = np.array([0.2, 0.03, 0.03])
 WITHIN, BALD_SHARE = 3.0, 0.6
+LEAST_SEEN = 0.06  # of the scalp: temples alone are bare on most people
 COVERED = ("neck", "scalp", "forehead", "left_ear", "right_ear")
 BARE = ("face", "nose", "lips")
 
@@ -202,8 +203,9 @@ def bare_share(
         seen &= inside_frame(camera, mesh)[1]
         value[seen] = np.log(np.maximum(look_up(camera, image, mesh[seen]), 0.01))
     known = np.isfinite(values).any((0, 2))
+    least = LEAST_SEEN * scalp.sum()
     scalp, face = scalp & known, face & known
-    if face.sum() < 20 or scalp.sum() < 20:
+    if face.sum() < 20 or scalp.sum() < least:
         return 0.0
     middle = np.full(mesh.shape, np.nan)
     middle[known] = np.nanmedian(values[:, known], axis=0)

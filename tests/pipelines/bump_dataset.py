@@ -80,13 +80,13 @@ def write_given(dataset: Dataset, subject: str, rig: list[Camera], shots: dict) 
 
 
 def write_track(dataset: Dataset, subject: str) -> None:
-    """A track of the built-in head, which is near enough to an ellipsoid to frame it."""
+    """A track of the built-in head, squeezed until most of it lies in the ellipsoid."""
     head = load_head("procedural")
     template = head.template.numpy()
     low, high = template.min(0), template.max(0)
     count = len(EXPRESSIONS)
     t = -(low + high) / 2
-    scale = np.array([0.15, 0.21, 0.18]) / (high - low)
+    scale = np.array([0.14, 0.2, 0.17]) / (high - low)
     arrays = {
         "schema": "express50.track/1",
         "head": "procedural",

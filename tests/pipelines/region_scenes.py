@@ -17,8 +17,9 @@ from express50.twin.surface import MISS, Caster
 from pipelines.regions.geometry import SCALP, TrackedHead, head_labels, make_head
 
 COLOURS = {"skin": (205, 160, 140), "hair": (60, 40, 30), "torso": (70, 110, 170)}
-SHIRT_TOP = -0.17  # metres, head space: over the neck's end, so that it hides some neck
-SHIRT_RADII = (0.17, 0.11)
+# Metres, head space: the shirt begins over the neck's end, so that it hides some neck.
+SHIRT_TOP = -0.13
+COLLAR_RADII, SHIRT_RADII = (0.09, 0.1), (0.22, 0.17)
 
 
 @dataclass(frozen=True)
@@ -58,9 +59,8 @@ def camera_at(
 def shirt() -> tuple[np.ndarray, np.ndarray]:
     """Make a tube around the neck that opens into shoulders: vertices (N, 3), faces (M, 3)."""
     around, s = np.meshgrid(np.linspace(0, 2 * np.pi, 49)[:-1], np.linspace(0, 1, 9))
-    width = 0.075 + (SHIRT_RADII[0] - 0.075) * s
-    deep = 0.085 + (SHIRT_RADII[1] - 0.085) * s
-    points = np.stack([width * np.cos(around), SHIRT_TOP - 0.12 * s, deep * np.sin(around) - 0.02],
+    width, deep = (a + (b - a) * s for a, b in zip(COLLAR_RADII, SHIRT_RADII, strict=True))
+    points = np.stack([width * np.cos(around), SHIRT_TOP - 0.16 * s, deep * np.sin(around) - 0.04],
                       axis=-1)  # fmt: skip
     index = np.arange(points[..., 0].size).reshape(around.shape)
     a, b = index[:-1], index[1:]

@@ -132,7 +132,7 @@ def test_landmarks_seen_aside_pull_the_mesh_there(head, chart, monkeypatch) -> N
     off = slide.goals - landmark_anchors(head).at(mesh)[slide.marks]
     # To the right on the chart is the subject's left, +x; a texel is 1.2 to 1.4 mm in front.
     front = np.abs(slide.normals[:, 2]) > 0.9
-    assert front.sum() > 15 and 2.0 < 1e3 * np.median(off[front, 0]) < 3.2
+    assert front.sum() > 10 and 2.0 < 1e3 * np.median(off[front, 0]) < 3.2
     far = slide_term(head, chart, None, mesh + 10_000.0)
     np.testing.assert_allclose(far.goals - 10_000.0, slide.goals, atol=1e-6)
     np.testing.assert_allclose(far.sigma, slide.sigma, rtol=1e-4)
