@@ -164,7 +164,7 @@ def expression_directions(
 
 #  name: share of the opening the upper lid comes down, the lower comes up, slide in x (mm)
 _LIDS: dict[str, tuple[float, float, float]] = {
-    "eyeBlink": (0.85, 0.135, 0.0),  # lids that touch would pass through each other
+    "eyeBlink": (0.855, 0.14, 0.0),  # lids that touch would pass through each other
     "eyeLookDown": (0.36, -0.1, 0.0),
     "eyeLookUp": (-0.2, 0.1, 0.0),
     "eyeLookIn": (0.0, 0.0, -0.7),

@@ -314,7 +314,7 @@ def test_views_together_give_what_each_gives_alone(
         alone = detect(network, frame)
         assert found.score == pytest.approx(alone.score, abs=1e-3)
         if found.score > 0.5:  # else the windows that were looked at may score alike
-            np.testing.assert_allclose(found.points, alone.points, atol=0.02)
+            np.testing.assert_allclose(found.points, alone.points, atol=0.05)
     assert detect_many(network, []) == []
 
 
