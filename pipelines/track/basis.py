@@ -245,6 +245,25 @@ def with_modes(model: HeadModel, count: int, along: int = 0) -> HeadModel:
     )
 
 
+def freeze_shape(basis: Basis, shape: np.ndarray, bias: np.ndarray) -> Basis:
+    """Fold a person's shape (S,) and detector bias (68, 3) into the basis; poses are left."""
+    coefficients, size = torch.from_numpy(np.asarray(shape, dtype=np.float64)), basis.shape_size
+    model = replace(
+        basis.model,
+        template=basis.model.template + basis.model.shape_dirs @ coefficients,
+        shape_dirs=basis.model.shape_dirs[..., :0],
+        shape_names=(),
+    )
+    return replace(
+        basis,
+        model=model,
+        directions=basis.directions[..., size:],
+        joints=basis.joints + basis.joint_directions[..., :size] @ coefficients,
+        joint_directions=basis.joint_directions[..., size:],
+        bias=bias,
+    )
+
+
 def split_shape(model: HeadModel, shape: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Split a fit into the head's shape coefficients (S,) and the modes' offsets (V, 3), metres.
 

@@ -111,8 +111,8 @@ def slide_term(
     rims = LIPS_APART[FIRST:]
     # Single precision is for places about the head, not for those of the world.
     places = uv_map.image((uv_map.samples.at(mesh) - mesh.mean(0)).astype(np.float32))
-    found, step = _between(places, at + rims)
-    home, home_step = _between(places, mark_places() + rims)
+    found, step = between(places, at + rims)
+    home, home_step = between(places, mark_places() + rims)
     seen = bilinear((mass > LEAST_SEEN).astype(np.float32), at + rims)
     good = np.flatnonzero((seen > 0.99) & (np.maximum(step, home_step) < TORN_M))
     if not len(good):
@@ -153,9 +153,10 @@ def _facing(pictures: FrameSetCrops, middle: np.ndarray, forward: np.ndarray) ->
     return pictures.some(chosen)
 
 
-def _between(places: np.ndarray, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def between(places: np.ndarray, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Interpolate places (S, 3) at texels (S, 2); also the longest step (S,) between texels."""
-    column, row = np.clip(corner_to_cell(at), 0, (WIDTH - 2, HEIGHT - 2)).astype(np.int64).T
+    most = places.shape[1] - 2, places.shape[0] - 2
+    column, row = np.clip(corner_to_cell(at), 0, most).astype(np.int64).T
     a, b = places[row, column], places[row, column + 1]
     c, d = places[row + 1, column], places[row + 1, column + 1]
     steps = [np.linalg.norm(x - y, axis=1) for x, y in ((a, b), (c, d), (a, c), (b, d))]
@@ -178,6 +179,7 @@ class FaceUvMap:
         places: (V, 2) column and row of every vertex, corner origin; far off where it has none.
         front: (F,) bool, faces of skin that the map shows, however small.
         skin: (T,) bool, texels of skin: not of eyes, teeth or tongue.
+        fine: texels per side of a texel of the map that the network reads.
     """
 
     samples: MeshPlaces
@@ -185,15 +187,17 @@ class FaceUvMap:
     places: np.ndarray
     front: np.ndarray
     skin: np.ndarray
+    fine: int = 1
 
     def image(self, values: np.ndarray) -> np.ndarray:
-        """Spread values (T, C) over the map (HEIGHT, WIDTH, C), 0 outside the head."""
-        out = np.zeros((HEIGHT, WIDTH, values.shape[1]), dtype=values.dtype)
+        """Spread values (T, C) over the map (HEIGHT, WIDTH, C), finer by `fine`; 0 off the head."""
+        size = HEIGHT * self.fine, WIDTH * self.fine
+        out = np.zeros((*size, values.shape[1]), dtype=values.dtype)
         out[tuple(self.texels.T)] = values
         return out
 
 
-def make_uv_map(model: HeadModel) -> FaceUvMap:
+def make_uv_map(model: HeadModel, fine: int = 1) -> FaceUvMap:
     """Lay a head model's template flat.
 
     Raises:
@@ -212,14 +216,14 @@ def make_uv_map(model: HeadModel) -> FaceUvMap:
     warp = RBFInterpolator(
         unrolled(marks, marks)[0], MARKS, kernel="thin_plate_spline", smoothing=1e-4
     )
-    places = to_texels(warp(turned))
+    places, width, height = fine * to_texels(warp(turned)), fine * WIDTH, fine * HEIGHT
     faces = model.faces.numpy()
     near = (np.abs(turned[:, 0]) < BACK)[faces].all(1)
     ids = np.flatnonzero(near)
     # Seen from outside, what is further from the axis is nearer.
     depth = 10.0 - np.minimum(radius, 5.0)
     flat = np.column_stack([places * depth[:, None], depth])
-    camera = Camera("map", WIDTH, HEIGHT, "PINHOLE", (1.0, 1.0, 0.0, 0.0), np.eye(4))
+    camera = Camera("map", width, height, "PINHOLE", (1.0, 1.0, 0.0, 0.0), np.eye(4))
     found = visible_faces(flat, faces[ids], camera)[0]
     face_id = np.where(found >= 0, ids[np.maximum(found, 0)], -1)
     texels = np.argwhere(face_id >= 0)
@@ -227,12 +231,12 @@ def make_uv_map(model: HeadModel) -> FaceUvMap:
     bary = flat_barycentrics(places[faces[of_texel]], cell_to_corner(texels[:, ::-1]))
     samples = MeshPlaces(faces[of_texel], bary)
     inside = (~movable_vertices(model))[faces].any(1)
-    shown = np.zeros((HEIGHT, WIDTH))
+    shown = np.zeros((height, width))
     shown[tuple(texels.T)] = (radius[samples.vertices] * bary).sum(1)
-    column, row = np.clip(places[faces].mean(1), 0, (WIDTH - 1, HEIGHT - 1)).astype(np.int64).T
-    on_map = ((places[faces] >= 0) & (places[faces] <= (WIDTH, HEIGHT))).all((1, 2))
+    column, row = np.clip(places[faces].mean(1), 0, (width - 1, height - 1)).astype(np.int64).T
+    on_map = ((places[faces] >= 0) & (places[faces] <= (width, height))).all((1, 2))
     front = near & on_map & ~inside & (radius[faces].mean(1) > shown[row, column] - SHEET)
-    return FaceUvMap(samples, texels, places, front, ~inside[of_texel])
+    return FaceUvMap(samples, texels, places, front, ~inside[of_texel], fine)
 
 
 def unrolled(points: np.ndarray, marks: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -11,12 +11,13 @@ from dataclasses import asdict, dataclass, replace
 import numpy as np
 
 from express50.head.model import HeadModel
-from pipelines.track.basis import ALONG, OFF, Basis
+from pipelines.track.basis import ALONG, OFF, Basis, freeze_shape
 from pipelines.track.eyes_and_jaw import EyeOffsets, with_irises_and_jaw
-from pipelines.track.face_uv import FaceUvMap, reading_map, slide_term, with_slide
+from pipelines.track.face_uv import FaceUvMap, make_uv_map, reading_map, slide_term, with_slide
 from pipelines.track.fit import fit
 from pipelines.track.outline import BALD_SHARE, bare_share, outline_terms
 from pipelines.track.photo_consistency import SkinSamples, patch_terms, skin_samples
+from pipelines.track.skin_flow import FINE, flow_term, skin_map
 from pipelines.track.state import State, Target, all_vertices, rotations
 from pipelines.track.surface import FrameSetCrops
 from pipelines.track.terms import NormalTerm, SlideTerm
@@ -26,6 +27,7 @@ ROUND_STEPS = 4
 EYE_ROUNDS = 2  # irises and visible jaw lines are found anew at least so often
 PATCH_REACH_M = 0.008  # of the first search, to either side of the mesh
 NARROWING, NARROWINGS = 0.6, 3  # factor of the reach from round to round, and how often
+FOLLOWING = 3  # rounds in which the skin is followed
 # Far from the surface, whole patches of skin may match wrongly together: trust grows by this
 # factor towards the last round.
 TRUST_GROWTH = 1 / 0.3
@@ -40,12 +42,15 @@ class Round:
         patch_reach_m: how far along the normals the surface is searched for; 0 for no search.
         patch_weight: trust in what the search finds.
         read_uv: find landmarks on the face UV map anew; otherwise the last reading stays.
+        follow_skin: follow the skin's texture from the resting face to the other expressions. The
+            shape is held: the texture shows how a face moves, not what it is.
     """
 
     outlines: bool
     patch_reach_m: float
     patch_weight: float
     read_uv: bool
+    follow_skin: bool = False
 
 
 Schedule = tuple[Round, ...]
@@ -54,10 +59,11 @@ Schedule = tuple[Round, ...]
 def make_schedule(outline_rounds: int, patch_rounds: int, uv_rounds: int) -> Schedule:
     """Lay out the rounds: outlines in the last ones, UV landmarks in the first.
 
-    The search narrows over the first rounds and gains trust towards the last.
+    The search narrows over the first rounds and gains trust towards the last. With both patches and
+    UV landmarks, more rounds follow the skin.
     """
     count = max(outline_rounds, patch_rounds, EYE_ROUNDS)
-    return tuple(
+    rounds = tuple(
         Round(
             outlines=count - index <= outline_rounds,
             patch_reach_m=PATCH_REACH_M * NARROWING ** min(index, NARROWINGS) * (patch_rounds > 0),
@@ -66,6 +72,9 @@ def make_schedule(outline_rounds: int, patch_rounds: int, uv_rounds: int) -> Sch
         )
         for index in range(count)
     )
+    if not (patch_rounds and uv_rounds):
+        return rounds
+    return rounds + FOLLOWING * (replace(rounds[-1], read_uv=False, follow_skin=True),)
 
 
 def schedule_table(schedule: Schedule) -> list[dict[str, object]]:
@@ -87,6 +96,7 @@ class SubjectEvidence:
         pictures: of every expression's frame set.
         skin: where the surface is searched for.
         uv_map: of the face; None if no round reads it.
+        fine_map: of the face, to follow the skin on; None if no round does.
         eyes: from `measure_eyes`.
         bald: the skull is bare.
     """
@@ -94,6 +104,7 @@ class SubjectEvidence:
     pictures: list[FrameSetCrops]
     skin: SkinSamples
     uv_map: FaceUvMap | None
+    fine_map: FaceUvMap | None
     eyes: EyeOffsets | None
     bald: bool
 
@@ -113,7 +124,9 @@ def gather(
         images = pictures[shown].images()
         bald = bare_share(model, images, meshes[shown]) > BALD_SHARE
     uv_map = reading_map(model) if any(one.read_uv for one in schedule) else None
-    return SubjectEvidence(pictures, skin_samples(model, samples), uv_map, eyes, bald)
+    fine_map = make_uv_map(model, FINE) if any(one.follow_skin for one in schedule) else None
+    skin = skin_samples(model, samples)
+    return SubjectEvidence(pictures, skin, uv_map, fine_map, eyes, bald)
 
 
 def refine(
@@ -125,6 +138,7 @@ def refine(
     outlines = sum(len(one.distances) for one in evidence.pictures)
     for one in schedule:
         meshes, turns, found = all_vertices(model, state), rotations(state), []
+        flows = skin_flows(model, targets, evidence, meshes) if one.follow_skin else {}
         for index, (target, pictures) in enumerate(zip(targets, evidence.pictures, strict=True)):
             mesh, terms = meshes[index], [*target.terms]
             if one.outlines:
@@ -134,12 +148,36 @@ def refine(
                 terms += patch_terms(model, evidence.skin, pictures, mesh, reach, weight)
             if one.read_uv and evidence.uv_map is not None:
                 slides[index] = slide_term(model, evidence.uv_map, pictures, mesh)
+            terms += flows.get(index, [])
             seen = replace(target, terms=tuple(terms))
             seen = with_irises_and_jaw(model, seen, mesh, turns[index], evidence.eyes)
             found.append(with_slide(seen, slides[index]))
+        if one.follow_skin:
+            person = freeze_shape(basis, state.shape, state.bias)
+            moved, _ = fit(person, found, State(np.zeros(0), state.poses), ROUND_STEPS)
+            state = replace(state, poses=moved.poses)
+            continue
         kinds = {type(term) for target in found for term in target.terms}
         free = tuple(
             name for kind, name in ((NormalTerm, OFF), (SlideTerm, ALONG)) if kind in kinds
         )
         state, _ = fit(basis, found, state, ROUND_STEPS, free)
     return state, found
+
+
+def skin_flows(
+    model: HeadModel, targets: list[Target], evidence: SubjectEvidence, meshes: np.ndarray
+) -> dict[int, list[SlideTerm]]:
+    """Follow the skin from the resting face to the other expressions, by their index."""
+    rest = next((k for k, target in enumerate(targets) if target.neutral), None)
+    uv_map = evidence.fine_map
+    if rest is None or uv_map is None:
+        return {}
+    still = skin_map(model, uv_map, evidence.pictures[rest], meshes[rest])
+    found = {}
+    for index, (pictures, mesh) in enumerate(zip(evidence.pictures, meshes, strict=True)):
+        if index != rest:
+            moved = skin_map(model, uv_map, pictures, mesh)
+            term = flow_term(uv_map, still, moved, mesh)
+            found[index] = [] if term is None else [term]
+    return found

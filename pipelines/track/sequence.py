@@ -19,7 +19,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-import torch
 
 from express50.capture.index import Cue
 from express50.contract.stage import Note
@@ -80,25 +79,6 @@ class ClipTracker:
     uv_map: FaceUvMap | None = None
     rounds: int = 0
     sweeps: int = SWEEPS
-
-
-def freeze_shape(basis: Basis, shape: np.ndarray, bias: np.ndarray) -> Basis:
-    """Fold a person's shape (S,) and detector bias (68, 3) into the basis; poses are left."""
-    coefficients, size = torch.from_numpy(np.asarray(shape, dtype=np.float64)), basis.shape_size
-    model = replace(
-        basis.model,
-        template=basis.model.template + basis.model.shape_dirs @ coefficients,
-        shape_dirs=basis.model.shape_dirs[..., :0],
-        shape_names=(),
-    )
-    return replace(
-        basis,
-        model=model,
-        directions=basis.directions[..., size:],
-        joints=basis.joints + basis.joint_directions[..., :size] @ coefficients,
-        joint_directions=basis.joint_directions[..., size:],
-        bias=bias,
-    )
 
 
 def make_windows(

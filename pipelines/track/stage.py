@@ -21,7 +21,7 @@ from express50.files.digests import path_digest, value_digest
 from express50.head.load import load_head
 from express50.head.model import landmarks
 from pipelines.track.appearance import write_texture
-from pipelines.track.basis import Basis, make_basis, split_shape, with_modes
+from pipelines.track.basis import Basis, freeze_shape, make_basis, split_shape, with_modes
 from pipelines.track.config import TrackConfig
 from pipelines.track.eyes_and_jaw import lid_terms, measure_eyes
 from pipelines.track.fit import consistent_sigma, fit
@@ -47,7 +47,7 @@ from pipelines.track.schedule import (
     refine,
     schedule_table,
 )
-from pipelines.track.sequence import ClipTracker, freeze_shape, pose_arrays, write_clips, write_npz
+from pipelines.track.sequence import ClipTracker, pose_arrays, write_clips, write_npz
 from pipelines.track.state import (
     RigScaleError,
     State,

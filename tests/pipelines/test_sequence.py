@@ -20,14 +20,13 @@ from express50.landmarks.detector import Detection
 from express50.landmarks.eyes_and_lips import Irises
 from express50.landmarks.sources import Marked
 from pipelines.track import sequence
-from pipelines.track.basis import Points
+from pipelines.track.basis import Points, freeze_shape
 from pipelines.track.observe import LandmarkView, Observation, agree
 from pipelines.track.read_inputs import read_clip
 from pipelines.track.sequence import (
     ClipTracker,
     Observed,
     _expected,
-    freeze_shape,
     jitter_mm,
     make_windows,
     track_window,

@@ -326,7 +326,7 @@ def test_stage_writes_the_contracted_file(tracked_dataset, tmp_path: Path) -> No
         "albedo.png", "appearance.npz",
     }  # fmt: skip
     assert set(metrics["landmark_rms_px"]) == {"neutral", "smile"}
-    assert [row["patch_reach_m"] for row in metrics["schedule"]] == [0.008, 0.0048]
+    assert [row["patch_reach_m"] for row in metrics["schedule"]] == [0.008] + 4 * [0.0048]
     with np.load(tmp_path / "out0" / "track.npz", allow_pickle=False) as track:
         shapes = {name: track[name].shape for name in track.files}
         assert str(track["schema"]) == "express50.track/2"

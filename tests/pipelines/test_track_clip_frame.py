@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipelines.track.basis import make_basis
+from pipelines.track.basis import freeze_shape, make_basis
 from pipelines.track.observe import Observation
 from pipelines.track.photo_consistency import skin_samples
-from pipelines.track.sequence import ClipTracker, fit_to_pictures, freeze_shape
+from pipelines.track.sequence import ClipTracker, fit_to_pictures
 from pipelines.track.state import Target, start_state
 from pipelines.track.surface import CutCrops, FrameSetCrops
 from pipelines.track.terms import NormalTerm

@@ -15,9 +15,10 @@ from express50.landmarks.network import face_box
 from express50.landmarks.sources import Marked
 from express50.landmarks.training.random_heads import random_head
 from express50.landmarks.training.views import HeadScene
+from pipelines.track.basis import freeze_shape
 from pipelines.track.observe import agree
 from pipelines.track.read_inputs import FOLLOWED_VIEWS, _ahead, _look, open_follower
-from pipelines.track.sequence import ClipTracker, freeze_shape, track_window
+from pipelines.track.sequence import ClipTracker, track_window
 from pipelines.track.state import Target, start_state
 from pipelines.track.terms import landmark_anchors
 from tests.express50.landmarks.test_landmarks import on_canvas
