@@ -108,7 +108,7 @@ def test_footage_alone_gives_figures_close_to_the_truth(dataset, twin, tmp_path)
     figures = measure_dataset(dataset, twin / "truth", tmp_path / "accuracy")
     assert figures["align.peak_error_frames_median"] <= 0.75
     assert figures["matte.mae"] < 0.012
-    assert figures["track.vertex_rmse_mm"] < 2.95
+    assert figures["track.vertex_rmse_mm"] < 4.9
     assert figures["depth.abs_error_mm_median"] < 3.4
     assert figures["depth.coverage"] > 0.95
     assert figures["regions.head_mae"] < 0.0145 and figures["regions.iou_mean"] > 0.67
