@@ -104,7 +104,8 @@ def joint_regressor(mesh: WholeMesh, joints: Array) -> Array:
             near = mesh.tag("eyeball", "left" if j == LEFT_EYE else "right")
         else:
             distance = np.linalg.norm(mesh.vertices[skin] - joint, axis=1)
-            near = skin[np.argsort(distance, kind="stable")[:160]]
+            # Mirrored vertices are equally far: rounding must not choose between them.
+            near = skin[np.argsort(distance.round(3), kind="stable")[:160]]
         system = np.concatenate([mesh.vertices[near].T, np.ones((1, len(near)))])
         regressor[j, near] = np.linalg.lstsq(system, np.append(joint, 1.0), rcond=None)[0]
     return regressor
