@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from express50.geometry.conventions import cell_to_corner
 from express50.geometry.sampling import bilinear
 from express50.head.model import HeadModel
 from pipelines.track.face_uv import LEAST_SEEN, FaceUvMap, between, unwrap
@@ -67,7 +68,7 @@ def flow_term(
     chosen = (uv_map.texels % EVERY == EVERY // 2).all(1)
     ids = np.flatnonzero(chosen & (inner[tuple(uv_map.texels.T)] > 0))
     row, column = uv_map.texels[ids].T
-    at = np.stack([column, row], axis=1) + 0.5
+    at = cell_to_corner(uv_map.texels[ids, ::-1])
     goal = at + there[row, column]
     missed = np.linalg.norm(goal + bilinear(back, goal) - at, axis=1)
     sure = (missed < BACK) & (_texture(first)[row, column] > TEXTURED)

@@ -185,7 +185,8 @@ class NormalTerm:
 class SlideTerm:
     """Places should slide along the skin to where it belongs; the distance off it does not count.
 
-    The places are the landmarks `marks` (n,) of the 68; the rest is as in NormalTerm.
+    `marks` are the landmarks of the 68 among them, none where the skin's texture is followed; the
+    rest is as in NormalTerm.
     """
 
     anchors: MeshPlaces

@@ -106,7 +106,7 @@ def test_a_run_without_pictures_says_what_is_missing(source) -> None:
     assert result["true_mesh"] == {"heldout_camera_psnr_db": None}
     row = result["landmark_only"]
     assert row["frames"] == 2 and 0 < row["seconds_per_frame"] < 60
-    assert row["vertex_rmse_mm"]["face"] < 6.0 and row["silhouette_iou"] > 0.8
+    assert row["vertex_rmse_mm"]["face"] < 6.0 and row["silhouette_iou"] > 0.85
     assert row["heldout_camera_psnr_db"] is None and "captures" in row["heldout_camera_psnr_reason"]
     assert row["jitter_mm"] is None and row["jitter_reason"]
     assert result["photometric_improves"] is None
