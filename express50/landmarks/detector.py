@@ -42,7 +42,6 @@ FOUND_SCORE = 0.5
 SHRINK, STEP = 0.55, 0.5
 SMALLEST = 0.25
 BATCH = 32  # windows at a time
-COARSE, MIDDLE = CROP, CROP  # pixels of the first looks
 KEEP_SHARE = 0.8
 # The last look is taken in several crops, in shares of the trained one, some mirrored. On a face,
 # profiles too, they differ by less than DIFFER_SHARE of the face box (median point), on walls,
@@ -100,7 +99,7 @@ def detect(
         net: From `load_network`.
         image: (H, W, 3) uint8 RGB; any size.
         refinements: Looks in sequence after the coarse pass; the last is taken in several crops,
-            one of them mirrored.
+            some of them mirrored.
         smallest: Side of the smallest windows searched, of the image's longer side. A face is
             found in windows of up to three times its width; each further size, SHRINK of the one
             before, costs about three times as much where no face is.
@@ -133,7 +132,7 @@ def detect_many(
         windows = {one: next(search, None) for one, search in left.items()}
         left = {one: search for one, search in left.items() if windows[one] is not None}
         looks = [Look(pyramids[one], window) for one in left for window in windows[one] or ()]
-        places = iter(_run(net, looks, COARSE))
+        places = iter(_run(net, looks))
         coarse = [
             max(islice(places, len(windows[one] or ())), key=lambda place: place.score)
             for one in left
@@ -172,7 +171,7 @@ def find_dense(net: LandmarkNet, image: np.ndarray, face: Detection) -> DensePoi
     """Find the dense points of a detected face, in the same crops as the last look at it."""
     pyramid = make_pyramid(image)
     windows = _last_windows(window_about(face.points))
-    output = _answer(net, [Look(pyramid, window) for window in windows], CROP, dense=True)
+    output = _answer(net, [Look(pyramid, window) for window in windows], dense=True)
     found = output.dense.double().numpy()
     scales = output.dense_log_scale.double().exp().numpy()
     partner = mirrored(found.shape[1])[POINTS:] - POINTS
@@ -225,7 +224,7 @@ def _refined(
     for _ in range(refinements - 1):
         going = [one for one in range(len(places)) if one not in straying]
         looks = [Look(pyramids[one], window_about(places[one].points)) for one in going]
-        for one, refined in zip(going, _run(net, looks, MIDDLE), strict=True):
+        for one, refined in zip(going, _run(net, looks), strict=True):
             if refined.score < KEEP_SHARE * places[one].score:
                 # The crop went astray, as it may on a profile: the wider view knew better.
                 straying.add(one)
@@ -236,7 +235,7 @@ def _refined(
         for pyramid, place in zip(pyramids, places, strict=True)
         for window in _last_windows(window_about(place.points))
     ]
-    found, count = _run(net, looks, CROP), len(LAST)
+    found, count = _run(net, looks), len(LAST)
     return [
         _agreed(place, found[count * one : count * (one + 1)]) for one, place in enumerate(places)
     ]
@@ -247,8 +246,8 @@ def _last_windows(window: np.ndarray) -> list[np.ndarray]:
     centre = window @ [CROP / 2, CROP / 2, 1.0]
     flip = np.diag([-1.0, 1.0])
     return [
-        place_crop(centre, scale * window[:, :2] @ (flip if mirrored else np.eye(2)), CROP)
-        for scale, mirrored in LAST
+        place_crop(centre, scale * window[:, :2] @ (flip if flipped else np.eye(2)), CROP)
+        for scale, flipped in LAST
     ]
 
 
@@ -335,23 +334,22 @@ def make_pyramid(image: np.ndarray) -> list[np.ndarray]:
     return levels
 
 
-def sample_window(pyramid: list[np.ndarray], window: np.ndarray, size: int = CROP) -> np.ndarray:
-    """Cut a crop (size, size, 3) uint8 out of the level whose resolution fits the window."""
-    pixels = np.diag([CROP / size, CROP / size, 1.0])
-    step = np.sqrt(abs(np.linalg.det(window[:, :2]))) * CROP / size
+def sample_window(pyramid: list[np.ndarray], window: np.ndarray) -> np.ndarray:
+    """Cut a crop (128, 128, 3) uint8 out of the level whose resolution fits the window."""
+    step = np.sqrt(abs(np.linalg.det(window[:, :2])))
     level = int(np.clip(np.floor(np.log2(max(step, 1e-6)) + 0.5), 0, len(pyramid) - 1))
     height, width = pyramid[0].shape[:2]
     shape = pyramid[level].shape
     scale = np.array([[shape[1] / width], [shape[0] / height]])
-    return cut_crop(pyramid[level], window @ pixels * scale, size)
+    return cut_crop(pyramid[level], window * scale, CROP)
 
 
-def _run(net: LandmarkNet, looks: Sequence[Look], size: int) -> list[_Place]:
-    """Run the network on looks of (size, size) pixels, `BATCH` at a time."""
+def _run(net: LandmarkNet, looks: Sequence[Look]) -> list[_Place]:
+    """Run the network on looks, `BATCH` at a time."""
     places = []
     for start in range(0, len(looks), BATCH):
         part = looks[start : start + BATCH]
-        output = _answer(net, part, size, dense=False)
+        output = _answer(net, part, dense=False)
         scales = output.log_scale.double().exp().numpy()
         visible = torch.sigmoid(output.seen).double().numpy()
         scores = torch.sigmoid(output.logit).double().numpy()
@@ -363,8 +361,8 @@ def _run(net: LandmarkNet, looks: Sequence[Look], size: int) -> list[_Place]:
     return places
 
 
-def _answer(net: LandmarkNet, looks: Sequence[Look], size: int, dense: bool) -> Output:
-    crops = np.stack([sample_window(look.pyramid, look.window, size) for look in looks])
+def _answer(net: LandmarkNet, looks: Sequence[Look], dense: bool) -> Output:
+    crops = np.stack([sample_window(look.pyramid, look.window) for look in looks])
     # (N, H, W, 3) seen as (N, 3, H, W) lies in memory as channels-last already.
     with torch.inference_mode():
         images = torch.from_numpy(crops).permute(0, 3, 1, 2)
@@ -403,5 +401,5 @@ def follow(net: LandmarkNet, image: np.ndarray, window: np.ndarray) -> Detection
     high = np.clip(np.ceil(corners.max(1)) + 1, low + 1, size).astype(int)
     part = np.ascontiguousarray(image[low[1] : high[1], low[0] : high[0]])
     moved = window - np.column_stack([np.zeros((2, 2)), low])
-    place = _run(net, [Look(make_pyramid(part), moved)], CROP)[0]
+    place = _run(net, [Look(make_pyramid(part), moved)])[0]
     return _detection(replace(place, points=place.points + low))

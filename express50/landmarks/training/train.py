@@ -58,7 +58,7 @@ KEEP_EVERY = 100
 FIRST_FILES = 6
 STEPS_PER_FILE = 300
 HELD_OUT = 0
-SMALL_EVERY = 4  # after the small steps these remain small: the detector's first look is
+SMALL_EVERY = 4  # after the small steps one in so many stays small, so that blurred faces are kept
 
 
 @dataclass(frozen=True, kw_only=True)
