@@ -71,7 +71,8 @@ def flow_term(
     at = cell_to_corner(uv_map.texels[ids, ::-1])
     goal = at + there[row, column]
     missed = np.linalg.norm(goal + bilinear(back, goal) - at, axis=1)
-    sure = (missed < BACK) & (_texture(first)[row, column] > TEXTURED)
+    contrast = cv2.cornerMinEigenVal(first.astype(np.float32) / 255.0, 9, 3)[row, column]
+    sure = (missed < BACK) & (contrast > TEXTURED**2)
     sure &= bilinear(inner, goal) > 0.99
     ids, at, goal = ids[sure], at[sure], goal[sure]
     if not len(ids):
@@ -90,8 +91,3 @@ def _flow(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     search = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     search.setFinestScale(0)
     return search.calc(first, second, np.zeros((*first.shape, 2), np.float32))
-
-
-def _texture(grey: np.ndarray) -> np.ndarray:
-    """Return the contrast (H, W) around each texel along the direction that has least of it."""
-    return np.sqrt(np.maximum(cv2.cornerMinEigenVal(grey.astype(np.float32) / 255.0, 9, 3), 0.0))
