@@ -64,15 +64,18 @@ def read_surface(path: Path) -> Surface:
     Raises:
         FormatError: it is not such a file, holds no face, or NaN.
     """
+    import open3d as o3d
     import trimesh
 
     try:
         mesh = trimesh.load(path, file_type="ply", process=False, force="mesh")
-        columns = mesh.metadata["_ply_raw"]["vertex"]["data"]
         vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
-        colors = np.stack([np.ravel(columns[k]) for k in ("red", "green", "blue")], axis=1)
-        confidence = np.ravel(columns["confidence"]).astype(np.float64)
-    except Exception as error:  # noqa: BLE001  # trimesh raises what the damage leads to
+        # Only Open3D hands out further properties of vertices; of damaged files it reads what it
+        # can, so that trimesh, which refuses them, comes first.
+        columns = o3d.t.io.read_point_cloud(str(path), format="ply").point
+        colors = columns["colors"].numpy()
+        confidence = columns["confidence"].numpy()[:, 0].astype(np.float64)
+    except Exception as error:  # noqa: BLE001  # both raise what the damage leads to
         raise FormatError(f"{path}: not a surface of depth ({error}); {_AGAIN}") from None
     if not len(faces) or not (np.isfinite(vertices).all() and np.isfinite(confidence).all()):
         raise FormatError(f"{path}: {len(faces)} faces, or NaN in the vertices; {_AGAIN}")

@@ -81,8 +81,9 @@ def lay(model: HeadModel, start: np.ndarray, surface: GivenSurface, detail: floa
     faces, free = model.faces.numpy(), movable_vertices(model)
     mesh = start
     for reach, multiple in ROUNDS:
-        plate = Plate(mesh, faces, free, multiple * detail)
-        normals = smooth_normals(mesh, model.faces, 2 * multiple * detail)
+        laplacian = cotangent_laplacian(mesh, faces)
+        plate = Plate(*laplacian, free, multiple * detail)
+        normals = smoothed(mesh_normals(mesh, model.faces), *laplacian, 2 * multiple * detail)
         height, trust = search.heights(mesh, normals, reach)
         trust = trust * trusted * ~folded(mesh, normals, faces)
         moved = ((mesh - start) * normals).sum(1)
@@ -134,15 +135,14 @@ class SurfaceSearch:
 
 
 class Plate:
-    """A thin plate over a mesh (V, 3), (F, 3) on springs; only `free` vertices (V,) leave it.
+    """A thin plate on springs over a mesh, given by the stiffness (V, V) and mass (V,) of its skin.
 
-    It follows heights whose wavelength is over `detail` metres.
+    Only `free` vertices (V,) leave it. It follows heights whose wavelength is over `detail` metres.
     """
 
     def __init__(
-        self, vertices: np.ndarray, faces: np.ndarray, free: np.ndarray, detail: float
+        self, stiffness: sparse.csr_matrix, mass: np.ndarray, free: np.ndarray, detail: float
     ) -> None:
-        stiffness, mass = cotangent_laplacian(vertices, faces)
         # A wave of amplitude NOISE and that wavelength costs as much as missing it does.
         scale = (detail / (2 * np.pi)) ** 2 / (NOISE_M * np.sqrt(np.median(mass)))
         self.bend = sparse.diags(scale * mass**-0.5) @ stiffness
@@ -185,11 +185,15 @@ def mesh_normals(vertices: np.ndarray, faces: torch.Tensor) -> np.ndarray:
     return vertex_normals(centred[None], faces)[0].numpy()
 
 
-def smooth_normals(vertices: np.ndarray, faces: torch.Tensor, wavelength: float) -> np.ndarray:
-    """Return unit normals (V, 3) of a mesh (V, 3), averaged over a wavelength in metres."""
-    stiffness, mass = cotangent_laplacian(vertices, faces.numpy())
+def smoothed(
+    normals: np.ndarray, stiffness: sparse.csr_matrix, mass: np.ndarray, wavelength: float
+) -> np.ndarray:
+    """Return a mesh's normals (V, 3), averaged over a wavelength in metres and of unit length.
+
+    Stiffness (V, V) and mass (V,) are those of `cotangent_laplacian`.
+    """
     spread = sparse.diags(mass) + (wavelength / (2 * np.pi)) ** 2 * stiffness
-    return _unit(splu(spread.tocsc()).solve(mass[:, None] * mesh_normals(vertices, faces)))
+    return _unit(splu(spread.tocsc()).solve(mass[:, None] * normals))
 
 
 def _unit(vectors: np.ndarray) -> np.ndarray:

@@ -21,7 +21,7 @@ from pipelines.register.scan import KINDS, UNITS, FittedScan, Scan, fit_scan, re
 from pipelines.register.stage import write_registration
 from pipelines.track.stage import write_track
 
-VERSION = 2  # raise it when the same scan gives other files
+VERSION = 3  # raise it when the same scan gives other files
 OF_DATASETS = ("set", "config", "items", "scheduler", "slurm", "print_job")
 
 
@@ -101,7 +101,7 @@ def register_scan(path: Path, head: str, folder: Path) -> dict:
         file = out / "track.npz"
         vertices = fitted.start[None]
         write_track(file, head, fitted.basis, fitted.targets, fitted.state, vertices)
-        metrics = write_registration(out, file, read_track(file), 0, fitted.laid)
+        metrics = write_registration(out, file, read_track(file), 0, fitted.laid, "parameters")
         write_head_obj(out / "head.obj", fitted.laid.vertices / UNITS[scan.unit], load_head(head))
         metrics |= distances(scan, fitted) | {"unit": scan.unit, "textured": scan.textured}
         metrics |= {"views": len(fitted.targets[0].observation.views), "identity": identity}

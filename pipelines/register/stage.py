@@ -60,10 +60,12 @@ def run(dataset: Dataset, item: str, out: Path) -> Result:
     return Result(metrics, (), warnings)
 
 
-def write_registration(out: Path, path: Path, track: Track, row: int, laid: LaidMesh) -> dict:
+def write_registration(
+    out: Path, path: Path, track: Track, row: int, laid: LaidMesh, start_name: str = "tracked"
+) -> dict:
     """Write registration.npz and a picture of a track's row; returns the metrics.
 
-    `path` is the track's file.
+    `path` is the track's file; the picture calls the track's mesh `start_name`.
     """
     model, start = load_head(track.head), track.vertices[row].astype(np.float64)
     numbers = {
@@ -75,7 +77,7 @@ def write_registration(out: Path, path: Path, track: Track, row: int, laid: Laid
     arrays = {name: array.astype(np.float32) for name, array in numbers.items()}
     arrays |= {"schema": np.array(REGISTRATION_SCHEMA), "track": np.array(file_sha256(path))}
     write_npz(out / "registration.npz", arrays | {"seen": laid.seen})
-    write_picture(out, model, track, row, laid)
+    write_picture(out, model, track, row, laid, start_name)
     return figures_of(model, start, laid)
 
 
@@ -114,8 +116,10 @@ def figures_of(model: HeadModel, start: np.ndarray, laid: LaidMesh) -> dict:
     return rounded | {"crossing_triangles": after, "crossing_triangles_tracked": before}
 
 
-def write_picture(out: Path, model: HeadModel, track: Track, row: int, laid: LaidMesh) -> None:
-    """Write a sheet: the tracked mesh above, the registered one below, from two sides."""
+def write_picture(
+    out: Path, model: HeadModel, track: Track, row: int, laid: LaidMesh, start_name: str
+) -> None:
+    """Write a sheet: the track's mesh above, the registered one below, from two sides."""
     (out / "qc").mkdir(exist_ok=True)
     rows = [
         [
@@ -124,5 +128,5 @@ def write_picture(out: Path, model: HeadModel, track: Track, row: int, laid: Lai
         ]
         for mesh in (track.vertices[row].astype(np.float64), laid.vertices)
     ]
-    sheet = contact_sheet(rows, ["tracked", "registered"], tile=(240, 240))
+    sheet = contact_sheet(rows, [start_name, "registered"], tile=(240, 240))
     write_image(out / "qc" / "registration.jpg", sheet, quality=90)

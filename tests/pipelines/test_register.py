@@ -13,7 +13,7 @@ from express50.contract.layout import Dataset
 from express50.dataset.export import Head, with_registered
 from express50.dataset.tracks import best_vertices, read_registration, read_track
 from express50.errors import FormatError, StageError
-from express50.geometry.meshes import read_surface, write_ply
+from express50.geometry.meshes import cotangent_laplacian, read_surface, write_ply
 from express50.geometry.raycast import mesh_scene
 from express50.geometry.transforms_torch import axis_angle_to_matrix
 from express50.head.load import load_head
@@ -111,7 +111,8 @@ def test_heights_point_to_the_nearer_sheet_that_faces_the_same_way():
 def test_the_uncertainty_is_the_spread_of_what_fits_the_data(model):
     """The plate's standard deviations are those of fits to data with the stated noise."""
     mesh, rng = posed(model, 3), np.random.default_rng(0)
-    plate = Plate(mesh, model.faces.numpy(), np.ones(len(mesh), bool), DETAIL)
+    laplacian = cotangent_laplacian(mesh, model.faces.numpy())
+    plate = Plate(*laplacian, np.ones(len(mesh), bool), DETAIL)
     weight = np.where(rng.uniform(size=len(mesh)) < 0.3, 0.0003**-2.0, 0.0)
     sigma = plate.sigma(weight)
     some = rng.choice(len(mesh), 12, replace=False)
