@@ -1,6 +1,7 @@
-"""Read text, JSON and TOML files, with errors that name the file and the line.
+"""Read text, JSON, TOML, YAML and XML files, with errors that name the file and the line.
 
-A file is a regular one of at most ``TEXT_LIMIT`` bytes, keys come once, and numbers are finite.
+A file is a regular one of at most ``TEXT_LIMIT`` bytes. In JSON and TOML keys come once and numbers
+are finite; YAML and XML are read as text, without references that could grow or name other files.
 """
 
 from __future__ import annotations
@@ -14,11 +15,15 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
+
+import yaml
 
 from express50.errors import Express50Error
 
 TEXT_LIMIT = 1 << 28  # bytes; the index of 100,000 samples takes 40 MB
 TOML_LIMIT = 1 << 20  # bytes; written by hand
+YAML_LIMIT, YAML_LEVELS = 1 << 18, 16  # bytes, which take seconds to parse; of nesting
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.+-]{0,199}")
 """Pattern of a name that may become a file or folder."""
 ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,119}")
@@ -112,6 +117,44 @@ def read_toml(path: Path, kind: Kind) -> dict[str, Any]:
         raise kind(f"{path}: {error.located(text)}; correct it") from None
     except (ValueError, RecursionError) as error:
         raise kind(f"{path}: not TOML: {reason(error)}; correct it") from None
+
+
+def read_yaml(path: Path, kind: Kind) -> Any:
+    """Read a YAML file whose scalars stay text.
+
+    Raises:
+        Express50Error: as `read_text`, or it is not YAML, nested too deeply, or has aliases, which
+            could make a small file endless.
+    """
+    text, level = read_text(path, kind, YAML_LIMIT), 0
+    try:
+        for event in yaml.parse(text, yaml.BaseLoader):
+            level += isinstance(event, yaml.CollectionStartEvent)
+            level -= isinstance(event, yaml.CollectionEndEvent)
+            if level > YAML_LEVELS or isinstance(event, yaml.AliasEvent):
+                raise kind(
+                    f"{path}: has aliases (*name) or is nested over {YAML_LEVELS} deep, expected"
+                    f" plain values; {AGAIN}"
+                )
+        return yaml.load(text, yaml.BaseLoader)
+    except (yaml.YAMLError, ValueError) as error:
+        raise kind(f"{path}: not YAML ({reason(error)}); {AGAIN}") from None
+
+
+def read_xml(path: Path, kind: Kind) -> ElementTree.Element:
+    """Read the root of an XML file.
+
+    Raises:
+        Express50Error: as `read_text`, or it is not XML, or declares a document type, whose
+            entities could grow without bound or name other files.
+    """
+    text = read_text(path, kind)
+    if "<!DOCTYPE" in text:
+        raise kind(f"{path}: declares a document type (<!DOCTYPE), expected none; {AGAIN}")
+    try:
+        return ElementTree.fromstring(text)
+    except (ElementTree.ParseError, ValueError) as error:
+        raise kind(f"{path}: not XML ({reason(error)}); {AGAIN}") from None
 
 
 def reason(error: BaseException) -> str:

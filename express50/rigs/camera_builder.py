@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from express50.errors import CalibrationError
-from express50.files.calibration import camera_rows, parse_cameras
+from express50.files.calibration import LARGEST, camera_rows, parse_cameras
 from express50.files.text import read_bytes
 from express50.geometry.cameras import Camera, resized
 
@@ -114,9 +114,24 @@ def finite_array(value: object, shape: tuple[int, ...], what: str) -> np.ndarray
         array = np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError, OverflowError):
         array = np.zeros(0)
-    if array.shape != shape or not np.isfinite(array).all():
+    if array.shape != shape or not (np.abs(array) < LARGEST).all():
         raise CalibrationError(f"{what} of shape {array.shape}, expected {shape}, finite")
     return array
+
+
+def as_rig(cameras: Iterable[Camera], path: Path) -> dict[str, Camera]:
+    """Return the cameras of a file by name, after the checks of `checked`.
+
+    Raises:
+        CalibrationError: as `checked`, or two share a name.
+    """
+    found: dict[str, Camera] = {}
+    for camera in cameras:
+        if found.setdefault(camera.id, camera) is not camera:
+            raise CalibrationError(
+                f"{path}: two cameras are called {camera.id}, expected a name each; rename one"
+            )
+    return checked(found, path)
 
 
 def checked(cameras: dict[str, Camera], path: Path) -> dict[str, Camera]:

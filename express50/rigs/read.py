@@ -1,6 +1,6 @@
 """Read a rig in any known format, at the footage's size, in metres.
 
-COLMAP's models and transforms.json have modules of their own. The other layouts are read here:
+Most formats have modules of their own. The others are read here:
 
 - OpenCV's YAML, one file per camera. OpenCV puts the pixel origin at the first pixel's centre, so K
   is shifted.
@@ -15,6 +15,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import h5py
@@ -27,6 +28,7 @@ from express50.files.text import TOML_LIMIT, read_json_table, read_text, reason
 from express50.geometry.cameras import Camera
 from express50.geometry.conventions import K_from_opencv
 from express50.geometry.transforms import axis_angle_to_matrix, make_transform
+from express50.rigs.calibrators import read_calibration_toml, read_kalibr, read_qualisys
 from express50.rigs.camera_builder import (
     at_size,
     camera_from_K,
@@ -36,9 +38,9 @@ from express50.rigs.camera_builder import (
     in_metres,
 )
 from express50.rigs.colmap import is_colmap, read_colmap_images
+from express50.rigs.photogrammetry import read_metashape, read_reality_capture, read_vggt
 from express50.rigs.transforms_json import is_transforms, read_transforms
 
-FORMATS = ("express50", "colmap", "opencv", "transforms", "nersemble", "renderme360")
 NERSEMBLE_SIZE = (2200, 3208)
 # Names in use: OpenCV's calibration sample, its stereo sample, ROS, and hand-written files.
 _K = ("camera_matrix", "cameraMatrix", "K", "M", "intrinsics")
@@ -50,6 +52,67 @@ YAML = (".yml", ".yaml")
 LEVELS, ENTRIES = 16, 64  # of nesting, and in a matrix
 
 
+class RigFormat(NamedTuple):
+    """How to recognise and read a format; the reader also gets the footage's size, or None."""
+
+    title: str
+    fits: Callable[[Path], bool]
+    read: Callable[[Path, tuple[int, int] | None], dict[str, Camera]]
+
+
+def _file(*ends: str, word: str = "") -> Callable[[Path], bool]:
+    """Return a test for a file with one of the endings that holds a word."""
+    return lambda path: path.is_file() and path.suffix in ends and (not word or holds(path, word))
+
+
+def _files(*ends: str) -> Callable[[Path], bool]:
+    """Return a test for a file with one of the endings, or a folder with such a file."""
+    return lambda path: any(
+        file.suffix in ends for file in (path.iterdir() if path.is_dir() else [path])
+    )
+
+
+# In the order in which they are tried.
+FORMATS = {
+    "renderme360": RigFormat("an .smc", _file(".smc"), lambda path, _: read_renderme(path)),
+    "nersemble": RigFormat(
+        "NeRSemble's camera_params.json",
+        _file(".json", word='"world_2_cam"'),
+        lambda path, _: read_nersemble(path),
+    ),
+    "colmap": RigFormat("a COLMAP model", is_colmap, lambda path, _: read_colmap_images(path)[0]),
+    "transforms": RigFormat("transforms.json", is_transforms, read_transforms),
+    "toml": RigFormat(
+        "caliscope's or aniposelib's TOML",
+        _file(".toml", word="distortions"),
+        lambda path, _: read_calibration_toml(path),
+    ),
+    "kalibr": RigFormat(
+        "Kalibr's camchain", _file(*YAML, word="camera_model"), lambda path, _: read_kalibr(path)
+    ),
+    "qualisys": RigFormat(
+        "Qualisys' .qca.txt",
+        _file(".txt", ".xml", word="focalLengthU"),
+        lambda path, _: read_qualisys(path),
+    ),
+    "metashape": RigFormat(
+        "Metashape's XML", _file(".xml", word="<chunk"), lambda path, _: read_metashape(path)
+    ),
+    "realitycapture": RigFormat(
+        "RealityCapture's .xmp files", _files(".xmp"), read_reality_capture
+    ),
+    "vggt": RigFormat("VGGT's .npz", _file(".npz"), read_vggt),
+    "opencv": RigFormat(
+        "OpenCV YAML", _files(*YAML), lambda path, size: read_opencv_yaml(path, size)
+    ),
+    "express50": RigFormat(
+        "our calibration.json",
+        lambda path: path.is_file() and holds(path, '"world_to_camera"'),
+        lambda path, _: read_cameras(path),
+    ),
+}
+
+
 def guess_format(path: Path) -> str:
     """Return the format of a file or folder.
 
@@ -58,19 +121,12 @@ def guess_format(path: Path) -> str:
     """
     if not path.exists():
         raise CalibrationError(f"{path}: does not exist")
-    tests = {
-        "renderme360": lambda p: p.is_file() and p.suffix == ".smc",
-        "nersemble": lambda p: p.is_file() and p.suffix == ".json" and holds(p, '"world_2_cam"'),
-        "colmap": is_colmap,
-        "transforms": is_transforms,
-        "opencv": lambda p: any(f.suffix in YAML for f in (p.iterdir() if p.is_dir() else [p])),
-        "express50": lambda p: p.is_file() and holds(p, '"world_to_camera"'),
-    }
-    found = next((name for name, fits in tests.items() if fits(path)), None)
+    found = next((name for name, known in FORMATS.items() if known.fits(path)), None)
     if found is None:
+        titles = [known.title for known in FORMATS.values()]
         raise CalibrationError(
-            f"{path}: no known calibration; expected a COLMAP model, OpenCV YAML, transforms.json,"
-            " NeRSemble's camera_params.json, an .smc or our calibration.json: name --format"
+            f"{path}: no known calibration; expected {', '.join(titles[:-1])} or {titles[-1]}:"
+            " name --format"
         )
     return found
 
@@ -92,15 +148,7 @@ def read_rig(
     Raises:
         CalibrationError: no format fits, or the content does not fit the format.
     """
-    readers: dict[str, Callable[[Path], dict[str, Camera]]] = {
-        "express50": read_cameras,
-        "colmap": lambda path: read_colmap_images(path)[0],
-        "opencv": lambda path: read_opencv_yaml(path, size),
-        "transforms": lambda path: read_transforms(path, size),
-        "nersemble": read_nersemble,
-        "renderme360": read_renderme,
-    }
-    found = readers[kind or guess_format(path)](path)
+    found = FORMATS[kind or guess_format(path)].read(path, size)
     if size is not None:
         found = {name: at_size(camera, size) for name, camera in found.items()}
     return in_metres(found, metres_per_unit)

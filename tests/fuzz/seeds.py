@@ -47,6 +47,7 @@ from tests.express50.capture.layouts import (
     write_transforms,
 )
 from tests.express50.head.flame_files import write_flame
+from tests.express50.rigs.test_other_tools import SIZE, WRITERS
 from tests.grmm.packed import write_shards
 from tests.grmm.synthetic import EllipsoidSource
 from tests.synth import make_capture, noise_video_images, write_video
@@ -69,6 +70,9 @@ def write_seeds(root: Path) -> None:
     (root / "binary").mkdir()
     pycolmap.Reconstruction(str(root / "scan/sparse/0")).write_binary(str(root / "binary"))
     _write_opencv(root / "yaml")
+    for tool, (_, write) in WRITERS.items():
+        (root / tool).mkdir()
+        write(root / tool)
     _write_pictures(root)
     (root / "flame").mkdir()
     write_flame(root / "flame")
@@ -191,6 +195,16 @@ def _rig_of(path: str) -> Callable[[Path], object]:
     return lambda root: read_rig(root / path, guess_format(root / path))
 
 
+def _tool(tool: str) -> Callable[[Path], object]:
+    """Read the one calibration in a tool's folder, or the folder of sidecars."""
+
+    def read(root: Path) -> object:
+        files = list((root / tool).iterdir())
+        return read_rig(files[0] if len(files) == 1 else root / tool, WRITERS[tool][0], SIZE)
+
+    return read
+
+
 def _data(read: Callable[..., object]) -> Callable[[Path], object]:
     return lambda root: read(Dataset(root / "data"), "S001")
 
@@ -223,6 +237,13 @@ READERS: dict[str, Callable[[Path], object]] = {
     "binary/cameras.bin": _rig_of("binary"),
     "binary/images.bin": _rig_of("binary"),
     "yaml/a.yml": _rig_of("yaml"),
+    "caliscope/camera_array.toml": _tool("caliscope"),
+    "aniposelib/calibration.toml": _tool("aniposelib"),
+    "kalibr/camchain.yaml": _tool("kalibr"),
+    "qualisys/Calib.qca.txt": _tool("qualisys"),
+    "metashape/cameras.xml": _tool("metashape"),
+    "realitycapture/cam00.xmp": _tool("realitycapture"),
+    "vggt/predictions.npz": _tool("vggt"),
     **{f"a.{end}": lambda root, end=end: read_image(root / f"a.{end}")
        for end in ("png", "jpg", "tif", "exr")},
     "a.mp4": lambda root: _video(root / "a.mp4"),

@@ -1,0 +1,185 @@
+"""Read cameras of photogrammetry: Metashape's XML, RealityCapture's XMP, VGGT's npz.
+
+- Metashape: ``transform`` is camera to chunk, OpenCV's axes; the chunk's or the component's own
+  transform leads on to the world. ``cx`` and ``cy`` count from the picture's middle, P1 and P2 are
+  OpenCV's p2 and p1, B1 is what fx has over f, and B2 is skew.
+- RealityCapture: one sidecar per picture. ``Rotation`` is world to camera by rows, OpenCV's axes;
+  ``Position`` is the camera's place. Focal length (for 36 mm) and principal point (from the middle)
+  are shares of the longer side; the last two distortion terms are OpenCV's p2 and p1.
+- VGGT: ``extrinsic`` is world to camera, OpenCV's axes. ``intrinsic`` is of the network's input,
+  whose middle is the principal point.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from xml.etree.ElementTree import Element
+
+import numpy as np
+
+from express50.errors import CalibrationError
+from express50.files.arrays import read_arrays
+from express50.files.text import read_xml
+from express50.geometry.cameras import Camera, resized
+from express50.geometry.transforms import make_transform
+from express50.rigs.camera_builder import as_rig, camera_from_K, finite_array, names_from_files
+
+RDF = "{http://www.w3.org/1999/02/22-rdf-syntax-ns#}"
+XCR = "{http://www.capturingreality.com/ns/xcr/1.1#}"
+# Metashape's terms; the first ten are f, cx, cy, B1, B2, then OpenCV's distortion in its order.
+TERMS = ("f", "cx", "cy", "b1", "b2", "k1", "k2", "p2", "p1", "k3", "k4", "p3", "p4")
+PATCH = 14  # pixels; VGGT rounds the height of its input to a multiple, which stretches it
+
+
+def read_metashape(path: Path) -> dict[str, Camera]:
+    """Read the aligned cameras of a chunk, named after their labels, in the chunk's unit.
+
+    Raises:
+        CalibrationError: it is not one chunk in one piece, a value is missing, or a lens has a
+            type or terms that OpenCV's model lacks.
+    """
+    chunks = list(read_xml(path, CalibrationError).iter("chunk"))
+    aligned = [
+        c for chunk in chunks for c in chunk.iter("camera") if c.find("transform") is not None
+    ]
+    parts = {camera.get("component_id", "") for camera in aligned}
+    if len(chunks) != 1 or len(parts) != 1:
+        raise CalibrationError(
+            f"{path}: {len(chunks)} chunks, {len(aligned)} aligned cameras in {len(parts)}"
+            " components; expected one chunk, aligned in one component: export that alone"
+        )
+    motion = _world_from_chunk(path, chunks[0], parts.pop())
+    sensors = {sensor.get("id"): sensor for sensor in chunks[0].iter("sensor")}
+    names = names_from_files([camera.get("label", "") for camera in aligned])
+    named = zip(names, aligned, strict=True)
+    return as_rig((_metashape_camera(path, name, c, sensors, motion) for name, c in named), path)
+
+
+def _world_from_chunk(path: Path, chunk: Element, part: str) -> np.ndarray:
+    """Read the similarity (4, 4) to the world; the identity where the chunk has none."""
+    inner = [c for c in chunk.iter("component") if c.get("id") == part]
+    found = [e.find("transform") for e in [*inner, chunk]]
+    element = next((e for e in found if e is not None), None)
+    if element is None:
+        return np.eye(4)
+    where = f"{path}: the chunk's transform"
+    R = _numbers(where, element, "rotation", 9).reshape(3, 3)
+    return make_transform(
+        R * _numbers(where, element, "scale", 1), _numbers(where, element, "translation", 3)
+    )
+
+
+def _metashape_camera(
+    path: Path, name: str, camera: Element, sensors: dict[str | None, Element], motion: np.ndarray
+) -> Camera:
+    where = f"{path}: camera {camera.get('label')}"
+    sensor = sensors.get(camera.get("sensor_id"))
+    found = [] if sensor is None else sensor.findall("calibration")
+    lens = next((c for c in found if c.get("class") == "adjusted"), found[-1] if found else None)
+    if lens is None or lens.get("type") != "frame":
+        raise CalibrationError(
+            f"{where}: has no frame lens, expected an aligned camera that is no fisheye; undistort"
+            " first"
+        )
+    value = {e.tag: _numbers(where, lens, e.tag, 1)[0] for e in lens if e.tag in TERMS}
+    odd = [key for key in ("k4", "p3", "p4") if value.get(key)]
+    if odd or "f" not in value:
+        raise CalibrationError(
+            f"{where}: has {', '.join(odd) or 'no f'}, expected f cx cy b1 b2 k1 k2 k3 p1 p2 alone;"
+            " optimise the cameras without the others"
+        )
+    f, cx, cy, b1, b2, *dist = (value.get(key, 0.0) for key in TERMS[:10])
+    sides = {} if (size := lens.find("resolution")) is None else size.attrib
+    width, height = finite_array(
+        [sides.get("width"), sides.get("height")], (2,), f"{where} has width and height"
+    )
+    K = np.array([[f + b1, b2, width / 2 + cx], [0, f, height / 2 + cy], [0, 0, 1]])
+    pose = motion @ _numbers(where, camera, "transform", 16).reshape(4, 4)
+    turn = pose[:3, :3].T / max(np.cbrt(np.linalg.det(motion[:3, :3])), 1e-9)
+    place = make_transform(turn, -turn @ pose[:3, 3])
+    return camera_from_K(name, K, dist, (int(width), int(height)), place)
+
+
+def _numbers(where: str, element: Element, child: str, count: int) -> np.ndarray:
+    words = (element.findtext(child) or "").split()
+    return finite_array(words, (count,), f"{where} has {child}")
+
+
+def read_reality_capture(path: Path, size: tuple[int, int] | None) -> dict[str, Camera]:
+    """Read an XMP sidecar, or a folder of them, named after the files, in the project's unit.
+
+    ``size`` is the width and height of the pictures, which sidecars do not say.
+
+    Raises:
+        CalibrationError: no size is given, a value is missing, or a lens has a model or terms that
+            OpenCV's model lacks.
+    """
+    if size is None:
+        raise CalibrationError(f"{path}: does not say the images' size; give --size WIDTHxHEIGHT")
+    files = sorted(path.glob("*.xmp")) if path.is_dir() else [path]
+    named = zip(names_from_files([file.name for file in files]), files, strict=True)
+    return as_rig((_sidecar(name, file, size) for name, file in named), path)
+
+
+def _sidecar(name: str, path: Path, size: tuple[int, int]) -> Camera:
+    value: dict[str, str] = {}  # properties stand as attributes or as elements
+    for row in read_xml(path, CalibrationError).iter(f"{RDF}Description"):
+        value |= row.attrib | {child.tag: child.text or "" for child in row}
+
+    def numbers(key: str, count: int, absent: str = "") -> np.ndarray:
+        words = value.get(XCR + key, absent).split()
+        return finite_array(words, (count,), f"{path} has xcr:{key}")
+
+    side = max(size)
+    f = numbers("FocalLength35mm", 1)[0] * side / 36
+    cx, cy = (numbers(f"PrincipalPoint{axis}", 1, "0")[0] * side for axis in "UV")
+    K = np.array([[f, 0, size[0] / 2 + cx], [0, f, size[1] / 2 + cy], [0, 0, 1]])
+    model = value.get(f"{XCR}DistortionModel", "")
+    # RealityCapture's own spelling. Old releases leave zeros at the end out.
+    count = min(len(value.get(f"{XCR}DistortionCoeficients", "").split()), 6)
+    terms = np.pad(numbers("DistortionCoeficients", count), (0, 6 - count))
+    k1, k2, k3, k4, t1, t2 = terms
+    uneven = numbers("Skew", 1, "0")[0] or numbers("AspectRatio", 1, "1")[0] != 1
+    if k4 or uneven or (terms.any() and not model.startswith("brown")):
+        raise CalibrationError(
+            f"{path}: lens {model[:40]} {terms.tolist()}, expected brown3 or brown3t2, no skew and"
+            " square pixels; set that distortion model and align again"
+        )
+    R = numbers("Rotation", 9).reshape(3, 3)
+    pose = make_transform(R, -R @ numbers("Position", 3))
+    return camera_from_K(name, K, [k1, k2, t2, t1, k3], size, pose)
+
+
+def read_vggt(path: Path, size: tuple[int, int] | None) -> dict[str, Camera]:
+    """Read the cameras of a ``predictions.npz``, called ``cam00`` and so on in its order.
+
+    The unit is the network's own. K is scaled to ``size`` where the network saw whole pictures,
+    stretched by no more than it rounds.
+
+    Raises:
+        CalibrationError: an array is missing or has another shape.
+    """
+    names = ("extrinsic", "intrinsic")
+    arrays = read_arrays(path, CalibrationError, "VGGT's predictions", names)
+    # The model's own output has a batch of one.
+    poses, matrices = (a[0] if a.ndim == 4 else a for a in (arrays[name] for name in names))
+    count = len(np.atleast_1d(poses))
+    poses = finite_array(poses, (count, 3, 4), f"{path} has extrinsic")
+    matrices = finite_array(matrices, (count, 3, 3), f"{path} has intrinsic")
+    found = as_rig(
+        (
+            camera_from_K(
+                f"cam{number:02d}",
+                K,
+                [],
+                (round(2 * K[0, 2]), round(2 * K[1, 2])),
+                make_transform(pose[:, :3], pose[:, 3]),
+            )
+            for number, (pose, K) in enumerate(zip(poses, matrices, strict=True))
+        ),
+        path,
+    )
+    if size is None:
+        return found
+    off = {n: abs(size[1] * c.width / size[0] - c.height) for n, c in found.items()}
+    return {n: resized(c, *size) if off[n] <= PATCH / 2 else c for n, c in found.items()}
