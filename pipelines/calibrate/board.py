@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 
 import cv2
@@ -21,6 +22,7 @@ from express50.files.containers import read_picture
 from express50.geometry.conventions import opencv_pixels_to_corner
 
 REQUIRED = ("squares_x", "squares_y", "square_length_m", "marker_length_m", "dictionary")
+ENOUGH = 4  # corners that show which way an image is to be read
 
 
 @dataclass(frozen=True)
@@ -132,12 +134,25 @@ def board_points(board: Board) -> np.ndarray:
 def detect_corners(
     image: np.ndarray, detector: cv2.aruco.CharucoDetector, board: Board
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Find the board's corners in an image (H, W, 3) uint8: ids (N,), pixels (N, 2)."""
+    """Find the board's corners in an image (H, W, 3) uint8: ids (N,), pixels (N, 2).
+
+    White-on-black prints are found in the negative, mirrored images and the back of a board that
+    is printed on both sides in the mirror. There the corners run round the board the other way.
+    """
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
-    corners, ids, _, _ = detector.detectBoard(grey)
-    if ids is None or len(ids) == 0:
-        return np.zeros(0, int), np.zeros((0, 2))
-    ids, corners = np.asarray(ids, int).reshape(-1), np.asarray(corners, float).reshape(-1, 2)
+    ids, corners = np.zeros(0, int), np.zeros((0, 2))
+    for negative, mirrored in product((False, True), repeat=2):
+        look = 255 - grey if negative else grey
+        look = cv2.flip(look, 1) if mirrored else look
+        at, found, _, _ = detector.detectBoard(look)
+        if found is not None and len(found) > len(ids):
+            ids, corners = np.asarray(found, int).reshape(-1), np.asarray(at, float).reshape(-1, 2)
+            if mirrored:
+                corners[:, 0] = grey.shape[1] - 1 - corners[:, 0]
+        if len(ids) >= ENOUGH:
+            break
+    if len(ids) == 0:
+        return ids, corners
     sides = square_sides(board_points(board)[ids, :2], corners, board.square_length_m)
     refined, found = refine_corners(grey, corners, sides)
     return ids[found], opencv_pixels_to_corner(refined[found])

@@ -44,7 +44,7 @@ Views = Mapping[str, Mapping[int, BoardView]]
 
 
 def seen_from_front(view: BoardView) -> bool:
-    """Check the sense in which corners run round the board: mirrors and wrong ids reverse it."""
+    """Check the sense in which corners run round the board: its back and mirrors reverse it."""
     flat = np.column_stack([view.points[:, :2], np.ones(len(view.points))])
     affine, _, rank, _ = np.linalg.lstsq(flat, view.pixels, rcond=None)
     return bool(rank == 3 and np.linalg.det(affine[:2]) > 0)
@@ -196,7 +196,8 @@ def relative_pose(
 
     `camera` and `views` are those of the camera the pose leads to. The candidate that predicts
     most corners in other frames is averaged with those near it. None if it explains less than half
-    of the frames.
+    of the frames, unless it explains a quarter and three: a camera with bad images stays, but one
+    that is out of step explains only the frame that its pose is from.
     """
     shared = sorted(set(from_poses) & set(to_poses))
     candidates = [
@@ -215,7 +216,7 @@ def relative_pose(
     errors = np.stack([predict(candidate) for candidate in sample])
     best = int(np.argmin(np.minimum(errors, near).sum(1)))
     agreed = float(np.mean(errors[best] < near))
-    if agreed < 0.5:
+    if agreed < 0.5 and (agreed < 0.25 or agreed * len(tested) < 3):
         return None
     weight = agreed * sum(len(views[f].points) for f in shared)
     stack = np.stack(candidates)

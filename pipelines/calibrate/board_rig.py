@@ -7,7 +7,7 @@ rig, and each board frame is one pose of the rig. There are no 3D points to esti
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from itertools import combinations
 
@@ -23,6 +23,7 @@ from pipelines.calibrate.board_guess import (
     MIN_FRAMES,
     NEAR,
     BoardView,
+    Views,
     all_board_poses,
     as_model,
     board_views,
@@ -38,6 +39,7 @@ from pipelines.calibrate.config import AUTO
 
 LADDER = ("SIMPLE_RADIAL", "RADIAL", "OPENCV")  # from few to many parameters
 WEAK_CORNERS, WEAK_FRAMES = 200, 8  # cameras with less are reported
+LEAST_CORNERS = 24  # that must fit the other cameras, or a camera is dropped
 REJECT_SIGMA = 4.0
 """Corners further off than this many robust standard deviations are rejected; 3 to 6 gave the same
 rig within 0.005 degrees."""
@@ -100,13 +102,14 @@ def solve_rig(
         errors=errors,
         corners_found=len(corners.corner),
         dropped=dict(sorted(dropped.items())),
-        weak=_weak(rig, kept),
+        weak=_weak(rig, corners, kept),
     )
 
 
 def _require(cameras: Mapping[str, object], dropped: Mapping[str, str]) -> None:
     if not cameras:
-        reasons = "; ".join(f"{name}: {why}" for name, why in sorted(dropped.items()))
+        of = {why: sorted(n for n in dropped if dropped[n] == why) for why in dropped.values()}
+        reasons = "; ".join(f"{', '.join(names)}: {why}" for why, names in of.items())
         raise CalibrationError(
             f"no camera can be calibrated from the board ({reasons}); record the board again: "
             "fill much of the picture, tilt it to every side, and show it to neighbouring cameras"
@@ -124,14 +127,7 @@ def _single_cameras(
     """Fit each camera's intrinsics on its own; returns the cameras and the views each one kept."""
     cameras, kept = {}, {}
     for name in corners.cameras:
-        large = board_views(corners, name, points, sizes[name])
-        good = {view.frame: view for view in large if seen_from_front(view)}
-        if len(large) - len(good) > len(good):
-            dropped[name] = (
-                f"its corners run the wrong way round in {len(large) - len(good)} of {len(large)} "
-                "board images: the images are mirrored or the board is not this one"
-            )
-            continue
+        good = {view.frame: view for view in board_views(corners, name, points, sizes[name])}
         if len(good) < MIN_FRAMES:
             dropped[name] = (
                 f"the board is seen well (at least {MIN_CORNERS} corners) in {len(good)} "
@@ -167,17 +163,30 @@ def _first_rig(
         for a, b in combinations(sorted(cameras), 2)
         if (found := relative_pose(cameras[b], views[b], poses[a], poses[b])) is not None
     }
-    placed = join_rig(sorted(cameras), edges)
+    placed = join_rig(sorted(cameras), edges) if edges or len(cameras) == 1 else {}
     for name in sorted(set(cameras) - set(placed)):
-        shared = {o for o in placed if set(poses[name]) & set(poses[o])}
-        dropped[name] = (
-            f"its board poses agree with no other camera's though it shares frames with "
-            f"{len(shared)}: not synchronised, or wrong corners"
-            if shared
-            else "it shares no board image with the other cameras"
+        dropped[name] = _why_apart(name, placed or cameras, views)
+    _require(placed, dropped)
+    if not any(seen_from_front(view) for name in placed for view in views[name].values()):
+        raise CalibrationError(
+            f"all board images of {', '.join(sorted(placed))} are mirrored: switch mirroring off"
+            " where the pictures are recorded; if the print itself is mirrored, print it anew"
         )
     boards = rig_from_boards(placed, cameras, views, poses)
     return BoardRig({n: replace(cameras[n], cam_from_world=T) for n, T in placed.items()}, boards)
+
+
+def _why_apart(name: str, others: Collection[str], views: Views) -> str:
+    """Say why a camera cannot be tied to others."""
+    shared = [o for o in others if o != name and set(views[o]) & set(views[name])]
+    if not shared:
+        return "it shares no board image with the other cameras"
+    apart = (
+        f"its board poses agree with no other camera's though it shares frames with {len(shared)}: "
+    )
+    if not any(seen_from_front(view) for view in views[name].values()):
+        return apart + "its images are mirrored; switch that off where they are recorded"
+    return apart + "not synchronised, or wrong corners"
 
 
 def _refine(
@@ -198,7 +207,7 @@ def _refine(
         # An image with fewer than six kept corners does not hold a board pose.
         image = corners.camera * len(corners.frames) + corners.frame
         keep &= np.bincount(image[keep], minlength=image.max(initial=0) + 1)[image] >= 6
-        rig = _drop_cameras(rig, corners, keep, number, dropped)
+        rig = _drop_cameras(rig, corners, keep, dropped)
         _require(rig.cameras, dropped)
         keep &= np.array([name in rig.cameras for name in corners.cameras])[corners.camera]
         kept = corners.select(keep)
@@ -246,28 +255,28 @@ def _simplest_models(
 
 
 def _drop_cameras(
-    rig: BoardRig, corners: BoardCorners, keep: np.ndarray, number: int, dropped: dict[str, str]
+    rig: BoardRig, corners: BoardCorners, keep: np.ndarray, dropped: dict[str, str]
 ) -> BoardRig:
-    """Drop cameras that lost most of their corners to rejection."""
+    """Drop cameras that the corners left by rejection do not determine."""
     cameras = {}
     for index, name in enumerate(corners.cameras):
         if name not in rig.cameras:
             continue
         mine = corners.camera == index
-        share = keep[mine].mean()
-        # Before the first adjustment the guess is coarse: only cameras with hardly any corner go.
-        if share < (0.5 if number else 0.05) or keep[mine].sum() < 24:
+        used, images = int(keep[mine].sum()), len(set(corners.frame[mine & keep]))
+        if used < LEAST_CORNERS or images < MIN_FRAMES:
             dropped[name] = (
-                f"only {keep[mine].sum()} of its {mine.sum()} corners fit the other cameras: "
-                "wrong corners, not synchronised, or moved during the recording"
+                f"only {used} of its {mine.sum()} corners, in {images} images, fit the other"
+                f" cameras, expected {LEAST_CORNERS} in {MIN_FRAMES}: wrong corners, not"
+                " synchronised, or moved during the recording"
             )
         else:
             cameras[name] = rig.cameras[name]
     return BoardRig(cameras, rig.boards)
 
 
-def _weak(rig: BoardRig, kept: BoardCorners) -> dict[str, str]:
-    """Name cameras whose corners are few, cover little of the image or tie to few others."""
+def _weak(rig: BoardRig, found: BoardCorners, kept: BoardCorners) -> dict[str, str]:
+    """Name cameras whose corners are few or bad, cover little of the image or tie to few others."""
     weak = {}
     seen = {name: set(kept.frame[kept.camera == kept.cameras.index(name)]) for name in rig.cameras}
     for name, camera in sorted(rig.cameras.items()):
@@ -276,7 +285,13 @@ def _weak(rig: BoardRig, kept: BoardCorners) -> dict[str, str]:
         covered = len(np.unique(cells, axis=0)) / 16
         shared = {f for other, frames in seen.items() if other != name for f in frames}
         tied = len(seen[name] & shared)
-        if mine.sum() < WEAK_CORNERS:
+        of = int((found.camera == found.cameras.index(name)).sum())
+        if 2 * mine.sum() < of:
+            weak[name] = (
+                f"only {int(mine.sum())} of its {of} corners fit the other cameras and are used:"
+                " not synchronised, moved during the recording, or wrong corners"
+            )
+        elif mine.sum() < WEAK_CORNERS:
             weak[name] = f"{int(mine.sum())} corners, expected {WEAK_CORNERS} or more"
         elif len(rig.cameras) > 1 and tied < WEAK_FRAMES:
             weak[name] = f"{tied} board images shared, expected {WEAK_FRAMES} or more"

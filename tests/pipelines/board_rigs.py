@@ -55,16 +55,21 @@ def board_motion(
 
 
 def observe(
-    rig: dict[str, Camera], boards: list[np.ndarray], noise_px: float, seed: int = 0
+    rig: dict[str, Camera],
+    boards: list[np.ndarray],
+    noise_px: float,
+    seed: int = 0,
+    both_sides: bool = False,
 ) -> BoardCorners:
-    """Corners in view from the print's side, with normal noise."""
+    """Corners in view from the print's side, or from both, with normal noise."""
     rng = np.random.default_rng(seed)
     rows = []
     for number, board in enumerate(boards):
         world = POINTS @ board[:3, :3].T + board[:3, 3]
         for name, camera in rig.items():
             towards = camera.center - world.mean(0)
-            if towards @ board[:3, 2] > -0.3 * np.linalg.norm(towards):
+            slope = towards @ board[:3, 2] / np.linalg.norm(towards)
+            if (-abs(slope) if both_sides else slope) > -0.3:
                 continue
             pixels, _ = project(camera, world)
             seen = ((pixels > 0) & (pixels < (camera.width, camera.height))).all(axis=1)

@@ -88,13 +88,59 @@ def test_bad_corners_do_not_move_the_rig() -> None:
     assert np.linalg.norm(solution.errors, axis=1).max() < 2.0
 
 
+def mirrored(observations: BoardCorners, *cameras: str) -> BoardCorners:
+    """The observations with the pictures of some cameras mirrored."""
+    for camera in cameras:
+        observations = changed(observations, camera, lambda p: p * [-1, 1] + [640, 0])
+    return observations
+
+
 def test_mirrored_images_are_named() -> None:
     rig = make_rig(4)
-    observations = observe(rig, board_motion(20, 5), 0.1)
-    mirrored = changed(observations, "cam02", lambda p: p * [-1, 1] + [640, 0])
-    solution = solve(rig, mirrored)
+    solution = solve(rig, mirrored(observe(rig, board_motion(20, 5), 0.1), "cam02"))
     assert "mirrored" in solution.dropped["cam02"]
     assert sorted(solution.cameras) == ["cam00", "cam01", "cam03"]
+    assert rig_errors(solution.cameras, rig)[0] < 0.1
+
+
+def test_a_rig_that_is_mirrored_as_a_whole_is_refused_in_one_line() -> None:
+    rig = make_rig(3)
+    with pytest.raises(CalibrationError, match="cam00, cam01, cam02 are mirrored") as error:
+        solve(rig, mirrored(observe(rig, board_motion(20, 5), 0.1), *rig))
+    assert "\n" not in str(error.value)
+
+
+def test_cameras_behind_a_board_that_is_printed_on_both_sides_are_tied_in() -> None:
+    rig = make_rig(6, span_deg=360)
+    solution = solve(rig, observe(rig, board_motion(30, 13, span_deg=120), 0.1, both_sides=True))
+    assert not solution.dropped and rig_errors(solution.cameras, rig)[0] < 0.1
+
+
+def test_a_rig_whose_every_camera_is_out_of_step_is_refused_in_one_line() -> None:
+    rig = make_rig(4)
+    observations = observe(rig, board_motion(24, 7), 0.1)
+    late = (observations.frame + 5 * observations.camera) % 24
+    with pytest.raises(CalibrationError, match="cam00, .*, cam03: .* not synchronised") as error:
+        solve(rig, replace(observations, frame=late))
+    assert "\n" not in str(error.value)
+
+
+def test_a_board_that_two_cameras_see_calibrates_these_and_names_the_others() -> None:
+    rig = make_rig(4)
+    observations = observe(rig, board_motion(24, 7), 0.1)
+    solution = solve(rig, observations.select(np.isin(observations.camera, [1, 2])))
+    assert sorted(solution.cameras) == ["cam01", "cam02"]
+    assert all("in 0 images" in solution.dropped[name] for name in ("cam00", "cam03"))
+
+
+def test_a_camera_stays_where_some_of_its_images_fit() -> None:
+    rig = make_rig(4)
+    observations = observe(rig, board_motion(40, 14), 0.1)
+    late = (observations.camera == 1) & (observations.frame % 5 < 3)
+    shifts = np.random.default_rng(0).normal(size=(40, 2)) * 12
+    pixels = observations.pixels + late[:, None] * shifts[observations.frame]
+    solution = solve(rig, replace(observations, pixels=pixels))
+    assert not solution.dropped and "corners fit the other cameras" in solution.weak["cam01"]
     assert rig_errors(solution.cameras, rig)[0] < 0.1
 
 
@@ -171,6 +217,20 @@ def test_corners_of_an_image_are_found_to_a_fraction_of_a_pixel() -> None:
     # A forgotten half pixel would show as a mean of 0.5.
     assert np.abs(errors.mean(axis=0)).max() < 0.02
     assert np.sqrt(np.mean(np.sum(errors**2, axis=1))) < 0.08
+
+
+@pytest.mark.parametrize("negative", [False, True])
+@pytest.mark.parametrize("mirror", [False, True])
+def test_white_on_black_and_mirrored_boards_are_found(negative: bool, mirror: bool) -> None:
+    rig = make_rig(1, focal=500.0)
+    board = board_motion(1, 12, shift=0.0)[0]
+    image = render_board(rig["cam00"], board)
+    image = 255 - image if negative else image
+    ids, pixels = detect_corners(image[:, :: -1 if mirror else 1], make_detector(BOARD), BOARD)
+    pixels = pixels * [-1, 1] + [640, 0] if mirror else pixels
+    true = observe(rig, [board], 0.0)
+    off = pixels - np.array([true.pixels[true.corner == i][0] for i in ids])
+    assert len(ids) >= 50 and np.sqrt(np.mean(np.sum(off**2, axis=1))) < 0.1
 
 
 def test_board_points_are_opencvs() -> None:
