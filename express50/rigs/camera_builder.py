@@ -115,7 +115,8 @@ def finite_array(value: object, shape: tuple[int, ...], what: str) -> np.ndarray
     except (TypeError, ValueError, OverflowError):
         array = np.zeros(0)
     if array.shape != shape or not (np.abs(array) < LARGEST).all():
-        raise CalibrationError(f"{what} of shape {array.shape}, expected {shape}, finite")
+        got = "nothing" if value is None else f"shape {array.shape}"
+        raise CalibrationError(f"{what}: got {got}, expected {shape}, finite; export it again")
     return array
 
 

@@ -239,7 +239,7 @@ def test_a_metashape_chunk_without_a_world_is_its_own(tmp_path):
         ("caliscope", "[cameras.0]", "[cameras.0", "not TOML"),
         ("aniposelib", 'name = "cam01"', 'name = "cam00"', "two cameras are called cam00"),
         ("aniposelib", "[cam_1]", "[cam_1]\nfisheye = true", "cam_1.*fisheye.*undistort"),
-        ("aniposelib", "rotation = [", "rotation = [9.0, ", r"shape \(4,\), expected \(3,\)"),
+        ("aniposelib", "rotation = [", "rotation = [9.0, ", r"got shape \(4,\), expected \(3,\)"),
         ("kalibr", "model: radtan", "model: equidistant", "cam0: model pinhole-equidistant"),
         ("kalibr", "cam1:", "cam7:", "without a gap"),
         ("kalibr", "T_cn_cnm1:\n  - [", "T_cn_cnm1:\n  - [.nan, ", "cam1 has T_cn_cnm1"),
@@ -273,7 +273,7 @@ def test_damage_is_one_clear_error(tmp_path, tool, old, new, words):
 def test_arrays_of_another_shape_and_missing_sizes_are_named(tmp_path):
     path, _ = write_vggt(tmp_path)
     np.savez(path, extrinsic=np.zeros((2, 4, 4)), intrinsic=np.zeros((2, 3, 3)))
-    with pytest.raises(CalibrationError, match=r"extrinsic of shape \(2, 4, 4\)"):
+    with pytest.raises(CalibrationError, match=r"extrinsic: got shape \(2, 4, 4\)"):
         read_rig(path)
     np.savez(path, extrinsic=np.zeros((2, 3, 4)))
     with pytest.raises(CalibrationError, match="has no intrinsic"):
