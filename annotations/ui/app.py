@@ -23,7 +23,9 @@ from annotations.ui.picture import (
     Aim,
     PicturePane,
     camera_name,
+    other_cameras,
     reference_look,
+    second_look,
     shots_ahead,
     strip_content,
     subject_look,
@@ -41,6 +43,7 @@ SLOWEST, FASTEST = 2.0, 30.0  # frames per second that are played
 # Rows of the strip by the terminal's height: pictures come first.
 _STRIP_ROWS = ((18, 3), (30, 5), (45, 7))
 _TALLEST_STRIP = 9
+LEAST_COLUMNS = 90  # of a terminal that shows three pictures: in narrower ones faces are too small
 
 
 class Desk(Screen[None]):
@@ -72,12 +75,14 @@ class Desk(Screen[None]):
         self._said: Text | None = None
 
     def compose(self) -> ComposeResult:
-        """Yield status, words, two pictures, strip, and a line for messages and hints."""
+        """Yield status, words, pictures, strip, and a line for messages and hints."""
         yield Static(id="status")
         yield Static(id="words")
         with Horizontal(id="panes"):
-            for name, side in (("frame", "left"), ("reference", "right")):
-                with Vertical(classes="pane", id=side):
+            sides = ("frame", "left"), ("second", "middle"), ("reference", "right")
+            for name, side in sides:
+                with Vertical(classes="pane", id=side) as pane:
+                    pane.display = name != "second"
                     yield Static(id=f"{name}-title", classes="title")
                     cell = self._sixel_cell
                     painter = Painter() if cell is None else SixelPainter(cell)
@@ -131,11 +136,30 @@ class Desk(Screen[None]):
             shown = "the frame" if swapped is None else "the reference"
             title = Text(f" blink: {shown}  (any key stops)", style=f"bold {theme.ACCENT}")
         self._write("#frame-title", title)
+        self._draw_second(scene, view)
         content = None
         if view is not None:
             content = strip_content(scene, view, self.session.hidden(scene.task))
-            self.cache.want(shots_ahead(scene, view, self.aim, picture.shape))
+            self.cache.want(shots_ahead(scene, view, self.aim, self._shapes()))
         self.query_one(CurveStrip).show(content)
+
+    def _draw_second(self, scene: TaskScene, view: CueView | None) -> None:
+        """Show the second camera where it is asked for and the terminal is wide enough."""
+        pane = self.query_one("#middle")
+        shown = self.aim.two and self.app.size.width >= LEAST_COLUMNS
+        if pane.display != shown:
+            pane.display = shown
+            self.call_after_refresh(self.draw)  # the other panes' widths change
+        if shown:
+            look = None if view is None else second_look(scene, view, self.aim)
+            picture = self.query_one("#second", PicturePane)
+            picture.show(look, f"{scene.task.subject} has no second camera")
+            self._write("#second-title", words.second_title(look, picture.size.width))
+
+    def _shapes(self) -> list[PaneShape]:
+        """Return the shapes of the panes that show the subject."""
+        shown = ["#frame", "#second"] if self.query_one("#middle").display else ["#frame"]
+        return [self.query_one(name, PicturePane).shape for name in shown]
 
     def _draw_status(self) -> None:
         if self.scene is not None:
@@ -178,17 +202,17 @@ class Desk(Screen[None]):
         if scene.problem or scene.notes:
             self.say(scene.problem or " · ".join(scene.notes), theme.ACCENT)
         ahead = [self.session.tasks[n] for n in self.session.following(TASKS_AHEAD)]
-        self._prepare(ahead, self.query_one("#frame", PicturePane).shape)
+        self._prepare(ahead, self._shapes())
 
     @work(thread=True, exclusive=True, group="ahead")
-    def _prepare(self, tasks: list[LabelTask], shape: PaneShape) -> None:
+    def _prepare(self, tasks: list[LabelTask], shapes: list[PaneShape]) -> None:
         """Read the next tasks, find their faces and ask for their pictures."""
         shots: list[FrameCrop] = []
         for task in tasks:
             scene = load_scene(self.session.dataset, task, self.session.annotator)
             view = view_of_scene(scene, self.session.hidden(task))
             if view is not None:
-                shots += shots_ahead(scene, view, self.aim, shape, FRAMES_AHEAD)
+                shots += shots_ahead(scene, view, self.aim, shapes, FRAMES_AHEAD)
         self.cache.want(shots, later=True)
 
     # Moves and looks
@@ -227,6 +251,26 @@ class Desk(Screen[None]):
             number = (self.aim.camera + by) % len(self.scene.cameras)
             self.aim = self.aim._replace(camera=number)
             self.draw()
+
+    def action_second(self) -> None:
+        """Show a second camera beside the frame, or stop."""
+        self._aim_second(not self.aim.two, self.aim.second)
+
+    def action_next_second(self) -> None:
+        """Choose another second camera."""
+        if self.scene is not None:
+            others = other_cameras(self.scene, self.aim) or [self.aim.second]
+            self._aim_second(True, others[self.aim.two % len(others)])
+
+    def _aim_second(self, two: bool, camera: str) -> None:
+        self.aim = self.aim._replace(two=two, second=camera)
+        width = self.app.size.width
+        if two and width < LEAST_COLUMNS:
+            self.say(
+                f"a second camera needs {LEAST_COLUMNS} columns, this terminal has {width}",
+                theme.ACCENT,
+            )
+        self.draw()
 
     def action_play(self) -> None:
         """Play the window, or stop."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -95,11 +96,16 @@ AHEAD = 64  # frames about the cursor that are decoded before they are asked for
 
 
 class Aim(NamedTuple):
-    """The view of both pictures: camera (counted from the best), zoom, finder of faces."""
+    """The view of the pictures: camera (counted from the best), zoom, finder of faces.
+
+    ``two`` asks for a second camera, of which ``second`` is the id that was chosen last.
+    """
 
     camera: int
     zoom: str
     faces: FaceFinder | None
+    two: bool = False
+    second: str = ""
 
 
 def camera_name(scene: TaskScene, number: int) -> str:
@@ -107,13 +113,28 @@ def camera_name(scene: TaskScene, number: int) -> str:
     return scene.cameras[number % len(scene.cameras)] if scene.cameras else ""
 
 
-def subject_look(scene: TaskScene, view: CueView, aim: Aim) -> FrameLook | None:
-    """Look at the frame under the cursor; None without footage."""
+def other_cameras(scene: TaskScene, aim: Aim) -> list[str]:
+    """List the cameras that can stand beside the first one, beginning with the chosen one."""
+    others = [name for name in scene.cameras if name != camera_name(scene, aim.camera)]
+    start = others.index(aim.second) if aim.second in others else 0
+    return others[start:] + others[:start]
+
+
+def second_look(scene: TaskScene, view: CueView, aim: Aim) -> FrameLook | None:
+    """Look at the frame under the cursor in the second camera; None where there is only one."""
+    others = other_cameras(scene, aim)
+    return subject_look(scene, view, aim, others[0]) if others else None
+
+
+def subject_look(
+    scene: TaskScene, view: CueView, aim: Aim, camera: str | None = None
+) -> FrameLook | None:
+    """Look at the frame under the cursor, in the aim's camera or another; None without footage."""
     if scene.index is None:
         return None
     # One framing for the whole window, so that only the face moves when one steps.
     anchor = view.candidates[0] if view.candidates else (view.first + view.last) // 2
-    look = _look(aim, scene.index, camera_name(scene, aim.camera), anchor)
+    look = _look(aim, scene.index, camera or camera_name(scene, aim.camera), anchor)
     return replace(look, frame=view.cursor)
 
 
@@ -144,15 +165,25 @@ def frames_ahead(view: CueView, count: int = AHEAD) -> list[int]:
 
 
 def shots_ahead(
-    scene: TaskScene, view: CueView, aim: Aim, shape: PaneShape, count: int = AHEAD
+    scene: TaskScene,
+    view: CueView,
+    aim: Aim,
+    shapes: Sequence[PaneShape],
+    count: int = AHEAD,
 ) -> list[FrameCrop]:
-    """Return pictures to decode for a task, most urgent first; finds the faces on the way."""
-    here, there = subject_look(scene, view, aim), reference_look(scene, aim)
-    shots = []
-    if here is not None:
-        shots = [shot_of(replace(here, frame=n), shape) for n in frames_ahead(view, count)]
+    """Return pictures to decode for a task, most urgent first; finds the faces on the way.
+
+    ``shapes`` are of the frame's pane and, while it is shown, of the second camera's.
+    """
+    looks = [subject_look(scene, view, aim)]
+    if len(shapes) > 1:
+        looks.append(second_look(scene, view, aim))
+    shown = [(look, shape) for look, shape in zip(looks, shapes, strict=True) if look is not None]
+    frames = frames_ahead(view, count)
+    shots = [shot_of(replace(look, frame=n), shape) for n in frames for look, shape in shown]
+    there = reference_look(scene, aim)
     if there is not None:
-        shots.insert(1, shot_of(there, shape))
+        shots.insert(len(shown), shot_of(there, shapes[0]))
     return shots
 
 

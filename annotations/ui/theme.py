@@ -42,8 +42,8 @@ Screen {{ background: {GROUND}; color: {TEXT}; layout: vertical; }}
 .title {{ background: {GROUND}; }}
 #panes {{ height: 1fr; }}
 .pane {{ width: 1fr; height: 100%; }}
-#right {{ margin-left: 1; }}
-#frame, #reference {{ width: 100%; height: 1fr; }}
+#middle, #right {{ margin-left: 1; }}
+#frame, #second, #reference {{ width: 100%; height: 1fr; }}
 #strip {{ width: 100%; height: 5; }}
 ModalScreen {{ align: center middle; background: {GROUND} 60%; }}
 .dialog {{
@@ -107,6 +107,8 @@ LOOK = (
     KeyAction("Z", "Z", "zoom(-1)", "zoom the other way"),
     KeyAction("c", "c", "camera(1)", "next camera, in both pictures"),
     KeyAction("C", "C", "camera(-1)", "previous camera"),
+    KeyAction("s", "s", "second", "second camera, same moment; or not"),
+    KeyAction("S", "S", "next_second", "another second camera"),
     KeyAction("b", "b", "blink", "blink: reference and frame in one place"),
     KeyAction("space", "Space", "play", "play the window, or stop"),
     KeyAction("question_mark,f1", "?", "help", "this help"),
@@ -116,6 +118,6 @@ GROUPS = (MOVE, DECIDE, LOOK)
 HINTS = (
     ("←→", "frame"), ("⇧←→", "ten"), ("Tab", "suggestion"), ("Enter", "mark, next"),
     ("[ ]", "plateau"), ("f", "flag"), ("u", "undo"), ("n p", "task"), ("z", "zoom"),
-    ("c", "camera"), ("b", "blink"), ("Space", "play"), ("g", "go to"), ("?", "help"),
-    ("q", "quit"),
+    ("c", "camera"), ("s", "second camera"), ("b", "blink"), ("Space", "play"), ("g", "go to"),
+    ("?", "help"), ("q", "quit"),
 )  # fmt: skip

@@ -64,18 +64,28 @@ def frame_title(scene: TaskScene, view: CueView | None, look: FrameLook | None, 
     """Write the title of the left picture: position, and tags of this very frame."""
     if look is None or view is None:
         return Text(f" {scene.task.subject}", style=theme.FAINT)
-    left = Text.assemble(
-        (f" frame {view.cursor}", f"bold {theme.TEXT}"),
-        (f"  {view.cursor - view.first + 1} of {view.last - view.first + 1}", theme.FAINT),
-    )
+    tags = Text()
     if view.cursor in view.candidates:
         rank = view.candidates.index(view.cursor) + 1
-        left.append("  suggested" if rank == 1 else f"  suggestion {rank}", theme.GREEN)
+        tags.append("  suggested" if rank == 1 else f"  suggestion {rank}", theme.GREEN)
     if scene.mine is not None and scene.mine.action == "flag":
-        left.append(f"  ⚑ {scene.mine.reason}", theme.RED)
+        tags.append(f"  ⚑ {scene.mine.reason}", theme.RED)
     elif scene.mine is not None and scene.mine.frame == view.cursor:
-        left.append("  ● your mark", theme.BLUE)
-    return fit(left, Text(f"{look.camera} {look.zoom} ", style=theme.FAINT), width)
+        tags.append("  ● your mark", theme.BLUE)
+    left = Text.assemble((f" frame {view.cursor}", f"bold {theme.TEXT}"))
+    place = f"  {view.cursor - view.first + 1} of {view.last - view.first + 1}"
+    right = Text(f"{look.camera} {look.zoom} ", style=theme.FAINT)
+    if left.cell_len + len(place) + tags.cell_len + right.cell_len < width:
+        left.append(place, theme.FAINT)
+    return fit(left.append_text(tags), right, width)
+
+
+def second_title(look: FrameLook | None, width: int) -> Text:
+    """Write the title of the middle picture: the second camera's id."""
+    if look is None:
+        return Text(" second camera", style=theme.FAINT)
+    left = Text.assemble((f" {look.camera}", f"bold {theme.TEXT}"))
+    return fit(left, Text("the same moment ", style=theme.FAINT), width)
 
 
 def reference_title(scene: TaskScene, look: FrameLook | None, width: int) -> Text:

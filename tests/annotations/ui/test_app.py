@@ -3,13 +3,15 @@
 import asyncio
 import json
 import shutil
+from dataclasses import replace
 
 import pytest
 from rich.text import Text
 
 from annotations.labels import append_label, current_labels, make_mark, read_labels
 from annotations.ui import app as app_module
-from annotations.ui.picture import PicturePane
+from annotations.ui.picture import Aim, PicturePane, other_cameras
+from annotations.ui.task import TaskScene
 from annotations.ui.theme import GROUPS
 from annotations.ui.timeline import CurveStrip
 from annotations.ui.words import fit, hint_line
@@ -210,6 +212,70 @@ def test_looking_keys_do_not_label(suggested, make_app, monkeypatch):
             await pilot.press("question_mark", "x")
 
     asyncio.run(run())
+
+
+def test_a_second_camera_shows_the_same_moment(suggested, make_app):
+    app = make_app(suggested)
+
+    def panes(app):
+        names = ("frame", "second", "reference")
+        looks = [app.desk.query_one(f"#{name}", PicturePane).look for name in names]
+        widths = [app.desk.query_one(f"#{name}").size.width for name in names]
+        return app.desk.query_one("#middle").display, looks, widths
+
+    async def run():
+        async with app.run_test(size=(110, 30)) as pilot:
+            await pilot.pause()
+            assert not panes(app)[0]
+            await pilot.press("s", "right", "right")
+            await pilot.pause()
+            shown, (frame, second, _), widths = panes(app)
+            assert shown and max(widths) - min(widths) <= 1
+            assert (frame.camera, second.camera, frame.frame, second.frame) == (
+                "cam01", "cam00", 6, 6,
+            )  # fmt: skip
+            assert line(app, "second-title").split() == ["cam00", "the", "same", "moment"]
+            await pilot.press("c")  # the first camera takes the second one's place
+            assert [look.camera for look in panes(app)[1][:2]] == ["cam00", "cam01"]
+            await pilot.press("enter")  # the next task: the choice stays
+            await pilot.pause()
+            shown, (frame, second, _), _ = panes(app)
+            assert shown and (frame.frame, second.frame) == (20, 20)
+            assert frame.camera != second.camera
+            await pilot.resize_terminal(80, 24)
+            await pilot.pause()
+            async with asyncio.timeout(30):
+                while panes(app)[0]:
+                    await pilot.pause(0.01)
+            await pilot.press("s", "s")
+            assert "needs 90 columns, this terminal has 80" in line(app, "message")
+            await pilot.resize_terminal(110, 30)
+            async with asyncio.timeout(30):
+                while not panes(app)[0]:
+                    await pilot.pause(0.01)
+            await pilot.press("s")
+            assert not panes(app)[0]
+
+    asyncio.run(run())
+    (label,) = labels(suggested)
+    assert label.camera == "cam00"  # the mark names the first camera
+
+
+def test_the_second_camera_is_chosen_among_the_others(suggested, make_app):
+    scene = TaskScene(task=None, name="", description="", cameras=("a", "b", "c"))
+    aim = Aim(1, "face", None)
+    assert other_cameras(scene, aim) == ["a", "c"]
+    assert other_cameras(scene, aim._replace(second="c")) == ["c", "a"]
+    assert other_cameras(scene, aim._replace(second="b")) == ["a", "c"]
+    app = make_app(suggested)
+
+    def alone(app):
+        app.desk.scene = replace(app.desk.scene, cameras=("cam01",))
+        app.desk.action_next_second()
+        picture = app.desk.query_one("#second", PicturePane)
+        return picture.look, line(app, "second-title")
+
+    assert drive(app, "s", size=(110, 30), check=alone) == (None, " second camera")
 
 
 def test_play_stops_at_the_end_of_the_window_and_restarts(suggested, make_app, monkeypatch):
