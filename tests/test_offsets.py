@@ -1,15 +1,20 @@
-"""Static offsets go with the shards, once a subject, and the trainer's mesh is the tracked one."""
+"""Offsets and registered meshes go with the shards; the trainer's mesh is the tracked one."""
 
 from __future__ import annotations
+
+import json
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
+from express50.dataset.tracks import REGISTRATION_SCHEMA
 from express50.errors import FormatError
+from express50.files.digests import file_sha256
 from express50.head.load import load_head
-from express50.shards.reader import ShardReader
-from express50.shards.writer import verify
+from express50.shards.reader import ShardReader, write_registered
+from express50.shards.writer import copy_samples, verify
 from grmm.checkpoint import Gallery, load_checkpoint, save_checkpoint
 from grmm.data import HeadViews, pose_state
 from grmm.edit import interpolate_tracked, transfer
@@ -26,7 +31,11 @@ from tests.pipelines.bump_dataset import make_dataset, published
 
 @pytest.fixture(scope="module")
 def packed(tmp_path_factory):
-    """Folder of shards, and the arrays of the one track with offsets; S002 has none."""
+    """Folder of shards, and the arrays of the one track with offsets; S002 has none.
+
+    S001's smile is registered; the registration of its neutral face is of another track, that of
+    S002's is damaged.
+    """
     dataset = make_dataset(tmp_path_factory.mktemp("offsets"), ("S001", "S002"), cameras=3, size=64)
     published(dataset, DEPTH, DepthConfig(voxel_mm=8, use_track=False))
     arrays = track_arrays("procedural", turn=0.1)
@@ -34,9 +43,29 @@ def packed(tmp_path_factory):
     arrays["t"] -= arrays["vertices"].mean(1)
     vertices = world_vertices(load_head("procedural"), arrays, arrays["offsets"])
     arrays["vertices"] = vertices.astype(np.float32)
-    write_track(dataset.track_file("S001"), arrays)
+    path = write_track(dataset.track_file("S001"), arrays)
+    for item, track in (("S001/smile", file_sha256(path)), ("S001/neutral", "0" * 64)):
+        write_registration(dataset.registration_file(*item.split("/")), track)
+    damaged = dataset.registration_file("S002", "neutral")
+    damaged.parent.mkdir(parents=True)
+    damaged.write_bytes(b"PK")
     published(dataset, PACK, PackConfig(size=32, test_subjects=("S002",)))
     return dataset.item_dir("pack", "shards"), arrays
+
+
+def write_registration(path: Path, track: str) -> None:
+    """Write numbers in the form of a registration of a track's digest."""
+    rng, count = np.random.default_rng(3), len(load_head("procedural").template)
+    arrays = {
+        name: rng.uniform(-0.015, 0.015, (count, 3)).astype(np.float32)
+        for name in ("vertices", "offsets")
+    }
+    sigma = rng.uniform(4e-4, 3e-3, count).astype(np.float32)
+    path.parent.mkdir(parents=True)
+    np.savez(
+        path, schema=REGISTRATION_SCHEMA, track=track, residual=0 * sigma, sigma=sigma,
+        seen=sigma < 1e-3, **arrays,
+    )  # fmt: skip
 
 
 def test_rebuilt_vertices_are_the_tracked_ones(packed) -> None:
@@ -87,6 +116,69 @@ def test_offsets_are_stored_once_a_subject_and_checked(packed, tmp_path) -> None
         path.write_bytes(good)
     with pytest.raises(FormatError, match="expected letters"):
         reader.offsets("../S001")
+
+
+def test_registered_meshes_are_packed_and_others_are_named(packed) -> None:
+    root, _ = packed
+    reader = ShardReader(root)
+    given = np.load(root.parents[1] / "register" / "S001" / "smile" / "registration.npz")
+    ((name, (offsets, sigma)),) = reader.registered("S001").items()
+    assert name == "smile"
+    np.testing.assert_allclose(offsets, given["offsets"], atol=4e-6)
+    np.testing.assert_allclose(sigma, given["sigma"], atol=1e-6)
+    told = {tuple(key.split("_")[:2]): reader.meta(n) for n, key in enumerate(reader.keys)}
+    assert [k for k, meta in told.items() if meta["track"]["registered"]] == [("S001", "smile")]
+    assert not (root / "S002.registered.npz").exists()
+    metrics = json.loads((root / "metrics.json").read_text())
+    assert metrics["registered"] == 3 and metrics["kept"] == 12
+    assert "| registered mesh | 3 of 12 samples |" in (root / "card.md").read_text()
+    why = {row["what"]: row["why"] for row in metrics["warnings"]}
+    assert "of another track; run 'express50 register' again" in why["S001/neutral"]
+    assert "not a registration" in why["S002/neutral"]
+
+
+def test_damaged_registered_meshes_are_one_clear_error(packed, tmp_path) -> None:
+    good = {
+        "expressions": np.array(["smile"]),
+        "offsets": np.zeros((1, 5, 3), np.float16),
+        "sigma": np.ones((1, 5), np.float16),
+    }
+    changes = (
+        ({"sigma": np.ones((1, 4), np.float16)}, r"sigma has shape \(1, 4\), expected \(1, 5\)"),
+        (
+            {"offsets": np.full((1, 5, 3), np.nan, np.float16)},
+            "offsets has 15 values that are not finite",
+        ),
+        ({"sigma": np.full((1, 5), "x")}, "sigma is <U1, expected numbers"),
+        ({"expressions": np.array("smile")}, r"expressions has shape \(\)"),
+    )
+    for change, words in changes:
+        np.savez(tmp_path / "S001.registered.npz", **(good | change))
+        with pytest.raises(FormatError, match=f"S001.registered.npz: {words}.*express50 pack"):
+            ShardReader(tmp_path, ()).registered("S001")
+    with pytest.raises(FormatError, match=r"S002.registered.npz: not registered meshes"):
+        ShardReader(tmp_path, ()).registered("S002")
+
+
+def test_copied_samples_keep_what_lies_beside_their_shards(packed, tmp_path) -> None:
+    root, _ = packed
+    names = ("S001.offsets.npy", "S001.registered.npz")
+    parts = []
+    for expression in ("neutral", "smile"):
+        parts.append(tmp_path / expression)
+        copy_samples([ShardReader(root).select(expressions=[expression])], parts[-1], 1)
+    copy_samples([ShardReader(part) for part in parts], tmp_path / "merged", 1)
+    for name in names:
+        assert (tmp_path / "merged" / name).read_bytes() == (root / name).read_bytes()
+    assert verify(tmp_path / "merged") == []
+    write_registered(parts[0], "S001", {"neutral": (np.zeros((5, 3)), np.ones(5))})
+    with pytest.raises(FormatError, match=r"differs from the other folder's S001.registered.npz"):
+        copy_samples([ShardReader(part) for part in parts], tmp_path / "again", 1)
+    (parts[1] / names[1]).unlink()
+    with pytest.raises(FormatError, match=r"S001.registered.npz: is missing"):
+        copy_samples([ShardReader(parts[1])], tmp_path / "again", 1)
+    (parts[0] / names[1]).unlink()  # its samples need none
+    assert copy_samples([ShardReader(parts[0])], tmp_path / "fewer", 1) == 6
 
 
 def test_checkpoints_transfer_and_interpolation_keep_offsets(packed, tmp_path) -> None:

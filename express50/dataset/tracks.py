@@ -182,21 +182,34 @@ def read_registration(path: Path) -> Registration:
         raise FormatError(f"{path}: not a registration ({words}); {again}") from None
 
 
+def registration_of(
+    dataset: Dataset, subject: str, track: Track, expression: str
+) -> Registration | None:
+    """Return an expression's registration; None where there is none.
+
+    Raises:
+        FormatError: it is damaged, or of another track.
+    """
+    path = dataset.registration_file(subject, expression)
+    if not path.is_file():
+        return None
+    found, digest = read_registration(path), file_sha256(dataset.track_file(subject))
+    if found.track != digest or found.vertices.shape != track.vertices.shape[1:]:
+        raise FormatError(f"{path}: is of another track; run 'express50 register' again")
+    return found
+
+
 def best_vertices(dataset: Dataset, subject: str, track: Track) -> np.ndarray:
     """Return the vertices (E, V, 3) float32 of a subject's track, registered ones where they are.
 
     Raises:
         FormatError: a registration is damaged, or of another track.
     """
-    vertices, digest = track.vertices.copy(), file_sha256(dataset.track_file(subject))
+    vertices = track.vertices.copy()
     for row, expression in enumerate(track.expressions):
-        path = dataset.registration_file(subject, expression)
-        if not path.is_file():
-            continue
-        found = read_registration(path)
-        if found.track != digest or found.vertices.shape != vertices[row].shape:
-            raise FormatError(f"{path}: is of another track; run 'express50 register' again")
-        vertices[row] = found.vertices
+        found = registration_of(dataset, subject, track, expression)
+        if found is not None:
+            vertices[row] = found.vertices
     return vertices
 
 

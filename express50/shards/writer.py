@@ -19,7 +19,14 @@ from express50.files.atomic import folder_in_one_step, write_json
 from express50.files.digests import file_sha256
 from express50.files.text import NAME, read_json
 from express50.shards.codecs import crc32
-from express50.shards.reader import KEY, SCHEMA, SHARD_NAME, ShardReader, offsets_file
+from express50.shards.reader import (
+    KEY,
+    SCHEMA,
+    SHARD_NAME,
+    SUBJECT_FILES,
+    ShardReader,
+    subject_file,
+)
 
 BLOCK = tarfile.BLOCKSIZE
 RECORD = tarfile.RECORDSIZE
@@ -251,7 +258,7 @@ def copy_samples(readers: Sequence[ShardReader], out: Path, shard_mb: int) -> in
 
     Raises:
         FormatError: there is none, a member is damaged, `out` is not empty, or two readers hold the
-            same (subject, expression), or a subject in different splits or with different offsets.
+            same (subject, expression), or a subject in different splits or with different files.
     """
     out = out.resolve()
     if out.exists() and not out.is_dir():
@@ -276,7 +283,9 @@ def copy_samples(readers: Sequence[ShardReader], out: Path, shard_mb: int) -> in
             ]
             writer.add_group(splits[subject], samples)
         writer.close()
-        _copy_offsets(readers, aside)
+        for reader in readers:
+            for subject in sorted({entry.subject for entry in reader.entries}):
+                _copy_subject_files(reader, subject, aside)
         write_json(aside / "splits.json", names | {"chosen_by": "the shards these are made of"})
         _write_card(readers, aside)
         write_manifest(aside, writer.digests)
@@ -310,22 +319,26 @@ def _checked_splits(readers: Sequence[ShardReader]) -> dict[str, str]:
     return splits
 
 
-def _copy_offsets(readers: Sequence[ShardReader], out: Path) -> None:
-    for reader in readers:
-        for subject in sorted({entry.subject for entry in reader.entries}):
-            source, target = offsets_file(reader.root, subject), offsets_file(out, subject)
-            if not source.is_file():
-                first = next(n for n, one in enumerate(reader.entries) if one.subject == subject)
-                track = reader.meta(first).get("track")
-                if isinstance(track, dict) and track.get("offsets"):
-                    reader.offsets(subject)  # raises, as its samples need them
-                continue
-            if target.exists() and target.read_bytes() != source.read_bytes():
-                raise FormatError(
-                    f"{source}: differs from the other folder's offsets of {subject}; pack this"
-                    " subject in one run"
-                )
-            shutil.copyfile(source, target)
+def _copy_subject_files(reader: ShardReader, subject: str, out: Path) -> None:
+    """Copy what lies beside the shards for a subject.
+
+    Raises:
+        FormatError: a file that its samples need is missing, or `out` has another one.
+    """
+    for name in SUBJECT_FILES:
+        source, target = subject_file(reader.root, subject, name), subject_file(out, subject, name)
+        if not source.is_file():
+            own = (n for n, entry in enumerate(reader.entries) if entry.subject == subject)
+            tracks = (reader.meta(number).get("track") for number in own)
+            if any(isinstance(track, dict) and track.get(Path(name).stem) for track in tracks):
+                raise FormatError(f"{source}: is missing; copy it again or rerun 'express50 pack'")
+            continue
+        if target.exists() and target.read_bytes() != source.read_bytes():
+            raise FormatError(
+                f"{source}: differs from the other folder's {target.name}; pack this subject in"
+                " one run"
+            )
+        shutil.copyfile(source, target)
 
 
 def _write_card(readers: Sequence[ShardReader], out: Path) -> None:

@@ -35,6 +35,7 @@ def inputs(dataset: Dataset, item: str, config: PackConfig) -> dict[str, Path | 
             "track": dataset.track_file(subject),
             "matte": dataset.item_dir("matte", subject),
             "depth": dataset.item_dir("depth", subject),
+            "register": dataset.item_dir("register", subject),
             "regions": dataset.item_dir("regions", subject),
         }
         found |= {f"{subject} {name}": path for name, path in parts.items() if path.exists()}
@@ -51,7 +52,7 @@ def run(dataset: Dataset, item: str, config: PackConfig, out: Path) -> Result:
 
 STAGE = Stage(
     name="pack",
-    version=9,
+    version=10,
     config=PackConfig,
     presets=PRESETS,
     items=items,

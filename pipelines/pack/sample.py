@@ -10,8 +10,15 @@ import numpy as np
 from express50.capture.frames import read_cameras_of, read_gains, read_peak_frame, read_plate_image
 from express50.capture.index import read_index, read_peaks
 from express50.contract.layout import Dataset
+from express50.contract.stage import Note
 from express50.dataset.depth_files import depth_file, read_depth
-from express50.dataset.tracks import existing_track, read_track
+from express50.dataset.tracks import (
+    Registration,
+    Track,
+    existing_track,
+    read_track,
+    registration_of,
+)
 from express50.errors import FormatError, StageError
 from express50.files.images import (
     DEPTH_LIMIT_M,
@@ -51,6 +58,8 @@ class PackedSubject:
         tracked: head-model parameters by expression.
         vertices: (V, 3) tracked mesh in the world by expression, metres.
         offsets: (V, 3) of the rest shape; None where all are 0.
+        registered: registrations by expression, where there are any of this track.
+        notes: why a registration is left out.
         meta: the fields of meta.json that all samples share.
     """
 
@@ -62,6 +71,8 @@ class PackedSubject:
     tracked: dict[str, dict]
     vertices: dict[str, np.ndarray]
     offsets: np.ndarray | None
+    registered: dict[str, Registration]
+    notes: list[Note]
     meta: dict
 
 
@@ -76,6 +87,7 @@ def read_subject(dataset: Dataset, name: str) -> PackedSubject:
     peak_rows = read_json_table(dataset.peaks_file(name), FormatError)
     track = read_track(existing_track(dataset, name))
     offsets = track.offsets if track.offsets.any() else None
+    registered, notes = _read_registered(dataset, name, track)
     shared = {"shape": track.shape.tolist(), "offsets": offsets is not None}
     return PackedSubject(
         name=name,
@@ -84,7 +96,9 @@ def read_subject(dataset: Dataset, name: str) -> PackedSubject:
         peaks=read_peaks(dataset, name),
         labels={expression: nameless(row) for expression, row in peak_rows.items()},
         tracked={
-            expression: {key: getattr(track, key)[row].tolist() for key in PARAMETERS} | shared
+            expression: {key: getattr(track, key)[row].tolist() for key in PARAMETERS}
+            | shared
+            | {"registered": expression in registered}
             for row, expression in enumerate(track.expressions)
         },
         vertices={
@@ -92,6 +106,8 @@ def read_subject(dataset: Dataset, name: str) -> PackedSubject:
             for row, expression in enumerate(track.expressions)
         },
         offsets=offsets,
+        registered=registered,
+        notes=notes,
         meta={
             "subject": name,
             "head": track.head,
@@ -101,6 +117,22 @@ def read_subject(dataset: Dataset, name: str) -> PackedSubject:
             "session": index.meta.get("session"),
         },
     )
+
+
+def _read_registered(
+    dataset: Dataset, name: str, track: Track
+) -> tuple[dict[str, Registration], list[Note]]:
+    """Read a subject's registrations by expression, and why one cannot be packed."""
+    found, notes = {}, []
+    for expression in track.expressions:
+        try:
+            registration = registration_of(dataset, name, track, expression)
+        except FormatError as error:
+            notes.append(Note(f"{name}/{expression}", f"packed without its registration: {error}"))
+            continue
+        if registration is not None:
+            found[expression] = registration
+    return found, notes
 
 
 def nameless(label: dict) -> dict:

@@ -14,7 +14,7 @@ from express50.contract.stage import Note, Result
 from express50.errors import CaptureError, FormatError, StageError
 from express50.files.atomic import write_json
 from express50.files.images import contact_sheet, write_image
-from express50.shards.reader import ShardReader, write_offsets
+from express50.shards.reader import ShardReader, write_offsets, write_registered
 from express50.shards.writer import PackedSample, ShardWriter, write_manifest
 from pipelines.pack.card import split_subjects, write_card
 from pipelines.pack.config import PackConfig
@@ -57,9 +57,8 @@ def run(dataset: Dataset, config: PackConfig, out: Path) -> Result:
         why = "; ".join(sorted({note.why for note in dropped})[:3])
         raise StageError(f"shards: none of {read} samples can be packed ({why})")
     packed = sorted({meta["subject"] for meta in metas})
-    for subject in subjects:
-        if subject.offsets is not None and subject.name in packed:
-            write_offsets(out, subject.name, subject.offsets)
+    for subject in (one for one in subjects if one.name in packed):
+        _write_subject_files(out, subject)
     how = "named" if config.test_subjects else "hash of the subject's id"
     write_json(out / "splits.json", splits | {"chosen_by": how})
     reader = ShardReader(out)
@@ -67,11 +66,13 @@ def run(dataset: Dataset, config: PackConfig, out: Path) -> Result:
     size = sum((out / shard).stat().st_size for shard in shards)
     with_parts = sum(meta["parts"] for meta in metas)
     bare = sum(meta["torso"] == "removed" for meta in metas)
+    registered = sum(meta["track"]["registered"] for meta in metas)
     statistics = {
         "picture size": f"{config.size} x {config.size}",
         "profile": config.profile,
         "labels of parts": f"{with_parts} of {len(metas)} samples",
         "torso removed": f"{bare} of {len(metas)} samples",
+        "registered mesh": f"{registered} of {len(metas)} samples",
         "shards": f"{len(shards)}, {size / 1e6:.1f} MB",
     }
     card = write_card(splits, metas, dropped, statistics, read_people(dataset, packed))
@@ -86,10 +87,12 @@ def run(dataset: Dataset, config: PackConfig, out: Path) -> Result:
         "depth_coverage": _write_contact_sheet(out, reader),
         "with_parts": with_parts,
         "torso_removed": bare,
+        "registered": registered,
     }
     reader.close()
     write_manifest(out, writer.digests)
-    return Result(metrics, dropped, warn_of_gaps(metas))
+    notes = [note for subject in subjects for note in subject.notes]
+    return Result(metrics, dropped, warn_of_gaps(metas) + notes)
 
 
 def _read_subjects(dataset: Dataset) -> tuple[list[PackedSubject], list[Note]]:
@@ -104,6 +107,14 @@ def _read_subjects(dataset: Dataset) -> tuple[list[PackedSubject], list[Note]]:
         except (StageError, FormatError, CaptureError) as error:
             dropped.append(Note(name, str(error)))
     return subjects, dropped
+
+
+def _write_subject_files(out: Path, subject: PackedSubject) -> None:
+    """Write what is stored once per subject, not with every sample."""
+    if subject.offsets is not None:
+        write_offsets(out, subject.name, subject.offsets)
+    if meshes := {name: (one.offsets, one.sigma) for name, one in subject.registered.items()}:
+        write_registered(out, subject.name, meshes)
 
 
 def _pack_group(

@@ -35,7 +35,7 @@ from express50.rigs.read import guess_format, read_rig
 from express50.runner.ledger import Ledger, Receipt
 from express50.runner.runner import run_stage
 from express50.shards.codecs import decode_picture, encode_pictures
-from express50.shards.reader import ShardReader, read_entries, write_offsets
+from express50.shards.reader import ShardReader, read_entries, write_offsets, write_registered
 from express50.shards.writer import verify, write_manifest
 from pipelines import ingest
 from tests.express50.capture.layouts import (
@@ -151,6 +151,7 @@ def _write_arrays(root: Path) -> None:
         vertices=np.zeros((2, 9, 3), np.float32), offsets=np.zeros((9, 3), np.float32),
     )  # fmt: skip
     write_offsets(root, "S001", rng.normal(size=(20, 3)))
+    write_registered(root, "S001", {"smile": (rng.normal(size=(20, 3)), rng.uniform(size=20))})
 
 
 def _video(path: Path) -> object:
@@ -255,6 +256,7 @@ READERS: dict[str, Callable[[Path], object]] = {
     "points.npz": lambda root: _points(root, "points.npz"),
     "points.json": lambda root: _points(root, "points.json"),
     "S001.offsets.npy": lambda root: ShardReader(root, ()).offsets("S001"),
+    "S001.registered.npz": lambda root: ShardReader(root, ()).registered("S001"),
     "flame/flame.pkl": _flame,
     "flame/landmark_embedding.npy": _flame,
     "flame/FLAME_masks.pkl": _flame,
