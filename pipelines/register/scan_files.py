@@ -1,27 +1,41 @@
-"""``express50 register --scan FILE OUT`` registers scans and writes a folder per scan."""
+"""``express50 register --scan FILE OUT`` registers scans: a folder per scan, and an index."""
 
 from __future__ import annotations
 
 import argparse
+import csv
+import io
 from pathlib import Path
 
 import numpy as np
 import open3d as o3d
+import torch
 
 from express50.console import FAILED, OK, say, say_json
 from express50.dataset.export import write_head_obj
 from express50.dataset.tracks import read_track
 from express50.errors import ConfigError, Express50Error, FormatError
-from express50.files.atomic import dump_json, folder_in_one_step
+from express50.files.atomic import dump_json, folder_in_one_step, write_bytes
 from express50.files.digests import file_sha256, value_digest
-from express50.files.text import ID, read_json_table
+from express50.files.text import ID, read_json_table, read_text
 from express50.geometry.raycast import mesh_scene
 from express50.head.load import load_head
-from pipelines.register.scan import KINDS, UNITS, FittedScan, Scan, fit_scan, read_scan
-from pipelines.register.stage import write_registration
+from express50.head.model import landmarks
+from pipelines.register.scan import FittedScan, fit_scan
+from pipelines.register.scan_landmarks import landmarks_beside, read_landmarks
+from pipelines.register.scan_look import PITCHES, YAWS
+from pipelines.register.scan_mesh import KINDS, UNITS, Scan, read_scan
+from pipelines.register.stage import LEAST_SEEN, write_registration
 from pipelines.track.stage import write_track
 
 VERSION = 3  # raise it when the same scan gives other files
+INDEX = "index.csv"
+COLUMNS = (
+    "name", "scan", "parameters", "mesh", "parameters_mm_median", "parameters_mm_p95",
+    "registered_mm_median", "registered_mm_p95", "unit", "metres_per_unit", "landmarks",
+    "warnings", "error",
+)  # fmt: skip
+PICTURES, FAR_MM = len(YAWS) * len(PITCHES), 10.0
 OF_DATASETS = ("set", "config", "items", "scheduler", "slurm", "print_job")
 
 
@@ -32,19 +46,60 @@ def run_scans(args: argparse.Namespace) -> int:
         raise ConfigError(f"--{ignored[0].replace('_', '-')} goes with a dataset, not with --scan")
     load_head(args.head)  # a wrong name is an error before the work
     out, accounts = args.dataset, []
-    for name, path in scans_of(args.scan).items():
-        account = {"scan": str(path), "folder": str(out / name)}
-        try:
-            account |= register_scan(path, args.head, out / name)
-            words = "current" if account["skipped"] else line_of(account)
-        except Express50Error as error:
-            account["error"] = words = str(error)
-        accounts.append(account)
-        if not args.json:
-            say(f"{name}: {words}")
+    scans, former = scans_of(args.scan), read_index(out / INDEX)
+    try:
+        for name, path in scans.items():
+            account: dict = {"name": name, "scan": str(path), "folder": str(out / name)}
+            try:
+                account |= register_scan(path, args.head, out / name)
+                words = "current" if account["skipped"] else line_of(account)
+            except Express50Error as error:
+                account["error"] = words = str(error)
+            accounts.append(account)
+            if not args.json:
+                say(f"{name}: {words}")
+    finally:  # an interrupted run lists what it has made
+        write_index(out / INDEX, former, accounts)
+    failed = sum("error" in account for account in accounts)
     if args.json:
         say_json(accounts)
-    return FAILED if any("error" in account for account in accounts) else OK
+    else:
+        say(f"{len(accounts) - failed} scans registered, {failed} failed; {out / INDEX} lists them")
+    return FAILED if failed else OK
+
+
+def read_index(path: Path) -> dict[str, dict[str, str]]:
+    """Read the rows of an index by the names of their scans; there are none without a file.
+
+    Raises:
+        FormatError: it is another file.
+    """
+    if not path.exists():
+        return {}
+    table = csv.DictReader(read_text(path, FormatError).splitlines())
+    if tuple(table.fieldnames or ()) != COLUMNS:
+        raise FormatError(f"{path}: is not an index of scans; move it away or name another folder")
+    return {row["name"]: row for row in table}
+
+
+def write_index(path: Path, former: dict[str, dict[str, str]], accounts: list[dict]) -> None:
+    """Write what was made and what failed; former rows stay while their files are there."""
+    rows: dict[str, dict] = {
+        name: row
+        for name, row in former.items()
+        if row["error"] or (path.parent / row["mesh"]).is_file()
+    }
+    for account in accounts:
+        name, row = account["name"], {key: account.get(key) for key in COLUMNS}
+        if "error" not in account:
+            files = {"parameters": f"{name}/track.npz", "mesh": f"{name}/head.obj"}
+            row |= files | {"warnings": "; ".join(account["warnings"])}
+        rows[name] = row
+    text = io.StringIO()
+    writer = csv.DictWriter(text, COLUMNS, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows[name] for name in sorted(rows))
+    write_bytes(path, text.getvalue().encode())
 
 
 def scans_of(paths: list[Path]) -> dict[str, Path]:
@@ -83,20 +138,21 @@ def register_scan(path: Path, head: str, folder: Path) -> dict:
     """Register a scan into a folder, unless it holds the result already; returns the metrics.
 
     Raises:
-        Express50Error: the scan cannot be read, or shows no face.
+        Express50Error: scan or landmarks cannot be read, or the scan shows no face.
     """
-    model = Path(head).expanduser()
-    identity = value_digest(
-        [VERSION, file_sha256(path), file_sha256(model) if model.is_file() else head]
-    )
+    files = [path, Path(head).expanduser(), landmarks_beside(path)]
+    digests = [file_sha256(file) if file and file.is_file() else str(file) for file in files]
+    identity = value_digest([VERSION, *digests])
     if folder.exists():
         if not (folder / "metrics.json").is_file():
             raise FormatError(f"{folder}: is not a registration of a scan; name another folder")
         former = read_json_table(folder / "metrics.json", FormatError, "delete the folder")
         if former.get("identity") == identity:
             return former | {"skipped": True}
-    scan = read_scan(path)
-    fitted = fit_scan(scan, head)
+    scan, picked = read_scan(path), np.full((68, 3), np.nan)
+    if files[2] is not None:
+        picked = UNITS[scan.unit] * read_landmarks(files[2])
+    fitted = fit_scan(scan, head, picked)
     with folder_in_one_step(folder.with_name(f".{folder.name}.part"), folder) as out:
         file = out / "track.npz"
         vertices = fitted.start[None]
@@ -104,9 +160,38 @@ def register_scan(path: Path, head: str, folder: Path) -> dict:
         metrics = write_registration(out, file, read_track(file), 0, fitted.laid, "parameters")
         write_head_obj(out / "head.obj", fitted.laid.vertices / UNITS[scan.unit], load_head(head))
         metrics |= distances(scan, fitted) | {"unit": scan.unit, "textured": scan.textured}
-        metrics |= {"views": len(fitted.targets[0].observation.views), "identity": identity}
+        metrics |= {"metres_per_unit": UNITS[scan.unit], "identity": identity}
+        metrics |= figures_of_landmarks(fitted, picked)
+        metrics["warnings"] = warnings_of(metrics)
         (out / "metrics.json").write_bytes(dump_json(metrics))
     return metrics | {"skipped": False}
+
+
+def figures_of_landmarks(fitted: FittedScan, picked: np.ndarray) -> dict:
+    """Count the views that show the face and the picked landmarks (68, 3), and how far these are.
+
+    Distances are from the fitted parameters' landmarks, those of the jaw line left out.
+    """
+    marks = landmarks(fitted.basis.model, torch.from_numpy(fitted.start)[None])[0].numpy()
+    known = np.isfinite(picked[:, 0])
+    away = 1e3 * np.linalg.norm(marks - picked, axis=1)[17:][known[17:]]
+    return {
+        "views": len(fitted.targets[0].observation.views),
+        "landmarks": int(known.sum()),
+        "landmarks_mm_median": round(float(np.median(away)), 4) if len(away) else None,
+        "landmarks_mm_largest": round(float(away.max()), 4) if len(away) else None,
+    }
+
+
+def warnings_of(metrics: dict) -> list[str]:
+    """List what is doubtful about a registered scan."""
+    seen, views, away = (metrics[k] for k in ("seen_share", "views", "landmarks_mm_largest"))
+    found = {
+        f"the scan was found at only {seen:.0%} of the face's vertices": seen < LEAST_SEEN,
+        f"only {views} of {PICTURES} pictures of the scan show a face": views < PICTURES / 2,
+        f"a given landmark is {away} mm from the fitted one": away and away > FAR_MM,
+    }
+    return [words for words, holds in found.items() if holds]
 
 
 def distances(scan: Scan, fitted: FittedScan) -> dict[str, float | None]:
@@ -127,8 +212,9 @@ def distances(scan: Scan, fitted: FittedScan) -> dict[str, float | None]:
 def line_of(account: dict) -> str:
     """Describe a registered scan in a line."""
     return (
-        f"{account['unit']}, {'coloured' if account['textured'] else 'no colours'};"
+        f"{account['unit']}, {'coloured' if account['textured'] else 'no colours'},"
+        f" {account['landmarks']} landmarks given;"
         f" {account['seen_share']:.0%} of the face found, parameters"
         f" {account['parameters_mm_median']} mm and mesh {account['registered_mm_median']} mm from"
-        f" the scan (medians); {account['folder']}"
+        f" the scan (medians){''.join('; warning: ' + words for words in account['warnings'])}"
     )

@@ -59,6 +59,7 @@ from pipelines.track.state import (
     rounded,
     start_state,
 )
+from pipelines.track.terms import Term
 
 SCHEMA = "express50.track/2"
 DECIMALS = 7
@@ -129,9 +130,11 @@ def run(
 
 
 def fit_landmarks(
-    basis: Basis, peaks: list[Observation], neutral: str
+    basis: Basis, peaks: list[Observation], neutral: str, further: tuple[Term, ...] = ()
 ) -> tuple[list[Target], State, list[Note]]:
     """Fit to landmarks alone and leave out those that contradict the fit.
+
+    `further` terms are about every expression.
 
     Returns:
         Targets, the fitted state, and the expressions without a start.
@@ -150,7 +153,7 @@ def fit_landmarks(
             lost.append(Note(observation.expression, str(error)))
             continue
         poses.append(pose)
-        terms = lid_terms(basis.model, observation)
+        terms = (*lid_terms(basis.model, observation), *further)
         sigma = posed_sigma(observation, *pose)
         targets.append(Target(observation, sigma, observation.expression == neutral, terms))
     state = start_state(basis, poses)

@@ -1,7 +1,8 @@
-"""Scans: any pose and unit, what is written, and what is skipped or refused."""
+"""Scans: any pose and unit, landmarks, what is written, and what is skipped or refused."""
 
 from __future__ import annotations
 
+import csv
 import json
 from pathlib import Path
 
@@ -12,9 +13,11 @@ import trimesh
 
 from express50.cli.main import main
 from express50.dataset.tracks import read_registration, read_track
+from express50.errors import FormatError
 from express50.geometry.transforms import axis_angle_to_matrix
 from express50.head.load import load_head
-from express50.head.model import pose
+from express50.head.model import landmarks, pose
+from pipelines.register.scan_landmarks import landmarks_beside, read_landmarks
 
 
 @pytest.fixture(scope="module")
@@ -32,6 +35,15 @@ def person():
 def write_scan(path: Path, vertices: np.ndarray, faces: np.ndarray) -> Path:
     trimesh.Trimesh(vertices, faces, process=False).export(path)
     return path
+
+
+def marks_of(vertices: np.ndarray) -> np.ndarray:
+    return landmarks(load_head("procedural"), torch.from_numpy(vertices)[None].float())[0].numpy()
+
+
+def rows_of(out: Path) -> dict[str, dict[str, str]]:
+    with (out / "index.csv").open(newline="") as file:
+        return {row["name"]: row for row in csv.DictReader(file)}
 
 
 def run(*arguments: object) -> int:
@@ -82,11 +94,103 @@ def test_a_bad_scan_does_not_stop_the_others_and_is_one_line(person, tmp_path, c
     ball.export(folder / "ball.stl")
     (folder / "notes.txt").write_text("no scan")
     assert run(tmp_path / "out", "--scan", folder) == 1
-    lines = capsys.readouterr().out.strip().splitlines()
-    assert [line.split(":")[0] for line in lines] == [
-        "ball", "damaged", "kilometres", "nan", "triangle"
-    ]  # fmt: skip
-    assert not list((tmp_path / "out").glob("[!.]*"))
+    *lines, last = capsys.readouterr().out.strip().splitlines()
+    names = ["ball", "damaged", "kilometres", "nan", "triangle"]
+    assert [line.split(":")[0] for line in lines] == names
+    assert "in kilometres" in lines[2] and "5 failed" in last
+    assert [path.name for path in (tmp_path / "out").glob("[!.]*")] == ["index.csv"]
+    rows = rows_of(tmp_path / "out")
+    assert list(rows) == names and all(row["error"] and not row["mesh"] for row in rows.values())
+
+
+@pytest.mark.slow
+def test_a_folder_with_landmarks_becomes_a_data_set(person, tmp_path, capsys):
+    vertices, faces = person
+    folder, out = tmp_path / "scans", tmp_path / "out"
+    folder.mkdir()
+    placed = 100 * vertices @ [[1.0, 0, 0], [0, 0, -1], [0, -1, 0]]  # upside down, y up to z down
+    write_scan(folder / "good.ply", placed @ np.diag([-1.0, 1, 1]), faces)
+    np.savetxt(folder / "good.txt", 100 * marks_of(vertices) @ [[-1, 0, 0], [0, 0, -1], [0, -1, 0]])
+    write_scan(folder / "off.ply", vertices, faces)
+    (folder / "off.csv").write_text(
+        "chin,0,0,3\n" + "nose_tip,0,0,0\nnasion,0,0,1\nupper_lip,1,0,0"
+    )
+    assert run(out, "--scan", folder) == 1
+    rows = rows_of(out)
+    good, off = rows["good"], rows["off"]
+    assert (good["unit"], good["metres_per_unit"], good["landmarks"]) == (
+        "centimetres",
+        "0.01",
+        "68",
+    )
+    assert float(good["registered_mm_median"]) < 0.05 < float(good["registered_mm_p95"]) + 0.05
+    assert (out / good["mesh"]).is_file() and (out / good["parameters"]).is_file()
+    metrics = json.loads((out / "good" / "metrics.json").read_text())
+    assert metrics["landmarks_mm_median"] < 0.8  # the detector's are 3 mm off
+    assert good["error"] == good["warnings"] == "" and "off the scan" in off["error"]
+    capsys.readouterr()
+    assert run(out, "--scan", folder / "good.ply") == 0
+    assert "good: current" in capsys.readouterr().out
+    assert rows_of(out) == rows  # rows of other runs stay
+    (folder / "good.txt").write_text("0 0 0\n")
+    assert run(out, "--scan", folder / "good.ply") == 1  # other landmarks are another input
+    assert "1 points without names" in rows_of(out)["good"]["error"]
+
+
+def test_landmarks_are_read_in_any_layout(tmp_path):
+    points = np.random.default_rng(0).normal(size=(68, 3)).round(3)
+    rows, inner = points.tolist(), points.copy()
+    inner[:17] = np.nan
+    named = {"Nose tip": rows[30], "36": rows[36], "left-eye outer": rows[45], "chin": rows[8]}
+    few = np.full((68, 3), np.nan)
+    few[[8, 30, 36, 45]] = points[[8, 30, 36, 45]]
+    line = '<point x="{}" y="{}" z="{}" name="{}" active="1"/>'.format
+    marked = "".join(line(*row, k + 1) for k, row in enumerate(rows))
+    texts = {
+        "all.json": (json.dumps(rows), points),
+        "all.txt": ("\n".join("{} {} {}".format(*row) for row in rows), points),
+        "all.pp": (f"<PickedPoints>{marked}</PickedPoints>", points),
+        "inner.csv": ("x,y,z\n" + "\n".join("{},{},{}".format(*row) for row in rows[17:]), inner),
+        "named.json": (json.dumps(named), few),
+        "named.csv": ("\n".join(f"{k}; {x}; {y}; {z}" for k, (x, y, z) in named.items()), few),
+    }
+    for name, (text, expected) in texts.items():
+        (tmp_path / name).write_text(text)
+        np.testing.assert_array_equal(read_landmarks(tmp_path / name), expected)
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "words"),
+    [
+        ("a.txt", "", "0 points"),
+        ("a.txt", "0 0 0\n" * 67, "67 points"),
+        ("a.txt", "0 0\n" * 68, "expected 3"),
+        ("a.csv", "0,0,0\n" * 30 + "0,nan,0\n" + "0,0,0\n" * 37, "expected 3 finite"),
+        ("a.csv", "elbow,0,0,0", "'elbow'"),
+        ("a.csv", "68,0,0,0", "from 0 to 67"),
+        ("a.csv", "nose_tip,0,0,0\npronasale,0,0,0", "twice"),
+        ("a.json", "[[NaN, 0, 0]]", "NaN"),
+        ("a.json", '{"chin": 3}', "no landmarks"),
+        ("a.json", "7", "no landmarks"),
+        ("a.pp", "<PickedPoints><point/>", "no landmarks"),
+        ("a.pp", '<PickedPoints><point x="0" y="0" name="chin"/></PickedPoints>', "no landmarks"),
+    ],
+)
+def test_wrong_landmarks_are_one_clear_line(tmp_path, name, text, words):
+    (tmp_path / name).write_text(text)
+    with pytest.raises(FormatError, match=words) as caught:
+        read_landmarks(tmp_path / name)
+    assert len(str(caught.value).splitlines()) == 1
+
+
+def test_landmarks_lie_beside_their_scan(tmp_path):
+    scan = tmp_path / "a.ply"
+    assert landmarks_beside(scan) is None
+    (tmp_path / "a_picked_points.pp").touch()
+    assert landmarks_beside(scan) == tmp_path / "a_picked_points.pp"
+    (tmp_path / "a_landmarks.json").touch()
+    with pytest.raises(FormatError, match="keep one"):
+        landmarks_beside(scan)
 
 
 def test_wrong_options_are_refused_before_the_work(person, tmp_path):
@@ -103,3 +207,6 @@ def test_wrong_options_are_refused_before_the_work(person, tmp_path):
     (tmp_path / "out" / "a" / "letter.txt").write_text("mine")
     assert run(tmp_path / "out", "--scan", scan) == 1
     assert (tmp_path / "out" / "a" / "letter.txt").read_text() == "mine"
+    (tmp_path / "out" / "index.csv").write_text("mine")
+    assert run(tmp_path / "out", "--scan", scan) != 0
+    assert (tmp_path / "out" / "index.csv").read_text() == "mine"

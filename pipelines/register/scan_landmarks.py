@@ -1,0 +1,149 @@
+"""Read landmarks that people picked on a scan, and refuse points that are on no human face."""
+
+from __future__ import annotations
+
+import re
+import xml.etree.ElementTree as ElementTree
+from pathlib import Path
+
+import numpy as np
+
+from express50.errors import FormatError, StageError
+from express50.files.text import read_json, read_text, reason
+from express50.geometry.transforms import similarity_fit
+
+BESIDE = ("", "_landmarks", "_picked_points")  # added to a scan's name; the last one by MeshLab
+KINDS = (".pp", ".json", ".csv", ".txt")
+LIMIT = 1 << 20  # bytes
+PICKED_M = 0.002  # standard deviation of a picked point
+COUNTS = (68, 51)  # of points that are known by their order; 51 are without the jaw line
+LEAST, LEAST_SPREAD_M = 4, 0.01  # points, and how far they stray from a line
+SIZES = (0.5, 2.0)  # of a face, times the head model's
+MISFIT_M = 0.02  # rms: an open mouth's chin is 30 mm from where the resting face has it
+MIRRORED = 0.7  # of the misfit that a mirrored face may leave
+NAMES = {
+    "chin": 8, "gnathion": 8, "nasion": 27, "nose_tip": 30, "pronasale": 30, "subnasale": 33,
+    "right_eye_outer": 36, "right_exocanthion": 36, "right_eye_inner": 39, "right_endocanthion": 39,
+    "left_eye_inner": 42, "left_endocanthion": 42, "left_eye_outer": 45, "left_exocanthion": 45,
+    "mouth_right": 48, "right_cheilion": 48, "mouth_left": 54, "left_cheilion": 54,
+    "upper_lip": 51, "labiale_superius": 51, "lower_lip": 57, "labiale_inferius": 57,
+}  # fmt: skip
+_FIX = "docs/FORMAT.md, section Scans, has the layouts"
+Picked = list[tuple[str, tuple[float, ...]]]
+"""Names, empty where there are none, and coordinates."""
+
+
+def landmarks_beside(scan: Path) -> Path | None:
+    """Return the file of landmarks beside a scan, if there is one.
+
+    Raises:
+        FormatError: there are two.
+    """
+    names = [scan.stem + mark + kind for mark in BESIDE for kind in KINDS]
+    found = [path for name in names if (path := scan.with_name(name)).is_file()]
+    if len(found) > 1:
+        raise FormatError(f"{found[0]}: {found[1].name} has landmarks too; keep one of them")
+    return found[0] if found else None
+
+
+def read_landmarks(path: Path) -> np.ndarray:
+    """Read landmarks (68, 3), iBUG-68 order, in the scan's unit and axes; NaN where none is given.
+
+    Raises:
+        FormatError: the layout, the number of points, a name or a coordinate is wrong.
+    """
+    try:
+        picked = {".pp": _read_pp, ".json": _read_json}.get(path.suffix, _read_rows)(path)
+        points = np.full((68, 3), np.nan)
+        for place, (name, xyz) in zip(_places([name for name, _ in picked]), picked, strict=True):
+            if len(xyz) != 3 or not np.isfinite(xyz).all():
+                words = f"point {name or place} is {xyz}, expected 3 finite numbers"
+                raise ValueError(words + "; name the points and leave out what is not known")
+            if np.isfinite(points[place]).all():
+                raise ValueError(f"point {name} is there twice")
+            points[place] = xyz
+    except (ValueError, TypeError, KeyError, AttributeError, ElementTree.ParseError) as error:
+        raise FormatError(f"{path}: no landmarks of a scan ({reason(error)}); {_FIX}") from None
+    return points
+
+
+def _places(names: list[str]) -> list[int]:
+    """Return the places among the 68 of points with such names, none of them named or all."""
+    count = len(names)
+    numbered = [str(k) for k in range(count)], [str(k + 1) for k in range(count)]
+    if count in COUNTS and (names in numbered or not any(names)):
+        return list(range(68 - count, 68))
+    if not names or not all(names):
+        raise ValueError(f"{count} points without names, expected {COUNTS[0]} or {COUNTS[1]}")
+    plain = [re.sub(r"[\s-]+", "_", name.strip().lower()) for name in names]
+    places = [int(name) if name.isdecimal() else NAMES.get(name, 68) for name in plain]
+    wrong = [name for name, place in zip(names, places, strict=True) if place > 67]
+    if wrong:
+        words = f"point {wrong[0]!r}, expected a number from 0 to 67 or one of {', '.join(NAMES)}"
+        raise ValueError(words)
+    return places
+
+
+def _read_pp(path: Path) -> Picked:
+    root = ElementTree.fromstring(read_text(path, FormatError, LIMIT))
+    return [
+        (point.get("name", ""), tuple(float(point.attrib[axis]) for axis in "xyz"))
+        for point in root.iter("point")
+        if point.get("active", "1") != "0"
+    ]
+
+
+def _read_json(path: Path) -> Picked:
+    content = read_json(path, FormatError)
+    rows = content.items() if isinstance(content, dict) else (("", row) for row in content)
+    return [(name, tuple(float(value) for value in row)) for name, row in rows]
+
+
+def _read_rows(path: Path) -> Picked:
+    """Read lines of x, y, z, perhaps after a name or a number; a head that ends in z is skipped."""
+    lines = read_text(path, FormatError, LIMIT).splitlines()
+    plain = [line.split("#")[0].strip(" \t,;") for line in lines]
+    rows = [re.split(r"[;,\s]+", line) for line in plain if line]
+    if rows and rows[0][-1][0] in "zZ":
+        rows = rows[1:]
+    return [("_".join(row[:-3]), tuple(map(float, row[-3:]))) for row in rows]
+
+
+def check_face(points: np.ndarray, template: np.ndarray, what: str) -> None:
+    """Refuse points (68, 3), metres, NaN where unknown, that no face like the template's has.
+
+    Raises:
+        StageError: they are too few, on a line, of another size, mirrored or in another order.
+    """
+    known = np.isfinite(points).all(1)
+    ours, theirs = template[known], points[known]
+    centred = ours - ours.mean(0) if known.any() else np.zeros((1, 3))
+    spread = np.linalg.svd(centred / np.sqrt(len(centred)), compute_uv=False)
+    if known.sum() < LEAST or spread[1] < LEAST_SPREAD_M:
+        raise StageError(
+            f"{what}: {known.sum()} points, expected at least {LEAST} that are not on a line, such"
+            " as corners of the eyes, corners of the mouth and the tip of the nose"
+        )
+    scale = similarity_fit(ours, theirs)[0]
+    if not SIZES[0] < scale < SIZES[1]:
+        raise StageError(
+            f"{what}: they measure {scale:.3g} times a human face in the scan's unit, expected"
+            f" {SIZES[0]:g} to {SIZES[1]:g}; give the scan alone, in one unit"
+        )
+    off, mirrored = _misfit(ours, theirs), _misfit(ours * [-1, 1, 1], theirs)
+    if mirrored < MIRRORED * off:
+        raise StageError(
+            f"{what}: they are those of a mirrored face; mirror the scan back, flip its triangles,"
+            " or swap left and right of landmarks that you gave"
+        )
+    if off > MISFIT_M:
+        raise StageError(
+            f"{what}: {1e3 * off:.0f} mm (rms) from a human face's, expected at most"
+            f" {1e3 * MISFIT_M:.0f}; give a face that is not inside out, and landmarks in order"
+        )
+
+
+def _misfit(source: np.ndarray, target: np.ndarray) -> float:
+    scale, turn, shift = similarity_fit(source, target)
+    off = target - scale * source @ turn.T - shift
+    return float(np.sqrt((off**2).sum(1).mean()))
