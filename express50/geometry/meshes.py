@@ -70,6 +70,7 @@ def read_surface(path: Path) -> Surface:
     try:
         mesh = trimesh.load(path, file_type="ply", process=False, force="mesh")
         vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
+        check_faces(faces, len(vertices))
         # Only Open3D hands out further properties of vertices; of damaged files it reads what it
         # can, so that trimesh, which refuses them, comes first.
         columns = o3d.t.io.read_point_cloud(str(path), format="ply").point
@@ -80,6 +81,16 @@ def read_surface(path: Path) -> Surface:
     if not len(faces) or not (np.isfinite(vertices).all() and np.isfinite(confidence).all()):
         raise FormatError(f"{path}: {len(faces)} faces, or NaN in the vertices; {_AGAIN}")
     return Surface(vertices, faces, colors, confidence)
+
+
+def check_faces(faces: np.ndarray, count: int) -> None:
+    """Refuse faces (F, 3) that name vertices which a mesh of `count` vertices does not have.
+
+    Raises:
+        ValueError: there are such.
+    """
+    if len(faces) and (faces.min() < 0 or faces.max() >= count):
+        raise ValueError(f"triangles name vertices {faces.min()} to {faces.max()} of {count}")
 
 
 def write_obj(

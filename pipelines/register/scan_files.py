@@ -87,7 +87,7 @@ def write_index(path: Path, former: dict[str, dict[str, str]], accounts: list[di
     rows: dict[str, dict] = {
         name: row
         for name, row in former.items()
-        if row["error"] or (path.parent / row["mesh"]).is_file()
+        if row["error"] or (path.parent / (row["mesh"] or "")).is_file()
     }
     for account in accounts:
         name, row = account["name"], {key: account.get(key) for key in COLUMNS}
@@ -96,7 +96,7 @@ def write_index(path: Path, former: dict[str, dict[str, str]], accounts: list[di
             row |= files | {"warnings": "; ".join(account["warnings"])}
         rows[name] = row
     text = io.StringIO()
-    writer = csv.DictWriter(text, COLUMNS, lineterminator="\n")
+    writer = csv.DictWriter(text, COLUMNS, extrasaction="ignore", lineterminator="\n")
     writer.writeheader()
     writer.writerows(rows[name] for name in sorted(rows))
     write_bytes(path, text.getvalue().encode())

@@ -62,7 +62,7 @@ def read_landmarks(path: Path) -> np.ndarray:
             if np.isfinite(points[place]).all():
                 raise ValueError(f"point {name} is there twice")
             points[place] = xyz
-    except (ValueError, TypeError, KeyError, AttributeError, ElementTree.ParseError) as error:
+    except (ValueError, ArithmeticError, TypeError, LookupError, ElementTree.ParseError) as error:
         raise FormatError(f"{path}: no landmarks of a scan ({reason(error)}); {_FIX}") from None
     return points
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from express50.errors import FormatError
 from express50.files.images import srgb_to_linear
+from express50.geometry.meshes import check_faces
 
 KINDS = (".obj", ".ply", ".glb", ".stl")
 UNITS = {"metres": 1.0, "centimetres": 0.01, "millimetres": 0.001}
@@ -46,6 +47,7 @@ def read_scan(path: Path) -> Scan:
     try:
         mesh = trimesh.load(path, force="mesh", process=False)
         vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
+        check_faces(faces, len(vertices))
         shades = read_colours(mesh)
     except Exception as error:  # noqa: BLE001  # trimesh raises what the damage leads to
         raise FormatError(f"{path}: cannot be read as a mesh ({error}); export it again") from None

@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 import pycolmap
 import torch
+import trimesh
 
 from annotations.exchange import export_labels, read_table
 from annotations.labels import append_label, make_mark, read_labels
@@ -38,6 +39,8 @@ from express50.shards.codecs import decode_picture, encode_pictures
 from express50.shards.reader import ShardReader, read_entries, write_offsets, write_registered
 from express50.shards.writer import verify, write_manifest
 from pipelines import ingest
+from pipelines.register.scan_landmarks import read_landmarks
+from pipelines.register.scan_mesh import KINDS, read_scan
 from tests.express50.capture.layouts import (
     write_ava,
     write_colmap,
@@ -77,6 +80,7 @@ def write_seeds(root: Path) -> None:
     (root / "flame").mkdir()
     write_flame(root / "flame")
     _write_arrays(root)
+    _write_scans(root)
     write_shards(root / "shards", EllipsoidSource(subjects=2, cameras=2, size=24))
     write_manifest(root / "shards")
     torch.save({"features.0.weight": torch.zeros(4, 3, 3, 3)}, root / "vgg.pth")
@@ -108,6 +112,18 @@ def _write_dataset(root: Path) -> None:
             ledger.write(Receipt(stage="a", item=f"i{number}", fingerprint="f", status="done"))
     with sqlite3.connect(root / "ledger.sqlite") as database:
         database.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+
+
+def _write_scans(root: Path) -> None:
+    """Write a mesh in every format that a scan may have, and landmarks."""
+    ball = trimesh.creation.icosphere(subdivisions=3, radius=0.1)
+    for kind in KINDS:
+        ball.export(root / f"ball{kind}")
+    rows = ball.vertices[:68].tolist()
+    marks = "".join('<point x="{}" y="{}" z="{}"/>'.format(*row) for row in rows)
+    (root / "marks.pp").write_text(f"<PickedPoints>{marks}</PickedPoints>")
+    (root / "marks.json").write_text(json.dumps({str(k): row for k, row in enumerate(rows)}))
+    np.savetxt(root / "marks.txt", rows)
 
 
 def _write_opencv(folder: Path) -> None:
@@ -264,6 +280,9 @@ READERS: dict[str, Callable[[Path], object]] = {
     "shards/index.json": lambda root: read_entries(root / "shards"),
     "shards/manifest.json": lambda root: _verified(root / "shards"),
     "shards/train-000000.tar": lambda root: _verified(root / "shards"),
+    **{f"ball{kind}": lambda root, kind=kind: read_scan(root / f"ball{kind}") for kind in KINDS},
+    **{f"marks.{end}": lambda root, end=end: read_landmarks(root / f"marks.{end}")
+       for end in ("pp", "json", "txt")},
     "vgg.pth": lambda root: read_weights(root / "vgg.pth", TrainError, "vgg", "a state dict"),
     f"{INDEX}/index.json": _data(read_index),
     "data/captures.json": lambda root: Dataset(root / "data").captures(),

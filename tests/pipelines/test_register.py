@@ -262,6 +262,7 @@ def test_what_is_missing_or_damaged_is_one_clear_error(dataset, tmp_path):
         b"",
         b"ply\n",
         whole[: len(whole) // 2],
+        whole[:-4] + b"\xff\xff\xff\x7f",  # a vertex that is not there
         whole.replace(b"confidence", b"x" * 10),
     ):
         path.write_bytes(damaged)
