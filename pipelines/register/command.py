@@ -11,7 +11,7 @@ from express50.contract.stage import Command
 def add_options(parser: Any) -> None:
     """Add the options to the parser of the stage's command."""
     words = "register this scan (.obj, .ply, .glb, .stl), or all of a folder, instead of a dataset;"
-    words += " DATASET is the folder to write to; may be repeated"
+    words += " landmarks beside it are used; DATASET is the folder to write to; may be repeated"
     parser.add_argument("--scan", type=Path, action="append", metavar="FILE", help=words)
     words = "with --scan: the head model to fit, as track.head takes it [procedural]"
     parser.add_argument("--head", default="procedural", metavar="MODEL", help=words)

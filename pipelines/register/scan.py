@@ -23,7 +23,7 @@ from pipelines.register.lay import (
     mesh_normals,
     trusted_vertices,
 )
-from pipelines.register.scan_landmarks import PICKED_M, check_face
+from pipelines.register.scan_landmarks import GIVEN_M, check_face
 from pipelines.register.scan_look import look
 from pipelines.register.scan_mesh import Scan
 from pipelines.register.skin import skin_trust
@@ -50,8 +50,8 @@ class FittedScan:
     laid: LaidMesh
 
 
-def fit_scan(scan: Scan, head: str, picked: np.ndarray | None = None) -> FittedScan:
-    """Fit a head model to a scan, with the help of picked landmarks (68, 3), NaN where unknown.
+def fit_scan(scan: Scan, head: str, given: np.ndarray | None = None) -> FittedScan:
+    """Fit a head model to a scan, with the help of given landmarks (68, 3), NaN where unknown.
 
     Raises:
         StageError: no face is found, or landmarks are not of this scan.
@@ -60,10 +60,10 @@ def fit_scan(scan: Scan, head: str, picked: np.ndarray | None = None) -> FittedS
     torch.set_num_threads(1)
     basis = make_basis(load_head(head))
     template = landmarks(basis.model, basis.model.template[None])[0].numpy()
-    picked = np.full((68, 3), np.nan) if picked is None else picked
-    observation = look(scan, template, picked)
+    given = np.full((68, 3), np.nan) if given is None else given
+    observation = look(scan, template, given)
     check_face(observation.points, template, "the face that is seen")
-    terms = picked_terms(basis.model, picked)
+    terms = given_terms(basis.model, given)
     # It may be any face: none is neutral.
     targets, state, lost = fit_landmarks(basis, [observation], "", terms)
     if lost:
@@ -84,13 +84,11 @@ def fit_scan(scan: Scan, head: str, picked: np.ndarray | None = None) -> FittedS
     return FittedScan(basis, targets, state, start, laid)
 
 
-def picked_terms(model: HeadModel, picked: np.ndarray) -> tuple[PointTerm, ...]:
-    """Make the terms that pull landmarks to picked ones (68, 3), NaN where there are none."""
-    known, anchors = np.flatnonzero(np.isfinite(picked[:, 0])), landmark_anchors(model)
-    rows = (known[known > 16], PICKED_M), (known[known < 17], PICKED_M / JAW_LINE_WEIGHT)
-    return tuple(
-        PointTerm(anchors.some(ids), picked[ids], sigma) for ids, sigma in rows if len(ids)
-    )
+def given_terms(model: HeadModel, given: np.ndarray) -> tuple[PointTerm, ...]:
+    """Make the terms that pull landmarks to given ones (68, 3), NaN where there are none."""
+    known, anchors = np.flatnonzero(np.isfinite(given[:, 0])), landmark_anchors(model)
+    rows = (known[known > 16], GIVEN_M), (known[known < 17], GIVEN_M / JAW_LINE_WEIGHT)
+    return tuple(PointTerm(anchors.some(ids), given[ids], sigma) for ids, sigma in rows if len(ids))
 
 
 def surface_term(

@@ -64,7 +64,8 @@ def run_scans(args: argparse.Namespace) -> int:
     if args.json:
         say_json(accounts)
     else:
-        say(f"{len(accounts) - failed} scans registered, {failed} failed; {out / INDEX} lists them")
+        done = len(accounts) - failed
+        say(f"scans: {done} registered, {failed} failed; {out / INDEX} lists them")
     return FAILED if failed else OK
 
 
@@ -149,10 +150,10 @@ def register_scan(path: Path, head: str, folder: Path) -> dict:
         former = read_json_table(folder / "metrics.json", FormatError, "delete the folder")
         if former.get("identity") == identity:
             return former | {"skipped": True}
-    scan, picked = read_scan(path), np.full((68, 3), np.nan)
+    scan, given = read_scan(path), np.full((68, 3), np.nan)
     if files[2] is not None:
-        picked = UNITS[scan.unit] * read_landmarks(files[2])
-    fitted = fit_scan(scan, head, picked)
+        given = UNITS[scan.unit] * read_landmarks(files[2])
+    fitted = fit_scan(scan, head, given)
     with folder_in_one_step(folder.with_name(f".{folder.name}.part"), folder) as out:
         file = out / "track.npz"
         vertices = fitted.start[None]
@@ -161,20 +162,20 @@ def register_scan(path: Path, head: str, folder: Path) -> dict:
         write_head_obj(out / "head.obj", fitted.laid.vertices / UNITS[scan.unit], load_head(head))
         metrics |= distances(scan, fitted) | {"unit": scan.unit, "textured": scan.textured}
         metrics |= {"metres_per_unit": UNITS[scan.unit], "identity": identity}
-        metrics |= figures_of_landmarks(fitted, picked)
+        metrics |= figures_of_landmarks(fitted, given)
         metrics["warnings"] = warnings_of(metrics)
         (out / "metrics.json").write_bytes(dump_json(metrics))
     return metrics | {"skipped": False}
 
 
-def figures_of_landmarks(fitted: FittedScan, picked: np.ndarray) -> dict:
-    """Count the views that show the face and the picked landmarks (68, 3), and how far these are.
+def figures_of_landmarks(fitted: FittedScan, given: np.ndarray) -> dict:
+    """Count the views that show the face and the given landmarks (68, 3), and how far these are.
 
     Distances are from the fitted parameters' landmarks, those of the jaw line left out.
     """
     marks = landmarks(fitted.basis.model, torch.from_numpy(fitted.start)[None])[0].numpy()
-    known = np.isfinite(picked[:, 0])
-    away = 1e3 * np.linalg.norm(marks - picked, axis=1)[17:][known[17:]]
+    known = np.isfinite(given[:, 0])
+    away = 1e3 * np.linalg.norm(marks - given, axis=1)[17:][known[17:]]
     return {
         "views": len(fitted.targets[0].observation.views),
         "landmarks": int(known.sum()),

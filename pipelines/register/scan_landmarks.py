@@ -1,4 +1,4 @@
-"""Read landmarks that people picked on a scan, and refuse points that are on no human face."""
+"""Read landmarks that people give with a scan, and refuse points that are on no human face."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from express50.geometry.transforms import similarity_fit
 BESIDE = ("", "_landmarks", "_picked_points")  # added to a scan's name; the last one by MeshLab
 KINDS = (".pp", ".json", ".csv", ".txt")
 LIMIT = 1 << 20  # bytes
-PICKED_M = 0.002  # standard deviation of a picked point
+GIVEN_M = 0.002  # standard deviation of a given point
 COUNTS = (68, 51)  # of points that are known by their order; 51 are without the jaw line
 LEAST, LEAST_SPREAD_M = 4, 0.01  # points, and how far they stray from a line
 SIZES = (0.5, 2.0)  # of a face, times the head model's
-MISFIT_M = 0.02  # rms: an open mouth's chin is 30 mm from where the resting face has it
-MIRRORED = 0.7  # of the misfit that a mirrored face may leave
+MISFIT_M = 0.03  # rms: 0.023 for a jaw that is wide open, 0.032 if each takes its neighbour's place
+MIRRORED = 0.9  # of the misfit that a mirrored face may leave; faces leave it over 1.27 times
 NAMES = {
     "chin": 8, "gnathion": 8, "nasion": 27, "nose_tip": 30, "pronasale": 30, "subnasale": 33,
     "right_eye_outer": 36, "right_exocanthion": 36, "right_eye_inner": 39, "right_endocanthion": 39,
@@ -29,7 +29,7 @@ NAMES = {
     "upper_lip": 51, "labiale_superius": 51, "lower_lip": 57, "labiale_inferius": 57,
 }  # fmt: skip
 _FIX = "docs/FORMAT.md, section Scans, has the layouts"
-Picked = list[tuple[str, tuple[float, ...]]]
+Rows = list[tuple[str, tuple[float, ...]]]
 """Names, empty where there are none, and coordinates."""
 
 
@@ -53,9 +53,9 @@ def read_landmarks(path: Path) -> np.ndarray:
         FormatError: the layout, the number of points, a name or a coordinate is wrong.
     """
     try:
-        picked = {".pp": _read_pp, ".json": _read_json}.get(path.suffix, _read_rows)(path)
+        rows = {".pp": _read_pp, ".json": _read_json}.get(path.suffix, _read_rows)(path)
         points = np.full((68, 3), np.nan)
-        for place, (name, xyz) in zip(_places([name for name, _ in picked]), picked, strict=True):
+        for place, (name, xyz) in zip(_places([name for name, _ in rows]), rows, strict=True):
             if len(xyz) != 3 or not np.isfinite(xyz).all():
                 words = f"point {name or place} is {xyz}, expected 3 finite numbers"
                 raise ValueError(words + "; name the points and leave out what is not known")
@@ -84,7 +84,7 @@ def _places(names: list[str]) -> list[int]:
     return places
 
 
-def _read_pp(path: Path) -> Picked:
+def _read_pp(path: Path) -> Rows:
     root = ElementTree.fromstring(read_text(path, FormatError, LIMIT))
     return [
         (point.get("name", ""), tuple(float(point.attrib[axis]) for axis in "xyz"))
@@ -93,13 +93,13 @@ def _read_pp(path: Path) -> Picked:
     ]
 
 
-def _read_json(path: Path) -> Picked:
+def _read_json(path: Path) -> Rows:
     content = read_json(path, FormatError)
     rows = content.items() if isinstance(content, dict) else (("", row) for row in content)
     return [(name, tuple(float(value) for value in row)) for name, row in rows]
 
 
-def _read_rows(path: Path) -> Picked:
+def _read_rows(path: Path) -> Rows:
     """Read lines of x, y, z, perhaps after a name or a number; a head that ends in z is skipped."""
     lines = read_text(path, FormatError, LIMIT).splitlines()
     plain = [line.split("#")[0].strip(" \t,;") for line in lines]

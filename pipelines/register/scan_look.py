@@ -1,7 +1,7 @@
 """Find the face of a scan by looking at it.
 
 The scan is drawn from all sides, the landmark detector finds the face in these pictures, and the
-cameras that drew them triangulate it. Landmarks that people picked take the place of the
+cameras that drew them triangulate it. Landmarks that are given take the place of the
 detector's, and say where to look.
 """
 
@@ -20,7 +20,7 @@ from express50.geometry.raycast import barycentrics, join_rays, mesh_scene
 from express50.geometry.transforms import look_at, rigid_fit
 from express50.landmarks.sources import EMBEDDED, Source, open_source
 from pipelines.register.lay import mesh_normals
-from pipelines.register.scan_landmarks import PICKED_M, check_face
+from pipelines.register.scan_landmarks import GIVEN_M, check_face
 from pipelines.register.scan_mesh import Scan
 from pipelines.track.observe import LandmarkView, Observation, agree
 from pipelines.track.state import INNER, MIN_TRIANGULATED
@@ -39,20 +39,20 @@ Frame = tuple[np.ndarray, np.ndarray, np.ndarray]
 """Middle of a face, its way up and its way ahead, each (3,)."""
 
 
-def look(scan: Scan, template: np.ndarray, picked: np.ndarray) -> Observation:
+def look(scan: Scan, template: np.ndarray, given: np.ndarray) -> Observation:
     """Find the landmarks of a scan's face in pictures of it.
 
-    Landmarks (68, 3) of a head model's template say how a face is made; picked ones (68, 3), NaN
+    Landmarks (68, 3) of a head model's template say how a face is made; given ones (68, 3), NaN
     where there is none, replace those that are found.
 
     Raises:
-        StageError: no picture shows a face, or picked landmarks are not of this scan.
+        StageError: no picture shows a face, or given landmarks are not of this scan.
     """
-    source, painter, known = open_source(EMBEDDED, {}), ScanPainter(scan), np.isfinite(picked[:, 0])
+    source, painter, known = open_source(EMBEDDED, {}), ScanPainter(scan), np.isfinite(given[:, 0])
     if known.any():
-        painter.check_near(picked)
-        check_face(picked, template, "the given landmarks")
-    frame = place_face(picked, template) if known.any() else find_face(source, painter)
+        painter.check_near(given)
+        check_face(given, template, "the given landmarks")
+    frame = place_face(given, template) if known.any() else find_face(source, painter)
     if painter.picture(place_camera(frame[0], frame[2], frame[1], SPAN_M))[1] > 0.5:
         raise StageError(INWARDS)
     views = look_around(source, painter, *frame)
@@ -68,8 +68,8 @@ def look(scan: Scan, template: np.ndarray, picked: np.ndarray) -> Observation:
         )
     return replace(
         found,
-        points=np.where(known[:, None], picked, found.points),
-        covariance=np.where(known[:, None, None], PICKED_M**2 * np.eye(3), found.covariance),
+        points=np.where(known[:, None], given, found.points),
+        covariance=np.where(known[:, None, None], GIVEN_M**2 * np.eye(3), found.covariance),
         inliers=found.inliers & ~known,
     )
 
@@ -101,10 +101,10 @@ def find_face(source: Source, painter: ScanPainter) -> Frame:
     return painter.middle_of(camera, face.points), rise @ axes[:2] / np.linalg.norm(rise), -axes[2]
 
 
-def place_face(picked: np.ndarray, template: np.ndarray) -> Frame:
-    """Find a face by picked landmarks (68, 3), NaN where there is none."""
-    known = np.isfinite(picked).all(1)
-    turn, shift = rigid_fit(template[known], picked[known])
+def place_face(given: np.ndarray, template: np.ndarray) -> Frame:
+    """Find a face by given landmarks (68, 3), NaN where there is none."""
+    known = np.isfinite(given).all(1)
+    turn, shift = rigid_fit(template[known], given[known])
     return turn @ (template.mean(0) - [0.0, 0.0, HALF_HEAD_M]) + shift, turn[:, 1], turn[:, 2]
 
 
@@ -165,14 +165,14 @@ class ScanPainter:
         shown = np.rint(255 * linear_to_srgb(np.clip(image, 0, 1))).astype(np.uint8)
         return shown, float(away.mean()) if seen.any() else 0.0
 
-    def check_near(self, picked: np.ndarray) -> None:
+    def check_near(self, given: np.ndarray) -> None:
         """Refuse landmarks (68, 3), NaN where unknown, that are far off the scan.
 
         Raises:
             StageError: they are.
         """
-        known = np.flatnonzero(np.isfinite(picked).all(1))
-        at = o3d.core.Tensor((picked[known] - self.centre).astype(np.float32))
+        known = np.flatnonzero(np.isfinite(given).all(1))
+        at = o3d.core.Tensor((given[known] - self.centre).astype(np.float32))
         away = self.scene.compute_distance(at).numpy()
         if (away > OFF_SCAN_M).any():
             raise StageError(

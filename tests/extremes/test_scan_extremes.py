@@ -6,12 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 import trimesh
 
 from express50.errors import FormatError, StageError
 from express50.geometry.transforms import axis_angle_to_matrix
 from express50.head.load import load_builtin
-from express50.head.model import landmarks
+from express50.head.model import landmarks, pose
 from pipelines.register.scan_landmarks import check_face
 from pipelines.register.scan_look import look
 from pipelines.register.scan_mesh import GREY, UNITS, Scan, read_scan
@@ -80,7 +81,7 @@ def test_inside_out_and_mirrored_scans_are_refused(head, axes, order):
 def test_a_mask_that_is_inside_out_is_refused(head):
     scan, marks, middles = head
     mask = scan.faces[middles[:, 2] > marks[8, 2] - 0.06]
-    with pytest.raises(StageError):
+    with pytest.raises(StageError, match="mirrored"):
         hollow = replace(scan, faces=np.ascontiguousarray(mask[:, ::-1]))
         check_face(look(hollow, marks, NONE).points, marks, "seen")
 
@@ -109,6 +110,13 @@ def test_few_landmarks_say_where_to_look_and_replace_what_is_found(head):
 def test_points_that_are_no_face_are_refused(head, change, words):
     with pytest.raises(StageError, match=words):
         check_face(change(head[1]), head[1], "landmarks")
+
+
+def test_a_mouth_that_is_wide_open_is_a_face(head):
+    model = load_builtin()
+    none = torch.zeros(1, 0)
+    mesh = pose(model, none, none, jaw=torch.tensor([[0.6, 0.0, 0.0]]))
+    check_face(landmarks(model, mesh)[0].double().numpy(), head[1], "seen")
 
 
 def test_landmarks_far_off_the_scan_are_refused(head):
