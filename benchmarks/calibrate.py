@@ -9,8 +9,9 @@ recorded first (some minutes). Then one camera of the solved rig after another i
 ``BUMP_DEG`` and must be found in the footage, and nothing may be found in the rig as solved.
 ``sfm`` and ``refine`` are rigs solved from footage alone, and perturbed ones put right, on the twin
 and on the foreign heads of ``../shared/captures`` where they are.
-``colour_gain_error_percent`` is of linear light a channel; ``colour_gain_unevened_percent`` leaves
-the cameras' colours as they are.
+``stated_to_true_error`` is the uncertainty that the solution states over its true error, in the
+head's place. ``colour_gain_error_percent`` is of linear light a channel;
+``colour_gain_unevened_percent`` leaves the cameras' colours as they are.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ import json
 import os
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -32,13 +33,12 @@ from express50.capture.index import Index, read_index
 from express50.contract.config import resolve_config
 from express50.contract.layout import Dataset
 from express50.files.calibration import read_cameras
-from express50.geometry.cameras import Camera, project, transform_camera, triangulate
+from express50.geometry.cameras import Camera, transform_camera
 from express50.geometry.transforms import (
     axis_angle_to_matrix,
     invert_transform,
     make_transform,
     matrix_to_axis_angle,
-    rigid_fit,
 )
 from express50.rigs.world_frame import meeting_point
 from express50.runner.runner import run_stage
@@ -54,6 +54,7 @@ from pipelines.calibrate.board import (
     board_points,
     read_corners,
 )
+from pipelines.calibrate.board_adjust import BoardRig, corner_errors
 from pipelines.calibrate.board_guess import (
     BoardView,
     board_poses,
@@ -64,13 +65,13 @@ from pipelines.calibrate.board_guess import (
     rig_from_boards,
     with_ideal,
 )
-from pipelines.calibrate.board_rig import BoardRig, corner_errors, solve_rig
+from pipelines.calibrate.board_rig import solve_rig
 from pipelines.calibrate.colour_gains import WhiteCollector
 from pipelines.calibrate.config import CalibrateConfig
 from pipelines.calibrate.footage import find_points, read_footage
 from pipelines.calibrate.given_rig import check_footage
+from pipelines.calibrate.uncertainty import camera_errors, head_points, state_uncertainty
 
-HEAD_RADIUS_M = 0.13
 BUMP_DEG = 0.3
 RIG = TwinConfig(
     subjects=1,
@@ -117,18 +118,18 @@ def main() -> int:
     detected = time.process_time()
     solution = solve_rig(observations, points, sizes, config.camera_model, config.rounds)
     solved = time.process_time()
-    rms = float(np.sqrt(np.mean(np.sum(solution.errors**2, axis=1))))
     started = time.process_time()
     rig = chained(observations, points, sizes)
     chain_seconds = time.process_time() - started
     errors = np.linalg.norm(corner_errors(rig, observations, points), axis=1)
     baseline = figures(rig.cameras, true) | {
-        "reprojection_px_rms": float(np.sqrt(np.mean(errors[np.isfinite(errors)] ** 2))),
+        "reprojection_px_rms": rms(errors[np.isfinite(errors)]),
         "seconds": detected - start + chain_seconds,
     }
     row: dict[str, object] = {
         **figures(solution.cameras, true),
-        "reprojection_px_rms": rms,
+        "stated_to_true_error": rounded(stated_figures(observations, points, sizes, true)),
+        "reprojection_px_rms": rms(np.linalg.norm(solution.errors, axis=1)),
         **bump_figures(solution.cameras, index, args.bumps),
         "seconds": solved - start,
         "seconds_detection": detected - start,
@@ -150,13 +151,9 @@ def gain_figures(palette: WhiteCollector, names: list[str]) -> dict[str, float]:
     every = sorted(make_rig(RIG.cameras, RIG.width, RIG.height, RIG.seed))
     true = np.log([make_sensor(every.index(name), RIG.seed).gain for name in names])
     true -= true.mean(0)
-
-    def rms(errors: np.ndarray) -> float:
-        return 100 * float(np.sqrt(np.mean(errors**2)))
-
     return {
-        "colour_gain_error_percent": rms(np.log(measured) - true),
-        "colour_gain_unevened_percent": rms(true),
+        "colour_gain_error_percent": 100 * rms((np.log(measured) - true).ravel()),
+        "colour_gain_unevened_percent": 100 * rms(true.ravel()),
     }
 
 
@@ -284,24 +281,41 @@ def figures(estimated: Mapping[str, Camera], true: Mapping[str, Camera]) -> dict
 
 
 def head_error(estimated: Mapping[str, Camera], true: Mapping[str, Camera]) -> float:
-    """Return the rms distance, pixels, of points in the head's place between both rigs' pictures.
-
-    The worlds are laid on each other by those points, triangulated by either rig: a camera's
-    rotation and principal point trade places without harm there, and would tilt a fit to the
-    cameras themselves.
-    """
+    """Return the rms distance, pixels, between where both rigs see points in the head's place."""
     middle = meeting_point(true)
-    points = np.random.default_rng(0).normal(size=(200, 3))
-    points *= HEAD_RADIUS_M / np.linalg.norm(points, axis=1, keepdims=True)
-    points += np.zeros(3) if middle is None else middle
-    names = sorted(estimated)
-    seen = np.stack([project(true[name], points)[0] for name in names])
-    found = triangulate([estimated[name] for name in names], seen)
-    R, t = rigid_fit(points, found)
-    offs = [
-        project(estimated[n], points @ R.T + t)[0] - p for n, p in zip(names, seen, strict=True)
-    ]
-    return float(np.sqrt(np.mean(np.sum(np.stack(offs) ** 2, axis=-1))))
+    points = head_points() + (np.zeros(3) if middle is None else middle)
+    return rms(camera_errors(estimated, true, points).values())
+
+
+def rms(values: Iterable[float]) -> float:
+    """Return the root mean square."""
+    return float(np.sqrt(np.mean(np.square(list(values)))))
+
+
+def stated_figures(
+    observations: BoardCorners,
+    points: np.ndarray,
+    sizes: Mapping[str, tuple[int, int]],
+    true: Mapping[str, Camera],
+) -> dict[str, float]:
+    """Return stated uncertainty over true error, rms over cameras, for rigs of 4, 8 and all.
+
+    The smaller rigs are every sixth and every third camera of the same recording: six rigs of four
+    and three of eight, of 24.
+    """
+    found = {}
+    for count in (4, 8, len(sizes)):
+        stated, off = list[float](), list[float]()
+        apart = len(sizes) // count
+        for first in range(apart):
+            names = sorted(sizes)[first::apart]
+            mine = np.isin(observations.camera, [observations.cameras.index(n) for n in names])
+            solved = solve_rig(observations.select(mine), points, sizes)
+            middle = meeting_point({name: true[name] for name in solved.cameras})
+            stated += [error.px for error in state_uncertainty(solved, points).values()]
+            off += camera_errors(solved.cameras, true, head_points() + middle).values()
+        found[f"{count}_cameras"] = rms(stated) / rms(off)
+    return found
 
 
 def chained(

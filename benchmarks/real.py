@@ -16,6 +16,7 @@ import sys
 import tempfile
 import tomllib
 from collections.abc import Mapping
+from dataclasses import asdict
 from pathlib import Path
 
 import cv2
@@ -29,6 +30,7 @@ from express50.geometry.conventions import K_from_opencv
 from express50.geometry.transforms import make_transform
 from pipelines.calibrate.board import Board, BoardCorners, board_points, read_corners
 from pipelines.calibrate.board_rig import solve_rig
+from pipelines.calibrate.uncertainty import state_uncertainty
 
 RIG4 = ("cameras_dropped", "reprojection_rms_px", "square_error_mm")
 
@@ -49,11 +51,14 @@ def rig4_figures(folder: Path) -> dict[str, object]:
     peer = peer_rig(folder / "camera_array.toml")
     board, odd, even = seen_board(folder, peer)
     sizes = {name: (camera.width, camera.height) for name, camera in peer.items()}
-    solved = solve_rig(odd, board_points(board), sizes)
+    points = board_points(board)
+    solved = solve_rig(odd, points, sizes)
     return {
         "cameras_dropped": len(peer) - len(solved.cameras),
         **judged(solved.cameras, even, board),
         "peer": judged({name: peer[name] for name in solved.cameras}, even, board),
+        "stated": {n: rounded(asdict(e)) for n, e in state_uncertainty(solved, points).items()},
+        "timing": {n: rounded(asdict(t)) for n, t in solved.timing.items()},
         "dropped": solved.dropped,
         "weak": solved.weak,
     }

@@ -255,11 +255,11 @@ def _linearise(rig: list[Camera], tracks: PointTracks, points: np.ndarray) -> _L
     return _Linear(errors, by_camera, by_point, sizes)
 
 
-class _Normal(NamedTuple):
-    """Normal equations with the points eliminated (Triggs et al., section 6.1).
+class Normal(NamedTuple):
+    """Normal equations of C cameras with K unknowns, from which G groups with M are eliminated.
 
-    `diagonal` (10C,) is the full system's, the rest the reduced one's. `follow` gives the points'
-    steps (P, 3) after a step (10C,) of the cameras.
+    `diagonal` (C K,) is the full system's, the rest the reduced one's. `follow` gives the groups'
+    steps (G, M) after a step (C K,) of the cameras. Source: Triggs et al., section 6.1.
     """
 
     cameras: np.ndarray
@@ -270,30 +270,50 @@ class _Normal(NamedTuple):
 
 def _eliminate_points(
     at: _Linear, tracks: PointTracks, scale: float, cameras: int, damping: float
-) -> _Normal:
-    total, size = int(tracks.point.max(initial=-1)) + 1, cameras * UNKNOWNS
+) -> Normal:
     root = (1 / tracks.sigma / np.sqrt(1 + (at.sizes / scale) ** 2))[:, None]
-    Jc, Jp, errors = at.by_camera * root[..., None], at.by_point * root[..., None], at.errors * root
-    V = _sum_by(Jp.transpose(0, 2, 1) @ Jp, tracks.point, total)
-    V += damping * V * np.eye(3)
-    V += 1e-9 * (1 + np.trace(V, axis1=1, axis2=2))[:, None, None] * np.eye(3)
+    by_camera, by_point = at.by_camera * root[..., None], at.by_point * root[..., None]
+    return eliminate(
+        by_camera, by_point, at.errors * root, tracks.camera, tracks.point, cameras, damping
+    )
+
+
+def eliminate(
+    by_camera: np.ndarray,
+    by_group: np.ndarray,
+    errors: np.ndarray,
+    camera: np.ndarray,
+    group: np.ndarray,
+    cameras: int,
+    damping: float = 0.0,
+) -> Normal:
+    """Eliminate what observations share in groups: points, or the board's poses.
+
+    `errors` (N, 2) are weighted and derived by the unknowns of the observation's camera (N, 2, K)
+    and group (N, 2, M); `camera` and `group` (N,) number these. `damping` adds so many times the
+    groups' diagonal.
+    """
+    total, each, size = int(group.max(initial=-1)) + 1, by_camera.shape[2], by_group.shape[2]
+    V = _sum_by(by_group.transpose(0, 2, 1) @ by_group, group, total)
+    V += damping * V * np.eye(size)
+    V += 1e-9 * (1 + np.trace(V, axis1=1, axis2=2))[:, None, None] * np.eye(size)
     inverse = np.linalg.inv(V)
-    blocks = np.zeros((total, cameras, UNKNOWNS, 3))
-    blocks[tracks.point, tracks.camera] = Jc.transpose(0, 2, 1) @ Jp
-    coupling = blocks.reshape(total, size, 3)
+    mixed = by_camera.transpose(0, 2, 1) @ by_group
+    blocks = _sum_by(mixed, group * cameras + camera, total * cameras)
+    coupling = blocks.reshape(total, cameras * each, size)
     scaled = coupling @ inverse
-    pull = _sum_by(np.einsum("nki,nk->ni", Jp, errors), tracks.point, total)
-    push = _sum_by(np.einsum("nki,nk->ni", Jc, errors), tracks.camera, cameras).reshape(-1)
+    pull = _sum_by(np.einsum("nki,nk->ni", by_group, errors), group, total)
+    push = _sum_by(np.einsum("nki,nk->ni", by_camera, errors), camera, cameras).reshape(-1)
     own = np.arange(cameras)
-    squares = np.zeros((cameras, UNKNOWNS, cameras, UNKNOWNS))
-    squares[own, :, own] = _sum_by(Jc.transpose(0, 2, 1) @ Jc, tracks.camera, cameras)
-    full = squares.reshape(size, size)
+    squares = np.zeros((cameras, each, cameras, each))
+    squares[own, :, own] = _sum_by(by_camera.transpose(0, 2, 1) @ by_camera, camera, cameras)
+    full = squares.reshape(cameras * each, cameras * each)
 
     def follow(step: np.ndarray) -> np.ndarray:
         moved = pull + np.tensordot(step, coupling, (0, 1))
         return -(inverse @ moved[..., None])[..., 0]
 
-    return _Normal(
+    return Normal(
         cameras=full - np.tensordot(scaled, coupling, ((0, 2), (0, 2))),
         right=np.tensordot(scaled, pull, ((0, 2), (0, 1))) - push,
         diagonal=np.diag(full).copy(),

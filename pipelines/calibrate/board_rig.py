@@ -1,9 +1,4 @@
-"""Solve a rig from board corners: single cameras, their rig, joint adjustment, rejection.
-
-The joint adjustment is COLMAP's. Its world is the board: its points are the board's corners, held
-constant, so the scale is the print's and the board stays flat and rigid. COLMAP's rig is the camera
-rig, and each board frame is one pose of the rig. There are no 3D points to estimate.
-"""
+"""Solve a rig from board corners: single cameras, their rig, joint adjustment, rejection."""
 
 from __future__ import annotations
 
@@ -12,12 +7,12 @@ from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
-import pycolmap
 
 from express50.errors import CalibrationError
-from express50.geometry.cameras import Camera, project
+from express50.geometry.cameras import Camera
 from express50.rigs.world_frame import canonical_from_rig, move_cameras
 from pipelines.calibrate.board import BoardCorners, even
+from pipelines.calibrate.board_adjust import BoardRig, adjust_board_rig, corner_errors
 from pipelines.calibrate.board_guess import (
     MIN_CORNERS,
     MIN_FRAMES,
@@ -36,6 +31,7 @@ from pipelines.calibrate.board_guess import (
     with_ideal,
 )
 from pipelines.calibrate.config import AUTO
+from pipelines.calibrate.timing import CameraTiming, estimate_timing, in_step
 
 LADDER = ("SIMPLE_RADIAL", "RADIAL", "OPENCV")  # from few to many parameters
 WEAK_CORNERS, WEAK_FRAMES = 200, 8  # cameras with less are reported
@@ -43,23 +39,15 @@ LEAST_CORNERS = 24  # that must fit the other cameras, or a camera is dropped
 REJECT_SIGMA = 4.0
 """Corners further off than this many robust standard deviations are rejected; 3 to 6 gave the same
 rig within 0.005 degrees."""
-ITERATIONS = 60  # of Levenberg-Marquardt; rigs before boards settle in fewer than 15
-
-
-@dataclass(frozen=True)
-class BoardRig:
-    """Cameras in the rig's space (their `cam_from_world`), and rig_from_board (4, 4) a frame."""
-
-    cameras: dict[str, Camera]
-    boards: dict[int, np.ndarray]
 
 
 @dataclass(frozen=True)
 class BoardSolution:
     """Cameras and world_from_board (4, 4) by frame in the canonical world, and what they rest on.
 
-    `corners` and their `errors` (N, 2), pixels, were kept of `corners_found`. `dropped` and `weak`
-    give a reason per camera.
+    `corners` and their `errors` (N, 2), pixels, were kept of `corners_found`; corners are brought
+    into step by `timing`, of cameras that saw the board move. `dropped` and `weak` give a reason
+    per camera.
     """
 
     cameras: dict[str, Camera]
@@ -67,6 +55,7 @@ class BoardSolution:
     corners: BoardCorners
     errors: np.ndarray
     corners_found: int
+    timing: dict[str, CameraTiming]
     dropped: dict[str, str]
     weak: dict[str, str]
 
@@ -92,7 +81,7 @@ def solve_rig(
     lone, views = _single_cameras(corners, points, sizes, lens, dropped)
     _require(lone, dropped)
     rig = _first_rig(lone, views, dropped)
-    rig, kept, errors = _refine(rig, corners, points, model, rounds, dropped)
+    rig, kept, errors, timing = _refine(rig, corners, points, model, rounds, dropped)
     middles = [pose[:3, :3] @ points.mean(0) + pose[:3, 3] for pose in rig.boards.values()]
     world_from_rig = canonical_from_rig(rig.cameras, np.median(middles, axis=0))
     return BoardSolution(
@@ -101,6 +90,7 @@ def solve_rig(
         corners=kept,
         errors=errors,
         corners_found=len(corners.corner),
+        timing=timing,
         dropped=dict(sorted(dropped.items())),
         weak=_weak(rig, corners, kept),
     )
@@ -196,20 +186,19 @@ def _refine(
     model: str,
     rounds: int,
     dropped: dict[str, str],
-) -> tuple[BoardRig, BoardCorners, np.ndarray]:
-    """Adjust, drop bad corners, images and cameras, and adjust again."""
-    errors = corner_errors(rig, corners, points)
-    keep = np.ones(len(errors), bool)
+) -> tuple[BoardRig, BoardCorners, np.ndarray, dict[str, CameraTiming]]:
+    """Adjust, drop bad corners, images and cameras, bring cameras into step, and adjust again."""
+    seen, errors = corners, corner_errors(rig, corners, points)
     limit = max(NEAR * float(np.hypot(c.width, c.height)) for c in rig.cameras.values())
-    loss_scale = limit / 3
+    loss_scale, timing = limit / 3, dict[str, CameraTiming]()
     for number in range(rounds):
-        keep = np.linalg.norm(errors, axis=1) < limit
-        # An image with fewer than six kept corners does not hold a board pose.
-        image = corners.camera * len(corners.frames) + corners.frame
-        keep &= np.bincount(image[keep], minlength=image.max(initial=0) + 1)[image] >= 6
+        keep = _held(np.linalg.norm(errors, axis=1) < limit, corners)
         rig = _drop_cameras(rig, corners, keep, dropped)
         _require(rig.cameras, dropped)
         keep &= np.array([name in rig.cameras for name in corners.cameras])[corners.camera]
+        if number:
+            timing = estimate_timing(rig, seen, keep, points, loss_scale, timing)
+            corners = in_step(seen, timing, {n: c.height for n, c in rig.cameras.items()})
         kept = corners.select(keep)
         if model == AUTO and number == min(1, rounds - 1):
             rig = _simplest_models(rig, kept, points, loss_scale)
@@ -220,7 +209,14 @@ def _refine(
         limit, loss_scale = max(REJECT_SIGMA * sigma, 0.05), 2 * sigma
     # Corners that only the last adjustment shows to be wrong are not reported as accepted.
     keep &= np.linalg.norm(errors, axis=1) < 2 * limit
-    return rig, corners.select(keep), errors[keep]
+    return rig, corners.select(keep), errors[keep], timing
+
+
+def _held(keep: np.ndarray, corners: BoardCorners) -> np.ndarray:
+    """Leave out frames in which no image has six kept corners: nothing holds the board's pose."""
+    counts = np.zeros((len(corners.cameras), len(corners.frames)), int)
+    np.add.at(counts, (corners.camera[keep], corners.frame[keep]), 1)
+    return keep & (counts.max(0) >= 6)[corners.frame]
 
 
 def _simplest_models(
@@ -298,124 +294,3 @@ def _weak(rig: BoardRig, found: BoardCorners, kept: BoardCorners) -> dict[str, s
         elif covered < 0.25:
             weak[name] = f"corners cover {covered:.0%} of its image, expected 25 % or more"
     return weak
-
-
-def corner_errors(rig: BoardRig, corners: BoardCorners, points: np.ndarray) -> np.ndarray:
-    """Compute the reprojection errors (N, 2), pixels; `points` (P, 3) are corners on the board.
-
-    Infinite where the rig has no such camera or frame, or the corner lies behind the camera.
-    """
-    errors = np.full((len(corners.corner), 2), np.inf)
-    for index, name in enumerate(corners.cameras):
-        for frame in rig.boards if name in rig.cameras else ():
-            rows = np.flatnonzero((corners.camera == index) & (corners.frame == frame))
-            pose = rig.cameras[name].cam_from_world @ rig.boards[frame]
-            placed = replace(rig.cameras[name], cam_from_world=pose)
-            pixels, _ = project(placed, points[corners.corner[rows]])
-            errors[rows] = pixels - corners.pixels[rows]
-    return np.where(np.isfinite(errors), errors, np.inf)
-
-
-def adjust_board_rig(
-    rig: BoardRig,
-    corners: BoardCorners,
-    points: np.ndarray,
-    loss_scale_px: float,
-    lenses: bool = True,
-    cameras: bool = True,
-) -> BoardRig:
-    """Refine board poses, and if asked `lenses` and the poses of `cameras`, over the corners.
-
-    Every observed camera and frame must be in `rig`; `points` (P, 3) are corners on the board,
-    metres. The Cauchy loss begins to flatten at `loss_scale_px`.
-    """
-    reconstruction, names, frames = _build(rig, corners, points)
-    options = pycolmap.BundleAdjustmentOptions()
-    options.print_summary = False
-    options.refine_points3D = False
-    options.refine_focal_length = lenses
-    options.refine_sensor_from_rig = cameras
-    options.refine_principal_point = lenses
-    options.refine_extra_params = lenses
-    options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
-    options.ceres.loss_function_scale = loss_scale_px
-    # There are no free points to eliminate, so COLMAP's choice by image count (an iterative
-    # solver beyond a thousand) loses to the default, factorising the normal equations.
-    options.ceres.auto_select_solver_type = False
-    options.ceres.solver_options.max_num_iterations = ITERATIONS
-    options.ceres.solver_options.function_tolerance = 1e-9
-    options.ceres.solver_options.num_threads = 1  # sums in one order: the same bytes every run
-    config = pycolmap.BundleAdjustmentConfig()
-    for image_id in reconstruction.reg_image_ids():
-        config.add_image(image_id)
-    pycolmap.create_default_bundle_adjuster(options, config, reconstruction).solve()
-    solved = reconstruction.rig(1)
-    root = rig.cameras[names[0]].cam_from_world  # the first camera stays where it was
-    found = {}
-    for i, name in enumerate(names):
-        made = reconstruction.camera(i + 1)
-        pose = _matrix(solved.sensor_from_rig(made.sensor_id)) @ root if i else root
-        params = tuple(float(p) for p in made.params)
-        found[name] = replace(rig.cameras[name], params=params, cam_from_world=pose)
-    boards = {
-        frame: np.linalg.inv(root) @ _matrix(reconstruction.frame(i + 1).rig_from_world)
-        for i, frame in enumerate(frames)
-    }
-    return BoardRig(found, boards)
-
-
-def _build(
-    rig: BoardRig, corners: BoardCorners, points: np.ndarray
-) -> tuple[pycolmap.Reconstruction, list[str], list[int]]:
-    """Write the rig as a COLMAP reconstruction; camera i and frame i get the id i + 1."""
-    reconstruction = pycolmap.Reconstruction()
-    names = [n for i, n in enumerate(corners.cameras) if (corners.camera == i).any()]
-    frames = sorted({int(f) for f in corners.frame})
-    root = rig.cameras[names[0]].cam_from_world
-    made_rig = pycolmap.Rig(rig_id=1)  # its own space is that of the first camera
-    for i, name in enumerate(names):
-        given = rig.cameras[name]
-        camera = pycolmap.Camera(
-            camera_id=i + 1, model=given.model, width=given.width, height=given.height,
-            params=list(given.params),
-        )  # fmt: skip
-        reconstruction.add_camera(camera)
-        if i == 0:
-            made_rig.add_ref_sensor(camera.sensor_id)
-        else:
-            pose = given.cam_from_world @ np.linalg.inv(root)
-            made_rig.add_sensor(camera.sensor_id, _rigid(pose))
-    reconstruction.add_rig(made_rig)
-    for corner, point in enumerate(points):
-        reconstruction.add_point3D_with_id(corner + 1, pycolmap.Point3D(xyz=point))
-    for i, frame in enumerate(frames):
-        made = pycolmap.Frame(frame_id=i + 1, rig_id=1)
-        made.rig_from_world = _rigid(root @ rig.boards[frame])
-        images = []
-        for j, name in enumerate(names):
-            index = corners.cameras.index(name)
-            rows = np.flatnonzero((corners.camera == index) & (corners.frame == frame))
-            if len(rows):
-                image = pycolmap.Image(
-                    name=f"{name}/{frame}", keypoints=corners.pixels[rows], camera_id=j + 1,
-                    image_id=i * len(names) + j + 1,
-                )  # fmt: skip
-                image.frame_id = i + 1
-                made.add_data_id(image.data_id)
-                images.append((image, corners.corner[rows]))
-        reconstruction.add_frame(made)
-        for image, seen in images:
-            reconstruction.add_image(image)
-            for k, corner in enumerate(seen):
-                element = pycolmap.TrackElement(image.image_id, k)
-                reconstruction.add_observation(int(corner) + 1, element)
-        reconstruction.register_frame(i + 1)
-    return reconstruction, names, frames
-
-
-def _rigid(T: np.ndarray) -> pycolmap.Rigid3d:
-    return pycolmap.Rigid3d(np.ascontiguousarray(T[:3]))
-
-
-def _matrix(pose: pycolmap.Rigid3d) -> np.ndarray:
-    return np.vstack([pose.matrix(), [0.0, 0.0, 0.0, 1.0]])

@@ -26,6 +26,7 @@ from pipelines.calibrate.adjuster import (
     triangulate_tracks,
 )
 from pipelines.calibrate.board import BoardCorners
+from pipelines.calibrate.board_adjust import BoardRig, adjust_board_rig, corner_errors
 from pipelines.calibrate.board_guess import (
     NEAR,
     all_board_poses,
@@ -33,7 +34,6 @@ from pipelines.calibrate.board_guess import (
     rig_from_boards,
     with_ideal,
 )
-from pipelines.calibrate.board_rig import BoardRig, adjust_board_rig, corner_errors
 from pipelines.calibrate.footage import at_footage_size, reduced_camera
 from pipelines.calibrate.tracks import LEAST_POINTS, FrameSetPoints, PointTracks, join_tracks
 

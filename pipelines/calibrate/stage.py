@@ -6,7 +6,7 @@ Given cameras are checked and refined; others are solved from a board or from th
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -42,6 +42,8 @@ from pipelines.calibrate.given_rig import (
     refine_by_board,
     refine_by_footage,
 )
+from pipelines.calibrate.timing import CameraTiming
+from pipelines.calibrate.uncertainty import state_uncertainty
 
 COLOUR_FRAMES = 12  # board images read per camera if only its colours are needed
 
@@ -200,6 +202,13 @@ def check_given(cameras: dict[str, Camera], sizes: dict[str, tuple[int, int]], w
 def _from_board(index: Index, config: CalibrateConfig) -> CalibratedRig:
     corners, points, whites = _read_board(index, config.board_frames)
     solution = solve_rig(corners, points, sizes_of(index), config.camera_model, config.rounds)
+    uncertainty = state_uncertainty(solution, points)
+    weak = {
+        name: f"{why}; expect errors of {error.px:.2g} px ({error.mm:.2g} mm) at the head"
+        if (error := uncertainty.get(name))
+        else why
+        for name, why in solution.weak.items()
+    }
     squared, kept = np.sum(solution.errors**2, axis=1), solution.corners
     return CalibratedRig(
         source="board",
@@ -212,12 +221,39 @@ def _from_board(index: Index, config: CalibrateConfig) -> CalibratedRig:
             "corners": len(squared),
             "corners_rejected": solution.corners_found - len(squared),
             "board_frames": len(solution.boards),
+            "uncertainty": {
+                name: {"px": round(error.px, 4), "mm": round(error.mm, 4)}
+                for name, error in uncertainty.items()
+            },
+            "timing": {
+                name: {key: round(value, 4) for key, value in asdict(found).items()}
+                for name, found in solution.timing.items()
+            },
         },
         gains=whites.gains(sorted(solution.cameras)),
         solution=solution,
         dropped=_notes(solution.dropped),
-        warnings=_notes(solution.weak),
+        warnings=(*_notes(weak), *_notes(_out_of_step(solution.timing))),
     )
+
+
+def _out_of_step(timing: Mapping[str, CameraTiming]) -> dict[str, str]:
+    """Name cameras whose pictures, or rows of a picture, are not of one instant with the others."""
+    found = {}
+    for name, camera in timing.items():
+        ways = []
+        if camera.late:
+            side = "late" if camera.late > 0 else "early"
+            ways.append(f"its pictures are {abs(camera.late):.2f} of a frame {side}")
+        if camera.readout:
+            rows = f"its last row {abs(camera.readout):.2f} of a frame from its first"
+            ways.append(f"{rows} (rolling shutter)")
+        if ways:
+            found[name] = (
+                f"{', '.join(ways)}; the calibration allows for it, later stages do not:"
+                " synchronise the cameras, or let subjects move slowly"
+            )
+    return found
 
 
 def _read_board(index: Index, limit: int) -> tuple[BoardCorners, np.ndarray, WhiteCollector]:

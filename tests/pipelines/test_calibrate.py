@@ -19,7 +19,8 @@ from pipelines.calibrate.board import (
     make_detector,
     opencv_board,
 )
-from pipelines.calibrate.board_rig import BoardRig, corner_errors, solve_rig
+from pipelines.calibrate.board_adjust import BoardRig, corner_errors
+from pipelines.calibrate.board_rig import solve_rig
 from pipelines.calibrate.stage import check_given
 from tests.pipelines.board_rigs import (
     BOARD,
@@ -219,18 +220,16 @@ def test_corners_of_an_image_are_found_to_a_fraction_of_a_pixel() -> None:
     assert np.sqrt(np.mean(np.sum(errors**2, axis=1))) < 0.08
 
 
-@pytest.mark.parametrize("negative", [False, True])
-@pytest.mark.parametrize("mirror", [False, True])
-def test_white_on_black_and_mirrored_boards_are_found(negative: bool, mirror: bool) -> None:
+def test_white_on_black_and_mirrored_boards_are_found() -> None:
     rig = make_rig(1, focal=500.0)
     board = board_motion(1, 12, shift=0.0)[0]
-    image = render_board(rig["cam00"], board)
-    image = 255 - image if negative else image
-    ids, pixels = detect_corners(image[:, :: -1 if mirror else 1], make_detector(BOARD), BOARD)
-    pixels = pixels * [-1, 1] + [640, 0] if mirror else pixels
-    true = observe(rig, [board], 0.0)
-    off = pixels - np.array([true.pixels[true.corner == i][0] for i in ids])
-    assert len(ids) >= 50 and np.sqrt(np.mean(np.sum(off**2, axis=1))) < 0.1
+    image, true = render_board(rig["cam00"], board, samples=2), observe(rig, [board], 0.0)
+    row = dict(zip(true.corner.tolist(), true.pixels, strict=True))
+    for look, flip in ((255 - image, False), (image[:, ::-1], True), (255 - image[:, ::-1], True)):
+        ids, pixels = detect_corners(look, make_detector(BOARD), BOARD)
+        pixels = pixels * [-1, 1] + [640, 0] if flip else pixels
+        off = np.linalg.norm(pixels - [row[i] for i in ids.tolist()], axis=1)
+        assert len(ids) >= 50 and np.sqrt(np.mean(off**2)) < 0.15
 
 
 def test_board_points_are_opencvs() -> None:

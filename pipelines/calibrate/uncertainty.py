@@ -1,0 +1,151 @@
+"""State how far the cameras of a board rig may be off, in the place of the head.
+
+The covariance of all cameras follows from the derivatives of the corners' errors, boards' poses
+eliminated. It is carried over to points in the head's place, after worlds are laid on each other by
+these points, as nothing else matters further on. It takes corners' errors for independent and the
+lens model for true, so it is joined with what two halves of the board images say of each other.
+After mrcal's projection uncertainty (Kogan, https://mrcal.secretsauce.net/uncertainty.html).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from express50.geometry.cameras import Camera, project, triangulate
+from express50.geometry.transforms import rigid_fit
+from pipelines.calibrate.adjuster import eliminate
+from pipelines.calibrate.board import BoardCorners
+from pipelines.calibrate.board_adjust import (
+    BoardRig,
+    adjust_board_rig,
+    derive,
+    derive_corners,
+    rig_covariance,
+    rigid_steps,
+)
+from pipelines.calibrate.board_rig import LEAST_CORNERS, BoardSolution
+
+HEAD_RADIUS_M = 0.13
+
+
+@dataclass(frozen=True)
+class HeadError:
+    """Expected error (root mean square) of where a camera sees points of the head: px, mm there."""
+
+    px: float
+    mm: float
+
+
+def state_uncertainty(solution: BoardSolution, points: np.ndarray) -> dict[str, HeadError]:
+    """Estimate each camera's error in the head's place; empty for a lone camera.
+
+    `points` (P, 3) are corners on the board. The covariance's variance is multiplied by the mean of
+    1 and of what halves of the board images differ by, squared, over what it lets expect of them.
+    """
+    names = sorted(solution.cameras)
+    if len(names) < 2:
+        return {}
+    rig, head = BoardRig(solution.cameras, solution.boards), head_points()
+    scale = 2 * max(float(np.median(np.linalg.norm(solution.errors, axis=1))) / 1.1774, 1e-3)
+    sigma = _noise(solution, scale)
+
+    def expected(corners: BoardCorners) -> dict[str, float]:
+        names, covariance = _covariance(rig, corners, points, sigma)
+        moved = _move_head([rig.cameras[name] for name in names], head)
+        squared = np.einsum("ckip,pq,ckiq->ck", moved, covariance, moved, optimize=True).mean(1)
+        return dict(zip(names, squared.tolist(), strict=True))
+
+    squared = expected(solution.corners)
+    halves = _halves(solution.corners)
+    if len(np.unique(halves[0].camera)) > 1:
+        one, other = (adjust_board_rig(rig, half, points, scale).cameras for half in halves)
+        variance = [expected(half) for half in halves]
+        for name, off in camera_errors(one, other, head).items():
+            squared[name] *= (1 + off**2 / sum(half[name] for half in variance)) / 2
+    return {name: _head_error(solution.cameras[name], squared[name]) for name in names}
+
+
+def _head_error(camera: Camera, squared_px: float) -> HeadError:
+    focal, px = np.sqrt(camera.K[0, 0] * camera.K[1, 1]), np.sqrt(squared_px)
+    return HeadError(float(px), float(1e3 * px * camera.cam_from_world[2, 3] / focal))
+
+
+def head_points() -> np.ndarray:
+    """Return points (40, 3) on a sphere about the canonical world's origin, where the head is."""
+    points = np.random.default_rng(0).normal(size=(40, 3))
+    return HEAD_RADIUS_M * points / np.linalg.norm(points, axis=1, keepdims=True)
+
+
+def camera_errors(
+    found: Mapping[str, Camera], true: Mapping[str, Camera], points: np.ndarray
+) -> dict[str, float]:
+    """Return by camera the rms distance, pixels, of points (N, 3) in two rigs' pictures.
+
+    The points are the true rig's. Worlds are laid on each other by the points as either rig
+    triangulates them: a camera's rotation and principal point trade places without harm there, and
+    would tilt a fit to the cameras themselves.
+    """
+    names = sorted(found)
+    seen = np.stack([project(true[name], points)[0] for name in names])
+    R, t = rigid_fit(points, triangulate([found[name] for name in names], seen))
+    offs = [project(found[n], points @ R.T + t)[0] - p for n, p in zip(names, seen, strict=True)]
+    rms = np.sqrt(np.mean(np.sum(np.stack(offs) ** 2, axis=-1), axis=1))
+    return dict(zip(names, rms.tolist(), strict=True))
+
+
+def _noise(solution: BoardSolution, scale: float) -> np.ndarray:
+    """Measure the corners' noise (C,) per camera, pixels, as a fit with Cauchy's loss passes it."""
+    length = np.linalg.norm(solution.errors, axis=1)
+    weight, sigma = 1 / (1 + (length / scale) ** 2), np.full(len(solution.corners.cameras), 1e-6)
+    for i in np.unique(solution.corners.camera):
+        mine = solution.corners.camera == i
+        pull = np.sqrt(np.mean((weight[mine] * length[mine]) ** 2) / 2)
+        sigma[i] = max(pull / np.mean(weight[mine] ** 2), 1e-6)
+    return sigma
+
+
+def _covariance(
+    rig: BoardRig, corners: BoardCorners, points: np.ndarray, sigma: np.ndarray
+) -> tuple[list[str], np.ndarray]:
+    """Return the names of the cameras and the covariance (14 C, 14 C) of their unknowns.
+
+    `sigma` is the noise of corners by the number that their camera has in `corners`.
+    """
+    present, camera = np.unique(corners.camera, return_inverse=True)
+    names = [corners.cameras[i] for i in present]
+    by_camera, by_board = derive_corners(rig, corners, points)
+    noise, none = sigma[corners.camera][:, None, None], np.zeros((len(camera), 2))
+    normal = eliminate(by_camera / noise, by_board / noise, none, camera, corners.frame, len(names))
+    unknowns = np.count_nonzero(normal.diagonal) + 6 * (len(np.unique(corners.frame)) - 1)
+    left = max(1 - unknowns / (2 * len(camera)), 0.1)  # noise that the unknowns did not take up
+    return names, rig_covariance(normal) / left
+
+
+def _move_head(cameras: list[Camera], head: np.ndarray) -> np.ndarray:
+    """Derive pixels (C, K, 2) of points (K, 3) by all cameras' unknowns: (C, K, 2, 14 C).
+
+    To first order, what `camera_errors` measures.
+    """
+    count, derived = len(cameras), [derive(camera, head) for camera in cameras]
+    by_camera, by_point = (np.stack(part) for part in zip(*derived, strict=True))
+    inverse = np.linalg.inv(np.einsum("ckij,ckil->kjl", by_point, by_point))
+    shift = -np.einsum("kjl,ckil,ckip->kjcp", inverse, by_point, by_camera, optimize=True)
+    turned = rigid_steps(head)
+    flat = shift.reshape(3 * len(head), -1)
+    motion = np.linalg.lstsq(turned.reshape(-1, 6), flat, rcond=None)[0]
+    moved = np.einsum("ckij,kjm,mp->ckip", by_point, turned, motion, optimize=True)
+    own = np.arange(count)
+    moved.reshape(*moved.shape[:3], count, -1)[own, :, :, own] += by_camera
+    return moved
+
+
+def _halves(corners: BoardCorners) -> tuple[BoardCorners, BoardCorners]:
+    """Split the corners by every other board frame, without cameras that a half does not hold."""
+    side = np.searchsorted(np.unique(corners.frame), corners.frame) % 2
+    seen = np.zeros((2, len(corners.cameras)))
+    np.add.at(seen, (side, corners.camera), 1)
+    held = (seen.min(0) >= LEAST_CORNERS)[corners.camera]
+    return corners.select(held & (side == 0)), corners.select(held & (side == 1))
