@@ -36,6 +36,10 @@ class FormatError(Express50Error):
     """A file does not follow its format."""
 
 
+class DiskFullError(Express50Error):
+    """The disk, or a quota on it, leaves no room; what is finished is kept."""
+
+
 class StageError(Express50Error):
     """A stage cannot process one of its items."""
 

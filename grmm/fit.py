@@ -20,7 +20,7 @@ from torch import Tensor
 
 from express50.console import log
 from express50.errors import TrainError
-from express50.files.atomic import write_json
+from express50.files.atomic import check_space, write_json
 from grmm import losses
 from grmm.checkpoint import Gallery, Loaded, collect_gallery, save_checkpoint
 from grmm.config import Config
@@ -69,11 +69,14 @@ def fit(
     Raises:
         TrainError: no views, or views of several subjects.
     """
+    judge = PerceptualMetrics(loaded.config.metrics)  # first, as it may refuse its files
+    out.mkdir(parents=True, exist_ok=True)
+    check_space(out)
     state = start(loaded, views, list(given))
     render = fitted_render(state)
     held_out = [i for i in held_out if views.keys[i].expression in state.z_exp]
     stages, effort = run_stages(state, lambda: _scores(state, held_out, render))
-    judge = PerceptualMetrics(loaded.config.metrics)
+    save_fit(state, out)
     rows = evaluate(views, held_out or state.given, render, judge)
     metrics: dict[str, object] = {
         "subject": views.keys[state.given[0]].subject,
@@ -88,7 +91,6 @@ def fit(
         "fid": judge.fid(),
     }
     metrics |= effort | judge.missing()
-    save_fit(state, out)
     comparison_sheet(out / "given.jpg", views, state.given[:6], render)
     if held_out:
         comparison_sheet(out / "held_out.jpg", views, held_out[:6], render)

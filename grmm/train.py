@@ -21,7 +21,7 @@ from torch.nn.parallel import DistributedDataParallel
 
 from express50.console import log
 from express50.errors import TrainError
-from express50.files.atomic import write_json
+from express50.files.atomic import check_space, write_json
 from express50.head.model import HeadModel
 from grmm import losses
 from grmm.config import Config
@@ -42,6 +42,7 @@ from grmm.train_state import (
     restore,
     save,
     set_rates,
+    spare_space,
     start_log,
     with_map_size,
 )
@@ -69,6 +70,7 @@ def train(
     # --- Processes, samples, model -------------------------------------------------------------
     rank, world, device = join_processes()
     torch.manual_seed(config.train.seed)
+    perceptual = PerceptualMetrics(config.metrics)  # first, as it may refuse its files
     views = HeadViews(source, head.to(device), config.data)
     config = with_map_size(config, views)
     state = prepare(views, config, rank, world)
@@ -79,6 +81,8 @@ def train(
         warm_start(state.model, views, state.training)
     parallel = DistributedDataParallel(state.model) if world > 1 else state.model
     if rank == 0:
+        out.mkdir(parents=True, exist_ok=True)
+        check_space(out)
         start_log(out / "log.jsonl", state.iteration)
         count, texels = len(state.model.texels), config.model.n_g**2
         log(
@@ -92,7 +96,7 @@ def train(
 
     # --- The loop ------------------------------------------------------------------------------
     started, saved = time.perf_counter() - state.seconds, state.seconds
-    with deferred_interrupt() as interrupt:
+    with deferred_interrupt() as interrupt, spare_space(checkpoint) as spare:
         while not finished(state, config):
             set_rates(state, config)
             step(state, parallel, config)
@@ -106,8 +110,11 @@ def train(
                 log(progress_line(state, config))
                 append_log(out / "log.jsonl", state)
             if rank == 0 and (due or last):
+                spare.unlink(missing_ok=True)
                 save(state, checkpoint, config, source.head)
                 saved = state.seconds
+            elif rank == 0 and not spare.exists():
+                save(state, spare, config, source.head)
             if interrupt.is_set():  # only now, after the save
                 raise KeyboardInterrupt
     if world > 1:
@@ -117,7 +124,7 @@ def train(
         time.sleep(GLOO_SECONDS)
 
     # --- The report ----------------------------------------------------------------------------
-    metrics = report(state, config, out) if rank == 0 else {}
+    metrics = report(state, config, out, perceptual) if rank == 0 else {}
     if rank == 0 and float(str(metrics["psnr_train_db"])) < GREY_DB:
         log("training images score worse than plain grey: training diverged; lower train.lr")
     return metrics
@@ -176,14 +183,15 @@ def objective(
     }
 
 
-def report(state: TrainState, config: Config, out: Path) -> dict[str, object]:
+def report(
+    state: TrainState, config: Config, out: Path, perceptual: PerceptualMetrics
+) -> dict[str, object]:
     """Evaluate, draw previews and write metrics.json."""
     model, views, count = state.model, state.views, config.train.evaluate_images
     render = training_render(model, views)
     trained = {views.keys[i].frame for i in state.training}
     held = [i for i in state.holdout if views.keys[i].frame in trained]
     new = [i for i in state.holdout if views.keys[i].frame not in trained]
-    perceptual = PerceptualMetrics(config.metrics)
     training = evaluate(views, spread(state.training, count), render)
     holdout = evaluate(views, spread(held, count), render, perceptual)
     expressions = evaluate(views, spread(new, count), render)

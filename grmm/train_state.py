@@ -165,6 +165,19 @@ def set_rates(state: TrainState, config: Config) -> None:
         group["lr"] = config.train.lr * group["scale"] * factor
 
 
+@contextlib.contextmanager
+def spare_space(path: Path) -> Iterator[Path]:
+    """Yield the file that occupies the space of the next checkpoint; it goes when training ends.
+
+    A disk that others fill meanwhile then still takes what was trained.
+    """
+    spare = path.with_name(f".{path.name}.spare")
+    try:
+        yield spare
+    finally:
+        spare.unlink(missing_ok=True)
+
+
 def save(state: TrainState, path: Path, config: Config, head_spec: str) -> None:
     """Write a checkpoint with the loop's full state."""
     save_checkpoint(
@@ -242,12 +255,14 @@ def start_log(path: Path, iteration: int) -> None:
 
 def append_log(path: Path, state: TrainState) -> None:
     """Append where a run is to OUT/log.jsonl, one JSON object per line."""
-    path.parent.mkdir(parents=True, exist_ok=True)
     numbers = {"loss": sum(state.terms.values())} | state.terms
     entry = {"iteration": state.iteration, "seconds": round(state.seconds, 3)}
     entry |= {name: round(value, 8) for name, value in numbers.items()}
-    with path.open("a", encoding="utf-8") as file:
-        file.write(json.dumps(entry) + "\n")
+    try:
+        with path.open("a", encoding="utf-8") as file:
+            file.write(json.dumps(entry) + "\n")
+    except OSError as error:  # a full disk; the weights matter more than a line about them
+        log(f"{path}: a line is not written ({error})")
 
 
 @contextlib.contextmanager

@@ -12,7 +12,7 @@ from express50.console import FAILED, OK, add_command, say, say_json, stdout_to_
 from express50.contract.config import PRESETS, config_toml, resolve_config
 from express50.contract.layout import Dataset
 from express50.contract.stage import Stage, stages, with_required
-from express50.errors import ConfigError, StageError
+from express50.errors import ConfigError, Express50Error, StageError
 
 
 def add_commands(subparsers: Any) -> None:
@@ -69,6 +69,16 @@ def config_of(stage: Stage, args: argparse.Namespace) -> Any:
     return resolve_config(stage, args.preset, args.config, args.set, stages())
 
 
+def _tried_config(stage: Stage, args: argparse.Namespace) -> Any:
+    """Build the configuration of a stage, and try the files that it names."""
+    config = config_of(stage, args)
+    try:
+        stage.try_files(config)
+    except Express50Error as error:
+        raise ConfigError(str(error)) from error
+    return config
+
+
 def run_one(args: argparse.Namespace) -> int:
     """Run one stage, and what its command runs first."""
     chosen = with_required([args.stage])
@@ -118,7 +128,7 @@ def _run(args: argparse.Namespace, chosen: Sequence[Stage], pattern: str | None)
         Pool(args.workers, args.scheduler, args.threads, slurm) as pool,
     ):
         # Every configuration is checked before the first stage spends hours.
-        configs = [config_of(stage, args) for stage in chosen]
+        configs = [_tried_config(stage, args) for stage in chosen]
         for stage, config in zip(chosen, configs, strict=True):
             items = _items(stage, dataset, args, pattern)
             summaries.append(run_stage(stage, dataset, config, items, pool=pool))

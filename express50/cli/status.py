@@ -39,7 +39,7 @@ class StageStatus:
         state: ``running``, ``stopped`` (its run was killed), ``failed`` (items did), ``done``, or
             ``not run``.
         done: items that are.
-        failed: receipts of items that are not.
+        failed: receipts of items whose last attempt failed.
         running: when each item that is worked at was begun, seconds since 1970.
         missing: items of the last run that wait or were left when it was stopped.
         rate: items per second of late; 0 while none has ended.
@@ -167,7 +167,7 @@ def read_status(
 
 def _stage(name: str, table: dict[str, Receipt], run: Run | None, now: float) -> StageStatus:
     receipts = tuple(table.values())
-    failed = tuple(r for r in receipts if r.status == "failed")
+    failed = tuple(r for r in receipts if r.reason)
     alive, open_items, former, rate = False, 0, 0, 0.0
     running: dict[str, float] = {}
     if run is not None:

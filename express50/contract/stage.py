@@ -57,6 +57,10 @@ def no_gpu(config: Any) -> bool:
     return False
 
 
+def no_files(config: Any) -> None:
+    """Try nothing: no setting names a file."""
+
+
 @dataclass(frozen=True)
 class Growth:
     """Sizes of the footage that a stage's cost is proportional to, for ``express50 plan``.
@@ -89,6 +93,8 @@ class Stage:
         run: ``run(dataset, item, config, out_dir)`` writes every file into ``out_dir`` and
             returns a ``Result`` (the runner writes it to ``metrics.json``). Raises Express50Error
             when the data of this item are bad.
+        try_files: opens the files that settings name; commands call it before any stage runs.
+            Raises Express50Error where one cannot be used.
         needs_gpu: whether items of this config may only run where there is a GPU; one at a time
             runs on each.
         help: one line for the command line, in the imperative.
@@ -107,6 +113,7 @@ class Stage:
     items: Callable[[Dataset], list[str]]
     inputs: Callable[[Dataset, str, Any], dict[str, Path | str]]
     run: Callable[[Dataset, str, Any, Path], Result]
+    try_files: Callable[[Any], None] = no_files
     needs_gpu: Callable[[Any], bool] = no_gpu
     help: str = ""
     purpose: str = ""

@@ -266,8 +266,8 @@ class _StageAudit:
         if to_do and receipts:
             count = f"{len(to_do)} of {len(known or ())} items are to do"
             self._note(stage, f"{count}; run 'express50 {stage.name}'")
-        if failed:
-            self._note(stage, f"{len(failed)} items failed; see status")
+        if failures := sum(bool(receipt.reason) for receipt in receipts.values()):
+            self._note(stage, f"{failures} items failed; see status")
 
     def _output_faults(self, stage: str) -> Iterator[Fault]:
         """Find outputs that are missing, changed or unaccounted for, at most one fault per item."""

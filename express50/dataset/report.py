@@ -93,7 +93,7 @@ def _stage_view(dataset: Dataset, stage: str, receipts: list[Receipt]) -> dict:
         "name": stage,
         "purpose": stages()[stage].purpose,
         "item_count": len(metrics),
-        "failed": [(r.item, r.reason) for r in receipts if r.status == "failed"],
+        "failed": [(r.item, r.reason) for r in receipts if r.reason],
         "dropped": _reasons(metrics, "dropped"),
         "noted": _reasons(metrics, "warnings"),
         "seconds": number(round(sum(r.seconds for r in receipts), 1)),

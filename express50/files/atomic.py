@@ -1,7 +1,11 @@
-"""Write files so that after a crash each is absent or whole: aside, synced, renamed."""
+"""Write files so that after a crash each is absent or whole: aside, synced, renamed.
+
+A full disk becomes one error, which stops a run before it computes what cannot be kept.
+"""
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import shutil
@@ -9,6 +13,11 @@ import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+
+from express50.errors import DiskFullError
+
+LEAST_FREE = 100e6  # bytes; with less a disk counts as full
+NO_SPACE = os.strerror(errno.ENOSPC)
 
 
 def dump_json(value: object) -> bytes:
@@ -23,22 +32,62 @@ def dump_json(value: object) -> bytes:
 
 def write_bytes(path: Path, data: bytes) -> None:
     """Write a file so that a reader or a crash sees the old bytes or the new, nothing between."""
-    path.parent.mkdir(parents=True, exist_ok=True)
     aside = path.with_name(f".{path.name}.{uuid.uuid4().hex}")
-    try:
-        with aside.open("wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        aside.replace(path)
-    finally:
-        aside.unlink(missing_ok=True)
-    sync_directory(path.parent)
+    with naming_full_disk(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            with aside.open("wb") as file:
+                file.write(data)
+                file.flush()
+                os.fsync(file.fileno())
+            aside.replace(path)
+        finally:
+            aside.unlink(missing_ok=True)
+        sync_directory(path.parent)
 
 
 def write_json(path: Path, value: object) -> None:
     """Write deterministic JSON in one step."""
     write_bytes(path, dump_json(value))
+
+
+def check_space(folder: Path) -> None:
+    """Refuse to go on where the disk of an existing folder is nearly full.
+
+    Raises:
+        DiskFullError: less than `LEAST_FREE` is left.
+    """
+    usage = shutil.disk_usage(folder)
+    if usage.total and usage.free < LEAST_FREE:  # some network drives do not tell their size
+        raise _full(folder, f"{usage.free / 1e6:.0f} MB are left, expected {LEAST_FREE / 1e6:.0f}")
+
+
+@contextmanager
+def naming_full_disk(path: Path) -> Iterator[None]:
+    """Turn any error that a full disk led to, also in a library, into one that names the path.
+
+    Raises:
+        DiskFullError: the body ended by such an error.
+    """
+    try:
+        yield
+    except DiskFullError:
+        raise
+    except Exception as error:
+        cause: BaseException | None = error
+        while cause is not None:
+            full = getattr(cause, "errno", None) in (errno.ENOSPC, errno.EDQUOT)
+            if full or NO_SPACE in str(cause):
+                raise _full(path, str(cause)) from error
+            cause = cause.__cause__ or cause.__context__
+        raise
+
+
+def _full(path: Path, why: str) -> DiskFullError:
+    return DiskFullError(
+        f"{path}: the disk is full ({why}); free some space and run the same again: it goes on "
+        "with what is not finished"
+    )
 
 
 @contextmanager

@@ -55,6 +55,26 @@ def source_files(landmarks: str) -> dict[str, Path]:
     return {"landmarks": Path(landmarks).expanduser()}
 
 
+def _existing_files(landmarks: str) -> dict[str, Path]:
+    files = source_files(landmarks)
+    for path in files.values():
+        if not path.is_file():
+            raise ConfigError(
+                f"landmarks {landmarks!r}: no file {path}; expected 'embedded', 'fan:' and the "
+                "path of FAN's TorchScript weights, or the path of a file of points"
+            )
+    return files
+
+
+def try_source(landmarks: str) -> None:
+    """Read the files of a source as far as that goes without cameras; raises as `open_source`."""
+    files = _existing_files(landmarks)
+    if "landmarks" in files:
+        _read_raw(files["landmarks"])
+    elif "fan" in files:
+        load_fan(files["fan"])
+
+
 def open_source(
     landmarks: str, cameras: Mapping[str, Camera], refinements: int = 3, smallest: float = SMALLEST
 ) -> Source:
@@ -71,13 +91,7 @@ def open_source(
         ConfigError: the file is missing, or is not of the expected kind.
         FormatError: the file of points is malformed.
     """
-    files = source_files(landmarks)
-    for path in files.values():
-        if not path.is_file():
-            raise ConfigError(
-                f"landmarks {landmarks!r}: no file {path}; expected 'embedded', 'fan:' and the "
-                "path of FAN's TorchScript weights, or the path of a file of points"
-            )
+    files = _existing_files(landmarks)
     if "landmarks" in files:
         table = read_points(files["landmarks"], cameras)
 
@@ -153,13 +167,7 @@ def read_points(path: Path, cameras: Mapping[str, Camera]) -> Table:
             far outside the image.
     """
     path = Path(path)
-    try:
-        raw = _read_npz(path) if path.suffix.lower() == ".npz" else _read_json(path)
-    except (ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
-        raise FormatError(
-            f"{path}: no file of landmarks ({type(error).__name__}: {error}); expected the layout "
-            "of docs/FORMAT.md"
-        ) from error
+    raw = _read_raw(path)
     if not any(camera_id in cameras for camera_id, _ in raw):
         names = sorted({camera_id for camera_id, _ in raw})
         raise FormatError(
@@ -177,6 +185,16 @@ def read_points(path: Path, cameras: Mapping[str, Camera]) -> Table:
             rows[known, :2] = normalised(camera, rows[known, :2]) * focal + middle
             table[key] = rows
     return table
+
+
+def _read_raw(path: Path) -> Table:
+    try:
+        return _read_npz(path) if path.suffix.lower() == ".npz" else _read_json(path)
+    except (ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
+        raise FormatError(
+            f"{path}: no file of landmarks ({type(error).__name__}: {error}); expected the layout "
+            "of docs/FORMAT.md"
+        ) from error
 
 
 def _read_npz(path: Path) -> Table:

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
 
-from express50.errors import StageError
+from express50.errors import DiskFullError, StageError
 from express50.runner.clusters import GPU, LocalWorkers, RemoteWorkers
 from express50.runner.ledger import Receipt
 from express50.runner.slurm import SlurmJob, SlurmWorkers
@@ -71,6 +71,7 @@ class Pool:
         Raises:
             StageError: the scheduler cannot be reached or went away, or offers no GPU that the
                 stage needs.
+            DiskFullError: there is no room for an item's outputs.
         """
         tasks = list(tasks)
         here = self.scheduler is None and self.slurm is None
@@ -123,6 +124,8 @@ class Pool:
                 ended = _ended(workers.client, running)
             for future, receipts, failure in ended:
                 batch = running.pop(future)
+                if isinstance(failure, DiskFullError):
+                    raise failure
                 if isinstance(failure, KilledWorker):
                     killed += batch
                 elif failure is not None:  # the tasks did not even start

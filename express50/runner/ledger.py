@@ -39,19 +39,20 @@ class Made:
 
 @dataclass(frozen=True, kw_only=True)
 class Receipt:
-    """The result of one item's last attempt.
+    """The state of one item: what is published, and how its last attempt ended.
 
     Attributes:
         stage: stage name.
         item: item id.
         fingerprint: digest of stage version, config and inputs.
-        status: ``done`` or ``failed``.
-        reason: one line for a failure, else empty.
+        status: ``done``, or ``failed`` where nothing is published.
+        reason: one line if the last attempt failed, else empty. What a former one published may
+            still stand: then the status stays ``done``, and all but this and the time are of it.
         metrics: what the stage returned.
-        seconds: wall time of the last attempt.
+        seconds: wall time of the attempt.
         peak_memory: largest resident memory while it ran, bytes.
         attempts: number of tries in that run.
-        time: when it ended, seconds since 1970.
+        time: when the last attempt ended, seconds since 1970.
         made: inputs and files of what was published; read by `Ledger.made`, not by `Ledger.read`.
     """
 
@@ -215,6 +216,14 @@ class Ledger:
                 files = {name: list(vars(m).values()) for name, m in receipt.made.files.items()}
                 texts = (json.dumps(t, sort_keys=True) for t in (receipt.made.inputs, files))
                 database.execute("INSERT OR REPLACE INTO made VALUES (?, ?, ?, ?)", (*key, *texts))
+
+    def note_attempt(self, last: Receipt) -> None:
+        """Note reason and time of an item's last attempt beside the receipt of what stands."""
+        with self._change() as database:
+            database.execute(
+                "UPDATE receipts SET reason = ?, time = ? WHERE stage = ? AND item = ?",
+                (last.reason, last.time, last.stage, last.item),
+            )
 
     def read(self, stage: str) -> dict[str, Receipt]:
         """Read the receipts of a stage by item, sorted.

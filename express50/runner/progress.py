@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import itertools
-import sqlite3
 import sys
 import threading
 import time
@@ -16,6 +15,7 @@ from rich.console import Console
 from rich.progress import MofNCompleteColumn, Progress
 
 from express50.console import log
+from express50.errors import FormatError
 from express50.runner.ledger import Ledger, Receipt, Run
 
 BEAT_SECONDS = 2.0
@@ -87,7 +87,7 @@ class RunLog:
             while True:
                 with self._lock:
                     run = replace(self._run, seen=time.time(), running=dict(self._run.running))
-                with contextlib.suppress(sqlite3.OperationalError):  # the run itself will say so
+                with contextlib.suppress(FormatError):  # the run itself will say so
                     ledger.write_run(run)
                 if over:
                     return

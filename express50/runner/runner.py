@@ -9,20 +9,27 @@ import tomllib
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import nullcontext
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
 from typing import Any
 
 from express50.contract.config import config_toml, nearest
 from express50.contract.layout import Dataset
 from express50.contract.stage import Note, Stage
-from express50.errors import ConfigError, Express50Error, StageError
-from express50.files.atomic import write_bytes
-from express50.files.digests import path_digest
+from express50.errors import ConfigError, StageError
+from express50.files.atomic import check_space, write_bytes
+from express50.files.digests import file_version, path_digest
 from express50.runner.executor import Pool
-from express50.runner.ledger import Ledger, Receipt
+from express50.runner.ledger import Ledger, Made, Receipt
 from express50.runner.progress import RunLog, showing
 from express50.runner.publish import clean_leftovers, discard_stale, set_aside, stage_lock
-from express50.runner.worker import Task, failed_receipt, fingerprint, input_digests
+from express50.runner.worker import (
+    Task,
+    failed_receipt,
+    failure_reason,
+    fingerprint,
+    input_digests,
+)
 
 WARNINGS = 12  # lines; more of them would hide the account
 ALIKE = 3  # so many first items that fail for one reason show a wrong setting
@@ -140,6 +147,7 @@ def run_stage(
 
     Raises:
         StageError: the stage has no items, or another run holds it.
+        DiskFullError: the dataset's disk is nearly full.
     """
     started = time.perf_counter()
     dataset = Dataset(dataset.root.resolve())
@@ -177,6 +185,7 @@ class _Work:
         unreadable: receipts of items whose inputs cannot be read.
         tasks: items to run.
         again: why items are run that a former run had made.
+        stands: items whose former output is right until a new one is whole.
     """
 
     former: Mapping[str, Receipt]
@@ -184,6 +193,7 @@ class _Work:
     unreadable: list[Receipt]
     tasks: list[Task]
     again: dict[str, str]
+    stands: set[str]
 
 
 def _sort_items(
@@ -198,7 +208,7 @@ def _sort_items(
     """Sort items into those that are up to date, that cannot be read, and that are to do."""
     receipts, made = ledger.read(stage.name), ledger.made(stage.name)
     done = {item: receipt for item, receipt in receipts.items() if receipt.status == "done"}
-    work = _Work(receipts, {}, [], [], {})
+    work = _Work(receipts, {}, [], [], {}, set())
     # Items share inputs; what a stage reads does not change while it runs.
     digest_of = functools.cache(lambda path: path_digest(path, ledger.sha256))
     for item in chosen:
@@ -206,28 +216,81 @@ def _sort_items(
             inputs = input_digests(stage, dataset, item, config, digest_of)
         except ConfigError:  # a setting is wrong, not an item: former outputs stay
             raise
-        except Express50Error as error:
-            reason = f"{type(error).__name__}: {error}"
+        except Exception as error:  # noqa: BLE001 (one damaged item must not stop the others)
+            reason = failure_reason(dataset, stage.name, item, error)
             task = Task(stage, dataset, item, config, "", {}, threads)
             work.unreadable.append(failed_receipt(task, reason, 0))
+            # A StageError: an earlier stage has taken back what the item was made of.
+            if item in done and not isinstance(error, StageError):
+                work.stands.add(item)
             continue
-        digest, receipt = fingerprint(stage, config, inputs), done.get(item)
-        output = dataset.item_dir(stage.name, item) / "metrics.json"
-        if receipt is not None and receipt.fingerprint == digest and output.is_file():
-            work.current[item] = _outcome(receipt, status="skipped")
-            continue
-        work.tasks.append(Task(stage, dataset, item, config, digest, inputs, threads))
-        if receipt is not None and receipt.fingerprint == digest:
-            work.again[item] = "output missing"
-        elif receipt is not None:
-            before = made[item].inputs if item in made else inputs
-            work.again[item] = _why_again(stage, before, inputs, changed)
+        digest = fingerprint(stage, config, inputs)
+        task = Task(stage, dataset, item, config, digest, inputs, threads)
+        if item in done:
+            _compare(task, done[item], made.get(item), ledger, changed, work)
+        else:
+            work.tasks.append(task)
     ledger.keep_digests()
     reasons = {receipt.reason for receipt in work.unreadable}
     if len(work.unreadable) == len(chosen) > 1 and len(reasons) == 1:
         # A setting is wrong rather than all items: former outputs stay.
         raise StageError(f"{stage.name}: no item can be made: {reasons.pop()}")
     return work
+
+
+def _compare(
+    task: Task,
+    former: Receipt,
+    made: Made | None,
+    ledger: Ledger,
+    changed: Sequence[str],
+    work: _Work,
+) -> None:
+    """Sort an item that a former run made: it is up to date, or is to be made again."""
+    there, same = _is_there(task, made, ledger), former.fingerprint == task.fingerprint
+    if there and same:
+        current = replace(former, reason="")
+        if former.reason:  # of an attempt with other settings
+            ledger.note_attempt(current)
+        work.current[task.item] = _outcome(current, status="skipped")
+        return
+    work.tasks.append(task)
+    if same:
+        work.again[task.item] = "output missing"
+        return
+    before = made.inputs if made is not None else task.inputs
+    work.again[task.item] = _why_again(task.stage, before, task.inputs, changed)
+    if there and not _other_data(task, before):
+        work.stands.add(task.item)
+
+
+def _is_there(task: Task, made: Made | None, ledger: Ledger) -> bool:
+    """Return whether an item's folder is the one that its receipt tells of.
+
+    A run may have been killed after it had published another and before the new receipt.
+    """
+    folder = task.dataset.item_dir(task.stage.name, task.item)
+    path = folder / "metrics.json"
+    if made is None or not path.is_file():
+        return path.is_file()
+    mark = made.files[path.name]
+    if file_version(path) == (mark.size, mark.mtime_ns, mark.inode):
+        return True
+    files = {folder / name: mark.sha256 for name, mark in made.files.items()}  # a copy, perhaps
+    return all(file.is_file() and ledger.sha256(file) == sha for file, sha in files.items())
+
+
+def _other_data(task: Task, before: Mapping[str, str]) -> bool:
+    """Return whether what earlier stages give an item differs from what its output was made of.
+
+    A later stage must not read such an output beside the new data. Files outside of the dataset
+    are different: settings name them, or they are footage, which only the first stage reads.
+    """
+    stage, root = task.stage, task.dataset.root
+    found = stage.inputs(task.dataset, task.item, task.config)
+    outside = {n for n, at in found.items() if isinstance(at, Path) and not at.is_relative_to(root)}
+    names = set() if stage.prepare else {*before, *task.inputs} - outside
+    return any(before.get(name) != task.inputs.get(name) for name in names)
 
 
 def _why_again(
@@ -256,16 +319,14 @@ def _run_items(
     log.current(len(outcomes))
 
     def begin(task: Task) -> None:
-        # A receipt must not outlive its output, should this run be killed half-way.
-        if task.item in work.former:
-            ledger.forget(stage.name, [task.item])
+        check_space(dataset.root)
         log.begin(task.item)
 
     total = len(work.tasks) + len(work.unreadable)
     with showing(stage.name, total, progress) as show:
 
         def settle(receipt: Receipt) -> None:
-            _record(dataset, ledger, receipt)
+            _record(dataset, ledger, receipt, receipt.item in work.stands)
             outcomes[receipt.item] = _outcome(receipt, again=work.again.get(receipt.item, ""))
             show(receipt)
             log.settle(receipt.item)
@@ -287,9 +348,9 @@ def _refuse_alike(stage: Stage, ended: list[Receipt], former: Mapping[str, Recei
     """Stop where the first items fail for one reason though they were made before.
 
     Raises:
-        StageError: they do; a setting is wrong, and the others' outputs are worth keeping.
+        StageError: they do, and did not when they were tried last: a setting is wrong.
     """
-    made = all(r.item in former and former[r.item].status == "done" for r in ended)
+    made = all(r.item in former and not former[r.item].reason for r in ended)
     if made and all(r.status == "failed" and r.reason == ended[0].reason for r in ended):
         raise StageError(
             f"{stage.name}: the first {len(ended)} items fail alike, though they were made before:"
@@ -297,8 +358,11 @@ def _refuse_alike(stage: Stage, ended: list[Receipt], former: Mapping[str, Recei
         )
 
 
-def _record(dataset: Dataset, ledger: Ledger, receipt: Receipt) -> None:
-    """Store a receipt; the former output of a failed item is set aside, unread."""
+def _record(dataset: Dataset, ledger: Ledger, receipt: Receipt, stands: bool) -> None:
+    """Store a receipt; a failed item's former output is set aside, unread, unless it stands."""
+    if receipt.status == "failed" and stands:
+        ledger.note_attempt(receipt)
+        return
     if receipt.status == "failed":
         set_aside(dataset, receipt.stage, receipt.item)
     else:

@@ -15,8 +15,8 @@ from typing import Any
 
 from express50.contract.layout import Dataset
 from express50.contract.stage import Stage
-from express50.errors import Express50Error, StageError
-from express50.files.atomic import dump_json, write_bytes
+from express50.errors import DiskFullError, Express50Error, StageError
+from express50.files.atomic import dump_json, naming_full_disk, write_bytes
 from express50.files.digests import files_of, value_digest
 from express50.runner.ledger import FileMark, Made, Receipt, mark_file
 from express50.runner.publish import publishing
@@ -64,6 +64,19 @@ def fingerprint(stage: Stage, config: Any, inputs: dict[str, str]) -> str:
     return value_digest([stage.name, stage.version, vars(config), inputs])
 
 
+def failure_reason(dataset: Dataset, stage: str, item: str, error: Exception) -> str:
+    """Say why an item failed; the traceback of a defect goes to the item's log."""
+    reason = f"{type(error).__name__}: {error}"
+    if isinstance(error, Express50Error):
+        return reason
+    log = dataset.log_file(stage, item)
+    try:
+        write_bytes(log, "".join(traceback.format_exception(error)).encode())
+        return f"{reason} (unexpected; traceback in {log})"
+    except (OSError, DiskFullError) as trouble:
+        return f"{reason} (unexpected; its traceback could not be written to {log}: {trouble})"
+
+
 def failed_receipt(task: Task, reason: str, attempts: int) -> Receipt:
     """Make the receipt of an item that no worker could run."""
     return Receipt(
@@ -87,9 +100,12 @@ def run_tasks(tasks: list[Task]) -> list[Receipt]:
 
 
 def run_task(task: Task) -> Receipt:
-    """Run one item and publish its outputs; any failure becomes a receipt.
+    """Run one item and publish its outputs; any failure of the item becomes a receipt.
 
     Only a receipt travels back to the driver, never data.
+
+    Raises:
+        DiskFullError: there is no room for the outputs, nor for any other item's.
     """
     cap_threads(task.threads)
     reset_peak_memory()
@@ -97,19 +113,13 @@ def run_task(task: Task) -> Receipt:
     reason, made = "", None
     metrics: dict = {}
     try:
-        metrics, files = _run_and_publish(task)
+        with naming_full_disk(task.dataset.root):
+            metrics, files = _run_and_publish(task)
         made = Made(task.inputs, files)
-    except Express50Error as error:
-        reason = f"{type(error).__name__}: {error}"
-    except Exception as error:  # noqa: BLE001
-        # A defect that one item triggers must not stop the others; the traceback goes to a file.
-        reason = f"{type(error).__name__}: {error} (unexpected; "
-        log = task.dataset.log_file(task.stage.name, task.item)
-        try:
-            write_bytes(log, "".join(traceback.format_exception(error)).encode())
-            reason += f"traceback in {log})"
-        except OSError as trouble:  # a full disk is a usual reason for the error itself
-            reason += f"its traceback could not be written to {log}: {trouble})"
+    except DiskFullError:
+        raise
+    except Exception as error:  # noqa: BLE001 (a defect that one item shows must not stop others)
+        reason = failure_reason(task.dataset, task.stage.name, task.item, error)
     return Receipt(
         stage=task.stage.name,
         item=task.item,

@@ -29,6 +29,15 @@ def inputs(dataset: Dataset, item: str, config: MatteConfig) -> dict[str, Path |
     return found
 
 
+def try_files(config: MatteConfig) -> None:
+    """Load the network."""
+    if config.weights:
+        from pipelines.matte.learned import BGMV2, SALIENT
+        from pipelines.networks import load_network
+
+        load_network(config.weights, SALIENT if config.method == "salient" else BGMV2)
+
+
 def run(dataset: Dataset, item: str, config: MatteConfig, out: Path) -> Result:
     """Matte one peak."""
     from pipelines.matte.stage import run as work
@@ -49,6 +58,7 @@ STAGE = Stage(
     items=peak_items,
     inputs=inputs,
     run=run,
+    try_files=try_files,
     needs_gpu=needs_gpu,
     help="separate the head from the background in every camera, and let the cameras agree",
     purpose="The opacity of the subject in every peak frame, keyed per camera; what the other"

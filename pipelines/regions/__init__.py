@@ -39,6 +39,15 @@ def needs_gpu(config: RegionsConfig) -> bool:
     return bool(config.segmentation) and config.device == "cuda"
 
 
+def try_files(config: RegionsConfig) -> None:
+    """Load the network."""
+    if config.segmentation:
+        from pipelines.networks import load_network
+        from pipelines.regions.sapiens import SAPIENS
+
+        load_network(config.segmentation, SAPIENS)
+
+
 def run(dataset: Dataset, item: str, config: RegionsConfig, out: Path) -> Result:
     """Label one expression."""
     from pipelines.regions.stage import run as work
@@ -54,6 +63,7 @@ STAGE = Stage(
     items=peak_items,
     inputs=inputs,
     run=run,
+    try_files=try_files,
     needs_gpu=needs_gpu,
     help="label skin, hair, neck and torso in each view, and cut the torso from the matte",
     purpose="The tracked mesh, each view's colours and depth label skin, ears, lips, eyes, mouth,"

@@ -42,6 +42,17 @@ def inputs(dataset: Dataset, item: str, config: TrackConfig) -> dict[str, Path |
     return found
 
 
+def try_files(config: TrackConfig) -> None:
+    """Read the head model and the landmarks."""
+    from express50.head.load import load_head
+    from express50.landmarks.sources import EMBEDDED, try_source
+
+    if config.head != "procedural":
+        load_head(config.head)
+    if config.landmarks != EMBEDDED:
+        try_source(config.landmarks)
+
+
 def run(dataset: Dataset, item: str, config: TrackConfig, out: Path) -> Result:
     """Track one subject; see `pipelines.track.stage`."""
     from pipelines.track.stage import run as work
@@ -57,6 +68,7 @@ STAGE = Stage(
     items=Dataset.subjects,  # all expressions of one share the shape
     inputs=inputs,
     run=run,
+    try_files=try_files,
     help="fit a head model to every peak frame",
     purpose="A head model is fitted to every peak frame: shape per subject, expression and pose"
     " per frame, and an albedo texture.",

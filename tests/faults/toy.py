@@ -66,6 +66,8 @@ def misbehave(dataset: Dataset, item: str, text: str) -> Result:
         raise KeyError("absent")
     if item.startswith("nan"):
         return Result({"value": float("nan")})
+    if item.startswith("full") and text != "repaired":
+        Path("/dev/full").write_text("more than there is room for")
     if item.startswith("poison"):
         os.kill(os.getpid(), signal.SIGKILL)
     if item.startswith("once"):

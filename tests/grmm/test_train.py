@@ -5,7 +5,10 @@ import signal
 import pytest
 import torch
 
-from express50.errors import ConfigError, FormatError, TrainError
+from express50.errors import ConfigError, DiskFullError, FormatError, TrainError
+from express50.files.atomic import write_bytes
+from grmm import checkpoint
+from grmm import train as train_module
 from grmm.data import HeadViews
 from grmm.evaluate import evaluate, summarise, training_render, write_evaluation
 from grmm.losses import LAYERS, load_vgg
@@ -58,6 +61,51 @@ def test_resuming_with_other_settings_is_refused(tmp_path, source):
         train(source, ellipsoid_head(), tmp_path, other, resume=True)
     with pytest.raises(FormatError, match="no such file"):
         train(source, ellipsoid_head(), tmp_path / "x", other, resume=True)
+
+
+class Disk:
+    """Takes checkpoints of a folder up to its free bytes, and gives back what is deleted."""
+
+    def __init__(self, folder, free):
+        self.folder, self.size = folder, free
+
+    def used(self):
+        return sum(path.stat().st_size for path in self.folder.glob("*checkpoint*"))
+
+    def write(self, path, data):
+        if self.used() + len(data) > self.size:
+            raise DiskFullError(f"{path}: the disk is full")
+        write_bytes(path, data)
+
+
+def test_a_disk_that_fills_up_takes_the_weights_still(tmp_path, source, monkeypatch):
+    disk, rates = Disk(tmp_path, 1e9), train_module.set_rates
+
+    def fill_late(state, config):
+        if state.iteration == 3:
+            disk.size = disk.used()
+        rates(state, config)
+
+    monkeypatch.setattr(checkpoint, "write_bytes", disk.write)
+    monkeypatch.setattr(train_module, "set_rates", fill_late)
+    train(source, ellipsoid_head(), tmp_path, tiny_config(train={"iterations": 5}))
+    assert state_of(tmp_path)["loop"]["iteration"] == 5
+    assert [path.name for path in tmp_path.glob("*checkpoint*")] == ["checkpoint.pt"]
+
+
+def test_training_on_a_full_disk_stops_at_once(tmp_path, source, monkeypatch, capsys):
+    monkeypatch.setattr(checkpoint, "write_bytes", Disk(tmp_path, 1e4).write)
+    with pytest.raises(DiskFullError):
+        train(source, ellipsoid_head(), tmp_path, tiny_config(train={"iterations": 25}))
+    assert "iteration 20" not in capsys.readouterr().err
+
+
+def test_files_of_metrics_are_tried_before_training(tmp_path, source):
+    (tmp_path / "bad.pth").write_bytes(b"mistyped")
+    config = tiny_config(metrics={"alexnet": str(tmp_path / "bad.pth")})
+    with pytest.raises(ConfigError, match="metrics.alexnet"):
+        train(source, ellipsoid_head(), tmp_path / "out", config)
+    assert not (tmp_path / "out").exists()
 
 
 def test_training_on_one_view_lowers_the_error(tmp_path):

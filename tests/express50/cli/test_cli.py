@@ -53,6 +53,27 @@ def test_ingest_then_skip_then_status(run, data, capture):
     assert out.splitlines()[1].split()[:3] == ["ingest", "1", "0"]
 
 
+@pytest.mark.parametrize(
+    "settings",
+    [
+        ["matte.method=bgmv2", "matte.weights"],
+        ["track.landmarks"],
+        ["track.head"],
+        ["regions.segmentation"],
+    ],
+    ids=lambda settings: settings[-1],
+)
+def test_a_mistyped_file_is_refused_before_anything_is_done(run, data, capture, settings):
+    """The file is there and is not what it should be: it has to be opened to know."""
+    bad = data.parent / "bad.npz"
+    bad.write_bytes(b"mistyped")
+    *others, name = settings
+    sets = [f"--set={text}" for text in (*others, f"{name}={bad}")]
+    code, _, err = run("run", data, capture, *sets, "--workers", "0")
+    assert code == 2 and str(bad) in err and err.count("\n") == 1
+    assert not data.exists()
+
+
 def test_json_is_alone_on_standard_output(data, capture):
     command = [sys.executable, "-m", "express50", "ingest", str(data), str(capture), "--json"]
     done = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, check=True)
